@@ -1,0 +1,30 @@
+"""Driving environments whose scenarios are points x with a probability: how often would this policy crash?"""
+
+from typing import TYPE_CHECKING, Any
+
+from rare_envs.registration import ENV_IDS, make_batch, register_envs
+
+if TYPE_CHECKING:
+    from rare_envs.distributions import TruncatedGaussianMixture
+    from rare_envs.problem import DrivingProblem
+    from rare_envs.space import ScenarioSpace
+
+__all__ = ["ENV_IDS", "DrivingProblem", "ScenarioSpace", "TruncatedGaussianMixture", "make_batch"]
+__version__ = "0.1.0"
+
+register_envs()
+
+_LAZY = {
+    "DrivingProblem": "rare_envs.problem",
+    "ScenarioSpace": "rare_envs.space",
+    "TruncatedGaussianMixture": "rare_envs.distributions",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import torch only when a name that needs it is used."""
+    if name in _LAZY:
+        from importlib import import_module
+
+        return getattr(import_module(_LAZY[name]), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,52 @@
+"""From a policy's action in [-1, 1] to an acceleration and a steering angle."""
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from torch import Tensor
+
+MAX_ACCELERATION = 5.0
+"""Acceleration [m/s^2] of an action of 1, and deceleration of -1: HighwayEnv's range."""
+MAX_STEERING = 0.1
+"""Steering angle [rad] of an action of 1. HighwayEnv's pi/4 would spin a car at motorway speed; 0.1 rad already asks
+for more than a tyre gives."""
+
+DISCRETE_ACTIONS = np.array([[-1.0, 0.0], [-0.4, 0.0], [0.0, 0.0], [0.2, 0.0], [0.4, 0.0]], dtype=np.float32)
+"""For algorithms with discrete actions: row k is the continuous action of index k (-5, -2, 0, 1, 2 m/s^2, straight)."""
+
+
+def action_space() -> spaces.Box:
+    """The continuous action: acceleration and steering, each in [-1, 1]."""
+    return spaces.Box(-1.0, 1.0, (2,), np.float32)
+
+
+def to_physical(action: Tensor, batch: int) -> Tensor:
+    """Scale actions to physical units.
+
+    Args:
+        action: Shape (B, 2) in [-1, 1] (clipped), or (B,) integers that index `DISCRETE_ACTIONS`.
+        batch: B.
+
+    Returns:
+        Acceleration [m/s^2] and steering angle [rad], shape (B, 2).
+
+    Raises:
+        ValueError: If shape or values are not those of an action.
+    """
+    if action.shape == (batch,) and not action.is_floating_point():
+        if bool(((action < 0) | (action >= len(DISCRETE_ACTIONS))).any()):
+            raise ValueError(f"Expected action indices in 0..{len(DISCRETE_ACTIONS) - 1}, got {action.tolist()[:5]}.")
+        action = torch.from_numpy(DISCRETE_ACTIONS)[action]
+    if action.shape != (batch, 2):
+        raise ValueError(
+            f"Expected actions of shape ({batch}, 2) in [-1, 1] (acceleration, steering), got {tuple(action.shape)}."
+        )
+    finite = torch.isfinite(action)
+    if not bool(finite.all()):
+        bad = int((~finite.all(dim=1)).sum())
+        raise ValueError(
+            f"The policy returned NaN or infinite actions for {bad} of {batch} observations; "
+            "check its weights and its observation normalisation."
+        )
+    scale = torch.tensor([MAX_ACCELERATION, MAX_STEERING], dtype=action.dtype, device=action.device)
+    return action.clamp(-1.0, 1.0) * scale

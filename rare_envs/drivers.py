@@ -1,0 +1,140 @@
+"""Drivers: what decides an acceleration and a steering angle. IDM, lane keeping and policies with `predict`."""
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rare_envs.actions import to_physical
+from rare_envs.geometry import Lead
+from rare_envs.state import LANE_WIDTH, VEHICLE_LENGTH, State
+
+_NEAR_ZERO = 0.01
+"""HighwayEnv's `not_zero`: distances [m] and speeds [m/s] in a denominator are kept at least this far from 0."""
+
+
+class Driver(Protocol):
+    """An ego. Its memory, if it has any, goes in and out, so that one driver serves any number of rollouts."""
+
+    def act(self, state: State, lead: Lead, observation: Any, memory: Any) -> tuple[Tensor, Any]:
+        """Decide for one tick.
+
+        Args:
+            state: Traffic of B scenarios.
+            lead: The ego's lead.
+            observation: Callable without arguments that gives the (B, F) observation; called only when needed.
+            memory: What the last call returned, None at the start.
+
+        Returns:
+            Acceleration [m/s^2] and steering angle [rad], shape (B, 2), and the new memory.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class IDM:
+    """Intelligent Driver Model with a hard maximum deceleration, on the bumper-to-bumper gap.
+
+    a = a_max [1 - (v/v0)^delta - (s*/gap)^2], at least -b_max, with
+    s* = s0 + s1 sqrt(v/v0) + T v + v dv / (2 sqrt(a_max b)).
+
+    The defaults are Tian et al.'s (2024, Table I; as found in their group's public code). The last term of s* is not
+    cut off at 0: a lead that pulls away fast from a short gap is braked for, as in HighwayEnv and in their code.
+    """
+
+    desired_speed: float = 21.72
+    """v0 [m/s]."""
+    time_headway: float = 1.2
+    """T [s]."""
+    max_acceleration: float = 2.22
+    """a_max [m/s^2]."""
+    comfortable_deceleration: float = 2.4
+    """b [m/s^2]."""
+    exponent: float = 4.0
+    """delta."""
+    jam_distance: float = 1.0
+    """s0 [m]."""
+    jam_distance_speed: float = 2.0
+    """s1 [m]."""
+    max_deceleration: float = 5.0
+    """b_max [m/s^2]: what the brakes can do."""
+    added_length: float = 0.0
+    """[m] added to the gap; HighwayEnv measures between centres, so its jam distance contains a vehicle length."""
+
+    @classmethod
+    def highway_env(cls, desired_speed: float) -> "IDM":
+        """HighwayEnv's `IDMVehicle`: distance between centres, jam distance 10 m, accelerations within 6 m/s^2."""
+        return cls(desired_speed, 1.5, 3.0, 5.0, 4.0, 10.0, 0.0, 6.0, VEHICLE_LENGTH)
+
+    def acceleration(self, speed: Tensor, lead: Lead, desired_speed: Tensor | None = None) -> Tensor:
+        """The IDM acceleration.
+
+        Args:
+            speed: Speed of the follower [m/s], shape (B,).
+            lead: Its lead.
+            desired_speed: v0 [m/s] of each follower, shape (B,), in place of the common one.
+
+        Returns:
+            Acceleration [m/s^2], shape (B,).
+        """
+        v0 = self.desired_speed if desired_speed is None else desired_speed
+        ratio = speed / v0
+        closing_gain = 0.5 / (self.max_acceleration * self.comfortable_deceleration) ** 0.5
+        wanted = self.jam_distance + speed * (self.time_headway + lead.closing_speed * closing_gain)
+        if self.jam_distance_speed:
+            wanted = wanted + self.jam_distance_speed * ratio.clamp(min=1e-9).sqrt()
+        crowding = wanted / (lead.gap + self.added_length).clamp(min=_NEAR_ZERO)
+        free = ratio.square().square() if self.exponent == 4.0 else ratio.pow(self.exponent)
+        acceleration = self.max_acceleration * (1.0 - free - crowding.square())
+        return acceleration.clamp(min=-self.max_deceleration)
+
+    def act(self, state: State, lead: Lead, observation: Any, memory: Any) -> tuple[Tensor, Any]:
+        """IDM behind the lead, lane keeping across; needs no observation and no memory."""
+        speed = state.speed[:, 0]
+        steering = lane_keeping(state.y[:, 0], state.heading[:, 0], speed)
+        return torch.stack((self.acceleration(speed, lead), steering), dim=1), memory
+
+
+def lane_keeping(y: Tensor, heading: Tensor, speed: Tensor) -> Tensor:
+    """HighwayEnv's steering controller, towards the centre of the nearest lane.
+
+    Offset to heading command (proportional, 0.6 s), heading error to yaw rate (0.2 s), yaw rate to steering angle.
+
+    Args:
+        y: Position across the road [m], shape (B,).
+        heading: Heading [rad], shape (B,).
+        speed: Speed [m/s], shape (B,).
+
+    Returns:
+        Steering angle [rad], shape (B,).
+    """
+    offset = y - torch.round(y / LANE_WIDTH) * LANE_WIDTH
+    speed = speed.clamp(min=_NEAR_ZERO)
+    heading_command = torch.asin((offset / (-0.6 * speed)).clamp(-1.0, 1.0)).clamp(-np.pi / 4, np.pi / 4)
+    yaw_rate = 5.0 * (heading_command - heading)
+    slip = torch.asin((VEHICLE_LENGTH / 2 / speed * yaw_rate).clamp(-1.0, 1.0))
+    return torch.atan(2.0 * torch.tan(slip)).clamp(-np.pi / 3, np.pi / 3)
+
+
+@dataclass(frozen=True)
+class PolicyDriver:
+    """Any object with Stable-Baselines3's `predict`, called on the whole batch."""
+
+    policy: Any
+
+    def act(self, state: State, lead: Lead, observation: Any, memory: Any) -> tuple[Tensor, Any]:
+        """Ask the policy; the observation is NumPy, as SB3 wants it.
+
+        Raises:
+            ValueError: If the policy's actions are not finite or have the wrong shape.
+        """
+        batch = state.x.shape[0]
+        start = np.full(batch, memory is None)
+        hidden = None if memory is None else memory[0]
+        action, hidden = self.policy.predict(
+            observation().numpy(force=True), state=hidden, episode_start=start, deterministic=True
+        )
+        physical = to_physical(torch.as_tensor(np.asarray(action)), batch)
+        return physical.to(state.x), (hidden,)

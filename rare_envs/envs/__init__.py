@@ -1,0 +1,1 @@
+"""Gymnasium shells over the world."""

@@ -1,0 +1,133 @@
+"""One scenario at a time: a `gymnasium.Env` over a batch of one."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from rare_envs.actions import action_space, to_physical
+from rare_envs.envs.rendering import Renderer
+from rare_envs.geometry import collision_type
+from rare_envs.observation import observation_space, observe
+from rare_envs.reward import reward_terms
+from rare_envs.setup import set_up
+from rare_envs.world import Episode
+
+Observation = NDArray[np.float32]
+
+
+class DrivingEnv(gym.Env[Observation, NDArray[np.float32]]):
+    """The ego drives, everything else follows the scenario.
+
+    Observation: `features`, see `rare_envs.observation`. Action: acceleration and steering in [-1, 1], see
+    `rare_envs.actions`. Reward: see `rare_envs.reward`. The episode terminates with a collision and is truncated at
+    the horizon. `info` carries `scenario`, `x`, `min_ttc` [s], `collision`, `reward_terms`, and at the end `measure`
+    (f(x)) and `collision_type`.
+    """
+
+    metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 10}  # noqa: RUF012  (Gymnasium's own form)
+
+    def __init__(self, env_id: str, render_mode: str | None = None, **kwargs: Any) -> None:
+        """Make the environment.
+
+        Args:
+            env_id: The scenario's registered id.
+            render_mode: None, "rgb_array" or "human".
+            **kwargs: See `rare_envs.setup.set_up`.
+
+        Raises:
+            ValueError: If an argument is invalid.
+        """
+        self.world, self.space = set_up(env_id, **kwargs)
+        self.observation_space = observation_space(self.world.scenario.vehicles)
+        self.action_space = action_space()
+        self.metadata = {**self.metadata, "render_fps": round(1.0 / self.world.dt)}
+        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
+            raise ValueError(f"Expected render_mode None, 'rgb_array' or 'human', got {render_mode!r}.")
+        self.render_mode = render_mode
+        self._renderer: Renderer | None = None
+        self._x = np.full(self.space.dim, np.nan)
+        self._episode: Episode | None = None
+        self._tick = 0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start an episode.
+
+        Args:
+            seed: Seeds the draw of the scenario.
+            options: Scenario parameters by name, or {"x": vector} for all of them. What is not given is drawn: a
+                whole x comes from the base distribution, then the given parameters replace theirs.
+
+        Returns:
+            Observation and info.
+
+        Raises:
+            ValueError: If an option is unknown, of the wrong shape, NaN or outside its range.
+        """
+        super().reset(seed=seed)
+        self._x = self.space.scenario_x(options, 1, self.np_random)[0]
+        self._tick = 0
+        with torch.inference_mode():
+            self._episode = self.world.start(torch.from_numpy(self._x[None]).float())
+            observation = observe(self._episode.state)[0].numpy()
+        self._show()
+        return observation, self._info(self._episode)
+
+    def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Move by one tick; see the class for what comes back.
+
+        Raises:
+            ValueError: If the action has the wrong shape or is NaN.
+        """
+        if self._episode is None:
+            raise RuntimeError("Expected reset() before step().")
+        with torch.inference_mode():
+            physical = to_physical(torch.as_tensor(np.asarray(action, np.float32))[None], 1)
+            episode = self.world.step(self._episode, physical)
+            terms = reward_terms(episode, physical)
+            observation = observe(episode.state)[0].numpy()
+            reward = float(terms.total)
+        self._episode, self._tick = episode, self._tick + 1
+        terminated = bool(episode.collided)
+        truncated = not terminated and self._tick >= self.world.ticks
+        info = self._info(episode)
+        info["reward_terms"] = {name: float(value) for name, value in terms._asdict().items()}
+        if terminated or truncated:
+            info["measure"] = float(episode.f)
+            info["collision_type"] = collision_type(episode.state) if terminated else None
+        self._show()
+        return observation, reward, terminated, truncated, info
+
+    def _info(self, episode: Episode) -> dict[str, Any]:
+        collided = bool(episode.collided)
+        return {
+            "scenario": self.space.named(self._x),
+            "x": self._x.copy(),
+            "min_ttc": 0.0 if collided else float(episode.danger),
+            "collision": collided,
+        }
+
+    def _show(self) -> None:
+        if self.render_mode == "human":
+            self.render()
+
+    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+        """Draw the road with HighwayEnv's graphics: an (H, W, 3) image for "rgb_array", a window for "human"."""
+        if self.render_mode is None or self._episode is None:
+            gym.logger.warn("Nothing to render: pass render_mode='rgb_array' or 'human' to gym.make and reset first.")
+            return None
+        if self._renderer is None:
+            window = self.render_mode == "human"
+            self._renderer = Renderer(self.world.scenario.lanes, window, self.metadata["render_fps"])
+        image = self._renderer.draw(self._episode.state, crashed=bool(self._episode.collided))
+        return None if self.render_mode == "human" else image
+
+    def close(self) -> None:
+        """Close the window."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None

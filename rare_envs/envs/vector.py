@@ -1,0 +1,211 @@
+"""Many scenarios at once: a `gymnasium.vector.VectorEnv` that is one batch, not many environments."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+from torch import Tensor
+
+from rare_envs.actions import action_space, to_physical
+from rare_envs.envs.rendering import Renderer
+from rare_envs.geometry import Lead, collision_type
+from rare_envs.observation import observation_space, observe
+from rare_envs.reward import RewardTerms, reward_terms
+from rare_envs.setup import set_up
+from rare_envs.state import State
+from rare_envs.world import Episode
+
+Info = dict[str, Any]
+
+
+class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[Any]]):
+    """`DrivingEnv` for a whole batch, with Gymnasium's SAME_STEP autoreset.
+
+    An episode that ends is replaced within the step by one drawn from the base distribution; its last observation
+    and info are in `infos["final_obs"]` and `infos["final_info"]`. One generator draws for the whole batch.
+    """
+
+    metadata = {  # noqa: RUF012  (Gymnasium's own form)
+        "render_modes": ["rgb_array"],
+        "render_fps": 10,
+        "autoreset_mode": AutoresetMode.SAME_STEP,
+    }
+
+    def __init__(self, env_id: str, num_envs: int = 1, render_mode: str | None = None, **kwargs: Any) -> None:
+        """Make the batch.
+
+        Args:
+            env_id: The scenario's registered id.
+            num_envs: Number of scenarios.
+            render_mode: None or "rgb_array" (one image for each scenario).
+            **kwargs: See `rare_envs.setup.set_up`.
+
+        Raises:
+            ValueError: If an argument is invalid.
+        """
+        if num_envs < 1:
+            raise ValueError(f"Expected num_envs of at least 1, got {num_envs}.")
+        if render_mode not in (None, "rgb_array"):
+            raise ValueError(f"Expected render_mode None or 'rgb_array' for a batch, got {render_mode!r}.")
+        self.world, self.space = set_up(env_id, **kwargs)
+        self.num_envs = num_envs
+        self.render_mode = render_mode
+        self.single_observation_space = observation_space(self.world.scenario.vehicles)
+        self.single_action_space = action_space()
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._x = np.full((num_envs, self.space.dim), np.nan)
+        self._tick = np.zeros(num_envs, dtype=np.int64)
+        self._episode: Episode | None = None
+        self._renderers: list[Renderer] = []
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], Info]:
+        """Start all episodes.
+
+        Args:
+            seed: Seeds the one generator of the batch; a list is taken as one seed.
+            options: Scenario parameters by name, scalars or arrays of shape (num_envs,), or {"x": (d,) or
+                (num_envs, d)}; what is not given is drawn as in `DrivingEnv.reset`.
+
+        Returns:
+            Observations, shape (num_envs, F), and infos.
+
+        Raises:
+            ValueError: If an option is unknown, of the wrong shape, NaN or outside its range.
+        """
+        if isinstance(seed, list):
+            self._np_random = np.random.default_rng([s for s in seed if s is not None] or None)
+        else:
+            super().reset(seed=seed)
+        self._x = self.space.scenario_x(options, self.num_envs, self.np_random)
+        self._tick[:] = 0
+        with torch.inference_mode():
+            self._episode = self._start(self._x)
+            observation = observe(self._episode.state).numpy()
+        return observation, self._info(self._episode, np.ones(self.num_envs, dtype=bool))
+
+    def step(
+        self, actions: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], Info]:
+        """Move all by one tick and replace the episodes that ended.
+
+        Raises:
+            ValueError: If the actions have the wrong shape or are NaN.
+        """
+        if self._episode is None:
+            raise RuntimeError("Expected reset() before step().")
+        with torch.inference_mode():
+            physical = to_physical(torch.as_tensor(np.asarray(actions, np.float32)), self.num_envs)
+            episode = self.world.step(self._episode, physical)
+            terms = reward_terms(episode, physical)
+            observation = observe(episode.state).numpy()
+            reward = terms.total.double().numpy()
+        self._episode = episode
+        self._tick += 1
+        terminated = episode.collided.numpy()
+        truncated = (self._tick >= self.world.ticks) & ~terminated
+        done = terminated | truncated
+        infos: Info = {}
+        if done.any():
+            infos["final_obs"], infos["_final_obs"] = _rows(observation, done), done.copy()
+            infos["final_info"], infos["_final_info"] = self._final_info(episode, terms, done), done.copy()
+            observation = self._replace(observation, done)
+        infos.update(self._info(self._episode, np.ones(self.num_envs, dtype=bool)))
+        _put(infos, "reward_terms", _terms(terms, ~done), ~done)
+        return observation, reward, terminated.copy(), truncated, infos
+
+    def _start(self, x: NDArray[np.float64]) -> Episode:
+        return self.world.start(torch.from_numpy(x).float())
+
+    def _replace(self, observation: NDArray[np.float32], done: NDArray[np.bool_]) -> NDArray[np.float32]:
+        rows = np.flatnonzero(done)
+        assert self._episode is not None
+        x = self.space.scenario_x(None, len(rows), self.np_random)
+        self._x = self._x.copy()
+        self._x[rows] = x
+        self._tick[rows] = 0
+        with torch.inference_mode():
+            fresh = self._start(x)
+            self._episode = _merge(self._episode, torch.from_numpy(rows), fresh)
+            observation = observation.copy()
+            observation[rows] = observe(fresh.state).numpy()
+        return observation
+
+    def _info(self, episode: Episode, mask: NDArray[np.bool_]) -> Info:
+        collided = episode.collided.numpy()
+        infos: Info = {}
+        scenario: Info = {}
+        for k, name in enumerate(self.space.names):
+            _put(scenario, name, self._x[:, k].copy(), mask)
+        _put(infos, "scenario", scenario, mask)
+        _put(infos, "x", self._x.copy(), mask)
+        _put(infos, "min_ttc", np.where(collided, 0.0, episode.danger.double().numpy()), mask)
+        _put(infos, "collision", collided.copy(), mask)
+        return infos
+
+    def _final_info(self, episode: Episode, terms: RewardTerms, done: NDArray[np.bool_]) -> Info:
+        infos = self._info(episode, done)
+        collided = episode.collided.numpy()
+        kinds = np.full(self.num_envs, None, dtype=object)
+        for row in np.flatnonzero(collided):
+            kinds[row] = collision_type(episode.state, int(row))
+        _put(infos, "reward_terms", _terms(terms, done), done)
+        _put(infos, "measure", episode.f.double().numpy(), done)
+        _put(infos, "collision_type", kinds, done & collided)
+        return infos
+
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """One (H, W, 3) image for each scenario."""
+        if self.render_mode is None or self._episode is None:
+            gym.logger.warn("Nothing to render: pass render_mode='rgb_array' to gym.make_vec and reset first.")
+            return None
+        if not self._renderers:
+            self._renderers = [Renderer(self.world.scenario.lanes, False, 10)]
+        episode, draw = self._episode, self._renderers[0].draw
+        return tuple(
+            draw(State(*(field[row : row + 1] for field in episode.state)), bool(episode.collided[row])).copy()
+            for row in range(self.num_envs)
+        )
+
+
+def _merge(old: Episode, rows: Tensor, new: Episode) -> Episode:
+    """Episodes with some rows replaced."""
+
+    def put(into: Tensor, values: Tensor) -> Tensor:
+        into = into.clone()
+        into[rows] = values
+        return into
+
+    return Episode(
+        State(*map(put, old.state, new.state)),
+        Lead(*map(put, old.lead, new.lead)),
+        put(old.danger, new.danger),
+        put(old.collided, new.collided),
+    )
+
+
+def _rows(values: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[Any]:
+    """Rows as objects, None where the mask is not set: Gymnasium's form of `final_obs`."""
+    rows = np.full(len(values), None, dtype=object)
+    for row in np.flatnonzero(mask):
+        rows[row] = values[row].copy()
+    return rows
+
+
+def _terms(terms: RewardTerms, mask: NDArray[np.bool_]) -> Info:
+    infos: Info = {}
+    for name, value in terms._asdict().items():
+        _put(infos, name, value.double().numpy(), mask)
+    return infos
+
+
+def _put(infos: Info, key: str, value: Any, mask: NDArray[np.bool_]) -> None:
+    """An entry with its mask, in Gymnasium's vector form."""
+    infos[key] = value
+    infos[f"_{key}"] = mask.copy()

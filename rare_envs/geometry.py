@@ -1,0 +1,134 @@
+"""Where vehicles are relative to each other: the lead, overlap of oriented boxes, the kind of a collision."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from rare_envs.state import LANE_WIDTH, VEHICLE_LENGTH, VEHICLE_WIDTH, State
+
+_DIAGONAL = (VEHICLE_LENGTH**2 + VEHICLE_WIDTH**2) ** 0.5
+_REACH = (LANE_WIDTH + VEHICLE_WIDTH) / 2
+"""A body at most this far [m] from a lane's centre reaches into the lane."""
+
+
+class Lead(NamedTuple):
+    """The vehicle that a follower has to mind."""
+
+    gap: Tensor
+    """Bumper to bumper along the road [m], shape (B,); inf without a lead, negative side by side."""
+    closing_speed: Tensor
+    """Follower's speed less the lead's, along the follower's heading [m/s], shape (B,); 0 without a lead."""
+
+
+def lead_of(state: State, lanes: int) -> Lead:
+    """The ego's lead: the nearest vehicle ahead whose body reaches into the ego's lane.
+
+    "Ahead" compares centres. A body reaches into a lane when its centre is within half a lane and half a vehicle of
+    the lane's centre, which for a 4 m lane is HighwayEnv's `on_lane` with its margin of 1 m.
+
+    Args:
+        state: Traffic of B scenarios.
+        lanes: Number of lanes; lane k is centred on y = 4 k.
+
+    Returns:
+        Gap and closing speed, shape (B,) each.
+    """
+    x, y = state.x[:, 0], state.y[:, 0]
+    lane_y: Tensor | float = 0.0
+    if lanes > 1:
+        lane_y = torch.round(y / LANE_WIDTH).clamp(0, lanes - 1) * LANE_WIDTH
+    nearest = torch.full_like(x, torch.inf)
+    lead_speed = state.speed[:, 0]
+    for j in range(1, state.x.shape[1]):
+        ahead = state.x[:, j] - x
+        minded = (ahead >= 0) & ((state.y[:, j] - lane_y).abs() <= _REACH) & (ahead <= nearest)
+        nearest = torch.where(minded, ahead, nearest)
+        along = state.speed[:, j] * torch.cos(state.heading[:, j] - state.heading[:, 0])
+        lead_speed = torch.where(minded, along, lead_speed)
+    return Lead(nearest - VEHICLE_LENGTH, state.speed[:, 0] - lead_speed)
+
+
+def boxes_overlap(dx: Tensor, dy: Tensor, heading: Tensor, other_heading: Tensor) -> Tensor:
+    """Whether two vehicles' bodies overlap, by the separating axis theorem on the boxes' four axes.
+
+    Args:
+        dx: Centre of the other less centre of the first [m], any shape; the other tensors have the same.
+        dy: Likewise across the road [m].
+        heading: Headings of the first [rad].
+        other_heading: Headings of the other [rad].
+
+    Returns:
+        True where the boxes share more than their edges.
+    """
+    cos, sin = torch.cos(heading), torch.sin(heading)
+    turn = other_heading - heading
+    along, across = dx * cos + dy * sin, dy * cos - dx * sin
+    cos, sin = torch.cos(turn), torch.sin(turn)
+    other_along, other_across = along * cos + across * sin, across * cos - along * sin
+    cos, sin = cos.abs(), sin.abs()
+    half_length, half_width = VEHICLE_LENGTH / 2, VEHICLE_WIDTH / 2
+    reach_along = half_length + half_length * cos + half_width * sin
+    reach_across = half_width + half_length * sin + half_width * cos
+    overlap = (along.abs() < reach_along) & (across.abs() < reach_across)
+    return overlap & (other_along.abs() < reach_along) & (other_across.abs() < reach_across)
+
+
+def ego_overlaps(state: State) -> Tensor:
+    """Which vehicles' bodies overlap the ego's.
+
+    Boxes are only compared where centres are closer than a diagonal, so the usual tick costs a comparison.
+
+    Args:
+        state: Traffic of B scenarios.
+
+    Returns:
+        Boolean, shape (B, N - 1).
+    """
+    dx = state.x[:, 1:] - state.x[:, :1]
+    dy = state.y[:, 1:] - state.y[:, :1]
+    near = (dx.abs() < _DIAGONAL) & (dy.abs() < _DIAGONAL)
+    if not bool(near.any()):
+        return near
+    row, column = near.nonzero(as_tuple=True)
+    ego, other = state.heading[row, 0], state.heading[row, column + 1]
+    near[row, column] = boxes_overlap(dx[row, column], dy[row, column], ego, other)
+    return near
+
+
+def off_road(state: State, lanes: int) -> Tensor:
+    """Whether the ego's centre is beyond the outer edge of the road.
+
+    Args:
+        state: Traffic of B scenarios.
+        lanes: Number of lanes.
+
+    Returns:
+        Boolean, shape (B,).
+    """
+    middle = (lanes - 1) * LANE_WIDTH / 2
+    return (state.y[:, 0] - middle).abs() > lanes * LANE_WIDTH / 2
+
+
+def collision_type(state: State, row: int = 0) -> str:
+    """What the ego of one scenario, in which there was a collision, has run into.
+
+    The contact is across the axis along which the bodies overlap least.
+
+    Args:
+        state: Traffic at the moment of the collision.
+        row: Which of the B scenarios.
+
+    Returns:
+        "rear_end" (the ego hits a vehicle ahead), "rear_ended" (it is hit from behind), "side" (flank to flank) or
+        "road_edge" (no vehicle, so the edge of the road).
+    """
+    hits = ego_overlaps(state)[row].nonzero().flatten().tolist()
+    if not hits:
+        return "road_edge"
+    j = hits[0] + 1
+    dx = float(state.x[row, j] - state.x[row, 0])
+    dy = float(state.y[row, j] - state.y[row, 0])
+    if VEHICLE_WIDTH - abs(dy) < VEHICLE_LENGTH - abs(dx):
+        return "side"
+    return "rear_end" if dx > 0 else "rear_ended"

@@ -1,0 +1,68 @@
+"""What an ego sees: the `features` observation."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from torch import Tensor
+
+from rare_envs.state import LANE_WIDTH, VEHICLE_LENGTH, State
+
+
+@dataclass(frozen=True)
+class Feature:
+    """One entry of the observation: the quantity divided by its scale, clipped to +-`CLIP`."""
+
+    name: str
+    unit: str
+    scale: float
+
+
+CLIP = 5.0
+"""Bound of every entry; scales are such that traffic in view stays within it."""
+EGO_FEATURES = (
+    Feature("speed", "m/s", 30.0),
+    Feature("y", "m", LANE_WIDTH),
+    Feature("heading", "rad", 0.1),
+)
+OTHER_FEATURES = (
+    Feature("gap", "m", 50.0),
+    Feature("relative_speed", "m/s", 10.0),
+    Feature("relative_y", "m", LANE_WIDTH),
+    Feature("lateral_speed", "m/s", 2.0),
+)
+"""Of each other vehicle: bumper gap along the road (negative beside or behind), its speed along the road less the
+ego's, its position across the road less the ego's, its speed across the road."""
+
+
+def observation_space(vehicles: int) -> spaces.Box:
+    """The space of `observe` for N vehicles: 3 features of the ego, then 4 of each other vehicle."""
+    size = len(EGO_FEATURES) + len(OTHER_FEATURES) * (vehicles - 1)
+    return spaces.Box(-CLIP, CLIP, (size,), np.float32)
+
+
+def observe(state: State) -> Tensor:
+    """The `features` observation of the ego.
+
+    Args:
+        state: Traffic of B scenarios with N vehicles.
+
+    Returns:
+        Shape (B, 3 + 4 (N - 1)), float32, within +-`CLIP`: the ego's features, then each other vehicle's.
+    """
+    along = state.speed * torch.cos(state.heading)
+    values = [state.speed[:, 0], state.y[:, 0], state.heading[:, 0]]
+    for j in range(1, state.x.shape[1]):
+        values += [
+            state.x[:, j] - state.x[:, 0] - VEHICLE_LENGTH,
+            along[:, j] - along[:, 0],
+            state.y[:, j] - state.y[:, 0],
+            state.speed[:, j] * torch.sin(state.heading[:, j]),
+        ]
+    return (torch.stack(values, dim=1) / _scales(state)).clamp(-CLIP, CLIP).float()
+
+
+def _scales(state: State) -> Tensor:
+    features = EGO_FEATURES + OTHER_FEATURES * (state.x.shape[1] - 1)
+    return torch.tensor([feature.scale for feature in features], dtype=state.x.dtype, device=state.x.device)

@@ -1,0 +1,141 @@
+"""DrivingProblem: a scenario and an ego as a function f(x), in the shape that samplers expect."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from rare_envs.actions import DISCRETE_ACTIONS
+from rare_envs.drivers import IDM, Driver, PolicyDriver
+from rare_envs.observation import observation_space
+from rare_envs.rollout import rollout
+from rare_envs.setup import set_up
+from rare_envs.space import Distribution, ScenarioSpace
+from rare_envs.world import World
+
+RULE_TILE = 16384
+"""Rollouts that a rule-based ego drives at once: where eager torch is fastest."""
+POLICY_TILE = 4096
+"""Likewise with a policy; fixed, because matrix products round differently by batch size."""
+
+
+class DrivingProblem:
+    """P[f(X) <= gamma] for an ego in a scenario; fits `samplers.Problem`.
+
+    f(x) is the safety measure of one rollout from scenario parameters x: -1 if the ego collides, else the least time
+    to collision [s] (capped at 10 s). It is a deterministic function of x.
+
+    Attributes:
+        env_id: The environment's id.
+        ego: What was given.
+        world: The simulation.
+        driver: The ego as a Driver.
+        space: Names, units, bounds and base distribution of x.
+    """
+
+    def __init__(
+        self,
+        env_id: str,
+        ego: Any = "idm",
+        measure: str = "ttc",
+        base: Any = None,
+        noise: bool | str = True,
+        **make_kwargs: Any,
+    ) -> None:
+        """Check everything that can be checked before a simulation.
+
+        Args:
+            env_id: For example "rare_envs/CutIn-v0".
+            ego: "idm", a `Driver`, or an object with Stable-Baselines3's `predict`, called on whole batches.
+            measure: Name of the safety measure.
+            base: Base distribution of x; None takes the environment's default ("us101").
+            noise: What becomes of a driver's own randomness: True, "fixed" or False. The drivers of this version
+                have none (policies act by their means), so the three agree.
+            **make_kwargs: Further keyword arguments of `gym.make` for this id.
+
+        Raises:
+            ValueError: If an argument is invalid or the ego's spaces are not the environment's.
+        """
+        if noise not in (True, False, "fixed"):
+            raise ValueError(f"Expected noise True, False or 'fixed', got {noise!r}.")
+        if base is not None:
+            make_kwargs["base"] = base
+        self.env_id = env_id
+        self.ego = ego
+        self.world: World
+        self.space: ScenarioSpace
+        self.world, self.space = set_up(env_id, measure=measure, **make_kwargs)
+        self.driver = as_driver(ego, self.world)
+
+    @property
+    def dim(self) -> int:
+        """Number of scenario parameters."""
+        return self.space.dim
+
+    @property
+    def base(self) -> Distribution:
+        """Distribution of x in ordinary traffic."""
+        return self.space.base
+
+    def evaluate(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Simulate.
+
+        Args:
+            x: Scenario parameters, shape (n, d).
+
+        Returns:
+            Safety measures, shape (n,).
+
+        Raises:
+            ValueError: If x has the wrong shape, is NaN or outside the physical box, or if the policy returns NaN.
+        """
+        x = self.space.validate(np.atleast_2d(x))
+        tile = POLICY_TILE if isinstance(self.driver, PolicyDriver) else RULE_TILE
+        f = np.empty(len(x))
+        with torch.inference_mode():
+            for first in range(0, len(x), tile):
+                rows = torch.from_numpy(x[first : first + tile]).float()
+                f[first : first + tile] = rollout(self.world, self.driver, rows).f.numpy()
+        return f
+
+
+def as_driver(ego: Any, world: World) -> Driver:
+    """The Driver that an ego stands for.
+
+    Raises:
+        ValueError: If it is neither "idm", nor a Driver, nor an object with `predict` whose spaces fit.
+    """
+    if isinstance(ego, str):
+        if ego == "idm":
+            return IDM()
+        raise ValueError(f"Unknown ego {ego!r}; expected 'idm' or an object with predict (files: agents.load_ego).")
+    if hasattr(ego, "act"):
+        driver: Driver = ego
+        return driver
+    if not callable(getattr(ego, "predict", None)):
+        raise ValueError(f"Expected an ego with a method predict(observation, ...), got {type(ego).__name__}.")
+    check_spaces(ego, observation_space(world.scenario.vehicles))
+    return PolicyDriver(ego)
+
+
+def check_spaces(ego: Any, expected: spaces.Box) -> None:
+    """Refuse an ego that was made for other observations or actions; one that does not tell is taken at its word.
+
+    Raises:
+        ValueError: If its `observation_space` or `action_space` does not fit.
+    """
+    observed = getattr(ego, "observation_space", None)
+    if observed is not None and getattr(observed, "shape", None) != expected.shape:
+        raise ValueError(
+            f"The ego expects observations {observed}, the environment gives {expected}; "
+            "train it in this environment or choose another observation."
+        )
+    acted = getattr(ego, "action_space", None)
+    discrete = isinstance(acted, spaces.Discrete) and int(acted.n) == len(DISCRETE_ACTIONS)
+    if acted is not None and not discrete and getattr(acted, "shape", None) != (2,):
+        raise ValueError(
+            f"The ego acts in {acted}, the environment takes Box(-1, 1, (2,)) (acceleration, steering) "
+            f"or Discrete({len(DISCRETE_ACTIONS)})."
+        )

@@ -1,0 +1,59 @@
+"""The reward that egos are trained on; estimates do not depend on it."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from rare_envs.actions import MAX_ACCELERATION, MAX_STEERING
+from rare_envs.state import LANE_WIDTH
+from rare_envs.world import Episode
+
+TARGET_SPEED = 21.72
+"""Speed [m/s] beyond which going faster earns nothing more: the desired speed of the reference IDM ego."""
+_TTC_COMFORT = 4.0
+"""Times to collision under this [s] cost."""
+
+
+class RewardTerms(NamedTuple):
+    """Terms of the reward of one tick, shape (B,) each; the reward is their sum."""
+
+    progress: Tensor
+    """Speed along the road over `TARGET_SPEED`, in 0 to 1."""
+    comfort: Tensor
+    """-0.1 (acceleration / 5 m/s^2)^2 - 0.1 (steering / 0.1 rad)^2."""
+    lane: Tensor
+    """-0.5 (offset from the centre of the nearest lane / half a lane)^2."""
+    risk: Tensor
+    """-(1 - TTC / 4 s) where the time to collision is shorter than that."""
+    collision: Tensor
+    """-30 in the tick of a collision, about what a long undisturbed drive is worth under usual discounting."""
+
+    @property
+    def total(self) -> Tensor:
+        """The reward, shape (B,)."""
+        return self.progress + self.comfort + self.lane + self.risk + self.collision
+
+
+def reward_terms(episode: Episode, action: Tensor) -> RewardTerms:
+    """Terms of the reward for arriving in `episode` by `action`.
+
+    Args:
+        episode: B episodes after the tick.
+        action: Acceleration [m/s^2] and steering [rad] of the tick, shape (B, 2).
+
+    Returns:
+        The terms, shape (B,) each.
+    """
+    state, lead = episode.state, episode.lead
+    along = state.speed[:, 0] * torch.cos(state.heading[:, 0])
+    offset = state.y[:, 0] - torch.round(state.y[:, 0] / LANE_WIDTH) * LANE_WIDTH
+    effort = action / action.new_tensor([MAX_ACCELERATION, MAX_STEERING])
+    ttc = lead.gap.clamp(min=0.0) / lead.closing_speed.clamp(min=1e-4)
+    return RewardTerms(
+        progress=(along / TARGET_SPEED).clamp(0.0, 1.0),
+        comfort=-0.1 * effort.square().sum(dim=1),
+        lane=-0.5 * (offset / (LANE_WIDTH / 2)).square(),
+        risk=-(1.0 - ttc / _TTC_COMFORT).clamp(min=0.0),
+        collision=-30.0 * episode.collided.to(along.dtype),
+    )

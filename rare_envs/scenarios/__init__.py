@@ -1,0 +1,13 @@
+"""Scenarios: what x means and how the vehicles around the ego move."""
+
+from types import MappingProxyType
+
+from rare_envs.scenarios.base import Scenario
+from rare_envs.scenarios.car_following import CAR_FOLLOWING
+from rare_envs.scenarios.cut_in import CUT_IN
+
+SCENARIOS: MappingProxyType[str, Scenario] = MappingProxyType(
+    {"rare_envs/CarFollowing-v0": CAR_FOLLOWING, "rare_envs/CutIn-v0": CUT_IN}
+)
+
+__all__ = ["CAR_FOLLOWING", "CUT_IN", "SCENARIOS", "Scenario"]

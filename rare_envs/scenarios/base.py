@@ -1,0 +1,41 @@
+"""What a scenario is: parameters, an initial state, and the motion of the vehicles around the ego."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from rare_envs.state import State
+
+
+class Others(NamedTuple):
+    """Vehicles 1 to N - 1 after a tick; shapes (B, N - 1), units as in `State`."""
+
+    x: Tensor
+    y: Tensor
+    heading: Tensor
+    speed: Tensor
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A named scenario; x of shape (B, d) has the parameters of `rare_envs.space.PARAMETERS[name]`, in their order."""
+
+    name: str
+    lanes: int
+    """Number of lanes; lane k is centred on y = 4 k."""
+    vehicles: int
+    """N, the ego included."""
+    horizon: float
+    """Default length of an episode [s]."""
+    initial: Callable[[Tensor], State]
+    """x (B, d) to the state at time 0."""
+    others: Callable[[State, float], Others]
+    """State and dt [s] to the other vehicles after the tick."""
+
+
+def columns(*values: Tensor | Sequence[Tensor]) -> Tensor:
+    """Columns (B,) side by side as (B, N), each contiguous in memory: ticks work on one vehicle's column at a time."""
+    return torch.stack(values).T

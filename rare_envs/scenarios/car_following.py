@@ -1,0 +1,29 @@
+"""Car-following: the ego behind a lead that keeps its speed (Tian et al. 2024, Fig. 3)."""
+
+import torch
+from torch import Tensor
+
+from rare_envs.scenarios.base import Others, Scenario, columns
+from rare_envs.state import VEHICLE_LENGTH, State
+
+
+def initial(x: Tensor) -> State:
+    """ego_speed, lead_speed [m/s], gap [m]; both vehicles in the middle of the one lane. theta is empty."""
+    ego_speed, lead_speed, gap = x.unbind(dim=1)
+    zero = torch.zeros_like(gap)
+    return State(
+        x=columns(zero, gap + VEHICLE_LENGTH),
+        y=columns(zero, zero),
+        heading=columns(zero, zero),
+        speed=columns(ego_speed, lead_speed),
+        theta=x[:, :0],
+    )
+
+
+def others(state: State, dt: float) -> Others:
+    """The lead keeps its speed."""
+    speed = state.speed[:, 1:]
+    return Others(state.x[:, 1:] + speed * dt, state.y[:, 1:], state.heading[:, 1:], speed)
+
+
+CAR_FOLLOWING = Scenario("car_following", lanes=1, vehicles=2, horizon=10.0, initial=initial, others=others)

@@ -1,0 +1,80 @@
+"""Cut-in: a vehicle moves into the gap between the ego and its lead along a cubic Bezier (Tian et al. 2024, Fig. 4)."""
+
+import torch
+from torch import Tensor
+
+from rare_envs.drivers import IDM
+from rare_envs.geometry import Lead
+from rare_envs.scenarios.base import Others, Scenario, columns
+from rare_envs.state import VEHICLE_LENGTH, State
+
+CUT_IN_DURATION = 4.0
+"""The lane change is as long as the way at the initial speed in this time [s] ..."""
+CUT_IN_MIN_LENGTH = 15.0
+"""... and at least this long [m]."""
+_CUTTER_IDM = IDM()
+
+
+def initial(x: Tensor) -> State:
+    """ego_speed, cut_in_speed, lead_speed [m/s], cut_in_gap (ego to cutter), lead_gap (cutter to lead), lateral_offset.
+
+    Vehicles: 0 ego, 1 cutter, 2 lead. theta columns: start of the cutter's path [m], its length [m], lateral offset
+    [m], the cutter's desired speed [m/s].
+    """
+    ego_speed, cut_in_speed, lead_speed, cut_in_gap, lead_gap, lateral_offset = x.unbind(dim=1)
+    zero = torch.zeros_like(ego_speed)
+    cutter_x = cut_in_gap + VEHICLE_LENGTH
+    length = (cut_in_speed * CUT_IN_DURATION).clamp(min=CUT_IN_MIN_LENGTH)
+    desired_speed = cut_in_speed.clamp(min=1.0)
+    return State(
+        x=columns(zero, cutter_x, cutter_x + lead_gap + VEHICLE_LENGTH),
+        y=columns(zero, lateral_offset, zero),
+        heading=columns(zero, zero, zero),
+        speed=columns(ego_speed, cut_in_speed, lead_speed),
+        theta=columns(cutter_x, length, lateral_offset, desired_speed),
+    )
+
+
+def bezier(progress: Tensor, length: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
+    """Cubic Bezier from (0, offset) to (length, 0) with both inner control points at thirds: level at both ends.
+
+    With t = progress / length it is y = offset (1 - 3 t^2 + 2 t^3), before and after it straight on.
+
+    Args:
+        progress: Way along the road since the start of the path [m], shape (B,).
+        length: Length of the path along the road [m], shape (B,).
+        offset: Lateral offset at the start [m], shape (B,).
+
+    Returns:
+        y [m] and slope dy/dx, shape (B,) each.
+    """
+    t = (progress / length).clamp(0.0, 1.0)
+    y = offset * (1.0 + t * t * (2.0 * t - 3.0))
+    slope = offset * (6.0 * t * (t - 1.0)) / length
+    return y, slope
+
+
+def others(state: State, dt: float) -> Others:
+    """The lead keeps its speed; the cutter follows its path, slows for the lead by IDM and else keeps its speed.
+
+    The released code of Tian et al. also steers the cutter along a Bezier (30 m long, by pure pursuit, with the ego's
+    IDM); ours is exactly on the curve, whose length grows with the speed, and its desired speed is its initial one.
+    """
+    start, length, offset, desired_speed = state.theta.unbind(dim=1)
+    speed, heading, lead_speed = state.speed[:, 1], state.heading[:, 1], state.speed[:, 2]
+    distance = state.x[:, 2] - state.x[:, 1]
+    cos = torch.cos(heading)
+    lead = Lead(distance - VEHICLE_LENGTH, speed - lead_speed * cos)
+    acceleration = _CUTTER_IDM.acceleration(speed, lead, desired_speed)
+    x = state.x[:, 1] + speed * cos * dt
+    y, slope = bezier(x - start, length, offset)
+    zero = torch.zeros_like(y)
+    return Others(
+        x=columns(x, state.x[:, 2] + lead_speed * dt),
+        y=columns(y, zero),
+        heading=columns(torch.atan(slope), zero),
+        speed=columns((speed + acceleration * dt).clamp(min=0.0), lead_speed),
+    )
+
+
+CUT_IN = Scenario("cut_in", lanes=2, vehicles=3, horizon=10.0, initial=initial, others=others)

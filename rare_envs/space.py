@@ -1,0 +1,353 @@
+"""Scenario parameters: names, units, ranges, and the base distribution over them.
+
+`ScenarioSpace` is what a scenario exposes as `space`; `load_base` finds the law behind it, shipped
+(`"us101"`, `"highway"`), in a JSON file of the same form, or as an object of the user's own.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from importlib import resources
+from os import PathLike
+from pathlib import Path
+from typing import Any, Protocol, cast, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from rare_envs.distributions import TruncatedGaussianMixture
+
+Array = NDArray[np.float64]
+
+BASES = ("us101", "highway")  # shipped for every scenario in PARAMETERS
+
+
+@runtime_checkable
+class Distribution(Protocol):
+    """A law on d-dimensional points with an exact map to standard normal space."""
+
+    def sample(self, n: int, rng: np.random.Generator) -> Array:
+        """Independent points, shape (n, d)."""
+
+    def log_prob(self, x: Array) -> Array:
+        """Log density, (n, d) -> (n,); -inf outside the support."""
+
+    def to_standard_normal(self, x: Array) -> Array:
+        """Map (n, d) -> (n, d) under which the law becomes N(0, I)."""
+
+    def from_standard_normal(self, u: Array) -> Array:
+        """Inverse of `to_standard_normal`, (n, d) -> (n, d)."""
+
+
+METHODS = ("sample", "log_prob", "to_standard_normal", "from_standard_normal")
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One named scenario parameter and the physical range it is allowed."""
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    meaning: str
+
+
+# Speeds: none backwards, and 45 m/s (162 km/h) is above what congested US 101 (at most 27 m/s in
+# the events) and free-flow traffic reach. Gaps: under 1 m is below IDM's standstill distance and
+# of the order of the position error of the recordings (1.2 m along the road); beyond 150 m the lead
+# no longer matters within 10 s (120 m for the gap that a vehicle cuts into: a longer one is no
+# cut-in). Lateral offset: vehicles 2 m wide with at least 0.2 m between their sides, and at most
+# one lane (4 m) plus half a metre off-centre each.
+_SPEED = ("m/s", 0.0, 45.0)
+PARAMETERS: dict[str, tuple[Parameter, ...]] = {
+    "car_following": (
+        Parameter("ego_speed", *_SPEED, "initial speed of the ego"),
+        Parameter("lead_speed", *_SPEED, "speed of the lead, which keeps it"),
+        Parameter("gap", "m", 1.0, 150.0, "initial gap from ego to lead, bumper to bumper"),
+    ),
+    "cut_in": (
+        Parameter("ego_speed", *_SPEED, "initial speed of the ego"),
+        Parameter("cut_in_speed", *_SPEED, "initial speed of the vehicle that cuts in"),
+        Parameter("lead_speed", *_SPEED, "speed of the lead in the ego's lane, which keeps it"),
+        Parameter("cut_in_gap", "m", 1.0, 120.0, "initial gap from ego to cutter along the road"),
+        Parameter("lead_gap", "m", 1.0, 150.0, "initial gap from cutter to lead along the road"),
+        Parameter("lateral_offset", "m", 2.2, 5.0, "initial distance of the centres across"),
+    ),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class ScenarioSpace:
+    """The parameters of a scenario in the order of x, and their base distribution.
+
+    Attributes:
+        names: Parameter names, length d.
+        units: Their units, length d.
+        low: Lower ends of the allowed ranges, shape (d,).
+        high: Upper ends of the allowed ranges, shape (d,).
+        base: Law of x; the methods of the same name go to it.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    low: Array
+    high: Array
+    base: Distribution
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "names", tuple(self.names))
+        object.__setattr__(self, "units", tuple(self.units))
+        for name in ("low", "high"):
+            bound = np.array(getattr(self, name), dtype=np.float64)
+            bound.setflags(write=False)
+            object.__setattr__(self, name, bound)
+        lengths = {len(self.names), len(self.units), *self.low.shape, *self.high.shape}
+        if len(lengths) != 1 or self.low.ndim != 1 or self.high.ndim != 1:
+            raise ValueError(
+                f"Expected as many names, units and bounds, got {len(self.names)} names, "
+                f"{len(self.units)} units, low {self.low.shape} and high {self.high.shape}."
+            )
+
+    @property
+    def dim(self) -> int:
+        """Number of parameters d."""
+        return len(self.names)
+
+    def sample(self, n: int, rng: np.random.Generator) -> Array:
+        """Independent scenarios from the base distribution, shape (n, d)."""
+        return self.base.sample(n, rng)
+
+    def log_prob(self, x: Array) -> Array:
+        """Log density of the base distribution, (n, d) -> (n,)."""
+        return self.base.log_prob(x)
+
+    def to_standard_normal(self, x: Array) -> Array:
+        """Map to standard normal space, (n, d) -> (n, d)."""
+        return self.base.to_standard_normal(x)
+
+    def from_standard_normal(self, u: Array) -> Array:
+        """Map from standard normal space, (n, d) -> (n, d)."""
+        return self.base.from_standard_normal(u)
+
+    def named(self, x_row: ArrayLike) -> dict[str, float]:
+        """One scenario as a mapping from names to values; x_row has shape (d,)."""
+        row = np.asarray(x_row, dtype=np.float64)
+        if row.shape != (self.dim,):
+            raise ValueError(f"Expected one scenario of shape ({self.dim},), got {row.shape}.")
+        return dict(zip(self.names, row.tolist(), strict=True))
+
+    def describe(self) -> str:
+        """All valid names with their ranges, in the order of x."""
+        return ", ".join(f"{name} {self._range(j)}" for j, name in enumerate(self.names))
+
+    def validate(self, x: ArrayLike) -> Array:
+        """Checks shape and ranges.
+
+        Args:
+            x: Scenarios, shape (n, d), or one of shape (d,).
+
+        Returns:
+            The same as float64, shape (n, d).
+
+        Raises:
+            ValueError: Wrong shape, NaN, or a value outside its range.
+        """
+        points = _as_numbers("x", x)
+        if points.ndim == 1:
+            points = points[None]
+        if points.ndim != 2 or points.shape[1] != self.dim:
+            raise ValueError(
+                f"Expected x of shape (n, {self.dim}) or ({self.dim},), got {np.shape(x)}; "
+                f"its columns are {self.describe()}."
+            )
+        for j in range(self.dim):
+            self._check_range(j, points[:, j])
+        return points
+
+    def scenario_x(
+        self, options: Mapping[str, Any] | None, n: int, rng: np.random.Generator
+    ) -> Array:
+        """Scenarios with some parameters given and the others drawn from the base distribution.
+
+        The given values replace drawn ones: the rest is not conditioned on them.
+
+        Args:
+            options: Parameter names to scalars or (n,) arrays, or {"x": (d,) or (n, d)} for all
+                of them; None draws everything.
+            n: Number of scenarios.
+            rng: Source of randomness.
+
+        Returns:
+            Scenarios, shape (n, d).
+
+        Raises:
+            ValueError: Unknown name, wrong shape, NaN, or a value outside its range.
+        """
+        options = {} if options is None else options
+        if "x" in options:
+            return self._given_x(options, n)
+        columns = {
+            self._index(name): self._column(name, value, n) for name, value in options.items()
+        }
+        points = np.array(self.base.sample(n, rng), dtype=np.float64)
+        for j, column in columns.items():
+            points[:, j] = column
+        return points
+
+    def _given_x(self, options: Mapping[str, Any], n: int) -> Array:
+        others = sorted(str(name) for name in options if name != "x")
+        if others:
+            raise ValueError(
+                f"x gives every parameter, so {', '.join(others)} cannot be given beside it."
+            )
+        points = self.validate(options["x"])
+        if len(points) not in (1, n):
+            raise ValueError(f"Expected x with 1 or {n} rows, one per scenario, got {len(points)}.")
+        return np.repeat(points, n, axis=0) if len(points) == 1 else points
+
+    def _column(self, name: str, value: Any, n: int) -> Array:
+        values = _as_numbers(name, value)
+        if values.shape not in ((), (1,), (n,)):
+            raise ValueError(
+                f"Expected {name} as one number or an array of shape ({n},), got {values.shape}."
+            )
+        self._check_range(self._index(name), np.atleast_1d(values))
+        return values
+
+    def _index(self, name: str) -> int:
+        if name in self.names:
+            return self.names.index(name)
+        raise ValueError(
+            f"Unknown scenario parameter {name!r}{did_you_mean(str(name), (*self.names, 'x'))}; "
+            f"valid are {self.describe()}, or 'x' for all of them in this order."
+        )
+
+    def _range(self, j: int) -> str:
+        return f"[{self.low[j]:g}, {self.high[j]:g}] {self.units[j]}".rstrip()
+
+    def _check_range(self, j: int, values: Array) -> None:
+        wrong = ~((values >= self.low[j]) & (values <= self.high[j]))  # True for NaN too
+        if wrong.any():
+            i = int(np.argmax(wrong))
+            row = f" (row {i})" if len(values) > 1 else ""
+            raise ValueError(
+                f"{self.names[j]} = {values[i]:.10g}{row} is outside its range {self._range(j)}; "
+                f"the parameters are {self.describe()}."
+            )
+
+
+def load_base(scenario: str, base: str | PathLike[str] | Distribution) -> Distribution:
+    """The base distribution of a scenario.
+
+    A JSON file holds what the shipped ones do: names, low, high, weights, means, covariances, and
+    if wanted units and provenance (see `TruncatedGaussianMixture`).
+
+    Args:
+        scenario: A key of PARAMETERS.
+        base: `"us101"`, `"highway"`, a path to a JSON file, or an object with the four methods of
+            `Distribution`.
+
+    Raises:
+        ValueError: There is no such scenario or file, or it does not fit the scenario.
+    """
+    if scenario not in PARAMETERS:
+        raise ValueError(
+            f"Unknown scenario {scenario!r}{did_you_mean(str(scenario), PARAMETERS)}; "
+            f"base distributions exist for {', '.join(PARAMETERS)}."
+        )
+    if not isinstance(base, str | PathLike):
+        return _checked_object(scenario, base)
+    if base in BASES:
+        shipped = resources.files("rare_envs") / "data" / f"{scenario}_{base}.json"
+        return _mixture_from_json(scenario, str(base), shipped.read_text(encoding="utf-8"))
+    path = Path(base)
+    if not path.is_file():
+        raise ValueError(
+            f"No base distribution {str(base)!r} for {scenario}"
+            f"{did_you_mean(str(base), BASES)}: neither one of {', '.join(BASES)} nor a file."
+        )
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"Cannot read the base distribution {path}: {error}.") from None
+    return _mixture_from_json(scenario, str(path), text)
+
+
+def _mixture_from_json(scenario: str, source: str, text: str) -> TruncatedGaussianMixture:
+    try:
+        data = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise ValueError(f"Base distribution {source} is not valid JSON: {error}.") from None
+    if not isinstance(data, dict):
+        raise ValueError(
+            f"Base distribution {source}: expected a JSON object, got {type(data).__name__}."
+        )
+    wanted = [p.name for p in PARAMETERS[scenario]]
+    names = data.get("names")
+    if names != wanted:
+        raise ValueError(
+            f"Base distribution {source} does not fit {scenario}: expected names {wanted} "
+            f"in this order, got {names}."
+        )
+    try:
+        mixture = TruncatedGaussianMixture.from_dict(data)
+    except ValueError as error:
+        raise ValueError(f"Base distribution {source}: {error}") from None
+    if mixture.dim != len(wanted):
+        raise ValueError(
+            f"Base distribution {source} does not fit {scenario}: expected means with "
+            f"{len(wanted)} columns, one per name, got {mixture.dim}."
+        )
+    _check_box(scenario, source, mixture)
+    return mixture
+
+
+def _check_box(scenario: str, source: str, mixture: TruncatedGaussianMixture) -> None:
+    for parameter, low, high in zip(PARAMETERS[scenario], mixture.low, mixture.high, strict=True):
+        if low < parameter.low or high > parameter.high:
+            raise ValueError(
+                f"Base distribution {source} gives {parameter.name} the range [{low:g}, {high:g}] "
+                f"{parameter.unit}; {scenario} allows [{parameter.low:g}, {parameter.high:g}]."
+            )
+
+
+def _checked_object(scenario: str, base: object) -> Distribution:
+    missing = [name for name in METHODS if not callable(getattr(base, name, None))]
+    if missing:
+        raise ValueError(
+            f"A base distribution must be one of {', '.join(BASES)}, a path to a JSON file, or an "
+            f"object with {', '.join(METHODS)}; got {type(base).__name__} without "
+            f"{', '.join(missing)}."
+        )
+    law = cast(Distribution, base)
+    names = [p.name for p in PARAMETERS[scenario]]
+    shape = np.shape(law.sample(1, np.random.default_rng(0)))
+    if shape != (1, len(names)):
+        raise ValueError(
+            f"Base distribution {type(base).__name__} does not fit {scenario}: sample(1, rng) must "
+            f"have shape (1, {len(names)}), one column for each of {', '.join(names)}; got {shape}."
+        )
+    return law
+
+
+def did_you_mean(name: str, valid: Iterable[str]) -> str:
+    """`" (did you mean 'x'?)"` for the nearest valid name, empty if none is near."""
+    near = difflib.get_close_matches(name, list(valid), n=1)
+    return f" (did you mean {near[0]!r}?)" if near else ""
+
+
+def _as_numbers(name: str, value: Any) -> Array:
+    """Float64 array of any shape; text, booleans and ragged lists are refused."""
+    try:
+        raw = np.asarray(value)
+        if raw.dtype.kind not in "iuf":
+            raise TypeError
+        return raw.astype(np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(
+            f"{name} must be a number or an array of numbers, got {value!r}."
+        ) from None

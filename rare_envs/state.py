@@ -1,0 +1,31 @@
+"""The state of B traffic scenarios with N vehicles each."""
+
+from typing import NamedTuple
+
+from torch import Tensor
+
+VEHICLE_LENGTH = 5.0
+"""Length of every vehicle [m], HighwayEnv's."""
+VEHICLE_WIDTH = 2.0
+"""Width of every vehicle [m], HighwayEnv's."""
+LANE_WIDTH = 4.0
+"""Lane width [m], HighwayEnv's."""
+
+
+class State(NamedTuple):
+    """Traffic of B scenarios with N vehicles; vehicle 0 is the ego.
+
+    The frame is HighwayEnv's: x along the road, y across it and positive to the right, the ego's first lane centred
+    on y = 0. Tensors are updated by `_replace`, never in place.
+    """
+
+    x: Tensor
+    """Centres along the road [m], shape (B, N)."""
+    y: Tensor
+    """Centres across the road [m], shape (B, N)."""
+    heading: Tensor
+    """Headings relative to the road [rad], shape (B, N)."""
+    speed: Tensor
+    """Speeds along the headings [m/s], never negative, shape (B, N)."""
+    theta: Tensor
+    """What the scenario fixes for the whole episode, shape (B, P); the scenario says what the P columns are."""
