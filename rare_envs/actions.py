@@ -15,7 +15,7 @@ DISCRETE_ACTIONS = np.array([[-1.0, 0.0], [-0.4, 0.0], [0.0, 0.0], [0.2, 0.0], [
 """For algorithms with discrete actions: row k is the continuous action of index k (-5, -2, 0, 1, 2 m/s^2, straight)."""
 
 
-def action_space() -> spaces.Box:
+def action_space() -> "spaces.Box[np.float32]":
     """The continuous action: acceleration and steering, each in [-1, 1]."""
     return spaces.Box(-1.0, 1.0, (2,), np.float32)
 

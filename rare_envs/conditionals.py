@@ -111,9 +111,7 @@ class _Search(NamedTuple):
 
     def take(self, keep: NDArray[np.intp]) -> _Search:
         law = self.law
-        part = Conditional(
-            law.log_weights[:, keep], law.mean[:, keep], law.scale, law.low[keep], law.high[keep]
-        )
+        part = Conditional(law.log_weights[:, keep], law.mean[:, keep], law.scale, law.low[keep], law.high[keep])
         columns = (self.log_cdf_low[:, keep], self.log_sf_low[:, keep])
         return _Search(part, *columns, *(array[keep] for array in self[3:]))
 

@@ -282,10 +282,7 @@ def _check_shapes(weights: Array, means: Array, covariances: Array, *bounds: Arr
     wanted = {"weights": (k,), "covariances": (k, d, d), "low": (d,), "high": (d,)}
     for (name, shape), array in zip(wanted.items(), (weights, covariances, *bounds), strict=True):
         if array.shape != shape:
-            raise ValueError(
-                f"Expected {name} of shape {shape} to go with means {means.shape}, "
-                f"got {array.shape}."
-            )
+            raise ValueError(f"Expected {name} of shape {shape} to go with means {means.shape}, got {array.shape}.")
 
 
 def _check_values(weights: Array, low: Array, high: Array) -> None:
@@ -295,9 +292,7 @@ def _check_values(weights: Array, low: Array, high: Array) -> None:
         raise ValueError(f"weights must sum to 1, got {weights.sum():.12g}.")
     if (low >= high).any():
         j = int(np.argmax(low >= high))
-        raise ValueError(
-            f"low must be below high, got [{low[j]:g}, {high[j]:g}] at coordinate {j}."
-        )
+        raise ValueError(f"low must be below high, got [{low[j]:g}, {high[j]:g}] at coordinate {j}.")
 
 
 def _cholesky(covariances: Array) -> Array:
@@ -306,9 +301,7 @@ def _cholesky(covariances: Array) -> Array:
             raise ValueError(f"covariances[{k}] is not symmetric.")
         smallest = float(np.linalg.eigvalsh(covariance)[0])
         if smallest <= 0.0:
-            raise ValueError(
-                f"covariances[{k}] is not positive definite: smallest eigenvalue {smallest:g}."
-            )
+            raise ValueError(f"covariances[{k}] is not positive definite: smallest eigenvalue {smallest:g}.")
     try:
         return np.asarray(np.linalg.cholesky(covariances), dtype=np.float64)
     except np.linalg.LinAlgError:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from rare_envs.actions import to_physical
 from rare_envs.geometry import Lead
+from rare_envs.observation import observe
 from rare_envs.state import LANE_WIDTH, VEHICLE_LENGTH, State
 
 _NEAR_ZERO = 0.01
@@ -18,13 +19,12 @@ _NEAR_ZERO = 0.01
 class Driver(Protocol):
     """An ego. Its memory, if it has any, goes in and out, so that one driver serves any number of rollouts."""
 
-    def act(self, state: State, lead: Lead, observation: Any, memory: Any) -> tuple[Tensor, Any]:
+    def act(self, state: State, lead: Lead, memory: Any) -> tuple[Tensor, Any]:
         """Decide for one tick.
 
         Args:
             state: Traffic of B scenarios.
             lead: The ego's lead.
-            observation: Callable without arguments that gives the (B, F) observation; called only when needed.
             memory: What the last call returned, None at the start.
 
         Returns:
@@ -84,14 +84,14 @@ class IDM:
         closing_gain = 0.5 / (self.max_acceleration * self.comfortable_deceleration) ** 0.5
         wanted = self.jam_distance + speed * (self.time_headway + lead.closing_speed * closing_gain)
         if self.jam_distance_speed:
-            wanted = wanted + self.jam_distance_speed * ratio.clamp(min=1e-9).sqrt()
+            wanted = wanted + self.jam_distance_speed * ratio.clamp(min=1e-24).sqrt()  # a finite slope at standstill
         crowding = wanted / (lead.gap + self.added_length).clamp(min=_NEAR_ZERO)
         free = ratio.square().square() if self.exponent == 4.0 else ratio.pow(self.exponent)
-        acceleration = self.max_acceleration * (1.0 - free - crowding.square())
+        acceleration: Tensor = self.max_acceleration * (1.0 - free - crowding.square())
         return acceleration.clamp(min=-self.max_deceleration)
 
-    def act(self, state: State, lead: Lead, observation: Any, memory: Any) -> tuple[Tensor, Any]:
-        """IDM behind the lead, lane keeping across; needs no observation and no memory."""
+    def act(self, state: State, lead: Lead, memory: Any) -> tuple[Tensor, Any]:
+        """IDM behind the lead, lane keeping across; no memory."""
         speed = state.speed[:, 0]
         steering = lane_keeping(state.y[:, 0], state.heading[:, 0], speed)
         return torch.stack((self.acceleration(speed, lead), steering), dim=1), memory
@@ -124,8 +124,8 @@ class PolicyDriver:
 
     policy: Any
 
-    def act(self, state: State, lead: Lead, observation: Any, memory: Any) -> tuple[Tensor, Any]:
-        """Ask the policy; the observation is NumPy, as SB3 wants it.
+    def act(self, state: State, lead: Lead, memory: Any) -> tuple[Tensor, Any]:
+        """Observe, and ask the policy for its mean action; a recurrent policy's hidden state is the memory.
 
         Raises:
             ValueError: If the policy's actions are not finite or have the wrong shape.
@@ -133,8 +133,7 @@ class PolicyDriver:
         batch = state.x.shape[0]
         start = np.full(batch, memory is None)
         hidden = None if memory is None else memory[0]
-        action, hidden = self.policy.predict(
-            observation().numpy(force=True), state=hidden, episode_start=start, deterministic=True
-        )
+        observation = observe(state).numpy(force=True)
+        action, hidden = self.policy.predict(observation, state=hidden, episode_start=start, deterministic=True)
         physical = to_physical(torch.as_tensor(np.asarray(action)), batch)
         return physical.to(state.x), (hidden,)

@@ -87,7 +87,7 @@ def ego_overlaps(state: State) -> Tensor:
     """
     dx = state.x[:, 1:] - state.x[:, :1]
     dy = state.y[:, 1:] - state.y[:, :1]
-    near = (dx.abs() < _DIAGONAL) & (dy.abs() < _DIAGONAL)
+    near: Tensor = (dx.abs() < _DIAGONAL) & (dy.abs() < _DIAGONAL)
     if not bool(near.any()):
         return near
     row, column = near.nonzero(as_tuple=True)
@@ -107,7 +107,8 @@ def off_road(state: State, lanes: int) -> Tensor:
         Boolean, shape (B,).
     """
     middle = (lanes - 1) * LANE_WIDTH / 2
-    return (state.y[:, 0] - middle).abs() > lanes * LANE_WIDTH / 2
+    beyond: Tensor = (state.y[:, 0] - middle).abs() > lanes * LANE_WIDTH / 2
+    return beyond
 
 
 def collision_type(state: State, row: int = 0) -> str:

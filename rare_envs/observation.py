@@ -36,7 +36,7 @@ OTHER_FEATURES = (
 ego's, its position across the road less the ego's, its speed across the road."""
 
 
-def observation_space(vehicles: int) -> spaces.Box:
+def observation_space(vehicles: int) -> "spaces.Box[np.float32]":
     """The space of `observe` for N vehicles: 3 features of the ego, then 4 of each other vehicle."""
     size = len(EGO_FEATURES) + len(OTHER_FEATURES) * (vehicles - 1)
     return spaces.Box(-CLIP, CLIP, (size,), np.float32)

@@ -120,7 +120,7 @@ def as_driver(ego: Any, world: World) -> Driver:
     return PolicyDriver(ego)
 
 
-def check_spaces(ego: Any, expected: spaces.Box) -> None:
+def check_spaces(ego: Any, expected: "spaces.Box[np.float32]") -> None:
     """Refuse an ego that was made for other observations or actions; one that does not tell is taken at its word.
 
     Raises:

@@ -1,9 +1,9 @@
 """The one time loop."""
 
-from rare_envs.drivers import Driver
-from rare_envs.observation import observe
-from rare_envs.world import Episode, World
 from torch import Tensor
+
+from rare_envs.drivers import Driver
+from rare_envs.world import Episode, World
 
 
 def rollout(world: World, driver: Driver, x: Tensor) -> Episode:
@@ -20,6 +20,6 @@ def rollout(world: World, driver: Driver, x: Tensor) -> Episode:
     """
     episode, memory = world.start(x), None
     for _ in range(world.ticks):
-        action, memory = driver.act(episode.state, episode.lead, lambda: observe(episode.state), memory)
+        action, memory = driver.act(episode.state, episode.lead, memory)
         episode = world.step(episode, action)
     return episode

@@ -168,9 +168,7 @@ class ScenarioSpace:
             self._check_range(j, points[:, j])
         return points
 
-    def scenario_x(
-        self, options: Mapping[str, Any] | None, n: int, rng: np.random.Generator
-    ) -> Array:
+    def scenario_x(self, options: Mapping[str, Any] | None, n: int, rng: np.random.Generator) -> Array:
         """Scenarios with some parameters given and the others drawn from the base distribution.
 
         The given values replace drawn ones: the rest is not conditioned on them.
@@ -190,9 +188,7 @@ class ScenarioSpace:
         options = {} if options is None else options
         if "x" in options:
             return self._given_x(options, n)
-        columns = {
-            self._index(name): self._column(name, value, n) for name, value in options.items()
-        }
+        columns = {self._index(name): self._column(name, value, n) for name, value in options.items()}
         points = np.array(self.base.sample(n, rng), dtype=np.float64)
         for j, column in columns.items():
             points[:, j] = column
@@ -201,9 +197,7 @@ class ScenarioSpace:
     def _given_x(self, options: Mapping[str, Any], n: int) -> Array:
         others = sorted(str(name) for name in options if name != "x")
         if others:
-            raise ValueError(
-                f"x gives every parameter, so {', '.join(others)} cannot be given beside it."
-            )
+            raise ValueError(f"x gives every parameter, so {', '.join(others)} cannot be given beside it.")
         points = self.validate(options["x"])
         if len(points) not in (1, n):
             raise ValueError(f"Expected x with 1 or {n} rows, one per scenario, got {len(points)}.")
@@ -212,9 +206,7 @@ class ScenarioSpace:
     def _column(self, name: str, value: Any, n: int) -> Array:
         values = _as_numbers(name, value)
         if values.shape not in ((), (1,), (n,)):
-            raise ValueError(
-                f"Expected {name} as one number or an array of shape ({n},), got {values.shape}."
-            )
+            raise ValueError(f"Expected {name} as one number or an array of shape ({n},), got {values.shape}.")
         self._check_range(self._index(name), np.atleast_1d(values))
         return values
 
@@ -283,15 +275,12 @@ def _mixture_from_json(scenario: str, source: str, text: str) -> TruncatedGaussi
     except json.JSONDecodeError as error:
         raise ValueError(f"Base distribution {source} is not valid JSON: {error}.") from None
     if not isinstance(data, dict):
-        raise ValueError(
-            f"Base distribution {source}: expected a JSON object, got {type(data).__name__}."
-        )
+        raise ValueError(f"Base distribution {source}: expected a JSON object, got {type(data).__name__}.")
     wanted = [p.name for p in PARAMETERS[scenario]]
     names = data.get("names")
     if names != wanted:
         raise ValueError(
-            f"Base distribution {source} does not fit {scenario}: expected names {wanted} "
-            f"in this order, got {names}."
+            f"Base distribution {source} does not fit {scenario}: expected names {wanted} in this order, got {names}."
         )
     try:
         mixture = TruncatedGaussianMixture.from_dict(data)
@@ -348,6 +337,4 @@ def _as_numbers(name: str, value: Any) -> Array:
             raise TypeError
         return raw.astype(np.float64)
     except (TypeError, ValueError):
-        raise ValueError(
-            f"{name} must be a number or an array of numbers, got {value!r}."
-        ) from None
+        raise ValueError(f"{name} must be a number or an array of numbers, got {value!r}.") from None

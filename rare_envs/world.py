@@ -92,8 +92,7 @@ class World:
         ego = (old.x[:, 0], old.y[:, 0], old.heading[:, 0], old.speed[:, 0])
         moved = bicycle(*ego, action[:, 0], action[:, 1], dt)
         x, y, heading, speed = (
-            torch.cat((first[None], rest.T)).T
-            for first, rest in zip(moved, self.scenario.others(old, dt), strict=True)
+            torch.cat((first[None], rest.T)).T for first, rest in zip(moved, self.scenario.others(old, dt), strict=True)
         )
         state = State(x, y, heading, speed, old.theta)
         lead = lead_of(state, lanes)

@@ -115,7 +115,7 @@ class DrivingEnv(gym.Env[Observation, NDArray[np.float32]]):
         if self.render_mode == "human":
             self.render()
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> NDArray[np.uint8] | None:
         """Draw the road with HighwayEnv's graphics: an (H, W, 3) image for "rgb_array", a window for "human"."""
         if self.render_mode is None or self._episode is None:
             gym.logger.warn("Nothing to render: pass render_mode='rgb_array' or 'human' to gym.make and reset first.")

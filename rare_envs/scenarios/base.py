@@ -1,6 +1,6 @@
 """What a scenario is: parameters, an initial state, and the motion of the vehicles around the ego."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -36,6 +36,6 @@ class Scenario:
     """State and dt [s] to the other vehicles after the tick."""
 
 
-def columns(*values: Tensor | Sequence[Tensor]) -> Tensor:
+def columns(*values: Tensor) -> Tensor:
     """Columns (B,) side by side as (B, N), each contiguous in memory: ticks work on one vehicle's column at a time."""
     return torch.stack(values).T

@@ -1,0 +1,1 @@
+"""Scripts that measure, one question each; run them as `python -m benchmarks.NAME`."""

@@ -1,0 +1,244 @@
+"""Env, VectorEnv and rollout: conformance with Gymnasium and Stable-Baselines3, and agreement with each other."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from numpy.typing import NDArray
+from stable_baselines3.common.env_checker import check_env as sb3_check_env
+
+import rare_envs
+from rare_envs.actions import DISCRETE_ACTIONS, to_physical
+from rare_envs.drivers import IDM
+from rare_envs.envs.vector import DrivingVectorEnv
+from rare_envs.observation import CLIP, observation_space
+
+ENV_IDS = rare_envs.ENV_IDS
+ids = pytest.mark.parametrize("env_id", ENV_IDS)
+
+
+class Scripted:
+    """An ego with SB3's `predict`: a fixed sequence of actions, then the last one for ever."""
+
+    def __init__(self, actions: NDArray[np.float32]) -> None:
+        self.actions = actions
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> Any:
+        tick = 0 if state is None else state[0]
+        action = self.actions[min(tick, len(self.actions) - 1)]
+        return np.repeat(action[None], len(observation), axis=0), (tick + 1,)
+
+
+def scripted_actions(seed: int = 0) -> NDArray[np.float32]:
+    rng = np.random.default_rng(seed)
+    return np.stack([rng.uniform(-0.7, 1.0, 100), rng.uniform(-0.05, 0.05, 100)], axis=1).astype(np.float32)
+
+
+def idm_action(env: Any) -> NDArray[np.float32]:
+    """The IDM ego's action, as an agent of the environment would give it (accelerations are within +-5 m/s^2)."""
+    episode = env.unwrapped._episode
+    physical = IDM().act(episode.state, episode.lead, None)[0][0]
+    return (physical / torch.tensor([5.0, 0.1])).numpy()
+
+
+@ids
+def test_gymnasium_checker(env_id: str) -> None:
+    check_env(gym.make(env_id).unwrapped, skip_render_check=True)
+
+
+@ids
+def test_stable_baselines3_checker(env_id: str) -> None:
+    sb3_check_env(gym.make(env_id))
+
+
+@ids
+def test_render_is_a_picture_of_all_vehicles(env_id: str) -> None:
+    env = gym.make(env_id, render_mode="rgb_array")
+    env.reset(seed=0)
+    image = env.render()
+    assert isinstance(image, np.ndarray)
+    assert (image.shape, image.dtype) == ((160, 800, 3), np.uint8)
+    colours = {tuple(c) for c in image.reshape(-1, 3).tolist()}
+    assert {(50, 200, 0), (100, 200, 255)} <= colours  # HighwayEnv's green ego, blue others
+    env.close()
+
+
+@ids
+def test_env_and_rollout_agree_bit_for_bit_with_a_rule_based_ego(env_id: str) -> None:
+    problem = rare_envs.DrivingProblem(env_id)
+    x = problem.base.sample(2_000, np.random.default_rng(5))
+    f = problem.evaluate(x)
+    env = gym.make(env_id)
+    low = np.argsort(f)[[0, 1, 2, 5, 20, 100]]
+    for row in [*low, 0]:
+        env.reset(options={"x": x[row]})
+        done = False
+        while not done:
+            # the physical action, not its float32 image in [-1, 1], which rounds
+            episode = env.unwrapped._episode  # type: ignore[attr-defined]
+            action = IDM().act(episode.state, episode.lead, None)[0]
+            env.unwrapped._episode = env.unwrapped.world.step(episode, action)  # type: ignore[attr-defined]
+            env.unwrapped._tick += 1  # type: ignore[attr-defined]
+            done = bool(env.unwrapped._episode.collided) or env.unwrapped._tick == env.unwrapped.world.ticks  # type: ignore[attr-defined]
+        assert float(env.unwrapped._episode.f) == f[row]  # type: ignore[attr-defined]
+
+
+@ids
+def test_env_vector_env_and_rollout_agree_on_the_same_x_and_actions(env_id: str) -> None:
+    actions = scripted_actions()
+    problem = rare_envs.DrivingProblem(env_id, ego=Scripted(actions))
+    x = problem.base.sample(64, np.random.default_rng(1))
+    f = problem.evaluate(x)
+    assert (f == -1.0).any()
+    assert (f > 0.0).any()
+
+    batch = rare_envs.make_batch(env_id, len(x))
+    batch.reset(options={"x": x})
+    measured = np.full(len(x), np.nan)
+    observations = []
+    for action in actions:
+        observation, reward, terminated, truncated, infos = batch.step(np.repeat(action[None], len(x), axis=0))
+        observations.append((observation, reward, infos))
+        first = (terminated | truncated) & np.isnan(measured)
+        measured[first] = infos["final_info"]["measure"][first] if first.any() else np.nan
+    np.testing.assert_array_equal(measured, f)
+
+    env = gym.make(env_id)
+    for row in range(8):
+        env.reset(options={"x": x[row]})
+        for tick, action in enumerate(actions):
+            observation, reward, terminated, truncated, info = env.step(action)
+            if terminated or truncated:
+                assert info["measure"] == f[row]
+                assert info["collision"] == (f[row] == -1.0) == terminated
+                np.testing.assert_array_equal(observation, observations[tick][2]["final_obs"][row])
+                break
+            np.testing.assert_array_equal(observation, observations[tick][0][row])
+            assert reward == pytest.approx(observations[tick][1][row], rel=1e-6)
+            assert info["min_ttc"] == observations[tick][2]["min_ttc"][row]
+
+
+@ids
+def test_a_row_does_not_depend_on_its_batch(env_id: str) -> None:
+    problem = rare_envs.DrivingProblem(env_id)
+    x = problem.base.sample(300, np.random.default_rng(2))
+    f = problem.evaluate(x)
+    for n in (1, 7, 33):
+        np.testing.assert_array_equal(problem.evaluate(x[:n]), f[:n])
+    np.testing.assert_array_equal(problem.evaluate(x[::-1])[::-1], f)
+
+
+@ids
+def test_info_at_start_and_end(env_id: str) -> None:
+    env = gym.make(env_id)
+    _, info = env.reset(seed=3)
+    space = env.unwrapped.space  # type: ignore[attr-defined]
+    assert info["scenario"] == dict(zip(space.names, info["x"].tolist(), strict=True))
+    assert not {"measure", "collision_type"} & info.keys()
+    done = False
+    while not done:
+        _, reward, terminated, truncated, info = env.step(np.array([1.0, 0.0], np.float32))
+        assert reward == pytest.approx(sum(info["reward_terms"].values()), rel=1e-5)
+        done = terminated or truncated
+    assert {"scenario", "x", "min_ttc", "collision", "measure", "collision_type"} <= info.keys()
+    assert terminated  # full throttle runs into the lead
+    assert (info["measure"], info["min_ttc"]) == (-1.0, 0.0)
+    assert info["collision_type"] in ("rear_end", "side")
+
+
+@ids
+def test_reset_options(env_id: str) -> None:
+    env = gym.make(env_id)
+    name = env.unwrapped.space.names[0]  # type: ignore[attr-defined]
+    _, free = env.reset(seed=11)
+    _, given = env.reset(seed=11, options={name: 12.5})
+    assert given["scenario"][name] == 12.5
+    assert np.array_equal(given["x"][1:], free["x"][1:])  # the others are drawn as without the option
+    _, again = env.reset(options={"x": free["x"]})
+    np.testing.assert_array_equal(again["x"], free["x"])
+    with pytest.raises(ValueError, match=rf"{name}.*range.*m/s"):
+        env.reset(options={name: -1.0})
+    with pytest.raises(ValueError, match=rf"did you mean '{name}'"):
+        env.reset(options={f"{name}_": 12.5})
+    with pytest.raises(ValueError, match=name):
+        env.reset(options={name: float("nan")})
+    with pytest.raises(ValueError, match="shape"):
+        env.reset(options={"x": [1.0, 2.0]})
+
+
+@ids
+def test_same_seed_same_episodes(env_id: str) -> None:
+    runs = []
+    for _ in range(2):
+        batch = rare_envs.make_batch(env_id, 16)
+        observation, _ = batch.reset(seed=4)
+        rows = [observation]
+        batch.action_space.seed(0)
+        for _ in range(150):
+            rows.append(batch.step(batch.action_space.sample())[0])
+        runs.append(np.array(rows))
+    np.testing.assert_array_equal(*runs)
+
+
+@ids
+def test_vector_env_replaces_ended_episodes_in_the_same_step(env_id: str) -> None:
+    batch = gym.make_vec(env_id, num_envs=32)  # the batched entry point is the default
+    assert isinstance(batch.unwrapped, DrivingVectorEnv)
+    assert batch.metadata["autoreset_mode"] == gym.vector.AutoresetMode.SAME_STEP
+    batch.reset(seed=0)
+    ended = 0
+    for _ in range(120):
+        x = batch.unwrapped._x.copy()
+        observation, _, terminated, truncated, infos = batch.step(np.tile(np.array([0.4, 0.0], np.float32), (32, 1)))
+        done = terminated | truncated
+        assert observation in batch.observation_space
+        np.testing.assert_array_equal((batch.unwrapped._x != x).any(axis=1), done)
+        if done.any():
+            np.testing.assert_array_equal(infos["_final_info"], done)
+            assert [row is not None for row in infos["final_obs"]] == done.tolist()
+            np.testing.assert_array_equal(infos["final_info"]["collision"][done], terminated[done])
+            np.testing.assert_array_equal(infos["final_info"]["x"][done], x[done])
+            ended += int(done.sum())
+    assert ended >= 32
+
+
+def test_observation_by_hand() -> None:
+    env = gym.make("rare_envs/CutIn-v0")
+    x = [20.0, 15.0, 18.0, 10.0, 30.0, 3.6]
+    observation, _ = env.reset(options={"x": x})
+    cutter, lead = [10 / 50, -5 / 10, 3.6 / 4, 0.0], [45 / 50, -2 / 10, 0.0, 0.0]
+    np.testing.assert_allclose(observation, [20 / 30, 0.0, 0.0, *cutter, *lead], rtol=1e-6)
+    assert np.abs(observation).max() < CLIP
+    assert observation_space(3).shape == (11,)
+
+
+def test_actions() -> None:
+    physical = to_physical(torch.tensor([[0.5, -1.0], [-3.0, 0.0]]), 2)
+    torch.testing.assert_close(physical, torch.tensor([[2.5, -0.1], [-5.0, 0.0]]))
+    torch.testing.assert_close(to_physical(torch.tensor([0, 4]), 2), torch.tensor([[-5.0, 0.0], [2.0, 0.0]]))
+    assert len(DISCRETE_ACTIONS) == 5
+    for wrong in (torch.tensor([5]), torch.tensor([[1, 0, 0]]), torch.tensor([[float("nan"), 0.0]])):
+        with pytest.raises(ValueError, match=r"action"):
+            to_physical(wrong, 1)
+
+
+def test_bad_arguments_are_refused_at_the_door() -> None:
+    for kwargs in (
+        {"observation": "features2"},
+        {"action": "meta"},
+        {"measure": "tcc"},
+        {"base": "us102"},
+        {"horizon": -1.0},
+        {"render_mode": "ansi"},
+    ):
+        with pytest.raises(ValueError, match=r"[Ee]xpected|Unknown|No base"):
+            rare_envs.envs.single.DrivingEnv("rare_envs/CutIn-v0", **kwargs)  # type: ignore[attr-defined]
+    with pytest.raises(ValueError, match="did you mean 'rare_envs/CutIn-v0'"):
+        rare_envs.make_batch("rare_envs/CutInn-v0", 4)
+    with pytest.raises(ValueError, match="num_envs"):
+        rare_envs.make_batch("rare_envs/CutIn-v0", 0)
