@@ -111,13 +111,13 @@ def as_driver(ego: Any, world: World) -> Driver:
         if ego == "idm":
             return IDM()
         raise ValueError(f"Unknown ego {ego!r}; expected 'idm' or an object with predict (files: agents.load_ego).")
-    if hasattr(ego, "act"):
+    if callable(getattr(ego, "predict", None)):
+        check_spaces(ego, observation_space(world.scenario.vehicles))
+        return PolicyDriver(ego)
+    if callable(getattr(ego, "act", None)):
         driver: Driver = ego
         return driver
-    if not callable(getattr(ego, "predict", None)):
-        raise ValueError(f"Expected an ego with a method predict(observation, ...), got {type(ego).__name__}.")
-    check_spaces(ego, observation_space(world.scenario.vehicles))
-    return PolicyDriver(ego)
+    raise ValueError(f"Expected an ego with a method predict(observation, ...), got {type(ego).__name__}.")
 
 
 def check_spaces(ego: Any, expected: "spaces.Box[np.float32]") -> None:

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from rare_envs.distributions import TruncatedGaussianMixture
+from rare_envs.log_mixture import LogMixture
 
 Array = NDArray[np.float64]
 
@@ -236,7 +237,7 @@ def load_base(scenario: str, base: str | PathLike[str] | Distribution) -> Distri
     """The base distribution of a scenario.
 
     A JSON file holds what the shipped ones do: names, low, high, weights, means, covariances, and
-    if wanted units and provenance (see `TruncatedGaussianMixture`).
+    if wanted units, provenance (see `TruncatedGaussianMixture`) and logarithmic (see `LogMixture`).
 
     Args:
         scenario: A key of PARAMETERS.
@@ -269,7 +270,7 @@ def load_base(scenario: str, base: str | PathLike[str] | Distribution) -> Distri
     return _mixture_from_json(scenario, str(path), text)
 
 
-def _mixture_from_json(scenario: str, source: str, text: str) -> TruncatedGaussianMixture:
+def _mixture_from_json(scenario: str, source: str, text: str) -> TruncatedGaussianMixture | LogMixture:
     try:
         data = json.loads(text)
     except json.JSONDecodeError as error:
@@ -283,7 +284,8 @@ def _mixture_from_json(scenario: str, source: str, text: str) -> TruncatedGaussi
             f"Base distribution {source} does not fit {scenario}: expected names {wanted} in this order, got {names}."
         )
     try:
-        mixture = TruncatedGaussianMixture.from_dict(data)
+        law = LogMixture if data.get("logarithmic") else TruncatedGaussianMixture
+        mixture = law.from_dict(data)
     except ValueError as error:
         raise ValueError(f"Base distribution {source}: {error}") from None
     if mixture.dim != len(wanted):
@@ -295,7 +297,7 @@ def _mixture_from_json(scenario: str, source: str, text: str) -> TruncatedGaussi
     return mixture
 
 
-def _check_box(scenario: str, source: str, mixture: TruncatedGaussianMixture) -> None:
+def _check_box(scenario: str, source: str, mixture: TruncatedGaussianMixture | LogMixture) -> None:
     for parameter, low, high in zip(PARAMETERS[scenario], mixture.low, mixture.high, strict=True):
         if low < parameter.low or high > parameter.high:
             raise ValueError(
@@ -325,8 +327,10 @@ def _checked_object(scenario: str, base: object) -> Distribution:
 
 def did_you_mean(name: str, valid: Iterable[str]) -> str:
     """`" (did you mean 'x'?)"` for the nearest valid name, empty if none is near."""
-    near = difflib.get_close_matches(name, list(valid), n=1)
-    return f" (did you mean {near[0]!r}?)" if near else ""
+    names = {v: v for v in valid}
+    names |= {v.split("/")[-1]: v for v in names}  # an id without its namespace
+    near = difflib.get_close_matches(name, list(names), n=1)
+    return f" (did you mean {names[near[0]]!r}?)" if near else ""
 
 
 def _as_numbers(name: str, value: Any) -> Array:

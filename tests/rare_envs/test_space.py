@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from rare_envs.distributions import TruncatedGaussianMixture
+from rare_envs.log_mixture import LogMixture
 from rare_envs.space import BASES, PARAMETERS, Distribution, ScenarioSpace, load_base
 
 NAMES = [p.name for p in PARAMETERS["cut_in"]]
@@ -113,7 +114,7 @@ def test_space_checks_its_own_lengths():
 
 def shipped_dict(scenario="car_following"):
     law = load_base(scenario, "us101")
-    assert isinstance(law, TruncatedGaussianMixture)
+    assert isinstance(law, TruncatedGaussianMixture | LogMixture)
     return {"names": [p.name for p in PARAMETERS[scenario]], **law.to_dict()}
 
 

@@ -1,0 +1,62 @@
+# `make demo` and `make test` need nothing but Python >= 3.10, git and make: each makes .venv and installs into it.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+# Errors only; byte code is compiled when it is first used, which is less of it and later.
+PIP := $(BIN)/python -m pip --disable-pip-version-check -qq
+INSTALL := $(PIP) install --no-compile
+# torch comes first and alone, so that nothing that depends on it chooses another build. TORCH_ARGS is for pip:
+# the index of PyTorch's CPU builds, say, which are a tenth of the size of the CUDA builds.
+TORCH := $(shell grep '^torch==' constraints.txt)
+TORCH_ARGS ?=
+TOO_OLD := import sys; sys.exit(sys.version_info < (3, 10) and "Rare Envs needs Python 3.10 or later; \
+this one is " + sys.version.split()[0] + ". Name another: make PYTHON=/path/to/python3.11")
+PACKAGES := agents rare_envs samplers training
+SOURCES := $(PACKAGES) tests benchmarks examples
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test test-slow lint type format bench clean
+
+help:  ## Show this list.
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1|\2/p' $(MAKEFILE_LIST) | column -t -s '|'
+
+demo: $(VENV)/.installed  ## Train a small PPO ego and estimate how often it collides.
+	@$(BIN)/python examples/demo.py
+
+test: $(VENV)/.installed  ## Run the tests (about a minute after installation).
+	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest
+
+test-slow: $(VENV)/.installed  ## Run the repeated-seed studies too.
+	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "not gpu"
+
+lint: $(VENV)/.developer  ## Check style and spelling.
+	@$(BIN)/ruff check $(SOURCES)
+	@$(BIN)/ruff format --check $(SOURCES)
+	@$(BIN)/codespell $(SOURCES) *.md
+
+type: $(VENV)/.developer  ## Check the types of the four packages.
+	@$(BIN)/mypy
+
+format: $(VENV)/.developer  ## Format the code and sort the imports.
+	@$(BIN)/ruff check --fix $(SOURCES)
+	@$(BIN)/ruff format $(SOURCES)
+
+bench: $(VENV)/.installed  ## Measure speed against HighwayEnv.
+	@OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.throughput
+
+clean:  ## Remove the environment, caches and runs.
+	rm -rf $(VENV) runs build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find $(SOURCES) -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(VENV)/.installed: pyproject.toml constraints.txt
+	@$(PYTHON) -c '$(TOO_OLD)'
+	@echo "Installing into $(VENV) (first time only) ..."
+	@$(PYTHON) -m venv $(VENV)
+	@$(INSTALL) $(TORCH_ARGS) "$(TORCH)"
+	@$(INSTALL) -c constraints.txt -e ".[test]"
+	@touch $@
+
+$(VENV)/.developer: $(VENV)/.installed
+	@$(INSTALL) -c constraints.txt -e ".[test,dev]"
+	@touch $@

@@ -1,0 +1,54 @@
+"""The main job, end to end: train a small PPO ego, then ask how often it crashes and how.
+
+python examples/demo.py [--steps 200000] [--out runs/demo]
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import torch
+
+from rare_envs.study import show
+from rare_envs.study.evaluate import Question, prepare, run
+from rare_envs.study.rundir import write_run
+from training import train_ego
+
+ENV_ID = "rare_envs/CutIn-v0"
+
+
+def demo(steps: int, out: Path) -> None:
+    """Train an ego, estimate its collision probability, write numbers and picture, and say what to do next.
+
+    Args:
+        steps: Environment steps of training.
+        out: Folder for everything that is written.
+    """
+    torch.set_num_threads(1)  # batches this small are slower on more
+    print(f"1. Training a PPO ego in {ENV_ID} for {steps:,} steps.", flush=True)
+    ego = train_ego(ENV_ID, algo="ppo", steps=steps, seed=0, out=out / "ego.zip")
+
+    print("2. Estimating how often it collides, by adaptive subset simulation.", flush=True)
+    study = prepare(Question(env_id=ENV_ID, ego=str(ego), method="adss", seed=0))
+    report = run(study, progress=True)
+    write_run(out, report)
+
+    print()
+    show.print_report(report, out)
+    print("\nNext, from the folder of this repository (the commands are in .venv/bin):")
+    for words, why in (
+        (f"{ENV_ID} --ego {ego} --method mc --max-sim 200000", "check the number by plain Monte Carlo"),
+        (f"{ENV_ID} --out runs/idm", "the same question for the rule-based ego"),
+        (f"{ENV_ID} --ego {ego} --base highway", "the same ego in free-flowing traffic"),
+    ):
+        print(f"  rare-envs estimate {words}\n      {why}")
+    print(f"  rare-envs train-ego {ENV_ID} --steps 1000000 --out better.zip\n      train for longer, then ask again")
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--steps", type=int, default=200_000)
+    parser.add_argument("--out", type=Path, default=Path("runs/demo"))
+    arguments = parser.parse_args()
+    demo(arguments.steps, arguments.out)

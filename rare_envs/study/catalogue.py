@@ -1,0 +1,51 @@
+"""What there is to choose from: environments, methods, egos, measures, base distributions."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import samplers
+from rare_envs.measures import MEASURES
+from rare_envs.scenarios import SCENARIOS
+from rare_envs.space import BASES, PARAMETERS
+
+EGOS = {
+    "idm": "rule-based driver, Intelligent Driver Model (the default)",
+    "FILE.zip": "policy saved by Stable-Baselines3, VecNormalize statistics beside it included",
+    "module:function": "what your function returns: any object with Stable-Baselines3's predict",
+}
+
+
+def catalogue() -> dict[str, Any]:
+    """Everything that can be named on the command line, as JSON-ready values.
+
+    Returns:
+        "environments" (id to parameters and bases), "methods", "egos", "measures".
+    """
+    environments = {
+        env_id: {
+            "parameters": [
+                {
+                    "name": parameter.name,
+                    "unit": parameter.unit,
+                    "low": parameter.low,
+                    "high": parameter.high,
+                    "meaning": parameter.meaning,
+                }
+                for parameter in PARAMETERS[scenario.name]
+            ],
+            "bases": list(BASES),
+        }
+        for env_id, scenario in SCENARIOS.items()
+    }
+    return {
+        "environments": environments,
+        "methods": {name: _first_line(method) for name, method in samplers.METHODS.items()},
+        "egos": EGOS,
+        "measures": {name: _first_line(measure) for name, measure in MEASURES.items()},
+    }
+
+
+def _first_line(documented: object) -> str:
+    """First line of a docstring."""
+    return (documented.__doc__ or "").strip().partition("\n")[0]

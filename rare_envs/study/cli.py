@@ -1,0 +1,168 @@
+"""The command line `rare-envs`: reads words, calls one function, prints. The work is done elsewhere.
+
+Exit codes: 0 done, 2 bad input (one line on standard error), 3 done with warnings that make the number doubtful.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from enum import Enum
+from pathlib import Path
+from typing import Annotated, Any, NoReturn
+
+import typer
+from typer.core import TyperGroup
+
+from rare_envs.study.checks import BadInput
+
+DOUBTFUL = 3
+_UsageError: type[Exception] = typer.BadParameter.__bases__[0]
+"""What Typer raises for a wrong option or a missing word; older versions of Typer take it from click."""
+
+
+class OneLineErrors(TyperGroup):
+    """Commands whose errors are one line on standard error and exit code 2."""
+
+    def main(self, *args: Any, **extra: Any) -> NoReturn:
+        """Run a command and exit."""
+        try:
+            code = super().main(*args, **{**extra, "standalone_mode": False})
+        except _UsageError as error:
+            words = getattr(error, "format_message")()  # noqa: B009  (its class differs by version)
+            _fail(f"{words.rstrip('.')}{'' if words.endswith('?') else '.'} See rare-envs --help.")
+        except BadInput as error:
+            _fail(str(error))
+        except (KeyboardInterrupt, typer.Abort):
+            print("stopped", file=sys.stderr)
+            sys.exit(130)
+        sys.exit(code if isinstance(code, int) else 0)
+
+
+def _fail(message: str) -> NoReturn:
+    """Say what is wrong in one line, and exit."""
+    print("rare-envs: " + " ".join(message.split()), file=sys.stderr)
+    sys.exit(2)
+
+
+app = typer.Typer(
+    cls=OneLineErrors,
+    help="How often does a driving policy crash? Train one, estimate its rare failures, see the most likely.",
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+
+class Noise(str, Enum):
+    """Words for the `noise` argument of `DrivingProblem`: True, "fixed" and False."""
+
+    ON = "on"
+    FIXED = "fixed"
+    OFF = "off"
+
+
+Env = Annotated[str, typer.Argument(metavar="ENV", help="Environment, such as rare_envs/CutIn-v0.")]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
+Seed = Annotated[int, typer.Option(help="Seed; the same seed gives the same answer.")]
+
+
+@app.command("list")
+def list_command(as_json: Json = False) -> None:
+    """Show environments with their parameters, methods, egos, measures and base distributions."""
+    from rare_envs.study.catalogue import catalogue
+    from rare_envs.study.show import print_catalogue
+
+    if as_json:
+        _print_json(catalogue())
+    else:
+        print_catalogue(catalogue())
+
+
+@app.command("estimate")
+def estimate_command(
+    env: Env,
+    ego: Annotated[str, typer.Option(help="idm, a Stable-Baselines3 .zip or module:function.")] = "idm",
+    algo: Annotated[str | None, typer.Option(help="Algorithm of the .zip, if the file does not tell.")] = None,
+    method: Annotated[str, typer.Option(help="Estimation method; see rare-envs list.")] = "adss",
+    base: Annotated[str | None, typer.Option(help="Base distribution: a name or a JSON file.")] = None,
+    measure: Annotated[str, typer.Option(help="Safety measure f; small is dangerous.")] = "ttc",
+    gamma: Annotated[float, typer.Option(help="Threshold: P[f <= gamma]; 0 counts collisions.")] = 0.0,
+    seed: Seed = 0,
+    max_sim: Annotated[int | None, typer.Option(help="Largest number of simulations.")] = None,
+    target_cov: Annotated[float | None, typer.Option(help="Stop at this coefficient of variation.")] = None,
+    replicates: Annotated[int, typer.Option(help="Independent runs that are pooled.")] = 1,
+    noise: Annotated[
+        Noise, typer.Option(help="Noise of egos and drivers: part of x, one fixed sequence, none.")
+    ] = Noise.ON,
+    out: Annotated[Path | None, typer.Option(help="Folder for result.json, failures.csv and plot.png.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Estimate how often an ego fails, with an interval, and show its most likely failure."""
+    _one_thread()
+    from rare_envs.study import checks, evaluate, show
+
+    question = evaluate.Question(
+        env_id=env,
+        ego=ego,
+        algo=algo,
+        method=method,
+        base=base,
+        measure=measure,
+        gamma=gamma,
+        seed=seed,
+        max_sim=max_sim,
+        target_cov=target_cov,
+        replicates=replicates,
+        noise={Noise.ON: True, Noise.OFF: False}.get(noise, noise.value),
+    )
+    study = evaluate.prepare(question)
+    if out is not None:
+        checks.writable_folder(out)
+    report = evaluate.run(study, progress=True)
+    if out is not None:
+        from rare_envs.study.rundir import write_run
+
+        write_run(out, report)
+    if as_json:
+        _print_json(report.to_dict())
+    else:
+        show.print_report(report, out)
+    raise typer.Exit(DOUBTFUL if report.doubtful else 0)
+
+
+@app.command("train-ego")
+def train_ego_command(
+    env: Env,
+    algo: Annotated[str, typer.Option(help="Stable-Baselines3 algorithm.")] = "ppo",
+    steps: Annotated[int, typer.Option(help="Environment steps to train for.")] = 200_000,
+    out: Annotated[Path, typer.Option(help="File to save the ego in.")] = Path("ego.zip"),
+    seed: Seed = 0,
+    num_envs: Annotated[int, typer.Option(help="Episodes that run side by side.")] = 256,
+    as_json: Json = False,
+) -> None:
+    """Train an ego on the batched simulation and save it for `rare-envs estimate --ego`."""
+    _one_thread()
+    from rare_envs.study.train import train
+
+    path = train(env, algo=algo, steps=steps, out=out, seed=seed, num_envs=num_envs)
+    if as_json:
+        _print_json({"ego": str(path), "env_id": env, "algo": algo, "steps": steps, "seed": seed})
+    else:
+        print(f"Saved {path}. Next: rare-envs estimate {env} --ego {path}")
+
+
+def _one_thread() -> None:
+    """Keep torch to one thread: at these batch sizes more threads cost more than they give."""
+    import torch
+
+    torch.set_num_threads(1)
+
+
+def _print_json(value: dict[str, Any]) -> None:
+    print(json.dumps(value, indent=2, allow_nan=False))
+
+
+def main() -> None:
+    """Run the command line; alone, it shows its help."""
+    app(sys.argv[1:] or ["--help"], prog_name="rare-envs")

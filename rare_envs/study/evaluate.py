@@ -1,0 +1,178 @@
+"""One evaluation: what is asked, checked in full before the first simulation, and what came out."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+import agents
+import rare_envs
+import samplers
+from rare_envs.setup import find_scenario
+from rare_envs.study.checks import BadInput
+
+
+@dataclass(frozen=True, kw_only=True)
+class Question:
+    """What an evaluation is asked: all of it, so that the same question gives the same answer.
+
+    Attributes:
+        env_id: Environment, such as "rare_envs/CutIn-v0".
+        ego: "idm", a path to a Stable-Baselines3 `.zip`, or `module:function`.
+        algo: Algorithm of a `.zip`; recognised from the file when None.
+        method: Name of a method in `samplers.METHODS`.
+        base: Name of a base distribution or path to a JSON file; the scenario's default when None.
+        measure: Safety measure f.
+        gamma: Threshold; the answer is P[f(X) <= gamma].
+        seed: Seed of everything that is drawn.
+        max_sim: Largest number of simulations, or None.
+        target_cov: Stop when the coefficient of variation is this small, or None.
+        replicates: Number of independent runs that are pooled.
+        noise: Noise of egos and drivers, as in `DrivingProblem`: True, "fixed" or False.
+    """
+
+    env_id: str
+    ego: str = "idm"
+    algo: str | None = None
+    method: str = "adss"
+    base: str | None = None
+    measure: str = "ttc"
+    gamma: float = 0.0
+    seed: int = 0
+    max_sim: int | None = None
+    target_cov: float | None = None
+    replicates: int = 1
+    noise: bool | str = True
+
+
+@dataclass(frozen=True)
+class Study:
+    """A question with everything that it names, loaded and checked."""
+
+    question: Question
+    problem: rare_envs.DrivingProblem
+    method: samplers.Method
+
+
+@dataclass(frozen=True)
+class Report:
+    """The answer to a question.
+
+    Attributes:
+        study: What was asked.
+        estimate: What the method found.
+        seconds: Wall time of the estimation [s].
+    """
+
+    study: Study
+    estimate: samplers.Estimate
+    seconds: float
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether the method itself warns that the number may be wrong."""
+        return bool(self.estimate.warnings)
+
+    def to_dict(self, top: int = 10) -> dict[str, Any]:
+        """The report as JSON-ready values: question, estimate and the `top` most likely failures."""
+        failures = self.estimate.failures
+        space = self.study.problem.space
+        ranked = [
+            {
+                "parameters": space.named(failure.x),
+                "f": failure.f if math.isfinite(failure.f) else None,
+                "log_p0": failure.log_p0,
+            }
+            for failure in itertools.islice(failures, top)
+        ]
+        return {
+            **self.estimate.to_dict(),
+            "question": asdict(self.study.question),
+            "doubtful": self.doubtful,
+            "seconds": self.seconds,
+            "n_failures": failures.total,
+            "failures": ranked,
+            "units": dict(zip(space.names, space.units, strict=True)),
+            "version": rare_envs.__version__,
+        }
+
+
+def prepare(question: Question) -> Study:
+    """Check a question and load what it names; nothing is simulated.
+
+    Args:
+        question: What is asked.
+
+    Returns:
+        The study, ready to run.
+
+    Raises:
+        BadInput: Something in the question cannot be used.
+    """
+    try:
+        method = samplers.get_method(question.method)
+        find_scenario(question.env_id)  # before the ego, which takes seconds to load
+        ego = agents.load_ego(question.ego, algo=question.algo)
+        problem = rare_envs.DrivingProblem(
+            question.env_id,
+            ego=ego,
+            measure=question.measure,
+            base=question.base,
+            noise=question.noise,
+        )
+    except (ValueError, OSError) as error:
+        raise BadInput(error) from error
+    _try_ego(problem)
+    return Study(question, problem, method)
+
+
+@torch.inference_mode()
+def _try_ego(problem: rare_envs.DrivingProblem) -> None:
+    """Let the ego decide once, on ordinary traffic at time 0, so that a broken one is found before the simulations.
+
+    Raises:
+        BadInput: It raised, or its actions are not actions.
+    """
+    x = problem.space.sample(2, np.random.default_rng(0))
+    start = problem.world.start(torch.from_numpy(x).float())
+    try:
+        problem.driver.act(start.state, start.lead, None)
+    except Exception as error:  # the ego is the user's: anything may happen in it
+        raise BadInput(f"The ego fails on its first observation: {error or type(error).__name__}") from error
+
+
+def run(study: Study, progress: bool | Callable[[samplers.Progress], None] = False) -> Report:
+    """Answer a question.
+
+    Args:
+        study: From `prepare`.
+        progress: True for a bar on standard error, or a function, as in `samplers.estimate`.
+
+    Returns:
+        The report.
+
+    Raises:
+        BadInput: A number in the question is out of range (nothing is simulated then), or the ego failed on some x.
+    """
+    question, start = study.question, time.perf_counter()
+    try:
+        estimate = samplers.estimate(
+            study.problem,
+            study.method,
+            gamma=question.gamma,
+            seed=question.seed,
+            max_sim=question.max_sim,
+            target_cov=question.target_cov,
+            replicates=question.replicates,
+            progress=progress,
+        )
+    except ValueError as error:
+        raise BadInput(error) from error
+    return Report(study, estimate, time.perf_counter() - start)

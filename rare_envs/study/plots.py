@@ -1,0 +1,219 @@
+"""One picture of one evaluation: how the number came about, what the failures have in common, how it happens."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from matplotlib.transforms import Affine2D
+from numpy.typing import NDArray
+
+from rare_envs.space import ScenarioSpace
+from rare_envs.state import LANE_WIDTH, VEHICLE_LENGTH, VEHICLE_WIDTH
+from rare_envs.study.evaluate import Report
+from rare_envs.study.replay import Replay, replay
+
+if TYPE_CHECKING:
+    from samplers.result import Failures
+
+ORDINARY = 2000
+"""Ordinary scenarios drawn behind the failures."""
+MOMENTS, LAST_SECONDS = 4, 3.0
+"""Bird's-eye views of a failure, spread over the seconds [s] up to its worst moment."""
+BEHIND, AHEAD = 12.0, 48.0
+"""What a bird's-eye view shows of the road around the ego [m]."""
+HEADROOM = 1.5
+"""Upper ends of the curves' axes over their largest values: room for the legend."""
+LINE, HIT, GREY = "#3b6fb5", "#c0392b", "#b8b8b8"
+VEHICLES = ("#2a9d3a", "#3b6fb5", "#e08a1e", "#8e5aa8", "#3aa6a6", "#7a7a7a")
+"""Colours of vehicles, the ego's first."""
+
+
+def save_plot(path: Path, report: Report) -> None:
+    """Draw a report and save it.
+
+    Args:
+        path: `.png` to write.
+        report: What to draw.
+    """
+    # a Figure of its own, without pyplot: no window, no global state, whatever backend the user has
+    with matplotlib.rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
+        figure = Figure(figsize=(16, 5.4), layout="constrained")
+        columns = figure.subfigures(1, 3, squeeze=False, width_ratios=(1.0, 1.05, 1.25), wspace=0.03)
+        left, middle, right = columns[0]
+        figure.suptitle(_headline(report), fontsize=12, fontweight="bold")
+        draw_convergence(left.subplots(), report)
+        draw_failures(middle.subplots(), report.study.problem.space, report.estimate.failures)
+        failures = report.estimate.failures
+        if len(failures):
+            drive = replay(report.study.problem, failures.x[0])
+            draw_drive(list(right.subplots(MOMENTS + 1, height_ratios=[1.0] * MOMENTS + [3.2])), drive)
+        else:
+            _say(right.subplots(), "no failure found, so none to show")
+        figure.savefig(path, dpi=120)
+
+
+def _headline(report: Report) -> str:
+    question, estimate = report.study.question, report.estimate
+    low, high = estimate.interval
+    return (
+        f"{question.env_id}, ego {question.ego}: P[f ≤ {estimate.gamma:g}] = {estimate.p:.2e}   "
+        f"({100 * estimate.confidence:g} % interval {low:.1e} to {high:.1e}, "
+        f"{estimate.n_sim:,} simulations)"
+    )
+
+
+def draw_convergence(axes: Axes, report: Report) -> None:
+    """Draw the estimate against the simulations spent, level by level, and the interval at the end."""
+    estimate = report.estimate
+    runs = sorted({level.run for level in estimate.trace})
+    for run in runs:
+        levels = [level for level in estimate.trace if level.run == run]
+        spent = np.cumsum([level.n_sim for level in levels])
+        values = np.array([level.estimate if level.estimate > 0 else np.nan for level in levels])
+        axes.plot(spent, values, "o-", color=LINE, alpha=max(0.25, 1 / len(runs)), markersize=4)
+        if len(runs) == 1:
+            _label_thresholds(axes, spent, values, [level.gamma for level in levels])
+    low, high = estimate.interval
+    axes.axhspan(max(low, 1e-300), high, color=HIT, alpha=0.12, linewidth=0)
+    label = f"{100 * estimate.confidence:g} % interval"
+    if estimate.p > 0:
+        axes.axhline(estimate.p, color=HIT, linewidth=1, label="result")
+    axes.plot([], [], color=HIT, alpha=0.25, linewidth=8, label=label)
+    axes.set_yscale("log")
+    smallest = min([v for v in (low, estimate.p, high / 30) if v > 0], default=1e-9)
+    axes.set_ylim(smallest / 3, 1.5)
+    axes.set_xlim(left=0)
+    axes.set_xlabel("simulations" if len(runs) == 1 else f"simulations, each of {len(runs)} runs")
+    axes.set_ylabel("P[f ≤ threshold of the level]")
+    axes.set_title("From ordinary traffic to the failures, level by level", fontsize=10)
+    axes.legend(loc="upper right", frameon=False)
+
+
+def _label_thresholds(axes: Axes, spent: NDArray[np.int64], values: NDArray[np.float64], gammas: list[float]) -> None:
+    """Write each level's threshold beside its point, where it differs from the one before."""
+    for i, (n, value, gamma) in enumerate(zip(spent, values, gammas, strict=True)):
+        if np.isfinite(value) and (i == 0 or gamma != gammas[i - 1]):
+            axes.annotate(f"f ≤ {gamma:.3g}", (n, value), (5, 5), textcoords="offset points", fontsize=8)
+
+
+def most_shifted(space: ScenarioSpace, ordinary: NDArray[np.float64], failures: NDArray[np.float64]) -> list[int]:
+    """Parameters in which failures differ most from ordinary traffic, the most shifted first.
+
+    Args:
+        space: Names of the parameters.
+        ordinary: Scenarios from the base distribution, shape (n, d).
+        failures: Failures, shape (m, d).
+
+    Returns:
+        Indices of the named parameters, by |mean shift| / standard deviation.
+    """
+    named = slice(0, len(space.names))
+    spread = np.maximum(ordinary[:, named].std(axis=0), 1e-12)
+    shift = np.abs(failures[:, named].mean(axis=0) - ordinary[:, named].mean(axis=0)) / spread
+    return [int(i) for i in np.argsort(-shift, kind="stable")]
+
+
+def draw_failures(axes: Axes, space: ScenarioSpace, failures: Failures) -> None:
+    """Draw failures over ordinary traffic in the two parameters in which they differ most."""
+    ordinary = space.sample(ORDINARY, np.random.default_rng(0))
+    a, b = most_shifted(space, ordinary, failures.x)[:2] if len(failures) else (0, 1)
+    axes.scatter(ordinary[:, a], ordinary[:, b], s=6, color=GREY, label="ordinary traffic", linewidths=0)
+    axes.set_xlabel(f"{space.names[a]} [{space.units[a]}]")
+    axes.set_ylabel(f"{space.names[b]} [{space.units[b]}]")
+    if len(failures):
+        rising = slice(None, None, -1)  # the most likely on top
+        x, y = failures.x[rising, a], failures.x[rising, b]
+        dots = axes.scatter(x, y, s=12, c=failures.log_p0[rising], cmap="YlOrRd", linewidths=0)
+        assert axes.figure is not None
+        axes.figure.colorbar(dots, ax=axes, label="log density in traffic (darker: more likely)")
+        star = failures.x[0]
+        axes.plot(star[a], star[b], "*", color="black", markersize=13, label="most likely failure")
+        axes.set_title("Failures against ordinary traffic (two most shifted parameters)", fontsize=10)
+    else:
+        axes.set_title("Ordinary traffic; no failure found", fontsize=10)
+    axes.legend(loc="best", fontsize=8)
+
+
+def draw_drive(axes: list[Axes], drive: Replay) -> None:
+    """Draw the seconds up to the worst moment of a drive from above, and its gap and speeds over time.
+
+    Args:
+        axes: `MOMENTS` views from above, then one for the curves.
+        drive: What happened.
+    """
+    first = int(np.argmin(np.abs(drive.time - (drive.time[drive.worst] - LAST_SECONDS))))
+    for view, t in zip(axes[:MOMENTS], np.linspace(first, drive.worst, MOMENTS).round(), strict=True):
+        draw_moment(view, drive, int(t))
+    axes[0].set_title("The most likely failure from above, and its speeds and gap", fontsize=10)
+    _draw_curves(axes[-1], drive)
+
+
+def draw_moment(axes: Axes, drive: Replay, t: int) -> None:
+    """Draw the vehicles at moment t (an index of `drive.time`) from above, the ego at 0 m."""
+    origin = drive.position[t, 0, 0]
+    hit = drive.collided and t == drive.worst
+    for j, ((x, y), heading) in enumerate(zip(drive.position[t], drive.heading[t], strict=True)):
+        body = Rectangle(
+            (-VEHICLE_LENGTH / 2, -VEHICLE_WIDTH / 2),
+            VEHICLE_LENGTH,
+            VEHICLE_WIDTH,
+            facecolor=colour(j),
+            edgecolor=HIT if hit and j == 0 else "none",
+        )
+        body.set_transform(Affine2D().rotate(heading).translate(x - origin, y) + axes.transData)
+        axes.add_patch(body)
+    for lane in range(drive.lanes + 1):
+        edge = lane in (0, drive.lanes)
+        axes.axhline(
+            (lane - 0.5) * LANE_WIDTH,
+            color="black" if edge else GREY,
+            linewidth=1,
+            dashes=(None, None) if edge else (6, 6),
+        )
+    axes.set_xlim(-BEHIND, AHEAD)
+    # the lateral axis points right of the direction of travel, which is down when driving to the right
+    axes.set_ylim((drive.lanes - 0.4) * LANE_WIDTH, -0.6 * LANE_WIDTH)
+    axes.set_aspect("equal")
+    axes.set_yticks([])
+    axes.set_xticks([])
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+    axes.set_ylabel(f"{drive.time[t]:.1f} s", rotation=0, ha="right", va="center")
+    if t == drive.worst:
+        axes.text(AHEAD, 0, "collision" if hit else "closest", color=HIT, ha="right", va="center", fontweight="bold")
+
+
+def colour(vehicle: int) -> str:
+    """The colour of a vehicle; 0 is the ego."""
+    return VEHICLES[0] if vehicle == 0 else VEHICLES[1 + (vehicle - 1) % (len(VEHICLES) - 1)]
+
+
+def _draw_curves(axes: Axes, drive: Replay) -> None:
+    """Draw speeds (left axis) and the gap to the lead (right axis) over time."""
+    for j in range(drive.speed.shape[1]):
+        label = "speed of the ego" if j == 0 else f"speed of vehicle {j}"
+        axes.plot(drive.time, drive.speed[:, j], color=colour(j), label=label)
+    axes.set_xlabel("time [s]")
+    axes.set_ylabel("speed [m/s]")
+    axes.set_ylim(0, HEADROOM * max(1.0, float(drive.speed.max())))
+    gaps = axes.twinx()
+    gap = np.where(np.isfinite(drive.gap), drive.gap, np.nan)
+    gaps.plot(drive.time, gap, color="black", linestyle=":", label="gap to the lead")
+    gaps.set_ylabel("gap [m]")
+    gaps.set_ylim(min(0.0, float(np.nanmin(gap, initial=0.0))), HEADROOM * float(np.nanmax(gap, initial=1.0)))
+    gaps.spines["right"].set_visible(True)
+    handles = [*axes.get_legend_handles_labels()[0], *gaps.get_legend_handles_labels()[0]]
+    labels = [*axes.get_legend_handles_labels()[1], *gaps.get_legend_handles_labels()[1]]
+    axes.legend(handles, labels, loc="upper center", ncols=2, fontsize=8, frameon=False)
+
+
+def _say(axes: Axes, text: str) -> None:
+    """Put a sentence where a drawing would be."""
+    axes.set_axis_off()
+    axes.text(0.5, 0.5, text, ha="center", va="center", transform=axes.transAxes)

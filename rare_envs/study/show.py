@@ -1,0 +1,90 @@
+"""What a person reads on standard output: tables and results."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+import samplers
+from rare_envs.study.evaluate import Report
+
+ORDINARY = 4000
+"""Scenarios drawn from the base distribution to say what is ordinary."""
+
+
+def print_catalogue(entries: dict[str, Any]) -> None:
+    """Print what `catalogue` gives as tables."""
+    console = Console(highlight=False)
+    for env_id, environment in entries["environments"].items():
+        table = Table("parameter", "unit", "range", "meaning", title=env_id, title_justify="left", title_style="bold")
+        for each in environment["parameters"]:
+            table.add_row(each["name"], each["unit"], f"{each['low']:g} to {each['high']:g}", each["meaning"])
+        console.print(table)
+        console.print(f"  base distributions: {', '.join(environment['bases'])}, or your own JSON file\n")
+    for kind, title in (("methods", "Methods"), ("egos", "Egos"), ("measures", "Safety measures")):
+        table = Table("name", "what it is", title=title, title_justify="left", title_style="bold")
+        for name, text in entries[kind].items():
+            table.add_row(name, text)
+        console.print(table)
+
+
+def print_report(report: Report, out: Path | None = None) -> None:
+    """Print the number, what it rests on, the most likely failure, and where the files are."""
+    # markup off: P[f <= 0] and what warnings quote would be read as tags
+    console = Console(highlight=False, soft_wrap=True, markup=False)
+    estimate, question = report.estimate, report.study.question
+    low, high = estimate.interval
+    console.print(
+        f"P[f <= {estimate.gamma:g}] = {estimate.p:.3e}{_one_in(estimate.p)}   {question.env_id}, ego {question.ego}",
+        style="bold",
+    )
+    rows = (
+        (f"{100 * estimate.confidence:g} % interval", f"{low:.3e} to {high:.3e}"),
+        ("c.o.v.", "not known" if math.isinf(estimate.cov) else f"{estimate.cov:.3f}"),
+        ("simulations", f"{estimate.n_sim:,} in {report.seconds:.1f} s"),
+        ("gain", _gain(estimate)),
+        ("method", f"{estimate.method.name}, seed {estimate.seed}, {estimate.status}"),
+    )
+    for name, value in rows:
+        console.print(f"  {name:<15} {value}")
+    _print_failure(console, report)
+    for warning in estimate.warnings:
+        console.print(f"warning: {warning}", style="yellow")
+    if out is not None:
+        names = ", ".join(path.name for path in sorted(out.iterdir()) if path.is_file())
+        console.print(f"written to {out}: {names}")
+
+
+def _one_in(p: float) -> str:
+    """A small probability in words."""
+    return f" (1 in {1 / p:,.0f} scenarios)" if 0 < p < 0.1 else ""
+
+
+def _gain(estimate: samplers.Estimate) -> str:
+    """The gain over plain Monte Carlo, and what it means."""
+    if math.isnan(estimate.gain):
+        return "not known"
+    needed = estimate.gain * estimate.n_sim
+    return f"{estimate.gain:.3g} (plain Monte Carlo: about {needed:,.0f} simulations for the same c.o.v.)"
+
+
+def _print_failure(console: Console, report: Report) -> None:
+    """Print the most likely failure beside the range that is ordinary for each parameter."""
+    failures, space = report.estimate.failures, report.study.problem.space
+    if not len(failures):
+        console.print("  no failure found")
+        return
+    ordinary = space.sample(ORDINARY, np.random.default_rng(0))
+    low, high = np.quantile(ordinary, (0.05, 0.95), axis=0)
+    console.print(
+        f"  most likely of {failures.total:,} failures found (f = {failures.f[0]:.3g}; "
+        "in brackets where nine of ten ordinary scenarios lie):"
+    )
+    for j, (name, value) in enumerate(space.named(failures.x[0]).items()):
+        unit = space.units[j]
+        console.print(f"    {name:<15} {value:8.2f} {unit:<4} [{low[j]:.1f} to {high[j]:.1f}]", markup=False)

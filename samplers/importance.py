@@ -1,0 +1,133 @@
+"""Estimating p with fresh draws from a fixed proposal.
+
+References:
+    Owen and Zhou, "Safe and effective importance sampling", JASA 95, 2000 (defensive mixtures).
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from samplers.families import Gaussian, Mixture
+from samplers.intervals import Interval, clopper_pearson, log_normal
+from samplers.method import Goal
+from samplers.problem import FloatArray, Problem, evaluate_at
+from samplers.result import Level
+from samplers.weights import effective_sample_size, largest_share
+
+MANY_ESS = 200
+"""From this effective number of failing points on, normal quantiles serve; below, t quantiles."""
+LOW_ESS = 30
+LARGE_SHARE = 0.15
+
+
+@dataclass(frozen=True, eq=False)
+class Draws:
+    """Independent draws from one proposal; only the failing ones matter."""
+
+    n: int
+    """Number of draws."""
+    f: FloatArray
+    """Outcomes of the k failing ones, shape (k,)."""
+    log_weights: FloatArray
+    """log(p0 / q) at the failing ones, shape (k,)."""
+
+    @property
+    def ess(self) -> float:
+        """Effective number of failing draws."""
+        return effective_sample_size(self.log_weights)
+
+    @property
+    def p(self) -> float:
+        """Mean of weight times indicator of failure."""
+        return float(np.exp(self.log_weights).sum()) / self.n
+
+    @property
+    def cov(self) -> float:
+        """Coefficient of variation of `p`; inf without a failing draw.
+
+        Standard error of the mean, with (largest term / n)^2 added to its square: where one
+        weight dominates, the sample variance alone is too small most of the time.
+        """
+        return weighted_cov(self.n, self.log_weights)
+
+
+def weighted_cov(n: int, log_weights: FloatArray) -> float:
+    """Return the c.o.v. of sum(w) / n over n draws whose nonzero terms have these log weights."""
+    if log_weights.size == 0:
+        return math.inf
+    w = np.exp(log_weights - log_weights.max())
+    mean = float(w.sum()) / n
+    spread = (float((w * w).sum()) / n - mean * mean) / max(n - 1, 1)
+    return math.sqrt(max(spread, 0.0) + 1.0 / (n * n)) / mean
+
+
+def draw(problem: Problem, sampler: Mixture, gamma: float, n: int, rng: np.random.Generator) -> Draws:
+    """Simulate n draws from `sampler`, a law in standard normal space, in one batch."""
+    u = sampler.sample(n, rng)
+    f = evaluate_at(problem, u)
+    u, f = u[f <= gamma], f[f <= gamma]
+    return Draws(n, f, Gaussian.standard(problem.dim).log_prob(u) - sampler.log_prob(u))
+
+
+def draw_until(
+    problem: Problem,
+    sampler: Mixture,
+    goal: Goal,
+    limit: int,
+    batch: int,
+    rng: np.random.Generator,
+) -> tuple[Draws, list[Level]]:
+    """Simulate batches until `limit` draws are made or goal.target_cov is met."""
+    draws = Draws(0, np.empty(0), np.empty(0))
+    trace: list[Level] = []
+    while draws.n < limit:
+        new = draw(problem, sampler, goal.gamma, min(batch, limit - draws.n), rng)
+        draws = Draws(
+            draws.n + new.n,
+            np.concatenate([draws.f, new.f]),
+            np.concatenate([draws.log_weights, new.log_weights]),
+        )
+        trace.append(
+            Level(
+                gamma=goal.gamma,
+                p=len(new.f) / new.n,
+                estimate=draws.p,
+                n_sim=new.n,
+                n_points=new.n,
+                cov=draws.cov,
+                ess=draws.ess,
+            )
+        )
+        goal.on_level(trace[-1])
+        if goal.target_cov is not None and draws.cov <= goal.target_cov:
+            break
+    return draws, trace
+
+
+def interval_of(draws: Draws, confidence: float, largest_weight: float) -> Interval:
+    """Return the interval of p: log-normal, with t quantiles where few draws carry it.
+
+    Without a failing draw p <= largest_weight P_q[failure] gives a one-sided interval. Where all
+    weights are 1 the draws are plain Monte Carlo and the interval is Clopper-Pearson's.
+    """
+    hits = len(draws.f)
+    if hits == 0 or largest_weight == 1.0:
+        low, high = clopper_pearson(hits, draws.n, confidence)
+        return low, min(1.0, high * largest_weight)
+    df = math.inf if draws.ess > MANY_ESS else max(draws.ess / 4, 3.0)
+    return log_normal(draws.p, draws.cov, confidence, df)
+
+
+def doubts(draws: Draws) -> list[str]:
+    """Return warnings about the weights of the failing draws."""
+    if len(draws.f) == 0:
+        return [f"None of {draws.n:,} final draws failed: p = 0 with a one-sided interval."]
+    found = []
+    if draws.ess < LOW_ESS:
+        found.append(f"The failing draws are worth {draws.ess:.0f} independent ones: the estimate is coarse.")
+    share = largest_share(draws.log_weights)
+    if share > LARGE_SHARE:
+        found.append(f"One draw carries {100 * share:.0f} % of p: failures lie where the proposal hardly reaches.")
+    return found

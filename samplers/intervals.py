@@ -1,0 +1,71 @@
+"""Coefficients of variation and confidence intervals.
+
+References:
+    Clopper and Pearson, "The use of confidence or fiducial limits", Biometrika 26, 1934.
+    Au and Beck, "Estimation of small failure probabilities in high dimensions by subset
+    simulation", Probabilistic Engineering Mechanics 16, 2001 (equations 25 to 29).
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+Interval = tuple[float, float]
+
+
+def clopper_pearson(hits: int, n: int, confidence: float) -> Interval:
+    """Return the exact binomial interval; one-sided where hits is 0 or n."""
+    tail = (1 - confidence) / 2
+    low = 0.0 if hits == 0 else float(stats.beta.ppf(tail, hits, n - hits + 1))
+    high = 1.0 if hits == n else float(stats.beta.ppf(1 - tail, hits + 1, n - hits))
+    return low, high
+
+
+def log_normal(p: float, cov: float, confidence: float, df: float = math.inf) -> Interval:
+    """Return p exp(-+ q s), s^2 = log(1 + cov^2), q the normal (or, with finite df, t) quantile.
+
+    For estimators whose logarithm is nearly normal; p must be positive. Cut at 1.
+    """
+    quantile = float(stats.t.ppf(0.5 + confidence / 2, df))
+    half = quantile * math.sqrt(math.log1p(cov * cov))
+    return p * math.exp(-half), min(1.0, p * math.exp(half))
+
+
+def binomial_cov(p: float, n: float) -> float:
+    """Return the c.o.v. of a share p of n independent points; inf where p = 0."""
+    return math.sqrt((1 - p) / (p * n)) if p > 0 else math.inf
+
+
+def gain_over_monte_carlo(p: float, cov: float, n_sim: int) -> float:
+    """Return Monte Carlo runs for the same c.o.v. divided by n_sim; NaN where p is 0 or 1."""
+    if not 0 < p < 1 or cov == 0 or n_sim == 0:
+        return math.nan
+    return (1 - p) / (p * cov * cov * n_sim)
+
+
+def correlation_factor(inside: NDArray[np.bool_], lengths: NDArray[np.int64]) -> float:
+    """Return Au and Beck's gamma: correlation in the chains raises a variance by 1 + gamma.
+
+    gamma = 2 sum_k (M_k / N) rho(k), with M_k the number of pairs at lag k inside the chains,
+    N the number of points and rho(k) the correlation of the indicator at lag k. With chains of
+    equal length L this is the paper's 2 sum_k (1 - k / L) rho(k). Negative sums, which are
+    sampling noise, count as 0.
+
+    Args:
+        inside: Indicator, shape (chains, steps): row i is chain i in time order.
+        lengths: How many of the steps of each chain count, shape (chains,).
+    """
+    used = np.arange(inside.shape[1]) < lengths[:, None]
+    total = int(used.sum())
+    share = float(inside[used].sum()) / total
+    variance = share * (1 - share)
+    if variance == 0:
+        return 0.0
+    gamma = 0.0
+    for lag in range(1, inside.shape[1]):
+        pairs = used[:, lag:]  # a used point has all its predecessors
+        both = (inside[:, :-lag] & inside[:, lag:])[pairs]
+        gamma += 2 * (float(both.sum()) - both.size * share * share) / (total * variance)
+    return max(gamma, 0.0)

@@ -1,0 +1,89 @@
+"""Plain Monte Carlo: the yardstick."""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from samplers.intervals import binomial_cov, clopper_pearson
+from samplers.method import Goal, Outcome, check_count, no_outcome_share
+from samplers.problem import FloatArray, Problem
+from samplers.result import Level, Status
+
+MANY_FAILURES = 20
+"""Fewer hits than this leave a c.o.v. above about 0.22: worth a warning."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MonteCarlo:
+    """Share of failing points among independent draws from the base distribution.
+
+    p = k / N with the Clopper-Pearson interval. Stops at `goal.target_cov` (Tian et al. stop at
+    a relative half-width of 0.2, that is target_cov = 0.102), looked at after every batch, else
+    when the simulations are used up. Stopping at a c.o.v. makes the interval approximate.
+
+    Args:
+        n: Simulations where `max_sim` does not say how many.
+        batch: Points per call of f.
+    """
+
+    n: int = 100_000
+    batch: int = 10_000
+
+    name: ClassVar[str] = "mc"
+    stops_at_target: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        check_count("MonteCarlo", "n", self.n, 1)
+        check_count("MonteCarlo", "batch", self.batch, 1)
+
+    def run(self, problem: Problem, goal: Goal, rng: np.random.Generator) -> Outcome:
+        """Draw batches until the target or the end of the budget."""
+        budget = self.n if goal.max_sim is None else goal.max_sim
+        n, met = 0, False
+        failing: list[FloatArray] = []
+        trace: list[Level] = []
+        hits = 0
+        while n < budget and not met:
+            size = min(self.batch, budget - n)
+            f = problem.evaluate(problem.base.sample(size, rng))
+            failing.append(f[f <= goal.gamma])
+            n, hits = n + size, hits + len(failing[-1])
+            cov = binomial_cov(hits / n, n)
+            met = goal.target_cov is not None and hits > 0 and cov <= goal.target_cov
+            trace.append(
+                Level(
+                    gamma=goal.gamma,
+                    p=len(failing[-1]) / size,
+                    estimate=hits / n,
+                    n_sim=size,
+                    n_points=size,
+                    cov=cov,
+                )
+            )
+            goal.on_level(trace[-1])
+        missed = goal.target_cov is not None and not met
+        return Outcome(
+            p=hits / n,
+            interval=clopper_pearson(hits, n, goal.confidence),
+            cov=binomial_cov(hits / n, n),
+            status=_status(hits, missed),
+            warnings=_warnings(hits, n),
+            trace=tuple(trace),
+            no_outcome_share=no_outcome_share(np.concatenate(failing)),
+        )
+
+
+def _status(hits: int, missed_target: bool) -> Status:
+    if hits == 0:
+        return Status.NO_HITS
+    return Status.BUDGET if missed_target else Status.CONVERGED
+
+
+def _warnings(hits: int, n: int) -> tuple[str, ...]:
+    if hits == 0:
+        return (f"None of {n:,} simulations failed: p = 0 with a one-sided interval.",)
+    if hits < MANY_FAILURES:
+        return (f"Only {hits} of {n:,} simulations failed; the estimate is coarse.",)
+    return ()

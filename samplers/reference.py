@@ -1,0 +1,111 @@
+"""Limit-state problems with known P[f(U) <= 0], U ~ N(0, I), for tests and benchmarks.
+
+The probabilities are closed forms or one-dimensional integrals to about 1e-12.
+"""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.integrate import quad
+from scipy.special import ndtr, ndtri
+from scipy.stats import chi2
+
+from samplers.problem import FloatArray, FunctionProblem
+
+
+class Reference(NamedTuple):
+    """A problem and its exact probability of failure at gamma = 0."""
+
+    name: str
+    problem: FunctionProblem
+    p: float
+
+
+def half_space(dim: int = 2, beta: float = 3.5) -> Reference:
+    """Half-space, f = beta - sum(u) / sqrt(d): p = Phi(-beta) in any dimension."""
+
+    def f(u: FloatArray) -> FloatArray:
+        return np.asarray(beta - u.sum(axis=1) / math.sqrt(dim))
+
+    return _reference(f"half_space_d{dim}", f, dim, _phi(-beta))
+
+
+def two_modes(distance: float = 2.0) -> Reference:
+    """Two quarter planes of equal weight: f = distance - max(min(u1, u2), min(-u1, u2)).
+
+    p = 2 Phi(-distance)^2, 1.035e-3 for distance 2. The demonstration problem of Norden,
+    O'Kelly and Sinha, "Efficient black-box assessment of autonomous vehicle safety", 2019.
+    """
+
+    def f(u: FloatArray) -> FloatArray:
+        return np.asarray(distance - np.minimum(np.abs(u[:, 0]), u[:, 1]))
+
+    return _reference("two_modes", f, 2, 2 * _phi(-distance) ** 2)
+
+
+def parabola(beta: float = 3.3, curvature: float = 0.2) -> Reference:
+    """One design point with a boundary that curves away: f = beta + curvature u1^2 - u2."""
+
+    def f(u: FloatArray) -> FloatArray:
+        return np.asarray(beta + curvature * u[:, 0] ** 2 - u[:, 1])
+
+    return _reference("parabola", f, 2, _normal_mean(lambda s: _phi(-beta - curvature * s * s)))
+
+
+def four_branches(k: float = 3.5) -> Reference:
+    """Series system of four branches: two parabolas and two planes around the origin."""
+
+    def f(u: FloatArray) -> FloatArray:
+        s, t = (u[:, 0] - u[:, 1]) / math.sqrt(2), (u[:, 0] + u[:, 1]) / math.sqrt(2)
+        parabolas = k + 0.2 * s * s - np.abs(t)
+        return np.asarray(np.minimum(parabolas, math.sqrt(2) * (k - np.abs(s))))
+
+    between = _normal_mean(lambda s: 2 * _phi(-k - 0.2 * s * s), -k, k)
+    return _reference("four_branches", f, 2, 2 * _phi(-k) + between)
+
+
+def plateau(dim: int = 3, beta: float = 3.5, tied: float = 0.6) -> Reference:
+    """Like a time to collision: -1 on failure, else in [0.5, cap], the share `tied` at the cap."""
+    direction = np.arange(1.0, dim + 1) / np.linalg.norm(np.arange(1.0, dim + 1))
+    cap = 0.5 + 3 * (beta - float(ndtri(tied)))
+
+    def f(u: FloatArray) -> FloatArray:
+        s = u @ direction
+        return np.where(s >= beta, -1.0, np.minimum(0.5 + 3 * (beta - s), cap))
+
+    return _reference(f"plateau_d{dim}_{tied:g}", f, dim, _phi(-beta))
+
+
+def shell(dim: int = 20, p: float = 1e-4) -> Reference:
+    """Failure in every direction, beyond a radius: f = r - |u|."""
+    radius = math.sqrt(float(chi2.isf(p, dim)))
+
+    def f(u: FloatArray) -> FloatArray:
+        return np.asarray(radius - np.linalg.norm(u, axis=1))
+
+    return _reference(f"shell_d{dim}", f, dim, p)
+
+
+def references() -> list[Reference]:
+    """Return one of each kind."""
+    return [half_space(), two_modes(), parabola(), four_branches(), plateau(), shell()]
+
+
+def _reference(name: str, f: Callable[[FloatArray], ArrayLike], dim: int, p: float) -> Reference:
+    return Reference(name, FunctionProblem(f, dim), p)
+
+
+def _phi(x: float) -> float:
+    return float(ndtr(x))
+
+
+def _normal_mean(g: Callable[[float], float], low: float = -12.0, high: float = 12.0) -> float:
+    """Return the integral of g(s) phi(s) over [low, high]."""
+
+    def integrand(s: float) -> float:
+        return g(s) * math.exp(-0.5 * s * s) / math.sqrt(2 * math.pi)
+
+    return float(quad(integrand, low, high, limit=500, epsabs=1e-18, epsrel=1e-12)[0])

@@ -1,0 +1,74 @@
+"""Combining independent runs of one method."""
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy import stats
+
+from samplers.intervals import Interval
+from samplers.method import Outcome
+from samplers.result import Level, Status
+
+BY_CONCERN = (Status.STALLED, Status.BUDGET, Status.CONVERGED)
+"""The status of the whole is the first of these that a run has."""
+
+
+def combined(outcomes: Sequence[Outcome], confidence: float) -> Outcome:
+    """Return the mean of R independent runs with a t interval on the log scale.
+
+    p is the arithmetic mean p_bar (each run's p-hat is unbiased, its logarithm is not). Its
+    c.o.v. is the larger of what the runs say of themselves and of what their spread shows. The
+    interval is p_bar exp(-+ t s / sqrt(R)) with s the standard deviation of log p-hat (of
+    p-hat / p_bar, where a run has p-hat = 0) and t the quantile with R - 1 degrees of freedom.
+    """
+    if len(outcomes) == 1:
+        return outcomes[0]
+    p = np.array([outcome.p for outcome in outcomes])
+    mean = float(p.mean())
+    return Outcome(
+        p=mean,
+        interval=_interval(outcomes, p, confidence),
+        cov=combined_cov(outcomes),
+        status=_status(outcomes) if mean > 0 else Status.NO_HITS,
+        warnings=_counted(outcomes),
+        trace=tuple(_numbered(outcomes)),
+        no_outcome_share=(float(np.average([o.no_outcome_share for o in outcomes], weights=p)) if mean else 0.0),
+    )
+
+
+def combined_cov(outcomes: Sequence[Outcome]) -> float:
+    """Return the c.o.v. of the mean of independent runs: own or empirical, whichever is larger."""
+    p = np.array([outcome.p for outcome in outcomes])
+    if not p.any():
+        return math.inf
+    errors = [o.p * o.cov for o in outcomes if o.p > 0]
+    own = math.sqrt(sum(e * e for e in errors)) / float(p.sum())
+    seen = float(p.std(ddof=1) / p.mean()) / math.sqrt(len(p)) if len(p) > 1 else 0.0
+    return max(own, seen)
+
+
+def _interval(outcomes: Sequence[Outcome], p: np.ndarray, confidence: float) -> Interval:
+    mean, runs = float(p.mean()), len(p)
+    if mean == 0 or np.ptp(p) == 0:  # no spread to go by: all runs' own intervals together
+        return min(o.interval[0] for o in outcomes), max(o.interval[1] for o in outcomes)
+    spread = float(np.log(p).std(ddof=1)) if p.all() else float(p.std(ddof=1)) / mean
+    half = float(stats.t.ppf(0.5 + confidence / 2, runs - 1)) * spread / math.sqrt(runs)
+    return mean * math.exp(-half), min(1.0, mean * math.exp(half))
+
+
+def _status(outcomes: Sequence[Outcome]) -> Status:
+    present = {outcome.status for outcome in outcomes}
+    return next((status for status in BY_CONCERN if status in present), Status.BUDGET)
+
+
+def _counted(outcomes: Sequence[Outcome]) -> tuple[str, ...]:
+    """Return the warnings of the runs, each once, with the number of runs that have it."""
+    texts = Counter(text for outcome in outcomes for text in outcome.warnings)
+    return tuple(f"In {count} of {len(outcomes)} runs: {text}" for text, count in texts.items())
+
+
+def _numbered(outcomes: Sequence[Outcome]) -> list[Level]:
+    return [replace(level, run=i) for i, o in enumerate(outcomes) for level in o.trace]

@@ -1,0 +1,210 @@
+"""What comes back from `estimate`: the probability, how far to trust it, and the failures."""
+
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from enum import Enum
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from samplers.problem import FloatArray
+
+if TYPE_CHECKING:
+    from samplers.method import Method
+
+
+class Status(str, Enum):
+    """How a run ended; prints as its value."""
+
+    CONVERGED = "converged"
+    """The method came to its own end (and met target_cov, if one was given)."""
+    NO_HITS = "no_hits"
+    """It came to its end without seeing a failure: p = 0, one-sided interval."""
+    BUDGET = "budget"
+    """max_sim was used up before the method came to its end or met target_cov."""
+    STALLED = "stalled"
+    """It could not get closer to the failures: ties in f, or too many levels."""
+
+    def __str__(self) -> str:
+        return str(self.value)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Level:
+    """One level of subset simulation, one iteration of cross-entropy, one batch of Monte Carlo."""
+
+    gamma: float
+    """Threshold of this level."""
+    p: float
+    """Share of this level's points with f <= gamma."""
+    estimate: float
+    """P[f(X) <= gamma of this level] as estimated so far."""
+    n_sim: int
+    """Simulations made for this level."""
+    n_points: int
+    """Points behind `p`: those simulated and, in subset simulation, the seeds."""
+    cov: float
+    """Coefficient of variation of this level's own share in the estimate."""
+    acceptance: float | None = None
+    """Share of accepted moves (Markov chains)."""
+    ess: float | None = None
+    """Effective number of points behind `p` (chains) or of failing points (weights)."""
+    run: int = 0
+    """Which replicate the level belongs to."""
+
+
+class Failure(NamedTuple):
+    """One failing point."""
+
+    x: FloatArray
+    f: float
+    log_p0: float
+
+
+@dataclass(frozen=True, eq=False)
+class Failures:
+    """Failing points, the most likely under the base distribution first.
+
+    Iterating or indexing gives `Failure(x, f, log_p0)`.
+    """
+
+    x: FloatArray
+    """Points, shape (m, d)."""
+    f: FloatArray
+    """Outcomes, shape (m,); NaN where f raised or gave NaN and was counted as failing."""
+    log_p0: FloatArray
+    """Log density under the base distribution, shape (m,), falling."""
+    total: int
+    """How many failing points were simulated; m of them are kept here."""
+
+    @classmethod
+    def empty(cls, dim: int) -> "Failures":
+        """No failures of a problem with `dim` dimensions."""
+        return cls(x=np.empty((0, dim)), f=np.empty(0), log_p0=np.empty(0), total=0)
+
+    def merged(self, x: FloatArray, f: FloatArray, log_p0: FloatArray, *, keep: int) -> "Failures":
+        """Add points x (k, d), f (k,), log_p0 (k,) and keep the `keep` most likely of all."""
+        all_log_p0 = np.concatenate([self.log_p0, log_p0])
+        best = np.argsort(-all_log_p0, kind="stable")[:keep]
+        return Failures(
+            x=np.concatenate([self.x, x])[best],
+            f=np.concatenate([self.f, f])[best],
+            log_p0=all_log_p0[best],
+            total=self.total + len(f),
+        )
+
+    def __len__(self) -> int:
+        """Return how many points are kept."""
+        return len(self.f)
+
+    def __getitem__(self, index: int) -> Failure:
+        """Return the failure at one rank, 0 being the most likely."""
+        return Failure(self.x[index], float(self.f[index]), float(self.log_p0[index]))
+
+    def __iter__(self) -> Iterator[Failure]:
+        """Go through the failures, most likely first."""
+        return (self[index] for index in range(len(self)))
+
+    def __eq__(self, other: object) -> bool:
+        """Compare values; NaN equals NaN."""
+        if not isinstance(other, Failures):
+            return NotImplemented
+        return (
+            self.total == other.total
+            and np.array_equal(self.x, other.x)
+            and np.array_equal(self.f, other.f, equal_nan=True)
+            and np.array_equal(self.log_p0, other.log_p0)
+        )
+
+    __hash__ = None  # type: ignore[assignment]  # arrays have no hash
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """P[f(X) <= gamma] with its interval, its cost and its failures."""
+
+    p: float
+    """Estimated probability."""
+    interval: tuple[float, float]
+    """Interval that should hold the true p with probability `confidence`."""
+    confidence: float
+    """Nominal coverage of `interval`."""
+    cov: float
+    """Estimated coefficient of variation of p; inf where p = 0."""
+    gamma: float
+    """Threshold of failure."""
+    n_sim: int
+    """Simulated points of the whole run, search included."""
+    gain: float
+    """Plain Monte Carlo runs for the same c.o.v., divided by n_sim; NaN where p is 0 or 1."""
+    status: Status
+    """How the run ended."""
+    warnings: tuple[str, ...]
+    """What makes the numbers doubtful; empty if nothing is known to."""
+    trace: tuple[Level, ...]
+    """One entry per level, iteration or batch."""
+    failures: Failures
+    """Failing points, the most likely first."""
+    method: "Method"
+    """The method and its settings."""
+    seed: int
+    """Seed that gives the same run again."""
+
+    def __str__(self) -> str:
+        """Return a few lines for people."""
+        low, high = self.interval
+        gain = "" if math.isnan(self.gain) else f", gain over Monte Carlo {self.gain:.3g}"
+        cov = "not known" if math.isinf(self.cov) else f"{self.cov:.3g}"
+        lines = [
+            f"P[f <= {self.gamma:g}] = {self.p:.3e}",
+            f"  {100 * self.confidence:g} % interval [{low:.3e}, {high:.3e}], c.o.v. {cov}",
+            f"  {self.n_sim:,} simulations{gain}; {self.method.name}, seed {self.seed}, "
+            f"{self.status}; {self.failures.total:,} failing points",
+        ]
+        return "\n".join(lines + [f"  warning: {text}" for text in self.warnings])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain lists, numbers and strings for JSON; NaN and infinities become None."""
+        data = {
+            "p": self.p,
+            "interval": list(self.interval),
+            "confidence": self.confidence,
+            "cov": self.cov,
+            "gamma": self.gamma,
+            "n_sim": self.n_sim,
+            "gain": self.gain,
+            "status": str(self.status),
+            "warnings": list(self.warnings),
+            "trace": [asdict(level) for level in self.trace],
+            "failures": {
+                "x": self.failures.x.tolist(),
+                "f": self.failures.f.tolist(),
+                "log_p0": self.failures.log_p0.tolist(),
+                "total": self.failures.total,
+            },
+            "method": {"name": self.method.name, "settings": method_settings(self.method)},
+            "seed": self.seed,
+        }
+        return {key: _finite(value) for key, value in data.items()}
+
+    def to_json(self) -> str:
+        """Return `to_dict` as one line of JSON."""
+        return json.dumps(self.to_dict(), allow_nan=False)
+
+
+def method_settings(method: "Method") -> dict[str, Any]:
+    """Return the settings of a method as plain values."""
+    return {key: getattr(method, key) for key in getattr(method, "__dataclass_fields__", {})}
+
+
+def _finite(value: Any) -> Any:
+    """Replace NaN and infinities inside value by None."""
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    return value

@@ -1,0 +1,68 @@
+"""Shared by the sampler tests: a generator, counting functions, a study over seeds."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+import samplers
+
+
+class Recorder:
+    """Wraps f and keeps its own books, independent of the package's counter."""
+
+    def __init__(self, f):
+        self.f = f
+        self.batches = []
+
+    def __call__(self, x):
+        self.batches.append(np.array(x))
+        return self.f(x)
+
+    @property
+    def rows(self) -> int:
+        return sum(len(batch) for batch in self.batches)
+
+    @property
+    def points(self):
+        return np.concatenate(self.batches)
+
+
+@dataclass
+class Study:
+    """Many runs on one problem with exact p."""
+
+    p: float
+    results: list
+
+    @property
+    def ratios(self):
+        return np.array([result.p for result in self.results]) / self.p
+
+    @property
+    def covered(self) -> int:
+        return sum(r.interval[0] <= self.p <= r.interval[1] for r in self.results)
+
+    @property
+    def own_cov(self) -> float:
+        return float(np.mean([result.cov for result in self.results]))
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(20240917)
+
+
+@pytest.fixture
+def recorder() -> type[Recorder]:
+    return Recorder
+
+
+@pytest.fixture
+def study() -> Callable[..., Study]:
+    def run(reference, method, runs, **options) -> Study:
+        results = [samplers.estimate(reference.problem, method, seed=seed, **options) for seed in range(runs)]
+        return Study(reference.p, results)
+
+    return run

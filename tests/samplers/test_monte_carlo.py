@@ -1,0 +1,57 @@
+import pytest
+
+import samplers
+from samplers.reference import half_space
+
+EASY = half_space(2, beta=1.5)
+
+
+def test_is_the_share_of_failures_with_the_exact_interval():
+    result = samplers.estimate(EASY.problem, "mc", seed=1, max_sim=2000)
+    assert result.p == result.failures.total / 2000
+    assert result.gain == pytest.approx(1.0)
+    assert result.interval == samplers.intervals.clopper_pearson(result.failures.total, 2000, 0.95)
+
+
+def test_stops_at_the_target():
+    method = samplers.MonteCarlo(batch=500)
+    result = samplers.estimate(EASY.problem, method, seed=1, target_cov=0.1)
+    assert result.cov <= 0.1
+    assert result.status == "converged"
+    # (1 - p) / (p 0.01) = 1397 expected, and one batch more at most
+    assert 1000 <= result.n_sim <= 2500
+    assert result.trace[-2].cov > 0.1
+
+
+def test_says_when_the_target_was_missed():
+    result = samplers.estimate(EASY.problem, "mc", seed=1, target_cov=0.01, max_sim=3000)
+    assert result.status == "budget"
+    assert any("target" in text for text in result.warnings)
+
+
+def test_few_hits_are_worth_a_warning():
+    result = samplers.estimate(EASY.problem, "mc", seed=1, max_sim=100)
+    assert 0 < result.failures.total < 20
+    assert "coarse" in result.warnings[0]
+
+
+def test_draws_from_the_base_itself():
+    """Its points come from base.sample, without a map through standard normal space."""
+
+    class Base(samplers.StandardNormal):
+        def from_standard_normal(self, u):
+            raise AssertionError("not needed")
+
+    class Problem:
+        dim, base = 2, Base(2)
+
+        def evaluate(self, x):
+            return x[:, 0]
+
+    assert samplers.estimate(Problem(), "mc", seed=1, max_sim=100).p > 0.3
+
+
+@pytest.mark.parametrize("settings", [{"n": 0}, {"batch": 0}, {"n": 10.5}])
+def test_settings_out_of_range(settings):
+    with pytest.raises(ValueError, match="whole number of at least 1"):
+        samplers.MonteCarlo(**settings)

@@ -1,0 +1,248 @@
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import samplers
+from samplers.problem import FunctionProblem
+from samplers.reference import half_space, plateau, shell
+from samplers.subset import Chains, Passed, after, descent_cov, described
+
+ADSS = samplers.AdaptiveSubsetSimulation
+
+
+def run(problem, seed=1, **settings):
+    return samplers.estimate(problem, ADSS(**settings), seed=seed)
+
+
+def seeds_of(trace):
+    """Points that each level after the first took over from the one before."""
+    return [round(level.p * level.n_points) for level in trace[:-1]]
+
+
+def test_seeds_are_never_simulated_again(recorder):
+    f = recorder(half_space().problem.f)
+    result = run(FunctionProblem(f, 2))
+    assert len(np.unique(f.points, axis=0)) == f.rows
+    for seeds, level in zip(seeds_of(result.trace), result.trace[1:], strict=True):
+        assert level.n_sim == level.n_points - seeds
+        assert level.n_points == 1000
+    assert result.n_sim == 1000 + sum(1000 - seeds for seeds in seeds_of(result.trace))
+
+
+def test_calls_of_f_are_few_and_large(recorder):
+    f = recorder(half_space().problem.f)
+    result = run(FunctionProblem(f, 2))
+    assert len(f.batches) <= 1 + 10 * (len(result.trace) - 1)
+    assert min(len(batch) for batch in f.batches[1:]) >= 90 or len(f.batches[-1]) >= 1
+    assert np.median([len(batch) for batch in f.batches[1:]]) >= 100
+
+
+def test_no_level_after_the_answer_is_known(recorder):
+    """p = 0.3 is known at level 0, p = 0.02 at level 1."""
+    f = recorder(half_space(2, -stats.norm.ppf(0.3)).problem.f)
+    result = run(FunctionProblem(f, 2))
+    assert result.n_sim == f.rows == 1000
+    assert result.interval == samplers.intervals.clopper_pearson(round(1000 * result.p), 1000, 0.95)
+    result = run(half_space(2, -stats.norm.ppf(0.03)).problem)
+    assert [level.gamma == 0.0 for level in result.trace] == [False, True]
+
+
+def test_p_is_the_product_of_true_shares():
+    result = run(half_space().problem)
+    assert result.p == pytest.approx(math.prod(level.p for level in result.trace))
+    assert [level.gamma for level in result.trace] == sorted((level.gamma for level in result.trace), reverse=True)
+    assert result.trace[-1].gamma == 0.0
+
+
+def test_level_zero_is_part_of_the_cov():
+    result = run(half_space(2, -stats.norm.ppf(0.03)).problem)
+    zero, last = result.trace
+    assert zero.cov == pytest.approx(math.sqrt(0.9 / (0.1 * 1000)))
+    both = math.sqrt((1 + zero.cov**2) * (1 + last.cov**2) - 1)
+    assert result.cov >= both * (1 - 1e-12)
+    assert after(Passed(), zero).cov == pytest.approx(zero.cov)
+
+
+def frozen(chains, steps):
+    """One chain in ten below the threshold, all of its points."""
+    f = np.where(np.arange(chains)[:, None] < chains // 10, -1.0, 1.0) * np.ones((chains, steps))
+    u = np.zeros((chains, steps, 1))
+    return Chains(u, f, np.full(chains, steps), np.arange(chains), chains * (steps - 1), 0.4)
+
+
+def test_chain_correlation_is_in_the_cov_of_a_level():
+    """Chains that never leave their side are worth one point each."""
+    level = described(frozen(100, 10), 0.0, Passed())
+    assert level.p == 0.1
+    assert level.ess == pytest.approx(100)
+    assert level.cov == pytest.approx(math.sqrt(0.9 / (0.1 * 100)))
+
+
+def test_chains_are_kept_apart_end_to_end():
+    """Real chains are correlated: gamma is well above 0; it would vanish with mixed chains."""
+    ess = [level.ess for seed in range(20) for level in run(half_space().problem, seed).trace[1:]]
+    assert 200 < np.mean(ess) < 600
+
+
+def test_descent_cov():
+    """All descendants of one point: worth one point. One each: binomial."""
+    assert descent_cov(np.full(50, 7), 1000) == pytest.approx(math.sqrt(1 - 1 / 1000))
+    assert descent_cov(np.arange(100), 1000) == pytest.approx(math.sqrt(0.9 / (0.1 * 1000)))
+    assert math.isinf(descent_cov(np.empty(0, dtype=int), 1000))
+
+
+def test_own_cov_matches_the_spread(study):
+    """40 % off would be seen; leaving out the chain correlation makes it 35 % too small."""
+    reference, runs = half_space(), 300
+    found = study(reference, ADSS(), runs)
+    spread = found.ratios.std(ddof=1)
+    assert 0.85 < found.own_cov / spread < 1.2
+
+
+@pytest.mark.parametrize("tied", [0.6, 0.9, 0.95])
+def test_ties_at_a_cap(study, tied):
+    reference, runs = plateau(3, 3.0, tied), 60
+    found = study(reference, ADSS(), runs)
+    assert all(result.status == "converged" for result in found.results)
+    error = found.ratios.std(ddof=1) / math.sqrt(runs)
+    assert abs(found.ratios.mean() - 1) < 4 * error + 0.05
+    if tied > 0.9:  # the first share is the true one, about 5 %
+        shares = [result.trace[0].p for result in found.results]
+        assert np.mean(shares) == pytest.approx(0.05, abs=0.005)
+        assert len(set(shares)) > 10
+
+
+def test_a_coarse_scale_of_outcomes(study):
+    """f in steps of 0.5: every threshold is tied."""
+
+    def f(x):
+        return np.ceil(2 * (3.0 - x[:, 0])) / 2
+
+    reference, runs = half_space(2, 3.0), 60
+    found = study(reference._replace(problem=FunctionProblem(f, 2)), ADSS(), runs)
+    error = found.ratios.std(ddof=1) / math.sqrt(runs)
+    assert abs(found.ratios.mean() - 1) < 4 * error + 0.05
+    assert found.covered >= stats.binom.ppf(1e-3, runs, 0.90)
+
+
+def test_stalls_honestly_where_everything_ties():
+    result = run(FunctionProblem(lambda x: np.full(len(x), 10.0), 2))
+    assert result.n_sim == 1000
+    assert result.status == "no_hits"
+    assert result.interval == samplers.intervals.clopper_pearson(0, 1000, 0.95)
+    assert any("No progress" in text for text in result.warnings)
+
+
+def test_gives_up_after_max_levels():
+    result = run(FunctionProblem(lambda x: 30 - x[:, 0], 2), max_levels=4)
+    assert len(result.trace) == 4
+    assert result.p == 0
+    # three levels passed: no larger than 1e-3 times the bound for no hit in about 100 chains
+    assert 1e-6 < result.interval[1] < 1e-3 * 0.1
+
+
+def test_a_budget_in_the_middle_of_a_level_is_used_and_said():
+    result = samplers.estimate(half_space().problem, ADSS(), seed=1, max_sim=3300)
+    assert result.n_sim == 3300
+    assert result.trace[-1].n_sim == 500
+    assert result.trace[-1].n_points == 500 + seeds_of(result.trace)[-1]
+    assert any("max_sim" in text for text in result.warnings) == (result.status != "converged")
+
+
+def test_noise_of_f_is_kept_with_the_point(study):
+    """Fresh noise at every call: simulating the seeds again would bias p by -20 % and more."""
+    noise = np.random.default_rng(3)
+
+    def f(x):
+        return 3.0 - x.sum(axis=1) / math.sqrt(6) + 0.4 * noise.standard_normal(len(x))
+
+    reference = half_space(6)._replace(problem=FunctionProblem(f, 6), p=float(stats.norm.sf(3.0 / math.hypot(1, 0.4))))
+    runs = 150
+    found = study(reference, ADSS(), runs)
+    error = found.ratios.std(ddof=1) / math.sqrt(runs)
+    assert abs(found.ratios.mean() - 1) < 4 * error + 0.04
+
+
+def test_number_of_points_need_not_be_a_multiple_of_the_seeds(study):
+    reference, runs = half_space(2, 2.5), 80
+    found = study(reference, ADSS(n=333, p0=0.13), runs)
+    error = found.ratios.std(ddof=1) / math.sqrt(runs)
+    assert abs(found.ratios.mean() - 1) < 4 * error + 0.1  # bias of order 1/N, three times that
+    assert all(level.n_points == 333 for level in found.results[0].trace)
+
+
+def test_many_dimensions(study):
+    reference, runs = half_space(100), 40
+    found = study(reference, ADSS(), runs)
+    error = found.ratios.std(ddof=1) / math.sqrt(runs)
+    assert abs(found.ratios.mean() - 1) < 4 * error + 0.05
+    assert found.covered >= stats.binom.ppf(1e-3, runs, 0.90)
+    acceptance = [level.acceptance for r in found.results for level in r.trace[1:]]
+    assert 0.3 < np.mean(acceptance) < 0.55  # steered to 0.44
+
+
+def test_no_chains_no_acceptance():
+    trace = run(half_space().problem).trace
+    assert trace[0].acceptance is None
+    assert all(0 < level.acceptance < 1 for level in trace[1:])
+
+
+@pytest.mark.parametrize(
+    "bad", [{"scale": 0.99, "target_acceptance": 1e-6}, {"scale": 1e-3, "target_acceptance": 0.999}]
+)
+def test_warns_of_bad_mixing(bad):
+    """Steps so large that nothing is accepted, and so small that everything is."""
+    problem = half_space(40).problem
+    good = samplers.estimate(problem, ADSS(n=500), seed=1)
+    assert not any("Acceptance" in text for text in good.warnings)
+    result = samplers.estimate(problem, ADSS(n=500, **bad), seed=1, max_sim=3000)
+    assert any("Acceptance" in text for text in result.warnings)
+
+
+def test_seed_deviations_as_in_the_paper(study):
+    reference, runs = half_space(), 60
+    found = study(reference, ADSS(sigma0="seeds"), runs)
+    error = found.ratios.std(ddof=1) / math.sqrt(runs)
+    assert abs(found.ratios.mean() - 1) < 4 * error + 0.05
+
+
+def test_one_dimension():
+    result = run(half_space(1).problem)
+    assert result.p == pytest.approx(half_space(1).p, rel=1.2)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"n": 5},
+        {"p0": 0.0},
+        {"p0": 0.5},
+        {"scale": 0.0},
+        {"target_acceptance": 1.0},
+        {"max_levels": 0},
+        {"sigma0": "sample"},
+    ],
+)
+def test_settings_out_of_range(settings):
+    with pytest.raises(ValueError, match=f"AdaptiveSubsetSimulation: expected .*{next(iter(settings))}"):
+        ADSS(**settings)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("reference", [half_space(2), half_space(10), half_space(100), shell(20)], ids=lambda r: r.name)
+def test_coverage_of_a_single_run(study, reference):
+    runs = 600
+    found = study(reference, ADSS(), runs)
+    assert found.covered >= stats.binom.ppf(1e-3, runs, 0.92)
+    assert 0.85 < found.own_cov / found.ratios.std(ddof=1) < 1.15
+
+
+@pytest.mark.slow
+def test_bias_falls_with_the_number_of_points(study):
+    runs = 400
+    small, large = (study(half_space(), ADSS(n=n), runs) for n in (500, 4000))
+    error = large.ratios.std(ddof=1) / math.sqrt(runs)
+    assert abs(large.ratios.mean() - 1) < 4 * error
+    assert small.ratios.std() > 2 * large.ratios.std()
