@@ -231,9 +231,7 @@ def _call_factory(spec: str) -> Ego | Literal["idm"]:
         with _working_directory_first():
             module = importlib.import_module(module_name)
     except Exception as error:  # the module is the user's: anything may happen in it
-        raise ValueError(
-            f"Cannot import {module_name!r} for the ego {spec!r}: {_one_line(error)}."
-        ) from error
+        raise ValueError(f"Cannot import {module_name!r} for the ego {spec!r}: {_one_line(error)}.") from error
     function = getattr(module, function_name, None)
     if not callable(function):
         names = [name for name in vars(module) if callable(getattr(module, name))]
@@ -245,10 +243,7 @@ def _call_factory(spec: str) -> Ego | Literal["idm"]:
     except Exception as error:  # likewise
         raise ValueError(f"{spec!r} failed to make an ego: {_one_line(error)}.") from error
     if ego != RULE_BASED and not callable(getattr(ego, "predict", None)):
-        raise ValueError(
-            f"Expected {spec!r} to return 'idm' or an object with predict, got "
-            f"{type(ego).__name__}."
-        )
+        raise ValueError(f"Expected {spec!r} to return 'idm' or an object with predict, got {type(ego).__name__}.")
     return cast("Ego | Literal['idm']", ego)
 
 

@@ -67,8 +67,7 @@ def read_header(path: Path) -> dict[str, Any]:
     """
     if not zipfile.is_zipfile(path):
         raise ValueError(
-            f"{str(path)!r} is not a zip file (or is cut short); expected a model saved by "
-            "Stable-Baselines3."
+            f"{str(path)!r} is not a zip file (or is cut short); expected a model saved by Stable-Baselines3."
         )
     try:
         with zipfile.ZipFile(path) as archive:

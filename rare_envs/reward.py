@@ -26,13 +26,15 @@ class RewardTerms(NamedTuple):
     """-0.5 (offset from the centre of the nearest lane / half a lane)^2."""
     risk: Tensor
     """-(1 - TTC / 4 s) where the time to collision is shorter than that."""
+    headway: Tensor
+    """-0.5 (1 - gap / (2 m + 1 s x speed)) where the gap to the lead is shorter than that."""
     collision: Tensor
     """-30 in the tick of a collision, about what a long undisturbed drive is worth under usual discounting."""
 
     @property
     def total(self) -> Tensor:
         """The reward, shape (B,)."""
-        return self.progress + self.comfort + self.lane + self.risk + self.collision
+        return self.progress + self.comfort + self.lane + self.risk + self.headway + self.collision
 
 
 def reward_terms(episode: Episode, action: Tensor) -> RewardTerms:
@@ -49,11 +51,13 @@ def reward_terms(episode: Episode, action: Tensor) -> RewardTerms:
     along = state.speed[:, 0] * torch.cos(state.heading[:, 0])
     offset = state.y[:, 0] - torch.round(state.y[:, 0] / LANE_WIDTH) * LANE_WIDTH
     effort = action / action.new_tensor([MAX_ACCELERATION, MAX_STEERING])
-    ttc = lead.gap.clamp(min=0.0) / lead.closing_speed.clamp(min=1e-4)
+    gap = lead.gap.clamp(min=0.0)
+    ttc = gap / lead.closing_speed.clamp(min=1e-4)
     return RewardTerms(
         progress=(along / TARGET_SPEED).clamp(0.0, 1.0),
         comfort=-0.1 * effort.square().sum(dim=1),
         lane=-0.5 * (offset / (LANE_WIDTH / 2)).square(),
         risk=-(1.0 - ttc / _TTC_COMFORT).clamp(min=0.0),
+        headway=-0.5 * (1.0 - gap / (2.0 + state.speed[:, 0])).clamp(min=0.0),
         collision=-30.0 * episode.collided.to(along.dtype),
     )

@@ -64,6 +64,9 @@ class CrossEntropy:
     - *Ties.* gamma_k is an outcome that occurred; if most outcomes tie, the largest below.
     - *Weights.* The paper samples from the proposal alone, whose weights are unbounded.
 
+    In some hundred dimensions the covariance cannot be learned from a thousand draws and the
+    weights degenerate: the result then carries warnings and a very wide interval.
+
     The interval is log-normal; where the base draws already fail with a share of rho or more,
     plain Monte Carlo draws and Clopper-Pearson take over.
 
@@ -154,11 +157,10 @@ class CrossEntropy:
             f = evaluate_at(problem, u)
             log_weights = Gaussian.standard(problem.dim).log_prob(u) - proposal.log_prob(u)
             level = next_level(f, self.rho, goal.gamma)
-            if level is None:
-                iterates.append(described(proposal, f, log_weights, float(f.min())))
-                return iterates, Status.STALLED
-            iterates.append(described(proposal, f, log_weights, level))
+            iterates.append(described(proposal, f, log_weights, float(f.min()) if level is None else level))
             goal.on_level(iterates[-1].record)
+            if level is None:
+                return iterates, Status.STALLED
             reached = sum(iterate.level == goal.gamma for iterate in iterates)
             if reached == 2 or (reached == 1 and len(iterates) == 1):
                 return iterates, Status.CONVERGED

@@ -2,6 +2,7 @@
 
 References:
     Owen and Zhou, "Safe and effective importance sampling", JASA 95, 2000 (defensive mixtures).
+    Maurer and Pontil, "Empirical Bernstein bounds and sample-variance penalization", COLT 2009.
 """
 
 import math
@@ -109,6 +110,9 @@ def draw_until(
 def interval_of(draws: Draws, confidence: float, largest_weight: float) -> Interval:
     """Return the interval of p: log-normal, with t quantiles where few draws carry it.
 
+    With an effective number of failing draws under LOW_ESS its upper end is at least the one
+    that `bernstein_bound` guarantees.
+
     Without a failing draw p <= largest_weight P_q[failure] gives a one-sided interval. Where all
     weights are 1 the draws are plain Monte Carlo and the interval is Clopper-Pearson's.
     """
@@ -117,7 +121,24 @@ def interval_of(draws: Draws, confidence: float, largest_weight: float) -> Inter
         low, high = clopper_pearson(hits, draws.n, confidence)
         return low, min(1.0, high * largest_weight)
     df = math.inf if draws.ess > MANY_ESS else max(draws.ess / 4, 3.0)
-    return log_normal(draws.p, draws.cov, confidence, df)
+    low, high = log_normal(draws.p, draws.cov, confidence, df)
+    if draws.ess < LOW_ESS:
+        high = max(high, bernstein_bound(draws, confidence, largest_weight))
+    return low, high
+
+
+def bernstein_bound(draws: Draws, confidence: float, largest_weight: float) -> float:
+    """Return an upper bound of p that holds whatever the weights, up to `largest_weight`, do.
+
+    The empirical Bernstein bound of Maurer and Pontil, theorem 4, for the mean of n terms in
+    [0, largest_weight], at the level (1 - confidence) / 2. It is wide (7 / 3 largest_weight / n
+    and more), which is what draws that hardly reach the failures deserve.
+    """
+    log_term = math.log(4 / (1 - confidence))
+    weights = np.exp(draws.log_weights)
+    variance = max(float((weights**2).sum()) / draws.n - draws.p**2, 0.0)
+    slack = 7 * largest_weight * log_term / (3 * max(draws.n - 1, 1))
+    return min(1.0, draws.p + math.sqrt(2 * variance * log_term / draws.n) + slack)
 
 
 def doubts(draws: Draws) -> list[str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import difflib
 import os
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
@@ -11,6 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
+
+from rare_envs.space import did_you_mean
 
 RECENT = 500
 """Episodes that the collision rate beside the progress bar looks back on."""
@@ -111,6 +112,8 @@ def train_ego(
     recipe = _recipe(algo)
     if steps < 1:
         raise ValueError(f"Expected steps >= 1, got {steps}.")
+    if not 0 <= seed < 2**32:
+        raise ValueError(f"Expected a seed from 0 to 2^32 - 1, got {seed}.")
     target = _writable(Path(out))
 
     import stable_baselines3
@@ -139,8 +142,7 @@ def train_ego(
 def _recipe(algo: str) -> Recipe:
     """The recipe of an algorithm by its name."""
     if algo not in RECIPES:
-        near = difflib.get_close_matches(algo.lower(), RECIPES, n=1)
-        hint = f" (did you mean {near[0]!r}?)" if near else ""
+        hint = did_you_mean(algo.lower(), RECIPES)
         raise ValueError(f"Unknown algorithm {algo!r}{hint}; expected one of {', '.join(RECIPES)}.")
     return RECIPES[algo]
 

@@ -6,7 +6,7 @@ from scipy import stats
 
 import samplers
 from samplers.families import Gaussian
-from samplers.importance import Draws, doubts, draw, interval_of, weighted_cov
+from samplers.importance import Draws, bernstein_bound, doubts, draw, interval_of, weighted_cov
 from samplers.problem import FunctionProblem
 from samplers.reference import half_space, plateau, two_modes
 
@@ -74,6 +74,19 @@ def test_a_step_of_the_search_matches_moments():
     np.testing.assert_allclose(np.diag(half.covariance), [0.625 + 1.0, 1.0], atol=0.02)
 
 
+def test_a_step_of_the_search_uses_the_likelihood_ratio(rng):
+    """From N((1.5, 0), I) the step aims at N(0, I) given u1 > 2: mean phi(2) / Phi(-2) = 2.373.
+
+    Without the weights it would be 1.5 + phi(0.5) / Phi(-0.5) = 2.641.
+    """
+    proposal = Gaussian(np.array([1.5, 0.0]), np.eye(2))
+    u = proposal.sample(200_000, rng)
+    u = u[u[:, 0] > 2.0]
+    log_weights = Gaussian.standard(2).log_prob(u) - proposal.log_prob(u)
+    moved = CE(alpha=1.0)._moved(proposal, u, log_weights)
+    np.testing.assert_allclose(moved.mean, [stats.norm.pdf(2) / stats.norm.sf(2), 0.0], atol=0.02)
+
+
 def test_mean_family_keeps_the_covariance():
     moved = CE(family="mean")._moved(Gaussian.standard(2), np.full((9, 2), 3.0), np.zeros(9))
     np.testing.assert_allclose(moved.mean, 0.8 * 3.0)
@@ -130,6 +143,25 @@ def test_warns_when_few_draws_carry_the_estimate():
     assert light[1] / light[0] < 1.3
     wide = interval_of(heavy, 0.95, 10.0)
     assert wide[1] / wide[0] > 10
+
+
+def test_interval_of_a_hopeless_proposal_still_holds_p():
+    """d = 300: the weights degenerate, p-hat is far too small, and the result does not hide it."""
+    reference = half_space(300)
+    for seed in range(4):
+        result = samplers.estimate(reference.problem, CE(), seed=seed, max_sim=4000)
+        assert result.interval[0] <= reference.p <= result.interval[1]
+        assert result.warnings
+
+
+def test_bernstein_bound_holds(rng):
+    """Two-point weights, mostly unseen: the mean stays under the bound."""
+    held = 0
+    for _ in range(400):
+        hits = rng.binomial(1000, 0.001)  # weight 10 with probability 1/1000: p = 0.01
+        draws = Draws(1000, np.zeros(hits), np.full(hits, math.log(10.0)))
+        held += bernstein_bound(draws, 0.95, 10.0) >= 0.01
+    assert held >= stats.binom.ppf(1e-3, 400, 0.975)
 
 
 def test_warns_when_the_search_ends_early():

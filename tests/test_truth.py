@@ -1,0 +1,56 @@
+"""The methods against the long Monte Carlo reference in traffic (`benchmarks/truth.json`)."""
+
+import json
+
+import pytest
+from scipy import stats
+
+import rare_envs
+import samplers
+from benchmarks.against_truth import compare
+from benchmarks.truth import RESULT
+
+TRUTH = json.loads(RESULT.read_text())["results"]
+
+
+def test_the_reference_is_long_and_complete() -> None:
+    assert [(row["env_id"], row["base"]) for row in TRUTH] == [
+        (env_id, base) for env_id in rare_envs.ENV_IDS for base in ("us101", "highway")
+    ]
+    for row in TRUTH:
+        assert row["rollouts"] >= 1e7
+        assert row["p"] == row["collisions"] / row["rollouts"]
+        # rare and measurable, as far as 10 million rollouts can tell
+        assert 5e-5 < row["p"] < 2e-3
+        if row["base"] == "highway":
+            assert 1e-4 < row["p"] < 1e-3
+
+
+@pytest.mark.parametrize("row", TRUTH, ids=lambda row: f"{row['env_id']}-{row['base']}")
+def test_the_reference_is_what_the_simulation_gives_now(row: dict[str, float]) -> None:
+    """100,000 fresh rollouts: the count is binomial with the reference's p."""
+    env_id, base = str(row["env_id"]), str(row["base"])
+    result = samplers.estimate(
+        rare_envs.DrivingProblem(env_id, base=base), samplers.MonteCarlo(), max_sim=100_000, seed=99
+    )
+    hits = round(result.p * result.n_sim)
+    test = stats.binomtest(hits, result.n_sim, row["p"])
+    assert test.pvalue > 1e-4
+
+
+@pytest.mark.parametrize("method", ["ce", "adss"])
+def test_a_few_seeds(method: str) -> None:
+    cell = compare(TRUTH[0], method, range(6))
+    # a t distribution with 5 degrees of freedom is beyond 6.9 once in a thousand times
+    assert abs(cell.z) < 6.9
+    assert 0.5 < cell.mean / cell.truth < 2.0
+    assert cell.coverage >= 0.5  # at a true coverage of 90 % missed once in 800 times
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", list(samplers.METHODS))
+@pytest.mark.parametrize("row", TRUTH, ids=lambda row: f"{row['env_id']}-{row['base']}")
+def test_forty_seeds(row: dict[str, float], method: str) -> None:
+    cell = compare(row, method, range(1000, 1040))
+    assert abs(cell.z) <= 3.0
+    assert cell.coverage >= 0.8
