@@ -10,8 +10,8 @@ from samplers.method import Goal, Outcome, check_count, no_outcome_share
 from samplers.problem import FloatArray, Problem
 from samplers.result import Level, Status
 
-MANY_FAILURES = 20
-"""Fewer hits than this leave a c.o.v. above about 0.22: worth a warning."""
+MANY_FAILURES = 5
+"""Fewer hits than this leave a c.o.v. above about 0.45 (half, in subset simulation): worth a warning."""
 
 
 @dataclass(frozen=True, kw_only=True)
