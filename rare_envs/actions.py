@@ -24,7 +24,7 @@ def to_physical(action: Tensor, batch: int) -> Tensor:
     """Scale actions to physical units.
 
     Args:
-        action: Shape (B, 2) in [-1, 1] (clipped), or (B,) integers that index `DISCRETE_ACTIONS`.
+        action: Shape (B, 2) in [-1, 1] (clipped, taken as float32), or (B,) integers that index `DISCRETE_ACTIONS`.
         batch: B.
 
     Returns:
@@ -37,6 +37,7 @@ def to_physical(action: Tensor, batch: int) -> Tensor:
         if bool(((action < 0) | (action >= len(DISCRETE_ACTIONS))).any()):
             raise ValueError(f"Expected action indices in 0..{len(DISCRETE_ACTIONS) - 1}, got {action.tolist()[:5]}.")
         action = torch.from_numpy(DISCRETE_ACTIONS)[action]
+    action = action.float()  # a policy's float64 must mean the same here and in `Env.step`
     if action.shape != (batch, 2):
         raise ValueError(
             f"Expected actions of shape ({batch}, 2) in [-1, 1] (acceleration, steering), got {tuple(action.shape)}."

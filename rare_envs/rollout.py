@@ -1,9 +1,31 @@
 """The one time loop."""
 
+from collections.abc import Iterator
+
 from torch import Tensor
 
 from rare_envs.drivers import Driver
 from rare_envs.world import Episode, World
+
+
+def drive(world: World, driver: Driver, x: Tensor) -> Iterator[Episode]:
+    """Drive B scenarios, moment by moment.
+
+    Args:
+        world: The world.
+        driver: The ego.
+        x: Scenario parameters, shape (B, d).
+
+    Yields:
+        The episodes at time 0 and after each tick up to the horizon. Rows in which the ego has collided are moved on
+        with the others, but their f stays -1.
+    """
+    episode, memory = world.start(x), None
+    yield episode
+    for _ in range(world.ticks):
+        action, memory = driver.act(episode.state, episode.lead, memory)
+        episode = world.step(episode, action)
+        yield episode
 
 
 def rollout(world: World, driver: Driver, x: Tensor) -> Episode:
@@ -15,11 +37,8 @@ def rollout(world: World, driver: Driver, x: Tensor) -> Episode:
         x: Scenario parameters, shape (B, d).
 
     Returns:
-        The episodes at the horizon; `.f` is the safety measure, shape (B,). Rows in which the ego has collided are
-        moved on with the others, but their f stays -1.
+        The episodes at the horizon; `.f` is the safety measure, shape (B,).
     """
-    episode, memory = world.start(x), None
-    for _ in range(world.ticks):
-        action, memory = driver.act(episode.state, episode.lead, memory)
-        episode = world.step(episode, action)
-    return episode
+    for episode in drive(world, driver, x):
+        last = episode
+    return last

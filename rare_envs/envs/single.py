@@ -86,7 +86,7 @@ class DrivingEnv(gym.Env[Observation, NDArray[np.float32]]):
         if self._episode is None:
             raise RuntimeError("Expected reset() before step().")
         with torch.inference_mode():
-            physical = to_physical(torch.as_tensor(np.asarray(action, np.float32))[None], 1)
+            physical = to_physical(torch.as_tensor(np.asarray(action))[None], 1)
             episode = self.world.step(self._episode, physical)
             terms = reward_terms(episode, physical)
             observation = observe(episode.state)[0].numpy()

@@ -101,7 +101,7 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArr
         if self._episode is None:
             raise RuntimeError("Expected reset() before step().")
         with torch.inference_mode():
-            physical = to_physical(torch.as_tensor(np.asarray(actions, np.float32)), self.num_envs)
+            physical = to_physical(torch.as_tensor(np.asarray(actions)), self.num_envs)
             episode = self.world.step(self._episode, physical)
             terms = reward_terms(episode, physical)
             observation = observe(episode.state).numpy()

@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from rare_envs import DrivingProblem
+from rare_envs.rollout import drive
 
 
 class Replay(NamedTuple):
@@ -47,14 +48,12 @@ def replay(problem: DrivingProblem, x: NDArray[np.float64]) -> Replay:
     Returns:
         The drive.
     """
-    world, driver = problem.world, problem.driver
+    world, episodes = problem.world, []
     # single precision, as in `DrivingProblem.evaluate`, so that f comes out the same
-    episode, memory = world.start(torch.from_numpy(x).float()[None]), None
-    episodes = [episode]
-    while len(episodes) <= world.ticks and not bool(episode.collided):
-        action, memory = driver.act(episode.state, episode.lead, memory)
-        episode = world.step(episode, action)
+    for episode in drive(world, problem.driver, torch.from_numpy(x).float()[None]):
         episodes.append(episode)
+        if bool(episode.collided):
+            break
     states = [each.state for each in episodes]
     x_y = torch.stack([torch.stack((s.x[0], s.y[0]), dim=-1) for s in states])
     return Replay(
@@ -65,7 +64,7 @@ def replay(problem: DrivingProblem, x: NDArray[np.float64]) -> Replay:
         gap=torch.stack([each.lead.gap[0] for each in episodes]).double().numpy(),
         closing_speed=torch.stack([each.lead.closing_speed[0] for each in episodes]).double().numpy(),
         worst=int(torch.cat([each.f for each in episodes]).argmin()),
-        f=float(episode.f),
-        collided=bool(episode.collided),
+        f=float(episodes[-1].f),
+        collided=bool(episodes[-1].collided),
         lanes=world.scenario.lanes,
     )

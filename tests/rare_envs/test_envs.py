@@ -23,7 +23,7 @@ ids = pytest.mark.parametrize("env_id", ENV_IDS)
 class Scripted:
     """An ego with SB3's `predict`: a fixed sequence of actions, then the last one for ever."""
 
-    def __init__(self, actions: NDArray[np.float32]) -> None:
+    def __init__(self, actions: NDArray[np.float64]) -> None:
         self.actions = actions
 
     def predict(
@@ -34,16 +34,9 @@ class Scripted:
         return np.repeat(action[None], len(observation), axis=0), (tick + 1,)
 
 
-def scripted_actions(seed: int = 0) -> NDArray[np.float32]:
+def scripted_actions(seed: int = 0) -> NDArray[np.float64]:
     rng = np.random.default_rng(seed)
-    return np.stack([rng.uniform(-0.7, 1.0, 100), rng.uniform(-0.05, 0.05, 100)], axis=1).astype(np.float32)
-
-
-def idm_action(env: Any) -> NDArray[np.float32]:
-    """The IDM ego's action, as an agent of the environment would give it (accelerations are within +-5 m/s^2)."""
-    episode = env.unwrapped._episode
-    physical = IDM().act(episode.state, episode.lead, None)[0][0]
-    return (physical / torch.tensor([5.0, 0.1])).numpy()
+    return np.stack([rng.uniform(-0.7, 1.0, 100), rng.uniform(-0.05, 0.05, 100)], axis=1)
 
 
 @ids
