@@ -20,12 +20,13 @@ def action_space() -> "spaces.Box[np.float32]":
     return spaces.Box(-1.0, 1.0, (2,), np.float32)
 
 
-def to_physical(action: Tensor, batch: int) -> Tensor:
+def to_physical(action: Tensor, batch: int, ignored: Tensor | None = None) -> Tensor:
     """Scale actions to physical units.
 
     Args:
         action: Shape (B, 2) in [-1, 1] (clipped, taken as float32), or (B,) integers that index `DISCRETE_ACTIONS`.
         batch: B.
+        ignored: Rows whose action does not matter, boolean of shape (B,); they get 0.
 
     Returns:
         Acceleration [m/s^2] and steering angle [rad], shape (B, 2).
@@ -33,6 +34,8 @@ def to_physical(action: Tensor, batch: int) -> Tensor:
     Raises:
         ValueError: If shape or values are not those of an action.
     """
+    if ignored is not None and action.shape[:1] == (batch,):
+        action = torch.where(ignored.reshape(-1, *[1] * (action.ndim - 1)), torch.zeros_like(action), action)
     if action.shape == (batch,) and not action.is_floating_point():
         if bool(((action < 0) | (action >= len(DISCRETE_ACTIONS))).any()):
             raise ValueError(f"Expected action indices in 0..{len(DISCRETE_ACTIONS) - 1}, got {action.tolist()[:5]}.")

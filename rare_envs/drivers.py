@@ -1,16 +1,21 @@
 """Drivers: what decides an acceleration and a steering angle. IDM, lane keeping and policies with `predict`."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from rare_envs.actions import to_physical
 from rare_envs.geometry import Lead
 from rare_envs.observation import observe
-from rare_envs.state import LANE_WIDTH, VEHICLE_LENGTH, State
+from rare_envs.state import LANE_WIDTH, VEHICLE_LENGTH
+
+if TYPE_CHECKING:
+    from rare_envs.world import Episode
 
 _NEAR_ZERO = 0.01
 """HighwayEnv's `not_zero`: distances [m] and speeds [m/s] in a denominator are kept at least this far from 0."""
@@ -19,12 +24,11 @@ _NEAR_ZERO = 0.01
 class Driver(Protocol):
     """An ego. Its memory, if it has any, goes in and out, so that one driver serves any number of rollouts."""
 
-    def act(self, state: State, lead: Lead, memory: Any) -> tuple[Tensor, Any]:
+    def act(self, episode: "Episode", memory: Any) -> tuple[Tensor, Any]:
         """Decide for one tick.
 
         Args:
-            state: Traffic of B scenarios.
-            lead: The ego's lead.
+            episode: B scenarios at this moment; what is decided for those that have collided does not matter.
             memory: What the last call returned, None at the start.
 
         Returns:
@@ -90,11 +94,12 @@ class IDM:
         acceleration: Tensor = self.max_acceleration * (1.0 - free - crowding.square())
         return acceleration.clamp(min=-self.max_deceleration)
 
-    def act(self, state: State, lead: Lead, memory: Any) -> tuple[Tensor, Any]:
+    def act(self, episode: "Episode", memory: Any) -> tuple[Tensor, Any]:
         """IDM behind the lead, lane keeping across; no memory."""
+        state = episode.state
         speed = state.speed[:, 0]
         steering = lane_keeping(state.y[:, 0], state.heading[:, 0], speed)
-        return torch.stack((self.acceleration(speed, lead), steering), dim=1), memory
+        return torch.stack((self.acceleration(speed, episode.lead), steering), dim=1), memory
 
 
 def lane_keeping(y: Tensor, heading: Tensor, speed: Tensor) -> Tensor:
@@ -123,17 +128,25 @@ class PolicyDriver:
     """Any object with Stable-Baselines3's `predict`, called on the whole batch."""
 
     policy: Any
+    normalise: Callable[[NDArray[np.float32]], NDArray[np.float32]] | None = None
+    """What the policy's observations went through in training, such as SB3's `VecNormalize.normalize_obs`."""
 
-    def act(self, state: State, lead: Lead, memory: Any) -> tuple[Tensor, Any]:
+    def act(self, episode: "Episode", memory: Any) -> tuple[Tensor, Any]:
         """Observe, and ask the policy for its mean action; a recurrent policy's hidden state is the memory.
+
+        No episode shows a policy what comes after its collision, so those rows are shown zeros and their actions,
+        which need not be finite, are ignored.
 
         Raises:
             ValueError: If the policy's actions are not finite or have the wrong shape.
         """
-        batch = state.x.shape[0]
+        state, over = episode.state, episode.collided
+        batch = len(over)
         start = np.full(batch, memory is None)
         hidden = None if memory is None else memory[0]
-        observation = observe(state).numpy(force=True)
+        observation = observe(state).masked_fill(over[:, None], 0.0).numpy(force=True)
+        if self.normalise is not None:
+            observation = self.normalise(observation)
         action, hidden = self.policy.predict(observation, state=hidden, episode_start=start, deterministic=True)
-        physical = to_physical(torch.as_tensor(np.asarray(action)), batch)
+        physical = to_physical(torch.as_tensor(np.asarray(action)).to(state.x.device), batch, over)
         return physical.to(state.x), (hidden,)

@@ -78,7 +78,10 @@ class LogMixture:
         Raises:
             ValueError: A key is missing or its value is not valid.
         """
-        chosen = np.asarray(data.get("logarithmic", ()), dtype=bool)
+        flags = data.get("logarithmic")
+        if not isinstance(flags, list | tuple) or not all(isinstance(flag, bool) for flag in flags):
+            raise ValueError(f"Expected logarithmic as a list of true and false, got {flags!r}.")
+        chosen = np.asarray(flags, dtype=bool)
         box, logs = {}, {}
         for end in ("low", "high"):
             box[end] = np.asarray(data.get(end, ()), dtype=np.float64)

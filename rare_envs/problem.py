@@ -60,13 +60,11 @@ class DrivingProblem:
         """
         if noise not in (True, False, "fixed"):
             raise ValueError(f"Expected noise True, False or 'fixed', got {noise!r}.")
-        if base is not None:
-            make_kwargs["base"] = base
         self.env_id = env_id
         self.ego = ego
         self.world: World
         self.space: ScenarioSpace
-        self.world, self.space = set_up(env_id, measure=measure, **make_kwargs)
+        self.world, self.space = set_up(env_id, measure=measure, base=base, **make_kwargs)
         self.driver = as_driver(ego, self.world)
 
     @property
@@ -111,9 +109,14 @@ def as_driver(ego: Any, world: World) -> Driver:
         if ego == "idm":
             return IDM()
         raise ValueError(f"Unknown ego {ego!r}; expected 'idm' or an object with predict (files: agents.load_ego).")
+    if isinstance(ego, type):
+        raise ValueError(f"Expected an ego, got the class {ego.__name__}; make or train one of it first.")
     if callable(getattr(ego, "predict", None)):
         check_spaces(ego, observation_space(world.scenario.vehicles))
-        return PolicyDriver(ego)
+        # a model trained behind SB3's VecNormalize wants its observations as they were then
+        statistics = getattr(ego, "get_vec_normalize_env", lambda: None)()
+        normalise = statistics.normalize_obs if statistics is not None and statistics.norm_obs else None
+        return PolicyDriver(ego, normalise)
     if callable(getattr(ego, "act", None)):
         driver: Driver = ego
         return driver

@@ -37,4 +37,6 @@ def make_batch(env_id: str, num_envs: int, **kwargs: Any) -> VectorEnv[Any, Any,
     from rare_envs.setup import find_scenario
 
     find_scenario(env_id)
+    if not isinstance(num_envs, int) or num_envs < 1:
+        raise ValueError(f"Expected num_envs of at least 1, got {num_envs!r}.")
     return gym.make_vec(env_id, num_envs=num_envs, vectorization_mode="vector_entry_point", **kwargs)

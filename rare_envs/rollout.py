@@ -23,7 +23,7 @@ def drive(world: World, driver: Driver, x: Tensor) -> Iterator[Episode]:
     episode, memory = world.start(x), None
     yield episode
     for _ in range(world.ticks):
-        action, memory = driver.act(episode.state, episode.lead, memory)
+        action, memory = driver.act(episode, memory)
         episode = world.step(episode, action)
         yield episode
 

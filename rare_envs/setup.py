@@ -18,9 +18,9 @@ def find_scenario(env_id: str) -> Scenario:
     Raises:
         ValueError: If there is none; the message suggests the nearest id and lists all.
     """
-    if env_id in SCENARIOS:
+    if isinstance(env_id, str) and env_id in SCENARIOS:
         return SCENARIOS[env_id]
-    hint = did_you_mean(env_id, SCENARIOS)
+    hint = did_you_mean(str(env_id), SCENARIOS)
     raise ValueError(f"Unknown environment {env_id!r}{hint}; the environments are {', '.join(SCENARIOS)}.")
 
 
@@ -32,7 +32,7 @@ def set_up(
     measure: str = "ttc",
     horizon: float | None = None,
     dt: float = 0.1,
-    base: Any = "us101",
+    base: Any = None,
 ) -> tuple[World, ScenarioSpace]:
     """The world and the scenario space of an environment.
 
@@ -43,7 +43,7 @@ def set_up(
         measure: Name of the safety measure, "ttc".
         horizon: Length of an episode [s]; None takes the scenario's.
         dt: Tick [s].
-        base: "us101", "highway", the path of a JSON file, or a distribution object.
+        base: "us101", "highway", the path of a JSON file, or a distribution object; None takes "us101".
 
     Returns:
         The world and the space of its parameters.
@@ -61,11 +61,11 @@ def set_up(
         units=tuple(p.unit for p in parameters),
         low=np.array([p.low for p in parameters]),
         high=np.array([p.high for p in parameters]),
-        base=load_base(scenario.name, base),
+        base=load_base(scenario.name, "us101" if base is None else base),
     )
     return world, space
 
 
-def _one_of(what: str, value: str, valid: tuple[str, ...]) -> None:
+def _one_of(what: str, value: object, valid: tuple[str, ...]) -> None:
     if value not in valid:
         raise ValueError(f"Unknown {what} {value!r}; expected one of {', '.join(map(repr, valid))}.")

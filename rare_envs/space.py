@@ -43,6 +43,8 @@ class Distribution(Protocol):
         """Inverse of `to_standard_normal`, (n, d) -> (n, d)."""
 
 
+_TRIAL_DRAWS = 1000
+"""Draws by which a user's distribution is tried before it is used."""
 METHODS = ("sample", "log_prob", "to_standard_normal", "from_standard_normal")
 
 
@@ -187,13 +189,15 @@ class ScenarioSpace:
             ValueError: Unknown name, wrong shape, NaN, or a value outside its range.
         """
         options = {} if options is None else options
+        if not isinstance(options, Mapping):
+            raise ValueError(f"Expected options as a mapping of parameter names to values, got {options!r}.")
         if "x" in options:
             return self._given_x(options, n)
         columns = {self._index(name): self._column(name, value, n) for name, value in options.items()}
         points = np.array(self.base.sample(n, rng), dtype=np.float64)
         for j, column in columns.items():
             points[:, j] = column
-        return points
+        return self.validate(points)
 
     def _given_x(self, options: Mapping[str, Any], n: int) -> Array:
         others = sorted(str(name) for name in options if name != "x")
@@ -315,13 +319,17 @@ def _checked_object(scenario: str, base: object) -> Distribution:
             f"{', '.join(missing)}."
         )
     law = cast(Distribution, base)
-    names = [p.name for p in PARAMETERS[scenario]]
-    shape = np.shape(law.sample(1, np.random.default_rng(0)))
-    if shape != (1, len(names)):
+    box = PARAMETERS[scenario]
+    draws = np.asarray(law.sample(_TRIAL_DRAWS, np.random.default_rng(0)), dtype=np.float64)
+    wrong = f"Base distribution {type(base).__name__} does not fit {scenario}: "
+    if draws.shape != (_TRIAL_DRAWS, len(box)):
         raise ValueError(
-            f"Base distribution {type(base).__name__} does not fit {scenario}: sample(1, rng) must "
-            f"have shape (1, {len(names)}), one column for each of {', '.join(names)}; got {shape}."
+            f"{wrong}sample({_TRIAL_DRAWS}, rng) must have shape ({_TRIAL_DRAWS}, {len(box)}), one column for each "
+            f"of {', '.join(p.name for p in box)}; got {draws.shape}."
         )
+    for p, column in zip(box, draws.T, strict=True):
+        if not ((column >= p.low) & (column <= p.high)).all():  # NaN is outside too
+            raise ValueError(f"{wrong}it draws {p.name} outside [{p.low:g}, {p.high:g}] {p.unit}; truncate it.")
     return law
 
 

@@ -1,6 +1,7 @@
 """The world: a scenario with its clock and its measure, as pure functions from episode to episode."""
 
 from dataclasses import dataclass
+from numbers import Real
 from typing import NamedTuple
 
 import torch
@@ -30,6 +31,10 @@ class Episode(NamedTuple):
         return torch.where(self.collided, COLLISION, self.danger)
 
 
+def _is_number(value: object) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool)
+
+
 @dataclass(frozen=True)
 class World:
     """A scenario, its tick and its measure. Nothing here changes, and nothing is random."""
@@ -42,13 +47,14 @@ class World:
     measure: str = "ttc"
 
     def __post_init__(self) -> None:
-        if not (0.0 < self.dt <= 1.0):
-            raise ValueError(f"Expected dt in (0, 1] s, got {self.dt}.")
+        if not (_is_number(self.dt) and 0.0 < self.dt <= 1.0):
+            raise ValueError(f"Expected dt in (0, 1] s, got {self.dt!r}.")
         if self.horizon is None:
             object.__setattr__(self, "horizon", self.scenario.horizon)
-        if not (self.dt <= self.seconds < float("inf")):
-            raise ValueError(f"Expected a horizon of at least one tick ({self.dt} s), got {self.horizon}.")
-        if self.measure not in MEASURES:
+        whole = _is_number(self.horizon) and self.dt <= self.seconds < 1e6
+        if not whole or abs(self.seconds / self.dt - self.ticks) > 1e-6:
+            raise ValueError(f"Expected a horizon of one or more whole ticks of {self.dt} s, got {self.horizon!r}.")
+        if not isinstance(self.measure, str) or self.measure not in MEASURES:
             raise ValueError(f"Unknown measure {self.measure!r}; the measures are {', '.join(MEASURES)}.")
 
     @property

@@ -1,6 +1,6 @@
 """Fits the base distributions `us101` to recorded traffic and writes the JSON files of the package.
 
-    python -m training.fit_scenarios --data ../shared/data --out rare_envs/data
+    python -m training.fit_scenarios --data DIR --out rare_envs/data
 
 Events (one per row of a CSV file) are filtered, standardised, and fitted with Gaussian mixtures with
 full covariances; the number of components is the one with the least Bayesian information criterion.
@@ -32,7 +32,7 @@ from training.highway_base import highway_base
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-COMMAND = "python -m training.fit_scenarios --data ../shared/data --out rare_envs/data"
+COMMAND = "python -m training.fit_scenarios --data DIR --out rare_envs/data"
 SOURCE = {
     "data": "Next Generation Simulation (NGSIM) Vehicle Trajectories and Supporting Data, US 101 "
     "(Los Angeles, southbound, 15 June 2005, 07:50 local time, congested)",

@@ -47,12 +47,13 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArr
         Raises:
             ValueError: If an argument is invalid.
         """
-        if num_envs < 1:
-            raise ValueError(f"Expected num_envs of at least 1, got {num_envs}.")
+        if not isinstance(num_envs, (int, np.integer)) or isinstance(num_envs, bool) or num_envs < 1:
+            raise ValueError(f"Expected num_envs of at least 1, got {num_envs!r}.")
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"Expected render_mode None or 'rgb_array' for a batch, got {render_mode!r}.")
         self.world, self.space = set_up(env_id, **kwargs)
-        self.num_envs = num_envs
+        self.metadata = {**self.metadata, "render_fps": round(1.0 / self.world.dt)}
+        self.num_envs = int(num_envs)
         self.render_mode = render_mode
         self.single_observation_space = observation_space(self.world.scenario.vehicles)
         self.single_action_space = action_space()
@@ -61,7 +62,7 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArr
         self._x = np.full((num_envs, self.space.dim), np.nan)
         self._tick = np.zeros(num_envs, dtype=np.int64)
         self._episode: Episode | None = None
-        self._renderers: list[Renderer] = []
+        self._renderer: Renderer | None = None
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
@@ -165,9 +166,9 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArr
         if self.render_mode is None or self._episode is None:
             gym.logger.warn("Nothing to render: pass render_mode='rgb_array' to gym.make_vec and reset first.")
             return None
-        if not self._renderers:
-            self._renderers = [Renderer(self.world.scenario.lanes, False, 10)]
-        episode, draw = self._episode, self._renderers[0].draw
+        if self._renderer is None:
+            self._renderer = Renderer(self.world.scenario.lanes, False, self.metadata["render_fps"])
+        episode, draw = self._episode, self._renderer.draw
         return tuple(
             draw(State(*(field[row : row + 1] for field in episode.state)), bool(episode.collided[row])).copy()
             for row in range(self.num_envs)

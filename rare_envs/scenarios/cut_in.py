@@ -55,7 +55,7 @@ def bezier(progress: Tensor, length: Tensor, offset: Tensor) -> tuple[Tensor, Te
 
 
 def others(state: State, dt: float) -> Others:
-    """The lead keeps its speed; the cutter follows its path, slows for the lead by IDM and else keeps its speed.
+    """The lead keeps its speed; the cutter follows its path, its speed is IDM's behind the lead.
 
     The released code of Tian et al. also steers the cutter along a Bezier (30 m long, by pure pursuit, with the ego's
     IDM); ours is exactly on the curve, whose length grows with the speed, and its desired speed is its initial one.

@@ -143,7 +143,7 @@ def _try_ego(problem: rare_envs.DrivingProblem) -> None:
     x = problem.space.sample(2, np.random.default_rng(0))
     start = problem.world.start(torch.from_numpy(x).float())
     try:
-        problem.driver.act(start.state, start.lead, None)
+        problem.driver.act(start, None)
     except Exception as error:  # the ego is the user's: anything may happen in it
         raise BadInput(f"The ego fails on its first observation: {error or type(error).__name__}") from error
 

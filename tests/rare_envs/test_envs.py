@@ -15,6 +15,8 @@ from rare_envs.actions import DISCRETE_ACTIONS, to_physical
 from rare_envs.drivers import IDM
 from rare_envs.envs.vector import DrivingVectorEnv
 from rare_envs.observation import CLIP, observation_space
+from rare_envs.scenarios import SCENARIOS
+from rare_envs.space import PARAMETERS
 
 ENV_IDS = rare_envs.ENV_IDS
 ids = pytest.mark.parametrize("env_id", ENV_IDS)
@@ -74,7 +76,7 @@ def test_env_and_rollout_agree_bit_for_bit_with_a_rule_based_ego(env_id: str) ->
         while not done:
             # the physical action, not its float32 image in [-1, 1], which rounds
             episode = env.unwrapped._episode  # type: ignore[attr-defined]
-            action = IDM().act(episode.state, episode.lead, None)[0]
+            action = IDM().act(episode, None)[0]
             env.unwrapped._episode = env.unwrapped.world.step(episode, action)  # type: ignore[attr-defined]
             env.unwrapped._tick += 1  # type: ignore[attr-defined]
             done = bool(env.unwrapped._episode.collided) or env.unwrapped._tick == env.unwrapped.world.ticks  # type: ignore[attr-defined]
@@ -235,3 +237,81 @@ def test_bad_arguments_are_refused_at_the_door() -> None:
         rare_envs.make_batch("rare_envs/CutInn-v0", 4)
     with pytest.raises(ValueError, match="num_envs"):
         rare_envs.make_batch("rare_envs/CutIn-v0", 0)
+
+
+@ids
+def test_episodes_after_a_replacement_are_those_of_the_single_env(env_id: str) -> None:
+    """Nothing of an ended episode, not its clock and not its least time to collision, is left in the next."""
+    batch, env = rare_envs.make_batch(env_id, 6, horizon=3.0), gym.make(env_id, horizon=3.0)
+    observation, infos = batch.reset(seed=5)
+    rng = np.random.default_rng(0)
+    x, given = infos["x"].copy(), [[] for _ in range(6)]  # type: ignore[var-annotated]
+    lives = np.zeros(6, dtype=int)
+    for _ in range(120):
+        actions = np.stack([rng.uniform(-0.2, 1.0, 6), rng.uniform(-0.2, 0.2, 6)], axis=1)
+        for row in range(6):
+            given[row].append(actions[row])
+        observation, reward, terminated, truncated, infos = batch.step(actions)
+        for row in np.flatnonzero(terminated | truncated):
+            env.reset(options={"x": x[row]})
+            for action in given[row]:
+                last = env.step(action)
+            final = infos["final_info"]
+            np.testing.assert_array_equal(last[0], infos["final_obs"][row])
+            assert last[1] == pytest.approx(reward[row], rel=1e-6)
+            assert last[2:4] == (terminated[row], truncated[row])
+            assert last[4]["measure"] == final["measure"][row]
+            assert last[4]["min_ttc"] == final["min_ttc"][row]
+            assert last[4]["collision_type"] == final["collision_type"][row]
+            x[row], given[row], lives[row] = infos["x"][row], [], lives[row] + 1
+            np.testing.assert_array_equal(env.reset(options={"x": x[row]})[0], observation[row])
+    assert lives.min() >= 3
+
+
+def test_reward_by_hand() -> None:
+    env = gym.make("rare_envs/CarFollowing-v0")
+    env.reset(options={"x": [20.0, 15.0, 14.5]})
+    _, reward, _, _, info = env.step(np.array([0.5, 0.0]))
+    # after the tick: speed 20.25, gap 14.5 - 0.5 = 14, closing at 5.25
+    terms = {
+        "progress": 20.25 / 21.72,
+        "comfort": -0.1 * 0.5**2,
+        "lane": 0.0,
+        "risk": -(1.0 - (14.0 / 5.25) / 4.0),
+        "headway": -0.5 * (1.0 - 14.0 / 22.25),
+        "collision": 0.0,
+    }
+    assert info["reward_terms"] == pytest.approx(terms, abs=1e-6)
+    assert reward == pytest.approx(sum(terms.values()), abs=1e-6)
+    env.reset(options={"x": [20.0, 15.0, 1.0]})
+    for _ in range(3):
+        _, _, terminated, _, info = env.step(np.array([1.0, 0.0]))
+    assert terminated
+    assert info["reward_terms"]["collision"] == -30.0
+
+
+def test_registered_ids_are_the_scenarios() -> None:
+    assert tuple(SCENARIOS) == ENV_IDS
+    assert {scenario.name for scenario in SCENARIOS.values()} == set(PARAMETERS)
+
+
+def test_wrong_types_are_value_errors() -> None:
+    for kwargs in (
+        {"dt": "0.1"},
+        {"dt": True},
+        {"dt": None},
+        {"horizon": "10"},
+        {"horizon": 0.25},
+        {"measure": ["ttc"]},
+    ):
+        with pytest.raises(ValueError, match=r"Expected|measure"):
+            gym.make("rare_envs/CutIn-v0", **kwargs)
+    env = gym.make("rare_envs/CutIn-v0").unwrapped
+    for options in ([], "abc", 3):
+        with pytest.raises(ValueError, match="mapping"):
+            env.reset(options=options)  # type: ignore[arg-type]
+    for num_envs in (2.5, "3", 0):
+        with pytest.raises(ValueError, match="num_envs"):
+            rare_envs.make_batch("rare_envs/CutIn-v0", num_envs)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="Unknown environment None"):
+        rare_envs.DrivingProblem(None)  # type: ignore[arg-type]

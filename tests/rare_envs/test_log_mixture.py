@@ -62,3 +62,9 @@ def test_dict_round_trip_and_refusals() -> None:
         LogMixture.from_dict({**LAW.to_dict(), "logarithmic": [True]})
     with pytest.raises(ValueError, match=r"x\[0, 1\] = 50 is outside"):
         LAW.to_standard_normal(np.array([[9.0, 50.0]]))
+
+
+@pytest.mark.parametrize("flags", ["abc", {"a": 1}, [1, 0], None, True])
+def test_logarithmic_has_to_be_a_list_of_booleans(flags: object) -> None:
+    with pytest.raises(ValueError, match="list of true and false"):
+        LogMixture.from_dict({**LAW.to_dict(), "logarithmic": flags})

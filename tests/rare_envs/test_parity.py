@@ -30,7 +30,7 @@ def drive(scenario: Scenario, idm: IDM, x: Array) -> tuple[Array, Array]:
         state = episode.state
         rows.append(torch.stack((state.x, state.y, state.heading, state.speed), dim=-1))
         collided.append(episode.collided)
-        episode = world.step(episode, idm.act(state, episode.lead, None)[0])
+        episode = world.step(episode, idm.act(episode, None)[0])
     return torch.stack(rows, dim=1).numpy(), torch.stack(collided, dim=1).numpy()
 
 
@@ -39,7 +39,12 @@ def points(low: list[float], high: list[float], n: int) -> Array:
 
 
 CAR_FOLLOWING_X = points([10, 2, 4], [30, 20, 50], 30)
-CUT_IN_X = points([8, 6, 6, 3, 8, 2.5], [25, 25, 25, 40, 50, 4.5], 40)
+CUT_IN_X = np.concatenate(
+    [
+        points([8, 6, 6, 3, 8, 2.5], [25, 25, 25, 40, 50, 4.5], 40),
+        points([4, 0, 4, 3, 8, 2.5], [10, 4, 12, 40, 50, 4.5], 8),  # paths of the least length
+    ]
+)
 
 
 @pytest.mark.parametrize(

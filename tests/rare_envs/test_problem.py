@@ -2,12 +2,17 @@
 
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecNormalize
 
+import agents
 import rare_envs
 import samplers
+import training
 from rare_envs.problem import POLICY_TILE
 
 
@@ -113,3 +118,65 @@ def test_wrong_x_is_refused() -> None:
         problem.evaluate(np.array([[20.0, 20.0, 500.0]]))
     with pytest.raises(ValueError, match="noise"):
         rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", noise="some")
+
+
+class RootOfGap(Constant):
+    """A law in the square root of the gap, defined for every state that an episode shows before contact."""
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> Any:
+        assert (observation[:, 3] >= 0.0).all()
+        acceleration = 0.1 * np.sqrt(observation[:, 3])
+        return np.stack([acceleration, 0.0 * acceleration], axis=1), state
+
+
+def test_what_comes_after_a_collision_is_not_shown_to_the_policy() -> None:
+    x, ego = np.array([[25.0, 10.0, 20.0], [20.0, 20.0, 30.0]]), RootOfGap([0.0])
+    f = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", ego=ego).evaluate(x)
+    env = gym.make("rare_envs/CarFollowing-v0")
+    for row in range(2):
+        observation, _ = env.reset(options={"x": x[row]})
+        done = False
+        while not done:
+            observation, _, terminated, truncated, info = env.step(ego.predict(observation[None])[0][0])
+            done = terminated or truncated
+        assert info["measure"] == f[row]
+    assert f[0] == -1.0 < f[1]
+
+
+def test_a_model_trained_behind_vec_normalize_gets_its_statistics(tmp_path: Any) -> None:
+    env = VecNormalize(training.sb3_vec_env("rare_envs/CutIn-v0", 16))
+    model = PPO("MlpPolicy", env, n_steps=16, batch_size=64, n_epochs=1, seed=0).learn(1_000)
+    model.save(tmp_path / "ego.zip")
+    env.save(str(tmp_path / "ego_vecnormalize.pkl"))
+    problem = rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego=model)
+    x = problem.base.sample(50, np.random.default_rng(0))
+    saved = rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego=agents.load_ego(str(tmp_path / "ego.zip")))
+    np.testing.assert_array_equal(problem.evaluate(x), saved.evaluate(x))
+    observed = Constant([0.0, 0.0], get_vec_normalize_env=lambda: env)
+    seen: list[Any] = []
+    observed.predict = lambda observation, **_: (seen.append(observation), (np.zeros((len(observation), 2)), None))[1]  # type: ignore[method-assign]
+    normalising = rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego=observed, horizon=0.1)
+    plain = gym.make("rare_envs/CutIn-v0").reset(options={"x": x[0]})[0]
+    normalising.evaluate(x[:1])
+    np.testing.assert_allclose(seen[0][0], env.normalize_obs(plain), rtol=1e-6)
+
+
+def test_classes_are_not_egos() -> None:
+    with pytest.raises(ValueError, match="class PPO"):
+        rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego=PPO)
+
+
+def test_base_objects_have_to_stay_in_range() -> None:
+    class Wide:
+        def sample(self, n: int, rng: np.random.Generator) -> Any:
+            return rng.normal(20.0, 10.0, (n, 3))
+
+        def log_prob(self, x: Any) -> Any:
+            return np.zeros(len(x))
+
+        to_standard_normal = from_standard_normal = log_prob
+
+    with pytest.raises(ValueError, match=r"draws ego_speed outside \[0, 45\] m/s"):
+        rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", base=Wide())

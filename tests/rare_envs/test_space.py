@@ -186,7 +186,7 @@ class Partial:
 def test_a_users_object():
     law = load_base("car_following", "highway")
     assert load_base("car_following", law) is law
-    with pytest.raises(ValueError, match=r"does not fit cut_in: sample.*must have shape \(1, 6\)"):
+    with pytest.raises(ValueError, match=r"does not fit cut_in: sample.*must have shape \(1000, 6\)"):
         load_base("cut_in", law)
     with pytest.raises(ValueError, match="Partial without log_prob, to_standard_normal, from_sta"):
         load_base("car_following", Partial())
