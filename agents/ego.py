@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.sb3_zip import algorithm_class, algorithm_of, read_header, weights_only_objects
+from rare_envs.space import did_you_mean
 
 RULE_BASED: Final = "idm"
 EXPECTED = "'idm', a path to a Stable-Baselines3 .zip or module:function"
@@ -100,7 +101,7 @@ def load_ego(spec: str | Path, algo: str | None = None) -> Ego | Literal["idm"]:
     Args:
         spec: "idm"; a path to a `.zip` saved by Stable-Baselines3; or `module:function`, a function
             without arguments that returns an ego (modules in the working directory are found).
-        algo: Algorithm of a `.zip`, such as "ppo"; recognised from the file when None.
+        algo: Algorithm of a `.zip`, such as "ppo"; recognised from the file when None. Only a `.zip` has one.
 
     Returns:
         "idm" as it stands, else an object with `predict`. A `.zip` gives a `SavedEgo`, whose
@@ -111,16 +112,18 @@ def load_ego(spec: str | Path, algo: str | None = None) -> Ego | Literal["idm"]:
     Raises:
         FileNotFoundError: The `.zip` does not exist.
         ValueError: The spec is none of these, the file is not a model of Stable-Baselines3 or is
-            damaged, or the function is missing, fails or returns something without `predict`.
+            damaged, the function is missing, fails or returns something without `predict`, or
+            algo is given for something that is no `.zip`.
     """
     text = str(spec)
-    if text == RULE_BASED:
-        return RULE_BASED
-    if text.endswith(".zip") or Path(text).is_file():
+    if text != RULE_BASED and (text.endswith(".zip") or Path(text).is_file()):
         return _load_zip(Path(text), algo)
-    if ":" in text and "/" not in text:
-        return _call_factory(text)
-    raise ValueError(f"Unknown ego {text!r}{_suggest_ego(text)}; expected {EXPECTED}.")
+    factory = ":" in text and "/" not in text
+    if text != RULE_BASED and not factory:
+        raise ValueError(f"Unknown ego {text!r}{_suggest_ego(text)}; expected {EXPECTED}.")
+    if algo is not None:
+        raise ValueError(f"Expected algo for a Stable-Baselines3 .zip only, got {algo!r} for {text!r}; leave it out.")
+    return _call_factory(text) if factory else RULE_BASED
 
 
 def _suggest_ego(text: str) -> str:
@@ -128,8 +131,7 @@ def _suggest_ego(text: str) -> str:
     saved = Path(f"{text}.zip")
     if saved.is_file():
         return f" (did you mean {str(saved)!r}?)"
-    near = difflib.get_close_matches(text.lower(), [RULE_BASED], n=1)
-    return f" (did you mean {near[0]!r}?)" if near else ""
+    return did_you_mean(text.lower(), [RULE_BASED])
 
 
 # --- Stable-Baselines3 files -------------------------------------------------------------------
@@ -230,19 +232,18 @@ def _call_factory(spec: str) -> Ego | Literal["idm"]:
     try:
         with _working_directory_first():
             module = importlib.import_module(module_name)
-    except Exception as error:  # the module is the user's: anything may happen in it
+    except (Exception, SystemExit) as error:  # the module is the user's: anything may happen in it
         raise ValueError(f"Cannot import {module_name!r} for the ego {spec!r}: {_one_line(error)}.") from error
     function = getattr(module, function_name, None)
     if not callable(function):
         names = [name for name in vars(module) if callable(getattr(module, name))]
-        near = difflib.get_close_matches(function_name, names, n=1)
-        hint = f"; did you mean {near[0]!r}?" if near else "."
-        raise ValueError(f"{module_name!r} has no function {function_name!r}{hint}")
+        raise ValueError(f"{module_name!r} has no function {function_name!r}{did_you_mean(function_name, names)}.")
     try:
         ego = function()
-    except Exception as error:  # likewise
+    except (Exception, SystemExit) as error:  # likewise
         raise ValueError(f"{spec!r} failed to make an ego: {_one_line(error)}.") from error
-    if ego != RULE_BASED and not callable(getattr(ego, "predict", None)):
+    rule_based = isinstance(ego, str) and ego == RULE_BASED  # an array, say, compares element by element
+    if not rule_based and not callable(getattr(ego, "predict", None)):
         raise ValueError(f"Expected {spec!r} to return 'idm' or an object with predict, got {type(ego).__name__}.")
     return cast("Ego | Literal['idm']", ego)
 
@@ -259,7 +260,7 @@ def _working_directory_first() -> Iterator[None]:
             sys.path.remove(here)
 
 
-def _one_line(error: Exception) -> str:
+def _one_line(error: BaseException) -> str:
     """An exception as one line without a full stop."""
     words = " ".join(str(error).split()).rstrip(".")
     kind = type(error).__name__

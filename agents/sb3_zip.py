@@ -7,7 +7,6 @@ and the policy's module are enough to tell the algorithms apart.
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import json
 import zipfile
@@ -15,6 +14,8 @@ import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+
+from rare_envs.space import did_you_mean
 
 CORE = ("ppo", "a2c", "sac", "td3", "ddpg", "dqn")  # in stable_baselines3
 CONTRIB = {  # in sb3_contrib, an optional package: name -> class
@@ -139,9 +140,7 @@ def algorithm_class(name: str, path: Path) -> Any:
                 "installed: pip install sb3-contrib."
             ) from error
     known = (*CORE, *CONTRIB)
-    near = difflib.get_close_matches(name, known, n=1)
-    hint = f" (did you mean {near[0]!r}?)" if near else ""
-    raise ValueError(f"Unknown algorithm {name!r}{hint}; expected one of {', '.join(known)}.")
+    raise ValueError(f"Unknown algorithm {name!r}{did_you_mean(name, known)}; expected one of {', '.join(known)}.")
 
 
 def weights_only_objects() -> dict[str, Any]:

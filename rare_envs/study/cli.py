@@ -5,6 +5,7 @@ Exit codes: 0 done, 2 bad input (one line on standard error), 3 done with warnin
 
 from __future__ import annotations
 
+import contextlib
 import json
 import sys
 from enum import Enum
@@ -91,7 +92,7 @@ def estimate_command(
     seed: Seed = 0,
     max_sim: Annotated[int | None, typer.Option(help="Largest number of simulations.")] = None,
     target_cov: Annotated[float | None, typer.Option(help="Stop at this coefficient of variation.")] = None,
-    replicates: Annotated[int, typer.Option(help="Independent runs that are pooled.")] = 1,
+    replicates: Annotated[int, typer.Option(help="Independent runs, combined by their mean.")] = 1,
     noise: Annotated[
         Noise, typer.Option(help="Noise of egos and drivers: part of x, one fixed sequence, none.")
     ] = Noise.ON,
@@ -116,14 +117,14 @@ def estimate_command(
         replicates=replicates,
         noise={Noise.ON: True, Noise.OFF: False}.get(noise, noise.value),
     )
-    study = evaluate.prepare(question)
-    if out is not None:
-        checks.writable_folder(out)
-    report = evaluate.run(study, progress=True)
-    if out is not None:
-        from rare_envs.study.rundir import write_run
+    with contextlib.redirect_stdout(sys.stderr):  # an ego may print, and standard output is for the answer
+        study = evaluate.prepare(question)
+        with contextlib.nullcontext() if out is None else checks.output_folder(out):
+            report = evaluate.run(study, progress=True)
+            if out is not None:
+                from rare_envs.study.rundir import write_run
 
-        write_run(out, report)
+                write_run(out, report)
     if as_json:
         _print_json(report.to_dict())
     else:

@@ -34,7 +34,7 @@ class Question:
         seed: Seed of everything that is drawn.
         max_sim: Largest number of simulations, or None.
         target_cov: Stop when the coefficient of variation is this small, or None.
-        replicates: Number of independent runs that are pooled.
+        replicates: Number of independent runs, combined by their mean.
         noise: Noise of egos and drivers, as in `DrivingProblem`: True, "fixed" or False.
     """
 
@@ -144,8 +144,9 @@ def _try_ego(problem: rare_envs.DrivingProblem) -> None:
     start = problem.world.start(torch.from_numpy(x).float())
     try:
         problem.driver.act(start, None)
-    except Exception as error:  # the ego is the user's: anything may happen in it
-        raise BadInput(f"The ego fails on its first observation: {error or type(error).__name__}") from error
+    except (Exception, SystemExit) as error:  # the ego is the user's: anything may happen in it
+        words = str(error) if isinstance(error, Exception) else ""
+        raise BadInput(f"The ego fails on its first observation: {words or repr(error)}") from error
 
 
 def run(study: Study, progress: bool | Callable[[samplers.Progress], None] = False) -> Report:
@@ -175,4 +176,6 @@ def run(study: Study, progress: bool | Callable[[samplers.Progress], None] = Fal
         )
     except ValueError as error:
         raise BadInput(error) from error
+    except SystemExit as error:
+        raise BadInput(f"The ego ended the program in the middle of the run: {error!r}") from error
     return Report(study, estimate, time.perf_counter() - start)

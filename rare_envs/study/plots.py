@@ -195,16 +195,15 @@ def colour(vehicle: int) -> str:
 
 
 def _draw_curves(axes: Axes, drive: Replay) -> None:
-    """Draw speeds (left axis) and the gap to the lead (right axis) over time."""
-    for j in range(drive.speed.shape[1]):
-        label = "speed of the ego" if j == 0 else f"speed of vehicle {j}"
-        axes.plot(drive.time, drive.speed[:, j], color=colour(j), label=label)
+    """Draw speeds (left axis) and the gap to the vehicle ahead (right axis) over time."""
+    for j, name in enumerate(drive.names):
+        axes.plot(drive.time, drive.speed[:, j], color=colour(j), label=f"speed of {name}")
     axes.set_xlabel("time [s]")
     axes.set_ylabel("speed [m/s]")
     axes.set_ylim(0, HEADROOM * max(1.0, float(drive.speed.max())))
     gaps = axes.twinx()
     gap = np.where(np.isfinite(drive.gap), drive.gap, np.nan)
-    gaps.plot(drive.time, gap, color="black", linestyle=":", label="gap to the lead")
+    gaps.plot(drive.time, gap, color="black", linestyle=":", label="gap to the vehicle ahead")
     gaps.set_ylabel("gap [m]")
     gaps.set_ylim(min(0.0, float(np.nanmin(gap, initial=0.0))), HEADROOM * float(np.nanmax(gap, initial=1.0)))
     gaps.spines["right"].set_visible(True)

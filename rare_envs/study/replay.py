@@ -10,6 +10,10 @@ from numpy.typing import NDArray
 
 from rare_envs import DrivingProblem
 from rare_envs.rollout import drive
+from rare_envs.scenarios import Scenario
+
+NAMES = {"car_following": ("the ego", "the lead"), "cut_in": ("the ego", "the cutter", "the lead")}
+"""What the vehicles of a scenario are called."""
 
 
 class Replay(NamedTuple):
@@ -35,6 +39,14 @@ class Replay(NamedTuple):
     """Whether the ego collided."""
     lanes: int
     """Number of lanes."""
+    names: tuple[str, ...]
+    """What the vehicles are called, length N."""
+
+
+def vehicle_names(scenario: Scenario) -> tuple[str, ...]:
+    """What the vehicles of a scenario are called, the ego first; one without a name has its number."""
+    known = NAMES.get(scenario.name, ("the ego",))
+    return tuple(known[j] if j < len(known) else f"vehicle {j}" for j in range(scenario.vehicles))
 
 
 @torch.inference_mode()
@@ -67,4 +79,5 @@ def replay(problem: DrivingProblem, x: NDArray[np.float64]) -> Replay:
         f=float(episodes[-1].f),
         collided=bool(episodes[-1].collided),
         lanes=world.scenario.lanes,
+        names=vehicle_names(world.scenario),
     )

@@ -17,6 +17,7 @@ import torch
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+import rare_envs
 from agents import Ego, SavedEgo, load_ego
 from agents.sb3_zip import algorithm_of, read_header
 
@@ -170,6 +171,12 @@ def test_an_unknown_algorithm_asks_for_its_name() -> None:
         algorithm_of({"policy_class": {"__module__": "mine"}}, Path("ego.zip"))
 
 
+@pytest.mark.parametrize("spec", ["idm", "no_such_module:make"])
+def test_algo_is_for_files_only(spec: str) -> None:
+    with pytest.raises(ValueError, match=rf"algo for a Stable-Baselines3 \.zip only, got 'ppo' for '{spec}'"):
+        load_ego(spec, algo="ppo")
+
+
 def test_a_missing_package_is_named(ppo_zip: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "sb3_contrib", None)  # as if not installed
     with pytest.raises(ValueError, match=r"RecurrentPPO.*pip install sb3-contrib"):
@@ -215,6 +222,26 @@ def test_statistics_beside_the_model_are_applied(model_at: str, statistics_at: s
     np.testing.assert_array_equal(actions, expected)
     np.testing.assert_array_equal(raw, before)
     assert np.abs(actions - model.predict(raw, deterministic=True)[0]).max() > 1e-3
+
+
+def test_observations_are_normalised_once_in_an_estimate(tmp_path: Path) -> None:
+    env_id = "rare_envs/CarFollowing-v0"
+    statistics = VecNormalize(DummyVecEnv([lambda: Still(features=7)]))
+    model = stable_baselines3.PPO("MlpPolicy", statistics, seed=0, n_steps=64, batch_size=64, n_epochs=1, device="cpu")
+    model.learn(64)
+    with torch.no_grad():
+        model.policy.action_net.weight.mul_(100.0)  # so that what it sees decides what it does
+    path = save(model, tmp_path / "ego.zip")
+    x = rare_envs.DrivingProblem(env_id).base.sample(50, np.random.default_rng(0))
+
+    def f(ego: Any) -> np.ndarray:
+        return rare_envs.DrivingProblem(env_id, ego=ego).evaluate(x)
+
+    plain = f(load_ego(path))
+    statistics.save(str(tmp_path / "vecnormalize.pkl"))
+    once = f(load_ego(path))
+    np.testing.assert_allclose(once, f(model), rtol=1e-5)
+    assert np.abs(once - plain).max() > 0.1
 
 
 def test_own_statistics_win_over_shared_ones(tmp_path: Path) -> None:
@@ -346,7 +373,9 @@ def test_nothing_is_unpickled_before_the_file_is_known_to_be_a_model(ppo_zip: Pa
 # --- other specs -------------------------------------------------------------------------------
 
 
-def test_the_rule_based_driver_stands_as_it_is() -> None:
+def test_the_rule_based_driver_stands_as_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "idm").write_text("a file of that name does not matter")
+    monkeypatch.chdir(tmp_path)
     assert load_ego("idm") == "idm"
 
 
@@ -375,6 +404,8 @@ def test_a_forgotten_suffix_is_pointed_out(ppo_zip: Path) -> None:
 def own_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     """A module of the user in the working directory; its name."""
     (tmp_path / "own_egos_for_test.py").write_text(
+        "import sys\n"
+        "import numpy as np\n"
         "class Straight:\n"
         "    def predict(self, observation, state=None, episode_start=None, deterministic=True):\n"
         "        return [[0.0, 0.0]] * len(observation), state\n"
@@ -382,6 +413,8 @@ def own_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
         "def make_rule_based():\n    return 'idm'\n"
         "def make_nothing():\n    return None\n"
         "def make_trouble():\n    raise RuntimeError('no\\nweights')\n"
+        "def make_exit():\n    sys.exit(7)\n"
+        "def make_array():\n    return np.zeros(2)\n"
     )
     monkeypatch.chdir(tmp_path)
     return "own_egos_for_test"
@@ -397,13 +430,22 @@ def test_a_function_of_the_user_makes_the_ego(own_module: str) -> None:
 @pytest.mark.parametrize(
     ("function", "message"),
     [
-        ("mak", r"has no function 'mak'; did you mean 'make'\?"),
+        ("mak", r"has no function 'mak' \(did you mean 'make'\?\)\."),
         ("zzz", r"has no function 'zzz'\."),
         ("make_nothing", "an object with predict, got NoneType"),
         ("make_trouble", "failed to make an ego: RuntimeError: no weights"),
+        ("make_exit", "failed to make an ego: SystemExit: 7"),
+        ("make_array", "an object with predict, got ndarray"),
     ],
 )
 def test_a_function_that_does_not_serve_is_refused(function: str, message: str, own_module: str) -> None:
     with pytest.raises(ValueError, match=message) as caught:
         load_ego(f"{own_module}:{function}")
     one_line(caught)
+
+
+def test_a_module_that_exits_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "script_for_test.py").write_text("import sys\nsys.exit('usage: script')\n")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match=r"Cannot import 'script_for_test' .*SystemExit: usage: script"):
+        load_ego("script_for_test:make")

@@ -13,6 +13,8 @@ from rare_envs.space import PARAMETERS
 from rare_envs.study.cli import app
 
 EGOS = """
+import sys
+
 import numpy as np
 from gymnasium.spaces import Box
 
@@ -36,6 +38,22 @@ def nan_when_close():
     ego = Ego()
     ego.choose = lambda observation: np.where(observation[:, 3:4] < 0.1, np.nan, 0.0) * np.ones(2)
     return ego
+
+def exiting():
+    sys.exit(7)
+
+def exiting_when_asked():
+    ego = Ego()
+    ego.choose = lambda observation: sys.exit(7)
+    return ego
+
+def exiting_when_close():
+    ego = Ego()
+    ego.choose = lambda observation: sys.exit(7) if observation[:, 3].min() < 0.1 else np.zeros((len(observation), 2))
+    return ego
+
+def array():
+    return np.zeros(2)
 
 def raising():
     ego = Ego()

@@ -44,6 +44,10 @@ BAD_ESTIMATES = {
     "NaN actions": ([FOLLOWING, "--ego", "egos_here:nan_actions"], ["NaN"]),
     "actions of a wrong shape": ([FOLLOWING, "--ego", "egos_here:wrong_shape"], ["(2, 2)"]),
     "an ego that raises": ([FOLLOWING, "--ego", "egos_here:raising"], ["division by zero"]),
+    "an ego's function that exits": ([FOLLOWING, "--ego", "egos_here:exiting"], ["egos_here:exiting", "7"]),
+    "an ego that exits": ([FOLLOWING, "--ego", "egos_here:exiting_when_asked"], ["SystemExit(7)"]),
+    "an array as ego": ([FOLLOWING, "--ego", "egos_here:array"], ["predict", "ndarray"]),
+    "algorithm of the rule-based ego": ([FOLLOWING, "--algo", "foo"], ["algo", "'foo'", "'idm'"]),
     "unknown algorithm": ([FOLLOWING, "--ego", "corrupt.zip", "--algo", "ppq"], ["corrupt.zip"]),
     "misspelt method": ([FOLLOWING, "--method", "addss"], ["'adss'", "mc"]),
     "misspelt base": ([FOLLOWING, "--base", "us102"], ["'us101'", "highway"]),
@@ -58,7 +62,9 @@ BAD_ESTIMATES = {
     "negative target": ([FOLLOWING, "--target-cov", "-0.1"], ["target_cov", "-0.1"]),
     "no replicates": ([FOLLOWING, "--replicates", "0"], ["replicates", "0"]),
     "negative seed": ([FOLLOWING, "--seed", "-1"], ["seed", "-1"]),
+    "gamma is NaN, for a new folder": ([FOLLOWING, "--gamma", "nan", "--out", "new/run"], ["gamma", "nan"]),
     "out is a file": ([FOLLOWING, "--out", "a_file"], ["a_file"]),
+    "out is in a file": ([FOLLOWING, "--out", "a_file/run"], ["a_file/run", "Not a directory"]),
     "misspelt option": ([FOLLOWING, "--mehtod", "adss"], ["--mehtod", "--method"]),
 }
 
@@ -73,6 +79,7 @@ def test_bad_input_is_one_line_before_any_simulation(
     monkeypatch.setattr(rare_envs.DrivingProblem, "evaluate", simulated)
     assert_refused(cli("estimate", *words), *said)
     assert (here / "a_file").read_text() == "mine"
+    assert not (here / "new").exists()
 
 
 @pytest.mark.parametrize("words", [["estimat"], ["--loud"], ["list", "extra"]])
@@ -80,12 +87,14 @@ def test_a_wrong_command_is_one_line(cli: Cli, words: list[str]) -> None:
     assert_refused(cli(*words), words[-1])
 
 
-def test_an_ego_that_fails_on_the_way_is_one_line(cli: Cli, here: Path, risky: str) -> None:
-    result = cli(*SMALL, "--base", risky, "--ego", "egos_here:nan_when_close")
-    assert result.exit_code == 2
-    assert result.stdout == ""
-    assert "NaN" in result.stderr.splitlines()[-1]
-    assert "Traceback" not in result.stderr
+@pytest.mark.parametrize(("ego", "said"), [("nan_when_close", "NaN"), ("exiting_when_close", "SystemExit(7)")])
+def test_an_ego_that_fails_on_the_way_is_one_line(cli: Cli, here: Path, risky: str, ego: str, said: str) -> None:
+    words = ("--base", risky, "--ego", f"egos_here:{ego}", "--out")
+    assert_refused(cli(*SMALL, *words, here / "new" / "run"), said)
+    assert not (here / "new").exists()
+    (here / "old").mkdir()
+    assert_refused(cli(*SMALL, *words, here / "old"), said)
+    assert (here / "old").exists()
 
 
 BAD_TRAININGS = {
@@ -118,6 +127,24 @@ def test_json_is_one_object_and_nothing_else(cli: Cli, risky: str) -> None:
     likely = [failure["log_p0"] for failure in answer["failures"]]
     assert likely == sorted(likely, reverse=True)
     assert "2,000 simulations" in result.stderr
+
+
+def test_what_an_ego_prints_is_no_part_of_the_answer(cli: Cli, here: Path, risky: str) -> None:
+    (here / "talking_ego.py").write_text(
+        "import egos_here\n"
+        "print('says the module')\n"
+        "class Talking(egos_here.Ego):\n"
+        "    def choose(self, observation):\n"
+        "        print('says the policy')\n"
+        "        return egos_here.np.zeros((len(observation), 2))\n"
+        "def make():\n"
+        "    print('says the function')\n"
+        "    return Talking()\n"
+    )
+    result = cli(*SMALL, "--base", risky, "--ego", "talking_ego:make", "--out", "run", "--json")
+    assert json.loads(result.stdout)["n_sim"] == 2000
+    for speaker in ("module", "function", "policy"):
+        assert f"says the {speaker}" in result.stderr
 
 
 def test_the_same_seed_gives_the_same_answer_and_another_seed_another(cli: Cli, risky: str) -> None:
@@ -168,6 +195,11 @@ def test_the_run_folder_holds_numbers_failures_and_a_picture(cli: Cli, risky: st
     for part in np.array_split(picture, 3, axis=1):  # each of the three drawings has ink and colour
         assert 0.01 < np.mean(part.min(axis=2) < 0.9) < 0.6
         assert np.mean(np.ptp(part, axis=2) > 0.2) > 0.001
+
+
+def test_help_calls_replicates_what_samplers_calls_them(cli: Cli) -> None:
+    shown = cli("estimate", "--help").stdout.replace("│", " ")
+    assert "Independent runs, combined by their mean" in " ".join(shown.split())
 
 
 def test_list_shows_what_there_is(cli: Cli) -> None:

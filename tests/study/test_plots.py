@@ -1,16 +1,19 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 import agents
 import rare_envs
+from rare_envs.scenarios import CUT_IN
 from rare_envs.study.checks import BadInput
 from rare_envs.study.evaluate import Question, prepare, run
-from rare_envs.study.plots import most_shifted, save_plot
-from rare_envs.study.replay import replay
+from rare_envs.study.plots import MOMENTS, draw_drive, most_shifted, save_plot
+from rare_envs.study.replay import replay, vehicle_names
 
 FOLLOWING = "rare_envs/CarFollowing-v0"
 
@@ -59,6 +62,23 @@ def test_a_replay_asks_a_policy_as_the_rollout_does(here: Path, risky: str) -> N
     assert [replay(problem, row).f for row in x] == problem.evaluate(x).tolist()
     # coasting closes 25 m at 10 m/s
     assert replay(problem, x[0]).time[-1] == pytest.approx(2.5, abs=0.15)
+
+
+@pytest.mark.parametrize("env_id", rare_envs.ENV_IDS)
+def test_the_legend_says_which_vehicle_is_which(env_id: str) -> None:
+    problem = rare_envs.DrivingProblem(env_id)
+    axes = list(Figure().subplots(MOMENTS + 1))
+    draw_drive(axes, replay(problem, problem.base.sample(1, np.random.default_rng(0))[0]))
+    legend = axes[-1].get_legend()
+    assert legend is not None
+    others = ["cutter", "lead"] if "CutIn" in env_id else ["lead"]
+    speeds = [f"speed of the {name}" for name in ("ego", *others)]
+    assert [text.get_text() for text in legend.get_texts()] == [*speeds, "gap to the vehicle ahead"]
+
+
+def test_vehicles_without_names_are_numbered() -> None:
+    assert vehicle_names(replace(CUT_IN, name="overtaking")) == ("the ego", "vehicle 1", "vehicle 2")
+    assert vehicle_names(replace(CUT_IN, vehicles=4)) == ("the ego", "the cutter", "the lead", "vehicle 3")
 
 
 def test_the_most_shifted_parameters_come_first() -> None:
