@@ -5,7 +5,7 @@ collects the failing points. No sampler knows of it.
 """
 
 from collections.abc import Callable
-from typing import Literal, get_args
+from typing import Literal, NoReturn, get_args
 
 import numpy as np
 
@@ -123,7 +123,7 @@ class Counted:
             raise
         except Exception as error:
             if self._on_error == "raise":
-                raise self._named(x, error) from error
+                self._raise_named(x, error)
             return self._by_halves(x)
 
     def _call(self, x: FloatArray) -> FloatArray:
@@ -147,29 +147,34 @@ class Counted:
                 parts.append(self._by_halves(half))
         return np.concatenate(parts)
 
-    def _named(self, x: FloatArray, error: Exception) -> EvaluationError:
-        """Return the error to raise, with the first row that raises again named."""
+    def _raise_named(self, x: FloatArray, error: Exception) -> NoReturn:
+        """Raise with the first row that raises again, and what f says of that row alone."""
         start, stop = 0, len(x)
         while stop - start > 1:
             middle = (start + stop) // 2
-            start, stop = (start, middle) if self._raises(x[start:middle]) else (middle, stop)
-        kind = f"{type(error).__name__}: {error}"
-        if not self._raises(x[start:stop]):
-            return EvaluationError(f"f raised on a batch of {len(x)} rows, not repeatably; {kind}")
-        return EvaluationError(f"f raised for {_where(x, start)}; {kind}")
+            start, stop = (start, middle) if self._raised(x[start:middle]) else (middle, stop)
+        alone = self._raised(x[start:stop])  # the batch may have raised for another row
+        if alone is None:
+            raise EvaluationError(f"f raised on a batch of {len(x)} rows, not repeatably; {_kind(error)}") from error
+        raise EvaluationError(f"f raised for {_where(x, start)}; {_kind(alone)}") from alone
 
-    def _raises(self, x: FloatArray) -> bool:
+    def _raised(self, x: FloatArray) -> Exception | None:
+        """Return what f raises for the rows of x, None if nothing."""
         try:
             self._problem.evaluate(x.copy())
-        except Exception:
-            return True
-        return False
+        except Exception as error:
+            return error
+        return None
 
     def _remember(self, x: FloatArray, f: FloatArray, failing: np.ndarray) -> None:
         if failing.any():
             found = x[failing]
             log_p0 = np.asarray(self.base.log_prob(found), dtype=np.float64)
             self._failures = self._failures.merged(found, f[failing], log_p0, keep=self._keep)
+
+
+def _kind(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}"
 
 
 def _where(x: FloatArray, row: int) -> str:

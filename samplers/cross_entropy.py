@@ -10,7 +10,7 @@ from samplers.families import Gaussian, Mixture, Moments, weighted_moments
 from samplers.importance import doubts, draw_until, interval_of, weighted_cov
 from samplers.intervals import binomial_cov
 from samplers.levels import next_level
-from samplers.method import Goal, Outcome, check_count, check_setting, no_outcome_share
+from samplers.method import Goal, Outcome, check_choice, check_count, check_setting, no_outcome_share
 from samplers.problem import FloatArray, Problem, evaluate_at
 from samplers.result import Level, Status
 from samplers.weights import effective_sample_size, normalised
@@ -107,12 +107,11 @@ class CrossEntropy:
         check_count(who, "max_iterations", self.max_iterations, 1)
         check_count(who, "n_final", self.n_final, 10)
         check_setting(who, "rho", self.rho, 0.0, 0.5)
-        check_setting(who, "1 - alpha", 1 - self.alpha, -1e-12, 1.0)
+        check_setting(who, "alpha", self.alpha, 0.0, 1.0, or_equal_high=True)
         check_setting(who, "base_share", self.base_share, 0.0, 1.0)
         check_setting(who, "wide_share", self.wide_share, 0.0, 1.0 - self.base_share)
         check_setting(who, "wide_factor", self.wide_factor, 1.0, math.inf)
-        if self.family not in ("gaussian", "mean"):
-            raise ValueError(f'{who}: expected family "gaussian" or "mean", got {self.family!r}.')
+        check_choice(who, "family", self.family, ("gaussian", "mean"))
 
     def run(self, problem: Problem, goal: Goal, rng: np.random.Generator) -> Outcome:
         """Search for a proposal, then estimate with fresh draws."""
@@ -124,9 +123,6 @@ class CrossEntropy:
         limit = self._limit(goal, sum(level.n_sim for level in trace))
         draws, final = draw_until(problem, sampler, goal, limit, self.n_final, rng)
         cov = binomial_cov(draws.p, draws.n) if common else draws.cov
-        missed = goal.target_cov is not None and cov > goal.target_cov
-        if ended is Status.CONVERGED and missed:
-            ended = Status.BUDGET
         reached = best is not None and best.level == goal.gamma
         return Outcome(
             p=draws.p,

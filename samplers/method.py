@@ -3,7 +3,7 @@
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar, Protocol, runtime_checkable
+from typing import ClassVar, Protocol, TypeGuard, runtime_checkable
 
 import numpy as np
 
@@ -26,7 +26,7 @@ class Goal:
     max_sim: int | None = None
     """Simulations that the run may use; None leaves it to the method."""
     target_cov: float | None = None
-    """Coefficient of variation to stop at, for methods with `stops_at_target`."""
+    """Coefficient of variation to stop at, for methods with `stops_at_target`; `estimate` judges if it is met."""
     on_level: Callable[[Level], None] = ignore_level
     """Called with every finished level."""
 
@@ -48,6 +48,8 @@ class Outcome:
     trace: tuple[Level, ...] = ()
     no_outcome_share: float = 0.0
     """Share of p that comes from points without an outcome (f raised or gave NaN)."""
+    counts: tuple[int, int] | None = None
+    """(k, n) where p = k / n and k counts the failing ones of n independent draws: such runs pool."""
 
 
 @runtime_checkable
@@ -74,10 +76,28 @@ def no_outcome_share(f: FloatArray, weights: FloatArray | None = None) -> float:
     return float(np.average(np.isneginf(f), weights=weights))
 
 
-def check_setting(method: str, name: str, value: float, low: float, high: float) -> None:
-    """Raise a ValueError unless low < value < high."""
-    if not low < value < high:
-        raise ValueError(f"{method}: expected {low:g} < {name} < {high:g}, got {value!r}.")
+def is_number(value: object) -> TypeGuard[float]:
+    """Return whether value is a real number (a bool is none) that a float can hold."""
+    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+        return False
+    return not isinstance(value, int) or abs(value) <= sys.float_info.max
+
+
+def check_setting(
+    method: str, name: str, value: object, low: float, high: float, *, or_equal_high: bool = False
+) -> None:
+    """Raise a ValueError unless value is a number with low < value < high (or value = high, if that is allowed)."""
+    if is_number(value) and (low < value < high or (or_equal_high and value == high)):
+        return
+    sign = "<=" if or_equal_high else "<"
+    raise ValueError(f"{method}: expected a number {low:g} < {name} {sign} {high:g}, got {value!r}.")
+
+
+def check_choice(method: str, name: str, value: object, choices: tuple[str, ...]) -> None:
+    """Raise a ValueError unless value is one of the choices."""
+    if not isinstance(value, str) or value not in choices:
+        wanted = " or ".join(f'"{choice}"' for choice in choices)
+        raise ValueError(f"{method}: expected {name} {wanted}, got {value!r}.")
 
 
 def check_count(method: str, name: str, value: object, least: int) -> None:

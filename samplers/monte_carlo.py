@@ -1,5 +1,6 @@
 """Plain Monte Carlo: the yardstick."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -21,6 +22,7 @@ class MonteCarlo:
     p = k / N with the Clopper-Pearson interval. Stops at `goal.target_cov` (Tian et al. stop at
     a relative half-width of 0.2, that is target_cov = 0.102), looked at after every batch, else
     when the simulations are used up. Stopping at a c.o.v. makes the interval approximate.
+    Replicates are pooled: their draws are those of one longer run.
 
     Args:
         n: Simulations where `max_sim` does not say how many.
@@ -63,22 +65,23 @@ class MonteCarlo:
                 )
             )
             goal.on_level(trace[-1])
-        missed = goal.target_cov is not None and not met
-        return Outcome(
-            p=hits / n,
-            interval=clopper_pearson(hits, n, goal.confidence),
-            cov=binomial_cov(hits / n, n),
-            status=_status(hits, missed),
-            warnings=_warnings(hits, n),
-            trace=tuple(trace),
-            no_outcome_share=no_outcome_share(np.concatenate(failing)),
-        )
+        return share_of_failures(hits, n, goal.confidence, trace, no_outcome_share(np.concatenate(failing)))
 
 
-def _status(hits: int, missed_target: bool) -> Status:
-    if hits == 0:
-        return Status.NO_HITS
-    return Status.BUDGET if missed_target else Status.CONVERGED
+def share_of_failures(
+    hits: int, n: int, confidence: float, trace: Sequence[Level], no_outcome_share: float
+) -> Outcome:
+    """Return the outcome of `hits` failing points among n independent draws."""
+    return Outcome(
+        p=hits / n,
+        interval=clopper_pearson(hits, n, confidence),
+        cov=binomial_cov(hits / n, n),
+        status=Status.CONVERGED if hits else Status.NO_HITS,
+        warnings=_warnings(hits, n),
+        trace=tuple(trace),
+        no_outcome_share=no_outcome_share,
+        counts=(hits, n),
+    )
 
 
 def _warnings(hits: int, n: int) -> tuple[str, ...]:

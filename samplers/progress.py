@@ -74,7 +74,7 @@ def listening(progress: bool | Listener, max_sim: int | None) -> Iterator[Listen
 
 @contextmanager
 def _rich_bar(max_sim: int | None) -> Iterator[Listener]:
-    """Show a bar on standard error while the run lasts."""
+    """Show a bar on standard error while the run lasts; one that fails leaves nothing of it."""
     from rich.console import Console  # optional, and slow to import
     from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
@@ -86,13 +86,20 @@ def _rich_bar(max_sim: int | None) -> Iterator[Listener]:
         TextColumn("{task.fields[state]}", markup=False),
         TimeElapsedColumn(),
     )
-    with Bar(*columns, console=Console(stderr=True)) as bar:
-        task = bar.add_task("estimate", total=max_sim, state="")
+    bar = Bar(*columns, console=Console(stderr=True))
+    task = bar.add_task("estimate", total=max_sim, state="")
 
-        def show(progress: Progress) -> None:
-            state = f"run {progress.run + 1} " if progress.run else ""
-            if not math.isnan(progress.p):
-                state += f"P[f <= {progress.level:.3g}] = {progress.p:.2e}"
-            bar.update(task, completed=progress.n_sim, state=state)
+    def show(progress: Progress) -> None:
+        state = f"run {progress.run + 1} " if progress.run else ""
+        if not math.isnan(progress.p):
+            state += f"P[f <= {progress.level:.3g}] = {progress.p:.2e}"
+        bar.update(task, completed=progress.n_sim, state=state)
 
+    bar.start()
+    try:
         yield show
+    except BaseException:
+        bar.live.transient = True  # clears the line
+        bar.live.stop()  # bar.stop() would add an empty line where standard error is a file
+        raise
+    bar.stop()

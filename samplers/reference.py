@@ -89,9 +89,26 @@ def shell(dim: int = 20, p: float = 1e-4) -> Reference:
     return _reference(f"shell_d{dim}", f, dim, p)
 
 
+def unannounced(announced: float = 4.0, hidden: float = 3.1) -> Reference:
+    """Two ways to fail, of which f announces the rarer one only: 3 % of p.
+
+    f = announced - u1 falls towards u1 > announced; u1 < -hidden, on the far side, where f is
+    largest, fails without a sign (f = -1). Methods that follow f downhill find the hidden region
+    by a lucky early draw or not at all, and then answer with P[u1 > announced] = 3.2e-5 and a
+    narrow interval that does not hold p = 9.99e-4. This problem is for measuring that: how often
+    a method misses such a region and whether anything warns of it. No method here is expected to
+    cover p.
+    """
+
+    def f(u: FloatArray) -> FloatArray:
+        return np.where(u[:, 0] < -hidden, -1.0, announced - u[:, 0])
+
+    return _reference("unannounced", f, 2, _phi(-announced) + _phi(-hidden))
+
+
 def references() -> list[Reference]:
-    """Return one of each kind."""
-    return [half_space(), two_modes(), parabola(), four_branches(), plateau(), shell()]
+    """Return one of each kind, for benchmarks; intervals need not hold the p of `unannounced`."""
+    return [half_space(), two_modes(), parabola(), four_branches(), plateau(), shell(), unannounced()]
 
 
 def _reference(name: str, f: Callable[[FloatArray], ArrayLike], dim: int, p: float) -> Reference:

@@ -28,9 +28,9 @@ def get_method(name: str, **settings: Any) -> Method:
     return cls(**settings)
 
 
-def check_name(kind: str, name: str, valid: list[str]) -> None:
+def check_name(kind: str, name: object, valid: list[str]) -> None:
     """Raise a ValueError that suggests the nearest valid name unless `name` is one."""
-    if name in valid:
+    if isinstance(name, str) and name in valid:
         return
     near = difflib.get_close_matches(str(name), valid, n=1)
     hint = f" Did you mean {near[0]!r}?" if near else ""

@@ -8,8 +8,9 @@ from dataclasses import replace
 import numpy as np
 from scipy import stats
 
-from samplers.intervals import Interval
+from samplers.intervals import Interval, binomial_cov
 from samplers.method import Outcome
+from samplers.monte_carlo import share_of_failures
 from samplers.result import Level, Status
 
 BY_CONCERN = (Status.STALLED, Status.BUDGET, Status.CONVERGED)
@@ -17,9 +18,13 @@ BY_CONCERN = (Status.STALLED, Status.BUDGET, Status.CONVERGED)
 
 
 def combined(outcomes: Sequence[Outcome], confidence: float) -> Outcome:
-    """Return the mean of R independent runs with a t interval on the log scale.
+    """Return R independent runs as one: pooled counts, or their mean with a t interval.
 
-    p is the arithmetic mean p_bar (each run's p-hat is unbiased, its logarithm is not). Its
+    Where every run is a share k_i / n_i of independent draws, the draws are those of one longer
+    run: p = sum k_i / sum n_i with the Clopper-Pearson interval. (A t interval would throw away
+    what binomial counts say of their own spread; with R = 2 its quantile is 12.7.)
+
+    Otherwise the interval is one of Student's on the log scale. p is the arithmetic mean p_bar (each run's p-hat is unbiased, its logarithm is not). Its
     c.o.v. is the larger of what the runs say of themselves and of what their spread shows. The
     interval is p_bar exp(-+ t s / sqrt(R)) with s the standard deviation of log p-hat (of
     p-hat / p_bar, where a run has p-hat = 0) and t the quantile with R - 1 degrees of freedom.
@@ -28,19 +33,42 @@ def combined(outcomes: Sequence[Outcome], confidence: float) -> Outcome:
         return outcomes[0]
     p = np.array([outcome.p for outcome in outcomes])
     mean = float(p.mean())
+    trace = tuple(_numbered(outcomes))
+    counts = pooled_counts(outcomes)
+    if counts is not None:
+        hits, n = counts
+        shares, weights = [o.no_outcome_share for o in outcomes], [o.counts[0] for o in outcomes if o.counts]
+        return share_of_failures(
+            hits, n, confidence, trace, float(np.average(shares, weights=weights)) if hits else 0.0
+        )
     return Outcome(
         p=mean,
         interval=_interval(outcomes, p, confidence),
         cov=combined_cov(outcomes),
         status=_status(outcomes) if mean > 0 else Status.NO_HITS,
         warnings=_counted(outcomes),
-        trace=tuple(_numbered(outcomes)),
+        trace=trace,
         no_outcome_share=(float(np.average([o.no_outcome_share for o in outcomes], weights=p)) if mean else 0.0),
     )
 
 
+def pooled_counts(outcomes: Sequence[Outcome]) -> tuple[int, int] | None:
+    """Return failing and all draws of the runs together; None if a run is no share of plain draws."""
+    counts = [outcome.counts for outcome in outcomes if outcome.counts is not None]
+    if len(counts) < len(outcomes):
+        return None
+    return sum(hits for hits, _ in counts), sum(n for _, n in counts)
+
+
 def combined_cov(outcomes: Sequence[Outcome]) -> float:
-    """Return the c.o.v. of the mean of independent runs: own or empirical, whichever is larger."""
+    """Return the c.o.v. of the combined runs.
+
+    That of the pooled counts or, for a mean, the own or empirical one, whichever is larger.
+    """
+    counts = pooled_counts(outcomes)
+    if counts is not None:
+        hits, n = counts
+        return binomial_cov(hits / n, n)
     p = np.array([outcome.p for outcome in outcomes])
     if not p.any():
         return math.inf

@@ -23,7 +23,7 @@ class Status(str, Enum):
     NO_HITS = "no_hits"
     """It came to its end without seeing a failure: p = 0, one-sided interval."""
     BUDGET = "budget"
-    """max_sim was used up before the method came to its end or met target_cov."""
+    """max_sim (or the limit of runs, see `estimate`) was used up before the end or before target_cov was met."""
     STALLED = "stalled"
     """It could not get closer to the failures: ties in f, or too many levels."""
 
@@ -200,7 +200,9 @@ def method_settings(method: "Method") -> dict[str, Any]:
 
 
 def _finite(value: Any) -> Any:
-    """Replace NaN and infinities inside value by None."""
+    """Replace NaN and infinities inside value by None, numbers of NumPy by Python's."""
+    if isinstance(value, np.generic):
+        value = value.item()
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, dict):

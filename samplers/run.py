@@ -8,18 +8,18 @@ import numpy as np
 
 from samplers.counted import ON_ERROR, Counted, OnError
 from samplers.intervals import gain_over_monte_carlo
-from samplers.method import Goal, Method, Outcome
+from samplers.method import Goal, Method, Outcome, is_number
 from samplers.problem import Distribution, Problem, check_dim
 from samplers.progress import Listener, Monitor, listening
 from samplers.registry import check_name, get_method
-from samplers.replication import combined, combined_cov
+from samplers.replication import combined, combined_cov, pooled_counts
 from samplers.result import Estimate, Status
 from samplers.subset import AdaptiveSubsetSimulation
 
 LEAST_REPLICATES = 5
-"""Runs made at least where one run misses target_cov: fewer give a useless t interval."""
+"""Runs made at least where those asked for miss target_cov: fewer give a useless t interval."""
 MOST_REPLICATES = 200
-"""Runs after which target_cov is given up where max_sim does not say."""
+"""Runs after which target_cov is given up."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,12 +54,18 @@ def estimate(
         gamma: Threshold of failure.
         seed: Same seed, same answer. None draws one, which the result states.
         max_sim: Simulations that are never exceeded, over all replicates.
-        target_cov: Coefficient of variation to stop at. Methods that can go on drawing do so;
-            the others are run again with fresh randomness, at least 5 runs in all where one is
-            not enough, and combined as replicates are. If it is not met within max_sim (or 200
-            runs) the status is "budget".
+        target_cov: Coefficient of variation to stop at. Methods that can go on drawing do so.
+            Where the runs asked for are not enough, further runs with fresh randomness are made
+            (at least 5 in all, unless counts are pooled) and combined as replicates are, until it
+            is met, what is left of max_sim is too little for one more run (pooled runs use it
+            all), 200 runs are made, or as many runs as `replicates` have come to the limit of
+            their method (`n` of MonteCarlo without max_sim, 100 batches of CrossEntropy). If it
+            is then not met the status is "budget".
         confidence: Nominal coverage of the interval.
-        replicates: Independent runs, combined by their mean with a t interval on the log scale.
+        replicates: Independent runs. Those of MonteCarlo are pooled: failing draws of all runs
+            by draws of all runs, with the Clopper-Pearson interval of these counts. All others
+            are combined by their mean with a t interval on the log scale, which with 2 or 3
+            runs is very wide.
         on_error: Where f raises or gives NaN: "raise" stops and names the row; "failure" counts
             the point as failing; "bound" also counts it as failing in p and in the upper end of
             the interval, but not in the lower end.
@@ -90,7 +96,8 @@ def estimate(
 def _runs(plan: _Plan, counted: Counted, monitor: Monitor) -> tuple[list[Outcome], bool]:
     """Run the method as often as asked for; return the outcomes and whether the target is met."""
     outcomes: list[Outcome] = []
-    largest = 0
+    largest = at_limit = 0
+    target = plan.goal.target_cov
     while True:
         monitor.run = len(outcomes)
         before = counted.n_sim
@@ -98,13 +105,14 @@ def _runs(plan: _Plan, counted: Counted, monitor: Monitor) -> tuple[list[Outcome
         rng = np.random.default_rng(np.random.SeedSequence(plan.seed, spawn_key=(len(outcomes),)))
         outcomes.append(plan.method.run(counted, goal, rng))
         largest = max(largest, counted.n_sim - before)
+        at_limit += plan.method.stops_at_target and goal.target_cov is not None and outcomes[-1].cov > goal.target_cov
         if len(outcomes) < plan.replicates:
             continue
-        target = plan.goal.target_cov
-        few = 1 < len(outcomes) < LEAST_REPLICATES and len(outcomes) > plan.replicates
+        pools = pooled_counts(outcomes) is not None
+        few = plan.replicates < len(outcomes) < LEAST_REPLICATES and not pools
         met = target is None or (combined_cov(outcomes) <= target and not few)
-        given_up = plan.method.stops_at_target or len(outcomes) >= MOST_REPLICATES
-        if met or given_up or plan.goal.budget - counted.n_sim < largest:
+        given_up = at_limit >= plan.replicates or len(outcomes) >= MOST_REPLICATES
+        if met or given_up or plan.goal.budget - counted.n_sim < (1 if pools else largest):
             return outcomes, met
 
 
@@ -181,13 +189,18 @@ def _checked(
     if seed is not None:
         _check_whole("seed", seed, 0)
     check_name("on_error", on_error, list(ON_ERROR))
-    goal = Goal(gamma=float(gamma), confidence=confidence, max_sim=max_sim, target_cov=target_cov)
+    goal = Goal(
+        gamma=float(gamma),
+        confidence=float(confidence),
+        max_sim=None if max_sim is None else int(max_sim),
+        target_cov=None if target_cov is None else float(target_cov),
+    )
     return _Plan(
         problem=problem,
         method=chosen,
         goal=goal,
         seed=_fresh_seed() if seed is None else int(seed),
-        replicates=replicates,
+        replicates=int(replicates),
         on_error=cast(OnError, on_error),
     )
 
@@ -208,11 +221,8 @@ def _check_problem(problem: Problem) -> None:
 
 
 def _check_number(name: str, value: object, low: float, high: float) -> None:
-    number = isinstance(value, int | float | np.integer | np.floating)
-    if not number or isinstance(value, bool) or not low < cast(float, value) < high:
-        between = (
-            "a finite number" if high - low == math.inf and low < 0 else (f"a number between {low:g} and {high:g}")
-        )
+    if not is_number(value) or not low < value < high:
+        between = "a finite number" if low == -math.inf else f"a number between {low:g} and {high:g}"
         raise ValueError(f"Expected {name} to be {between}, got {value!r}.")
 
 

@@ -16,7 +16,7 @@ from samplers.intervals import (
 )
 from samplers.kernels import adapted_scale, conditional_step, proposal_sigma
 from samplers.levels import next_level
-from samplers.method import Goal, Outcome, check_count, check_setting, no_outcome_share
+from samplers.method import Goal, Outcome, check_choice, check_count, check_setting, no_outcome_share
 from samplers.problem import FloatArray, Problem, evaluate_at
 from samplers.result import Level, Status
 
@@ -136,8 +136,7 @@ class AdaptiveSubsetSimulation:
         check_setting(who, "p0", self.p0, 0.0, 0.5)
         check_setting(who, "scale", self.scale, 0.0, math.inf)
         check_setting(who, "target_acceptance", self.target_acceptance, 0.0, 1.0)
-        if self.sigma0 not in ("seeds", "unit"):
-            raise ValueError(f'{who}: expected sigma0 "seeds" or "unit", got {self.sigma0!r}.')
+        check_choice(who, "sigma0", self.sigma0, ("unit", "seeds"))
 
     def run(self, problem: Problem, goal: Goal, rng: np.random.Generator) -> Outcome:
         """Go from level to level until the share of failures among its points is p0 or more."""
