@@ -68,9 +68,7 @@ class MonteCarlo:
         return share_of_failures(hits, n, goal.confidence, trace, no_outcome_share(np.concatenate(failing)))
 
 
-def share_of_failures(
-    hits: int, n: int, confidence: float, trace: Sequence[Level], no_outcome_share: float
-) -> Outcome:
+def share_of_failures(hits: int, n: int, confidence: float, trace: Sequence[Level], no_outcome_share: float) -> Outcome:
     """Return the outcome of `hits` failing points among n independent draws."""
     return Outcome(
         p=hits / n,

@@ -24,8 +24,8 @@ def combined(outcomes: Sequence[Outcome], confidence: float) -> Outcome:
     run: p = sum k_i / sum n_i with the Clopper-Pearson interval. (A t interval would throw away
     what binomial counts say of their own spread; with R = 2 its quantile is 12.7.)
 
-    Otherwise the interval is one of Student's on the log scale. p is the arithmetic mean p_bar (each run's p-hat is unbiased, its logarithm is not). Its
-    c.o.v. is the larger of what the runs say of themselves and of what their spread shows. The
+    Otherwise p is the arithmetic mean p_bar (each run's p-hat is unbiased, its logarithm is not).
+    Its c.o.v. is the larger of what the runs say of themselves and of what their spread shows. The
     interval is p_bar exp(-+ t s / sqrt(R)) with s the standard deviation of log p-hat (of
     p-hat / p_bar, where a run has p-hat = 0) and t the quantile with R - 1 degrees of freedom.
     """
@@ -37,10 +37,8 @@ def combined(outcomes: Sequence[Outcome], confidence: float) -> Outcome:
     counts = pooled_counts(outcomes)
     if counts is not None:
         hits, n = counts
-        shares, weights = [o.no_outcome_share for o in outcomes], [o.counts[0] for o in outcomes if o.counts]
-        return share_of_failures(
-            hits, n, confidence, trace, float(np.average(shares, weights=weights)) if hits else 0.0
-        )
+        without = sum(o.no_outcome_share * o.counts[0] for o in outcomes if o.counts)
+        return share_of_failures(hits, n, confidence, trace, without / hits if hits else 0.0)
     return Outcome(
         p=mean,
         interval=_interval(outcomes, p, confidence),

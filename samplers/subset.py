@@ -1,7 +1,7 @@
 """Adaptive subset simulation (Tian et al. 2024)."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import ClassVar, Literal, NamedTuple
 
@@ -25,6 +25,10 @@ LONGEST_CHAIN = 50
 """More steps than this from a handful of seeds cost calls of f and add little."""
 FEW_CHAINS = 20
 LARGE_COV = 0.5
+FEWEST_SEEDS = 10
+"""A level is not made smaller for the sake of the budget than this many seeds allow."""
+USUAL_LEVELS = 4
+"""Levels that shall fit into a small budget: down to p = p0^4, 1e-4."""
 
 
 class Chains(NamedTuple):
@@ -104,6 +108,10 @@ class AdaptiveSubsetSimulation:
     log-normal, or Clopper-Pearson where level 0 already answers. p-hat has a bias of order 1/N
     (+1 to +4 % at N = 1000 and p = 2e-4).
 
+    Where max_sim does not hold four levels of n points (3.7 n with p0 = 0.1), N is what lets them
+    fit, but at least 10 / p0; a warning says so where that is less than half of n. With a smaller
+    max_sim there is level 0 only.
+
     Args:
         n: Points per level, N. (The paper has 500.)
         p0: Wanted conditional probability of each level.
@@ -140,6 +148,24 @@ class AdaptiveSubsetSimulation:
 
     def run(self, problem: Problem, goal: Goal, rng: np.random.Generator) -> Outcome:
         """Go from level to level until the share of failures among its points is p0 or more."""
+        fitted = replace(self, n=self._points(goal.budget))
+        outcome = fitted._descend(problem, goal, rng)
+        return replace(outcome, warnings=(*self._about_budget(fitted.n, goal.budget), *outcome.warnings))
+
+    def _points(self, budget: int) -> int:
+        """Return the points per level: fewer than n where the budget does not hold the usual levels."""
+        fitting = int(budget / (1 + (USUAL_LEVELS - 1) * (1 - self.p0)))  # seeds are not simulated again
+        return min(self.n, max(math.ceil(FEWEST_SEEDS / self.p0), fitting))
+
+    def _about_budget(self, n: int, budget: int) -> list[str]:
+        """Return the warning about a budget that is too small for n points per level."""
+        if budget < n:
+            return [f"max_sim leaves {budget} of the {n} simulations that level 0 needs at least: plain draws only."]
+        coarse = n < self.n / 2
+        return [f"max_sim leaves {budget} simulations: {n} points per level, not {self.n}."] if coarse else []
+
+    def _descend(self, problem: Problem, goal: Goal, rng: np.random.Generator) -> Outcome:
+        """Run with n points per level, as far as the budget goes."""
         chains = first_level(problem, min(self.n, goal.budget), rng)
         left = goal.budget - chains.n_new
         passed, scale, trace = Passed(), self.scale, list[Level]()
@@ -161,6 +187,8 @@ class AdaptiveSubsetSimulation:
         """Return how the run ends with these chains, or None if it goes on to `level`."""
         if level == gamma:
             return Status.CONVERGED
+        if left == 0 and chains.f.size < self.n:
+            return Status.BUDGET  # too few points of level 0 to speak of ties
         if level is None or depth + 1 >= self.max_levels:
             return Status.STALLED
         n_seeds = int(np.count_nonzero(chains.f[chains.used] <= level))

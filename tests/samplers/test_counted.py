@@ -86,6 +86,20 @@ def test_raise_keeps_the_cause():
     assert isinstance(caught.value.__cause__, RuntimeError)
 
 
+def test_raise_quotes_what_f_says_of_the_row_it_names():
+    """f names one bad row of its batch, and not the first."""
+
+    def f(x):
+        bad = np.flatnonzero(x[:, 0] >= 2)
+        if len(bad):
+            raise RuntimeError(f"no road at {x[bad[-1], 0]:g}")
+        return x[:, 0]
+
+    with pytest.raises(EvaluationError, match=r"row 1 of a batch of 5, x = .*; RuntimeError: no road at 3$") as caught:
+        counted(f).evaluate(X)
+    assert str(caught.value.__cause__) == "no road at 3"
+
+
 def test_an_error_that_does_not_repeat_is_said_to():
     calls = []
 

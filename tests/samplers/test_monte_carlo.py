@@ -29,6 +29,12 @@ def test_says_when_the_target_was_missed():
     assert any("target" in text for text in result.warnings)
 
 
+def test_without_max_sim_n_is_the_limit():
+    result = samplers.estimate(EASY.problem, samplers.MonteCarlo(n=2000), seed=1, target_cov=0.01)
+    assert result.n_sim == 2000
+    assert result.status == "budget"
+
+
 def test_few_hits_are_worth_a_warning():
     result = samplers.estimate(EASY.problem, "mc", seed=2, max_sim=30)
     assert 0 < result.failures.total < 5

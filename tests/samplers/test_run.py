@@ -1,3 +1,4 @@
+import json
 import subprocess
 import sys
 
@@ -16,6 +17,23 @@ PROBLEM = half_space().problem
         ({"gamma": float("nan")}, "gamma to be a finite number, got nan"),
         ({"gamma": float("inf")}, "gamma to be a finite number"),
         ({"gamma": "0"}, "gamma to be a finite number"),
+        ({"gamma": None}, "gamma to be a finite number, got None"),
+        ({"gamma": True}, "gamma to be a finite number, got True"),
+        ({"gamma": 10**400}, "gamma to be a finite number, got 10"),
+        ({"confidence": "0.9"}, "confidence to be a number between 0 and 1, got '0.9'"),
+        ({"confidence": True}, "confidence"),
+        ({"max_sim": "5"}, "max_sim to be a whole number of at least 1, got '5'"),
+        ({"max_sim": True}, "max_sim"),
+        ({"target_cov": "0.1"}, "target_cov to be a number between 0 and inf, got '0.1'"),
+        ({"target_cov": True}, "target_cov"),
+        ({"target_cov": 10**400}, "target_cov"),
+        ({"replicates": None}, "replicates to be a whole number of at least 1, got None"),
+        ({"replicates": 2.0}, "replicates"),
+        ({"replicates": True}, "replicates"),
+        ({"seed": "1"}, "seed to be a whole number of at least 0, got '1'"),
+        ({"seed": False}, "seed"),
+        ({"on_error": None}, "on_error None"),
+        ({"on_error": np.array(["raise"])}, "on_error"),
         ({"confidence": 1.2}, "confidence to be a number between 0 and 1, got 1.2"),
         ({"confidence": 0}, "confidence"),
         ({"max_sim": -5}, "max_sim to be a whole number of at least 1, got -5"),
@@ -66,6 +84,46 @@ def test_unknown_setting_is_named():
     with pytest.raises(ValueError, match=r"setting of CrossEntropy 'alfa'. Did you mean 'alpha'"):
         samplers.get_method("ce", alfa=0.5)
     assert samplers.get_method("ce", alpha=0.5) == samplers.CrossEntropy(alpha=0.5)
+
+
+@pytest.mark.parametrize(
+    ("cls", "name", "expected"),
+    [
+        (samplers.AdaptiveSubsetSimulation, "scale", "a number 0 < scale < inf"),
+        (samplers.AdaptiveSubsetSimulation, "p0", "a number 0 < p0 < 0.5"),
+        (samplers.AdaptiveSubsetSimulation, "target_acceptance", "a number 0 < target_acceptance < 1"),
+        (samplers.AdaptiveSubsetSimulation, "sigma0", 'sigma0 "unit" or "seeds"'),
+        (samplers.AdaptiveSubsetSimulation, "n", "n to be a whole number of at least 10"),
+        (samplers.CrossEntropy, "rho", "a number 0 < rho < 0.5"),
+        (samplers.CrossEntropy, "alpha", "a number 0 < alpha <= 1"),
+        (samplers.CrossEntropy, "base_share", "a number 0 < base_share < 1"),
+        (samplers.CrossEntropy, "wide_share", "a number 0 < wide_share < 0.9"),
+        (samplers.CrossEntropy, "wide_factor", "a number 1 < wide_factor < inf"),
+        (samplers.CrossEntropy, "family", 'family "gaussian" or "mean"'),
+        (samplers.MonteCarlo, "n", "n to be a whole number of at least 1"),
+    ],
+)
+@pytest.mark.parametrize("value", [None, "a", True, [0.3], np.array([0.3, 0.4])], ids=repr)
+def test_settings_of_the_wrong_type_are_refused_by_name(cls, name, expected, value):
+    with pytest.raises(ValueError, match=f"{cls.__name__}: expected {expected}"):
+        cls(**{name: value})
+
+
+def test_step_size_is_named_and_may_be_one():
+    for wrong in (0, 0.0, -0.1, 1.0000001, float("nan"), 10**400):
+        with pytest.raises(ValueError, match=r"CrossEntropy: expected a number 0 < alpha <= 1, got"):
+            samplers.CrossEntropy(alpha=wrong)
+    assert samplers.CrossEntropy(alpha=1).alpha == 1
+
+
+def test_numbers_of_numpy_are_numbers():
+    method = samplers.MonteCarlo(n=np.int64(500), batch=np.int32(100))
+    result = samplers.estimate(
+        PROBLEM, method, gamma=np.float32(2.0), confidence=np.float32(0.5), seed=np.int64(1), replicates=np.int8(2)
+    )
+    assert result.n_sim == 1000
+    settings = json.loads(result.to_json())["method"]["settings"]
+    assert (settings["n"], settings["batch"]) == (500, 100)
 
 
 def test_default_method_and_name_as_string():

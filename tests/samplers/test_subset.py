@@ -1,13 +1,17 @@
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy import stats
 
 import samplers
+from samplers.intervals import log_normal
+from samplers.method import Goal
 from samplers.problem import FunctionProblem
 from samplers.reference import half_space, plateau, shell
-from samplers.subset import Chains, Passed, after, descent_cov, described
+from samplers.result import Status
+from samplers.subset import Chains, Passed, after, descent_cov, described, finish
 
 ADSS = samplers.AdaptiveSubsetSimulation
 
@@ -93,6 +97,25 @@ def test_descent_cov():
     assert math.isinf(descent_cov(np.empty(0, dtype=int), 1000))
 
 
+def test_cov_is_the_larger_of_chain_correlation_and_descent():
+    """100 chains that stay where they are; 10 fail. Either estimate can be the larger one."""
+    chains, goal = frozen(100, 10), Goal(gamma=0.0)
+
+    def outcome(roots, passed):
+        zero = replace(described(frozen(1000, 1), 0.0, Passed()), n_points=1000)
+        last = described(chains._replace(roots=roots), 0.0, passed)
+        return finish(chains._replace(roots=roots), goal, passed, [zero, last], Status.CONVERGED), last
+
+    one_root, passed = np.zeros(100, dtype=int), Passed(0.1, 0.1)
+    by_descent, last = outcome(one_root, passed)
+    assert by_descent.cov == descent_cov(np.zeros(100, dtype=int), 1000) > 2 * after(passed, last).cov
+    assert by_descent.interval == log_normal(by_descent.p, by_descent.cov, 0.95)
+
+    passed = Passed(0.1, 2.0)
+    by_levels, last = outcome(np.arange(100), passed)
+    assert by_levels.cov == after(passed, last).cov > 2 * descent_cov(np.repeat(np.arange(10), 10), 1000)
+
+
 def test_own_cov_matches_the_spread(study):
     """40 % off would be seen; leaving out the chain correlation makes it 35 % too small."""
     reference, runs = half_space(), 300
@@ -144,11 +167,49 @@ def test_gives_up_after_max_levels():
 
 
 def test_a_budget_in_the_middle_of_a_level_is_used_and_said():
-    result = samplers.estimate(half_space().problem, ADSS(), seed=1, max_sim=3300)
-    assert result.n_sim == 3300
-    assert result.trace[-1].n_sim == 500
-    assert result.trace[-1].n_points == 500 + seeds_of(result.trace)[-1]
-    assert any("max_sim" in text for text in result.warnings) == (result.status != "converged")
+    result = samplers.estimate(half_space(2, 4.5).problem, ADSS(n=500), seed=1, max_sim=2150)
+    assert result.n_sim == 2150
+    assert [level.n_sim for level in result.trace] == [500, 450, 450, 450, 300]
+    assert result.trace[-1].n_points == 300 + seeds_of(result.trace)[-1]
+    assert any("max_sim was used up at level 4" in text for text in result.warnings)
+
+
+@pytest.mark.parametrize("max_sim", [1, 2, 5, 50, 99])
+def test_a_budget_under_level_zero_is_named_as_the_reason(max_sim):
+    result = samplers.estimate(half_space().problem, ADSS(), seed=1, max_sim=max_sim)
+    assert result.n_sim == max_sim
+    assert result.warnings[0] == (
+        f"max_sim leaves {max_sim} of the 100 simulations that level 0 needs at least: plain draws only."
+    )
+    assert "max_sim was used up at level 0" in result.warnings[1]
+    assert not any("ties" in text for text in result.warnings)
+    assert result.interval == samplers.intervals.clopper_pearson(0, max_sim, 0.95)
+
+
+def test_a_budget_for_few_points_has_the_status_budget():
+    """Two of 50 points fail, less than p0: the run would go on."""
+    problem = FunctionProblem(lambda x: np.arange(len(x)) - 1.5, 2)
+    result = samplers.estimate(problem, ADSS(), seed=1, max_sim=50)
+    assert (result.p, result.status) == (0.04, "budget")
+
+
+@pytest.mark.parametrize(("max_sim", "n"), [(100, 100), (370, 100), (740, 200), (1000, 270), (3699, 999), (3700, 1000)])
+def test_points_per_level_fit_the_budget(max_sim, n):
+    result = samplers.estimate(half_space(2, 4.5).problem, ADSS(), seed=1, max_sim=max_sim)
+    assert result.trace[0].n_points == n
+    assert len(result.trace) == (1 if max_sim == 100 else 4)
+    assert any(f"{n} points per level, not 1000" in text for text in result.warnings) == (n < 500)
+    assert samplers.estimate(half_space().problem, ADSS(n=50), seed=1, max_sim=80).trace[0].n_points == 50
+
+
+def test_a_small_budget_is_spent_well(study):
+    """A thousand simulations: Monte Carlo would have a c.o.v. of 0.86."""
+    reference, runs = half_space(2, 3.0), 200
+    found = study(reference, ADSS(), runs, max_sim=1000)
+    error = found.ratios.std(ddof=1) / math.sqrt(runs)
+    assert abs(found.ratios.mean() - 1) < 4 * error + 0.04 * 1000 / 270  # bias of order 1/N
+    assert found.ratios.std(ddof=1) < 0.7
+    assert found.covered >= stats.binom.ppf(1e-3, runs, 0.88)
 
 
 def test_noise_of_f_is_kept_with_the_point(study):
