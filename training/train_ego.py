@@ -114,6 +114,9 @@ def train_ego(
         raise ValueError(f"Expected steps >= 1, got {steps}.")
     if not 0 <= seed < 2**32:
         raise ValueError(f"Expected a seed from 0 to 2^32 - 1, got {seed}.")
+    from rare_envs.setup import find_scenario
+
+    find_scenario(env_id)
     target = _writable(Path(out))
 
     import stable_baselines3

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 
 import agents
@@ -22,3 +23,9 @@ def test_a_trained_ego_collides_far_less_than_a_random_policy(tmp_path: Path) ->
     collisions = int((problem.evaluate(x) <= 0.0).sum())
     # three standard errors of the count above what was seen
     assert (collisions + 3.0 * max(collisions, 1) ** 0.5) / len(x) < random_collision_rate() / FACTOR
+
+
+def test_an_unknown_environment_leaves_no_folder_behind(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="did you mean 'rare_envs/CutIn-v0'"):
+        train_ego("CutIn", steps=1, out=tmp_path / "new" / "ego.zip")
+    assert not (tmp_path / "new").exists()
