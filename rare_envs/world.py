@@ -78,7 +78,7 @@ class World:
         """
         state = self.scenario.initial(x)
         lead = lead_of(state, self.scenario.lanes)
-        danger = MEASURES[self.measure](state, lead)
+        danger = MEASURES[self.measure](state, lead, self.scenario.lanes)
         return Episode(state, lead, danger, torch.zeros_like(danger, dtype=torch.bool))
 
     def step(self, episode: Episode, action: Tensor) -> Episode:
@@ -103,5 +103,5 @@ class World:
         state = State(x, y, heading, speed, old.theta)
         lead = lead_of(state, lanes)
         collided = episode.collided | ego_overlaps(state).any(dim=1) | off_road(state, lanes)
-        danger = torch.minimum(episode.danger, MEASURES[self.measure](state, lead))
+        danger = torch.minimum(episode.danger, MEASURES[self.measure](state, lead, lanes))
         return Episode(state, lead, danger, collided)

@@ -141,11 +141,26 @@ def test_ego_in_the_other_lane_minds_that_lane() -> None:
 
 def test_ttc_of_two_cars() -> None:
     state = traffic((0.0, 0.0, 0.0, 20.0))
-    assert ttc(state, Lead(tensor(30.0), tensor(10.0))).item() == pytest.approx(3.0)
-    assert ttc(state, Lead(tensor(30.0), tensor(-1.0))).item() == TTC_MAX
-    assert ttc(state, Lead(tensor(500.0), tensor(10.0))).item() == TTC_MAX
-    assert ttc(state, Lead(tensor(math.inf), tensor(0.0))).item() == TTC_MAX
-    assert 0.0 < ttc(state, Lead(tensor(-2.0), tensor(10.0))).item() < 0.01  # beside, not a collision
+    assert ttc(state, Lead(tensor(30.0), tensor(10.0)), 1).item() == pytest.approx(3.0)
+    assert ttc(state, Lead(tensor(30.0), tensor(-1.0)), 1).item() == TTC_MAX
+    assert ttc(state, Lead(tensor(500.0), tensor(10.0)), 1).item() == TTC_MAX
+    assert ttc(state, Lead(tensor(math.inf), tensor(0.0)), 1).item() == TTC_MAX
+    assert 0.0 < ttc(state, Lead(tensor(-2.0), tensor(10.0)), 1).item() < 0.01  # beside, not a collision
+
+
+@pytest.mark.parametrize(
+    ("y", "heading", "lanes", "expected"),
+    [
+        (0.0, 0.05, 1, 2.0 / (20.0 * math.sin(0.05))),  # to the right edge, 2 m away
+        (0.5, -0.05, 1, 2.5 / (20.0 * math.sin(0.05))),  # back to the left one
+        (0.0, 0.05, 2, 6.0 / (20.0 * math.sin(0.05))),  # a second lane on the right
+        (1.9, 0.0, 1, TTC_MAX),  # along the edge, not towards it
+        (3.0, 0.05, 1, 0.01 / (20.0 * math.sin(0.05))),  # beyond it
+    ],
+)
+def test_ttc_of_the_edge_of_the_road(y: float, heading: float, lanes: int, expected: float) -> None:
+    state, nobody = traffic((0.0, y, heading, 20.0)), Lead(tensor(math.inf), tensor(0.0))
+    assert ttc(state, nobody, lanes).item() == pytest.approx(expected)
 
 
 def test_off_road() -> None:
