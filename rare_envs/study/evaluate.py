@@ -80,6 +80,12 @@ class Report:
         """Whether the method itself warns that the number may be wrong."""
         return bool(self.estimate.warnings)
 
+    @property
+    def vec_normalize(self) -> str | None:
+        """File of the `VecNormalize` statistics that were applied to a saved ego's observations, if there was one."""
+        path = getattr(self.study.problem.ego, "statistics_path", None)
+        return None if path is None else str(path)
+
     def to_dict(self, top: int = 10) -> dict[str, Any]:
         """The report as JSON-ready values: question, estimate and the `top` most likely failures."""
         failures = self.estimate.failures
@@ -96,6 +102,7 @@ class Report:
             **self.estimate.to_dict(),
             "question": asdict(self.study.question),
             "doubtful": self.doubtful,
+            "vec_normalize": self.vec_normalize,
             "seconds": self.seconds,
             "n_failures": failures.total,
             "failures": ranked,

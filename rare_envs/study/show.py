@@ -52,9 +52,13 @@ def print_report(report: Report, out: Path | None = None) -> None:
     )
     for name, value in rows:
         console.print(f"  {name:<15} {value}")
+    if report.vec_normalize is not None:
+        console.print(f"  {'observations':<15} normalised by {report.vec_normalize}")
     _print_failure(console, report)
     for warning in estimate.warnings:
         console.print(f"warning: {warning}", style="yellow")
+    if question.method != "mc" and question.ego != "idm":
+        console.print("check it: --method mc --max-sim 300000 finds ways to crash that f does not announce")
     if out is not None:
         names = ", ".join(path.name for path in sorted(out.iterdir()) if path.is_file())
         console.print(f"written to {out}: {names}")

@@ -241,3 +241,19 @@ def test_the_installed_command_behaves_the_same() -> None:
     alone = run()
     assert (alone.returncode, alone.stderr) == (0, "")
     assert all(word in alone.stdout for word in ("list", "estimate", "train-ego"))
+
+
+def test_the_result_names_the_statistics_that_were_applied(cli, tmp_path):
+    """A policy with somebody else's VecNormalize statistics drives like a stranger: say which file it was."""
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    import training
+
+    env = VecNormalize(training.sb3_vec_env(FOLLOWING, 4))
+    PPO("MlpPolicy", env, n_steps=8, batch_size=32).save(tmp_path / "ego.zip")
+    words = ("estimate", FOLLOWING, "--ego", str(tmp_path / "ego.zip"), "--method", "mc", "--max-sim", "50", "--json")
+    assert json.loads(cli(*words).stdout)["vec_normalize"] is None
+    env.save(str(tmp_path / "vecnormalize.pkl"))
+    assert json.loads(cli(*words).stdout)["vec_normalize"] == str(tmp_path / "vecnormalize.pkl")
+    assert "normalised by" in cli(*words[:-1]).stdout
