@@ -49,8 +49,8 @@ def to_physical(action: Tensor, batch: int, ignored: Tensor | None = None) -> Te
     if not bool(finite.all()):
         bad = int((~finite.all(dim=1)).sum())
         raise ValueError(
-            f"The policy returned NaN or infinite actions for {bad} of {batch} observations; "
-            "check its weights and its observation normalisation."
+            f"NaN or infinite actions for {bad} of {batch} observations; "
+            "check the policy's weights and observation normalisation."
         )
     scale = torch.tensor([MAX_ACCELERATION, MAX_STEERING], dtype=action.dtype, device=action.device)
     return action.clamp(-1.0, 1.0) * scale

@@ -85,6 +85,8 @@ class DrivingEnv(gym.Env[Observation, NDArray[np.float32]]):
         """
         if self._episode is None:
             raise RuntimeError("Expected reset() before step().")
+        if np.shape(action) != self.action_space.shape:
+            raise ValueError(f"Expected an action of shape (2,) (acceleration, steering), got {np.shape(action)}.")
         with torch.inference_mode():
             physical = to_physical(torch.as_tensor(np.asarray(action))[None], 1)
             episode = self.world.step(self._episode, physical)

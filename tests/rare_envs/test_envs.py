@@ -290,6 +290,15 @@ def test_reward_by_hand() -> None:
     assert info["reward_terms"]["collision"] == -30.0
 
 
+def test_wrong_actions_are_refused_and_the_episode_goes_on() -> None:
+    env = gym.make("rare_envs/CarFollowing-v0").unwrapped
+    env.reset(seed=0)
+    for action in (1, np.zeros(3), np.zeros((1, 2)), [np.nan, 0.0]):
+        with pytest.raises(ValueError, match=r"shape \(2,\)|NaN"):
+            env.step(action)
+    assert env.step([0.0, 0.0])[4]["x"].shape == (3,)
+
+
 def test_registered_ids_are_the_scenarios() -> None:
     assert tuple(SCENARIOS) == ENV_IDS
     assert {scenario.name for scenario in SCENARIOS.values()} == set(PARAMETERS)
