@@ -1,6 +1,7 @@
 """The cross-entropy method (O'Kelly et al. 2018, algorithm 1)."""
 
 import math
+from collections.abc import Generator
 from dataclasses import dataclass
 from typing import ClassVar, Literal, NamedTuple
 
@@ -10,8 +11,17 @@ from samplers.families import Gaussian, Mixture, Moments, weighted_moments
 from samplers.importance import doubts, draw_until, interval_of, weighted_cov
 from samplers.intervals import binomial_cov
 from samplers.levels import next_level
-from samplers.method import Goal, Outcome, check_choice, check_count, check_setting, no_outcome_share
-from samplers.problem import FloatArray, Problem, evaluate_at
+from samplers.method import (
+    Goal,
+    Interrupted,
+    Outcome,
+    Steps,
+    check_choice,
+    check_count,
+    check_setting,
+    no_outcome_share,
+)
+from samplers.problem import FloatArray, Inputs
 from samplers.result import Level, Status
 from samplers.weights import effective_sample_size, normalised
 
@@ -113,15 +123,15 @@ class CrossEntropy:
         check_setting(who, "wide_factor", self.wide_factor, 1.0, math.inf)
         check_choice(who, "family", self.family, ("gaussian", "mean"))
 
-    def run(self, problem: Problem, goal: Goal, rng: np.random.Generator) -> Outcome:
+    def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Search for a proposal, then estimate with fresh draws."""
-        iterates, ended = self._search(problem, goal, rng)
+        iterates, ended = yield from self._search(inputs, goal, rng)
         trace = [iterate.record for iterate in iterates]
         common = len(iterates) < 2  # the base draws fail often enough, or there is no way on
         best = min(iterates, key=lambda i: (i.level, i.record.cov)) if iterates else None
-        sampler = plain(problem.dim) if common or best is None else self._defensive(best.proposal)
+        sampler = plain(inputs.dim) if common or best is None else self._defensive(best.proposal)
         limit = self._limit(goal, sum(level.n_sim for level in trace))
-        draws, final = draw_until(problem, sampler, goal, limit, self.n_final, rng)
+        draws, final, stopped = yield from draw_until(inputs, sampler, goal, limit, self.n_final, rng)
         cov = binomial_cov(draws.p, draws.n) if common else draws.cov
         reached = best is not None and best.level == goal.gamma
         return Outcome(
@@ -140,18 +150,20 @@ class CrossEntropy:
             return goal.max_sim - spent
         return self.n_final * (1 if goal.target_cov is None else MOST_BATCHES)
 
-    def _search(self, problem: Problem, goal: Goal, rng: np.random.Generator) -> tuple[list[Iterate], Status]:
+    def _search(
+        self, inputs: Inputs, goal: Goal, rng: np.random.Generator
+    ) -> Generator[FloatArray, FloatArray, tuple[list[Iterate], Status]]:
         """Run algorithm 1 until two proposals have reached gamma; return iterates and ending."""
         if goal.budget < LEAST_BUDGET:
             return [], Status.BUDGET
         size = min(self.n_iteration, goal.budget // 10)
         affordable = int(SEARCH_SHARE * goal.budget) // size
-        proposal = Gaussian.standard(problem.dim)
+        proposal = Gaussian.standard(inputs.dim)
         iterates: list[Iterate] = []
         for _ in range(min(self.max_iterations, affordable)):
             u = proposal.sample(size, rng)
-            f = evaluate_at(problem, u)
-            log_weights = Gaussian.standard(problem.dim).log_prob(u) - proposal.log_prob(u)
+            f = yield inputs.base.from_standard_normal(u)
+            log_weights = Gaussian.standard(inputs.dim).log_prob(u) - proposal.log_prob(u)
             level = next_level(f, self.rho, goal.gamma)
             iterates.append(described(proposal, f, log_weights, float(f.min()) if level is None else level))
             goal.on_level(iterates[-1].record)

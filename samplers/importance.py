@@ -6,14 +6,15 @@ References:
 """
 
 import math
+from collections.abc import Generator
 from dataclasses import dataclass
 
 import numpy as np
 
 from samplers.families import Gaussian, Mixture
 from samplers.intervals import Interval, clopper_pearson, log_normal
-from samplers.method import Goal
-from samplers.problem import FloatArray, Problem, evaluate_at
+from samplers.method import Goal, Interrupted
+from samplers.problem import FloatArray, Inputs
 from samplers.result import Level
 from samplers.weights import effective_sample_size, largest_share
 
@@ -64,27 +65,35 @@ def weighted_cov(n: int, log_weights: FloatArray) -> float:
     return math.sqrt(max(spread, 0.0) + 1.0 / (n * n)) / mean
 
 
-def draw(problem: Problem, sampler: Mixture, gamma: float, n: int, rng: np.random.Generator) -> Draws:
+def draw(
+    inputs: Inputs, sampler: Mixture, gamma: float, n: int, rng: np.random.Generator
+) -> Generator[FloatArray, FloatArray, Draws]:
     """Simulate n draws from `sampler`, a law in standard normal space, in one batch."""
     u = sampler.sample(n, rng)
-    f = evaluate_at(problem, u)
+    f = yield inputs.base.from_standard_normal(u)
     u, f = u[f <= gamma], f[f <= gamma]
-    return Draws(n, f, Gaussian.standard(problem.dim).log_prob(u) - sampler.log_prob(u))
+    return Draws(n, f, Gaussian.standard(inputs.dim).log_prob(u) - sampler.log_prob(u))
 
 
 def draw_until(
-    problem: Problem,
+    inputs: Inputs,
     sampler: Mixture,
     goal: Goal,
     limit: int,
     batch: int,
     rng: np.random.Generator,
-) -> tuple[Draws, list[Level]]:
-    """Simulate batches until `limit` draws are made or goal.target_cov is met."""
+) -> Generator[FloatArray, FloatArray, tuple[Draws, list[Level], bool]]:
+    """Simulate batches until `limit` draws are made or goal.target_cov is met.
+
+    Returns the draws, a record of every batch and whether the run was interrupted.
+    """
     draws = Draws(0, np.empty(0), np.empty(0))
     trace: list[Level] = []
     while draws.n < limit:
-        new = draw(problem, sampler, goal.gamma, min(batch, limit - draws.n), rng)
+        try:
+            new = yield from draw(inputs, sampler, goal.gamma, min(batch, limit - draws.n), rng)
+        except Interrupted:
+            return draws, trace, True
         draws = Draws(
             draws.n + new.n,
             np.concatenate([draws.f, new.f]),
@@ -104,7 +113,7 @@ def draw_until(
         goal.on_level(trace[-1])
         if goal.target_cov is not None and draws.cov <= goal.target_cov:
             break
-    return draws, trace
+    return draws, trace, False
 
 
 def interval_of(draws: Draws, confidence: float, largest_weight: float) -> Interval:

@@ -7,7 +7,6 @@ References:
 """
 
 import math
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -27,32 +26,27 @@ class Step(NamedTuple):
     """Which chains moved, shape (n,)."""
 
 
-def conditional_step(
-    evaluate: Callable[[FloatArray], FloatArray],
-    u: FloatArray,
-    f: FloatArray,
-    level: float,
-    sigma: FloatArray,
-    rng: np.random.Generator,
-) -> Step:
-    """Move every chain once by conditional sampling, all of them in one call of `evaluate`.
+def conditional_proposal(u: FloatArray, sigma: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Propose a move of every chain by conditional sampling (pCN).
 
-    Proposal v = rho u + sigma xi with xi ~ N(0, I) and rho = sqrt(1 - sigma^2), which leaves
-    N(0, I) invariant; it is taken if f(v) <= level. Hence N(0, I) given f <= level is left
-    invariant, without a ratio test. A chain that stays keeps its stored outcome, so the kernel
-    is also right for an f with noise of its own.
+    v = rho u + sigma xi with xi ~ N(0, I) and rho = sqrt(1 - sigma^2) leaves N(0, I) invariant.
+    Taken if f(v) <= level (`accepted_step`) it leaves N(0, I) given f <= level invariant, without
+    a ratio test.
 
     Args:
-        evaluate: f at points of standard normal space, (n, d) -> (n,).
-        u: Present points, shape (n, d), all with f <= level.
-        f: Their outcomes, shape (n,).
-        level: Threshold.
+        u: Present points, shape (n, d).
         sigma: Standard deviation of the proposal in each dimension, shape (d,), in (0, 1].
         rng: Source of randomness.
     """
-    rho = np.sqrt(1.0 - sigma * sigma)
-    proposal = rho * u + sigma * rng.standard_normal(u.shape)
-    f_proposal = evaluate(proposal)
+    return np.asarray(np.sqrt(1.0 - sigma * sigma) * u + sigma * rng.standard_normal(u.shape))
+
+
+def accepted_step(u: FloatArray, f: FloatArray, proposal: FloatArray, f_proposal: FloatArray, level: float) -> Step:
+    """Return where the chains stand: at the proposal if its outcome is <= level, else where they were.
+
+    A chain that stays keeps its stored outcome, so the kernel is also right for an f with noise of
+    its own: on (point, noise) together it is exact.
+    """
     accepted = f_proposal <= level
     return Step(
         u=np.where(accepted[:, None], proposal, u),

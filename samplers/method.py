@@ -1,13 +1,14 @@
-"""What a method is: settings with a `run`, given a goal and giving an outcome."""
+"""What a method is: settings with `steps`, given a goal, asking for simulations and giving an outcome."""
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from typing import ClassVar, Protocol, TypeGuard, runtime_checkable
 
 import numpy as np
+from numpy.typing import NDArray
 
-from samplers.problem import FloatArray, Problem
+from samplers.problem import FloatArray, Inputs
 from samplers.result import Level, Status
 
 
@@ -36,6 +37,27 @@ class Goal:
         return sys.maxsize if self.max_sim is None else self.max_sim
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Sample:
+    """Weighted points of one run: P[f(X) <= g] is the sum of the weights of the points with f <= g.
+
+    At g = gamma the sum is p-hat, save for control variates. What `Estimate.curve` and
+    `Estimate.reweight` work with.
+    """
+
+    f: FloatArray
+    """Outcomes, shape (m,)."""
+    weights: FloatArray
+    """Shape (m,): 1 / N for N plain draws, p0 / (q N) for N draws from q, P_j / N for a point of level j of subset
+    simulation that lies above the next level."""
+    units: NDArray[np.int64]
+    """To which independent unit each point belongs (the draw itself; the root of its chain), shape (m,)."""
+    n_units: int
+    """Independent units drawn, those without a point among these m included."""
+    x: FloatArray
+    """The points with f <= gamma, in their order in `f`, shape (k, d), in physical space."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
     """What one run of a method found."""
@@ -50,23 +72,34 @@ class Outcome:
     """Share of p that comes from points without an outcome (f raised or gave NaN)."""
     counts: tuple[int, int] | None = None
     """(k, n) where p = k / n and k counts the failing ones of n independent draws: such runs pool."""
+    sample: Sample | None = None
+    """The points behind p; None if the method cannot give them."""
+
+
+class Interrupted(Exception):
+    """Thrown into a method where it waits for outcomes: there will be no more of them."""
+
+
+Steps = Generator[FloatArray, FloatArray, Outcome]
+"""Yields points x (n, d) to be simulated, is sent their f (n,), returns the outcome."""
 
 
 @runtime_checkable
 class Method(Protocol):
     """A frozen dataclass of settings that can run.
 
-    `run` keeps to `goal.max_sim`, draws only from `rng` and calls `problem.evaluate` with as few
-    and as large batches as it can.
+    `steps` keeps to `goal.max_sim`, draws only from `rng` and yields as few and as large batches
+    as it can. Where `Interrupted` is thrown in at a yield (time limit, callback), it returns what
+    the simulations made so far say, with Status.STOPPED, and yields no more.
     """
 
     name: ClassVar[str]
     """Name on the command line."""
     stops_at_target: ClassVar[bool]
-    """Whether `run` itself goes on until goal.target_cov is met."""
+    """Whether `steps` itself goes on until goal.target_cov is met."""
 
-    def run(self, problem: Problem, goal: Goal, rng: np.random.Generator) -> Outcome:
-        """Estimate P[f(X) <= goal.gamma]."""
+    def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
+        """Estimate P[f(X) <= goal.gamma], X ~ inputs.base."""
 
 
 def no_outcome_share(f: FloatArray, weights: FloatArray | None = None) -> float:

@@ -1,14 +1,14 @@
 """Plain Monte Carlo: the yardstick."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
 
 from samplers.intervals import binomial_cov, clopper_pearson
-from samplers.method import Goal, Outcome, check_count, no_outcome_share
-from samplers.problem import FloatArray, Problem
+from samplers.method import Goal, Interrupted, Outcome, Steps, check_count, no_outcome_share
+from samplers.problem import FloatArray, Inputs
 from samplers.result import Level, Status
 
 MANY_FAILURES = 5
@@ -40,16 +40,20 @@ class MonteCarlo:
         check_count("MonteCarlo", "n", self.n, 1)
         check_count("MonteCarlo", "batch", self.batch, 1)
 
-    def run(self, problem: Problem, goal: Goal, rng: np.random.Generator) -> Outcome:
+    def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Draw batches until the target or the end of the budget."""
         budget = self.n if goal.max_sim is None else goal.max_sim
-        n, met = 0, False
+        n, met, stopped = 0, False, False
         failing: list[FloatArray] = []
         trace: list[Level] = []
         hits = 0
         while n < budget and not met:
             size = min(self.batch, budget - n)
-            f = problem.evaluate(problem.base.sample(size, rng))
+            try:
+                f = yield inputs.base.sample(size, rng)
+            except Interrupted:
+                stopped = True
+                break
             failing.append(f[f <= goal.gamma])
             n, hits = n + size, hits + len(failing[-1])
             cov = binomial_cov(hits / n, n)
@@ -65,7 +69,8 @@ class MonteCarlo:
                 )
             )
             goal.on_level(trace[-1])
-        return share_of_failures(hits, n, goal.confidence, trace, no_outcome_share(np.concatenate(failing)))
+        outcome = share_of_failures(hits, n, goal.confidence, trace, no_outcome_share(np.concatenate(failing)))
+        return replace(outcome, status=Status.STOPPED) if stopped else outcome
 
 
 def share_of_failures(hits: int, n: int, confidence: float, trace: Sequence[Level], no_outcome_share: float) -> Outcome:

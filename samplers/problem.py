@@ -32,8 +32,8 @@ class Distribution(Protocol):
 
 
 @runtime_checkable
-class Problem(Protocol):
-    """P[f(X) <= gamma] for X ~ base; small f is dangerous."""
+class Inputs(Protocol):
+    """The random input X of a problem; all that a method knows of it."""
 
     @property
     def dim(self) -> int:
@@ -42,6 +42,11 @@ class Problem(Protocol):
     @property
     def base(self) -> Distribution:
         """The law of X."""
+
+
+@runtime_checkable
+class Problem(Inputs, Protocol):
+    """P[f(X) <= gamma] for X ~ base; small f is dangerous."""
 
     def evaluate(self, x: FloatArray) -> FloatArray:
         """Simulate the rows of x (n, d); return f, shape (n,), float64."""
@@ -105,8 +110,3 @@ def check_dim(dim: object) -> None:
     """Raise a ValueError unless dim is a positive whole number."""
     if isinstance(dim, bool) or not isinstance(dim, int | np.integer) or dim < 1:
         raise ValueError(f"Expected dim to be a whole number of at least 1, got {dim!r}.")
-
-
-def evaluate_at(problem: Problem, u: FloatArray) -> FloatArray:
-    """Return f at points u (n, d) of standard normal space, shape (n,)."""
-    return problem.evaluate(problem.base.from_standard_normal(u))

@@ -24,6 +24,8 @@ class Status(str, Enum):
     """It came to its end without seeing a failure: p = 0, one-sided interval."""
     BUDGET = "budget"
     """max_sim (or the limit of runs, see `estimate`) was used up before the end or before target_cov was met."""
+    STOPPED = "stopped"
+    """Someone stopped it: the time limit or a callback."""
     STALLED = "stalled"
     """It could not get closer to the failures: ties in f, or too many levels."""
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from samplers.counted import ON_ERROR, Counted, OnError
 from samplers.intervals import gain_over_monte_carlo
-from samplers.method import Goal, Method, Outcome, is_number
+from samplers.method import Goal, Method, Outcome, Steps, is_number
 from samplers.problem import Distribution, Problem, check_dim
 from samplers.progress import Listener, Monitor, listening
 from samplers.registry import check_name, get_method
@@ -103,7 +103,7 @@ def _runs(plan: _Plan, counted: Counted, monitor: Monitor) -> tuple[list[Outcome
         before = counted.n_sim
         goal = replace(_share(plan, before, len(outcomes)), on_level=monitor.on_level)
         rng = np.random.default_rng(np.random.SeedSequence(plan.seed, spawn_key=(len(outcomes),)))
-        outcomes.append(plan.method.run(counted, goal, rng))
+        outcomes.append(driven(plan.method.steps(counted, goal, rng), counted))
         largest = max(largest, counted.n_sim - before)
         at_limit += plan.method.stops_at_target and goal.target_cov is not None and outcomes[-1].cov > goal.target_cov
         if len(outcomes) < plan.replicates:
@@ -114,6 +114,16 @@ def _runs(plan: _Plan, counted: Counted, monitor: Monitor) -> tuple[list[Outcome
         given_up = at_limit >= plan.replicates or len(outcomes) >= MOST_REPLICATES
         if met or given_up or plan.goal.budget - counted.n_sim < (1 if pools else largest):
             return outcomes, met
+
+
+def driven(steps: Steps, problem: Problem) -> Outcome:
+    """Simulate what a method asks for until it has its outcome."""
+    try:
+        x = next(steps)
+        while True:
+            x = steps.send(problem.evaluate(x))
+    except StopIteration as end:
+        return cast(Outcome, end.value)
 
 
 def _share(plan: _Plan, spent: int, done: int) -> Goal:

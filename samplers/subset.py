@@ -1,8 +1,8 @@
 """Adaptive subset simulation (Tian et al. 2024)."""
 
 import math
+from collections.abc import Generator
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
@@ -14,10 +14,19 @@ from samplers.intervals import (
     correlation_factor,
     log_normal,
 )
-from samplers.kernels import adapted_scale, conditional_step, proposal_sigma
+from samplers.kernels import accepted_step, adapted_scale, conditional_proposal, proposal_sigma
 from samplers.levels import next_level
-from samplers.method import Goal, Outcome, check_choice, check_count, check_setting, no_outcome_share
-from samplers.problem import FloatArray, Problem, evaluate_at
+from samplers.method import (
+    Goal,
+    Interrupted,
+    Outcome,
+    Steps,
+    check_choice,
+    check_count,
+    check_setting,
+    no_outcome_share,
+)
+from samplers.problem import FloatArray, Inputs
 from samplers.result import Level, Status
 
 ACCEPTANCE_RANGE = (0.15, 0.85)
@@ -146,10 +155,10 @@ class AdaptiveSubsetSimulation:
         check_setting(who, "target_acceptance", self.target_acceptance, 0.0, 1.0)
         check_choice(who, "sigma0", self.sigma0, ("unit", "seeds"))
 
-    def run(self, problem: Problem, goal: Goal, rng: np.random.Generator) -> Outcome:
+    def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Go from level to level until the share of failures among its points is p0 or more."""
         fitted = replace(self, n=self._points(goal.budget))
-        outcome = fitted._descend(problem, goal, rng)
+        outcome = yield from fitted._descend(inputs, goal, rng)
         return replace(outcome, warnings=(*self._about_budget(fitted.n, goal.budget), *outcome.warnings))
 
     def _points(self, budget: int) -> int:
@@ -164,9 +173,9 @@ class AdaptiveSubsetSimulation:
         coarse = n < self.n / 2
         return [f"max_sim leaves {budget} simulations: {n} points per level, not {self.n}."] if coarse else []
 
-    def _descend(self, problem: Problem, goal: Goal, rng: np.random.Generator) -> Outcome:
+    def _descend(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Run with n points per level, as far as the budget goes."""
-        chains = first_level(problem, min(self.n, goal.budget), rng)
+        chains = yield from first_level(inputs, min(self.n, goal.budget), rng)
         left = goal.budget - chains.n_new
         passed, scale, trace = Passed(), self.scale, list[Level]()
         while True:
@@ -178,7 +187,7 @@ class AdaptiveSubsetSimulation:
             if stop is not None:
                 return finish(chains, goal, passed, trace, stop)
             passed = after(passed, trace[-1])
-            chains, scale = self._next(problem, chains, threshold, scale, left, rng)
+            chains, scale = yield from self._next(inputs, chains, threshold, scale, left, rng)
             left -= chains.n_new
 
     def _reason_to_stop(
@@ -196,29 +205,29 @@ class AdaptiveSubsetSimulation:
 
     def _next(
         self,
-        problem: Problem,
+        inputs: Inputs,
         chains: Chains,
         level: float,
         scale: float,
         left: int,
         rng: np.random.Generator,
-    ) -> tuple[Chains, float]:
+    ) -> Generator[FloatArray, FloatArray, tuple[Chains, float]]:
         """Simulate the points of the next level; return them and the adapted scale."""
         seeds = inside(chains, level)
         n = len(seeds.f)
         longest = max(LONGEST_CHAIN, math.ceil(1 / self.p0))
         total = max(min(self.n, n + left, n * longest), n)
-        return self._grow(problem, seeds, level, total, scale, rng)
+        return (yield from self._grow(inputs, seeds, level, total, scale, rng))
 
     def _grow(
         self,
-        problem: Problem,
+        inputs: Inputs,
         seeds: Seeds,
         level: float,
         total: int,
         scale: float,
         rng: np.random.Generator,
-    ) -> tuple[Chains, float]:
+    ) -> Generator[FloatArray, FloatArray, tuple[Chains, float]]:
         """Grow a chain from every seed until there are `total` points; all chains move together.
 
         Where total is no multiple of the number of seeds, randomly chosen chains get one step
@@ -226,16 +235,17 @@ class AdaptiveSubsetSimulation:
         """
         n = len(seeds.f)
         lengths = total // n + (rng.permutation(n) < total % n)
-        u = np.zeros((n, int(lengths.max()), problem.dim))
+        u = np.zeros((n, int(lengths.max()), inputs.dim))
         f = np.full(u.shape[:2], np.inf)
         u[:, 0], f[:, 0] = seeds.u, seeds.f
-        sigma0 = np.ones(problem.dim) if self.sigma0 == "unit" else deviations(seeds.u)
+        sigma0 = np.ones(inputs.dim) if self.sigma0 == "unit" else deviations(seeds.u)
         moved = 0
         for t in range(1, f.shape[1]):
             on = lengths > t
             sigma = proposal_sigma(scale, sigma0)
-            evaluate = partial(evaluate_at, problem)
-            step = conditional_step(evaluate, u[on, t - 1], f[on, t - 1], level, sigma, rng)
+            proposal = conditional_proposal(u[on, t - 1], sigma, rng)
+            f_proposal = yield inputs.base.from_standard_normal(proposal)
+            step = accepted_step(u[on, t - 1], f[on, t - 1], proposal, f_proposal, level)
             u[on, t], f[on, t] = step.u, step.f
             moved += int(step.accepted.sum())
             scale = adapted_scale(
@@ -249,10 +259,10 @@ class AdaptiveSubsetSimulation:
         return Chains(u, f, lengths, seeds.roots, new, moved / new if new else None), scale
 
 
-def first_level(problem: Problem, n: int, rng: np.random.Generator) -> Chains:
+def first_level(inputs: Inputs, n: int, rng: np.random.Generator) -> Generator[FloatArray, FloatArray, Chains]:
     """Draw the n independent points of level 0."""
-    u = rng.standard_normal((n, problem.dim))
-    f = evaluate_at(problem, u)
+    u = rng.standard_normal((n, inputs.dim))
+    f = yield inputs.base.from_standard_normal(u)
     return Chains(u[:, None], f[:, None], np.ones(n, dtype=np.int64), np.arange(n), n, None)
 
 

@@ -3,7 +3,6 @@ import pytest
 from scipy import stats
 
 import samplers
-from samplers.problem import evaluate_at
 
 
 def test_standard_normal_density_and_map(rng):
@@ -29,17 +28,3 @@ def test_dim_must_be_a_positive_whole_number(dim):
 def test_f_must_be_callable():
     with pytest.raises(ValueError, match="function"):
         samplers.FunctionProblem(3.0, 2)
-
-
-def test_evaluate_at_goes_through_the_base():
-    class Shifted(samplers.StandardNormal):
-        def from_standard_normal(self, u):
-            return u + 10.0
-
-    class Problem:
-        dim, base = 1, Shifted(1)
-
-        def evaluate(self, x):
-            return x[:, 0]
-
-    np.testing.assert_array_equal(evaluate_at(Problem(), np.array([[1.0], [2.0]])), [11.0, 12.0])
