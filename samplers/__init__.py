@@ -3,16 +3,17 @@
 Knows NumPy and probability, nothing about driving. `estimate` is the front door.
 """
 
-from samplers.counted import EvaluationError
+from samplers.ask_tell import Run
 from samplers.cross_entropy import CrossEntropy
-from samplers.method import Goal, Method, Outcome
+from samplers.ledger import EvaluationError
+from samplers.method import Goal, Interrupted, Method, Outcome, Sample, Stepping, Steps
 from samplers.monte_carlo import MonteCarlo
 from samplers.problem import Distribution, FunctionProblem, Problem, StandardNormal
 from samplers.progress import Progress
 from samplers.registry import METHODS, get_method
 from samplers.result import Estimate, Failure, Failures, Level, Status
 from samplers.run import estimate
-from samplers.subset import AdaptiveSubsetSimulation
+from samplers.subset import AdaptiveSubsetSimulation, SubsetSimulation
 
 __all__ = [
     "METHODS",
@@ -25,14 +26,20 @@ __all__ = [
     "Failures",
     "FunctionProblem",
     "Goal",
+    "Interrupted",
     "Level",
     "Method",
     "MonteCarlo",
     "Outcome",
     "Problem",
     "Progress",
+    "Run",
+    "Sample",
     "StandardNormal",
     "Status",
+    "Stepping",
+    "Steps",
+    "SubsetSimulation",
     "estimate",
     "get_method",
 ]

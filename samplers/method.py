@@ -3,13 +3,17 @@
 import sys
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
-from typing import ClassVar, Protocol, TypeGuard, runtime_checkable
+from typing import TYPE_CHECKING, ClassVar, Protocol, TypeGuard, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from samplers.problem import FloatArray, Inputs
 from samplers.result import Level, Status
+
+if TYPE_CHECKING:
+    from samplers.ask_tell import Run
+    from samplers.ledger import OnError
 
 
 def ignore_level(level: Level) -> None:
@@ -85,12 +89,12 @@ Steps = Generator[FloatArray, FloatArray, Outcome]
 
 
 @runtime_checkable
-class Method(Protocol):
-    """A frozen dataclass of settings that can run.
+class Stepping(Protocol):
+    """What `estimate` needs of a method: a name and its steps. As a rule a frozen dataclass of settings.
 
     `steps` keeps to `goal.max_sim`, draws only from `rng` and yields as few and as large batches
-    as it can. Where `Interrupted` is thrown in at a yield (time limit, callback), it returns what
-    the simulations made so far say, with Status.STOPPED, and yields no more.
+    as it can. `Interrupted` may be thrown in at any yield but the first (time limit, callback): it
+    then returns what the simulations made so far say, with Status.STOPPED, and yields no more.
     """
 
     name: ClassVar[str]
@@ -100,6 +104,44 @@ class Method(Protocol):
 
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Estimate P[f(X) <= goal.gamma], X ~ inputs.base."""
+
+
+@runtime_checkable
+class Method(Stepping, Protocol):
+    """A method to subclass: write `steps`, and `start` comes with it."""
+
+    def start(
+        self,
+        problem: Inputs,
+        gamma: float = 0.0,
+        seed: int | None = None,
+        max_sim: int | None = None,
+        target_cov: float | None = None,
+        confidence: float = 0.95,
+        replicates: int = 1,
+        on_error: "OnError" = "raise",
+    ) -> "Run":
+        """Start a run whose simulations you make yourself: `ask` for points, `tell` their outcomes.
+
+        Args:
+            problem: Has `dim` and `base`; `evaluate` is not needed.
+            gamma: Threshold of failure.
+            seed: Same seed, same answer.
+            max_sim: Simulations that are never asked for more of.
+            target_cov: Coefficient of variation to stop at.
+            confidence: Nominal coverage of the interval.
+            replicates: Independent runs, side by side in every batch.
+            on_error: What NaN among the outcomes means.
+
+        Returns:
+            The run; it gives what `estimate` with the same arguments gives.
+
+        Raises:
+            ValueError: If an argument is not as described in `estimate`.
+        """
+        from samplers.ask_tell import start  # which imports this module
+
+        return start(self, problem, gamma, seed, max_sim, target_cov, confidence, replicates, on_error)
 
 
 def no_outcome_share(f: FloatArray, weights: FloatArray | None = None) -> float:

@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from samplers.intervals import binomial_cov, clopper_pearson
-from samplers.method import Goal, Interrupted, Outcome, Steps, check_count, no_outcome_share
+from samplers.method import Goal, Interrupted, Method, Outcome, Sample, Steps, check_count, no_outcome_share
 from samplers.problem import FloatArray, Inputs
 from samplers.result import Level, Status
 
@@ -16,12 +16,13 @@ MANY_FAILURES = 5
 
 
 @dataclass(frozen=True, kw_only=True)
-class MonteCarlo:
+class MonteCarlo(Method):
     """Share of failing points among independent draws from the base distribution.
 
-    p = k / N with the Clopper-Pearson interval. Stops at `goal.target_cov` (Tian et al. stop at
-    a relative half-width of 0.2, that is target_cov = 0.102), looked at after every batch, else
-    when the simulations are used up. Stopping at a c.o.v. makes the interval approximate.
+    p = k / N with the Clopper-Pearson interval. Stops at `goal.target_cov`, looked at after every
+    batch, else when the simulations are used up. Tian et al. stop where the 95 % interval reaches
+    20 % of p to either side: 1.96 c.o.v. = 0.2, that is target_cov = 0.102. Stopping at a c.o.v.
+    makes the interval approximate.
     Replicates are pooled: their draws are those of one longer run.
 
     Args:
@@ -43,18 +44,20 @@ class MonteCarlo:
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Draw batches until the target or the end of the budget."""
         budget = self.n if goal.max_sim is None else goal.max_sim
-        n, met, stopped = 0, False, False
+        n, hits, met, stopped = 0, 0, False, False
+        outcomes: list[FloatArray] = []
         failing: list[FloatArray] = []
         trace: list[Level] = []
-        hits = 0
         while n < budget and not met:
             size = min(self.batch, budget - n)
+            x = inputs.base.sample(size, rng)
             try:
-                f = yield inputs.base.sample(size, rng)
+                f = yield x
             except Interrupted:
                 stopped = True
                 break
-            failing.append(f[f <= goal.gamma])
+            outcomes.append(f)
+            failing.append(x[f <= goal.gamma])
             n, hits = n + size, hits + len(failing[-1])
             cov = binomial_cov(hits / n, n)
             met = goal.target_cov is not None and hits > 0 and cov <= goal.target_cov
@@ -69,8 +72,16 @@ class MonteCarlo:
                 )
             )
             goal.on_level(trace[-1])
-        outcome = share_of_failures(hits, n, goal.confidence, trace, no_outcome_share(np.concatenate(failing)))
-        return replace(outcome, status=Status.STOPPED) if stopped else outcome
+        sample = equal_draws(np.concatenate(outcomes), np.concatenate(failing))
+        without = no_outcome_share(sample.f[sample.f <= goal.gamma])
+        outcome = share_of_failures(hits, n, goal.confidence, trace, without)
+        return replace(outcome, sample=sample, status=Status.STOPPED if stopped else outcome.status)
+
+
+def equal_draws(f: FloatArray, x: FloatArray) -> Sample:
+    """Return independent draws of equal weight: outcomes f (n,) of all, the failing points x (k, d)."""
+    n = len(f)
+    return Sample(f=f, weights=np.broadcast_to(1 / n, n), units=np.arange(n), n_units=n, x=x)
 
 
 def share_of_failures(hits: int, n: int, confidence: float, trace: Sequence[Level], no_outcome_share: float) -> Outcome:

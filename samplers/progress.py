@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from samplers.result import Level
 
@@ -21,43 +21,36 @@ class Progress:
     p: float
     """Running estimate of P[f(X) <= level]; NaN before the first level."""
     run: int
-    """Replicate under way, counted from 0."""
+    """Replicate that finished this level, counted from 0 (they run side by side)."""
 
 
 Listener = Callable[[Progress], None]
 
 
 class Monitor:
-    """Puts together what the counter and the method report and passes it on."""
+    """Puts together what the counter and the methods report and passes it on.
+
+    Args:
+        listener: Given `progress` whenever it changes.
+        max_sim: Simulations allowed; None for no limit.
+    """
 
     def __init__(self, listener: Listener | None, max_sim: int | None) -> None:
+        self.progress = Progress(n_sim=0, max_sim=max_sim, level=math.inf, p=math.nan, run=0)
         self._listener = listener
-        self._max_sim = max_sim
-        self._n_sim = 0
-        self._level, self._p = math.inf, math.nan
-        self.run = 0
 
     def on_batch(self, n_sim: int) -> None:
         """Note that n_sim simulations are done."""
-        self._n_sim = n_sim
-        self._tell()
+        self._tell(replace(self.progress, n_sim=n_sim))
 
     def on_level(self, level: Level) -> None:
         """Note a finished level."""
-        self._level, self._p = level.gamma, level.estimate
-        self._tell()
+        self._tell(replace(self.progress, level=level.gamma, p=level.estimate, run=level.run))
 
-    def _tell(self) -> None:
+    def _tell(self, progress: Progress) -> None:
+        self.progress = progress
         if self._listener is not None:
-            self._listener(
-                Progress(
-                    n_sim=self._n_sim,
-                    max_sim=self._max_sim,
-                    level=self._level,
-                    p=self._p,
-                    run=self.run,
-                )
-            )
+            self._listener(progress)
 
 
 @contextmanager

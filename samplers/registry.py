@@ -1,27 +1,76 @@
-"""The methods by the names that the command line uses."""
+"""The methods by the names that the command line uses, those of other packages included."""
 
 import difflib
 import inspect
-from typing import Any
+import warnings
+from collections.abc import Iterator, Mapping
+from functools import cached_property
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, cast
 
 from samplers.cross_entropy import CrossEntropy
-from samplers.method import Method
+from samplers.method import Stepping
 from samplers.monte_carlo import MonteCarlo
 from samplers.subset import AdaptiveSubsetSimulation
 
-METHODS: dict[str, type[Method]] = {
-    method.name: method for method in (MonteCarlo, CrossEntropy, AdaptiveSubsetSimulation)
-}
+GROUP = "rare_envs.samplers"
+"""Entry points of this group name methods of other packages."""
 
 
-def get_method(name: str, **settings: Any) -> Method:
+class Methods(Mapping[str, type[Stepping]]):
+    """Methods by name: our own, then those that installed packages offer.
+
+    A package offers a method by an entry point, here in its `pyproject.toml`:
+
+        [project.entry-points."rare_envs.samplers"]
+        lattice = "their_package:Lattice"
+
+    with the `name` of the class on the left. Others' code is imported when someone first asks
+    for a name that is not ours, or for all names. An entry point that cannot be used is left out
+    with a `RuntimeWarning` that names it.
+
+    Args:
+        own: Our own methods.
+    """
+
+    def __init__(self, *own: type[Stepping]) -> None:
+        self._own = {method.name: method for method in own}
+
+    @cached_property
+    def _offered(self) -> dict[str, type[Stepping]]:
+        found: dict[str, type[Stepping]] = {}
+        for entry in sorted(entry_points(group=GROUP), key=lambda entry: entry.name):
+            try:
+                if entry.name in self._own or entry.name in found:
+                    raise ValueError("that name is taken")
+                found[entry.name] = _loaded(entry)
+            except Exception as error:  # whatever another package does must not break this one
+                message = f"The method {_origin(entry)} cannot be used: {type(error).__name__}: {error}"
+                warnings.warn(message, RuntimeWarning, stacklevel=2)
+        return found
+
+    def __getitem__(self, name: str) -> type[Stepping]:
+        return self._own[name] if name in self._own else self._offered[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter([*self._own, *self._offered])
+
+    def __len__(self) -> int:
+        return len(self._own) + len(self._offered)
+
+
+METHODS: Mapping[str, type[Stepping]] = Methods(MonteCarlo, CrossEntropy, AdaptiveSubsetSimulation)
+
+
+def get_method(name: str, **settings: Any) -> Stepping:
     """Return the method of that name with the given settings.
 
     Raises:
         ValueError: If the name or a setting is not known (the nearest one is suggested) or a
             setting has a value out of range.
     """
-    check_name("method", name, list(METHODS))
+    if not isinstance(name, str) or name not in METHODS:
+        check_name("method", name, list(METHODS))
     cls = METHODS[name]
     for setting in settings:
         check_name(f"setting of {cls.__name__}", setting, list(inspect.signature(cls).parameters))
@@ -35,3 +84,21 @@ def check_name(kind: str, name: object, valid: list[str]) -> None:
     near = difflib.get_close_matches(str(name), valid, n=1)
     hint = f" Did you mean {near[0]!r}?" if near else ""
     raise ValueError(f"Unknown {kind} {name!r}.{hint} Valid: {', '.join(valid)}.")
+
+
+def _loaded(entry: EntryPoint) -> type[Stepping]:
+    """Import the class that an entry point names."""
+    cls: Any = entry.load()
+    if not isinstance(cls, type):
+        raise TypeError(f"expected a class, got {cls!r}")
+    missing = [name for name in ("name", "stops_at_target", "steps") if not hasattr(cls, name)]
+    if missing:
+        raise TypeError(f"the class {cls.__name__} has no {', '.join(missing)}")
+    if cls.name != entry.name:
+        raise ValueError(f"the class {cls.__name__} is named {cls.name!r}, its entry point {entry.name!r}")
+    return cast(type[Stepping], cls)
+
+
+def _origin(entry: EntryPoint) -> str:
+    package = "" if entry.dist is None else f" of {entry.dist.name}"
+    return f"{entry.name!r}{package} ({entry.value})"

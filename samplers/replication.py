@@ -9,11 +9,11 @@ import numpy as np
 from scipy import stats
 
 from samplers.intervals import Interval, binomial_cov
-from samplers.method import Outcome
+from samplers.method import Outcome, Sample
 from samplers.monte_carlo import share_of_failures
 from samplers.result import Level, Status
 
-BY_CONCERN = (Status.STALLED, Status.BUDGET, Status.CONVERGED)
+BY_CONCERN = (Status.STOPPED, Status.STALLED, Status.BUDGET, Status.CONVERGED)
 """The status of the whole is the first of these that a run has."""
 
 
@@ -28,25 +28,60 @@ def combined(outcomes: Sequence[Outcome], confidence: float) -> Outcome:
     Its c.o.v. is the larger of what the runs say of themselves and of what their spread shows. The
     interval is p_bar exp(-+ t s / sqrt(R)) with s the standard deviation of log p-hat (of
     p-hat / p_bar, where a run has p-hat = 0) and t the quantile with R - 1 degrees of freedom.
+    Runs that were stopped before their end have no part in the mean if any run came to its end: one
+    that is still on its way to the failures has p-hat = 0, which is no estimate. Their levels stay
+    in the trace.
     """
     if len(outcomes) == 1:
         return outcomes[0]
-    p = np.array([outcome.p for outcome in outcomes])
-    mean = float(p.mean())
     trace = tuple(_numbered(outcomes))
     counts = pooled_counts(outcomes)
     if counts is not None:
         hits, n = counts
         without = sum(o.no_outcome_share * o.counts[0] for o in outcomes if o.counts)
-        return share_of_failures(hits, n, confidence, trace, without / hits if hits else 0.0)
+        whole = share_of_failures(hits, n, confidence, trace, without / hits if hits else 0.0)
+        return replace(whole, sample=merged_sample(outcomes, [o.counts[1] / n for o in outcomes if o.counts]))
+    used = ended(outcomes)
+    left_out = len(outcomes) - len(used)
+    about = (f"{left_out} of {len(outcomes)} runs were stopped before their end and left out.",) if left_out else ()
+    if len(used) == 1:
+        return replace(used[0], trace=trace, warnings=(*used[0].warnings, *about))
+    p = np.array([outcome.p for outcome in used])
+    mean = float(p.mean())
     return Outcome(
         p=mean,
-        interval=_interval(outcomes, p, confidence),
-        cov=combined_cov(outcomes),
-        status=_status(outcomes) if mean > 0 else Status.NO_HITS,
-        warnings=_counted(outcomes),
+        interval=_interval(used, p, confidence),
+        cov=combined_cov(used),
+        status=_status(used) if mean > 0 else Status.NO_HITS,
+        warnings=(*_counted(used), *about),
         trace=trace,
-        no_outcome_share=(float(np.average([o.no_outcome_share for o in outcomes], weights=p)) if mean else 0.0),
+        no_outcome_share=(float(np.average([o.no_outcome_share for o in used], weights=p)) if mean else 0.0),
+        sample=merged_sample(used, [1 / len(used)] * len(used)),
+    )
+
+
+def ended(outcomes: Sequence[Outcome]) -> Sequence[Outcome]:
+    """Return the runs that came to their end or, where there is none, all of them."""
+    return [outcome for outcome in outcomes if outcome.status is not Status.STOPPED] or outcomes
+
+
+def merged_sample(outcomes: Sequence[Outcome], shares: Sequence[float]) -> Sample | None:
+    """Return the points behind a weighted mean of runs, or None if a run does not give its own.
+
+    Args:
+        outcomes: R runs.
+        shares: The weight of each run in the mean, R numbers that add up to 1.
+    """
+    samples = [outcome.sample for outcome in outcomes if outcome.sample is not None]
+    if len(samples) < len(outcomes):
+        return None
+    first_units = np.cumsum([0, *(sample.n_units for sample in samples)])
+    return Sample(
+        f=np.concatenate([sample.f for sample in samples]),
+        weights=np.concatenate([share * sample.weights for share, sample in zip(shares, samples, strict=True)]),
+        units=np.concatenate([first + sample.units for first, sample in zip(first_units, samples, strict=False)]),
+        n_units=int(first_units[-1]),
+        x=np.concatenate([sample.x for sample in samples]),
     )
 
 

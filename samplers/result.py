@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from enum import Enum
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -12,7 +12,7 @@ import numpy as np
 from samplers.problem import FloatArray
 
 if TYPE_CHECKING:
-    from samplers.method import Method
+    from samplers.method import Sample, Stepping
 
 
 class Status(str, Enum):
@@ -149,10 +149,12 @@ class Estimate:
     """One entry per level, iteration or batch."""
     failures: Failures
     """Failing points, the most likely first."""
-    method: "Method"
+    method: "Stepping"
     """The method and its settings."""
     seed: int
     """Seed that gives the same run again."""
+    sample: "Sample | None" = field(default=None, compare=False, repr=False)
+    """The weighted points behind p; None if the method cannot give them."""
 
     def __str__(self) -> str:
         """Return a few lines for people."""
@@ -196,7 +198,7 @@ class Estimate:
         return json.dumps(self.to_dict(), allow_nan=False)
 
 
-def method_settings(method: "Method") -> dict[str, Any]:
+def method_settings(method: "Stepping") -> dict[str, Any]:
     """Return the settings of a method as plain values."""
     return {key: getattr(method, key) for key in getattr(method, "__dataclass_fields__", {})}
 

@@ -58,7 +58,7 @@ class Study:
 
     question: Question
     problem: rare_envs.DrivingProblem
-    method: samplers.Method
+    method: samplers.Stepping
 
 
 @dataclass(frozen=True)

@@ -121,9 +121,10 @@ class Fixed:
     def __init__(self, pools):
         self.pools = pools
 
-    def run(self, problem, goal, rng):
+    def steps(self, inputs, goal, rng):
         n = min(400, goal.budget)
-        hits = int(np.count_nonzero(problem.evaluate(rng.standard_normal((n, 2))) <= goal.gamma))
+        f = yield rng.standard_normal((n, 2))
+        hits = int(np.count_nonzero(f <= goal.gamma))
         counts = (hits, n) if self.pools else None
         return outcome(hits / n, binomial_cov(hits / n, n), counts=counts)
 

@@ -192,13 +192,14 @@ def test_f_that_raises_is_searched_for_the_row():
 
 
 def test_a_method_of_your_own(recorder):
-    """Anything with name, stops_at_target and run; it cannot overspend or hide calls."""
+    """Anything with name, stops_at_target and steps; it cannot overspend or hide calls."""
 
     class Greedy:
         name, stops_at_target = "greedy", True
 
-        def run(self, problem, goal, rng):
-            f = problem.evaluate(rng.standard_normal((100, problem.dim)))
+        def steps(self, inputs, goal, rng):
+            assert not hasattr(inputs, "evaluate")
+            f = yield rng.standard_normal((100, inputs.dim))
             p = float(np.mean(f <= goal.gamma))
             return samplers.Outcome(p=p, interval=(0.0, 1.0), cov=0.1, status=samplers.Status.CONVERGED)
 

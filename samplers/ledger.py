@@ -1,0 +1,89 @@
+"""What has been simulated: counted, checked, and the failing points remembered."""
+
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from samplers.problem import Distribution, FloatArray
+from samplers.result import Failures
+
+OnError = Literal["raise", "failure", "bound"]
+ON_ERROR: tuple[str, ...] = get_args(OnError)
+
+NO_OUTCOME = -np.inf
+"""What a method sees for a row without an outcome (counted as failing, on_error not "raise")."""
+LOWEST = float(np.finfo(np.float64).min)
+"""What a method sees for an f of -inf, so that NO_OUTCOME keeps its meaning."""
+KEEP_FAILURES = 1000
+
+
+class EvaluationError(ValueError):
+    """f raised, returned NaN or returned something that is not one number per row."""
+
+
+class Ledger:
+    """Counts every row, settles what NaN means and keeps the most likely failing points.
+
+    Args:
+        dim: Number of dimensions of x.
+        base: The law of X.
+        gamma: Threshold of failure, f <= gamma.
+        on_error: "raise" refuses NaN; "failure" and "bound" hand it on as NO_OUTCOME.
+        keep: How many failing points are kept, the most likely ones.
+    """
+
+    def __init__(
+        self, dim: int, base: Distribution, gamma: float, on_error: OnError = "raise", keep: int = KEEP_FAILURES
+    ) -> None:
+        self.n_sim = 0
+        self.n_errors = 0
+        self.failures = Failures.empty(dim)
+        self._base = base
+        self._gamma = gamma
+        self._on_error = on_error
+        self._keep = keep
+
+    def enter(self, x: FloatArray, outcomes: ArrayLike) -> FloatArray:
+        """Enter the outcomes of the rows of x (n, d); return f as methods see it, shape (n,), never NaN.
+
+        Raises:
+            EvaluationError: If there is not one number per row, or one is NaN (on_error "raise");
+                nothing is entered then.
+        """
+        f = one_per_row(outcomes, len(x))
+        missing = np.isnan(f)
+        if missing.any() and self._on_error == "raise":
+            row = where(x, int(np.argmax(missing)))
+            raise EvaluationError(f'f returned NaN for {row}; on_error="failure" or "bound" would count it instead.')
+        self.n_sim += len(x)
+        self.n_errors += int(missing.sum())
+        self._remember(x, f, missing | (f <= self._gamma))
+        return np.where(missing, NO_OUTCOME, np.maximum(f, LOWEST))
+
+    def _remember(self, x: FloatArray, f: FloatArray, failing: NDArray[np.bool_]) -> None:
+        if failing.any():
+            found = x[failing]
+            log_p0 = np.asarray(self._base.log_prob(found), dtype=np.float64)
+            self.failures = self.failures.merged(found, f[failing], log_p0, keep=self._keep)
+
+
+def one_per_row(outcomes: ArrayLike, n: int) -> FloatArray:
+    """Return the outcomes as float64, shape (n,).
+
+    Raises:
+        EvaluationError: If they are not n numbers.
+    """
+    try:
+        f = np.asarray(outcomes, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise EvaluationError(f"Expected f to return shape ({n},), one number per row of x: {error}") from error
+    if f.shape != (n,):
+        raise EvaluationError(f"Expected f to return shape ({n},), one value per row of x, got {f.shape}.")
+    return f
+
+
+def where(x: FloatArray, row: int) -> str:
+    """Return words that name a row of a batch x (n, d)."""
+    shown = np.array2string(x[row], precision=6, threshold=8, separator=", ", max_line_width=10**6)
+    return f"row {row} of a batch of {len(x)}, x = {shown}"

@@ -1,0 +1,115 @@
+"""The arguments of `estimate` and of `Method.start`, checked."""
+
+import math
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+
+from samplers.ledger import ON_ERROR, OnError
+from samplers.method import Goal, Stepping, is_number
+from samplers.problem import Distribution, Inputs, check_dim
+from samplers.registry import check_name, get_method
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan:
+    """What a run is asked: problem, method, goal, seed and the number of replicates."""
+
+    inputs: Inputs
+    method: Stepping
+    goal: Goal
+    seed: int
+    replicates: int
+    on_error: OnError
+
+
+@dataclass(frozen=True)
+class InputsOnly:
+    """dim and base of a problem: all that a method is shown, so that it cannot call f itself."""
+
+    dim: int
+    base: Distribution
+
+
+def checked(
+    problem: Inputs,
+    method: Stepping | str,
+    gamma: float,
+    seed: int | None,
+    max_sim: int | None,
+    target_cov: float | None,
+    confidence: float,
+    replicates: int,
+    on_error: str,
+) -> Plan:
+    """Return the arguments as a plan; a seed is drawn where there is none.
+
+    Raises:
+        ValueError: If an argument is not as described in `estimate`; it says what was expected.
+    """
+    check_problem(problem, ("dim", "base"))
+    chosen = get_method(method) if isinstance(method, str) else method
+    if isinstance(chosen, type):
+        raise ValueError(f"Expected a method, got the class {chosen.__name__}; add brackets: ().")
+    if not isinstance(chosen, Stepping):
+        raise ValueError(f"Expected a method such as MonteCarlo(), got {chosen!r}.")
+    check_number("gamma", gamma, -math.inf, math.inf)
+    check_number("confidence", confidence, 0.0, 1.0)
+    if target_cov is not None:
+        check_number("target_cov", target_cov, 0.0, math.inf)
+    check_whole("replicates", replicates, 1)
+    if max_sim is not None:
+        check_whole("max_sim", max_sim, replicates)
+    if seed is not None:
+        check_whole("seed", seed, 0)
+    check_name("on_error", on_error, list(ON_ERROR))
+    goal = Goal(
+        gamma=float(gamma),
+        confidence=float(confidence),
+        max_sim=None if max_sim is None else int(max_sim),
+        target_cov=None if target_cov is None else float(target_cov),
+    )
+    return Plan(
+        inputs=InputsOnly(int(problem.dim), problem.base),
+        method=chosen,
+        goal=goal,
+        seed=_fresh_seed() if seed is None else int(seed),
+        replicates=int(replicates),
+        on_error=cast(OnError, on_error),
+    )
+
+
+def check_problem(problem: object, needed: tuple[str, ...]) -> None:
+    """Raise a ValueError unless the problem has what is needed, a dimension and a base distribution."""
+    for name in needed:
+        if not hasattr(problem, name):
+            raise ValueError(
+                f"Expected a problem with {', '.join(needed[:-1])} and {needed[-1]}, got {type(problem).__name__} "
+                f"without {name}; FunctionProblem(f, dim) wraps a function."
+            )
+    inputs = cast(Inputs, problem)
+    check_dim(inputs.dim)
+    if not isinstance(inputs.base, Distribution):
+        raise ValueError(
+            "Expected problem.base to have sample, log_prob, to_standard_normal and "
+            f"from_standard_normal, got {type(inputs.base).__name__}."
+        )
+
+
+def check_number(name: str, value: object, low: float, high: float) -> None:
+    """Raise a ValueError unless value is a number between low and high, both excluded."""
+    if not is_number(value) or not low < value < high:
+        between = "a finite number" if low == -math.inf else f"a number between {low:g} and {high:g}"
+        raise ValueError(f"Expected {name} to be {between}, got {value!r}.")
+
+
+def check_whole(name: str, value: object, least: int) -> None:
+    """Raise a ValueError unless value is a whole number of at least `least`."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise ValueError(f"Expected {name} to be a whole number of at least {least}, got {value!r}.")
+
+
+def _fresh_seed() -> int:
+    """Return a seed that nobody chose, short enough to type."""
+    return int(np.random.SeedSequence().generate_state(1)[0])
