@@ -14,6 +14,7 @@ from samplers.levels import next_level
 from samplers.method import (
     Goal,
     Interrupted,
+    Method,
     Outcome,
     Steps,
     check_choice,
@@ -43,7 +44,7 @@ class Iterate(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CrossEntropy:
+class CrossEntropy(Method):
     """Importance sampling from a Gaussian found by the cross-entropy method.
 
     Search (algorithm 1): draw N_k points from the proposal theta_k, take as gamma_k the
