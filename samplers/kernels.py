@@ -1,13 +1,19 @@
 """Markov kernels in standard normal space that stay inside {f <= level}.
 
+A kernel proposes candidates that leave N(0, I) invariant; a candidate is taken if its outcome is <= level
+(`accepted_step`), which makes N(0, I) given f <= level the invariant law.
+
 References:
+    Au and Beck, "Estimation of small failure probabilities in high dimensions by subset simulation",
+    Probabilistic Engineering Mechanics 16, 2001 (modified Metropolis, section 4).
     Papaioannou, Betz, Zwirglmaier and Straub, "MCMC algorithms for subset simulation",
     Probabilistic Engineering Mechanics 41, 2015 (conditional sampling, section 3.3; its
     adaptation, section 3.4).
 """
 
 import math
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +30,88 @@ class Step(NamedTuple):
     """Their outcomes, shape (n,): the stored ones where the chain stayed."""
     accepted: NDArray[np.bool_]
     """Which chains moved, shape (n,)."""
+
+
+class Kernel(Protocol):
+    """How the chains of a level move."""
+
+    def started(self, seeds: FloatArray) -> "Kernel":
+        """Return the kernel for a level whose chains start at these points (n, d)."""
+
+    def candidates(self, u: FloatArray, rng: np.random.Generator) -> FloatArray:
+        """Propose a move from each of the points u (n, d); a row equal to its point is a stay."""
+
+    def adapted(self, acceptance: float, iteration: int) -> "Kernel":
+        """Return the kernel after the iteration-th step of a level, of which this share was accepted."""
+
+
+@dataclass(frozen=True)
+class FixedMetropolis:
+    """Component-wise Metropolis whose spread never changes (Au and Beck)."""
+
+    spread: float
+    """Half-width of the uniform or standard deviation of the normal steps."""
+    law: Literal["uniform", "normal"]
+
+    def started(self, seeds: FloatArray) -> "FixedMetropolis":
+        """Return itself."""
+        return self
+
+    def candidates(self, u: FloatArray, rng: np.random.Generator) -> FloatArray:
+        """Propose a move from each of the points u (n, d)."""
+        unit = rng.uniform(-1, 1, u.shape) if self.law == "uniform" else rng.standard_normal(u.shape)
+        return metropolis_candidates(u, self.spread * unit, rng)
+
+    def adapted(self, acceptance: float, iteration: int) -> "FixedMetropolis":
+        """Return itself."""
+        return self
+
+
+@dataclass(frozen=True, eq=False)
+class ScaledKernel:
+    """Conditional sampling or component-wise Metropolis with an adaptive scale (Tian et al. 2024)."""
+
+    proposal: Literal["conditional", "metropolis"]
+    sigma0: Literal["unit", "seeds"]
+    scale: float
+    """lambda of equation (14)."""
+    target: float
+    """Acceptance rate that the scale is steered to."""
+    deviations: FloatArray
+    """sigma_0k of equation (14), shape (d,)."""
+
+    def started(self, seeds: FloatArray) -> "ScaledKernel":
+        """Return the kernel with the scale reached and, if asked for, the deviations of these seeds (n, d)."""
+        return replace(self, deviations=deviations(seeds)) if self.sigma0 == "seeds" else self
+
+    def candidates(self, u: FloatArray, rng: np.random.Generator) -> FloatArray:
+        """Propose a move from each of the points u (n, d)."""
+        sigma = proposal_sigma(self.scale, self.deviations)
+        if self.proposal == "conditional":
+            return conditional_proposal(u, sigma, rng)
+        return metropolis_candidates(u, sigma * rng.standard_normal(u.shape), rng)
+
+    def adapted(self, acceptance: float, iteration: int) -> "ScaledKernel":
+        """Return the kernel with the scale of equation (16)."""
+        largest = 1 / float(self.deviations.min())
+        return replace(self, scale=adapted_scale(self.scale, acceptance, iteration, self.target, largest))
+
+
+def metropolis_candidates(u: FloatArray, steps: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Move every component by a symmetric step, kept with probability min(1, phi(new) / phi(old)).
+
+    The first half of the modified Metropolis algorithm (Au and Beck, section 4; equations 7, 8 and 19, 20 of
+    Tian et al. 2024). Each component on its own leaves N(0, 1) invariant because its step is symmetric: a
+    step that is not, such as that of `conditional_proposal`, needs another ratio.
+
+    Args:
+        u: Present points, shape (n, d).
+        steps: Draws of a law symmetric about 0, shape (n, d).
+        rng: Source of randomness.
+    """
+    moved = u + steps
+    log_ratio = 0.5 * (u * u - moved * moved)
+    return np.where(np.log1p(-rng.random(u.shape)) <= log_ratio, moved, u)
 
 
 def conditional_proposal(u: FloatArray, sigma: FloatArray, rng: np.random.Generator) -> FloatArray:
@@ -53,6 +141,12 @@ def accepted_step(u: FloatArray, f: FloatArray, proposal: FloatArray, f_proposal
         f=np.where(accepted, f_proposal, f),
         accepted=accepted,
     )
+
+
+def deviations(u: FloatArray) -> FloatArray:
+    """Return the standard deviation of points u (n, d) in each dimension; 1 where it is 0."""
+    spread = u.std(axis=0, ddof=1) if len(u) > 1 else np.zeros(u.shape[1])
+    return np.where(spread > 0, spread, 1.0)
 
 
 def proposal_sigma(scale: float, sigma0: FloatArray) -> FloatArray:

@@ -11,7 +11,7 @@ from typing import Any, cast
 from samplers.cross_entropy import CrossEntropy
 from samplers.method import Stepping
 from samplers.monte_carlo import MonteCarlo
-from samplers.subset import AdaptiveSubsetSimulation
+from samplers.subset import AdaptiveSubsetSimulation, SubsetSimulation
 
 GROUP = "rare_envs.samplers"
 """Entry points of this group name methods of other packages."""
@@ -59,7 +59,7 @@ class Methods(Mapping[str, type[Stepping]]):
         return len(self._own) + len(self._offered)
 
 
-METHODS: Mapping[str, type[Stepping]] = Methods(MonteCarlo, CrossEntropy, AdaptiveSubsetSimulation)
+METHODS: Mapping[str, type[Stepping]] = Methods(MonteCarlo, CrossEntropy, SubsetSimulation, AdaptiveSubsetSimulation)
 
 
 def get_method(name: str, **settings: Any) -> Stepping:
