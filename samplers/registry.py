@@ -36,6 +36,11 @@ class Methods(Mapping[str, type[Stepping]]):
     def __init__(self, *own: type[Stepping]) -> None:
         self._own = {method.name: method for method in own}
 
+    @property
+    def own(self) -> list[str]:
+        """The names of our own methods."""
+        return list(self._own)
+
     @cached_property
     def _offered(self) -> dict[str, type[Stepping]]:
         found: dict[str, type[Stepping]] = {}
@@ -59,7 +64,7 @@ class Methods(Mapping[str, type[Stepping]]):
         return len(self._own) + len(self._offered)
 
 
-METHODS: Mapping[str, type[Stepping]] = Methods(MonteCarlo, CrossEntropy, SubsetSimulation, AdaptiveSubsetSimulation)
+METHODS = Methods(MonteCarlo, CrossEntropy, SubsetSimulation, AdaptiveSubsetSimulation)
 
 
 def get_method(name: str, **settings: Any) -> Stepping:
@@ -88,15 +93,16 @@ def check_name(kind: str, name: object, valid: list[str]) -> None:
 
 def _loaded(entry: EntryPoint) -> type[Stepping]:
     """Import the class that an entry point names."""
-    cls: Any = entry.load()
-    if not isinstance(cls, type):
-        raise TypeError(f"expected a class, got {cls!r}")
-    missing = [name for name in ("name", "stops_at_target", "steps") if not hasattr(cls, name)]
+    loaded: object = entry.load()
+    if not isinstance(loaded, type):
+        raise TypeError(f"expected a class, got {loaded!r}")
+    missing = [name for name in ("name", "stops_at_target", "steps") if not hasattr(loaded, name)]
     if missing:
-        raise TypeError(f"the class {cls.__name__} has no {', '.join(missing)}")
+        raise TypeError(f"the class {loaded.__name__} has no {', '.join(missing)}")
+    cls = cast(type[Stepping], loaded)
     if cls.name != entry.name:
         raise ValueError(f"the class {cls.__name__} is named {cls.name!r}, its entry point {entry.name!r}")
-    return cast(type[Stepping], cls)
+    return cls
 
 
 def _origin(entry: EntryPoint) -> str:

@@ -1,3 +1,4 @@
+import numpy as np
 import pytest
 
 import samplers
@@ -61,3 +62,20 @@ def test_draws_from_the_base_itself():
 def test_settings_out_of_range(settings):
     with pytest.raises(ValueError, match="whole number of at least 1"):
         samplers.MonteCarlo(**settings)
+
+
+def test_gives_all_its_draws_with_equal_weight(recorder):
+    f = recorder(EASY.problem.f)
+    result = samplers.estimate(samplers.FunctionProblem(f, 2), samplers.MonteCarlo(batch=300), seed=1, max_sim=1000)
+    sample = result.sample
+    np.testing.assert_array_equal(sample.f, EASY.problem.f(f.points))
+    np.testing.assert_array_equal(sample.weights, 1e-3)
+    np.testing.assert_array_equal(sample.units, np.arange(1000))
+    assert sample.n_units == 1000
+    np.testing.assert_array_equal(sample.x, f.points[sample.f <= 0])
+
+
+def test_the_papers_stop_at_a_relative_half_width_of_a_fifth():
+    result = samplers.estimate(EASY.problem, samplers.MonteCarlo(batch=100), seed=1, target_cov=0.102)
+    half_width = (result.interval[1] - result.interval[0]) / 2
+    assert half_width / result.p == pytest.approx(0.2, rel=0.05)

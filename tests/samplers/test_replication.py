@@ -6,8 +6,11 @@ import pytest
 from scipy import stats
 
 import samplers
+from samplers.ask_tell import Run
 from samplers.intervals import binomial_cov, clopper_pearson
-from samplers.method import Outcome
+from samplers.lane import Lane
+from samplers.method import Goal, Outcome, Sample
+from samplers.plan import checked
 from samplers.reference import half_space
 from samplers.replication import combined, combined_cov
 from samplers.result import Status
@@ -74,6 +77,37 @@ def test_replicates_share_the_budget(recorder):
     result = samplers.estimate(problem, "mc", seed=1, replicates=3, max_sim=1000)
     assert f.rows == result.n_sim == 1000
     assert [level.n_sim for level in result.trace] == [333, 333, 334]
+
+
+def one_after_another(problem, method, seed, replicates, max_sim):
+    """The same runs without any interleaving."""
+    outcomes = []
+    for i in range(replicates):
+        share = None if max_sim is None else max_sim // replicates
+        goal = Goal(gamma=0.0, max_sim=share)
+        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(i,)))
+        lane = Lane(method.steps(problem, goal, rng), goal, problem.dim)
+        while lane.live:
+            lane.tell(problem.evaluate(lane.waiting))
+        outcomes.append(lane.outcome)
+    return combined(outcomes, 0.95)
+
+
+@pytest.mark.parametrize("max_sim", [None, 6000])
+@pytest.mark.parametrize("method", sorted(samplers.METHODS))
+def test_side_by_side_is_one_after_another_in_fewer_calls(method, max_sim, recorder):
+    problem, chosen = half_space(3, 3.0).problem, samplers.get_method(method)
+    alone, together = (recorder(problem.f) for _ in range(2))
+    expected = one_after_another(samplers.FunctionProblem(alone, 3), chosen, 7, 3, max_sim)
+    result = samplers.estimate(samplers.FunctionProblem(together, 3), chosen, seed=7, replicates=3, max_sim=max_sim)
+    assert result.p == expected.p
+    assert result.interval == expected.interval
+    assert result.cov == expected.cov
+    assert result.trace == expected.trace
+    assert result.warnings == expected.warnings
+    np.testing.assert_array_equal(np.unique(together.points, axis=0), np.unique(alone.points, axis=0))
+    assert together.rows == alone.rows
+    assert len(together.batches) < 0.6 * len(alone.batches)
 
 
 def test_first_replicate_is_the_single_run():
@@ -236,3 +270,75 @@ def test_coverage_of_replicated_runs_with_many_seeds(study):
     runs = 400
     found = study(half_space(), samplers.AdaptiveSubsetSimulation(), runs, replicates=10)
     assert found.covered >= stats.binom.ppf(1e-3, runs, 0.93)
+
+
+def sample(f, weights, first_x, n_units=None):
+    f = np.array(f, dtype=float)
+    n_units = len(f) if n_units is None else n_units
+    x = first_x + np.arange(np.count_nonzero(f <= 0), dtype=float)[:, None]
+    return Sample(f=f, weights=np.array(weights), units=np.arange(len(f)), n_units=n_units, x=x)
+
+
+def test_samples_are_merged_as_the_runs_are():
+    one = outcome(0.3, sample=sample([-1.0, 2.0], [0.3, 0.7], 10.0, n_units=4))
+    two = outcome(0.1, sample=sample([3.0, -2.0, 0.0], [0.9, 0.06, 0.04], 20.0))
+    merged = combined([one, two], 0.95).sample
+    np.testing.assert_array_equal(merged.f, [-1, 2, 3, -2, 0])
+    np.testing.assert_allclose(merged.weights, [0.15, 0.35, 0.45, 0.03, 0.02])
+    np.testing.assert_array_equal(merged.units, [0, 1, 4, 5, 6])
+    assert merged.n_units == 7
+    np.testing.assert_array_equal(merged.x[:, 0], [10, 20, 21])
+    assert combined([one, replace(two, sample=None)], 0.95).sample is None
+
+
+def test_samples_of_pooled_counts_weigh_draws():
+    few = outcome(0.5, counts=(1, 2), sample=sample([-1.0, 1.0], [0.5] * 2, 0.0))
+    many = outcome(0.25, counts=(2, 8), sample=sample([-1.0] * 2 + [1.0] * 6, [1 / 8] * 8, 5.0))
+    pooled = combined([few, many], 0.95)
+    assert pooled.p == 0.3
+    np.testing.assert_allclose(pooled.sample.weights, 0.1)
+    assert pooled.sample.n_units == 10
+
+
+def test_a_run_on_its_way_has_no_part_in_the_mean():
+    ends = [outcome(1e-4), outcome(2e-4)]
+    level = samplers.Level(gamma=1.0, p=0.1, estimate=0.1, n_sim=50, n_points=50, cov=0.1)
+    cut = outcome(0.0, math.inf, Status.STOPPED, trace=(level,))
+    result = combined([*ends, cut], 0.95)
+    assert result.p == pytest.approx(1.5e-4)
+    assert result.interval == combined(ends, 0.95).interval
+    assert result.trace == (replace(level, run=2),)
+    assert result.warnings == ("1 of 3 runs were stopped before their end and left out.",)
+    single = combined([ends[0], cut], 0.95)
+    assert (single.p, single.interval, single.trace) == (1e-4, (0.0, 1.0), (replace(level, run=1),))
+    assert combined([cut, replace(cut, p=1e-3)], 0.95).p == 5e-4
+
+
+def stopped_after(batches, method, **options):
+    """The result of a run that is stopped after so many batches, and the run."""
+    problem = half_space(2, 2.0).problem
+    run = Run(checked(problem, method, 0.0, 1, **{**ARGUMENTS, **options}))
+    for _ in range(batches):
+        run.tell(problem.evaluate(run.ask()))
+    return run.result()
+
+
+ARGUMENTS = {"max_sim": None, "target_cov": None, "confidence": 0.95, "replicates": 1, "on_error": "raise"}
+
+
+def test_replicates_stopped_on_their_way():
+    result = stopped_after(2, samplers.MonteCarlo(batch=100), replicates=3, max_sim=5000)
+    assert (result.n_sim, result.status) == (600, "stopped")
+    assert result.p == result.failures.total / 600
+    assert result.interval == clopper_pearson(result.failures.total, 600, 0.95)
+    assert len(result.sample.f) == 600
+
+
+def test_stopped_while_further_runs_are_made_for_the_target():
+    """Two runs of 400 draws, then one more at a time: the third had not been told a thing, or is left out."""
+    first = stopped_after(1, Fixed(False), replicates=2, target_cov=0.01)
+    assert (first.n_sim, first.status) == (800, "stopped")
+    assert not any("left out" in text for text in first.warnings)
+    pooled = stopped_after(2, Fixed(True), replicates=2, target_cov=0.01)
+    assert pooled.n_sim == 1200
+    assert pooled.interval == clopper_pearson(pooled.failures.total, 1200, 0.95)

@@ -1,6 +1,7 @@
 import json
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -47,10 +48,15 @@ PROBLEM = half_space().problem
         ({"seed": -1}, "seed to be a whole number of at least 0, got -1"),
         ({"seed": 1.5}, "seed"),
         ({"on_error": "ignore"}, "on_error 'ignore'.*Valid: raise, failure, bound"),
-        ({"method": "adds"}, "method 'adds'. Did you mean 'adss'.*Valid: mc, ce, adss"),
+        ({"method": "adds"}, "method 'adds'. Did you mean 'adss'.*Valid: mc, ce, .*adss"),
         ({"method": samplers.MonteCarlo}, "the class MonteCarlo; add brackets"),
         ({"method": 3}, "a method such as MonteCarlo"),
         ({"progress": 1}, "progress to be True, False or a function"),
+        ({"time_limit": -1}, "time_limit to be a number between 0 and inf, got -1"),
+        ({"time_limit": 0}, "time_limit"),
+        ({"time_limit": float("nan")}, "time_limit"),
+        ({"time_limit": "3 s"}, "time_limit"),
+        ({"stop": True}, "stop to be a function of Progress, got True"),
     ],
 )
 def test_bad_arguments_are_refused_before_any_simulation(options, expected, recorder):
@@ -95,7 +101,6 @@ def test_unknown_setting_is_named():
         (samplers.AdaptiveSubsetSimulation, "sigma0", 'sigma0 "unit" or "seeds"'),
         (samplers.AdaptiveSubsetSimulation, "n", "n to be a whole number of at least 10"),
         (samplers.CrossEntropy, "rho", "a number 0 < rho < 0.5"),
-        (samplers.CrossEntropy, "alpha", "a number 0 < alpha <= 1"),
         (samplers.CrossEntropy, "base_share", "a number 0 < base_share < 1"),
         (samplers.CrossEntropy, "wide_share", "a number 0 < wide_share < 0.9"),
         (samplers.CrossEntropy, "wide_factor", "a number 1 < wide_factor < inf"),
@@ -218,3 +223,61 @@ def test_importing_it_imports_no_torch_and_no_driving():
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert out.stdout.strip() == "[]"
+
+
+def slow(x):
+    time.sleep(0.02)
+    return 2.0 - x[:, 0]
+
+
+@pytest.mark.parametrize("replicates", [1, 3])
+def test_time_limit(replicates, recorder):
+    f = recorder(slow)
+    problem, method = samplers.FunctionProblem(f, 2), samplers.MonteCarlo(batch=100)
+    result = samplers.estimate(problem, method, seed=1, max_sim=10**6, time_limit=0.1, replicates=replicates)
+    assert result.status == "stopped"
+    assert result.n_sim == f.rows == 100 * replicates * len(f.batches)
+    assert 1 <= len(f.batches) <= 6
+    assert any(f"time limit of 0.1 s after {f.rows:,} simulations" in text for text in result.warnings)
+    assert result.p == result.failures.total / f.rows
+
+
+def test_time_enough_changes_nothing():
+    plain = samplers.estimate(PROBLEM, "mc", seed=1, max_sim=1000)
+    assert samplers.estimate(PROBLEM, "mc", seed=1, max_sim=1000, time_limit=100, stop=lambda progress: False) == plain
+
+
+@pytest.mark.parametrize("name", sorted(samplers.METHODS))
+@pytest.mark.parametrize("replicates", [1, 2])
+def test_stopped_by_a_callback(name, replicates, recorder):
+    f = recorder(PROBLEM.f)
+    seen = []
+
+    def after_1000(progress):
+        seen.append(progress.n_sim)
+        return progress.n_sim >= 1000
+
+    method = samplers.MonteCarlo(batch=400) if name == "mc" else samplers.get_method(name)
+    result = samplers.estimate(
+        samplers.FunctionProblem(f, 2), method, seed=1, max_sim=5000, replicates=replicates, stop=after_1000
+    )
+    assert result.status == "stopped"
+    assert result.n_sim == f.rows == seen[-1] == sum(level.n_sim for level in result.trace)
+    assert len(seen) == len(f.batches)
+    low, high = result.interval
+    assert 0 <= low <= result.p <= high <= 1
+    assert any(f"Stopped by the callback after {f.rows:,} simulations" in text for text in result.warnings)
+
+
+def test_a_stop_with_the_last_batch_is_none():
+    result = samplers.estimate(PROBLEM, "mc", seed=1, max_sim=1000, stop=lambda progress: True)
+    assert result == samplers.estimate(PROBLEM, "mc", seed=1, max_sim=1000)
+
+
+def test_a_target_that_is_met_in_fact():
+    """The spread of p-hat over 200 seeds is at most 1.3 times the target."""
+    target, runs = 0.2, 200
+    problem = half_space(2, 1.5).problem
+    method = samplers.MonteCarlo(batch=50)
+    p = np.array([samplers.estimate(problem, method, seed=seed, target_cov=target).p for seed in range(runs)])
+    assert p.std(ddof=1) / half_space(2, 1.5).p <= 1.3 * target

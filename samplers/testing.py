@@ -1,0 +1,250 @@
+"""What every method must do, as checks to run on a method of your own.
+
+    from samplers.testing import check_method
+
+    check_method(Lattice(points=100))
+
+A method that fails raises an AssertionError that says what was expected. The seeds are fixed, so
+the same method passes or fails every time. All runs together take a few 100,000 calls of cheap
+functions.
+"""
+
+import math
+import random
+from collections.abc import Callable
+
+import numpy as np
+from scipy.special import ndtr
+
+from samplers.ask_tell import start
+from samplers.lane import NOT_KNOWN
+from samplers.method import Stepping
+from samplers.problem import FloatArray, FunctionProblem
+from samplers.reference import half_space, two_modes
+from samplers.result import Estimate, Status
+from samplers.run import estimate
+
+F = Callable[[FloatArray], FloatArray]
+
+
+def check_method(method: Stepping) -> None:
+    """Run all checks on a method.
+
+    Args:
+        method: With the settings to check; `check_counts` also runs it without max_sim.
+
+    Raises:
+        AssertionError: The method does not do what a method must; the text says what.
+    """
+    for check in CHECKS:
+        check(method)
+
+
+def check_form(method: Stepping) -> None:
+    """It has a name, says whether it stops at the target, and has steps."""
+    _expect(isinstance(method, Stepping), method, "expected the attributes name, stops_at_target and steps")
+    _expect(isinstance(method.name, str) and method.name != "", method, f"expected a name, got {method.name!r}")
+    told = method.stops_at_target
+    _expect(isinstance(told, bool), method, f"expected stops_at_target to be True or False, got {told!r}")
+
+
+def check_counts(method: Stepping) -> None:
+    """Every simulation is in n_sim and in exactly one level of the trace; points with f <= gamma are failures."""
+    for max_sim in (None, 2500):
+        f = _Counting(half_space(2, 3.0).problem.f)
+        result = estimate(FunctionProblem(f, 2), method, seed=3, max_sim=max_sim)
+        _expect_sound(method, result, f.rows)
+        failing = result.failures.total
+        _expect(failing == f.failing, method, f"{f.failing} points failed, the result has {failing}")
+
+
+def check_budget(method: Stepping) -> None:
+    """max_sim is never exceeded, however small, and alone or shared by replicates."""
+    for max_sim, replicates in [(1, 1), (2, 1), (7, 1), (7, 7), (50, 1), (500, 1), (1001, 3), (1950, 1), (3000, 1)]:
+        f = _Counting(half_space(2, 3.0).problem.f)
+        result = estimate(FunctionProblem(f, 2), method, seed=3, max_sim=max_sim, replicates=replicates)
+        _expect_sound(method, result, f.rows)
+        _expect(f.rows <= max_sim, method, f"max_sim={max_sim} was exceeded: {f.rows} simulations")
+        if result.p == 0:
+            _expect(result.status == Status.NO_HITS, method, f"p = 0 calls for no_hits, got {result.status}")
+
+
+def check_seed(method: Stepping) -> None:
+    """The same seed gives the same answer, another seed another; nothing comes from global generators."""
+    problem, before = two_modes().problem, _global_state()
+    first, again, other = (estimate(problem, method, seed=seed, max_sim=5000) for seed in (5, 5, 6))
+    _expect(first == again, method, f"the same seed gave {first.p} and {again.p}")
+    _expect(first.failures != other.failures, method, "another seed gave the same failing points")
+    _expect(_global_state() == before, method, "it draws from a global generator; use rng alone")
+
+
+def check_no_failure(method: Stepping) -> None:
+    """Nothing fails: p = 0 with a one-sided interval and a warning, also where f goes downhill."""
+    for dim in (1, 2, 6):
+        result = estimate(_constant(10.0, dim), method, seed=1, max_sim=5000)
+        _expect_none(method, result)
+        _expect(result.interval[1] < 0.02, method, f"5000 points without failure bound p by {result.interval[1]:.2g}")
+    _expect_none(method, estimate(FunctionProblem(lambda x: 30 - x[:, 0], 3), method, seed=1, max_sim=3000))
+
+
+def check_failure_everywhere(method: Stepping) -> None:
+    """Everything fails: p = 1 without error, the interval reaches down a little."""
+    for dim in (1, 2):
+        result = estimate(_constant(-1.0, dim), method, seed=1, max_sim=3000)
+        low, high = result.interval
+        _expect(result.p == 1 and result.cov == 0, method, f"expected p = 1 with c.o.v. 0, got {result.p}")
+        _expect(0.99 < low < 1 == high, method, f"expected an interval in [0.99, 1], got [{low}, {high}]")
+        _expect(result.status == Status.CONVERGED, method, f"expected converged, got {result.status}")
+
+
+def check_ties(method: Stepping) -> None:
+    """Equality with gamma is failure; a handful of distinct outcomes do not confuse it."""
+    for seed in range(5):
+        problem = FunctionProblem(lambda x: np.floor(x[:, 0] + 4.5), 2)
+        _expect_near(method, estimate(problem, method, gamma=2.0, seed=seed, max_sim=5000), _phi(-1.5), "whole numbers")
+
+
+def check_infinite(method: Stepping) -> None:
+    """Outcomes may be +inf and -inf."""
+    problem = FunctionProblem(lambda x: np.where(x[:, 0] > 1.5, -np.inf, np.inf), 2)
+    _expect_near(method, estimate(problem, method, seed=1, max_sim=5000), _phi(-1.5), "infinite outcomes")
+
+
+def check_missing(method: Stepping) -> None:
+    """Rows without an outcome count as failing."""
+
+    def f(x: FloatArray) -> FloatArray:
+        return np.where(x[:, 1] > 1.5, np.nan, 10.0 - x[:, 0])
+
+    result = estimate(FunctionProblem(f, 2), method, seed=1, max_sim=5000, on_error="failure")
+    _expect_near(method, result, _phi(-1.5), "rows without an outcome")
+
+
+def check_dimensions(method: Stepping) -> None:
+    """One dimension is enough, and with 1,500 the result is right or warns."""
+    result = estimate(half_space(1, 2.0).problem, method, seed=1, max_sim=5000)
+    _expect_near(method, result, _phi(-2.0), "one dimension")
+    f = _Counting(half_space(1500, 2.0).problem.f)
+    result = estimate(FunctionProblem(f, 1500), method, seed=1, max_sim=3000)
+    _expect_sound(method, result, f.rows)
+    holds = result.interval[0] <= _phi(-2.0) <= result.interval[1]
+    _expect(holds or len(result.warnings) > 0, method, f"1,500 dimensions: missed p without a warning\n{result}")
+
+
+def check_interruption(method: Stepping) -> None:
+    """Stopped after any batch, what has been simulated is in the result."""
+    reference = half_space(2, 3.0)
+    whole = start(method, reference.problem, seed=2, max_sim=4000)
+    batches = 0
+    while not whole.done:
+        whole.tell(reference.problem.f(whole.ask()))
+        batches += 1
+    for after in sorted({math.ceil(batches * i / 12) for i in range(1, 12)} & set(range(1, batches))):
+        run = start(method, reference.problem, seed=2, max_sim=4000)
+        rows = 0
+        for _ in range(after):
+            x = run.ask()
+            rows += len(x)
+            run.tell(reference.problem.f(x))
+        result = run.result()
+        known = not set(NOT_KNOWN.warnings) & set(result.warnings)
+        _expect(known, method, f"Interrupted after batch {after}: expected an Outcome from what there is")
+        _expect_sound(method, result, rows)
+
+
+def check_sample(method: Stepping) -> None:
+    """The weighted points behind p, where it gives them, fit together and give p."""
+    result = estimate(half_space(2, 2.0).problem, method, seed=4, max_sim=3000, replicates=2)
+    sample = result.sample
+    if sample is None:
+        return
+    m, k = len(sample.f), int(np.count_nonzero(sample.f <= 0))
+    _expect(sample.weights.shape == sample.units.shape == (m,), method, f"expected {m} weights and units")
+    _expect(bool((sample.weights >= 0).all()), method, "expected weights of at least 0")
+    fits = bool(((sample.units >= 0) & (sample.units < sample.n_units)).all())
+    _expect(fits, method, f"expected units in 0 to {sample.n_units - 1}")
+    _expect(sample.x.shape == (k, 2), method, f"expected the {k} failing points, got x of shape {sample.x.shape}")
+    p = float(sample.weights[sample.f <= 0].sum())
+    near = abs(p - result.p) <= 3 * result.cov * result.p  # control variates may make a difference
+    _expect(near, method, f"the weights of failing points add up to {p:.4g}, p is {result.p:.4g}")
+
+
+def check_right(method: Stepping) -> None:
+    """Ten runs on an easy problem are not wildly wrong: a first look, no proof."""
+    reference = half_space(2, 2.0)
+    results = [estimate(reference.problem, method, seed=seed, max_sim=2000) for seed in range(10)]
+    ratios = np.array([result.p for result in results]) / reference.p
+    allowed = 0.1 + 4 * ratios.std(ddof=1) / math.sqrt(10)
+    _expect(abs(ratios.mean() - 1) < allowed, method, f"mean of 10 runs is {ratios.mean():.3g} times the true p")
+    held = sum(result.interval[0] <= reference.p <= result.interval[1] for result in results)
+    _expect(held >= 6, method, f"{held} of 10 intervals hold the true p")
+
+
+CHECKS: tuple[Callable[[Stepping], None], ...] = (
+    check_form,
+    check_counts,
+    check_budget,
+    check_seed,
+    check_no_failure,
+    check_failure_everywhere,
+    check_ties,
+    check_infinite,
+    check_missing,
+    check_dimensions,
+    check_interruption,
+    check_sample,
+    check_right,
+)
+
+
+class _Counting:
+    """f with its own books."""
+
+    def __init__(self, f: Callable[[FloatArray], object]) -> None:
+        self.rows = self.failing = 0
+        self._f = f
+
+    def __call__(self, x: FloatArray) -> FloatArray:
+        values = np.asarray(self._f(x), dtype=np.float64)
+        self.rows += len(x)
+        self.failing += int(np.count_nonzero(values <= 0))
+        return values
+
+
+def _expect(holds: bool, method: Stepping, otherwise: str) -> None:
+    if not holds:
+        raise AssertionError(f"{getattr(method, 'name', method)!r}: {otherwise}.")
+
+
+def _expect_sound(method: Stepping, result: Estimate, rows: int) -> None:
+    (low, high), levels = result.interval, sum(level.n_sim for level in result.trace)
+    _expect(result.n_sim == rows, method, f"{rows} simulations, n_sim says {result.n_sim}")
+    _expect(levels == rows, method, f"{rows} simulations, the levels of the trace add up to {levels}")
+    _expect(0 <= low <= result.p <= high <= 1, method, f"expected 0 <= low <= p <= high <= 1, got\n{result}")
+    _expect(result.cov >= 0, method, f"expected a c.o.v. of at least 0, got {result.cov}")
+    _expect(result.p > 0 or high > 0, method, "p = 0 is no certainty: expected an upper end above 0")
+
+
+def _expect_none(method: Stepping, result: Estimate) -> None:
+    low, high = result.interval
+    _expect(result.p == low == 0 < high, method, f"nothing failed: expected p = 0, interval (0, more), got\n{result}")
+    _expect(len(result.failures) == 0, method, "nothing failed, but the result has failures")
+    _expect(len(result.warnings) > 0, method, "nothing failed: expected a warning")
+    _expect(result.status == Status.NO_HITS, method, f"nothing failed: expected no_hits, got {result.status}")
+
+
+def _expect_near(method: Stepping, result: Estimate, p: float, what: str) -> None:
+    _expect(abs(result.p / p - 1) < 0.5, method, f"{what}: expected p near {p:.3g}, got\n{result}")
+
+
+def _constant(value: float, dim: int) -> FunctionProblem:
+    return FunctionProblem(lambda x: np.full(len(x), value), dim)
+
+
+def _global_state() -> tuple[object, bytes]:
+    state = np.random.get_state(legacy=False)  # noqa: NPY002  (to see that nobody uses it)
+    return random.getstate(), repr(state).encode()
+
+
+def _phi(x: float) -> float:
+    return float(ndtr(x))

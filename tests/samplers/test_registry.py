@@ -1,0 +1,138 @@
+"""Methods of other packages, found by entry point."""
+
+import subprocess
+import sys
+import textwrap
+import warnings
+
+import pytest
+
+import samplers
+from samplers.registry import GROUP, METHODS, Methods
+from samplers.testing import check_method
+
+LATTICE = """
+    import dataclasses
+    from typing import ClassVar
+
+    import samplers
+    from samplers.intervals import binomial_cov, clopper_pearson
+
+
+    @dataclasses.dataclass(frozen=True)
+    class Lattice:
+        '''Plain draws under another name.'''
+
+        n: int = 2000
+
+        name: ClassVar[str] = "lattice"
+        stops_at_target: ClassVar[bool] = False
+
+        def steps(self, inputs, goal, rng):
+            n = min(self.n, goal.budget)
+            f = yield inputs.base.sample(n, rng)
+            hits = int((f <= goal.gamma).sum())
+            level = samplers.Level(
+                gamma=goal.gamma, p=hits / n, estimate=hits / n, n_sim=n, n_points=n, cov=binomial_cov(hits / n, n)
+            )
+            return samplers.Outcome(
+                p=hits / n,
+                interval=clopper_pearson(hits, n, goal.confidence),
+                cov=level.cov,
+                status=samplers.Status.CONVERGED if hits else samplers.Status.NO_HITS,
+                warnings=() if hits else ("No failures.",),
+                trace=(level,),
+            )
+
+
+    class Nameless:
+        def steps(self, inputs, goal, rng):
+            yield
+
+
+    NUMBER = 3
+    """
+
+
+@pytest.fixture
+def installed(tmp_path, monkeypatch):
+    """Pretend that a package with these entry points is installed; gives its folder."""
+
+    def install(**entries):
+        (tmp_path / "lattice_methods.py").write_text(textwrap.dedent(LATTICE))
+        info = tmp_path / "lattice_methods-1.0.dist-info"
+        info.mkdir()
+        (info / "METADATA").write_text("Metadata-Version: 2.1\nName: lattice-methods\nVersion: 1.0\n")
+        lines = [f"{name.replace('_', '-')} = {value}" for name, value in entries.items()]
+        (info / "entry_points.txt").write_text("\n".join([f"[{GROUP}]", *lines]) + "\n")
+        monkeypatch.syspath_prepend(tmp_path)
+        return tmp_path
+
+    yield install
+    sys.modules.pop("lattice_methods", None)
+
+
+def fresh():
+    """The registry as a new process sees it."""
+    return Methods(*(METHODS[name] for name in METHODS.own))
+
+
+def test_a_method_of_another_package_is_found(installed):
+    installed(lattice="lattice_methods:Lattice")
+    methods = fresh()
+    assert list(methods) == [*METHODS.own, "lattice"]
+    assert len(methods) == len(METHODS.own) + 1
+    method = methods["lattice"](n=500)
+    assert samplers.estimate(samplers.reference.half_space(2, 1.0).problem, method, seed=1).n_sim == 500
+    check_method(methods["lattice"]())
+
+
+def test_our_own_methods_do_not_import_others(installed):
+    installed(lattice="lattice_methods:Lattice")
+    methods = fresh()
+    assert methods["mc"] is samplers.MonteCarlo
+    assert "mc" in methods
+    assert "lattice_methods" not in sys.modules
+    assert "lattice" in methods
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("lattice", "no_such_module:Lattice", "ModuleNotFoundError: No module named 'no_such_module'"),
+        ("lattice", "lattice_methods:Lettuce", "AttributeError: .*Lettuce"),
+        ("lattice", "lattice_methods:NUMBER", "expected a class, got 3"),
+        ("lattice", "lattice_methods:Nameless", "class Nameless has no name, stops_at_target"),
+        ("grid", "lattice_methods:Lattice", "class Lattice is named 'lattice', its entry point 'grid'"),
+        ("mc", "lattice_methods:Lattice", "that name is taken"),
+    ],
+)
+def test_one_that_cannot_be_used_is_named_and_left_out(installed, name, value, said):
+    installed(**{name: value})
+    methods = fresh()
+    with pytest.warns(
+        RuntimeWarning, match=rf"method '{name}' of lattice-methods \({value}\) cannot be used: .*{said}"
+    ):
+        assert list(methods) == METHODS.own
+    assert methods["mc"] is samplers.MonteCarlo
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert list(methods) == METHODS.own  # said once
+
+
+def python(folder, *words):
+    code = f"import sys; sys.path.insert(0, {str(folder)!r}); from rare_envs.study.cli import main; main()"
+    return subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, timeout=120)
+
+
+def test_the_command_line_knows_it(installed):
+    folder = installed(lattice="lattice_methods:Lattice", broken="lattice_methods:Lettuce")
+    found = python(folder, "estimate", "rare_envs/CarFollowing-v0", "--method", "lattice", "--json")
+    assert '"name": "lattice"' in found.stdout
+    assert '"n_sim": 2000' in found.stdout
+    listed = python(folder, "list")
+    assert "Plain draws under another name." in listed.stdout
+    assert "'broken' of lattice-methods" in listed.stderr
+    unknown = python(folder, "estimate", "rare_envs/CarFollowing-v0", "--method", "latice")
+    assert unknown.returncode == 2
+    assert "Did you mean 'lattice'?" in unknown.stderr
