@@ -3,12 +3,14 @@
 import math
 from collections.abc import Generator
 from dataclasses import dataclass
-from typing import ClassVar, Literal, NamedTuple
+from typing import ClassVar, Literal, TypeVar
 
 import numpy as np
 
-from samplers.families import Gaussian, Mixture, Moments, weighted_moments
-from samplers.importance import doubts, draw_until, interval_of, weighted_cov
+from samplers.blocks import GaussianBlock, MixtureBlock, NormalBlock, Product, announced_blocks
+from samplers.ce_search import Batch, Iterate, Search
+from samplers.families import Gaussian, Mixture
+from samplers.importance import Space, doubts, draw_until, interval_of
 from samplers.intervals import binomial_cov
 from samplers.levels import next_level
 from samplers.method import (
@@ -23,8 +25,8 @@ from samplers.method import (
     no_outcome_share,
 )
 from samplers.problem import FloatArray, Inputs
-from samplers.result import Level, Status
-from samplers.weights import effective_sample_size, normalised
+from samplers.result import Status
+from samplers.weights import normalised
 
 MOST_BATCHES = 100
 """Batches of final draws after which a target c.o.v. is given up where max_sim does not say."""
@@ -32,61 +34,75 @@ LEAST_BUDGET = 100
 """With less than this a search is not worth its draws."""
 SEARCH_SHARE = 2 / 3
 """Largest share of max_sim that the search may use."""
-
-
-class Iterate(NamedTuple):
-    """One proposal of the search and what its draws showed."""
-
-    proposal: Gaussian
-    level: float
-    """max(gamma, rho-quantile of f under the proposal)."""
-    record: Level
+T = TypeVar("T")
+FAMILIES = ("gaussian", "mean", "mixture", "blocks")
 
 
 @dataclass(frozen=True, kw_only=True)
 class CrossEntropy(Method):
-    """Importance sampling from a Gaussian found by the cross-entropy method.
+    """Importance sampling from a law found by the cross-entropy method.
 
     Search (algorithm 1): draw N_k points from the proposal theta_k, take as gamma_k the
     rho-quantile of f, but not less than gamma, and move theta to the Kullback-Leibler projection
-    of alpha Q_k + (1 - alpha) P_theta, where Q_k is the base law given f <= gamma_k (equation 2).
-    For a Gaussian family that is matching E[u] and E[u u']; expectations under Q_k come from the
-    elite points with the joint likelihood ratio p0 / p_theta (equation 3), in logarithms.
+    of alpha_k Q_k + (1 - alpha_k) P_theta, where Q_k is the base law given f <= gamma_k
+    (equation 2). For an exponential family that is a matter of the expected sufficient
+    statistics; those under Q_k come from the elite points with the joint likelihood ratio
+    p0 / p_theta (equation 3), in logarithms.
     Estimate: fresh draws, independent of the search given the proposal, from
-    base_share N(0, I) + wide_share widened proposal + the rest proposal, so that p-hat is
-    unbiased and no weight exceeds 1 / base_share.
+    base_share of the base law + wide_share of the widened proposal + the rest proposal, so that
+    p-hat is unbiased and no weight exceeds 1 / base_share.
 
-    Works in standard normal space. Where the paper, its released code and this implementation
-    differ:
+    Families. In standard normal space: one Gaussian with mean and covariance ("gaussian"), with
+    the mean only ("mean"), or a mixture of Gaussians ("mixture"), which can follow several
+    regions of failure. In physical space: the paper's blocks ("blocks"), for a base distribution
+    that announces its own (`base.blocks`, see `announced_blocks`; `Product` is one): Beta in a
+    box, Normal with fixed covariance and its mean in a box, Gaussian, mixture.
+
+    Where the paper, its released code and this implementation differ:
 
     - *gamma_k.* The algorithm box says "minimum of gamma and the quantile", the text
       gamma_k >= gamma; the latter is meant and done here.
     - *Equation 3* divides by N_k; we divide by the sum of the weights, so that Q_k has mass 1.
-      The code uses each block's own likelihood ratio and divides by N rho.
-    - *Family.* The paper has Beta blocks and Normal blocks with fixed covariance and bounded
-      mean. Ours is one Gaussian with mean and covariance ("gaussian"), which covers curved and
-      two-lobed regions better, or with the mean only ("mean"). The covariance is drawn
-      towards the present one, which counts as (d + 1) max(1, d / 10) elite points: without
-      that, in many dimensions, the noise of its d (d + 1) / 2 entries ruins the weights.
+      The code divides by N rho even where more points than that are below gamma.
+    - *Likelihood ratio.* The code updates each block with its own ratio; here that is
+      likelihood_ratio="block". It varies less in many dimensions, but is not the projection of
+      equation 2: coordinates are moved towards the law of points with f <= gamma_k under a
+      product that is the base law in the one block and the proposal in all others.
+    - *Projection.* As in the paper. The code's programme for the mean of a Normal has the
+      covariance where its inverse belongs, and its Beta box is [0.5, 5], the paper's [1.5, 7].
+    - *Family.* The default is not the paper's: one Gaussian with its covariance covers curved
+      and two-lobed regions better than products. The covariance is drawn towards the present
+      one (`pulled_gaussian`).
     - *End.* The paper runs K = 100 iterations of 5000; ours ends the search when two
-      proposals have reached gamma. Search simulations are part of n_sim.
-    - *Choice.* Both choose the iterate with the lowest rho-quantile, here not counted below
-      gamma; among equals (f = -1 for every collision) the smallest c.o.v. decides.
+      proposals have reached gamma, unless early_end=False. Search simulations are part of n_sim.
+    - *Choice.* The paper takes the iterate with the lowest rho-quantile (choice="quantile"), the
+      code that with the lowest mean of the elite. Ours does not count quantiles below gamma;
+      among equals the smallest c.o.v. decides: an ever lower quantile favours one mode.
     - *Ties.* gamma_k is an outcome that occurred; if most outcomes tie, the largest below.
     - *Weights.* The paper samples from the proposal alone, whose weights are unbounded.
 
-    In some hundred dimensions the covariance cannot be learned from a thousand draws and the
-    weights degenerate: the result then carries warnings and a very wide interval.
+    The paper's settings: CrossEntropy(family="blocks", rho=0.01, alpha=0.8, n_iteration=5000,
+    max_iterations=100, early_end=False, choice="quantile", n_final=100_000).
+
+    In some hundred dimensions a covariance cannot be learned from a thousand draws and the
+    weights degenerate: the result then carries warnings and a very wide interval. The mean of a
+    Normal of d dimensions is learned from m effective elite points up to a shift of about
+    sqrt(d / m) standard deviations, which is what a small radius guards against.
 
     The interval is log-normal; where the base draws already fail with a share of rho or more,
-    plain Monte Carlo draws and Clopper-Pearson take over.
+    plain Monte Carlo draws and Clopper-Pearson take over. A run that is stopped before its final
+    draws gives the estimate of the base draws and the last proposal's, taken as one sample.
 
     Args:
-        family: Which parameters of the Gaussian the search moves.
+        family: "gaussian", "mean", "mixture" or "blocks", see above.
+        components: Gaussians of the family "mixture" at most.
+        likelihood_ratio: "joint" (equation 3) or "block" (as in the released code).
         rho: Elite fraction. (The paper has 0.01 with N_k = 5000.)
-        alpha: Step size, in (0, 1].
-        n_iteration: Draws per iteration, N_k; at most a tenth of max_sim.
+        alpha: Step size alpha_k in (0, 1], or several: the last one holds on.
+        n_iteration: Draws per iteration, N_k, or several; at most a tenth of max_sim.
         max_iterations: Iterations at most, K.
+        early_end: End the search once two proposals have reached gamma.
+        choice: Which iterate to keep: "cov" or "quantile", see above.
         n_final: Final draws; with max_sim all that is left, with target_cov batches of this.
         base_share: Share of base draws in the final sample.
         wide_share: Share of draws from the widened proposal.
@@ -98,11 +114,15 @@ class CrossEntropy(Method):
         Owen and Zhou, "Safe and effective importance sampling", JASA 95, 2000.
     """
 
-    family: Literal["gaussian", "mean"] = "gaussian"
+    family: Literal["gaussian", "mean", "mixture", "blocks"] = "gaussian"
+    components: int = 3
+    likelihood_ratio: Literal["joint", "block"] = "joint"
     rho: float = 0.1
-    alpha: float = 0.8
-    n_iteration: int = 1000
+    alpha: float | tuple[float, ...] = 0.8
+    n_iteration: int | tuple[int, ...] = 1000
     max_iterations: int = 20
+    early_end: bool = True
+    choice: Literal["cov", "quantile"] = "cov"
     n_final: int = 4000
     base_share: float = 0.1
     wide_share: float = 0.2
@@ -114,36 +134,58 @@ class CrossEntropy(Method):
     def __post_init__(self) -> None:
         """Check the settings."""
         who = "CrossEntropy"
-        check_count(who, "n_iteration", self.n_iteration, 10)
+        check_choice(who, "family", self.family, FAMILIES)
+        check_choice(who, "likelihood_ratio", self.likelihood_ratio, ("joint", "block"))
+        check_choice(who, "choice", self.choice, ("cov", "quantile"))
+        check_count(who, "components", self.components, 1)
         check_count(who, "max_iterations", self.max_iterations, 1)
         check_count(who, "n_final", self.n_final, 10)
+        for size in several(self.n_iteration) or [None]:
+            check_count(who, "n_iteration", size, 10)
+        for step in several(self.alpha) or [None]:
+            check_setting(who, "alpha", step, 0.0, 1.0, or_equal_high=True)
         check_setting(who, "rho", self.rho, 0.0, 0.5)
-        check_setting(who, "alpha", self.alpha, 0.0, 1.0, or_equal_high=True)
         check_setting(who, "base_share", self.base_share, 0.0, 1.0)
         check_setting(who, "wide_share", self.wide_share, 0.0, 1.0 - self.base_share)
         check_setting(who, "wide_factor", self.wide_factor, 1.0, math.inf)
-        check_choice(who, "family", self.family, ("gaussian", "mean"))
 
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Search for a proposal, then estimate with fresh draws."""
-        iterates, ended = yield from self._search(inputs, goal, rng)
-        trace = [iterate.record for iterate in iterates]
-        common = len(iterates) < 2  # the base draws fail often enough, or there is no way on
-        best = min(iterates, key=lambda i: (i.level, i.record.cov)) if iterates else None
-        sampler = plain(inputs.dim) if common or best is None else self._defensive(best.proposal)
-        limit = self._limit(goal, sum(level.n_sim for level in trace))
-        draws, final, stopped = yield from draw_until(inputs, sampler, goal, limit, self.n_final, rng)
-        cov = binomial_cov(draws.p, draws.n) if common else draws.cov
+        base, space = self._start(inputs)
+        search = yield from self._search(base, space, goal, rng)
+        common = len(search.iterates) < 2  # the base draws fail often enough, or there is no way on
+        best = search.best(self.choice)
+        if search.status is Status.STOPPED:
+            return search.outcome(space)
+        sampler = base if common or best is None else self._defensive(base, best.proposal)
+        limit = self._limit(goal, search.n_sim)
+        draws, final, stopped = yield from draw_until(inputs, sampler, goal, limit, self.n_final, rng, space)
+        if draws.n == 0:
+            return search.outcome(space)
         reached = best is not None and best.level == goal.gamma
+        status = search.status if len(draws.f) else Status.NO_HITS
         return Outcome(
             p=draws.p,
             interval=interval_of(draws, goal.confidence, 1.0 if common else 1 / self.base_share),
-            cov=cov,
-            status=ended if len(draws.f) else Status.NO_HITS,
-            warnings=tuple(([] if reached else [search_ended(best, ended)]) + doubts(draws)),
-            trace=(*trace, *final),
+            cov=binomial_cov(draws.p, draws.n) if common else draws.cov,
+            status=Status.STOPPED if stopped else status,
+            warnings=tuple(([] if reached else [search_ended(best, search.status)]) + doubts(draws)),
+            trace=(*search.trace, *final),
             no_outcome_share=no_outcome_share(draws.f, np.exp(draws.log_weights)),
+            sample=draws.sample,
         )
+
+    def _start(self, inputs: Inputs) -> tuple[Product, Space]:
+        """Return the base law by blocks, theta_0, and the space that the search works in."""
+        if self.family == "blocks":
+            base = announced_blocks(inputs)
+            return base, Space.physical(base)
+        law = Gaussian.standard(inputs.dim)
+        if self.family == "mixture":
+            base = Product((MixtureBlock(law, self.components),))
+        else:
+            base = Product((GaussianBlock(law) if self.family == "gaussian" else NormalBlock(law),))
+        return base, Space(base, inputs.base.from_standard_normal)
 
     def _limit(self, goal: Goal, spent: int) -> int:
         """Return how many final draws may be made."""
@@ -152,77 +194,62 @@ class CrossEntropy(Method):
         return self.n_final * (1 if goal.target_cov is None else MOST_BATCHES)
 
     def _search(
-        self, inputs: Inputs, goal: Goal, rng: np.random.Generator
-    ) -> Generator[FloatArray, FloatArray, tuple[list[Iterate], Status]]:
-        """Run algorithm 1 until two proposals have reached gamma; return iterates and ending."""
+        self, base: Product, space: Space, goal: Goal, rng: np.random.Generator
+    ) -> Generator[FloatArray, FloatArray, Search]:
+        """Run algorithm 1, as a rule until two proposals have reached gamma."""
+        search = Search(goal, self.rho)
         if goal.budget < LEAST_BUDGET:
-            return [], Status.BUDGET
-        size = min(self.n_iteration, goal.budget // 10)
-        affordable = int(SEARCH_SHARE * goal.budget) // size
-        proposal = Gaussian.standard(inputs.dim)
-        iterates: list[Iterate] = []
-        for _ in range(min(self.max_iterations, affordable)):
+            return search.ended(Status.BUDGET)
+        proposal = base
+        for k in range(self.max_iterations):
+            size = min(at(self.n_iteration, k), goal.budget // 10)
+            if search.n_sim + size > int(SEARCH_SHARE * goal.budget):
+                return search.ended(Status.BUDGET)
             u = proposal.sample(size, rng)
-            f = yield inputs.base.from_standard_normal(u)
-            log_weights = Gaussian.standard(inputs.dim).log_prob(u) - proposal.log_prob(u)
+            try:
+                f = yield space.to_x(u)
+            except Interrupted:
+                return search.ended(Status.STOPPED)
             level = next_level(f, self.rho, goal.gamma)
-            iterates.append(described(proposal, f, log_weights, float(f.min()) if level is None else level))
-            goal.on_level(iterates[-1].record)
+            lowest = float(f.min()) if level is None else level
+            elite = u[f <= lowest]
+            log_ratios = base.log_probs(elite) - proposal.log_probs(elite)
+            search.add(Batch(proposal, u, f), lowest, log_ratios.sum(axis=0))
             if level is None:
-                return iterates, Status.STALLED
-            reached = sum(iterate.level == goal.gamma for iterate in iterates)
-            if reached == 2 or (reached == 1 and len(iterates) == 1):
-                return iterates, Status.CONVERGED
-            elite = f <= level
-            proposal = self._moved(proposal, u[elite], log_weights[elite])
-        if iterates[-1].level == goal.gamma:
-            return iterates, Status.CONVERGED
-        return iterates, Status.BUDGET if affordable < self.max_iterations else Status.STALLED
+                return search.ended(Status.STALLED)
+            if search.n_reached == 2 - (k == 0) and (self.early_end or k == 0):
+                return search.ended(Status.CONVERGED)
+            proposal = self._moved(proposal, elite, log_ratios, at(self.alpha, k))
+        return search.ended(Status.CONVERGED if level == goal.gamma else Status.STALLED)
 
-    def _moved(self, proposal: Gaussian, elite: FloatArray, log_weights: FloatArray) -> Gaussian:
-        """Return the proposal after one step of equation 2 towards the elite points (n, d)."""
-        target = weighted_moments(elite, normalised(log_weights))
-        now = proposal.moments
-        mixed = Moments(*(self.alpha * new + (1 - self.alpha) * old for new, old in zip(target, now, strict=True)))
-        if self.family == "mean":
-            return Gaussian(mixed.first, proposal.cholesky)
-        dim = len(mixed.first)
-        prior = (dim + 1) * max(1.0, dim / 10)  # worth this many elite points
-        pull = prior / (prior + effective_sample_size(log_weights))
-        covariance = (1 - pull) * mixed.covariance + pull * proposal.covariance
-        return Gaussian.from_covariance(mixed.first, covariance)
+    def _moved(self, proposal: Product, elite: FloatArray, log_ratios: FloatArray, alpha: float) -> Product:
+        """Return the proposal after one step of equation 2 towards the elite points.
 
-    def _defensive(self, proposal: Gaussian) -> Mixture:
+        Args:
+            proposal: P_theta_k.
+            elite: Shape (n, d).
+            log_ratios: log(p0 / p_theta_k) of each block, shape (blocks, n).
+            alpha: Step size.
+        """
+        if self.likelihood_ratio == "joint":
+            log_ratios = np.broadcast_to(log_ratios.sum(axis=0), log_ratios.shape)
+        return proposal.moved(elite, np.stack([normalised(ratios) for ratios in log_ratios]), alpha)
+
+    def _defensive(self, base: Product, proposal: Product) -> Mixture:
         """Return the law of the final draws; its density is at least base_share of the base."""
         shares = [self.base_share, self.wide_share]
-        return Mixture(
-            np.array([*shares, 1 - sum(shares)]),
-            [
-                Gaussian.standard(len(proposal.mean)),
-                proposal.widened(self.wide_factor),
-                proposal,
-            ],
-        )
+        return Mixture(np.array([*shares, 1 - sum(shares)]), [base, proposal.widened(self.wide_factor), proposal])
 
 
-def plain(dim: int) -> Mixture:
-    """N(0, I) as a mixture of one component."""
-    return Mixture(np.ones(1), [Gaussian.standard(dim)])
+def several(setting: T | tuple[T, ...]) -> tuple[T, ...]:
+    """Return a setting that may be one value or several as several."""
+    return tuple(setting) if isinstance(setting, tuple | list) else (setting,)
 
 
-def described(proposal: Gaussian, f: FloatArray, log_weights: FloatArray, level: float) -> Iterate:
-    """Return an iterate with its record: what its draws f (n,) say about P[f <= level]."""
-    elite = f <= level
-    record = Level(
-        gamma=level,
-        p=float(elite.mean()),
-        estimate=float(np.exp(log_weights[elite]).sum()) / len(f),
-        n_sim=len(f),
-        n_points=len(f),
-        cov=weighted_cov(len(f), log_weights[elite]),
-        ess=effective_sample_size(log_weights[elite]),
-    )
-    return Iterate(proposal, level, record)
+def at(setting: T | tuple[T, ...], k: int) -> T:
+    """Return the value of a setting at iteration k; the last one given holds on."""
+    values = several(setting)
+    return values[min(k, len(values) - 1)]
 
 
 def search_ended(best: Iterate | None, ended: Status) -> str:

@@ -1,14 +1,24 @@
-"""Proposal families in standard normal space: sample, log_prob, weighted fit."""
+"""Laws to draw from: Gaussians and mixtures, with their densities and moments."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from scipy.linalg import solve_triangular
-from scipy.special import logsumexp
+from scipy.special import logsumexp, softmax
 
 from samplers.problem import LOG_TWO_PI, FloatArray
+
+
+class Law(Protocol):
+    """What can be drawn from and has a density."""
+
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw n independent points, shape (n, d)."""
+
+    def log_prob(self, u: FloatArray, /) -> FloatArray:
+        """Log density at u (n, d), shape (n,)."""
 
 
 class Moments(NamedTuple):
@@ -23,6 +33,10 @@ class Moments(NamedTuple):
     def covariance(self) -> FloatArray:
         """E[u u'] - E[u] E[u]', shape (d, d)."""
         return self.second - np.outer(self.first, self.first)
+
+    def mixed(self, other: "Moments", share: float) -> "Moments":
+        """Return the moments of the mixture of this law, with weight `share`, and another one."""
+        return Moments(share * self.first + (1 - share) * other.first, share * self.second + (1 - share) * other.second)
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +59,11 @@ class Gaussian:
         return cls(mean, np.asarray(np.linalg.cholesky(covariance), dtype=np.float64))
 
     @property
+    def dim(self) -> int:
+        """Number of coordinates d."""
+        return len(self.mean)
+
+    @property
     def covariance(self) -> FloatArray:
         """L L', shape (d, d)."""
         return self.cholesky @ self.cholesky.T
@@ -60,22 +79,30 @@ class Gaussian:
 
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw n independent points, shape (n, d)."""
-        return self.mean + rng.standard_normal((n, len(self.mean))) @ self.cholesky.T
+        return self.from_standard_normal(rng.standard_normal((n, self.dim)))
 
     def log_prob(self, u: FloatArray) -> FloatArray:
         """Log density at u (n, d), shape (n,)."""
-        z = solve_triangular(self.cholesky, (u - self.mean).T, lower=True)
+        z = self.to_standard_normal(u)
         log_det = float(np.log(np.diag(self.cholesky)).sum())
-        return np.asarray(-0.5 * np.einsum("ij,ij->j", z, z) - log_det - 0.5 * len(self.mean) * LOG_TWO_PI)
+        return np.asarray(-0.5 * np.einsum("ij,ij->i", z, z) - log_det - 0.5 * self.dim * LOG_TWO_PI)
+
+    def to_standard_normal(self, u: FloatArray) -> FloatArray:
+        """Return L^-1 (u - mean) of the rows of u (n, d)."""
+        return np.asarray(solve_triangular(self.cholesky, (u - self.mean).T, lower=True).T)
+
+    def from_standard_normal(self, z: FloatArray) -> FloatArray:
+        """Return mean + L z of the rows of z (n, d)."""
+        return np.asarray(self.mean + z @ self.cholesky.T)
 
 
 @dataclass(frozen=True, eq=False)
 class Mixture:
-    """A mixture of Gaussians."""
+    """A mixture of laws."""
 
     weights: FloatArray
     """Shape (k,), adding up to 1."""
-    components: Sequence[Gaussian]
+    components: Sequence[Law]
     """k of them."""
 
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
@@ -88,6 +115,34 @@ class Mixture:
         """Log density at u (n, d), shape (n,)."""
         terms = [np.log(w) + c.log_prob(u) for w, c in zip(self.weights, self.components, strict=True)]
         return np.asarray(logsumexp(terms, axis=0))
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianMixture(Mixture):
+    """A mixture of Gaussians."""
+
+    components: Sequence[Gaussian]
+
+    def widened(self, factor: float) -> "GaussianMixture":
+        """Return the same with the standard deviations of all components multiplied by factor."""
+        return GaussianMixture(self.weights, [component.widened(factor) for component in self.components])
+
+    def responsibilities(self, u: FloatArray) -> FloatArray:
+        """Return how likely each point u (n, d) comes from each component, shape (n, k)."""
+        terms = [np.log(w) + c.log_prob(u) for w, c in zip(self.weights, self.components, strict=True)]
+        return np.asarray(softmax(np.stack(terms, axis=1), axis=1))
+
+
+def pulled_gaussian(target: Moments, present: Gaussian, points: float) -> Gaussian:
+    """Return the Gaussian with the target's mean and its covariance, drawn towards the present one.
+
+    The present covariance counts as (d + 1) max(1, d / 10) points beside the effectively `points`
+    that are behind the target: in many dimensions the noise of the d (d + 1) / 2 entries of a
+    covariance ruins importance weights.
+    """
+    prior = (present.dim + 1) * max(1.0, present.dim / 10)
+    pull = prior / (prior + points)
+    return Gaussian.from_covariance(target.first, (1 - pull) * target.covariance + pull * present.covariance)
 
 
 def weighted_moments(u: FloatArray, weights: FloatArray) -> Moments:

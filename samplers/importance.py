@@ -6,14 +6,14 @@ References:
 """
 
 import math
-from collections.abc import Generator
-from dataclasses import dataclass
+from collections.abc import Callable, Generator
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from samplers.families import Gaussian, Mixture
+from samplers.families import Gaussian, Law
 from samplers.intervals import Interval, clopper_pearson, log_normal
-from samplers.method import Goal, Interrupted
+from samplers.method import Goal, Interrupted, Sample
 from samplers.problem import FloatArray, Inputs
 from samplers.result import Level
 from samplers.weights import effective_sample_size, largest_share
@@ -25,8 +25,28 @@ LARGE_SHARE = 0.15
 
 
 @dataclass(frozen=True, eq=False)
+class Space:
+    """Where a proposal lives, and the base law there."""
+
+    base: Law
+    """p0."""
+    to_x: Callable[[FloatArray], FloatArray]
+    """Maps points of this space, shape (n, d), to physical space."""
+
+    @classmethod
+    def standard_normal(cls, inputs: Inputs) -> "Space":
+        """Standard normal space of some inputs."""
+        return cls(Gaussian.standard(inputs.dim), inputs.base.from_standard_normal)
+
+    @classmethod
+    def physical(cls, base: Law) -> "Space":
+        """Physical space, where `base` is the law of x."""
+        return cls(base, np.asarray)
+
+
+@dataclass(frozen=True, eq=False)
 class Draws:
-    """Independent draws from one proposal; only the failing ones matter."""
+    """Independent draws from one proposal; p rests on the failing ones."""
 
     n: int
     """Number of draws."""
@@ -34,6 +54,36 @@ class Draws:
     """Outcomes of the k failing ones, shape (k,)."""
     log_weights: FloatArray
     """log(p0 / q) at the failing ones, shape (k,)."""
+    x: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
+    """The failing ones in physical space, shape (k, d)."""
+    f_safe: FloatArray = field(default_factory=lambda: np.empty(0))
+    """Outcomes of the others, shape (n - k,)."""
+    log_weights_safe: FloatArray = field(default_factory=lambda: np.empty(0))
+    """log(p0 / q) at the others, shape (n - k,)."""
+
+    @classmethod
+    def weighted(cls, f: FloatArray, log_weights: FloatArray, x: FloatArray, gamma: float) -> "Draws":
+        """Return draws with outcomes f (n,), log(p0 / q) (n,) and points x (n, d) in physical space."""
+        fails = f <= gamma
+        return cls(len(f), f[fails], log_weights[fails], x[fails], f[~fails], log_weights[~fails])
+
+    def joined(self, other: "Draws") -> "Draws":
+        """Return these draws and others from the same proposal."""
+        if self.n == 0:
+            return other
+        parts = ("f", "log_weights", "x", "f_safe", "log_weights_safe")
+        return Draws(self.n + other.n, *(np.concatenate([getattr(self, p), getattr(other, p)]) for p in parts))
+
+    @property
+    def sample(self) -> Sample:
+        """The draws as the weighted points behind p, for every threshold."""
+        return Sample(
+            f=np.concatenate([self.f, self.f_safe]),
+            weights=np.exp(np.concatenate([self.log_weights, self.log_weights_safe])) / self.n,
+            units=np.arange(self.n, dtype=np.int64),
+            n_units=self.n,
+            x=self.x,
+        )
 
     @property
     def ess(self) -> float:
@@ -66,22 +116,29 @@ def weighted_cov(n: int, log_weights: FloatArray) -> float:
 
 
 def draw(
-    inputs: Inputs, sampler: Mixture, gamma: float, n: int, rng: np.random.Generator
+    inputs: Inputs,
+    sampler: Law,
+    gamma: float,
+    n: int,
+    rng: np.random.Generator,
+    space: Space | None = None,
 ) -> Generator[FloatArray, FloatArray, Draws]:
-    """Simulate n draws from `sampler`, a law in standard normal space, in one batch."""
+    """Simulate n draws from `sampler`, a law in `space` (None: standard normal space), in one batch."""
+    space = space or Space.standard_normal(inputs)
     u = sampler.sample(n, rng)
-    f = yield inputs.base.from_standard_normal(u)
-    u, f = u[f <= gamma], f[f <= gamma]
-    return Draws(n, f, Gaussian.standard(inputs.dim).log_prob(u) - sampler.log_prob(u))
+    x = space.to_x(u)
+    f = yield x
+    return Draws.weighted(f, space.base.log_prob(u) - sampler.log_prob(u), x, gamma)
 
 
 def draw_until(
     inputs: Inputs,
-    sampler: Mixture,
+    sampler: Law,
     goal: Goal,
     limit: int,
     batch: int,
     rng: np.random.Generator,
+    space: Space | None = None,
 ) -> Generator[FloatArray, FloatArray, tuple[Draws, list[Level], bool]]:
     """Simulate batches until `limit` draws are made or goal.target_cov is met.
 
@@ -91,14 +148,10 @@ def draw_until(
     trace: list[Level] = []
     while draws.n < limit:
         try:
-            new = yield from draw(inputs, sampler, goal.gamma, min(batch, limit - draws.n), rng)
+            new = yield from draw(inputs, sampler, goal.gamma, min(batch, limit - draws.n), rng, space)
         except Interrupted:
             return draws, trace, True
-        draws = Draws(
-            draws.n + new.n,
-            np.concatenate([draws.f, new.f]),
-            np.concatenate([draws.log_weights, new.log_weights]),
-        )
+        draws = draws.joined(new)
         trace.append(
             Level(
                 gamma=goal.gamma,

@@ -5,12 +5,23 @@ import pytest
 from scipy import stats
 
 import samplers
+from samplers.blocks import GaussianBlock, NormalBlock, Product
 from samplers.families import Gaussian
 from samplers.importance import Draws, bernstein_bound, doubts, draw, interval_of, weighted_cov
 from samplers.problem import FunctionProblem
 from samplers.reference import half_space, plateau, two_modes
 
 CE = samplers.CrossEntropy
+
+
+def driven(steps, evaluate):
+    """Answer a generator that yields points with their outcomes; return what it returns."""
+    try:
+        x = next(steps)
+        while True:
+            x = steps.send(evaluate(x))
+    except StopIteration as end:
+        return end.value
 
 
 def mean_error(found):
@@ -65,10 +76,11 @@ def test_many_dimensions(study):
 def test_a_step_of_the_search_matches_moments():
     """Equation 2 for a Gaussian: with alpha = 1 and many points the moments of the elite."""
     elite = np.random.default_rng(1).standard_normal((100_000, 2)) * [0.5, 1.0] + [2.0, 0.0]
-    moved = CE(alpha=1.0)._moved(Gaussian.standard(2), elite, np.zeros(len(elite)))
+    start, ratios = Product((GaussianBlock(Gaussian.standard(2)),)), np.zeros((1, len(elite)))
+    moved = CE()._moved(start, elite, ratios, 1.0).blocks[0].law
     np.testing.assert_allclose(moved.mean, elite.mean(axis=0))
     np.testing.assert_allclose(moved.covariance, np.cov(elite.T), atol=1e-3)
-    half = CE(alpha=0.5)._moved(Gaussian.standard(2), elite, np.zeros(len(elite)))
+    half = CE()._moved(start, elite, ratios, 0.5).blocks[0].law
     np.testing.assert_allclose(half.mean, elite.mean(axis=0) / 2)
     # mixture of N(0, I) and the elite: mean of the variances plus a quarter of the shift squared
     np.testing.assert_allclose(np.diag(half.covariance), [0.625 + 1.0, 1.0], atol=0.02)
@@ -82,15 +94,15 @@ def test_a_step_of_the_search_uses_the_likelihood_ratio(rng):
     proposal = Gaussian(np.array([1.5, 0.0]), np.eye(2))
     u = proposal.sample(200_000, rng)
     u = u[u[:, 0] > 2.0]
-    log_weights = Gaussian.standard(2).log_prob(u) - proposal.log_prob(u)
-    moved = CE(alpha=1.0)._moved(proposal, u, log_weights)
-    np.testing.assert_allclose(moved.mean, [stats.norm.pdf(2) / stats.norm.sf(2), 0.0], atol=0.02)
+    log_ratios = (Gaussian.standard(2).log_prob(u) - proposal.log_prob(u))[None]
+    moved = CE()._moved(Product((GaussianBlock(proposal),)), u, log_ratios, 1.0)
+    np.testing.assert_allclose(moved.blocks[0].law.mean, [stats.norm.pdf(2) / stats.norm.sf(2), 0.0], atol=0.02)
 
 
 def test_mean_family_keeps_the_covariance():
-    moved = CE(family="mean")._moved(Gaussian.standard(2), np.full((9, 2), 3.0), np.zeros(9))
-    np.testing.assert_allclose(moved.mean, 0.8 * 3.0)
-    np.testing.assert_array_equal(moved.covariance, np.eye(2))
+    block = NormalBlock(Gaussian.standard(2)).moved(np.full((9, 2), 3.0), np.full(9, 1 / 9), 0.8)
+    np.testing.assert_allclose(block.law.mean, 0.8 * 3.0)
+    np.testing.assert_array_equal(block.law.covariance, np.eye(2))
 
 
 def test_a_common_event_is_left_to_plain_draws():
@@ -128,8 +140,9 @@ def test_weighted_cov_matches_the_spread_of_the_estimate(rng):
 
 def test_weights_of_the_final_draws_give_p(rng):
     reference, far = half_space(2, 3.0), Gaussian(np.full(2, 2.2), np.eye(2))
-    sampler = CE()._defensive(far)
-    draws = draw(reference.problem, sampler, 0.0, 50_000, rng)
+    base = Product((GaussianBlock(Gaussian.standard(2)),))
+    sampler = CE()._defensive(base, Product((GaussianBlock(far),)))
+    draws = driven(draw(reference.problem, sampler, 0.0, 50_000, rng), reference.problem.evaluate)
     assert draws.p == pytest.approx(reference.p, rel=4 * draws.cov)
     assert np.exp(draws.log_weights).max() <= 10.0
     assert draws.cov < 0.02
