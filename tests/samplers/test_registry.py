@@ -120,19 +120,27 @@ def test_one_that_cannot_be_used_is_named_and_left_out(installed, name, value, s
         assert list(methods) == METHODS.own  # said once
 
 
-def python(folder, *words):
-    code = f"import sys; sys.path.insert(0, {str(folder)!r}); from rare_envs.study.cli import main; main()"
-    return subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, timeout=120)
+COMMANDS = """
+import sys
+sys.path.insert(0, sys.argv[1])
+from rare_envs.study.cli import main
+for words in ("estimate {env} --method lattice --json", "list", "estimate {env} --method latice"):
+    sys.argv[1:] = words.format(env="rare_envs/CarFollowing-v0").split()
+    try:
+        main()
+    except SystemExit as end:
+        print("exit code", end.code)
+"""
 
 
 def test_the_command_line_knows_it(installed):
     folder = installed(lattice="lattice_methods:Lattice", broken="lattice_methods:Lettuce")
-    found = python(folder, "estimate", "rare_envs/CarFollowing-v0", "--method", "lattice", "--json")
-    assert '"name": "lattice"' in found.stdout
-    assert '"n_sim": 2000' in found.stdout
-    listed = python(folder, "list")
-    assert "Plain draws under another name." in listed.stdout
-    assert "'broken' of lattice-methods" in listed.stderr
-    unknown = python(folder, "estimate", "rare_envs/CarFollowing-v0", "--method", "latice")
-    assert unknown.returncode == 2
-    assert "Did you mean 'lattice'?" in unknown.stderr
+    shown = subprocess.run([sys.executable, "-c", COMMANDS, folder], capture_output=True, text=True, timeout=120)
+    answer, listed, refused = shown.stdout.split("exit code")[:3]
+    assert '"name": "lattice"' in answer
+    assert '"n_sim": 2000' in answer
+    assert "Plain draws under another name." in listed
+    assert refused.strip() == "0"
+    assert shown.stdout.endswith("exit code 2\n")
+    assert "Did you mean 'lattice'?" in shown.stderr
+    assert shown.stderr.count("'broken' of lattice-methods") == 1
