@@ -82,7 +82,7 @@ class CrossEntropy(Method):
     - *Weights.* The paper samples from the proposal alone, whose weights are unbounded.
 
     The paper's settings: CrossEntropy(family="blocks", rho=0.01, alpha=0.8, n_iteration=5000,
-    max_iterations=100, early_end=False, choice="quantile", n_final=100_000).
+    max_iterations=100, early_end=False, choice="quantile", n_final=100_000, wide_share=0).
 
     In some hundred dimensions a covariance cannot be learned from a thousand draws and the
     weights degenerate: the result then carries warnings and a very wide interval. The mean of a
@@ -105,7 +105,7 @@ class CrossEntropy(Method):
         choice: Which iterate to keep: "cov" or "quantile", see above.
         n_final: Final draws; with max_sim all that is left, with target_cov batches of this.
         base_share: Share of base draws in the final sample.
-        wide_share: Share of draws from the widened proposal.
+        wide_share: Share of draws from the widened proposal; may be 0.
         wide_factor: By how much its standard deviations are wider.
 
     References:
@@ -146,7 +146,8 @@ class CrossEntropy(Method):
             check_setting(who, "alpha", step, 0.0, 1.0, or_equal_high=True)
         check_setting(who, "rho", self.rho, 0.0, 0.5)
         check_setting(who, "base_share", self.base_share, 0.0, 1.0)
-        check_setting(who, "wide_share", self.wide_share, 0.0, 1.0 - self.base_share)
+        if self.wide_share != 0:
+            check_setting(who, "wide_share", self.wide_share, 0.0, 1.0 - self.base_share)
         check_setting(who, "wide_factor", self.wide_factor, 1.0, math.inf)
 
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
@@ -237,6 +238,8 @@ class CrossEntropy(Method):
 
     def _defensive(self, base: Product, proposal: Product) -> Mixture:
         """Return the law of the final draws; its density is at least base_share of the base."""
+        if self.wide_share == 0:
+            return Mixture(np.array([self.base_share, 1 - self.base_share]), [base, proposal])
         shares = [self.base_share, self.wide_share]
         return Mixture(np.array([*shares, 1 - sum(shares)]), [base, proposal.widened(self.wide_factor), proposal])
 

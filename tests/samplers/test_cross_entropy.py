@@ -1,3 +1,4 @@
+import json
 import math
 
 import numpy as np
@@ -6,10 +7,13 @@ from scipy import stats
 
 import samplers
 from samplers.blocks import GaussianBlock, NormalBlock, Product
+from samplers.ce_search import Batch, Search
+from samplers.cross_entropy import at
 from samplers.families import Gaussian
-from samplers.importance import Draws, bernstein_bound, doubts, draw, interval_of, weighted_cov
+from samplers.importance import Draws, Space, bernstein_bound, doubts, draw, interval_of, weighted_cov
+from samplers.method import Goal
 from samplers.problem import FunctionProblem
-from samplers.reference import half_space, plateau, two_modes
+from samplers.reference import four_branches, half_space, parabola, plateau, two_modes
 
 CE = samplers.CrossEntropy
 
@@ -71,6 +75,85 @@ def test_many_dimensions(study):
     found = study(half_space(100), CE(), 40)
     assert abs(found.ratios.mean() - 1) < 4 * mean_error(found) + 0.03
     assert found.covered >= stats.binom.ppf(1e-3, 40, 0.88)
+
+
+@pytest.mark.parametrize("reference", [two_modes(), four_branches(3.0), parabola()], ids=lambda r: r.name)
+def test_mixture_family(study, reference):
+    found = study(reference, CE(family="mixture"), 40)
+    assert abs(found.ratios.mean() - 1) < 4 * mean_error(found) + 0.02
+    assert found.covered >= stats.binom.ppf(1e-3, 40, 0.90)
+    assert found.own_cov < 0.05
+
+
+def test_mixture_is_better_than_one_gaussian_on_several_regions():
+    one, several = (
+        samplers.estimate(four_branches().problem, CE(family=family), seed=1) for family in ("gaussian", "mixture")
+    )
+    assert several.cov < 0.8 * one.cov
+
+
+@pytest.mark.parametrize("family", ["gaussian", "mean", "mixture"])
+def test_a_run_stopped_in_the_search_gives_what_there_is(family):
+    """After each batch in turn; all of it within its own error of p, or wide."""
+    reference = half_space(2, 3.0)
+    for after in range(1, 6):
+        run = CE(family=family, n_final=1000).start(reference.problem, seed=3, target_cov=0.01)
+        for _ in range(after):
+            run.tell(reference.problem.f(run.ask()))
+        result = run.result()
+        assert result.status == "stopped"
+        assert result.n_sim == sum(level.n_sim for level in result.trace) == 1000 * after
+        assert result.interval[0] / 1.2 <= reference.p <= 1.2 * result.interval[1]
+        assert result.warnings if after < 4 else 0 < result.cov < 0.2
+
+
+def test_a_stopped_search_weighs_base_and_proposal_as_one_mixture(rng):
+    """E[w] = 1 and E[w 1{f <= 0}] = p for draws of both laws, with weights of at most 2."""
+    reference, law = half_space(2, 2.0), Gaussian(np.full(2, 1.5), 0.7 * np.eye(2))
+    base = Product((GaussianBlock(Gaussian.standard(2)),))
+    search = Search(Goal(gamma=0.0), 0.1)
+    for proposal in (base, Product((GaussianBlock(law),))):
+        u = proposal.sample(20_000, rng)
+        search.add(Batch(proposal, u, reference.problem.f(u)), 0.0, np.zeros(9))
+    outcome = search.outcome(Space(base, np.asarray))
+    assert outcome.p == pytest.approx(reference.p, rel=4 * outcome.cov)
+    assert outcome.sample.weights.max() * 40_000 <= 2.0
+    assert outcome.sample.weights.sum() == pytest.approx(1.0, abs=0.02)
+
+
+def test_final_draws_serve_higher_thresholds():
+    """P[u >= beta - g] of all g from the weights of all final draws."""
+    sample = samplers.estimate(half_space(2, 3.5).problem, CE(), seed=1).sample
+    assert sample.n_units == len(sample.f) == 4000
+    for g in (0.0, 0.5, 1.0, 2.0, 3.5):
+        weights = sample.weights[sample.f <= g]
+        assert weights.sum() == pytest.approx(stats.norm.sf(3.5 - g), abs=4 * np.sqrt((weights**2).sum()))
+    np.testing.assert_allclose(half_space(2, 3.5).problem.f(sample.x), sample.f[sample.f <= 0])
+
+
+def test_all_iterations_of_the_paper():
+    """K iterations and no fewer; the early end stops after two proposals have reached gamma."""
+    settings = {"n_iteration": 500, "max_iterations": 9, "choice": "quantile"}
+    whole = samplers.estimate(half_space().problem, CE(early_end=False, **settings), seed=1)
+    assert len(whole.trace) == 10
+    assert whole.status == "converged"
+    short = samplers.estimate(half_space().problem, CE(**settings), seed=1)
+    assert [level.gamma for level in short.trace[:-1]].count(0.0) == 2
+    assert len(short.trace) < 8
+
+
+def test_sizes_and_steps_may_change_from_iteration_to_iteration():
+    method = CE(n_iteration=(400, 700), alpha=(1.0, 0.5))
+    result = samplers.estimate(half_space().problem, method, seed=1)
+    assert [level.n_sim for level in result.trace[:-1]] == [400] + [700] * (len(result.trace) - 2)
+    assert json.loads(result.to_json())["method"]["settings"]["alpha"] == [1.0, 0.5]
+    assert [at((1.0, 0.5), k) for k in range(3)] == [1.0, 0.5, 0.5]
+    assert at(0.8, 7) == 0.8
+
+
+def test_no_wide_draws():
+    result = samplers.estimate(half_space().problem, CE(wide_share=0.0), seed=1)
+    assert result.p == pytest.approx(half_space().p, rel=4 * result.cov)
 
 
 def test_a_step_of_the_search_matches_moments():
@@ -196,6 +279,12 @@ def test_warns_when_the_search_ends_early():
         {"wide_share": 0.95},
         {"wide_factor": 0.5},
         {"family": "beta"},
+        {"likelihood_ratio": "none"},
+        {"choice": "last"},
+        {"components": 0},
+        {"alpha": (0.8, 1.2)},
+        {"alpha": ()},
+        {"n_iteration": (1000, 5)},
     ],
 )
 def test_settings_out_of_range(settings):
