@@ -5,6 +5,7 @@ Knows NumPy and probability, nothing about driving. `estimate` is the front door
 
 from samplers.ask_tell import Run
 from samplers.cross_entropy import CrossEntropy
+from samplers.importance_sampling import ImportanceSampling
 from samplers.ledger import EvaluationError
 from samplers.method import Goal, Interrupted, Method, Outcome, Sample, Stepping, Steps
 from samplers.monte_carlo import MonteCarlo
@@ -26,6 +27,7 @@ __all__ = [
     "Failures",
     "FunctionProblem",
     "Goal",
+    "ImportanceSampling",
     "Interrupted",
     "Level",
     "Method",

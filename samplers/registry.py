@@ -9,6 +9,7 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Any, cast
 
 from samplers.cross_entropy import CrossEntropy
+from samplers.importance_sampling import ImportanceSampling
 from samplers.method import Stepping
 from samplers.monte_carlo import MonteCarlo
 from samplers.subset import AdaptiveSubsetSimulation, SubsetSimulation
@@ -64,7 +65,7 @@ class Methods(Mapping[str, type[Stepping]]):
         return len(self._own) + len(self._offered)
 
 
-METHODS = Methods(MonteCarlo, CrossEntropy, SubsetSimulation, AdaptiveSubsetSimulation)
+METHODS = Methods(MonteCarlo, ImportanceSampling, CrossEntropy, SubsetSimulation, AdaptiveSubsetSimulation)
 
 
 def get_method(name: str, **settings: Any) -> Stepping:
