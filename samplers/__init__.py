@@ -4,6 +4,8 @@ Knows NumPy and probability, nothing about driving. `estimate` is the front door
 """
 
 from samplers.ask_tell import Run
+from samplers.beta_block import BetaBlock
+from samplers.blocks import GaussianBlock, MixtureBlock, NormalBlock, Product
 from samplers.cross_entropy import CrossEntropy
 from samplers.importance_sampling import ImportanceSampling
 from samplers.ledger import EvaluationError
@@ -19,6 +21,7 @@ from samplers.subset import AdaptiveSubsetSimulation, SubsetSimulation
 __all__ = [
     "METHODS",
     "AdaptiveSubsetSimulation",
+    "BetaBlock",
     "CrossEntropy",
     "Distribution",
     "Estimate",
@@ -26,14 +29,18 @@ __all__ = [
     "Failure",
     "Failures",
     "FunctionProblem",
+    "GaussianBlock",
     "Goal",
     "ImportanceSampling",
     "Interrupted",
     "Level",
     "Method",
+    "MixtureBlock",
     "MonteCarlo",
+    "NormalBlock",
     "Outcome",
     "Problem",
+    "Product",
     "Progress",
     "Run",
     "Sample",

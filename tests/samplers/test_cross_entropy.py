@@ -85,6 +85,16 @@ def test_mixture_family(study, reference):
     assert found.own_cov < 0.05
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("family", ["gaussian", "mean", "mixture"])
+@pytest.mark.parametrize("reference", [half_space(), half_space(6), parabola(), plateau()], ids=lambda r: r.name)
+def test_one_region_is_covered_at_the_usual_settings(study, reference, family):
+    found = study(reference, CE(family=family), 200)
+    assert abs(found.ratios.mean() - 1) < 4 * mean_error(found) + 0.01
+    assert found.covered >= 0.88 * 200
+    assert 0.8 < found.own_cov / found.ratios.std(ddof=1) < 1.3
+
+
 def test_mixture_is_better_than_one_gaussian_on_several_regions():
     one, several = (
         samplers.estimate(four_branches().problem, CE(family=family), seed=1) for family in ("gaussian", "mixture")
