@@ -7,14 +7,16 @@ from samplers.ask_tell import Run
 from samplers.beta_block import BetaBlock
 from samplers.blocks import GaussianBlock, MixtureBlock, NormalBlock, Product
 from samplers.cross_entropy import CrossEntropy
+from samplers.curve import Curve
 from samplers.importance_sampling import ImportanceSampling
 from samplers.ledger import EvaluationError
-from samplers.method import Goal, Interrupted, Method, Outcome, Sample, Stepping, Steps
+from samplers.method import Goal, Interrupted, Layer, Method, Outcome, Sample, Stepping, Steps
 from samplers.monte_carlo import MonteCarlo
 from samplers.problem import Distribution, FunctionProblem, Problem, StandardNormal
 from samplers.progress import Progress
 from samplers.registry import METHODS, get_method
 from samplers.result import Estimate, Failure, Failures, Level, Status
+from samplers.reweighting import Reweighted
 from samplers.run import estimate
 from samplers.subset import AdaptiveSubsetSimulation, SubsetSimulation
 
@@ -23,6 +25,7 @@ __all__ = [
     "AdaptiveSubsetSimulation",
     "BetaBlock",
     "CrossEntropy",
+    "Curve",
     "Distribution",
     "Estimate",
     "EvaluationError",
@@ -33,6 +36,7 @@ __all__ = [
     "Goal",
     "ImportanceSampling",
     "Interrupted",
+    "Layer",
     "Level",
     "Method",
     "MixtureBlock",
@@ -42,6 +46,7 @@ __all__ = [
     "Problem",
     "Product",
     "Progress",
+    "Reweighted",
     "Run",
     "Sample",
     "StandardNormal",

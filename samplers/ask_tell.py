@@ -147,6 +147,8 @@ class Run:
             method=plan.method,
             seed=plan.seed,
             sample=whole.sample,
+            base=plan.inputs.base,
+            on_error=plan.on_error,
         )
 
     def _outcomes(self) -> list[Outcome]:

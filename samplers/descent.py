@@ -7,6 +7,7 @@ References:
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -17,8 +18,8 @@ from samplers.chains import Chains, first_level, grown
 from samplers.intervals import Interval, binomial_cov, clopper_pearson, correlation_factor, log_normal
 from samplers.kernels import Kernel
 from samplers.levels import next_level
-from samplers.method import Goal, Outcome, Sample, Steps, no_outcome_share
-from samplers.problem import Inputs
+from samplers.method import Goal, Layer, Outcome, Sample, Steps, no_outcome_share
+from samplers.problem import FloatArray, Inputs
 from samplers.result import Level, Status
 
 ACCEPTANCE_RANGE = (0.15, 0.85)
@@ -151,7 +152,16 @@ def weighted_points(inputs: Inputs, levels: list[Chains], trace: list[Level], ga
         units=np.concatenate([points.roots for points in kept]),
         n_units=trace[0].n_points,
         x=inputs.base.from_standard_normal(last.u[last.f <= gamma]),
+        layers=tuple(_layers(levels, trace, weights)),
     )
+
+
+def _layers(levels: list[Chains], trace: list[Level], weights: FloatArray) -> Iterator[Layer]:
+    """Go through the levels with all their points; level j has thresholds from that of level j + 1 to its own."""
+    thresholds = [math.inf, *(record.gamma for record in trace[:-1]), -math.inf]
+    for chains, weight, high, low in zip(levels, weights, thresholds, thresholds[1:], strict=False):
+        points = chains.where(chains.used)
+        yield Layer(f=points.f, weights=np.full(len(points.f), weight), units=points.roots, low=low, high=high)
 
 
 def finish(chains: Chains, goal: Goal, passed: Passed, trace: list[Level], status: Status) -> Outcome:

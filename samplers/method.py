@@ -1,5 +1,6 @@
 """What a method is: settings with `steps`, given a goal, asking for simulations and giving an outcome."""
 
+import math
 import sys
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
@@ -42,6 +43,22 @@ class Goal:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class Layer:
+    """All points of one level, and the thresholds it speaks for: P[f(X) <= g] for low <= g < high."""
+
+    f: FloatArray
+    """Outcomes, shape (m,)."""
+    weights: FloatArray
+    """Shape (m,)."""
+    units: NDArray[np.int64]
+    """As in `Sample`, shape (m,)."""
+    low: float = -math.inf
+    """Where the next level takes over."""
+    high: float = math.inf
+    """Threshold of this level, where the one before takes over."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Sample:
     """Weighted points of one run: P[f(X) <= g] is the sum of the weights of the points with f <= g.
 
@@ -60,6 +77,14 @@ class Sample:
     """Independent units drawn, those without a point among these m included."""
     x: FloatArray
     """The points with f <= gamma, in their order in `f`, shape (k, d), in physical space."""
+    layers: tuple[Layer, ...] = ()
+    """For levels that grow from one another: all points of each. They give the same p, and its spread at thresholds
+    passed early: p there rests on all points of that level, not on the few of them that the next ones descend from."""
+
+    @property
+    def all_layers(self) -> tuple[Layer, ...]:
+        """The layers; the sample itself as one where it has none."""
+        return self.layers or (Layer(f=self.f, weights=self.weights, units=self.units),)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -82,6 +82,13 @@ def merged_sample(outcomes: Sequence[Outcome], shares: Sequence[float]) -> Sampl
         units=np.concatenate([first + sample.units for first, sample in zip(first_units, samples, strict=False)]),
         n_units=int(first_units[-1]),
         x=np.concatenate([sample.x for sample in samples]),
+        layers=tuple(
+            replace(layer, weights=share * layer.weights, units=first + layer.units)
+            for first, share, sample in zip(first_units, shares, samples, strict=False)
+            for layer in sample.all_layers
+        )
+        if any(sample.layers for sample in samples)
+        else (),
     )
 
 

@@ -8,11 +8,14 @@ from enum import Enum
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from samplers.problem import FloatArray
+from samplers.problem import Distribution, FloatArray
 
 if TYPE_CHECKING:
+    from samplers.curve import Curve
     from samplers.method import Sample, Stepping
+    from samplers.reweighting import HasLogProb, Reweighted
 
 
 class Status(str, Enum):
@@ -155,6 +158,49 @@ class Estimate:
     """Seed that gives the same run again."""
     sample: "Sample | None" = field(default=None, compare=False, repr=False)
     """The weighted points behind p; None if the method cannot give them."""
+    base: "Distribution | None" = field(default=None, compare=False, repr=False)
+    """The law of X."""
+    on_error: str = field(default="raise", repr=False)
+    """What was done where f raised or gave NaN."""
+
+    def curve(self, gammas: ArrayLike) -> "Curve":
+        """Return P[f(X) <= g] for other thresholds g from the same simulations, with a simultaneous band.
+
+        Thresholds above gamma were passed on the way. Below gamma the curve goes on as long as the
+        points there are worth 5 independent units (draws; paths, in subset simulation).
+
+        Args:
+            gammas: Thresholds, shape (k,), in any order.
+
+        Raises:
+            ValueError: If a threshold lies below what is known (the text says from where on it is),
+                or the method gave no weighted points.
+        """
+        from samplers.curve import curve_of  # which imports this module
+
+        return curve_of(self, gammas)
+
+    def reweight(self, new_base: "HasLogProb") -> "Reweighted":
+        """Return P[f(X) <= gamma] with X from another base distribution, from the same simulations.
+
+        Every failing point counts with the ratio of the densities. That works near the old base:
+        where the new one has its mass among points that were hardly drawn, the effective number of
+        units drops and the answer is refused. A region that fails and was never drawn from, because
+        the old base gives it little or no density, cannot be seen at all and no interval shows it;
+        where `new_base` can be sampled, draws from it tell whether it reaches beyond the old
+        support.
+
+        Args:
+            new_base: The other law of X: `log_prob` of points (n, d) in physical space gives (n,).
+
+        Raises:
+            ValueError: If the effective number of units or points is too small, the new base has
+                density where the old has none, it does not fit, nothing failed, or the method gave
+                no weighted points.
+        """
+        from samplers.reweighting import reweighted  # which imports this module
+
+        return reweighted(self, new_base)
 
     def __str__(self) -> str:
         """Return a few lines for people."""
@@ -191,7 +237,7 @@ class Estimate:
             "method": {"name": self.method.name, "settings": method_settings(self.method)},
             "seed": self.seed,
         }
-        return {key: _finite(value) for key, value in data.items()}
+        return {key: plain(value) for key, value in data.items()}
 
     def to_json(self) -> str:
         """Return `to_dict` as one line of JSON."""
@@ -203,14 +249,14 @@ def method_settings(method: "Stepping") -> dict[str, Any]:
     return {key: getattr(method, key) for key in getattr(method, "__dataclass_fields__", {})}
 
 
-def _finite(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """Replace NaN and infinities inside value by None, numbers of NumPy by Python's."""
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
+        return {key: plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
+        return [plain(item) for item in value]
     return value

@@ -153,7 +153,7 @@ def check_interruption(method: Stepping) -> None:
 
 
 def check_sample(method: Stepping) -> None:
-    """The weighted points behind p, where it gives them, fit together and give p."""
+    """The weighted points behind p, where it gives them, fit together and give p, also at thresholds passed."""
     result = estimate(half_space(2, 2.0).problem, method, seed=4, max_sim=3000, replicates=2)
     sample = result.sample
     if sample is None:
@@ -167,6 +167,9 @@ def check_sample(method: Stepping) -> None:
     p = float(sample.weights[sample.f <= 0].sum())
     near = abs(p - result.p) <= 3 * result.cov * result.p  # control variates may make a difference
     _expect(near, method, f"the weights of failing points add up to {p:.4g}, p is {result.p:.4g}")
+    curve, truth = result.curve([0.0, 0.5, 1.0, 2.0, 3.0]), ndtr(np.array([-2.0, -1.5, -1.0, 0.0, 1.0]))
+    held = (0.8 * curve.low <= truth) & (truth <= 1.2 * curve.high)
+    _expect(bool(held.all()), method, f"the curve misses {truth}:\n{curve}")
 
 
 def check_right(method: Stepping) -> None:
