@@ -9,6 +9,7 @@ from samplers.blocks import GaussianBlock, MixtureBlock, NormalBlock, Product
 from samplers.cross_entropy import CrossEntropy
 from samplers.curve import Curve
 from samplers.importance_sampling import ImportanceSampling
+from samplers.improved_cross_entropy import ImprovedCrossEntropy
 from samplers.ledger import EvaluationError
 from samplers.method import Goal, Interrupted, Layer, Method, Outcome, Sample, Stepping, Steps
 from samplers.monte_carlo import MonteCarlo
@@ -35,6 +36,7 @@ __all__ = [
     "GaussianBlock",
     "Goal",
     "ImportanceSampling",
+    "ImprovedCrossEntropy",
     "Interrupted",
     "Layer",
     "Level",

@@ -10,6 +10,7 @@ from typing import Any, cast
 
 from samplers.cross_entropy import CrossEntropy
 from samplers.importance_sampling import ImportanceSampling
+from samplers.improved_cross_entropy import ImprovedCrossEntropy
 from samplers.method import Stepping
 from samplers.monte_carlo import MonteCarlo
 from samplers.subset import AdaptiveSubsetSimulation, SubsetSimulation
@@ -65,7 +66,9 @@ class Methods(Mapping[str, type[Stepping]]):
         return len(self._own) + len(self._offered)
 
 
-METHODS = Methods(MonteCarlo, ImportanceSampling, CrossEntropy, SubsetSimulation, AdaptiveSubsetSimulation)
+METHODS = Methods(
+    MonteCarlo, ImportanceSampling, CrossEntropy, ImprovedCrossEntropy, SubsetSimulation, AdaptiveSubsetSimulation
+)
 
 
 def get_method(name: str, **settings: Any) -> Stepping:

@@ -66,7 +66,8 @@ def pooled(rounds: Sequence[Round], inputs: Inputs, gamma: float) -> Draws:
     """Return the draws of all rounds as if from the mixture of their proposals.
 
     For a run that is stopped during its search. The first round being base draws, no weight exceeds N / n_0.
-    Later proposals were fitted to earlier draws, so that this is not unbiased; fresh draws would be.
+    Later proposals were fitted to earlier draws, so that this is not unbiased as fresh draws would be: low by 1 to
+    4 %, by 9 % after two rounds of a mixture with several regions, its interval covers p in 92 to 100 % of runs.
     """
     n = np.array([len(found.f) for found in rounds])
     u, f = (np.concatenate(parts) for parts in zip(*((found.u, found.f) for found in rounds), strict=True))
