@@ -98,6 +98,9 @@ def curve_of(estimate: Estimate, gammas: ArrayLike) -> Curve:
     probability `confidence` (sup-t); 10,000 draws of a generator that comes from the seed find it.
     As the truth rises with g, the band's ends are made to do so too, which only narrows it.
 
+    The units of replicates are taken together: with 2 or 3 runs the band can be narrower at gamma
+    than the t interval of their mean.
+
     Raises:
         ValueError: As described in `Estimate.curve`.
     """

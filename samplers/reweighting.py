@@ -16,8 +16,8 @@ LEAST_ESS = 30.0
 """Effective number of failing points that the answer must rest on."""
 LEAST_UNITS = 5.0
 """Effective number of independent units (draws; paths of chains) that these points must come from."""
-LARGEST_LOG = 700.0
-"""exp of this is still a float."""
+LARGEST_LOG = 600.0
+"""exp of this, or of its negative, is still a float."""
 DRAWS = 10_000
 """Draws from the new base that look for places where the old one has no density."""
 
@@ -81,7 +81,8 @@ def reweighted(estimate: Estimate, new_base: HasLogProb) -> Reweighted:
     failing = sample.f <= estimate.gamma
     f, old, owners = sample.f[failing], sample.weights[failing], sample.units[failing]
     log_ratios = ratios(estimate, new_base, sample.x)
-    largest = max(float(log_ratios.max()), -LARGEST_LOG)  # taken out, so that nothing overflows
+    highest = float(log_ratios.max())
+    largest = highest if math.isfinite(highest) else 0.0  # taken out, so that nothing overflows
     terms = old * np.exp(log_ratios - largest)
     totals = np.bincount(owners, weights=terms, minlength=1).astype(np.float64)
     ess, units = effective(terms), effective(totals)
@@ -90,7 +91,7 @@ def reweighted(estimate: Estimate, new_base: HasLogProb) -> Reweighted:
     square = 1 / units - 1 / sample.n_units + (float(totals.max()) / total) ** 2
     own = 1 / effective(np.bincount(owners, weights=old).astype(np.float64)) - 1 / sample.n_units
     cov = math.sqrt(max(square, 0.0)) * inflation(estimate, math.sqrt(max(own, 0.0)))
-    ratio = total / float(old.sum()) * math.exp(min(largest, LARGEST_LOG))
+    ratio = total / float(old.sum()) * math.exp(min(max(largest, -LARGEST_LOG), LARGEST_LOG))
     p = min(1.0, estimate.p * ratio)
     low, high = interval_of_sum(p, cov, units, alone(sample), estimate.confidence)
     if estimate.on_error == "bound":
