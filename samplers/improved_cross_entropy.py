@@ -56,9 +56,9 @@ class ImprovedCrossEntropy(Method):
     von Mises-Fisher-Nakagami laws ("vmfn"), a direction and a radius, for many dimensions and failure
     around the origin. Mixtures by expectation-maximisation of weighted points.
 
-    Where the paper, the authors' code and this implementation differ:
+    Where the authors' released code (the ERA group's iCE scripts) and this implementation differ:
 
-    - *Estimate.* The paper estimates from the last draws of the search. Their proposal was stopped by
+    - *Estimate.* The code estimates from the last draws of the search. Their proposal was stopped by
       looking at them, and its weights are not bounded; fresh draws with base draws among them cost
       more simulations and are right whatever the search did. They also come from a proposal fitted once
       more, to the failures alone (sigma = 0) and to those of all rounds, weighted by p0 / (mixture of
@@ -66,12 +66,13 @@ class ImprovedCrossEntropy(Method):
     - *Wide draws* are ours: a Gaussian fitted to failures beyond a plane falls off sideways and outwards as
       fast as they do or faster, and the weights there would be heavy.
     - *sigma* is sought by halving intervals of its logarithm, between 1e-15 and 10 times the median of
-      |f - gamma|; the code minimises a square over sigma itself. f may be infinite: +inf has weight 0
+      |f - gamma|; the code minimises |c.o.v. - target| over sigma itself, from a first width of 50 times
+      the mean of f, which an outlier or a negative mean spoils. f may be infinite: +inf has weight 0
       at any finite width. Ties and a cap of f are no difficulty, since no quantile is taken.
-    - *Components.* The paper fixes their number. Ours takes the number with the best Bayesian
-      information criterion, up to `components`.
+    - *Components.* The code starts with a given number and drops the small ones. Ours takes the number
+      with the best Bayesian information criterion, up to `components`.
     - *Covariances* are shrunk towards I but for the direction of the mean (`shrunk_gaussian`), which
-      makes "gaussian" and "mixture" usable in some hundred dimensions; the paper's are not.
+      makes "gaussian" and "mixture" usable in a hundred dimensions, where those of the points alone are not.
 
     A region that the search did not see or lost in fitting is seen by base draws only, as a rare heavy
     weight (then warned of) or not at all. The interval is log-normal (`interval_of`); where the base draws
@@ -80,7 +81,7 @@ class ImprovedCrossEntropy(Method):
     Args:
         family: Family of the proposal.
         components: Components of a mixture at most.
-        weight_cov: C.o.v. of the weights that sets the next width. (The paper's delta_target.)
+        weight_cov: C.o.v. of the weights that sets the next width. (The code's CV_target.)
         n_round: Draws per round of the search; at most a tenth of max_sim.
         max_rounds: Rounds of the search at most.
         n_final: Final draws; with max_sim all that is left, with a target c.o.v. batches of this.
