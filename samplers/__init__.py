@@ -20,6 +20,7 @@ from samplers.result import Estimate, Failure, Failures, Level, Status
 from samplers.reweighting import Reweighted
 from samplers.run import estimate
 from samplers.subset import AdaptiveSubsetSimulation, SubsetSimulation
+from samplers.two_stage import TwoStage
 
 __all__ = [
     "METHODS",
@@ -56,6 +57,7 @@ __all__ = [
     "Stepping",
     "Steps",
     "SubsetSimulation",
+    "TwoStage",
     "estimate",
     "get_method",
 ]

@@ -169,8 +169,10 @@ def draw_until(
     return draws, trace, False
 
 
-def interval_of(draws: Draws, confidence: float, largest_weight: float) -> Interval:
+def interval_of(draws: Draws, confidence: float, largest_weight: float, cov: float | None = None) -> Interval:
     """Return the interval of p: log-normal, with t quantiles where few draws carry it.
+
+    `cov` is the c.o.v. where it is not that of independent draws (None).
 
     With an effective number of failing draws under LOW_ESS its upper end is at least the one
     that `bernstein_bound` guarantees.
@@ -183,7 +185,7 @@ def interval_of(draws: Draws, confidence: float, largest_weight: float) -> Inter
         low, high = clopper_pearson(hits, draws.n, confidence)
         return low, min(1.0, high * largest_weight)
     df = math.inf if draws.ess > MANY_ESS else max(draws.ess / 4, 3.0)
-    low, high = log_normal(draws.p, draws.cov, confidence, df)
+    low, high = log_normal(draws.p, draws.cov if cov is None else cov, confidence, df)
     if draws.ess < LOW_ESS:
         high = max(high, bernstein_bound(draws, confidence, largest_weight))
     return low, high

@@ -14,6 +14,7 @@ from samplers.improved_cross_entropy import ImprovedCrossEntropy
 from samplers.method import Stepping
 from samplers.monte_carlo import MonteCarlo
 from samplers.subset import AdaptiveSubsetSimulation, SubsetSimulation
+from samplers.two_stage import TwoStage
 
 GROUP = "rare_envs.samplers"
 """Entry points of this group name methods of other packages."""
@@ -67,7 +68,13 @@ class Methods(Mapping[str, type[Stepping]]):
 
 
 METHODS = Methods(
-    MonteCarlo, ImportanceSampling, CrossEntropy, ImprovedCrossEntropy, SubsetSimulation, AdaptiveSubsetSimulation
+    TwoStage,
+    MonteCarlo,
+    ImportanceSampling,
+    CrossEntropy,
+    ImprovedCrossEntropy,
+    SubsetSimulation,
+    AdaptiveSubsetSimulation,
 )
 
 

@@ -1,0 +1,152 @@
+"""What the proposals of `TwoStage` are mixed from, each described by its ratio to N(0, I).
+
+All live in standard normal space. Where a component is N(0, I) in most directions, its ratio needs the few others
+only, which keeps weights exact and cheap in hundreds of dimensions.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaln, log_ndtr, logsumexp, ndtri_exp
+
+from samplers.problem import FloatArray
+
+
+class Component(Protocol):
+    """A law in standard normal space."""
+
+    def log_ratio(self, u: FloatArray) -> FloatArray:
+        """Log of its density over that of N(0, I) at u (n, d), shape (n,); -inf where it has none."""
+
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw n independent points, shape (n, d)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Wide:
+    """N(0, scale^2 I); the base law where scale is 1."""
+
+    dim: int
+    scale: float = 1.0
+
+    def log_ratio(self, u: FloatArray) -> FloatArray:
+        """0.5 |u|^2 (1 - scale^-2) - d log(scale)."""
+        square = np.einsum("ij,ij->i", u, u)
+        return np.asarray(0.5 * square * (1 - self.scale**-2) - self.dim * math.log(self.scale))
+
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw n points."""
+        return self.scale * rng.standard_normal((n, self.dim))
+
+
+@dataclass(frozen=True, eq=False)
+class Bump:
+    """Independent Gaussians along some orthonormal axes, N(0, 1) in every direction outside their span."""
+
+    axes: FloatArray
+    """Orthonormal columns, shape (d, r)."""
+    mean: FloatArray
+    """Along the axes, shape (r,)."""
+    variance: FloatArray
+    """Along the axes, shape (r,)."""
+
+    @property
+    def centre(self) -> FloatArray:
+        """Its mean, shape (d,)."""
+        return self.axes @ self.mean
+
+    def log_ratio(self, u: FloatArray) -> FloatArray:
+        """Depends on the coordinates along the axes only."""
+        t = u @ self.axes
+        terms = t * t - (t - self.mean) ** 2 / self.variance - np.log(self.variance)
+        return np.asarray(0.5 * terms.sum(axis=1))
+
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw n points."""
+        xi = rng.standard_normal((n, len(self.axes)))
+        t = xi @ self.axes
+        return np.asarray(xi + (self.mean + np.sqrt(self.variance) * t - t) @ self.axes.T)
+
+    def tempered(self, power: float) -> "Bump":
+        """Return q^power phi^(1 - power), normalised: nearer to the origin and wider.
+
+        With a noisy f, where points fail with probability pi, failures have density q ~ phi pi and the best
+        proposal is phi sqrt(pi): the tempered one with power 1/2.
+        """
+        precision = power / self.variance + (1 - power)
+        return Bump(self.axes, power * self.mean / self.variance / precision, 1 / precision)
+
+
+@dataclass(frozen=True, eq=False)
+class Slice:
+    """N(0, I) beyond a plane, axis . u >= start; exact for a half-space."""
+
+    axis: FloatArray
+    """Unit vector, shape (d,)."""
+    start: float
+    across: Bump | None = None
+    """Another law for the directions within the plane; its axes are orthogonal to `axis`."""
+
+    def log_ratio(self, u: FloatArray) -> FloatArray:
+        """1 / Phi(-start) beyond the plane, none before it."""
+        ratio = np.where(u @ self.axis >= self.start, -float(log_ndtr(-self.start)), -np.inf)
+        return ratio if self.across is None else ratio + self.across.log_ratio(u)
+
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw n points."""
+        xi = rng.standard_normal((n, len(self.axis))) if self.across is None else self.across.sample(n, rng)
+        t = -ndtri_exp(np.log1p(-rng.random(n)) + log_ndtr(-self.start))
+        return np.asarray(xi + np.outer(t - xi @ self.axis, self.axis))
+
+
+@dataclass(frozen=True, eq=False)
+class Shell:
+    """Every direction alike, |u|^2 = start + Gamma(shape, scale): for failure beyond a radius."""
+
+    dim: int
+    start: float
+    shape: float
+    scale: float
+
+    def log_ratio(self, u: FloatArray) -> FloatArray:
+        """Ratio of the densities of |u|^2: shifted Gamma over chi-squared with d degrees of freedom."""
+        square = np.einsum("ij,ij->i", u, u)
+        beyond = square > self.start
+        ratio = np.full(len(u), -np.inf)
+        r, s, half = square[beyond], square[beyond] - self.start, self.dim / 2
+        log_chi2 = (half - 1) * np.log(r) - r / 2 - half * math.log(2) - gammaln(half)
+        log_gamma = (self.shape - 1) * np.log(s) - s / self.scale - gammaln(self.shape)
+        ratio[beyond] = log_gamma - self.shape * math.log(self.scale) - log_chi2
+        return ratio
+
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw n points."""
+        direction = rng.standard_normal((n, self.dim))
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        return np.asarray(direction * np.sqrt(self.start + self.scale * rng.gamma(self.shape, size=n))[:, None])
+
+
+def log_ratios(components: Sequence[Component], u: FloatArray) -> FloatArray:
+    """Return the log ratios of k components at u (n, d), shape (k, n)."""
+    return np.array([component.log_ratio(u) for component in components]).reshape(len(components), len(u))
+
+
+def mixed(log_r: FloatArray, weights: FloatArray) -> FloatArray:
+    """Return the log ratio of sum_k weights_k q_k from those of the q_k (k, n), shape (n,)."""
+    return np.asarray(logsumexp(log_r, axis=0, b=weights[:, None]))
+
+
+def draw_counts(weights: FloatArray, n: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Share n draws among components: n weights_k rounded up or down, n weights_k on average."""
+    bounds = np.floor(np.cumsum(weights / weights.sum() * n) + rng.random())
+    bounds[-1] = n  # but for rounding errors
+    return np.diff(np.concatenate([[0.0], np.minimum(bounds, n)])).astype(np.int64)
+
+
+def draw(components: Sequence[Component], counts: NDArray[np.int64], rng: np.random.Generator) -> FloatArray:
+    """Draw counts_k points from each component, one component after the other."""
+    return np.concatenate([c.sample(int(k), rng) for c, k in zip(components, counts, strict=True) if k > 0])

@@ -1,0 +1,299 @@
+"""From regions of failure to a proposal: rounds of draws, each from a better mixture than the one before."""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from samplers.bumps import HIGH_DIM, Points, clipped, fitted, refitted
+from samplers.components import Bump, Component, Shell, Slice, Wide, log_ratios, mixed
+from samplers.exploration import Batch, Region
+from samplers.importance import Draws
+from samplers.planes import beyond
+from samplers.problem import FloatArray, Inputs
+from samplers.second_moment import Floor, least_variance, with_floors
+
+BASE_FLOOR = 0.05
+"""Share of base draws: no weight exceeds 1 / BASE_FLOOR."""
+TEMPERED_FLOOR = 0.1
+TEMPERED_MORE = 0.2
+"""Share of tempered bumps, and how much more where half of the other draws do not fail."""
+TEMPERED_SOFT = 0.5
+SHARP = 0.42
+"""Where less than this share of the draws from sharp proposals fail, f is noisy or the regions are oddly shaped: then
+no slices, which have no density outside, and TEMPERED_SOFT."""
+REGION_FLOOR = 0.5
+REGION_FLOOR_LAST = 0.2
+"""Share of draws that is dealt out evenly among the regions, in the rounds and in the estimate. Weights of a region's
+first draws can be so uneven that it seems to have no mass: it must not be lost by that."""
+SMALLEST = 0.004
+"""Components with less of the draws than this are left out."""
+KEPT = 0.01
+"""But those that the exploration led to keep this much until the last round."""
+START = {
+    "base": 0.1,
+    "wide": 0.05,
+    "shell": 0.1,
+    "bump": 0.5,
+    "plane": 0.5,
+    "first": 0.2,
+    "tempered": 0.25,
+    "slice": 0.1,
+}
+SHARP_KINDS = ("bump", "plane", "first", "slice", "shell")
+NO_REGION = -1
+
+
+class Candidate(NamedTuple):
+    """A component that may become part of the proposal."""
+
+    component: Component
+    kind: str
+    region: int = NO_REGION
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """A mixture to draw from."""
+
+    candidates: list[Candidate]
+    weights: FloatArray
+    """Adding up to 1, shape (k,)."""
+
+    @property
+    def components(self) -> list[Component]:
+        """Its components."""
+        return [candidate.component for candidate in self.candidates]
+
+    def log_weights(self, u: FloatArray) -> FloatArray:
+        """log(phi / q) at u (n, d), shape (n,)."""
+        used = [c for c, a in zip(self.components, self.weights, strict=True) if a > 0]
+        return -mixed(log_ratios(used, u), self.weights[self.weights > 0])
+
+
+class History:
+    """All draws from known components, weighed as draws from the mixture of all of them (Owen and Zhou 2000)."""
+
+    def __init__(self, dim: int) -> None:
+        self.u = np.empty((0, dim))
+        """The failing ones, shape (k, d)."""
+        self.batches: list[Batch] = []
+        self._log_density = np.empty(0)
+        self._components: list[Component] = []
+        self._counts = np.empty(0)
+
+    @property
+    def n(self) -> int:
+        """Number of draws."""
+        return sum(len(batch.f) for batch in self.batches)
+
+    @property
+    def log_weights(self) -> FloatArray:
+        """log(phi / q) - log(n) at the failing draws, shape (k,): their sum is an estimate of p."""
+        return -self._log_density
+
+    def add(self, batch: Batch, gamma: float) -> None:
+        """Take in a batch of draws."""
+        used = [c for c, n in zip(batch.components, batch.counts, strict=True) if n > 0]
+        counts = batch.counts[batch.counts > 0].astype(np.float64)
+        self._log_density = np.logaddexp(self._log_density, mixed(log_ratios(used, self.u), counts))
+        self._components += used
+        self._counts = np.concatenate([self._counts, counts])
+        self.batches.append(batch)
+        found = batch.u[batch.f <= gamma]
+        self._log_density = np.append(self._log_density, mixed(log_ratios(self._components, found), self._counts))
+        self.u = np.concatenate([self.u, found])
+
+    def draws(self, inputs: Inputs, gamma: float) -> Draws:
+        """Return all draws, failing or not."""
+        u = np.concatenate([batch.u for batch in self.batches])
+        f = np.concatenate([batch.f for batch in self.batches])
+        log_weights = math.log(self.n) - mixed(log_ratios(self._components, u), self._counts)
+        return Draws.weighted(f, log_weights, inputs.base.from_standard_normal(u), gamma)
+
+
+class Refinement:
+    """What is known of the regions, and the proposals that follow from it.
+
+    Args:
+        regions: From the exploration, at least one.
+        history: Draws made so far.
+        gamma: Threshold of failure.
+        rng: Source of randomness.
+    """
+
+    def __init__(self, regions: list[Region], history: History, gamma: float, rng: np.random.Generator) -> None:
+        self._dim = regions[0].u.shape[1]
+        self._regions = regions
+        self._history = history
+        self._gamma = gamma
+        self._rng = rng
+        self._sharp_hits = 1.0
+        self._points = np.concatenate([region.points for region in regions])
+        bumps = [(bump, k) for k, region in enumerate(regions) for bump in self._first_bumps(region)]
+        self._first = [Candidate(bump, "first", k) for bump, k in bumps]
+        self._bumps = [bump for bump, _ in bumps]
+        self._fresh: list[Bump] = []
+        self._planes = [
+            Candidate(part, "plane", k)
+            for k, region in enumerate(regions)
+            for part in beyond(region.points, region.u, region.f)
+        ]
+        self._near: list[tuple[FloatArray, FloatArray]] = []
+
+    def proposal(self, *, last: bool = False) -> Proposal:
+        """Return the mixture for the next draws; `last`: for the estimate."""
+        seen = len(self._near) > 0
+        candidates = self._candidates(seen)
+        kinds = np.array([candidate.kind for candidate in candidates])
+        regions = np.array([candidate.region for candidate in candidates])
+        start = np.array([START[kind] / np.count_nonzero(kinds == kind) for kind in kinds])
+        weights = start / start.sum()
+        if not seen or len(self._history.u) == 0:
+            return Proposal(candidates, weights)
+        floors = self._floors(kinds, regions, REGION_FLOOR_LAST if last else REGION_FLOOR)
+        log_r = log_ratios([candidate.component for candidate in candidates], self._history.u)
+        weights = least_variance(log_r, self._history.log_weights, weights, floors)
+        kept = kinds == "base"
+        if not last:
+            explored = np.isin(kinds, ["first", "plane"])
+            weights = np.where(explored, np.maximum(weights, KEPT), weights)
+            kept = kept | explored
+        weights = np.where((weights < SMALLEST) & ~kept, 0.0, weights)
+        return Proposal(candidates, with_floors(weights / weights.sum(), floors))
+
+    def learn(self, proposal: Proposal, batch: Batch, *, afresh: bool) -> None:
+        """Take in the outcomes of draws; `afresh`: also fit new bumps to all failures."""
+        self._history.add(batch, self._gamma)
+        kinds = np.repeat([candidate.kind for candidate in proposal.candidates], batch.counts)
+        sharp = np.isin(kinds, SHARP_KINDS)
+        self._sharp_hits = float((batch.f[sharp] <= self._gamma).mean()) if sharp.any() else 0.0
+        near = ~np.isin(kinds, ["wide", "shell", "base"])
+        self._near.append((batch.u[near], batch.f[near]))
+        if len(self._history.u) > 5:
+            self._bumps = refitted(self._bumps, self._history.u, self._history.log_weights)
+            self._fresh = self._fresh_bumps() if afresh and self._dim <= HIGH_DIM else []
+            if afresh or self._dim > HIGH_DIM or len(self._regions) > 1:
+                self._planes = self._new_planes()
+
+    def _first_bumps(self, region: Region) -> list[Bump]:
+        chains, steps, _ = region.chains.shape
+        n = chains * steps
+        points = Points(
+            u=region.points,
+            weights=np.full(n, 1 / n),
+            ess=2.0 * chains,
+            groups=np.repeat(np.arange(chains), steps),
+        )
+        return fitted(points, 3 if self._dim <= HIGH_DIM else 1, self._rng).bumps
+
+    def _fresh_bumps(self) -> list[Bump]:
+        """Return a mixture fitted to all failures, where their weights carry one."""
+        weights = clipped(self._history.log_weights)
+        ess = 1 / float((weights**2).sum())
+        if ess < max(60, 6 * self._dim):
+            return []
+        return fitted(Points(self._history.u, weights, ess, np.arange(len(weights))), 8, self._rng).bumps
+
+    def _new_planes(self) -> list[Candidate]:
+        """Return planes from what was known of each region and the draws nearest to it."""
+        u, f = np.concatenate([u for u, _ in self._near]), np.concatenate([f for _, f in self._near])
+        log_r = log_ratios([first.component for first in self._first], u)
+        owner = np.array([first.region for first in self._first])[log_r.argmax(axis=0)]
+        owner = np.where(log_r.max(axis=0) > 1, owner, NO_REGION)
+        fails = f <= self._gamma
+        planes = []
+        for k, region in enumerate(self._regions):
+            own = owner == k
+            points = np.concatenate([region.points, u[own & fails]])
+            parts = beyond(points, np.concatenate([region.u, u[own]]), np.concatenate([region.f, f[own]]))
+            planes += [Candidate(part, "plane", k) for part in parts]
+        return planes
+
+    def _candidates(self, seen: bool) -> list[Candidate]:
+        sharp = not seen or self._sharp_hits > SHARP
+        bumps = [Candidate(b, "bump", c.region) for b, c in zip(self._bumps, self._first, strict=True)]
+        bumps += [Candidate(bump, "bump") for bump in self._fresh]
+        planes = [c for c in self._planes if sharp or isinstance(c.component, Bump)]
+        first = self._first if seen else []
+        found = [Candidate(Wide(self._dim), "base"), Candidate(Wide(self._dim, 1.5), "wide")]
+        found += self._shells() + bumps + planes + first
+        if sharp:
+            found += [Candidate(part, "slice") for part in self._slices(seen)]
+        for candidate in bumps + planes + first:
+            if isinstance(candidate.component, Bump):
+                found.append(Candidate(candidate.component.tempered(0.5), "tempered", candidate.region))
+        return found
+
+    def _floors(self, kinds: NDArray[np.str_], regions: NDArray[np.int64], for_regions: float) -> list[Floor]:
+        hits = self._sharp_hits
+        tempered = TEMPERED_FLOOR + TEMPERED_MORE * (1 - hits) if hits > SHARP else TEMPERED_SOFT
+        floors = [Floor(kinds == "base", BASE_FLOOR), Floor(kinds == "tempered", tempered)]
+        n = len(self._regions)
+        if n > 1:
+            floors += [Floor((regions == k) & (kinds != "tempered"), for_regions / n) for k in range(n)]
+        return floors
+
+    def _shells(self) -> list[Candidate]:
+        if self._dim < 3:
+            return []
+        shells = [shell_around(self._points, np.ones(len(self._points)))]
+        if len(self._history.u) >= 20:
+            log_w = self._history.log_weights
+            shells.append(shell_around(self._history.u, np.exp(log_w - log_w.max())))
+        return [Candidate(shell, "shell") for shell in shells]
+
+    def _slices(self, seen: bool) -> list[Slice]:
+        """Return slices through the edge of each bump's failures, plain and with the bump's shape across."""
+        u = self._history.u if seen else self._points
+        log_w = self._history.log_weights if seen else np.zeros(len(u))
+        bumps = self._bumps + self._fresh
+        if len(u) == 0:
+            return []
+        owner = log_ratios(bumps, u).argmax(axis=0)
+        return [
+            part
+            for k, bump in enumerate(bumps)
+            if np.count_nonzero(owner == k) >= 10
+            for part in slices_of(bump, u[owner == k], np.exp(log_w[owner == k] - log_w.max()))
+        ]
+
+
+def slices_of(bump: Bump, u: FloatArray, weights: FloatArray) -> list[Slice]:
+    """Return slices that start at the 2 % quantile of failures u (n, d) with weights (n,) along a bump's centre."""
+    centre, dim = bump.centre, len(bump.axes)
+    norm = float(np.linalg.norm(centre))
+    if norm < 1e-6:
+        return []
+    axis = centre / norm
+    start = quantile(u @ axis, weights, 0.02) - 0.02
+    if start < 0.5:
+        return []
+    parts = [Slice(axis, start)]
+    if bump.axes.shape[1] == dim > 1:
+        across = np.eye(dim) - np.outer(axis, axis)
+        values, vectors = np.linalg.eigh(across @ (bump.axes * bump.variance @ bump.axes.T) @ across)
+        within = np.argsort(np.abs(vectors.T @ axis))[: dim - 1]
+        axes = vectors[:, within]
+        parts.append(Slice(axis, start, Bump(axes, axes.T @ centre, np.maximum(values[within], 1e-6))))
+    return parts
+
+
+def shell_around(u: FloatArray, weights: FloatArray) -> Shell:
+    """Return the shell whose |u|^2 has the moments of points u (n, d) with weights (n,)."""
+    square = np.einsum("ij,ij->i", u, u)
+    start = 0.98 * quantile(square, weights, 0.01)
+    beyond_start = square > start
+    s, w = square[beyond_start] - start, weights[beyond_start]
+    mean = float(np.average(s, weights=w))
+    variance = max(float(np.average((s - mean) ** 2, weights=w)), 1e-6)
+    return Shell(u.shape[1], start, max(mean * mean / variance, 0.3), max(variance / mean, 1e-3))
+
+
+def quantile(x: FloatArray, weights: FloatArray, share: float) -> float:
+    """Return the smallest x (n,) up to which at least this share of the weights (n,) lies."""
+    order = np.argsort(x)
+    total = np.cumsum(weights[order])
+    return float(x[order][min(int(np.searchsorted(total, share * total[-1])), len(x) - 1)])

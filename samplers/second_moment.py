@@ -1,0 +1,59 @@
+"""Weights of a mixture of proposals that minimise the variance of importance sampling."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from samplers.problem import FloatArray
+
+STEPS = 60
+NEGLIGIBLE = 30.0
+"""Points whose weight is e^-30 of the largest one do not matter."""
+
+
+class Floor:
+    """Components that together get at least some share of the draws."""
+
+    def __init__(self, members: NDArray[np.bool_], least: float) -> None:
+        self.members = members
+        self.least = least
+
+
+def least_variance(
+    log_r: FloatArray, log_weights: FloatArray, start: FloatArray, floors: Sequence[Floor]
+) -> FloatArray:
+    """Return weights a (k,) of a mixture q_a = sum_k a_k q_k that minimise the second moment of its estimate.
+
+    That is sum_i w_i (phi / q_a)(u_i) over failing points u_i with importance weights w_i, convex in a. Each step
+    multiplies a_k by the square root of G_k = sum_i w_i (phi q_k / q_a^2)(u_i); at the optimum all G_k with a_k > 0
+    are equal.
+
+    Args:
+        log_r: log(q_k / phi) at the failing points, shape (k, n).
+        log_weights: Of the failing points, shape (n,).
+        start: First weights, shape (k,).
+        floors: Lower limits, kept in every step.
+    """
+    matter = log_weights > log_weights.max() - NEGLIGIBLE
+    log_r, log_weights = log_r[:, matter], log_weights[matter]
+    largest = log_r.max(axis=0)
+    ratio = np.exp(log_r - largest)
+    scaled = np.exp(log_weights - largest - (log_weights - largest).max())
+    a = start
+    for _ in range(STEPS):
+        q = np.maximum(a @ ratio, 1e-300)
+        a = a * np.sqrt((ratio * (scaled / (q * q))).sum(axis=1))
+        a = with_floors(a / a.sum(), floors)
+    return a
+
+
+def with_floors(a: FloatArray, floors: Sequence[Floor]) -> FloatArray:
+    """Return weights (k,) raised to the floors, one floor after the other; they still add up to 1."""
+    for floor in floors:
+        members, total = floor.members, float(a[floor.members].sum())
+        if total < floor.least:
+            inside = a[members] / total if total > 0 else np.full(members.sum(), 1 / members.sum())
+            a = a * (1 - floor.least) / (1 - total)
+            a[members] = floor.least * inside
+    return a
