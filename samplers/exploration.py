@@ -32,6 +32,10 @@ MOST_LEVELS = 30
 BISECTIONS = 3
 MOST_REGIONS = 8
 MOST_CLONES = 60
+PROBES = 30
+NUDGE = 1e-6
+NOISY = 0.9
+"""Where less than this share of the points right beside failing ones fail, f is noisy."""
 
 
 @dataclass(frozen=True)
@@ -133,6 +137,14 @@ class Descent(NamedTuple):
     f: FloatArray
 
 
+class Found(NamedTuple):
+    """What the exploration found."""
+
+    regions: list[Region]
+    noisy: bool
+    """Whether f has noise of its own: then regions cannot be told apart, and all of it is one."""
+
+
 Ask = Generator[FloatArray, FloatArray, Batch]
 
 
@@ -148,7 +160,7 @@ def first_draws(simulator: Simulator, sizes: Sizes, rng: np.random.Generator) ->
 
 def regions_of(
     simulator: Simulator, first: Batch, gamma: float, sizes: Sizes, rng: np.random.Generator
-) -> Generator[FloatArray, FloatArray, list[Region]]:
+) -> Generator[FloatArray, FloatArray, Found]:
     """Find the regions of failure, starting from the first draws; none if nothing fails."""
     n_base = int(first.counts[0])
     descent = yield from _descend(simulator, first.u[:n_base], first.f[:n_base], gamma, sizes, rng)
@@ -159,17 +171,21 @@ def regions_of(
     room = max(sizes.level_starts, sizes.starts + sizes.level_starts - len(far))
     starts = np.concatenate([far, rng.permutation(descent.failing)[:room]])
     if len(starts) == 0:
-        return []
+        return Found([], noisy=False)
     return (yield from _grown(simulator, starts, descent, gamma, rng))
 
 
 def _grown(
     simulator: Simulator, starts: FloatArray, descent: Descent, gamma: float, rng: np.random.Generator
-) -> Generator[FloatArray, FloatArray, list[Region]]:
+) -> Generator[FloatArray, FloatArray, Found]:
     """Run chains from failing points, twice; sort them into regions after each time."""
     dim = starts.shape[1]
     steps = (5, 6) if dim <= HIGH_DIM else (8, 8)
     walk = yield from _walk(simulator, starts, np.full(len(starts), 0.5), None, steps[0], gamma, rng)
+    if (yield from _is_noisy(simulator, walk.states[:, -1], gamma, rng)):
+        last = yield from _walk(simulator, walk.states[:, -1], walk.sigma, None, steps[1], gamma, rng)
+        region = Region(last.states[:, 1:], last.proposals.reshape(-1, dim), last.f.ravel())
+        return Found([region], noisy=True)
     labels = yield from _same_region(simulator, walk.states[:, -1], gamma, rng)
     more = _clones(labels, min(max(8, math.ceil(2.5 * dim / steps[1])), 24), rng)
     walk, labels = walk.of(more), labels[more]
@@ -184,7 +200,7 @@ def _grown(
     for k in range(labels.max() + 1):
         own = labels == k
         regions.append(Region(last.states[own, 1:], proposals[own].reshape(-1, dim), f[own].ravel()))
-    return [_with_descent(regions[0], descent)] if len(regions) == 1 else regions
+    return Found([_with_descent(regions[0], descent)] if len(regions) == 1 else regions, noisy=False)
 
 
 def _descend(
@@ -268,6 +284,15 @@ def _walk(
         proposals.append(proposal)
         outcomes.append(f)
     return Walk(np.stack(states, axis=1), np.stack(proposals, axis=1), np.stack(outcomes, axis=1), sigma)
+
+
+def _is_noisy(
+    simulator: Simulator, u: FloatArray, gamma: float, rng: np.random.Generator
+) -> Generator[FloatArray, FloatArray, bool]:
+    """Return whether points right beside failing ones (n, d) do not always fail."""
+    u = rng.permutation(u)[:PROBES]
+    f = yield from simulator.f(u + NUDGE * rng.standard_normal(u.shape))
+    return float((f <= gamma).mean()) < NOISY
 
 
 def _same_region(

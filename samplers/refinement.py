@@ -6,10 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import log_ndtr
 
 from samplers.bumps import HIGH_DIM, Points, clipped, fitted, refitted
 from samplers.components import Bump, Component, Shell, Slice, Wide, log_ratios, mixed
-from samplers.exploration import Batch, Region
+from samplers.exploration import MOST_REGIONS, Batch, Found, Region
 from samplers.importance import Draws
 from samplers.planes import beyond
 from samplers.problem import FloatArray, Inputs
@@ -20,10 +21,9 @@ BASE_FLOOR = 0.05
 TEMPERED_FLOOR = 0.1
 TEMPERED_MORE = 0.2
 """Share of tempered bumps, and how much more where half of the other draws do not fail."""
-TEMPERED_SOFT = 0.5
-SHARP = 0.42
-"""Where less than this share of the draws from sharp proposals fail, f is noisy or the regions are oddly shaped: then
-no slices, which have no density outside, and TEMPERED_SOFT."""
+BASE_NOISY = 0.1
+TEMPERED_NOISY = 0.5
+"""Their share where f is noisy: there they are what is best."""
 REGION_FLOOR = 0.5
 REGION_FLOOR_LAST = 0.2
 """Share of draws that is dealt out evenly among the regions, in the rounds and in the estimate. Weights of a region's
@@ -106,27 +106,33 @@ class History:
         self._log_density = np.append(self._log_density, mixed(log_ratios(self._components, found), self._counts))
         self.u = np.concatenate([self.u, found])
 
-    def draws(self, inputs: Inputs, gamma: float) -> Draws:
-        """Return all draws, failing or not."""
+    def everything(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return all draws, failing or not: u (n, d), f (n,) and log(phi / q) - log(n), shape (n,)."""
         u = np.concatenate([batch.u for batch in self.batches])
         f = np.concatenate([batch.f for batch in self.batches])
-        log_weights = math.log(self.n) - mixed(log_ratios(self._components, u), self._counts)
-        return Draws.weighted(f, log_weights, inputs.base.from_standard_normal(u), gamma)
+        return u, f, -mixed(log_ratios(self._components, u), self._counts)
+
+    def draws(self, inputs: Inputs, gamma: float) -> Draws:
+        """Return all draws as those from one proposal."""
+        u, f, log_weights = self.everything()
+        return Draws.weighted(f, log_weights + math.log(self.n), inputs.base.from_standard_normal(u), gamma)
 
 
 class Refinement:
     """What is known of the regions, and the proposals that follow from it.
 
     Args:
-        regions: From the exploration, at least one.
+        found: By the exploration, at least one region.
         history: Draws made so far.
         gamma: Threshold of failure.
         rng: Source of randomness.
     """
 
-    def __init__(self, regions: list[Region], history: History, gamma: float, rng: np.random.Generator) -> None:
+    def __init__(self, found: Found, history: History, gamma: float, rng: np.random.Generator) -> None:
+        regions = found.regions
         self._dim = regions[0].u.shape[1]
         self._regions = regions
+        self._noisy = found.noisy
         self._history = history
         self._gamma = gamma
         self._rng = rng
@@ -154,8 +160,9 @@ class Refinement:
         if not seen or len(self._history.u) == 0:
             return Proposal(candidates, weights)
         floors = self._floors(kinds, regions, REGION_FLOOR_LAST if last else REGION_FLOOR)
-        log_r = log_ratios([candidate.component for candidate in candidates], self._history.u)
-        weights = least_variance(log_r, self._history.log_weights, weights, floors)
+        u, log_w = self._smoothed() if self._noisy else (self._history.u, self._history.log_weights)
+        log_r = log_ratios([candidate.component for candidate in candidates], u)
+        weights = least_variance(log_r, log_w, weights, floors)
         kept = kinds == "base"
         if not last:
             explored = np.isin(kinds, ["first", "plane"])
@@ -178,6 +185,22 @@ class Refinement:
             if afresh or self._dim > HIGH_DIM or len(self._regions) > 1:
                 self._planes = self._new_planes()
 
+    def _smoothed(self) -> tuple[FloatArray, FloatArray]:
+        """Return all draws u (n, d), weighted also by the probability that they fail, as logistic regression has it.
+
+        With a noisy f the few failures among the draws near the origin carry large weights by chance. What the
+        weights of the mixture have to guard against is how likely such draws are to fail.
+        """
+        from sklearn.linear_model import LogisticRegression  # slow to import, and seldom needed
+        from sklearn.preprocessing import PolynomialFeatures
+
+        u, f, log_w = self._history.everything()
+        x = PolynomialFeatures(2 if self._dim <= 20 else 1, include_bias=False).fit_transform(u)
+        fails = f <= self._gamma
+        odds = LogisticRegression(C=100.0, max_iter=2000).fit(x, fails).decision_function(x) / 1.702
+        # The logistic curve has far heavier tails than noise that is near normal: log_ndtr(odds / 1.702) has not.
+        return u, log_w + log_ndtr(odds)
+
     def _first_bumps(self, region: Region) -> list[Bump]:
         chains, steps, _ = region.chains.shape
         n = chains * steps
@@ -187,7 +210,8 @@ class Refinement:
             ess=2.0 * chains,
             groups=np.repeat(np.arange(chains), steps),
         )
-        return fitted(points, 3 if self._dim <= HIGH_DIM else 1, self._rng).bumps
+        most = 8 if self._noisy else 3
+        return fitted(points, most if self._dim <= HIGH_DIM else 1, self._rng).bumps
 
     def _fresh_bumps(self) -> list[Bump]:
         """Return a mixture fitted to all failures, where their weights carry one."""
@@ -213,26 +237,26 @@ class Refinement:
         return planes
 
     def _candidates(self, seen: bool) -> list[Candidate]:
-        sharp = not seen or self._sharp_hits > SHARP
         bumps = [Candidate(b, "bump", c.region) for b, c in zip(self._bumps, self._first, strict=True)]
         bumps += [Candidate(bump, "bump") for bump in self._fresh]
-        planes = [c for c in self._planes if sharp or isinstance(c.component, Bump)]
+        planes = [] if self._noisy else self._planes
         first = self._first if seen else []
         found = [Candidate(Wide(self._dim), "base"), Candidate(Wide(self._dim, 1.5), "wide")]
         found += self._shells() + bumps + planes + first
-        if sharp:
+        if not self._noisy:
             found += [Candidate(part, "slice") for part in self._slices(seen)]
         for candidate in bumps + planes + first:
             if isinstance(candidate.component, Bump):
-                found.append(Candidate(candidate.component.tempered(0.5), "tempered", candidate.region))
+                for power in (0.5, 0.25) if self._noisy else (0.5,):
+                    found.append(Candidate(candidate.component.tempered(power), "tempered", candidate.region))
         return found
 
     def _floors(self, kinds: NDArray[np.str_], regions: NDArray[np.int64], for_regions: float) -> list[Floor]:
-        hits = self._sharp_hits
-        tempered = TEMPERED_FLOOR + TEMPERED_MORE * (1 - hits) if hits > SHARP else TEMPERED_SOFT
-        floors = [Floor(kinds == "base", BASE_FLOOR), Floor(kinds == "tempered", tempered)]
+        tempered = TEMPERED_NOISY if self._noisy else TEMPERED_FLOOR + TEMPERED_MORE * (1 - self._sharp_hits)
+        base = BASE_NOISY if self._noisy else BASE_FLOOR
+        floors = [Floor(kinds == "base", base), Floor(kinds == "tempered", tempered)]
         n = len(self._regions)
-        if n > 1:
+        if 1 < n < MOST_REGIONS:  # as many as that are pieces of something like a shell
             floors += [Floor((regions == k) & (kinds != "tempered"), for_regions / n) for k in range(n)]
         return floors
 

@@ -110,6 +110,7 @@ class _Run:
         self._history = History(inputs.dim)
         self._base_u = np.empty((0, inputs.dim))
         self._base_f = np.empty(0)
+        self._n_base = 0
         self._trace: list[Level] = []
 
     @property
@@ -121,16 +122,17 @@ class _Run:
         gamma, sizes = self._goal.gamma, Sizes.within(self._budget)
         first = yield from first_draws(self._simulator, sizes, self._rng)
         self._base_u, self._base_f = first.u[: sizes.base], first.f[: sizes.base]
+        self._n_base = sizes.base
         share = float((self._base_f <= gamma).mean())
         self._note(share, share, len(first.f), binomial_cov(share, sizes.base))
         if share >= COMMON:
             return None
         self._history.add(first, gamma)
-        regions = yield from regions_of(self._simulator, first, gamma, sizes, self._rng)
-        chains = sum(len(region.f) for region in regions)
-        fails = sum(int((region.f <= gamma).sum()) for region in regions)
+        found = yield from regions_of(self._simulator, first, gamma, sizes, self._rng)
+        chains = sum(len(region.f) for region in found.regions)
+        fails = sum(int((region.f <= gamma).sum()) for region in found.regions)
         self._note(fails / max(chains, 1), share, chains, math.inf)
-        return Refinement(regions, self._history, gamma, self._rng) if regions else None
+        return Refinement(found, self._history, gamma, self._rng) if found.regions else None
 
     def refined(self, refinement: Refinement) -> Generator[FloatArray, FloatArray, Proposal]:
         """Draw and learn in rounds; return the mixture for the estimate."""
@@ -204,12 +206,14 @@ class _Run:
             warnings=tuple(doubts(draws)),
             trace=self._closed_trace(),
             no_outcome_share=no_outcome_share(draws.f, np.exp(draws.log_weights)),
+            base_draws=self._n_base,
         )
 
     def _drawn(self, proposal: Proposal, n: int) -> Generator[FloatArray, FloatArray, Batch]:
         counts = draw_counts(proposal.weights, n, self._rng)
         u = draw(proposal.components, counts, self._rng)
         f = yield from self._simulator.f(u)
+        self._n_base += int(counts[0])  # of a proposal the first component is the base law
         return Batch(proposal.components, counts, u, f)
 
     def _note_draws(self, batch: Batch, estimate: float, cov: float, ess: float) -> None:
