@@ -149,6 +149,7 @@ class Run:
             sample=whole.sample,
             base=plan.inputs.base,
             on_error=plan.on_error,
+            base_draws=whole.base_draws,
         )
 
     def _outcomes(self) -> list[Outcome]:

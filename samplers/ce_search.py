@@ -58,6 +58,11 @@ class Search:
         return sum(level.n_sim for level in self.trace)
 
     @property
+    def base_draws(self) -> int:
+        """How many of them are base draws: the first batch."""
+        return len(self.batches[0].f) if self.batches else 0
+
+    @property
     def n_reached(self) -> int:
         """How many proposals have reached gamma."""
         return sum(iterate.level == self.goal.gamma for iterate in self.iterates)
@@ -117,4 +122,5 @@ class Search:
             trace=tuple(self.trace),
             no_outcome_share=no_outcome_share(draws.f, np.exp(draws.log_weights)),
             sample=draws.sample,
+            base_draws=self.base_draws,
         )

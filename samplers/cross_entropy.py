@@ -164,16 +164,18 @@ class CrossEntropy(Method):
         if draws.n == 0:
             return search.outcome(space)
         reached = best is not None and best.level == goal.gamma
+        base_share = 1.0 if common else self.base_share
         status = search.status if len(draws.f) else Status.NO_HITS
         return Outcome(
             p=draws.p,
-            interval=interval_of(draws, goal.confidence, 1.0 if common else 1 / self.base_share),
+            interval=interval_of(draws, goal.confidence, 1 / base_share),
             cov=binomial_cov(draws.p, draws.n) if common else draws.cov,
             status=Status.STOPPED if stopped else status,
             warnings=tuple(([] if reached else [search_ended(best, search.status)]) + doubts(draws)),
             trace=(*search.trace, *final),
             no_outcome_share=no_outcome_share(draws.f, np.exp(draws.log_weights)),
             sample=draws.sample,
+            base_draws=search.base_draws + int(base_share * draws.n),
         )
 
     def _start(self, inputs: Inputs) -> tuple[Product, Space]:

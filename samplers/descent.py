@@ -176,6 +176,7 @@ def finish(chains: Chains, goal: Goal, passed: Passed, trace: list[Level], statu
         warnings=tuple(_warnings(trace, status, len(hits), cov)),
         trace=tuple(trace),
         no_outcome_share=no_outcome_share(hits),
+        base_draws=trace[0].n_points,
     )
 
 

@@ -133,6 +133,7 @@ class ImportanceSampling(Method):
         limit = 0 if search.status is Status.STOPPED else min(goal.budget - search.n_sim, self._most(goal))
         final = draw_until(inputs, sampler, replace(goal, target_cov=target), limit, self.batch, rng)
         draws, trace, stopped = yield from final
+        base_draws = search.base_draws + int(draws.n / largest)
         if draws.n == 0:  # stopped before the first batch
             draws, largest = pooled(search.rounds, inputs, goal.gamma), float(len(search.rounds))
         cov = binomial_cov(draws.p, draws.n) if largest == 1 else draws.cov
@@ -147,6 +148,7 @@ class ImportanceSampling(Method):
             trace=(*search.trace, *trace),
             no_outcome_share=no_outcome_share(draws.f, np.exp(draws.log_weights)) if len(draws.f) else 0.0,
             sample=draws.sample,
+            base_draws=base_draws,
         )
 
     def _most(self, goal: Goal) -> int:

@@ -131,6 +131,7 @@ class ImprovedCrossEntropy(Method):
             largest = 1 / self.base_share
         limit = 0 if search.status is Status.STOPPED else self._limit(goal, search.n_sim)
         draws, trace, stopped = yield from draw_until(inputs, sampler, goal, limit, self.n_final, rng)
+        base_draws = search.base_draws + int(draws.n / largest)
         if draws.n == 0:  # stopped before the first batch
             draws, largest = pooled(search.rounds, inputs, goal.gamma), float(len(search.rounds))
         stopped = stopped or search.status is Status.STOPPED
@@ -144,6 +145,7 @@ class ImprovedCrossEntropy(Method):
             trace=(*search.trace, *trace),
             no_outcome_share=no_outcome_share(draws.f, np.exp(draws.log_weights)) if len(draws.f) else 0.0,
             sample=draws.sample,
+            base_draws=base_draws,
         )
 
     def _defensive(self, base: Law, proposal: Proposal) -> Mixture:

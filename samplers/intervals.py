@@ -23,6 +23,14 @@ def clopper_pearson(hits: int, n: int, confidence: float) -> Interval:
     return low, high
 
 
+def nothing_in(n: int, confidence: float) -> float:
+    """Return the upper bound of a probability of which n independent draws showed nothing; 1 where n = 0.
+
+    The one-sided interval of Clopper and Pearson, with all of 1 - confidence at the upper end.
+    """
+    return -math.expm1(math.log1p(-confidence) / n) if n else 1.0
+
+
 def log_normal(p: float, cov: float, confidence: float, df: float = math.inf) -> Interval:
     """Return p exp(-+ q s), s^2 = log(1 + cov^2), q the normal (or, with finite df, t) quantile.
 

@@ -103,6 +103,9 @@ class Outcome:
     """(k, n) where p = k / n and k counts the failing ones of n independent draws: such runs pool."""
     sample: Sample | None = None
     """The points behind p; None if the method cannot give them."""
+    base_draws: int = 0
+    """Independent draws from the base law that the run made, wherever: they bound what `Estimate.unseen` says. Of
+    draws from a mixture, the expected number from its base component."""
 
 
 class Interrupted(Exception):

@@ -95,6 +95,7 @@ def share_of_failures(hits: int, n: int, confidence: float, trace: Sequence[Leve
         trace=tuple(trace),
         no_outcome_share=no_outcome_share,
         counts=(hits, n),
+        base_draws=n,
     )
 
 

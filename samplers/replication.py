@@ -57,6 +57,7 @@ def combined(outcomes: Sequence[Outcome], confidence: float) -> Outcome:
         trace=trace,
         no_outcome_share=(float(np.average([o.no_outcome_share for o in used], weights=p)) if mean else 0.0),
         sample=merged_sample(used, [1 / len(used)] * len(used)),
+        base_draws=sum(outcome.base_draws for outcome in used),
     )
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from samplers.intervals import nothing_in
 from samplers.problem import Distribution, FloatArray
 
 if TYPE_CHECKING:
@@ -162,6 +163,19 @@ class Estimate:
     """The law of X."""
     on_error: str = field(default="raise", repr=False)
     """What was done where f raised or gave NaN."""
+    base_draws: int = 0
+    """Simulations that were independent draws from the base distribution."""
+
+    @property
+    def unseen(self) -> float:
+        """Largest probability M that a region of failure may have and yet hold none of the base draws.
+
+        With a larger one the chance to see none of it is under 1 - confidence: M = 1 - (1 - confidence)^(1 / n) for
+        n base draws, the one-sided Clopper-Pearson bound without a hit. 1 without base draws. What leads a method
+        to failures other than base draws (levels of f, wide draws, chains) may find far smaller regions, but
+        guarantees nothing.
+        """
+        return nothing_in(self.base_draws, self.confidence)
 
     def curve(self, gammas: ArrayLike) -> "Curve":
         """Return P[f(X) <= g] for other thresholds g from the same simulations, with a simultaneous band.
@@ -202,6 +216,13 @@ class Estimate:
 
         return reweighted(self, new_base)
 
+    @property
+    def proviso(self) -> str:
+        """What p and its interval take for granted, in words."""
+        if self.base_draws == 0:
+            return "no region of failure was missed (no base draws bound its size)"
+        return f"no region of more than {self.unseen:.1e} was missed ({self.base_draws:,} base draws saw none other)"
+
     def __str__(self) -> str:
         """Return a few lines for people."""
         low, high = self.interval
@@ -212,6 +233,7 @@ class Estimate:
             f"  {100 * self.confidence:g} % interval [{low:.3e}, {high:.3e}], c.o.v. {cov}",
             f"  {self.n_sim:,} simulations{gain}; {self.method.name}, seed {self.seed}, "
             f"{self.status}; {self.failures.total:,} failing points",
+            f"  given that {self.proviso}",
         ]
         return "\n".join(lines + [f"  warning: {text}" for text in self.warnings])
 
@@ -224,6 +246,8 @@ class Estimate:
             "cov": self.cov,
             "gamma": self.gamma,
             "n_sim": self.n_sim,
+            "base_draws": self.base_draws,
+            "unseen": self.unseen,
             "gain": self.gain,
             "status": str(self.status),
             "warnings": list(self.warnings),

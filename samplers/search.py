@@ -46,6 +46,11 @@ class Search(NamedTuple):
         """Simulations made."""
         return sum(level.n_sim for level in self.trace)
 
+    @property
+    def base_draws(self) -> int:
+        """How many of them are base draws: the first round."""
+        return len(self.rounds[0].f) if self.rounds else 0
+
 
 def described(found: Round, level: float) -> Level:
     """Return the record of a round: what its draws say about P[f <= level]."""

@@ -224,6 +224,9 @@ def _expect_sound(method: Stepping, result: Estimate, rows: int) -> None:
     _expect(result.n_sim == rows, method, f"{rows} simulations, n_sim says {result.n_sim}")
     _expect(levels == rows, method, f"{rows} simulations, the levels of the trace add up to {levels}")
     _expect(0 <= low <= result.p <= high <= 1, method, f"expected 0 <= low <= p <= high <= 1, got\n{result}")
+    drawn = result.base_draws
+    _expect(0 <= drawn <= rows, method, f"expected at most {rows} base draws, the result has {drawn}")
+    _expect(0 < result.unseen <= 1, method, f"expected unseen in (0, 1], got {result.unseen}")
     _expect(result.cov >= 0, method, f"expected a c.o.v. of at least 0, got {result.cov}")
     _expect(result.p > 0 or high > 0, method, "p = 0 is no certainty: expected an upper end above 0")
 

@@ -47,6 +47,7 @@ def print_report(report: Report, out: Path | None = None) -> None:
         (f"{100 * estimate.confidence:g} % interval", f"{low:.3e} to {high:.3e}"),
         ("c.o.v.", "not known" if math.isinf(estimate.cov) else f"{estimate.cov:.3f}"),
         ("simulations", f"{estimate.n_sim:,} in {report.seconds:.1f} s"),
+        ("given that", estimate.proviso),
         ("gain", _gain(estimate)),
         ("method", f"{estimate.method.name}, seed {estimate.seed}, {estimate.status}"),
     )

@@ -1,7 +1,9 @@
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
+import pytest
 
 import samplers
 from samplers.reference import half_space
@@ -44,6 +46,52 @@ def test_to_dict_has_no_infinities():
     assert data["cov"] is None
     assert data["gain"] is None
     json.dumps(data, allow_nan=False)
+
+
+def test_says_how_large_a_region_may_have_been_missed():
+    estimate = result()
+    assert estimate.base_draws == 1000
+    assert (1 - estimate.unseen) ** 1000 == pytest.approx(0.05)
+    assert "no region of more than 3.0e-03 was missed (1,000 base draws saw none other)" in str(estimate)
+    assert (1 - result(confidence=0.9).unseen) ** 1000 == pytest.approx(0.1)
+    assert estimate.to_dict()["unseen"] == estimate.unseen
+    without = replace(estimate, base_draws=0)
+    assert without.unseen == 1
+    assert "no base draws" in str(without)
+
+
+@pytest.mark.parametrize(
+    ("method", "expected"),
+    [
+        (samplers.MonteCarlo(n=3000), 3000),
+        (samplers.SubsetSimulation(n=500), 500),
+        (samplers.AdaptiveSubsetSimulation(n=500), 500),
+        (samplers.CrossEntropy(n_iteration=500, n_final=2000), 500 + 200),
+        (samplers.ImprovedCrossEntropy(n_round=500, n_final=2000), 500 + 200),
+    ],
+    ids=lambda value: getattr(value, "name", ""),
+)
+def test_counts_base_draws_of_search_and_estimate(method, expected):
+    assert samplers.estimate(half_space().problem, method, seed=1).base_draws == expected
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["two-stage", "ce"])
+def test_a_region_as_large_as_said_is_rarely_missed(method):
+    """A sliver that nothing leads to, beside a half-space: it is seen unless all base draws miss it."""
+    missed = 0
+    for seed in range(100):
+        seen = []
+
+        def f(x, seen=seen):
+            sliver = np.abs(x[:, 0] + 0.5) < 0.006  # p = 0.0042
+            seen.append(sliver.any())
+            return np.where(sliver, -1.0, 3.5 - x[:, 0])
+
+        unseen = samplers.estimate(samplers.FunctionProblem(f, 2), method, seed=seed, max_sim=6000).unseen
+        assert unseen < 0.006
+        missed += not any(seen)
+    assert missed <= 10
 
 
 def test_failures_read_as_arrays_and_one_by_one():
