@@ -1,7 +1,7 @@
 """From regions of failure to a proposal: rounds of draws, each from a better mixture than the one before."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
 from samplers.bumps import HIGH_DIM, Points, clipped, fitted, refitted
-from samplers.components import Bump, Component, Shell, Slice, Wide, log_ratios, mixed
+from samplers.components import Bump, Component, Shell, Slice, Wide, draw, draw_counts, log_ratios, mixed
 from samplers.exploration import MOST_REGIONS, Batch, Found, Region
+from samplers.gate import Gate, kept, learned_gate
 from samplers.importance import Draws
 from samplers.planes import beyond
 from samplers.problem import FloatArray, Inputs
@@ -44,6 +45,7 @@ START = {
 }
 SHARP_KINDS = ("bump", "plane", "first", "slice", "shell")
 NO_REGION = -1
+GATE_DRAWS = 15_000
 
 
 class Candidate(NamedTuple):
@@ -61,6 +63,11 @@ class Proposal:
     candidates: list[Candidate]
     weights: FloatArray
     """Adding up to 1, shape (k,)."""
+    gate: Gate | None = None
+    mass: FloatArray = field(default_factory=lambda: np.ones(0))
+    """Share of each component's draws that the gate lets through, shape (k,)."""
+    mass_cov: float = 0.0
+    """What the error of `mass` adds to the c.o.v. of p."""
 
     @property
     def components(self) -> list[Component]:
@@ -69,8 +76,39 @@ class Proposal:
 
     def log_weights(self, u: FloatArray) -> FloatArray:
         """log(phi / q) at u (n, d), shape (n,)."""
-        used = [c for c, a in zip(self.components, self.weights, strict=True) if a > 0]
-        return -mixed(log_ratios(used, u), self.weights[self.weights > 0])
+        used = self.weights > 0
+        log_r = log_ratios([c for c, a in zip(self.components, used, strict=True) if a], u)
+        if self.gate is not None:
+            log_r = log_r + np.where(self.gated[used, None], np.log(self.gate(u)) - np.log(self.mass)[used, None], 0.0)
+        return -mixed(log_r, self.weights[used])
+
+    @property
+    def gated(self) -> NDArray[np.bool_]:
+        """Which components the gate thins: not those that guard against what the classifier does not know."""
+        return np.array([candidate.kind not in ("base", "wide") for candidate in self.candidates])
+
+    def drawn(self, n: int, rng: np.random.Generator) -> tuple[FloatArray, NDArray[np.int64]]:
+        """Draw n points (n, d), one component after the other; return them and how many are from which."""
+        counts = draw_counts(self.weights, n, rng)
+        if self.gate is None:
+            return draw(self.components, counts, rng), counts
+        return np.concatenate(
+            [
+                kept(component, int(k), self.gate, rng) if gated else component.sample(int(k), rng)
+                for component, k, gated in zip(self.components, counts, self.gated, strict=True)
+                if k > 0
+            ]
+        ), counts
+
+    def behind(self, gate: Gate, rng: np.random.Generator) -> "Proposal":
+        """Return the same with a gate; what it lets through of each component is found by drawing, not simulating."""
+        mass, error = np.ones(len(self.weights)), 0.0
+        for k, component in enumerate(self.components):
+            if self.gated[k] and self.weights[k] > 0:
+                let_through = gate(component.sample(max(int(self.weights[k] * GATE_DRAWS), 500), rng))
+                mass[k] = let_through.mean()
+                error += (self.weights[k] / mass[k]) ** 2 * float(let_through.var()) / len(let_through)
+        return replace(self, gate=gate, mass=mass, mass_cov=math.sqrt(error))
 
 
 class History:
@@ -148,6 +186,7 @@ class Refinement:
             for part in beyond(region.points, region.u, region.f)
         ]
         self._near: list[tuple[FloatArray, FloatArray]] = []
+        self._near_log_weights = np.empty(0)
 
     def proposal(self, *, last: bool = False) -> Proposal:
         """Return the mixture for the next draws; `last`: for the estimate."""
@@ -169,7 +208,16 @@ class Refinement:
             weights = np.where(explored, np.maximum(weights, KEPT), weights)
             kept = kept | explored
         weights = np.where((weights < SMALLEST) & ~kept, 0.0, weights)
-        return Proposal(candidates, with_floors(weights / weights.sum(), floors))
+        proposal = Proposal(candidates, with_floors(weights / weights.sum(), floors))
+        gate = self._gate() if last and not self._noisy and self._dim <= HIGH_DIM else None
+        return proposal if gate is None else proposal.behind(gate, self._rng)
+
+    def _gate(self) -> Gate | None:
+        """Return a gate that has learned from the chains and the draws of all rounds."""
+        u = np.concatenate([region.u for region in self._regions] + [u for u, _ in self._near[:-1]])
+        f = np.concatenate([region.f for region in self._regions] + [f for _, f in self._near[:-1]])
+        u_new, f_new = self._near[-1]
+        return learned_gate((u, f <= self._gamma), (u_new, f_new <= self._gamma), self._near_log_weights)
 
     def learn(self, proposal: Proposal, batch: Batch, *, afresh: bool) -> None:
         """Take in the outcomes of draws; `afresh`: also fit new bumps to all failures."""
@@ -179,6 +227,7 @@ class Refinement:
         self._sharp_hits = float((batch.f[sharp] <= self._gamma).mean()) if sharp.any() else 0.0
         near = ~np.isin(kinds, ["wide", "shell", "base"])
         self._near.append((batch.u[near], batch.f[near]))
+        self._near_log_weights = proposal.log_weights(batch.u[near])
         if len(self._history.u) > 5:
             self._bumps = refitted(self._bumps, self._history.u, self._history.log_weights)
             self._fresh = self._fresh_bumps() if afresh and self._dim <= HIGH_DIM else []

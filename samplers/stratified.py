@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from samplers.components import log_ratios, mixed
 from samplers.exploration import Batch
 from samplers.importance import Draws
 from samplers.method import Sample
@@ -27,6 +26,8 @@ class Strata:
     """Of weight times indicator of failure, shape (k,)."""
     squares: FloatArray
     """Sums of their squares, shape (k,)."""
+    mass_cov: float
+    """What else is not exact: see `Proposal.mass_cov`."""
     u_safe: FloatArray
     """The draws that did not fail, in the order of `draws.f_safe`, shape (m, d)."""
 
@@ -34,7 +35,7 @@ class Strata:
     def none(cls, k: int, dim: int) -> "Strata":
         """No draws yet from a proposal of k components in d dimensions."""
         zero = np.zeros(k)
-        return cls(Draws(0, np.empty(0), np.empty(0)), zero, zero, zero, np.empty((0, dim)))
+        return cls(Draws(0, np.empty(0), np.empty(0)), zero, zero, zero, 0.0, np.empty((0, dim)))
 
     def joined(self, batch: Batch, proposal: Proposal, inputs: Inputs, gamma: float) -> "Strata":
         """Return these draws and another batch from the same proposal."""
@@ -48,6 +49,7 @@ class Strata:
             self.counts + batch.counts,
             self.sums + np.bincount(owner, weights=y, minlength=k),
             self.squares + np.bincount(owner, weights=y * y, minlength=k),
+            proposal.mass_cov,
             np.concatenate([self.u_safe, batch.u[~fails]]),
         )
 
@@ -69,7 +71,7 @@ class Strata:
         n, s1, s2 = self.counts[many], self.sums[many], self.squares[many]
         within = float(((s2 - s1 * s1 / n) * n / (n - 1)).sum()) + float(self.squares[~many].sum())
         largest = math.exp(float(self.draws.log_weights.max()))
-        return math.sqrt(max(within, 0.0) + largest * largest) / (self.draws.n * self.p)
+        return math.hypot(math.sqrt(max(within, 0.0) + largest * largest) / (self.draws.n * self.p), self.mass_cov)
 
     def sample(self, proposal: Proposal, base_f: FloatArray, base_u: FloatArray, gamma: float) -> Sample:
         """Return the weighted points behind p: failing draws as they are, the others with the first base draws.
@@ -80,9 +82,7 @@ class Strata:
         n, n_base = self.draws.n, len(base_f)
         more = base_f > gamma
         u = np.concatenate([self.u_safe, base_u[more]])
-        used = proposal.weights > 0
-        components = [c for c, a in zip(proposal.components, used, strict=True) if a]
-        log_density = np.logaddexp(math.log(n) + mixed(log_ratios(components, u), proposal.weights[used]), _log(n_base))
+        log_density = np.logaddexp(math.log(n) - proposal.log_weights(u), _log(n_base))
         k = len(self.draws.f)
         units = np.concatenate([np.arange(n), n + np.flatnonzero(more)])
         return Sample(

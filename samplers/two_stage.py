@@ -7,7 +7,6 @@ from typing import ClassVar
 
 import numpy as np
 
-from samplers.components import draw, draw_counts
 from samplers.exploration import Batch, Simulator, Sizes, first_draws, regions_of
 from samplers.importance import Draws, doubts, interval_of
 from samplers.intervals import binomial_cov
@@ -210,8 +209,7 @@ class _Run:
         )
 
     def _drawn(self, proposal: Proposal, n: int) -> Generator[FloatArray, FloatArray, Batch]:
-        counts = draw_counts(proposal.weights, n, self._rng)
-        u = draw(proposal.components, counts, self._rng)
+        u, counts = proposal.drawn(n, self._rng)
         f = yield from self._simulator.f(u)
         self._n_base += int(counts[0])  # of a proposal the first component is the base law
         return Batch(proposal.components, counts, u, f)
