@@ -58,8 +58,8 @@ def demo(steps: int, out: Path) -> None:
     print(f"1. Training a PPO ego in {ENV_ID} for {steps:,} steps.", flush=True)
     ego = train_ego(ENV_ID, algo="ppo", steps=steps, seed=0, out=out / "ego.zip")
 
-    print("2. Estimating how often it collides, by adaptive subset simulation.", flush=True)
-    study = prepare(Question(env_id=ENV_ID, ego=str(ego), method="adss", seed=0))
+    print("2. Estimating how often it collides: explore, then estimate from a fresh sample.", flush=True)
+    study = prepare(Question(env_id=ENV_ID, ego=str(ego), seed=0))
     report = run(study, progress=True)
     write_run(out, report)
 

@@ -22,6 +22,7 @@ from samplers.method import (
     check_choice,
     check_count,
     check_setting,
+    is_number,
     no_outcome_share,
 )
 from samplers.problem import FloatArray, Inputs
@@ -146,7 +147,7 @@ class CrossEntropy(Method):
             check_setting(who, "alpha", step, 0.0, 1.0, or_equal_high=True)
         check_setting(who, "rho", self.rho, 0.0, 0.5)
         check_setting(who, "base_share", self.base_share, 0.0, 1.0)
-        if self.wide_share != 0:
+        if not (is_number(self.wide_share) and self.wide_share == 0):
             check_setting(who, "wide_share", self.wide_share, 0.0, 1.0 - self.base_share)
         check_setting(who, "wide_factor", self.wide_factor, 1.0, math.inf)
 

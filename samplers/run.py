@@ -13,12 +13,12 @@ from samplers.plan import check_number, check_problem, checked
 from samplers.problem import Problem
 from samplers.progress import Listener, Progress, listening
 from samplers.result import Estimate
-from samplers.subset import AdaptiveSubsetSimulation
+from samplers.two_stage import TwoStage
 
 
 def estimate(
     problem: Problem,
-    method: Stepping | str = AdaptiveSubsetSimulation(),  # noqa: B008  (frozen, so safe to share)
+    method: Stepping | str = TwoStage(),  # noqa: B008  (frozen, so safe to share)
     gamma: float = 0.0,
     seed: int | None = None,
     max_sim: int | None = None,

@@ -85,7 +85,7 @@ def estimate_command(
     env: Env,
     ego: Annotated[str, typer.Option(help="idm, a Stable-Baselines3 .zip or module:function.")] = "idm",
     algo: Annotated[str | None, typer.Option(help="Algorithm of the .zip, if the file does not tell.")] = None,
-    method: Annotated[str, typer.Option(help="Estimation method; see rare-envs list.")] = "adss",
+    method: Annotated[str, typer.Option(help="Estimation method; see rare-envs list.")] = "two-stage",
     base: Annotated[str | None, typer.Option(help="Base distribution: a name or a JSON file.")] = None,
     measure: Annotated[str, typer.Option(help="Safety measure f; small is dangerous.")] = "ttc",
     gamma: Annotated[float, typer.Option(help="Threshold: P[f <= gamma]; 0 counts collisions.")] = 0.0,

@@ -41,7 +41,7 @@ class Question:
     env_id: str
     ego: str = "idm"
     algo: str | None = None
-    method: str = "adss"
+    method: str = "two-stage"
     base: str | None = None
     measure: str = "ttc"
     gamma: float = 0.0

@@ -48,7 +48,7 @@ PROBLEM = half_space().problem
         ({"seed": -1}, "seed to be a whole number of at least 0, got -1"),
         ({"seed": 1.5}, "seed"),
         ({"on_error": "ignore"}, "on_error 'ignore'.*Valid: raise, failure, bound"),
-        ({"method": "adds"}, "method 'adds'. Did you mean 'adss'.*Valid: mc, ce, .*adss"),
+        ({"method": "adds"}, "method 'adds'. Did you mean 'adss'.*Valid: two-stage, mc, .*adss"),
         ({"method": samplers.MonteCarlo}, "the class MonteCarlo; add brackets"),
         ({"method": 3}, "a method such as MonteCarlo"),
         ({"progress": 1}, "progress to be True, False or a function"),
@@ -132,12 +132,12 @@ def test_numbers_of_numpy_are_numbers():
 
 
 def test_default_method_and_name_as_string():
-    assert samplers.estimate(PROBLEM, seed=1) == samplers.estimate(PROBLEM, "adss", seed=1)
+    assert samplers.estimate(PROBLEM, seed=1) == samplers.estimate(PROBLEM, "two-stage", seed=1)
 
 
 def test_f_of_the_wrong_length():
     with pytest.raises(ValueError, match=r"Expected f to return shape \(1000,\)"):
-        samplers.estimate(samplers.FunctionProblem(lambda x: np.zeros(3), 2), seed=1)
+        samplers.estimate(samplers.FunctionProblem(lambda x: np.zeros(3), 2), "adss", seed=1)
 
 
 def test_a_drawn_seed_repeats_the_run():
