@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from samplers.components import Component
 from samplers.problem import FloatArray
@@ -33,7 +34,7 @@ class Gate:
     def __call__(self, u: FloatArray) -> FloatArray:
         """Return the probabilities at u (n, d), shape (n,)."""
         odds = self.intercept + self.slope * self.classifier.decision_function(u)
-        return np.maximum(np.exp(-0.5 * np.logaddexp(0.0, -odds)), self.lowest)
+        return np.asarray(np.maximum(np.exp(-0.5 * np.logaddexp(0.0, -odds)), self.lowest))
 
 
 def kept(component: Component, n: int, gate: Gate, rng: np.random.Generator) -> FloatArray:
@@ -47,7 +48,7 @@ def kept(component: Component, n: int, gate: Gate, rng: np.random.Generator) -> 
 
 
 def learned_gate(
-    known: tuple[FloatArray, FloatArray], fresh: tuple[FloatArray, FloatArray], log_weights: FloatArray
+    known: tuple[FloatArray, NDArray[np.bool_]], fresh: tuple[FloatArray, NDArray[np.bool_]], log_weights: FloatArray
 ) -> Gate | None:
     """Return the gate for the next draws, or None if none is worth it.
 

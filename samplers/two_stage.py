@@ -7,6 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from samplers.cross_checks import against_base_draws, against_rounds, regions_lost
 from samplers.exploration import Batch, Simulator, Sizes, first_draws, regions_of
 from samplers.importance import Draws, doubts, interval_of
 from samplers.intervals import binomial_cov
@@ -163,9 +164,15 @@ class _Run:
         if strata.draws.n == 0:
             return self.interrupted()
         outcome = self._outcome(strata.draws, strata.cov, 1 / BASE_FLOOR)
+        base_hits = int((self._base_f <= goal.gamma).sum())
+        checks = (
+            *against_base_draws(strata.p, base_hits, len(self._base_f)),
+            *against_rounds(strata, self._history.log_weights),
+            *regions_lost(strata, proposal),
+        )
         sample = strata.sample(proposal, self._base_f, self._base_u, goal.gamma)
         status = Status.STOPPED if stopped else outcome.status
-        return replace(outcome, sample=sample, status=status)
+        return replace(outcome, warnings=(*outcome.warnings, *checks), sample=sample, status=status)
 
     def interrupted(self) -> Outcome:
         """Return what all draws from known components say."""
