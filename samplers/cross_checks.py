@@ -6,7 +6,7 @@ import numpy as np
 from scipy import stats
 
 from samplers.problem import FloatArray
-from samplers.refinement import NO_REGION, Proposal
+from samplers.proposal import NO_REGION, Proposal
 from samplers.stratified import Strata
 from samplers.weights import effective_sample_size
 

@@ -1,20 +1,17 @@
 """From regions of failure to a proposal: rounds of draws, each from a better mixture than the one before."""
 
-import math
-from dataclasses import dataclass, field, replace
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
 from samplers.bumps import HIGH_DIM, Points, clipped, fitted, refitted
-from samplers.components import Bump, Component, Shell, Slice, Wide, draw, draw_counts, log_ratios, mixed
+from samplers.components import Bump, Shell, Slice, Wide, log_ratios
 from samplers.exploration import MOST_REGIONS, Batch, Found, Region
-from samplers.gate import Gate, kept, learned_gate
-from samplers.importance import Draws
+from samplers.gate import Gate, learned_gate
+from samplers.history import History
 from samplers.planes import beyond
-from samplers.problem import FloatArray, Inputs
+from samplers.problem import FloatArray
+from samplers.proposal import NO_REGION, Candidate, Proposal
 from samplers.second_moment import Floor, least_variance, with_floors
 
 BASE_FLOOR = 0.05
@@ -44,116 +41,6 @@ START = {
     "slice": 0.1,
 }
 SHARP_KINDS = ("bump", "plane", "first", "slice", "shell")
-NO_REGION = -1
-GATE_DRAWS = 15_000
-
-
-class Candidate(NamedTuple):
-    """A component that may become part of the proposal."""
-
-    component: Component
-    kind: str
-    region: int = NO_REGION
-
-
-@dataclass(frozen=True)
-class Proposal:
-    """A mixture to draw from."""
-
-    candidates: list[Candidate]
-    weights: FloatArray
-    """Adding up to 1, shape (k,)."""
-    gate: Gate | None = None
-    mass: FloatArray = field(default_factory=lambda: np.ones(0))
-    """Share of each component's draws that the gate lets through, shape (k,)."""
-    mass_cov: float = 0.0
-    """What the error of `mass` adds to the c.o.v. of p."""
-
-    @property
-    def components(self) -> list[Component]:
-        """Its components."""
-        return [candidate.component for candidate in self.candidates]
-
-    def log_weights(self, u: FloatArray) -> FloatArray:
-        """log(phi / q) at u (n, d), shape (n,)."""
-        used = self.weights > 0
-        log_r = log_ratios([c for c, a in zip(self.components, used, strict=True) if a], u)
-        if self.gate is not None:
-            log_r = log_r + np.where(self.gated[used, None], np.log(self.gate(u)) - np.log(self.mass)[used, None], 0.0)
-        return -mixed(log_r, self.weights[used])
-
-    @property
-    def gated(self) -> NDArray[np.bool_]:
-        """Which components the gate thins: not those that guard against what the classifier does not know."""
-        return np.array([candidate.kind not in ("base", "wide") for candidate in self.candidates])
-
-    def drawn(self, n: int, rng: np.random.Generator) -> tuple[FloatArray, NDArray[np.int64]]:
-        """Draw n points (n, d), one component after the other; return them and how many are from which."""
-        counts = draw_counts(self.weights, n, rng)
-        if self.gate is None:
-            return draw(self.components, counts, rng), counts
-        return np.concatenate(
-            [
-                kept(component, int(k), self.gate, rng) if gated else component.sample(int(k), rng)
-                for component, k, gated in zip(self.components, counts, self.gated, strict=True)
-                if k > 0
-            ]
-        ), counts
-
-    def behind(self, gate: Gate, rng: np.random.Generator) -> "Proposal":
-        """Return the same with a gate; what it lets through of each component is found by drawing, not simulating."""
-        mass, error = np.ones(len(self.weights)), 0.0
-        for k, component in enumerate(self.components):
-            if self.gated[k] and self.weights[k] > 0:
-                let_through = gate(component.sample(max(int(self.weights[k] * GATE_DRAWS), 500), rng))
-                mass[k] = let_through.mean()
-                error += (self.weights[k] / mass[k]) ** 2 * float(let_through.var()) / len(let_through)
-        return replace(self, gate=gate, mass=mass, mass_cov=math.sqrt(error))
-
-
-class History:
-    """All draws from known components, weighed as draws from the mixture of all of them (Owen and Zhou 2000)."""
-
-    def __init__(self, dim: int) -> None:
-        self.u = np.empty((0, dim))
-        """The failing ones, shape (k, d)."""
-        self.batches: list[Batch] = []
-        self._log_density = np.empty(0)
-        self._components: list[Component] = []
-        self._counts = np.empty(0)
-
-    @property
-    def n(self) -> int:
-        """Number of draws."""
-        return sum(len(batch.f) for batch in self.batches)
-
-    @property
-    def log_weights(self) -> FloatArray:
-        """log(phi / q) - log(n) at the failing draws, shape (k,): their sum is an estimate of p."""
-        return -self._log_density
-
-    def add(self, batch: Batch, gamma: float) -> None:
-        """Take in a batch of draws."""
-        used = [c for c, n in zip(batch.components, batch.counts, strict=True) if n > 0]
-        counts = batch.counts[batch.counts > 0].astype(np.float64)
-        self._log_density = np.logaddexp(self._log_density, mixed(log_ratios(used, self.u), counts))
-        self._components += used
-        self._counts = np.concatenate([self._counts, counts])
-        self.batches.append(batch)
-        found = batch.u[batch.f <= gamma]
-        self._log_density = np.append(self._log_density, mixed(log_ratios(self._components, found), self._counts))
-        self.u = np.concatenate([self.u, found])
-
-    def everything(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return all draws, failing or not: u (n, d), f (n,) and log(phi / q) - log(n), shape (n,)."""
-        u = np.concatenate([batch.u for batch in self.batches])
-        f = np.concatenate([batch.f for batch in self.batches])
-        return u, f, -mixed(log_ratios(self._components, u), self._counts)
-
-    def draws(self, inputs: Inputs, gamma: float) -> Draws:
-        """Return all draws as those from one proposal."""
-        u, f, log_weights = self.everything()
-        return Draws.weighted(f, log_weights + math.log(self.n), inputs.base.from_standard_normal(u), gamma)
 
 
 class Refinement:

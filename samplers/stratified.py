@@ -9,7 +9,7 @@ from samplers.exploration import Batch
 from samplers.importance import Draws
 from samplers.method import Sample
 from samplers.problem import FloatArray, Inputs
-from samplers.refinement import Proposal
+from samplers.proposal import Proposal
 
 FEWEST = 10
 """Components with fewer draws than this are one stratum."""

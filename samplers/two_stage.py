@@ -9,12 +9,14 @@ import numpy as np
 
 from samplers.cross_checks import against_base_draws, against_rounds, regions_lost
 from samplers.exploration import Batch, Simulator, Sizes, first_draws, regions_of
+from samplers.history import History
 from samplers.importance import Draws, doubts, interval_of
 from samplers.intervals import binomial_cov
 from samplers.method import Goal, Interrupted, Method, Outcome, Steps, check_count, no_outcome_share
 from samplers.monte_carlo import equal_draws, share_of_failures
 from samplers.problem import FloatArray, Inputs
-from samplers.refinement import BASE_FLOOR, History, Proposal, Refinement
+from samplers.proposal import Proposal
+from samplers.refinement import BASE_FLOOR, Refinement
 from samplers.result import Level, Status
 from samplers.stratified import Strata
 from samplers.weights import effective_sample_size
@@ -42,17 +44,23 @@ class TwoStage(Method):
     2. *Refinement* (`refinement.py`): each region is described by Gaussian bumps, by a plane from linear regression
        of f where it is linear, by slices of N(0, I) beyond a plane and by a shell. Three rounds of draws follow, each
        from a mixture of these whose weights minimise the estimated variance (`second_moment.py`), with lower limits
-       for the base law, for tempered bumps (which bound weights where f is noisy or a bump is a bad description) and
-       for each region.
-    3. *Estimate*: fresh draws from the last mixture, stratified by component, and nothing else: given the first two
-       stages p-hat is unbiased. (Reusing the draws of earlier rounds, as adaptive multiple importance sampling does,
-       biases p by 1 to 6 % here and makes its intervals too short.)
+       for the base law, for tempered bumps (which bound weights where a bump is a bad description) and for each
+       region. In up to 40 dimensions a classifier then thins the last mixture where it sees no failure (`gate.py`).
+    3. *Estimate* (`stratified.py`): fresh draws from the last mixture, stratified by component, and nothing else:
+       given the first two stages p-hat is unbiased. (Reusing the draws of earlier rounds, as adaptive multiple
+       importance sampling does, biases p by some per cent and makes its intervals too short.)
 
     Everything happens in standard normal space, so that wide draws stay within the support of the parameters.
-    f is asked for in about 45 batches. The interval is log-normal; it widens by t quantiles where few draws carry
-    the weight and by Bernstein's bound where very few do. Warnings tell of uneven weights, of rounds that disagree
-    and of regions that the last mixture does not cover. What nothing tells of is a region that neither f announces
-    nor any draw has hit; `Estimate.unseen` bounds its probability.
+    f is asked for in 35 to 60 batches. Regression of f and subset simulation apart, f is used by its sign only.
+
+    *Noise.* f may have noise of its own that is no part of x: p is then the marginal probability. No stored outcome
+    is simulated again. That f is noisy is noticed by 30 points right beside failing ones; regions are then not told
+    apart, and half of the draws come from tempered bumps, which are best where failure is a matter of chance.
+
+    *Interval.* Log-normal; it widens by t quantiles where few draws carry the weight and by Bernstein's bound where
+    very few do. *Warnings* (`cross_checks.py`) tell of uneven weights, of base draws that fail more often than p
+    allows, of rounds that disagree, and of regions that the last draws do not meet again. What nothing tells of is a
+    region that neither f announces nor any draw has hit; `Estimate.unseen` bounds its probability.
 
     Where a tenth of the base draws fails, or nothing is found at all, the rest is plain Monte Carlo.
 
