@@ -13,6 +13,10 @@ from samplers.method import Outcome, Sample
 from samplers.monte_carlo import share_of_failures
 from samplers.result import Level, Status
 
+OWN_ERROR_SHORT = 1.5
+"""Runs are taken to understate their own errors by this factor before they are said to disagree."""
+FALSE_ALARM = 1e-4
+"""Probability with which runs whose errors are right would be said to."""
 BY_CONCERN = (Status.STOPPED, Status.STALLED, Status.BUDGET, Status.CONVERGED)
 """The status of the whole is the first of these that a run has."""
 
@@ -53,12 +57,24 @@ def combined(outcomes: Sequence[Outcome], confidence: float) -> Outcome:
         interval=_interval(used, p, confidence),
         cov=combined_cov(used),
         status=_status(used) if mean > 0 else Status.NO_HITS,
-        warnings=(*_counted(used), *about),
+        warnings=(*_counted(used), *about, *_disagreement(used)),
         trace=trace,
         no_outcome_share=(float(np.average([o.no_outcome_share for o in used], weights=p)) if mean else 0.0),
         sample=merged_sample(used, [1 / len(used)] * len(used)),
         base_draws=sum(outcome.base_draws for outcome in used),
     )
+
+
+def _disagreement(outcomes: Sequence[Outcome]) -> list[str]:
+    """Warn where runs lie further apart than their own errors allow: a region was found by some of them only."""
+    p = np.array([outcome.p for outcome in outcomes])
+    error = OWN_ERROR_SHORT * np.array([outcome.p * outcome.cov if outcome.p > 0 else 0.0 for outcome in outcomes])
+    if len(p) < 3 or not (error > 0).all():
+        return []
+    apart = float((((p - p.mean()) / error) ** 2).sum())
+    if stats.chi2.sf(apart, len(p) - 1) > FALSE_ALARM:
+        return []
+    return [f"The runs disagree ({p.min():.2e} to {p.max():.2e}): some of them may have missed a region of failure."]
 
 
 def ended(outcomes: Sequence[Outcome]) -> Sequence[Outcome]:

@@ -342,3 +342,11 @@ def test_stopped_while_further_runs_are_made_for_the_target():
     pooled = stopped_after(2, Fixed(True), replicates=2, target_cov=0.01)
     assert pooled.n_sim == 1200
     assert pooled.interval == clopper_pearson(pooled.failures.total, 1200, 0.95)
+
+
+def test_runs_that_disagree_are_told_of():
+    """One of five runs has found a region that holds a third of p."""
+    runs = [outcome(p, cov=0.02) for p in (1.00e-4, 1.01e-4, 1.00e-4, 1.02e-4, 1.5e-4)]
+    assert any("disagree" in text for text in combined(runs, 0.95).warnings)
+    alike = [outcome(p, cov=0.02) for p in (1.00e-4, 1.03e-4, 0.97e-4, 1.02e-4, 0.99e-4)]
+    assert not combined(alike, 0.95).warnings
