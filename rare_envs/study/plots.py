@@ -27,6 +27,8 @@ MOMENTS, LAST_SECONDS = 4, 3.0
 """Bird's-eye views of a failure, spread over the seconds [s] up to its worst moment."""
 BEHIND, AHEAD = 12.0, 48.0
 """What a bird's-eye view shows of the road around the ego [m]."""
+NORMAL_QUANTILE, WIDEST_COV = 1.96, 3.0
+"""Half-width of the band around estimates on the way, in standard errors; c.o.v. beyond which it is cut."""
 HEADROOM = 1.5
 """Upper ends of the curves' axes over their largest values: room for the legend."""
 LINE, HIT, GREY = "#3b6fb5", "#c0392b", "#b8b8b8"
@@ -72,13 +74,19 @@ def draw_convergence(axes: Axes, report: Report) -> None:
     """Draw the estimate against the simulations spent, level by level, and the interval at the end."""
     estimate = report.estimate
     runs = sorted({level.run for level in estimate.trace})
+    by_levels = any(level.gamma != estimate.gamma for level in estimate.trace)
+    seen = []
     for run in runs:
         levels = [level for level in estimate.trace if level.run == run]
         spent = np.cumsum([level.n_sim for level in levels])
         values = np.array([level.estimate if level.estimate > 0 else np.nan for level in levels])
+        seen += [value for value in values if value > 0]
         axes.plot(spent, values, "o-", color=LINE, alpha=max(0.25, 1 / len(runs)), markersize=4)
-        if len(runs) == 1:
+        if len(runs) == 1 and by_levels:
             _label_thresholds(axes, spent, values, [level.gamma for level in levels])
+        elif len(runs) == 1:
+            spread = np.exp(NORMAL_QUANTILE * np.minimum([level.cov for level in levels], WIDEST_COV))
+            axes.fill_between(spent, values / spread, values * spread, color=LINE, alpha=0.15, linewidth=0)
     low, high = estimate.interval
     axes.axhspan(max(low, 1e-300), high, color=HIT, alpha=0.12, linewidth=0)
     label = f"{100 * estimate.confidence:g} % interval"
@@ -86,12 +94,17 @@ def draw_convergence(axes: Axes, report: Report) -> None:
         axes.axhline(estimate.p, color=HIT, linewidth=1, label="result")
     axes.plot([], [], color=HIT, alpha=0.25, linewidth=8, label=label)
     axes.set_yscale("log")
-    smallest = min([v for v in (low, estimate.p, high / 30) if v > 0], default=1e-9)
-    axes.set_ylim(smallest / 3, 1.5)
+    if by_levels or not seen:
+        smallest = min([v for v in (low, estimate.p, high / 30) if v > 0], default=1e-9)
+        axes.set_ylim(smallest / 3, 1.5)
+    else:  # nothing but P[f <= gamma] is estimated on the way
+        least, most = min(*seen, max(low, high / 30)), max(*seen, high)
+        axes.set_ylim(least / 1.5, min(most * 1.5, 1.5))
     axes.set_xlim(left=0)
     axes.set_xlabel("simulations" if len(runs) == 1 else f"simulations, each of {len(runs)} runs")
-    axes.set_ylabel("P[f ≤ threshold of the level]")
-    axes.set_title("From ordinary traffic to the failures, level by level", fontsize=10)
+    way = "From ordinary traffic to the failures, level by level" if by_levels else "The estimate, batch by batch"
+    axes.set_ylabel("P[f ≤ threshold of the level]" if by_levels else f"P[f ≤ {estimate.gamma:g}]")
+    axes.set_title(way, fontsize=10)
     axes.legend(loc="upper right", frameon=False)
 
 
