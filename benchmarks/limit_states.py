@@ -1,11 +1,12 @@
 """Kinds of limit states with known P[f(U) <= 0], U ~ N(0, I), as a benchmark needs them.
 
-More than `samplers.reference`, which it builds on: several regions in many dimensions, noise, jumps, ties, intersections,
-islands. All are written along the axes; N(0, I) is the same in every direction, so any rotation of them has the same p.
-`benchmarks.catalogue` has the parameters; the probabilities are closed forms or one-dimensional integrals.
+More than `samplers.reference`, which it builds on: several regions in many dimensions, noise, jumps, ties, islands,
+intersections. All are written along the axes; N(0, I) is the same in every direction, so any rotation of them has the
+same p. `benchmarks.catalogue` has the parameters; the probabilities are closed forms or one-dimensional integrals.
 """
 
 import functools
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -160,7 +161,7 @@ def ring_part(dim: int = 10, p_radius: float = 2e-2, beta: float = 1.8) -> Limit
     radius = math.sqrt(squared)
 
     def f(u: FloatArray) -> FloatArray:
-        return np.maximum(radius - np.linalg.norm(u, axis=1), beta - u[:, 0])
+        return np.asarray(np.maximum(radius - np.linalg.norm(u, axis=1), beta - u[:, 0]))
 
     p = _normal_mean(lambda s: float(chi2.sf(max(squared - s * s, 0.0), dim - 1)), radius, low=beta)
     return LimitState(f, dim, p)
@@ -205,7 +206,7 @@ def _any(betas: Sequence[float]) -> float:
 
 def _integral(g: Callable[[float], float], low: float, high: float, *breaks: float) -> float:
     edges = [low, *(b for b in breaks if low < b < high), high]
-    pieces = zip(edges[:-1], edges[1:], strict=True)
+    pieces = itertools.pairwise(edges)
     return float(sum(quad(g, a, b, limit=500, epsabs=1e-18, epsrel=1e-12)[0] for a, b in pieces))
 
 

@@ -142,7 +142,7 @@ def power_of(runs: Iterable[Run]) -> Power:
 
 def without_numbers(text: str) -> str:
     """Replace the numbers in a text by #."""
-    return re.sub(r"[-+]?\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?", "#", text)
+    return re.sub(r"[-+]?\d(?:[\d,]*\d)?(?:\.\d+)?(?:e[-+]?\d+)?", "#", text)
 
 
 @dataclass(frozen=True)
