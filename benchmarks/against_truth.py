@@ -14,11 +14,11 @@ from typing import Annotated, Any
 import numpy as np
 import torch
 import typer
-from rich.progress import track
 
 import rare_envs
 import samplers
 from benchmarks.truth import RESULT as TRUTH
+from samplers.ask_tell import start
 
 RESULT = Path(__file__).with_name("against_truth.json")
 MONTE_CARLO_BUDGET = 100_000
@@ -62,10 +62,8 @@ def compare(row: dict[str, Any], method: str, seeds: range) -> Cell:
     """
     problem = rare_envs.DrivingProblem(row["env_id"], base=row["base"])
     max_sim = MONTE_CARLO_BUDGET if method == "mc" else None
-    runs = [
-        samplers.estimate(problem, samplers.get_method(method), seed=seed, max_sim=max_sim)
-        for seed in track(seeds, description=f"{row['env_id']} {row['base']} {method}")
-    ]
+    started = [start(method, problem, seed=seed, max_sim=max_sim) for seed in seeds]
+    runs = side_by_side(problem, started)
     p, truth = np.array([run.p for run in runs]), row["p"]
     error = np.hypot(p.std(ddof=1) / len(p) ** 0.5, row["standard_error"])
     n_sim = float(np.mean([run.n_sim for run in runs]))
@@ -86,6 +84,27 @@ def compare(row: dict[str, Any], method: str, seeds: range) -> Cell:
     )
 
 
+def side_by_side(problem: samplers.Problem, runs: list[samplers.Run]) -> list[samplers.Estimate]:
+    """Finish runs together, so that the simulation sees all their points in one batch.
+
+    Each gives what `samplers.estimate` with its seed gives, ten times as soon.
+
+    Args:
+        problem: What they were started on.
+        runs: None of them done.
+
+    Returns:
+        Their estimates.
+    """
+    while live := [run for run in runs if not run.done]:
+        asked = [run.ask() for run in live]
+        f = problem.evaluate(np.concatenate(asked))
+        ends = np.cumsum([len(x) for x in asked])
+        for run, part in zip(live, np.split(f, ends[:-1]), strict=True):
+            run.tell(part)
+    return [run.result() for run in runs]
+
+
 def main(
     seeds: int = 40,
     first_seed: int = 0,
@@ -100,7 +119,7 @@ def main(
             cells.append(compare(row, method, range(first_seed, first_seed + seeds)))
             cell = cells[-1]
             print(
-                f"{cell.env_id:25s} {cell.base:8s} {cell.method:5s} mean/p {cell.mean / cell.truth:.3f} "
+                f"{cell.env_id:25s} {cell.base:8s} {cell.method:9s} mean/p {cell.mean / cell.truth:.3f} "
                 f"z {cell.z:+.2f} "
                 f"coverage {cell.coverage:.2f} cov {cell.cov:.3f} own {cell.own_cov:.3f} n_sim {cell.n_sim:.0f} "
                 f"gain {cell.gain:.1f} warned {cell.warned:.2f}",
