@@ -8,7 +8,7 @@ from scipy.integrate import simpson
 from samplers.components import Bump, Slice, Wide, draw, draw_counts
 from samplers.exploration import Batch
 from samplers.problem import FunctionProblem
-from samplers.refinement import Candidate, Proposal
+from samplers.proposal import GATE_DRAWS, Candidate, Proposal
 from samplers.stratified import FEWEST, Strata
 
 BETA = 2.0
@@ -150,3 +150,39 @@ def test_sample_without_base_draws(rng):
     sample = found.sample(PROPOSAL, np.empty(0), np.empty((0, 1)), 0.0)
     assert sample.n_units == len(sample.f) == 4000
     assert sample.weights.sum() == pytest.approx(1.0, abs=4 * np.sqrt((sample.weights**2).sum()))
+
+
+def gate(u):
+    """Lets most draws short of the threshold go, as a classifier would that is not quite right."""
+    return np.where(u[:, 0] > 2.1, 1.0, 0.3)
+
+
+def passed(law):
+    return law.sf(2.1) + 0.3 * law.cdf(2.1)
+
+
+def test_a_gate_thins_components_and_the_weights_account_for_it(rng):
+    """The shares that it lets through are estimated once, by drawing: their error is that of all runs together."""
+    proposal = PROPOSAL.behind(gate, rng)
+    for (_, law), mass, weight in zip(LAWS, proposal.mass, WEIGHTS, strict=True):
+        share, drawn = passed(law), max(GATE_DRAWS * weight, 500)
+        assert mass == pytest.approx(share, abs=4 * math.sqrt(0.25 / drawn))
+    found = []
+    for _ in range(300):
+        u, counts = proposal.drawn(100, rng)
+        found.append(strata(Batch(proposal.components, counts, u, PROBLEM.evaluate(u)), proposal=proposal))
+    p = np.array([one.p for one in found])
+    assert p.mean() == pytest.approx(P, abs=4 * math.hypot(p.std() / math.sqrt(300), proposal.mass_cov * P))
+    own = np.mean([variance_within(one) for one in found])
+    assert own == pytest.approx(p.var(), rel=4 * math.sqrt(2.5 / 300))
+    assert 0 < proposal.mass_cov < 0.02
+
+
+def test_base_and_wide_draws_pass_every_gate(rng):
+    candidates = [Candidate(Wide(1), "base"), Candidate(Wide(1, 1.5), "wide"), Candidate(LAWS[1][0], "bump")]
+    proposal = Proposal(candidates, np.array([0.2, 0.2, 0.6])).behind(gate, rng)
+    np.testing.assert_array_equal(proposal.mass[:2], 1.0)
+    u, counts = proposal.drawn(10_000, rng)
+    assert stats.kstest(u[: counts[0], 0], "norm").pvalue > 1e-4
+    weights = np.exp(proposal.log_weights(np.linspace(-10, 10, 500)[:, None]))
+    assert weights.max() <= 1 / 0.2
