@@ -7,7 +7,7 @@ from scipy import stats
 
 import rare_envs
 import samplers
-from benchmarks.against_truth import compare
+from benchmarks.against_truth import compare, side_by_side
 from benchmarks.truth import RESULT
 
 TRUTH = json.loads(RESULT.read_text())["results"]
@@ -36,6 +36,13 @@ def test_the_reference_is_what_the_simulation_gives_now(row: dict[str, float]) -
     hits = round(result.p * result.n_sim)
     test = stats.binomtest(hits, result.n_sim, row["p"])
     assert test.pvalue > 1e-4
+
+
+def test_runs_side_by_side_are_the_runs_alone() -> None:
+    problem, method = rare_envs.DrivingProblem(rare_envs.ENV_IDS[0]), samplers.CrossEntropy()
+    together = side_by_side(problem, [method.start(problem, seed=seed) for seed in range(3)])
+    assert together[1] == samplers.estimate(problem, method, seed=1)
+    assert len({result.p for result in together}) == 3
 
 
 @pytest.mark.parametrize("method", ["two-stage", "ce"])
