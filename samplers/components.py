@@ -149,4 +149,4 @@ def draw_counts(weights: FloatArray, n: int, rng: np.random.Generator) -> NDArra
 
 def draw(components: Sequence[Component], counts: NDArray[np.int64], rng: np.random.Generator) -> FloatArray:
     """Draw counts_k points from each component, one component after the other."""
-    return np.concatenate([c.sample(int(k), rng) for c, k in zip(components, counts, strict=True) if k > 0])
+    return np.concatenate([c.sample(int(k), rng) for c, k in zip(components, counts, strict=True)])

@@ -32,6 +32,8 @@ MOST_LEVELS = 30
 BISECTIONS = 3
 MOST_REGIONS = 8
 MOST_CLONES = 60
+COST_OF_CHAIN = 25
+"""Simulations that a chain needs at most before it is sorted: bisection, two walks, looks at its region."""
 PROBES = 30
 NUDGE = 1e-6
 NOISY = 0.9
@@ -53,6 +55,8 @@ class Sizes:
     """Chains from failures of subset simulation at most, and more of them where wide draws fail less often."""
     most: int
     """Simulations after which no further level is begun."""
+    limit: int
+    """Simulations of the whole exploration."""
 
     @classmethod
     def within(cls, budget: int) -> "Sizes":
@@ -65,6 +69,7 @@ class Sizes:
             starts=max(10, round(40 * scale)),
             level_starts=max(6, round(16 * scale)),
             most=int(0.45 * budget),
+            limit=int(0.65 * budget),
         )
 
 
@@ -166,17 +171,18 @@ def regions_of(
     descent = yield from _descend(simulator, first.u[:n_base], first.f[:n_base], gamma, sizes, rng)
     wide = np.flatnonzero(first.f[n_base:] <= gamma) + n_base
     scale = np.repeat(np.arange(len(first.counts)), first.counts)
-    chosen = wide[_some(scale[wide], sizes.starts, rng)]
+    most = max(2, (sizes.limit - simulator.n_sim) // COST_OF_CHAIN)
+    chosen = wide[_some(scale[wide], min(sizes.starts, most), rng)]
     far = yield from _drawn_in(simulator, first.u[chosen], gamma)
-    room = max(sizes.level_starts, sizes.starts + sizes.level_starts - len(far))
-    starts = np.concatenate([far, rng.permutation(descent.failing)[:room]])
+    others = max(sizes.level_starts, sizes.starts + sizes.level_starts - len(far))
+    starts = np.concatenate([far, rng.permutation(descent.failing)[: min(others, most - len(far))]])
     if len(starts) == 0:
         return Found([], noisy=False)
-    return (yield from _grown(simulator, starts, descent, gamma, rng))
+    return (yield from _grown(simulator, starts, descent, gamma, sizes.limit, rng))
 
 
 def _grown(
-    simulator: Simulator, starts: FloatArray, descent: Descent, gamma: float, rng: np.random.Generator
+    simulator: Simulator, starts: FloatArray, descent: Descent, gamma: float, limit: int, rng: np.random.Generator
 ) -> Generator[FloatArray, FloatArray, Found]:
     """Run chains from failing points, twice; sort them into regions after each time."""
     dim = starts.shape[1]
@@ -186,13 +192,15 @@ def _grown(
         last = yield from _walk(simulator, walk.states[:, -1], walk.sigma, None, steps[1], gamma, rng)
         region = Region(last.states[:, 1:], last.proposals.reshape(-1, dim), last.f.ravel())
         return Found([region], noisy=True)
-    labels = yield from _same_region(simulator, walk.states[:, -1], gamma, rng)
-    more = _clones(labels, min(max(8, math.ceil(2.5 * dim / steps[1])), 24), rng)
+    after = len(starts) * (steps[1] + 1)  # the second walk, and one look at where it ended
+    labels = yield from _same_region(simulator, walk.states[:, -1], gamma, limit - after, rng)
+    room = max(limit - simulator.n_sim - after, 0) // (steps[1] + 1)
+    more = _clones(labels, min(max(8, math.ceil(2.5 * dim / steps[1])), 24), room, rng)
     walk, labels = walk.of(more), labels[more]
     directions = np.array([_direction(walk.of(labels == k), _few(labels, descent)) for k in range(labels.max() + 1)])
     start, sigma = walk.states[:, -1], walk.sigma
     last = yield from _walk(simulator, start, sigma, directions[labels], steps[1], gamma, rng)
-    labels = yield from _same_region(simulator, last.states[:, -1], gamma, rng)
+    labels = yield from _same_region(simulator, last.states[:, -1], gamma, limit, rng)
     kept = 2 if dim <= HIGH_DIM else 4  # early proposals to wide failures are far from where failures are likely
     proposals = np.concatenate([walk.proposals[:, -kept:], last.proposals], axis=1)
     f = np.concatenate([walk.f[:, -kept:], last.f], axis=1)
@@ -296,9 +304,12 @@ def _is_noisy(
 
 
 def _same_region(
-    simulator: Simulator, u: FloatArray, gamma: float, rng: np.random.Generator
+    simulator: Simulator, u: FloatArray, gamma: float, limit: int, rng: np.random.Generator
 ) -> Generator[FloatArray, FloatArray, NDArray[np.int64]]:
-    """Sort failing points (n, d) into regions, numbered from 0: those half way to whose first point fails."""
+    """Sort failing points (n, d) into regions, numbered from 0: those half way to whose first point fails.
+
+    Points left over after MOST_REGIONS regions or at the limit of simulations go to the region with the nearest mean.
+    """
     labels = np.full(len(u), -1)
     for k in range(MOST_REGIONS):
         free = np.flatnonzero(labels < 0)
@@ -307,22 +318,24 @@ def _same_region(
         first = rng.choice(free)
         labels[first] = k
         others = free[free != first]
+        if simulator.n_sim + len(others) > limit:
+            break
         fails = (yield from simulator.f(0.5 * (u[others] + u[first]))) <= gamma
         labels[others[fails]] = k
     free = np.flatnonzero(labels < 0)
     if len(free):
-        means = np.array([u[labels == k].mean(axis=0) for k in range(MOST_REGIONS)])
+        means = np.array([u[labels == k].mean(axis=0) for k in range(labels.max() + 1)])
         labels[free] = np.argmax(u[free] @ means.T - 0.5 * (means**2).sum(axis=1), axis=1)
     return labels
 
 
-def _clones(labels: NDArray[np.int64], least: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Return the numbers of all chains, those of regions with few repeated until there are `least` of them."""
+def _clones(labels: NDArray[np.int64], least: int, room: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Return the numbers of all chains, those of regions with few repeated until there are `least` or no room is."""
     more = []
     for k in range(labels.max() + 1):
         own = np.flatnonzero(labels == k)
         more.append(rng.choice(own, max(least - len(own), 0)))
-    return np.concatenate([np.arange(len(labels)), np.concatenate(more)[:MOST_CLONES]])
+    return np.concatenate([np.arange(len(labels)), np.concatenate(more)[: min(room, MOST_CLONES)]])
 
 
 def _few(labels: NDArray[np.int64], descent: Descent) -> Descent | None:
@@ -347,5 +360,5 @@ def _with_descent(region: Region, descent: Descent) -> Region:
     """Add the lower points of subset simulation where those around the region are too few for a regression."""
     if len(region.u) >= 3 * region.u.shape[1] or len(descent.f) == 0:
         return region
-    low = descent.f <= np.quantile(descent.f, 0.7)
+    low = descent.f <= np.quantile(descent.f, 0.7, method="lower")  # f may be infinite
     return Region(region.chains, np.concatenate([region.u, descent.u[low]]), np.concatenate([region.f, descent.f[low]]))

@@ -39,7 +39,7 @@ class Gate:
 
 def kept(component: Component, n: int, gate: Gate, rng: np.random.Generator) -> FloatArray:
     """Draw n points (n, d) of a component that pass the gate, by rejection."""
-    parts, missing = [], n
+    parts, missing = [component.sample(0, rng)], n
     while missing > 0:
         u = component.sample(2 * missing + 20, rng)
         parts.append(u[rng.random(len(u)) < gate(u)][:missing])

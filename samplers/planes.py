@@ -34,7 +34,10 @@ def falling(u: FloatArray, f: FloatArray) -> tuple[FloatArray, float]:
         return np.zeros(dim), 0.0
     low, high = np.quantile(f[finite], [0.02, 0.98])
     usual = finite & (f >= low) & (f <= high)
-    slope, r2 = _robust_slope(u[usual], f[usual])
+    size = float(np.abs(f[usual]).max()) if usual.any() else 0.0
+    if size == 0.0:
+        return np.zeros(dim), 0.0
+    slope, r2 = _robust_slope(u[usual], f[usual] / size)
     norm = float(np.linalg.norm(slope))
     return (-slope / norm, r2) if norm > 0 else (slope, 0.0)
 

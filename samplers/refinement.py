@@ -96,7 +96,9 @@ class Refinement:
             kept = kept | explored
         weights = np.where((weights < SMALLEST) & ~kept, 0.0, weights)
         proposal = Proposal(candidates, with_floors(weights / weights.sum(), floors))
-        gate = self._gate() if last and not self._noisy and self._dim <= HIGH_DIM else None
+        # Where there are several regions a classifier of all of them was seen to cost coverage.
+        one = len(self._regions) in (1, MOST_REGIONS)
+        gate = self._gate() if last and one and not self._noisy and self._dim <= HIGH_DIM else None
         return proposal if gate is None else proposal.behind(gate, self._rng)
 
     def _gate(self) -> Gate | None:
@@ -190,11 +192,11 @@ class Refinement:
     def _floors(self, kinds: NDArray[np.str_], regions: NDArray[np.int64], for_regions: float) -> list[Floor]:
         tempered = TEMPERED_NOISY if self._noisy else TEMPERED_FLOOR + TEMPERED_MORE * (1 - self._sharp_hits)
         base = BASE_NOISY if self._noisy else BASE_FLOOR
-        floors = [Floor(kinds == "base", base), Floor(kinds == "tempered", tempered)]
+        floors = [Floor(kinds == "tempered", tempered)]
         n = len(self._regions)
         if 1 < n < MOST_REGIONS:  # as many as that are pieces of something like a shell
             floors += [Floor((regions == k) & (kinds != "tempered"), for_regions / n) for k in range(n)]
-        return floors
+        return [*floors, Floor(kinds == "base", base)]  # the last one is kept to the letter: it bounds the weights
 
     def _shells(self) -> list[Candidate]:
         if self._dim < 3:

@@ -147,6 +147,8 @@ class _Run:
         room = self._left
         for number, share in enumerate(ROUNDS, start=1):
             proposal = refinement.proposal()
+            if int(share * room) == 0:
+                continue
             batch = yield from self._drawn(proposal, int(share * room))
             refinement.learn(proposal, batch, afresh=number > len(ROUNDS) - AFRESH)
             log_w = self._history.log_weights
@@ -170,7 +172,8 @@ class _Run:
             if goal.target_cov is not None and strata.cov <= goal.target_cov:
                 break
         if strata.draws.n == 0:
-            return self.interrupted()
+            outcome = self.interrupted()
+            return outcome if stopped else replace(outcome, status=Status.BUDGET)
         outcome = self._outcome(strata.draws, strata.cov, 1 / BASE_FLOOR)
         base_hits = int((self._base_f <= goal.gamma).sum())
         checks = (
@@ -191,8 +194,9 @@ class _Run:
     def plain(self) -> Steps:
         """Spend the rest on base draws; those made so far count too."""
         goal, inputs, stopped = self._goal, self._simulator.inputs, False
+        size = PLAIN_BATCH if goal.target_cov is None else max(self._budget // 10, 100)
         while self._simulator.n_sim < self._end:
-            u = self._rng.standard_normal((min(self._end - self._simulator.n_sim, PLAIN_BATCH), inputs.dim))
+            u = self._rng.standard_normal((min(self._end - self._simulator.n_sim, size), inputs.dim))
             try:
                 f = yield from self._simulator.f(u)
             except Interrupted:
