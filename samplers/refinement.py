@@ -196,7 +196,7 @@ class Refinement:
         n = len(self._regions)
         if 1 < n < MOST_REGIONS:  # as many as that are pieces of something like a shell
             floors += [Floor((regions == k) & (kinds != "tempered"), for_regions / n) for k in range(n)]
-        return [*floors, Floor(kinds == "base", base)]  # the last one is kept to the letter: it bounds the weights
+        return [*floors, Floor(kinds == "base", base)]
 
     def _shells(self) -> list[Candidate]:
         if self._dim < 3:

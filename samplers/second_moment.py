@@ -49,11 +49,18 @@ def least_variance(
 
 
 def with_floors(a: FloatArray, floors: Sequence[Floor]) -> FloatArray:
-    """Return weights (k,) raised to the floors, one floor after the other; they still add up to 1."""
-    for floor in floors:
-        members, total = floor.members, float(a[floor.members].sum())
-        if total < floor.least:
-            inside = a[members] / total if total > 0 else np.full(members.sum(), 1 / members.sum())
-            a = a * (1 - floor.least) / (1 - total)
-            a[members] = floor.least * inside
-    return a
+    """Return weights (k,) raised to floors of disjoint members, the others lowered in proportion; they add up to 1."""
+    raised: list[Floor] = []
+    while True:
+        low = [f for f in floors if f not in raised and float(a[f.members].sum()) < f.least - 1e-12]
+        if not low:
+            return a
+        raised += low
+        others = ~np.any([f.members for f in raised], axis=0)
+        rest = float(a[others].sum())
+        room = 1 - sum(f.least for f in raised)
+        a = np.where(others, a * (room / rest if rest > 0 else 0.0), a)
+        for f in raised:
+            total = float(a[f.members].sum())
+            inside = a[f.members] / total if total > 0 else np.full(f.members.sum(), 1 / f.members.sum())
+            a[f.members] = inside * (f.least if rest > 0 else f.least / (1 - room))

@@ -124,7 +124,6 @@ def test_a_floor_of_members_without_weight_is_dealt_out_evenly():
     np.testing.assert_allclose(raised, [0.1, 0.1, 0.32, 0.48])
 
 
-@pytest.mark.xfail(reason="floors are raised one after the other, which lowers those raised before")
 def test_several_floors_are_kept():
     floors = [Floor(only(6, 0), 0.05), Floor(only(6, 2, 3), 0.4), Floor(only(6, 4), 0.1)]
     for seed in range(8):
