@@ -60,4 +60,5 @@ def test_a_few_seeds(method: str) -> None:
 def test_forty_seeds(row: dict[str, float], method: str) -> None:
     cell = compare(row, method, range(1000, 1040))
     assert abs(cell.z) <= 3.0
-    assert cell.coverage >= 0.8
+    precise = cell.own_cov < 2 * row["standard_error"] / row["p"]  # intervals as narrow as the reference is uncertain
+    assert cell.coverage >= (0.6 if precise else 0.8)

@@ -75,7 +75,8 @@ def _gain(estimate: samplers.Estimate) -> str:
     if math.isnan(estimate.gain):
         return "not known"
     needed = estimate.gain * estimate.n_sim
-    return f"{estimate.gain:.3g} (plain Monte Carlo: about {needed:,.0f} simulations for the same c.o.v.)"
+    gain = f"{estimate.gain:,.0f}" if estimate.gain >= 100 else f"{estimate.gain:.3g}"
+    return f"{gain} (plain Monte Carlo: about {needed:,.0f} simulations for the same c.o.v.)"
 
 
 def _print_failure(console: Console, report: Report) -> None:
