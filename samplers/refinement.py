@@ -199,7 +199,7 @@ class Refinement:
         return [*floors, Floor(kinds == "base", base)]
 
     def _shells(self) -> list[Candidate]:
-        if self._dim < 3:
+        if self._dim < 2:
             return []
         shells = [shell_around(self._points, np.ones(len(self._points)))]
         if len(self._history.u) >= 20:

@@ -118,6 +118,7 @@ class _Run:
         self._history = History(inputs.dim)
         self._base_u = np.empty((0, inputs.dim))
         self._base_f = np.empty(0)
+        self._set_aside = self._base_u, self._base_f
         self._n_base = 0
         self._trace: list[Level] = []
 
@@ -134,6 +135,9 @@ class _Run:
         share = float((self._base_f <= gamma).mean())
         self._note(share, share, len(first.f), binomial_cov(share, sizes.base))
         if share >= COMMON:
+            # These draws have decided that plain Monte Carlo follows: counted in p they would bias it.
+            self._set_aside = self._base_u, self._base_f
+            self._base_u, self._base_f = self._base_u[:0], self._base_f[:0]
             return None
         self._history.add(first, gamma)
         found = yield from regions_of(self._simulator, first, gamma, sizes, self._rng)
@@ -207,6 +211,8 @@ class _Run:
             self._note(float((f <= goal.gamma).mean()), share, len(f), binomial_cov(share, len(self._base_f)))
             if goal.target_cov is not None and binomial_cov(share, len(self._base_f)) <= goal.target_cov:
                 break
+        if len(self._base_f) == 0:  # stopped at once: better those than nothing
+            self._base_u, self._base_f = self._set_aside
         fails = self._base_f <= goal.gamma
         without = no_outcome_share(self._base_f[fails])
         outcome = share_of_failures(int(fails.sum()), len(fails), goal.confidence, self._closed_trace(), without)

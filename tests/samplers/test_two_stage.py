@@ -379,7 +379,7 @@ def test_right_and_covered(study, reference, max_sim):
         four_branches(),
         plateau(),
         shell(),
-        pytest.param(shell(2), marks=pytest.mark.xfail(reason="no shell in two dimensions: intervals too short")),
+        shell(2),
         deceptive(),
         noisy(),
     ],
