@@ -124,7 +124,7 @@ COMMANDS = """
 import sys
 sys.path.insert(0, sys.argv[1])
 from rare_envs.study.cli import main
-for words in ("estimate {env} --method lattice --json", "list", "estimate {env} --method latice"):
+for words in ("estimate {env} --method lattice --json", "list", "estimate {env} --method lattic"):
     sys.argv[1:] = words.format(env="rare_envs/CarFollowing-v0").split()
     try:
         main()
