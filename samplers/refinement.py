@@ -96,9 +96,7 @@ class Refinement:
             kept = kept | explored
         weights = np.where((weights < SMALLEST) & ~kept, 0.0, weights)
         proposal = Proposal(candidates, with_floors(weights / weights.sum(), floors))
-        # Where there are several regions a classifier of all of them was seen to cost coverage.
-        one = len(self._regions) in (1, MOST_REGIONS)
-        gate = self._gate() if last and one and not self._noisy and self._dim <= HIGH_DIM else None
+        gate = self._gate() if last and not self._noisy and self._dim <= HIGH_DIM else None
         return proposal if gate is None else proposal.behind(gate, self._rng)
 
     def _gate(self) -> Gate | None:
