@@ -2,8 +2,8 @@
 
     python -m benchmarks.gap_models EVENTS
 
-EVENTS is the folder with the events that `training.fit_scenarios` reads. Prints, for both scenarios and both models, the
-BIC of the joint fit in common units, the components, and the IDM ego's collision probability by plain Monte Carlo.
+EVENTS is the folder with the events that `training.fit_scenarios` reads. Prints, for both scenarios and both models,
+the BIC of the joint fit in common units, the components, and the IDM ego's collision probability.
 """
 
 import json
