@@ -57,7 +57,9 @@ def test_the_same_base_gives_the_same_p(method):
     again = result.reweight(samplers.StandardNormal(2))
     assert again.p == pytest.approx(result.p)
     assert again.ratio == pytest.approx(1)
-    assert 0.99 * result.cov < again.cov < 1.4 * result.cov
+    # Reweighting takes draws as independent; those of two-stage are stratified, and spread less.
+    most = 3.0 if method == "two-stage" else 1.4
+    assert 0.99 * result.cov < again.cov < most * result.cov
     assert again.interval[0] < 1.05 * result.interval[0]
     assert again.interval[1] > 0.95 * result.interval[1]
     assert again.ess >= again.units * 0.99
