@@ -67,9 +67,9 @@ def learned_gate(
     for seen in (fails, fails_new):
         if min(np.count_nonzero(seen), np.count_nonzero(~seen)) < FEWEST:
             return None
-    classifier = SVC(C=10.0).fit(u, fails)
+    classifier = SVC(C=10.0, random_state=0).fit(u, fails)
     decision = classifier.decision_function(u_new)
-    line = LogisticRegression(C=100.0).fit(decision[:, None], fails_new)
+    line = LogisticRegression(C=100.0, random_state=0).fit(decision[:, None], fails_new)
     intercept, slope = float(line.intercept_[0]), float(line.coef_[0, 0])
     if slope <= 0:
         return None
@@ -84,5 +84,5 @@ def learned_gate(
             best, least = lowest, variance
     if best is None:
         return None
-    both = SVC(C=10.0).fit(np.concatenate([u, u_new]), np.concatenate([fails, fails_new]))
+    both = SVC(C=10.0, random_state=0).fit(np.concatenate([u, u_new]), np.concatenate([fails, fails_new]))
     return Gate(both, intercept, slope, best)

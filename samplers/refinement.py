@@ -133,7 +133,7 @@ class Refinement:
         u, f, log_w = self._history.everything()
         x = PolynomialFeatures(2 if self._dim <= 20 else 1, include_bias=False).fit_transform(u)
         fails = f <= self._gamma
-        odds = LogisticRegression(C=100.0, max_iter=2000).fit(x, fails).decision_function(x) / 1.702
+        odds = LogisticRegression(C=100.0, max_iter=2000, random_state=0).fit(x, fails).decision_function(x) / 1.702
         # The logistic curve has far heavier tails than noise that is near normal: log_ndtr(odds / 1.702) has not.
         return u, log_w + log_ndtr(odds)
 
