@@ -1,0 +1,91 @@
+"""The network of a learned driver: 51 features to a Gaussian over acceleration and yaw rate."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+FEATURES = 51
+HIDDEN = (200, 100)
+ACTIONS = 2
+"""Acceleration and yaw rate."""
+HEAD = (HIDDEN[-1] + 1) * 2 * ACTIONS
+"""Weights of the last layer, 404: what a search over drivers perturbs (O'Kelly et al. 2018, section 4)."""
+CLIP = 8.0
+"""Normalised features are clipped to +-this."""
+LOG_STD_CAP = 0.0
+"""The log standard deviation of normalised actions approaches this smoothly from below: a hard cap would have no
+gradient, and leave half of the weights without effect."""
+
+
+class Scaling(NamedTuple):
+    """Means and spreads of recorded driving, by which features and actions are normalised."""
+
+    feature_mean: Tensor
+    """Shape (51,)."""
+    feature_std: Tensor
+    """Shape (51,); 1 for what is constant."""
+    action_mean: Tensor
+    """Shape (2,): [m/s^2] and [rad/s]."""
+    action_std: Tensor
+
+
+class Policy(nn.Module):
+    """51-200-100 tanh units, then one linear layer to two means and two log standard deviations.
+
+    O'Kelly et al. have the same sizes with ReLU; on the data that the shipped drivers learned from, tanh overfits less.
+    Everything is in normalised units, see `Scaling`.
+    """
+
+    def __init__(self, scaling: Scaling) -> None:
+        """Start with small heads, and a log standard deviation of -1."""
+        super().__init__()
+        for name, value in scaling._asdict().items():
+            self.register_buffer(name, torch.as_tensor(value, dtype=torch.float32).clone())
+        self.first = nn.Linear(FEATURES, HIDDEN[0])
+        self.second = nn.Linear(HIDDEN[0], HIDDEN[1])
+        self.head = nn.Linear(HIDDEN[1], 2 * ACTIONS)
+        with torch.no_grad():
+            self.head.weight.mul_(0.1)
+            self.head.bias.zero_()
+            self.head.bias[ACTIONS:] = -1.0
+
+    @property
+    def scaling(self) -> Scaling:
+        """The normalisation that the weights belong to."""
+        return Scaling(*(self.get_buffer(name) for name in Scaling._fields))
+
+    def trunk(self, features: Tensor) -> Tensor:
+        """Features (..., 51) in SI units to hidden units (..., 100)."""
+        scaling = self.scaling
+        normal = ((features - scaling.feature_mean) / scaling.feature_std).clamp(-CLIP, CLIP)
+        return torch.tanh(self.second(torch.tanh(self.first(normal))))
+
+    def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Features (..., 51) in SI units to means and log standard deviations (..., 2) of normalised actions."""
+        return split(self.head(self.trunk(features)))
+
+
+def split(output: Tensor) -> tuple[Tensor, Tensor]:
+    """The four outputs of the last layer (..., 4) as means and capped log standard deviations (..., 2)."""
+    mean, log_std = output[..., :ACTIONS], output[..., ACTIONS:]
+    return mean, LOG_STD_CAP - nn.functional.softplus(LOG_STD_CAP - log_std)
+
+
+def head_weights(policy: Policy) -> Tensor:
+    """The 404 weights of the last layer: for each of the four outputs its 100 weights and its bias."""
+    return torch.cat((policy.head.weight, policy.head.bias[:, None]), dim=1).flatten()
+
+
+def with_head(hidden: Tensor, weights: Tensor) -> Tensor:
+    """The last layer with weights of its own for every scenario.
+
+    Args:
+        hidden: Hidden units of M vehicles in B scenarios, shape (B, M, 100).
+        weights: As `head_weights` has them, shape (B, 404).
+
+    Returns:
+        Outputs, shape (B, M, 4).
+    """
+    layer = weights.view(len(weights), 2 * ACTIONS, HIDDEN[-1] + 1)
+    return torch.baddbmm(layer[:, None, :, -1], hidden, layer[:, :, :-1].mT)
