@@ -1,0 +1,1 @@
+"""Recorded traffic: trajectory tables, smoothing, scenes and events."""

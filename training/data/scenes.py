@@ -1,0 +1,213 @@
+"""Scenes: every vehicle in a window of road over some seconds, ready to be replayed or driven anew."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+from pyarrow import ArrowInvalid
+
+from training.data.smoothing import CUTOFF_ACROSS, CUTOFF_ALONG, motion, smooth
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+DT = 0.1
+"""Time step of every scene [s]."""
+US101_FILE = "ngsim_us101_scenes.parquet"
+US101_EDGES = (0.0, 3.49, 6.87, 10.20, 13.52, 17.25, 21.0)
+"""Lane boundaries of US 101 [m], measured from the left edge of the road; the last lane only where it exists."""
+US101_ZERO = 1_118_846_980
+"""Unix time [s] from which the clock of the US 101 scenes counts: 15 June 2005, 07:49:40 local."""
+US101_TEST = ((64.0, 89.0), (157.0, 194.0))
+"""Clock [s] of the test scenes, 2, 11, 12, 17, 21, 22 and 29: 64 to 88.4 s and 157.8 to 193.2 s."""
+_US101_COLUMNS = ("scene", "vehicle", "epoch_ms", "y_along", "d", "lane", "length", "width")
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Vehicles V at steps T, 0.1 s apart, on a straight road.
+
+    Positions are box centres: x along the road, y across and positive to the right [m], heading relative to the road
+    [rad], positive to the right. Arrays are float64 and NaN where there is no value.
+    """
+
+    name: str
+    start: float
+    """Clock of the recording at step 0 [s]."""
+    edges: tuple[float, ...]
+    """y of the lane boundaries, left to right [m]."""
+    x: Array
+    """Shape (T, V), like the following."""
+    y: Array
+    heading: Array
+    speed: Array
+    acceleration: Array
+    """From this step to the next [m/s^2]; NaN where the record ends before it is known."""
+    yaw_rate: Array
+    """From this step to the next [rad/s]; NaN where the acceleration is."""
+    present: Mask
+    """True where x, y, heading and speed are known."""
+    length: Array
+    """Shape (V,) [m]."""
+    width: Array
+    """Shape (V,) [m]."""
+
+    def __post_init__(self) -> None:
+        shape = self.x.shape
+        if len(shape) != 2 or any(values.shape != shape for values in self._fields()):
+            raise ValueError(f"Scene {self.name}: expected arrays of one shape (T, V), got x of shape {shape}.")
+        if self.length.shape != shape[1:] or self.width.shape != shape[1:]:
+            raise ValueError(f"Scene {self.name}: expected length and width of shape {shape[1:]}.")
+        for values in self._fields()[:4]:
+            if not (np.isfinite(values) == self.present).all():
+                raise ValueError(f"Scene {self.name}: states must be finite where present and NaN elsewhere.")
+        for values in (*self._fields(), self.length, self.width):
+            values.setflags(write=False)
+
+    def _fields(self) -> tuple[NDArray[np.float64] | Mask, ...]:
+        return (self.x, self.y, self.heading, self.speed, self.acceleration, self.yaw_rate, self.present)
+
+    @property
+    def end(self) -> float:
+        """Clock of the recording at the last step [s]."""
+        return self.start + DT * (len(self.x) - 1)
+
+    @property
+    def acted(self) -> Mask:
+        """True where state and action are known, shape (T, V)."""
+        known: Mask = self.present & np.isfinite(self.acceleration)
+        return known
+
+    def lane(self) -> NDArray[np.int64]:
+        """Lane of each centre, 0 the leftmost, shape (T, V); -1 off the road or not present."""
+        inner = np.searchsorted(np.array(self.edges), np.nan_to_num(self.y, nan=-np.inf), side="right") - 1
+        return np.where(self.present & (inner < len(self.edges) - 1), inner, -1)
+
+    def leads_lane(self) -> Mask:
+        """True where nobody ahead is recorded in the vehicle's lane, shape (T, V).
+
+        Such a vehicle may have reacted to someone outside the window: its actions are no examples.
+        """
+        lane = self.lane()
+        x = np.where(self.present, self.x, -np.inf)
+        leads = np.zeros_like(self.present)
+        steps = np.arange(len(x))
+        for number in range(-1, len(self.edges) - 1):
+            inside = self.present & (lane == number)
+            first = np.argmax(np.where(inside, x, -np.inf), axis=1)
+            leads[steps, first] |= inside[steps, first]
+        return leads
+
+
+def assemble(
+    name: str, start: float, edges: Sequence[float], columns: dict[str, Array], length: Array, width: Array
+) -> Scene:
+    """Puts rows in the place that `step` and `vehicle` (column of the scene, 0 to V - 1) give them.
+
+    Args:
+        name: Of the scene.
+        start: Clock at step 0 [s].
+        edges: Lane boundaries [m].
+        columns: `step`, `vehicle`, `x`, `y`, `heading`, `speed`, `acceleration`, `yaw_rate`, each of shape (rows,).
+        length: Of each vehicle [m], shape (V,).
+        width: Of each vehicle [m], shape (V,).
+    """
+    known = np.isfinite(columns["speed"])
+    step, vehicle = (columns[key][known].astype(np.int64) for key in ("step", "vehicle"))
+    shape = (int(columns["step"].max()) + 1, len(length))
+
+    def placed(key: str) -> Array:
+        values = np.full(shape, np.nan)
+        values[step, vehicle] = columns[key][known]
+        return values
+
+    states = {key: placed(key) for key in ("x", "y", "heading", "speed", "acceleration", "yaw_rate")}
+    return Scene(
+        name, start, tuple(edges), **states, present=np.isfinite(states["x"]), length=length.copy(), width=width.copy()
+    )
+
+
+def load_us101_scenes(folder: Path | str) -> tuple[Scene, ...]:
+    """The 28 usable scenes of US 101, smoothed.
+
+    The scenes overlap, so the copies of a vehicle are first merged by vehicle and time, each track is cut at its
+    holes and smoothed once over its whole length, and then the scenes are cut from the tracks. x is NGSIM's Local_Y
+    [m], the same in all scenes, moved from the front to the centre; scene 1 (two vehicles) and ramps are left out.
+
+    Raises:
+        ValueError: The file is missing, cannot be read or lacks a column.
+    """
+    path = Path(folder) / US101_FILE
+    try:
+        table = pq.read_table(path, columns=list(_US101_COLUMNS))
+    except (OSError, ArrowInvalid) as error:
+        raise ValueError(f"Cannot read recorded scenes from {path}: {error}") from None
+    rows = {key: table[key].to_numpy().astype(np.float64) for key in _US101_COLUMNS}
+    usable = (rows["scene"] != 1) & (rows["lane"] <= 6)
+    rows = {key: values[usable] for key, values in rows.items()}
+    track_rows = np.column_stack([rows["vehicle"], rows["epoch_ms"]])
+    keys, copy = np.unique(track_rows, axis=0, return_inverse=True)
+    copy = copy.ravel()
+    count = np.bincount(copy)
+    x, y, length = (np.bincount(copy, rows[key]) / count for key in ("y_along", "d", "length"))
+    smoothed = smooth_tracks(keys[:, 0], keys[:, 1] / 1000.0, x - 0.5 * length, y)
+    for key, values in smoothed.items():
+        rows[key] = values[copy]
+    return tuple(_us101_scene(rows, int(number)) for number in np.unique(rows["scene"]))
+
+
+def smooth_tracks(track: Array, time: Array, x: Array, y: Array, dt: float = DT) -> dict[str, Array]:
+    """Smooth states and actions of rows sorted by track and time; tracks are cut where steps are missing.
+
+    Returns:
+        `x`, `y`, `heading`, `speed`, `acceleration`, `yaw_rate` of each row.
+    """
+    cuts = np.flatnonzero((np.diff(track) != 0) | (np.abs(np.diff(time) - dt) > 0.1 * dt)) + 1
+    result = {key: np.empty(len(x)) for key in ("x", "y", "heading", "speed", "acceleration", "yaw_rate")}
+    for piece in np.split(np.arange(len(x)), cuts):
+        along, across = smooth(x[piece], CUTOFF_ALONG, dt), smooth(y[piece], CUTOFF_ACROSS, dt)
+        for key, values in zip(result, (along, across, *motion(along, across, dt)), strict=True):
+            result[key][piece] = values
+    return result
+
+
+def _us101_scene(rows: dict[str, Array], number: int) -> Scene:
+    inside = rows["scene"] == number
+    scene = {key: values[inside] for key, values in rows.items()}
+    first = scene["epoch_ms"].min()
+    _, first_row, column = np.unique(scene["vehicle"], return_index=True, return_inverse=True)
+    scene["step"], scene["vehicle"] = np.rint((scene["epoch_ms"] - first) / 100.0), column.astype(np.float64)
+    edges = US101_EDGES[: 7 if (scene["lane"] == 6).any() else 6]
+    length, width = (scene[key][first_row] for key in ("length", "width"))
+    return assemble(f"us101-{number:02}", first / 1000.0 - US101_ZERO, edges, scene, length, width)
+
+
+def split(
+    scenes: Sequence[Scene], test: Sequence[tuple[float, float]] = US101_TEST
+) -> tuple[tuple[Scene, ...], tuple[Scene, ...]]:
+    """Scenes to learn from and scenes to test on, apart by the recording's clock.
+
+    Args:
+        scenes: Of one recording.
+        test: Intervals of the clock [s] that are kept for tests.
+
+    Returns:
+        Training scenes, which lie outside the intervals, and test scenes, which lie inside one.
+
+    Raises:
+        ValueError: A scene lies across the end of an interval, so one moment would be on both sides.
+    """
+    kept: tuple[list[Scene], list[Scene]] = ([], [])
+    for scene in scenes:
+        inside = any(low <= scene.start and scene.end <= high for low, high in test)
+        if not inside and any(scene.start <= high and low <= scene.end for low, high in test):
+            raise ValueError(
+                f"Scene {scene.name} ({scene.start:g} to {scene.end:g} s) lies across the end of a test interval."
+            )
+        kept[inside].append(scene)
+    return tuple(kept[0]), tuple(kept[1])
