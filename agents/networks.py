@@ -13,9 +13,6 @@ HEAD = (HIDDEN[-1] + 1) * 2 * ACTIONS
 """Weights of the last layer, 404: what a search over drivers perturbs (O'Kelly et al. 2018, section 4)."""
 CLIP = 8.0
 """Normalised features are clipped to +-this."""
-LOG_STD_CAP = 0.0
-"""The log standard deviation of normalised actions approaches this smoothly from below: a hard cap would have no
-gradient, and leave half of the weights without effect."""
 
 
 class Scaling(NamedTuple):
@@ -37,11 +34,19 @@ class Policy(nn.Module):
     Everything is in normalised units, see `Scaling`.
     """
 
-    def __init__(self, scaling: Scaling) -> None:
-        """Start with small heads, and a log standard deviation of -1."""
+    def __init__(self, scaling: Scaling, log_std_cap: float = 0.0) -> None:
+        """Start with small heads, and a log standard deviation of about -1.3.
+
+        Args:
+            scaling: Of features and actions.
+            log_std_cap: The log standard deviations approach this smoothly from below. A hard cap would have no
+                gradient beyond it, and leave half of the last layer's weights without effect.
+        """
         super().__init__()
+        self.log_std_cap: Tensor
+        self.register_buffer("log_std_cap", torch.tensor(float(log_std_cap)))
         for name, value in scaling._asdict().items():
-            self.register_buffer(name, torch.as_tensor(value, dtype=torch.float32).clone())
+            self.register_buffer(name, value.detach().float().clone())
         self.first = nn.Linear(FEATURES, HIDDEN[0])
         self.second = nn.Linear(HIDDEN[0], HIDDEN[1])
         self.head = nn.Linear(HIDDEN[1], 2 * ACTIONS)
@@ -63,13 +68,12 @@ class Policy(nn.Module):
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Features (..., 51) in SI units to means and log standard deviations (..., 2) of normalised actions."""
-        return split(self.head(self.trunk(features)))
+        return self.split(self.head(self.trunk(features)))
 
-
-def split(output: Tensor) -> tuple[Tensor, Tensor]:
-    """The four outputs of the last layer (..., 4) as means and capped log standard deviations (..., 2)."""
-    mean, log_std = output[..., :ACTIONS], output[..., ACTIONS:]
-    return mean, LOG_STD_CAP - nn.functional.softplus(LOG_STD_CAP - log_std)
+    def split(self, output: Tensor) -> tuple[Tensor, Tensor]:
+        """The four outputs of the last layer (..., 4) as means and capped log standard deviations (..., 2)."""
+        mean, log_std = output[..., :ACTIONS], output[..., ACTIONS:]
+        return mean, self.log_std_cap - nn.functional.softplus(self.log_std_cap - log_std)
 
 
 def head_weights(policy: Policy) -> Tensor:

@@ -1,9 +1,9 @@
 """Lidar: 20 beams from the middle of each vehicle, their ranges and range rates.
 
-Which body a beam meets first is decided without gradients, and only for beams that can meet it: a body that covers less
-than 9 degrees to either side of its bearing can be met by the beam nearest to that bearing only, less than 27 degrees by
-three. Range and rate of the one chosen body are then computed with gradients; the minimum over bodies passes its
-gradient to the chosen one only, so nothing is lost.
+Which body a beam meets first is decided without gradients, and only for beams that can meet it: a body that covers
+less than 9 degrees to either side of its bearing can be met by the beam nearest to that bearing only, less than 27
+degrees by three. Range and rate of the one chosen body are then computed with gradients; the minimum over bodies
+passes its gradient to the chosen one only, so nothing is lost.
 
 References:
     Kuefler, Morton, Wheeler and Kochenderfer, "Imitating driver behavior with generative adversarial networks", 2017.
