@@ -1,4 +1,8 @@
-"""The vehicle model: HighwayEnv's kinematic bicycle, one explicit Euler step."""
+"""Vehicle models, one explicit Euler step each: HighwayEnv's kinematic bicycle, and a point mass.
+
+Both move in road coordinates. Where the road is curved, with curvature k, a way of d metres along the road at y is
+d / (1 - k y) of the reference line, and the road turns under the vehicle by k times that.
+"""
 
 import torch
 from torch import Tensor
@@ -7,7 +11,14 @@ from rare_envs.state import VEHICLE_LENGTH
 
 
 def bicycle(
-    x: Tensor, y: Tensor, heading: Tensor, speed: Tensor, acceleration: Tensor, steering: Tensor, dt: float
+    x: Tensor,
+    y: Tensor,
+    heading: Tensor,
+    speed: Tensor,
+    acceleration: Tensor,
+    steering: Tensor,
+    dt: float,
+    curvature: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Move vehicles by one tick with the kinematic bicycle model.
 
@@ -22,6 +33,7 @@ def bicycle(
         acceleration: Accelerations [m/s^2].
         steering: Front wheel angles [rad].
         dt: Tick [s].
+        curvature: Of the road at x [1/m], positive to the right; None for a straight road.
 
     Returns:
         x, y, heading and speed after the tick.
@@ -32,9 +44,54 @@ def bicycle(
     slip = torch.atan(torch.tan(steering) * 0.5)
     course = heading + slip
     distance = speed * dt
+    ahead, turn = distance * torch.cos(course), distance * torch.sin(slip) / (VEHICLE_LENGTH / 2)
+    if curvature is not None:
+        ahead, turn = _along_curve(ahead, turn, y, curvature)
     return (
-        x + distance * torch.cos(course),
+        x + ahead,
         y + distance * torch.sin(course),
-        heading + distance * torch.sin(slip) / (VEHICLE_LENGTH / 2),
+        heading + turn,
         (speed + acceleration * dt).clamp(min=0.0),
     )
+
+
+def point_mass(
+    x: Tensor,
+    y: Tensor,
+    heading: Tensor,
+    speed: Tensor,
+    acceleration: Tensor,
+    yaw_rate: Tensor,
+    dt: float,
+    curvature: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Move vehicles by one tick as points that turn at will: the model of learned drivers.
+
+    Args:
+        x: Centres along the road [m], any shape; the other tensors have the same.
+        y: Centres across the road [m].
+        heading: Headings relative to the road [rad].
+        speed: Speeds [m/s].
+        acceleration: Accelerations [m/s^2].
+        yaw_rate: Change of the heading in the world [rad/s].
+        dt: Tick [s].
+        curvature: Of the road at x [1/m], positive to the right; None for a straight road.
+
+    Returns:
+        x, y, heading and speed after the tick; the speed is not negative.
+
+    References:
+        O'Kelly, Sinha, Namkoong, Duchi and Tedrake, "Scalable end-to-end autonomous vehicle testing via rare-event
+        simulation", 2018: the model of their released simulator.
+    """
+    distance = speed * dt
+    ahead, turn = distance * torch.cos(heading), yaw_rate * dt
+    if curvature is not None:
+        ahead, turn = _along_curve(ahead, turn, y, curvature)
+    return x + ahead, y + distance * torch.sin(heading), heading + turn, (speed + acceleration * dt).clamp(min=0.0)
+
+
+def _along_curve(ahead: Tensor, turn: Tensor, y: Tensor, curvature: Tensor) -> tuple[Tensor, Tensor]:
+    """Way of the reference line [m] and turn relative to it [rad] of vehicles that go `ahead` [m] and `turn` [rad]."""
+    ahead = ahead / (1.0 - curvature * y)
+    return ahead, turn - curvature * ahead
