@@ -1,0 +1,168 @@
+"""Learned drivers: 51 features to acceleration and yaw rate, for whole batches of scenarios at once."""
+
+import copy
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from agents.networks import ACTIONS, FEATURES, HEAD, HIDDEN, Policy, with_head
+from agents.weights import WeightDistribution
+from rare_envs.state import VEHICLE_LENGTH
+
+if TYPE_CHECKING:
+    from rare_envs.world import Episode
+
+MAX_STEERING = math.pi / 3
+"""Largest steering angle [rad], HighwayEnv's."""
+_MAX_SLIP_SINE = math.sin(math.atan(0.5 * math.tan(MAX_STEERING)))
+_NEAR_ZERO = 0.01
+"""Speeds [m/s] in a denominator are kept at least this far from 0."""
+
+
+@dataclass(frozen=True, eq=False)
+class LearnedDriver:
+    """A Gaussian policy with the colour of its noise and the limits of its actions.
+
+    The actions of a vehicle at tick t are
+
+        action = action_mean + action_std (mean + exp(log_std) eps_t), within the limits,
+        eps_t = rho eps_(t-1) + sqrt(1 - rho^2) xi_t with eps_0 = xi_0 and xi ~ N(0, 1),
+
+    so that every eps_t is N(0, 1). Recorded drivers are far from white noise (rho is about 0.95 in ticks of 0.1 s);
+    O'Kelly et al. (2018) sample white noise, rho = 0.
+
+    Raises:
+        ValueError: If rho is not in [0, 1), limits are out of order, or there are not 404 weights.
+    """
+
+    policy: Policy
+    rho: tuple[float, float] = (0.0, 0.0)
+    """Autocorrelation of the noise of acceleration and yaw rate after one tick."""
+    acceleration: tuple[float, float] = (-8.0, 4.0)
+    """Limits [m/s^2]."""
+    yaw_rate: tuple[float, float] = (-0.3, 0.3)
+    """Limits [rad/s]."""
+    weights: WeightDistribution | None = None
+    """Law of the 404 weights of the last layer, if an ensemble has given one."""
+    name: str = "learned"
+
+    def __post_init__(self) -> None:
+        for name in ("rho", "acceleration", "yaw_rate"):
+            pair = tuple(float(value) for value in getattr(self, name))
+            if len(pair) != ACTIONS:
+                raise ValueError(f"Expected {name} as two numbers, got {pair}.")
+            object.__setattr__(self, name, pair)
+        if not all(0.0 <= rho < 1.0 for rho in self.rho):
+            raise ValueError(f"Expected rho in [0, 1), got {self.rho}.")
+        for name in ("acceleration", "yaw_rate"):
+            low, high = getattr(self, name)
+            if not low < high:
+                raise ValueError(f"Expected limits of {name} in ascending order, got {(low, high)}.")
+        if self.weights is not None and self.weights.dim != HEAD:
+            raise ValueError(f"Expected a distribution of {HEAD} weights, got one of {self.weights.dim}.")
+
+    def act(
+        self,
+        features: Tensor,
+        weights: Tensor | None = None,
+        innovations: Tensor | None = None,
+        memory: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor | None]:
+        """Decide for one tick; the networks of all vehicles are one forward pass, also when weights differ.
+
+        Args:
+            features: What M vehicles in B scenarios perceive, shape (B, M, 51).
+            weights: Last layers of the scenarios, shape (B, 404) as `head_weights` has them; None for the policy's own.
+            innovations: xi, shape (B, M, 2); None for the mean actions.
+            memory: eps of the tick before, as the last call returned it; None at the start.
+
+        Returns:
+            Accelerations [m/s^2] and yaw rates [rad/s], shape (B, M, 2), and the new memory: eps, or None without
+            innovations, which ends the noise.
+
+        Raises:
+            ValueError: If a shape is wrong.
+        """
+        batch, vehicles = _checked_shapes(features, weights, innovations, memory)
+        policy = self.policy
+        hidden = policy.trunk(features.to(policy.head.weight.dtype).reshape(batch * vehicles, FEATURES))
+        if weights is None:
+            output = policy.head(hidden).view(batch, vehicles, 2 * ACTIONS)
+        else:
+            output = with_head(hidden.view(batch, vehicles, HIDDEN[-1]), weights.to(hidden.dtype).contiguous())
+        normal, log_std = policy.split(output)
+        noise = None if innovations is None else self.noise(innovations.to(hidden.dtype), memory)
+        if noise is not None:
+            normal = normal + log_std.exp() * noise
+        scaling = policy.scaling
+        action = scaling.action_mean + scaling.action_std * normal
+        low, high = action.new_tensor(tuple(zip(self.acceleration, self.yaw_rate, strict=True)))
+        return action.clamp(low, high).to(features.dtype), noise
+
+    def noise(self, innovations: Tensor, memory: Tensor | None) -> Tensor:
+        """The next eps of shape (..., 2) from xi of the same shape and the last eps, None at the start."""
+        if memory is None:
+            return innovations
+        rho = innovations.new_tensor(self.rho)
+        return rho * memory + (1.0 - rho.square()).sqrt() * innovations
+
+
+def _checked_shapes(
+    features: Tensor, weights: Tensor | None, innovations: Tensor | None, memory: Tensor | None
+) -> tuple[int, int]:
+    """B and M."""
+    if features.ndim != 3 or features.shape[-1] != FEATURES:
+        raise ValueError(f"Expected features of shape (B, M, {FEATURES}), got {tuple(features.shape)}.")
+    batch, vehicles, _ = features.shape
+    if weights is not None and weights.shape != (batch, HEAD):
+        raise ValueError(f"Expected weights of shape ({batch}, {HEAD}), got {tuple(weights.shape)}.")
+    for name, value in (("innovations", innovations), ("memory", memory)):
+        if value is not None and value.shape != (batch, vehicles, ACTIONS):
+            expected = (batch, vehicles, ACTIONS)
+            raise ValueError(f"Expected {name} of shape {expected}, got {tuple(value.shape)}.")
+    return batch, vehicles
+
+
+def with_weights(policy: Policy, weights: Tensor) -> Policy:
+    """A copy of a network with other weights (404,) in its last layer, as `head_weights` has them."""
+    if weights.shape != (HEAD,):
+        raise ValueError(f"Expected weights of shape ({HEAD},), got {tuple(weights.shape)}.")
+    changed = copy.deepcopy(policy)
+    layer = weights.detach().view(2 * ACTIONS, HIDDEN[-1] + 1)
+    with torch.no_grad():
+        changed.head.weight.copy_(layer[:, :-1])
+        changed.head.bias.copy_(layer[:, -1])
+    return changed
+
+
+@dataclass(frozen=True, eq=False)
+class LearnedEgo:
+    """A learned driver as ego: a Driver that acts by its mean actions and has no memory."""
+
+    driver: LearnedDriver
+
+    def act(self, episode: "Episode", memory: Any) -> tuple[Tensor, Any]:
+        """Perceive and decide for one tick; see `rare_envs.drivers.Driver`."""
+        actions, _ = self.driver.act(episode.perception[:, :1])
+        acceleration, yaw_rate = actions[:, 0].unbind(dim=-1)
+        return torch.stack((acceleration, steering_for(yaw_rate, episode.state.speed[:, 0])), dim=1), memory
+
+
+def steering_for(yaw_rate: Tensor, speed: Tensor) -> Tensor:
+    """The steering angle with which the kinematic bicycle (`rare_envs.dynamics.bicycle`) turns at a yaw rate.
+
+    Inverts yaw rate = v sin(beta) / (l / 2), beta = atan(tan(steering) / 2), with l the vehicle's length. A vehicle
+    too slow to turn as fast as wanted steers by `MAX_STEERING`.
+
+    Args:
+        yaw_rate: Wanted [rad/s], shape (B,).
+        speed: [m/s], shape (B,).
+
+    Returns:
+        Steering angle [rad], shape (B,).
+    """
+    sine = yaw_rate * (VEHICLE_LENGTH / 2) / speed.clamp(min=_NEAR_ZERO)
+    return torch.atan(2.0 * torch.tan(torch.asin(sine.clamp(-_MAX_SLIP_SINE, _MAX_SLIP_SINE))))

@@ -1,0 +1,1 @@
+"""Learning drivers from recorded traffic."""
