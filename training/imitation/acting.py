@@ -1,0 +1,36 @@
+"""How a policy acts in training: coloured Gaussian noise, bounds, and the likelihood of an action."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from agents.networks import Policy
+
+LOW = (-8.0, -0.3)
+HIGH = (4.0, 0.3)
+"""Bounds of acceleration [m/s^2] and yaw rate [rad/s]."""
+
+
+def coloured(noise: Tensor, fresh: Tensor, rho: Tensor) -> Tensor:
+    """Next value of a stationary autoregression of order 1 with unit variance; all (..., 2), rho (2,)."""
+    return rho * noise + (1.0 - rho.square()).sqrt() * fresh
+
+
+def physical(policy: Policy, action: Tensor) -> Tensor:
+    """Normalised actions (..., 2) in m/s^2 and rad/s, within bounds."""
+    scaling = policy.scaling
+    low, high = action.new_tensor(LOW), action.new_tensor(HIGH)
+    return (scaling.action_mean + scaling.action_std * action).clamp(low, high)
+
+
+def normalised(policy: Policy, action: Tensor) -> Tensor:
+    """Inverse of `physical` within the bounds."""
+    scaling = policy.scaling
+    return (action - scaling.action_mean) / scaling.action_std
+
+
+def log_likelihood(mean: Tensor, log_std: Tensor, action: Tensor) -> Tensor:
+    """Log density of normalised actions under independent Gaussians, (..., 2) -> (...,)."""
+    z = (action - mean) * torch.exp(-log_std)
+    return -(0.5 * z.square() + log_std + 0.5 * math.log(2.0 * math.pi)).sum(dim=-1)

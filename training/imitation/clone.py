@@ -1,0 +1,33 @@
+"""Behaviour cloning: the likelihood of recorded actions, maximised."""
+
+import torch
+
+from agents.networks import Policy
+from training.imitation.acting import log_likelihood, normalised
+from training.imitation.config import Config
+from training.imitation.expert import Pairs, scaling_of
+
+
+def clone(pairs: Pairs, config: Config, generator: torch.Generator) -> Policy:
+    """A policy that maximises the likelihood of recorded actions.
+
+    Few epochs: what 51 features say of the next action is little, and more is memorising.
+
+    Args:
+        pairs: Recorded driving.
+        config: `epochs`, `batch`, `clone_rate`, `weight_decay` and `log_std_cap` are used.
+        generator: Source of the initial weights and of the order of the pairs.
+    """
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(int(torch.randint(2**31, (), generator=generator)))
+        policy = Policy(scaling_of(pairs), config.log_std_cap)
+    optimiser = torch.optim.Adam(policy.parameters(), lr=config.clone_rate, weight_decay=config.weight_decay)
+    action = normalised(policy, pairs.action)
+    for _ in range(config.epochs):
+        order = torch.randperm(len(action), generator=generator)
+        for rows in order.split(config.batch):
+            loss = -log_likelihood(*policy(pairs.features[rows]), action[rows]).mean()
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+    return policy

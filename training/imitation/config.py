@@ -1,0 +1,92 @@
+"""Settings of one training, with the values that the shipped drivers were trained with."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+Method = Literal["bc", "gail", "mgail"]
+
+
+@dataclass(frozen=True)
+class Config:
+    """How to learn a driver from recorded scenes. Pairs are values at the start and at the end of a schedule."""
+
+    method: Method = "mgail"
+    seed: int = 0
+    updates: int = 1000
+    """Updates of the policy after behaviour cloning."""
+
+    # behaviour cloning, which every method starts from
+    epochs: int = 6
+    batch: int = 512
+    clone_rate: float = 1e-3
+    weight_decay: float = 1e-4
+    log_std_cap: float = 0.0
+    """See `agents.networks.Policy`."""
+
+    # rollouts
+    pools: int = 5
+    """Sets of scenes that are driven in turn and kept between updates, so that late moments are visited too."""
+    scenes: int = 8
+    """Scenes of a pool."""
+    horizon: tuple[int, int] = (15, 30)
+    """Ticks of one rollout."""
+    age: tuple[int, int] = (30, 150)
+    """Ticks after which a pool starts anew from the record."""
+    drivers: tuple[int, int] = (60, 60)
+    """Vehicles of a scene that are driven: the curriculum over the number of agents (Bhattacharyya et al. 2018)."""
+    rho: tuple[float, float] = (0.95, 0.95)
+    """Autocorrelation of the noise of acceleration and yaw rate from tick to tick; 0 is white noise, as O'Kelly et
+    al. have it."""
+
+    # costs of the policy
+    critic_weight: float = 3.0
+    clone_weight: tuple[float, float] = (0.1, 0.03)
+    """Of the likelihood of recorded actions; it falls geometrically."""
+    anneal: float = 0.7
+    """Share of the training in which the schedules run."""
+    collision_weight: float = 8.0
+    edge_weight: float = 8.0
+    brake_weight: float = 1.0
+
+    # optimisation
+    policy_rate: float = 3e-4
+    critic_rate: float = 4e-4
+    critic_steps: int = 3
+    critic_batch: int = 512
+    memory: int = 8
+    """Rollouts that the critic learns from."""
+    warm_up: int = 30
+    """Rounds in which only the critic learns."""
+    gradient_penalty: float = 0.5
+
+    # MGAIL
+    credit: float = 0.97
+    """Share of the gradient of the state that is passed on to the tick before."""
+    learned_model: bool = False
+    """Take the gradient through a learned forward model, as Baram et al. do, in place of the simulator."""
+
+    # GAIL, by proximal policy optimisation
+    discount: float = 0.97
+    gae: float = 0.95
+    clip: float = 0.2
+    ppo_epochs: int = 4
+    ppo_batch: int = 2048
+    value_rate: float = 1e-3
+
+    def __post_init__(self) -> None:
+        if self.method not in ("bc", "gail", "mgail"):
+            raise ValueError(f"Expected method 'bc', 'gail' or 'mgail', got {self.method!r}.")
+        for name in ("updates", "epochs"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"Expected {name} >= 0, got {getattr(self, name)}.")
+        for name in ("pools", "scenes", "batch", "critic_batch", "memory", "ppo_batch"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"Expected {name} >= 1, got {getattr(self, name)}.")
+        if not all(0.0 <= rho < 1.0 for rho in self.rho):
+            raise ValueError(f"Expected rho in [0, 1), got {self.rho}.")
+
+    def along(self, ends: tuple[float, float], update: int) -> float:
+        """Value of a geometric schedule at an update."""
+        share = min(update / max(self.anneal * self.updates, 1.0), 1.0)
+        first, last = ends
+        return float(first * (last / first) ** share)

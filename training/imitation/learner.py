@@ -1,0 +1,184 @@
+"""What GAIL and MGAIL share: the state of a training, its rounds, and how it is kept and resumed."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from agents.networks import ACTIONS, FEATURES, Policy
+from training.imitation.acting import log_likelihood
+from training.imitation.config import Config
+from training.imitation.critic import Critic, inputs, train_critic
+from training.imitation.expert import Pairs
+from training.imitation.pools import Pool, fresh_pool
+from training.imitation.recording import Recording
+from training.imitation.rollout import Steps, roll
+from training.imitation.traffic import Traffic
+
+Log = dict[str, float]
+_LEARNED = ("policy", "critic", "value", "policy_optimiser", "critic_optimiser", "value_optimiser")
+"""What has weights or moments of its own."""
+
+
+@dataclass
+class Learner:
+    """A training under way. Everything random comes from `generator`, so that a resumed training goes on as it would."""
+
+    config: Config
+    recording: Recording
+    among: Tensor
+    """Scenes that are driven, with repetition if they are bootstrapped, shape (k,)."""
+    pairs: Pairs
+    """Recorded driving that the critic and the likelihood see."""
+    policy: Policy
+    critic: Critic
+    generator: torch.Generator
+    update: int = 0
+    simulated: int = 0
+    """Vehicle-steps so far."""
+
+    def __post_init__(self) -> None:
+        """Make optimisers, pools and the critic's memory."""
+        config = self.config
+        self.policy_optimiser = torch.optim.Adam(self.policy.parameters(), config.policy_rate, betas=(0.9, 0.99))
+        self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), config.critic_rate, betas=(0.5, 0.9))
+        self.value = _value(self.generator)
+        self.value_optimiser = torch.optim.Adam(self.value.parameters(), config.value_rate)
+        self.pools: list[Pool] = []
+        self.rollouts: deque[Tensor] = deque(maxlen=config.memory)
+        self.recorded = inputs(self.policy, self.pairs.features, self.recorded_action)
+
+    @property
+    def recorded_action(self) -> Tensor:
+        """Recorded actions in normalised units, shape (n, 2)."""
+        scaling = self.policy.scaling
+        return (self.pairs.action - scaling.action_mean) / scaling.action_std
+
+    @property
+    def rho(self) -> Tensor:
+        """Autocorrelation of the noise, shape (2,)."""
+        return torch.tensor(self.config.rho)
+
+    def now(self, ends: tuple[int, int]) -> int:
+        """Value of a linear schedule of whole numbers."""
+        share = min(self.update / max(self.config.anneal * self.config.updates, 1.0), 1.0)
+        return round(ends[0] + (ends[1] - ends[0]) * share)
+
+    def drive(self, credit: float) -> Steps:
+        """Drive the next pool for a horizon; a pool that is old starts anew from the record."""
+        config = self.config
+        while len(self.pools) < config.pools:
+            self.pools.append(self._new_pool())
+        index = self.update % config.pools
+        if self.pools[index].age >= self.now(config.age):
+            self.pools[index] = self._new_pool()
+        horizon = self.now(config.horizon)
+        steps, self.pools[index] = roll(
+            self.recording, self.policy, self.pools[index], horizon, self.rho, credit, self.generator
+        )
+        self.simulated += len(steps.features)
+        return steps
+
+    def _new_pool(self) -> Pool:
+        config = self.config
+        return fresh_pool(
+            self.recording, self.among, config.scenes, self.now(config.drivers), self.now(config.horizon), self.generator
+        )
+
+    def learn_critic(self, steps: Steps) -> float:
+        """Let the critic learn from the rollout and the ones before, and return its loss."""
+        config = self.config
+        self.rollouts.append(inputs(self.policy, steps.features.detach(), steps.action.detach()))
+        return train_critic(
+            self.critic,
+            self.critic_optimiser,
+            self.recorded,
+            self.rollouts,
+            config.critic_steps,
+            config.critic_batch,
+            config.gradient_penalty,
+            self.generator,
+        )
+
+    def warm_up(self) -> None:
+        """Let the critic learn before the policy moves."""
+        for _ in range(self.config.warm_up):
+            with torch.no_grad():
+                steps = self.drive(1.0)
+            self.learn_critic(steps)
+
+    def clone_loss(self) -> Tensor:
+        """Negative log likelihood of some recorded actions."""
+        rows = torch.randint(len(self.pairs.features), (self.config.batch,), generator=self.generator)
+        return -log_likelihood(*self.policy(self.pairs.features[rows]), self.recorded_action[rows]).mean()
+
+    def save(self, path: Path) -> None:
+        """Write everything that a resumed training needs."""
+        state = {
+            "update": self.update,
+            "simulated": self.simulated,
+            **{name: getattr(self, name).state_dict() for name in _LEARNED},
+            "generator": self.generator.get_state(),
+            "rollouts": list(self.rollouts),
+            "pools": [{"traffic": pool.traffic._asdict(), "noise": pool.noise, "age": pool.age} for pool in self.pools],
+        }
+        partial = path.with_suffix(".partial")
+        torch.save(state, partial)
+        partial.replace(path)
+
+    def load(self, path: Path) -> None:
+        """Take up where a training was saved.
+
+        Raises:
+            ValueError: If the file is of another training.
+        """
+        state: dict[str, Any] = torch.load(path, weights_only=True)
+        if not state.keys() >= {"update", "pools", *_LEARNED}:
+            raise ValueError(f"Expected a checkpoint of a training in {str(path)!r}.")
+        self.update, self.simulated = state["update"], state["simulated"]
+        for name in _LEARNED:
+            getattr(self, name).load_state_dict(state[name])
+        self.generator.set_state(state["generator"])
+        self.rollouts.extend(state["rollouts"])
+        self.pools = [Pool(Traffic(**pool["traffic"]), pool["noise"], pool["age"]) for pool in state["pools"]]
+
+
+def _value(generator: torch.Generator) -> nn.Sequential:
+    """An estimate of the rewards to come, for GAIL."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(int(torch.randint(2**31, (), generator=generator)))
+        return nn.Sequential(
+            nn.Linear(FEATURES + ACTIONS, 128), nn.Tanh(), nn.Linear(128, 128), nn.Tanh(), nn.Linear(128, 1)
+        )
+
+
+Update = Callable[[Learner], Log]
+
+
+def train(learner: Learner, update: Update, after: Callable[[Learner, Log], None] | None = None) -> Policy:
+    """Make the updates that are left.
+
+    Args:
+        learner: The training; it may have been resumed.
+        update: One round: drive, let the critic learn, move the policy.
+        after: Called after each, for progress, logs and checkpoints.
+
+    Returns:
+        The policy after the last update: never the best of several.
+    """
+    if learner.update == 0:
+        learner.warm_up()
+    while learner.update < learner.config.updates:
+        log = update(learner)
+        learner.update += 1
+        if after is not None:
+            after(learner, log)
+    return learner.policy
+
+

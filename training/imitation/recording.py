@@ -1,0 +1,84 @@
+"""Recorded scenes as tensors, padded to one number of vehicles and ticks."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from training.data.scenes import Scene
+
+NOWHERE = -1e4
+"""x of vehicles that are not there [m]: further than any sensor reaches; each is parked apart from the others."""
+_APART = 300.0
+
+
+class Recording(NamedTuple):
+    """S scenes of at most T ticks, V vehicles and L lanes, single precision; units and frame as in `Scene`."""
+
+    x: Tensor
+    """Shape (S, T, V), as the next five; 0 where absent."""
+    y: Tensor
+    heading: Tensor
+    speed: Tensor
+    acceleration: Tensor
+    yaw_rate: Tensor
+    present: Tensor
+    """Whether a vehicle is there, boolean, shape (S, T, V)."""
+    acts: Tensor
+    """Whether its acceleration and yaw rate are known there, boolean, shape (S, T, V)."""
+    length: Tensor
+    """Shape (S, V)."""
+    width: Tensor
+    edges: Tensor
+    """Lane boundaries from left to right [m], shape (S, L + 1); beyond the last lane they repeat the last edge."""
+    ticks: Tensor
+    """Ticks of each scene, shape (S,)."""
+
+
+def stack(scenes: Sequence[Scene]) -> Recording:
+    """Put scenes side by side.
+
+    Raises:
+        ValueError: If there are none.
+    """
+    if not scenes:
+        raise ValueError("Expected at least one scene.")
+    ticks = max(scene.x.shape[0] for scene in scenes)
+    vehicles = max(scene.x.shape[1] for scene in scenes)
+    lanes = max(len(scene.edges) for scene in scenes)
+
+    def padded(name: str) -> Tensor:
+        out = np.zeros((len(scenes), ticks, vehicles), dtype=np.float32)
+        for row, scene in zip(out, scenes, strict=True):
+            values = getattr(scene, name)
+            row[: values.shape[0], : values.shape[1]] = np.nan_to_num(values)
+        return torch.from_numpy(out)
+
+    def sizes(name: str, fill: float) -> Tensor:
+        out = np.full((len(scenes), vehicles), fill, dtype=np.float32)
+        for row, scene in zip(out, scenes, strict=True):
+            row[: len(getattr(scene, name))] = getattr(scene, name)
+        return torch.from_numpy(out)
+
+    present = padded("present") > 0
+    known = np.zeros(present.shape, dtype=bool)
+    for row, scene in zip(known, scenes, strict=True):
+        whole = np.isfinite(scene.acceleration) & np.isfinite(scene.yaw_rate) & scene.present
+        row[: whole.shape[0], : whole.shape[1]] = whole
+    edges = [tuple(scene.edges) + (scene.edges[-1],) * (lanes - len(scene.edges)) for scene in scenes]
+    return Recording(
+        *(padded(name) for name in ("x", "y", "heading", "speed", "acceleration", "yaw_rate")),
+        present=present,
+        acts=torch.from_numpy(known),
+        length=sizes("length", 1.0),
+        width=sizes("width", 1.0),
+        edges=torch.tensor(edges, dtype=torch.float32),
+        ticks=torch.tensor([scene.x.shape[0] for scene in scenes]),
+    )
+
+
+def parked(like: Tensor) -> Tensor:
+    """Places x for vehicles that are not there, shape of the given tensor (..., V)."""
+    return (NOWHERE - _APART * torch.arange(like.shape[-1], dtype=like.dtype)).expand_as(like)

@@ -1,0 +1,83 @@
+"""Rollouts of a policy in recorded traffic, with the gradient through the simulator."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from agents.networks import Policy
+from training.imitation.acting import coloured, physical
+from training.imitation.penalties import Penalties, penalties
+from training.imitation.pools import Pool
+from training.imitation.recording import Recording
+from training.imitation.traffic import Traffic, detached, look, step
+
+
+class Steps(NamedTuple):
+    """n moments of driven vehicles: T ticks, each with the same vehicles in the same order."""
+
+    features: Tensor
+    """Shape (n, 51), SI units."""
+    action: Tensor
+    """Normalised, shape (n, 2)."""
+    collision: Tensor
+    """Cost, shape (n,), as the next two."""
+    edge: Tensor
+    brake: Tensor
+    noise: Tensor
+    """State of the coloured noise before the action, shape (n, 2)."""
+
+
+def roll(
+    recording: Recording,
+    policy: Policy,
+    pool: Pool,
+    ticks: int,
+    rho: Tensor,
+    credit: float,
+    generator: torch.Generator,
+) -> tuple[Steps, Pool]:
+    """Drive a pool for some ticks.
+
+    Args:
+        recording: The scenes.
+        policy: The driver of all driven vehicles: parameters are shared.
+        pool: Where to begin; its traffic carries no gradient.
+        ticks: How long.
+        rho: Autocorrelation of the noise, shape (2,).
+        credit: Share of the gradient of the state that each tick passes on to the tick before.
+        generator: Source of the noise.
+
+    Returns:
+        The moments, differentiable in the policy's weights, and the pool afterwards, which is not.
+    """
+    traffic, noise = pool.traffic, pool.noise
+    m = noise.shape[1]
+    driven = traffic.driven[:, :m]
+    unused = traffic.x.new_zeros(*traffic.x.shape[:1], traffic.x.shape[1] - m, 2)
+    rows = []
+    for _ in range(ticks):
+        features = look(traffic, m)
+        mean, log_std = policy(features)
+        before = noise
+        noise = coloured(noise, torch.randn(noise.shape, generator=generator), rho)
+        action = mean + torch.exp(log_std) * noise
+        moved = torch.cat((physical(policy, action), unused), dim=1)
+        cost = _penalties(traffic, features, moved[:, :m], m)
+        rows.append([part[driven] for part in (features, action, *cost, before)])
+        traffic = _passing(step(recording, traffic, moved), credit)
+    columns = [torch.cat(column) for column in zip(*rows, strict=True)]
+    return Steps(*columns), Pool(detached(traffic), noise, pool.age + ticks)
+
+
+def _penalties(traffic: Traffic, features: Tensor, action: Tensor, m: int) -> Penalties:
+    return penalties(traffic.x, traffic.y, traffic.length, traffic.width, traffic.edges, features, action, m)
+
+
+def _passing(traffic: Traffic, credit: float) -> Traffic:
+    """The same traffic; on the way back its gradient is multiplied by `credit`."""
+    moved = {
+        name: (value := getattr(traffic, name)) * credit + value.detach() * (1.0 - credit)
+        for name in ("x", "y", "heading", "speed")
+    }
+    return traffic._replace(**moved)
