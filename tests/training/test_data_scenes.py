@@ -5,12 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from training.data.scenes import DT, US101_FILE, Scene, load_us101_scenes, split
+from training.data.compact import SCENES
+from training.data.scenes import Scene, load_us101_scenes, split
 from training.data.smoothing import SLOWEST, motion, smooth
+from training.data.table import DT
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 needs_data = pytest.mark.skipif(
-    not (DATA / US101_FILE).is_file(), reason=f"recorded traffic is not part of the repository: {DATA} is absent"
+    not (DATA / SCENES).is_file(), reason=f"recorded traffic is not part of the repository: {DATA} is absent"
 )
 
 
@@ -125,5 +127,5 @@ def test_recorded_scenes_are_what_was_measured():
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(ValueError, match=US101_FILE):
+    with pytest.raises(ValueError, match=SCENES):
         load_us101_scenes(tmp_path)

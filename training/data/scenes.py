@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
-from pyarrow import ArrowInvalid
 
+from training.data.compact import SCENES, US101_EDGES, columns_of
 from training.data.smoothing import CUTOFF_ACROSS, CUTOFF_ALONG, motion, smooth
+from training.data.table import DT
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-DT = 0.1
-"""Time step of every scene [s]."""
-US101_FILE = "ngsim_us101_scenes.parquet"
-US101_EDGES = (0.0, 3.49, 6.87, 10.20, 13.52, 17.25, 21.0)
-"""Lane boundaries of US 101 [m], measured from the left edge of the road; the last lane only where it exists."""
 US101_ZERO = 1_118_846_980
 """Unix time [s] from which the clock of the US 101 scenes counts: 15 June 2005, 07:49:40 local."""
 US101_TEST = ((64.0, 89.0), (157.0, 194.0))
@@ -105,7 +101,7 @@ class Scene:
 
 
 def assemble(
-    name: str, start: float, edges: Sequence[float], columns: dict[str, Array], length: Array, width: Array
+    name: str, start: float, edges: Sequence[float], columns: Mapping[str, NDArray[Any]], length: Array, width: Array
 ) -> Scene:
     """Puts rows in the place that `step` and `vehicle` (column of the scene, 0 to V - 1) give them.
 
@@ -142,12 +138,7 @@ def load_us101_scenes(folder: Path | str) -> tuple[Scene, ...]:
     Raises:
         ValueError: The file is missing, cannot be read or lacks a column.
     """
-    path = Path(folder) / US101_FILE
-    try:
-        table = pq.read_table(path, columns=list(_US101_COLUMNS))
-    except (OSError, ArrowInvalid) as error:
-        raise ValueError(f"Cannot read recorded scenes from {path}: {error}") from None
-    rows = {key: table[key].to_numpy().astype(np.float64) for key in _US101_COLUMNS}
+    rows = columns_of(Path(folder) / SCENES, _US101_COLUMNS)
     usable = (rows["scene"] != 1) & (rows["lane"] <= 6)
     rows = {key: values[usable] for key, values in rows.items()}
     track_rows = np.column_stack([rows["vehicle"], rows["epoch_ms"]])
@@ -155,34 +146,39 @@ def load_us101_scenes(folder: Path | str) -> tuple[Scene, ...]:
     copy = copy.ravel()
     count = np.bincount(copy)
     x, y, length = (np.bincount(copy, rows[key]) / count for key in ("y_along", "d", "length"))
-    smoothed = smooth_tracks(keys[:, 0], keys[:, 1] / 1000.0, x - 0.5 * length, y)
+    breaks = 1 + np.flatnonzero((np.diff(keys[:, 0]) != 0) | (np.diff(keys[:, 1]) != 100))
+    smoothed = smooth_tracks(breaks, x - 0.5 * length, y)
     for key, values in smoothed.items():
         rows[key] = values[copy]
     return tuple(_us101_scene(rows, int(number)) for number in np.unique(rows["scene"]))
 
 
-def smooth_tracks(track: Array, time: Array, x: Array, y: Array, dt: float = DT) -> dict[str, Array]:
-    """Smooth states and actions of rows sorted by track and time; tracks are cut where steps are missing.
+def smooth_tracks(breaks: NDArray[np.int64], x: Array, y: Array) -> dict[str, Array]:
+    """Smooth states and actions of rows of tracks one after another.
+
+    Args:
+        breaks: Rows at which a track begins; the first need not be among them.
+        x: Along the road [m], shape (rows,).
+        y: Across the road [m], shape (rows,).
 
     Returns:
         `x`, `y`, `heading`, `speed`, `acceleration`, `yaw_rate` of each row.
     """
-    cuts = np.flatnonzero((np.diff(track) != 0) | (np.abs(np.diff(time) - dt) > 0.1 * dt)) + 1
     result = {key: np.empty(len(x)) for key in ("x", "y", "heading", "speed", "acceleration", "yaw_rate")}
-    for piece in np.split(np.arange(len(x)), cuts):
-        along, across = smooth(x[piece], CUTOFF_ALONG, dt), smooth(y[piece], CUTOFF_ACROSS, dt)
-        for key, values in zip(result, (along, across, *motion(along, across, dt)), strict=True):
+    for piece in np.split(np.arange(len(x)), breaks[breaks > 0]):
+        along, across = smooth(x[piece], CUTOFF_ALONG, DT), smooth(y[piece], CUTOFF_ACROSS, DT)
+        for key, values in zip(result, (along, across, *motion(along, across, DT)), strict=True):
             result[key][piece] = values
     return result
 
 
-def _us101_scene(rows: dict[str, Array], number: int) -> Scene:
+def _us101_scene(rows: Mapping[str, NDArray[Any]], number: int) -> Scene:
     inside = rows["scene"] == number
     scene = {key: values[inside] for key, values in rows.items()}
     first = scene["epoch_ms"].min()
     _, first_row, column = np.unique(scene["vehicle"], return_index=True, return_inverse=True)
     scene["step"], scene["vehicle"] = np.rint((scene["epoch_ms"] - first) / 100.0), column.astype(np.float64)
-    edges = US101_EDGES[: 7 if (scene["lane"] == 6).any() else 6]
+    edges = US101_EDGES if (scene["lane"] == 6).any() else US101_EDGES[:-1]
     length, width = (scene[key][first_row] for key in ("length", "width"))
     return assemble(f"us101-{number:02}", first / 1000.0 - US101_ZERO, edges, scene, length, width)
 

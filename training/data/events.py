@@ -1,0 +1,186 @@
+"""Car-following and cut-in events in a table of trajectories.
+
+The definitions are those behind the shipped `us101` distributions; docs/data.md states them in full.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from pyarrow import csv
+
+from training.data.table import DT, Trajectories
+
+Array = NDArray[np.float64]
+Events = dict[str, NDArray[Any]]
+
+SEEN = 20
+"""Frames a pair of ego and leader is seen in one lane for, at least: 2 s."""
+SETTLED = 8
+"""Frames in one lane on either side of a lane change, at least: 0.8 s."""
+LATERAL_SPAN = 5
+"""Frames over which the lateral speed is measured: 0.5 s."""
+LATERAL_SPEED = 0.2
+"""A lane change has begun when the speed across exceeds this [m/s]."""
+
+CAR_FOLLOWING = ("recording", "frame", "lane", "ego", "lead", "v_ego", "v_lead", "gap", "a_ego", "a_lead", "n")
+CUT_IN = (
+    *("recording", "frame", "phase", "vehicle", "from_lane", "to_lane", "start_seen", "v_cutin", "lateral_speed"),
+    *("ego", "v_ego", "gap_ego_cutin", "lateral_offset", "lead", "v_lead", "gap_cutin_lead"),
+)
+
+
+def car_following_events(trajectories: Trajectories) -> Events:
+    """The first frame of each pair of ego and leader that is seen in one lane for `SEEN` frames or more.
+
+    Returns:
+        Columns of `CAR_FOLLOWING`, each of shape (events,): speeds [m/s], accelerations [m/s^2], `gap` bumper to
+        bumper [m], `n` frames the pair was seen for. In the order of the table: by ego, then by time.
+    """
+    t = trajectories
+    leader = t.find(t.leader)
+    rows = np.flatnonzero(leader >= 0)
+    rows = rows[t.lane[leader[rows]] == t.lane[rows]]
+    recording = np.unique(t.recording, return_inverse=True)[1].ravel()
+    pairs = np.column_stack([recording[rows], t.vehicle[rows], t.leader[rows]])
+    _, first, n = np.unique(pairs, axis=0, return_index=True, return_counts=True)
+    seen = n >= SEEN
+    order = np.argsort(first[seen])
+    ego, n = rows[first[seen][order]], n[seen][order]
+    lead = leader[ego]
+    return {
+        "recording": t.recording[ego],
+        "frame": t.frame[ego],
+        "lane": t.lane[ego],
+        "ego": t.vehicle[ego],
+        "lead": t.vehicle[lead],
+        "v_ego": t.speed[ego],
+        "v_lead": t.speed[lead],
+        "gap": gap(t, ego, lead),
+        "a_ego": t.acceleration[ego],
+        "a_lead": t.acceleration[lead],
+        "n": n,
+    }
+
+
+def gap(trajectories: Trajectories, behind: NDArray[np.int64], before: NDArray[np.int64]) -> Array:
+    """Bumper to bumper distance between rows [m]; NaN where a row is -1."""
+    t = trajectories
+    value = t.x[before] - t.x[behind] - 0.5 * (t.length[before] + t.length[behind])
+    return np.where((behind >= 0) & (before >= 0), value, np.nan)
+
+
+def lane_changes(trajectories: Trajectories) -> NDArray[np.int64]:
+    """Rows that are the first in a neighbouring lane, `SETTLED` frames or more in one lane on either side."""
+    t = trajectories
+    new_track = np.zeros(len(t), dtype=bool)
+    new_track[t.breaks()] = True
+    runs = np.flatnonzero(new_track | np.append(True, np.diff(t.lane) != 0))
+    length = np.diff(np.append(runs, len(t)))
+    settled = (length[1:] >= SETTLED) & (length[:-1] >= SETTLED)
+    lane, before = t.lane[runs[1:]], t.lane[runs[:-1]]
+    neighbours = (np.abs(lane - before) == 1) & (lane > 0) & (before > 0)
+    crossings: NDArray[np.int64] = runs[1:][settled & neighbours & ~new_track[runs[1:]]]
+    return crossings
+
+
+def start_of(trajectories: Trajectories, crossing: int, first: int) -> tuple[int, bool]:
+    """Where the lane change that crosses at a row began, and whether that was seen.
+
+    Walking back from the crossing: the last row before the speed towards the new lane, over the `LATERAL_SPAN`
+    frames around it, fell to `LATERAL_SPEED` or less; the first row of the track (unseen) if it never did.
+    """
+    t = trajectories
+    side = np.sign(t.lane[crossing] - t.lane[crossing - 1])
+    row = crossing
+    while row - LATERAL_SPAN >= first:
+        if side * (t.y[row] - t.y[row - LATERAL_SPAN]) <= LATERAL_SPEED * LATERAL_SPAN * DT:
+            return row, True
+        row -= 1
+    return row, False
+
+
+def cut_in_events(trajectories: Trajectories) -> Events:
+    """Lane changes, each at its start and at its crossing, between the vehicles they cut in between.
+
+    Returns:
+        Columns of `CUT_IN`, each of shape (2 changes,): ego is the nearest vehicle behind in the new lane, lead the
+        nearest ahead in it, -1 and NaN where there is none; gaps bumper to bumper (negative: side by side) and the
+        lateral offset from ego [m]; `lateral_speed` towards the new lane over 0.8 s around the crossing [m/s].
+    """
+    t = trajectories
+    breaks = t.breaks()
+    crossings = lane_changes(t)
+    firsts = breaks[np.searchsorted(breaks, crossings, side="right") - 1]
+    starts = [start_of(t, int(c), int(first)) for c, first in zip(crossings, firsts, strict=True)]
+    rows = np.column_stack([crossings, [row for row, _ in starts]]).ravel().astype(np.int64)
+    change = np.repeat(crossings, 2)
+    ego, lead = _neighbours(t, rows, t.lane[change])
+    side = np.sign(t.lane[change] - t.lane[change - 1])
+    reach = SETTLED // 2
+    return {
+        "recording": t.recording[rows],
+        "frame": t.frame[rows],
+        "phase": np.tile(["crossing", "start"], len(crossings)),
+        "vehicle": t.vehicle[rows],
+        "from_lane": t.lane[change - 1],
+        "to_lane": t.lane[change],
+        "start_seen": np.repeat(np.array([seen for _, seen in starts], dtype=bool), 2),
+        "v_cutin": t.speed[rows],
+        "lateral_speed": side * (t.y[change + reach] - t.y[change - reach]) / (2 * reach * DT)
+        if len(rows)
+        else t.y[:0],
+        "ego": np.where(ego >= 0, t.vehicle[ego], -1),
+        "v_ego": np.where(ego >= 0, t.speed[ego], np.nan),
+        "gap_ego_cutin": gap(t, ego, rows),
+        "lateral_offset": np.where(ego >= 0, np.abs(t.y[rows] - t.y[ego]), np.nan),
+        "lead": np.where(lead >= 0, t.vehicle[lead], -1),
+        "v_lead": np.where(lead >= 0, t.speed[lead], np.nan),
+        "gap_cutin_lead": gap(t, rows, lead),
+    }
+
+
+def _neighbours(
+    t: Trajectories, rows: NDArray[np.int64], lane: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows of the nearest vehicles behind and ahead in a lane, by their fronts, at the frames of rows; -1: none."""
+    front = t.x + 0.5 * np.nan_to_num(t.length)
+    recording = np.unique(t.recording, return_inverse=True)[1].ravel()
+    moment = recording * (np.ptp(t.frame) + 1) + t.frame - t.frame.min()
+    order = np.argsort(moment, kind="stable")
+    low, high = (np.searchsorted(moment[order], moment[rows], side) for side in ("left", "right"))
+    behind, before = np.full(len(rows), -1), np.full(len(rows), -1)
+    for i, (row, number) in enumerate(zip(rows, lane, strict=True)):
+        others = order[low[i] : high[i]]
+        others = others[(t.lane[others] == number) & (t.vehicle[others] != t.vehicle[row])]
+        back, ahead = (others[front[others] <= front[row]], others[front[others] > front[row]])
+        if back.size:
+            behind[i] = back[np.argmax(front[back])]
+        if ahead.size:
+            before[i] = ahead[np.argmin(front[ahead])]
+    return behind, before
+
+
+EXTRACTORS = {"car_following": car_following_events, "cut_in": cut_in_events}
+"""Events that `training.fit_scenarios` fits a scenario to."""
+
+
+def pooled(parts: Sequence[Events]) -> Events:
+    """Events of several tables as one."""
+    if not parts:
+        raise ValueError("There are no events to pool: no recording was given.")
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def write_events(events: Mapping[str, NDArray[Any]], path: Path | str) -> None:
+    """Writes events as CSV, missing values as empty fields."""
+    columns = {
+        name: pa.array(np.round(values, 4) if values.dtype.kind == "f" else values, from_pandas=True)
+        for name, values in events.items()
+    }
+    csv.write_csv(pa.table(columns), path)

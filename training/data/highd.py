@@ -1,0 +1,159 @@
+"""highD recordings: `XX_tracks.csv`, `XX_tracksMeta.csv` and `XX_recordingMeta.csv`.
+
+In the files x runs to the right and y down in the drone's picture, x and y are the upper left corner of a vehicle's
+box, `width` is its extent along the road and `height` that across. Vehicles of drivingDirection 1 use the upper lanes
+and move towards -x; their coordinates are turned by half a turn, so that x always runs in the direction of travel and
+y to the right. Each direction is a recording of its own. Krajewski, Bock, Kloeker, Eckstein, "The highD dataset",
+ITSC 2018.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from training.data.reading import Gaps, Rows, check_lengths, check_tracks, read_numbers
+from training.data.table import DT, NOBODY, Trajectories, tabulate
+
+Array = NDArray[np.float64]
+
+TRACK_NAMES = {
+    "frame": ("frame",),
+    "vehicle": ("id",),
+    "x": ("x",),
+    "y": ("y",),
+    "length": ("width",),
+    "width": ("height",),
+    "vx": ("xVelocity",),
+    "vy": ("yVelocity",),
+    "acceleration": ("xAcceleration",),
+    "leader": ("precedingId",),
+}
+SIDES = {1: "upper", 2: "lower"}
+"""Lanes by drivingDirection."""
+
+
+def highd_recordings(folder: Path | str) -> tuple[str, ...]:
+    """Numbers of the recordings in a folder, such as "01".
+
+    Raises:
+        ValueError: There is none.
+    """
+    found = tuple(sorted(path.name.removesuffix("_tracks.csv") for path in Path(folder).glob("*_tracks.csv")))
+    if not found:
+        raise ValueError(f"{folder} has no files XX_tracks.csv; is it the data folder of highD?")
+    return found
+
+
+def load_highd(folder: Path | str, recording: str, *, gaps: Gaps = "error") -> Trajectories:
+    """Reads one recording as two, such as "01-upper" and "01-lower", brought from 25 Hz to 10 Hz.
+
+    Positions are interpolated by cubic splines, speeds and accelerations linearly, the leader is that of the nearest
+    frame. Lanes are counted from the left in the direction of travel, by the lane markings.
+
+    Args:
+        folder: Where the three files are.
+        recording: Its number, such as "01".
+        gaps: Where a vehicle is missing for some frames: "error", or "cut" its track there.
+
+    Raises:
+        ValueError: A file cannot be read, lacks a column or holds impossible values.
+    """
+    folder = Path(folder)
+    rate, markings = _recording_meta(folder / f"{recording}_recordingMeta.csv")
+    directions = _directions(folder / f"{recording}_tracksMeta.csv")
+    rows = read_numbers(folder / f"{recording}_tracks.csv", TRACK_NAMES)
+    direction = _direction_of(rows, directions)
+    sign = np.where(direction == 1, -1.0, 1.0)
+    check_lengths(rows, rows["length"], "metres")
+    x = sign * (rows["x"] + 0.5 * rows["length"])
+    speed = np.hypot(rows["vx"], rows["vy"])
+    check_tracks(rows, rows["vehicle"], rows["frame"], x, speed, 1.0 / rate, gaps)
+    backwards = sign * rows["vx"] < -1.0
+    if backwards.any():
+        row = int(np.argmax(backwards))
+        raise rows.error(row, f"vehicle {rows['vehicle'][row]:g} moves against its drivingDirection.")
+    values = np.column_stack(
+        [x, sign * (rows["y"] + 0.5 * rows["width"]), speed, sign * rows["acceleration"], rows["length"], rows["width"]]
+    )
+    resampled = _resample(rows["vehicle"], rows["frame"] / rate, 1.0 / rate, values, rows["leader"], direction)
+    side = resampled.pop("direction")
+    names = np.array([f"{recording}-{SIDES[number]}" for number in (1, 2)])
+    edges = {str(names[0]): tuple(-y for y in reversed(markings[0])), str(names[1]): markings[1]}
+    resampled["lane"] = np.zeros(len(side))
+    for number, name in zip((1, 2), names, strict=True):
+        mine = side == number
+        resampled["lane"][mine] = lanes_of(resampled["y"][mine], edges[str(name)])
+    present = {str(name) for name in names[np.unique(side).astype(np.int64) - 1]}
+    recordings = names[side.astype(np.int64) - 1]
+    table = {"recording": recordings, **resampled}
+    return tabulate(table, {name: edges[name] for name in sorted(present)})
+
+
+def lanes_of(y: Array, edges: tuple[float, ...]) -> NDArray[np.int64]:
+    """Lane of each position, 1 the leftmost, 0 outside."""
+    lane = np.searchsorted(np.array(edges), y, side="right")
+    return np.where(lane < len(edges), lane, 0)
+
+
+def _recording_meta(path: Path) -> tuple[float, tuple[tuple[float, ...], tuple[float, ...]]]:
+    """Frame rate [Hz] and lane markings [m] of the upper and the lower lanes, top to bottom."""
+    rows = read_numbers(
+        path,
+        {"rate": ("frameRate",), "upper": ("upperLaneMarkings",), "lower": ("lowerLaneMarkings",)},
+        text=("upper", "lower"),
+    )
+    rate = float(rows["rate"][0])
+    if rate < 1.0 / DT:
+        raise rows.error(0, f"frameRate is {rate:g}, at least {1.0 / DT:g} Hz is needed.")
+    try:
+        upper, lower = (tuple(float(y) for y in str(rows[side][0]).split(";")) for side in ("upper", "lower"))
+    except ValueError:
+        raise rows.error(0, "lane markings must be numbers separated by semicolons.") from None
+    if any(len(side) < 2 or not (np.diff(side) > 0.0).all() for side in (upper, lower)):
+        raise rows.error(0, "expected at least two lane markings on each side, increasing.")
+    return rate, (upper, lower)
+
+
+def _directions(path: Path) -> dict[int, int]:
+    rows = read_numbers(path, {"vehicle": ("id",), "direction": ("drivingDirection",)})
+    bad = ~np.isin(rows["direction"], list(SIDES))
+    if bad.any():
+        row = int(np.argmax(bad))
+        raise rows.error(row, f"drivingDirection is {rows['direction'][row]:g}, expected 1 or 2.")
+    return {int(vehicle): int(side) for vehicle, side in zip(rows["vehicle"], rows["direction"], strict=True)}
+
+
+def _direction_of(rows: Rows, directions: dict[int, int]) -> NDArray[np.int64]:
+    vehicles, index = np.unique(rows["vehicle"], return_inverse=True)
+    found = np.array([directions.get(int(vehicle), 0) for vehicle in vehicles])[index.ravel()]
+    if (found == 0).any():
+        row = int(np.argmax(found == 0))
+        raise rows.error(row, f"vehicle {rows['vehicle'][row]:g} is not in the file of tracksMeta.")
+    return found
+
+
+def _resample(
+    vehicle: Array, time: Array, dt: float, values: Array, leader: Array, direction: NDArray[np.int64]
+) -> dict[str, Array]:
+    """Tracks at multiples of `DT`, cut at their holes; `values` in the order of the names below."""
+    order = np.lexsort([time, vehicle])
+    cuts = 1 + np.flatnonzero((np.diff(vehicle[order]) != 0) | (np.diff(time[order]) > 1.5 * dt))
+    parts: list[Array] = []
+    for piece in np.split(order, cuts):
+        t = time[piece]
+        frame = np.arange(np.ceil(t[0] / DT - 1e-6), np.floor(t[-1] / DT + 1e-6) + 1.0)
+        at = np.clip(frame * DT, t[0], t[-1])
+        if not len(frame):
+            continue
+        spline = CubicSpline(t, values[piece, :2])(at) if len(t) > 3 else values[piece, :2][np.searchsorted(t, at)]
+        linear = np.column_stack([np.interp(at, t, column) for column in values[piece, 2:].T])
+        nearest = piece[np.minimum(np.rint((at - t[0]) / dt).astype(np.int64), len(t) - 1)]
+        ahead = np.where(leader[nearest] > 0, leader[nearest], NOBODY)
+        same = np.full(len(frame), vehicle[piece[0]])
+        parts.append(np.column_stack([same, frame, spline, linear, ahead, direction[nearest]]))
+    names = ("vehicle", "frame", "x", "y", "speed", "acceleration", "length", "width", "leader", "direction")
+    return dict(zip(names, np.concatenate(parts).T, strict=True))

@@ -1,0 +1,158 @@
+"""Raw NGSIM trajectories: CSV with a header, or the published text files without one.
+
+Lengths are in feet, `Global_Time` in milliseconds, positions those of the front centre; `Local_Y` runs along the road
+and `Local_X` across, to the right of the left edge of the section. Lane 1 is the leftmost. Next Generation Simulation
+(NGSIM) Vehicle Trajectories and Supporting Data, U.S. Department of Transportation, record 8ect-6jqj.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from training.data.reading import Gaps, Rows, check_lengths, check_tracks, header_of, read_numbers
+from training.data.table import NOBODY, Trajectories, tabulate
+
+Array = NDArray[np.float64]
+
+FOOT = 0.3048
+STEP = 100.0
+"""Time between frames [ms]."""
+PAUSE = 60_000.0
+"""A number that comes back after so long [ms] belongs to another vehicle: each 15 minutes were numbered anew."""
+RENUMBERED = 1_000_000
+"""Added to the number of such a vehicle, once for each time it comes back."""
+NAMES = {
+    "vehicle": ("Vehicle_ID",),
+    "time": ("Global_Time",),
+    "x_lateral": ("Local_X",),
+    "y_along": ("Local_Y",),
+    "length": ("v_Length",),
+    "width": ("v_Width",),
+    "speed": ("v_Vel",),
+    "acceleration": ("v_Acc",),
+    "lane": ("Lane_ID",),
+    "leader": ("Preceding", "Preceeding"),
+}
+LOCATION = "Location"
+_TEXT_ORDER = (0, 3, 4, 5, 8, 9, 11, 12, 13, 14)  # of NAMES, in the 18 columns of the files without a header
+_TEXT_COLUMNS = 18
+
+
+def load_ngsim(path: Path | str, *, location: str | None = None, gaps: Gaps = "error") -> Trajectories:
+    """Reads one file; the recording is named after the file, or after the location.
+
+    Args:
+        path: CSV with the published header (the order of columns does not matter, others are passed over), or text
+            with the 18 published columns and no header, separated by blanks or commas.
+        location: Which of the file's locations, such as "us-101", where it has several.
+        gaps: Where a vehicle is missing for some frames: "error", or "cut" its track there.
+
+    Returns:
+        The table, with lane boundaries estimated by `lane_edges`.
+
+    Raises:
+        ValueError: The file cannot be read, lacks a column, holds impossible values, or has several locations.
+    """
+    rows = _read(Path(path))
+    if LOCATION not in rows.columns:
+        if location is not None:
+            raise ValueError(f"{path} has no column {LOCATION}; leave location out.")
+        return _table(rows, Path(path).stem, gaps)
+    places = sorted({str(place) for place in rows[LOCATION]})
+    if location is None and len(places) > 1:
+        raise ValueError(f"{path} has the locations {', '.join(places)}; choose one with location=.")
+    if location is not None and location not in places:
+        raise ValueError(f"{path} has the locations {', '.join(places)}, not {location}.")
+    location = location or places[0]
+    return _table(rows.where(rows[LOCATION] == location), location, gaps)
+
+
+def _read(path: Path) -> Rows:
+    header = header_of(path)
+    if any(character.isalpha() for character in header[0]):
+        located = any(name.lower() == LOCATION.lower() for name in header)
+        names = NAMES | ({LOCATION: (LOCATION,)} if located else {})
+        return read_numbers(path, names, text=(LOCATION,))
+    try:
+        values = np.loadtxt(path, ndmin=2, delimiter="," if len(header) > 1 else None)
+    except ValueError as error:
+        raise ValueError(f"Cannot read {path}: {error}") from None
+    if values.shape[1] != _TEXT_COLUMNS:
+        raise ValueError(f"{path} has no header and {values.shape[1]} columns; expected the {_TEXT_COLUMNS} of NGSIM.")
+    columns = {name: values[:, place] for name, place in zip(NAMES, _TEXT_ORDER, strict=True)}
+    return Rows(path, columns, np.arange(1, 1 + len(values)))
+
+
+def _table(rows: Rows, recording: str, gaps: Gaps) -> Trajectories:
+    """Feet and milliseconds become SI units, fronts become centres."""
+    frame = np.rint(rows["time"] / STEP)
+    length, y_along, speed = (FOOT * rows[name] for name in ("length", "y_along", "speed"))
+    check_lengths(rows, length, "feet")
+    vehicle, leader = _renumbered(rows["vehicle"], rows["leader"], frame)
+    check_tracks(rows, vehicle, frame, y_along, speed, STEP / 1000.0, gaps)
+    y, lane = FOOT * rows["x_lateral"], rows["lane"].astype(np.int64)
+    columns = {
+        "recording": recording,
+        "vehicle": vehicle,
+        "frame": frame,
+        "x": y_along - 0.5 * length,
+        "y": y,
+        "speed": speed,
+        "acceleration": FOOT * rows["acceleration"],
+        "length": length,
+        "width": FOOT * rows["width"],
+        "lane": lane,
+        "leader": leader,
+    }
+    edges = lane_edges(y, lane)
+    return tabulate(columns, {recording: edges} if edges else {})
+
+
+def _renumbered(vehicle: Array, leader: Array, frame: Array) -> tuple[Array, Array]:
+    """Numbers of vehicles and leaders, with new ones for numbers that were given again after a `PAUSE`."""
+    order = np.lexsort([frame, vehicle])
+    fresh = np.append(True, np.diff(vehicle[order]) != 0)
+    again = np.append(False, (np.diff(vehicle[order]) == 0) & (np.diff(frame[order]) > PAUSE / STEP))
+    times = np.cumsum(again)
+    since = np.maximum.accumulate(np.where(fresh, np.arange(len(times)), 0))
+    number = np.empty(len(vehicle))
+    number[order] = vehicle[order] + RENUMBERED * (times - times[since])
+    unled = leader <= 0
+    if not again.any():
+        return number, np.where(unled, NOBODY, leader)
+    span = np.ptp(frame) + 1.0
+    keys, wanted = (values * span + (frame - frame.min()) for values in (vehicle, leader))
+    place = np.minimum(np.searchsorted(keys[order], wanted), len(keys) - 1)
+    known = (keys[order][place] == wanted) & ~unled
+    return number, np.where(known, number[order][place], NOBODY)
+
+
+def lane_edges(y: Array, lane: NDArray[np.int64]) -> tuple[float, ...]:
+    """Lane boundaries where the format has none: halfway between the median positions of neighbouring lanes.
+
+    The outer lanes get the width of the space to their neighbours. Lanes count from 1 as long as each lies 2.5 to
+    5 m to the right of the one before it; ramps, which lie beside each other, do not.
+
+    Args:
+        y: Across the road [m], shape (rows,).
+        lane: 1 is the leftmost.
+
+    Returns:
+        Boundaries [m], left to right; none if fewer than two lanes are found.
+    """
+    centres: list[float] = []
+    for number in range(1, int(lane.max()) + 1):
+        centre = float(np.median(y[lane == number])) if (lane == number).any() else np.nan
+        if not np.isfinite(centre) or (centres and not 2.5 <= centre - centres[-1] <= 5.0):
+            break
+        centres.append(centre)
+    if len(centres) < 2:
+        return ()
+    middle = [0.5 * (left + right) for left, right in pairwise(centres)]
+    first = centres[0] - 0.5 * (centres[1] - centres[0])
+    last = centres[-1] + 0.5 * (centres[-1] - centres[-2])
+    return (first, *middle, last)

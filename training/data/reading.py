@@ -1,0 +1,211 @@
+"""Columns of text files, and the checks every recording passes before it becomes a table.
+
+Errors name the file and the line, counted from 1 as editors do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from pyarrow import csv
+
+Array = NDArray[np.float64]
+Gaps = Literal["error", "cut"]
+
+FASTEST = 70.0
+"""Speeds above this [m/s] (252 km/h) are taken for wrong units or broken tracking."""
+FASTEST_JUMP = 100.0
+"""So are positions that move faster than this [m/s]."""
+SIZES = (2.5, 30.0)
+"""Median length of vehicles [m]; outside, lengths are not in the expected unit."""
+AGREEMENT = (0.8, 1.25)
+"""How far positions move for each metre the recorded speeds say; outside, units differ."""
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Columns of a file that remember their lines."""
+
+    path: Path
+    columns: Mapping[str, NDArray[Any]]
+    lines: NDArray[np.int64]
+    """Line of each row."""
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        return self.columns[name]
+
+    def __len__(self) -> int:
+        return len(self.lines)
+
+    def where(self, chosen: NDArray[np.bool_]) -> Rows:
+        """The chosen rows."""
+        return Rows(self.path, {name: values[chosen] for name, values in self.columns.items()}, self.lines[chosen])
+
+    def error(self, row: int, text: str) -> ValueError:
+        """An error that names the line of a row."""
+        return ValueError(f"{self.path}, line {self.lines[row]}: {text}")
+
+
+def header_of(path: Path) -> list[str]:
+    """Fields of the first line.
+
+    Raises:
+        ValueError: The file cannot be read or is empty.
+    """
+    try:
+        with path.open(encoding="utf-8-sig") as file:
+            header = [name.strip().strip('"') for name in file.readline().split(",")]
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"Cannot read {path}: {error}") from None
+    if header == [""]:
+        raise ValueError(f"{path} is empty.")
+    return header
+
+
+def read_numbers(path: Path | str, names: Mapping[str, Sequence[str]], text: Sequence[str] = ()) -> Rows:
+    """Columns of a CSV file with a header, as float64.
+
+    Args:
+        path: The file.
+        names: For each column wanted, the headers it goes by; upper and lower case are the same.
+        text: Those of the columns to give as strings instead.
+
+    Raises:
+        ValueError: The file cannot be read, is empty, lacks a column, or holds something else than a number.
+    """
+    path = Path(path)
+    header = header_of(path)
+    known = {name.lower(): i for i, name in enumerate(header)}
+    found = {name: next((known[a.lower()] for a in also if a.lower() in known), None) for name, also in names.items()}
+    missing = [names[name][0] for name, i in found.items() if i is None]
+    if missing:
+        raise ValueError(f"{path} lacks the columns {', '.join(missing)}; it has {', '.join(header)}.")
+    places = {name: f"c{i}" for name, i in found.items()}
+    wanted = sorted(set(places.values()))
+    numeric = {places[name] for name in names if name not in text}
+    reading = csv.ReadOptions(column_names=[f"c{i}" for i in range(len(header))], skip_rows=1, use_threads=False)
+    parsing = csv.ParseOptions(ignore_empty_lines=False)
+
+    def read(numbers: pa.DataType) -> pa.Table:
+        types = {name: numbers if name in numeric else pa.string() for name in wanted}
+        converting = csv.ConvertOptions(include_columns=wanted, column_types=types, strings_can_be_null=False)
+        return csv.read_csv(path, reading, parsing, converting)
+
+    try:
+        table = read(pa.float64())
+    except pa.ArrowInvalid as error:
+        try:
+            table = read(pa.string())
+        except pa.ArrowInvalid:
+            raise ValueError(f"Cannot read {path}: {error}") from None
+    if not table.num_rows:
+        raise ValueError(f"{path} has a header and no rows.")
+    columns = {name: _numbers(table[place], name in text) for name, place in places.items()}
+    rows = Rows(path, columns, np.arange(2, 2 + table.num_rows))
+    for name in (name for name in names if name not in text):
+        bad = ~np.isfinite(rows[name])
+        if bad.any():
+            row = int(np.argmax(bad))
+            value = table[places[name]][row].as_py()
+            raise rows.error(row, f"{names[name][0]} is {value!r}, a number was expected.")
+    return rows
+
+
+def _numbers(column: pa.ChunkedArray, text: bool) -> NDArray[np.float64]:
+    if text or not pa.types.is_string(column.type):
+        values: NDArray[np.float64] = column.to_numpy()
+        return values
+    return np.array([_number(value) for value in column.to_pylist()], dtype=np.float64)
+
+
+def _number(value: str) -> float:
+    try:
+        return float(value)
+    except ValueError:
+        return np.nan
+
+
+def check_tracks(rows: Rows, vehicle: Array, frame: Array, x: Array, speed: Array, dt: float, gaps: Gaps) -> None:
+    """Refuses tracks that cannot be: rows given twice, holes, impossible speeds, positions and speeds that disagree.
+
+    Args:
+        rows: The file, for its name and lines.
+        vehicle: Number, shape (rows,), like the following.
+        frame: Number of the time step in the file.
+        x: Along the road [m].
+        speed: As recorded [m/s].
+        dt: Time between frames [s].
+        gaps: What to do where a vehicle is missing for some frames: "error", or "cut" the track there.
+
+    Raises:
+        ValueError: Something of the above, with the line of its first occurrence.
+    """
+    bad = (speed < 0.0) | (speed > FASTEST)
+    if bad.any():
+        row = int(np.argmax(bad))
+        raise rows.error(row, f"speed is {speed[row]:.4g} m/s, expected 0 to {FASTEST:g}; are the units right?")
+    order = np.lexsort([frame, vehicle])
+    same = np.diff(vehicle[order]) == 0
+    step = np.diff(frame[order])
+    here, before = order[1:], order[:-1]
+
+    def first(wrong: NDArray[np.bool_]) -> tuple[int, int] | None:
+        """Row at fault and the row before it in the track."""
+        if not wrong.any():
+            return None
+        place = np.flatnonzero(wrong)[np.argmin(here[wrong])]
+        return int(here[place]), int(before[place])
+
+    if found := first(same & (step == 0)):
+        row, other = found
+        raise rows.error(
+            row, f"vehicle {vehicle[row]:g} at frame {frame[row]:g} is given twice, first in line {rows.lines[other]}."
+        )
+    if gaps == "error" and (found := first(same & (step > 1))):
+        row, other = found
+        missing = frame[row] - frame[other] - 1
+        raise rows.error(
+            row,
+            f"vehicle {vehicle[row]:g} was missing for {missing:g} frames before; "
+            "gaps='cut' goes on with a new track here.",
+        )
+    moved, said = np.abs(np.diff(x[order])), 0.5 * (speed[order][1:] + speed[order][:-1]) * dt
+    next_frame = same & (step == 1)
+    if found := first(next_frame & (moved > FASTEST_JUMP * dt)):
+        row, other = found
+        distance = abs(x[row] - x[other])
+        raise rows.error(row, f"vehicle {vehicle[row]:g} moved {distance:.4g} m in {dt:g} s; are the units right?")
+    total = said[next_frame].sum()
+    ratio = moved[next_frame].sum() / total if total > 0.0 else 1.0
+    if not AGREEMENT[0] <= ratio <= AGREEMENT[1]:
+        found = first(next_frame & (np.abs(moved - ratio * said) <= 0.5 * ratio * said + 1e-9))
+        row = found[0] if found else 0
+        raise rows.error(
+            row,
+            f"positions move {ratio:.3g} times as fast as the recorded speeds say, here and in the whole file; "
+            "are the units of length, time and speed right?",
+        )
+
+
+def check_lengths(rows: Rows, length: Array, unit: str) -> None:
+    """Refuses lengths that are not those of vehicles.
+
+    Raises:
+        ValueError: A length is not positive, or their median is outside `SIZES`.
+    """
+    if (length <= 0.0).any():
+        row = int(np.argmax(length <= 0.0))
+        raise rows.error(row, f"length of the vehicle is {length[row]:g} m.")
+    median = float(np.median(length))
+    if not SIZES[0] <= median <= SIZES[1]:
+        raise rows.error(
+            0,
+            f"the median length of vehicles is {median:.3g} m, expected {SIZES[0]:g} to {SIZES[1]:g}; "
+            f"lengths were taken to be in {unit}.",
+        )

@@ -1,0 +1,171 @@
+"""The one table of recorded trajectories that every loader makes and everything else reads."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+
+DT = 0.1
+"""Time between frames [s]."""
+NOBODY = -1
+"""Leader of a vehicle that follows nobody."""
+_METADATA = b"rare_envs.edges"
+_TYPES: dict[str, Any] = {"recording": np.str_} | dict.fromkeys(("vehicle", "frame", "lane", "leader"), np.int64)
+
+
+@dataclass(frozen=True)
+class Trajectories:
+    """Vehicles at frames, one row each, sorted by recording, vehicle and frame; every column of shape (rows,).
+
+    x runs along the road in the direction of travel, y across and positive to the right; both are those of the centre
+    of the vehicle's box.
+
+    Raises:
+        ValueError: Columns differ in length, rows are not sorted or occur twice, or values are impossible.
+    """
+
+    recording: NDArray[np.str_]
+    """Name of one carriageway recorded without a break."""
+    vehicle: Integers
+    """Number within the recording."""
+    frame: Integers
+    """Number of the time step, `DT` apart and common to the vehicles of a recording; a gap is a hole in the track."""
+    x: Array
+    """[m]"""
+    y: Array
+    """[m]; NaN where it was not recorded."""
+    speed: Array
+    """As recorded [m/s], not negative."""
+    acceleration: Array
+    """As recorded, along the road [m/s^2]; NaN where it was not recorded."""
+    length: Array
+    """[m]; NaN where it was not recorded (x is the front then)."""
+    width: Array
+    """[m]; NaN where it was not recorded."""
+    lane: Integers
+    """1 is the leftmost; 0 outside the lanes or not recorded."""
+    leader: Integers
+    """Number of the vehicle ahead in the same lane, `NOBODY` where there is none in the record."""
+    edges: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    """y of the lane boundaries of a recording, left to right [m]: lane n is between the n-th and the next."""
+
+    def __post_init__(self) -> None:
+        sizes = {name: self.column(name).shape for name in COLUMNS}
+        if len(set(sizes.values())) != 1 or len(self.vehicle.shape) != 1:
+            raise ValueError(f"Expected columns of one length, got {sizes}.")
+        if not len(self):
+            raise ValueError("A table of trajectories needs at least one row.")
+        same = (self.recording[1:] == self.recording[:-1]) & (self.vehicle[1:] == self.vehicle[:-1])
+        later = (self.recording[1:] > self.recording[:-1]) | (
+            (self.recording[1:] == self.recording[:-1]) & (self.vehicle[1:] > self.vehicle[:-1])
+        )
+        wrong = np.flatnonzero(~(later | (same & (self.frame[1:] > self.frame[:-1]))))
+        if wrong.size:
+            raise ValueError(f"Rows {wrong[0]} and {wrong[0] + 1} are not in order of recording, vehicle and frame.")
+        for name, bad in (
+            ("x", ~np.isfinite(self.x)),
+            ("speed", ~(self.speed >= 0.0)),
+            ("length", self.length <= 0.0),
+            ("width", self.width <= 0.0),
+            ("lane", self.lane < 0),
+        ):
+            if bad.any():
+                row = int(np.argmax(bad))
+                raise ValueError(f"Row {row}: {name} is {self.column(name)[row]:g}.")
+        for name, edges in self.edges.items():
+            if not (np.diff(edges) > 0.0).all():
+                raise ValueError(f"Lane boundaries of {name} must increase to the right, got {edges}.")
+
+    def __len__(self) -> int:
+        return len(self.vehicle)
+
+    def column(self, name: str) -> NDArray[Any]:
+        """A column by name."""
+        values: NDArray[Any] = getattr(self, name)
+        return values
+
+    def rows(self, chosen: NDArray[Any]) -> Trajectories:
+        """The chosen rows, as a mask or as increasing indices."""
+        return replace(self, **{name: self.column(name)[chosen] for name in COLUMNS})
+
+    @property
+    def time(self) -> Array:
+        """Clock of the recording [s]."""
+        return np.asarray(DT * self.frame, dtype=np.float64)
+
+    def breaks(self) -> NDArray[np.int64]:
+        """Rows at which a track begins: another recording, another vehicle, or the first frame after a hole."""
+        same = (self.recording[1:] == self.recording[:-1]) & (self.vehicle[1:] == self.vehicle[:-1])
+        return np.append(0, 1 + np.flatnonzero(~(same & (np.diff(self.frame) == 1))))
+
+    def find(self, vehicle: Integers) -> Integers:
+        """Rows of other vehicles of the same recording and frame, shape (rows,); -1 where there is none."""
+        recordings = np.unique(self.recording, return_inverse=True)[1].ravel()
+        vehicles, frames = np.ptp(self.vehicle) + 1, np.ptp(self.frame) + 1
+        frame = self.frame - self.frame.min()
+        keys = (recordings * vehicles + self.vehicle - self.vehicle.min()) * frames + frame
+        wanted = (recordings * vehicles + vehicle - self.vehicle.min()) * frames + frame
+        row = np.minimum(np.searchsorted(keys, wanted), len(self) - 1)
+        known = (keys[row] == wanted) & (self.vehicle[row] == vehicle)
+        return np.where(known, row, -1).astype(np.int64)
+
+
+COLUMNS = tuple(f.name for f in fields(Trajectories) if f.name != "edges")
+
+
+def tabulate(columns: Mapping[str, Any], edges: Mapping[str, tuple[float, ...]] | None = None) -> Trajectories:
+    """A table of columns in any order of rows; columns may be one number or name for all rows."""
+    size = np.shape(columns["vehicle"])
+    arrays = {name: np.broadcast_to(np.asarray(columns[name], _TYPES.get(name, np.float64)), size) for name in COLUMNS}
+    order = np.lexsort([arrays[name] for name in ("frame", "vehicle", "recording")])
+    return Trajectories(**{name: values[order] for name, values in arrays.items()}, edges=dict(edges or {}))
+
+
+def ahead(frame: Integers, lane: Integers, x: Array, recording: NDArray[Any] | None = None) -> Integers:
+    """Rows of the nearest vehicle ahead in the same lane, shape (rows,); -1 where there is none, or no lane."""
+    group = np.zeros(len(x), np.int64) if recording is None else np.unique(recording, return_inverse=True)[1].ravel()
+    order = np.lexsort([x, lane, frame, group])
+    sames = [np.diff(values[order]) == 0 for values in (lane, frame, group)]
+    result = np.full(len(x), -1, dtype=np.int64)
+    follows = np.append(sames[0] & sames[1] & sames[2] & (lane[order][1:] > 0), False)
+    result[order[follows]] = order[1:][follows[:-1]]
+    return result
+
+
+def write_trajectories(trajectories: Trajectories, path: Path | str) -> None:
+    """Writes a table as parquet, lane boundaries in its metadata."""
+    edges = json.dumps({name: list(values) for name, values in trajectories.edges.items()})
+    table = pa.table({name: pa.array(trajectories.column(name)) for name in COLUMNS})
+    pq.write_table(table.replace_schema_metadata({_METADATA: edges.encode()}), path)
+
+
+def read_trajectories(path: Path | str) -> Trajectories:
+    """Reads what `write_trajectories` wrote.
+
+    Raises:
+        ValueError: The file cannot be read, lacks a column or holds impossible values.
+    """
+    try:
+        table = pq.read_table(path)
+    except (OSError, pa.ArrowInvalid) as error:
+        raise ValueError(f"Cannot read trajectories from {path}: {error}") from None
+    missing = [name for name in COLUMNS if name not in table.column_names]
+    if missing:
+        raise ValueError(f"{path} lacks the columns {', '.join(missing)}.")
+    edges = json.loads((table.schema.metadata or {}).get(_METADATA, b"{}"))
+    try:
+        columns = {name: table[name].to_numpy() for name in COLUMNS}
+        return tabulate(columns, {name: tuple(values) for name, values in edges.items()})
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
