@@ -1,4 +1,4 @@
-"""How a policy acts in training: coloured Gaussian noise, bounds, and the likelihood of an action."""
+"""How a policy acts in training: bounds of its actions and their likelihood."""
 
 import math
 
@@ -10,11 +10,6 @@ from agents.networks import Policy
 LOW = (-8.0, -0.3)
 HIGH = (4.0, 0.3)
 """Bounds of acceleration [m/s^2] and yaw rate [rad/s]."""
-
-
-def coloured(noise: Tensor, fresh: Tensor, rho: Tensor) -> Tensor:
-    """Next value of a stationary autoregression of order 1 with unit variance; all (..., 2), rho (2,)."""
-    return rho * noise + (1.0 - rho.square()).sqrt() * fresh
 
 
 def physical(policy: Policy, action: Tensor) -> Tensor:

@@ -25,9 +25,10 @@ def clone(pairs: Pairs, config: Config, generator: torch.Generator) -> Policy:
     action = normalised(policy, pairs.action)
     for _ in range(config.epochs):
         order = torch.randperm(len(action), generator=generator)
-        for rows in order.split(config.batch):
-            loss = -log_likelihood(*policy(pairs.features[rows]), action[rows]).mean()
+        for rows in torch.split(order, config.batch):
+            mean, log_std = policy(pairs.features[rows])
+            loss = -log_likelihood(mean, log_std, action[rows]).mean()
             optimiser.zero_grad()
-            loss.backward()
+            torch.autograd.backward(loss)
             optimiser.step()
     return policy

@@ -3,7 +3,13 @@
 from dataclasses import dataclass
 from typing import Literal
 
+from agents.noise import Colour
+
 Method = Literal["bc", "gail", "mgail"]
+
+
+HUMAN = Colour.swinging(frequency=(1.70, 1.57), damping=(0.845, 0.40))
+"""The autocorrelation of what cloning leaves unexplained in the record, within 0.03 up to 1 s."""
 
 
 @dataclass(frozen=True)
@@ -34,9 +40,8 @@ class Config:
     """Ticks after which a pool starts anew from the record."""
     drivers: tuple[int, int] = (60, 60)
     """Vehicles of a scene that are driven: the curriculum over the number of agents (Bhattacharyya et al. 2018)."""
-    rho: tuple[float, float] = (0.95, 0.95)
-    """Autocorrelation of the noise of acceleration and yaw rate from tick to tick; 0 is white noise, as O'Kelly et
-    al. have it."""
+    colour: Colour = HUMAN
+    """Of the noise of acceleration and yaw rate; `Colour()` is white noise, as O'Kelly et al. have it."""
 
     # costs of the policy
     critic_weight: float = 3.0
@@ -82,8 +87,6 @@ class Config:
         for name in ("pools", "scenes", "batch", "critic_batch", "memory", "ppo_batch"):
             if getattr(self, name) < 1:
                 raise ValueError(f"Expected {name} >= 1, got {getattr(self, name)}.")
-        if not all(0.0 <= rho < 1.0 for rho in self.rho):
-            raise ValueError(f"Expected rho in [0, 1), got {self.rho}.")
 
     def along(self, ends: tuple[float, float], update: int) -> float:
         """Value of a geometric schedule at an update."""

@@ -80,6 +80,6 @@ def train_critic(
         other = torch.randint(len(made), (batch,), generator=generator)
         loss = critic_loss(critic, recorded[rows], made[other], penalty, generator)
         optimiser.zero_grad()
-        loss.backward()
+        torch.autograd.backward(loss)
         optimiser.step()
     return float(loss.detach())

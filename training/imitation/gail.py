@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from agents.networks import CLIP, Policy
+from agents.noise import Colour
 from training.imitation.acting import log_likelihood
 from training.imitation.critic import inputs, policy_cost
 from training.imitation.learner import Learner, Log
@@ -42,13 +43,13 @@ def advantages(reward: Tensor, value: Tensor, discount: float, gae: float) -> Te
     return out
 
 
-def conditional(policy: Policy, features: Tensor, noise: Tensor, rho: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and log standard deviation of an action, given the noise one tick before.
+def conditional(policy: Policy, features: Tensor, noise: Tensor, colour: Colour) -> tuple[Tensor, Tensor]:
+    """Mean and log standard deviation of actions, given the noise that was expected.
 
     Coloured noise makes actions depend on each other; given the noise before, they are independent Gaussians again.
     """
     mean, log_std = policy(features)
-    return mean + torch.exp(log_std) * rho * noise, log_std + 0.5 * torch.log1p(-rho.square())
+    return mean + torch.exp(log_std) * noise, log_std + torch.log(noise.new_tensor(colour.scale))
 
 
 def surrogate(ratio: Tensor, advantage: Tensor, clip: float) -> Tensor:
@@ -88,22 +89,22 @@ def update(learner: Learner) -> Log:
         gain = advantages(reward[:-1], expected, config.discount, config.gae)
         target = (gain + expected[:-1]).flatten()
         kept = len(target)
-        old = log_likelihood(*conditional(policy, steps.features, steps.noise, learner.rho), steps.action)[:kept]
+        old = log_likelihood(*conditional(policy, steps.features, steps.noise, config.colour), steps.action)[:kept]
     gain = gain.flatten()
     gain = (gain - gain.mean()) / gain.std().clamp(min=1e-6)
     for _ in range(config.ppo_epochs):
-        for rows in torch.randperm(kept, generator=learner.generator).split(config.ppo_batch):
-            law = conditional(policy, steps.features[rows], steps.noise[rows], learner.rho)
+        for rows in torch.split(torch.randperm(kept, generator=learner.generator), config.ppo_batch):
+            law = conditional(policy, steps.features[rows], steps.noise[rows], config.colour)
             ratio = torch.exp(log_likelihood(*law, steps.action[rows]) - old[rows])
             clone = config.along(config.clone_weight, learner.update) * learner.clone_loss()
             loss = clone - surrogate(ratio, gain[rows], config.clip).mean()
             learner.policy_optimiser.zero_grad()
-            loss.backward()
+            torch.autograd.backward(loss)
             torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
             learner.policy_optimiser.step()
             error = (value(seen[rows])[:, 0] - target[rows]).square().mean()
             learner.value_optimiser.zero_grad()
-            error.backward()
+            torch.autograd.backward(error)
             learner.value_optimiser.step()
     return {
         "reward": float(reward.mean()),

@@ -28,7 +28,7 @@ _LEARNED = ("policy", "critic", "value", "policy_optimiser", "critic_optimiser",
 
 @dataclass
 class Learner:
-    """A training under way. Everything random comes from `generator`, so that a resumed training goes on as it would."""
+    """A training under way; everything random comes from `generator`, so that a resumed one goes on as it would."""
 
     config: Config
     recording: Recording
@@ -60,11 +60,6 @@ class Learner:
         scaling = self.policy.scaling
         return (self.pairs.action - scaling.action_mean) / scaling.action_std
 
-    @property
-    def rho(self) -> Tensor:
-        """Autocorrelation of the noise, shape (2,)."""
-        return torch.tensor(self.config.rho)
-
     def now(self, ends: tuple[int, int]) -> int:
         """Value of a linear schedule of whole numbers."""
         share = min(self.update / max(self.config.anneal * self.config.updates, 1.0), 1.0)
@@ -80,7 +75,7 @@ class Learner:
             self.pools[index] = self._new_pool()
         horizon = self.now(config.horizon)
         steps, self.pools[index] = roll(
-            self.recording, self.policy, self.pools[index], horizon, self.rho, credit, self.generator
+            self.recording, self.policy, self.pools[index], horizon, config.colour, credit, self.generator
         )
         self.simulated += len(steps.features)
         return steps
@@ -88,7 +83,13 @@ class Learner:
     def _new_pool(self) -> Pool:
         config = self.config
         return fresh_pool(
-            self.recording, self.among, config.scenes, self.now(config.drivers), self.now(config.horizon), self.generator
+            self.recording,
+            self.among,
+            config.scenes,
+            self.now(config.drivers),
+            self.now(config.horizon),
+            config.colour,
+            self.generator,
         )
 
     def learn_critic(self, steps: Steps) -> float:
@@ -116,7 +117,8 @@ class Learner:
     def clone_loss(self) -> Tensor:
         """Negative log likelihood of some recorded actions."""
         rows = torch.randint(len(self.pairs.features), (self.config.batch,), generator=self.generator)
-        return -log_likelihood(*self.policy(self.pairs.features[rows]), self.recorded_action[rows]).mean()
+        mean, log_std = self.policy(self.pairs.features[rows])
+        return -log_likelihood(mean, log_std, self.recorded_action[rows]).mean()
 
     def save(self, path: Path) -> None:
         """Write everything that a resumed training needs."""
@@ -180,5 +182,3 @@ def train(learner: Learner, update: Update, after: Callable[[Learner, Log], None
         if after is not None:
             after(learner, log)
     return learner.policy
-
-

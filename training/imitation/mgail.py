@@ -28,7 +28,7 @@ def update(learner: Learner) -> Log:
         + config.along(config.clone_weight, learner.update) * clone
     )
     learner.policy_optimiser.zero_grad()
-    loss.backward()
+    torch.autograd.backward(loss)
     norm = torch.nn.utils.clip_grad_norm_(learner.policy.parameters(), 1.0)
     learner.policy_optimiser.step()
     critic = learner.learn_critic(steps)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from agents.noise import Colour
 from training.imitation.recording import Recording
 from training.imitation.traffic import Traffic, start
 
@@ -15,13 +16,19 @@ class Pool:
 
     traffic: Traffic
     noise: Tensor
-    """State of the drivers' coloured noise, shape (B, M, 2)."""
+    """Memory of the drivers' coloured noise, shape (B, M, 2, 2)."""
     age: int = 0
     """Ticks driven since the record."""
 
 
 def fresh_pool(
-    recording: Recording, among: Tensor, size: int, most: int, shortest: int, generator: torch.Generator
+    recording: Recording,
+    among: Tensor,
+    size: int,
+    most: int,
+    shortest: int,
+    colour: Colour,
+    generator: torch.Generator,
 ) -> Pool:
     """Start scenes at random moments of their records.
 
@@ -31,11 +38,12 @@ def fresh_pool(
         size: Scenes of the pool.
         most: Vehicles of a scene that are driven at most.
         shortest: Ticks of record that are left at least, if the scene is that long.
+        colour: Of the drivers' noise.
         generator: Source of scenes and moments.
     """
     scene = among[torch.randint(len(among), (size,), generator=generator)]
     last = (recording.ticks[scene] - shortest).clamp(min=1)
     tick = (torch.rand(size, generator=generator) * last).long()
     traffic = start(recording, scene, tick, most)
-    noise = torch.randn(size, traffic.drivers, 2, generator=generator)
+    noise = colour.begin(torch.randn(size, traffic.drivers, 2, 2, generator=generator))
     return Pool(traffic, noise)

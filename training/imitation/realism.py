@@ -237,7 +237,7 @@ def measure(
     steps = driven.sum() * ticks
     by_scene = tuple(
         float(crashed[:, rows].sum() / (driven[rows].sum() * ticks))
-        for scene in starts[0].unique()
+        for scene in torch.unique(starts[0])
         if driven[rows := starts[0] == scene].any()
     )
     return Realism(
@@ -264,7 +264,8 @@ def _errors(recording: Recording, traffic: Traffic, driven: Tensor) -> dict[str,
 
     def off(name: str) -> Tensor:
         record: Tensor = getattr(recording, name)[traffic.scene, at].gather(1, traffic.vehicle)
-        return (getattr(traffic, name) - record)[:, :m][known]
+        made: Tensor = getattr(traffic, name)
+        return (made - record)[:, :m][known]
 
     along, across = off("x"), off("y")
     return {"position": (along.square() + across.square()).sqrt(), "speed": off("speed"), "lateral": across}

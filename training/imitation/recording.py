@@ -69,7 +69,12 @@ def stack(scenes: Sequence[Scene]) -> Recording:
         row[: whole.shape[0], : whole.shape[1]] = whole
     edges = [tuple(scene.edges) + (scene.edges[-1],) * (lanes - len(scene.edges)) for scene in scenes]
     return Recording(
-        *(padded(name) for name in ("x", "y", "heading", "speed", "acceleration", "yaw_rate")),
+        x=padded("x"),
+        y=padded("y"),
+        heading=padded("heading"),
+        speed=padded("speed"),
+        acceleration=padded("acceleration"),
+        yaw_rate=padded("yaw_rate"),
         present=present,
         acts=torch.from_numpy(known),
         length=sizes("length", 1.0),

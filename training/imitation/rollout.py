@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from agents.networks import Policy
-from training.imitation.acting import coloured, physical
+from agents.noise import Colour
+from training.imitation.acting import physical
 from training.imitation.penalties import Penalties, penalties
 from training.imitation.pools import Pool
 from training.imitation.recording import Recording
@@ -25,7 +26,7 @@ class Steps(NamedTuple):
     edge: Tensor
     brake: Tensor
     noise: Tensor
-    """State of the coloured noise before the action, shape (n, 2)."""
+    """What the noise of the action was expected to be from the ticks before, shape (n, 2)."""
 
 
 def roll(
@@ -33,7 +34,7 @@ def roll(
     policy: Policy,
     pool: Pool,
     ticks: int,
-    rho: Tensor,
+    colour: Colour,
     credit: float,
     generator: torch.Generator,
 ) -> tuple[Steps, Pool]:
@@ -44,30 +45,30 @@ def roll(
         policy: The driver of all driven vehicles: parameters are shared.
         pool: Where to begin; its traffic carries no gradient.
         ticks: How long.
-        rho: Autocorrelation of the noise, shape (2,).
+        colour: Of the noise.
         credit: Share of the gradient of the state that each tick passes on to the tick before.
         generator: Source of the noise.
 
     Returns:
         The moments, differentiable in the policy's weights, and the pool afterwards, which is not.
     """
-    traffic, noise = pool.traffic, pool.noise
-    m = noise.shape[1]
+    traffic, memory = pool.traffic, pool.noise
+    m = memory.shape[1]
     driven = traffic.driven[:, :m]
     unused = traffic.x.new_zeros(*traffic.x.shape[:1], traffic.x.shape[1] - m, 2)
     rows = []
     for _ in range(ticks):
         features = look(traffic, m)
         mean, log_std = policy(features)
-        before = noise
-        noise = coloured(noise, torch.randn(noise.shape, generator=generator), rho)
+        expected = colour.expected(memory)
+        noise, memory = colour.next(memory, torch.randn(expected.shape, generator=generator))
         action = mean + torch.exp(log_std) * noise
         moved = torch.cat((physical(policy, action), unused), dim=1)
         cost = _penalties(traffic, features, moved[:, :m], m)
-        rows.append([part[driven] for part in (features, action, *cost, before)])
+        rows.append([part[driven] for part in (features, action, *cost, expected)])
         traffic = _passing(step(recording, traffic, moved), credit)
     columns = [torch.cat(column) for column in zip(*rows, strict=True)]
-    return Steps(*columns), Pool(detached(traffic), noise, pool.age + ticks)
+    return Steps(*columns), Pool(detached(traffic), memory, pool.age + ticks)
 
 
 def _penalties(traffic: Traffic, features: Tensor, action: Tensor, m: int) -> Penalties:
