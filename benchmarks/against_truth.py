@@ -18,7 +18,8 @@ import typer
 import rare_envs
 import samplers
 from benchmarks.truth import RESULT as TRUTH
-from samplers.ask_tell import start
+from samplers.ask_tell import Run
+from samplers.plan import checked
 
 RESULT = Path(__file__).with_name("against_truth.json")
 MONTE_CARLO_BUDGET = 100_000
@@ -62,7 +63,7 @@ def compare(row: dict[str, Any], method: str, seeds: range) -> Cell:
     """
     problem = rare_envs.DrivingProblem(row["env_id"], base=row["base"])
     max_sim = MONTE_CARLO_BUDGET if method == "mc" else None
-    started = [start(method, problem, seed=seed, max_sim=max_sim) for seed in seeds]
+    started = [Run(checked(problem, method, seed=seed, max_sim=max_sim)) for seed in seeds]
     runs = side_by_side(problem, started)
     p, truth = np.array([run.p for run in runs]), row["p"]
     error = np.hypot(p.std(ddof=1) / len(p) ** 0.5, row["standard_error"])

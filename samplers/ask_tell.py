@@ -8,10 +8,10 @@ from numpy.typing import ArrayLike
 
 from samplers.intervals import gain_over_monte_carlo
 from samplers.lane import Lane
-from samplers.ledger import Ledger, OnError
+from samplers.ledger import Ledger
 from samplers.method import Goal, Outcome, Stepping
-from samplers.plan import Plan, checked
-from samplers.problem import FloatArray, Inputs
+from samplers.plan import Plan
+from samplers.problem import FloatArray
 from samplers.progress import Listener, Monitor, Progress
 from samplers.replication import combined, combined_cov, pooled_counts
 from samplers.result import Estimate, Status
@@ -20,21 +20,6 @@ LEAST_REPLICATES = 5
 """Runs made at least where those asked for miss target_cov: fewer give a useless t interval."""
 MOST_REPLICATES = 200
 """Runs after which target_cov is given up."""
-
-
-def start(
-    method: Stepping | str,
-    problem: Inputs,
-    gamma: float = 0.0,
-    seed: int | None = None,
-    max_sim: int | None = None,
-    target_cov: float | None = None,
-    confidence: float = 0.95,
-    replicates: int = 1,
-    on_error: OnError = "raise",
-) -> "Run":
-    """Start a run; see `Method.start`."""
-    return Run(checked(problem, method, gamma, seed, max_sim, target_cov, confidence, replicates, on_error))
 
 
 class Run:
@@ -50,7 +35,7 @@ class Run:
     answer is that of the same runs one after another. Runs added for target_cov come one at a time.
 
     Args:
-        plan: The checked arguments.
+        plan: The arguments, as `checked` returns them.
         listener: Given `Progress` after every batch and every level.
     """
 

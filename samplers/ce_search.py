@@ -120,7 +120,7 @@ class Search:
             status=Status.STOPPED,
             warnings=("Stopped before the final draws: the estimate is the search's own.", *doubts(draws)),
             trace=tuple(self.trace),
-            no_outcome_share=no_outcome_share(draws.f, np.exp(draws.log_weights)),
+            no_outcome_share=no_outcome_share(draws.f, draws.log_weights),
             sample=draws.sample,
             base_draws=self.base_draws,
         )

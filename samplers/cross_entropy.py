@@ -9,32 +9,17 @@ import numpy as np
 
 from samplers.blocks import GaussianBlock, MixtureBlock, NormalBlock, Product, announced_blocks
 from samplers.ce_search import Batch, Iterate, Search
-from samplers.families import Gaussian, Mixture
-from samplers.importance import Space, doubts, draw_until, interval_of
+from samplers.checks import check_choice, check_count, check_setting, is_number
+from samplers.families import Gaussian, Law
+from samplers.importance import Space, defensive, doubts, draw_until, final_draws, interval_of
 from samplers.intervals import binomial_cov
 from samplers.levels import next_level
-from samplers.method import (
-    Goal,
-    Interrupted,
-    Method,
-    Outcome,
-    Steps,
-    check_choice,
-    check_count,
-    check_setting,
-    is_number,
-    no_outcome_share,
-)
+from samplers.method import Goal, Interrupted, Method, Outcome, Steps, no_outcome_share
 from samplers.problem import FloatArray, Inputs
 from samplers.result import Status
+from samplers.search import LEAST_BUDGET, SEARCH_SHARE
 from samplers.weights import normalised
 
-MOST_BATCHES = 100
-"""Batches of final draws after which a target c.o.v. is given up where max_sim does not say."""
-LEAST_BUDGET = 100
-"""With less than this a search is not worth its draws."""
-SEARCH_SHARE = 2 / 3
-"""Largest share of max_sim that the search may use."""
 T = TypeVar("T")
 FAMILIES = ("gaussian", "mean", "mixture", "blocks")
 
@@ -159,8 +144,11 @@ class CrossEntropy(Method):
         best = search.best(self.choice)
         if search.status is Status.STOPPED:
             return search.outcome(space)
-        sampler = base if common or best is None else self._defensive(base, best.proposal)
-        limit = self._limit(goal, search.n_sim)
+        sampler: Law = base
+        if best is not None and not common:
+            wide = best.proposal.widened(self.wide_factor)
+            sampler = defensive(base, wide, best.proposal, self.base_share, self.wide_share)
+        limit = final_draws(goal, search.n_sim, self.n_final)
         draws, final, stopped = yield from draw_until(inputs, sampler, goal, limit, self.n_final, rng, space)
         if draws.n == 0:
             return search.outcome(space)
@@ -174,7 +162,7 @@ class CrossEntropy(Method):
             status=Status.STOPPED if stopped else status,
             warnings=tuple(([] if reached else [search_ended(best, search.status)]) + doubts(draws)),
             trace=(*search.trace, *final),
-            no_outcome_share=no_outcome_share(draws.f, np.exp(draws.log_weights)),
+            no_outcome_share=no_outcome_share(draws.f, draws.log_weights),
             sample=draws.sample,
             base_draws=search.base_draws + int(base_share * draws.n),
         )
@@ -190,12 +178,6 @@ class CrossEntropy(Method):
         else:
             base = Product((GaussianBlock(law) if self.family == "gaussian" else NormalBlock(law),))
         return base, Space(base, inputs.base.from_standard_normal)
-
-    def _limit(self, goal: Goal, spent: int) -> int:
-        """Return how many final draws may be made."""
-        if goal.max_sim is not None:
-            return goal.max_sim - spent
-        return self.n_final * (1 if goal.target_cov is None else MOST_BATCHES)
 
     def _search(
         self, base: Product, space: Space, goal: Goal, rng: np.random.Generator
@@ -238,13 +220,6 @@ class CrossEntropy(Method):
         if self.likelihood_ratio == "joint":
             log_ratios = np.broadcast_to(log_ratios.sum(axis=0), log_ratios.shape)
         return proposal.moved(elite, np.stack([normalised(ratios) for ratios in log_ratios]), alpha)
-
-    def _defensive(self, base: Product, proposal: Product) -> Mixture:
-        """Return the law of the final draws; its density is at least base_share of the base."""
-        if self.wide_share == 0:
-            return Mixture(np.array([self.base_share, 1 - self.base_share]), [base, proposal])
-        shares = [self.base_share, self.wide_share]
-        return Mixture(np.array([*shares, 1 - sum(shares)]), [base, proposal.widened(self.wide_factor), proposal])
 
 
 def several(setting: T | tuple[T, ...]) -> tuple[T, ...]:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from samplers.components import Component
 from samplers.problem import FloatArray
 
-LOWEST = (0.5, 0.25)
+LEAST_PASSED = (0.5, 0.25)
 """Shares of the draws that may be kept where the classifier sees no failure."""
 WORTH = 0.9
 """A gate is used where it promises less than this of the variance without it."""
@@ -37,7 +37,7 @@ class Gate:
         return np.asarray(np.maximum(np.exp(-0.5 * np.logaddexp(0.0, -odds)), self.lowest))
 
 
-def kept(component: Component, n: int, gate: Gate, rng: np.random.Generator) -> FloatArray:
+def draw_through(gate: Gate, component: Component, n: int, rng: np.random.Generator) -> FloatArray:
     """Draw n points (n, d) of a component that pass the gate, by rejection."""
     parts, missing = [component.sample(0, rng)], n
     while missing > 0:
@@ -76,10 +76,10 @@ def learned_gate(
     w = np.where(fails_new, np.exp(log_weights - log_weights[fails_new].max()), 0.0)
     mean, square = float(w.mean()), w * w
     best, least = None, WORTH * (float(square.mean()) - mean**2)
-    for lowest in LOWEST:
+    for lowest in LEAST_PASSED:
         gate = Gate(classifier, intercept, slope, lowest)
-        kept = gate(u_new)
-        variance = float((square / kept).mean()) * float(kept.mean()) - mean**2
+        passed = gate(u_new)
+        variance = float((square / passed).mean()) * float(passed.mean()) - mean**2
         if variance < least:
             best, least = lowest, variance
     if best is None:

@@ -5,9 +5,9 @@ import math
 import numpy as np
 
 from samplers.components import Component, log_ratios, mixed
-from samplers.exploration import Batch
 from samplers.importance import Draws
 from samplers.problem import FloatArray, Inputs
+from samplers.simulator import Batch
 
 
 class History:

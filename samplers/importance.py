@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from samplers.families import Gaussian, Law
+from samplers.families import Gaussian, Law, Mixture
 from samplers.intervals import Interval, clopper_pearson, log_normal
 from samplers.method import Goal, Interrupted, Sample
 from samplers.problem import FloatArray, Inputs
@@ -21,6 +21,8 @@ from samplers.weights import effective_sample_size, largest_share
 MANY_ESS = 200
 """From this effective number of failing points on, normal quantiles serve; below, t quantiles."""
 LOW_ESS = 30
+MOST_BATCHES = 100
+"""Batches of final draws after which a target c.o.v. is given up where max_sim does not say."""
 LARGE_SHARE = 0.15
 
 
@@ -167,6 +169,23 @@ def draw_until(
         if goal.target_cov is not None and draws.cov <= goal.target_cov:
             break
     return draws, trace, False
+
+
+def defensive(base: Law, wide: Law, proposal: Law, base_share: float, wide_share: float) -> Mixture:
+    """Return base_share of the base law + wide_share (may be 0) of a widened proposal + the rest proposal.
+
+    Its density is at least base_share of the base, so that no weight exceeds 1 / base_share.
+    """
+    if wide_share == 0:
+        return Mixture(np.array([base_share, 1 - base_share]), [base, proposal])
+    return Mixture(np.array([base_share, wide_share, 1 - (base_share + wide_share)]), [base, wide, proposal])
+
+
+def final_draws(goal: Goal, spent: int, n_final: int) -> int:
+    """Return how many final draws may be made after a search, in batches of n_final."""
+    if goal.max_sim is not None:
+        return goal.max_sim - spent
+    return n_final * (1 if goal.target_cov is None else MOST_BATCHES)
 
 
 def interval_of(draws: Draws, confidence: float, largest_weight: float, cov: float | None = None) -> Interval:

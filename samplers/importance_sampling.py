@@ -7,20 +7,12 @@ from typing import ClassVar
 
 import numpy as np
 
+from samplers.checks import check_count, check_setting
 from samplers.families import Law, Mixture
 from samplers.importance import doubts, draw_until, interval_of
 from samplers.intervals import binomial_cov
 from samplers.levels import next_level
-from samplers.method import (
-    Goal,
-    Interrupted,
-    Method,
-    Outcome,
-    Steps,
-    check_count,
-    check_setting,
-    no_outcome_share,
-)
+from samplers.method import Goal, Interrupted, Method, Outcome, Steps, no_outcome_share
 from samplers.problem import FloatArray, Inputs, StandardNormal
 from samplers.result import Level, Status
 from samplers.search import LEAST_BUDGET, SEARCH_SHARE, Round, Search, described, pooled, search_ended
@@ -146,7 +138,7 @@ class ImportanceSampling(Method):
             status=status if len(draws.f) or stopped else Status.NO_HITS,
             warnings=(*_about(search.status, misled), *_about_stop(status, cov, target), *doubts(draws)),
             trace=(*search.trace, *trace),
-            no_outcome_share=no_outcome_share(draws.f, np.exp(draws.log_weights)) if len(draws.f) else 0.0,
+            no_outcome_share=no_outcome_share(draws.f, draws.log_weights),
             sample=draws.sample,
             base_draws=base_draws,
         )

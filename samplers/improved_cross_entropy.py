@@ -8,30 +8,19 @@ from typing import ClassVar, Literal
 import numpy as np
 from scipy.special import log_ndtr
 
-from samplers.families import Law, Mixture
+from samplers.checks import check_choice, check_count, check_setting
+from samplers.families import Law
 from samplers.fitting import Proposal, mixture_of, shrunk_gaussian, widened
-from samplers.importance import doubts, draw_until, interval_of
+from samplers.importance import defensive, doubts, draw_until, final_draws, interval_of
 from samplers.importance_sampling import Tilted
 from samplers.intervals import binomial_cov
-from samplers.method import (
-    Goal,
-    Interrupted,
-    Method,
-    Outcome,
-    Steps,
-    check_choice,
-    check_count,
-    check_setting,
-    no_outcome_share,
-)
+from samplers.method import Goal, Interrupted, Method, Outcome, Steps, no_outcome_share
 from samplers.problem import FloatArray, Inputs
 from samplers.result import Level, Status
 from samplers.search import LEAST_BUDGET, SEARCH_SHARE, Round, Search, described, pooled, search_ended
 from samplers.vmfn import Vmfn
 from samplers.weights import normalised
 
-MOST_BATCHES = 100
-"""Batches of final draws after which a target c.o.v. is given up where max_sim does not say."""
 WIDEST = 10.0
 NARROWEST = 1e-15
 """Smoothing widths that are looked at, in units of the scale of f."""
@@ -66,9 +55,10 @@ class ImprovedCrossEntropy(Method):
     - *Wide draws* are ours: a Gaussian fitted to failures beyond a plane falls off sideways and outwards as
       fast as they do or faster, and the weights there would be heavy.
     - *sigma* is sought by halving intervals of its logarithm, between 1e-15 and 10 times the median of
-      |f - gamma|; the code minimises |c.o.v. - target| over sigma itself, from a first width of 50 times
-      the mean of f, which an outlier or a negative mean spoils. f may be infinite: +inf has weight 0
-      at any finite width. Ties and a cap of f are no difficulty, since no quantile is taken.
+      |f - gamma|; the code minimises |c.o.v. - target| over sigma itself, from a first width of 10 times
+      the mean of f (`sigma_t(1) = 10*mean(geval)` in iCE_SG, iCE_GM and iCE_vMFNM), which an outlier or a
+      negative mean spoils. f may be infinite: +inf has weight 0 at any finite width. Ties and a cap of f are
+      no difficulty, since no quantile is taken.
     - *Components.* The code starts with a given number and drops the small ones. Ours takes the number
       with the best Bayesian information criterion, up to `components`.
     - *Covariances* are shrunk towards I but for the direction of the mean (`shrunk_gaussian`), which
@@ -127,9 +117,10 @@ class ImprovedCrossEntropy(Method):
         base, largest = Tilted(np.zeros(inputs.dim)), 1.0
         sampler: Law = base
         if proposal is not None:
-            sampler = self._defensive(base, proposal)
+            wide = widened(proposal, self.wide_factor)
+            sampler = defensive(base, wide, proposal, self.base_share, self.wide_share)
             largest = 1 / self.base_share
-        limit = 0 if search.status is Status.STOPPED else self._limit(goal, search.n_sim)
+        limit = 0 if search.status is Status.STOPPED else final_draws(goal, search.n_sim, self.n_final)
         draws, trace, stopped = yield from draw_until(inputs, sampler, goal, limit, self.n_final, rng)
         base_draws = search.base_draws + int(draws.n / largest)
         if draws.n == 0:  # stopped before the first batch
@@ -143,21 +134,10 @@ class ImprovedCrossEntropy(Method):
             status=status,
             warnings=(*search_ended(search.status), *doubts(draws)),
             trace=(*search.trace, *trace),
-            no_outcome_share=no_outcome_share(draws.f, np.exp(draws.log_weights)) if len(draws.f) else 0.0,
+            no_outcome_share=no_outcome_share(draws.f, draws.log_weights),
             sample=draws.sample,
             base_draws=base_draws,
         )
-
-    def _defensive(self, base: Law, proposal: Proposal) -> Mixture:
-        """Return the law of the final draws; its density is at least base_share of the base."""
-        shares = [self.base_share, self.wide_share]
-        return Mixture(np.array([*shares, 1 - sum(shares)]), [base, widened(proposal, self.wide_factor), proposal])
-
-    def _limit(self, goal: Goal, spent: int) -> int:
-        """Return how many final draws may be made."""
-        if goal.max_sim is not None:
-            return goal.max_sim - spent
-        return self.n_final * (1 if goal.target_cov is None else MOST_BATCHES)
 
     def _search(
         self, inputs: Inputs, goal: Goal, rng: np.random.Generator

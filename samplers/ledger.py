@@ -13,7 +13,7 @@ ON_ERROR: tuple[str, ...] = get_args(OnError)
 
 NO_OUTCOME = -np.inf
 """What a method sees for a row without an outcome (counted as failing, on_error not "raise")."""
-LOWEST = float(np.finfo(np.float64).min)
+LEAST_FLOAT = float(np.finfo(np.float64).min)
 """What a method sees for an f of -inf, so that NO_OUTCOME keeps its meaning."""
 KEEP_FAILURES = 1000
 
@@ -59,7 +59,7 @@ class Ledger:
         self.n_sim += len(x)
         self.n_errors += int(missing.sum())
         self._remember(x, f, missing | (f <= self._gamma))
-        return np.where(missing, NO_OUTCOME, np.maximum(f, LOWEST))
+        return np.where(missing, NO_OUTCOME, np.maximum(f, LEAST_FLOAT))
 
     def _remember(self, x: FloatArray, f: FloatArray, failing: NDArray[np.bool_]) -> None:
         if failing.any():

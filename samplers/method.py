@@ -4,13 +4,14 @@ import math
 import sys
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Protocol, TypeGuard, runtime_checkable
+from typing import TYPE_CHECKING, ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from samplers.problem import FloatArray, Inputs
 from samplers.result import Level, Status
+from samplers.weights import normalised
 
 if TYPE_CHECKING:
     from samplers.ask_tell import Run
@@ -167,43 +168,15 @@ class Method(Stepping, Protocol):
         Raises:
             ValueError: If an argument is not as described in `estimate`.
         """
-        from samplers.ask_tell import start  # which imports this module
+        from samplers.ask_tell import Run  # which imports this module
+        from samplers.plan import checked
 
-        return start(self, problem, gamma, seed, max_sim, target_cov, confidence, replicates, on_error)
+        return Run(checked(problem, self, gamma, seed, max_sim, target_cov, confidence, replicates, on_error))
 
 
-def no_outcome_share(f: FloatArray, weights: FloatArray | None = None) -> float:
+def no_outcome_share(f: FloatArray, log_weights: FloatArray | None = None) -> float:
     """Return the (weighted) share of points without an outcome, f = -inf, among f (k,)."""
-    if f.size == 0:
+    missing = np.isneginf(f)
+    if not missing.any():
         return 0.0
-    return float(np.average(np.isneginf(f), weights=weights))
-
-
-def is_number(value: object) -> TypeGuard[float]:
-    """Return whether value is a real number (a bool is none) that a float can hold."""
-    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
-        return False
-    return not isinstance(value, int) or abs(value) <= sys.float_info.max
-
-
-def check_setting(
-    method: str, name: str, value: object, low: float, high: float, *, or_equal_high: bool = False
-) -> None:
-    """Raise a ValueError unless value is a number with low < value < high (or value = high, if that is allowed)."""
-    if is_number(value) and (low < value < high or (or_equal_high and value == high)):
-        return
-    sign = "<=" if or_equal_high else "<"
-    raise ValueError(f"{method}: expected a number {low:g} < {name} {sign} {high:g}, got {value!r}.")
-
-
-def check_choice(method: str, name: str, value: object, choices: tuple[str, ...]) -> None:
-    """Raise a ValueError unless value is one of the choices."""
-    if not isinstance(value, str) or value not in choices:
-        wanted = " or ".join(f'"{choice}"' for choice in choices)
-        raise ValueError(f"{method}: expected {name} {wanted}, got {value!r}.")
-
-
-def check_count(method: str, name: str, value: object, least: int) -> None:
-    """Raise a ValueError unless value is a whole number of at least `least`."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-        raise ValueError(f"{method}: expected {name} to be a whole number of at least {least}, got {value!r}.")
+    return float(missing.mean() if log_weights is None else normalised(log_weights)[missing].sum())

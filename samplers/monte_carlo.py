@@ -6,8 +6,9 @@ from typing import ClassVar
 
 import numpy as np
 
+from samplers.checks import check_count
 from samplers.intervals import binomial_cov, clopper_pearson
-from samplers.method import Goal, Interrupted, Method, Outcome, Sample, Steps, check_count, no_outcome_share
+from samplers.method import Goal, Interrupted, Method, Outcome, Sample, Steps, no_outcome_share
 from samplers.problem import FloatArray, Inputs
 from samplers.result import Level, Status
 

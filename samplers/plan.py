@@ -6,10 +6,11 @@ from typing import cast
 
 import numpy as np
 
+from samplers.checks import check_name, check_number, check_whole
 from samplers.ledger import ON_ERROR, OnError
-from samplers.method import Goal, Stepping, is_number
-from samplers.problem import Distribution, Inputs, check_dim
-from samplers.registry import check_name, get_method
+from samplers.method import Goal, Stepping
+from samplers.problem import Distribution, Inputs
+from samplers.registry import get_method
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,15 +36,15 @@ class InputsOnly:
 def checked(
     problem: Inputs,
     method: Stepping | str,
-    gamma: float,
-    seed: int | None,
-    max_sim: int | None,
-    target_cov: float | None,
-    confidence: float,
-    replicates: int,
-    on_error: str,
+    gamma: float = 0.0,
+    seed: int | None = None,
+    max_sim: int | None = None,
+    target_cov: float | None = None,
+    confidence: float = 0.95,
+    replicates: int = 1,
+    on_error: str = "raise",
 ) -> Plan:
-    """Return the arguments as a plan; a seed is drawn where there is none.
+    """Return the arguments as a plan; a seed is drawn where there is none. The defaults are those of `estimate`.
 
     Raises:
         ValueError: If an argument is not as described in `estimate`; it says what was expected.
@@ -89,25 +90,12 @@ def check_problem(problem: object, needed: tuple[str, ...]) -> None:
                 f"without {name}; FunctionProblem(f, dim) wraps a function."
             )
     inputs = cast(Inputs, problem)
-    check_dim(inputs.dim)
+    check_whole("dim", inputs.dim, 1)
     if not isinstance(inputs.base, Distribution):
         raise ValueError(
             "Expected problem.base to have sample, log_prob, to_standard_normal and "
             f"from_standard_normal, got {type(inputs.base).__name__}."
         )
-
-
-def check_number(name: str, value: object, low: float, high: float) -> None:
-    """Raise a ValueError unless value is a number between low and high, both excluded."""
-    if not is_number(value) or not low < value < high:
-        between = "a finite number" if low == -math.inf else f"a number between {low:g} and {high:g}"
-        raise ValueError(f"Expected {name} to be {between}, got {value!r}.")
-
-
-def check_whole(name: str, value: object, least: int) -> None:
-    """Raise a ValueError unless value is a whole number of at least `least`."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-        raise ValueError(f"Expected {name} to be a whole number of at least {least}, got {value!r}.")
 
 
 def _fresh_seed() -> int:

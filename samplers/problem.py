@@ -10,6 +10,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from samplers.checks import check_whole
+
 FloatArray = NDArray[np.float64]
 LOG_TWO_PI = float(np.log(2 * np.pi))
 
@@ -94,7 +96,7 @@ class FunctionProblem:
         """Check the two arguments."""
         if not callable(self.f):
             raise ValueError(f"Expected f to be a function of an (n, d) array, got {self.f!r}.")
-        check_dim(self.dim)
+        check_whole("dim", self.dim, 1)
 
     @property
     def base(self) -> StandardNormal:
@@ -104,9 +106,3 @@ class FunctionProblem:
     def evaluate(self, x: FloatArray) -> FloatArray:
         """Call f on the rows of x (n, d); return its values as float64."""
         return np.asarray(self.f(x), dtype=np.float64)
-
-
-def check_dim(dim: object) -> None:
-    """Raise a ValueError unless dim is a positive whole number."""
-    if isinstance(dim, bool) or not isinstance(dim, int | np.integer) or dim < 1:
-        raise ValueError(f"Expected dim to be a whole number of at least 1, got {dim!r}.")

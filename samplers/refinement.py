@@ -6,13 +6,14 @@ from scipy.special import log_ndtr
 
 from samplers.bumps import HIGH_DIM, Points, clipped, fitted, refitted
 from samplers.components import Bump, Shell, Slice, Wide, log_ratios
-from samplers.exploration import MOST_REGIONS, Batch, Found, Region
 from samplers.gate import Gate, learned_gate
 from samplers.history import History
 from samplers.planes import beyond
 from samplers.problem import FloatArray
 from samplers.proposal import NO_REGION, Candidate, Proposal
+from samplers.regions import MOST_REGIONS, Found, Region
 from samplers.second_moment import Floor, least_variance, with_floors
+from samplers.simulator import Batch
 
 BASE_FLOOR = 0.05
 """Share of base draws: no weight exceeds 1 / BASE_FLOOR."""
@@ -89,12 +90,12 @@ class Refinement:
         u, log_w = self._smoothed() if self._noisy else (self._history.u, self._history.log_weights)
         log_r = log_ratios([candidate.component for candidate in candidates], u)
         weights = least_variance(log_r, log_w, weights, floors)
-        kept = kinds == "base"
+        stays = kinds == "base"
         if not last:
             explored = np.isin(kinds, ["first", "plane"])
             weights = np.where(explored, np.maximum(weights, KEPT), weights)
-            kept = kept | explored
-        weights = np.where((weights < SMALLEST) & ~kept, 0.0, weights)
+            stays = stays | explored
+        weights = np.where((weights < SMALLEST) & ~stays, 0.0, weights)
         proposal = Proposal(candidates, with_floors(weights / weights.sum(), floors))
         gate = self._gate() if last and not self._noisy and self._dim <= HIGH_DIM else None
         return proposal if gate is None else proposal.behind(gate, self._rng)

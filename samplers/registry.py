@@ -1,6 +1,5 @@
 """The methods by the names that the command line uses, those of other packages included."""
 
-import difflib
 import inspect
 import warnings
 from collections.abc import Iterator, Mapping
@@ -8,6 +7,7 @@ from functools import cached_property
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, cast
 
+from samplers.checks import check_name
 from samplers.cross_entropy import CrossEntropy
 from samplers.importance_sampling import ImportanceSampling
 from samplers.improved_cross_entropy import ImprovedCrossEntropy
@@ -91,15 +91,6 @@ def get_method(name: str, **settings: Any) -> Stepping:
     for setting in settings:
         check_name(f"setting of {cls.__name__}", setting, list(inspect.signature(cls).parameters))
     return cls(**settings)
-
-
-def check_name(kind: str, name: object, valid: list[str]) -> None:
-    """Raise a ValueError that suggests the nearest valid name unless `name` is one."""
-    if isinstance(name, str) and name in valid:
-        return
-    near = difflib.get_close_matches(str(name), valid, n=1)
-    hint = f" Did you mean {near[0]!r}?" if near else ""
-    raise ValueError(f"Unknown {kind} {name!r}.{hint} Valid: {', '.join(valid)}.")
 
 
 def _loaded(entry: EntryPoint) -> type[Stepping]:

@@ -6,10 +6,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from samplers.ask_tell import Run
+from samplers.checks import check_number
 from samplers.guarded import Guarded
 from samplers.ledger import OnError
 from samplers.method import Stepping
-from samplers.plan import check_number, check_problem, checked
+from samplers.plan import check_problem, checked
 from samplers.problem import Problem
 from samplers.progress import Listener, Progress, listening
 from samplers.result import Estimate

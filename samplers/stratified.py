@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from samplers.exploration import Batch
 from samplers.importance import Draws
 from samplers.method import Sample
 from samplers.problem import FloatArray, Inputs
 from samplers.proposal import Proposal
+from samplers.simulator import Batch
 
 FEWEST = 10
 """Components with fewer draws than this are one stratum."""

@@ -6,9 +6,10 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
+from samplers.checks import check_choice, check_count, check_setting
 from samplers.descent import Descent
 from samplers.kernels import FixedMetropolis, ScaledKernel
-from samplers.method import Goal, Method, Steps, check_choice, check_count, check_setting
+from samplers.method import Goal, Method, Steps
 from samplers.problem import Inputs
 
 

@@ -7,17 +7,19 @@ from typing import ClassVar
 
 import numpy as np
 
+from samplers.checks import check_count
 from samplers.cross_checks import against_base_draws, against_rounds, regions_lost
-from samplers.exploration import Batch, Simulator, Sizes, first_draws, regions_of
+from samplers.exploration import Sizes, first_draws, regions_of
 from samplers.history import History
 from samplers.importance import Draws, doubts, interval_of
 from samplers.intervals import binomial_cov
-from samplers.method import Goal, Interrupted, Method, Outcome, Steps, check_count, no_outcome_share
+from samplers.method import Goal, Interrupted, Method, Outcome, Steps, no_outcome_share
 from samplers.monte_carlo import equal_draws, share_of_failures
 from samplers.problem import FloatArray, Inputs
 from samplers.proposal import Proposal
 from samplers.refinement import BASE_FLOOR, Refinement
 from samplers.result import Level, Status
+from samplers.simulator import Batch, Simulator
 from samplers.stratified import Strata
 from samplers.weights import effective_sample_size
 
@@ -47,8 +49,11 @@ class TwoStage(Method):
        for the base law, for tempered bumps (which bound weights where a bump is a bad description) and for each
        region. In up to 40 dimensions a classifier then thins the last mixture where it sees no failure (`gate.py`).
     3. *Estimate* (`stratified.py`): fresh draws from the last mixture, stratified by component, and nothing else:
-       given the first two stages p-hat is unbiased. (Reusing the draws of earlier rounds, as adaptive multiple
-       importance sampling does, biases p by some per cent and makes its intervals too short.)
+       given the first two stages p-hat is unbiased, but for two things. Behind a classifier the weights rest on the
+       shares of draws that it lets through; these are found by draws that are not simulated, and their error, some
+       tenths of a per cent, is the same for all weights of a component (the c.o.v. holds it, `Proposal.mass_cov`).
+       And with a target c.o.v. the draws end where they say so. (Reusing the draws of earlier rounds, as adaptive
+       multiple importance sampling does, biases p by some per cent and makes its intervals too short.)
 
     Everything happens in standard normal space, so that wide draws stay within the support of the parameters.
     f is asked for in 35 to 60 batches. Regression of f and subset simulation apart, f is used by its sign only.
@@ -229,7 +234,7 @@ class _Run:
             status=Status.CONVERGED if len(draws.f) else Status.NO_HITS,
             warnings=tuple(doubts(draws)),
             trace=self._closed_trace(),
-            no_outcome_share=no_outcome_share(draws.f, np.exp(draws.log_weights)),
+            no_outcome_share=no_outcome_share(draws.f, draws.log_weights),
             base_draws=self._n_base,
         )
 

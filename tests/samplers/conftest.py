@@ -2,13 +2,13 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-import sklearn.linear_model  # noqa: F401
-import sklearn.svm  # noqa: F401  (its import draws from the global generator, which methods must not)
 
 import samplers
+from samplers.method import Interrupted
 
 
 class Recorder:
@@ -51,6 +51,13 @@ class Study:
         return float(np.mean([result.cov for result in self.results]))
 
 
+class Driven(NamedTuple):
+    """What steps returned, and all outcomes that they were sent."""
+
+    value: Any
+    f: np.ndarray
+
+
 @pytest.fixture
 def rng() -> np.random.Generator:
     return np.random.default_rng(20240917)
@@ -59,6 +66,24 @@ def rng() -> np.random.Generator:
 @pytest.fixture
 def recorder() -> type[Recorder]:
     return Recorder
+
+
+@pytest.fixture
+def drive() -> Callable[..., Driven]:
+    def run(steps, problem, interrupt_at=None) -> Driven:
+        """Answer the points that steps yield; interrupt in place of the batch of that number, counted from 0."""
+        f = []
+        try:
+            x = next(steps)
+            while len(f) != interrupt_at:
+                f.append(problem.evaluate(x))
+                x = steps.send(f[-1])
+            steps.throw(Interrupted())
+        except StopIteration as end:
+            return Driven(end.value, np.concatenate(f))
+        raise AssertionError("expected an outcome after an interruption")
+
+    return run
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import samplers
-from samplers.ask_tell import shares, start
+from samplers.ask_tell import shares
 from samplers.ledger import EvaluationError
 from samplers.reference import half_space
 
@@ -27,7 +27,7 @@ def finished(run, f=EASY.f):
 @pytest.mark.parametrize("options", [{}, {"replicates": 3}, {"max_sim": 3000}], ids=str)
 def test_gives_what_estimate_gives(method, options):
     chosen = samplers.get_method(method)
-    told = finished(start(chosen, Places(), seed=3, **options))
+    told = finished(chosen.start(Places(), seed=3, **options))
     assert told == samplers.estimate(EASY, chosen, seed=3, **options)
 
 

@@ -4,23 +4,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from samplers.exploration import (
-    BISECTIONS,
-    MOST_CLONES,
-    MOST_REGIONS,
-    Simulator,
-    Sizes,
-    _clones,
-    _descend,
-    _drawn_in,
-    _same_region,
-    _some,
-    _walk,
-    first_draws,
-    regions_of,
-)
+from samplers.exploration import BISECTIONS, Sizes, _descend, _drawn_in, _some, first_draws, regions_of
 from samplers.problem import FunctionProblem
 from samplers.reference import four_branches, plateau, shell
+from samplers.regions import MOST_CLONES, MOST_REGIONS, _clones, _same_region, _walk
+from samplers.simulator import Simulator
 
 
 def half_spaces(dim, *betas):

@@ -6,7 +6,7 @@ from scipy import stats
 
 import samplers
 from samplers.importance_sampling import Tilted, far_share
-from samplers.method import Goal, Interrupted
+from samplers.method import Goal
 from samplers.problem import FunctionProblem, StandardNormal
 from samplers.reference import four_branches, half_space, parabola, plateau
 from samplers.result import Status
@@ -23,16 +23,11 @@ def test_a_tilt_of_the_standard_normal_law_is_a_shift(rng):
     np.testing.assert_allclose(tilted.sample(20_000, rng).mean(axis=0), theta, atol=0.04)
 
 
-def test_the_tilt_is_the_mean_of_the_failures():
+def test_the_tilt_is_the_mean_of_the_failures(drive):
     """For a half-space at beta that is phi(beta) / Phi(-beta) along its normal."""
     reference = half_space(2, 3.0)
     steps = IS(n_round=5000)._search(reference.problem, Goal(gamma=0.0), np.random.default_rng(1))
-    x = next(steps)
-    try:
-        while True:
-            x = steps.send(reference.problem.evaluate(x))
-    except StopIteration as end:
-        search, tilt = end.value
+    search, tilt = drive(steps, reference.problem).value
     assert search.status is Status.CONVERGED
     length = stats.norm.pdf(3.0) / stats.norm.sf(3.0)
     np.testing.assert_allclose(tilt.shift, np.full(2, length / math.sqrt(2)), atol=0.1)
@@ -103,18 +98,12 @@ def test_rounds_pool_into_one_sample(rng):
 
 
 @pytest.mark.parametrize("at", [1, 2, 3, 4, 5, 6])
-def test_interrupted_anywhere_it_answers_from_what_was_simulated(at):
-    problem, made = half_space().problem, 0
+def test_interrupted_anywhere_it_answers_from_what_was_simulated(drive, at):
+    problem = half_space().problem
     steps = IS(half_width=0.01).steps(problem, Goal(gamma=0.0), np.random.default_rng(2))
-    x = next(steps)
-    with pytest.raises(StopIteration) as end:
-        for _ in range(at):
-            made += len(x)
-            x = steps.send(problem.evaluate(x))
-        steps.throw(Interrupted())
-    outcome = end.value.value
+    outcome, f = drive(steps, problem, interrupt_at=at)
     assert outcome.status is Status.STOPPED
-    assert sum(level.n_sim for level in outcome.trace) == made
+    assert sum(level.n_sim for level in outcome.trace) == len(f)
     assert outcome.interval[0] <= half_space().p <= outcome.interval[1]
     sample = outcome.sample
     assert sample.weights[sample.f <= 0].sum() == pytest.approx(outcome.p)

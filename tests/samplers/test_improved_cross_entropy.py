@@ -6,7 +6,7 @@ from scipy import stats
 
 import samplers
 from samplers.improved_cross_entropy import log_smooth, next_width, scale_of, spread
-from samplers.method import Goal, Interrupted
+from samplers.method import Goal
 from samplers.problem import FunctionProblem
 from samplers.reference import four_branches, half_space, parabola, plateau, shell
 from samplers.result import Status
@@ -104,50 +104,35 @@ def test_scale():
     assert scale_of(np.zeros(3)) == 1.0
 
 
-def interrupted(family, at, seed):
-    """Return the outcome of a run stopped in place of batch `at`, and how many simulations it got."""
-    problem, made = half_space().problem, 0
+def endless(family, seed):
+    """The steps of a run that does not end before it is interrupted."""
     goal = Goal(gamma=0.0, target_cov=1e-4)
-    steps = ICE(family=family, n_final=500).steps(problem, goal, np.random.default_rng(seed))
-    x = next(steps)
-    with pytest.raises(StopIteration) as end:
-        for _ in range(at):
-            made += len(x)
-            x = steps.send(problem.evaluate(x))
-        steps.throw(Interrupted())
-    return end.value.value, made
+    return ICE(family=family, n_final=500).steps(half_space().problem, goal, np.random.default_rng(seed))
 
 
 @pytest.mark.parametrize("family", FAMILIES)
 @pytest.mark.parametrize("at", [1, 2, 3, 4, 5, 6])
-def test_interrupted_anywhere_it_answers_from_what_was_simulated(family, at):
-    outcome, made = interrupted(family, at, 2)
+def test_interrupted_anywhere_it_answers_from_what_was_simulated(drive, family, at):
+    outcome, f = drive(endless(family, 2), half_space().problem, interrupt_at=at)
     assert outcome.status is Status.STOPPED
-    assert sum(level.n_sim for level in outcome.trace) == made
+    assert sum(level.n_sim for level in outcome.trace) == len(f)
     assert 0 <= outcome.interval[0] <= outcome.p <= outcome.interval[1] <= 1
     sample = outcome.sample
     assert sample.weights[sample.f <= 0].sum() == pytest.approx(outcome.p)
 
 
 @pytest.mark.parametrize("at", [2, 4, 6])
-def test_intervals_of_interrupted_runs_hold(at):
+def test_intervals_of_interrupted_runs_hold(drive, at):
     """In the search (2), about its end (4) and among the final draws (6)."""
-    runs, p = 25, half_space().p
-    outcomes = [interrupted("gaussian", at, seed)[0] for seed in range(runs)]
+    runs, p, problem = 25, half_space().p, half_space().problem
+    outcomes = [drive(endless("gaussian", seed), problem, interrupt_at=at).value for seed in range(runs)]
     covered = sum(o.interval[0] <= p <= o.interval[1] for o in outcomes)
     assert covered >= stats.binom.ppf(1e-3, runs, 0.92)
 
 
-def test_final_weights_are_bounded_by_the_base_draws():
-    outcome = None
-    steps = ICE().steps(four_branches().problem, Goal(gamma=0.0), np.random.default_rng(1))
-    x = next(steps)
-    try:
-        while True:
-            x = steps.send(four_branches().problem.evaluate(x))
-    except StopIteration as end:
-        outcome = end.value
-    sample = outcome.sample
+def test_final_weights_are_bounded_by_the_base_draws(drive):
+    problem = four_branches().problem
+    sample = drive(ICE().steps(problem, Goal(gamma=0.0), np.random.default_rng(1)), problem).value.sample
     assert sample.n_units == 4000
     assert sample.weights.max() <= 10 / 4000 * (1 + 1e-9)
     assert sample.weights.sum() == pytest.approx(1, abs=0.3)

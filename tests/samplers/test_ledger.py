@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from samplers.ledger import LOWEST, EvaluationError, Ledger
+from samplers.ledger import LEAST_FLOAT, EvaluationError, Ledger
 from samplers.problem import StandardNormal
 
 X = np.array([[1.0, 0.0], [3.0, 0.0], [2.0, 7.5], [4.0, 0.0], [-1.0, 0.0]])
@@ -47,7 +47,7 @@ def test_rows_without_outcome_count_as_failing(on_error):
 
 def test_minus_infinity_is_an_outcome():
     book = ledger(on_error="failure")
-    np.testing.assert_array_equal(book.enter(X, np.full(5, -np.inf)), LOWEST)
+    np.testing.assert_array_equal(book.enter(X, np.full(5, -np.inf)), LEAST_FLOAT)
     assert book.n_errors == 0
 
 

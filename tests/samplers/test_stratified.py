@@ -6,9 +6,9 @@ from scipy import stats
 from scipy.integrate import simpson
 
 from samplers.components import Bump, Slice, Wide, draw, draw_counts
-from samplers.exploration import Batch
 from samplers.problem import FunctionProblem
 from samplers.proposal import GATE_DRAWS, Candidate, Proposal
+from samplers.simulator import Batch
 from samplers.stratified import FEWEST, Strata
 
 BETA = 2.0

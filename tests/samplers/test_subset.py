@@ -9,7 +9,7 @@ import samplers
 from samplers.chains import Chains
 from samplers.descent import Passed, after, descent_cov, described, effective_roots, finish
 from samplers.intervals import log_normal
-from samplers.method import Goal, Interrupted
+from samplers.method import Goal
 from samplers.problem import FunctionProblem
 from samplers.reference import half_space, plateau, shell
 from samplers.result import Status
@@ -25,23 +25,6 @@ def run(problem, seed=1, **settings):
 def seeds_of(trace):
     """Points that each level after the first took over from the one before."""
     return [round(level.p * level.n_points) for level in trace[:-1]]
-
-
-class Interrupting:
-    """Drives a method by hand and interrupts it in place of the batch with this number."""
-
-    def __init__(self, method, problem, at, **goal):
-        self.f, self.levels = [], []
-        goal = Goal(gamma=0.0, on_level=self.levels.append, **goal)
-        steps = method.steps(problem, goal, np.random.default_rng(4))
-        x = next(steps)
-        try:
-            for _ in range(at):
-                self.f.append(problem.evaluate(x))
-                x = steps.send(self.f[-1])
-            steps.throw(Interrupted())
-        except StopIteration as end:
-            self.outcome = end.value
 
 
 BOTH = [SS(), ADSS(), ADSS(proposal="metropolis"), SS(law="normal")]
@@ -323,12 +306,13 @@ def test_settings_out_of_range(settings):
 
 @pytest.mark.parametrize("at", [1, 2, 5, 10, 11, 12, 19, 20, 23])
 @pytest.mark.parametrize("method", [SS(), ADSS()], ids=["ss", "adss"])
-def test_interrupted_anywhere_it_answers_from_what_was_simulated(method, at):
-    run = Interrupting(method, half_space().problem, at)
-    outcome = run.outcome
+def test_interrupted_anywhere_it_answers_from_what_was_simulated(drive, method, at):
+    problem, levels = half_space().problem, []
+    steps = method.steps(problem, Goal(gamma=0.0, on_level=levels.append), np.random.default_rng(4))
+    outcome, f = drive(steps, problem, interrupt_at=at)
     assert outcome.status is Status.STOPPED
-    assert sum(level.n_sim for level in outcome.trace) == sum(map(len, run.f))
-    assert outcome.trace == tuple(run.levels)
+    assert sum(level.n_sim for level in outcome.trace) == len(f)
+    assert outcome.trace == tuple(levels)
     low, high = outcome.interval
     assert 0 <= low <= outcome.p <= high <= 1
     assert low <= half_space().p <= high
@@ -337,22 +321,10 @@ def test_interrupted_anywhere_it_answers_from_what_was_simulated(method, at):
     assert outcome.sample.weights.sum() == pytest.approx(1)
 
 
-def full(method, problem, seed=4, **goal):
-    """Return the outcome of a run driven by hand and all outcomes of f."""
-    steps, f = method.steps(problem, Goal(gamma=0.0, **goal), np.random.default_rng(seed)), []
-    x = next(steps)
-    try:
-        while True:
-            f.append(problem.evaluate(x))
-            x = steps.send(f[-1])
-    except StopIteration as end:
-        return end.value, np.concatenate(f)
-
-
 @pytest.mark.parametrize("method", BOTH, ids=IDS)
-def test_the_weighted_points_give_p_at_every_threshold(method):
+def test_the_weighted_points_give_p_at_every_threshold(drive, method):
     reference = half_space(3)
-    outcome, _ = full(method, reference.problem)
+    outcome = drive(method.steps(reference.problem, Goal(gamma=0.0), np.random.default_rng(4)), reference.problem).value
     sample = outcome.sample
     assert sample.weights.sum() == pytest.approx(1)
     assert sample.weights[sample.f <= 0].sum() == pytest.approx(outcome.p)
@@ -369,10 +341,10 @@ def test_the_weighted_points_give_p_at_every_threshold(method):
     assert sample.weights[sample.f <= median].sum() == pytest.approx(0.5, abs=0.06)
 
 
-def test_the_curve_is_right_on_average():
+def test_the_curve_is_right_on_average(study):
     """p of thresholds passed on the way, from the weighted points."""
     reference, levels = half_space(2, 3.0), np.array([0.5, 1.0, 2.0])
-    samples = [full(ADSS(n=500), reference.problem, seed)[0].sample for seed in range(60)]
+    samples = [result.sample for result in study(reference, ADSS(n=500), 60).results]
     found = np.array([[s.weights[s.f <= g].sum() for g in levels] for s in samples]) / stats.norm.sf(3.0 - levels)
     error = found.std(axis=0, ddof=1) / math.sqrt(len(samples))
     assert (abs(found.mean(axis=0) - 1) < 4 * error + 0.03).all()

@@ -1,6 +1,8 @@
 """The conformance checks find what is wrong with a method."""
 
 import random
+import subprocess
+import sys
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -61,6 +63,23 @@ class Plain:
 
 def test_a_sound_method_from_outside_passes():
     check_method(Plain())
+
+
+SEEDS = """
+import sys
+import samplers
+from samplers.testing import check_seed
+assert "sklearn" not in sys.modules
+for name in samplers.METHODS.own:
+    check_seed(samplers.get_method(name))
+assert "sklearn" in sys.modules
+"""
+
+
+def test_imports_inside_a_run_are_no_draws():
+    """The import of scikit-learn draws from Python's global generator; no method of ours does."""
+    shown = subprocess.run([sys.executable, "-c", SEEDS], capture_output=True, text=True, timeout=120)
+    assert shown.returncode == 0, shown.stderr
 
 
 @pytest.mark.parametrize(
