@@ -159,9 +159,10 @@ def check_known(sample: Sample, gamma: float, gammas: FloatArray) -> None:
     if lowest >= start:
         return
     known = f"the curve is known from g = {start!r} on" if math.isfinite(start) else "no threshold is known"
+    more = f"gamma={lowest!r}" if lowest < gamma else "more simulations"
     raise ValueError(
         f"Threshold {lowest!r} is too low for this run: {known}. Below, fewer than {LEAST_ESS:g} effective "
-        f"independent points speak; estimate again with gamma={lowest!r}."
+        f"independent points speak; estimate again with {more}."
     )
 
 

@@ -47,8 +47,11 @@ def binomial_cov(p: float, n: float) -> float:
 
 
 def gain_over_monte_carlo(p: float, cov: float, n_sim: int) -> float:
-    """Return Monte Carlo runs for the same c.o.v. divided by n_sim; NaN where p is 0 or 1."""
-    if not 0 < p < 1 or cov == 0 or n_sim == 0:
+    """Return Monte Carlo runs for the same c.o.v. divided by n_sim.
+
+    NaN where p is 0 or 1, and from a c.o.v. of 1 on: p itself is then not known.
+    """
+    if not 0 < p < 1 or not 0 < cov < 1 or n_sim == 0:
         return math.nan
     return (1 - p) / (p * cov * cov * n_sim)
 

@@ -15,6 +15,10 @@ from samplers.result import Level, Status
 
 OWN_ERROR_SHORT = 1.5
 """Runs are taken to understate their own errors by this factor before they are said to disagree."""
+LEAST_SPREAD = 1 / 3
+"""Runs closer together than this share of their own errors are so by chance, such as counts that tie."""
+WORTHLESS = 1.0
+"""A run with a c.o.v. from here on knows no more of p than its interval says."""
 FALSE_ALARM = 1e-4
 """Probability with which runs whose errors are right would be said to."""
 BY_CONCERN = (Status.STOPPED, Status.STALLED, Status.BUDGET, Status.CONVERGED)
@@ -31,7 +35,9 @@ def combined(outcomes: Sequence[Outcome], confidence: float) -> Outcome:
     Otherwise p is the arithmetic mean p_bar (each run's p-hat is unbiased, its logarithm is not).
     Its c.o.v. is the larger of what the runs say of themselves and of what their spread shows. The
     interval is p_bar exp(-+ t s / sqrt(R)) with s the standard deviation of log p-hat (of
-    p-hat / p_bar, where a run has p-hat = 0) and t the quantile with R - 1 degrees of freedom.
+    p-hat / p_bar, where a run has p-hat = 0), but at least a third of the runs' own c.o.v., and t the
+    quantile with R - 1 degrees of freedom. Where no run has a c.o.v. under 1 their spread says nothing
+    either: the interval is that of all runs' intervals together.
     Runs that were stopped before their end have no part in the mean if any run came to its end: one
     that is still on its way to the failures has p-hat = 0, which is no estimate. Their levels stay
     in the trace.
@@ -71,7 +77,8 @@ def _disagreement(outcomes: Sequence[Outcome]) -> list[str]:
     error = OWN_ERROR_SHORT * np.array([outcome.p * outcome.cov if outcome.p > 0 else 0.0 for outcome in outcomes])
     if len(p) < 3 or not (error > 0).all():
         return []
-    apart = float((((p - p.mean()) / error) ** 2).sum())
+    with np.errstate(over="ignore"):  # inf is far enough apart
+        apart = float((((p - p.mean()) / error) ** 2).sum())
     if stats.chi2.sf(apart, len(p) - 1) > FALSE_ALARM:
         return []
     return [f"The runs disagree ({p.min():.2e} to {p.max():.2e}): some of them may have missed a region of failure."]
@@ -129,17 +136,24 @@ def combined_cov(outcomes: Sequence[Outcome]) -> float:
     p = np.array([outcome.p for outcome in outcomes])
     if not p.any():
         return math.inf
-    errors = [o.p * o.cov for o in outcomes if o.p > 0]
-    own = math.sqrt(sum(e * e for e in errors)) / float(p.sum())
-    seen = float(p.std(ddof=1) / p.mean()) / math.sqrt(len(p)) if len(p) > 1 else 0.0
-    return max(own, seen)
+    seen = float((p / p.mean()).std(ddof=1)) if len(p) > 1 else 0.0
+    return max(_own_error(outcomes), seen) / math.sqrt(len(p))
+
+
+def _own_error(outcomes: Sequence[Outcome]) -> float:
+    """Return what the runs say of themselves: the root mean square of their errors, relative to their mean."""
+    mean = float(np.mean([outcome.p for outcome in outcomes]))
+    errors = [outcome.p / mean * outcome.cov for outcome in outcomes if outcome.p > 0]  # p squared might underflow
+    return math.hypot(*errors) / math.sqrt(len(outcomes))
 
 
 def _interval(outcomes: Sequence[Outcome], p: np.ndarray, confidence: float) -> Interval:
     mean, runs = float(p.mean()), len(p)
-    if mean == 0 or np.ptp(p) == 0:  # no spread to go by: all runs' own intervals together
+    if np.ptp(p) == 0 or min(outcome.cov for outcome in outcomes) >= WORTHLESS:
+        # no spread to go by: all runs' own intervals together
         return min(o.interval[0] for o in outcomes), max(o.interval[1] for o in outcomes)
-    spread = float(np.log(p).std(ddof=1)) if p.all() else float(p.std(ddof=1)) / mean
+    spread = float(np.log(p).std(ddof=1)) if p.all() else float((p / mean).std(ddof=1))
+    spread = max(spread, LEAST_SPREAD * _own_error(outcomes))
     half = float(stats.t.ppf(0.5 + confidence / 2, runs - 1)) * spread / math.sqrt(runs)
     return mean * math.exp(-half), min(1.0, mean * math.exp(half))
 

@@ -38,13 +38,15 @@ class UnitSums:
     @property
     def cov(self) -> FloatArray:
         """Coefficient of variation of `p`, shape (G,); inf where p = 0."""
-        relative = np.divide(np.diag(self.second), self.p**2, out=np.full(len(self.p), np.inf), where=self.p > 0)
+        square = self.p**2  # may underflow
+        relative = np.divide(np.diag(self.second), square, out=np.full(len(self.p), np.inf), where=square > 0)
         return np.asarray(np.sqrt(np.maximum(relative - 1 / self.n_units, 0.0)))
 
     @property
     def ess(self) -> FloatArray:
         """Effective number of units behind `p`, (sum T)^2 / sum T^2, shape (G,)."""
-        return np.divide(self.p**2, np.diag(self.second), out=np.zeros(len(self.p)), where=self.p > 0)
+        second = np.diag(self.second)
+        return np.divide(self.p**2, second, out=np.zeros(len(self.p)), where=second > 0)
 
     @property
     def counted(self) -> NDArray[np.bool_]:

@@ -51,6 +51,7 @@ def test_gain_of_monte_carlo_itself_is_one():
     assert gain_over_monte_carlo(0.01, binomial_cov(0.01, 5000), 5000) == pytest.approx(1.0)
     assert math.isnan(gain_over_monte_carlo(0.0, math.inf, 100))
     assert math.isnan(gain_over_monte_carlo(1.0, 0.0, 100))
+    assert math.isnan(gain_over_monte_carlo(1e-180, 1.41, 1000))
 
 
 def lengths_of(inside):

@@ -52,6 +52,21 @@ def test_some_runs_without_a_hit():
     assert result.interval[0] < 1e-4 < result.interval[1]
 
 
+def test_runs_that_nearly_tie_are_no_closer_than_their_own_errors_allow():
+    """Three shares of 333, 333 and 334 draws with five hits each: their spread is rounding."""
+    result = combined([outcome(5 / n, 0.45) for n in (333, 333, 334)], 0.95)
+    half = stats.t.ppf(0.975, 2) * 0.45 / 3 / math.sqrt(3)
+    assert result.interval == pytest.approx((result.p * np.exp(-half), result.p * np.exp(half)), rel=1e-3)
+
+
+def test_runs_that_know_nothing_have_their_own_intervals_together():
+    """One draw carries each: the spread of such runs is no measure of what they all missed."""
+    runs = [outcome(p, 1.4, interval=(p / 40, 0.1)) for p in (1e-200, 2e-200, 4e-180, 1e-316)]
+    result = combined(runs, 0.95)
+    assert result.interval == (min(run.interval[0] for run in runs), 0.1)
+    assert result.cov == pytest.approx(1.4)
+
+
 def test_warnings_are_counted_and_the_worst_status_kept():
     runs = [outcome(1e-4, warnings=("odd",)), outcome(2e-4, status=Status.BUDGET)]
     result = combined([*runs, outcome(1e-4, warnings=("odd",))], 0.95)
