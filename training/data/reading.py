@@ -113,7 +113,7 @@ def read_numbers(path: Path | str, names: Mapping[str, Sequence[str]], text: Seq
         if bad.any():
             row = int(np.argmax(bad))
             value = table[places[name]][row].as_py()
-            raise rows.error(row, f"{names[name][0]} is {value!r}, a number was expected.")
+            raise rows.error(row, f"{names[name][0]} is {repr(value) if value else 'empty'}, a number was expected.")
     return rows
 
 
