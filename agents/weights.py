@@ -89,7 +89,7 @@ class WeightDistribution:
     @property
     def std(self) -> Array:
         """Standard deviation of each weight, shape (d,)."""
-        return np.sqrt(np.square(self.cholesky).sum(axis=1))
+        return np.asarray(np.sqrt(np.square(self.cholesky).sum(axis=1)))
 
     def sample(self, n: int, rng: np.random.Generator) -> Array:
         """Draw n independent points, shape (n, d)."""

@@ -122,8 +122,7 @@ class _Moments(NamedTuple):
 
 
 def _moments(members: Array, shrinkage: float, names: Sequence[str]) -> _Moments:
-    spread = members.std(axis=0, ddof=1)
-    inert = ~np.isfinite(spread) | (np.ptp(members, axis=0) == 0.0)
+    inert = ~np.isfinite(members).all(axis=0) | (members == members[0]).all(axis=0)
     if inert.any():
         some = ", ".join(names[j] for j in np.flatnonzero(inert)[:5])
         raise ValueError(
@@ -131,7 +130,7 @@ def _moments(members: Array, shrinkage: float, names: Sequence[str]) -> _Moments
             f"(the same in all, or not finite): {some}{', ...' if inert.sum() > 5 else ''}. "
             "Does a clamp keep gradients from them?"
         )
-    mean = members.mean(axis=0)
+    mean, spread = members.mean(axis=0), members.std(axis=0, ddof=1)
     normal = (members - mean) / spread
     correlation = (1.0 - shrinkage) * normal.T @ normal / (len(members) - 1)
     np.fill_diagonal(correlation, 1.0)

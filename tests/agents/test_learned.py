@@ -1,0 +1,178 @@
+"""Learned drivers: one batched pass against a loop over networks, the noise, the limits, and the ego."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from agents import LearnedDriver, LearnedEgo
+from agents.learned import MAX_STEERING, steering_for, with_weights
+from agents.networks import HEAD, head_weights
+from agents.weights import WeightDistribution
+from rare_envs.dynamics import bicycle
+
+DT = 0.1
+
+
+@pytest.fixture
+def driver(policy):
+    return LearnedDriver(policy, rho=(0.95, 0.8))
+
+
+def test_one_pass_equals_a_loop_over_networks(driver, features, generator):
+    """Three ticks with noise: each scenario by a network of its own, vehicle by vehicle."""
+    batch, vehicles = 32, 5
+    weights = head_weights(driver.policy) + 0.01 * torch.randn(batch, HEAD, generator=generator)
+    networks = [with_weights(driver.policy, row) for row in weights]
+    memory, eps = None, None
+    for _ in range(3):
+        x = features(batch, vehicles)
+        xi = torch.randn(batch, vehicles, 2, generator=generator)
+        action, memory = driver.act(x, weights, xi, memory)
+        rho = torch.tensor(driver.rho)
+        eps = xi if eps is None else rho * eps + torch.sqrt(1 - rho**2) * xi
+        for b, network in enumerate(networks):
+            for m in range(vehicles):
+                mean, log_std = network(x[b, m])
+                scaling = network.scaling
+                expected = scaling.action_mean + scaling.action_std * (mean + log_std.exp() * eps[b, m])
+                expected = torch.stack((expected[0].clamp(-8.0, 4.0), expected[1].clamp(-0.3, 0.3)))
+                torch.testing.assert_close(action[b, m], expected, atol=1e-5, rtol=0.0)
+        torch.testing.assert_close(memory, eps)
+
+
+def test_the_network_runs_once_for_all(driver, features, generator):
+    rows = []
+    with driver.policy.first.register_forward_hook(lambda module, inputs, output: rows.append(len(output))):
+        driver.act(features(7, 3), torch.randn(7, HEAD, generator=generator))
+    assert rows == [21]
+
+
+def test_own_weights_and_none_agree(driver, features):
+    x = features(4, 2)
+    weights = head_weights(driver.policy).expand(4, HEAD)
+    torch.testing.assert_close(driver.act(x, weights)[0], driver.act(x)[0], atol=1e-6, rtol=0.0)
+
+
+def test_weights_may_come_as_draws_of_a_law(driver, features, law, rng):
+    x = features(4, 2)
+    weights = torch.from_numpy(law.sample(4, rng))
+    action, _ = driver.act(x, weights)
+    assert action.dtype == torch.float32
+    torch.testing.assert_close(action, driver.act(x, weights.float())[0])
+
+
+def test_noise_is_stationary_with_its_colour(driver, generator):
+    n = 20_000
+    memory, lags = None, []
+    for _ in range(20):
+        before = memory
+        memory = driver.noise(torch.randn(n, 2, generator=generator), memory)
+        np.testing.assert_allclose(memory.std(dim=0), 1.0, atol=5 / np.sqrt(2 * n))
+        if before is not None:
+            lags.append((before * memory).mean(dim=0).numpy())
+    np.testing.assert_allclose(lags, np.tile(driver.rho, (19, 1)), atol=5 * np.sqrt(2 / n))
+
+
+def test_white_noise_forgets(policy, features, generator):
+    driver = LearnedDriver(policy)
+    x, xi = features(3, 2), torch.randn(3, 2, 2, generator=generator)
+    torch.testing.assert_close(driver.act(x, None, xi, torch.ones(3, 2, 2))[0], driver.act(x, None, xi)[0])
+
+
+def test_without_innovations_the_mean_acts_and_the_noise_ends(driver, features):
+    x = features(3, 2)
+    action, memory = driver.act(x, memory=torch.full((3, 2, 2), 5.0))
+    mean, _ = driver.policy(x)
+    scaling = driver.policy.scaling
+    torch.testing.assert_close(action, scaling.action_mean + scaling.action_std * mean)
+    assert memory is None
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_actions_stay_within_their_limits(policy, features, sign):
+    driver = LearnedDriver(policy, acceleration=(-5.0, 3.0), yaw_rate=(-0.1, 0.2))
+    action, _ = driver.act(features(2, 3), innovations=torch.full((2, 3, 2), sign * 1e3))
+    expected = torch.tensor([-5.0, -0.1] if sign < 0 else [3.0, 0.2])
+    torch.testing.assert_close(action, expected.expand(2, 3, 2))
+
+
+def test_strides_and_precision_of_the_input_do_not_matter(driver, features):
+    x = features(4, 6)
+    action, _ = driver.act(x[:, ::2])
+    torch.testing.assert_close(action, driver.act(x[:, ::2].contiguous())[0])
+    double, _ = driver.act(x[:, ::2].double())
+    assert double.dtype == torch.float64
+    torch.testing.assert_close(double.float(), action)
+
+
+def test_actions_have_gradients_in_features_and_weights(driver, features, generator):
+    x = (0.1 * features(2, 2)).requires_grad_()
+    weights = head_weights(driver.policy).repeat(2, 1).requires_grad_()
+    action, _ = driver.act(x, weights, torch.randn(2, 2, 2, generator=generator))
+    of_x, of_weights = torch.autograd.grad(action.sum(), (x, weights))
+    assert bool(of_x.isfinite().all()) and of_x.abs().sum() > 0.0
+    assert of_weights.count_nonzero() == 2 * HEAD
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"features": torch.zeros(4, 51)}, r"features of shape \(B, M, 51\), got \(4, 51\)"),
+        ({"weights": torch.zeros(HEAD)}, r"weights of shape \(4, 404\), got \(404,\)"),
+        ({"innovations": torch.zeros(4, 2)}, r"innovations of shape \(4, 3, 2\)"),
+        ({"innovations": torch.zeros(4, 3, 2), "memory": torch.zeros(4, 1, 2)}, r"memory of shape \(4, 3, 2\)"),
+    ],
+)
+def test_wrong_shapes_are_refused(driver, change, message):
+    with pytest.raises(ValueError, match=message):
+        driver.act(**{"features": torch.zeros(4, 3, 51), **change})
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"rho": (0.9, 1.0)}, "rho in"),
+        ({"rho": (0.9,)}, "two numbers"),
+        ({"acceleration": (4.0, -8.0)}, "ascending"),
+        ({"yaw_rate": (float("nan"), 0.3)}, "ascending"),
+        ({"weights": WeightDistribution(np.zeros(3), np.eye(3))}, "404 weights"),
+    ],
+)
+def test_impossible_drivers_are_refused(policy, change, message):
+    with pytest.raises(ValueError, match=message):
+        LearnedDriver(policy, **change)
+
+
+def test_other_weights_leave_the_network_as_it_was(policy):
+    before = head_weights(policy)
+    changed = with_weights(policy, before + 1.0)
+    torch.testing.assert_close(head_weights(policy), before, atol=0.0, rtol=0.0)
+    torch.testing.assert_close(head_weights(changed), before + 1.0, atol=0.0, rtol=0.0)
+    with pytest.raises(ValueError, match="404"):
+        with_weights(policy, before[:-1])
+
+
+def test_the_ego_moves_the_bicycle_as_its_driver_wants(driver, features):
+    perception = features(8, 3)
+    speed = torch.linspace(5.0, 30.0, 8)
+    state = SimpleNamespace(speed=torch.stack((speed, torch.zeros(8)), dim=1))
+    action, memory = LearnedEgo(driver).act(SimpleNamespace(perception=perception, state=state), None)
+    wanted = driver.act(perception)[0][:, 0]
+    zero = torch.zeros(8)
+    _, _, heading, new_speed = bicycle(zero, zero, zero, speed, action[:, 0], action[:, 1], DT)
+    torch.testing.assert_close(heading / DT, wanted[:, 1], atol=1e-5, rtol=0.0)
+    torch.testing.assert_close(new_speed, speed + DT * wanted[:, 0])
+    assert memory is None
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_steering_at_low_speed(dtype):
+    """As far as the wheels go and to the right side, finite with its gradient at standstill."""
+    speed = torch.zeros(3, dtype=dtype, requires_grad=True)
+    wanted = torch.tensor([-0.3, 0.0, 0.3], dtype=dtype, requires_grad=True)
+    steering = steering_for(wanted, speed)
+    torch.testing.assert_close(steering, torch.tensor([-MAX_STEERING, 0.0, MAX_STEERING], dtype=dtype))
+    for gradient in torch.autograd.grad(steering.sum(), (speed, wanted)):
+        assert bool(gradient.isfinite().all())
