@@ -45,8 +45,9 @@ def model_card(folder: Path) -> str:
         _drivers_table(drivers),
         f"**Use.** {USE}",
         "## Data and licence",
-        *_unique(
-            f"{p.data.rstrip('.')}. Licence of the data and of these files: {p.data_licence}." for p in _of(drivers)
+        *dict.fromkeys(
+            f"{provenance.data.rstrip('.')}. Licence of the data and of these files: {provenance.data_licence}."
+            for _, provenance in drivers.values()
         ),
         ATTRIBUTION,
         "## Training",
