@@ -12,7 +12,8 @@ from torch import Tensor
 from rare_envs.actions import to_physical
 from rare_envs.geometry import Lead
 from rare_envs.observation import observe
-from rare_envs.state import LANE_WIDTH, VEHICLE_LENGTH
+from rare_envs.road import Road
+from rare_envs.state import VEHICLE_LENGTH
 
 if TYPE_CHECKING:
     from rare_envs.world import Episode
@@ -98,24 +99,26 @@ class IDM:
         """IDM behind the lead, lane keeping across; no memory."""
         state = episode.state
         speed = state.speed[:, 0]
-        steering = lane_keeping(state.y[:, 0], state.heading[:, 0], speed)
+        steering = lane_keeping(state.y[:, 0], state.heading[:, 0], speed, episode.road)
         return torch.stack((self.acceleration(speed, episode.lead), steering), dim=1), memory
 
 
-def lane_keeping(y: Tensor, heading: Tensor, speed: Tensor) -> Tensor:
+def lane_keeping(y: Tensor, heading: Tensor, speed: Tensor, road: Road) -> Tensor:
     """HighwayEnv's steering controller, towards the centre of the nearest lane.
 
     Offset to heading command (proportional, 0.6 s), heading error to yaw rate (0.2 s), yaw rate to steering angle.
+    On a curve of radius R it runs wide by 0.12 s^2 v^2 / R, 3 cm at 30 m/s on the I-80.
 
     Args:
         y: Position across the road [m], shape (B,).
         heading: Heading [rad], shape (B,).
         speed: Speed [m/s], shape (B,).
+        road: The road they are on.
 
     Returns:
         Steering angle [rad], shape (B,).
     """
-    offset = y - torch.round(y / LANE_WIDTH) * LANE_WIDTH
+    offset = y - road.centre_of(y)
     speed = speed.clamp(min=_NEAR_ZERO)
     heading_command = torch.asin((offset / (-0.6 * speed)).clamp(-1.0, 1.0)).clamp(-np.pi / 4, np.pi / 4)
     yaw_rate = 5.0 * (heading_command - heading)

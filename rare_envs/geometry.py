@@ -5,11 +5,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from rare_envs.state import LANE_WIDTH, VEHICLE_LENGTH, VEHICLE_WIDTH, State
+from rare_envs.road import Road
+from rare_envs.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
 
 _DIAGONAL = (VEHICLE_LENGTH**2 + VEHICLE_WIDTH**2) ** 0.5
-_REACH = (LANE_WIDTH + VEHICLE_WIDTH) / 2
-"""A body at most this far [m] from a lane's centre reaches into the lane."""
 
 
 class Lead(NamedTuple):
@@ -21,28 +20,27 @@ class Lead(NamedTuple):
     """Follower's speed less the lead's, along the follower's heading [m/s], shape (B,); 0 without a lead."""
 
 
-def lead_of(state: State, lanes: int) -> Lead:
+def lead_of(state: State, road: Road) -> Lead:
     """The ego's lead: the nearest vehicle ahead whose body reaches into the ego's lane.
 
     "Ahead" compares centres. A body reaches into a lane when its centre is within half a lane and half a vehicle of
-    the lane's centre, which for a 4 m lane is HighwayEnv's `on_lane` with its margin of 1 m.
+    the lane's centre, which for a 4 m lane is HighwayEnv's `on_lane` with its margin of 1 m. Gaps are measured along
+    the road's reference line.
 
     Args:
         state: Traffic of B scenarios.
-        lanes: Number of lanes; lane k is centred on y = 4 k.
+        road: Their road.
 
     Returns:
         Gap and closing speed, shape (B,) each.
     """
     x, y = state.x[:, 0], state.y[:, 0]
-    lane_y: Tensor | float = 0.0
-    if lanes > 1:
-        lane_y = torch.round(y / LANE_WIDTH).clamp(0, lanes - 1) * LANE_WIDTH
+    lane_y, reach = road.centre_of(y), (road.width + VEHICLE_WIDTH) / 2
     nearest = torch.full_like(x, torch.inf)
     lead_speed = state.speed[:, 0]
     for j in range(1, state.x.shape[1]):
         ahead = state.x[:, j] - x
-        minded = (ahead >= 0) & ((state.y[:, j] - lane_y).abs() <= _REACH) & (ahead <= nearest)
+        minded = (ahead >= 0) & ((state.y[:, j] - lane_y).abs() <= reach) & (ahead <= nearest)
         nearest = torch.where(minded, ahead, nearest)
         along = state.speed[:, j] * torch.cos(state.heading[:, j] - state.heading[:, 0])
         lead_speed = torch.where(minded, along, lead_speed)
@@ -74,57 +72,44 @@ def boxes_overlap(dx: Tensor, dy: Tensor, heading: Tensor, other_heading: Tensor
     return overlap & (other_along.abs() < reach_along) & (other_across.abs() < reach_across)
 
 
-def ego_overlaps(state: State) -> Tensor:
+def ego_overlaps(state: State, road: Road) -> Tensor:
     """Which vehicles' bodies overlap the ego's.
 
-    Boxes are only compared where centres are closer than a diagonal, so the usual tick costs a comparison.
+    They are compared in the world: where the road turns, distances along it are not those between bodies. Boxes are
+    only compared where centres are closer than a diagonal, so the usual tick costs a comparison.
 
     Args:
         state: Traffic of B scenarios.
+        road: Their road.
 
     Returns:
         Boolean, shape (B, N - 1).
     """
-    dx = state.x[:, 1:] - state.x[:, :1]
-    dy = state.y[:, 1:] - state.y[:, :1]
+    x, y, heading = road.to_world(state.x, state.y, state.heading)
+    dx, dy = x[:, 1:] - x[:, :1], y[:, 1:] - y[:, :1]
     near: Tensor = (dx.abs() < _DIAGONAL) & (dy.abs() < _DIAGONAL)
     if not bool(near.any()):
         return near
     row, column = near.nonzero(as_tuple=True)
-    ego, other = state.heading[row, 0], state.heading[row, column + 1]
-    near[row, column] = boxes_overlap(dx[row, column], dy[row, column], ego, other)
+    near[row, column] = boxes_overlap(dx[row, column], dy[row, column], heading[row, 0], heading[row, column + 1])
     return near
 
 
-def off_road(state: State, lanes: int) -> Tensor:
-    """Whether the ego's centre is beyond the outer edge of the road.
-
-    Args:
-        state: Traffic of B scenarios.
-        lanes: Number of lanes.
-
-    Returns:
-        Boolean, shape (B,).
-    """
-    middle = (lanes - 1) * LANE_WIDTH / 2
-    beyond: Tensor = (state.y[:, 0] - middle).abs() > lanes * LANE_WIDTH / 2
-    return beyond
-
-
-def collision_type(state: State, row: int = 0) -> str:
+def collision_type(state: State, road: Road, row: int = 0) -> str:
     """What the ego of one scenario, in which there was a collision, has run into.
 
     The contact is across the axis along which the bodies overlap least.
 
     Args:
         state: Traffic at the moment of the collision.
+        road: Their road.
         row: Which of the B scenarios.
 
     Returns:
         "rear_end" (the ego hits a vehicle ahead), "rear_ended" (it is hit from behind), "side" (flank to flank) or
         "road_edge" (no vehicle, so the edge of the road).
     """
-    hits = ego_overlaps(state)[row].nonzero().flatten().tolist()
+    hits = ego_overlaps(state, road)[row].nonzero().flatten().tolist()
     if not hits:
         return "road_edge"
     j = hits[0] + 1

@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from rare_envs.geometry import Lead
-from rare_envs.state import LANE_WIDTH, State
+from rare_envs.road import Road
+from rare_envs.state import State
 
 TTC_MAX = 10.0
 """Cap of the time to collision [s]; what is further away, or not closing, counts as this."""
@@ -19,11 +20,11 @@ _GAP_MIN = 0.01
 _STILL = 1e-4
 """Closing speeds are floored here [m/s], far below gap / TTC_MAX, so no value under the cap changes."""
 
-Measure = Callable[[State, Lead, int], Tensor]
-"""State, the ego's lead and the number of lanes to shape (B,)."""
+Measure = Callable[[State, Lead, Road], Tensor]
+"""State, the ego's lead and the road to shape (B,)."""
 
 
-def ttc(state: State, lead: Lead, lanes: int) -> Tensor:
+def ttc(state: State, lead: Lead, road: Road) -> Tensor:
     """Time to collision of the ego with its lead, or with the edge of the road, if speeds and headings stay.
 
     To the lead: gap / closing speed while closing. To the edge, which is a wall: way to it / speed across the road
@@ -36,7 +37,7 @@ def ttc(state: State, lead: Lead, lanes: int) -> Tensor:
     Args:
         state: Traffic of B scenarios.
         lead: The ego's lead.
-        lanes: Number of lanes.
+        road: Their road.
 
     Returns:
         Time to collision [s], in (0, TTC_MAX], shape (B,).
@@ -46,8 +47,8 @@ def ttc(state: State, lead: Lead, lanes: int) -> Tensor:
     """
     to_lead = lead.gap.clamp(min=_GAP_MIN) / lead.closing_speed.clamp(min=_STILL)
     across = state.speed[:, 0] * torch.sin(state.heading[:, 0])
-    offset = state.y[:, 0] - (lanes - 1) * LANE_WIDTH / 2
-    room = lanes * LANE_WIDTH / 2 - offset * torch.sign(across)
+    offset = state.y[:, 0] - road.middle
+    room = road.lanes * road.width / 2 - offset * torch.sign(across)
     to_edge = room.clamp(min=_GAP_MIN) / across.abs().clamp(min=_STILL)
     return torch.minimum(to_lead, to_edge).clamp(max=TTC_MAX)
 

@@ -6,7 +6,6 @@ import torch
 from torch import Tensor
 
 from rare_envs.actions import MAX_ACCELERATION, MAX_STEERING
-from rare_envs.state import LANE_WIDTH
 from rare_envs.world import Episode
 
 TARGET_SPEED = 21.72
@@ -49,14 +48,16 @@ def reward_terms(episode: Episode, action: Tensor) -> RewardTerms:
     """
     state, lead = episode.state, episode.lead
     along = state.speed[:, 0] * torch.cos(state.heading[:, 0])
-    offset = state.y[:, 0] - torch.round(state.y[:, 0] / LANE_WIDTH) * LANE_WIDTH
+    width = episode.road.width
+    offset = state.y[:, 0] - episode.road.centre_of(state.y[:, 0])
+    offset = offset - torch.round(offset / width) * width  # off the road, as if lanes went on
     effort = action / action.new_tensor([MAX_ACCELERATION, MAX_STEERING])
     gap = lead.gap.clamp(min=0.0)
     ttc = gap / lead.closing_speed.clamp(min=1e-4)
     return RewardTerms(
         progress=(along / TARGET_SPEED).clamp(0.0, 1.0),
         comfort=-0.1 * effort.square().sum(dim=1),
-        lane=-0.5 * (offset / (LANE_WIDTH / 2)).square(),
+        lane=-0.5 * (offset / (width / 2)).square(),
         risk=-(1.0 - ttc / _TTC_COMFORT).clamp(min=0.0),
         headway=-0.5 * (1.0 - gap / (2.0 + state.speed[:, 0])).clamp(min=0.0),
         collision=-30.0 * episode.collided.to(along.dtype),

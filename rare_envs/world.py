@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from rare_envs.dynamics import bicycle
-from rare_envs.geometry import Lead, ego_overlaps, lead_of, off_road
+from rare_envs.geometry import Lead, ego_overlaps, lead_of
 from rare_envs.measures import COLLISION, MEASURES
+from rare_envs.road import Road
 from rare_envs.scenarios import Scenario
 from rare_envs.state import State
 
@@ -24,6 +25,8 @@ class Episode(NamedTuple):
     """Least measure over the states so far, shape (B,); without meaning once collided."""
     collided: Tensor
     """Whether the ego has collided by now, boolean, shape (B,)."""
+    road: Road
+    """The road that all are on."""
 
     @property
     def f(self) -> Tensor:
@@ -77,9 +80,10 @@ class World:
             The episodes at time 0.
         """
         state = self.scenario.initial(x)
-        lead = lead_of(state, self.scenario.lanes)
-        danger = MEASURES[self.measure](state, lead, self.scenario.lanes)
-        return Episode(state, lead, danger, torch.zeros_like(danger, dtype=torch.bool))
+        road = self.scenario.road
+        lead = lead_of(state, road)
+        danger = MEASURES[self.measure](state, lead, road)
+        return Episode(state, lead, danger, torch.zeros_like(danger, dtype=torch.bool), road)
 
     def step(self, episode: Episode, action: Tensor) -> Episode:
         """Move every vehicle by one tick: all decide on the old state, then all move.
@@ -94,14 +98,15 @@ class World:
         Returns:
             The episodes one tick later.
         """
-        old, dt, lanes = episode.state, self.dt, self.scenario.lanes
+        old, dt, road = episode.state, self.dt, episode.road
         ego = (old.x[:, 0], old.y[:, 0], old.heading[:, 0], old.speed[:, 0])
-        moved = bicycle(*ego, action[:, 0], action[:, 1], dt)
+        curvature = None if road.curve is None else road.curvature(old.x[:, 0])
+        moved = bicycle(*ego, action[:, 0], action[:, 1], dt, curvature)
         x, y, heading, speed = (
             torch.cat((first[None], rest.T)).T for first, rest in zip(moved, self.scenario.others(old, dt), strict=True)
         )
         state = State(x, y, heading, speed, old.theta)
-        lead = lead_of(state, lanes)
-        collided = episode.collided | ego_overlaps(state).any(dim=1) | off_road(state, lanes)
-        danger = torch.minimum(episode.danger, MEASURES[self.measure](state, lead, lanes))
-        return Episode(state, lead, danger, collided)
+        lead = lead_of(state, road)
+        collided = episode.collided | ego_overlaps(state, road).any(dim=1) | road.off_road(state.y[:, 0])
+        danger = torch.minimum(episode.danger, MEASURES[self.measure](state, lead, road))
+        return Episode(state, lead, danger, collided, road)

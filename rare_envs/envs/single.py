@@ -100,7 +100,7 @@ class DrivingEnv(gym.Env[Observation, NDArray[np.float32]]):
         info["reward_terms"] = {name: float(value) for name, value in terms._asdict().items()}
         if terminated or truncated:
             info["measure"] = float(episode.f)
-            info["collision_type"] = collision_type(episode.state) if terminated else None
+            info["collision_type"] = collision_type(episode.state, episode.road) if terminated else None
         self._show()
         return observation, reward, terminated, truncated, info
 
@@ -124,7 +124,7 @@ class DrivingEnv(gym.Env[Observation, NDArray[np.float32]]):
             return None
         if self._renderer is None:
             window = self.render_mode == "human"
-            self._renderer = Renderer(self.world.scenario.lanes, window, self.metadata["render_fps"])
+            self._renderer = Renderer(self.world.scenario.road, window, self.metadata["render_fps"])
         image = self._renderer.draw(self._episode.state, crashed=bool(self._episode.collided))
         return None if self.render_mode == "human" else image
 

@@ -155,7 +155,7 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArr
         collided = episode.collided.numpy()
         kinds = np.full(self.num_envs, None, dtype=object)
         for row in np.flatnonzero(collided):
-            kinds[row] = collision_type(episode.state, int(row))
+            kinds[row] = collision_type(episode.state, episode.road, int(row))
         _put(infos, "reward_terms", _terms(terms, done), done)
         _put(infos, "measure", episode.f.double().numpy(), done)
         _put(infos, "collision_type", kinds, done & collided)
@@ -167,7 +167,7 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArr
             gym.logger.warn("Nothing to render: pass render_mode='rgb_array' to gym.make_vec and reset first.")
             return None
         if self._renderer is None:
-            self._renderer = Renderer(self.world.scenario.lanes, False, self.metadata["render_fps"])
+            self._renderer = Renderer(self.world.scenario.road, False, self.metadata["render_fps"])
         episode, draw = self._episode, self._renderer.draw
         return tuple(
             draw(State(*(field[row : row + 1] for field in episode.state)), bool(episode.collided[row])).copy()
@@ -188,6 +188,7 @@ def _merge(old: Episode, rows: Tensor, new: Episode) -> Episode:
         Lead(*map(put, old.lead, new.lead)),
         put(old.danger, new.danger),
         put(old.collided, new.collided),
+        new.road,
     )
 
 

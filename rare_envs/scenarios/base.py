@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from rare_envs.road import Road
 from rare_envs.state import State
 
 
@@ -24,8 +25,7 @@ class Scenario:
     """A named scenario; x of shape (B, d) has the parameters of `rare_envs.space.PARAMETERS[name]`, in their order."""
 
     name: str
-    lanes: int
-    """Number of lanes; lane k is centred on y = 4 k."""
+    road: Road
     vehicles: int
     """N, the ego included."""
     horizon: float

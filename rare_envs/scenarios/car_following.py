@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor
 
+from rare_envs.road import straight
 from rare_envs.scenarios.base import Others, Scenario, columns
 from rare_envs.state import VEHICLE_LENGTH, State
 
@@ -26,4 +27,4 @@ def others(state: State, dt: float) -> Others:
     return Others(state.x[:, 1:] + speed * dt, state.y[:, 1:], state.heading[:, 1:], speed)
 
 
-CAR_FOLLOWING = Scenario("car_following", lanes=1, vehicles=2, horizon=10.0, initial=initial, others=others)
+CAR_FOLLOWING = Scenario("car_following", road=straight(1), vehicles=2, horizon=10.0, initial=initial, others=others)

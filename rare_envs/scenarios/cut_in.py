@@ -5,6 +5,7 @@ from torch import Tensor
 
 from rare_envs.drivers import IDM
 from rare_envs.geometry import Lead
+from rare_envs.road import straight
 from rare_envs.scenarios.base import Others, Scenario, columns
 from rare_envs.state import VEHICLE_LENGTH, State
 
@@ -77,4 +78,4 @@ def others(state: State, dt: float) -> Others:
     )
 
 
-CUT_IN = Scenario("cut_in", lanes=2, vehicles=3, horizon=10.0, initial=initial, others=others)
+CUT_IN = Scenario("cut_in", road=straight(2), vehicles=3, horizon=10.0, initial=initial, others=others)

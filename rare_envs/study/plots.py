@@ -14,7 +14,7 @@ from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
 
 from rare_envs.space import ScenarioSpace
-from rare_envs.state import LANE_WIDTH, VEHICLE_LENGTH, VEHICLE_WIDTH
+from rare_envs.state import VEHICLE_LENGTH, VEHICLE_WIDTH
 from rare_envs.study.evaluate import Report
 from rare_envs.study.replay import Replay, replay
 
@@ -181,17 +181,18 @@ def draw_moment(axes: Axes, drive: Replay, t: int) -> None:
         )
         body.set_transform(Affine2D().rotate(heading).translate(x - origin, y) + axes.transData)
         axes.add_patch(body)
-    for lane in range(drive.lanes + 1):
-        edge = lane in (0, drive.lanes)
+    left, *_, right = drive.road.edges
+    for y in drive.road.edges:
+        edge = y in (left, right)
         axes.axhline(
-            (lane - 0.5) * LANE_WIDTH,
+            y,
             color="black" if edge else GREY,
             linewidth=1,
             dashes=(None, None) if edge else (6, 6),
         )
     axes.set_xlim(-BEHIND, AHEAD)
     # the lateral axis points right of the direction of travel, which is down when driving to the right
-    axes.set_ylim((drive.lanes - 0.4) * LANE_WIDTH, -0.6 * LANE_WIDTH)
+    axes.set_ylim(right + 0.1 * drive.road.width, left - 0.1 * drive.road.width)
     axes.set_aspect("equal")
     axes.set_yticks([])
     axes.set_xticks([])

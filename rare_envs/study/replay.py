@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from rare_envs import DrivingProblem
+from rare_envs.road import Road
 from rare_envs.rollout import drive
 from rare_envs.scenarios import Scenario
 
@@ -37,8 +38,8 @@ class Replay(NamedTuple):
     """The safety measure of the drive."""
     collided: bool
     """Whether the ego collided."""
-    lanes: int
-    """Number of lanes."""
+    road: Road
+    """The road that they are on."""
     names: tuple[str, ...]
     """What the vehicles are called, length N."""
 
@@ -78,6 +79,6 @@ def replay(problem: DrivingProblem, x: NDArray[np.float64]) -> Replay:
         worst=int(torch.cat([each.f for each in episodes]).argmin()),
         f=float(episodes[-1].f),
         collided=bool(episodes[-1].collided),
-        lanes=world.scenario.lanes,
+        road=world.scenario.road,
         names=vehicle_names(world.scenario),
     )

@@ -8,8 +8,9 @@ import torch
 
 from rare_envs.drivers import IDM, lane_keeping
 from rare_envs.dynamics import bicycle
-from rare_envs.geometry import Lead, boxes_overlap, collision_type, lead_of, off_road
+from rare_envs.geometry import Lead, boxes_overlap, collision_type, lead_of
 from rare_envs.measures import TTC_MAX, ttc
+from rare_envs.road import straight
 from rare_envs.scenarios import CAR_FOLLOWING, CUT_IN
 from rare_envs.scenarios.cut_in import bezier
 from rare_envs.state import State
@@ -90,7 +91,7 @@ def test_idm_limits() -> None:
 def test_lane_keeping_returns_to_the_lane() -> None:
     state = (tensor(0.0), tensor(1.0), tensor(0.05), tensor(20.0))
     for _ in range(100):
-        state = bicycle(*state, tensor(0.0), lane_keeping(state[1], state[2], state[3]), 0.1)
+        state = bicycle(*state, tensor(0.0), lane_keeping(*state[1:], straight(1)), 0.1)
     assert state[1].item() == pytest.approx(0.0, abs=1e-4)
     assert state[2].item() == pytest.approx(0.0, abs=1e-4)
 
@@ -128,24 +129,24 @@ def test_lead_is_the_nearest_ahead_that_reaches_into_the_lane() -> None:
         (20.0, 3.1, 0.0, 5.0),
         (-8.0, 0, 0, 30.0),
     )
-    lead = lead_of(traffic(ego, far, near, beside, behind), lanes=2)
+    lead = lead_of(traffic(ego, far, near, beside, behind), straight(2))
     assert (lead.gap.item(), lead.closing_speed.item()) == (25.0, 8.0)
-    nobody = lead_of(traffic(ego, beside, behind), lanes=2)
+    nobody = lead_of(traffic(ego, beside, behind), straight(2))
     assert (nobody.gap.item(), nobody.closing_speed.item()) == (math.inf, 0.0)
 
 
 def test_ego_in_the_other_lane_minds_that_lane() -> None:
     ego, here, there = (0.0, 3.5, 0.0, 20.0), (40.0, 4.0, 0.0, 15.0), (20.0, 0.0, 0.0, 10.0)
-    assert lead_of(traffic(ego, here, there), lanes=2).gap.item() == 35.0
+    assert lead_of(traffic(ego, here, there), straight(2)).gap.item() == 35.0
 
 
 def test_ttc_of_two_cars() -> None:
     state = traffic((0.0, 0.0, 0.0, 20.0))
-    assert ttc(state, Lead(tensor(30.0), tensor(10.0)), 1).item() == pytest.approx(3.0)
-    assert ttc(state, Lead(tensor(30.0), tensor(-1.0)), 1).item() == TTC_MAX
-    assert ttc(state, Lead(tensor(500.0), tensor(10.0)), 1).item() == TTC_MAX
-    assert ttc(state, Lead(tensor(math.inf), tensor(0.0)), 1).item() == TTC_MAX
-    assert 0.0 < ttc(state, Lead(tensor(-2.0), tensor(10.0)), 1).item() < 0.01  # beside, not a collision
+    assert ttc(state, Lead(tensor(30.0), tensor(10.0)), straight(1)).item() == pytest.approx(3.0)
+    assert ttc(state, Lead(tensor(30.0), tensor(-1.0)), straight(1)).item() == TTC_MAX
+    assert ttc(state, Lead(tensor(500.0), tensor(10.0)), straight(1)).item() == TTC_MAX
+    assert ttc(state, Lead(tensor(math.inf), tensor(0.0)), straight(1)).item() == TTC_MAX
+    assert 0.0 < ttc(state, Lead(tensor(-2.0), tensor(10.0)), straight(1)).item() < 0.01  # beside, not a collision
 
 
 @pytest.mark.parametrize(
@@ -160,12 +161,12 @@ def test_ttc_of_two_cars() -> None:
 )
 def test_ttc_of_the_edge_of_the_road(y: float, heading: float, lanes: int, expected: float) -> None:
     state, nobody = traffic((0.0, y, heading, 20.0)), Lead(tensor(math.inf), tensor(0.0))
-    assert ttc(state, nobody, lanes).item() == pytest.approx(expected)
+    assert ttc(state, nobody, straight(lanes)).item() == pytest.approx(expected)
 
 
 def test_off_road() -> None:
     for lanes, y, outside in [(1, 1.9, False), (1, 2.1, True), (1, -2.1, True), (2, 5.9, False), (2, 6.1, True)]:
-        assert off_road(traffic((0.0, y, 0.0, 20.0)), lanes).item() is outside
+        assert straight(lanes).off_road(tensor(y)).item() is outside
 
 
 @pytest.mark.parametrize(
@@ -178,7 +179,7 @@ def test_off_road() -> None:
     ],
 )
 def test_collision_type(other: tuple[float, float, float, float], kind: str) -> None:
-    assert collision_type(traffic((0.0, 0.0, 0.0, 20.0), other)) == kind
+    assert collision_type(traffic((0.0, 0.0, 0.0, 20.0), other), straight(1)) == kind
 
 
 def test_bezier_is_de_casteljau_and_level_at_both_ends() -> None:

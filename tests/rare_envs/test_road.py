@@ -10,8 +10,16 @@ import pytest
 import torch
 
 from rare_envs.curve import Curve
+from rare_envs.drivers import IDM
 from rare_envs.dynamics import bicycle, point_mass
+from rare_envs.envs.rendering import WIDTH, Renderer
+from rare_envs.geometry import ego_overlaps
 from rare_envs.road import Road, i80, straight
+from rare_envs.rollout import drive
+from rare_envs.scenarios import Scenario
+from rare_envs.scenarios.base import Others, columns
+from rare_envs.state import State
+from rare_envs.world import World
 from training import i80_road
 
 F64 = torch.float64
@@ -223,6 +231,74 @@ def test_a_car_that_turns_with_the_road_stays_in_its_lane(road: Road) -> None:
     s = torch.arange(0.0, state[0].item(), 0.01, dtype=F64)
     own_line = state[0].item() - y0 * float(road.curve.at(s[-1]).heading)
     assert own_line == pytest.approx(600.0, abs=0.05)
+
+
+def pair(x: float, y: float, other_x: float, other_y: float, heading: float = 0.0) -> State:
+    """The ego and one other vehicle at 25 m/s."""
+    rows = ((x, other_x), (y, other_y), (heading, 0.0), (25.0, 25.0), ())
+    return State(*(torch.tensor([row], dtype=F64) for row in rows))
+
+
+def others(state: State, dt: float) -> Others:
+    x, y, heading, speed, _ = (field[:, 1:] for field in state)
+    return Others(x + speed * dt, y, heading, speed)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_an_ego_keeps_its_lane_of_the_i80(dtype: torch.dtype) -> None:
+    def initial(x: torch.Tensor) -> State:
+        ones = torch.ones_like(x[:, 0])
+        return State(
+            columns(0 * ones, 60 * ones),
+            columns(x[:, 0], 11 * ones),
+            columns(*[0 * ones] * 2),
+            columns(*[25 * ones] * 2),
+            x[:, :0],
+        )
+
+    road = i80()
+    world = World(Scenario("drive", road, 2, 30.0, initial, others))
+    starts = torch.tensor([[road.centre(lane) + 0.8] for lane in range(6)], dtype=dtype)
+    episodes = list(drive(world, IDM(desired_speed=25.0), starts))
+    assert not episodes[-1].collided.any()
+    y = torch.stack([episode.state.y[:, 0] for episode in episodes[50:]])
+    off = (y - torch.tensor([road.centre(lane) for lane in range(6)], dtype=dtype)).abs().amax(0)
+    assert (off < 0.02).all()  # 0.12 v^2 / R at 25 m/s and R = 3600 m
+    assert (off > 0.005).all()  # the road does turn
+
+
+def test_bodies_overlap_in_the_world_not_along_the_road() -> None:
+    """Where 5 m of the road's line are 5 (1 - k y) m at y."""
+    road = Road((-30.0, 0.0, 30.0), Curve(50.0, (0.0, 0.004, 0.004, 0.0)))
+    for y, other_x, overlap in [(20.0, 5.3, True), (20.0, 5.5, False), (-20.0, 4.7, False), (-20.0, 4.55, True)]:
+        assert ego_overlaps(pair(75.0, y, 75.0 + other_x, y), road).item() is overlap
+    state = pair(75.0, 20.0, 75.0, 21.9)
+    assert ego_overlaps(state, road).item() is True
+    assert ego_overlaps(state._replace(y=torch.tensor([[20.0, 22.1]], dtype=F64)), road).item() is False
+
+
+def test_a_curved_road_is_drawn_in_the_world() -> None:
+    road = i80()
+    renderer = Renderer(road, window=False, fps=10)
+    for x in (0.0, 400.0, 1500.0):
+        image = renderer.draw(pair(x, road.centre(1), x + 30.0, road.centre(4)), crashed=False)
+        assert image.shape == (240, WIDTH, 3)
+        at = {}
+        for name, ahead, y in [
+            ("ego", 0.0, road.centre(1)),
+            ("other", 30.0, road.centre(4)),
+            ("road", 60.0, road.centre(2)),
+        ]:
+            point, camera = (
+                torch.stack(road.to_world(*torch.tensor([px, py, 0.0], dtype=F64))[:2])
+                for px, py in ((x + ahead, y), (x, road.middle))
+            )
+            column, row = (8.0 * (point - camera) + torch.tensor([0.3 * WIDTH, 120.0])).round().long().tolist()
+            at[name] = image[row, column].tolist()
+        assert at == {"ego": [50, 200, 0], "other": [100, 200, 255], "road": [100, 100, 100]}
+        # white lines: the two edges whole, so that every column of the image crosses both
+        assert ((image == 255).all(axis=-1).sum(axis=0) >= 2 * 2).all()
+    renderer.close()
 
 
 def test_fast_enough_to_be_called_every_tick() -> None:
