@@ -126,6 +126,8 @@ def test_recorded_events_are_those_behind_the_shipped_bases():
     assert len(common) >= 465 and len(mine) <= 493
     same = [pair for pair in common if 100 * events["frame"][mine[pair]] == int(shipped[pair]["epoch_ms"])]
     assert len(same) >= 451
+    apart = car_following_events(us101_scenes(DATA, merged=False))
+    assert len(set(zip(apart["ego"].tolist(), apart["lead"].tolist(), strict=True)) & set(shipped)) == 468
     for column in ("v_ego", "v_lead", "gap"):
         differences = [events[column][mine[pair]] - float(shipped[pair][column]) for pair in same]
         assert np.abs(differences).max() < 0.03

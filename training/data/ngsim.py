@@ -35,7 +35,7 @@ NAMES = {
     "speed": ("v_Vel",),
     "acceleration": ("v_Acc",),
     "lane": ("Lane_ID",),
-    "leader": ("Preceding", "Preceeding"),
+    "leader": ("Preceding",),
 }
 LOCATION = "Location"
 _TEXT_ORDER = (0, 3, 4, 5, 8, 9, 11, 12, 13, 14)  # of NAMES, in the 18 columns of the files without a header

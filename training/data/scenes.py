@@ -128,12 +128,19 @@ def assemble(
     )
 
 
-def load_us101_scenes(folder: Path | str) -> tuple[Scene, ...]:
+def load_us101_scenes(
+    folder: Path | str, along: float = CUTOFF_ALONG, across: float = CUTOFF_ACROSS
+) -> tuple[Scene, ...]:
     """The 28 usable scenes of US 101, smoothed.
 
     The scenes overlap, so the copies of a vehicle are first merged by vehicle and time, each track is cut at its
     holes and smoothed once over its whole length, and then the scenes are cut from the tracks. x is NGSIM's Local_Y
     [m], the same in all scenes, moved from the front to the centre; scene 1 (two vehicles) and ramps are left out.
+
+    Args:
+        folder: Where the file is.
+        along: Cut-off of the smoother along the road [Hz].
+        across: Cut-off across the road [Hz].
 
     Raises:
         ValueError: The file is missing, cannot be read or lacks a column.
@@ -147,27 +154,31 @@ def load_us101_scenes(folder: Path | str) -> tuple[Scene, ...]:
     count = np.bincount(copy)
     x, y, length = (np.bincount(copy, rows[key]) / count for key in ("y_along", "d", "length"))
     breaks = 1 + np.flatnonzero((np.diff(keys[:, 0]) != 0) | (np.diff(keys[:, 1]) != 100))
-    smoothed = smooth_tracks(breaks, x - 0.5 * length, y)
+    smoothed = smooth_tracks(breaks, x - 0.5 * length, y, along, across)
     for key, values in smoothed.items():
         rows[key] = values[copy]
     return tuple(_us101_scene(rows, int(number)) for number in np.unique(rows["scene"]))
 
 
-def smooth_tracks(breaks: NDArray[np.int64], x: Array, y: Array) -> dict[str, Array]:
+def smooth_tracks(
+    breaks: NDArray[np.int64], x: Array, y: Array, along: float = CUTOFF_ALONG, across: float = CUTOFF_ACROSS
+) -> dict[str, Array]:
     """Smooth states and actions of rows of tracks one after another.
 
     Args:
         breaks: Rows at which a track begins; the first need not be among them.
         x: Along the road [m], shape (rows,).
         y: Across the road [m], shape (rows,).
+        along: Cut-off along the road [Hz].
+        across: Cut-off across the road [Hz].
 
     Returns:
         `x`, `y`, `heading`, `speed`, `acceleration`, `yaw_rate` of each row.
     """
     result = {key: np.empty(len(x)) for key in ("x", "y", "heading", "speed", "acceleration", "yaw_rate")}
     for piece in np.split(np.arange(len(x)), breaks[breaks > 0]):
-        along, across = smooth(x[piece], CUTOFF_ALONG, DT), smooth(y[piece], CUTOFF_ACROSS, DT)
-        for key, values in zip(result, (along, across, *motion(along, across, DT)), strict=True):
+        px, py = smooth(x[piece], along, DT), smooth(y[piece], across, DT)
+        for key, values in zip(result, (px, py, *motion(px, py, DT)), strict=True):
             result[key][piece] = values
     return result
 
