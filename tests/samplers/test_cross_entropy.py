@@ -10,22 +10,12 @@ from samplers.blocks import GaussianBlock, NormalBlock, Product
 from samplers.ce_search import Batch, Search
 from samplers.cross_entropy import at
 from samplers.families import Gaussian
-from samplers.importance import Draws, Space, bernstein_bound, doubts, draw, interval_of, weighted_cov
+from samplers.importance import Draws, Space, bernstein_bound, defensive, doubts, draw, interval_of, weighted_cov
 from samplers.method import Goal
 from samplers.problem import FunctionProblem
 from samplers.reference import four_branches, half_space, parabola, plateau, two_modes
 
 CE = samplers.CrossEntropy
-
-
-def driven(steps, evaluate):
-    """Answer a generator that yields points with their outcomes; return what it returns."""
-    try:
-        x = next(steps)
-        while True:
-            x = steps.send(evaluate(x))
-    except StopIteration as end:
-        return end.value
 
 
 def mean_error(found):
@@ -231,11 +221,12 @@ def test_weighted_cov_matches_the_spread_of_the_estimate(rng):
     assert math.isinf(weighted_cov(10, np.empty(0)))
 
 
-def test_weights_of_the_final_draws_give_p(rng):
+def test_weights_of_the_final_draws_give_p(drive, rng):
     reference, far = half_space(2, 3.0), Gaussian(np.full(2, 2.2), np.eye(2))
     base = Product((GaussianBlock(Gaussian.standard(2)),))
-    sampler = CE()._defensive(base, Product((GaussianBlock(far),)))
-    draws = driven(draw(reference.problem, sampler, 0.0, 50_000, rng), reference.problem.evaluate)
+    proposal = Product((GaussianBlock(far),))
+    sampler = defensive(base, proposal.widened(1.5), proposal, 0.1, 0.2)
+    draws = drive(draw(reference.problem, sampler, 0.0, 50_000, rng), reference.problem).value
     assert draws.p == pytest.approx(reference.p, rel=4 * draws.cov)
     assert np.exp(draws.log_weights).max() <= 10.0
     assert draws.cov < 0.02
