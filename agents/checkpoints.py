@@ -23,6 +23,7 @@ from torch import Tensor
 from agents.learned import LearnedDriver
 from agents.networks import ACTIONS, CLIP, HEAD, Policy, Scaling
 from agents.networks import FEATURES as WIDTH
+from agents.noise import Colour
 from agents.weights import WeightDistribution
 from rare_envs.drivers import IDM
 from rare_envs.perception import FEATURES
@@ -113,7 +114,7 @@ def save_driver(driver: LearnedDriver, provenance: Provenance, path: str | PathL
         "features": FEATURES,
         "feature_clip": CLIP,
         "log_std_cap": float(driver.policy.log_std_cap),
-        "rho": driver.rho,
+        "colour": asdict(driver.colour),
         "acceleration": driver.acceleration,
         "yaw_rate": driver.yaw_rate,
         "radius": None if driver.weights is None else driver.weights.radius,
@@ -142,13 +143,13 @@ def read_driver(path: str | PathLike[str]) -> LearnedDriver:
     try:
         return LearnedDriver(
             policy,
-            rho=header["rho"],
+            colour=Colour(**{name: tuple(pair) for name, pair in header["colour"].items()}),
             acceleration=header["acceleration"],
             yaw_rate=header["yaw_rate"],
             weights=_weights(tensors, header["radius"], path),
             name=header["name"],
         )
-    except (TypeError, ValueError) as error:
+    except (AttributeError, TypeError, ValueError) as error:
         raise ValueError(f"{str(path)!r} is no usable driver: {error}") from None
 
 
@@ -201,7 +202,7 @@ def _check_header(header: Mapping[str, Any], path: Path) -> None:
     _require(header, ("format", "features", "feature_clip"), path)
     if header["format"] != FORMAT:
         raise ValueError(f"{str(path)!r} has format {header['format']!r}; this version reads format {FORMAT}.")
-    _require(header, ("name", "rho", "acceleration", "yaw_rate", "radius"), path)
+    _require(header, ("name", "colour", "acceleration", "yaw_rate", "radius"), path)
     theirs = header["features"]
     if not isinstance(theirs, list) or theirs != list(FEATURES):
         pairs = zip(theirs, FEATURES, strict=False) if isinstance(theirs, list) else []

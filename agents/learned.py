@@ -9,7 +9,9 @@ import torch
 from torch import Tensor
 
 from agents.networks import ACTIONS, FEATURES, HEAD, HIDDEN, Policy, with_head
+from agents.noise import WHITE, Colour
 from agents.weights import WeightDistribution
+from rare_envs.perception import CURVATURE
 from rare_envs.state import VEHICLE_LENGTH
 
 if TYPE_CHECKING:
@@ -29,18 +31,16 @@ class LearnedDriver:
     The actions of a vehicle at tick t are
 
         action = action_mean + action_std (mean + exp(log_std) eps_t), within the limits,
-        eps_t = rho eps_(t-1) + sqrt(1 - rho^2) xi_t with eps_0 = xi_0 and xi ~ N(0, 1),
 
-    so that every eps_t is N(0, 1). Recorded drivers are far from white noise (rho is about 0.95 in ticks of 0.1 s);
-    O'Kelly et al. (2018) sample white noise, rho = 0.
+    where every eps_t is N(0, 1) and coloured, see `Colour`. O'Kelly et al. (2018) sample white noise, `Colour()`.
 
     Raises:
-        ValueError: If rho is not in [0, 1), limits are out of order, or there are not 404 weights.
+        ValueError: If limits are out of order, or there are not 404 weights.
     """
 
     policy: Policy
-    rho: tuple[float, float] = (0.0, 0.0)
-    """Autocorrelation of the noise of acceleration and yaw rate after one tick."""
+    colour: Colour = WHITE
+    """Of the noise of acceleration and yaw rate."""
     acceleration: tuple[float, float] = (-8.0, 4.0)
     """Limits [m/s^2]."""
     yaw_rate: tuple[float, float] = (-0.3, 0.3)
@@ -50,13 +50,11 @@ class LearnedDriver:
     name: str = "learned"
 
     def __post_init__(self) -> None:
-        for name in ("rho", "acceleration", "yaw_rate"):
+        for name in ("acceleration", "yaw_rate"):
             pair = tuple(float(value) for value in getattr(self, name))
             if len(pair) != ACTIONS:
                 raise ValueError(f"Expected {name} as two numbers, got {pair}.")
             object.__setattr__(self, name, pair)
-        if not all(0.0 <= rho < 1.0 for rho in self.rho):
-            raise ValueError(f"Expected rho in [0, 1), got {self.rho}.")
         for name in ("acceleration", "yaw_rate"):
             low, high = getattr(self, name)
             if not low < high:
@@ -76,15 +74,14 @@ class LearnedDriver:
         Args:
             features: What M vehicles in B scenarios perceive, shape (B, M, 51).
             weights: Last layers of the scenarios, shape (B, 404) as `head_weights` has them; None for the policy's own.
-            innovations: xi, shape (B, M, 2); None for the mean actions.
-            memory: eps of the tick before, as the last call returned it; None at the start.
+            innovations: Independent standard normal draws, shape (B, M, 2); None for the mean actions.
+            memory: Of the noise, shape (B, M, 2, 2), as the last call returned it, at the start `begin`.
 
         Returns:
-            Accelerations [m/s^2] and yaw rates [rad/s], shape (B, M, 2), and the new memory: eps, or None without
-            innovations, which ends the noise.
+            Accelerations [m/s^2] and yaw rates [rad/s], shape (B, M, 2), and the new memory.
 
         Raises:
-            ValueError: If a shape is wrong.
+            ValueError: If a shape is wrong, or innovations come without a memory.
         """
         batch, vehicles = _checked_shapes(features, weights, innovations, memory)
         policy = self.policy
@@ -94,20 +91,17 @@ class LearnedDriver:
         else:
             output = with_head(hidden.view(batch, vehicles, HIDDEN[-1]), weights.to(hidden.dtype).contiguous())
         normal, log_std = policy.split(output)
-        noise = None if innovations is None else self.noise(innovations.to(hidden.dtype), memory)
-        if noise is not None:
+        if innovations is not None and memory is not None:
+            noise, memory = self.colour.next(memory.to(hidden.dtype), innovations.to(hidden.dtype))
             normal = normal + log_std.exp() * noise
         scaling = policy.scaling
         action = scaling.action_mean + scaling.action_std * normal
         low, high = action.new_tensor(tuple(zip(self.acceleration, self.yaw_rate, strict=True)))
-        return action.clamp(low, high).to(features.dtype), noise
+        return action.clamp(low, high).to(features.dtype), memory
 
-    def noise(self, innovations: Tensor, memory: Tensor | None) -> Tensor:
-        """The next eps of shape (..., 2) from xi of the same shape and the last eps, None at the start."""
-        if memory is None:
-            return innovations
-        rho = innovations.new_tensor(self.rho)
-        return rho * memory + (1.0 - rho.square()).sqrt() * innovations
+    def begin(self, draws: Tensor) -> Tensor:
+        """The memory of the noise at the start, from independent standard normal draws of shape (B, M, 2, 2)."""
+        return self.colour.begin(draws)
 
 
 def _checked_shapes(
@@ -119,10 +113,13 @@ def _checked_shapes(
     batch, vehicles, _ = features.shape
     if weights is not None and weights.shape != (batch, HEAD):
         raise ValueError(f"Expected weights of shape ({batch}, {HEAD}), got {tuple(weights.shape)}.")
-    for name, value in (("innovations", innovations), ("memory", memory)):
-        if value is not None and value.shape != (batch, vehicles, ACTIONS):
-            expected = (batch, vehicles, ACTIONS)
-            raise ValueError(f"Expected {name} of shape {expected}, got {tuple(value.shape)}.")
+    expected = (batch, vehicles, ACTIONS)
+    if innovations is not None and innovations.shape != expected:
+        raise ValueError(f"Expected innovations of shape {expected}, got {tuple(innovations.shape)}.")
+    if innovations is not None and memory is None:
+        raise ValueError("Expected a memory beside the innovations; at the start it is driver.begin(draws).")
+    if memory is not None and memory.shape != (*expected, 2):
+        raise ValueError(f"Expected memory of shape {(*expected, 2)}, got {tuple(memory.shape)}.")
     return batch, vehicles
 
 
@@ -146,9 +143,12 @@ class LearnedEgo:
 
     def act(self, episode: "Episode", memory: Any) -> tuple[Tensor, Any]:
         """Perceive and decide for one tick; see `rare_envs.drivers.Driver`."""
-        actions, _ = self.driver.act(episode.perception[:, :1])
+        features = episode.perception[:, :1]
+        actions, _ = self.driver.act(features)
         acceleration, yaw_rate = actions[:, 0].unbind(dim=-1)
-        return torch.stack((acceleration, steering_for(yaw_rate, episode.state.speed[:, 0])), dim=1), memory
+        speed = episode.state.speed[:, 0]
+        yaw_rate = yaw_rate + speed * features[:, 0, CURVATURE]  # it has learned on a straight road
+        return torch.stack((acceleration, steering_for(yaw_rate, speed)), dim=1), memory
 
 
 def steering_for(yaw_rate: Tensor, speed: Tensor) -> Tensor:

@@ -72,3 +72,7 @@ class Colour:
         """The next value (..., 2) from standard normal draws (..., 2), and the memory after it."""
         value = self.expected(memory) + fresh.new_tensor(self.scale) * fresh
         return value, torch.stack((value, memory[..., 0]), dim=-1)
+
+
+WHITE = Colour()
+"""Independent from tick to tick."""

@@ -15,6 +15,7 @@ from torch import Tensor
 from agents import LearnedDriver
 from agents.learned import with_weights
 from agents.networks import ACTIONS, FEATURES, HEAD, Policy, Scaling, head_weights
+from agents.noise import Colour
 from benchmarks.throughput import seconds
 
 FLOOR = 20.0
@@ -24,11 +25,12 @@ def compare(batch: int, vehicles: int, rounds: int = 20) -> dict[str, float]:
     """Times [ms] of one tick both ways, their ratio, and the largest difference of an action."""
     generator = torch.Generator().manual_seed(0)
     scaling = Scaling(torch.zeros(FEATURES), torch.ones(FEATURES), torch.zeros(ACTIONS), torch.ones(ACTIONS))
-    driver = LearnedDriver(Policy(scaling).requires_grad_(False), rho=(0.95, 0.95))
+    driver = LearnedDriver(Policy(scaling).requires_grad_(False), colour=Colour((0.95, 0.95)))
     weights = head_weights(driver.policy) + 0.01 * torch.randn(batch, HEAD, generator=generator)
-    drivers = [LearnedDriver(with_weights(driver.policy, row), rho=driver.rho) for row in weights]
+    drivers = [LearnedDriver(with_weights(driver.policy, row), colour=driver.colour) for row in weights]
     features = torch.randn(batch, vehicles, FEATURES, generator=generator)
-    innovations, memory = torch.randn(2, batch, vehicles, ACTIONS, generator=generator)
+    innovations = torch.randn(batch, vehicles, ACTIONS, generator=generator)
+    memory = driver.begin(torch.randn(batch, vehicles, ACTIONS, 2, generator=generator))
 
     def at_once() -> Tensor:
         return driver.act(features, weights, innovations, memory)[0]

@@ -13,6 +13,7 @@ from safetensors import safe_open
 
 from agents import LearnedDriver, Provenance, load_driver, read_driver, read_provenance, save_driver
 from agents.checkpoints import SHIPPED
+from agents.noise import Colour
 from rare_envs.drivers import IDM
 
 PROVENANCE = Provenance(
@@ -27,7 +28,7 @@ PROVENANCE = Provenance(
 
 @pytest.fixture
 def driver(policy, law):
-    return LearnedDriver(policy, (0.95, 0.9), (-7.0, 3.5), (-0.25, 0.3), law, "tester")
+    return LearnedDriver(policy, Colour((0.95, 0.9)), (-7.0, 3.5), (-0.25, 0.3), law, "tester")
 
 
 @pytest.fixture
@@ -50,9 +51,11 @@ def test_a_driver_comes_back_as_it_was(driver, file, features, generator):
     again = read_driver(file)
     x, xi = features(4, 3), torch.randn(4, 3, 2, generator=generator)
     weights = torch.from_numpy(driver.weights.sample(4, np.random.default_rng(1)))
+    memory = driver.begin(torch.randn(4, 3, 2, 2, generator=generator))
     for given in (None, weights):
-        torch.testing.assert_close(again.act(x, given, xi)[0], driver.act(x, given, xi)[0], atol=0.0, rtol=0.0)
-    for name in ("rho", "acceleration", "yaw_rate", "name"):
+        made, expected = (one.act(x, given, xi, memory) for one in (again, driver))
+        torch.testing.assert_close(made, expected, atol=0.0, rtol=0.0)
+    for name in ("colour", "acceleration", "yaw_rate", "name"):
         assert getattr(again, name) == getattr(driver, name)
     np.testing.assert_array_equal(again.weights.mean, driver.weights.mean)
     np.testing.assert_array_equal(again.weights.precision, driver.weights.precision)
@@ -78,7 +81,8 @@ def test_the_header_says_what_decides_how_it_drives(file):
     with safe_open(file, framework="pt") as opened:
         header = json.loads(opened.metadata()["driver"])
     assert len(header["features"]) == 51 and header["features"][0] == "lane_offset"
-    assert (header["rho"], header["log_std_cap"]) == ([0.95, 0.9], pytest.approx(-0.2))
+    assert header["colour"] == {"first": [0.95, 0.9], "second": [0.0, 0.0]}
+    assert header["log_std_cap"] == pytest.approx(-0.2)
     assert (header["acceleration"], header["yaw_rate"]) == ([-7.0, 3.5], [-0.25, 0.3])
     assert header["command"] == PROVENANCE.command and header["data_licence"] == "CC BY-SA 3.0"
 
@@ -132,9 +136,9 @@ def test_a_missing_file_is_named_with_its_neighbours(file):
         ({"policy__head__bias": torch.full((4,), torch.nan)}, r"inf or NaN in policy\.head\.bias"),
         ({"weights__mean": torch.zeros(403).double()}, r"weights\.mean of shape \(404,\)"),
         ({"weights__precision": torch.zeros(3).double()}, "no usable driver: Expected triplets"),
-        ({"header": {"rho": [0.9, 1.5]}}, r"no usable driver: Expected rho in \[0, 1\)"),
-        ({"header": {"rho": ...}}, "lacks rho"),
-        ({"header": {"rho": 0.9}}, "no usable driver"),
+        ({"header": {"colour": {"first": [0.9, 1.5], "second": [0.0, 0.0]}}}, "no usable driver.*stationary"),
+        ({"header": {"colour": ...}}, "lacks colour"),
+        ({"header": {"colour": 0.9}}, "no usable driver"),
         ({"header": {"format": 2}}, "format 2; this version reads format 1"),
         ({"header": {"feature_clip": 10.0}}, r"clips features at 10\.0"),
         ({"header": {"features": ["lane_offset", "speed"]}}, "2 other features.*difference is 'speed' for 'heading'"),

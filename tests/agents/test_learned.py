@@ -9,15 +9,17 @@ import torch
 from agents import LearnedDriver, LearnedEgo
 from agents.learned import MAX_STEERING, steering_for, with_weights
 from agents.networks import HEAD, head_weights
+from agents.noise import Colour
 from agents.weights import WeightDistribution
 from rare_envs.dynamics import bicycle
+from rare_envs.perception import CURVATURE
 
 DT = 0.1
 
 
 @pytest.fixture
 def driver(policy):
-    return LearnedDriver(policy, rho=(0.95, 0.8))
+    return LearnedDriver(policy, colour=Colour((0.95, 0.8), (0.0, -0.3)))
 
 
 def test_one_pass_equals_a_loop_over_networks(driver, features, generator):
@@ -25,13 +27,12 @@ def test_one_pass_equals_a_loop_over_networks(driver, features, generator):
     batch, vehicles = 32, 5
     weights = head_weights(driver.policy) + 0.01 * torch.randn(batch, HEAD, generator=generator)
     networks = [with_weights(driver.policy, row) for row in weights]
-    memory, eps = None, None
+    memory = driver.begin(torch.randn(batch, vehicles, 2, 2, generator=generator))
     for _ in range(3):
         x = features(batch, vehicles)
         xi = torch.randn(batch, vehicles, 2, generator=generator)
+        eps, after = driver.colour.next(memory, xi)
         action, memory = driver.act(x, weights, xi, memory)
-        rho = torch.tensor(driver.rho)
-        eps = xi if eps is None else rho * eps + torch.sqrt(1 - rho**2) * xi
         for b, network in enumerate(networks):
             for m in range(vehicles):
                 mean, log_std = network(x[b, m])
@@ -39,7 +40,7 @@ def test_one_pass_equals_a_loop_over_networks(driver, features, generator):
                 expected = scaling.action_mean + scaling.action_std * (mean + log_std.exp() * eps[b, m])
                 expected = torch.stack((expected[0].clamp(-8.0, 4.0), expected[1].clamp(-0.3, 0.3)))
                 torch.testing.assert_close(action[b, m], expected, atol=1e-5, rtol=0.0)
-        torch.testing.assert_close(memory, eps)
+        torch.testing.assert_close(memory, after)
 
 
 def test_the_network_runs_once_for_all(driver, features, generator):
@@ -63,37 +64,26 @@ def test_weights_may_come_as_draws_of_a_law(driver, features, law, rng):
     torch.testing.assert_close(action, driver.act(x, weights.float())[0])
 
 
-def test_noise_is_stationary_with_its_colour(driver, generator):
-    n = 20_000
-    memory, lags = None, []
-    for _ in range(20):
-        before = memory
-        memory = driver.noise(torch.randn(n, 2, generator=generator), memory)
-        np.testing.assert_allclose(memory.std(dim=0), 1.0, atol=5 / np.sqrt(2 * n))
-        if before is not None:
-            lags.append((before * memory).mean(dim=0).numpy())
-    np.testing.assert_allclose(lags, np.tile(driver.rho, (19, 1)), atol=5 * np.sqrt(2 / n))
-
-
 def test_white_noise_forgets(policy, features, generator):
     driver = LearnedDriver(policy)
     x, xi = features(3, 2), torch.randn(3, 2, 2, generator=generator)
-    torch.testing.assert_close(driver.act(x, None, xi, torch.ones(3, 2, 2))[0], driver.act(x, None, xi)[0])
+    first, _ = driver.act(x, None, xi, torch.ones(3, 2, 2, 2))
+    torch.testing.assert_close(first, driver.act(x, None, xi, torch.zeros(3, 2, 2, 2))[0])
 
 
-def test_without_innovations_the_mean_acts_and_the_noise_ends(driver, features):
+def test_without_innovations_the_mean_acts(driver, features):
     x = features(3, 2)
-    action, memory = driver.act(x, memory=torch.full((3, 2, 2), 5.0))
+    action, _ = driver.act(x, memory=torch.full((3, 2, 2, 2), 5.0))
     mean, _ = driver.policy(x)
     scaling = driver.policy.scaling
     torch.testing.assert_close(action, scaling.action_mean + scaling.action_std * mean)
-    assert memory is None
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 def test_actions_stay_within_their_limits(policy, features, sign):
     driver = LearnedDriver(policy, acceleration=(-5.0, 3.0), yaw_rate=(-0.1, 0.2))
-    action, _ = driver.act(features(2, 3), innovations=torch.full((2, 3, 2), sign * 1e3))
+    fresh, memory = torch.full((2, 3, 2), sign * 1e3), torch.zeros(2, 3, 2, 2)
+    action, _ = driver.act(features(2, 3), innovations=fresh, memory=memory)
     expected = torch.tensor([-5.0, -0.1] if sign < 0 else [3.0, 0.2])
     torch.testing.assert_close(action, expected.expand(2, 3, 2))
 
@@ -110,7 +100,7 @@ def test_strides_and_precision_of_the_input_do_not_matter(driver, features):
 def test_actions_have_gradients_in_features_and_weights(driver, features, generator):
     x = (0.1 * features(2, 2)).requires_grad_()
     weights = head_weights(driver.policy).repeat(2, 1).requires_grad_()
-    action, _ = driver.act(x, weights, torch.randn(2, 2, 2, generator=generator))
+    action, _ = driver.act(x, weights, torch.randn(2, 2, 2, generator=generator), torch.ones(2, 2, 2, 2))
     of_x, of_weights = torch.autograd.grad(action.sum(), (x, weights))
     assert bool(of_x.isfinite().all()) and of_x.abs().sum() > 0.0
     assert of_weights.count_nonzero() == 2 * HEAD
@@ -122,7 +112,8 @@ def test_actions_have_gradients_in_features_and_weights(driver, features, genera
         ({"features": torch.zeros(4, 51)}, r"features of shape \(B, M, 51\), got \(4, 51\)"),
         ({"weights": torch.zeros(HEAD)}, r"weights of shape \(4, 404\), got \(404,\)"),
         ({"innovations": torch.zeros(4, 2)}, r"innovations of shape \(4, 3, 2\)"),
-        ({"innovations": torch.zeros(4, 3, 2), "memory": torch.zeros(4, 1, 2)}, r"memory of shape \(4, 3, 2\)"),
+        ({"innovations": torch.zeros(4, 3, 2)}, "memory beside the innovations"),
+        ({"innovations": torch.zeros(4, 3, 2), "memory": torch.zeros(4, 3, 2)}, r"memory of shape \(4, 3, 2, 2\)"),
     ],
 )
 def test_wrong_shapes_are_refused(driver, change, message):
@@ -133,8 +124,7 @@ def test_wrong_shapes_are_refused(driver, change, message):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"rho": (0.9, 1.0)}, "rho in"),
-        ({"rho": (0.9,)}, "two numbers"),
+        ({"acceleration": (4.0,)}, "two numbers"),
         ({"acceleration": (4.0, -8.0)}, "ascending"),
         ({"yaw_rate": (float("nan"), 0.3)}, "ascending"),
         ({"weights": WeightDistribution(np.zeros(3), np.eye(3))}, "404 weights"),
@@ -156,6 +146,7 @@ def test_other_weights_leave_the_network_as_it_was(policy):
 
 def test_the_ego_moves_the_bicycle_as_its_driver_wants(driver, features):
     perception = features(8, 3)
+    perception[..., CURVATURE] = 0.0
     speed = torch.linspace(5.0, 30.0, 8)
     state = SimpleNamespace(speed=torch.stack((speed, torch.zeros(8)), dim=1))
     action, memory = LearnedEgo(driver).act(SimpleNamespace(perception=perception, state=state), None)
@@ -165,6 +156,24 @@ def test_the_ego_moves_the_bicycle_as_its_driver_wants(driver, features):
     torch.testing.assert_close(heading / DT, wanted[:, 1], atol=1e-5, rtol=0.0)
     torch.testing.assert_close(new_speed, speed + DT * wanted[:, 0])
     assert memory is None
+
+
+def test_the_ego_turns_with_the_road(driver, features):
+    """A bend of 1/500 m to the right is steered on top of what the driver does, and the driver sees it as a feature."""
+    straight = features(4, 1)
+    straight[..., CURVATURE] = 0.0
+    bend = straight.clone()
+    bend[..., CURVATURE] = 0.002
+    speed = torch.full((4, 1), 20.0)
+    yaw_rates = []
+    for perception in (straight, bend):
+        state = SimpleNamespace(speed=speed)
+        action, _ = LearnedEgo(driver).act(SimpleNamespace(perception=perception, state=state), None)
+        zero = torch.zeros(4)
+        _, _, heading, _ = bicycle(zero, zero, zero, speed[:, 0], action[:, 0], action[:, 1], DT)
+        yaw_rates.append(heading / DT)
+    difference = driver.act(bend)[0][:, 0, 1] - driver.act(straight)[0][:, 0, 1]
+    torch.testing.assert_close(yaw_rates[1] - yaw_rates[0], difference + 0.04, atol=1e-4, rtol=0.0)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -5,6 +5,7 @@ import torch
 
 from agents import LearnedDriver, Provenance, save_driver
 from agents.networks import Policy, Scaling
+from agents.noise import Colour
 from training.imitation.card import main, model_card
 
 
@@ -19,7 +20,7 @@ def test_the_card_has_every_driver_with_its_command_metrics_and_licence(tmp_path
             metrics=metrics,
             ensemble={"penalty": 0.5, "tried": [{"penalty": 0.8}]} if kind == "mgail" else {},
         )
-        driver = LearnedDriver(Policy(scaling), rho=(0.95, 0.0), name=kind)
+        driver = LearnedDriver(Policy(scaling), colour=Colour((0.95, 0.0)), name=kind)
         save_driver(driver, provenance, tmp_path / f"{kind}.safetensors")
     main(tmp_path)
     card = (tmp_path / "README.md").read_text(encoding="utf-8")
@@ -29,7 +30,7 @@ def test_the_card_has_every_driver_with_its_command_metrics_and_licence(tmp_path
         "| collision | 0.05235 | 0.004 |",
         "| js speed |  | 0.03 |",
         "| penalty |  | 0.5 |",
-        "| noise colour (acceleration, yaw rate) | 0.95, 0 | 0.95, 0 |",
+        "| noise, coefficients of lag 1 | 0.95, 0 | 0.95, 0 |",
         "- mgail: `train mgail`",
         "US 101, 3 minutes. Licence of the data and of these files: CC BY-SA 3.0.",
     ):

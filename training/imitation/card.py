@@ -62,7 +62,8 @@ def _drivers_table(drivers: Mapping[str, tuple[LearnedDriver, Provenance]]) -> s
     columns = {
         name: {
             "kind": provenance.kind,
-            "noise colour (acceleration, yaw rate)": f"{driver.rho[0]:g}, {driver.rho[1]:g}",
+            "noise, coefficients of lag 1": ", ".join(f"{value:.3g}" for value in driver.colour.first),
+            "noise, coefficients of lag 2": ", ".join(f"{value:.3g}" for value in driver.colour.second),
             "acceleration [m/s^2]": f"{driver.acceleration[0]:g} to {driver.acceleration[1]:g}",
             "yaw rate [rad/s]": f"{driver.yaw_rate[0]:g} to {driver.yaw_rate[1]:g}",
             "law of the weights": "no" if driver.weights is None else "yes",
