@@ -153,6 +153,28 @@ def train_ego_command(
         print(f"Saved {path}. Next: rare-envs estimate {env} --ego {path}")
 
 
+@app.command("train-drivers")
+def train_drivers_command(
+    out: Annotated[Path, typer.Option(help="Folder; a training that was stopped in it is taken up.")],
+    data: Annotated[Path | None, typer.Option(help="Folder with the compact tables of US 101.")] = None,
+    ngsim: Annotated[Path | None, typer.Option(help="Or a raw NGSIM file, CSV or text.")] = None,
+    highd: Annotated[Path | None, typer.Option(help="Or a folder with highD's files.")] = None,
+    method: Annotated[str, typer.Option(help="bc, gail or mgail.")] = "mgail",
+    updates: Annotated[int | None, typer.Option(help="Updates of the policy.")] = None,
+    seed: Seed = 0,
+    as_json: Json = False,
+) -> None:
+    """Train background drivers from recorded traffic; `python -m training.imitation.train` has every setting."""
+    _one_thread()
+    from rare_envs.study.train import train_drivers
+
+    path = train_drivers(data=data, ngsim=ngsim, highd=highd, method=method, seed=seed, updates=updates, out=out)
+    if as_json:
+        _print_json({"driver": str(path), "method": method, "seed": seed})
+    else:
+        print(f"Saved {path}. Load it with agents.load_driver({str(path)!r}).")
+
+
 def _one_thread() -> None:
     """Keep torch to one thread: at these batch sizes more threads cost more than they give."""
     import torch

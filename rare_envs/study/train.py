@@ -1,4 +1,4 @@
-"""Training an ego, as the command line asks for it."""
+"""Training an ego or drivers, as the command line asks for it."""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ from pathlib import Path
 
 from rare_envs.study.checks import BadInput
 from training import train_ego
+from training.imitation.config import Config
+from training.imitation.folders import train_driver
+from training.imitation.train import source_of
 
 
 def train(env_id: str, *, algo: str, steps: int, out: Path, seed: int, num_envs: int) -> Path:
@@ -27,5 +30,33 @@ def train(env_id: str, *, algo: str, steps: int, out: Path, seed: int, num_envs:
     """
     try:
         return train_ego(env_id, algo=algo, steps=steps, seed=seed, num_envs=num_envs, out=out)
+    except ValueError as error:
+        raise BadInput(error) from error
+
+
+def train_drivers(
+    *, data: Path | None, ngsim: Path | None, highd: Path | None, method: str, seed: int, updates: int | None, out: Path
+) -> Path:
+    """Check the words of a user, then train a driver from recorded traffic.
+
+    Args:
+        data: Folder with the compact tables of US 101.
+        ngsim: Or a raw NGSIM file.
+        highd: Or a folder with highD's files.
+        method: "bc", "gail" or "mgail".
+        seed: Seed of everything random.
+        updates: After behaviour cloning; None for what the shipped drivers had.
+        out: Folder of the training.
+
+    Returns:
+        The driver's file.
+
+    Raises:
+        BadInput: Something cannot be used.
+    """
+    try:
+        chosen = {} if updates is None else {"updates": updates}
+        config = Config(method=method, seed=seed, **chosen)  # type: ignore[arg-type]  # Config checks the word
+        return train_driver(source_of(data, ngsim, highd), config, out, progress=True)
     except ValueError as error:
         raise BadInput(error) from error

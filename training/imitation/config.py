@@ -56,6 +56,9 @@ class Config:
     # optimisation
     policy_rate: float = 3e-4
     critic_rate: float = 4e-4
+    last_rate: float = 0.1
+    """Share of the rates of policy and critic that is left at the end: they fall once the schedules have run. Only the
+    policy of the last update is kept, and this is what makes it settle."""
     critic_steps: int = 3
     critic_batch: int = 512
     memory: int = 8
@@ -84,9 +87,16 @@ class Config:
         for name in ("updates", "epochs"):
             if getattr(self, name) < 0:
                 raise ValueError(f"Expected {name} >= 0, got {getattr(self, name)}.")
+        if not (0.0 < self.anneal <= 1.0 and 0.0 < self.last_rate <= 1.0):
+            raise ValueError(f"Expected anneal and last_rate in (0, 1], got {self.anneal}, {self.last_rate}.")
         for name in ("pools", "scenes", "batch", "critic_batch", "memory", "ppo_batch"):
             if getattr(self, name) < 1:
                 raise ValueError(f"Expected {name} >= 1, got {getattr(self, name)}.")
+
+    def rate(self, update: int) -> float:
+        """Factor of the learning rates at an update: 1, then linearly down to `last_rate`."""
+        start = self.anneal * self.updates
+        return 1.0 - (1.0 - self.last_rate) * min(max((update - start) / max(self.updates - start, 1.0), 0.0), 1.0)
 
     def along(self, ends: tuple[float, float], update: int) -> float:
         """Value of a geometric schedule at an update."""

@@ -65,6 +65,14 @@ class Learner:
         share = min(self.update / max(self.config.anneal * self.config.updates, 1.0), 1.0)
         return round(ends[0] + (ends[1] - ends[0]) * share)
 
+    def set_rates(self) -> None:
+        """Learning rates of this update."""
+        factor = self.config.rate(self.update)
+        rates = (self.policy_optimiser, self.config.policy_rate), (self.critic_optimiser, self.config.critic_rate)
+        for optimiser, rate in rates:
+            for group in optimiser.param_groups:
+                group["lr"] = factor * rate
+
     def drive(self, credit: float) -> Steps:
         """Drive the next pool for a horizon; a pool that is old starts anew from the record."""
         config = self.config
@@ -177,6 +185,7 @@ def train(learner: Learner, update: Update, after: Callable[[Learner, Log], None
     if learner.update == 0:
         learner.warm_up()
     while learner.update < learner.config.updates:
+        learner.set_rates()
         log = update(learner)
         learner.update += 1
         if after is not None:

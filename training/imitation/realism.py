@@ -10,15 +10,16 @@ References:
 """
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from agents import LearnedDriver
 from rare_envs.lidar import AHEAD, MAX_RANGE
 from rare_envs.perception import RANGES, RATES
 from training.imitation.recording import Recording
@@ -253,6 +254,35 @@ def measure(
         rmse={name: float(error.square().mean().sqrt()) for name, error in errors.items()},
         scene_collision=by_scene,
     )
+
+
+def sampled(driver: LearnedDriver, generator: torch.Generator, weights: Tensor | None = None) -> Act:
+    """A learned driver with its noise, ready for `measure`.
+
+    Args:
+        driver: The driver.
+        generator: Source of the noise.
+        weights: Last layers, shape (404,); None for the driver's own.
+    """
+
+    def act(features: Tensor, memory: Tensor | None) -> tuple[Tensor, Tensor | None]:
+        draws = (*features.shape[:2], 2)
+        if memory is None:
+            memory = driver.begin(torch.randn(*draws, 2, generator=generator))
+        last = None if weights is None else weights.expand(len(features), -1)
+        return driver.act(features, last, torch.randn(draws, generator=generator), memory)
+
+    return act
+
+
+def metrics(recording: Recording, driver: LearnedDriver, seed: int = 0) -> dict[str, dict[str, Any]]:
+    """What the header of a driver's file says: `measure` over 10 s and 20 s, with one sequence of noise."""
+    out = {}
+    for seconds in (10.0, 20.0):
+        found = asdict(measure(recording, sampled(driver, torch.Generator().manual_seed(seed)), seconds=seconds))
+        del found["scene_collision"], found["seconds"]
+        out[f"{seconds:g} s"] = {name: value for name, value in found.items() if value != {}}
+    return out
 
 
 def _errors(recording: Recording, traffic: Traffic, driven: Tensor) -> dict[str, Tensor]:

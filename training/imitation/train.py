@@ -1,136 +1,130 @@
 """Train a driver from recorded traffic.
 
     python -m training.imitation.train --data FOLDER --method mgail --seed 0 --out runs/mgail
+    python -m training.imitation.train --highd FOLDER --recording 01 --out runs/highd
 
-Training that was interrupted goes on where its last checkpoint left off, to the same weights.
+Writes into the folder `driver.safetensors` (see `agents.load_driver`), `training.json` (source and settings) and a
+checkpoint. The same command on the same folder takes up a training that was stopped, to the same weights.
 """
 
 from __future__ import annotations
 
-import contextlib
-import json
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict
+import sys
+from dataclasses import fields
+from enum import Enum
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+import typer
 
-from agents.networks import Policy
-from training.data.scenes import Scene
-from training.imitation import gail, mgail
-from training.imitation.clone import clone
 from training.imitation.config import Config
-from training.imitation.critic import Critic
-from training.imitation.expert import Pairs, expert_pairs
-from training.imitation.learner import Learner, Log, Update, train
-from training.imitation.recording import Recording, stack
-
-UPDATES: dict[str, Update] = {"gail": gail.update, "mgail": mgail.update}
-EVERY = 50
-"""Updates between checkpoints."""
+from training.imitation.folders import COLOURS, train_driver
+from training.imitation.sources import Source
 
 
-def prepare(scenes: Sequence[Scene], config: Config) -> Learner:
-    """Everything of a training before its first update: the record, its pairs, a cloned policy, a new critic."""
-    recording = stack(scenes)
-    return learner_of(recording, expert_pairs(recording), torch.arange(len(scenes)), config)
+class Method(str, Enum):
+    """Ways to learn."""
+
+    BC = "bc"
+    GAIL = "gail"
+    MGAIL = "mgail"
 
 
-def learner_of(recording: Recording, pairs: Pairs, among: torch.Tensor, config: Config) -> Learner:
-    """As `prepare`, from what has been prepared; `among` are the scenes to drive."""
-    generator = torch.Generator().manual_seed(config.seed)
-    policy = clone(pairs, config, generator)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(int(torch.randint(2**31, (), generator=generator)))
-        critic = Critic()
-    return Learner(config, recording, among, pairs, policy, critic, generator)
+class Noise(str, Enum):
+    """Colours of the drivers' noise."""
+
+    HUMAN = "human"
+    WHITE = "white"
 
 
-def fit(
-    learner: Learner, out: Path | None = None, log: bool = False, progress: bool = False, every: int = EVERY
-) -> Policy:
-    """Make the updates of a training.
+D = Config()
+Count = Annotated[int, typer.Option(min=1)]
+Number = Annotated[float, typer.Option()]
+Whole = Annotated[tuple[int, int], typer.Option(help="First and last value.")]
+Ends = Annotated[tuple[float, float], typer.Option(help="First and last value.")]
 
-    Args:
-        learner: As `prepare` makes it.
-        out: Folder of the checkpoint; a training that is found there is taken up. None keeps nothing.
-        log: Write TensorBoard logs there.
-        progress: Show a bar on standard error.
-        every: Updates between checkpoints.
+
+def command(
+    out: Annotated[Path, typer.Option(help="Folder; a training that was stopped in it is taken up.")],
+    data: Annotated[Path | None, typer.Option(help="Folder with the compact tables of US 101.")] = None,
+    ngsim: Annotated[Path | None, typer.Option(help="Or a raw NGSIM file, CSV or text.")] = None,
+    highd: Annotated[Path | None, typer.Option(help="Or a folder with highD's files.")] = None,
+    location: Annotated[str | None, typer.Option(help="Of an NGSIM file that has several.")] = None,
+    recording: Annotated[list[str] | None, typer.Option(help="Of highD, such as 01; may be repeated.")] = None,
+    seconds: Annotated[float, typer.Option(help="Length of the scenes of such files [s].")] = Source.seconds,
+    log: Annotated[bool, typer.Option("--log", help="Write TensorBoard logs into the folder.")] = False,
+    method: Annotated[Method, typer.Option(help="How to learn.")] = Method.MGAIL,
+    seed: Annotated[int, typer.Option(help="The same seed gives the same weights.")] = D.seed,
+    updates: Annotated[int, typer.Option(min=0, help="After behaviour cloning.")] = D.updates,
+    noise: Annotated[Noise, typer.Option(help="Coloured as people's, or white.")] = Noise.HUMAN,
+    epochs: Annotated[int, typer.Option(min=0, help="Of behaviour cloning.")] = D.epochs,
+    batch: Count = D.batch,
+    clone_rate: Number = D.clone_rate,
+    weight_decay: Number = D.weight_decay,
+    log_std_cap: Number = D.log_std_cap,
+    pools: Count = D.pools,
+    scenes: Count = D.scenes,
+    horizon: Whole = D.horizon,
+    age: Whole = D.age,
+    drivers: Whole = D.drivers,
+    critic_weight: Number = D.critic_weight,
+    clone_weight: Ends = D.clone_weight,
+    anneal: Number = D.anneal,
+    collision_weight: Number = D.collision_weight,
+    edge_weight: Number = D.edge_weight,
+    brake_weight: Number = D.brake_weight,
+    policy_rate: Number = D.policy_rate,
+    critic_rate: Number = D.critic_rate,
+    last_rate: Number = D.last_rate,
+    critic_steps: Count = D.critic_steps,
+    critic_batch: Count = D.critic_batch,
+    memory: Count = D.memory,
+    warm_up: Annotated[int, typer.Option(min=0, help="Rounds of the critic alone.")] = D.warm_up,
+    gradient_penalty: Number = D.gradient_penalty,
+    credit: Number = D.credit,
+    learned_model: Annotated[bool, typer.Option(help="MGAIL: gradient of a learned model.")] = D.learned_model,
+    discount: Number = D.discount,
+    gae: Number = D.gae,
+    clip: Number = D.clip,
+    ppo_epochs: Count = D.ppo_epochs,
+    ppo_batch: Count = D.ppo_batch,
+    value_rate: Number = D.value_rate,
+) -> None:
+    """Train a driver from recorded traffic. training/imitation/config.py says what the settings mean."""
+    words: dict[str, Any] = dict(locals())
+    words |= {"method": method.value, "colour": COLOURS[noise.value]}
+    torch.set_num_threads(1)  # at these sizes more threads cost more than they give
+    try:
+        source = source_of(data, ngsim, highd, location, recording, seconds)
+        config = Config(**{option.name: words[option.name] for option in fields(Config)})
+        path = train_driver(source, config, out, log=log, progress=True)
+    except ValueError as error:
+        print(f"train: {error}", file=sys.stderr)
+        raise typer.Exit(2) from None
+    print(f"Saved {path}. Next: agents.load_driver({str(path)!r})")
+
+
+def source_of(
+    data: Path | None,
+    ngsim: Path | None,
+    highd: Path | None,
+    location: str | None = None,
+    recording: list[str] | None = None,
+    seconds: float = Source.seconds,
+) -> Source:
+    """The one source that is named.
 
     Raises:
-        ValueError: If the folder holds a training with other settings.
+        ValueError: If none is, or several are.
     """
-    if learner.config.method == "bc":
-        return learner.policy
-    if out is not None:
-        _take_up(learner, out)
-    with _bar(learner, progress) as show, _writer(out if log else None) as write:
-
-        def after(learner: Learner, entry: Log) -> None:
-            show(learner, entry)
-            write(learner, entry)
-            if out is not None and (learner.update % every == 0 or learner.update == learner.config.updates):
-                learner.save(out / "checkpoint.pt")
-
-        return train(learner, UPDATES[learner.config.method], after)
+    named = [(kind, path) for kind, path in (("data", data), ("ngsim", ngsim), ("highd", highd)) if path is not None]
+    if len(named) != 1:
+        raise ValueError("Expected one of --data FOLDER, --ngsim FILE and --highd FOLDER.")
+    return Source(*named[0], location, tuple(recording or ()), seconds)
 
 
-def _take_up(learner: Learner, out: Path) -> None:
-    """Note the settings in a folder, or check that they are those of the training in it and take it up."""
-    out.mkdir(parents=True, exist_ok=True)
-    settings = json.dumps(asdict(learner.config), indent=1)
-    noted = out / "config.json"
-    if not noted.exists():
-        noted.write_text(settings + "\n")
-    elif json.loads(noted.read_text()) != json.loads(settings):
-        raise ValueError(f"{str(out)!r} holds a training with other settings; choose another folder or remove it.")
-    if (out / "checkpoint.pt").exists():
-        learner.load(out / "checkpoint.pt")
-
-
-After = Callable[[Learner, Log], None]
-
-
-@contextlib.contextmanager
-def _bar(learner: Learner, show: bool) -> Iterator[After]:
-    """A progress bar on standard error."""
-    if not show:
-        yield lambda learner, entry: None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
-    with Progress(*columns, console=Console(stderr=True)) as bar:
-        task = bar.add_task("", total=learner.config.updates, completed=learner.update)
-
-        def after(learner: Learner, entry: Log) -> None:
-            text = ", ".join(f"{name} {entry[name]:.3f}" for name in ("collision", "edge", "critic") if name in entry)
-            bar.update(task, completed=learner.update, description=text)
-
-        yield after
-
-
-@contextlib.contextmanager
-def _writer(folder: Path | None) -> Iterator[After]:
-    """TensorBoard logs."""
-    if folder is None:
-        yield lambda learner, entry: None
-        return
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError as error:
-        raise ValueError("Logs need TensorBoard: pip install tensorboard.") from error
-    writer: Any = SummaryWriter(str(folder))
-
-    def after(learner: Learner, entry: Log) -> None:
-        for name, value in entry.items():
-            writer.add_scalar(name, value, learner.update)
-        writer.add_scalar("vehicle_steps", learner.simulated, learner.update)
-
-    try:
-        yield after
-    finally:
-        writer.close()
+if __name__ == "__main__":
+    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+    app.command()(command)
+    app()

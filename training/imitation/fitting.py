@@ -1,0 +1,93 @@
+"""Fitting a driver to recorded scenes, from data to the last update."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from agents.networks import Policy
+from training.data.scenes import Scene
+from training.imitation import gail, mgail
+from training.imitation.clone import clone
+from training.imitation.config import Config
+from training.imitation.critic import Critic
+from training.imitation.expert import Pairs, expert_pairs
+from training.imitation.learner import Learner, Log, Update, train
+from training.imitation.progress import bar, tensorboard
+from training.imitation.recording import Recording, stack
+
+UPDATES: dict[str, Update] = {"gail": gail.update, "mgail": mgail.update}
+EVERY = 50
+"""Updates between checkpoints."""
+CHECKPOINT = "checkpoint.pt"
+"""Its name in the folder of a training."""
+
+
+@dataclass(frozen=True)
+class Data:
+    """Recorded traffic, ready for trainings."""
+
+    recording: Recording
+    pairs: Pairs
+    test: Recording | None
+    """None if there are too few scenes to keep some apart."""
+
+
+def prepare(scenes: Sequence[Scene], test: Sequence[Scene] = ()) -> Data:
+    """Stack scenes and pair what was seen with what was done in them.
+
+    Raises:
+        ValueError: If nobody follows anybody in any scene.
+    """
+    if not scenes:
+        raise ValueError("Expected scenes to learn from, got none.")
+    recording = stack(scenes)
+    pairs = expert_pairs(recording)
+    if not len(pairs.scene):
+        raise ValueError("Nobody follows anybody in these scenes, so there is nothing to learn.")
+    return Data(recording, pairs, stack(test) if test else None)
+
+
+def learner_of(data: Data, config: Config) -> Learner:
+    """Everything of a training before its first update: a cloned policy, a new critic."""
+    generator = torch.Generator().manual_seed(config.seed)
+    policy = clone(data.pairs, config, generator)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(int(torch.randint(2**31, (), generator=generator)))
+        critic = Critic()
+    return Learner(config, data.recording, torch.unique(data.pairs.scene), data.pairs, policy, critic, generator)
+
+
+def fit(
+    learner: Learner, out: Path | None = None, log: bool = False, progress: bool = False, every: int = EVERY
+) -> Policy:
+    """Make the updates of a training.
+
+    Args:
+        learner: As `learner_of` makes it.
+        out: Folder of the checkpoint; a training that is found there is taken up. None keeps nothing.
+        log: Write TensorBoard logs there.
+        progress: Show a bar on standard error.
+        every: Updates between checkpoints.
+
+    Raises:
+        ValueError: If logs are asked for and TensorBoard is not installed.
+    """
+    if learner.config.method == "bc":
+        if out is not None:
+            learner.save(out / CHECKPOINT)
+        return learner.policy
+    if out is not None and (out / CHECKPOINT).exists():
+        learner.load(out / CHECKPOINT)
+    with bar(learner, progress) as show, tensorboard(out if log else None, learner.update) as write:
+
+        def after(learner: Learner, entry: Log) -> None:
+            show(learner, entry)
+            write(learner, entry)
+            if out is not None and (learner.update % every == 0 or learner.update == learner.config.updates):
+                learner.save(out / CHECKPOINT)
+
+        return train(learner, UPDATES[learner.config.method], after)

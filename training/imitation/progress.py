@@ -1,0 +1,64 @@
+"""What a training shows while it runs: a bar, and TensorBoard logs."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from training.imitation.learner import Learner, Log
+
+After = Callable[[Learner, Log], None]
+"""Called after every update."""
+
+
+@contextlib.contextmanager
+def bar(learner: Learner, show: bool) -> Iterator[After]:
+    """A progress bar on standard error."""
+    if not show:
+        yield lambda learner, entry: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.description}"))
+    with Progress(*columns, console=Console(stderr=True)) as shown:
+        task = shown.add_task("", total=learner.config.updates, completed=learner.update)
+
+        def after(learner: Learner, entry: Log) -> None:
+            text = ", ".join(f"{name} {entry[name]:.3f}" for name in ("collision", "edge", "critic") if name in entry)
+            shown.update(task, completed=learner.update, description=text)
+
+        yield after
+
+
+@contextlib.contextmanager
+def tensorboard(folder: Path | None, update: int) -> Iterator[After]:
+    """TensorBoard logs in a folder; None writes none.
+
+    Args:
+        folder: Where to.
+        update: Updates that were made before; entries of later ones, which a killed run left, are dropped.
+
+    Raises:
+        ValueError: If TensorBoard is not installed.
+    """
+    if folder is None:
+        yield lambda learner, entry: None
+        return
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError as error:
+        raise ValueError("Logs need TensorBoard: pip install 'rare-envs[logs]', or leave logs out.") from error
+    writer: Any = SummaryWriter(str(folder), purge_step=update + 1)
+
+    def after(learner: Learner, entry: Log) -> None:
+        for name, value in entry.items():
+            writer.add_scalar(name, value, learner.update)
+        writer.add_scalar("vehicle_steps", learner.simulated, learner.update)
+
+    try:
+        yield after
+    finally:
+        writer.close()

@@ -1,0 +1,93 @@
+"""Where recorded scenes come from: the tables of US 101, or a user's own NGSIM or highD files."""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+
+from training.data.highd import highd_recordings, load_highd
+from training.data.ngsim import load_ngsim
+from training.data.scenes import Scene, load_us101_scenes, split
+from training.data.windows import scenes_of
+
+KINDS = ("data", "ngsim", "highd")
+HELD_OUT = 0.2
+"""Share of a user's recording, its end, that is kept for tests."""
+_NGSIM = "CC BY-SA 3.0, as reported of the NGSIM record 8ect-6jqj"
+_HIGHD = "highD's: non-commercial, and neither the data nor what derives from it is passed on without leave"
+
+
+@dataclass(frozen=True)
+class Source:
+    """Recorded traffic in files.
+
+    Raises:
+        ValueError: If the kind is unknown.
+    """
+
+    kind: str
+    """"data" for a folder with the compact tables of US 101, "ngsim" for a raw file, "highd" for a folder."""
+    path: Path
+    location: str | None = None
+    """Of a raw NGSIM file that has several."""
+    recordings: tuple[str, ...] = ()
+    """Of highD, such as "01"; none for all that are in the folder."""
+    seconds: float = 10.0
+    """Length of the scenes that a user's recording is cut into [s]."""
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise ValueError(f"Expected one of {', '.join(KINDS)}, got {self.kind!r}.")
+
+    @property
+    def description(self) -> str:
+        """What it is, for those who get a driver without it."""
+        if self.kind == "data":
+            return "NGSIM US 101, 15 June 2005, 07:49:51 to 07:52:53 without 64 to 88 s and 158 to 193 s of its clock"
+        if self.kind == "ngsim":
+            return f"NGSIM, {self.location or self.path.stem}, the first {1 - HELD_OUT:.0%}"
+        return f"highD, {', '.join(self.recordings) or 'all recordings'}, the first {1 - HELD_OUT:.0%} of each"
+
+    @property
+    def licence(self) -> str:
+        """Of the data."""
+        return _HIGHD if self.kind == "highd" else _NGSIM
+
+    @property
+    def options(self) -> str:
+        """The source as options of the command line; of the path its name only."""
+        words = [f"--{self.kind}", self.path.name or str(self.path)]
+        words += ["--location", self.location] if self.location else []
+        for recording in self.recordings:
+            words += ["--recording", recording]
+        words += ["--seconds", f"{self.seconds:g}"] if self.seconds != Source.seconds else []
+        return shlex.join(words)
+
+
+def load(source: Source) -> tuple[tuple[Scene, ...], tuple[Scene, ...]]:
+    """Scenes to learn from and scenes to test on, which share no moment.
+
+    Raises:
+        ValueError: A file is missing or broken; see the loaders.
+    """
+    if source.kind == "data":
+        return split(load_us101_scenes(source.path))
+    if source.kind == "ngsim":
+        return split_end(scenes_of(load_ngsim(source.path, location=source.location, gaps="cut"), source.seconds))
+    names = source.recordings or highd_recordings(source.path)
+    tables = [load_highd(source.path, name, gaps="cut") for name in names]
+    return split_end([scene for table in tables for scene in scenes_of(table, source.seconds)])
+
+
+def split_end(scenes: tuple[Scene, ...] | list[Scene]) -> tuple[tuple[Scene, ...], tuple[Scene, ...]]:
+    """The last fifth of every recording's scenes apart from the rest; of a single scene, none."""
+    learn: list[Scene] = []
+    test: list[Scene] = []
+    for _, group in groupby(scenes, key=lambda scene: scene.name.rsplit("-", 1)[0]):
+        found = list(group)
+        kept = len(found) - (max(round(HELD_OUT * len(found)), 1) if len(found) > 1 else 0)
+        learn += found[:kept]
+        test += found[kept:]
+    return tuple(learn), tuple(test)
