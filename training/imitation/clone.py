@@ -1,5 +1,7 @@
 """Behaviour cloning: the likelihood of recorded actions, maximised."""
 
+from collections.abc import Iterator
+
 import torch
 
 from agents.networks import Policy
@@ -9,9 +11,7 @@ from training.imitation.expert import Pairs, scaling_of
 
 
 def clone(pairs: Pairs, config: Config, generator: torch.Generator) -> Policy:
-    """A policy that maximises the likelihood of recorded actions.
-
-    Few epochs: what 51 features say of the next action is little, and more is memorising.
+    """A new policy that maximises the likelihood of recorded actions.
 
     Args:
         pairs: Recorded driving.
@@ -21,6 +21,16 @@ def clone(pairs: Pairs, config: Config, generator: torch.Generator) -> Policy:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(torch.randint(2**31, (), generator=generator)))
         policy = Policy(scaling_of(pairs), config.log_std_cap)
+    for _ in improve(policy, pairs, config, generator):
+        pass
+    return policy
+
+
+def improve(policy: Policy, pairs: Pairs, config: Config, generator: torch.Generator) -> Iterator[None]:
+    """Ascend the likelihood, epoch by epoch, with what of the policy requires gradients.
+
+    Few epochs: what 51 features say of the next action is little, and more is memorising.
+    """
     optimiser = torch.optim.Adam(policy.parameters(), lr=config.clone_rate, weight_decay=config.weight_decay)
     action = normalised(policy, pairs.action)
     for _ in range(config.epochs):
@@ -31,4 +41,4 @@ def clone(pairs: Pairs, config: Config, generator: torch.Generator) -> Policy:
             optimiser.zero_grad()
             torch.autograd.backward(loss)
             optimiser.step()
-    return policy
+        yield

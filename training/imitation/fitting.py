@@ -15,7 +15,7 @@ from training.imitation.clone import clone
 from training.imitation.config import Config
 from training.imitation.critic import Critic
 from training.imitation.expert import Pairs, expert_pairs
-from training.imitation.learner import Learner, Log, Update, train
+from training.imitation.learner import Learner, Update, updates
 from training.imitation.progress import bar, tensorboard
 from training.imitation.recording import Recording, stack
 
@@ -66,6 +66,8 @@ def fit(
 ) -> Policy:
     """Make the updates of a training.
 
+    The policy is the one after the last update, never the best of several.
+
     Args:
         learner: As `learner_of` makes it.
         out: Folder of the checkpoint; a training that is found there is taken up. None keeps nothing.
@@ -83,11 +85,9 @@ def fit(
     if out is not None and (out / CHECKPOINT).exists():
         learner.load(out / CHECKPOINT)
     with bar(learner, progress) as show, tensorboard(out if log else None, learner.update) as write:
-
-        def after(learner: Learner, entry: Log) -> None:
+        for entry in updates(learner, UPDATES[learner.config.method]):
             show(learner, entry)
             write(learner, entry)
             if out is not None and (learner.update % every == 0 or learner.update == learner.config.updates):
                 learner.save(out / CHECKPOINT)
-
-        return train(learner, UPDATES[learner.config.method], after)
+    return learner.policy

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -148,15 +148,27 @@ class Learner:
         Raises:
             ValueError: If the file is of another training.
         """
-        state: dict[str, Any] = torch.load(path, weights_only=True)
-        if not state.keys() >= {"update", "pools", *_LEARNED}:
-            raise ValueError(f"Expected a checkpoint of a training in {str(path)!r}.")
+        state = self.inherit(path)
         self.update, self.simulated = state["update"], state["simulated"]
-        for name in _LEARNED:
-            getattr(self, name).load_state_dict(state[name])
         self.generator.set_state(state["generator"])
         self.rollouts.extend(state["rollouts"])
         self.pools = [Pool(Traffic(**pool["traffic"]), pool["noise"], pool["age"]) for pool in state["pools"]]
+
+    def inherit(self, path: Path) -> dict[str, Any]:
+        """Take what has been learned from a saved training, but neither its place in it nor its traffic.
+
+        Returns:
+            Everything that the file holds.
+
+        Raises:
+            ValueError: If the file is of another training.
+        """
+        state: dict[str, Any] = torch.load(path, weights_only=True)
+        if not state.keys() >= {"update", "pools", *_LEARNED}:
+            raise ValueError(f"Expected a checkpoint of a training in {str(path)!r}.")
+        for name in _LEARNED:
+            getattr(self, name).load_state_dict(state[name])
+        return state
 
 
 def _value(generator: torch.Generator) -> nn.Sequential:
@@ -171,16 +183,12 @@ def _value(generator: torch.Generator) -> nn.Sequential:
 Update = Callable[[Learner], Log]
 
 
-def train(learner: Learner, update: Update, after: Callable[[Learner, Log], None] | None = None) -> Policy:
-    """Make the updates that are left.
+def updates(learner: Learner, update: Update) -> Iterator[Log]:
+    """Make the updates that are left, one by one.
 
     Args:
         learner: The training; it may have been resumed.
         update: One round: drive, let the critic learn, move the policy.
-        after: Called after each, for progress, logs and checkpoints.
-
-    Returns:
-        The policy after the last update: never the best of several.
     """
     if learner.update == 0:
         learner.warm_up()
@@ -188,6 +196,4 @@ def train(learner: Learner, update: Update, after: Callable[[Learner, Log], None
         learner.set_rates()
         log = update(learner)
         learner.update += 1
-        if after is not None:
-            after(learner, log)
-    return learner.policy
+        yield log

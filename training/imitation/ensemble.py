@@ -1,0 +1,205 @@
+"""An ensemble of drivers around a trained one, and the law of their last layers.
+
+    python -m training.imitation.ensemble runs/mgail --members 32 --out mgail.safetensors
+
+A member is the base's training taken up once more: from the base's weights, with the base's critic, optimisers and
+losses as they were at its end, and with the trunk frozen. Only chance differs: its scenes are drawn from the base's
+with repetition, those that it starts in and those whose driving it compares with. Anything else that differed (new
+critics, other weights of the losses) would move all members the same way, and their mean away from the base.
+
+Scenes of one recording overlap in vehicles and time, and a run is short: the spread says how far the last layer can
+move at no loss, not what a posterior would say. Metadata record how far a member moves within its run beside how far
+members are from each other, and how far their mean is from the base.
+"""
+
+from __future__ import annotations
+
+import copy
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+import torch
+import typer
+from rich.console import Console
+from rich.progress import track
+from torch import Tensor
+
+from agents import LearnedDriver, read_driver, read_provenance, save_driver
+from agents.networks import head_weights
+from agents.weights import Array
+from training.imitation.clone import improve
+from training.imitation.config import Config
+from training.imitation.critic import Critic
+from training.imitation.expert import Pairs
+from training.imitation.fitting import CHECKPOINT, UPDATES, Data, prepare
+from training.imitation.folders import DRIVER, read_settings
+from training.imitation.learner import Learner, updates
+from training.imitation.sources import load
+from training.imitation.weight_fit import FOLDS, fit_weights
+
+
+@dataclass(frozen=True)
+class Ensemble:
+    """How to make an ensemble.
+
+    Raises:
+        ValueError: If there are too few members to fit a law, or updates.
+    """
+
+    members: int = 32
+    updates: int = 60
+    """Of each member; one of a driver that was only cloned makes the epochs of its base."""
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.members < 2 * FOLDS or self.updates < 2:
+            raise ValueError(f"Expected {2 * FOLDS} or more members and 2 or more updates, got {self}.")
+
+
+class Member(NamedTuple):
+    """One trained member."""
+
+    weights: Array
+    """Its last layer, shape (404,)."""
+    within: Array
+    """Standard deviation of each weight over the second half of its run, shape (404,)."""
+
+
+def settings_of(base: Config, ensemble: Ensemble) -> Config:
+    """The base's settings with all schedules at their ends."""
+    last: dict[str, Any] = {name: (getattr(base, name)[1],) * 2 for name in ("horizon", "age", "drivers")}
+    clone_weight = (base.clone_weight[1], base.clone_weight[1])
+    return replace(base, updates=ensemble.updates, warm_up=0, clone_weight=clone_weight, **last)
+
+
+def train_member(
+    data: Data, driver: LearnedDriver, base: Config, checkpoint: Path, ensemble: Ensemble, number: int
+) -> Member:
+    """Train a member.
+
+    Args:
+        data: What the base learned from.
+        driver: The base.
+        base: Its settings.
+        checkpoint: Of its training.
+        ensemble: Settings of the ensemble.
+        number: Decides, with the ensemble's seed, everything random.
+    """
+    (seed,) = np.random.SeedSequence([ensemble.seed, number]).generate_state(1)
+    generator = torch.Generator().manual_seed(int(seed))
+    scenes = torch.unique(data.pairs.scene)
+    drawn = scenes[torch.randint(len(scenes), (len(scenes),), generator=generator)]
+    pairs, config = of_scenes(data.pairs, drawn), settings_of(base, ensemble)
+    policy = copy.deepcopy(driver.policy)
+    policy.head.requires_grad_(True)
+    visited: list[Tensor] = []
+    if config.method == "bc":
+        for _ in improve(policy, pairs, config, generator):
+            visited.append(head_weights(policy).detach())
+    else:
+        learner = Learner(config, data.recording, drawn, pairs, policy, Critic(), generator)
+        learner.inherit(checkpoint)
+        for _ in updates(learner, UPDATES[config.method]):
+            visited.append(head_weights(policy).detach())
+    late = torch.stack(visited[len(visited) // 2 :]).double().numpy()
+    return Member(late[-1], late.std(axis=0))
+
+
+def of_scenes(pairs: Pairs, drawn: Tensor) -> Pairs:
+    """The pairs of scenes that were drawn, as often as they were drawn."""
+    rows = torch.cat([(pairs.scene == scene).nonzero().flatten() for scene in drawn])
+    return Pairs(*(column[rows] for column in pairs))
+
+
+def members_of(folder: Path, ensemble: Ensemble, progress: bool = False) -> list[Member]:
+    """Train an ensemble around the driver in a folder; members that are kept there are not trained again.
+
+    Raises:
+        ValueError: If the folder holds no finished training, or members of another driver.
+    """
+    source, base = read_settings(folder)
+    driver = read_driver(folder / DRIVER)
+    own = head_weights(driver.policy).double().numpy()
+    kept = folder / f"members-{ensemble.updates}-{ensemble.seed}"
+    kept.mkdir(exist_ok=True)
+    data = prepare(load(source)[0])
+    members = []
+    for number in track(range(ensemble.members), "members", console=Console(stderr=True), disable=not progress):
+        path = kept / f"{number:03}.npz"
+        if not path.exists():
+            member = train_member(data, driver, base, folder / CHECKPOINT, ensemble, number)
+            partial = path.with_suffix(".part")
+            with partial.open("wb") as file:
+                np.savez(file, base=own, weights=member.weights, within=member.within)
+            partial.replace(path)
+        with np.load(path) as found:
+            if not np.array_equal(found["base"], own):
+                raise ValueError(f"{str(path)!r} is a member around another driver; remove {str(kept)!r}.")
+            members.append(Member(found["weights"], found["within"]))
+    return members
+
+
+def spread_of(members: list[Member], base: Array) -> dict[str, float]:
+    """How far members are from each other, move within their runs, and are as a whole from the base."""
+    weights = np.stack([member.weights for member in members])
+    between, within = weights.std(axis=0, ddof=1), np.stack([member.within for member in members]).mean(axis=0)
+    bias = np.abs(weights.mean(axis=0) - base)
+    return {
+        "between_median": float(np.median(between)),
+        "between_max": float(between.max()),
+        "within_median": float(np.median(within)),
+        "within_max": float(within.max()),
+        "bias_median": float(np.median(bias)),
+        "bias_max": float(bias.max()),
+        "bias_over_spread": float(np.sqrt(np.square(bias).mean() / np.square(between).mean())),
+    }
+
+
+def make_ensemble(folder: Path, ensemble: Ensemble, out: Path, progress: bool = False) -> Path:
+    """Write the driver in a folder anew, with the law of its weights.
+
+    Args:
+        folder: Of a finished training.
+        ensemble: Settings.
+        out: File to write, `.safetensors`.
+        progress: Show a bar on standard error.
+
+    Returns:
+        The file.
+
+    Raises:
+        ValueError: If there is no finished training, or no law can be fitted.
+    """
+    members = members_of(folder, ensemble, progress)
+    driver, provenance = read_driver(folder / DRIVER), read_provenance(folder / DRIVER)
+    fit = fit_weights(np.stack([member.weights for member in members]))
+    spread = spread_of(members, head_weights(driver.policy).double().numpy())
+    command = f"python -m training.imitation.ensemble RUN --members {ensemble.members} --updates {ensemble.updates}"
+    about = {"command": f"{command} --seed {ensemble.seed}", **spread, **fit.metadata}
+    return save_driver(replace(driver, weights=fit.distribution), replace(provenance, ensemble=about), out)
+
+
+def command(
+    run: Annotated[Path, typer.Argument(help="Folder of a finished training.")],
+    out: Annotated[Path, typer.Option(help="The driver with the law of its weights, .safetensors.")],
+    members: Annotated[int, typer.Option(help="Members to train.")] = Ensemble.members,
+    updates: Annotated[int, typer.Option(help="Of each member.")] = Ensemble.updates,
+    seed: Annotated[int, typer.Option(help="The same seed gives the same law.")] = Ensemble.seed,
+) -> None:
+    """Train an ensemble around a driver and fit the law of its last layer's weights."""
+    torch.set_num_threads(1)
+    try:
+        path = make_ensemble(run, Ensemble(members, updates, seed), out, progress=True)
+    except (ValueError, FileNotFoundError) as error:
+        print(f"ensemble: {error}", file=sys.stderr)
+        raise typer.Exit(2) from None
+    print(f"Saved {path}.")
+
+
+if __name__ == "__main__":
+    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+    app.command()(command)
+    app()
