@@ -43,9 +43,11 @@ def weights(policy):
     return torch.cat([value.flatten() for value in policy.state_dict().values()])
 
 
-@pytest.mark.parametrize("method", ["gail", "mgail"])
-def test_a_killed_training_resumes_to_the_same_weights(data, method, tmp_path):
-    config = tiny(method=method)
+@pytest.mark.parametrize(
+    "settings", [{"method": "gail"}, {"method": "mgail"}, {"learned_model": True}], ids=["gail", "mgail", "model"]
+)
+def test_a_killed_training_resumes_to_the_same_weights(data, settings, tmp_path):
+    config = tiny(**settings)
     whole = fit(learner_of(data, config))
     stopped = learner_of(data, config)
 
@@ -144,7 +146,7 @@ def test_a_command_repeats_its_training(made_up, monkeypatch, tmp_path):
     import typer
     from typer.testing import CliRunner
 
-    config = tiny(method="gail", seed=4, learned_model=True, colour=WHITE, clone_weight=(0.2, 0.1))
+    config = tiny(method="mgail", seed=4, learned_model=True, colour=WHITE, clone_weight=(0.2, 0.1))
     found = []
     monkeypatch.setattr(command_line, "train_driver", lambda *given, **how: found.append(given) or tmp_path)
     app = typer.Typer()
@@ -180,7 +182,15 @@ def test_the_end_of_each_recording_is_kept_for_tests():
 
 
 @pytest.mark.parametrize(
-    "settings", [{"method": "sac"}, {"updates": -1}, {"pools": 0}, {"anneal": 0.0}, {"last_rate": 2.0}]
+    "settings",
+    [
+        {"method": "sac"},
+        {"method": "gail", "learned_model": True},
+        {"updates": -1},
+        {"pools": 0},
+        {"anneal": 0.0},
+        {"last_rate": 2.0},
+    ],
 )
 def test_settings_are_checked(settings):
     with pytest.raises(ValueError, match="Expected"):

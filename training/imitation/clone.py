@@ -1,6 +1,7 @@
 """Behaviour cloning: the likelihood of recorded actions, maximised."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import TypeVar
 
 import torch
 
@@ -18,9 +19,7 @@ def clone(pairs: Pairs, config: Config, generator: torch.Generator) -> Policy:
         config: `epochs`, `batch`, `clone_rate`, `weight_decay` and `log_std_cap` are used.
         generator: Source of the initial weights and of the order of the pairs.
     """
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(int(torch.randint(2**31, (), generator=generator)))
-        policy = Policy(scaling_of(pairs), config.log_std_cap)
+    policy = seeded(lambda: Policy(scaling_of(pairs), config.log_std_cap), generator)
     for _ in improve(policy, pairs, config, generator):
         pass
     return policy
@@ -42,3 +41,13 @@ def improve(policy: Policy, pairs: Pairs, config: Config, generator: torch.Gener
             torch.autograd.backward(loss)
             optimiser.step()
         yield
+
+
+Module = TypeVar("Module")
+
+
+def seeded(make: Callable[[], Module], generator: torch.Generator) -> Module:
+    """A network whose initial weights are drawn from a generator; PyTorch takes them from the global one."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(int(torch.randint(2**31, (), generator=generator)))
+        return make()

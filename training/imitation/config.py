@@ -72,6 +72,8 @@ class Config:
     """Share of the gradient of the state that is passed on to the tick before."""
     learned_model: bool = False
     """Take the gradient through a learned forward model, as Baram et al. do, in place of the simulator."""
+    model_rate: float = 1e-3
+    model_steps: int = 10
 
     # GAIL, by proximal policy optimisation
     discount: float = 0.97
@@ -84,6 +86,8 @@ class Config:
     def __post_init__(self) -> None:
         if self.method not in ("bc", "gail", "mgail"):
             raise ValueError(f"Expected method 'bc', 'gail' or 'mgail', got {self.method!r}.")
+        if self.learned_model and self.method != "mgail":
+            raise ValueError(f"Expected method 'mgail' with learned_model, got {self.method!r}.")
         for name in ("updates", "epochs"):
             if getattr(self, name) < 0:
                 raise ValueError(f"Expected {name} >= 0, got {getattr(self, name)}.")

@@ -11,7 +11,7 @@ import torch
 from agents.networks import Policy
 from training.data.scenes import Scene
 from training.imitation import gail, mgail
-from training.imitation.clone import clone
+from training.imitation.clone import clone, seeded
 from training.imitation.config import Config
 from training.imitation.critic import Critic
 from training.imitation.expert import Pairs, expert_pairs
@@ -55,9 +55,7 @@ def learner_of(data: Data, config: Config) -> Learner:
     """Everything of a training before its first update: a cloned policy, a new critic."""
     generator = torch.Generator().manual_seed(config.seed)
     policy = clone(data.pairs, config, generator)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(int(torch.randint(2**31, (), generator=generator)))
-        critic = Critic()
+    critic = seeded(Critic, generator)
     return Learner(config, data.recording, torch.unique(data.pairs.scene), data.pairs, policy, critic, generator)
 
 

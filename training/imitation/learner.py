@@ -13,9 +13,11 @@ from torch import Tensor, nn
 
 from agents.networks import ACTIONS, FEATURES, Policy
 from training.imitation.acting import log_likelihood
+from training.imitation.clone import seeded
 from training.imitation.config import Config
 from training.imitation.critic import Critic, inputs, train_critic
 from training.imitation.expert import Pairs
+from training.imitation.forward_model import ForwardModel, train_model
 from training.imitation.pools import Pool, fresh_pool
 from training.imitation.recording import Recording
 from training.imitation.rollout import Steps, roll
@@ -48,8 +50,14 @@ class Learner:
         config = self.config
         self.policy_optimiser = torch.optim.Adam(self.policy.parameters(), config.policy_rate, betas=(0.9, 0.99))
         self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), config.critic_rate, betas=(0.5, 0.9))
-        self.value = _value(self.generator)
+        self.value = seeded(_value, self.generator)
         self.value_optimiser = torch.optim.Adam(self.value.parameters(), config.value_rate)
+        self.learned: tuple[str, ...] = _LEARNED
+        self.model: ForwardModel | None = None
+        if config.learned_model:
+            self.model = seeded(ForwardModel, self.generator)
+            self.model_optimiser = torch.optim.Adam(self.model.parameters(), config.model_rate)
+            self.learned += ("model", "model_optimiser")
         self.pools: list[Pool] = []
         self.rollouts: deque[Tensor] = deque(maxlen=config.memory)
         self.recorded = inputs(self.policy, self.pairs.features, self.recorded_action)
@@ -83,7 +91,7 @@ class Learner:
             self.pools[index] = self._new_pool()
         horizon = self.now(config.horizon)
         steps, self.pools[index] = roll(
-            self.recording, self.policy, self.pools[index], horizon, config.colour, credit, self.generator
+            self.recording, self.policy, self.pools[index], horizon, config.colour, credit, self.generator, self.model
         )
         self.simulated += len(steps.features)
         return steps
@@ -115,12 +123,23 @@ class Learner:
             self.generator,
         )
 
+    def learn_model(self, steps: Steps) -> float:
+        """Let the forward model learn from the rollout, if there is one, and return its error."""
+        if self.model is None:
+            return 0.0
+        config, ticks = self.config, self.now(self.config.horizon)
+        seen, done = (part.detach().view(ticks, -1, part.shape[1]) for part in (steps.features, steps.action))
+        return train_model(
+            self.model, self.model_optimiser, self.policy, seen, done, config.model_steps, config.batch, self.generator
+        )
+
     def warm_up(self) -> None:
-        """Let the critic learn before the policy moves."""
+        """Let critic and forward model learn before the policy moves."""
         for _ in range(self.config.warm_up):
             with torch.no_grad():
                 steps = self.drive(1.0)
             self.learn_critic(steps)
+            self.learn_model(steps)
 
     def clone_loss(self) -> Tensor:
         """Negative log likelihood of some recorded actions."""
@@ -133,7 +152,7 @@ class Learner:
         state = {
             "update": self.update,
             "simulated": self.simulated,
-            **{name: getattr(self, name).state_dict() for name in _LEARNED},
+            **{name: getattr(self, name).state_dict() for name in self.learned},
             "generator": self.generator.get_state(),
             "rollouts": list(self.rollouts),
             "pools": [{"traffic": pool.traffic._asdict(), "noise": pool.noise, "age": pool.age} for pool in self.pools],
@@ -164,20 +183,18 @@ class Learner:
             ValueError: If the file is of another training.
         """
         state: dict[str, Any] = torch.load(path, weights_only=True)
-        if not state.keys() >= {"update", "pools", *_LEARNED}:
+        if not state.keys() >= {"update", "pools", *self.learned}:
             raise ValueError(f"Expected a checkpoint of a training in {str(path)!r}.")
-        for name in _LEARNED:
+        for name in self.learned:
             getattr(self, name).load_state_dict(state[name])
         return state
 
 
-def _value(generator: torch.Generator) -> nn.Sequential:
+def _value() -> nn.Sequential:
     """An estimate of the rewards to come, for GAIL."""
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(int(torch.randint(2**31, (), generator=generator)))
-        return nn.Sequential(
-            nn.Linear(FEATURES + ACTIONS, 128), nn.Tanh(), nn.Linear(128, 128), nn.Tanh(), nn.Linear(128, 1)
-        )
+    return nn.Sequential(
+        nn.Linear(FEATURES + ACTIONS, 128), nn.Tanh(), nn.Linear(128, 128), nn.Tanh(), nn.Linear(128, 1)
+    )
 
 
 Update = Callable[[Learner], Log]

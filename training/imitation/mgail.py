@@ -1,7 +1,7 @@
 """MGAIL: the policy follows the gradient of its costs through the simulator.
 
 Baram et al. learn a forward model, because their simulator has no gradient. Ours has one, so nothing has to be learned
-and nothing is approximated; their way is kept for comparison (`Config.learned_model`).
+and nothing is approximated; their way is kept for comparison (`Config.learned_model`, see `forward_model`).
 
 References:
     Baram, Anschel, Caspi and Mannor, "End-to-end differentiable adversarial imitation learning", ICML 2017.
@@ -31,7 +31,7 @@ def update(learner: Learner) -> Log:
     torch.autograd.backward(loss)
     norm = torch.nn.utils.clip_grad_norm_(learner.policy.parameters(), 1.0)
     learner.policy_optimiser.step()
-    critic = learner.learn_critic(steps)
+    critic, model = learner.learn_critic(steps), learner.learn_model(steps)
     return {
         "loss": float(loss.detach()),
         "likeness": float(likeness.detach()),
@@ -41,4 +41,5 @@ def update(learner: Learner) -> Log:
         "clone": float(clone.detach()),
         "gradient_norm": float(norm),
         "critic": critic,
+        **({"model": model} if config.learned_model else {}),
     }

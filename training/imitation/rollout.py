@@ -8,6 +8,7 @@ from torch import Tensor
 from agents.networks import Policy
 from agents.noise import Colour
 from training.imitation.acting import physical
+from training.imitation.forward_model import ForwardModel
 from training.imitation.penalties import Penalties, penalties
 from training.imitation.pools import Pool
 from training.imitation.recording import Recording
@@ -37,6 +38,7 @@ def roll(
     colour: Colour,
     credit: float,
     generator: torch.Generator,
+    model: ForwardModel | None = None,
 ) -> tuple[Steps, Pool]:
     """Drive a pool for some ticks.
 
@@ -48,6 +50,7 @@ def roll(
         colour: Of the noise.
         credit: Share of the gradient of the state that each tick passes on to the tick before.
         generator: Source of the noise.
+        model: Take the gradient through it in place of the simulator.
 
     Returns:
         The moments, differentiable in the policy's weights, and the pool afterwards, which is not.
@@ -57,16 +60,21 @@ def roll(
     driven = traffic.driven[:, :m]
     unused = traffic.x.new_zeros(*traffic.x.shape[:1], traffic.x.shape[1] - m, 2)
     rows = []
+    features: Tensor | None = None
+    action: Tensor | None = None
     for _ in range(ticks):
-        features = look(traffic, m)
+        before, features = features, look(traffic, m)
+        if model is not None and before is not None and action is not None:
+            features = model.substituted(policy, before, action, features, credit)
         mean, log_std = policy(features)
         expected = colour.expected(memory)
         noise, memory = colour.next(memory, torch.randn(expected.shape, generator=generator))
         action = mean + torch.exp(log_std) * noise
         moved = torch.cat((physical(policy, action), unused), dim=1)
-        cost = _penalties(traffic, features, moved[:, :m], m)
+        cost = _penalties(traffic, features if model is None else features.detach(), moved[:, :m], m)
         rows.append([part[driven] for part in (features, action, *cost, expected)])
-        traffic = _passing(step(recording, traffic, moved), credit)
+        traffic = step(recording, traffic, moved)
+        traffic = _passing(traffic, credit) if model is None else detached(traffic)
     columns = [torch.cat(column) for column in zip(*rows, strict=True)]
     return Steps(*columns), Pool(detached(traffic), memory, pool.age + ticks)
 

@@ -84,6 +84,8 @@ def command(
     gradient_penalty: Number = D.gradient_penalty,
     credit: Number = D.credit,
     learned_model: Annotated[bool, typer.Option(help="MGAIL: gradient of a learned model.")] = D.learned_model,
+    model_rate: Number = D.model_rate,
+    model_steps: Count = D.model_steps,
     discount: Number = D.discount,
     gae: Number = D.gae,
     clip: Number = D.clip,
