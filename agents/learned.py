@@ -3,7 +3,7 @@
 import copy
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -140,9 +140,13 @@ class LearnedEgo:
     """A learned driver as ego: a Driver that acts by its mean actions and has no memory."""
 
     driver: LearnedDriver
+    sees: ClassVar[bool] = True
+    """It needs a world in which vehicles look."""
 
     def act(self, episode: "Episode", memory: Any) -> tuple[Tensor, Any]:
         """Perceive and decide for one tick; see `rare_envs.drivers.Driver`."""
+        if episode.perception is None:
+            raise ValueError('Expected a world in which vehicles look: make it with observation="lidar".')
         features = episode.perception[:, :1]
         actions, _ = self.driver.act(features)
         acceleration, yaw_rate = actions[:, 0].unbind(dim=-1)

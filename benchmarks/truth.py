@@ -62,7 +62,7 @@ def main(
     torch.set_num_threads(1)
     results = []
     for env_id in rare_envs.ENV_IDS:
-        for base in BASES:
+        for base in BASES[scenario.name]:
             results.append(truth(env_id, base, int(rollouts), seed))
             print(json.dumps(results[-1]))
             command = f"python -m benchmarks.truth --rollouts {rollouts:g} --seed {seed}"

@@ -133,6 +133,8 @@ class PolicyDriver:
     policy: Any
     normalise: Callable[[NDArray[np.float32]], NDArray[np.float32]] | None = None
     """What the policy's observations went through in training, such as SB3's `VecNormalize.normalize_obs`."""
+    observation: str = "features"
+    """What it observes."""
 
     def act(self, episode: "Episode", memory: Any) -> tuple[Tensor, Any]:
         """Observe, and ask the policy for its mean action; a recurrent policy's hidden state is the memory.
@@ -147,7 +149,7 @@ class PolicyDriver:
         batch = len(over)
         start = np.full(batch, memory is None)
         hidden = None if memory is None else memory[0]
-        observation = observe(state).masked_fill(over[:, None], 0.0).numpy(force=True)
+        observation = observe(episode, self.observation).masked_fill(over[:, None], 0.0).numpy(force=True)
         if self.normalise is not None:
             observation = self.normalise(observation)
         action, hidden = self.policy.predict(observation, state=hidden, episode_start=start, deterministic=True)

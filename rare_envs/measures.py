@@ -1,12 +1,15 @@
 """Safety measures: how close a state is to a collision; small is dangerous, always finite."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from types import MappingProxyType
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from rare_envs.geometry import Lead
+from rare_envs.perception import RANGES, RATES
 from rare_envs.road import Road
 from rare_envs.state import State
 
@@ -20,11 +23,31 @@ _GAP_MIN = 0.01
 _STILL = 1e-4
 """Closing speeds are floored here [m/s], far below gap / TTC_MAX, so no value under the cap changes."""
 
-Measure = Callable[[State, Lead, Road], Tensor]
-"""State, the ego's lead and the road to shape (B,)."""
+
+class Moment(NamedTuple):
+    """What a measure may look at."""
+
+    state: State
+    lead: Lead
+    """The ego's."""
+    road: Road
+    perception: Tensor | None
+    """What vehicles see, shape (B, M, 51), the ego first; None unless the measure needs it."""
 
 
-def ttc(state: State, lead: Lead, road: Road) -> Tensor:
+@dataclass(frozen=True)
+class Measure:
+    """How dangerous a moment is, and how an episode's measure comes from its moments': it is the least of them."""
+
+    of: Callable[[Moment], Tensor]
+    """A moment to shape (B,)."""
+    sees: bool = False
+    """Whether it needs what the ego sees."""
+    collision: float | None = COLLISION
+    """The measure of an episode with a collision; None if it is the least of the moments before it."""
+
+
+def ttc(moment: Moment) -> Tensor:
     """Time to collision of the ego with its lead, or with the edge of the road, if speeds and headings stay.
 
     To the lead: gap / closing speed while closing. To the edge, which is a wall: way to it / speed across the road
@@ -35,9 +58,7 @@ def ttc(state: State, lead: Lead, road: Road) -> Tensor:
     would miss that way to crash.
 
     Args:
-        state: Traffic of B scenarios.
-        lead: The ego's lead.
-        road: Their road.
+        moment: Of B scenarios.
 
     Returns:
         Time to collision [s], in (0, TTC_MAX], shape (B,).
@@ -45,6 +66,7 @@ def ttc(state: State, lead: Lead, road: Road) -> Tensor:
     References:
         Hayward, "Near-miss determination through use of a scale of danger", 1972.
     """
+    state, lead, road, _ = moment
     to_lead = lead.gap.clamp(min=_GAP_MIN) / lead.closing_speed.clamp(min=_STILL)
     across = state.speed[:, 0] * torch.sin(state.heading[:, 0])
     offset = state.y[:, 0] - road.middle
@@ -53,4 +75,31 @@ def ttc(state: State, lead: Lead, road: Road) -> Tensor:
     return torch.minimum(to_lead, to_edge).clamp(max=TTC_MAX)
 
 
-MEASURES: MappingProxyType[str, Measure] = MappingProxyType({"ttc": ttc})
+def lidar_ttc(moment: Moment) -> Tensor:
+    """Least time to collision along the ego's lidar beams: range / closing speed of each that closes, at most 10 s.
+
+    The beams start at the ego's centre, so at contact about 1 m is left at the side and 2.5 m ahead: small values come
+    with violent contacts, side-swipes above all. The moment of a collision is not measured, and a collision is worth
+    no more than the moments before it (`Measure.collision`). In the released code beams that meet nothing and those
+    that do not close count as infinite; here everything is at most `TTC_MAX`.
+
+    Args:
+        moment: Of B scenarios.
+
+    Returns:
+        Time to collision [s], in [0, TTC_MAX], shape (B,).
+
+    References:
+        O'Kelly, Sinha, Namkoong, Duchi and Tedrake, "Scalable end-to-end autonomous vehicle testing via rare-event
+        simulation", 2018, appendix A and released code.
+    """
+    assert moment.perception is not None
+    ego = moment.perception[:, 0]
+    closing = -ego[:, RATES]
+    time = torch.where(closing > 0.0, ego[:, RANGES] / closing.clamp(min=_STILL), TTC_MAX)
+    return time.amin(dim=1).clamp(max=TTC_MAX)
+
+
+MEASURES: MappingProxyType[str, Measure] = MappingProxyType(
+    {"ttc": Measure(ttc), "lidar_ttc": Measure(lidar_ttc, sees=True, collision=None)}
+)

@@ -1,13 +1,18 @@
-"""What an ego sees: the `features` observation."""
+"""What an ego observes: `features`, its own state and the others' relative to it, or `lidar`."""
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from gymnasium import spaces
 from torch import Tensor
 
+from rare_envs.lidar import BEAMS, MAX_RANGE
 from rare_envs.state import LANE_WIDTH, VEHICLE_LENGTH, State
+
+if TYPE_CHECKING:
+    from rare_envs.world import Episode
 
 
 @dataclass(frozen=True)
@@ -36,13 +41,32 @@ OTHER_FEATURES = (
 ego's, its position across the road less the ego's, its speed across the road."""
 
 
-def observation_space(vehicles: int) -> "spaces.Box[np.float32]":
-    """The space of `observe` for N vehicles: 3 features of the ego, then 4 of each other vehicle."""
+_CORE_SCALES = (LANE_WIDTH, 0.1, 30.0, VEHICLE_LENGTH, 2.0, 0.01, LANE_WIDTH, LANE_WIDTH, 1.0, 1.0, 1.0)
+LIDAR_SCALES = (*_CORE_SCALES, *(MAX_RANGE,) * BEAMS, *(10.0,) * BEAMS)
+"""Scales of the `lidar` observation, which are the 51 features of learned drivers (`perception.FEATURES`)."""
+
+
+def observation_space(vehicles: int, observation: str = "features") -> "spaces.Box[np.float32]":
+    """The space of an observation.
+
+    Args:
+        vehicles: N.
+        observation: "features": 3 of the ego, then 4 of each other vehicle; or "lidar": the ego's 51.
+    """
     size = len(EGO_FEATURES) + len(OTHER_FEATURES) * (vehicles - 1)
-    return spaces.Box(-CLIP, CLIP, (size,), np.float32)
+    return spaces.Box(-CLIP, CLIP, (len(LIDAR_SCALES) if observation == "lidar" else size,), np.float32)
 
 
-def observe(state: State) -> Tensor:
+def observe(episode: "Episode", observation: str) -> Tensor:
+    """What the egos of B episodes observe, shape (B, F), float32, within +-`CLIP`."""
+    if observation == "lidar":
+        assert episode.perception is not None
+        scales = episode.perception.new_tensor(LIDAR_SCALES)
+        return (episode.perception[:, 0] / scales).clamp(-CLIP, CLIP).float()
+    return features(episode.state)
+
+
+def features(state: State) -> Tensor:
     """The `features` observation of the ego.
 
     Args:

@@ -1,5 +1,6 @@
 """DrivingProblem: a scenario and an ego as a function f(x), in the shape that samplers expect."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,10 @@ RULE_TILE = 16384
 """Rollouts that a rule-based ego drives at once: where eager torch is fastest."""
 POLICY_TILE = 4096
 """Likewise with a policy; fixed, because matrix products round differently by batch size."""
+
+
+LIDAR_TILE = 512
+"""Likewise where vehicles look: small enough for what a tick needs to stay in the cache."""
 
 
 class DrivingProblem:
@@ -51,21 +56,22 @@ class DrivingProblem:
             ego: "idm", a `Driver`, or an object with Stable-Baselines3's `predict`, called on whole batches.
             measure: Name of the safety measure.
             base: Base distribution of x; None takes the environment's default ("us101").
-            noise: What becomes of a driver's own randomness: True, "fixed" or False. The drivers of this version
-                have none (policies act by their means), so the three agree.
+            noise: What becomes of the randomness of learned drivers: True, it is part of x, standard normal columns
+                behind the others; "fixed", one sequence for all x, so that p is conditional on it; False, mean
+                actions. Scripts and egos have none (policies act by their means), so there the three agree.
             **make_kwargs: Further keyword arguments of `gym.make` for this id.
 
         Raises:
             ValueError: If an argument is invalid or the ego's spaces are not the environment's.
         """
-        if noise not in (True, False, "fixed"):
-            raise ValueError(f"Expected noise True, False or 'fixed', got {noise!r}.")
         self.env_id = env_id
         self.ego = ego
         self.world: World
         self.space: ScenarioSpace
-        self.world, self.space = set_up(env_id, measure=measure, base=base, **make_kwargs)
+        self.world, self.space = set_up(env_id, measure=measure, base=base, noise=noise, **make_kwargs)
         self.driver = as_driver(ego, self.world)
+        if getattr(self.driver, "sees", False):
+            self.world = replace(self.world, lidar=True)
 
     @property
     def dim(self) -> int:
@@ -91,6 +97,7 @@ class DrivingProblem:
         """
         x = self.space.validate(np.atleast_2d(x))
         tile = POLICY_TILE if isinstance(self.driver, PolicyDriver) else RULE_TILE
+        tile = LIDAR_TILE if self.world.sees else tile
         f = np.empty(len(x))
         with torch.inference_mode():
             for first in range(0, len(x), tile):
@@ -112,11 +119,11 @@ def as_driver(ego: Any, world: World) -> Driver:
     if isinstance(ego, type):
         raise ValueError(f"Expected an ego, got the class {ego.__name__}; make or train one of it first.")
     if callable(getattr(ego, "predict", None)):
-        check_spaces(ego, observation_space(world.scenario.vehicles))
+        check_spaces(ego, observation_space(world.scenario.vehicles, world.observation))
         # a model trained behind SB3's VecNormalize wants its observations as they were then
         statistics = getattr(ego, "get_vec_normalize_env", lambda: None)()
         normalise = statistics.normalize_obs if statistics is not None and statistics.norm_obs else None
-        return PolicyDriver(ego, normalise)
+        return PolicyDriver(ego, normalise, world.observation)
     if callable(getattr(ego, "act", None)):
         driver: Driver = ego
         return driver

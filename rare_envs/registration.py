@@ -5,7 +5,7 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.vector import VectorEnv
 
-ENV_IDS = ("rare_envs/CarFollowing-v0", "rare_envs/CutIn-v0")
+ENV_IDS = ("rare_envs/CarFollowing-v0", "rare_envs/CutIn-v0", "rare_envs/Highway-v0")
 
 
 def register_envs() -> None:

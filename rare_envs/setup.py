@@ -4,11 +4,13 @@ from typing import Any
 
 import numpy as np
 
+from rare_envs.background import find_drivers
+from rare_envs.blocks import NoiseLaw, beside
 from rare_envs.scenarios import SCENARIOS, Scenario
-from rare_envs.space import PARAMETERS, ScenarioSpace, did_you_mean, load_base
+from rare_envs.space import PARAMETERS, Distribution, Parameter, ScenarioSpace, did_you_mean, load_base
 from rare_envs.world import World
 
-OBSERVATIONS = ("features",)
+OBSERVATIONS = ("features", "lidar")
 ACTIONS = ("continuous",)
 
 
@@ -33,17 +35,25 @@ def set_up(
     horizon: float | None = None,
     dt: float = 0.1,
     base: Any = None,
+    drivers: Any = None,
+    noise: bool | str = True,
 ) -> tuple[World, ScenarioSpace]:
     """The world and the scenario space of an environment.
 
     Args:
         env_id: For example "rare_envs/CutIn-v0".
-        observation: "features".
+        observation: "features" or "lidar".
         action: "continuous".
-        measure: Name of the safety measure, "ttc".
+        measure: Name of the safety measure, "ttc" or "lidar_ttc".
         horizon: Length of an episode [s]; None takes the scenario's.
         dt: Tick [s].
-        base: "us101", "highway", the path of a JSON file, or a distribution object; None takes "us101".
+        base: Law of the scenario's own parameters: the name of a shipped one, the path of a JSON file, or a
+            distribution object; None takes the scenario's default.
+        drivers: Of the vehicles around the ego: "mgail", "gail", "bc", the path of a driver's file, or a `Background`;
+            None takes the scenario's default, which is its script but for the highway. The weights of learned drivers
+            are parameters of the scenario.
+        noise: What becomes of the drivers' noise. True: it is part of x, standard normal columns behind the others.
+            "fixed": one sequence for all x, so that probabilities are conditional on it. False: mean actions.
 
     Returns:
         The world and the space of its parameters.
@@ -54,16 +64,41 @@ def set_up(
     scenario = find_scenario(env_id)
     _one_of("observation", observation, OBSERVATIONS)
     _one_of("action", action, ACTIONS)
-    world = World(scenario, dt=dt, horizon=horizon, measure=measure)
-    parameters = PARAMETERS[scenario.name]
-    space = ScenarioSpace(
+    background = find_drivers(scenario.drivers if drivers is None else drivers)
+    world = World(
+        scenario,
+        dt=dt,
+        horizon=horizon,
+        measure=measure,
+        drivers=background,
+        noise=noise,
+        observation=observation,
+    )
+    return world, space_of(world, load_base(scenario.name, base))
+
+
+def space_of(world: World, base: Distribution) -> ScenarioSpace:
+    """The parameters of a world: the scenario's, then its drivers' weights and noise.
+
+    Args:
+        world: The world.
+        base: Law of the scenario's own parameters.
+    """
+    parameters, laws = list(PARAMETERS[world.scenario.name]), [base]
+    if world.drivers is not None and world.drivers.weights is not None:
+        parameters.append(Parameter("weights", "", -np.inf, np.inf, "of the drivers' last layer", world.weights))
+        laws.append(world.drivers.weights)
+    if world.draws:
+        parameters.append(Parameter("noise", "", -np.inf, np.inf, "of the drivers, tick by tick", world.draws))
+        laws.append(NoiseLaw(world.draws))
+    return ScenarioSpace(
         names=tuple(p.name for p in parameters),
         units=tuple(p.unit for p in parameters),
-        low=np.array([p.low for p in parameters]),
-        high=np.array([p.high for p in parameters]),
-        base=load_base(scenario.name, "us101" if base is None else base),
+        low=np.repeat([p.low for p in parameters], [p.size for p in parameters]),
+        high=np.repeat([p.high for p in parameters], [p.size for p in parameters]),
+        base=beside(*laws),
+        sizes=tuple(p.size for p in parameters),
     )
-    return world, space
 
 
 def _one_of(what: str, value: object, valid: tuple[str, ...]) -> None:

@@ -10,6 +10,7 @@ import difflib
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from importlib import resources
 from os import PathLike
 from pathlib import Path
@@ -18,12 +19,18 @@ from typing import Any, Protocol, cast, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rare_envs.beta_law import BetaLaw
 from rare_envs.distributions import TruncatedGaussianMixture
 from rare_envs.log_mixture import LogMixture
 
 Array = NDArray[np.float64]
 
-BASES = ("us101", "highway")  # shipped for every scenario in PARAMETERS
+BASES = {
+    "car_following": ("us101", "highway"),
+    "cut_in": ("us101", "highway"),
+    "highway": ("okelly2018",),
+}
+"""Base distributions that are shipped for each scenario; the first is the default."""
 
 
 @runtime_checkable
@@ -57,6 +64,8 @@ class Parameter:
     low: float
     high: float
     meaning: str
+    size: int = 1
+    """Columns of x that it takes: 1 for a scalar, more for a block of like values, one for each vehicle, say."""
 
 
 # Speeds: none backwards, and 45 m/s (162 km/h) is above what congested US 101 (at most 27 m/s in
@@ -80,6 +89,13 @@ PARAMETERS: dict[str, tuple[Parameter, ...]] = {
         Parameter("lead_gap", "m", 1.0, 150.0, "initial gap from cutter to lead along the road"),
         Parameter("lateral_offset", "m", 2.2, 5.0, "initial distance of the centres across"),
     ),
+    # The ranges of O'Kelly et al. (2018), section 4, which are those of their Beta laws.
+    "highway": (
+        Parameter("s", "m", 80.0, 120.0, "initial place along the road, the ego's first", 6),
+        Parameter("t", "m", -0.25, 0.25, "initial place to the right of the lane's middle", 6),
+        Parameter("heading", "deg", -3.6, 3.6, "initial heading relative to the road, positive to the right", 6),
+        Parameter("speed", "m/s", 10.0, 20.0, "initial speed", 6),
+    ),
 }
 
 
@@ -88,11 +104,12 @@ class ScenarioSpace:
     """The parameters of a scenario in the order of x, and their base distribution.
 
     Attributes:
-        names: Parameter names, length d.
-        units: Their units, length d.
-        low: Lower ends of the allowed ranges, shape (d,).
-        high: Upper ends of the allowed ranges, shape (d,).
+        names: Parameter names.
+        units: Their units.
+        low: Lower ends of the allowed ranges, one for each column of x, shape (d,).
+        high: Upper ends, shape (d,).
         base: Law of x; the methods of the same name go to it.
+        sizes: Columns of x that each parameter takes; by default one each.
     """
 
     names: tuple[str, ...]
@@ -100,25 +117,27 @@ class ScenarioSpace:
     low: Array
     high: Array
     base: Distribution
+    sizes: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "names", tuple(self.names))
         object.__setattr__(self, "units", tuple(self.units))
+        object.__setattr__(self, "sizes", tuple(self.sizes) or (1,) * len(self.names))
         for name in ("low", "high"):
             bound = np.array(getattr(self, name), dtype=np.float64)
             bound.setflags(write=False)
             object.__setattr__(self, name, bound)
-        lengths = {len(self.names), len(self.units), *self.low.shape, *self.high.shape}
-        if len(lengths) != 1 or self.low.ndim != 1 or self.high.ndim != 1:
+        fits = len(self.names) == len(self.units) == len(self.sizes)
+        if not (fits and self.low.shape == self.high.shape == (sum(self.sizes),)):
             raise ValueError(
-                f"Expected as many names, units and bounds, got {len(self.names)} names, "
-                f"{len(self.units)} units, low {self.low.shape} and high {self.high.shape}."
+                f"Expected as many names, units and bounds, got {len(self.names)} names, {len(self.units)} units, "
+                f"sizes {self.sizes}, low {self.low.shape} and high {self.high.shape}."
             )
 
     @property
     def dim(self) -> int:
-        """Number of parameters d."""
-        return len(self.names)
+        """Number of columns of x, d."""
+        return sum(self.sizes)
 
     def sample(self, n: int, rng: np.random.Generator) -> Array:
         """Independent scenarios from the base distribution, shape (n, d)."""
@@ -136,16 +155,34 @@ class ScenarioSpace:
         """Map from standard normal space, (n, d) -> (n, d)."""
         return self.base.from_standard_normal(u)
 
-    def named(self, x_row: ArrayLike) -> dict[str, float]:
-        """One scenario as a mapping from names to values; x_row has shape (d,)."""
+    def named(self, x_row: ArrayLike) -> dict[str, Any]:
+        """One scenario, shape (d,), as a mapping from names to numbers, or to arrays for blocks."""
         row = np.asarray(x_row, dtype=np.float64)
         if row.shape != (self.dim,):
             raise ValueError(f"Expected one scenario of shape ({self.dim},), got {row.shape}.")
-        return dict(zip(self.names, row.tolist(), strict=True))
+        return {name: float(part[0]) if size == 1 else part for name, size, part in self._parts(row)}
+
+    def columns(self, x: Array) -> dict[str, Array]:
+        """Scenarios (n, d) as a mapping from names to columns: (n,), or (n, size) for blocks."""
+        return {name: part[:, 0] if size == 1 else part for name, size, part in self._parts(x)}
+
+    def _parts(self, x: Array) -> list[tuple[str, int, Array]]:
+        """Name, size and columns of each parameter."""
+        parts = zip(self.names, self.sizes, self._slices, strict=True)
+        return [(name, size, x[..., at].copy()) for name, size, at in parts]
+
+    @cached_property
+    def _slices(self) -> tuple[slice, ...]:
+        """Columns of x of each parameter."""
+        ends = np.cumsum(self.sizes).tolist()
+        return tuple(slice(end - size, end) for size, end in zip(self.sizes, ends, strict=True))
 
     def describe(self) -> str:
         """All valid names with their ranges, in the order of x."""
-        return ", ".join(f"{name} {self._range(j)}" for j, name in enumerate(self.names))
+        return ", ".join(f"{self._title(j)} {self._range(j)}" for j in range(len(self.names)))
+
+    def _title(self, j: int) -> str:
+        return self.names[j] if self.sizes[j] == 1 else f"{self.names[j]} ({self.sizes[j]} values)"
 
     def validate(self, x: ArrayLike) -> Array:
         """Checks shape and ranges.
@@ -167,8 +204,8 @@ class ScenarioSpace:
                 f"Expected x of shape (n, {self.dim}) or ({self.dim},), got {np.shape(x)}; "
                 f"its columns are {self.describe()}."
             )
-        for j in range(self.dim):
-            self._check_range(j, points[:, j])
+        for j in range(len(self.names)):
+            self._check_range(j, points[:, self._slices[j]])
         return points
 
     def scenario_x(self, options: Mapping[str, Any] | None, n: int, rng: np.random.Generator) -> Array:
@@ -177,8 +214,8 @@ class ScenarioSpace:
         The given values replace drawn ones: the rest is not conditioned on them.
 
         Args:
-            options: Parameter names to scalars or (n,) arrays, or {"x": (d,) or (n, d)} for all
-                of them; None draws everything.
+            options: Parameter names to scalars or (n,) arrays, blocks to (size,) or (n, size) arrays, or
+                {"x": (d,) or (n, d)} for all of them; None draws everything.
             n: Number of scenarios.
             rng: Source of randomness.
 
@@ -196,7 +233,7 @@ class ScenarioSpace:
         columns = {self._index(name): self._column(name, value, n) for name, value in options.items()}
         points = np.array(self.base.sample(n, rng), dtype=np.float64)
         for j, column in columns.items():
-            points[:, j] = column
+            points[:, self._slices[j]] = column
         return self.validate(points)
 
     def _given_x(self, options: Mapping[str, Any], n: int) -> Array:
@@ -209,11 +246,18 @@ class ScenarioSpace:
         return np.repeat(points, n, axis=0) if len(points) == 1 else points
 
     def _column(self, name: str, value: Any, n: int) -> Array:
-        values = _as_numbers(name, value)
-        if values.shape not in ((), (1,), (n,)):
-            raise ValueError(f"Expected {name} as one number or an array of shape ({n},), got {values.shape}.")
-        self._check_range(self._index(name), np.atleast_1d(values))
-        return values
+        values, j = _as_numbers(name, value), self._index(name)
+        size = self.sizes[j]
+        if size == 1:
+            if values.shape not in ((), (1,), (n,)):
+                raise ValueError(f"Expected {name} as one number or an array of shape ({n},), got {values.shape}.")
+            column = np.atleast_1d(values)[:, None]
+        else:
+            if values.shape not in ((size,), (n, size)):
+                raise ValueError(f"Expected {name} of shape ({size},) or ({n}, {size}), got {values.shape}.")
+            column = np.atleast_2d(values)
+        self._check_range(j, column)
+        return column
 
     def _index(self, name: str) -> int:
         if name in self.names:
@@ -224,29 +268,34 @@ class ScenarioSpace:
         )
 
     def _range(self, j: int) -> str:
-        return f"[{self.low[j]:g}, {self.high[j]:g}] {self.units[j]}".rstrip()
+        at = self._slices[j].start
+        return f"[{self.low[at]:g}, {self.high[at]:g}] {self.units[j]}".rstrip()
 
     def _check_range(self, j: int, values: Array) -> None:
-        wrong = ~((values >= self.low[j]) & (values <= self.high[j]))  # True for NaN too
+        """Check the columns of a parameter, shape (n, size)."""
+        low, high = self.low[self._slices[j]], self.high[self._slices[j]]
+        wrong = ~((values >= low) & (values <= high) & np.isfinite(values))  # True for NaN too
         if wrong.any():
-            i = int(np.argmax(wrong))
+            i, k = np.unravel_index(int(np.argmax(wrong)), wrong.shape)
             row = f" (row {i})" if len(values) > 1 else ""
+            which = f"[{k}]" if self.sizes[j] > 1 else ""
             raise ValueError(
-                f"{self.names[j]} = {values[i]:.10g}{row} is outside its range {self._range(j)}; "
+                f"{self.names[j]}{which} = {values[i, k]:.10g}{row} is outside its range {self._range(j)}; "
                 f"the parameters are {self.describe()}."
             )
 
 
-def load_base(scenario: str, base: str | PathLike[str] | Distribution) -> Distribution:
+def load_base(scenario: str, base: str | PathLike[str] | Distribution | None) -> Distribution:
     """The base distribution of a scenario.
 
     A JSON file holds what the shipped ones do: names, low, high, weights, means, covariances, and
-    if wanted units, provenance (see `TruncatedGaussianMixture`) and logarithmic (see `LogMixture`).
+    if wanted units, provenance (see `TruncatedGaussianMixture`) and logarithmic (see `LogMixture`); or, for independent
+    Beta laws, names, low, high, alpha and beta, one for each column of x (see `BetaLaw`).
 
     Args:
         scenario: A key of PARAMETERS.
-        base: `"us101"`, `"highway"`, a path to a JSON file, or an object with the four methods of
-            `Distribution`.
+        base: The name of a shipped one (see `BASES`), a path to a JSON file, or an object with the four methods of
+            `Distribution`; None for the scenario's default.
 
     Raises:
         ValueError: There is no such scenario or file, or it does not fit the scenario.
@@ -256,25 +305,27 @@ def load_base(scenario: str, base: str | PathLike[str] | Distribution) -> Distri
             f"Unknown scenario {scenario!r}{did_you_mean(str(scenario), PARAMETERS)}; "
             f"base distributions exist for {', '.join(PARAMETERS)}."
         )
+    shipped = BASES[scenario]
+    base = shipped[0] if base is None else base
     if not isinstance(base, str | PathLike):
         return _checked_object(scenario, base)
-    if base in BASES:
-        shipped = resources.files("rare_envs") / "data" / f"{scenario}_{base}.json"
-        return _mixture_from_json(scenario, str(base), shipped.read_text(encoding="utf-8"))
+    if base in shipped:
+        file = resources.files("rare_envs") / "data" / f"{scenario}_{base}.json"
+        return _from_json(scenario, str(base), file.read_text(encoding="utf-8"))
     path = Path(base)
     if not path.is_file():
         raise ValueError(
             f"No base distribution {str(base)!r} for {scenario}"
-            f"{did_you_mean(str(base), BASES)}: neither one of {', '.join(BASES)} nor a file."
+            f"{did_you_mean(str(base), shipped)}: neither one of {', '.join(shipped)} nor a file."
         )
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise ValueError(f"Cannot read the base distribution {path}: {error}.") from None
-    return _mixture_from_json(scenario, str(path), text)
+    return _from_json(scenario, str(path), text)
 
 
-def _mixture_from_json(scenario: str, source: str, text: str) -> TruncatedGaussianMixture | LogMixture:
+def _from_json(scenario: str, source: str, text: str) -> TruncatedGaussianMixture | LogMixture | BetaLaw:
     try:
         data = json.loads(text)
     except json.JSONDecodeError as error:
@@ -288,21 +339,22 @@ def _mixture_from_json(scenario: str, source: str, text: str) -> TruncatedGaussi
             f"Base distribution {source} does not fit {scenario}: expected names {wanted} in this order, got {names}."
         )
     try:
-        law = LogMixture if data.get("logarithmic") else TruncatedGaussianMixture
-        mixture = law.from_dict(data)
+        kind = BetaLaw if "alpha" in data else LogMixture if data.get("logarithmic") else TruncatedGaussianMixture
+        law: TruncatedGaussianMixture | LogMixture | BetaLaw = kind.from_dict(data)
     except ValueError as error:
         raise ValueError(f"Base distribution {source}: {error}") from None
-    if mixture.dim != len(wanted):
+    columns = sum(p.size for p in PARAMETERS[scenario])
+    if law.dim != columns:
         raise ValueError(
-            f"Base distribution {source} does not fit {scenario}: expected means with "
-            f"{len(wanted)} columns, one per name, got {mixture.dim}."
+            f"Base distribution {source} does not fit {scenario}: expected {columns} columns, got {law.dim}."
         )
-    _check_box(scenario, source, mixture)
-    return mixture
+    _check_box(scenario, source, law)
+    return law
 
 
-def _check_box(scenario: str, source: str, mixture: TruncatedGaussianMixture | LogMixture) -> None:
-    for parameter, low, high in zip(PARAMETERS[scenario], mixture.low, mixture.high, strict=True):
+def _check_box(scenario: str, source: str, law: TruncatedGaussianMixture | LogMixture | BetaLaw) -> None:
+    box = [parameter for parameter in PARAMETERS[scenario] for _ in range(parameter.size)]
+    for parameter, low, high in zip(box, law.low, law.high, strict=True):
         if low < parameter.low or high > parameter.high:
             raise ValueError(
                 f"Base distribution {source} gives {parameter.name} the range [{low:g}, {high:g}] "
@@ -314,12 +366,12 @@ def _checked_object(scenario: str, base: object) -> Distribution:
     missing = [name for name in METHODS if not callable(getattr(base, name, None))]
     if missing:
         raise ValueError(
-            f"A base distribution must be one of {', '.join(BASES)}, a path to a JSON file, or an "
+            f"A base distribution must be one of {', '.join(BASES[scenario])}, a path to a JSON file, or an "
             f"object with {', '.join(METHODS)}; got {type(base).__name__} without "
             f"{', '.join(missing)}."
         )
     law = cast(Distribution, base)
-    box = PARAMETERS[scenario]
+    box = [parameter for parameter in PARAMETERS[scenario] for _ in range(parameter.size)]
     draws = np.asarray(law.sample(_TRIAL_DRAWS, np.random.default_rng(0)), dtype=np.float64)
     wrong = f"Base distribution {type(base).__name__} does not fit {scenario}: "
     if draws.shape != (_TRIAL_DRAWS, len(box)):

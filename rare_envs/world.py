@@ -1,18 +1,22 @@
-"""The world: a scenario with its clock and its measure, as pure functions from episode to episode."""
+"""The world: a scenario with its drivers, its clock and its measure, as pure functions from episode to episode."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from numbers import Real
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from rare_envs.background import Background, Minds, begin, decide, fixed_draws, noise_size
 from rare_envs.dynamics import bicycle
 from rare_envs.geometry import Lead, ego_overlaps, lead_of
-from rare_envs.measures import COLLISION, MEASURES
+from rare_envs.lidar import Bodies
+from rare_envs.measures import MEASURES, Measure, Moment
+from rare_envs.perception import OnRoad, perceive
 from rare_envs.road import Road
 from rare_envs.scenarios import Scenario
-from rare_envs.state import State
+from rare_envs.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
 
 
 class Episode(NamedTuple):
@@ -21,17 +25,27 @@ class Episode(NamedTuple):
     state: State
     lead: Lead
     """The ego's lead in this state."""
-    danger: Tensor
-    """Least measure over the states so far, shape (B,); without meaning once collided."""
+    f: Tensor
+    """The safety measure of the episode so far, shape (B,): the least of its moments', and what the measure gives to a
+    collision (-1) after one."""
     collided: Tensor
     """Whether the ego has collided by now, boolean, shape (B,)."""
     road: Road
     """The road that all are on."""
+    perception: Tensor | None = None
+    """What the vehicles see in this state, `rare_envs.perception.FEATURES`, shape (B, N, 51), the ego first; None in a
+    world in which nobody looks."""
+    minds: Minds | None = None
+    """What goes on in the drivers around the ego, if they are not the scenario's script."""
 
-    @property
-    def f(self) -> Tensor:
-        """The safety measure of the episode so far: -1 after a collision, else the least measure, shape (B,)."""
-        return torch.where(self.collided, COLLISION, self.danger)
+
+def look(state: State, road: Road) -> Tensor:
+    """The 51 features of all vehicles, shape (B, N, 51)."""
+    x, y, heading = road.to_world(state.x, state.y, state.heading)
+    size = torch.ones_like(x)
+    bodies = Bodies(x, y, heading, state.speed, VEHICLE_LENGTH * size, VEHICLE_WIDTH * size)
+    left, right = road.markers(state.y)
+    return perceive(bodies, OnRoad(0.5 * (left - right), state.heading, road.curvature(state.x), left, right))
 
 
 def _is_number(value: object) -> bool:
@@ -40,7 +54,7 @@ def _is_number(value: object) -> bool:
 
 @dataclass(frozen=True)
 class World:
-    """A scenario, its tick and its measure. Nothing here changes, and nothing is random."""
+    """A scenario, its tick, its measure and its drivers. Nothing here changes, and nothing is random."""
 
     scenario: Scenario
     dt: float = 0.1
@@ -48,6 +62,14 @@ class World:
     horizon: float | None = None
     """Length of an episode [s]; None takes the scenario's."""
     measure: str = "ttc"
+    drivers: Background | None = None
+    """Of the vehicles around the ego; None for the scenario's script."""
+    noise: bool | str = True
+    """Drivers' noise: True, part of x; "fixed", one sequence for all x; False, mean actions."""
+    observation: str = "features"
+    """What the ego observes: "features" or "lidar"."""
+    lidar: bool = False
+    """Look even if neither drivers nor measure nor observation ask for it."""
 
     def __post_init__(self) -> None:
         if not (_is_number(self.dt) and 0.0 < self.dt <= 1.0):
@@ -59,6 +81,10 @@ class World:
             raise ValueError(f"Expected a horizon of one or more whole ticks of {self.dt} s, got {self.horizon!r}.")
         if not isinstance(self.measure, str) or self.measure not in MEASURES:
             raise ValueError(f"Unknown measure {self.measure!r}; the measures are {', '.join(MEASURES)}.")
+        if not (isinstance(self.noise, bool) or self.noise == "fixed"):
+            raise ValueError(f"Expected noise True, False or 'fixed', got {self.noise!r}.")
+        if self.drivers is not None and self.dt != 0.1:
+            raise ValueError(f"Expected dt = 0.1 s, the tick that these drivers learned with, got {self.dt!r}.")
 
     @property
     def seconds(self) -> float:
@@ -70,20 +96,65 @@ class World:
         """Length of an episode in ticks."""
         return round(self.seconds / self.dt)
 
+    @property
+    def sees(self) -> bool:
+        """Whether the vehicles look at every moment."""
+        needed = self.drivers is not None or self._measure.sees
+        return self.lidar or needed or self.observation == "lidar"
+
+    @property
+    def _measure(self) -> Measure:
+        return MEASURES[self.measure]
+
+    @property
+    def weights(self) -> int:
+        """Number of columns of x that are weights of the drivers."""
+        return 0 if self.drivers is None or self.drivers.weights is None else self.drivers.weights.dim
+
+    @property
+    def draws(self) -> int:
+        """Number of columns of x that are drivers' noise."""
+        return noise_size(self.ticks, self._others) if self.drivers is not None and self.noise is True else 0
+
+    @property
+    def _others(self) -> int:
+        return self.scenario.vehicles - 1
+
+    @cached_property
+    def _fixed(self) -> Tensor:
+        return fixed_draws(self.ticks, self._others)
+
     def start(self, x: Tensor) -> Episode:
         """Begin B episodes.
 
         Args:
-            x: Scenario parameters, shape (B, d), within the physical box; dtype and device are kept.
+            x: Scenario parameters, drivers' weights and drivers' noise side by side, shape (B, d), within the physical
+                box; dtype and device are kept.
 
         Returns:
             The episodes at time 0.
         """
-        state = self.scenario.initial(x)
+        size = self.scenario.size
+        state = self.scenario.initial(x[:, :size])
+        collided = torch.zeros(len(x), dtype=torch.bool, device=x.device)
+        minds = None
+        if self.drivers is not None:
+            weights, noise = x[:, size : size + self.weights], x[:, size + self.weights :]
+            minds = begin(self.drivers, weights.contiguous(), self._draws(noise))
+        moment = self._moment(state)
+        f = self._measure.of(moment)
+        return Episode(state, moment.lead, f, collided, moment.road, moment.perception, minds)
+
+    def _draws(self, noise: Tensor) -> Tensor:
+        """Draws of the drivers' noise as tensors, shape (B, 2 + T, M, 2), or (B, 0, M, 2)."""
+        batch, shape = len(noise), (self._others, 2)
+        if self.noise == "fixed":
+            return self._fixed.to(noise).expand(batch, -1, -1, -1)
+        return noise.reshape(batch, -1 if self.noise else 0, *shape)
+
+    def _moment(self, state: State) -> Moment:
         road = self.scenario.road
-        lead = lead_of(state, road)
-        danger = MEASURES[self.measure](state, lead, road)
-        return Episode(state, lead, danger, torch.zeros_like(danger, dtype=torch.bool), road)
+        return Moment(state, lead_of(state, road), road, look(state, road) if self.sees else None)
 
     def step(self, episode: Episode, action: Tensor) -> Episode:
         """Move every vehicle by one tick: all decide on the old state, then all move.
@@ -98,15 +169,21 @@ class World:
         Returns:
             The episodes one tick later.
         """
-        old, dt, road = episode.state, self.dt, episode.road
+        old, dt, road, minds = episode.state, self.dt, episode.road, episode.minds
         ego = (old.x[:, 0], old.y[:, 0], old.heading[:, 0], old.speed[:, 0])
         curvature = None if road.curve is None else road.curvature(old.x[:, 0])
         moved = bicycle(*ego, action[:, 0], action[:, 1], dt, curvature)
-        x, y, heading, speed = (
-            torch.cat((first[None], rest.T)).T for first, rest in zip(moved, self.scenario.others(old, dt), strict=True)
-        )
+        if self.drivers is None or minds is None or episode.perception is None:
+            others = self.scenario.others(old, dt)
+        else:
+            decided, minds = decide(self.drivers, minds, episode.perception[:, 1:])
+            others = self.scenario.driven(old, decided, dt)
+        x, y, heading, speed = (torch.cat((first[None], rest.T)).T for first, rest in zip(moved, others, strict=True))
         state = State(x, y, heading, speed, old.theta)
-        lead = lead_of(state, road)
-        collided = episode.collided | ego_overlaps(state, road).any(dim=1) | road.off_road(state.y[:, 0])
-        danger = torch.minimum(episode.danger, MEASURES[self.measure](state, lead, road))
-        return Episode(state, lead, danger, collided, road)
+        moment = self._moment(state)
+        hit = ego_overlaps(state, road).any(dim=1) | road.off_road(state.y[:, 0])
+        collided = episode.collided | hit
+        least = torch.minimum(episode.f, self._measure.of(moment))
+        worth = episode.f if self._measure.collision is None else self._measure.collision
+        f = torch.where(collided, worth, least)
+        return Episode(state, moment.lead, f, collided, road, moment.perception, minds)

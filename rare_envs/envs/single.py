@@ -41,7 +41,7 @@ class DrivingEnv(gym.Env[Observation, NDArray[np.float32]]):
             ValueError: If an argument is invalid.
         """
         self.world, self.space = set_up(env_id, **kwargs)
-        self.observation_space = observation_space(self.world.scenario.vehicles)
+        self.observation_space = observation_space(self.world.scenario.vehicles, self.world.observation)
         self.action_space = action_space()
         self.metadata = {**self.metadata, "render_fps": round(1.0 / self.world.dt)}
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
@@ -73,7 +73,7 @@ class DrivingEnv(gym.Env[Observation, NDArray[np.float32]]):
         self._tick = 0
         with torch.inference_mode():
             self._episode = self.world.start(torch.from_numpy(self._x[None]).float())
-            observation = observe(self._episode.state)[0].numpy()
+            observation = observe(self._episode, self.world.observation)[0].numpy()
         self._show()
         return observation, self._info(self._episode)
 
@@ -91,7 +91,7 @@ class DrivingEnv(gym.Env[Observation, NDArray[np.float32]]):
             physical = to_physical(torch.as_tensor(np.asarray(action))[None], 1)
             episode = self.world.step(self._episode, physical)
             terms = reward_terms(episode, physical)
-            observation = observe(episode.state)[0].numpy()
+            observation = observe(episode, self.world.observation)[0].numpy()
             reward = float(terms.total)
         self._episode, self._tick = episode, self._tick + 1
         terminated = bool(episode.collided)
@@ -109,7 +109,7 @@ class DrivingEnv(gym.Env[Observation, NDArray[np.float32]]):
         return {
             "scenario": self.space.named(self._x),
             "x": self._x.copy(),
-            "min_ttc": 0.0 if collided else float(episode.danger),
+            "min_ttc": 0.0 if collided else float(episode.f),
             "collision": collided,
         }
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rare_envs.actions import action_space, to_physical
+from rare_envs.background import Minds
 from rare_envs.envs.rendering import Renderer
 from rare_envs.geometry import Lead, collision_type
 from rare_envs.observation import observation_space, observe
@@ -55,7 +56,7 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArr
         self.metadata = {**self.metadata, "render_fps": round(1.0 / self.world.dt)}
         self.num_envs = int(num_envs)
         self.render_mode = render_mode
-        self.single_observation_space = observation_space(self.world.scenario.vehicles)
+        self.single_observation_space = observation_space(self.world.scenario.vehicles, self.world.observation)
         self.single_action_space = action_space()
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -88,7 +89,7 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArr
         self._tick[:] = 0
         with torch.inference_mode():
             self._episode = self._start(self._x)
-            observation = observe(self._episode.state).numpy()
+            observation = observe(self._episode, self.world.observation).numpy()
         return observation, self._info(self._episode, np.ones(self.num_envs, dtype=bool))
 
     def step(
@@ -105,7 +106,7 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArr
             physical = to_physical(torch.as_tensor(np.asarray(actions)), self.num_envs)
             episode = self.world.step(self._episode, physical)
             terms = reward_terms(episode, physical)
-            observation = observe(episode.state).numpy()
+            observation = observe(episode, self.world.observation).numpy()
             reward = terms.total.double().numpy()
         self._episode = episode
         self._tick += 1
@@ -135,18 +136,18 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArr
             fresh = self._start(x)
             self._episode = _merge(self._episode, torch.from_numpy(rows), fresh)
             observation = observation.copy()
-            observation[rows] = observe(fresh.state).numpy()
+            observation[rows] = observe(fresh, self.world.observation).numpy()
         return observation
 
     def _info(self, episode: Episode, mask: NDArray[np.bool_]) -> Info:
         collided = episode.collided.numpy()
         infos: Info = {}
         scenario: Info = {}
-        for k, name in enumerate(self.space.names):
-            _put(scenario, name, self._x[:, k].copy(), mask)
+        for name, column in self.space.columns(self._x).items():
+            _put(scenario, name, column, mask)
         _put(infos, "scenario", scenario, mask)
         _put(infos, "x", self._x.copy(), mask)
-        _put(infos, "min_ttc", np.where(collided, 0.0, episode.danger.double().numpy()), mask)
+        _put(infos, "min_ttc", np.where(collided, 0.0, episode.f.double().numpy()), mask)
         _put(infos, "collision", collided.copy(), mask)
         return infos
 
@@ -183,12 +184,19 @@ def _merge(old: Episode, rows: Tensor, new: Episode) -> Episode:
         into[rows] = values
         return into
 
+    seen, minds = old.perception, old.minds
+    if seen is not None and new.perception is not None:
+        seen = put(seen, new.perception)
+    if minds is not None and new.minds is not None:
+        minds = Minds(*map(put, minds, new.minds))
     return Episode(
         State(*map(put, old.state, new.state)),
         Lead(*map(put, old.lead, new.lead)),
-        put(old.danger, new.danger),
+        put(old.f, new.f),
         put(old.collided, new.collided),
-        new.road,
+        old.road,
+        seen,
+        minds,
     )
 
 

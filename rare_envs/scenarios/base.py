@@ -22,7 +22,7 @@ class Others(NamedTuple):
 
 @dataclass(frozen=True)
 class Scenario:
-    """A named scenario; x of shape (B, d) has the parameters of `rare_envs.space.PARAMETERS[name]`, in their order."""
+    """A named scenario; x of shape (B, size) has the parameters of `rare_envs.space.PARAMETERS[name]`, in order."""
 
     name: str
     road: Road
@@ -33,7 +33,14 @@ class Scenario:
     initial: Callable[[Tensor], State]
     """x (B, d) to the state at time 0."""
     others: Callable[[State, float], Others]
-    """State and dt [s] to the other vehicles after the tick."""
+    """The script: state and dt [s] to the other vehicles after the tick."""
+    driven: Callable[[State, Tensor, float], Others]
+    """State, the other vehicles' accelerations and yaw rates (B, N - 1, 2) and dt [s] to the same, for vehicles that
+    have drivers."""
+    size: int
+    """Number of columns of x that `initial` takes."""
+    drivers: str | None = None
+    """Drivers of the other vehicles unless told otherwise; None for the script."""
 
 
 def columns(*values: Tensor) -> Tensor:

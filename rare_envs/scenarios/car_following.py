@@ -27,4 +27,19 @@ def others(state: State, dt: float) -> Others:
     return Others(state.x[:, 1:] + speed * dt, state.y[:, 1:], state.heading[:, 1:], speed)
 
 
-CAR_FOLLOWING = Scenario("car_following", road=straight(1), vehicles=2, horizon=10.0, initial=initial, others=others)
+def driven(state: State, action: Tensor, dt: float) -> Others:
+    """The lead accelerates as its driver wants and stays in the middle of the lane."""
+    kept = others(state, dt)
+    return kept._replace(speed=(kept.speed + action[..., 0] * dt).clamp(min=0.0))
+
+
+CAR_FOLLOWING = Scenario(
+    "car_following",
+    road=straight(1),
+    vehicles=2,
+    horizon=10.0,
+    initial=initial,
+    others=others,
+    driven=driven,
+    size=3,
+)

@@ -61,21 +61,41 @@ def others(state: State, dt: float) -> Others:
     The released code of Tian et al. also steers the cutter along a Bezier (30 m long, by pure pursuit, with the ego's
     IDM); ours is exactly on the curve, whose length grows with the speed, and its desired speed is its initial one.
     """
-    start, length, offset, desired_speed = state.theta.unbind(dim=1)
-    speed, heading, lead_speed = state.speed[:, 1], state.heading[:, 1], state.speed[:, 2]
+    desired_speed = state.theta[:, 3]
+    speed, lead_speed = state.speed[:, 1], state.speed[:, 2]
     distance = state.x[:, 2] - state.x[:, 1]
-    cos = torch.cos(heading)
-    lead = Lead(distance - VEHICLE_LENGTH, speed - lead_speed * cos)
+    lead = Lead(distance - VEHICLE_LENGTH, speed - lead_speed * torch.cos(state.heading[:, 1]))
     acceleration = _CUTTER_IDM.acceleration(speed, lead, desired_speed)
-    x = state.x[:, 1] + speed * cos * dt
+    return _moved(state, (speed + acceleration * dt).clamp(min=0.0), lead_speed, dt)
+
+
+def driven(state: State, action: Tensor, dt: float) -> Others:
+    """Both accelerate as their drivers want; the cutter stays on its path, the lead in its lane."""
+    speed = (state.speed[:, 1:] + action[..., 0] * dt).clamp(min=0.0)
+    return _moved(state, speed[:, 0], speed[:, 1], dt)
+
+
+def _moved(state: State, speed: Tensor, lead_speed: Tensor, dt: float) -> Others:
+    """Cutter and lead after the tick: the cutter on its path, the lead straight on, with new speeds (B,)."""
+    start, length, offset, _ = state.theta.unbind(dim=1)
+    x = state.x[:, 1] + state.speed[:, 1] * torch.cos(state.heading[:, 1]) * dt
     y, slope = bezier(x - start, length, offset)
     zero = torch.zeros_like(y)
     return Others(
-        x=columns(x, state.x[:, 2] + lead_speed * dt),
+        x=columns(x, state.x[:, 2] + state.speed[:, 2] * dt),
         y=columns(y, zero),
         heading=columns(torch.atan(slope), zero),
-        speed=columns((speed + acceleration * dt).clamp(min=0.0), lead_speed),
+        speed=columns(speed, lead_speed),
     )
 
 
-CUT_IN = Scenario("cut_in", road=straight(2), vehicles=3, horizon=10.0, initial=initial, others=others)
+CUT_IN = Scenario(
+    "cut_in",
+    road=straight(2),
+    vehicles=3,
+    horizon=10.0,
+    initial=initial,
+    others=others,
+    driven=driven,
+    size=6,
+)

@@ -31,10 +31,11 @@ def catalogue() -> dict[str, Any]:
                     "low": parameter.low,
                     "high": parameter.high,
                     "meaning": parameter.meaning,
+                    "size": parameter.size,
                 }
                 for parameter in PARAMETERS[scenario.name]
             ],
-            "bases": list(BASES),
+            "bases": list(BASES[scenario.name]),
         }
         for env_id, scenario in SCENARIOS.items()
     }
@@ -42,7 +43,7 @@ def catalogue() -> dict[str, Any]:
         "environments": environments,
         "methods": {name: _first_line(method) for name, method in samplers.METHODS.items()},
         "egos": EGOS,
-        "measures": {name: _first_line(measure) for name, measure in MEASURES.items()},
+        "measures": {name: _first_line(measure.of) for name, measure in MEASURES.items()},
     }
 
 

@@ -9,7 +9,7 @@ import torch
 from rare_envs.drivers import IDM, lane_keeping
 from rare_envs.dynamics import bicycle
 from rare_envs.geometry import Lead, boxes_overlap, collision_type, lead_of
-from rare_envs.measures import TTC_MAX, ttc
+from rare_envs.measures import TTC_MAX, Moment, ttc
 from rare_envs.road import straight
 from rare_envs.scenarios import CAR_FOLLOWING, CUT_IN
 from rare_envs.scenarios.cut_in import bezier
@@ -142,11 +142,13 @@ def test_ego_in_the_other_lane_minds_that_lane() -> None:
 
 def test_ttc_of_two_cars() -> None:
     state = traffic((0.0, 0.0, 0.0, 20.0))
-    assert ttc(state, Lead(tensor(30.0), tensor(10.0)), straight(1)).item() == pytest.approx(3.0)
-    assert ttc(state, Lead(tensor(30.0), tensor(-1.0)), straight(1)).item() == TTC_MAX
-    assert ttc(state, Lead(tensor(500.0), tensor(10.0)), straight(1)).item() == TTC_MAX
-    assert ttc(state, Lead(tensor(math.inf), tensor(0.0)), straight(1)).item() == TTC_MAX
-    assert 0.0 < ttc(state, Lead(tensor(-2.0), tensor(10.0)), straight(1)).item() < 0.01  # beside, not a collision
+    assert ttc(Moment(state, Lead(tensor(30.0), tensor(10.0)), straight(1), None)).item() == pytest.approx(3.0)
+    assert ttc(Moment(state, Lead(tensor(30.0), tensor(-1.0)), straight(1), None)).item() == TTC_MAX
+    assert ttc(Moment(state, Lead(tensor(500.0), tensor(10.0)), straight(1), None)).item() == TTC_MAX
+    assert ttc(Moment(state, Lead(tensor(math.inf), tensor(0.0)), straight(1), None)).item() == TTC_MAX
+    assert (
+        0.0 < ttc(Moment(state, Lead(tensor(-2.0), tensor(10.0)), straight(1), None)).item() < 0.01
+    )  # beside, not a collision
 
 
 @pytest.mark.parametrize(
@@ -161,7 +163,7 @@ def test_ttc_of_two_cars() -> None:
 )
 def test_ttc_of_the_edge_of_the_road(y: float, heading: float, lanes: int, expected: float) -> None:
     state, nobody = traffic((0.0, y, heading, 20.0)), Lead(tensor(math.inf), tensor(0.0))
-    assert ttc(state, nobody, straight(lanes)).item() == pytest.approx(expected)
+    assert ttc(Moment(state, nobody, straight(lanes), None)).item() == pytest.approx(expected)
 
 
 def test_off_road() -> None:

@@ -257,7 +257,10 @@ def test_an_ego_keeps_its_lane_of_the_i80(dtype: torch.dtype) -> None:
         )
 
     road = i80()
-    world = World(Scenario("drive", road, 2, 30.0, initial, others))
+    script = Scenario(
+        "drive", road, 2, 30.0, initial, others, driven=lambda state, action, dt: others(state, dt), size=1
+    )
+    world = World(script)
     starts = torch.tensor([[road.centre(lane) + 0.8] for lane in range(6)], dtype=dtype)
     episodes = list(drive(world, IDM(desired_speed=25.0), starts))
     assert not episodes[-1].collided.any()

@@ -18,9 +18,10 @@ def make_space(scenario="cut_in", base="us101"):
     return ScenarioSpace(
         names=tuple(p.name for p in box),
         units=tuple(p.unit for p in box),
-        low=np.array([p.low for p in box]),
-        high=np.array([p.high for p in box]),
+        low=np.array([p.low for p in box for _ in range(p.size)]),
+        high=np.array([p.high for p in box for _ in range(p.size)]),
         base=load_base(scenario, base),
+        sizes=tuple(p.size for p in box),
     )
 
 
@@ -28,12 +29,11 @@ def rng():
     return np.random.default_rng(0)
 
 
-@pytest.mark.parametrize("scenario", PARAMETERS)
-@pytest.mark.parametrize("base", BASES)
+@pytest.mark.parametrize(("scenario", "base"), [(name, base) for name, bases in BASES.items() for base in bases])
 def test_shipped_bases_fit_their_scenario(scenario, base):
     space = make_space(scenario, base)
     assert isinstance(space.base, Distribution)
-    assert space.dim == len(PARAMETERS[scenario])
+    assert space.dim == sum(parameter.size for parameter in PARAMETERS[scenario])
     x = space.sample(1000, rng())
     assert (space.validate(x) == x).all()
     assert np.isfinite(space.log_prob(x)).all()
@@ -152,7 +152,7 @@ def test_json_that_does_not_fit(tmp_path, change, message):
 def test_json_with_the_wrong_dimension(tmp_path):
     content = {**shipped_dict("cut_in"), "names": shipped_dict()["names"]}
     path = write(tmp_path / "mine.json", content)
-    with pytest.raises(ValueError, match="expected means with 3 columns, one per name, got 6"):
+    with pytest.raises(ValueError, match="does not fit car_following: expected 3 columns, got 6"):
         load_base("car_following", path)
 
 
@@ -190,5 +190,6 @@ def test_a_users_object():
         load_base("cut_in", law)
     with pytest.raises(ValueError, match="Partial without log_prob, to_standard_normal, from_sta"):
         load_base("car_following", Partial())
-    with pytest.raises(ValueError, match="got NoneType without sample"):
-        load_base("car_following", None)
+    with pytest.raises(ValueError, match="got int without sample"):
+        load_base("car_following", 3)
+    assert load_base("car_following", None).to_dict() == load_base("car_following", "us101").to_dict()

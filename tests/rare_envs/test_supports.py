@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 import rare_envs
 import samplers
 
-CASES = [(env_id, base) for env_id in rare_envs.ENV_IDS for base in ("us101", "highway")]
+CASES = [(env_id, base) for env_id in rare_envs.ENV_IDS[:2] for base in ("us101", "highway")]
 
 
 class Recording:

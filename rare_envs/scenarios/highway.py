@@ -1,0 +1,56 @@
+"""Highway: six vehicles on the six curved lanes of Interstate 80 (O'Kelly et al. 2018, section 4).
+
+Five of them are driven by learned drivers, whose last layer's weights are parameters of the scenario. Where the paper
+leaves a choice, ours: every vehicle starts in a lane of its own, the ego in the third from the left, because six cars
+within 40 m would often overlap otherwise (the released code doubles three cars instead); an episode is 10 s long, as in
+the released code and as long as the drivers were held to recorded traffic, where the paper drives 2 km or 100 s
+(`horizon=100`); vehicles are 5 m x 2 m as everywhere here, where the released code has 4 m x 2 m.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+from rare_envs.dynamics import point_mass
+from rare_envs.road import i80
+from rare_envs.scenarios.base import Others, Scenario
+from rare_envs.state import State
+
+VEHICLES = 6
+LANES = (2, 0, 1, 3, 4, 5)
+"""Lane of each vehicle at the start, the ego's first; 0 is the leftmost."""
+
+
+def initial(x: Tensor) -> State:
+    """Six columns each: s along the road [m], t off the middle of the lane [m], heading [deg] and speed [m/s]."""
+    s, t, heading, speed = x.view(len(x), 4, VEHICLES).unbind(dim=1)
+    middle = x.new_tensor([i80().centre(lane) for lane in LANES])
+    return State(s.T.contiguous().T, t + middle, heading * (math.pi / 180.0), speed.clone(), theta=x[:, :0])
+
+
+def driven(state: State, action: Tensor, dt: float) -> Others:
+    """Points that turn at will. Yaw rates are relative to the road: the drivers have learned on a straight one."""
+    others = (field[:, 1:] for field in (state.x, state.y, state.heading, state.speed))
+    x, y, heading, speed = others
+    curvature = i80().curvature(x)
+    ahead = torch.cos(heading) * speed / (1.0 - curvature * y)
+    return Others(*point_mass(x, y, heading, speed, action[..., 0], action[..., 1] + curvature * ahead, dt, curvature))
+
+
+def others(state: State, dt: float) -> Others:
+    """Without drivers everybody keeps speed and heading relative to the road."""
+    return driven(state, torch.zeros_like(state.x[:, 1:, None]).expand(-1, -1, 2), dt)
+
+
+HIGHWAY = Scenario(
+    "highway",
+    road=i80(),
+    vehicles=VEHICLES,
+    horizon=10.0,
+    initial=initial,
+    others=others,
+    driven=driven,
+    size=4 * VEHICLES,
+    drivers="mgail",
+)
