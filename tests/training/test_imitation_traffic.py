@@ -9,11 +9,12 @@ import torch
 from agents.networks import Policy
 from tests.training.synthetic_scenes import scene, scenes
 from training.imitation.acting import physical
+from training.imitation.behaviour import overlaps
 from training.imitation.config import Config
 from training.imitation.expert import expert_pairs, scaling_of
 from training.imitation.penalties import penalties
 from training.imitation.pools import Pool
-from training.imitation.realism import BINS, jensen_shannon, measure, overlaps
+from training.imitation.realism import BINS, jensen_shannon, measure
 from training.imitation.recording import Recording, stack
 from training.imitation.rollout import roll
 from training.imitation.traffic import Traffic, look, start, step

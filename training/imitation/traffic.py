@@ -48,7 +48,9 @@ class Traffic(NamedTuple):
         return int(self.driven.sum(dim=1).max())
 
 
-def start(recording: Recording, scene: Tensor, tick: Tensor, most: int | None = None) -> Traffic:
+def start(
+    recording: Recording, scene: Tensor, tick: Tensor, most: int | None = None, only: Tensor | None = None
+) -> Traffic:
     """Traffic as recorded at a moment of some scenes.
 
     Args:
@@ -56,6 +58,7 @@ def start(recording: Recording, scene: Tensor, tick: Tensor, most: int | None = 
         scene: Scene of each row, shape (B,).
         tick: Tick of each row, shape (B,).
         most: Drive no more than this many vehicles of a scene, the rearmost; None for all that may be driven.
+        only: Drive this vehicle of each row and no other, shape (B,).
     """
     edges = recording.edges[scene]
     there = recording.present[scene, tick]
@@ -64,6 +67,8 @@ def start(recording: Recording, scene: Tensor, tick: Tensor, most: int | None = 
     if most is not None:
         rank = torch.where(driven, x, torch.inf).argsort(dim=1).argsort(dim=1)
         driven = driven & (rank < most)
+    if only is not None:
+        driven = driven & (torch.arange(driven.shape[1]) == only[:, None])
     order = (2 * driven.int() + there.int()).argsort(dim=1, descending=True, stable=True)
     vehicle = order[:, : int(there.sum(dim=1).max())]
 
@@ -106,11 +111,11 @@ def look(traffic: Traffic, observers: int | None = None) -> Tensor:
     return perceive(bodies, on_road(traffic.y, traffic.heading, traffic.edges), observers)
 
 
-def step(recording: Recording, traffic: Traffic, action: Tensor) -> Traffic:
+def step(recording: Recording | None, traffic: Traffic, action: Tensor) -> Traffic:
     """Move everybody by one tick: explicit Euler with the old values, as recorded motion was inverted.
 
     Args:
-        recording: The scenes.
+        recording: The scenes; None for traffic that none has recorded: who is not driven keeps to its speed.
         traffic: B scenes with V vehicles.
         action: Acceleration [m/s^2] and yaw rate [rad/s], shape (B, V, 2); only that of driven vehicles counts.
 
@@ -125,7 +130,7 @@ def step(recording: Recording, traffic: Traffic, action: Tensor) -> Traffic:
     speed = speed + (speed.clamp(min=0.0) - speed).detach()  # the gradient passes a standstill
     moved = {"x": x, "y": y, "heading": heading, "speed": speed}
     tick = traffic.tick + 1
-    if not bool(traffic.driven.all()):
+    if recording is not None and not bool(traffic.driven.all()):
         moved = _replayed(recording, traffic, tick, moved)
     return traffic._replace(**moved, tick=tick)
 
