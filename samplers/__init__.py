@@ -10,9 +10,9 @@ from samplers.cross_entropy import CrossEntropy
 from samplers.curve import Curve
 from samplers.importance_sampling import ImportanceSampling
 from samplers.improved_cross_entropy import ImprovedCrossEntropy
-from samplers.ledger import EvaluationError
 from samplers.method import Goal, Interrupted, Layer, Method, Outcome, Sample, Stepping, Steps
 from samplers.monte_carlo import MonteCarlo
+from samplers.outcomes import EvaluationError
 from samplers.problem import Distribution, FunctionProblem, Problem, StandardNormal
 from samplers.progress import Progress
 from samplers.registry import METHODS, get_method

@@ -146,7 +146,10 @@ def sample_of(estimate: Estimate) -> Sample:
 
 def checked(gammas: ArrayLike) -> FloatArray:
     """Return thresholds as an array of shape (k,) with k > 0, all finite."""
-    values = np.array(gammas, dtype=np.float64, ndmin=1)
+    try:
+        values = np.array(gammas, dtype=np.float64, ndmin=1)
+    except (TypeError, ValueError):
+        values = np.empty(0)
     if values.ndim != 1 or values.size == 0 or not np.isfinite(values).all():
         raise ValueError(f"Expected finite thresholds, shape (k,) with k at least 1, got {gammas!r}.")
     return values

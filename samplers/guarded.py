@@ -6,7 +6,8 @@ from typing import NoReturn
 import numpy as np
 from numpy.typing import ArrayLike
 
-from samplers.ledger import EvaluationError, OnError, one_per_row, where
+from samplers.ledger import OnError
+from samplers.outcomes import EvaluationError, one_per_row, where
 from samplers.problem import FloatArray
 
 

@@ -5,6 +5,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from samplers.outcomes import EvaluationError, one_per_row, where
 from samplers.problem import Distribution, FloatArray
 from samplers.result import Failures
 
@@ -16,10 +17,6 @@ NO_OUTCOME = -np.inf
 LEAST_FLOAT = float(np.finfo(np.float64).min)
 """What a method sees for an f of -inf, so that NO_OUTCOME keeps its meaning."""
 KEEP_FAILURES = 1000
-
-
-class EvaluationError(ValueError):
-    """f raised, returned NaN or returned something that is not one number per row."""
 
 
 class Ledger:
@@ -66,24 +63,3 @@ class Ledger:
             found = x[failing]
             log_p0 = np.asarray(self._base.log_prob(found), dtype=np.float64)
             self.failures = self.failures.merged(found, f[failing], log_p0, keep=self._keep)
-
-
-def one_per_row(outcomes: ArrayLike, n: int) -> FloatArray:
-    """Return the outcomes as float64, shape (n,).
-
-    Raises:
-        EvaluationError: If they are not n numbers.
-    """
-    try:
-        f = np.asarray(outcomes, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise EvaluationError(f"Expected f to return shape ({n},), one number per row of x: {error}") from error
-    if f.shape != (n,):
-        raise EvaluationError(f"Expected f to return shape ({n},), one value per row of x, got {f.shape}.")
-    return f
-
-
-def where(x: FloatArray, row: int) -> str:
-    """Return words that name a row of a batch x (n, d)."""
-    shown = np.array2string(x[row], precision=6, threshold=8, separator=", ", max_line_width=10**6)
-    return f"row {row} of a batch of {len(x)}, x = {shown}"

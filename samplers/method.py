@@ -177,6 +177,6 @@ class Method(Stepping, Protocol):
 def no_outcome_share(f: FloatArray, log_weights: FloatArray | None = None) -> float:
     """Return the (weighted) share of points without an outcome, f = -inf, among f (k,)."""
     missing = np.isneginf(f)
-    if not missing.any():
-        return 0.0
-    return float(missing.mean() if log_weights is None else normalised(log_weights)[missing].sum())
+    if log_weights is None or missing.all() or not missing.any():  # exactly 1 or 0, whatever the weights
+        return float(missing.mean()) if len(f) else 0.0
+    return min(float(normalised(log_weights)[missing].sum()), 1.0)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from samplers.checks import check_whole
+from samplers.outcomes import one_per_row
 
 FloatArray = NDArray[np.float64]
 LOG_TWO_PI = float(np.log(2 * np.pi))
@@ -56,9 +57,17 @@ class Problem(Inputs, Protocol):
 
 @dataclass(frozen=True)
 class StandardNormal:
-    """The law N(0, I) in `dim` dimensions; its map to standard normal space is the identity."""
+    """The law N(0, I) in `dim` dimensions; its map to standard normal space is the identity.
+
+    Raises:
+        ValueError: If dim is not a positive whole number.
+    """
 
     dim: int
+
+    def __post_init__(self) -> None:
+        """Check the dimension."""
+        check_whole("dim", self.dim, 1)
 
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw n independent points, shape (n, d)."""
@@ -104,5 +113,11 @@ class FunctionProblem:
         return StandardNormal(self.dim)
 
     def evaluate(self, x: FloatArray) -> FloatArray:
-        """Call f on the rows of x (n, d); return its values as float64."""
-        return np.asarray(self.f(x), dtype=np.float64)
+        """Call f on the rows of x (n, d); return its values as float64.
+
+        Raises:
+            ValueError: If x is not of shape (n, d), or f does not return one number per row.
+        """
+        if np.ndim(x) != 2 or np.shape(x)[1] != self.dim:
+            raise ValueError(f"Expected x of shape (n, {self.dim}), got {np.shape(x)}.")
+        return one_per_row(self.f(x), len(x))

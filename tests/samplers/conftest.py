@@ -87,6 +87,11 @@ def drive() -> Callable[..., Driven]:
 
 
 @pytest.fixture
+def study_of() -> type[Study]:
+    return Study
+
+
+@pytest.fixture
 def study() -> Callable[..., Study]:
     def run(reference, method, runs, **options) -> Study:
         results = [samplers.estimate(reference.problem, method, seed=seed, **options) for seed in range(runs)]

@@ -5,7 +5,7 @@ import pytest
 
 import samplers
 from samplers.ask_tell import shares
-from samplers.ledger import EvaluationError
+from samplers.outcomes import EvaluationError
 from samplers.reference import half_space
 
 EASY = half_space(2, 2.0).problem

@@ -55,9 +55,9 @@ def test_the_paper_s_highway_of_428_dimensions():
     """24 Beta, 404 Normal with full covariance and the mean in a box of 0.01."""
     problem = BlockProblem(24, 404, 4.0, radius=0.01)
     method = CE(family="blocks", n_iteration=5000, n_final=5000, wide_share=0.0)
-    start = time.perf_counter()
+    start = time.process_time()
     result = samplers.estimate(problem, method, seed=1)
-    assert time.perf_counter() - start < 15.0  # 2 s as a rule
+    assert time.process_time() - start < 15.0  # 2 s as a rule
     assert result.p == pytest.approx(problem.p, rel=4 * result.cov)
     assert result.cov < 0.15  # plain Monte Carlo with 10,000: 0.23
     assert not result.warnings

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from samplers.guarded import Guarded
-from samplers.ledger import EvaluationError
+from samplers.outcomes import EvaluationError
 
 X = np.array([[1.0, 0.0], [3.0, 0.0], [2.0, 7.5], [4.0, 0.0], [-1.0, 0.0]])
 

@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from samplers.ledger import LEAST_FLOAT, EvaluationError, Ledger
+from samplers.ledger import LEAST_FLOAT, Ledger
+from samplers.outcomes import EvaluationError
 from samplers.problem import StandardNormal
 
 X = np.array([[1.0, 0.0], [3.0, 0.0], [2.0, 7.5], [4.0, 0.0], [-1.0, 0.0]])

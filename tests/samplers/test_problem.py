@@ -23,8 +23,35 @@ def test_function_problem_is_a_problem():
 def test_dim_must_be_a_positive_whole_number(dim):
     with pytest.raises(ValueError, match="whole number of at least 1"):
         samplers.FunctionProblem(lambda x: x[:, 0], dim)
+    with pytest.raises(ValueError, match="whole number of at least 1"):
+        samplers.StandardNormal(dim)
 
 
 def test_f_must_be_callable():
     with pytest.raises(ValueError, match="function"):
         samplers.FunctionProblem(3.0, 2)
+
+
+@pytest.mark.parametrize("x", [np.zeros(2), np.zeros((3, 1)), np.zeros((3, 3)), np.zeros((1, 3, 2)), 0.0])
+def test_x_must_be_rows_of_d_numbers(x):
+    with pytest.raises(ValueError, match=r"Expected x of shape \(n, 2\), got \("):
+        samplers.FunctionProblem(lambda x: x[..., 0], 2).evaluate(x)
+
+
+@pytest.mark.parametrize(
+    "f",
+    [
+        lambda x: 1.0,
+        lambda x: x,
+        lambda x: x[1:, 0],
+        lambda x: None,
+        lambda x: ["far"] * len(x),
+        lambda x: 1j * x[:, 0],
+    ],
+    ids=["scalar", "x", "short", "none", "words", "complex"],
+)
+@pytest.mark.parametrize("on_error", ["raise", "failure", "bound"])
+def test_f_must_give_one_real_number_per_row(f, on_error):
+    """Not an outcome that is missing, but an f that is none: no rule for errors covers it."""
+    with pytest.raises(samplers.EvaluationError, match=r"Expected f to return shape \(50,\), one"):
+        samplers.estimate(samplers.FunctionProblem(f, 2), "mc", seed=1, max_sim=50, on_error=on_error)
