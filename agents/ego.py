@@ -1,4 +1,4 @@
-"""Egos by name: the rule-based driver, Stable-Baselines3 files, functions that make an ego.
+"""Egos by name: the rule-based driver, learned drivers, Stable-Baselines3 files, functions that make an ego.
 
 A Stable-Baselines3 `.zip` holds pickled objects beside its weights, and so do `VecNormalize`
 statistics: loading either can run code that its author put there. Load files that you trust.
@@ -21,11 +21,13 @@ from typing import Any, Final, Literal, Protocol, cast, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.checkpoints import SHIPPED, SUFFIX, load_driver
+from agents.learned import LearnedDriver, LearnedEgo
 from agents.sb3_zip import algorithm_class, algorithm_of, read_header, weights_only_objects
 from rare_envs.space import did_you_mean
 
 RULE_BASED: Final = "idm"
-EXPECTED = "'idm', a path to a Stable-Baselines3 .zip or module:function"
+EXPECTED = f"'idm', {', '.join(map(repr, SHIPPED))}, a path to a {SUFFIX} or Stable-Baselines3 .zip, or module:function"
 
 
 @runtime_checkable
@@ -95,43 +97,47 @@ class SavedEgo:
         return actions, state
 
 
-def load_ego(spec: str | Path, algo: str | None = None) -> Ego | Literal["idm"]:
+def load_ego(spec: str | Path, algo: str | None = None) -> Ego | LearnedEgo | Literal["idm"]:
     """Find an ego by what a user would type.
 
     Args:
-        spec: "idm"; a path to a `.zip` saved by Stable-Baselines3; or `module:function`, a function
+        spec: "idm"; "mgail", "gail" or "bc", or a path to a `.safetensors`, for a learned driver, which as ego acts by
+            its mean actions; a path to a `.zip` saved by Stable-Baselines3; or `module:function`, a function
             without arguments that returns an ego (modules in the working directory are found).
         algo: Algorithm of a `.zip`, such as "ppo"; recognised from the file when None. Only a `.zip` has one.
 
     Returns:
-        "idm" as it stands, else an object with `predict`. A `.zip` gives a `SavedEgo`, whose
+        "idm" as it stands, a `LearnedEgo`, else an object with `predict`. A `.zip` gives a `SavedEgo`, whose
         `observation_space` and `action_space` are those of the policy. `VecNormalize` statistics
         saved beside a `.zip` are applied to its observations: `<name>_vecnormalize.pkl`,
         `vecnormalize.pkl`, or where RL Zoo and Stable-Baselines3's checkpoints put them.
 
     Raises:
-        FileNotFoundError: The `.zip` does not exist.
-        ValueError: The spec is none of these, the file is not a model of Stable-Baselines3 or is
+        FileNotFoundError: The file does not exist.
+        ValueError: The spec is none of these, the file is not a model of Stable-Baselines3 or no driver or is
             damaged, the function is missing, fails or returns something without `predict`, or
             algo is given for something that is no `.zip`.
     """
     text = str(spec)
-    if text != RULE_BASED and (text.endswith(".zip") or Path(text).is_file()):
+    learned = text in SHIPPED or text.endswith(SUFFIX)
+    if text != RULE_BASED and not learned and (text.endswith(".zip") or Path(text).is_file()):
         return _load_zip(Path(text), algo)
     factory = ":" in text and "/" not in text
-    if text != RULE_BASED and not factory:
+    if text != RULE_BASED and not learned and not factory:
         raise ValueError(f"Unknown ego {text!r}{_suggest_ego(text)}; expected {EXPECTED}.")
     if algo is not None:
         raise ValueError(f"Expected algo for a Stable-Baselines3 .zip only, got {algo!r} for {text!r}; leave it out.")
+    if learned:
+        return LearnedEgo(cast(LearnedDriver, load_driver(text)))
     return _call_factory(text) if factory else RULE_BASED
 
 
 def _suggest_ego(text: str) -> str:
-    """A "did you mean" for a misspelt ego: the rule-based driver or a `.zip` saved nearby."""
+    """A "did you mean" for a misspelt ego: a driver by name or a `.zip` saved nearby."""
     saved = Path(f"{text}.zip")
     if saved.is_file():
         return f" (did you mean {str(saved)!r}?)"
-    return did_you_mean(text.lower(), [RULE_BASED])
+    return did_you_mean(text.lower(), [RULE_BASED, *SHIPPED])
 
 
 # --- Stable-Baselines3 files -------------------------------------------------------------------

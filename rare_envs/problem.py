@@ -20,8 +20,6 @@ RULE_TILE = 16384
 """Rollouts that a rule-based ego drives at once: where eager torch is fastest."""
 POLICY_TILE = 4096
 """Likewise with a policy; fixed, because matrix products round differently by batch size."""
-
-
 LIDAR_TILE = 512
 """Likewise where vehicles look: small enough for what a tick needs to stay in the cache."""
 
@@ -77,6 +75,12 @@ class DrivingProblem:
     def dim(self) -> int:
         """Number of scenario parameters."""
         return self.space.dim
+
+    @property
+    def given(self) -> str:
+        """What p is conditional on, in words for `samplers.Estimate.given`; empty if nothing is held fixed."""
+        noisy = self.world.drivers is not None and self.world.drivers.noisy
+        return "the drivers' noise is one fixed sequence" if noisy and self.world.noise == "fixed" else ""
 
     @property
     def base(self) -> Distribution:

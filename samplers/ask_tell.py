@@ -135,6 +135,7 @@ class Run:
             base=plan.inputs.base,
             on_error=plan.on_error,
             base_draws=whole.base_draws,
+            given=plan.given,
         )
 
     def _outcomes(self) -> list[Outcome]:

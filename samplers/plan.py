@@ -23,6 +23,8 @@ class Plan:
     seed: int
     replicates: int
     on_error: OnError
+    given: str = ""
+    """What the problem holds fixed, see `Estimate.given`."""
 
 
 @dataclass(frozen=True)
@@ -78,6 +80,7 @@ def checked(
         seed=_fresh_seed() if seed is None else int(seed),
         replicates=int(replicates),
         on_error=cast(OnError, on_error),
+        given=str(getattr(problem, "given", "")),
     )
 
 

@@ -165,6 +165,8 @@ class Estimate:
     """What was done where f raised or gave NaN."""
     base_draws: int = 0
     """Simulations that were independent draws from the base distribution."""
+    given: str = ""
+    """What the problem holds fixed, so that p is conditional on it: its attribute `given`, if it has one."""
 
     @property
     def unseen(self) -> float:
@@ -219,9 +221,11 @@ class Estimate:
     @property
     def proviso(self) -> str:
         """What p and its interval take for granted, in words."""
+        fixed = f"{self.given} and " if self.given else ""
         if self.base_draws == 0:
-            return "no region of failure was missed (no base draws bound its size)"
-        return f"no region of more than {self.unseen:.1e} was missed ({self.base_draws:,} base draws saw none other)"
+            return f"{fixed}no region of failure was missed (no base draws bound its size)"
+        missed = f"no region of more than {self.unseen:.1e} was missed ({self.base_draws:,} base draws saw none other)"
+        return fixed + missed
 
     def __str__(self) -> str:
         """Return a few lines for people."""
@@ -248,6 +252,7 @@ class Estimate:
             "n_sim": self.n_sim,
             "base_draws": self.base_draws,
             "unseen": self.unseen,
+            "given": self.given,
             "gain": self.gain,
             "status": str(self.status),
             "warnings": list(self.warnings),

@@ -11,8 +11,16 @@ from rare_envs.space import BASES, PARAMETERS
 
 EGOS = {
     "idm": "rule-based driver, Intelligent Driver Model (the default)",
+    "mgail, gail, bc, FILE.safetensors": "learned driver with lidar, by its mean actions",
     "FILE.zip": "policy saved by Stable-Baselines3, VecNormalize statistics beside it included",
     "module:function": "what your function returns: any object with Stable-Baselines3's predict",
+}
+DRIVERS = {
+    "mgail": "learned from recorded traffic by imitation, with gradients through the simulation",
+    "gail": "the same with policy gradients",
+    "bc": "the same by behaviour cloning",
+    "idm": "rule-based driver, Intelligent Driver Model and lane keeping by what it sees",
+    "FILE.safetensors": "driver that you trained, see rare-envs train-drivers",
 }
 
 
@@ -20,7 +28,7 @@ def catalogue() -> dict[str, Any]:
     """Everything that can be named on the command line, as JSON-ready values.
 
     Returns:
-        "environments" (id to parameters and bases), "methods", "egos", "measures".
+        "environments" (id to parameters, bases and drivers), "methods", "egos", "drivers", "measures".
     """
     environments = {
         env_id: {
@@ -36,6 +44,7 @@ def catalogue() -> dict[str, Any]:
                 for parameter in PARAMETERS[scenario.name]
             ],
             "bases": list(BASES[scenario.name]),
+            "drivers": scenario.drivers,
         }
         for env_id, scenario in SCENARIOS.items()
     }
@@ -43,6 +52,7 @@ def catalogue() -> dict[str, Any]:
         "environments": environments,
         "methods": {name: _first_line(method) for name, method in samplers.METHODS.items()},
         "egos": EGOS,
+        "drivers": DRIVERS,
         "measures": {name: _first_line(measure.of) for name, measure in MEASURES.items()},
     }
 

@@ -83,7 +83,9 @@ def list_command(as_json: Json = False) -> None:
 @app.command("estimate")
 def estimate_command(
     env: Env,
-    ego: Annotated[str, typer.Option(help="idm, a Stable-Baselines3 .zip or module:function.")] = "idm",
+    ego: Annotated[
+        str, typer.Option(help="idm, mgail, gail, bc, a driver's or a Stable-Baselines3 file, or module:function.")
+    ] = "idm",
     algo: Annotated[str | None, typer.Option(help="Algorithm of the .zip, if the file does not tell.")] = None,
     method: Annotated[str, typer.Option(help="Estimation method; see rare-envs list.")] = "two-stage",
     base: Annotated[str | None, typer.Option(help="Base distribution: a name or a JSON file.")] = None,
@@ -93,9 +95,12 @@ def estimate_command(
     max_sim: Annotated[int | None, typer.Option(help="Largest number of simulations.")] = None,
     target_cov: Annotated[float | None, typer.Option(help="Stop at this coefficient of variation.")] = None,
     replicates: Annotated[int, typer.Option(help="Independent runs, combined by their mean.")] = 1,
-    noise: Annotated[
-        Noise, typer.Option(help="Noise of egos and drivers: part of x, one fixed sequence, none.")
-    ] = Noise.ON,
+    drivers: Annotated[
+        str | None, typer.Option(help="Of the vehicles around the ego: mgail, gail, bc, idm or a file.")
+    ] = None,
+    noise: Annotated[Noise, typer.Option(help="The drivers' noise: part of x, one fixed sequence, none.")] = Noise.ON,
+    observation: Annotated[str, typer.Option(help="What the ego observes: features or lidar.")] = "features",
+    horizon: Annotated[float | None, typer.Option(help="Length of an episode in seconds.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for result.json, failures.csv and plot.png.")] = None,
     as_json: Json = False,
 ) -> None:
@@ -116,6 +121,9 @@ def estimate_command(
         target_cov=target_cov,
         replicates=replicates,
         noise={Noise.ON: True, Noise.OFF: False}.get(noise, noise.value),
+        drivers=drivers,
+        observation=observation,
+        horizon=horizon,
     )
     with contextlib.redirect_stdout(sys.stderr):  # an ego may print, and standard output is for the answer
         study = evaluate.prepare(question)

@@ -25,7 +25,8 @@ class Question:
 
     Attributes:
         env_id: Environment, such as "rare_envs/CutIn-v0".
-        ego: "idm", a path to a Stable-Baselines3 `.zip`, or `module:function`.
+        ego: "idm", a learned driver ("mgail", "gail", "bc" or its file), a path to a Stable-Baselines3 `.zip`, or
+            `module:function`.
         algo: Algorithm of a `.zip`; recognised from the file when None.
         method: Name of a method in `samplers.METHODS`.
         base: Name of a base distribution or path to a JSON file; the scenario's default when None.
@@ -35,7 +36,10 @@ class Question:
         max_sim: Largest number of simulations, or None.
         target_cov: Stop when the coefficient of variation is this small, or None.
         replicates: Number of independent runs, combined by their mean.
-        noise: Noise of egos and drivers, as in `DrivingProblem`: True, "fixed" or False.
+        noise: Noise of the drivers, as in `DrivingProblem`: True, "fixed" or False.
+        drivers: Of the vehicles around the ego: the name of installed ones or a file; the scenario's default when None.
+        horizon: Length of an episode [s]; the scenario's when None.
+        observation: What the ego observes: "features" or "lidar".
     """
 
     env_id: str
@@ -50,6 +54,9 @@ class Question:
     target_cov: float | None = None
     replicates: int = 1
     noise: bool | str = True
+    drivers: str | None = None
+    horizon: float | None = None
+    observation: str = "features"
 
 
 @dataclass(frozen=True)
@@ -92,7 +99,7 @@ class Report:
         space = self.study.problem.space
         ranked = [
             {
-                "parameters": space.named(failure.x),
+                "parameters": {name: np.asarray(value).tolist() for name, value in space.named(failure.x).items()},
                 "f": failure.f if math.isfinite(failure.f) else None,
                 "log_p0": failure.log_p0,
             }
@@ -133,6 +140,9 @@ def prepare(question: Question) -> Study:
             measure=question.measure,
             base=question.base,
             noise=question.noise,
+            drivers=question.drivers,
+            horizon=question.horizon,
+            observation=question.observation,
         )
     except (ValueError, OSError) as error:
         raise BadInput(error) from error

@@ -13,8 +13,10 @@ from matplotlib.patches import Rectangle
 from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
 
+from rare_envs.road import Road
 from rare_envs.space import ScenarioSpace
 from rare_envs.state import VEHICLE_LENGTH, VEHICLE_WIDTH
+from rare_envs.study.columns import columns_of
 from rare_envs.study.evaluate import Report
 from rare_envs.study.replay import Replay, replay
 
@@ -25,8 +27,12 @@ ORDINARY = 2000
 """Ordinary scenarios drawn behind the failures."""
 MOMENTS, LAST_SECONDS = 4, 3.0
 """Bird's-eye views of a failure, spread over the seconds [s] up to its worst moment."""
-BEHIND, AHEAD = 12.0, 48.0
-"""What a bird's-eye view shows of the road around the ego [m]."""
+BEHIND, FAR_BEHIND, AHEAD = 12.0, 45.0, 48.0
+"""What a bird's-eye view shows of the road around the ego [m]; further behind where there is traffic."""
+ORDINARY_ROAD = 14.0
+"""Width of a road [m] that a view has room for; on wider ones it is higher."""
+CURVES = 3.2
+"""Height of the curves under the views, over that of a view of an ordinary road."""
 NORMAL_QUANTILE, WIDEST_COV = 1.96, 3.0
 """Half-width of the band around estimates on the way, in standard errors; c.o.v. beyond which it is cut."""
 HEADROOM = 1.5
@@ -45,7 +51,8 @@ def save_plot(path: Path, report: Report) -> None:
     """
     # a Figure of its own, without pyplot: no window, no global state, whatever backend the user has
     with matplotlib.rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
-        figure = Figure(figsize=(16, 5.4), layout="constrained")
+        view = _view_height(report.study.problem.world.scenario.road)
+        figure = Figure(figsize=(16, 5.4 * (MOMENTS * view + CURVES) / (MOMENTS + CURVES)), layout="constrained")
         columns = figure.subfigures(1, 3, squeeze=False, width_ratios=(1.0, 1.05, 1.25), wspace=0.03)
         left, middle, right = columns[0]
         figure.suptitle(_headline(report), fontsize=12, fontweight="bold")
@@ -54,10 +61,15 @@ def save_plot(path: Path, report: Report) -> None:
         failures = report.estimate.failures
         if len(failures):
             drive = replay(report.study.problem, failures.x[0])
-            draw_drive(list(right.subplots(MOMENTS + 1, height_ratios=[1.0] * MOMENTS + [3.2])), drive)
+            draw_drive(list(right.subplots(MOMENTS + 1, height_ratios=[view] * MOMENTS + [CURVES])), drive)
         else:
             _say(right.subplots(), "no failure found, so none to show")
         figure.savefig(path, dpi=120)
+
+
+def _view_height(road: Road) -> float:
+    """Height of a bird's-eye view over that of an ordinary road."""
+    return max(1.0, road.lanes * road.width / ORDINARY_ROAD)
 
 
 def _headline(report: Report) -> str:
@@ -119,17 +131,17 @@ def most_shifted(space: ScenarioSpace, ordinary: NDArray[np.float64], failures: 
     """Parameters in which failures differ most from ordinary traffic, the most shifted first.
 
     Args:
-        space: Names of the parameters.
+        space: Of the parameters.
         ordinary: Scenarios from the base distribution, shape (n, d).
         failures: Failures, shape (m, d).
 
     Returns:
-        Indices of the named parameters, by |mean shift| / standard deviation.
+        Indices of columns of x, by |mean shift| / standard deviation; those of large blocks are left out.
     """
-    named = slice(0, len(space.names))
-    spread = np.maximum(ordinary[:, named].std(axis=0), 1e-12)
-    shift = np.abs(failures[:, named].mean(axis=0) - ordinary[:, named].mean(axis=0)) / spread
-    return [int(i) for i in np.argsort(-shift, kind="stable")]
+    shown = np.flatnonzero([column.shown for column in columns_of(space)])
+    spread = np.maximum(ordinary[:, shown].std(axis=0), 1e-12)
+    shift = np.abs(failures[:, shown].mean(axis=0) - ordinary[:, shown].mean(axis=0)) / spread
+    return [int(i) for i in shown[np.argsort(-shift, kind="stable")]]
 
 
 def draw_failures(axes: Axes, space: ScenarioSpace, failures: Failures) -> None:
@@ -137,8 +149,9 @@ def draw_failures(axes: Axes, space: ScenarioSpace, failures: Failures) -> None:
     ordinary = space.sample(ORDINARY, np.random.default_rng(0))
     a, b = most_shifted(space, ordinary, failures.x)[:2] if len(failures) else (0, 1)
     axes.scatter(ordinary[:, a], ordinary[:, b], s=6, color=GREY, label="ordinary traffic", linewidths=0)
-    axes.set_xlabel(f"{space.names[a]} [{space.units[a]}]")
-    axes.set_ylabel(f"{space.names[b]} [{space.units[b]}]")
+    columns = columns_of(space)
+    axes.set_xlabel(columns[a].label)
+    axes.set_ylabel(columns[b].label)
     if len(failures):
         rising = slice(None, None, -1)  # the most likely on top
         x, y = failures.x[rising, a], failures.x[rising, b]
@@ -168,7 +181,7 @@ def draw_drive(axes: list[Axes], drive: Replay) -> None:
 
 
 def draw_moment(axes: Axes, drive: Replay, t: int) -> None:
-    """Draw the vehicles at moment t (an index of `drive.time`) from above, the ego at 0 m."""
+    """Draw the vehicles at moment t (an index of `drive.time`) from above, the ego at 0 m; bends are straightened."""
     origin = drive.position[t, 0, 0]
     hit = drive.collided and t == drive.worst
     for j, ((x, y), heading) in enumerate(zip(drive.position[t], drive.heading[t], strict=True)):
@@ -190,7 +203,8 @@ def draw_moment(axes: Axes, drive: Replay, t: int) -> None:
             linewidth=1,
             dashes=(None, None) if edge else (6, 6),
         )
-    axes.set_xlim(-BEHIND, AHEAD)
+    furthest = float(np.max(drive.position[:, :1, 0] - drive.position[..., 0])) + VEHICLE_LENGTH
+    axes.set_xlim(-min(max(BEHIND, furthest), FAR_BEHIND), AHEAD)
     # the lateral axis points right of the direction of travel, which is down when driving to the right
     axes.set_ylim(right + 0.1 * drive.road.width, left - 0.1 * drive.road.width)
     axes.set_aspect("equal")
@@ -200,7 +214,8 @@ def draw_moment(axes: Axes, drive: Replay, t: int) -> None:
         spine.set_visible(False)
     axes.set_ylabel(f"{drive.time[t]:.1f} s", rotation=0, ha="right", va="center")
     if t == drive.worst:
-        axes.text(AHEAD, 0, "collision" if hit else "closest", color=HIT, ha="right", va="center", fontweight="bold")
+        lane = drive.position[t, 0, 1]
+        axes.text(AHEAD, lane, "collision" if hit else "closest", color=HIT, ha="right", va="center", fontweight="bold")
 
 
 def colour(vehicle: int) -> str:
@@ -223,7 +238,7 @@ def _draw_curves(axes: Axes, drive: Replay) -> None:
     gaps.spines["right"].set_visible(True)
     handles = [*axes.get_legend_handles_labels()[0], *gaps.get_legend_handles_labels()[0]]
     labels = [*axes.get_legend_handles_labels()[1], *gaps.get_legend_handles_labels()[1]]
-    axes.legend(handles, labels, loc="upper center", ncols=2, fontsize=8, frameon=False)
+    axes.legend(handles, labels, loc="upper center", ncols=2 if len(drive.names) < 5 else 3, fontsize=8, frameon=False)
 
 
 def _say(axes: Axes, text: str) -> None:

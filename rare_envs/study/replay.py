@@ -12,9 +12,14 @@ from rare_envs import DrivingProblem
 from rare_envs.road import Road
 from rare_envs.rollout import drive
 from rare_envs.scenarios import Scenario
+from rare_envs.scenarios.highway import LANES
 
-NAMES = {"car_following": ("the ego", "the lead"), "cut_in": ("the ego", "the cutter", "the lead")}
-"""What the vehicles of a scenario are called."""
+NAMES = {
+    "car_following": ("the ego", "the lead"),
+    "cut_in": ("the ego", "the cutter", "the lead"),
+    "highway": ("the ego", *(f"lane {lane + 1}'s car" for lane in LANES[1:])),
+}
+"""What the vehicles of a scenario are called; on the highway by the lane that they start in, from the left."""
 
 
 class Replay(NamedTuple):

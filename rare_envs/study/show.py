@@ -11,7 +11,9 @@ from rich.console import Console
 from rich.table import Table
 
 import samplers
+from rare_envs.study.columns import SHOWN
 from rare_envs.study.evaluate import Report
+from samplers.problem import FloatArray
 
 ORDINARY = 4000
 """Scenarios drawn from the base distribution to say what is ordinary."""
@@ -23,10 +25,19 @@ def print_catalogue(entries: dict[str, Any]) -> None:
     for env_id, environment in entries["environments"].items():
         table = Table("parameter", "unit", "range", "meaning", title=env_id, title_justify="left", title_style="bold")
         for each in environment["parameters"]:
-            table.add_row(each["name"], each["unit"], f"{each['low']:g} to {each['high']:g}", each["meaning"])
+            name = each["name"] if each["size"] == 1 else f"{each['name']} ({each['size']} values)"
+            table.add_row(name, each["unit"], f"{each['low']:g} to {each['high']:g}", each["meaning"])
         console.print(table)
-        console.print(f"  base distributions: {', '.join(environment['bases'])}, or your own JSON file\n")
-    for kind, title in (("methods", "Methods"), ("egos", "Egos"), ("measures", "Safety measures")):
+        console.print(f"  base distributions: {', '.join(environment['bases'])}, or your own JSON file")
+        around = environment["drivers"] or "a script, unless told otherwise"
+        console.print(f"  drivers around the ego: {around}\n")
+    titles = {
+        "methods": "Methods",
+        "egos": "Egos",
+        "drivers": "Drivers around the ego (their weights and noise become parameters)",
+        "measures": "Safety measures",
+    }
+    for kind, title in titles.items():
         table = Table("name", "what it is", title=title, title_justify="left", title_style="bold")
         for name, text in entries[kind].items():
             table.add_row(name, text)
@@ -86,11 +97,35 @@ def _print_failure(console: Console, report: Report) -> None:
         console.print("  no failure found")
         return
     ordinary = space.sample(ORDINARY, np.random.default_rng(0))
-    low, high = np.quantile(ordinary, (0.05, 0.95), axis=0)
     console.print(
         f"  most likely of {failures.total:,} failures found (f = {failures.f[0]:.3g}; "
         "in brackets where nine of ten ordinary scenarios lie):"
     )
-    for j, (name, value) in enumerate(space.named(failures.x[0]).items()):
-        unit = space.units[j]
-        console.print(f"    {name:<15} {value:8.2f} {unit:<4} [{low[j]:.1f} to {high[j]:.1f}]", markup=False)
+    normal = space.columns(space.to_standard_normal(np.vstack((failures.x[:1], ordinary))))
+    found, usual = space.columns(failures.x[:1]), space.columns(ordinary)
+    for j, name in enumerate(space.names):
+        if space.sizes[j] <= SHOWN:
+            low, high = np.quantile(usual[name], (0.05, 0.95))
+            values = " ".join(f"{value:8.2f}" for value in found[name].flat)
+            console.print(f"    {name:<15} {values} {space.units[j]:<4} [{low:.1f} to {high:.1f}]")
+        else:
+            console.print(f"    {name:<15} {_summary(name, found[name][0], usual[name], normal[name])}")
+
+
+def _summary(name: str, values: FloatArray, ordinary: FloatArray, normal: FloatArray) -> str:
+    """What there is to say about a block of many values.
+
+    Args:
+        name: Of the parameter.
+        values: Of the failure, shape (k,).
+        ordinary: Of ordinary scenarios, shape (n, k).
+        normal: Both in standard normal space, the failure's first, shape (1 + n, k).
+    """
+    distance = np.linalg.norm(normal, axis=1)
+    low, high = np.quantile(distance[1:], (0.05, 0.95))
+    spread = (values - ordinary.mean(axis=0)) / np.maximum(ordinary.std(axis=0), 1e-12)
+    furthest = int(np.abs(spread).argmax())
+    return (
+        f"{len(values):,} values, {distance[0]:.2f} standard deviations from their mean [{low:.1f} to {high:.1f}], "
+        f"most in {name}[{furthest}], {spread[furthest]:+.1f}"
+    )

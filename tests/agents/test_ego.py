@@ -18,7 +18,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import rare_envs
-from agents import Ego, SavedEgo, load_ego
+from agents import Ego, LearnedEgo, Provenance, SavedEgo, load_driver, load_ego, save_driver
 from agents.sb3_zip import algorithm_of, read_header
 
 FEATURES = 5
@@ -379,10 +379,28 @@ def test_the_rule_based_driver_stands_as_it_is(tmp_path: Path, monkeypatch: pyte
     assert load_ego("idm") == "idm"
 
 
+def test_learned_drivers_are_egos_by_name_and_by_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mgail").write_text("a file of that name does not matter")
+    by_name = load_ego("mgail")
+    assert isinstance(by_name, LearnedEgo)
+    assert by_name.driver.name == load_driver("mgail").name
+    provenance = Provenance(kind="test", command="none", data="none", data_licence="none")
+    save_driver(by_name.driver, provenance, tmp_path / "own.safetensors")
+    by_file = load_ego("own.safetensors")
+    assert isinstance(by_file, LearnedEgo)
+    features = torch.randn(3, 2, 51)
+    torch.testing.assert_close(by_file.driver.act(features)[0], by_name.driver.act(features)[0])
+    with pytest.raises(FileNotFoundError, match=r"there are own\.safetensors"):
+        load_ego("owm.safetensors")
+    with pytest.raises(ValueError, match=r"algo for a Stable-Baselines3 \.zip only"):
+        load_ego("mgail", algo="ppo")
+
+
 @pytest.mark.parametrize(
     ("spec", "message"),
     [
-        ("idn", r"Unknown ego 'idn' \(did you mean 'idm'\?\); expected 'idm', a path"),
+        ("idn", r"Unknown ego 'idn' \(did you mean 'idm'\?\); expected 'idm', 'mgail',"),
         ("", "Unknown ego ''"),
         ("runs/ego", "Unknown ego 'runs/ego'"),
         (":make", "Expected module:function"),

@@ -180,3 +180,10 @@ def test_base_objects_have_to_stay_in_range() -> None:
 
     with pytest.raises(ValueError, match=r"draws ego_speed outside \[0, 45\] m/s"):
         rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", base=Wide())
+
+
+def test_p_is_conditional_on_fixed_noise_and_says_so() -> None:
+    for noise, drivers, given in (("fixed", "mgail", True), ("fixed", None, False), (True, "mgail", False)):
+        problem = rare_envs.DrivingProblem("rare_envs/CutIn-v0", drivers=drivers, noise=noise, horizon=1.0)
+        result = samplers.estimate(problem, "mc", gamma=2.0, seed=0, max_sim=50)
+        assert ("given that the drivers' noise is one fixed sequence and" in str(result)) == given

@@ -1,6 +1,7 @@
 import json
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -58,6 +59,21 @@ def test_says_how_large_a_region_may_have_been_missed():
     without = replace(estimate, base_draws=0)
     assert without.unseen == 1
     assert "no base draws" in str(without)
+
+
+def test_says_what_the_problem_holds_fixed():
+    problem = samplers.FunctionProblem(lambda u: 2.0 - u[:, 0], 2)
+    free = samplers.estimate(problem, "mc", seed=1, max_sim=500)
+    assert (free.given, free.to_dict()["given"]) == ("", "")
+    problem = SimpleNamespace(dim=2, base=problem.base, evaluate=problem.evaluate, given="one die is fixed")
+    fixed = samplers.estimate(problem, "mc", seed=1, max_sim=500)
+    assert fixed.to_dict()["given"] == "one die is fixed"
+    assert "given that one die is fixed and no region of more than" in str(fixed)
+    assert "one die is fixed and no region of failure was missed" in replace(fixed, base_draws=0).proviso
+    run = samplers.MonteCarlo(n=500).start(problem, seed=1)
+    while not run.done:
+        run.tell(problem.evaluate(run.ask()))
+    assert run.result().given == "one die is fixed"
 
 
 @pytest.mark.parametrize(

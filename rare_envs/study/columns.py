@@ -1,0 +1,34 @@
+"""The columns of x one by one: their names, and which of them a person looks at."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from rare_envs.space import ScenarioSpace
+
+SHOWN = 12
+"""Blocks of more values than this, drivers' weights and noise, are summarised instead of shown."""
+
+
+class Column(NamedTuple):
+    """One column of x."""
+
+    name: str
+    """The parameter's name; in a block with the number in it, such as "speed[0]"."""
+    unit: str
+    shown: bool
+    """Whether the block is small enough to show its values."""
+
+    @property
+    def label(self) -> str:
+        """Name and unit, for an axis."""
+        return f"{self.name} [{self.unit}]" if self.unit else self.name
+
+
+def columns_of(space: ScenarioSpace) -> list[Column]:
+    """The columns in the order of x."""
+    return [
+        Column(name if size == 1 else f"{name}[{k}]", unit, size <= SHOWN)
+        for name, unit, size in zip(space.names, space.units, space.sizes, strict=True)
+        for k in range(size)
+    ]
