@@ -24,8 +24,8 @@ from agents.learned import LearnedDriver
 from agents.networks import ACTIONS, CLIP, HEAD, Policy, Scaling
 from agents.networks import FEATURES as WIDTH
 from agents.noise import Colour
+from agents.rules import RuleDriver
 from agents.weights import WeightDistribution
-from rare_envs.drivers import IDM
 from rare_envs.perception import FEATURES
 from rare_envs.space import did_you_mean
 
@@ -57,7 +57,7 @@ class Provenance:
     """How the law of its weights was fitted."""
 
 
-def load_driver(name: str | PathLike[str]) -> LearnedDriver | IDM:
+def load_driver(name: str | PathLike[str]) -> LearnedDriver | RuleDriver:
     """Find a driver by name.
 
     Args:
@@ -65,7 +65,7 @@ def load_driver(name: str | PathLike[str]) -> LearnedDriver | IDM:
             `save_driver` wrote.
 
     Returns:
-        A `LearnedDriver`, or `rare_envs.drivers.IDM` with its default parameters.
+        A `LearnedDriver`, or a `RuleDriver` with its default parameters.
 
     Raises:
         FileNotFoundError: The file does not exist.
@@ -73,7 +73,7 @@ def load_driver(name: str | PathLike[str]) -> LearnedDriver | IDM:
     """
     text = str(name)
     if text == RULE_BASED:
-        return IDM()
+        return RuleDriver()
     if text in SHIPPED:
         with resources.as_file(resources.files("agents") / "data" / f"{text}{SUFFIX}") as path:
             return read_driver(path)

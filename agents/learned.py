@@ -48,6 +48,7 @@ class LearnedDriver:
     weights: WeightDistribution | None = None
     """Law of the 404 weights of the last layer, if an ensemble has given one."""
     name: str = "learned"
+    noisy: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         for name in ("acceleration", "yaw_rate"):

@@ -1,6 +1,7 @@
 """A driver by rule that sees what learned drivers see."""
 
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -29,6 +30,12 @@ class RuleDriver:
     idm: IDM = field(default_factory=IDM)
     yaw_rate: tuple[float, float] = (-0.3, 0.3)
     """Limits [rad/s]."""
+    weights: ClassVar[None] = None
+    noisy: ClassVar[bool] = False
+
+    def begin(self, draws: Tensor) -> Tensor:
+        """No memory: (B, M, 2, 2) -> (B, M, 0)."""
+        return draws[..., 0, :0]
 
     def act(
         self,

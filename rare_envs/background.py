@@ -31,6 +31,10 @@ class Background(Protocol):
     def weights(self) -> Law | None:
         """Law of the weights that tell one driver from another; None if all are alike."""
 
+    @property
+    def noisy(self) -> bool:
+        """Whether they act with noise if they are given draws."""
+
     def begin(self, draws: Tensor) -> Tensor:
         """The memory at the start, (B, M, ...), from standard normal draws of shape (B, M, 2, 2)."""
 

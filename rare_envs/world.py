@@ -114,11 +114,15 @@ class World:
     @property
     def draws(self) -> int:
         """Number of columns of x that are drivers' noise."""
-        return noise_size(self.ticks, self._others) if self.drivers is not None and self.noise is True else 0
+        return noise_size(self.ticks, self._others) if self._noisy and self.noise is True else 0
 
     @property
     def _others(self) -> int:
         return self.scenario.vehicles - 1
+
+    @property
+    def _noisy(self) -> bool:
+        return self.drivers is not None and self.drivers.noisy and self.noise is not False
 
     @cached_property
     def _fixed(self) -> Tensor:
@@ -148,9 +152,9 @@ class World:
     def _draws(self, noise: Tensor) -> Tensor:
         """Draws of the drivers' noise as tensors, shape (B, 2 + T, M, 2), or (B, 0, M, 2)."""
         batch, shape = len(noise), (self._others, 2)
-        if self.noise == "fixed":
+        if self._noisy and self.noise == "fixed":
             return self._fixed.to(noise).expand(batch, -1, -1, -1)
-        return noise.reshape(batch, -1 if self.noise else 0, *shape)
+        return noise.reshape(batch, -1 if self._noisy else 0, *shape)
 
     def _moment(self, state: State) -> Moment:
         road = self.scenario.road

@@ -14,7 +14,7 @@ from safetensors import safe_open
 from agents import LearnedDriver, Provenance, load_driver, read_driver, read_provenance, save_driver
 from agents.checkpoints import SHIPPED
 from agents.noise import Colour
-from rare_envs.drivers import IDM
+from agents.rules import RuleDriver
 
 PROVENANCE = Provenance(
     kind="mgail",
@@ -170,7 +170,7 @@ def test_what_cannot_be_saved_is_refused(driver, tmp_path):
 
 
 def test_drivers_by_name(file):
-    assert load_driver("idm") == IDM()
+    assert load_driver("idm") == RuleDriver()
     assert load_driver(file).name == load_driver(str(file)).name == "tester"
 
 

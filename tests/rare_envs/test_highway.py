@@ -158,6 +158,18 @@ def test_learned_drivers_in_the_scripted_scenarios(env_id):
     assert last.state.y[:, 1:].abs().max() <= 5.0  # across, they stay on the scenario's path
 
 
+def test_drivers_by_rule_have_neither_weights_nor_noise():
+    for noise in (True, "fixed", False):
+        problem = rare_envs.DrivingProblem(HIGHWAY, drivers="idm", noise=noise)
+        assert problem.dim == 24
+    x = draw(problem, 64)
+    last = list(drive(problem.world, problem.driver, torch.from_numpy(x)))[-1]
+    road = problem.world.scenario.road
+    # they keep the lanes that they started in, on the curve too
+    torch.testing.assert_close(road.lane_of(last.state.y), torch.tensor(LANES).expand(64, -1))
+    assert (last.state.y - road.centre_of(last.state.y)).abs().max() < 0.1
+
+
 def test_a_learned_ego_looks():
     ego = agents.LearnedEgo(agents.load_driver("mgail"))
     problem = rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego=ego, **SHORT)
