@@ -24,7 +24,7 @@ def finished(run, f=EASY.f):
 
 
 @pytest.mark.parametrize("method", sorted(samplers.METHODS))
-@pytest.mark.parametrize("options", [{}, {"replicates": 3}, {"max_sim": 3000}], ids=str)
+@pytest.mark.parametrize("options", [{}, {"replicates": 3, "max_sim": 4501}], ids=str)
 def test_gives_what_estimate_gives(method, options):
     chosen = samplers.get_method(method)
     told = finished(chosen.start(Places(), seed=3, **options))

@@ -248,7 +248,7 @@ def options_of(method):
 @pytest.mark.parametrize("case", CASES, ids=IDS)
 @pytest.mark.parametrize("method", ["mc", "ce", "ss", "adss"])
 def test_the_band_holds_the_whole_truth(method, case):
-    runs = 25
+    runs = 15
     assert runs_inside(method, case, runs, **options_of(method)) >= stats.binom.ppf(1e-3, runs, 0.9)
 
 

@@ -35,7 +35,7 @@ def gain(found):
     ids=lambda v: getattr(v, "name", v),
 )
 def test_gain_over_monte_carlo(study, reference, family, least):
-    runs = 15
+    runs = 10
     found = study(reference, ICE(family=family), runs, max_sim=6000)
     error = found.ratios.std(ddof=1) / math.sqrt(runs)
     assert abs(found.ratios.mean() - 1) < 5 * error
