@@ -9,6 +9,7 @@ import torch
 from agents import LearnedDriver, WeightDistribution
 from agents.networks import head_weights
 from benchmarks import imitation
+from benchmarks.forward_model import compare
 from benchmarks.imitation import Effort, highway, moved, named, report, rounded
 from benchmarks.imitation_figures import draw, tables
 from tests.training.synthetic_scenes import scenes
@@ -87,3 +88,11 @@ def test_drivers_are_named_by_their_files(driver, tmp_path):
 
 def test_numbers_are_rounded():
     assert rounded({"a": [1.23456789, 3], "b": "c"}) == {"a": [1.2346, 3], "b": "c"}
+
+
+def test_gradients_of_both_ways_are_compared(data):
+    learner = learner_of(data, Config(learned_model=True, epochs=1, scenes=2))
+    learned, noise, blind, length = compare(learner, 3, starts=2)
+    assert max(abs(learned), abs(noise), abs(blind)) <= 1 + 1e-5
+    assert noise > 0
+    assert length > 0

@@ -2,6 +2,7 @@
 
 import dataclasses
 import inspect
+import json
 
 import pytest
 import torch
@@ -223,3 +224,24 @@ def test_logs_without_tensorboard_are_refused(data, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
     with pytest.raises(ValueError, match=r"rare-envs\[logs\]"):
         fit(learner_of(data, tiny(updates=1)), tmp_path, log=True)
+
+
+def rare_envs_command(words):
+    from rare_envs.study import cli
+
+    with pytest.raises(SystemExit) as stop:
+        cli.app(words, prog_name="rare-envs")
+    return stop.value.code
+
+
+def test_the_shared_command_line_trains_drivers(made_up, tmp_path, capsys):
+    words = ["train-drivers", "--data", "tables", "--method", "bc", "--out", str(tmp_path / "run"), "--json"]
+    assert rare_envs_command(words) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert read_provenance(answer["driver"]).kind == answer["method"] == "bc"
+
+
+@pytest.mark.parametrize("words", [["--data", "t", "--method", "sac"], ["--data", "nowhere"], []])
+def test_the_shared_command_line_refuses_in_one_line(words, tmp_path, capsys):
+    assert rare_envs_command(["train-drivers", *words, "--out", str(tmp_path / "run")]) == 2
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1
