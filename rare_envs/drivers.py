@@ -21,6 +21,12 @@ if TYPE_CHECKING:
 _NEAR_ZERO = 0.01
 """HighwayEnv's `not_zero`: distances [m] and speeds [m/s] in a denominator are kept at least this far from 0."""
 
+MAX_STEERING = np.pi / 3
+"""Largest steering angle of lane keeping [rad], HighwayEnv's."""
+_MAX_SLIP_SINE = np.sin(np.arctan(0.5 * np.tan(MAX_STEERING)))
+"""Sine of the slip angle at the largest steering angle. Near 1 single precision may give a slip beyond pi / 2, and its
+tangent the other sign."""
+
 
 class Driver(Protocol):
     """An ego. Its memory, if it has any, goes in and out, so that one driver serves any number of rollouts."""
@@ -122,8 +128,8 @@ def lane_keeping(y: Tensor, heading: Tensor, speed: Tensor, road: Road) -> Tenso
     speed = speed.clamp(min=_NEAR_ZERO)
     heading_command = torch.asin((offset / (-0.6 * speed)).clamp(-1.0, 1.0)).clamp(-np.pi / 4, np.pi / 4)
     yaw_rate = 5.0 * (heading_command - heading)
-    slip = torch.asin((VEHICLE_LENGTH / 2 / speed * yaw_rate).clamp(-1.0, 1.0))
-    return torch.atan(2.0 * torch.tan(slip)).clamp(-np.pi / 3, np.pi / 3)
+    slip = torch.asin((VEHICLE_LENGTH / 2 / speed * yaw_rate).clamp(-_MAX_SLIP_SINE, _MAX_SLIP_SINE))
+    return torch.atan(2.0 * torch.tan(slip)).clamp(-MAX_STEERING, MAX_STEERING)
 
 
 @dataclass(frozen=True)

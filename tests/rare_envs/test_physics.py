@@ -88,6 +88,21 @@ def test_idm_limits() -> None:
     assert start.item() == pytest.approx(2.22)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, F64])
+def test_lane_keeping_never_steers_the_wrong_way(dtype: torch.dtype) -> None:
+    """At low speed the wanted yaw rate is beyond what the wheels can do: as far as they turn, and to the lane."""
+    y = torch.tensor([1.5, -1.5, 1.5, -1.5], dtype=dtype)
+    speed = torch.tensor([0.5, 0.5, 0.0, 0.0], dtype=dtype)
+    steering = lane_keeping(y, torch.zeros_like(y), speed, straight(1))
+    limit = math.pi / 3
+    assert steering.tolist() == pytest.approx([-limit, limit, -limit, limit], abs=1e-5)
+    grid = torch.linspace(-1.9, 1.9, 39, dtype=dtype)
+    y, heading, speed = torch.meshgrid(grid, 0.4 * grid, 10 * grid.abs(), indexing="ij")
+    steering = lane_keeping(y, heading, speed, straight(1))
+    exact = lane_keeping(y.double(), heading.double(), speed.double(), straight(1))
+    torch.testing.assert_close(steering.double(), exact, rtol=0, atol=1e-4)
+
+
 def test_lane_keeping_returns_to_the_lane() -> None:
     state = (tensor(0.0), tensor(1.0), tensor(0.05), tensor(20.0))
     for _ in range(100):
