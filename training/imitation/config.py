@@ -18,7 +18,7 @@ class Config:
 
     method: Method = "mgail"
     seed: int = 0
-    updates: int = 1000
+    updates: int = 1500
     """Updates of the policy after behaviour cloning."""
 
     # behaviour cloning, which every method starts from
@@ -45,12 +45,12 @@ class Config:
 
     # costs of the policy
     critic_weight: float = 3.0
-    clone_weight: tuple[float, float] = (0.1, 0.03)
+    clone_weight: tuple[float, float] = (0.1, 0.06)
     """Of the likelihood of recorded actions; it falls geometrically."""
     anneal: float = 0.7
     """Share of the training in which the schedules run."""
-    collision_weight: float = 8.0
-    edge_weight: float = 8.0
+    collision_weight: float = 16.0
+    edge_weight: float = 16.0
     brake_weight: float = 1.0
 
     # optimisation
