@@ -165,12 +165,13 @@ def test_the_critic_s_cost_falls_where_driving_looks_recorded():
 
 
 def test_rewards_are_the_costs_of_mgail_with_another_sign(data):
-    learner = learner_of(data, SMALL)
+    weights = {"critic_weight": 3.0, "collision_weight": 8.0, "edge_weight": 4.0, "brake_weight": 2.0}
+    learner = learner_of(data, dataclasses.replace(SMALL, **weights))
     with torch.no_grad():
         steps = learner.drive(1.0)
         likeness = policy_cost(learner.critic, inputs(learner.policy, steps.features, steps.action))
         reward = rewards(learner, steps)
-    torch.testing.assert_close(reward, -(3 * likeness + 8 * steps.collision + 8 * steps.edge + steps.brake))
+    torch.testing.assert_close(reward, -(3 * likeness + 8 * steps.collision + 4 * steps.edge + 2 * steps.brake))
     assert seen_by_value(learner.policy, steps).shape == (len(reward), 53)
 
 

@@ -88,7 +88,7 @@ def test_learning_rates_fall_after_the_schedules():
 
 
 def test_the_learner_uses_them(data):
-    learner = learner_of(data, tiny(updates=2, anneal=0.5))
+    learner = learner_of(data, tiny(updates=2, anneal=0.5, policy_rate=3e-4, critic_rate=4e-4))
     fit(learner)
     (group,) = learner.policy_optimiser.param_groups
     assert group["lr"] == pytest.approx(3e-4)
