@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from rare_envs.road import Road
+from rare_envs.road import Placed, Road
 from rare_envs.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
 
 _DIAGONAL = (VEHICLE_LENGTH**2 + VEHICLE_WIDTH**2) ** 0.5
@@ -36,14 +36,13 @@ def lead_of(state: State, road: Road) -> Lead:
     """
     x, y = state.x[:, 0], state.y[:, 0]
     lane_y, reach = road.centre_of(y), (road.width + VEHICLE_WIDTH) / 2
-    nearest = torch.full_like(x, torch.inf)
-    lead_speed = state.speed[:, 0]
-    for j in range(1, state.x.shape[1]):
-        ahead = state.x[:, j] - x
-        minded = (ahead >= 0) & ((state.y[:, j] - lane_y).abs() <= reach) & (ahead <= nearest)
-        nearest = torch.where(minded, ahead, nearest)
-        along = state.speed[:, j] * torch.cos(state.heading[:, j] - state.heading[:, 0])
-        lead_speed = torch.where(minded, along, lead_speed)
+    ahead = state.x[:, 1:] - x[:, None]
+    minded = (ahead >= 0) & ((state.y[:, 1:] - lane_y[:, None]).abs() <= reach)
+    along = state.speed[:, 1:] * torch.cos(state.heading[:, 1:] - state.heading[:, :1])
+    nearest, lead_speed = torch.full_like(x, torch.inf), state.speed[:, 0]
+    for way, seen, speed in zip(ahead.unbind(1), minded.unbind(1), along.unbind(1), strict=True):
+        nearer = seen & (way <= nearest)
+        nearest, lead_speed = torch.where(nearer, way, nearest), torch.where(nearer, speed, lead_speed)
     return Lead(nearest - VEHICLE_LENGTH, state.speed[:, 0] - lead_speed)
 
 
@@ -72,7 +71,7 @@ def boxes_overlap(dx: Tensor, dy: Tensor, heading: Tensor, other_heading: Tensor
     return overlap & (other_along.abs() < reach_along) & (other_across.abs() < reach_across)
 
 
-def ego_overlaps(state: State, road: Road) -> Tensor:
+def ego_overlaps(state: State, road: Road, placed: Placed | None = None) -> Tensor:
     """Which vehicles' bodies overlap the ego's.
 
     They are compared in the world: where the road turns, distances along it are not those between bodies. Boxes are
@@ -81,11 +80,12 @@ def ego_overlaps(state: State, road: Road) -> Tensor:
     Args:
         state: Traffic of B scenarios.
         road: Their road.
+        placed: Where they are in the world, if that is known already.
 
     Returns:
         Boolean, shape (B, N - 1).
     """
-    x, y, heading = road.to_world(state.x, state.y, state.heading)
+    x, y, heading = road.to_world(state.x, state.y, state.heading) if placed is None else placed[:3]
     dx, dy = x[:, 1:] - x[:, :1], y[:, 1:] - y[:, :1]
     near: Tensor = (dx.abs() < _DIAGONAL) & (dy.abs() < _DIAGONAL)
     if not bool(near.any()):

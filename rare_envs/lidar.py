@@ -12,6 +12,7 @@ References:
 """
 
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
@@ -33,6 +34,8 @@ _WINDOWS = (
 )
 """Beams that may meet a body, counted from the one nearest to its bearing, while the sine of half the angle that it
 covers, half diagonal over distance, is less than this."""
+_FEW = 512
+"""Pairs of vehicles up to which all are tested with all beams: the last window alone costs the fewest operations."""
 _FLAT = 1e-9
 """Least size of a direction's component, so that a beam along a side divides by no zero."""
 
@@ -117,7 +120,7 @@ def _crossing(
         Distances [m]; the beam's line misses the box where the first is greater than the second.
     """
     cos, sin = torch.cos(heading), torch.sin(heading)
-    along, across = 1.0 / _away_from_zero(torch.cos(turn)), 1.0 / _away_from_zero(torch.sin(turn))
+    along, across = _away_from_zero(torch.cos(turn)).reciprocal(), _away_from_zero(torch.sin(turn)).reciprocal()
     middle_along, half_along = (dx * cos + dy * sin) * along, 0.5 * length * along.abs()
     middle_across, half_across = (dy * cos - dx * sin) * across, 0.5 * width * across.abs()
     enters = torch.maximum(middle_along - half_along, middle_across - half_across)
@@ -126,7 +129,7 @@ def _crossing(
 
 
 def _away_from_zero(value: Tensor) -> Tensor:
-    return torch.where(value.abs() < _FLAT, _FLAT, value)
+    return value.masked_fill(value.abs() < _FLAT, _FLAT)
 
 
 def _first_met(bodies: Bodies, m: int) -> tuple[Tensor, Tensor]:
@@ -144,39 +147,56 @@ def _first_met(bodies: Bodies, m: int) -> tuple[Tensor, Tensor]:
     bearing = torch.atan2(dy, dx) - bodies.heading[:, :m, None]
     facing = torch.round((bearing - FIRST) / SPACING).to(torch.int64)
 
-    keys = torch.full((batch * m, BEAMS), _NOTHING, dtype=torch.int64, device=dx.device)
+    relative = bodies.heading[:, :m, None] - bodies.heading[:, None, :]
+    keys = torch.full((batch * m * BEAMS,), _NOTHING, dtype=torch.int64, device=dx.device)
     untested = distance < MAX_RANGE + half_diagonal
-    for offsets, sine in _WINDOWS:
+    for offsets, sine in _WINDOWS if batch * m * v > _FEW else _WINDOWS[-1:]:
         enough = untested & (half_diagonal < sine * distance) if sine else untested
-        b, i, j = enough.nonzero(as_tuple=True)
+        pair = enough.flatten().nonzero().squeeze(1)  # observer and body, as a number in (B, m, V)
+        if not len(pair):
+            continue
         untested = untested & ~enough
-        beam = facing[b, i, j][:, None] + torch.tensor(offsets, device=dx.device)
-        other_heading = bodies.heading[b, j][:, None]
-        turn = bodies.heading[b, i][:, None] - other_heading + (FIRST + SPACING * beam)
+        observer = torch.div(pair, v, rounding_mode="floor")
+        vehicle = pair - observer * v
+        body = vehicle + torch.div(observer, m, rounding_mode="floor") * v
+        beam = (_taken(facing, pair) + _offsets(offsets, dx.device)) % BEAMS
         enters, leaves = _crossing(
-            dx[b, i, j][:, None],
-            dy[b, i, j][:, None],
-            other_heading,
-            turn,
-            bodies.length[b, j][:, None],
-            bodies.width[b, j][:, None],
+            _taken(dx, pair),
+            _taken(dy, pair),
+            _taken(bodies.heading, body),
+            _taken(relative, pair) + (FIRST + SPACING * beam),
+            _taken(bodies.length, body),
+            _taken(bodies.width, body),
         )
         meets = (enters <= leaves) & (leaves > 0.0) & (enters < MAX_RANGE)
-        key = torch.where(meets, _key(enters, j[:, None], v), _NOTHING)
-        slot = (b * m + i)[:, None] * BEAMS + beam % BEAMS
-        keys.view(-1).scatter_reduce_(0, slot.flatten(), key.flatten(), "amin")
+        key = torch.where(meets, _key(enters, vehicle[:, None]), _NOTHING)
+        slot = observer[:, None] * BEAMS + beam
+        keys.scatter_reduce_(0, slot.flatten(), key.flatten(), "amin")
     keys = keys.view(batch, m, BEAMS)
-    found = (keys // v).to(torch.int32).view(torch.float32)
-    return torch.where(keys == _NOTHING, -1, keys % v), found
+    found = (keys >> _VEHICLE_BITS).to(torch.int32).view(torch.float32)
+    return torch.where(keys == _NOTHING, -1, keys & (2**_VEHICLE_BITS - 1)), found
+
+
+def _taken(field: Tensor, numbers: Tensor) -> Tensor:
+    """Entries of a field by their numbers in it (n,), as a column (n, 1)."""
+    return field.flatten().index_select(0, numbers)[:, None]
+
+
+@lru_cache(maxsize=32)
+def _offsets(offsets: tuple[int, ...], device: torch.device) -> Tensor:
+    return torch.tensor(offsets, device=device)
 
 
 _NOTHING = torch.iinfo(torch.int64).max
 
 
-def _key(distance: Tensor, vehicle: Tensor, vehicles: int) -> Tensor:
-    """Integers that are ordered as the distances are, with the vehicle in the last digit.
+_VEHICLE_BITS = 16
+
+
+def _key(distance: Tensor, vehicle: Tensor) -> Tensor:
+    """Integers that are ordered as the distances are, with the vehicle in the last bits.
 
     The bits of positive single-precision numbers, read as integers, are ordered as the numbers are.
     """
     bits = distance.clamp(min=0.0).float().view(torch.int32).to(torch.int64)
-    return bits * vehicles + vehicle
+    return (bits << _VEHICLE_BITS) | vehicle

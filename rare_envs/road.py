@@ -10,11 +10,25 @@ from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache
 from importlib import resources
 from itertools import pairwise
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from rare_envs.curve import Curve
+
+
+class Placed(NamedTuple):
+    """Vehicles in the flat world; all of one shape."""
+
+    x: Tensor
+    """[m]."""
+    y: Tensor
+    """[m]."""
+    heading: Tensor
+    """Relative to the X axis [rad]."""
+    curvature: Tensor
+    """Of the road where they are [1/m]."""
 
 
 @dataclass(frozen=True)
@@ -101,11 +115,18 @@ class Road:
         """
         if self.curve is None:
             return x, y, heading
+        return self.place(x, y, heading)[:3]
+
+    def place(self, x: Tensor, y: Tensor, heading: Tensor) -> "Placed":
+        """`to_world`, and the curvature of the reference line at x, in one."""
+        if self.curve is None:
+            return Placed(x, y, heading, torch.zeros_like(x))
         point = self.curve.at(x)
-        return (
+        return Placed(
             torch.addcmul(point.x, y, torch.sin(point.heading), value=-1.0),
             torch.addcmul(point.y, y, torch.cos(point.heading)),
             point.heading + heading,
+            point.curvature,
         )
 
     def from_world(self, x: Tensor, y: Tensor, heading: Tensor) -> tuple[Tensor, Tensor, Tensor]:

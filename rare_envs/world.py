@@ -14,7 +14,7 @@ from rare_envs.geometry import Lead, ego_overlaps, lead_of
 from rare_envs.lidar import Bodies
 from rare_envs.measures import MEASURES, Measure, Moment
 from rare_envs.perception import OnRoad, perceive
-from rare_envs.road import Road
+from rare_envs.road import Placed, Road
 from rare_envs.scenarios import Scenario
 from rare_envs.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
 
@@ -39,13 +39,12 @@ class Episode(NamedTuple):
     """What goes on in the drivers around the ego, if they are not the scenario's script."""
 
 
-def look(state: State, road: Road) -> Tensor:
-    """The 51 features of all vehicles, shape (B, N, 51)."""
-    x, y, heading = road.to_world(state.x, state.y, state.heading)
-    size = torch.ones_like(x)
-    bodies = Bodies(x, y, heading, state.speed, VEHICLE_LENGTH * size, VEHICLE_WIDTH * size)
+def look(state: State, road: Road, placed: Placed | None = None) -> Tensor:
+    """The 51 features of all vehicles, shape (B, N, 51); where they are is found out unless it is `placed`."""
+    x, y, heading, curvature = placed or road.place(state.x, state.y, state.heading)
+    bodies = Bodies(x, y, heading, state.speed, x.new_tensor(VEHICLE_LENGTH), x.new_tensor(VEHICLE_WIDTH))
     left, right = road.markers(state.y)
-    return perceive(bodies, OnRoad(0.5 * (left - right), state.heading, road.curvature(state.x), left, right))
+    return perceive(bodies, OnRoad(0.5 * (left - right), state.heading, curvature, left, right))
 
 
 def _is_number(value: object) -> bool:
@@ -145,7 +144,7 @@ class World:
         if self.drivers is not None:
             weights, noise = x[:, size : size + self.weights], x[:, size + self.weights :]
             minds = begin(self.drivers, weights.contiguous(), self._draws(noise))
-        moment = self._moment(state)
+        moment = self._moment(state, self._placed(state))
         f = self._measure.of(moment)
         return Episode(state, moment.lead, f, collided, moment.road, moment.perception, minds)
 
@@ -156,9 +155,13 @@ class World:
             return self._fixed.to(noise).expand(batch, -1, -1, -1)
         return noise.reshape(batch, -1 if self._noisy else 0, *shape)
 
-    def _moment(self, state: State) -> Moment:
+    def _moment(self, state: State, placed: Placed | None) -> Moment:
         road = self.scenario.road
-        return Moment(state, lead_of(state, road), road, look(state, road) if self.sees else None)
+        return Moment(state, lead_of(state, road), road, look(state, road, placed) if self.sees else None)
+
+    def _placed(self, state: State) -> Placed | None:
+        """Where the vehicles are in the flat world, if they look."""
+        return self.scenario.road.place(state.x, state.y, state.heading) if self.sees else None
 
     def step(self, episode: Episode, action: Tensor) -> Episode:
         """Move every vehicle by one tick: all decide on the old state, then all move.
@@ -184,8 +187,9 @@ class World:
             others = self.scenario.driven(old, decided, dt)
         x, y, heading, speed = (torch.cat((first[None], rest.T)).T for first, rest in zip(moved, others, strict=True))
         state = State(x, y, heading, speed, old.theta)
-        moment = self._moment(state)
-        hit = ego_overlaps(state, road).any(dim=1) | road.off_road(state.y[:, 0])
+        placed = self._placed(state)
+        moment = self._moment(state, placed)
+        hit = ego_overlaps(state, road, placed).any(dim=1) | road.off_road(state.y[:, 0])
         collided = episode.collided | hit
         least = torch.minimum(episode.f, self._measure.of(moment))
         worth = episode.f if self._measure.collision is None else self._measure.collision
