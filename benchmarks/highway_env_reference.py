@@ -1,12 +1,16 @@
-"""The two scenarios played by HighwayEnv's own objects: what parity is tested and speed is measured against."""
+"""The scenarios played by HighwayEnv's own objects: what parity is tested and speed is measured against."""
 
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
+from highway_env.envs.common.observation import LidarObservation
 from highway_env.road.road import Road, RoadNetwork
 from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.kinematics import Vehicle
 from numpy.typing import NDArray
+
+from rare_envs.scenarios.highway import LANES
 
 Array = NDArray[np.float64]
 
@@ -107,6 +111,20 @@ def cut_in(x: Array, ego: type[IDMVehicle] = TianVehicle, target_speed: float = 
     return road
 
 
+def highway(x: Array) -> Road:
+    """Six of HighwayEnv's IDM vehicles on six straight lanes, started like ours; only their speed is comparable.
+
+    Args:
+        x: Starts with six of each: places along the road, offsets in the lane, headings [deg] and speeds.
+    """
+    road = _road(len(LANES))
+    s, t, heading, speed = x[: 4 * len(LANES)].reshape(4, len(LANES))
+    road.vehicles = [
+        IDMVehicle(road, [s[j], 4.0 * lane + t[j]], np.deg2rad(heading[j]), speed[j]) for j, lane in enumerate(LANES)
+    ]
+    return road
+
+
 def drive(road: Road, ticks: int, dt: float = 0.1) -> tuple[Array, bool]:
     """Run HighwayEnv's own loop.
 
@@ -127,6 +145,17 @@ def drive(road: Road, ticks: int, dt: float = 0.1) -> tuple[Array, bool]:
             return np.array(rows), True
         rows.append(_state(road))
     return np.array(rows), False
+
+
+def drive_looking(road: Road, ticks: int, dt: float = 0.1) -> None:
+    """Run HighwayEnv's own loop and let every vehicle measure with HighwayEnv's lidar, 20 beams, at each tick."""
+    lidar = LidarObservation(SimpleNamespace(road=road), cells=20, maximum_range=100.0)
+    for _ in range(ticks):
+        for vehicle in road.vehicles:
+            lidar.observer_vehicle = vehicle
+            lidar.observe()
+        road.act()
+        road.step(dt)
 
 
 def _state(road: Road) -> list[list[float]]:
