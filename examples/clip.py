@@ -1,0 +1,67 @@
+"""A clip of six learned drivers on the highway, drawn by HighwayEnv's graphics.
+
+    python examples/clip.py --out clip.gif                    # 20 s as a moving picture
+    python examples/clip.py --still docs/images/highway.png   # one moment of it
+
+Prints what happened: who left the road, who touched whom, how fast they were.
+"""
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import torch
+import typer
+from PIL import Image
+
+import agents
+import rare_envs
+from rare_envs.envs.rendering import Renderer
+from rare_envs.geometry import boxes_overlap
+from rare_envs.road import Road
+from rare_envs.rollout import drive
+from rare_envs.state import State
+
+
+def pairs_in_contact(state: State, road: Road) -> int:
+    """How many pairs of the first scenario's vehicles overlap."""
+    x, y, heading = (field[0] for field in road.to_world(state.x, state.y, state.heading))
+    i, j = torch.triu_indices(len(x), len(x), 1)
+    return int(boxes_overlap(x[j] - x[i], y[j] - y[i], heading[i], heading[j]).sum())
+
+
+def main(
+    out: Annotated[Path | None, typer.Option(help="GIF to write.")] = None,
+    still: Annotated[Path | None, typer.Option(help="PNG to write.")] = None,
+    at: Annotated[float, typer.Option(help="Moment of the PNG [s].")] = 5.0,
+    seconds: Annotated[float, typer.Option(help="Length of the clip [s].")] = 20.0,
+    drivers: Annotated[str, typer.Option(help="mgail, gail, bc, idm or a file.")] = "mgail",
+    ego: Annotated[str, typer.Option(help="An ego as for rare-envs estimate.")] = "mgail",
+    env: Annotated[str, typer.Option(help="Environment.")] = "rare_envs/Highway-v0",
+    seed: int = 0,
+) -> None:
+    """Drive one scenario drawn from the base distribution and draw it."""
+    problem = rare_envs.DrivingProblem(env, ego=agents.load_ego(ego), drivers=drivers, horizon=seconds)
+    x = torch.from_numpy(problem.base.sample(1, np.random.default_rng(seed))).float()
+    road = problem.world.scenario.road
+    renderer, frames, contacts, off = Renderer(road, window=False, fps=10), [], 0, 0
+    with torch.inference_mode():
+        for tick, episode in enumerate(drive(problem.world, problem.driver, x)):
+            image = renderer.draw(episode.state, bool(episode.collided))
+            if out is not None:
+                frames.append(Image.fromarray(image).quantize(64))
+            if still is not None and tick == round(at / problem.world.dt):
+                Image.fromarray(image).save(still)
+            contacts += pairs_in_contact(episode.state, road)
+            off += int(road.off_road(episode.state.y).sum())
+    if out is not None:
+        frames[0].save(out, save_all=True, append_images=frames[1:], duration=100, loop=0)
+    speed = episode.state.speed[0]
+    print(
+        f"seed {seed}: {off} vehicle-steps off the road, {contacts} pair-steps in contact, "
+        f"speeds after {seconds:g} s from {float(speed.min()):.1f} to {float(speed.max()):.1f} m/s"
+    )
+
+
+if __name__ == "__main__":
+    typer.run(main)
