@@ -169,14 +169,14 @@ def shipped(name):
     return json.loads((resources.files("rare_envs") / "data" / name).read_text(encoding="utf-8"))
 
 
-@pytest.mark.parametrize("scenario", PARAMETERS)
+@pytest.mark.parametrize("scenario", RECIPES)
 def test_highway_files_are_what_the_script_writes(scenario):
     written = json.loads(base_file(scenario, *highway_base(scenario)))
     assert written == shipped(f"{scenario}_highway.json")
     assert "NOT fitted" in written["provenance"]["kind"]
 
 
-@pytest.mark.parametrize("scenario", PARAMETERS)
+@pytest.mark.parametrize("scenario", RECIPES)
 def test_fitted_files_say_where_they_come_from(scenario):
     provenance = shipped(f"{scenario}_us101.json")["provenance"]
     assert provenance["source"]["record"] == "8ect-6jqj"
