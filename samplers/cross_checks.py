@@ -1,12 +1,12 @@
 """Checks of a `TwoStage` estimate against what else was simulated: what would show had a region been missed."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from scipy import stats
 
-from samplers.problem import FloatArray
-from samplers.proposal import NO_REGION, Proposal
+from samplers.importance import Draws
 from samplers.stratified import Strata
 from samplers.weights import effective_sample_size
 
@@ -15,7 +15,8 @@ FALSE_ALARM = 1e-3
 ROUNDS_APART = 4.0
 """Standard errors between the rounds and the estimate."""
 ENOUGH_ESS = 30.0
-ENOUGH_DRAWS = 30
+LEFT_OUT = 0.05
+"""Share of p that a single draw in a region may stand for."""
 
 
 def against_base_draws(p: float, hits: int, n: int) -> list[str]:
@@ -29,23 +30,34 @@ def against_base_draws(p: float, hits: int, n: int) -> list[str]:
     return [f"{hits} of {n:,} base draws failed where p = {p:.2e} lets expect {expected:.2g}: p misses failures."]
 
 
-def against_rounds(strata: Strata, log_weights: FloatArray) -> list[str]:
-    """Warn where the rounds before, whose failing draws have these log weights (k,), together say something else."""
-    if len(log_weights) == 0 or len(strata.draws.f) == 0 or effective_sample_size(log_weights) < ENOUGH_ESS:
+def against_rounds(strata: Strata, rounds: Sequence[Draws]) -> list[str]:
+    """Warn where the rounds before, each weighed by its own proposal, together say something else.
+
+    Weighed as draws from all rounds' proposals together they would be worth more, but are often too low by a third:
+    later proposals depend on earlier draws.
+    """
+    n = sum(draws.n for draws in rounds)
+    log_weights = np.concatenate([np.empty(0), *(draws.log_weights for draws in rounds)])
+    if len(strata.draws.f) == 0 or effective_sample_size(log_weights) < ENOUGH_ESS:
         return []
     w = np.exp(log_weights)
-    before, error = float(w.sum()), math.sqrt(float((w * w).sum()))
+    before, error = float(w.sum()) / n, math.sqrt(float((w * w).sum())) / n
     apart = abs(before - strata.p) / math.hypot(error, strata.cov * strata.p)
     if apart < ROUNDS_APART:
         return []
     return [f"The rounds before the estimate say {before:.2e}, {apart:.1f} standard errors from it."]
 
 
-def regions_lost(strata: Strata, proposal: Proposal) -> list[str]:
-    """Warn of regions that the exploration found and where hardly a final draw made for them fails."""
-    regions = np.array([candidate.region for candidate in proposal.candidates])
-    lost = 0
-    for region in set(regions.tolist()) - {NO_REGION}:
-        own = regions == region
-        lost += int(strata.counts[own].sum() >= ENOUGH_DRAWS and not strata.sums[own].any())
-    return [f"{lost} of the regions found are not met again by the draws made for them."] if lost else []
+def regions_left_out(strata: Strata) -> list[str]:
+    """Warn of regions where the points that the exploration found have weights that p cannot do without.
+
+    Where one draw is worth some per cent of p, the proposal does not describe the region, and that the final draws
+    met hardly any of that weight says nothing.
+    """
+    share = strata.typical / max(strata.draws.n * strata.p, 1e-300)
+    lost = int((share > LEFT_OUT).sum())
+    if lost == 0 or len(strata.draws.f) == 0:
+        return []
+    return [
+        f"The draws hardly reach {lost} of {len(share)} regions found: a point there would be {share.max():.0%} of p."
+    ]

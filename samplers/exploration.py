@@ -59,7 +59,7 @@ class Sizes:
             base=round(500 * scale),
             wide=((1.5, round(120 * scale)), (2.2, round(120 * scale)), (3.0, round(80 * scale))),
             level=max(100, round(250 * scale)),
-            starts=max(10, round(40 * scale)),
+            starts=max(10, round(60 * scale)),
             level_starts=max(6, round(16 * scale)),
             most=int(0.45 * budget),
             limit=int(0.65 * budget),

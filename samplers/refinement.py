@@ -8,10 +8,10 @@ from samplers.bumps import HIGH_DIM, Points, clipped, fitted, refitted
 from samplers.components import Bump, Shell, Slice, Wide, log_ratios
 from samplers.gate import Gate, learned_gate
 from samplers.history import History
-from samplers.planes import beyond
+from samplers.planes import beyond, edge, quantile
 from samplers.problem import FloatArray
 from samplers.proposal import NO_REGION, Candidate, Proposal
-from samplers.regions import MOST_REGIONS, Found, Region
+from samplers.regions import Found, Region
 from samplers.second_moment import Floor, least_variance, with_floors
 from samplers.simulator import Batch
 
@@ -27,6 +27,8 @@ REGION_FLOOR = 0.5
 REGION_FLOOR_LAST = 0.2
 """Share of draws that is dealt out evenly among the regions, in the rounds and in the estimate. Weights of a region's
 first draws can be so uneven that it seems to have no mass: it must not be lost by that."""
+SHELL_FLOOR = 0.1
+"""Share of shells where the regions are no more than pieces of one."""
 SMALLEST = 0.004
 """Components with less of the draws than this are left out."""
 KEPT = 0.01
@@ -59,6 +61,7 @@ class Refinement:
         self._dim = regions[0].u.shape[1]
         self._regions = regions
         self._noisy = found.noisy
+        self._scattered = found.scattered
         self._history = history
         self._gamma = gamma
         self._rng = rng
@@ -71,7 +74,7 @@ class Refinement:
         self._planes = [
             Candidate(part, "plane", k)
             for k, region in enumerate(regions)
-            for part in beyond(region.points, region.u, region.f)
+            for part in beyond(region.points, region.u, region.f, gamma)
         ]
         self._near: list[tuple[FloatArray, FloatArray]] = []
         self._near_log_weights = np.empty(0)
@@ -99,6 +102,17 @@ class Refinement:
         proposal = Proposal(candidates, with_floors(weights / weights.sum(), floors))
         gate = self._gate() if last and not self._noisy and self._dim <= HIGH_DIM else None
         return proposal if gate is None else proposal.behind(gate, self._rng)
+
+    def typical_weights(self, proposal: Proposal) -> FloatArray:
+        """Return what the exploration's points in each region would weigh on average as draws of a proposal, (m,).
+
+        Without the heaviest of three chains or more: one may have strayed to where hardly any failure is.
+        """
+        typical = []
+        for region in self._regions:
+            chains = np.sort(np.exp(proposal.log_weights(region.points)).reshape(region.chains.shape[:2]).mean(axis=1))
+            typical.append(float(chains[:-1].mean() if len(chains) > 2 else chains.mean()))
+        return np.array(typical)
 
     def _gate(self) -> Gate | None:
         """Return a gate that has learned from the chains and the draws of all rounds."""
@@ -169,7 +183,7 @@ class Refinement:
         for k, region in enumerate(self._regions):
             own = owner == k
             points = np.concatenate([region.points, u[own & fails]])
-            parts = beyond(points, np.concatenate([region.u, u[own]]), np.concatenate([region.f, f[own]]))
+            parts = beyond(points, np.concatenate([region.u, u[own]]), np.concatenate([region.f, f[own]]), self._gamma)
             planes += [Candidate(part, "plane", k) for part in parts]
         return planes
 
@@ -193,7 +207,9 @@ class Refinement:
         base = BASE_NOISY if self._noisy else BASE_FLOOR
         floors = [Floor(kinds == "tempered", tempered)]
         n = len(self._regions)
-        if 1 < n < MOST_REGIONS:  # as many as that are pieces of something like a shell
+        if self._scattered:
+            floors.append(Floor(kinds == "shell", SHELL_FLOOR))
+        elif n > 1:
             floors += [Floor((regions == k) & (kinds != "tempered"), for_regions / n) for k in range(n)]
         return [*floors, Floor(kinds == "base", base)]
 
@@ -229,7 +245,7 @@ def slices_of(bump: Bump, u: FloatArray, weights: FloatArray) -> list[Slice]:
     if norm < 1e-6:
         return []
     axis = centre / norm
-    start = quantile(u @ axis, weights, 0.02) - 0.02
+    start = edge(u @ axis, weights, float(weights.sum()) ** 2 / float((weights**2).sum()), 0.02) - 0.02
     if start < 0.5:
         return []
     parts = [Slice(axis, start)]
@@ -251,10 +267,3 @@ def shell_around(u: FloatArray, weights: FloatArray) -> Shell:
     mean = float(np.average(s, weights=w))
     variance = max(float(np.average((s - mean) ** 2, weights=w)), 1e-6)
     return Shell(u.shape[1], start, max(mean * mean / variance, 0.3), max(variance / mean, 1e-3))
-
-
-def quantile(x: FloatArray, weights: FloatArray, share: float) -> float:
-    """Return the smallest x (n,) up to which at least this share of the weights (n,) lies."""
-    order = np.argsort(x)
-    total = np.cumsum(weights[order])
-    return float(x[order][min(int(np.searchsorted(total, share * total[-1])), len(x) - 1)])

@@ -17,7 +17,10 @@ from samplers.problem import FloatArray
 from samplers.simulator import Simulator
 
 CHAIN_ACCEPTANCE = 0.35
-MOST_REGIONS = 8
+MANY_REGIONS = 8
+MOST_REGIONS = 16
+SCATTERED = 0.25
+"""Where this share of the points is in none of MANY_REGIONS regions, failure is something like a shell."""
 MOST_CLONES = 60
 PROBES = 30
 NUDGE = 1e-6
@@ -74,6 +77,8 @@ class Found(NamedTuple):
     regions: list[Region]
     noisy: bool
     """Whether f has noise of its own: then regions cannot be told apart, and all of it is one."""
+    scattered: bool = False
+    """Whether they are no more than pieces of something like a shell."""
 
 
 def grown(
@@ -88,7 +93,7 @@ def grown(
         region = Region(last.states[:, 1:], last.proposals.reshape(-1, dim), last.f.ravel())
         return Found([region], noisy=True)
     after = len(starts) * (steps[1] + 1)  # the second walk, and one look at where it ended
-    labels = yield from _same_region(simulator, walk.states[:, -1], gamma, limit - after, rng)
+    labels, _ = yield from _same_region(simulator, walk.states[:, -1], gamma, limit - after)
     room = max(limit - simulator.n_sim - after, 0) // (steps[1] + 1)
     more = _clones(labels, min(max(8, math.ceil(2.5 * dim / steps[1])), 24), room, rng)
     walk, labels = walk.of(more), labels[more]
@@ -96,7 +101,7 @@ def grown(
     directions = np.array([_direction(walk.of(labels == k), alone) for k in range(labels.max() + 1)])
     start, sigma = walk.states[:, -1], walk.sigma
     last = yield from _walk(simulator, start, sigma, directions[labels], steps[1], gamma, rng)
-    labels = yield from _same_region(simulator, last.states[:, -1], gamma, limit, rng)
+    labels, scattered = yield from _same_region(simulator, last.states[:, -1], gamma, limit)
     late = 2 if dim <= HIGH_DIM else 4  # early proposals to wide failures are far from where failures are likely
     proposals = np.concatenate([walk.proposals[:, -late:], last.proposals], axis=1)
     f = np.concatenate([walk.f[:, -late:], last.f], axis=1)
@@ -104,7 +109,8 @@ def grown(
     for k in range(labels.max() + 1):
         own = labels == k
         regions.append(Region(last.states[own, 1:], proposals[own].reshape(-1, dim), f[own].ravel()))
-    return Found([_with_descent(regions[0], descent)] if len(regions) == 1 else regions, noisy=False)
+    regions = [_with_descent(regions[0], descent)] if len(regions) == 1 else regions
+    return Found(regions, noisy=False, scattered=scattered)
 
 
 def _walk(
@@ -154,18 +160,25 @@ def _is_noisy(
 
 
 def _same_region(
-    simulator: Simulator, u: FloatArray, gamma: float, limit: int, rng: np.random.Generator
-) -> Generator[FloatArray, FloatArray, NDArray[np.int64]]:
+    simulator: Simulator, u: FloatArray, gamma: float, limit: int
+) -> Generator[FloatArray, FloatArray, tuple[NDArray[np.int64], bool]]:
     """Sort failing points (n, d) into regions, numbered from 0: those half way to whose first point fails.
 
-    Points left over after MOST_REGIONS regions or at the limit of simulations go to the region with the nearest mean.
+    The first point of a region is the one nearest to the origin: far ones may lie in two regions, or reach into
+    another one by half. Points left over after the last region, or at the limit of simulations, go to the region with
+    the nearest mean.
+
+    Returns:
+        The regions' numbers (n,), and whether so many points are left over that failure is something like a shell.
     """
     labels = np.full(len(u), -1)
+    scattered = False
     for k in range(MOST_REGIONS):
         free = np.flatnonzero(labels < 0)
-        if len(free) == 0:
+        scattered = k >= MANY_REGIONS and len(free) > SCATTERED * len(u)
+        if len(free) == 0 or scattered:
             break
-        first = rng.choice(free)
+        first = free[np.argmin((u[free] ** 2).sum(axis=1))]
         labels[first] = k
         others = free[free != first]
         if simulator.n_sim + len(others) > limit:
@@ -176,7 +189,7 @@ def _same_region(
     if len(free):
         means = np.array([u[labels == k].mean(axis=0) for k in range(labels.max() + 1)])
         labels[free] = np.argmax(u[free] @ means.T - 0.5 * (means**2).sum(axis=1), axis=1)
-    return labels
+    return labels, scattered
 
 
 def _clones(labels: NDArray[np.int64], least: int, room: int, rng: np.random.Generator) -> NDArray[np.int64]:

@@ -28,14 +28,16 @@ class Strata:
     """Sums of their squares, shape (k,)."""
     mass_cov: float
     """What else is not exact: see `Proposal.mass_cov`."""
+    typical: FloatArray
+    """Weights to be expected, whether or not a draw has shown them: one for each region found, shape (m,)."""
     u_safe: FloatArray
     """The draws that did not fail, in the order of `draws.f_safe`, shape (m, d)."""
 
     @classmethod
-    def none(cls, k: int, dim: int) -> "Strata":
+    def none(cls, k: int, dim: int, typical: FloatArray) -> "Strata":
         """No draws yet from a proposal of k components in d dimensions."""
         zero = np.zeros(k)
-        return cls(Draws(0, np.empty(0), np.empty(0)), zero, zero, zero, 0.0, np.empty((0, dim)))
+        return cls(Draws(0, np.empty(0), np.empty(0)), zero, zero, zero, 0.0, typical, np.empty((0, dim)))
 
     def joined(self, batch: Batch, proposal: Proposal, inputs: Inputs, gamma: float) -> "Strata":
         """Return these draws and another batch from the same proposal."""
@@ -50,6 +52,7 @@ class Strata:
             self.sums + np.bincount(owner, weights=y, minlength=k),
             self.squares + np.bincount(owner, weights=y * y, minlength=k),
             proposal.mass_cov,
+            self.typical,
             np.concatenate([self.u_safe, batch.u[~fails]]),
         )
 
@@ -63,14 +66,14 @@ class Strata:
         """Coefficient of variation of `p`; inf without a failing draw.
 
         The variance within the components: how many draws come from which is no matter of chance. The square of
-        the largest term is added, for what draws as heavy as that have not shown yet.
+        the largest term, seen or typical of a region, is added, for what draws as heavy as that have not shown yet.
         """
         if len(self.draws.f) == 0:
             return math.inf
         many = self.counts >= FEWEST
         n, s1, s2 = self.counts[many], self.sums[many], self.squares[many]
         within = float(((s2 - s1 * s1 / n) * n / (n - 1)).sum()) + float(self.squares[~many].sum())
-        largest = math.exp(float(self.draws.log_weights.max()))
+        largest = max(math.exp(float(self.draws.log_weights.max())), float(self.typical.max(initial=0.0)))
         return math.hypot(math.sqrt(max(within, 0.0) + largest * largest) / (self.draws.n * self.p), self.mass_cov)
 
     def sample(self, proposal: Proposal, base_f: FloatArray, base_u: FloatArray, gamma: float) -> Sample:

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from samplers.checks import check_count
-from samplers.cross_checks import against_base_draws, against_rounds, regions_lost
+from samplers.cross_checks import against_base_draws, against_rounds, regions_left_out
 from samplers.exploration import Sizes, first_draws, regions_of
 from samplers.history import History
 from samplers.importance import Draws, doubts, interval_of
@@ -64,7 +64,7 @@ class TwoStage(Method):
 
     *Interval.* Log-normal; it widens by t quantiles where few draws carry the weight and by Bernstein's bound where
     very few do. *Warnings* (`cross_checks.py`) tell of uneven weights, of base draws that fail more often than p
-    allows, of rounds that disagree, and of regions that the last draws do not meet again. What nothing tells of is a
+    allows, of rounds that disagree, and of regions that the last draws hardly reach. What nothing tells of is a
     region that neither f announces nor any draw has hit; `Estimate.unseen` bounds its probability.
 
     Where a tenth of the base draws fails, or nothing is found at all, the rest is plain Monte Carlo.
@@ -125,6 +125,7 @@ class _Run:
         self._base_f = np.empty(0)
         self._set_aside = self._base_u, self._base_f
         self._n_base = 0
+        self._rounds: list[Draws] = []
         self._trace: list[Level] = []
 
     @property
@@ -159,6 +160,7 @@ class _Run:
             if int(share * room) == 0:
                 continue
             batch = yield from self._drawn(proposal, int(share * room))
+            self._rounds.append(Draws.weighted(batch.f, proposal.log_weights(batch.u), batch.u, self._goal.gamma))
             refinement.learn(proposal, batch, afresh=number > len(ROUNDS) - AFRESH)
             log_w = self._history.log_weights
             ess = effective_sample_size(log_w)
@@ -168,7 +170,7 @@ class _Run:
     def estimated(self, refinement: Refinement, proposal: Proposal) -> Steps:
         """Draw from the last mixture until the budget is used or the target is met."""
         goal, inputs, stopped = self._goal, self._simulator.inputs, False
-        strata = Strata.none(len(proposal.weights), inputs.dim)
+        strata = Strata.none(len(proposal.weights), inputs.dim, refinement.typical_weights(proposal))
         size = self._left if goal.target_cov is None else max(self._budget // 10, 100)
         while self._simulator.n_sim < self._end:
             try:
@@ -187,8 +189,8 @@ class _Run:
         base_hits = int((self._base_f <= goal.gamma).sum())
         checks = (
             *against_base_draws(strata.p, base_hits, len(self._base_f)),
-            *against_rounds(strata, self._history.log_weights),
-            *regions_lost(strata, proposal),
+            *against_rounds(strata, self._rounds),
+            *regions_left_out(strata),
         )
         sample = strata.sample(proposal, self._base_f, self._base_u, goal.gamma)
         status = Status.STOPPED if stopped else outcome.status

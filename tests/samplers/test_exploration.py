@@ -7,7 +7,7 @@ from scipy import stats
 from samplers.exploration import BISECTIONS, Sizes, _descend, _drawn_in, _some, first_draws, regions_of
 from samplers.problem import FunctionProblem
 from samplers.reference import four_branches, plateau, shell
-from samplers.regions import MOST_CLONES, MOST_REGIONS, _clones, _same_region, _walk
+from samplers.regions import MANY_REGIONS, MOST_CLONES, MOST_REGIONS, _clones, _same_region, _walk
 from samplers.simulator import Simulator
 
 
@@ -211,17 +211,32 @@ def test_points_are_drawn_in_along_their_rays_and_still_fail(rng):
 def test_regions_are_told_apart_by_the_point_half_way(rng):
     problem = half_spaces(4, 2.5, 2.5, 2.5)
     u = np.concatenate([rng.normal(0, 0.1, (20, 4)) + 3.0 * np.eye(4)[k] for k in range(3)])
-    labels = driven(_same_region(Simulator(problem), u, 0.0, 10**6, rng), problem)
+    labels, scattered = driven(_same_region(Simulator(problem), u, 0.0, 10**6), problem)
+    assert not scattered
     assert labels.shape == (60,)
     assert all(len(set(labels[20 * k : 20 * (k + 1)])) == 1 for k in range(3))
     assert set(labels) == {0, 1, 2}
 
 
-def test_more_regions_than_allowed_are_joined(rng):
-    problem = FunctionProblem(lambda u: 3.0 - np.abs(u).max(axis=1), 10)
-    u = np.concatenate([s * 3.3 * np.eye(10) for s in (1, -1)])
-    labels = driven(_same_region(Simulator(problem), np.repeat(u, 3, axis=0), 0.0, 10**6, rng), problem)
-    assert set(labels) == set(range(MOST_REGIONS))
+def test_a_far_point_and_one_in_two_regions_join_no_regions(rng):
+    """Half way from (8, 0) to (0, 3) lies within the first region; (4, 4) is in both."""
+    problem = half_spaces(2, 3.0, 3.0)
+    u = np.array([[8.0, 0.0], [4.0, 4.0], [3.1, 0.0], [0.0, 3.2], [3.3, 0.5], [-0.5, 3.1]])
+    for order in [rng.permutation(6) for _ in range(20)]:
+        labels, _ = driven(_same_region(Simulator(problem), u[order], 0.0, 10**6), problem)
+        found = labels[np.argsort(order)]
+        assert found[2] == found[4] != found[3] == found[5]
+
+
+@pytest.mark.parametrize("dim", [6, 10])
+def test_more_regions_than_a_shell_would_need_are_pieces_of_it(dim):
+    """The faces of a cube: 12 regions leave few points unsorted after the first eight, 20 leave most of them."""
+    problem = FunctionProblem(lambda u: 3.0 - np.abs(u).max(axis=1), dim)
+    u = np.concatenate([s * 3.3 * np.eye(dim) for s in (1, -1)])
+    per_face = np.repeat([6, 1], [8, 4]) if dim == 6 else np.full(20, 3)
+    labels, scattered = driven(_same_region(Simulator(problem), np.repeat(u, per_face, axis=0), 0.0, 10**6), problem)
+    assert scattered == (dim == 10)
+    assert set(labels) == set(range(12 if dim == 6 else MANY_REGIONS))
 
 
 def test_starts_are_half_the_least_wide_and_half_at_random(rng):

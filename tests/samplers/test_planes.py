@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from samplers.components import Bump, Slice
-from samplers.planes import LEAST_R2, beyond, falling
+from samplers.planes import LEAST_R2, beyond, edge, falling, plane_of
 
 
 def unit(dim, seed=0):
@@ -181,3 +181,53 @@ def test_no_proposals_from_few_failures_or_a_plane_at_the_origin(rng):
     assert beyond(u[f < 0][:7], u, f) == []
     centred = around(axis, 300, rng, mean=0.0)
     assert beyond(centred, centred, -(centred @ axis)) == []
+
+
+def beyond_plane(axis, beta, n, rng):
+    """Draws from N(0, I) beyond a plane."""
+    xi = rng.standard_normal((n, len(axis)))
+    return xi + (stats.truncnorm(beta, np.inf).rvs(n, random_state=rng) - xi @ axis)[:, None] * axis
+
+
+@pytest.mark.parametrize("dim", [8, 100])
+def test_points_of_another_region_among_the_failures_change_nothing(dim):
+    """A tenth of the failures, and the points around them, lie beyond another plane."""
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        axis, other = np.eye(dim)[0], np.eye(dim)[1]
+        points = np.concatenate([beyond_plane(axis, 3.0, 180, rng), beyond_plane(other, 3.2, 20, rng)])
+        u = np.concatenate([around(axis, 270, rng), around(other, 30, rng)])
+        f = np.minimum(3.0 - u @ axis, 5.0 * (3.2 - u @ other))
+        _, cut = beyond(points, u, f)
+        assert angle(cut.axis, axis) < (0.02 if dim == 8 else 0.06)
+        assert 2.98 - (0.03 if dim == 8 else 0.2) < cut.start < 2.99  # it was not found at all
+
+
+def test_a_region_whose_surroundings_fall_towards_another_one(rng):
+    """Outside the region f is that of a plane that falls more slowly: the failing points know better."""
+    axis, other = np.eye(6)[0], np.eye(6)[1]
+    u = around(axis, 80, rng, mean=3.2)
+    f = np.minimum(2.0 * (3.0 - u @ axis), 0.3 * (3.0 - u @ other))
+    _, cut = beyond(beyond_plane(axis, 3.0, 40, rng), u, f)
+    assert angle(cut.axis, axis) < 0.01
+    assert cut.start == pytest.approx(2.98, abs=0.02)
+
+
+@pytest.mark.parametrize("n", [150, 300])
+def test_hardly_any_failure_lies_before_the_start_of_a_plane_that_is_turned(n):
+    """In many dimensions its direction is uncertain, and the start is put back by as much."""
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        axis = unit(100)
+        u = around(axis, n, rng, mean=3.2)
+        plane = plane_of(u, 3.0 - u @ axis + 0.05 * rng.standard_normal(n))
+        before = beyond_plane(axis, 3.0, 10_000, rng) @ plane.axis < plane.crossing(0.0)
+        assert before.mean() < 0.03
+
+
+@pytest.mark.parametrize("n", [10, 40, 400])
+def test_the_edge_of_a_few_points_is_not_beyond_the_true_one(n, rng):
+    """Exponential excess over 3: the least of n is 1 / n beyond."""
+    found = [edge(3.0 + rng.exponential(size=n), np.ones(n), n, 0.02) for _ in range(200)]
+    assert np.mean(np.array(found) > 3.0 + 0.05) < 0.15
+    assert np.mean(found) > 3.0 - 3.0 / n

@@ -52,7 +52,7 @@ def batch(counts, rng, proposal=PROPOSAL):
 
 
 def strata(*batches, proposal=PROPOSAL):
-    found = Strata.none(len(proposal.weights), 1)
+    found = Strata.none(len(proposal.weights), 1, np.empty(0))
     for part in batches:
         found = found.joined(part, proposal, PROBLEM, 0.0)
     return found
@@ -121,7 +121,7 @@ def test_without_a_failing_draw_nothing_is_known_of_the_spread(rng):
     found = strata(batch([5, 0, 50, 0], np.random.default_rng(0)))
     assert found.p == 0
     assert found.cov == math.inf
-    assert Strata.none(4, 1).cov == math.inf
+    assert Strata.none(4, 1, np.empty(0)).cov == math.inf
 
 
 def test_weights_of_base_draws_are_bounded(rng):
