@@ -130,6 +130,8 @@ def find_drivers(drivers: Any) -> Background | None:
     if name not in known and not (is_file and "file" in known):
         names = sorted(set(known) - {"file"})
         listed = ", ".join(map(repr, names)) or "none is installed: pip install rare-envs"
-        raise ValueError(f"Unknown drivers {name!r}{did_you_mean(name, names)}; expected one of {listed}, or a file.")
+        raise ValueError(
+            f"Unknown drivers {name!r}{did_you_mean(name, names)}; expected one of {listed}, or a .safetensors file."
+        )
     found: Background = known["file" if is_file else name].load()(name)
     return found

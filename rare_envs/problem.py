@@ -9,6 +9,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rare_envs.actions import DISCRETE_ACTIONS
+from rare_envs.background import Background
 from rare_envs.drivers import IDM, Driver, PolicyDriver
 from rare_envs.observation import observation_space
 from rare_envs.rollout import rollout
@@ -128,6 +129,8 @@ def as_driver(ego: Any, world: World) -> Driver:
         statistics = getattr(ego, "get_vec_normalize_env", lambda: None)()
         normalise = statistics.normalize_obs if statistics is not None and statistics.norm_obs else None
         return PolicyDriver(ego, normalise, world.observation)
+    if isinstance(ego, Background):
+        raise ValueError("These drivers drive the traffic around an ego; as an ego take agents.LearnedEgo(driver).")
     if callable(getattr(ego, "act", None)):
         driver: Driver = ego
         return driver

@@ -197,3 +197,7 @@ def _print_json(value: dict[str, Any]) -> None:
 def main() -> None:
     """Run the command line; alone, it shows its help."""
     app(sys.argv[1:] or ["--help"], prog_name="rare-envs")
+
+
+if __name__ == "__main__":
+    main()

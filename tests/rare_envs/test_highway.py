@@ -177,6 +177,12 @@ def test_a_learned_ego_looks():
     assert np.isfinite(problem.evaluate(draw(problem, 16))).all()
 
 
+@pytest.mark.parametrize("name", ["mgail", "idm"])
+def test_drivers_are_no_egos(name):
+    with pytest.raises(ValueError, match=r"agents\.LearnedEgo"):
+        rare_envs.DrivingProblem(HIGHWAY, ego=agents.load_driver(name))
+
+
 def test_lidar_observation():
     env = gym.make("rare_envs/CarFollowing-v0", observation="lidar")
     observation, _ = env.reset(options={"x": [20.0, 15.0, 30.0]})

@@ -10,6 +10,7 @@ import torch
 from agents import load_driver, read_provenance
 from agents.networks import head_weights
 from agents.noise import WHITE
+from tests.training.recordings import simulate, write_ngsim
 from tests.training.synthetic_scenes import scenes
 from training.imitation import train as command_line
 from training.imitation.config import Config
@@ -245,3 +246,13 @@ def test_the_shared_command_line_trains_drivers(made_up, tmp_path, capsys):
 def test_the_shared_command_line_refuses_in_one_line(words, tmp_path, capsys):
     assert rare_envs_command(["train-drivers", *words, "--out", str(tmp_path / "run")]) == 2
     assert len(capsys.readouterr().err.strip().splitlines()) == 1
+
+
+def test_a_training_that_could_not_begin_does_not_block_its_folder(tmp_path):
+    """A typo in the path of the data, and the same folder again with the right one."""
+    out = tmp_path / "run"
+    with pytest.raises(ValueError, match="Cannot read"):
+        train_driver(Source("ngsim", tmp_path / "nope.csv"), Config(method="bc", epochs=1), out)
+    write_ngsim(tmp_path / "mine.csv", simulate(seed=1))
+    source = Source("ngsim", tmp_path / "mine.csv")
+    assert train_driver(source, Config(method="bc", epochs=1), out, measured=False).exists()

@@ -17,7 +17,7 @@ from agents.networks import Policy
 from agents.noise import WHITE, Colour
 from training.imitation.acting import HIGH, LOW
 from training.imitation.config import HUMAN, Config
-from training.imitation.fitting import fit, learner_of, prepare
+from training.imitation.fitting import CHECKPOINT, fit, learner_of, prepare
 from training.imitation.realism import metrics
 from training.imitation.sources import Source, load
 
@@ -89,10 +89,14 @@ def _option(name: str, value: Any) -> list[str]:
 
 def _note_settings(source: Source, config: Config, out: Path) -> None:
     """Write source and settings into a folder, or check that they are those of the training in it."""
-    out.mkdir(parents=True, exist_ok=True)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"Cannot make the folder {str(out)!r}: {error}.") from None
     text = json.dumps({"source": {**asdict(source), "path": str(source.path)}, "config": asdict(config)}, indent=1)
     noted = out / SETTINGS
-    if not noted.exists():
+    begun = any((out / name).exists() for name in (CHECKPOINT, DRIVER))
+    if not noted.exists() or not begun:
         noted.write_text(text + "\n", encoding="utf-8")
     elif json.loads(noted.read_text(encoding="utf-8")) != json.loads(text):
         raise ValueError(f"{str(out)!r} holds a training with other settings; choose another folder or remove it.")
