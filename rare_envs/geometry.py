@@ -95,6 +95,32 @@ def ego_overlaps(state: State, road: Road, placed: Placed | None = None) -> Tens
     return near
 
 
+def overlaps(state: State, road: Road, placed: Placed | None = None) -> Tensor:
+    """Which vehicles' bodies overlap which.
+
+    Args:
+        state: Traffic of B scenarios.
+        road: Their road.
+        placed: Where they are in the world, if that is known already.
+
+    Returns:
+        Boolean, shape (B, N, N), symmetric, nobody with itself; row 0 is `ego_overlaps`.
+    """
+    x, y, heading = road.to_world(state.x, state.y, state.heading) if placed is None else placed[:3]
+    n = x.shape[1]
+    i, j = torch.triu_indices(n, n, 1, device=x.device)
+    dx, dy = x[:, j] - x[:, i], y[:, j] - y[:, i]
+    near = (dx.abs() < _DIAGONAL) & (dy.abs() < _DIAGONAL)
+    both = torch.zeros(len(x), n, n, dtype=torch.bool, device=x.device)
+    row, pair = near.nonzero(as_tuple=True)
+    if len(row):
+        i, j = i[pair], j[pair]
+        hit = boxes_overlap(dx[row, pair], dy[row, pair], heading[row, i], heading[row, j])
+        both[row, i, j] = hit
+        both[row, j, i] = hit
+    return both
+
+
 def collision_type(state: State, road: Road, row: int = 0) -> str:
     """What the ego of one scenario, in which there was a collision, has run into.
 

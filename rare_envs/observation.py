@@ -57,13 +57,22 @@ def observation_space(vehicles: int, observation: str = "features") -> "spaces.B
     return spaces.Box(-CLIP, CLIP, (len(LIDAR_SCALES) if observation == "lidar" else size,), np.float32)
 
 
-def observe(episode: "Episode", observation: str) -> Tensor:
-    """What the egos of B episodes observe, shape (B, F), float32, within +-`CLIP`."""
+def observe(episode: "Episode", observation: str, vehicle: int = 0) -> Tensor:
+    """What one vehicle observes in each of B episodes: the ego, or another one as if it were the ego.
+
+    Args:
+        episode: B episodes.
+        observation: "features" or "lidar".
+        vehicle: Index of the vehicle that looks.
+
+    Returns:
+        Shape (B, F), float32, within +-`CLIP`.
+    """
     if observation == "lidar":
         assert episode.perception is not None
         scales = episode.perception.new_tensor(LIDAR_SCALES)
-        return (episode.perception[:, 0] / scales).clamp(-CLIP, CLIP).float()
-    return features(episode.state)
+        return (episode.perception[:, vehicle] / scales).clamp(-CLIP, CLIP).float()
+    return features(episode.state.seen_by(vehicle))
 
 
 def features(state: State) -> Tensor:

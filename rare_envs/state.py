@@ -29,3 +29,14 @@ class State(NamedTuple):
     """Speeds along the headings [m/s], never negative, shape (B, N)."""
     theta: Tensor
     """What the scenario fixes for the whole episode, shape (B, P); the scenario says what the P columns are."""
+
+    def seen_by(self, vehicle: int) -> "State":
+        """The same traffic with another vehicle in the ego's place; the others follow in their order.
+
+        Args:
+            vehicle: Index of the vehicle that becomes number 0.
+        """
+        if vehicle == 0:
+            return self
+        order = [vehicle, *(j for j in range(self.x.shape[1]) if j != vehicle)]
+        return State(*(field[:, order] for field in self[:4]), theta=self.theta)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from rare_envs.background import Background, Minds, begin, decide, fixed_draws, noise_size
+from rare_envs.commands import led
 from rare_envs.dynamics import bicycle
 from rare_envs.geometry import Lead, ego_overlaps, lead_of
 from rare_envs.lidar import Bodies
@@ -37,6 +38,9 @@ class Episode(NamedTuple):
     world in which nobody looks."""
     minds: Minds | None = None
     """What goes on in the drivers around the ego, if they are not the scenario's script."""
+    strayed: Tensor | None = None
+    """Which vehicles have been commanded, so that a script no longer knows them, boolean, shape (B, N); None before
+    anyone but the ego has been."""
 
 
 def look(state: State, road: Road, placed: Placed | None = None) -> Tensor:
@@ -163,28 +167,40 @@ class World:
         """Where the vehicles are in the flat world, if they look."""
         return self.scenario.road.place(state.x, state.y, state.heading) if self.sees else None
 
-    def step(self, episode: Episode, action: Tensor) -> Episode:
+    def step(self, episode: Episode, action: Tensor, commanded: Tensor | None = None) -> Episode:
         """Move every vehicle by one tick: all decide on the old state, then all move.
 
         A collision (a vehicle's body overlaps the ego's, or the ego's centre leaves the road, which is walled) is
         remembered; whoever steps on after it gets motion without meaning, but an unchanged f.
 
+        A vehicle that is commanded moves as the ego does, by the bicycle model. One that has been and no longer is goes
+        on from where it is: with the world's drivers, or by IDM and lane keeping where there was a script, which
+        knows its path only.
+
         Args:
             episode: B episodes.
-            action: Acceleration [m/s^2] and steering angle [rad] of the ego, shape (B, 2).
+            action: Acceleration [m/s^2] and steering angle [rad] of the ego, shape (B, 2); with `commanded` of all
+                vehicles, shape (B, N, 2).
+            commanded: Which vehicles obey their action, boolean, shape (B, N); the ego always does. None if the
+                others keep their drivers.
 
         Returns:
             The episodes one tick later.
         """
         old, dt, road, minds = episode.state, self.dt, episode.road, episode.minds
+        steered = action if commanded is None else action[:, 0]
         ego = (old.x[:, 0], old.y[:, 0], old.heading[:, 0], old.speed[:, 0])
         curvature = None if road.curve is None else road.curvature(old.x[:, 0])
-        moved = bicycle(*ego, action[:, 0], action[:, 1], dt, curvature)
+        moved = bicycle(*ego, steered[:, 0], steered[:, 1], dt, curvature)
+        decided = None
         if self.drivers is None or minds is None or episode.perception is None:
             others = self.scenario.others(old, dt)
         else:
             decided, minds = decide(self.drivers, minds, episode.perception[:, 1:])
             others = self.scenario.driven(old, decided, dt)
+        strayed = episode.strayed
+        if commanded is not None or strayed is not None:
+            others, strayed = led(episode, action, commanded, others, decided, dt)
         x, y, heading, speed = (torch.cat((first[None], rest.T)).T for first, rest in zip(moved, others, strict=True))
         state = State(x, y, heading, speed, old.theta)
         placed = self._placed(state)
@@ -194,4 +210,4 @@ class World:
         least = torch.minimum(episode.f, self._measure.of(moment))
         worth = episode.f if self._measure.collision is None else self._measure.collision
         f = torch.where(collided, worth, least)
-        return Episode(state, moment.lead, f, collided, road, moment.perception, minds)
+        return Episode(state, moment.lead, f, collided, road, moment.perception, minds, strayed)

@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rare_envs.actions import action_space, to_physical
-from rare_envs.background import Minds
 from rare_envs.envs.rendering import Renderer
-from rare_envs.geometry import Lead, collision_type
+from rare_envs.geometry import collision_type
 from rare_envs.observation import observation_space, observe
 from rare_envs.reward import RewardTerms, reward_terms
 from rare_envs.setup import set_up
@@ -178,26 +177,19 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArr
 
 def _merge(old: Episode, rows: Tensor, new: Episode) -> Episode:
     """Episodes with some rows replaced."""
+    merged: Episode = _put_rows(old, rows, new)
+    return merged
 
-    def put(into: Tensor, values: Tensor) -> Tensor:
-        into = into.clone()
-        into[rows] = values
-        return into
 
-    seen, minds = old.perception, old.minds
-    if seen is not None and new.perception is not None:
-        seen = put(seen, new.perception)
-    if minds is not None and new.minds is not None:
-        minds = Minds(*map(put, minds, new.minds))
-    return Episode(
-        State(*map(put, old.state, new.state)),
-        Lead(*map(put, old.lead, new.lead)),
-        put(old.f, new.f),
-        put(old.collided, new.collided),
-        old.road,
-        seen,
-        minds,
-    )
+def _put_rows(old: Any, rows: Tensor, new: Any) -> Any:
+    """Tensors, or tuples of such, with some rows replaced; what is neither, such as the road, is common to all."""
+    if isinstance(old, Tensor):
+        old = old.clone()
+        old[rows] = new
+        return old
+    if isinstance(old, tuple):
+        return type(old)(*(_put_rows(a, rows, b) for a, b in zip(old, new, strict=True)))
+    return old
 
 
 def _rows(values: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[Any]:

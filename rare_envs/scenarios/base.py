@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from rare_envs.dynamics import point_mass
 from rare_envs.road import Road
 from rare_envs.state import State
 
@@ -46,3 +47,18 @@ class Scenario:
 def columns(*values: Tensor) -> Tensor:
     """Columns (B,) side by side as (B, N), each contiguous in memory: ticks work on one vehicle's column at a time."""
     return torch.stack(values).T
+
+
+def roaming(state: State, action: Tensor, dt: float, road: Road) -> Others:
+    """Vehicles 1 to N - 1 as points that turn at will, wherever they are on the road.
+
+    Args:
+        state: Traffic of B scenarios.
+        action: Their accelerations [m/s^2] and yaw rates relative to the road [rad/s], shape (B, N - 1, 2).
+        dt: Tick [s].
+        road: The road.
+    """
+    x, y, heading, speed = (field[:, 1:] for field in (state.x, state.y, state.heading, state.speed))
+    curvature = road.curvature(x)
+    ahead = torch.cos(heading) * speed / (1.0 - curvature * y)
+    return Others(*point_mass(x, y, heading, speed, action[..., 0], action[..., 1] + curvature * ahead, dt, curvature))

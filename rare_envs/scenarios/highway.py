@@ -12,9 +12,8 @@ import math
 import torch
 from torch import Tensor
 
-from rare_envs.dynamics import point_mass
 from rare_envs.road import i80
-from rare_envs.scenarios.base import Others, Scenario
+from rare_envs.scenarios.base import Others, Scenario, roaming
 from rare_envs.state import State
 
 VEHICLES = 6
@@ -31,11 +30,7 @@ def initial(x: Tensor) -> State:
 
 def driven(state: State, action: Tensor, dt: float) -> Others:
     """Points that turn at will. Yaw rates are relative to the road: the drivers have learned on a straight one."""
-    others = (field[:, 1:] for field in (state.x, state.y, state.heading, state.speed))
-    x, y, heading, speed = others
-    curvature = i80().curvature(x)
-    ahead = torch.cos(heading) * speed / (1.0 - curvature * y)
-    return Others(*point_mass(x, y, heading, speed, action[..., 0], action[..., 1] + curvature * ahead, dt, curvature))
+    return roaming(state, action, dt, i80())
 
 
 def others(state: State, dt: float) -> Others:
