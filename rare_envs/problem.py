@@ -43,7 +43,7 @@ class DrivingProblem:
         self,
         env_id: str,
         ego: Any = "idm",
-        measure: str = "ttc",
+        measure: Any = "ttc",
         base: Any = None,
         noise: bool | str = True,
         **make_kwargs: Any,
@@ -53,7 +53,7 @@ class DrivingProblem:
         Args:
             env_id: For example "rare_envs/CutIn-v0".
             ego: "idm", a `Driver`, or an object with Stable-Baselines3's `predict`, called on whole batches.
-            measure: Name of the safety measure.
+            measure: The safety measure: a name, an object or a function, see `rare_envs.measures.find_measure`.
             base: Base distribution of x; None takes the environment's default ("us101").
             noise: What becomes of the randomness of learned drivers: True, it is part of x, standard normal columns
                 behind the others; "fixed", one sequence for all x, so that p is conditional on it; False, mean

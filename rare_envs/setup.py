@@ -31,7 +31,7 @@ def set_up(
     *,
     observation: str = "features",
     action: str = "continuous",
-    measure: str = "ttc",
+    measure: Any = "ttc",
     horizon: float | None = None,
     dt: float = 0.1,
     base: Any = None,
@@ -44,7 +44,8 @@ def set_up(
         env_id: For example "rare_envs/CutIn-v0".
         observation: "features" or "lidar".
         action: "continuous".
-        measure: Name of the safety measure, "ttc" or "lidar_ttc".
+        measure: The safety measure: a name in `rare_envs.measures.MEASURES`, a `Measure` or another of its kind, or a
+            function; see `rare_envs.measures.find_measure`.
         horizon: Length of an episode [s]; None takes the scenario's.
         dt: Tick [s].
         base: Law of the scenario's own parameters: the name of a shipped one, the path of a JSON file, or a

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from functools import cached_property
 from numbers import Real
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,7 +13,7 @@ from rare_envs.commands import led
 from rare_envs.dynamics import bicycle
 from rare_envs.geometry import Lead, ego_overlaps, lead_of
 from rare_envs.lidar import Bodies
-from rare_envs.measures import MEASURES, Measure, Moment
+from rare_envs.measures import MEASURES, EpisodeMeasure, Moment, find_measure
 from rare_envs.perception import OnRoad, perceive
 from rare_envs.road import Placed, Road
 from rare_envs.scenarios import Scenario
@@ -26,9 +26,8 @@ class Episode(NamedTuple):
     state: State
     lead: Lead
     """The ego's lead in this state."""
-    f: Tensor
-    """The safety measure of the episode so far, shape (B,): the least of its moments', and what the measure gives to a
-    collision (-1) after one."""
+    kept: Any
+    """What the measure keeps of the episode so far; see `f`."""
     collided: Tensor
     """Whether the ego has collided by now, boolean, shape (B,)."""
     road: Road
@@ -41,6 +40,12 @@ class Episode(NamedTuple):
     strayed: Tensor | None = None
     """Which vehicles have been commanded, so that a script no longer knows them, boolean, shape (B, N); None before
     anyone but the ego has been."""
+    measure: EpisodeMeasure = MEASURES["ttc"]
+
+    @property
+    def f(self) -> Tensor:
+        """The safety measure of the episode so far, shape (B,); after a collision it stays what it is."""
+        return self.measure.f(self.kept)
 
 
 def look(state: State, road: Road, placed: Placed | None = None) -> Tensor:
@@ -64,7 +69,8 @@ class World:
     """Tick [s]."""
     horizon: float | None = None
     """Length of an episode [s]; None takes the scenario's."""
-    measure: str = "ttc"
+    measure: Any = "ttc"
+    """What `rare_envs.measures.find_measure` takes: a name, a `Measure`, a function of a `Moment`."""
     drivers: Background | None = None
     """Of the vehicles around the ego; None for the scenario's script."""
     noise: bool | str = True
@@ -82,8 +88,7 @@ class World:
         whole = _is_number(self.horizon) and self.dt <= self.seconds < 1e6
         if not whole or abs(self.seconds / self.dt - self.ticks) > 1e-6:
             raise ValueError(f"Expected a horizon of one or more whole ticks of {self.dt} s, got {self.horizon!r}.")
-        if not isinstance(self.measure, str) or self.measure not in MEASURES:
-            raise ValueError(f"Unknown measure {self.measure!r}; the measures are {', '.join(MEASURES)}.")
+        find_measure(self.measure)
         if not (isinstance(self.noise, bool) or self.noise == "fixed"):
             raise ValueError(f"Expected noise True, False or 'fixed', got {self.noise!r}.")
         if self.drivers is not None and self.dt != 0.1:
@@ -105,9 +110,9 @@ class World:
         needed = self.drivers is not None or self._measure.sees
         return self.lidar or needed or self.observation == "lidar"
 
-    @property
-    def _measure(self) -> Measure:
-        return MEASURES[self.measure]
+    @cached_property
+    def _measure(self) -> EpisodeMeasure:
+        return find_measure(self.measure)
 
     @property
     def weights(self) -> int:
@@ -149,8 +154,8 @@ class World:
             weights, noise = x[:, size : size + self.weights], x[:, size + self.weights :]
             minds = begin(self.drivers, weights.contiguous(), self._draws(noise))
         moment = self._moment(state, self._placed(state))
-        f = self._measure.of(moment)
-        return Episode(state, moment.lead, f, collided, moment.road, moment.perception, minds)
+        kept = self._measure.begin(moment, self.ticks)
+        return Episode(state, moment.lead, kept, collided, moment.road, moment.perception, minds, None, self._measure)
 
     def _draws(self, noise: Tensor) -> Tensor:
         """Draws of the drivers' noise as tensors, shape (B, 2 + T, M, 2), or (B, 0, M, 2)."""
@@ -159,9 +164,10 @@ class World:
             return self._fixed.to(noise).expand(batch, -1, -1, -1)
         return noise.reshape(batch, -1 if self._noisy else 0, *shape)
 
-    def _moment(self, state: State, placed: Placed | None) -> Moment:
+    def _moment(self, state: State, placed: Placed | None, before: State | None = None) -> Moment:
         road = self.scenario.road
-        return Moment(state, lead_of(state, road), road, look(state, road, placed) if self.sees else None)
+        seen = look(state, road, placed) if self.sees else None
+        return Moment(state, lead_of(state, road), road, seen, before, self.dt)
 
     def _placed(self, state: State) -> Placed | None:
         """Where the vehicles are in the flat world, if they look."""
@@ -204,10 +210,8 @@ class World:
         x, y, heading, speed = (torch.cat((first[None], rest.T)).T for first, rest in zip(moved, others, strict=True))
         state = State(x, y, heading, speed, old.theta)
         placed = self._placed(state)
-        moment = self._moment(state, placed)
+        moment = self._moment(state, placed, old)
         hit = ego_overlaps(state, road, placed).any(dim=1) | road.off_road(state.y[:, 0])
         collided = episode.collided | hit
-        least = torch.minimum(episode.f, self._measure.of(moment))
-        worth = episode.f if self._measure.collision is None else self._measure.collision
-        f = torch.where(collided, worth, least)
-        return Episode(state, moment.lead, f, collided, road, moment.perception, minds, strayed)
+        kept = self._measure.fold(episode.kept, moment, episode.collided, collided)
+        return Episode(state, moment.lead, kept, collided, road, moment.perception, minds, strayed, self._measure)

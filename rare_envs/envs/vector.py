@@ -182,14 +182,15 @@ def _merge(old: Episode, rows: Tensor, new: Episode) -> Episode:
 
 
 def _put_rows(old: Any, rows: Tensor, new: Any) -> Any:
-    """Tensors, or tuples of such, with some rows replaced; what is neither, such as the road, is common to all."""
+    """Tensors, tuples of such or what knows how (`put`), with some rows replaced; the rest, as the road, is common."""
     if isinstance(old, Tensor):
         old = old.clone()
         old[rows] = new
         return old
     if isinstance(old, tuple):
-        return type(old)(*(_put_rows(a, rows, b) for a, b in zip(old, new, strict=True)))
-    return old
+        parts = [_put_rows(a, rows, b) for a, b in zip(old, new, strict=True)]
+        return type(old)(*parts) if hasattr(old, "_fields") else tuple(parts)
+    return old.put(rows, new) if hasattr(old, "put") else old
 
 
 def _rows(values: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[Any]:

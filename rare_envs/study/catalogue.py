@@ -53,7 +53,7 @@ def catalogue() -> dict[str, Any]:
         "methods": {name: _first_line(method) for name, method in samplers.METHODS.items()},
         "egos": EGOS,
         "drivers": DRIVERS,
-        "measures": {name: _first_line(measure.of) for name, measure in MEASURES.items()},
+        "measures": {name: _first_line(getattr(measure, "of", measure)) for name, measure in MEASURES.items()},
     }
 
 

@@ -1,50 +1,18 @@
-"""Safety measures: how close a state is to a collision; small is dangerous, always finite."""
-
-from collections.abc import Callable
-from dataclasses import dataclass
-from types import MappingProxyType
-from typing import NamedTuple
+"""Time to collision of the ego with what is ahead of it: its lead, the edge of the road, what its lidar meets."""
 
 import torch
 from torch import Tensor
 
-from rare_envs.geometry import Lead
+from rare_envs.measures.moment import Moment
 from rare_envs.perception import RANGES, RATES
-from rare_envs.road import Road
-from rare_envs.state import State
 
 TTC_MAX = 10.0
 """Cap of the time to collision [s]; what is further away, or not closing, counts as this."""
-COLLISION = -1.0
-"""The value of every measure in a collision (Tian et al. 2024, equation 3)."""
 _GAP_MIN = 0.01
 """Gaps are floored here [m] so that only a collision, never a narrow escape, comes to 0 or less."""
 
 _STILL = 1e-4
 """Closing speeds are floored here [m/s], far below gap / TTC_MAX, so no value under the cap changes."""
-
-
-class Moment(NamedTuple):
-    """What a measure may look at."""
-
-    state: State
-    lead: Lead
-    """The ego's."""
-    road: Road
-    perception: Tensor | None
-    """What vehicles see, shape (B, M, 51), the ego first; None unless the measure needs it."""
-
-
-@dataclass(frozen=True)
-class Measure:
-    """How dangerous a moment is, and how an episode's measure comes from its moments': it is the least of them."""
-
-    of: Callable[[Moment], Tensor]
-    """A moment to shape (B,)."""
-    sees: bool = False
-    """Whether it needs what the ego sees."""
-    collision: float | None = COLLISION
-    """The measure of an episode with a collision; None if it is the least of the moments before it."""
 
 
 def ttc(moment: Moment) -> Tensor:
@@ -66,7 +34,7 @@ def ttc(moment: Moment) -> Tensor:
     References:
         Hayward, "Near-miss determination through use of a scale of danger", 1972.
     """
-    state, lead, road, _ = moment
+    state, lead, road = moment.state, moment.lead, moment.road
     to_lead = lead.gap.clamp(min=_GAP_MIN) / lead.closing_speed.clamp(min=_STILL)
     across = state.speed[:, 0] * torch.sin(state.heading[:, 0])
     offset = state.y[:, 0] - road.middle
@@ -98,8 +66,3 @@ def lidar_ttc(moment: Moment) -> Tensor:
     closing = -ego[:, RATES]
     time = torch.where(closing > 0.0, ego[:, RANGES] / closing.clamp(min=_STILL), TTC_MAX)
     return time.amin(dim=1).clamp(max=TTC_MAX)
-
-
-MEASURES: MappingProxyType[str, Measure] = MappingProxyType(
-    {"ttc": Measure(ttc), "lidar_ttc": Measure(lidar_ttc, sees=True, collision=None)}
-)
