@@ -1,8 +1,9 @@
 """Egos and drivers: the policies whose safety is estimated, and those that surround them."""
 
 from agents.checkpoints import Provenance, load_driver, read_driver, read_provenance, save_driver
-from agents.ego import Ego, SavedEgo, load_ego
+from agents.ego import Ego, load_ego
 from agents.learned import LearnedDriver, LearnedEgo
+from agents.saved import SavedEgo
 from agents.weights import WeightDistribution
 
 __all__ = [

@@ -13,7 +13,7 @@ import zipfile
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from rare_envs.space import did_you_mean
 
@@ -54,11 +54,12 @@ SETTINGS = (  # a setting that only this algorithm has; the first that is presen
 )
 
 
-def read_header(path: Path) -> dict[str, Any]:
+def read_header(file: Path | BinaryIO, name: str | None = None) -> dict[str, Any]:
     """Read the settings of a saved model, pickles left closed.
 
     Args:
-        path: A file that exists.
+        file: A file that exists, or its content.
+        name: What to call it in messages; the path when None.
 
     Returns:
         The entries of the member `data`, and "version" (of Stable-Baselines3).
@@ -66,20 +67,19 @@ def read_header(path: Path) -> dict[str, Any]:
     Raises:
         ValueError: The file is not a zip, is damaged, or is not a model of Stable-Baselines3.
     """
-    if not zipfile.is_zipfile(path):
-        raise ValueError(
-            f"{str(path)!r} is not a zip file (or is cut short); expected a model saved by Stable-Baselines3."
-        )
+    name = str(file) if name is None else name
+    if not zipfile.is_zipfile(file):
+        raise ValueError(f"{name!r} is not a zip file (or is cut short); expected a model saved by Stable-Baselines3.")
     try:
-        with zipfile.ZipFile(path) as archive:
+        with zipfile.ZipFile(file) as archive:
             members = set(archive.namelist())
             header = json.loads(archive.read("data")) if "data" in members else None
             version = _read_text(archive, members, "_stable_baselines3_version")
     except (zipfile.BadZipFile, zlib.error, ValueError, RuntimeError, OSError) as error:
-        raise ValueError(f"{str(path)!r} is damaged ({error}); save the model again.") from error
+        raise ValueError(f"{name!r} is damaged ({error}); save the model again.") from error
     if not isinstance(header, dict) or "policy.pth" not in members or "policy_class" not in header:
         raise ValueError(
-            f"{str(path)!r} is a zip file but not a Stable-Baselines3 model: it lacks its members "
+            f"{name!r} is a zip file but not a Stable-Baselines3 model: it lacks its members "
             "'data' and 'policy.pth'. Write it with model.save(path)."
         )
     return {**header, "version": version}
@@ -158,6 +158,8 @@ def weights_only_objects() -> dict[str, Any]:
         "clip_range": 0.0,
         "clip_range_vf": None,
         "exploration_schedule": None,
+        "delta_std_schedule": None,
+        "weights": None,
         "action_noise": None,
         "n_envs": 1,
         "n_steps": 1,

@@ -1,12 +1,10 @@
 """Drivers: what decides an acceleration and a steering angle. IDM, lane keeping and policies with `predict`."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from rare_envs.actions import to_physical
@@ -137,8 +135,6 @@ class PolicyDriver:
     """Any object with Stable-Baselines3's `predict`, called on the whole batch."""
 
     policy: Any
-    normalise: Callable[[NDArray[np.float32]], NDArray[np.float32]] | None = None
-    """What the policy's observations went through in training, such as SB3's `VecNormalize.normalize_obs`."""
     observation: str = "features"
     """What it observes."""
 
@@ -156,8 +152,6 @@ class PolicyDriver:
         start = np.full(batch, memory is None)
         hidden = None if memory is None else memory[0]
         observation = observe(episode, self.observation).masked_fill(over[:, None], 0.0).numpy(force=True)
-        if self.normalise is not None:
-            observation = self.normalise(observation)
         action, hidden = self.policy.predict(observation, state=hidden, episode_start=start, deterministic=True)
         physical = to_physical(torch.as_tensor(np.asarray(action)).to(state.x.device), batch, over)
         return physical.to(state.x), (hidden,)

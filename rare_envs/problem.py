@@ -12,6 +12,7 @@ from rare_envs.actions import DISCRETE_ACTIONS
 from rare_envs.background import Background
 from rare_envs.drivers import IDM, Driver, PolicyDriver
 from rare_envs.observation import observation_space
+from rare_envs.policies import fitted, stacking
 from rare_envs.rollout import rollout
 from rare_envs.setup import set_up
 from rare_envs.space import Distribution, ScenarioSpace
@@ -124,11 +125,9 @@ def as_driver(ego: Any, world: World) -> Driver:
     if isinstance(ego, type):
         raise ValueError(f"Expected an ego, got the class {ego.__name__}; make or train one of it first.")
     if callable(getattr(ego, "predict", None)):
-        check_spaces(ego, observation_space(world.scenario.vehicles, world.observation))
-        # a model trained behind SB3's VecNormalize wants its observations as they were then
-        statistics = getattr(ego, "get_vec_normalize_env", lambda: None)()
-        normalise = statistics.normalize_obs if statistics is not None and statistics.norm_obs else None
-        return PolicyDriver(ego, normalise, world.observation)
+        expected = observation_space(world.scenario.vehicles, world.observation)
+        check_spaces(ego, expected)
+        return PolicyDriver(fitted(ego, expected.shape), world.observation)
     if isinstance(ego, Background):
         raise ValueError("These drivers drive the traffic around an ego; as an ego take agents.LearnedEgo(driver).")
     if callable(getattr(ego, "act", None)):
@@ -144,7 +143,8 @@ def check_spaces(ego: Any, expected: "spaces.Box[np.float32]") -> None:
         ValueError: If its `observation_space` or `action_space` does not fit.
     """
     observed = getattr(ego, "observation_space", None)
-    if observed is not None and getattr(observed, "shape", None) != expected.shape:
+    shape = getattr(observed, "shape", None)
+    if observed is not None and (shape is None or stacking(expected.shape, shape) is None):
         raise ValueError(
             f"The ego expects observations {observed}, the environment gives {expected}; "
             "train it in this environment or choose another observation."

@@ -87,6 +87,7 @@ def estimate_command(
         str, typer.Option(help="idm, mgail, gail, bc, a driver's or a Stable-Baselines3 file, or module:function.")
     ] = "idm",
     algo: Annotated[str | None, typer.Option(help="Algorithm of the .zip, if the file does not tell.")] = None,
+    trust: Annotated[bool, typer.Option("--trust", help="Let the ego's .zip run code when it is loaded.")] = False,
     method: Annotated[str, typer.Option(help="Estimation method; see rare-envs list.")] = "two-stage",
     base: Annotated[str | None, typer.Option(help="Base distribution: a name or a JSON file.")] = None,
     measure: Annotated[str, typer.Option(help="Safety measure f; small is dangerous.")] = "ttc",
@@ -112,6 +113,7 @@ def estimate_command(
         env_id=env,
         ego=ego,
         algo=algo,
+        trust=trust,
         method=method,
         base=base,
         measure=measure,

@@ -28,6 +28,7 @@ class Question:
         ego: "idm", a learned driver ("mgail", "gail", "bc" or its file), a path to a Stable-Baselines3 `.zip`, or
             `module:function`.
         algo: Algorithm of a `.zip`; recognised from the file when None.
+        trust: Let the ego's `.zip` run code when it is loaded, as `agents.load_ego` explains.
         method: Name of a method in `samplers.METHODS`.
         base: Name of a base distribution or path to a JSON file; the scenario's default when None.
         measure: Safety measure f.
@@ -45,6 +46,7 @@ class Question:
     env_id: str
     ego: str = "idm"
     algo: str | None = None
+    trust: bool = False
     method: str = "two-stage"
     base: str | None = None
     measure: str = "ttc"
@@ -133,7 +135,7 @@ def prepare(question: Question) -> Study:
     try:
         method = samplers.get_method(question.method)
         find_scenario(question.env_id)  # before the ego, which takes seconds to load
-        ego = agents.load_ego(question.ego, algo=question.algo)
+        ego = agents.load_ego(question.ego, algo=question.algo, trust=question.trust)
         problem = rare_envs.DrivingProblem(
             question.env_id,
             ego=ego,

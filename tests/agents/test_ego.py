@@ -119,7 +119,9 @@ class OwnPolicy(stable_baselines3.sac.policies.SACPolicy):
 
 def test_a_policy_class_of_the_user_is_recognised_by_its_settings(tmp_path: Path) -> None:
     path = save(make_model("sac", policy=OwnPolicy, buffer_size=10), tmp_path / "ego.zip")
-    ego = load_ego(path)
+    with pytest.raises(ValueError, match=r"'policy_class' it asks for .*OwnPolicy, which may run code.*trust=True"):
+        load_ego(path)
+    ego = load_ego(path, trust=True)
     assert isinstance(ego, SavedEgo)
     assert ego.algorithm == "sac"
 

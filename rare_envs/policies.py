@@ -1,0 +1,94 @@
+"""What stands between an environment and a policy trained behind wrappers: normalised and stacked observations."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+Shape = tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Normalised:
+    """A policy whose observations first go through a function, such as SB3's `VecNormalize.normalize_obs`."""
+
+    policy: Any
+    normalise: Callable[[Array], Array]
+
+    def predict(
+        self, observation: Array, state: Any = None, episode_start: Array | None = None, deterministic: bool = True
+    ) -> tuple[Array, Any]:
+        """Stable-Baselines3's `predict` on observations as the environment gives them."""
+        action, state = self.policy.predict(self.normalise(observation), state, episode_start, deterministic)
+        return action, state
+
+
+@dataclass(frozen=True)
+class Stacked:
+    """A policy that sees the last k observations; they are kept in its state, oldest first.
+
+    With one axis as in SB3's `VecFrameStack` (side by side along the last axis, zeros before the first observation),
+    with a new axis as in Gymnasium's `FrameStackObservation` (copies of the first observation before it).
+    """
+
+    policy: Any
+    frames: int
+    """k."""
+    new_axis: bool = False
+
+    def predict(
+        self, observation: Array, state: Any = None, episode_start: Array | None = None, deterministic: bool = True
+    ) -> tuple[Array, Any]:
+        """Stable-Baselines3's `predict` on single observations."""
+        fresh = np.zeros((self.frames, *observation.shape), observation.dtype)  # (k, B, ...)
+        seen, inner = (fresh, None) if state is None else state
+        starts = np.full(len(observation), state is None)
+        if episode_start is not None:
+            starts |= np.asarray(episode_start, dtype=bool)
+        seen = np.concatenate((seen[1:], observation[None]))
+        seen[:-1, starts] = observation[starts] if self.new_axis else 0
+        shown = np.moveaxis(seen, 0, 1) if self.new_axis else np.concatenate(tuple(seen), axis=-1)
+        action, inner = self.policy.predict(np.ascontiguousarray(shown), inner, episode_start, deterministic)
+        return action, (seen, inner)
+
+
+def stacking(given: Shape, wanted: Shape) -> tuple[int, bool] | None:
+    """How many frames of shape `given` make an observation of shape `wanted`.
+
+    Returns:
+        Their number, and whether they lie along an axis of their own; None if the shapes do not go together.
+    """
+    if wanted == given:
+        return 1, False
+    if len(wanted) == len(given) + 1 and wanted[1:] == given:
+        return wanted[0], True
+    if len(wanted) != len(given) or not given or wanted[:-1] != given[:-1]:
+        return None
+    frames, rest = divmod(wanted[-1], given[-1])
+    return (frames, False) if frames and not rest else None
+
+
+def fitted(policy: Any, given: Shape) -> Any:
+    """The policy behind the wrappers that it was trained with, so that it takes the environment's observations.
+
+    Args:
+        policy: Has `predict`; the shape of its `observation_space`, if it has one, tells how many frames it sees, and
+            `get_vec_normalize_env`, if it has one, SB3's `VecNormalize`, whose shape tells whether observations are
+            normalised before or after they are stacked.
+        given: Shape of the environment's observations.
+    """
+    wanted = getattr(getattr(policy, "observation_space", None), "shape", None)
+    frames, new_axis = (stacking(given, wanted) if wanted is not None else None) or (1, False)
+    statistics: Any = getattr(policy, "get_vec_normalize_env", lambda: None)()
+    normalise = statistics.normalize_obs if statistics is not None and statistics.norm_obs else None
+    whole = normalise is not None and statistics.observation_space.shape == wanted
+    if normalise is not None and whole:
+        policy = Normalised(policy, normalise)
+    if frames > 1 or new_axis:
+        policy = Stacked(policy, frames, new_axis)
+    if normalise is not None and not whole:
+        policy = Normalised(policy, normalise)
+    return policy
