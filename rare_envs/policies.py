@@ -22,7 +22,10 @@ class Normalised:
         self, observation: Array, state: Any = None, episode_start: Array | None = None, deterministic: bool = True
     ) -> tuple[Array, Any]:
         """Stable-Baselines3's `predict` on observations as the environment gives them."""
-        action, state = self.policy.predict(self.normalise(observation), state, episode_start, deterministic)
+        shown = self.normalise(observation)
+        action, state = self.policy.predict(
+            shown, state=state, episode_start=episode_start, deterministic=deterministic
+        )
         return action, state
 
 
@@ -51,7 +54,10 @@ class Stacked:
         seen = np.concatenate((seen[1:], observation[None]))
         seen[:-1, starts] = observation[starts] if self.new_axis else 0
         shown = np.moveaxis(seen, 0, 1) if self.new_axis else np.concatenate(tuple(seen), axis=-1)
-        action, inner = self.policy.predict(np.ascontiguousarray(shown), inner, episode_start, deterministic)
+        shown = np.ascontiguousarray(shown)
+        action, inner = self.policy.predict(
+            shown, state=inner, episode_start=episode_start, deterministic=deterministic
+        )
         return action, (seen, inner)
 
 
