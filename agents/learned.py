@@ -2,19 +2,25 @@
 
 import copy
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from agents.networks import ACTIONS, FEATURES, HEAD, HIDDEN, Policy, with_head
 from agents.noise import WHITE, Colour
 from agents.weights import WeightDistribution
-from rare_envs.perception import CURVATURE
+from rare_envs import actions
+from rare_envs.observation import LIDAR_SCALES, observation_space
+from rare_envs.perception import CURVATURE, SPEED
 from rare_envs.state import VEHICLE_LENGTH
 
 if TYPE_CHECKING:
+    from gymnasium import spaces
+
     from rare_envs.world import Episode
 
 MAX_STEERING = math.pi / 3
@@ -38,7 +44,7 @@ class LearnedDriver:
         ValueError: If limits are out of order, or there are not 404 weights.
     """
 
-    policy: Policy
+    policy: Policy = field(repr=False)
     colour: Colour = WHITE
     """Of the noise of acceleration and yaw rate."""
     acceleration: tuple[float, float] = (-8.0, 4.0)
@@ -82,6 +88,7 @@ class LearnedDriver:
             Accelerations [m/s^2] and yaw rates [rad/s], shape (B, M, 2), and the new memory.
 
         Raises:
+            TypeError: If something is no tensor.
             ValueError: If a shape is wrong, or innovations come without a memory.
         """
         batch, vehicles = _checked_shapes(features, weights, innovations, memory)
@@ -109,6 +116,10 @@ def _checked_shapes(
     features: Tensor, weights: Tensor | None, innovations: Tensor | None, memory: Tensor | None
 ) -> tuple[int, int]:
     """B and M."""
+    named = {"features": features, "weights": weights, "innovations": innovations, "memory": memory}
+    for name, value in named.items():
+        if not isinstance(value, Tensor) and (value is not None or name == "features"):
+            raise TypeError(f"Expected {name} as a torch.Tensor, got {type(value).__name__}; use torch.as_tensor.")
     if features.ndim != 3 or features.shape[-1] != FEATURES:
         raise ValueError(f"Expected features of shape (B, M, {FEATURES}), got {tuple(features.shape)}.")
     batch, vehicles, _ = features.shape
@@ -138,22 +149,75 @@ def with_weights(policy: Policy, weights: Tensor) -> Policy:
 
 @dataclass(frozen=True, eq=False)
 class LearnedEgo:
-    """A learned driver as ego: a Driver that acts by its mean actions and has no memory."""
+    """A learned driver as ego: a Driver that acts by its mean actions and has no memory.
+
+    In simulations `act` is asked, whatever the environment observes. `predict` is for those who step an environment
+    themselves, made with `observation="lidar"`.
+    """
 
     driver: LearnedDriver
     sees: ClassVar[bool] = True
     """It needs a world in which vehicles look."""
 
+    @property
+    def observation_space(self) -> "spaces.Box[np.float32]":
+        """What `predict` takes: the observation "lidar"."""
+        return observation_space(1, "lidar")
+
+    @property
+    def action_space(self) -> "spaces.Box[np.float32]":
+        """What `predict` gives: acceleration and steering in [-1, 1]."""
+        return actions.action_space()
+
     def act(self, episode: "Episode", memory: Any) -> tuple[Tensor, Any]:
         """Perceive and decide for one tick; see `rare_envs.drivers.Driver`."""
         if episode.perception is None:
             raise ValueError('Expected a world in which vehicles look: make it with observation="lidar".')
-        features = episode.perception[:, :1]
-        actions, _ = self.driver.act(features)
-        acceleration, yaw_rate = actions[:, 0].unbind(dim=-1)
-        speed = episode.state.speed[:, 0]
-        yaw_rate = yaw_rate + speed * features[:, 0, CURVATURE]  # it has learned on a straight road
-        return torch.stack((acceleration, steering_for(yaw_rate, speed)), dim=1), memory
+        return self._decided(episode.perception[:, 0]), memory
+
+    @torch.inference_mode()
+    def predict(
+        self,
+        observation: NDArray[np.float32],
+        state: Any = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = True,
+    ) -> tuple[NDArray[np.float32], Any]:
+        """Choose actions as a Stable-Baselines3 model does, for the observation "lidar".
+
+        The environment's actions reach to 5 m/s^2 and 0.1 rad, those of `act` as far as the driver's: where it brakes
+        harder or steers further, this gives the limit.
+
+        Args:
+            observation: Of one environment, shape (51,), or of B, shape (B, 51).
+            state: Passed through.
+            episode_start: Passed over.
+            deterministic: Passed over; the actions are the mean ones either way.
+
+        Returns:
+            Actions in [-1, 1], shape (2,) or (B, 2), and the state.
+
+        Raises:
+            ValueError: If the observation has another shape.
+        """
+        del episode_start, deterministic
+        seen = torch.as_tensor(np.asarray(observation, dtype=np.float32))
+        if seen.ndim not in (1, 2) or seen.shape[-1] != FEATURES:
+            raise ValueError(
+                f'Expected observations of shape (B, {FEATURES}), got {tuple(seen.shape)}; '
+                'make the environment with observation="lidar".'
+            )
+        physical = self._decided(torch.atleast_2d(seen) * seen.new_tensor(LIDAR_SCALES))
+        scaled = physical / physical.new_tensor((actions.MAX_ACCELERATION, actions.MAX_STEERING))
+        return scaled.clamp(-1.0, 1.0).reshape(*seen.shape[:-1], ACTIONS).numpy(), state
+
+    def _decided(self, features: Tensor) -> Tensor:
+        """Acceleration [m/s^2] and steering angle [rad], shape (B, 2), by what the egos see, shape (B, 51)."""
+        decided, _ = self.driver.act(features[:, None])
+        acceleration, yaw_rate = decided[:, 0].unbind(dim=-1)
+        speed = features[:, SPEED]
+        yaw_rate = yaw_rate + speed * features[:, CURVATURE]  # it has learned on a straight road
+        return torch.stack((acceleration, steering_for(yaw_rate, speed)), dim=1)
 
 
 def steering_for(yaw_rate: Tensor, speed: Tensor) -> Tensor:

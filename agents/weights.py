@@ -58,6 +58,9 @@ class WeightDistribution:
             object.__setattr__(self, name, value)
         self._whitening  # noqa: B018 - positive definite, or an error now rather than at the first draw
 
+    def __repr__(self) -> str:
+        return f"WeightDistribution({self.dim} weights, radius={self.radius:g})"
+
     @property
     def dim(self) -> int:
         """Number of weights d."""
@@ -92,7 +95,13 @@ class WeightDistribution:
         return np.asarray(np.sqrt(np.square(self.cholesky).sum(axis=1)))
 
     def sample(self, n: int, rng: np.random.Generator) -> Array:
-        """Draw n independent points, shape (n, d)."""
+        """Draw n independent points, shape (n, d).
+
+        Raises:
+            TypeError: If rng is no generator, such as a seed.
+        """
+        if not isinstance(rng, np.random.Generator):
+            raise TypeError(f"Expected rng as a numpy.random.Generator, got {rng!r}; np.random.default_rng(seed) is one.")
         return self.from_standard_normal(rng.standard_normal((n, self.dim)))
 
     def log_prob(self, x: Array, /) -> Array:

@@ -121,9 +121,15 @@ def as_driver(ego: Any, world: World) -> Driver:
     if isinstance(ego, str):
         if ego == "idm":
             return IDM()
-        raise ValueError(f"Unknown ego {ego!r}; expected 'idm' or an object with predict (files: agents.load_ego).")
+        raise ValueError(
+            f"Expected the ego as 'idm' or an object, got {ego!r}; names and files become objects by "
+            f"agents.load_ego({ego!r})."
+        )
     if isinstance(ego, type):
         raise ValueError(f"Expected an ego, got the class {ego.__name__}; make or train one of it first.")
+    if getattr(ego, "sees", False):  # a Driver that looks by itself, whatever the environment observes
+        looking: Driver = ego
+        return looking
     if callable(getattr(ego, "predict", None)):
         expected = observation_space(world.scenario.vehicles, world.observation)
         check_spaces(ego, expected)

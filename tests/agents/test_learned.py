@@ -1,20 +1,14 @@
-"""Learned drivers: one batched pass against a loop over networks, the noise, the limits, and the ego."""
-
-from types import SimpleNamespace
+"""Learned drivers: one batched pass against a loop over networks, the noise and the limits."""
 
 import numpy as np
 import pytest
 import torch
 
-from agents import LearnedDriver, LearnedEgo
-from agents.learned import MAX_STEERING, steering_for, with_weights
+from agents import LearnedDriver
+from agents.learned import with_weights
 from agents.networks import HEAD, head_weights
 from agents.noise import Colour
 from agents.weights import WeightDistribution
-from rare_envs.dynamics import bicycle
-from rare_envs.perception import CURVATURE
-
-DT = 0.1
 
 
 @pytest.fixture
@@ -121,6 +115,12 @@ def test_wrong_shapes_are_refused(driver, change, message):
         driver.act(**{"features": torch.zeros(4, 3, 51), **change})
 
 
+@pytest.mark.parametrize("name", ["features", "weights", "innovations", "memory"])
+def test_arrays_in_place_of_tensors_are_refused(driver, name):
+    with pytest.raises(TypeError, match=f"{name} as a torch.Tensor, got ndarray"):
+        driver.act(**{"features": torch.zeros(4, 3, 51), name: np.zeros((4, 3, 51))})
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -142,46 +142,3 @@ def test_other_weights_leave_the_network_as_it_was(policy):
     torch.testing.assert_close(head_weights(changed), before + 1.0, atol=0.0, rtol=0.0)
     with pytest.raises(ValueError, match="404"):
         with_weights(policy, before[:-1])
-
-
-def test_the_ego_moves_the_bicycle_as_its_driver_wants(driver, features):
-    perception = features(8, 3)
-    perception[..., CURVATURE] = 0.0
-    speed = torch.linspace(5.0, 30.0, 8)
-    state = SimpleNamespace(speed=torch.stack((speed, torch.zeros(8)), dim=1))
-    action, memory = LearnedEgo(driver).act(SimpleNamespace(perception=perception, state=state), None)
-    wanted = driver.act(perception)[0][:, 0]
-    zero = torch.zeros(8)
-    _, _, heading, new_speed = bicycle(zero, zero, zero, speed, action[:, 0], action[:, 1], DT)
-    torch.testing.assert_close(heading / DT, wanted[:, 1], atol=1e-5, rtol=0.0)
-    torch.testing.assert_close(new_speed, speed + DT * wanted[:, 0])
-    assert memory is None
-
-
-def test_the_ego_turns_with_the_road(driver, features):
-    """A bend of 1/500 m to the right is steered on top of what the driver does, and the driver sees it as a feature."""
-    straight = features(4, 1)
-    straight[..., CURVATURE] = 0.0
-    bend = straight.clone()
-    bend[..., CURVATURE] = 0.002
-    speed = torch.full((4, 1), 20.0)
-    yaw_rates = []
-    for perception in (straight, bend):
-        state = SimpleNamespace(speed=speed)
-        action, _ = LearnedEgo(driver).act(SimpleNamespace(perception=perception, state=state), None)
-        zero = torch.zeros(4)
-        _, _, heading, _ = bicycle(zero, zero, zero, speed[:, 0], action[:, 0], action[:, 1], DT)
-        yaw_rates.append(heading / DT)
-    difference = driver.act(bend)[0][:, 0, 1] - driver.act(straight)[0][:, 0, 1]
-    torch.testing.assert_close(yaw_rates[1] - yaw_rates[0], difference + 0.04, atol=1e-4, rtol=0.0)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_steering_at_low_speed(dtype):
-    """As far as the wheels go and to the right side, finite with its gradient at standstill."""
-    speed = torch.zeros(3, dtype=dtype, requires_grad=True)
-    wanted = torch.tensor([-0.3, 0.0, 0.3], dtype=dtype, requires_grad=True)
-    steering = steering_for(wanted, speed)
-    torch.testing.assert_close(steering, torch.tensor([-MAX_STEERING, 0.0, MAX_STEERING], dtype=dtype))
-    for gradient in torch.autograd.grad(steering.sum(), (speed, wanted)):
-        assert bool(gradient.isfinite().all())

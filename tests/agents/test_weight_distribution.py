@@ -37,6 +37,15 @@ def test_draws_and_maps_are_those_of_the_generator(law):
     np.testing.assert_array_equal(law.sample(4, np.random.default_rng(5)), law.from_standard_normal(u))
 
 
+def test_it_is_named_in_one_short_line(law):
+    assert repr(law) == "WeightDistribution(404 weights, radius=0.01)"
+
+
+def test_a_seed_is_no_generator(small):
+    with pytest.raises(TypeError, match=r"rng as a numpy.random.Generator, got 0; np.random.default_rng"):
+        small.sample(3, 0)
+
+
 def test_maps_are_inverse_and_density_is_theirs(law, rng):
     """log p(x) = log phi(u) - log |dx / du| at u = the point in standard normal space."""
     u = rng.standard_normal((20, law.dim))

@@ -208,8 +208,11 @@ def test_scenes_follow_the_record_and_meet_where_they_were_cut(simulated, tmp_pa
 
 def test_what_scenes_need_is_named():
     table = cutting_in()
-    with pytest.raises(ValueError, match="lane boundaries of recording r"):
-        scenes_of(tabulate({name: table.column(name) for name in COLUMNS}))
+    columns = {name: table.column(name) for name in COLUMNS}
+    with pytest.raises(ValueError, match=r"'r' has no lane boundaries.*y = 1\.8 to 5\.2 m.*lane 1 at 1\.8 m"):
+        scenes_of(tabulate(columns))
+    with pytest.raises(ValueError, match=r"nobody between its lane boundaries, -7 to 0 m; its vehicles are at y ="):
+        scenes_of(tabulate(columns, {"r": (-7.0, -3.5, 0.0)}))
     with pytest.raises(ValueError, match="Scenes need width"):
         scenes_of(tabulate({name: table.column(name) for name in COLUMNS} | {"width": np.nan}))
     with pytest.raises(ValueError, match=r"scenes of 0\.4 s or more"):

@@ -3,6 +3,7 @@
 import dataclasses
 import inspect
 import json
+from pathlib import Path
 
 import pytest
 import torch
@@ -188,7 +189,8 @@ def test_the_end_of_each_recording_is_kept_for_tests():
     [
         {"method": "sac"},
         {"method": "gail", "learned_model": True},
-        {"updates": -1},
+        {"updates": 0},
+        {"epochs": -1},
         {"pools": 0},
         {"anneal": 0.0},
         {"last_rate": 2.0},
@@ -225,6 +227,8 @@ def test_logs_without_tensorboard_are_refused(data, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
     with pytest.raises(ValueError, match=r"rare-envs\[logs\]"):
         fit(learner_of(data, tiny(updates=1)), tmp_path, log=True)
+    with pytest.raises(ValueError, match=r"rare-envs\[logs\]"):  # before the data are even looked for
+        train_driver(Source("data", tmp_path / "nowhere"), TINY, tmp_path / "run", log=True)
 
 
 def rare_envs_command(words):
@@ -251,6 +255,9 @@ def test_the_shared_command_line_refuses_in_one_line(words, tmp_path, capsys):
 def test_a_training_that_could_not_begin_does_not_block_its_folder(tmp_path):
     """A typo in the path of the data, and the same folder again with the right one."""
     out = tmp_path / "run"
+    with pytest.raises(ValueError, match=r"no ngsim_us101_scenes\.parquet in the folder 'nope'"):
+        train_driver(Source("data", Path("nope")), Config(method="bc", epochs=1), out)
+    assert not out.exists()
     with pytest.raises(ValueError, match="Cannot read"):
         train_driver(Source("ngsim", tmp_path / "nope.csv"), Config(method="bc", epochs=1), out)
     write_ngsim(tmp_path / "mine.csv", simulate(seed=1))

@@ -30,6 +30,11 @@ def columns_of(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
     Raises:
         ValueError: The file is missing, cannot be read or lacks a column.
     """
+    if not path.is_file():
+        raise ValueError(
+            f"There is no {path.name} in the folder {str(path.parent)!r}. That is one of the compact tables, which are "
+            "no part of the package; recordings of your own are read as NGSIM or highD files."
+        )
     try:
         table = pq.read_table(path)
     except (OSError, ArrowInvalid) as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from training.data.scenes import Scene, assemble, smooth_tracks
 from training.data.table import DT, Trajectories
@@ -22,8 +23,8 @@ def scenes_of(trajectories: Trajectories, seconds: float = 10.0) -> tuple[Scene,
         seconds: Length of a scene [s]; the last one of a recording is shorter.
 
     Raises:
-        ValueError: A recording has no lane boundaries, a row has no position across or size, or the length is
-            less than a few steps.
+        ValueError: A recording has no lane boundaries or nobody between them, a row has no position across or size,
+            or the length is less than a few steps.
     """
     t = trajectories
     steps = round(seconds / DT)
@@ -35,13 +36,19 @@ def scenes_of(trajectories: Trajectories, seconds: float = 10.0) -> tuple[Scene,
     smooth = smooth_tracks(t.breaks(), t.x, t.y)
     scenes: list[Scene] = []
     for recording in np.unique(t.recording):
+        own = t.recording == recording
         edges = t.edges.get(str(recording), ())
         if not edges:
             raise ValueError(
-                f"Scenes need the lane boundaries of recording {recording}; put them into edges "
-                "(dataclasses.replace(table, edges={...}))."
+                f"Recording {str(recording)!r} has no lane boundaries, which scenes need. Give the y of each from left "
+                f"to right [m], as in tabulate(columns, edges={{{str(recording)!r}: (0.0, 3.5, 7.0)}}); {_where(t, own)}."
             )
-        inside = (t.recording == recording) & (smooth["y"] >= edges[0]) & (smooth["y"] < edges[-1])
+        inside = own & (smooth["y"] >= edges[0]) & (smooth["y"] < edges[-1])
+        if not inside.any():
+            raise ValueError(
+                f"Recording {str(recording)!r} has nobody between its lane boundaries, {edges[0]:g} to {edges[-1]:g} m; "
+                f"{_where(t, own)}."
+            )
         inside &= np.isfinite(smooth["speed"])
         window = t.frame // steps
         for number in np.unique(window[inside]):
@@ -54,3 +61,11 @@ def scenes_of(trajectories: Trajectories, seconds: float = 10.0) -> tuple[Scene,
             name = f"{recording}-{start:.0f}"
             scenes.append(assemble(name, start, edges, columns, t.length[rows[first]], t.width[rows[first]]))
     return tuple(scenes)
+
+
+def _where(t: Trajectories, rows: NDArray[np.bool_]) -> str:
+    """Where the vehicles of a recording are across the road, in words."""
+    lanes = np.unique(t.lane[rows & (t.lane > 0)])
+    words = f"its vehicles are at y = {t.y[rows].min():.1f} to {t.y[rows].max():.1f} m"
+    medians = ", ".join(f"lane {lane} at {np.median(t.y[rows & (t.lane == lane)]):.1f} m" for lane in lanes[:8])
+    return f"{words}, those of {medians}" if medians else words

@@ -88,9 +88,10 @@ class Config:
             raise ValueError(f"Expected method 'bc', 'gail' or 'mgail', got {self.method!r}.")
         if self.learned_model and self.method != "mgail":
             raise ValueError(f"Expected method 'mgail' with learned_model, got {self.method!r}.")
-        for name in ("updates", "epochs"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"Expected {name} >= 0, got {getattr(self, name)}.")
+        if self.epochs < 0:
+            raise ValueError(f"Expected epochs >= 0, got {self.epochs}.")
+        if self.updates < 1:
+            raise ValueError(f"Expected updates >= 1, got {self.updates}; a driver that is only cloned is method 'bc'.")
         if not (0.0 < self.anneal <= 1.0 and 0.0 < self.last_rate <= 1.0):
             raise ValueError(f"Expected anneal and last_rate in (0, 1], got {self.anneal}, {self.last_rate}.")
         for name in ("pools", "scenes", "batch", "critic_batch", "memory", "ppo_batch"):

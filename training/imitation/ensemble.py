@@ -55,8 +55,10 @@ class Ensemble:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.members < 2 * FOLDS or self.updates < 2:
-            raise ValueError(f"Expected {2 * FOLDS} or more members and 2 or more updates, got {self}.")
+        if self.members < 2 * FOLDS:
+            raise ValueError(f"Expected {2 * FOLDS} or more members, for a law to be fitted, got {self.members}.")
+        if self.updates < 2:
+            raise ValueError(f"Expected 2 or more updates of each member, got {self.updates}.")
 
 
 class Member(NamedTuple):

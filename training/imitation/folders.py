@@ -18,6 +18,7 @@ from agents.noise import WHITE, Colour
 from training.imitation.acting import HIGH, LOW
 from training.imitation.config import HUMAN, Config
 from training.imitation.fitting import CHECKPOINT, fit, learner_of, prepare
+from training.imitation.progress import summary_writer
 from training.imitation.realism import metrics
 from training.imitation.sources import Source, load
 
@@ -44,10 +45,15 @@ def train_driver(
         The driver's file.
 
     Raises:
-        ValueError: If the data cannot be read, or the folder holds another training.
+        ValueError: If the data cannot be read, the folder holds another training, or logs are asked for and
+            TensorBoard is not installed.
     """
-    _note_settings(source, config, out)
+    if log:
+        summary_writer()
+    settings = _settings(source, config)
+    _check_folder(out, settings)
     data = prepare(*load(source))
+    _note_settings(out, settings)
     policy = fit(learner_of(data, config), out, log, progress)
     driver = driver_of(policy, config)
     provenance = Provenance(
@@ -87,19 +93,28 @@ def _option(name: str, value: Any) -> list[str]:
     return [flag, *(str(part) for part in (value if isinstance(value, tuple) else (value,)))]
 
 
-def _note_settings(source: Source, config: Config, out: Path) -> None:
-    """Write source and settings into a folder, or check that they are those of the training in it."""
+def _settings(source: Source, config: Config) -> str:
+    """Source and settings as JSON."""
+    return json.dumps({"source": {**asdict(source), "path": str(source.path)}, "config": asdict(config)}, indent=1)
+
+
+def _check_folder(out: Path, settings: str) -> None:
+    """Refuse a folder that is a file, or that holds a training with other settings."""
+    if out.exists() and not out.is_dir():
+        raise ValueError(f"Expected a folder for the training, got the file {str(out)!r}.")
+    begun = any((out / name).exists() for name in (CHECKPOINT, DRIVER))
+    noted = out / SETTINGS
+    if begun and noted.exists() and json.loads(noted.read_text(encoding="utf-8")) != json.loads(settings):
+        raise ValueError(f"{str(out)!r} holds a training with other settings; choose another folder or remove it.")
+
+
+def _note_settings(out: Path, settings: str) -> None:
+    """Write settings into a folder, which is made if there is none."""
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ValueError(f"Cannot make the folder {str(out)!r}: {error}.") from None
-    text = json.dumps({"source": {**asdict(source), "path": str(source.path)}, "config": asdict(config)}, indent=1)
-    noted = out / SETTINGS
-    begun = any((out / name).exists() for name in (CHECKPOINT, DRIVER))
-    if not noted.exists() or not begun:
-        noted.write_text(text + "\n", encoding="utf-8")
-    elif json.loads(noted.read_text(encoding="utf-8")) != json.loads(text):
-        raise ValueError(f"{str(out)!r} holds a training with other settings; choose another folder or remove it.")
+    (out / SETTINGS).write_text(settings + "\n", encoding="utf-8")
 
 
 def read_settings(folder: Path) -> tuple[Source, Config]:

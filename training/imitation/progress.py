@@ -33,6 +33,19 @@ def bar(learner: Learner, show: bool) -> Iterator[After]:
         yield after
 
 
+def summary_writer() -> Any:
+    """TensorBoard's class of writers.
+
+    Raises:
+        ValueError: If TensorBoard is not installed.
+    """
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError as error:
+        raise ValueError("Logs need TensorBoard: pip install 'rare-envs[logs]', or leave logs out.") from error
+    return SummaryWriter
+
+
 @contextlib.contextmanager
 def tensorboard(folder: Path | None, update: int) -> Iterator[After]:
     """TensorBoard logs in a folder; None writes none.
@@ -47,11 +60,7 @@ def tensorboard(folder: Path | None, update: int) -> Iterator[After]:
     if folder is None:
         yield lambda learner, entry: None
         return
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError as error:
-        raise ValueError("Logs need TensorBoard: pip install 'rare-envs[logs]', or leave logs out.") from error
-    writer: Any = SummaryWriter(str(folder), purge_step=update + 1)
+    writer: Any = summary_writer()(str(folder), purge_step=update + 1)
 
     def after(learner: Learner, entry: Log) -> None:
         for name, value in entry.items():

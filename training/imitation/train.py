@@ -56,7 +56,7 @@ def command(
     log: Annotated[bool, typer.Option("--log", help="Write TensorBoard logs into the folder.")] = False,
     method: Annotated[Method, typer.Option(help="How to learn.")] = Method.MGAIL,
     seed: Annotated[int, typer.Option(help="The same seed gives the same weights.")] = D.seed,
-    updates: Annotated[int, typer.Option(min=0, help="After behaviour cloning.")] = D.updates,
+    updates: Annotated[int, typer.Option(min=1, help="After behaviour cloning.")] = D.updates,
     noise: Annotated[Noise, typer.Option(help="Coloured as people's, or white.")] = Noise.HUMAN,
     epochs: Annotated[int, typer.Option(min=0, help="Of behaviour cloning.")] = D.epochs,
     batch: Count = D.batch,
