@@ -204,7 +204,7 @@ class LearnedEgo:
         seen = torch.as_tensor(np.asarray(observation, dtype=np.float32))
         if seen.ndim not in (1, 2) or seen.shape[-1] != FEATURES:
             raise ValueError(
-                f'Expected observations of shape (B, {FEATURES}), got {tuple(seen.shape)}; '
+                f"Expected observations of shape (B, {FEATURES}), got {tuple(seen.shape)}; "
                 'make the environment with observation="lidar".'
             )
         physical = self._decided(torch.atleast_2d(seen) * seen.new_tensor(LIDAR_SCALES))

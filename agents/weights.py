@@ -101,7 +101,7 @@ class WeightDistribution:
             TypeError: If rng is no generator, such as a seed.
         """
         if not isinstance(rng, np.random.Generator):
-            raise TypeError(f"Expected rng as a numpy.random.Generator, got {rng!r}; np.random.default_rng(seed) is one.")
+            raise TypeError(f"Expected rng as a numpy.random.Generator, got {rng!r}; see np.random.default_rng.")
         return self.from_standard_normal(rng.standard_normal((n, self.dim)))
 
     def log_prob(self, x: Array, /) -> Array:

@@ -29,9 +29,7 @@ from rare_envs.rollout import drive
 from samplers.problem import FloatArray
 from samplers.result import plain
 
-PAPER = samplers.CrossEntropy(
-    family="blocks", rho=0.01, alpha=0.8, early_end=False, choice="quantile", wide_share=0
-)
+PAPER = samplers.CrossEntropy(family="blocks", rho=0.01, alpha=0.8, early_end=False, choice="quantile", wide_share=0)
 METHODS: dict[str, Any] = {
     # 50 elites for the means of 404 weights, as in the paper: noise of the means, not failures, is what it follows
     "ce-50-elites": samplers.CrossEntropy(

@@ -42,7 +42,7 @@ def test_it_is_named_in_one_short_line(law):
 
 
 def test_a_seed_is_no_generator(small):
-    with pytest.raises(TypeError, match=r"rng as a numpy.random.Generator, got 0; np.random.default_rng"):
+    with pytest.raises(TypeError, match=r"rng as a numpy.random.Generator, got 0; see np.random.default_rng"):
         small.sample(3, 0)
 
 

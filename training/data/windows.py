@@ -35,18 +35,18 @@ def scenes_of(trajectories: Trajectories, seconds: float = 10.0) -> tuple[Scene,
             raise ValueError(f"Scenes need {name} in every row; this table lacks it in some.")
     smooth = smooth_tracks(t.breaks(), t.x, t.y)
     scenes: list[Scene] = []
-    for recording in np.unique(t.recording):
+    for recording in np.unique(t.recording).tolist():
         own = t.recording == recording
-        edges = t.edges.get(str(recording), ())
+        edges = t.edges.get(recording, ())
         if not edges:
             raise ValueError(
-                f"Recording {str(recording)!r} has no lane boundaries, which scenes need. Give the y of each from left "
-                f"to right [m], as in tabulate(columns, edges={{{str(recording)!r}: (0.0, 3.5, 7.0)}}); {_where(t, own)}."
+                f"Recording {recording!r} has no lane boundaries, which scenes need. Give the y of each from left to "
+                f"right [m], as in tabulate(columns, edges={{{recording!r}: (0.0, 3.5, 7.0)}}); {_where(t, own)}."
             )
         inside = own & (smooth["y"] >= edges[0]) & (smooth["y"] < edges[-1])
         if not inside.any():
             raise ValueError(
-                f"Recording {str(recording)!r} has nobody between its lane boundaries, {edges[0]:g} to {edges[-1]:g} m; "
+                f"Recording {recording!r} has nobody between its lane boundaries, {edges[0]:g} to {edges[-1]:g} m; "
                 f"{_where(t, own)}."
             )
         inside &= np.isfinite(smooth["speed"])
