@@ -207,7 +207,7 @@ class LearnedEgo:
                 f"Expected observations of shape (B, {FEATURES}), got {tuple(seen.shape)}; "
                 'make the environment with observation="lidar".'
             )
-        physical = self._decided(torch.atleast_2d(seen) * seen.new_tensor(LIDAR_SCALES))
+        physical = self._decided(seen.reshape(-1, FEATURES) * seen.new_tensor(LIDAR_SCALES))
         scaled = physical / physical.new_tensor((actions.MAX_ACCELERATION, actions.MAX_STEERING))
         return scaled.clamp(-1.0, 1.0).reshape(*seen.shape[:-1], ACTIONS).numpy(), state
 

@@ -1,5 +1,6 @@
 """From the keyword arguments of `gym.make` to a world and its scenario space."""
 
+import inspect
 from typing import Any
 
 import numpy as np
@@ -37,6 +38,7 @@ def set_up(
     base: Any = None,
     drivers: Any = None,
     noise: bool | str = True,
+    **unknown: Any,
 ) -> tuple[World, ScenarioSpace]:
     """The world and the scenario space of an environment.
 
@@ -56,13 +58,21 @@ def set_up(
         noise: What becomes of the drivers' noise. True: it is part of x, standard normal columns behind the others.
             "fixed": one sequence for all x, so that probabilities are conditional on it. False: mean actions.
 
+        **unknown: What is none of these, and refused.
+
     Returns:
         The world and the space of its parameters.
 
     Raises:
+        TypeError: If there is no such argument; the message suggests the nearest and lists all.
         ValueError: If an argument is not one of those; the message says what is.
     """
     scenario = find_scenario(env_id)
+    for name in unknown:
+        known = [word for word in inspect.signature(set_up).parameters if word not in ("env_id", "unknown")]
+        of_reset = name in (parameter.name for parameter in PARAMETERS[scenario.name])
+        hint = " (reset takes it as an option)" if of_reset else did_you_mean(name, known)
+        raise TypeError(f"{env_id} takes no keyword argument {name!r}{hint}; it takes {', '.join(known)}.")
     _one_of("observation", observation, OBSERVATIONS)
     _one_of("action", action, ACTIONS)
     background = find_drivers(scenario.drivers if drivers is None else drivers)

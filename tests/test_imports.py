@@ -65,8 +65,9 @@ def without_lazy_parts(tree: ast.Module) -> ast.Module:
 
 
 def package_of(module: str) -> str:
-    """The row of the table that a module belongs to."""
-    return STUDY if f"{module}.".startswith(f"{STUDY}.") else module.partition(".")[0]
+    """The row of the table that a module belongs to; `python -m rare_envs` is the command line."""
+    top = f"{module}.".startswith(f"{STUDY}.") or module == "rare_envs.__main__"
+    return STUDY if top else module.partition(".")[0]
 
 
 def violations(root: Path) -> list[str]:

@@ -5,10 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 import samplers
+from agents.networks import HEAD
+from rare_envs.background import noise_size
 from rare_envs.measures import MEASURES
 from rare_envs.scenarios import SCENARIOS
 from rare_envs.space import BASES, PARAMETERS
 
+TICK = 0.1
+"""[s], the usual one."""
 EGOS = {
     "idm": "rule-based driver, Intelligent Driver Model (the default)",
     "mgail, gail, bc, FILE.safetensors": "learned driver with lidar, by its mean actions",
@@ -28,7 +32,8 @@ def catalogue() -> dict[str, Any]:
     """Everything that can be named on the command line, as JSON-ready values.
 
     Returns:
-        "environments" (id to parameters, bases and drivers), "methods", "egos", "drivers", "measures".
+        "environments" (id to parameters, bases, drivers and what learned drivers add to x, with their noise and for an
+        episode of the usual length), "methods", "egos", "drivers", "measures".
     """
     environments = {
         env_id: {
@@ -45,6 +50,10 @@ def catalogue() -> dict[str, Any]:
             ],
             "bases": list(BASES[scenario.name]),
             "drivers": scenario.drivers,
+            "of_learned_drivers": [
+                {"name": "weights", "size": HEAD},
+                {"name": "noise", "size": noise_size(round(scenario.horizon / TICK), scenario.vehicles - 1)},
+            ],
         }
         for env_id, scenario in SCENARIOS.items()
     }

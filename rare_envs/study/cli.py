@@ -66,6 +66,11 @@ class Noise(str, Enum):
 Env = Annotated[str, typer.Argument(metavar="ENV", help="Environment, such as rare_envs/CutIn-v0.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
 Seed = Annotated[int, typer.Option(help="Seed; the same seed gives the same answer.")]
+Base = Annotated[str | None, typer.Option(help="Base distribution: a name or a JSON file.")]
+Drivers = Annotated[str | None, typer.Option(help="Of the vehicles around the ego: mgail, gail, bc, idm or a file.")]
+NoiseOption = Annotated[Noise, typer.Option("--noise", help="The drivers' noise: part of x, one fixed sequence, none.")]
+Observation = Annotated[str, typer.Option(help="What the ego observes: features or lidar.")]
+Horizon = Annotated[float | None, typer.Option(help="Length of an episode in seconds.")]
 
 
 @app.command("list")
@@ -89,19 +94,17 @@ def estimate_command(
     algo: Annotated[str | None, typer.Option(help="Algorithm of the .zip, if the file does not tell.")] = None,
     trust: Annotated[bool, typer.Option("--trust", help="Let the ego's .zip run code when it is loaded.")] = False,
     method: Annotated[str, typer.Option(help="Estimation method; see rare-envs list.")] = "two-stage",
-    base: Annotated[str | None, typer.Option(help="Base distribution: a name or a JSON file.")] = None,
+    base: Base = None,
     measure: Annotated[str, typer.Option(help="Safety measure f; small is dangerous.")] = "ttc",
     gamma: Annotated[float, typer.Option(help="Threshold: P[f <= gamma]; 0 counts collisions.")] = 0.0,
     seed: Seed = 0,
     max_sim: Annotated[int | None, typer.Option(help="Largest number of simulations.")] = None,
     target_cov: Annotated[float | None, typer.Option(help="Stop at this coefficient of variation.")] = None,
     replicates: Annotated[int, typer.Option(help="Independent runs, combined by their mean.")] = 1,
-    drivers: Annotated[
-        str | None, typer.Option(help="Of the vehicles around the ego: mgail, gail, bc, idm or a file.")
-    ] = None,
-    noise: Annotated[Noise, typer.Option(help="The drivers' noise: part of x, one fixed sequence, none.")] = Noise.ON,
-    observation: Annotated[str, typer.Option(help="What the ego observes: features or lidar.")] = "features",
-    horizon: Annotated[float | None, typer.Option(help="Length of an episode in seconds.")] = None,
+    drivers: Drivers = None,
+    noise: NoiseOption = Noise.ON,
+    observation: Observation = "features",
+    horizon: Horizon = None,
     out: Annotated[Path | None, typer.Option(help="Folder for result.json, failures.csv and plot.png.")] = None,
     as_json: Json = False,
 ) -> None:
@@ -122,7 +125,7 @@ def estimate_command(
         max_sim=max_sim,
         target_cov=target_cov,
         replicates=replicates,
-        noise={Noise.ON: True, Noise.OFF: False}.get(noise, noise.value),
+        noise=_noise(noise),
         drivers=drivers,
         observation=observation,
         horizon=horizon,
@@ -150,17 +153,32 @@ def train_ego_command(
     out: Annotated[Path, typer.Option(help="File to save the ego in.")] = Path("ego.zip"),
     seed: Seed = 0,
     num_envs: Annotated[int, typer.Option(help="Episodes that run side by side.")] = 256,
+    base: Base = None,
+    drivers: Drivers = None,
+    noise: NoiseOption = Noise.ON,
+    observation: Observation = "features",
+    horizon: Horizon = None,
     as_json: Json = False,
 ) -> None:
     """Train an ego on the batched simulation and save it for `rare-envs estimate --ego`."""
     _one_thread()
     from rare_envs.study.train import train
 
-    path = train(env, algo=algo, steps=steps, out=out, seed=seed, num_envs=num_envs)
+    world = {
+        "base": base,
+        "drivers": drivers,
+        "noise": _noise(noise),
+        "observation": observation,
+        "horizon": horizon,
+    }
+    path = train(env, algo=algo, steps=steps, out=out, seed=seed, num_envs=num_envs, **world)
     if as_json:
-        _print_json({"ego": str(path), "env_id": env, "algo": algo, "steps": steps, "seed": seed})
+        _print_json({"ego": str(path), "env_id": env, "algo": algo, "steps": steps, "seed": seed, **world})
     else:
-        print(f"Saved {path}. Next: rare-envs estimate {env} --ego {path}")
+        words = {"base": base, "drivers": drivers, "noise": noise.value, "horizon": horizon, "observation": observation}
+        usual = {"noise": Noise.ON.value, "observation": "features"}
+        told = [f" --{name} {word}" for name, word in words.items() if word not in (None, usual.get(name))]
+        print(f"Saved {path}. Next: rare-envs estimate {env} --ego {path}{''.join(told)}")
 
 
 @app.command("train-drivers")
@@ -183,6 +201,11 @@ def train_drivers_command(
         _print_json({"driver": str(path), "method": method, "seed": seed})
     else:
         print(f"Saved {path}. Load it with agents.load_driver({str(path)!r}).")
+
+
+def _noise(word: Noise) -> bool | str:
+    """The `noise` argument of `DrivingProblem` for a word."""
+    return {Noise.ON: True, Noise.OFF: False}.get(word, word.value)
 
 
 def _one_thread() -> None:

@@ -90,6 +90,15 @@ class Report:
         return bool(self.estimate.warnings)
 
     @property
+    def notes(self) -> tuple[str, ...]:
+        """What was asked for and makes no difference here."""
+        world, noise = self.study.problem.world, self.study.question.noise
+        if noise is True or (world.drivers is not None and world.drivers.noisy):
+            return ()
+        word = "off" if noise is False else noise
+        return (f"--noise {word} changes nothing: nobody in this traffic drives with noise (see --drivers)",)
+
+    @property
     def vec_normalize(self) -> str | None:
         """File of the `VecNormalize` statistics that were applied to a saved ego's observations, if there was one."""
         path = getattr(self.study.problem.ego, "statistics_path", None)
@@ -111,6 +120,7 @@ class Report:
             **self.estimate.to_dict(),
             "question": asdict(self.study.question),
             "doubtful": self.doubtful,
+            "notes": self.notes,
             "vec_normalize": self.vec_normalize,
             "seconds": self.seconds,
             "n_failures": failures.total,

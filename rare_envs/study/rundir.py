@@ -1,4 +1,4 @@
-"""The folder a run leaves behind: result.json, failures.csv, plot.png."""
+"""The folder a run leaves behind: result.json, failures.csv (and failures.npz), plot.png."""
 
 from __future__ import annotations
 
@@ -8,11 +8,15 @@ import re
 from pathlib import Path
 from typing import Any
 
-from rare_envs.study.columns import columns_of
+import numpy as np
+from numpy.typing import NDArray
+
+from rare_envs.study.columns import SHOWN, columns_of
 from rare_envs.study.evaluate import Report
 from rare_envs.study.plots import save_plot
 
-RESULT, FAILURES, PLOT = "result.json", "failures.csv", "plot.png"
+RESULT, FAILURES, BLOCKS, PLOT = "result.json", "failures.csv", "failures.npz", "plot.png"
+"""Blocks are what a table has no room for: of more than `columns.SHOWN` values, drivers' weights and noise."""
 
 
 def write_run(folder: Path, report: Report) -> None:
@@ -23,7 +27,7 @@ def write_run(folder: Path, report: Report) -> None:
         report: What to write.
     """
     (folder / RESULT).write_text(to_text(report.to_dict()) + "\n", encoding="utf-8")
-    _write_failures(folder / FAILURES, report)
+    _write_failures(folder, report)
     save_plot(folder / PLOT, report)
 
 
@@ -34,10 +38,48 @@ def to_text(value: dict[str, Any]) -> str:
     return re.sub(r"\[\n([^\[\]{}\"]*)\n *\]", lambda found: f"[{' '.join(found[1].split())}]", text)
 
 
-def _write_failures(path: Path, report: Report) -> None:
-    """One failure a row, the most likely first: the columns of its x by name, f and log p0."""
-    with path.open("w", newline="", encoding="utf-8") as file:
+def read_failures(folder: Path) -> dict[str, NDArray[np.float64]]:
+    """Read the failures of a run, the most likely first.
+
+    Args:
+        folder: Of `rare-envs estimate --out`.
+
+    Returns:
+        Parameters by name, shape (n,), or (n, size) for blocks; then "f" and "log_p0", shape (n,). The parameters of
+        row k replay by `env.reset(options={name: found[name][k] for name in env.unwrapped.space.names})`.
+
+    Raises:
+        FileNotFoundError: There is no such run.
+    """
+    with (folder / FAILURES).open(newline="", encoding="utf-8") as file:
+        header, *rows = csv.reader(file)
+    table = np.array(rows, dtype=np.float64).reshape(len(rows), len(header))
+    columns: dict[str, list[NDArray[np.float64]]] = {}
+    for name, values in zip(header, table.T, strict=True):
+        columns.setdefault(name.partition("[")[0], []).append(values)
+    found = {name: parts[0] if len(parts) == 1 else np.stack(parts, axis=1) for name, parts in columns.items()}
+    if (folder / BLOCKS).exists():
+        with np.load(folder / BLOCKS) as blocks:
+            found |= {name: blocks[name].astype(np.float64) for name in blocks.files}
+    return found
+
+
+def _write_failures(folder: Path, report: Report) -> None:
+    """One failure a row, the most likely first.
+
+    The table has the columns of x by name but for large blocks, f and log p0. Large blocks go row by row into a file
+    of arrays, in single precision, in which they are simulated, so that they replay to the same f.
+    """
+    space, failures = report.study.problem.space, report.estimate.failures
+    columns = columns_of(space)
+    shown = [column.shown for column in columns]
+    with (folder / FAILURES).open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow([*(column.name for column in columns_of(report.study.problem.space)), "f", "log_p0"])
+        writer.writerow([*(column.name for column in columns if column.shown), "f", "log_p0"])
         # repr of a float gives it back exactly, so that a row replays to the same f
-        writer.writerows([*failure.x.tolist(), failure.f, failure.log_p0] for failure in report.estimate.failures)
+        writer.writerows([*failure.x[shown].tolist(), failure.f, failure.log_p0] for failure in failures)
+    large = {name for name, size in zip(space.names, space.sizes, strict=True) if size > SHOWN}
+    (folder / BLOCKS).unlink(missing_ok=True)
+    if large:
+        blocks = {name: part.astype(np.float32) for name, part in space.columns(failures.x).items() if name in large}
+        np.savez_compressed(folder / BLOCKS, allow_pickle=False, **blocks)

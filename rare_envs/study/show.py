@@ -17,6 +17,8 @@ from samplers.problem import FloatArray
 
 ORDINARY = 4000
 """Scenarios drawn from the base distribution to say what is ordinary."""
+ENOUGH, MANY = 3.0, 300_000
+"""Simulations over p that show with 95 % a region of failure as probable as all that was found; what they may cost."""
 
 
 def print_catalogue(entries: dict[str, Any]) -> None:
@@ -30,7 +32,9 @@ def print_catalogue(entries: dict[str, Any]) -> None:
         console.print(table)
         console.print(f"  base distributions: {', '.join(environment['bases'])}, or your own JSON file")
         around = environment["drivers"] or "a script, unless told otherwise"
-        console.print(f"  drivers around the ego: {around}\n")
+        console.print(f"  drivers around the ego: {around}")
+        added = ", ".join(f"{each['name']} ({each['size']:,} values)" for each in environment["of_learned_drivers"])
+        console.print(f"  learned drivers add: {added}\n")
     titles = {
         "methods": "Methods",
         "egos": "Egos",
@@ -69,8 +73,11 @@ def print_report(report: Report, out: Path | None = None) -> None:
     _print_failure(console, report)
     for warning in estimate.warnings:
         console.print(f"warning: {warning}", style="yellow")
-    if question.method != "mc" and question.ego != "idm":
-        console.print("check it: --method mc --max-sim 300000 finds ways to crash that f does not announce")
+    for note in report.notes:
+        console.print(f"note: {note}")
+    if question.method != "mc" and question.ego != "idm" and estimate.p < estimate.unseen:
+        n = float(f"{ENOUGH / estimate.p:.1g}") if estimate.p > ENOUGH / MANY else MANY
+        console.print(f"check it: --method mc --max-sim {n:.0f} finds ways to crash that f does not announce")
     if out is not None:
         names = ", ".join(path.name for path in sorted(out.iterdir()) if path.is_file())
         console.print(f"written to {out}: {names}")

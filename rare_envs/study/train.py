@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from rare_envs.study.checks import BadInput
 from training import train_ego
@@ -11,7 +12,7 @@ from training.imitation.folders import train_driver
 from training.imitation.train import source_of
 
 
-def train(env_id: str, *, algo: str, steps: int, out: Path, seed: int, num_envs: int) -> Path:
+def train(env_id: str, *, algo: str, steps: int, out: Path, seed: int, num_envs: int, **world: Any) -> Path:
     """Check the words of a user, then train.
 
     Args:
@@ -21,6 +22,7 @@ def train(env_id: str, *, algo: str, steps: int, out: Path, seed: int, num_envs:
         out: `.zip` to write.
         seed: Seed of networks, scenarios and exploration.
         num_envs: Episodes side by side.
+        **world: Keyword arguments of `gym.make`: base, drivers, noise, observation, horizon.
 
     Returns:
         The file that was written.
@@ -29,8 +31,8 @@ def train(env_id: str, *, algo: str, steps: int, out: Path, seed: int, num_envs:
         BadInput: Something cannot be used; nothing was simulated.
     """
     try:
-        return train_ego(env_id, algo=algo, steps=steps, seed=seed, num_envs=num_envs, out=out)
-    except ValueError as error:
+        return train_ego(env_id, algo=algo, steps=steps, seed=seed, num_envs=num_envs, out=out, **world)
+    except (ValueError, OSError) as error:
         raise BadInput(error) from error
 
 

@@ -232,6 +232,28 @@ def test_wrong_arguments_are_refused(kwargs, message):
         gym.make(HIGHWAY, **kwargs)
 
 
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        (
+            "measur",
+            r"Highway-v0 takes no .* 'measur' \(did you mean 'measure'\?\); it takes observation,",
+        ),
+        ("speed", r"'speed' \(reset takes it as an option\)"),
+        ("wheels", r"'wheels'; it takes"),
+    ],
+)
+def test_unknown_arguments_are_named_with_the_environment(name, message):
+    for make in (gym.make, rare_envs.DrivingProblem):
+        with pytest.raises(TypeError, match=message):
+            make(HIGHWAY, **{name: 1})
+
+
+def test_an_ego_by_name_is_told_where_names_become_egos():
+    with pytest.raises(ValueError, match=r"agents\.load_ego\('mgail'\)"):
+        rare_envs.DrivingProblem(HIGHWAY, ego="mgail")
+
+
 def test_beta_law_against_scipy():
     law = BetaLaw([2.0, 5.0], [2.0, 1.5], [80.0, -1.0], [120.0, 1.0])
     x = law.sample(2000, np.random.default_rng(0))

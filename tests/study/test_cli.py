@@ -203,47 +203,6 @@ def test_the_run_folder_holds_numbers_failures_and_a_picture(cli: Cli, risky: st
         assert np.mean(np.ptp(part, axis=2) > 0.2) > 0.001
 
 
-HIGHWAY = ("estimate", "rare_envs/Highway-v0", "--measure", "lidar_ttc", "--gamma", 1.0, "--horizon", 2)
-
-
-def test_the_highway_end_to_end(cli: Cli, tmp_path: Path) -> None:
-    """Blocks of x in every place where parameters are told, and drivers and horizon in the record."""
-    words = ("--ego", "bc", "--drivers", "gail", "--noise", "fixed", "--method", "mc", "--max-sim", 256)
-    result = cli(*HIGHWAY, *words, "--out", tmp_path)
-    assert result.exit_code in (0, 3), result.output
-    assert "the drivers' noise is one fixed sequence" in result.stdout
-    assert max(map(len, result.stdout.splitlines())) < 200
-    lines = {line.split()[0]: line for line in result.stdout.splitlines() if line.strip()}
-    assert len(lines["speed"].partition("m/s")[0].split()) == 1 + 6
-    assert "404 values" in lines["weights"]
-
-    answer = json.loads((tmp_path / "result.json").read_text())
-    asked = answer["question"]
-    assert (asked["drivers"], asked["ego"], asked["horizon"], asked["noise"]) == ("gail", "bc", 2.0, "fixed")
-    assert asked["observation"] == "features"
-    assert answer["given"] == "the drivers' noise is one fixed sequence"
-    likely = answer["failures"][0]["parameters"]
-    assert {name: len(values) for name, values in likely.items()} == {
-        "s": 6,
-        "t": 6,
-        "heading": 6,
-        "speed": 6,
-        "weights": 404,
-    }
-    with (tmp_path / "failures.csv").open(newline="") as file:
-        header, *rows = csv.reader(file)
-    assert header[:2] == ["s[0]", "s[1]"]
-    assert header[-3:] == ["weights[403]", "f", "log_p0"]
-    x = np.array(rows, dtype=float)
-    np.testing.assert_array_equal(x[0, :6], likely["s"])
-    ego = agents.load_ego(asked["ego"])
-    problem = rare_envs.DrivingProblem(
-        asked["env_id"], ego=ego, measure="lidar_ttc", noise="fixed", drivers="gail", horizon=2.0
-    )
-    np.testing.assert_allclose(problem.evaluate(x[:, :-2]), x[:, -2], atol=1e-3)  # products round by batch size
-    assert (tmp_path / "plot.png").stat().st_size > 50_000
-
-
 def test_what_the_ego_observes_can_be_chosen(cli: Cli, here: Path) -> None:
     (here / "looking.py").write_text(
         "import egos_here\n"
@@ -277,11 +236,15 @@ def test_list_shows_what_there_is(cli: Cli) -> None:
         assert [each["name"] for each in listed] == list(space.names[: len(listed)])
         assert set(space.names[len(listed) :]) == ({"weights", "noise"} if environment["drivers"] else set())
         assert sizes == list(space.sizes[: len(listed)])
+        learned = rare_envs.DrivingProblem(env_id, drivers="mgail").space
+        added = [(each["name"], each["size"]) for each in environment["of_learned_drivers"]]
+        assert added == list(zip(learned.names, learned.sizes, strict=True))[len(listed) :]
         for end in ("low", "high"):
             expected = np.repeat([each[end] for each in listed], sizes).tolist()
             assert expected == getattr(space, end)[: sum(sizes)].tolist()
         assert all(each["unit"] and each["meaning"] for each in listed)
     assert "speed (6 values)" in shown
+    assert "weights (404 values), noise (1,020 values)" in shown
     for name in (*agents.checkpoints.SHIPPED, "okelly2018", "lidar_ttc"):
         assert name in shown
 
@@ -299,8 +262,7 @@ def test_an_ego_is_trained_and_then_estimated(cli: Cli, risky: str, tmp_path: Pa
 
 
 def run(*words: str) -> subprocess.CompletedProcess[str]:
-    code = "from rare_envs.study.cli import main; main()"
-    return subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=False)
+    return subprocess.run([sys.executable, "-m", "rare_envs", *words], capture_output=True, text=True, check=False)
 
 
 def test_the_installed_command_behaves_the_same() -> None:
