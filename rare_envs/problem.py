@@ -122,7 +122,7 @@ def as_driver(ego: Any, world: World) -> Driver:
         if ego == "idm":
             return IDM()
         raise ValueError(
-            f"Expected the ego as 'idm' or an object, got {ego!r}; names and files become objects by "
+            f"Unknown ego {ego!r}; expected 'idm' or an object. Names and files become objects by "
             f"agents.load_ego({ego!r})."
         )
     if isinstance(ego, type):
