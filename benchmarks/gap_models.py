@@ -17,12 +17,12 @@ import typer
 
 import rare_envs
 from rare_envs.log_mixture import LogMixture
-from rare_envs.space import PARAMETERS
+from rare_envs.scenarios import named
 from training import fit_scenarios
 from training.fit_scenarios import RECIPES, filter_events, read_events, us101_base
 
 GAPS = {"car_following": ("gap",), "cut_in": ("gap_ego_cutin", "gap_cutin_lead")}
-ENV_IDS = dict(zip(GAPS, rare_envs.ENV_IDS[:2], strict=True))
+ENV_IDS = {"car_following": "rare_envs/CarFollowing-v0", "cut_in": "rare_envs/CutIn-v0"}
 
 
 def main(data: Path, rollouts: int = 1_000_000, seed: int = 0) -> None:
@@ -31,7 +31,7 @@ def main(data: Path, rollouts: int = 1_000_000, seed: int = 0) -> None:
     for scenario, gaps in GAPS.items():
         for logarithmic in ((), gaps):
             recipe = replace(RECIPES[scenario], logarithmic=logarithmic)
-            (events, _), _ = filter_events(read_events(data / recipe.file, recipe), recipe, PARAMETERS[scenario])
+            (events, _), _ = filter_events(read_events(data / recipe.file, recipe), recipe, named(scenario).parameters)
             columns = [recipe.columns.index(gap) for gap in logarithmic]
             # the density of x is that of the standardised coordinates times the Jacobian of getting there
             jacobian = np.log(events[:, columns]).sum()

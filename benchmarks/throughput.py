@@ -23,7 +23,7 @@ import samplers
 from benchmarks import highway_env_reference as reference
 from rare_envs.rollout import rollout
 
-CAR_FOLLOWING, CUT_IN, HIGHWAY = rare_envs.ENV_IDS
+CAR_FOLLOWING, CUT_IN, HIGHWAY = (f"rare_envs/{name}-v0" for name in ("CarFollowing", "CutIn", "Highway"))
 HORIZON = 20.0
 """Episodes of 200 ticks, as in the published baselines."""
 TICKS = 200

@@ -16,7 +16,6 @@ from rich.progress import track
 
 import rare_envs
 from rare_envs.scenarios import SCENARIOS
-from rare_envs.space import BASES
 
 RESULT = Path(__file__).with_name("truth.json")
 CHUNK = 131_072
@@ -65,7 +64,7 @@ def main(
     for env_id, scenario in SCENARIOS.items():
         if scenario.drivers is not None:
             continue  # with learned drivers a collision is too rare, and a rollout too slow
-        for base in BASES[scenario.name]:
+        for base in scenario.bases:
             results.append(truth(env_id, base, int(rollouts), seed))
             print(json.dumps(results[-1]))
             command = f"python -m benchmarks.truth --rollouts {rollouts:g} --seed {seed}"

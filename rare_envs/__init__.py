@@ -2,14 +2,25 @@
 
 from typing import TYPE_CHECKING, Any
 
-from rare_envs.registration import ENV_IDS, make_batch, register_envs
+from rare_envs.registration import make_batch, register_envs, register_scenario
+from rare_envs.scenarios import SCENARIOS
 
 if TYPE_CHECKING:
     from rare_envs.distributions import TruncatedGaussianMixture
     from rare_envs.problem import DrivingProblem
     from rare_envs.space import ScenarioSpace
 
-__all__ = ["ENV_IDS", "DrivingProblem", "ScenarioSpace", "TruncatedGaussianMixture", "make_batch"]
+    ENV_IDS: tuple[str, ...]
+    """Ids of all environments, your own included."""
+
+__all__ = [
+    "ENV_IDS",
+    "DrivingProblem",
+    "ScenarioSpace",
+    "TruncatedGaussianMixture",
+    "make_batch",
+    "register_scenario",
+]
 __version__ = "0.1.0"
 
 register_envs()
@@ -23,6 +34,8 @@ _LAZY = {
 
 def __getattr__(name: str) -> Any:
     """Import torch only when a name that needs it is used."""
+    if name == "ENV_IDS":
+        return tuple(SCENARIOS)
     if name in _LAZY:
         from importlib import import_module
 

@@ -1,16 +1,21 @@
 """Registered ids. Data only: entry points are strings, so importing is cheap."""
 
-from typing import Any
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 from gymnasium.vector import VectorEnv
 
-ENV_IDS = ("rare_envs/CarFollowing-v0", "rare_envs/CutIn-v0", "rare_envs/Highway-v0")
+from rare_envs.scenarios import SCENARIOS
+
+if TYPE_CHECKING:
+    from rare_envs.scenarios.base import Scenario
 
 
 def register_envs() -> None:
     """Register the ids with Gymnasium, once."""
-    for env_id in ENV_IDS:
+    for env_id in SCENARIOS:
         if env_id not in gym.registry:
             gym.register(
                 env_id,
@@ -18,6 +23,25 @@ def register_envs() -> None:
                 vector_entry_point="rare_envs.envs.vector:DrivingVectorEnv",
                 kwargs={"env_id": env_id},
             )
+
+
+def register_scenario(env_id: str, scenario: Scenario) -> None:
+    """Make a scenario of your own known under an id: to `gym.make`, `parallel_env`, `DrivingProblem` and the rest.
+
+    Args:
+        env_id: In Gymnasium's form, such as "my_namespace/Overtaking-v0".
+        scenario: The scenario; it is tried on a few draws of its default base distribution.
+
+    Raises:
+        ValueError: If the id is taken, or the scenario does not work.
+    """
+    from rare_envs.scenarios.trial import try_scenario
+
+    if env_id in gym.registry:
+        raise ValueError(f"The id {env_id!r} is taken; choose another one.")
+    try_scenario(scenario)
+    SCENARIOS.add(env_id, scenario)
+    register_envs()
 
 
 def make_batch(env_id: str, num_envs: int, **kwargs: Any) -> VectorEnv[Any, Any, Any]:

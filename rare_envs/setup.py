@@ -6,9 +6,11 @@ from typing import Any
 import numpy as np
 
 from rare_envs.background import find_drivers
+from rare_envs.bases import load_base
 from rare_envs.blocks import NoiseLaw, beside
-from rare_envs.scenarios import SCENARIOS, Scenario
-from rare_envs.space import PARAMETERS, Distribution, Parameter, ScenarioSpace, did_you_mean, load_base
+from rare_envs.scenarios import SCENARIOS
+from rare_envs.scenarios.base import Scenario
+from rare_envs.space import Distribution, Parameter, ScenarioSpace, did_you_mean
 from rare_envs.world import World
 
 OBSERVATIONS = ("features", "lidar")
@@ -85,7 +87,7 @@ def set_up(
         noise=noise,
         observation=observation,
     )
-    return world, space_of(world, load_base(scenario.name, base))
+    return world, space_of(world, load_base(scenario, base))
 
 
 def space_of(world: World, base: Distribution) -> ScenarioSpace:
@@ -95,7 +97,7 @@ def space_of(world: World, base: Distribution) -> ScenarioSpace:
         world: The world.
         base: Law of the scenario's own parameters.
     """
-    parameters, laws = list(PARAMETERS[world.scenario.name]), [base]
+    parameters, laws = list(world.scenario.parameters), [base]
     if world.drivers is not None and world.drivers.weights is not None:
         parameters.append(Parameter("weights", "", -np.inf, np.inf, "of the drivers' last layer", world.weights))
         laws.append(world.drivers.weights)

@@ -1,36 +1,17 @@
-"""Scenario parameters: names, units, ranges, and the base distribution over them.
-
-`ScenarioSpace` is what a scenario exposes as `space`; `load_base` finds the law behind it, shipped
-(`"us101"`, `"highway"`), in a JSON file of the same form, or as an object of the user's own.
-"""
+"""Scenario parameters: names, units, ranges, and the law over them, which a scenario exposes as its `space`."""
 
 from __future__ import annotations
 
 import difflib
-import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from importlib import resources
-from os import PathLike
-from pathlib import Path
-from typing import Any, Protocol, cast, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rare_envs.beta_law import BetaLaw
-from rare_envs.distributions import TruncatedGaussianMixture
-from rare_envs.log_mixture import LogMixture
-
 Array = NDArray[np.float64]
-
-BASES = {
-    "car_following": ("us101", "highway"),
-    "cut_in": ("us101", "highway"),
-    "highway": ("okelly2018",),
-}
-"""Base distributions that are shipped for each scenario; the first is the default."""
 
 
 @runtime_checkable
@@ -50,11 +31,6 @@ class Distribution(Protocol):
         """Inverse of `to_standard_normal`, (n, d) -> (n, d)."""
 
 
-_TRIAL_DRAWS = 1000
-"""Draws by which a user's distribution is tried before it is used."""
-METHODS = ("sample", "log_prob", "to_standard_normal", "from_standard_normal")
-
-
 @dataclass(frozen=True)
 class Parameter:
     """One named scenario parameter and the physical range it is allowed."""
@@ -66,37 +42,6 @@ class Parameter:
     meaning: str
     size: int = 1
     """Columns of x that it takes: 1 for a scalar, more for a block of like values, one for each vehicle, say."""
-
-
-# Speeds: none backwards, and 45 m/s (162 km/h) is above what congested US 101 (at most 27 m/s in
-# the events) and free-flow traffic reach. Gaps: under 1 m is below IDM's standstill distance and
-# of the order of the position error of the recordings (1.2 m along the road); beyond 150 m the lead
-# no longer matters within 10 s (120 m for the gap that a vehicle cuts into: a longer one is no
-# cut-in). Lateral offset: vehicles 2 m wide with at least 0.2 m between their sides, and at most
-# one lane (4 m) plus half a metre off-centre each.
-_SPEED = ("m/s", 0.0, 45.0)
-PARAMETERS: dict[str, tuple[Parameter, ...]] = {
-    "car_following": (
-        Parameter("ego_speed", *_SPEED, "initial speed of the ego"),
-        Parameter("lead_speed", *_SPEED, "speed of the lead, which keeps it"),
-        Parameter("gap", "m", 1.0, 150.0, "initial gap from ego to lead, bumper to bumper"),
-    ),
-    "cut_in": (
-        Parameter("ego_speed", *_SPEED, "initial speed of the ego"),
-        Parameter("cut_in_speed", *_SPEED, "initial speed of the vehicle that cuts in"),
-        Parameter("lead_speed", *_SPEED, "speed of the lead in the ego's lane, which keeps it"),
-        Parameter("cut_in_gap", "m", 1.0, 120.0, "initial gap from ego to cutter along the road"),
-        Parameter("lead_gap", "m", 1.0, 150.0, "initial gap from cutter to lead along the road"),
-        Parameter("lateral_offset", "m", 2.2, 5.0, "initial distance of the centres across"),
-    ),
-    # The ranges of O'Kelly et al. (2018), section 4, which are those of their Beta laws.
-    "highway": (
-        Parameter("s", "m", 80.0, 120.0, "initial place along the road, the ego's first", 6),
-        Parameter("t", "m", -0.25, 0.25, "initial place to the right of the lane's middle", 6),
-        Parameter("heading", "deg", -3.6, 3.6, "initial heading relative to the road, positive to the right", 6),
-        Parameter("speed", "m/s", 10.0, 20.0, "initial speed", 6),
-    ),
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -283,106 +228,6 @@ class ScenarioSpace:
                 f"{self.names[j]}{which} = {values[i, k]:.10g}{row} is outside its range {self._range(j)}; "
                 f"the parameters are {self.describe()}."
             )
-
-
-def load_base(scenario: str, base: str | PathLike[str] | Distribution | None) -> Distribution:
-    """The base distribution of a scenario.
-
-    A JSON file holds what the shipped ones do: names, low, high, weights, means, covariances, and
-    if wanted units, provenance (see `TruncatedGaussianMixture`) and logarithmic (see `LogMixture`); or, for independent
-    Beta laws, names, low, high, alpha and beta, one for each column of x (see `BetaLaw`).
-
-    Args:
-        scenario: A key of PARAMETERS.
-        base: The name of a shipped one (see `BASES`), a path to a JSON file, or an object with the four methods of
-            `Distribution`; None for the scenario's default.
-
-    Raises:
-        ValueError: There is no such scenario or file, or it does not fit the scenario.
-    """
-    if scenario not in PARAMETERS:
-        raise ValueError(
-            f"Unknown scenario {scenario!r}{did_you_mean(str(scenario), PARAMETERS)}; "
-            f"base distributions exist for {', '.join(PARAMETERS)}."
-        )
-    shipped = BASES[scenario]
-    base = shipped[0] if base is None else base
-    if not isinstance(base, str | PathLike):
-        return _checked_object(scenario, base)
-    if base in shipped:
-        file = resources.files("rare_envs") / "data" / f"{scenario}_{base}.json"
-        return _from_json(scenario, str(base), file.read_text(encoding="utf-8"))
-    path = Path(base)
-    if not path.is_file():
-        raise ValueError(
-            f"No base distribution {str(base)!r} for {scenario}"
-            f"{did_you_mean(str(base), shipped)}: neither one of {', '.join(shipped)} nor a file."
-        )
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"Cannot read the base distribution {path}: {error}.") from None
-    return _from_json(scenario, str(path), text)
-
-
-def _from_json(scenario: str, source: str, text: str) -> TruncatedGaussianMixture | LogMixture | BetaLaw:
-    try:
-        data = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise ValueError(f"Base distribution {source} is not valid JSON: {error}.") from None
-    if not isinstance(data, dict):
-        raise ValueError(f"Base distribution {source}: expected a JSON object, got {type(data).__name__}.")
-    wanted = [p.name for p in PARAMETERS[scenario]]
-    names = data.get("names")
-    if names != wanted:
-        raise ValueError(
-            f"Base distribution {source} does not fit {scenario}: expected names {wanted} in this order, got {names}."
-        )
-    try:
-        kind = BetaLaw if "alpha" in data else LogMixture if data.get("logarithmic") else TruncatedGaussianMixture
-        law: TruncatedGaussianMixture | LogMixture | BetaLaw = kind.from_dict(data)
-    except ValueError as error:
-        raise ValueError(f"Base distribution {source}: {error}") from None
-    columns = sum(p.size for p in PARAMETERS[scenario])
-    if law.dim != columns:
-        raise ValueError(
-            f"Base distribution {source} does not fit {scenario}: expected {columns} columns, got {law.dim}."
-        )
-    _check_box(scenario, source, law)
-    return law
-
-
-def _check_box(scenario: str, source: str, law: TruncatedGaussianMixture | LogMixture | BetaLaw) -> None:
-    box = [parameter for parameter in PARAMETERS[scenario] for _ in range(parameter.size)]
-    for parameter, low, high in zip(box, law.low, law.high, strict=True):
-        if low < parameter.low or high > parameter.high:
-            raise ValueError(
-                f"Base distribution {source} gives {parameter.name} the range [{low:g}, {high:g}] "
-                f"{parameter.unit}; {scenario} allows [{parameter.low:g}, {parameter.high:g}]."
-            )
-
-
-def _checked_object(scenario: str, base: object) -> Distribution:
-    missing = [name for name in METHODS if not callable(getattr(base, name, None))]
-    if missing:
-        raise ValueError(
-            f"A base distribution must be one of {', '.join(BASES[scenario])}, a path to a JSON file, or an "
-            f"object with {', '.join(METHODS)}; got {type(base).__name__} without "
-            f"{', '.join(missing)}."
-        )
-    law = cast(Distribution, base)
-    box = [parameter for parameter in PARAMETERS[scenario] for _ in range(parameter.size)]
-    draws = np.asarray(law.sample(_TRIAL_DRAWS, np.random.default_rng(0)), dtype=np.float64)
-    wrong = f"Base distribution {type(base).__name__} does not fit {scenario}: "
-    if draws.shape != (_TRIAL_DRAWS, len(box)):
-        raise ValueError(
-            f"{wrong}sample({_TRIAL_DRAWS}, rng) must have shape ({_TRIAL_DRAWS}, {len(box)}), one column for each "
-            f"of {', '.join(p.name for p in box)}; got {draws.shape}."
-        )
-    for p, column in zip(box, draws.T, strict=True):
-        if not ((column >= p.low) & (column <= p.high)).all():  # NaN is outside too
-            raise ValueError(f"{wrong}it draws {p.name} outside [{p.low:g}, {p.high:g}] {p.unit}; truncate it.")
-    return law
 
 
 def did_you_mean(name: str, valid: Iterable[str]) -> str:

@@ -39,4 +39,4 @@ class State(NamedTuple):
         if vehicle == 0:
             return self
         order = [vehicle, *(j for j in range(self.x.shape[1]) if j != vehicle)]
-        return State(*(field[:, order] for field in self[:4]), theta=self.theta)
+        return State(self.x[:, order], self.y[:, order], self.heading[:, order], self.speed[:, order], self.theta)

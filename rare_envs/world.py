@@ -16,7 +16,7 @@ from rare_envs.lidar import Bodies
 from rare_envs.measures import MEASURES, EpisodeMeasure, Moment, find_measure
 from rare_envs.perception import OnRoad, perceive
 from rare_envs.road import Placed, Road
-from rare_envs.scenarios import Scenario
+from rare_envs.scenarios.base import Scenario
 from rare_envs.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
 
 

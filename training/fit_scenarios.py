@@ -8,7 +8,7 @@ recordings first: of highD, or with --ngsim of raw NGSIM.
 
 Events (one per row of a CSV file) are filtered, standardised, and fitted with Gaussian mixtures with
 full covariances; the number of components is the one with the least Bayesian information criterion.
-Back in physical units the mixture is cut to the box of `rare_envs.space.PARAMETERS`. The first line also
+Back in physical units the mixture is cut to the box of the scenario's parameters. The first line also
 writes the two `highway` files, which are assembled and not fitted (`training.highway_base`).
 """
 
@@ -30,7 +30,8 @@ from scipy.special import ndtr
 from sklearn.mixture import GaussianMixture
 
 from rare_envs.distributions import TruncatedGaussianMixture
-from rare_envs.space import PARAMETERS, Parameter
+from rare_envs.scenarios import named
+from rare_envs.space import Parameter
 from training.data.events import EXTRACTORS, Events, pooled, write_events
 from training.data.highd import highd_recordings, load_highd
 from training.data.ngsim import load_ngsim
@@ -66,7 +67,7 @@ class Recipe:
 
     file: str
     columns: tuple[str, ...]
-    """Columns in the order of `PARAMETERS[scenario]`."""
+    """Columns in the order of the scenario's parameters."""
     apart: tuple[str, ...] = ()
     """The last of the columns, if they are fitted apart: independent of the others, from events of their own."""
     required: tuple[str, ...] = ()
@@ -297,17 +298,17 @@ def base_file(
     provenance: Mapping[str, Any],
     replaced: Mapping[str, Any] = MappingProxyType({}),
 ) -> str:
-    """Text of a base distribution file, as `rare_envs.space.load_base` reads it.
+    """Text of a base distribution file, as `rare_envs.bases.load_base` reads it.
 
     Args:
-        scenario: A key of PARAMETERS.
+        scenario: Name of the scenario, such as "cut_in".
         mixture: The law, of logarithms where some coordinates are.
         provenance: Where it comes from.
         replaced: Entries in place of the mixture's own: the box of x, where some coordinates are logarithms.
     """
     content = {
-        "names": [p.name for p in PARAMETERS[scenario]],
-        "units": [p.unit for p in PARAMETERS[scenario]],
+        "names": [p.name for p in named(scenario).parameters],
+        "units": [p.unit for p in named(scenario).parameters],
         **mixture.to_dict(),
         **replaced,
         "provenance": {**provenance, "mass_outside_box": mass_outside(mixture)},
@@ -333,7 +334,7 @@ def fitted_base(scenario: str, path: Path, source: Mapping[str, str], command: s
     Raises:
         ValueError: The events cannot be read, or are too few.
     """
-    recipe, box = RECIPES[scenario], PARAMETERS[scenario]
+    recipe, box = RECIPES[scenario], named(scenario).parameters
     (together, own), log = filter_events(read_events(path, recipe), recipe, box)
     low, high = (np.array([getattr(p, end) for p in box]) for end in ("low", "high"))
     chosen = np.array([column in recipe.logarithmic for column in recipe.columns])

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rare_envs.distributions import TruncatedGaussianMixture
-from rare_envs.space import PARAMETERS
+from rare_envs.scenarios import named
 
 Array = NDArray[np.float64]
 
@@ -121,7 +121,7 @@ COMPONENTS: dict[str, tuple[Component, ...]] = {
 
 def highway_base(scenario: str) -> tuple[TruncatedGaussianMixture, dict[str, Any]]:
     """The assembled mixture of a scenario and its provenance."""
-    components, box = COMPONENTS[scenario], PARAMETERS[scenario]
+    components, box = COMPONENTS[scenario], named(scenario).parameters
     mixture = TruncatedGaussianMixture(
         np.array([component.weight for component in components]),
         np.array([component.mean for component in components]),

@@ -1,14 +1,17 @@
 """What a scenario is: parameters, an initial state, and the motion of the vehicles around the ego."""
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from importlib import resources
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from rare_envs.dynamics import point_mass
 from rare_envs.road import Road
+from rare_envs.space import Parameter
 from rare_envs.state import State
 
 
@@ -21,16 +24,36 @@ class Others(NamedTuple):
     speed: Tensor
 
 
-@dataclass(frozen=True)
+DATA = resources.files("rare_envs") / "data"
+"""Files that come with the package."""
+# None backwards, and 45 m/s (162 km/h) is above what congested US 101 (at most 27 m/s in the events) and free-flow
+# traffic reach.
+SPEED = ("m/s", 0.0, 45.0)
+"""Unit and range of a speed as a parameter."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Scenario:
-    """A named scenario; x of shape (B, size) has the parameters of `rare_envs.space.PARAMETERS[name]`, in order."""
+    """Everything that the project knows of a scenario; one file makes one, and `rare_envs.scenarios` lists it.
+
+    Raises:
+        ValueError: If it contradicts itself.
+    """
 
     name: str
+    """Short name, such as "cut_in"."""
     road: Road
-    vehicles: int
-    """N, the ego included."""
+    vehicle_names: tuple[str, ...]
+    """Names of the N vehicles, "ego" first; agents are called by them."""
+    labels: tuple[str, ...] = ()
+    """The same in words for pictures; by default from the names: "the cutter", "vehicle 1"."""
     horizon: float
     """Default length of an episode [s]."""
+    parameters: tuple[Parameter, ...]
+    """What the columns of x are, in order."""
+    bases: Mapping[str, Any]
+    """Base distributions by name, the default first: JSON files, contents of such a file (names and box may be left
+    out there), or distribution objects."""
     initial: Callable[[Tensor], State]
     """x (B, d) to the state at time 0."""
     others: Callable[[State, float], Others]
@@ -38,10 +61,43 @@ class Scenario:
     driven: Callable[[State, Tensor, float], Others]
     """State, the other vehicles' accelerations and yaw rates (B, N - 1, 2) and dt [s] to the same, for vehicles that
     have drivers."""
-    size: int
-    """Number of columns of x that `initial` takes."""
     drivers: str | None = None
     """Drivers of the other vehicles unless told otherwise; None for the script."""
+
+    def __post_init__(self) -> None:
+        names = tuple(p.name for p in self.parameters)
+        labels = self.labels or tuple(_in_words(vehicle) for vehicle in self.vehicle_names)
+        object.__setattr__(self, "labels", labels)
+        for what, right in {
+            'vehicles with different names, "ego" first': self.vehicle_names[:1] == ("ego",)
+            and _distinct(self.vehicle_names),
+            "as many labels as vehicles": len(labels) == len(self.vehicle_names),
+            "parameters with different names, none of them 'x'": names and _distinct(names) and "x" not in names,
+            "parameters with low < high": all(p.low < p.high and p.size >= 1 for p in self.parameters),
+            "at least one base distribution": len(self.bases) > 0,
+            "a horizon in s": math.isfinite(self.horizon) and self.horizon > 0,
+        }.items():
+            if not right:
+                raise ValueError(f"Expected {what} in the scenario {self.name!r}.")
+
+    @property
+    def vehicles(self) -> int:
+        """N, the ego included."""
+        return len(self.vehicle_names)
+
+    @property
+    def size(self) -> int:
+        """Number of columns of x."""
+        return sum(p.size for p in self.parameters)
+
+
+def _distinct(names: tuple[str, ...]) -> bool:
+    return len(set(names)) == len(names)
+
+
+def _in_words(vehicle: str) -> str:
+    words = vehicle.replace("_", " ")
+    return words if words[-1].isdigit() else f"the {words}"
 
 
 def columns(*values: Tensor) -> Tensor:

@@ -4,7 +4,8 @@ import torch
 from torch import Tensor
 
 from rare_envs.road import straight
-from rare_envs.scenarios.base import Others, Scenario, columns
+from rare_envs.scenarios.base import DATA, SPEED, Others, Scenario, columns
+from rare_envs.space import Parameter
 from rare_envs.state import VEHICLE_LENGTH, State
 
 
@@ -34,12 +35,19 @@ def driven(state: State, action: Tensor, dt: float) -> Others:
 
 
 CAR_FOLLOWING = Scenario(
-    "car_following",
+    name="car_following",
     road=straight(1),
-    vehicles=2,
+    vehicle_names=("ego", "lead"),
     horizon=10.0,
+    # Gaps: under 1 m is below IDM's standstill distance and of the order of the position error of the recordings (1.2 m
+    # along the road); beyond 150 m the lead no longer matters within 10 s.
+    parameters=(
+        Parameter("ego_speed", *SPEED, "initial speed of the ego"),
+        Parameter("lead_speed", *SPEED, "speed of the lead, which keeps it"),
+        Parameter("gap", "m", 1.0, 150.0, "initial gap from ego to lead, bumper to bumper"),
+    ),
+    bases={"us101": DATA / "car_following_us101.json", "highway": DATA / "car_following_highway.json"},
     initial=initial,
     others=others,
     driven=driven,
-    size=3,
 )

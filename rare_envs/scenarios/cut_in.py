@@ -6,7 +6,8 @@ from torch import Tensor
 from rare_envs.drivers import IDM
 from rare_envs.geometry import Lead
 from rare_envs.road import straight
-from rare_envs.scenarios.base import Others, Scenario, columns
+from rare_envs.scenarios.base import DATA, SPEED, Others, Scenario, columns
+from rare_envs.space import Parameter
 from rare_envs.state import VEHICLE_LENGTH, State
 
 CUT_IN_DURATION = 4.0
@@ -90,12 +91,23 @@ def _moved(state: State, speed: Tensor, lead_speed: Tensor, dt: float) -> Others
 
 
 CUT_IN = Scenario(
-    "cut_in",
+    name="cut_in",
     road=straight(2),
-    vehicles=3,
+    vehicle_names=("ego", "cutter", "lead"),
     horizon=10.0,
+    # Gaps as in car-following; a gap that a vehicle cuts into and that is longer than 120 m makes no cut-in. Lateral
+    # offset: vehicles 2 m wide with at least 0.2 m between their sides, and at most one lane (4 m) plus half a metre
+    # off-centre each.
+    parameters=(
+        Parameter("ego_speed", *SPEED, "initial speed of the ego"),
+        Parameter("cut_in_speed", *SPEED, "initial speed of the vehicle that cuts in"),
+        Parameter("lead_speed", *SPEED, "speed of the lead in the ego's lane, which keeps it"),
+        Parameter("cut_in_gap", "m", 1.0, 120.0, "initial gap from ego to cutter along the road"),
+        Parameter("lead_gap", "m", 1.0, 150.0, "initial gap from cutter to lead along the road"),
+        Parameter("lateral_offset", "m", 2.2, 5.0, "initial distance of the centres across"),
+    ),
+    bases={"us101": DATA / "cut_in_us101.json", "highway": DATA / "cut_in_highway.json"},
     initial=initial,
     others=others,
     driven=driven,
-    size=6,
 )

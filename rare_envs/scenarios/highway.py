@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 from rare_envs.road import i80
-from rare_envs.scenarios.base import Others, Scenario, roaming
+from rare_envs.scenarios.base import DATA, Others, Scenario, roaming
+from rare_envs.space import Parameter
 from rare_envs.state import State
 
 VEHICLES = 6
@@ -39,13 +40,21 @@ def others(state: State, dt: float) -> Others:
 
 
 HIGHWAY = Scenario(
-    "highway",
+    name="highway",
     road=i80(),
-    vehicles=VEHICLES,
+    vehicle_names=("ego", *(f"vehicle_{j}" for j in range(1, VEHICLES))),
+    labels=("the ego", *(f"lane {lane + 1}'s car" for lane in LANES[1:])),
     horizon=10.0,
+    # the ranges of the paper, which are those of its Beta laws
+    parameters=(
+        Parameter("s", "m", 80.0, 120.0, "initial place along the road, the ego's first", VEHICLES),
+        Parameter("t", "m", -0.25, 0.25, "initial place to the right of the lane's middle", VEHICLES),
+        Parameter("heading", "deg", -3.6, 3.6, "initial heading relative to the road, positive to the right", VEHICLES),
+        Parameter("speed", "m/s", 10.0, 20.0, "initial speed", VEHICLES),
+    ),
+    bases={"okelly2018": DATA / "highway_okelly2018.json"},
     initial=initial,
     others=others,
     driven=driven,
-    size=4 * VEHICLES,
     drivers="mgail",
 )

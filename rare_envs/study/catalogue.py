@@ -9,7 +9,6 @@ from agents.networks import HEAD
 from rare_envs.background import noise_size
 from rare_envs.measures import MEASURES
 from rare_envs.scenarios import SCENARIOS
-from rare_envs.space import BASES, PARAMETERS
 
 TICK = 0.1
 """[s], the usual one."""
@@ -46,9 +45,9 @@ def catalogue() -> dict[str, Any]:
                     "meaning": parameter.meaning,
                     "size": parameter.size,
                 }
-                for parameter in PARAMETERS[scenario.name]
+                for parameter in scenario.parameters
             ],
-            "bases": list(BASES[scenario.name]),
+            "bases": list(scenario.bases),
             "drivers": scenario.drivers,
             "of_learned_drivers": [
                 {"name": "weights", "size": HEAD},

@@ -11,15 +11,6 @@ from numpy.typing import NDArray
 from rare_envs import DrivingProblem
 from rare_envs.road import Road
 from rare_envs.rollout import drive
-from rare_envs.scenarios import Scenario
-from rare_envs.scenarios.highway import LANES
-
-NAMES = {
-    "car_following": ("the ego", "the lead"),
-    "cut_in": ("the ego", "the cutter", "the lead"),
-    "highway": ("the ego", *(f"lane {lane + 1}'s car" for lane in LANES[1:])),
-}
-"""What the vehicles of a scenario are called; on the highway by the lane that they start in, from the left."""
 
 
 class Replay(NamedTuple):
@@ -47,12 +38,6 @@ class Replay(NamedTuple):
     """The road that they are on."""
     names: tuple[str, ...]
     """What the vehicles are called, length N."""
-
-
-def vehicle_names(scenario: Scenario) -> tuple[str, ...]:
-    """What the vehicles of a scenario are called, the ego first; one without a name has its number."""
-    known = NAMES.get(scenario.name, ("the ego",))
-    return tuple(known[j] if j < len(known) else f"vehicle {j}" for j in range(scenario.vehicles))
 
 
 @torch.inference_mode()
@@ -85,5 +70,5 @@ def replay(problem: DrivingProblem, x: NDArray[np.float64]) -> Replay:
         f=float(episodes[-1].f),
         collided=bool(episodes[-1].collided),
         road=world.scenario.road,
-        names=vehicle_names(world.scenario),
+        names=world.scenario.labels,
     )

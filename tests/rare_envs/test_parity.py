@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 from benchmarks import highway_env_reference as reference
 from rare_envs.drivers import IDM
 from rare_envs.dynamics import bicycle
-from rare_envs.scenarios import CAR_FOLLOWING, CUT_IN, Scenario
+from rare_envs.scenarios.base import Scenario
+from rare_envs.scenarios.car_following import CAR_FOLLOWING
+from rare_envs.scenarios.cut_in import CUT_IN
 from rare_envs.world import World
 
 TOLERANCE = 1e-9

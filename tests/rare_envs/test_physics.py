@@ -11,8 +11,8 @@ from rare_envs.dynamics import bicycle
 from rare_envs.geometry import Lead, boxes_overlap, collision_type, lead_of
 from rare_envs.measures import TTC_MAX, Moment, ttc
 from rare_envs.road import straight
-from rare_envs.scenarios import CAR_FOLLOWING, CUT_IN
-from rare_envs.scenarios.cut_in import bezier
+from rare_envs.scenarios.car_following import CAR_FOLLOWING
+from rare_envs.scenarios.cut_in import CUT_IN, bezier
 from rare_envs.state import State
 from rare_envs.world import World
 

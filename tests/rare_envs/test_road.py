@@ -16,8 +16,8 @@ from rare_envs.envs.rendering import WIDTH, Renderer
 from rare_envs.geometry import ego_overlaps
 from rare_envs.road import Road, i80, straight
 from rare_envs.rollout import drive
-from rare_envs.scenarios import Scenario
-from rare_envs.scenarios.base import Others, columns
+from rare_envs.scenarios.base import Others, Scenario, columns
+from rare_envs.space import Parameter
 from rare_envs.state import State
 from rare_envs.world import World
 from training import i80_road
@@ -258,7 +258,15 @@ def test_an_ego_keeps_its_lane_of_the_i80(dtype: torch.dtype) -> None:
 
     road = i80()
     script = Scenario(
-        "drive", road, 2, 30.0, initial, others, driven=lambda state, action, dt: others(state, dt), size=1
+        name="drive",
+        road=road,
+        vehicle_names=("ego", "other"),
+        horizon=30.0,
+        parameters=(Parameter("y", "m", -2.0, 30.0, "initial place across the road"),),
+        bases={"even": {"alpha": [1.0], "beta": [1.0]}},
+        initial=initial,
+        others=others,
+        driven=lambda state, action, dt: others(state, dt),
     )
     world = World(script)
     starts = torch.tensor([[road.centre(lane) + 0.8] for lane in range(6)], dtype=dtype)

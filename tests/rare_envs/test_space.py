@@ -6,21 +6,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rare_envs.bases import load_base
 from rare_envs.distributions import TruncatedGaussianMixture
 from rare_envs.log_mixture import LogMixture
-from rare_envs.space import BASES, PARAMETERS, Distribution, ScenarioSpace, load_base
+from rare_envs.scenarios import SCENARIOS, named
+from rare_envs.space import Distribution, ScenarioSpace
 
-NAMES = [p.name for p in PARAMETERS["cut_in"]]
+NAMES = [p.name for p in named("cut_in").parameters]
 
 
 def make_space(scenario="cut_in", base="us101"):
-    box = PARAMETERS[scenario]
+    box = named(scenario).parameters
     return ScenarioSpace(
         names=tuple(p.name for p in box),
         units=tuple(p.unit for p in box),
         low=np.array([p.low for p in box for _ in range(p.size)]),
         high=np.array([p.high for p in box for _ in range(p.size)]),
-        base=load_base(scenario, base),
+        base=load_base(named(scenario), base),
         sizes=tuple(p.size for p in box),
     )
 
@@ -29,11 +31,13 @@ def rng():
     return np.random.default_rng(0)
 
 
-@pytest.mark.parametrize(("scenario", "base"), [(name, base) for name, bases in BASES.items() for base in bases])
+@pytest.mark.parametrize(
+    ("scenario", "base"), [(each.name, base) for each in SCENARIOS.values() for base in each.bases]
+)
 def test_shipped_bases_fit_their_scenario(scenario, base):
     space = make_space(scenario, base)
     assert isinstance(space.base, Distribution)
-    assert space.dim == sum(parameter.size for parameter in PARAMETERS[scenario])
+    assert space.dim == sum(parameter.size for parameter in named(scenario).parameters)
     x = space.sample(1000, rng())
     assert (space.validate(x) == x).all()
     assert np.isfinite(space.log_prob(x)).all()
@@ -42,7 +46,7 @@ def test_shipped_bases_fit_their_scenario(scenario, base):
 
 
 def test_parameter_names_and_order():
-    assert [p.name for p in PARAMETERS["car_following"]] == ["ego_speed", "lead_speed", "gap"]
+    assert [p.name for p in named("car_following").parameters] == ["ego_speed", "lead_speed", "gap"]
     assert NAMES == [
         "ego_speed", "cut_in_speed", "lead_speed", "cut_in_gap", "lead_gap", "lateral_offset",
     ]  # fmt: skip
@@ -107,15 +111,15 @@ def test_bad_options_are_refused(options, message):
 
 
 def test_space_checks_its_own_lengths():
-    base = load_base("car_following", "us101")
+    base = load_base(named("car_following"), "us101")
     with pytest.raises(ValueError, match="2 names, 3 units"):
         ScenarioSpace(("a", "b"), ("m", "m", "m"), np.zeros(3), np.ones(3), base)
 
 
 def shipped_dict(scenario="car_following"):
-    law = load_base(scenario, "us101")
+    law = load_base(named(scenario), "us101")
     assert isinstance(law, TruncatedGaussianMixture | LogMixture)
-    return {"names": [p.name for p in PARAMETERS[scenario]], **law.to_dict()}
+    return {"names": [p.name for p in named(scenario).parameters], **law.to_dict()}
 
 
 def write(path: Path, content) -> Path:
@@ -125,10 +129,10 @@ def write(path: Path, content) -> Path:
 
 def test_a_users_json(tmp_path):
     path = write(tmp_path / "mine.json", shipped_dict())
-    x = load_base("car_following", "us101").sample(10, rng())
+    x = load_base(named("car_following"), "us101").sample(10, rng())
     for base in (path, str(path)):
-        law = load_base("car_following", base)
-        assert (law.log_prob(x) == load_base("car_following", "us101").log_prob(x)).all()
+        law = load_base(named("car_following"), base)
+        assert (law.log_prob(x) == load_base(named("car_following"), "us101").log_prob(x)).all()
 
 
 @pytest.mark.parametrize(
@@ -144,7 +148,7 @@ def test_a_users_json(tmp_path):
 def test_json_that_does_not_fit(tmp_path, change, message):
     path = write(tmp_path / "mine.json", {**shipped_dict(), **change})
     with pytest.raises(ValueError, match=message) as caught:
-        load_base("car_following", path)
+        load_base(named("car_following"), path)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -153,7 +157,7 @@ def test_json_with_the_wrong_dimension(tmp_path):
     content = {**shipped_dict("cut_in"), "names": shipped_dict()["names"]}
     path = write(tmp_path / "mine.json", content)
     with pytest.raises(ValueError, match="does not fit car_following: expected 3 columns, got 6"):
-        load_base("car_following", path)
+        load_base(named("car_following"), path)
 
 
 def test_files_that_are_no_base(tmp_path):
@@ -169,13 +173,13 @@ def test_files_that_are_no_base(tmp_path):
         (write(tmp_path / "list.json", [1]), "expected a JSON object, got list"),
     ]:
         with pytest.raises(ValueError, match=message) as caught:
-            load_base("cut_in", base)
+            load_base(named("cut_in"), base)
         assert "\n" not in str(caught.value)
 
 
 def test_unknown_scenario():
-    with pytest.raises(ValueError, match=r"'cutin' \(did you mean 'cut_in'\?\)"):
-        load_base("cutin", "us101")
+    with pytest.raises(ValueError, match="Unknown scenario 'cutin'; there are car_following, cut_in"):
+        named("cutin")
 
 
 class Partial:
@@ -184,12 +188,12 @@ class Partial:
 
 
 def test_a_users_object():
-    law = load_base("car_following", "highway")
-    assert load_base("car_following", law) is law
+    law = load_base(named("car_following"), "highway")
+    assert load_base(named("car_following"), law) is law
     with pytest.raises(ValueError, match=r"does not fit cut_in: sample.*must have shape \(1000, 6\)"):
-        load_base("cut_in", law)
+        load_base(named("cut_in"), law)
     with pytest.raises(ValueError, match="Partial without log_prob, to_standard_normal, from_sta"):
-        load_base("car_following", Partial())
+        load_base(named("car_following"), Partial())
     with pytest.raises(ValueError, match="got int without sample"):
-        load_base("car_following", 3)
-    assert load_base("car_following", None).to_dict() == load_base("car_following", "us101").to_dict()
+        load_base(named("car_following"), 3)
+    assert load_base(named("car_following"), None).to_dict() == load_base(named("car_following"), "us101").to_dict()

@@ -6,8 +6,9 @@ from numpy.typing import NDArray
 
 import rare_envs
 import samplers
+from rare_envs.scenarios import SCENARIOS
 
-CASES = [(env_id, base) for env_id in rare_envs.ENV_IDS[:2] for base in ("us101", "highway")]
+CASES = [(env_id, base) for env_id, each in SCENARIOS.items() if each.drivers is None for base in each.bases]
 
 
 class Recording:

@@ -9,12 +9,13 @@ from matplotlib.figure import Figure
 
 import agents
 import rare_envs
-from rare_envs.scenarios import CUT_IN
+from rare_envs.scenarios.cut_in import CUT_IN
+from rare_envs.scenarios.highway import HIGHWAY
 from rare_envs.study.checks import BadInput
 from rare_envs.study.columns import columns_of
 from rare_envs.study.evaluate import Question, prepare, run
 from rare_envs.study.plots import MOMENTS, draw_drive, most_shifted, save_plot
-from rare_envs.study.replay import replay, vehicle_names
+from rare_envs.study.replay import replay
 
 FOLLOWING = "rare_envs/CarFollowing-v0"
 
@@ -74,18 +75,15 @@ def test_the_legend_says_which_vehicle_is_which(env_id: str) -> None:
     draw_drive(axes, replay(problem, problem.base.sample(1, np.random.default_rng(0))[0]))
     legend = axes[-1].get_legend()
     assert legend is not None
-    others = {
-        "rare_envs/CarFollowing-v0": ["the lead"],
-        "rare_envs/CutIn-v0": ["the cutter", "the lead"],
-        "rare_envs/Highway-v0": [f"lane {number}'s car" for number in (1, 2, 4, 5, 6)],
-    }
-    speeds = [f"speed of {name}" for name in ("the ego", *others[env_id])]
+    speeds = [f"speed of {label}" for label in problem.world.scenario.labels]
     assert [text.get_text() for text in legend.get_texts()] == [*speeds, "gap to the vehicle ahead"]
 
 
 def test_vehicles_without_names_are_numbered() -> None:
-    assert vehicle_names(replace(CUT_IN, name="overtaking")) == ("the ego", "vehicle 1", "vehicle 2")
-    assert vehicle_names(replace(CUT_IN, vehicles=4)) == ("the ego", "the cutter", "the lead", "vehicle 3")
+    assert CUT_IN.labels == ("the ego", "the cutter", "the lead")
+    numbered = replace(CUT_IN, vehicle_names=("ego", "vehicle_1", "vehicle_2"), labels=())
+    assert numbered.labels == ("the ego", "vehicle 1", "vehicle 2")
+    assert HIGHWAY.labels == ("the ego", *(f"lane {number}'s car" for number in (1, 2, 4, 5, 6)))
 
 
 def test_the_most_shifted_parameters_come_first() -> None:

@@ -9,7 +9,8 @@ import pytest
 from typer import Typer
 from typer.testing import CliRunner
 
-from rare_envs.space import load_base
+from rare_envs.bases import load_base
+from rare_envs.scenarios import named
 from tests.training.recordings import simulate, write_highd, write_ngsim
 from training import fit_scenarios
 from training.data.compact import SCENES, us101_scenes
@@ -165,7 +166,7 @@ def test_bases_are_fitted_to_a_highd_folder(simulated, quick, tmp_path):
     assert result.exit_code == 0, result.output
     for scenario in fit_scenarios.RECIPES:
         path = tmp_path / "bases" / f"{scenario}_cologne.json"
-        points = load_base(scenario, path).sample(100, np.random.default_rng(0))
+        points = load_base(named(scenario), path).sample(100, np.random.default_rng(0))
         assert np.isfinite(points).all()
         # simulated speeds are between 9 and 27 m/s
         assert 12.0 < points[:, 0].mean() < 25.0

@@ -11,7 +11,7 @@ from typer import Typer
 from typer.testing import CliRunner
 
 from rare_envs.distributions import TruncatedGaussianMixture
-from rare_envs.space import PARAMETERS
+from rare_envs.scenarios import named
 from training import fit_scenarios
 from training.fit_scenarios import (
     RECIPES,
@@ -128,7 +128,7 @@ def test_filters_drop_and_count(tmp_path):
             ["start", 16.0, *GOOD[1:], True],
         ],
     )
-    recipe, box = RECIPES["cut_in"], PARAMETERS["cut_in"]
+    recipe, box = RECIPES["cut_in"], named("cut_in").parameters
     (points, offsets), log = filter_events(read_events(path, recipe), recipe, box)
     # speeds and gaps count even where the offset at the start was not seen or is out of range
     assert points.tolist() == [GOOD[:5], GOOD[:5], GOOD[:5], [16.0, *GOOD[1:5]]]

@@ -1,0 +1,72 @@
+"""Hard brake: a lead that brakes to a standstill in front of an ego that followed it at its speed.
+
+The deceleration scenario of UN Regulation 157 (annex 4, appendix 3) and Euro NCAP's CCRb test: ego and lead drive at
+one speed, then the lead brakes at a constant rate until it stands. Euro NCAP lets the braking build up within 1 s; here
+it is there at once, which leaves less time.
+"""
+
+import torch
+from torch import Tensor
+
+from rare_envs.road import straight
+from rare_envs.scenarios.base import Others, Scenario, columns
+from rare_envs.space import Parameter
+from rare_envs.state import VEHICLE_LENGTH, State
+
+US101 = {
+    "means": [[10.66, 2.511, 0.726]],
+    "covariances": [[[13.69, 1.149, 0.1046], [1.149, 0.2868, -0.0132], [0.1046, -0.0132, 0.1249]]],
+    "weights": [1.0],
+    "logarithmic": [False, True, True],
+    "provenance": {
+        "kind": "moments of recorded events",
+        "source": "NGSIM, US 101 (Los Angeles, southbound, 15 June 2005, congested), 370 vehicles over 640 m each",
+        "events": "265 brakings by 3 m/s or more; speed at their beginning, gap of the braking vehicle to its own lead "
+        "at that time (nobody's who follows is recorded), strongest deceleration of positions smoothed over 1 s",
+        "licence": "CC BY-SA 3.0, as that of the data",
+    },
+}
+"""Normal speed, logarithms of gap and deceleration."""
+
+
+def initial(x: Tensor) -> State:
+    """Speed [m/s] of both, gap [m], deceleration [m/s^2] of the lead, which is theta's only column."""
+    speed, gap, deceleration = x.unbind(dim=1)
+    zero = torch.zeros_like(gap)
+    return State(
+        x=columns(zero, gap + VEHICLE_LENGTH),
+        y=columns(zero, zero),
+        heading=columns(zero, zero),
+        speed=columns(speed, speed),
+        theta=deceleration[:, None],
+    )
+
+
+def others(state: State, dt: float) -> Others:
+    """The lead brakes until it stands."""
+    return driven(state, -state.theta[..., None], dt)
+
+
+def driven(state: State, action: Tensor, dt: float) -> Others:
+    """The lead accelerates as its driver wants and stays in the middle of the lane."""
+    speed = state.speed[:, 1:]
+    braked = (speed + action[..., 0] * dt).clamp(min=0.0)
+    return Others(state.x[:, 1:] + speed * dt, state.y[:, 1:], state.heading[:, 1:], braked)
+
+
+HARD_BRAKE = Scenario(
+    name="hard_brake",
+    road=straight(1),
+    vehicle_names=("ego", "lead"),
+    horizon=10.0,
+    # Euro NCAP's points (50 km/h, gaps of 12 and 40 m, 2 and 6 m/s^2) are inside; a dry road allows about 10 m/s^2.
+    parameters=(
+        Parameter("speed", "m/s", 1.0, 45.0, "initial speed of both"),
+        Parameter("gap", "m", 1.0, 150.0, "initial gap from ego to lead, bumper to bumper"),
+        Parameter("deceleration", "m/s^2", 0.5, 10.0, "of the lead, until it stands"),
+    ),
+    bases={"us101": US101},
+    initial=initial,
+    others=others,
+    driven=driven,
+)
