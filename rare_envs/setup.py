@@ -72,7 +72,7 @@ def set_up(
     scenario = find_scenario(env_id)
     for name in unknown:
         known = [word for word in inspect.signature(set_up).parameters if word not in ("env_id", "unknown")]
-        of_reset = name in (parameter.name for parameter in PARAMETERS[scenario.name])
+        of_reset = name in (parameter.name for parameter in scenario.parameters)
         hint = " (reset takes it as an option)" if of_reset else did_you_mean(name, known)
         raise TypeError(f"{env_id} takes no keyword argument {name!r}{hint}; it takes {', '.join(known)}.")
     _one_of("observation", observation, OBSERVATIONS)
