@@ -16,9 +16,9 @@ from rare_envs.space import did_you_mean
 
 EXPECTED: Final = (
     f"'{RULE_BASED}', {', '.join(map(repr, SHIPPED))}, a path to a {SUFFIX} or Stable-Baselines3 .zip, "
-    "or module:function"
+    "an .onnx file or module:function"
 )
-Kind = Literal["rule", "learned", "url", "zip", "function", "unknown"]
+Kind = Literal["rule", "learned", "url", "onnx", "zip", "function", "unknown"]
 
 
 @runtime_checkable
@@ -51,7 +51,8 @@ def load_ego(spec: str | Path, algo: str | None = None, trust: bool = False) -> 
 
     Args:
         spec: "idm"; "mgail", "gail" or "bc", or a path to a `.safetensors`, for a learned driver, which as ego acts by
-            its mean actions; a path to a `.zip` saved by Stable-Baselines3; or `module:function`, a function
+            its mean actions; a path to a `.zip` saved by Stable-Baselines3; a path to an `.onnx` file
+            (see `agents.onnx_ego.OnnxEgo` for its form); or `module:function`, a function
             without arguments that returns an ego (modules in the working directory are found).
         algo: Algorithm of a `.zip`, such as "ppo"; recognised from the file when None. Only a `.zip` has one.
         trust: Open the pickles in a `.zip` as Stable-Baselines3 does, which runs whatever code is in them. Without it
@@ -79,6 +80,10 @@ def load_ego(spec: str | Path, algo: str | None = None, trust: bool = False) -> 
         return load_saved(Path(text), algo, trust)
     if algo is not None:
         raise ValueError(f"Expected algo for a Stable-Baselines3 .zip only, got {algo!r} for {text!r}; leave it out.")
+    if kind == "onnx":
+        from agents.onnx_ego import OnnxEgo
+
+        return OnnxEgo(Path(text))
     if kind == "learned":
         return LearnedEgo(cast(LearnedDriver, load_driver(text)))
     return cast(Ego, call_factory(text)) if kind == "function" else "idm"
@@ -92,6 +97,8 @@ def kind_of(spec: str) -> Kind:
         return "learned"
     if "://" in spec:
         return "url"
+    if spec.endswith(".onnx"):
+        return "onnx"
     if spec.endswith(".zip") or Path(spec).is_file():
         return "zip"
     return "function" if ":" in spec and "/" not in spec else "unknown"

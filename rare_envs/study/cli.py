@@ -65,6 +65,7 @@ class Noise(str, Enum):
 
 Env = Annotated[str, typer.Argument(metavar="ENV", help="Environment, such as rare_envs/CutIn-v0.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
+Trust = Annotated[bool, typer.Option("--trust", help="Let the ego's .zip run code when it is loaded.")]
 Seed = Annotated[int, typer.Option(help="Seed; the same seed gives the same answer.")]
 Base = Annotated[str | None, typer.Option(help="Base distribution: a name or a JSON file.")]
 Drivers = Annotated[str | None, typer.Option(help="Of the vehicles around the ego: mgail, gail, bc, idm or a file.")]
@@ -89,10 +90,10 @@ def list_command(as_json: Json = False) -> None:
 def estimate_command(
     env: Env,
     ego: Annotated[
-        str, typer.Option(help="idm, mgail, gail, bc, a driver's or a Stable-Baselines3 file, or module:function.")
+        str, typer.Option(help="idm, mgail, gail, bc, a driver's, Stable-Baselines3 or .onnx file, or module:function.")
     ] = "idm",
     algo: Annotated[str | None, typer.Option(help="Algorithm of the .zip, if the file does not tell.")] = None,
-    trust: Annotated[bool, typer.Option("--trust", help="Let the ego's .zip run code when it is loaded.")] = False,
+    trust: Trust = False,
     method: Annotated[str, typer.Option(help="Estimation method; see rare-envs list.")] = "two-stage",
     base: Base = None,
     measure: Annotated[str, typer.Option(help="Safety measure f; small is dangerous.")] = "ttc",
@@ -201,6 +202,28 @@ def train_drivers_command(
         _print_json({"driver": str(path), "method": method, "seed": seed})
     else:
         print(f"Saved {path}. Load it with agents.load_driver({str(path)!r}).")
+
+
+@app.command("export-ego")
+def export_ego_command(
+    model: Annotated[Path, typer.Argument(metavar="MODEL", help="A .zip saved by Stable-Baselines3.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="The .onnx file to write.")],
+    algo: Annotated[str | None, typer.Option(help="Algorithm of the .zip, if the file does not tell.")] = None,
+    trust: Trust = False,
+    as_json: Json = False,
+) -> None:
+    """Write a saved policy as ONNX, normalisation, memory and clipping included, and check that both act alike."""
+    from rare_envs.study.export_ego import export_ego
+
+    with contextlib.redirect_stdout(sys.stderr):
+        done = export_ego(model, out, algo=algo, trust=trust)
+    if as_json:
+        _print_json(done)
+    else:
+        print(
+            f"Wrote {out}: its actions differ by {done['largest_difference']:.1e} at most "
+            f"on {done['observations_tried']:,} random observations."
+        )
 
 
 def _noise(word: Noise) -> bool | str:
