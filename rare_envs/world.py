@@ -148,14 +148,39 @@ class World:
         """
         size = self.scenario.size
         state = self.scenario.initial(x[:, :size])
-        collided = torch.zeros(len(x), dtype=torch.bool, device=x.device)
         minds = None
         if self.drivers is not None:
             weights, noise = x[:, size : size + self.weights], x[:, size + self.weights :]
             minds = begin(self.drivers, weights.contiguous(), self._draws(noise))
-        moment = self._moment(state, self._placed(state))
+        return self.first(state, self._look(state, self._placed(state)), minds)
+
+    def first(self, state: State, perception: Tensor | None, minds: Minds | None = None) -> Episode:
+        """Episodes at time 0.
+
+        Args:
+            state: Of B scenarios; the vehicle in the ego's place is the one whose episodes these are.
+            perception: What the vehicles see, in the same order.
+            minds: Of the drivers around the ego.
+        """
+        road = self.scenario.road
+        collided = torch.zeros_like(state.x[:, 0], dtype=torch.bool)
+        moment = Moment(state, lead_of(state, road), road, perception, None, self.dt)
         kept = self._measure.begin(moment, self.ticks)
-        return Episode(state, moment.lead, kept, collided, moment.road, moment.perception, minds, None, self._measure)
+        return Episode(state, moment.lead, kept, collided, road, perception, minds, None, self._measure)
+
+    def next(self, episode: Episode, state: State, perception: Tensor | None, hit: Tensor) -> Episode:
+        """Episodes one tick later; minds and who has strayed stay as they were.
+
+        Args:
+            episode: Before the tick.
+            state: After it.
+            perception: What the vehicles see then.
+            hit: Whether the vehicle in the ego's place touches another or is off the road, boolean, shape (B,).
+        """
+        moment = Moment(state, lead_of(state, episode.road), episode.road, perception, episode.state, self.dt)
+        collided = episode.collided | hit
+        kept = self._measure.fold(episode.kept, moment, episode.collided, collided)
+        return episode._replace(state=state, lead=moment.lead, kept=kept, collided=collided, perception=perception)
 
     def _draws(self, noise: Tensor) -> Tensor:
         """Draws of the drivers' noise as tensors, shape (B, 2 + T, M, 2), or (B, 0, M, 2)."""
@@ -164,10 +189,9 @@ class World:
             return self._fixed.to(noise).expand(batch, -1, -1, -1)
         return noise.reshape(batch, -1 if self._noisy else 0, *shape)
 
-    def _moment(self, state: State, placed: Placed | None, before: State | None = None) -> Moment:
-        road = self.scenario.road
-        seen = look(state, road, placed) if self.sees else None
-        return Moment(state, lead_of(state, road), road, seen, before, self.dt)
+    def _look(self, state: State, placed: Placed | None) -> Tensor | None:
+        """What the vehicles see, if they look."""
+        return look(state, self.scenario.road, placed) if self.sees else None
 
     def _placed(self, state: State) -> Placed | None:
         """Where the vehicles are in the flat world, if they look."""
@@ -210,8 +234,6 @@ class World:
         x, y, heading, speed = (torch.cat((first[None], rest.T)).T for first, rest in zip(moved, others, strict=True))
         state = State(x, y, heading, speed, old.theta)
         placed = self._placed(state)
-        moment = self._moment(state, placed, old)
         hit = ego_overlaps(state, road, placed).any(dim=1) | road.off_road(state.y[:, 0])
-        collided = episode.collided | hit
-        kept = self._measure.fold(episode.kept, moment, episode.collided, collided)
-        return Episode(state, moment.lead, kept, collided, road, moment.perception, minds, strayed, self._measure)
+        episode = episode._replace(minds=minds, strayed=strayed)
+        return self.next(episode, state, self._look(state, placed), hit)

@@ -9,6 +9,7 @@ from rare_envs.geometry import ego_overlaps, overlaps
 from rare_envs.observation import observe
 from rare_envs.setup import set_up
 from rare_envs.state import State
+from rare_envs.world import look
 
 every = pytest.mark.parametrize("env_id", rare_envs.ENV_IDS)
 
@@ -120,7 +121,7 @@ def test_every_vehicle_observes_what_an_ego_in_its_place_would(env_id):
     world, episode = start(env_id, observation="lidar", horizon=1.0)
     for vehicle in range(world.scenario.vehicles):
         state = episode.state.seen_by(vehicle)
-        looking = world._moment(state, world._placed(state)).perception
+        looking = look(state, world.scenario.road)
         as_ego = episode._replace(state=state, perception=looking)
         for observation in ("features", "lidar"):
             torch.testing.assert_close(observe(episode, observation, vehicle), observe(as_ego, observation))
