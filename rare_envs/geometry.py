@@ -1,10 +1,11 @@
-"""Where vehicles are relative to each other: the lead, overlap of oriented boxes, the kind of a collision."""
+"""Where vehicles are relative to each other: the lead, overlap of oriented boxes."""
 
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from rare_envs.crashes import collision_type as collision_type
 from rare_envs.road import Placed, Road
 from rare_envs.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
 
@@ -44,6 +45,16 @@ def lead_of(state: State, road: Road) -> Lead:
         nearer = seen & (way <= nearest)
         nearest, lead_speed = torch.where(nearer, way, nearest), torch.where(nearer, speed, lead_speed)
     return Lead(nearest - VEHICLE_LENGTH, state.speed[:, 0] - lead_speed)
+
+
+def lead_index(state: State, road: Road) -> Tensor:
+    """Which vehicle is the ego's lead, see `lead_of`: its index, int64, shape (B,); 0, the ego, if there is none."""
+    x, y = state.x[:, :1], state.y[:, :1]
+    ahead, reach = state.x - x, (road.width + VEHICLE_WIDTH) / 2
+    minded = (ahead >= 0) & ((state.y - road.centre_of(y)).abs() <= reach)
+    way = torch.where(minded, ahead, torch.inf)[:, 1:]
+    least, found = way.flip(1).min(1)  # of vehicles level with each other the last one, as in `lead_of`
+    return torch.where(least < torch.inf, way.shape[1] - found, 0)
 
 
 def boxes_overlap(dx: Tensor, dy: Tensor, heading: Tensor, other_heading: Tensor) -> Tensor:
@@ -119,28 +130,3 @@ def overlaps(state: State, road: Road, placed: Placed | None = None) -> Tensor:
         both[row, i, j] = hit
         both[row, j, i] = hit
     return both
-
-
-def collision_type(state: State, road: Road, row: int = 0) -> str:
-    """What the ego of one scenario, in which there was a collision, has run into.
-
-    The contact is across the axis along which the bodies overlap least.
-
-    Args:
-        state: Traffic at the moment of the collision.
-        road: Their road.
-        row: Which of the B scenarios.
-
-    Returns:
-        "rear_end" (the ego hits a vehicle ahead), "rear_ended" (it is hit from behind), "side" (flank to flank) or
-        "road_edge" (no vehicle, so the edge of the road).
-    """
-    hits = ego_overlaps(state, road)[row].nonzero().flatten().tolist()
-    if not hits:
-        return "road_edge"
-    j = hits[0] + 1
-    dx = float(state.x[row, j] - state.x[row, 0])
-    dy = float(state.y[row, j] - state.y[row, 0])
-    if VEHICLE_WIDTH - abs(dy) < VEHICLE_LENGTH - abs(dx):
-        return "side"
-    return "rear_end" if dx > 0 else "rear_ended"

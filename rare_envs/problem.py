@@ -23,7 +23,7 @@ RULE_TILE = 16384
 POLICY_TILE = 4096
 """Likewise with a policy; fixed, because matrix products round differently by batch size."""
 LIDAR_TILE = 512
-"""Likewise where vehicles look: small enough for what a tick needs to stay in the cache."""
+"""Likewise where vehicles look, or whole episodes are kept: small enough for what is needed to stay in the cache."""
 
 
 class DrivingProblem:
@@ -103,7 +103,7 @@ class DrivingProblem:
         """
         x = self.space.validate(np.atleast_2d(x))
         tile = POLICY_TILE if isinstance(self.driver, PolicyDriver) else RULE_TILE
-        tile = LIDAR_TILE if self.world.sees else tile
+        tile = LIDAR_TILE if self.world.sees or self.world.recorded else tile
         f = np.empty(len(x))
         with torch.inference_mode():
             for first in range(0, len(x), tile):

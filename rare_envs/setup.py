@@ -4,6 +4,7 @@ import inspect
 from typing import Any
 
 import numpy as np
+import torch
 
 from rare_envs.background import find_drivers
 from rare_envs.bases import load_base
@@ -87,7 +88,31 @@ def set_up(
         noise=noise,
         observation=observation,
     )
-    return world, space_of(world, load_base(scenario, base))
+    space = space_of(world, load_base(scenario, base))
+    if not isinstance(measure, str):
+        _try_measure(world, space)
+    return world, space
+
+
+@torch.inference_mode()
+def _try_measure(world: World, space: ScenarioSpace) -> None:
+    """Let a user's measure judge two drives of one tick, so that a broken one is found before the simulations.
+
+    Raises:
+        ValueError: If it raises, or does not give one finite number for each.
+    """
+    x = torch.from_numpy(space.sample(2, np.random.default_rng(0))).float()
+    try:
+        f = world.step(world.start(x), torch.zeros(2, 2)).f
+    except Exception as error:  # the function is the user's: anything may happen in it
+        raise ValueError(f"The measure {world.measure!r} fails on two ordinary scenarios: {error!r}") from error
+    if not isinstance(f, torch.Tensor) or f.shape != (2,):
+        raise ValueError(
+            f"Expected the measure {world.measure!r} to give one number for each of 2 scenarios, shape (2,), "
+            f"got {f.shape if isinstance(f, torch.Tensor) else f!r}."
+        )
+    if not bool(torch.isfinite(f).all()):
+        raise ValueError(f"Expected finite numbers from the measure {world.measure!r}, got {f.tolist()}.")
 
 
 def space_of(world: World, base: Distribution) -> ScenarioSpace:

@@ -110,6 +110,11 @@ class World:
         needed = self.drivers is not None or self._measure.sees
         return self.lidar or needed or self.observation == "lidar"
 
+    @property
+    def recorded(self) -> bool:
+        """Whether the measure keeps whole episodes."""
+        return bool(getattr(self._measure, "records", False))
+
     @cached_property
     def _measure(self) -> EpisodeMeasure:
         return find_measure(self.measure)

@@ -86,7 +86,8 @@ class Measure:
         if self.collision is None:
             worth = kept
         elif callable(self.collision):
-            worth = torch.where(before, kept, self.collision(moment))
+            new = now & ~before
+            worth = torch.where(new, self.collision(moment), kept) if bool(new.any()) else kept
         else:
             worth = self.collision
         return torch.where(now, worth, f)

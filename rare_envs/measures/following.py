@@ -1,18 +1,14 @@
-"""Time to collision of the ego with what is ahead of it: its lead, the edge of the road, what its lidar meets."""
+"""Times until the ego meets what is ahead of it: its lead, the edge of the road, what its lidar sees."""
 
 import torch
 from torch import Tensor
 
+from rare_envs.measures.lead import GAP_MIN, STILL, acceleration_of_lead, gap_of
 from rare_envs.measures.moment import Moment
 from rare_envs.perception import RANGES, RATES
 
 TTC_MAX = 10.0
 """Cap of the time to collision [s]; what is further away, or not closing, counts as this."""
-_GAP_MIN = 0.01
-"""Gaps are floored here [m] so that only a collision, never a narrow escape, comes to 0 or less."""
-
-_STILL = 1e-4
-"""Closing speeds are floored here [m/s], far below gap / TTC_MAX, so no value under the cap changes."""
 
 
 def ttc(moment: Moment) -> Tensor:
@@ -34,13 +30,21 @@ def ttc(moment: Moment) -> Tensor:
     References:
         Hayward, "Near-miss determination through use of a scale of danger", 1972.
     """
-    state, lead, road = moment.state, moment.lead, moment.road
-    to_lead = lead.gap.clamp(min=_GAP_MIN) / lead.closing_speed.clamp(min=_STILL)
+    lead = moment.lead
+    to_lead = lead.gap.clamp(min=GAP_MIN) / lead.closing_speed.clamp(min=STILL)
+    return torch.minimum(to_lead, time_to_edge(moment)).clamp(max=TTC_MAX)
+
+
+def time_to_edge(moment: Moment) -> Tensor:
+    """Time until the ego's centre leaves the road if speed and heading stay [s], shape (B,).
+
+    Way to the edge / speed across the road towards it; without a cap, up to 20 000 s for an ego that drives straight.
+    """
+    state, road = moment.state, moment.road
     across = state.speed[:, 0] * torch.sin(state.heading[:, 0])
     offset = state.y[:, 0] - road.middle
     room = road.lanes * road.width / 2 - offset * torch.sign(across)
-    to_edge = room.clamp(min=_GAP_MIN) / across.abs().clamp(min=_STILL)
-    return torch.minimum(to_lead, to_edge).clamp(max=TTC_MAX)
+    return room.clamp(min=GAP_MIN) / across.abs().clamp(min=STILL)
 
 
 def lidar_ttc(moment: Moment) -> Tensor:
@@ -64,5 +68,53 @@ def lidar_ttc(moment: Moment) -> Tensor:
     assert moment.perception is not None
     ego = moment.perception[:, 0]
     closing = -ego[:, RATES]
-    time = torch.where(closing > 0.0, ego[:, RANGES] / closing.clamp(min=_STILL), TTC_MAX)
+    time = torch.where(closing > 0.0, ego[:, RANGES] / closing.clamp(min=STILL), TTC_MAX)
     return time.amin(dim=1).clamp(max=TTC_MAX)
+
+
+def mttc(moment: Moment) -> Tensor:
+    """Modified time to collision of the ego with its lead: if both keep their accelerations.
+
+    The least t > 0 with gap - dv t - da t^2 / 2 = 0, dv the closing speed, da the ego's acceleration less the lead's:
+    t = 2 gap / (dv + sqrt(dv^2 + 2 da gap)); there is none where the root is not real or the denominator not positive.
+    Accelerations are those of the last tick, along the ego's heading. As published, nobody stops: speeds may pass 0.
+
+    Critical values: as for the time to collision, often 1.5 to 4 s.
+
+    Args:
+        moment: Of B scenarios.
+
+    Returns:
+        Modified time to collision [s], in (0, TTC_MAX], shape (B,).
+
+    References:
+        Ozbay, Yang, Bartin and Mudigonda, "Derivation and validation of new simulation-based surrogate safety measure",
+        Transportation Research Record 2083, 2008.
+    """
+    gap, dv = gap_of(moment), moment.lead.closing_speed
+    da = moment.acceleration[:, 0] - acceleration_of_lead(moment)
+    square = dv.square() + 2.0 * da * gap
+    real = square > 0
+    denominator = dv + torch.where(real, square, 1.0).sqrt()
+    meets = real & (denominator > 2.0 * gap / TTC_MAX)
+    return torch.where(meets, 2.0 * gap / torch.where(meets, denominator, 1.0), TTC_MAX)
+
+
+def thw(moment: Moment) -> Tensor:
+    """Time headway of the ego: how long until it is where its lead's rear bumper is now, gap / speed.
+
+    SAE J2944 calls this the time gap and keeps "headway" for bumper-to-same-bumper, which would not be 0 in contact.
+
+    Critical values: 2 s is taught to drivers, under 0.9 s is fined in Germany (Vogel, 2003).
+
+    Args:
+        moment: Of B scenarios.
+
+    Returns:
+        Time headway [s], in (0, TTC_MAX], shape (B,).
+
+    References:
+        Vogel, "A comparison of headway and time to collision as safety indicators", Accident Analysis and Prevention
+        35, 2003.
+    """
+    return (gap_of(moment) / moment.state.speed[:, 0].clamp(min=STILL)).clamp(max=TTC_MAX)

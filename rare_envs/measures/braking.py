@@ -1,0 +1,106 @@
+"""How hard the ego has to brake for its lead, and how long it can wait with it."""
+
+import torch
+from torch import Tensor
+
+from rare_envs.actions import MAX_ACCELERATION
+from rare_envs.measures.following import TTC_MAX
+from rare_envs.measures.lead import STILL, acceleration_of_lead, gap_of
+from rare_envs.measures.moment import Moment
+
+BRAKES = MAX_ACCELERATION
+"""The hardest braking that an action can ask for [m/s^2]."""
+DECELERATION_MAX = 100.0
+"""Cap of decelerations [m/s^2], ten times what tyres can do; with a centimetre left they would be in the thousands."""
+
+
+def drac(moment: Moment) -> Tensor:
+    """Deceleration rate to avoid a crash: by which the ego just reaches its lead's speed when the gap is used up.
+
+    closing speed^2 / (2 gap) while closing, else 0; the lead keeps its speed.
+
+    Critical value: 3.4 m/s^2, the deceleration that most drivers find comfortable (AASHTO, 2004).
+
+    Args:
+        moment: Of B scenarios.
+
+    Returns:
+        Deceleration [m/s^2], in [0, DECELERATION_MAX], shape (B,).
+
+    References:
+        Almqvist, Hyden and Risser, "Use of speed limiters in cars for increased safety and a better environment",
+        Transportation Research Record 1318, 1991; Archer, "Indicators for traffic safety assessment and prediction",
+        2005.
+    """
+    closing = moment.lead.closing_speed.clamp(min=0.0)
+    return (closing.square() / (2.0 * gap_of(moment))).clamp(max=DECELERATION_MAX)
+
+
+def required_deceleration(moment: Moment) -> Tensor:
+    """The least constant deceleration of the ego with which it never touches its lead, which keeps its own.
+
+    With b the deceleration of the lead over the last tick (b = 0 where it speeds up), v the ego's speed, w the lead's
+    and dv = v - w, two cases. The speeds become equal while the lead still moves: b + dv^2 / (2 gap). The lead stops
+    first, if 2 gap / dv > w / b or dv <= 0: v^2 / (2 (gap + w^2 / (2 b))). If b = 0 it is `drac`.
+
+    Critical values: 3.4 m/s^2 is comfortable, above 8 m/s^2 a dry road gives no more.
+
+    Args:
+        moment: Of B scenarios.
+
+    Returns:
+        Deceleration [m/s^2], in [0, DECELERATION_MAX], shape (B,).
+
+    References:
+        Jansson, "Collision avoidance theory with application to automotive collision mitigation", 2005 (the first case,
+        as the required longitudinal acceleration).
+    """
+    gap, dv, speed = gap_of(moment), moment.lead.closing_speed, moment.state.speed[:, 0]
+    lead_speed = (speed - dv).clamp(min=0.0)
+    braking = (-acceleration_of_lead(moment)).clamp(min=0.0)
+    rolling = braking + dv.clamp(min=0.0).square() / (2.0 * gap)
+    # the ways are compared crosswise, without a division by what may be 0
+    stops_first = (braking > 0) & ((dv <= 0) | (2.0 * gap * braking > lead_speed * dv))
+    way = gap + lead_speed.square() / (2.0 * torch.where(stops_first, braking, 1.0))
+    required = torch.where(stops_first, speed.square() / (2.0 * way), rolling)
+    return required.clamp(max=DECELERATION_MAX)
+
+
+def btn(moment: Moment, brakes: float = BRAKES) -> Tensor:
+    """Brake threat number: the required deceleration as a share of what the brakes can do.
+
+    Critical value: 1, above which braking alone cannot prevent the collision.
+
+    Args:
+        moment: Of B scenarios.
+        brakes: The hardest braking of the ego [m/s^2].
+
+    Returns:
+        Brake threat number, in [0, DECELERATION_MAX / brakes], shape (B,).
+
+    References:
+        Jansson, "Collision avoidance theory with application to automotive collision mitigation", 2005.
+    """
+    return required_deceleration(moment) / brakes
+
+
+def ttb(moment: Moment, brakes: float = BRAKES) -> Tensor:
+    """Time to brake: how long the ego can wait until it must brake fully for its lead, which keeps its speed.
+
+    gap / closing speed - closing speed / (2 brakes). Negative past the point of no return: by how much it is too late.
+
+    Critical value: 0, the point of no return.
+
+    Args:
+        moment: Of B scenarios.
+        brakes: The hardest braking of the ego [m/s^2].
+
+    Returns:
+        Time to brake [s], in (-TTC_MAX, TTC_MAX], shape (B,).
+
+    References:
+        Hillenbrand, Spieker and Kroschel, "A multilevel collision mitigation approach: its situation assessment,
+        decision making, and performance tradeoffs", IEEE Transactions on Intelligent Transportation Systems 7, 2006.
+    """
+    closing = moment.lead.closing_speed.clamp(min=STILL)
+    return (gap_of(moment) / closing - closing / (2.0 * brakes)).clamp(-0.99 * TTC_MAX, TTC_MAX)
