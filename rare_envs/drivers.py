@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rare_envs.actions import to_physical
+from rare_envs.actions import IDLE, read_actions
 from rare_envs.geometry import Lead
 from rare_envs.observation import observe
 from rare_envs.road import Road
@@ -37,7 +37,8 @@ class Driver(Protocol):
             memory: What the last call returned, None at the start.
 
         Returns:
-            Acceleration [m/s^2] and steering angle [rad], shape (B, 2), and the new memory.
+            Acceleration [m/s^2] and steering angle [rad], shape (B, 2), or in a world with meta-actions these, shape
+            (B,); and the new memory.
         """
         ...
 
@@ -122,7 +123,20 @@ def lane_keeping(y: Tensor, heading: Tensor, speed: Tensor, road: Road) -> Tenso
     Returns:
         Steering angle [rad], shape (B,).
     """
-    offset = y - road.centre_of(y)
+    return steering_control(y - road.centre_of(y), heading, speed)
+
+
+def steering_control(offset: Tensor, heading: Tensor, speed: Tensor) -> Tensor:
+    """HighwayEnv's steering controller (`ControlledVehicle.steering_control`) towards a line.
+
+    Args:
+        offset: Place to the right of the line [m], any shape; the other tensors have the same.
+        heading: Heading relative to the line [rad].
+        speed: Speed [m/s].
+
+    Returns:
+        Steering angle [rad].
+    """
     speed = speed.clamp(min=_NEAR_ZERO)
     heading_command = torch.asin((offset / (-0.6 * speed)).clamp(-1.0, 1.0)).clamp(-np.pi / 4, np.pi / 4)
     yaw_rate = 5.0 * (heading_command - heading)
@@ -137,6 +151,10 @@ class PolicyDriver:
     policy: Any
     observation: str = "features"
     """What it observes."""
+    action: str = "continuous"
+    """What its actions are."""
+    stride: int = 1
+    """It is asked every so many ticks; meta-actions only are carried out in between."""
 
     def act(self, episode: "Episode", memory: Any) -> tuple[Tensor, Any]:
         """Observe, and ask the policy for its mean action; a recurrent policy's hidden state is the memory.
@@ -149,9 +167,12 @@ class PolicyDriver:
         """
         state, over = episode.state, episode.collided
         batch = len(over)
+        hidden, tick = (None, 0) if memory is None else memory
+        if tick % self.stride:
+            return torch.full((batch,), IDLE, device=state.x.device), (hidden, tick + 1)
         start = np.full(batch, memory is None)
-        hidden = None if memory is None else memory[0]
-        observation = observe(episode, self.observation).masked_fill(over[:, None], 0.0).numpy(force=True)
+        seen = observe(episode, self.observation)
+        observation = seen.masked_fill(over.view(-1, *[1] * (seen.ndim - 1)), 0.0).numpy(force=True)
         action, hidden = self.policy.predict(observation, state=hidden, episode_start=start, deterministic=True)
-        physical = to_physical(torch.as_tensor(np.asarray(action)).to(state.x.device), batch, over)
-        return physical.to(state.x), (hidden,)
+        given = read_actions(self.action, torch.as_tensor(np.asarray(action)).to(state.x.device), batch, over)
+        return given.to(state.x) if given.is_floating_point() else given, (hidden, tick + 1)

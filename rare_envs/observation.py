@@ -1,4 +1,4 @@
-"""What an ego observes: `features`, its own state and the others' relative to it, or `lidar`."""
+"""What an ego observes: `features`, its own state and the others' relative to it, `lidar`, or `kinematics`."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -8,11 +8,16 @@ import torch
 from gymnasium import spaces
 from torch import Tensor
 
+from rare_envs.kinematics import kinematics, kinematics_space
 from rare_envs.lidar import BEAMS, MAX_RANGE
 from rare_envs.state import LANE_WIDTH, VEHICLE_LENGTH, State
 
 if TYPE_CHECKING:
     from rare_envs.world import Episode
+
+
+OBSERVATIONS = ("features", "lidar", "kinematics")
+"""Kinds of observations."""
 
 
 @dataclass(frozen=True)
@@ -51,8 +56,11 @@ def observation_space(vehicles: int, observation: str = "features") -> "spaces.B
 
     Args:
         vehicles: N.
-        observation: "features": 3 of the ego, then 4 of each other vehicle; or "lidar": the ego's 51.
+        observation: "features": 3 of the ego, then 4 of each other vehicle; "lidar": the ego's 51; "kinematics":
+            HighwayEnv's 5 x 5.
     """
+    if observation == "kinematics":
+        return kinematics_space()
     size = len(EGO_FEATURES) + len(OTHER_FEATURES) * (vehicles - 1)
     return spaces.Box(-CLIP, CLIP, (len(LIDAR_SCALES) if observation == "lidar" else size,), np.float32)
 
@@ -62,12 +70,14 @@ def observe(episode: "Episode", observation: str, vehicle: int = 0) -> Tensor:
 
     Args:
         episode: B episodes.
-        observation: "features" or "lidar".
+        observation: One of `OBSERVATIONS`.
         vehicle: Index of the vehicle that looks.
 
     Returns:
-        Shape (B, F), float32, within +-`CLIP`.
+        Shape (B, F), float32, within +-`CLIP`; (B, 5, 5) for "kinematics".
     """
+    if observation == "kinematics":
+        return kinematics(episode.state, episode.road, vehicle)
     if observation == "lidar":
         assert episode.perception is not None
         scales = episode.perception.new_tensor(LIDAR_SCALES)

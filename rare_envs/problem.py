@@ -8,7 +8,7 @@ import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from rare_envs.actions import DISCRETE_ACTIONS
+from rare_envs.actions import DISCRETE_ACTIONS, META_ACTIONS
 from rare_envs.background import Background
 from rare_envs.drivers import IDM, Driver, PolicyDriver
 from rare_envs.observation import observation_space
@@ -132,8 +132,8 @@ def as_driver(ego: Any, world: World) -> Driver:
         return looking
     if callable(getattr(ego, "predict", None)):
         expected = observation_space(world.scenario.vehicles, world.observation)
-        check_spaces(ego, expected)
-        return PolicyDriver(fitted(ego, expected.shape), world.observation)
+        check_spaces(ego, expected, world.action)
+        return PolicyDriver(fitted(ego, expected.shape), world.observation, world.action, world.stride)
     if isinstance(ego, Background):
         raise ValueError("These drivers drive the traffic around an ego; as an ego take agents.LearnedEgo(driver).")
     if callable(getattr(ego, "act", None)):
@@ -142,8 +142,10 @@ def as_driver(ego: Any, world: World) -> Driver:
     raise ValueError(f"Expected an ego with a method predict(observation, ...), got {type(ego).__name__}.")
 
 
-def check_spaces(ego: Any, expected: "spaces.Box[np.float32]") -> None:
+def check_spaces(ego: Any, expected: "spaces.Box[np.float32]", action: str = "continuous") -> None:
     """Refuse an ego that was made for other observations or actions; one that does not tell is taken at its word.
+
+    Bounds may differ: HighwayEnv declares none for the observations that are clipped here as there.
 
     Raises:
         ValueError: If its `observation_space` or `action_space` does not fit.
@@ -156,6 +158,13 @@ def check_spaces(ego: Any, expected: "spaces.Box[np.float32]") -> None:
             "train it in this environment or choose another observation."
         )
     acted = getattr(ego, "action_space", None)
+    if acted is not None and action == "meta":
+        if not (isinstance(acted, spaces.Discrete) and int(acted.n) == len(META_ACTIONS)):
+            raise ValueError(
+                f"The ego acts in {acted}, the environment takes Discrete({len(META_ACTIONS)}) "
+                f"({', '.join(META_ACTIONS)}); leave action='meta' out for an ego that accelerates and steers."
+            )
+        return
     discrete = isinstance(acted, spaces.Discrete) and int(acted.n) == len(DISCRETE_ACTIONS)
     if acted is not None and not discrete and getattr(acted, "shape", None) != (2,):
         raise ValueError(

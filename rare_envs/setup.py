@@ -6,16 +6,15 @@ from typing import Any
 import numpy as np
 import torch
 
+from rare_envs.actions import ACTIONS
 from rare_envs.background import find_drivers
 from rare_envs.bases import load_base
 from rare_envs.blocks import NoiseLaw, beside
+from rare_envs.observation import OBSERVATIONS
 from rare_envs.scenarios import SCENARIOS
 from rare_envs.scenarios.base import Scenario
 from rare_envs.space import Distribution, Parameter, ScenarioSpace, did_you_mean
 from rare_envs.world import World
-
-OBSERVATIONS = ("features", "lidar")
-ACTIONS = ("continuous",)
 
 
 def find_scenario(env_id: str) -> Scenario:
@@ -47,8 +46,8 @@ def set_up(
 
     Args:
         env_id: For example "rare_envs/CutIn-v0".
-        observation: "features" or "lidar".
-        action: "continuous".
+        observation: "features", "lidar" or "kinematics" (HighwayEnv's).
+        action: "continuous" or "meta" (HighwayEnv's, see `rare_envs.meta`: a step is then one second).
         measure: The safety measure: a name in `rare_envs.measures.MEASURES`, a `Measure` or another of its kind, or a
             function; see `rare_envs.measures.find_measure`.
         horizon: Length of an episode [s]; None takes the scenario's.
@@ -87,6 +86,7 @@ def set_up(
         drivers=background,
         noise=noise,
         observation=observation,
+        action=action,
     )
     space = space_of(world, load_base(scenario, base))
     if not isinstance(measure, str):

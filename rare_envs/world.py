@@ -14,6 +14,7 @@ from rare_envs.dynamics import bicycle
 from rare_envs.geometry import Lead, ego_overlaps, lead_of
 from rare_envs.lidar import Bodies
 from rare_envs.measures import MEASURES, EpisodeMeasure, Moment, find_measure
+from rare_envs.meta import DECISION, Aim, aim_of, follow
 from rare_envs.perception import OnRoad, perceive
 from rare_envs.road import Placed, Road
 from rare_envs.scenarios.base import Scenario
@@ -41,6 +42,8 @@ class Episode(NamedTuple):
     """Which vehicles have been commanded, so that a script no longer knows them, boolean, shape (B, N); None before
     anyone but the ego has been."""
     measure: EpisodeMeasure = MEASURES["ttc"]
+    aim: Aim | None = None
+    """What the controllers of vehicles with meta-actions aim for, (B, N) each; None in a world without such actions."""
 
     @property
     def f(self) -> Tensor:
@@ -76,7 +79,9 @@ class World:
     noise: bool | str = True
     """Drivers' noise: True, part of x; "fixed", one sequence for all x; False, mean actions."""
     observation: str = "features"
-    """What the ego observes: "features" or "lidar"."""
+    """What the ego observes: "features", "lidar" or "kinematics"."""
+    action: str = "continuous"
+    """What a policy decides: "continuous", each tick, or "meta", each second."""
     lidar: bool = False
     """Look even if neither drivers nor measure nor observation ask for it."""
 
@@ -88,6 +93,12 @@ class World:
         whole = _is_number(self.horizon) and self.dt <= self.seconds < 1e6
         if not whole or abs(self.seconds / self.dt - self.ticks) > 1e-6:
             raise ValueError(f"Expected a horizon of one or more whole ticks of {self.dt} s, got {self.horizon!r}.")
+        for what, seconds in (("dt", 1.0 / self.dt), ("horizon", self.seconds / DECISION)):
+            if self.action == "meta" and abs(seconds - round(seconds)) > 1e-6:
+                raise ValueError(
+                    f"Expected a dt that divides 1 s and a horizon of whole seconds with action='meta', in which a "
+                    f"decision takes 1 s; got {what} = {getattr(self, what)!r}."
+                )
         find_measure(self.measure)
         if not (isinstance(self.noise, bool) or self.noise == "fixed"):
             raise ValueError(f"Expected noise True, False or 'fixed', got {self.noise!r}.")
@@ -103,6 +114,11 @@ class World:
     def ticks(self) -> int:
         """Length of an episode in ticks."""
         return round(self.seconds / self.dt)
+
+    @property
+    def stride(self) -> int:
+        """Ticks from one decision of a policy to the next."""
+        return round(DECISION / self.dt) if self.action == "meta" else 1
 
     @property
     def sees(self) -> bool:
@@ -171,7 +187,8 @@ class World:
         collided = torch.zeros_like(state.x[:, 0], dtype=torch.bool)
         moment = Moment(state, lead_of(state, road), road, perception, None, self.dt)
         kept = self._measure.begin(moment, self.ticks)
-        return Episode(state, moment.lead, kept, collided, road, perception, minds, None, self._measure)
+        aim = aim_of(state, road) if self.action == "meta" else None
+        return Episode(state, moment.lead, kept, collided, road, perception, minds, None, self._measure, aim)
 
     def next(self, episode: Episode, state: State, perception: Tensor | None, hit: Tensor) -> Episode:
         """Episodes one tick later; minds and who has strayed stay as they were.
@@ -202,6 +219,22 @@ class World:
         """Where the vehicles are in the flat world, if they look."""
         return self.scenario.road.place(state.x, state.y, state.heading) if self.sees else None
 
+    def obey(self, episode: Episode, action: Tensor, commanded: Tensor | None = None) -> tuple[Episode, Tensor]:
+        """Turn meta-actions, if such they are, into what the vehicles' controllers do in this tick.
+
+        Args:
+            episode: B episodes.
+            action: As in `step`.
+            commanded: As in `step`.
+
+        Returns:
+            The episodes with their new aims, and accelerations [m/s^2] and steering angles [rad] in a last axis of 2.
+        """
+        if episode.aim is None or action.is_floating_point():
+            return episode, action
+        aim, action = follow(episode.aim, action, commanded, episode.state, episode.road)
+        return episode._replace(aim=aim), action
+
     def step(self, episode: Episode, action: Tensor, commanded: Tensor | None = None) -> Episode:
         """Move every vehicle by one tick: all decide on the old state, then all move.
 
@@ -215,13 +248,15 @@ class World:
         Args:
             episode: B episodes.
             action: Acceleration [m/s^2] and steering angle [rad] of the ego, shape (B, 2); with `commanded` of all
-                vehicles, shape (B, N, 2).
+                vehicles, shape (B, N, 2). In a world with meta-actions also those, whole numbers of shape (B,) or
+                (B, N): a decision, and `IDLE` in the ticks that follow it.
             commanded: Which vehicles obey their action, boolean, shape (B, N); the ego always does. None if the
                 others keep their drivers.
 
         Returns:
             The episodes one tick later.
         """
+        episode, action = self.obey(episode, action, commanded)
         old, dt, road, minds = episode.state, self.dt, episode.road, episode.minds
         steered = action if commanded is None else action[:, 0]
         ego = (old.x[:, 0], old.y[:, 0], old.heading[:, 0], old.speed[:, 0])

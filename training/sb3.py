@@ -28,7 +28,7 @@ def sb3_vec_env(
         num_envs: Number of episodes that run side by side.
         seed: Seed of the first reset; an algorithm's own seed replaces it.
         discrete: Offer the rows of `rare_envs.actions.DISCRETE_ACTIONS` as a `Discrete` action
-            space, for algorithms such as DQN.
+            space, for algorithms such as DQN; an environment with `action="meta"` has one already.
         **make_kwargs: Keyword arguments of `gym.make` for this environment.
 
     Returns:
@@ -42,8 +42,9 @@ def sb3_vec_env(
 
     if num_envs < 1:
         raise ValueError(f"Expected num_envs >= 1, got {num_envs}.")
-    actions = np.asarray(DISCRETE_ACTIONS) if discrete else None
-    env = BatchedVecEnv(rare_envs.make_batch(id, num_envs, **make_kwargs), actions)
+    batch = rare_envs.make_batch(id, num_envs, **make_kwargs)
+    continuous = isinstance(batch.single_action_space, gym.spaces.Box)
+    env = BatchedVecEnv(batch, np.asarray(DISCRETE_ACTIONS) if discrete and continuous else None)
     if seed is not None:
         env.seed(seed)
     return VecMonitor(env)

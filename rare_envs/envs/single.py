@@ -7,22 +7,23 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from rare_envs.actions import action_space, to_physical
+from rare_envs.actions import read_actions, space_of_actions
+from rare_envs.decisions import advance
 from rare_envs.envs.rendering import Renderer
 from rare_envs.geometry import collision_type
 from rare_envs.observation import observation_space, observe
-from rare_envs.reward import reward_terms
 from rare_envs.setup import set_up
 from rare_envs.world import Episode
 
 Observation = NDArray[np.float32]
 
 
-class DrivingEnv(gym.Env[Observation, NDArray[np.float32]]):
+class DrivingEnv(gym.Env[Observation, Any]):
     """The ego drives, everything else follows the scenario.
 
     Observation: `features`, see `rare_envs.observation`. Action: acceleration and steering in [-1, 1], see
-    `rare_envs.actions`. Reward: see `rare_envs.reward`. The episode terminates with a collision and is truncated at
+    `rare_envs.actions`, for one tick; with `action="meta"` one of HighwayEnv's meta-actions, see `rare_envs.meta`, for
+    one second. Reward: see `rare_envs.reward`. The episode terminates with a collision and is truncated at
     the horizon. `info` carries `scenario`, `x`, `min_ttc` [s], `collision`, `reward_terms`, and at the end `measure`
     (f(x)) and `collision_type`.
     """
@@ -42,8 +43,8 @@ class DrivingEnv(gym.Env[Observation, NDArray[np.float32]]):
         """
         self.world, self.space = set_up(env_id, **kwargs)
         self.observation_space = observation_space(self.world.scenario.vehicles, self.world.observation)
-        self.action_space = action_space()
-        self.metadata = {**self.metadata, "render_fps": round(1.0 / self.world.dt)}
+        self.action_space = space_of_actions(self.world.action)
+        self.metadata = {**self.metadata, "render_fps": round(1.0 / (self.world.dt * self.world.stride))}
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"Expected render_mode None, 'rgb_array' or 'human', got {render_mode!r}.")
         self.render_mode = render_mode
@@ -77,8 +78,8 @@ class DrivingEnv(gym.Env[Observation, NDArray[np.float32]]):
         self._show()
         return observation, self._info(self._episode)
 
-    def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Move by one tick; see the class for what comes back.
+    def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Carry out one decision; see the class for what comes back.
 
         Raises:
             ValueError: If the action has the wrong shape or is NaN.
@@ -86,14 +87,14 @@ class DrivingEnv(gym.Env[Observation, NDArray[np.float32]]):
         if self._episode is None:
             raise RuntimeError("Expected reset() before step().")
         if np.shape(action) != self.action_space.shape:
-            raise ValueError(f"Expected an action of shape (2,) (acceleration, steering), got {np.shape(action)}.")
+            wanted = "of shape (2,) (acceleration, steering)" if self.action_space.shape else "as one whole number"
+            raise ValueError(f"Expected an action {wanted}, got shape {np.shape(action)}.")
         with torch.inference_mode():
-            physical = to_physical(torch.as_tensor(np.asarray(action))[None], 1)
-            episode = self.world.step(self._episode, physical)
-            terms = reward_terms(episode, physical)
+            given = read_actions(self.world.action, torch.as_tensor(np.asarray(action))[None], 1)
+            episode, terms = advance(self.world, self._episode, given)
             observation = observe(episode, self.world.observation)[0].numpy()
             reward = float(terms.total)
-        self._episode, self._tick = episode, self._tick + 1
+        self._episode, self._tick = episode, self._tick + self.world.stride
         terminated = bool(episode.collided)
         truncated = not terminated and self._tick >= self.world.ticks
         info = self._info(episode)

@@ -10,11 +10,12 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rare_envs.actions import action_space, to_physical
+from rare_envs.actions import read_actions, space_of_actions
+from rare_envs.decisions import advance
 from rare_envs.envs.rendering import Renderer
 from rare_envs.geometry import collision_type
 from rare_envs.observation import observation_space, observe
-from rare_envs.reward import RewardTerms, reward_terms
+from rare_envs.reward import RewardTerms
 from rare_envs.setup import set_up
 from rare_envs.state import State
 from rare_envs.world import Episode
@@ -22,7 +23,7 @@ from rare_envs.world import Episode
 Info = dict[str, Any]
 
 
-class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArray[Any]]):
+class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]]):
     """`DrivingEnv` for a whole batch, with Gymnasium's SAME_STEP autoreset.
 
     An episode that ends is replaced within the step by one drawn from the base distribution; its last observation
@@ -52,11 +53,11 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArr
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"Expected render_mode None or 'rgb_array' for a batch, got {render_mode!r}.")
         self.world, self.space = set_up(env_id, **kwargs)
-        self.metadata = {**self.metadata, "render_fps": round(1.0 / self.world.dt)}
+        self.metadata = {**self.metadata, "render_fps": round(1.0 / (self.world.dt * self.world.stride))}
         self.num_envs = int(num_envs)
         self.render_mode = render_mode
         self.single_observation_space = observation_space(self.world.scenario.vehicles, self.world.observation)
-        self.single_action_space = action_space()
+        self.single_action_space = space_of_actions(self.world.action)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._x = np.full((num_envs, self.space.dim), np.nan)
@@ -92,9 +93,9 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArr
         return observation, self._info(self._episode, np.ones(self.num_envs, dtype=bool))
 
     def step(
-        self, actions: NDArray[np.float32]
+        self, actions: NDArray[Any]
     ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], Info]:
-        """Move all by one tick and replace the episodes that ended.
+        """Carry out one decision each and replace the episodes that ended.
 
         Raises:
             ValueError: If the actions have the wrong shape or are NaN.
@@ -102,13 +103,12 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[np.float32], NDArr
         if self._episode is None:
             raise RuntimeError("Expected reset() before step().")
         with torch.inference_mode():
-            physical = to_physical(torch.as_tensor(np.asarray(actions)), self.num_envs)
-            episode = self.world.step(self._episode, physical)
-            terms = reward_terms(episode, physical)
+            given = read_actions(self.world.action, torch.as_tensor(np.asarray(actions)), self.num_envs)
+            episode, terms = advance(self.world, self._episode, given)
             observation = observe(episode, self.world.observation).numpy()
             reward = terms.total.double().numpy()
         self._episode = episode
-        self._tick += 1
+        self._tick += self.world.stride
         terminated = episode.collided.numpy()
         truncated = (self._tick >= self.world.ticks) & ~terminated
         done = terminated | truncated

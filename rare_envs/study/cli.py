@@ -70,7 +70,8 @@ Seed = Annotated[int, typer.Option(help="Seed; the same seed gives the same answ
 Base = Annotated[str | None, typer.Option(help="Base distribution: a name or a JSON file.")]
 Drivers = Annotated[str | None, typer.Option(help="Of the vehicles around the ego: mgail, gail, bc, idm or a file.")]
 NoiseOption = Annotated[Noise, typer.Option("--noise", help="The drivers' noise: part of x, one fixed sequence, none.")]
-Observation = Annotated[str, typer.Option(help="What the ego observes: features or lidar.")]
+Observation = Annotated[str, typer.Option(help="What the ego observes: features, lidar, or HighwayEnv's kinematics.")]
+Action = Annotated[str, typer.Option(help="What it decides: continuous, each tick, or HighwayEnv's meta, each second.")]
 Horizon = Annotated[float | None, typer.Option(help="Length of an episode in seconds.")]
 
 
@@ -105,6 +106,7 @@ def estimate_command(
     drivers: Drivers = None,
     noise: NoiseOption = Noise.ON,
     observation: Observation = "features",
+    action: Action = "continuous",
     horizon: Horizon = None,
     out: Annotated[Path | None, typer.Option(help="Folder for result.json, failures.csv and plot.png.")] = None,
     as_json: Json = False,
@@ -129,6 +131,7 @@ def estimate_command(
         noise=_noise(noise),
         drivers=drivers,
         observation=observation,
+        action=action,
         horizon=horizon,
     )
     with contextlib.redirect_stdout(sys.stderr):  # an ego may print, and standard output is for the answer
@@ -158,6 +161,7 @@ def train_ego_command(
     drivers: Drivers = None,
     noise: NoiseOption = Noise.ON,
     observation: Observation = "features",
+    action: Action = "continuous",
     horizon: Horizon = None,
     as_json: Json = False,
 ) -> None:
@@ -170,14 +174,15 @@ def train_ego_command(
         "drivers": drivers,
         "noise": _noise(noise),
         "observation": observation,
+        "action": action,
         "horizon": horizon,
     }
     path = train(env, algo=algo, steps=steps, out=out, seed=seed, num_envs=num_envs, **world)
     if as_json:
         _print_json({"ego": str(path), "env_id": env, "algo": algo, "steps": steps, "seed": seed, **world})
     else:
-        words = {"base": base, "drivers": drivers, "noise": noise.value, "horizon": horizon, "observation": observation}
-        usual = {"noise": Noise.ON.value, "observation": "features"}
+        words = {**world, "noise": noise.value}
+        usual = {"noise": Noise.ON.value, "observation": "features", "action": "continuous"}
         told = [f" --{name} {word}" for name, word in words.items() if word not in (None, usual.get(name))]
         print(f"Saved {path}. Next: rare-envs estimate {env} --ego {path}{''.join(told)}")
 

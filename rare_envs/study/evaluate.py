@@ -40,7 +40,8 @@ class Question:
         noise: Noise of the drivers, as in `DrivingProblem`: True, "fixed" or False.
         drivers: Of the vehicles around the ego: the name of installed ones or a file; the scenario's default when None.
         horizon: Length of an episode [s]; the scenario's when None.
-        observation: What the ego observes: "features" or "lidar".
+        observation: What the ego observes: "features", "lidar" or "kinematics".
+        action: What a policy decides: "continuous" or "meta".
     """
 
     env_id: str
@@ -59,6 +60,7 @@ class Question:
     drivers: str | None = None
     horizon: float | None = None
     observation: str = "features"
+    action: str = "continuous"
 
 
 @dataclass(frozen=True)
@@ -155,6 +157,7 @@ def prepare(question: Question) -> Study:
             drivers=question.drivers,
             horizon=question.horizon,
             observation=question.observation,
+            action=question.action,
         )
     except (ValueError, OSError) as error:
         raise BadInput(error) from error

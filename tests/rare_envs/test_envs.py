@@ -227,7 +227,7 @@ def test_actions() -> None:
 def test_bad_arguments_are_refused_at_the_door() -> None:
     for kwargs in (
         {"observation": "features2"},
-        {"action": "meta"},
+        {"action": "mega"},
         {"measure": "tcc"},
         {"base": "us102"},
         {"horizon": -1.0},
