@@ -10,6 +10,8 @@ from torch import Tensor
 
 from rare_envs.state import VEHICLE_LENGTH, VEHICLE_WIDTH
 
+DIAGONAL = (VEHICLE_LENGTH**2 + VEHICLE_WIDTH**2) ** 0.5
+"""Bodies whose centres are further apart than this [m] do not touch."""
 _LENGTHS = (VEHICLE_LENGTH / 2, VEHICLE_WIDTH / 2)
 
 

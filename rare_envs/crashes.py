@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from rare_envs.boxes import axes_of, crossing, project, separation
+from rare_envs.boxes import DIAGONAL, axes_of, crossing, project, separation
 from rare_envs.encounter import pairs, velocities
 from rare_envs.road import Road
 from rare_envs.state import State
@@ -111,6 +111,20 @@ def crash_of_others(state: State, road: Road, before: State | None = None, dt: f
     """As `crash_of`, but between vehicles other than the ego, of kind "others"."""
     found = _pair_crash(state, road, before, dt, slice(state.x.shape[1] - 1, None))
     return found._replace(kind=torch.where(found.kind == NONE, NONE, OTHERS))
+
+
+def others_touch(state: State, road: Road) -> Tensor:
+    """Whether two vehicles other than the ego overlap, boolean, shape (B,)."""
+    n = state.x.shape[1] - 1
+    first, second = (list(index[n:]) for index in pairs(n + 1))
+    x, y, heading = road.to_world(state.x, state.y, state.heading)
+    dx, dy = x[:, second] - x[:, first], y[:, second] - y[:, first]
+    touch = (dx.abs() < DIAGONAL) & (dy.abs() < DIAGONAL)
+    if bool(touch.any()):
+        one, other = heading[:, first][touch], heading[:, second][touch]
+        touch[touch.clone()] = separation(axes_of(dx[touch], dy[touch], one, other)) < 0
+    touching: Tensor = touch.any(1)
+    return touching
 
 
 def _pair_crash(state: State, road: Road, before: State | None, dt: float, which: slice) -> Crash:

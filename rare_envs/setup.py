@@ -40,6 +40,7 @@ def set_up(
     base: Any = None,
     drivers: Any = None,
     noise: bool | str = True,
+    collisions: str = "ego",
     **unknown: Any,
 ) -> tuple[World, ScenarioSpace]:
     """The world and the scenario space of an environment.
@@ -59,7 +60,7 @@ def set_up(
             are parameters of the scenario.
         noise: What becomes of the drivers' noise. True: it is part of x, standard normal columns behind the others.
             "fixed": one sequence for all x, so that probabilities are conditional on it. False: mean actions.
-
+        collisions: Which count: those of the "ego", or "any", those between two other vehicles too.
         **unknown: What is none of these, and refused.
 
     Returns:
@@ -87,6 +88,7 @@ def set_up(
         noise=noise,
         observation=observation,
         action=action,
+        collisions=collisions,
     )
     space = space_of(world, load_base(scenario, base))
     if not isinstance(measure, str):

@@ -8,8 +8,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from rare_envs import witness
 from rare_envs.background import Background, Minds, begin, decide, fixed_draws, noise_size
 from rare_envs.commands import led
+from rare_envs.crashes import others_touch
 from rare_envs.dynamics import bicycle
 from rare_envs.geometry import Lead, ego_overlaps, lead_of
 from rare_envs.lidar import Bodies
@@ -19,6 +21,7 @@ from rare_envs.perception import OnRoad, perceive
 from rare_envs.road import Placed, Road
 from rare_envs.scenarios.base import Scenario
 from rare_envs.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
+from rare_envs.witness import Witness
 
 
 class Episode(NamedTuple):
@@ -44,6 +47,8 @@ class Episode(NamedTuple):
     measure: EpisodeMeasure = MEASURES["ttc"]
     aim: Aim | None = None
     """What the controllers of vehicles with meta-actions aim for, (B, N) each; None in a world without such actions."""
+    witness: Witness | None = None
+    """Least time to collision and crashes so far; None unless the world has a witness."""
 
     @property
     def f(self) -> Tensor:
@@ -84,6 +89,10 @@ class World:
     """What a policy decides: "continuous", each tick, or "meta", each second."""
     lidar: bool = False
     """Look even if neither drivers nor measure nor observation ask for it."""
+    collisions: str = "ego"
+    """Which collisions count: those of the "ego", or "any", those between other vehicles too."""
+    witnessed: bool = False
+    """Keep the least time to collision and who crashed with whom; see `Episode.witness`."""
 
     def __post_init__(self) -> None:
         if not (_is_number(self.dt) and 0.0 < self.dt <= 1.0):
@@ -100,6 +109,8 @@ class World:
                     f"decision takes 1 s; got {what} = {getattr(self, what)!r}."
                 )
         find_measure(self.measure)
+        if self.collisions not in ("ego", "any"):
+            raise ValueError(f"Expected collisions 'ego' or 'any', got {self.collisions!r}.")
         if not (isinstance(self.noise, bool) or self.noise == "fixed"):
             raise ValueError(f"Expected noise True, False or 'fixed', got {self.noise!r}.")
         if self.drivers is not None and self.dt != 0.1:
@@ -188,7 +199,8 @@ class World:
         moment = Moment(state, lead_of(state, road), road, perception, None, self.dt)
         kept = self._measure.begin(moment, self.ticks)
         aim = aim_of(state, road) if self.action == "meta" else None
-        return Episode(state, moment.lead, kept, collided, road, perception, minds, None, self._measure, aim)
+        seen = witness.begin(moment) if self.witnessed else None
+        return Episode(state, moment.lead, kept, collided, road, perception, minds, None, self._measure, aim, seen)
 
     def next(self, episode: Episode, state: State, perception: Tensor | None, hit: Tensor) -> Episode:
         """Episodes one tick later; minds and who has strayed stay as they were.
@@ -202,6 +214,9 @@ class World:
         moment = Moment(state, lead_of(state, episode.road), episode.road, perception, episode.state, self.dt)
         collided = episode.collided | hit
         kept = self._measure.fold(episode.kept, moment, episode.collided, collided)
+        seen = episode.witness
+        if seen is not None:
+            episode = episode._replace(witness=witness.fold(seen, moment, episode.collided, collided))
         return episode._replace(state=state, lead=moment.lead, kept=kept, collided=collided, perception=perception)
 
     def _draws(self, noise: Tensor) -> Tensor:
@@ -275,5 +290,7 @@ class World:
         state = State(x, y, heading, speed, old.theta)
         placed = self._placed(state)
         hit = ego_overlaps(state, road, placed).any(dim=1) | road.off_road(state.y[:, 0])
+        if self.collisions == "any":
+            hit = hit | others_touch(state, road)
         episode = episode._replace(minds=minds, strayed=strayed)
         return self.next(episode, state, self._look(state, placed), hit)

@@ -1,5 +1,6 @@
 """One scenario at a time: a `gymnasium.Env` over a batch of one."""
 
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -8,9 +9,9 @@ import torch
 from numpy.typing import NDArray
 
 from rare_envs.actions import read_actions, space_of_actions
+from rare_envs.crashes import describe
 from rare_envs.decisions import advance
 from rare_envs.envs.rendering import Renderer
-from rare_envs.geometry import collision_type
 from rare_envs.observation import observation_space, observe
 from rare_envs.setup import set_up
 from rare_envs.world import Episode
@@ -25,7 +26,7 @@ class DrivingEnv(gym.Env[Observation, Any]):
     `rare_envs.actions`, for one tick; with `action="meta"` one of HighwayEnv's meta-actions, see `rare_envs.meta`, for
     one second. Reward: see `rare_envs.reward`. The episode terminates with a collision and is truncated at
     the horizon. `info` carries `scenario`, `x`, `min_ttc` [s], `collision`, `reward_terms`, and at the end `measure`
-    (f(x)) and `collision_type`.
+    (f(x)), `collision_type` and `crash`, which say who ran into whom and how hard (`rare_envs.crashes`), or None.
     """
 
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 10}  # noqa: RUF012  (Gymnasium's own form)
@@ -41,7 +42,8 @@ class DrivingEnv(gym.Env[Observation, Any]):
         Raises:
             ValueError: If an argument is invalid.
         """
-        self.world, self.space = set_up(env_id, **kwargs)
+        world, self.space = set_up(env_id, **kwargs)
+        self.world = replace(world, witnessed=True)
         self.observation_space = observation_space(self.world.scenario.vehicles, self.world.observation)
         self.action_space = space_of_actions(self.world.action)
         self.metadata = {**self.metadata, "render_fps": round(1.0 / (self.world.dt * self.world.stride))}
@@ -101,16 +103,19 @@ class DrivingEnv(gym.Env[Observation, Any]):
         info["reward_terms"] = {name: float(value) for name, value in terms._asdict().items()}
         if terminated or truncated:
             info["measure"] = float(episode.f)
-            info["collision_type"] = collision_type(episode.state, episode.road) if terminated else None
+            assert episode.witness is not None
+            info["crash"] = crash = describe(episode.witness.crash)
+            info["collision_type"] = None if crash is None else crash["kind"]
         self._show()
         return observation, reward, terminated, truncated, info
 
     def _info(self, episode: Episode) -> dict[str, Any]:
+        assert episode.witness is not None
         collided = bool(episode.collided)
         return {
             "scenario": self.space.named(self._x),
             "x": self._x.copy(),
-            "min_ttc": 0.0 if collided else float(episode.f),
+            "min_ttc": 0.0 if collided else float(episode.witness.least_ttc),
             "collision": collided,
         }
 

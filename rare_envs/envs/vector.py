@@ -1,5 +1,6 @@
 """Many scenarios at once: a `gymnasium.vector.VectorEnv` that is one batch, not many environments."""
 
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -11,9 +12,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rare_envs.actions import read_actions, space_of_actions
+from rare_envs.crashes import KINDS, NONE
 from rare_envs.decisions import advance
 from rare_envs.envs.rendering import Renderer
-from rare_envs.geometry import collision_type
 from rare_envs.observation import observation_space, observe
 from rare_envs.reward import RewardTerms
 from rare_envs.setup import set_up
@@ -52,7 +53,8 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
             raise ValueError(f"Expected num_envs of at least 1, got {num_envs!r}.")
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"Expected render_mode None or 'rgb_array' for a batch, got {render_mode!r}.")
-        self.world, self.space = set_up(env_id, **kwargs)
+        world, self.space = set_up(env_id, **kwargs)
+        self.world = replace(world, witnessed=True)
         self.metadata = {**self.metadata, "render_fps": round(1.0 / (self.world.dt * self.world.stride))}
         self.num_envs = int(num_envs)
         self.render_mode = render_mode
@@ -139,6 +141,7 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         return observation
 
     def _info(self, episode: Episode, mask: NDArray[np.bool_]) -> Info:
+        assert episode.witness is not None
         collided = episode.collided.numpy()
         infos: Info = {}
         scenario: Info = {}
@@ -146,19 +149,24 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
             _put(scenario, name, column, mask)
         _put(infos, "scenario", scenario, mask)
         _put(infos, "x", self._x.copy(), mask)
-        _put(infos, "min_ttc", np.where(collided, 0.0, episode.f.double().numpy()), mask)
+        _put(infos, "min_ttc", np.where(collided, 0.0, episode.witness.least_ttc.double().numpy()), mask)
         _put(infos, "collision", collided.copy(), mask)
         return infos
 
     def _final_info(self, episode: Episode, terms: RewardTerms, done: NDArray[np.bool_]) -> Info:
         infos = self._info(episode, done)
-        collided = episode.collided.numpy()
-        kinds = np.full(self.num_envs, None, dtype=object)
-        for row in np.flatnonzero(collided):
-            kinds[row] = collision_type(episode.state, episode.road, int(row))
+        assert episode.witness is not None
+        crash = episode.witness.crash
+        crashed = done & (crash.kind != NONE).numpy()
+        kinds = np.array(KINDS, dtype=object)[crash.kind.numpy()]
+        kinds[~crashed] = None
         _put(infos, "reward_terms", _terms(terms, done), done)
         _put(infos, "measure", episode.f.double().numpy(), done)
-        _put(infos, "collision_type", kinds, done & collided)
+        _put(infos, "collision_type", kinds, crashed)
+        details: Info = {}
+        for name, values in {**crash._asdict(), "kind": kinds}.items():
+            _put(details, name, values if name == "kind" else values.numpy(), crashed)
+        _put(infos, "crash", details, crashed)
         return infos
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:

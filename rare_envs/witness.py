@@ -1,0 +1,52 @@
+"""What an onlooker keeps of an episode beside its measure: the least time to collision, and who crashed with whom."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from rare_envs.crashes import NONE, Crash, crash_of, crash_of_others, others_touch
+from rare_envs.measures import Moment, ttc
+
+
+class Witness(NamedTuple):
+    """Of B episodes so far."""
+
+    least_ttc: Tensor
+    """Least time to collision [s], shape (B,)."""
+    own: Crash
+    """Crash of the ego."""
+    others: Crash
+    """First crash between two other vehicles while the episode ran."""
+
+    @property
+    def crash(self) -> Crash:
+        """Crash of the ego; where it had none, that of others."""
+        return self.own.replaced(self.own.kind == NONE, self.others)
+
+
+def begin(moment: Moment) -> Witness:
+    """At time 0."""
+    nothing = Crash.nothing(moment.state.x[:, 0])
+    return Witness(ttc(moment), nothing, nothing)
+
+
+def fold(seen: Witness, moment: Moment, before: Tensor, now: Tensor) -> Witness:
+    """One more moment.
+
+    Args:
+        seen: Of the moments before.
+        moment: The next.
+        before: Whether the episode had ended in a collision before this moment, boolean, shape (B,).
+        now: Whether it has by this moment, boolean, shape (B,).
+    """
+    state, road = moment.state, moment.road
+    least = torch.where(before, seen.least_ttc, torch.minimum(seen.least_ttc, ttc(moment)))
+    own, others = seen.own, seen.others
+    new = now & ~before
+    if bool(new.any()):
+        own = own.replaced(new, crash_of(state, road, moment.before, moment.dt))
+    touch = others_touch(state, road) & (others.kind == NONE) & ~before
+    if bool(touch.any()):
+        others = others.replaced(touch, crash_of_others(state, road, moment.before, moment.dt))
+    return Witness(least, own, others)
