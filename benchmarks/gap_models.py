@@ -18,8 +18,8 @@ import typer
 import rare_envs
 from rare_envs.log_mixture import LogMixture
 from rare_envs.scenarios import named
-from training import fit_scenarios
-from training.fit_scenarios import RECIPES, filter_events, read_events, us101_base
+from training.event_recipes import RECIPES, filter_events, read_events
+from training.fit_scenarios import us101_base
 
 GAPS = {"car_following": ("gap",), "cut_in": ("gap_ego_cutin", "gap_cutin_lead")}
 ENV_IDS = {"car_following": "rare_envs/CarFollowing-v0", "cut_in": "rare_envs/CutIn-v0"}
@@ -37,8 +37,7 @@ def main(data: Path, rollouts: int = 1_000_000, seed: int = 0) -> None:
             jacobian = np.log(events[:, columns]).sum()
             events[:, columns] = np.log(events[:, columns])
             jacobian += len(events) * np.log(events.std(axis=0)).sum()
-            fit_scenarios.RECIPES = {**RECIPES, scenario: recipe}
-            text = us101_base(scenario, data)
+            text = us101_base(scenario, data, recipe=recipe)
             content = json.loads(text)
             best = min(c["bic"] for c in content["provenance"]["selection"] if c["accepted"])
             with tempfile.NamedTemporaryFile("w", suffix=".json") as file:

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from rare_envs.bases import load_base
 from rare_envs.scenarios import named
 from tests.training.recordings import simulate, write_highd, write_ngsim
-from training import fit_scenarios
+from training import fit_scenarios, mixture_fit
 from training.data.compact import SCENES, us101_scenes
 from training.data.events import (
     CAR_FOLLOWING,
@@ -26,6 +26,7 @@ from training.data.events import (
 from training.data.ngsim import load_ngsim
 from training.data.table import COLUMNS, NOBODY, Trajectories, ahead, tabulate
 from training.data.windows import scenes_of
+from training.event_recipes import RECIPES
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 needs_data = pytest.mark.skipif(
@@ -150,8 +151,7 @@ def simulated():
 
 @pytest.fixture
 def quick(monkeypatch):
-    monkeypatch.setattr(fit_scenarios, "RESTARTS", 1)
-    monkeypatch.setattr(fit_scenarios, "MAX_COMPONENTS", 1)
+    monkeypatch.setattr(mixture_fit, "RESTARTS", 1)
 
 
 def run_cli(*arguments):
@@ -164,7 +164,7 @@ def test_bases_are_fitted_to_a_highd_folder(simulated, quick, tmp_path):
     write_highd(tmp_path / "highD", simulated, simulate(1, lanes=2, per_lane=6, seconds=12.0))
     result = run_cli("--highd", tmp_path / "highD", "--out", tmp_path / "bases", "--name", "cologne")
     assert result.exit_code == 0, result.output
-    for scenario in fit_scenarios.RECIPES:
+    for scenario in RECIPES:
         path = tmp_path / "bases" / f"{scenario}_cologne.json"
         points = load_base(named(scenario), path).sample(100, np.random.default_rng(0))
         assert np.isfinite(points).all()

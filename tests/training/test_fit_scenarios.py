@@ -12,18 +12,11 @@ from typer.testing import CliRunner
 
 from rare_envs.distributions import TruncatedGaussianMixture
 from rare_envs.scenarios import named
-from training import fit_scenarios
-from training.fit_scenarios import (
-    RECIPES,
-    SMALLEST_COMPONENT,
-    base_file,
-    filter_events,
-    fit_mixture,
-    mass_outside,
-    read_events,
-    us101_base,
-)
+from training import fit_scenarios, mixture_fit
+from training.event_recipes import RECIPES, filter_events, read_events
+from training.fit_scenarios import base_file, us101_base
 from training.highway_base import highway_base
+from training.mixture_fit import COVARIANCE_FLOOR, SMALLEST_COMPONENT, fit_mixture, mass_outside
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 needs_data = pytest.mark.skipif(
@@ -42,9 +35,8 @@ TRUTH = TruncatedGaussianMixture(
 
 @pytest.fixture
 def quick(monkeypatch):
-    """Fewer starts and components: enough for well separated clusters."""
-    monkeypatch.setattr(fit_scenarios, "RESTARTS", 2)
-    monkeypatch.setattr(fit_scenarios, "MAX_COMPONENTS", 3)
+    """Fewer starts: enough for well separated clusters."""
+    monkeypatch.setattr(mixture_fit, "RESTARTS", 2)
 
 
 def fit_truth(n, seed=0):
@@ -64,7 +56,7 @@ def test_fit_recovers_a_known_mixture(quick):
         assert (np.abs(law.means[k] - TRUTH.means[k]) < 4.0 * np.sqrt(variance / counts[k])).all()
         # Sampling error of a covariance, and the floor: 1 % of the overall variance.
         error = 4.0 * np.sqrt(2.0 / counts[k]) * np.sqrt(np.outer(variance, variance))
-        floor = fit_scenarios.COVARIANCE_FLOOR * np.diag([30.0, 15.0])
+        floor = COVARIANCE_FLOOR * np.diag([30.0, 15.0])
         assert (np.abs(law.covariances[k] - TRUTH.covariances[k]) < error + floor).all()
 
 
