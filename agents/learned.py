@@ -1,7 +1,6 @@
 """Learned drivers: 51 features to acceleration and yaw rate, for whole batches of scenarios at once."""
 
 import copy
-import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -14,20 +13,14 @@ from agents.networks import ACTIONS, FEATURES, HEAD, HIDDEN, Policy, with_head
 from agents.noise import WHITE, Colour
 from agents.weights import WeightDistribution
 from rare_envs import actions
+from rare_envs.dynamics import steering_for
 from rare_envs.observation import LIDAR_SCALES, observation_space
 from rare_envs.perception import CURVATURE, SPEED
-from rare_envs.state import VEHICLE_LENGTH
 
 if TYPE_CHECKING:
     from gymnasium import spaces
 
     from rare_envs.world import Episode
-
-MAX_STEERING = math.pi / 3
-"""Largest steering angle [rad], HighwayEnv's."""
-_MAX_SLIP_SINE = math.sin(math.atan(0.5 * math.tan(MAX_STEERING)))
-_NEAR_ZERO = 0.01
-"""Speeds [m/s] in a denominator are kept at least this far from 0."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,20 +211,3 @@ class LearnedEgo:
         speed = features[:, SPEED]
         yaw_rate = yaw_rate + speed * features[:, CURVATURE]  # it has learned on a straight road
         return torch.stack((acceleration, steering_for(yaw_rate, speed)), dim=1)
-
-
-def steering_for(yaw_rate: Tensor, speed: Tensor) -> Tensor:
-    """The steering angle with which the kinematic bicycle (`rare_envs.dynamics.bicycle`) turns at a yaw rate.
-
-    Inverts yaw rate = v sin(beta) / (l / 2), beta = atan(tan(steering) / 2), with l the vehicle's length. A vehicle
-    too slow to turn as fast as wanted steers by `MAX_STEERING`.
-
-    Args:
-        yaw_rate: Wanted [rad/s], shape (B,).
-        speed: [m/s], shape (B,).
-
-    Returns:
-        Steering angle [rad], shape (B,).
-    """
-    sine = yaw_rate * (VEHICLE_LENGTH / 2) / speed.clamp(min=_NEAR_ZERO)
-    return torch.atan(2.0 * torch.tan(torch.asin(sine.clamp(-_MAX_SLIP_SINE, _MAX_SLIP_SINE))))

@@ -60,11 +60,14 @@ class Policy(nn.Module):
         """The normalisation that the weights belong to."""
         return Scaling(*(self.get_buffer(name) for name in Scaling._fields))
 
+    def normalised(self, features: Tensor) -> Tensor:
+        """Features (..., 51) from SI units to multiples of their spreads in the record, clipped."""
+        scaling = self.scaling
+        return ((features - scaling.feature_mean) / scaling.feature_std).clamp(-CLIP, CLIP)
+
     def trunk(self, features: Tensor) -> Tensor:
         """Features (..., 51) in SI units to hidden units (..., 100)."""
-        scaling = self.scaling
-        normal = ((features - scaling.feature_mean) / scaling.feature_std).clamp(-CLIP, CLIP)
-        return torch.tanh(self.second(torch.tanh(self.first(normal))))
+        return torch.tanh(self.second(torch.tanh(self.first(self.normalised(features)))))
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
         """Features (..., 51) in SI units to means and log standard deviations (..., 2) of normalised actions."""

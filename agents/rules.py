@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from rare_envs.drivers import IDM
+from rare_envs.dynamics import NEAR_ZERO
 from rare_envs.geometry import Lead
 from rare_envs.lidar import AHEAD, MAX_RANGE
 from rare_envs.perception import FEATURES, RANGES, RATES
@@ -16,7 +17,6 @@ OFFSET_TIME = 0.6
 """[s]: an offset from the middle of the lane asks for offset / time of lateral speed."""
 HEADING_TIME = 0.2
 """[s]: an error of heading asks for error / time of yaw rate."""
-_NEAR_ZERO = 0.01
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class RuleDriver:
         speed = features[..., _SPEED]
         gap = torch.where(ahead < MAX_RANGE, ahead - 0.5 * features[..., _LENGTH], torch.inf)
         acceleration = self.idm.acceleration(speed, Lead(gap, -rate))
-        across = -features[..., _OFFSET] / (OFFSET_TIME * speed.clamp(min=_NEAR_ZERO))
+        across = -features[..., _OFFSET] / (OFFSET_TIME * speed.clamp(min=NEAR_ZERO))
         wanted = torch.asin(across.clamp(-1.0, 1.0)).clamp(-torch.pi / 4, torch.pi / 4)
         yaw_rate = ((wanted - features[..., _HEADING]) / HEADING_TIME).clamp(*self.yaw_rate)
         return torch.stack((acceleration, yaw_rate), dim=-1), memory

@@ -17,17 +17,8 @@ from PIL import Image
 import agents
 import rare_envs
 from rare_envs.envs.rendering import Renderer
-from rare_envs.geometry import boxes_overlap
-from rare_envs.road import Road
+from rare_envs.geometry import overlaps
 from rare_envs.rollout import drive
-from rare_envs.state import State
-
-
-def pairs_in_contact(state: State, road: Road) -> int:
-    """How many pairs of the first scenario's vehicles overlap."""
-    x, y, heading = (field[0] for field in road.to_world(state.x, state.y, state.heading))
-    i, j = torch.triu_indices(len(x), len(x), 1)
-    return int(boxes_overlap(x[j] - x[i], y[j] - y[i], heading[i], heading[j]).sum())
 
 
 def main(
@@ -52,7 +43,7 @@ def main(
                 frames.append(Image.fromarray(image).quantize(64))
             if still is not None and tick == round(at / problem.world.dt):
                 Image.fromarray(image).save(still)
-            contacts += pairs_in_contact(episode.state, road)
+            contacts += int(overlaps(episode.state, road).sum()) // 2
             off += int(road.off_road(episode.state.y).sum())
     if out is not None:
         frames[0].save(out, save_all=True, append_images=frames[1:], duration=100, loop=0)

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from rare_envs.actions import IDLE, read_actions
+from rare_envs.dynamics import NEAR_ZERO, steering_for
 from rare_envs.geometry import Lead
 from rare_envs.observation import observe
 from rare_envs.road import Road
@@ -15,15 +16,6 @@ from rare_envs.state import VEHICLE_LENGTH
 
 if TYPE_CHECKING:
     from rare_envs.world import Episode
-
-_NEAR_ZERO = 0.01
-"""HighwayEnv's `not_zero`: distances [m] and speeds [m/s] in a denominator are kept at least this far from 0."""
-
-MAX_STEERING = np.pi / 3
-"""Largest steering angle of lane keeping [rad], HighwayEnv's."""
-_MAX_SLIP_SINE = np.sin(np.arctan(0.5 * np.tan(MAX_STEERING)))
-"""Sine of the slip angle at the largest steering angle. Near 1 single precision may give a slip beyond pi / 2, and its
-tangent the other sign."""
 
 
 class Driver(Protocol):
@@ -95,7 +87,7 @@ class IDM:
         wanted = self.jam_distance + speed * (self.time_headway + lead.closing_speed * closing_gain)
         if self.jam_distance_speed:
             wanted = wanted + self.jam_distance_speed * ratio.clamp(min=1e-24).sqrt()  # a finite slope at standstill
-        crowding = wanted / (lead.gap + self.added_length).clamp(min=_NEAR_ZERO)
+        crowding = wanted / (lead.gap + self.added_length).clamp(min=NEAR_ZERO)
         free = ratio.square().square() if self.exponent == 4.0 else ratio.pow(self.exponent)
         acceleration: Tensor = self.max_acceleration * (1.0 - free - crowding.square())
         return acceleration.clamp(min=-self.max_deceleration)
@@ -137,11 +129,10 @@ def steering_control(offset: Tensor, heading: Tensor, speed: Tensor) -> Tensor:
     Returns:
         Steering angle [rad].
     """
-    speed = speed.clamp(min=_NEAR_ZERO)
+    speed = speed.clamp(min=NEAR_ZERO)
     heading_command = torch.asin((offset / (-0.6 * speed)).clamp(-1.0, 1.0)).clamp(-np.pi / 4, np.pi / 4)
     yaw_rate = 5.0 * (heading_command - heading)
-    slip = torch.asin((VEHICLE_LENGTH / 2 / speed * yaw_rate).clamp(-_MAX_SLIP_SINE, _MAX_SLIP_SINE))
-    return torch.atan(2.0 * torch.tan(slip)).clamp(-MAX_STEERING, MAX_STEERING)
+    return steering_for(yaw_rate, speed)
 
 
 @dataclass(frozen=True)

@@ -4,10 +4,20 @@ Both move in road coordinates. Where the road is curved, with curvature k, a way
 d / (1 - k y) of the reference line, and the road turns under the vehicle by k times that.
 """
 
+import math
+
 import torch
 from torch import Tensor
 
 from rare_envs.state import VEHICLE_LENGTH
+
+MAX_STEERING = math.pi / 3
+"""Largest steering angle [rad], HighwayEnv's."""
+_MAX_SLIP_SINE = math.sin(math.atan(0.5 * math.tan(MAX_STEERING)))
+"""Sine of the slip angle at the largest steering angle. Near 1 single precision may give a slip beyond pi / 2, and its
+tangent the other sign."""
+NEAR_ZERO = 0.01
+"""HighwayEnv's `not_zero`: distances [m] and speeds [m/s] in a denominator are kept at least this far from 0."""
 
 
 def bicycle(
@@ -53,6 +63,24 @@ def bicycle(
         heading + turn,
         (speed + acceleration * dt).clamp(min=0.0),
     )
+
+
+def steering_for(yaw_rate: Tensor, speed: Tensor) -> Tensor:
+    """The steering angle with which `bicycle` turns at a yaw rate.
+
+    Inverts yaw rate = v sin(beta) / (l / 2), beta = atan(tan(steering) / 2), with l the vehicle's length. A vehicle
+    too slow to turn as fast as wanted steers by `MAX_STEERING`.
+
+    Args:
+        yaw_rate: Wanted [rad/s], shape (B,).
+        speed: [m/s], shape (B,).
+
+    Returns:
+        Steering angle [rad], shape (B,).
+    """
+    sine = VEHICLE_LENGTH / 2 / speed.clamp(min=NEAR_ZERO) * yaw_rate
+    slip = torch.asin(sine.clamp(-_MAX_SLIP_SINE, _MAX_SLIP_SINE))
+    return torch.atan(2.0 * torch.tan(slip)).clamp(-MAX_STEERING, MAX_STEERING)
 
 
 def point_mass(

@@ -57,7 +57,14 @@ def lead_index(state: State, road: Road) -> Tensor:
     return torch.where(least < torch.inf, way.shape[1] - found, 0)
 
 
-def boxes_overlap(dx: Tensor, dy: Tensor, heading: Tensor, other_heading: Tensor) -> Tensor:
+def boxes_overlap(
+    dx: Tensor,
+    dy: Tensor,
+    heading: Tensor,
+    other_heading: Tensor,
+    size: tuple[Tensor | float, Tensor | float] = (VEHICLE_LENGTH, VEHICLE_WIDTH),
+    other_size: tuple[Tensor | float, Tensor | float] = (VEHICLE_LENGTH, VEHICLE_WIDTH),
+) -> Tensor:
     """Whether two vehicles' bodies overlap, by the separating axis theorem on the boxes' four axes.
 
     Args:
@@ -65,6 +72,8 @@ def boxes_overlap(dx: Tensor, dy: Tensor, heading: Tensor, other_heading: Tensor
         dy: Likewise across the road [m].
         heading: Headings of the first [rad].
         other_heading: Headings of the other [rad].
+        size: Length and width of the first [m].
+        other_size: Of the other [m].
 
     Returns:
         True where the boxes share more than their edges.
@@ -75,11 +84,11 @@ def boxes_overlap(dx: Tensor, dy: Tensor, heading: Tensor, other_heading: Tensor
     cos, sin = torch.cos(turn), torch.sin(turn)
     other_along, other_across = along * cos + across * sin, across * cos - along * sin
     cos, sin = cos.abs(), sin.abs()
-    half_length, half_width = VEHICLE_LENGTH / 2, VEHICLE_WIDTH / 2
-    reach_along = half_length + half_length * cos + half_width * sin
-    reach_across = half_width + half_length * sin + half_width * cos
-    overlap = (along.abs() < reach_along) & (across.abs() < reach_across)
-    return overlap & (other_along.abs() < reach_along) & (other_across.abs() < reach_across)
+    (length, width), (other_length, other_width) = ((0.5 * long, 0.5 * wide) for long, wide in (size, other_size))
+    overlap = along.abs() < length + other_length * cos + other_width * sin
+    overlap = overlap & (across.abs() < width + other_length * sin + other_width * cos)
+    overlap = overlap & (other_along.abs() < other_length + length * cos + width * sin)
+    return overlap & (other_across.abs() < other_width + length * sin + width * cos)
 
 
 def ego_overlaps(state: State, road: Road, placed: Placed | None = None) -> Tensor:

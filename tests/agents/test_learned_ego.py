@@ -9,9 +9,8 @@ import torch
 
 import rare_envs
 from agents import LearnedDriver, LearnedEgo, load_driver
-from agents.learned import MAX_STEERING, steering_for
 from rare_envs.actions import MAX_ACCELERATION
-from rare_envs.dynamics import bicycle
+from rare_envs.dynamics import MAX_STEERING, bicycle, steering_for
 from rare_envs.observation import LIDAR_SCALES
 from rare_envs.perception import CURVATURE, SPEED
 

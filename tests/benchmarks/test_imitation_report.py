@@ -8,10 +8,11 @@ import torch
 
 from agents import LearnedDriver, WeightDistribution
 from agents.networks import head_weights
-from benchmarks import imitation
+from benchmarks import imitation_rows
 from benchmarks.forward_model import compare
-from benchmarks.imitation import Effort, highway, moved, named, report, rounded
+from benchmarks.imitation import named, report, rounded
 from benchmarks.imitation_figures import draw, tables
+from benchmarks.imitation_rows import Effort, highway, moved
 from tests.training.synthetic_scenes import scenes
 from training.imitation.config import HUMAN, Config
 from training.imitation.fitting import learner_of, prepare
@@ -30,8 +31,8 @@ def driver(data):
 
 
 def test_a_report_has_every_row_table_and_figure(data, driver, tmp_path, monkeypatch):
-    monkeypatch.setattr(imitation, "RADII", (0.1,))
-    monkeypatch.setattr(imitation, "SECONDS", (2.0, 3.0))
+    monkeypatch.setattr(imitation_rows, "RADII", (0.1,))
+    monkeypatch.setattr(imitation_rows, "SECONDS", (2.0, 3.0))
     effort = Effort(noises=2, draws=2, rollouts=2, each=1, highway=5)
     found = report(data.recording, data.recording, {"bc": driver}, effort)
     json.dumps(found, allow_nan=False)

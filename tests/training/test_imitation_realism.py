@@ -9,18 +9,9 @@ import torch
 from tests.training.synthetic_scenes import scenes
 from training.imitation.accuracy import TIMES, replayed_errors, segments
 from training.imitation.behaviour import behaviour_of, drive, every, recorded_behaviour
-from training.imitation.realism import (
-    BINS,
-    jensen_shannon,
-    quantities,
-    recorded_tally,
-    standard_errors,
-    summary,
-    tallies,
-    tally,
-    together,
-)
+from training.imitation.realism import jensen_shannon, recorded_tally, standard_errors, summary, tallies
 from training.imitation.recording import stack
+from training.imitation.tally import BINS, quantities, tally, together
 from training.imitation.traffic import start
 
 

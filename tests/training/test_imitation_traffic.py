@@ -14,9 +14,10 @@ from training.imitation.config import Config
 from training.imitation.expert import expert_pairs, scaling_of
 from training.imitation.penalties import penalties
 from training.imitation.pools import Pool
-from training.imitation.realism import BINS, jensen_shannon, measure
+from training.imitation.realism import jensen_shannon, measure
 from training.imitation.recording import Recording, stack
 from training.imitation.rollout import roll
+from training.imitation.tally import BINS
 from training.imitation.traffic import Traffic, look, start, step
 
 

@@ -11,9 +11,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from training.data.table import DT
 from training.imitation.behaviour import Act, drive, every
 from training.imitation.recording import Recording
-from training.imitation.traffic import DT, Traffic, start
+from training.imitation.traffic import Traffic, start
 
 TIMES = (0.5, 1.0, 2.0, 3.0, 4.0, 5.0, 10.0)
 """Seconds after which drivers are compared."""

@@ -7,10 +7,12 @@ import torch
 from torch import Tensor
 
 from agents import LearnedDriver
+from rare_envs.geometry import boxes_overlap
 from rare_envs.lidar import AHEAD
 from rare_envs.perception import RANGES, RATES
+from training.data.table import DT
 from training.imitation.recording import Recording
-from training.imitation.traffic import DT, Traffic, lane_of, look, start, step
+from training.imitation.traffic import Traffic, lane_of, look, start, step
 
 Act = Callable[[Tensor, "Tensor | None"], tuple[Tensor, "Tensor | None"]]
 """From features (B, M, 51) and a memory, None at first, to actions (B, M, 2) [m/s^2, rad/s] and the new memory."""
@@ -96,23 +98,22 @@ def drive(recording: Recording | None, traffic: Traffic, act: Act, ticks: int) -
 
 def overlaps(traffic: Traffic, m: int) -> Tensor:
     """Which pairs of bodies share ground: the first m vehicles with all, boolean, shape (B, m, V)."""
-    half_length, half_width = 0.5 * traffic.length, 0.5 * traffic.width
-    dx = traffic.x[:, None, :] - traffic.x[:, :m, None]
-    dy = traffic.y[:, None, :] - traffic.y[:, :m, None]
-    own, other = traffic.heading[:, :m, None], traffic.heading[:, None, :]
-    cos, sin = torch.cos(other - own).abs(), torch.sin(other - own).abs()
-    sizes = half_length[:, :m, None], half_width[:, :m, None], half_length[:, None, :], half_width[:, None, :]
-    apart = torch.zeros_like(dx, dtype=torch.bool)
-    for heading, (length, width, its_length, its_width) in (
-        (own, sizes),
-        (other, (sizes[2], sizes[3], sizes[0], sizes[1])),
-    ):
-        along = dx * torch.cos(heading) + dy * torch.sin(heading)
-        across = dy * torch.cos(heading) - dx * torch.sin(heading)
-        apart = apart | (along.abs() >= length + its_length * cos + its_width * sin)
-        apart = apart | (across.abs() >= width + its_length * sin + its_width * cos)
-    itself = torch.eye(m, traffic.x.shape[1], dtype=torch.bool)
-    return ~apart & ~itself
+
+    def each(field: Tensor) -> Tensor:
+        return field[:, :m, None]
+
+    def other(field: Tensor) -> Tensor:
+        return field[:, None, :]
+
+    touching = boxes_overlap(
+        other(traffic.x) - each(traffic.x),
+        other(traffic.y) - each(traffic.y),
+        each(traffic.heading),
+        other(traffic.heading),
+        (each(traffic.length), each(traffic.width)),
+        (other(traffic.length), other(traffic.width)),
+    )
+    return touching & ~torch.eye(m, traffic.x.shape[1], dtype=torch.bool)
 
 
 def behaviour_of(moments: Iterator[Moment]) -> Behaviour:

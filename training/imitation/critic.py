@@ -5,7 +5,7 @@ from collections import deque
 import torch
 from torch import Tensor, nn
 
-from agents.networks import ACTIONS, CLIP, FEATURES, Policy
+from agents.networks import ACTIONS, FEATURES, Policy
 
 _HIDDEN = 128
 
@@ -31,9 +31,7 @@ class Critic(nn.Module):
 
 def inputs(policy: Policy, features: Tensor, action: Tensor) -> Tensor:
     """What the critic sees: normalised features (n, 51) beside normalised actions (n, 2)."""
-    scaling = policy.scaling
-    seen = ((features - scaling.feature_mean) / scaling.feature_std).clamp(-CLIP, CLIP)
-    return torch.cat((seen, action), dim=1)
+    return torch.cat((policy.normalised(features), action), dim=1)
 
 
 def policy_cost(critic: Critic, pairs: Tensor) -> Tensor:

@@ -14,7 +14,7 @@ References:
 import torch
 from torch import Tensor
 
-from agents.networks import CLIP, Policy
+from agents.networks import Policy
 from agents.noise import Colour
 from training.imitation.acting import log_likelihood
 from training.imitation.critic import inputs, policy_cost
@@ -59,9 +59,7 @@ def surrogate(ratio: Tensor, advantage: Tensor, clip: float) -> Tensor:
 
 def seen_by_value(policy: Policy, steps: Steps) -> Tensor:
     """What the value depends on: normalised features and the noise that goes on, shape (n, 53)."""
-    scaling = policy.scaling
-    normal = ((steps.features - scaling.feature_mean) / scaling.feature_std).clamp(-CLIP, CLIP)
-    return torch.cat((normal, steps.noise), dim=1)
+    return torch.cat((policy.normalised(steps.features), steps.noise), dim=1)
 
 
 def rewards(learner: Learner, steps: Steps) -> Tensor:

@@ -12,10 +12,8 @@ from torch import Tensor
 
 from rare_envs.lidar import Bodies
 from rare_envs.perception import OnRoad, perceive
+from training.data.table import DT
 from training.imitation.recording import Recording, parked
-
-DT = 0.1
-"""Tick [s]."""
 
 
 class Traffic(NamedTuple):
