@@ -96,8 +96,9 @@ def test_an_ego_is_trained_in_the_world_that_was_asked_for(cli: Cli, risky: str,
     words = ("train-ego", FOLLOWING, "--steps", 64, "--num-envs", 8, "--out", ego)
     trained = cli(*words, *world)
     assert trained.exit_code == 0, trained.output
-    again = f"--ego {ego} --base {risky} --drivers idm --noise off --horizon 3.0 --observation lidar"
-    assert again in trained.stdout.replace("\n", " ")
+    again = trained.stdout.replace("\n", " ").partition(f"--ego {ego} ")[2]
+    asked = {f"--base {risky}", "--drivers idm", "--noise off", "--horizon 3.0", "--observation lidar"}
+    assert {f"--{words.strip()}" for words in again.split("--")[1:]} == asked
     assert agents.load_ego(ego).observation_space.shape == (51,)
     answer = json.loads(cli(*words, *world, "--json").stdout)
     assert (answer["drivers"], answer["horizon"], answer["noise"]) == ("idm", 3.0, False)
