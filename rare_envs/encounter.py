@@ -34,6 +34,11 @@ def velocities(state: State, heading: Tensor) -> tuple[Tensor, Tensor]:
     return state.speed * torch.cos(heading), state.speed * torch.sin(heading)
 
 
+def least(values: Tensor, nobody: float) -> Tensor:
+    """The least over pairs (B, P), shape (B,), and at most what it is where there is nobody else."""
+    return torch.nn.functional.pad(values, (0, 1), value=nobody).amin(1)
+
+
 def encounter(state: State, road: Road) -> Encounter:
     """The ego with each of the N - 1 other vehicles.
 

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from rare_envs.encounter import least
 from rare_envs.measures.moment import Moment
 from rare_envs.state import VEHICLE_LENGTH, VEHICLE_WIDTH
 
@@ -98,7 +99,7 @@ def rss_longitudinal(moment: Moment, rss: RSS = RSS()) -> Tensor:
         The least margin over the other vehicles [m], shape (B,).
     """
     of = margins(moment, rss)
-    return torch.where(of.across < 0, of.along, MARGIN_MAX).amin(1)
+    return least(torch.where(of.across < 0, of.along, MARGIN_MAX), MARGIN_MAX)
 
 
 def rss_lateral(moment: Moment, rss: RSS = RSS()) -> Tensor:
@@ -114,7 +115,7 @@ def rss_lateral(moment: Moment, rss: RSS = RSS()) -> Tensor:
         The least margin over the other vehicles [m], shape (B,).
     """
     of = margins(moment, rss)
-    return torch.where(of.along < 0, of.across, MARGIN_MAX).amin(1)
+    return least(torch.where(of.along < 0, of.across, MARGIN_MAX), MARGIN_MAX)
 
 
 def rss_margin(moment: Moment, rss: RSS = RSS()) -> Tensor:
@@ -131,4 +132,4 @@ def rss_margin(moment: Moment, rss: RSS = RSS()) -> Tensor:
     Returns:
         The margin [m], shape (B,).
     """
-    return torch.maximum(*margins(moment, rss)).amin(1)
+    return least(torch.maximum(*margins(moment, rss)), MARGIN_MAX)

@@ -5,7 +5,7 @@ from torch import Tensor
 
 from rare_envs.boxes import clearance as distance
 from rare_envs.boxes import time_to_contact
-from rare_envs.encounter import encounter
+from rare_envs.encounter import encounter, least
 from rare_envs.measures.following import TTC_MAX, time_to_edge
 from rare_envs.measures.lead import GAP_MIN
 from rare_envs.measures.moment import Moment
@@ -37,8 +37,8 @@ def ttc_2d(moment: Moment) -> Tensor:
         detection", 2005, section 5.5 (separating axes of moving bodies).
     """
     met = encounter(moment.state, moment.road)
-    times = time_to_contact(met.axes, met.rate).clamp(TIME_MIN, TTC_MAX).amin(1)
-    return torch.minimum(times, time_to_edge(moment)).clamp(max=TTC_MAX)
+    times = least(time_to_contact(met.axes, met.rate).clamp(min=TIME_MIN), TTC_MAX)
+    return torch.minimum(times, time_to_edge(moment))
 
 
 def clearance(moment: Moment) -> Tensor:
@@ -53,7 +53,7 @@ def clearance(moment: Moment) -> Tensor:
         Distance [m], in [0.01, CLEARANCE_MAX], shape (B,).
     """
     met = encounter(moment.state, moment.road)
-    return distance(met.axes, met.turn).clamp(GAP_MIN, CLEARANCE_MAX).amin(1)
+    return least(distance(met.axes, met.turn).clamp(min=GAP_MIN), CLEARANCE_MAX)
 
 
 def margin(moment: Moment) -> Tensor:
@@ -81,5 +81,5 @@ def margin(moment: Moment) -> Tensor:
     # the same fraction twice: each form loses its digits where the other keeps them
     slow = (root - closing) / (2.0 * DRIFT**2)
     inverse = torch.where(closing > 0, 2.0 / (root + closing.clamp(min=0.0)), slow)
-    times = (gap.clamp(min=0.0) * inverse).amax(-1).clamp(min=TIME_MIN).amin(1)
-    return torch.minimum(times, time_to_edge(moment))
+    times = (gap.clamp(min=0.0) * inverse).amax(-1).clamp(min=TIME_MIN)
+    return torch.minimum(least(times, torch.inf), time_to_edge(moment))
