@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
-from rare_envs.registration import make_batch, register_envs, register_scenario
+from rare_envs.registration import make_batch, parallel_env, register_envs, register_scenario
 from rare_envs.scenarios import SCENARIOS
 
 if TYPE_CHECKING:
@@ -19,6 +19,7 @@ __all__ = [
     "ScenarioSpace",
     "TruncatedGaussianMixture",
     "make_batch",
+    "parallel_env",
     "register_scenario",
 ]
 __version__ = "0.1.0"

@@ -10,6 +10,7 @@ from gymnasium.vector import VectorEnv
 from rare_envs.scenarios import SCENARIOS
 
 if TYPE_CHECKING:
+    from rare_envs.envs.parallel import DrivingParallelEnv
     from rare_envs.scenarios.base import Scenario
 
 
@@ -42,6 +43,22 @@ def register_scenario(env_id: str, scenario: Scenario) -> None:
     try_scenario(scenario)
     SCENARIOS.add(env_id, scenario)
     register_envs()
+
+
+def parallel_env(env_id: str, **kwargs: Any) -> DrivingParallelEnv:
+    """The PettingZoo `ParallelEnv` of an id: every vehicle an agent.
+
+    Args:
+        env_id: For example "rare_envs/CutIn-v0".
+        **kwargs: `agents`, `ego`, `rewards` and `render_mode`, see `rare_envs.envs.parallel.DrivingParallelEnv`, and
+            keyword arguments of `gym.make` for the id.
+
+    Raises:
+        ValueError: If the id or an argument is unknown.
+    """
+    from rare_envs.envs.parallel import DrivingParallelEnv
+
+    return DrivingParallelEnv(env_id, **kwargs)
 
 
 def make_batch(env_id: str, num_envs: int, **kwargs: Any) -> VectorEnv[Any, Any, Any]:

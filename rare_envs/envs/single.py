@@ -9,8 +9,8 @@ import torch
 from numpy.typing import NDArray
 
 from rare_envs.actions import read_actions, space_of_actions
-from rare_envs.crashes import describe
 from rare_envs.decisions import advance
+from rare_envs.envs.infos import info_of, step_info
 from rare_envs.envs.rendering import Renderer
 from rare_envs.observation import observation_space, observe
 from rare_envs.setup import set_up
@@ -78,7 +78,7 @@ class DrivingEnv(gym.Env[Observation, Any]):
             self._episode = self.world.start(torch.from_numpy(self._x[None]).float())
             observation = observe(self._episode, self.world.observation)[0].numpy()
         self._show()
-        return observation, self._info(self._episode)
+        return observation, info_of(self.space, self._x, self._episode)
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Carry out one decision; see the class for what comes back.
@@ -99,25 +99,9 @@ class DrivingEnv(gym.Env[Observation, Any]):
         self._episode, self._tick = episode, self._tick + self.world.stride
         terminated = bool(episode.collided)
         truncated = not terminated and self._tick >= self.world.ticks
-        info = self._info(episode)
-        info["reward_terms"] = {name: float(value) for name, value in terms._asdict().items()}
-        if terminated or truncated:
-            info["measure"] = float(episode.f)
-            assert episode.witness is not None
-            info["crash"] = crash = describe(episode.witness.crash)
-            info["collision_type"] = None if crash is None else crash["kind"]
+        info = step_info(self.space, self._x, episode, terms, terminated or truncated)
         self._show()
         return observation, reward, terminated, truncated, info
-
-    def _info(self, episode: Episode) -> dict[str, Any]:
-        assert episode.witness is not None
-        collided = bool(episode.collided)
-        return {
-            "scenario": self.space.named(self._x),
-            "x": self._x.copy(),
-            "min_ttc": 0.0 if collided else float(episode.witness.least_ttc),
-            "collision": collided,
-        }
 
     def _show(self) -> None:
         if self.render_mode == "human":

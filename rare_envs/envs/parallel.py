@@ -1,0 +1,271 @@
+"""Several agents at a time: a PettingZoo `ParallelEnv` over the same world as the environment of one."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from gymnasium import spaces
+from gymnasium.utils import seeding
+from numpy.typing import NDArray
+from pettingzoo import ParallelEnv
+from torch import Tensor
+
+from rare_envs.actions import IDLE, read_actions, space_of_actions
+from rare_envs.crowd import Crowd, gather
+from rare_envs.deeds import carry_out
+from rare_envs.envs.infos import Info, info_of, step_info
+from rare_envs.envs.rendering import Renderer
+from rare_envs.incentives import Reward, own_reward, total_of
+from rare_envs.observation import observation_space, observe
+from rare_envs.problem import as_driver
+from rare_envs.scenarios.base import Scenario
+from rare_envs.setup import set_up
+from rare_envs.space import did_you_mean
+
+Observation = NDArray[np.float32]
+Actions = Mapping[str, Any]
+
+
+class DrivingParallelEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: ignore[misc]
+    """Every vehicle is an agent, or those named; each observes, acts, is rewarded and ends as an ego in its place.
+
+    A vehicle without an action keeps its driver: the scenario's script or learned drivers, and for the ego the driver
+    `ego`. An agent terminates when its vehicle touches another one or leaves the road, is truncated at the horizon,
+    and then leaves `agents`; its vehicle rolls out, see `rare_envs.crowd`.
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012  (PettingZoo's own form)
+        "name": "rare_envs",
+        "render_modes": ["rgb_array", "human"],
+        "is_parallelizable": True,
+        "render_fps": 10,
+    }
+
+    def __init__(
+        self,
+        env_id: str,
+        *,
+        agents: Sequence[str] | None = None,
+        ego: Any = "idm",
+        rewards: Mapping[str, Reward] | None = None,
+        render_mode: str | None = None,
+        **kwargs: Any,
+    ) -> None:
+        """Make the environment.
+
+        Args:
+            env_id: The scenario's registered id.
+            agents: Names of the vehicles that may act (`Scenario.vehicle_names`); None for all.
+            ego: Who drives the ego when it gets no action: "idm", a `Driver` or an object with `predict`.
+            rewards: Rewards of agents by name; by default each has the reward of an ego, in its own view.
+            render_mode: None, "rgb_array" or "human".
+            **kwargs: See `rare_envs.setup.set_up`.
+
+        Raises:
+            ValueError: If an argument is invalid.
+        """
+        world, self.space = set_up(env_id, **kwargs)
+        self.world = replace(world, witnessed=True)
+        scenario = self.world.scenario
+        self.possible_agents = chosen_agents(scenario, agents)
+        self.rewards = chosen_rewards(self.possible_agents, rewards)
+        self._driver = as_driver(ego, self.world)
+        self.metadata = {
+            **self.metadata,
+            "name": env_id,
+            "render_fps": round(1.0 / (self.world.dt * self.world.stride)),
+        }
+        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
+            raise ValueError(f"Expected render_mode None, 'rgb_array' or 'human', got {render_mode!r}.")
+        self.render_mode = render_mode
+        self.agents: list[str] = []
+        self.observation_spaces = {
+            agent: observation_space(scenario.vehicles, self.world.observation) for agent in self.possible_agents
+        }
+        self.action_spaces = {agent: space_of_actions(self.world.action) for agent in self.possible_agents}
+        self._vehicles = {agent: scenario.vehicle_names.index(agent) for agent in self.possible_agents}
+        self._np_random: np.random.Generator | None = None
+        self._renderer: Renderer | None = None
+        self._x = np.full(self.space.dim, np.nan)
+        self._crowd: Crowd | None = None
+        self._memory: Any = None
+        self._tick = 0
+
+    def observation_space(self, agent: str) -> "spaces.Box[np.float32]":
+        """The space of an agent's observations."""
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> spaces.Space[Any]:
+        """The space of an agent's actions."""
+        return self.action_spaces[agent]
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Observation], dict[str, Info]]:
+        """Start an episode; the same seed draws the same scenario as in `gym.make`.
+
+        Args:
+            seed: Seeds the draw of the scenario.
+            options: Scenario parameters by name, or {"x": vector} for all of them, as in `DrivingEnv.reset`.
+
+        Returns:
+            Observations and infos by agent.
+
+        Raises:
+            ValueError: If an option is unknown, of the wrong shape, NaN or outside its range.
+        """
+        if seed is not None or self._np_random is None:
+            self._np_random, _ = seeding.np_random(seed)
+        if options == {"options": 1}:
+            options = None  # what PettingZoo's conformance test asks for, to see that options are taken at all
+        self._x = self.space.scenario_x(options, 1, self._np_random)[0]
+        self._tick, self._memory, self.agents = 0, None, list(self.possible_agents)
+        with torch.inference_mode():
+            self._crowd = gather(self.world, torch.from_numpy(self._x[None]).float())
+            observations = {agent: self._observe(self._crowd, agent) for agent in self.agents}
+        infos = {agent: info_of(self.space, self._x, self._view(self._crowd, agent)) for agent in self.agents}
+        self._show()
+        return observations, infos
+
+    def step(
+        self, actions: Actions
+    ) -> tuple[dict[str, Observation], dict[str, float], dict[str, bool], dict[str, bool], dict[str, Info]]:
+        """Move by one tick.
+
+        Args:
+            actions: Actions by agent, as in `DrivingEnv.step`; an agent without one, or with None, leaves its vehicle
+                to its driver.
+
+        Returns:
+            Observations, rewards, terminations, truncations and infos of the agents that were there before the step.
+
+        Raises:
+            ValueError: If an agent does not exist or has left, or an action has the wrong shape or is NaN.
+            RuntimeError: If all agents have left, or there was no `reset`.
+        """
+        if self._crowd is None or not self.agents:
+            raise RuntimeError("Expected reset() before step(): no agent is there.")
+        given = {agent: action for agent, action in actions.items() if action is not None}
+        for agent in given:
+            self._check_agent(agent)
+        with torch.inference_mode():
+            chosen, commanded = self._read(given)
+            rewards_of = {self._vehicles[agent]: self.rewards[agent] for agent in self.agents}
+            after, earned, self._memory = carry_out(
+                self.world, self._crowd, chosen, commanded, rewards_of, self._driver, self._memory
+            )
+            self._crowd = after
+            self._tick += self.world.stride
+            terms = {agent: earned[self._vehicles[agent]] for agent in self.agents}
+            rewards = {agent: float(total_of(reward)) for agent, reward in terms.items()}
+            observations = {agent: self._observe(after, agent) for agent in self.agents}
+        views = {agent: self._view(after, agent) for agent in self.agents}
+        terminated = {agent: bool(view.collided) for agent, view in views.items()}
+        over = self._tick >= self.world.ticks
+        truncated = {agent: over and not terminated[agent] for agent in self.agents}
+        infos = {
+            agent: step_info(self.space, self._x, view, terms[agent], terminated[agent] or over, self._vehicles[agent])
+            for agent, view in views.items()
+        }
+        self.agents = [agent for agent in self.agents if not (terminated[agent] or truncated[agent])]
+        self._show()
+        return observations, rewards, terminated, truncated, infos
+
+    def _read(self, given: Actions) -> tuple[Tensor, Tensor]:
+        """Actions of all vehicles, (1, N, 2) or (1, N), and who is commanded (1, N)."""
+        n, kind = self.world.scenario.vehicles, self.world.action
+        chosen = torch.full((1, n), IDLE) if kind == "meta" else torch.zeros(1, n, 2)
+        commanded = torch.zeros(1, n, dtype=torch.bool)
+        for agent, action in given.items():
+            shape = self.action_spaces[agent].shape
+            if np.shape(action) != shape:
+                raise ValueError(f"Expected an action of shape {shape} for {agent!r}, got {np.shape(action)}.")
+            chosen[:, self._vehicles[agent]] = read_actions(kind, torch.as_tensor(np.asarray(action))[None], 1)
+            commanded[:, self._vehicles[agent]] = True
+        return chosen, commanded
+
+    def _check_agent(self, agent: str) -> None:
+        if agent in self.agents:
+            return
+        if agent in self.possible_agents:
+            assert self._crowd is not None
+            raise ValueError(
+                f"Expected actions of {', '.join(self.agents)} only: {agent!r} has left, because its vehicle collided."
+            )
+        hint = did_you_mean(str(agent), self.possible_agents)
+        raise ValueError(f"There is no agent {agent!r}{hint}; the agents are {', '.join(self.possible_agents)}.")
+
+    def _view(self, crowd: Crowd, agent: str) -> Any:
+        return crowd.views[self._vehicles[agent]]
+
+    def _observe(self, crowd: Crowd, agent: str) -> Observation:
+        observation: Observation = observe(self._view(crowd, agent), self.world.observation)[0].numpy()
+        return observation
+
+    def _show(self) -> None:
+        if self.render_mode == "human":
+            self.render()
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Draw the road with HighwayEnv's graphics: an (H, W, 3) image for "rgb_array", a window for "human"."""
+        if self.render_mode is None or self._crowd is None:
+            gym.logger.warn("Nothing to render: pass render_mode='rgb_array' or 'human' and reset first.")
+            return None
+        if self._renderer is None:
+            window = self.render_mode == "human"
+            self._renderer = Renderer(self.world.scenario.road, window, self.metadata["render_fps"])
+        image = self._renderer.draw(self._crowd.traffic.state, crashed=bool(self._crowd.views[0].collided))
+        return None if self.render_mode == "human" else image
+
+    def state(self) -> NDArray[np.float32]:
+        """The whole traffic, for a central critic: x, y [m], heading [rad] and speed [m/s] of each, shape (N, 4)."""
+        if self._crowd is None:
+            raise RuntimeError("Expected reset() before state().")
+        traffic = torch.stack(self._crowd.traffic.state[:4], dim=-1)[0]
+        whole: NDArray[np.float32] = traffic.float().numpy()
+        return whole
+
+    def close(self) -> None:
+        """Close the window."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+
+def chosen_agents(scenario: Scenario, agents: Sequence[str] | None) -> list[str]:
+    """The agents that an argument `agents` stands for.
+
+    Raises:
+        ValueError: If there is no such vehicle, none is named or one twice.
+    """
+    names = scenario.vehicle_names
+    if agents is None:
+        return list(names)
+    if isinstance(agents, str) or not isinstance(agents, Sequence):
+        raise ValueError(f"Expected agents as a list of names, such as ['{names[-1]}'], got {agents!r}.")
+    for agent in agents:
+        if agent not in names:
+            hint = did_you_mean(str(agent), names)
+            raise ValueError(f"There is no vehicle {agent!r}{hint}; the vehicles are {', '.join(names)}.")
+    if not agents or len(set(agents)) < len(agents):
+        raise ValueError(f"Expected one or more different agents, got {list(agents)}.")
+    return list(agents)
+
+
+def chosen_rewards(agents: Sequence[str], rewards: Mapping[str, Reward] | None) -> dict[str, Reward]:
+    """The reward of each agent.
+
+    Raises:
+        ValueError: If one is given for somebody who is no agent, or is no function.
+    """
+    rewards = {} if rewards is None else rewards
+    for agent, reward in rewards.items():
+        if agent not in agents:
+            hint = did_you_mean(str(agent), agents)
+            raise ValueError(f"Reward for {agent!r}{hint}, but the agents are {', '.join(agents)}.")
+        if not callable(reward):
+            raise ValueError(f"Expected the reward of {agent!r} as a function of a Tick, got {reward!r}.")
+    return {agent: rewards.get(agent, own_reward) for agent in agents}
