@@ -7,6 +7,7 @@ from rare_envs.scenarios import SCENARIOS
 
 if TYPE_CHECKING:
     from rare_envs.distributions import TruncatedGaussianMixture
+    from rare_envs.faults import FaultTolerant
     from rare_envs.problem import DrivingProblem
     from rare_envs.space import ScenarioSpace
 
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
 __all__ = [
     "ENV_IDS",
     "DrivingProblem",
+    "FaultTolerant",
     "ScenarioSpace",
     "TruncatedGaussianMixture",
     "make_batch",
@@ -28,6 +30,7 @@ register_envs()
 
 _LAZY = {
     "DrivingProblem": "rare_envs.problem",
+    "FaultTolerant": "rare_envs.faults",
     "ScenarioSpace": "rare_envs.space",
     "TruncatedGaussianMixture": "rare_envs.distributions",
 }

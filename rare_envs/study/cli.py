@@ -108,6 +108,7 @@ def estimate_command(
     observation: Observation = "features",
     action: Action = "continuous",
     horizon: Horizon = None,
+    on_error: Annotated[str, typer.Option(help="Where the ego fails twice: raise, failure or bound.")] = "raise",
     out: Annotated[Path | None, typer.Option(help="Folder for result.json, failures.csv and plot.png.")] = None,
     as_json: Json = False,
 ) -> None:
@@ -133,6 +134,7 @@ def estimate_command(
         observation=observation,
         action=action,
         horizon=horizon,
+        on_error=on_error,
     )
     with contextlib.redirect_stdout(sys.stderr):  # an ego may print, and standard output is for the answer
         study = evaluate.prepare(question)

@@ -7,15 +7,18 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Literal, cast
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 import agents
 import rare_envs
 import samplers
+from rare_envs.faults import ON_ERROR, EgoGone, Fault, FaultTolerant
 from rare_envs.setup import find_scenario
+from rare_envs.space import did_you_mean
 from rare_envs.study.checks import BadInput
 
 
@@ -42,6 +45,8 @@ class Question:
         horizon: Length of an episode [s]; the scenario's when None.
         observation: What the ego observes: "features", "lidar" or "kinematics".
         action: What a policy decides: "continuous" or "meta".
+        on_error: What scenarios count as on which the ego fails twice: "raise" ends the run, "failure" counts them as
+            failing, "bound" as failing in p and the upper end of the interval, but not in the lower end.
     """
 
     env_id: str
@@ -61,6 +66,7 @@ class Question:
     horizon: float | None = None
     observation: str = "features"
     action: str = "continuous"
+    on_error: str = "raise"
 
 
 @dataclass(frozen=True)
@@ -80,11 +86,13 @@ class Report:
         study: What was asked.
         estimate: What the method found.
         seconds: Wall time of the estimation [s].
+        faults: Scenarios on which the ego failed twice.
     """
 
     study: Study
     estimate: samplers.Estimate
     seconds: float
+    faults: tuple[Fault, ...] = ()
 
     @property
     def doubtful(self) -> bool:
@@ -112,7 +120,7 @@ class Report:
         space = self.study.problem.space
         ranked = [
             {
-                "parameters": {name: np.asarray(value).tolist() for name, value in space.named(failure.x).items()},
+                "parameters": self._parameters(failure.x),
                 "f": failure.f if math.isfinite(failure.f) else None,
                 "log_p0": failure.log_p0,
             }
@@ -127,9 +135,17 @@ class Report:
             "seconds": self.seconds,
             "n_failures": failures.total,
             "failures": ranked,
+            "n_faults": len(self.faults),
+            "faults": [
+                {"parameters": self._parameters(fault.x), "reason": fault.reason} for fault in self.faults[:top]
+            ],
             "units": dict(zip(space.names, space.units, strict=True)),
             "version": rare_envs.__version__,
         }
+
+    def _parameters(self, x: NDArray[np.float64]) -> dict[str, Any]:
+        named = self.study.problem.space.named(x)
+        return {name: np.asarray(value).tolist() for name, value in named.items()}
 
 
 def prepare(question: Question) -> Study:
@@ -145,6 +161,7 @@ def prepare(question: Question) -> Study:
         BadInput: Something in the question cannot be used.
     """
     try:
+        _check_on_error(question.on_error)
         method = samplers.get_method(question.method)
         find_scenario(question.env_id)  # before the ego, which takes seconds to load
         ego = agents.load_ego(question.ego, algo=question.algo, trust=question.trust)
@@ -163,6 +180,11 @@ def prepare(question: Question) -> Study:
         raise BadInput(error) from error
     _try_ego(problem)
     return Study(question, problem, method)
+
+
+def _check_on_error(word: str) -> None:
+    if word not in ON_ERROR:
+        raise ValueError(f"Unknown on_error {word!r}{did_you_mean(word, ON_ERROR)}; expected {', '.join(ON_ERROR)}.")
 
 
 @torch.inference_mode()
@@ -195,19 +217,19 @@ def run(study: Study, progress: bool | Callable[[samplers.Progress], None] = Fal
         BadInput: A number in the question is out of range (nothing is simulated then), or the ego failed on some x.
     """
     question, start = study.question, time.perf_counter()
+    problem = FaultTolerant(study.problem, question.on_error)
     try:
         estimate = samplers.estimate(
-            study.problem,
+            problem,
             study.method,
             gamma=question.gamma,
             seed=question.seed,
             max_sim=question.max_sim,
             target_cov=question.target_cov,
             replicates=question.replicates,
+            on_error=cast("Literal['raise', 'failure', 'bound']", question.on_error),
             progress=progress,
         )
-    except ValueError as error:
+    except (ValueError, EgoGone) as error:
         raise BadInput(error) from error
-    except SystemExit as error:
-        raise BadInput(f"The ego ended the program in the middle of the run: {error!r}") from error
-    return Report(study, estimate, time.perf_counter() - start)
+    return Report(study, estimate, time.perf_counter() - start, tuple(problem.faults))

@@ -1,4 +1,4 @@
-"""The folder a run leaves behind: result.json, failures.csv (and failures.npz), plot.png."""
+"""The folder a run leaves behind: result.json, failures.csv (and failures.npz), plot.png, faults.csv."""
 
 from __future__ import annotations
 
@@ -11,12 +11,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rare_envs.space import ScenarioSpace
 from rare_envs.study.columns import SHOWN, columns_of
 from rare_envs.study.evaluate import Report
 from rare_envs.study.plots import save_plot
 
 RESULT, FAILURES, BLOCKS, PLOT = "result.json", "failures.csv", "failures.npz", "plot.png"
 """Blocks are what a table has no room for: of more than `columns.SHOWN` values, drivers' weights and noise."""
+FAULTS, FAULT_BLOCKS = "faults.csv", "faults.npz"
+"""Likewise, scenarios on which the ego failed."""
 
 
 def write_run(folder: Path, report: Report) -> None:
@@ -28,6 +31,7 @@ def write_run(folder: Path, report: Report) -> None:
     """
     (folder / RESULT).write_text(to_text(report.to_dict()) + "\n", encoding="utf-8")
     _write_failures(folder, report)
+    _write_faults(folder, report)
     save_plot(folder / PLOT, report)
 
 
@@ -65,21 +69,40 @@ def read_failures(folder: Path) -> dict[str, NDArray[np.float64]]:
 
 
 def _write_failures(folder: Path, report: Report) -> None:
-    """One failure a row, the most likely first.
+    """One failure a row, the most likely first: x, f and log p0."""
+    failures = report.estimate.failures
+    # repr of a float gives it back exactly, so that a row replays to the same f
+    rest = [(failure.f, failure.log_p0) for failure in failures]
+    _write_table(folder / FAILURES, report.study.problem.space, failures.x, ("f", "log_p0"), rest)
 
-    The table has the columns of x by name but for large blocks, f and log p0. Large blocks go row by row into a file
-    of arrays, in single precision, in which they are simulated, so that they replay to the same f.
+
+def _write_faults(folder: Path, report: Report) -> None:
+    """One scenario a row on which the ego failed: x and the reason; no file without one."""
+    space, faults = report.study.problem.space, report.faults
+    for name in (FAULTS, FAULT_BLOCKS):
+        (folder / name).unlink(missing_ok=True)
+    if faults:
+        x = np.stack([fault.x for fault in faults])
+        _write_table(folder / FAULTS, space, x, ("reason",), [(fault.reason,) for fault in faults])
+
+
+def _write_table(
+    path: Path, space: ScenarioSpace, x: NDArray[np.float64], names: tuple[str, ...], rest: list[tuple[Any, ...]]
+) -> None:
+    """Scenarios, one a row.
+
+    The table has the columns of x by name but for large blocks, then the rest. Large blocks go row by row into a file
+    of arrays beside it, in single precision, in which they are simulated, so that they replay to the same f.
     """
-    space, failures = report.study.problem.space, report.estimate.failures
     columns = columns_of(space)
     shown = [column.shown for column in columns]
-    with (folder / FAILURES).open("w", newline="", encoding="utf-8") as file:
+    with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow([*(column.name for column in columns if column.shown), "f", "log_p0"])
-        # repr of a float gives it back exactly, so that a row replays to the same f
-        writer.writerows([*failure.x[shown].tolist(), failure.f, failure.log_p0] for failure in failures)
+        writer.writerow([*(column.name for column in columns if column.shown), *names])
+        writer.writerows([*row[shown].tolist(), *more] for row, more in zip(x, rest, strict=True))
     large = {name for name, size in zip(space.names, space.sizes, strict=True) if size > SHOWN}
-    (folder / BLOCKS).unlink(missing_ok=True)
+    blocks_path = path.with_suffix(".npz")
+    blocks_path.unlink(missing_ok=True)
     if large:
-        blocks = {name: part.astype(np.float32) for name, part in space.columns(failures.x).items() if name in large}
-        np.savez_compressed(folder / BLOCKS, allow_pickle=False, **blocks)
+        blocks = {name: part.astype(np.float32) for name, part in space.columns(x).items() if name in large}
+        np.savez_compressed(blocks_path, allow_pickle=False, **blocks)

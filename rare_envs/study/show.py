@@ -70,6 +70,9 @@ def print_report(report: Report, out: Path | None = None) -> None:
         console.print(f"  {name:<15} {value}")
     if report.vec_normalize is not None:
         console.print(f"  {'observations':<15} normalised by {report.vec_normalize}")
+    if report.faults:
+        first = report.faults[0].reason
+        console.print(f"  {'faults':<15} the ego failed twice on {len(report.faults)} scenarios; the first: {first}")
     _print_failure(console, report)
     for warning in estimate.warnings:
         console.print(f"warning: {warning}", style="yellow")

@@ -1,0 +1,135 @@
+"""What becomes of scenarios on which an ego fails: found, tried again, written down, and the others kept."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+ON_ERROR = ("raise", "failure", "bound")
+
+
+class EgoGone(RuntimeError):
+    """The ego cannot be asked any more, whatever the scenario."""
+
+
+class EgoFault(ValueError):
+    """The ego has failed on a scenario, twice."""
+
+
+class Fault(NamedTuple):
+    """A scenario on which the ego failed."""
+
+    x: FloatArray
+    """Its parameters, shape (d,)."""
+    reason: str
+    """What went wrong, in one line."""
+
+
+class FaultTolerant:
+    """A problem around one whose ego may raise, hang (if remote), die, or give NaN or actions of a wrong shape.
+
+    A batch that fails is handed over again in halves until the rows that fail stand alone; such a row is tried once
+    more. If it fails again its f is NaN, which `samplers.estimate(..., on_error="failure" or "bound")` counts, and what
+    happened is kept. The halves cost simulations that are not in `n_sim`; they are counted here.
+
+    Attributes:
+        problem: What is asked.
+        faults: Scenarios that failed twice, in the order they were met.
+        n_retried: Rows handed over again.
+    """
+
+    def __init__(self, problem: Any, on_error: str = "failure") -> None:
+        """Wrap a problem.
+
+        Args:
+            problem: Has `dim`, `base` and `evaluate`, such as a `DrivingProblem`.
+            on_error: "raise" ends with an error that names the scenario and the reason; "failure" and "bound" give
+                NaN.
+
+        Raises:
+            ValueError: If on_error is none of these.
+        """
+        if on_error not in ON_ERROR:
+            raise ValueError(f"Expected on_error {', '.join(map(repr, ON_ERROR))}, got {on_error!r}.")
+        self.problem = problem
+        self.faults: list[Fault] = []
+        self.n_retried = 0
+        self._on_error = on_error
+
+    @property
+    def dim(self) -> int:
+        """Number of scenario parameters."""
+        return int(self.problem.dim)
+
+    @property
+    def base(self) -> Any:
+        """Distribution of x in ordinary traffic."""
+        return self.problem.base
+
+    @property
+    def given(self) -> str:
+        """What p is conditional on, as the problem says."""
+        return str(getattr(self.problem, "given", ""))
+
+    def evaluate(self, x: FloatArray) -> FloatArray:
+        """Simulate.
+
+        Args:
+            x: Scenario parameters, shape (n, d).
+
+        Returns:
+            Safety measures, shape (n,); NaN where the ego failed twice.
+
+        Raises:
+            EgoFault: If it failed twice and on_error is "raise".
+            EgoGone: If there is nobody to ask any more.
+        """
+        x = np.atleast_2d(np.asarray(x, dtype=np.float64))
+        f, reasons = self._by_halves(x)
+        for row in sorted(reasons):
+            self.n_retried += 1
+            again, why = self._attempt(x[row : row + 1])
+            if why is None and not np.isnan(again[0]):
+                f[row] = again[0]
+                continue
+            fault = Fault(x[row].copy(), why or "f is NaN")
+            if self._on_error == "raise":
+                raise EgoFault(f"The ego failed twice on x = {_shown(fault.x)}: {fault.reason}")
+            self.faults.append(fault)
+        return f
+
+    def _by_halves(self, x: FloatArray) -> tuple[FloatArray, dict[int, str]]:
+        """f, NaN where a row failed, and the reasons by row."""
+        f, why = self._attempt(x)
+        if why is None:
+            return f, dict.fromkeys(np.flatnonzero(np.isnan(f)).tolist(), "f is NaN")
+        if len(x) == 1:
+            return f, {0: why}
+        middle = len(x) // 2
+        self.n_retried += len(x)
+        first, reasons = self._by_halves(x[:middle])
+        second, later = self._by_halves(x[middle:])
+        return np.concatenate((first, second)), reasons | {middle + row: reason for row, reason in later.items()}
+
+    def _attempt(self, x: FloatArray) -> tuple[FloatArray, str | None]:
+        """F of a batch, or NaN and the reason."""
+        try:
+            return np.array(self.problem.evaluate(x.copy()), dtype=np.float64), None
+        except EgoGone:
+            raise
+        except (Exception, SystemExit) as error:  # the ego is the user's: anything may happen in it
+            return np.full(len(x), np.nan), _reason(error)
+
+
+def _reason(error: BaseException) -> str:
+    words = " ".join(str(error).split())
+    if isinstance(error, ValueError) and words:  # ours say what is wrong by themselves
+        return words
+    return f"{type(error).__name__}: {words}" if words and not isinstance(error, SystemExit) else repr(error)
+
+
+def _shown(x: FloatArray) -> str:
+    return np.array2string(x, precision=6, threshold=8, separator=", ", max_line_width=10**6)
