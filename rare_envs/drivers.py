@@ -7,7 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rare_envs.actions import IDLE, read_actions
+from rare_envs.actions import IDLE
+from rare_envs.asking import Asked, ask
 from rare_envs.dynamics import NEAR_ZERO, steering_for
 from rare_envs.geometry import Lead
 from rare_envs.observation import observe
@@ -146,24 +147,28 @@ class PolicyDriver:
     """What its actions are."""
     stride: int = 1
     """It is asked every so many ticks; meta-actions only are carried out in between."""
+    lost: dict[int, str] | None = None
+    """Where rows are written down on which the policy fails, with the reason; None if such a failure is raised."""
 
     def act(self, episode: "Episode", memory: Any) -> tuple[Tensor, Any]:
         """Observe, and ask the policy for its mean action; a recurrent policy's hidden state is the memory.
 
         No episode shows a policy what comes after its collision, so those rows are shown zeros and their actions,
-        which need not be finite, are ignored.
+        which need not be finite, are ignored. So it is with rows that are lost.
 
         Raises:
-            ValueError: If the policy's actions are not finite or have the wrong shape.
+            ValueError: If the policy's actions are not finite or have the wrong shape, and rows cannot be lost.
         """
         state, over = episode.state, episode.collided
         batch = len(over)
         hidden, tick = (None, 0) if memory is None else memory
         if tick % self.stride:
             return torch.full((batch,), IDLE, device=state.x.device), (hidden, tick + 1)
-        start = np.full(batch, memory is None)
+        if self.lost:
+            over = over.clone()
+            over[list(self.lost)] = True
         seen = observe(episode, self.observation)
         observation = seen.masked_fill(over.view(-1, *[1] * (seen.ndim - 1)), 0.0).numpy(force=True)
-        action, hidden = self.policy.predict(observation, state=hidden, episode_start=start, deterministic=True)
-        given = read_actions(self.action, torch.as_tensor(np.asarray(action)).to(state.x.device), batch, over)
+        start = np.full(batch, memory is None)
+        given, hidden = ask(self.policy, self.action, Asked(observation, hidden, start, over), self.lost)
         return given.to(state.x) if given.is_floating_point() else given, (hidden, tick + 1)

@@ -31,9 +31,10 @@ class Fault(NamedTuple):
 class FaultTolerant:
     """A problem around one whose ego may raise, hang (if remote), die, or give NaN or actions of a wrong shape.
 
-    A batch that fails is handed over again in halves until the rows that fail stand alone; such a row is tried once
-    more. If it fails again its f is NaN, which `samplers.estimate(..., on_error="failure" or "bound")` counts, and what
-    happened is kept. The halves cost simulations that are not in `n_sim`; they are counted here.
+    Rows on which it fails are found: at the tick at which they do if it has no memory, else by handing the batch over
+    in halves until they stand alone. They are simulated once more. If the ego fails on them again f is NaN, which
+    `samplers.estimate(..., on_error="failure" or "bound")` counts, and what happened is kept. The simulations that
+    this costs are not in `n_sim`; they are counted here.
 
     Attributes:
         problem: What is asked.
@@ -89,13 +90,13 @@ class FaultTolerant:
         """
         x = np.atleast_2d(np.asarray(x, dtype=np.float64))
         f, reasons = self._by_halves(x)
-        for row in sorted(reasons):
-            self.n_retried += 1
-            again, why = self._attempt(x[row : row + 1])
-            if why is None and not np.isnan(again[0]):
-                f[row] = again[0]
-                continue
-            fault = Fault(x[row].copy(), why or "f is NaN")
+        if not reasons:
+            return f
+        rows = sorted(reasons)
+        self.n_retried += len(rows)
+        f[rows], again = self._by_halves(x[rows])
+        for number, reason in sorted(again.items()):
+            fault = Fault(x[rows[number]].copy(), reason)
             if self._on_error == "raise":
                 raise EgoFault(f"The ego failed twice on x = {_shown(fault.x)}: {fault.reason}")
             self.faults.append(fault)
@@ -103,28 +104,29 @@ class FaultTolerant:
 
     def _by_halves(self, x: FloatArray) -> tuple[FloatArray, dict[int, str]]:
         """f, NaN where a row failed, and the reasons by row."""
-        f, why = self._attempt(x)
-        if why is None:
-            return f, dict.fromkeys(np.flatnonzero(np.isnan(f)).tolist(), "f is NaN")
-        if len(x) == 1:
-            return f, {0: why}
+        try:
+            return self._attempt(x.copy())
+        except EgoGone:
+            raise
+        except (Exception, SystemExit) as error:  # the ego is the user's: anything may happen in it
+            if len(x) == 1:
+                return np.full(1, np.nan), {0: reason_of(error)}
         middle = len(x) // 2
         self.n_retried += len(x)
         first, reasons = self._by_halves(x[:middle])
         second, later = self._by_halves(x[middle:])
         return np.concatenate((first, second)), reasons | {middle + row: reason for row, reason in later.items()}
 
-    def _attempt(self, x: FloatArray) -> tuple[FloatArray, str | None]:
-        """F of a batch, or NaN and the reason."""
-        try:
-            return np.array(self.problem.evaluate(x.copy()), dtype=np.float64), None
-        except EgoGone:
-            raise
-        except (Exception, SystemExit) as error:  # the ego is the user's: anything may happen in it
-            return np.full(len(x), np.nan), _reason(error)
+    def _attempt(self, x: FloatArray) -> tuple[FloatArray, dict[int, str]]:
+        """F of a batch, and reasons where rows alone have failed, by the problem's `attempt` if it has one."""
+        attempt = getattr(self.problem, "attempt", None)
+        f, reasons = (self.problem.evaluate(x), {}) if attempt is None else attempt(x)
+        f = np.array(f, dtype=np.float64)
+        return f, dict.fromkeys(np.flatnonzero(np.isnan(f)).tolist(), "f is NaN") | reasons
 
 
-def _reason(error: BaseException) -> str:
+def reason_of(error: BaseException) -> str:
+    """What went wrong, in one line."""
     words = " ".join(str(error).split())
     if isinstance(error, ValueError) and words:  # ours say what is wrong by themselves
         return words

@@ -101,6 +101,26 @@ class DrivingProblem:
         Raises:
             ValueError: If x has the wrong shape, is NaN or outside the physical box, or if the policy returns NaN.
         """
+        return self._simulated(x, None)
+
+    def attempt(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], dict[int, str]]:
+        """Simulate, and let rows go on which the policy fails.
+
+        Args:
+            x: Scenario parameters, shape (n, d).
+
+        Returns:
+            Safety measures, shape (n,), NaN in rows that are lost, and the reasons by row.
+
+        Raises:
+            Exception: A policy with a memory has failed on the batch, which may be the fault of any row.
+        """
+        lost: dict[int, str] = {}
+        f = self._simulated(x, lost)
+        f[list(lost)] = np.nan
+        return f, lost
+
+    def _simulated(self, x: NDArray[np.float64], lost: dict[int, str] | None) -> NDArray[np.float64]:
         x = self.space.validate(np.atleast_2d(x))
         tile = POLICY_TILE if isinstance(self.driver, PolicyDriver) else RULE_TILE
         tile = LIDAR_TILE if self.world.sees or self.world.recorded else tile
@@ -108,7 +128,12 @@ class DrivingProblem:
         with torch.inference_mode():
             for first in range(0, len(x), tile):
                 rows = torch.from_numpy(x[first : first + tile]).float()
-                f[first : first + tile] = rollout(self.world, self.driver, rows).f.numpy()
+                driver, mine = self.driver, dict[int, str]()
+                if lost is not None and isinstance(driver, PolicyDriver):
+                    driver = replace(driver, lost=mine)
+                f[first : first + tile] = rollout(self.world, driver, rows).f.numpy()
+                if lost is not None:
+                    lost.update({first + row: reason for row, reason in mine.items()})
         return f
 
 

@@ -59,11 +59,12 @@ def save_plot(path: Path, report: Report) -> None:
         draw_convergence(left.subplots(), report)
         draw_failures(middle.subplots(), report.study.problem.space, report.estimate.failures)
         failures = report.estimate.failures
-        if len(failures):
-            drive = replay(report.study.problem, failures.x[0])
+        driven = np.flatnonzero(~np.isnan(failures.f))  # scenarios on which the ego failed cannot be driven again
+        if len(driven):
+            drive = replay(report.study.problem, failures.x[driven[0]])
             draw_drive(list(right.subplots(MOMENTS + 1, height_ratios=[view] * MOMENTS + [CURVES])), drive)
         else:
-            _say(right.subplots(), "no failure found, so none to show")
+            _say(right.subplots(), "no failure found that can be shown")
         figure.savefig(path, dpi=120)
 
 

@@ -19,13 +19,14 @@ GAP = 30.0
 class Coasting:
     """Fails where a scenario begins with a short gap, however the batch is made up."""
 
-    def __init__(self, fail: Any = None) -> None:
+    def __init__(self, fail: Any = None, memory: bool = False) -> None:
         self.fail = fail
+        self.memory = memory
 
     def predict(self, observation: Any, state: Any, episode_start: Any, deterministic: bool) -> Any:
         actions = np.zeros((len(observation), 2), np.float32)
         short = (observation[:, 3] * 50.0 < GAP) & bool(episode_start[0])
-        return (self.fail(actions, short) if self.fail and short.any() else actions), state
+        return (self.fail(actions, short) if self.fail and short.any() else actions), (1 if self.memory else None)
 
 
 def raises(actions: Any, short: Any) -> Any:
@@ -64,15 +65,17 @@ def problem(ego: Any) -> rare_envs.DrivingProblem:
     return rare_envs.DrivingProblem(ENV, ego=ego, horizon=1.0)
 
 
+@pytest.mark.parametrize("memory", [False, True])
 @pytest.mark.parametrize("how", FAILING)
-def test_only_scenarios_on_which_the_ego_fails_are_lost(how: str, x: np.ndarray) -> None:
+def test_only_scenarios_on_which_the_ego_fails_are_lost(how: str, memory: bool, x: np.ndarray) -> None:
     fail, reason = FAILING[how]
-    tolerant = FaultTolerant(problem(Coasting(fail)))
+    tolerant = FaultTolerant(problem(Coasting(fail, memory)))
     f = tolerant.evaluate(x)
     bad = x[:, 2] < GAP
     np.testing.assert_array_equal(np.isnan(f), bad)
     np.testing.assert_array_equal(f[~bad], problem(Coasting()).evaluate(x)[~bad])
     np.testing.assert_array_equal([fault.x for fault in tolerant.faults], x[bad])
+    assert tolerant.n_retried < (5 if memory else 2) * len(x)
     assert all(reason in fault.reason and "\n" not in fault.reason for fault in tolerant.faults)
 
 
@@ -89,14 +92,14 @@ def test_a_fault_that_passes_costs_nothing_but_time(on_error: str, x: np.ndarray
 
     def once(actions: Any, short: Any) -> Any:
         calls.append(1)
-        if len(calls) <= 2:
+        if len(calls) == 1:
             raise OSError("busy")
         return actions
 
     tolerant = FaultTolerant(problem(Coasting(once)), on_error)
     np.testing.assert_array_equal(tolerant.evaluate(x), problem(Coasting()).evaluate(x))
     assert not tolerant.faults
-    assert tolerant.n_retried > 0
+    assert len(calls) > 1
 
 
 def test_nobody_is_asked_again_once_the_ego_is_gone(x: np.ndarray) -> None:
@@ -149,4 +152,4 @@ def test_an_ego_that_fails_on_one_scenario_in_fifty_is_estimated_all_the_same() 
     plain = samplers.estimate(problem(Coasting()), samplers.MonteCarlo(), **settings)
     lost = len(tolerant.faults)
     assert abs(result.p - plain.p) <= lost / 200
-    assert tolerant.n_retried > 0
+    assert lost < 20
