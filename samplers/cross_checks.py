@@ -15,6 +15,8 @@ FALSE_ALARM = 1e-3
 ROUNDS_APART = 4.0
 """Standard errors between the rounds and the estimate."""
 ENOUGH_ESS = 30.0
+LOW_RATE = 0.025
+"""Independent failures for each final draw. With less, weights are so uneven that heavy ones may not have been met."""
 LEFT_OUT = 0.05
 """Share of p that a single draw in a region may stand for."""
 
@@ -46,6 +48,14 @@ def against_rounds(strata: Strata, rounds: Sequence[Draws]) -> list[str]:
     if apart < ROUNDS_APART:
         return []
     return [f"The rounds before the estimate say {before:.2e}, {apart:.1f} standard errors from it."]
+
+
+def rarely_worth(strata: Strata) -> list[str]:
+    """Warn where the draws are worth so little that the weights may have a tail that none of them has met."""
+    draws = strata.draws
+    if len(draws.f) == 0 or draws.ess >= LOW_RATE * draws.n:
+        return []
+    return [f"{draws.n:,} draws are worth {draws.ess:.0f} failures: there may be heavier weights than any met."]
 
 
 def regions_left_out(strata: Strata) -> list[str]:

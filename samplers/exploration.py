@@ -101,7 +101,7 @@ def _descend(
 ) -> Generator[FloatArray, FloatArray, Downhill]:
     """Run subset simulation from base draws u (n, d), f (n,), until a tenth of a level fails or the budget is used."""
     points, outcomes = [u[:0]], [f[:0]]
-    sigma = 0.6
+    sigma, levels = 0.6, 0
     for _ in range(MOST_LEVELS):
         level = next_level(f, LEVEL_FRACTION, gamma)
         if level is None or level == gamma:
@@ -123,7 +123,8 @@ def _descend(
             at.append(f_chain)
             sigma = min(sigma * math.exp((accepted.mean() - LEVEL_ACCEPTANCE) / math.sqrt(step)), 1.0)
         u, f = np.concatenate(states), np.concatenate(at)
-    return Downhill(np.unique(u[f <= gamma], axis=0), np.concatenate(points), np.concatenate(outcomes))
+        levels += 1
+    return Downhill(np.unique(u[f <= gamma], axis=0), np.concatenate(points), np.concatenate(outcomes), levels)
 
 
 def _some(scale: NDArray[np.int64], n: int, rng: np.random.Generator) -> NDArray[np.int64]:

@@ -60,7 +60,10 @@ class Refinement:
         regions = found.regions
         self._dim = regions[0].u.shape[1]
         self._regions = regions
-        self._noisy = found.noisy
+        self.noisy = found.noisy
+        """Whether f has noise of its own."""
+        self.levels = found.levels
+        """Levels that subset simulation passed on the way down."""
         self._scattered = found.scattered
         self._history = history
         self._gamma = gamma
@@ -90,7 +93,7 @@ class Refinement:
         if not seen or len(self._history.u) == 0:
             return Proposal(candidates, weights)
         floors = self._floors(kinds, regions, REGION_FLOOR_LAST if last else REGION_FLOOR)
-        u, log_w = self._smoothed() if self._noisy else (self._history.u, self._history.log_weights)
+        u, log_w = self._smoothed() if self.noisy else (self._history.u, self._history.log_weights)
         log_r = log_ratios([candidate.component for candidate in candidates], u)
         weights = least_variance(log_r, log_w, weights, floors)
         stays = kinds == "base"
@@ -100,7 +103,7 @@ class Refinement:
             stays = stays | explored
         weights = np.where((weights < SMALLEST) & ~stays, 0.0, weights)
         proposal = Proposal(candidates, with_floors(weights / weights.sum(), floors))
-        gate = self._gate() if last and not self._noisy and self._dim <= HIGH_DIM else None
+        gate = self._gate() if last and not self.noisy and self._dim <= HIGH_DIM else None
         return proposal if gate is None else proposal.behind(gate, self._rng)
 
     def typical_weights(self, proposal: Proposal) -> FloatArray:
@@ -161,7 +164,7 @@ class Refinement:
             ess=2.0 * chains,
             groups=np.repeat(np.arange(chains), steps),
         )
-        most = 8 if self._noisy else 3
+        most = 8 if self.noisy else 3
         return fitted(points, most if self._dim <= HIGH_DIM else 1, self._rng).bumps
 
     def _fresh_bumps(self) -> list[Bump]:
@@ -190,21 +193,21 @@ class Refinement:
     def _candidates(self, seen: bool) -> list[Candidate]:
         bumps = [Candidate(b, "bump", c.region) for b, c in zip(self._bumps, self._first, strict=True)]
         bumps += [Candidate(bump, "bump") for bump in self._fresh]
-        planes = [] if self._noisy else self._planes
+        planes = [] if self.noisy else self._planes
         first = self._first if seen else []
         found = [Candidate(Wide(self._dim), "base"), Candidate(Wide(self._dim, 1.5), "wide")]
         found += self._shells() + bumps + planes + first
-        if not self._noisy:
+        if not self.noisy:
             found += [Candidate(part, "slice") for part in self._slices(seen)]
         for candidate in bumps + planes + first:
             if isinstance(candidate.component, Bump):
-                for power in (0.5, 0.25) if self._noisy else (0.5,):
+                for power in (0.5, 0.25) if self.noisy else (0.5,):
                     found.append(Candidate(candidate.component.tempered(power), "tempered", candidate.region))
         return found
 
     def _floors(self, kinds: NDArray[np.str_], regions: NDArray[np.int64], for_regions: float) -> list[Floor]:
-        tempered = TEMPERED_NOISY if self._noisy else TEMPERED_FLOOR + TEMPERED_MORE * (1 - self._sharp_hits)
-        base = BASE_NOISY if self._noisy else BASE_FLOOR
+        tempered = TEMPERED_NOISY if self.noisy else TEMPERED_FLOOR + TEMPERED_MORE * (1 - self._sharp_hits)
+        base = BASE_NOISY if self.noisy else BASE_FLOOR
         floors = [Floor(kinds == "tempered", tempered)]
         n = len(self._regions)
         if self._scattered:

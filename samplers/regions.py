@@ -69,6 +69,8 @@ class Downhill(NamedTuple):
     u: FloatArray
     """All points simulated, shape (n, d)."""
     f: FloatArray
+    levels: int = 0
+    """Levels passed."""
 
 
 class Found(NamedTuple):
@@ -79,6 +81,8 @@ class Found(NamedTuple):
     """Whether f has noise of its own: then regions cannot be told apart, and all of it is one."""
     scattered: bool = False
     """Whether they are no more than pieces of something like a shell."""
+    levels: int = 0
+    """Levels that subset simulation passed."""
 
 
 def grown(
@@ -91,7 +95,7 @@ def grown(
     if (yield from _is_noisy(simulator, walk.states[:, -1], gamma, rng)):
         last = yield from _walk(simulator, walk.states[:, -1], walk.sigma, None, steps[1], gamma, rng)
         region = Region(last.states[:, 1:], last.proposals.reshape(-1, dim), last.f.ravel())
-        return Found([region], noisy=True)
+        return Found([region], noisy=True, levels=descent.levels)
     after = len(starts) * (steps[1] + 1)  # the second walk, and one look at where it ended
     labels, _ = yield from _same_region(simulator, walk.states[:, -1], gamma, limit - after)
     room = max(limit - simulator.n_sim - after, 0) // (steps[1] + 1)
@@ -110,7 +114,7 @@ def grown(
         own = labels == k
         regions.append(Region(last.states[own, 1:], proposals[own].reshape(-1, dim), f[own].ravel()))
     regions = [_with_descent(regions[0], descent)] if len(regions) == 1 else regions
-    return Found(regions, noisy=False, scattered=scattered)
+    return Found(regions, noisy=False, scattered=scattered, levels=descent.levels)
 
 
 def _walk(

@@ -7,8 +7,9 @@ from typing import ClassVar
 
 import numpy as np
 
+from samplers import fallback
 from samplers.checks import check_count
-from samplers.cross_checks import against_base_draws, against_rounds, regions_left_out
+from samplers.cross_checks import against_base_draws, against_rounds, rarely_worth, regions_left_out
 from samplers.exploration import Sizes, first_draws, regions_of
 from samplers.history import History
 from samplers.importance import Draws, doubts, interval_of
@@ -25,6 +26,8 @@ from samplers.weights import effective_sample_size
 
 LEAST_BUDGET = 400
 """With less than this an exploration is not worth its draws."""
+FEW = 1500
+"""With less than this one of two like regions is missed in 3 to 30 % of runs, and nothing tells."""
 COMMON = 0.1
 """Where this share of the base draws fails, plain Monte Carlo is as good as anything."""
 ROUNDS = (0.09, 0.12, 0.14)
@@ -67,7 +70,9 @@ class TwoStage(Method):
     allows, of rounds that disagree, and of regions that the last draws hardly reach. What nothing tells of is a
     region that neither f announces nor any draw has hit; `Estimate.unseen` bounds its probability.
 
-    Where a tenth of the base draws fails, or nothing is found at all, the rest is plain Monte Carlo.
+    Where a tenth of the base draws fails, or nothing is found at all, the rest is plain Monte Carlo. Where no mixture
+    describes the failures (dozens of regions, hundreds of dimensions without a plane), the rounds show it, and what
+    is left goes into adaptive subset simulation (`fallback.py`), with a warning.
 
     Args:
         n: Simulations where `max_sim` does not say how many; with a target c.o.v. final batches of a tenth of it
@@ -105,9 +110,15 @@ class TwoStage(Method):
             if refinement is None:
                 return (yield from run.plain())
             proposal = yield from run.refined(refinement)
+            if proposal is None:
+                return (yield from run.descended(refinement.levels))
         except Interrupted:
             return run.interrupted()
-        return (yield from run.estimated(refinement, proposal))
+        outcome = yield from run.estimated(refinement, proposal)
+        if budget < FEW:
+            few = f"An exploration within {budget:,} simulations may miss regions without notice ({FEW:,} are enough)."
+            outcome = replace(outcome, warnings=(*outcome.warnings, few))
+        return outcome
 
 
 class _Run:
@@ -152,20 +163,38 @@ class _Run:
         self._note(fails / max(chains, 1), share, chains, math.inf)
         return Refinement(found, self._history, gamma, self._rng) if found.regions else None
 
-    def refined(self, refinement: Refinement) -> Generator[FloatArray, FloatArray, Proposal]:
-        """Draw and learn in rounds; return the mixture for the estimate."""
+    def refined(self, refinement: Refinement) -> Generator[FloatArray, FloatArray, Proposal | None]:
+        """Draw and learn in rounds; return the mixture for the estimate, None if it would not serve."""
         room = self._left
+        proposal = refinement.proposal()
         for number, share in enumerate(ROUNDS, start=1):
-            proposal = refinement.proposal()
-            if int(share * room) == 0:
-                continue
-            batch = yield from self._drawn(proposal, int(share * room))
-            self._rounds.append(Draws.weighted(batch.f, proposal.log_weights(batch.u), batch.u, self._goal.gamma))
-            refinement.learn(proposal, batch, afresh=number > len(ROUNDS) - AFRESH)
-            log_w = self._history.log_weights
-            ess = effective_sample_size(log_w)
-            self._note_draws(batch, float(np.exp(log_w).sum()), 1 / math.sqrt(ess) if ess else math.inf, ess)
-        return refinement.proposal(last=True)
+            n = int(share * room)
+            if n > 0:
+                batch = yield from self._drawn(proposal, n)
+                self._rounds.append(Draws.weighted(batch.f, proposal.log_weights(batch.u), batch.u, self._goal.gamma))
+                refinement.learn(proposal, batch, afresh=number > len(ROUNDS) - AFRESH)
+                log_w = self._history.log_weights
+                ess = effective_sample_size(log_w)
+                self._note_draws(batch, float(np.exp(log_w).sum()), 1 / math.sqrt(ess) if ess else math.inf, ess)
+            proposal = refinement.proposal(last=number == len(ROUNDS))
+            if number > 1 and not self._serves(refinement, proposal):
+                return None
+        return proposal
+
+    def _serves(self, refinement: Refinement, proposal: Proposal) -> bool:
+        """Tell whether to go on with a proposal; where f is noisy there is nothing better."""
+        if refinement.noisy or self._end - self._simulator.n_sim < fallback.LEAST_BUDGET or not self._rounds:
+            return True
+        return fallback.describes(self._rounds[-1], refinement.typical_weights(proposal))
+
+    def descended(self, levels: int) -> Steps:
+        """Spend the rest on subset simulation, which needs no proposal."""
+        left = self._end - self._simulator.n_sim
+        outcome = yield from fallback.subset_simulation(self._simulator.inputs, self._goal, levels, left, self._rng)
+        if outcome.status is Status.STOPPED and outcome.p == 0:
+            return self.interrupted()
+        trace, base_draws = self._closed_trace() + outcome.trace, self._n_base + outcome.base_draws
+        return replace(outcome, trace=trace, base_draws=base_draws)
 
     def estimated(self, refinement: Refinement, proposal: Proposal) -> Steps:
         """Draw from the last mixture until the budget is used or the target is met."""
@@ -191,6 +220,7 @@ class _Run:
             *against_base_draws(strata.p, base_hits, len(self._base_f)),
             *against_rounds(strata, self._rounds),
             *regions_left_out(strata),
+            *(() if refinement.noisy else rarely_worth(strata)),
         )
         sample = strata.sample(proposal, self._base_f, self._base_u, goal.gamma)
         status = Status.STOPPED if stopped else outcome.status

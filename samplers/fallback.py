@@ -1,0 +1,56 @@
+"""Where no proposal describes the failures: subset simulation, which needs none."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from samplers.importance import Draws
+from samplers.method import Goal, Steps
+from samplers.problem import FloatArray, Inputs
+from samplers.subset import AdaptiveSubsetSimulation
+
+LEAST_RATE = 0.04
+"""What a round of draws must be worth, in independent failures for each draw. Proposals that come to something reach
+0.05 to 0.8; with less, the spread of the weights is that of the failures that were hit, not of those that there are."""
+LARGEST_TYPICAL = 30.0
+"""How many times p a point that the exploration found may weigh as a draw: 1 to 3 is usual, 17 was seen to do."""
+LEAST_BUDGET = 300
+"""Subset simulation is not worth its draws with less."""
+WORTH = 30.0
+"""Points of a level at p0 = 0.1 for one that is independent: (1 - p0) / p0, and correlation along the chains."""
+
+
+def describes(last: Draws, typical: FloatArray) -> bool:
+    """Return whether a proposal describes the failures so well that the weights of its draws can be believed.
+
+    Args:
+        last: The draws of the last round.
+        typical: Weights of the exploration's points as draws of the proposal, one for each region, shape (m,).
+    """
+    if len(last.f) == 0 or last.ess < LEAST_RATE * last.n:
+        return False
+    return bool(np.median(typical) <= LARGEST_TYPICAL * last.p)
+
+
+def subset_simulation(inputs: Inputs, goal: Goal, levels: int, budget: int, rng: np.random.Generator) -> Steps:
+    """Run adaptive subset simulation with the points per level that a budget or a target c.o.v. asks for.
+
+    Args:
+        inputs: Dimension and base law.
+        goal: What the method was asked for.
+        levels: Levels that the exploration passed on its way down.
+        budget: Simulations that are never exceeded.
+        rng: Source of randomness.
+    """
+    levels = max(levels, 2)
+    n = int(budget / (1 + 0.9 * levels))  # seeds are not simulated again
+    if goal.target_cov is not None:
+        n = min(n, math.ceil(WORTH * (levels + 1) / goal.target_cov**2))
+    method = AdaptiveSubsetSimulation(n=max(n, 10))
+    outcome = yield from method.steps(inputs, replace(goal, max_sim=budget), rng)
+    about = (
+        "No proposal describes the failures: p is from adaptive subset simulation with what was left, "
+        f"{budget:,} simulations; by itself (adss) it would have had all of them."
+    )
+    return replace(outcome, warnings=(about, *outcome.warnings))
