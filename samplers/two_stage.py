@@ -191,9 +191,9 @@ class _Run:
         """Spend the rest on subset simulation, which needs no proposal."""
         left = self._end - self._simulator.n_sim
         outcome = yield from fallback.subset_simulation(self._simulator.inputs, self._goal, levels, left, self._rng)
-        if outcome.status is Status.STOPPED and outcome.p == 0:
-            return self.interrupted()
         trace, base_draws = self._closed_trace() + outcome.trace, self._n_base + outcome.base_draws
+        if outcome.status is Status.STOPPED and outcome.p == 0:  # on its way to the failures: no estimate
+            outcome = self.interrupted()
         return replace(outcome, trace=trace, base_draws=base_draws)
 
     def estimated(self, refinement: Refinement, proposal: Proposal) -> Steps:

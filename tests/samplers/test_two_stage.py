@@ -3,7 +3,7 @@ import math
 
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import integrate, stats
 
 import samplers
 from samplers.problem import FunctionProblem
@@ -347,6 +347,60 @@ def test_stopped_in_the_estimate():
     assert result.trace[-1].n_sim == 300
 
 
+# where no proposal describes the failures
+
+
+def slabs(dim=20, beta=4.5):
+    """2 d regions, more than a proposal has room for: beyond beta along any axis, either way."""
+    p = 1 - (1 - 2 * PHI(-beta)) ** dim
+    return reference(f"slabs_d{dim}", lambda u: beta - np.abs(u).max(axis=1), dim, p)
+
+
+def ellipsoid(dim=50):
+    """Outside of an ellipsoid whose axes are of 50 lengths: a weighted sum of squares, p by inversion (Imhof 1961)."""
+    weights, limit = 1 / np.arange(1.0, dim + 1), 18.0
+
+    def integrand(t):
+        angle = 0.5 * np.arctan(weights * t).sum() - 0.5 * limit * t
+        return math.sin(angle) / (t * math.exp(0.25 * np.log1p((weights * t) ** 2).sum()))
+
+    p = 0.5 + integrate.quad(integrand, 0, np.inf, limit=500)[0] / math.pi
+    return reference("ellipsoid", lambda u: limit - u**2 @ weights, dim, p)
+
+
+@pytest.mark.parametrize("make", [slabs, ellipsoid])
+def test_subset_simulation_takes_over(recorder, make):
+    reference = make()
+    for seed in range(3):
+        result = counted(recorder, reference.problem, seed=seed, max_sim=6000)
+        assert result.warnings[0].startswith("No proposal describes the failures")
+        assert result.interval[0] < reference.p < result.interval[1]
+        assert 0.15 < result.cov < 1
+        assert result.n_sim <= 6000
+
+
+def test_subset_simulation_takes_as_many_points_as_the_target_asks_for(recorder):
+    sizes = [counted(recorder, slabs().problem, seed=0, target_cov=target).n_sim for target in (0.3, 0.5)]
+    assert 4000 < sizes[1] < sizes[0] < 12_000
+
+
+def test_subset_simulation_is_stopped():
+    reference = slabs()
+    run = TS().start(reference.problem, seed=0)
+    while not run.done and run.progress.n_sim < 5000:
+        run.tell(reference.problem.f(run.ask()))
+    run.stop()
+    result = run.result()
+    assert result.status == "stopped"
+    assert result.n_sim == sum(level.n_sim for level in result.trace)
+
+
+@pytest.mark.parametrize("max_sim", [800, 1500])
+def test_a_small_exploration_says_so(max_sim):
+    result = samplers.estimate(linear(3.0), TS(), seed=0, max_sim=max_sim)
+    assert any("may miss regions" in text for text in result.warnings) == (max_sim < 1500)
+
+
 # studies
 
 
@@ -389,6 +443,12 @@ def test_right_and_covered_with_many_seeds(study, reference):
     found = study(reference, TS(), 40)
     judge(found, 0.005)
     assert 0.6 < found.own_cov / found.ratios.std(ddof=1) < 1.6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("make", [slabs, ellipsoid])
+def test_subset_simulation_is_right_and_covered(study, make):
+    judge(study(make(), TS(), 40), 0.05)
 
 
 @pytest.mark.slow
