@@ -8,6 +8,7 @@ from rare_envs.scenarios import SCENARIOS
 if TYPE_CHECKING:
     from rare_envs.distributions import TruncatedGaussianMixture
     from rare_envs.faults import FaultTolerant
+    from rare_envs.interop import HighwayEnvProblem, HighwayEnvScenario, highway_env_problem
     from rare_envs.problem import DrivingProblem
     from rare_envs.space import ScenarioSpace
 
@@ -18,8 +19,11 @@ __all__ = [
     "ENV_IDS",
     "DrivingProblem",
     "FaultTolerant",
+    "HighwayEnvProblem",
+    "HighwayEnvScenario",
     "ScenarioSpace",
     "TruncatedGaussianMixture",
+    "highway_env_problem",
     "make_batch",
     "parallel_env",
     "register_scenario",
@@ -31,8 +35,11 @@ register_envs()
 _LAZY = {
     "DrivingProblem": "rare_envs.problem",
     "FaultTolerant": "rare_envs.faults",
+    "HighwayEnvProblem": "rare_envs.interop",
+    "HighwayEnvScenario": "rare_envs.interop",
     "ScenarioSpace": "rare_envs.space",
     "TruncatedGaussianMixture": "rare_envs.distributions",
+    "highway_env_problem": "rare_envs.interop",
 }
 
 

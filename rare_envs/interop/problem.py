@@ -1,0 +1,176 @@
+"""`highway_env_problem`: how often does an ego crash in one of HighwayEnv's own environments?"""
+
+import multiprocessing
+import os
+import weakref
+from collections.abc import Callable, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rare_envs.interop import simulation
+from rare_envs.interop.simulation import MAX_SECONDS, Driven, Simulation, one_thread, portable
+from rare_envs.space import Distribution, ScenarioSpace
+
+Array = NDArray[np.float64]
+
+
+class HighwayEnvProblem:
+    """P[f(X) <= gamma] for an ego in a HighwayEnv environment; fits `samplers.Problem`. See `highway_env_problem`.
+
+    Worker processes start with the first evaluation and end with `close`, at the end of a `with` block, or with the
+    program.
+
+    Attributes:
+        env_id: The environment's id.
+        ego: What was given.
+        workers: Number of processes.
+        space: Names, units, bounds and base distribution of x.
+        fixed: Parameters that are held, and their values.
+    """
+
+    def __init__(self, task: Simulation, ego: Any, workers: int) -> None:
+        """Make the environment once, here, so that what does not fit is known before the work.
+
+        Args:
+            task: What a drive is made of.
+            ego: As the user gave it.
+            workers: Number of processes.
+
+        Raises:
+            ValueError: If the task cannot be made.
+        """
+        if isinstance(workers, bool) or not isinstance(workers, int) or workers < 1:
+            raise ValueError(f"Expected workers of at least 1, got {workers!r}.")
+        self.env_id, self.ego, self.workers = task.env_id, ego, workers
+        self._task = task
+        self._driven: Driven | None = task.ready()
+        self.space: ScenarioSpace = self._driven.env.space
+        self.fixed: dict[str, Any] = self._driven.env.fixed
+        self._noise = task.settings["noise"]
+        self._random = self._driven.env.layout.leftover
+
+    @property
+    def dim(self) -> int:
+        """Number of columns of x."""
+        return self.space.dim
+
+    @property
+    def base(self) -> Distribution:
+        """Distribution of x."""
+        return self.space.base
+
+    @property
+    def given(self) -> str:
+        """What p is conditional on, in words for `samplers.Estimate.given`; empty if nothing is held fixed."""
+        fixed = self._random and self._noise == "fixed"
+        return "what HighwayEnv draws beyond x is one fixed draw" if fixed else ""
+
+    def evaluate(self, x: Array) -> Array:
+        """Drive.
+
+        Args:
+            x: Scenario parameters, shape (n, d).
+
+        Returns:
+            Measures, shape (n,); the same whatever the number of workers.
+
+        Raises:
+            ValueError: If x has the wrong shape, is NaN or outside its ranges, or an action is not finite.
+            RuntimeError: If a worker process died.
+        """
+        x = self.space.validate(np.atleast_2d(x))
+        if self.workers == 1 or len(x) == 1:
+            self._driven = self._driven or self._task.ready()
+            with one_thread():
+                return np.array([self._driven.f(row) for row in x])
+        chunk = max(1, min(8, len(x) // (4 * self.workers)))
+        try:
+            return np.array(list(self._pool.map(simulation.drive, x, chunksize=chunk)))
+        except BrokenProcessPool as error:
+            self.close()
+            raise RuntimeError(
+                "A worker process ended before its work: the ego cannot be loaded there (give a function that makes "
+                "it, in a module that can be imported), or memory ran out (use fewer workers)."
+            ) from error
+
+    @cached_property
+    def _pool(self) -> ProcessPoolExecutor:
+        import cloudpickle
+
+        pool = ProcessPoolExecutor(
+            self.workers,
+            mp_context=multiprocessing.get_context("spawn"),
+            initializer=simulation.begin,
+            initargs=(cloudpickle.dumps(self._task),),
+        )
+        self._end = weakref.finalize(self, pool.shutdown, wait=False, cancel_futures=True)
+        return pool
+
+    def close(self) -> None:
+        """End the worker processes; another evaluation starts new ones."""
+        if "_pool" in self.__dict__:
+            self._end.detach()
+            self.__dict__.pop("_pool").shutdown(cancel_futures=True)
+
+    def __enter__(self) -> "HighwayEnvProblem":
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Processes and environments stay where they are."""
+        return {**{k: v for k, v in self.__dict__.items() if k not in ("_pool", "_end")}, "_driven": None}
+
+
+def highway_env_problem(
+    env_id: str,
+    ego: Any = "idm",
+    *,
+    config: Mapping[str, Any] | None = None,
+    vehicles: int | None = None,
+    measure: str | Callable[[Any], float] = "ttc",
+    fixed: Mapping[str, Any] | str | None = None,
+    noise: bool | str = True,
+    base: Any = None,
+    horizon: float = MAX_SECONDS,
+    workers: int | None = 1,
+) -> HighwayEnvProblem:
+    """A HighwayEnv environment and an ego as a function f(x) of scenario parameters, for `samplers.estimate`.
+
+    f(x) is -1 if the ego crashes, else the least measure over all simulation steps. It is a deterministic function of
+    x: what HighwayEnv draws beyond the named parameters is seeded by the parameter `noise`.
+
+    Args:
+        env_id: "highway-v0", "highway-fast-v0", "merge-v0", "intersection-v0", "roundabout-v0" or a later version of
+            these.
+        ego: "idm" for HighwayEnv's `IDMVehicle`, an object with Stable-Baselines3's `predict`, or a function without
+            arguments that makes one in each worker process. Policies act by their means.
+        config: HighwayEnv's configuration, such as the observation that the ego was trained with.
+        vehicles: Number of vehicles with parameters, on the highway; 4 by default.
+        measure: "ttc" (least time until the ego's body touches any other), "front_ttc" (to the vehicle in front), or a
+            function of HighwayEnv's environment.
+        fixed: Values of parameters that are held, or "highway_env" for those that HighwayEnv itself holds: p is then
+            the share of crashes in the environment as it is (up to what docs/highway_env.md says of each).
+        noise: True, what is left random is seeded by the parameter `noise`; "fixed", by one number for all x.
+        base: Law of the parameters without noise; HighwayEnv's own by default.
+        horizon: Drives are cut off here [s], if the environment does not end them before.
+        workers: Processes, each with one thread; None for one per core. They are started afresh, so a script that uses
+            them needs `if __name__ == "__main__":`.
+
+    Returns:
+        The problem.
+
+    Raises:
+        ValueError: If an argument is invalid, or the ego's spaces are not the environment's.
+    """
+    if isinstance(horizon, bool) or not isinstance(horizon, int | float) or not 0.0 < horizon <= 1e4:
+        raise ValueError(f"Expected a horizon in seconds, positive and at most 10,000, got {horizon!r}.")
+    settings = {"vehicles": vehicles, "measure": measure, "fixed": fixed, "noise": noise, "base": base}
+    task = Simulation(env_id, portable(ego), config, settings, float(horizon))
+    return HighwayEnvProblem(task, ego, (os.cpu_count() or 1) if workers is None else workers)

@@ -1,0 +1,243 @@
+"""`HighwayEnvScenario`: a HighwayEnv environment whose start is set by parameters."""
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
+from highway_env.envs.common.abstract import AbstractEnv
+from highway_env.envs.merge_env import MergeGenericEnv
+from highway_env.envs.roundabout_env import RoundaboutGenericEnv
+
+from rare_envs.blocks import NoiseLaw, beside
+from rare_envs.interop.closeness import CLOSENESS, COLLISION, TTC_MAX
+from rare_envs.interop.layout import IDM, Group, Layout, idm_groups, set_idm
+from rare_envs.interop.layouts import LAYOUTS
+from rare_envs.space import Array, Parameter, ScenarioSpace, did_you_mean
+
+SUPPORTED = "highway-v0, highway-fast-v0, merge-v0, merge-v1, intersection-v0 to -v2, roundabout-v0, roundabout-v1"
+_FIXED_SEED = 12345
+
+
+class HighwayEnvScenario(gym.Wrapper[Any, Any, Any, Any]):
+    """A HighwayEnv environment with scenario parameters as reset options, and a base distribution over them.
+
+    `reset(options={"gap": [20.0, 15.0, 30.0, 30.0], "ego_speed": 28.0})` sets these; what is not given is drawn from
+    `space.base`, and `options={"x": vector}` sets all. Everything after reset is HighwayEnv's own, and a function of x
+    and the actions: what HighwayEnv still draws (the traffic beyond the vehicles that have parameters) is seeded by the
+    parameter `noise`, a standard normal number of which every bit counts.
+
+    `info` carries `scenario` (names to values), `x`, `collision`, `min_measure` (so far), and at the end `measure`: -1
+    if the ego crashed, else the least measure over all simulation steps, not only those at which the policy is asked.
+
+    Attributes:
+        space: Names, units, bounds and base distribution of x.
+        fixed: Parameters that are held, name to value; they are not in x.
+    """
+
+    def __init__(
+        self,
+        env: gym.Env[Any, Any],
+        *,
+        vehicles: int | None = None,
+        measure: str | Callable[[Any], float] = "ttc",
+        fixed: Mapping[str, Any] | str | None = None,
+        noise: bool | str = True,
+        base: Any = None,
+    ) -> None:
+        """Wrap an environment.
+
+        Args:
+            env: From `gym.make` of HighwayEnv, with any configuration; wrappers that change observations go around
+                this one.
+            vehicles: Number of vehicles with parameters, on the highway only; 4 by default.
+            measure: "ttc", "front_ttc", or a function of HighwayEnv's environment, called at each simulation step;
+                small is dangerous, and 0 or less is for collisions only if gamma = 0 is to count just them.
+            fixed: Values of parameters that are to be held, or "highway_env" for all that HighwayEnv itself holds: x is
+                then what it draws, with the law by which it draws it.
+            noise: True, what is left random is seeded by the parameter `noise`; "fixed", by one number for all x.
+            base: Law of the parameters without noise, in place of HighwayEnv's: an object with the four methods of
+                `rare_envs.space.Distribution`.
+
+        Raises:
+            ValueError: If the environment is not one of HighwayEnv's that are known here, or an argument is invalid.
+        """
+        super().__init__(env)
+        self.layout = _layout_of(env)
+        self._measure = _measure_of(measure)
+        if noise is not True and noise != "fixed":
+            raise ValueError(f"Expected noise True or 'fixed', got {noise!r}.")
+        self._rng = np.random.default_rng()
+        self.layout.prepare(self.scene)
+        groups = self._groups(vehicles)
+        self.fixed = _fixed(groups, fixed)
+        varying = [group for group in groups if group.parameters[0].name not in self.fixed]
+        self.space = _space(varying, self.layout.leftover and noise is True, base)
+        self._x: Array = np.full(self.space.dim, np.nan)
+        self._least = TTC_MAX
+
+    @property
+    def scene(self) -> Any:
+        """HighwayEnv's environment itself: its road, vehicles and configuration."""
+        return self.env.unwrapped
+
+    def _groups(self, vehicles: int | None) -> list[Group]:
+        default, most = self.layout.vehicles
+        available = most if most is not None else int(self.scene.config["vehicles_count"])
+        count = min(default, available) if vehicles is None else vehicles
+        low = 1 if most is None else most
+        if isinstance(count, bool) or not isinstance(count, int) or not low <= count <= available:
+            raise ValueError(f"Expected vehicles from {low} to {available} for this environment, got {vehicles!r}.")
+        return self.layout.groups(self.scene, count) + idm_groups(self.layout)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Start an episode.
+
+        Args:
+            seed: Seeds the draw of what is not given.
+            options: Parameters by name, or {"x": vector}.
+
+        Returns:
+            Observation and info.
+
+        Raises:
+            ValueError: If an option is unknown, held, of the wrong shape, NaN or outside its range.
+        """
+        if seed is not None:
+            self._rng = np.random.default_rng(seed)
+        self._x = self.space.scenario_x(options, 1, self._rng)[0]
+        values = {**self.fixed, **self.space.named(self._x)}
+        scene = self.scene
+        self.env.reset(seed=_seed(values.pop("noise", None)))
+        self.layout.arrange(scene, values)
+        self._set_idm(values)
+        self._watch()
+        scene.define_spaces()  # links observation and action to the scene again, as HighwayEnv's own reset does
+        observation = scene.observation_type.observe()
+        info = scene._info(observation, action=scene.action_space.sample())
+        return observation, info | self._info()
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """One decision of the policy, as in HighwayEnv."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self._set_idm({**self.fixed, **self.space.named(self._x)})  # of vehicles that came during the step
+        info = info | self._info()
+        if terminated or truncated:
+            info["measure"] = self.measured
+        return observation, reward, bool(terminated), bool(truncated), info
+
+    @property
+    def usual_idm(self) -> dict[str, float]:
+        """HighwayEnv's own parameters of IDM in this environment."""
+        return dict(zip(IDM, self.layout.idm, strict=True))
+
+    @property
+    def measured(self) -> float:
+        """The measure of the episode so far."""
+        return COLLISION if self.scene.vehicle.crashed else self._least
+
+    def _set_idm(self, values: Mapping[str, Any]) -> None:
+        ego = self.scene.vehicle
+        set_idm([vehicle for vehicle in self.scene.road.vehicles if vehicle is not ego], values)
+
+    def _watch(self) -> None:
+        """Measure now and after every simulation step of this episode."""
+        scene, road = self.scene, self.scene.road
+        step = road.step
+        self._least = self._look()
+
+        def watched(dt: float) -> None:
+            step(dt)
+            if not scene.vehicle.crashed:
+                self._least = min(self._least, self._look())
+
+        road.step = watched
+
+    def _look(self) -> float:
+        value = float(self._measure(self.scene))
+        if math.isnan(value):
+            raise ValueError(f"The measure {self._measure!r} gave NaN; expected a number that is small in danger.")
+        return value
+
+    def _info(self) -> dict[str, Any]:
+        crashed = bool(self.scene.vehicle.crashed)
+        scenario = {**self.fixed, **self.space.named(self._x)}
+        return {"scenario": scenario, "x": self._x.copy(), "min_measure": self.measured, "collision": crashed}
+
+
+def _layout_of(env: gym.Env[Any, Any]) -> Layout:
+    """The layout of an environment.
+
+    Raises:
+        ValueError: If there is none for it.
+    """
+    inner: Any = env.unwrapped
+    plain: Any = env
+    while isinstance(plain, OrderEnforcing | PassiveEnvChecker | TimeLimit):
+        plain = plain.env
+    if not isinstance(inner, AbstractEnv):
+        raise ValueError(f"Expected an environment of HighwayEnv ({SUPPORTED}), got {env}.")
+    if plain is not inner:
+        raise ValueError(f"Expected the environment as gym.make gives it, got {plain}; put wrappers around this one.")
+    generic = isinstance(inner, MergeGenericEnv | RoundaboutGenericEnv)
+    found = [layout for kind, layout in LAYOUTS.items() if isinstance(inner, kind) and not generic]
+    if not found or len(inner.controlled_vehicles) != 1:
+        raise ValueError(f"No parameters are known for {type(inner).__name__}; expected {SUPPORTED}, with one ego.")
+    return found[0]
+
+
+def _measure_of(measure: str | Callable[[Any], float]) -> Callable[[Any], float]:
+    if callable(measure):
+        return measure
+    if measure in CLOSENESS:
+        return CLOSENESS[measure]
+    hint = did_you_mean(str(measure), CLOSENESS)
+    raise ValueError(f"Unknown measure {measure!r}{hint}; expected {', '.join(CLOSENESS)} or a function.")
+
+
+def _fixed(groups: list[Group], fixed: Mapping[str, Any] | str | None) -> dict[str, Any]:
+    """Values of the parameters that are held, checked against their ranges.
+
+    Raises:
+        ValueError: If a parameter is unknown, is drawn together with others, or its value is outside its range.
+    """
+    usual = {group.parameters[0].name: group.usual for group in groups if group.usual is not None}
+    if fixed is None or fixed == "highway_env":
+        return usual if fixed else {}
+    if not isinstance(fixed, Mapping):
+        raise ValueError(f"Expected fixed as a mapping of names to values or 'highway_env', got {fixed!r}.")
+    alone = {group.parameters[0].name: group for group in groups if len(group.parameters) == 1}
+    for name in fixed:
+        if name not in alone:
+            hint = did_you_mean(str(name), alone)
+            raise ValueError(f"Cannot hold {name!r}{hint}; what can be held is {', '.join(alone)}.")
+    if not fixed:
+        return {}
+    held = _space([alone[name] for name in fixed], False, None)
+    return held.named(held.scenario_x(dict(fixed), 1, np.random.default_rng(0))[0])
+
+
+def _space(groups: list[Group], noise: bool, base: Any) -> ScenarioSpace:
+    """The parameters that vary and their law."""
+    parameters = [parameter for group in groups for parameter in group.parameters]
+    laws = [group.law for group in groups] if base is None else [base]
+    if noise:
+        parameters.append(Parameter("noise", "", -np.inf, np.inf, "seeds what HighwayEnv still draws"))
+        laws.append(NoiseLaw(1))
+    if not parameters:
+        raise ValueError("Every parameter is held; expected at least one that varies.")
+    return ScenarioSpace(
+        names=tuple(p.name for p in parameters),
+        units=tuple(p.unit for p in parameters),
+        low=np.repeat([p.low for p in parameters], [p.size for p in parameters]),
+        high=np.repeat([p.high for p in parameters], [p.size for p in parameters]),
+        base=beside(*laws),
+        sizes=tuple(p.size for p in parameters),
+    )
+
+
+def _seed(noise: float | None) -> int:
+    """A seed from the bits of a number."""
+    return _FIXED_SEED if noise is None else int(np.float64(noise).view(np.uint64))

@@ -1,0 +1,183 @@
+"""One drive of an ego in a HighwayEnv scenario, from x to f; what a worker process holds."""
+
+import contextlib
+import sys
+import warnings
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium as gym
+import highway_env  # noqa: F401  (registers the ids)
+import numpy as np
+from highway_env.vehicle.behavior import IDMVehicle
+from numpy.typing import NDArray
+
+from rare_envs.interop.layout import set_idm
+from rare_envs.interop.scenario import HighwayEnvScenario
+from rare_envs.policies import fitted
+from rare_envs.space import did_you_mean
+
+MAX_SECONDS = 100.0
+"""Longest drive [s] unless told otherwise: HighwayEnv's merge ends at a place, where not every ego arrives."""
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """What a drive is made of. It can be pickled; the environment is made where it is first needed."""
+
+    env_id: str
+    ego: Any
+    """"idm", an object with `predict`, or a function without arguments that makes one."""
+    config: Mapping[str, Any] | None = None
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """Keyword arguments of `HighwayEnvScenario`."""
+    seconds: float = MAX_SECONDS
+    """Drives are cut off here."""
+
+    def ready(self) -> "Driven":
+        """Make the environment and the ego.
+
+        Raises:
+            ValueError: If the environment, the ego or their spaces are not what is expected.
+        """
+        env = HighwayEnvScenario(make(self.env_id, self.config), **self.settings)
+        if self.ego == "idm":
+            return Driven(env, None, self.seconds)
+        ego = self.ego if callable(getattr(self.ego, "predict", None)) else self.ego()
+        if not callable(getattr(ego, "predict", None)):
+            raise ValueError(f"Expected an ego with predict from {self.ego!r}, got {type(ego).__name__}.")
+        check_spaces(ego, env)
+        return Driven(env, fitted(ego, env.observation_space.shape or ()), self.seconds)
+
+
+def make(env_id: str, config: Mapping[str, Any] | None) -> gym.Env[Any, Any]:
+    """An environment of HighwayEnv.
+
+    Raises:
+        ValueError: If there is none of this name.
+    """
+    known = [name for name, spec in gym.registry.items() if str(spec.entry_point).startswith("highway_env.")]
+    if env_id not in known:
+        raise ValueError(f"Unknown environment of HighwayEnv {env_id!r}{did_you_mean(str(env_id), known)}.")
+    with warnings.catch_warnings():  # an older version is asked for on purpose: results belong to a version
+        warnings.filterwarnings("ignore", message=".*is out of date", category=DeprecationWarning)
+        return gym.make(env_id, config=None if config is None else dict(config))
+
+
+def portable(ego: Any) -> Any:
+    """An ego without what training hung on it: of a Stable-Baselines3 model the policy, with its statistics."""
+    if isinstance(ego, str):
+        if ego == "idm":
+            return ego
+        raise ValueError(f"Unknown ego {ego!r}; expected 'idm' or an object with predict (files: agents.load_ego).")
+    if isinstance(ego, type):
+        raise ValueError(f"Expected an ego, got the class {ego.__name__}; make or train one of it first.")
+    if not callable(getattr(ego, "predict", None)):
+        if callable(ego):
+            return ego
+        raise ValueError(f"Expected an ego with a method predict(observation, ...), got {type(ego).__name__}.")
+    policy = getattr(ego, "policy", None)
+    statistics = getattr(ego, "get_vec_normalize_env", lambda: None)()
+    if callable(getattr(policy, "predict", None)) and statistics is None:
+        return policy
+    return ego
+
+
+def check_spaces(ego: Any, env: gym.Env[Any, Any]) -> None:
+    """Refuse an ego that was made for other observations or actions; one that does not tell is taken at its word.
+
+    Raises:
+        ValueError: If its spaces do not fit.
+    """
+    for what in ("observation", "action"):
+        given, expected = getattr(env, f"{what}_space"), getattr(ego, f"{what}_space", None)
+        fits = type(expected) is type(given) and getattr(expected, "shape", None) == getattr(given, "shape", None)
+        if expected is not None and not (fits and getattr(expected, "n", None) == getattr(given, "n", None)):
+            raise ValueError(
+                f"The ego was made for {what}s {expected}, the environment has {given}; "
+                f"give the environment the config that the ego was trained with."
+            )
+
+
+@dataclass(frozen=True)
+class Driven:
+    """An environment and its ego, ready to drive."""
+
+    env: HighwayEnvScenario
+    ego: Any
+    seconds: float
+
+    def f(self, x: NDArray[np.float64]) -> float:
+        """The measure of the drive from x, shape (d,).
+
+        Raises:
+            ValueError: If the ego's action is not finite.
+        """
+        env = self.env
+        observation, _ = env.reset(options={"x": x})
+        if self.ego is None:
+            let_idm_drive(env)
+        period, memory = 1.0 / env.scene.config["policy_frequency"], None
+        for step in range(round(self.seconds / period)):
+            action: Any = idle(env.action_space)
+            if self.ego is not None:
+                action, memory = self.ego.predict(
+                    np.asarray(observation)[None], state=memory, episode_start=np.array([step == 0]), deterministic=True
+                )
+                action = np.asarray(action)[0]
+                if not np.isfinite(action).all():
+                    raise ValueError(f"The ego's action is not finite: {action}.")
+            observation, _, terminated, truncated, _ = env.step(action)
+            if terminated or truncated:
+                break
+        return env.measured
+
+
+def idle(space: gym.Space[Any]) -> Any:
+    """An action that an ego which decides for itself ignores."""
+    return 1 if isinstance(space, gym.spaces.Discrete) else np.zeros(space.shape or (), dtype=np.float32)
+
+
+def let_idm_drive(env: HighwayEnvScenario) -> None:
+    """Put HighwayEnv's own `IDMVehicle`, with HighwayEnv's parameters, in the place of the ego."""
+    inner = env.scene
+    old = inner.vehicle
+    driver = IDMVehicle.create_from(old)
+    set_idm([driver], env.usual_idm)
+    inner.road.vehicles[inner.road.vehicles.index(old)] = driver
+    inner.controlled_vehicles = [driver]
+    inner.define_spaces()
+
+
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """Let torch, if it is there, use one thread: sums round alike everywhere, and small networks run faster."""
+    torch = sys.modules.get("torch")
+    before = 1 if torch is None else torch.get_num_threads()
+    if torch is not None:
+        torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        if torch is not None:
+            torch.set_num_threads(before)
+
+
+_driven: Driven | None = None
+"""Of a worker process."""
+
+
+def begin(blob: bytes) -> None:
+    """Make environment and ego in a worker process."""
+    global _driven
+    import cloudpickle
+
+    _driven = cloudpickle.loads(blob).ready()
+
+
+def drive(x: NDArray[np.float64]) -> float:
+    """One drive in a worker process."""
+    assert _driven is not None
+    with one_thread():
+        return _driven.f(x)
