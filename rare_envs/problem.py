@@ -99,7 +99,8 @@ class DrivingProblem:
             Safety measures, shape (n,).
 
         Raises:
-            ValueError: If x has the wrong shape, is NaN or outside the physical box, or if the policy returns NaN.
+            ValueError: If x has the wrong shape, is NaN or outside the physical box, or if the policy or the measure
+                returns NaN.
         """
         return self._simulated(x, None)
 
@@ -134,6 +135,11 @@ class DrivingProblem:
                 f[first : first + tile] = rollout(self.world, driver, rows).f.numpy()
                 if lost is not None:
                     lost.update({first + row: reason for row, reason in mine.items()})
+        for row in np.flatnonzero(np.isnan(f)):
+            if lost is None:
+                named = {name: value for name, value in self.space.named(x[row]).items() if np.size(value) == 1}
+                raise ValueError(f"The measure {self.world.measure!r} gave NaN, first at row {row}: {named}.")
+            lost.setdefault(int(row), "the measure gave NaN")
         return f
 
 

@@ -41,6 +41,20 @@ class EpisodeMeasure(Protocol):
         """The measure of the episodes so far, shape (B,)."""
 
 
+def one_each(value: Any, like: Tensor) -> Tensor:
+    """What a measure's function returned, if it is one number for each of B episodes.
+
+    Raises:
+        ValueError: If it is not.
+    """
+    if isinstance(value, Tensor) and value.shape == like.shape:
+        return value
+    came = f"a tensor of shape {tuple(value.shape)}" if isinstance(value, Tensor) else repr(value)
+    raise ValueError(
+        f"Expected one number for each of {len(like)} episodes, a tensor of shape ({len(like)},), got {came}."
+    )
+
+
 @dataclass(frozen=True)
 class Measure:
     """The most dangerous moment of an episode decides: f is the least over its moments.
@@ -77,7 +91,7 @@ class Measure:
         return kept
 
     def _danger(self, moment: Moment) -> Tensor:
-        value = self.of(moment)
+        value = one_each(self.of(moment), moment.lead.gap)
         return value if self.critical is None else self.critical - value
 
     def _ended(self, kept: Tensor, f: Tensor, moment: Moment, before: Tensor, now: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from rare_envs.geometry import Lead
-from rare_envs.measures.base import COLLISION
+from rare_envs.measures.base import COLLISION, one_each
 from rare_envs.measures.moment import Moment
 from rare_envs.road import Road
 from rare_envs.state import State
@@ -57,7 +57,7 @@ class Trace(NamedTuple):
 
 def _flat(values: Tensor) -> Tensor:
     """(T, B, ...) to (T B, ...)."""
-    return values.reshape(-1, *values.shape[2:])
+    return values.flatten(0, 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,6 +161,6 @@ class TraceMeasure:
 
     def f(self, kept: Record) -> Tensor:
         """What the function says of the episodes so far."""
-        value = self.of(kept.trace())
+        value = one_each(self.of(kept.trace()), kept.first)
         f = value if self.critical is None else self.critical - value
         return f if self.collision is None else torch.where(kept.collided, self.collision, f)
