@@ -192,12 +192,17 @@ def test_the_end_of_each_recording_is_kept_for_tests():
         {"updates": 0},
         {"epochs": -1},
         {"pools": 0},
+        {"horizon": (15, 0)},
+        {"clone_weight": (0.1, 0.0)},
+        {"policy_rate": float("nan")},
+        {"edge_weight": -1.0},
+        {"discount": 1.1},
         {"anneal": 0.0},
         {"last_rate": 2.0},
     ],
 )
 def test_settings_are_checked(settings):
-    with pytest.raises(ValueError, match="Expected"):
+    with pytest.raises(ValueError, match=f"Expected {next(iter(settings))}|with learned_model"):
         Config(**settings)
 
 

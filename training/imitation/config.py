@@ -1,5 +1,7 @@
 """Settings of one training, with the values that the shipped drivers were trained with."""
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -10,6 +12,32 @@ Method = Literal["bc", "gail", "mgail"]
 
 HUMAN = Colour.swinging(frequency=(1.70, 1.57), damping=(0.845, 0.40))
 """The autocorrelation of what cloning leaves unexplained in the record, within 0.03 up to 1 s."""
+
+
+_RANGES: tuple[tuple[tuple[str, ...], Callable[[float], bool], str], ...] = (
+    (
+        (
+            *("batch", "pools", "scenes", "horizon", "age", "drivers"),
+            *("critic_steps", "critic_batch", "memory", "model_steps", "ppo_epochs", "ppo_batch"),
+        ),
+        lambda value: value >= 1,
+        ">= 1",
+    ),
+    (("epochs", "warm_up", "weight_decay", "gradient_penalty"), lambda value: value >= 0, ">= 0"),
+    (
+        ("critic_weight", "collision_weight", "edge_weight", "brake_weight"),
+        lambda value: 0 <= value < math.inf,
+        ">= 0",
+    ),
+    (
+        ("clone_weight", "clone_rate", "policy_rate", "critic_rate", "model_rate", "value_rate", "clip"),
+        lambda value: 0 < value < math.inf,
+        "> 0",
+    ),
+    (("anneal", "last_rate"), lambda value: 0 < value <= 1, "in (0, 1]"),
+    (("credit", "discount", "gae"), lambda value: 0 <= value <= 1, "in [0, 1]"),
+)
+"""Settings, what holds of each of their values, and that in words. Schedules of weights are geometric, so not 0."""
 
 
 @dataclass(frozen=True)
@@ -88,15 +116,13 @@ class Config:
             raise ValueError(f"Expected method 'bc', 'gail' or 'mgail', got {self.method!r}.")
         if self.learned_model and self.method != "mgail":
             raise ValueError(f"Expected method 'mgail' with learned_model, got {self.method!r}.")
-        if self.epochs < 0:
-            raise ValueError(f"Expected epochs >= 0, got {self.epochs}.")
         if self.updates < 1:
             raise ValueError(f"Expected updates >= 1, got {self.updates}; a driver that is only cloned is method 'bc'.")
-        if not (0.0 < self.anneal <= 1.0 and 0.0 < self.last_rate <= 1.0):
-            raise ValueError(f"Expected anneal and last_rate in (0, 1], got {self.anneal}, {self.last_rate}.")
-        for name in ("pools", "scenes", "batch", "critic_batch", "memory", "ppo_batch"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"Expected {name} >= 1, got {getattr(self, name)}.")
+        for names, holds, expected in _RANGES:
+            for name in names:
+                value = getattr(self, name)
+                if not all(holds(part) for part in (value if isinstance(value, tuple) else (value,))):
+                    raise ValueError(f"Expected {name} {expected}, got {value}.")
 
     def rate(self, update: int) -> float:
         """Factor of the learning rates at an update: 1, then linearly down to `last_rate`."""
