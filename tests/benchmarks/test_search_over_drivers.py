@@ -1,5 +1,6 @@
 """The study of searches over drivers: its statistics by hand, its methods as the paper has them."""
 
+import json
 from types import SimpleNamespace
 
 import numpy as np
@@ -58,3 +59,12 @@ def test_words_are_checked_before_anything_is_simulated(option, word, monkeypatc
     result = CliRunner().invoke(app, [option, word])
     assert result.exit_code == 2
     assert word in result.output
+
+
+def test_a_reference_of_another_question_is_refused(tmp_path):
+    question = {"ego": "idm", "gamma": 0.5}
+    path = tmp_path / "report.json"
+    path.write_text(json.dumps({"question": question, "reference": {"p": 1e-3}}))
+    assert study.earlier(path, question) == {"p": 1e-3}
+    with pytest.raises(typer.BadParameter, match="'gamma': 0.5"):
+        study.earlier(path, {**question, "gamma": 0.4})
