@@ -164,9 +164,8 @@ def main(
     )
     question = {"ego": ego, "drivers": drivers, "noise": noise, "gamma": gamma}
     truth = earlier(truth_of, question) if truth_of else reference(problem, gamma, rollouts, seed)
-    print(
-        f"{problem.dim} dimensions, p = {truth['p']:.3g} +- {truth['standard_error']:.1g} ({truth['rollouts']:,} rollouts)"
-    )
+    error = f"{truth['standard_error']:.1g} ({truth['rollouts']:,} rollouts)"
+    print(f"{problem.dim} dimensions, p = {truth['p']:.3g} +- {error}")
     command = f"python -m benchmarks.search_over_drivers {' '.join(sys.argv[1:])}"
     data: dict[str, Any] = {"about": about(command=command), "question": question, "reference": truth, "rows": []}
     found: list[samplers.Estimate] = []
