@@ -35,10 +35,10 @@ def main(
     problem = rare_envs.DrivingProblem(env, ego=agents.load_ego(ego), drivers=drivers, horizon=seconds)
     x = torch.from_numpy(problem.base.sample(1, np.random.default_rng(seed))).float()
     road = problem.world.scenario.road
-    renderer, frames, contacts, off = Renderer(road, window=False, fps=10), [], 0, 0
+    renderer, frames, contacts, off = Renderer(problem.world), [], 0, 0
     with torch.inference_mode():
         for tick, episode in enumerate(drive(problem.world, problem.driver, x)):
-            image = renderer.draw(episode.state, bool(episode.collided))
+            image = renderer.draw(episode, tick * problem.world.dt)
             if out is not None:
                 frames.append(Image.fromarray(image).quantize(64))
             if still is not None and tick == round(at / problem.world.dt):

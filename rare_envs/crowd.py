@@ -31,8 +31,10 @@ class Crowd(NamedTuple):
 def gather(world: World, x: Tensor) -> Crowd:
     """Begin B episodes; x as in `World.start`."""
     own = world.start(x)
+    nobody = torch.zeros_like(own.state.x, dtype=torch.bool)
+    own = own._replace(strayed=nobody)
     others = (world.first(own.state.seen_by(j), _seen_by(own.perception, j)) for j in range(1, world.scenario.vehicles))
-    return Crowd(own, (own, *others), torch.zeros_like(own.state.x, dtype=torch.bool))
+    return Crowd(own, (own, *others), nobody)
 
 
 def move(world: World, crowd: Crowd, action: Tensor, commanded: Tensor) -> Crowd:
@@ -53,12 +55,9 @@ def move(world: World, crowd: Crowd, action: Tensor, commanded: Tensor) -> Crowd
     """
     traffic, wrecked, road = crowd.traffic, crowd.wrecked, world.scenario.road
     active = commanded | wrecked
-    if bool(active[:, 1:].any()) or bool(wrecked.any()):
-        speed = traffic.state.speed
-        rolling_out = torch.stack((-speed, torch.zeros_like(speed)), dim=-1)
-        traffic = world.step(traffic, torch.where(wrecked[..., None], rolling_out, action), active)
-    else:
-        traffic = world.step(traffic, action[:, 0])
+    speed = traffic.state.speed
+    rolling_out = torch.stack((-speed, torch.zeros_like(speed)), dim=-1)
+    traffic = world.step(traffic, torch.where(wrecked[..., None], rolling_out, action), active)
     state = traffic.state
     touching, off = overlaps(state, road), road.off_road(state.y)
     hit = touching.any(dim=2)

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from rare_envs.actions import IDLE
-from rare_envs.crowd import Crowd, move
-from rare_envs.drivers import Driver
+from rare_envs.crowd import Crowd, gather, move
+from rare_envs.drivers import Driver, PolicyDriver
 from rare_envs.incentives import Reward, Tick
 from rare_envs.meta import aim_of
 from rare_envs.world import Episode, World
@@ -97,3 +97,31 @@ def _each(function: Any, *terms: Any) -> Any:
     if isinstance(terms[0], Tensor):
         return function(*terms)
     return type(terms[0])(*(function(*each) for each in zip(*terms, strict=True)))
+
+
+def play(world: World, x: Tensor, policies: Mapping[int, Any], ego: Driver) -> Crowd:
+    """Drive B scenarios from start to horizon with policies in some of the vehicles.
+
+    Args:
+        world: The world.
+        x: Scenario parameters, shape (B, d).
+        policies: Objects with Stable-Baselines3's `predict`, by vehicle; the others keep their drivers.
+        ego: Drives the ego if it has no policy.
+
+    Returns:
+        The episodes at the horizon.
+    """
+    drivers = {vehicle: PolicyDriver(policy, world.observation, world.action) for vehicle, policy in policies.items()}
+    crowd, memory = gather(world, x), None
+    memories: dict[int, Any] = dict.fromkeys(drivers)
+    batch, n = crowd.wrecked.shape
+    commanded = torch.zeros(batch, n, dtype=torch.bool, device=x.device)
+    commanded[:, list(drivers)] = True
+    shape = (batch, n) if world.action == "meta" else (batch, n, 2)
+    for _ in range(world.ticks // world.stride):
+        action = torch.full(shape, IDLE) if world.action == "meta" else torch.zeros(shape)
+        for vehicle, driver in drivers.items():
+            chosen, memories[vehicle] = driver.act(crowd.views[vehicle], memories[vehicle])
+            action[:, vehicle] = chosen
+        crowd, _, memory = carry_out(world, crowd, action, commanded, {}, ego, memory)
+    return crowd

@@ -50,6 +50,41 @@ def sb3_vec_env(
     return VecMonitor(env)
 
 
+def sb3_agents_env(
+    id: str,
+    num_scenarios: int,
+    agents: Sequence[str] | None = None,
+    ego: Any = "idm",
+    rewards: Mapping[str, Any] | None = None,
+    seed: int | None = None,
+    **make_kwargs: Any,
+) -> VecMonitor:
+    """Open an environment of ours for one Stable-Baselines3 policy that several agents share.
+
+    Args:
+        id: Environment id, such as "rare_envs/CutIn-v0".
+        num_scenarios: B, scenarios side by side in one simulation; each agent of each is a row.
+        agents: Names of the vehicles that act, of A; None for all. With one of them in the background this is the
+            training of an adversary.
+        ego: Who drives the ego if it is no agent: "idm", a driver or a policy.
+        rewards: Reward functions by agent (`rare_envs.incentives`); by default that of an ego, in its own view.
+        seed: Seed of the first reset; an algorithm's own seed replaces it.
+        **make_kwargs: Keyword arguments of `gym.make` for this environment.
+
+    Returns:
+        A `VecEnv` of B A rows that also records returns and lengths of episodes.
+
+    Raises:
+        ValueError: An argument is refused.
+    """
+    from rare_envs.envs.agents import AgentsVectorEnv
+
+    env = BatchedVecEnv(AgentsVectorEnv(id, num_scenarios, agents=agents, ego=ego, rewards=rewards, **make_kwargs))
+    if seed is not None:
+        env.seed(seed)
+    return VecMonitor(env)
+
+
 class BatchedVecEnv(VecEnv):
     """Adapter from a Gymnasium `VectorEnv` with same-step autoreset to a `VecEnv`.
 

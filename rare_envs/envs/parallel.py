@@ -216,8 +216,14 @@ class DrivingParallelEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  #
             return None
         if self._renderer is None:
             window = self.render_mode == "human"
-            self._renderer = Renderer(self.world.scenario.road, window, self.metadata["render_fps"])
-        image = self._renderer.draw(self._crowd.traffic.state, crashed=bool(self._crowd.views[0].collided))
+            self._renderer = Renderer(self.world, window, self.metadata["render_fps"])
+        crashed = (self._crowd.collided | self._crowd.wrecked)[0].nonzero().flatten().tolist()
+        image = self._renderer.draw(
+            self._crowd.traffic,
+            self._tick * self.world.dt,
+            agents=[self._vehicles[agent] for agent in self.possible_agents],
+            crashed=crashed,
+        )
         return None if self.render_mode == "human" else image
 
     def state(self) -> NDArray[np.float32]:

@@ -1,17 +1,23 @@
-"""Pictures of a state, drawn by HighwayEnv's own graphics."""
+"""Pictures of episodes: roads and vehicles by HighwayEnv's own graphics, numbers above, who is who below."""
 
+from collections.abc import Collection
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from rare_envs.geometry import overlaps
 from rare_envs.road import Road
-from rare_envs.state import State
+from rare_envs.scenarios.base import Scenario
+from rare_envs.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
+from rare_envs.world import Episode, World
 
 WIDTH, HEIGHT = 800, 160
-"""Size of the image [pixels]; it is higher where the road asks for it."""
+"""Size of the picture of the road [pixels]; it is higher where the road asks for it."""
+STRIP = 24
+"""Height of the lines of text above and below [pixels]; all heights are multiples of 16, as video codecs want."""
 _SCALING = 8.0
 """Pixels per metre."""
 _MARGIN = 4.0
@@ -21,74 +27,172 @@ _SEGMENT = 6 * 4.33
 _AHEAD, _BEHIND = 4, 2
 """Pieces drawn ahead of the ego's and behind it."""
 
+Colour = tuple[int, int, int]
+COLOURS: dict[str, Colour] = {
+    "ego": (50, 200, 0),
+    "lead": (100, 200, 255),
+    "cutter": (200, 200, 0),
+    "others": (190, 190, 205),
+    "crashed": (255, 100, 100),
+}
+"""Of vehicles by what they are called, HighwayEnv's green, blue, yellow and red; "others" for other names."""
+AGENT: Colour = (200, 0, 150)
+"""Outline of vehicles other than the ego that an agent drives, HighwayEnv's purple."""
+_PAPER: Colour = (255, 255, 255)
+_INK: Colour = (30, 30, 30)
+
+
+class Cast(NamedTuple):
+    """Who is drawn how."""
+
+    roles: tuple[str, ...]
+    """A key of `COLOURS` for each vehicle."""
+    agents: frozenset[int]
+    """Vehicles other than the ego that agents drive."""
+
 
 class Renderer:
-    """Draws states onto one surface that follows the ego."""
+    """Draws episodes of a world onto one surface that follows the ego."""
 
-    def __init__(self, road: Road, window: bool, fps: int) -> None:
+    def __init__(self, world: World, window: bool = False, fps: int = 10) -> None:
         """Prepare a surface.
 
         Args:
-            road: The road.
+            world: Of the episodes.
             window: Whether to show it in a window too.
             fps: Frames per second of the window.
         """
         import pygame
+        import pygame.freetype
         from highway_env.road.graphics import WorldSurface
 
         self._pygame: Any = pygame
-        self._road = road
-        height = max(HEIGHT, 16 * round((road.lanes * road.width + 2 * _MARGIN) * _SCALING / 16))
+        self._world = world
+        self._scenario: Scenario = world.scenario
+        self._road: Road = world.scenario.road
+        height = max(HEIGHT, 16 * round((self._road.lanes * self._road.width + 2 * _MARGIN) * _SCALING / 16))
         self._surface = WorldSurface((WIDTH, height), 0, pygame.Surface((WIDTH, height)))
         self._surface.scaling = _SCALING
         self._surface.centering_position = [0.3, 0.5]
+        self._canvas = pygame.Surface((WIDTH, height + 2 * STRIP))
+        pygame.freetype.init()
+        self._font = pygame.freetype.Font(None, 14)
+        self._font.origin = True  # texts are placed by their base line
         self._fps = fps
         self._screen = None
         if window:
             pygame.display.init()  # not pygame.init(), which would also want a sound card
-            self._screen = pygame.display.set_mode((WIDTH, height))
+            self._screen = pygame.display.set_mode(self._canvas.get_size())
             self._clock = pygame.time.Clock()
 
-    def draw(self, state: State, crashed: bool) -> NDArray[np.uint8]:
-        """Draw the first scenario of a state.
+    def draw(
+        self,
+        episode: Episode,
+        time: float | None = None,
+        row: int = 0,
+        agents: Collection[int] = (),
+        crashed: Collection[int] | None = None,
+    ) -> NDArray[np.uint8]:
+        """Draw one of B episodes.
 
         Args:
-            state: Traffic of B scenarios; the first is drawn.
-            crashed: Whether to paint the ego as crashed.
+            episode: The episodes.
+            time: Since their start [s].
+            row: Which one.
+            agents: Indices of the vehicles that agents drive.
+            crashed: Indices of the vehicles that have crashed; None for the ego, if it has, and whom it touches.
 
         Returns:
             The image, shape (H, WIDTH, 3).
         """
+        state = State(*(field[row : row + 1] for field in episode.state))
+        if crashed is None:
+            crashed = _crashed(state, self._road) if bool(episode.collided[row]) else ()
+        cast = self._cast(agents, crashed)
+        self._draw_road(state, cast)
+        self._canvas.fill(_PAPER)
+        self._canvas.blit(self._surface, (0, STRIP))
+        self._write(8, 17, caption(self._world, episode, time, row))
+        self._draw_legend(cast)
+        if self._screen is not None:
+            self._screen.blit(self._canvas, (0, 0))
+            self._pygame.event.pump()
+            self._clock.tick(self._fps)
+            self._pygame.display.flip()
+        image: NDArray[np.uint8] = np.moveaxis(self._pygame.surfarray.array3d(self._canvas), 0, 1)
+        return image
+
+    def _cast(self, agents: Collection[int], crashed: Collection[int]) -> Cast:
+        names = (name if name in COLOURS else "others" for name in self._scenario.vehicle_names)
+        roles = tuple("crashed" if j in crashed else name for j, name in enumerate(names))
+        return Cast(roles, frozenset(agents) - {0})
+
+    def _draw_road(self, state: State, cast: Cast) -> None:
         from highway_env.road.graphics import RoadGraphics
         from highway_env.road.road import Road as Traffic
-        from highway_env.vehicle.graphics import VehicleGraphics
         from highway_env.vehicle.kinematics import Vehicle
 
         ego_x = float(state.x[0, 0])
         traffic = Traffic(_network(self._road, ego_x))
-        positions = self._road.to_world(state.x[0], state.y[0], state.heading[0])
-        for j, (x, y, heading) in enumerate(zip(*(each.tolist() for each in positions), strict=True)):
+        places = torch.stack(self._road.to_world(state.x[0], state.y[0], state.heading[0]), dim=1).tolist()
+        for j, (x, y, heading) in enumerate(places):
             vehicle = Vehicle(traffic, [x, y], heading, float(state.speed[0, j]))
-            vehicle.color = VehicleGraphics.EGO_COLOR if j == 0 else VehicleGraphics.BLUE
+            vehicle.color = COLOURS[cast.roles[j]]
             traffic.vehicles.append(vehicle)
-        if crashed:
-            traffic.vehicles[0].color = VehicleGraphics.RED
         self._surface.move_display_window_to(_point(self._road, ego_x, self._road.middle))
         RoadGraphics.display(traffic, self._surface)
         RoadGraphics.display_traffic(traffic, self._surface, offscreen=True)
-        if self._screen is not None:
-            self._screen.blit(self._surface, (0, 0))
-            self._pygame.event.pump()
-            self._clock.tick(self._fps)
-            self._pygame.display.flip()
-        image: NDArray[np.uint8] = np.moveaxis(self._pygame.surfarray.array3d(self._surface), 0, 1)
-        return image
+        for j in cast.agents:
+            corners = [self._surface.pos2pix(x, y) for x, y in _corners(*places[j])]
+            self._pygame.draw.polygon(self._surface, AGENT, corners, width=3)
+
+    def _draw_legend(self, cast: Cast) -> None:
+        """Colours and what they mean, in a line below the road."""
+        x, y = 8, self._canvas.get_height() - STRIP + 6
+        for role in COLOURS:
+            if role in cast.roles:
+                self._pygame.draw.rect(self._canvas, COLOURS[role], (x, y, 20, 11))
+                x += 26 + self._write(x + 26, y + 10, role) + 18
+        if cast.agents:
+            self._pygame.draw.rect(self._canvas, AGENT, (x, y, 20, 11), width=3)
+            self._write(x + 26, y + 10, "driven by an agent")
+
+    def _write(self, x: int, y: int, text: str) -> int:
+        """Write a line, and return how long it is."""
+        width: int = self._font.render_to(self._canvas, (x, y), text, _INK).width
+        return width
 
     def close(self) -> None:
         """Close the window, if there is one."""
         if self._screen is not None:
             self._pygame.display.quit()
             self._screen = None
+
+
+def caption(world: World, episode: Episode, time: float | None, row: int = 0) -> str:
+    """The numbers of a moment: time, speed, gap and time to collision of the ego, the measure of the episode so far."""
+    gap, closing = float(episode.lead.gap[row]), float(episode.lead.closing_speed[row])
+    ttc = gap / closing if closing > 0 and gap > 0 else np.inf
+    parts = [] if time is None else [f"{time:4.1f} s"]
+    parts.append(f"ego {float(episode.state.speed[row, 0]):4.1f} m/s")
+    parts.append(f"gap {gap:5.1f} m" if np.isfinite(gap) else "nobody ahead")
+    parts.append(f"TTC {ttc:4.1f} s" if ttc < 100 else "TTC   -  ")
+    measure = f" ({world.measure})" if isinstance(world.measure, str) else ""
+    parts.append(f"f so far{measure} {float(episode.f[row]):.2f}")
+    return "    ".join(parts)
+
+
+def _crashed(state: State, road: Road) -> set[int]:
+    """The ego and whom it touches."""
+    return {0, *overlaps(state, road)[0, 0].nonzero().flatten().tolist()}
+
+
+def _corners(x: float, y: float, heading: float) -> list[tuple[float, float]]:
+    """Corners of a vehicle in the world [m]."""
+    along, across = VEHICLE_LENGTH / 2, VEHICLE_WIDTH / 2
+    cos, sin = np.cos(heading), np.sin(heading)
+    box = ((along, across), (along, -across), (-along, -across), (-along, across))
+    return [(x + a * cos - b * sin, y + a * sin + b * cos) for a, b in box]
 
 
 def _network(road: Road, x: float) -> Any:

@@ -114,8 +114,8 @@ class DrivingEnv(gym.Env[Observation, Any]):
             return None
         if self._renderer is None:
             window = self.render_mode == "human"
-            self._renderer = Renderer(self.world.scenario.road, window, self.metadata["render_fps"])
-        image = self._renderer.draw(self._episode.state, crashed=bool(self._episode.collided))
+            self._renderer = Renderer(self.world, window, self.metadata["render_fps"])
+        image = self._renderer.draw(self._episode, self._tick * self.world.dt)
         return None if self.render_mode == "human" else image
 
     def close(self) -> None:

@@ -9,16 +9,15 @@ import torch
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
-from torch import Tensor
 
 from rare_envs.actions import read_actions, space_of_actions
 from rare_envs.crashes import KINDS, NONE
 from rare_envs.decisions import advance
 from rare_envs.envs.rendering import Renderer
+from rare_envs.envs.rows import merged, put, rows_of
 from rare_envs.observation import observation_space, observe
 from rare_envs.reward import RewardTerms
 from rare_envs.setup import set_up
-from rare_envs.state import State
 from rare_envs.world import Episode
 
 Info = dict[str, Any]
@@ -116,11 +115,11 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         done = terminated | truncated
         infos: Info = {}
         if done.any():
-            infos["final_obs"], infos["_final_obs"] = _rows(observation, done), done.copy()
+            infos["final_obs"], infos["_final_obs"] = rows_of(observation, done), done.copy()
             infos["final_info"], infos["_final_info"] = self._final_info(episode, terms, done), done.copy()
             observation = self._replace(observation, done)
         infos.update(self._info(self._episode, np.ones(self.num_envs, dtype=bool)))
-        _put(infos, "reward_terms", _terms(terms, ~done), ~done)
+        put(infos, "reward_terms", _terms(terms, ~done), ~done)
         return observation, reward, terminated.copy(), truncated, infos
 
     def _start(self, x: NDArray[np.float64]) -> Episode:
@@ -135,7 +134,7 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         self._tick[rows] = 0
         with torch.inference_mode():
             fresh = self._start(x)
-            self._episode = _merge(self._episode, torch.from_numpy(rows), fresh)
+            self._episode = merged(self._episode, torch.from_numpy(rows), fresh)
             observation = observation.copy()
             observation[rows] = observe(fresh, self.world.observation).numpy()
         return observation
@@ -146,11 +145,11 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         infos: Info = {}
         scenario: Info = {}
         for name, column in self.space.columns(self._x).items():
-            _put(scenario, name, column, mask)
-        _put(infos, "scenario", scenario, mask)
-        _put(infos, "x", self._x.copy(), mask)
-        _put(infos, "min_ttc", np.where(collided, 0.0, episode.witness.least_ttc.double().numpy()), mask)
-        _put(infos, "collision", collided.copy(), mask)
+            put(scenario, name, column, mask)
+        put(infos, "scenario", scenario, mask)
+        put(infos, "x", self._x.copy(), mask)
+        put(infos, "min_ttc", np.where(collided, 0.0, episode.witness.least_ttc.double().numpy()), mask)
+        put(infos, "collision", collided.copy(), mask)
         return infos
 
     def _final_info(self, episode: Episode, terms: RewardTerms, done: NDArray[np.bool_]) -> Info:
@@ -160,13 +159,13 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         crashed = done & (crash.kind != NONE).numpy()
         kinds = np.array(KINDS, dtype=object)[crash.kind.numpy()]
         kinds[~crashed] = None
-        _put(infos, "reward_terms", _terms(terms, done), done)
-        _put(infos, "measure", episode.f.double().numpy(), done)
-        _put(infos, "collision_type", kinds, crashed)
+        put(infos, "reward_terms", _terms(terms, done), done)
+        put(infos, "measure", episode.f.double().numpy(), done)
+        put(infos, "collision_type", kinds, crashed)
         details: Info = {}
         for name, values in {**crash._asdict(), "kind": kinds}.items():
-            _put(details, name, values if name == "kind" else values.numpy(), crashed)
-        _put(infos, "crash", details, crashed)
+            put(details, name, values if name == "kind" else values.numpy(), crashed)
+        put(infos, "crash", details, crashed)
         return infos
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
@@ -175,48 +174,13 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
             gym.logger.warn("Nothing to render: pass render_mode='rgb_array' to gym.make_vec and reset first.")
             return None
         if self._renderer is None:
-            self._renderer = Renderer(self.world.scenario.road, False, self.metadata["render_fps"])
-        episode, draw = self._episode, self._renderer.draw
-        return tuple(
-            draw(State(*(field[row : row + 1] for field in episode.state)), bool(episode.collided[row])).copy()
-            for row in range(self.num_envs)
-        )
-
-
-def _merge(old: Episode, rows: Tensor, new: Episode) -> Episode:
-    """Episodes with some rows replaced."""
-    merged: Episode = _put_rows(old, rows, new)
-    return merged
-
-
-def _put_rows(old: Any, rows: Tensor, new: Any) -> Any:
-    """Tensors, tuples of such or what knows how (`put`), with some rows replaced; the rest, as the road, is common."""
-    if isinstance(old, Tensor):
-        old = old.clone()
-        old[rows] = new
-        return old
-    if isinstance(old, tuple):
-        parts = [_put_rows(a, rows, b) for a, b in zip(old, new, strict=True)]
-        return type(old)(*parts) if hasattr(old, "_fields") else tuple(parts)
-    return old.put(rows, new) if hasattr(old, "put") else old
-
-
-def _rows(values: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[Any]:
-    """Rows as objects, None where the mask is not set: Gymnasium's form of `final_obs`."""
-    rows = np.full(len(values), None, dtype=object)
-    for row in np.flatnonzero(mask):
-        rows[row] = values[row].copy()
-    return rows
+            self._renderer = Renderer(self.world, False, self.metadata["render_fps"])
+        episode, draw, dt = self._episode, self._renderer.draw, self.world.dt
+        return tuple(draw(episode, self._tick[row] * dt, row).copy() for row in range(self.num_envs))
 
 
 def _terms(terms: RewardTerms, mask: NDArray[np.bool_]) -> Info:
     infos: Info = {}
     for name, value in terms._asdict().items():
-        _put(infos, name, value.double().numpy(), mask)
+        put(infos, name, value.double().numpy(), mask)
     return infos
-
-
-def _put(infos: Info, key: str, value: Any, mask: NDArray[np.bool_]) -> None:
-    """An entry with its mask, in Gymnasium's vector form."""
-    infos[key] = value
-    infos[f"_{key}"] = mask.copy()

@@ -52,19 +52,6 @@ def test_stable_baselines3_checker(env_id: str) -> None:
     sb3_check_env(gym.make(env_id))
 
 
-@ids
-def test_render_is_a_picture_of_all_vehicles(env_id: str) -> None:
-    env = gym.make(env_id, render_mode="rgb_array")
-    env.reset(seed=0)
-    image = env.render()
-    assert isinstance(image, np.ndarray)
-    height = 240 if env_id == "rare_envs/Highway-v0" else 160  # six lanes
-    assert (image.shape, image.dtype) == ((height, 800, 3), np.uint8)
-    colours = {tuple(c) for c in image.reshape(-1, 3).tolist()}
-    assert {(50, 200, 0), (100, 200, 255)} <= colours  # HighwayEnv's green ego, blue others
-    env.close()
-
-
 @scripted
 def test_env_and_rollout_agree_bit_for_bit_with_a_rule_based_ego(env_id: str) -> None:
     problem = rare_envs.DrivingProblem(env_id)

@@ -3,6 +3,7 @@
 import json
 import math
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +13,12 @@ import torch
 from rare_envs.curve import Curve
 from rare_envs.drivers import IDM
 from rare_envs.dynamics import bicycle, point_mass
-from rare_envs.envs.rendering import WIDTH, Renderer
+from rare_envs.envs.rendering import STRIP, WIDTH, Renderer
 from rare_envs.geometry import ego_overlaps
 from rare_envs.road import Road, i80, straight
 from rare_envs.rollout import drive
 from rare_envs.scenarios.base import Others, Scenario, columns
+from rare_envs.scenarios.highway import HIGHWAY
 from rare_envs.space import Parameter
 from rare_envs.state import State
 from rare_envs.world import World
@@ -290,10 +292,13 @@ def test_bodies_overlap_in_the_world_not_along_the_road() -> None:
 
 def test_a_curved_road_is_drawn_in_the_world() -> None:
     road = i80()
-    renderer = Renderer(road, window=False, fps=10)
+    world = World(replace(HIGHWAY, vehicle_names=("ego", "lead"), labels=(), drivers=None))
+    renderer = Renderer(world)
     for x in (0.0, 400.0, 1500.0):
-        image = renderer.draw(pair(x, road.centre(1), x + 30.0, road.centre(4)), crashed=False)
-        assert image.shape == (240, WIDTH, 3)
+        state = pair(x, road.centre(1), x + 30.0, road.centre(4))
+        image = renderer.draw(world.first(state, None))
+        assert image.shape == (240 + 2 * STRIP, WIDTH, 3)
+        image = image[STRIP:-STRIP]
         at = {}
         for name, ahead, y in [
             ("ego", 0.0, road.centre(1)),
