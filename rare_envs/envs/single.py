@@ -54,6 +54,17 @@ class DrivingEnv(gym.Env[Observation, Any]):
         self._x = np.full(self.space.dim, np.nan)
         self._episode: Episode | None = None
         self._tick = 0
+        self._recorder: Any = None
+        self._between = False
+
+    def set_record_video_wrapper(self, wrapper: Any) -> None:
+        """Let Gymnasium's `RecordVideo` have a frame of every tick of a meta-action, not one a second.
+
+        Args:
+            wrapper: The `RecordVideo`, as HighwayEnv's method of this name takes it.
+        """
+        self._recorder = wrapper
+        wrapper.frames_per_sec = round(1.0 / self.world.dt)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -93,7 +104,9 @@ class DrivingEnv(gym.Env[Observation, Any]):
             raise ValueError(f"Expected an action {wanted}, got shape {np.shape(action)}.")
         with torch.inference_mode():
             given = read_actions(self.world.action, torch.as_tensor(np.asarray(action))[None], 1)
-            episode, terms = advance(self.world, self._episode, given)
+            self._between = False
+            watch = self._watch if self.world.stride > 1 and (self._recorder or self.render_mode == "human") else None
+            episode, terms = advance(self.world, self._episode, given, watch=watch)
             observation = observe(episode, self.world.observation)[0].numpy()
             reward = float(terms.total)
         self._episode, self._tick = episode, self._tick + self.world.stride
@@ -102,6 +115,14 @@ class DrivingEnv(gym.Env[Observation, Any]):
         info = step_info(self.space, self._x, episode, terms, terminated or truncated)
         self._show()
         return observation, reward, terminated, truncated, info
+
+    def _watch(self, episode: Episode) -> None:
+        """Show the ticks within a decision; its last one is shown after it."""
+        if self._between and self.render_mode == "human":
+            self.render()
+        elif self._between:
+            self._recorder._capture_frame()
+        self._episode, self._between = episode, True
 
     def _show(self) -> None:
         if self.render_mode == "human":

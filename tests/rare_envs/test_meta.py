@@ -257,3 +257,47 @@ def test_wrong_actions_and_settings_are_refused() -> None:
         rare_envs.DrivingProblem(
             "rare_envs/CutIn-v0", ego=Continuous(np.zeros(1)), observation="kinematics", action="meta"
         )
+
+
+class Recorder:
+    """Stands for Gymnasium's `RecordVideo`: one frame after reset and after each step, and what it is asked for."""
+
+    def __init__(self, env: Any) -> None:
+        self.env, self.places, self.frames_per_sec = env, [], 1
+
+    def _capture_frame(self) -> None:
+        assert self.env.render().shape[2] == 3
+        self.places.append(float(self.env._episode.state.x[0, 0]))
+
+
+def test_a_recording_has_a_frame_of_every_tick() -> None:
+    env: Any = gym.make("rare_envs/CarFollowing-v0", action="meta", render_mode="rgb_array").unwrapped
+    recorder = Recorder(env)
+    env.set_record_video_wrapper(recorder)
+    env.reset(options={"x": [25.0, 25.0, 100.0]})
+    for _ in range(2):
+        env.step(IDLE)
+        recorder._capture_frame()  # as the wrapper does after each step
+    assert recorder.frames_per_sec == 10
+    np.testing.assert_allclose(recorder.places, 2.5 * np.arange(1, 21), atol=1e-3)
+    env.close()
+
+
+@pytest.mark.parametrize("env_id", ["rare_envs/CutIn-v0", "rare_envs/Highway-v0"])
+def test_in_parallel_env_the_ego_alone_is_the_environment_of_one(env_id: str) -> None:
+    kwargs: Any = {"observation": "kinematics", "action": "meta", "drivers": "idm"}
+    one, many = gym.make(env_id, **kwargs), rare_envs.parallel_env(env_id, **kwargs)
+    first, second = one.reset(seed=4), many.reset(seed=4)
+    np.testing.assert_array_equal(first[0], second[0]["ego"])
+    for action in (FASTER, LANE_RIGHT, SLOWER, IDLE, LANE_LEFT):
+        step, steps = one.step(action), many.step({"ego": action})
+        np.testing.assert_array_equal(step[0], steps[0]["ego"])
+        assert step[1] == steps[1]["ego"]
+        if step[2] or step[3]:
+            assert step[4]["measure"] == steps[4]["ego"]["measure"]
+            break
+    cutter = next(agent for agent in many.possible_agents if agent != "ego")
+    many.reset(seed=4)
+    observation = many.step({"ego": IDLE, cutter: FASTER})[0][cutter]
+    assert observation.shape == (5, 5)
+    assert many.action_space(cutter) == gym.spaces.Discrete(5)
