@@ -1,6 +1,6 @@
 """Train an adversary on one background vehicle, and see how often it makes the ego crash.
 
-    python examples/adversary.py --steps 300000 --out adversary.zip
+    python examples/adversary.py --steps 200000 --out adversary.zip
 
 The cutter of the cut-in scenario is rewarded for bringing the ego, a rule-based driver, into danger, and pays for
 driving as no road user does. What it finds is what can go wrong; how probable that is, it cannot say: see
@@ -22,12 +22,12 @@ from rare_envs.drivers import IDM
 from rare_envs.incentives import adversary_reward
 
 
-def train(env_id: str, agent: str, steps: int, seed: int = 0, num_scenarios: int = 128) -> Any:
+def train(env_id: str, agent: str, steps: int, seed: int = 0, num_scenarios: int = 64) -> Any:
     """A PPO policy for one background vehicle against the IDM ego."""
     from stable_baselines3 import PPO
 
     env = training.sb3_agents_env(env_id, num_scenarios, agents=[agent], rewards={agent: adversary_reward})
-    model = PPO("MlpPolicy", env, n_steps=100, batch_size=1600, n_epochs=5, learning_rate=1e-3, gamma=0.98, seed=seed)
+    model = PPO("MlpPolicy", env, n_steps=100, batch_size=800, learning_rate=1e-3, gamma=0.95, seed=seed)
     return model.learn(steps)
 
 
@@ -51,7 +51,7 @@ def interval(hits: int, n: int) -> tuple[float, float]:
 def main(
     env_id: str = "rare_envs/CutIn-v0",
     agent: Annotated[str, typer.Option(help="The vehicle that becomes an adversary.")] = "cutter",
-    steps: int = 300_000,
+    steps: int = 200_000,
     n: Annotated[int, typer.Option(help="Scenarios of the comparison.")] = 4_000,
     seed: int = 0,
     out: Annotated[Path | None, typer.Option(help="File to save the adversary in.")] = None,

@@ -233,6 +233,46 @@ def export_ego_command(
         )
 
 
+@app.command("replay")
+def replay_command(
+    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder that rare-envs estimate --out has written.")],
+    failure: Annotated[int, typer.Option(help="Which failure; 0 is the most likely.")] = 0,
+    out: Annotated[Path | None, typer.Option(help="A .gif of the drive, or a .png of its worst moment.")] = None,
+    trust: Trust = False,
+    as_json: Json = False,
+) -> None:
+    """Drive a failure that a run has found again, and show it with its measure over time."""
+    _one_thread()
+    from rare_envs.study import film
+
+    if out is not None:
+        film.check_film(out)
+    with contextlib.redirect_stdout(sys.stderr):
+        found = film.find(run, failure, trust)
+        drive = film.drive_again(found.problem, found.x)
+        if out is not None:
+            film.write_film(out, drive)
+    same = abs(drive.f - found.f) <= film.SAME
+    answer = {
+        "failure": failure,
+        "failures": found.of,
+        "f": drive.f,
+        "f_recorded": found.f,
+        "same": same,
+        "log_p0": found.log_p0,
+        "seconds": drive.time(len(drive.episodes) - 1),
+        "crash": drive.crash,
+        "out": None if out is None else str(out),
+    }
+    if as_json:
+        _print_json(answer)
+    else:
+        print("\n".join(film.in_words(found, drive, failure)))
+        if out is not None:
+            print(f"Wrote {out}.")
+    raise typer.Exit(0 if same else DOUBTFUL)
+
+
 def _noise(word: Noise) -> bool | str:
     """The `noise` argument of `DrivingProblem` for a word."""
     return {Noise.ON: True, Noise.OFF: False}.get(word, word.value)
