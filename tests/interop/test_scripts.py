@@ -1,0 +1,56 @@
+"""HighwayEnv's training scripts run on our environments, and policies trained on its own are evaluated in ours."""
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import agents
+import rare_envs
+from examples.highway_env_scripts import LAYOUT, train
+from training import sb3_vec_env
+
+FEW: dict[str, Any] = {
+    "dqn": {"learning_starts": 4, "policy_kwargs": {"net_arch": [8]}},
+    "ppo": {"n_steps": 4, "batch_size": 24, "n_epochs": 1, "policy_kwargs": {"net_arch": [8]}},
+}
+
+
+@pytest.mark.parametrize(
+    ("algo", "env_id"),
+    [("dqn", "highway-fast-v0"), ("dqn", "rare_envs/CutIn-v0"), ("ppo", "rare_envs/CarFollowing-v0")],
+)
+def test_the_scripts_train_policies_that_drive_here(algo: str, env_id: str, tmp_path: Path) -> None:
+    model = train(algo, env_id, 12, **FEW[algo])
+    assert model.num_timesteps >= 12
+    model.save(tmp_path / "ego.zip")
+    for ours in ("rare_envs/CarFollowing-v0", "rare_envs/CutIn-v0"):
+        problem = rare_envs.DrivingProblem(ours, ego=agents.load_ego(tmp_path / "ego.zip"), base="highway", **LAYOUT)
+        x = problem.base.sample(4, np.random.default_rng(0))
+        f = problem.evaluate(x)
+        env = gym.make(ours, **LAYOUT)
+        for row, value in zip(x, f, strict=True):  # the loop with which the scripts end
+            observation, _ = env.reset(options={"x": row})
+            done = truncated = False
+            while not (done or truncated):
+                action, _ = model.predict(observation, deterministic=True)
+                observation, _, done, truncated, info = env.step(action)
+            assert info["measure"] == value
+
+
+def test_the_batched_simulation_trains_on_meta_actions() -> None:
+    vec_env = sb3_vec_env("rare_envs/CutIn-v0", 8, discrete=True, **LAYOUT)
+    assert vec_env.action_space == gym.spaces.Discrete(5)
+    assert vec_env.observation_space.shape == (5, 5)
+    vec_env.seed(0)
+    vec_env.reset()
+    ended = 0
+    for _ in range(12):
+        observation, reward, done, infos = vec_env.step(np.array([vec_env.action_space.sample() for _ in range(8)]))
+        ended += done.sum()
+        assert all("terminal_observation" in infos[row] for row in np.flatnonzero(done))
+    assert observation.shape == (8, 5, 5)
+    assert np.isfinite(reward).all()
+    assert ended >= 8
