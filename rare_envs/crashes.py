@@ -30,8 +30,8 @@ _MAIS3 = {"all": (-6.9540, 0.1637), "frontal": (-6.9774, 0.1620), "rear": (-8.03
 class Crash(NamedTuple):
     """Crashes of B episodes.
 
-    Of two vehicles, the first is the one that runs into the other: along the normal of the contact it moves faster
-    towards it than the other towards the first.
+    Of two vehicles, the first is the one that runs into the other: it moves faster towards it than the other towards
+    the first, along the road, or across it where flanks meet.
     """
 
     kind: Tensor
@@ -155,12 +155,11 @@ def _pair_crash(state: State, road: Road, before: State | None, dt: float, which
 
     towards = torch.sign(on_axis(axes.offset))  # the normal points from the first to the second
     closing = (-on_axis(rate) * towards).clamp(min=0.0)
-    own = on_axis(project(along[:, first], across[:, first], one, other)) * towards
     index_one, index_two = (torch.tensor(each, device=x.device).expand_as(at) for each in (first, second))
-    # approach speeds: own towards the second, closing - own of the second towards the first
     couple = torch.stack((of(index_one), of(index_two)), -1)
-    vehicles = torch.where((own >= closing - own)[:, None], couple, couple.flip(-1))
     kind = _kind(of(axis), of(other - one), of(axes.offset[..., 0]))
+    own, its = (_approach(state, before, dt, kind == SIDE, each) for each in (couple, couple.flip(-1)))
+    vehicles = torch.where((own >= its)[:, None], couple, couple.flip(-1))
     change = ((1.0 + RESTITUTION) / 2.0 * closing)[:, None].expand(-1, 2)
     lengthwise = (kind != SIDE)[:, None]
     risk = torch.stack((injury_risk(change[:, 0], "frontal"), injury_risk(change[:, 1], "rear")), -1)
@@ -177,6 +176,16 @@ def _moved(state: State, road: Road, heading: Tensor, before: State | None, dt: 
     x, y, _ = road.to_world(state.x, state.y, state.heading)
     old_x, old_y, _ = road.to_world(before.x, before.y, before.heading)
     return (x - old_x) / dt, (y - old_y) / dt
+
+
+def _approach(state: State, before: State | None, dt: float, side: Tensor, couple: Tensor) -> Tensor:
+    """Speed of the first of two vehicles towards the second, across the road or along it [m/s], shape (B,)."""
+    along, across = velocities(state, state.heading)
+    if before is not None:
+        along, across = (state.x - before.x) / dt, (state.y - before.y) / dt
+    place, speed = torch.where(side[:, None], state.y, state.x), torch.where(side[:, None], across, along)
+    first, second = place.gather(1, couple).unbind(1)
+    return speed.gather(1, couple[:, :1])[:, 0] * torch.sign(second - first)
 
 
 def _kind(axis: Tensor, turn: Tensor, ahead: Tensor) -> Tensor:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from rare_envs.actions import DISCRETE_ACTIONS, META_ACTIONS
 from rare_envs.background import Background
+from rare_envs.crashes import KINDS, Crash
 from rare_envs.drivers import IDM, Driver, PolicyDriver
 from rare_envs.observation import observation_space
 from rare_envs.policies import fitted, stacking
@@ -121,10 +122,43 @@ class DrivingProblem:
         f[list(lost)] = np.nan
         return f, lost
 
+    def crashes(self, x: NDArray[np.float64]) -> Crash:
+        """Simulate again and tell what kind of crash each scenario ends in.
+
+        Args:
+            x: Scenario parameters, shape (n, d).
+
+        Returns:
+            Who ran into whom, how fast and how bad that is; `rare_envs.crashes.KINDS` has the words for the kinds. Of
+            kind "others" are collisions between other vehicles in episodes in which the ego has none.
+
+        Raises:
+            ValueError: If x has the wrong shape, is NaN or outside the physical box, or if the policy returns NaN.
+        """
+        x = self.space.validate(np.atleast_2d(x))
+        world, found = replace(self.world, measure="ttc", witnessed=True), []
+        with torch.inference_mode():
+            for first in range(0, len(x), self._tile):
+                rows = torch.from_numpy(x[first : first + self._tile]).float()
+                seen = rollout(world, self.driver, rows).witness
+                assert seen is not None
+                found.append(seen.crash)
+        return Crash(*(torch.cat(parts) for parts in zip(*found, strict=True)))
+
+    def crash_kinds(self, x: NDArray[np.float64]) -> list[str]:
+        """Words for the kinds of crash that scenarios x (n, d) end in, such as "rear_end"; see `crashes`."""
+        return [KINDS[kind] for kind in self.crashes(x).kind]
+
+    @property
+    def _tile(self) -> int:
+        """Rollouts at once."""
+        if self.world.sees or self.world.recorded:
+            return LIDAR_TILE
+        return POLICY_TILE if isinstance(self.driver, PolicyDriver) else RULE_TILE
+
     def _simulated(self, x: NDArray[np.float64], lost: dict[int, str] | None) -> NDArray[np.float64]:
         x = self.space.validate(np.atleast_2d(x))
-        tile = POLICY_TILE if isinstance(self.driver, PolicyDriver) else RULE_TILE
-        tile = LIDAR_TILE if self.world.sees or self.world.recorded else tile
+        tile = self._tile
         f = np.empty(len(x))
         with torch.inference_mode():
             for first in range(0, len(x), tile):

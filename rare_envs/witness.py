@@ -1,5 +1,6 @@
 """What an onlooker keeps of an episode beside its measure: the least time to collision, and who crashed with whom."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
@@ -7,6 +8,7 @@ from torch import Tensor
 
 from rare_envs.crashes import NONE, Crash, crash_of, crash_of_others, others_touch
 from rare_envs.measures import Moment, ttc
+from rare_envs.state import State
 
 
 class Witness(NamedTuple):
@@ -40,13 +42,21 @@ def fold(seen: Witness, moment: Moment, before: Tensor, now: Tensor) -> Witness:
         before: Whether the episode had ended in a collision before this moment, boolean, shape (B,).
         now: Whether it has by this moment, boolean, shape (B,).
     """
-    state, road = moment.state, moment.road
     least = torch.where(before, seen.least_ttc, torch.minimum(seen.least_ttc, ttc(moment)))
     own, others = seen.own, seen.others
     new = now & ~before
     if bool(new.any()):
-        own = own.replaced(new, crash_of(state, road, moment.before, moment.dt))
-    touch = others_touch(state, road) & (others.kind == NONE) & ~before
+        own = _entered(own, new, crash_of, moment)
+    touch = others_touch(moment.state, moment.road) & (others.kind == NONE) & ~before
     if bool(touch.any()):
-        others = others.replaced(touch, crash_of_others(state, road, moment.before, moment.dt))
+        others = _entered(others, touch, crash_of_others, moment)
     return Witness(least, own, others)
+
+
+def _entered(crash: Crash, where: Tensor, find: Callable[..., Crash], moment: Moment) -> Crash:
+    """Crashes with those of the episodes `where`, boolean, shape (B,), found and put in."""
+    rows = where.nonzero()[:, 0]
+    state = State(*(field[rows] for field in moment.state))
+    before = None if moment.before is None else State(*(field[rows] for field in moment.before))
+    found = find(state, moment.road, before, moment.dt)
+    return Crash(*(old.index_put((rows,), new) for old, new in zip(crash, found, strict=True)))

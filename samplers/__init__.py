@@ -19,6 +19,7 @@ from samplers.registry import METHODS, get_method
 from samplers.result import Estimate, Failure, Failures, Level, Status
 from samplers.reweighting import Reweighted
 from samplers.run import estimate
+from samplers.shares import Share
 from samplers.subset import AdaptiveSubsetSimulation, SubsetSimulation
 from samplers.two_stage import TwoStage
 
@@ -52,6 +53,7 @@ __all__ = [
     "Reweighted",
     "Run",
     "Sample",
+    "Share",
     "StandardNormal",
     "Status",
     "Stepping",

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from enum import Enum
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from samplers.curve import Curve
     from samplers.method import Sample, Stepping
     from samplers.reweighting import HasLogProb, Reweighted
+    from samplers.shares import Share
 
 
 class Status(str, Enum):
@@ -217,6 +218,20 @@ class Estimate:
         from samplers.reweighting import reweighted  # which imports this module
 
         return reweighted(self, new_base)
+
+    def shares(self, label: "Callable[[FloatArray], Sequence[str]]", most: int | None = None) -> "dict[str, Share]":
+        """Return p by kind of failure, from the same simulations; the kinds' p add up to p.
+
+        Args:
+            label: Says of failing points (k, d), in physical space, what kind of failure each is: k words.
+            most: Look at no more failing points than this, evenly spaced among them; None for all.
+
+        Raises:
+            ValueError: If the method gave no weighted points, or label does not give k words.
+        """
+        from samplers.shares import shares_of  # which imports this module
+
+        return shares_of(self, label, most)
 
     @property
     def proviso(self) -> str:

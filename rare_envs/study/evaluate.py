@@ -6,7 +6,7 @@ import itertools
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal, cast
 
 import numpy as np
@@ -20,6 +20,7 @@ from rare_envs.faults import ON_ERROR, EgoGone, Fault, FaultTolerant
 from rare_envs.setup import find_scenario
 from rare_envs.space import did_you_mean
 from rare_envs.study.checks import BadInput
+from rare_envs.study.kinds import Kinds, look_again
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,12 +88,14 @@ class Report:
         estimate: What the method found.
         seconds: Wall time of the estimation [s].
         faults: Scenarios on which the ego failed twice.
+        kinds: What the failures ended in.
     """
 
     study: Study
     estimate: samplers.Estimate
     seconds: float
     faults: tuple[Fault, ...] = ()
+    kinds: Kinds = field(default_factory=Kinds)
 
     @property
     def doubtful(self) -> bool:
@@ -100,8 +103,18 @@ class Report:
         return bool(self.estimate.warnings)
 
     @property
+    def crashes(self) -> tuple[dict[str, Any] | None, ...]:
+        """What each of the listed failures ended in, see `rare_envs.crashes.describe`; None where nobody crashed."""
+        return self.kinds.listed or (None,) * len(self.estimate.failures)
+
+    @property
     def notes(self) -> tuple[str, ...]:
-        """What was asked for and makes no difference here."""
+        """What was asked for and makes no difference here, and what is not known."""
+        unknown = (f"kinds of crash are not known: {self.kinds.unknown}",) if self.kinds.unknown else ()
+        return (*self._idle_words, *unknown)
+
+    @property
+    def _idle_words(self) -> tuple[str, ...]:
         world, noise = self.study.problem.world, self.study.question.noise
         if noise is True or (world.drivers is not None and world.drivers.noisy):
             return ()
@@ -123,8 +136,9 @@ class Report:
                 "parameters": self._parameters(failure.x),
                 "f": failure.f if math.isfinite(failure.f) else None,
                 "log_p0": failure.log_p0,
+                "crash": crash,
             }
-            for failure in itertools.islice(failures, top)
+            for failure, crash in itertools.islice(zip(failures, self.crashes, strict=True), top)
         ]
         return {
             **self.estimate.to_dict(),
@@ -134,6 +148,7 @@ class Report:
             "vec_normalize": self.vec_normalize,
             "seconds": self.seconds,
             "n_failures": failures.total,
+            "kinds": {kind: share.to_dict() for kind, share in self.kinds.shares.items()},
             "failures": ranked,
             "n_faults": len(self.faults),
             "faults": [
@@ -232,4 +247,5 @@ def run(study: Study, progress: bool | Callable[[samplers.Progress], None] = Fal
         )
     except (ValueError, EgoGone) as error:
         raise BadInput(error) from error
-    return Report(study, estimate, time.perf_counter() - start, tuple(problem.faults))
+    seconds = time.perf_counter() - start
+    return Report(study, estimate, seconds, tuple(problem.faults), look_again(study.problem, estimate))

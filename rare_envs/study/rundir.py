@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rare_envs.crashes import KINDS, NONE
 from rare_envs.space import ScenarioSpace
 from rare_envs.study.columns import SHOWN, columns_of
 from rare_envs.study.evaluate import Report
@@ -18,6 +19,18 @@ from rare_envs.study.plots import save_plot
 
 RESULT, FAILURES, BLOCKS, PLOT = "result.json", "failures.csv", "failures.npz", "plot.png"
 """Blocks are what a table has no room for: of more than `columns.SHOWN` values, drivers' weights and noise."""
+CRASH = (
+    "crash",
+    "striking",
+    "struck",
+    "impact_speed",
+    "closing_speed",
+    "delta_v_striking",
+    "delta_v_struck",
+    "injury_risk_striking",
+    "injury_risk_struck",
+)
+"""Columns of failures.csv that say what a failure ended in: `rare_envs.crashes.Crash`."""
 FAULTS, FAULT_BLOCKS = "faults.csv", "faults.npz"
 """Likewise, scenarios on which the ego failed."""
 
@@ -42,24 +55,27 @@ def to_text(value: dict[str, Any]) -> str:
     return re.sub(r"\[\n([^\[\]{}\"]*)\n *\]", lambda found: f"[{' '.join(found[1].split())}]", text)
 
 
-def read_failures(folder: Path) -> dict[str, NDArray[np.float64]]:
+def read_failures(folder: Path) -> dict[str, NDArray[Any]]:
     """Read the failures of a run, the most likely first.
 
     Args:
         folder: Of `rare-envs estimate --out`.
 
     Returns:
-        Parameters by name, shape (n,), or (n, size) for blocks; then "f" and "log_p0", shape (n,). The parameters of
-        row k replay by `env.reset(options={name: found[name][k] for name in env.unwrapped.space.names})`.
+        Parameters by name, shape (n,), or (n, size) for blocks; then "f" and "log_p0", shape (n,), and what the
+        failure ended in: "crash" (words) and the numbers of `CRASH`, NaN without a crash. The parameters of row k
+        replay by `env.reset(options={name: found[name][k] for name in env.unwrapped.space.names})`.
 
     Raises:
         FileNotFoundError: There is no such run.
     """
     with (folder / FAILURES).open(newline="", encoding="utf-8") as file:
         header, *rows = csv.reader(file)
-    table = np.array(rows, dtype=np.float64).reshape(len(rows), len(header))
-    columns: dict[str, list[NDArray[np.float64]]] = {}
-    for name, values in zip(header, table.T, strict=True):
+    columns: dict[str, list[NDArray[Any]]] = {}
+    for column, name in enumerate(header):
+        cells = [row[column] for row in rows]
+        words = name == CRASH[0]
+        values = np.array(cells, dtype=str) if words else np.array([float(cell or "nan") for cell in cells])
         columns.setdefault(name.partition("[")[0], []).append(values)
     found = {name: parts[0] if len(parts) == 1 else np.stack(parts, axis=1) for name, parts in columns.items()}
     if (folder / BLOCKS).exists():
@@ -69,11 +85,20 @@ def read_failures(folder: Path) -> dict[str, NDArray[np.float64]]:
 
 
 def _write_failures(folder: Path, report: Report) -> None:
-    """One failure a row, the most likely first: x, f and log p0."""
+    """One failure a row, the most likely first: x, f, log p0 and the crash."""
     failures = report.estimate.failures
     # repr of a float gives it back exactly, so that a row replays to the same f
-    rest = [(failure.f, failure.log_p0) for failure in failures]
-    _write_table(folder / FAILURES, report.study.problem.space, failures.x, ("f", "log_p0"), rest)
+    kind = "" if report.kinds.unknown else KINDS[NONE]
+    rest = [(one.f, one.log_p0, *_crash(crash, kind)) for one, crash in zip(failures, report.crashes, strict=True)]
+    _write_table(folder / FAILURES, report.study.problem.space, failures.x, ("f", "log_p0", *CRASH), rest)
+
+
+def _crash(crash: dict[str, Any] | None, kind: str) -> tuple[Any, ...]:
+    """A crash as the columns `CRASH`; only the kind that is given where there is none."""
+    if crash is None:
+        return (kind, *("" for _ in CRASH[1:]))
+    speeds = (crash["impact_speed"], crash["closing_speed"])
+    return (crash["kind"], *crash["vehicles"], *speeds, *crash["delta_v"], *crash["injury_risk"])
 
 
 def _write_faults(folder: Path, report: Report) -> None:

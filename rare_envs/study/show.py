@@ -13,6 +13,7 @@ from rich.table import Table
 import samplers
 from rare_envs.study.columns import SHOWN
 from rare_envs.study.evaluate import Report
+from rare_envs.study.kinds import NAMES
 from samplers.problem import FloatArray
 
 ORDINARY = 4000
@@ -68,6 +69,7 @@ def print_report(report: Report, out: Path | None = None) -> None:
     )
     for name, value in rows:
         console.print(f"  {name:<15} {value}")
+    _print_kinds(console, report)
     if report.vec_normalize is not None:
         console.print(f"  {'observations':<15} normalised by {report.vec_normalize}")
     if report.faults:
@@ -84,6 +86,21 @@ def print_report(report: Report, out: Path | None = None) -> None:
     if out is not None:
         names = ", ".join(path.name for path in sorted(out.iterdir()) if path.is_file())
         console.print(f"written to {out}: {names}")
+
+
+def _print_kinds(console: Console, report: Report) -> None:
+    """Print p by kind of crash, and how bad the listed ones are."""
+    for number, (kind, share) in enumerate(report.kinds.shares.items()):
+        low, high = share.interval
+        text = f"{share.p:.1e} [{low:.1e}, {high:.1e}], {100 * share.of_failures:.3g} %: {NAMES.get(kind, kind)}"
+        console.print(f"  {'of which' if number == 0 else '':<15} {text}")
+
+
+def _in_words(crash: dict[str, Any]) -> str:
+    """Who ran into whom, how fast, and what that means for the ego's people."""
+    who = ["the edge of the road" if one < 0 else f"vehicle {one}" if one else "the ego" for one in crash["vehicles"]]
+    speeds = f"{crash['impact_speed']:.1f} m/s at contact, delta-v {max(crash['delta_v']):.1f} m/s"
+    return f"{who[0]} runs into {who[1]}: {speeds}, serious injury {100 * max(crash['injury_risk']):.2g} %"
 
 
 def _one_in(p: float) -> str:
@@ -111,6 +128,8 @@ def _print_failure(console: Console, report: Report) -> None:
         f"  most likely of {failures.total:,} failures found (f = {failures.f[0]:.3g}; "
         "in brackets where nine of ten ordinary scenarios lie):"
     )
+    if report.crashes[0] is not None:
+        console.print(f"    {_in_words(report.crashes[0])}")
     normal = space.columns(space.to_standard_normal(np.vstack((failures.x[:1], ordinary))))
     found, usual = space.columns(failures.x[:1]), space.columns(ordinary)
     for j, name in enumerate(space.names):
