@@ -12,13 +12,14 @@ from agents.checkpoints import SHIPPED, SUFFIX, load_driver
 from agents.factory import RULE_BASED, call_factory
 from agents.learned import LearnedDriver, LearnedEgo
 from agents.saved import load_saved
+from rare_envs.faults import EgoGone
 from rare_envs.space import did_you_mean
 
 EXPECTED: Final = (
     f"'{RULE_BASED}', {', '.join(map(repr, SHIPPED))}, a path to a {SUFFIX} or Stable-Baselines3 .zip, "
-    "an .onnx file or module:function"
+    "an .onnx file, module:function, tcp://host:port, or process:EGO for one of these in a process of its own"
 )
-Kind = Literal["rule", "learned", "url", "onnx", "zip", "function", "unknown"]
+Kind = Literal["rule", "learned", "url", "remote", "process", "onnx", "zip", "function", "unknown"]
 
 
 @runtime_checkable
@@ -52,8 +53,10 @@ def load_ego(spec: str | Path, algo: str | None = None, trust: bool = False) -> 
     Args:
         spec: "idm"; "mgail", "gail" or "bc", or a path to a `.safetensors`, for a learned driver, which as ego acts by
             its mean actions; a path to a `.zip` saved by Stable-Baselines3; a path to an `.onnx` file
-            (see `agents.onnx_ego.OnnxEgo` for its form); or `module:function`, a function
-            without arguments that returns an ego (modules in the working directory are found).
+            (see `agents.onnx_ego.OnnxEgo` for its form); `module:function`, a function
+            without arguments that returns an ego (modules in the working directory are found); `tcp://host:port`
+            for an ego in another program (docs/remote.md); or `process:EGO`, any of these files and functions in a
+            process of its own, which is ended and started anew where the ego hangs or dies.
         algo: Algorithm of a `.zip`, such as "ppo"; recognised from the file when None. Only a `.zip` has one.
         trust: Open the pickles in a `.zip` as Stable-Baselines3 does, which runs whatever code is in them. Without it
             a file that needs code of its author's (a policy class of their own, say) is refused.
@@ -78,8 +81,10 @@ def load_ego(spec: str | Path, algo: str | None = None, trust: bool = False) -> 
         raise ValueError(f"Unknown ego {text!r}{_suggest_ego(text)}; expected {EXPECTED}.")
     if kind == "zip":
         return load_saved(Path(text), algo, trust)
-    if algo is not None:
+    if algo is not None and kind != "process":
         raise ValueError(f"Expected algo for a Stable-Baselines3 .zip only, got {algo!r} for {text!r}; leave it out.")
+    if kind in ("remote", "process"):
+        return _elsewhere(kind, text, algo, trust)
     if kind == "onnx":
         from agents.onnx_ego import OnnxEgo
 
@@ -89,12 +94,35 @@ def load_ego(spec: str | Path, algo: str | None = None, trust: bool = False) -> 
     return cast(Ego, call_factory(text)) if kind == "function" else "idm"
 
 
+def _elsewhere(kind: Kind, text: str, algo: str | None, trust: bool) -> Ego:
+    """An ego in another process."""
+    try:
+        import msgpack  # noqa: F401
+        import zmq  # noqa: F401
+    except ImportError as error:
+        raise ValueError(f"{text!r} needs pyzmq and msgpack: pip install 'rare-envs[remote]'.") from error
+    try:
+        if kind == "process":
+            from agents.isolated import isolate
+
+            return isolate(text.removeprefix("process:"), algo, trust)
+        from agents.zmq_link import connect
+
+        return connect(text)
+    except EgoGone as error:
+        raise ValueError(str(error)) from error
+
+
 def kind_of(spec: str) -> Kind:
     """What a user means by an ego's name; nothing is opened."""
     if spec == RULE_BASED:
         return "rule"
     if spec in SHIPPED or spec.endswith(SUFFIX):
         return "learned"
+    if spec.startswith("process:"):
+        return "process"
+    if spec.startswith(("tcp://", "ipc://")):
+        return "remote"
     if "://" in spec:
         return "url"
     if spec.endswith(".onnx"):

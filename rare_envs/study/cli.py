@@ -273,6 +273,22 @@ def replay_command(
     raise typer.Exit(0 if same else DOUBTFUL)
 
 
+@app.command("serve-ego")
+def serve_ego_command(
+    ego: Annotated[str, typer.Argument(metavar="EGO", help="As for estimate --ego.")],
+    bind: Annotated[
+        str, typer.Option(help="Address; beyond 127.0.0.1 it needs RARE_ENVS_SECRET.")
+    ] = "tcp://127.0.0.1:5555",
+    algo: Annotated[str | None, typer.Option(help="Algorithm of the .zip, if the file does not tell.")] = None,
+    trust: Trust = False,
+) -> None:
+    """Lend an ego to simulations in other processes or on other machines (estimate --ego tcp://...)."""
+    _one_thread()
+    from rare_envs.study.serve_ego import serve_ego
+
+    serve_ego(ego, bind, algo=algo, trust=trust)
+
+
 def _noise(word: Noise) -> bool | str:
     """The `noise` argument of `DrivingProblem` for a word."""
     return {Noise.ON: True, Noise.OFF: False}.get(word, word.value)

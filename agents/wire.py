@@ -1,0 +1,116 @@
+"""Messages between the simulation and an ego elsewhere: msgpack maps, arrays as bytes, seals. See docs/remote.md."""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import math
+from typing import Any, TypeGuard
+
+import msgpack
+import numpy as np
+from numpy.typing import NDArray
+
+PROTOCOL = 1
+"""Version of the protocol; both sides must speak the same."""
+MAX_BYTES = 256 * 2**20
+"""Largest message."""
+MAX_BATCH = 2**16
+"""Most rows of a batch."""
+MOST = 2**63 - 1
+"""Largest number of a session or message."""
+NONCE = 16
+"""Bytes of a nonce."""
+DTYPES = ("<f4", "<f8", "<i4", "<i8", "|u1")
+_LIMITS = {"max_array_len": 4096, "max_map_len": 64, "max_str_len": 2**16, "max_ext_len": 0}
+_MOST_AXES = 5
+
+Message = dict[str, Any]
+
+
+class Malformed(ValueError):
+    """A message that is not of the protocol's form."""
+
+
+def pack(message: Message) -> bytes:
+    """A message as bytes."""
+    content: bytes = msgpack.packb(message, use_bin_type=True)
+    return content
+
+
+def unpack(content: bytes) -> Message:
+    """The message in some bytes, whoever wrote them.
+
+    Raises:
+        Malformed: They are no msgpack map with text for keys, or too many.
+    """
+    if len(content) > MAX_BYTES:
+        raise Malformed(f"a message of {len(content)} bytes, more than {MAX_BYTES}")
+    try:
+        message = msgpack.unpackb(content, raw=False, strict_map_key=True, max_bin_len=len(content), **_LIMITS)
+    except Exception as error:  # msgpack raises many kinds
+        raise Malformed(f"no msgpack: {type(error).__name__}: {error}") from error
+    if not isinstance(message, dict) or not all(isinstance(key, str) for key in message):
+        raise Malformed("no map from text")
+    return message
+
+
+def pack_array(values: NDArray[Any]) -> Message:
+    """An array as a map of dtype, shape and little-endian bytes in C order.
+
+    Raises:
+        Malformed: It holds something else than numbers.
+    """
+    if values.dtype == bool:
+        values = values.astype(np.uint8)
+    elif np.issubdtype(values.dtype, np.integer) and values.dtype != np.uint8:
+        values = values.astype("<i8")
+    elif np.issubdtype(values.dtype, np.floating):
+        values = values.astype("<f8" if values.dtype == np.float64 else "<f4")
+    if values.dtype.str not in DTYPES:
+        raise Malformed(f"an array of {values.dtype}, expected numbers")
+    return {"dtype": values.dtype.str, "shape": list(values.shape), "data": values.tobytes()}
+
+
+def unpack_array(given: Any) -> NDArray[Any]:
+    """The array in such a map.
+
+    Raises:
+        Malformed: It is not of that form, or dtype, shape and bytes do not go together.
+    """
+    if not isinstance(given, dict) or set(given) != {"dtype", "shape", "data"}:
+        raise Malformed("an array is a map of dtype, shape and data")
+    dtype, shape, data = given["dtype"], given["shape"], given["data"]
+    if dtype not in DTYPES:
+        raise Malformed(f"dtype {dtype!r}, expected one of {', '.join(DTYPES)}")
+    if not isinstance(shape, list) or len(shape) > _MOST_AXES or not all(is_count(size, MAX_BYTES) for size in shape):
+        raise Malformed(f"shape {shape!r}")
+    if not isinstance(data, bytes) or len(data) != math.prod(shape) * np.dtype(dtype).itemsize:
+        raise Malformed(f"data do not fill shape {shape} of {dtype}")
+    return np.frombuffer(bytearray(data), dtype=dtype).reshape(shape)  # a bytearray, so that it can be written to
+
+
+def is_count(value: object, most: int = MOST) -> TypeGuard[int]:
+    """Whether a value is a whole number from 0 to most; a bool is none."""
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= most
+
+
+# --- seals -------------------------------------------------------------------------------------
+
+ASK, ANSWER = b"ask:", b"answer:"
+"""What a seal covers before the message, so that an answer cannot be sent back as a question."""
+
+
+def seal(key: bytes, direction: bytes, content: bytes) -> bytes:
+    """HMAC-SHA256 of a message, 32 bytes."""
+    return hmac.new(key, direction + content, hashlib.sha256).digest()
+
+
+def sealed(key: bytes, direction: bytes, tag: bytes, content: bytes) -> bool:
+    """Whether a seal is right, compared in constant time."""
+    return hmac.compare_digest(seal(key, direction, content), tag)
+
+
+def session_key(secret: bytes, client_nonce: bytes, server_nonce: bytes) -> bytes:
+    """The key of a connection, after its hello."""
+    return hmac.new(secret, b"key:" + client_nonce + server_nonce, hashlib.sha256).digest()
