@@ -6,6 +6,7 @@ Knows NumPy and probability, nothing about driving. `estimate` is the front door
 from samplers.ask_tell import Run
 from samplers.beta_block import BetaBlock
 from samplers.blocks import GaussianBlock, MixtureBlock, NormalBlock, Product
+from samplers.comparison import Comparison, compare
 from samplers.cross_entropy import CrossEntropy
 from samplers.curve import Curve
 from samplers.importance_sampling import ImportanceSampling
@@ -27,6 +28,7 @@ __all__ = [
     "METHODS",
     "AdaptiveSubsetSimulation",
     "BetaBlock",
+    "Comparison",
     "CrossEntropy",
     "Curve",
     "Distribution",
@@ -60,6 +62,7 @@ __all__ = [
     "Steps",
     "SubsetSimulation",
     "TwoStage",
+    "compare",
     "estimate",
     "get_method",
 ]

@@ -10,7 +10,7 @@ from samplers.method import Goal, Steps
 from samplers.problem import FloatArray, Inputs
 from samplers.subset import AdaptiveSubsetSimulation
 
-LEAST_RATE = 0.04
+LEAST_RATE = 0.03
 """What a round of draws must be worth, in independent failures for each draw. Proposals that come to something reach
 0.05 to 0.8; with less, the spread of the weights is that of the failures that were hit, not of those that there are."""
 LARGEST_TYPICAL = 30.0

@@ -94,14 +94,20 @@ def alone(sample: Sample) -> bool:
     return not sample.layers and len(np.unique(sample.units)) == len(sample.units)
 
 
-def interval_of_sum(p: float, cov: float, ess: float, alone: bool, confidence: float) -> Interval:
-    """Return a log-normal interval of p > 0 with the t quantile that `ess` effective units deserve.
+def degrees_of_freedom(ess: float, alone: bool) -> float:
+    """Return the degrees of freedom of a sum over `ess` effective units; inf where they are many.
 
-    Sums of chains have ess - 1 degrees of freedom, as in subset simulation; single draws, whose weights
-    are skewed, a quarter of ess but at least 3, as in importance sampling.
+    Sums of chains have ess - 1, as in subset simulation; single draws, whose weights are skewed, a quarter of ess
+    but at least 3, as in importance sampling.
     """
-    df = max(ess / 4, 3.0) if alone else max(ess - 1, 1.0)
-    return log_normal(p, cov, confidence, df=math.inf if ess > MANY_ESS else df)
+    if ess > MANY_ESS:
+        return math.inf
+    return max(ess / 4, 3.0) if alone else max(ess - 1, 1.0)
+
+
+def interval_of_sum(p: float, cov: float, ess: float, alone: bool, confidence: float) -> Interval:
+    """Return a log-normal interval of p > 0 with the t quantile that `ess` effective units deserve."""
+    return log_normal(p, cov, confidence, df=degrees_of_freedom(ess, alone))
 
 
 def interval_of_count(p: float, n: int, confidence: float) -> Interval:

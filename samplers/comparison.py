@@ -1,0 +1,237 @@
+"""Two functions on the same draws: how many times likelier is failure of one than of the other?"""
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from samplers.curve import inflation, sample_of
+from samplers.intervals import Interval, nothing_in
+from samplers.method import Stepping
+from samplers.plan import check_problem
+from samplers.problem import Distribution, FloatArray, Problem
+from samplers.progress import Listener
+from samplers.result import Estimate, plain
+from samplers.reweighting import LARGEST_LOG, effective
+from samplers.run import estimate
+from samplers.two_stage import TwoStage
+from samplers.units import alone, degrees_of_freedom, interval_of_sum
+
+FEW = 30.0
+"""Effective failing units below which a probability is called coarse."""
+CHECKED = 16
+"""Draws at which the two base laws are compared."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Side:
+    """P[f(X) <= gamma] of one of the two."""
+
+    p: float
+    interval: Interval
+    cov: float
+    ess: float
+    """Effective number of independent failing units behind p."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """p_A / p_B from the same draws with the same weights."""
+
+    ratio: float
+    """p_A / p_B; inf where p_B = 0, NaN where both are 0."""
+    interval: Interval
+    """Interval that should hold the true ratio with probability `confidence`."""
+    confidence: float
+    a: Side
+    b: Side
+    both: float
+    """P[both fail]."""
+    n_sim: int
+    """Simulations of A and of B together."""
+    warnings: tuple[str, ...]
+    """What makes the numbers doubtful."""
+    either: Estimate = field(repr=False)
+    """P[A or B fails], from which all this comes."""
+
+    def __str__(self) -> str:
+        """Return a few lines for people."""
+        low, high = self.interval
+        lines = [f"p_A / p_B = {self.ratio:.3g}", f"  {self.confidence:.0%} interval [{low:.3g}, {high:.3g}]"]
+        for name, side in (("A", self.a), ("B", self.b)):
+            lines.append(f"  p_{name} = {side.p:.3e} [{side.interval[0]:.3e}, {side.interval[1]:.3e}]")
+        lines.append(f"  both fail: {self.both:.3e}; {self.n_sim:,} simulations, half of them of each")
+        return "\n".join(lines + [f"  warning: {text}" for text in self.warnings])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain numbers for JSON; NaN and infinities become None."""
+        sides = {name: {key: plain(value) for key, value in vars(getattr(self, name)).items()} for name in ("a", "b")}
+        data = {
+            "ratio": self.ratio,
+            "interval": list(self.interval),
+            "confidence": self.confidence,
+            "both": self.both,
+            "n_sim": self.n_sim,
+            "warnings": list(self.warnings),
+            "either": self.either.to_dict(),
+        }
+        return {**{key: plain(value) for key, value in data.items()}, **sides}
+
+
+class Either:
+    """The problem that fails where A or B does: f = min(f_A, f_B), and which of them it was.
+
+    Args:
+        a: Problem A.
+        b: Problem B, with the same base law.
+        gamma: Threshold of failure.
+    """
+
+    def __init__(self, a: Problem, b: Problem, gamma: float) -> None:
+        self.dim, self.base = int(a.dim), a.base
+        self.given = str(getattr(a, "given", ""))
+        self.n_sim = 0
+        self._problems, self._gamma = (a, b), gamma
+        self._known: dict[bytes, tuple[bool, bool]] = {}
+
+    def evaluate(self, x: FloatArray) -> FloatArray:
+        """Simulate the rows of x (n, d) with both; return the smaller outcome of each, shape (n,)."""
+        f = np.stack([np.asarray(problem.evaluate(x), dtype=np.float64) for problem in self._problems])
+        self.n_sim += 2 * len(x)
+        least = np.asarray(f.min(axis=0))
+        for row in np.flatnonzero(least <= self._gamma):
+            self._known[x[row].tobytes()] = (bool(f[0, row] <= self._gamma), bool(f[1, row] <= self._gamma))
+        return least
+
+    def who_fails(self, x: FloatArray) -> NDArray[np.bool_]:
+        """Return whether A and whether B fails at points x (k, d) that were simulated, shape (2, k)."""
+        lost = np.array([row.tobytes() not in self._known for row in x], dtype=bool)
+        if lost.any():  # mapped there and back in another batch, some coordinate differs by its last bit
+            self.evaluate(x[lost])
+        return np.array([self._known.get(row.tobytes(), (False, False)) for row in x], dtype=bool).reshape(-1, 2).T
+
+
+def compare(
+    a: Problem,
+    b: Problem,
+    method: Stepping | str = TwoStage(),  # noqa: B008  (frozen, so safe to share)
+    gamma: float = 0.0,
+    seed: int | None = None,
+    max_sim: int | None = None,
+    confidence: float = 0.95,
+    progress: bool | Listener = False,
+) -> Comparison:
+    """Estimate P[f_A(X) <= gamma] / P[f_B(X) <= gamma] for two functions of the same X.
+
+    The method estimates P[A or B fails], f = min(f_A, f_B), and both are simulated at every draw. With weights w_i and
+    indicators a_i, b_i of the draws, p_A = sum w a and p_B = sum w b; the error of log(p_A / p_B) is that of
+    sum w (a / p_A - b / p_B), to which draws where both fail contribute next to nothing: the more alike the two are,
+    the better their ratio is known, where errors of two runs of their own would add up. The interval is log-normal
+    with the t quantile of the effective number of draws where one of them fails; where there is none it is the
+    Clopper-Pearson bound on how often that can be.
+
+    Where one fails hundreds of times less often than the other few draws show it failing, and a warning says so:
+    then estimate each by itself.
+
+    Args:
+        a: Problem A: `dim`, `base`, `evaluate`.
+        b: Problem B, with the same base law.
+        method: One that gives weighted points (`Estimate.sample`), as all of `METHODS` do.
+        gamma: Threshold of failure, for both.
+        seed: Same seed, same answer.
+        max_sim: Simulations of A and B together that are never exceeded.
+        confidence: Nominal coverage of the intervals.
+        progress: As in `estimate`.
+
+    Raises:
+        ValueError: If an argument is not as described in `estimate`, or the base laws differ.
+    """
+    for problem in (a, b):
+        check_problem(problem, ("dim", "base", "evaluate"))
+    _check_same_base(a, b)
+    problem = Either(a, b, gamma)
+    limit = None if max_sim is None else max_sim // 2
+    found = estimate(problem, method, gamma, seed, limit, confidence=confidence, progress=progress)
+    return _compared(found, problem)
+
+
+def _check_same_base(a: Problem, b: Problem) -> None:
+    """Raise a ValueError unless X has the same law in both problems, as far as a few draws tell."""
+    if int(a.dim) != int(b.dim):
+        raise ValueError(f"Expected two problems with the same x, got {a.dim} and {b.dim} dimensions.")
+    x = a.base.sample(CHECKED, np.random.default_rng(0))
+    laws: tuple[Distribution, Distribution] = (a.base, b.base)
+    log_p = [law.log_prob(x) for law in laws]
+    if not np.allclose(log_p[0], log_p[1], rtol=1e-9, atol=1e-9):
+        raise ValueError("Expected two problems with the same base distribution; their densities differ.")
+
+
+def _compared(found: Estimate, problem: Either) -> Comparison:
+    """Return what the points of an estimate of P[A or B fails] say of the two."""
+    sample = sample_of(found)
+    fails = sample.f <= found.gamma
+    weights, units = sample.weights[fails], sample.units[fails]
+    which = problem.who_fails(sample.x)
+    totals = np.array([np.bincount(units, weights=weights * hit, minlength=sample.n_units) for hit in which])
+    own = float(np.bincount(units, weights=weights, minlength=sample.n_units).std()) * math.sqrt(sample.n_units)
+    factor = inflation(found, own / found.p if found.p > 0 else math.inf)
+    single = alone(sample)
+    a, b = (_side(total, factor, single, found) for total in totals)
+    few = [f"{name} failed in draws worth {s.ess:.0f} only" for name, s in (("A", a), ("B", b)) if s.ess < FEW]
+    about = [f"{' and '.join(few)}: the ratio is coarse; estimate each by itself."] if few else []
+    return Comparison(
+        ratio=_ratio(a.p, b.p),
+        interval=_interval(totals, factor, single, found),
+        confidence=found.confidence,
+        a=a,
+        b=b,
+        both=float(weights[which.all(axis=0)].sum()),
+        n_sim=problem.n_sim,
+        warnings=(*found.warnings, *about),
+        either=found,
+    )
+
+
+def _ratio(a: float, b: float) -> float:
+    if b > 0:
+        return a / b
+    return math.inf if a > 0 else math.nan
+
+
+def _side(totals: FloatArray, factor: float, single: bool, found: Estimate) -> Side:
+    """Return the probability that unit totals (n_units,) add up to."""
+    p, ess = float(totals.sum()), effective(totals)
+    if p == 0:
+        return Side(p=0.0, interval=(0.0, found.interval[1]), cov=math.inf, ess=0.0)
+    cov = factor * _error(totals) / p
+    return Side(p=p, interval=interval_of_sum(p, cov, ess, single, found.confidence), cov=cov, ess=ess)
+
+
+def _interval(totals: FloatArray, factor: float, single: bool, found: Estimate) -> Interval:
+    """Return the interval of the ratio from the unit totals of A and B, shape (2, n_units)."""
+    p_a, p_b = totals.sum(axis=1)
+    if p_a == 0 and p_b == 0:
+        return 0.0, math.inf
+    apart = totals[0] != totals[1]  # units that tell the two from one another
+    if p_a == 0 or p_b == 0 or not apart.any():
+        # Of `ess` draws none was such that ...: of such draws there are at most
+        share = nothing_in(max(round(effective(totals.max(axis=0))), 1), found.confidence)
+        if p_a == 0:
+            return 0.0, share
+        return (1 / share, math.inf) if p_b == 0 else (1 - share, 1 / (1 - share))
+    z = totals[0] / p_a - totals[1] / p_b
+    spread, ratio = factor * _error(z), float(p_a / p_b)
+    ess = effective(np.where(apart, np.abs(z), 0.0))
+    quantile = float(stats.t.ppf(0.5 + found.confidence / 2, degrees_of_freedom(ess, single)))
+    half = min(quantile * spread, LARGEST_LOG)
+    return ratio * math.exp(-half), ratio * math.exp(half)
+
+
+def _error(totals: FloatArray) -> float:
+    """Return the standard error of a sum of unit totals (n,), the largest counted once more, as in `weighted_cov`."""
+    n = len(totals)
+    square = float(((totals - totals.mean()) ** 2).sum()) * n / max(n - 1, 1)
+    return math.sqrt(square + float(np.abs(totals).max()) ** 2)

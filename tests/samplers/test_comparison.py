@@ -1,0 +1,124 @@
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import samplers
+from samplers import FunctionProblem
+
+PHI = stats.norm.cdf
+
+
+def half_space(beta, direction):
+    unit = np.array(direction) / np.linalg.norm(direction)
+    return FunctionProblem(lambda u: beta - u @ unit, len(unit))
+
+
+NESTED = half_space(3.5, [1.0, 0, 0, 0]), half_space(3.7, [1.0, 0, 0, 0]), PHI(-3.5) / PHI(-3.7)
+TILTED = half_space(3.5, [1.0, 0, 0, 0]), half_space(3.5, [1.0, 0.3, 0, 0]), 1.0
+APART = half_space(3.5, [1.0, 0, 0, 0]), half_space(3.7, [0, 1.0, 0, 0]), PHI(-3.5) / PHI(-3.7)
+
+
+@pytest.mark.parametrize(("a", "b", "ratio"), [NESTED, TILTED, APART], ids=["nested", "tilted", "apart"])
+def test_the_ratio_and_both_probabilities_are_right(a, b, ratio):
+    found = samplers.compare(a, b, seed=1, max_sim=8000)
+    assert found.interval[0] < ratio < found.interval[1]
+    assert abs(math.log(found.ratio / ratio)) < 0.25
+    assert found.a.interval[0] < PHI(-3.5) < found.a.interval[1]
+    assert found.ratio == pytest.approx(found.a.p / found.b.p)
+    assert found.a.p + found.b.p - found.both == pytest.approx(found.either.p)
+    assert found.n_sim <= 8000
+    assert found.warnings == ()
+
+
+def test_equal_functions_are_known_to_be_so():
+    found = samplers.compare(NESTED[0], NESTED[0], seed=0, max_sim=4000)
+    assert found.ratio == 1.0
+    assert 0.99 < found.interval[0] < 1.0 < found.interval[1] < 1.01
+
+
+def test_functions_that_are_nearly_alike_are_told_apart_better_than_by_runs_of_their_own():
+    a, b = half_space(3.5, [1.0, 0]), half_space(3.51, [1.0, 0])
+    found = samplers.compare(a, b, seed=0, max_sim=6000)
+    alone = [samplers.estimate(problem, seed=0, max_sim=3000).cov for problem in (a, b)]
+    ratio = PHI(-3.5) / PHI(-3.51)
+    assert found.interval[0] < ratio < found.interval[1]
+    half = 0.5 * math.log(found.interval[1] / found.interval[0])
+    assert half < 0.7 * 1.96 * math.hypot(*alone)
+
+
+@pytest.mark.parametrize(("method", "max_sim"), [("mc", 60_000), ("adss", 8000)])
+def test_other_methods(method, max_sim):
+    a, b = half_space(2.5, [1.0, 0]), half_space(2.5, [1.0, 0.2])
+    found = samplers.compare(a, b, method, seed=0, max_sim=max_sim)
+    assert found.interval[0] < 1 < found.interval[1]
+    assert found.interval[1] < 3 * found.interval[0]
+
+
+def test_monte_carlo_with_hand_counted_hits():
+    """Four failing draws of A, two of B, one of both."""
+    order = np.array([1, 1, 1, 1, 0, 0, 0, 0, 0, 0])
+    other = np.array([1, 0, 0, 0, 1, 0, 0, 0, 0, 0])
+
+    def picks(hits):
+        seen: dict[float, int] = {}
+
+        def f(x):
+            ranks = [seen.setdefault(float(value), len(seen)) for value in x[:, 0]]
+            return np.array([-1.0 if rank < 10 and hits[rank] else 1.0 for rank in ranks])
+
+        return FunctionProblem(f, 1)
+
+    found = samplers.compare(picks(order), picks(other), "mc", seed=0, max_sim=200)
+    assert (found.ratio, found.a.p, found.b.p, found.both) == pytest.approx((2.0, 0.04, 0.02, 0.01))
+    assert found.interval[0] < 1.0 < found.interval[1]
+    assert "coarse" in found.warnings[-1]
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "ratio", "low", "high"), [(9.0, 2.0, 0.0, 0.0, 0.2), (2.0, 9.0, math.inf, 5.0, math.inf)]
+)
+def test_one_never_fails(a, b, ratio, low, high):
+    found = samplers.compare(half_space(a, [1.0]), half_space(b, [1.0]), "mc", seed=0, max_sim=4000)
+    assert found.ratio == ratio
+    assert low <= found.interval[0] <= found.interval[1] <= high
+
+
+def test_neither_fails():
+    found = samplers.compare(half_space(9.0, [1.0]), half_space(9.0, [1.0]), "mc", seed=0, max_sim=400)
+    assert math.isnan(found.ratio)
+    assert found.interval == (0.0, math.inf)
+    assert found.to_dict()["ratio"] is None
+
+
+def test_same_seed_same_answer():
+    first, second = (samplers.compare(*TILTED[:2], seed=3, max_sim=3000) for _ in range(2))
+    assert first.to_dict() == second.to_dict()
+    assert "p_A / p_B" in str(first)
+
+
+def test_problems_with_another_x_are_refused():
+    with pytest.raises(ValueError, match="4 and 2 dimensions"):
+        samplers.compare(NESTED[0], half_space(3.0, [1.0, 0]))
+    wider = half_space(3.0, [1.0, 0])
+
+    class Other:
+        dim = 2
+        base = samplers.Product([samplers.BetaBlock(alpha=2.0, beta=2.0, low=[-1.0, -1.0], high=[1.0, 1.0])])
+
+        def evaluate(self, x):
+            return x[:, 0]
+
+    with pytest.raises(ValueError, match="same base distribution"):
+        samplers.compare(wider, Other())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("a", "b", "ratio"), [NESTED, TILTED, APART], ids=["nested", "tilted", "apart"])
+def test_intervals_hold_the_ratio(a, b, ratio):
+    found = [samplers.compare(a, b, seed=seed, max_sim=6000) for seed in range(60)]
+    held = sum(each.interval[0] < ratio < each.interval[1] for each in found)
+    assert held >= stats.binom.ppf(1e-3, 60, 0.9)
+    logs = np.log([each.ratio / ratio for each in found])
+    assert abs(logs.mean()) < 4 * logs.std(ddof=1) / math.sqrt(60) + 0.01
