@@ -151,6 +151,55 @@ def estimate_command(
     raise typer.Exit(DOUBTFUL if report.doubtful else 0)
 
 
+@app.command("compare")
+def compare_command(
+    ego_a: Annotated[str, typer.Argument(metavar="EGO_A", help="An ego, as for estimate --ego.")],
+    ego_b: Annotated[str, typer.Argument(metavar="EGO_B", help="The other ego.")],
+    env: Env,
+    trust: Trust = False,
+    method: Annotated[str, typer.Option(help="Estimation method; see rare-envs list.")] = "two-stage",
+    base: Base = None,
+    measure: Annotated[str, typer.Option(help="Safety measure f; small is dangerous.")] = "ttc",
+    gamma: Annotated[float, typer.Option(help="Threshold: P[f <= gamma]; 0 counts collisions.")] = 0.0,
+    seed: Seed = 0,
+    max_sim: Annotated[int, typer.Option(help="Largest number of simulations, of both egos together.")] = 12_000,
+    drivers: Drivers = None,
+    noise: NoiseOption = Noise.ON,
+    observation: Observation = "features",
+    action: Action = "continuous",
+    horizon: Horizon = None,
+    as_json: Json = False,
+) -> None:
+    """Estimate how many times likelier ego A fails than ego B, with an interval, from the same scenarios."""
+    _one_thread()
+    from rare_envs.study.compare import compare
+    from rare_envs.study.evaluate import Question
+
+    question = Question(
+        env_id=env,
+        ego=ego_a,
+        trust=trust,
+        method=method,
+        base=base,
+        measure=measure,
+        gamma=gamma,
+        seed=seed,
+        max_sim=max_sim,
+        noise=_noise(noise),
+        drivers=drivers,
+        observation=observation,
+        action=action,
+        horizon=horizon,
+    )
+    with contextlib.redirect_stdout(sys.stderr):
+        found = compare(question, ego_b, progress=True)
+    if as_json:
+        _print_json(found["json"])
+    else:
+        print(f"A = {ego_a}, B = {ego_b}, {env}\n{found['comparison']}")
+    raise typer.Exit(DOUBTFUL if found["comparison"].warnings else 0)
+
+
 @app.command("train-ego")
 def train_ego_command(
     env: Env,
