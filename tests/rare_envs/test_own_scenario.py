@@ -1,0 +1,157 @@
+"""A scenario of one's own: one definition, one registration, and it passes the suites like those that are shipped."""
+
+import json
+import subprocess
+import sys
+import warnings
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from stable_baselines3.common.env_checker import check_env as sb3_check_env
+
+import rare_envs
+import samplers
+from rare_envs.road import straight
+from rare_envs.scenarios import SCENARIOS, named
+from rare_envs.scenarios.base import Others, Scenario, columns
+from rare_envs.space import Parameter
+from rare_envs.state import VEHICLE_LENGTH, State
+from rare_envs.study.catalogue import catalogue
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")  # PettingZoo's test module imports what PettingZoo has deprecated
+    from pettingzoo.test import parallel_api_test, parallel_seed_test
+
+ENV_ID = "tests/Standing-v0"
+
+
+def initial(x):
+    """speed, distance: an ego that comes upon a vehicle that stands."""
+    speed, distance = x.unbind(dim=1)
+    zero = torch.zeros_like(speed)
+    return State(
+        columns(zero, distance + VEHICLE_LENGTH),
+        columns(zero, zero),
+        columns(zero, zero),
+        columns(speed, zero),
+        theta=x[:, :0],
+    )
+
+
+def others(state, dt):
+    return Others(state.x[:, 1:], state.y[:, 1:], state.heading[:, 1:], state.speed[:, 1:])
+
+
+STANDING = Scenario(
+    name="standing",
+    road=straight(1),
+    vehicle_names=("ego", "stalled"),
+    horizon=6.0,
+    parameters=(
+        Parameter("speed", "m/s", 5.0, 30.0, "of the ego"),
+        Parameter("distance", "m", 10.0, 150.0, "bumper to bumper"),
+    ),
+    bases={"even": {"alpha": [1.0, 1.0], "beta": [1.0, 1.0]}},
+    initial=initial,
+    others=others,
+    driven=lambda state, action, dt: others(state, dt),
+)
+
+
+@pytest.fixture
+def registered():
+    rare_envs.register_scenario(ENV_ID, STANDING)
+    yield ENV_ID
+    SCENARIOS.remove(ENV_ID)
+    del gym.registry[ENV_ID]
+
+
+def test_it_is_known_everywhere(registered):
+    assert registered in rare_envs.ENV_IDS
+    assert named("standing") is STANDING
+    entry = catalogue()["environments"][registered]
+    assert [p["name"] for p in entry["parameters"]] == ["speed", "distance"]
+    assert entry["bases"] == ["even"]
+    with pytest.raises(ValueError, match="did you mean 'tests/Standing-v0'"):
+        rare_envs.make_batch("tests/Standin-v0", 2)
+
+
+def test_it_passes_the_suites(registered):
+    check_env(gym.make(registered).unwrapped, skip_render_check=True)
+    sb3_check_env(gym.make(registered))
+    parallel_api_test(rare_envs.parallel_env(registered), num_cycles=60)
+    parallel_seed_test(partial(rare_envs.parallel_env, registered), num_cycles=30)
+    batch = gym.make_vec(registered, num_envs=4)
+    observation, infos = batch.reset(seed=0, options={"speed": np.full(4, 20.0)})
+    assert observation in batch.observation_space
+    assert (infos["scenario"]["speed"] == 20.0).all()
+    env = rare_envs.parallel_env(registered, render_mode="rgb_array")
+    env.reset(seed=0)
+    assert env.render().shape == (208, 800, 3)
+
+
+def test_its_probability_is_the_one_on_paper(registered):
+    """An ego that only brakes stops within v^2 / (2 * 5): it crashes where the distance is shorter."""
+
+    class Braking:
+        def predict(self, observation, state=None, episode_start=None, deterministic=True):
+            return np.tile([-1.0, 0.0], (len(observation), 1)), None
+
+    problem = rare_envs.DrivingProblem(registered, ego=Braking())
+    n = 20_000
+    result = samplers.estimate(problem, samplers.MonteCarlo(), max_sim=n, seed=0)
+    v = np.linspace(5.0, 30.0, 100_001)
+    # explicit Euler drives half a tick's way at the first speed more
+    exact = np.clip((v**2 / 10 + v * 0.05 - 10.0) / 140.0, 0.0, 1.0).mean()
+    assert abs(result.p - exact) < 5 * (exact * (1 - exact) / n) ** 0.5
+    assert samplers.estimate(problem, samplers.TwoStage(), gamma=0.0, seed=0).interval[0] < exact
+
+
+def test_a_command_line_takes_it_from_a_module_of_ones_own(tmp_path):
+    """`python -c` as a user's program would: register, then call the command."""
+    code = (
+        "import sys; sys.path.insert(0, sys.argv[1]); from test_own_scenario import ENV_ID, STANDING; import rare_envs;"
+        "rare_envs.register_scenario(ENV_ID, STANDING); from rare_envs.study.cli import app;"
+        "app(['estimate', ENV_ID, '--method', 'mc', '--max-sim', '500', '--json'], prog_name='rare-envs')"
+    )
+
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", code, str(Path(__file__).parent)], capture_output=True, text=True
+    )
+    assert done.returncode in (0, 3), done.stderr
+    assert json.loads(done.stdout)["question"]["env_id"] == ENV_ID
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"vehicle_names": ("car", "stalled")}, '"ego" first'),
+        ({"vehicle_names": ("ego", "ego")}, "different names"),
+        ({"labels": ("the ego",)}, "as many labels as vehicles"),
+        ({"bases": {}}, "at least one base distribution"),
+        ({"horizon": 0.0}, "a horizon in s"),
+        ({"parameters": ()}, "parameters with different names"),
+        ({"parameters": (Parameter("x", "m", 0.0, 1.0, ""),)}, "none of them 'x'"),
+        ({"parameters": (Parameter("speed", "m/s", 1.0, 0.0, ""),)}, "low < high"),
+        ({"bases": {"even": {"alpha": [1.0], "beta": [1.0]}}}, "Base distribution even"),
+        ({"vehicle_names": ("ego", "stalled", "ghost"), "labels": ()}, r"expected x of shape \(B, 3\) from initial"),
+        ({"others": lambda state, dt: Others(*(field * torch.nan for field in others(state, dt)))}, "not finite"),
+        ({"driven": lambda state, action, dt: Others(*(state[:4]))}, r"shape \(B, 1\) from driven"),
+    ],
+)
+def test_what_does_not_work_is_refused_when_it_is_made_or_registered(change, message):
+    with pytest.raises(ValueError, match=message):
+        rare_envs.register_scenario("tests/Broken-v0", replace(STANDING, **change))
+    assert "tests/Broken-v0" not in rare_envs.ENV_IDS
+    assert "tests/Broken-v0" not in gym.registry
+
+
+def test_an_id_is_taken_once():
+    with pytest.raises(ValueError, match="is taken"):
+        rare_envs.register_scenario("rare_envs/CutIn-v0", STANDING)
