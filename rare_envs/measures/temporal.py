@@ -8,6 +8,7 @@ References:
 import difflib
 import logging
 import re
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -106,9 +107,13 @@ def _signal(trace: Trace, name: str) -> Tensor:
 def _parsed(formula: str, dt: float) -> tuple[Any, list[str]]:
     """A monitor for a formula, and the signals that it names."""
     try:
-        import rtamt
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # of the parser that it uses
+            import rtamt
     except ImportError as error:
-        raise ImportError("Signal temporal logic needs rtamt: pip install 'rare-envs[stl]'.") from error
+        raise ImportError(
+            "Signal temporal logic needs rtamt, on Python 3.11 or earlier: pip install 'rare-envs[stl]'."
+        ) from error
     if not isinstance(formula, str):
         raise ValueError(f"Expected a formula such as 'always (gap > 2)', got {formula!r}.")
     names = [name for name in dict.fromkeys(_NAME.findall(formula)) if name in SIGNALS or _OF_VEHICLE.fullmatch(name)]

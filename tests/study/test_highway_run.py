@@ -13,7 +13,7 @@ from typer.testing import Result
 
 import agents
 import rare_envs
-from rare_envs.study.rundir import read_failures
+from rare_envs.study.rundir import CRASH, read_failures
 
 Cli = Callable[..., Result]
 FOLLOWING = "rare_envs/CarFollowing-v0"
@@ -67,7 +67,7 @@ def test_a_short_table_needs_no_second_file(cli: Cli, risky: str, tmp_path: Path
     cli("estimate", FOLLOWING, "--base", risky, "--method", "mc", "--max-sim", 2000, "--out", tmp_path)
     assert not (tmp_path / "failures.npz").exists()
     found = read_failures(tmp_path)
-    assert list(found) == ["ego_speed", "lead_speed", "gap", "f", "log_p0"]
+    assert list(found) == ["ego_speed", "lead_speed", "gap", "f", "log_p0", *CRASH]
     problem = rare_envs.DrivingProblem(FOLLOWING, base=risky)
     x = np.column_stack([found[name] for name in problem.space.names])
     np.testing.assert_array_equal(problem.evaluate(x), found["f"])
