@@ -153,7 +153,7 @@ class LearnedEgo:
     """It needs a world in which vehicles look."""
 
     @property
-    def observation_space(self) -> "spaces.Box[np.float32]":
+    def observation_space(self) -> "spaces.Space[Any]":
         """What `predict` takes: the observation "lidar"."""
         return observation_space(1, "lidar")
 

@@ -9,13 +9,14 @@ from torch import Tensor
 
 from rare_envs.actions import read_actions
 from rare_envs.faults import EgoGone, reason_of
+from rare_envs.mixed import each
 
 
 class Asked(NamedTuple):
     """What a policy is asked: B rows."""
 
-    observation: NDArray[np.float32]
-    """Shape (B, ...)."""
+    observation: Any
+    """Shape (B, ...), or several of that kind by name."""
     hidden: Any
     """Its memory; None at the start, and always if it has none."""
     start: NDArray[np.bool_]
@@ -25,7 +26,7 @@ class Asked(NamedTuple):
 
     def rows(self, part: slice) -> "Asked":
         """Some of the rows, for a policy without a memory."""
-        return Asked(self.observation[part], None, self.start[part], self.over[part])
+        return Asked(each(lambda one: one[part], self.observation), None, self.start[part], self.over[part])
 
 
 def ask(policy: Any, kind: str, asked: Asked, lost: dict[int, str] | None = None) -> tuple[Tensor, Any]:

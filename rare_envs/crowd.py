@@ -33,7 +33,10 @@ def gather(world: World, x: Tensor) -> Crowd:
     own = world.start(x)
     nobody = torch.zeros_like(own.state.x, dtype=torch.bool)
     own = own._replace(strayed=nobody)
-    others = (world.first(own.state.seen_by(j), _seen_by(own.perception, j)) for j in range(1, world.scenario.vehicles))
+    others = (
+        world.first(own.state.seen_by(j), _seen_by(own.perception, j), sight=own.sight and own.sight._replace(viewer=j))
+        for j in range(1, world.scenario.vehicles)
+    )
     return Crowd(own, (own, *others), nobody)
 
 

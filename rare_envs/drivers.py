@@ -11,6 +11,7 @@ from rare_envs.actions import IDLE
 from rare_envs.asking import Asked, ask
 from rare_envs.dynamics import NEAR_ZERO, steering_for
 from rare_envs.geometry import Lead
+from rare_envs.mixed import each
 from rare_envs.observation import observe
 from rare_envs.road import Road
 from rare_envs.state import VEHICLE_LENGTH
@@ -168,7 +169,12 @@ class PolicyDriver:
             over = over.clone()
             over[list(self.lost)] = True
         seen = observe(episode, self.observation)
-        observation = seen.masked_fill(over.view(-1, *[1] * (seen.ndim - 1)), 0.0).numpy(force=True)
+        observation = each(lambda part: _blank(part, over).numpy(force=True), seen)
         start = np.full(batch, memory is None)
         given, hidden = ask(self.policy, self.action, Asked(observation, hidden, start, over), self.lost)
         return given.to(state.x) if given.is_floating_point() else given, (hidden, tick + 1)
+
+
+def _blank(observation: Tensor, rows: Tensor) -> Tensor:
+    """An observation with zeros in some rows."""
+    return observation.masked_fill(rows.view(-1, *[1] * (observation.ndim - 1)), 0)

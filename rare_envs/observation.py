@@ -1,23 +1,21 @@
-"""What an ego observes: `features`, its own state and the others' relative to it, `lidar`, or `kinematics`."""
+"""What an ego observes: `features`, its own state and the others' relative to it, `lidar`, `kinematics`, `camera`."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from gymnasium import spaces
 from torch import Tensor
 
+from rare_envs.camera import Camera, take_picture
 from rare_envs.kinematics import kinematics, kinematics_space
 from rare_envs.lidar import BEAMS, MAX_RANGE
+from rare_envs.mixed import kinds_of
 from rare_envs.state import LANE_WIDTH, VEHICLE_LENGTH, State
 
 if TYPE_CHECKING:
-    from rare_envs.world import Episode
-
-
-OBSERVATIONS = ("features", "lidar", "kinematics")
-"""Kinds of observations."""
+    from rare_envs.world import Episode, World
 
 
 @dataclass(frozen=True)
@@ -51,31 +49,51 @@ LIDAR_SCALES = (*_CORE_SCALES, *(MAX_RANGE,) * BEAMS, *(10.0,) * BEAMS)
 """Scales of the `lidar` observation, which are the 51 features of learned drivers (`perception.FEATURES`)."""
 
 
-def observation_space(vehicles: int, observation: str = "features") -> "spaces.Box[np.float32]":
+def observation_space(vehicles: int, observation: str = "features", camera: Camera | None = None) -> spaces.Space[Any]:
     """The space of an observation.
 
     Args:
         vehicles: N.
         observation: "features": 3 of the ego, then 4 of each other vehicle; "lidar": the ego's 51; "kinematics":
-            HighwayEnv's 5 x 5.
+            HighwayEnv's 5 x 5; "camera": an image, uint8, H x W x 3. Several joined by "+" make a `Dict`.
+        camera: Says how large the image is; None for the usual one.
     """
+    kinds = kinds_of(observation)
+    if len(kinds) > 1:
+        return spaces.Dict({kind: observation_space(vehicles, kind, camera) for kind in kinds})
+    if observation == "camera":
+        camera = camera or Camera()
+        return spaces.Box(0, 255, (camera.height, camera.width, 3), np.uint8)
     if observation == "kinematics":
         return kinematics_space()
     size = len(EGO_FEATURES) + len(OTHER_FEATURES) * (vehicles - 1)
     return spaces.Box(-CLIP, CLIP, (len(LIDAR_SCALES) if observation == "lidar" else size,), np.float32)
 
 
-def observe(episode: "Episode", observation: str, vehicle: int = 0) -> Tensor:
+def space_of_observations(world: "World") -> spaces.Space[Any]:
+    """What an ego observes in a world."""
+    return observation_space(world.scenario.vehicles, world.observation, world.camera)
+
+
+def observe(episode: "Episode", observation: str, vehicle: int = 0) -> Any:
     """What one vehicle observes in each of B episodes: the ego, or another one as if it were the ego.
 
     Args:
         episode: B episodes.
-        observation: One of `OBSERVATIONS`.
+        observation: A kind of observation, or several joined by "+", see `rare_envs.mixed.KINDS`.
         vehicle: Index of the vehicle that looks.
 
     Returns:
-        Shape (B, F), float32, within +-`CLIP`; (B, 5, 5) for "kinematics".
+        Shape (B, F), float32, within +-`CLIP`; (B, 5, 5) for "kinematics"; (B, H, W, 3), uint8, red, green and blue,
+        for "camera". Of several a mapping from their names.
     """
+    kinds = kinds_of(observation)
+    if len(kinds) > 1:
+        return {kind: observe(episode, kind, vehicle) for kind in kinds}
+    if observation == "camera":
+        assert episode.sight is not None
+        sight = episode.sight if vehicle == 0 else episode.sight._replace(viewer=vehicle)
+        return take_picture(episode.state.seen_by(vehicle), episode.road, sight)
     if observation == "kinematics":
         return kinematics(episode.state, episode.road, vehicle)
     if observation == "lidar":

@@ -5,7 +5,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
+
+from rare_envs.mixed import batch_size, each
 
 Array = NDArray[Any]
 Shape = tuple[int, ...]
@@ -43,18 +46,26 @@ class Stacked:
     new_axis: bool = False
 
     def predict(
-        self, observation: Array, state: Any = None, episode_start: Array | None = None, deterministic: bool = True
+        self, observation: Any, state: Any = None, episode_start: Array | None = None, deterministic: bool = True
     ) -> tuple[Array, Any]:
         """Stable-Baselines3's `predict` on single observations."""
-        fresh = np.zeros((self.frames, *observation.shape), observation.dtype)  # (k, B, ...)
-        seen, inner = (fresh, None) if state is None else state
-        starts = np.full(len(observation), state is None)
+        starts = np.full(batch_size(observation), state is None)
         if episode_start is not None:
             starts |= np.asarray(episode_start, dtype=bool)
-        seen = np.concatenate((seen[1:], observation[None]))
-        seen[:-1, starts] = observation[starts] if self.new_axis else 0
-        shown = np.moveaxis(seen, 0, 1) if self.new_axis else np.concatenate(tuple(seen), axis=-1)
-        shown = np.ascontiguousarray(shown)
+
+        def later(old: Array, now: Array) -> Array:
+            new: Array = np.concatenate((old[1:], now[None]))
+            new[:-1, starts] = now[starts] if self.new_axis else 0
+            return new
+
+        def side_by_side(frames: Array) -> Array:
+            shown = np.moveaxis(frames, 0, 1) if self.new_axis else np.concatenate(tuple(frames), axis=-1)
+            return np.ascontiguousarray(shown)
+
+        fresh = each(lambda now: np.zeros((self.frames, *now.shape), now.dtype), observation)  # (k, B, ...)
+        seen, inner = (fresh, None) if state is None else state
+        seen = each(later, seen, observation)
+        shown = each(side_by_side, seen)
         action, inner = self.policy.predict(
             shown, state=inner, episode_start=episode_start, deterministic=deterministic
         )
@@ -77,20 +88,41 @@ def stacking(given: Shape, wanted: Shape) -> tuple[int, bool] | None:
     return (frames, False) if frames and not rest else None
 
 
-def fitted(policy: Any, given: Shape) -> Any:
+def frames_of(given: spaces.Space[Any], wanted: Any) -> tuple[int, bool] | None:
+    """`stacking` for spaces: mappings by name, where all have to agree, and images also with their channels first.
+
+    Args:
+        given: Space of the environment's observations.
+        wanted: Space of the policy's.
+    """
+    if isinstance(given, spaces.Dict):
+        if not isinstance(wanted, spaces.Dict) or set(given.spaces) != set(wanted.spaces):
+            return None
+        found = {frames_of(space, wanted[name]) for name, space in given.spaces.items()}
+        return found.pop() if len(found) == 1 else None
+    if given.shape is None or getattr(wanted, "shape", None) is None:
+        return None
+    shape = tuple(wanted.shape)
+    straight = stacking(given.shape, shape)
+    if straight is None and given.dtype == np.uint8 and len(shape) == 3:  # SB3 transposes images by itself
+        return stacking(given.shape, (*shape[1:], shape[0]))
+    return straight
+
+
+def fitted(policy: Any, given: spaces.Space[Any]) -> Any:
     """The policy behind the wrappers that it was trained with, so that it takes the environment's observations.
 
     Args:
-        policy: Has `predict`; the shape of its `observation_space`, if it has one, tells how many frames it sees, and
-            `get_vec_normalize_env`, if it has one, SB3's `VecNormalize`, whose shape tells whether observations are
+        policy: Has `predict`; its `observation_space`, if it has one, tells how many frames it sees, and
+            `get_vec_normalize_env`, if it has one, SB3's `VecNormalize`, whose space tells whether observations are
             normalised before or after they are stacked.
-        given: Shape of the environment's observations.
+        given: Space of the environment's observations.
     """
-    wanted = getattr(getattr(policy, "observation_space", None), "shape", None)
-    frames, new_axis = (stacking(given, wanted) if wanted is not None else None) or (1, False)
+    wanted = getattr(policy, "observation_space", None)
+    frames, new_axis = (frames_of(given, wanted) if wanted is not None else None) or (1, False)
     statistics: Any = getattr(policy, "get_vec_normalize_env", lambda: None)()
     normalise = statistics.normalize_obs if statistics is not None and statistics.norm_obs else None
-    whole = normalise is not None and statistics.observation_space.shape == wanted
+    whole = normalise is not None and frames_of(statistics.observation_space, wanted) == (1, False)
     if normalise is not None and whole:
         policy = Normalised(policy, normalise)
     if frames > 1 or new_axis:

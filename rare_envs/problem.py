@@ -12,8 +12,9 @@ from rare_envs.actions import DISCRETE_ACTIONS, META_ACTIONS
 from rare_envs.background import Background
 from rare_envs.crashes import KINDS, Crash
 from rare_envs.drivers import IDM, Driver, PolicyDriver
-from rare_envs.observation import observation_space
-from rare_envs.policies import fitted, stacking
+from rare_envs.mixed import kinds_of
+from rare_envs.observation import space_of_observations
+from rare_envs.policies import fitted, frames_of
 from rare_envs.rollout import rollout
 from rare_envs.setup import set_up
 from rare_envs.space import Distribution, ScenarioSpace
@@ -25,6 +26,9 @@ POLICY_TILE = 4096
 """Likewise with a policy; fixed, because matrix products round differently by batch size."""
 LIDAR_TILE = 512
 """Likewise where vehicles look, or whole episodes are kept: small enough for what is needed to stay in the cache."""
+
+CAMERA_TILE = 128
+"""Likewise with a policy that sees pictures: its layers' values for all of them have to fit into memory."""
 
 
 class DrivingProblem:
@@ -82,8 +86,14 @@ class DrivingProblem:
     @property
     def given(self) -> str:
         """What p is conditional on, in words for `samplers.Estimate.given`; empty if nothing is held fixed."""
-        noisy = self.world.drivers is not None and self.world.drivers.noisy
-        return "the drivers' noise is one fixed sequence" if noisy and self.world.noise == "fixed" else ""
+        if self.world.noise != "fixed":
+            return ""
+        fixed = []
+        if self.world.drivers is not None and self.world.drivers.noisy:
+            fixed.append("the drivers' noise is one fixed sequence")
+        if self.world.weather:
+            fixed.append("the camera's noise is one fixed pattern of each tick")
+        return ", ".join(fixed)
 
     @property
     def base(self) -> Distribution:
@@ -152,6 +162,8 @@ class DrivingProblem:
     @property
     def _tile(self) -> int:
         """Rollouts at once."""
+        if isinstance(self.driver, PolicyDriver) and "camera" in kinds_of(self.world.observation):
+            return CAMERA_TILE
         if self.world.sees or self.world.recorded:
             return LIDAR_TILE
         return POLICY_TILE if isinstance(self.driver, PolicyDriver) else RULE_TILE
@@ -196,9 +208,9 @@ def as_driver(ego: Any, world: World) -> Driver:
         looking: Driver = ego
         return looking
     if callable(getattr(ego, "predict", None)):
-        expected = observation_space(world.scenario.vehicles, world.observation)
+        expected = space_of_observations(world)
         check_spaces(ego, expected, world.action)
-        return PolicyDriver(fitted(ego, expected.shape), world.observation, world.action, world.stride)
+        return PolicyDriver(fitted(ego, expected), world.observation, world.action, world.stride)
     if isinstance(ego, Background):
         raise ValueError("These drivers drive the traffic around an ego; as an ego take agents.LearnedEgo(driver).")
     if callable(getattr(ego, "act", None)):
@@ -207,7 +219,7 @@ def as_driver(ego: Any, world: World) -> Driver:
     raise ValueError(f"Expected an ego with a method predict(observation, ...), got {type(ego).__name__}.")
 
 
-def check_spaces(ego: Any, expected: "spaces.Box[np.float32]", action: str = "continuous") -> None:
+def check_spaces(ego: Any, expected: spaces.Space[Any], action: str = "continuous") -> None:
     """Refuse an ego that was made for other observations or actions; one that does not tell is taken at its word.
 
     Bounds may differ: HighwayEnv declares none for the observations that are clipped here as there.
@@ -216,8 +228,7 @@ def check_spaces(ego: Any, expected: "spaces.Box[np.float32]", action: str = "co
         ValueError: If its `observation_space` or `action_space` does not fit.
     """
     observed = getattr(ego, "observation_space", None)
-    shape = getattr(observed, "shape", None)
-    if observed is not None and (shape is None or stacking(expected.shape, shape) is None):
+    if observed is not None and frames_of(expected, observed) is None:
         raise ValueError(
             f"The ego expects observations {observed}, the environment gives {expected}; "
             "train it in this environment or choose another observation."

@@ -10,7 +10,8 @@ from rare_envs.actions import ACTIONS
 from rare_envs.background import find_drivers
 from rare_envs.bases import load_base
 from rare_envs.blocks import NoiseLaw, beside
-from rare_envs.observation import OBSERVATIONS
+from rare_envs.camera import find_camera
+from rare_envs.mixed import read_kinds
 from rare_envs.scenarios import SCENARIOS
 from rare_envs.scenarios.base import Scenario
 from rare_envs.space import Distribution, Parameter, ScenarioSpace, did_you_mean
@@ -32,7 +33,7 @@ def find_scenario(env_id: str) -> Scenario:
 def set_up(
     env_id: str,
     *,
-    observation: str = "features",
+    observation: str | list[str] | tuple[str, ...] = "features",
     action: str = "continuous",
     measure: Any = "ttc",
     horizon: float | None = None,
@@ -41,13 +42,16 @@ def set_up(
     drivers: Any = None,
     noise: bool | str = True,
     collisions: str = "ego",
+    camera: Any = None,
+    weather: bool = False,
     **unknown: Any,
 ) -> tuple[World, ScenarioSpace]:
     """The world and the scenario space of an environment.
 
     Args:
         env_id: For example "rare_envs/CutIn-v0".
-        observation: "features", "lidar" or "kinematics" (HighwayEnv's).
+        observation: "features", "lidar", "kinematics" (HighwayEnv's) or "camera"; several, such as "camera+lidar" or
+            ("camera", "lidar"), make a `Dict`.
         action: "continuous" or "meta" (HighwayEnv's, see `rare_envs.meta`: a step is then one second).
         measure: The safety measure: a name in `rare_envs.measures.MEASURES`, a `Measure` or another of its kind, or a
             function; see `rare_envs.measures.find_measure`.
@@ -61,6 +65,10 @@ def set_up(
         noise: What becomes of the drivers' noise. True: it is part of x, standard normal columns behind the others.
             "fixed": one sequence for all x, so that probabilities are conditional on it. False: mean actions.
         collisions: Which count: those of the "ego", or "any", those between two other vehicles too.
+        camera: Of the observation "camera": a `rare_envs.camera.Camera`, or the size (height, width) of its pictures;
+            None for 66 x 200.
+        weather: Whether weather and the camera's noise are part of x, see `rare_envs.camera.weather`; without it there
+            is a clear day. Traffic does not mind the weather.
         **unknown: What is none of these, and refused.
 
     Returns:
@@ -76,8 +84,10 @@ def set_up(
         of_reset = name in (parameter.name for parameter in scenario.parameters)
         hint = " (reset takes it as an option)" if of_reset else did_you_mean(name, known)
         raise TypeError(f"{env_id} takes no keyword argument {name!r}{hint}; it takes {', '.join(known)}.")
-    _one_of("observation", observation, OBSERVATIONS)
+    kinds = read_kinds(observation)
     _one_of("action", action, ACTIONS)
+    if not isinstance(weather, bool):
+        raise ValueError(f"Expected weather True or False, got {weather!r}.")
     background = find_drivers(scenario.drivers if drivers is None else drivers)
     world = World(
         scenario,
@@ -86,9 +96,11 @@ def set_up(
         measure=measure,
         drivers=background,
         noise=noise,
-        observation=observation,
+        observation=kinds,
         action=action,
         collisions=collisions,
+        camera=find_camera(camera),
+        weather=weather,
     )
     space = space_of(world, load_base(scenario, base))
     if not isinstance(measure, str):
@@ -113,19 +125,25 @@ def _try_measure(world: World, space: ScenarioSpace) -> None:
 
 
 def space_of(world: World, base: Distribution) -> ScenarioSpace:
-    """The parameters of a world: the scenario's, then its drivers' weights and noise.
+    """The parameters of a world: the scenario's, then the weather's, its drivers' weights and all noise.
 
     Args:
         world: The world.
         base: Law of the scenario's own parameters.
     """
     parameters, laws = list(world.scenario.parameters), [base]
+    for weather, law in world.weather_laws:
+        parameters += weather
+        laws.append(law)
     if world.drivers is not None and world.drivers.weights is not None:
         parameters.append(Parameter("weights", "", -np.inf, np.inf, "of the drivers' last layer", world.weights))
         laws.append(world.drivers.weights)
     if world.draws:
         parameters.append(Parameter("noise", "", -np.inf, np.inf, "of the drivers, tick by tick", world.draws))
         laws.append(NoiseLaw(world.draws))
+    if world.keys:
+        parameters.append(Parameter("camera_noise", "", -np.inf, np.inf, "from which the noise of all pixels follows"))
+        laws.append(NoiseLaw(1))
     return ScenarioSpace(
         names=tuple(p.name for p in parameters),
         units=tuple(p.unit for p in parameters),

@@ -10,6 +10,8 @@ from torch import Tensor
 
 from rare_envs import witness
 from rare_envs.background import Background, Minds, begin, decide, fixed_draws, noise_size
+from rare_envs.camera import Camera, Sight, clear_day
+from rare_envs.camera.weather import read_weather, weather_parameters
 from rare_envs.commands import led
 from rare_envs.crashes import others_touch
 from rare_envs.dynamics import bicycle
@@ -17,11 +19,15 @@ from rare_envs.geometry import Lead, ego_overlaps, lead_of
 from rare_envs.lidar import Bodies
 from rare_envs.measures import MEASURES, EpisodeMeasure, Moment, find_measure
 from rare_envs.meta import DECISION, Aim, aim_of, follow
+from rare_envs.mixed import kinds_of
 from rare_envs.perception import OnRoad, perceive
 from rare_envs.road import Placed, Road
 from rare_envs.scenarios.base import Scenario
+from rare_envs.space import Distribution, Parameter
 from rare_envs.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
 from rare_envs.witness import Witness
+
+WeatherLaws = tuple[tuple[tuple[Parameter, ...], Distribution], ...]
 
 
 class Episode(NamedTuple):
@@ -49,6 +55,8 @@ class Episode(NamedTuple):
     """What the controllers of vehicles with meta-actions aim for, (B, N) each; None in a world without such actions."""
     witness: Witness | None = None
     """Least time to collision and crashes so far; None unless the world has a witness."""
+    sight: Sight | None = None
+    """What a camera sees beside the traffic; None in a world without a camera."""
 
     @property
     def f(self) -> Tensor:
@@ -84,7 +92,7 @@ class World:
     noise: bool | str = True
     """Drivers' noise: True, part of x; "fixed", one sequence for all x; False, mean actions."""
     observation: str = "features"
-    """What the ego observes: "features", "lidar" or "kinematics"."""
+    """What the ego observes: one of `rare_envs.mixed.KINDS`, or several joined by "+"."""
     action: str = "continuous"
     """What a policy decides: "continuous", each tick, or "meta", each second."""
     lidar: bool = False
@@ -93,6 +101,10 @@ class World:
     """Which collisions count: those of the "ego", or "any", those between other vehicles too."""
     witnessed: bool = False
     """Keep the least time to collision and who crashed with whom; see `Episode.witness`."""
+    camera: Camera = Camera()  # noqa: RUF009  (frozen)
+    """What takes the pictures where "camera" is observed."""
+    weather: bool = False
+    """Whether there is weather in x; a camera sees it."""
 
     def __post_init__(self) -> None:
         if not (_is_number(self.dt) and 0.0 < self.dt <= 1.0):
@@ -135,7 +147,7 @@ class World:
     def sees(self) -> bool:
         """Whether the vehicles look at every moment."""
         needed = self.drivers is not None or self._measure.sees
-        return self.lidar or needed or self.observation == "lidar"
+        return self.lidar or needed or "lidar" in kinds_of(self.observation)
 
     @property
     def recorded(self) -> bool:
@@ -157,6 +169,21 @@ class World:
         return noise_size(self.ticks, self._others) if self._noisy and self.noise is True else 0
 
     @property
+    def conditions(self) -> int:
+        """Number of columns of x that are weather."""
+        return sum(each.size for parameters, _ in self.weather_laws for each in parameters)
+
+    @property
+    def weather_laws(self) -> WeatherLaws:
+        """Parameters of the weather with their laws, in the order of x."""
+        return tuple(weather_parameters(self.noise is not False)) if self.weather else ()
+
+    @property
+    def keys(self) -> int:
+        """Number of columns of x, the last, from which the camera's noise follows: 1 or 0."""
+        return int(self.weather and self.noise is True)
+
+    @property
     def _others(self) -> int:
         return self.scenario.vehicles - 1
 
@@ -172,27 +199,33 @@ class World:
         """Begin B episodes.
 
         Args:
-            x: Scenario parameters, drivers' weights and drivers' noise side by side, shape (B, d), within the physical
-                box; dtype and device are kept.
+            x: Scenario parameters, weather, drivers' weights, drivers' noise and the key of the camera's noise side by
+                side, shape (B, d), within the physical box; dtype and device are kept.
 
         Returns:
             The episodes at time 0.
         """
-        size = self.scenario.size
-        state = self.scenario.initial(x[:, :size])
+        sizes = [self.scenario.size, self.conditions, self.weights, self.draws, self.keys]
+        own, weather, weights, noise, key = torch.split(x, sizes, dim=1)
+        state = self.scenario.initial(own)
         minds = None
         if self.drivers is not None:
-            weights, noise = x[:, size : size + self.weights], x[:, size + self.weights :]
             minds = begin(self.drivers, weights.contiguous(), self._draws(noise))
-        return self.first(state, self._look(state, self._placed(state)), minds)
+        sight = None
+        if "camera" in kinds_of(self.observation):
+            sight = Sight.at_start(self.camera, read_weather(weather, key) if self.weather else clear_day(x))
+        return self.first(state, self._look(state, self._placed(state)), minds, sight)
 
-    def first(self, state: State, perception: Tensor | None, minds: Minds | None = None) -> Episode:
+    def first(
+        self, state: State, perception: Tensor | None, minds: Minds | None = None, sight: Sight | None = None
+    ) -> Episode:
         """Episodes at time 0.
 
         Args:
             state: Of B scenarios; the vehicle in the ego's place is the one whose episodes these are.
             perception: What the vehicles see, in the same order.
             minds: Of the drivers around the ego.
+            sight: Of a camera on the vehicle in the ego's place.
         """
         road = self.scenario.road
         collided = torch.zeros_like(state.x[:, 0], dtype=torch.bool)
@@ -200,7 +233,9 @@ class World:
         kept = self._measure.begin(moment, self.ticks)
         aim = aim_of(state, road) if self.action == "meta" else None
         seen = witness.begin(moment) if self.witnessed else None
-        return Episode(state, moment.lead, kept, collided, road, perception, minds, None, self._measure, aim, seen)
+        return Episode(
+            state, moment.lead, kept, collided, road, perception, minds, None, self._measure, aim, seen, sight
+        )
 
     def next(self, episode: Episode, state: State, perception: Tensor | None, hit: Tensor) -> Episode:
         """Episodes one tick later; minds and who has strayed stay as they were.
@@ -217,7 +252,10 @@ class World:
         seen = episode.witness
         if seen is not None:
             episode = episode._replace(witness=witness.fold(seen, moment, episode.collided, collided))
-        return episode._replace(state=state, lead=moment.lead, kept=kept, collided=collided, perception=perception)
+        sight = None if episode.sight is None else episode.sight.later()
+        return episode._replace(
+            state=state, lead=moment.lead, kept=kept, collided=collided, perception=perception, sight=sight
+        )
 
     def _draws(self, noise: Tensor) -> Tensor:
         """Draws of the drivers' noise as tensors, shape (B, 2 + T, M, 2), or (B, 0, M, 2)."""

@@ -11,6 +11,8 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
+from rare_envs.mixed import each
+
 Indices = int | Iterable[int] | None
 
 
@@ -117,30 +119,30 @@ class BatchedVecEnv(VecEnv):
             action_space = gym.spaces.Discrete(len(discrete_actions))
         super().__init__(env.num_envs, env.single_observation_space, action_space)
 
-    def reset(self) -> NDArray[Any]:
+    def reset(self) -> Any:
         """Start new episodes everywhere, with the seed and options set before, if any."""
         options = merge_options(self._options)
         observation, infos = self.env.reset(seed=self._seeds[0], options=options)
         self.reset_infos = [info_row(infos, row) for row in range(self.num_envs)]
         self._reset_seeds()
         self._reset_options()
-        return np.asarray(observation)
+        return each(np.asarray, observation)
 
     def step_async(self, actions: NDArray[Any]) -> None:
         """Take note of the actions, shape (B, 2), or (B,) for discrete ones."""
         self._actions = actions if self._table is None else self._table[actions]
 
-    def step_wait(self) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any], list[dict[str, Any]]]:
+    def step_wait(self) -> tuple[Any, NDArray[Any], NDArray[Any], list[dict[str, Any]]]:
         """Advance the batch by one step; ended episodes are followed by new ones at once."""
         observation, reward, terminated, truncated, infos = self.env.step(self._actions)
         done = np.logical_or(terminated, truncated)
         rows: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for row in np.flatnonzero(done).tolist():
             rows[row] = info_row(infos.get("final_info", {}), row)
-            rows[row]["terminal_observation"] = np.asarray(infos["final_obs"][row])
+            rows[row]["terminal_observation"] = each(np.asarray, infos["final_obs"][row])
             rows[row]["TimeLimit.truncated"] = bool(truncated[row] and not terminated[row])
             self.reset_infos[row] = info_row(infos, row)
-        return np.asarray(observation), np.asarray(reward, dtype=np.float32), done, rows
+        return each(np.asarray, observation), np.asarray(reward, dtype=np.float32), done, rows
 
     def close(self) -> None:
         """Close the batch."""

@@ -17,7 +17,8 @@ from rare_envs.deeds import carry_out
 from rare_envs.envs.parallel import chosen_agents, chosen_rewards
 from rare_envs.envs.rows import merged, put, rows_of
 from rare_envs.incentives import Reward, total_of
-from rare_envs.observation import observation_space, observe
+from rare_envs.mixed import each
+from rare_envs.observation import observe, space_of_observations
 from rare_envs.problem import as_driver
 from rare_envs.setup import set_up
 
@@ -72,7 +73,7 @@ class AgentsVectorEnv(VectorEnv[NDArray[np.float32], Array, Array]):
         by_name = chosen_rewards(self.agents, rewards)
         self._rewards = {vehicle: by_name[agent] for vehicle, agent in zip(self._vehicles, self.agents, strict=True)}
         self._driver = as_driver(ego, self.world)
-        self.single_observation_space = observation_space(scenario.vehicles, self.world.observation)
+        self.single_observation_space = space_of_observations(self.world)
         self.single_action_space = space_of_actions(self.world.action)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
@@ -152,10 +153,9 @@ class AgentsVectorEnv(VectorEnv[NDArray[np.float32], Array, Array]):
         """Values of the agents, (B, ...) each, as (B A, ...)."""
         return torch.stack(columns, dim=1).flatten(0, 1)
 
-    def _observe(self, crowd: Crowd) -> NDArray[np.float32]:
+    def _observe(self, crowd: Crowd) -> Any:
         views = [observe(crowd.views[vehicle], self.world.observation) for vehicle in self._vehicles]
-        observation: NDArray[np.float32] = self._by_row(views).numpy()
-        return observation
+        return each(lambda *parts: self._by_row(list(parts)).numpy(), *views)
 
     def _replaced(self, crowd: Crowd, rows: NDArray[np.intp]) -> Crowd:
         x = self.space.scenario_x(None, len(rows), self.np_random)

@@ -19,7 +19,8 @@ from rare_envs.deeds import carry_out
 from rare_envs.envs.infos import Info, info_of, step_info
 from rare_envs.envs.rendering import Renderer
 from rare_envs.incentives import Reward, own_reward, total_of
-from rare_envs.observation import observation_space, observe
+from rare_envs.mixed import each
+from rare_envs.observation import observe, space_of_observations
 from rare_envs.problem import as_driver
 from rare_envs.scenarios.base import Scenario
 from rare_envs.setup import set_up
@@ -82,9 +83,7 @@ class DrivingParallelEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  #
             raise ValueError(f"Expected render_mode None, 'rgb_array' or 'human', got {render_mode!r}.")
         self.render_mode = render_mode
         self.agents: list[str] = []
-        self.observation_spaces = {
-            agent: observation_space(scenario.vehicles, self.world.observation) for agent in self.possible_agents
-        }
+        self.observation_spaces = {agent: space_of_observations(self.world) for agent in self.possible_agents}
         self.action_spaces = {agent: space_of_actions(self.world.action) for agent in self.possible_agents}
         self._vehicles = {agent: scenario.vehicle_names.index(agent) for agent in self.possible_agents}
         self._np_random: np.random.Generator | None = None
@@ -94,7 +93,7 @@ class DrivingParallelEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  #
         self._memory: Any = None
         self._tick = 0
 
-    def observation_space(self, agent: str) -> "spaces.Box[np.float32]":
+    def observation_space(self, agent: str) -> spaces.Space[Any]:
         """The space of an agent's observations."""
         return self.observation_spaces[agent]
 
@@ -202,7 +201,9 @@ class DrivingParallelEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  #
         return crowd.views[self._vehicles[agent]]
 
     def _observe(self, crowd: Crowd, agent: str) -> Observation:
-        observation: Observation = observe(self._view(crowd, agent), self.world.observation)[0].numpy()
+        observation: Observation = each(
+            lambda part: part[0].numpy(), observe(self._view(crowd, agent), self.world.observation)
+        )
         return observation
 
     def _show(self) -> None:

@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from rare_envs.mixed import each
+
 T = TypeVar("T")
 
 
@@ -26,12 +28,23 @@ def _merged(old: Any, rows: Tensor, new: Any) -> Any:
     return old.put(rows, new) if hasattr(old, "put") else old
 
 
-def rows_of(values: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[Any]:
-    """Rows as objects, None where the mask is not set: Gymnasium's form of `final_obs`."""
-    rows = np.full(len(values), None, dtype=object)
+def rows_of(observation: Any, mask: NDArray[np.bool_]) -> NDArray[Any]:
+    """Rows of an observation as objects, None where the mask is not set: Gymnasium's form of `final_obs`."""
+    rows = np.full(len(mask), None, dtype=object)
     for row in np.flatnonzero(mask):
-        rows[row] = values[row].copy()
+        rows[row] = each(lambda part, row=row: part[row].copy(), observation)
     return rows
+
+
+def with_rows(observation: Any, rows: NDArray[np.intp], fresh: Any) -> Any:
+    """An observation with some of its rows replaced."""
+
+    def replaced(old: NDArray[Any], new: NDArray[Any]) -> NDArray[Any]:
+        old = old.copy()
+        old[rows] = new
+        return old
+
+    return each(replaced, observation, fresh)
 
 
 def put(infos: dict[str, Any], key: str, value: Any, mask: NDArray[np.bool_]) -> None:

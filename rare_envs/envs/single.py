@@ -12,7 +12,8 @@ from rare_envs.actions import read_actions, space_of_actions
 from rare_envs.decisions import advance
 from rare_envs.envs.infos import info_of, step_info
 from rare_envs.envs.rendering import Renderer
-from rare_envs.observation import observation_space, observe
+from rare_envs.mixed import each
+from rare_envs.observation import observe, space_of_observations
 from rare_envs.setup import set_up
 from rare_envs.world import Episode
 
@@ -44,7 +45,7 @@ class DrivingEnv(gym.Env[Observation, Any]):
         """
         world, self.space = set_up(env_id, **kwargs)
         self.world = replace(world, witnessed=True)
-        self.observation_space = observation_space(self.world.scenario.vehicles, self.world.observation)
+        self.observation_space = space_of_observations(self.world)
         self.action_space = space_of_actions(self.world.action)
         self.metadata = {**self.metadata, "render_fps": round(1.0 / (self.world.dt * self.world.stride))}
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
@@ -87,7 +88,7 @@ class DrivingEnv(gym.Env[Observation, Any]):
         self._tick = 0
         with torch.inference_mode():
             self._episode = self.world.start(torch.from_numpy(self._x[None]).float())
-            observation = observe(self._episode, self.world.observation)[0].numpy()
+            observation = each(lambda part: part[0].numpy(), observe(self._episode, self.world.observation))
         self._show()
         return observation, info_of(self.space, self._x, self._episode)
 
@@ -107,7 +108,7 @@ class DrivingEnv(gym.Env[Observation, Any]):
             self._between = False
             watch = self._watch if self.world.stride > 1 and (self._recorder or self.render_mode == "human") else None
             episode, terms = advance(self.world, self._episode, given, watch=watch)
-            observation = observe(episode, self.world.observation)[0].numpy()
+            observation = each(lambda part: part[0].numpy(), observe(episode, self.world.observation))
             reward = float(terms.total)
         self._episode, self._tick = episode, self._tick + self.world.stride
         terminated = bool(episode.collided)

@@ -9,13 +9,15 @@ import torch
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
+from torch import Tensor
 
 from rare_envs.actions import read_actions, space_of_actions
 from rare_envs.crashes import KINDS, NONE
 from rare_envs.decisions import advance
 from rare_envs.envs.rendering import Renderer
-from rare_envs.envs.rows import merged, put, rows_of
-from rare_envs.observation import observation_space, observe
+from rare_envs.envs.rows import merged, put, rows_of, with_rows
+from rare_envs.mixed import each
+from rare_envs.observation import observe, space_of_observations
 from rare_envs.reward import RewardTerms
 from rare_envs.setup import set_up
 from rare_envs.world import Episode
@@ -57,7 +59,7 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         self.metadata = {**self.metadata, "render_fps": round(1.0 / (self.world.dt * self.world.stride))}
         self.num_envs = int(num_envs)
         self.render_mode = render_mode
-        self.single_observation_space = observation_space(self.world.scenario.vehicles, self.world.observation)
+        self.single_observation_space = space_of_observations(self.world)
         self.single_action_space = space_of_actions(self.world.action)
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -90,7 +92,7 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         self._tick[:] = 0
         with torch.inference_mode():
             self._episode = self._start(self._x)
-            observation = observe(self._episode, self.world.observation).numpy()
+            observation = each(Tensor.numpy, observe(self._episode, self.world.observation))
         return observation, self._info(self._episode, np.ones(self.num_envs, dtype=bool))
 
     def step(
@@ -106,7 +108,7 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         with torch.inference_mode():
             given = read_actions(self.world.action, torch.as_tensor(np.asarray(actions)), self.num_envs)
             episode, terms = advance(self.world, self._episode, given)
-            observation = observe(episode, self.world.observation).numpy()
+            observation = each(Tensor.numpy, observe(episode, self.world.observation))
             reward = terms.total.double().numpy()
         self._episode = episode
         self._tick += self.world.stride
@@ -125,7 +127,7 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
     def _start(self, x: NDArray[np.float64]) -> Episode:
         return self.world.start(torch.from_numpy(x).float())
 
-    def _replace(self, observation: NDArray[np.float32], done: NDArray[np.bool_]) -> NDArray[np.float32]:
+    def _replace(self, observation: Any, done: NDArray[np.bool_]) -> Any:
         rows = np.flatnonzero(done)
         assert self._episode is not None
         x = self.space.scenario_x(None, len(rows), self.np_random)
@@ -135,9 +137,8 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         with torch.inference_mode():
             fresh = self._start(x)
             self._episode = merged(self._episode, torch.from_numpy(rows), fresh)
-            observation = observation.copy()
-            observation[rows] = observe(fresh, self.world.observation).numpy()
-        return observation
+            seen = each(Tensor.numpy, observe(fresh, self.world.observation))
+        return with_rows(observation, rows, seen)
 
     def _info(self, episode: Episode, mask: NDArray[np.bool_]) -> Info:
         assert episode.witness is not None

@@ -48,7 +48,7 @@ class Simulation:
         if not callable(getattr(ego, "predict", None)):
             raise ValueError(f"Expected an ego with predict from {self.ego!r}, got {type(ego).__name__}.")
         check_spaces(ego, env)
-        return Driven(env, fitted(ego, env.observation_space.shape or ()), self.seconds)
+        return Driven(env, fitted(ego, env.observation_space), self.seconds)
 
 
 def make(env_id: str, config: Mapping[str, Any] | None) -> gym.Env[Any, Any]:

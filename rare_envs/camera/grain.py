@@ -1,0 +1,39 @@
+"""Noise of a camera: a function of key, tick, viewer and pixel, so that nothing is random but the key.
+
+A 32-bit hash of these gives four bytes; their sum, centred and scaled, has mean 0, variance 1 and nearly a normal law
+(that of Irwin and Hall for four terms, which ends at 3.5 standard deviations).
+"""
+
+import torch
+from torch import Tensor
+
+from rare_envs.camera.weather import Sight
+
+_STEP = -1640531535
+"""2^32 over the golden ratio, as int32: Weyl's sequence spreads consecutive numbers."""
+_FACTORS = (0x7FEB352D, 0x846CA68B - 2**32)
+"""Of a mixing function with low bias: Wellons, "Prospecting for hash functions", 2018 (lowbias32)."""
+_MEAN, _DEVIATION = 4 * 127.5, (4 * (256**2 - 1) / 12) ** 0.5
+
+
+def grain(sight: Sight, values: int) -> Tensor:
+    """Noise of one picture for each of B cameras, shape (B, values), mean 0 and variance 1."""
+    key = sight.weather.key.to(torch.int32)
+    for number in (sight.tick, torch.full_like(sight.tick, sight.viewer)):
+        key = _mixed(key + (number.to(torch.int32) + 1) * _STEP)
+    place = torch.arange(values, dtype=torch.int32, device=key.device) * _STEP
+    bits = _mixed(place[None, :] + key[:, None])
+    total: Tensor = bits & 255
+    for shift in (8, 16, 24):
+        total += (bits >> shift) & 255
+    return total.float().sub_(_MEAN).div_(_DEVIATION)
+
+
+def _mixed(bits: Tensor) -> Tensor:
+    """Scramble 32-bit integers; multiplication wraps around."""
+    bits = bits ^ ((bits >> 16) & 0xFFFF)
+    bits = bits * _FACTORS[0]
+    bits ^= (bits >> 15) & 0x1FFFF
+    bits *= _FACTORS[1]
+    bits ^= (bits >> 16) & 0xFFFF
+    return bits

@@ -1,0 +1,49 @@
+"""Observations of one kind, or of several together by name."""
+
+from collections.abc import Callable
+from typing import Any
+
+KINDS = ("features", "lidar", "kinematics", "camera")
+"""What can be observed."""
+
+
+def read_kinds(observation: Any) -> str:
+    """The kinds of an observation in the alphabetical order of their names, joined by "+".
+
+    Args:
+        observation: One of `KINDS`, several joined by "+", or a list or tuple of them.
+
+    Raises:
+        ValueError: If it is none of these, or one is named twice.
+    """
+    names = observation.split("+") if isinstance(observation, str) else observation
+    if not isinstance(names, list | tuple) or not names or not all(name in KINDS for name in names):
+        raise ValueError(
+            f"Unknown observation {observation!r}; expected one of {', '.join(map(repr, KINDS))}, or several, such as "
+            '"camera+lidar".'
+        )
+    if len(set(names)) < len(names):
+        raise ValueError(f"Expected different observations, got {observation!r}.")
+    return "+".join(sorted(names))
+
+
+def kinds_of(observation: str) -> tuple[str, ...]:
+    """The kinds of an observation as `read_kinds` writes it."""
+    return tuple(observation.split("+"))
+
+
+def each(function: Callable[..., Any], *observed: Any) -> Any:
+    """Apply a function to an observation, or to each of those in a mapping.
+
+    Args:
+        function: Takes as many arguments as there are observations.
+        *observed: Tensors or arrays, or mappings of such with the same names.
+    """
+    if isinstance(observed[0], dict):
+        return {name: function(*(one[name] for one in observed)) for name in observed[0]}
+    return function(*observed)
+
+
+def batch_size(observed: Any) -> int:
+    """Number of rows of an observation."""
+    return len(next(iter(observed.values()))) if isinstance(observed, dict) else len(observed)
