@@ -51,6 +51,32 @@ class Simulation:
         return Driven(env, fitted(ego, env.observation_space), self.seconds)
 
 
+@dataclass(frozen=True)
+class Bare:
+    """The policy of a Stable-Baselines3 model and its `VecNormalize` statistics, without environment and buffers."""
+
+    policy: Any
+    statistics: Any
+
+    @property
+    def observation_space(self) -> Any:
+        """What the policy was trained on."""
+        return self.policy.observation_space
+
+    @property
+    def action_space(self) -> Any:
+        """Likewise."""
+        return self.policy.action_space
+
+    def get_vec_normalize_env(self) -> Any:
+        """The statistics, or None."""
+        return self.statistics
+
+    def predict(self, *args: Any, **kwargs: Any) -> Any:
+        """The policy's."""
+        return self.policy.predict(*args, **kwargs)
+
+
 def make(env_id: str, config: Mapping[str, Any] | None) -> gym.Env[Any, Any]:
     """An environment of HighwayEnv.
 
@@ -77,11 +103,8 @@ def portable(ego: Any) -> Any:
         if callable(ego):
             return ego
         raise ValueError(f"Expected an ego with a method predict(observation, ...), got {type(ego).__name__}.")
-    policy = getattr(ego, "policy", None)
-    statistics = getattr(ego, "get_vec_normalize_env", lambda: None)()
-    if callable(getattr(policy, "predict", None)) and statistics is None:
-        return policy
-    return ego
+    statistics = getattr(ego, "get_vec_normalize_env", None)
+    return ego if statistics is None else Bare(ego.policy, statistics())
 
 
 def check_spaces(ego: Any, env: gym.Env[Any, Any]) -> None:
