@@ -322,6 +322,35 @@ def replay_command(
     raise typer.Exit(0 if same else DOUBTFUL)
 
 
+@app.command("check-ego")
+def check_ego_command(
+    ego: Annotated[str, typer.Argument(metavar="EGO", help="As for estimate --ego.")],
+    env: Env,
+    algo: Annotated[str | None, typer.Option(help="Algorithm of the .zip, if the file does not tell.")] = None,
+    trust: Trust = False,
+    observation: Observation = "features",
+    action: Action = "continuous",
+    time_limit: Annotated[float, typer.Option(help="Seconds that one check may take.")] = 30.0,
+    as_json: Json = False,
+) -> None:
+    """Look, in seconds, whether an ego fits: spaces, normalisation, determinism, memory, speed. 2: it does not."""
+    from dataclasses import asdict
+
+    from rare_envs.study.check_ego import Asked, check_ego
+    from rare_envs.study.findings import exit_code
+    from rare_envs.study.show_findings import VERDICTS, print_findings
+
+    findings = check_ego(Asked(ego, env, algo, trust, observation, action, time_limit))
+    code = exit_code(findings)
+    if as_json:
+        _print_json(
+            {"ego": ego, "env_id": env, "verdict": VERDICTS[code], "findings": [asdict(each) for each in findings]}
+        )
+    else:
+        print_findings(findings, f"{ego} in {env}")
+    raise typer.Exit(code)
+
+
 @app.command("serve-ego")
 def serve_ego_command(
     ego: Annotated[str, typer.Argument(metavar="EGO", help="As for estimate --ego.")],
