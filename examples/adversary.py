@@ -1,6 +1,6 @@
 """Train an adversary on one background vehicle, and see how often it makes the ego crash.
 
-    python examples/adversary.py --steps 200000 --out adversary.zip
+    python -m examples.adversary --steps 200000 --out adversary.zip
 
 The cutter of the cut-in scenario is rewarded for bringing the ego, a rule-based driver, into danger, and pays for
 driving as no road user does. What it finds is what can go wrong; how probable that is, it cannot say: see
@@ -22,18 +22,21 @@ from rare_envs.drivers import IDM
 from rare_envs.incentives import adversary_reward
 
 
-def train(env_id: str, agent: str, steps: int, seed: int = 0, num_scenarios: int = 64) -> Any:
+def train(env_id: str, agent: str, steps: int, seed: int = 0, num_scenarios: int = 64, **make_kwargs: Any) -> Any:
     """A PPO policy for one background vehicle against the IDM ego."""
     from stable_baselines3 import PPO
 
-    env = training.sb3_agents_env(env_id, num_scenarios, agents=[agent], rewards={agent: adversary_reward})
-    model = PPO("MlpPolicy", env, n_steps=100, batch_size=800, learning_rate=1e-3, gamma=0.95, seed=seed)
+    rewards = {agent: adversary_reward}
+    env = training.sb3_agents_env(env_id, num_scenarios, agents=[agent], rewards=rewards, **make_kwargs)
+    model = PPO(
+        "MlpPolicy", env, n_steps=6400 // num_scenarios, batch_size=800, learning_rate=1e-3, gamma=0.95, seed=seed
+    )
     return model.learn(steps)
 
 
-def collisions(env_id: str, policies: dict[str, Any], n: int, seed: int) -> int:
+def collisions(env_id: str, policies: dict[str, Any], n: int, seed: int, **make_kwargs: Any) -> int:
     """In how many of n scenarios from the base distribution the IDM ego collides."""
-    problem = rare_envs.DrivingProblem(env_id)
+    problem = rare_envs.DrivingProblem(env_id, **make_kwargs)
     x = torch.from_numpy(problem.base.sample(n, np.random.default_rng(seed))).float()
     names = problem.world.scenario.vehicle_names
     with torch.inference_mode():

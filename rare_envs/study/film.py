@@ -195,19 +195,20 @@ def in_words(found: Found, drive: Drive, number: int) -> list[str]:
     return lines
 
 
-def check_film(path: Path) -> None:
+def check_film(path: Path | str) -> None:
     """Refuse a name whose pictures cannot be written.
 
     Raises:
         BadInput: It ends neither in .gif nor in .png, or its folder does not exist.
     """
+    path = Path(path)
     if path.suffix.lower() not in (".gif", ".png"):
         raise BadInput(f"Expected a file that ends in .gif (the drive) or .png (its worst moment), got {str(path)!r}.")
     if not path.parent.is_dir():
         raise BadInput(f"There is no folder {str(path.parent)!r}.")
 
 
-def write_film(path: Path, drive: Drive, width: int = WIDTH, every: int = 1) -> None:
+def write_film(path: Path | str, drive: Drive, width: int = WIDTH, every: int = 1) -> None:
     """Write a drive as a moving picture (.gif), or its worst moment (.png).
 
     Args:
@@ -220,6 +221,7 @@ def write_film(path: Path, drive: Drive, width: int = WIDTH, every: int = 1) -> 
         BadInput: See `check_film`.
     """
     check_film(path)
+    path = Path(path)
     shown = pictures(drive)
     shown = [each.resize((width, round(each.height * width / WIDTH)), Image.Resampling.LANCZOS) for each in shown]
     if path.suffix.lower() == ".png":
