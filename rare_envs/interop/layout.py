@@ -1,6 +1,7 @@
 """What a HighwayEnv environment has for parameters, and how they are put into its scene."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -88,6 +89,17 @@ def set_idm(vehicles: list[Any], values: Values) -> None:
         if isinstance(vehicle, IDMVehicle):
             for name, it in IDM.items():
                 setattr(vehicle, it.attribute, it.sign * float(values[name]) + it.shift)
+
+
+@contextmanager
+def class_kept(kind: type) -> Iterator[None]:
+    """Put the parameters of IDM of a class back afterwards: HighwayEnv's intersection changes them for good."""
+    before = {it.attribute: getattr(kind, it.attribute) for it in IDM.values() if hasattr(kind, it.attribute)}
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            setattr(kind, name, value)
 
 
 def beta(shape: float, low: list[float], high: list[float]) -> BetaLaw:

@@ -10,10 +10,11 @@ from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 from highway_env.envs.common.abstract import AbstractEnv
 from highway_env.envs.merge_env import MergeGenericEnv
 from highway_env.envs.roundabout_env import RoundaboutGenericEnv
+from highway_env.utils import class_from_path
 
 from rare_envs.blocks import NoiseLaw, beside
 from rare_envs.interop.closeness import CLOSENESS, COLLISION, TTC_MAX
-from rare_envs.interop.layout import IDM, Group, Layout, idm_groups, set_idm
+from rare_envs.interop.layout import IDM, Group, Layout, class_kept, idm_groups, set_idm
 from rare_envs.interop.layouts import LAYOUTS
 from rare_envs.space import Array, Parameter, ScenarioSpace, did_you_mean
 
@@ -110,7 +111,8 @@ class HighwayEnvScenario(gym.Wrapper[Any, Any, Any, Any]):
         self._x = self.space.scenario_x(options, 1, self._rng)[0]
         values = {**self.fixed, **self.space.named(self._x)}
         scene = self.scene
-        self.env.reset(seed=_seed(values.pop("noise", None)))
+        with class_kept(class_from_path(scene.config["other_vehicles_type"])):
+            self.env.reset(seed=_seed(values.pop("noise", None)))
         self.layout.arrange(scene, values)
         self._set_idm(values)
         self._watch()

@@ -13,7 +13,7 @@ import numpy as np
 from highway_env.vehicle.behavior import IDMVehicle
 from numpy.typing import NDArray
 
-from rare_envs.interop.layout import set_idm
+from rare_envs.interop.layout import class_kept, set_idm
 from rare_envs.interop.scenario import HighwayEnvScenario
 from rare_envs.policies import fitted
 from rare_envs.space import did_you_mean
@@ -86,7 +86,10 @@ def make(env_id: str, config: Mapping[str, Any] | None) -> gym.Env[Any, Any]:
     known = [name for name, spec in gym.registry.items() if str(spec.entry_point).startswith("highway_env.")]
     if env_id not in known:
         raise ValueError(f"Unknown environment of HighwayEnv {env_id!r}{did_you_mean(str(env_id), known)}.")
-    with warnings.catch_warnings():  # an older version is asked for on purpose: results belong to a version
+    with (
+        class_kept(IDMVehicle),
+        warnings.catch_warnings(),
+    ):  # an older version is asked for on purpose: results belong to a version
         warnings.filterwarnings("ignore", message=".*is out of date", category=DeprecationWarning)
         return gym.make(env_id, config=None if config is None else dict(config))
 

@@ -47,6 +47,7 @@ def test_f_is_the_measure_of_the_drive_that_the_wrapper_shows() -> None:
         assert info["collision"] == (value == -1.0) == terminated
     assert len(set(f)) > 2
     np.testing.assert_array_equal(problem.evaluate(x[::-1])[::-1], f)
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(problem)).evaluate(x[:2]), f[:2])
 
 
 def test_workers_and_their_number_change_no_bit() -> None:
@@ -79,7 +80,7 @@ def test_statistics_of_a_model_travel_without_its_environment() -> None:
     vec_env.obs_rms.mean[...] = 0.5  # type: ignore[union-attr]
     seen = np.random.default_rng(0).uniform(-1.0, 1.0, (1, 5, 5)).astype(np.float32)
     expected = model.predict(np.asarray(vec_env.normalize_obs(seen)), deterministic=True)[0]
-    there = fitted(pickle.loads(pickle.dumps(portable(model))), (5, 5))
+    there = fitted(pickle.loads(pickle.dumps(portable(model))), vec_env.observation_space)
     assert there.normalise(seen)[0, 0, 0] == pytest.approx(vec_env.normalize_obs(seen)[0, 0, 0])  # type: ignore[call-overload]
     np.testing.assert_array_equal(there.predict(seen)[0], expected)
 

@@ -27,13 +27,6 @@ def scenario(env_id: str, **kwargs: Any) -> Any:
     return HighwayEnvScenario(make(env_id, CONFIGS[env_id]), **kwargs)
 
 
-@pytest.fixture(autouse=True)
-def unchanged_class(monkeypatch: pytest.MonkeyPatch) -> None:
-    """HighwayEnv's intersection changes the class of all vehicles for good; the next test finds it as it was."""
-    for name in ("DISTANCE_WANTED", "COMFORT_ACC_MAX", "COMFORT_ACC_MIN"):
-        monkeypatch.setattr(IDMVehicle, name, getattr(IDMVehicle, name))
-
-
 def others(env: Any) -> list[Any]:
     return [v for v in env.unwrapped.road.vehicles if v is not env.unwrapped.vehicle]
 
@@ -90,14 +83,13 @@ def test_intersection_and_roundabout_options_are_what_the_scene_then_has() -> No
 def test_idm_options_are_the_vehicles_own_and_those_of_vehicles_that_come_later() -> None:
     env = scenario("intersection-v2")
     idm = {"time_headway": 0.7, "jam_distance": 3.0, "max_acceleration": 4.0, "comfortable_deceleration": 2.0}
-    usual = (IDMVehicle.TIME_WANTED, IDMVehicle.COMFORT_ACC_MIN)
     env.unwrapped.config["spawn_probability"] = 1.0
     env.reset(seed=0, options=idm)
     env.step(1)
     for vehicle in others(env):
         assert (vehicle.TIME_WANTED, vehicle.DISTANCE_WANTED) == (0.7, 8.0)
         assert (vehicle.COMFORT_ACC_MAX, vehicle.COMFORT_ACC_MIN) == (4.0, -2.0)
-    assert usual[0] == IDMVehicle.TIME_WANTED
+    assert (IDMVehicle.TIME_WANTED, IDMVehicle.DISTANCE_WANTED, IDMVehicle.COMFORT_ACC_MIN) == (1.5, 10.0, -5.0)
     assert "TIME_WANTED" not in vars(env.unwrapped.vehicle)
 
 
@@ -202,10 +194,10 @@ def test_density_of_the_highway_law_is_the_jacobian_of_its_map() -> None:
 
 
 @pytest.mark.parametrize("env_id", list(CONFIGS))
-def test_same_x_same_scene_whatever_came_before(env_id: str) -> None:
+def test_same_x_same_scene_whatever_came_before(env_id: str, monkeypatch: pytest.MonkeyPatch) -> None:
     env, again = scenario(env_id), scenario(env_id)
     _, info = env.reset(seed=7)
-    scenario("intersection-v2").reset(seed=0)  # changes HighwayEnv's class of vehicles
+    monkeypatch.setattr(IDMVehicle, "DISTANCE_WANTED", 7.0)  # as HighwayEnv's own intersection leaves it
     again.reset(seed=3)
     first, second = env.reset(options={"x": info["x"]})[0], again.reset(options={"x": info["x"]})[0]
     np.testing.assert_array_equal(first, second)
