@@ -15,7 +15,7 @@ class Witness(NamedTuple):
     """Of B episodes so far."""
 
     least_ttc: Tensor
-    """Least time to collision [s], shape (B,)."""
+    """Least time to collision [s], shape (B,), without meaning after a collision."""
     own: Crash
     """Crash of the ego."""
     others: Crash
@@ -27,13 +27,13 @@ class Witness(NamedTuple):
         return self.own.replaced(self.own.kind == NONE, self.others)
 
 
-def begin(moment: Moment) -> Witness:
-    """At time 0."""
+def begin(moment: Moment, least_ttc: Tensor | None = None) -> Witness:
+    """At time 0; arguments as of `fold`."""
     nothing = Crash.nothing(moment.state.x[:, 0])
-    return Witness(ttc(moment), nothing, nothing)
+    return Witness(ttc(moment) if least_ttc is None else least_ttc, nothing, nothing)
 
 
-def fold(seen: Witness, moment: Moment, before: Tensor, now: Tensor) -> Witness:
+def fold(seen: Witness, moment: Moment, before: Tensor, now: Tensor, least_ttc: Tensor | None = None) -> Witness:
     """One more moment.
 
     Args:
@@ -41,8 +41,9 @@ def fold(seen: Witness, moment: Moment, before: Tensor, now: Tensor) -> Witness:
         moment: The next.
         before: Whether the episode had ended in a collision before this moment, boolean, shape (B,).
         now: Whether it has by this moment, boolean, shape (B,).
+        least_ttc: The least time to collision where it is known already [s], shape (B,).
     """
-    least = torch.where(before, seen.least_ttc, torch.minimum(seen.least_ttc, ttc(moment)))
+    least = torch.minimum(seen.least_ttc, ttc(moment)) if least_ttc is None else least_ttc
     own, others = seen.own, seen.others
     new = now & ~before
     if bool(new.any()):

@@ -232,7 +232,7 @@ class World:
         moment = Moment(state, lead_of(state, road), road, perception, None, self.dt)
         kept = self._measure.begin(moment, self.ticks)
         aim = aim_of(state, road) if self.action == "meta" else None
-        seen = witness.begin(moment) if self.witnessed else None
+        seen = witness.begin(moment, self._least_ttc(kept)) if self.witnessed else None
         return Episode(
             state, moment.lead, kept, collided, road, perception, minds, None, self._measure, aim, seen, sight
         )
@@ -251,11 +251,16 @@ class World:
         kept = self._measure.fold(episode.kept, moment, episode.collided, collided)
         seen = episode.witness
         if seen is not None:
-            episode = episode._replace(witness=witness.fold(seen, moment, episode.collided, collided))
+            seen = witness.fold(seen, moment, episode.collided, collided, self._least_ttc(kept))
+            episode = episode._replace(witness=seen)
         sight = None if episode.sight is None else episode.sight.later()
         return episode._replace(
             state=state, lead=moment.lead, kept=kept, collided=collided, perception=perception, sight=sight
         )
+
+    def _least_ttc(self, kept: Any) -> Tensor | None:
+        """The least time to collision, where that is the measure."""
+        return kept if self.measure == "ttc" else None
 
     def _draws(self, noise: Tensor) -> Tensor:
         """Draws of the drivers' noise as tensors, shape (B, 2 + T, M, 2), or (B, 0, M, 2)."""
