@@ -47,9 +47,9 @@ def test_the_highway_end_to_end(cli: Cli, tmp_path: Path) -> None:
     with (tmp_path / "failures.csv").open(newline="") as file:
         header, *rows = csv.reader(file)
     assert header[:2] == ["s[0]", "s[1]"]
-    assert header[-3:] == ["speed[5]", "f", "log_p0"]
+    assert header[-3 - len(CRASH) :] == ["speed[5]", "f", "log_p0", *CRASH]
     found = read_failures(tmp_path)
-    assert [len(values) for values in found.values()] == [len(rows)] * 7
+    assert [len(values) for values in found.values()] == [len(rows)] * (7 + len(CRASH))
     for name, values in likely.items():
         np.testing.assert_array_equal(found[name][0], np.float32(values) if name == "weights" else values)
     ego = agents.load_ego(asked["ego"])
