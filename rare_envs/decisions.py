@@ -72,9 +72,12 @@ def held(over: Tensor, old: Episode, new: Episode) -> Episode:
     def hold(before: Tensor, after: Tensor) -> Tensor:
         return torch.where(over.view(-1, *[1] * (after.ndim - 1)), before, after)
 
-    seen = new.perception
+    seen, sight = new.perception, new.sight
+    if sight is not None and old.sight is not None:
+        sight = sight._replace(tick=hold(old.sight.tick, sight.tick))
     return new._replace(
         state=State(*map(hold, old.state, new.state)),
         lead=Lead(*map(hold, old.lead, new.lead)),
         perception=seen if seen is None or old.perception is None else hold(old.perception, seen),
+        sight=sight,
     )
