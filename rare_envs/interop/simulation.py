@@ -14,6 +14,7 @@ from highway_env.vehicle.behavior import IDMVehicle
 from numpy.typing import NDArray
 
 from rare_envs.interop.layout import class_kept, set_idm
+from rare_envs.interop.quick import quicken
 from rare_envs.interop.scenario import HighwayEnvScenario
 from rare_envs.policies import fitted
 from rare_envs.space import did_you_mean
@@ -42,6 +43,7 @@ class Simulation:
             ValueError: If the environment, the ego or their spaces are not what is expected.
         """
         env = HighwayEnvScenario(make(self.env_id, self.config), **self.settings)
+        quicken(env.scene, blind=self.ego == "idm")
         if self.ego == "idm":
             return Driven(env, None, self.seconds)
         ego = self.ego if callable(getattr(self.ego, "predict", None)) else self.ego()
