@@ -36,6 +36,10 @@ _WINDOWS = (
 covers, half diagonal over distance, is less than this."""
 _FEW = 512
 """Pairs of vehicles up to which all are tested with all beams: the last window alone costs the fewest operations."""
+_NOTHING = torch.iinfo(torch.int64).max
+"""Key of a beam that has met nothing, see `_key`."""
+_VEHICLE_BITS = 16
+"""Last bits of a key, which hold the number of the vehicle."""
 _FLAT = 1e-9
 """Least size of a direction's component, so that a beam along a side divides by no zero."""
 
@@ -185,12 +189,6 @@ def _taken(field: Tensor, numbers: Tensor) -> Tensor:
 @lru_cache(maxsize=32)
 def _offsets(offsets: tuple[int, ...], device: torch.device) -> Tensor:
     return torch.tensor(offsets, device=device)
-
-
-_NOTHING = torch.iinfo(torch.int64).max
-
-
-_VEHICLE_BITS = 16
 
 
 def _key(distance: Tensor, vehicle: Tensor) -> Tensor:
