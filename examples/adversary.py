@@ -22,16 +22,23 @@ from rare_envs.drivers import IDM
 from rare_envs.incentives import adversary_reward
 
 
-def train(env_id: str, agent: str, steps: int, seed: int = 0, num_scenarios: int = 64, **make_kwargs: Any) -> Any:
+def train(
+    env_id: str,
+    agent: str,
+    steps: int,
+    seed: int = 0,
+    num_scenarios: int = 64,
+    n_steps: int = 100,
+    batch_size: int = 800,
+    **make_kwargs: Any,
+) -> Any:
     """A PPO policy for one background vehicle against the IDM ego."""
     from stable_baselines3 import PPO
 
     rewards = {agent: adversary_reward}
     env = training.sb3_agents_env(env_id, num_scenarios, agents=[agent], rewards=rewards, **make_kwargs)
-    model = PPO(
-        "MlpPolicy", env, n_steps=6400 // num_scenarios, batch_size=800, learning_rate=1e-3, gamma=0.95, seed=seed
-    )
-    return model.learn(steps)
+    settings = {"n_steps": n_steps, "batch_size": batch_size, "learning_rate": 1e-3, "gamma": 0.95}
+    return PPO("MlpPolicy", env, seed=seed, **settings).learn(steps)
 
 
 def collisions(env_id: str, policies: dict[str, Any], n: int, seed: int, **make_kwargs: Any) -> int:

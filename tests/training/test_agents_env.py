@@ -101,7 +101,7 @@ def test_an_adversary_raises_the_collision_rate():
     low, high = np.array([14.0, 14.0, 14.0, 1.0, 30.0, 3.0]), np.array([16.0, 16.0, 16.0, 4.0, 50.0, 4.0])
     near = {"base": BetaLaw(np.full(6, 2.0), np.full(6, 2.0), low, high), "horizon": 5.0}
     n = 400
-    model = adversary.train(CUT_IN, "cutter", steps=12_800, num_scenarios=128, **near)
+    model = adversary.train(CUT_IN, "cutter", 16_000, num_scenarios=32, n_steps=50, batch_size=400, **near)
     scripted = adversary.collisions(CUT_IN, {}, n, seed=1, **near)
     attacked = adversary.collisions(CUT_IN, {"cutter": model}, n, seed=1, **near)
     # the counts are binomial: a difference of 5 standard deviations, none of which is beyond sqrt(n / 4)

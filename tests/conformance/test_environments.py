@@ -1,0 +1,141 @@
+"""Every environment x observation x action behind every wrapper, without a warning; and one seed, one trajectory."""
+
+from itertools import product
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium import wrappers
+from gymnasium.utils.env_checker import check_env, data_equivalence
+from stable_baselines3.common.env_checker import check_env as sb3_check_env
+
+import rare_envs
+from rare_envs.actions import ACTIONS
+from rare_envs.mixed import KINDS as OBSERVATIONS
+from rare_envs.rollout import drive
+
+KINDS = [kind for kind in OBSERVATIONS if kind != "camera"]
+"""Images have a suite of their own: they are slow, and not every wrapper is for them."""
+every = pytest.mark.parametrize("env_id", rare_envs.ENV_IDS)
+each_kind = pytest.mark.parametrize(("observation", "action"), list(product(KINDS, ACTIONS)))
+WRAPPERS = {
+    "TimeLimit": lambda env: wrappers.TimeLimit(env, 3),
+    "RecordEpisodeStatistics": wrappers.RecordEpisodeStatistics,
+    "FlattenObservation": wrappers.FlattenObservation,
+    "FrameStackObservation": lambda env: wrappers.FrameStackObservation(env, 3),
+    "NormalizeObservation": wrappers.NormalizeObservation,
+    "NormalizeReward": wrappers.NormalizeReward,
+    "Autoreset": wrappers.Autoreset,
+}
+VECTOR_WRAPPERS = {
+    "RecordEpisodeStatistics": wrappers.vector.RecordEpisodeStatistics,
+    "NormalizeReward": wrappers.vector.NormalizeReward,
+    "ClipReward": lambda batch: wrappers.vector.ClipReward(batch, -1.0, 1.0),
+    "DictInfoToList": wrappers.vector.DictInfoToList,
+}
+
+
+@every
+@each_kind
+def test_checkers(env_id, observation, action):
+    env = gym.make(env_id, observation=observation, action=action, horizon=2.0)
+    check_env(env.unwrapped, skip_render_check=True)
+    sb3_check_env(env if observation != "kinematics" else wrappers.FlattenObservation(env))  # it wants one axis
+
+
+@every
+@each_kind
+def test_behind_every_wrapper(env_id, observation, action):
+    """An episode or two behind each: observations are in the space that the wrapper says, and episodes end."""
+    inner = gym.make(env_id, observation=observation, action=action, horizon=2.0).unwrapped
+    for name, wrap in WRAPPERS.items():
+        env = wrap(inner)
+        env.action_space.seed(0)
+        seen, _ = env.reset(seed=0)
+        assert seen in env.observation_space, name
+        ended = False
+        for _ in range(22):
+            seen, _, terminated, truncated, info = env.step(env.action_space.sample())
+            assert seen in env.observation_space, name
+            if terminated or truncated:
+                ended = True
+                assert name != "RecordEpisodeStatistics" or info["episode"]["l"] > 0
+                break
+        assert ended, name
+
+
+@every
+@each_kind
+def test_batches_behind_every_vector_wrapper(env_id, observation, action):
+    for name, wrap in VECTOR_WRAPPERS.items():
+        batch = wrap(gym.make_vec(env_id, num_envs=3, observation=observation, action=action, horizon=1.0))
+        batch.action_space.seed(0)
+        seen, _ = batch.reset(seed=0)
+        assert seen in batch.observation_space, name
+        ended = 0
+        for _ in range(12):
+            seen, reward, terminated, truncated, _ = batch.step(batch.action_space.sample())
+            assert seen in batch.observation_space, name
+            assert np.isfinite(reward).all(), name
+            ended += int((terminated | truncated).sum())
+        assert ended >= 3, name
+
+
+@pytest.mark.parametrize("wrap", [wrappers.vector.FlattenObservation, wrappers.vector.NormalizeObservation])
+def test_gymnasium_changes_observations_of_batches_that_reset_in_the_next_step_only(wrap):
+    """Ours reset in the same step: that is Gymnasium's rule, and its message says so."""
+    with pytest.raises(ValueError, match="NEXT_STEP or DISABLED"):
+        wrap(gym.make_vec(rare_envs.ENV_IDS[0], num_envs=2))
+
+
+class Recorded:
+    """An ego with a fixed sequence of actions, whatever it sees."""
+
+    def __init__(self, actions):
+        self.actions = actions
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        tick = 0 if state is None else int(state[0][0])
+        rows = np.repeat(self.actions[min(tick, len(self.actions) - 1)][None], len(observation), axis=0)
+        return rows, (np.full(len(observation), tick + 1),)
+
+
+@every
+@pytest.mark.parametrize("action", ACTIONS)
+def test_same_seed_same_trajectory_however_it_is_asked_for(env_id, action):
+    """gym.make, make_vec, parallel_env and rollout; of one, because products of networks round by batch size."""
+    kwargs = {"action": action, "observation": "kinematics", "horizon": 2.0}
+    one, batch = gym.make(env_id, **kwargs), gym.make_vec(env_id, num_envs=1, **kwargs)
+    several = rare_envs.parallel_env(env_id, **kwargs)
+    space = one.action_space
+    space.seed(1)
+    steps = [space.sample() for _ in range(20)]
+    first, info = one.reset(seed=5)
+    others, infos = batch.reset(seed=5)
+    many, _ = several.reset(seed=5)
+    np.testing.assert_array_equal(infos["x"][0], info["x"])
+    np.testing.assert_array_equal(others[0], first)
+    np.testing.assert_array_equal(many["ego"], first)
+    states, taken, ended = [], [], False
+    while not ended:
+        chosen = steps[len(taken)]
+        taken.append(chosen)
+        expected = one.step(chosen)
+        states.append(one.unwrapped._episode.state)
+        seen, reward, terminated, truncated, final = batch.step(np.asarray([chosen]))
+        ended = expected[2] or expected[3]
+        seen = final["final_obs"][0] if ended else seen[0]
+        np.testing.assert_array_equal(seen, expected[0])
+        assert (reward[0], terminated[0], truncated[0]) == expected[1:4]
+        parallel = tuple(each["ego"] for each in several.step({"ego": chosen}))
+        assert data_equivalence(expected, parallel, exact=True)
+    problem = rare_envs.DrivingProblem(env_id, ego=Recorded(np.asarray(taken)), **kwargs)
+    x = torch.from_numpy(info["x"]).float()[None]
+    with torch.inference_mode():
+        moments = list(drive(problem.world, problem.driver, x))
+    stride = problem.world.stride
+    for k, state in enumerate(states[:-1], start=1):  # a decision may end before its last tick
+        for one_field, other in zip(state[:4], moments[k * stride].state[:4], strict=True):
+            assert torch.equal(one_field, other)
+    assert float(moments[-1].f) == expected[4]["measure"]
