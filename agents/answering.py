@@ -123,6 +123,7 @@ class Answerer:
         if not isinstance(theirs, bytes) or (self._secret is not None and len(theirs) != wire.NONCE):
             raise Malformed(f"nonce is {wire.NONCE} bytes")
         key = None if self._secret is None else wire.session_key(self._secret, theirs, ours)
+        declared = getattr(self.ego, "deterministic", None)
         self._peers.pop(peer, None)
         self._peers[peer] = _Peer(key, message["id"])
         while len(self._peers) > MAX_PEERS:
@@ -133,6 +134,7 @@ class Answerer:
             "name": self._name,
             "observation": describe(getattr(self.ego, "observation_space", None)),
             "action": describe(getattr(self.ego, "action_space", None)),
+            "deterministic": declared if isinstance(declared, bool) else None,
             "max_batch": wire.MAX_BATCH,
             "nonce": ours,
             "client_nonce": theirs,

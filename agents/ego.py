@@ -17,9 +17,10 @@ from rare_envs.space import did_you_mean
 
 EXPECTED: Final = (
     f"'{RULE_BASED}', {', '.join(map(repr, SHIPPED))}, a path to a {SUFFIX} or Stable-Baselines3 .zip, "
-    "an .onnx file, module:function, tcp://host:port, or process:EGO for one of these in a process of its own"
+    "an .onnx file, module:function, tcp://host:port, or process:EGO for one of these in a process of its own, "
+    "noisy:EGO for one behind the imperfections of a full stack"
 )
-Kind = Literal["rule", "learned", "url", "remote", "process", "onnx", "zip", "function", "unknown"]
+Kind = Literal["rule", "learned", "url", "remote", "process", "noisy", "onnx", "zip", "function", "unknown"]
 
 
 @runtime_checkable
@@ -56,7 +57,8 @@ def load_ego(spec: str | Path, algo: str | None = None, trust: bool = False) -> 
             (see `agents.onnx_ego.OnnxEgo` for its form); `module:function`, a function
             without arguments that returns an ego (modules in the working directory are found); `tcp://host:port`
             for an ego in another program (docs/remote.md); or `process:EGO`, any of these files and functions in a
-            process of its own, which is ended and started anew where the ego hangs or dies.
+            process of its own, which is ended and started anew where the ego hangs or dies; or `noisy:EGO`, any ego
+            behind the imperfections of a full stack (`agents.noisy.Stack`).
         algo: Algorithm of a `.zip`, such as "ppo"; recognised from the file when None. Only a `.zip` has one.
         trust: Open the pickles in a `.zip` as Stable-Baselines3 does, which runs whatever code is in them. Without it
             a file that needs code of its author's (a policy class of their own, say) is refused.
@@ -83,6 +85,11 @@ def load_ego(spec: str | Path, algo: str | None = None, trust: bool = False) -> 
         return load_saved(Path(text), algo, trust)
     if algo is not None and kind != "process":
         raise ValueError(f"Expected algo for a Stable-Baselines3 .zip only, got {algo!r} for {text!r}; leave it out.")
+    if kind == "noisy":
+        from agents.noisy import NoisyEgo, Stack
+
+        inner, _, settings = text.removeprefix("noisy:").partition("?")
+        return cast(Ego, NoisyEgo(load_ego(inner, algo, trust), Stack.read(settings)))
     if kind in ("remote", "process"):
         return _elsewhere(kind, text, algo, trust)
     if kind == "onnx":
@@ -121,6 +128,8 @@ def kind_of(spec: str) -> Kind:
         return "learned"
     if spec.startswith("process:"):
         return "process"
+    if spec.startswith("noisy:"):
+        return "noisy"
     if spec.startswith(("tcp://", "ipc://")):
         return "remote"
     if "://" in spec:

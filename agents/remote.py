@@ -92,6 +92,7 @@ class RemoteEgo:
         name: What the ego calls itself.
         observation_space: What it says it observes, None if it does not.
         action_space: Likewise how it acts.
+        deterministic: Whether it says that its answers repeat; None if it does not say.
     """
 
     def __init__(self, link: Link, timeout: float = TIMEOUT, patience: float = PATIENCE) -> None:
@@ -121,6 +122,7 @@ class RemoteEgo:
         except BaseException:
             link.close()
             raise
+        self.deterministic = hello.get("deterministic")
         self.name = str(hello.get("name", "ego"))
         self.observation_space = read_space(hello.get("observation"))
         self.action_space = read_space(hello.get("action"))

@@ -16,7 +16,7 @@ from rare_envs.mixed import kinds_of
 from rare_envs.observation import space_of_observations
 from rare_envs.policies import fitted, frames_of
 from rare_envs.rollout import rollout
-from rare_envs.setup import set_up
+from rare_envs.setup import set_up, with_noise
 from rare_envs.space import Distribution, ScenarioSpace
 from rare_envs.world import World
 
@@ -43,6 +43,9 @@ class DrivingProblem:
         world: The simulation.
         driver: The ego as a Driver.
         space: Names, units, bounds and base distribution of x.
+        varies: Whether the ego answers differently from run to run, by randomness that is not part of x: an attribute
+            `deterministic` of it that is False says so. Then p is over that randomness as well, outcomes count as they
+            fell, and failures may not replay.
     """
 
     def __init__(
@@ -63,7 +66,8 @@ class DrivingProblem:
             base: Base distribution of x; None takes the environment's default ("us101").
             noise: What becomes of the randomness of learned drivers: True, it is part of x, standard normal columns
                 behind the others; "fixed", one sequence for all x, so that p is conditional on it; False, mean
-                actions. Scripts and egos have none (policies act by their means), so there the three agree.
+                actions. Scripts and most egos have none (policies act by their means), so there the three agree; the
+                noise of an ego behind a stack (`noisy:EGO`) goes with it.
             **make_kwargs: Further keyword arguments of `gym.make` for this id.
 
         Raises:
@@ -75,6 +79,8 @@ class DrivingProblem:
         self.space: ScenarioSpace
         self.world, self.space = set_up(env_id, measure=measure, base=base, noise=noise, **make_kwargs)
         self.driver = as_driver(ego, self.world)
+        self.space = with_noise(self.space, "ego_noise", getattr(self.driver, "columns", 0))
+        self.varies: bool = getattr(ego, "deterministic", None) is False
         if getattr(self.driver, "sees", False):
             self.world = replace(self.world, lidar=True)
 
@@ -86,9 +92,11 @@ class DrivingProblem:
     @property
     def given(self) -> str:
         """What p is conditional on, in words for `samplers.Estimate.given`; empty if nothing is held fixed."""
+        fixed = ["the ego's own noise is not part of x, so that failures may not replay"] if self.varies else []
         if self.world.noise != "fixed":
-            return ""
-        fixed = []
+            return ", ".join(fixed)
+        if hasattr(self.driver, "columns"):
+            fixed.append("the ego's noise is one fixed sequence")
         if self.world.drivers is not None and self.world.drivers.noisy:
             fixed.append("the drivers' noise is one fixed sequence")
         if self.world.weather:
@@ -204,6 +212,9 @@ def as_driver(ego: Any, world: World) -> Driver:
         )
     if isinstance(ego, type):
         raise ValueError(f"Expected an ego, got the class {ego.__name__}; make or train one of it first.")
+    if callable(getattr(ego, "in_world", None)):
+        made: Driver = ego.in_world(world)
+        return made
     if getattr(ego, "sees", False):  # a Driver that looks by itself, whatever the environment observes
         looking: Driver = ego
         return looking

@@ -14,12 +14,15 @@ def drive(world: World, driver: Driver, x: Tensor) -> Iterator[Episode]:
     Args:
         world: The world.
         driver: The ego.
-        x: Scenario parameters, shape (B, d).
+        x: Scenario parameters, shape (B, d), and behind them the noise of the ego, if it has `columns` of its own.
 
     Yields:
         The episodes at time 0 and after each tick up to the horizon. Rows in which the ego has collided are moved on
         with the others, but their f stays -1.
     """
+    own = getattr(driver, "columns", 0)
+    if own:
+        x, driver = x[:, :-own], driver.with_draws(x[:, -own:])  # type: ignore[attr-defined]
     episode, memory = world.start(x), None
     yield episode
     for _ in range(world.ticks):

@@ -154,6 +154,20 @@ def space_of(world: World, base: Distribution) -> ScenarioSpace:
     )
 
 
+def with_noise(space: ScenarioSpace, name: str, size: int) -> ScenarioSpace:
+    """The space with a further block of noise, standard normal columns behind the others; as it is for size 0."""
+    if not size:
+        return space
+    return ScenarioSpace(
+        names=(*space.names, name),
+        units=(*space.units, ""),
+        low=np.append(space.low, np.full(size, -np.inf)),
+        high=np.append(space.high, np.full(size, np.inf)),
+        base=beside(space.base, NoiseLaw(size)),
+        sizes=(*space.sizes, size),
+    )
+
+
 def _one_of(what: str, value: object, valid: tuple[str, ...]) -> None:
     if value not in valid:
         raise ValueError(f"Unknown {what} {value!r}; expected one of {', '.join(map(repr, valid))}.")

@@ -17,6 +17,7 @@ import agents
 import rare_envs
 import samplers
 from rare_envs.faults import ON_ERROR, EgoGone, Fault, FaultTolerant
+from rare_envs.rollout import drive
 from rare_envs.setup import find_scenario
 from rare_envs.space import did_you_mean
 from rare_envs.study.checks import BadInput
@@ -204,15 +205,20 @@ def _check_on_error(word: str) -> None:
 
 @torch.inference_mode()
 def _try_ego(problem: rare_envs.DrivingProblem) -> None:
-    """Let the ego decide once, on ordinary traffic at time 0, so that a broken one is found before the simulations.
+    """Let the ego decide twice, on ordinary traffic at time 0.
+
+    So a broken one is found before the simulations, and one that answers differently from run to run.
 
     Raises:
         BadInput: It raised, or its actions are not actions.
     """
-    x = problem.space.sample(2, np.random.default_rng(0))
-    start = problem.world.start(torch.from_numpy(x).float())
+    x = torch.from_numpy(problem.space.sample(2, np.random.default_rng(0))).float()
     try:
-        problem.driver.act(start, None)
+        first, again = (list(itertools.islice(drive(problem.world, problem.driver, x), 2))[1] for _ in range(2))
+        same = torch.equal(first.state.speed, again.state.speed) and torch.equal(
+            first.state.heading, again.state.heading
+        )
+        problem.varies = problem.varies or not same
     except (Exception, SystemExit) as error:  # the ego is the user's: anything may happen in it
         words = str(error) if isinstance(error, Exception) else ""
         raise BadInput(f"The ego fails on its first observation: {words or repr(error)}") from error

@@ -45,3 +45,17 @@ def test_an_unknown_word_is_refused(cli: Cli) -> None:
     result = cli(*SMALL, "--on-error", "bonud")
     assert (result.exit_code, result.stdout) == (2, "")
     assert "did you mean 'bound'" in result.stderr
+
+
+def test_an_ego_that_answers_differently_each_time_is_noticed(cli: Cli, here: Path) -> None:
+    (here / "restless.py").write_text(
+        "import egos_here\n"
+        "import numpy as np\n"
+        "def make():\n"
+        "    ego = egos_here.Ego()\n"
+        "    ego.choose = lambda observation: np.random.uniform(-1, 1, (len(observation), 2))\n"
+        "    return ego\n"
+    )
+    words = (*SMALL[:-1], 50, "--json", "--ego")
+    assert "failures may not replay" in json.loads(cli(*words, "restless:make").stdout)["given"]
+    assert json.loads(cli(*words, "egos_here:coasting").stdout)["given"] == ""
