@@ -152,7 +152,7 @@ def draws(env_id: str, n: int) -> NDArray[np.float64]:
 @pytest.mark.parametrize("env_id", ["highway-fast-v0", "merge-v1", "roundabout-v1"])
 def test_the_base_distribution_is_the_law_by_which_highway_env_draws(env_id: str) -> None:
     env = scenario(env_id, fixed="highway_env")
-    theirs = draws(env_id, 60)
+    theirs = draws(env_id, 40)
     x = env.space.sample(2000, np.random.default_rng(0))
     columns = env.space.columns(x)
     ours = np.hstack([columns[name].reshape(len(x), -1) for name in env.space.names if name != "noise"])

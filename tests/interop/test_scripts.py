@@ -20,7 +20,7 @@ FEW: dict[str, Any] = {
 
 @pytest.mark.parametrize(
     ("algo", "env_id"),
-    [("dqn", "highway-fast-v0"), ("dqn", "rare_envs/CutIn-v0"), ("ppo", "rare_envs/CarFollowing-v0")],
+    [("dqn", "highway-fast-v0"), ("ppo", "rare_envs/CutIn-v0")],  # DQN on ours is in docs/highway_env.md
 )
 def test_the_scripts_train_policies_that_drive_here(algo: str, env_id: str, tmp_path: Path) -> None:
     model = train(algo, env_id, 12, **FEW[algo])
@@ -28,7 +28,7 @@ def test_the_scripts_train_policies_that_drive_here(algo: str, env_id: str, tmp_
     model.save(tmp_path / "ego.zip")
     for ours in ("rare_envs/CarFollowing-v0", "rare_envs/CutIn-v0"):
         problem = rare_envs.DrivingProblem(ours, ego=agents.load_ego(tmp_path / "ego.zip"), base="highway", **LAYOUT)
-        x = problem.base.sample(4, np.random.default_rng(0))
+        x = problem.base.sample(2, np.random.default_rng(0))
         f = problem.evaluate(x)
         env = gym.make(ours, **LAYOUT)
         for row, value in zip(x, f, strict=True):  # the loop with which the scripts end
