@@ -43,6 +43,10 @@ FLOORS = {
 """Least ratios to HighwayEnv."""
 REAL_TIME = {1: 60.0, 64: 600.0, 256: 3000.0, 512: 3000.0, 1024: 3000.0}
 """Batch sizes of the highway and the least multiples of real time on one core."""
+CAMERA_REAL_TIME = 15.0
+"""Least multiple of real time on one core of 64 highways whose egos look at pictures of 66 x 200, ten a second."""
+PAPERS_SLOW_DOWN = 15.0
+"""Of simulations with a camera against those without, in O'Kelly et al. (2018), networks included."""
 MEMORY_LIMIT = 2.0
 """Of a million cut-ins, and of 1,024 highways, in one call [GiB]."""
 
@@ -175,6 +179,39 @@ def highway(batch: int, rounds: int) -> dict[str, float]:
     return {**_rates(ours, theirs), "batch": batch}
 
 
+class Cruise:
+    """An ego that looks and does nothing, so that the time of a drive is that of traffic and sensors."""
+
+    def predict(self, observation: Any, state: Any = None, **_: Any) -> Any:
+        """Neither accelerates nor steers."""
+        return np.zeros((len(observation), 2)), state
+
+
+def camera(batch: int, rounds: int, weather: bool = False) -> dict[str, float]:
+    """Highway-v0 with five learned drivers and an ego that looks: through a camera, and through lidar, in turn.
+
+    Rates are seconds of traffic over seconds of work.
+    """
+    rates: dict[str, list[float]] = {}
+    problems = {
+        kind: rare_envs.DrivingProblem(HIGHWAY, ego=Cruise(), observation=kind, weather=weather)
+        for kind in ("camera", "lidar")
+    }
+    for problem in problems.values():
+        problem.evaluate(problem.base.sample(2, np.random.default_rng(0)))
+    for _ in range(rounds):
+        for kind, problem in problems.items():
+            x = problem.base.sample(batch, np.random.default_rng(0))
+            work = seconds(lambda problem=problem, x=x: problem.evaluate(x))  # type: ignore[misc]
+            rates.setdefault(kind, []).append(batch * problem.world.seconds / work)
+    return {
+        "per_second": float(np.median(rates["camera"])),
+        "lidar_per_second": float(np.median(rates["lidar"])),
+        "slow_down": float(np.median(np.divide(rates["lidar"], rates["camera"]))),
+        "batch": batch,
+    }
+
+
 def highway_memory(rollouts: int = 1024) -> dict[str, float]:
     """Peak memory of this process after 1,024 rollouts of the highway in one batch."""
     problem = rare_envs.DrivingProblem(HIGHWAY, measure="lidar_ttc")
@@ -212,12 +249,16 @@ def main(
     out: Annotated[Path | None, typer.Option(help="Write the result here as JSON.")] = None,
     with_memory: Annotated[bool, typer.Option(help="Also run a million rollouts.")] = True,
     only_highway: Annotated[bool, typer.Option(help="Leave the other scenarios out.")] = False,
+    only_camera: Annotated[bool, typer.Option(help="The camera on the highway alone.")] = False,
 ) -> None:
     """Measure everything, print a table, and fail if a floor is missed."""
     torch.set_num_threads(1)
-    results: dict[str, dict[str, float]] = {"highway_memory": highway_memory()}  # first: a peak stays
-    results |= {f"highway_{batch}": highway(batch, rounds) for batch in REAL_TIME}
-    if not only_highway:
+    results: dict[str, dict[str, float]] = {}
+    if not only_camera:
+        results = {"highway_memory": highway_memory()}  # first: a peak stays
+        results |= {f"highway_{batch}": highway(batch, rounds) for batch in REAL_TIME}
+    results["camera_64"], results["camera_64_weather"] = camera(64, rounds), camera(64, rounds, weather=True)
+    if not (only_highway or only_camera):
         results["car_following_idm"] = rollout_ratio(CAR_FOLLOWING, rounds)
         results["cut_in_idm"] = rollout_ratio(CUT_IN, rounds)
         results["car_following_ppo"] = policy_ratio(rounds)
@@ -231,6 +272,13 @@ def main(
             print(f"{name:20s} {row['peak_gib']:8.2f} GiB (limit {MEMORY_LIMIT:g})")
             missed += [name] * (row["peak_gib"] > MEMORY_LIMIT)
             continue
+        if "slow_down" in row:
+            print(
+                f"{name:20s} {row['per_second']:8.0f} times real time (floor {CAMERA_REAL_TIME:g}), "
+                f"{row['slow_down']:.0f} times slower than lidar ({PAPERS_SLOW_DOWN:g} in O'Kelly et al.)"
+            )
+            missed += [name] * (row["per_second"] < CAMERA_REAL_TIME)
+            continue
         floor = FLOORS.get(name, 0.0)
         line = f"{name:20s} {row['ratio']:8.0f} times HighwayEnv (floor {floor:g})"
         if "batch" in row:
@@ -240,7 +288,7 @@ def main(
         print(line)
         missed += [name] * (row["ratio"] < floor)
     if out is not None:
-        machine = {"cpus": os.cpu_count(), "torch": torch.__version__}
+        machine = {"cpus": os.cpu_count(), "load": os.getloadavg(), "torch": torch.__version__}
         out.write_text(json.dumps({"machine": machine, "results": results}, indent=2) + "\n")
     if missed:
         print(f"Missed: {', '.join(missed)}")
