@@ -14,12 +14,12 @@ from rare_envs.space import Parameter
 from rare_envs.state import VEHICLE_LENGTH, State
 
 US101 = {
-    "means": [[10.66, 2.511, 0.726]],
-    "covariances": [[[13.69, 1.149, 0.1046], [1.149, 0.2868, -0.0132], [0.1046, -0.0132, 0.1249]]],
+    "means": [[10.6561, 2.5113, 0.7264]],
+    "covariances": [[[13.7428, 1.1543, 0.1011], [1.1543, 0.2879, -0.0142], [0.1011, -0.0142, 0.1254]]],
     "weights": [1.0],
     "logarithmic": [False, True, True],
     "provenance": {
-        "kind": "moments of recorded events",
+        "kind": "moments of recorded events, by python -m training.brakings",
         "source": "NGSIM, US 101 (Los Angeles, southbound, 15 June 2005, congested), 370 vehicles over 640 m each",
         "events": "265 brakings by 3 m/s or more; speed at their beginning, gap of the braking vehicle to its own lead "
         "at that time (nobody's who follows is recorded), strongest deceleration of positions smoothed over 1 s",
