@@ -109,6 +109,7 @@ def estimate_command(
     action: Action = "continuous",
     horizon: Horizon = None,
     on_error: Annotated[str, typer.Option(help="Where the ego fails twice: raise, failure or bound.")] = "raise",
+    collisions: Annotated[str, typer.Option(help="Which count: ego, or any, between others too.")] = "ego",
     out: Annotated[Path | None, typer.Option(help="Folder for result.json, failures.csv and plot.png.")] = None,
     as_json: Json = False,
 ) -> None:
@@ -135,6 +136,7 @@ def estimate_command(
         action=action,
         horizon=horizon,
         on_error=on_error,
+        collisions=collisions,
     )
     with contextlib.redirect_stdout(sys.stderr):  # an ego may print, and standard output is for the answer
         study = evaluate.prepare(question)

@@ -47,6 +47,7 @@ class Question:
         horizon: Length of an episode [s]; the scenario's when None.
         observation: What the ego observes: "features", "lidar" or "kinematics".
         action: What a policy decides: "continuous" or "meta".
+        collisions: Which collisions count: those of the "ego", or "any", those between two other vehicles too.
         on_error: What scenarios count as on which the ego fails twice: "raise" ends the run, "failure" counts them as
             failing, "bound" as failing in p and the upper end of the interval, but not in the lower end.
     """
@@ -69,6 +70,7 @@ class Question:
     observation: str = "features"
     action: str = "continuous"
     on_error: str = "raise"
+    collisions: str = "ego"
 
 
 @dataclass(frozen=True)
@@ -189,6 +191,7 @@ def prepare(question: Question) -> Study:
             noise=question.noise,
             drivers=question.drivers,
             horizon=question.horizon,
+            collisions=question.collisions,
             observation=question.observation,
             action=question.action,
         )

@@ -1,4 +1,4 @@
-"""The same scenes through commonroad-crime, where it is installed: it pins an older commonroad-io, so not with the tests."""
+"""The same scenes through commonroad-crime, where it is installed; the tests do not install it."""
 
 import warnings
 from typing import Any
