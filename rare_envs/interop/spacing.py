@@ -1,0 +1,75 @@
+"""How HighwayEnv spaces vehicles on its highway, as a distribution."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from rare_envs.beta_law import BetaLaw
+from rare_envs.interop.layout import LENGTH, beta
+from rare_envs.space import Array
+
+
+@dataclass(frozen=True, eq=False)
+class SpacingLaw:
+    """Speeds and gaps of vehicles as `Vehicle.create_random` draws them, speeds first.
+
+    Speeds are uniform; a vehicle of speed v is put (12 m + 1 s x v) x factor x U ahead of the one before it, centre to
+    centre, with U uniform on [0.9, 1.1].
+
+    Args:
+        vehicles: K; columns are K speeds and K gaps.
+        low: Lowest speed [m/s].
+        high: Highest speed [m/s].
+        factor: By lanes and density.
+    """
+
+    vehicles: int
+    low: float
+    high: float
+    factor: float
+
+    @property
+    def dim(self) -> int:
+        """Number of columns."""
+        return 2 * self.vehicles
+
+    @property
+    def least(self) -> float:
+        """The shortest gap [m]."""
+        return 0.9 * self.factor * (12.0 + self.low) - LENGTH
+
+    def _uniform(self) -> BetaLaw:
+        k = self.vehicles
+        return beta(1.0, [self.low] * k + [0.9] * k, [self.high] * k + [1.1] * k)
+
+    def _scale(self, speed: Array) -> Array:
+        return self.factor * (12.0 + speed)
+
+    def _gaps(self, points: Array, change: Callable[[Array, Array], Array]) -> Array:
+        """Points with their second half changed, given the scale that their first half makes."""
+        speed, rest = np.split(np.array(points, dtype=np.float64), 2, axis=1)
+        return np.hstack([speed, change(rest, self._scale(speed))])
+
+    def _in_metres(self, points: Array) -> Array:
+        return self._gaps(points, lambda u, scale: u * scale - LENGTH)
+
+    def _in_spacings(self, points: Array) -> Array:
+        return self._gaps(points, lambda gap, scale: (gap + LENGTH) / scale)
+
+    def sample(self, n: int, rng: np.random.Generator) -> Array:
+        """Independent points, shape (n, 2 K)."""
+        return self._in_metres(self._uniform().sample(n, rng))
+
+    def log_prob(self, x: Array) -> Array:
+        """Log density, (n, 2 K) -> (n,)."""
+        scale = self._scale(np.asarray(x)[:, : self.vehicles])
+        return np.asarray(self._uniform().log_prob(self._in_spacings(x)) - np.log(scale).sum(axis=1))
+
+    def to_standard_normal(self, x: Array) -> Array:
+        """Map (n, 2 K) -> (n, 2 K)."""
+        return self._uniform().to_standard_normal(self._in_spacings(x))
+
+    def from_standard_normal(self, u: Array) -> Array:
+        """Inverse of `to_standard_normal`."""
+        return self._in_metres(self._uniform().from_standard_normal(u))
