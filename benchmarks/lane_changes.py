@@ -24,7 +24,7 @@ from torch import Tensor
 from agents import LearnedDriver
 from benchmarks.imitation import named, rounded
 from benchmarks.runs import about
-from rare_envs.perception import FEATURES
+from rare_envs.perception import FEATURES, HEADING, SPEED
 from training.data.table import DT
 from training.imitation.behaviour import Act, drive, sampled
 from training.imitation.expert import Pairs, expert_pairs
@@ -38,7 +38,7 @@ AFTER = 2.0
 """Seconds beyond that in which they may still cross."""
 SETTLED = 10
 """Ticks that a vehicle is in one lane on either side of a crossing, at least."""
-OFFSET, HEADING, SPEED = (FEATURES.index(name) for name in ("lane_offset", "heading", "speed"))
+OFFSET = FEATURES.index("lane_offset")
 CLASSES = {
     "keeps its lane: less than 0.2 m/s across": (0.0, 0.2, -np.inf, np.inf),
     "0.2 to 0.4 m/s across": (0.2, 0.4, -np.inf, np.inf),

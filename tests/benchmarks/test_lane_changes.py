@@ -5,7 +5,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from benchmarks.lane_changes import CLASSES, HEADING, OFFSET, SPEED, completed, crossings_of, steering
+from benchmarks.lane_changes import CLASSES, OFFSET, completed, crossings_of, steering
+from rare_envs.perception import HEADING, SPEED
 from tests.training.synthetic_scenes import scenes
 from training.imitation.expert import Pairs
 from training.imitation.recording import stack

@@ -11,7 +11,7 @@ from tests.training.synthetic_scenes import scene, scenes
 from training.imitation.acting import physical
 from training.imitation.behaviour import overlaps
 from training.imitation.config import Config
-from training.imitation.expert import expert_pairs, scaling_of
+from training.imitation.expert import emphasised, expert_pairs, scaling_of
 from training.imitation.penalties import penalties
 from training.imitation.pools import Pool
 from training.imitation.realism import jensen_shannon, measure
@@ -86,6 +86,19 @@ def test_pairs_hold_every_known_moment_of_followers(recording):
     assert len(pairs.features) == 3 * (6 * 59 - 29)
     assert scaling_of(pairs).feature_std.min() > 0
     assert pairs.action[:, 0].abs().max() <= 0.6 + 1e-6
+
+
+def test_moments_of_fast_motion_across_count_several_times(recording):
+    pairs = expert_pairs(recording)
+    pairs = pairs._replace(features=pairs.features.clone())
+    pairs.features[:, 1] = 0.0
+    pairs.features[5, 1], pairs.features[5, 2] = -0.05, 10.0  # 0.5 m/s to the left
+    pairs.features[9, 1], pairs.features[9, 2] = 0.05, 6.0  # 0.3 m/s
+    more = emphasised(pairs, 3)
+    assert len(more.features) == len(pairs.features) + 2
+    for column, whole in zip(more, pairs, strict=True):
+        torch.testing.assert_close(column[-2:], whole[[5, 5]])
+    assert emphasised(pairs, 1) is pairs
 
 
 def test_scenes_without_followers_are_refused():

@@ -8,7 +8,7 @@ import torch
 from agents.networks import Policy
 from training.imitation.acting import log_likelihood, normalised
 from training.imitation.config import Config
-from training.imitation.expert import Pairs, scaling_of
+from training.imitation.expert import Pairs, emphasised, scaling_of
 
 
 def clone(pairs: Pairs, config: Config, generator: torch.Generator) -> Policy:
@@ -16,7 +16,7 @@ def clone(pairs: Pairs, config: Config, generator: torch.Generator) -> Policy:
 
     Args:
         pairs: Recorded driving.
-        config: `epochs`, `batch`, `clone_rate`, `weight_decay` and `log_std_cap` are used.
+        config: `epochs`, `batch`, `clone_rate`, `weight_decay`, `log_std_cap` and `lateral_weight` are used.
         generator: Source of the initial weights and of the order of the pairs.
     """
     policy = seeded(lambda: Policy(scaling_of(pairs), config.log_std_cap), generator)
@@ -30,6 +30,7 @@ def improve(policy: Policy, pairs: Pairs, config: Config, generator: torch.Gener
 
     Few epochs: what 51 features say of the next action is little, and more is memorising.
     """
+    pairs = emphasised(pairs, config.lateral_weight)
     optimiser = torch.optim.Adam(policy.parameters(), lr=config.clone_rate, weight_decay=config.weight_decay)
     action = normalised(policy, pairs.action)
     for _ in range(config.epochs):

@@ -17,7 +17,7 @@ HUMAN = Colour.swinging(frequency=(1.70, 1.57), damping=(0.845, 0.40))
 _RANGES: tuple[tuple[tuple[str, ...], Callable[[float], bool], str], ...] = (
     (
         (
-            *("batch", "pools", "scenes", "horizon", "age", "drivers"),
+            *("batch", "lateral_weight", "pools", "scenes", "horizon", "age", "drivers"),
             *("critic_steps", "critic_batch", "memory", "model_steps", "ppo_epochs", "ppo_batch"),
         ),
         lambda value: value >= 1,
@@ -56,6 +56,9 @@ class Config:
     weight_decay: float = 1e-4
     log_std_cap: float = 0.0
     """See `agents.networks.Policy`."""
+    lateral_weight: int = 1
+    """How many times recorded moments of fast motion across the lane count in the likelihood, see
+    `training.imitation.expert.emphasised`; more than once, and drivers finish more of the lane changes under way."""
 
     # rollouts
     pools: int = 5

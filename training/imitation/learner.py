@@ -12,11 +12,11 @@ import torch
 from torch import Tensor, nn
 
 from agents.networks import ACTIONS, FEATURES, Policy
-from training.imitation.acting import log_likelihood
+from training.imitation.acting import log_likelihood, normalised
 from training.imitation.clone import seeded
 from training.imitation.config import Config
 from training.imitation.critic import Critic, inputs, train_critic
-from training.imitation.expert import Pairs
+from training.imitation.expert import Pairs, emphasised
 from training.imitation.forward_model import ForwardModel, train_model
 from training.imitation.pools import Pool, fresh_pool
 from training.imitation.recording import Recording
@@ -60,13 +60,9 @@ class Learner:
             self.learned += ("model", "model_optimiser")
         self.pools: list[Pool] = []
         self.rollouts: deque[Tensor] = deque(maxlen=config.memory)
-        self.recorded = inputs(self.policy, self.pairs.features, self.recorded_action)
-
-    @property
-    def recorded_action(self) -> Tensor:
-        """Recorded actions in normalised units, shape (n, 2)."""
-        scaling = self.policy.scaling
-        return (self.pairs.action - scaling.action_mean) / scaling.action_std
+        self.recorded = inputs(self.policy, self.pairs.features, normalised(self.policy, self.pairs.action))
+        followed = emphasised(self.pairs, config.lateral_weight)
+        self.followed = followed.features, normalised(self.policy, followed.action)
 
     def now(self, ends: tuple[int, int]) -> int:
         """Value of a linear schedule of whole numbers."""
@@ -143,9 +139,10 @@ class Learner:
 
     def clone_loss(self) -> Tensor:
         """Negative log likelihood of some recorded actions."""
-        rows = torch.randint(len(self.pairs.features), (self.config.batch,), generator=self.generator)
-        mean, log_std = self.policy(self.pairs.features[rows])
-        return -log_likelihood(mean, log_std, self.recorded_action[rows]).mean()
+        features, action = self.followed
+        rows = torch.randint(len(features), (self.config.batch,), generator=self.generator)
+        mean, log_std = self.policy(features[rows])
+        return -log_likelihood(mean, log_std, action[rows]).mean()
 
     def save(self, path: Path) -> None:
         """Write everything that a resumed training needs."""

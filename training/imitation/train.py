@@ -63,6 +63,7 @@ def command(
     clone_rate: Number = D.clone_rate,
     weight_decay: Number = D.weight_decay,
     log_std_cap: Number = D.log_std_cap,
+    lateral_weight: Count = D.lateral_weight,
     pools: Count = D.pools,
     scenes: Count = D.scenes,
     horizon: Whole = D.horizon,
