@@ -16,7 +16,6 @@ from rare_envs.state import VEHICLE_LENGTH, VEHICLE_WIDTH
 
 HEIGHT = 1.5
 """Of every vehicle [m], a usual car's."""
-SIZE = (VEHICLE_LENGTH, VEHICLE_WIDTH, HEIGHT)
 PAINT: tuple[Colour, ...] = (
     (0.62, 0.12, 0.10),
     (0.16, 0.27, 0.52),
@@ -31,8 +30,6 @@ WINDOWS = (0.90, 1.35)
 """Between these heights [m] the sides are windows."""
 _NEAR = 0.3
 """Depth in front of the camera up to which projections are not trusted [m]."""
-_FLAT = 1e-9
-"""Least size of a direction's component, so that a ray along a side divides by no zero."""
 
 
 class Boxes(NamedTuple):
@@ -45,10 +42,6 @@ class Boxes(NamedTuple):
     cos: Tensor
     """Of the heading relative to the camera's, positive to the right."""
     sin: Tensor
-
-    def pick(self, numbers: Tensor) -> "Boxes":
-        """The boxes with some numbers, 0 to T N - 1, shapes (C,)."""
-        return Boxes(*torch.stack(self).flatten(1).index_select(1, numbers).unbind(0))
 
     def corners(self) -> tuple[Tensor, Tensor]:
         """Places of the four vertical edges, forward and right, shapes (T, N, 4)."""
@@ -63,6 +56,8 @@ class Candidates(NamedTuple):
 
     box: Tensor
     """Number of the box, frame by frame, 0 to T N - 1."""
+    row: Tensor
+    """Row of the pixel."""
     pixel: Tensor
     """Number of the pixel in the picture, row by row."""
 
@@ -111,44 +106,31 @@ def around(camera: Camera, forward: Tensor, right: Tensor, up: Tensor, first_row
 
     left, end = limits(right, 0, camera.width, camera.width)
     top, bottom = limits(down, first_row, camera.height, camera.height)
-    wide = end - left
-    count = wide * (bottom - top)
-    box = torch.repeat_interleave(count)
-    first = count.cumsum(0) - count
-    number = torch.arange(len(box), device=box.device) - first.index_select(0, box)
-    lower = torch.div(number, wide.index_select(0, box), rounding_mode="floor")
-    start = (top * camera.width + left).index_select(0, box)
-    return Candidates(box, start + number + lower * (camera.width - wide).index_select(0, box))
+    box, line = _counted(torch.where(end > left, bottom - top, 0))
+    row = line + top.index_select(0, box)
+    stretch, place = _counted((end - left).index_select(0, box))
+    start = row * camera.width + left.index_select(0, box)
+    return Candidates(
+        box.index_select(0, stretch), row.index_select(0, stretch), start.index_select(0, stretch) + place
+    )
 
 
-class Crossing(NamedTuple):
-    """Where rays meet boxes; shapes (C,)."""
-
-    enters: Tensor
-    """In lengths of the direction."""
-    leaves: Tensor
-    """The ray's line misses the box where this is less than `enters`."""
-    axis: Tensor
-    """Of the face through which it enters: 0 front or rear, 1 a side, 2 the roof."""
+def _counted(count: Tensor) -> tuple[Tensor, Tensor]:
+    """For each of n groups of some members: the group of every member, and its number within it, from 0."""
+    group = torch.repeat_interleave(count)
+    return group, torch.arange(len(group), device=count.device) - (count.cumsum(0) - count).index_select(0, group)
 
 
-def cross(origin: tuple[Tensor, ...], direction: tuple[Tensor, ...]) -> Crossing:
-    """Cut rays with a box of `SIZE` around the origin of its own frame (slab method).
+def _slab(origin: Tensor, inverse: Tensor, size: float) -> tuple[Tensor, Tensor]:
+    """Where rays enter and leave the space between two planes at +-size / 2, in lengths of their directions.
 
     Args:
-        origin: Along, across, up [m], shapes (C,).
-        direction: Likewise.
+        origin: Of the rays, across the planes [m].
+        inverse: One over their directions across the planes; infinite along them.
+        size: Distance of the planes [m].
     """
-    nears, fars = [], []
-    for start, way, size in zip(origin, direction, SIZE, strict=True):
-        inverse = way.masked_fill(way.abs() < _FLAT, _FLAT).reciprocal()
-        middle, half = -start * inverse, 0.5 * size * inverse.abs()
-        nears.append(middle - half)
-        fars.append(middle + half)
-    sides = torch.maximum(nears[0], nears[1])
-    axis = torch.where(nears[2] > sides, 2, (nears[1] > nears[0]).long())
-    leaves = torch.minimum(torch.minimum(fars[0], fars[1]), fars[2])
-    return Crossing(torch.maximum(sides, nears[2]), leaves, axis)
+    one, other = (-0.5 * size - origin).mul_(inverse), (0.5 * size - origin).mul_(inverse)
+    return torch.minimum(one, other), torch.maximum(one, other)
 
 
 def _turned(forward: Tensor, right: Tensor, cos: Tensor, sin: Tensor) -> tuple[Tensor, Tensor]:
@@ -156,33 +138,41 @@ def _turned(forward: Tensor, right: Tensor, cos: Tensor, sin: Tensor) -> tuple[T
     return forward * cos + right * sin, right * cos - forward * sin
 
 
+def _picked(numbers: Tensor, *values: Tensor) -> tuple[Tensor, ...]:
+    """Entries of flat tensors by their numbers (C,)."""
+    return tuple(value.flatten().index_select(0, numbers) for value in values)
+
+
 def shadows(boxes: Boxes, light: Light, camera: Camera, seen: Pixels) -> Tensor | None:
     """Which ground pixels see no sun because of a box, boolean, shape (T, R, W); None if all do.
 
     Shadows count for all N boxes, that of the camera's own vehicle included.
     """
+    sun_forward, sun_right, sun_up = light.sun[:, :, None].unbind(1)
     forward, right = boxes.corners()
-    steep = HEIGHT / light.sun[:, 2, None, None]
-    moved = (forward - light.sun[:, 0, None, None] * steep, right - light.sun[:, 1, None, None] * steep)
+    steep = (HEIGHT / sun_up)[..., None]
+    moved = forward - sun_forward[..., None] * steep, right - sun_right[..., None] * steep
     forward, right = torch.cat((forward, moved[0]), -1), torch.cat((right, moved[1]), -1)
     at = around(camera, forward, right, torch.zeros_like(forward), seen.sky)
     if not len(at.box):
         return None
-    n = boxes.cos.shape[1]
-    frame, pixel = torch.div(at.box, n, rounding_mode="floor"), at.pixel - seen.sky * camera.width
-    box_forward, box_right, cos, sin = boxes.pick(at.box)
-    row = torch.div(pixel, camera.width, rounding_mode="floor")
-    x, y = _turned(
-        seen.forward[:, 0].index_select(0, row) - box_forward,
-        seen.right.flatten().index_select(0, pixel) - box_right,
-        cos,
-        sin,
+    origin = _turned(boxes.forward, boxes.right, boxes.cos, boxes.sin)
+    sun = _turned(sun_forward, sun_right, boxes.cos, boxes.sin)
+    above = (HEIGHT / sun_up).expand_as(boxes.cos)
+    x0, y0, cos, sin, inverse_x, inverse_y, leaves = _picked(
+        at.box, *origin, boxes.cos, boxes.sin, 1.0 / sun[0], 1.0 / sun[1], above
     )
-    sun = light.sun.index_select(0, frame)
-    met = cross((x, y, torch.full_like(x, -0.5 * HEIGHT)), (*_turned(sun[:, 0], sun[:, 1], cos, sin), sun[:, 2]))
-    dark = (met.enters <= met.leaves) & (met.leaves > 0.0)
+    pixel = at.pixel - seen.sky * camera.width
+    (ground_forward,), (ground_right,) = _picked(at.row - seen.sky, seen.forward), _picked(pixel, seen.right)
+    x, y = _turned(ground_forward, ground_right, cos, sin)
+    near_x, far_x = _slab(x - x0, inverse_x, VEHICLE_LENGTH)
+    near_y, far_y = _slab(y - y0, inverse_y, VEHICLE_WIDTH)
+    enters = torch.maximum(near_x, near_y).clamp_(min=0.0)
+    (dark,) = (enters <= torch.minimum(torch.minimum(far_x, far_y), leaves)).nonzero(as_tuple=True)
     shade = torch.zeros(len(boxes.cos), *seen.right.shape, dtype=torch.bool, device=x.device)
-    shade.view(-1)[(frame * seen.right.numel() + pixel)[dark]] = True
+    box, pixel = _picked(dark, at.box, pixel)
+    frame = torch.div(box, boxes.cos.shape[1], rounding_mode="floor")
+    shade.view(-1).index_fill_(0, frame * seen.right.numel() + pixel, True)
     return shade
 
 
@@ -190,7 +180,7 @@ def paint(image: Tensor, boxes: Boxes, light: Light, camera: Camera, seen: Pixel
     """Draw boxes into pictures.
 
     Args:
-        image: Colours, shape (T, 3, H W), changed in place.
+        image: Colours, shape (T, H W, 3), changed in place.
         boxes: N boxes in each.
         light: Of the pictures.
         camera: The camera.
@@ -203,33 +193,53 @@ def paint(image: Tensor, boxes: Boxes, light: Light, camera: Camera, seen: Pixel
     at = around(camera, forward, right, up)
     if not len(at.box):
         return
-    n, size = boxes.cos.shape[1], image.shape[2]
-    frame = torch.div(at.box, n, rounding_mode="floor")
-    box_forward, box_right, cos, sin = boxes.pick(at.box)
-    ray = seen.ray.index_select(1, at.pixel)
-    x, y = _turned(-box_forward, -box_right, cos, sin)
-    z = torch.full_like(x, camera.mount_height - 0.5 * HEIGHT)
-    direction = (*_turned(ray[0], ray[1], cos, sin), ray[2])
-    met = cross((x, y, z), direction)
+    origin = _turned(-boxes.forward, -boxes.right, boxes.cos, boxes.sin)
+    ray_forward, ray_right, ray_up = seen.ray
+    middle = camera.mount_height - 0.5 * HEIGHT
+    near_z, far_z = _slab(torch.full_like(ray_up, middle), 1.0 / ray_up, HEIGHT)  # the same for all boxes
+    x0, y0, cos, sin = _picked(at.box, *origin, boxes.cos, boxes.sin)
+    way_forward, way_right, near_z, far_z = _picked(at.pixel, ray_forward, ray_right, near_z, far_z)
+    x, y = _turned(way_forward, way_right, cos, sin)
+    near_x, far_x = _slab(x0, x.reciprocal_(), VEHICLE_LENGTH)
+    near_y, far_y = _slab(y0, y.reciprocal_(), VEHICLE_WIDTH)
+    enters = torch.maximum(torch.maximum(near_x, near_y), near_z)
+    (hit,) = ((enters <= torch.minimum(torch.minimum(far_x, far_y), far_z)) & (enters > 0.0)).nonzero(as_tuple=True)
 
-    hit = (met.enters <= met.leaves) & (met.enters > 0.0)
-    key = met.enters.contiguous().view(torch.int32).to(torch.int64) * n + (at.box - frame * n)
-    slot = frame * size + at.pixel
+    n, size = boxes.cos.shape[1], image.shape[1]
+    box, pixel, enters, near_y, near_z = _picked(hit, at.box, at.pixel, enters, near_y, near_z)
+    frame = torch.div(box, n, rounding_mode="floor")
+    slot = frame * size + pixel
+    key = enters.view(torch.int32).to(torch.int64) * (n * len(image)) + box
     nearest = torch.full((len(image) * size,), torch.iinfo(torch.int64).max, device=image.device)
-    nearest.scatter_reduce_(0, slot[hit], key[hit], "amin")
-    (won,) = (hit & (nearest[slot] == key)).nonzero(as_tuple=True)
+    nearest.scatter_reduce_(0, slot, key, "amin")
+    (won,) = (nearest.index_select(0, slot) == key).nonzero(as_tuple=True)
 
-    frame, pixel, axis = frame[won], at.pixel[won], met.axis[won]
-    way = torch.stack(direction)[:, won]
-    sun = light.sun[frame]
-    sun_own = torch.stack((*_turned(sun[:, 0], sun[:, 1], cos[won], sin[won]), sun[:, 2]))
-    facing = -way.gather(0, axis[None])[0].sign() * sun_own.gather(0, axis[None])[0]
-    bright = light.diffuse[frame] + light.direct[frame] * facing.clamp(min=0.0)
-    level = z[won] + 0.5 * HEIGHT + met.enters[won] * way[2]
+    box, frame, pixel, slot, enters, near_y, near_z = _picked(won, box, frame, pixel, slot, enters, near_y, near_z)
+    axis = torch.where(near_z == enters, 2, (near_y == enters).long())
+    (climb,) = _picked(pixel, ray_up)
+    level = camera.mount_height + enters * climb
     glass = (axis < 2) & (level > WINDOWS[0]) & (level < WINDOWS[1])
-    clear = light.through(met.enters[won] * seen.norm[pixel], frame)
-    own = colours[at.box[won] % n]
-    for channel in range(3):
-        colour = torch.where(glass, GLASS[channel], own[:, channel]) * bright
-        air = AIR[channel] * light.brightness[frame]
-        image.view(-1)[(frame * 3 + channel) * size + pixel] = air + clear * (colour - air)
+    colour = _faces(boxes, origin, light, colours).index_select(0, (box * 3 + axis) * 2 + glass)
+    clear = light.through(enters * seen.norm.index_select(0, pixel), frame)[:, None]
+    air = (light.brightness[:, None] * colour.new_tensor(AIR)).index_select(0, frame)
+    image.view(-1, 3).index_copy_(0, slot, torch.addcmul(air, clear, colour - air))
+
+
+def _faces(boxes: Boxes, origin: tuple[Tensor, Tensor], light: Light, colours: Tensor) -> Tensor:
+    """Colours that the faces of boxes show to the camera: front or rear, a side and the roof, body and windows.
+
+    Args:
+        boxes: N boxes in T pictures.
+        origin: The camera in the boxes' own frames [m]; it sees the faces on its side.
+        light: Of the pictures.
+        colours: Of the boxes, shape (N, 3).
+
+    Returns:
+        Shape (T N 3 2, 3).
+    """
+    sun_forward, sun_right, sun_up = light.sun[:, :, None].unbind(1)
+    along, across = _turned(sun_forward, sun_right, boxes.cos, boxes.sin)
+    facing = torch.stack((along * origin[0].sign(), across * origin[1].sign(), sun_up.expand_as(along)), dim=-1)
+    bright = light.diffuse[:, None, None] + light.direct[:, None, None] * facing.clamp(min=0.0)
+    paints = torch.stack((colours, colours.new_tensor(GLASS).expand_as(colours)), dim=1)
+    return (bright[..., None, None] * paints[:, None]).view(-1, 3)

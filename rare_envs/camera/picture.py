@@ -37,7 +37,7 @@ def take_picture(state: State, road: Road, sight: Sight) -> Tensor:
         part = slice(first, first + rows)
         some = State(*(field[part] for field in state))
         when = sight._replace(weather=Weather(*(field[part] for field in sight.weather)), tick=sight.tick[part])
-        drawn = _draw(some, road, when).movedim(1, 2) * 255.0
+        drawn = _draw(some, road, when).mul_(255.0)
         if bool(when.weather.noise.any()):
             drawn += when.weather.noise.float()[:, None, None] * grain(when, drawn[0].numel()).view(drawn.shape)
         image[part] = drawn.round_().clamp_(0.0, 255.0).to(torch.uint8).view(-1, *image.shape[1:])
@@ -45,7 +45,7 @@ def take_picture(state: State, road: Road, sight: Sight) -> Tensor:
 
 
 def _draw(state: State, road: Road, sight: Sight) -> Tensor:
-    """Colours from 0 to 1, shape (T, 3, H W), without noise."""
+    """Colours from 0 to 1, shape (T, H W, 3), without noise."""
     camera = sight.camera
     seen = pixels(camera, state.x.device)
     x, y, heading = road.to_world(state.x, state.y, state.heading)
@@ -56,13 +56,13 @@ def _draw(state: State, road: Road, sight: Sight) -> Tensor:
     view = View(camera_x[:, 0], camera_y[:, 0], heading[:, 0])
     light = light_of(sight.weather, view.heading)
 
-    image = torch.empty(len(x), 3, camera.height * camera.width, device=x.device)
+    image = torch.empty(len(x), camera.height * camera.width, 3, device=x.device)
     above = seen.sky * camera.width
     if seen.sky:
-        image[:, :, :above] = sky(light, seen.ray[:, :above], seen.norm[:above])
+        image[:, :above] = sky(light, seen.ray[:, :above], seen.norm[:above]).movedim(1, 2)
     if seen.sky < camera.height:
         cover = cover_of(road_lines(view, road, seen), road, seen)
-        image[:, :, above:] = ground(cover, shadows(boxes, light, camera, seen), light, seen).flatten(2)
+        image[:, above:] = ground(cover, shadows(boxes, light, camera, seen), light, seen).flatten(2).movedim(1, 2)
     others = Boxes(*(part[:, 1:] for part in boxes))
     paint(image, others, light, camera, seen, _colours(len(x[0]), sight.viewer, image))
     return image
