@@ -9,14 +9,13 @@ from __future__ import annotations
 import importlib
 import io
 import pickle
+import re
 from typing import Any
 
 ARRAYS = {
     "numpy": {"dtype", "ndarray"},
     "numpy._core.numeric": {"_frombuffer"},
-    "numpy.core.numeric": {"_frombuffer"},
     "numpy._core.multiarray": {"scalar", "_reconstruct"},
-    "numpy.core.multiarray": {"scalar", "_reconstruct"},
     "numpy.random._pickle": {"__generator_ctor", "__bit_generator_ctor", "__randomstate_ctor"},
     "numpy.random.bit_generator": {"__pyx_unpickle_SeedSequence", "SeedSequence"},
     "numpy.random._pcg64": {"PCG64"},
@@ -53,6 +52,7 @@ class _Reader(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
         """The class or function of that name, if it is listed."""
         if "." not in name:
+            module = re.sub(r"^numpy\.core\.", "numpy._core.", module)  # what NumPy 1 called it
             if name in ARRAYS.get(module, ()):
                 return getattr(importlib.import_module(module), name)
             for package, bases in CLASSES.items():

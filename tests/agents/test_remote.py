@@ -6,6 +6,8 @@ import itertools
 import os
 import pickle
 import socket
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -475,3 +477,55 @@ def test_what_cannot_be_loaded_in_a_process_is_said_here() -> None:
         load_ego("process:no_such:make")
     with pytest.raises(ValueError, match="timeout=SECONDS"):
         load_ego("process:idm?timeuot=3")
+
+
+@pytest.mark.slow
+def test_a_served_ego_that_is_killed_and_started_again_loses_nothing(tmp_path: Path) -> None:
+    """With the real command and a real kill, in the middle of a drive."""
+    (tmp_path / "served_for_test.py").write_text(
+        "import numpy as np\n"
+        "class Least:\n"
+        "    def predict(self, observation, state=None, episode_start=None, deterministic=True):\n"
+        "        gap = observation[:, 3]\n"
+        "        least = gap if state is None else np.minimum(gap, np.where(episode_start, gap, state))\n"
+        "        return np.stack((least - 0.4, 0 * gap), axis=1).astype(np.float32), least\n"
+        "def make():\n"
+        "    return Least()\n"
+    )
+    command = [
+        sys.executable,
+        "-c",
+        "from rare_envs.study.cli import main; main()",
+        "serve-ego",
+        "served_for_test:make",
+    ]
+    paths = os.pathsep.join([str(Path(rare_envs.__file__).parents[1]), str(tmp_path)])
+
+    def served(bind: str) -> tuple[subprocess.Popen[str], str]:
+        environment = {**os.environ, "PYTHONPATH": paths}
+        words = [*command, "--bind", bind]
+        process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True, cwd=tmp_path, env=environment)
+        assert process.stderr is not None
+        return process, process.stderr.readline().split(" at ")[1].split(";")[0]
+
+    first, address = served("tcp://127.0.0.1:*")
+    there, running = connect(f"{address}?patience=60"), [first]
+    x, calls, predict = problem(there).base.sample(50, np.random.default_rng(0)), itertools.count(), there.predict
+    plain = problem(there).evaluate(x)
+
+    def interrupted(*words: Any, **more: Any) -> Any:
+        if next(calls) == 7:
+            first.kill()
+            first.wait()
+            threading.Thread(target=lambda: running.append(served(address)[0])).start()
+        return predict(*words, **more)
+
+    there.predict = interrupted  # type: ignore[method-assign]
+    try:
+        np.testing.assert_array_equal(problem(there).evaluate(x), plain)
+    finally:
+        there.close()
+        for process in running:
+            process.kill()
+            process.communicate()
+    assert len(running) == 2

@@ -258,6 +258,13 @@ def test_only_listed_classes_are_opened(content: bytes) -> None:
         open_pickle(content)
 
 
+def test_arrays_written_by_numpy_1_are_opened() -> None:
+    values = np.arange(6.0).reshape(2, 3)
+    old = pickle.dumps(values, protocol=3).replace(b"numpy._core.multiarray", b"numpy.core.multiarray")
+    assert b"numpy.core" in old
+    np.testing.assert_array_equal(open_pickle(old), values)
+
+
 def test_an_ego_is_not_fetched(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"Will not load an ego from 'https://example\.org/ego\.zip': download"):
         load_ego("https://example.org/ego.zip")
