@@ -215,11 +215,9 @@ def describe(crash: Crash, row: int = 0) -> dict[str, Any] | None:
         "injury_risk" (both of the two vehicles in this order).
     """
     kind = KINDS[int(crash.kind[row])]
-    return (
-        None
-        if kind == KINDS[NONE]
-        else {"kind": kind, **{name: each[row].tolist() for name, each in crash._asdict().items() if name != "kind"}}
-    )
+    if kind == KINDS[NONE]:
+        return None
+    return {name: kind if name == "kind" else values[row].tolist() for name, values in crash._asdict().items()}
 
 
 def collision_type(state: State, road: Road, row: int = 0) -> str:

@@ -5,7 +5,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from rare_envs.crashes import collision_type as collision_type
 from rare_envs.road import Placed, Road
 from rare_envs.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
 

@@ -1,8 +1,8 @@
 """Responsibility-Sensitive Safety: distances that are kept by whoever is not to blame.
 
 References:
-    Shalev-Shwartz, Shammah and Shashua, "On a formal model of safe and scalable self-driving cars", 2017, definitions 1
-    (longitudinal), 6 (lateral) and 8 (dangerous situation).
+    Shalev-Shwartz, Shammah and Shashua, "On a formal model of safe and scalable self-driving cars", 2017: safe
+    longitudinal distance (same direction), safe lateral distance, dangerous situation.
 """
 
 from dataclasses import dataclass

@@ -6,9 +6,10 @@ from itertools import pairwise
 import pytest
 import torch
 
+from rare_envs.crashes import collision_type
 from rare_envs.drivers import IDM, lane_keeping
 from rare_envs.dynamics import bicycle
-from rare_envs.geometry import Lead, boxes_overlap, collision_type, lead_of
+from rare_envs.geometry import Lead, boxes_overlap, lead_of
 from rare_envs.measures import TTC_MAX, Moment, ttc
 from rare_envs.road import straight
 from rare_envs.scenarios.car_following import CAR_FOLLOWING
