@@ -48,6 +48,8 @@ class HighwayEnvProblem:
             raise ValueError(f"Expected workers of at least 1, got {workers!r}.")
         self.env_id, self.ego, self.workers = task.env_id, ego, workers
         self._task = task
+        if workers > 1:
+            _packed(task)
         self._driven: Driven | None = task.ready()
         self.space: ScenarioSpace = self._driven.env.space
         self.fixed: dict[str, Any] = self._driven.env.fixed
@@ -100,13 +102,11 @@ class HighwayEnvProblem:
 
     @cached_property
     def _pool(self) -> ProcessPoolExecutor:
-        import cloudpickle
-
         pool = ProcessPoolExecutor(
             self.workers,
             mp_context=multiprocessing.get_context("spawn"),
             initializer=simulation.begin,
-            initargs=(cloudpickle.dumps(self._task),),
+            initargs=(_packed(self._task),),
         )
         self._end = weakref.finalize(self, pool.shutdown, wait=False, cancel_futures=True)
         return pool
@@ -126,6 +126,24 @@ class HighwayEnvProblem:
     def __getstate__(self) -> dict[str, Any]:
         """Processes and environments stay where they are."""
         return {**{k: v for k, v in self.__dict__.items() if k not in ("_pool", "_end")}, "_driven": None}
+
+
+def _packed(task: Simulation) -> bytes:
+    """A task as it goes to worker processes.
+
+    Raises:
+        ValueError: If something in it cannot be pickled.
+    """
+    import cloudpickle
+
+    try:
+        packed: bytes = cloudpickle.dumps(task)
+    except Exception as error:  # the ego is the user's: anything may happen in it
+        raise ValueError(
+            f"The ego cannot be sent to worker processes ({type(error).__name__}: {error}); give a function without "
+            "arguments that makes it, or take workers=1."
+        ) from error
+    return packed
 
 
 def highway_env_problem(

@@ -1,6 +1,7 @@
 """HighwayEnv's environments as problems: f is what the drive shows, p is the truth, workers change nothing."""
 
 import pickle
+import threading
 from types import SimpleNamespace
 from typing import Any
 
@@ -220,6 +221,10 @@ def test_bad_input_is_refused_at_the_door() -> None:
             fast(ego, **kwargs)
     with pytest.raises(ValueError, match="did you mean 'highway-fast-v0'"):
         rare_envs.highway_env_problem("highway-fast")
+    locked = Always(1)
+    locked.lock = threading.Lock()  # type: ignore[attr-defined]
+    with pytest.raises(ValueError, match="give a function without arguments that makes it"):
+        fast(locked, workers=2)
     problem = fast(Always(np.nan))
     with pytest.raises(ValueError, match="not finite"):
         problem.evaluate(problem.base.sample(1, np.random.default_rng(0)))
