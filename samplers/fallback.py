@@ -6,15 +6,17 @@ from dataclasses import replace
 import numpy as np
 
 from samplers.importance import Draws
-from samplers.method import Goal, Steps
+from samplers.method import Goal, Outcome, Steps
 from samplers.problem import FloatArray, Inputs
 from samplers.subset import AdaptiveSubsetSimulation
 
-LEAST_RATE = 0.03
-"""What a round of draws must be worth, in independent failures for each draw. Proposals that come to something reach
-0.05 to 0.8; with less, the spread of the weights is that of the failures that were hit, not of those that there are."""
+HOPELESS_RATE = 0.02
+"""What the last round of draws must be worth, in independent failures for each draw. Proposals that come to something
+reach 0.05 to 0.9; with less, the spread of the weights is that of the failures met, not of those that there are."""
+LEAST_RATE = 0.1
 LARGEST_TYPICAL = 30.0
-"""How many times p a point that the exploration found may weigh as a draw: 1 to 3 is usual, 17 was seen to do."""
+"""How many times p a point that the exploration found may weigh as a draw, where the rate is under LEAST_RATE: 1 to 3
+is usual, 17 was seen to do."""
 LEAST_BUDGET = 300
 """Subset simulation is not worth its draws with less."""
 WORTH = 30.0
@@ -28,9 +30,22 @@ def describes(last: Draws, typical: FloatArray) -> bool:
         last: The draws of the last round.
         typical: Weights of the exploration's points as draws of the proposal, one for each region, shape (m,).
     """
-    if len(last.f) == 0 or last.ess < LEAST_RATE * last.n:
+    if len(last.f) == 0 or last.ess < HOPELESS_RATE * last.n:
         return False
-    return bool(np.median(typical) <= LARGEST_TYPICAL * last.p)
+    return last.ess >= LEAST_RATE * last.n or bool(np.median(typical) <= LARGEST_TYPICAL * last.p)
+
+
+def reconciled(found: Outcome, before: Outcome) -> Outcome:
+    """Return what subset simulation found, or what was known before it, if that is more than it can be reconciled with.
+
+    Subset simulation follows f downhill; wide draws find regions that f does not announce as well.
+    """
+    if before.interval[0] <= found.interval[1]:
+        return found
+    interval = min(before.interval[0], found.interval[0]), max(before.interval[1], found.interval[1])
+    about = f"Subset simulation, with the rest, missed regions that were found before: p was {found.p:.1e} there."
+    warnings = (*before.warnings, *found.warnings, about)
+    return replace(before, interval=interval, status=found.status, warnings=warnings)
 
 
 def subset_simulation(inputs: Inputs, goal: Goal, levels: int, budget: int, rng: np.random.Generator) -> Steps:

@@ -177,9 +177,7 @@ class _Run:
                 ess = effective_sample_size(log_w)
                 self._note_draws(batch, float(np.exp(log_w).sum()), 1 / math.sqrt(ess) if ess else math.inf, ess)
             proposal = refinement.proposal(last=number == len(ROUNDS))
-            if number > 1 and not self._serves(refinement, proposal):
-                return None
-        return proposal
+        return proposal if self._serves(refinement, proposal) else None
 
     def _serves(self, refinement: Refinement, proposal: Proposal) -> bool:
         """Tell whether to go on with a proposal; where f is noisy there is nothing better."""
@@ -192,9 +190,10 @@ class _Run:
         left = self._end - self._simulator.n_sim
         outcome = yield from fallback.subset_simulation(self._simulator.inputs, self._goal, levels, left, self._rng)
         trace, base_draws = self._closed_trace() + outcome.trace, self._n_base + outcome.base_draws
-        if outcome.status is Status.STOPPED and outcome.p == 0:  # on its way to the failures: no estimate
-            outcome = self.interrupted()
-        return replace(outcome, trace=trace, base_draws=base_draws)
+        before = self.interrupted()
+        on_its_way = outcome.status is Status.STOPPED and outcome.p == 0  # no estimate, then
+        whole = before if on_its_way else fallback.reconciled(outcome, before)
+        return replace(whole, trace=trace, base_draws=base_draws)
 
     def estimated(self, refinement: Refinement, proposal: Proposal) -> Steps:
         """Draw from the last mixture until the budget is used or the target is met."""
