@@ -109,7 +109,7 @@ def test_an_ego_is_trained_in_the_world_that_was_asked_for(cli: Cli, risky: str,
     [
         (("--drivers", "mgial"), "did you mean 'mgail'"),
         (("--base", "us102"), "'us101'"),
-        (("--observation", "camera"), "'features', 'lidar'"),
+        (("--observation", "sonar"), "'features', 'lidar'"),
         (("--horizon", 0), "horizon"),
         (("--noise", "loud"), "'fixed'"),
     ],
