@@ -128,7 +128,7 @@ def train_ego(
     try:
         with _one_thread(), _progress_bar(steps, progress) as callback:
             model = getattr(stable_baselines3, algo.upper())(
-                "MlpPolicy",
+                _policy_name(env.observation_space),
                 env,
                 policy_kwargs={**recipe.policy, "activation_fn": nn.ReLU},
                 seed=seed,
@@ -140,6 +140,16 @@ def train_ego(
     finally:
         env.close()
     return target
+
+
+def _policy_name(space: Any) -> str:
+    """Stable-Baselines3's name for a policy that takes such observations."""
+    from gymnasium.spaces import Dict
+    from stable_baselines3.common.preprocessing import is_image_space
+
+    if isinstance(space, Dict):
+        return "MultiInputPolicy"
+    return "CnnPolicy" if is_image_space(space) else "MlpPolicy"
 
 
 def _recipe(algo: str) -> Recipe:

@@ -70,7 +70,10 @@ Seed = Annotated[int, typer.Option(help="Seed; the same seed gives the same answ
 Base = Annotated[str | None, typer.Option(help="Base distribution: a name or a JSON file.")]
 Drivers = Annotated[str | None, typer.Option(help="Of the vehicles around the ego: mgail, gail, bc, idm or a file.")]
 NoiseOption = Annotated[Noise, typer.Option("--noise", help="The drivers' noise: part of x, one fixed sequence, none.")]
-Observation = Annotated[str, typer.Option(help="What the ego observes: features, lidar, or HighwayEnv's kinematics.")]
+Observation = Annotated[
+    str, typer.Option(help="What the ego observes: features, lidar, kinematics, camera, or camera+lidar.")
+]
+Weather = Annotated[bool, typer.Option("--weather", help="Make weather and the camera's noise parameters.")]
 Action = Annotated[str, typer.Option(help="What it decides: continuous, each tick, or HighwayEnv's meta, each second.")]
 Horizon = Annotated[float | None, typer.Option(help="Length of an episode in seconds.")]
 
@@ -106,6 +109,7 @@ def estimate_command(
     drivers: Drivers = None,
     noise: NoiseOption = Noise.ON,
     observation: Observation = "features",
+    weather: Weather = False,
     action: Action = "continuous",
     horizon: Horizon = None,
     on_error: Annotated[str, typer.Option(help="Where the ego fails twice: raise, failure or bound.")] = "raise",
@@ -133,6 +137,7 @@ def estimate_command(
         noise=_noise(noise),
         drivers=drivers,
         observation=observation,
+        weather=weather,
         action=action,
         horizon=horizon,
         on_error=on_error,
@@ -168,6 +173,7 @@ def compare_command(
     drivers: Drivers = None,
     noise: NoiseOption = Noise.ON,
     observation: Observation = "features",
+    weather: Weather = False,
     action: Action = "continuous",
     horizon: Horizon = None,
     as_json: Json = False,
@@ -190,6 +196,7 @@ def compare_command(
         noise=_noise(noise),
         drivers=drivers,
         observation=observation,
+        weather=weather,
         action=action,
         horizon=horizon,
     )
@@ -214,6 +221,7 @@ def train_ego_command(
     drivers: Drivers = None,
     noise: NoiseOption = Noise.ON,
     observation: Observation = "features",
+    weather: Weather = False,
     action: Action = "continuous",
     horizon: Horizon = None,
     as_json: Json = False,
@@ -229,14 +237,16 @@ def train_ego_command(
         "observation": observation,
         "action": action,
         "horizon": horizon,
+        "weather": weather,
     }
     path = train(env, algo=algo, steps=steps, out=out, seed=seed, num_envs=num_envs, **world)
     if as_json:
         _print_json({"ego": str(path), "env_id": env, "algo": algo, "steps": steps, "seed": seed, **world})
     else:
-        words = {**world, "noise": noise.value}
+        words = {**world, "noise": noise.value, "weather": None}
         usual = {"noise": Noise.ON.value, "observation": "features", "action": "continuous"}
         told = [f" --{name} {word}" for name, word in words.items() if word not in (None, usual.get(name))]
+        told += [" --weather"] * weather
         print(f"Saved {path}. Next: rare-envs estimate {env} --ego {path}{''.join(told)}")
 
 

@@ -17,8 +17,9 @@ from rare_envs import DrivingProblem
 from rare_envs.actions import space_of_actions
 from rare_envs.drivers import PolicyDriver
 from rare_envs.faults import FaultTolerant, reason_of
-from rare_envs.observation import observe
-from rare_envs.policies import stacking
+from rare_envs.mixed import batch_size, each, kinds_of
+from rare_envs.observation import observe, space_of_observations
+from rare_envs.policies import frames_of
 from rare_envs.study.findings import Finding, failed, passed, warned
 
 ROWS = 32
@@ -41,33 +42,49 @@ class Probe:
 
     ego: Any
     problem: DrivingProblem
-    seen: Array
-    """Observations of ordinary scenarios at time 0, shape (ROWS, ...)."""
+    seen: Any
+    """Observations of ordinary scenarios at time 0, shape (ROWS, ...), or several of that kind by name."""
 
     @classmethod
     def of(cls, ego: Any, problem: DrivingProblem) -> Probe:
         """Take observations."""
         x = problem.base.sample(ROWS, np.random.default_rng(0))
         with torch.inference_mode():
-            seen = observe(problem.world.start(torch.from_numpy(x).float()), problem.world.observation).numpy()
+            start = problem.world.start(torch.from_numpy(x).float())
+            seen = each(torch.Tensor.numpy, observe(start, problem.world.observation))
         return cls(ego, problem, seen)
+
+    @property
+    def space(self) -> spaces.Space[Any]:
+        """What the environment observes."""
+        return space_of_observations(self.problem.world)
+
+    def changed(self, change: Callable[[Array], Any]) -> Any:
+        """The observations changed by a function, and of their own types."""
+        return each(lambda part: np.asarray(change(part)).astype(part.dtype), self.seen)
+
+    def rows(self, size: int) -> Any:
+        """So many observations."""
+        return self.changed(lambda part: np.resize(part, (size, *part.shape[1:])))
 
     @property
     def policy(self) -> Any:
         """The ego behind the wrappers of its training."""
         return self.problem.driver.policy if isinstance(self.problem.driver, PolicyDriver) else None
 
-    def ask(self, observation: Array, state: Any = None, start: Any = None) -> tuple[Array, Any]:
+    def ask(self, observation: Any, state: Any = None, start: Any = None) -> tuple[Array, Any]:
         """Actions as numbers, and the memory."""
-        begun = np.full(len(observation), state is None) if start is None else start
-        action, state = self.policy.predict(observation.copy(), state=state, episode_start=begun, deterministic=True)
+        begun = np.full(batch_size(observation), state is None) if start is None else start
+        action, state = self.policy.predict(
+            each(np.copy, observation), state=state, episode_start=begun, deterministic=True
+        )
         return np.asarray(action), state
 
 
 def spaces_fit(probe: Probe) -> Iterator[Finding]:
     """Declared spaces against the environment's; that they fit at all was found when the problem was made."""
     world = probe.problem.world
-    ours = spaces.Box(-np.inf, np.inf, probe.seen.shape[1:]), space_of_actions(world.action)
+    ours = probe.space, space_of_actions(world.action)
     observed, acts = (getattr(probe.ego, f"{name}_space", None) for name in ("observation", "action"))
     if observed is None or acts is None:
         missing = " and ".join(
@@ -80,11 +97,16 @@ def spaces_fit(probe: Probe) -> Iterator[Finding]:
             False,
         )
     if observed is not None:
-        frames, _ = stacking(ours[0].shape, observed.shape) or (1, False)
-        stacked = f", {frames} frames of {ours[0].shape}" if frames > 1 else ""
-        yield passed("observations", f"{observed.shape} {observed.dtype}{stacked}")
-        if observed.dtype is not None and not np.issubdtype(observed.dtype, np.floating):
-            yield warned("observations", f"it was made for {observed.dtype}", "train it on float observations")
+        frames, _ = frames_of(ours[0], observed) or (1, False)
+        stacked = f", {frames} frames of {ours[0].shape or ours[0]}" if frames > 1 else ""
+        words = f"{observed.shape} {observed.dtype}" if observed.shape is not None else str(observed)
+        yield passed("observations", f"{words}{stacked}")
+        if observed.dtype is not None and np.issubdtype(observed.dtype, np.floating) != np.issubdtype(
+            ours[0].dtype, np.floating
+        ):
+            yield warned(
+                "observations", f"it was made for {observed.dtype}, here they are {ours[0].dtype}", "train it on these"
+            )
     if isinstance(acts, spaces.Box) and isinstance(ours[1], spaces.Box):
         same = np.array_equal(acts.low, ours[1].low) and np.array_equal(acts.high, ours[1].high)
         unbounded = not (np.isfinite(acts.low).any() or np.isfinite(acts.high).any())
@@ -115,6 +137,9 @@ def statistics_fit(probe: Probe) -> Iterator[Finding]:
     statistics = probe.ego.statistics
     if not statistics.norm_obs:
         yield passed("normalisation", f"{probe.ego.statistics_path} does not normalise observations")
+        return
+    if isinstance(probe.seen, dict) or probe.seen.ndim > 2:
+        yield passed("normalisation", f"{probe.ego.statistics_path}; of such observations their fit is not checked")
         return
     single = statistics.observation_space.shape == probe.seen.shape[1:]
     seen = (
@@ -164,7 +189,7 @@ def acts(probe: Probe) -> Iterator[Finding]:
 
 def same_again(probe: Probe) -> Iterator[Finding]:
     """Whether an answer repeats, and whether it depends on what was asked before."""
-    other = np.roll(probe.seen, 1, axis=0) * 0.5
+    other = probe.changed(lambda part: np.roll(part, 1, axis=0) * 0.5)
     first, second = probe.ask(probe.seen)[0], probe.ask(probe.seen)[0]
     probe.ask(other)
     third = probe.ask(probe.seen)[0]
@@ -191,7 +216,7 @@ def remembers(probe: Probe) -> Iterator[Finding]:
         yield passed("memory", "none: an answer depends on one observation")
         return
     for _ in range(2):
-        _, state = probe.ask(probe.seen * 0.9, state)
+        _, state = probe.ask(probe.changed(lambda part: part * 0.9), state)
     begun = np.zeros(ROWS, dtype=bool)
     begun[: ROWS // 2] = True
     again, _ = probe.ask(probe.seen, state, begun)
@@ -211,8 +236,9 @@ def rows_stand_alone(probe: Probe) -> Iterator[Finding]:
     """Whether a row's answer depends on the other rows, their order or their number."""
     whole = probe.ask(probe.seen)[0]
     order = np.random.default_rng(1).permutation(ROWS)
-    shuffled = _differ(probe.ask(probe.seen[order])[0], whole[order])
-    alone = _differ(np.concatenate([probe.ask(probe.seen[row : row + 1])[0] for row in range(8)]), whole[:8])
+    shuffled = _differ(probe.ask(probe.changed(lambda part: part[order]))[0], whole[order])
+    single = [probe.changed(lambda part, row=row: part[row : row + 1]) for row in range(8)]  # type: ignore[misc]
+    alone = _differ(np.concatenate([probe.ask(row)[0] for row in single]), whole[:8])
     for name, off in (("order of the batch", shuffled), ("size of the batch", alone)):
         if off > ROUNDING:
             yield failed(
@@ -226,11 +252,17 @@ def rows_stand_alone(probe: Probe) -> Iterator[Finding]:
 
 def at_the_edges(probe: Probe) -> Iterator[Finding]:
     """Zeros (which rows are shown whose episode is over), the ends of the observation's range, and NaN."""
-    cases = {"zeros": 0.0, "the lower end": -5.0, "the upper end": 5.0}
+    space = probe.space
+    boxes = dict(space.spaces) if isinstance(space, spaces.Dict) else space
+    cases = {
+        "zeros": probe.changed(np.zeros_like),
+        "the lower end": each(lambda part, box: np.broadcast_to(box.low, part.shape), probe.seen, boxes),
+        "the upper end": each(lambda part, box: np.broadcast_to(box.high, part.shape), probe.seen, boxes),
+    }
     bad = []
-    for name, value in cases.items():
+    for name, case in cases.items():
         try:
-            action, _ = probe.ask(np.full_like(probe.seen, value))
+            action, _ = probe.ask(case)
             bad += [] if np.isfinite(action).all() else [f"{name}: NaN or infinite"]
         except (Exception, SystemExit) as error:
             bad.append(f"{name}: {reason_of(error)}")
@@ -242,8 +274,10 @@ def at_the_edges(probe: Probe) -> Iterator[Finding]:
         )
     else:
         yield passed("range", "finite at zeros and at both ends of what is observed")
+    if not isinstance(probe.seen, dict) and probe.seen.dtype == np.uint8:
+        return
     try:
-        action, _ = probe.ask(np.full_like(probe.seen, np.nan))
+        action, _ = probe.ask(each(lambda part: part if part.dtype == np.uint8 else part * np.nan, probe.seen))
         finite = bool(np.isfinite(action).all())
         yield passed("NaN", "answered by numbers; the environment never gives NaN" if finite else "answered by NaN")
     except (Exception, SystemExit) as error:
@@ -254,14 +288,14 @@ def is_fast(probe: Probe) -> Iterator[Finding]:
     """Milliseconds by batch size."""
     times = {}
     for size in SIZES:
-        observation = np.resize(probe.seen, (size, *probe.seen.shape[1:]))
+        observation = probe.rows(size)
         probe.ask(observation)
-        each = []
+        durations = []
         for _ in range(5 if size < 1024 else 3):
             begun = time.perf_counter()
             probe.ask(observation)
-            each.append(time.perf_counter() - begun)
-        times[size] = float(np.median(each))
+            durations.append(time.perf_counter() - begun)
+        times[size] = float(np.median(durations))
     found = ", ".join(f"{1e3 * seconds:.2g} ms for {size}" for size, seconds in times.items())
     needed = TYPICAL / SIZES[-1] * times[SIZES[-1]] * probe.problem.world.ticks
     if needed > SLOW:
@@ -272,7 +306,8 @@ def is_fast(probe: Probe) -> Iterator[Finding]:
 
 def keeps_memory_small(probe: Probe) -> Iterator[Finding]:
     """Megabytes that 100 calls leave behind."""
-    observation = np.resize(probe.seen, (256, *probe.seen.shape[1:]))
+    pictures = "camera" in kinds_of(probe.problem.world.observation)
+    observation = probe.rows(16 if pictures else 256)
     for _ in range(20):
         probe.ask(observation)
     before = _megabytes()

@@ -45,9 +45,10 @@ class Question:
         noise: Noise of the drivers, as in `DrivingProblem`: True, "fixed" or False.
         drivers: Of the vehicles around the ego: the name of installed ones or a file; the scenario's default when None.
         horizon: Length of an episode [s]; the scenario's when None.
-        observation: What the ego observes: "features", "lidar" or "kinematics".
+        observation: What the ego observes: "features", "lidar", "kinematics" or "camera"; several joined by "+".
         action: What a policy decides: "continuous" or "meta".
         collisions: Which collisions count: those of the "ego", or "any", those between two other vehicles too.
+        weather: Whether weather and the camera's noise are parameters.
         on_error: What scenarios count as on which the ego fails twice: "raise" ends the run, "failure" counts them as
             failing, "bound" as failing in p and the upper end of the interval, but not in the lower end.
     """
@@ -71,6 +72,7 @@ class Question:
     action: str = "continuous"
     on_error: str = "raise"
     collisions: str = "ego"
+    weather: bool = False
 
 
 @dataclass(frozen=True)
@@ -119,7 +121,7 @@ class Report:
     @property
     def _idle_words(self) -> tuple[str, ...]:
         world, noise = self.study.problem.world, self.study.question.noise
-        if noise is True or (world.drivers is not None and world.drivers.noisy):
+        if noise is True or world.weather or (world.drivers is not None and world.drivers.noisy):
             return ()
         word = "off" if noise is False else noise
         return (f"--noise {word} changes nothing: nobody in this traffic drives with noise (see --drivers)",)
@@ -193,6 +195,7 @@ def prepare(question: Question) -> Study:
             horizon=question.horizon,
             collisions=question.collisions,
             observation=question.observation,
+            weather=question.weather,
             action=question.action,
         )
     except (ValueError, OSError) as error:

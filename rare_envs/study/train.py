@@ -22,7 +22,7 @@ def train(env_id: str, *, algo: str, steps: int, out: Path, seed: int, num_envs:
         out: `.zip` to write.
         seed: Seed of networks, scenarios and exploration.
         num_envs: Episodes side by side.
-        **world: Keyword arguments of `gym.make`: base, drivers, noise, observation, action, horizon.
+        **world: Keyword arguments of `gym.make`: base, drivers, noise, observation, action, horizon, weather.
 
     Returns:
         The file that was written.

@@ -145,6 +145,13 @@ def test_equal_to_the_slow_renderer_within_rounding(number: int) -> None:
     assert (difference > 0.51).mean() < 0.01  # half a level by rounding
 
 
+def test_straight_ahead_of_the_middle_column() -> None:
+    """Rays along a box's sides divide by zero: a picture of odd width has a column of them."""
+    vehicles, camera, sky = [[0.0, 0.0, 0.0], [15.0, 0.0, 0.0]], Camera(15, 41), (1e-4, 0.5, math.pi)
+    expected = picture(np.array(vehicles), straight(1), camera, *sky)
+    assert np.abs(shot(vehicles, straight(1), camera, sky) - expected).max() < 1.0
+
+
 @pytest.mark.parametrize("road", [straight(3), i80(), BEND], ids=["straight", "i80", "bend"])
 def test_pictures_do_not_depend_on_their_batch(road: Road) -> None:
     rng = np.random.default_rng(0)
