@@ -58,7 +58,7 @@ BAD_ESTIMATES = {
     "misspelt drivers": ([FOLLOWING, "--drivers", "mgial"], ["did you mean 'mgail'"]),
     "drivers that are no file": ([FOLLOWING, "--drivers", "nowhere.safetensors"], ["nowhere.safetensors"]),
     "misspelt learned ego": ([FOLLOWING, "--ego", "mgial"], ["did you mean 'mgail'"]),
-    "unknown observation": ([FOLLOWING, "--observation", "camera"], ["'features', 'lidar'"]),
+    "unknown observation": ([FOLLOWING, "--observation", "sonar"], ["'features', 'lidar'"]),
     "no horizon": ([FOLLOWING, "--horizon", "0"], ["horizon", "0.0"]),
     "gamma is NaN": ([FOLLOWING, "--gamma", "nan"], ["gamma", "nan"]),
     "gamma is infinite": ([FOLLOWING, "--gamma", "inf"], ["gamma", "inf"]),
