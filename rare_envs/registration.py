@@ -14,16 +14,30 @@ if TYPE_CHECKING:
     from rare_envs.scenarios.base import Scenario
 
 
+HIGHWAY_ENV_LAYOUT = {"observation": "kinematics", "action": "meta"}
+"""What makes an environment look like one of HighwayEnv's."""
+
+
 def register_envs() -> None:
-    """Register the ids with Gymnasium, once."""
+    """Register the ids with Gymnasium, once, and each again with HighwayEnv's layout (`kinematics_id`)."""
     for env_id in SCENARIOS:
-        if env_id not in gym.registry:
-            gym.register(
-                env_id,
-                entry_point="rare_envs.envs.single:DrivingEnv",
-                vector_entry_point="rare_envs.envs.vector:DrivingVectorEnv",
-                kwargs={"env_id": env_id},
-            )
+        for name, layout in ((env_id, {}), (kinematics_id(env_id), HIGHWAY_ENV_LAYOUT)):
+            if name not in gym.registry:
+                gym.register(
+                    name,
+                    entry_point="rare_envs.envs.single:DrivingEnv",
+                    vector_entry_point="rare_envs.envs.vector:DrivingVectorEnv",
+                    kwargs={"env_id": env_id, **layout},
+                )
+
+
+def kinematics_id(env_id: str) -> str:
+    """The id under which an environment has HighwayEnv's layout: "rare_envs/CutIn-kinematics-v0", for example.
+
+    For `gym.make` and `gym.make_vec`, so that scripts written for HighwayEnv run with nothing but the id changed.
+    """
+    name, _, version = env_id.rpartition("-v")
+    return f"{name}-kinematics-v{version}"
 
 
 def register_scenario(env_id: str, scenario: Scenario) -> None:

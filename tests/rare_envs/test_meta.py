@@ -301,3 +301,15 @@ def test_in_parallel_env_the_ego_alone_is_the_environment_of_one(env_id: str) ->
     observation = many.step({"ego": IDLE, cutter: FASTER})[0][cutter]
     assert observation.shape == (5, 5)
     assert many.action_space(cutter) == gym.spaces.Discrete(5)
+
+
+def test_an_id_with_highway_envs_layout() -> None:
+    """So that a script written for HighwayEnv runs with nothing but the id changed."""
+    env = gym.make("rare_envs/CutIn-kinematics-v0")
+    same = gym.make("rare_envs/CutIn-v0", observation="kinematics", action="meta")
+    assert env.observation_space == same.observation_space
+    assert env.action_space == same.action_space
+    np.testing.assert_array_equal(env.reset(seed=3)[0], same.reset(seed=3)[0])
+    for action in (3, 1):
+        np.testing.assert_array_equal(env.step(action)[0], same.step(action)[0])
+    assert gym.make_vec("rare_envs/HardBrake-kinematics-v0", num_envs=2).reset()[0].shape == (2, 5, 5)
