@@ -210,11 +210,11 @@ def test_info_says_the_same_alone_in_a_batch_and_in_a_problem() -> None:
 @pytest.mark.parametrize("method", ["mc", "adss"])
 def test_shares_of_the_kinds_add_up_to_p(method: str) -> None:
     problem = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", ego=Coasting())
-    result = samplers.estimate(problem, method, gamma=1.0, seed=0, max_sim=6000)
+    result = samplers.estimate(problem, method, gamma=1.0, seed=0, max_sim=3000)
     kinds = result.shares(problem.crash_kinds)
     assert {"rear_end", "none"} == set(kinds)  # not every time to collision under 1 s ends in a collision
     assert sum(share.p for share in kinds.values()) == pytest.approx(result.p, rel=1e-12)
-    hits = samplers.estimate(problem, method, gamma=0.0, seed=0, max_sim=6000)
+    hits = samplers.estimate(problem, method, gamma=0.0, seed=0, max_sim=3000)
     low, high = hits.interval
     assert kinds["rear_end"].p == pytest.approx(hits.p, rel=0.2)
     assert set(hits.shares(problem.crash_kinds)) == {"rear_end"}
