@@ -13,6 +13,7 @@ _STEP = -1640531535
 """2^32 over the golden ratio, as int32: Weyl's sequence spreads consecutive numbers."""
 _FACTORS = (0x7FEB352D, 0x846CA68B - 2**32)
 """Of a mixing function with low bias: Wellons, "Prospecting for hash functions", 2018 (lowbias32)."""
+_EVEN = 0x00FF00FF
 _MEAN, _DEVIATION = 4 * 127.5, (4 * (256**2 - 1) / 12) ** 0.5
 
 
@@ -23,17 +24,13 @@ def grain(sight: Sight, values: int) -> Tensor:
         key = _mixed(key + (number.to(torch.int32) + 1) * _STEP)
     place = torch.arange(values, dtype=torch.int32, device=key.device) * _STEP
     bits = _mixed(place[None, :] + key[:, None])
-    total: Tensor = bits & 255
-    for shift in (8, 16, 24):
-        total += (bits >> shift) & 255
+    pairs = (bits >> 8).bitwise_and_(_EVEN).add_(bits.bitwise_and_(_EVEN))  # bytes 0 + 1 and 2 + 3
+    total = (pairs >> 16).add_(pairs.bitwise_and_(0xFFFF))
     return total.float().sub_(_MEAN).div_(_DEVIATION)
 
 
 def _mixed(bits: Tensor) -> Tensor:
-    """Scramble 32-bit integers; multiplication wraps around."""
-    bits = bits ^ ((bits >> 16) & 0xFFFF)
-    bits = bits * _FACTORS[0]
-    bits ^= (bits >> 15) & 0x1FFFF
-    bits *= _FACTORS[1]
-    bits ^= (bits >> 16) & 0xFFFF
-    return bits
+    """Scramble 32-bit integers, in place; multiplication wraps around."""
+    bits.bitwise_xor_((bits >> 16).bitwise_and_(0xFFFF)).mul_(_FACTORS[0])
+    bits.bitwise_xor_((bits >> 15).bitwise_and_(0x1FFFF)).mul_(_FACTORS[1])
+    return bits.bitwise_xor_((bits >> 16).bitwise_and_(0xFFFF))

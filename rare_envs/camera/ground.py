@@ -107,21 +107,24 @@ def cover_of(lines: Lines, road: Road, seen: Pixels) -> Cover:
     strip.add_((t1 * seen.right_per_column).abs_()).clamp_(min=1e-4)
     share = strip.reciprocal()
 
-    def band(middle: float, width: float) -> Tensor:
-        """Width of a band's overlap with the strip [m]."""
-        overlap = (t - middle).abs_().neg_().add_(0.5 * width).add_(strip, alpha=0.5)
-        return overlap.clamp_(min=0.0).minimum(strip.clamp(max=width))
+    def band(middle: float, reach: Tensor, most: Tensor) -> Tensor:
+        """Width of a band's overlap with the strip [m]; `reach` is half of both, `most` the less of both."""
+        distance = (t - middle).abs_()
+        overlap = torch.sub(reach, distance, out=distance).clamp_(min=0.0)
+        return torch.minimum(overlap, most, out=overlap)
 
     left, *inner, right = road.edges
-    surface = band(road.middle, right - left + LINE_WIDTH)
+    whole = right - left + LINE_WIDTH
+    line = (0.5 * strip).add_(0.5 * LINE_WIDTH), strip.clamp(max=LINE_WIDTH)
+    surface = band(road.middle, (0.5 * strip).add_(0.5 * whole), strip.clamp(max=whole))
     white = torch.zeros_like(t)
     if inner:
         for edge in inner:
-            white += band(edge, LINE_WIDTH)
+            white += band(edge, *line)
         s = torch.addcmul(s1, s2, seen.right).mul_(seen.right).add_(s0)
         white *= _dashes(s, t1 * seen.forward_per_row)
-    white += band(right, LINE_WIDTH)
-    return Cover(surface.mul_(share), white.mul_(share), band(left, LINE_WIDTH).mul_(share))
+    white += band(right, *line)
+    return Cover(surface.mul_(share), white.mul_(share), band(left, *line).mul_(share))
 
 
 def _dashes(s: Tensor, length: Tensor) -> Tensor:
