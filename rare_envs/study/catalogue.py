@@ -35,8 +35,8 @@ def catalogue() -> dict[str, Any]:
     """Everything that can be named on the command line, as JSON-ready values.
 
     Returns:
-        "environments" (id to parameters, bases, drivers and what learned drivers add to x, with their noise and for an
-        episode of the usual length), "methods", "egos", "drivers", "measures".
+        "environments" (id to parameters, vehicles, bases, drivers and what learned drivers add to x, with their noise
+        and for an episode of the usual length), "methods", "egos", "drivers", "measures".
     """
     environments = {
         env_id: {
@@ -51,6 +51,7 @@ def catalogue() -> dict[str, Any]:
                 }
                 for parameter in scenario.parameters
             ],
+            "vehicles": list(scenario.vehicle_names),
             "bases": list(scenario.bases),
             "drivers": scenario.drivers,
             "of_learned_drivers": [

@@ -31,6 +31,7 @@ def print_catalogue(entries: dict[str, Any]) -> None:
             name = each["name"] if each["size"] == 1 else f"{each['name']} ({each['size']} values)"
             table.add_row(name, each["unit"], f"{each['low']:g} to {each['high']:g}", each["meaning"])
         console.print(table)
+        console.print(f"  vehicles, each of which can be an agent: {', '.join(environment['vehicles'])}")
         console.print(f"  base distributions: {', '.join(environment['bases'])}, or your own JSON file")
         around = environment["drivers"] or "a script, unless told otherwise"
         console.print(f"  drivers around the ego: {around}")

@@ -231,6 +231,7 @@ def test_list_shows_what_there_is(cli: Cli) -> None:
         assert name in shown
     for env_id, environment in entries["environments"].items():
         space = rare_envs.DrivingProblem(env_id).space
+        assert environment["vehicles"] == rare_envs.parallel_env(env_id).possible_agents
         listed = environment["parameters"]
         sizes = [each["size"] for each in listed]
         assert [each["name"] for each in listed] == list(space.names[: len(listed)])

@@ -20,10 +20,10 @@ FOLLOWING = "rare_envs/CarFollowing-v0"
 @pytest.mark.parametrize("kwargs", [{}, {"observation": "kinematics", "action": "meta"}], ids=["continuous", "meta"])
 def test_rows_are_the_agents_of_the_parallel_environment(env_id, kwargs):
     """The same scenarios and actions give the same observations, rewards and ends, row by row, to the last bit."""
-    batch = AgentsVectorEnv(env_id, 3, horizon=3.0, drivers="idm", **kwargs)
+    batch = AgentsVectorEnv(env_id, 3, horizon=2.0, drivers="idm", **kwargs)
     batch.action_space.seed(0)
     observation, _ = batch.reset(seed=0)
-    several = [rare_envs.parallel_env(env_id, horizon=3.0, drivers="idm", **kwargs) for _ in range(3)]
+    several = [rare_envs.parallel_env(env_id, horizon=2.0, drivers="idm", **kwargs) for _ in range(3)]
     names, n = several[0].possible_agents, len(several[0].possible_agents)
     x = batch._x.copy()
     for env, row in zip(several, x, strict=True):
