@@ -104,7 +104,7 @@ def frames_of(given: spaces.Space[Any], wanted: Any) -> tuple[int, bool] | None:
         return None
     shape = tuple(wanted.shape)
     straight = stacking(given.shape, shape)
-    if straight is None and given.dtype == np.uint8 and len(shape) == 3:  # SB3 transposes images by itself
+    if straight is None and given.dtype == wanted.dtype == np.uint8 and len(shape) == 3:  # SB3 transposes by itself
         return stacking(given.shape, (*shape[1:], shape[0]))
     return straight
 

@@ -144,6 +144,13 @@ def space_of(world: World, base: Distribution) -> ScenarioSpace:
     if world.keys:
         parameters.append(Parameter("camera_noise", "", -np.inf, np.inf, "from which the noise of all pixels follows"))
         laws.append(NoiseLaw(1))
+    names = [p.name for p in parameters]
+    twice = {name for name in names if names.count(name) > 1}
+    if twice:
+        raise ValueError(
+            f"{world.scenario.name} has parameters of its own named {', '.join(sorted(twice))}, as weather or drivers "
+            "have; rename them."
+        )
     return ScenarioSpace(
         names=tuple(p.name for p in parameters),
         units=tuple(p.unit for p in parameters),

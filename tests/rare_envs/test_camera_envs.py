@@ -15,6 +15,7 @@ from stable_baselines3.common.vec_env import VecFrameStack
 
 import rare_envs
 from rare_envs.camera import Camera
+from rare_envs.envs.agents import AgentsVectorEnv
 from rare_envs.mixed import each, read_kinds
 from rare_envs.policies import frames_of
 from rare_envs.problem import CAMERA_TILE
@@ -167,6 +168,30 @@ def test_a_camera_on_every_agent() -> None:
     red = {agent: (p[:, :, 0] > 2.5 * p[:, :, 1].astype(float)).sum() for agent, p in pictures.items()}
     assert red["ego"] > 20  # the cutter, vehicle 1, is red for everybody else
     assert red["cutter"] == red["lead"] == 0
+
+
+def test_a_batch_of_agents_that_see() -> None:
+    """Rows of agents that share a policy: what each sees in its place, also at the end of an episode."""
+    settings: dict[str, Any] = {"observation": "camera+features", "camera": SMALL, "horizon": 0.2}
+    batch, env = AgentsVectorEnv(CUT_IN, 2, **settings), rare_envs.parallel_env(CUT_IN, **settings)
+    x = batch.space.sample(2, np.random.default_rng(0))
+    seen, _ = batch.reset(options={"x": x})
+    assert batch.observation_space.contains(seen)
+    alone, _ = env.reset(options={"x": x[1]})
+    for number, agent in enumerate(env.agents):
+        each(np.testing.assert_array_equal, each(lambda part, row=3 + number: part[row], seen), alone[agent])
+    for _ in range(2):
+        seen, _, _, truncated, infos = batch.step(np.zeros((batch.num_envs, 2)))
+        alone, *_ = env.step(dict.fromkeys(env.agents, np.zeros(2)))
+    assert truncated.all()
+    for number, agent in enumerate(env.possible_agents):
+        each(np.testing.assert_array_equal, infos["final_obs"][3 + number], alone[agent])
+
+
+def test_a_network_that_does_not_transpose_is_not_taken_for_one_that_does() -> None:
+    image = spaces.Box(0, 255, (*SMALL, 3), np.uint8)
+    assert frames_of(image, spaces.Box(-np.inf, np.inf, (3, *SMALL))) is None  # an .onnx file's
+    assert frames_of(image, spaces.Box(-np.inf, np.inf, (*SMALL, 3))) == (1, False)
 
 
 def test_an_ego_for_other_pictures_is_refused() -> None:
