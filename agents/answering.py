@@ -13,7 +13,7 @@ from gymnasium import spaces
 
 from agents import wire
 from agents.wire import Malformed, Message
-from rare_envs.faults import reason_of
+from rare_envs.faults import EgoGone, reason_of
 
 MAX_PEERS, MAX_SESSIONS = 64, 64
 """How many are remembered; the one unused for longest makes room."""
@@ -182,7 +182,7 @@ class Answerer:
             if action.shape[:1] != (session.batch,):
                 raise ValueError(f"Expected actions for {session.batch} rows, got shape {action.shape}.")
             packed = wire.pack_array(action)
-        except (Exception, SystemExit) as error:  # the ego is the user's: anything may happen in it
+        except (Exception, SystemExit, EgoGone) as error:  # the ego is the user's: anything may happen in it
             peer.sessions.pop(number, None)
             raise Refused("ego", reason_of(error)) from error
         session.state, session.step = state, session.step + 1

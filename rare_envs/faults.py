@@ -11,8 +11,11 @@ FloatArray = NDArray[np.float64]
 ON_ERROR = ("raise", "failure", "bound")
 
 
-class EgoGone(RuntimeError):
-    """The ego cannot be asked any more, whatever the scenario."""
+class EgoGone(BaseException):
+    """The ego cannot be asked any more, whatever the scenario.
+
+    Like KeyboardInterrupt it is no `Exception`: nobody who makes the best of failing scenarios may take it for one.
+    """
 
 
 class EgoFault(ValueError):

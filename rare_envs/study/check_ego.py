@@ -141,7 +141,7 @@ def findings_of(asked: Asked) -> Iterator[Finding | str]:
         yield passed("loading", f"{type(ego).__name__}" if not isinstance(ego, str) else ego)
         problem = DrivingProblem(asked.env_id, ego=ego, observation=asked.observation, action=asked.action)
         probe = Probe.of(ego, problem)
-    except (Exception, SystemExit) as error:  # the ego is the user's: anything may happen in it
+    except (Exception, SystemExit, EgoGone) as error:  # the ego is the user's: anything may happen in it
         yield failed("loading", reason_of(error), "see docs/egos.md for what an ego is")
         return
     for check in CHECKS if probe.policy is not None else (drives,):

@@ -15,6 +15,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 from typer.core import TyperGroup
 
+from rare_envs.faults import EgoGone
 from rare_envs.study.checks import BadInput
 
 DOUBTFUL = 3
@@ -32,7 +33,7 @@ class OneLineErrors(TyperGroup):
         except _UsageError as error:
             words = getattr(error, "format_message")()  # noqa: B009  (its class differs by version)
             _fail(f"{words.rstrip('.')}{'' if words.endswith('?') else '.'} See rare-envs --help.")
-        except BadInput as error:
+        except (BadInput, EgoGone) as error:
             _fail(str(error))
         except (KeyboardInterrupt, typer.Abort):
             print("stopped", file=sys.stderr)

@@ -225,8 +225,8 @@ def _try_ego(problem: rare_envs.DrivingProblem) -> None:
             first.state.heading, again.state.heading
         )
         problem.varies = problem.varies or not same
-    except (Exception, SystemExit) as error:  # the ego is the user's: anything may happen in it
-        words = str(error) if isinstance(error, Exception) else ""
+    except (Exception, SystemExit, EgoGone) as error:  # the ego is the user's: anything may happen in it
+        words = "" if isinstance(error, SystemExit) else str(error)
         raise BadInput(f"The ego fails on its first observation: {words or repr(error)}") from error
 
 

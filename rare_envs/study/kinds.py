@@ -12,6 +12,7 @@ import numpy as np
 import samplers
 from rare_envs import DrivingProblem
 from rare_envs.crashes import describe
+from rare_envs.faults import EgoGone
 
 LOOKED_AT = 10_000
 """Failing points that are driven again, evenly spaced among all."""
@@ -49,7 +50,7 @@ def look_again(problem: DrivingProblem, estimate: samplers.Estimate) -> Kinds:
     try:
         crashes = problem.crashes(estimate.failures.x[known])
         shares = {} if estimate.sample is None else estimate.shares(problem.crash_kinds, LOOKED_AT)
-    except Exception as error:  # the ego is the user's, and need not do again what it did before
+    except (Exception, SystemExit, EgoGone) as error:  # the ego is the user's, and need not do again what it did before
         return Kinds(unknown=f"{type(error).__name__}: {error}")
     row = np.cumsum(known) - 1
     listed = (describe(crashes, int(at)) if one else None for at, one in zip(row, known, strict=True))

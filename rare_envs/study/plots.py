@@ -13,6 +13,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
 
+from rare_envs.faults import EgoGone, reason_of
 from rare_envs.road import Road
 from rare_envs.space import ScenarioSpace
 from rare_envs.state import VEHICLE_LENGTH, VEHICLE_WIDTH
@@ -58,14 +59,24 @@ def save_plot(path: Path, report: Report) -> None:
         figure.suptitle(_headline(report), fontsize=12, fontweight="bold")
         draw_convergence(left.subplots(), report)
         draw_failures(middle.subplots(), report.study.problem.space, report.estimate.failures)
-        failures = report.estimate.failures
-        driven = np.flatnonzero(~np.isnan(failures.f))  # scenarios on which the ego failed cannot be driven again
-        if len(driven):
-            drive = replay(report.study.problem, failures.x[driven[0]])
-            draw_drive(list(right.subplots(MOMENTS + 1, height_ratios=[view] * MOMENTS + [CURVES])), drive)
+        drive = _likeliest_drive(report)
+        if isinstance(drive, str):
+            _say(right.subplots(), drive)
         else:
-            _say(right.subplots(), "no failure found that can be shown")
+            draw_drive(list(right.subplots(MOMENTS + 1, height_ratios=[view] * MOMENTS + [CURVES])), drive)
         figure.savefig(path, dpi=120)
+
+
+def _likeliest_drive(report: Report) -> Replay | str:
+    """The likeliest failure driven again, or why it cannot be shown."""
+    failures = report.estimate.failures
+    driven = np.flatnonzero(~np.isnan(failures.f))  # not those on which the ego failed
+    if not len(driven):
+        return "no failure found that can be shown"
+    try:
+        return replay(report.study.problem, failures.x[driven[0]])
+    except (Exception, SystemExit, EgoGone) as error:  # the ego is the user's, and need not do again what it did before
+        return f"the failure cannot be shown: {reason_of(error)}"
 
 
 def _view_height(road: Road) -> float:

@@ -112,6 +112,10 @@ def test_nobody_is_asked_again_once_the_ego_is_gone(x: np.ndarray) -> None:
     with pytest.raises(EgoGone):
         FaultTolerant(problem(Coasting(gone)), "bound").evaluate(x)
     assert len(calls) == 1
+    for tolerant in (problem(Coasting(gone)), FaultTolerant(problem(Coasting(gone)), "bound")):
+        with pytest.raises(EgoGone, match="not there"):
+            samplers.estimate(tolerant, samplers.MonteCarlo(), gamma=3.0, max_sim=300, seed=0, on_error="bound")
+    assert len(calls) == 3
 
 
 def test_faults_widen_the_interval_by_both_extremes() -> None:
