@@ -1,6 +1,6 @@
 """The ground: verges, road surface and lane lines, each with the part of a pixel's footprint that it covers.
 
-Each row of pixels looks at a straight line across the vehicle's heading. Along it the road's own coordinates are
+Each row of pixels looks at a straight line across the camera's heading. Along it the road's own coordinates are
 smooth, so they are found exactly at three points near the road and by a parabola in between.
 """
 
@@ -46,7 +46,7 @@ class Lines(NamedTuple):
     t: tuple[Tensor, Tensor, Tensor]
     """Likewise of the place to the right of the reference line."""
     turn: Tensor
-    """Sine of the vehicle's heading relative to the road there."""
+    """Sine of the camera's heading relative to the road there."""
 
 
 def road_lines(view: View, road: Road, seen: Pixels) -> Lines:
@@ -122,7 +122,7 @@ def cover_of(lines: Lines, road: Road, seen: Pixels) -> Cover:
         for edge in inner:
             white += band(edge, *line)
         s = torch.addcmul(s1, s2, seen.right).mul_(seen.right).add_(s0)
-        white *= _dashes(s, t1 * seen.forward_per_row)
+        white *= _dashes(s, (t1 * seen.forward_per_row).addcmul(lines.turn, seen.right_per_row, value=-1.0))
     white += band(right, *line)
     return Cover(surface.mul_(share), white.mul_(share), band(left, *line).mul_(share))
 

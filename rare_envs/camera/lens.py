@@ -14,7 +14,7 @@ SIGHT = 2000.0
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera that looks ahead along a vehicle's heading; pixels are square.
+    """A pinhole camera on a vehicle, level across its line of sight; pixels are square.
 
     66 x 200 is what PilotNet takes (Bojarski et al. 2016). The mount is behind the windscreen of a car of 1.5 m; field
     of view and pitch show the ground from 4.3 m ahead, and put the horizon at three tenths of the picture.
@@ -38,6 +38,10 @@ class Camera:
     """Above the ground [m]."""
     mount_ahead: float = 0.5
     """Ahead of the vehicle's middle [m]."""
+    mount_right: float = 0.0
+    """To the right of the vehicle's middle [m]."""
+    yaw: float = 0.0
+    """By which it looks to the right of the vehicle's heading [rad]. The own body is not drawn."""
 
     def __post_init__(self) -> None:
         for name in ("height", "width"):
@@ -49,6 +53,8 @@ class Camera:
             ("pitch", -math.pi / 2, math.pi / 2),
             ("mount_height", 0.0, 100.0),
             ("mount_ahead", -10.0, 10.0),
+            ("mount_right", -10.0, 10.0),
+            ("yaw", -2 * math.pi, 2 * math.pi),
         ):
             value: object = getattr(self, name)
             if not isinstance(value, int | float) or isinstance(value, bool) or not low < value < high:
@@ -79,10 +85,10 @@ def find_camera(camera: object) -> Camera:
 
 
 class Pixels(NamedTuple):
-    """What the H x W pixels of a camera see, in its vehicle's frame (forward, right, up) with the camera as origin.
+    """What the H x W pixels of a camera see, in a level frame (forward, right, up) with the camera as origin.
 
     Ground is seen by the last R of the H rows. As the camera does not roll, each of these looks at a straight line
-    across the vehicle's heading.
+    across its heading.
     """
 
     ray: Tensor

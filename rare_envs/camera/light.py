@@ -36,7 +36,7 @@ class Light(NamedTuple):
     fog: Tensor
     """Extinction coefficient [1/m], shape (T,)."""
     sun: Tensor
-    """Direction of the sun in the camera's frame (forward, right, up), shape (T, 3)."""
+    """Direction of the sun in the camera's level frame (forward, right, up), shape (T, 3)."""
     direct: Tensor
     """Light of the sun on a surface that faces it, shape (T,)."""
     diffuse: Tensor

@@ -71,11 +71,14 @@ def _rows(fields: Any, part: slice) -> Any:
 def _scene(state: State, road: Road, sight: Sight, seen: Pixels) -> Scene:
     """Place vehicles, light and road in the frames of the cameras."""
     x, y, heading = road.to_world(state.x, state.y, state.heading)
-    cos, sin = torch.cos(heading[:, :1]), torch.sin(heading[:, :1])
-    camera_x, camera_y = x[:, :1] + sight.camera.mount_ahead * cos, y[:, :1] + sight.camera.mount_ahead * sin
-    dx, dy, turn = x - camera_x, y - camera_y, (heading - heading[:, :1]).float()
+    own, camera = heading[:, :1], sight.camera
+    cos, sin, ahead, right = torch.cos(own), torch.sin(own), camera.mount_ahead, camera.mount_right
+    camera_x, camera_y = x[:, :1] + ahead * cos - right * sin, y[:, :1] + ahead * sin + right * cos
+    gaze = own + camera.yaw
+    cos, sin = torch.cos(gaze), torch.sin(gaze)
+    dx, dy, turn = x - camera_x, y - camera_y, (heading - gaze).float()
     boxes = Boxes((dx * cos + dy * sin).float(), (dy * cos - dx * sin).float(), torch.cos(turn), torch.sin(turn))
-    view = View(camera_x[:, 0], camera_y[:, 0], heading[:, 0])
+    view = View(camera_x[:, 0], camera_y[:, 0], gaze[:, 0])
     return Scene(boxes, light_of(sight.weather, view.heading), road_lines(view, road, seen))
 
 

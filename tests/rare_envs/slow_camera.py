@@ -76,7 +76,9 @@ def picture(
     placed = [slow.world(*vehicle) for vehicle in vehicles]
     x, y, heading = placed[seen_from]
     eye = np.array((x + camera.mount_ahead * math.cos(heading), y + camera.mount_ahead * math.sin(heading), 0.0))
+    eye += camera.mount_right * np.array((-math.sin(heading), math.cos(heading), 0.0))
     eye[2] = camera.mount_height
+    heading += camera.yaw
     ahead, up = np.array((math.cos(heading), math.sin(heading), 0.0)), np.array((0.0, 0.0, 1.0))
     right = np.array((-math.sin(heading), math.cos(heading), 0.0))
     axis = math.cos(camera.pitch) * ahead - math.sin(camera.pitch) * up

@@ -54,7 +54,7 @@ def pinhole(camera: Camera, forward: float, right: float, up: float) -> tuple[fl
 @pytest.mark.parametrize(
     ("x", "y", "heading"), [(12.0, 0.0, 0.0), (30.0, 4.0, 0.0), (15.0, -3.5, 0.3), (60.0, 1.0, -0.2), (9.0, 3.0, 0.1)]
 )
-@pytest.mark.parametrize("camera", [LARGE, Camera(400, 600, 1.4, -0.02, 1.1, 1.5)], ids=["usual", "other"])
+@pytest.mark.parametrize("camera", [LARGE, Camera(400, 600, 1.4, -0.02, 1.1, 1.5, -0.4, 0.15)], ids=["usual", "other"])
 def test_a_body_is_where_its_projected_corners_are(x: float, y: float, heading: float, camera: Camera) -> None:
     far = [-500.0, 0.0, 0.0]
     with_it = shot([[0.0, 0.0, 0.0], [x, y, heading]], straight(3), camera)
@@ -64,7 +64,9 @@ def test_a_body_is_where_its_projected_corners_are(x: float, y: float, heading: 
     for along, across, up in np.ndindex(2, 2, 2):
         dx, dy = (along - 0.5) * VEHICLE_LENGTH, (across - 0.5) * VEHICLE_WIDTH
         forward = x + dx * math.cos(heading) - dy * math.sin(heading) - camera.mount_ahead
-        corners.append(pinhole(camera, forward, y + dx * math.sin(heading) + dy * math.cos(heading), up * HEIGHT))
+        right = y + dx * math.sin(heading) + dy * math.cos(heading) - camera.mount_right
+        cos, sin = math.cos(camera.yaw), math.sin(camera.yaw)
+        corners.append(pinhole(camera, forward * cos + right * sin, right * cos - forward * sin, up * HEIGHT))
     sides = ConvexHull(np.array(corners)).equations  # a point is inside where all sides @ (column, row, 1) < 0
     row, column = np.indices(seen.shape) + 0.5
     outside = (sides @ np.stack((column, row, np.ones_like(row))).reshape(3, -1)).max(axis=0).reshape(seen.shape)
@@ -127,6 +129,8 @@ SCENES = [
     (i80(), Camera(16, 44), (0.005, 0.1, -0.1)),
     (i80(), Camera(20, 30, 1.2, -0.05, 1.6, 1.0), (1e-3, 1.2, -2.0)),
     (BEND, Camera(16, 44), (1e-4, 0.5, 1.0)),
+    (i80(), Camera(16, 44, pitch=0.12, mount_right=-1.1, yaw=0.6), (1e-3, 0.7, -1.0)),
+    (i80(), Camera(14, 40, mount_ahead=-2.0, mount_right=0.5, yaw=-2.9), (5e-3, 0.3, 1.0)),
 ]
 
 
@@ -210,6 +214,7 @@ def test_colours_are_red_green_blue() -> None:
         ({"field_of_view": 4.0}, "field_of_view"),
         ({"pitch": 2.0}, "pitch"),
         ({"mount_height": float("nan")}, "mount_height"),
+        ({"yaw": 90.0}, "yaw"),
     ],
 )
 def test_an_impossible_camera_is_refused(settings: dict[str, float], words: str) -> None:

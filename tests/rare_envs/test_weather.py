@@ -1,6 +1,7 @@
 """Weather: its laws, what it does to pictures, and that all of it is in x."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -13,12 +14,15 @@ from torch import Tensor
 
 import rare_envs
 import samplers
+from rare_envs.bases import load_base
 from rare_envs.blocks import beside
 from rare_envs.camera import Camera, Sight, Weather, take_picture
 from rare_envs.camera.grain import grain
 from rare_envs.camera.weather import CONDITIONS, FOG_LAW, SENSOR_NOISE, SENSOR_NOISE_LAW, SUN_LAW
 from rare_envs.road import straight
+from rare_envs.setup import find_scenario, space_of
 from rare_envs.state import State
+from rare_envs.world import World
 
 CUT_IN, HIGHWAY = "rare_envs/CutIn-v0", "rare_envs/Highway-v0"
 LAWS = [FOG_LAW, SUN_LAW, SENSOR_NOISE_LAW]
@@ -178,6 +182,16 @@ def test_on_the_highway_weather_stands_before_the_drivers_and_all_noise_behind()
     np.testing.assert_allclose(episode.sight.weather.fog, parts["fog"], rtol=1e-6)
     np.testing.assert_allclose(torch.rad2deg(episode.sight.weather.sun_azimuth), parts["sun_azimuth"], rtol=1e-6)
     np.testing.assert_allclose(episode.sight.weather.noise, parts["sensor_noise"], rtol=1e-6)
+
+
+def test_a_scenario_with_fog_of_its_own_has_to_rename_it() -> None:
+    scenario = find_scenario(CUT_IN)
+    first = replace(scenario.parameters[0], name="fog")
+    foggy = replace(scenario, parameters=(first, *scenario.parameters[1:]))
+    base = load_base(scenario, None)
+    assert "fog" in space_of(World(foggy), base).names
+    with pytest.raises(ValueError, match="fog"):
+        space_of(World(foggy, weather=True), base)
 
 
 def test_weather_is_a_reset_option() -> None:
