@@ -154,8 +154,8 @@ class PolicyDriver:
     def act(self, episode: "Episode", memory: Any) -> tuple[Tensor, Any]:
         """Observe, and ask the policy for its mean action; a recurrent policy's hidden state is the memory.
 
-        No episode shows a policy what comes after its collision, so those rows are shown zeros and their actions,
-        which need not be finite, are ignored. So it is with rows that are lost.
+        No episode shows a policy what comes after its collision, so those rows are shown what another row sees, and
+        their actions are ignored. So it is with rows that are lost.
 
         Raises:
             ValueError: If the policy's actions are not finite or have the wrong shape, and rows cannot be lost.
@@ -169,12 +169,15 @@ class PolicyDriver:
             over = over.clone()
             over[list(self.lost)] = True
         seen = observe(episode, self.observation)
-        observation = each(lambda part: _blank(part, over).numpy(force=True), seen)
+        observation = each(lambda part: _replaced(part, over).numpy(force=True), seen)
         start = np.full(batch, memory is None)
         given, hidden = ask(self.policy, self.action, Asked(observation, hidden, start, over), self.lost)
         return given.to(state.x) if given.is_floating_point() else given, (hidden, tick + 1)
 
 
-def _blank(observation: Tensor, rows: Tensor) -> Tensor:
-    """An observation with zeros in some rows."""
-    return observation.masked_fill(rows.view(-1, *[1] * (observation.ndim - 1)), 0)
+def _replaced(observation: Tensor, rows: Tensor) -> Tensor:
+    """An observation with what the first other row sees in some rows; zeros if there is no other."""
+    wide = rows.view(-1, *[1] * (observation.ndim - 1))
+    if bool(rows.all()):
+        return observation.masked_fill(wide, 0)
+    return torch.where(wide, observation[int((~rows).int().argmax())], observation)

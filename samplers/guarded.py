@@ -31,13 +31,16 @@ class Guarded:
         """Simulate the rows of x (n, d); return f, shape (n,), NaN for rows on which it raised.
 
         Raises:
-            EvaluationError: If f raises (on_error "raise") or has the wrong shape.
+            EvaluationError: If f raises (on_error "raise") or has the wrong shape. An error of f's with a true attribute
+                `final` is passed on as it is.
         """
         try:
             return self._call(x)
         except EvaluationError:
             raise
         except Exception as error:
+            if _is_final(error):
+                raise
             if self._on_error == "raise":
                 self._raise_named(x, error)
             return self._by_halves(x)
@@ -56,7 +59,9 @@ class Guarded:
                 parts.append(self._call(half))
             except EvaluationError:
                 raise
-            except Exception:
+            except Exception as error:
+                if _is_final(error):
+                    raise
                 parts.append(self._by_halves(half))
         return np.concatenate(parts)
 
@@ -78,6 +83,11 @@ class Guarded:
         except Exception as error:
             return error
         return None
+
+
+def _is_final(error: Exception) -> bool:
+    """Return whether f says that asking again is of no use: it has done so, or there is nobody to ask."""
+    return bool(getattr(error, "final", False))
 
 
 def _kind(error: Exception) -> str:

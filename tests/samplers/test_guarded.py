@@ -81,3 +81,19 @@ def test_rows_that_raise_get_nan_and_rows_handed_over_again_are_counted(on_error
     guarded = Guarded(raises_at_two, on_error)
     np.testing.assert_array_equal(guarded.evaluate(X), [1.0, 3.0, np.nan, 4.0, -1.0])
     assert guarded.n_retried == 5 + 3  # 5 -> 3 + 2; 3 -> 2 + 1
+
+
+@pytest.mark.parametrize("on_error", ["raise", "failure"])
+def test_a_final_error_is_passed_on_at_once(on_error):
+    class Gone(RuntimeError):
+        final = True
+
+    calls = []
+
+    def f(x):
+        calls.append(len(x))
+        raise Gone("nobody is there")
+
+    with pytest.raises(Gone, match="nobody is there"):
+        Guarded(f, on_error).evaluate(np.zeros((8, 2)))
+    assert calls == [8]

@@ -95,11 +95,11 @@ def test_a_wrong_command_is_one_line(cli: Cli, words: list[str]) -> None:
 
 @pytest.mark.parametrize(("ego", "said"), [("nan_when_close", "NaN"), ("exiting_when_close", "SystemExit(7)")])
 def test_an_ego_that_fails_on_the_way_is_one_line(cli: Cli, here: Path, risky: str, ego: str, said: str) -> None:
-    words = ("--base", risky, "--ego", f"egos_here:{ego}", "--out")
-    assert_refused(cli(*SMALL, *words, here / "new" / "run"), said)
+    words = (*SMALL[:-1], 300, "--base", risky, "--ego", f"egos_here:{ego}", "--out")
+    assert_refused(cli(*words, here / "new" / "run"), said)
     assert not (here / "new").exists()
     (here / "old").mkdir()
-    assert_refused(cli(*SMALL, *words, here / "old"), said)
+    assert_refused(cli(*words, here / "old"), said)
     assert (here / "old").exists()
 
 
