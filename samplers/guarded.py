@@ -31,7 +31,7 @@ class Guarded:
         """Simulate the rows of x (n, d); return f, shape (n,), NaN for rows on which it raised.
 
         Raises:
-            EvaluationError: If f raises (on_error "raise") or has the wrong shape. An error of f's with a true attribute
+            EvaluationError: If f raises (on_error "raise") or has the wrong shape. An error with a true attribute
                 `final` is passed on as it is.
         """
         try:
