@@ -20,6 +20,7 @@ from rare_envs.faults import FaultTolerant, reason_of
 from rare_envs.mixed import batch_size, each, kinds_of
 from rare_envs.observation import observe, space_of_observations
 from rare_envs.policies import frames_of
+from rare_envs.rollout import drive
 from rare_envs.study.findings import Finding, failed, passed, warned
 
 ROWS = 32
@@ -50,7 +51,7 @@ class Probe:
         """Take observations."""
         x = problem.base.sample(ROWS, np.random.default_rng(0))
         with torch.inference_mode():
-            start = problem.world.start(torch.from_numpy(x).float())
+            start = next(drive(problem.world, problem.driver, torch.from_numpy(x).float()))
             seen = each(torch.Tensor.numpy, observe(start, problem.world.observation))
         return cls(ego, problem, seen)
 

@@ -183,8 +183,11 @@ def test_a_good_ego_passes(broken: str, ego: str) -> None:
     assert ("none" in result["memory"].found) == (ego == "good")
 
 
-def test_egos_without_predict_are_driven_only() -> None:
-    assert findings("idm")["driving"].status == "pass"
+@pytest.mark.parametrize("ego", ["idm", "noisy:idm", "bc"])
+def test_egos_without_predict_are_driven_only(ego: str) -> None:
+    result = findings(ego)
+    assert result["driving"].status == "pass"
+    assert {each.status for each in result.values()} == {"pass"}
 
 
 @pytest.mark.parametrize("ego", ["dying", pytest.param("hanging", marks=pytest.mark.slow)])
