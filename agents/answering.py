@@ -166,9 +166,7 @@ class Answerer:
         session = peer.sessions.get(number) if wire.is_count(number) else None
         if number is None or session is None or step != session.step or isinstance(step, bool):
             raise Refused("session", "Unknown session or another step; reset it and send its observations again.")
-        observation = wire.unpack_array(message.get("observation"))
-        if observation.ndim < 2 or len(observation) != session.batch:
-            raise Malformed(f"expected observations of {session.batch} rows, got shape {observation.shape}")
+        observation = wire.unpack_observation(message.get("observation"), session.batch)
         start = np.full(session.batch, session.step == 0)
         if message.get("start") is not None:
             given = wire.unpack_array(message["start"])
@@ -199,6 +197,8 @@ def describe(space: Any) -> Message | None:
     """A space in the words of the protocol; None for one it has no words for."""
     if isinstance(space, spaces.Discrete):
         return {"n": int(space.n)}
+    if isinstance(space, spaces.Dict):
+        return {"parts": {name: describe(part) for name, part in space.items()}}
     if isinstance(space, spaces.Box):
         described: Message = {"shape": list(space.shape)}
         if space.low.size <= 1024:
@@ -216,6 +216,9 @@ def read_space(given: Any) -> spaces.Space[Any] | None:
     if given is None:
         return None
     try:
+        if "parts" in given:
+            parts = {name: read_space(part) for name, part in given["parts"].items()}
+            return spaces.Dict({name: part for name, part in parts.items() if part is not None})
         if "n" in given:
             return spaces.Discrete(int(given["n"]))
         shape = tuple(int(size) for size in given["shape"])

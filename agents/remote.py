@@ -15,6 +15,7 @@ from agents import wire
 from agents.answering import read_space
 from agents.wire import Malformed, Message
 from rare_envs.faults import EgoGone
+from rare_envs.mixed import batch_size
 
 TIMEOUT, PATIENCE = 10.0, 30.0
 """Seconds to wait for an answer, and for an ego that has gone to come back."""
@@ -78,7 +79,7 @@ class _Session:
         self.step = 0
         self.epoch = -1
         self.memory = False
-        self.history: list[tuple[NDArray[Any], NDArray[np.bool_] | None]] = []
+        self.history: list[tuple[Any, NDArray[np.bool_] | None]] = []
 
 
 class RemoteEgo:
@@ -140,8 +141,7 @@ class RemoteEgo:
             RemoteError: The ego failed on this batch.
             EgoGone: It is not there any more.
         """
-        observation = np.asarray(observation)
-        session = self._session(len(observation)) if state is None else state
+        session = self._session(batch_size(observation)) if state is None else state
         start = None if episode_start is None or session.step == 0 else np.asarray(episode_start, dtype=bool)
         if start is not None and not start.any():
             start = None
@@ -166,7 +166,7 @@ class RemoteEgo:
         weakref.finalize(session, self._ended.append, session.number)
         return session
 
-    def _act(self, session: _Session, observation: NDArray[Any], start: NDArray[np.bool_] | None) -> NDArray[Any]:
+    def _act(self, session: _Session, observation: Any, start: NDArray[np.bool_] | None) -> NDArray[Any]:
         why = ""
         for _ in range(2):
             try:
@@ -201,14 +201,12 @@ class RemoteEgo:
             self._send_act(session, step, observation, start)
         session.epoch = self._epoch
 
-    def _send_act(
-        self, session: _Session, step: int, observation: NDArray[Any], start: NDArray[np.bool_] | None
-    ) -> Message:
+    def _send_act(self, session: _Session, step: int, observation: Any, start: NDArray[np.bool_] | None) -> Message:
         message: Message = {
             "type": "act",
             "session": session.number,
             "step": step,
-            "observation": wire.pack_array(observation),
+            "observation": wire.pack_observation(observation),
         }
         if start is not None:
             message["start"] = wire.pack_array(start)

@@ -90,6 +90,30 @@ def unpack_array(given: Any) -> NDArray[Any]:
     return np.frombuffer(bytearray(data), dtype=dtype).reshape(shape)  # a bytearray, so that it can be written to
 
 
+def pack_observation(observed: Any) -> Message:
+    """An array, or a mapping from names to arrays as a map with the entry "parts"."""
+    if isinstance(observed, dict):
+        return {"parts": {name: pack_array(np.asarray(part)) for name, part in observed.items()}}
+    return pack_array(np.asarray(observed))
+
+
+def unpack_observation(given: Any, batch: int) -> Any:
+    """The observations in such a map.
+
+    Raises:
+        Malformed: It is not of that form, or not of so many rows.
+    """
+    named = isinstance(given, dict) and set(given) == {"parts"}
+    parts = given["parts"] if named else {"": given}
+    if not isinstance(parts, dict) or not parts or not all(isinstance(name, str) for name in parts):
+        raise Malformed("parts is a map from names to arrays")
+    found = {name: unpack_array(part) for name, part in parts.items()}
+    for part in found.values():
+        if part.ndim < 2 or len(part) != batch:
+            raise Malformed(f"expected observations of {batch} rows, got shape {part.shape}")
+    return found if named else found[""]
+
+
 def is_count(value: object, most: int = MOST) -> TypeGuard[int]:
     """Whether a value is a whole number from 0 to most; a bool is none."""
     return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= most

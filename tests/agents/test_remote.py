@@ -529,3 +529,24 @@ def test_a_served_ego_that_is_killed_and_started_again_loses_nothing(tmp_path: P
             process.kill()
             process.communicate()
     assert len(running) == 2
+
+
+def test_observations_of_several_kinds_travel_by_name(serve: Any, ask: Any) -> None:
+    class Two:
+        observation_space = spaces.Dict(
+            {"near": Braking.observation_space, "far": spaces.Box(0, 255, (2, 3), np.uint8)}
+        )
+
+        def predict(self, observation: Any, **_: Any) -> Any:
+            return np.stack((observation["near"][:, 0], observation["far"].sum(axis=(1, 2))), axis=1), None
+
+    there = ask(serve(Two()).address)
+    assert {name: part.shape for name, part in there.observation_space.items()} == {"near": (7,), "far": (2, 3)}
+    observation = {"near": np.full((2, 7), 0.5, np.float32), "far": np.full((2, 2, 3), 200, np.uint8)}
+    np.testing.assert_array_equal(there.predict(observation)[0], [[0.5, 1200.0], [0.5, 1200.0]])
+    server = Answerer(Two())
+    for message in good_messages()[:2]:
+        server.answer(b"me", [wire.pack(message)])
+    for parts in ({}, [1], {"near": None}, {"near": wire.pack_array(np.zeros((3, 7)))}):
+        bad = {**good_messages()[2], "observation": {"parts": parts}}
+        assert wire.unpack(server.answer(b"me", [wire.pack(bad)])[0])["type"] == "error"
