@@ -17,6 +17,8 @@ LEAST_RATE = 0.1
 LARGEST_TYPICAL = 30.0
 """How many times p a point that the exploration found may weigh as a draw, where the rate is under LEAST_RATE: 1 to 3
 is usual, 17 was seen to do."""
+ABSURD = 1e4
+"""How many times p, whatever the rate: the draws all come from a place where hardly any failure is."""
 LEAST_BUDGET = 300
 """Subset simulation is not worth its draws with less."""
 WORTH = 30.0
@@ -32,7 +34,7 @@ def describes(last: Draws, typical: FloatArray) -> bool:
     """
     if len(last.f) == 0 or last.ess < HOPELESS_RATE * last.n:
         return False
-    return last.ess >= LEAST_RATE * last.n or bool(np.median(typical) <= LARGEST_TYPICAL * last.p)
+    return bool(np.median(typical) <= (ABSURD if last.ess >= LEAST_RATE * last.n else LARGEST_TYPICAL) * last.p)
 
 
 def reconciled(found: Outcome, before: Outcome) -> Outcome:
