@@ -95,7 +95,8 @@ def list_command(as_json: Json = False) -> None:
 def estimate_command(
     env: Env,
     ego: Annotated[
-        str, typer.Option(help="idm, mgail, gail, bc, a driver's, Stable-Baselines3 or .onnx file, or module:function.")
+        str,
+        typer.Option(help="A name, a .zip or .onnx, module:function, tcp://..., noisy:EGO; see rare-envs list."),
     ] = "idm",
     algo: Annotated[str | None, typer.Option(help="Algorithm of the .zip, if the file does not tell.")] = None,
     trust: Trust = False,

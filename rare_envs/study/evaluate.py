@@ -93,6 +93,7 @@ class Report:
         estimate: What the method found.
         seconds: Wall time of the estimation [s].
         faults: Scenarios on which the ego failed twice.
+        n_retried: Simulations that were repeated to find them; not in n_sim.
         kinds: What the failures ended in.
     """
 
@@ -101,6 +102,7 @@ class Report:
     seconds: float
     faults: tuple[Fault, ...] = ()
     kinds: Kinds = field(default_factory=Kinds)
+    n_retried: int = 0
 
     @property
     def doubtful(self) -> bool:
@@ -156,6 +158,7 @@ class Report:
             "kinds": {kind: share.to_dict() for kind, share in self.kinds.shares.items()},
             "failures": ranked,
             "n_faults": len(self.faults),
+            "n_retried": self.n_retried,
             "faults": [
                 {"parameters": self._parameters(fault.x), "reason": fault.reason} for fault in self.faults[:top]
             ],
@@ -260,4 +263,5 @@ def run(study: Study, progress: bool | Callable[[samplers.Progress], None] = Fal
     except (ValueError, EgoGone) as error:
         raise BadInput(error) from error
     seconds = time.perf_counter() - start
-    return Report(study, estimate, seconds, tuple(problem.faults), look_again(study.problem, estimate))
+    kinds = look_again(study.problem, estimate)
+    return Report(study, estimate, seconds, tuple(problem.faults), kinds, problem.n_retried)

@@ -76,6 +76,7 @@ def print_report(report: Report, out: Path | None = None) -> None:
     if report.faults:
         first = report.faults[0].reason
         console.print(f"  {'faults':<15} the ego failed twice on {len(report.faults)} scenarios; the first: {first}")
+        console.print(f"  {'':<15} {report.n_retried:,} more simulations were made to find them")
     _print_failure(console, report)
     for warning in estimate.warnings:
         console.print(f"warning: {warning}", style="yellow")

@@ -32,6 +32,7 @@ def test_scenarios_on_which_the_ego_fails_are_listed(cli: Cli, here: Path, risky
     assert header == ["ego_speed", "lead_speed", "gap", "reason"]
     assert len(rows) == answer["n_faults"] == answer["n_failures"] > 10  # this ego fails before it collides
     assert all(reason in row[-1] for row in rows)
+    assert answer["n_retried"] >= len(rows)
     assert answer["faults"][0]["parameters"]["gap"] == float(rows[0][2])
     assert answer["p"] == pytest.approx(len(rows) / 400)
     assert found["bound"]["interval"][0] == 0.0
