@@ -88,8 +88,9 @@ def load_ego(spec: str | Path, algo: str | None = None, trust: bool = False) -> 
     if kind == "noisy":
         from agents.noisy import NoisyEgo, Stack
 
-        inner, _, settings = text.removeprefix("noisy:").partition("?")
-        return cast(Ego, NoisyEgo(load_ego(inner, algo, trust), Stack.read(settings)))
+        inner, mark, settings = text.removeprefix("noisy:").rpartition("?")
+        stack = Stack.read(settings if mark else "")
+        return cast(Ego, NoisyEgo(load_ego(inner if mark else settings, algo, trust), stack))
     if kind in ("remote", "process"):
         return _elsewhere(kind, text, algo, trust)
     if kind == "onnx":
@@ -118,6 +119,13 @@ def _elsewhere(kind: Kind, text: str, algo: str | None, trust: bool) -> Ego:
         return connect(text)
     except EgoGone as error:
         raise ValueError(str(error)) from error
+
+
+def innermost(spec: str) -> str:
+    """The ego inside `noisy:` and `process:`, without their settings."""
+    while spec.startswith(("noisy:", "process:")):
+        spec = spec.partition(":")[2].rpartition("?")[0] or spec.partition(":")[2]
+    return spec
 
 
 def kind_of(spec: str) -> Kind:

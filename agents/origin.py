@@ -6,7 +6,7 @@ import os
 import stat
 from pathlib import Path
 
-from agents.ego import kind_of
+from agents.ego import innermost, kind_of
 from agents.saved import find_statistics
 
 CAN_RUN_CODE = (".zip", ".pkl")
@@ -18,8 +18,8 @@ def doubts(spec: str) -> list[str]:
     Args:
         spec: As for `agents.load_ego`.
     """
-    kind = kind_of(spec.removeprefix("process:"))
-    path = Path(spec.removeprefix("process:").partition("?")[0])
+    spec = innermost(spec)
+    kind, path = kind_of(spec), Path(spec)
     if kind == "url":
         return [f"{spec!r} is a remote place"]
     if kind != "zip":

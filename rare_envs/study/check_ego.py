@@ -58,7 +58,7 @@ def check_ego(asked: Asked) -> list[Finding]:
     Raises:
         BadInput: The environment is unknown, or there is no such file.
     """
-    from agents.ego import kind_of
+    from agents.ego import innermost, kind_of
     from agents.origin import doubts
     from rare_envs.setup import find_scenario
 
@@ -68,7 +68,7 @@ def check_ego(asked: Asked) -> list[Finding]:
         raise BadInput(error) from error
     if asked.time_limit <= 0:
         raise BadInput(f"Expected a time limit of some seconds, got {asked.time_limit}.")
-    reasons, kind = doubts(asked.ego), kind_of(asked.ego.removeprefix("process:"))
+    reasons, kind = doubts(asked.ego), kind_of(innermost(asked.ego))
     findings = []
     if reasons and not asked.trust:
         advice = "opening it can run code that others put there; copy it to a place of your own, or say --trust"

@@ -216,12 +216,14 @@ def saved(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("what", ["file", "folder", "statistics"])
 def test_a_zip_that_others_can_write_to_is_refused_unless_trusted(what: str, saved: Path, cli: Cli) -> None:
-    assert doubts(str(saved)) == []
+    wrapped = f"noisy:process:{saved}?timeout=3?lag=1"
+    assert doubts(str(saved)) == doubts(wrapped) == []
     statistics = saved.with_name("vecnormalize.pkl")
     if what == "statistics":
         statistics.write_bytes(b"")
     path = {"file": saved, "folder": saved.parent, "statistics": statistics}[what]
     path.chmod(path.stat().st_mode | 0o002)
+    assert doubts(wrapped) == doubts(str(saved)) != []
     refused = cli("check-ego", saved, ENV, "--json")
     (finding,) = json.loads(refused.stdout)["findings"]
     assert (refused.exit_code, finding["check"], finding["status"]) == (2, "origin", "fail")
