@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Any
 
 import samplers
 from agents.networks import HEAD
 from rare_envs.background import noise_size
+from rare_envs.camera.weather import CONDITIONS, SENSOR_NOISE
 from rare_envs.measures import MEASURES
 from rare_envs.scenarios import SCENARIOS
 
@@ -36,21 +38,12 @@ def catalogue() -> dict[str, Any]:
 
     Returns:
         "environments" (id to parameters, vehicles, bases, drivers and what learned drivers add to x, with their noise
-        and for an episode of the usual length), "methods", "egos", "drivers", "measures".
+        and for an episode of the usual length), "weather" (parameters that `--weather` adds), "methods", "egos",
+        "drivers", "measures".
     """
     environments = {
         env_id: {
-            "parameters": [
-                {
-                    "name": parameter.name,
-                    "unit": parameter.unit,
-                    "low": parameter.low,
-                    "high": parameter.high,
-                    "meaning": parameter.meaning,
-                    "size": parameter.size,
-                }
-                for parameter in scenario.parameters
-            ],
+            "parameters": [asdict(parameter) for parameter in scenario.parameters],
             "vehicles": list(scenario.vehicle_names),
             "bases": list(scenario.bases),
             "drivers": scenario.drivers,
@@ -63,6 +56,7 @@ def catalogue() -> dict[str, Any]:
     }
     return {
         "environments": environments,
+        "weather": [asdict(parameter) for parameter in (*CONDITIONS, SENSOR_NOISE)],
         "methods": {name: _first_line(method) for name, method in samplers.METHODS.items()},
         "egos": EGOS,
         "drivers": DRIVERS,

@@ -26,17 +26,14 @@ def print_catalogue(entries: dict[str, Any]) -> None:
     """Print what `catalogue` gives as tables."""
     console = Console(highlight=False)
     for env_id, environment in entries["environments"].items():
-        table = Table("parameter", "unit", "range", "meaning", title=env_id, title_justify="left", title_style="bold")
-        for each in environment["parameters"]:
-            name = each["name"] if each["size"] == 1 else f"{each['name']} ({each['size']} values)"
-            table.add_row(name, each["unit"], f"{each['low']:g} to {each['high']:g}", each["meaning"])
-        console.print(table)
+        console.print(_parameters(env_id, environment["parameters"]))
         console.print(f"  vehicles, each of which can be an agent: {', '.join(environment['vehicles'])}")
         console.print(f"  base distributions: {', '.join(environment['bases'])}, or your own JSON file")
         around = environment["drivers"] or "a script, unless told otherwise"
         console.print(f"  drivers around the ego: {around}")
         added = ", ".join(f"{each['name']} ({each['size']:,} values)" for each in environment["of_learned_drivers"])
         console.print(f"  learned drivers add: {added}\n")
+    console.print(_parameters("Weather, which --weather adds for egos with a camera", entries["weather"]))
     titles = {
         "methods": "Methods",
         "egos": "Egos",
@@ -48,6 +45,15 @@ def print_catalogue(entries: dict[str, Any]) -> None:
         for name, text in entries[kind].items():
             table.add_row(name, text)
         console.print(table)
+
+
+def _parameters(title: str, parameters: list[dict[str, Any]]) -> Table:
+    """Names, units, ranges and meanings."""
+    table = Table("parameter", "unit", "range", "meaning", title=title, title_justify="left", title_style="bold")
+    for each in parameters:
+        name = each["name"] if each["size"] == 1 else f"{each['name']} ({each['size']} values)"
+        table.add_row(name, each["unit"], f"{each['low']:g} to {each['high']:g}", each["meaning"])
+    return table
 
 
 def print_report(report: Report, out: Path | None = None) -> None:

@@ -56,6 +56,12 @@ def test_weather_on_the_command_line(cli: Cli, tmp_path: Path) -> None:
     assert found["question"]["observation"] == "camera+lidar"
 
 
+def test_the_list_has_the_weather(cli: Cli) -> None:
+    listed = json.loads(cli("list", "--json").stdout)["weather"]
+    assert [each["name"] for each in listed] == ["fog", "sun_elevation", "sun_azimuth", "sensor_noise"]
+    assert "sun_elevation" in cli("list").stdout
+
+
 def test_training_on_pictures(cli: Cli, tmp_path: Path) -> None:
     ego = tmp_path / "sees.zip"
     words = ["train-ego", CUT_IN, "--observation", "camera", "--weather", "--num-envs", "2", "--steps", "8"]
