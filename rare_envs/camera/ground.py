@@ -18,9 +18,9 @@ VERGE: Colour = (0.38, 0.43, 0.25)
 WHITE: Colour = (0.92, 0.92, 0.92)
 YELLOW: Colour = (0.90, 0.72, 0.18)
 LINE_WIDTH = 0.15
-"""Of lane lines [m]: 6 inches, what the MUTCD (2023, section 3A.04) has on freeways."""
+"""Of lane lines [m]: 6 inches, the upper end of a normal line (MUTCD, chapter 3A)."""
 DASH, PERIOD = 3.05, 12.19
-"""Length of a dash and from one to the next [m]: 10 ft lines, 30 ft gaps (MUTCD 2023, section 3A.04)."""
+"""Length of a dash and from one to the next [m]: 10 ft lines, 30 ft gaps (MUTCD, chapter 3A)."""
 _REACH = 15.0
 """From the middle to the outer ones of the three points at which a row's road coordinates are exact, at most [m]."""
 _OFF = 40.0
