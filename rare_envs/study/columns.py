@@ -32,3 +32,8 @@ def columns_of(space: ScenarioSpace) -> list[Column]:
         for name, unit, size in zip(space.names, space.units, space.sizes, strict=True)
         for k in range(size)
     ]
+
+
+def digits(value: float, places: int = 2) -> str:
+    """A value with so many decimal places, or with two digits where these would be zeros (fog is 1e-4 per metre)."""
+    return f"{value:.2g}" if 0.0 < abs(value) < 10.0**-places else f"{value:.{places}f}"

@@ -20,7 +20,7 @@ from rare_envs.envs.rendering import WIDTH, Renderer
 from rare_envs.measures import Moment
 from rare_envs.rollout import drive
 from rare_envs.study.checks import BadInput
-from rare_envs.study.columns import SHOWN
+from rare_envs.study.columns import SHOWN, digits
 from rare_envs.study.evaluate import Question, prepare
 from rare_envs.study.rundir import FAILURES, RESULT, read_failures
 from rare_envs.world import Episode
@@ -178,7 +178,7 @@ def in_words(found: Found, drive: Drive, number: int) -> list[str]:
     for name, values in space.named(found.x).items():
         unit = space.units[space.names.index(name)]
         several = np.atleast_1d(values)
-        shown = " ".join(f"{value:.2f}" for value in several) if len(several) <= SHOWN else f"{len(several)} values"
+        shown = " ".join(map(digits, several)) if len(several) <= SHOWN else f"{len(several)} values"
         lines.append(f"  {name:<15} {shown} {unit}".rstrip())
     end = drive.time(len(drive.episodes) - 1)
     crash = drive.crash

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 import samplers
-from rare_envs.study.columns import SHOWN
+from rare_envs.study.columns import SHOWN, digits
 from rare_envs.study.evaluate import Report
 from rare_envs.study.kinds import NAMES
 from samplers.problem import FloatArray
@@ -143,8 +143,8 @@ def _print_failure(console: Console, report: Report) -> None:
     for j, name in enumerate(space.names):
         if space.sizes[j] <= SHOWN:
             low, high = np.quantile(usual[name], (0.05, 0.95))
-            values = " ".join(f"{value:8.2f}" for value in found[name].flat)
-            console.print(f"    {name:<15} {values} {space.units[j]:<4} [{low:.1f} to {high:.1f}]")
+            values = " ".join(f"{digits(value):>8}" for value in found[name].flat)
+            console.print(f"    {name:<15} {values} {space.units[j]:<4} [{digits(low, 1)} to {digits(high, 1)}]")
         else:
             console.print(f"    {name:<15} {_summary(name, found[name][0], usual[name], normal[name])}")
 
