@@ -17,9 +17,6 @@ class EgoGone(BaseException):
     Like KeyboardInterrupt it is no `Exception`: nobody who makes the best of failing scenarios may take it for one.
     """
 
-    final = True
-    """Asking again is of no use."""
-
 
 class EgoFault(ValueError):
     """The ego has failed on a scenario, twice."""

@@ -10,9 +10,9 @@ from samplers.method import Goal, Outcome, Steps
 from samplers.problem import FloatArray, Inputs
 from samplers.subset import AdaptiveSubsetSimulation
 
-HOPELESS_RATE = 0.02
+HOPELESS_RATE = 0.005
 """What the last round of draws must be worth, in independent failures for each draw. Proposals that come to something
-reach 0.05 to 0.9; with less, the spread of the weights is that of the failures met, not of those that there are."""
+reach 0.01 to 0.9; with less, the spread of the weights is that of the failures met, not of those that there are."""
 LEAST_RATE = 0.1
 LARGEST_TYPICAL = 30.0
 """How many times p a point that the exploration found may weigh as a draw, where the rate is under LEAST_RATE: 1 to 3
