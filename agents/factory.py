@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import importlib
-import os
-import sys
-from collections.abc import Iterator
 from typing import Any
 
 from agents.words import one_line
+from rare_envs.modules import working_directory_first
 from rare_envs.space import did_you_mean
 
 RULE_BASED = "idm"
@@ -44,15 +41,3 @@ def call_factory(spec: str) -> Any:
     if not rule_based and not callable(getattr(ego, "predict", None)):
         raise ValueError(f"Expected {spec!r} to return 'idm' or an object with predict, got {type(ego).__name__}.")
     return ego
-
-
-@contextlib.contextmanager
-def working_directory_first() -> Iterator[None]:
-    """Find modules in the working directory, as `python -m` does and console scripts do not."""
-    here = os.getcwd()
-    sys.path.insert(0, here)
-    try:
-        yield
-    finally:
-        with contextlib.suppress(ValueError):
-            sys.path.remove(here)

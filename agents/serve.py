@@ -51,7 +51,7 @@ class EgoServer:
             self._socket.bind(bind)
         except zmq.ZMQError as error:
             self.close()
-            raise ValueError(f"Cannot listen on {bind!r}: {error}.") from error
+            raise ValueError(f"Cannot listen on {bind!r}: {error}; expected tcp://host:port.") from error
         self.address = self._socket.getsockopt_string(zmq.LAST_ENDPOINT)
 
     def run(self) -> None:

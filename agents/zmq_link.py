@@ -51,7 +51,7 @@ class ZmqLink:
         try:
             self._socket.connect(self._address)
         except zmq.ZMQError as error:
-            raise ValueError(f"Cannot connect to {self._address!r}: {error}.") from error
+            raise ValueError(f"Cannot connect to {self._address!r}: {error}; expected tcp://host:port.") from error
         self._key = self._secret
 
     def hello(self, greeting: Message, timeout: float) -> Message:

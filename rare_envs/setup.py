@@ -1,6 +1,8 @@
 """From the keyword arguments of `gym.make` to a world and its scenario space."""
 
+import importlib
 import inspect
+import re
 from typing import Any
 
 import numpy as np
@@ -12,6 +14,8 @@ from rare_envs.bases import load_base
 from rare_envs.blocks import NoiseLaw, beside
 from rare_envs.camera import find_camera
 from rare_envs.mixed import read_kinds
+from rare_envs.modules import working_directory_first
+from rare_envs.registration import kinematics_id
 from rare_envs.scenarios import SCENARIOS
 from rare_envs.scenarios.base import Scenario
 from rare_envs.space import Distribution, Parameter, ScenarioSpace, did_you_mean
@@ -21,13 +25,40 @@ from rare_envs.world import World
 def find_scenario(env_id: str) -> Scenario:
     """The scenario of an environment id.
 
+    Args:
+        env_id: For example "rare_envs/CutIn-v0"; "module:my_namespace/Overtaking-v0", as for `gym.make`, imports first
+            the module that registers it.
+
     Raises:
         ValueError: If there is none; the message suggests the nearest id and lists all.
     """
-    if isinstance(env_id, str) and env_id in SCENARIOS:
-        return SCENARIOS[env_id]
-    hint = did_you_mean(str(env_id), SCENARIOS)
+    module, _, name = env_id.rpartition(":") if isinstance(env_id, str) else ("", "", env_id)
+    if module:
+        _import_for(env_id, module)
+    if isinstance(name, str) and name in SCENARIOS:
+        return SCENARIOS[name]
+    layouts = {kinematics_id(each): each for each in SCENARIOS}
+    if name in layouts:
+        raise ValueError(
+            f"{name!r} is for gym.make and gym.make_vec; here take {layouts[name]!r} with "
+            f"observation 'kinematics' and action 'meta'."
+        )
+    if re.match(r"(highway(-fast)?|merge|intersection|roundabout)-v\d", str(name)):
+        raise ValueError(
+            f"{name!r} is an environment of HighwayEnv, not of the batched simulation: its drives become a problem by "
+            f"rare_envs.highway_env_problem({name!r}, ego=...). The environments here are {', '.join(SCENARIOS)}."
+        )
+    hint = did_you_mean(str(name), SCENARIOS)
     raise ValueError(f"Unknown environment {env_id!r}{hint}; the environments are {', '.join(SCENARIOS)}.")
+
+
+def _import_for(env_id: str, module: str) -> None:
+    try:
+        with working_directory_first():
+            importlib.import_module(module)
+    except (Exception, SystemExit) as error:  # the module is the user's: anything may happen in it
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        raise ValueError(f"Cannot import {module!r} for the environment {env_id!r}: {reason}") from error
 
 
 def set_up(

@@ -147,6 +147,8 @@ class DrivingParallelEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  #
         """
         if self._crowd is None or not self.agents:
             raise RuntimeError("Expected reset() before step(): no agent is there.")
+        if not isinstance(actions, Mapping):
+            raise ValueError(f"Expected actions as a mapping of agents to actions, got {type(actions).__name__}.")
         given = {agent: action for agent, action in actions.items() if action is not None}
         for agent in given:
             self._check_agent(agent)
@@ -269,6 +271,8 @@ def chosen_rewards(agents: Sequence[str], rewards: Mapping[str, Reward] | None) 
         ValueError: If one is given for somebody who is no agent, or is no function.
     """
     rewards = {} if rewards is None else rewards
+    if not isinstance(rewards, Mapping):
+        raise ValueError(f"Expected rewards as a mapping of agents to functions of a Tick, got {rewards!r}.")
     for agent, reward in rewards.items():
         if agent not in agents:
             hint = did_you_mean(str(agent), agents)

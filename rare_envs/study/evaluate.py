@@ -118,7 +118,18 @@ class Report:
     def notes(self) -> tuple[str, ...]:
         """What was asked for and makes no difference here, and what is not known."""
         unknown = (f"kinds of crash are not known: {self.kinds.unknown}",) if self.kinds.unknown else ()
-        return (*self._idle_words, *unknown)
+        return (*self._idle_words, *self._other_actions, *unknown)
+
+    @property
+    def _other_actions(self) -> tuple[str, ...]:
+        """HighwayEnv's meta-actions and our discrete ones are both numbers from 0 to 4: no space tells them apart."""
+        acts, question = getattr(self.study.problem.ego, "action_space", None), self.study.question
+        if question.observation != "kinematics" or question.action != "continuous" or not hasattr(acts, "n"):
+            return ()
+        return (
+            "the ego's actions 0 to 4 were taken as five accelerations; one that was trained in HighwayEnv needs "
+            "--action meta",
+        )
 
     @property
     def _idle_words(self) -> tuple[str, ...]:

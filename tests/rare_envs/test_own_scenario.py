@@ -14,6 +14,7 @@ import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
+from typer.testing import CliRunner
 
 import rare_envs
 import samplers
@@ -23,6 +24,7 @@ from rare_envs.scenarios.base import Others, Scenario, columns
 from rare_envs.space import Parameter
 from rare_envs.state import VEHICLE_LENGTH, State
 from rare_envs.study.catalogue import catalogue
+from rare_envs.study.cli import app
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # PettingZoo's test module imports what PettingZoo has deprecated
@@ -155,3 +157,31 @@ def test_what_does_not_work_is_refused_when_it_is_made_or_registered(change, mes
 def test_an_id_is_taken_once():
     with pytest.raises(ValueError, match="is taken"):
         rare_envs.register_scenario("rare_envs/CutIn-v0", STANDING)
+
+
+def test_a_command_imports_the_module_that_registers_it(tmp_path, monkeypatch):
+    """Under the id that `gym.make` takes, from the working directory; a run of it replays."""
+    (tmp_path / "crests.py").write_text(
+        f"import sys; sys.path.append({str(Path(__file__).parent)!r})\n"
+        "from test_own_scenario import STANDING; import rare_envs\n"
+        "rare_envs.register_scenario('tests/Crest-v0', STANDING)\n"
+    )
+    (tmp_path / "broken.py").write_text("1 / 0\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    env_id = "crests:tests/Crest-v0"
+    try:
+        ran = CliRunner().invoke(
+            app, ["estimate", env_id, "--method", "mc", "--max-sim", "2000", "--out", "run", "--json"]
+        )
+        assert ran.exit_code in (0, 3), ran.stderr
+        assert json.loads(ran.stdout)["question"]["env_id"] == env_id
+        assert rare_envs.DrivingProblem(env_id).space.names == ("speed", "distance")
+        with pytest.raises(ValueError, match="did you mean 'tests/Crest-v0'"):
+            rare_envs.DrivingProblem("crests:tests/Crests-v0")
+    finally:
+        SCENARIOS.remove("tests/Crest-v0")
+        del gym.registry["tests/Crest-v0"]
+    for name in ("broken", "nowhere_at_all"):
+        with pytest.raises(ValueError, match=f"Cannot import '{name}' for the environment '{name}:tests/Crest-v0'"):
+            rare_envs.DrivingProblem(f"{name}:tests/Crest-v0")

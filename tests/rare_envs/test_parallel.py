@@ -215,6 +215,7 @@ def test_contacts_of_others_are_noted_and_change_nothing():
         ({"render_mode": "ansi"}, "render_mode"),
         ({"observation": "feature"}, "Unknown observation"),
         ({"ego": "idn"}, "Unknown ego"),
+        ({"rewards": len}, "rewards as a mapping"),
     ],
 )
 def test_bad_arguments(kwargs, message):
@@ -236,6 +237,7 @@ def test_bad_actions_and_options():
         ({"lead": np.zeros(2)}, "no agent 'lead'"),
         ({"cutter": np.zeros(3)}, r"shape \(2,\) for 'cutter', got \(3,\)"),
         ({"ego": np.array([np.nan, 0.0])}, "NaN"),
+        ([np.zeros(2)], "actions as a mapping of agents to actions, got list"),
     ):
         with pytest.raises(ValueError, match=message):
             env.step(actions)

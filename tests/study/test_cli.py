@@ -37,6 +37,11 @@ def assert_refused(result: Result, *words: str) -> None:
 BAD_ESTIMATES = {
     "unknown environment": (["rare_envs/CutIn-v1"], ["rare_envs/CutIn-v0"]),
     "environment without its namespace": (["CutIn"], ["rare_envs/CutIn-v0"]),
+    "the id with HighwayEnv's layout": (
+        ["rare_envs/CutIn-kinematics-v0"],
+        ["rare_envs/CutIn-v0", "'kinematics'", "'meta'"],
+    ),
+    "HighwayEnv's environment": (["highway-fast-v0"], ["rare_envs.highway_env_problem('highway-fast-v0'"]),
     "missing environment": ([], ["ENV"]),
     "missing .zip": ([FOLLOWING, "--ego", "nowhere.zip"], ["nowhere.zip"]),
     "corrupt .zip": ([FOLLOWING, "--ego", "corrupt.zip"], ["corrupt.zip"]),

@@ -120,3 +120,26 @@ def test_a_world_that_does_not_exist_is_refused_in_one_line(cli: Cli, tmp_path: 
     assert said in result.stderr
     assert result.stderr.count("\n") == 1
     assert not (tmp_path / "ego.zip").exists()
+
+
+DISCRETE = """
+import gymnasium as gym
+import numpy as np
+
+class Idle:
+    action_space = gym.spaces.Discrete(5)
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        return np.ones(len(observation), int), None
+"""
+
+
+def test_what_actions_are_taken_for_is_pointed_out(cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A policy from HighwayEnv without its meta-actions runs all the same, and drives like a stranger."""
+    (tmp_path / "idle_egos.py").write_text(DISCRETE)
+    monkeypatch.chdir(tmp_path)
+    words = ("estimate", FOLLOWING, "--ego", "idle_egos:Idle", "--method", "mc", "--max-sim", 50, "--json")
+    (note,) = json.loads(cli(*words, "--observation", "kinematics").stdout)["notes"]
+    assert "--action meta" in note
+    for more in (("--observation", "kinematics", "--action", "meta"), ()):
+        assert json.loads(cli(*words, *more).stdout)["notes"] == []
