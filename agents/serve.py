@@ -51,7 +51,8 @@ class EgoServer:
             self._socket.bind(bind)
         except zmq.ZMQError as error:
             self.close()
-            raise ValueError(f"Cannot listen on {bind!r}: {error}; expected tcp://host:port.") from error
+            hint = "" if bind.startswith("tcp://") else "; expected tcp://host:port"
+            raise ValueError(f"Cannot listen on {bind!r}: {error}{hint}.") from error
         self.address = self._socket.getsockopt_string(zmq.LAST_ENDPOINT)
 
     def run(self) -> None:
