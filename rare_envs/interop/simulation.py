@@ -83,7 +83,8 @@ def make(env_id: str, config: Mapping[str, Any] | None) -> gym.Env[Any, Any]:
     """An environment of HighwayEnv.
 
     Raises:
-        ValueError: If there is none of this name.
+        ValueError: If there is none of this name, or the configuration has a word that it does not know, which
+            HighwayEnv itself would pass over in silence.
     """
     known = [name for name, spec in gym.registry.items() if str(spec.entry_point).startswith("highway_env.")]
     if env_id not in known:
@@ -93,7 +94,12 @@ def make(env_id: str, config: Mapping[str, Any] | None) -> gym.Env[Any, Any]:
         warnings.catch_warnings(),
     ):  # an older version is asked for on purpose: results belong to a version
         warnings.filterwarnings("ignore", message=".*is out of date", category=DeprecationWarning)
-        return gym.make(env_id, config=None if config is None else dict(config))
+        env = gym.make(env_id, config=None if config is None else dict(config))
+    words = list(env.unwrapped.default_config())  # type: ignore[attr-defined]
+    for word in config or ():
+        if word not in words:
+            raise ValueError(f"{env_id} has no {word!r} to configure{did_you_mean(word, words)}; {', '.join(words)}.")
+    return env
 
 
 def portable(ego: Any) -> Any:
