@@ -63,7 +63,7 @@ class ChildLink:
             (size,) = _SIZE.unpack(self._receive(_SIZE.size, deadline))
             return self._receive(size, deadline)
         except TimeoutError as error:
-            raise Lost(f"no answer within {timeout:g} s") from error
+            raise Lost(f"no answer within {timeout:.3g} s") from error
         except (OSError, EOFError) as error:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._process.wait(1.0)

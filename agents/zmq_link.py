@@ -78,7 +78,7 @@ class ZmqLink:
             if self._socket in ready:
                 return self._content(self._socket.recv_multipart())
             if not ready:
-                raise Lost(f"no answer within {timeout:g} s")
+                raise Lost(f"no answer within {timeout:.3g} s")
             recv_monitor_message(self._monitor)
             raise Lost("the connection broke")
 

@@ -60,7 +60,7 @@ class Comparison:
     def __str__(self) -> str:
         """Return a few lines for people."""
         low, high = self.interval
-        lines = [f"p_A / p_B = {self.ratio:.3g}", f"  {self.confidence:.0%} interval [{low:.3g}, {high:.3g}]"]
+        lines = [f"p_A / p_B = {self.ratio:.3g}", f"  {100 * self.confidence:g} % interval [{low:.3g}, {high:.3g}]"]
         for name, side in (("A", self.a), ("B", self.b)):
             lines.append(f"  p_{name} = {side.p:.3e} [{side.interval[0]:.3e}, {side.interval[1]:.3e}]")
         lines.append(f"  both fail: {self.both:.3e}; {self.n_sim:,} simulations, half of them of each")

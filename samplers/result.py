@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from enum import Enum
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -290,7 +290,7 @@ class Estimate:
 
 def method_settings(method: "Stepping") -> dict[str, Any]:
     """Return the settings of a method as plain values."""
-    return {key: getattr(method, key) for key in getattr(method, "__dataclass_fields__", {})}
+    return {each.name: getattr(method, each.name) for each in fields(method)} if is_dataclass(method) else {}
 
 
 def plain(value: Any) -> Any:
