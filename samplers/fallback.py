@@ -42,7 +42,7 @@ def reconciled(found: Outcome, before: Outcome) -> Outcome:
 
     Subset simulation follows f downhill; wide draws find regions that f does not announce as well.
     """
-    if before.interval[0] <= found.interval[1]:
+    if before.interval[0] <= found.p:
         return found
     interval = min(before.interval[0], found.interval[0]), max(before.interval[1], found.interval[1])
     about = f"Subset simulation, with the rest, missed regions that were found before: p was {found.p:.1e} there."
