@@ -24,7 +24,7 @@ help:  ## Show this list.
 demo: $(VENV)/.installed  ## Train a small PPO ego and estimate how often it collides.
 	@$(BIN)/python examples/demo.py
 
-test: $(VENV)/.installed  ## Run the tests (about a minute after installation).
+test: $(VENV)/.installed  ## Run the tests (some minutes).
 	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 
 test-slow: $(VENV)/.installed  ## Run the repeated-seed studies too.
