@@ -25,6 +25,10 @@ def try_scenario(scenario: Scenario) -> None:
     x = torch.from_numpy(load_base(scenario).sample(_DRAWS, np.random.default_rng(0))).float()
     n = scenario.vehicles
     state = scenario.initial(x)
+    if not isinstance(state, State):
+        raise ValueError(
+            f"Scenario {scenario.name!r}: expected initial(x) to give a State, got {type(state).__name__}."
+        )
     _check(scenario, "initial(x)", state[:4], n)
     if len(state.theta) != _DRAWS:
         raise ValueError(
@@ -39,6 +43,11 @@ def _still(state: State) -> Tensor:
 
 
 def _check(scenario: Scenario, what: str, fields: tuple[Tensor, ...], vehicles: int) -> None:
+    if not isinstance(fields, tuple) or not all(isinstance(field, Tensor) for field in fields[:4]) or len(fields) < 4:
+        raise ValueError(
+            f"Scenario {scenario.name!r}: expected {what} to give x, y, heading and speed, as State or Others; "
+            f"got {fields!r}."
+        )
     for name, field in zip(State._fields, fields, strict=False):
         if field.shape != (_DRAWS, vehicles):
             raise ValueError(

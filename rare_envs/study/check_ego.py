@@ -35,6 +35,9 @@ class Asked:
         observation: What the ego observes.
         action: What it decides.
         time_limit: Seconds that one check may take.
+        base: Base distribution of the scenarios it is tried on; the environment's default when None.
+        drivers: Of the vehicles around it; the environment's default when None.
+        horizon: Length of an episode [s]; the environment's when None.
     """
 
     ego: str
@@ -44,6 +47,9 @@ class Asked:
     observation: str = "features"
     action: str = "continuous"
     time_limit: float = 30.0
+    base: str | None = None
+    drivers: str | None = None
+    horizon: float | None = None
 
 
 def check_ego(asked: Asked) -> list[Finding]:
@@ -139,7 +145,15 @@ def findings_of(asked: Asked) -> Iterator[Finding | str]:
     try:
         ego = agents.load_ego(asked.ego, algo=asked.algo, trust=asked.trust)
         yield passed("loading", f"{type(ego).__name__}" if not isinstance(ego, str) else ego)
-        problem = DrivingProblem(asked.env_id, ego=ego, observation=asked.observation, action=asked.action)
+        problem = DrivingProblem(
+            asked.env_id,
+            ego=ego,
+            observation=asked.observation,
+            action=asked.action,
+            base=asked.base,
+            drivers=asked.drivers,
+            horizon=asked.horizon,
+        )
         probe = Probe.of(ego, problem)
     except (Exception, SystemExit, EgoGone) as error:  # the ego is the user's: anything may happen in it
         yield failed("loading", reason_of(error), "see docs/egos.md for what an ego is")

@@ -344,6 +344,9 @@ def check_ego_command(
     trust: Trust = False,
     observation: Observation = "features",
     action: Action = "continuous",
+    base: Base = None,
+    drivers: Drivers = None,
+    horizon: Horizon = None,
     time_limit: Annotated[float, typer.Option(help="Seconds that one check may take.")] = 30.0,
     as_json: Json = False,
 ) -> None:
@@ -354,7 +357,9 @@ def check_ego_command(
     from rare_envs.study.findings import exit_code
     from rare_envs.study.show_findings import VERDICTS, print_findings
 
-    findings = check_ego(Asked(ego, env, algo, trust, observation, action, time_limit))
+    findings = check_ego(
+        Asked(ego, env, algo, trust, observation, action, time_limit, base=base, drivers=drivers, horizon=horizon)
+    )
     code = exit_code(findings)
     if as_json:
         _print_json(

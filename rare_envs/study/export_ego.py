@@ -25,6 +25,10 @@ def export_ego(model: Path, out: Path, algo: str | None = None, trust: bool = Fa
     Raises:
         BadInput: The model cannot be read, the file cannot be written, or they act differently.
     """
+    if model.suffix != ".zip":
+        raise BadInput(
+            f"Only policies saved by Stable-Baselines3, files that end in .zip, are exported; got {str(model)!r}."
+        )
     if out.suffix != ".onnx":
         raise BadInput(f"Expected a file that ends in .onnx, got {str(out)!r}.")
     if not out.parent.is_dir() or not os.access(out.parent, os.W_OK):

@@ -204,7 +204,12 @@ def test_the_command_writes_and_says_what_it_compared(saved: Any, tmp_path: Path
     assert answer["vec_normalize"] == str(tmp_path / "vecnormalize.pkl")
     assert (tmp_path / "ego.onnx").stat().st_size > 1000
     assert "random observations" in CliRunner().invoke(app, words).stdout
-    for bad in (["nowhere.zip", str(tmp_path / "b.onnx")], [words[1], "b.zip"], [words[1], "nowhere/b.onnx"]):
+    for bad in (
+        ["nowhere.zip", str(tmp_path / "b.onnx")],
+        [words[1], "b.zip"],
+        [words[1], "nowhere/b.onnx"],
+        ["idm", "b.onnx"],
+    ):
         refused = CliRunner().invoke(app, ["export-ego", *bad])
         assert (refused.exit_code, refused.stdout) == (2, "")
         assert refused.stderr.count("\n") == 1

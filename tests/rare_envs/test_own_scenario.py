@@ -145,6 +145,8 @@ def test_a_command_line_takes_it_from_a_module_of_ones_own(tmp_path):
         ({"vehicle_names": ("ego", "stalled", "ghost"), "labels": ()}, r"expected x of shape \(B, 3\) from initial"),
         ({"others": lambda state, dt: Others(*(field * torch.nan for field in others(state, dt)))}, "not finite"),
         ({"driven": lambda state, action, dt: Others(*(state[:4]))}, r"shape \(B, 1\) from driven"),
+        ({"others": lambda state, dt: None}, r"expected others\(state, dt\) to give x, y, heading and speed"),
+        ({"initial": lambda x: None}, r"expected initial\(x\) to give a State"),
     ],
 )
 def test_what_does_not_work_is_refused_when_it_is_made_or_registered(change, message):

@@ -286,3 +286,10 @@ def test_a_server_that_keeps_to_the_protocol_passes() -> None:
     assert worse["another step"].status == worse["no reset"].status == "fail"
     nobody = findings(f"{server.address}?timeout=0.3&patience=0.3")
     assert "is it running" in nobody["protocol"].advice
+
+
+@pytest.mark.parametrize(("option", "word"), [("--base", "nowhere"), ("--drivers", "nobody")])
+def test_it_is_tried_in_the_traffic_that_is_asked_for(cli: Cli, option: str, word: str) -> None:
+    findings = json.loads(cli("check-ego", "idm", ENV, option, word, "--json").stdout)["findings"]
+    assert findings[-1]["status"] == "fail"
+    assert word in findings[-1]["found"]
