@@ -21,7 +21,7 @@ def blocks(page: Path) -> list[str]:
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_code_of_a_page(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     if page.name == "measures.md":
-        pytest.importorskip("rtamt")  # which its page on temporal logic uses, and Python 3.12 does not have
+        pytest.importorskip("rtamt", reason="rtamt, for temporal logic, runs on Python 3.11 or older")
     monkeypatch.chdir(tmp_path)
     torch.set_num_threads(1)
     code = blocks(page)

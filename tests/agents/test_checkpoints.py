@@ -2,7 +2,6 @@
 
 import json
 import pickle
-from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -186,8 +185,6 @@ def test_unknown_names_get_a_suggestion(file, monkeypatch):
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_shipped_drivers_load(name):
-    if not (resources.files("agents") / "data" / f"{name}.safetensors").is_file():
-        pytest.skip("not shipped yet")
     driver = load_driver(name)
     assert isinstance(driver, LearnedDriver)
     action, _ = driver.act(torch.zeros(2, 3, 51))

@@ -208,7 +208,7 @@ SAMPLE: dict[str, Callable[[], object]] = {
 @pytest.mark.parametrize("name", SAMPLE)
 def test_same_value_alone_in_a_batch_and_in_a_problem(name: str) -> None:
     if name == "stl":
-        pytest.importorskip("rtamt")
+        pytest.importorskip("rtamt", reason="rtamt runs on Python 3.11 or older")
     measure, kwargs = SAMPLE[name](), {"horizon": 2.0}
     whole = problem(measure, CUT_IN, **kwargs)
     # half of them collide, at different times
@@ -246,7 +246,7 @@ def test_min_ttc_is_one_whatever_the_measure() -> None:
 
 
 def test_robustness_by_hand() -> None:
-    pytest.importorskip("rtamt")
+    pytest.importorskip("rtamt", reason="rtamt runs on Python 3.11 or older")
     assert f(stl("always (gap > 2)"), *CLOSE) == pytest.approx(-1.5, abs=1e-3)
     assert f(stl("always[0:5] (gap > 2)"), *CLOSE) == pytest.approx(48.5, abs=1e-3)  # 50.5 m at 5 s
     assert f(stl("eventually[2:3] (ttc < 7.5)"), *CLOSE) == pytest.approx(7.5 - 7.05, abs=1e-3)
@@ -259,7 +259,7 @@ def test_robustness_by_hand() -> None:
 
 def test_robustness_is_what_the_signals_say() -> None:
     """ "always" is the least over time, "eventually" the greatest, bounds are in seconds."""
-    pytest.importorskip("rtamt")
+    pytest.importorskip("rtamt", reason="rtamt runs on Python 3.11 or older")
     kept: list[Trace] = []
     recorder = TraceMeasure(lambda trace: kept.append(trace) or trace.of(ttc).amin(0), collision=None)
     x = problem("ttc").base.sample(20, np.random.default_rng(3))
@@ -283,14 +283,14 @@ def test_robustness_is_what_the_signals_say() -> None:
     ],
 )
 def test_bad_formulas_are_refused_before_anything_is_driven(formula: str, words: list[str]) -> None:
-    pytest.importorskip("rtamt")
+    pytest.importorskip("rtamt", reason="rtamt runs on Python 3.11 or older")
     with pytest.raises(ValueError) as error:
         stl(formula)
     assert all(word in str(error.value) for word in words)
 
 
 def test_formulas_that_do_not_fit_the_world_are_refused() -> None:
-    pytest.importorskip("rtamt")
+    pytest.importorskip("rtamt", reason="rtamt runs on Python 3.11 or older")
     with pytest.raises(ValueError, match="vehicles are 0 to 1"):
         problem(stl("always (speed_2 > 1)"))
     with pytest.raises(ValueError, match="multiple of the sampling period"):

@@ -221,7 +221,7 @@ def test_scenes_without_followers_are_refused():
 
 
 def test_logs_go_to_tensorboard(data, tmp_path):
-    pytest.importorskip("tensorboard")
+    pytest.importorskip("tensorboard", reason="the extra logs is optional")
     fit(learner_of(data, tiny(updates=2)), tmp_path, log=True)
     assert list(tmp_path.glob("events.out.*"))
 
