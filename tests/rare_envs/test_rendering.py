@@ -99,6 +99,7 @@ def test_pictures_of_a_batch():
 
 
 @pytest.mark.skipif(importlib.util.find_spec("moviepy") is None, reason="Gymnasium's RecordVideo needs moviepy")
+@pytest.mark.filterwarnings("ignore:invalid escape sequence")  # in moviepy 1's own text, when it is first compiled
 def test_gymnasium_records_a_video(tmp_path):
     env = gym.wrappers.RecordVideo(gym.make(CUT_IN, render_mode="rgb_array", horizon=1.0), str(tmp_path / "films"))
     env.reset(seed=0)
