@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from numpy.typing import NDArray
 
 from agents import wire
 from agents.wire import Malformed, Message
@@ -17,6 +18,10 @@ from rare_envs.faults import EgoGone, reason_of
 
 MAX_PEERS, MAX_SESSIONS = 64, 64
 """How many are remembered; the one unused for longest makes room."""
+MOST_BOUNDS = 1024
+"""Numbers of a space's bound that are sent."""
+MOST_VALUES = 2**24
+"""Numbers of an observation, in a space that a client believes."""
 
 
 class Refused(Exception):
@@ -200,11 +205,16 @@ def describe(space: Any) -> Message | None:
     if isinstance(space, spaces.Dict):
         return {"parts": {name: describe(part) for name, part in space.items()}}
     if isinstance(space, spaces.Box):
-        described: Message = {"shape": list(space.shape)}
-        if space.low.size <= 1024:
-            described |= {"low": space.low.ravel().tolist(), "high": space.high.ravel().tolist()}
-        return described
+        whole = {"dtype": "|u1"} if space.dtype == np.uint8 else {}
+        return {"shape": list(space.shape), **whole, "low": _bound(space.low), "high": _bound(space.high)}
     return None
+
+
+def _bound(values: NDArray[Any]) -> Any:
+    """A bound as one number if it is the same everywhere; None if there are too many to send."""
+    if values.size and (values == values.flat[0]).all():
+        return float(values.flat[0])
+    return values.ravel().tolist() if values.size <= MOST_BOUNDS else None
 
 
 def read_space(given: Any) -> spaces.Space[Any] | None:
@@ -213,19 +223,38 @@ def read_space(given: Any) -> spaces.Space[Any] | None:
     Raises:
         Malformed: It is not of that form.
     """
+    try:
+        return _read_space(given, nested=False)
+    except Exception as error:  # whatever the server has written
+        raise Malformed(f"a space {given!r:.100}: {reason_of(error)}") from error
+
+
+def _read_space(given: Any, nested: bool) -> spaces.Space[Any] | None:
     if given is None:
         return None
-    try:
-        if "parts" in given:
-            parts = {name: read_space(part) for name, part in given["parts"].items()}
-            return spaces.Dict({name: part for name, part in parts.items() if part is not None})
-        if "n" in given:
-            return spaces.Discrete(int(given["n"]))
-        shape = tuple(int(size) for size in given["shape"])
-        low, high = (
-            np.asarray(given.get(end, limit), dtype=np.float32) for end, limit in (("low", -np.inf), ("high", np.inf))
-        )
-        spread = [bound.reshape(shape) if bound.ndim else np.full(shape, bound) for bound in (low, high)]
-        return spaces.Box(spread[0], spread[1], dtype=np.float32)
-    except Exception as error:  # whatever the server has written
-        raise Malformed(f"a space {given!r:.100}: {error}") from error
+    if "parts" in given:
+        if nested:
+            raise Malformed("parts of parts")
+        parts = {name: _read_space(part, nested=True) for name, part in given["parts"].items()}
+        if not parts or None in parts.values():
+            return None
+        return spaces.Dict({name: part for name, part in parts.items() if part is not None})
+    if "n" in given:
+        if not wire.is_count(given["n"]):
+            raise Malformed("n is a whole number")
+        return spaces.Discrete(given["n"])
+    shape = given["shape"]
+    if not wire.is_shape(shape, MOST_VALUES):
+        raise Malformed(f"shape {shape!r:.50}")
+    dtype: Any = np.uint8 if given.get("dtype") == "|u1" else np.float32
+    widest = (0, 255) if dtype == np.uint8 else (-np.inf, np.inf)
+    low, high = (_read_bound(given.get(end), shape, limit) for end, limit in zip(("low", "high"), widest, strict=True))
+    return spaces.Box(low.clip(*widest).astype(dtype), high.clip(*widest).astype(dtype), dtype=dtype)
+
+
+def _read_bound(given: Any, shape: list[int], limit: float) -> NDArray[np.float64]:
+    """A bound in every entry, shape `shape`."""
+    bound = np.asarray(limit if given is None else given, dtype=np.float64)
+    if np.isnan(bound).any():
+        raise Malformed("a bound is NaN")
+    return bound.reshape(shape) if bound.ndim else np.full(shape, bound)

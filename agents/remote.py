@@ -20,6 +20,8 @@ from rare_envs.mixed import batch_size
 TIMEOUT, PATIENCE = 10.0, 30.0
 """Seconds to wait for an answer, and for an ego that has gone to come back."""
 _HELLO_EVERY = 1.0
+MOST_NAME = 100
+"""Letters of an ego's name that are kept."""
 
 
 class Lost(Exception):
@@ -117,16 +119,17 @@ class RemoteEgo:
         self._ended: list[int] = []
         try:
             hello = self._connect()
+            self.observation_space = read_space(hello.get("observation"))
+            self.action_space = read_space(hello.get("action"))
         except RemoteError as error:
             link.close()
             raise ValueError(f"The ego at {link.where} refuses: {error}") from error
         except BaseException:
             link.close()
             raise
-        self.deterministic = hello.get("deterministic")
-        self.name = str(hello.get("name", "ego"))
-        self.observation_space = read_space(hello.get("observation"))
-        self.action_space = read_space(hello.get("action"))
+        self._spaces = _spaces(hello)
+        self.deterministic = None if hello.get("deterministic") is None else bool(hello["deterministic"])
+        self.name = str(hello.get("name", "ego"))[:MOST_NAME]
 
     def predict(
         self,
@@ -171,7 +174,7 @@ class RemoteEgo:
         for _ in range(2):
             try:
                 if not self._connected:
-                    self._connect()
+                    self._reconnect()
                 self._restore(session)
                 reply = self._send_act(session, session.step, observation, start)
                 action = wire.unpack_array(reply.get("action"))
@@ -259,6 +262,24 @@ class RemoteEgo:
         self._connected = True
         return reply
 
+    def _reconnect(self) -> None:
+        """Connect again, to the same ego.
+
+        Raises:
+            EgoGone: Another one is there, or it refuses.
+        """
+        try:
+            hello = self._connect()
+        except (RemoteError, Malformed) as error:
+            raise EgoGone(f"The ego at {self._link.where} went away, and what is there now refuses: {error}") from error
+        if _spaces(hello) != self._spaces:
+            raise EgoGone(f"The ego at {self._link.where} went away, and one with other spaces is there now.")
+
     def close(self) -> None:
         """End the connection."""
         self._link.close()
+
+
+def _spaces(hello: Message) -> tuple[Any, Any]:
+    """What an ego says that it observes and how it acts."""
+    return hello.get("observation"), hello.get("action")

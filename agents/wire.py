@@ -83,8 +83,8 @@ def unpack_array(given: Any) -> NDArray[Any]:
     dtype, shape, data = given["dtype"], given["shape"], given["data"]
     if dtype not in DTYPES:
         raise Malformed(f"dtype {dtype!r}, expected one of {', '.join(DTYPES)}")
-    if not isinstance(shape, list) or len(shape) > _MOST_AXES or not all(is_count(size, MAX_BYTES) for size in shape):
-        raise Malformed(f"shape {shape!r}")
+    if not is_shape(shape):
+        raise Malformed(f"shape {shape!r:.100}")
     if not isinstance(data, bytes) or len(data) != math.prod(shape) * np.dtype(dtype).itemsize:
         raise Malformed(f"data do not fill shape {shape} of {dtype}")
     return np.frombuffer(bytearray(data), dtype=dtype).reshape(shape)  # a bytearray, so that it can be written to
@@ -117,6 +117,13 @@ def unpack_observation(given: Any, batch: int) -> Any:
 def is_count(value: object, most: int = MOST) -> TypeGuard[int]:
     """Whether a value is a whole number from 0 to most; a bool is none."""
     return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= most
+
+
+def is_shape(value: object, most: int = MAX_BYTES) -> TypeGuard[list[int]]:
+    """Whether a value is a list of sizes, of no more than so many numbers."""
+    if not isinstance(value, list) or len(value) > _MOST_AXES or not all(is_count(size, most) for size in value):
+        return False
+    return math.prod(value) <= most
 
 
 # --- seals -------------------------------------------------------------------------------------

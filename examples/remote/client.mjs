@@ -1,5 +1,5 @@
 // A client in JavaScript, without any package: asks an ego that rare-envs serve-ego lends for a few actions.
-// node client.mjs PORT FEATURES [BATCH]
+// node client.mjs PORT FEATURES [BATCH]; FEATURES is how many numbers to show it if it does not say what it observes.
 import net from "node:net";
 import { pack, unpack } from "./msgpack.mjs";
 import { send, speak } from "./zmtp.mjs";
@@ -17,10 +17,22 @@ function ask(message) {
   });
 }
 
-const values = Float32Array.from({ length: batch * features }, (_, i) => Math.fround(i / 10));
+// Some numbers for a batch, in the space that the ego describes: an array, or of several kinds a map of arrays.
+function observationOf(space) {
+  if (space.parts) {
+    const parts = Object.entries(space.parts).map(([name, part]) => [name, observationOf(part)]);
+    return { parts: Object.fromEntries(parts) };
+  }
+  const shape = [batch, ...space.shape];
+  const length = shape.reduce((a, b) => a * b, 1);
+  if (space.dtype === "|u1") return { dtype: "|u1", shape, data: Uint8Array.from({ length }, (_, i) => i % 256) };
+  const values = Float32Array.from({ length }, (_, i) => i / 10);
+  return { dtype: "<f4", shape, data: new Uint8Array(values.buffer) };
+}
+
 const hello = await ask({ type: "hello", protocol: 1, client: "javascript" });
 await ask({ type: "reset", session: 1, batch });
-const observation = { dtype: "<f4", shape: [batch, features], data: new Uint8Array(values.buffer) };
+const observation = observationOf(hello.observation ?? { shape: [features] });
 const { action } = await ask({ type: "act", session: 1, step: 0, observation });
 await ask({ type: "end", session: 1 });
 const bytes = new Uint8Array(action.data).buffer;

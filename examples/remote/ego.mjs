@@ -55,9 +55,10 @@ function answerer() {
     if (message.type !== "act") throw refuse("unknown", `unknown type ${message.type}`);
     const session = sessions.get(message.session);
     if (!session || session.step !== message.step) throw refuse("session", "unknown session or another step");
-    const observation = readFloats(message.observation);
-    const [batch, features] = message.observation.shape;
-    if (batch !== session.batch || message.observation.shape.length !== 2 || features < 5)
+    const seen = message.observation?.parts?.features ?? message.observation; // of several kinds only this one matters
+    const observation = readFloats(seen);
+    const [batch, features] = seen.shape;
+    if (batch !== session.batch || seen.shape.length !== 2 || features < 5)
       throw refuse("malformed", `expected ${session.batch} rows of 5 or more features`);
     session.step += 1;
     const actions = decide(observation, features);

@@ -7,8 +7,10 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 
 from rare_envs.faults import EgoGone, reason_of
+from rare_envs.mixed import each
 from rare_envs.study.findings import Finding, failed, passed
 
 ADVICE = "docs/remote.md has the protocol"
@@ -58,13 +60,16 @@ def conformance(spec: str) -> Iterator[Finding]:
 
 def _questions(hello: Any) -> dict[str, Callable[[str, Any], Iterator[Finding]]]:
     """What is asked after the hello."""
-    shape = (hello.get("observation") or {}).get("shape") or [7]
+    from agents.answering import read_space
+
+    space = read_space(hello.get("observation")) or spaces.Box(-5.0, 5.0, (7,), np.float32)
 
     def act(session: int, step: int, rows: int = 3) -> dict[str, Any]:
         from agents import wire
 
-        observation = wire.pack_array(np.zeros((rows, *shape), np.float32))
-        return {"type": "act", "session": session, "step": step, "observation": observation}
+        parts = dict(space.spaces) if isinstance(space, spaces.Dict) else space
+        blank = each(lambda part: np.zeros((rows, *part.shape), part.dtype), parts)
+        return {"type": "act", "session": session, "step": step, "observation": wire.pack_observation(blank)}
 
     def expect(kind: str, *messages: Any) -> Callable[[str, Any], Iterator[Finding]]:
         def run(name: str, ask: Any) -> Iterator[Finding]:

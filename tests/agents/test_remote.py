@@ -25,7 +25,7 @@ from rare_envs.faults import EgoGone, FaultTolerant
 pytest.importorskip("zmq", reason="the extra remote is optional")
 msgpack = pytest.importorskip("msgpack", reason="the extra remote is optional")
 from agents import wire  # noqa: E402
-from agents.answering import Answerer  # noqa: E402
+from agents.answering import Answerer, describe, read_space  # noqa: E402
 from agents.remote import RemoteEgo, RemoteError  # noqa: E402
 from agents.serve import EgoServer, is_loopback  # noqa: E402
 from agents.zmq_link import ZmqLink, connect  # noqa: E402
@@ -550,3 +550,54 @@ def test_observations_of_several_kinds_travel_by_name(serve: Any, ask: Any) -> N
     for parts in ({}, [1], {"near": None}, {"near": wire.pack_array(np.zeros((3, 7)))}):
         bad = {**good_messages()[2], "observation": {"parts": parts}}
         assert wire.unpack(server.answer(b"me", [wire.pack(bad)])[0])["type"] == "error"
+
+
+@pytest.mark.parametrize("where", ["tcp", pytest.param("process", marks=pytest.mark.slow)])
+def test_an_ego_elsewhere_sees_camera_and_lidar_as_at_home(where: str, serve: Any, tmp_path: Path) -> None:
+    """Pictures, whose channels come first in the space of the policy, and numbers."""
+    from stable_baselines3 import PPO
+
+    from training import sb3_vec_env
+
+    world: dict[str, Any] = {"observation": "camera+lidar", "camera": (36, 64), "horizon": 0.5}
+    env = sb3_vec_env(ENV, num_envs=1, seed=0, **world)
+    PPO("MultiInputPolicy", env, seed=0, device="cpu").save(tmp_path / "ego.zip")
+    home = load_ego(tmp_path / "ego.zip")
+    assert home.observation_space["camera"].shape == (3, 36, 64)
+    there = load_ego(f"process:{tmp_path}/ego.zip" if where == "process" else serve(home).address)
+    assert there.observation_space == home.observation_space
+    problems = [rare_envs.DrivingProblem(ENV, ego=ego, measure="clearance", **world) for ego in (home, there)]
+    x = problems[0].base.sample(3, np.random.default_rng(0))
+    np.testing.assert_array_equal(problems[1].evaluate(x), problems[0].evaluate(x))
+    there.close()
+
+
+def test_spaces_survive_the_journey_and_lies_do_not() -> None:
+    uneven = spaces.Box(np.array([0.0, -np.inf], np.float32), np.array([1.0, 2.0], np.float32))
+    shapes = spaces.Box(-5.0, 5.0, (3, 3)), uneven
+    image = spaces.Box(0, 255, (36, 64, 3), np.uint8)
+    for space in (*shapes, image, spaces.Discrete(5), spaces.Dict({"camera": image, "lidar": shapes[0]})):
+        described = wire.unpack(wire.pack({"space": describe(space)}))["space"]
+        assert read_space(described) == space
+        assert len(str(described)) < 300
+    assert read_space({"shape": [2]}) == spaces.Box(-np.inf, np.inf, (2,))
+    box: dict[str, Any] = {"shape": [2], "low": [0.0, 0.0], "high": 1.0}
+    wrong: list[Any] = [7, "box", [], {}, {"n": 0}, {"n": -1}, {"n": True}, {"n": 1e9}, {"parts": []}]
+    wrong += [{"parts": {"a": {"parts": {"b": {"n": 2}}}}}, {"parts": {"a": 3}}]
+    wrong += [{**box, "shape": shape} for shape in ([-2], [2**40], [2**12, 2**13], "2", [[2]], [1.5])]
+    wrong += [{**box, "low": low} for low in ([0.0] * 3, "zero", float("nan"), 2.0, {}, [[0.0], [0.0, 1.0]])]
+    for given in wrong:
+        with pytest.raises(wire.Malformed, match="a space"):
+            read_space(given)
+
+
+def test_another_ego_that_comes_back_is_not_taken_for_the_first(serve: Any, ask: Any, x: np.ndarray) -> None:
+    class Other(Braking):
+        observation_space = spaces.Box(-1.0, 1.0, (7,), np.float32)
+
+    first = serve(Braking())
+    there = ask(first.address)
+    first.end()
+    serve(Other(), first.address)
+    with pytest.raises(EgoGone, match="one with other spaces is there now"):
+        FaultTolerant(problem(there), "bound").evaluate(x)

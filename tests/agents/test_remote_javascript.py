@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from gymnasium import spaces
 
 import rare_envs
 
@@ -66,8 +67,26 @@ def test_noise_does_not_end_it(address: str) -> None:
     ego.close()
 
 
-def test_a_client_in_javascript_is_answered() -> None:
-    with EgoServer(Same(), "tcp://127.0.0.1:*", name="here") as server:
+def test_several_kinds_of_observations_come_by_name(address: str) -> None:
+    ego = load_ego(f"{address}?timeout=20&patience=20")
+    seen = {"camera": np.zeros((2, 4, 6, 3), np.uint8), "features": np.full((2, 7), 0.5, np.float32)}
+    np.testing.assert_array_equal(ego.predict(seen)[0], Same().predict(seen["features"])[0])
+    ego.close()
+
+
+class SameWithCamera(Same):
+    observation_space = spaces.Dict(
+        {"camera": spaces.Box(0, 255, (4, 6, 3), np.uint8), "features": spaces.Box(-5, 5, (7,), np.float32)}
+    )
+
+    def predict(self, observation: Any, **_: Any) -> Any:
+        action, state = super().predict(observation["features"])
+        return action * observation["camera"][:, :1, 1, 1], state
+
+
+@pytest.mark.parametrize("ego", [Same(), SameWithCamera()])
+def test_a_client_in_javascript_is_answered(ego: Any) -> None:
+    with EgoServer(ego, "tcp://127.0.0.1:*", name="here") as server:
         thread = threading.Thread(target=server.run)
         thread.start()
         try:
@@ -77,6 +96,8 @@ def test_a_client_in_javascript_is_answered() -> None:
             server.stop()
             thread.join()
     answer = json.loads(done.stdout)
-    observation = (np.arange(21) / 10).astype(np.float32).reshape(3, 7)
+    features = (np.arange(21) / 10).astype(np.float32).reshape(3, 7)
+    pictures = (np.arange(3 * 72) % 256).astype(np.uint8).reshape(3, 4, 6, 3)
+    observation = features if type(ego) is Same else {"camera": pictures, "features": features}
     assert (answer["name"], answer["shape"]) == ("here", [3, 2])
-    np.testing.assert_array_equal(np.float32(answer["action"]).reshape(3, 2), Same().predict(observation)[0])
+    np.testing.assert_array_equal(np.float32(answer["action"]).reshape(3, 2), ego.predict(observation)[0])
