@@ -20,6 +20,7 @@ from benchmarks.limit_states import (
     stepped,
     strip,
 )
+from benchmarks.no_proposal import network, slabs, squares
 from samplers.reference import Reference, four_branches, half_space, parabola, plateau, shell
 
 
@@ -71,6 +72,13 @@ CASES: dict[str, Case] = {
     "decep_d8": Case(partial(half_spaces, 8, (4.9, 3.5), (0.5, 10.0)), 1500, rotation=4),
     "decep_box_d3": Case(hidden_box, min_coverage=None),
     "never_d4": Case(never),
+    # no proposal is to be found: dozens of regions, hundreds of dimensions without a direction
+    "slabs_d20": Case(partial(slabs, 20, 4.5)),
+    "slabs_d500": Case(partial(slabs, 500, 5.0)),
+    "squares_d50": Case(partial(squares, 50, 1.0, 17.0)),
+    "squares_d200": Case(partial(squares, 200, 0.5, 42.6)),
+    "network_d30": Case(partial(network, 30)),
+    "network_d400": Case(partial(network, 400)),
     # every evaluation adds fresh noise; no proposal in u can gain more than 413 and 35
     "noisy_d6": Case(partial(half_spaces, 6, (3.5,), noise=0.3), 150, rotation=11),
     "noise2_d4": Case(partial(half_spaces, 4, (4.0, 4.2), noise=0.6), 6, min_coverage=0.90, rotation=12),

@@ -233,11 +233,12 @@ class Refinement:
         if len(u) == 0:
             return []
         owner = log_ratios(bumps, u).argmax(axis=0)
+        own = [owner == k for k in range(len(bumps))]
         return [
             part
-            for k, bump in enumerate(bumps)
-            if np.count_nonzero(owner == k) >= 10
-            for part in slices_of(bump, u[owner == k], np.exp(log_w[owner == k] - log_w.max()))
+            for bump, rows in zip(bumps, own, strict=True)
+            if np.count_nonzero(rows) >= 10
+            for part in slices_of(bump, u[rows], np.exp(log_w[rows] - log_w[rows].max()))
         ]
 
 

@@ -16,6 +16,7 @@ from benchmarks.limit_states import (
     stepped,
     strip,
 )
+from benchmarks.no_proposal import network, slabs, squares
 
 NEAR = {
     "half-spaces": half_spaces(3, (1.0, 1.4, 2.0), (1.0, 3.0, 0.4)),
@@ -30,6 +31,9 @@ NEAR = {
     "strip": strip(4, beta=1.0),
     "ring": ring_part(5, p_radius=0.3, beta=0.8),
     "box": hidden_box(beta=1.5),
+    "slabs": slabs(20, 2.5),
+    "squares": squares(50, 1.0, 8.0),
+    "squares, flatter": squares(20, 0.5, 13.0),
 }
 
 
@@ -55,6 +59,15 @@ def test_catalogue(name):
     assert np.isfinite(f).all()
     if not state.noise:
         np.testing.assert_allclose(f, state.problem().evaluate(u @ random_rotation(state.dim, 7)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dim", [30, 400])
+def test_probability_of_networks(dim):
+    """Drawn input by input, where the reference draws what reaches the layer."""
+    state, n, rng = network(dim), 1_000_000, np.random.default_rng(5)
+    hits = sum(np.count_nonzero(state.f(rng.standard_normal((n // 100, dim))) <= 0) for _ in range(100))
+    assert hits / n == pytest.approx(state.p, abs=4 * np.sqrt(state.p / n))
 
 
 def test_never_is_zero():

@@ -3,9 +3,10 @@ import math
 
 import numpy as np
 import pytest
-from scipy import integrate, stats
+from scipy import stats
 
 import samplers
+from benchmarks.catalogue import CASES
 from samplers.problem import FunctionProblem
 from samplers.reference import Reference, four_branches, half_space, plateau, shell
 
@@ -350,27 +351,15 @@ def test_stopped_in_the_estimate():
 # where no proposal describes the failures
 
 
-def slabs(dim=20, beta=4.5):
-    """2 d regions, more than a proposal has room for: beyond beta along any axis, either way."""
-    p = 1 - (1 - 2 * PHI(-beta)) ** dim
-    return reference(f"slabs_d{dim}", lambda u: beta - np.abs(u).max(axis=1), dim, p)
+def case(name):
+    """A problem of the benchmark for which no proposal is to be found."""
+    state = CASES[name].make()
+    return Reference(name, state.problem(), state.p)
 
 
-def ellipsoid(dim=50):
-    """Outside of an ellipsoid whose axes are of 50 lengths: a weighted sum of squares, p by inversion (Imhof 1961)."""
-    weights, limit = 1 / np.arange(1.0, dim + 1), 18.0
-
-    def integrand(t):
-        angle = 0.5 * np.arctan(weights * t).sum() - 0.5 * limit * t
-        return math.sin(angle) / (t * math.exp(0.25 * np.log1p((weights * t) ** 2).sum()))
-
-    p = 0.5 + integrate.quad(integrand, 0, np.inf, limit=500)[0] / math.pi
-    return reference("ellipsoid", lambda u: limit - u**2 @ weights, dim, p)
-
-
-@pytest.mark.parametrize("make", [slabs, ellipsoid])
-def test_subset_simulation_takes_over(recorder, make):
-    reference = make()
+@pytest.mark.parametrize("name", ["slabs_d20", "squares_d50"])
+def test_subset_simulation_takes_over(recorder, name):
+    reference = case(name)
     for seed in range(3):
         result = counted(recorder, reference.problem, seed=seed, max_sim=6000)
         assert result.warnings[0].startswith("No proposal describes the failures")
@@ -379,13 +368,24 @@ def test_subset_simulation_takes_over(recorder, make):
         assert result.n_sim <= 6000
 
 
+def test_a_region_so_far_out_that_its_weights_vanish(recorder):
+    """Wide draws in 800 dimensions reach |u| > 65, whose probability is below the smallest float."""
+
+    def f(u):
+        return np.minimum(3.3 - u[:, 0], (65.0**2 - (u**2).sum(axis=1)) / 50)
+
+    for seed in range(2):
+        result = counted(recorder, FunctionProblem(f, 800), seed=seed, max_sim=3000)
+        assert result.interval[0] < PHI(-3.3) < result.interval[1]
+
+
 def test_subset_simulation_takes_as_many_points_as_the_target_asks_for(recorder):
-    sizes = [counted(recorder, slabs().problem, seed=0, target_cov=target).n_sim for target in (0.3, 0.5)]
+    sizes = [counted(recorder, case("slabs_d20").problem, seed=0, target_cov=target).n_sim for target in (0.3, 0.5)]
     assert 4000 < sizes[1] < sizes[0] < 12_000
 
 
 def test_subset_simulation_is_stopped():
-    reference = slabs()
+    reference = case("slabs_d20")
     run = TS().start(reference.problem, seed=0)
     while not run.done and run.progress.n_sim < 5000:
         run.tell(reference.problem.f(run.ask()))
@@ -446,9 +446,9 @@ def test_right_and_covered_with_many_seeds(study, reference):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("make", [slabs, ellipsoid])
-def test_subset_simulation_is_right_and_covered(study, make):
-    judge(study(make(), TS(), 40), 0.05)
+@pytest.mark.parametrize("name", ["slabs_d20", "squares_d50"])
+def test_subset_simulation_is_right_and_covered(study, name):
+    judge(study(case(name), TS(), 40), 0.05)
 
 
 @pytest.mark.slow
