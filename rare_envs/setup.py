@@ -182,14 +182,7 @@ def space_of(world: World, base: Distribution) -> ScenarioSpace:
             f"{world.scenario.name} has parameters of its own named {', '.join(sorted(twice))}, as weather or drivers "
             "have; rename them."
         )
-    return ScenarioSpace(
-        names=tuple(p.name for p in parameters),
-        units=tuple(p.unit for p in parameters),
-        low=np.repeat([p.low for p in parameters], [p.size for p in parameters]),
-        high=np.repeat([p.high for p in parameters], [p.size for p in parameters]),
-        base=beside(*laws),
-        sizes=tuple(p.size for p in parameters),
-    )
+    return ScenarioSpace.of(parameters, beside(*laws))
 
 
 def with_noise(space: ScenarioSpace, name: str, size: int) -> ScenarioSpace:

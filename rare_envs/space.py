@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Protocol, runtime_checkable
@@ -78,6 +78,19 @@ class ScenarioSpace:
                 f"Expected as many names, units and bounds, got {len(self.names)} names, {len(self.units)} units, "
                 f"sizes {self.sizes}, low {self.low.shape} and high {self.high.shape}."
             )
+
+    @classmethod
+    def of(cls, parameters: Sequence[Parameter], base: Distribution) -> ScenarioSpace:
+        """The space of some parameters, in the order of x, and of their law."""
+        sizes = tuple(p.size for p in parameters)
+        return cls(
+            names=tuple(p.name for p in parameters),
+            units=tuple(p.unit for p in parameters),
+            low=np.repeat([p.low for p in parameters], sizes),
+            high=np.repeat([p.high for p in parameters], sizes),
+            base=base,
+            sizes=sizes,
+        )
 
     @property
     def dim(self) -> int:

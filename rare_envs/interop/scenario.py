@@ -230,14 +230,7 @@ def _space(groups: list[Group], noise: bool, base: Any) -> ScenarioSpace:
         laws.append(NoiseLaw(1))
     if not parameters:
         raise ValueError("Every parameter is held; expected at least one that varies.")
-    return ScenarioSpace(
-        names=tuple(p.name for p in parameters),
-        units=tuple(p.unit for p in parameters),
-        low=np.repeat([p.low for p in parameters], [p.size for p in parameters]),
-        high=np.repeat([p.high for p in parameters], [p.size for p in parameters]),
-        base=beside(*laws),
-        sizes=tuple(p.size for p in parameters),
-    )
+    return ScenarioSpace.of(parameters, beside(*laws))
 
 
 def _seed(noise: float | None) -> int:

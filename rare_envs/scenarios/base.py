@@ -105,6 +105,19 @@ def columns(*values: Tensor) -> Tensor:
     return torch.stack(values).T
 
 
+def straight_on(state: State, acceleration: Tensor | float, dt: float) -> Others:
+    """Vehicles 1 to N - 1 straight on along a straight road, down to a standstill.
+
+    Args:
+        state: Traffic of B scenarios.
+        acceleration: Theirs [m/s^2], shape (B, N - 1).
+        dt: Tick [s].
+    """
+    speed = state.speed[:, 1:]
+    after = (speed + acceleration * dt).clamp(min=0.0)
+    return Others(state.x[:, 1:] + speed * dt, state.y[:, 1:], state.heading[:, 1:], after)
+
+
 def roaming(state: State, action: Tensor, dt: float, road: Road) -> Others:
     """Vehicles 1 to N - 1 as points that turn at will, wherever they are on the road.
 

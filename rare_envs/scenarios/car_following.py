@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from rare_envs.road import straight
-from rare_envs.scenarios.base import DATA, SPEED, Others, Scenario, columns
+from rare_envs.scenarios.base import DATA, SPEED, Others, Scenario, columns, straight_on
 from rare_envs.space import Parameter
 from rare_envs.state import VEHICLE_LENGTH, State
 
@@ -24,14 +24,12 @@ def initial(x: Tensor) -> State:
 
 def others(state: State, dt: float) -> Others:
     """The lead keeps its speed."""
-    speed = state.speed[:, 1:]
-    return Others(state.x[:, 1:] + speed * dt, state.y[:, 1:], state.heading[:, 1:], speed)
+    return straight_on(state, 0.0, dt)
 
 
 def driven(state: State, action: Tensor, dt: float) -> Others:
     """The lead accelerates as its driver wants and stays in the middle of the lane."""
-    kept = others(state, dt)
-    return kept._replace(speed=(kept.speed + action[..., 0] * dt).clamp(min=0.0))
+    return straight_on(state, action[..., 0], dt)
 
 
 CAR_FOLLOWING = Scenario(

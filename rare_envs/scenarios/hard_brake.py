@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from rare_envs.road import straight
-from rare_envs.scenarios.base import Others, Scenario, columns
+from rare_envs.scenarios.base import Others, Scenario, columns, straight_on
 from rare_envs.space import Parameter
 from rare_envs.state import VEHICLE_LENGTH, State
 
@@ -44,14 +44,12 @@ def initial(x: Tensor) -> State:
 
 def others(state: State, dt: float) -> Others:
     """The lead brakes until it stands."""
-    return driven(state, -state.theta[..., None], dt)
+    return straight_on(state, -state.theta, dt)
 
 
 def driven(state: State, action: Tensor, dt: float) -> Others:
     """The lead accelerates as its driver wants and stays in the middle of the lane."""
-    speed = state.speed[:, 1:]
-    braked = (speed + action[..., 0] * dt).clamp(min=0.0)
-    return Others(state.x[:, 1:] + speed * dt, state.y[:, 1:], state.heading[:, 1:], braked)
+    return straight_on(state, action[..., 0], dt)
 
 
 HARD_BRAKE = Scenario(
