@@ -9,8 +9,6 @@ from pathlib import Path
 from agents.ego import innermost, kind_of
 from agents.saved import find_statistics
 
-CAN_RUN_CODE = (".zip", ".pkl")
-
 
 def doubts(spec: str) -> list[str]:
     """Reasons not to open what an ego's name stands for, if opening it can run code; empty if there are none.

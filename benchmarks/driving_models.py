@@ -9,7 +9,6 @@ traffic. The reference probabilities are those of `benchmarks.driving_references
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
 from benchmarks.limit_states import LimitState
@@ -18,7 +17,6 @@ from samplers.problem import FloatArray
 TTC_CAP = 10.0
 STEP = 0.1
 """Time step [s]."""
-BoolArray = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,6 @@ import samplers
 from rare_envs.study.checks import BadInput
 from rare_envs.study.evaluate import Question, prepare
 
-NOT_ASKED = ("target_cov", "replicates", "on_error")
-
 
 def compare(question: Question, ego_b: str, progress: bool = False) -> dict[str, Any]:
     """Estimate p_A / p_B, see `samplers.compare`.
