@@ -156,8 +156,8 @@ class DrivingProblem:
         x = self.space.validate(np.atleast_2d(x))
         world, found = replace(self.world, measure="ttc", witnessed=True), []
         with torch.inference_mode():
-            for first in range(0, len(x), self._tile):
-                rows = torch.from_numpy(x[first : first + self._tile]).float()
+            for first in range(0, len(x), self.tile):
+                rows = torch.from_numpy(x[first : first + self.tile]).float()
                 seen = rollout(world, self.driver, rows).witness
                 assert seen is not None
                 found.append(seen.crash)
@@ -168,8 +168,8 @@ class DrivingProblem:
         return [KINDS[kind] for kind in self.crashes(x).kind]
 
     @property
-    def _tile(self) -> int:
-        """Rollouts at once."""
+    def tile(self) -> int:
+        """Rollouts at once: `evaluate` simulates so many rows together, then the next."""
         if isinstance(self.driver, PolicyDriver) and "camera" in kinds_of(self.world.observation):
             return CAMERA_TILE
         if self.world.sees or self.world.recorded:
@@ -178,7 +178,7 @@ class DrivingProblem:
 
     def _simulated(self, x: NDArray[np.float64], lost: dict[int, str] | None) -> NDArray[np.float64]:
         x = self.space.validate(np.atleast_2d(x))
-        tile = self._tile
+        tile = self.tile
         f = np.empty(len(x))
         with torch.inference_mode():
             for first in range(0, len(x), tile):

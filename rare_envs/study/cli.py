@@ -121,7 +121,7 @@ def estimate_command(
 ) -> None:
     """Estimate how often an ego fails, with an interval, and show its most likely failure."""
     _one_thread()
-    from rare_envs.study import checks, evaluate, show
+    from rare_envs.study import evaluate, rundir
 
     question = evaluate.Question(
         env_id=env,
@@ -147,17 +147,38 @@ def estimate_command(
     )
     with contextlib.redirect_stdout(sys.stderr):  # an ego may print, and standard output is for the answer
         study = evaluate.prepare(question)
-        with contextlib.nullcontext() if out is None else checks.output_folder(out):
-            report = evaluate.run(study, progress=True)
-            if out is not None:
-                from rare_envs.study.rundir import write_run
+        report = evaluate.run(study, progress=True) if out is None else rundir.run_into(out, study, progress=True)
+    _answer(report, out, as_json)
 
-                write_run(out, report)
+
+def _answer(report: Any, out: Path | None, as_json: bool) -> NoReturn:
+    """Print a report and exit."""
+    from rare_envs.study.show import print_report
+
     if as_json:
         _print_json(report.to_dict())
     else:
-        show.print_report(report, out)
+        print_report(report, out)
     raise typer.Exit(DOUBTFUL if report.doubtful else 0)
+
+
+@app.command("resume")
+def resume_command(
+    run: Annotated[
+        Path, typer.Argument(metavar="RUN", help="Folder of an estimate --out that has not come to its end.")
+    ],
+    ego: Annotated[str | None, typer.Option(help="New address of an ego in another program, tcp://...")] = None,
+    on_error: Annotated[str | None, typer.Option(help="Instead of what the run had: raise, failure or bound.")] = None,
+    trust: Trust = False,
+    as_json: Json = False,
+) -> None:
+    """Go on with a run whose ego has gone, or that was stopped; the answer is that of an undisturbed run."""
+    _one_thread()
+    from rare_envs.study.rundir import resume
+
+    with contextlib.redirect_stdout(sys.stderr):
+        report = resume(run, ego, on_error, trust, progress=True)
+    _answer(report, run, as_json)
 
 
 @app.command("compare")

@@ -21,6 +21,7 @@ from rare_envs.rollout import drive
 from rare_envs.setup import find_scenario
 from rare_envs.space import did_you_mean
 from rare_envs.study.checks import BadInput
+from rare_envs.study.journal import Journal, Journaled
 from rare_envs.study.kinds import Kinds, look_again
 
 
@@ -244,12 +245,17 @@ def _try_ego(problem: rare_envs.DrivingProblem) -> None:
         raise BadInput(f"The ego fails on its first observation: {words or repr(error)}") from error
 
 
-def run(study: Study, progress: bool | Callable[[samplers.Progress], None] = False) -> Report:
+def run(
+    study: Study,
+    progress: bool | Callable[[samplers.Progress], None] = False,
+    journal: Journal | None = None,
+) -> Report:
     """Answer a question.
 
     Args:
         study: From `prepare`.
         progress: True for a bar on standard error, or a function, as in `samplers.estimate`.
+        journal: Takes what is simulated, and gives what an earlier run had simulated.
 
     Returns:
         The report.
@@ -261,7 +267,7 @@ def run(study: Study, progress: bool | Callable[[samplers.Progress], None] = Fal
     problem = FaultTolerant(study.problem, question.on_error)
     try:
         estimate = samplers.estimate(
-            problem,
+            problem if journal is None else Journaled(problem, journal, study.problem.tile),
             study.method,
             gamma=question.gamma,
             seed=question.seed,
@@ -271,7 +277,9 @@ def run(study: Study, progress: bool | Callable[[samplers.Progress], None] = Fal
             on_error=cast("Literal['raise', 'failure', 'bound']", question.on_error),
             progress=progress,
         )
-    except (ValueError, EgoGone) as error:
+    except EgoGone as error:
+        raise BadInput(f"{error}{'' if journal else ' With --out what was simulated would have been kept.'}") from error
+    except ValueError as error:
         raise BadInput(error) from error
     seconds = time.perf_counter() - start
     kinds = look_again(study.problem, estimate)

@@ -1,20 +1,29 @@
-"""The folder a run leaves behind: result.json, failures.csv (and failures.npz), plot.png, faults.csv."""
+"""The folder a run leaves behind: result.json, failures.csv (and failures.npz), plot.png, faults.csv.
+
+Until it is done its finished simulations are there, see `rare_envs.study.journal`.
+"""
 
 from __future__ import annotations
 
 import csv
 import json
 import re
+import sys
+from contextlib import closing
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.ego import kind_of
 from rare_envs.crashes import KINDS, NONE
 from rare_envs.space import ScenarioSpace
+from rare_envs.study.checks import BadInput, output_folder
 from rare_envs.study.columns import SHOWN, columns_of
-from rare_envs.study.evaluate import Report
+from rare_envs.study.evaluate import Question, Report, Study, prepare, run
+from rare_envs.study.journal import Journal
 from rare_envs.study.plots import save_plot
 
 RESULT, FAILURES, BLOCKS, PLOT = "result.json", "failures.csv", "failures.npz", "plot.png"
@@ -33,6 +42,70 @@ CRASH = (
 """Columns of failures.csv that say what a failure ended in: `rare_envs.crashes.Crash`."""
 FAULTS, FAULT_BLOCKS = "faults.csv", "faults.npz"
 """Likewise, scenarios on which the ego failed."""
+
+
+def run_into(folder: Path, study: Study, progress: bool = False) -> Report:
+    """Answer a question and write the answer; what is simulated is kept, should the run end before its time.
+
+    Args:
+        folder: Is made, if need be; files of an earlier run in it are replaced.
+        study: From `rare_envs.study.evaluate.prepare`.
+        progress: Show a bar on standard error.
+
+    Returns:
+        The report.
+
+    Raises:
+        BadInput: See `rare_envs.study.evaluate.run`; or the folder cannot be used, or has an unfinished run.
+    """
+    with output_folder(folder), closing(Journal(folder, asdict(study.question))) as journal:
+        return _run(folder, study, journal, progress)
+
+
+def resume(
+    folder: Path, ego: str | None = None, on_error: str | None = None, trust: bool = False, progress: bool = False
+) -> Report:
+    """Take up a run that has ended before its time, and come to the answer of one that has not.
+
+    Args:
+        folder: Of the run.
+        ego: Address of an ego in another program, if it has changed.
+        on_error: What to count scenarios as on which the ego fails, if that has changed.
+        trust: Let the ego's file run code, as the run was allowed to.
+        progress: Show a bar on standard error.
+
+    Raises:
+        BadInput: There is no unfinished run, it cannot be taken up, or it ends again.
+    """
+    with closing(Journal(folder)) as journal:
+        try:
+            question = Question(**{**journal.question, "trust": trust})
+        except TypeError as error:
+            raise BadInput(f"Cannot take up the run in {str(folder)!r}: {error}") from error
+        if ego is not None and {kind_of(ego), kind_of(question.ego)} != {"remote"}:
+            raise BadInput(f"Expected --ego for one whose address has changed only; the run has {question.ego!r}.")
+        question = replace(question, ego=ego or question.ego, on_error=on_error or question.on_error)
+        return _run(folder, prepare(question), journal, progress)
+
+
+def _run(folder: Path, study: Study, journal: Journal, progress: bool) -> Report:
+    try:
+        report = run(study, progress, journal)
+        write_run(folder, report)
+    except BadInput as error:
+        raise BadInput(f"{error}{_advice(journal, folder)}") from error
+    except KeyboardInterrupt:
+        print(f"Stopped.{_advice(journal, folder)}", file=sys.stderr)
+        raise
+    journal.remove()
+    return report
+
+
+def _advice(journal: Journal, folder: Path) -> str:
+    """What is left of a run that has ended, and what to do about it."""
+    if not journal.n:
+        return ""
+    return f" {journal.n:,} simulations are kept; go on with: rare-envs resume {folder}"
 
 
 def write_run(folder: Path, report: Report) -> None:
