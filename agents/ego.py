@@ -61,7 +61,8 @@ def load_ego(spec: str | Path, algo: str | None = None, trust: bool = False) -> 
             behind the imperfections of a full stack (`agents.noisy.Stack`).
         algo: Algorithm of a `.zip`, such as "ppo"; recognised from the file when None. Only a `.zip` has one.
         trust: Open the pickles in a `.zip` as Stable-Baselines3 does, which runs whatever code is in them. Without it
-            a file that needs code of its author's (a policy class of their own, say) is refused.
+            a file that needs code of its author's (a policy class of their own, say) is refused, and one to which
+            everybody may write.
 
     Returns:
         "idm" as it stands, a `LearnedEgo`, else an object with `predict`. A `.zip` gives a `SavedEgo`, whose

@@ -1,4 +1,4 @@
-"""Where a file comes from: whether others could have changed it."""
+"""Where a file that can run code comes from: whether others could have put another in its place."""
 
 from __future__ import annotations
 
@@ -6,35 +6,47 @@ import os
 import stat
 from pathlib import Path
 
-from agents.ego import innermost, kind_of
-from agents.saved import find_statistics
+TRUSTED = "it is opened as Stable-Baselines3 does, and whatever code is in it runs"
+"""What trust means."""
+ADVICE = (
+    "others may have put something else there: copy it to a folder of your own, or take away their right to write "
+    f"(chmod o-w). With --trust (trust=True) it is opened nevertheless; mind that {TRUSTED}, where otherwise only what "
+    "is known to be harmless is made of it"
+)
+"""What to do about a doubt."""
 
 
-def doubts(spec: str) -> list[str]:
-    """Reasons not to open what an ego's name stands for, if opening it can run code; empty if there are none.
+def check_origin(*files: Path | None) -> None:
+    """Refuse files that others may have written.
 
-    Args:
-        spec: As for `agents.load_ego`.
+    Raises:
+        ValueError: One of them is doubtful; the message says why and what to do.
     """
-    spec = innermost(spec)
-    kind, path = kind_of(spec), Path(spec)
-    if kind == "url":
-        return [f"{spec!r} is a remote place"]
-    if kind != "zip":
+    if reasons := doubts(*files):
+        raise ValueError(f"Will not open it: {'; '.join(reasons)}; {ADVICE}.")
+
+
+def doubts(*files: Path | None) -> list[str]:
+    """Reasons not to open files; empty if there are none. Files that do not exist give none.
+
+    A file is doubtful if everybody may write to it or put another in its place, in its folder or one above. Where
+    everybody may add files but not replace those of others (/tmp), one that belongs to somebody else is.
+    """
+    if os.name != "posix":  # others' rights are not in the mode
         return []
-    files = [path, find_statistics(path)] if path.exists() else []
-    return [doubt for file in files if file is not None for doubt in writable_by_others(file)]
+    found = [doubt for file in files if file is not None and file.exists() for doubt in _doubts(file.resolve())]
+    return list(dict.fromkeys(found))
 
 
-def writable_by_others(path: Path) -> list[str]:
-    """Where others may write: the file, its folder, or a folder above in which they may put another in its place."""
-    found, path = [], path.resolve()
-    if path.stat().st_mode & stat.S_IWOTH:
-        found.append(f"{str(path)!r} is writable by everybody")
-    if path.stat().st_uid not in (0, os.getuid()):
-        found.append(f"{str(path)!r} belongs to another user")
+def _doubts(path: Path) -> list[str]:
+    status = path.stat()
+    found = [f"{str(path)!r} is writable by everybody"] if status.st_mode & stat.S_IWOTH else []
     for folder in path.parents:
         mode = folder.stat().st_mode
-        if mode & stat.S_IWOTH and (folder == path.parent or not mode & stat.S_ISVTX):
+        if not mode & stat.S_IWOTH:
+            continue
+        if not mode & stat.S_ISVTX:
             found.append(f"the folder {str(folder)!r} is writable by everybody")
+        elif folder == path.parent and status.st_uid not in (0, os.getuid()):
+            found.append(f"{str(path)!r} belongs to another user, in a folder to which everybody may add")
     return found

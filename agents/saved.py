@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from agents.origin import check_origin
 from agents.safe_pickle import ForeignObject, open_pickle
 from agents.sb3_zip import algorithm_class, algorithm_of, read_header, weights_only_objects
 from agents.words import one_line
@@ -91,17 +92,20 @@ def load_saved(path: Path, algo: str | None, trust: bool = False) -> SavedEgo:
 
     Raises:
         FileNotFoundError: The file does not exist.
-        ValueError: It is no model, is damaged, or needs trust.
+        ValueError: It is no model, is damaged, or needs trust: for what is in it, or because others may write to it or
+            its statistics (`agents.origin`).
     """
     if not path.exists():
         raise FileNotFoundError(f"No ego at {str(path)!r}{_suggest_file(path)}.")
     if not path.is_file():
         raise ValueError(f"Expected a Stable-Baselines3 .zip, got the folder {str(path)!r}.")
+    found = find_statistics(path)
+    if not trust:
+        check_origin(path, found)
     header = read_header(path)
     name = algo.lower() if algo is not None else algorithm_of(header, path)
     algorithm = algorithm_class(name, path)
     model = _load_model(algorithm, name, header, path, trust)
-    found = find_statistics(path)
     statistics = None if found is None else _load_statistics(found, model.observation_space, trust)
     return SavedEgo(model, name, path, statistics, found)
 

@@ -14,6 +14,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 from rare_envs.study.checks import BadInput
@@ -31,7 +32,7 @@ class Asked:
         ego: As for `agents.load_ego`.
         env_id: Environment.
         algo: Algorithm of a `.zip`, if the file does not tell.
-        trust: Open it even from a place where others may write, and let it run code.
+        trust: As for `agents.load_ego`.
         observation: What the ego observes.
         action: What it decides.
         time_limit: Seconds that one check may take.
@@ -65,7 +66,8 @@ def check_ego(asked: Asked) -> list[Finding]:
         BadInput: The environment is unknown, or there is no such file.
     """
     from agents.ego import innermost, kind_of
-    from agents.origin import doubts
+    from agents.origin import ADVICE, TRUSTED, doubts
+    from agents.saved import find_statistics
     from rare_envs.setup import find_scenario
 
     try:
@@ -74,17 +76,17 @@ def check_ego(asked: Asked) -> list[Finding]:
         raise BadInput(error) from error
     if asked.time_limit <= 0:
         raise BadInput(f"Expected a time limit of some seconds, got {asked.time_limit}.")
-    reasons, kind = doubts(asked.ego), kind_of(innermost(asked.ego))
-    findings = []
-    if reasons and not asked.trust:
-        advice = "opening it can run code that others put there; copy it to a place of your own, or say --trust"
-        return [failed("origin", "; ".join(reasons), advice)]
+    name = innermost(asked.ego)
+    findings, kind = [], kind_of(name)
+    if kind == "url":
+        return [failed("origin", f"{name!r} is a remote place", "download the file, look where it comes from, name it")]
     if kind == "zip":
+        reasons = doubts(Path(name), find_statistics(Path(name)))
+        if reasons and not asked.trust:
+            return [failed("origin", "; ".join(reasons), ADVICE)]
         place = f" ({'; '.join(reasons)})" if reasons else ""
-        advice = "load only files that you trust; here only what is known to be harmless is opened"
-        if asked.trust:
-            advice = "you said --trust: whatever code is in it runs"
-        findings.append(warned("origin", f"loading a Stable-Baselines3 .zip can run code{place}", advice, False))
+        advice = f"you said --trust: {TRUSTED}" if asked.trust else "opened here is only what is known to be harmless"
+        findings.append(warned("origin", f"a Stable-Baselines3 .zip can hold code{place}", advice, False))
     return findings + list(_in_a_process(asked))
 
 

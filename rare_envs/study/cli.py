@@ -66,7 +66,9 @@ class Noise(str, Enum):
 
 Env = Annotated[str, typer.Argument(metavar="ENV", help="Environment, such as rare_envs/CutIn-v0.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
-Trust = Annotated[bool, typer.Option("--trust", help="Let the ego's .zip run code when it is loaded.")]
+Trust = Annotated[
+    bool, typer.Option("--trust", help="Let the ego's .zip run code; open it though others can write to it.")
+]
 Seed = Annotated[int, typer.Option(help="Seed; the same seed gives the same answer.")]
 Base = Annotated[str | None, typer.Option(help="Base distribution: a name or a JSON file.")]
 Drivers = Annotated[str | None, typer.Option(help="Of the vehicles around the ego: mgail, gail, bc, idm or a file.")]

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from typer.testing import Result
 
+import agents
 from agents.origin import doubts
 from rare_envs.study.check_ego import Asked, findings_of
 from rare_envs.study.findings import Finding, exit_code
@@ -215,24 +216,58 @@ def saved(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("what", ["file", "folder", "statistics"])
-def test_a_zip_that_others_can_write_to_is_refused_unless_trusted(what: str, saved: Path, cli: Cli) -> None:
-    wrapped = f"noisy:process:{saved}?timeout=3?lag=1"
-    assert doubts(str(saved)) == doubts(wrapped) == []
+def test_a_zip_that_others_can_write_to_is_refused_by_every_command(what: str, saved: Path, cli: Cli) -> None:
     statistics = saved.with_name("vecnormalize.pkl")
     if what == "statistics":
         statistics.write_bytes(b"")
+    assert doubts(saved, statistics) == []
     path = {"file": saved, "folder": saved.parent, "statistics": statistics}[what]
     path.chmod(path.stat().st_mode | 0o002)
-    assert doubts(wrapped) == doubts(str(saved)) != []
+    (doubt,) = doubts(saved, statistics)
     refused = cli("check-ego", saved, ENV, "--json")
     (finding,) = json.loads(refused.stdout)["findings"]
     assert (refused.exit_code, finding["check"], finding["status"]) == (2, "origin", "fail")
-    assert "writable by everybody" in finding["found"]
-    assert "--trust" in finding["advice"]
-    if what == "file":
-        trusted = json.loads(cli("check-ego", saved, ENV, "--json", "--trust").stdout)["findings"]
-        assert [each["status"] for each in trusted[:2]] == ["warn", "pass"]
-        assert "can run code" in trusted[0]["found"]
+    assert finding["found"] == doubt
+    assert "writable by everybody" in doubt
+    commands: list[list[Any]] = [
+        ["estimate", ENV, "--ego", saved],
+        ["estimate", ENV, "--ego", f"noisy:{saved}?lag=1"],
+        ["compare", "idm", saved, ENV],
+        ["serve-ego", saved],
+        ["export-ego", saved, saved.with_suffix(".onnx")],
+    ]
+    for words in commands:
+        said = cli(*words)
+        assert (said.exit_code, said.stdout) == (2, "")
+        assert f"Will not open it: {doubt}; {finding['advice']}." in said.stderr
+    with pytest.raises(
+        ValueError, match=r"is writable by everybody.*copy it to a folder of your own.*code is in it runs"
+    ):
+        agents.load_ego(saved)
+
+
+def test_trust_opens_it_all_the_same(saved: Path, cli: Cli) -> None:
+    saved.chmod(0o666)
+    found = json.loads(cli("check-ego", saved, ENV, "--json", "--trust").stdout)["findings"]
+    assert [each["status"] for each in found[:2]] == ["warn", "pass"]
+    assert "writable by everybody" in found[0]["found"]
+    assert "whatever code is in it runs" in found[0]["advice"]
+    out = saved.parent / "run"
+    words = ("estimate", ENV, "--ego", saved, "--method", "mc", "--max-sim", 50, "--gamma", 9, "--out", out)
+    assert cli(*words, "--trust").exit_code in (0, 3)
+    assert "writable by everybody" in cli("replay", out).stderr
+    assert cli("replay", out, "--trust").exit_code in (0, 3)
+
+
+def test_where_everybody_may_add_files_ones_own_are_safe(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    saved.parent.chmod(0o1777)  # as /tmp is
+    assert doubts(saved) == []
+    if os.getuid() == 0:
+        os.chown(saved, 1234, -1)
+    monkeypatch.setattr("os.getuid", lambda: 4321)
+    assert "belongs to another user" in doubts(saved)[0]
+    saved.parent.chmod(0o755)  # a colleague's: nobody else can have put it there
+    assert doubts(saved) == []
 
 
 def test_a_remote_file_is_refused(cli: Cli) -> None:
