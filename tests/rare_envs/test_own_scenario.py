@@ -1,7 +1,6 @@
 """A scenario of one's own: one definition, one registration, and it passes the suites like those that are shipped."""
 
 import json
-import subprocess
 import sys
 import warnings
 from dataclasses import replace
@@ -113,21 +112,6 @@ def test_its_probability_is_the_one_on_paper(registered):
     exact = np.clip((v**2 / 10 + v * 0.05 - 10.0) / 140.0, 0.0, 1.0).mean()
     assert abs(result.p - exact) < 5 * (exact * (1 - exact) / n) ** 0.5
     assert samplers.estimate(problem, samplers.TwoStage(), gamma=0.0, seed=0).interval[0] < exact
-
-
-def test_a_command_line_takes_it_from_a_module_of_ones_own(tmp_path):
-    """`python -c` as a user's program would: register, then call the command."""
-    code = (
-        "import sys; sys.path.insert(0, sys.argv[1]); from test_own_scenario import ENV_ID, STANDING; import rare_envs;"
-        "rare_envs.register_scenario(ENV_ID, STANDING); from rare_envs.study.cli import app;"
-        "app(['estimate', ENV_ID, '--method', 'mc', '--max-sim', '500', '--json'], prog_name='rare-envs')"
-    )
-
-    done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", code, str(Path(__file__).parent)], capture_output=True, text=True
-    )
-    assert done.returncode in (0, 3), done.stderr
-    assert json.loads(done.stdout)["question"]["env_id"] == ENV_ID
 
 
 @pytest.mark.parametrize(

@@ -1,13 +1,15 @@
 """Methods of other packages, found by entry point."""
 
-import subprocess
+import json
 import sys
 import textwrap
 import warnings
 
 import pytest
+from typer.testing import CliRunner
 
 import samplers
+from rare_envs.study.cli import app
 from samplers.registry import GROUP, METHODS, Methods
 from samplers.testing import check_method
 
@@ -68,7 +70,9 @@ def installed(tmp_path, monkeypatch):
         monkeypatch.syspath_prepend(tmp_path)
         return tmp_path
 
+    vars(METHODS).pop("_offered", None)  # as in a new process
     yield install
+    vars(METHODS).pop("_offered", None)
     sys.modules.pop("lattice_methods", None)
 
 
@@ -120,27 +124,17 @@ def test_one_that_cannot_be_used_is_named_and_left_out(installed, name, value, s
         assert list(methods) == METHODS.own  # said once
 
 
-COMMANDS = """
-import sys
-sys.path.insert(0, sys.argv[1])
-from rare_envs.study.cli import main
-for words in ("estimate {env} --method lattice --json", "list", "estimate {env} --method lattic"):
-    sys.argv[1:] = words.format(env="rare_envs/CarFollowing-v0").split()
-    try:
-        main()
-    except SystemExit as end:
-        print("exit code", end.code)
-"""
+def command_line(*words):
+    return CliRunner().invoke(app, words)
 
 
 def test_the_command_line_knows_it(installed):
-    folder = installed(lattice="lattice_methods:Lattice", broken="lattice_methods:Lettuce")
-    shown = subprocess.run([sys.executable, "-c", COMMANDS, folder], capture_output=True, text=True, timeout=120)
-    answer, listed, refused = shown.stdout.split("exit code")[:3]
-    assert '"name": "lattice"' in answer
-    assert '"n_sim": 2000' in answer
-    assert "Plain draws under another name." in listed
-    assert refused.strip() == "0"
-    assert shown.stdout.endswith("exit code 2\n")
-    assert "Did you mean 'lattice'?" in shown.stderr
-    assert shown.stderr.count("'broken' of lattice-methods") == 1
+    installed(lattice="lattice_methods:Lattice", broken="lattice_methods:Lettuce")
+    env = "rare_envs/CarFollowing-v0"
+    with pytest.warns(RuntimeWarning, match="'broken' of lattice-methods"):
+        answer = json.loads(command_line("estimate", env, "--method", "lattice", "--json").stdout)
+    assert (answer["method"]["name"], answer["n_sim"]) == ("lattice", 2000)
+    assert "Plain draws under another name." in command_line("list").stdout
+    refused = command_line("estimate", env, "--method", "lattic")
+    assert refused.exit_code == 2
+    assert "Did you mean 'lattice'?" in refused.stderr
