@@ -12,7 +12,7 @@ import time
 
 from agents import wire
 from agents.answering import Answerer
-from agents.remote import Lost, RemoteEgo, read_settings
+from agents.remote import RemoteEgo, Silent, read_settings
 from agents.wire import Message
 
 START = 60.0
@@ -63,11 +63,11 @@ class ChildLink:
             (size,) = _SIZE.unpack(self._receive(_SIZE.size, deadline))
             return self._receive(size, deadline)
         except TimeoutError as error:
-            raise Lost(f"no answer within {timeout:.3g} s") from error
+            raise Silent(f"no answer within {timeout:.3g} s") from error
         except (OSError, EOFError) as error:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._process.wait(1.0)
-            raise Lost(f"its process ended (exit status {self._process.returncode})") from error
+            raise Silent(f"its process ended (exit status {self._process.returncode})") from error
 
     def _receive(self, size: int, deadline: float) -> bytes:
         assert self._socket is not None

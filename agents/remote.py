@@ -14,18 +14,23 @@ from numpy.typing import NDArray
 from agents import wire
 from agents.answering import read_space
 from agents.wire import Malformed, Message
-from rare_envs.faults import EgoGone
+from rare_envs.faults import EgoGone, NoAnswer
 from rare_envs.mixed import batch_size
 
 TIMEOUT, PATIENCE = 10.0, 30.0
 """Seconds to wait for an answer, and for an ego that has gone to come back."""
 _HELLO_EVERY = 1.0
+_HURRY = 0.5
 MOST_NAME = 100
 """Letters of an ego's name that are kept."""
 
 
 class Lost(Exception):
     """No answer: the other side is silent, or the connection broke."""
+
+
+class Silent(Lost):
+    """No answer in time, or its process has died: perhaps because of what it was asked."""
 
 
 class RemoteError(RuntimeError):
@@ -46,7 +51,8 @@ class Link(Protocol):
         """Send a message and wait for the answer.
 
         Raises:
-            Lost: There is none within the time [s].
+            Silent: There is none within the time [s], or its process has died.
+            Lost: The connection broke.
         """
 
     def hello(self, greeting: Message, timeout: float) -> Message:
@@ -114,6 +120,9 @@ class RemoteEgo:
         self._timeout, self._patience = timeout, patience
         self._ids, self._numbers = itertools.count(1), itertools.count(1)
         self._epoch = 0
+        self._suspected = 0
+        self._longest = 0.0
+        self._warm = False
         self._connected = False
         self._spare: dict[int, _Session] = {}
         self._ended: list[int] = []
@@ -141,6 +150,7 @@ class RemoteEgo:
         """Choose an action for each row of a batch; see `agents.Ego`.
 
         Raises:
+            NoAnswer: It does not answer in time, or its process dies.
             RemoteError: The ego failed on this batch.
             EgoGone: It is not there any more.
         """
@@ -171,6 +181,8 @@ class RemoteEgo:
 
     def _act(self, session: _Session, observation: Any, start: NDArray[np.bool_] | None) -> NDArray[Any]:
         why = ""
+        if session.batch >= self._suspected:
+            self._suspected = 0
         for _ in range(2):
             try:
                 if not self._connected:
@@ -178,6 +190,9 @@ class RemoteEgo:
                 self._restore(session)
                 reply = self._send_act(session, session.step, observation, start)
                 action = wire.unpack_array(reply.get("action"))
+            except Silent as silent:
+                self._connected, self._suspected = False, max(self._suspected, session.batch)
+                raise NoAnswer(f"The ego at {self._link.where}: {silent}.") from silent
             except (Lost, Malformed) as lost:
                 self._connected, why = False, str(lost)
                 continue
@@ -213,7 +228,21 @@ class RemoteEgo:
         }
         if start is not None:
             message["start"] = wire.pack_array(start)
-        return self._ask(message)
+        begun = time.monotonic()
+        reply = self._ask(message, self._time_for(session.batch))
+        self._longest, self._warm = max(self._longest, time.monotonic() - begun), True
+        return reply
+
+    def _time_for(self, batch: int) -> float:
+        """Seconds to wait for the actions of a batch.
+
+        Parts of a batch that was not answered in time get less: what it has ever taken, ten times over. A part that
+        might have been answered a little later is no harm done, as its rows are asked about one by one, with all the
+        time that they may take.
+        """
+        if not (self._warm and 1 < batch < self._suspected):
+            return self._timeout
+        return min(self._timeout, max(_HURRY, 10.0 * self._longest))
 
     def ping(self) -> float:
         """Ask whether anybody is there; the seconds until the answer.
@@ -259,7 +288,7 @@ class RemoteEgo:
         if reply.get("protocol") != wire.PROTOCOL:
             raise RemoteError(f"it speaks protocol {reply.get('protocol')!r}, expected {wire.PROTOCOL}")
         self._epoch += 1
-        self._connected = True
+        self._connected, self._warm = True, False
         return reply
 
     def _reconnect(self) -> None:

@@ -11,7 +11,7 @@ import zmq
 from zmq.utils.monitor import recv_monitor_message
 
 from agents import wire
-from agents.remote import Lost, RemoteEgo, read_settings
+from agents.remote import Lost, RemoteEgo, Silent, read_settings
 from agents.wire import Malformed, Message
 
 SECRET = "RARE_ENVS_SECRET"
@@ -78,7 +78,7 @@ class ZmqLink:
             if self._socket in ready:
                 return self._content(self._socket.recv_multipart())
             if not ready:
-                raise Lost(f"no answer within {timeout:.3g} s")
+                raise Silent(f"no answer within {timeout:.3g} s")
             recv_monitor_message(self._monitor)
             raise Lost("the connection broke")
 

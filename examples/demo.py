@@ -59,7 +59,7 @@ def demo(steps: int, out: Path) -> None:
     ego = train_ego(ENV_ID, algo="ppo", steps=steps, seed=0, out=out / "ego.zip")
 
     print("2. Estimating how often it collides: explore, then estimate from a fresh sample.", flush=True)
-    study = prepare(Question(env_id=ENV_ID, ego=str(ego), seed=0))
+    study = prepare(Question(env_id=ENV_ID, ego=str(ego), seed=0, trust=True))  # it has just been written
     report = run(study, progress=True)
     write_run(out, report)
 

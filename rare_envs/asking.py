@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rare_envs.actions import read_actions
-from rare_envs.faults import EgoGone, reason_of
+from rare_envs.faults import EgoGone, NoAnswer, part_size, reason_of
 from rare_envs.mixed import each
 
 
@@ -46,7 +46,10 @@ def ask(policy: Any, kind: str, asked: Asked, lost: dict[int, str] | None = None
             has a memory.
     """
     if lost is None:
-        action, hidden = _predict(policy, asked)
+        try:
+            action, hidden = _predict(policy, asked)
+        except NoAnswer:  # its connection may have been lost
+            action, hidden = _predict(policy, asked)
         return read_actions(kind, action, len(asked.start), asked.over), hidden
     try:
         action, hidden = _predict(policy, asked)
@@ -54,8 +57,8 @@ def ask(policy: Any, kind: str, asked: Asked, lost: dict[int, str] | None = None
         return read_actions(kind, action, len(over), over), hidden
     except EgoGone:
         raise
-    except (Exception, SystemExit):  # the policy is the user's: anything may happen in it
-        found = None if asked.hidden is not None else _in_parts(policy, kind, asked)
+    except (Exception, SystemExit) as error:  # the policy is the user's: anything may happen in it
+        found = None if asked.hidden is not None else _in_parts(policy, kind, asked, error, len(asked.start))
         if found is None:
             raise
         given, reasons = found
@@ -79,13 +82,26 @@ def _not_finite(action: Tensor, over: Tensor, lost: dict[int, str]) -> Tensor:
     return bad
 
 
-def _in_parts(policy: Any, kind: str, asked: Asked) -> tuple[Tensor, dict[int, str]] | None:
-    """Ask again in halves until the rows that fail stand alone; None if the policy turns out to have a memory."""
-    if len(asked.start) == 1:
-        parts = [asked]
-    else:
-        middle = len(asked.start) // 2
-        parts = [asked.rows(slice(None, middle)), asked.rows(slice(middle, None))]
+def _in_parts(
+    policy: Any, kind: str, asked: Asked, error: BaseException, whole: int
+) -> tuple[Tensor, dict[int, str]] | None:
+    """Ask again, after an error, in parts until the rows that fail stand alone.
+
+    Args:
+        policy: Is asked.
+        kind: Of its actions.
+        asked: Rows on which it failed.
+        error: How.
+        whole: Rows of the batch that they are part of.
+
+    Returns:
+        Actions and reasons by row; None if the policy turns out to have a memory.
+    """
+    rows = len(asked.start)
+    if rows == 1 and isinstance(error, NoAnswer):
+        return _idle(kind, asked), {0: reason_of(error)}
+    size = 1 if rows == 1 else part_size(rows, error, whole)
+    parts = [asked.rows(slice(first, first + size)) for first in range(0, rows, size)]
     given: list[Tensor] = []
     reasons: dict[int, str] = {}
     first = 0
@@ -103,7 +119,7 @@ def _in_parts(policy: Any, kind: str, asked: Asked) -> tuple[Tensor, dict[int, s
             if len(part.start) == 1:
                 done, mine = _idle(kind, part), {0: reason_of(error)}
             else:
-                deeper = _in_parts(policy, kind, part)
+                deeper = _in_parts(policy, kind, part, error, whole)
                 if deeper is None:
                     return None
                 done, mine = deeper

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,6 +17,10 @@ class EgoGone(BaseException):
 
     Like KeyboardInterrupt it is no `Exception`: nobody who makes the best of failing scenarios may take it for one.
     """
+
+
+class NoAnswer(RuntimeError):
+    """The ego has not answered in time, or has died: perhaps because of one of the rows that it was asked about."""
 
 
 class EgoFault(ValueError):
@@ -38,9 +43,9 @@ class FaultTolerant:
     """A problem around one whose ego may raise, hang (if remote), die, or give NaN or actions of a wrong shape.
 
     Rows on which it fails are found: at the tick at which they do if it has no memory, else by handing the batch over
-    in halves until they stand alone. They are simulated once more. If the ego fails on them again f is NaN, which
-    `samplers.estimate(..., on_error="failure" or "bound")` counts, and what happened is kept. The simulations that
-    this costs are not in `n_sim`; they are counted here.
+    in parts (see `part_size`) until they stand alone. They are simulated once more. If the ego fails on them again f
+    is NaN, which `samplers.estimate(..., on_error="failure" or "bound")` counts, and what happened is kept. The
+    simulations that this costs are not in `n_sim`; they are counted here.
 
     Attributes:
         problem: What is asked.
@@ -95,12 +100,12 @@ class FaultTolerant:
             EgoGone: If there is nobody to ask any more.
         """
         x = np.atleast_2d(np.asarray(x, dtype=np.float64))
-        f, reasons = self._by_halves(x)
+        f, reasons = self._in_parts(x, len(x))
         if not reasons:
             return f
         rows = sorted(reasons)
         self.n_retried += len(rows)
-        f[rows], again = self._by_halves(x[rows])
+        f[rows], again = self._in_parts(x[rows], len(rows))
         for number, reason in sorted(again.items()):
             fault = Fault(x[rows[number]].copy(), reason)
             if self._on_error == "raise":
@@ -108,8 +113,8 @@ class FaultTolerant:
             self.faults.append(fault)
         return f
 
-    def _by_halves(self, x: FloatArray) -> tuple[FloatArray, dict[int, str]]:
-        """f, NaN where a row failed, and the reasons by row."""
+    def _in_parts(self, x: FloatArray, whole: int) -> tuple[FloatArray, dict[int, str]]:
+        """f, NaN where a row failed, and the reasons by row; x is part of a batch of so many."""
         try:
             return self._attempt(x.copy())
         except EgoGone:
@@ -117,11 +122,14 @@ class FaultTolerant:
         except (Exception, SystemExit) as error:  # the ego is the user's: anything may happen in it
             if len(x) == 1:
                 return np.full(1, np.nan), {0: reason_of(error)}
-        middle = len(x) // 2
+            size = part_size(len(x), error, whole)
         self.n_retried += len(x)
-        first, reasons = self._by_halves(x[:middle])
-        second, later = self._by_halves(x[middle:])
-        return np.concatenate((first, second)), reasons | {middle + row: reason for row, reason in later.items()}
+        parts, reasons = [], dict[int, str]()
+        for first in range(0, len(x), size):
+            f, found = self._in_parts(x[first : first + size], whole)
+            parts.append(f)
+            reasons |= {first + row: reason for row, reason in found.items()}
+        return np.concatenate(parts), reasons
 
     def _attempt(self, x: FloatArray) -> tuple[FloatArray, dict[int, str]]:
         """F of a batch, and reasons where rows alone have failed, by the problem's `attempt` if it has one."""
@@ -129,6 +137,25 @@ class FaultTolerant:
         f, reasons = (self.problem.evaluate(x), {}) if attempt is None else attempt(x)
         f = np.array(f, dtype=np.float64)
         return f, dict.fromkeys(np.flatnonzero(np.isnan(f)).tolist(), "f is NaN") | reasons
+
+
+def part_size(n: int, error: BaseException, whole: int) -> int:
+    """How many rows to ask about at a time after an error on n of them, to find those on which it happens.
+
+    Half of them, which takes the fewest questions. Where the error is that no answer came, questions are cheap, but
+    waiting for one that does not come, or for a process that starts again, is not: then the square root of the whole
+    batch, and after that each row alone. So a row is found by two more waits, not by one for each halving, in about
+    twice that root of questions.
+
+    Args:
+        n: Rows, 2 or more.
+        error: What happened.
+        whole: Rows of the batch that they are part of.
+    """
+    if not isinstance(error, NoAnswer):
+        return (n + 1) // 2
+    root = math.isqrt(whole)
+    return root if 1 < root < n else 1
 
 
 def reason_of(error: BaseException) -> str:

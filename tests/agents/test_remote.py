@@ -20,13 +20,13 @@ from gymnasium import spaces
 
 import rare_envs
 from agents import load_ego
-from rare_envs.faults import EgoGone, FaultTolerant
+from rare_envs.faults import EgoGone, FaultTolerant, NoAnswer
 
 pytest.importorskip("zmq", reason="the extra remote is optional")
 msgpack = pytest.importorskip("msgpack", reason="the extra remote is optional")
 from agents import wire  # noqa: E402
 from agents.answering import Answerer, describe, read_space  # noqa: E402
-from agents.remote import RemoteEgo, RemoteError  # noqa: E402
+from agents.remote import RemoteEgo, RemoteError, Silent  # noqa: E402
 from agents.serve import EgoServer, is_loopback  # noqa: E402
 from agents.zmq_link import ZmqLink, connect  # noqa: E402
 
@@ -455,21 +455,104 @@ def dangerous(tmp_path: Path, monkeypatch: Any) -> Iterator[Any]:
     ego.close()
 
 
+class Hung(BaseException):
+    """Stands for a call that does not return, or not in time."""
+
+
+class VirtualLink:
+    """Answers at once, but for rows that begin with certain gaps: it hangs on some, and takes 2 s for others."""
+
+    where = "virtual"
+
+    def __init__(self, memory: bool) -> None:
+        self.memory, self.waits, self.starts, self.questions = memory, list[float](), 0, 0
+
+    def open(self) -> None:
+        self.starts += 1
+        self.answerer = Answerer(self)
+
+    def predict(self, observation: Any, state: Any, episode_start: Any, deterministic: bool) -> Any:
+        gap = 50 * observation[:, 3]
+        self.questions += 1
+        if episode_start[0] and ((gap > 30) & (gap < 32)).any():
+            raise Hung
+        if episode_start[0] and ((gap > 40) & (gap < 42)).any() and self.timeout < 2.0:
+            raise Hung
+        return np.full((len(observation), 2), -0.1, np.float32), 1 if self.memory else None
+
+    def hello(self, greeting: Any, timeout: float) -> Any:
+        return wire.unpack(self.ask(wire.pack(greeting), timeout))
+
+    def ask(self, content: bytes, timeout: float) -> bytes:
+        self.timeout = timeout
+        try:
+            return self.answerer.answer(b"", [content])[0]
+        except Hung:
+            self.waits.append(timeout)
+            raise Silent(f"no answer within {timeout:.3g} s") from None
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.mark.parametrize("memory", [False, True])
+def test_rows_that_hang_are_found_at_little_cost_and_slow_ones_not_accused(memory: bool) -> None:
+    n, link = 400, VirtualLink(memory)
+    world = problem(RemoteEgo(link, timeout=10.0))
+    x = world.base.sample(n, np.random.default_rng(0))
+    x[:, 2] = np.where(np.arange(n) % 2, 60.0, 80.0)
+    world.evaluate(x[:5])  # it has answered before
+    hanging, slow = [123, 300], [5, 6, 133, 399]
+    x[hanging, 2], x[slow, 2] = 31.0, 41.0
+    tolerant, link.questions = FaultTolerant(world), 0
+    np.testing.assert_array_equal(np.flatnonzero(np.isnan(tolerant.evaluate(x))), hanging)
+    assert {fault.reason for fault in tolerant.faults} == {"NoAnswer: The ego at virtual: no answer within 10 s."}
+    # once for all, once for each row alone, once for both when they are tried again, and once more for each
+    assert link.waits.count(10.0) <= 1 + 2 + 1 + 2 + 2  # or where it has just been started again, a part
+    assert link.waits.count(0.5) <= 3 + 1 + 1  # for a part with such rows, or both of them
+    assert link.starts == 1 + len(link.waits)
+    ticks = 20 if memory else 1
+    assert link.questions < ticks * (20 + 5 * 20 + 20) + 20
+
+
+def test_a_plain_evaluation_asks_twice_before_it_gives_up(x: np.ndarray) -> None:
+    link = VirtualLink(memory=False)
+    x = x.copy()
+    x[0, 2] = 31.0
+    with pytest.raises(NoAnswer, match="no answer within 10 s"):
+        problem(RemoteEgo(link, timeout=10.0)).evaluate(x)
+    assert link.waits == [10.0, 10.0]
+
+
 def one_row(gap: float) -> tuple[np.ndarray, None, np.ndarray]:
     return np.full((1, 7), gap / 50, np.float32), None, np.ones(1, bool)
 
 
 def test_a_process_of_its_own_holds_an_ego_that_dies(dangerous: Any) -> None:
     np.testing.assert_array_equal(dangerous.predict(*one_row(60.0))[0], [[-0.1, -0.1]])
-    with pytest.raises(RemoteError, match=r"failed twice .*its process ended \(exit status 3\)"):
+    with pytest.raises(NoAnswer, match=r"its process ended \(exit status 3\)"):
         dangerous.predict(*one_row(21.0))
 
 
 @pytest.mark.slow
 def test_a_process_of_its_own_holds_an_ego_that_hangs(dangerous: Any) -> None:
-    with pytest.raises(RemoteError, match=r"failed twice .*no answer within 1\.5 s"):
+    with pytest.raises(NoAnswer, match=r"no answer within 1\.5 s"):
         dangerous.predict(*one_row(31.0))
     np.testing.assert_array_equal(dangerous.predict(*one_row(60.0))[0], [[-0.1, -0.1]])
+
+
+@pytest.mark.slow
+def test_scenarios_on_which_a_process_hangs_or_dies_are_found(dangerous: Any, x: np.ndarray) -> None:
+    x = np.repeat(x, 6, axis=0)
+    x[:, 2] = 60.0
+    x[[100, 200], 2] = 31.0, 21.0
+    tolerant = FaultTolerant(problem(dangerous))
+    np.testing.assert_array_equal(np.flatnonzero(np.isnan(tolerant.evaluate(x))), [100, 200])
+    assert [fault.reason.partition(": ")[2].rpartition(": ")[2] for fault in tolerant.faults] == [
+        "no answer within 1.5 s.",
+        "its process ended (exit status 3).",
+    ]
+    assert dangerous._epoch <= 12  # processes, the first one included
 
 
 def test_what_cannot_be_loaded_in_a_process_is_said_here() -> None:
