@@ -60,6 +60,11 @@ class Product:
     def _ends(self) -> NDArray[np.intp]:
         return np.cumsum([block.dim for block in self.blocks])[:-1]
 
+    @cached_property
+    def noise(self) -> NDArray[np.bool_]:
+        """Which columns are noise, shape (d,): samplers may leave these as they are."""
+        return np.repeat([isinstance(block, NoiseLaw) for block in self.blocks], [block.dim for block in self.blocks])
+
     def sample(self, n: int, rng: np.random.Generator) -> Array:
         """Independent points, shape (n, d)."""
         return np.hstack([block.sample(n, rng) for block in self.blocks])

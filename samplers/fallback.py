@@ -32,9 +32,14 @@ def describes(last: Draws, typical: FloatArray) -> bool:
         last: The draws of the last round.
         typical: Weights of the exploration's points as draws of the proposal, one for each region, shape (m,).
     """
-    if len(last.f) == 0 or last.ess < HOPELESS_RATE * last.n:
+    if not meets(last):
         return False
     return bool(np.median(typical) <= (ABSURD if last.ess >= LEAST_RATE * last.n else LARGEST_TYPICAL) * last.p)
+
+
+def meets(last: Draws) -> bool:
+    """Return whether the draws of the last round meet failures often enough."""
+    return len(last.f) > 0 and last.ess >= HOPELESS_RATE * last.n
 
 
 def reconciled(found: Outcome, before: Outcome) -> Outcome:

@@ -19,7 +19,11 @@ LOG_TWO_PI = float(np.log(2 * np.pi))
 
 @runtime_checkable
 class Distribution(Protocol):
-    """A law on R^d with an exact map to and from standard normal space."""
+    """A law on R^d with an exact map to and from standard normal space.
+
+    It may say which coordinates are a simulation's own randomness, by an attribute `noise`, booleans of shape (d,);
+    `TwoStage` draws those as they come.
+    """
 
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw n independent points, shape (n, d)."""

@@ -22,6 +22,7 @@ from samplers.refinement import BASE_FLOOR, Refinement
 from samplers.result import Level, Status
 from samplers.simulator import Batch, Simulator
 from samplers.stratified import Strata
+from samplers.untilted import without_noise
 from samplers.weights import effective_sample_size
 
 LEAST_BUDGET = 400
@@ -64,6 +65,7 @@ class TwoStage(Method):
     *Noise.* f may have noise of its own that is no part of x: p is then the marginal probability. No stored outcome
     is simulated again. That f is noisy is noticed by 30 points right beside failing ones; regions are then not told
     apart, and half of the draws come from tempered bumps, which are best where failure is a matter of chance.
+    Coordinates of x that the base law calls noise are left as they are (`untilted.py`).
 
     *Interval.* Log-normal; it widens by t quantiles where few draws carry the weight and by Bernstein's bound where
     very few do. *Warnings* (`cross_checks.py`) tell of uneven weights, of base draws that fail more often than p
@@ -71,8 +73,9 @@ class TwoStage(Method):
     region that neither f announces nor any draw has hit; `Estimate.unseen` bounds its probability.
 
     Where a tenth of the base draws fails, or nothing is found at all, the rest is plain Monte Carlo. Where no mixture
-    describes the failures (dozens of regions, hundreds of dimensions without a plane), the rounds show it, and what
-    is left goes into adaptive subset simulation (`fallback.py`), with a warning.
+    describes the failures (dozens of regions, hundreds of dimensions without a plane, failures that the noise alone
+    decides on), the rounds show it, and what is left goes into adaptive subset simulation in all coordinates
+    (`fallback.py`), with a warning.
 
     Args:
         n: Simulations where `max_sim` does not say how many; with a target c.o.v. final batches of a tenth of it
@@ -108,10 +111,10 @@ class TwoStage(Method):
         try:
             refinement = yield from run.explored()
             if refinement is None:
-                return (yield from run.plain())
+                return (yield from run.plain() if run.common or not run.untilted else run.descended())
             proposal = yield from run.refined(refinement)
             if proposal is None:
-                return (yield from run.descended(refinement.levels))
+                return (yield from run.descended())
         except Interrupted:
             return run.interrupted()
         outcome = yield from run.estimated(refinement, proposal)
@@ -130,9 +133,14 @@ class _Run:
         goes_on = goal.max_sim is None and goal.target_cov is not None
         self._end = budget + MOST_BATCHES * (budget // 10) if goes_on else budget
         self._rng = rng
-        self._simulator = Simulator(inputs)
-        self._history = History(inputs.dim)
-        self._base_u = np.empty((0, inputs.dim))
+        self._all = inputs
+        tilted = without_noise(inputs, rng)
+        self.untilted = tilted is not inputs
+        self.common = False
+        self._levels = 0
+        self._simulator = Simulator(tilted)
+        self._history = History(tilted.dim)
+        self._base_u = np.empty((0, tilted.dim))
         self._base_f = np.empty(0)
         self._set_aside = self._base_u, self._base_f
         self._n_base = 0
@@ -155,12 +163,14 @@ class _Run:
             # These draws have decided that plain Monte Carlo follows: counted in p they would bias it.
             self._set_aside = self._base_u, self._base_f
             self._base_u, self._base_f = self._base_u[:0], self._base_f[:0]
+            self.common = True
             return None
         self._history.add(first, gamma)
         found = yield from regions_of(self._simulator, first, gamma, sizes, self._rng)
         chains = sum(len(region.f) for region in found.regions)
         fails = sum(int((region.f <= gamma).sum()) for region in found.regions)
         self._note(fails / max(chains, 1), share, chains, math.inf)
+        self._levels = found.levels
         return Refinement(found, self._history, gamma, self._rng) if found.regions else None
 
     def refined(self, refinement: Refinement) -> Generator[FloatArray, FloatArray, Proposal | None]:
@@ -180,15 +190,17 @@ class _Run:
         return proposal if self._serves(refinement, proposal) else None
 
     def _serves(self, refinement: Refinement, proposal: Proposal) -> bool:
-        """Tell whether to go on with a proposal; where f is noisy there is nothing better."""
-        if refinement.noisy or self._end - self._simulator.n_sim < fallback.LEAST_BUDGET or not self._rounds:
+        """Tell whether to go on with a proposal; where f is noisy by itself there is nothing better."""
+        if self._end - self._simulator.n_sim < fallback.LEAST_BUDGET or not self._rounds:
             return True
+        if refinement.noisy:
+            return not self.untilted or fallback.meets(self._rounds[-1])
         return fallback.describes(self._rounds[-1], refinement.typical_weights(proposal))
 
-    def descended(self, levels: int) -> Steps:
-        """Spend the rest on subset simulation, which needs no proposal."""
+    def descended(self) -> Steps:
+        """Spend the rest on subset simulation in all coordinates, which needs no proposal."""
         left = self._end - self._simulator.n_sim
-        outcome = yield from fallback.subset_simulation(self._simulator.inputs, self._goal, levels, left, self._rng)
+        outcome = yield from fallback.subset_simulation(self._all, self._goal, self._levels, left, self._rng)
         trace, base_draws = self._closed_trace() + outcome.trace, self._n_base + outcome.base_draws
         before = self.interrupted()
         on_its_way = outcome.status is Status.STOPPED and outcome.p == 0  # no estimate, then

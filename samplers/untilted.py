@@ -1,0 +1,75 @@
+"""Searching a part of x only: noise that is part of x is drawn afresh for every point, and kept with it.
+
+A simulation's own randomness (of learned drivers, of a stack of sensors) is hundreds of coordinates of x that are
+standard normal and matter little one by one. Wide draws of all of them are nothing like noise, and no proposal
+describes failures in so many dimensions. Left as they are, they cost nothing: with Z ~ N(0, I) for the noise,
+p = E[P(f(X, Z) <= gamma | X)], and weights are those of X alone. f is then noisy for the search, and still every
+simulated x replays.
+"""
+
+from typing import cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from samplers.problem import Distribution, FloatArray, Inputs
+
+
+def noise_of(inputs: Inputs) -> NDArray[np.bool_]:
+    """Which coordinates of x are noise, shape (d,): what the base law says as `noise`, none where it says nothing."""
+    noise = getattr(inputs.base, "noise", None)
+    return np.zeros(inputs.dim, dtype=bool) if noise is None else np.asarray(noise, dtype=bool)
+
+
+def without_noise(inputs: Inputs, rng: np.random.Generator) -> Inputs:
+    """The inputs that a search is to tilt: these themselves, where none of them is noise, or all of them are."""
+    noise = noise_of(inputs)
+    return inputs if not noise.any() or noise.all() else cast(Inputs, Untilted(inputs, noise, rng))
+
+
+class Untilted:
+    """The coordinates that are not noise, as inputs of their own; points u (n, k) become x (n, d) with noise drawn.
+
+    The same u gets the same noise again: rows of u are known by their bytes, and their noise is made anew from a
+    counter, so that nothing large is kept.
+    """
+
+    def __init__(self, inputs: Inputs, noise: NDArray[np.bool_], rng: np.random.Generator) -> None:
+        """For one run.
+
+        Args:
+            inputs: All of x.
+            noise: Which coordinates are noise, shape (d,).
+            rng: Seeds the noise.
+        """
+        self.dim = int(np.count_nonzero(~noise))
+        self._base, self._noise = inputs.base, noise
+        self._seed = int(rng.integers(2**63))
+        self._number: dict[bytes, int] = {}
+
+    @property
+    def base(self) -> Distribution:
+        """Their law."""
+        return self
+
+    def from_standard_normal(self, u: FloatArray) -> FloatArray:
+        """Map u (n, k) to x (n, d), with noise."""
+        whole = np.empty((len(u), len(self._noise)))
+        whole[:, ~self._noise] = u
+        count = len(self._noise) - self.dim
+        for row, key in enumerate(map(bytes, np.ascontiguousarray(u))):
+            number = self._number.setdefault(key, len(self._number))
+            whole[row, self._noise] = np.random.default_rng((self._seed, number)).standard_normal(count)
+        return self._base.from_standard_normal(whole)
+
+    def to_standard_normal(self, x: FloatArray) -> FloatArray:
+        """Map x (n, d) to u (n, k)."""
+        return self._base.to_standard_normal(x)[:, ~self._noise]
+
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw points x, shape (n, d)."""
+        return self.from_standard_normal(rng.standard_normal((n, self.dim)))
+
+    def log_prob(self, x: FloatArray) -> FloatArray:
+        """Log density of x (n, d), noise included, shape (n,)."""
+        return self._base.log_prob(x)
