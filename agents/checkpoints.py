@@ -101,13 +101,10 @@ def save_driver(driver: LearnedDriver, provenance: Provenance, path: str | PathL
         ValueError: If the path has another ending, or something is NaN or infinite.
     """
     path = Path(path)
-    if path.suffix != SUFFIX:
-        raise ValueError(f"Expected a path that ends with {SUFFIX}, got {str(path)!r}.")
     tensors = {_POLICY + name: value.detach().cpu().contiguous() for name, value in driver.policy.state_dict().items()}
     if driver.weights is not None:
         arrays = driver.weights.to_arrays()
         tensors |= {_WEIGHTS + name: torch.from_numpy(np.array(value)) for name, value in arrays.items()}
-    _check_finite(tensors, path)
     header = {
         "format": FORMAT,
         "name": driver.name,
@@ -120,11 +117,7 @@ def save_driver(driver: LearnedDriver, provenance: Provenance, path: str | PathL
         "radius": None if driver.weights is None else driver.weights.radius,
         **asdict(provenance),
     }
-    content = safetensors.torch.save(tensors, {_HEADER: json.dumps(header, allow_nan=False)})
-    unfinished = path.with_name(f"{path.name}.part")
-    unfinished.write_bytes(content)
-    unfinished.replace(path)
-    return path
+    return write_file(path, tensors, _HEADER, header)
 
 
 def read_driver(path: str | PathLike[str]) -> LearnedDriver:
@@ -136,9 +129,9 @@ def read_driver(path: str | PathLike[str]) -> LearnedDriver:
             for other features; the message says which.
     """
     path = Path(path)
-    header, tensors = _read(path)
+    header, tensors = read_file(path)
     _check_header(header, path)
-    _check_finite(tensors, path)
+    check_finite(tensors, path)
     policy = _policy(tensors, path)
     try:
         return LearnedDriver(
@@ -156,28 +149,56 @@ def read_driver(path: str | PathLike[str]) -> LearnedDriver:
 def read_provenance(path: str | PathLike[str]) -> Provenance:
     """Read where a driver comes from; errors as in `read_driver`."""
     path = Path(path)
-    header, _ = _read(path)
-    _require(header, (f.name for f in fields(Provenance)), path)
+    header, _ = read_file(path)
+    require(header, (f.name for f in fields(Provenance)), path)
     return Provenance(**{f.name: header[f.name] for f in fields(Provenance)})
 
 
-# --- reading ------------------------------------------------------------------------------------
+# --- files of any kind --------------------------------------------------------------------------
 
 
-def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+def write_file(path: Path, tensors: Mapping[str, Tensor], entry: str, header: Mapping[str, Any]) -> Path:
+    """Write tensors and a header to a file; an interrupted call leaves no half of it.
+
+    Args:
+        path: Ends with .safetensors.
+        tensors: By name.
+        entry: What the file holds, such as "driver": the header's one name.
+        header: Plain numbers, texts, lists and mappings.
+
+    Raises:
+        ValueError: If the path has another ending, or something is NaN or infinite.
+    """
+    if path.suffix != SUFFIX:
+        raise ValueError(f"Expected a path that ends with {SUFFIX}, got {str(path)!r}.")
+    check_finite(tensors, path)
+    content = safetensors.torch.save(dict(tensors), {entry: json.dumps(header, allow_nan=False)})
+    unfinished = path.with_name(f"{path.name}.part")
+    unfinished.write_bytes(content)
+    unfinished.replace(path)
+    return path
+
+
+def read_file(path: Path, entry: str = _HEADER) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Header and tensors of a file that `write_file` wrote.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It is no safetensors file, or holds something else.
+    """
     if not path.is_file():
-        near = [] if not path.parent.is_dir() else sorted(entry.name for entry in path.parent.glob(f"*{SUFFIX}"))
+        near = [] if not path.parent.is_dir() else sorted(each.name for each in path.parent.glob(f"*{SUFFIX}"))
         near = difflib.get_close_matches(path.name, near, n=3) or near[:3]
-        raise FileNotFoundError(f"No driver at {str(path)!r}{'; there are ' + ', '.join(near) if near else ''}.")
+        raise FileNotFoundError(f"No {entry} at {str(path)!r}{'; there are ' + ', '.join(near) if near else ''}.")
     try:
         with safe_open(path, framework="pt") as file:
-            text = (file.metadata() or {}).get(_HEADER)
+            text = (file.metadata() or {}).get(entry)
             tensors = {name: file.get_tensor(name) for name in file.keys()}
     except (SafetensorError, OSError) as error:
         pickled = " It looks like a file of torch.save; such files can run code and are not read." * _is_zip(path)
         raise ValueError(f"{str(path)!r} is not a safetensors file, or is damaged: {error}.{pickled}") from None
     if text is None:
-        raise ValueError(f"{str(path)!r} holds tensors but no driver: save drivers with agents.save_driver.")
+        raise ValueError(f"{str(path)!r} holds tensors but no {entry}: save drivers with agents.save_driver.")
     try:
         header = json.loads(text)
     except json.JSONDecodeError as error:
@@ -192,17 +213,18 @@ def _is_zip(path: Path) -> bool:
         return file.read(2) == b"PK"
 
 
-def _require(found: Mapping[str, Any], names: Any, path: Path) -> None:
+def require(found: Mapping[str, Any], names: Any, path: Path) -> None:
+    """Refuse a file that lacks something."""
     missing = [name for name in names if name not in found]
     if missing:
         raise ValueError(f"{str(path)!r} lacks {', '.join(missing)}.")
 
 
 def _check_header(header: Mapping[str, Any], path: Path) -> None:
-    _require(header, ("format", "features", "feature_clip"), path)
+    require(header, ("format", "features", "feature_clip"), path)
     if header["format"] != FORMAT:
         raise ValueError(f"{str(path)!r} has format {header['format']!r}; this version reads format {FORMAT}.")
-    _require(header, ("name", "colour", "acceleration", "yaw_rate", "radius"), path)
+    require(header, ("name", "colour", "acceleration", "yaw_rate", "radius"), path)
     theirs = header["features"]
     if not isinstance(theirs, list) or theirs != list(FEATURES):
         pairs = zip(theirs, FEATURES, strict=False) if isinstance(theirs, list) else []
@@ -213,7 +235,8 @@ def _check_header(header: Mapping[str, Any], path: Path) -> None:
         raise ValueError(f"{str(path)!r} clips features at {header['feature_clip']!r}, this version at {CLIP}.")
 
 
-def _check_finite(tensors: Mapping[str, Tensor], path: Path) -> None:
+def check_finite(tensors: Mapping[str, Tensor], path: Path) -> None:
+    """Refuse tensors that are not finite."""
     wrong = [name for name, value in tensors.items() if not bool(torch.isfinite(value).all())]
     if wrong:
         raise ValueError(f"{str(path)!r}: expected finite numbers, got inf or NaN in {', '.join(wrong)}.")
@@ -223,10 +246,10 @@ def _policy(tensors: Mapping[str, Tensor], path: Path) -> Policy:
     with torch.device("meta"):  # shapes only: initial weights would be drawn from the global generator
         policy = Policy(Scaling(*(torch.empty(size) for size in (WIDTH, WIDTH, ACTIONS, ACTIONS))))
     expected = policy.state_dict()
-    _require(tensors, (_POLICY + name for name in expected), path)
+    require(tensors, (_POLICY + name for name in expected), path)
     found = {name: tensors[_POLICY + name] for name in expected}
     for name, value in found.items():
-        _check_tensor(_POLICY + name, value, tuple(expected[name].shape), torch.float32, path)
+        check_tensor(_POLICY + name, value, tuple(expected[name].shape), torch.float32, path)
     policy.load_state_dict(found, assign=True)
     return policy.eval().requires_grad_(False)
 
@@ -235,12 +258,13 @@ def _weights(tensors: Mapping[str, Tensor], radius: Any, path: Path) -> WeightDi
     if radius is None:
         return None
     names = ("mean", "rows", "columns", "precision")
-    _require(tensors, (_WEIGHTS + name for name in names), path)
-    _check_tensor(f"{_WEIGHTS}mean", tensors[f"{_WEIGHTS}mean"], (HEAD,), torch.float64, path)
+    require(tensors, (_WEIGHTS + name for name in names), path)
+    check_tensor(f"{_WEIGHTS}mean", tensors[f"{_WEIGHTS}mean"], (HEAD,), torch.float64, path)
     return WeightDistribution.from_arrays({name: tensors[_WEIGHTS + name].numpy() for name in names}, radius)
 
 
-def _check_tensor(name: str, value: Tensor, shape: tuple[int, ...], dtype: torch.dtype, path: Path) -> None:
+def check_tensor(name: str, value: Tensor, shape: tuple[int, ...], dtype: torch.dtype, path: Path) -> None:
+    """Refuse a tensor of another shape or type."""
     if tuple(value.shape) != shape or value.dtype != dtype:
         raise ValueError(
             f"{str(path)!r}: expected {name} of shape {shape} and {dtype}, got {tuple(value.shape)} and {value.dtype}."

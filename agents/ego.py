@@ -12,15 +12,16 @@ from agents.checkpoints import SHIPPED, SUFFIX, load_driver
 from agents.factory import RULE_BASED, call_factory
 from agents.learned import LearnedDriver, LearnedEgo
 from agents.saved import load_saved
+from agents.vision_file import VISION, holds_vision, load_vision
 from rare_envs.faults import EgoGone
 from rare_envs.space import did_you_mean
 
 EXPECTED: Final = (
-    f"'{RULE_BASED}', {', '.join(map(repr, SHIPPED))}, a path to a {SUFFIX} or Stable-Baselines3 .zip, "
+    f"'{RULE_BASED}', {', '.join(map(repr, (*SHIPPED, VISION)))}, a path to a {SUFFIX} or Stable-Baselines3 .zip, "
     "an .onnx file, module:function, tcp://host:port, or process:EGO for one of these in a process of its own, "
     "noisy:EGO for one behind the imperfections of a full stack"
 )
-Kind = Literal["rule", "learned", "url", "remote", "process", "noisy", "onnx", "zip", "function", "unknown"]
+Kind = Literal["rule", "learned", "vision", "url", "remote", "process", "noisy", "onnx", "zip", "function", "unknown"]
 
 
 @runtime_checkable
@@ -52,8 +53,9 @@ def load_ego(spec: str | Path, algo: str | None = None, trust: bool = False) -> 
     """Find an ego by what a user would type.
 
     Args:
-        spec: "idm"; "mgail", "gail" or "bc", or a path to a `.safetensors`, for a learned driver, which as ego acts by
-            its mean actions; a path to a `.zip` saved by Stable-Baselines3; a path to an `.onnx` file
+        spec: "idm"; "vision", PilotNet on the front camera; "mgail", "gail" or "bc", for a learned driver, which as ego
+            acts by its mean actions; a path to a `.safetensors` with one of either kind; a path to a `.zip`
+            saved by Stable-Baselines3; a path to an `.onnx` file
             (see `agents.onnx_ego.OnnxEgo` for its form); `module:function`, a function
             without arguments that returns an ego (modules in the working directory are found); `tcp://host:port`
             for an ego in another program (docs/remote.md); or `process:EGO`, any of these files and functions in a
@@ -98,6 +100,8 @@ def load_ego(spec: str | Path, algo: str | None = None, trust: bool = False) -> 
         from agents.onnx_ego import OnnxEgo
 
         return OnnxEgo(Path(text))
+    if kind == "vision":
+        return load_vision(text)
     if kind == "learned":
         return LearnedEgo(cast(LearnedDriver, load_driver(text)))
     return cast(Ego, call_factory(text)) if kind == "function" else "idm"
@@ -130,9 +134,11 @@ def innermost(spec: str) -> str:
 
 
 def kind_of(spec: str) -> Kind:
-    """What a user means by an ego's name; nothing is opened."""
+    """What a user means by an ego's name; of a `.safetensors` the header tells."""
     if spec == RULE_BASED:
         return "rule"
+    if spec == VISION or (spec.endswith(SUFFIX) and holds_vision(spec)):
+        return "vision"
     if spec in SHIPPED or spec.endswith(SUFFIX):
         return "learned"
     if spec.startswith("process:"):
@@ -155,4 +161,4 @@ def _suggest_ego(text: str) -> str:
     saved = Path(f"{text}.zip")
     if saved.is_file():
         return f" (did you mean {str(saved)!r}?)"
-    return did_you_mean(text.lower(), [RULE_BASED, *SHIPPED])
+    return did_you_mean(text.lower(), [RULE_BASED, *SHIPPED, VISION])

@@ -99,6 +99,11 @@ class NoisyEgo:
     ego: Any
     stack: Stack = field(default_factory=Stack)
 
+    @property
+    def observation_space(self) -> Any:
+        """That of the ego behind it, None if it has none."""
+        return getattr(self.ego, "observation_space", None)
+
     def in_world(self, world: World) -> NoisyDriver:
         """The driver that it is in a world.
 

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
-KINDS = ("features", "lidar", "kinematics", "camera")
+KINDS = ("features", "lidar", "kinematics", "camera", "speed")
 """What can be observed."""
 
 

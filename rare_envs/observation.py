@@ -1,4 +1,4 @@
-"""What an ego observes: `features`, its own state and the others' relative to it, `lidar`, `kinematics`, `camera`."""
+"""What an ego observes: `features`, its own state and the others' relative to it, `lidar`, `camera` and others."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -55,7 +55,8 @@ def observation_space(vehicles: int, observation: str = "features", camera: Came
     Args:
         vehicles: N.
         observation: "features": 3 of the ego, then 4 of each other vehicle; "lidar": the ego's 51; "kinematics":
-            HighwayEnv's 5 x 5; "camera": an image, uint8, H x W x 3. Several joined by "+" make a `Dict`.
+            HighwayEnv's 5 x 5; "camera": an image, uint8, H x W x 3; "speed": the ego's own, all that a camera does
+            not show of it. Several joined by "+" make a `Dict`.
         camera: Says how large the image is; None for the usual one.
     """
     kinds = kinds_of(observation)
@@ -66,6 +67,8 @@ def observation_space(vehicles: int, observation: str = "features", camera: Came
         return spaces.Box(0, 255, (camera.height, camera.width, 3), np.uint8)
     if observation == "kinematics":
         return kinematics_space()
+    if observation == "speed":
+        return spaces.Box(-CLIP, CLIP, (1,), np.float32)
     size = len(EGO_FEATURES) + len(OTHER_FEATURES) * (vehicles - 1)
     return spaces.Box(-CLIP, CLIP, (len(LIDAR_SCALES) if observation == "lidar" else size,), np.float32)
 
@@ -100,6 +103,8 @@ def observe(episode: "Episode", observation: str, vehicle: int = 0) -> Any:
         assert episode.perception is not None
         scales = episode.perception.new_tensor(LIDAR_SCALES)
         return (episode.perception[:, vehicle] / scales).clamp(-CLIP, CLIP).float()
+    if observation == "speed":
+        return (episode.state.speed[:, vehicle, None] / EGO_FEATURES[0].scale).clamp(-CLIP, CLIP).float()
     return features(episode.state.seen_by(vehicle))
 
 

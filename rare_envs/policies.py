@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from rare_envs.mixed import batch_size, each
+from rare_envs.mixed import KINDS, batch_size, each, read_kinds
 
 Array = NDArray[Any]
 Shape = tuple[int, ...]
@@ -86,6 +86,13 @@ def stacking(given: Shape, wanted: Shape) -> tuple[int, bool] | None:
         return None
     frames, rest = divmod(wanted[-1], given[-1])
     return (frames, False) if frames and not rest else None
+
+
+def observation_for(ego: Any) -> str:
+    """What to show an ego where nobody says: kinds that its space names, such as "camera+speed", else "features"."""
+    space = getattr(ego, "observation_space", None)
+    names = set(space.spaces) if isinstance(space, spaces.Dict) else set[str]()
+    return read_kinds(sorted(names)) if names and names <= set(KINDS) else "features"
 
 
 def frames_of(given: spaces.Space[Any], wanted: Any) -> tuple[int, bool] | None:

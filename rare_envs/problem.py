@@ -14,7 +14,7 @@ from rare_envs.crashes import KINDS, Crash
 from rare_envs.drivers import IDM, Driver, PolicyDriver
 from rare_envs.mixed import kinds_of
 from rare_envs.observation import space_of_observations
-from rare_envs.policies import fitted, frames_of
+from rare_envs.policies import fitted, frames_of, observation_for
 from rare_envs.rollout import rollout
 from rare_envs.setup import set_up, with_noise
 from rare_envs.space import Distribution, ScenarioSpace
@@ -68,7 +68,8 @@ class DrivingProblem:
                 behind the others; "fixed", one sequence for all x, so that p is conditional on it; False, mean
                 actions. Scripts and most egos have none (policies act by their means), so there the three agree; the
                 noise of an ego behind a stack (`noisy:EGO`) goes with it.
-            **make_kwargs: Further keyword arguments of `gym.make` for this id.
+            **make_kwargs: Further keyword arguments of `gym.make` for this id. Without an `observation` an ego whose
+                `observation_space` is a `Dict` is shown what its names ask for, another "features".
 
         Raises:
             ValueError: If an argument is invalid or the ego's spaces are not the environment's.
@@ -77,6 +78,7 @@ class DrivingProblem:
         self.ego = ego
         self.world: World
         self.space: ScenarioSpace
+        make_kwargs["observation"] = make_kwargs.get("observation") or observation_for(ego)
         self.world, self.space = set_up(env_id, measure=measure, base=base, noise=noise, **make_kwargs)
         self.driver = as_driver(ego, self.world)
         self.space = with_noise(self.space, "ego_noise", getattr(self.driver, "columns", 0))
@@ -170,7 +172,8 @@ class DrivingProblem:
     @property
     def tile(self) -> int:
         """Rollouts at once: `evaluate` simulates so many rows together, then the next."""
-        if isinstance(self.driver, PolicyDriver) and "camera" in kinds_of(self.world.observation):
+        asked = getattr(self.driver, "inner", self.driver)
+        if isinstance(asked, PolicyDriver) and "camera" in kinds_of(self.world.observation):
             return CAMERA_TILE
         if self.world.sees or self.world.recorded:
             return LIDAR_TILE
@@ -240,9 +243,11 @@ def check_spaces(ego: Any, expected: spaces.Space[Any], action: str = "continuou
     """
     observed = getattr(ego, "observation_space", None)
     if observed is not None and frames_of(expected, observed) is None:
+        wanted = observation_for(ego)
+        which = "another observation" if wanted == "features" else f"observation={wanted!r}"
         raise ValueError(
             f"The ego expects observations {observed}, the environment gives {expected}; "
-            "train it in this environment or choose another observation."
+            f"train it in this environment or choose {which}."
         )
     acted = getattr(ego, "action_space", None)
     if acted is not None and action == "meta":

@@ -17,6 +17,7 @@ TICK = 0.1
 EGOS = {
     "idm": "rule-based driver, Intelligent Driver Model (the default)",
     "mgail, gail, bc, FILE.safetensors": "learned driver with lidar, by its mean actions",
+    "vision": "PilotNet on pictures of a front camera, which imitates a driver by rule; see docs/camera.md",
     "FILE.zip": "policy saved by Stable-Baselines3 or sb3-contrib, VecNormalize statistics beside it included",
     "FILE.onnx": "graph from observations to actions; rare-envs export-ego writes one of a .zip",
     "module:function": "what your function returns: any object with Stable-Baselines3's predict",

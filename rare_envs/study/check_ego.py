@@ -33,7 +33,7 @@ class Asked:
         env_id: Environment.
         algo: Algorithm of a `.zip`, if the file does not tell.
         trust: As for `agents.load_ego`.
-        observation: What the ego observes.
+        observation: What the ego observes; None for what it asks for itself.
         action: What it decides.
         time_limit: Seconds that one check may take.
         base: Base distribution of the scenarios it is tried on; the environment's default when None.
@@ -45,7 +45,7 @@ class Asked:
     env_id: str
     algo: str | None = None
     trust: bool = False
-    observation: str = "features"
+    observation: str | None = None
     action: str = "continuous"
     time_limit: float = 30.0
     base: str | None = None

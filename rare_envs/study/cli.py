@@ -76,6 +76,14 @@ NoiseOption = Annotated[Noise, typer.Option("--noise", help="The drivers' noise:
 Observation = Annotated[
     str, typer.Option(help="What the ego observes: features, lidar, kinematics, camera, or camera+lidar.")
 ]
+Shown = Annotated[
+    str | None,
+    typer.Option(
+        "--observation",
+        help="What the ego observes: features, lidar, kinematics, camera, speed, or camera+lidar; by default what it "
+        "asks for, else features.",
+    ),
+]
 Weather = Annotated[bool, typer.Option("--weather", help="Make weather and the camera's noise parameters.")]
 Action = Annotated[str, typer.Option(help="What it decides: continuous, each tick, or HighwayEnv's meta, each second.")]
 Horizon = Annotated[float | None, typer.Option(help="Length of an episode in seconds.")]
@@ -112,7 +120,7 @@ def estimate_command(
     replicates: Annotated[int, typer.Option(help="Independent runs, combined by their mean.")] = 1,
     drivers: Drivers = None,
     noise: NoiseOption = Noise.ON,
-    observation: Observation = "features",
+    observation: Shown = None,
     weather: Weather = False,
     action: Action = "continuous",
     horizon: Horizon = None,
@@ -197,7 +205,7 @@ def compare_command(
     max_sim: Annotated[int, typer.Option(help="Largest number of simulations, of both egos together.")] = 12_000,
     drivers: Drivers = None,
     noise: NoiseOption = Noise.ON,
-    observation: Observation = "features",
+    observation: Shown = None,
     weather: Weather = False,
     action: Action = "continuous",
     horizon: Horizon = None,
@@ -365,7 +373,7 @@ def check_ego_command(
     env: Env,
     algo: Annotated[str | None, typer.Option(help="Algorithm of the .zip, if the file does not tell.")] = None,
     trust: Trust = False,
-    observation: Observation = "features",
+    observation: Shown = None,
     action: Action = "continuous",
     base: Base = None,
     drivers: Drivers = None,

@@ -6,7 +6,7 @@ import itertools
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal, cast
 
 import numpy as np
@@ -46,7 +46,8 @@ class Question:
         noise: Noise of the drivers, as in `DrivingProblem`: True, "fixed" or False.
         drivers: Of the vehicles around the ego: the name of installed ones or a file; the scenario's default when None.
         horizon: Length of an episode [s]; the scenario's when None.
-        observation: What the ego observes: "features", "lidar", "kinematics" or "camera"; several joined by "+".
+        observation: What the ego observes: "features", "lidar", "kinematics", "camera" or "speed"; several joined by
+            "+"; None for what it asks for itself, else "features".
         action: What a policy decides: "continuous" or "meta".
         collisions: Which collisions count: those of the "ego", or "any", those between two other vehicles too.
         weather: Whether weather and the camera's noise are parameters.
@@ -69,7 +70,7 @@ class Question:
     noise: bool | str = True
     drivers: str | None = None
     horizon: float | None = None
-    observation: str = "features"
+    observation: str | None = None
     action: str = "continuous"
     on_error: str = "raise"
     collisions: str = "ego"
@@ -216,7 +217,7 @@ def prepare(question: Question) -> Study:
     except (ValueError, OSError) as error:
         raise BadInput(error) from error
     _try_ego(problem)
-    return Study(question, problem, method)
+    return Study(replace(question, observation=problem.world.observation), problem, method)
 
 
 def _check_on_error(word: str) -> None:

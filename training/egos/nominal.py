@@ -1,7 +1,7 @@
 """The judge of ordinary driving: does an ego keep its lane and its distance for a minute of ordinary traffic?
 
     python -m training.egos.nominal --ego idm
-    python -m training.egos.nominal --ego vision --observation camera --case straight --rollouts 100
+    python -m training.egos.nominal --ego vision --case straight --rollouts 100
 
 An ego keeps its lane if its body never crosses a line of the lane that it starts in. It keeps its distance if it runs
 into nobody and never follows its lead closer than 0.5 s or 1 m; a lead that cuts in closer than that leaves it 10 s.
@@ -29,6 +29,7 @@ from rare_envs.crashes import NONE, ROAD_EDGE
 from rare_envs.drivers import Driver
 from rare_envs.geometry import lead_index
 from rare_envs.mixed import kinds_of
+from rare_envs.policies import observation_for
 from rare_envs.problem import as_driver
 from rare_envs.rollout import drive
 from rare_envs.space import did_you_mean
@@ -96,7 +97,7 @@ def judge(
     rollouts: int = 400,
     seed: int = 0,
     seconds: float = SECONDS,
-    observation: str = "features",
+    observation: str | None = None,
     measured: World | None = None,
 ) -> Verdicts:
     """Drive an ego through ordinary traffic and say of each rollout whether it kept its lane and its distance.
@@ -107,7 +108,7 @@ def judge(
         rollouts: How many.
         seed: Of starts and of the others' noise.
         seconds: Length of each [s].
-        observation: What an ego with `predict` observes.
+        observation: What an ego with `predict` observes; None for what it asks for itself.
         measured: A world to be judged in instead of that of the case.
 
     Raises:
@@ -116,6 +117,7 @@ def judge(
     if isinstance(case, str) and case not in CASES:
         raise ValueError(f"Unknown case {case!r}{did_you_mean(case, CASES)}; expected one of {', '.join(CASES)}.")
     case = CASES[case] if isinstance(case, str) else case
+    observation = observation or observation_for(ego)
     world = measured or world_of(case, seconds, observation)
     driver = as_driver(ego, world)
     if getattr(driver, "sees", False):
@@ -224,7 +226,7 @@ def command(
     rollouts: Annotated[int, typer.Option(min=1)] = 400,
     seed: Annotated[int, typer.Option()] = 0,
     seconds: Annotated[float, typer.Option(help="Length of a rollout.")] = SECONDS,
-    observation: Annotated[str, typer.Option(help="What an ego with predict observes.")] = "features",
+    observation: Annotated[str | None, typer.Option(help="What an ego with predict observes.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object.")] = False,
 ) -> None:
     """Judge an ego in ordinary traffic."""

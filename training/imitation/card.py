@@ -12,6 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from agents import LearnedDriver, Provenance, read_driver, read_provenance
+from agents.vision_file import holds_vision, read_vision_provenance
 
 ATTRIBUTION = (
     "Derived from recorded trajectories of the Next Generation Simulation (NGSIM) programme: U.S. Department of "
@@ -24,15 +25,21 @@ USE = (
     "traffic on one road, know nothing of other roads, weather, people on foot or traffic lights, and must not drive a "
     "car."
 )
+SEEING = (
+    "PilotNet on pictures of the front camera of this project, the own speed beside them, in imitation of a driver by "
+    "rule. It knows no photographs, no other camera, no crossings and no people on foot, and must not drive a car."
+)
 
 
 def model_card(folder: Path) -> str:
-    """The card of all drivers in a folder, as Markdown.
+    """The card of all drivers, and egos that see, in a folder, as Markdown.
 
     Raises:
-        ValueError: If there is none, or a file is no driver.
+        ValueError: If there is no driver, or a file is neither.
     """
-    paths = sorted(folder.glob("*.safetensors"))
+    found = sorted(folder.glob("*.safetensors"))
+    seeing = [path for path in found if holds_vision(path)]
+    paths = [path for path in found if path not in seeing]
     if not paths:
         raise ValueError(f"Expected drivers (*.safetensors) in {str(folder)!r}, found none.")
     drivers = {path.stem: (read_driver(path), read_provenance(path)) for path in paths}
@@ -54,8 +61,20 @@ def model_card(folder: Path) -> str:
         "\n".join(f"- {name}: `{provenance.command}`" for name, (_, provenance) in drivers.items()),
         *(["## Metrics", _table("metric", metrics)] if any(metrics.values()) else []),
         *(["## Law of the last layer's weights", _table("", ensembles)] if any(ensembles.values()) else []),
+        *(part for path in seeing for part in _seeing(path)),
     ]
     return "\n\n".join(parts) + "\n"
+
+
+def _seeing(path: Path) -> Iterator[str]:
+    """Of a network that drives by pictures."""
+    provenance = read_vision_provenance(path)
+    yield f"## {path.stem}, an ego that sees"
+    yield f'{SEEING} Load it with `agents.load_ego("{path.stem}")`.'
+    yield f"**Data.** {provenance.data} Licence of the file: {provenance.data_licence}."
+    yield f"**Training.** {provenance.kind}, by `{provenance.command}`."
+    if provenance.metrics:
+        yield _table("case", {name: dict(_flat(values)) for name, values in provenance.metrics.items()})
 
 
 def _drivers_table(drivers: Mapping[str, tuple[LearnedDriver, Provenance]]) -> str:

@@ -1,0 +1,257 @@
+"""Train the ego `vision`: imitation of a driver by rule, with corrections where the network itself leads.
+
+    python -m training.egos.vision --out runs/vision
+
+Round 0 imitates the expert in its own drives. In each later round the network drives, mixed with the expert less and
+less, the expert says what it would have done there, and the network learns from all that was ever noted: DAgger. A
+training that was stopped is taken up at the last round that was finished, to the same weights.
+
+References:
+    Ross, Gordon and Bagnell, "A reduction of imitation learning and structured prediction to no-regret online
+    learning", AISTATS 2011.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+import typer
+from rich.console import Console
+from rich.progress import Progress
+from torch import nn
+
+from agents import Provenance
+from agents.pilotnet import UNITS, PilotNet
+from agents.vision import VisionEgo
+from agents.vision_file import save_vision
+from training.egos.lane_expert import TRUTHS
+from training.egos.nominal import judge, summary_of
+from training.egos.ordinary import CASES
+from training.egos.pictures import Pictures, collect, joined, mirrored
+
+CHECKPOINT, SETTINGS, FILE = "checkpoint.pt", "settings.json", "vision.safetensors"
+JUDGED = 2026
+"""Seed of the drives by which the result is judged, which no training uses."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """How the network is trained."""
+
+    seed: int = 0
+    rounds: int = 6
+    """Of DAgger, after the first imitation."""
+    first_drives: int = 56
+    """Lessons in which the expert drives."""
+    drives: int = 7
+    """Lessons of each later round."""
+    rows: int = 24
+    """Scenarios of a lesson."""
+    first_ticks: int = 100
+    """Length of a scenario in which the expert drives."""
+    ticks: int = 120
+    """Length of the others."""
+    first_kept: float = 0.1
+    """Share of the moments that are noted."""
+    kept: float = 0.2
+    """Likewise in later rounds."""
+    noise: float = 1.0
+    """See `pictures.collect`."""
+    mixing: float = 0.5
+    """In round k the expert decides at a share `mixing`^k of the ticks."""
+    first_visits: int = 45_000
+    """Pictures that are learned from before the first round, with repetition."""
+    visits: int = 25_000
+    """Likewise after each round."""
+    batch: int = 32
+    rate: float = 1e-3
+    """Of Adam, falling as a cosine to a hundredth."""
+    truth_weight: float = 0.5
+    """Of the second task, see `lane_expert.truths`."""
+
+    def __post_init__(self) -> None:
+        for each in fields(self):
+            value = getattr(self, each.name)
+            low = 0 if each.name in ("seed", "rounds", "noise", "mixing", "truth_weight") else None
+            if not (value >= low if low is not None else value > 0) or not math.isfinite(value):
+                raise ValueError(f"Expected {each.name} {'of at least 0' if low == 0 else 'above 0'}, got {value!r}.")
+        for name in ("first_kept", "kept", "mixing"):
+            if getattr(self, name) > 1:
+                raise ValueError(f"Expected {name} of at most 1, got {getattr(self, name)!r}.")
+
+    @property
+    def all_visits(self) -> int:
+        """Pictures that are learned from in all."""
+        return self.first_visits + self.rounds * self.visits
+
+
+class Training:
+    """A training under way."""
+
+    def __init__(self, config: Config, out: Path) -> None:
+        self.config, self.out = config, out
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(config.seed)
+            self.network = PilotNet()
+            self.probe = nn.Linear(UNITS, TRUTHS)
+        self.parameters = [*self.network.parameters(), *self.probe.parameters()]
+        self.optimiser = torch.optim.Adam(self.parameters, config.rate)
+        self.round = 0
+        """The next to be done."""
+        self.visited = 0
+        self.noted: list[Pictures] = []
+
+    def take_up(self) -> None:
+        """Go on where a training in the folder was stopped."""
+        path = self.out / CHECKPOINT
+        if not path.is_file():
+            return
+        found = torch.load(path, weights_only=True)
+        self.network.load_state_dict(found["network"])
+        self.probe.load_state_dict(found["probe"])
+        self.optimiser.load_state_dict(found["optimiser"])
+        self.round, self.visited = found["round"], found["visited"]
+        self.noted = [Pictures(*torch.load(self._noted(k), weights_only=True)) for k in range(self.round)]
+
+    def do_round(self) -> Iterator[str]:
+        """Collect, learn, and keep what was learned; yields after each part of the work with what is going on."""
+        rng = np.random.default_rng((self.config.seed, self.round))
+        parts = []
+        for part in self._collect(rng):
+            parts.append(part)
+            yield f"round {self.round}: {sum(len(each.speed) for each in parts)} pictures taken"
+        self.noted.append(joined(parts))
+        torch.save(tuple(self.noted[-1]), self._noted(self.round))
+        yield from self._learn(rng)
+        self.round += 1
+        state = {
+            "network": self.network.state_dict(),
+            "probe": self.probe.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+            "round": self.round,
+            "visited": self.visited,
+        }
+        unfinished = (self.out / CHECKPOINT).with_suffix(".part")
+        torch.save(state, unfinished)
+        unfinished.replace(self.out / CHECKPOINT)
+
+    def _noted(self, number: int) -> Path:
+        return self.out / f"pictures_{number}.pt"
+
+    def _collect(self, rng: np.random.Generator) -> Iterator[Pictures]:
+        config, first = self.config, self.round == 0
+        return collect(
+            None if first else self.network,
+            1.0 - config.mixing**self.round,
+            drives=config.first_drives if first else config.drives,
+            rows=config.rows,
+            ticks=config.first_ticks if first else config.ticks,
+            kept=config.first_kept if first else config.kept,
+            noise=config.noise if first else 0.0,
+            rng=rng,
+        )
+
+    def _learn(self, rng: np.random.Generator) -> Iterator[str]:
+        config, data = self.config, joined(self.noted)
+        left = config.visits if self.round else config.first_visits
+        losses: list[list[float]] = []
+        while left > 0:
+            for group in self.optimiser.param_groups:
+                group["lr"] = config.rate * (0.505 + 0.495 * math.cos(math.pi * self.visited / config.all_visits))
+            size = min(config.batch, left)
+            some = data.rows(torch.from_numpy(rng.integers(0, len(data.speed), size)))
+            losses.append(self._step(mirrored(some, torch.from_numpy(rng.random(size) < 0.5))))
+            left, self.visited = left - size, self.visited + size
+            if len(losses) % 20 == 0 or left <= 0:
+                mean = np.mean(losses[-100:], axis=0)
+                words = ", ".join(f"{name} {value:.4f}" for name, value in zip(LOSSES, mean, strict=True))
+                yield f"round {self.round}: {words}"
+
+    def _step(self, some: Pictures) -> list[float]:
+        hidden = self.network.hidden(some.picture, some.earlier, some.speed)
+        error = nn.functional.smooth_l1_loss(self.network.out(hidden), some.wanted, reduction="none", beta=0.5)
+        truth = nn.functional.smooth_l1_loss(self.probe(hidden), some.truth)
+        loss = error.mean() + self.config.truth_weight * truth
+        self.optimiser.zero_grad()
+        torch.autograd.backward(loss)
+        nn.utils.clip_grad_norm_(self.parameters, 5.0)
+        self.optimiser.step()
+        return [*error.detach().mean(0).tolist(), truth.item()]
+
+
+LOSSES = ("acceleration", "turn", "truths")
+
+
+def train(config: Config, out: Path, progress: bool = False) -> PilotNet:
+    """Train from the start, or from where a training in the folder was stopped.
+
+    Args:
+        config: Settings.
+        out: Folder; it is made if there is none. It takes the pictures too, about 53 kB each.
+        progress: Show a bar on standard error.
+
+    Returns:
+        The network.
+
+    Raises:
+        ValueError: The folder holds a training with other settings.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    noted = out / SETTINGS
+    if noted.exists() and json.loads(noted.read_text(encoding="utf-8")) != asdict(config):
+        raise ValueError(f"{str(out)!r} holds a training with other settings; choose another folder or remove it.")
+    noted.write_text(json.dumps(asdict(config), indent=1) + "\n", encoding="utf-8")
+    training = Training(config, out)
+    training.take_up()
+    with Progress(console=Console(stderr=True), disable=not progress) as bar:
+        task = bar.add_task("", total=config.all_visits, completed=training.visited)
+        while training.round <= config.rounds:
+            for words in training.do_round():
+                bar.update(task, completed=training.visited, description=words)
+    return training.network.eval().requires_grad_(False)
+
+
+def provenance_of(config: Config, metrics: dict[str, Any]) -> Provenance:
+    """Where a network comes from, for the header of its file."""
+    return Provenance(
+        kind="imitation of a driver by rule with on-policy corrections (DAgger)",
+        command=f"python -m training.egos.vision --out OUT --seed {config.seed} --rounds {config.rounds}",
+        data="Pictures of this project's own simulations; nothing was recorded on a road.",
+        data_licence="that of the project",
+        metrics=metrics,
+    )
+
+
+def measured(network: PilotNet, rollouts: int) -> dict[str, Any]:
+    """How well it drives in ordinary traffic, by case of `training.egos.nominal`."""
+    found = {}
+    for case in CASES:
+        one = summary_of(judge(VisionEgo(network), case, rollouts, seed=JUDGED))
+        found[case] = {"kept": one.kept, "of": one.judged, "low": one.interval[0], "high": one.interval[1]}
+        found[case] |= {**one.reasons, "speed": one.speed, "headway": one.headway, "margin": one.margin}
+    return found
+
+
+def main(
+    out: Annotated[Path, typer.Option(help="Folder; a training that was stopped in it is taken up.")],
+    seed: Annotated[int, typer.Option(help="Of everything that is random.")] = Config.seed,
+    rounds: Annotated[int, typer.Option(help="Of corrections.")] = Config.rounds,
+    judged: Annotated[int, typer.Option(help="Minutes of driving in each kind of ordinary traffic to judge it.")] = 0,
+) -> None:
+    """Train the ego `vision`, and write it to OUT/vision.safetensors."""
+    torch.set_num_threads(1)
+    config = Config(seed=seed, rounds=rounds)
+    network = train(config, out, progress=True)
+    metrics = measured(network, judged) if judged else {}
+    print(f"Wrote {save_vision(network, provenance_of(config, metrics), out / FILE)}.")
+
+
+if __name__ == "__main__":
+    typer.run(main)
