@@ -218,9 +218,9 @@ def bernstein_bound(draws: Draws, confidence: float, largest_weight: float) -> f
     and more), which is what draws that hardly reach the failures deserve.
     """
     log_term = math.log(4 / (1 - confidence))
-    weights = np.exp(draws.log_weights)
-    variance = max(float((weights**2).sum()) / draws.n - draws.p**2, 0.0)
-    slack = 7 * largest_weight * log_term / (3 * max(draws.n - 1, 1))
+    weights, less = np.exp(draws.log_weights), max(draws.n - 1, 1)
+    variance = max(float((weights**2).sum()) - draws.n * draws.p**2, 0.0) / less
+    slack = 7 * largest_weight * log_term / (3 * less)
     return min(1.0, draws.p + math.sqrt(2 * variance * log_term / draws.n) + slack)
 
 
