@@ -92,7 +92,7 @@ class Either:
 
     def __init__(self, a: Problem, b: Problem, gamma: float) -> None:
         self.dim, self.base = int(a.dim), a.base
-        self.given = str(getattr(a, "given", ""))
+        self.given = ", ".join(dict.fromkeys(str(given) for p in (a, b) if (given := getattr(p, "given", ""))))
         self.n_sim = 0
         self._problems, self._gamma = (a, b), gamma
         self._known: dict[bytes, tuple[bool, bool]] = {}

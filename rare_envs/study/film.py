@@ -191,7 +191,10 @@ def in_words(found: Found, drive: Drive, number: int) -> list[str]:
         how = f"{crash['kind']}, closing at {crash['closing_speed']:.1f} m/s"
         lines.append(f"Crash after {end:.1f} s: {who} into {whom} ({how}).")
     if abs(drive.f - found.f) > SAME:
-        lines.append(f"warning: the run recorded f = {found.f:.4g}; ego, drivers or this program have changed since.")
+        why = "ego, drivers or this program have changed since"
+        if found.problem.varies:
+            why = "the ego answers differently from run to run, and what was recorded is what counts"
+        lines.append(f"warning: the run recorded f = {found.f:.4g}; {why}.")
     return lines
 
 

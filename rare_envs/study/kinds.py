@@ -47,6 +47,8 @@ def look_again(problem: DrivingProblem, estimate: samplers.Estimate) -> Kinds:
     known = np.isfinite(estimate.failures.f)
     if not known.any():
         return Kinds()
+    if problem.varies:
+        return Kinds(unknown="the ego answers differently from run to run, so that its failures cannot be seen again")
     try:
         crashes = problem.crashes(estimate.failures.x[known])
         shares = {} if estimate.sample is None else estimate.shares(problem.crash_kinds, LOOKED_AT)

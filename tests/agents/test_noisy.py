@@ -13,7 +13,7 @@ import torch
 import rare_envs
 import samplers
 from agents import load_ego
-from agents.noisy import EACH, OWN, NoisyEgo, Stack
+from agents.noisy import EACH, OWN, NoisyDriver, NoisyEgo, Stack
 from rare_envs.rollout import drive, rollout
 
 ENV = "rare_envs/CutIn-v0"
@@ -48,6 +48,47 @@ def test_the_probability_is_that_of_fresh_noise() -> None:
     assert p > 1.5 * float((bare.evaluate(x.double().numpy()) <= gamma).mean())  # the noise matters
     two_stage = samplers.estimate(around, samplers.AdaptiveSubsetSimulation(n=800), gamma=gamma, seed=1)
     assert abs(math.log(two_stage.p / p)) < 4 * math.hypot(error / p, two_stage.cov)
+
+
+class Fresh(NoisyDriver):
+    """The same stack, whose noise is drawn as the drive goes and is no part of x: an autoregression by hand."""
+
+    columns = 0  # type: ignore[assignment]
+    generator = torch.Generator().manual_seed(11)
+
+    def _later(self, errors: torch.Tensor, plan: int) -> torch.Tensor:
+        fresh = torch.randn(errors.shape, generator=self.generator)
+        kept = math.exp(-self.stack.period / self.stack.correlation) if plan else 0.0
+        return kept * errors + math.sqrt(1 - kept**2) * fresh
+
+
+def monte_carlo(around: rare_envs.DrivingProblem, gamma: float, n: int) -> tuple[float, float]:
+    """P[f <= gamma] with fresh noise in each drive, and its standard error."""
+    assert isinstance(around.driver, NoisyDriver)
+    driver = Fresh(around.driver.inner, around.driver.stack, around.world)
+    x = torch.from_numpy(around.base.sample(n, np.random.default_rng(5))[:, : around.dim - around.driver.columns])
+    with torch.inference_mode():
+        f = torch.cat([rollout(around.world, driver, part).f for part in x.float().split(10_000)])
+    p = float((f <= gamma).double().mean())
+    return p, math.sqrt(p * (1 - p) / n)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("env_id", "method"),
+    [
+        ("rare_envs/CarFollowing-v0", samplers.AdaptiveSubsetSimulation(n=2000)),
+        ("rare_envs/CutIn-v0", samplers.AdaptiveSubsetSimulation(n=2000)),
+        ("rare_envs/CutIn-v0", samplers.TwoStage()),
+    ],
+)
+def test_rare_failures_are_as_probable_with_noise_in_x_as_with_fresh_noise(env_id: str, method: Any) -> None:
+    ego = load_ego("noisy:idm?position=1&speed=1&missed=0.05&latency=0.5")
+    around = rare_envs.DrivingProblem(env_id, ego=ego, horizon=5.0)
+    p, error = monte_carlo(around, 0.5, 40_000)
+    assert 1e-3 < p < 3e-2
+    found = samplers.estimate(around, method, gamma=0.5, seed=2, max_sim=8000)
+    assert abs(math.log(found.p / p)) < 4 * math.hypot(error / p, found.cov)
 
 
 def test_everything_random_is_in_x() -> None:
@@ -175,3 +216,38 @@ def test_an_ego_with_noise_of_its_own_says_what_that_means() -> None:
     assert "given that the ego's own noise is not part of x, so that failures may not replay" in " ".join(
         str(result).split()
     )
+
+
+class Absent:
+    """Follows the lead, but for 5 % of the drives, which it decides by itself at their start: then it coasts."""
+
+    deterministic = False
+
+    def __init__(self) -> None:
+        self.rng = np.random.default_rng(7)
+        self.asked: list[float] = []
+
+    def predict(self, observation: Any, state: Any, episode_start: Any, deterministic: bool) -> Any:
+        if state is None:
+            state = self.rng.uniform(size=len(observation)) < 0.05
+            self.asked += observation[:, 3].tolist()
+        speed, gap, closing = observation[:, 0], observation[:, 3], observation[:, 4]
+        wanted = np.where(state, 0.0, 5.0 * (gap - 0.9 * speed) + 20.0 * closing)
+        return np.stack((wanted, 0.0 * wanted), axis=1).clip(-1.0, 1.0).astype(np.float32), state
+
+
+@pytest.mark.parametrize("method", [samplers.TwoStage(), samplers.AdaptiveSubsetSimulation(n=500)], ids=["ts", "adss"])
+def test_outcomes_of_an_ego_with_noise_of_its_own_stand_as_they_fell(method: Any) -> None:
+    """p over its noise too is that of Monte Carlo; each scenario is simulated once, and its outcome never again."""
+    ego, gamma = Absent(), 1.5
+    world = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", ego=ego, horizon=4.0)
+    assert world.varies
+    plain = samplers.estimate(world, samplers.MonteCarlo(), gamma=gamma, max_sim=12_000, seed=1)
+    assert len(ego.asked) == plain.n_sim
+    ego.asked.clear()
+    found = samplers.estimate(world, method, gamma=gamma, max_sim=5000, seed=2)
+    assert len(ego.asked) == found.n_sim
+    assert len(set(ego.asked)) > 0.99 * found.n_sim  # but for rounding to single precision
+    assert abs(math.log(found.p / plain.p)) < 4 * math.hypot(found.cov, plain.cov)
+    assert "failures may not replay" in found.given
+    assert (found.failures.f <= gamma).all()

@@ -57,8 +57,13 @@ def test_an_ego_that_answers_differently_each_time_is_noticed(cli: Cli, here: Pa
         "    ego.choose = lambda observation: np.random.uniform(-1, 1, (len(observation), 2))\n"
         "    return ego\n"
     )
-    words = (*SMALL[:-1], 50, "--json", "--ego")
-    assert "failures may not replay" in json.loads(cli(*words, "restless:make").stdout)["given"]
+    words = (*SMALL[:-1], 50, "--json", "--gamma", 5, "--ego")
+    for ego in ("restless:make", "noisy:restless:make"):
+        found = json.loads(cli(*words, ego).stdout)
+        assert "failures may not replay" in found["given"]
+        assert found["n_failures"] > 0
+        assert found["kinds"] == {}
+        assert "cannot be seen again" in " ".join(found["notes"])
     assert json.loads(cli(*words, "egos_here:coasting").stdout)["given"] == ""
 
 

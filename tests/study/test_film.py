@@ -8,7 +8,7 @@ from PIL import Image
 
 import rare_envs
 from rare_envs.study.checks import BadInput
-from rare_envs.study.film import LAST, STRIP, drive_again, find, pictures, write_film
+from rare_envs.study.film import LAST, STRIP, drive_again, find, in_words, pictures, write_film
 from rare_envs.study.rundir import read_failures
 
 FOLLOWING = "rare_envs/CarFollowing-v0"
@@ -40,6 +40,16 @@ def test_a_failure_of_a_run_is_shown(cli, run, tmp_path):
     words = cli("replay", run, "--out", tmp_path / "worst.png").stdout
     for said in ("Failure 0 of", "ego_speed", "the ego into the lead (rear_end", f"Wrote {tmp_path / 'worst.png'}"):
         assert said in words
+
+
+def test_a_drive_that_comes_out_otherwise_says_why(run):
+    found = find(run, 0)
+    drive = drive_again(found.problem, found.x)
+    other = found._replace(f=found.f + 1.0)
+    assert "have changed since" in in_words(other, drive, 0)[-1]
+    found.problem.varies = True
+    assert "what was recorded is what counts" in in_words(other, drive, 0)[-1]
+    assert "recorded" not in in_words(found, drive, 0)[-1]
 
 
 def test_bad_input_is_one_line(cli, run):
