@@ -6,46 +6,35 @@ Exit codes: 0 done, 2 bad input (one line on standard error), 3 done with warnin
 from __future__ import annotations
 
 import contextlib
-import json
 import sys
-from enum import Enum
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
 import typer
-from typer.core import TyperGroup
 
-from rare_envs.faults import EgoGone
-from rare_envs.study.checks import BadInput
+from rare_envs.study.options import (
+    Action,
+    Algo,
+    Base,
+    Drivers,
+    Ego,
+    Env,
+    Gamma,
+    Horizon,
+    Json,
+    Measure,
+    Method,
+    Noise,
+    NoiseOption,
+    Observation,
+    Seed,
+    Shown,
+    Trust,
+    Weather,
+)
+from rare_envs.study.shell import OneLineErrors, one_thread, print_json
 
 DOUBTFUL = 3
-_UsageError: type[Exception] = typer.BadParameter.__bases__[0]
-"""What Typer raises for a wrong option or a missing word; older versions of Typer take it from click."""
-
-
-class OneLineErrors(TyperGroup):
-    """Commands whose errors are one line on standard error and exit code 2."""
-
-    def main(self, *args: Any, **extra: Any) -> NoReturn:
-        """Run a command and exit."""
-        try:
-            code = super().main(*args, **{**extra, "standalone_mode": False})
-        except _UsageError as error:
-            words = getattr(error, "format_message")()  # noqa: B009  (its class differs by version)
-            _fail(f"{words.rstrip('.')}{'' if words.endswith('?') else '.'} See rare-envs --help.")
-        except (BadInput, EgoGone) as error:
-            _fail(str(error))
-        except (KeyboardInterrupt, typer.Abort):
-            print("stopped", file=sys.stderr)
-            sys.exit(130)
-        sys.exit(code if isinstance(code, int) else 0)
-
-
-def _fail(message: str) -> NoReturn:
-    """Say what is wrong in one line, and exit."""
-    print("rare-envs: " + " ".join(message.split()), file=sys.stderr)
-    sys.exit(2)
-
 
 app = typer.Typer(
     cls=OneLineErrors,
@@ -56,39 +45,6 @@ app = typer.Typer(
 )
 
 
-class Noise(str, Enum):
-    """Words for the `noise` argument of `DrivingProblem`: True, "fixed" and False."""
-
-    ON = "on"
-    FIXED = "fixed"
-    OFF = "off"
-
-
-Env = Annotated[str, typer.Argument(metavar="ENV", help="Environment, such as rare_envs/CutIn-v0.")]
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
-Trust = Annotated[
-    bool, typer.Option("--trust", help="Let the ego's .zip run code; open it though others can write to it.")
-]
-Seed = Annotated[int, typer.Option(help="Seed; the same seed gives the same answer.")]
-Base = Annotated[str | None, typer.Option(help="Base distribution: a name or a JSON file.")]
-Drivers = Annotated[str | None, typer.Option(help="Of the vehicles around the ego: mgail, gail, bc, idm or a file.")]
-NoiseOption = Annotated[Noise, typer.Option("--noise", help="The drivers' noise: part of x, one fixed sequence, none.")]
-Observation = Annotated[
-    str, typer.Option(help="What the ego observes: features, lidar, kinematics, camera, or camera+lidar.")
-]
-Shown = Annotated[
-    str | None,
-    typer.Option(
-        "--observation",
-        help="What the ego observes: features, lidar, kinematics, camera, speed, or camera+lidar; by default what it "
-        "asks for, else features.",
-    ),
-]
-Weather = Annotated[bool, typer.Option("--weather", help="Make weather and the camera's noise parameters.")]
-Action = Annotated[str, typer.Option(help="What it decides: continuous, each tick, or HighwayEnv's meta, each second.")]
-Horizon = Annotated[float | None, typer.Option(help="Length of an episode in seconds.")]
-
-
 @app.command("list")
 def list_command(as_json: Json = False) -> None:
     """Show environments with their parameters, methods, egos, measures and base distributions."""
@@ -96,7 +52,7 @@ def list_command(as_json: Json = False) -> None:
     from rare_envs.study.show import print_catalogue
 
     if as_json:
-        _print_json(catalogue())
+        print_json(catalogue())
     else:
         print_catalogue(catalogue())
 
@@ -108,12 +64,12 @@ def estimate_command(
         str,
         typer.Option(help="A name, a .zip or .onnx, module:function, tcp://..., noisy:EGO; see rare-envs list."),
     ] = "idm",
-    algo: Annotated[str | None, typer.Option(help="Algorithm of the .zip, if the file does not tell.")] = None,
+    algo: Algo = None,
     trust: Trust = False,
-    method: Annotated[str, typer.Option(help="Estimation method; see rare-envs list.")] = "two-stage",
+    method: Method = "two-stage",
     base: Base = None,
-    measure: Annotated[str, typer.Option(help="Safety measure f; small is dangerous.")] = "ttc",
-    gamma: Annotated[float, typer.Option(help="Threshold: P[f <= gamma]; 0 counts collisions.")] = 0.0,
+    measure: Measure = "ttc",
+    gamma: Gamma = 0.0,
     seed: Seed = 0,
     max_sim: Annotated[int | None, typer.Option(help="Largest number of simulations.")] = None,
     target_cov: Annotated[float | None, typer.Option(help="Stop at this coefficient of variation.")] = None,
@@ -130,7 +86,7 @@ def estimate_command(
     as_json: Json = False,
 ) -> None:
     """Estimate how often an ego fails, with an interval, and show its most likely failure."""
-    _one_thread()
+    one_thread()
     from rare_envs.study import evaluate, rundir
 
     question = evaluate.Question(
@@ -146,7 +102,7 @@ def estimate_command(
         max_sim=max_sim,
         target_cov=target_cov,
         replicates=replicates,
-        noise=_noise(noise),
+        noise=noise.argument,
         drivers=drivers,
         observation=observation,
         weather=weather,
@@ -166,7 +122,7 @@ def _answer(report: Any, out: Path | None, as_json: bool) -> NoReturn:
     from rare_envs.study.show import print_report
 
     if as_json:
-        _print_json(report.to_dict())
+        print_json(report.to_dict())
     else:
         print_report(report, out)
     raise typer.Exit(DOUBTFUL if report.doubtful else 0)
@@ -183,7 +139,7 @@ def resume_command(
     as_json: Json = False,
 ) -> None:
     """Go on with a run whose ego has gone, or that was stopped; the answer is that of an undisturbed run."""
-    _one_thread()
+    one_thread()
     from rare_envs.study.rundir import resume
 
     with contextlib.redirect_stdout(sys.stderr):
@@ -197,10 +153,10 @@ def compare_command(
     ego_b: Annotated[str, typer.Argument(metavar="EGO_B", help="The other ego.")],
     env: Env,
     trust: Trust = False,
-    method: Annotated[str, typer.Option(help="Estimation method; see rare-envs list.")] = "two-stage",
+    method: Method = "two-stage",
     base: Base = None,
-    measure: Annotated[str, typer.Option(help="Safety measure f; small is dangerous.")] = "ttc",
-    gamma: Annotated[float, typer.Option(help="Threshold: P[f <= gamma]; 0 counts collisions.")] = 0.0,
+    measure: Measure = "ttc",
+    gamma: Gamma = 0.0,
     seed: Seed = 0,
     max_sim: Annotated[int, typer.Option(help="Largest number of simulations, of both egos together.")] = 12_000,
     drivers: Drivers = None,
@@ -212,7 +168,7 @@ def compare_command(
     as_json: Json = False,
 ) -> None:
     """Estimate how many times likelier ego A fails than ego B, with an interval, from the same scenarios."""
-    _one_thread()
+    one_thread()
     from rare_envs.study.compare import compare
     from rare_envs.study.evaluate import Question
 
@@ -226,7 +182,7 @@ def compare_command(
         gamma=gamma,
         seed=seed,
         max_sim=max_sim,
-        noise=_noise(noise),
+        noise=noise.argument,
         drivers=drivers,
         observation=observation,
         weather=weather,
@@ -236,7 +192,7 @@ def compare_command(
     with contextlib.redirect_stdout(sys.stderr):
         found = compare(question, ego_b, progress=True)
     if as_json:
-        _print_json(found["json"])
+        print_json(found["json"])
     else:
         print(f"A = {ego_a}, B = {ego_b}, {env}\n{found['comparison']}")
     raise typer.Exit(DOUBTFUL if found["comparison"].warnings else 0)
@@ -260,13 +216,13 @@ def train_ego_command(
     as_json: Json = False,
 ) -> None:
     """Train an ego on the batched simulation and save it for `rare-envs estimate --ego`."""
-    _one_thread()
+    one_thread()
     from rare_envs.study.train import train
 
     world = {
         "base": base,
         "drivers": drivers,
-        "noise": _noise(noise),
+        "noise": noise.argument,
         "observation": observation,
         "action": action,
         "horizon": horizon,
@@ -274,7 +230,7 @@ def train_ego_command(
     }
     path = train(env, algo=algo, steps=steps, out=out, seed=seed, num_envs=num_envs, **world)
     if as_json:
-        _print_json({"ego": str(path), "env_id": env, "algo": algo, "steps": steps, "seed": seed, **world})
+        print_json({"ego": str(path), "env_id": env, "algo": algo, "steps": steps, "seed": seed, **world})
     else:
         words = {**world, "noise": noise.value, "weather": None}
         usual = {"noise": Noise.ON.value, "observation": "features", "action": "continuous"}
@@ -295,12 +251,12 @@ def train_drivers_command(
     as_json: Json = False,
 ) -> None:
     """Train background drivers from recorded traffic; `python -m training.imitation.train` has every setting."""
-    _one_thread()
+    one_thread()
     from rare_envs.study.train import train_drivers
 
     path = train_drivers(data=data, ngsim=ngsim, highd=highd, method=method, seed=seed, updates=updates, out=out)
     if as_json:
-        _print_json({"driver": str(path), "method": method, "seed": seed})
+        print_json({"driver": str(path), "method": method, "seed": seed})
     else:
         print(f"Saved {path}. Load it with agents.load_driver({str(path)!r}).")
 
@@ -309,7 +265,7 @@ def train_drivers_command(
 def export_ego_command(
     model: Annotated[Path, typer.Argument(metavar="MODEL", help="A .zip saved by Stable-Baselines3.")],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="The .onnx file to write.")],
-    algo: Annotated[str | None, typer.Option(help="Algorithm of the .zip, if the file does not tell.")] = None,
+    algo: Algo = None,
     trust: Trust = False,
     as_json: Json = False,
 ) -> None:
@@ -319,7 +275,7 @@ def export_ego_command(
     with contextlib.redirect_stdout(sys.stderr):
         done = export_ego(model, out, algo=algo, trust=trust)
     if as_json:
-        _print_json(done)
+        print_json(done)
     else:
         print(
             f"Wrote {out}: its actions differ by {done['largest_difference']:.1e} at most "
@@ -336,7 +292,7 @@ def replay_command(
     as_json: Json = False,
 ) -> None:
     """Drive a failure that a run has found again, and show it with its measure over time."""
-    _one_thread()
+    one_thread()
     from rare_envs.study import film
 
     if out is not None:
@@ -359,7 +315,7 @@ def replay_command(
         "out": None if out is None else str(out),
     }
     if as_json:
-        _print_json(answer)
+        print_json(answer)
     else:
         print("\n".join(film.in_words(found, drive, failure)))
         if out is not None:
@@ -369,9 +325,9 @@ def replay_command(
 
 @app.command("check-ego")
 def check_ego_command(
-    ego: Annotated[str, typer.Argument(metavar="EGO", help="As for estimate --ego.")],
+    ego: Ego,
     env: Env,
-    algo: Annotated[str | None, typer.Option(help="Algorithm of the .zip, if the file does not tell.")] = None,
+    algo: Algo = None,
     trust: Trust = False,
     observation: Shown = None,
     action: Action = "continuous",
@@ -393,7 +349,7 @@ def check_ego_command(
     )
     code = exit_code(findings)
     if as_json:
-        _print_json(
+        print_json(
             {"ego": ego, "env_id": env, "verdict": VERDICTS[code], "findings": [asdict(each) for each in findings]}
         )
     else:
@@ -403,34 +359,18 @@ def check_ego_command(
 
 @app.command("serve-ego")
 def serve_ego_command(
-    ego: Annotated[str, typer.Argument(metavar="EGO", help="As for estimate --ego.")],
+    ego: Ego,
     bind: Annotated[
         str, typer.Option(help="Address; beyond 127.0.0.1 it needs RARE_ENVS_SECRET.")
     ] = "tcp://127.0.0.1:5555",
-    algo: Annotated[str | None, typer.Option(help="Algorithm of the .zip, if the file does not tell.")] = None,
+    algo: Algo = None,
     trust: Trust = False,
 ) -> None:
     """Lend an ego to simulations in other processes or on other machines (estimate --ego tcp://...)."""
-    _one_thread()
+    one_thread()
     from rare_envs.study.serve_ego import serve_ego
 
     serve_ego(ego, bind, algo=algo, trust=trust)
-
-
-def _noise(word: Noise) -> bool | str:
-    """The `noise` argument of `DrivingProblem` for a word."""
-    return {Noise.ON: True, Noise.OFF: False}.get(word, word.value)
-
-
-def _one_thread() -> None:
-    """Keep torch to one thread: at these batch sizes more threads cost more than they give."""
-    import torch
-
-    torch.set_num_threads(1)
-
-
-def _print_json(value: dict[str, Any]) -> None:
-    print(json.dumps(value, indent=2, allow_nan=False))
 
 
 def main() -> None:
