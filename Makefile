@@ -12,6 +12,11 @@ TORCH := $(shell grep '^torch==' constraints.txt)
 TORCH_ARGS ?=
 TOO_OLD := import sys; sys.exit(sys.version_info < (3, 10) and "Rare Envs needs Python 3.10 or later; \
 this one is " + sys.version.split()[0] + ". Name another: make PYTHON=/path/to/python3.11")
+# Processes that share the test files among them; each takes up to 2 GB of memory.
+WORKERS ?= 2
+TESTS := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadfile
+# Kept whatever the environment says: without it every process compiles all libraries anew.
+export PYTHONDONTWRITEBYTECODE :=
 PACKAGES := agents rare_envs samplers training
 SOURCES := $(PACKAGES) tests benchmarks examples
 
@@ -24,11 +29,11 @@ help:  ## Show this list.
 demo: $(VENV)/.installed  ## Train a small PPO ego and estimate how often it collides.
 	@$(BIN)/python examples/demo.py
 
-test: $(VENV)/.installed  ## Run the tests (some minutes).
-	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest
+test: $(VENV)/.installed  ## Run the tests (some minutes; WORKERS=8 for more processes than 2).
+	@$(TESTS)
 
 test-slow: $(VENV)/.installed  ## Run the repeated-seed studies too.
-	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "not gpu"
+	@$(TESTS) -m "not gpu"
 
 lint: $(VENV)/.developer  ## Check style and spelling.
 	@$(BIN)/ruff check $(SOURCES)
