@@ -1,5 +1,6 @@
 """DrivingProblem: a scenario and an ego as a function f(x), in the shape that samplers expect."""
 
+import warnings
 from dataclasses import replace
 from typing import Any
 
@@ -29,6 +30,17 @@ LIDAR_TILE = 512
 
 CAMERA_TILE = 128
 """Likewise with a policy that sees pictures: its layers' values for all of them have to fit into memory."""
+
+
+AMBIGUOUS = (
+    "the ego's actions 0 to 4 were taken as five accelerations; one that was trained in HighwayEnv needs "
+    "action='meta' (--action meta)"
+)
+"""HighwayEnv's meta-actions and our discrete ones are both numbers from 0 to 4: no space tells them apart."""
+
+
+class AmbiguousActions(UserWarning):
+    """An ego's actions can be taken in two ways."""
 
 
 class DrivingProblem:
@@ -81,6 +93,8 @@ class DrivingProblem:
         make_kwargs["observation"] = make_kwargs.get("observation") or observation_for(ego)
         self.world, self.space = set_up(env_id, measure=measure, base=base, noise=noise, **make_kwargs)
         self.driver = as_driver(ego, self.world)
+        for note in self.notes:
+            warnings.warn(note, AmbiguousActions, stacklevel=2)
         self.space = with_noise(self.space, "ego_noise", getattr(self.driver, "columns", 0))
         self.varies: bool = getattr(ego, "deterministic", None) is False
         if getattr(self.driver, "sees", False):
@@ -90,6 +104,12 @@ class DrivingProblem:
     def dim(self) -> int:
         """Number of scenario parameters."""
         return self.space.dim
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What could not be checked and may be meant otherwise; an `AmbiguousActions` warning has said it."""
+        meant = self.world.action == "continuous" and "kinematics" in kinds_of(self.world.observation)
+        return (AMBIGUOUS,) if meant and isinstance(getattr(self.ego, "action_space", None), spaces.Discrete) else ()
 
     @property
     def given(self) -> str:

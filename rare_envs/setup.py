@@ -13,6 +13,7 @@ from rare_envs.background import find_drivers
 from rare_envs.bases import load_base
 from rare_envs.blocks import NoiseLaw, beside
 from rare_envs.camera import find_camera
+from rare_envs.measures.named import named_measure
 from rare_envs.mixed import read_kinds
 from rare_envs.modules import working_directory_first
 from rare_envs.registration import kinematics_id
@@ -84,8 +85,8 @@ def set_up(
         observation: "features", "lidar", "kinematics" (HighwayEnv's) or "camera"; several, such as "camera+lidar" or
             ("camera", "lidar"), make a `Dict`.
         action: "continuous" or "meta" (HighwayEnv's, see `rare_envs.meta`: a step is then one second).
-        measure: The safety measure: a name in `rare_envs.measures.MEASURES`, a `Measure` or another of its kind, or a
-            function; see `rare_envs.measures.find_measure`.
+        measure: The safety measure: a name in `rare_envs.measures.MEASURES`, "stl:FORMULA", "module:name", a `Measure`
+            or another of its kind, or a function; see `rare_envs.measures.find_measure`.
         horizon: Length of an episode [s]; None takes the scenario's.
         dt: Tick [s].
         base: Law of the scenario's own parameters: the name of a shipped one, the path of a JSON file, or a
@@ -124,7 +125,7 @@ def set_up(
         scenario,
         dt=dt,
         horizon=horizon,
-        measure=measure,
+        measure=named_measure(measure),
         drivers=background,
         noise=noise,
         observation=kinds,
@@ -134,7 +135,7 @@ def set_up(
         weather=weather,
     )
     space = space_of(world, load_base(scenario, base))
-    if not isinstance(measure, str):
+    if not isinstance(world.measure, str):
         _try_measure(world, space)
     return world, space
 

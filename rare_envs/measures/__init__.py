@@ -115,5 +115,5 @@ def find_measure(measure: Any) -> EpisodeMeasure:
     hint = did_you_mean(measure, MEASURES) if isinstance(measure, str) else ""
     raise ValueError(
         f"Unknown measure {measure!r}{hint}; the measures are {', '.join(MEASURES)}, "
-        "or a function of a Moment (see docs/measures.md)."
+        "module:name, stl:FORMULA, or a function of a Moment (see docs/measures.md)."
     )

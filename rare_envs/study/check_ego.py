@@ -11,6 +11,7 @@ import queue
 import subprocess
 import sys
 import threading
+import warnings
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -134,6 +135,7 @@ def findings_of(asked: Asked) -> Iterator[Finding | str]:
     from agents.ego import kind_of
     from rare_envs import DrivingProblem
     from rare_envs.faults import EgoGone, reason_of
+    from rare_envs.problem import AmbiguousActions
     from rare_envs.study.conformance import conformance
     from rare_envs.study.ego_checks import CHECKS, Probe, drives
 
@@ -147,15 +149,19 @@ def findings_of(asked: Asked) -> Iterator[Finding | str]:
     try:
         ego = agents.load_ego(asked.ego, algo=asked.algo, trust=asked.trust)
         yield passed("loading", f"{type(ego).__name__}" if not isinstance(ego, str) else ego)
-        problem = DrivingProblem(
-            asked.env_id,
-            ego=ego,
-            observation=asked.observation,
-            action=asked.action,
-            base=asked.base,
-            drivers=asked.drivers,
-            horizon=asked.horizon,
-        )
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", AmbiguousActions)
+            problem = DrivingProblem(
+                asked.env_id,
+                ego=ego,
+                observation=asked.observation,
+                action=asked.action,
+                base=asked.base,
+                drivers=asked.drivers,
+                horizon=asked.horizon,
+            )
+        for note in problem.notes:
+            yield warned("action space", note, "say --action meta if it was trained there")
         probe = Probe.of(ego, problem)
     except (Exception, SystemExit, EgoGone) as error:  # the ego is the user's: anything may happen in it
         yield failed("loading", reason_of(error), "see docs/egos.md for what an ego is")

@@ -16,6 +16,7 @@ from rare_envs.study.options import (
     Action,
     Algo,
     Base,
+    Collisions,
     Drivers,
     Ego,
     Env,
@@ -81,7 +82,7 @@ def estimate_command(
     action: Action = "continuous",
     horizon: Horizon = None,
     on_error: Annotated[str, typer.Option(help="Where the ego fails twice: raise, failure or bound.")] = "raise",
-    collisions: Annotated[str, typer.Option(help="Which count: ego, or any, between others too.")] = "ego",
+    collisions: Collisions = "ego",
     out: Annotated[Path | None, typer.Option(help="Folder for result.json, failures.csv and plot.png.")] = None,
     as_json: Json = False,
 ) -> None:
@@ -165,6 +166,8 @@ def compare_command(
     weather: Weather = False,
     action: Action = "continuous",
     horizon: Horizon = None,
+    collisions: Collisions = "ego",
+    out: Annotated[Path | None, typer.Option(help="Folder for comparison.json and failures.csv.")] = None,
     as_json: Json = False,
 ) -> None:
     """Estimate how many times likelier ego A fails than ego B, with an interval, from the same scenarios."""
@@ -188,13 +191,17 @@ def compare_command(
         weather=weather,
         action=action,
         horizon=horizon,
+        collisions=collisions,
     )
     with contextlib.redirect_stdout(sys.stderr):
-        found = compare(question, ego_b, progress=True)
+        found = compare(question, ego_b, progress=True, out=out)
     if as_json:
         print_json(found["json"])
     else:
-        print(f"A = {ego_a}, B = {ego_b}, {env}\n{found['comparison']}")
+        notes = "".join(f"\n  note: {note}" for note in found["json"]["notes"])
+        print(f"A = {ego_a}, B = {ego_b}, {env}\n{found['comparison']}{notes}")
+        if out is not None:
+            print(f"Wrote {out}.")
     raise typer.Exit(DOUBTFUL if found["comparison"].warnings else 0)
 
 

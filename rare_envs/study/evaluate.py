@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import time
+import warnings
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal, cast
@@ -17,6 +18,7 @@ import agents
 import rare_envs
 import samplers
 from rare_envs.faults import ON_ERROR, EgoGone, Fault, FaultTolerant
+from rare_envs.problem import AmbiguousActions
 from rare_envs.rollout import drive
 from rare_envs.setup import find_scenario
 from rare_envs.space import did_you_mean
@@ -37,7 +39,7 @@ class Question:
         trust: Let the ego's `.zip` run code when it is loaded, as `agents.load_ego` explains.
         method: Name of a method in `samplers.METHODS`.
         base: Name of a base distribution or path to a JSON file; the scenario's default when None.
-        measure: Safety measure f.
+        measure: Safety measure f: a name, "module:name" or "stl:FORMULA".
         gamma: Threshold; the answer is P[f(X) <= gamma].
         seed: Seed of everything that is drawn.
         max_sim: Largest number of simulations, or None.
@@ -120,18 +122,7 @@ class Report:
     def notes(self) -> tuple[str, ...]:
         """What was asked for and makes no difference here, and what is not known."""
         unknown = (f"kinds of crash are not known: {self.kinds.unknown}",) if self.kinds.unknown else ()
-        return (*self._idle_words, *self._other_actions, *unknown)
-
-    @property
-    def _other_actions(self) -> tuple[str, ...]:
-        """HighwayEnv's meta-actions and our discrete ones are both numbers from 0 to 4: no space tells them apart."""
-        acts, question = getattr(self.study.problem.ego, "action_space", None), self.study.question
-        if question.observation != "kinematics" or question.action != "continuous" or not hasattr(acts, "n"):
-            return ()
-        return (
-            "the ego's actions 0 to 4 were taken as five accelerations; one that was trained in HighwayEnv needs "
-            "--action meta",
-        )
+        return (*self._idle_words, *self.study.problem.notes, *unknown)
 
     @property
     def _idle_words(self) -> tuple[str, ...]:
@@ -201,19 +192,21 @@ def prepare(question: Question) -> Study:
         method = samplers.get_method(question.method)
         find_scenario(question.env_id)  # before the ego, which takes seconds to load
         ego = agents.load_ego(question.ego, algo=question.algo, trust=question.trust)
-        problem = rare_envs.DrivingProblem(
-            question.env_id,
-            ego=ego,
-            measure=question.measure,
-            base=question.base,
-            noise=question.noise,
-            drivers=question.drivers,
-            horizon=question.horizon,
-            collisions=question.collisions,
-            observation=question.observation,
-            weather=question.weather,
-            action=question.action,
-        )
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", AmbiguousActions)  # it is among the notes
+            problem = rare_envs.DrivingProblem(
+                question.env_id,
+                ego=ego,
+                measure=question.measure,
+                base=question.base,
+                noise=question.noise,
+                drivers=question.drivers,
+                horizon=question.horizon,
+                collisions=question.collisions,
+                observation=question.observation,
+                weather=question.weather,
+                action=question.action,
+            )
     except (ValueError, OSError) as error:
         raise BadInput(error) from error
     _try_ego(problem)

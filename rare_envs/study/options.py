@@ -46,6 +46,9 @@ Action = Annotated[str, typer.Option(help="What it decides: continuous, each tic
 Horizon = Annotated[float | None, typer.Option(help="Length of an episode in seconds.")]
 Algo = Annotated[str | None, typer.Option(help="Algorithm of the .zip, if the file does not tell.")]
 Method = Annotated[str, typer.Option(help="Estimation method; see rare-envs list.")]
-Measure = Annotated[str, typer.Option(help="Safety measure f; small is dangerous.")]
+Measure = Annotated[
+    str, typer.Option(help="Safety measure f, small is dangerous: a name, module:function or stl:FORMULA.")
+]
+Collisions = Annotated[str, typer.Option(help="Which count: ego, or any, between others too.")]
 Gamma = Annotated[float, typer.Option(help="Threshold: P[f <= gamma]; 0 counts collisions.")]
 Ego = Annotated[str, typer.Argument(metavar="EGO", help="An ego, as for estimate --ego.")]

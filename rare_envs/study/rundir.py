@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+import samplers
 from agents.ego import kind_of
 from rare_envs.crashes import KINDS, NONE
 from rare_envs.space import ScenarioSpace
@@ -159,11 +160,22 @@ def read_failures(folder: Path) -> dict[str, NDArray[Any]]:
 
 def _write_failures(folder: Path, report: Report) -> None:
     """One failure a row, the most likely first: x, f, log p0 and the crash."""
-    failures = report.estimate.failures
-    # repr of a float gives it back exactly, so that a row replays to the same f
     kind = "" if report.kinds.unknown else KINDS[NONE]
-    rest = [(one.f, one.log_p0, *_crash(crash, kind)) for one, crash in zip(failures, report.crashes, strict=True)]
-    _write_table(folder / FAILURES, report.study.problem.space, failures.x, ("f", "log_p0", *CRASH), rest)
+    crashes = [_crash(crash, kind) for crash in report.crashes]
+    write_failures(folder, report.study.problem.space, report.estimate.failures, CRASH, crashes)
+
+
+def write_failures(
+    folder: Path,
+    space: ScenarioSpace,
+    failures: samplers.Failures,
+    names: tuple[str, ...] = (),
+    more: list[tuple[Any, ...]] | None = None,
+) -> None:
+    """Write `FAILURES`: one failure a row, the most likely first: x, f, log p0, and what more there is, by name."""
+    # repr of a float gives it back exactly, so that a row replays to the same f
+    rest = [(one.f, one.log_p0, *extra) for one, extra in zip(failures, more or [()] * len(failures), strict=True)]
+    _write_table(folder / FAILURES, space, failures.x, ("f", "log_p0", *names), rest)
 
 
 def _crash(crash: dict[str, Any] | None, kind: str) -> tuple[Any, ...]:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -295,6 +296,43 @@ def test_formulas_that_do_not_fit_the_world_are_refused() -> None:
         problem(stl("always (speed_2 > 1)"))
     with pytest.raises(ValueError, match="multiple of the sampling period"):
         problem(stl("always[0:0.05] (gap > 1)"))
+
+
+def test_measures_by_what_a_user_types(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "measures_here.py").write_text(
+        "from rare_envs.measures import Measure, ttc\n"
+        "def gap(moment):\n    return moment.lead.gap\n"
+        "mine = Measure(ttc, collision=-7.0)\n"
+        "number = 3\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    x = rare_envs.DrivingProblem(FOLLOWING).base.sample(20, np.random.default_rng(0))
+
+    def of(measure: object) -> np.ndarray:
+        return problem(measure, horizon=1.0).evaluate(x)
+
+    np.testing.assert_array_equal(of("measures_here:gap"), of(lambda moment: moment.lead.gap))
+    np.testing.assert_array_equal(of("measures_here:mine"), of(Measure(ttc, collision=-7.0)))
+    for wrong, words in (
+        ("measures_here:gpa", "nothing called 'gpa' .did you mean 'gap'"),
+        ("measures_here:number", "Unknown measure 3"),
+        ("no_such_module:gap", "Cannot import 'no_such_module'"),
+        (":gap", "Cannot import ''"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            of(wrong)
+
+
+def test_a_formula_by_what_a_user_types() -> None:
+    pytest.importorskip("rtamt", reason="rtamt runs on Python 3.11 or older")
+    x = rare_envs.DrivingProblem(FOLLOWING).base.sample(5, np.random.default_rng(0))
+    found = [
+        rare_envs.DrivingProblem(FOLLOWING, measure=measure, horizon=1.0).evaluate(x)
+        for measure in ("stl: always (gap > 2)", stl("always (gap > 2)"))
+    ]
+    np.testing.assert_array_equal(*found)
+    with pytest.raises(ValueError, match="does not parse"):
+        rare_envs.DrivingProblem(FOLLOWING, measure="stl:always (gap >")
 
 
 def test_unknown_measures_are_refused() -> None:

@@ -4,6 +4,8 @@ import json
 
 import pytest
 
+from rare_envs.study.rundir import read_failures
+
 FOLLOWING = "rare_envs/CarFollowing-v0"
 
 
@@ -20,6 +22,19 @@ def test_the_ratio_of_an_ego_that_brakes_and_one_that_does_not(cli, risky, here)
     text = cli(*words)
     assert "A = egos_here:coasting, B = idm" in text.stdout
     assert f"p_A / p_B = {found['ratio']:.3g}" in text.stdout
+
+
+def test_a_folder_of_results(cli, risky, here):
+    words = ("compare", "egos_here:coasting", "idm", FOLLOWING, "--base", risky, "--method", "mc", "--max-sim", 400)
+    found = json.loads(cli(*words, "--collisions", "any", "--out", here / "run", "--json").stdout)
+    assert json.loads((here / "run" / "comparison.json").read_text()) == found
+    assert found["question"]["collisions"] == "any"
+    failures = read_failures(here / "run")
+    assert len(failures["f"]) > 3
+    assert (failures["f"] <= 0.0).all()
+    assert failures["gap"].shape == failures["log_p0"].shape == failures["f"].shape
+    assert cli("replay", here / "run").exit_code == 2
+    assert cli(*words, "--collisions", "none").exit_code == 2
 
 
 def test_the_same_ego_twice(cli, risky):

@@ -13,6 +13,9 @@ from typer.testing import Result
 
 import agents
 import rare_envs
+from rare_envs.problem import AmbiguousActions
+from rare_envs.study.check_ego import Asked, findings_of
+from rare_envs.study.findings import Finding
 from rare_envs.study.rundir import CRASH, read_failures
 
 Cli = Callable[..., Result]
@@ -143,3 +146,14 @@ def test_what_actions_are_taken_for_is_pointed_out(cli: Cli, tmp_path: Path, mon
     assert "--action meta" in note
     for more in (("--observation", "kinematics", "--action", "meta"), ()):
         assert json.loads(cli(*words, *more).stdout)["notes"] == []
+    both = (
+        *("compare", "idle_egos:Idle", "idm", FOLLOWING),
+        *("--method", "mc", "--max-sim", 20, "--observation", "kinematics"),
+    )
+    assert json.loads(cli(*both, "--json").stdout)["notes"] == [f"A: {note}"]
+    assert f"note: A: {note}" in cli(*both).stdout
+    asked = Asked("idle_egos:Idle", FOLLOWING, observation="kinematics")
+    (found,) = (each for each in findings_of(asked) if isinstance(each, Finding) and each.found == note)
+    assert (found.check, found.status) == ("action space", "warn")
+    with pytest.warns(AmbiguousActions, match="--action meta"):
+        rare_envs.DrivingProblem(FOLLOWING, ego=agents.load_ego("idle_egos:Idle"), observation="kinematics")
