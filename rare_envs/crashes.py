@@ -218,19 +218,3 @@ def describe(crash: Crash, row: int = 0) -> dict[str, Any] | None:
     if kind == KINDS[NONE]:
         return None
     return {name: kind if name == "kind" else values[row].tolist() for name, values in crash._asdict().items()}
-
-
-def collision_type(state: State, road: Road, row: int = 0) -> str:
-    """What the ego of one scenario, in which there was a collision, has run into.
-
-    Args:
-        state: Traffic at the moment of the collision.
-        road: Their road.
-        row: Which of the B scenarios.
-
-    Returns:
-        "rear_end" (the ego hits a vehicle ahead), "rear_ended" (it is hit from behind), "side" (flank to flank) or
-        "road_edge" (no vehicle, so the edge of the road).
-    """
-    kind = int(_pair_crash(state, road, None, 0.1, slice(0, state.x.shape[1] - 1)).kind[row])
-    return KINDS[kind or ROAD_EDGE]

@@ -66,6 +66,54 @@ def test_a_corner_that_is_hit_from_behind_is_no_side_swipe() -> None:
     assert tick((0.0, 0.0, 0.0, 30.0), (4.0, 1.9, 0.0, 18.0))["kind"] == "rear_end"
 
 
+LONGWAYS = math.pi / 2 - 0.17
+"""Heading of a vehicle that crosses the road, askew, so that its axes are not the ego's."""
+
+
+@pytest.mark.parametrize(
+    ("other", "kind", "vehicles"),
+    [
+        ((3.6, 0.0, LONGWAYS, 2.0), "rear_end", [0, 1]),  # a corner of the ego's front into its flank
+        ((-2.6, -3.3, LONGWAYS, 8.0), "side", [1, 0]),  # its front into the ego's corner, and with it the flank
+    ],
+)
+def test_vehicles_that_cross_meet_front_or_flank(other: Vehicle, kind: str, vehicles: list[int]) -> None:
+    crash = tick((0.0, 0.0, 0.0, 12.0 if kind == "rear_end" else 0.0), other)
+    assert (crash["kind"], crash["vehicles"]) == (kind, vehicles)
+
+
+def test_at_rest_the_way_out_is_the_shortest() -> None:
+    """Nothing moves: bodies that overlap by 10 cm of their widths and a metre of their lengths are flank to flank."""
+    assert tick((0.0, 0.0, 0.0, 0.0), (4.0, 1.9, 0.0, 0.0))["kind"] == "side"
+    assert tick((0.0, 0.0, 0.0, 0.0), (4.9, 1.0, 0.0, 0.0))["kind"] == "rear_end"
+
+
+def test_without_the_tick_before_speeds_and_headings_tell() -> None:
+    road = straight(1)
+    for vehicles in (
+        ((0.0, 0.0, 0.0, 30.0), (4.5, 0.8, 0.0, 20.0)),
+        ((0.0, 0.0, 0.0, 12.0), (-4.7, -0.5, 0.0, 20.0)),
+        ((0.0, 0.0, 0.0, 20.0), (1.0, 1.95, -0.05, 20.0)),
+        ((0.0, 2.1, 0.2, 15.0), (60.0, 0.0, 0.0, 20.0)),
+    ):
+        found, expected = describe(crash_of(traffic(*vehicles), road)), tick(*vehicles, lanes=1)
+        assert found is not None
+        assert found.pop("kind") == expected.pop("kind")
+        for name, value in found.items():
+            assert value == pytest.approx(expected[name]), name
+
+
+def test_others_touch_where_their_bodies_overlap() -> None:
+    rng, batch = np.random.default_rng(4), 300
+    x, y = rng.uniform(-8.0, 8.0, (batch, 4)), rng.uniform(10.0, 18.0, (batch, 4))
+    heading = rng.uniform(-0.6, 0.6, (batch, 4))
+    state = State(*(torch.from_numpy(each) for each in (x, y, heading, np.ones((batch, 4)), x[:, :0])))
+    bodies = [[corners(*pose) for pose in zip(*row, strict=True)] for row in zip(x, y, heading, strict=True)]
+    expected = [any(overlap(row[i], row[j]) for i, j in ((1, 2), (1, 3), (2, 3))) for row in bodies]
+    assert others_touch(state, straight(9)).tolist() == expected
+    assert 60 < sum(expected) < 240
+
+
 def test_the_edge_is_a_wall() -> None:
     crash = tick((0.0, 2.1, 0.2, 15.0), (60.0, 0.0, 0.0, 20.0), lanes=1)
     across = 15.0 * math.sin(0.2)

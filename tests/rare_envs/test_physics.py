@@ -6,7 +6,6 @@ from itertools import pairwise
 import pytest
 import torch
 
-from rare_envs.crashes import collision_type
 from rare_envs.drivers import IDM, lane_keeping
 from rare_envs.dynamics import bicycle
 from rare_envs.geometry import Lead, boxes_overlap, lead_of
@@ -185,19 +184,6 @@ def test_ttc_of_the_edge_of_the_road(y: float, heading: float, lanes: int, expec
 def test_off_road() -> None:
     for lanes, y, outside in [(1, 1.9, False), (1, 2.1, True), (1, -2.1, True), (2, 5.9, False), (2, 6.1, True)]:
         assert straight(lanes).off_road(tensor(y)).item() is outside
-
-
-@pytest.mark.parametrize(
-    ("other", "kind"),
-    [
-        ((4.5, 0.5, 0.0, 10.0), "rear_end"),
-        ((-4.5, 0.0, 0.0, 30.0), "rear_ended"),
-        ((1.0, 1.8, 0.0, 20.0), "side"),
-        ((50.0, 0.0, 0.0, 20.0), "road_edge"),
-    ],
-)
-def test_collision_type(other: tuple[float, float, float, float], kind: str) -> None:
-    assert collision_type(traffic((0.0, 0.0, 0.0, 20.0), other), straight(1)) == kind
 
 
 def test_bezier_is_de_casteljau_and_level_at_both_ends() -> None:
