@@ -31,6 +31,9 @@ from rare_envs.space import did_you_mean
 
 RULE_BASED = "idm"
 SHIPPED = ("mgail", "gail", "bc")
+"""Drivers of the traffic."""
+SHIPPED_EGOS = ("imitation",)
+"""Drivers that were trained to be egos: by their mean actions they keep lane and distance, see docs/egos.md."""
 SUFFIX = ".safetensors"
 FORMAT = 1
 """Version of the header."""
@@ -61,8 +64,8 @@ def load_driver(name: str | PathLike[str]) -> LearnedDriver | RuleDriver:
     """Find a driver by name.
 
     Args:
-        name: "mgail", "gail" or "bc", which are shipped; "idm", the rule-based driver; or the path of a file that
-            `save_driver` wrote.
+        name: "mgail", "gail" or "bc", which are shipped, and "imitation", which was trained to be an ego; "idm", the
+            rule-based driver; or the path of a file that `save_driver` wrote.
 
     Returns:
         A `LearnedDriver`, or a `RuleDriver` with its default parameters.
@@ -74,12 +77,12 @@ def load_driver(name: str | PathLike[str]) -> LearnedDriver | RuleDriver:
     text = str(name)
     if text == RULE_BASED:
         return RuleDriver()
-    if text in SHIPPED:
+    if text in (*SHIPPED, *SHIPPED_EGOS):
         with resources.as_file(resources.files("agents") / "data" / f"{text}{SUFFIX}") as path:
             return read_driver(path)
     if text.endswith(SUFFIX) or Path(text).is_file():
         return read_driver(text)
-    names = (*SHIPPED, RULE_BASED)
+    names = (*SHIPPED, *SHIPPED_EGOS, RULE_BASED)
     hint = did_you_mean(text.lower(), names)
     if Path(f"{text}{SUFFIX}").is_file():
         hint = f" (did you mean {text + SUFFIX!r}?)"

@@ -8,7 +8,7 @@ from typing import Any, Final, Literal, Protocol, cast, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.checkpoints import SHIPPED, SUFFIX, load_driver
+from agents.checkpoints import SHIPPED, SHIPPED_EGOS, SUFFIX, load_driver
 from agents.factory import RULE_BASED, call_factory
 from agents.learned import LearnedDriver, LearnedEgo
 from agents.saved import load_saved
@@ -17,7 +17,8 @@ from rare_envs.faults import EgoGone
 from rare_envs.space import did_you_mean
 
 EXPECTED: Final = (
-    f"'{RULE_BASED}', {', '.join(map(repr, (*SHIPPED, VISION)))}, a path to a {SUFFIX} or Stable-Baselines3 .zip, "
+    f"{', '.join(map(repr, (RULE_BASED, *SHIPPED_EGOS, VISION, *SHIPPED)))}, a path to a {SUFFIX} or "
+    "Stable-Baselines3 .zip, "
     "an .onnx file, module:function, tcp://host:port, or process:EGO for one of these in a process of its own, "
     "noisy:EGO for one behind the imperfections of a full stack"
 )
@@ -53,14 +54,14 @@ def load_ego(spec: str | Path, algo: str | None = None, trust: bool = False) -> 
     """Find an ego by what a user would type.
 
     Args:
-        spec: "idm"; "vision", PilotNet on the front camera; "mgail", "gail" or "bc", for a learned driver, which as ego
-            acts by its mean actions; a path to a `.safetensors` with one of either kind; a path to a `.zip`
-            saved by Stable-Baselines3; a path to an `.onnx` file
-            (see `agents.onnx_ego.OnnxEgo` for its form); `module:function`, a function
-            without arguments that returns an ego (modules in the working directory are found); `tcp://host:port`
-            for an ego in another program (docs/remote.md); or `process:EGO`, any of these files and functions in a
-            process of its own, which is ended and started anew where the ego hangs or dies; or `noisy:EGO`, any ego
-            behind the imperfections of a full stack (`agents.noisy.Stack`).
+        spec: "idm"; "imitation", the shipped ego with lidar; "vision", PilotNet on the front camera; "mgail", "gail" or
+            "bc", drivers of the traffic, which as egos act by their mean actions; a path to a `.safetensors` with one
+            of these kinds; a path to a `.zip` saved by Stable-Baselines3; a path to an `.onnx` file (see
+            `agents.onnx_ego.OnnxEgo` for its form); `module:function`, a function without arguments that returns an ego
+            (modules in the working directory are found); `tcp://host:port` for an ego in another program
+            (docs/remote.md); or `process:EGO`, any of these files and functions in a process of its own, which is ended
+            and started anew where the ego hangs or dies; or `noisy:EGO`, any ego behind the imperfections of a full
+            stack (`agents.noisy.Stack`).
         algo: Algorithm of a `.zip`, such as "ppo"; recognised from the file when None. Only a `.zip` has one.
         trust: Open the pickles in a `.zip` as Stable-Baselines3 does, which runs whatever code is in them. Without it
             a file that needs code of its author's (a policy class of their own, say) is refused, and one to which
@@ -139,7 +140,7 @@ def kind_of(spec: str) -> Kind:
         return "rule"
     if spec == VISION or (spec.endswith(SUFFIX) and holds_vision(spec)):
         return "vision"
-    if spec in SHIPPED or spec.endswith(SUFFIX):
+    if spec in (*SHIPPED, *SHIPPED_EGOS) or spec.endswith(SUFFIX):
         return "learned"
     if spec.startswith("process:"):
         return "process"
@@ -161,4 +162,4 @@ def _suggest_ego(text: str) -> str:
     saved = Path(f"{text}.zip")
     if saved.is_file():
         return f" (did you mean {str(saved)!r}?)"
-    return did_you_mean(text.lower(), [RULE_BASED, *SHIPPED, VISION])
+    return did_you_mean(text.lower(), [RULE_BASED, *SHIPPED_EGOS, VISION, *SHIPPED])

@@ -32,6 +32,7 @@ FEATURES = (
 )
 """Names in order. The three flags are always 0: in recorded traffic they are constant, so no policy can learn what they
 mean; they are kept so that the layout is the published one."""
+LANE_OFFSET = FEATURES.index("lane_offset")
 HEADING = FEATURES.index("heading")
 SPEED = FEATURES.index("speed")
 CURVATURE = FEATURES.index("curvature")

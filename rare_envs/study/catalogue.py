@@ -16,6 +16,7 @@ TICK = 0.1
 """[s], the usual one."""
 EGOS = {
     "idm": "rule-based driver, Intelligent Driver Model (the default)",
+    "imitation": "shipped ego with lidar, learned from recorded traffic and from encounters",
     "mgail, gail, bc, FILE.safetensors": "learned driver with lidar, by its mean actions",
     "vision": "PilotNet on pictures of a front camera, which imitates a driver by rule; see docs/camera.md",
     "FILE.zip": "policy saved by Stable-Baselines3 or sb3-contrib, VecNormalize statistics beside it included",

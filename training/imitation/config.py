@@ -25,7 +25,15 @@ _RANGES: tuple[tuple[tuple[str, ...], Callable[[float], bool], str], ...] = (
     ),
     (("epochs", "warm_up", "weight_decay", "gradient_penalty"), lambda value: value >= 0, ">= 0"),
     (
-        ("critic_weight", "collision_weight", "edge_weight", "brake_weight"),
+        (
+            "critic_weight",
+            "collision_weight",
+            "edge_weight",
+            "brake_weight",
+            "headway_weight",
+            "lane_weight",
+            "speed_weight",
+        ),
         lambda value: 0 <= value < math.inf,
         ">= 0",
     ),
@@ -83,6 +91,12 @@ class Config:
     collision_weight: float = 16.0
     edge_weight: float = 16.0
     brake_weight: float = 1.0
+    headway_weight: float = 0.0
+    """Of following closely, which people do; drivers of the traffic have neither this nor the next two."""
+    lane_weight: float = 0.0
+    """Of being beside the middle of the lane."""
+    speed_weight: float = 0.0
+    """Of being faster than the limit."""
 
     # optimisation
     policy_rate: float = 3e-4

@@ -51,12 +51,19 @@ def prepare(scenes: Sequence[Scene], test: Sequence[Scene] = ()) -> Data:
     return Data(recording, pairs, stack(test) if test else None)
 
 
-def learner_of(data: Data, config: Config) -> Learner:
-    """Everything of a training before its first update: a cloned policy, a new critic."""
+def learner_of(data: Data, config: Config, among: torch.Tensor | None = None) -> Learner:
+    """Everything of a training before its first update: a cloned policy, a new critic.
+
+    Args:
+        data: Recorded traffic.
+        config: Settings.
+        among: Scenes that are driven, the oftener listed the oftener, shape (k,); None for all that have pairs.
+    """
     generator = torch.Generator().manual_seed(config.seed)
     policy = clone(data.pairs, config, generator)
     critic = seeded(Critic, generator)
-    return Learner(config, data.recording, torch.unique(data.pairs.scene), data.pairs, policy, critic, generator)
+    among = torch.unique(data.pairs.scene) if among is None else among
+    return Learner(config, data.recording, among, data.pairs, policy, critic, generator)
 
 
 def fit(

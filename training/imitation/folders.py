@@ -50,10 +50,10 @@ def train_driver(
     """
     if log:
         summary_writer()
-    settings = _settings(source, config)
-    _check_folder(out, settings)
+    settings = settings_of(source, config)
+    check_folder(out, settings)
     data = prepare(*load(source))
-    _note_settings(out, settings)
+    note_settings(out, settings)
     policy = fit(learner_of(data, config), out, log, progress)
     driver = driver_of(policy, config)
     provenance = Provenance(
@@ -93,13 +93,17 @@ def _option(name: str, value: Any) -> list[str]:
     return [flag, *(str(part) for part in (value if isinstance(value, tuple) else (value,)))]
 
 
-def _settings(source: Source, config: Config) -> str:
+def settings_of(source: Source, config: Config) -> str:
     """Source and settings as JSON."""
     return json.dumps({"source": {**asdict(source), "path": str(source.path)}, "config": asdict(config)}, indent=1)
 
 
-def _check_folder(out: Path, settings: str) -> None:
-    """Refuse a folder that is a file, or that holds a training with other settings."""
+def check_folder(out: Path, settings: str) -> None:
+    """Refuse a folder for a training.
+
+    Raises:
+        ValueError: If it is a file, or holds a training with other settings.
+    """
     if out.exists() and not out.is_dir():
         raise ValueError(f"Expected a folder for the training, got the file {str(out)!r}.")
     begun = any((out / name).exists() for name in (CHECKPOINT, DRIVER))
@@ -108,8 +112,12 @@ def _check_folder(out: Path, settings: str) -> None:
         raise ValueError(f"{str(out)!r} holds a training with other settings; choose another folder or remove it.")
 
 
-def _note_settings(out: Path, settings: str) -> None:
-    """Write settings into a folder, which is made if there is none."""
+def note_settings(out: Path, settings: str) -> None:
+    """Write settings into a folder, which is made if there is none.
+
+    Raises:
+        ValueError: If it cannot be made.
+    """
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:

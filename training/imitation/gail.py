@@ -1,8 +1,7 @@
 """GAIL: the policy follows rewards, by proximal policy optimisation; all vehicles share its parameters.
 
-The reward of a moment is minus the costs that MGAIL descends: the critic's, and those for collision, road edge and
-hard braking (reward augmentation, Bhattacharyya et al. 2019). The costs are added to the gradient of the recorded
-actions' likelihood, as there.
+The reward of a moment is minus the costs that MGAIL descends: the critic's, and the penalties (reward augmentation,
+Bhattacharyya et al. 2019). The costs are added to the gradient of the recorded actions' likelihood, as there.
 
 References:
     Ho and Ermon, "Generative adversarial imitation learning", NeurIPS 2016.
@@ -67,7 +66,9 @@ def rewards(learner: Learner, steps: Steps) -> Tensor:
     config = learner.config
     likeness = policy_cost(learner.critic, inputs(learner.policy, steps.features, steps.action))
     costs = config.collision_weight * steps.collision + config.edge_weight * steps.edge
-    return -(config.critic_weight * likeness + costs + config.brake_weight * steps.brake)
+    manners = config.headway_weight * steps.headway + config.lane_weight * steps.lane
+    manners = manners + config.speed_weight * steps.speed
+    return -(config.critic_weight * likeness + costs + config.brake_weight * steps.brake + manners)
 
 
 def update(learner: Learner) -> Log:

@@ -25,6 +25,9 @@ def update(learner: Learner) -> Log:
         + config.collision_weight * collision
         + config.edge_weight * edge
         + config.brake_weight * brake
+        + config.headway_weight * steps.headway.mean()
+        + config.lane_weight * steps.lane.mean()
+        + config.speed_weight * steps.speed.mean()
         + config.along(config.clone_weight, learner.update) * clone
     )
     learner.policy_optimiser.zero_grad()
@@ -38,6 +41,9 @@ def update(learner: Learner) -> Log:
         "collision": float(collision.detach()),
         "edge": float(edge.detach()),
         "brake": float(brake.detach()),
+        "headway": float(steps.headway.detach().mean()),
+        "lane": float(steps.lane.detach().mean()),
+        "speed": float(steps.speed.detach().mean()),
         "clone": float(clone.detach()),
         "gradient_norm": float(norm),
         "critic": critic,

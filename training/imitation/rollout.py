@@ -23,9 +23,12 @@ class Steps(NamedTuple):
     action: Tensor
     """Normalised, shape (n, 2)."""
     collision: Tensor
-    """Cost, shape (n,), as the next two."""
+    """Cost, shape (n,), as the next five."""
     edge: Tensor
     brake: Tensor
+    headway: Tensor
+    lane: Tensor
+    speed: Tensor
     noise: Tensor
     """What the noise of the action was expected to be from the ticks before, shape (n, 2)."""
 
@@ -80,7 +83,8 @@ def roll(
 
 
 def _penalties(traffic: Traffic, features: Tensor, action: Tensor, m: int) -> Penalties:
-    return penalties(traffic.x, traffic.y, traffic.length, traffic.width, traffic.edges, features, action, m)
+    bodies = traffic.x, traffic.y, traffic.speed, traffic.length, traffic.width
+    return penalties(*bodies, traffic.edges, features, action, m)
 
 
 def _passing(traffic: Traffic, credit: float) -> Traffic:

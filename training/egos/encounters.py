@@ -1,0 +1,117 @@
+"""Encounters of this project's scenarios as scenes, so that a driver learns in them as it does in recorded ones.
+
+The ego is driven, by IDM where a scene is made and by whoever learns later on; the others are replayed. Many encounters
+make one scene: they stand behind each other on one road, too far apart to see each other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from rare_envs.bases import load_base
+from rare_envs.drivers import IDM
+from rare_envs.rollout import drive
+from rare_envs.scenarios import named
+from rare_envs.state import VEHICLE_LENGTH, VEHICLE_WIDTH
+from rare_envs.world import World
+from training.data.scenes import Scene
+from training.egos.nominal import draw, world_of
+from training.egos.ordinary import CASES
+
+APART = 1500.0
+"""Distance of neighbouring encounters at their start [m]."""
+VEHICLES = 39
+"""Most vehicles of a scene."""
+
+
+@dataclass(frozen=True)
+class Kind:
+    """Encounters of one kind."""
+
+    scenario: str
+    """Short name of a scenario, or one of `training.egos.ordinary.CASES` on a straight road."""
+    base: str | None = None
+    """Base distribution of the scenario."""
+    scenes: int = 1
+    seconds: float = 6.0
+    """Length [s]; the others go on at constant speed after it."""
+    given: Mapping[str, float] = field(default_factory=dict)
+    """Parameters that are the same in all."""
+
+
+def encounters(kinds: Sequence[Kind], rng: np.random.Generator) -> list[Scene]:
+    """Scenes full of encounters; every other one is mirrored, since scenarios know one side only.
+
+    Args:
+        kinds: Which, and how many.
+        rng: Source of their parameters.
+    """
+    scenes = []
+    for kind in kinds:
+        world = _world(kind)
+        each = VEHICLES // world.scenario.vehicles
+        tracks = _tracks(world, _parameters(kind, world, each * kind.scenes, rng))
+        for number in range(kind.scenes):
+            rows = slice(number * each, (number + 1) * each)
+            side = -1.0 if number % 2 else 1.0
+            name = f"{kind.scenario} {kind.base or ''} {number}"
+            scenes.append(_scene(name, world, tracks[:, rows], side))
+    return scenes
+
+
+def _world(kind: Kind) -> World:
+    if kind.scenario in CASES:
+        return world_of(CASES[kind.scenario], kind.seconds)
+    return World(named(kind.scenario), horizon=kind.seconds)
+
+
+def _parameters(kind: Kind, world: World, n: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    if kind.scenario in CASES:
+        x = draw(CASES[kind.scenario], world, n, 0, rng)
+    else:
+        x = np.asarray(load_base(world.scenario, kind.base).sample(n, rng))
+    names = [parameter.name for parameter in world.scenario.parameters]
+    for name, value in kind.given.items():
+        x[:, names.index(name)] = value
+    return x
+
+
+def _tracks(world: World, x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """x, y, heading and speed of everybody with IDM as ego, shape (T, n, N, 4)."""
+    with torch.inference_mode():
+        states = [episode.state for episode in drive(world, IDM(), torch.from_numpy(x))]
+        moments = [torch.stack((s.x, s.y, s.heading, s.speed), dim=-1) for s in states]
+    return np.asarray(torch.stack(moments).numpy())
+
+
+def _scene(name: str, world: World, tracks: NDArray[np.float64], side: float) -> Scene:
+    """One scene of some encounters (T, n, N, 4), mirrored for side = -1."""
+    road, (ticks, n, vehicles, _) = world.scenario.road, tracks.shape
+    place = APART * np.arange(n)[:, None]
+    flat: dict[str, Any] = {
+        "x": tracks[..., 0] + place,
+        "y": side * tracks[..., 1],
+        "heading": side * tracks[..., 2],
+        "speed": tracks[..., 3],
+    }
+    flat = {key: values.reshape(ticks, n * vehicles) for key, values in flat.items()}
+    ego = np.arange(n * vehicles) % vehicles == 0
+    # whose actions are not known is replayed; what the ego did is not learned from, so any number will do
+    action = np.where(ego, 0.0, np.nan) * np.ones((ticks, 1))
+    return Scene(
+        name=name,
+        start=0.0,
+        edges=tuple(sorted(side * edge for edge in road.edges)),
+        **flat,
+        acceleration=action,
+        yaw_rate=action.copy(),
+        present=np.ones((ticks, n * vehicles), dtype=bool),
+        length=np.full(n * vehicles, VEHICLE_LENGTH),
+        width=np.full(n * vehicles, VEHICLE_WIDTH),
+    )

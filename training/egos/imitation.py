@@ -1,0 +1,156 @@
+"""Train the ego `imitation`: a driver that has learned from people, and from encounters that people seldom have.
+
+    python -m training.egos.imitation --data FOLDER --out runs/imitation
+
+It learns as the drivers of the traffic do (`training.imitation`): its likelihood and its critic know recorded people
+only, and the gradient goes through the simulator. Two things differ. Beside recorded scenes it drives encounters
+(`training.egos.encounters`): vehicles that cut in, brake hard, or are not there at all. And it pays for following
+closely, for leaving the middle of its lane and for speeding, which people do not mind as much as we do.
+
+Writes `driver.safetensors` into the folder, with how it does in ordinary traffic (`training.egos.nominal`) in its
+header, and a checkpoint. The same command on the same folder takes up a training that was stopped, to the same
+weights.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+import typer
+
+from agents import LearnedDriver, LearnedEgo, Provenance, save_driver
+from training.data.scenes import Scene
+from training.egos.encounters import Kind, encounters
+from training.egos.nominal import judge, summary_of
+from training.egos.ordinary import CASES
+from training.imitation.config import Config
+from training.imitation.expert import expert_pairs
+from training.imitation.fitting import Data, fit, learner_of
+from training.imitation.folders import DRIVER, check_folder, driver_of, note_settings, settings_of
+from training.imitation.learner import Learner
+from training.imitation.realism import metrics
+from training.imitation.recording import stack
+from training.imitation.sources import Source, load
+
+NAME = "imitation"
+CONFIG = Config(
+    method="mgail",
+    updates=1000,
+    age=(30, 60),  # encounters are over by then, and what comes after them teaches little
+    critic_weight=2.0,
+    clone_weight=(0.1, 0.03),
+    collision_weight=32.0,
+    edge_weight=16.0,
+    brake_weight=0.3,
+    headway_weight=10.0,
+    lane_weight=8.0,
+    speed_weight=8.0,
+)
+KINDS = (
+    Kind("cut_in", "us101", 20, 4.0),
+    Kind("cut_in", "highway", 10, 4.0),
+    Kind("hard_brake", "us101", 8, 8.0),
+    Kind("car_following", "us101", 2, 8.0),
+    Kind("car_following", "highway", 2, 8.0),
+    Kind("straight", None, 10, 30.0),
+    Kind("straight", None, 2, 30.0, {"gap": 140.0, "lead_speed": 25.0}),
+    Kind("car_following", "highway", 2, 8.0, {"gap": 140.0}),
+)
+"""Encounters; in the last two the lead is out of sight."""
+RECORDED = 0.4
+"""Share of recorded ones among the scenes that are driven."""
+JUDGED, JUDGED_SEED = 400, 1000
+"""Rollouts of each case in the header of the file."""
+
+
+def prepare(scenes: Sequence[Scene], kinds: Sequence[Kind], config: Config) -> Learner:
+    """Everything of the training before its first update.
+
+    Args:
+        scenes: Recorded ones; likelihood and critic know these only.
+        kinds: Encounters that are driven beside them.
+        config: Settings; the encounters are drawn by its seed.
+    """
+    pairs = expert_pairs(stack(scenes))
+    met = encounters(kinds, np.random.default_rng(config.seed))
+    recorded = torch.unique(pairs.scene)
+    times = round(RECORDED / (1.0 - RECORDED) * len(met) / len(recorded))
+    among = torch.cat((recorded.repeat(max(times, 1)), len(scenes) + torch.arange(len(met))))
+    return learner_of(Data(stack((*scenes, *met)), pairs, None), config, among)
+
+
+def judged(driver: LearnedDriver, rollouts: int = JUDGED) -> dict[str, Any]:
+    """How it drives in ordinary traffic as an ego, for the header of its file."""
+    found = {}
+    for case in CASES:
+        one = summary_of(judge(LearnedEgo(driver), case, rollouts, JUDGED_SEED))
+        found[case] = {"kept": one.kept, "judged": one.judged, "at least": one.interval[0]}
+    return found
+
+
+def train(
+    data: Path,
+    config: Config,
+    out: Path,
+    *,
+    kinds: Sequence[Kind] = KINDS,
+    rollouts: int = JUDGED,
+    progress: bool = False,
+) -> Path:
+    """Train the ego from the tables of US 101, from the first update or from where a training was stopped.
+
+    Args:
+        data: Folder with the tables.
+        config: Settings.
+        out: Folder; it is made if there is none.
+        kinds: Encounters.
+        rollouts: How many it is judged by in each case of ordinary traffic.
+        progress: Show a bar on standard error.
+
+    Returns:
+        The ego's file.
+
+    Raises:
+        ValueError: If the data cannot be read, or the folder holds another training.
+    """
+    source = Source("data", data)
+    settings = settings_of(source, config)
+    check_folder(out, settings)
+    learn, test = load(source)
+    note_settings(out, settings)
+    driver = replace(driver_of(fit(prepare(learn, kinds, config), out, progress=progress), config), name=NAME)
+    provenance = Provenance(
+        kind="mgail, with encounters",
+        command=f"python -m training.egos.imitation --data {data.name} --seed {config.seed}",
+        data=source.description,
+        data_licence=source.licence,
+        metrics={**metrics(stack(test), driver), "ordinary": judged(driver, rollouts)},
+    )
+    return save_driver(driver, provenance, out / DRIVER)
+
+
+def command(
+    out: Annotated[Path, typer.Option(help="Folder; a training that was stopped in it is taken up.")],
+    data: Annotated[Path, typer.Option(help="Folder with the compact tables of US 101.")],
+    seed: Annotated[int, typer.Option(help="The same seed gives the same weights.")] = CONFIG.seed,
+) -> None:
+    """Train the ego `imitation`."""
+    torch.set_num_threads(1)
+    try:
+        path = train(data, replace(CONFIG, seed=seed), out, progress=True)
+    except ValueError as error:
+        print(f"imitation: {error}", file=sys.stderr)
+        raise typer.Exit(2) from None
+    print(f"Saved {path}. Next: python -m training.egos.nominal --ego {path}")
+
+
+if __name__ == "__main__":
+    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+    app.command()(command)
+    app()
