@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from samplers.curve import inflation, sample_of
-from samplers.intervals import Interval, nothing_in
+from samplers.intervals import Interval, degrees_of_freedom, nothing_in
 from samplers.method import Stepping
 from samplers.plan import check_problem
 from samplers.problem import Distribution, FloatArray, Problem
@@ -18,7 +18,7 @@ from samplers.result import Estimate, plain
 from samplers.reweighting import LARGEST_LOG, effective
 from samplers.run import estimate
 from samplers.two_stage import TwoStage
-from samplers.units import alone, degrees_of_freedom, interval_of_sum
+from samplers.units import alone, interval_of_sum
 
 FEW = 30.0
 """Effective failing units below which a probability is called coarse."""

@@ -12,14 +12,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from samplers.families import Gaussian, Law, Mixture
-from samplers.intervals import Interval, clopper_pearson, log_normal
+from samplers.intervals import Interval, clopper_pearson, degrees_of_freedom, log_normal
 from samplers.method import Goal, Interrupted, Sample
 from samplers.problem import FloatArray, Inputs
 from samplers.result import Level
 from samplers.weights import effective_sample_size, largest_share
 
-MANY_ESS = 200
-"""From this effective number of failing points on, normal quantiles serve; below, t quantiles."""
 LOW_ESS = 30
 MOST_BATCHES = 100
 """Batches of final draws after which a target c.o.v. is given up where max_sim does not say."""
@@ -203,8 +201,8 @@ def interval_of(draws: Draws, confidence: float, largest_weight: float, cov: flo
     if hits == 0 or largest_weight == 1.0:
         low, high = clopper_pearson(hits, draws.n, confidence)
         return low, min(1.0, high * largest_weight)
-    df = math.inf if draws.ess > MANY_ESS else max(draws.ess / 4, 3.0)
-    low, high = log_normal(draws.p, draws.cov if cov is None else cov, confidence, df)
+    spread = draws.cov if cov is None else cov
+    low, high = log_normal(draws.p, spread, confidence, degrees_of_freedom(draws.ess, alone=True))
     if draws.ess < LOW_ESS:
         high = max(high, bernstein_bound(draws, confidence, largest_weight))
     return low, high

@@ -4,6 +4,8 @@ References:
     Clopper and Pearson, "The use of confidence or fiducial limits", Biometrika 26, 1934.
     Au and Beck, "Estimation of small failure probabilities in high dimensions by subset
     simulation", Probabilistic Engineering Mechanics 16, 2001 (equations 25 to 29).
+    Korn and Graubard, "Confidence intervals for proportions with small expected number of positive
+    counts estimated from survey data", Survey Methodology 24, 1998 (degrees of freedom from units).
 """
 
 import math
@@ -13,6 +15,8 @@ from numpy.typing import NDArray
 from scipy import stats
 
 Interval = tuple[float, float]
+MANY_ESS = 200
+"""From this effective number of units on, normal quantiles serve; below, t quantiles."""
 
 
 def clopper_pearson(hits: int, n: int, confidence: float) -> Interval:
@@ -39,6 +43,17 @@ def log_normal(p: float, cov: float, confidence: float, df: float = math.inf) ->
     quantile = float(stats.t.ppf(0.5 + confidence / 2, df))
     half = quantile * math.sqrt(math.log1p(cov * cov))
     return p * math.exp(-half), min(1.0, p * math.exp(half))
+
+
+def degrees_of_freedom(ess: float, alone: bool) -> float:
+    """Return the degrees of freedom of a sum over `ess` effective units; inf where they are many.
+
+    Sums of chains have ess - 1, as in subset simulation; single draws, whose weights are skewed, a quarter of ess
+    but at least 3, as in importance sampling.
+    """
+    if ess > MANY_ESS:
+        return math.inf
+    return max(ess / 4, 3.0) if alone else max(ess - 1, 1.0)
 
 
 def binomial_cov(p: float, n: float) -> float:

@@ -5,19 +5,15 @@ With T_c the sum of the weights in unit c, p-hat = sum T_c and its variance is s
 
 References:
     Lee and Whiteley, "Variance estimation in the particle filter", Biometrika 105, 2018 (the spread from roots).
-    Korn and Graubard, "Confidence intervals for proportions with small expected number of positive
-    counts estimated from survey data", Survey Methodology 24, 1998 (degrees of freedom from units).
 """
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from samplers.importance import MANY_ESS
-from samplers.intervals import Interval, clopper_pearson, log_normal
+from samplers.intervals import Interval, clopper_pearson, degrees_of_freedom, log_normal
 from samplers.method import Sample
 from samplers.problem import FloatArray
 
@@ -92,17 +88,6 @@ def unit_sums(sample: Sample, gammas: FloatArray) -> UnitSums:
 def alone(sample: Sample) -> bool:
     """Return whether every point of a sample is a unit of its own (a draw, no chain)."""
     return not sample.layers and len(np.unique(sample.units)) == len(sample.units)
-
-
-def degrees_of_freedom(ess: float, alone: bool) -> float:
-    """Return the degrees of freedom of a sum over `ess` effective units; inf where they are many.
-
-    Sums of chains have ess - 1, as in subset simulation; single draws, whose weights are skewed, a quarter of ess
-    but at least 3, as in importance sampling.
-    """
-    if ess > MANY_ESS:
-        return math.inf
-    return max(ess / 4, 3.0) if alone else max(ess - 1, 1.0)
 
 
 def interval_of_sum(p: float, cov: float, ess: float, alone: bool, confidence: float) -> Interval:
