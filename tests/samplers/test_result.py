@@ -8,6 +8,7 @@ import pytest
 
 import samplers
 from samplers.reference import half_space
+from samplers.result import Failures, plain
 
 
 def result(**options):
@@ -74,6 +75,41 @@ def test_says_what_the_problem_holds_fixed():
     while not run.done:
         run.tell(problem.evaluate(run.ask()))
     assert run.result().given == "one die is fixed"
+
+
+def failures(log_p0, f=None, total=None):
+    """Failing points x = log_p0 in one dimension."""
+    values = np.array(log_p0, dtype=float)
+    f = -np.ones(len(values)) if f is None else np.array(f)
+    return Failures(x=values[:, None], f=f, log_p0=values, total=len(values) if total is None else total)
+
+
+def test_the_most_likely_failures_are_kept():
+    new = np.array([-2.0, -9.0, -1.0, -3.0])
+    kept = failures([-1.0, -5.0], [0.0, -1.0], total=7).merged(new[:, None], new, new, keep=4)
+    np.testing.assert_array_equal(kept.log_p0, [-1.0, -1.0, -2.0, -3.0])
+    np.testing.assert_array_equal(kept.f, [0.0, -1.0, -2.0, -3.0])  # of equals the earlier first
+    np.testing.assert_array_equal(kept.x[:, 0], kept.log_p0)
+    assert (len(kept), kept.total) == (4, 11)
+    assert kept[2].f == kept[2].log_p0 == -2.0
+    assert [each.f for each in kept] == [0.0, -1.0, -2.0, -3.0]
+    assert len(Failures.empty(3)) == Failures.empty(3).total == 0
+    assert Failures.empty(3).x.shape == (0, 3)
+
+
+def test_failures_are_equal_value_by_value():
+    some = failures([-1.0, -2.0], [-1.0, np.nan])
+    assert some == failures([-1.0, -2.0], [-1.0, np.nan])
+    for change in ({"x": some.x + 1}, {"f": np.array([-1.0, -1.0])}, {"log_p0": some.log_p0 - 1}, {"total": 3}):
+        assert some != replace(some, **change)
+    assert some != "failures"
+
+
+def test_plain_values_keep_their_shape():
+    value = {"a": (np.float64(1.5), np.int64(2), math.inf, -math.inf, math.nan), "b": [{"c": True}, None, "word"]}
+    assert plain(value) == {"a": [1.5, 2, None, None, None], "b": [{"c": True}, None, "word"]}
+    assert type(plain(np.float64(1.5))) is float
+    assert type(plain(np.int64(2))) is int
 
 
 @pytest.mark.parametrize(
