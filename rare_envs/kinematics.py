@@ -32,8 +32,11 @@ BEHIND = 2 * VEHICLE_LENGTH
 
 
 def kinematics_space() -> "spaces.Box[np.float32]":
-    """The space of `kinematics`: `ROWS` x `FEATURES`, clipped to [-1, 1]; HighwayEnv declares it unbounded."""
-    return spaces.Box(-1.0, 1.0, (ROWS, len(FEATURES)), np.float32)
+    """The space of `kinematics`, as HighwayEnv declares it: `ROWS` x `FEATURES`, without bounds.
+
+    What is observed is clipped to [-1, 1] here as there, but Stable-Baselines3's `load(path, env)` wants equal spaces.
+    """
+    return spaces.Box(-np.inf, np.inf, (ROWS, len(FEATURES)), np.float32)
 
 
 def kinematics(state: State, road: Road, vehicle: int = 0) -> Tensor:

@@ -18,7 +18,11 @@ from rare_envs.interop.layout import IDM, Group, Layout, class_kept, idm_groups,
 from rare_envs.interop.layouts import LAYOUTS
 from rare_envs.space import Array, Parameter, ScenarioSpace, did_you_mean
 
-SUPPORTED = "highway-v0, highway-fast-v0, merge-v0, merge-v1, intersection-v0 to -v2, roundabout-v0, roundabout-v1"
+SUPPORTED = (
+    *("highway-v0", "highway-fast-v0", "merge-v0", "merge-v1", "roundabout-v0", "roundabout-v1"),
+    *("intersection-v0", "intersection-v1", "intersection-v2"),
+)
+"""Ids of HighwayEnv that have parameters, as far as the installed version has them."""
 _FIXED_SEED = 12345
 
 
@@ -180,13 +184,14 @@ def _layout_of(env: gym.Env[Any, Any]) -> Layout:
     while isinstance(plain, OrderEnforcing | PassiveEnvChecker | TimeLimit):
         plain = plain.env
     if not isinstance(inner, AbstractEnv):
-        raise ValueError(f"Expected an environment of HighwayEnv ({SUPPORTED}), got {env}.")
+        raise ValueError(f"Expected an environment of HighwayEnv ({', '.join(SUPPORTED)}), got {env}.")
     if plain is not inner:
         raise ValueError(f"Expected the environment as gym.make gives it, got {plain}; put wrappers around this one.")
     generic = isinstance(inner, MergeGenericEnv | RoundaboutGenericEnv)
     found = [layout for kind, layout in LAYOUTS.items() if isinstance(inner, kind) and not generic]
     if not found or len(inner.controlled_vehicles) != 1:
-        raise ValueError(f"No parameters are known for {type(inner).__name__}; expected {SUPPORTED}, with one ego.")
+        known = ", ".join(SUPPORTED)
+        raise ValueError(f"No parameters are known for {type(inner).__name__}; expected {known}, with one ego.")
     return found[0]
 
 

@@ -5,11 +5,14 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any
 
+import gymnasium as gym
+
 import samplers
 from agents.networks import HEAD
 from rare_envs.background import noise_size
 from rare_envs.camera.weather import CONDITIONS, SENSOR_NOISE
 from rare_envs.measures import MEASURES
+from rare_envs.registration import kinematics_id
 from rare_envs.scenarios import SCENARIOS
 
 TICK = 0.1
@@ -40,11 +43,16 @@ def catalogue() -> dict[str, Any]:
 
     Returns:
         "environments" (id to parameters, vehicles, bases, drivers and what learned drivers add to x, with their noise
-        and for an episode of the usual length), "weather" (parameters that `--weather` adds), "methods", "egos",
-        "drivers", "measures".
+        and for an episode of the usual length), "highway_env" (HighwayEnv's own ids that have parameters), "weather"
+        (parameters that `--weather` adds), "methods", "egos", "drivers", "measures".
     """
+    import highway_env  # noqa: F401  (registers its ids)
+
+    from rare_envs.interop.scenario import SUPPORTED
+
     environments = {
         env_id: {
+            "kinematics_id": kinematics_id(env_id),
             "parameters": [asdict(parameter) for parameter in scenario.parameters],
             "vehicles": list(scenario.vehicle_names),
             "bases": list(scenario.bases),
@@ -58,6 +66,7 @@ def catalogue() -> dict[str, Any]:
     }
     return {
         "environments": environments,
+        "highway_env": [name for name in SUPPORTED if name in gym.registry],
         "weather": [asdict(parameter) for parameter in (*CONDITIONS, SENSOR_NOISE)],
         "methods": {name: _first_line(method) for name, method in samplers.METHODS.items()},
         "egos": EGOS,

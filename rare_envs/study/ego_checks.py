@@ -257,8 +257,8 @@ def at_the_edges(probe: Probe) -> Iterator[Finding]:
     boxes = dict(space.spaces) if isinstance(space, spaces.Dict) else space
     cases = {
         "zeros": probe.changed(np.zeros_like),
-        "the lower end": each(lambda part, box: np.broadcast_to(box.low, part.shape), probe.seen, boxes),
-        "the upper end": each(lambda part, box: np.broadcast_to(box.high, part.shape), probe.seen, boxes),
+        "the lower end": each(lambda part, box: _end(box.low, -1.0, part), probe.seen, boxes),
+        "the upper end": each(lambda part, box: _end(box.high, 1.0, part), probe.seen, boxes),
     }
     bad = []
     for name, case in cases.items():
@@ -283,6 +283,11 @@ def at_the_edges(probe: Probe) -> Iterator[Finding]:
         yield passed("NaN", "answered by numbers; the environment never gives NaN" if finite else "answered by NaN")
     except (Exception, SystemExit) as error:
         yield passed("NaN", f"refused: {reason_of(error)}")
+
+
+def _end(bound: Array, unbounded: float, part: Array) -> Array:
+    """Observations at a bound of their space; where it has none they are scaled to [-1, 1]."""
+    return np.broadcast_to(np.where(np.isfinite(bound), bound, unbounded), part.shape).astype(part.dtype)
 
 
 def is_fast(probe: Probe) -> Iterator[Finding]:

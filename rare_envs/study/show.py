@@ -32,7 +32,11 @@ def print_catalogue(entries: dict[str, Any]) -> None:
         around = environment["drivers"] or "a script, unless told otherwise"
         console.print(f"  drivers around the ego: {around}")
         added = ", ".join(f"{each['name']} ({each['size']:,} values)" for each in environment["of_learned_drivers"])
-        console.print(f"  learned drivers add: {added}\n")
+        console.print(f"  learned drivers add: {added}")
+        console.print(f"  with HighwayEnv's observations and actions: {environment['kinematics_id']}\n")
+    console.print(
+        f"HighwayEnv's own, by rare_envs.highway_env_problem in Python: {', '.join(entries['highway_env'])}\n"
+    )
     console.print(_parameters("Weather, which --weather adds for egos with a camera", entries["weather"]))
     titles = {
         "methods": "Methods",

@@ -1,13 +1,16 @@
 """`observation="kinematics"` and `action="meta"` against HighwayEnv itself in float64, and through our environments."""
 
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import highway_env  # noqa: F401  (registers its ids)
 import numpy as np
 import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
+from stable_baselines3 import DQN
 
 import rare_envs
 from benchmarks.highway_env_scene import Scene
@@ -224,6 +227,8 @@ def test_env_vector_env_and_problem_agree(env_id: str) -> None:
 
 @pytest.mark.parametrize("env_id", rare_envs.ENV_IDS)
 @pytest.mark.parametrize("observation", ["features", "kinematics"])
+# kinematics has no bounds, like HighwayEnv's, of which the checker warns
+@pytest.mark.filterwarnings("ignore:.*A Box observation space .*imum value is -?infinity")
 def test_gymnasium_checker(env_id: str, observation: str) -> None:
     check_env(gym.make(env_id, observation=observation, action="meta").unwrapped, skip_render_check=True)
 
@@ -313,3 +318,17 @@ def test_an_id_with_highway_envs_layout() -> None:
     for action in (3, 1):
         np.testing.assert_array_equal(env.step(action)[0], same.step(action)[0])
     assert gym.make_vec("rare_envs/HardBrake-kinematics-v0", num_envs=2).reset()[0].shape == (2, 5, 5)
+
+
+def test_stable_baselines3_takes_our_environment_for_a_policy_from_highway_env(tmp_path: Path) -> None:
+    there, ours = gym.make("highway-fast-v0"), gym.make("rare_envs/CutIn-kinematics-v0")
+    assert there.observation_space == ours.observation_space
+    assert there.action_space == ours.action_space
+    settings: dict[str, Any] = {"buffer_size": 50, "learning_starts": 4, "batch_size": 4, "device": "cpu"}
+    DQN("MlpPolicy", there, **settings).save(tmp_path / "dqn.zip")
+    model = DQN.load(tmp_path / "dqn.zip", env=ours).learn(12)
+    observation, _ = ours.reset(seed=0)
+    assert abs(observation).max() <= 1.0
+    assert model.predict(observation)[0] in range(5)
+    model.save(tmp_path / "dqn.zip")
+    DQN.load(tmp_path / "dqn.zip", env=there)

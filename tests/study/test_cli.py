@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from matplotlib.image import imread
@@ -16,6 +17,7 @@ from typer.testing import Result
 import agents
 import rare_envs
 import samplers
+from rare_envs import HighwayEnvScenario
 from rare_envs.scenarios import SCENARIOS
 
 Cli = Callable[..., Result]
@@ -227,6 +229,7 @@ def test_help_calls_replicates_what_samplers_calls_them(cli: Cli) -> None:
     assert "Independent runs, combined by their mean" in " ".join(shown.split())
 
 
+@pytest.mark.filterwarnings("ignore:.*is out of date")  # HighwayEnv keeps its old versions
 def test_list_shows_what_there_is(cli: Cli) -> None:
     shown = cli("list").stdout
     entries = json.loads(cli("list", "--json").stdout)
@@ -249,6 +252,12 @@ def test_list_shows_what_there_is(cli: Cli) -> None:
             expected = np.repeat([each[end] for each in listed], sizes).tolist()
             assert expected == getattr(space, end)[: sum(sizes)].tolist()
         assert all(each["unit"] and each["meaning"] for each in listed)
+        assert environment["kinematics_id"] in gym.registry
+        assert environment["kinematics_id"] in shown
+    for env_id in entries["highway_env"]:
+        assert HighwayEnvScenario(gym.make(env_id)).space.dim > 0
+        assert env_id in " ".join(shown.split())
+    assert {"highway-v0", "merge-v0", "intersection-v0", "roundabout-v0"} <= set(entries["highway_env"])
     assert "speed (6 values)" in shown
     assert "weights (404 values), noise (1,020 values)" in shown
     for name in (*agents.checkpoints.SHIPPED, "okelly2018", "lidar_ttc"):
