@@ -13,6 +13,7 @@ from agents import Provenance, load_ego
 from agents.pilotnet import HEIGHT, WIDTH, PilotNet, luma
 from agents.vision import LAG, SPEED_SCALE, VisionEgo, recall, to_actions
 from agents.vision_file import load_vision, read_vision_provenance, save_vision
+from rare_envs.study.check_ego import Asked, check_ego
 
 CUT_IN = "rare_envs/CutIn-v0"
 
@@ -141,6 +142,12 @@ def test_it_drives_behind_a_stack_and_in_a_process_of_its_own(spec: str) -> None
     if spec == "process:vision":
         plain = rare_envs.DrivingProblem(CUT_IN, ego=load_ego("vision"), horizon=0.3)
         np.testing.assert_allclose(f, plain.evaluate(x), atol=1e-6)
+
+
+def test_check_ego_finds_nothing_wrong_with_it() -> None:
+    findings = check_ego(Asked("vision", CUT_IN, horizon=0.5))
+    assert {finding.check for finding in findings} >= {"memory", "latency", "driving"}
+    assert {finding.status for finding in findings if finding.check != "latency"} == {"pass"}
 
 
 def test_another_observation_is_refused_with_the_right_one_named() -> None:
