@@ -9,6 +9,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rare_envs.mixed import KINDS, batch_size, each, read_kinds
+from rare_envs.observation import observation_space
 
 Array = NDArray[Any]
 Shape = tuple[int, ...]
@@ -88,9 +89,16 @@ def stacking(given: Shape, wanted: Shape) -> tuple[int, bool] | None:
     return (frames, False) if frames and not rest else None
 
 
-def observation_for(ego: Any) -> str:
-    """What to show an ego where nobody says: kinds that its space names, such as "camera+speed", else "features"."""
+def observation_for(ego: Any, vehicles: int = 1) -> str:
+    """What to show an ego where nobody says: what its space tells, else "features".
+
+    Args:
+        ego: A `Dict` names the kinds, such as "camera+speed"; the space of "lidar" is known by its shape.
+        vehicles: Of the scenario, whose features may have that shape too.
+    """
     space = getattr(ego, "observation_space", None)
+    if space == observation_space(vehicles, "lidar") != observation_space(vehicles, "features"):
+        return "lidar"
     names = set(space.spaces) if isinstance(space, spaces.Dict) else set[str]()
     return read_kinds(sorted(names)) if names and names <= set(KINDS) else "features"
 

@@ -17,7 +17,7 @@ from rare_envs.mixed import kinds_of
 from rare_envs.observation import space_of_observations
 from rare_envs.policies import fitted, frames_of, observation_for
 from rare_envs.rollout import rollout
-from rare_envs.setup import set_up, with_noise
+from rare_envs.setup import find_scenario, set_up, with_noise
 from rare_envs.space import Distribution, ScenarioSpace
 from rare_envs.world import World
 
@@ -81,7 +81,8 @@ class DrivingProblem:
                 actions. Scripts and most egos have none (policies act by their means), so there the three agree; the
                 noise of an ego behind a stack (`noisy:EGO`) goes with it.
             **make_kwargs: Further keyword arguments of `gym.make` for this id. Without an `observation` an ego whose
-                `observation_space` is a `Dict` is shown what its names ask for, another "features".
+                `observation_space` is a `Dict` is shown what its names ask for, one whose space is that of the lidar
+                this, another "features".
 
         Raises:
             ValueError: If an argument is invalid or the ego's spaces are not the environment's.
@@ -90,7 +91,9 @@ class DrivingProblem:
         self.ego = ego
         self.world: World
         self.space: ScenarioSpace
-        make_kwargs["observation"] = make_kwargs.get("observation") or observation_for(ego)
+        make_kwargs["observation"] = make_kwargs.get("observation") or observation_for(
+            ego, find_scenario(env_id).vehicles
+        )
         self.world, self.space = set_up(env_id, measure=measure, base=base, noise=noise, **make_kwargs)
         self.driver = as_driver(ego, self.world)
         for note in self.notes:

@@ -174,7 +174,11 @@ def test_drivers_by_name(file):
 
 
 def test_unknown_names_get_a_suggestion(file, monkeypatch):
-    with pytest.raises(ValueError, match=r"'mgial' \(did you mean 'mgail'\?\); expected 'mgail', 'gail', 'bc', 'idm'"):
+    with pytest.raises(
+        ValueError,
+        match=r"'mgial' \(did you mean 'mgail'\?\); expected 'mgail', 'gail', 'bc', "
+        r"'imitation', 'idm'",
+    ):
         load_driver("mgial")
     with pytest.raises(ValueError, match="did you mean 'idm'"):
         load_driver("IDM")

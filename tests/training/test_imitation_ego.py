@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ import torch
 import agents
 import rare_envs
 from rare_envs.drivers import IDM
+from rare_envs.observation import observation_space
+from rare_envs.policies import observation_for
 from rare_envs.rollout import drive
 from rare_envs.scenarios.cut_in import CUT_IN
 from rare_envs.world import World
@@ -87,6 +90,19 @@ def test_it_is_found_by_name_and_tells_where_it_comes_from() -> None:
 def test_it_is_no_driver_of_the_traffic() -> None:
     with pytest.raises(ValueError, match="expected one of 'bc', 'gail', 'idm', 'mgail'"):
         rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", drivers="imitation")
+
+
+def test_it_needs_no_observation_in_a_process_of_its_own_either() -> None:
+    """Elsewhere it is an ego with `predict`, whose space tells that it wants the lidar."""
+    away = SimpleNamespace(
+        predict=agents.load_ego("imitation").predict, observation_space=observation_space(1, "lidar")
+    )
+    problem = rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego=away)
+    here = rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego=agents.load_ego("imitation"))
+    x = here.base.sample(32, np.random.default_rng(0))
+    gentle = here.evaluate(x) > 2.0  # where no more than the environment's 5 m/s^2 is needed
+    np.testing.assert_allclose(problem.evaluate(x)[gentle], here.evaluate(x)[gentle], atol=0.05)
+    assert observation_for(away, vehicles=13) == "features"  # as many of them as the lidar has
 
 
 @pytest.mark.parametrize("case", ["straight", "bends"])
