@@ -137,7 +137,8 @@ def findings_of(asked: Asked) -> Iterator[Finding | str]:
     from rare_envs.faults import EgoGone, reason_of
     from rare_envs.problem import AmbiguousActions
     from rare_envs.study.conformance import conformance
-    from rare_envs.study.ego_checks import CHECKS, Probe, drives
+    from rare_envs.study.ego_checks import CHECKS, drives
+    from rare_envs.study.probe import Probe
 
     if kind_of(asked.ego) == "remote":
         yield "protocol"

@@ -14,7 +14,8 @@ from typer.testing import Result
 
 import rare_envs
 from rare_envs.study.columns import digits
-from rare_envs.study.ego_checks import CHECKS, Probe
+from rare_envs.study.ego_checks import CHECKS
+from rare_envs.study.probe import Probe
 
 Cli = Callable[..., Result]
 CUT_IN = "rare_envs/CutIn-v0"
