@@ -54,7 +54,7 @@ class UnitSums:
         """Correlation of `p` between thresholds, shape (G, G); 0 to those that do not vary."""
         covariance = self.second - np.outer(self.p, self.p) / self.n_units
         deviation = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-        varies = deviation > 1e-9 * self.p
+        varies = deviation > 1e-7 * self.p  # less is rounding: it is the root of a difference
         scale = np.where(varies, 1 / np.where(varies, deviation, 1.0), 0.0)
         return np.asarray(covariance * np.outer(scale, scale))
 
