@@ -114,6 +114,13 @@ def test_others_touch_where_their_bodies_overlap() -> None:
     assert 60 < sum(expected) < 240
 
 
+def test_a_crash_of_others_is_without_the_ego() -> None:
+    state = traffic((0.0, 0.0, 0.0, 20.0), (4.5, 0.0, 0.0, 10.0), (-4.5, 0.0, 0.0, 30.0))
+    assert describe(crash_of_others(state, straight(1))) is None
+    assert others_touch(state, straight(1)).tolist() == [False]
+    assert describe(crash_of(state, straight(1))) is not None
+
+
 def test_the_edge_is_a_wall() -> None:
     crash = tick((0.0, 2.1, 0.2, 15.0), (60.0, 0.0, 0.0, 20.0), lanes=1)
     across = 15.0 * math.sin(0.2)

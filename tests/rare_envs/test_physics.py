@@ -5,9 +5,10 @@ from itertools import pairwise
 
 import pytest
 import torch
+from highway_env.utils import not_zero
 
 from rare_envs.drivers import IDM, lane_keeping
-from rare_envs.dynamics import bicycle
+from rare_envs.dynamics import MAX_STEERING, NEAR_ZERO, bicycle, steering_for
 from rare_envs.geometry import Lead, boxes_overlap, lead_of
 from rare_envs.measures import TTC_MAX, Moment, ttc
 from rare_envs.road import straight
@@ -36,6 +37,20 @@ def test_bicycle_straight_line_is_uniform_acceleration() -> None:
     # explicit Euler: sum of (20 + 0.1 k) 0.1 for k = 0..9
     assert x.item() == pytest.approx(20.0 + 0.45)
     assert (y.item(), heading.item(), speed.item()) == (0.0, 0.0, pytest.approx(21.0))
+
+
+def test_steering_for_a_yaw_rate_is_how_the_bicycle_turns_at_it() -> None:
+    speed, rate = tensor(0.02, 3.0, 20.0, 20.0), tensor(0.004, -0.5, 0.3, 0.0)
+    zero = torch.zeros_like(speed)
+    *_, heading, _ = bicycle(zero, zero, zero, speed, zero, steering_for(rate, speed), 0.1)
+    torch.testing.assert_close(heading, 0.1 * rate)
+    # whoever is too slow for it, a vehicle at rest for one, steers as far as it goes
+    largest = steering_for(tensor(0.5, -0.5, 0.5), tensor(1.0, 0.0, 0.0))
+    torch.testing.assert_close(largest, MAX_STEERING * tensor(1.0, -1.0, 1.0))
+
+
+def test_nothing_is_divided_by_less_than_in_highway_env() -> None:
+    assert NEAR_ZERO == not_zero(0.0)
 
 
 def test_bicycle_turns_on_the_kinematic_circle() -> None:
