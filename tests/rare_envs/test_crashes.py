@@ -86,6 +86,8 @@ def test_at_rest_the_way_out_is_the_shortest() -> None:
     """Nothing moves: bodies that overlap by 10 cm of their widths and a metre of their lengths are flank to flank."""
     assert tick((0.0, 0.0, 0.0, 0.0), (4.0, 1.9, 0.0, 0.0))["kind"] == "side"
     assert tick((0.0, 0.0, 0.0, 0.0), (4.9, 1.0, 0.0, 0.0))["kind"] == "rear_end"
+    # who has touched all along comes before who comes in this tick
+    assert tick((0.0, 0.0, 0.0, 0.0), (-4.5, 0.0, 0.0, 30.0), (4.9, 1.0, 0.0, 0.0))["vehicles"] == [0, 2]
 
 
 def test_without_the_tick_before_speeds_and_headings_tell() -> None:

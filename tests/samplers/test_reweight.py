@@ -51,6 +51,27 @@ def run(method="ce", seed=1, **options):
     return samplers.estimate(half_space(2, BETA).problem, method, seed=seed, **options)
 
 
+def test_of_plain_draws_the_spread_is_that_of_the_ratios():
+    """The variance of a mean of ratios, 0 where f > gamma, and the largest of them once more."""
+    result, new = run("mc", max_sim=60_000), Normal(0.3)
+    x = result.sample.x
+    ratios = np.exp(new.log_prob(x) - Normal(0.0).log_prob(x))
+    terms = np.concatenate([ratios, np.zeros(60_000 - len(x))])
+    answer = result.reweight(new)
+    assert answer.p == pytest.approx(terms.mean())
+    variance = terms.var() / 60_000 + (terms.max() / 60_000) ** 2
+    assert answer.cov == pytest.approx(np.sqrt(variance) / terms.mean())
+
+
+def test_what_the_estimate_knows_beyond_its_units_widens_the_answer():
+    """Units are independent draws or paths; a c.o.v. above theirs (of chains, of doubts) is handed on as it is."""
+    result = run("adss", max_sim=3000)
+    low, high = (replace(result, cov=factor * result.cov).reweight(Normal(0.1)).cov for factor in (4.0, 12.0))
+    assert high == pytest.approx(3.0 * low)
+    smaller = replace(result, cov=1e-3).reweight(Normal(0.1)).cov
+    assert smaller == replace(result, cov=2e-3).reweight(Normal(0.1)).cov > 0.05  # but no less than that of the units
+
+
 @pytest.mark.parametrize("method", sorted(samplers.METHODS))
 def test_the_same_base_gives_the_same_p(method):
     result = run(method)
