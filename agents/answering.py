@@ -20,7 +20,7 @@ MAX_PEERS, MAX_SESSIONS = 64, 64
 """How many are remembered; the one unused for longest makes room."""
 MOST_BOUNDS = 1024
 """Numbers of a space's bound that are sent."""
-MOST_VALUES = 2**24
+MOST_VALUES = 2**23
 """Numbers of an observation, in a space that a client believes."""
 
 

@@ -54,6 +54,14 @@ SETTINGS = (  # a setting that only this algorithm has; the first that is presen
 )
 
 
+UNPACKED, MOST_PACKED = 64 * 2**20, 20
+"""Bytes that any archive may unpack to, and how many times its size a larger one may."""
+
+
+class TooLarge(ValueError):
+    """An archive that is far larger unpacked."""
+
+
 def read_header(file: Path | BinaryIO, name: str | None = None) -> dict[str, Any]:
     """Read the settings of a saved model, pickles left closed.
 
@@ -72,10 +80,13 @@ def read_header(file: Path | BinaryIO, name: str | None = None) -> dict[str, Any
         raise ValueError(f"{name!r} is not a zip file (or is cut short); expected a model saved by Stable-Baselines3.")
     try:
         with zipfile.ZipFile(file) as archive:
+            _check_size(archive, name)
             members = set(archive.namelist())
             header = json.loads(archive.read("data")) if "data" in members else None
             version = _read_text(archive, members, "_stable_baselines3_version")
-    except (zipfile.BadZipFile, zlib.error, ValueError, RuntimeError, OSError) as error:
+    except TooLarge:
+        raise
+    except (zipfile.BadZipFile, zlib.error, ValueError, RuntimeError, RecursionError, OSError) as error:
         raise ValueError(f"{name!r} is damaged ({error}); save the model again.") from error
     if not isinstance(header, dict) or "policy.pth" not in members or "policy_class" not in header:
         raise ValueError(
@@ -83,6 +94,16 @@ def read_header(file: Path | BinaryIO, name: str | None = None) -> dict[str, Any
             "'data' and 'policy.pth'. Write it with model.save(path)."
         )
     return {**header, "version": version}
+
+
+def _check_size(archive: zipfile.ZipFile, name: str) -> None:
+    """Refuse an archive that would fill the memory: Stable-Baselines3 stores its members as they are."""
+    unpacked = sum(member.file_size for member in archive.infolist())
+    packed = sum(member.compress_size for member in archive.infolist())
+    if unpacked > max(UNPACKED, MOST_PACKED * packed):
+        raise TooLarge(
+            f"{name!r} would unpack from {packed / 1e6:.1f} to {unpacked / 1e6:,.0f} MB; no policy does that."
+        )
 
 
 def _read_text(archive: zipfile.ZipFile, members: set[str], name: str) -> str:

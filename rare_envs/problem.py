@@ -1,6 +1,8 @@
 """DrivingProblem: a scenario and an ego as a function f(x), in the shape that samplers expect."""
 
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -13,6 +15,7 @@ from rare_envs.actions import DISCRETE_ACTIONS, META_ACTIONS
 from rare_envs.background import Background
 from rare_envs.crashes import KINDS, Crash
 from rare_envs.drivers import IDM, Driver, PolicyDriver
+from rare_envs.faults import reason_of
 from rare_envs.mixed import kinds_of
 from rare_envs.observation import space_of_observations
 from rare_envs.policies import fitted, frames_of, observation_for
@@ -91,15 +94,16 @@ class DrivingProblem:
         self.ego = ego
         self.world: World
         self.space: ScenarioSpace
-        make_kwargs["observation"] = make_kwargs.get("observation") or observation_for(
-            ego, find_scenario(env_id).vehicles
-        )
+        vehicles = find_scenario(env_id).vehicles
+        with _told(ego):
+            make_kwargs["observation"] = make_kwargs.get("observation") or observation_for(ego, vehicles)
         self.world, self.space = set_up(env_id, measure=measure, base=base, noise=noise, **make_kwargs)
-        self.driver = as_driver(ego, self.world)
+        with _told(ego):
+            self.driver = as_driver(ego, self.world)
+            self.varies: bool = getattr(ego, "deterministic", None) is False
         for note in self.notes:
             warnings.warn(note, AmbiguousActions, stacklevel=2)
         self.space = with_noise(self.space, "ego_noise", getattr(self.driver, "columns", 0))
-        self.varies: bool = getattr(ego, "deterministic", None) is False
         if getattr(self.driver, "sees", False):
             self.world = replace(self.world, lidar=True)
 
@@ -223,6 +227,17 @@ class DrivingProblem:
         return f
 
 
+@contextmanager
+def _told(ego: Any) -> Iterator[None]:
+    """Turn whatever happens when an ego is asked about itself into a ValueError: it is the user's."""
+    try:
+        yield
+    except ValueError:
+        raise
+    except Exception as error:
+        raise ValueError(f"An ego of class {type(ego).__name__} cannot be used: {reason_of(error)}") from error
+
+
 def as_driver(ego: Any, world: World) -> Driver:
     """The Driver that an ego stands for.
 
@@ -281,7 +296,8 @@ def check_spaces(ego: Any, expected: spaces.Space[Any], action: str = "continuou
             )
         return
     discrete = isinstance(acted, spaces.Discrete) and int(acted.n) == len(DISCRETE_ACTIONS)
-    if acted is not None and not discrete and getattr(acted, "shape", None) != (2,):
+    several = isinstance(acted, spaces.MultiDiscrete | spaces.MultiBinary)
+    if acted is not None and not discrete and (several or getattr(acted, "shape", None) != (2,)):
         raise ValueError(
             f"The ego acts in {acted}, the environment takes Box(-1, 1, (2,)) (acceleration, steering) "
             f"or Discrete({len(DISCRETE_ACTIONS)})."

@@ -233,6 +233,30 @@ def test_a_hostile_zip_is_refused_and_runs_nothing(entry: str, tmp_path: Path) -
     assert not mark.exists()
 
 
+def test_an_archive_that_would_fill_the_memory_is_not_unpacked(tmp_path: Path) -> None:
+    path = tmp_path / "bomb.zip"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        archive.writestr("data", b'{"policy_class": {}}')
+        archive.writestr("policy.pth", bytes(65 * 2**20))
+    assert path.stat().st_size < 2**20
+    for trust in (False, True):
+        with pytest.raises(ValueError, match=r"would unpack from 0\.\d to 68 MB"):
+            load_ego(path, trust=trust)
+
+
+def test_names_that_lead_out_of_an_archive_lead_nowhere(tmp_path: Path) -> None:
+    env = gym.make("rare_envs/CarFollowing-v0")
+    inside = tmp_path / "inside"
+    inside.mkdir()
+    sb3.PPO("MlpPolicy", env, n_steps=8, batch_size=8, device="cpu").save(inside / "ego.zip")
+    with zipfile.ZipFile(inside / "ego.zip", "a") as archive:
+        archive.writestr("../outside.txt", b"x")
+        archive.writestr("/outside.txt", b"x")
+    load_ego(inside / "ego.zip")
+    assert [path.name for path in tmp_path.iterdir()] == ["inside"]
+    assert [path.name for path in inside.iterdir()] == ["ego.zip"]
+
+
 def test_hostile_statistics_are_refused_and_run_nothing(tmp_path: Path) -> None:
     untrained("ppo").save(tmp_path / "ego.zip")
     mark = tmp_path / "was_here"

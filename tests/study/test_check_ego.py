@@ -202,6 +202,48 @@ def test_the_check_outlives_the_ego(broken: str, ego: str, cli: Cli) -> None:
     assert "process:EGO" in last["advice"]
 
 
+LIARS = """
+import numpy as np
+from gymnasium import spaces
+
+class Base:
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        return np.zeros((len(observation), 2), np.float32), None
+
+def made(**more):
+    return lambda: type("Liar", (Base,), more)()
+
+def boom(self):
+    raise RuntimeError("boom")
+
+observes_words = made(observation_space="Box")
+observes_nothing = made(observation_space=spaces.Dict({}))
+space_raises = made(observation_space=property(boom))
+acts_in_pairs = made(action_space=spaces.MultiDiscrete([2, 2]))
+action_raises = made(action_space=property(boom))
+unsure = made(deterministic=property(boom))
+no_method = made(predict=7)
+three_results = made(predict=lambda self, *a, **k: (None, None, None))
+objects = made(predict=lambda self, o, **k: (np.full((len(o), 2), None), None))
+imaginary = made(predict=lambda self, o, **k: (np.full((len(o), 2), 1j), None))
+odd_statistics = made(get_vec_normalize_env=lambda self: 7)
+no_driver = made(in_world=property(boom))
+"""
+
+
+def test_an_ego_that_is_not_what_it_says_is_one_line_and_one_finding(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cli: Cli
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "liars_here.py").write_text(LIARS)
+    for name in [line.partition(" =")[0] for line in LIARS.splitlines() if " = made(" in line]:
+        ego = f"liars_here:{name}"
+        result = cli("estimate", ENV, "--ego", ego, "--method", "mc", "--max-sim", 5, "--horizon", 1)
+        assert (result.exit_code, result.stdout, result.stderr.count("\n")) == (2, "", 1), (name, result.output)
+        found = [each for each in findings_of(Asked(ego, ENV, horizon=1.0)) if isinstance(each, Finding)]
+        assert exit_code(found) == 2, (name, found)
+
+
 # --- where files come from ---------------------------------------------------------------------
 
 
