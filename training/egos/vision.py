@@ -235,7 +235,8 @@ def measured(network: PilotNet, rollouts: int) -> dict[str, Any]:
     for case in CASES:
         one = summary_of(judge(VisionEgo(network), case, rollouts, seed=JUDGED))
         found[case] = {"kept": one.kept, "of": one.judged, "low": one.interval[0], "high": one.interval[1]}
-        found[case] |= {**one.reasons, "speed": one.speed, "headway": one.headway, "margin": one.margin}
+        headway = one.headway if math.isfinite(one.headway) else None  # nobody ahead
+        found[case] |= {**one.reasons, "speed": one.speed, "headway": headway, "margin": one.margin}
     return found
 
 
