@@ -131,7 +131,7 @@ def page(cells: Iterable[Cell]) -> str:
 def line(cell: Cell) -> str:
     """A row of the table."""
     return (
-        f"| `{cell.ego}` | `{cell.method}` | {cell.p:.2e} | {cell.low:.1e} to {cell.high:.1e} | {cell.n_sim:,} "
+        f"| `{cell.ego}` | `{cell.method}` | {cell.p:.2e} | {cell.low:.2e} to {cell.high:.2e} | {cell.n_sim:,} "
         f"| {cell.seconds:.0f} s | {len(cell.warnings) or ''} |"
     )
 
@@ -154,7 +154,7 @@ def main(
     cells = {
         (cell["env_id"], cell["ego"], cell["method"]): Cell(**{**cell, "warnings": tuple(cell["warnings"])})
         for cell in read()["cells"]
-        if cell["ego"] not in chosen
+        if cell["ego"] not in chosen or env not in cell["env_id"]
     }
     for key in [(env_id, ego, method) for env_id in SCENARIOS for ego in EGOS for method in METHODS]:
         if key in cells or env not in key[0] or (chosen and key[1] not in chosen):
