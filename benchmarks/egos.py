@@ -38,6 +38,16 @@ scenario at hand (`dqn` likewise), in every scenario with its default base and d
 within {horizon:g} s with its 95 % interval, by [two methods](estimates.md), simulations, wall time, number of warnings,
 and the likeliest failure that was found (`python -m benchmarks.egos`).
 
+A row of it in Python, with a quarter of the simulations:
+
+```python
+import agents
+import rare_envs
+import samplers
+
+problem = rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego=agents.load_ego("imitation"))
+print(samplers.estimate(problem, seed=0, max_sim=1500))
+```
 """
 
 
