@@ -185,9 +185,12 @@ def interval(chains: Chains, hits: int, goal: Goal, passed: Passed, trace: list[
     if len(trace) == 1:
         return clopper_pearson(hits, trace[0].n_points, goal.confidence)
     if hits == 0:
-        # No hit in correlated points: bound the last share as if each chain were one point.
-        upper = clopper_pearson(0, len(chains.lengths), goal.confidence)[1]
-        return 0.0, log_normal(passed.p, passed.cov, goal.confidence)[1] * upper
+        # The level reached is as uncertain as its descent, and its share as if each of its roots were one point.
+        roots = chains.where(chains.used).roots
+        independent = effective_roots(roots)
+        cov = max(passed.cov, descent_cov(roots, trace[0].n_points))
+        reached = log_normal(passed.p, cov, goal.confidence, df=max(independent - 1, 1.0))[1]
+        return 0.0, reached * clopper_pearson(0, max(int(independent), 1), goal.confidence)[1]
     roots = chains.where(chains.f <= goal.gamma).roots
     return log_normal(passed.p * trace[-1].p, cov, goal.confidence, df=max(effective_roots(roots) - 1, 1.0))
 

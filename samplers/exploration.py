@@ -92,7 +92,7 @@ def regions_of(
     others = max(sizes.level_starts, sizes.starts + sizes.level_starts - len(far))
     starts = np.concatenate([far, rng.permutation(descent.failing)[: min(others, most - len(far))]])
     if len(starts) == 0:
-        return Found([], noisy=False, levels=descent.levels + 1)
+        return Found([], noisy=False)
     return (yield from grown(simulator, starts, descent, gamma, sizes.limit, rng))
 
 

@@ -111,7 +111,7 @@ class TwoStage(Method):
         try:
             refinement = yield from run.explored()
             if refinement is None:
-                return (yield from run.plain() if run.common or not run.untilted else run.descended())
+                return (yield from run.plain())
             proposal = yield from run.refined(refinement)
             if proposal is None:
                 return (yield from run.descended())
@@ -135,8 +135,7 @@ class _Run:
         self._rng = rng
         self._all = inputs
         tilted = without_noise(inputs, rng)
-        self.untilted = tilted is not inputs
-        self.common = False
+        self._untilted = tilted is not inputs
         self._levels = 0
         self._simulator = Simulator(tilted)
         self._history = History(tilted.dim)
@@ -163,7 +162,6 @@ class _Run:
             # These draws have decided that plain Monte Carlo follows: counted in p they would bias it.
             self._set_aside = self._base_u, self._base_f
             self._base_u, self._base_f = self._base_u[:0], self._base_f[:0]
-            self.common = True
             return None
         self._history.add(first, gamma)
         found = yield from regions_of(self._simulator, first, gamma, sizes, self._rng)
@@ -194,7 +192,7 @@ class _Run:
         if self._end - self._simulator.n_sim < fallback.LEAST_BUDGET or not self._rounds:
             return True
         if refinement.noisy:
-            return not self.untilted or fallback.meets(self._rounds[-1])
+            return not self._untilted or fallback.meets(self._rounds[-1])
         return fallback.describes(self._rounds[-1], refinement.typical_weights(proposal))
 
     def descended(self) -> Steps:
