@@ -231,7 +231,7 @@ def provenance_of(config: Config, metrics: dict[str, Any]) -> Provenance:
 
 def measured(network: PilotNet, rollouts: int) -> dict[str, Any]:
     """How well it drives in ordinary traffic, by case of `training.egos.nominal`."""
-    found = {}
+    found: dict[str, dict[str, Any]] = {}
     for case in CASES:
         one = summary_of(judge(VisionEgo(network), case, rollouts, seed=JUDGED))
         found[case] = {"kept": one.kept, "of": one.judged, "low": one.interval[0], "high": one.interval[1]}

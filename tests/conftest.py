@@ -1,0 +1,5 @@
+"""What all tests need."""
+
+import os
+
+os.umask(0o022)  # a .zip to which everybody may write is refused
