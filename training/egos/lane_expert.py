@@ -13,8 +13,10 @@ from rare_envs.world import Episode
 
 OFFSET_TIME, HEADING_TIME = 0.6, 0.2
 """[s], as in `rare_envs.drivers.lane_keeping`."""
-_IDM = IDM()
+_IDM = IDM(jam_distance=2.0)
+"""Treiber, Hennecke and Helbing's (2000) distance at standstill: 1 m, the suite's, leaves nothing to an imitator."""
 TRUTHS = 5
+"""Numbers of `truths`."""
 
 
 def expert(episode: Episode) -> Tensor:

@@ -87,14 +87,14 @@ FOLLOWING = Scenario(
 
 
 def _speeds(n: int, rng: np.random.Generator, spread: float = 4.0) -> tuple[Array, Array]:
-    """Speeds of the ego, and speeds near those [m/s]."""
-    own = rng.uniform(2.0, TOP_SPEED, n)
+    """Speeds of the ego, one in four of them slow, and speeds near those [m/s]."""
+    own = np.where(rng.random(n) < 0.25, rng.uniform(0.0, 6.0, n), rng.uniform(2.0, TOP_SPEED, n))
     return own, np.clip(own + rng.normal(0.0, spread, n), 0.0, TOP_SPEED + 5.0)
 
 
 def _following(n: int, rng: np.random.Generator) -> Array:
     own, lead = _speeds(n, rng)
-    gap = np.where(rng.random(n) < 0.15, 200.0, 3.0 + own * rng.uniform(0.3, 3.5, n))
+    gap = np.where(rng.random(n) < 0.15, 200.0, 2.0 + own * rng.uniform(0.3, 3.5, n))
     lead = np.where(gap == 200.0, TOP_SPEED + 10.0, lead)  # soon out of sight
     swing = rng.uniform(0.0, 1.5, n) * (rng.random(n) < 0.6)
     side = rng.choice((-1.0, 1.0), n) * 3.75

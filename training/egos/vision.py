@@ -46,7 +46,7 @@ class Config:
     """How the network is trained."""
 
     seed: int = 0
-    rounds: int = 6
+    rounds: int = 5
     """Of DAgger, after the first imitation."""
     first_drives: int = 56
     """Lessons in which the expert drives."""
@@ -66,9 +66,9 @@ class Config:
     """See `pictures.collect`."""
     mixing: float = 0.5
     """In round k the expert decides at a share `mixing`^k of the ticks."""
-    first_visits: int = 45_000
+    first_visits: int = 40_000
     """Pictures that are learned from before the first round, with repetition."""
-    visits: int = 25_000
+    visits: int = 20_000
     """Likewise after each round."""
     batch: int = 32
     rate: float = 1e-3
