@@ -9,6 +9,7 @@ const socket = net.connect(port, "127.0.0.1");
 let id = 0;
 let waiting = null;
 speak(socket, "REQ", (frames) => waiting(unpack(frames[frames.length - 1])));
+socket.on("close", () => waiting({ type: "error", reason: "the server hung up" }));
 
 function ask(message) {
   return new Promise((resolve, reject) => {

@@ -21,8 +21,12 @@ function ready(type) {
   return frame(COMMAND, Buffer.concat([Buffer.from("\x05READY\x0bSocket-Type"), size, Buffer.from(type)]));
 }
 
+const early = new WeakMap(); // what waits for the other side's READY; libzmq hangs up on who does not wait
+
 export function send(socket, frames) {
-  socket.write(Buffer.concat(frames.map((body, i) => frame(i < frames.length - 1 ? MORE : 0, body))));
+  const bytes = Buffer.concat(frames.map((body, i) => frame(i < frames.length - 1 ? MORE : 0, body)));
+  if (early.has(socket)) early.get(socket).push(bytes);
+  else socket.write(bytes);
 }
 
 // Speak ZMTP on a TCP socket; onMessage gets the frames of each message. Whoever breaks the rules is disconnected.
@@ -30,6 +34,7 @@ export function speak(socket, type, onMessage) {
   let buffer = Buffer.alloc(0);
   let greeted = false;
   let frames = [];
+  early.set(socket, []);
   socket.setNoDelay(true);
   socket.on("error", () => socket.destroy());
   socket.write(GREETING);
@@ -53,7 +58,12 @@ export function speak(socket, type, onMessage) {
       if (buffer.length < start + size) return;
       const body = buffer.subarray(start, start + size);
       buffer = buffer.subarray(start + size);
-      if (flags & COMMAND) continue; // READY, and what later versions add
+      if (flags & COMMAND) {
+        // READY, and what later versions add
+        for (const bytes of early.get(socket) ?? []) socket.write(bytes);
+        early.delete(socket);
+        continue;
+      }
       frames.push(body);
       if (flags & MORE) continue;
       const message = frames;
