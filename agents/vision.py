@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
@@ -34,6 +34,8 @@ class VisionEgo:
     """A network that sees, as ego: Stable-Baselines3's `predict`, with the last pictures as its memory."""
 
     network: PilotNet
+    dt: ClassVar[float] = 0.1
+    """Time between two pictures [s] that its memory counts on."""
 
     @cached_property
     def observation_space(self) -> spaces.Space[Any]:

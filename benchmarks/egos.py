@@ -11,7 +11,7 @@ import json
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import torch
 import typer
@@ -146,9 +146,18 @@ def line(cell: Cell) -> str:
     )
 
 
-def read() -> dict[str, Any]:
-    """What has been measured so far."""
-    return json.loads(RESULT.read_text()) if RESULT.exists() else {"cells": []}
+def read() -> dict[tuple[str, str, str], Cell]:
+    """What has been measured so far, by scenario, ego and method."""
+    cells = json.loads(RESULT.read_text())["cells"] if RESULT.exists() else []
+    found = [Cell(**{**cell, "warnings": tuple(cell["warnings"])}) for cell in cells]
+    return {(cell.env_id, cell.ego, cell.method): cell for cell in found}
+
+
+def write(cells: dict[tuple[str, str, str], Cell]) -> None:
+    """Write what has been measured."""
+    versions = {"rare_envs": rare_envs.__version__, "torch": torch.__version__}
+    about = {"command": "python -m benchmarks.egos", "versions": versions}
+    RESULT.write_text(json.dumps({**about, "cells": [asdict(cell) for cell in cells.values()]}, indent=1) + "\n")
 
 
 def main(
@@ -159,23 +168,16 @@ def main(
 ) -> None:
     """Measure what is not measured yet and write the page."""
     torch.set_num_threads(1)
-    images = docs / "images"
     chosen = only.split(",") if only else []
-    cells = {
-        (cell["env_id"], cell["ego"], cell["method"]): Cell(**{**cell, "warnings": tuple(cell["warnings"])})
-        for cell in read()["cells"]
-        if cell["ego"] not in chosen or env not in cell["env_id"]
-    }
+    measured = {key for key, cell in read().items() if cell.ego not in chosen or env not in cell.env_id}
     for key in [(env_id, ego, method) for env_id in SCENARIOS for ego in EGOS for method in METHODS]:
-        if key in cells or env not in key[0] or (chosen and key[1] not in chosen):
+        if key in measured or env not in key[0] or (chosen and key[1] not in chosen):
             continue
-        cells[key] = ask(*key, runs=runs, images=images)
-        print(line(cells[key]), flush=True)
-        versions = {"rare_envs": rare_envs.__version__, "torch": torch.__version__}
-        about = {"command": "python -m benchmarks.egos", "versions": versions}
-        RESULT.write_text(json.dumps({**about, "cells": [asdict(cell) for cell in cells.values()]}, indent=1) + "\n")
+        cell = ask(*key, runs=runs, images=docs / "images")
+        print(line(cell), flush=True)
+        write({**read(), key: cell})  # read anew: another process may measure other egos
     order = {ego: place for place, ego in enumerate(EGOS)}
-    in_order = sorted(cells.values(), key=lambda cell: (order[cell.ego], METHODS.index(cell.method)))
+    in_order = sorted(read().values(), key=lambda cell: (order[cell.ego], METHODS.index(cell.method)))
     (docs / "shipped_egos.md").write_text(page(in_order), encoding="utf-8")
 
 

@@ -262,6 +262,9 @@ def as_driver(ego: Any, world: World) -> Driver:
     if callable(getattr(ego, "predict", None)):
         expected = space_of_observations(world)
         check_spaces(ego, expected, world.action)
+        tick = getattr(ego, "dt", None)
+        if tick is not None and tick != world.dt:
+            raise ValueError(f"Expected dt={tick:g} s, which this ego remembers pictures by, got {world.dt:g} s.")
         return PolicyDriver(fitted(ego, expected), world.observation, world.action, world.stride)
     if isinstance(ego, Background):
         raise ValueError("These drivers drive the traffic around an ego; as an ego take agents.LearnedEgo(driver).")

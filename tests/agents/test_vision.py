@@ -173,3 +173,8 @@ def test_files_of_another_kind_are_refused() -> None:
         load_vision(Path("agents/data/bc.safetensors"))
     with pytest.raises(FileNotFoundError, match="No vision at"):
         load_vision("nowhere.safetensors")
+
+
+def test_another_tick_is_refused():
+    with pytest.raises(ValueError, match=r"Expected dt=0.1 s"):
+        rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego=load_ego("vision"), dt=0.05)
