@@ -37,7 +37,7 @@ def test_the_highway_end_to_end(cli: Cli, tmp_path: Path) -> None:
     answer = json.loads((tmp_path / "result.json").read_text())
     asked = answer["question"]
     assert (asked["drivers"], asked["ego"], asked["horizon"], asked["noise"]) == ("gail", "bc", 2.0, "fixed")
-    assert asked["observation"] == "features"
+    assert asked["observation"] == "lidar"
     assert answer["given"] == "the drivers' noise is one fixed sequence"
     likely = answer["failures"][0]["parameters"]
     assert {name: len(values) for name, values in likely.items()} == {
