@@ -38,9 +38,10 @@ scenario at hand (`dqn` likewise), in every scenario with its default base and d
 within {horizon:g} s with its 95 % interval, by [two methods](estimates.md), simulations, wall time, number of warnings,
 and the likeliest failure that was found (`python -m benchmarks.egos`).
 
-Wall times are from a machine of two cores with other work on it. `dqn` chooses among five accelerations and cannot
-steer: on the I-80's curves it leaves its lane, or the road. In the 1,448 dimensions of `Highway-v0` nothing announces a
-collision, so that all methods can do is count: intervals are wide there, and warnings say so.
+`vision` has {most:,} simulations at most. Wall times are from a busy machine of two cores. `dqn` chooses among five
+accelerations and cannot steer: on the I-80's curves it leaves its lane, or the road. In the 1,448 dimensions of
+`Highway-v0` nothing announces a collision, so that all methods can do is count: intervals are wide there, and warnings
+say so.
 
 A row of it in Python, with a quarter of the simulations:
 
@@ -127,7 +128,7 @@ def page(cells: Iterable[Cell]) -> str:
     """The page of all results."""
     cells = list(cells)
     horizon = max(scenario.horizon for scenario in SCENARIOS.values())
-    parts = [HEAD.format(horizon=horizon, steps=STEPS)]
+    parts = [HEAD.format(horizon=horizon, steps=STEPS, most=MOST["vision"])]
     for env_id in SCENARIOS:
         own = [cell for cell in cells if cell.env_id == env_id]
         rows = [line(cell) for cell in own]
