@@ -114,7 +114,7 @@ class TwoStage(Method):
                 return (yield from run.plain())
             proposal = yield from run.refined(refinement)
             if proposal is None:
-                return (yield from run.descended())
+                return (yield from run.descended(refinement.levels))
         except Interrupted:
             return run.interrupted()
         outcome = yield from run.estimated(refinement, proposal)
@@ -136,7 +136,6 @@ class _Run:
         self._all = inputs
         tilted = without_noise(inputs, rng)
         self._untilted = tilted is not inputs
-        self._levels = 0
         self._simulator = Simulator(tilted)
         self._history = History(tilted.dim)
         self._base_u = np.empty((0, tilted.dim))
@@ -168,7 +167,6 @@ class _Run:
         chains = sum(len(region.f) for region in found.regions)
         fails = sum(int((region.f <= gamma).sum()) for region in found.regions)
         self._note(fails / max(chains, 1), share, chains, math.inf)
-        self._levels = found.levels
         return Refinement(found, self._history, gamma, self._rng) if found.regions else None
 
     def refined(self, refinement: Refinement) -> Generator[FloatArray, FloatArray, Proposal | None]:
@@ -195,10 +193,10 @@ class _Run:
             return not self._untilted or fallback.meets(self._rounds[-1])
         return fallback.describes(self._rounds[-1], refinement.typical_weights(proposal))
 
-    def descended(self) -> Steps:
+    def descended(self, levels: int) -> Steps:
         """Spend the rest on subset simulation in all coordinates, which needs no proposal."""
         left = self._end - self._simulator.n_sim
-        outcome = yield from fallback.subset_simulation(self._all, self._goal, self._levels, left, self._rng)
+        outcome = yield from fallback.subset_simulation(self._all, self._goal, levels, left, self._rng)
         trace, base_draws = self._closed_trace() + outcome.trace, self._n_base + outcome.base_draws
         before = self.interrupted()
         on_its_way = outcome.status is Status.STOPPED and outcome.p == 0  # no estimate, then
