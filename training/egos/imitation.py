@@ -18,17 +18,16 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import torch
 import typer
 
-from agents import LearnedDriver, LearnedEgo, Provenance, save_driver
+from agents import LearnedEgo, Provenance, save_driver
 from training.data.scenes import Scene
 from training.egos.encounters import Kind, encounters
-from training.egos.nominal import judge, summary_of
-from training.egos.ordinary import CASES
+from training.egos.nominal import in_ordinary_traffic
 from training.imitation.config import Config
 from training.imitation.expert import expert_pairs
 from training.imitation.fitting import Data, fit, learner_of
@@ -85,15 +84,6 @@ def prepare(scenes: Sequence[Scene], kinds: Sequence[Kind], config: Config) -> L
     return learner_of(Data(stack((*scenes, *met)), pairs, None), config, among)
 
 
-def judged(driver: LearnedDriver, rollouts: int = JUDGED) -> dict[str, Any]:
-    """How it drives in ordinary traffic as an ego, for the header of its file."""
-    found = {}
-    for case in CASES:
-        one = summary_of(judge(LearnedEgo(driver), case, rollouts, JUDGED_SEED))
-        found[case] = {"kept": one.kept, "judged": one.judged, "at least": one.interval[0]}
-    return found
-
-
 def train(
     data: Path,
     config: Config,
@@ -130,7 +120,10 @@ def train(
         command=f"python -m training.egos.imitation --data {data.name} --seed {config.seed}",
         data=source.description,
         data_licence=source.licence,
-        metrics={**metrics(stack(test), driver), "ordinary": judged(driver, rollouts)},
+        metrics={
+            **metrics(stack(test), driver),
+            "ordinary": in_ordinary_traffic(LearnedEgo(driver), rollouts, JUDGED_SEED),
+        },
     )
     return save_driver(driver, provenance, out / DRIVER)
 

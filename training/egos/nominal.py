@@ -220,6 +220,12 @@ def summary_of(found: Verdicts) -> Summary:
     )
 
 
+def in_ordinary_traffic(ego: Any, rollouts: int, seed: int) -> dict[str, dict[str, float]]:
+    """How an ego drives in each case, for the header of its file: drives kept, judged, and the interval's lower end."""
+    found = {case: summary_of(judge(ego, case, rollouts, seed)) for case in CASES}
+    return {case: {"kept": one.kept, "judged": one.judged, "at least": one.interval[0]} for case, one in found.items()}
+
+
 def command(
     ego: Annotated[str, typer.Option(help="As in every command: idm, imitation, a file ...")] = "idm",
     case: Annotated[list[str], typer.Option(help="Kinds of traffic; may be repeated.")] = list(CASES),  # noqa: B006

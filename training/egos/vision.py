@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -32,11 +33,12 @@ from agents.pilotnet import UNITS, PilotNet
 from agents.vision import VisionEgo
 from agents.vision_file import save_vision
 from training.egos.lane_expert import TRUTHS
-from training.egos.nominal import judge, summary_of
-from training.egos.ordinary import CASES
+from training.egos.nominal import in_ordinary_traffic
 from training.egos.pictures import Pictures, collect, joined, mirrored
+from training.imitation.fitting import CHECKPOINT
+from training.imitation.folders import check_folder, note_settings
 
-CHECKPOINT, SETTINGS, FILE = "checkpoint.pt", "settings.json", "vision.safetensors"
+FILE = "vision.safetensors"
 JUDGED = 2026
 """Seed of the drives by which the result is judged, which no training uses."""
 
@@ -201,13 +203,11 @@ def train(config: Config, out: Path, progress: bool = False) -> PilotNet:
         The network.
 
     Raises:
-        ValueError: The folder holds a training with other settings.
+        ValueError: The folder cannot be made, or holds a training with other settings.
     """
-    out.mkdir(parents=True, exist_ok=True)
-    noted = out / SETTINGS
-    if noted.exists() and json.loads(noted.read_text(encoding="utf-8")) != asdict(config):
-        raise ValueError(f"{str(out)!r} holds a training with other settings; choose another folder or remove it.")
-    noted.write_text(json.dumps(asdict(config), indent=1) + "\n", encoding="utf-8")
+    settings = json.dumps(asdict(config), indent=1)
+    check_folder(out, settings)
+    note_settings(out, settings)
     training = Training(config, out)
     training.take_up()
     with Progress(console=Console(stderr=True), disable=not progress) as bar:
@@ -229,17 +229,6 @@ def provenance_of(config: Config, metrics: dict[str, Any]) -> Provenance:
     )
 
 
-def measured(network: PilotNet, rollouts: int) -> dict[str, Any]:
-    """How well it drives in ordinary traffic, by case of `training.egos.nominal`."""
-    found: dict[str, dict[str, Any]] = {}
-    for case in CASES:
-        one = summary_of(judge(VisionEgo(network), case, rollouts, seed=JUDGED))
-        found[case] = {"kept": one.kept, "of": one.judged, "low": one.interval[0], "high": one.interval[1]}
-        headway = one.headway if math.isfinite(one.headway) else None  # nobody ahead
-        found[case] |= {**one.reasons, "speed": one.speed, "headway": headway, "margin": one.margin}
-    return found
-
-
 def main(
     out: Annotated[Path, typer.Option(help="Folder; a training that was stopped in it is taken up.")],
     seed: Annotated[int, typer.Option(help="Of everything that is random.")] = Config.seed,
@@ -248,9 +237,13 @@ def main(
 ) -> None:
     """Train the ego `vision`, and write it to OUT/vision.safetensors."""
     torch.set_num_threads(1)
-    config = Config(seed=seed, rounds=rounds)
-    network = train(config, out, progress=True)
-    metrics = measured(network, judged) if judged else {}
+    try:
+        config = Config(seed=seed, rounds=rounds)
+        network = train(config, out, progress=True)
+    except ValueError as error:
+        print(f"vision: {error}", file=sys.stderr)
+        raise typer.Exit(2) from None
+    metrics = in_ordinary_traffic(VisionEgo(network), judged, JUDGED) if judged else {}
     print(f"Wrote {save_vision(network, provenance_of(config, metrics), out / FILE)}.")
 
 
