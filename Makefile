@@ -48,7 +48,7 @@ format: $(VENV)/.developer  ## Format the code and sort the imports.
 	@$(BIN)/ruff format $(SOURCES)
 
 bench: $(VENV)/.installed  ## Measure speed against HighwayEnv.
-	@OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.throughput
+	@OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.simulation.throughput
 
 clean:  ## Remove the environment, caches and runs.
 	rm -rf $(VENV) runs build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

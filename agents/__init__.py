@@ -1,10 +1,10 @@
 """Egos and drivers: the policies whose safety is estimated, and those that surround them."""
 
-from agents.checkpoints import Provenance, load_driver, read_driver, read_provenance, save_driver
-from agents.ego import Ego, load_ego
-from agents.learned import LearnedDriver, LearnedEgo
-from agents.saved import SavedEgo
-from agents.weights import WeightDistribution
+from agents.learned.checkpoints import Provenance, load_driver, read_driver, read_provenance, save_driver
+from agents.learned.driver import LearnedDriver, LearnedEgo
+from agents.learned.weight_distribution import WeightDistribution
+from agents.loading import Ego, load_ego
+from agents.sb3.saved_ego import SavedEgo
 
 __all__ = [
     "Ego",

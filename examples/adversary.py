@@ -17,9 +17,9 @@ from scipy.stats import beta
 
 import rare_envs
 import training
-from rare_envs.deeds import play
-from rare_envs.drivers import IDM
-from rare_envs.incentives import adversary_reward
+from rare_envs.control.idm import IDM
+from rare_envs.multi_agent.rewards import adversary_reward
+from rare_envs.multi_agent.step import play
 
 
 def train(

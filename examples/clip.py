@@ -17,8 +17,8 @@ from PIL import Image
 import agents
 import rare_envs
 from rare_envs.envs.rendering import Renderer
-from rare_envs.geometry import overlaps
-from rare_envs.rollout import drive
+from rare_envs.simulation.rollout import drive
+from rare_envs.traffic.overlap import overlaps
 
 
 def main(

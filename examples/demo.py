@@ -14,9 +14,9 @@ import torch
 from numpy.typing import NDArray
 
 import rare_envs
-from rare_envs.study import show
+from rare_envs.study.cli import printing as show
 from rare_envs.study.evaluate import Question, prepare, run
-from rare_envs.study.rundir import write_run
+from rare_envs.study.run_directory import write_run
 from training import train_ego
 
 ENV_ID = "rare_envs/CutIn-v0"

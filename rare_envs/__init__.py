@@ -3,14 +3,14 @@
 from typing import TYPE_CHECKING, Any
 
 from rare_envs.registration import make_batch, parallel_env, register_envs, register_scenario
-from rare_envs.scenarios import SCENARIOS
+from rare_envs.scenarios.registry import SCENARIOS
 
 if TYPE_CHECKING:
-    from rare_envs.distributions import TruncatedGaussianMixture
-    from rare_envs.faults import FaultTolerant
+    from rare_envs.distributions.space import ScenarioSpace
+    from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
+    from rare_envs.egos.faults import FaultTolerant
     from rare_envs.interop import HighwayEnvProblem, HighwayEnvScenario, highway_env_problem
     from rare_envs.problem import DrivingProblem
-    from rare_envs.space import ScenarioSpace
 
     ENV_IDS: tuple[str, ...]
     """Ids of all environments, your own included."""
@@ -34,11 +34,12 @@ register_envs()
 
 _LAZY = {
     "DrivingProblem": "rare_envs.problem",
-    "FaultTolerant": "rare_envs.faults",
+    "IDM": "rare_envs.control.idm",
+    "FaultTolerant": "rare_envs.egos.faults",
     "HighwayEnvProblem": "rare_envs.interop",
     "HighwayEnvScenario": "rare_envs.interop",
-    "ScenarioSpace": "rare_envs.space",
-    "TruncatedGaussianMixture": "rare_envs.distributions",
+    "ScenarioSpace": "rare_envs.distributions.space",
+    "TruncatedGaussianMixture": "rare_envs.distributions.truncated_mixture",
     "highway_env_problem": "rare_envs.interop",
 }
 

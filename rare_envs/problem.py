@@ -11,18 +11,16 @@ import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from rare_envs.actions import DISCRETE_ACTIONS, META_ACTIONS
-from rare_envs.background import Background
-from rare_envs.crashes import KINDS, Crash
-from rare_envs.drivers import IDM, Driver, PolicyDriver
-from rare_envs.faults import reason_of
-from rare_envs.mixed import kinds_of
-from rare_envs.observation import space_of_observations
-from rare_envs.policies import fitted, frames_of, observation_for
-from rare_envs.rollout import rollout
-from rare_envs.setup import find_scenario, set_up, with_noise
-from rare_envs.space import Distribution, ScenarioSpace
-from rare_envs.world import World
+from rare_envs.distributions.space import Distribution, ScenarioSpace
+from rare_envs.egos.faults import reason_of
+from rare_envs.egos.policy import PolicyDriver, as_driver
+from rare_envs.egos.wrappers import observation_for
+from rare_envs.make import set_up, with_noise
+from rare_envs.scenarios.registry import find_scenario
+from rare_envs.sensors.kinds import kinds_of
+from rare_envs.simulation.rollout import rollout
+from rare_envs.simulation.world import World
+from rare_envs.traffic.crash import KINDS, Crash
 
 RULE_TILE = 16384
 """Rollouts that a rule-based ego drives at once: where eager torch is fastest."""
@@ -77,7 +75,8 @@ class DrivingProblem:
         Args:
             env_id: For example "rare_envs/CutIn-v0".
             ego: "idm", a `Driver`, or an object with Stable-Baselines3's `predict`, called on whole batches.
-            measure: The safety measure: a name, an object or a function, see `rare_envs.measures.find_measure`.
+            measure: The safety measure: a name, an object or a function, see
+                `rare_envs.measures.registry.find_measure`.
             base: Base distribution of x; None takes the environment's default ("us101").
             noise: What becomes of the randomness of learned drivers: True, it is part of x, standard normal columns
                 behind the others; "fixed", one sequence for all x, so that p is conditional on it; False, mean
@@ -176,8 +175,8 @@ class DrivingProblem:
             x: Scenario parameters, shape (n, d).
 
         Returns:
-            Who ran into whom, how fast and how bad that is; `rare_envs.crashes.KINDS` has the words for the kinds. Of
-            kind "others" are collisions between other vehicles in episodes in which the ego has none.
+            Who ran into whom, how fast and how bad that is; `rare_envs.traffic.crash.KINDS` has the words for the
+            kinds. Of kind "others" are collisions between other vehicles in episodes in which the ego has none.
 
         Raises:
             ValueError: If x has the wrong shape, is NaN or outside the physical box, or if the policy returns NaN.
@@ -236,72 +235,3 @@ def _told(ego: Any) -> Iterator[None]:
         raise
     except Exception as error:
         raise ValueError(f"An ego of class {type(ego).__name__} cannot be used: {reason_of(error)}") from error
-
-
-def as_driver(ego: Any, world: World) -> Driver:
-    """The Driver that an ego stands for.
-
-    Raises:
-        ValueError: If it is neither "idm", nor a Driver, nor an object with `predict` whose spaces fit.
-    """
-    if isinstance(ego, str):
-        if ego == "idm":
-            return IDM()
-        raise ValueError(
-            f"Unknown ego {ego!r}; expected 'idm' or an object. Names and files become objects by "
-            f"agents.load_ego({ego!r})."
-        )
-    if isinstance(ego, type):
-        raise ValueError(f"Expected an ego, got the class {ego.__name__}; make or train one of it first.")
-    if callable(getattr(ego, "in_world", None)):
-        made: Driver = ego.in_world(world)
-        return made
-    if getattr(ego, "sees", False):  # a Driver that looks by itself, whatever the environment observes
-        looking: Driver = ego
-        return looking
-    if callable(getattr(ego, "predict", None)):
-        expected = space_of_observations(world)
-        check_spaces(ego, expected, world.action)
-        tick = getattr(ego, "dt", None)
-        if tick is not None and tick != world.dt:
-            raise ValueError(f"Expected dt={tick:g} s, which this ego remembers pictures by, got {world.dt:g} s.")
-        return PolicyDriver(fitted(ego, expected), world.observation, world.action, world.stride)
-    if isinstance(ego, Background):
-        raise ValueError("These drivers drive the traffic around an ego; as an ego take agents.LearnedEgo(driver).")
-    if callable(getattr(ego, "act", None)):
-        driver: Driver = ego
-        return driver
-    raise ValueError(f"Expected an ego with a method predict(observation, ...), got {type(ego).__name__}.")
-
-
-def check_spaces(ego: Any, expected: spaces.Space[Any], action: str = "continuous") -> None:
-    """Refuse an ego that was made for other observations or actions; one that does not tell is taken at its word.
-
-    Bounds may differ: HighwayEnv declares none for the observations that are clipped here as there.
-
-    Raises:
-        ValueError: If its `observation_space` or `action_space` does not fit.
-    """
-    observed = getattr(ego, "observation_space", None)
-    if observed is not None and frames_of(expected, observed) is None:
-        wanted = observation_for(ego)
-        which = "another observation" if wanted == "features" else f"observation={wanted!r}"
-        raise ValueError(
-            f"The ego expects observations {observed}, the environment gives {expected}; "
-            f"train it in this environment or choose {which}."
-        )
-    acted = getattr(ego, "action_space", None)
-    if acted is not None and action == "meta":
-        if not (isinstance(acted, spaces.Discrete) and int(acted.n) == len(META_ACTIONS)):
-            raise ValueError(
-                f"The ego acts in {acted}, the environment takes Discrete({len(META_ACTIONS)}) "
-                f"({', '.join(META_ACTIONS)}); leave action='meta' out for an ego that accelerates and steers."
-            )
-        return
-    discrete = isinstance(acted, spaces.Discrete) and int(acted.n) == len(DISCRETE_ACTIONS)
-    several = isinstance(acted, spaces.MultiDiscrete | spaces.MultiBinary)
-    if acted is not None and not discrete and (several or getattr(acted, "shape", None) != (2,)):
-        raise ValueError(
-            f"The ego acts in {acted}, the environment takes Box(-1, 1, (2,)) (acceleration, steering) "
-            f"or Discrete({len(DISCRETE_ACTIONS)})."
-        )

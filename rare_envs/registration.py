@@ -7,15 +7,11 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 from gymnasium.vector import VectorEnv
 
-from rare_envs.scenarios import SCENARIOS
+from rare_envs.scenarios.registry import HIGHWAY_ENV_LAYOUT, SCENARIOS, kinematics_id
 
 if TYPE_CHECKING:
     from rare_envs.envs.parallel import DrivingParallelEnv
     from rare_envs.scenarios.base import Scenario
-
-
-HIGHWAY_ENV_LAYOUT = {"observation": "kinematics", "action": "meta"}
-"""What makes an environment look like one of HighwayEnv's."""
 
 
 def register_envs() -> None:
@@ -31,15 +27,6 @@ def register_envs() -> None:
                 )
 
 
-def kinematics_id(env_id: str) -> str:
-    """The id under which an environment has HighwayEnv's layout: "rare_envs/CutIn-kinematics-v0", for example.
-
-    For `gym.make` and `gym.make_vec`, so that scripts written for HighwayEnv run with nothing but the id changed.
-    """
-    name, _, version = env_id.rpartition("-v")
-    return f"{name}-kinematics-v{version}"
-
-
 def register_scenario(env_id: str, scenario: Scenario) -> None:
     """Make a scenario of your own known under an id: to `gym.make`, `parallel_env`, `DrivingProblem` and the rest.
 
@@ -50,7 +37,7 @@ def register_scenario(env_id: str, scenario: Scenario) -> None:
     Raises:
         ValueError: If the id is taken, or the scenario does not work.
     """
-    from rare_envs.scenarios.trial import try_scenario
+    from rare_envs.scenarios.validation import try_scenario
 
     if env_id in gym.registry:
         raise ValueError(f"The id {env_id!r} is taken; choose another one.")
@@ -89,7 +76,7 @@ def make_batch(env_id: str, num_envs: int, **kwargs: Any) -> VectorEnv[Any, Any,
     Raises:
         ValueError: If the id or an argument is unknown.
     """
-    from rare_envs.setup import find_scenario
+    from rare_envs.scenarios.registry import find_scenario
 
     find_scenario(env_id)
     if not isinstance(num_envs, int) or num_envs < 1:

@@ -3,26 +3,29 @@
 Knows NumPy and probability, nothing about driving. `estimate` is the front door.
 """
 
-from samplers.ask_tell import Run
-from samplers.beta_block import BetaBlock
-from samplers.blocks import GaussianBlock, MixtureBlock, NormalBlock, Product
+from samplers.analysis.curve import Curve
+from samplers.analysis.failure_modes import Share
+from samplers.analysis.reweighting import Reweighted
 from samplers.comparison import Comparison, compare
-from samplers.cross_entropy import CrossEntropy
-from samplers.curve import Curve
-from samplers.importance_sampling import ImportanceSampling
-from samplers.improved_cross_entropy import ImprovedCrossEntropy
-from samplers.method import Goal, Interrupted, Layer, Method, Outcome, Sample, Stepping, Steps
-from samplers.monte_carlo import MonteCarlo
-from samplers.outcomes import EvaluationError
+from samplers.errors import EvaluationError
+from samplers.estimation import estimate
+from samplers.execution.progress import Progress
+from samplers.execution.run import Run
+from samplers.method import Goal, Interrupted, Outcome, Stepping, Steps
+from samplers.methods.base import Method
+from samplers.methods.cross_entropy.beta_block import BetaBlock
+from samplers.methods.cross_entropy.blocks import GaussianBlock, MixtureBlock, NormalBlock, Product
+from samplers.methods.cross_entropy.method import CrossEntropy
+from samplers.methods.importance_sampling import ImportanceSampling
+from samplers.methods.improved_cross_entropy import ImprovedCrossEntropy
+from samplers.methods.monte_carlo import MonteCarlo
+from samplers.methods.subset_simulation import AdaptiveSubsetSimulation, SubsetSimulation
+from samplers.methods.two_stage.method import TwoStage
 from samplers.problem import Distribution, FunctionProblem, Problem, StandardNormal
-from samplers.progress import Progress
 from samplers.registry import METHODS, get_method
-from samplers.result import Estimate, Failure, Failures, Level, Status
-from samplers.reweighting import Reweighted
-from samplers.run import estimate
-from samplers.shares import Share
-from samplers.subset import AdaptiveSubsetSimulation, SubsetSimulation
-from samplers.two_stage import TwoStage
+from samplers.result import Estimate, Failure, Failures
+from samplers.sample import Layer, Sample
+from samplers.trace import Level, Status
 
 __all__ = [
     "METHODS",

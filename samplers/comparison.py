@@ -8,17 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from samplers.curve import inflation, sample_of
-from samplers.intervals import Interval, degrees_of_freedom, nothing_in
+from samplers.analysis.base import inflation, sample_of
+from samplers.analysis.reweighting import LARGEST_LOG
+from samplers.estimation import estimate
+from samplers.execution.arguments import check_problem
+from samplers.execution.progress import Listener
 from samplers.method import Stepping
-from samplers.plan import check_problem
+from samplers.methods.two_stage.method import TwoStage
 from samplers.problem import Distribution, FloatArray, Problem
-from samplers.progress import Listener
-from samplers.result import Estimate, plain
-from samplers.reweighting import LARGEST_LOG, effective
-from samplers.run import estimate
-from samplers.two_stage import TwoStage
-from samplers.units import alone, interval_of_sum
+from samplers.result import Estimate
+from samplers.serialization import plain
+from samplers.statistics.cluster_sums import alone, interval_of_sum
+from samplers.statistics.intervals import Interval, degrees_of_freedom, nothing_in
+from samplers.statistics.weights import effective
 
 FEW = 30.0
 """Effective failing units below which a probability is called coarse."""

@@ -10,8 +10,8 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from samplers.checks import check_whole
-from samplers.outcomes import one_per_row
+from samplers.errors import one_per_row
+from samplers.validation import check_whole
 
 FloatArray = NDArray[np.float64]
 LOG_TWO_PI = float(np.log(2 * np.pi))

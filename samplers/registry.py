@@ -7,14 +7,14 @@ from functools import cached_property
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, cast
 
-from samplers.checks import check_name
-from samplers.cross_entropy import CrossEntropy
-from samplers.importance_sampling import ImportanceSampling
-from samplers.improved_cross_entropy import ImprovedCrossEntropy
 from samplers.method import Stepping
-from samplers.monte_carlo import MonteCarlo
-from samplers.subset import AdaptiveSubsetSimulation, SubsetSimulation
-from samplers.two_stage import TwoStage
+from samplers.methods.cross_entropy.method import CrossEntropy
+from samplers.methods.importance_sampling import ImportanceSampling
+from samplers.methods.improved_cross_entropy import ImprovedCrossEntropy
+from samplers.methods.monte_carlo import MonteCarlo
+from samplers.methods.subset_simulation import AdaptiveSubsetSimulation, SubsetSimulation
+from samplers.methods.two_stage.method import TwoStage
+from samplers.validation import check_name
 
 GROUP = "rare_envs.samplers"
 """Entry points of this group name methods of other packages."""

@@ -4,62 +4,25 @@ import json
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
-from enum import Enum
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from samplers.intervals import nothing_in
+from samplers.analysis.curve import curve_of
+from samplers.analysis.failure_modes import shares_of
+from samplers.analysis.reweighting import reweighted
 from samplers.problem import Distribution, FloatArray
+from samplers.serialization import plain
+from samplers.statistics.intervals import nothing_in
+from samplers.trace import Level, Status
 
 if TYPE_CHECKING:
-    from samplers.curve import Curve
-    from samplers.method import Sample, Stepping
-    from samplers.reweighting import HasLogProb, Reweighted
-    from samplers.shares import Share
-
-
-class Status(str, Enum):
-    """How a run ended; prints as its value."""
-
-    CONVERGED = "converged"
-    """The method came to its own end (and met target_cov, if one was given)."""
-    NO_HITS = "no_hits"
-    """It came to its end without seeing a failure: p = 0, one-sided interval."""
-    BUDGET = "budget"
-    """max_sim (or the limit of runs, see `estimate`) was used up before the end or before target_cov was met."""
-    STOPPED = "stopped"
-    """Someone stopped it: the time limit or a callback."""
-    STALLED = "stalled"
-    """It could not get closer to the failures: ties in f, or too many levels."""
-
-    def __str__(self) -> str:
-        return str(self.value)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Level:
-    """One level of subset simulation, one iteration of cross-entropy, one batch of Monte Carlo."""
-
-    gamma: float
-    """Threshold of this level."""
-    p: float
-    """Share of this level's points with f <= gamma."""
-    estimate: float
-    """P[f(X) <= gamma of this level] as estimated so far."""
-    n_sim: int
-    """Simulations made for this level."""
-    n_points: int
-    """Points behind `p`: those simulated and, in subset simulation, the seeds."""
-    cov: float
-    """Coefficient of variation of this level's own share in the estimate."""
-    acceptance: float | None = None
-    """Share of accepted moves (Markov chains)."""
-    ess: float | None = None
-    """Effective number of points behind `p` (chains) or of failing points (weights)."""
-    run: int = 0
-    """Which replicate the level belongs to."""
+    from samplers.analysis.curve import Curve
+    from samplers.analysis.failure_modes import Share
+    from samplers.analysis.reweighting import HasLogProb, Reweighted
+    from samplers.method import Stepping
+    from samplers.sample import Sample
 
 
 class Failure(NamedTuple):
@@ -193,8 +156,6 @@ class Estimate:
             ValueError: If a threshold lies below what is known (the text says from where on it is),
                 or the method gave no weighted points.
         """
-        from samplers.curve import curve_of  # which imports this module
-
         return curve_of(self, gammas)
 
     def reweight(self, new_base: "HasLogProb") -> "Reweighted":
@@ -215,8 +176,6 @@ class Estimate:
                 density where the old has none, it does not fit, nothing failed, or the method gave
                 no weighted points.
         """
-        from samplers.reweighting import reweighted  # which imports this module
-
         return reweighted(self, new_base)
 
     def shares(self, label: "Callable[[FloatArray], Sequence[str]]", most: int | None = None) -> "dict[str, Share]":
@@ -229,8 +188,6 @@ class Estimate:
         Raises:
             ValueError: If the method gave no weighted points, or label does not give k words.
         """
-        from samplers.shares import shares_of  # which imports this module
-
         return shares_of(self, label, most)
 
     @property
@@ -291,16 +248,3 @@ class Estimate:
 def method_settings(method: "Stepping") -> dict[str, Any]:
     """Return the settings of a method as plain values."""
     return {each.name: getattr(method, each.name) for each in fields(method)} if is_dataclass(method) else {}
-
-
-def plain(value: Any) -> Any:
-    """Replace NaN and infinities inside value by None, numbers of NumPy by Python's."""
-    if isinstance(value, np.generic):
-        value = value.item()
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, dict):
-        return {key: plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    return value

@@ -1,7 +1,5 @@
 """What every method must do, as checks to run on a method of your own.
 
-    from samplers.testing import check_method
-
     check_method(Lattice(points=100))
 
 A method that fails raises an AssertionError that says what was expected. The seeds are fixed, so
@@ -16,14 +14,15 @@ from collections.abc import Callable
 import numpy as np
 from scipy.special import ndtr
 
-from samplers.ask_tell import Run
-from samplers.lane import NOT_KNOWN
+from samplers.estimation import estimate
+from samplers.execution.arguments import checked
+from samplers.execution.replicate import NOT_KNOWN
+from samplers.execution.run import Run
+from samplers.limit_states import half_space, two_modes
 from samplers.method import Stepping
-from samplers.plan import checked
 from samplers.problem import FloatArray, FunctionProblem
-from samplers.reference import half_space, two_modes
-from samplers.result import Estimate, Status
-from samplers.run import estimate
+from samplers.result import Estimate
+from samplers.trace import Status
 
 F = Callable[[FloatArray], FloatArray]
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import rare_envs
-from rare_envs.scenarios import SCENARIOS
+from rare_envs.scenarios.registry import SCENARIOS
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])

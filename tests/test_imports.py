@@ -113,24 +113,24 @@ def test_there_is_no_import_cycle() -> None:
 
 def test_the_tree_is_really_read() -> None:
     found = modules(ROOT)
-    assert {"samplers.result", "rare_envs.world", "agents.ego", "training.sb3", f"{STUDY}.cli"} <= set(found)
+    assert {"samplers.result", "rare_envs.simulation.world", "agents.loading", "training.vec_env", f"{STUDY}.cli"} <= set(found)
 
 
 @pytest.mark.parametrize(
     ("file", "line"),
     [
-        ("samplers/run.py", "import torch"),
-        ("samplers/run.py", "from rare_envs import world"),
-        ("rare_envs/world.py", "from samplers.result import Estimate"),
-        ("rare_envs/world.py", "def f():\n    from agents import load_ego"),
-        ("rare_envs/world.py", "from .study import cli"),
-        ("rare_envs/world.py", "import rare_envs.study.cli"),
-        ("agents/ego.py", "import training"),
-        ("training/sb3.py", "from rare_envs.study.cli import main"),
+        ("samplers/estimation.py", "import torch"),
+        ("samplers/estimation.py", "from rare_envs.simulation import world"),
+        ("rare_envs/simulation/world.py", "from samplers.result import Estimate"),
+        ("rare_envs/simulation/world.py", "def f():\n    from agents import load_ego"),
+        ("rare_envs/simulation/world.py", "from ..study import cli"),
+        ("rare_envs/simulation/world.py", "import rare_envs.study.cli"),
+        ("agents/loading.py", "import training"),
+        ("training/vec_env.py", "from rare_envs.study.cli import main"),
     ],
 )
 def test_a_forbidden_import_is_found(tmp_path: Path, file: str, line: str) -> None:
-    for path in (file, "rare_envs/study/cli.py"):
+    for path in (file, "rare_envs/study/cli/__init__.py"):
         (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / path).write_text("import numpy\n")
     assert violations(tmp_path) == []

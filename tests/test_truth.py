@@ -1,4 +1,4 @@
-"""The methods against the long Monte Carlo reference in traffic (`benchmarks/truth.json`)."""
+"""The methods against the long Monte Carlo reference in traffic (`benchmarks/results/truth.json`)."""
 
 import json
 
@@ -7,8 +7,8 @@ from scipy import stats
 
 import rare_envs
 import samplers
-from benchmarks.against_truth import compare, side_by_side
-from benchmarks.truth import RESULT
+from benchmarks.estimators.against_truth import compare, side_by_side
+from benchmarks.estimators.truth import RESULT
 
 TRUTH = json.loads(RESULT.read_text())["results"]
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from training.train_ego import train_ego
 
 if TYPE_CHECKING:
-    from training.sb3 import sb3_agents_env, sb3_vec_env
+    from training.vec_env import sb3_agents_env, sb3_vec_env
 
 __all__ = ["sb3_agents_env", "sb3_vec_env", "train_ego"]
 
@@ -16,6 +16,6 @@ def __getattr__(name: str) -> Any:
     """Import what needs Stable-Baselines3 on first use: it takes seconds to load."""
     if name not in ("sb3_agents_env", "sb3_vec_env"):
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from training import sb3
+    from training import vec_env as sb3
 
     return getattr(sb3, name)

@@ -11,7 +11,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from rare_envs.space import did_you_mean
+from rare_envs.plugins import did_you_mean
 
 RECENT = 500
 """Episodes that the collision rate beside the progress bar looks back on."""
@@ -26,7 +26,7 @@ class Recipe:
     policy: Mapping[str, Any] = field(default_factory=dict)
     """Arguments of its policy, `policy_kwargs`; ReLU is added, the fastest activation on a CPU."""
     discrete: bool = False
-    """Whether it chooses among `rare_envs.actions.DISCRETE_ACTIONS`."""
+    """Whether it chooses among `rare_envs.control.actions.DISCRETE_ACTIONS`."""
     noise: float = 0.0
     """Standard deviation of the exploration noise of a policy that has none of its own."""
 
@@ -114,7 +114,7 @@ def train_ego(
         raise ValueError(f"Expected steps >= 1, got {steps}.")
     if not 0 <= seed < 2**32:
         raise ValueError(f"Expected a seed from 0 to 2^32 - 1, got {seed}.")
-    from rare_envs.setup import find_scenario
+    from rare_envs.scenarios.registry import find_scenario
 
     find_scenario(env_id)
     target = _writable(Path(out))
@@ -122,7 +122,7 @@ def train_ego(
     import stable_baselines3
     from torch import nn
 
-    from training.sb3 import sb3_vec_env
+    from training.vec_env import sb3_vec_env
 
     env = sb3_vec_env(env_id, num_envs, discrete=recipe.discrete, **make_kwargs)
     try:

@@ -13,18 +13,19 @@ from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 from torch import Tensor
 
-from rare_envs.actions import IDLE, read_actions, space_of_actions
-from rare_envs.crowd import Crowd, gather
-from rare_envs.deeds import carry_out
-from rare_envs.envs.infos import Info, info_of, step_info
+from rare_envs.control.actions import IDLE, read_actions, space_of_actions
+from rare_envs.egos.policy import as_driver
+from rare_envs.envs.info import Info, info_of, step_info
 from rare_envs.envs.rendering import Renderer
-from rare_envs.incentives import Reward, own_reward, total_of
-from rare_envs.mixed import each
-from rare_envs.observation import observe, space_of_observations
-from rare_envs.problem import as_driver
+from rare_envs.make import set_up
+from rare_envs.multi_agent.episode import Crowd, gather
+from rare_envs.multi_agent.rewards import Reward, own_reward, total_of
+from rare_envs.multi_agent.step import carry_out
+from rare_envs.plugins import did_you_mean
 from rare_envs.scenarios.base import Scenario
-from rare_envs.setup import set_up
-from rare_envs.space import did_you_mean
+from rare_envs.sensors.kinds import each
+from rare_envs.simulation.observation import observe
+from rare_envs.simulation.world import space_of_observations
 
 Observation = NDArray[np.float32]
 Actions = Mapping[str, Any]
@@ -35,7 +36,7 @@ class DrivingParallelEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  #
 
     A vehicle without an action keeps its driver: the scenario's script or learned drivers, and for the ego the driver
     `ego`. An agent terminates when its vehicle touches another one or leaves the road, is truncated at the horizon,
-    and then leaves `agents`; its vehicle rolls out, see `rare_envs.crowd`.
+    and then leaves `agents`; its vehicle rolls out, see `rare_envs.multi_agent.episode`.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012  (PettingZoo's own form)
@@ -63,7 +64,7 @@ class DrivingParallelEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  #
             ego: Who drives the ego when it gets no action: "idm", a `Driver` or an object with `predict`.
             rewards: Rewards of agents by name; by default each has the reward of an ego, in its own view.
             render_mode: None, "rgb_array" or "human".
-            **kwargs: See `rare_envs.setup.set_up`.
+            **kwargs: See `rare_envs.make.set_up`.
 
         Raises:
             ValueError: If an argument is invalid.

@@ -8,11 +8,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from rare_envs.geometry import overlaps
-from rare_envs.road import Road
 from rare_envs.scenarios.base import Scenario
-from rare_envs.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
-from rare_envs.world import Episode, World
+from rare_envs.simulation.episode import Episode
+from rare_envs.simulation.world import World
+from rare_envs.traffic.overlap import overlaps
+from rare_envs.traffic.road import Road
+from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
 
 WIDTH, HEIGHT = 800, 160
 """Size of the picture of the road [pixels]; it is higher where the road asks for it."""

@@ -8,14 +8,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from rare_envs.actions import read_actions, space_of_actions
-from rare_envs.decisions import advance
-from rare_envs.envs.infos import info_of, step_info
+from rare_envs.control.actions import read_actions, space_of_actions
+from rare_envs.envs.info import info_of, step_info
 from rare_envs.envs.rendering import Renderer
-from rare_envs.mixed import each
-from rare_envs.observation import observe, space_of_observations
-from rare_envs.setup import set_up
-from rare_envs.world import Episode
+from rare_envs.make import set_up
+from rare_envs.sensors.kinds import each
+from rare_envs.simulation.decision import advance
+from rare_envs.simulation.episode import Episode
+from rare_envs.simulation.observation import observe
+from rare_envs.simulation.world import space_of_observations
 
 Observation = NDArray[np.float32]
 
@@ -23,11 +24,12 @@ Observation = NDArray[np.float32]
 class DrivingEnv(gym.Env[Observation, Any]):
     """The ego drives, everything else follows the scenario.
 
-    Observation: `features`, see `rare_envs.observation`. Action: acceleration and steering in [-1, 1], see
-    `rare_envs.actions`, for one tick; with `action="meta"` one of HighwayEnv's meta-actions, see `rare_envs.meta`, for
-    one second. Reward: see `rare_envs.reward`. The episode terminates with a collision and is truncated at
-    the horizon. `info` carries `scenario`, `x`, `min_ttc` [s], `collision`, `reward_terms`, and at the end `measure`
-    (f(x)), `collision_type` and `crash`, which say who ran into whom and how hard (`rare_envs.crashes`), or None.
+    Observation: `features`, see `rare_envs.simulation.observation`. Action: acceleration and steering in [-1, 1], see
+    `rare_envs.control.actions`, for one tick; with `action="meta"` one of HighwayEnv's meta-actions, see
+    `rare_envs.control.meta_actions`, for one second. Reward: see `rare_envs.simulation.reward`. The episode terminates
+    with a collision and is truncated at the horizon. `info` carries `scenario`, `x`, `min_ttc` [s], `collision`,
+    `reward_terms`, and at the end `measure` (f(x)), `collision_type` and `crash`, which say who ran into whom and how
+    hard (`rare_envs.traffic.crash`), or None.
     """
 
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 10}  # noqa: RUF012  (Gymnasium's own form)
@@ -38,7 +40,7 @@ class DrivingEnv(gym.Env[Observation, Any]):
         Args:
             env_id: The scenario's registered id.
             render_mode: None, "rgb_array" or "human".
-            **kwargs: See `rare_envs.setup.set_up`.
+            **kwargs: See `rare_envs.make.set_up`.
 
         Raises:
             ValueError: If an argument is invalid.

@@ -11,16 +11,17 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rare_envs.actions import read_actions, space_of_actions
-from rare_envs.crashes import KINDS, NONE
-from rare_envs.decisions import advance
+from rare_envs.control.actions import read_actions, space_of_actions
+from rare_envs.envs.batch_rows import merged, put, rows_of, with_rows
 from rare_envs.envs.rendering import Renderer
-from rare_envs.envs.rows import merged, put, rows_of, with_rows
-from rare_envs.mixed import each
-from rare_envs.observation import observe, space_of_observations
-from rare_envs.reward import RewardTerms
-from rare_envs.setup import set_up
-from rare_envs.world import Episode
+from rare_envs.make import set_up
+from rare_envs.sensors.kinds import each
+from rare_envs.simulation.decision import advance
+from rare_envs.simulation.episode import Episode
+from rare_envs.simulation.observation import observe
+from rare_envs.simulation.reward import RewardTerms
+from rare_envs.simulation.world import space_of_observations
+from rare_envs.traffic.crash import KINDS, NONE
 
 Info = dict[str, Any]
 
@@ -45,7 +46,7 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
             env_id: The scenario's registered id.
             num_envs: Number of scenarios.
             render_mode: None or "rgb_array" (one image for each scenario).
-            **kwargs: See `rare_envs.setup.set_up`.
+            **kwargs: See `rare_envs.make.set_up`.
 
         Raises:
             ValueError: If an argument is invalid.

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rare_envs.distributions.space import Distribution, ScenarioSpace
 from rare_envs.interop import simulation
 from rare_envs.interop.simulation import MAX_SECONDS, Driven, Simulation, one_thread, portable
-from rare_envs.space import Distribution, ScenarioSpace
 
 Array = NDArray[np.float64]
 

@@ -12,11 +12,12 @@ from highway_env.envs.merge_env import MergeGenericEnv
 from highway_env.envs.roundabout_env import RoundaboutGenericEnv
 from highway_env.utils import class_from_path
 
-from rare_envs.blocks import NoiseLaw, beside
-from rare_envs.interop.closeness import CLOSENESS, COLLISION, TTC_MAX
-from rare_envs.interop.layout import IDM, Group, Layout, class_kept, idm_groups, set_idm
-from rare_envs.interop.layouts import LAYOUTS
-from rare_envs.space import Array, Parameter, ScenarioSpace, did_you_mean
+from rare_envs.distributions.product import NoiseLaw, beside
+from rare_envs.distributions.space import Array, Parameter, ScenarioSpace
+from rare_envs.interop.environments import LAYOUTS
+from rare_envs.interop.measures import CLOSENESS, COLLISION, TTC_MAX
+from rare_envs.interop.parameters import IDM, Group, Layout, class_kept, idm_groups, set_idm
+from rare_envs.plugins import did_you_mean
 
 SUPPORTED = (
     *("highway-v0", "highway-fast-v0", "merge-v0", "merge-v1", "roundabout-v0", "roundabout-v1"),
@@ -64,7 +65,7 @@ class HighwayEnvScenario(gym.Wrapper[Any, Any, Any, Any]):
                 then what it draws, with the law by which it draws it.
             noise: True, what is left random is seeded by the parameter `noise`; "fixed", by one number for all x.
             base: Law of the parameters without noise, in place of HighwayEnv's: an object with the four methods of
-                `rare_envs.space.Distribution`.
+                `rare_envs.distributions.space.Distribution`.
 
         Raises:
             ValueError: If the environment is not one of HighwayEnv's that are known here, or an argument is invalid.

@@ -13,11 +13,11 @@ import numpy as np
 from highway_env.vehicle.behavior import IDMVehicle
 from numpy.typing import NDArray
 
-from rare_envs.interop.layout import class_kept, set_idm
-from rare_envs.interop.quick import quicken
+from rare_envs.egos.wrappers import fitted
+from rare_envs.interop.fast_observation import quicken
+from rare_envs.interop.parameters import class_kept, set_idm
 from rare_envs.interop.scenario import HighwayEnvScenario
-from rare_envs.policies import fitted
-from rare_envs.space import did_you_mean
+from rare_envs.plugins import did_you_mean
 
 MAX_SECONDS = 100.0
 """Longest drive [s] unless told otherwise: HighwayEnv's merge ends at a place, where not every ego arrives."""

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rare_envs.beta_law import BetaLaw
-from rare_envs.interop.layout import LENGTH, beta
-from rare_envs.space import Array
+from rare_envs.distributions.beta import BetaLaw
+from rare_envs.distributions.space import Array
+from rare_envs.interop.parameters import LENGTH, beta
 
 
 @dataclass(frozen=True, eq=False)

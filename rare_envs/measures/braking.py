@@ -3,10 +3,9 @@
 import torch
 from torch import Tensor
 
-from rare_envs.actions import MAX_ACCELERATION
-from rare_envs.measures.following import TTC_MAX
-from rare_envs.measures.lead import STILL, acceleration_of_lead, gap_of
-from rare_envs.measures.moment import Moment
+from rare_envs.control.actions import MAX_ACCELERATION
+from rare_envs.measures.moment import STILL, Moment, acceleration_of_lead, gap_of
+from rare_envs.measures.time_to_collision import TTC_MAX
 
 BRAKES = MAX_ACCELERATION
 """The hardest braking that an action can ask for [m/s^2]."""

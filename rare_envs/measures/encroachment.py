@@ -3,8 +3,8 @@
 import torch
 from torch import Tensor
 
-from rare_envs.boxes import axes_of, separation
-from rare_envs.measures.trace import Trace
+from rare_envs.measures.episode_trace import Trace
+from rare_envs.traffic.oriented_boxes import axes_of, separation
 
 PET_MAX = 5.0
 """Cap of the post-encroachment time [s]; whoever comes later is no conflict."""

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from rare_envs.measures.base import Measure
-from rare_envs.measures.following import ttc
 from rare_envs.measures.moment import Moment
+from rare_envs.measures.time_to_collision import ttc
 
 TTC_CRITICAL = 3.0
 """Time to collision [s] under which an episode counts as exposed; Minderhoud and Bovy look at up to 4 s."""

@@ -11,9 +11,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from rare_envs.encounter import least
 from rare_envs.measures.moment import Moment
-from rare_envs.state import VEHICLE_LENGTH, VEHICLE_WIDTH
+from rare_envs.traffic.pairs import least
+from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
 
 MARGIN_MAX = 1000.0
 """Cap of margins [m], where there is nobody."""

@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from rare_envs.dynamics import point_mass
-from rare_envs.road import Road
-from rare_envs.space import Parameter
-from rare_envs.state import State
+from rare_envs.distributions.space import Parameter
+from rare_envs.traffic.road import Road
+from rare_envs.traffic.state import State
+from rare_envs.traffic.vehicle_models import point_mass
 
 
 class Others(NamedTuple):

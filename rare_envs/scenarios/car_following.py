@@ -3,10 +3,10 @@
 import torch
 from torch import Tensor
 
-from rare_envs.road import straight
+from rare_envs.distributions.space import Parameter
 from rare_envs.scenarios.base import DATA, SPEED, Others, Scenario, columns, straight_on
-from rare_envs.space import Parameter
-from rare_envs.state import VEHICLE_LENGTH, State
+from rare_envs.traffic.road import straight
+from rare_envs.traffic.state import VEHICLE_LENGTH, State
 
 
 def initial(x: Tensor) -> State:

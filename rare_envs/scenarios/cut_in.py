@@ -3,12 +3,12 @@
 import torch
 from torch import Tensor
 
-from rare_envs.drivers import IDM
-from rare_envs.geometry import Lead
-from rare_envs.road import straight
+from rare_envs.control.idm import IDM
+from rare_envs.distributions.space import Parameter
 from rare_envs.scenarios.base import DATA, SPEED, Others, Scenario, columns
-from rare_envs.space import Parameter
-from rare_envs.state import VEHICLE_LENGTH, State
+from rare_envs.traffic.lead import Lead
+from rare_envs.traffic.road import straight
+from rare_envs.traffic.state import VEHICLE_LENGTH, State
 
 CUT_IN_DURATION = 4.0
 """The lane change is as long as the way at the initial speed in this time [s] ..."""

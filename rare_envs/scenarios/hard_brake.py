@@ -8,10 +8,10 @@ it is there at once, which leaves less time.
 import torch
 from torch import Tensor
 
-from rare_envs.road import straight
+from rare_envs.distributions.space import Parameter
 from rare_envs.scenarios.base import Others, Scenario, columns, straight_on
-from rare_envs.space import Parameter
-from rare_envs.state import VEHICLE_LENGTH, State
+from rare_envs.traffic.road import straight
+from rare_envs.traffic.state import VEHICLE_LENGTH, State
 
 US101 = {
     "means": [[10.6561, 2.5113, 0.7264]],
@@ -19,7 +19,7 @@ US101 = {
     "weights": [1.0],
     "logarithmic": [False, True, True],
     "provenance": {
-        "kind": "moments of recorded events, by python -m training.brakings",
+        "kind": "moments of recorded events, by python -m training.scenario_fitting.brakings",
         "source": "NGSIM, US 101 (Los Angeles, southbound, 15 June 2005, congested), 370 vehicles over 640 m each",
         "events": "265 brakings by 3 m/s or more; speed at their beginning, gap of the braking vehicle to its own lead "
         "at that time (nobody's who follows is recorded), strongest deceleration of positions smoothed over 1 s",

@@ -12,10 +12,10 @@ import math
 import torch
 from torch import Tensor
 
-from rare_envs.road import i80
+from rare_envs.distributions.space import Parameter
 from rare_envs.scenarios.base import DATA, Others, Scenario, roaming
-from rare_envs.space import Parameter
-from rare_envs.state import State
+from rare_envs.traffic.road import i80
+from rare_envs.traffic.state import State
 
 VEHICLES = 6
 LANES = (2, 0, 1, 3, 4, 5)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from rare_envs.space import ScenarioSpace
+from rare_envs.distributions.space import ScenarioSpace
 
 SHOWN = 12
 """Blocks of more values than this, drivers' weights and noise, are summarised instead of shown."""

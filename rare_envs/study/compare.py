@@ -9,10 +9,10 @@ from typing import Any
 
 import rare_envs
 import samplers
-from rare_envs.faults import EgoGone
-from rare_envs.study.checks import BadInput, output_folder
+from rare_envs.egos.faults import EgoGone
+from rare_envs.study.errors import BadInput, output_folder
 from rare_envs.study.evaluate import Question, prepare
-from rare_envs.study.rundir import to_text, write_failures
+from rare_envs.study.run_directory import to_text, write_failures
 
 COMPARISON = "comparison.json"
 NOT_ASKED = ("target_cov", "replicates", "on_error")

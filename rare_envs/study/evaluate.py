@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 import agents
 import rare_envs
 import samplers
-from rare_envs.faults import ON_ERROR, EgoGone, Fault, FaultTolerant
+from rare_envs.egos.faults import ON_ERROR, EgoGone, Fault, FaultTolerant
+from rare_envs.plugins import did_you_mean
 from rare_envs.problem import AmbiguousActions
-from rare_envs.rollout import drive
-from rare_envs.setup import find_scenario
-from rare_envs.space import did_you_mean
-from rare_envs.study.checks import BadInput
+from rare_envs.scenarios.registry import find_scenario
+from rare_envs.simulation.rollout import drive
+from rare_envs.study.crash_kinds import Kinds, look_again
+from rare_envs.study.errors import BadInput
 from rare_envs.study.journal import Journal, Journaled
-from rare_envs.study.kinds import Kinds, look_again
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,7 +115,7 @@ class Report:
 
     @property
     def crashes(self) -> tuple[dict[str, Any] | None, ...]:
-        """What each of the listed failures ended in, see `rare_envs.crashes.describe`; None where nobody crashed."""
+        """The crash of each listed failure, see `rare_envs.traffic.crash.describe`; None where nobody crashed."""
         return self.kinds.listed or (None,) * len(self.estimate.failures)
 
     @property

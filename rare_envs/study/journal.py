@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import rare_envs
-from rare_envs.faults import Fault, FaultTolerant
-from rare_envs.study.checks import BadInput
+from rare_envs.egos.faults import Fault, FaultTolerant
+from rare_envs.study.errors import BadInput
 
 JOURNAL = "journal.npy"
 """Arrays one behind the other: the question, then for each batch x, f, and what is known of faults."""

@@ -13,13 +13,13 @@ from matplotlib.patches import Rectangle
 from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
 
-from rare_envs.faults import EgoGone, reason_of
-from rare_envs.road import Road
-from rare_envs.space import ScenarioSpace
-from rare_envs.state import VEHICLE_LENGTH, VEHICLE_WIDTH
+from rare_envs.distributions.space import ScenarioSpace
+from rare_envs.egos.faults import EgoGone, reason_of
 from rare_envs.study.columns import columns_of
 from rare_envs.study.evaluate import Report
 from rare_envs.study.replay import Replay, replay
+from rare_envs.traffic.road import Road
+from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
 
 if TYPE_CHECKING:
     from samplers.result import Failures

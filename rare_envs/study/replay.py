@@ -9,8 +9,8 @@ import torch
 from numpy.typing import NDArray
 
 from rare_envs import DrivingProblem
-from rare_envs.road import Road
-from rare_envs.rollout import drive
+from rare_envs.simulation.rollout import drive
+from rare_envs.traffic.road import Road
 
 
 class Replay(NamedTuple):

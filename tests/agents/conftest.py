@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from agents.networks import FEATURES, HEAD, Policy, Scaling
-from agents.weights import WeightDistribution
+from agents.learned.networks import FEATURES, HEAD, Policy, Scaling
+from agents.learned.weight_distribution import WeightDistribution
 
 
 @pytest.fixture

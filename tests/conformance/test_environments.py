@@ -11,9 +11,9 @@ from gymnasium.utils.env_checker import check_env, data_equivalence
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 import rare_envs
-from rare_envs.actions import ACTIONS
-from rare_envs.mixed import KINDS as OBSERVATIONS
-from rare_envs.rollout import drive
+from rare_envs.control.actions import ACTIONS
+from rare_envs.sensors.kinds import KINDS as OBSERVATIONS
+from rare_envs.simulation.rollout import drive
 
 KINDS = [kind for kind in OBSERVATIONS if kind != "camera"]
 """Images have a suite of their own: they are slow, and not every wrapper is for them."""

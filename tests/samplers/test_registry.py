@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 import samplers
-from rare_envs.study.cli import app
+from rare_envs.study.cli.app import app
 from samplers.registry import GROUP, METHODS, Methods
 from samplers.testing import check_method
 
@@ -18,7 +18,7 @@ LATTICE = """
     from typing import ClassVar
 
     import samplers
-    from samplers.intervals import binomial_cov, clopper_pearson
+    from samplers.statistics.intervals import binomial_cov, clopper_pearson
 
 
     @dataclasses.dataclass(frozen=True)
@@ -87,7 +87,7 @@ def test_a_method_of_another_package_is_found(installed):
     assert list(methods) == [*METHODS.own, "lattice"]
     assert len(methods) == len(METHODS.own) + 1
     method = methods["lattice"](n=500)
-    assert samplers.estimate(samplers.reference.half_space(2, 1.0).problem, method, seed=1).n_sim == 500
+    assert samplers.estimate(samplers.limit_states.half_space(2, 1.0).problem, method, seed=1).n_sim == 500
     check_method(methods["lattice"]())
 
 

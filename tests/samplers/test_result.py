@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 import samplers
-from samplers.reference import half_space
-from samplers.result import Failures, plain
+from samplers.limit_states import half_space
+from samplers.result import Failures
+from samplers.serialization import plain
 
 
 def result(**options):

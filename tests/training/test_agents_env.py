@@ -8,9 +8,9 @@ from stable_baselines3.common.vec_env import VecEnv
 import rare_envs
 import training
 from examples import adversary, shared_policy
-from rare_envs.beta_law import BetaLaw
-from rare_envs.envs.agents import AgentsVectorEnv
-from rare_envs.incentives import adversary_reward
+from rare_envs.distributions.beta import BetaLaw
+from rare_envs.envs.multi_agent_vector import AgentsVectorEnv
+from rare_envs.multi_agent.rewards import adversary_reward
 
 CUT_IN = "rare_envs/CutIn-v0"
 FOLLOWING = "rare_envs/CarFollowing-v0"

@@ -14,7 +14,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from pyarrow import csv
 
-from training.data.table import DT, Trajectories
+from training.data.trajectories import DT, Trajectories
 
 Array = NDArray[np.float64]
 Events = dict[str, NDArray[Any]]
@@ -167,7 +167,7 @@ def _neighbours(
 
 
 EXTRACTORS = {"car_following": car_following_events, "cut_in": cut_in_events}
-"""Events that `training.fit_scenarios` fits a scenario to."""
+"""Events that `training.scenario_fitting.fit` fits a scenario to."""
 
 
 def pooled(parts: Sequence[Events]) -> Events:

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from training.data.reading import Gaps, Rows, check_lengths, check_tracks, read_numbers
-from training.data.table import DT, NOBODY, Trajectories, tabulate
+from training.data.text_columns import Gaps, Rows, check_lengths, check_tracks, read_numbers
+from training.data.trajectories import DT, NOBODY, Trajectories, tabulate
 
 Array = NDArray[np.float64]
 

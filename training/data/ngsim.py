@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from training.data.reading import Gaps, Rows, check_lengths, check_tracks, header_of, read_numbers
-from training.data.table import NOBODY, Trajectories, tabulate
+from training.data.text_columns import Gaps, Rows, check_lengths, check_tracks, header_of, read_numbers
+from training.data.trajectories import NOBODY, Trajectories, tabulate
 
 Array = NDArray[np.float64]
 

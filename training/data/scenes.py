@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from training.data.compact import SCENES, US101_EDGES, columns_of
+from training.data.ngsim_tables import SCENES, US101_EDGES, columns_of
 from training.data.smoothing import CUTOFF_ACROSS, CUTOFF_ALONG, motion, smooth
-from training.data.table import DT
+from training.data.trajectories import DT
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from training.data.scenes import Scene, assemble, smooth_tracks
-from training.data.table import DT, Trajectories
+from training.data.trajectories import DT, Trajectories
 
 SHORTEST = 4
 """Steps of a scene, at least."""

@@ -14,15 +14,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from rare_envs.bases import load_base
-from rare_envs.drivers import IDM
-from rare_envs.rollout import drive
-from rare_envs.scenarios import named
-from rare_envs.state import VEHICLE_LENGTH, VEHICLE_WIDTH
-from rare_envs.world import World
+from rare_envs.control.idm import IDM
+from rare_envs.scenarios.base_distributions import load_base
+from rare_envs.scenarios.registry import named
+from rare_envs.simulation.rollout import drive
+from rare_envs.simulation.world import World
+from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
 from training.data.scenes import Scene
-from training.egos.nominal import draw, world_of
-from training.egos.ordinary import CASES
+from training.egos.nominal_driving import draw, world_of
+from training.egos.nominal_traffic import CASES
 
 APART = 1500.0
 """Distance of neighbouring encounters at their start [m]."""
@@ -35,7 +35,7 @@ class Kind:
     """Encounters of one kind."""
 
     scenario: str
-    """Short name of a scenario, or one of `training.egos.ordinary.CASES` on a straight road."""
+    """Short name of a scenario, or one of `training.egos.nominal_traffic.CASES` on a straight road."""
     base: str | None = None
     """Base distribution of the scenario."""
     scenes: int = 1

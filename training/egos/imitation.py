@@ -7,8 +7,8 @@ only, and the gradient goes through the simulator. Two things differ. Beside rec
 (`training.egos.encounters`): vehicles that cut in, brake hard, or are not there at all. And it pays for following
 closely, for leaving the middle of its lane and for speeding, which people do not mind as much as we do.
 
-Writes `driver.safetensors` into the folder, with how it does in ordinary traffic (`training.egos.nominal`) in its
-header, and a checkpoint. The same command on the same folder takes up a training that was stopped, to the same
+Writes `driver.safetensors` into the folder, with how it does in ordinary traffic (`training.egos.nominal_driving`) in
+its header, and a checkpoint. The same command on the same folder takes up a training that was stopped, to the same
 weights.
 """
 
@@ -27,15 +27,15 @@ import typer
 from agents import LearnedEgo, Provenance, save_driver
 from training.data.scenes import Scene
 from training.egos.encounters import Kind, encounters
-from training.egos.nominal import in_ordinary_traffic
-from training.imitation.config import Config
-from training.imitation.expert import expert_pairs
-from training.imitation.fitting import Data, fit, learner_of
-from training.imitation.folders import DRIVER, check_folder, driver_of, note_settings, settings_of
-from training.imitation.learner import Learner
-from training.imitation.realism import metrics
-from training.imitation.recording import stack
-from training.imitation.sources import Source, load
+from training.egos.nominal_driving import in_ordinary_traffic
+from training.imitation.algorithms.config import Config
+from training.imitation.algorithms.expert_pairs import expert_pairs
+from training.imitation.algorithms.learner import Learner
+from training.imitation.datasets import Source, load
+from training.imitation.evaluation.realism import metrics
+from training.imitation.fit import Data, fit, learner_of
+from training.imitation.run_folder import DRIVER, check_folder, driver_of, note_settings, settings_of
+from training.imitation.traffic.recording import stack
 
 NAME = "imitation"
 CONFIG = Config(
@@ -140,7 +140,7 @@ def command(
     except ValueError as error:
         print(f"imitation: {error}", file=sys.stderr)
         raise typer.Exit(2) from None
-    print(f"Saved {path}. Next: python -m training.egos.nominal --ego {path}")
+    print(f"Saved {path}. Next: python -m training.egos.nominal_driving --ego {path}")
 
 
 if __name__ == "__main__":

@@ -29,14 +29,14 @@ from rich.progress import Progress
 from torch import nn
 
 from agents import Provenance
-from agents.pilotnet import UNITS, PilotNet
-from agents.vision import VisionEgo
-from agents.vision_file import save_vision
-from training.egos.lane_expert import TRUTHS
-from training.egos.nominal import in_ordinary_traffic
-from training.egos.pictures import Pictures, collect, joined, mirrored
-from training.imitation.fitting import CHECKPOINT
-from training.imitation.folders import check_folder, note_settings
+from agents.vision.checkpoint import save_vision
+from agents.vision.ego import VisionEgo
+from agents.vision.pilotnet import UNITS, PilotNet
+from training.egos.expert_driver import TRUTHS
+from training.egos.image_dataset import Pictures, collect, joined, mirrored
+from training.egos.nominal_driving import in_ordinary_traffic
+from training.imitation.fit import CHECKPOINT
+from training.imitation.run_folder import check_folder, note_settings
 
 FILE = "vision.safetensors"
 JUDGED = 2026

@@ -28,16 +28,16 @@ from rich.progress import track
 from torch import Tensor
 
 from agents import LearnedDriver, read_driver, read_provenance, save_driver
-from agents.networks import head_weights
-from agents.weights import Array
-from training.imitation.clone import improve
-from training.imitation.config import Config
-from training.imitation.critic import Critic
-from training.imitation.expert import Pairs
-from training.imitation.fitting import CHECKPOINT, UPDATES, Data, prepare
-from training.imitation.folders import DRIVER, read_settings
-from training.imitation.learner import Learner, updates
-from training.imitation.sources import load
+from agents.learned.networks import head_weights
+from agents.learned.weight_distribution import Array
+from training.imitation.algorithms.behaviour_cloning import improve
+from training.imitation.algorithms.config import Config
+from training.imitation.algorithms.critic import Critic
+from training.imitation.algorithms.expert_pairs import Pairs
+from training.imitation.algorithms.learner import Learner, updates
+from training.imitation.datasets import load
+from training.imitation.fit import CHECKPOINT, UPDATES, Data, prepare
+from training.imitation.run_folder import DRIVER, read_settings
 from training.imitation.weight_fit import FOLDS, fit_weights
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from training.imitation.learner import Learner, Log
+from training.imitation.algorithms.learner import Learner, Log
 
 After = Callable[[Learner, Log], None]
 """Called after every update."""

@@ -18,9 +18,9 @@ from typing import Annotated, Any
 import torch
 import typer
 
-from training.imitation.config import Config
-from training.imitation.folders import COLOURS, train_driver
-from training.imitation.sources import Source
+from training.imitation.algorithms.config import Config
+from training.imitation.datasets import Source
+from training.imitation.run_folder import COLOURS, train_driver
 
 
 class Method(str, Enum):
@@ -97,7 +97,7 @@ def command(
     ppo_batch: Count = D.ppo_batch,
     value_rate: Number = D.value_rate,
 ) -> None:
-    """Train a driver from recorded traffic. training/imitation/config.py says what the settings mean."""
+    """Train a driver from recorded traffic. training/imitation/algorithms/config.py says what the settings mean."""
     words: dict[str, Any] = dict(locals())
     words |= {"method": method.value, "colour": COLOURS[noise.value]}
     torch.set_num_threads(1)  # at these sizes more threads cost more than they give

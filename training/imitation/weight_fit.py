@@ -20,7 +20,7 @@ import numpy as np
 from sklearn.covariance import graphical_lasso
 from sklearn.exceptions import ConvergenceWarning
 
-from agents.weights import RADIUS, WEIGHT_NAMES, Array, WeightDistribution
+from agents.learned.weight_distribution import RADIUS, WEIGHT_NAMES, Array, WeightDistribution
 
 PENALTIES = (0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.25, 0.2, 0.15, 0.1)
 """Tried in this order, on correlations; with a quarter of the identity mixed in the first keeps no dependence."""

@@ -1,0 +1,1 @@
+"""Learned drivers: networks, coloured noise, checkpoints and the distribution of their weights."""

@@ -1,0 +1,213 @@
+"""Learned drivers: 51 features to acceleration and yaw rate, for whole batches of scenarios at once."""
+
+import copy
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from agents.learned.coloured_noise import WHITE, Colour
+from agents.learned.networks import ACTIONS, FEATURES, HEAD, HIDDEN, Policy, with_head
+from agents.learned.weight_distribution import WeightDistribution
+from rare_envs.control import actions
+from rare_envs.sensors.perception import CURVATURE, SPEED
+from rare_envs.simulation.observation import LIDAR_SCALES, observation_space
+from rare_envs.traffic.vehicle_models import steering_for
+
+if TYPE_CHECKING:
+    from gymnasium import spaces
+
+    from rare_envs.simulation.episode import Episode
+
+
+@dataclass(frozen=True, eq=False)
+class LearnedDriver:
+    """A Gaussian policy with the colour of its noise and the limits of its actions.
+
+    The actions of a vehicle at tick t are
+
+        action = action_mean + action_std (mean + exp(log_std) eps_t), within the limits,
+
+    where every eps_t is N(0, 1) and coloured, see `Colour`. O'Kelly et al. (2018) sample white noise, `Colour()`.
+
+    Raises:
+        ValueError: If limits are out of order, or there are not 404 weights.
+    """
+
+    policy: Policy = field(repr=False)
+    colour: Colour = WHITE
+    """Of the noise of acceleration and yaw rate."""
+    acceleration: tuple[float, float] = (-8.0, 4.0)
+    """Limits [m/s^2]."""
+    yaw_rate: tuple[float, float] = (-0.3, 0.3)
+    """Limits [rad/s]."""
+    weights: WeightDistribution | None = None
+    """Law of the 404 weights of the last layer, if an ensemble has given one."""
+    name: str = "learned"
+    noisy: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        for name in ("acceleration", "yaw_rate"):
+            pair = tuple(float(value) for value in getattr(self, name))
+            if len(pair) != ACTIONS:
+                raise ValueError(f"Expected {name} as two numbers, got {pair}.")
+            object.__setattr__(self, name, pair)
+        for name in ("acceleration", "yaw_rate"):
+            low, high = getattr(self, name)
+            if not low < high:
+                raise ValueError(f"Expected limits of {name} in ascending order, got {(low, high)}.")
+        if self.weights is not None and self.weights.dim != HEAD:
+            raise ValueError(f"Expected a distribution of {HEAD} weights, got one of {self.weights.dim}.")
+
+    def act(
+        self,
+        features: Tensor,
+        weights: Tensor | None = None,
+        innovations: Tensor | None = None,
+        memory: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor | None]:
+        """Decide for one tick; the networks of all vehicles are one forward pass, also when weights differ.
+
+        Args:
+            features: What M vehicles in B scenarios perceive, shape (B, M, 51).
+            weights: Last layers of the scenarios, shape (B, 404) as `head_weights` has them; None for the policy's own.
+            innovations: Independent standard normal draws, shape (B, M, 2); None for the mean actions.
+            memory: Of the noise, shape (B, M, 2, 2), as the last call returned it, at the start `begin`.
+
+        Returns:
+            Accelerations [m/s^2] and yaw rates [rad/s], shape (B, M, 2), and the new memory.
+
+        Raises:
+            TypeError: If something is no tensor.
+            ValueError: If a shape is wrong, or innovations come without a memory.
+        """
+        batch, vehicles = _checked_shapes(features, weights, innovations, memory)
+        policy = self.policy
+        hidden = policy.trunk(features.to(policy.head.weight.dtype).reshape(batch * vehicles, FEATURES))
+        if weights is None:
+            output = policy.head(hidden).view(batch, vehicles, 2 * ACTIONS)
+        else:
+            output = with_head(hidden.view(batch, vehicles, HIDDEN[-1]), weights.to(hidden.dtype).contiguous())
+        normal, log_std = policy.split(output)
+        if innovations is not None and memory is not None:
+            noise, memory = self.colour.next(memory.to(hidden.dtype), innovations.to(hidden.dtype))
+            normal = normal + log_std.exp() * noise
+        scaling = policy.scaling
+        action = scaling.action_mean + scaling.action_std * normal
+        low, high = action.new_tensor(tuple(zip(self.acceleration, self.yaw_rate, strict=True)))
+        return action.clamp(low, high).to(features.dtype), memory
+
+    def begin(self, draws: Tensor) -> Tensor:
+        """The memory of the noise at the start, from independent standard normal draws of shape (B, M, 2, 2)."""
+        return self.colour.begin(draws)
+
+
+def _checked_shapes(
+    features: Tensor, weights: Tensor | None, innovations: Tensor | None, memory: Tensor | None
+) -> tuple[int, int]:
+    """B and M."""
+    named = {"features": features, "weights": weights, "innovations": innovations, "memory": memory}
+    for name, value in named.items():
+        if not isinstance(value, Tensor) and (value is not None or name == "features"):
+            raise TypeError(f"Expected {name} as a torch.Tensor, got {type(value).__name__}; use torch.as_tensor.")
+    if features.ndim != 3 or features.shape[-1] != FEATURES:
+        raise ValueError(f"Expected features of shape (B, M, {FEATURES}), got {tuple(features.shape)}.")
+    batch, vehicles, _ = features.shape
+    if weights is not None and weights.shape != (batch, HEAD):
+        raise ValueError(f"Expected weights of shape ({batch}, {HEAD}), got {tuple(weights.shape)}.")
+    expected = (batch, vehicles, ACTIONS)
+    if innovations is not None and innovations.shape != expected:
+        raise ValueError(f"Expected innovations of shape {expected}, got {tuple(innovations.shape)}.")
+    if innovations is not None and memory is None:
+        raise ValueError("Expected a memory beside the innovations; at the start it is driver.begin(draws).")
+    if memory is not None and memory.shape != (*expected, 2):
+        raise ValueError(f"Expected memory of shape {(*expected, 2)}, got {tuple(memory.shape)}.")
+    return batch, vehicles
+
+
+def with_weights(policy: Policy, weights: Tensor) -> Policy:
+    """A copy of a network with other weights (404,) in its last layer, as `head_weights` has them."""
+    if weights.shape != (HEAD,):
+        raise ValueError(f"Expected weights of shape ({HEAD},), got {tuple(weights.shape)}.")
+    changed = copy.deepcopy(policy)
+    layer = weights.detach().view(2 * ACTIONS, HIDDEN[-1] + 1)
+    with torch.no_grad():
+        changed.head.weight.copy_(layer[:, :-1])
+        changed.head.bias.copy_(layer[:, -1])
+    return changed
+
+
+@dataclass(frozen=True, eq=False)
+class LearnedEgo:
+    """A learned driver as ego: a Driver that acts by its mean actions and has no memory.
+
+    In simulations `act` is asked, whatever the environment observes. `predict` is for those who step an environment
+    themselves, made with `observation="lidar"`.
+    """
+
+    driver: LearnedDriver
+    sees: ClassVar[bool] = True
+    """It needs a world in which vehicles look."""
+
+    @property
+    def observation_space(self) -> "spaces.Space[Any]":
+        """What `predict` takes: the observation "lidar"."""
+        return observation_space(1, "lidar")
+
+    @property
+    def action_space(self) -> "spaces.Box[np.float32]":
+        """What `predict` gives: acceleration and steering in [-1, 1]."""
+        return actions.action_space()
+
+    def act(self, episode: "Episode", memory: Any) -> tuple[Tensor, Any]:
+        """Perceive and decide for one tick; see `rare_envs.simulation.rollout.Driver`."""
+        if episode.perception is None:
+            raise ValueError('Expected a world in which vehicles look: make it with observation="lidar".')
+        return self._decided(episode.perception[:, 0]), memory
+
+    @torch.inference_mode()
+    def predict(
+        self,
+        observation: NDArray[np.float32],
+        state: Any = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = True,
+    ) -> tuple[NDArray[np.float32], Any]:
+        """Choose actions as a Stable-Baselines3 model does, for the observation "lidar".
+
+        The environment's actions reach to 5 m/s^2 and 0.1 rad, those of `act` as far as the driver's: where it brakes
+        harder or steers further, this gives the limit.
+
+        Args:
+            observation: Of one environment, shape (51,), or of B, shape (B, 51).
+            state: Passed through.
+            episode_start: Passed over.
+            deterministic: Passed over; the actions are the mean ones either way.
+
+        Returns:
+            Actions in [-1, 1], shape (2,) or (B, 2), and the state.
+
+        Raises:
+            ValueError: If the observation has another shape.
+        """
+        del episode_start, deterministic
+        seen = torch.as_tensor(np.asarray(observation, dtype=np.float32))
+        if seen.ndim not in (1, 2) or seen.shape[-1] != FEATURES:
+            raise ValueError(
+                f"Expected observations of shape (B, {FEATURES}), got {tuple(seen.shape)}; "
+                'make the environment with observation="lidar".'
+            )
+        physical = self._decided(seen.reshape(-1, FEATURES) * seen.new_tensor(LIDAR_SCALES))
+        scaled = physical / physical.new_tensor((actions.MAX_ACCELERATION, actions.MAX_STEERING))
+        return scaled.clamp(-1.0, 1.0).reshape(*seen.shape[:-1], ACTIONS).numpy(), state
+
+    def _decided(self, features: Tensor) -> Tensor:
+        """Acceleration [m/s^2] and steering angle [rad], shape (B, 2), by what the egos see, shape (B, 51)."""
+        decided, _ = self.driver.act(features[:, None])
+        acceleration, yaw_rate = decided[:, 0].unbind(dim=-1)
+        speed = features[:, SPEED]
+        yaw_rate = yaw_rate + speed * features[:, CURVATURE]  # it has learned on a straight road
+        return torch.stack((acceleration, steering_for(yaw_rate, speed)), dim=1)

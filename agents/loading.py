@@ -1,0 +1,165 @@
+"""Egos by name: the rule-based driver, learned drivers, Stable-Baselines3 files, functions that make an ego."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Final, Literal, Protocol, cast, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.learned.checkpoints import SHIPPED, SHIPPED_EGOS, SUFFIX, load_driver
+from agents.learned.driver import LearnedDriver, LearnedEgo
+from agents.python_function import RULE_BASED, call_factory
+from agents.sb3.saved_ego import load_saved
+from agents.vision.checkpoint import VISION, holds_vision, load_vision
+from rare_envs.egos.faults import EgoGone
+from rare_envs.plugins import did_you_mean
+
+EXPECTED: Final = (
+    f"{', '.join(map(repr, (RULE_BASED, *SHIPPED_EGOS, VISION, *SHIPPED)))}, a path to a {SUFFIX} or "
+    "Stable-Baselines3 .zip, "
+    "an .onnx file, module:function, tcp://host:port, or process:EGO for one of these in a process of its own, "
+    "noisy:EGO for one behind the imperfections of a full stack"
+)
+Kind = Literal["rule", "learned", "vision", "url", "remote", "process", "noisy", "onnx", "zip", "function", "unknown"]
+
+
+@runtime_checkable
+class Ego(Protocol):
+    """What drives the ego vehicle: Stable-Baselines3's `predict`, called on whole batches."""
+
+    def predict(
+        self,
+        observation: Any,
+        state: Any = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = True,
+    ) -> tuple[NDArray[Any], Any]:
+        """Choose an action for each row of a batch.
+
+        Args:
+            observation: Observations of B scenarios, shape (B, F).
+            state: Memory of a recurrent policy from the step before; None at the start.
+            episode_start: Rows that begin a new episode, shape (B,).
+            deterministic: Act by the mean (or best) action, without exploration noise.
+
+        Returns:
+            Actions, shape (B, 2) in [-1, 1] or (B,) integers, and the memory to pass on.
+        """
+        ...
+
+
+def load_ego(spec: str | Path, algo: str | None = None, trust: bool = False) -> Ego | LearnedEgo | Literal["idm"]:
+    """Find an ego by what a user would type.
+
+    Args:
+        spec: "idm"; "imitation", the shipped ego with lidar; "vision", PilotNet on the front camera; "mgail", "gail" or
+            "bc", drivers of the traffic, which as egos act by their mean actions; a path to a `.safetensors` with one
+            of these kinds; a path to a `.zip` saved by Stable-Baselines3; a path to an `.onnx` file (see
+            `agents.onnx.ego.OnnxEgo` for its form); `module:function`, a function without arguments that returns an ego
+            (modules in the working directory are found); `tcp://host:port` for an ego in another program
+            (docs/remote.md); or `process:EGO`, any of these files and functions in a process of its own, which is ended
+            and started anew where the ego hangs or dies; or `noisy:EGO`, any ego behind the imperfections of a full
+            stack (`agents.imperfect_stack.Stack`).
+        algo: Algorithm of a `.zip`, such as "ppo"; recognised from the file when None. Only a `.zip` has one.
+        trust: Open the pickles in a `.zip` as Stable-Baselines3 does, which runs whatever code is in them. Without it
+            a file that needs code of its author's (a policy class of their own, say) is refused, and one to which
+            everybody may write.
+
+    Returns:
+        "idm" as it stands, a `LearnedEgo`, else an object with `predict`. A `.zip` gives a `SavedEgo`, whose
+        `observation_space` and `action_space` are those of the policy. `VecNormalize` statistics
+        saved beside a `.zip` are applied to its observations: `<name>_vecnormalize.pkl`,
+        `vecnormalize.pkl`, or where RL Zoo and Stable-Baselines3's checkpoints put them.
+
+    Raises:
+        FileNotFoundError: The file does not exist.
+        ValueError: The spec is none of these, the file is not a model of Stable-Baselines3 or no driver or is
+            damaged or not trusted, the function is missing, fails or returns something without `predict`, or
+            algo is given for something that is no `.zip`.
+    """
+    text = str(spec)
+    kind = kind_of(text)
+    if kind == "url":
+        raise ValueError(f"Will not load an ego from {text!r}: download the file, look where it comes from, name it.")
+    if kind == "unknown":
+        raise ValueError(f"Unknown ego {text!r}{_suggest_ego(text)}; expected {EXPECTED}.")
+    if kind == "zip":
+        return load_saved(Path(text), algo, trust)
+    if algo is not None and kind != "process":
+        raise ValueError(f"Expected algo for a Stable-Baselines3 .zip only, got {algo!r} for {text!r}; leave it out.")
+    if kind == "noisy":
+        from agents.imperfect_stack import NoisyEgo, Stack
+
+        inner, mark, settings = text.removeprefix("noisy:").rpartition("?")
+        stack = Stack.read(settings if mark else "")
+        return cast(Ego, NoisyEgo(load_ego(inner if mark else settings, algo, trust), stack))
+    if kind in ("remote", "process"):
+        return _elsewhere(kind, text, algo, trust)
+    if kind == "onnx":
+        from agents.onnx.ego import OnnxEgo
+
+        return OnnxEgo(Path(text))
+    if kind == "vision":
+        return load_vision(text)
+    if kind == "learned":
+        return LearnedEgo(cast(LearnedDriver, load_driver(text)))
+    return cast(Ego, call_factory(text)) if kind == "function" else "idm"
+
+
+def _elsewhere(kind: Kind, text: str, algo: str | None, trust: bool) -> Ego:
+    """An ego in another process."""
+    try:
+        import msgpack  # noqa: F401
+        import zmq  # noqa: F401
+    except ImportError as error:
+        raise ValueError(f"{text!r} needs pyzmq and msgpack: pip install 'rare-envs[remote]'.") from error
+    try:
+        if kind == "process":
+            from agents.remote.subprocess_link import isolate
+
+            return isolate(text.removeprefix("process:"), algo, trust)
+        from agents.remote.zmq_link import connect
+
+        return connect(text)
+    except EgoGone as error:
+        raise ValueError(str(error)) from error
+
+
+def innermost(spec: str) -> str:
+    """The ego inside `noisy:` and `process:`, without their settings."""
+    while spec.startswith(("noisy:", "process:")):
+        spec = spec.partition(":")[2].rpartition("?")[0] or spec.partition(":")[2]
+    return spec
+
+
+def kind_of(spec: str) -> Kind:
+    """What a user means by an ego's name; of a `.safetensors` the header tells."""
+    if spec == RULE_BASED:
+        return "rule"
+    if spec == VISION or (spec.endswith(SUFFIX) and holds_vision(spec)):
+        return "vision"
+    if spec in (*SHIPPED, *SHIPPED_EGOS) or spec.endswith(SUFFIX):
+        return "learned"
+    if spec.startswith("process:"):
+        return "process"
+    if spec.startswith("noisy:"):
+        return "noisy"
+    if spec.startswith(("tcp://", "ipc://")):
+        return "remote"
+    if "://" in spec:
+        return "url"
+    if spec.endswith(".onnx"):
+        return "onnx"
+    if spec.endswith(".zip") or Path(spec).is_file():
+        return "zip"
+    return "function" if ":" in spec and "/" not in spec else "unknown"
+
+
+def _suggest_ego(text: str) -> str:
+    """A "did you mean" for a misspelt ego: a driver by name or a `.zip` saved nearby."""
+    saved = Path(f"{text}.zip")
+    if saved.is_file():
+        return f" (did you mean {str(saved)!r}?)"
+    return did_you_mean(text.lower(), [RULE_BASED, *SHIPPED_EGOS, VISION, *SHIPPED])

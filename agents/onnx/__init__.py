@@ -1,0 +1,1 @@
+"""ONNX files as egos, and the export of egos to them."""

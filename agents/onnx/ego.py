@@ -1,0 +1,162 @@
+"""Egos in ONNX files: a graph from observations to actions, with or without a memory."""
+
+from __future__ import annotations
+
+import json
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from agents.python_function import one_line
+from rare_envs.control.actions import DISCRETE_ACTIONS
+
+KEY = "rare_envs"
+"""Entry of a file's metadata in which `agents.onnx.export` says what the policy observes and how it acts."""
+_TYPES = {"tensor(float)": np.float32, "tensor(double)": np.float64}
+
+
+class OnnxEgo:
+    """A policy in an ONNX file, run by onnxruntime on the CPU.
+
+    The first input is the observations, shape (B, ...), float or double. The first output is the actions: (B, 2) in
+    [-1, 1] (acceleration and steering, clipped by the environment), (B,) or (B, 1) integers, or (B, 5) scores of which
+    the best counts. Further inputs are a memory, as many as there are further outputs, in the same order: each of
+    shape (B, ...), zeros at the start of an episode, then what the output of the tick before was. A batch size that
+    the file fixes at 1 is respected, row by row.
+
+    Attributes:
+        path: The file.
+        observation_space: From the file.
+        action_space: From the file, None if it does not tell.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Read the file.
+
+        Raises:
+            FileNotFoundError: It does not exist.
+            ValueError: It is no ONNX graph, or not of this form, or onnxruntime is not installed.
+        """
+        if not path.is_file():
+            raise FileNotFoundError(f"No ego at {str(path)!r}.")
+        try:
+            import onnxruntime
+        except ImportError as error:
+            raise ValueError(f"{str(path)!r} needs onnxruntime: pip install 'rare-envs[onnx]'.") from error
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        options.log_severity_level = 3
+        try:
+            self._session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        except Exception as error:  # onnxruntime's own exceptions have no common class
+            raise ValueError(f"Cannot load {str(path)!r} as ONNX: {one_line(error)}.") from error
+        self.path = path
+        self._inputs, self._outputs = self._session.get_inputs(), self._session.get_outputs()
+        self._check()
+
+    def _check(self) -> None:
+        memory = len(self._inputs) - 1
+        if memory < 0 or memory != len(self._outputs) - 1:
+            raise ValueError(
+                f"Expected {str(self.path)!r} to have one input (observations) and one output (actions), and after "
+                f"them a memory, as many inputs as outputs; got inputs {self._names(self._inputs)} "
+                f"and outputs {self._names(self._outputs)}."
+            )
+        for port in self._inputs:
+            if port.type not in _TYPES or not port.shape or any(not isinstance(size, int) for size in port.shape[1:]):
+                raise ValueError(
+                    f"Expected input {port.name!r} of {str(self.path)!r} to be float or double of shape "
+                    f"(batch, fixed sizes), got {port.type} {port.shape}."
+                )
+
+    @staticmethod
+    def _names(ports: Any) -> str:
+        return ", ".join(port.name for port in ports) or "none"
+
+    @cached_property
+    def described(self) -> dict[str, Any]:
+        """What `agents.onnx.export` has written into the file; empty for other files."""
+        text = self._session.get_modelmeta().custom_metadata_map.get(KEY, "{}")
+        try:
+            found = json.loads(text)
+        except json.JSONDecodeError:
+            return {}
+        return found if isinstance(found, dict) else {}
+
+    @property
+    def observation_space(self) -> spaces.Box:
+        """What it observes; without bounds, which the file does not tell."""
+        return spaces.Box(-np.inf, np.inf, tuple(self._inputs[0].shape[1:]), np.float32)
+
+    @property
+    def action_space(self) -> spaces.Space[Any] | None:
+        """How it acts, if the file tells."""
+        action = self.described.get("action", {})
+        if "n" in action:
+            return spaces.Discrete(int(action["n"]))
+        if "low" in action:
+            return spaces.Box(np.float32(action["low"]), np.float32(action["high"]), dtype=np.float32)
+        sizes = self._outputs[0].shape[1:]
+        return spaces.Discrete(len(DISCRETE_ACTIONS)) if self._scores(sizes) else None
+
+    @property
+    def stateful(self) -> bool:
+        """Whether it has a memory."""
+        return len(self._inputs) > 1
+
+    @property
+    def fixed_batch(self) -> int | None:
+        """The batch size that the file fixes, None if it takes any."""
+        size = self._inputs[0].shape[0]
+        return size if isinstance(size, int) else None
+
+    def predict(
+        self,
+        observation: Any,
+        state: Any = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = True,
+    ) -> tuple[NDArray[Any], Any]:
+        """Choose an action for each row of a batch; see `agents.Ego`. What the graph does is always deterministic."""
+        observation = np.asarray(observation)
+        memory = self._begin(len(observation)) if state is None else list(state)
+        if state is not None and episode_start is not None and np.any(episode_start):
+            anew = np.asarray(episode_start, dtype=bool)
+            memory = [np.where(anew.reshape(-1, *[1] * (part.ndim - 1)), 0, part).astype(part.dtype) for part in memory]
+        outputs = self._in_portions([observation, *memory])
+        return self._action(outputs[0]), tuple(outputs[1:]) or None
+
+    def _begin(self, batch: int) -> list[NDArray[Any]]:
+        return [np.zeros((batch, *port.shape[1:]), _TYPES[port.type]) for port in self._inputs[1:]]
+
+    def _in_portions(self, values: list[NDArray[Any]]) -> list[NDArray[Any]]:
+        """Run all rows, in portions if the file fixes the batch size; the last one is filled up with its last row."""
+        size = self.fixed_batch
+        if size is None:
+            return self._run(values)
+        portions = []
+        for first in range(0, len(values[0]), size):
+            rows = np.arange(first, first + size).clip(max=len(values[0]) - 1)
+            portions.append(self._run([part[rows] for part in values]))
+        return [np.concatenate(parts)[: len(values[0])] for parts in zip(*portions, strict=True)]
+
+    def _run(self, values: list[NDArray[Any]]) -> list[NDArray[Any]]:
+        feed = {
+            port.name: np.ascontiguousarray(value, _TYPES[port.type])
+            for port, value in zip(self._inputs, values, strict=True)
+        }
+        found: list[NDArray[Any]] = self._session.run(None, feed)
+        return found
+
+    @staticmethod
+    def _scores(sizes: Any) -> bool:
+        return list(sizes) == [len(DISCRETE_ACTIONS)]
+
+    def _action(self, output: NDArray[Any]) -> NDArray[Any]:
+        if np.issubdtype(output.dtype, np.integer):
+            return output[:, 0] if output.ndim == 2 and output.shape[1] == 1 else output
+        return output.argmax(axis=1) if self._scores(output.shape[1:]) else output

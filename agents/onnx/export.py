@@ -1,0 +1,183 @@
+"""A saved Stable-Baselines3 policy as an ONNX file that takes raw observations and gives actions ready to be used.
+
+Stable-Baselines3's own recipe leaves out what `predict` does around the network. Here normalisation of observations,
+frames stacked behind it, the squashed or clipped action and a recurrent policy's memory are in the graph.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from torch import Tensor, nn
+
+from agents.onnx.ego import KEY, OnnxEgo
+from agents.sb3.saved_ego import SavedEgo
+
+TOLERANCE = 1e-5
+"""Largest difference of an action that an export may make."""
+TICKS, BATCHES = 20, (1, 7, 64)
+
+
+@dataclass(frozen=True)
+class Exported:
+    """What an export has written.
+
+    Attributes:
+        path: The file.
+        difference: Largest difference of its actions from those of the policy, on random observations.
+        observations: How many were tried.
+    """
+
+    path: Path
+    difference: float
+    observations: int
+
+
+class _Graph(nn.Module):
+    """Raw observations and memory to actions and memory, batch first throughout."""
+
+    def __init__(self, ego: SavedEgo) -> None:
+        super().__init__()
+        self.policy = ego.model.policy
+        self.policy.set_training_mode(False)
+        self.recurrent = hasattr(self.policy, "lstm_actor")
+        self.frames = 1 if ego.frames is None else ego.frames[0]
+        self.mean: Tensor | None = None
+        statistics = ego.statistics
+        if statistics is not None and statistics.norm_obs:
+            self.mean = torch.as_tensor(statistics.obs_rms.mean, dtype=torch.float64)
+            self.scale = torch.as_tensor(np.sqrt(statistics.obs_rms.var + statistics.epsilon), dtype=torch.float64)
+            self.clip = float(statistics.clip_obs)
+
+    def memory(self, observation: Any, batch: int) -> list[Tensor]:
+        """Zeros of the memory's shapes."""
+        parts = []
+        if self.frames > 1:
+            parts.append(torch.zeros(batch, (self.frames - 1) * observation.shape[0]))
+        if self.recurrent:
+            layers, _, hidden = self.policy.lstm_hidden_state_shape
+            parts += [torch.zeros(batch, layers, hidden), torch.zeros(batch, layers, hidden)]
+        return parts
+
+    def forward(self, observation: Tensor, *memory: Tensor) -> tuple[Tensor, ...]:
+        seen = observation
+        if self.mean is not None:  # in double precision, as VecNormalize does
+            seen = ((seen.double() - self.mean) / self.scale).clamp(-self.clip, self.clip).float()
+        carried: tuple[Tensor, ...] = ()
+        if self.frames > 1:
+            seen = torch.cat((memory[0], seen), dim=1)
+            carried = (seen[:, observation.shape[1] :],)
+        if self.recurrent:
+            states = (memory[-2].transpose(0, 1).contiguous(), memory[-1].transpose(0, 1).contiguous())
+            starts = torch.zeros(seen.shape[0])  # a memory of zeros is what an episode starts with
+            action, states = self.policy._predict(seen, states, starts, deterministic=True)
+            carried = (*carried, *(state.transpose(0, 1) for state in states))
+        else:
+            action = self.policy._predict(seen, deterministic=True)
+        return (self._finished(action), *carried)
+
+    def _finished(self, action: Tensor) -> Tensor:
+        """What `predict` makes of the network's action."""
+        space = self.policy.action_space
+        if not isinstance(space, spaces.Box):
+            return action
+        low, high = torch.as_tensor(space.low), torch.as_tensor(space.high)
+        if self.policy.squash_output:
+            return low + 0.5 * (action + 1.0) * (high - low)
+        return torch.minimum(torch.maximum(action, low), high)
+
+
+def export_onnx(ego: SavedEgo, path: Path, seed: int = 0) -> Exported:
+    """Write a policy as ONNX and compare the file with it on random observations, over several ticks and batch sizes.
+
+    Args:
+        ego: The policy.
+        path: Where to write; it is written only if the comparison holds.
+        seed: Of the observations.
+
+    Returns:
+        What was found.
+
+    Raises:
+        ValueError: The policy cannot be written, or the file acts otherwise.
+    """
+    try:
+        import onnx
+    except ImportError as error:
+        raise ValueError("Exporting needs onnx and onnxruntime: pip install 'rare-envs[onnx]'.") from error
+    space = ego.observation_space
+    if not isinstance(space, spaces.Box) or (ego.frames is not None and (ego.frames[1] or len(space.shape) != 1)):
+        raise ValueError(f"Cannot export a policy that observes {space}; expected one Box of numbers.")
+    described = {"algorithm": ego.algorithm, "observation": list(space.shape), "action": _described(ego.action_space)}
+    draft = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        _trace(ego, draft)
+        model = onnx.load(str(draft))
+        model.metadata_props.add(key=KEY, value=json.dumps(described))
+        onnx.save(model, str(draft))
+        difference, count = compare(ego, OnnxEgo(draft), np.random.default_rng(seed))
+        if not difference <= TOLERANCE:
+            raise ValueError(f"The exported graph acts otherwise, by up to {difference:.2g}; nothing was written.")
+        draft.replace(path)
+    finally:
+        draft.unlink(missing_ok=True)
+    return Exported(path, difference, count)
+
+
+def _trace(ego: SavedEgo, path: Path) -> None:
+    """Write the graph, traced on zeros; the tracer is fast, and whatever it may get wrong is found by `compare`."""
+    graph, space = _Graph(ego).eval(), ego.observation_space
+    memory = graph.memory(space, 2)
+    names = [f"memory_{part}" for part in range(len(memory))]
+    ports = ["observation", *names, "action", *(f"next_{name}" for name in names)]
+    with torch.no_grad(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of the tracer, about branches that do not depend on the observation
+        try:
+            torch.onnx.export(
+                graph,
+                (torch.zeros(2, *space.shape), *memory),
+                path,
+                input_names=ports[: 1 + len(names)],
+                output_names=ports[1 + len(names) :],
+                dynamic_axes={port: {0: "batch"} for port in ports},
+                dynamo=False,
+            )
+        except Exception as error:  # torch has many, without a common class
+            raise ValueError(f"Cannot export a policy of class {type(ego.model.policy).__name__}: {error}") from error
+
+
+def _described(space: Any) -> dict[str, Any]:
+    if isinstance(space, spaces.Discrete):
+        return {"n": int(space.n)}
+    return {"low": space.low.tolist(), "high": space.high.tolist()}
+
+
+def compare(policy: Any, other: Any, rng: np.random.Generator) -> tuple[float, int]:
+    """The largest difference between two egos' actions on random observations, memories carried, and their number.
+
+    Args:
+        policy: An ego with a bounded `observation_space`.
+        other: The ego to compare with it.
+        rng: Draws the observations.
+    """
+    space, worst, count = policy.observation_space, 0.0, 0
+    low, high = np.clip(space.low, -10.0, 10.0), np.clip(space.high, -10.0, 10.0)
+    for batch in BATCHES:
+        states: list[Any] = [None, None]
+        for tick in range(TICKS):
+            observation = rng.uniform(low, high, (batch, *space.shape)).astype(np.float32)
+            start = np.full(batch, tick == 0)
+            found = []
+            for which, ego in enumerate((policy, other)):
+                action, states[which] = ego.predict(observation, states[which], start, True)
+                found.append(np.asarray(action, dtype=np.float64))
+            worst, count = max(worst, float(np.abs(found[0] - found[1]).max())), count + batch
+    return worst, count

@@ -1,0 +1,1 @@
+"""Egos in other processes and on other machines: client, server and protocol."""

@@ -1,0 +1,1 @@
+"""Saved Stable-Baselines3 policies, and how their files are opened safely."""

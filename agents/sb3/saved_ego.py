@@ -1,0 +1,210 @@
+"""Policies saved by Stable-Baselines3: a `.zip`, and the `VecNormalize` statistics beside it.
+
+Both hold pickles. They are opened by `agents.sb3.safe_pickle`, so that a file from somewhere else cannot run code; one
+that needs classes of its author's own is opened as Stable-Baselines3 would only if the caller trusts it.
+"""
+
+from __future__ import annotations
+
+import base64
+import difflib
+import io
+import pickle
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.python_function import one_line
+from agents.sb3.file_trust import check_origin
+from agents.sb3.safe_pickle import ForeignObject, open_pickle
+from agents.sb3.zip_header import algorithm_class, algorithm_of, read_header, weights_only_objects
+from rare_envs.egos.wrappers import Normalised, Stacked, stacking
+
+TRUST = "if you trust where the file comes from, load it with trust=True (--trust)"
+
+
+@dataclass(frozen=True)
+class SavedEgo:
+    """A Stable-Baselines3 policy read from a file, with its observation statistics if it has any.
+
+    Attributes:
+        model: The Stable-Baselines3 algorithm, on the CPU.
+        algorithm: Its name, such as "ppo".
+        path: Where it came from.
+        statistics: Its `VecNormalize` statistics, or None; observations pass through them first.
+        statistics_path: Where the statistics came from, or None.
+    """
+
+    model: Any
+    algorithm: str
+    path: Path
+    statistics: Any = None
+    statistics_path: Path | None = None
+
+    @property
+    def observation_space(self) -> Any:
+        """What it observes: what the policy was trained on, of single frames if they were normalised one by one."""
+        return self.model.observation_space if self.frames is None else self.statistics.observation_space
+
+    @property
+    def action_space(self) -> Any:
+        """The action space that the policy was trained on."""
+        return self.model.action_space
+
+    @property
+    def frames(self) -> tuple[int, bool] | None:
+        """Frames that were stacked behind `VecNormalize`, as `rare_envs.egos.wrappers.stacking` says; None without."""
+        if self.statistics is None or self.statistics.observation_space.shape == self.model.observation_space.shape:
+            return None
+        return stacking(self.statistics.observation_space.shape, self.model.observation_space.shape)
+
+    @cached_property
+    def policy(self) -> Any:
+        """The model behind its statistics and stacks."""
+        policy = self.model if self.frames is None else Stacked(self.model, *self.frames)
+        return policy if self.statistics is None else Normalised(policy, self.statistics.normalize_obs)
+
+    def predict(
+        self,
+        observation: Any,
+        state: Any = None,
+        episode_start: NDArray[np.bool_] | None = None,
+        deterministic: bool = True,
+    ) -> tuple[NDArray[Any], Any]:
+        """Choose an action for each row of a batch; see `Ego.predict`."""
+        actions, state = self.policy.predict(observation, state, episode_start, deterministic)
+        return actions, state
+
+
+def load_saved(path: Path, algo: str | None, trust: bool = False) -> SavedEgo:
+    """Read a `.zip`: what it says of itself first, then its weights, then its statistics.
+
+    Args:
+        path: The file.
+        algo: Its algorithm; None finds it.
+        trust: Open its pickles as Stable-Baselines3 does, which runs whatever code is in them.
+
+    Raises:
+        FileNotFoundError: The file does not exist.
+        ValueError: It is no model, is damaged, or needs trust: for what is in it, or because others may write to it or
+            its statistics (`agents.sb3.file_trust`).
+    """
+    if not path.exists():
+        raise FileNotFoundError(f"No ego at {str(path)!r}{_suggest_file(path)}.")
+    if not path.is_file():
+        raise ValueError(f"Expected a Stable-Baselines3 .zip, got the folder {str(path)!r}.")
+    found = find_statistics(path)
+    if not trust:
+        check_origin(path, found)
+    header = read_header(path)
+    name = algo.lower() if algo is not None else algorithm_of(header, path)
+    algorithm = algorithm_class(name, path)
+    model = _load_model(algorithm, name, header, path, trust)
+    statistics = None if found is None else _load_statistics(found, model.observation_space, trust)
+    return SavedEgo(model, name, path, statistics, found)
+
+
+def _suggest_file(path: Path) -> str:
+    """Names in the same folder that a mistyped path may have meant."""
+    if not path.parent.is_dir():
+        return f": the folder {str(path.parent)!r} does not exist"
+    names = sorted(entry.name for entry in path.parent.glob("*.zip"))
+    near = difflib.get_close_matches(path.name, names, n=3, cutoff=0.5) or names[:3]
+    if not near:
+        return f": the folder {str(path.parent)!r} has no .zip"
+    return f"; in that folder: {', '.join(near)}"
+
+
+def _load_model(algorithm: Any, name: str, header: Mapping[str, Any], path: Path, trust: bool) -> Any:
+    """Build the algorithm and put the saved weights in."""
+    given = weights_only_objects()
+    try:
+        content = path.read_bytes()  # once, so that what is loaded is what was looked at
+        if not trust:
+            given = {**opened_objects(read_header(io.BytesIO(content), str(path)), set(given)), **given}
+        return algorithm.load(io.BytesIO(content), device="cpu", custom_objects=given)
+    except ForeignObject as error:
+        raise ValueError(f"Will not load {str(path)!r}: {one_line(error).partition(': ')[2]}; {TRUST}.") from error
+    except Exception as error:  # a damaged or foreign pickle can raise anything at all
+        version = header.get("version", "unknown")
+        raise ValueError(
+            f"Cannot load {str(path)!r} as {name.upper()} (saved by Stable-Baselines3 {version}): "
+            f"{one_line(error)}. The file is damaged, needs a package that is not installed, or "
+            "holds another algorithm (name it with algo)."
+        ) from error
+
+
+def opened_objects(header: Mapping[str, Any], without: set[str]) -> dict[str, Any]:
+    """The pickled entries of a model's settings, opened safely.
+
+    Raises:
+        ForeignObject: One asks for something that may run code; the message names the entry.
+    """
+    opened = {}
+    for key, value in header.items():
+        if key in without or not isinstance(value, dict) or ":serialized:" not in value:
+            continue
+        try:
+            opened[key] = open_pickle(base64.b64decode(str(value[":serialized:"])))
+        except ForeignObject as error:
+            raise ForeignObject(f"in its {key!r} {error}") from error
+    return opened
+
+
+# --- statistics --------------------------------------------------------------------------------
+
+
+def _statistics_candidates(path: Path) -> Iterator[Path]:
+    """Places where `VecNormalize` statistics of a model are kept, most specific first."""
+    folder, stem = path.parent, path.stem
+    yield folder / f"{stem}_vecnormalize.pkl"
+    checkpoint = re.fullmatch(r"(.+)_(\d+_steps)", stem)  # Stable-Baselines3's CheckpointCallback
+    if checkpoint:
+        yield folder / f"{checkpoint[1]}_vecnormalize_{checkpoint[2]}.pkl"
+    yield folder / stem / "vecnormalize.pkl"  # RL Zoo: Env-v0_1/Env-v0.zip, Env-v0_1/Env-v0/
+    run = re.fullmatch(r"(.+)_\d+", folder.resolve().name)  # RL Zoo: Env-v0_1/best_model.zip
+    if run:
+        yield folder / run[1] / "vecnormalize.pkl"
+    yield folder / "vecnormalize.pkl"
+
+
+def find_statistics(path: Path) -> Path | None:
+    """The `VecNormalize` statistics of a model, or None."""
+    return next((found for found in _statistics_candidates(path) if found.is_file()), None)
+
+
+def _load_statistics(path: Path, observation_space: Any, trust: bool) -> Any:
+    """Read `VecNormalize` statistics and check that they fit the policy."""
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    try:
+        content = path.read_bytes()
+        statistics = pickle.loads(content) if trust else open_pickle(content)
+    except ForeignObject as error:
+        raise ValueError(
+            f"Will not read the VecNormalize statistics {str(path)!r}: {one_line(error).partition(': ')[2]}; {TRUST}."
+        ) from error
+    except Exception as error:  # a damaged pickle can raise anything at all
+        raise ValueError(
+            f"Cannot read the VecNormalize statistics {str(path)!r}: {one_line(error)}. "
+            "Save them again, or move the file away if it does not belong to this ego."
+        ) from error
+    if not isinstance(statistics, VecNormalize):
+        raise ValueError(
+            f"Expected VecNormalize statistics in {str(path)!r}, got {type(statistics).__name__}; "
+            "move the file away if it does not belong to this ego."
+        )
+    if stacking(statistics.observation_space.shape or (), observation_space.shape) is None:
+        raise ValueError(
+            f"VecNormalize statistics {str(path)!r} are for observations of shape "
+            f"{statistics.observation_space.shape}, the ego's have {observation_space.shape}; "
+            "move the file away if it does not belong to this ego."
+        )
+    statistics.training = False
+    return statistics

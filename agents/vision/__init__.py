@@ -1,0 +1,1 @@
+"""The ego that drives by camera: its network, its checkpoint and its driving."""

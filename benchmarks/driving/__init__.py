@@ -1,0 +1,1 @@
+"""Benchmarks in traffic: realism of drivers, searches over them, egos."""

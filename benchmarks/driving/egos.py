@@ -1,0 +1,191 @@
+"""How often does each ego crash in each scenario, by two methods, and what is its likeliest crash?
+
+    python -m benchmarks.driving.egos
+
+trains a PPO and a DQN ego in each scenario as the demo does, unless they are there already, asks `TwoStage` and
+`AdaptiveSubsetSimulation` about every ego in every scenario, and writes docs/shipped_egos.md with its pictures and
+benchmarks/results/egos.json. What that file has is not simulated again, but for the egos that are named: `--only
+vision,ppo`.
+"""
+
+import json
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated
+
+import torch
+import typer
+
+import rare_envs
+from rare_envs.scenarios.registry import SCENARIOS
+from rare_envs.study.evaluate import Question, Report, prepare, run
+from rare_envs.study.video import drive_again, write_film
+from training import train_ego
+
+RESULT = Path(__file__).parents[1] / "results" / "egos.json"
+STEPS = 400_000
+"""Of the training of an ego, as in the demo."""
+EGOS = ("idm", "imitation", "vision", "noisy:idm", "ppo", "dqn")
+METHODS = ("two-stage", "adss")
+MOST = {"vision": 1500}
+"""Simulations of one run; the others get what the methods take by themselves."""
+NARROW = 400
+"""Width of the pictures [pixels]."""
+HEAD = """# The shipped egos, everywhere
+
+Every ego that comes with this project, and two that `rare-envs train-ego ENV --algo ppo --steps {steps}` trained in the
+scenario at hand (`dqn` likewise), in every scenario with its default base and drivers: the probability of a collision
+within {horizon:g} s with its 95 % interval, by [two methods](estimates.md), simulations, wall time, number of warnings,
+and the likeliest failure that was found (`python -m benchmarks.driving.egos`).
+
+`vision` has {most:,} simulations at most. Wall times are from a busy machine of two cores. `dqn` chooses among five
+accelerations and cannot steer: on the I-80's curves it leaves its lane, or the road. In the 1,448 dimensions of
+`Highway-v0` nothing announces a collision, so that all methods can do is count: intervals are wide there, and warnings
+say so.
+
+A row of it in Python, with a quarter of the simulations:
+
+```python
+import agents
+import rare_envs
+import samplers
+
+problem = rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego=agents.load_ego("imitation"))
+print(samplers.estimate(problem, seed=0, max_sim=1500))
+```
+"""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One ego in one scenario, by one method."""
+
+    env_id: str
+    ego: str
+    method: str
+    p: float
+    low: float
+    high: float
+    n_sim: int
+    seconds: float
+    """Wall time."""
+    warnings: tuple[str, ...]
+    picture: str
+    """File of the likeliest failure; empty without one."""
+    words: str
+    """What it is."""
+
+
+def trained(algo: str, env_id: str, folder: Path) -> Path:
+    """The ego that `rare-envs train-ego ENV --algo ALGO --steps 400000` makes."""
+    path = folder / f"{algo}_{SCENARIOS[env_id].name}.zip"
+    return path if path.exists() else train_ego(env_id, algo=algo, steps=STEPS, seed=0, out=path)
+
+
+def ask(env_id: str, ego: str, method: str, runs: Path, images: Path) -> Cell:
+    """Estimate, and draw the likeliest failure.
+
+    Args:
+        env_id: The scenario.
+        ego: One of `EGOS`.
+        method: Name of the method.
+        runs: Folder of the trained egos.
+        images: Folder of the pictures.
+
+    Returns:
+        What came out.
+    """
+    spec = str(trained(ego, env_id, runs)) if ego in ("ppo", "dqn") else ego
+    report = run(prepare(Question(env_id=env_id, ego=spec, method=method, max_sim=MOST.get(ego))), progress=True)
+    estimate = report.estimate
+    picture, words = likeliest(report, images / f"ego_{SCENARIOS[env_id].name}_{ego.replace(':', '_')}.png")
+    return Cell(
+        env_id,
+        ego,
+        method,
+        estimate.p,
+        *estimate.interval,
+        n_sim=estimate.n_sim,
+        seconds=report.seconds,
+        warnings=estimate.warnings,
+        picture=picture,
+        words=words,
+    )
+
+
+def likeliest(report: Report, path: Path) -> tuple[str, str]:
+    """Draw the likeliest failure that a run has found; its file and what it is."""
+    found = report.estimate.failures
+    if len(found) == 0:
+        return "", "no failure found"
+    drive = drive_again(report.study.problem, found[0].x)
+    write_film(path, drive, width=NARROW)
+    crash = drive.crash
+    return path.name, "no crash" if crash is None else f"{crash['kind']}, {crash['closing_speed']:.1f} m/s"
+
+
+def page(cells: Iterable[Cell]) -> str:
+    """The page of all results."""
+    cells = list(cells)
+    horizon = max(scenario.horizon for scenario in SCENARIOS.values())
+    parts = [HEAD.format(horizon=horizon, steps=STEPS, most=MOST["vision"])]
+    for env_id in SCENARIOS:
+        own = [cell for cell in cells if cell.env_id == env_id]
+        rows = [line(cell) for cell in own]
+        shown = [cell for cell in own if cell.method == METHODS[0] and cell.picture]
+        pictures = [
+            f"**{cell.ego}**: {cell.words}\n\n![{cell.ego}: {cell.words}](images/{cell.picture})" for cell in shown
+        ]
+        head = (
+            "| ego | method | p | 95 % interval | simulations | wall time | warnings |\n|---|---|---|---|---|---|---|\n"
+        )
+        parts.append(f"## {env_id}\n\n{head}" + "\n".join(rows) + "\n\n" + "\n\n".join(pictures) + "\n")
+    return "\n".join(parts)
+
+
+def line(cell: Cell) -> str:
+    """A row of the table."""
+    return (
+        f"| `{cell.ego}` | `{cell.method}` | {cell.p:.2e} | {cell.low:.2e} to {cell.high:.2e} | {cell.n_sim:,} "
+        f"| {cell.seconds:.0f} s | {len(cell.warnings) or ''} |"
+    )
+
+
+def read() -> dict[tuple[str, str, str], Cell]:
+    """What has been measured so far, by scenario, ego and method."""
+    cells = json.loads(RESULT.read_text())["cells"] if RESULT.exists() else []
+    found = [Cell(**{**cell, "warnings": tuple(cell["warnings"])}) for cell in cells]
+    return {(cell.env_id, cell.ego, cell.method): cell for cell in found}
+
+
+def write(cells: dict[tuple[str, str, str], Cell]) -> None:
+    """Write what has been measured."""
+    versions = {"rare_envs": rare_envs.__version__, "torch": torch.__version__}
+    about = {"command": "python -m benchmarks.driving.egos", "versions": versions}
+    RESULT.write_text(json.dumps({**about, "cells": [asdict(cell) for cell in cells.values()]}, indent=1) + "\n")
+
+
+def main(
+    docs: Annotated[Path, typer.Option(help="Folder of the page.")] = Path("docs"),
+    runs: Annotated[Path, typer.Option(help="Folder of the trained egos.")] = Path("runs/egos"),
+    only: Annotated[str, typer.Option(help="Egos to measure anew, with commas between; all that are not yet.")] = "",
+    env: Annotated[str, typer.Option(help="Only environments whose id contains this.")] = "",
+) -> None:
+    """Measure what is not measured yet and write the page."""
+    torch.set_num_threads(1)
+    chosen = only.split(",") if only else []
+    measured = {key for key, cell in read().items() if cell.ego not in chosen or env not in cell.env_id}
+    for key in [(env_id, ego, method) for env_id in SCENARIOS for ego in EGOS for method in METHODS]:
+        if key in measured or env not in key[0] or (chosen and key[1] not in chosen):
+            continue
+        cell = ask(*key, runs=runs, images=docs / "images")
+        print(line(cell), flush=True)
+        write({**read(), key: cell})  # read anew: another process may measure other egos
+    order = {ego: place for place, ego in enumerate(EGOS)}
+    in_order = sorted(read().values(), key=lambda cell: (order[cell.ego], METHODS.index(cell.method)))
+    (docs / "shipped_egos.md").write_text(page(in_order), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,149 @@
+"""Do drivers finish the lane changes that people have begun? Why learned drivers change lanes so rarely.
+
+    python -m benchmarks.driving.lane_changes DATA [DRIVER ...] --json lane_changes.json
+
+DATA is the folder with the tables of US 101; drivers are files or the names of shipped ones. Two questions:
+
+- *Under way.* Every lane change in the record is taken up some time before the crossing, all vehicles driven by the
+  driver: how many of these vehicles cross in that time and 2 s more? Of the people all do.
+- *Steering.* What yaw rate is there on average, by how fast a vehicle moves across its lane and on which side of the
+  middle it is: in the record, and of the driver's mean actions in the same moments? Towards where it moves is positive.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+import torch
+import typer
+from torch import Tensor
+
+from agents import LearnedDriver
+from benchmarks.driving.realism import named, rounded
+from benchmarks.estimators.runs import about
+from rare_envs.sensors.perception import FEATURES, HEADING, SPEED
+from training.data.trajectories import DT
+from training.imitation.algorithms.expert_pairs import Pairs, expert_pairs
+from training.imitation.datasets import Source, load
+from training.imitation.evaluation.behaviour import Act, drive, sampled
+from training.imitation.traffic.recording import Recording, stack
+from training.imitation.traffic.replayed_traffic import lane_of, start
+
+BEFORE = (0.5, 1.0, 1.5, 2.0, 3.0)
+"""Seconds before the crossing at which drivers take over."""
+AFTER = 2.0
+"""Seconds beyond that in which they may still cross."""
+SETTLED = 10
+"""Ticks that a vehicle is in one lane on either side of a crossing, at least."""
+OFFSET = FEATURES.index("lane_offset")
+CLASSES = {
+    "keeps its lane: less than 0.2 m/s across": (0.0, 0.2, -np.inf, np.inf),
+    "0.2 to 0.4 m/s across": (0.2, 0.4, -np.inf, np.inf),
+    "moves out: 0.6 m/s or more, beyond the middle": (0.6, np.inf, 0.0, np.inf),
+    "comes in: 0.6 m/s or more, 0.5 m or more before the middle": (0.6, np.inf, -np.inf, -0.5),
+}
+"""Moments by speed across [m/s] and offset from the middle [m], both towards where the vehicle moves."""
+
+
+class Crossings(NamedTuple):
+    """n lane changes of a recording, shape (n,) each."""
+
+    scene: Tensor
+    tick: Tensor
+    """The first in the new lane."""
+    vehicle: Tensor
+    side: Tensor
+    """1 to the right, -1 to the left."""
+
+
+def crossings_of(recording: Recording) -> Crossings:
+    """Changes of lane with `SETTLED` ticks in one lane on either side."""
+    ticks = recording.x.shape[1]
+    lane = torch.stack([lane_of(recording.y[:, tick], recording.edges) for tick in range(ticks)], dim=1)
+    lane = torch.where(recording.present, lane, -1)
+    found = []
+    for tick in range(SETTLED, ticks - SETTLED + 1):
+        before, after = lane[:, tick - SETTLED : tick], lane[:, tick : tick + SETTLED]
+        settled = (before == before[:, -1:]).all(dim=1) & (after == after[:, :1]).all(dim=1)
+        crossed = settled & (before[:, -1] >= 0) & (after[:, 0] >= 0) & (before[:, -1] != after[:, 0])
+        scene, vehicle = crossed.nonzero(as_tuple=True)
+        side = (after[:, 0] - before[:, -1])[scene, vehicle].sign()
+        found.append(torch.stack((scene, torch.full_like(scene, tick), vehicle, side)))
+    return Crossings(*torch.cat(found, dim=1))
+
+
+def completed(recording: Recording, crossings: Crossings, act: Act, seconds: float) -> tuple[int, float]:
+    """How many changes can be taken up some seconds before the crossing, and the share that the driver completes."""
+    lead = round(seconds / DT)
+    scene, tick, vehicle, side = (column[crossings.tick >= lead] for column in crossings)
+    traffic = start(recording, scene, tick - lead)
+    chosen = traffic.driven & (traffic.vehicle == vehicle[:, None])
+    rows = chosen.any(dim=1)  # the others have nobody ahead in their lane, and are replayed
+    traffic = type(traffic)(*(field[rows] for field in traffic))
+    row, at = torch.arange(int(rows.sum())), chosen[rows].int().argmax(dim=1)
+    first = lane_of(traffic.y, traffic.edges)[row, at]
+    crossed = torch.zeros(len(row), dtype=torch.bool)
+    with torch.inference_mode():
+        for moment in drive(recording, traffic, act, lead + round(AFTER / DT)):
+            now = lane_of(moment.traffic.y, moment.traffic.edges)[row, at]
+            crossed |= (now - first) * side[rows] > 0
+    return len(row), float(crossed.float().mean())
+
+
+def steering(pairs: Pairs, drivers: dict[str, LearnedDriver]) -> dict[str, dict[str, float]]:
+    """Mean yaw rates [rad/s] towards where vehicles move, by `CLASSES`, of people and of drivers' mean actions."""
+    heading = pairs.features[:, HEADING]
+    side = heading.sign()
+    across, offset = heading.abs() * pairs.features[:, SPEED], pairs.features[:, OFFSET] * side
+    with torch.inference_mode():
+        made = {name: driver.act(pairs.features[:, None])[0][:, 0, 1] for name, driver in drivers.items()}
+    out = {}
+    for name, (slow, fast, left, right) in CLASSES.items():
+        inside = (across >= slow) & (across < fast) & (offset >= left) & (offset < right)
+        rates = {"people": pairs.action[:, 1], **made}
+        out[name] = {"moments": int(inside.sum())} | {
+            who: float((rate * side)[inside].mean()) for who, rate in rates.items()
+        }
+    return out
+
+
+def report(recording: Recording, drivers: dict[str, LearnedDriver], noises: int) -> dict[str, Any]:
+    """Both questions, ready for JSON."""
+    crossings = crossings_of(recording)
+    under_way: dict[str, dict[str, float]] = {}
+    for seconds in BEFORE:
+        row: dict[str, float] = {}
+        for name, driver in drivers.items():
+            runs = [
+                completed(recording, crossings, sampled(driver, torch.Generator().manual_seed(seed)), seconds)
+                for seed in range(noises)
+            ]
+            row["changes"], row[name] = runs[0][0], float(np.mean([share for _, share in runs]))
+        under_way[f"{seconds:g} s before"] = row
+    return {
+        "crossings": len(crossings.scene),
+        "under_way": under_way,
+        "steering": steering(expert_pairs(recording), drivers),
+    }
+
+
+def main(
+    data: Annotated[Path, typer.Argument(help="Folder with the compact tables of US 101.")],
+    drivers: Annotated[list[str] | None, typer.Argument(help="Files or shipped names.")] = None,
+    noises: Annotated[int, typer.Option(help="Sequences of noise of each driver.")] = 5,
+    out: Annotated[Path | None, typer.Option("--json")] = None,
+) -> None:
+    """Measure on all scenes, those that the drivers learned from included: changes are few."""
+    torch.set_num_threads(1)
+    learn, test = load(Source("data", data))
+    found = rounded(report(stack([*learn, *test]), named(drivers or ["mgail", "gail", "bc"]), noises))
+    print(json.dumps(found, indent=1))
+    if out is not None:
+        out.write_text(json.dumps({"about": about(torch=torch.__version__), **found}, indent=1) + "\n", "utf-8")
+
+
+if __name__ == "__main__":
+    typer.run(main)

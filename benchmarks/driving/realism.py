@@ -1,0 +1,142 @@
+"""How human are the drivers? All vehicles of held-out scenes driven by each, compared with the people in them.
+
+    python -m benchmarks.driving.realism DATA [DRIVER ...] --out FOLDER
+
+DATA is the folder with the tables of US 101; drivers are files or the names of shipped ones. Writes `imitation.json`,
+`imitation.md` (tables) and figures. Beside the drivers stand the record itself, constant velocity and IDM with lane
+keeping; of a driver that has a law of its weights, policies drawn from it and policies moved within a search box too.
+
+Each driver is measured with several sequences of noise; standard errors are by bootstrap over the test scenes, which
+share vehicles, so they are rather too small. Divergences are from the people in the test scenes; those of the record
+are between its training and its test scenes.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import torch
+import typer
+from torch import Tensor
+
+from agents import LearnedDriver, load_driver, read_driver
+from agents.learned.networks import ACTIONS
+from agents.learned.rule_driver import RuleDriver
+from benchmarks.driving.realism_figures import draw, tables
+from benchmarks.driving.realism_rows import Effort, Judge, accuracy, boxes, drawn, noisy, on_highway, people
+from benchmarks.estimators.runs import about
+from training.imitation.algorithms.expert_pairs import expert_pairs
+from training.imitation.datasets import Source, load
+from training.imitation.evaluation.behaviour import Act
+from training.imitation.evaluation.driving_statistics import BINS
+from training.imitation.evaluation.realism import recorded_tally
+from training.imitation.traffic.recording import Recording, stack
+
+
+def constant_velocity(features: Tensor, memory: Tensor | None) -> tuple[Tensor, Tensor | None]:
+    """Neither speed nor heading changes."""
+    return features.new_zeros(*features.shape[:2], ACTIONS), None
+
+
+def by_rule(features: Tensor, memory: Tensor | None) -> tuple[Tensor, Tensor | None]:
+    """IDM and lane keeping."""
+    return RuleDriver().act(features, None, None, memory)
+
+
+def report(
+    train: Recording,
+    test: Recording,
+    drivers: dict[str, LearnedDriver],
+    effort: Effort,
+    say: Callable[[str], None] = lambda text: None,
+) -> dict[str, Any]:
+    """Everything that is measured, ready for JSON.
+
+    Args:
+        train: Scenes that the drivers learned from.
+        test: Scenes that they did not.
+        drivers: By name.
+        effort: How much is simulated.
+        say: Told what is being measured.
+    """
+    judge = Judge(test, recorded_tally(test), effort)
+    features = expert_pairs(test).features
+    rules: dict[str, Act] = {"constant velocity": constant_velocity, "IDM, lane keeping": by_rule}
+    rows = [people(train, judge)]
+    errors, highways = {}, []
+    for name, act in rules.items():
+        say(name)
+        rows.append(judge.row(name, "reference", [act]))
+        errors[name] = accuracy(test, act, effort, rollouts=1)
+        highways.append(on_highway(name, act, judge))
+    for name, driver in drivers.items():
+        say(name)
+        rows.append(judge.row(name, "driver", noisy(driver, effort.noises)))
+        errors[name] = accuracy(test, noisy(driver, 1)[0], effort)
+        highways.append(on_highway(name, noisy(driver, 1)[0], judge))
+        if driver.weights is not None:
+            say(f"{name}, law and boxes")
+            rows += [drawn(name, driver, judge), *boxes(name, driver, features, judge)]
+    return {
+        "realism": rows,
+        "replayed": errors,
+        "highway": highways,
+        "bins": {name: list(bins) for name, bins in BINS.items()},
+    }
+
+
+def named(words: Sequence[str]) -> dict[str, LearnedDriver]:
+    """Drivers by what they are called: shipped names, stems of files, or folders of trainings."""
+    out = {}
+    for word in words:
+        path = Path(word)
+        driver = read_driver(path) if path.suffix else load_driver(word)
+        if not isinstance(driver, LearnedDriver):
+            raise typer.BadParameter(f"{word!r} has not been learned; IDM is measured anyway.")
+        out[path.parent.name if path.stem == "driver" else path.stem] = driver
+    return out
+
+
+def main(
+    data: Annotated[Path, typer.Argument(help="Folder with the compact tables of US 101.")],
+    drivers: Annotated[
+        list[str] | None, typer.Argument(help="Files or shipped names; mgail, gail and bc if none.")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("imitation"),
+    noises: Annotated[int, typer.Option(help="Sequences of noise of each driver.")] = Effort.noises,
+    draws: Annotated[int, typer.Option(help="Policies drawn from laws and boxes.")] = Effort.draws,
+    rollouts: Annotated[int, typer.Option(help="Of each segment among recorded others.")] = Effort.rollouts,
+) -> None:
+    """Measure how human drivers are, and draw it."""
+    torch.set_num_threads(1)
+    begun = time.perf_counter()
+    effort = replace(Effort(), noises=noises, draws=draws, rollouts=rollouts)
+    train, test = (stack(scenes) for scenes in load(Source("data", data)))
+    chosen = named(drivers or ["mgail", "gail", "bc"])
+    found = report(
+        train, test, chosen, effort, lambda text: print(f"{time.perf_counter() - begun:5.0f} s  {text}", flush=True)
+    )
+    found["about"] = about(torch=torch.__version__, **asdict(effort), seconds=round(time.perf_counter() - begun))
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "imitation.json").write_text(json.dumps(rounded(found), indent=1) + "\n", encoding="utf-8")
+    (out / "imitation.md").write_text(tables(found), encoding="utf-8")
+    draw(found, out)
+    print(tables(found))
+
+
+def rounded(value: Any) -> Any:
+    """Numbers with five significant digits."""
+    if isinstance(value, dict):
+        return {name: rounded(part) for name, part in value.items()}
+    if isinstance(value, list):
+        return [rounded(part) for part in value]
+    return float(f"{value:.5g}") if isinstance(value, float) else value
+
+
+if __name__ == "__main__":
+    typer.run(main)

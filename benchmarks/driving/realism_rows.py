@@ -1,0 +1,198 @@
+"""Rows of the report on human likeness: how each is measured, for people, drivers, laws, boxes and other starts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from agents import LearnedDriver
+from agents.learned.networks import ACTIONS, HIDDEN
+from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
+from training.data.ngsim_tables import US101_EDGES
+from training.imitation.evaluation.behaviour import Act, behaviour_of, drive, sampled
+from training.imitation.evaluation.driving_statistics import BINS, Tally, tally, together
+from training.imitation.evaluation.prediction_error import Errors, replayed_errors, segments
+from training.imitation.evaluation.realism import recorded_tally, standard_errors, summary, tallies
+from training.imitation.traffic.recording import Recording
+from training.imitation.traffic.replayed_traffic import Traffic
+
+SECONDS = (10.0, 20.0)
+RADII = (0.003, 0.01, 0.03, 0.1)
+"""Half-widths of search boxes around the mean of the weights."""
+Rows = list[dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much is simulated."""
+
+    noises: int = 3
+    """Sequences of noise of each driver."""
+    draws: int = 6
+    """Policies drawn from a law, and from the inside and the corners of a box."""
+    rollouts: int = 20
+    """Of each segment in which one vehicle is driven among recorded others."""
+    each: int = 4
+    """Such vehicles every 2 s of a scene."""
+    highway: int = 200
+    """Starts at O'Kelly et al.'s speeds."""
+
+
+@dataclass(frozen=True)
+class Judge:
+    """Measures drivers against people."""
+
+    test: Recording
+    recorded: Tally
+    """Of the test scenes."""
+    effort: Effort
+
+    def row(self, name: str, kind: str, acts: Sequence[Act], seconds: Sequence[float] | None = None) -> dict[str, Any]:
+        """Realism of one driver over some times.
+
+        Args:
+            name: Of the row.
+            kind: What it is: "reference", "driver", "law" or "box".
+            acts: One for each sequence of noise, or for each policy.
+            seconds: Times [s], the longest last; None for `SECONDS`.
+        """
+        seconds = SECONDS if seconds is None else seconds
+        runs = [tallies(self.test, act, tuple(seconds)) for act in acts]
+        return {"name": name, "kind": kind, **self.figures({time: [run[time] for run in runs] for time in seconds})}
+
+    def figures(self, runs: dict[float, list[Tally]]) -> dict[str, Any]:
+        """Values and standard errors of several runs together, and the collision rate of each."""
+        out: dict[str, Any] = {}
+        for seconds, parts in runs.items():
+            whole = together(parts)
+            out[f"{seconds:g} s"] = {
+                **asdict(summary(whole, self.recorded)),
+                "standard_error": asdict(standard_errors(whole, self.recorded, np.random.default_rng(0))),
+                "collisions": [summary(part, self.recorded).collision for part in parts],
+            }
+        whole = together(runs[SECONDS[0]])
+        out["shares"] = {
+            name: (whole.counts[name].sum(0) / max(whole.counts[name].sum(), 1.0)).tolist() for name in BINS
+        }
+        return out
+
+
+def noisy(driver: LearnedDriver, number: int, weights: Tensor | None = None) -> list[Act]:
+    """A driver with several sequences of noise."""
+    return [sampled(driver, torch.Generator().manual_seed(seed), weights) for seed in range(number)]
+
+
+def people(train: Recording, judge: Judge) -> dict[str, Any]:
+    """The record's own rates; divergences between its training and its test scenes."""
+    learned = recorded_tally(train)
+    row = {"name": "people", "kind": "reference", **judge.figures({time: [judge.recorded] for time in SECONDS})}
+    for seconds in SECONDS:
+        row[f"{seconds:g} s"]["divergence"] = summary(learned, judge.recorded).divergence
+        row[f"{seconds:g} s"]["hard_brake_in_training_scenes"] = summary(learned, judge.recorded).hard_brake
+    return row
+
+
+def drawn(name: str, driver: LearnedDriver, judge: Judge) -> dict[str, Any]:
+    """Policies drawn from the law of a driver's weights, one sequence of noise each."""
+    assert driver.weights is not None
+    weights = torch.from_numpy(driver.weights.sample(judge.effort.draws, np.random.default_rng(0))).float()
+    acts = [noisy(driver, 1, row)[0] for row in weights]
+    return judge.row(f"{name}, drawn from its law", "law", acts)
+
+
+def moved(driver: LearnedDriver, features: Tensor, draws: int) -> Iterator[tuple[float, str, list[Tensor]]]:
+    """Weights moved within boxes around their mean: radius, direction, and the weights (404,) that belong to them.
+
+    A direction is "uniform" or "corner" (random ones), or names an output and a sign: all weights of that output are
+    moved with the signs of its mean inputs, which shifts it the furthest.
+    """
+    assert driver.weights is not None
+    mean = torch.from_numpy(np.array(driver.weights.mean)).float()
+    with torch.no_grad():
+        hidden = driver.policy.trunk(features).mean(dim=0)
+    signs = torch.cat((hidden.sign(), torch.ones(1)))
+    generator = torch.Generator().manual_seed(0)
+    for radius in RADII:
+        inside = 2.0 * torch.rand(draws, len(mean), generator=generator) - 1.0
+        yield radius, "uniform", list(mean + radius * inside)
+        yield radius, "corner", list(mean + radius * inside.sign())
+        for output, name in enumerate(("acceleration", "yaw rate", "spread of acceleration", "spread of yaw rate")):
+            for sign in (1.0, -1.0):
+                direction = torch.zeros(2 * ACTIONS, HIDDEN[-1] + 1)
+                direction[output] = sign * signs
+                yield radius, f"{name} {'+' if sign > 0 else '-'}", [mean + radius * direction.flatten()]
+
+
+def boxes(name: str, driver: LearnedDriver, features: Tensor, judge: Judge) -> Rows:
+    """How policies drive that a search may move to, over 10 s."""
+    rows = []
+    for radius, direction, weights in moved(driver, features, max(judge.effort.draws // 2, 1)):
+        acts = [noisy(driver, 1, row)[0] for row in weights]
+        row = judge.row(f"{name}, box {radius:g}, {direction}", "box", acts, SECONDS[:1])
+        del row["shares"]
+        rows.append({**row, "driver": name, "radius": radius, "direction": direction})
+    return rows
+
+
+def accuracy(test: Recording, act: Act, effort: Effort, rollouts: int | None = None) -> dict[str, dict[str, float]]:
+    """Root mean square errors with one vehicle driven and the others replayed, by seconds."""
+    chosen = segments(test, 2.0, effort.each, torch.Generator().manual_seed(0))
+    found = replayed_errors(test, act, chosen, effort.rollouts if rollouts is None else rollouts)
+    return {f"{seconds:g}": _rmse(errors, len(test.x)) for seconds, errors in found.items() if len(errors.scene)}
+
+
+def _rmse(errors: Errors, scenes: int, draws: int = 200) -> dict[str, float]:
+    """Root mean squares and their standard errors, by bootstrap over scenes."""
+    times = np.random.default_rng(0).multinomial(scenes, [1 / scenes] * scenes, draws)
+    number = np.bincount(errors.scene.numpy(), minlength=scenes)
+    out = {"vehicles": float(len(errors.scene))}
+    for name in ("position", "speed", "lateral"):
+        squared = getattr(errors, name).double().square().numpy()
+        sums = np.bincount(errors.scene.numpy(), squared, minlength=scenes)
+        out[name] = float(np.sqrt(squared.mean()))
+        out[f"{name}_standard_error"] = float(
+            np.nanstd(np.sqrt((times @ sums) / np.maximum(times @ number, 1)), ddof=1)
+        )
+    return out
+
+
+def highway(number: int) -> Traffic:
+    """Six cars within 40 m, one in each lane, at 10 to 20 m/s: how O'Kelly et al. start, on the lanes of US 101."""
+    rng = np.random.default_rng(0)
+    along, across, heading, speed = (torch.from_numpy(rng.beta(2, 2, (number, 6))).float() for _ in range(4))
+    edges = torch.tensor(US101_EDGES)
+    every = torch.ones(number, 6, dtype=torch.bool)
+    return Traffic(
+        x=40.0 * along,
+        y=0.5 * (edges[1:] + edges[:-1]) + 0.5 * across - 0.25,
+        heading=torch.deg2rad(7.2 * heading - 3.6),
+        speed=10.0 * speed + 10.0,
+        length=torch.full((number, 6), VEHICLE_LENGTH),
+        width=torch.full((number, 6), VEHICLE_WIDTH),
+        edges=edges.expand(number, -1),
+        scene=torch.arange(number),
+        tick=torch.zeros(number, dtype=torch.long),
+        vehicle=torch.arange(6).expand(number, -1),
+        there=every,
+        driven=every,
+    )
+
+
+def on_highway(name: str, act: Act, judge: Judge) -> dict[str, Any]:
+    """Behaviour at O'Kelly et al.'s starting speeds; divergences are from the people of US 101."""
+    start = highway(judge.effort.highway)
+    with torch.inference_mode():
+        whole = behaviour_of(drive(None, start, act, round(SECONDS[-1] / 0.1)))
+    runs = {}
+    for seconds in SECONDS:
+        part = type(whole)(whole.scene, *(column[: round(seconds / 0.1)] for column in whole[1:]))
+        runs[seconds] = [tally(part, judge.effort.highway)]
+    last = whole.speed[-1].double()
+    figures = judge.figures(runs)
+    del figures["shares"]
+    return {"name": name, **figures, "last_speed": float(last.mean()), "slowest": float(last.min())}

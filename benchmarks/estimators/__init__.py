@@ -1,0 +1,1 @@
+"""Benchmarks of the samplers: limit states, references, comparisons."""

@@ -1,0 +1,146 @@
+"""OpenTURNS and our default method on the same problems in one run.
+
+    python -m benchmarks.estimators.against_openturns --runs 100 --workers 2 --json against_openturns.json
+
+Subset sampling, cross-entropy in standard space and nonparametric adaptive importance sampling (NAIS) with their
+defaults and `--points` draws a level, each stopped at 300,000 evaluations (cross-entropy has no bound of its own; a run
+so stopped counts as raised). Their intervals are p -+ half their 95 % confidence length. Ours is run with as many
+simulations as theirs took on average. Columns as in `benchmarks.estimators.compare_methods`.
+"""
+
+import json
+import sys
+import time
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import openturns
+import typer
+from rich.console import Console
+from rich.progress import track
+from threadpoolctl import threadpool_limits
+
+from benchmarks.estimators.catalogue import CASES
+from benchmarks.estimators.compare_methods import selected
+from benchmarks.estimators.report import table
+from benchmarks.estimators.runs import Job, Meter, Run, about, failed, limit_state, rotation_of, run_all
+from benchmarks.estimators.summary import Cell, cells_of
+from samplers.problem import FloatArray
+from samplers.serialization import plain
+
+ALGORITHMS = {
+    "openturns-ss": openturns.SubsetSampling,
+    "openturns-ce": openturns.StandardSpaceCrossEntropyImportanceSampling,
+    "openturns-nais": openturns.NAIS,
+}
+GUARD = 300_000
+BLOCK = 100
+"""Points that OpenTURNS hands over at once: that many chains in subset sampling, 10 % of the points of a level."""
+
+
+def run_openturns(job: Job, points: int = 1000) -> Run:
+    """Run one of their algorithms once.
+
+    Args:
+        job: `method` is a name of `ALGORITHMS`; `max_sim` and `replicates` are not used.
+        points: Draws of each level or iteration.
+    """
+    state = limit_state(job.problem)
+    meter = Meter(state.problem(rotation_of(job), noise_seed=job.seed).evaluate, limit=GUARD)
+    openturns.TBB.Disable()  # one thread, as ours
+    openturns.RandomGenerator.SetSeed(job.seed)
+    with threadpool_limits(limits=1):
+        start = time.process_time()
+        try:
+            algorithm = ALGORITHMS[job.method](_event(meter, state.dim))
+            algorithm.setMaximumOuterSampling(max(points // BLOCK, 1))
+            algorithm.setBlockSize(min(points, BLOCK))
+            algorithm.run()
+            result = algorithm.getResult()
+            p, half = result.getProbabilityEstimate(), 0.5 * result.getConfidenceLength(0.95)
+            cov = result.getCoefficientOfVariation()
+        except Exception as error:  # an error of f arrives as a RuntimeError with the traceback as its text
+            reason = RuntimeError(str(error).strip().splitlines()[-1])
+            return failed(job, meter, time.process_time() - start, reason)
+        seconds = time.process_time() - start - meter.seconds
+    return Run(
+        method=job.method,
+        problem=job.problem,
+        seed=job.seed,
+        p=p,
+        low=p - half,
+        high=p + half,
+        cov=cov if p > 0 and cov >= 0 else float("inf"),
+        n_sim=meter.points,
+        calls=meter.calls,
+        seconds=seconds,
+        status="ended",
+    )
+
+
+def _event(f: Meter, dim: int) -> Any:
+    """Return the event {f(U) <= 0}, U ~ N(0, I)."""
+
+    def column(u: Any) -> FloatArray:
+        return f(np.asarray(u))[:, None]
+
+    function = openturns.PythonFunction(dim, 1, func_sample=column)
+    response = openturns.CompositeRandomVector(function, openturns.RandomVector(openturns.Normal(dim)))
+    return openturns.ThresholdEvent(response, openturns.LessOrEqual(), 0.0)
+
+
+def _ours(method: str, theirs: list[Cell], job: dict[str, Any], runs: int, most: int) -> list[Job]:
+    """Return runs of our method, each as costly as one of theirs, named after it."""
+    budgets = {(cell.method, cell.problem): min(round(cell.n_sim), most) for cell in theirs}
+    return [
+        Job(method=method, problem=problem, seed=run, max_sim=budget, **job)
+        for (_, problem), budget in budgets.items()
+        for run in range(runs)
+    ]
+
+
+def main(
+    runs: Annotated[int, typer.Option(min=2, help="Runs of each method on each problem.")] = 100,
+    ours: Annotated[str, typer.Option(help="Our method.")] = "two-stage",
+    problems: Annotated[str, typer.Option(help="Names with commas between; all without it.")] = "",
+    points: Annotated[int, typer.Option(min=1, help="Draws of OpenTURNS in each level.")] = 1000,
+    most: Annotated[int, typer.Option(min=1, help="No run of ours takes more simulations.")] = 20_000,
+    rotation: Annotated[int | None, typer.Option(help="Seed of a rotation of the input spaces.")] = None,
+    workers: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
+    out: Annotated[Path | None, typer.Option("--json", help="Write figures and runs here.")] = None,
+) -> None:
+    """Measure and print one row of theirs and one of ours for each algorithm and problem."""
+    openturns.Log.Show(openturns.Log.NONE)
+    names = selected(problems, list(CASES), "problem")
+    console = Console(stderr=True)
+    cells: list[Cell] = []
+    all_runs: list[Run] = []
+    for algorithm in ALGORITHMS:
+        jobs = [Job(algorithm, name, run, rotation=rotation) for name in names for run in range(runs)]
+        made = run_all(jobs, workers, partial(run_openturns, points=points))
+        theirs = list(track(made, total=len(jobs), console=console, description=algorithm))
+        their_cells = cells_of(theirs)
+        jobs = _ours(ours, their_cells, {"rotation": rotation}, runs, most)
+        description = f"{ours} at the cost of {algorithm}"
+        own = list(track(run_all(jobs, workers), total=len(jobs), console=console, description=description))
+        pairs = zip(their_cells, cells_of(own), strict=True)
+        cells += [cell for pair in pairs for cell in pair]
+        all_runs += theirs + own
+    print(table(cells))
+    for text in sorted({f"{run.method} on {run.problem}: {run.error}" for run in all_runs if run.error}):
+        print(f"raised: {text}")
+    if out:
+        command = f"python -m benchmarks.estimators.against_openturns {' '.join(sys.argv[1:])}"
+        data = {
+            "about": about(command=command, openturns=openturns.__version__, points=points, rotation=rotation),
+            "cells": [asdict(cell) for cell in cells],
+            "runs": [asdict(run) for run in all_runs],
+        }
+        out.write_text(json.dumps(plain(data), indent=1, allow_nan=False) + "\n")
+
+
+if __name__ == "__main__":
+    typer.run(main)

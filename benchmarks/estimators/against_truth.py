@@ -1,0 +1,135 @@
+"""Do the methods find the truth in traffic? Repeated seeds against `benchmarks/results/truth.json`.
+
+    python -m benchmarks.estimators.against_truth --seeds 40
+
+For the IDM ego in both scenarios with both bases: mean over the seeds and its distance from the truth in standard
+errors (of the mean and of the truth together), how often the 95 % interval holds the truth, simulations and gain.
+"""
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+import typer
+
+import rare_envs
+import samplers
+from benchmarks.estimators.truth import RESULT as TRUTH
+from samplers.execution.arguments import checked
+from samplers.execution.run import Run
+from samplers.registry import get_method
+
+RESULT = Path(__file__).parents[1] / "results" / "against_truth.json"
+MONTE_CARLO_BUDGET = 100_000
+"""Plain Monte Carlo gets this many simulations, the others their defaults."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One method on one problem."""
+
+    env_id: str
+    base: str
+    method: str
+    seeds: int
+    truth: float
+    mean: float
+    z: float
+    """(mean - truth) / standard error."""
+    coverage: float
+    cov: float
+    """Empirical c.o.v. of the estimates."""
+    own_cov: float
+    """Mean of the c.o.v. that the method reports."""
+    n_sim: float
+    gain: float
+    """(1 - p) / p / (n_sim x relative mean square error)."""
+    warned: float
+    """Share of results with a warning."""
+
+
+def compare(row: dict[str, Any], method: str, seeds: range) -> Cell:
+    """Repeat one method.
+
+    Args:
+        row: Entry of `truth.json`.
+        method: Command-line name of the method.
+        seeds: Seeds, one for each run.
+
+    Returns:
+        The comparison.
+    """
+    problem = rare_envs.DrivingProblem(row["env_id"], base=row["base"])
+    max_sim = MONTE_CARLO_BUDGET if method == "mc" else None
+    started = [Run(checked(problem, get_method(method), seed=seed, max_sim=max_sim)) for seed in seeds]
+    runs = side_by_side(problem, started)
+    p, truth = np.array([run.p for run in runs]), row["p"]
+    error = np.hypot(p.std(ddof=1) / len(p) ** 0.5, row["standard_error"])
+    n_sim = float(np.mean([run.n_sim for run in runs]))
+    return Cell(
+        env_id=row["env_id"],
+        base=row["base"],
+        method=method,
+        seeds=len(p),
+        truth=truth,
+        mean=float(p.mean()),
+        z=float((p.mean() - truth) / error),
+        coverage=float(np.mean([run.interval[0] <= truth <= run.interval[1] for run in runs])),
+        cov=float(p.std(ddof=1) / truth),
+        own_cov=float(np.mean([run.cov for run in runs])),
+        n_sim=n_sim,
+        gain=float((1.0 - truth) / truth / (n_sim * np.mean((p / truth - 1.0) ** 2))),
+        warned=float(np.mean([bool(run.warnings) for run in runs])),
+    )
+
+
+def side_by_side(problem: samplers.Problem, runs: list[samplers.Run]) -> list[samplers.Estimate]:
+    """Finish runs together, so that the simulation sees all their points in one batch.
+
+    Each gives what `samplers.estimate` with its seed gives, ten times as soon.
+
+    Args:
+        problem: What they were started on.
+        runs: None of them done.
+
+    Returns:
+        Their estimates.
+    """
+    while live := [run for run in runs if not run.done]:
+        asked = [run.ask() for run in live]
+        f = problem.evaluate(np.concatenate(asked))
+        ends = np.cumsum([len(x) for x in asked])
+        for run, part in zip(live, np.split(f, ends[:-1]), strict=True):
+            run.tell(part)
+    return [run.result() for run in runs]
+
+
+def main(
+    seeds: int = 40,
+    first_seed: int = 0,
+    env: Annotated[str, typer.Option(help="Only environments whose id contains this.")] = "",
+    out: Annotated[Path, typer.Option(help="Where the result goes.")] = RESULT,
+) -> None:
+    """Compare every method with the truth and write the result."""
+    torch.set_num_threads(1)
+    cells = []
+    for row in json.loads(TRUTH.read_text())["results"]:
+        for method in samplers.METHODS if env in row["env_id"] else ():
+            cells.append(compare(row, method, range(first_seed, first_seed + seeds)))
+            cell = cells[-1]
+            print(
+                f"{cell.env_id:25s} {cell.base:8s} {cell.method:9s} mean/p {cell.mean / cell.truth:.3f} "
+                f"z {cell.z:+.2f} "
+                f"coverage {cell.coverage:.2f} cov {cell.cov:.3f} own {cell.own_cov:.3f} n_sim {cell.n_sim:.0f} "
+                f"gain {cell.gain:.1f} warned {cell.warned:.2f}",
+                flush=True,
+            )
+    command = f"python -m benchmarks.estimators.against_truth --seeds {seeds} --first-seed {first_seed}"
+    out.write_text(json.dumps({"command": command, "cells": [asdict(cell) for cell in cells]}, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    typer.run(main)

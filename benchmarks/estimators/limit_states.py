@@ -1,0 +1,216 @@
+"""Kinds of limit states with known P[f(U) <= 0], U ~ N(0, I), as a benchmark needs them.
+
+More than `samplers.limit_states`, which it builds on: several regions in many dimensions, noise, jumps, ties, islands,
+intersections. All are written along the axes; N(0, I) is the same in every direction, so any rotation of them has the
+same p. `benchmarks.estimators.catalogue` has the parameters; the probabilities are closed forms or one-dimensional
+integrals.
+"""
+
+import functools
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.integrate import quad
+from scipy.special import log_ndtr, ndtr
+from scipy.stats import chi2, ncx2
+
+from samplers.limit_states import Reference
+from samplers.problem import FloatArray, FunctionProblem
+
+Function = Callable[[FloatArray], FloatArray]
+
+
+@dataclass(frozen=True)
+class LimitState:
+    """f, failing where f <= 0, and how likely that is."""
+
+    f: Function
+    """Maps points of N(0, I), shape (n, d), to (n,)."""
+    dim: int
+    p: float
+    standard_error: float = 0.0
+    """Of p; 0 where p is exact."""
+    noise: float = 0.0
+    """Standard deviation of the Gaussian noise that every evaluation adds to f."""
+
+    def problem(self, rotation: int | None = None, noise_seed: int = 0) -> FunctionProblem:
+        """Return the problem for a sampler.
+
+        Args:
+            rotation: Seed of a random rotation of the input space; None for no rotation.
+            noise_seed: Seed of the noise: one for each run.
+        """
+        f = self.f if rotation is None else _rotated(self.f, random_rotation(self.dim, rotation))
+        return FunctionProblem(_noisy(f, self.noise, noise_seed) if self.noise else f, self.dim)
+
+
+@functools.lru_cache(maxsize=8)
+def random_rotation(dim: int, seed: int) -> FloatArray:
+    """Return a random orthogonal matrix, uniform over all (QR with the signs of R made positive)."""
+    q, r = np.linalg.qr(np.random.default_rng(seed).standard_normal((dim, dim)))
+    rotation: FloatArray = q * np.sign(np.diag(r))
+    return rotation
+
+
+def known(reference: Reference) -> LimitState:
+    """Return a problem of `samplers.limit_states` as a limit state."""
+    return LimitState(reference.problem.evaluate, reference.problem.dim, reference.p)
+
+
+def half_spaces(dim: int, betas: Sequence[float], slopes: Sequence[float] = (), noise: float = 0.0) -> LimitState:
+    """One half-space along each of the first axes: f = min_k slope_k (beta_k - u_k) + noise.
+
+    p = 1 - prod_k Phi(beta_k); with noise (slopes 1) the mean of 1 - prod_k Phi(beta_k + noise z) over z ~ N(0, 1).
+    """
+    scale = np.array(slopes or [1.0] * len(betas))
+    beta = np.array(betas)
+
+    def f(u: FloatArray) -> FloatArray:
+        return np.asarray(np.min(scale * (beta - u[:, : len(beta)]), axis=1))
+
+    if not noise:
+        return LimitState(f, dim, _any(betas))
+    p = _normal_mean(lambda z: _any([b + noise * z for b in betas]))
+    return LimitState(f, dim, p, noise=noise)
+
+
+def opposite(dim: int, ahead: float, behind: float, slopes: tuple[float, float] = (1.0, 1.0)) -> LimitState:
+    """Two half-spaces that face each other: f = min(slope_0 (ahead - u_1), slope_1 (behind + u_1)).
+
+    With a small slope on the far side f leads away from the nearer one, which is most of p (Breitung, "The geometry
+    of limit state function graphs and subset simulation", 2019).
+    """
+
+    def f(u: FloatArray) -> FloatArray:
+        return np.minimum(slopes[0] * (ahead - u[:, 0]), slopes[1] * (behind + u[:, 0]))
+
+    return LimitState(f, dim, _phi(-ahead) + _phi(-behind))
+
+
+def stepped(smooth: LimitState, step: float = 0.5, cap: float = 3.0) -> LimitState:
+    """Round f up to whole steps and cap it, as a recorded time to collision may be: ties everywhere, the same p."""
+
+    def f(u: FloatArray) -> FloatArray:
+        return np.minimum(step * np.ceil(smooth.f(u) / step), cap)
+
+    return LimitState(f, smooth.dim, smooth.p)
+
+
+def bowl(dim: int, beta: float, curvature: float) -> LimitState:
+    """One design point, the boundary curving away in all directions: f = beta + curvature sum_{k>1} u_k^2 - u_1."""
+
+    def f(u: FloatArray) -> FloatArray:
+        return np.asarray(beta + curvature * np.sum(u[:, 1:] ** 2, axis=1) - u[:, 0])
+
+    radius = chi2(dim - 1)
+    low, high = radius.ppf(1e-15), radius.isf(1e-15)
+    return LimitState(f, dim, _integral(lambda q: radius.pdf(q) * _phi(-beta - curvature * q), low, high))
+
+
+def concave(beta: float = 5.0, curvature: float = 0.5, shift: float = 0.1) -> LimitState:
+    """A parabola bent around the origin, two far design points: f = beta - u_2 - curvature (u_1 - shift)^2."""
+
+    def f(u: FloatArray) -> FloatArray:
+        return np.asarray(beta - u[:, 1] - curvature * (u[:, 0] - shift) ** 2)
+
+    return LimitState(f, 2, _normal_mean(lambda s: _phi(-beta + curvature * (s - shift) ** 2), -3.2, 0.0, 3.2))
+
+
+def islands(centres: Sequence[Sequence[float]], radii: Sequence[float]) -> LimitState:
+    """Balls of failure that do not touch: f = min_k |u - centre_k| - radius_k."""
+    centre, radius = np.array(centres), np.array(radii)
+    dim = centre.shape[1]
+
+    def f(u: FloatArray) -> FloatArray:
+        distance = np.linalg.norm(u[:, None, :] - centre, axis=2)
+        return np.asarray(np.min(distance - radius, axis=1))
+
+    p = sum(float(ncx2.cdf(r * r, dim, c @ c)) for c, r in zip(centre, radius, strict=True))
+    return LimitState(f, dim, p)
+
+
+def corner(dim: int, betas: Sequence[float]) -> LimitState:
+    """Failure only where all of several things go wrong: f = max_k (beta_k - u_k)."""
+    beta = np.array(betas)
+
+    def f(u: FloatArray) -> FloatArray:
+        return np.asarray(np.max(beta - u[:, : len(beta)], axis=1))
+
+    return LimitState(f, dim, math.prod(_phi(-b) for b in betas))
+
+
+def strip(dim: int = 4, beta: float = 2.8, centre: float = 1.0, half_width: float = 0.25) -> LimitState:
+    """A thin strip behind a jump: u_1 > beta and |u_2 - centre| < half_width.
+
+    f is 5 - u_1 before beta and says nothing of u_2; beyond, it is -0.02 in the strip and the distance to it outside.
+    """
+
+    def f(u: FloatArray) -> FloatArray:
+        distance = np.abs(u[:, 1] - centre) - half_width
+        beyond = np.where(distance < 0, -0.02, np.maximum(distance, 0.02))
+        return np.where(u[:, 0] > beta, beyond, 5.0 - u[:, 0])
+
+    return LimitState(f, dim, _phi(-beta) * (_phi(centre + half_width) - _phi(centre - half_width)))
+
+
+def ring_part(dim: int = 10, p_radius: float = 2e-2, beta: float = 1.8) -> LimitState:
+    """The part with u_1 > beta of everything beyond a radius, P[|U| > r] = p_radius: f = max(r - |u|, beta - u_1)."""
+    squared = float(chi2.isf(p_radius, dim))
+    radius = math.sqrt(squared)
+
+    def f(u: FloatArray) -> FloatArray:
+        return np.asarray(np.maximum(radius - np.linalg.norm(u, axis=1), beta - u[:, 0]))
+
+    p = _normal_mean(lambda s: float(chi2.sf(max(squared - s * s, 0.0), dim - 1)), radius, low=beta)
+    return LimitState(f, dim, p)
+
+
+def hidden_box(slope: float = 0.5, beta: float = 4.6) -> LimitState:
+    """A box of failure, 2.2 < u_2 < 3.4 and -2.6 < u_3 < -1.6, that f does not announce, beside a far half-space.
+
+    f = slope (beta - u_1) outside the box. The box is nearly all of p. Nothing but a draw in it can find it.
+    """
+
+    def f(u: FloatArray) -> FloatArray:
+        box = (u[:, 1] > 2.2) & (u[:, 1] < 3.4) & (u[:, 2] > -2.6) & (u[:, 2] < -1.6)
+        return np.where(box, -1.0, slope * (beta - u[:, 0]))
+
+    box = (_phi(-2.2) - _phi(-3.4)) * (_phi(-1.6) - _phi(-2.6))
+    return LimitState(f, 3, box + (1.0 - box) * _phi(-beta))
+
+
+def never(dim: int = 4) -> LimitState:
+    """No failure that anyone will see: f = 50 - u_1; p = Phi(-50) is 0 in double precision."""
+    return LimitState(lambda u: np.asarray(50.0 - u[:, 0]), dim, 0.0)
+
+
+def _rotated(f: Function, rotation: FloatArray) -> Function:
+    return lambda u: f(u @ rotation)
+
+
+def _noisy(f: Function, sd: float, seed: int) -> Function:
+    rng = np.random.default_rng([seed, 777])
+    return lambda u: f(u) + sd * rng.standard_normal(len(u))
+
+
+def _phi(x: float) -> float:
+    return float(ndtr(x))
+
+
+def _any(betas: Sequence[float]) -> float:
+    """Return 1 - prod_k Phi(beta_k), without cancellation."""
+    return -math.expm1(float(np.sum(log_ndtr(betas))))
+
+
+def _integral(g: Callable[[float], float], low: float, high: float, *breaks: float) -> float:
+    edges = [low, *(b for b in breaks if low < b < high), high]
+    pieces = itertools.pairwise(edges)
+    return float(sum(quad(g, a, b, limit=500, epsabs=1e-18, epsrel=1e-12)[0] for a, b in pieces))
+
+
+def _normal_mean(g: Callable[[float], float], *breaks: float, low: float = -12.0) -> float:
+    """Return the integral of g(s) phi(s) over s > low, in pieces between the breaks."""
+    return _integral(lambda s: g(s) * math.exp(-0.5 * s * s) / math.sqrt(2 * math.pi), low, 12.0, *breaks)

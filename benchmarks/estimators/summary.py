@@ -1,0 +1,206 @@
+"""Runs into figures: per method and problem, pooled, and whether warnings come with the runs that are wrong."""
+
+import math
+import re
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from benchmarks.estimators.catalogue import CASES
+from benchmarks.estimators.runs import Run, limit_state
+from samplers.problem import FloatArray
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One method on one problem. NaN where a figure has no meaning, as ratios where p = 0."""
+
+    method: str
+    problem: str
+    p: float
+    runs: int
+    raised: int
+    """Runs that ended in an exception; they count as not covering and nowhere else."""
+    mean_over_p: float
+    mean_se: float
+    """Standard error of mean_over_p."""
+    cov: float
+    """Spread of the estimates / their mean."""
+    own_cov: float
+    """Mean of what the runs state."""
+    own_over_cov: float
+    gain: float
+    """(1 - p) / p / (n_sim x relative mean square error)."""
+    gain_se: float
+    """Standard error of the gain, that of the mean square error only."""
+    coverage: float
+    warned: float
+    worst: float
+    """Largest |estimate / p - 1|."""
+    n_sim: float
+    calls: float
+    seconds: float
+    """Processor time of one run without f."""
+
+
+def cells_of(runs: Iterable[Run]) -> list[Cell]:
+    """Return one cell for each method and problem, in the order of their first runs."""
+    groups: dict[tuple[str, str], list[Run]] = defaultdict(list)
+    for run in runs:
+        groups[run.method, run.problem].append(run)
+    return [cell_of(group, limit_state(group[0].problem).p) for group in groups.values()]
+
+
+def cell_of(runs: Sequence[Run], p: float) -> Cell:
+    """Summarise the runs of one method on one problem with probability p."""
+    ended = [run for run in runs if not run.error]
+    estimates = np.array([run.p for run in ended])
+    ratio = estimates / p if p > 0 else np.full(len(ended), math.nan)
+    own_cov = _mean([run.cov for run in ended if math.isfinite(run.cov)])
+    cov = _spread(ratio) / _mean(ratio)
+    error = (ratio - 1.0) ** 2
+    n_sim = _mean([run.n_sim for run in runs])
+    gain = (1.0 - p) / p / (n_sim * _mean(error)) if p > 0 and _mean(error) > 0 else math.nan
+    return Cell(
+        method=runs[0].method,
+        problem=runs[0].problem,
+        p=p,
+        runs=len(runs),
+        raised=len(runs) - len(ended),
+        mean_over_p=_mean(ratio),
+        mean_se=_spread(ratio) / math.sqrt(len(runs)),
+        cov=cov,
+        own_cov=own_cov,
+        own_over_cov=own_cov / cov if cov > 0 else math.nan,
+        gain=gain,
+        gain_se=gain * _spread(error) / (_mean(error) * math.sqrt(len(runs))) if _mean(error) > 0 else math.nan,
+        coverage=sum(covers(run, p) for run in ended) / len(runs),
+        warned=_mean([bool(run.warnings) for run in ended]),
+        worst=float(np.max(np.abs(ratio - 1.0))) if len(ended) else math.nan,
+        n_sim=n_sim,
+        calls=_mean([run.calls for run in runs]),
+        seconds=_mean([run.seconds for run in runs]),
+    )
+
+
+def covers(run: Run, p: float) -> bool:
+    """Does the interval hold p?"""
+    return run.low <= p <= run.high
+
+
+def own_errors_off(run: Run, p: float) -> float:
+    """Return by how many of its own standard errors the estimate is off.
+
+    NaN where nothing can be said: p is 0, the run raised, or it gave 0 with an interval that holds p. An estimate of 0
+    with one that does not is off by infinitely many.
+    """
+    if run.error or p == 0:
+        return math.nan
+    if run.p == 0:
+        return math.nan if covers(run, p) else math.inf
+    return abs(run.p - p) / (run.cov * run.p) if run.cov > 0 else (0.0 if run.p == p else math.inf)
+
+
+@dataclass(frozen=True)
+class Power:
+    """Do warnings come with the runs that are wrong, and only with those?"""
+
+    wrong: int
+    """Runs off by more than 4 of their own standard errors."""
+    wrong_warned: int
+    right: int
+    """Runs within 2."""
+    right_warned: int
+    texts: dict[str, tuple[int, int, int]]
+    """Runs with each warning (numbers as #): wrong, right, neither."""
+
+
+def power_of(runs: Iterable[Run]) -> Power:
+    """Return the power of the warnings over runs of one method."""
+    counts: Counter[str] = Counter()
+    texts: dict[str, Counter[str]] = defaultdict(Counter)
+    for run in runs:
+        off = own_errors_off(run, limit_state(run.problem).p)
+        kind = "wrong" if off > 4 else "right" if off <= 2 else "neither"
+        counts[kind] += 1
+        counts[f"{kind} warned"] += bool(run.warnings)
+        for text in {without_numbers(warning) for warning in run.warnings}:
+            texts[text][kind] += 1
+    return Power(
+        wrong=counts["wrong"],
+        wrong_warned=counts["wrong warned"],
+        right=counts["right"],
+        right_warned=counts["right warned"],
+        texts={
+            text: (count["wrong"], count["right"], count["neither"])
+            for text, count in sorted(texts.items(), key=lambda item: -item[1].total())
+        },
+    )
+
+
+def without_numbers(text: str) -> str:
+    """Replace the numbers in a text by #."""
+    return re.sub(r"[-+]?\d(?:[\d,]*\d)?(?:\.\d+)?(?:e[-+]?\d+)?", "#", text)
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A target and what was measured."""
+
+    target: str
+    measured: float
+    met: bool
+
+
+def pooled_coverage(cells: Sequence[Cell]) -> tuple[float, int]:
+    """Return coverage over all runs and their number, but for p = 0 and regions that cannot be known of."""
+    counted = [cell for cell in cells if cell.p > 0 and CASES[cell.problem].min_coverage is not None]
+    runs = sum(cell.runs for cell in counted)
+    return (sum(cell.coverage * cell.runs for cell in counted) / runs if runs else math.nan), runs
+
+
+def verdicts(cells: Sequence[Cell], power: Power, replicates: int = 1) -> list[Verdict]:
+    """Compare the cells of one method with what it should reach.
+
+    The default method has targets for gain, bias, intervals and warnings; the others for coverage only.
+    """
+    if cells[0].method != "two-stage":
+        needed = 0.93 if replicates >= 10 else 0.88
+        pooled, _ = pooled_coverage(cells)
+        return [Verdict(f"pooled coverage >= {needed:.0%}", pooled, pooled >= needed)]
+    out = []
+    for cell in cells:
+        case = CASES[cell.problem]
+        if case.min_gain is not None:
+            out.append(Verdict(f"{cell.problem}: gain >= {case.min_gain:,g}", cell.gain, cell.gain >= case.min_gain))
+        if cell.p == 0 or case.min_coverage is None:
+            continue
+        ratio = cell.own_over_cov
+        coverage = f"{cell.problem}: coverage >= {case.min_coverage:.0%}"
+        out += [
+            Verdict(coverage, cell.coverage, cell.coverage >= case.min_coverage),
+            Verdict(f"{cell.problem}: mean/p within 3 %", cell.mean_over_p, abs(cell.mean_over_p - 1) <= 0.03),
+            Verdict(f"{cell.problem}: own c.o.v. 0.8 to 1.3 of the real one", ratio, 0.8 <= ratio <= 1.3),
+        ]
+    pooled, _ = pooled_coverage(cells)
+    wrong, right = _share(power.wrong_warned, power.wrong), _share(power.right_warned, power.right)
+    return [
+        *out,
+        Verdict("pooled coverage >= 93%", pooled, pooled >= 0.93),
+        Verdict("wrong runs warned >= 80 %", wrong, power.wrong == 0 or wrong >= 0.80),
+        Verdict("right runs warned <= 5 %", right, power.right == 0 or right <= 0.05),
+    ]
+
+
+def _share(part: int, whole: int) -> float:
+    return part / whole if whole else math.nan
+
+
+def _mean(values: Sequence[float] | FloatArray) -> float:
+    return float(np.mean(values)) if len(values) else math.nan
+
+
+def _spread(values: FloatArray) -> float:
+    return float(np.std(values, ddof=1)) if len(values) > 1 else math.nan

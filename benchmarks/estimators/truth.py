@@ -1,0 +1,77 @@
+"""What is the IDM ego's collision probability? Plain Monte Carlo, no sampler of ours involved.
+
+    python -m benchmarks.estimators.truth --rollouts 1e7
+
+writes `benchmarks/results/truth.json`, which the tests of the samplers compare with.
+"""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import torch
+import typer
+from rich.progress import track
+
+import rare_envs
+from rare_envs.scenarios.registry import SCENARIOS
+
+RESULT = Path(__file__).parents[1] / "results" / "truth.json"
+CHUNK = 131_072
+
+ENV_IDS = ("rare_envs/CarFollowing-v0", "rare_envs/CutIn-v0")
+"""Collisions elsewhere are too rare for plain Monte Carlo, and with learned drivers a rollout is too slow."""
+
+
+def truth(env_id: str, base: str, rollouts: int, seed: int) -> dict[str, float | int | str]:
+    """Count collisions in independent draws from the base distribution.
+
+    Args:
+        env_id: The environment.
+        base: Name of the base distribution.
+        rollouts: Number of rollouts.
+        seed: Seed of the draws.
+
+    Returns:
+        The counts, the proportion and its standard error.
+    """
+    problem = rare_envs.DrivingProblem(env_id, base=base)
+    rng = np.random.default_rng(seed)
+    sizes = [min(CHUNK, rollouts - first) for first in range(0, rollouts, CHUNK)]
+    collisions = 0
+    for size in track(sizes, description=f"{env_id} {base}"):
+        collisions += int((problem.evaluate(problem.base.sample(size, rng)) <= 0.0).sum())
+    p = collisions / rollouts
+    return {
+        "env_id": env_id,
+        "base": base,
+        "ego": "idm",
+        "gamma": 0.0,
+        "rollouts": rollouts,
+        "collisions": collisions,
+        "p": p,
+        "standard_error": (p * (1.0 - p) / rollouts) ** 0.5,
+        "seed": seed,
+    }
+
+
+def main(
+    rollouts: Annotated[float, typer.Option(help="Rollouts for each scenario and base.")] = 1e7,
+    seed: int = 2026,
+    out: Path = RESULT,
+) -> None:
+    """Measure both scenarios with both bases and write the result."""
+    torch.set_num_threads(1)
+    results = []
+    for env_id in ENV_IDS:
+        for base in SCENARIOS[env_id].bases:
+            results.append(truth(env_id, base, int(rollouts), seed))
+            print(json.dumps(results[-1]))
+            command = f"python -m benchmarks.estimators.truth --rollouts {rollouts:g} --seed {seed}"
+            versions = {"rare_envs": rare_envs.__version__, "torch": torch.__version__, "numpy": np.__version__}
+            out.write_text(json.dumps({"command": command, "versions": versions, "results": results}, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,7 +1,0 @@
-"""The front camera: pictures by casting rays at road, vehicles and sky, and the weather that changes them."""
-
-from rare_envs.camera.lens import Camera, find_camera
-from rare_envs.camera.picture import take_picture
-from rare_envs.camera.weather import Sight, Weather, clear_day
-
-__all__ = ["Camera", "Sight", "Weather", "clear_day", "find_camera", "take_picture"]

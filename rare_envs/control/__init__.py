@@ -1,0 +1,1 @@
+"""Control: actions, meta-actions, the Intelligent Driver Model and steering."""

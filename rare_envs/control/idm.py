@@ -1,0 +1,96 @@
+"""IDM: the Intelligent Driver Model, and the ego that follows it and keeps its lane."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from rare_envs.control.steering import lane_keeping
+from rare_envs.traffic.lead import Lead
+from rare_envs.traffic.road import Road
+from rare_envs.traffic.state import VEHICLE_LENGTH, State
+from rare_envs.traffic.vehicle_models import NEAR_ZERO
+
+
+class Scene(Protocol):
+    """What a rule-based ego needs of an episode."""
+
+    @property
+    def state(self) -> State:
+        """State of the traffic."""
+
+    @property
+    def lead(self) -> Lead:
+        """The ego's lead in this state."""
+
+    @property
+    def road(self) -> Road:
+        """The road that all are on."""
+
+
+@dataclass(frozen=True)
+class IDM:
+    """Intelligent Driver Model with a hard maximum deceleration, on the bumper-to-bumper gap.
+
+    a = a_max [1 - (v/v0)^delta - (s*/gap)^2], at least -b_max, with
+    s* = s0 + s1 sqrt(v/v0) + T v + v dv / (2 sqrt(a_max b)).
+
+    The defaults are Tian et al.'s (2024, Table I; as found in their group's public code). The last term of s* is not
+    cut off at 0: a lead that pulls away fast from a short gap is braked for, as in HighwayEnv and in their code.
+    """
+
+    desired_speed: float = 21.72
+    """v0 [m/s]."""
+    time_headway: float = 1.2
+    """T [s]."""
+    max_acceleration: float = 2.22
+    """a_max [m/s^2]."""
+    comfortable_deceleration: float = 2.4
+    """b [m/s^2]."""
+    exponent: float = 4.0
+    """delta."""
+    jam_distance: float = 1.0
+    """s0 [m]."""
+    jam_distance_speed: float = 2.0
+    """s1 [m]."""
+    max_deceleration: float = 5.0
+    """b_max [m/s^2]: what the brakes can do."""
+    added_length: float = 0.0
+    """[m] added to the gap; HighwayEnv measures between centres, so its jam distance contains a vehicle length."""
+
+    @classmethod
+    def highway_env(cls, desired_speed: float) -> IDM:
+        """HighwayEnv's `IDMVehicle`: distance between centres, jam distance 10 m, accelerations within 6 m/s^2."""
+        return cls(desired_speed, 1.5, 3.0, 5.0, 4.0, 10.0, 0.0, 6.0, VEHICLE_LENGTH)
+
+    def acceleration(self, speed: Tensor, lead: Lead, desired_speed: Tensor | None = None) -> Tensor:
+        """The IDM acceleration.
+
+        Args:
+            speed: Speed of the follower [m/s], shape (B,).
+            lead: Its lead.
+            desired_speed: v0 [m/s] of each follower, shape (B,), in place of the common one.
+
+        Returns:
+            Acceleration [m/s^2], shape (B,).
+        """
+        v0 = self.desired_speed if desired_speed is None else desired_speed
+        ratio = speed / v0
+        closing_gain = 0.5 / (self.max_acceleration * self.comfortable_deceleration) ** 0.5
+        wanted = self.jam_distance + speed * (self.time_headway + lead.closing_speed * closing_gain)
+        if self.jam_distance_speed:
+            wanted = wanted + self.jam_distance_speed * ratio.clamp(min=1e-24).sqrt()  # a finite slope at standstill
+        crowding = wanted / (lead.gap + self.added_length).clamp(min=NEAR_ZERO)
+        free = ratio.square().square() if self.exponent == 4.0 else ratio.pow(self.exponent)
+        acceleration: Tensor = self.max_acceleration * (1.0 - free - crowding.square())
+        return acceleration.clamp(min=-self.max_deceleration)
+
+    def act(self, episode: Scene, memory: Any) -> tuple[Tensor, Any]:
+        """IDM behind the lead, lane keeping across; no memory."""
+        state = episode.state
+        speed = state.speed[:, 0]
+        steering = lane_keeping(state.y[:, 0], state.heading[:, 0], speed, episode.road)
+        return torch.stack((self.acceleration(speed, episode.lead), steering), dim=1), memory

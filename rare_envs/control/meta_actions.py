@@ -1,0 +1,144 @@
+"""HighwayEnv's meta-actions: a policy names a lane or a speed, and two controllers drive there.
+
+`DiscreteMetaAction` with an `MDPVehicle`, HighwayEnv's defaults: the policy is asked once a second; in between a speed
+controller and a steering controller act at every tick. What they aim for is an `Aim`, the only memory there is.
+
+On a straight road the motion is HighwayEnv's own. On a curved one lanes, offsets and headings are those along the road,
+and the steering looks ahead by 0.1 s as HighwayEnv's does on its curved lanes.
+
+References:
+    Leurent, "An environment for autonomous driving decision-making", 2018: HighwayEnv,
+    `envs/common/action.py` and `vehicle/controller.py`.
+"""
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from rare_envs.control.actions import FASTER, IDLE, LANE_LEFT, LANE_RIGHT, SLOWER
+from rare_envs.control.steering import steering_control
+from rare_envs.traffic.road import Road
+from rare_envs.traffic.state import State
+
+TARGET_SPEEDS = (20.0, 25.0, 30.0)
+"""Speeds [m/s] that a policy may choose, equally spaced."""
+DECISION = 1.0
+"""Time between two decisions of the policy [s]: HighwayEnv's `policy_frequency` of 1 Hz."""
+_TAU_SPEED = 0.6
+"""Time constant of the speed controller [s]."""
+_TAU_PURSUIT = 0.1
+"""How far ahead the steering controller looks at the road's heading [s]."""
+
+
+class Aim(NamedTuple):
+    """What the controllers aim for; integers of one shape, one for each vehicle."""
+
+    lane: Tensor
+    """Index of the target lane, 0 the leftmost."""
+    speed: Tensor
+    """Index of the target speed in `TARGET_SPEEDS`."""
+
+
+def aim_of(state: State, road: Road) -> Aim:
+    """What controllers aim for at first, shape (B, N): the vehicle's lane, the target speed nearest to its speed."""
+    return Aim(road.lane_of(state.y), _nearest_speed(state.speed))
+
+
+def follow(aim: Aim, action: Tensor, commanded: Tensor | None, state: State, road: Road) -> tuple[Aim, Tensor]:
+    """What meta-actions make of vehicles for one tick.
+
+    A vehicle that does not obey its action has no aim of its own: when it begins to obey, it aims for where it is.
+
+    Args:
+        aim: Of all vehicles, shape (B, N).
+        action: Meta-actions of the ego, shape (B,); with `commanded` of all vehicles, shape (B, N).
+        commanded: Which vehicles obey, boolean, shape (B, N); the ego always does. None if no other does.
+        state: Traffic of B scenarios.
+        road: Their road.
+
+    Returns:
+        The new aim, and acceleration [m/s^2] and steering angle [rad], shape (B, 2), or (B, N, 2) with `commanded`.
+    """
+    if commanded is None:
+        pad = state.x.shape[1] - 1
+        alone, physical = follow(
+            aim,
+            torch.nn.functional.pad(action[:, None], (0, pad), value=IDLE),
+            torch.zeros_like(state.x, dtype=torch.bool),
+            state,
+            road,
+        )
+        return alone, physical[:, 0]
+    obeys = commanded.clone()
+    obeys[:, 0] = True
+    aim = Aim(*(torch.where(obeys, old, new) for old, new in zip(aim, aim_of(state, road), strict=True)))
+    aim = decide(aim, torch.where(obeys, action, IDLE), state.y, state.speed, road)
+    return aim, control(aim, state.x, state.y, state.heading, state.speed, road)
+
+
+def decide(aim: Aim, action: Tensor, y: Tensor, speed: Tensor, road: Road) -> Aim:
+    """Follow meta-actions.
+
+    Left and right move the target lane by one from the present target, if there is such a lane and its middle is within
+    two lane widths of the vehicle. Faster and slower aim for the speed after or before the one nearest to the vehicle's
+    present speed (not to the present target).
+
+    Args:
+        aim: What the controllers have aimed for so far.
+        action: Indices of `rare_envs.control.actions.META_ACTIONS`, of the same shape.
+        y: Place across the road [m], likewise.
+        speed: Speed [m/s], likewise.
+        road: The road.
+
+    Returns:
+        What they aim for now; where the action is idle, the same.
+    """
+    centres, widths = _lanes(road, y.dtype, y.device)
+    aside = (action == LANE_RIGHT).long() - (action == LANE_LEFT).long()
+    wanted = (aim.lane + aside).clamp(0, road.lanes - 1)
+    reachable = (y - centres[wanted]).abs() <= 2.0 * widths[wanted]
+    change = (action == FASTER).long() - (action == SLOWER).long()
+    changed = (_nearest_speed(speed) + change).clamp(0, len(TARGET_SPEEDS) - 1)
+    return Aim(torch.where(reachable, wanted, aim.lane), torch.where(change != 0, changed, aim.speed))
+
+
+def control(aim: Aim, x: Tensor, y: Tensor, heading: Tensor, speed: Tensor, road: Road) -> Tensor:
+    """What HighwayEnv's two low-level controllers do for one tick.
+
+    Acceleration is (target speed - speed) / 0.6 s, without a limit. Steering as in
+    `rare_envs.control.steering.steering_control`, towards the middle of the target lane.
+
+    Args:
+        aim: What they aim for.
+        x: Place along the road [m], of the same shape, as the other tensors.
+        y: Place across the road [m].
+        heading: Relative to the road [rad].
+        speed: [m/s].
+        road: The road.
+
+    Returns:
+        Acceleration [m/s^2] and steering angle [rad], in a last axis of 2.
+    """
+    acceleration = (speed.new_tensor(TARGET_SPEEDS)[aim.speed] - speed) / _TAU_SPEED
+    centres, _ = _lanes(road, y.dtype, y.device)
+    if road.curve is not None:
+        ahead = road.curve.at(x + speed * _TAU_PURSUIT).heading - road.curve.at(x).heading
+        heading = heading - ahead
+    return torch.stack((acceleration, steering_control(y - centres[aim.lane], heading, speed)), dim=-1)
+
+
+def _nearest_speed(speed: Tensor) -> Tensor:
+    """Index of the nearest target speed; half-way between two the even one, as NumPy rounds."""
+    first, last = TARGET_SPEEDS[0], TARGET_SPEEDS[-1]
+    index = torch.round((speed - first) / (last - first) * (len(TARGET_SPEEDS) - 1))
+    return index.clamp(0, len(TARGET_SPEEDS) - 1).long()
+
+
+@lru_cache(maxsize=32)
+def _lanes(road: Road, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Centres and widths of the lanes [m]."""
+    with torch.inference_mode(False):
+        edges = torch.tensor(road.edges, dtype=dtype, device=device)
+        return (edges[1:] + edges[:-1]) / 2, edges[1:] - edges[:-1]

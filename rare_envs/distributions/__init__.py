@@ -1,0 +1,1 @@
+"""Distributions of scenario parameters and the spaces that they live on."""

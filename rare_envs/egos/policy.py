@@ -1,0 +1,139 @@
+"""Policies as drivers: objects with the `predict` of Stable-Baselines3, and the check of their spaces."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from torch import Tensor
+
+from rare_envs.control.actions import DISCRETE_ACTIONS, IDLE, META_ACTIONS
+from rare_envs.control.idm import IDM
+from rare_envs.egos.inference import Asked, ask
+from rare_envs.egos.wrappers import fitted, frames_of, observation_for
+from rare_envs.sensors.kinds import each
+from rare_envs.simulation.background import Background
+from rare_envs.simulation.observation import observe
+from rare_envs.simulation.rollout import Driver
+from rare_envs.simulation.world import World, space_of_observations
+
+if TYPE_CHECKING:
+    from rare_envs.simulation.episode import Episode
+
+
+@dataclass(frozen=True)
+class PolicyDriver:
+    """Any object with Stable-Baselines3's `predict`, called on the whole batch."""
+
+    policy: Any
+    observation: str = "features"
+    """What it observes."""
+    action: str = "continuous"
+    """What its actions are."""
+    stride: int = 1
+    """It is asked every so many ticks; meta-actions only are carried out in between."""
+    lost: dict[int, str] | None = None
+    """Where rows are written down on which the policy fails, with the reason; None if such a failure is raised."""
+
+    def act(self, episode: Episode, memory: Any) -> tuple[Tensor, Any]:
+        """Observe, and ask the policy for its mean action; a recurrent policy's hidden state is the memory.
+
+        No episode shows a policy what comes after its collision, so those rows are shown what another row sees, and
+        their actions are ignored. So it is with rows that are lost.
+
+        Raises:
+            ValueError: If the policy's actions are not finite or have the wrong shape, and rows cannot be lost.
+        """
+        state, over = episode.state, episode.collided
+        batch = len(over)
+        hidden, tick = (None, 0) if memory is None else memory
+        if tick % self.stride:
+            return torch.full((batch,), IDLE, device=state.x.device), (hidden, tick + 1)
+        if self.lost:
+            over = over.clone()
+            over[list(self.lost)] = True
+        seen = observe(episode, self.observation)
+        observation = each(lambda part: _replaced(part, over).numpy(force=True), seen)
+        start = np.full(batch, memory is None)
+        given, hidden = ask(self.policy, self.action, Asked(observation, hidden, start, over), self.lost)
+        return given.to(state.x) if given.is_floating_point() else given, (hidden, tick + 1)
+
+
+def _replaced(observation: Tensor, rows: Tensor) -> Tensor:
+    """An observation with what the first other row sees in some rows; zeros if there is no other."""
+    wide = rows.view(-1, *[1] * (observation.ndim - 1))
+    if bool(rows.all()):
+        return observation.masked_fill(wide, 0)
+    return torch.where(wide, observation[int((~rows).int().argmax())], observation)
+
+
+def as_driver(ego: Any, world: World) -> Driver:
+    """The Driver that an ego stands for.
+
+    Raises:
+        ValueError: If it is neither "idm", nor a Driver, nor an object with `predict` whose spaces fit.
+    """
+    if isinstance(ego, str):
+        if ego == "idm":
+            return IDM()
+        raise ValueError(
+            f"Unknown ego {ego!r}; expected 'idm' or an object. Names and files become objects by "
+            f"agents.load_ego({ego!r})."
+        )
+    if isinstance(ego, type):
+        raise ValueError(f"Expected an ego, got the class {ego.__name__}; make or train one of it first.")
+    if callable(getattr(ego, "in_world", None)):
+        made: Driver = ego.in_world(world)
+        return made
+    if getattr(ego, "sees", False):  # a Driver that looks by itself, whatever the environment observes
+        looking: Driver = ego
+        return looking
+    if callable(getattr(ego, "predict", None)):
+        expected = space_of_observations(world)
+        check_spaces(ego, expected, world.action)
+        tick = getattr(ego, "dt", None)
+        if tick is not None and tick != world.dt:
+            raise ValueError(f"Expected dt={tick:g} s, which this ego remembers pictures by, got {world.dt:g} s.")
+        return PolicyDriver(fitted(ego, expected), world.observation, world.action, world.stride)
+    if isinstance(ego, Background):
+        raise ValueError("These drivers drive the traffic around an ego; as an ego take agents.LearnedEgo(driver).")
+    if callable(getattr(ego, "act", None)):
+        driver: Driver = ego
+        return driver
+    raise ValueError(f"Expected an ego with a method predict(observation, ...), got {type(ego).__name__}.")
+
+
+def check_spaces(ego: Any, expected: spaces.Space[Any], action: str = "continuous") -> None:
+    """Refuse an ego that was made for other observations or actions; one that does not tell is taken at its word.
+
+    Bounds may differ: HighwayEnv declares none for the observations that are clipped here as there.
+
+    Raises:
+        ValueError: If its `observation_space` or `action_space` does not fit.
+    """
+    observed = getattr(ego, "observation_space", None)
+    if observed is not None and frames_of(expected, observed) is None:
+        wanted = observation_for(ego)
+        which = "another observation" if wanted == "features" else f"observation={wanted!r}"
+        raise ValueError(
+            f"The ego expects observations {observed}, the environment gives {expected}; "
+            f"train it in this environment or choose {which}."
+        )
+    acted = getattr(ego, "action_space", None)
+    if acted is not None and action == "meta":
+        if not (isinstance(acted, spaces.Discrete) and int(acted.n) == len(META_ACTIONS)):
+            raise ValueError(
+                f"The ego acts in {acted}, the environment takes Discrete({len(META_ACTIONS)}) "
+                f"({', '.join(META_ACTIONS)}); leave action='meta' out for an ego that accelerates and steers."
+            )
+        return
+    discrete = isinstance(acted, spaces.Discrete) and int(acted.n) == len(DISCRETE_ACTIONS)
+    several = isinstance(acted, spaces.MultiDiscrete | spaces.MultiBinary)
+    if acted is not None and not discrete and (several or getattr(acted, "shape", None) != (2,)):
+        raise ValueError(
+            f"The ego acts in {acted}, the environment takes Box(-1, 1, (2,)) (acceleration, steering) "
+            f"or Discrete({len(DISCRETE_ACTIONS)})."
+        )

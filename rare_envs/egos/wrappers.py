@@ -1,0 +1,147 @@
+"""What stands between an environment and a policy trained behind wrappers: normalised and stacked observations."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from rare_envs.sensors.kinds import KINDS, batch_size, each, read_kinds
+from rare_envs.simulation.observation import observation_space
+
+Array = NDArray[Any]
+Shape = tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Normalised:
+    """A policy whose observations first go through a function, such as SB3's `VecNormalize.normalize_obs`."""
+
+    policy: Any
+    normalise: Callable[[Array], Array]
+
+    def predict(
+        self, observation: Array, state: Any = None, episode_start: Array | None = None, deterministic: bool = True
+    ) -> tuple[Array, Any]:
+        """Stable-Baselines3's `predict` on observations as the environment gives them."""
+        shown = self.normalise(observation)
+        action, state = self.policy.predict(
+            shown, state=state, episode_start=episode_start, deterministic=deterministic
+        )
+        return action, state
+
+
+@dataclass(frozen=True)
+class Stacked:
+    """A policy that sees the last k observations; they are kept in its state, oldest first.
+
+    With one axis as in SB3's `VecFrameStack` (side by side along the last axis, zeros before the first observation),
+    with a new axis as in Gymnasium's `FrameStackObservation` (copies of the first observation before it).
+    """
+
+    policy: Any
+    frames: int
+    """k."""
+    new_axis: bool = False
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Array | None = None, deterministic: bool = True
+    ) -> tuple[Array, Any]:
+        """Stable-Baselines3's `predict` on single observations."""
+        starts = np.full(batch_size(observation), state is None)
+        if episode_start is not None:
+            starts |= np.asarray(episode_start, dtype=bool)
+
+        def later(old: Array, now: Array) -> Array:
+            new: Array = np.concatenate((old[1:], now[None]))
+            new[:-1, starts] = now[starts] if self.new_axis else 0
+            return new
+
+        def side_by_side(frames: Array) -> Array:
+            shown = np.moveaxis(frames, 0, 1) if self.new_axis else np.concatenate(tuple(frames), axis=-1)
+            return np.ascontiguousarray(shown)
+
+        fresh = each(lambda now: np.zeros((self.frames, *now.shape), now.dtype), observation)  # (k, B, ...)
+        seen, inner = (fresh, None) if state is None else state
+        seen = each(later, seen, observation)
+        shown = each(side_by_side, seen)
+        action, inner = self.policy.predict(
+            shown, state=inner, episode_start=episode_start, deterministic=deterministic
+        )
+        return action, (seen, inner)
+
+
+def stacking(given: Shape, wanted: Shape) -> tuple[int, bool] | None:
+    """How many frames of shape `given` make an observation of shape `wanted`.
+
+    Returns:
+        Their number, and whether they lie along an axis of their own; None if the shapes do not go together.
+    """
+    if wanted == given:
+        return 1, False
+    if len(wanted) == len(given) + 1 and wanted[1:] == given:
+        return wanted[0], True
+    if len(wanted) != len(given) or not given or wanted[:-1] != given[:-1]:
+        return None
+    frames, rest = divmod(wanted[-1], given[-1])
+    return (frames, False) if frames and not rest else None
+
+
+def observation_for(ego: Any, vehicles: int = 1) -> str:
+    """What to show an ego where nobody says: what its space tells, else "features".
+
+    Args:
+        ego: A `Dict` names the kinds, such as "camera+speed"; the space of "lidar" is known by its shape.
+        vehicles: Of the scenario, whose features may have that shape too.
+    """
+    space = getattr(ego, "observation_space", None)
+    if space == observation_space(vehicles, "lidar") != observation_space(vehicles, "features"):
+        return "lidar"
+    names = set(space.spaces) if isinstance(space, spaces.Dict) else set[str]()
+    return read_kinds(sorted(names)) if names and names <= set(KINDS) else "features"
+
+
+def frames_of(given: spaces.Space[Any], wanted: Any) -> tuple[int, bool] | None:
+    """`stacking` for spaces: mappings by name, where all have to agree, and images also with their channels first.
+
+    Args:
+        given: Space of the environment's observations.
+        wanted: Space of the policy's.
+    """
+    if isinstance(given, spaces.Dict):
+        if not isinstance(wanted, spaces.Dict) or set(given.spaces) != set(wanted.spaces):
+            return None
+        found = {frames_of(space, wanted[name]) for name, space in given.spaces.items()}
+        return found.pop() if len(found) == 1 else None
+    if given.shape is None or getattr(wanted, "shape", None) is None:
+        return None
+    shape = tuple(wanted.shape)
+    straight = stacking(given.shape, shape)
+    if straight is None and given.dtype == wanted.dtype == np.uint8 and len(shape) == 3:  # SB3 transposes by itself
+        return stacking(given.shape, (*shape[1:], shape[0]))
+    return straight
+
+
+def fitted(policy: Any, given: spaces.Space[Any]) -> Any:
+    """The policy behind the wrappers that it was trained with, so that it takes the environment's observations.
+
+    Args:
+        policy: Has `predict`; its `observation_space`, if it has one, tells how many frames it sees, and
+            `get_vec_normalize_env`, if it has one, SB3's `VecNormalize`, whose space tells whether observations are
+            normalised before or after they are stacked.
+        given: Space of the environment's observations.
+    """
+    wanted = getattr(policy, "observation_space", None)
+    frames, new_axis = (frames_of(given, wanted) if wanted is not None else None) or (1, False)
+    statistics: Any = getattr(policy, "get_vec_normalize_env", lambda: None)()
+    normalise = statistics.normalize_obs if statistics is not None and statistics.norm_obs else None
+    whole = normalise is not None and frames_of(statistics.observation_space, wanted) == (1, False)
+    if normalise is not None and whole:
+        policy = Normalised(policy, normalise)
+    if frames > 1 or new_axis:
+        policy = Stacked(policy, frames, new_axis)
+    if normalise is not None and not whole:
+        policy = Normalised(policy, normalise)
+    return policy

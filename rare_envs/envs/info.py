@@ -1,0 +1,57 @@
+"""What environments say beside observation and reward: `info` of one episode."""
+
+from typing import Any
+
+from numpy.typing import NDArray
+
+from rare_envs.distributions.space import ScenarioSpace
+from rare_envs.multi_agent.episode import order_of
+from rare_envs.multi_agent.rewards import terms_of
+from rare_envs.simulation.episode import Episode
+from rare_envs.traffic.crash import describe
+
+Info = dict[str, Any]
+
+
+def info_of(space: ScenarioSpace, x: NDArray[Any], episode: Episode) -> Info:
+    """Info of one episode at any moment: `scenario`, `x`, `min_ttc` [s] and `collision`.
+
+    Args:
+        space: Of its parameters.
+        x: They, shape (d,).
+        episode: A batch of one, in a world with a witness.
+    """
+    assert episode.witness is not None
+    collided = bool(episode.collided)
+    return {
+        "scenario": space.named(x),
+        "x": x.copy(),
+        "min_ttc": 0.0 if collided else float(episode.witness.least_ttc),
+        "collision": collided,
+    }
+
+
+def step_info(
+    space: ScenarioSpace, x: NDArray[Any], episode: Episode, reward: Any, over: bool, vehicle: int = 0
+) -> Info:
+    """Info after a step: `reward_terms` too, and at the end of the episode `measure`, `crash` and `collision_type`.
+
+    Args:
+        space: Of the scenario's parameters.
+        x: They, shape (d,).
+        episode: A batch of one, as a vehicle lives it.
+        reward: Of the step, with its terms.
+        over: Whether this is the end.
+        vehicle: Whose episode it is.
+    """
+    info = info_of(space, x, episode)
+    info["reward_terms"] = {name: float(value) for name, value in terms_of(reward).items()}
+    if over:
+        assert episode.witness is not None
+        info["measure"] = float(episode.f)
+        info["crash"] = crash = describe(episode.witness.crash)
+        info["collision_type"] = None if crash is None else crash["kind"]
+        if crash is not None and vehicle:
+            order = order_of(vehicle, episode.state.x.shape[1])
+            crash["vehicles"] = [each if each < 0 else order[each] for each in crash["vehicles"]]
+    return info

@@ -1,0 +1,175 @@
+"""Several agents in many scenarios: a `gymnasium.vector.VectorEnv` whose rows are agents that share one policy."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+from numpy.typing import NDArray
+from torch import Tensor
+
+from rare_envs.control.actions import IDLE, read_actions, space_of_actions
+from rare_envs.egos.policy import as_driver
+from rare_envs.envs.batch_rows import merged, put, rows_of
+from rare_envs.envs.parallel import chosen_agents, chosen_rewards
+from rare_envs.make import set_up
+from rare_envs.multi_agent.episode import Crowd, gather
+from rare_envs.multi_agent.rewards import Reward, total_of
+from rare_envs.multi_agent.step import carry_out
+from rare_envs.sensors.kinds import each
+from rare_envs.simulation.observation import observe
+from rare_envs.simulation.world import space_of_observations
+
+Array = NDArray[Any]
+
+
+class AgentsVectorEnv(VectorEnv[NDArray[np.float32], Array, Array]):
+    """`DrivingParallelEnv` for a batch of B scenarios with A agents each, with Gymnasium's SAME_STEP autoreset.
+
+    Row b A + a is agent a of scenario b. A scenario is replaced within the step when the ego or an agent collides, or
+    at the horizon. That terminates the rows of agents that have collided, all rows if it was the ego, and truncates the
+    others: what they lived through is cut short, so a learner should bootstrap there.
+    """
+
+    metadata = {  # noqa: RUF012  (Gymnasium's own form)
+        "render_modes": [],
+        "autoreset_mode": AutoresetMode.SAME_STEP,
+    }
+
+    def __init__(
+        self,
+        env_id: str,
+        scenarios: int = 1,
+        *,
+        agents: Sequence[str] | None = None,
+        ego: Any = "idm",
+        rewards: Mapping[str, Reward] | None = None,
+        **kwargs: Any,
+    ) -> None:
+        """Make the batch.
+
+        Args:
+            env_id: The scenario's registered id.
+            scenarios: B.
+            agents: Names of the vehicles that act, as in `DrivingParallelEnv`; None for all.
+            ego: Who drives the ego if it is no agent; without memory, because scenarios begin at different times.
+            rewards: Rewards of agents by name, as in `DrivingParallelEnv`.
+            **kwargs: See `rare_envs.make.set_up`.
+
+        Raises:
+            ValueError: If an argument is invalid.
+        """
+        if not isinstance(scenarios, (int, np.integer)) or isinstance(scenarios, bool) or scenarios < 1:
+            raise ValueError(f"Expected one or more scenarios, got {scenarios!r}.")
+        world, self.space = set_up(env_id, **kwargs)
+        self.world = replace(world, witnessed=True)
+        scenario = self.world.scenario
+        self.agents = chosen_agents(scenario, agents)
+        self.scenarios = int(scenarios)
+        self.num_envs = self.scenarios * len(self.agents)
+        self._vehicles = [scenario.vehicle_names.index(agent) for agent in self.agents]
+        by_name = chosen_rewards(self.agents, rewards)
+        self._rewards = {vehicle: by_name[agent] for vehicle, agent in zip(self._vehicles, self.agents, strict=True)}
+        self._driver = as_driver(ego, self.world)
+        self.single_observation_space = space_of_observations(self.world)
+        self.single_action_space = space_of_actions(self.world.action)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self._tick = np.zeros(self.scenarios, dtype=np.int64)
+        self._x = np.full((self.scenarios, self.space.dim), np.nan)
+        self._crowd: Crowd | None = None
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Start all scenarios.
+
+        Args:
+            seed: Seeds the one generator of the batch; of a list the first.
+            options: As in `DrivingVectorEnv.reset`, for the B scenarios.
+
+        Returns:
+            Observations, shape (B A, F), and infos.
+        """
+        super().reset(seed=seed[0] if isinstance(seed, list) else seed)
+        self._x = self.space.scenario_x(options, self.scenarios, self.np_random)
+        self._tick[:] = 0
+        with torch.inference_mode():
+            self._crowd = gather(self.world, torch.from_numpy(self._x).float())
+            return self._observe(self._crowd), {}
+
+    def step(self, actions: Array) -> tuple[NDArray[np.float32], NDArray[np.float64], Array, Array, dict[str, Any]]:
+        """Carry out one decision of each agent and replace the scenarios that ended.
+
+        Raises:
+            ValueError: If the actions have the wrong shape or are NaN.
+        """
+        if self._crowd is None:
+            raise RuntimeError("Expected reset() before step().")
+        with torch.inference_mode():
+            chosen, commanded = self._read(torch.as_tensor(np.asarray(actions)))
+            crowd, earned, memory = carry_out(
+                self.world, self._crowd, chosen, commanded, self._rewards, self._driver, None
+            )
+            _refuse_memory(memory)
+            observation = self._observe(crowd)
+            reward = self._by_row([total_of(earned[vehicle]) for vehicle in self._vehicles]).double().numpy()
+        self._tick += self.world.stride
+        collided, ego = crowd.collided, crowd.views[0].collided
+        own = self._by_row([collided[:, vehicle] for vehicle in self._vehicles]).numpy()
+        crash = ego.numpy() | own.reshape(self.scenarios, -1).any(axis=1)
+        done = crash | (self._tick >= self.world.ticks)
+        done_rows, ego_rows = (each.repeat(len(self.agents)) for each in (done, ego.numpy()))
+        terminated = own | ego_rows
+        infos: dict[str, Any] = {}
+        if done.any():
+            infos["final_obs"], infos["_final_obs"] = rows_of(observation, done_rows), done_rows.copy()
+            final: dict[str, Any] = {}
+            put(final, "collision", own, done_rows)
+            put(final, "ego_collision", ego_rows, done_rows)
+            measures = self._by_row([crowd.views[vehicle].f for vehicle in self._vehicles])
+            put(final, "measure", measures.double().numpy(), done_rows)
+            infos["final_info"], infos["_final_info"] = final, done_rows.copy()
+            crowd = self._replaced(crowd, np.flatnonzero(done))
+            with torch.inference_mode():
+                observation = self._observe(crowd)
+        self._crowd = crowd
+        return observation, reward, terminated, done_rows & ~terminated, infos
+
+    def _read(self, actions: Tensor) -> tuple[Tensor, Tensor]:
+        """Actions of all vehicles, (B, N, 2) or (B, N), and who is commanded (B, N)."""
+        given = read_actions(self.world.action, actions, self.num_envs)
+        given = given.view(self.scenarios, len(self.agents), *given.shape[1:])
+        shape = (self.scenarios, self.world.scenario.vehicles)
+        chosen = torch.full(shape, IDLE) if self.world.action == "meta" else torch.zeros(*shape, 2)
+        chosen[:, self._vehicles] = given
+        commanded = torch.zeros(shape, dtype=torch.bool)
+        commanded[:, self._vehicles] = True
+        return chosen, commanded
+
+    def _by_row(self, columns: list[Tensor]) -> Tensor:
+        """Values of the agents, (B, ...) each, as (B A, ...)."""
+        return torch.stack(columns, dim=1).flatten(0, 1)
+
+    def _observe(self, crowd: Crowd) -> Any:
+        views = [observe(crowd.views[vehicle], self.world.observation) for vehicle in self._vehicles]
+        return each(lambda *parts: self._by_row(list(parts)).numpy(), *views)
+
+    def _replaced(self, crowd: Crowd, rows: NDArray[np.intp]) -> Crowd:
+        x = self.space.scenario_x(None, len(rows), self.np_random)
+        self._x[rows], self._tick[rows] = x, 0
+        with torch.inference_mode():
+            fresh = gather(self.world, torch.from_numpy(x).float())
+            return merged(crowd, torch.from_numpy(rows), fresh)
+
+
+def _refuse_memory(memory: Any) -> None:
+    kept = memory[0] if isinstance(memory, tuple) else memory
+    if kept is not None:
+        raise ValueError(
+            "Expected an ego without memory: scenarios of a batch begin at different times, and a recurrent or stacked "
+            "policy would remember another one's. rare_envs.parallel_env takes such egos."
+        )

@@ -1,0 +1,146 @@
+"""What a HighwayEnv environment has for parameters, and how they are put into its scene."""
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from highway_env.vehicle.behavior import IDMVehicle
+from highway_env.vehicle.controller import ControlledVehicle, MDPVehicle
+from highway_env.vehicle.kinematics import Vehicle
+
+from rare_envs.distributions.beta import BetaLaw
+from rare_envs.distributions.space import Distribution, Parameter
+from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
+
+Values = Mapping[str, Any]
+"""Names to numbers, or to arrays for parameters of several vehicles."""
+LENGTH: float = Vehicle.LENGTH
+
+
+@dataclass(frozen=True)
+class Group:
+    """Parameters that are drawn together, independent of all others."""
+
+    parameters: tuple[Parameter, ...]
+    law: Distribution
+    usual: float | None = None
+    """What HighwayEnv always takes; None where it draws."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The parameters of a kind of environment."""
+
+    groups: Callable[[Any, int], list[Group]]
+    """An environment and a number of vehicles to the parameters of the scene."""
+    arrange: Callable[[Any, Values], None]
+    """Puts values into the scene that the environment has just made."""
+    vehicles: tuple[int, int | None]
+    """Default number of vehicles with parameters, and the largest; None for as many as there are."""
+    idm: tuple[float, float, float, float] = (1.5, 5.0, 3.0, 5.0)
+    """HighwayEnv's values of `IDM`, in its order."""
+    leftover: bool = True
+    """Whether anything is left that HighwayEnv draws."""
+    prepare: Callable[[Any], None] = lambda env: None
+    """Called once on the environment."""
+
+
+@dataclass(frozen=True)
+class _Setting:
+    """A parameter of IDM that is an attribute of HighwayEnv's vehicles, as sign * value + shift."""
+
+    attribute: str
+    unit: str
+    low: float
+    high: float
+    spread: float
+    meaning: str
+    sign: float = 1.0
+    shift: float = 0.0
+
+
+IDM = {
+    "time_headway": _Setting("TIME_WANTED", "s", 0.1, 5.0, 1.0, "time gap that the others want"),
+    "jam_distance": _Setting(
+        "DISTANCE_WANTED", "m", 0.0, 20.0, 2.0, "bumper gap that they want at standstill", shift=LENGTH
+    ),
+    "max_acceleration": _Setting("COMFORT_ACC_MAX", "m/s^2", 0.5, 10.0, 1.5, "their largest acceleration"),
+    "comfortable_deceleration": _Setting("COMFORT_ACC_MIN", "m/s^2", 0.5, 10.0, 1.5, "their comfortable one", -1.0),
+}
+"""Parameters of the Intelligent Driver Model that all vehicles but the ego share; the law of each is a Beta(2, 2)
+around HighwayEnv's value."""
+
+
+def idm_groups(layout: Layout) -> list[Group]:
+    """One group for each parameter of IDM."""
+    found = []
+    for usual, (name, it) in zip(layout.idm, IDM.items(), strict=True):
+        spread = min(it.spread, usual - it.low, it.high - usual)
+        parameter = Parameter(name, it.unit, it.low, it.high, it.meaning)
+        found.append(Group((parameter,), beta(2.0, [usual - spread], [usual + spread]), usual))
+    return found
+
+
+def set_idm(vehicles: list[Any], values: Values) -> None:
+    """Give vehicles their parameters. They are set on the vehicles: HighwayEnv's intersection changes the class."""
+    for vehicle in vehicles:
+        if isinstance(vehicle, IDMVehicle):
+            for name, it in IDM.items():
+                setattr(vehicle, it.attribute, it.sign * float(values[name]) + it.shift)
+
+
+@contextmanager
+def class_kept(kind: type) -> Iterator[None]:
+    """Put the parameters of IDM of a class back afterwards: HighwayEnv's intersection changes them for good."""
+    before = {it.attribute: getattr(kind, it.attribute) for it in IDM.values() if hasattr(kind, it.attribute)}
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            setattr(kind, name, value)
+
+
+def beta(shape: float, low: list[float], high: list[float]) -> BetaLaw:
+    """Independent Beta(shape, shape) on ranges; shape 1 is uniform."""
+    size = len(low)
+    return BetaLaw(np.full(size, shape), np.full(size, shape), np.array(low), np.array(high))
+
+
+def normal(mean: list[float], deviation: list[float], reach: float = 4.0) -> TruncatedGaussianMixture:
+    """Independent normal variables, cut off at `reach` standard deviations (6e-5 of the mass at 4)."""
+    centre, sd = np.array(mean), np.array(deviation)
+    return TruncatedGaussianMixture(
+        np.ones(1), centre[None], np.diag(sd**2)[None], centre - reach * sd, centre + reach * sd
+    )
+
+
+def lane_number(coordinate: float, lanes: int) -> int:
+    """The lane of a coordinate in [0, lanes]: its whole part, so that lanes are equally likely under a uniform law."""
+    return min(int(coordinate), lanes - 1)
+
+
+def move(vehicle: Any, lane_index: tuple[str, str, int], place: float, speed: float) -> None:
+    """Put a vehicle into the middle of a lane, as if HighwayEnv had made it there.
+
+    Args:
+        vehicle: Of HighwayEnv.
+        lane_index: The lane.
+        place: Along the lane [m].
+        speed: [m/s].
+    """
+    lane = vehicle.road.network.get_lane(lane_index)
+    vehicle.position = np.array(lane.position(place, 0.0), dtype=np.float64)
+    vehicle.heading, vehicle.speed = lane.heading_at(place), float(speed)
+    vehicle.history.clear()
+    vehicle.on_state_update()
+    if isinstance(vehicle, ControlledVehicle):
+        vehicle.target_lane_index, vehicle.target_speed = vehicle.lane_index, vehicle.speed
+        if vehicle.route:
+            vehicle.plan_route_to(vehicle.route[-1][1])
+    if isinstance(vehicle, MDPVehicle):
+        vehicle.speed_index = vehicle.speed_to_index(vehicle.speed)
+        vehicle.target_speed = vehicle.index_to_speed(vehicle.speed_index)
+    if isinstance(vehicle, IDMVehicle):
+        vehicle.timer = (np.sum(vehicle.position) * np.pi) % vehicle.LANE_CHANGE_DELAY

@@ -1,0 +1,162 @@
+"""From the keyword arguments of `gym.make` to a world and its scenario space."""
+
+import inspect
+from typing import Any
+
+import numpy as np
+import torch
+
+from rare_envs.control.actions import ACTIONS
+from rare_envs.distributions.product import NoiseLaw, beside
+from rare_envs.distributions.space import Distribution, Parameter, ScenarioSpace
+from rare_envs.measures.registry import named_measure
+from rare_envs.plugins import did_you_mean
+from rare_envs.scenarios.base_distributions import load_base
+from rare_envs.scenarios.registry import find_scenario
+from rare_envs.sensors.camera import find_camera
+from rare_envs.sensors.kinds import read_kinds
+from rare_envs.simulation.background import find_drivers
+from rare_envs.simulation.world import World
+
+
+def set_up(
+    env_id: str,
+    *,
+    observation: str | list[str] | tuple[str, ...] = "features",
+    action: str = "continuous",
+    measure: Any = "ttc",
+    horizon: float | None = None,
+    dt: float = 0.1,
+    base: Any = None,
+    drivers: Any = None,
+    noise: bool | str = True,
+    collisions: str = "ego",
+    camera: Any = None,
+    weather: bool = False,
+    **unknown: Any,
+) -> tuple[World, ScenarioSpace]:
+    """The world and the scenario space of an environment.
+
+    Args:
+        env_id: For example "rare_envs/CutIn-v0".
+        observation: "features", "lidar", "kinematics" (HighwayEnv's) or "camera"; several, such as "camera+lidar" or
+            ("camera", "lidar"), make a `Dict`.
+        action: "continuous" or "meta" (HighwayEnv's, see `rare_envs.control.meta_actions`: a step is then one second).
+        measure: The safety measure: a name in `rare_envs.measures.registry.MEASURES`, "stl:FORMULA", "module:name", a
+            `Measure` or another of its kind, or a function; see `rare_envs.measures.registry.find_measure`.
+        horizon: Length of an episode [s]; None takes the scenario's.
+        dt: Tick [s].
+        base: Law of the scenario's own parameters: the name of a shipped one, the path of a JSON file, or a
+            distribution object; None takes the scenario's default.
+        drivers: Of the vehicles around the ego: "mgail", "gail", "bc", the path of a driver's file, or a `Background`;
+            None takes the scenario's default, which is its script but for the highway. The weights of learned drivers
+            are parameters of the scenario.
+        noise: What becomes of the drivers' noise. True: it is part of x, standard normal columns behind the others.
+            "fixed": one sequence for all x, so that probabilities are conditional on it. False: mean actions.
+        collisions: Which count: those of the "ego", or "any", those between two other vehicles too.
+        camera: Of the observation "camera": a `rare_envs.sensors.camera.Camera`, or the size (height, width) of its
+            pictures; None for 66 x 200.
+        weather: Whether weather and the camera's noise are part of x, see `rare_envs.sensors.camera.weather`; without
+            it there is a clear day. Traffic does not mind the weather.
+        **unknown: What is none of these, and refused.
+
+    Returns:
+        The world and the space of its parameters.
+
+    Raises:
+        TypeError: If there is no such argument; the message suggests the nearest and lists all.
+        ValueError: If an argument is not one of those; the message says what is.
+    """
+    scenario = find_scenario(env_id)
+    for name in unknown:
+        known = [word for word in inspect.signature(set_up).parameters if word not in ("env_id", "unknown")]
+        of_reset = name in (parameter.name for parameter in scenario.parameters)
+        hint = " (reset takes it as an option)" if of_reset else did_you_mean(name, known)
+        raise TypeError(f"{env_id} takes no keyword argument {name!r}{hint}; it takes {', '.join(known)}.")
+    kinds = read_kinds(observation)
+    _one_of("action", action, ACTIONS)
+    if not isinstance(weather, bool):
+        raise ValueError(f"Expected weather True or False, got {weather!r}.")
+    background = find_drivers(scenario.drivers if drivers is None else drivers)
+    world = World(
+        scenario,
+        dt=dt,
+        horizon=horizon,
+        measure=named_measure(measure),
+        drivers=background,
+        noise=noise,
+        observation=kinds,
+        action=action,
+        collisions=collisions,
+        camera=find_camera(camera),
+        weather=weather,
+    )
+    space = space_of(world, load_base(scenario, base))
+    if not isinstance(world.measure, str):
+        _try_measure(world, space)
+    return world, space
+
+
+@torch.inference_mode()
+def _try_measure(world: World, space: ScenarioSpace) -> None:
+    """Let a user's measure judge two drives of one tick, so that a broken one is found before the simulations.
+
+    Raises:
+        ValueError: If it raises, or does not give one finite number for each.
+    """
+    x = torch.from_numpy(space.sample(2, np.random.default_rng(0))).float()
+    try:
+        f = world.step(world.start(x), torch.zeros(2, 2)).f
+    except Exception as error:  # the function is the user's: anything may happen in it
+        raise ValueError(f"The measure {world.measure!r} fails on two ordinary scenarios: {error}") from error
+    if not bool(torch.isfinite(f).all()):
+        raise ValueError(f"Expected finite numbers from the measure {world.measure!r}, got {f.tolist()}.")
+
+
+def space_of(world: World, base: Distribution) -> ScenarioSpace:
+    """The parameters of a world: the scenario's, then the weather's, its drivers' weights and all noise.
+
+    Args:
+        world: The world.
+        base: Law of the scenario's own parameters.
+    """
+    parameters, laws = list(world.scenario.parameters), [base]
+    for weather, law in world.weather_laws:
+        parameters += weather
+        laws.append(law)
+    if world.drivers is not None and world.drivers.weights is not None:
+        parameters.append(Parameter("weights", "", -np.inf, np.inf, "of the drivers' last layer", world.weights))
+        laws.append(world.drivers.weights)
+    if world.draws:
+        parameters.append(Parameter("noise", "", -np.inf, np.inf, "of the drivers, tick by tick", world.draws))
+        laws.append(NoiseLaw(world.draws))
+    if world.keys:
+        parameters.append(Parameter("camera_noise", "", -np.inf, np.inf, "from which the noise of all pixels follows"))
+        laws.append(NoiseLaw(1))
+    names = [p.name for p in parameters]
+    twice = {name for name in names if names.count(name) > 1}
+    if twice:
+        raise ValueError(
+            f"{world.scenario.name} has parameters of its own named {', '.join(sorted(twice))}, as weather or drivers "
+            "have; rename them."
+        )
+    return ScenarioSpace.of(parameters, beside(*laws))
+
+
+def with_noise(space: ScenarioSpace, name: str, size: int) -> ScenarioSpace:
+    """The space with a further block of noise, standard normal columns behind the others; as it is for size 0."""
+    if not size:
+        return space
+    return ScenarioSpace(
+        names=(*space.names, name),
+        units=(*space.units, ""),
+        low=np.append(space.low, np.full(size, -np.inf)),
+        high=np.append(space.high, np.full(size, np.inf)),
+        base=beside(space.base, NoiseLaw(size)),
+        sizes=(*space.sizes, size),
+    )
+
+
+def _one_of(what: str, value: object, valid: tuple[str, ...]) -> None:
+    if value not in valid:
+        raise ValueError(f"Unknown {what} {value!r}; expected one of {', '.join(map(repr, valid))}.")

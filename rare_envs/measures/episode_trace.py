@@ -1,0 +1,166 @@
+"""Measures of a whole episode: what was recorded of it, moment by moment."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import ClassVar, NamedTuple
+
+import torch
+from torch import Tensor
+
+from rare_envs.measures.base import COLLISION, one_each
+from rare_envs.measures.moment import Moment
+from rare_envs.traffic.lead import Lead
+from rare_envs.traffic.road import Road
+from rare_envs.traffic.state import State
+
+
+class Trace(NamedTuple):
+    """B episodes from start to horizon, T moments of N vehicles.
+
+    T is that of a whole episode, always: an episode that ended early, in a collision, repeats its last moment, so that
+    the same episode gives the same value wherever it was driven.
+    """
+
+    state: State
+    """Every field with an axis for time in front: shapes (T, B, N), theta (T, B, P)."""
+    lead: Lead
+    """The ego's; shapes (T, B)."""
+    road: Road
+    perception: Tensor | None
+    """What vehicles see, shape (T, B, M, 51); None unless the measure needs it."""
+    valid: Tensor
+    """Which moments were driven, up to a collision and with it, boolean, shape (T, B)."""
+    collided: Tensor
+    """Whether the ego has collided, boolean, shape (B,)."""
+    dt: float
+    """Tick [s]."""
+
+    @property
+    def time(self) -> Tensor:
+        """Time of each moment [s], shape (T,)."""
+        x = self.state.x
+        return torch.arange(len(x), dtype=x.dtype, device=x.device) * self.dt
+
+    def of(self, function: Callable[[Moment], Tensor]) -> Tensor:
+        """A function of a moment, such as `ttc`, at every moment: shape (T, B)."""
+        before = State(*(torch.cat((field[:1], field[:-1])) for field in self.state))
+        moment = Moment(
+            State(*map(_flat, self.state)),
+            Lead(*map(_flat, self.lead)),
+            self.road,
+            None if self.perception is None else _flat(self.perception),
+            State(*map(_flat, before)),
+            self.dt,
+        )
+        return function(moment).view(self.valid.shape)
+
+
+def _flat(values: Tensor) -> Tensor:
+    """(T, B, ...) to (T B, ...)."""
+    return values.flatten(0, 1)
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """The moments of B episodes so far; they need not have begun at the same time."""
+
+    moments: tuple[Moment, ...]
+    """The latest last; older ones than any of the episodes are dropped."""
+    first: Tensor
+    """Index of the first moment of each episode, int64, shape (B,)."""
+    last: Tensor
+    """Index of the last moment of each that counts: the newest, or the collision, int64, shape (B,)."""
+    collided: Tensor
+    """Boolean, shape (B,)."""
+    ticks: int
+    """Length of a whole episode."""
+
+    def added(self, moment: Moment, before: Tensor, now: Tensor) -> "Record":
+        """With one more moment."""
+        old = int(self.first.min())
+        moments = (*self.moments[old:], moment)
+        last = torch.where(before, self.last - old, len(moments) - 1)
+        return Record(moments, self.first - old, last, now, self.ticks)
+
+    def put(self, rows: Tensor, new: "Record") -> "Record":
+        """With the episodes `rows` replaced by new ones that have just begun."""
+        newest, fresh = self.moments[-1], new.moments[-1]
+        seen = newest.perception
+        if seen is not None and fresh.perception is not None:
+            seen = _put(seen, rows, fresh.perception)
+        merged = newest._replace(
+            state=State(*(_put(a, rows, b) for a, b in zip(newest.state, fresh.state, strict=True))),
+            lead=Lead(*(_put(a, rows, b) for a, b in zip(newest.lead, fresh.lead, strict=True))),
+            perception=seen,
+        )
+        at = torch.full_like(self.first[rows], len(self.moments) - 1)
+        return replace(
+            self,
+            moments=(*self.moments[:-1], merged),
+            first=_put(self.first, rows, at),
+            last=_put(self.last, rows, at),
+            collided=_put(self.collided, rows, new.collided),
+        )
+
+    def trace(self) -> Trace:
+        """As it is handed to a measure."""
+        time = torch.arange(self.ticks + 1, device=self.first.device)[:, None]
+        at = torch.minimum(self.first + time, self.last)
+        row = torch.arange(len(self.first), device=self.first.device)
+
+        def aligned(values: list[Tensor]) -> Tensor:
+            return torch.stack(values)[at, row]
+
+        states, leads = [each.state for each in self.moments], [each.lead for each in self.moments]
+        seen = [each.perception for each in self.moments if each.perception is not None]
+        return Trace(
+            State(*(aligned([getattr(state, name) for state in states]) for name in State._fields)),
+            Lead(*(aligned([getattr(lead, name) for lead in leads]) for name in Lead._fields)),
+            self.moments[-1].road,
+            aligned(seen) if seen else None,
+            self.first + time <= self.last,
+            self.collided,
+            self.moments[-1].dt,
+        )
+
+
+def _put(old: Tensor, rows: Tensor, new: Tensor) -> Tensor:
+    old = old.clone()
+    old[rows] = new
+    return old
+
+
+@dataclass(frozen=True)
+class TraceMeasure:
+    """A function of the whole episode."""
+
+    of: Callable[[Trace], Tensor]
+    """A trace of B episodes to the measure in its own unit and sign, shape (B,)."""
+    sees: bool = False
+    """Whether it needs what the ego sees."""
+    collision: float | None = COLLISION
+    """f of an episode with a collision; None for what the function says of it."""
+    critical: float | None = None
+    """The critical value of a measure whose large values are dangerous, as in `Measure`."""
+    unit: str = ""
+    records: ClassVar[bool] = True
+    """It keeps whole episodes."""
+
+    def gamma(self, value: float) -> float:
+        """The threshold of f that stands for a value in the measure's own unit and sign."""
+        return value if self.critical is None else self.critical - value
+
+    def begin(self, moment: Moment, ticks: int) -> Record:
+        """Record the first moment."""
+        at = torch.zeros(len(moment.state.x), dtype=torch.int64, device=moment.state.x.device)
+        return Record((moment,), at, at, at > 0, ticks)
+
+    def fold(self, kept: Record, moment: Moment, before: Tensor, now: Tensor) -> Record:
+        """Record one more moment."""
+        return kept.added(moment, before, now)
+
+    def f(self, kept: Record) -> Tensor:
+        """What the function says of the episodes so far."""
+        value = one_each(self.of(kept.trace()), kept.first)
+        f = value if self.critical is None else self.critical - value
+        return f if self.collision is None else torch.where(kept.collided, self.collision, f)

@@ -1,0 +1,151 @@
+"""Signal temporal logic: f is the robustness of a formula over an episode, by rtamt (`pip install rare-envs[stl]`).
+
+References:
+    Donze and Maler, "Robust satisfaction of temporal logic over real-valued signals", 2010; Nickovic and Yamaguchi,
+    "RTAMT: online robustness monitors from STL", 2020.
+"""
+
+import difflib
+import logging
+import re
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from rare_envs.measures.braking import drac
+from rare_envs.measures.clearance import clearance
+from rare_envs.measures.episode_trace import Trace, TraceMeasure
+from rare_envs.measures.moment import Moment
+from rare_envs.measures.time_to_collision import thw, ttc
+
+ROBUSTNESS_MAX = 1e6
+"""Robustness is cut here, where a formula says nothing of the signals."""
+
+SIGNALS: MappingProxyType[str, Callable[[Moment], Tensor]] = MappingProxyType(
+    {
+        "gap": lambda moment: moment.lead.gap.clamp(max=1000.0),
+        "closing_speed": lambda moment: moment.lead.closing_speed,
+        "lead_speed": lambda moment: moment.state.speed[:, 0] - moment.lead.closing_speed,
+        "speed": lambda moment: moment.state.speed[:, 0],
+        "acceleration": lambda moment: moment.acceleration[:, 0],
+        "heading": lambda moment: moment.state.heading[:, 0],
+        "lane_offset": lambda moment: moment.state.y[:, 0] - moment.road.centre_of(moment.state.y[:, 0]),
+        "edge": lambda moment: (
+            moment.road.lanes * moment.road.width / 2 - (moment.state.y[:, 0] - moment.road.middle).abs()
+        ),
+        "ttc": ttc,
+        "thw": thw,
+        "drac": drac,
+        "clearance": clearance,
+    }
+)
+"""Signals of the ego that a formula may name, in SI units: gap to the lead (at most 1000), closing speed, speed of the
+lead (the ego's, without one), speed, acceleration, heading relative to the road, offset to the right of the lane's
+middle, way from the ego's centre to the edge of the road, and measures."""
+_OF_VEHICLE = re.compile(r"(x|y|heading|speed)_(\d+)")
+_NAME = re.compile(r"[A-Za-z_]\w*")
+
+
+def stl(formula: str) -> TraceMeasure:
+    """Robustness of a formula of signal temporal logic over the episode, at its start: by how much it holds.
+
+    Negative where the formula is violated, so f <= 0 counts episodes that violate it (or just hold it), and a collision
+    counts only if the formula speaks of it, as "always (clearance > 0)" does not quite: its signal is over 0 until
+    contact. `with_collision(stl(...), -100)` has collisions fail whatever the formula says.
+
+    Args:
+        formula: In rtamt's language, such as "always (gap > 2)" or "always[0:5] (ttc > 1.5 or speed < 3)"; times in s.
+            Names: `SIGNALS`, and x_1, y_1, heading_1, speed_1 and so on of every vehicle, 0 being the ego.
+
+    Raises:
+        ValueError: If it does not parse or names an unknown signal.
+        ImportError: If rtamt is not installed.
+    """
+    _parsed(formula, 1e-3)
+    return TraceMeasure(Robustness(formula), collision=None)
+
+
+@dataclass(frozen=True)
+class Robustness:
+    """Robustness of a formula over a trace."""
+
+    formula: str
+
+    def __call__(self, trace: Trace) -> Tensor:
+        """From a trace of B episodes to shape (B,).
+
+        Raises:
+            ValueError: If a time in the formula is no multiple of the tick, or a vehicle in it does not exist.
+        """
+        monitor, names = _parsed(self.formula, trace.dt)
+        columns = {name: _signal(trace, name).T.tolist() for name in names}
+        ticks = [trace.dt * k for k in range(len(trace.valid))]
+        found = []
+        for row in range(trace.valid.shape[1]):
+            found.append(monitor.evaluate({"time": ticks, **{name: columns[name][row] for name in names}})[0][1])
+        values = torch.tensor(found, dtype=trace.state.x.dtype, device=trace.state.x.device)
+        return values.clamp(-ROBUSTNESS_MAX, ROBUSTNESS_MAX)
+
+
+def _signal(trace: Trace, name: str) -> Tensor:
+    """One signal, shape (T, B)."""
+    if name in SIGNALS:
+        return trace.of(SIGNALS[name])
+    field, _, vehicle = name.rpartition("_")
+    values: Tensor = getattr(trace.state, field)
+    if int(vehicle) >= values.shape[2]:
+        raise ValueError(f"The formula names {name!r}, but the vehicles are 0 to {values.shape[2] - 1}.")
+    return values[:, :, int(vehicle)]
+
+
+def _parsed(formula: str, dt: float) -> tuple[Any, list[str]]:
+    """A monitor for a formula, and the signals that it names."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # of the parser that it uses
+            import rtamt
+    except ImportError as error:
+        raise ImportError(
+            "Signal temporal logic needs rtamt, on Python 3.11 or earlier: pip install 'rare-envs[stl]'."
+        ) from error
+    if not isinstance(formula, str):
+        raise ValueError(f"Expected a formula such as 'always (gap > 2)', got {formula!r}.")
+    names = [name for name in dict.fromkeys(_NAME.findall(formula)) if name in SIGNALS or _OF_VEHICLE.fullmatch(name)]
+    monitor = rtamt.StlDiscreteTimeOfflineSpecification()
+    for name in names:
+        monitor.declare_var(name, "float")
+    monitor.spec = formula
+    monitor.set_sampling_period(dt, "s", 0.1)
+    try:
+        with _silent():
+            monitor.parse()
+    except KeyError as error:
+        unknown = str(error.args[0])
+        near = difflib.get_close_matches(unknown, list(SIGNALS), n=1)
+        hint = f" (did you mean {near[0]!r}?)" if near else ""
+        raise ValueError(
+            f"The formula names an unknown signal {unknown!r}{hint}; the signals are {', '.join(SIGNALS)}, "
+            "and x_0, y_0, heading_0, speed_0 and so on of every vehicle."
+        ) from error
+    except rtamt.RTAMTException as error:
+        raise ValueError(f"The formula {formula!r} does not parse: {error}") from error
+    if len(monitor.ast.specs) != 1:
+        raise ValueError(f"Expected one formula, got {len(monitor.ast.specs)} in {formula!r}; join them with 'and'.")
+    return monitor, names
+
+
+@contextmanager
+def _silent() -> Iterator[None]:
+    """Keep rtamt from logging what is raised as an error here."""
+    level = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        yield
+    finally:
+        logging.disable(level)

@@ -1,0 +1,119 @@
+"""Times until the ego meets what is ahead of it: its lead, the edge of the road, what its lidar sees."""
+
+import torch
+from torch import Tensor
+
+from rare_envs.measures.moment import GAP_MIN, STILL, Moment, acceleration_of_lead, gap_of
+from rare_envs.sensors.perception import RANGES, RATES
+
+TTC_MAX = 10.0
+"""Cap of the time to collision [s]; what is further away, or not closing, counts as this."""
+
+
+def ttc(moment: Moment) -> Tensor:
+    """Time to collision of the ego with its lead, or with the edge of the road, if speeds and headings stay.
+
+    To the lead: gap / closing speed while closing. To the edge, which is a wall: way to it / speed across the road
+    towards it; for an ego that drives straight there is none. The smaller of the two, at most `TTC_MAX`. Gaps are at
+    least 1 cm: side by side with a vehicle that reaches into the lane the time is short but positive.
+
+    Without the edge, f would not announce that an ego is about to leave the road, and methods that follow f downhill
+    would miss that way to crash.
+
+    Args:
+        moment: Of B scenarios.
+
+    Returns:
+        Time to collision [s], in (0, TTC_MAX], shape (B,).
+
+    References:
+        Hayward, "Near-miss determination through use of a scale of danger", 1972.
+    """
+    lead = moment.lead
+    to_lead = lead.gap.clamp(min=GAP_MIN) / lead.closing_speed.clamp(min=STILL)
+    return torch.minimum(to_lead, time_to_edge(moment)).clamp(max=TTC_MAX)
+
+
+def time_to_edge(moment: Moment) -> Tensor:
+    """Time until the ego's centre leaves the road if speed and heading stay [s], shape (B,).
+
+    Way to the edge / speed across the road towards it; without a cap, up to 20 000 s for an ego that drives straight.
+    """
+    state, road = moment.state, moment.road
+    across = state.speed[:, 0] * torch.sin(state.heading[:, 0])
+    offset = state.y[:, 0] - road.middle
+    room = road.lanes * road.width / 2 - offset * torch.sign(across)
+    return room.clamp(min=GAP_MIN) / across.abs().clamp(min=STILL)
+
+
+def lidar_ttc(moment: Moment) -> Tensor:
+    """Least time to collision along the ego's lidar beams: range / closing speed of each that closes, at most 10 s.
+
+    The beams start at the ego's centre, so at contact about 1 m is left at the side and 2.5 m ahead: small values come
+    with violent contacts, side-swipes above all. The moment of a collision is not measured, and a collision is worth
+    no more than the moments before it (`Measure.collision`). In the released code beams that meet nothing and those
+    that do not close count as infinite; here everything is at most `TTC_MAX`.
+
+    Args:
+        moment: Of B scenarios.
+
+    Returns:
+        Time to collision [s], in [0, TTC_MAX], shape (B,).
+
+    References:
+        O'Kelly, Sinha, Namkoong, Duchi and Tedrake, "Scalable end-to-end autonomous vehicle testing via rare-event
+        simulation", 2018, appendix A and released code.
+    """
+    assert moment.perception is not None
+    ego = moment.perception[:, 0]
+    closing = -ego[:, RATES]
+    time = torch.where(closing > 0.0, ego[:, RANGES] / closing.clamp(min=STILL), TTC_MAX)
+    return time.amin(dim=1).clamp(max=TTC_MAX)
+
+
+def mttc(moment: Moment) -> Tensor:
+    """Modified time to collision of the ego with its lead: if both keep their accelerations.
+
+    The least t > 0 with gap - dv t - da t^2 / 2 = 0, dv the closing speed, da the ego's acceleration less the lead's:
+    t = 2 gap / (dv + sqrt(dv^2 + 2 da gap)); there is none where the root is not real or the denominator not positive.
+    Accelerations are those of the last tick, along the ego's heading. As published, nobody stops: speeds may pass 0.
+
+    Critical values: as for the time to collision, often 1.5 to 4 s.
+
+    Args:
+        moment: Of B scenarios.
+
+    Returns:
+        Modified time to collision [s], in (0, TTC_MAX], shape (B,).
+
+    References:
+        Ozbay, Yang, Bartin and Mudigonda, "Derivation and validation of new simulation-based surrogate safety measure",
+        Transportation Research Record 2083, 2008.
+    """
+    gap, dv = gap_of(moment), moment.lead.closing_speed
+    da = moment.acceleration[:, 0] - acceleration_of_lead(moment)
+    square = dv.square() + 2.0 * da * gap
+    real = square > 0
+    denominator = dv + torch.where(real, square, 1.0).sqrt()
+    meets = real & (denominator > 2.0 * gap / TTC_MAX)
+    return torch.where(meets, 2.0 * gap / torch.where(meets, denominator, 1.0), TTC_MAX)
+
+
+def thw(moment: Moment) -> Tensor:
+    """Time headway of the ego: how long until it is where its lead's rear bumper is now, gap / speed.
+
+    SAE J2944 calls this the time gap and keeps "headway" for bumper-to-same-bumper, which would not be 0 in contact.
+
+    Critical values: 2 s is taught to drivers, under 0.9 s is fined in Germany (Vogel, 2003).
+
+    Args:
+        moment: Of B scenarios.
+
+    Returns:
+        Time headway [s], in (0, TTC_MAX], shape (B,).
+
+    References:
+        Vogel, "A comparison of headway and time to collision as safety indicators", Accident Analysis and Prevention
+        35, 2003.
+    """
+    return (gap_of(moment) / moment.state.speed[:, 0].clamp(min=STILL)).clamp(max=TTC_MAX)

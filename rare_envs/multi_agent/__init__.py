@@ -1,0 +1,1 @@
+"""Several agents: their episode, its step and their rewards."""

@@ -1,0 +1,129 @@
+"""One step of an environment of several agents: a decision of each, and the ticks until the next."""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from rare_envs.control.actions import IDLE
+from rare_envs.control.meta_actions import aim_of
+from rare_envs.egos.policy import PolicyDriver
+from rare_envs.multi_agent.episode import Crowd, gather, move
+from rare_envs.multi_agent.rewards import Reward, Tick
+from rare_envs.simulation.episode import Episode
+from rare_envs.simulation.rollout import Driver
+from rare_envs.simulation.world import World
+
+
+class Outcome(NamedTuple):
+    """What came of the agents' decisions."""
+
+    crowd: Crowd
+    rewards: dict[int, Any]
+    """By vehicle, as its reward function gives them: their mean over the ticks, where ticks after its collision count
+    as 0."""
+    memory: Any
+    """Of the ego's driver."""
+
+
+def carry_out(
+    world: World,
+    crowd: Crowd,
+    action: Tensor,
+    commanded: Tensor,
+    rewards: Mapping[int, Reward],
+    ego: Driver,
+    memory: Any = None,
+) -> Outcome:
+    """Carry out decisions, as `rare_envs.simulation.decision.advance` does for one agent.
+
+    Args:
+        world: The world.
+        crowd: B episodes.
+        action: Of all vehicles: physical, shape (B, N, 2), or meta-actions, shape (B, N).
+        commanded: Which of them obey it, boolean, shape (B, N).
+        rewards: Reward functions by vehicle.
+        ego: Drives the ego where it is not commanded.
+        memory: The ego's driver's.
+
+    Returns:
+        The episodes at the time of the next decision, rewards and memory.
+    """
+    sums: dict[int, Any] = {}
+    meta = not action.is_floating_point()
+    for tick in range(world.stride):
+        chosen = torch.full_like(action, IDLE) if meta and tick else action
+        traffic, physical, memory = _decided(world, crowd, chosen, commanded, ego, memory)
+        before = crowd
+        crowd = move(world, crowd._replace(traffic=traffic), physical, commanded)
+        for vehicle, reward in rewards.items():
+            terms = reward(Tick(before, crowd, vehicle, physical[:, vehicle]))
+            if tick:
+                over = before.views[vehicle].collided
+                terms = _each(lambda term, over=over: term.masked_fill(over, 0.0), terms)
+            sums[vehicle] = terms if tick == 0 else _each(torch.add, sums[vehicle], terms)
+        if world.stride > 1 and bool(crowd.collided.all()):
+            break
+    if world.stride > 1:
+        sums = {vehicle: _each(lambda term: term / world.stride, terms) for vehicle, terms in sums.items()}
+    return Outcome(crowd, sums, memory)
+
+
+def _decided(
+    world: World, crowd: Crowd, action: Tensor, commanded: Tensor, ego: Driver, memory: Any
+) -> tuple[Episode, Tensor, Any]:
+    """The traffic with its new aims, accelerations and steering angles (B, N, 2), and the ego's driver's memory."""
+    by_driver = ~commanded[:, 0]
+    driven: Tensor | None = None
+    if bool(by_driver.any()):
+        driven, memory = ego.act(crowd.views[0], memory)
+        if not driven.is_floating_point():  # a policy with meta-actions in such a world
+            mixed = torch.where(by_driver, driven, action[:, 0])
+            action, driven = torch.cat((mixed[:, None], action[:, 1:]), dim=1), None
+    traffic, physical = world.obey(crowd.traffic, action, commanded)
+    first = torch.arange(physical.shape[1], device=physical.device) == 0
+    physical = torch.where((commanded | first)[..., None], physical, torch.zeros_like(physical))
+    if driven is None:
+        return traffic, physical, memory
+    physical = torch.where((first & by_driver[:, None])[..., None], driven[:, None].to(physical), physical)
+    if traffic.aim is not None:  # the ego aims for nothing while a driver drives it
+        where = aim_of(traffic.state, traffic.road)
+        aim = (torch.where(first & by_driver[:, None], new, old) for new, old in zip(where, traffic.aim, strict=True))
+        traffic = traffic._replace(aim=type(where)(*aim))
+    return traffic, physical, memory
+
+
+def _each(function: Any, *terms: Any) -> Any:
+    """Apply a function term by term."""
+    if isinstance(terms[0], Tensor):
+        return function(*terms)
+    return type(terms[0])(*(function(*each) for each in zip(*terms, strict=True)))
+
+
+def play(world: World, x: Tensor, policies: Mapping[int, Any], ego: Driver) -> Crowd:
+    """Drive B scenarios from start to horizon with policies in some of the vehicles.
+
+    Args:
+        world: The world.
+        x: Scenario parameters, shape (B, d).
+        policies: Objects with Stable-Baselines3's `predict`, by vehicle; the others keep their drivers.
+        ego: Drives the ego if it has no policy.
+
+    Returns:
+        The episodes at the horizon.
+    """
+    drivers = {vehicle: PolicyDriver(policy, world.observation, world.action) for vehicle, policy in policies.items()}
+    crowd, memory = gather(world, x), None
+    memories: dict[int, Any] = dict.fromkeys(drivers)
+    batch, n = crowd.wrecked.shape
+    commanded = torch.zeros(batch, n, dtype=torch.bool, device=x.device)
+    commanded[:, list(drivers)] = True
+    shape = (batch, n) if world.action == "meta" else (batch, n, 2)
+    for _ in range(world.ticks // world.stride):
+        action = torch.full(shape, IDLE) if world.action == "meta" else torch.zeros(shape)
+        for vehicle, driver in drivers.items():
+            chosen, memories[vehicle] = driver.act(crowd.views[vehicle], memories[vehicle])
+            action[:, vehicle] = chosen
+        crowd, _, memory = carry_out(world, crowd, action, commanded, {}, ego, memory)
+    return crowd

@@ -1,0 +1,139 @@
+"""Base distributions of scenarios: shipped, in a JSON file, or an object of the user's own."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+
+from rare_envs.distributions.beta import BetaLaw
+from rare_envs.distributions.log_mixture import LogMixture
+from rare_envs.distributions.space import Distribution, Parameter
+from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
+from rare_envs.plugins import did_you_mean
+
+if TYPE_CHECKING:
+    from rare_envs.scenarios.base import Scenario
+
+Law = TruncatedGaussianMixture | LogMixture | BetaLaw
+_TRIAL_DRAWS = 1000
+"""Draws by which a user's distribution is tried before it is used."""
+METHODS = ("sample", "log_prob", "to_standard_normal", "from_standard_normal")
+
+
+def load_base(scenario: Scenario, base: str | PathLike[str] | Distribution | None = None) -> Distribution:
+    """The base distribution of a scenario.
+
+    A JSON file holds what the shipped ones do: names, low, high, weights, means, covariances, and
+    if wanted units, provenance (see `TruncatedGaussianMixture`) and logarithmic (see `LogMixture`); or, for independent
+    Beta laws, names, low, high, alpha and beta, one for each column of x (see `BetaLaw`).
+
+    Args:
+        scenario: The scenario.
+        base: The name of one of `scenario.bases`, a path to a JSON file, or an object with the four methods of
+            `Distribution`; None for the scenario's default, which is its first.
+
+    Raises:
+        ValueError: There is no such file, or it does not fit the scenario.
+    """
+    base = next(iter(scenario.bases)) if base is None else base
+    if not isinstance(base, str | PathLike):
+        return _checked_object(scenario, base)
+    shipped = scenario.bases.get(str(base))
+    if isinstance(shipped, Mapping):
+        box = columns_of(scenario)
+        own = {
+            "names": [p.name for p in scenario.parameters],
+            "low": [p.low for p in box],
+            "high": [p.high for p in box],
+        }
+        return _from_dict(scenario, str(base), {**own, **shipped})
+    if shipped is not None and hasattr(shipped, "read_text"):
+        return _from_json(scenario, str(base), shipped.read_text(encoding="utf-8"))
+    if shipped is not None:
+        return _checked_object(scenario, shipped)
+    path = Path(base)
+    if not path.is_file():
+        raise ValueError(
+            f"No base distribution {str(base)!r} for {scenario.name}"
+            f"{did_you_mean(str(base), scenario.bases)}: neither one of {', '.join(scenario.bases)} nor a file."
+        )
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"Cannot read the base distribution {path}: {error}.") from None
+    return _from_json(scenario, str(path), text)
+
+
+def columns_of(scenario: Scenario) -> list[Parameter]:
+    """The parameter of each column of x."""
+    return [parameter for parameter in scenario.parameters for _ in range(parameter.size)]
+
+
+def _from_json(scenario: Scenario, source: str, text: str) -> Law:
+    try:
+        data = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise ValueError(f"Base distribution {source} is not valid JSON: {error}.") from None
+    if not isinstance(data, dict):
+        raise ValueError(f"Base distribution {source}: expected a JSON object, got {type(data).__name__}.")
+    return _from_dict(scenario, source, data)
+
+
+def _from_dict(scenario: Scenario, source: str, data: Mapping[str, Any]) -> Law:
+    wanted = [p.name for p in scenario.parameters]
+    names = data.get("names")
+    if names != wanted:
+        raise ValueError(
+            f"Base distribution {source} does not fit {scenario.name}: "
+            f"expected names {wanted} in this order, got {names}."
+        )
+    try:
+        kind = BetaLaw if "alpha" in data else LogMixture if data.get("logarithmic") else TruncatedGaussianMixture
+        law: Law = kind.from_dict(data)
+    except ValueError as error:
+        raise ValueError(f"Base distribution {source}: {error}") from None
+    columns = len(columns_of(scenario))
+    if law.dim != columns:
+        raise ValueError(
+            f"Base distribution {source} does not fit {scenario.name}: expected {columns} columns, got {law.dim}."
+        )
+    _check_box(scenario, source, law)
+    return law
+
+
+def _check_box(scenario: Scenario, source: str, law: Law) -> None:
+    box = columns_of(scenario)
+    for parameter, low, high in zip(box, law.low, law.high, strict=True):
+        if low < parameter.low or high > parameter.high:
+            raise ValueError(
+                f"Base distribution {source} gives {parameter.name} the range [{low:g}, {high:g}] "
+                f"{parameter.unit}; {scenario.name} allows [{parameter.low:g}, {parameter.high:g}]."
+            )
+
+
+def _checked_object(scenario: Scenario, base: object) -> Distribution:
+    missing = [name for name in METHODS if not callable(getattr(base, name, None))]
+    if missing:
+        raise ValueError(
+            f"A base distribution must be one of {', '.join(scenario.bases)}, a path to a JSON file, or an "
+            f"object with {', '.join(METHODS)}; got {type(base).__name__} without "
+            f"{', '.join(missing)}."
+        )
+    law = cast(Distribution, base)
+    box = columns_of(scenario)
+    draws = np.asarray(law.sample(_TRIAL_DRAWS, np.random.default_rng(0)), dtype=np.float64)
+    wrong = f"Base distribution {type(base).__name__} does not fit {scenario.name}: "
+    if draws.shape != (_TRIAL_DRAWS, len(box)):
+        raise ValueError(
+            f"{wrong}sample({_TRIAL_DRAWS}, rng) must have shape ({_TRIAL_DRAWS}, {len(box)}), one column for each "
+            f"of {', '.join(p.name for p in box)}; got {draws.shape}."
+        )
+    for p, column in zip(box, draws.T, strict=True):
+        if not ((column >= p.low) & (column <= p.high)).all():  # NaN is outside too
+            raise ValueError(f"{wrong}it draws {p.name} outside [{p.low:g}, {p.high:g}] {p.unit}; truncate it.")
+    return law

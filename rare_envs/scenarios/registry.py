@@ -1,0 +1,120 @@
+"""The registry of scenarios: environment ids, short names, and the module that registers an id of a user's own."""
+
+from __future__ import annotations
+
+import importlib
+import re
+from collections.abc import Iterator, Mapping
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+from rare_envs.plugins import did_you_mean, working_directory_first
+
+if TYPE_CHECKING:
+    from rare_envs.scenarios.base import Scenario
+
+
+class Registry(Mapping[str, "Scenario"]):
+    """Environment ids to scenarios; a file is imported, and torch with it, when its scenario is first asked for."""
+
+    def __init__(self, entries: Mapping[str, str]) -> None:
+        """From ids to "module:name"."""
+        self._entries: dict[str, str | Scenario] = dict(entries)
+
+    def __getitem__(self, env_id: str) -> Scenario:
+        """The scenario of an id."""
+        entry = self._entries[env_id]
+        if isinstance(entry, str):
+            module, _, name = entry.partition(":")
+            entry = self._entries[env_id] = getattr(import_module(module), name)
+        return entry
+
+    def __iter__(self) -> Iterator[str]:
+        """The ids in the order of their registration."""
+        return iter(self._entries)
+
+    def __len__(self) -> int:
+        """How many there are."""
+        return len(self._entries)
+
+    def add(self, env_id: str, scenario: Scenario) -> None:
+        """Add a scenario, or replace one."""
+        self._entries[env_id] = scenario
+
+    def remove(self, env_id: str) -> None:
+        """Forget a scenario."""
+        del self._entries[env_id]
+
+
+SCENARIOS = Registry(
+    {
+        "rare_envs/CarFollowing-v0": "rare_envs.scenarios.car_following:CAR_FOLLOWING",
+        "rare_envs/CutIn-v0": "rare_envs.scenarios.cut_in:CUT_IN",
+        "rare_envs/Highway-v0": "rare_envs.scenarios.highway:HIGHWAY",
+        "rare_envs/HardBrake-v0": "rare_envs.scenarios.hard_brake:HARD_BRAKE",
+    }
+)
+
+
+def named(name: str) -> Scenario:
+    """The scenario of a short name, such as "cut_in".
+
+    Raises:
+        ValueError: If there is none.
+    """
+    for scenario in SCENARIOS.values():
+        if scenario.name == name:
+            return scenario
+    raise ValueError(f"Unknown scenario {name!r}; there are {', '.join(each.name for each in SCENARIOS.values())}.")
+
+
+def find_scenario(env_id: str) -> Scenario:
+    """The scenario of an environment id.
+
+    Args:
+        env_id: For example "rare_envs/CutIn-v0"; "module:my_namespace/Overtaking-v0", as for `gym.make`, imports first
+            the module that registers it.
+
+    Raises:
+        ValueError: If there is none; the message suggests the nearest id and lists all.
+    """
+    module, _, name = env_id.rpartition(":") if isinstance(env_id, str) else ("", "", env_id)
+    if module:
+        _import_for(env_id, module)
+    if isinstance(name, str) and name in SCENARIOS:
+        return SCENARIOS[name]
+    layouts = {kinematics_id(each): each for each in SCENARIOS}
+    if name in layouts:
+        raise ValueError(
+            f"{name!r} is for gym.make and gym.make_vec; here take {layouts[name]!r} with "
+            f"observation 'kinematics' and action 'meta'."
+        )
+    if re.match(r"(highway(-fast)?|merge|intersection|roundabout)-v\d", str(name)):
+        raise ValueError(
+            f"{name!r} is an environment of HighwayEnv, not of the batched simulation: its drives become a problem by "
+            f"rare_envs.highway_env_problem({name!r}, ego=...). The environments here are {', '.join(SCENARIOS)}."
+        )
+    hint = did_you_mean(str(name), SCENARIOS)
+    raise ValueError(f"Unknown environment {env_id!r}{hint}; the environments are {', '.join(SCENARIOS)}.")
+
+
+def _import_for(env_id: str, module: str) -> None:
+    try:
+        with working_directory_first():
+            importlib.import_module(module)
+    except (Exception, SystemExit) as error:  # the module is the user's: anything may happen in it
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        raise ValueError(f"Cannot import {module!r} for the environment {env_id!r}: {reason}") from error
+
+
+HIGHWAY_ENV_LAYOUT = {"observation": "kinematics", "action": "meta"}
+"""What makes an environment look like one of HighwayEnv's."""
+
+
+def kinematics_id(env_id: str) -> str:
+    """The id under which an environment has HighwayEnv's layout: "rare_envs/CutIn-kinematics-v0", for example.
+
+    For `gym.make` and `gym.make_vec`, so that scripts written for HighwayEnv run with nothing but the id changed.
+    """
+    name, _, version = env_id.rpartition("-v")
+    return f"{name}-kinematics-v{version}"

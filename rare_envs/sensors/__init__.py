@@ -1,0 +1,1 @@
+"""Sensors: lidar, perception, kinematics, camera, and the kinds of observation made of them."""

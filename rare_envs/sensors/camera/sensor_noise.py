@@ -1,0 +1,36 @@
+"""Noise of a camera: a function of key, tick, viewer and pixel, so that nothing is random but the key.
+
+A 32-bit hash of these gives four bytes; their sum, centred and scaled, has mean 0, variance 1 and nearly a normal law
+(that of Irwin and Hall for four terms, which ends at 3.5 standard deviations).
+"""
+
+import torch
+from torch import Tensor
+
+from rare_envs.sensors.camera.weather import Sight
+
+_STEP = -1640531535
+"""2^32 over the golden ratio, as int32: Weyl's sequence spreads consecutive numbers."""
+_FACTORS = (0x7FEB352D, 0x846CA68B - 2**32)
+"""Of a mixing function with low bias: Wellons, "Prospecting for hash functions", 2018 (lowbias32)."""
+_EVEN = 0x00FF00FF
+_MEAN, _DEVIATION = 4 * 127.5, (4 * (256**2 - 1) / 12) ** 0.5
+
+
+def grain(sight: Sight, values: int) -> Tensor:
+    """Noise of one picture for each of B cameras, shape (B, values), mean 0 and variance 1."""
+    key = sight.weather.key.to(torch.int32)
+    for number in (sight.tick, torch.full_like(sight.tick, sight.viewer)):
+        key = _mixed(key + (number.to(torch.int32) + 1) * _STEP)
+    place = torch.arange(values, dtype=torch.int32, device=key.device) * _STEP
+    bits = _mixed(place[None, :] + key[:, None])
+    pairs = (bits >> 8).bitwise_and_(_EVEN).add_(bits.bitwise_and_(_EVEN))  # bytes 0 + 1 and 2 + 3
+    total = (pairs >> 16).add_(pairs.bitwise_and_(0xFFFF))
+    return total.float().sub_(_MEAN).div_(_DEVIATION)
+
+
+def _mixed(bits: Tensor) -> Tensor:
+    """Scramble 32-bit integers, in place; multiplication wraps around."""
+    bits.bitwise_xor_((bits >> 16).bitwise_and_(0xFFFF)).mul_(_FACTORS[0])
+    bits.bitwise_xor_((bits >> 15).bitwise_and_(0x1FFFF)).mul_(_FACTORS[1])
+    return bits.bitwise_xor_((bits >> 16).bitwise_and_(0xFFFF))

@@ -1,0 +1,175 @@
+"""Weather: what changes what a camera sees, as parameters of a scenario with their base law.
+
+The law is assembled from published statistics and definitions, not fitted; `docs/camera.md` gives the reasons.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rare_envs.distributions.beta import BetaLaw
+from rare_envs.distributions.log_mixture import LogMixture
+from rare_envs.distributions.space import Array, Distribution, Parameter
+from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
+from rare_envs.sensors.camera.pinhole import Camera
+
+
+@dataclass(frozen=True)
+class LogNormalLaw:
+    """A positive variable whose logarithm is normal, cut to a range; to cross-entropy a block that moves its median."""
+
+    median: float
+    spread: float
+    """Standard deviation of the logarithm."""
+    low: float
+    high: float
+    dim: ClassVar[int] = 1
+
+    @cached_property
+    def _law(self) -> LogMixture:
+        return LogMixture.from_dict(
+            {
+                "weights": [1.0],
+                "means": [[math.log(self.median)]],
+                "covariances": [[[self.spread**2]]],
+                "low": [self.low],
+                "high": [self.high],
+                "logarithmic": [True],
+            }
+        )
+
+    @property
+    def mixture(self) -> TruncatedGaussianMixture:
+        """The law of the logarithm."""
+        return self._law.mixture
+
+    def sample(self, n: int, rng: np.random.Generator) -> Array:
+        """Independent points, shape (n, 1)."""
+        return self._law.sample(n, rng)
+
+    def log_prob(self, x: Array) -> Array:
+        """Log density, (n, 1) -> (n,); -inf outside the range."""
+        return self._law.log_prob(x)
+
+    def to_standard_normal(self, x: Array) -> Array:
+        """Map (n, 1) -> (n, 1)."""
+        return self._law.to_standard_normal(x)
+
+    def from_standard_normal(self, u: Array) -> Array:
+        """Inverse of `to_standard_normal`, (n, 1) -> (n, 1)."""
+        return self._law.from_standard_normal(u)
+
+    def moved(self, x: Array, weights: Array, alpha: float) -> "LogNormalLaw":
+        """The law with its median moved towards that of weighted points, by the part alpha of the way in logarithms."""
+        logs = np.log(np.clip(x[:, 0], self.low, self.high))
+        wanted = float(np.sum(weights * logs) / np.sum(weights))
+        return LogNormalLaw(
+            math.exp((1.0 - alpha) * math.log(self.median) + alpha * wanted), self.spread, self.low, self.high
+        )
+
+    def widened(self, factor: float) -> "LogNormalLaw":
+        """The law with a spread larger by a factor."""
+        return LogNormalLaw(self.median, self.spread * factor, self.low, self.high)
+
+
+class WeatherBeta(BetaLaw):
+    """Independent Beta laws; a cross-entropy search keeps their shape parameters from 1 to 7."""
+
+    box: ClassVar[tuple[float, float]] = (1.0, 7.0)
+
+
+CONDITIONS = (
+    Parameter("fog", "1/m", 1e-5, 0.3, "extinction coefficient of the air"),
+    Parameter("sun_elevation", "deg", 5.0, 76.0, "above the horizon"),
+    Parameter("sun_azimuth", "deg", -180.0, 180.0, "of the sun from the start of the road, positive to the right"),
+)
+"""Parameters of the scenario with `weather=True`, behind its own."""
+SENSOR_NOISE = Parameter("sensor_noise", "levels", 0.0, 10.0, "standard deviation of the noise of a pixel, of 255")
+"""One more, unless `noise=False`."""
+FOG_LAW = LogNormalLaw(1.9e-4, 1.2, 1e-5, 0.3)
+"""Median visibility 16 km; less than 1 km, which is fog by definition, in 1 of 100 cases."""
+SUN_LAW = WeatherBeta(*map(np.array, ([1.1, 1.0], [1.58, 1.0], [5.0, -180.0], [76.0, 180.0])))
+"""Elevation as over the year's days at the latitude of the I-80 site, azimuth uniform."""
+SENSOR_NOISE_LAW = WeatherBeta(*map(np.array, ([2.0], [5.0], [0.0], [10.0])))
+"""Mean 2.9 levels: a signal-to-noise ratio of 39 dB at full scale."""
+
+
+def weather_parameters(noisy: bool) -> Iterator[tuple[tuple[Parameter, ...], Distribution]]:
+    """Parameters of the weather with their laws, in the order of x.
+
+    Args:
+        noisy: Whether the camera has noise.
+    """
+    yield CONDITIONS[:1], FOG_LAW
+    yield CONDITIONS[1:], SUN_LAW
+    if noisy:
+        yield (SENSOR_NOISE,), SENSOR_NOISE_LAW
+
+
+class Weather(NamedTuple):
+    """The weather of B scenarios, and the noise of their cameras; shapes (B,)."""
+
+    fog: Tensor
+    """Extinction coefficient of the air [1/m]."""
+    sun_elevation: Tensor
+    """Above the horizon [rad]."""
+    sun_azimuth: Tensor
+    """From the X axis of the flat world, positive to the right [rad]."""
+    noise: Tensor
+    """Standard deviation of the noise of a pixel, in levels of 255."""
+    key: Tensor
+    """From which all noise of an episode follows, int64."""
+
+
+CLEAR = (1.5e-4, math.radians(45.0), math.radians(120.0))
+"""Fog, sun elevation and azimuth without `weather=True`: a clear day, visibility 20 km, the sun behind to the right."""
+
+
+def clear_day(like: Tensor) -> Weather:
+    """The weather without weather, for the B rows of a tensor; no noise."""
+    fog, elevation, azimuth = (like.new_full((len(like),), value) for value in CLEAR)
+    return Weather(fog, elevation, azimuth, torch.zeros_like(fog), _keys(fog[:, None]))
+
+
+def read_weather(x: Tensor, key: Tensor) -> Weather:
+    """Weather from columns of x.
+
+    Args:
+        x: Fog, elevation and azimuth [deg], and the noise if there is any; shape (B, 3) or (B, 4).
+        key: A standard normal column from which the noise follows, shape (B, 1), or (B, 0) for one pattern for all.
+    """
+    fog, elevation, azimuth = x[:, :3].unbind(1)
+    noise = x[:, 3] if x.shape[1] > 3 else torch.zeros_like(fog)
+    key = key if key.shape[1] else x.new_zeros(len(x), 1)
+    return Weather(fog, torch.deg2rad(elevation), torch.deg2rad(azimuth), noise, _keys(key))
+
+
+def _keys(column: Tensor) -> Tensor:
+    """The bits of single-precision numbers (B, 1), as int64 of shape (B,)."""
+    return column[:, 0].float().contiguous().view(torch.int32).to(torch.int64)
+
+
+class Sight(NamedTuple):
+    """What a camera's picture depends on beside the traffic."""
+
+    camera: Camera
+    weather: Weather
+    tick: Tensor
+    """Ticks since the start of the episode, int64, shape (B,)."""
+    viewer: int = 0
+    """Which vehicle carries the camera, 0 the ego."""
+
+    @classmethod
+    def at_start(cls, camera: Camera, weather: Weather) -> "Sight":
+        """At time 0."""
+        return cls(camera, weather, torch.zeros_like(weather.key))
+
+    def later(self) -> "Sight":
+        """One tick later."""
+        return self._replace(tick=self.tick + 1)

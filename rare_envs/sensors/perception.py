@@ -1,0 +1,95 @@
+"""What a driver sees: the 51 features of learned drivers.
+
+References:
+    Kuefler, Morton, Wheeler and Kochenderfer, "Imitating driver behavior with generative adversarial networks", 2017.
+    O'Kelly, Sinha, Namkoong, Duchi and Tedrake, "Scalable end-to-end autonomous vehicle testing via rare-event
+    simulation", 2018: the same features and order, from their released code.
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from rare_envs.sensors.lidar import AHEAD, BEAMS, SPACING, Bodies, sense
+from rare_envs.traffic.road import Placed, Road
+from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
+
+BEAM_NAMES = tuple(round(math.degrees(SPACING * (k - AHEAD))) for k in range(BEAMS))
+FEATURES = (
+    "lane_offset",
+    "heading",
+    "speed",
+    "length",
+    "width",
+    "curvature",
+    "left_marker",
+    "right_marker",
+    "colliding",
+    "off_road",
+    "reversing",
+    *(f"range_{angle}" for angle in BEAM_NAMES),
+    *(f"rate_{angle}" for angle in BEAM_NAMES),
+)
+"""Names in order. The three flags are always 0: in recorded traffic they are constant, so no policy can learn what they
+mean; they are kept so that the layout is the published one."""
+LANE_OFFSET = FEATURES.index("lane_offset")
+HEADING = FEATURES.index("heading")
+SPEED = FEATURES.index("speed")
+CURVATURE = FEATURES.index("curvature")
+RANGES = slice(11, 11 + BEAMS)
+RATES = slice(11 + BEAMS, 11 + 2 * BEAMS)
+
+
+class OnRoad(NamedTuple):
+    """Where vehicles are on their road; shapes (B, V)."""
+
+    offset: Tensor
+    """To the right of the middle of the nearest lane [m]."""
+    heading: Tensor
+    """Relative to the road [rad]."""
+    curvature: Tensor
+    """Of the road there [1/m]."""
+    left: Tensor
+    """Distance to the marker on the left of that lane [m]."""
+    right: Tensor
+    """Likewise on the right."""
+
+
+def perceive(bodies: Bodies, on_road: OnRoad, observers: int | None = None) -> Tensor:
+    """The 51 features of the first vehicles.
+
+    Args:
+        bodies: V vehicles in B scenes.
+        on_road: Where they are on the road.
+        observers: M, how many of the vehicles look; None for all.
+
+    Returns:
+        Shape (B, M, 51), in the order of `FEATURES`, SI units.
+    """
+    m = bodies.x.shape[1] if observers is None else observers
+    readings = sense(bodies, m)
+    zero = torch.zeros_like(bodies.x)
+    core = (
+        on_road.offset,
+        on_road.heading,
+        bodies.speed,
+        bodies.length.expand_as(zero),
+        bodies.width.expand_as(zero),
+        on_road.curvature,
+        on_road.left,
+        on_road.right,
+        zero,
+        zero,
+        zero,
+    )
+    return torch.cat((torch.stack(core, dim=-1)[:, :m], readings.range, readings.rate), dim=-1)
+
+
+def look(state: State, road: Road, placed: Placed | None = None) -> Tensor:
+    """The 51 features of all vehicles, shape (B, N, 51); where they are is found out unless it is `placed`."""
+    x, y, heading, curvature = placed or road.place(state.x, state.y, state.heading)
+    bodies = Bodies(x, y, heading, state.speed, x.new_tensor(VEHICLE_LENGTH), x.new_tensor(VEHICLE_WIDTH))
+    left, right = road.markers(state.y)
+    return perceive(bodies, OnRoad(0.5 * (left - right), state.heading, curvature, left, right))

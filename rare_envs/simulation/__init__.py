@@ -1,0 +1,1 @@
+"""Simulation: the world, its episodes, the rollout, observations and rewards."""

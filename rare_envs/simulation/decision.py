@@ -1,0 +1,84 @@
+"""One step of an environment: one decision of the policy, and the ticks until the next."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from rare_envs.control.actions import IDLE
+from rare_envs.simulation.episode import Episode
+from rare_envs.simulation.reward import RewardTerms, reward_terms
+from rare_envs.simulation.world import World
+from rare_envs.traffic.lead import Lead
+from rare_envs.traffic.state import State
+
+
+class Outcome(NamedTuple):
+    """What came of a decision in B episodes."""
+
+    episode: Episode
+    """After it; those with a collision stay as they were in its tick."""
+    terms: RewardTerms
+    """Terms of the reward, shape (B,) each: their mean over the ticks, where ticks after a collision count as 0."""
+
+
+def advance(
+    world: World,
+    episode: Episode,
+    action: Tensor,
+    commanded: Tensor | None = None,
+    watch: Callable[[Episode], None] | None = None,
+) -> Outcome:
+    """Carry out a decision.
+
+    A continuous action is one tick. A meta-action is a second: it is given to the controllers once, which then act at
+    every tick, and the measure looks at every tick too.
+
+    Args:
+        world: The world.
+        episode: B episodes, none of which has collided.
+        action: As in `World.step`.
+        commanded: As in `World.step`.
+        watch: Called with the episodes after each tick.
+
+    Returns:
+        The episodes at the time of the next decision, and the reward.
+    """
+    sums: RewardTerms | None = None
+    for tick in range(world.stride):
+        chosen = action if tick == 0 else torch.full_like(action, IDLE)
+        ready, physical = world.obey(episode, chosen, commanded)
+        moved = world.step(ready, physical, commanded)
+        terms = reward_terms(moved, physical if commanded is None else physical[:, 0])
+        over = episode.collided
+        if tick:
+            moved = held(over, episode, moved)
+            terms = RewardTerms(*(term.masked_fill(over, 0.0) for term in terms))
+        sums = terms if sums is None else RewardTerms(*map(torch.add, sums, terms))
+        episode = moved
+        if watch is not None:
+            watch(episode)
+        if world.stride > 1 and bool(episode.collided.all()):
+            break
+    assert sums is not None
+    if world.stride > 1:
+        sums = RewardTerms(*(term / world.stride for term in sums))
+    return Outcome(episode, sums)
+
+
+def held(over: Tensor, old: Episode, new: Episode) -> Episode:
+    """The new episodes, but the traffic of those that are over as it was."""
+
+    def hold(before: Tensor, after: Tensor) -> Tensor:
+        return torch.where(over.view(-1, *[1] * (after.ndim - 1)), before, after)
+
+    seen, sight = new.perception, new.sight
+    if sight is not None and old.sight is not None:
+        sight = sight._replace(tick=hold(old.sight.tick, sight.tick))
+    return new._replace(
+        state=State(*map(hold, old.state, new.state)),
+        lead=Lead(*map(hold, old.lead, new.lead)),
+        perception=seen if seen is None or old.perception is None else hold(old.perception, seen),
+        sight=sight,
+    )

@@ -1,0 +1,51 @@
+"""Episode: the state of B rollouts at one moment."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from torch import Tensor
+
+from rare_envs.control.meta_actions import Aim
+from rare_envs.measures import EpisodeMeasure
+from rare_envs.measures.registry import MEASURES
+from rare_envs.sensors.camera import Sight
+from rare_envs.simulation.background import Minds
+from rare_envs.simulation.episode_statistics import Witness
+from rare_envs.traffic.lead import Lead
+from rare_envs.traffic.road import Road
+from rare_envs.traffic.state import State
+
+
+class Episode(NamedTuple):
+    """B episodes at one moment."""
+
+    state: State
+    lead: Lead
+    """The ego's lead in this state."""
+    kept: Any
+    """What the measure keeps of the episode so far; see `f`."""
+    collided: Tensor
+    """Whether the ego has collided by now, boolean, shape (B,)."""
+    road: Road
+    """The road that all are on."""
+    perception: Tensor | None = None
+    """What the vehicles see in this state, `rare_envs.sensors.perception.FEATURES`, shape (B, N, 51), the ego first;
+    None in a world in which nobody looks."""
+    minds: Minds | None = None
+    """What goes on in the drivers around the ego, if they are not the scenario's script."""
+    strayed: Tensor | None = None
+    """Which vehicles have been commanded, so that a script no longer knows them, boolean, shape (B, N); None before
+    anyone but the ego has been."""
+    measure: EpisodeMeasure = MEASURES["ttc"]
+    aim: Aim | None = None
+    """What the controllers of vehicles with meta-actions aim for, (B, N) each; None in a world without such actions."""
+    witness: Witness | None = None
+    """Least time to collision and crashes so far; None unless the world has a witness."""
+    sight: Sight | None = None
+    """What a camera sees beside the traffic; None in a world without a camera."""
+
+    @property
+    def f(self) -> Tensor:
+        """The safety measure of the episode so far, shape (B,); after a collision it stays what it is."""
+        return self.measure.f(self.kept)

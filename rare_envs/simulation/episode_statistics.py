@@ -1,0 +1,63 @@
+"""What an onlooker keeps of an episode beside its measure: the least time to collision, and who crashed with whom."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from rare_envs.measures import Moment, ttc
+from rare_envs.traffic.crash import NONE, Crash, crash_of, crash_of_others, others_touch
+from rare_envs.traffic.state import State
+
+
+class Witness(NamedTuple):
+    """Of B episodes so far."""
+
+    least_ttc: Tensor
+    """Least time to collision [s], shape (B,), without meaning after a collision."""
+    own: Crash
+    """Crash of the ego."""
+    others: Crash
+    """First crash between two other vehicles while the episode ran."""
+
+    @property
+    def crash(self) -> Crash:
+        """Crash of the ego; where it had none, that of others."""
+        return self.own.replaced(self.own.kind == NONE, self.others)
+
+
+def begin(moment: Moment, least_ttc: Tensor | None = None) -> Witness:
+    """At time 0; arguments as of `fold`."""
+    nothing = Crash.nothing(moment.state.x[:, 0])
+    return Witness(ttc(moment) if least_ttc is None else least_ttc, nothing, nothing)
+
+
+def fold(seen: Witness, moment: Moment, before: Tensor, now: Tensor, least_ttc: Tensor | None = None) -> Witness:
+    """One more moment.
+
+    Args:
+        seen: Of the moments before.
+        moment: The next.
+        before: Whether the episode had ended in a collision before this moment, boolean, shape (B,).
+        now: Whether it has by this moment, boolean, shape (B,).
+        least_ttc: The least time to collision where it is known already [s], shape (B,).
+    """
+    least = torch.minimum(seen.least_ttc, ttc(moment)) if least_ttc is None else least_ttc
+    own, others = seen.own, seen.others
+    new = now & ~before
+    if bool(new.any()):
+        own = _entered(own, new, crash_of, moment)
+    touch = others_touch(moment.state, moment.road) & (others.kind == NONE) & ~before
+    if bool(touch.any()):
+        others = _entered(others, touch, crash_of_others, moment)
+    return Witness(least, own, others)
+
+
+def _entered(crash: Crash, where: Tensor, find: Callable[..., Crash], moment: Moment) -> Crash:
+    """Crashes with those of the episodes `where`, boolean, shape (B,), found and put in."""
+    rows = where.nonzero()[:, 0]
+    state = State(*(field[rows] for field in moment.state))
+    before = None if moment.before is None else State(*(field[rows] for field in moment.before))
+    found = find(state, moment.road, before, moment.dt)
+    return Crash(*(old.index_put((rows,), new) for old, new in zip(crash, found, strict=True)))

@@ -1,0 +1,129 @@
+"""What an ego observes: `features`, its own state and the others' relative to it, `lidar`, `camera` and others."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from torch import Tensor
+
+from rare_envs.sensors.camera import Camera, take_picture
+from rare_envs.sensors.kinds import kinds_of
+from rare_envs.sensors.kinematics import kinematics, kinematics_space
+from rare_envs.sensors.lidar import BEAMS, MAX_RANGE
+from rare_envs.traffic.state import LANE_WIDTH, VEHICLE_LENGTH, State
+
+if TYPE_CHECKING:
+    from rare_envs.simulation.episode import Episode
+
+
+@dataclass(frozen=True)
+class Feature:
+    """One entry of the observation: the quantity divided by its scale, clipped to +-`CLIP`."""
+
+    name: str
+    unit: str
+    scale: float
+
+
+CLIP = 5.0
+"""Bound of every entry; scales are such that traffic in view stays within it."""
+EGO_FEATURES = (
+    Feature("speed", "m/s", 30.0),
+    Feature("y", "m", LANE_WIDTH),
+    Feature("heading", "rad", 0.1),
+)
+OTHER_FEATURES = (
+    Feature("gap", "m", 50.0),
+    Feature("relative_speed", "m/s", 10.0),
+    Feature("relative_y", "m", LANE_WIDTH),
+    Feature("lateral_speed", "m/s", 2.0),
+)
+"""Of each other vehicle: bumper gap along the road (negative beside or behind), its speed along the road less the
+ego's, its position across the road less the ego's, its speed across the road."""
+
+
+_CORE_SCALES = (LANE_WIDTH, 0.1, 30.0, VEHICLE_LENGTH, 2.0, 0.01, LANE_WIDTH, LANE_WIDTH, 1.0, 1.0, 1.0)
+LIDAR_SCALES = (*_CORE_SCALES, *(MAX_RANGE,) * BEAMS, *(10.0,) * BEAMS)
+"""Scales of the `lidar` observation, which are the 51 features of learned drivers (`perception.FEATURES`)."""
+
+
+def observation_space(vehicles: int, observation: str = "features", camera: Camera | None = None) -> spaces.Space[Any]:
+    """The space of an observation.
+
+    Args:
+        vehicles: N.
+        observation: "features": 3 of the ego, then 4 of each other vehicle; "lidar": the ego's 51; "kinematics":
+            HighwayEnv's 5 x 5; "camera": an image, uint8, H x W x 3; "speed": the ego's own, all that a camera does
+            not show of it. Several joined by "+" make a `Dict`.
+        camera: Says how large the image is; None for the usual one.
+    """
+    kinds = kinds_of(observation)
+    if len(kinds) > 1:
+        return spaces.Dict({kind: observation_space(vehicles, kind, camera) for kind in kinds})
+    if observation == "camera":
+        camera = camera or Camera()
+        return spaces.Box(0, 255, (camera.height, camera.width, 3), np.uint8)
+    if observation == "kinematics":
+        return kinematics_space()
+    if observation == "speed":
+        return spaces.Box(-CLIP, CLIP, (1,), np.float32)
+    size = len(EGO_FEATURES) + len(OTHER_FEATURES) * (vehicles - 1)
+    return spaces.Box(-CLIP, CLIP, (len(LIDAR_SCALES) if observation == "lidar" else size,), np.float32)
+
+
+def observe(episode: "Episode", observation: str, vehicle: int = 0) -> Any:
+    """What one vehicle observes in each of B episodes: the ego, or another one as if it were the ego.
+
+    Args:
+        episode: B episodes.
+        observation: A kind of observation, or several joined by "+", see `rare_envs.sensors.kinds.KINDS`.
+        vehicle: Index of the vehicle that looks.
+
+    Returns:
+        Shape (B, F), float32, within +-`CLIP`; (B, 5, 5) for "kinematics"; (B, H, W, 3), uint8, red, green and blue,
+        for "camera". Of several a mapping from their names.
+    """
+    kinds = kinds_of(observation)
+    if len(kinds) > 1:
+        return {kind: observe(episode, kind, vehicle) for kind in kinds}
+    if observation == "camera":
+        assert episode.sight is not None
+        sight = episode.sight if vehicle == 0 else episode.sight._replace(viewer=vehicle)
+        return take_picture(episode.state.seen_by(vehicle), episode.road, sight)
+    if observation == "kinematics":
+        return kinematics(episode.state, episode.road, vehicle)
+    if observation == "lidar":
+        assert episode.perception is not None
+        scales = episode.perception.new_tensor(LIDAR_SCALES)
+        return (episode.perception[:, vehicle] / scales).clamp(-CLIP, CLIP).float()
+    if observation == "speed":
+        return (episode.state.speed[:, vehicle, None] / EGO_FEATURES[0].scale).clamp(-CLIP, CLIP).float()
+    return features(episode.state.seen_by(vehicle))
+
+
+def features(state: State) -> Tensor:
+    """The `features` observation of the ego.
+
+    Args:
+        state: Traffic of B scenarios with N vehicles.
+
+    Returns:
+        Shape (B, 3 + 4 (N - 1)), float32, within +-`CLIP`: the ego's features, then each other vehicle's.
+    """
+    along = state.speed * torch.cos(state.heading)
+    values = [state.speed[:, 0], state.y[:, 0], state.heading[:, 0]]
+    for j in range(1, state.x.shape[1]):
+        values += [
+            state.x[:, j] - state.x[:, 0] - VEHICLE_LENGTH,
+            along[:, j] - along[:, 0],
+            state.y[:, j] - state.y[:, 0],
+            state.speed[:, j] * torch.sin(state.heading[:, j]),
+        ]
+    return (torch.stack(values, dim=1) / _scales(state)).clamp(-CLIP, CLIP).float()
+
+
+def _scales(state: State) -> Tensor:
+    features = EGO_FEATURES + OTHER_FEATURES * (state.x.shape[1] - 1)
+    return torch.tensor([feature.scale for feature in features], dtype=state.x.dtype, device=state.x.device)

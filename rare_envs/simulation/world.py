@@ -1,0 +1,305 @@
+"""The world: a scenario with its drivers, its clock and its measure, as pure functions from episode to episode."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from numbers import Real
+from typing import Any
+
+import torch
+from gymnasium import spaces
+from torch import Tensor
+
+from rare_envs.control.meta_actions import DECISION, aim_of, follow
+from rare_envs.distributions.space import Distribution, Parameter
+from rare_envs.measures import EpisodeMeasure, Moment
+from rare_envs.measures.registry import find_measure
+from rare_envs.scenarios.base import Scenario
+from rare_envs.sensors.camera import Camera, Sight, clear_day
+from rare_envs.sensors.camera.weather import read_weather, weather_parameters
+from rare_envs.sensors.kinds import kinds_of
+from rare_envs.sensors.perception import look
+from rare_envs.simulation import episode_statistics as witness
+from rare_envs.simulation.background import Background, Minds, begin, decide, fixed_draws, noise_size
+from rare_envs.simulation.episode import Episode
+from rare_envs.simulation.observation import observation_space
+from rare_envs.simulation.overrides import led
+from rare_envs.traffic.crash import others_touch
+from rare_envs.traffic.lead import lead_of
+from rare_envs.traffic.overlap import ego_overlaps
+from rare_envs.traffic.road import Placed
+from rare_envs.traffic.state import State
+from rare_envs.traffic.vehicle_models import bicycle
+
+WeatherLaws = tuple[tuple[tuple[Parameter, ...], Distribution], ...]
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool)
+
+
+@dataclass(frozen=True)
+class World:
+    """A scenario, its tick, its measure and its drivers. Nothing here changes, and nothing is random."""
+
+    scenario: Scenario
+    dt: float = 0.1
+    """Tick [s]."""
+    horizon: float | None = None
+    """Length of an episode [s]; None takes the scenario's."""
+    measure: Any = "ttc"
+    """What `rare_envs.measures.registry.find_measure` takes: a name, a `Measure`, a function of a `Moment`."""
+    drivers: Background | None = None
+    """Of the vehicles around the ego; None for the scenario's script."""
+    noise: bool | str = True
+    """Drivers' noise: True, part of x; "fixed", one sequence for all x; False, mean actions."""
+    observation: str = "features"
+    """What the ego observes: one of `rare_envs.sensors.kinds.KINDS`, or several joined by "+"."""
+    action: str = "continuous"
+    """What a policy decides: "continuous", each tick, or "meta", each second."""
+    lidar: bool = False
+    """Look even if neither drivers nor measure nor observation ask for it."""
+    collisions: str = "ego"
+    """Which collisions count: those of the "ego", or "any", those between other vehicles too."""
+    witnessed: bool = False
+    """Keep the least time to collision and who crashed with whom; see `Episode.witness`."""
+    camera: Camera = Camera()  # noqa: RUF009  (frozen)
+    """What takes the pictures where "camera" is observed."""
+    weather: bool = False
+    """Whether there is weather in x; a camera sees it."""
+
+    def __post_init__(self) -> None:
+        if not (_is_number(self.dt) and 0.0 < self.dt <= 1.0):
+            raise ValueError(f"Expected dt in (0, 1] s, got {self.dt!r}.")
+        if self.horizon is None:
+            object.__setattr__(self, "horizon", self.scenario.horizon)
+        whole = _is_number(self.horizon) and self.dt <= self.seconds < 1e6
+        if not whole or abs(self.seconds / self.dt - self.ticks) > 1e-6:
+            raise ValueError(f"Expected a horizon of one or more whole ticks of {self.dt} s, got {self.horizon!r}.")
+        for what, seconds in (("dt", 1.0 / self.dt), ("horizon", self.seconds / DECISION)):
+            if self.action == "meta" and abs(seconds - round(seconds)) > 1e-6:
+                raise ValueError(
+                    f"Expected a dt that divides 1 s and a horizon of whole seconds with action='meta', in which a "
+                    f"decision takes 1 s; got {what} = {getattr(self, what)!r}."
+                )
+        find_measure(self.measure)
+        if self.collisions not in ("ego", "any"):
+            raise ValueError(f"Expected collisions 'ego' or 'any', got {self.collisions!r}.")
+        if not (isinstance(self.noise, bool) or self.noise == "fixed"):
+            raise ValueError(f"Expected noise True, False or 'fixed', got {self.noise!r}.")
+        if self.drivers is not None and self.dt != 0.1:
+            raise ValueError(f"Expected dt = 0.1 s, the tick that these drivers learned with, got {self.dt!r}.")
+
+    @property
+    def seconds(self) -> float:
+        """Length of an episode [s]."""
+        return self.scenario.horizon if self.horizon is None else self.horizon
+
+    @property
+    def ticks(self) -> int:
+        """Length of an episode in ticks."""
+        return round(self.seconds / self.dt)
+
+    @property
+    def stride(self) -> int:
+        """Ticks from one decision of a policy to the next."""
+        return round(DECISION / self.dt) if self.action == "meta" else 1
+
+    @property
+    def sees(self) -> bool:
+        """Whether the vehicles look at every moment."""
+        needed = self.drivers is not None or self._measure.sees
+        return self.lidar or needed or "lidar" in kinds_of(self.observation)
+
+    @property
+    def recorded(self) -> bool:
+        """Whether the measure keeps whole episodes."""
+        return bool(getattr(self._measure, "records", False))
+
+    @cached_property
+    def _measure(self) -> EpisodeMeasure:
+        return find_measure(self.measure)
+
+    @property
+    def weights(self) -> int:
+        """Number of columns of x that are weights of the drivers."""
+        return 0 if self.drivers is None or self.drivers.weights is None else self.drivers.weights.dim
+
+    @property
+    def draws(self) -> int:
+        """Number of columns of x that are drivers' noise."""
+        return noise_size(self.ticks, self._others) if self._noisy and self.noise is True else 0
+
+    @property
+    def conditions(self) -> int:
+        """Number of columns of x that are weather."""
+        return sum(each.size for parameters, _ in self.weather_laws for each in parameters)
+
+    @property
+    def weather_laws(self) -> WeatherLaws:
+        """Parameters of the weather with their laws, in the order of x."""
+        return tuple(weather_parameters(self.noise is not False)) if self.weather else ()
+
+    @property
+    def keys(self) -> int:
+        """Number of columns of x, the last, from which the camera's noise follows: 1 or 0."""
+        return int(self.weather and self.noise is True)
+
+    @property
+    def _others(self) -> int:
+        return self.scenario.vehicles - 1
+
+    @property
+    def _noisy(self) -> bool:
+        return self.drivers is not None and self.drivers.noisy and self.noise is not False
+
+    @cached_property
+    def _fixed(self) -> Tensor:
+        return fixed_draws(self.ticks, self._others)
+
+    def start(self, x: Tensor) -> Episode:
+        """Begin B episodes.
+
+        Args:
+            x: Scenario parameters, weather, drivers' weights, drivers' noise and the key of the camera's noise side by
+                side, shape (B, d), within the physical box; dtype and device are kept.
+
+        Returns:
+            The episodes at time 0.
+        """
+        sizes = [self.scenario.size, self.conditions, self.weights, self.draws, self.keys]
+        own, weather, weights, noise, key = torch.split(x, sizes, dim=1)
+        state = self.scenario.initial(own)
+        minds = None
+        if self.drivers is not None:
+            minds = begin(self.drivers, weights.contiguous(), self._draws(noise))
+        sight = None
+        if "camera" in kinds_of(self.observation):
+            sight = Sight.at_start(self.camera, read_weather(weather, key) if self.weather else clear_day(x))
+        return self.first(state, self._look(state, self._placed(state)), minds, sight)
+
+    def first(
+        self, state: State, perception: Tensor | None, minds: Minds | None = None, sight: Sight | None = None
+    ) -> Episode:
+        """Episodes at time 0.
+
+        Args:
+            state: Of B scenarios; the vehicle in the ego's place is the one whose episodes these are.
+            perception: What the vehicles see, in the same order.
+            minds: Of the drivers around the ego.
+            sight: Of a camera on the vehicle in the ego's place.
+        """
+        road = self.scenario.road
+        collided = torch.zeros_like(state.x[:, 0], dtype=torch.bool)
+        moment = Moment(state, lead_of(state, road), road, perception, None, self.dt)
+        kept = self._measure.begin(moment, self.ticks)
+        aim = aim_of(state, road) if self.action == "meta" else None
+        seen = witness.begin(moment, self._least_ttc(kept)) if self.witnessed else None
+        return Episode(
+            state, moment.lead, kept, collided, road, perception, minds, None, self._measure, aim, seen, sight
+        )
+
+    def next(self, episode: Episode, state: State, perception: Tensor | None, hit: Tensor) -> Episode:
+        """Episodes one tick later; minds and who has strayed stay as they were.
+
+        Args:
+            episode: Before the tick.
+            state: After it.
+            perception: What the vehicles see then.
+            hit: Whether the vehicle in the ego's place touches another or is off the road, boolean, shape (B,).
+        """
+        moment = Moment(state, lead_of(state, episode.road), episode.road, perception, episode.state, self.dt)
+        collided = episode.collided | hit
+        kept = self._measure.fold(episode.kept, moment, episode.collided, collided)
+        seen = episode.witness
+        if seen is not None:
+            seen = witness.fold(seen, moment, episode.collided, collided, self._least_ttc(kept))
+            episode = episode._replace(witness=seen)
+        sight = None if episode.sight is None else episode.sight.later()
+        return episode._replace(
+            state=state, lead=moment.lead, kept=kept, collided=collided, perception=perception, sight=sight
+        )
+
+    def _least_ttc(self, kept: Any) -> Tensor | None:
+        """The least time to collision, where that is the measure."""
+        return kept if self.measure == "ttc" else None
+
+    def _draws(self, noise: Tensor) -> Tensor:
+        """Draws of the drivers' noise as tensors, shape (B, 2 + T, M, 2), or (B, 0, M, 2)."""
+        batch, shape = len(noise), (self._others, 2)
+        if self._noisy and self.noise == "fixed":
+            return self._fixed.to(noise).expand(batch, -1, -1, -1)
+        return noise.reshape(batch, -1 if self._noisy else 0, *shape)
+
+    def _look(self, state: State, placed: Placed | None) -> Tensor | None:
+        """What the vehicles see, if they look."""
+        return look(state, self.scenario.road, placed) if self.sees else None
+
+    def _placed(self, state: State) -> Placed | None:
+        """Where the vehicles are in the flat world, if they look."""
+        return self.scenario.road.place(state.x, state.y, state.heading) if self.sees else None
+
+    def obey(self, episode: Episode, action: Tensor, commanded: Tensor | None = None) -> tuple[Episode, Tensor]:
+        """Turn meta-actions, if such they are, into what the vehicles' controllers do in this tick.
+
+        Args:
+            episode: B episodes.
+            action: As in `step`.
+            commanded: As in `step`.
+
+        Returns:
+            The episodes with their new aims, and accelerations [m/s^2] and steering angles [rad] in a last axis of 2.
+        """
+        if episode.aim is None or action.is_floating_point():
+            return episode, action
+        aim, action = follow(episode.aim, action, commanded, episode.state, episode.road)
+        return episode._replace(aim=aim), action
+
+    def step(self, episode: Episode, action: Tensor, commanded: Tensor | None = None) -> Episode:
+        """Move every vehicle by one tick: all decide on the old state, then all move.
+
+        A collision (a vehicle's body overlaps the ego's, or the ego's centre leaves the road, which is walled) is
+        remembered; whoever steps on after it gets motion without meaning, but an unchanged f.
+
+        A vehicle that is commanded moves as the ego does, by the bicycle model. One that has been and no longer is goes
+        on from where it is: with the world's drivers, or by IDM and lane keeping where there was a script, which
+        knows its path only.
+
+        Args:
+            episode: B episodes.
+            action: Acceleration [m/s^2] and steering angle [rad] of the ego, shape (B, 2); with `commanded` of all
+                vehicles, shape (B, N, 2). In a world with meta-actions also those, whole numbers of shape (B,) or
+                (B, N): a decision, and `IDLE` in the ticks that follow it.
+            commanded: Which vehicles obey their action, boolean, shape (B, N); the ego always does. None if the
+                others keep their drivers.
+
+        Returns:
+            The episodes one tick later.
+        """
+        episode, action = self.obey(episode, action, commanded)
+        old, dt, road, minds = episode.state, self.dt, episode.road, episode.minds
+        steered = action if commanded is None else action[:, 0]
+        ego = (old.x[:, 0], old.y[:, 0], old.heading[:, 0], old.speed[:, 0])
+        curvature = None if road.curve is None else road.curvature(old.x[:, 0])
+        moved = bicycle(*ego, steered[:, 0], steered[:, 1], dt, curvature)
+        decided = None
+        if self.drivers is None or minds is None or episode.perception is None:
+            others = self.scenario.others(old, dt)
+        else:
+            decided, minds = decide(self.drivers, minds, episode.perception[:, 1:])
+            others = self.scenario.driven(old, decided, dt)
+        strayed = episode.strayed
+        if commanded is not None or strayed is not None:
+            others, strayed = led(episode, action, commanded, others, decided, dt)
+        x, y, heading, speed = (torch.cat((first[None], rest.T)).T for first, rest in zip(moved, others, strict=True))
+        state = State(x, y, heading, speed, old.theta)
+        placed = self._placed(state)
+        hit = ego_overlaps(state, road, placed).any(dim=1) | road.off_road(state.y[:, 0])
+        if self.collisions == "any":
+            hit = hit | others_touch(state, road)
+        episode = episode._replace(minds=minds, strayed=strayed)
+        return self.next(episode, state, self._look(state, placed), hit)
+
+
+def space_of_observations(world: "World") -> spaces.Space[Any]:
+    """What an ego observes in a world."""
+    return observation_space(world.scenario.vehicles, world.observation, world.camera)

@@ -1,0 +1,79 @@
+"""What there is to choose from: environments, methods, egos, measures, base distributions."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+import gymnasium as gym
+
+import samplers
+from agents.learned.networks import HEAD
+from rare_envs.measures.registry import MEASURES
+from rare_envs.scenarios.registry import SCENARIOS, kinematics_id
+from rare_envs.sensors.camera.weather import CONDITIONS, SENSOR_NOISE
+from rare_envs.simulation.background import noise_size
+
+TICK = 0.1
+"""[s], the usual one."""
+EGOS = {
+    "idm": "rule-based driver, Intelligent Driver Model (the default)",
+    "imitation": "shipped ego with lidar, learned from recorded traffic and from encounters",
+    "mgail, gail, bc, FILE.safetensors": "learned driver with lidar, by its mean actions",
+    "vision": "PilotNet on pictures of a front camera, which imitates a driver by rule; see docs/camera.md",
+    "FILE.zip": "policy saved by Stable-Baselines3 or sb3-contrib, VecNormalize statistics beside it included",
+    "FILE.onnx": "graph from observations to actions; rare-envs export-ego writes one of a .zip",
+    "module:function": "what your function returns: any object with Stable-Baselines3's predict",
+    "tcp://HOST:PORT": "program in any language, see docs/remote.md; rare-envs serve-ego lends one of these",
+    "process:EGO": "one of these in a process of its own, for an ego that may hang or die",
+    "noisy:EGO": "one of these behind the imperfections of a full stack, see docs/egos.md",
+}
+DRIVERS = {
+    "mgail": "learned from recorded traffic by imitation, with gradients through the simulation",
+    "gail": "the same with policy gradients",
+    "bc": "the same by behaviour cloning",
+    "idm": "rule-based driver, Intelligent Driver Model and lane keeping by what it sees",
+    "FILE.safetensors": "driver that you trained, see rare-envs train-drivers",
+}
+
+
+def catalogue() -> dict[str, Any]:
+    """Everything that can be named on the command line, as JSON-ready values.
+
+    Returns:
+        "environments" (id to parameters, vehicles, bases, drivers and what learned drivers add to x, with their noise
+        and for an episode of the usual length), "highway_env" (HighwayEnv's own ids that have parameters), "weather"
+        (parameters that `--weather` adds), "methods", "egos", "drivers", "measures".
+    """
+    import highway_env  # noqa: F401  (registers its ids)
+
+    from rare_envs.interop.scenario import SUPPORTED
+
+    environments = {
+        env_id: {
+            "kinematics_id": kinematics_id(env_id),
+            "parameters": [asdict(parameter) for parameter in scenario.parameters],
+            "vehicles": list(scenario.vehicle_names),
+            "bases": list(scenario.bases),
+            "drivers": scenario.drivers,
+            "of_learned_drivers": [
+                {"name": "weights", "size": HEAD},
+                {"name": "noise", "size": noise_size(round(scenario.horizon / TICK), scenario.vehicles - 1)},
+            ],
+        }
+        for env_id, scenario in SCENARIOS.items()
+    }
+    return {
+        "environments": environments,
+        "highway_env": [name for name in SUPPORTED if name in gym.registry],
+        "weather": [asdict(parameter) for parameter in (*CONDITIONS, SENSOR_NOISE)],
+        "methods": {name: _first_line(method) for name, method in samplers.METHODS.items()},
+        "egos": EGOS,
+        "drivers": DRIVERS,
+        "measures": {name: _first_line(getattr(measure, "of", measure)) for name, measure in MEASURES.items()},
+    }
+
+
+def _first_line(documented: object) -> str:
+    """First line of a docstring."""
+    return (documented.__doc__ or "").strip().partition("\n")[0]

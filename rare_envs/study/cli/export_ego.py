@@ -1,0 +1,51 @@
+"""`rare-envs export-ego`: a saved policy as an ONNX file."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+from agents.sb3.saved_ego import SavedEgo, load_saved
+from rare_envs.study.errors import BadInput
+
+
+def export_ego(model: Path, out: Path, algo: str | None = None, trust: bool = False) -> dict[str, Any]:
+    """Write a Stable-Baselines3 `.zip` as ONNX and check that both act alike.
+
+    Args:
+        model: The `.zip`.
+        out: The file to write, ending in `.onnx`.
+        algo: Algorithm of the `.zip`, if the file does not tell.
+        trust: As for `agents.load_ego`.
+
+    Returns:
+        What was written, JSON-ready.
+
+    Raises:
+        BadInput: The model cannot be read, the file cannot be written, or they act differently.
+    """
+    if model.suffix != ".zip":
+        raise BadInput(
+            f"Only policies saved by Stable-Baselines3, files that end in .zip, are exported; got {str(model)!r}."
+        )
+    if out.suffix != ".onnx":
+        raise BadInput(f"Expected a file that ends in .onnx, got {str(out)!r}.")
+    if not out.parent.is_dir() or not os.access(out.parent, os.W_OK):
+        raise BadInput(f"Cannot write to the folder {str(out.parent)!r}.")
+    try:
+        from agents.onnx.export import TOLERANCE, export_onnx
+
+        ego: SavedEgo = load_saved(model, algo, trust)
+        exported = export_onnx(ego, out)
+    except (ValueError, OSError) as error:
+        raise BadInput(error) from error
+    return {
+        "model": str(model),
+        "algorithm": ego.algorithm,
+        "vec_normalize": None if ego.statistics_path is None else str(ego.statistics_path),
+        "onnx": str(exported.path),
+        "largest_difference": exported.difference,
+        "tolerance": TOLERANCE,
+        "observations_tried": exported.observations,
+    }

@@ -1,0 +1,172 @@
+"""What a person reads on standard output: tables and results."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+import samplers
+from rare_envs.study.columns import SHOWN, digits
+from rare_envs.study.crash_kinds import NAMES
+from rare_envs.study.evaluate import Report
+from samplers.problem import FloatArray
+
+ORDINARY = 4000
+"""Scenarios drawn from the base distribution to say what is ordinary."""
+ENOUGH, MANY = 3.0, 300_000
+"""Simulations over p that show with 95 % a region of failure as probable as all that was found; what they may cost."""
+
+
+def print_catalogue(entries: dict[str, Any]) -> None:
+    """Print what `catalogue` gives as tables."""
+    console = Console(highlight=False)
+    for env_id, environment in entries["environments"].items():
+        console.print(_parameters(env_id, environment["parameters"]))
+        console.print(f"  vehicles, each of which can be an agent: {', '.join(environment['vehicles'])}")
+        console.print(f"  base distributions: {', '.join(environment['bases'])}, or your own JSON file")
+        around = environment["drivers"] or "a script, unless told otherwise"
+        console.print(f"  drivers around the ego: {around}")
+        added = ", ".join(f"{each['name']} ({each['size']:,} values)" for each in environment["of_learned_drivers"])
+        console.print(f"  learned drivers add: {added}")
+        console.print(f"  with HighwayEnv's observations and actions: {environment['kinematics_id']}\n")
+    console.print(
+        f"HighwayEnv's own, by rare_envs.highway_env_problem in Python: {', '.join(entries['highway_env'])}\n"
+    )
+    console.print(_parameters("Weather, which --weather adds for egos with a camera", entries["weather"]))
+    titles = {
+        "methods": "Methods",
+        "egos": "Egos",
+        "drivers": "Drivers around the ego (their weights and noise become parameters)",
+        "measures": "Safety measures",
+    }
+    for kind, title in titles.items():
+        table = Table("name", "what it is", title=title, title_justify="left", title_style="bold")
+        for name, text in entries[kind].items():
+            table.add_row(name, text)
+        console.print(table)
+
+
+def _parameters(title: str, parameters: list[dict[str, Any]]) -> Table:
+    """Names, units, ranges and meanings."""
+    table = Table("parameter", "unit", "range", "meaning", title=title, title_justify="left", title_style="bold")
+    for each in parameters:
+        name = each["name"] if each["size"] == 1 else f"{each['name']} ({each['size']} values)"
+        table.add_row(name, each["unit"], f"{each['low']:g} to {each['high']:g}", each["meaning"])
+    return table
+
+
+def print_report(report: Report, out: Path | None = None) -> None:
+    """Print the number, what it rests on, the most likely failure, and where the files are."""
+    # markup off: P[f <= 0] and what warnings quote would be read as tags
+    console = Console(highlight=False, soft_wrap=True, markup=False)
+    estimate, question = report.estimate, report.study.question
+    low, high = estimate.interval
+    console.print(
+        f"P[f <= {estimate.gamma:g}] = {estimate.p:.3e}{_one_in(estimate.p)}   {question.env_id}, ego {question.ego}",
+        style="bold",
+    )
+    rows = (
+        (f"{100 * estimate.confidence:g} % interval", f"{low:.3e} to {high:.3e}"),
+        ("c.o.v.", "not known" if math.isinf(estimate.cov) else f"{estimate.cov:.3f}"),
+        ("simulations", f"{estimate.n_sim:,} in {report.seconds:.1f} s"),
+        ("given that", estimate.proviso),
+        ("gain", _gain(estimate)),
+        ("method", f"{estimate.method.name}, seed {estimate.seed}, {estimate.status}"),
+    )
+    for name, value in rows:
+        console.print(f"  {name:<15} {value}")
+    _print_kinds(console, report)
+    if report.vec_normalize is not None:
+        console.print(f"  {'observations':<15} normalised by {report.vec_normalize}")
+    if report.faults:
+        first = report.faults[0].reason
+        console.print(f"  {'faults':<15} the ego failed twice on {len(report.faults)} scenarios; the first: {first}")
+        console.print(f"  {'':<15} {report.n_retried:,} more simulations were made to find them")
+    _print_failure(console, report)
+    for warning in estimate.warnings:
+        console.print(f"warning: {warning}", style="yellow")
+    for note in report.notes:
+        console.print(f"note: {note}")
+    if question.method != "mc" and question.ego != "idm" and estimate.p < estimate.unseen:
+        n = float(f"{ENOUGH / estimate.p:.1g}") if estimate.p > ENOUGH / MANY else MANY
+        console.print(f"check it: --method mc --max-sim {n:.0f} finds ways to crash that f does not announce")
+    if out is not None:
+        names = ", ".join(path.name for path in sorted(out.iterdir()) if path.is_file())
+        console.print(f"written to {out}: {names}")
+
+
+def _print_kinds(console: Console, report: Report) -> None:
+    """Print p by kind of crash, and how bad the listed ones are."""
+    for number, (kind, share) in enumerate(report.kinds.shares.items()):
+        low, high = share.interval
+        text = f"{share.p:.1e} [{low:.1e}, {high:.1e}], {100 * share.of_failures:.3g} %: {NAMES.get(kind, kind)}"
+        console.print(f"  {'of which' if number == 0 else '':<15} {text}")
+
+
+def _in_words(crash: dict[str, Any]) -> str:
+    """Who ran into whom, how fast, and what that means for the ego's people."""
+    who = ["the edge of the road" if one < 0 else f"vehicle {one}" if one else "the ego" for one in crash["vehicles"]]
+    speeds = f"{crash['impact_speed']:.1f} m/s at contact, delta-v {max(crash['delta_v']):.1f} m/s"
+    return f"{who[0]} runs into {who[1]}: {speeds}, serious injury {100 * max(crash['injury_risk']):.2g} %"
+
+
+def _one_in(p: float) -> str:
+    """A small probability in words."""
+    return f" (1 in {1 / p:,.0f} scenarios)" if 0 < p < 0.1 else ""
+
+
+def _gain(estimate: samplers.Estimate) -> str:
+    """The gain over plain Monte Carlo, and what it means."""
+    if math.isnan(estimate.gain):
+        return "not known"
+    needed = estimate.gain * estimate.n_sim
+    gain = f"{estimate.gain:,.0f}" if estimate.gain >= 100 else f"{estimate.gain:.3g}"
+    return f"{gain} (plain Monte Carlo: about {needed:,.0f} simulations for the same c.o.v.)"
+
+
+def _print_failure(console: Console, report: Report) -> None:
+    """Print the most likely failure beside the range that is ordinary for each parameter."""
+    failures, space = report.estimate.failures, report.study.problem.space
+    if not len(failures):
+        console.print("  no failure found")
+        return
+    ordinary = space.sample(ORDINARY, np.random.default_rng(0))
+    console.print(
+        f"  most likely of {failures.total:,} failures found (f = {failures.f[0]:.3g}; "
+        "in brackets where nine of ten ordinary scenarios lie):"
+    )
+    if report.crashes[0] is not None:
+        console.print(f"    {_in_words(report.crashes[0])}")
+    normal = space.columns(space.to_standard_normal(np.vstack((failures.x[:1], ordinary))))
+    found, usual = space.columns(failures.x[:1]), space.columns(ordinary)
+    for j, name in enumerate(space.names):
+        if space.sizes[j] <= SHOWN:
+            low, high = np.quantile(usual[name], (0.05, 0.95))
+            values = " ".join(f"{digits(value):>8}" for value in found[name].flat)
+            console.print(f"    {name:<15} {values} {space.units[j]:<4} [{digits(low, 1)} to {digits(high, 1)}]")
+        else:
+            console.print(f"    {name:<15} {_summary(name, found[name][0], usual[name], normal[name])}")
+
+
+def _summary(name: str, values: FloatArray, ordinary: FloatArray, normal: FloatArray) -> str:
+    """What there is to say about a block of many values.
+
+    Args:
+        name: Of the parameter.
+        values: Of the failure, shape (k,).
+        ordinary: Of ordinary scenarios, shape (n, k).
+        normal: Both in standard normal space, the failure's first, shape (1 + n, k).
+    """
+    distance = np.linalg.norm(normal, axis=1)
+    low, high = np.quantile(distance[1:], (0.05, 0.95))
+    spread = (values - ordinary.mean(axis=0)) / np.maximum(ordinary.std(axis=0), 1e-12)
+    furthest = int(np.abs(spread).argmax())
+    return (
+        f"{len(values):,} values, {distance[0]:.2f} standard deviations from their mean [{low:.1f} to {high:.1f}], "
+        f"most in {name}[{furthest}], {spread[furthest]:+.1f}"
+    )

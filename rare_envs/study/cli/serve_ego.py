@@ -1,0 +1,38 @@
+"""`rare-envs serve-ego`: an ego lent to simulations elsewhere."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+import agents
+from rare_envs.study.errors import BadInput
+
+
+def serve_ego(spec: str, bind: str, algo: str | None = None, trust: bool = False) -> None:
+    """Answer requests for an ego until it is interrupted.
+
+    Args:
+        spec: As for `agents.load_ego`.
+        bind: Address to listen on, such as "tcp://127.0.0.1:5555".
+        algo: Algorithm of a `.zip`, if the file does not tell.
+        trust: As for `agents.load_ego`.
+
+    Raises:
+        BadInput: The ego cannot be loaded or served, or the address cannot be used.
+    """
+    try:
+        from agents.remote.server import EgoServer
+        from agents.remote.zmq_link import SECRET
+    except ImportError as error:
+        raise BadInput("Serving needs pyzmq and msgpack: pip install 'rare-envs[remote]'.") from error
+    try:
+        ego = agents.load_ego(spec, algo=algo, trust=trust)
+        if not callable(getattr(ego, "predict", None)):
+            raise ValueError(f"Expected an ego with predict, got {spec!r}, which needs more than observations.")
+        server = EgoServer(ego, bind, os.environ.get(SECRET, "").encode() or None, name=spec)
+    except (ValueError, OSError) as error:
+        raise BadInput(error) from error
+    with server:
+        print(f"Serving {spec} at {server.address}; stop with Ctrl-C.", file=sys.stderr, flush=True)
+        server.run()

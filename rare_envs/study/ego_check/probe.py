@@ -1,0 +1,77 @@
+"""An ego in an environment, as the checks of `check-ego` ask it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from rare_envs import DrivingProblem
+from rare_envs.egos.policy import PolicyDriver
+from rare_envs.sensors.kinds import batch_size, each
+from rare_envs.simulation.observation import observe
+from rare_envs.simulation.rollout import drive
+from rare_envs.simulation.world import space_of_observations
+
+ROWS = 32
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Probe:
+    """An ego in its environment, and observations to ask it about."""
+
+    ego: Any
+    problem: DrivingProblem
+    seen: Any
+    """Observations of ordinary scenarios at time 0, shape (ROWS, ...), or several of that kind by name."""
+
+    @classmethod
+    def of(cls, ego: Any, problem: DrivingProblem) -> Probe:
+        """Take observations."""
+        x = problem.base.sample(ROWS, np.random.default_rng(0))
+        with torch.inference_mode():
+            start = next(drive(problem.world, problem.driver, torch.from_numpy(x).float()))
+            seen = each(torch.Tensor.numpy, observe(start, problem.world.observation))
+        return cls(ego, problem, seen)
+
+    @property
+    def space(self) -> spaces.Space[Any]:
+        """What the environment observes."""
+        return space_of_observations(self.problem.world)
+
+    def changed(self, change: Callable[[Array], Any]) -> Any:
+        """The observations changed by a function, and of their own types."""
+        return each(lambda part: np.asarray(change(part)).astype(part.dtype), self.seen)
+
+    def rows(self, size: int) -> Any:
+        """So many observations."""
+        return self.changed(lambda part: np.resize(part, (size, *part.shape[1:])))
+
+    @property
+    def policy(self) -> Any:
+        """The ego behind the wrappers of its training."""
+        return self.problem.driver.policy if isinstance(self.problem.driver, PolicyDriver) else None
+
+    def ask(self, observation: Any, state: Any = None, start: Any = None) -> tuple[Array, Any]:
+        """Actions as numbers, and the memory."""
+        begun = np.full(batch_size(observation), state is None) if start is None else start
+        action, state = self.policy.predict(
+            each(np.copy, observation), state=state, episode_start=begun, deterministic=True
+        )
+        return np.asarray(action), state
+
+
+def differ(one: Array, other: Array) -> float:
+    """Largest difference of actions; infinite where shapes or NaN differ."""
+    if one.shape != other.shape:
+        return np.inf
+    apart = np.abs(one.astype(float) - other.astype(float))
+    apart[np.isnan(one.astype(float)) & np.isnan(other.astype(float))] = 0.0
+    return float(np.nan_to_num(apart, nan=np.inf).max(initial=0.0))

@@ -1,0 +1,113 @@
+"""Does a server keep to the protocol of docs/remote.md? Asked over the socket, message by message."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from rare_envs.egos.faults import EgoGone, reason_of
+from rare_envs.sensors.kinds import each
+from rare_envs.study.ego_check.findings import Finding, failed, passed
+
+ADVICE = "docs/remote.md has the protocol"
+
+
+def conformance(spec: str) -> Iterator[Finding]:
+    """Check a server.
+
+    Args:
+        spec: "tcp://host:port", with time-outs as for `agents.load_ego`.
+    """
+    try:
+        from agents.remote import protocol as wire
+        from agents.remote.client import TIMEOUT, Lost, read_settings
+        from agents.remote.zmq_link import SECRET, ZmqLink
+    except ImportError:
+        yield failed("protocol", "pyzmq and msgpack are not installed", "pip install 'rare-envs[remote]'")
+        return
+    address, settings = read_settings(spec)
+    timeout = settings.get("timeout", TIMEOUT)
+    link = ZmqLink(address, os.environ.get(SECRET, "").encode() or None)
+    numbers = iter(range(1, 10**6))
+
+    def ask(message: Any) -> Any:
+        content = message if isinstance(message, bytes) else wire.pack({"id": next(numbers), **message})
+        return wire.unpack(link.ask(content, timeout))
+
+    try:
+        link.open()
+        before = ask({"type": "ping"})
+        link.open()
+        hello = link.hello(
+            {"type": "hello", "protocol": wire.PROTOCOL, "client": "check-ego", "id": next(numbers)}, timeout
+        )
+        if hello.get("type") != "hello" or hello.get("protocol") != wire.PROTOCOL:
+            yield failed("handshake", f"{hello.get('reason', hello)}", ADVICE)
+            return
+        yield passed("handshake", f"protocol {wire.PROTOCOL}, {hello.get('name', 'no name')!r}")
+        yield _expected("before hello", before, "error")
+        for name, act in _questions(hello).items():
+            yield from act(name, ask)
+    except (Lost, EgoGone, ValueError) as error:
+        yield failed("protocol", reason_of(error), f"is it running at {address}? {ADVICE}")
+    finally:
+        link.close()
+
+
+def _questions(hello: Any) -> dict[str, Callable[[str, Any], Iterator[Finding]]]:
+    """What is asked after the hello."""
+    from agents.remote.request_handler import read_space
+
+    space = read_space(hello.get("observation")) or spaces.Box(-5.0, 5.0, (7,), np.float32)
+
+    def act(session: int, step: int, rows: int = 3) -> dict[str, Any]:
+        from agents.remote import protocol as wire
+
+        parts = dict(space.spaces) if isinstance(space, spaces.Dict) else space
+        blank = each(lambda part: np.zeros((rows, *part.shape), part.dtype), parts)
+        return {"type": "act", "session": session, "step": step, "observation": wire.pack_observation(blank)}
+
+    def expect(kind: str, *messages: Any) -> Callable[[str, Any], Iterator[Finding]]:
+        def run(name: str, ask: Any) -> Iterator[Finding]:
+            for message in messages:
+                reply = ask(message)
+            yield _expected(name, reply, kind)
+
+        return run
+
+    def two_sessions(name: str, ask: Any) -> Iterator[Finding]:
+        for session in (11, 12):
+            ask({"type": "reset", "session": session, "batch": 3})
+        kinds = [ask(act(session, step)).get("type") for step in (0, 1) for session in (11, 12)]
+        yield _expected(name, {"type": kinds[0] if len(set(kinds)) == 1 else kinds}, "action")
+
+    reset = {"type": "reset", "session": 1, "batch": 3}
+    empty = {"dtype": "<f4", "shape": [3, 7], "data": b""}
+    return {
+        "heartbeat": expect("pong", {"type": "ping"}),
+        "unknown type": expect("error", {"type": "dance"}),
+        "no msgpack": expect("error", b"\xc1 not a message"),
+        "cut short": expect("error", b"\x82\xa4type\xa5res"),
+        "no reset": expect("error", act(99, 0)),
+        "reset": expect("ready", reset),
+        "act": expect("action", act(1, 0)),
+        "act again": expect("action", act(1, 1)),
+        "another step": expect("error", act(1, 7)),
+        "another batch": expect("error", reset, act(1, 0, rows=4)),
+        "data missing": expect("error", reset, {**act(1, 0), "observation": empty}),
+        "two sessions": two_sessions,
+        "end": expect("ended", {"type": "end", "session": 1}),
+        "after it all": expect("pong", {"type": "ping"}),
+    }
+
+
+def _expected(name: str, reply: Any, kind: str) -> Finding:
+    """Whether an answer is of the kind that the protocol says."""
+    found = reply.get("type")
+    if found == kind:
+        return passed(name, f"{kind}: {reply['reason']}" if kind == "error" and "reason" in reply else kind)
+    return failed(name, f"got {found!r} ({reply.get('reason', '')}), expected {kind!r}", ADVICE)

@@ -1,0 +1,218 @@
+"""The folder a run leaves behind: result.json, failures.csv (and failures.npz), plot.png, faults.csv.
+
+Until it is done its finished simulations are there, see `rare_envs.study.journal`.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import sys
+from contextlib import closing
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import samplers
+from agents.loading import kind_of
+from rare_envs.distributions.space import ScenarioSpace
+from rare_envs.study.columns import SHOWN, columns_of
+from rare_envs.study.errors import BadInput, output_folder
+from rare_envs.study.evaluate import Question, Report, Study, prepare, run
+from rare_envs.study.journal import Journal
+from rare_envs.study.plots import save_plot
+from rare_envs.traffic.crash import KINDS, NONE
+
+RESULT, FAILURES, BLOCKS, PLOT = "result.json", "failures.csv", "failures.npz", "plot.png"
+"""Blocks are what a table has no room for: of more than `columns.SHOWN` values, drivers' weights and noise."""
+CRASH = (
+    "crash",
+    "striking",
+    "struck",
+    "impact_speed",
+    "closing_speed",
+    "delta_v_striking",
+    "delta_v_struck",
+    "injury_risk_striking",
+    "injury_risk_struck",
+)
+"""Columns of failures.csv that say what a failure ended in: `rare_envs.traffic.crash.Crash`."""
+FAULTS, FAULT_BLOCKS = "faults.csv", "faults.npz"
+"""Likewise, scenarios on which the ego failed."""
+
+
+def run_into(folder: Path, study: Study, progress: bool = False) -> Report:
+    """Answer a question and write the answer; what is simulated is kept, should the run end before its time.
+
+    Args:
+        folder: Is made, if need be; files of an earlier run in it are replaced.
+        study: From `rare_envs.study.evaluate.prepare`.
+        progress: Show a bar on standard error.
+
+    Returns:
+        The report.
+
+    Raises:
+        BadInput: See `rare_envs.study.evaluate.run`; or the folder cannot be used, or has an unfinished run.
+    """
+    with output_folder(folder), closing(Journal(folder, asdict(study.question))) as journal:
+        return _run(folder, study, journal, progress)
+
+
+def resume(
+    folder: Path, ego: str | None = None, on_error: str | None = None, trust: bool = False, progress: bool = False
+) -> Report:
+    """Take up a run that has ended before its time, and come to the answer of one that has not.
+
+    Args:
+        folder: Of the run.
+        ego: Address of an ego in another program, if it has changed.
+        on_error: What to count scenarios as on which the ego fails, if that has changed.
+        trust: Let the ego's file run code, as the run was allowed to.
+        progress: Show a bar on standard error.
+
+    Raises:
+        BadInput: There is no unfinished run, it cannot be taken up, or it ends again.
+    """
+    with closing(Journal(folder)) as journal:
+        try:
+            question = Question(**{**journal.question, "trust": trust})
+        except TypeError as error:
+            raise BadInput(f"Cannot take up the run in {str(folder)!r}: {error}") from error
+        if ego is not None and {kind_of(ego), kind_of(question.ego)} != {"remote"}:
+            raise BadInput(f"Expected --ego for one whose address has changed only; the run has {question.ego!r}.")
+        question = replace(question, ego=ego or question.ego, on_error=on_error or question.on_error)
+        return _run(folder, prepare(question), journal, progress)
+
+
+def _run(folder: Path, study: Study, journal: Journal, progress: bool) -> Report:
+    try:
+        report = run(study, progress, journal)
+        write_run(folder, report)
+    except BadInput as error:
+        raise BadInput(f"{error}{_advice(journal, folder)}") from error
+    except KeyboardInterrupt:
+        print(f"Stopped.{_advice(journal, folder)}", file=sys.stderr)
+        raise
+    journal.remove()
+    return report
+
+
+def _advice(journal: Journal, folder: Path) -> str:
+    """What is left of a run that has ended, and what to do about it."""
+    if not journal.n:
+        return ""
+    return f" {journal.n:,} simulations are kept; go on with: rare-envs resume {folder}"
+
+
+def write_run(folder: Path, report: Report) -> None:
+    """Write a report; numbers first, so that they are safe whatever happens to the picture.
+
+    Args:
+        folder: An existing folder; files of an earlier run in it are replaced.
+        report: What to write.
+    """
+    (folder / RESULT).write_text(to_text(report.to_dict()) + "\n", encoding="utf-8")
+    _write_failures(folder, report)
+    _write_faults(folder, report)
+    save_plot(folder / PLOT, report)
+
+
+def to_text(value: dict[str, Any]) -> str:
+    """JSON with one entry a line, but lists of numbers in one, however long."""
+    text = json.dumps(value, indent=2, allow_nan=False)
+    # a line that ends with a bracket is no part of a string, which would have no line breaks
+    return re.sub(r"\[\n([^\[\]{}\"]*)\n *\]", lambda found: f"[{' '.join(found[1].split())}]", text)
+
+
+def read_failures(folder: Path) -> dict[str, NDArray[Any]]:
+    """Read the failures of a run, the most likely first.
+
+    Args:
+        folder: Of `rare-envs estimate --out`.
+
+    Returns:
+        Parameters by name, shape (n,), or (n, size) for blocks; then "f" and "log_p0", shape (n,), and what the
+        failure ended in: "crash" (words) and the numbers of `CRASH`, NaN without a crash. The parameters of row k
+        replay by `env.reset(options={name: found[name][k] for name in env.unwrapped.space.names})`.
+
+    Raises:
+        FileNotFoundError: There is no such run.
+    """
+    with (folder / FAILURES).open(newline="", encoding="utf-8") as file:
+        header, *rows = csv.reader(file)
+    columns: dict[str, list[NDArray[Any]]] = {}
+    for column, name in enumerate(header):
+        cells = [row[column] for row in rows]
+        words = name == CRASH[0]
+        values = np.array(cells, dtype=str) if words else np.array([float(cell or "nan") for cell in cells])
+        columns.setdefault(name.partition("[")[0], []).append(values)
+    found = {name: parts[0] if len(parts) == 1 else np.stack(parts, axis=1) for name, parts in columns.items()}
+    if (folder / BLOCKS).exists():
+        with np.load(folder / BLOCKS) as blocks:
+            found |= {name: blocks[name].astype(np.float64) for name in blocks.files}
+    return found
+
+
+def _write_failures(folder: Path, report: Report) -> None:
+    """One failure a row, the most likely first: x, f, log p0 and the crash."""
+    kind = "" if report.kinds.unknown else KINDS[NONE]
+    crashes = [_crash(crash, kind) for crash in report.crashes]
+    write_failures(folder, report.study.problem.space, report.estimate.failures, CRASH, crashes)
+
+
+def write_failures(
+    folder: Path,
+    space: ScenarioSpace,
+    failures: samplers.Failures,
+    names: tuple[str, ...] = (),
+    more: list[tuple[Any, ...]] | None = None,
+) -> None:
+    """Write `FAILURES`: one failure a row, the most likely first: x, f, log p0, and what more there is, by name."""
+    # repr of a float gives it back exactly, so that a row replays to the same f
+    rest = [(one.f, one.log_p0, *extra) for one, extra in zip(failures, more or [()] * len(failures), strict=True)]
+    _write_table(folder / FAILURES, space, failures.x, ("f", "log_p0", *names), rest)
+
+
+def _crash(crash: dict[str, Any] | None, kind: str) -> tuple[Any, ...]:
+    """A crash as the columns `CRASH`; only the kind that is given where there is none."""
+    if crash is None:
+        return (kind, *("" for _ in CRASH[1:]))
+    speeds = (crash["impact_speed"], crash["closing_speed"])
+    return (crash["kind"], *crash["vehicles"], *speeds, *crash["delta_v"], *crash["injury_risk"])
+
+
+def _write_faults(folder: Path, report: Report) -> None:
+    """One scenario a row on which the ego failed: x and the reason; no file without one."""
+    space, faults = report.study.problem.space, report.faults
+    for name in (FAULTS, FAULT_BLOCKS):
+        (folder / name).unlink(missing_ok=True)
+    if faults:
+        x = np.stack([fault.x for fault in faults])
+        _write_table(folder / FAULTS, space, x, ("reason",), [(fault.reason,) for fault in faults])
+
+
+def _write_table(
+    path: Path, space: ScenarioSpace, x: NDArray[np.float64], names: tuple[str, ...], rest: list[tuple[Any, ...]]
+) -> None:
+    """Scenarios, one a row.
+
+    The table has the columns of x by name but for large blocks, then the rest. Large blocks go row by row into a file
+    of arrays beside it, in single precision, in which they are simulated, so that they replay to the same f.
+    """
+    columns = columns_of(space)
+    shown = [column.shown for column in columns]
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow([*(column.name for column in columns if column.shown), *names])
+        writer.writerows([*row[shown].tolist(), *more] for row, more in zip(x, rest, strict=True))
+    large = {name for name, size in zip(space.names, space.sizes, strict=True) if size > SHOWN}
+    blocks_path = path.with_suffix(".npz")
+    blocks_path.unlink(missing_ok=True)
+    if large:
+        blocks = {name: part.astype(np.float32) for name, part in space.columns(x).items() if name in large}
+        np.savez_compressed(blocks_path, allow_pickle=False, **blocks)

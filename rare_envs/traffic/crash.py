@@ -1,0 +1,220 @@
+"""What kind of crash it was: who hit whom and where, how fast, and how bad that is for the people inside.
+
+Two bodies touch when they begin to overlap along the last of the four axes on which they can be apart; that axis is the
+normal of the contact. Along the tick bodies are taken to move straight, from where they were to where they are.
+"""
+
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from rare_envs.traffic.oriented_boxes import DIAGONAL, axes_of, crossing, project, separation
+from rare_envs.traffic.pairs import pairs, velocities
+from rare_envs.traffic.road import Road
+from rare_envs.traffic.state import State
+
+KINDS = ("none", "rear_end", "rear_ended", "side", "road_edge", "others")
+"""Kinds of crash by number: none; the ego runs into a vehicle ahead; it is run into from behind; flank against flank
+(side-swipe); the ego leaves the road; only other vehicles collided."""
+NONE, REAR_END, REAR_ENDED, SIDE, ROAD_EDGE, OTHERS = range(len(KINDS))
+RESTITUTION = 0.0
+"""Share of the closing speed with which bodies part again: 0, a plastic impact, as usual above 10 m/s; near 0.3 at
+walking pace."""
+_MPH = 2.2369362920544
+"""Miles per hour in a metre per second."""
+_MAIS3 = {"all": (-6.9540, 0.1637), "frontal": (-6.9774, 0.1620), "rear": (-8.0329, 0.1793)}
+"""Intercept and slope per mph of delta-v, by crash mode; see `injury_risk`."""
+
+
+class Crash(NamedTuple):
+    """Crashes of B episodes.
+
+    Of two vehicles, the first is the one that runs into the other: it moves faster towards it than the other towards
+    the first, along the road, or across it where flanks meet.
+    """
+
+    kind: Tensor
+    """Index of `KINDS`, int64, shape (B,)."""
+    vehicles: Tensor
+    """Indices of the two vehicles, int64, shape (B, 2); -1 for the edge of the road, and for nobody."""
+    impact_speed: Tensor
+    """Relative speed at contact [m/s], shape (B,)."""
+    closing_speed: Tensor
+    """Its part along the normal of the contact [m/s], shape (B,)."""
+    delta_v: Tensor
+    """Change of velocity of the two in the impact [m/s], shape (B, 2): (1 + restitution) / 2 of the closing speed, as
+    masses are equal and nothing rubs; all of it (1 + restitution times) against the edge, which is a wall."""
+    injury_risk: Tensor
+    """Probability that an occupant of the two is injured seriously (MAIS 3 or more), shape (B, 2), see
+    `injury_risk`."""
+
+    @classmethod
+    def nothing(cls, like: Tensor) -> "Crash":
+        """No crash, in B = len(like) episodes of the dtype and device of `like`."""
+        batch, whole = len(like), torch.int64
+        zero = torch.zeros(batch, dtype=like.dtype, device=like.device)
+        both = zero[:, None].expand(batch, 2)
+        nobody = torch.full((batch, 2), -1, dtype=whole, device=like.device)
+        return cls(torch.full_like(zero, NONE, dtype=whole), nobody, zero, zero, both, both)
+
+    def replaced(self, where: Tensor, by: "Crash") -> "Crash":
+        """These crashes, but `by` in the episodes `where`, boolean, shape (B,)."""
+        return Crash(
+            *(
+                torch.where(where if old.ndim == 1 else where[:, None], new, old)
+                for old, new in zip(self, by, strict=True)
+            )
+        )
+
+
+def injury_risk(delta_v: Tensor, mode: str = "all") -> Tensor:
+    """Probability of a serious injury (MAIS 3 or more) of an occupant, by the delta-v of the vehicle.
+
+    Logistic, 1 / (1 + exp(-(a + b delta-v))), from tow-away crashes of light vehicles in the United States, 2010 to
+    2015 (NASS-CDS); restraint, age and intrusion are averaged over. That sample has few light crashes, and the curve
+    does not go to 0 at 0 (about 0.1 %), so it is an order of severity rather than a forecast.
+
+    Args:
+        delta_v: Change of velocity in the impact [m/s], any shape.
+        mode: "frontal", "rear" (struck from behind) or "all" crashes.
+
+    Returns:
+        Probability, same shape.
+
+    References:
+        Wang, "MAIS(05/08) injury probability curves as functions of delta V", NHTSA, DOT HS 813 219, 2022.
+    """
+    intercept, slope = _MAIS3[mode]
+    return torch.sigmoid(intercept + slope * _MPH * delta_v)
+
+
+def crash_of(state: State, road: Road, before: State | None = None, dt: float = 0.1) -> Crash:
+    """The crash of the ego in each of B scenarios at the moment in which it happened.
+
+    Args:
+        state: Traffic at that moment.
+        road: Their road.
+        before: Traffic one tick earlier, from which the ways of the tick are known; None goes by speeds and headings.
+        dt: Tick [s].
+
+    Returns:
+        With the first vehicle that the ego touched, or with the edge of the road where it overlaps none and has left
+        the road; else no crash.
+    """
+    found = _pair_crash(state, road, before, dt, slice(0, state.x.shape[1] - 1))
+    off = (found.kind == NONE) & road.off_road(state.y[:, 0])
+    return found.replaced(off, _edge_crash(state, before, dt))
+
+
+def crash_of_others(state: State, road: Road, before: State | None = None, dt: float = 0.1) -> Crash:
+    """As `crash_of`, but between vehicles other than the ego, of kind "others"."""
+    found = _pair_crash(state, road, before, dt, slice(state.x.shape[1] - 1, None))
+    return found._replace(kind=torch.where(found.kind == NONE, NONE, OTHERS))
+
+
+def others_touch(state: State, road: Road) -> Tensor:
+    """Whether two vehicles other than the ego overlap, boolean, shape (B,)."""
+    n = state.x.shape[1] - 1
+    first, second = (list(index[n:]) for index in pairs(n + 1))
+    x, y, heading = road.to_world(state.x, state.y, state.heading)
+    dx, dy = x[:, second] - x[:, first], y[:, second] - y[:, first]
+    touch = (dx.abs() < DIAGONAL) & (dy.abs() < DIAGONAL)
+    if bool(touch.any()):
+        one, other = heading[:, first][touch], heading[:, second][touch]
+        touch[touch.clone()] = separation(axes_of(dx[touch], dy[touch], one, other)) < 0
+    touching: Tensor = touch.any(1)
+    return touching
+
+
+def _pair_crash(state: State, road: Road, before: State | None, dt: float, which: slice) -> Crash:
+    """The first contact among some pairs of vehicles."""
+    first, second = (list(index[which]) for index in pairs(state.x.shape[1]))
+    nothing = Crash.nothing(state.x[:, 0])
+    if not first:
+        return nothing
+    x, y, heading = road.to_world(state.x, state.y, state.heading)
+    along, across = _moved(state, road, heading, before, dt)
+    one, other = heading[:, first], heading[:, second]
+    axes = axes_of(x[:, second] - x[:, first], y[:, second] - y[:, first], one, other)
+    dvx, dvy = along[:, second] - along[:, first], across[:, second] - across[:, first]
+    rate = project(dvx, dvy, one, other)
+    enter = crossing(axes, rate).enter
+    since, axis = enter.max(-1)
+    resting = torch.isinf(since)  # nothing moves: the axis along which they overlap least
+    axis = torch.where(resting, axes.gap.argmax(-1), axis)
+    touching = separation(axes) < 0
+    at = torch.where(touching, torch.where(resting, torch.finfo(since.dtype).min, since), torch.inf)
+    pair = at.argmin(1, keepdim=True)
+
+    def of(values: Tensor) -> Tensor:
+        return values.gather(1, pair)[:, 0]
+
+    def on_axis(values: Tensor) -> Tensor:
+        return of(values.gather(-1, axis[..., None])[..., 0])
+
+    towards = torch.sign(on_axis(axes.offset))  # the normal points from the first to the second
+    closing = (-on_axis(rate) * towards).clamp(min=0.0)
+    index_one, index_two = (torch.tensor(each, device=x.device).expand_as(at) for each in (first, second))
+    couple = torch.stack((of(index_one), of(index_two)), -1)
+    kind = _kind(of(axis), of(other - one), of(axes.offset[..., 0]))
+    own, its = (_approach(state, before, dt, kind == SIDE, each) for each in (couple, couple.flip(-1)))
+    vehicles = torch.where((own >= its)[:, None], couple, couple.flip(-1))
+    change = ((1.0 + RESTITUTION) / 2.0 * closing)[:, None].expand(-1, 2)
+    lengthwise = (kind != SIDE)[:, None]
+    risk = torch.stack((injury_risk(change[:, 0], "frontal"), injury_risk(change[:, 1], "rear")), -1)
+    risk = torch.where(lengthwise, risk, injury_risk(change))
+    speed = of((dvx.square() + dvy.square()).sqrt())
+    crash = Crash(kind, vehicles, speed, closing, change, risk)
+    return nothing.replaced(touching.any(1), crash)
+
+
+def _moved(state: State, road: Road, heading: Tensor, before: State | None, dt: float) -> tuple[Tensor, Tensor]:
+    """Velocities in the world over the last tick [m/s], shape (B, N) each."""
+    if before is None:
+        return velocities(state, heading)
+    x, y, _ = road.to_world(state.x, state.y, state.heading)
+    old_x, old_y, _ = road.to_world(before.x, before.y, before.heading)
+    return (x - old_x) / dt, (y - old_y) / dt
+
+
+def _approach(state: State, before: State | None, dt: float, side: Tensor, couple: Tensor) -> Tensor:
+    """Speed of the first of two vehicles towards the second, across the road or along it [m/s], shape (B,)."""
+    along, across = velocities(state, state.heading)
+    if before is not None:
+        along, across = (state.x - before.x) / dt, (state.y - before.y) / dt
+    place, speed = torch.where(side[:, None], state.y, state.x), torch.where(side[:, None], across, along)
+    first, second = place.gather(1, couple).unbind(1)
+    return speed.gather(1, couple[:, :1])[:, 0] * torch.sign(second - first)
+
+
+def _kind(axis: Tensor, turn: Tensor, ahead: Tensor) -> Tensor:
+    """Kind by the normal's angle to the heading of the first, and by whether the second is ahead of it."""
+    angle = torch.where(axis >= 2, turn, 0.0)
+    lengthwise = (torch.cos(angle).abs() >= torch.sin(angle).abs()) == (axis % 2 == 0)
+    return torch.where(lengthwise, torch.where(ahead > 0, REAR_END, REAR_ENDED), SIDE)
+
+
+def _edge_crash(state: State, before: State | None, dt: float) -> Crash:
+    """The ego against the edge of the road, a wall along it."""
+    crash = Crash.nothing(state.x[:, 0])
+    across = state.speed[:, 0] * torch.sin(state.heading[:, 0])
+    if before is not None:
+        across = (state.y[:, 0] - before.y[:, 0]) / dt
+    change = torch.stack(((1.0 + RESTITUTION) * across.abs(), torch.zeros_like(across)), -1)
+    risk = torch.stack((injury_risk(change[:, 0]), torch.zeros_like(across)), -1)
+    edge = crash.vehicles + torch.tensor([1, 0], device=across.device)
+    return Crash(torch.full_like(crash.kind, ROAD_EDGE), edge, state.speed[:, 0], across.abs(), change, risk)
+
+
+def describe(crash: Crash, row: int = 0) -> dict[str, Any] | None:
+    """One crash in plain values, for `info` and for files; None where there was none.
+
+    Returns:
+        "kind" (of `KINDS`), "vehicles" (who ran into whom), "impact_speed", "closing_speed", "delta_v" [m/s] and
+        "injury_risk" (both of the two vehicles in this order).
+    """
+    kind = KINDS[int(crash.kind[row])]
+    if kind == KINDS[NONE]:
+        return None
+    return {name: kind if name == "kind" else values[row].tolist() for name, values in crash._asdict().items()}

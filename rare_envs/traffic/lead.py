@@ -1,0 +1,54 @@
+"""Where vehicles are relative to each other: the lead, overlap of oriented boxes."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from rare_envs.traffic.road import Road
+from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
+
+
+class Lead(NamedTuple):
+    """The vehicle that a follower has to mind."""
+
+    gap: Tensor
+    """Bumper to bumper along the road [m], shape (B,); inf without a lead, negative side by side."""
+    closing_speed: Tensor
+    """Follower's speed less the lead's, along the follower's heading [m/s], shape (B,); 0 without a lead."""
+
+
+def lead_of(state: State, road: Road) -> Lead:
+    """The ego's lead: the nearest vehicle ahead whose body reaches into the ego's lane.
+
+    "Ahead" compares centres. A body reaches into a lane when its centre is within half a lane and half a vehicle of
+    the lane's centre, which for a 4 m lane is HighwayEnv's `on_lane` with its margin of 1 m. Gaps are measured along
+    the road's reference line.
+
+    Args:
+        state: Traffic of B scenarios.
+        road: Their road.
+
+    Returns:
+        Gap and closing speed, shape (B,) each.
+    """
+    x, y = state.x[:, 0], state.y[:, 0]
+    lane_y, reach = road.centre_of(y), (road.width + VEHICLE_WIDTH) / 2
+    ahead = state.x[:, 1:] - x[:, None]
+    minded = (ahead >= 0) & ((state.y[:, 1:] - lane_y[:, None]).abs() <= reach)
+    along = state.speed[:, 1:] * torch.cos(state.heading[:, 1:] - state.heading[:, :1])
+    nearest, lead_speed = torch.full_like(x, torch.inf), state.speed[:, 0]
+    for way, seen, speed in zip(ahead.unbind(1), minded.unbind(1), along.unbind(1), strict=True):
+        nearer = seen & (way <= nearest)
+        nearest, lead_speed = torch.where(nearer, way, nearest), torch.where(nearer, speed, lead_speed)
+    return Lead(nearest - VEHICLE_LENGTH, state.speed[:, 0] - lead_speed)
+
+
+def lead_index(state: State, road: Road) -> Tensor:
+    """Which vehicle is the ego's lead, see `lead_of`: its index, int64, shape (B,); 0, the ego, if there is none."""
+    x, y = state.x[:, :1], state.y[:, :1]
+    ahead, reach = state.x - x, (road.width + VEHICLE_WIDTH) / 2
+    minded = (ahead >= 0) & ((state.y - road.centre_of(y)).abs() <= reach)
+    way = torch.where(minded, ahead, torch.inf)[:, 1:]
+    least, found = way.flip(1).min(1)  # of vehicles level with each other the last one, as in `lead_of`
+    return torch.where(least < torch.inf, way.shape[1] - found, 0)

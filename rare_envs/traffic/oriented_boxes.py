@@ -1,0 +1,150 @@
+"""Two vehicles' bodies, boxes that may be turned: how far apart, when they meet, how deep they overlap.
+
+Two convex bodies are apart exactly if they are apart along one of the axes of their sides; of two boxes there are four.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
+
+DIAGONAL = (VEHICLE_LENGTH**2 + VEHICLE_WIDTH**2) ** 0.5
+"""Bodies whose centres are further apart than this [m] do not touch."""
+_LENGTHS = (VEHICLE_LENGTH / 2, VEHICLE_WIDTH / 2)
+
+
+class Axes(NamedTuple):
+    """The other body as seen from the first along four axes, the last axis of each tensor.
+
+    They are: along and across the first body, along and across the other.
+    """
+
+    offset: Tensor
+    """Centre of the other less centre of the first [m], shape (..., 4)."""
+    reach: Tensor
+    """Offsets smaller than this overlap along the axis [m], shape (..., 4)."""
+
+    @property
+    def gap(self) -> Tensor:
+        """Distance between the bodies along each axis [m], negative where they overlap, shape (..., 4)."""
+        return self.offset.abs() - self.reach
+
+
+class Crossing(NamedTuple):
+    """When two bodies overlap along each axis, shape (..., 4), if velocities and headings stay."""
+
+    enter: Tensor
+    """From this time [s] on, ..."""
+    leave: Tensor
+    """... until this one."""
+
+
+def project(x: Tensor, y: Tensor, heading: Tensor, other_heading: Tensor) -> Tensor:
+    """A vector along the four axes.
+
+    Args:
+        x: Component along the world's X axis, any shape; the other tensors have the same.
+        y: Component along its Y axis.
+        heading: Headings of the first bodies [rad].
+        other_heading: Headings of the other bodies [rad].
+
+    Returns:
+        Shape (..., 4).
+    """
+    cos, sin = torch.cos(heading), torch.sin(heading)
+    other_cos, other_sin = torch.cos(other_heading), torch.sin(other_heading)
+    return torch.stack(
+        (x * cos + y * sin, y * cos - x * sin, x * other_cos + y * other_sin, y * other_cos - x * other_sin), -1
+    )
+
+
+def axes_of(dx: Tensor, dy: Tensor, heading: Tensor, other_heading: Tensor) -> Axes:
+    """Two bodies along their four axes.
+
+    Args:
+        dx: Centre of the other less centre of the first [m], any shape; the other tensors have the same.
+        dy: Likewise across.
+        heading: Headings of the first [rad].
+        other_heading: Headings of the other [rad].
+    """
+    turn = other_heading - heading
+    cos, sin = torch.cos(turn).abs(), torch.sin(turn).abs()
+    half_length, half_width = _LENGTHS
+    along = half_length + half_length * cos + half_width * sin
+    across = half_width + half_length * sin + half_width * cos
+    return Axes(project(dx, dy, heading, other_heading), torch.stack((along, across, along, across), -1))
+
+
+def separation(axes: Axes) -> Tensor:
+    """The largest gap along an axis [m], shape (...).
+
+    Positive if and only if the bodies are apart, then at most their distance; else the negative depth of their overlap:
+    the least way that one has to be moved to be clear of the other.
+    """
+    return axes.gap.amax(-1)
+
+
+def clearance(axes: Axes, turn: Tensor) -> Tensor:
+    """Exact distance between two bodies [m], the negative depth of their overlap if they do.
+
+    The distance of two convex polygons that are apart is that of a corner of one from the other.
+
+    Args:
+        axes: Of the two.
+        turn: Heading of the other less heading of the first [rad], shape (...).
+
+    Returns:
+        Shape (...).
+    """
+    along, across, other_along, other_across = axes.offset.unbind(-1)
+    corners = _corner_distance(along, across, turn)
+    own = _corner_distance(-other_along, -other_across, -turn)
+    depth = separation(axes)
+    return torch.where(depth < 0, depth, torch.minimum(corners, own))
+
+
+def _corner_distance(along: Tensor, across: Tensor, turn: Tensor) -> Tensor:
+    """Least distance [m] of a corner of a turned box, centred at (along, across), from an unturned one at 0."""
+    half_length, half_width = _LENGTHS
+    cos, sin = torch.cos(turn)[..., None], torch.sin(turn)[..., None]
+    u = cos.new_tensor([half_length, half_length, -half_length, -half_length])
+    v = cos.new_tensor([half_width, -half_width, half_width, -half_width])
+    out = (along[..., None] + u * cos - v * sin).abs() - half_length
+    aside = (across[..., None] + u * sin + v * cos).abs() - half_width
+    square = out.clamp(min=0.0).square() + aside.clamp(min=0.0).square()
+    least = square.amin(-1)
+    apart = least > 0
+    return torch.where(apart, least, 1.0).sqrt() * apart  # the root has no slope at 0
+
+
+def crossing(axes: Axes, rate: Tensor) -> Crossing:
+    """When the bodies overlap along each axis.
+
+    Args:
+        axes: Of the two bodies now.
+        rate: Velocity of the other less that of the first along the axes [m/s], shape (..., 4).
+    """
+    still = rate == 0
+    speed = torch.where(still, 1.0, rate)
+    middle, half = -axes.offset / speed, axes.reach / speed.abs()
+    always = torch.where(axes.gap < 0, torch.inf, -torch.inf)
+    return Crossing(torch.where(still, -always, middle - half), torch.where(still, always, middle + half))
+
+
+def time_to_contact(axes: Axes, rate: Tensor) -> Tensor:
+    """Exact time until two bodies touch if velocities and headings stay [s]: a swept test on the four axes.
+
+    They overlap while they do along every axis: from the last entry to the first exit.
+
+    Args:
+        axes: Of the two bodies now.
+        rate: Velocity of the other less that of the first along the axes [m/s], shape (..., 4).
+
+    Returns:
+        0 where they overlap now, inf where they never will, shape (...).
+    """
+    times = crossing(axes, rate)
+    enter, leave = times.enter.amax(-1), times.leave.amin(-1)
+    return torch.where((enter < leave) & (leave > 0), enter.clamp(min=0.0), torch.inf)

@@ -1,0 +1,125 @@
+"""Vehicle models, one explicit Euler step each: HighwayEnv's kinematic bicycle, and a point mass.
+
+Both move in road coordinates. Where the road is curved, with curvature k, a way of d metres along the road at y is
+d / (1 - k y) of the reference line, and the road turns under the vehicle by k times that.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+from rare_envs.traffic.state import VEHICLE_LENGTH
+
+MAX_STEERING = math.pi / 3
+"""Largest steering angle [rad], HighwayEnv's."""
+_MAX_SLIP_SINE = math.sin(math.atan(0.5 * math.tan(MAX_STEERING)))
+"""Sine of the slip angle at the largest steering angle. Near 1 single precision may give a slip beyond pi / 2, and its
+tangent the other sign."""
+NEAR_ZERO = 0.01
+"""HighwayEnv's `not_zero`: distances [m] and speeds [m/s] in a denominator are kept at least this far from 0."""
+
+
+def bicycle(
+    x: Tensor,
+    y: Tensor,
+    heading: Tensor,
+    speed: Tensor,
+    acceleration: Tensor,
+    steering: Tensor,
+    dt: float,
+    curvature: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Move vehicles by one tick with the kinematic bicycle model.
+
+    beta = atan(tan(steering) / 2), then x, y and heading move with the old speed and heading, and the speed last.
+    HighwayEnv's `Vehicle.step` is the same but for one deliberate difference: it lets vehicles reverse, ours stop.
+
+    Args:
+        x: Centres along the road [m], any shape; the other tensors have the same.
+        y: Centres across the road [m].
+        heading: Headings [rad].
+        speed: Speeds [m/s].
+        acceleration: Accelerations [m/s^2].
+        steering: Front wheel angles [rad].
+        dt: Tick [s].
+        curvature: Of the road at x [1/m], positive to the right; None for a straight road.
+
+    Returns:
+        x, y, heading and speed after the tick.
+
+    References:
+        Polack et al., "The kinematic bicycle model", 2017; HighwayEnv, `vehicle/kinematics.py`.
+    """
+    slip = torch.atan(torch.tan(steering) * 0.5)
+    course = heading + slip
+    distance = speed * dt
+    ahead, turn = distance * torch.cos(course), distance * torch.sin(slip) / (VEHICLE_LENGTH / 2)
+    if curvature is not None:
+        ahead, turn = _along_curve(ahead, turn, y, curvature)
+    return (
+        x + ahead,
+        y + distance * torch.sin(course),
+        heading + turn,
+        (speed + acceleration * dt).clamp(min=0.0),
+    )
+
+
+def steering_for(yaw_rate: Tensor, speed: Tensor) -> Tensor:
+    """The steering angle with which `bicycle` turns at a yaw rate.
+
+    Inverts yaw rate = v sin(beta) / (l / 2), beta = atan(tan(steering) / 2), with l the vehicle's length. A vehicle
+    too slow to turn as fast as wanted steers by `MAX_STEERING`.
+
+    Args:
+        yaw_rate: Wanted [rad/s], shape (B,).
+        speed: [m/s], shape (B,).
+
+    Returns:
+        Steering angle [rad], shape (B,).
+    """
+    sine = VEHICLE_LENGTH / 2 / speed.clamp(min=NEAR_ZERO) * yaw_rate
+    slip = torch.asin(sine.clamp(-_MAX_SLIP_SINE, _MAX_SLIP_SINE))
+    return torch.atan(2.0 * torch.tan(slip)).clamp(-MAX_STEERING, MAX_STEERING)
+
+
+def point_mass(
+    x: Tensor,
+    y: Tensor,
+    heading: Tensor,
+    speed: Tensor,
+    acceleration: Tensor,
+    yaw_rate: Tensor,
+    dt: float,
+    curvature: Tensor | None = None,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Move vehicles by one tick as points that turn at will: the model of learned drivers.
+
+    Args:
+        x: Centres along the road [m], any shape; the other tensors have the same.
+        y: Centres across the road [m].
+        heading: Headings relative to the road [rad].
+        speed: Speeds [m/s].
+        acceleration: Accelerations [m/s^2].
+        yaw_rate: Change of the heading in the world [rad/s].
+        dt: Tick [s].
+        curvature: Of the road at x [1/m], positive to the right; None for a straight road.
+
+    Returns:
+        x, y, heading and speed after the tick; the speed is not negative.
+
+    References:
+        O'Kelly, Sinha, Namkoong, Duchi and Tedrake, "Scalable end-to-end autonomous vehicle testing via rare-event
+        simulation", 2018: the model of their released simulator.
+    """
+    distance = speed * dt
+    ahead, turn = distance * torch.cos(heading), yaw_rate * dt
+    if curvature is not None:
+        ahead, turn = _along_curve(ahead, turn, y, curvature)
+    return x + ahead, y + distance * torch.sin(heading), heading + turn, (speed + acceleration * dt).clamp(min=0.0)
+
+
+def _along_curve(ahead: Tensor, turn: Tensor, y: Tensor, curvature: Tensor) -> tuple[Tensor, Tensor]:
+    """Way of the reference line [m] and turn relative to it [rad] of vehicles that go `ahead` [m] and `turn` [rad]."""
+    ahead = ahead / (1.0 - curvature * y)
+    return ahead, turn - curvature * ahead

@@ -1,0 +1,173 @@
+"""The probability of failure under another base distribution, from the same simulations."""
+
+import math
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from samplers.analysis.base import WeightedEstimate, inflation, sample_of
+from samplers.problem import Distribution, FloatArray
+from samplers.serialization import plain
+from samplers.statistics.cluster_sums import alone, interval_of_sum
+from samplers.statistics.intervals import Interval
+from samplers.statistics.weights import effective
+
+LEAST_ESS = 30.0
+"""Effective number of failing points that the answer must rest on."""
+LEAST_UNITS = 5.0
+"""Effective number of independent units (draws; paths of chains) that these points must come from."""
+LARGEST_LOG = 600.0
+"""exp of this, or of its negative, is still a float."""
+DRAWS = 10_000
+"""Draws from the new base that look for places where the old one has no density."""
+
+
+@runtime_checkable
+class HasLogProb(Protocol):
+    """A law that can be evaluated."""
+
+    def log_prob(self, x: FloatArray, /) -> FloatArray:
+        """Log density at x (n, d), shape (n,)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reweighted:
+    """P[f(X) <= gamma] with X from another base distribution."""
+
+    p: float
+    """Estimated probability under the new base."""
+    interval: Interval
+    """Interval that should hold the true p with probability `confidence`."""
+    confidence: float
+    """Nominal coverage of `interval`."""
+    cov: float
+    """Coefficient of variation of p."""
+    ess: float
+    """Effective number of failing points behind p, (sum w)^2 / sum w^2."""
+    units: float
+    """Effective number of independent units that these come from: the same for independent draws."""
+    gamma: float
+    """Threshold of failure."""
+    ratio: float
+    """p over the p of the old base."""
+
+    def __str__(self) -> str:
+        """Return two lines for people."""
+        low, high = self.interval
+        return (
+            f"P[f <= {self.gamma:g}] = {self.p:.3e} under the new base, {self.ratio:.3g} times that under the old\n"
+            f"  {100 * self.confidence:g} % interval [{low:.3e}, {high:.3e}], c.o.v. {self.cov:.3g}; "
+            f"effectively {self.ess:.0f} failing points from {self.units:.0f} independent units"
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain numbers for JSON."""
+        data = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        return {key: plain(value) for key, value in data.items()}
+
+
+def reweighted(estimate: WeightedEstimate, new_base: HasLogProb) -> Reweighted:
+    """Return p under another base; see `Estimate.reweight`.
+
+    p1 = sum of w r over the failing points, r = p1(x) / p0(x). With T_c the sums over units, its
+    variance is sum T_c^2 - p1^2 / n, to which the largest T_c^2 is added: where one term dominates, the
+    spread of those seen is too small most of the time. The interval is log-normal with the t
+    quantile of the effective units.
+
+    Raises:
+        ValueError: As described in `Estimate.reweight`.
+    """
+    sample = sample_of(estimate)
+    failing = sample.f <= estimate.gamma
+    f, old, owners = sample.f[failing], sample.weights[failing], sample.units[failing]
+    log_ratios = ratios(estimate, new_base, sample.x)
+    highest = float(log_ratios.max())
+    largest = highest if math.isfinite(highest) else 0.0  # taken out, so that nothing overflows
+    terms = old * np.exp(log_ratios - largest)
+    totals = np.bincount(owners, weights=terms, minlength=1).astype(np.float64)
+    ess, units = effective(terms), effective(totals)
+    check_enough(estimate, ess, units)
+    total = float(terms.sum())
+    square = 1 / units - 1 / sample.n_units + (float(totals.max()) / total) ** 2
+    own = 1 / effective(np.bincount(owners, weights=old).astype(np.float64)) - 1 / sample.n_units
+    cov = math.sqrt(max(square, 0.0)) * inflation(estimate, math.sqrt(max(own, 0.0)))
+    ratio = total / float(old.sum()) * math.exp(min(max(largest, -LARGEST_LOG), LARGEST_LOG))
+    p = min(1.0, estimate.p * ratio)
+    low, high = interval_of_sum(p, cov, units, alone(sample), estimate.confidence)
+    if estimate.on_error == "bound":
+        low *= 1 - float(terms[np.isneginf(f)].sum()) / total
+    return Reweighted(
+        p=p,
+        interval=(low, high),
+        confidence=estimate.confidence,
+        cov=cov,
+        ess=ess,
+        units=units,
+        gamma=estimate.gamma,
+        ratio=p / estimate.p,
+    )
+
+
+def ratios(estimate: WeightedEstimate, new_base: HasLogProb, x: FloatArray) -> FloatArray:
+    """Return log(p1 / p0) at the failing points x (k, d), shape (k,), or raise a ValueError where that cannot be."""
+    base = estimate.base
+    if base is None:
+        raise ValueError("The estimate does not know its base distribution (`Estimate.base`).")
+    if len(x) == 0:
+        raise ValueError(f"No point failed (f <= {estimate.gamma:g}): there is nothing to weigh anew.")
+    check_fits(new_base, x.shape[1])
+    check_support(base, new_base, x.shape[1], estimate.seed)
+    new, old = log_density(new_base, x), log_density(base, x)
+    wrong = np.isnan(new) | np.isposinf(new) | ~np.isfinite(old)
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        raise ValueError(
+            f"Expected finite densities at the failing points; at {x[row]} log_prob is {new[row]} under the new base "
+            f"and {old[row]} under the old."
+        )
+    return new - old
+
+
+def check_fits(new_base: object, dim: int) -> None:
+    """Raise a ValueError unless the new base has a log_prob and, as far as it says, `dim` dimensions."""
+    if not isinstance(new_base, HasLogProb):
+        raise ValueError(f"Expected a distribution with log_prob, got {new_base!r}.")
+    own = getattr(new_base, "dim", dim)
+    if own != dim:
+        raise ValueError(f"Expected a distribution in {dim} dimensions, got one in {own}.")
+
+
+def check_support(base: Distribution, new_base: HasLogProb, dim: int, seed: int) -> None:
+    """Raise a ValueError if draws from the new base, where there is a way to make them, fall outside the old one."""
+    draw = getattr(new_base, "sample", None)
+    if not callable(draw):
+        return
+    x = np.asarray(draw(DRAWS, np.random.default_rng(seed)), dtype=np.float64)
+    if x.shape != (DRAWS, dim):
+        raise ValueError(f"Expected a distribution in {dim} dimensions; {DRAWS} draws of this have shape {x.shape}.")
+    outside = float(np.mean(np.isneginf(base.log_prob(x))))
+    if outside > 0:
+        raise ValueError(
+            f"The old base has no density at {100 * outside:.2g} % of draws from the new one: failures there were "
+            "never drawn. Estimate again with the new base."
+        )
+
+
+def log_density(law: HasLogProb, x: FloatArray) -> FloatArray:
+    """Return log_prob at x (k, d), its shape (k,) checked."""
+    values = np.asarray(law.log_prob(x), dtype=np.float64)
+    if values.shape != (len(x),):
+        raise ValueError(f"Expected log_prob to give one number per point, shape ({len(x)},), got {values.shape}.")
+    return values
+
+
+def check_enough(estimate: WeightedEstimate, ess: float, units: float) -> None:
+    """Raise a ValueError where too few points or units carry the new estimate."""
+    if ess >= LEAST_ESS and units >= LEAST_UNITS:
+        return
+    raise ValueError(
+        f"The failing points of this run are worth {ess:.1f} points from {units:.1f} independent units under the new "
+        f"base; at least {LEAST_ESS:g} and {LEAST_UNITS:g} are needed. Estimate again with the new base, or start "
+        f"from a run with more failing points (it has {estimate.failures.total:,})."
+    )

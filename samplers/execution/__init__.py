@@ -1,0 +1,1 @@
+"""Running a method: arguments, the ask-tell dialogue, the evaluation log, replicates and faults."""

@@ -1,0 +1,173 @@
+"""Combining independent runs of one method."""
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy import stats
+
+from samplers.method import Outcome, share_of_failures
+from samplers.sample import Sample
+from samplers.statistics.intervals import Interval, binomial_cov
+from samplers.trace import Level, Status
+
+OWN_ERROR_SHORT = 1.5
+"""Runs are taken to understate their own errors by this factor before they are said to disagree."""
+LEAST_SPREAD = 1 / 3
+"""Runs closer together than this share of their own errors are so by chance, such as counts that tie."""
+WORTHLESS = 1.0
+"""A run with a c.o.v. from here on knows no more of p than its interval says."""
+FALSE_ALARM = 1e-4
+"""Probability with which runs whose errors are right would be said to."""
+BY_CONCERN = (Status.STOPPED, Status.STALLED, Status.BUDGET, Status.CONVERGED)
+"""The status of the whole is the first of these that a run has."""
+
+
+def combined(outcomes: Sequence[Outcome], confidence: float) -> Outcome:
+    """Return R independent runs as one: pooled counts, or their mean with a t interval.
+
+    Where every run is a share k_i / n_i of independent draws, the draws are those of one longer
+    run: p = sum k_i / sum n_i with the Clopper-Pearson interval. (A t interval would throw away
+    what binomial counts say of their own spread; with R = 2 its quantile is 12.7.)
+
+    Otherwise p is the arithmetic mean p_bar (each run's p-hat is unbiased, its logarithm is not).
+    Its c.o.v. is the larger of what the runs say of themselves and of what their spread shows. The
+    interval is p_bar exp(-+ t s / sqrt(R)) with s the standard deviation of log p-hat (of
+    p-hat / p_bar, where a run has p-hat = 0), but at least a third of the runs' own c.o.v., and t the
+    quantile with R - 1 degrees of freedom. Where no run has a c.o.v. under 1 their spread says nothing
+    either: the interval is that of all runs' intervals together.
+    Runs that were stopped before their end have no part in the mean if any run came to its end: one
+    that is still on its way to the failures has p-hat = 0, which is no estimate. Their levels stay
+    in the trace.
+    """
+    if len(outcomes) == 1:
+        return outcomes[0]
+    trace = tuple(_numbered(outcomes))
+    counts = pooled_counts(outcomes)
+    if counts is not None:
+        hits, n = counts
+        without = sum(o.no_outcome_share * o.counts[0] for o in outcomes if o.counts)
+        whole = share_of_failures(hits, n, confidence, trace, without / hits if hits else 0.0)
+        return replace(whole, sample=merged_sample(outcomes, [o.counts[1] / n for o in outcomes if o.counts]))
+    used = ended(outcomes)
+    left_out = len(outcomes) - len(used)
+    about = (f"{left_out} of {len(outcomes)} runs were stopped before their end and left out.",) if left_out else ()
+    if len(used) == 1:
+        return replace(used[0], trace=trace, warnings=(*used[0].warnings, *about))
+    p = np.array([outcome.p for outcome in used])
+    mean = float(p.mean())
+    return Outcome(
+        p=mean,
+        interval=_interval(used, p, confidence),
+        cov=combined_cov(used),
+        status=_status(used) if mean > 0 else Status.NO_HITS,
+        warnings=(*_counted(used), *about, *_disagreement(used)),
+        trace=trace,
+        no_outcome_share=(float(np.average([o.no_outcome_share for o in used], weights=p)) if mean else 0.0),
+        sample=merged_sample(used, [1 / len(used)] * len(used)),
+        base_draws=sum(outcome.base_draws for outcome in used),
+    )
+
+
+def _disagreement(outcomes: Sequence[Outcome]) -> list[str]:
+    """Warn where runs lie further apart than their own errors allow: a region was found by some of them only."""
+    p = np.array([outcome.p for outcome in outcomes])
+    error = OWN_ERROR_SHORT * np.array([outcome.p * outcome.cov if outcome.p > 0 else 0.0 for outcome in outcomes])
+    if len(p) < 3 or not (error > 0).all():
+        return []
+    with np.errstate(over="ignore"):  # inf is far enough apart
+        apart = float((((p - p.mean()) / error) ** 2).sum())
+    if stats.chi2.sf(apart, len(p) - 1) > FALSE_ALARM:
+        return []
+    return [f"The runs disagree ({p.min():.2e} to {p.max():.2e}): some of them may have missed a region of failure."]
+
+
+def ended(outcomes: Sequence[Outcome]) -> Sequence[Outcome]:
+    """Return the runs that came to their end or, where there is none, all of them."""
+    return [outcome for outcome in outcomes if outcome.status is not Status.STOPPED] or outcomes
+
+
+def merged_sample(outcomes: Sequence[Outcome], shares: Sequence[float]) -> Sample | None:
+    """Return the points behind a weighted mean of runs, or None if a run does not give its own.
+
+    Args:
+        outcomes: R runs.
+        shares: The weight of each run in the mean, R numbers that add up to 1.
+    """
+    samples = [outcome.sample for outcome in outcomes if outcome.sample is not None]
+    if len(samples) < len(outcomes):
+        return None
+    first_units = np.cumsum([0, *(sample.n_units for sample in samples)])
+    return Sample(
+        f=np.concatenate([sample.f for sample in samples]),
+        weights=np.concatenate([share * sample.weights for share, sample in zip(shares, samples, strict=True)]),
+        units=np.concatenate([first + sample.units for first, sample in zip(first_units, samples, strict=False)]),
+        n_units=int(first_units[-1]),
+        x=np.concatenate([sample.x for sample in samples]),
+        layers=tuple(
+            replace(layer, weights=share * layer.weights, units=first + layer.units)
+            for first, share, sample in zip(first_units, shares, samples, strict=False)
+            for layer in sample.all_layers
+        )
+        if any(sample.layers for sample in samples)
+        else (),
+    )
+
+
+def pooled_counts(outcomes: Sequence[Outcome]) -> tuple[int, int] | None:
+    """Return failing and all draws of the runs together; None if a run is no share of plain draws."""
+    counts = [outcome.counts for outcome in outcomes if outcome.counts is not None]
+    if len(counts) < len(outcomes):
+        return None
+    return sum(hits for hits, _ in counts), sum(n for _, n in counts)
+
+
+def combined_cov(outcomes: Sequence[Outcome]) -> float:
+    """Return the c.o.v. of the combined runs.
+
+    That of the pooled counts or, for a mean, the own or empirical one, whichever is larger.
+    """
+    counts = pooled_counts(outcomes)
+    if counts is not None:
+        hits, n = counts
+        return binomial_cov(hits / n, n)
+    p = np.array([outcome.p for outcome in outcomes])
+    if not p.any():
+        return math.inf
+    seen = float((p / p.mean()).std(ddof=1)) if len(p) > 1 else 0.0
+    return max(_own_error(outcomes), seen) / math.sqrt(len(p))
+
+
+def _own_error(outcomes: Sequence[Outcome]) -> float:
+    """Return what the runs say of themselves: the root mean square of their errors, relative to their mean."""
+    mean = float(np.mean([outcome.p for outcome in outcomes]))
+    errors = [outcome.p / mean * outcome.cov for outcome in outcomes if outcome.p > 0]  # p squared might underflow
+    return math.hypot(*errors) / math.sqrt(len(outcomes))
+
+
+def _interval(outcomes: Sequence[Outcome], p: np.ndarray, confidence: float) -> Interval:
+    mean, runs = float(p.mean()), len(p)
+    if np.ptp(p) == 0 or min(outcome.cov for outcome in outcomes) >= WORTHLESS:
+        # no spread to go by: all runs' own intervals together
+        return min(o.interval[0] for o in outcomes), max(o.interval[1] for o in outcomes)
+    spread = float(np.log(p).std(ddof=1)) if p.all() else float((p / mean).std(ddof=1))
+    spread = max(spread, LEAST_SPREAD * _own_error(outcomes))
+    half = float(stats.t.ppf(0.5 + confidence / 2, runs - 1)) * spread / math.sqrt(runs)
+    return mean * math.exp(-half), min(1.0, mean * math.exp(half))
+
+
+def _status(outcomes: Sequence[Outcome]) -> Status:
+    present = {outcome.status for outcome in outcomes}
+    return next((status for status in BY_CONCERN if status in present), Status.BUDGET)
+
+
+def _counted(outcomes: Sequence[Outcome]) -> tuple[str, ...]:
+    """Return the warnings of the runs, each once, with the number of runs that have it."""
+    texts = Counter(text for outcome in outcomes for text in outcome.warnings)
+    return tuple(f"In {count} of {len(outcomes)} runs: {text}" for text, count in texts.items())
+
+
+def _numbered(outcomes: Sequence[Outcome]) -> list[Level]:
+    return [replace(level, run=i) for i, o in enumerate(outcomes) for level in o.trace]

@@ -1,0 +1,98 @@
+"""Telling people how far a run has come."""
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+from samplers.trace import Level
+
+
+@dataclass(frozen=True, kw_only=True)
+class Progress:
+    """How far a run has come."""
+
+    n_sim: int
+    """Simulations done."""
+    max_sim: int | None
+    """Simulations allowed; None for no limit."""
+    level: float
+    """Threshold of the last finished level; inf before the first."""
+    p: float
+    """Running estimate of P[f(X) <= level]; NaN before the first level."""
+    run: int
+    """Replicate that finished this level, counted from 0 (they run side by side)."""
+
+
+Listener = Callable[[Progress], None]
+
+
+class Monitor:
+    """Puts together what the counter and the methods report and passes it on.
+
+    Args:
+        listener: Given `progress` whenever it changes.
+        max_sim: Simulations allowed; None for no limit.
+    """
+
+    def __init__(self, listener: Listener | None, max_sim: int | None) -> None:
+        self.progress = Progress(n_sim=0, max_sim=max_sim, level=math.inf, p=math.nan, run=0)
+        self._listener = listener
+
+    def on_batch(self, n_sim: int) -> None:
+        """Note that n_sim simulations are done."""
+        self._tell(replace(self.progress, n_sim=n_sim))
+
+    def on_level(self, level: Level) -> None:
+        """Note a finished level."""
+        self._tell(replace(self.progress, level=level.gamma, p=level.estimate, run=level.run))
+
+    def _tell(self, progress: Progress) -> None:
+        self.progress = progress
+        if self._listener is not None:
+            self._listener(progress)
+
+
+@contextmanager
+def listening(progress: bool | Listener, max_sim: int | None) -> Iterator[Listener | None]:
+    """Give the listener that `progress` asks for: none, a bar on standard error, or itself."""
+    if callable(progress):
+        yield progress
+    elif progress:
+        with _rich_bar(max_sim) as listener:
+            yield listener
+    else:
+        yield None
+
+
+@contextmanager
+def _rich_bar(max_sim: int | None) -> Iterator[Listener]:
+    """Show a bar on standard error while the run lasts; one that fails leaves nothing of it."""
+    from rich.console import Console  # optional, and slow to import
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bar
+
+    columns = (
+        TextColumn("[bold]{task.description}"),
+        BarColumn(bar_width=20),
+        TextColumn("{task.completed:,.0f} simulations"),
+        TextColumn("{task.fields[state]}", markup=False),
+        TimeElapsedColumn(),
+    )
+    bar = Bar(*columns, console=Console(stderr=True))
+    task = bar.add_task("estimate", total=max_sim, state="")
+
+    def show(progress: Progress) -> None:
+        state = f"run {progress.run + 1} " if progress.run else ""
+        if not math.isnan(progress.p):
+            state += f"P[f <= {progress.level:.3g}] = {progress.p:.2e}"
+        bar.update(task, completed=progress.n_sim, state=state)
+
+    bar.start()
+    try:
+        yield show
+    except BaseException:
+        bar.live.transient = True  # clears the line
+        bar.live.stop()  # bar.stop() would add an empty line where standard error is a file
+        raise
+    bar.stop()

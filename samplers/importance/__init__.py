@@ -1,0 +1,1 @@
+"""Importance sampling from a fixed proposal, and the search for one."""

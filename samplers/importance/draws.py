@@ -1,0 +1,138 @@
+"""Draws: importance-weighted points from one proposal, with their spread, interval and doubts."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from samplers.problem import FloatArray
+from samplers.sample import Sample
+from samplers.statistics.intervals import Interval, clopper_pearson, degrees_of_freedom, log_normal
+from samplers.statistics.weights import effective_sample_size, largest_share
+
+LOW_ESS = 30
+
+
+LARGE_SHARE = 0.15
+
+
+@dataclass(frozen=True, eq=False)
+class Draws:
+    """Independent draws from one proposal; p rests on the failing ones."""
+
+    n: int
+    """Number of draws."""
+    f: FloatArray
+    """Outcomes of the k failing ones, shape (k,)."""
+    log_weights: FloatArray
+    """log(p0 / q) at the failing ones, shape (k,)."""
+    x: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
+    """The failing ones in physical space, shape (k, d)."""
+    f_safe: FloatArray = field(default_factory=lambda: np.empty(0))
+    """Outcomes of the others, shape (n - k,)."""
+    log_weights_safe: FloatArray = field(default_factory=lambda: np.empty(0))
+    """log(p0 / q) at the others, shape (n - k,)."""
+
+    @classmethod
+    def weighted(cls, f: FloatArray, log_weights: FloatArray, x: FloatArray, gamma: float) -> Draws:
+        """Return draws with outcomes f (n,), log(p0 / q) (n,) and points x (n, d) in physical space."""
+        fails = f <= gamma
+        return cls(len(f), f[fails], log_weights[fails], x[fails], f[~fails], log_weights[~fails])
+
+    def joined(self, other: Draws) -> Draws:
+        """Return these draws and others from the same proposal."""
+        if self.n == 0:
+            return other
+        parts = ("f", "log_weights", "x", "f_safe", "log_weights_safe")
+        return Draws(self.n + other.n, *(np.concatenate([getattr(self, p), getattr(other, p)]) for p in parts))
+
+    @property
+    def sample(self) -> Sample:
+        """The draws as the weighted points behind p, for every threshold."""
+        return Sample(
+            f=np.concatenate([self.f, self.f_safe]),
+            weights=np.exp(np.concatenate([self.log_weights, self.log_weights_safe])) / self.n,
+            units=np.arange(self.n, dtype=np.int64),
+            n_units=self.n,
+            x=self.x,
+        )
+
+    @property
+    def ess(self) -> float:
+        """Effective number of failing draws."""
+        return effective_sample_size(self.log_weights)
+
+    @property
+    def p(self) -> float:
+        """Mean of weight times indicator of failure."""
+        return float(np.exp(self.log_weights).sum()) / self.n
+
+    @property
+    def cov(self) -> float:
+        """Coefficient of variation of `p`; inf without a failing draw.
+
+        Standard error of the mean, with (largest term / n)^2 added to its square: where one
+        weight dominates, the sample variance alone is too small most of the time.
+        """
+        return weighted_cov(self.n, self.log_weights)
+
+
+def weighted_cov(n: int, log_weights: FloatArray) -> float:
+    """Return the c.o.v. of sum(w) / n over n draws whose nonzero terms have these log weights."""
+    if log_weights.size == 0:
+        return math.inf
+    w = np.exp(log_weights - log_weights.max())
+    mean = float(w.sum()) / n
+    spread = (float((w * w).sum()) / n - mean * mean) / max(n - 1, 1)
+    return math.sqrt(max(spread, 0.0) + 1.0 / (n * n)) / mean
+
+
+def interval_of(draws: Draws, confidence: float, largest_weight: float, cov: float | None = None) -> Interval:
+    """Return the interval of p: log-normal, with t quantiles where few draws carry it.
+
+    `cov` is the c.o.v. where it is not that of independent draws (None).
+
+    With an effective number of failing draws under LOW_ESS its upper end is at least the one
+    that `bernstein_bound` guarantees.
+
+    Without a failing draw p <= largest_weight P_q[failure] gives a one-sided interval. Where all
+    weights are 1 the draws are plain Monte Carlo and the interval is Clopper-Pearson's.
+    """
+    hits = len(draws.f)
+    if hits == 0 or largest_weight == 1.0:
+        low, high = clopper_pearson(hits, draws.n, confidence)
+        return low, min(1.0, high * largest_weight)
+    spread = draws.cov if cov is None else cov
+    low, high = log_normal(draws.p, spread, confidence, degrees_of_freedom(draws.ess, alone=True))
+    if draws.ess < LOW_ESS:
+        high = max(high, bernstein_bound(draws, confidence, largest_weight))
+    return low, high
+
+
+def bernstein_bound(draws: Draws, confidence: float, largest_weight: float) -> float:
+    """Return an upper bound of p that holds whatever the weights, up to `largest_weight`, do.
+
+    The empirical Bernstein bound of Maurer and Pontil, theorem 4, for the mean of n terms in
+    [0, largest_weight], at the level (1 - confidence) / 2. It is wide (7 / 3 largest_weight / n
+    and more), which is what draws that hardly reach the failures deserve.
+    """
+    log_term = math.log(4 / (1 - confidence))
+    weights, less = np.exp(draws.log_weights), max(draws.n - 1, 1)
+    variance = max(float((weights**2).sum()) - draws.n * draws.p**2, 0.0) / less
+    slack = 7 * largest_weight * log_term / (3 * less)
+    return min(1.0, draws.p + math.sqrt(2 * variance * log_term / draws.n) + slack)
+
+
+def doubts(draws: Draws) -> list[str]:
+    """Return warnings about the weights of the failing draws."""
+    if len(draws.f) == 0:
+        return [f"None of {draws.n:,} final draws failed: p = 0 with a one-sided interval."]
+    found = []
+    if draws.ess < LOW_ESS:
+        found.append(f"The failing draws are worth {draws.ess:.0f} independent ones: the estimate is coarse.")
+    share = largest_share(draws.log_weights)
+    if share > LARGE_SHARE:
+        found.append(f"One draw carries {100 * share:.0f} % of p: failures lie where the proposal hardly reaches.")
+    return found

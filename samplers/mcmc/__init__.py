@@ -1,0 +1,1 @@
+"""Markov chains: kernels that leave a conditioned distribution invariant, and the chains they drive."""

@@ -1,0 +1,1 @@
+"""The methods: Monte Carlo, importance sampling, cross-entropy, subset simulation, two-stage."""

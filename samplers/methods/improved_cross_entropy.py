@@ -1,0 +1,240 @@
+"""Improved cross-entropy method (Papaioannou, Geyer and Straub 2019)."""
+
+import math
+from collections.abc import Generator
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import numpy as np
+from scipy.special import log_ndtr
+
+from samplers.importance.draws import doubts, interval_of
+from samplers.importance.sampling import defensive, draw_until, final_draws
+from samplers.importance.search import LEAST_BUDGET, SEARCH_SHARE, Round, Search, described, pooled, search_ended
+from samplers.method import Goal, Interrupted, Outcome, Steps, no_outcome_share
+from samplers.methods.base import Method
+from samplers.methods.mixture_em import Proposal, mixture_of, shrunk_gaussian, widened
+from samplers.problem import FloatArray, Inputs
+from samplers.proposals.gaussian import Tilted
+from samplers.proposals.mixture import Law
+from samplers.proposals.von_mises_fisher import Vmfn
+from samplers.statistics.intervals import binomial_cov
+from samplers.statistics.weights import normalised
+from samplers.trace import Level, Status
+from samplers.validation import check_choice, check_count, check_setting
+
+WIDEST = 10.0
+NARROWEST = 1e-15
+"""Smoothing widths that are looked at, in units of the scale of f."""
+HALVINGS = 60
+HUGE = 1e300
+"""Outcomes from there on stand for infinite ones and say nothing about the scale of f."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImprovedCrossEntropy(Method):
+    """Cross-entropy whose targets are smooth, so that all points count and not only the lowest ones.
+
+    Target k is p0(u) Phi(-(f(u) - gamma) / sigma_k), which becomes p0 given failure as sigma falls to 0.
+    Search, in standard normal space: of draws from the proposal q_k fitted to target k, sigma_(k+1) is the
+    width, at most sigma_k, at which the weights Phi(-(f - gamma) / sigma) p0 / q_k have the c.o.v.
+    weight_cov, and q_(k+1) is fitted to all draws with these weights. It ends when the
+    c.o.v. of I[f <= gamma] / Phi(-(f - gamma) / sigma_k) falls to weight_cov.
+    Estimate: fresh draws from base_share p0 + wide_share (q widened) + the rest q, with q fitted to the failing
+    draws of all rounds (`pooled`), so that p-hat given the search is unbiased and no weight exceeds 1 / base_share.
+
+    Families: one Gaussian ("gaussian"); a mixture of Gaussians ("mixture"); a mixture of
+    von Mises-Fisher-Nakagami laws ("vmfn"), a direction and a radius, for many dimensions and failure
+    around the origin. Mixtures by expectation-maximisation of weighted points.
+
+    Where the authors' released code (the ERA group's iCE scripts) and this implementation differ:
+
+    - *Estimate.* The code estimates from the last draws of the search. Their proposal was stopped by
+      looking at them, and its weights are not bounded; fresh draws with base draws among them cost
+      more simulations and are right whatever the search did. They also come from a proposal fitted once
+      more, to the failures alone (sigma = 0) and to those of all rounds, weighted by p0 / (mixture of
+      the proposals): a region that the last round has thinned out or lost is still in the first ones.
+    - *Wide draws* are ours: a Gaussian fitted to failures beyond a plane falls off sideways and outwards as
+      fast as they do or faster, and the weights there would be heavy.
+    - *sigma* is sought by halving intervals of its logarithm, between 1e-15 and 10 times the median of
+      |f - gamma|; the code minimises |c.o.v. - target| over sigma itself, from a first width of 10 times
+      the mean of f (`sigma_t(1) = 10*mean(geval)` in iCE_SG, iCE_GM and iCE_vMFNM), which an outlier or a
+      negative mean spoils. f may be infinite: +inf has weight 0 at any finite width. Ties and a cap of f are
+      no difficulty, since no quantile is taken.
+    - *Components.* The code starts with a given number and drops the small ones. Ours takes the number
+      with the best Bayesian information criterion, up to `components`.
+    - *Covariances* are shrunk towards I but for the direction of the mean (`shrunk_gaussian`), which
+      makes "gaussian" and "mixture" usable in a hundred dimensions, where those of the points alone are not.
+
+    A region that the search did not see or lost in fitting is seen by base draws only, as a rare heavy
+    weight (then warned of) or not at all. The interval is log-normal (`interval_of`); where the base draws
+    themselves fail often enough, plain draws and Clopper-Pearson take over.
+
+    Args:
+        family: Family of the proposal.
+        components: Components of a mixture at most.
+        weight_cov: C.o.v. of the weights that sets the next width. (The code's CV_target.)
+        n_round: Draws per round of the search; at most a tenth of max_sim.
+        max_rounds: Rounds of the search at most.
+        n_final: Final draws; with max_sim all that is left, with a target c.o.v. batches of this.
+        base_share: Share of base draws in the final sample.
+        wide_share: Share of draws from the widened proposal.
+        wide_factor: By how much its components are wider.
+
+    References:
+        Papaioannou, Geyer and Straub, "Improved cross entropy-based importance sampling with a flexible
+        mixture model", Reliability Engineering and System Safety 191, 2019.
+        Owen and Zhou, "Safe and effective importance sampling", JASA 95, 2000 (the base draws).
+    """
+
+    family: Literal["gaussian", "mixture", "vmfn"] = "mixture"
+    components: int = 4
+    weight_cov: float = 1.5
+    n_round: int = 1000
+    max_rounds: int = 20
+    n_final: int = 4000
+    base_share: float = 0.1
+    wide_share: float = 0.2
+    wide_factor: float = 1.5
+
+    name: ClassVar[str] = "ice"
+    stops_at_target: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        who = "ImprovedCrossEntropy"
+        check_choice(who, "family", self.family, ("gaussian", "mixture", "vmfn"))
+        check_count(who, "components", self.components, 1)
+        check_setting(who, "weight_cov", self.weight_cov, 0.0, math.inf)
+        check_count(who, "n_round", self.n_round, 10)
+        check_count(who, "max_rounds", self.max_rounds, 1)
+        check_count(who, "n_final", self.n_final, 10)
+        check_setting(who, "base_share", self.base_share, 0.0, 1.0)
+        check_setting(who, "wide_share", self.wide_share, 0.0, 1.0 - self.base_share)
+        check_setting(who, "wide_factor", self.wide_factor, 1.0, math.inf)
+
+    def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
+        """Search for a proposal, then estimate with fresh draws."""
+        search, proposal = yield from self._search(inputs, goal, rng)
+        base, largest = Tilted(np.zeros(inputs.dim)), 1.0
+        sampler: Law = base
+        if proposal is not None:
+            wide = widened(proposal, self.wide_factor)
+            sampler = defensive(base, wide, proposal, self.base_share, self.wide_share)
+            largest = 1 / self.base_share
+        limit = 0 if search.status is Status.STOPPED else final_draws(goal, search.n_sim, self.n_final)
+        draws, trace, stopped = yield from draw_until(inputs, sampler, goal, limit, self.n_final, rng)
+        base_draws = search.base_draws + int(draws.n / largest)
+        if draws.n == 0:  # stopped before the first batch
+            draws, largest = pooled(search.rounds, inputs, goal.gamma), float(len(search.rounds))
+        stopped = stopped or search.status is Status.STOPPED
+        status = Status.STOPPED if stopped else search.status if len(draws.f) else Status.NO_HITS
+        return Outcome(
+            p=draws.p,
+            interval=interval_of(draws, goal.confidence, largest),
+            cov=binomial_cov(draws.p, draws.n) if largest == 1 else draws.cov,
+            status=status,
+            warnings=(*search_ended(search.status), *doubts(draws)),
+            trace=(*search.trace, *trace),
+            no_outcome_share=no_outcome_share(draws.f, draws.log_weights),
+            sample=draws.sample,
+            base_draws=base_draws,
+        )
+
+    def _search(
+        self, inputs: Inputs, goal: Goal, rng: np.random.Generator
+    ) -> Generator[FloatArray, FloatArray, tuple[Search, Proposal | None]]:
+        """Narrow the target down to failure; return the proposal fitted last, None where base draws serve."""
+        rounds, trace = list[Round](), list[Level]()
+        if goal.budget < LEAST_BUDGET:
+            return Search(rounds, trace, Status.BUDGET), None
+        size = min(self.n_round, goal.budget // 10)
+        affordable = int(SEARCH_SHARE * goal.budget) // size
+        law: Law = Tilted(np.zeros(inputs.dim))
+        proposal: Proposal | None = None
+        width, narrowest = math.inf, 0.0
+        for k in range(min(self.max_rounds, affordable)):
+            u = law.sample(size, rng)
+            try:
+                f = yield inputs.base.from_standard_normal(u)
+            except Interrupted:
+                return Search(rounds, trace, Status.STOPPED), None
+            rounds.append(Round(law, u, f))
+            trace.append(described(rounds[-1], goal.gamma))
+            goal.on_level(trace[-1])
+            g, log_ratio = np.clip(f - goal.gamma, -HUGE, HUGE), rounds[-1].log_weights
+            reached = spread(np.where(g <= 0, -log_smooth(g, width), -np.inf)) <= self.weight_cov
+            if reached and k == 0:
+                return Search(rounds, trace, Status.CONVERGED), None
+            if k == 0:
+                scale = scale_of(g)
+                width, narrowest = WIDEST * scale, NARROWEST * scale
+            width = next_width(g, log_ratio, self.weight_cov, narrowest, width)
+            if reached or (width == narrowest and (g <= 0).any()):
+                points = np.concatenate([found.u[found.f <= goal.gamma] for found in rounds])
+                fitted = self._fitted(points, pooled(rounds, inputs, goal.gamma).log_weights, rng)
+                return Search(rounds, trace, Status.CONVERGED), fitted
+            log_weights = log_smooth(g, width) + log_ratio
+            if width == narrowest or not np.isfinite(log_weights).any():  # all outcomes alike
+                return Search(rounds, trace, Status.STALLED), proposal
+            law = proposal = self._fitted(u, log_weights, rng)
+        ended = Status.BUDGET if affordable < self.max_rounds else Status.STALLED
+        return Search(rounds, trace, ended), proposal
+
+    def _fitted(self, u: FloatArray, log_weights: FloatArray, rng: np.random.Generator) -> Proposal:
+        """Return the law of the family nearest to points u (n, d) with these weights (n,)."""
+        used = np.isfinite(log_weights)
+        u, weights = u[used], normalised(log_weights[used])
+        dim = u.shape[1]
+        if self.family == "gaussian":
+            return mixture_of(shrunk_gaussian, u, weights, 1, 1, rng)
+        if self.family == "mixture":
+            size = dim + min(dim * (dim + 1) // 2, 2 * dim)  # shrinking leaves about so many
+            return mixture_of(shrunk_gaussian, u, weights, self.components, size, rng)
+        return mixture_of(Vmfn.fitted, u, weights, self.components, dim + 2, rng)
+
+
+def log_smooth(g: FloatArray, width: float) -> FloatArray:
+    """Return log Phi(-g / width) of g = f - gamma (n,), a smooth indicator of g <= 0."""
+    with np.errstate(over="ignore"):
+        return np.asarray(log_ndtr(-g / width))
+
+
+def spread(log_weights: FloatArray) -> float:
+    """Return the c.o.v. of weights given as logarithms (n,); inf where all are 0."""
+    highest = float(log_weights.max())
+    if highest == -math.inf:
+        return math.inf
+    weights = np.exp(log_weights - highest)
+    return float(weights.std() / weights.mean())
+
+
+def next_width(g: FloatArray, log_ratio: FloatArray, target: float, low: float, high: float) -> float:
+    """Return the width in [low, high] at which the weights Phi(-g / width) p0 / q have the target c.o.v.
+
+    `low` where they have less at any width, `high` where they have more.
+
+    Args:
+        g: f - gamma, shape (n,).
+        log_ratio: log(p0 / q), shape (n,).
+        target: Wanted c.o.v.
+        low: Least width.
+        high: Largest width, that of the round before.
+    """
+    if spread(log_smooth(g, low) + log_ratio) <= target:
+        return low
+    if spread(log_smooth(g, high) + log_ratio) >= target:
+        return high
+    for _ in range(HALVINGS):
+        middle = math.sqrt(low) * math.sqrt(high)
+        if spread(log_smooth(g, middle) + log_ratio) > target:
+            low = middle
+        else:
+            high = middle
+    return high
+
+
+def scale_of(g: FloatArray) -> float:
+    """Return the median of |g| over finite g other than 0; 1 where there is none."""
+    sizes = np.abs(g[(np.abs(g) < HUGE) & (g != 0)])
+    return float(np.median(sizes)) if len(sizes) else 1.0

@@ -1,0 +1,77 @@
+"""Plain Monte Carlo: the yardstick."""
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+
+from samplers.method import Goal, Interrupted, Steps, no_outcome_share, share_of_failures
+from samplers.methods.base import Method
+from samplers.problem import FloatArray, Inputs
+from samplers.sample import equal_draws
+from samplers.statistics.intervals import binomial_cov
+from samplers.trace import Level, Status
+from samplers.validation import check_count
+
+
+@dataclass(frozen=True, kw_only=True)
+class MonteCarlo(Method):
+    """Share of failing points among independent draws from the base distribution.
+
+    p = k / N with the Clopper-Pearson interval. Stops at `goal.target_cov`, looked at after every
+    batch, else when the simulations are used up. Tian et al. stop where the 95 % interval reaches
+    20 % of p to either side: 1.96 c.o.v. = 0.2, that is target_cov = 0.102. Stopping at a c.o.v.
+    makes the interval approximate.
+    Replicates are pooled: their draws are those of one longer run.
+
+    Args:
+        n: Simulations where `max_sim` does not say how many.
+        batch: Points per call of f.
+    """
+
+    n: int = 100_000
+    batch: int = 10_000
+
+    name: ClassVar[str] = "mc"
+    stops_at_target: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        check_count("MonteCarlo", "n", self.n, 1)
+        check_count("MonteCarlo", "batch", self.batch, 1)
+
+    def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
+        """Draw batches until the target or the end of the budget."""
+        budget = self.n if goal.max_sim is None else goal.max_sim
+        n, hits, met, stopped = 0, 0, False, False
+        outcomes: list[FloatArray] = []
+        failing: list[FloatArray] = []
+        trace: list[Level] = []
+        while n < budget and not met:
+            size = min(self.batch, budget - n)
+            x = inputs.base.sample(size, rng)
+            try:
+                f = yield x
+            except Interrupted:
+                stopped = True
+                break
+            outcomes.append(f)
+            failing.append(x[f <= goal.gamma])
+            n, hits = n + size, hits + len(failing[-1])
+            cov = binomial_cov(hits / n, n)
+            met = goal.target_cov is not None and hits > 0 and cov <= goal.target_cov
+            trace.append(
+                Level(
+                    gamma=goal.gamma,
+                    p=len(failing[-1]) / size,
+                    estimate=hits / n,
+                    n_sim=size,
+                    n_points=size,
+                    cov=cov,
+                )
+            )
+            goal.on_level(trace[-1])
+        sample = equal_draws(np.concatenate(outcomes), np.concatenate(failing))
+        without = no_outcome_share(sample.f[sample.f <= goal.gamma])
+        outcome = share_of_failures(hits, n, goal.confidence, trace, without)
+        return replace(outcome, sample=sample, status=Status.STOPPED if stopped else outcome.status)

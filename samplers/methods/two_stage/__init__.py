@@ -1,0 +1,1 @@
+"""Two-stage: explore for failure regions, refine a mixture proposal, estimate with fresh draws."""

@@ -1,0 +1,1 @@
+"""Proposal distributions: Gaussians, mixtures, the von Mises-Fisher-Nakagami distribution."""

@@ -1,0 +1,60 @@
+"""Mixtures of distributions, and of Gaussians."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from scipy.special import logsumexp, softmax
+
+from samplers.problem import FloatArray
+from samplers.proposals.gaussian import Gaussian
+
+
+class Law(Protocol):
+    """What can be drawn from and has a density."""
+
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw n independent points, shape (n, d)."""
+
+    def log_prob(self, u: FloatArray, /) -> FloatArray:
+        """Log density at u (n, d), shape (n,)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Mixture:
+    """A mixture of laws."""
+
+    weights: FloatArray
+    """Shape (k,), adding up to 1."""
+    components: Sequence[Law]
+    """k of them."""
+
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw n independent points, shape (n, d)."""
+        counts = rng.multinomial(n, self.weights)
+        parts = [c.sample(int(k), rng) for c, k in zip(self.components, counts, strict=True)]
+        return rng.permutation(np.concatenate(parts))
+
+    def log_prob(self, u: FloatArray) -> FloatArray:
+        """Log density at u (n, d), shape (n,)."""
+        terms = [np.log(w) + c.log_prob(u) for w, c in zip(self.weights, self.components, strict=True)]
+        return np.asarray(logsumexp(terms, axis=0))
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianMixture(Mixture):
+    """A mixture of Gaussians."""
+
+    components: Sequence[Gaussian]
+
+    def widened(self, factor: float) -> GaussianMixture:
+        """Return the same with the standard deviations of all components multiplied by factor."""
+        return GaussianMixture(self.weights, [component.widened(factor) for component in self.components])
+
+    def responsibilities(self, u: FloatArray) -> FloatArray:
+        """Return how likely each point u (n, d) comes from each component, shape (n, k)."""
+        terms = [np.log(w) + c.log_prob(u) for w, c in zip(self.weights, self.components, strict=True)]
+        return np.asarray(softmax(np.stack(terms, axis=1), axis=1))

@@ -1,0 +1,1 @@
+"""Statistics: intervals, importance weights, thresholds, sums over clusters."""

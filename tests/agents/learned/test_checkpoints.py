@@ -1,0 +1,195 @@
+"""Drivers in files: what goes in comes out, nothing is run on reading, and what may be wrong with a file is said."""
+
+import json
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+import safetensors.torch
+import torch
+from safetensors import safe_open
+
+from agents import LearnedDriver, Provenance, load_driver, read_driver, read_provenance, save_driver
+from agents.learned.checkpoints import SHIPPED
+from agents.learned.coloured_noise import Colour
+from agents.learned.rule_driver import RuleDriver
+
+PROVENANCE = Provenance(
+    kind="mgail",
+    command="python -m training.train_driver --seed 1",
+    data="a recording",
+    data_licence="CC BY-SA 3.0",
+    metrics={"collision": 0.004, "js": {"speed": 0.03}},
+    ensemble={"penalty": 0.5, "tried": [{"penalty": 0.5, "condition": 3.0}]},
+)
+
+
+@pytest.fixture
+def driver(policy, law):
+    return LearnedDriver(policy, Colour((0.95, 0.9)), (-7.0, 3.5), (-0.25, 0.3), law, "tester")
+
+
+@pytest.fixture
+def file(driver, tmp_path):
+    return save_driver(driver, PROVENANCE, tmp_path / "driver.safetensors")
+
+
+def rewrite(file: Path, header=None, **tensors) -> Path:
+    """Change a file: entries of the header, and tensors by name, dots written as double underscores; None removes."""
+    with safe_open(file, framework="pt") as old:
+        content = json.loads(old.metadata()["driver"]) | (header or {})
+    changed = safetensors.torch.load_file(file) | {name.replace("__", "."): value for name, value in tensors.items()}
+    kept = {name: value for name, value in changed.items() if value is not None}
+    content = {name: value for name, value in content.items() if value is not ...}
+    safetensors.torch.save_file(kept, file, {"driver": json.dumps(content)})
+    return file
+
+
+def test_a_driver_comes_back_as_it_was(driver, file, features, generator):
+    again = read_driver(file)
+    x, xi = features(4, 3), torch.randn(4, 3, 2, generator=generator)
+    weights = torch.from_numpy(driver.weights.sample(4, np.random.default_rng(1)))
+    memory = driver.begin(torch.randn(4, 3, 2, 2, generator=generator))
+    for given in (None, weights):
+        made, expected = (one.act(x, given, xi, memory) for one in (again, driver))
+        torch.testing.assert_close(made, expected, atol=0.0, rtol=0.0)
+    for name in ("colour", "acceleration", "yaw_rate", "name"):
+        assert getattr(again, name) == getattr(driver, name)
+    np.testing.assert_array_equal(again.weights.mean, driver.weights.mean)
+    np.testing.assert_array_equal(again.weights.precision, driver.weights.precision)
+    assert again.weights.radius == driver.weights.radius
+    assert read_provenance(file) == PROVENANCE
+    assert not any(p.requires_grad for p in again.policy.parameters())
+    assert not again.policy.training
+
+
+def test_a_driver_without_a_law_comes_back_without(policy, tmp_path):
+    file = save_driver(LearnedDriver(policy), PROVENANCE, tmp_path / "plain.safetensors")
+    assert read_driver(file).weights is None
+
+
+def test_equal_drivers_are_equal_bytes_and_small(driver, file, tmp_path):
+    again = save_driver(read_driver(file), PROVENANCE, tmp_path / "again.safetensors")
+    assert again.read_bytes() == file.read_bytes()
+    assert file.stat().st_size < 300_000
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["again.safetensors", "driver.safetensors"]
+
+
+def test_the_header_says_what_decides_how_it_drives(file):
+    with safe_open(file, framework="pt") as opened:
+        header = json.loads(opened.metadata()["driver"])
+    assert len(header["features"]) == 51 and header["features"][0] == "lane_offset"
+    assert header["colour"] == {"first": [0.95, 0.9], "second": [0.0, 0.0]}
+    assert header["log_std_cap"] == pytest.approx(-0.2)
+    assert (header["acceleration"], header["yaw_rate"]) == ([-7.0, 3.5], [-0.25, 0.3])
+    assert header["command"] == PROVENANCE.command and header["data_licence"] == "CC BY-SA 3.0"
+
+
+def test_reading_draws_nothing_and_unpickles_nothing(file, monkeypatch):
+    def refuse(*args, **kwargs):
+        raise AssertionError("unpickled")
+
+    for module, name in ((torch, "load"), (pickle, "load"), (pickle, "loads"), (pickle, "Unpickler")):
+        monkeypatch.setattr(module, name, refuse)
+    before = torch.get_rng_state()
+    read_driver(file)
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_other_files_are_told_apart(driver, tmp_path):
+    pickled, text, bare = (tmp_path / f"{name}.safetensors" for name in ("pickled", "text", "bare"))
+    torch.save(driver.policy.state_dict(), pickled)
+    with pytest.raises(ValueError, match=r"not a safetensors file.*torch\.save"):
+        read_driver(pickled)
+    text.write_text("hello")
+    with pytest.raises(ValueError, match="not a safetensors file") as error:
+        read_driver(text)
+    assert "torch.save" not in str(error.value)
+    safetensors.torch.save_file({"a": torch.zeros(1)}, bare)
+    with pytest.raises(ValueError, match="tensors but no driver"):
+        read_driver(bare)
+
+
+def test_a_damaged_file_is_refused(file):
+    file.write_bytes(file.read_bytes()[:-1000])
+    with pytest.raises(ValueError, match="damaged"):
+        read_driver(file)
+
+
+def test_a_missing_file_is_named_with_its_neighbours(file):
+    with pytest.raises(FileNotFoundError, match=r"drives\.safetensors.*there are driver\.safetensors"):
+        read_driver(file.with_name("drives.safetensors"))
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        read_driver(file.parent / "nowhere" / "driver.safetensors")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"policy__first__weight": None}, r"lacks policy\.first\.weight"),
+        ({"policy__feature_mean": None}, r"lacks policy\.feature_mean"),
+        ({"weights__rows": None}, r"lacks weights\.rows"),
+        ({"policy__head__bias": torch.zeros(6)}, r"policy\.head\.bias of shape \(4,\) .* got \(6,\)"),
+        ({"policy__head__bias": torch.zeros(4).double()}, r"float32, got \(4,\) and torch\.float64"),
+        ({"policy__head__bias": torch.full((4,), torch.nan)}, r"inf or NaN in policy\.head\.bias"),
+        ({"weights__mean": torch.zeros(403).double()}, r"weights\.mean of shape \(404,\)"),
+        ({"weights__precision": torch.zeros(3).double()}, "no usable driver: Expected triplets"),
+        ({"header": {"colour": {"first": [0.9, 1.5], "second": [0.0, 0.0]}}}, "no usable driver.*stationary"),
+        ({"header": {"colour": ...}}, "lacks colour"),
+        ({"header": {"colour": 0.9}}, "no usable driver"),
+        ({"header": {"format": 2}}, "format 2; this version reads format 1"),
+        ({"header": {"feature_clip": 10.0}}, r"clips features at 10\.0"),
+        ({"header": {"features": ["lane_offset", "speed"]}}, "2 other features.*difference is 'speed' for 'heading'"),
+        ({"header": {"features": None}}, "0 other features"),
+    ],
+)
+def test_what_is_wrong_with_a_file_is_said(file, changes, message):
+    with pytest.raises(ValueError, match=message):
+        read_driver(rewrite(file, **changes))
+
+
+def test_a_file_without_provenance_still_drives(file):
+    rewrite(file, {"command": ...})
+    read_driver(file)
+    with pytest.raises(ValueError, match="lacks command"):
+        read_provenance(file)
+
+
+def test_what_cannot_be_saved_is_refused(driver, tmp_path):
+    with pytest.raises(ValueError, match=r"ends with \.safetensors"):
+        save_driver(driver, PROVENANCE, tmp_path / "driver.pt")
+    bad = Provenance(kind="bc", command="", data="", data_licence="", metrics={"collision": float("nan")})
+    with pytest.raises(ValueError, match="JSON"):
+        save_driver(driver, bad, tmp_path / "driver.safetensors")
+    driver.policy.head.bias[0] = torch.inf
+    with pytest.raises(ValueError, match=r"inf or NaN in policy\.head\.bias"):
+        save_driver(driver, PROVENANCE, tmp_path / "driver.safetensors")
+    assert not list(tmp_path.iterdir())
+
+
+def test_drivers_by_name(file):
+    assert load_driver("idm") == RuleDriver()
+    assert load_driver(file).name == load_driver(str(file)).name == "tester"
+
+
+def test_unknown_names_get_a_suggestion(file, monkeypatch):
+    with pytest.raises(
+        ValueError,
+        match=r"'mgial' \(did you mean 'mgail'\?\); expected 'mgail', 'gail', 'bc', "
+        r"'imitation', 'idm'",
+    ):
+        load_driver("mgial")
+    with pytest.raises(ValueError, match="did you mean 'idm'"):
+        load_driver("IDM")
+    monkeypatch.chdir(file.parent)
+    with pytest.raises(ValueError, match=r"did you mean 'driver\.safetensors'"):
+        load_driver("driver")
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_shipped_drivers_load(name):
+    driver = load_driver(name)
+    assert isinstance(driver, LearnedDriver)
+    action, _ = driver.act(torch.zeros(2, 3, 51))
+    assert bool(action.isfinite().all())

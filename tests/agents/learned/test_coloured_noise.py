@@ -1,0 +1,63 @@
+"""Coloured noise: its law in closed form and in samples."""
+
+import math
+
+import pytest
+import torch
+
+from agents.learned.coloured_noise import Colour
+
+SWINGING = Colour.swinging(frequency=(1.70, 1.57), damping=(0.845, 0.40))
+
+
+def sequence(colour, ticks, n=100_000, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    memory = colour.begin(torch.randn(n, 2, 2, generator=generator))
+    values = []
+    for _ in range(ticks):
+        value, memory = colour.next(memory, torch.randn(n, 2, generator=generator))
+        values.append(value)
+    return torch.stack(values)
+
+
+def test_white_noise_is_the_fresh_draw():
+    fresh = torch.randn(5, 2)
+    value, _ = Colour().next(Colour().begin(torch.randn(5, 2, 2)), fresh)
+    torch.testing.assert_close(value, fresh)
+
+
+@pytest.mark.parametrize("colour", [SWINGING, Colour((0.95, 0.5), (0.0, 0.0)), Colour()])
+def test_stationary_from_the_first_tick(colour):
+    values = sequence(colour, 30)
+    # the variance of n = 1e5 draws has a standard error of sqrt(2 / n) = 0.0045
+    torch.testing.assert_close(values.var(dim=1), torch.ones(30, 2), atol=5 * 0.0045, rtol=0)
+
+
+def test_autocorrelation_obeys_the_recursion():
+    values = sequence(SWINGING, 21)
+    for action, (a, b) in enumerate(zip(SWINGING.first, SWINGING.second, strict=True)):
+        expected = [1.0, a / (1 - b)]
+        for _ in range(19):
+            expected.append(a * expected[-1] + b * expected[-2])
+        for lag in (1, 5, 10, 20):
+            found = float((values[0, :, action] * values[lag, :, action]).mean())
+            assert found == pytest.approx(expected[lag], abs=5 / math.sqrt(100_000) * 1.5)
+
+
+def test_swings_back():
+    # half a period after a large value, a large one of the other sign is expected
+    values = sequence(SWINGING, 21)
+    assert float((values[0, :, 1] * values[20, :, 1]).mean()) < -0.4
+
+
+def test_the_expected_part_is_known_before_the_draw():
+    memory = SWINGING.begin(torch.randn(7, 2, 2, generator=torch.Generator().manual_seed(1)))
+    value, after = SWINGING.next(memory, torch.zeros(7, 2))
+    torch.testing.assert_close(value, SWINGING.expected(memory))
+    torch.testing.assert_close(after[..., 0], value)
+    torch.testing.assert_close(after[..., 1], memory[..., 0])
+
+
+def test_a_noise_that_grows_is_refused():
+    with pytest.raises(ValueError, match="stationary"):
+        Colour((1.0, 0.5), (0.0, 0.0))

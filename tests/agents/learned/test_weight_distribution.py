@@ -1,0 +1,123 @@
+"""The law of the last layer's weights: density, draws and maps against each other, arrays, and as a block."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from agents.learned.weight_distribution import RADIUS, WeightDistribution
+from samplers.methods.cross_entropy.blocks import announced_blocks
+
+PRECISION = np.array([[4.0, 1.0, 0.0], [1.0, 3.0, -0.5], [0.0, -0.5, 2.0]])
+MEAN = np.array([1.0, -2.0, 0.5])
+
+
+@pytest.fixture
+def small():
+    return WeightDistribution(MEAN, PRECISION)
+
+
+def test_density_against_scipy(small, rng):
+    x = 2.0 * rng.standard_normal((50, 3))
+    exact = stats.multivariate_normal(MEAN, np.linalg.inv(PRECISION)).logpdf(x)
+    np.testing.assert_allclose(small.log_prob(x), exact, rtol=1e-12)
+
+
+def test_draws_have_mean_and_covariance(small, rng):
+    n, covariance = 200_000, np.linalg.inv(PRECISION)
+    x = small.sample(n, rng)
+    np.testing.assert_allclose(x.mean(axis=0), MEAN, atol=4 * np.sqrt(covariance.max() / n))
+    np.testing.assert_allclose(np.cov(x.T), covariance, atol=4 * covariance.max() * np.sqrt(2 / n))
+    np.testing.assert_allclose(small.std, np.sqrt(np.diag(covariance)), rtol=1e-12)
+
+
+def test_draws_and_maps_are_those_of_the_generator(law):
+    u = np.random.default_rng(5).standard_normal((4, 404))
+    np.testing.assert_array_equal(law.sample(4, np.random.default_rng(5)), law.from_standard_normal(u))
+
+
+def test_it_is_named_in_one_short_line(law):
+    assert repr(law) == "WeightDistribution(404 weights, radius=0.01)"
+
+
+def test_a_seed_is_no_generator(small):
+    with pytest.raises(TypeError, match=r"rng as a numpy.random.Generator, got 0; see np.random.default_rng"):
+        small.sample(3, 0)
+
+
+def test_maps_are_inverse_and_density_is_theirs(law, rng):
+    """log p(x) = log phi(u) - log |dx / du| at u = the point in standard normal space."""
+    u = rng.standard_normal((20, law.dim))
+    x = law.from_standard_normal(u)
+    np.testing.assert_allclose(law.to_standard_normal(x), u, atol=1e-10)
+    _, log_det = np.linalg.slogdet(law.precision)
+    np.testing.assert_allclose(law.log_prob(x), stats.norm.logpdf(u).sum(axis=1) + 0.5 * log_det, rtol=1e-12)
+    np.testing.assert_allclose(law.covariance @ law.precision, np.eye(law.dim), atol=1e-8)
+    np.testing.assert_array_equal(law.cholesky, np.tril(law.cholesky))
+
+
+def test_rows_stand_alone(law, rng):
+    x = law.sample(5, rng)
+    for call in (law.log_prob, law.to_standard_normal, law.from_standard_normal):
+        alone = np.concatenate([call(row[None]) for row in x])
+        np.testing.assert_allclose(alone, call(x), rtol=1e-12, atol=1e-10)
+
+
+def test_arrays_bring_back_the_same_law(law):
+    arrays = law.to_arrays()
+    again = WeightDistribution.from_arrays(arrays, law.radius)
+    np.testing.assert_array_equal(again.mean, law.mean)
+    np.testing.assert_array_equal(again.precision, law.precision)
+    assert sum(array.nbytes for array in arrays.values()) < 0.1 * law.precision.nbytes
+
+
+def test_it_is_a_block_whose_mean_stays_in_the_box(law, rng):
+    base = SimpleNamespace(
+        blocks=(law, SimpleNamespace(alpha=np.full(2, 2.0), beta=np.full(2, 2.0), low=np.zeros(2), high=np.ones(2))),
+        log_prob=lambda x: law.log_prob(x[:, :404]) + stats.beta(2, 2).logpdf(x[:, 404:]).sum(axis=1),
+    )
+    product = announced_blocks(SimpleNamespace(base=base, dim=406))
+    x = product.sample(300, rng)
+    wanted = np.full((2, 300), 1 / 300)
+    x[:, :404] += 0.05  # asks for means far outside the box
+    moved = product.moved(x, wanted, 0.8)
+    shift = moved.sample(20_000, rng)[:, :404].mean(axis=0) - law.mean
+    assert np.abs(shift).max() < RADIUS + 5 * law.std.max() / np.sqrt(20_000)
+    assert np.abs(shift).max() > 0.5 * RADIUS
+
+
+def test_arrays_cannot_be_changed(small):
+    with pytest.raises(ValueError, match="read-only"):
+        small.mean[0] = 0.0
+    with pytest.raises(ValueError, match="read-only"):
+        small.precision[0, 0] = 0.0
+
+
+@pytest.mark.parametrize(
+    ("mean", "precision", "radius", "message"),
+    [
+        (MEAN, PRECISION[:2], 0.01, "got \\(3,\\) and \\(2, 3\\)"),
+        (MEAN * np.nan, PRECISION, 0.01, "finite"),
+        (MEAN, PRECISION + np.triu(np.ones((3, 3)), 1), 0.01, "symmetric"),
+        (MEAN, -PRECISION, 0.01, "positive definite"),
+        (MEAN, PRECISION, -1.0, "radius"),
+        (MEAN, PRECISION, np.nan, "radius"),
+    ],
+)
+def test_what_is_no_law_is_refused(mean, precision, radius, message):
+    with pytest.raises(ValueError, match=message):
+        WeightDistribution(mean, precision, radius)
+
+
+def test_points_of_another_shape_are_refused(small):
+    with pytest.raises(ValueError, match=r"shape \(n, 3\), got \(3,\)"):
+        small.log_prob(MEAN)
+
+
+def test_arrays_that_are_no_upper_triangle_are_refused(small):
+    arrays = small.to_arrays()
+    with pytest.raises(ValueError, match="upper triangle"):
+        WeightDistribution.from_arrays({**arrays, "columns": arrays["columns"] + 1})
+    with pytest.raises(ValueError, match="one length"):
+        WeightDistribution.from_arrays({**arrays, "precision": arrays["precision"][1:]})

@@ -1,0 +1,253 @@
+"""An ego behind the imperfections of a stack: each does what it says, and their randomness is all in x."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import rare_envs
+import samplers
+from agents import load_ego
+from agents.imperfect_stack import EACH, OWN, NoisyDriver, NoisyEgo, Stack
+from rare_envs.simulation.rollout import drive, rollout
+
+ENV = "rare_envs/CutIn-v0"
+PERFECT = Stack(**dict.fromkeys(Stack.__dataclass_fields__, 0.0) | {"jerk": 1e6, "steering_rate": 1e6})
+
+
+def problem(ego: Any, noise: Any = True, horizon: float = 4.0) -> rare_envs.DrivingProblem:
+    return rare_envs.DrivingProblem(ENV, ego=ego, noise=noise, horizon=horizon)
+
+
+@pytest.mark.parametrize("noise", [True, "fixed", False])
+def test_a_perfect_stack_changes_nothing(noise: Any) -> None:
+    around, plain = problem(NoisyEgo("idm", PERFECT), noise), problem("idm")
+    x = around.base.sample(50, np.random.default_rng(0))
+    np.testing.assert_allclose(around.evaluate(x), plain.evaluate(x[:, :6]), atol=1e-4)
+
+
+def test_the_probability_is_that_of_fresh_noise() -> None:
+    """Once with the noise as columns of x, once drawn by a generator of its own in each rollout; by another method."""
+    ego, gamma, n = load_ego("noisy:idm"), 1.5, 4000
+    around = problem(ego)
+    by_columns = samplers.estimate(around, samplers.MonteCarlo(), gamma=gamma, seed=0, max_sim=n)
+    bare = problem("idm")
+    x = torch.from_numpy(bare.base.sample(n, np.random.default_rng(5))).float()
+    fresh = torch.randn(n, around.driver.columns, generator=torch.Generator().manual_seed(5))
+    with torch.inference_mode():
+        f = rollout(around.world, around.driver, torch.cat((x, fresh), dim=1)).f
+    p = float((f <= gamma).float().mean())
+    error = math.sqrt(2 * p * (1 - p) / n)
+    assert 0.005 < p < 0.2
+    assert abs(by_columns.p - p) < 4 * error
+    assert p > 1.5 * float((bare.evaluate(x.double().numpy()) <= gamma).mean())  # the noise matters
+    two_stage = samplers.estimate(around, samplers.AdaptiveSubsetSimulation(n=800), gamma=gamma, seed=1)
+    assert abs(math.log(two_stage.p / p)) < 4 * math.hypot(error / p, two_stage.cov)
+
+
+class Fresh(NoisyDriver):
+    """The same stack, whose noise is drawn as the drive goes and is no part of x: an autoregression by hand."""
+
+    columns = 0  # type: ignore[assignment]
+    generator = torch.Generator().manual_seed(11)
+
+    def _later(self, errors: torch.Tensor, plan: int) -> torch.Tensor:
+        fresh = torch.randn(errors.shape, generator=self.generator)
+        kept = math.exp(-self.stack.period / self.stack.correlation) if plan else 0.0
+        return kept * errors + math.sqrt(1 - kept**2) * fresh
+
+
+def monte_carlo(around: rare_envs.DrivingProblem, gamma: float, n: int) -> tuple[float, float]:
+    """P[f <= gamma] with fresh noise in each drive, and its standard error."""
+    assert isinstance(around.driver, NoisyDriver)
+    driver = Fresh(around.driver.inner, around.driver.stack, around.world)
+    x = torch.from_numpy(around.base.sample(n, np.random.default_rng(5))[:, : around.dim - around.driver.columns])
+    with torch.inference_mode():
+        f = torch.cat([rollout(around.world, driver, part).f for part in x.float().split(10_000)])
+    p = float((f <= gamma).double().mean())
+    return p, math.sqrt(p * (1 - p) / n)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("env_id", "method"),
+    [
+        ("rare_envs/CarFollowing-v0", samplers.AdaptiveSubsetSimulation(n=2000)),
+        ("rare_envs/CutIn-v0", samplers.AdaptiveSubsetSimulation(n=2000)),
+        ("rare_envs/CutIn-v0", samplers.TwoStage()),
+    ],
+)
+def test_rare_failures_are_as_probable_with_noise_in_x_as_with_fresh_noise(env_id: str, method: Any) -> None:
+    ego = load_ego("noisy:idm?position=1&speed=1&missed=0.05&latency=0.5")
+    around = rare_envs.DrivingProblem(env_id, ego=ego, horizon=5.0)
+    p, error = monte_carlo(around, 0.5, 40_000)
+    assert 1e-3 < p < 3e-2
+    found = samplers.estimate(around, method, gamma=0.5, seed=2, max_sim=8000)
+    assert abs(math.log(found.p / p)) < 4 * math.hypot(error / p, found.cov)
+
+
+def test_everything_random_is_in_x() -> None:
+    around = problem(load_ego("noisy:idm"))
+    x = around.base.sample(40, np.random.default_rng(1))
+    f = around.evaluate(x)
+    np.testing.assert_array_equal(around.evaluate(x), f)
+    np.testing.assert_allclose(around.evaluate(x[7:9]), f[7:9], atol=1e-5)
+    other = x.copy()
+    other[:, 6:] = around.base.sample(40, np.random.default_rng(2))[:, 6:]
+    assert (around.evaluate(other) != f).any()
+    plans, size = around.driver.shape
+    assert (plans, size) == (20, OWN + EACH * 2)
+    assert around.space.names[-1] == "ego_noise"
+    assert around.dim == 6 + plans * size == len(around.space.low)
+
+
+def test_noise_can_be_fixed_or_left_out() -> None:
+    x = problem("idm").base.sample(30, np.random.default_rng(0))
+    found = {noise: problem(load_ego("noisy:idm"), noise) for noise in ("fixed", False)}
+    assert {each.dim for each in found.values()} == {6}
+    assert found["fixed"].given == "the ego's noise is one fixed sequence"
+    assert found[False].given == problem(load_ego("noisy:idm")).given == ""
+    f = {noise: each.evaluate(x) for noise, each in found.items()}
+    assert (f["fixed"] != f[False]).any()
+    assert (f[False] != problem("idm").evaluate(x)).any()  # the lags remain
+
+
+def test_errors_have_the_law_that_they_are_said_to_have() -> None:
+    stack = Stack(missed=0.05, correlation=0.4)
+    driver = problem(NoisyEgo("idm", stack)).driver
+    n = 20_000
+    draws = torch.randn(n, driver.columns, generator=torch.Generator().manual_seed(0))
+    driver = driver.with_draws(draws)
+    errors = [driver._later(torch.zeros(n, driver.shape[1]), 0)]
+    for plan in range(1, 4):
+        errors.append(driver._later(errors[-1], plan))
+    for late, each in enumerate(errors):
+        np.testing.assert_allclose(each.std(dim=0), 1.0, atol=0.03)
+        kept = (each * errors[0]).mean(dim=0)
+        np.testing.assert_allclose(kept, math.exp(-late * 0.2 / 0.4), atol=0.04)
+    state = driver.world.start(torch.from_numpy(problem("idm").base.sample(n, np.random.default_rng(0))).float()).state
+    seen = driver._seen(state, state, errors[-1])
+    missed = seen.x[:, 1:] - seen.x[:, :1] > 300.0
+    np.testing.assert_allclose(missed.float().mean(dim=0), 0.05, atol=5 * math.sqrt(0.05 / n))
+    np.testing.assert_allclose((seen.y[:, 0] - state.y[:, 0]).std(), stack.across, rtol=0.03)
+    off = (seen.x - state.x)[:, 1:][~missed]
+    np.testing.assert_allclose(off.std(), stack.position, rtol=0.03)
+    np.testing.assert_allclose((seen.speed - state.speed)[:, 1:].std(), stack.speed, rtol=0.05)
+
+
+class Recorder:
+    """Notes what it sees, and asks for one action."""
+
+    def __init__(self) -> None:
+        self.seen: list[Any] = []
+
+    def act(self, episode: Any, memory: Any) -> Any:
+        self.seen.append(episode.state)
+        wanted = torch.tensor([2.0, 0.01]).expand(len(episode.collided), 2)
+        return wanted * len(self.seen), memory
+
+
+def test_others_are_seen_late_and_the_speed_is_planned_now_and_then() -> None:
+    recorder = Recorder()
+    around = problem(NoisyEgo(recorder, replace(PERFECT, latency=0.3, period=0.2)))
+    x = torch.from_numpy(around.base.sample(3, np.random.default_rng(0))).float()
+    true = [episode.state for episode in drive(around.world, around.driver, x)]
+    for tick, seen in enumerate(recorder.seen):
+        late = true[max(tick - 3, 0)]
+        torch.testing.assert_close(seen.x[:, 1:] - seen.x[:, :1], late.x[:, 1:] - late.x[:, :1], atol=1e-3, rtol=0)
+        torch.testing.assert_close(seen.speed[:, 1:], late.speed[:, 1:])
+        torch.testing.assert_close(seen.y[:, 0], true[tick].y[:, 0])
+    speed = torch.stack([state.speed[:, 0] for state in true])
+    gained = speed[1:] - speed[:-1]
+    planned = 0.1 * torch.tensor([2.0 * (1 + 2 * (tick // 2)) for tick in range(len(gained))])
+    torch.testing.assert_close(gained[:6], planned[:6, None].expand(6, 3), atol=1e-3, rtol=0)
+
+
+def test_actuators_follow_with_a_lag_and_within_their_rates() -> None:
+    driver = problem(NoisyEgo("idm", Stack(lag=0.5, steering_lag=0.2, jerk=1e6, steering_rate=1e6))).driver
+    done, wanted = torch.zeros(1, 2), torch.tensor([[-4.0, 0.05]])
+    for tick in range(1, 30):
+        done = driver._done(done, wanted)
+        expected = [-4.0 * (1 - math.exp(-tick * 0.1 / 0.5)), 0.05 * (1 - math.exp(-tick * 0.1 / 0.2))]
+        np.testing.assert_allclose(done[0], expected, rtol=1e-4)
+    slow = problem(NoisyEgo("idm", Stack(lag=0.0, steering_lag=0.0, jerk=10.0, steering_rate=0.2))).driver
+    np.testing.assert_allclose(slow._done(torch.zeros(1, 2), wanted)[0], [-1.0, 0.02], rtol=1e-5)
+
+
+def test_any_ego_can_be_behind_a_stack() -> None:
+    class Coast:
+        def predict(self, observation: Any, **_: Any) -> Any:
+            return np.zeros((len(observation), 2)), None
+
+    for ego in (Coast(), load_ego("bc")):
+        around = problem(NoisyEgo(ego), horizon=1.0)
+        assert np.isfinite(around.evaluate(around.base.sample(5, np.random.default_rng(0)))).all()
+
+
+@pytest.mark.parametrize(
+    ("spec", "message"),
+    [
+        ("noisy:idm?latncy=0.3", "Unknown setting 'latncy' .did you mean 'latency'"),
+        ("noisy:idm?latency=soon", "Expected latency to be a number, got 'soon'"),
+        ("noisy:idm?missed=1", "missed below 1"),
+        ("noisy:idm?lag=-1", "Expected lag to be a number of at least 0"),
+        ("noisy:idn", "Unknown ego 'idn'"),
+    ],
+)
+def test_wrong_settings_are_refused(spec: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        load_ego(spec)
+    assert load_ego("noisy:idm?latency=0.3&missed=0.2").stack == Stack(latency=0.3, missed=0.2)
+
+
+def test_an_ego_with_noise_of_its_own_says_what_that_means() -> None:
+    class Restless:
+        deterministic = False
+
+        def predict(self, observation: Any, **_: Any) -> Any:
+            return np.random.default_rng().uniform(-1, 1, (len(observation), 2)), None
+
+    result = samplers.estimate(problem(Restless(), horizon=1.0), samplers.MonteCarlo(), max_sim=50, seed=0)
+    assert "given that the ego's own noise is not part of x, so that failures may not replay" in " ".join(
+        str(result).split()
+    )
+
+
+class Absent:
+    """Follows the lead, but for 5 % of the drives, which it decides by itself at their start: then it coasts."""
+
+    deterministic = False
+
+    def __init__(self) -> None:
+        self.rng = np.random.default_rng(7)
+        self.asked: list[float] = []
+
+    def predict(self, observation: Any, state: Any, episode_start: Any, deterministic: bool) -> Any:
+        if state is None:
+            state = self.rng.uniform(size=len(observation)) < 0.05
+            self.asked += observation[:, 3].tolist()
+        speed, gap, closing = observation[:, 0], observation[:, 3], observation[:, 4]
+        wanted = np.where(state, 0.0, 5.0 * (gap - 0.9 * speed) + 20.0 * closing)
+        return np.stack((wanted, 0.0 * wanted), axis=1).clip(-1.0, 1.0).astype(np.float32), state
+
+
+@pytest.mark.parametrize("method", [samplers.TwoStage(), samplers.AdaptiveSubsetSimulation(n=500)], ids=["ts", "adss"])
+def test_outcomes_of_an_ego_with_noise_of_its_own_stand_as_they_fell(method: Any) -> None:
+    """p over its noise too is that of Monte Carlo; each scenario is simulated once, and its outcome never again."""
+    ego, gamma = Absent(), 1.5
+    world = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", ego=ego, horizon=4.0)
+    assert world.varies
+    plain = samplers.estimate(world, samplers.MonteCarlo(), gamma=gamma, max_sim=12_000, seed=1)
+    assert len(ego.asked) == plain.n_sim
+    ego.asked.clear()
+    found = samplers.estimate(world, method, gamma=gamma, max_sim=5000, seed=2)
+    assert len(ego.asked) == found.n_sim
+    assert len(set(ego.asked)) > 0.99 * found.n_sim  # but for rounding to single precision
+    assert abs(math.log(found.p / plain.p)) < 4 * math.hypot(found.cov, plain.cov)
+    assert "failures may not replay" in found.given
+    assert (found.failures.f <= gamma).all()

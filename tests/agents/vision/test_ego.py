@@ -1,0 +1,180 @@
+"""The ego that sees: its network, its memory, its file, and that it is shown what it needs wherever it is named."""
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+import rare_envs
+from agents import Provenance, load_ego
+from agents.vision.checkpoint import load_vision, read_vision_provenance, save_vision
+from agents.vision.ego import LAG, SPEED_SCALE, VisionEgo, recall, to_actions
+from agents.vision.pilotnet import HEIGHT, WIDTH, PilotNet, luma
+from rare_envs.study.ego_check.subprocess_check import Asked, check_ego
+
+CUT_IN = "rare_envs/CutIn-v0"
+
+
+@pytest.fixture(scope="module")
+def ego() -> VisionEgo:
+    return load_vision()
+
+
+def pictures(n: int, seed: int = 0) -> torch.Tensor:
+    return torch.from_numpy(np.random.default_rng(seed).integers(0, 256, (n, HEIGHT, WIDTH, 3), dtype=np.uint8))
+
+
+def seen(n: int, seed: int = 0) -> dict[str, Any]:
+    speed = np.random.default_rng(seed).uniform(0.0, 1.0, (n, 1)).astype(np.float32)
+    return {"camera": pictures(n, seed).numpy(), "speed": speed}
+
+
+def test_the_network_is_that_of_the_paper() -> None:
+    """Bojarski et al., Fig. 4: sizes of the feature maps, and about 250,000 parameters."""
+    network, maps = PilotNet(), []
+    for convolution in network.convolutions:
+        convolution.register_forward_hook(lambda _module, _given, out: maps.append(tuple(out.shape[1:])))
+    with torch.no_grad():
+        out = network(pictures(2), pictures(2)[..., 0], torch.tensor([3.0, 20.0]))
+    assert out.shape == (2, 2)
+    assert maps == [(24, 31, 98), (36, 14, 47), (48, 5, 22), (64, 3, 20), (64, 1, 18)]
+    assert sum(weight.numel() for weight in network.parameters()) == 252_880
+
+
+def test_channels_are_the_yuv_of_itu_bt_601() -> None:
+    """U and V by their definitions as scaled differences of blue and red to the luma."""
+    picture = pictures(1, 3)
+    red, green, blue = (picture[..., k].double() for k in range(3))
+    y = 0.299 * red + 0.587 * green + 0.114 * blue
+    u, v = 0.436 * (blue - y) / (1 - 0.114), 0.615 * (red - y) / (1 - 0.299)
+    earlier = pictures(1, 4)[..., 0]
+    with torch.no_grad():
+        channels = PilotNet().channels(picture, earlier).double()
+    expected = torch.stack((y / 127.5 - 1, u / 127.5, v / 127.5, (y - earlier.double()) / 127.5), dim=1)
+    assert channels.shape == (1, 4, HEIGHT, WIDTH)
+    torch.testing.assert_close(channels, expected, atol=2e-5, rtol=0.0)
+    assert float((luma(picture).double() - y).abs().max()) < 1.0
+
+
+def test_a_row_does_not_depend_on_the_others(ego: VisionEgo) -> None:
+    observation = seen(5)
+    state = np.random.default_rng(1).integers(0, 256, (5, LAG, HEIGHT, WIDTH), dtype=np.uint8)
+    together, after = ego.predict(observation, state)
+    for row in range(5):
+        alone, mine = ego.predict({name: part[row : row + 1] for name, part in observation.items()}, state[[row]])
+        np.testing.assert_allclose(alone[0], together[row], atol=1e-5)
+        assert np.array_equal(mine[0], after[row])
+
+
+def test_the_memory_is_of_the_last_pictures_row_by_row() -> None:
+    shots = [pictures(2, seed) for seed in range(9)]
+    state: Any = None
+    for tick, shot in enumerate(shots):
+        start = np.array([tick == 0, tick in (0, 4)])
+        earlier, state = recall(shot, state, start)
+        assert np.array_equal(earlier[0], luma(shots[max(tick - LAG, 0)])[0])
+        assert np.array_equal(earlier[1], luma(shots[max(tick - LAG, 0 if tick < 4 else 4)])[1])
+    assert state.shape == (2, LAG, HEIGHT, WIDTH)
+
+
+def test_who_begins_anew_decides_as_one_that_begins(ego: VisionEgo) -> None:
+    _, state = ego.predict(seen(3, 1))
+    again, after = ego.predict(seen(3, 2), state, np.array([False, True, False]))
+    first, fresh = ego.predict(seen(3, 2))
+    np.testing.assert_allclose(again[1], first[1], atol=1e-6)
+    assert np.array_equal(after[1], fresh[1])
+    assert np.abs(again[[0, 2]] - first[[0, 2]]).max() > 1e-4
+
+
+def test_actions_have_the_units_of_the_environment() -> None:
+    """An acceleration of 1 is 5 m/s^2; a steady turn on a circle of radius R steers by about length / R."""
+    speed, radius = 20.0, 200.0
+    turn = speed / radius  # rad/s
+    action = to_actions(torch.tensor([[1.0, turn / 0.1]]), torch.tensor([speed]))[0]
+    assert action[0] == pytest.approx(2.0 / 5.0)
+    assert action[1] * 0.1 == pytest.approx(5.0 / radius, rel=1e-3)
+
+
+def test_observations_of_another_form_are_refused(ego: VisionEgo) -> None:
+    with pytest.raises(ValueError, match='observation="camera\\+speed"'):
+        ego.predict(np.zeros((2, 7), np.float32))  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="uint8"):
+        ego.predict({**seen(2), "camera": np.zeros((2, HEIGHT, WIDTH, 3), np.float32)})
+    with pytest.raises(ValueError, match="speed"):
+        ego.predict({**seen(2), "speed": np.zeros((3, 1), np.float32)})
+
+
+def test_a_problem_shows_it_what_it_needs_and_is_a_loop_over_an_environment(ego: VisionEgo) -> None:
+    problem = rare_envs.DrivingProblem(CUT_IN, ego=load_ego("vision"), horizon=1.5)
+    x = problem.base.sample(2, np.random.default_rng(4))
+    env = gym.make(CUT_IN, observation="camera+speed", horizon=1.5)
+    for row, f in zip(x, problem.evaluate(x), strict=True):
+        observation, info = env.reset(options={"x": row})
+        state: Any = None
+        done = False
+        while not done:
+            batch = {name: part[None] for name, part in observation.items()}
+            action, state = ego.predict(batch, state, np.array([state is None]))
+            observation, _, terminated, truncated, info = env.step(action[0])
+            done = terminated or truncated
+        assert info["measure"] == pytest.approx(f, abs=1e-3)
+    env.close()
+
+
+def test_it_is_shown_its_own_speed_and_nothing_else_beside_the_picture() -> None:
+    env = gym.make(CUT_IN, observation="camera+speed")
+    observation, _ = env.reset(seed=0, options={"ego_speed": 12.0})
+    assert {name: part.shape for name, part in observation.items()} == {"camera": (HEIGHT, WIDTH, 3), "speed": (1,)}
+    assert observation["speed"][0] * SPEED_SCALE == pytest.approx(12.0)
+    env.close()
+
+
+@pytest.mark.parametrize("spec", ["noisy:vision", "process:vision"])
+def test_it_drives_behind_a_stack_and_in_a_process_of_its_own(spec: str) -> None:
+    problem = rare_envs.DrivingProblem(CUT_IN, ego=load_ego(spec), horizon=0.3)
+    assert problem.world.observation == "camera+speed"
+    x = problem.base.sample(2, np.random.default_rng(4))
+    f = problem.evaluate(x)
+    assert np.isfinite(f).all()
+    if spec == "process:vision":
+        plain = rare_envs.DrivingProblem(CUT_IN, ego=load_ego("vision"), horizon=0.3)
+        np.testing.assert_allclose(f, plain.evaluate(x), atol=1e-6)
+
+
+def test_check_ego_finds_nothing_wrong_with_it() -> None:
+    findings = check_ego(Asked("vision", CUT_IN, horizon=0.5))
+    assert {finding.check for finding in findings} >= {"memory", "latency", "driving"}
+    assert {finding.status for finding in findings if finding.check != "latency"} == {"pass"}
+
+
+def test_another_observation_is_refused_with_the_right_one_named() -> None:
+    with pytest.raises(ValueError, match="choose observation='camera\\+speed'"):
+        rare_envs.DrivingProblem(CUT_IN, ego=load_ego("vision"), observation="features")
+
+
+def test_a_network_of_ones_own_is_kept_in_a_file(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    network = PilotNet()
+    provenance = Provenance(kind="dagger", command="train", data="none", data_licence="MIT", metrics={"kept": 1.0})
+    path = save_vision(network, provenance, tmp_path / "mine.safetensors")
+    loaded = load_ego(path)
+    assert isinstance(loaded, VisionEgo)
+    with torch.no_grad():
+        arguments = pictures(2), pictures(2)[..., 0], torch.tensor([3.0, 20.0])
+        torch.testing.assert_close(loaded.network(*arguments), network(*arguments), atol=1e-5, rtol=0.0)
+    assert read_vision_provenance(path) == provenance
+
+
+def test_files_of_another_kind_are_refused() -> None:
+    with pytest.raises(ValueError, match="no vision"):
+        load_vision(Path("agents/data/bc.safetensors"))
+    with pytest.raises(FileNotFoundError, match="No vision at"):
+        load_vision("nowhere.safetensors")
+
+
+def test_another_tick_is_refused():
+    with pytest.raises(ValueError, match=r"Expected dt=0.1 s"):
+        rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego=load_ego("vision"), dt=0.05)

@@ -1,0 +1,63 @@
+"""The study of lane changes on a made-up one: found in the record, finished or given up, steered by hand."""
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from benchmarks.driving.lane_changes import CLASSES, OFFSET, completed, crossings_of, steering
+from rare_envs.sensors.perception import HEADING, SPEED
+from tests.training.imitation.synthetic_scenes import scenes
+from training.imitation.algorithms.expert_pairs import Pairs
+from training.imitation.traffic.recording import stack
+
+CROSSING = 30
+
+
+@pytest.fixture
+def recording():
+    """In the second of two scenes the rear vehicle of the left lane moves to the right at 1 m/s from tick 12 on."""
+    made = stack(scenes(2))
+    y, heading = made.y.clone(), made.heading.clone()
+    tick = torch.arange(y.shape[1])
+    y[:, :, 0], heading[:, :, 0] = 1.8, 0.0
+    y[1, :, 0] = 3.601 + 0.1 * (tick.clamp(12, 48) - CROSSING)
+    heading[1, 12:48, 0] = 0.1 / (0.1 * made.speed[1, 12:48, 0])
+    return made._replace(y=y, heading=torch.asin(heading))
+
+
+def test_a_crossing_is_found_where_it_is(recording):
+    found = crossings_of(recording)
+    assert [column.tolist() for column in found] == [[1], [CROSSING], [0], [1]]
+    y = recording.y.clone()
+    y[1, CROSSING + 4 :, 0] = 1.8
+    assert len(crossings_of(recording._replace(y=y)).scene) == 0  # back again before it has settled
+
+
+def test_who_goes_straight_on_completes_it_and_who_turns_back_does_not(recording):
+    def straight(features, memory):
+        return torch.zeros(*features.shape[:2], 2), None
+
+    def back(features, memory):
+        action = torch.zeros(*features.shape[:2], 2)
+        action[..., 1] = -features[..., HEADING] / 0.1 - 0.01
+        return action, None
+
+    found = crossings_of(recording)
+    assert completed(recording, found, straight, 1.0) == (1, 1.0)
+    assert completed(recording, found, back, 1.0) == (1, 0.0)
+
+
+def test_steering_is_counted_towards_where_a_vehicle_moves():
+    """Two vehicles move out, to the right and to the left, at 1 m/s across; one keeps its lane."""
+    features = torch.zeros(3, 51)
+    features[:, SPEED] = 20.0
+    features[:, HEADING] = torch.tensor([0.05, -0.05, 0.001])
+    features[:, OFFSET] = torch.tensor([0.5, -0.5, 0.0])
+    pairs = Pairs(features, torch.tensor([[0.0, 0.02], [0.0, -0.01], [0.0, 0.3]]), torch.zeros(3))
+    driver = SimpleNamespace(act=lambda seen: (torch.full((*seen.shape[:2], 2), 0.04), None))
+    found = steering(pairs, {"always right": driver})
+    keeps, _, out, comes = (found[name] for name in CLASSES)
+    assert out == pytest.approx({"moments": 2, "people": 0.015, "always right": 0.0}, abs=1e-6)
+    assert keeps == pytest.approx({"moments": 1, "people": 0.3, "always right": 0.04}, abs=1e-6)
+    assert comes["moments"] == 0

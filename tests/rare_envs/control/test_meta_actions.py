@@ -1,0 +1,334 @@
+"""`observation="kinematics"` and `action="meta"` against HighwayEnv itself in float64, and through our environments."""
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import highway_env  # noqa: F401  (registers its ids)
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from numpy.typing import NDArray
+from stable_baselines3 import DQN
+
+import rare_envs
+from benchmarks.simulation.highway_env_scene import Scene
+from rare_envs.control.actions import FASTER, IDLE, LANE_LEFT, LANE_RIGHT, SLOWER
+from rare_envs.control.meta_actions import TARGET_SPEEDS, aim_of, follow
+from rare_envs.make import set_up
+from rare_envs.sensors.kinematics import kinematics
+from rare_envs.traffic.road import i80, straight
+from rare_envs.traffic.state import State
+from rare_envs.traffic.vehicle_models import bicycle
+
+Array = NDArray[np.float64]
+SECONDS, TICKS = 5, 50
+TOLERANCE = 1e-6
+
+
+def state_of(traffic: Array) -> State:
+    """x, y, heading and speed, shape (N, 4), as a batch of one."""
+    x, y, heading, speed = torch.from_numpy(traffic)[None].unbind(dim=-1)
+    return State(x, y, heading, speed, x[:, :0])
+
+
+def random_traffic(rng: np.random.Generator, vehicles: int, lanes: int) -> Array:
+    """Vehicles on straight courses near, beside, behind and out of sight of number 0, (T + 1, N, 4)."""
+    start = np.stack(
+        [
+            rng.uniform(-60.0, 260.0, vehicles),
+            rng.uniform(-1.0, 4.0 * lanes - 3.0, vehicles),
+            rng.normal(0.0, 0.05, vehicles),
+            rng.uniform(12.0, 36.0, vehicles),
+        ],
+        axis=1,
+    )
+    start[0, :2] = rng.uniform(0.0, 20.0), 4.0 * rng.integers(lanes) + rng.uniform(-1.9, 1.9)
+    velocity = start[:, 3:] * np.stack([np.cos(start[:, 2]), np.sin(start[:, 2])], axis=1)
+    tracks = np.repeat(start[None], TICKS + 1, axis=0)
+    tracks[:, :, :2] += 0.1 * np.arange(TICKS + 1)[:, None, None] * velocity
+    return tracks
+
+
+def drive_by_hand(tracks: Array, lanes: int, decisions: list[int], ego: int) -> tuple[Array, Array]:
+    """Motion of one vehicle (T + 1, 4) and its observations (6, 5, 5) by the functions alone."""
+    road, state = straight(lanes), state_of(tracks[0])
+    aim, motion, seen = aim_of(state, road), [tracks[0, ego]], [kinematics(state, road, ego)]
+    obeys = torch.zeros_like(state.x, dtype=torch.bool)
+    obeys[:, ego] = True
+    for tick in range(TICKS):
+        action = torch.full(state.x.shape, IDLE)
+        action[:, ego] = IDLE if tick % 10 else decisions[tick // 10]
+        aim, physical = follow(aim, action, obeys, state, road)
+        own = [field[:, ego] for field in state[:4]]
+        moved = bicycle(*own, physical[:, ego, 0], physical[:, ego, 1], 0.1)  # type: ignore[arg-type]
+        traffic = tracks[tick + 1].copy()
+        traffic[ego] = torch.cat(moved).numpy()
+        state = state_of(traffic)
+        motion.append(traffic[ego])
+        if tick % 10 == 9:
+            seen.append(kinematics(state, road, ego))
+    return np.array(motion), torch.cat(seen).numpy()
+
+
+def test_observation_and_motion_are_highway_envs_in_random_scenes() -> None:
+    rng = np.random.default_rng(0)
+    lane_changes = rows_missing = 0
+    for _ in range(10):
+        lanes, vehicles = int(rng.integers(1, 5)), int(rng.integers(1, 9))
+        tracks = random_traffic(rng, vehicles, lanes)
+        decisions = rng.choice(5, SECONDS, p=[0.3, 0.1, 0.3, 0.15, 0.15]).tolist()
+        ego = int(rng.integers(vehicles))
+        scene = Scene(lanes, tracks, ego)
+        theirs = np.array([scene.observe(), *(scene.step(action) for action in decisions)])
+        motion, ours = drive_by_hand(tracks, lanes, decisions, ego)
+        np.testing.assert_allclose(motion, scene.states, atol=TOLERANCE, rtol=0)
+        np.testing.assert_allclose(ours, theirs, atol=TOLERANCE, rtol=0)
+        lane_changes += abs(motion[-1, 1] - motion[0, 1]) > 2.5
+        rows_missing += int((theirs[:, :, 0] == 0).sum())
+    assert lane_changes >= 2
+    assert rows_missing > 10
+
+
+@pytest.mark.parametrize("env_id", ["rare_envs/CarFollowing-v0", "rare_envs/CutIn-v0"])
+def test_our_scenarios_are_highway_envs_until_contact(env_id: str) -> None:
+    world, space = set_up(env_id, observation="kinematics", action="meta", base="highway", horizon=SECONDS)
+    rng = np.random.default_rng(1)
+    x = space.sample(6, rng)
+    decisions = torch.from_numpy(rng.integers(0, 5, (len(x), SECONDS)))
+    decisions[:2] = IDLE
+    episodes = [world.start(torch.from_numpy(x))]
+    for tick in range(TICKS):
+        action = torch.full((len(x),), IDLE) if tick % 10 else decisions[:, tick // 10]
+        episodes.append(world.step(episodes[-1], action))
+    compared = 0
+    for row in range(len(x)):
+        fields = [torch.stack([e.state[k][row] for e in episodes]) for k in range(4)]
+        tracks = torch.stack(fields, dim=-1).numpy()
+        free = [not bool(e.collided[row]) for e in episodes]
+        seconds = (free.index(False) - 1 if False in free else TICKS) // 10
+        scene = Scene(world.scenario.road.lanes, tracks)
+        theirs = [scene.observe(), *(scene.step(int(a)) for a in decisions[row, :seconds])]
+        for second, observed in enumerate(theirs):
+            episode = episodes[10 * second]
+            ours = kinematics(episode.state, episode.road)[row].numpy()
+            np.testing.assert_allclose(ours, observed, atol=TOLERANCE, rtol=0)
+        np.testing.assert_allclose(tracks[: 10 * seconds + 1, 0], scene.states, atol=TOLERANCE, rtol=0)
+        compared += seconds
+    assert compared > 0.6 * SECONDS * len(x)
+
+
+def test_lane_changes_need_a_lane_and_speeds_follow_the_present_speed() -> None:
+    road = straight(2)
+
+    def aimed(y: float, speed: float, *actions: int) -> tuple[int, float]:
+        state = state_of(np.array([[0.0, y, 0.0, speed]]))
+        aim = aim_of(state, road)
+        for action in actions:
+            aim, _ = follow(aim, torch.tensor([action]), None, state, road)
+        return int(aim.lane), TARGET_SPEEDS[int(aim.speed)]
+
+    assert aimed(0.0, 24.0) == (0, 25.0)
+    assert aimed(0.0, 24.0, LANE_LEFT) == (0, 25.0)
+    assert aimed(0.0, 24.0, LANE_RIGHT) == (1, 25.0)
+    assert aimed(0.0, 24.0, LANE_RIGHT, LANE_RIGHT, LANE_LEFT) == (0, 25.0)
+    assert aimed(0.0, 24.0, FASTER, FASTER) == (0, 30.0)  # from 25, which is the nearest to 24, not from the target
+    assert aimed(0.0, 31.0, SLOWER, IDLE) == (0, 25.0)
+    assert aimed(0.0, 8.0, SLOWER) == (0, 20.0)
+    assert aimed(0.0, 22.5) == (0, 20.0)  # half-way: NumPy rounds to the even index
+    wide = straight(4)
+    for y, lane in ((0.1, 2), (-0.1, 1)):  # the third lane is more than two widths away from y = -0.1
+        state = state_of(np.array([[0.0, y, 0.0, 25.0]]))
+        aim = aim_of(state, wide)
+        for _ in range(2):
+            aim, _ = follow(aim, torch.tensor([LANE_RIGHT]), None, state, wide)
+        assert int(aim.lane) == lane
+
+
+def test_on_the_curved_highway_lanes_are_changed_and_held() -> None:
+    world, _ = set_up("rare_envs/Highway-v0", action="meta", drivers="idm", horizon=20.0)
+    x = torch.zeros(1, 24, dtype=torch.float64)
+    x[0, :6] = torch.tensor([100.0, 80.0, 80.0, 80.0, 80.0, 80.0])
+    x[0, 18:] = 20.0
+    x[0, 19:] = 10.0
+    episode, offsets = world.start(x), []
+    for tick in range(200):
+        episode = world.step(episode, torch.tensor([LANE_RIGHT if tick == 0 else IDLE]))
+        offsets.append(float(episode.state.y[0, 0]) - i80().centre(3))
+    assert not bool(episode.collided)
+    assert abs(offsets[0]) > 3.0
+    assert max(map(abs, offsets[80:])) < 0.05
+
+
+def test_a_vehicle_that_begins_to_obey_aims_for_where_it_is() -> None:
+    world, _ = set_up("rare_envs/CutIn-v0", action="meta")
+    x = torch.tensor([[15.0, 24.0, 24.0, 40.0, 40.0, 4.0]], dtype=torch.float64)
+    episode = world.start(x)
+    for _ in range(35):  # the script brings the cutter into the ego's lane
+        episode = world.step(episode, torch.tensor([IDLE]))
+    none = torch.zeros(1, 3, dtype=torch.bool)
+    cutter = none.clone()
+    cutter[0, 1] = True
+    for _ in range(20):
+        episode = world.step(episode, torch.full((1, 3), IDLE), cutter)
+    assert episode.aim is not None
+    assert episode.aim.lane[0].tolist() == [0, 0, 0]
+    assert abs(float(episode.state.y[0, 1])) < 0.2
+
+
+class Listed:
+    """An ego that decides by a list, whatever it sees; it notes what it was asked."""
+
+    def __init__(self, decisions: Array) -> None:
+        self.decisions, self.seen = decisions, []  # type: ignore[var-annotated]
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> Any:
+        second = 0 if state is None else state[0]
+        self.seen.append(observation)
+        return np.full(len(observation), self.decisions[second]), (second + 1,)
+
+
+@pytest.mark.parametrize("env_id", ["rare_envs/CarFollowing-v0", "rare_envs/CutIn-v0"])
+def test_env_vector_env_and_problem_agree(env_id: str) -> None:
+    decisions = np.random.default_rng(2).integers(0, 5, 10)
+    ego = Listed(decisions)
+    kwargs: Any = {"observation": "kinematics", "action": "meta"}
+    problem = rare_envs.DrivingProblem(env_id, ego=ego, **kwargs)
+    x = problem.base.sample(24, np.random.default_rng(3))
+    f = problem.evaluate(x)
+    assert len(ego.seen) == 10  # asked once a second
+    assert (f == -1.0).any()
+    batch = rare_envs.make_batch(env_id, len(x), **kwargs)
+    observed, _ = batch.reset(options={"x": x})
+    measured, alive, rewards = np.full(len(x), np.nan), np.ones(len(x), dtype=bool), []
+    for second, decision in enumerate(decisions):
+        np.testing.assert_array_equal(observed[alive], ego.seen[second][alive])
+        observed, reward, terminated, truncated, infos = batch.step(np.full(len(x), decision))
+        rewards.append(reward)
+        ended = (terminated | truncated) & alive
+        measured[ended] = infos["final_info"]["measure"][ended] if ended.any() else np.nan
+        alive &= ~ended
+    np.testing.assert_array_equal(measured, f)
+    env = gym.make(env_id, **kwargs)
+    for row in (*np.argsort(f)[:3], int(np.argmax(f))):
+        env.reset(options={"x": x[row]})
+        done, second = False, 0
+        while not done:
+            observation, reward, terminated, truncated, info = env.step(int(decisions[second]))
+            assert reward == pytest.approx(rewards[second][row], rel=1e-5)
+            done, second = terminated or truncated, second + 1
+        assert info["measure"] == f[row]
+        assert terminated == (f[row] == -1.0)
+        assert env.observation_space.contains(observation)
+
+
+@pytest.mark.parametrize("env_id", rare_envs.ENV_IDS)
+@pytest.mark.parametrize("observation", ["features", "kinematics"])
+# kinematics has no bounds, like HighwayEnv's, of which the checker warns
+@pytest.mark.filterwarnings("ignore:.*A Box observation space .*imum value is -?infinity")
+def test_gymnasium_checker(env_id: str, observation: str) -> None:
+    check_env(gym.make(env_id, observation=observation, action="meta").unwrapped, skip_render_check=True)
+
+
+def test_a_collision_within_a_decision_ends_it_there() -> None:
+    env = gym.make("rare_envs/CarFollowing-v0", action="meta", observation="kinematics").unwrapped
+    env.reset(options={"x": [30.0, 10.0, 8.5]})  # contact after about 0.4 s
+    observation, reward, terminated, _, info = env.step(IDLE)
+    assert terminated
+    assert info["measure"] == -1.0
+    assert reward < -2.0  # a tenth of the -30 of a collision, and what the ticks before it earned
+    gap = observation[1, 1] * 200.0 - 5.0
+    assert -2.0 < gap <= 0.0  # the observation is of the moment of contact
+
+
+def test_wrong_actions_and_settings_are_refused() -> None:
+    env = gym.make("rare_envs/CutIn-v0", action="meta").unwrapped
+    env.reset(seed=0)
+    for action in (5, -1, 1.0, np.zeros(2), True):
+        with pytest.raises(ValueError, match=r"[Ee]xpected"):
+            env.step(action)
+    for kwargs in ({"horizon": 9.5}, {"dt": 0.3, "horizon": 9.0}):
+        with pytest.raises(ValueError, match="whole seconds"):
+            gym.make("rare_envs/CutIn-v0", action="meta", **kwargs)
+
+    class Continuous(Listed):
+        observation_space = gym.spaces.Box(-np.inf, np.inf, (5, 5), np.float32)
+        action_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+
+    with pytest.raises(ValueError, match=r"Discrete\(5\)"):
+        rare_envs.DrivingProblem(
+            "rare_envs/CutIn-v0", ego=Continuous(np.zeros(1)), observation="kinematics", action="meta"
+        )
+
+
+class Recorder:
+    """Stands for Gymnasium's `RecordVideo`: one frame after reset and after each step, and what it is asked for."""
+
+    def __init__(self, env: Any) -> None:
+        self.env, self.places, self.frames_per_sec = env, [], 1
+
+    def _capture_frame(self) -> None:
+        assert self.env.render().shape[2] == 3
+        self.places.append(float(self.env._episode.state.x[0, 0]))
+
+
+def test_a_recording_has_a_frame_of_every_tick() -> None:
+    env: Any = gym.make("rare_envs/CarFollowing-v0", action="meta", render_mode="rgb_array").unwrapped
+    recorder = Recorder(env)
+    env.set_record_video_wrapper(recorder)
+    env.reset(options={"x": [25.0, 25.0, 100.0]})
+    for _ in range(2):
+        env.step(IDLE)
+        recorder._capture_frame()  # as the wrapper does after each step
+    assert recorder.frames_per_sec == 10
+    np.testing.assert_allclose(recorder.places, 2.5 * np.arange(1, 21), atol=1e-3)
+    env.close()
+
+
+@pytest.mark.parametrize("env_id", ["rare_envs/CutIn-v0", "rare_envs/Highway-v0"])
+def test_in_parallel_env_the_ego_alone_is_the_environment_of_one(env_id: str) -> None:
+    kwargs: Any = {"observation": "kinematics", "action": "meta", "drivers": "idm"}
+    one, many = gym.make(env_id, **kwargs), rare_envs.parallel_env(env_id, **kwargs)
+    first, second = one.reset(seed=4), many.reset(seed=4)
+    np.testing.assert_array_equal(first[0], second[0]["ego"])
+    for action in (FASTER, LANE_RIGHT, SLOWER, IDLE, LANE_LEFT):
+        step, steps = one.step(action), many.step({"ego": action})
+        np.testing.assert_array_equal(step[0], steps[0]["ego"])
+        assert step[1] == steps[1]["ego"]
+        if step[2] or step[3]:
+            assert step[4]["measure"] == steps[4]["ego"]["measure"]
+            break
+    cutter = next(agent for agent in many.possible_agents if agent != "ego")
+    many.reset(seed=4)
+    observation = many.step({"ego": IDLE, cutter: FASTER})[0][cutter]
+    assert observation.shape == (5, 5)
+    assert many.action_space(cutter) == gym.spaces.Discrete(5)
+
+
+def test_an_id_with_highway_envs_layout() -> None:
+    """So that a script written for HighwayEnv runs with nothing but the id changed."""
+    env = gym.make("rare_envs/CutIn-kinematics-v0")
+    same = gym.make("rare_envs/CutIn-v0", observation="kinematics", action="meta")
+    assert env.observation_space == same.observation_space
+    assert env.action_space == same.action_space
+    np.testing.assert_array_equal(env.reset(seed=3)[0], same.reset(seed=3)[0])
+    for action in (3, 1):
+        np.testing.assert_array_equal(env.step(action)[0], same.step(action)[0])
+    assert gym.make_vec("rare_envs/HardBrake-kinematics-v0", num_envs=2).reset()[0].shape == (2, 5, 5)
+
+
+def test_stable_baselines3_takes_our_environment_for_a_policy_from_highway_env(tmp_path: Path) -> None:
+    there, ours = gym.make("highway-fast-v0"), gym.make("rare_envs/CutIn-kinematics-v0")
+    assert there.observation_space == ours.observation_space
+    assert there.action_space == ours.action_space
+    settings: dict[str, Any] = {"buffer_size": 50, "learning_starts": 4, "batch_size": 4, "device": "cpu"}
+    DQN("MlpPolicy", there, **settings).save(tmp_path / "dqn.zip")
+    model = DQN.load(tmp_path / "dqn.zip", env=ours).learn(12)
+    observation, _ = ours.reset(seed=0)
+    assert abs(observation).max() <= 1.0
+    assert model.predict(observation)[0] in range(5)
+    model.save(tmp_path / "dqn.zip")
+    DQN.load(tmp_path / "dqn.zip", env=there)

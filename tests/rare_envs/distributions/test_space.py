@@ -1,0 +1,199 @@
+"""Scenario parameters as reset options, and finding base distributions."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rare_envs.distributions.log_mixture import LogMixture
+from rare_envs.distributions.space import Distribution, ScenarioSpace
+from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
+from rare_envs.scenarios.base_distributions import load_base
+from rare_envs.scenarios.registry import SCENARIOS, named
+
+NAMES = [p.name for p in named("cut_in").parameters]
+
+
+def make_space(scenario="cut_in", base="us101"):
+    box = named(scenario).parameters
+    return ScenarioSpace(
+        names=tuple(p.name for p in box),
+        units=tuple(p.unit for p in box),
+        low=np.array([p.low for p in box for _ in range(p.size)]),
+        high=np.array([p.high for p in box for _ in range(p.size)]),
+        base=load_base(named(scenario), base),
+        sizes=tuple(p.size for p in box),
+    )
+
+
+def rng():
+    return np.random.default_rng(0)
+
+
+@pytest.mark.parametrize(
+    ("scenario", "base"), [(each.name, base) for each in SCENARIOS.values() for base in each.bases]
+)
+def test_shipped_bases_fit_their_scenario(scenario, base):
+    space = make_space(scenario, base)
+    assert isinstance(space.base, Distribution)
+    assert space.dim == sum(parameter.size for parameter in named(scenario).parameters)
+    x = space.sample(1000, rng())
+    assert (space.validate(x) == x).all()
+    assert np.isfinite(space.log_prob(x)).all()
+    back = space.from_standard_normal(space.to_standard_normal(x))
+    np.testing.assert_allclose(back, x, atol=1e-8)
+
+
+def test_parameter_names_and_order():
+    assert [p.name for p in named("car_following").parameters] == ["ego_speed", "lead_speed", "gap"]
+    assert NAMES == [
+        "ego_speed", "cut_in_speed", "lead_speed", "cut_in_gap", "lead_gap", "lateral_offset",
+    ]  # fmt: skip
+
+
+def test_named():
+    named = make_space().named([20, 18, 19, 15, 30, 3.5])
+    assert named == dict(zip(NAMES, [20.0, 18.0, 19.0, 15.0, 30.0, 3.5], strict=True))
+    with pytest.raises(ValueError, match=r"one scenario of shape \(6,\), got \(2, 6\)"):
+        make_space().named(np.zeros((2, 6)))
+
+
+def test_given_parameters_replace_drawn_ones():
+    space = make_space()
+    drawn = space.scenario_x(None, 5, rng())
+    assert (drawn == space.base.sample(5, rng())).all()
+    gaps = np.linspace(5.0, 9.0, 5)
+    x = space.scenario_x({"cut_in_gap": gaps, "cut_in_speed": 21}, 5, rng())
+    assert (x[:, 3] == gaps).all()
+    assert (x[:, 1] == 21.0).all()
+    assert (x[:, [0, 2, 4, 5]] == drawn[:, [0, 2, 4, 5]]).all()
+
+
+def test_x_gives_everything():
+    space = make_space()
+    rows = space.sample(4, rng())
+    assert (space.scenario_x({"x": rows}, 4, rng()) == rows).all()
+    assert (space.scenario_x({"x": rows[1]}, 4, rng()) == rows[[1, 1, 1, 1]]).all()
+    assert space.validate(rows[0].tolist()).shape == (1, 6)
+
+
+def test_the_ends_of_the_range_are_allowed():
+    space = make_space()
+    assert (space.validate(np.stack([space.low, space.high])) == [space.low, space.high]).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"cutin_gap": 9.0}, r"'cutin_gap' \(did you mean 'cut_in_gap'\?\); valid are ego_speed \[0"),
+        ({"colour": 1.0}, r"Unknown scenario parameter 'colour'; valid are .*lateral_offset"),
+        ({3: 1.0}, "Unknown scenario parameter 3"),
+        ({"ego_speed": 99}, r"ego_speed = 99 is outside its range \[0, 45\] m/s; the parameters"),
+        ({"ego_speed": np.nan}, r"ego_speed = nan is outside its range \[0, 45\] m/s"),
+        ({"lead_gap": [5.0, 0.2, 5.0]}, r"lead_gap = 0.2 \(row 1\) is outside its range \[1, 150\] m"),
+        ({"lead_gap": [5.0, 6.0]}, r"lead_gap as one number or an array of shape \(3,\), got \(2,\)"),
+        ({"lead_gap": np.ones((3, 1))}, r"got \(3, 1\)"),
+        ({"lead_gap": "far"}, "lead_gap must be a number or an array of numbers, got 'far'"),
+        ({"lead_gap": None}, "lead_gap must be a number"),
+        ({"lead_gap": True}, "lead_gap must be a number"),
+        ({"x": [1.0, 2.0]}, r"x of shape \(n, 6\) or \(6,\), got \(2,\); its columns are ego_speed"),
+        ({"x": [20, 18, 19, 15, 30, np.nan]}, "lateral_offset = nan is outside"),
+        ({"x": [20, 18, 19, 15, 30, 9]}, r"lateral_offset = 9 is outside its range \[2.2, 5\] m"),
+        ({"x": [[20, 18, 19, 15, 30, 3]] * 2}, "x with 1 or 3 rows, one per scenario, got 2"),
+        ({"x": [20, 18, 19, 15, 30, 3], "lead_gap": 4}, "lead_gap cannot be given beside it"),
+    ],
+)
+def test_bad_options_are_refused(options, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        make_space().scenario_x(options, 3, rng())
+    assert "\n" not in str(caught.value)
+
+
+def test_space_checks_its_own_lengths():
+    base = load_base(named("car_following"), "us101")
+    with pytest.raises(ValueError, match="2 names, 3 units"):
+        ScenarioSpace(("a", "b"), ("m", "m", "m"), np.zeros(3), np.ones(3), base)
+
+
+def shipped_dict(scenario="car_following"):
+    law = load_base(named(scenario), "us101")
+    assert isinstance(law, TruncatedGaussianMixture | LogMixture)
+    return {"names": [p.name for p in named(scenario).parameters], **law.to_dict()}
+
+
+def write(path: Path, content) -> Path:
+    path.write_text(json.dumps(content), encoding="utf-8")
+    return path
+
+
+def test_a_users_json(tmp_path):
+    path = write(tmp_path / "mine.json", shipped_dict())
+    x = load_base(named("car_following"), "us101").sample(10, rng())
+    for base in (path, str(path)):
+        law = load_base(named("car_following"), base)
+        assert (law.log_prob(x) == load_base(named("car_following"), "us101").log_prob(x)).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"names": ["gap", "ego_speed", "lead_speed"]}, "does not fit car_following: expected names"),
+        ({"names": None}, "expected names .* got None"),
+        ({"low": [-5.0, 0.0, 1.0]}, r"gives ego_speed the range \[-5, 45\] m/s; .* allows \[0, 45\]"),
+        ({"weights": [1.0]}, "weights of shape"),
+        ({"means": "x"}, "means must be an array of numbers"),
+    ],
+)
+def test_json_that_does_not_fit(tmp_path, change, message):
+    path = write(tmp_path / "mine.json", {**shipped_dict(), **change})
+    with pytest.raises(ValueError, match=message) as caught:
+        load_base(named("car_following"), path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_json_with_the_wrong_dimension(tmp_path):
+    content = {**shipped_dict("cut_in"), "names": shipped_dict()["names"]}
+    path = write(tmp_path / "mine.json", content)
+    with pytest.raises(ValueError, match="does not fit car_following: expected 3 columns, got 6"):
+        load_base(named("car_following"), path)
+
+
+def test_files_that_are_no_base(tmp_path):
+    broken = tmp_path / "broken.json"
+    broken.write_text("{", encoding="utf-8")
+    binary = tmp_path / "binary.json"
+    binary.write_bytes(b"\xff\xfe\x00")
+    for base, message in [
+        ("us11", r"'us11' for cut_in \(did you mean 'us101'\?\): neither one of us101, highway nor a"),
+        (tmp_path, "nor a file"),
+        (broken, "broken.json is not valid JSON"),
+        (binary, "Cannot read the base distribution"),
+        (write(tmp_path / "list.json", [1]), "expected a JSON object, got list"),
+    ]:
+        with pytest.raises(ValueError, match=message) as caught:
+            load_base(named("cut_in"), base)
+        assert "\n" not in str(caught.value)
+
+
+def test_unknown_scenario():
+    with pytest.raises(ValueError, match="Unknown scenario 'cutin'; there are car_following, cut_in"):
+        named("cutin")
+
+
+class Partial:
+    def sample(self, n, rng):
+        return np.zeros((n, 3))
+
+
+def test_a_users_object():
+    law = load_base(named("car_following"), "highway")
+    assert load_base(named("car_following"), law) is law
+    with pytest.raises(ValueError, match=r"does not fit cut_in: sample.*must have shape \(1000, 6\)"):
+        load_base(named("cut_in"), law)
+    with pytest.raises(ValueError, match="Partial without log_prob, to_standard_normal, from_sta"):
+        load_base(named("car_following"), Partial())
+    with pytest.raises(ValueError, match="got int without sample"):
+        load_base(named("car_following"), 3)
+    assert load_base(named("car_following"), None).to_dict() == load_base(named("car_following"), "us101").to_dict()

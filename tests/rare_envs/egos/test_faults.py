@@ -1,0 +1,159 @@
+"""Scenarios on which an ego raises, stops, or gives NaN or a wrong shape are found, and no others lost."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import rare_envs
+import samplers
+from rare_envs.egos.faults import EgoFault, EgoGone, FaultTolerant
+
+ENV = "rare_envs/CarFollowing-v0"
+GAP = 30.0
+"""Starts in front of less than this are those on which the egos below fail."""
+
+
+class Coasting:
+    """Fails where a scenario begins with a short gap, however the batch is made up."""
+
+    def __init__(self, fail: Any = None, memory: bool = False) -> None:
+        self.fail = fail
+        self.memory = memory
+
+    def predict(self, observation: Any, state: Any, episode_start: Any, deterministic: bool) -> Any:
+        actions = np.zeros((len(observation), 2), np.float32)
+        short = (observation[:, 3] * 50.0 < GAP) & bool(episode_start[0])
+        return (self.fail(actions, short) if self.fail and short.any() else actions), (1 if self.memory else None)
+
+
+def raises(actions: Any, short: Any) -> Any:
+    raise RuntimeError("no\nroad")
+
+
+def stops(actions: Any, short: Any) -> Any:
+    raise SystemExit(7)
+
+
+def gives_nan(actions: Any, short: Any) -> Any:
+    actions[short] = np.nan
+    return actions
+
+
+FAILING = {
+    "raises": (raises, "RuntimeError: no road"),
+    "ends the program": (stops, "SystemExit(7)"),
+    "gives NaN": (gives_nan, "NaN or infinite actions"),
+    "gives infinity": (lambda actions, short: np.where(short[:, None], np.inf, actions), "NaN or infinite actions"),
+    "gives the wrong shape": (lambda actions, short: actions[:, :1], "Expected actions of shape"),
+    "gives too few actions": (lambda actions, short: actions[~short], "Expected actions of shape"),
+    "gives words": (lambda actions, short: np.full(actions.shape, "left"), "TypeError"),
+    "gives nothing": (lambda actions, short: None, "TypeError"),
+}
+
+
+@pytest.fixture(scope="module")
+def x() -> np.ndarray:
+    points = rare_envs.DrivingProblem(ENV).base.sample(60, np.random.default_rng(3))
+    points[:, 2] = np.where(np.arange(60) % 13 == 4, 25.0, 60.0 + np.arange(60) / 2)
+    return points
+
+
+def problem(ego: Any) -> rare_envs.DrivingProblem:
+    return rare_envs.DrivingProblem(ENV, ego=ego, horizon=1.0)
+
+
+@pytest.mark.parametrize("memory", [False, True])
+@pytest.mark.parametrize("how", FAILING)
+def test_only_scenarios_on_which_the_ego_fails_are_lost(how: str, memory: bool, x: np.ndarray) -> None:
+    fail, reason = FAILING[how]
+    tolerant = FaultTolerant(problem(Coasting(fail, memory)))
+    f = tolerant.evaluate(x)
+    bad = x[:, 2] < GAP
+    np.testing.assert_array_equal(np.isnan(f), bad)
+    np.testing.assert_array_equal(f[~bad], problem(Coasting()).evaluate(x)[~bad])
+    np.testing.assert_array_equal([fault.x for fault in tolerant.faults], x[bad])
+    assert tolerant.n_retried < (5 if memory else 2) * len(x)
+    assert all(reason in fault.reason and "\n" not in fault.reason for fault in tolerant.faults)
+
+
+def test_to_raise_names_the_scenario_and_the_reason(x: np.ndarray) -> None:
+    with pytest.raises(EgoFault, match=r"failed twice on x = \[.*25\..*\]: RuntimeError: no road"):
+        FaultTolerant(problem(Coasting(raises)), "raise").evaluate(x)
+    with pytest.raises(ValueError, match="Expected on_error 'raise', 'failure', 'bound', got 'bonud'"):
+        FaultTolerant(problem(Coasting()), "bonud")
+
+
+@pytest.mark.parametrize("on_error", ["raise", "bound"])
+def test_a_fault_that_passes_costs_nothing_but_time(on_error: str, x: np.ndarray) -> None:
+    calls: list[int] = []
+
+    def once(actions: Any, short: Any) -> Any:
+        calls.append(1)
+        if len(calls) == 1:
+            raise OSError("busy")
+        return actions
+
+    tolerant = FaultTolerant(problem(Coasting(once)), on_error)
+    np.testing.assert_array_equal(tolerant.evaluate(x), problem(Coasting()).evaluate(x))
+    assert not tolerant.faults
+    assert len(calls) > 1
+
+
+def test_nobody_is_asked_again_once_the_ego_is_gone(x: np.ndarray) -> None:
+    calls = []
+
+    def gone(actions: Any, short: Any) -> Any:
+        calls.append(1)
+        raise EgoGone("not there")
+
+    with pytest.raises(EgoGone):
+        FaultTolerant(problem(Coasting(gone)), "bound").evaluate(x)
+    assert len(calls) == 1
+    for tolerant in (problem(Coasting(gone)), FaultTolerant(problem(Coasting(gone)), "bound")):
+        with pytest.raises(EgoGone, match="not there"):
+            samplers.estimate(tolerant, samplers.MonteCarlo(), gamma=3.0, max_sim=300, seed=0, on_error="bound")
+    assert len(calls) == 3
+
+
+def test_faults_widen_the_interval_by_both_extremes() -> None:
+    """Counting by hand: collisions and faults of the same draws."""
+    settings = {"max_sim": 2000, "seed": 1, "gamma": 3.0}
+    good, bad = problem(Coasting()), Coasting(raises)
+    found = {}
+    for on_error in ("failure", "bound"):
+        tolerant = FaultTolerant(problem(bad), on_error)
+        found[on_error] = samplers.estimate(tolerant, samplers.MonteCarlo(), on_error=on_error, **settings)
+        lost = len(tolerant.faults)
+    x = good.base.sample(2000, np.random.default_rng(np.random.SeedSequence(1, spawn_key=(0,))))
+    plain = samplers.estimate(good, samplers.MonteCarlo(), **settings)
+    assert plain.p * 2000 == (good.evaluate(x) <= 3.0).sum()
+    short = x[:, 2] - 0.0 < GAP - 1e-3
+    either = ((good.evaluate(x) <= 3.0) | short).sum()
+    assert abs(lost - short.sum()) <= 2  # single precision decides at the edge
+    assert abs(found["failure"].p * 2000 - either) <= 2
+    assert found["bound"].interval[1] == found["failure"].interval[1]
+    assert found["bound"].interval[0] < found["failure"].interval[0]
+    assert f"{lost} simulations gave no outcome" in " ".join(found["bound"].warnings)
+
+
+def test_an_ego_that_fails_on_one_scenario_in_fifty_is_estimated_all_the_same() -> None:
+    rng = np.random.default_rng(0)
+
+    class Flaky(Coasting):
+        """Fails at random, so that trying again helps."""
+
+        def predict(self, observation: Any, *rest: Any, **more: Any) -> Any:
+            if rng.uniform() < 0.02:
+                raise RuntimeError("flaky")
+            return super().predict(observation, *rest, **more)
+
+    settings = {"max_sim": 200, "seed": 1, "gamma": 3.0}
+    tolerant = FaultTolerant(problem(Flaky()))
+    result = samplers.estimate(tolerant, samplers.MonteCarlo(), on_error="bound", **settings)
+    plain = samplers.estimate(problem(Coasting()), samplers.MonteCarlo(), **settings)
+    lost = len(tolerant.faults)
+    assert abs(result.p - plain.p) <= lost / 200
+    assert lost < 20

@@ -1,0 +1,245 @@
+"""Several agents: PettingZoo's conformance, agreement with the environment of one, crashes, and bad input."""
+
+import warnings
+from functools import partial
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import data_equivalence
+from pettingzoo.utils import parallel_to_aec
+
+import rare_envs
+from rare_envs.make import set_up
+from rare_envs.multi_agent.episode import gather, move
+from rare_envs.multi_agent.rewards import adversary_reward, own_reward
+
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")  # PettingZoo's test module imports what PettingZoo has deprecated
+    from pettingzoo.test import parallel_api_test, parallel_seed_test, render_test
+
+every = pytest.mark.parametrize("env_id", rare_envs.ENV_IDS)
+CUT_IN = "rare_envs/CutIn-v0"
+FOLLOWING = "rare_envs/CarFollowing-v0"
+
+
+@every
+@pytest.mark.parametrize("observation", ["features", "lidar"])
+def test_pettingzoo_api(env_id, observation):
+    parallel_api_test(rare_envs.parallel_env(env_id, observation=observation, horizon=3.0), num_cycles=60)
+
+
+@every
+def test_pettingzoo_seeds(env_id):
+    parallel_seed_test(partial(rare_envs.parallel_env, env_id, horizon=3.0), num_cycles=30)
+
+
+@every
+def test_pettingzoo_render(env_id, monkeypatch):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    render_test(lambda render_mode: parallel_to_aec(rare_envs.parallel_env(env_id, render_mode=render_mode)))
+
+
+@every
+@pytest.mark.parametrize("agents", [["ego"], None])
+def test_an_ego_alone_has_exactly_the_environment_of_one(env_id, agents):
+    """To the last bit, until the ego's end: whether the others may not act or do not."""
+    for kwargs in (
+        {"horizon": 4.0},
+        {"horizon": 1.0, "observation": "lidar", "drivers": "mgail"},
+        {"horizon": 4.0, "observation": "kinematics", "action": "meta"},
+    ):
+        one = gym.make(env_id, **kwargs)
+        several = rare_envs.parallel_env(env_id, agents=agents, **kwargs)
+        rng = np.random.default_rng(0)
+        for seed in range(2):
+            observation, info = one.reset(seed=seed)
+            observations, infos = several.reset(seed=seed)
+            assert data_equivalence((observation, info), (observations["ego"], infos["ego"]), exact=True)
+            done = False
+            while not done:
+                action = rng.uniform((-1.0, -0.2), (1.0, 0.2)).astype(np.float32)
+                if "action" in kwargs:
+                    action = int(rng.integers(5))
+                expected = one.step(action)
+                got = several.step({"ego": action})
+                assert data_equivalence(expected, tuple(each["ego"] for each in got), exact=True)
+                done = expected[2] or expected[3]
+            assert "ego" not in several.agents
+
+
+@pytest.mark.parametrize("env_id", [FOLLOWING, CUT_IN, "rare_envs/HardBrake-v0"])
+def test_nobody_acting_is_a_rollout_of_the_egos_driver(env_id):
+    problem = rare_envs.DrivingProblem(env_id)
+    x = problem.base.sample(2000, np.random.default_rng(0))
+    f = problem.evaluate(x)
+    env = rare_envs.parallel_env(env_id)
+    for row in np.argsort(f)[[0, 1, 50]]:
+        env.reset(options={"x": x[row]})
+        while "ego" in env.agents:
+            *_, infos = env.step({})
+        assert infos["ego"]["measure"] == f[row]
+
+
+@every
+def test_seeds_draw_the_scenario_that_they_draw_for_one(env_id):
+    one, several = gym.make(env_id), rare_envs.parallel_env(env_id)
+    for seed in (0, None, None, 3):  # without a seed the stream goes on
+        _, info = one.reset(seed=seed)
+        _, infos = several.reset(seed=seed)
+        assert all(np.array_equal(each["x"], info["x"]) for each in infos.values())
+    space = one.unwrapped.space
+    low, high = (bound[: space.sizes[0]] for bound in (space.low, space.high))
+    given = {space.names[0]: low + 0.6 * (high - low)}
+    _, infos = several.reset(seed=1, options=given)
+    np.testing.assert_array_equal(np.atleast_1d(infos["ego"]["scenario"][space.names[0]]), given[space.names[0]])
+
+
+def test_who_crashes_leaves_and_the_others_drive_on():
+    env = rare_envs.parallel_env(CUT_IN)
+    env.reset(options={"x": [20.0, 20.0, 20.0, 5.0, 60.0, 4.0]})
+    full, coast = np.array([1.0, 0.0], np.float32), np.zeros(2, np.float32)
+    # the cutter stays in its lane: the ego passes it and runs into the lead, which brakes
+    while {"ego", "lead"} <= set(env.agents):
+        actions = {"ego": full, "cutter": coast, "lead": -full}
+        _, rewards, terminated, truncated, infos = env.step(actions)
+    assert terminated == {"ego": True, "cutter": False, "lead": True}
+    assert not any(truncated.values())
+    assert env.agents == ["cutter"]
+    assert [infos[agent]["collision_type"] for agent in ("ego", "lead")] == ["rear_end", "rear_ended"]
+    assert infos["ego"]["crash"]["vehicles"] == infos["lead"]["crash"]["vehicles"] == [0, 2]  # the ego runs into it
+    assert rewards["ego"] < -20
+    assert rewards["lead"] < -20
+    assert rewards["cutter"] > 0
+    speed = env.state()[:, 3]
+    after, *_ = env.step({"cutter": coast})
+    assert set(after) == {"cutter"}
+    np.testing.assert_allclose(env.state()[:, 3], speed * [0.9, 1.0, 0.9], rtol=1e-5)  # wrecks lose a tenth per tick
+    with pytest.raises(ValueError, match="Expected actions of cutter only: 'ego' has left"):
+        env.step({"ego": full})
+    while env.agents:
+        *_, truncated, infos = env.step({"cutter": coast})
+    assert truncated == {"cutter": True}
+    assert infos["cutter"]["measure"] > 0
+    with pytest.raises(RuntimeError, match="no agent"):
+        env.step({})
+
+
+def test_a_vehicle_off_the_road_is_its_own_collision():
+    env = rare_envs.parallel_env(FOLLOWING)
+    env.reset(options={"x": [20.0, 20.0, 60.0]})
+    while "lead" in env.agents:
+        *_, infos = env.step({"lead": np.array([0.0, 1.0])})
+    assert infos["lead"]["collision_type"] == "road_edge"
+    assert not infos["ego"]["collision"]
+    assert env.agents == ["ego"]
+
+
+def test_rewards_are_those_of_an_ego_in_each_place():
+    """Car-following seen by the lead: nobody ahead, so no risk and no headway; its own speed and effort."""
+    env = rare_envs.parallel_env(FOLLOWING)
+    env.reset(options={"x": [20.0, 15.0, 14.5]})
+    _, rewards, *_, infos = env.step({"ego": np.array([0.5, 0.0]), "lead": np.array([-0.5, 0.0])})
+    terms = infos["lead"]["reward_terms"]
+    assert terms == pytest.approx(
+        {"progress": 14.75 / 21.72, "comfort": -0.025, "lane": 0, "risk": 0, "headway": 0, "collision": 0}, abs=1e-6
+    )
+    assert rewards["lead"] == pytest.approx(sum(terms.values()), abs=1e-6)
+    risk = -(1.0 - (14.0 / 5.5) / 4.0)  # closing at 20.25 - 14.75
+    assert infos["ego"]["reward_terms"]["risk"] == pytest.approx(risk, abs=1e-6)
+
+
+def test_the_adversarys_reward_by_hand():
+    env = rare_envs.parallel_env(FOLLOWING, agents=["lead"], rewards={"lead": adversary_reward})
+    env.reset(options={"x": [20.0, 15.0, 14.5]})
+    *_, infos = env.step({"lead": np.array([-1.0, 0.0])})
+    terms = infos["lead"]["reward_terms"]
+    speed = float(env.state()[0, 3])  # of the ego, which IDM brakes
+    assert terms["danger"] == pytest.approx(1.0 - 14.0 / (speed - 14.5) / 4.0, abs=1e-5)
+    assert terms["comfort"] == pytest.approx(-0.1)
+    assert (terms["collision"], terms["fault"]) == (0.0, 0.0)
+    env.reset(options={"x": [20.0, 15.0, 2.0]})
+    while env.agents:
+        *_, infos = env.step({"lead": np.array([-1.0, 0.0])})
+    assert (infos["lead"]["reward_terms"]["collision"], infos["lead"]["reward_terms"]["fault"]) == (30.0, 0.0)
+    env.reset(options={"x": [20.0, 20.0, 100.0]})
+    while env.agents:
+        *_, infos = env.step({"lead": np.array([0.0, 1.0])})
+    assert (infos["lead"]["reward_terms"]["collision"], infos["lead"]["reward_terms"]["fault"]) == (0.0, -30.0)
+
+
+def test_a_row_of_a_batch_is_the_episode_alone():
+    world, space = set_up(CUT_IN, horizon=5.0)
+    x = torch.from_numpy(space.sample(32, np.random.default_rng(0))).float()
+    rng = torch.Generator().manual_seed(0)
+    action = torch.rand(50, 32, 3, 2, generator=rng) * torch.tensor([8.0, 0.04]) - torch.tensor([4.0, 0.02])
+    commanded = torch.rand(50, 32, 3, generator=rng) < 0.5
+    together = gather(world, x)
+    alone = [gather(world, x[k : k + 1]) for k in range(4)]
+    for t in range(50):
+        together = move(world, together, action[t], commanded[t])
+        for k in range(4):
+            alone[k] = move(world, alone[k], action[t, k : k + 1], commanded[t, k : k + 1])
+            for view, own in zip(together.views, alone[k].views, strict=True):
+                assert torch.equal(view.f[k], own.f[0])
+                assert torch.equal(view.state.x[k], own.state.x[0])
+            assert torch.equal(together.wrecked[k], alone[k].wrecked[0])
+    assert together.wrecked.any()
+    assert not together.wrecked.all()
+
+
+def test_contacts_of_others_are_noted_and_change_nothing():
+    """A cutter much faster than the lead runs into it while the ego is far behind: as in the environment of one."""
+    world, _ = set_up(CUT_IN)
+    x = torch.tensor([[5.0, 40.0, 5.0, 60.0, 60.0, 2.2]])
+    crowd, episode = gather(world, x), world.start(x)
+    nobody = torch.zeros(1, 3, dtype=torch.bool)
+    for _ in range(60):
+        crowd = move(world, crowd, torch.zeros(1, 3, 2), nobody)
+        episode = world.step(episode, torch.zeros(1, 2))
+    assert crowd.collided.tolist() == [[False, True, True]]
+    assert not crowd.wrecked.any()
+    assert torch.equal(crowd.traffic.state.x, episode.state.x)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"agents": ["cuter"]}, r"no vehicle 'cuter' \(did you mean 'cutter'\?\); the vehicles are ego, cutter, lead"),
+        ({"agents": "ego"}, "agents as a list of names"),
+        ({"agents": []}, "one or more different agents"),
+        ({"agents": ["ego", "ego"]}, "one or more different agents"),
+        ({"rewards": {"leed": own_reward}}, r"Reward for 'leed' \(did you mean 'lead'"),
+        ({"rewards": {"lead": 3}}, "reward of 'lead' as a function"),
+        ({"render_mode": "ansi"}, "render_mode"),
+        ({"observation": "feature"}, "Unknown observation"),
+        ({"ego": "idn"}, "Unknown ego"),
+        ({"rewards": len}, "rewards as a mapping"),
+    ],
+)
+def test_bad_arguments(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        rare_envs.parallel_env(CUT_IN, **kwargs)
+
+
+def test_bad_actions_and_options():
+    with pytest.raises(ValueError, match="did you mean 'rare_envs/CutIn-v0'"):
+        rare_envs.parallel_env("rare_envs/CutInn-v0")
+    env = rare_envs.parallel_env(CUT_IN, agents=["ego", "cutter"])
+    with pytest.raises(RuntimeError, match="reset"):
+        env.step({})
+    with pytest.raises(ValueError, match="did you mean 'cut_in_gap'"):
+        env.reset(options={"cut_in_gab": 9.0})
+    env.reset(seed=0)
+    for actions, message in (
+        ({"eggo": np.zeros(2)}, r"no agent 'eggo' \(did you mean 'ego'\?\); the agents are ego, cutter"),
+        ({"lead": np.zeros(2)}, "no agent 'lead'"),
+        ({"cutter": np.zeros(3)}, r"shape \(2,\) for 'cutter', got \(3,\)"),
+        ({"ego": np.array([np.nan, 0.0])}, "NaN"),
+        ([np.zeros(2)], "actions as a mapping of agents to actions, got list"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            env.step(actions)
+    observations, *_ = env.step({"ego": np.zeros(2), "cutter": None})
+    assert set(observations) == {"ego", "cutter"}

@@ -1,0 +1,291 @@
+"""Highway: its parameters, its drivers as part of x, and the agreement of environment and rollout."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+
+import agents
+import rare_envs
+import samplers
+from rare_envs.control.idm import IDM
+from rare_envs.distributions.beta import BetaLaw
+from rare_envs.distributions.product import NoiseLaw, Product
+from rare_envs.measures import TTC_MAX, Moment, lidar_ttc
+from rare_envs.scenarios.highway import LANES
+from rare_envs.sensors.perception import look
+from rare_envs.simulation.background import Minds, begin, decide, fixed_draws
+from rare_envs.simulation.rollout import drive
+from rare_envs.traffic.road import i80
+
+HIGHWAY = "rare_envs/Highway-v0"
+SHORT = {"horizon": 2.0}
+
+
+def draw(problem, n, seed=0):
+    return problem.base.sample(n, np.random.default_rng(seed))
+
+
+def test_parameters_are_the_papers_then_weights_and_noise():
+    space = rare_envs.DrivingProblem(HIGHWAY).space
+    assert space.names == ("s", "t", "heading", "speed", "weights", "noise")
+    assert space.sizes == (6, 6, 6, 6, 404, (2 + 100) * 5 * 2)
+    assert rare_envs.DrivingProblem(HIGHWAY, noise="fixed").dim == 428
+    assert rare_envs.DrivingProblem(HIGHWAY, noise=False).dim == 428
+    x = space.columns(space.sample(4000, np.random.default_rng(0)))
+    for name, low, width in (("s", 80, 40), ("t", -0.25, 0.5), ("heading", -3.6, 7.2), ("speed", 10, 10)):
+        assert stats.kstest(((x[name] - low) / width).ravel(), stats.beta(2, 2).cdf).pvalue > 1e-3
+
+
+def test_the_ego_starts_in_the_third_lane_and_everybody_has_one():
+    problem = rare_envs.DrivingProblem(HIGHWAY, noise=False)
+    state = problem.world.start(torch.from_numpy(draw(problem, 50))).state
+    assert sorted(LANES) == list(range(6))
+    lanes = i80().lane_of(state.y)
+    assert (lanes == torch.tensor(LANES)).all()
+    assert lanes[0, 0] == 2
+    assert state.heading.abs().max() <= np.deg2rad(3.6)
+
+
+def test_to_standard_normal_and_back():
+    space = rare_envs.DrivingProblem(HIGHWAY, **SHORT).space
+    x = space.sample(50, np.random.default_rng(0))
+    np.testing.assert_allclose(space.from_standard_normal(space.to_standard_normal(x)), x, atol=1e-9)
+    far = space.from_standard_normal(6.0 * np.sign(space.to_standard_normal(x)))
+    space.validate(far)
+    np.testing.assert_allclose(space.to_standard_normal(far)[:, :24], 6.0 * np.sign(far[:, :24] - x[:, :24]), rtol=1e-6)
+
+
+def test_cross_entropy_finds_the_blocks():
+    """24 Beta, 404 Normal in the box, and noise that stays: 428 and more dimensions."""
+    from samplers.methods.cross_entropy.blocks import announced_blocks
+
+    problem = rare_envs.DrivingProblem(HIGHWAY, measure="lidar_ttc", **SHORT)
+    blocks = announced_blocks(problem)
+    assert [block.dim for block in blocks.blocks] == [24, 404, problem.space.sizes[-1]]
+    x = draw(problem, 200)
+    weights = np.tile(np.arange(1, 201) / (200 * 201 / 2), (3, 1))
+    moved = blocks.moved(x, weights, 0.8)
+    change = moved.blocks[1].law.mean - blocks.blocks[1].law.mean
+    assert 0 < np.abs(change).max() <= 0.01 + 1e-12
+    assert moved.blocks[2] is blocks.blocks[2]
+    method = samplers.CrossEntropy(family="blocks", n_iteration=100, max_iterations=2, n_final=100)
+    result = samplers.estimate(problem, method, gamma=0.6, seed=0)
+    assert result.n_sim == 300
+
+
+def test_environment_and_rollout_agree_and_x_replays():
+    problem = rare_envs.DrivingProblem(HIGHWAY, measure="lidar_ttc", **SHORT)
+    x = draw(problem, 4)
+    f = problem.evaluate(x)
+    env = gym.make(HIGHWAY, measure="lidar_ttc", **SHORT).unwrapped
+    for row in range(4):
+        env.reset(options={"x": x[row]})
+        done = False
+        while not done:
+            episode = env._episode
+            env._episode = env.world.step(episode, IDM().act(episode, None)[0])
+            env._tick += 1
+            done = bool(env._episode.collided) or env._tick == env.world.ticks
+        assert float(env._episode.f) == pytest.approx(f[row], abs=1e-3)  # products round differently by batch size
+
+
+def test_named_parameters_in_and_out():
+    env = gym.make(HIGHWAY, **SHORT)
+    _, info = env.reset(seed=1, options={"speed": [12, 13, 14, 15, 16, 17]})
+    assert info["scenario"]["speed"].tolist() == [12, 13, 14, 15, 16, 17]
+    assert info["scenario"]["weights"].shape == (404,)
+    with pytest.raises(ValueError, match=r"speed\[2\] = 25.* is outside its range \[10, 20\] m/s"):
+        env.reset(options={"speed": [12, 13, 25, 15, 16, 17]})
+    with pytest.raises(ValueError, match=r"Expected speed of shape \(6,\)"):
+        env.reset(options={"speed": 12.0})
+
+
+def test_noise_and_weights_matter_and_nothing_else_is_random():
+    problem = rare_envs.DrivingProblem(HIGHWAY, measure="lidar_ttc", **SHORT)
+    x = draw(problem, 32)
+    f = problem.evaluate(x)
+    np.testing.assert_array_equal(problem.evaluate(x), f)
+    for name in ("weights", "noise"):
+        other = x.copy()
+        at = problem.space._slices[problem.space.names.index(name)]
+        other[:, at] = draw(problem, 32, seed=1)[:, at]
+        assert np.mean(problem.evaluate(other) != f) > 0.5
+
+
+def test_fixed_noise_is_one_sequence_and_no_noise_is_none():
+    drivers = agents.load_driver("mgail")
+    features = torch.randn(3, 5, 51)
+    draws = fixed_draws(7, 5)
+    torch.testing.assert_close(draws, fixed_draws(7, 5))
+    quiet = begin(drivers, torch.zeros(3, 0), torch.zeros(3, 0, 5, 2))
+    torch.testing.assert_close(decide(drivers, quiet, features)[0], drivers.act(features)[0])
+    noisy = begin(drivers, torch.zeros(3, 0), draws.expand(3, -1, -1, -1).float())
+    action, after = decide(drivers, noisy, features)
+    memory = drivers.begin(draws[:, :2].movedim(1, -1).expand(3, -1, -1, -1).float())
+    expected, _ = drivers.act(features, None, draws[:, 2].expand(3, -1, -1).float(), memory)
+    torch.testing.assert_close(action, expected)
+    assert isinstance(after, Minds)
+    assert after.tick.tolist() == [1, 1, 1]
+
+
+def test_rows_of_a_batch_may_be_at_different_ticks():
+    """As after an episode of a vector environment was replaced."""
+    drivers = agents.load_driver("mgail")
+    draws = torch.randn(2, 6, 5, 2)
+    minds = begin(drivers, torch.zeros(2, 0), draws)
+    features = torch.randn(2, 5, 51)
+    _, later = decide(drivers, minds, features)
+    mixed = Minds(*(torch.stack((a[0], b[1])) for a, b in zip(minds, later, strict=True)))
+    action, _ = decide(drivers, mixed, features)
+    torch.testing.assert_close(action[0], decide(drivers, minds, features)[0][0], rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(action[1], decide(drivers, later, features)[0][1], rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("env_id", [env_id for env_id in rare_envs.ENV_IDS if env_id != HIGHWAY])
+def test_learned_drivers_in_the_scripted_scenarios(env_id):
+    problem = rare_envs.DrivingProblem(env_id, drivers="mgail", **SHORT)
+    vehicles = problem.world.scenario.vehicles - 1
+    own = 3 if vehicles == 1 else 6
+    assert problem.dim == own + 404 + 22 * vehicles * 2
+    x = draw(problem, 64)
+    f = problem.evaluate(x)
+    assert np.isfinite(f).all()
+    scripted = rare_envs.DrivingProblem(env_id, **SHORT)
+    assert (scripted.evaluate(x[:, :own]) != f).any()
+    last = list(drive(problem.world, problem.driver, torch.from_numpy(x).float()))[-1]
+    assert last.state.y[:, 1:].abs().max() <= 5.0  # across, they stay on the scenario's path
+
+
+def test_drivers_by_rule_have_neither_weights_nor_noise():
+    for noise in (True, "fixed", False):
+        problem = rare_envs.DrivingProblem(HIGHWAY, drivers="idm", noise=noise)
+        assert problem.dim == 24
+    x = draw(problem, 64)
+    last = list(drive(problem.world, problem.driver, torch.from_numpy(x)))[-1]
+    road = problem.world.scenario.road
+    # they keep the lanes that they started in, on the curve too
+    torch.testing.assert_close(road.lane_of(last.state.y), torch.tensor(LANES).expand(64, -1))
+    assert (last.state.y - road.centre_of(last.state.y)).abs().max() < 0.1
+
+
+def test_a_learned_ego_looks():
+    ego = agents.LearnedEgo(agents.load_driver("mgail"))
+    problem = rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego=ego, **SHORT)
+    assert problem.world.sees
+    assert np.isfinite(problem.evaluate(draw(problem, 16))).all()
+
+
+@pytest.mark.parametrize("name", ["mgail", "idm"])
+def test_drivers_are_no_egos(name):
+    with pytest.raises(ValueError, match=r"agents\.LearnedEgo"):
+        rare_envs.DrivingProblem(HIGHWAY, ego=agents.load_driver(name))
+
+
+def test_lidar_observation():
+    env = gym.make("rare_envs/CarFollowing-v0", observation="lidar")
+    observation, _ = env.reset(options={"x": [20.0, 15.0, 30.0]})
+    assert observation.shape == (51,)
+    ahead = 11 + 9
+    assert observation[ahead] == pytest.approx(32.5 / 100)  # from the ego's middle
+    assert observation[ahead + 20] == pytest.approx(-5.0 / 10)
+    assert env.step(env.action_space.sample())[0] in env.observation_space
+
+
+def test_lidar_ttc_on_paper():
+    world = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", measure="lidar_ttc").world
+    episode = world.start(torch.tensor([[20.0, 15.0, 30.0], [15.0, 20.0, 30.0]]))
+    assert episode.f.tolist() == pytest.approx([32.5 / 5.0, TTC_MAX])
+    moment = Moment(episode.state, episode.lead, episode.road, look(episode.state, episode.road))
+    torch.testing.assert_close(lidar_ttc(moment), episode.f)
+
+
+def test_lidar_ttc_ends_before_the_collision():
+    problem = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", measure="lidar_ttc", ego=Asleep())
+    f = problem.evaluate(np.array([[30.0, 10.0, 20.0]]))
+    assert 0.0 < f[0] < 0.3
+    assert problem_with_ttc().evaluate(np.array([[30.0, 10.0, 20.0]]))[0] == -1.0
+
+
+class Asleep:
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        return np.zeros((len(observation), 2)), None
+
+
+def problem_with_ttc():
+    return rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", ego=Asleep())
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"drivers": "mgial"}, "did you mean 'mgail'"),
+        ({"drivers": 3}, "Expected drivers by name"),
+        ({"noise": "some"}, "noise True, False or 'fixed'"),
+        ({"dt": 0.2}, "dt = 0.1"),
+        ({"base": "us101"}, "neither one of okelly2018"),
+    ],
+)
+def test_wrong_arguments_are_refused(kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        gym.make(HIGHWAY, **kwargs)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        (
+            "measur",
+            r"Highway-v0 takes no .* 'measur' \(did you mean 'measure'\?\); it takes observation,",
+        ),
+        ("speed", r"'speed' \(reset takes it as an option\)"),
+        ("wheels", r"'wheels'; it takes"),
+    ],
+)
+def test_unknown_arguments_are_named_with_the_environment(name, message):
+    for make in (gym.make, rare_envs.DrivingProblem):
+        with pytest.raises(TypeError, match=message):
+            make(HIGHWAY, **{name: 1})
+
+
+def test_an_ego_by_name_is_told_where_names_become_egos():
+    with pytest.raises(ValueError, match=r"agents\.load_ego\('mgail'\)"):
+        rare_envs.DrivingProblem(HIGHWAY, ego="mgail")
+
+
+def test_beta_law_against_scipy():
+    law = BetaLaw([2.0, 5.0], [2.0, 1.5], [80.0, -1.0], [120.0, 1.0])
+    x = law.sample(2000, np.random.default_rng(0))
+    marginals = [stats.beta(2, 2, 80, 40), stats.beta(5, 1.5, -1, 2)]
+    np.testing.assert_allclose(law.log_prob(x), sum(m.logpdf(x[:, j]) for j, m in enumerate(marginals)))
+    for j, marginal in enumerate(marginals):
+        assert stats.kstest(x[:, j], marginal.cdf).pvalue > 1e-3
+        np.testing.assert_allclose(law.to_standard_normal(x)[:, j], stats.norm.ppf(marginal.cdf(x[:, j])), atol=1e-6)
+    assert law.log_prob(np.array([[79.0, 0.0]])) == -np.inf
+    u = np.random.default_rng(1).standard_normal((1000, 2)) * 1.5
+    np.testing.assert_allclose(law.to_standard_normal(law.from_standard_normal(u)), u, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"alpha": [0.0, 2.0]}, "positive alpha"),
+        ({"high": [80.0, 1.0]}, "low < high"),
+        ({"low": [80.0]}, "one shape"),
+    ],
+)
+def test_beta_laws_that_are_none(change, message):
+    law = {"alpha": [2.0, 2.0], "beta": [2.0, 2.0], "low": [80.0, -1.0], "high": [120.0, 1.0]}
+    with pytest.raises(ValueError, match=message):
+        BetaLaw.from_dict({**law, **change})
+    with pytest.raises(ValueError, match="no alpha, beta"):
+        BetaLaw.from_dict({"low": [0.0], "high": [1.0]})
+
+
+def test_product_of_blocks():
+    law = Product((BetaLaw([2.0], [3.0], [0.0], [1.0]), NoiseLaw(2)))
+    x = law.sample(500, np.random.default_rng(0))
+    expected = stats.beta(2, 3).logpdf(x[:, 0]) + stats.norm.logpdf(x[:, 1:]).sum(axis=1)
+    np.testing.assert_allclose(law.log_prob(x), expected)
+    np.testing.assert_allclose(law.from_standard_normal(law.to_standard_normal(x)), x, atol=1e-9)

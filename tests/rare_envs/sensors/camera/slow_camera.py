@@ -1,0 +1,209 @@
+"""A camera the slow way, pixel by pixel in plain Python and NumPy, by other formulas than the batched one.
+
+Bodies are cut face by face (a plane, then a rectangle in it); shadows are convex polygons on the ground; the road's
+coordinates come from the nearest of many points of its line; what covers a pixel's footprint is counted on many points.
+Only constants, colours above all, are taken from the package.
+"""
+
+import itertools
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rare_envs.sensors.camera import Camera
+from rare_envs.sensors.camera import ground as g
+from rare_envs.sensors.camera import light as li
+from rare_envs.sensors.camera import vehicles as b
+from rare_envs.sensors.camera.pinhole import SIGHT
+from rare_envs.traffic.road import Road
+from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
+
+Array = NDArray[np.float64]
+Place = tuple[float, float, float]
+STEP = 0.25
+"""Between points of a curved road's line [m]; the nearest place is interpolated between them."""
+
+
+class SlowRoad:
+    """Road coordinates by search among points; the line itself is the integral of its curvature."""
+
+    def __init__(self, road: Road) -> None:
+        self.road = road
+        if road.curve is not None:
+            s = np.arange(0.0, 2500.0, STEP)
+            fine = np.linspace(0.0, 2500.0, 20 * len(s))
+            knots = np.arange(len(road.curve.curvature)) * road.curve.spacing
+            bend = np.interp(fine, knots, road.curve.curvature, right=0.0)
+            ds = fine[1] - fine[0]
+            heading = np.concatenate(([0.0], np.cumsum((bend[1:] + bend[:-1]) / 2 * ds)))
+            slopes = np.cos(heading), np.sin(heading)
+            line = [np.concatenate(([0.0], np.cumsum((w[1:] + w[:-1]) / 2 * ds))) for w in slopes]
+            self.s, self.x, self.y, self.heading = s, *(np.interp(s, fine, w) for w in (*line, heading))
+
+    def coordinates(self, x: float, y: float) -> tuple[float, float]:
+        """s and t of a point of the world."""
+        if self.road.curve is None:
+            return x, y
+        i = int(np.argmin((self.x - x) ** 2 + (self.y - y) ** 2))
+        cos, sin = math.cos(self.heading[i]), math.sin(self.heading[i])
+        dx, dy = x - self.x[i], y - self.y[i]
+        return self.s[i] + dx * cos + dy * sin, dy * cos - dx * sin
+
+    def world(self, s: float, t: float, heading: float) -> tuple[float, float, float]:
+        """Place and heading in the world."""
+        if self.road.curve is None:
+            return s, t, heading
+        x, y, turn = (float(np.interp(s, self.s, w)) for w in (self.x, self.y, self.heading))
+        return x - t * math.sin(turn), y + t * math.cos(turn), turn + heading
+
+
+def picture(
+    vehicles: Array, road: Road, camera: Camera, fog: float, elevation: float, azimuth: float, seen_from: int = 0
+) -> Array:
+    """Colours from 0 to 255, not rounded, shape (H, W, 3).
+
+    Args:
+        vehicles: s, t and heading of each in the road, shape (N, 3).
+        road: The road.
+        camera: The camera.
+        fog: [1/m].
+        elevation: Of the sun [rad].
+        azimuth: Of the sun, from the world's X axis to the right [rad].
+        seen_from: Which vehicle has the camera.
+    """
+    slow = SlowRoad(road)
+    placed = [slow.world(*vehicle) for vehicle in vehicles]
+    x, y, heading = placed[seen_from]
+    eye = np.array((x + camera.mount_ahead * math.cos(heading), y + camera.mount_ahead * math.sin(heading), 0.0))
+    eye += camera.mount_right * np.array((-math.sin(heading), math.cos(heading), 0.0))
+    eye[2] = camera.mount_height
+    heading += camera.yaw
+    ahead, up = np.array((math.cos(heading), math.sin(heading), 0.0)), np.array((0.0, 0.0, 1.0))
+    right = np.array((-math.sin(heading), math.cos(heading), 0.0))
+    axis = math.cos(camera.pitch) * ahead - math.sin(camera.pitch) * up
+    below = -math.sin(camera.pitch) * ahead - math.cos(camera.pitch) * up
+    level = math.cos(elevation)
+    sun = np.array((level * math.cos(azimuth), level * math.sin(azimuth), math.sin(elevation)))
+    scene = Scene(slow, placed, seen_from, fog, sun)
+    half_width = math.tan(camera.field_of_view / 2)
+    image = np.zeros((camera.height, camera.width, 3))
+
+    def ray(row: float, column: float) -> Array:
+        size = 2 * half_width / camera.width
+        way: Array = axis + (column - camera.width / 2) * size * right + (row - camera.height / 2) * size * below
+        return way
+
+    for row, column in itertools.product(range(camera.height), range(camera.width)):
+        image[row, column] = scene.colour(eye, ray, row, column)
+    return 255 * np.clip(image, 0, 1)
+
+
+class Scene:
+    """What rays meet."""
+
+    def __init__(self, road: SlowRoad, placed: list[Place], own: int, fog: float, sun: Array) -> None:
+        self.road, self.placed, self.own, self.fog, self.sun = road, placed, own, fog, sun
+        through = math.exp(-fog * li.FOG_DEPTH / sun[2])
+        self.direct = li.DIRECT * through
+        self.diffuse = li.DIFFUSE + (li.DIRECT - self.direct) * sun[2] / 2
+        self.air = np.array(li.AIR) * (0.6 + 0.4 * sun[2])
+        self.shadows = [shadow(*place, sun) for place in placed]
+
+    def colour(self, eye: Array, ray, row: int, column: int) -> Array:  # type: ignore[no-untyped-def]
+        way = ray(row + 0.5, column + 0.5)
+        way = way / np.linalg.norm(way)
+        nearest, colour = math.inf, np.zeros(3)
+        for number, (x, y, heading) in enumerate(self.placed):
+            if number == self.own:
+                continue
+            for normal, centre, spans in faces(x, y, heading):
+                slope = normal @ way
+                if slope >= 0.0:  # seen from behind
+                    continue
+                distance = normal @ (centre - eye) / slope
+                point = eye + distance * way
+                inside = all(abs(direction @ (point - centre)) <= half for direction, half in spans)
+                if inside and 0.0 < distance < nearest:
+                    nearest = distance
+                    pane = abs(normal[2]) < 0.5 and b.WINDOWS[0] < point[2] < b.WINDOWS[1]
+                    paint = b.GLASS if pane else b.PAINT[(number - 1) % len(b.PAINT)]
+                    colour = np.array(paint) * (self.diffuse + self.direct * max(0.0, normal @ self.sun))
+        if nearest < math.inf:
+            return self.seen(colour, nearest)
+        level = math.hypot(way[0], way[1])
+        if way[2] < 0.0 and eye[2] / -way[2] * level <= SIGHT:
+            return self.ground(eye, ray, row, column)
+        steep = min(max(way[2] / li.STEEP, 0.0), 1.0)
+        blue = (np.array(li.HORIZON) * (1 - steep) + np.array(li.ZENITH) * steep) * (0.6 + 0.4 * self.sun[2])
+        glow = max(0.0, way @ self.sun) ** li.GLOW * self.direct / li.DIRECT
+        depth = min(li.SKY_PATH, li.FOG_DEPTH / way[2]) if way[2] > 0 else li.SKY_PATH
+        return self.seen(blue * (1 - glow) + np.array(li.SUN) * glow, depth)
+
+    def seen(self, colour: Array, distance: float) -> Array:
+        """Through the air."""
+        left = math.exp(-self.fog * distance)
+        return colour * left + self.air * (1.0 - left)
+
+    def ground(self, eye: Array, ray, row: int, column: int) -> Array:  # type: ignore[no-untyped-def]
+        def meet(r: float, c: float) -> Array:
+            way = ray(r, c)
+            point: Array = eye - way * eye[2] / way[2]
+            return point
+
+        middle = meet(row + 0.5, column + 0.5)
+        s, t = self.road.coordinates(*middle[:2])
+        h = 1e-3
+        across, along = 0.0, 0.0
+        for dr, dc in ((h, 0.0), (0.0, h)):
+            far = self.road.coordinates(*meet(row + 0.5 + dr, column + 0.5 + dc)[:2])
+            near = self.road.coordinates(*meet(row + 0.5 - dr, column + 0.5 - dc)[:2])
+            across += abs(far[1] - near[1]) / (2 * h)
+            along = abs(far[0] - near[0]) / (2 * h) if dr else along
+        left, *inner, right = self.road.road.edges
+        places = t + across * (np.arange(4000) + 0.5 - 2000) / 4000
+
+        def part(edge: float) -> float:
+            return float((np.abs(places - edge) < g.LINE_WIDTH / 2).mean())
+
+        ways = s + along * (np.arange(4000) + 0.5 - 2000) / 4000
+        dash = float((ways % g.PERIOD < g.DASH).mean())
+        road = float(((places > left - g.LINE_WIDTH / 2) & (places < right + g.LINE_WIDTH / 2)).mean())
+        white, yellow = sum(map(part, inner)) * dash + part(right), part(left)
+        colour = np.array(g.VERGE) * (1 - road) + np.array(g.ASPHALT) * (road - white - yellow)
+        colour = colour + white * np.array(g.WHITE) + yellow * np.array(g.YELLOW)
+        dark = any(within(polygon, middle[:2]) for polygon in self.shadows)
+        light = self.diffuse + (0.0 if dark else self.direct * self.sun[2])
+        return self.seen(colour * light, float(np.linalg.norm(middle - eye)))
+
+
+def faces(x: float, y: float, heading: float):  # type: ignore[no-untyped-def]
+    """Outward normal, centre and two half extents of the five faces of a body that can be seen."""
+    along, up = np.array((math.cos(heading), math.sin(heading), 0.0)), np.array((0.0, 0.0, 1.0))
+    across = np.array((-math.sin(heading), math.cos(heading), 0.0))
+    middle = np.array((x, y, b.HEIGHT / 2))
+    halves = ((along, VEHICLE_LENGTH / 2), (across, VEHICLE_WIDTH / 2), (up, b.HEIGHT / 2))
+    for k, (direction, half) in enumerate(halves):
+        for sign in (1.0, -1.0):
+            yield sign * direction, middle + sign * half * direction, halves[:k] + halves[k + 1 :]
+
+
+def shadow(x: float, y: float, heading: float, sun: Array) -> Array:
+    """The convex polygon on the ground that a body keeps the sun from, shape (K, 2), counter-clockwise."""
+    from scipy.spatial import ConvexHull
+
+    cos, sin = math.cos(heading), math.sin(heading)
+    points = []
+    for along, across, up in itertools.product((0.5, -0.5), (0.5, -0.5), (0.0, b.HEIGHT)):
+        dx, dy = along * VEHICLE_LENGTH, across * VEHICLE_WIDTH
+        corner = np.array((x + dx * cos - dy * sin, y + dx * sin + dy * cos))
+        points.append(corner - sun[:2] / sun[2] * up)
+    hull = np.array(points)
+    return hull[ConvexHull(hull).vertices]
+
+
+def within(polygon: Array, point: Array) -> bool:
+    """Whether a point is in a convex polygon: to the left of all its sides."""
+    sides = np.roll(polygon, -1, axis=0) - polygon
+    to = point - polygon
+    return bool((sides[:, 0] * to[:, 1] - sides[:, 1] * to[:, 0] >= 0.0).all())

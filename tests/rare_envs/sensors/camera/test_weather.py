@@ -1,0 +1,226 @@
+"""Weather: its laws, what it does to pictures, and that all of it is in x."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from scipy import stats
+from torch import Tensor
+
+import rare_envs
+import samplers
+from rare_envs.distributions.product import beside
+from rare_envs.make import space_of
+from rare_envs.scenarios.base_distributions import load_base
+from rare_envs.scenarios.registry import find_scenario
+from rare_envs.sensors.camera import Camera, Sight, Weather, take_picture
+from rare_envs.sensors.camera.sensor_noise import grain
+from rare_envs.sensors.camera.weather import CONDITIONS, FOG_LAW, SENSOR_NOISE, SENSOR_NOISE_LAW, SUN_LAW
+from rare_envs.simulation.world import World
+from rare_envs.traffic.road import straight
+from rare_envs.traffic.state import State
+
+CUT_IN, HIGHWAY = "rare_envs/CutIn-v0", "rare_envs/Highway-v0"
+LAWS = [FOG_LAW, SUN_LAW, SENSOR_NOISE_LAW]
+VISIBILITY = 2.996
+"""Visibility times extinction coefficient: 5 % of the contrast is left (WMO's meteorological optical range)."""
+
+
+def shots(**sky: Any) -> Tensor:
+    """A car 25 m ahead in pictures of different weather, shape (B, H, W, 3), in floating point."""
+    usual = {"fog": 1.5e-4, "sun_elevation": 0.8, "sun_azimuth": 2.0, "noise": 0.0, "key": 0}
+    batch = len(next(iter(sky.values())))
+    columns = {name: torch.as_tensor(sky.get(name, [value] * batch)) for name, value in usual.items()}
+    x = torch.tensor([[0.0, 25.0]]).repeat(batch, 1)
+    state = State(x, torch.zeros_like(x), torch.zeros_like(x), torch.zeros_like(x), x[:, :0])
+    weather = Weather(**{name: column.long() if name == "key" else column.float() for name, column in columns.items()})
+    return take_picture(state, straight(3), Sight.at_start(Camera(), weather)).float()
+
+
+def test_fog_hides_what_is_far_first() -> None:
+    images = shots(fog=[1e-5, 0.003, 0.01, 0.03, 0.1])
+    car = (images[:, 22:26, 95:105] - images[:, 10:14, 95:105]).abs().mean(dim=(1, 2, 3))  # against the sky
+    line = images[:, 55:, :].std(dim=(1, 2)).amax(dim=1)
+    assert (car.diff() < 0).all()
+    assert car[-1] < 0.15 * car[0]  # exp(-0.1 x 22)
+    assert line[-1] > 0.3 * line[0]  # the line 5 m ahead is still there
+
+
+def test_contrast_is_lost_as_koschmieder_says() -> None:
+    """Contrast of a dark car against the air falls with exp(-fog x distance)."""
+    fog = torch.tensor([0.02, 0.04])
+    images = shots(fog=fog, sun_azimuth=[0.0, 0.0])  # the rear is in the shade
+    air = images[:, 15, 100]
+    contrast = (images[:, 27, 100] / air - 1.0)[:, 0]
+    way = 25.0 - 2.5 - Camera().mount_ahead
+    diffuse = 0.45 + 0.5 * 0.65 * math.sin(0.8) * (1.0 - torch.exp(-fog * 100.0 / math.sin(0.8)))
+    inherent = 0.62 * diffuse / (0.80 * (0.6 + 0.4 * math.sin(0.8))) - 1.0  # the first car's red against the air
+    torch.testing.assert_close(contrast, inherent * torch.exp(-fog * way), atol=0.02, rtol=0.0)
+
+
+def test_low_sun_makes_long_shadows_away_from_it() -> None:
+    """Counted in pixels of the ground beside the car that are darker than with the sun on the other side."""
+    for elevation, pixels in ((0.15, 25), (1.3, 5)):  # 10 m and 0.4 m long
+        sides = shots(sun_elevation=[elevation] * 2, sun_azimuth=[math.pi / 2, -math.pi / 2])[:, 29, :, 0]
+        on_right, on_left = sides[1] - sides[0] > 5.0, sides[0] - sides[1] > 5.0
+        shadows = on_right[:90].sum(), on_left[110:].sum()
+        assert (min(shadows) > pixels) if elevation < 1.0 else (max(shadows) < pixels)
+        assert not on_right[110:].any() and not on_left[:90].any()
+
+
+def test_the_side_that_faces_the_sun_is_brighter() -> None:
+    behind, ahead = shots(sun_azimuth=[math.pi, 0.0], sun_elevation=[0.4, 0.4])
+    assert (behind[27, 95:105] > 1.4 * ahead[27, 95:105]).all()  # the rear of the car
+    assert (ahead[:10].mean(dim=(0, 1)) > behind[:10].mean(dim=(0, 1))).all()  # the sky around the sun
+
+
+def test_noise_is_as_strong_as_it_says_and_grows_with_it() -> None:
+    clean, *noisy = shots(noise=[0.0, 2.0, 8.0], key=[5, 5, 5])
+    for level, image in zip((2.0, 8.0), noisy, strict=True):
+        difference = (image - clean)[clean.clamp(40, 215) == clean]
+        assert float(difference.std()) == pytest.approx(math.hypot(level, math.sqrt(1 / 12)), rel=0.03)
+        assert abs(float(difference.mean())) < 0.1
+
+
+def test_noise_is_white_and_nearly_normal() -> None:
+    n, keys = 3 * 66 * 200, torch.tensor([0, 1, 2**30, 1065353216, 1065353217])
+    sight = Sight.at_start(Camera(), Weather(*torch.zeros(4, 5), keys))
+    for values in (grain(sight, n), grain(sight._replace(tick=sight.tick + 1), n), grain(sight._replace(viewer=3), n)):
+        assert values.mean(dim=1).abs().max() < 5 / math.sqrt(n)
+        assert (values.var(dim=1) - 1).abs().max() < 5 * math.sqrt(2 / n)
+        for lag in (1, 3, 600, 66 * 200):  # along rows, channels and columns
+            together = (values[:, lag:] * values[:, :-lag]).mean(dim=1)
+            assert together.abs().max() < 5 / math.sqrt(n - lag)
+    pairs = torch.cat(
+        [grain(sight, n), grain(sight._replace(tick=sight.tick + 1), n), grain(sight._replace(viewer=1), n)]
+    )
+    across = torch.corrcoef(pairs) - torch.eye(len(pairs))
+    assert across.abs().max() < 5 / math.sqrt(n)
+    inside = (pairs[0].abs() < 1.0).float().mean()
+    assert float(inside) == pytest.approx(0.6827, abs=0.02)  # of a normal law
+
+
+@pytest.mark.parametrize("law", LAWS, ids=["fog", "sun", "noise"])
+def test_laws_and_their_maps(law: Any) -> None:
+    rng = np.random.default_rng(0)
+    x = law.sample(4000, rng)
+    u = law.to_standard_normal(x)
+    np.testing.assert_allclose(law.from_standard_normal(u), x, rtol=1e-6)
+    for column in u.T:
+        assert stats.kstest(column, "norm").pvalue > 1e-3
+    # density: that of u times the derivative of the map
+    h = 1e-6 * np.abs(x).clip(1e-6)
+    slopes = (law.to_standard_normal(x + h) - law.to_standard_normal(x - h)) / (2 * h)
+    expected = (stats.norm.logpdf(u) + np.log(slopes)).sum(axis=1)
+    inner = (np.abs(u) < 3).all(axis=1)
+    np.testing.assert_allclose(law.log_prob(x)[inner], expected[inner], atol=1e-3)
+
+
+def test_fog_is_as_frequent_as_said() -> None:
+    extinction = VISIBILITY / np.array([[16_000.0], [1_000.0]])
+    above = stats.norm.sf(FOG_LAW.to_standard_normal(extinction)[:, 0])
+    np.testing.assert_allclose(above, [0.5, 0.01], rtol=0.1)
+
+
+def test_sun_elevations_are_those_of_a_year_of_days() -> None:
+    """From the Sun's declination and hour angle at 37.84 degrees north (Emeryville), above 5 degrees."""
+    day, hour = np.meshgrid(np.arange(365), np.linspace(-180, 180, 720))
+    declination = np.radians(-23.44 * np.cos(2 * np.pi * (day + 10) / 365))
+    latitude = np.radians(37.84)
+    sine = np.sin(latitude) * np.sin(declination)
+    sine = sine + np.cos(latitude) * np.cos(declination) * np.cos(np.radians(hour))
+    elevation = np.degrees(np.arcsin(sine))
+    elevation = elevation[elevation > 5.0]
+    levels = np.array([0.1, 0.25, 0.5, 0.75, 0.9])
+    law = SUN_LAW.from_standard_normal(np.column_stack((stats.norm.ppf(levels), np.zeros(5))))
+    np.testing.assert_allclose(law[:, 0], np.quantile(elevation, levels), atol=1.5)
+    assert elevation.max() < CONDITIONS[1].high
+
+
+def test_a_search_by_blocks_moves_the_weather() -> None:
+    """Cross-entropy in physical space finds fog and low sun; p is known."""
+
+    class FoggyEvening:
+        dim = 3
+        base = beside(FOG_LAW, SUN_LAW)
+
+        def evaluate(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+            u = self.base.to_standard_normal(x)
+            return np.asarray(3.5 - (u[:, 0] - u[:, 1]) / math.sqrt(2.0))
+
+    method = samplers.CrossEntropy(family="blocks", n_iteration=1000, n_final=4000)
+    result = samplers.estimate(FoggyEvening(), method, gamma=0.0, seed=1)
+    assert result.p == pytest.approx(stats.norm.sf(3.5), rel=4 * result.cov)
+    assert result.cov < 0.15
+    assert result.interval[0] < stats.norm.sf(3.5) < result.interval[1]
+
+
+@pytest.mark.parametrize(
+    ("noise", "names"), [(True, ["sensor_noise", "camera_noise"]), ("fixed", ["sensor_noise"]), (False, [])]
+)
+def test_weather_joins_x_behind_the_scenario(noise: bool | str, names: list[str]) -> None:
+    problem = rare_envs.DrivingProblem(CUT_IN, weather=True, noise=noise)
+    own = rare_envs.DrivingProblem(CUT_IN).space.names
+    assert problem.space.names == (*own, *(p.name for p in CONDITIONS), *names)
+    assert ("fixed pattern" in problem.given) == (noise == "fixed")
+
+
+def test_on_the_highway_weather_stands_before_the_drivers_and_all_noise_behind() -> None:
+    problem = rare_envs.DrivingProblem(HIGHWAY, weather=True, observation="camera")
+    conditions = [p.name for p in (*CONDITIONS, SENSOR_NOISE)]
+    assert list(problem.space.names)[4:] == [*conditions, "weights", "noise", "camera_noise"]
+    x = problem.base.sample(2, np.random.default_rng(0))
+    parts = problem.space.columns(x)
+    without = rare_envs.DrivingProblem(HIGHWAY)
+    same = np.column_stack([parts[name] for name in without.space.names])
+    np.testing.assert_array_equal(problem.evaluate(x), without.evaluate(same))  # an ego that does not look at it
+    episode = problem.world.start(torch.from_numpy(x).float())
+    assert episode.sight is not None
+    np.testing.assert_allclose(episode.sight.weather.fog, parts["fog"], rtol=1e-6)
+    np.testing.assert_allclose(torch.rad2deg(episode.sight.weather.sun_azimuth), parts["sun_azimuth"], rtol=1e-6)
+    np.testing.assert_allclose(episode.sight.weather.noise, parts["sensor_noise"], rtol=1e-6)
+
+
+def test_a_scenario_with_fog_of_its_own_has_to_rename_it() -> None:
+    scenario = find_scenario(CUT_IN)
+    first = replace(scenario.parameters[0], name="fog")
+    foggy = replace(scenario, parameters=(first, *scenario.parameters[1:]))
+    base = load_base(scenario, None)
+    assert "fog" in space_of(World(foggy), base).names
+    with pytest.raises(ValueError, match="fog"):
+        space_of(World(foggy, weather=True), base)
+
+
+def test_weather_is_a_reset_option() -> None:
+    env = gym.make(CUT_IN, observation="camera", weather=True)
+    clear, _ = env.reset(seed=0, options={"fog": 1e-4, "sensor_noise": 0.0})
+    foggy, info = env.reset(seed=0, options={"fog": 0.1, "sensor_noise": 0.0})
+    assert info["scenario"]["fog"] == 0.1
+    assert foggy.std() < 0.5 * clear.std()
+    with pytest.raises(ValueError, match="fog"):
+        env.reset(options={"fog": 1.0})
+    with pytest.raises(ValueError, match="weather"):
+        gym.make(CUT_IN, weather="foggy")
+
+
+def test_noise_follows_from_its_column_and_the_tick_alone() -> None:
+    env = gym.make(CUT_IN, observation="camera", weather=True)
+    first, info = env.reset(seed=3, options={"sensor_noise": 8.0})
+    x = info["x"]
+    again, _ = env.reset(options={"x": x})
+    np.testing.assert_array_equal(first, again)
+    other = x.copy()
+    other[-1] += 0.1  # camera_noise
+    different, _ = env.reset(options={"x": other})
+    assert (different != first).mean() > 0.8
+    assert abs(different.astype(float) - first).max() < 80
+    fixed = gym.make(CUT_IN, observation="camera", weather=True, noise="fixed")
+    image, _ = fixed.reset(options={"x": x[:-1]})
+    same, _ = fixed.reset(seed=9, options={"x": x[:-1]})
+    np.testing.assert_array_equal(image, same)
+    assert (image != first).mean() > 0.8

@@ -1,0 +1,127 @@
+"""Commands to vehicles around the ego, contacts of any two vehicles, and what any vehicle observes."""
+
+import numpy as np
+import pytest
+import torch
+
+import rare_envs
+from rare_envs.make import set_up
+from rare_envs.sensors.perception import look
+from rare_envs.simulation.observation import observe
+from rare_envs.traffic.overlap import ego_overlaps, overlaps
+from rare_envs.traffic.state import State
+
+every = pytest.mark.parametrize("env_id", rare_envs.ENV_IDS)
+
+
+def start(env_id, n=4, **kwargs):
+    world, space = set_up(env_id, **kwargs)
+    x = torch.from_numpy(space.sample(n, np.random.default_rng(0))).float()
+    return world, world.start(x)
+
+
+def ego_action(n):
+    return torch.tensor([[1.0, 0.002]]).expand(n, 2)
+
+
+@every
+@torch.inference_mode()
+def test_nobody_commanded_is_as_without_commands(env_id):
+    world, episode = start(env_id, horizon=2.0)
+    alone = episode
+    batch, n = episode.state.x.shape
+    action = torch.full((batch, n, 2), 3.0)
+    action[:, 0] = ego_action(batch)
+    for _ in range(world.ticks):
+        alone = world.step(alone, ego_action(batch))
+        episode = world.step(episode, action, torch.zeros(batch, n, dtype=torch.bool))
+        for one, other in zip(alone.state, episode.state, strict=True):
+            assert torch.equal(one, other)
+        assert torch.equal(alone.f, episode.f)
+
+
+@every
+@torch.inference_mode()
+def test_a_commanded_vehicle_moves_as_an_ego_in_its_place_would(env_id):
+    world, episode = start(env_id, horizon=2.0, drivers="idm")
+    batch, n = episode.state.x.shape
+    for vehicle in range(1, n):
+        swapped = episode._replace(state=episode.state.seen_by(vehicle), minds=None)
+        led, commanded = episode, torch.zeros(batch, n, dtype=torch.bool)
+        commanded[:, vehicle] = True
+        action = torch.zeros(batch, n, 2)
+        action[:, vehicle] = ego_action(batch)
+        for _ in range(5):
+            led = world.step(led, action, commanded)
+            swapped = world.step(swapped, ego_action(batch))
+        for one, other in zip(led.state[:4], swapped.state[:4], strict=True):
+            torch.testing.assert_close(one[:, vehicle], other[:, 0], rtol=1e-6, atol=1e-5)
+        others = [j for j in range(1, n) if j != vehicle]  # have not strayed
+        assert not led.strayed[:, others].any()
+
+
+@torch.inference_mode()
+def test_a_commanded_lead_brakes_as_in_the_textbook():
+    world, _ = start("rare_envs/CarFollowing-v0")
+    episode = world.start(torch.tensor([[20.0, 20.0, 50.0]]))
+    action = torch.tensor([[[0.0, 0.0], [-4.0, 0.0]]])
+    for _ in range(30):
+        episode = world.step(episode, action, torch.tensor([[False, True]]))
+    t, dt = 3.0, world.dt
+    assert float(episode.state.speed[0, 1]) == pytest.approx(20.0 - 4.0 * t, abs=1e-4)
+    # explicit Euler moves with the old speed: half a tick of the acceleration more than v t - a t^2 / 2
+    way = 20.0 * t - 2.0 * t**2 + 4.0 * t * dt / 2
+    assert float(episode.state.x[0, 1]) == pytest.approx(55.0 + way, abs=1e-3)
+    assert float(episode.lead.gap) == pytest.approx(50.0 + way - 60.0, abs=1e-3)
+
+
+@every
+@pytest.mark.parametrize("drivers", [None, "mgail"])
+@torch.inference_mode()
+def test_a_vehicle_that_is_commanded_no_longer_goes_on_from_where_it_is(env_id, drivers):
+    world, episode = start(env_id, horizon=4.0, drivers=drivers, noise=False)
+    batch, n = episode.state.x.shape
+    action = torch.zeros(batch, n, 2)
+    action[:, 1:] = torch.tensor([-1.0, 0.01])
+    for tick in range(world.ticks):
+        before = episode.state
+        commanded = torch.full((batch, n), tick < 10)
+        episode = world.step(episode, action, commanded) if tick < 20 else world.step(episode, action[:, 0])
+        moved = torch.hypot(episode.state.x - before.x, episode.state.y - before.y)
+        assert (moved <= before.speed * world.dt * 1.05 + 1e-3).all()  # the I-80 is longer on its outer lanes
+        assert ((episode.state.speed - before.speed).abs() <= 1.0).all()
+
+
+def test_contacts_of_all_pairs_are_those_of_each_vehicle_as_ego():
+    rng = np.random.default_rng(0)
+    world, _ = start("rare_envs/Highway-v0", n=1, noise=False)
+    fields = [rng.uniform(low, high, (500, 6)) for low, high in ((0, 25), (0, 12), (-0.5, 0.5), (0, 20))]
+    state = State(*map(torch.from_numpy, fields), theta=torch.zeros(500, 0))
+    both = overlaps(state, world.scenario.road)
+    assert torch.equal(both, both.mT)
+    assert not both.diagonal(dim1=1, dim2=2).any()
+    assert 0.05 < both.double().mean() < 0.5
+    assert torch.equal(both[:, 0, 1:], ego_overlaps(state, world.scenario.road))
+    for vehicle in range(1, 6):
+        others = [j for j in range(6) if j != vehicle]
+        expected = ego_overlaps(state.seen_by(vehicle), world.scenario.road)
+        assert torch.equal(both[:, vehicle][:, others], expected)
+
+
+def test_what_the_cutter_observes_by_hand():
+    world, _ = start("rare_envs/CutIn-v0", n=1)
+    episode = world.start(torch.tensor([[20.0, 15.0, 18.0, 10.0, 30.0, 3.6]]))
+    ego, lead = [-20 / 50, 5 / 10, -3.6 / 4, 0.0], [30 / 50, 3 / 10, -3.6 / 4, 0.0]
+    seen = observe(episode, "features", vehicle=1)[0]
+    np.testing.assert_allclose(seen, [15 / 30, 3.6 / 4, 0.0, *ego, *lead], rtol=1e-6, atol=1e-7)
+
+
+@every
+def test_every_vehicle_observes_what_an_ego_in_its_place_would(env_id):
+    world, episode = start(env_id, observation="lidar", horizon=1.0)
+    for vehicle in range(world.scenario.vehicles):
+        state = episode.state.seen_by(vehicle)
+        looking = look(state, world.scenario.road)
+        as_ego = episode._replace(state=state, perception=looking)
+        for observation in ("features", "lidar"):
+            torch.testing.assert_close(observe(episode, observation, vehicle), observe(as_ego, observation))

@@ -1,0 +1,116 @@
+"""Bases under which crashes are common or do not happen, so that a small run shows both."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from rare_envs.scenarios.registry import named
+from rare_envs.study.cli.app import app
+
+EGOS = """
+import sys
+
+import numpy as np
+from gymnasium.spaces import Box
+
+class Ego:
+    observation_space = action_space = None
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        return self.choose(observation), state
+
+def coasting():
+    ego = Ego()
+    ego.choose = lambda observation: np.zeros((len(observation), 2), np.float32)
+    return ego
+
+def nan_actions():
+    ego = Ego()
+    ego.choose = lambda observation: np.full((len(observation), 2), np.nan)
+    return ego
+
+def nan_when_close():
+    ego = Ego()
+    ego.choose = lambda observation: np.where(observation[:, 3:4] < 0.1, np.nan, 0.0) * np.ones(2)
+    return ego
+
+def exiting():
+    sys.exit(7)
+
+def exiting_when_asked():
+    ego = Ego()
+    ego.choose = lambda observation: sys.exit(7)
+    return ego
+
+def exiting_when_close():
+    ego = Ego()
+    ego.choose = lambda observation: sys.exit(7) if observation[:, 3].min() < 0.1 else np.zeros((len(observation), 2))
+    return ego
+
+def array():
+    return np.zeros(2)
+
+def raising():
+    ego = Ego()
+    ego.choose = lambda observation: 1 / 0
+    return ego
+
+def wrong_space():
+    ego = coasting()
+    ego.observation_space = Box(-1.0, 1.0, (99,))
+    return ego
+
+def wrong_shape():
+    ego = Ego()
+    ego.choose = lambda observation: np.zeros((len(observation), 5))
+    return ego
+"""
+
+
+def write_base(path: Path, gap: float) -> Path:
+    """A base for car-following at 20 m/s behind 10 m/s with gaps around the one given."""
+    parameters = named("car_following").parameters
+    spread = [[4.0, 0.0, 0.0], [0.0, 4.0, 0.0], [0.0, 0.0, 25.0]]
+    base = {
+        "names": [p.name for p in parameters],
+        "low": [p.low for p in parameters],
+        "high": [p.high for p in parameters],
+        "weights": [1.0],
+        "means": [[20.0, 10.0, gap]],
+        "covariances": [spread],
+    }
+    path.write_text(json.dumps(base))
+    return path
+
+
+@pytest.fixture
+def risky(tmp_path: Path) -> str:
+    """Gaps around 30 m: about one scenario in thirty ends in a collision."""
+    return str(write_base(tmp_path / "risky.json", gap=30.0))
+
+
+@pytest.fixture
+def safe(tmp_path: Path) -> str:
+    return str(write_base(tmp_path / "safe.json", gap=100.0))
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A working directory with egos of the user's own (`egos_here`) and damaged files."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "egos_here.py").write_text(EGOS)
+    (tmp_path / "corrupt.zip").write_bytes(b"PK\x03\x04 this was a model once")
+    (tmp_path / "broken.json").write_text('{"names": [')
+    (tmp_path / "a_file").write_text("mine")
+    return tmp_path
+
+
+@pytest.fixture
+def cli() -> Callable[..., Result]:
+    """Run the command line in this process."""
+    return lambda *words: CliRunner().invoke(app, [str(word) for word in words])

@@ -1,0 +1,372 @@
+"""check-ego: one broken ego for each rule, and none that ends the check."""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import Result
+
+import agents
+from agents.sb3.file_trust import doubts
+from rare_envs.study.ego_check.findings import Finding, exit_code
+from rare_envs.study.ego_check.subprocess_check import Asked, findings_of
+
+Cli = Callable[..., Result]
+ENV = "rare_envs/CarFollowing-v0"
+EGOS = """
+import os
+import time
+
+import numpy as np
+from gymnasium import spaces
+
+BOX = spaces.Box(-5.0, 5.0, (7,), np.float32)
+ACTS = spaces.Box(-1.0, 1.0, (2,), np.float32)
+CALLS = []
+
+
+def made(predict, observation_space=BOX, action_space=ACTS):
+    class Ego:
+        pass
+    ego = Ego()
+    ego.observation_space, ego.action_space = observation_space, action_space
+    ego.predict = lambda observation, state=None, episode_start=None, deterministic=True: predict(
+        observation, state, episode_start)
+    return ego
+
+
+def braking(observation, *_):
+    return np.stack((observation[:, 3] - 0.5, 0.0 * observation[:, 0]), axis=1), None
+
+
+def good():
+    return made(braking)
+
+def good_without_spaces():
+    return made(braking, None, None)
+
+def good_with_memory():
+    def predict(observation, state, start):
+        least = observation[:, 3] if state is None else np.minimum(observation[:, 3], np.where(start, np.inf, state))
+        return np.stack((least - 0.5, 0.0 * least), axis=1), least
+    return made(predict)
+
+def another_unit():
+    return made(braking, action_space=spaces.Box(-5.0, 5.0, (2,), np.float32))
+
+def another_shape():
+    return made(braking, spaces.Box(-5.0, 5.0, (8,), np.float32))
+
+def lies_about_actions():
+    return made(braking, action_space=spaces.Discrete(5))
+
+def lies_about_observations():
+    return made(lambda observation, *_: (observation @ np.ones((8, 2)), None))
+
+def short():
+    return made(lambda observation, *_: (braking(observation)[0][:-1], None))
+
+def nan():
+    return made(lambda observation, *_: (braking(observation)[0] * np.nan, None))
+
+def nan_at_zero():
+    return made(lambda observation, *_: (braking(observation)[0] / np.abs(observation).max(axis=1)[:, None], None))
+
+def constant():
+    return made(lambda observation, *_: (np.zeros((len(observation), 2)), None))
+
+def random():
+    return made(lambda observation, *_: (braking(observation)[0] + np.random.normal(size=(len(observation), 2)), None))
+
+def hidden_memory():
+    def predict(observation, *_):
+        action = braking(observation)[0] + (len(CALLS) and not np.array_equal(CALLS[-1], observation))
+        CALLS.append(observation)
+        return action, None
+    return made(predict)
+
+def looks_at_others():
+    return made(lambda observation, *_: (braking(observation - observation.mean(axis=0))[0], None))
+
+def looks_at_order():
+    return made(lambda observation, *_: (braking(observation)[0] + 0.01 * np.arange(len(observation))[:, None], None))
+
+def never_begins_anew():
+    def predict(observation, state, start):
+        total = observation[:, 3] + (0.0 if state is None else state)
+        return np.stack((total - 0.5, 0.0 * total), axis=1), total
+    return made(predict)
+
+def wild():
+    return made(lambda observation, *_: (np.full((len(observation), 2), 1.0) * np.sign(observation[:, 3:4]), None))
+
+def leaking():
+    def predict(observation, *_):
+        CALLS.append(np.ones(100_000))
+        return braking(observation)
+    return made(predict)
+
+def raising():
+    def predict(observation, *_):
+        raise RuntimeError("no weights")
+    return made(predict)
+
+def dying():
+    return made(lambda observation, *_: os._exit(9))
+
+def hanging():
+    return made(lambda observation, *_: time.sleep(100))
+
+def no_ego():
+    return 7
+"""
+
+
+@pytest.fixture
+def broken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """A module with egos of every kind; its name."""
+    monkeypatch.chdir(tmp_path)
+    name = f"broken_egos_{os.getpid()}_{abs(hash(str(tmp_path))) % 10**6}"
+    (tmp_path / f"{name}.py").write_text(EGOS)
+    return name
+
+
+def findings(ego: str) -> dict[str, Finding]:
+    return {each.check: each for each in findings_of(Asked(ego, ENV)) if isinstance(each, Finding)}
+
+
+@pytest.mark.parametrize(
+    ("ego", "check", "status", "found"),
+    [
+        ("good_without_spaces", "spaces", "warn", "no observation_space and action_space"),
+        ("another_unit", "action space", "warn", "from [-5.0, -5.0] to [5.0, 5.0]"),
+        ("another_shape", "loading", "fail", "expects observations"),
+        ("lies_about_actions", "actions", "fail", "says Discrete(5)"),
+        ("lies_about_observations", "acts", "fail", "ValueError"),
+        ("short", "actions", "fail", "shape (31, 2)"),
+        ("nan", "actions", "fail", "NaN or infinite for 32 of 32"),
+        ("nan_at_zero", "range", "fail", "zeros: NaN"),
+        ("constant", "actions", "warn", "the same for all"),
+        ("random", "determinism", "warn", "vary from call to call"),
+        ("hidden_memory", "determinism", "fail", "depend on earlier calls"),
+        ("looks_at_others", "size of the batch", "fail", "change with it"),
+        ("looks_at_order", "order of the batch", "fail", "change with it"),
+        ("never_begins_anew", "memory", "warn", "rows that begin an episode are off"),
+        ("wild", "driving", "warn", "collides in"),
+        ("leaking", "space", "warn", "MB more after 100 calls"),
+        ("raising", "acts", "fail", "RuntimeError: no weights"),
+        ("no_ego", "loading", "fail", "an object with predict, got int"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:invalid value encountered")
+@pytest.mark.filterwarnings("ignore:divide by zero")
+def test_each_rule_finds_the_ego_that_breaks_it(broken: str, ego: str, check: str, status: str, found: str) -> None:
+    result = findings(f"{broken}:{ego}")
+    assert result[check].status == status, result
+    assert found in result[check].found or (check == "acts" and result[check].found), result[check]
+    assert result[check].advice
+    assert exit_code(list(result.values())) in ((2,) if status == "fail" else (0, 2, 3))
+
+
+@pytest.mark.parametrize("ego", ["good", "good_with_memory"])
+def test_a_good_ego_passes(broken: str, ego: str) -> None:
+    result = findings(f"{broken}:{ego}")
+    assert {each.status for each in result.values()} == {"pass"}, result
+    assert {"memory", "determinism", "latency", "driving", "NaN", "space"} <= set(result)
+    assert exit_code(list(result.values())) == 0
+    assert ("none" in result["memory"].found) == (ego == "good")
+
+
+@pytest.mark.parametrize("ego", ["idm", "noisy:idm", "bc"])
+def test_egos_without_predict_are_driven_only(ego: str) -> None:
+    result = findings(ego)
+    assert result["driving"].status == "pass"
+    assert {each.status for each in result.values()} == {"pass"}
+
+
+@pytest.mark.parametrize("ego", ["dying", pytest.param("hanging", marks=pytest.mark.slow)])
+def test_the_check_outlives_the_ego(broken: str, ego: str, cli: Cli) -> None:
+    result = cli("check-ego", f"{broken}:{ego}", ENV, "--time-limit", 2, "--json")
+    answer = json.loads(result.stdout)
+    assert result.exit_code == 2
+    last = answer["findings"][-1]
+    assert (last["check"], last["status"]) == ("acts", "fail")
+    assert ("exit status 9" if ego == "dying" else "no end after 2 s") in last["found"]
+    assert "process:EGO" in last["advice"]
+
+
+LIARS = """
+import numpy as np
+from gymnasium import spaces
+
+class Base:
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        return np.zeros((len(observation), 2), np.float32), None
+
+def made(**more):
+    return lambda: type("Liar", (Base,), more)()
+
+def boom(self):
+    raise RuntimeError("boom")
+
+observes_words = made(observation_space="Box")
+observes_nothing = made(observation_space=spaces.Dict({}))
+space_raises = made(observation_space=property(boom))
+acts_in_pairs = made(action_space=spaces.MultiDiscrete([2, 2]))
+action_raises = made(action_space=property(boom))
+unsure = made(deterministic=property(boom))
+no_method = made(predict=7)
+three_results = made(predict=lambda self, *a, **k: (None, None, None))
+objects = made(predict=lambda self, o, **k: (np.full((len(o), 2), None), None))
+imaginary = made(predict=lambda self, o, **k: (np.full((len(o), 2), 1j), None))
+odd_statistics = made(get_vec_normalize_env=lambda self: 7)
+no_driver = made(in_world=property(boom))
+"""
+
+
+def test_an_ego_that_is_not_what_it_says_is_one_line_and_one_finding(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cli: Cli
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "liars_here.py").write_text(LIARS)
+    for name in [line.partition(" =")[0] for line in LIARS.splitlines() if " = made(" in line]:
+        ego = f"liars_here:{name}"
+        result = cli("estimate", ENV, "--ego", ego, "--method", "mc", "--max-sim", 5, "--horizon", 1)
+        assert (result.exit_code, result.stdout, result.stderr.count("\n")) == (2, "", 1), (name, result.output)
+        found = [each for each in findings_of(Asked(ego, ENV, horizon=1.0)) if isinstance(each, Finding)]
+        assert exit_code(found) == 2, (name, found)
+
+
+# --- where files come from ---------------------------------------------------------------------
+
+
+@pytest.fixture
+def saved(tmp_path: Path) -> Path:
+    from stable_baselines3 import PPO
+
+    import training
+
+    PPO("MlpPolicy", training.sb3_vec_env(ENV, 2), n_steps=8, batch_size=16, device="cpu").save(tmp_path / "ego.zip")
+    return tmp_path / "ego.zip"
+
+
+@pytest.mark.parametrize("what", ["file", "folder", "statistics"])
+def test_a_zip_that_others_can_write_to_is_refused_by_every_command(what: str, saved: Path, cli: Cli) -> None:
+    statistics = saved.with_name("vecnormalize.pkl")
+    if what == "statistics":
+        statistics.write_bytes(b"")
+    assert doubts(saved, statistics) == []
+    path = {"file": saved, "folder": saved.parent, "statistics": statistics}[what]
+    path.chmod(path.stat().st_mode | 0o002)
+    (doubt,) = doubts(saved, statistics)
+    refused = cli("check-ego", saved, ENV, "--json")
+    (finding,) = json.loads(refused.stdout)["findings"]
+    assert (refused.exit_code, finding["check"], finding["status"]) == (2, "origin", "fail")
+    assert finding["found"] == doubt
+    assert "writable by everybody" in doubt
+    commands: list[list[Any]] = [
+        ["estimate", ENV, "--ego", saved],
+        ["estimate", ENV, "--ego", f"noisy:{saved}?lag=1"],
+        ["compare", "idm", saved, ENV],
+        ["serve-ego", saved],
+        ["export-ego", saved, saved.with_suffix(".onnx")],
+    ]
+    for words in commands:
+        said = cli(*words)
+        assert (said.exit_code, said.stdout) == (2, "")
+        assert f"Will not open it: {doubt}; {finding['advice']}." in said.stderr
+    with pytest.raises(
+        ValueError, match=r"is writable by everybody.*copy it to a folder of your own.*code is in it runs"
+    ):
+        agents.load_ego(saved)
+
+
+def test_trust_opens_it_all_the_same(saved: Path, cli: Cli) -> None:
+    saved.chmod(0o666)
+    found = json.loads(cli("check-ego", saved, ENV, "--json", "--trust").stdout)["findings"]
+    assert [each["status"] for each in found[:2]] == ["warn", "pass"]
+    assert "writable by everybody" in found[0]["found"]
+    assert "whatever code is in it runs" in found[0]["advice"]
+    out = saved.parent / "run"
+    words = ("estimate", ENV, "--ego", saved, "--method", "mc", "--max-sim", 50, "--gamma", 9, "--out", out)
+    assert cli(*words, "--trust").exit_code in (0, 3)
+    assert "writable by everybody" in cli("replay", out).stderr
+    assert cli("replay", out, "--trust").exit_code in (0, 3)
+
+
+def test_where_everybody_may_add_files_ones_own_are_safe(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    saved.parent.chmod(0o1777)  # as /tmp is
+    assert doubts(saved) == []
+    if os.getuid() == 0:
+        os.chown(saved, 1234, -1)
+    monkeypatch.setattr("os.getuid", lambda: 4321)
+    assert "belongs to another user" in doubts(saved)[0]
+    saved.parent.chmod(0o755)  # a colleague's: nobody else can have put it there
+    assert doubts(saved) == []
+
+
+def test_a_remote_file_is_refused(cli: Cli) -> None:
+    refused = cli("check-ego", "https://example.org/ego.zip", ENV)
+    assert refused.exit_code == 2
+    assert "remote place" in refused.stdout
+
+
+def test_an_unknown_environment_is_one_line(cli: Cli) -> None:
+    refused = cli("check-ego", "idm", "rare_envs/CutIn-v1")
+    assert (refused.exit_code, refused.stdout) == (2, "")
+    assert "rare_envs/CutIn-v0" in refused.stderr
+
+
+# --- servers -----------------------------------------------------------------------------------
+
+
+def test_a_server_that_keeps_to_the_protocol_passes() -> None:
+    pytest.importorskip("zmq", reason="the extra remote is optional")
+    from agents.remote.server import EgoServer
+
+    class Good:
+        def predict(self, observation: Any, **_: Any) -> Any:
+            return np.stack((observation[:, 3] - 0.5, 0.0 * observation[:, 0]), axis=1), None
+
+    with EgoServer(Good(), "tcp://127.0.0.1:*") as server:
+        thread = threading.Thread(target=server.run)
+        thread.start()
+        try:
+            result = findings(f"{server.address}?timeout=20")
+            answer = server._answerer.answer
+
+            def forgetful(peer: bytes, frames: list[bytes]) -> list[bytes]:
+                """Answers a step that is not the next as if it were."""
+                from agents.remote import protocol as wire
+
+                content = answer(peer, frames)[0]
+                message = wire.unpack(content)
+                if message.get("code") == "session":
+                    return [wire.pack({"type": "action", "id": message["id"]})]
+                return [content]
+
+            server._answerer.answer = forgetful  # type: ignore[method-assign]
+            worse = findings(f"{server.address}?timeout=20")
+        finally:
+            server.stop()
+            thread.join()
+    assert {each.status for each in result.values()} == {"pass", "warn"}, result
+    assert result["handshake"].found == "protocol 1, 'ego'"
+    assert {"heartbeat", "two sessions", "cut short", "driving"} <= set(result)
+    assert worse["another step"].status == worse["no reset"].status == "fail"
+    nobody = findings(f"{server.address}?timeout=0.3&patience=0.3")
+    assert "is it running" in nobody["protocol"].advice
+
+
+@pytest.mark.parametrize(("option", "word"), [("--base", "nowhere"), ("--drivers", "nobody")])
+def test_it_is_tried_in_the_traffic_that_is_asked_for(cli: Cli, option: str, word: str) -> None:
+    findings = json.loads(cli("check-ego", "idm", ENV, option, word, "--json").stdout)["findings"]
+    assert findings[-1]["status"] == "fail"
+    assert word in findings[-1]["found"]

@@ -1,0 +1,265 @@
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from scipy import stats
+from scipy.special import ndtr, ndtri
+
+import samplers
+from samplers.analysis.curve import known_from
+from samplers.limit_states import half_space, parabola, plateau
+from samplers.sample import Layer, Sample
+from samplers.statistics.cluster_sums import unit_sums
+from samplers.statistics.intervals import clopper_pearson
+
+GRID = [-0.2, 0.0, 0.4, 1.0, 2.0, 3.0, 4.5]
+
+
+def run(method="mc", beta=2.0, seed=1, **options):
+    return samplers.estimate(half_space(2, beta).problem, method, seed=seed, **options)
+
+
+def sample(f, weights, units, n_units, **parts):
+    f = np.array(f, dtype=float)
+    x = np.zeros((np.count_nonzero(f <= 0), 1))
+    return Sample(f=f, weights=np.array(weights), units=np.array(units), n_units=n_units, x=x, **parts)
+
+
+@pytest.mark.parametrize("method", sorted(samplers.METHODS))
+@pytest.mark.parametrize("replicates", [1, 3])
+def test_it_rises_through_the_estimate_inside_its_band(method, replicates):
+    result = run(method, replicates=replicates, max_sim=6000)
+    curve = result.curve(GRID)
+    assert curve.p[1] == pytest.approx(result.p)
+    for values in (curve.p, curve.low, curve.high):
+        assert (np.diff(values) >= 0).all()
+    assert (0 <= curve.low).all()
+    assert (curve.low <= curve.p).all()
+    assert (curve.p <= curve.high).all()
+    assert (curve.high <= 1).all()
+    assert curve.cov[1] >= 0.99 * result.cov
+    assert curve.confidence == result.confidence
+    assert len(curve) == len(GRID)
+    if replicates == 1:  # the t interval of three runs may be wider
+        assert np.log(curve.high[1] / curve.low[1]) > 0.9 * np.log(result.interval[1] / result.interval[0])
+
+
+def test_one_threshold_of_plain_draws_has_the_exact_interval():
+    result = run(max_sim=3000)
+    curve = result.curve(0.0)
+    assert (curve.low[0], curve.high[0]) == result.interval
+    hits = np.count_nonzero(result.sample.f <= 0.7)
+    other = result.curve([0.7])
+    assert (other.low[0], other.high[0]) == clopper_pearson(hits, 3000, 0.95)
+    assert other.ess[0] == pytest.approx(hits)
+
+
+@pytest.mark.parametrize("method", ["adss", "ce"])
+def test_one_threshold_has_the_interval_of_the_estimate(method):
+    result = run(method, beta=3.5)
+    curve = result.curve([0.0])
+    assert (curve.low[0], curve.high[0]) == pytest.approx(result.interval, rel=0.01)
+
+
+def test_more_thresholds_make_a_wider_band_and_a_higher_confidence_too():
+    result = run("adss", beta=3.5)
+    one, many = result.curve([0.0]), result.curve(np.linspace(0, 4, 41))
+    assert many.low[0] < one.low[0] < one.high[0] < many.high[0]
+    surer = replace(result, confidence=0.99).curve([0.0])
+    assert surer.low[0] < one.low[0]
+
+
+def test_the_same_result_gives_the_same_band_in_any_order():
+    result = run("adss")
+    curve, again = result.curve(GRID), run("adss").curve(GRID)
+    np.testing.assert_array_equal(curve.high, again.high)
+    mixed = result.curve([*GRID[::-1], 0.0])
+    np.testing.assert_array_equal(mixed.gammas, [*GRID[::-1], 0.0])
+    np.testing.assert_array_equal(mixed.p, [*curve.p[::-1], curve.p[1]])
+    np.testing.assert_array_equal(mixed.low, [*curve.low[::-1], curve.low[1]])
+    assert run("adss", seed=2).curve(GRID).p[0] != curve.p[0]
+
+
+@pytest.mark.parametrize("method", ["ss", "adss"])
+def test_thresholds_passed_early_rest_on_all_points_of_their_level(method):
+    result = run(method, beta=3.5)
+    curve = result.curve([3.5, 5.0])  # level 0: 1000 plain draws
+    hits = np.round(curve.p * 1000)
+    np.testing.assert_allclose(curve.p * 1000, hits)
+    np.testing.assert_allclose(curve.ess, hits)
+    np.testing.assert_allclose(curve.cov, np.sqrt((1 - curve.p) / hits))
+    second = result.trace[0].gamma - 1e-9  # just inside level 1, which descends from 100 points
+    assert 40 < result.curve([second]).ess[0] <= 100
+
+
+@pytest.mark.parametrize("method", ["ss", "adss"])
+def test_layers_and_points_give_the_same_sums(method):
+    points = run(method, beta=3.5, replicates=2).sample
+    grid = np.sort(points.f)[::50]
+    sums = unit_sums(points, grid).p
+    np.testing.assert_allclose(sums, [points.weights[points.f <= g].sum() for g in grid])
+    np.testing.assert_allclose(unit_sums(replace(points, layers=()), grid).p, sums)
+
+
+def test_sums_of_units_by_hand():
+    found = unit_sums(sample([-1, 0, 0, 2], [0.1, 0.2, 0.05, 0.3], [0, 0, 1, 2], 10), np.array([-2.0, 0.0, 1.0, 3.0]))
+    np.testing.assert_allclose(found.p, [0, 0.35, 0.35, 0.65])
+    within = 0.3**2 + 0.05**2
+    np.testing.assert_allclose(found.second[1], [0, within, within, within])
+    assert found.second[3, 3] == pytest.approx(within + 0.3**2)
+    assert found.ess[1] == pytest.approx(0.35**2 / within)
+    assert found.cov[0] == np.inf
+    assert found.cov[3] == pytest.approx(math.sqrt((within + 0.09) / 0.65**2 - 0.1))
+    assert not found.counted[1:].any()
+
+
+def test_a_layer_counts_where_it_speaks():
+    first = Layer(f=np.array([0.5, 3.0]), weights=np.array([0.5, 0.5]), units=np.array([0, 1]), low=1.0)
+    second = Layer(f=np.array([0.2, 0.9]), weights=np.array([0.25, 0.25]), units=np.array([0, 0]), high=1.0)
+    both = sample([0.2, 0.9, 3.0], [0.25, 0.25, 0.5], [0, 0, 1], 2, layers=(first, second))
+    np.testing.assert_allclose(unit_sums(both, np.array([0.1, 0.2, 0.99, 1.0, 3.0])).p, [0, 0.25, 0.5, 0.5, 1])
+
+
+@pytest.mark.parametrize("method", ["mc", "ce", "adss"])
+def test_too_low_a_threshold_is_refused_with_what_is_known(method):
+    result = run(method, max_sim=3000)
+    start = known_from(result.sample, 0.0)
+    assert result.curve([start, 1.0]).ess[0] >= 4.99
+    with pytest.raises(ValueError, match=rf"-9\.0 is too low .* known from g = {start!r} on.*gamma=-9\.0"):
+        result.curve([0.0, -9.0])
+
+
+def test_gamma_itself_is_known_however_few_points_failed():
+    result = run(beta=3.0, max_sim=1000)
+    assert 0 < result.failures.total < 5
+    assert result.curve([0.0, 0.5]).p[0] == result.p
+
+
+def test_where_nothing_failed_the_thresholds_passed_are_known():
+    result = run(beta=6.0, max_sim=1000)
+    assert result.p == 0
+    with pytest.raises(ValueError, match="known from"):
+        result.curve([0.0])
+    assert result.curve([6.0]).p[0] == pytest.approx(0.5, abs=0.1)
+
+
+def test_where_everything_fails():
+    for method in ("mc", "adss", "ce"):
+        always = samplers.estimate(samplers.FunctionProblem(lambda x: -np.ones(len(x)), 1), method, seed=1)
+        curve = always.curve([-1.0, 0.0, 3.0])
+        np.testing.assert_allclose(curve.p, 1)
+        np.testing.assert_array_equal(curve.high, 1)
+        assert (curve.low > 0.99).all()
+        assert (curve.low < 1).all()
+
+
+@pytest.mark.parametrize("gammas", [[], [np.nan], [np.inf], [[0.0, 1.0]]])
+def test_thresholds_are_finite_numbers(gammas):
+    with pytest.raises(ValueError, match="finite thresholds"):
+        run(max_sim=100).curve(gammas)
+
+
+def test_a_method_without_weighted_points_has_no_curve():
+    with pytest.raises(ValueError, match="'mc' gave no weighted points"):
+        replace(run(max_sim=100), sample=None).curve([0.0])
+
+
+def test_points_without_an_outcome_are_not_in_the_lower_end_where_they_only_bound():
+    def f(x):
+        return np.where(x[:, 1] > 2.0, np.nan, 2.0 - x[:, 0])
+
+    problem = samplers.FunctionProblem(f, 2)
+    bound, counted = (
+        samplers.estimate(problem, "mc", seed=1, max_sim=5000, on_error=on_error) for on_error in ("bound", "failure")
+    )
+    curve, whole = bound.curve([0.0, 1.0]), counted.curve([0.0, 1.0])
+    np.testing.assert_array_equal(curve.p, whole.p)
+    np.testing.assert_array_equal(curve.high, whole.high)
+    assert (curve.low < whole.low).all()
+    assert bound.curve([0.0]).low[0] == pytest.approx(bound.interval[0])
+
+
+def test_it_goes_through_an_estimate_that_is_not_the_plain_sum():
+    """As control variates make it."""
+    result = run("ce", beta=3.0)
+    moved = replace(result, p=1.1 * result.p, cov=2 * result.cov)
+    curve, plain = moved.curve([-0.2, 0.0, 2.0]), result.curve([-0.2, 0.0, 2.0])
+    np.testing.assert_allclose(curve.p[:2], 1.1 * plain.p[:2])
+    assert curve.p[2] - plain.p[2] == pytest.approx(0.1 * result.p)
+    np.testing.assert_allclose(curve.cov, 2 * plain.cov, rtol=0.02)
+
+
+def test_what_it_says_of_itself():
+    curve = run("adss").curve(GRID)
+    data = json.loads(json.dumps(curve.to_dict(), allow_nan=False))
+    assert data["p"] == curve.p.tolist()
+    assert data["confidence"] == 0.95
+    text = str(curve)
+    assert len(text.splitlines()) == len(GRID) + 1
+    assert "95 % band" in text
+    axes = curve.plot(Figure().subplots())
+    assert axes.get_yscale() == "log"
+    assert len(axes.lines) == len(axes.collections) == 1
+
+
+PLATEAU_CAP = 0.5 + 3 * (3.5 - float(ndtri(0.6)))
+
+
+def half_space_truth(g):
+    return ndtr(g - 3.5)
+
+
+def parabola_truth(g):
+    return np.array([parabola(3.3 - value).p for value in g])
+
+
+def plateau_truth(g):
+    rising = ndtr((g - 0.5) / 3 - 3.5)
+    return np.select([g < 0.5, g < PLATEAU_CAP], [ndtr(-3.5), rising], 1.0)
+
+
+CASES = [
+    (half_space(2, 3.5), half_space_truth, np.linspace(-0.6, 5.5, 41)),
+    (parabola(), parabola_truth, np.linspace(-0.6, 5.5, 41)),
+    (plateau(), plateau_truth, np.array([0, 0.1, 0.5, *np.arange(1.0, 11.0), PLATEAU_CAP - 1e-6, PLATEAU_CAP, 12.0])),
+]
+IDS = [case[0].name for case in CASES]
+
+
+def runs_inside(method, case, runs, **options):
+    """How many bands hold the whole truth, at all thresholds known."""
+    reference, truth, grid = case
+    exact, inside = truth(grid), 0
+    for seed in range(runs):
+        result = samplers.estimate(reference.problem, method, seed=5000 + seed, **options)
+        known = grid >= known_from(result.sample, 0.0)
+        curve = result.curve(grid[known])
+        inside += bool(((curve.low <= exact[known]) & (exact[known] <= curve.high)).all())
+    return inside
+
+
+def options_of(method):
+    return {"max_sim": 20_000} if method == "mc" else {}
+
+
+@pytest.mark.parametrize("case", CASES, ids=IDS)
+@pytest.mark.parametrize("method", ["mc", "ce", "ss", "adss"])
+def test_the_band_holds_the_whole_truth(method, case):
+    runs = 15
+    assert runs_inside(method, case, runs, **options_of(method)) >= stats.binom.ppf(1e-3, runs, 0.9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES, ids=IDS)
+@pytest.mark.parametrize("method", ["mc", "ce", "ss", "adss"])
+def test_the_band_holds_the_whole_truth_in_nine_of_ten_runs(method, case):
+    runs = 200
+    assert runs_inside(method, case, runs, **options_of(method)) >= 0.9 * runs
+
+
+@pytest.mark.slow
+def test_the_band_of_replicates_holds_the_whole_truth():
+    assert runs_inside("adss", CASES[0], 100, replicates=5) >= 90

@@ -1,0 +1,148 @@
+"""Fresh draws from a fixed proposal: p, its spread, its interval and its doubts, against the formulas written out."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from samplers.importance.draws import Draws, bernstein_bound, doubts, interval_of
+from samplers.importance.sampling import defensive, draw_until, final_draws
+from samplers.limit_states import half_space
+from samplers.method import Goal
+from samplers.problem import FunctionProblem
+from samplers.proposals.gaussian import Gaussian
+from samplers.statistics.intervals import clopper_pearson
+
+
+def weighing(*weights, n=1000):
+    """n draws of which those with these weights fail."""
+    return Draws(n, np.zeros(len(weights)), np.log(weights))
+
+
+def equal(k, weight=0.01):
+    return weighing(*[weight] * k)
+
+
+def log_normal(p, cov, quantile):
+    half = quantile * math.sqrt(math.log(1 + cov**2))
+    return p * math.exp(-half), p * math.exp(half)
+
+
+def test_p_and_cov_by_hand():
+    draws = weighing(3.0, 1.0, n=8)
+    terms = np.array([3.0, 1.0, 0, 0, 0, 0, 0, 0])
+    assert draws.p == pytest.approx(terms.mean())
+    # the variance of a mean, and (largest term / n)^2
+    assert draws.cov == pytest.approx(math.sqrt(terms.var(ddof=1) / 8 + (3 / 8) ** 2) / terms.mean())
+    assert draws.ess == pytest.approx(16 / 10)
+
+
+def test_outcomes_at_gamma_fail_and_draws_join():
+    f, log_weights, x = np.array([2.0, 1.0, 0.0]), np.log([1.0, 2.0, 3.0]), np.arange(6.0).reshape(3, 2)
+    draws = Draws.weighted(f, log_weights, x, gamma=1.0)
+    np.testing.assert_array_equal(draws.x, x[1:])
+    both = draws.joined(draws)
+    assert (both.n, both.p) == (6, pytest.approx(5 / 3))
+    sample = both.sample
+    np.testing.assert_array_equal(sample.f, [1.0, 0.0, 1.0, 0.0, 2.0, 2.0])
+    np.testing.assert_allclose(sample.weights, np.array([2.0, 3.0, 2.0, 3.0, 1.0, 1.0]) / 6)
+    assert Draws(0, np.empty(0), np.empty(0)).joined(draws) is draws
+
+
+@pytest.mark.parametrize(("ess", "df"), [(201, math.inf), (200, 50.0), (40, 10.0)])
+def test_quantiles_are_of_as_many_degrees_as_a_quarter_of_the_failing_draws_are_worth(ess, df):
+    draws = equal(ess)
+    expected = log_normal(draws.p, draws.cov, stats.t.ppf(0.95, df))
+    assert interval_of(draws, 0.9, 10.0) == pytest.approx(expected)
+    wider = log_normal(draws.p, 0.5, stats.t.ppf(0.95, df))
+    assert interval_of(draws, 0.9, 10.0, cov=0.5) == pytest.approx((wider[0], wider[1]))
+
+
+def test_of_few_draws_the_upper_end_is_guaranteed():
+    few = equal(29)
+    low, high = interval_of(few, 0.95, 10.0)
+    assert low == pytest.approx(log_normal(few.p, few.cov, stats.t.ppf(0.975, 29 / 4))[0])
+    assert high == bernstein_bound(few, 0.95, 10.0)
+    assert interval_of(equal(31), 0.95, 10.0)[1] < bernstein_bound(equal(31), 0.95, 10.0)
+    tiny = equal(8)
+    assert interval_of(tiny, 0.95, 10.0)[0] == pytest.approx(log_normal(tiny.p, tiny.cov, stats.t.ppf(0.975, 3))[0])
+
+
+def test_without_a_failing_draw_and_without_weights_the_interval_is_the_binomial_one():
+    assert interval_of(weighing(), 0.95, 4.0) == (0.0, pytest.approx(4.0 * clopper_pearson(0, 1000, 0.95)[1]))
+    assert interval_of(weighing(n=5), 0.95, 10.0) == (0.0, 1.0)
+    assert interval_of(equal(7, weight=1.0), 0.95, 1.0) == clopper_pearson(7, 1000, 0.95)
+
+
+def test_bernstein_bound_is_that_of_the_theorem():
+    """Maurer and Pontil, theorem 4, for terms scaled to [0, 1], each end of the interval at half of 1 - confidence."""
+    terms = np.concatenate([[0.5, 2.0, 4.0], np.zeros(197)]) / 10.0
+    delta, n = 0.05, 200
+    theorem = (
+        terms.mean()
+        + math.sqrt(2 * terms.var(ddof=1) * math.log(2 / delta) / n)
+        + 7 * math.log(2 / delta) / (3 * (n - 1))
+    )
+    assert bernstein_bound(weighing(0.5, 2.0, 4.0, n=n), 0.9, 10.0) == pytest.approx(10.0 * theorem)
+    assert bernstein_bound(weighing(0.5, 2.0, 4.0, n=n), 0.9, 1e4) == 1.0
+
+
+def test_doubts_are_of_few_and_of_heavy_draws():
+    assert "worth 29" in doubts(equal(29))[0]
+    assert doubts(equal(31)) == []
+    others = [1.0] * 100
+    assert doubts(weighing(*others, 17.5)) == []  # 14.9 %
+    (doubt,) = doubts(weighing(*others, 17.8))  # 15.1 %
+    assert "One draw carries 15 %" in doubt
+    assert "None of 1,000 final draws failed" in doubts(weighing())[0]
+
+
+def test_final_draws_are_what_is_left_or_what_was_set():
+    assert final_draws(Goal(gamma=0.0, max_sim=5000), spent=1200, n_final=1000) == 3800
+    assert final_draws(Goal(gamma=0.0), spent=1200, n_final=1000) == 1000
+    assert final_draws(Goal(gamma=0.0, target_cov=0.1), spent=1200, n_final=1000) == 100_000
+
+
+def test_no_weight_exceeds_one_over_the_base_s_share(rng):
+    base, far, wide = (Gaussian(np.full(2, m), s * np.eye(2)) for m, s in ((0.0, 1.0), (3.0, 0.1), (3.0, 4.0)))
+    u = 4.0 * rng.standard_normal((2000, 2))
+    for wide_share in (0.0, 0.25):
+        mixture = defensive(base, wide, far, 0.125, wide_share)
+        parts = [0.125 * np.exp(base.log_prob(u)), wide_share * np.exp(wide.log_prob(u))]
+        density = sum(parts) + (0.875 - wide_share) * np.exp(far.log_prob(u))
+        np.testing.assert_allclose(mixture.log_prob(u), np.log(density))
+        assert (base.log_prob(u) - mixture.log_prob(u)).max() <= math.log(8.0) * (1 + 1e-12)
+
+
+def until(drive, limit, batch, **goal):
+    problem, told = half_space(2, 1.0).problem, []
+    steps = draw_until(
+        problem,
+        Gaussian(np.full(2, 0.7), np.eye(2)),
+        Goal(gamma=0.0, on_level=told.append, **goal),
+        limit,
+        batch,
+        np.random.default_rng(0),
+    )
+    draws, trace, stopped = drive(steps, problem).value
+    assert told == trace
+    return draws, trace, stopped
+
+
+def test_batches_up_to_a_limit_or_a_target(drive):
+    draws, trace, stopped = until(drive, 2500, 1000)
+    assert [level.n_sim for level in trace] == [level.n_points for level in trace] == [1000, 1000, 500]
+    assert (draws.n, stopped) == (2500, False)
+    assert (trace[-1].estimate, trace[-1].cov, trace[-1].ess) == (draws.p, draws.cov, draws.ess)
+    assert trace[0].p == pytest.approx(stats.norm.sf(1.0 - 0.7 * math.sqrt(2)), abs=4 * 0.5 / math.sqrt(1000))
+    assert draws.p == pytest.approx(stats.norm.sf(1.0), rel=4 * draws.cov)
+    draws, trace, _ = until(drive, 100_000, 500, target_cov=0.02)
+    assert trace[-1].cov <= 0.02 < trace[-2].cov
+
+
+def test_stopped_on_the_way_there_is_what_was_drawn(drive):
+    problem = FunctionProblem(lambda u: 1.0 - u[:, 0], 2)
+    steps = draw_until(problem, Gaussian.standard(2), Goal(gamma=0.0), 3000, 1000, np.random.default_rng(0))
+    draws, trace, stopped = drive(steps, problem, interrupt_at=2).value
+    assert (draws.n, len(trace), stopped) == (2000, 2, True)

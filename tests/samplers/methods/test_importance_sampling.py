@@ -1,0 +1,126 @@
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import samplers
+from samplers.importance.search import Round, Search, described, pooled
+from samplers.limit_states import four_branches, half_space, parabola, plateau
+from samplers.method import Goal
+from samplers.methods.importance_sampling import far_share
+from samplers.problem import FunctionProblem, StandardNormal
+from samplers.proposals.gaussian import Tilted
+from samplers.trace import Status
+
+IS = samplers.ImportanceSampling
+
+
+def test_a_tilt_of_the_standard_normal_law_is_a_shift(rng):
+    theta = np.array([1.5, -0.5])
+    tilted, u = Tilted(theta), rng.standard_normal((5, 2))
+    ratio = tilted.log_prob(u) - StandardNormal(2).log_prob(u)
+    np.testing.assert_allclose(ratio, u @ theta - 0.5 * theta @ theta)
+    np.testing.assert_allclose(tilted.sample(20_000, rng).mean(axis=0), theta, atol=0.04)
+
+
+def test_the_tilt_is_the_mean_of_the_failures(drive):
+    """For a half-space at beta that is phi(beta) / Phi(-beta) along its normal."""
+    reference = half_space(2, 3.0)
+    steps = IS(n_round=5000)._search(reference.problem, Goal(gamma=0.0), np.random.default_rng(1))
+    search, tilt = drive(steps, reference.problem).value
+    assert search.status is Status.CONVERGED
+    length = stats.norm.pdf(3.0) / stats.norm.sf(3.0)
+    np.testing.assert_allclose(tilt.shift, np.full(2, length / math.sqrt(2)), atol=0.1)
+
+
+@pytest.mark.parametrize("reference", [half_space(), parabola(), plateau()], ids=lambda r: r.name)
+def test_unbiased_and_covered_where_one_tilt_serves(study, reference):
+    runs = 150
+    found = study(reference, IS(), runs)
+    assert abs(found.ratios.mean() - 1) < 4 * found.ratios.std(ddof=1) / math.sqrt(runs)
+    assert found.covered >= stats.binom.ppf(1e-3, runs, 0.93)
+    assert not any(result.warnings for result in found.results)
+
+
+def test_stops_at_the_relative_half_width():
+    result = samplers.estimate(half_space().problem, IS(), seed=1)
+    assert result.cov <= 0.2 / 1.96
+    assert result.status == "converged"
+    narrow = samplers.estimate(half_space().problem, IS(half_width=0.05, batch=500), seed=1)
+    final = [level for level in narrow.trace if level.n_points == 500][-2:]
+    assert final[1].cov <= 0.05 / 1.96 < final[0].cov
+    aimed = samplers.estimate(half_space().problem, IS(), seed=1, target_cov=0.02)
+    assert aimed.cov <= 0.02
+
+
+def test_says_where_the_draws_did_not_suffice():
+    result = samplers.estimate(half_space().problem, IS(half_width=0.01), seed=1, max_sim=4000)
+    assert (result.n_sim, result.status) == (4000, "budget")
+    assert any("The draws were used up" in text for text in result.warnings)
+
+
+@pytest.mark.parametrize("reference", [four_branches(3.0)], ids=lambda r: r.name)
+def test_base_draws_where_one_tilt_does_not_serve(study, reference):
+    """A tilt towards one branch would miss the others and say nothing."""
+    found = study(reference, IS(), 20)
+    assert all(any("base draws take its place" in text for text in r.warnings) for r in found.results)
+    assert found.covered >= 16
+
+
+def test_far_share(rng):
+    u = rng.standard_normal((4000, 2))
+    f = 1.5 - abs(u[:, 0])  # two regions
+    first = Round(Tilted(np.zeros(2)), u, f)
+    search = Search([first], [described(first, 0.0)], Status.CONVERGED)
+    inputs = FunctionProblem(lambda x: 1.5 - abs(x[:, 0]), 2)
+    assert far_share(search, np.array([2.0, 0.0]), inputs, 0.0) == pytest.approx(0.5, abs=0.06)
+    one = first._replace(f=1.5 - u[:, 0])
+    search = Search([one], [described(one, 0.0)], Status.CONVERGED)
+    assert far_share(search, np.array([2.0, 0.0]), inputs, 0.0) == 0
+
+
+def test_rounds_pool_into_one_sample(rng):
+    """Weights by the mixture of the proposals: right on average and bounded by the share of base draws."""
+    inputs = half_space(2, 2.0)
+    estimates = []
+    for _ in range(200):
+        rounds = []
+        for shift in ([0.0, 0.0], [1.5, 1.5], [3.0, 3.0]):
+            law = Tilted(np.array(shift))
+            u = law.sample(200, rng)
+            rounds.append(Round(law, u, inputs.problem.evaluate(u)))
+        draws = pooled(rounds, inputs.problem, 0.0)
+        assert draws.n == 600
+        assert np.exp(draws.log_weights).max() <= 3
+        estimates.append(draws.p)
+    error = np.std(estimates, ddof=1) / math.sqrt(200)
+    assert abs(np.mean(estimates) - inputs.p) < 4 * error
+
+
+@pytest.mark.parametrize("at", [1, 2, 3, 4, 5, 6])
+def test_interrupted_anywhere_it_answers_from_what_was_simulated(drive, at):
+    problem = half_space().problem
+    steps = IS(half_width=0.01).steps(problem, Goal(gamma=0.0), np.random.default_rng(2))
+    outcome, f = drive(steps, problem, interrupt_at=at)
+    assert outcome.status is Status.STOPPED
+    assert sum(level.n_sim for level in outcome.trace) == len(f)
+    assert outcome.interval[0] <= half_space().p <= outcome.interval[1]
+    sample = outcome.sample
+    assert sample.weights[sample.f <= 0].sum() == pytest.approx(outcome.p)
+
+
+@pytest.mark.parametrize("dim", [1, 1500])
+def test_any_number_of_dimensions(dim):
+    reference = half_space(dim, 2.5)
+    result = samplers.estimate(reference.problem, IS(), seed=1, max_sim=5000)
+    assert result.interval[0] <= reference.p <= result.interval[1]
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"half_width": 0.0}, {"n": 0}, {"batch": 0}, {"n_round": 5}, {"max_rounds": 0}, {"rho": 0.5}, {"base_share": 1.0}],
+)
+def test_settings_out_of_range(settings):
+    with pytest.raises(ValueError, match=f"ImportanceSampling: expected .*{next(iter(settings))}"):
+        IS(**settings)

@@ -1,0 +1,175 @@
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import samplers
+from samplers.limit_states import four_branches, half_space, parabola, plateau, shell
+from samplers.method import Goal
+from samplers.methods.improved_cross_entropy import log_smooth, next_width, scale_of, spread
+from samplers.problem import FunctionProblem
+from samplers.trace import Status
+
+ICE = samplers.ImprovedCrossEntropy
+FAMILIES = ("gaussian", "mixture", "vmfn")
+
+
+def gain(found):
+    n = np.mean([result.n_sim for result in found.results])
+    return (1 - found.p) / found.p / (n * np.mean((found.ratios - 1) ** 2))
+
+
+@pytest.mark.parametrize(
+    ("reference", "family", "least"),
+    [
+        (half_space(), "gaussian", 700),
+        (half_space(), "mixture", 1500),
+        (half_space(), "vmfn", 700),
+        (parabola(), "mixture", 700),
+        (four_branches(), "mixture", 10),
+        (plateau(), "mixture", 1000),
+        (shell(), "vmfn", 1000),
+        (half_space(100), "vmfn", 80),
+    ],
+    ids=lambda v: getattr(v, "name", v),
+)
+def test_gain_over_monte_carlo(study, reference, family, least):
+    runs = 10
+    found = study(reference, ICE(family=family), runs, max_sim=6000)
+    error = found.ratios.std(ddof=1) / math.sqrt(runs)
+    assert abs(found.ratios.mean() - 1) < 5 * error
+    assert gain(found) > least
+    assert found.covered >= stats.binom.ppf(1e-3, runs, 0.90)
+
+
+def test_a_family_that_does_not_fit_says_so():
+    """A Gaussian cannot lie around the origin."""
+    results = [samplers.estimate(shell().problem, ICE(family="gaussian"), seed=s, max_sim=6000) for s in range(5)]
+    assert all(result.warnings for result in results)
+    assert sum(r.interval[0] <= shell().p <= r.interval[1] for r in results) >= 4
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("scale", [1e-6, 1e6])
+def test_the_scale_of_f_does_not_matter(family, scale):
+    reference = half_space(2, 3.0)
+    results = [
+        samplers.estimate(FunctionProblem(lambda x, c=c: c * reference.problem.f(x), 2), ICE(family=family), seed=1)
+        for c in (1.0, scale)
+    ]
+    assert results[1].p == pytest.approx(results[0].p, rel=0.1)
+    assert results[1].n_sim == results[0].n_sim
+
+
+@pytest.mark.parametrize("far", [np.inf, 1e308, 1e12])
+def test_outcomes_that_stand_for_nothing(far):
+    """Half of the scenarios have no meaningful outcome."""
+    reference = half_space(2, 3.0)
+    problem = FunctionProblem(lambda x: np.where(x[:, 0] < 0, far, reference.problem.f(x)), 2)
+    s = math.sqrt(0.5)  # less P[(u1 + u2) / sqrt(2) > 3, u1 < 0]
+    exact = reference.p - float(stats.multivariate_normal([0, 0], [[1, -s], [-s, 1]]).cdf([-3.0, 0.0]))
+    found = np.mean([samplers.estimate(problem, ICE(), seed=seed).p for seed in range(5)])
+    assert found == pytest.approx(exact, rel=0.06)
+
+
+def test_gamma_shifts_f():
+    shifted = samplers.estimate(
+        FunctionProblem(lambda x: half_space().problem.f(x) + 7, 2), ICE(), gamma=7.0, seed=3, max_sim=6000
+    )
+    assert shifted.p == pytest.approx(samplers.estimate(half_space().problem, ICE(), seed=3, max_sim=6000).p, rel=1e-6)
+
+
+def test_the_width_gives_the_weights_their_spread(rng):
+    g, log_ratio = 3.0 - rng.standard_normal(1000), 0.1 * rng.standard_normal(1000)
+    width = next_width(g, log_ratio, 1.5, 1e-15, 30.0)
+    assert spread(log_smooth(g, width) + log_ratio) == pytest.approx(1.5, abs=1e-6)
+    assert next_width(g, log_ratio, 1.5, 1e-15, 0.1) == 0.1  # as wide as allowed is too narrow
+    assert next_width(-abs(g), log_ratio, 1.5, 1e-15, 30.0) == 1e-15  # all fail
+
+
+def test_spread():
+    assert spread(np.log([1.0, 3.0]) - 1000) == pytest.approx(0.5)
+    assert spread(np.full(3, -np.inf)) == math.inf
+
+
+def test_smooth_indicator():
+    g = np.array([-1e300, -1.0, 0.0, 1.0, 1e300])
+    np.testing.assert_allclose(np.exp(log_smooth(g, 1e-12)), [1, 1, 0.5, 0, 0])
+    np.testing.assert_allclose(np.exp(log_smooth(g, math.inf)), 0.5)
+
+
+def test_scale():
+    assert scale_of(np.array([1.0, -2.0, 3.0, 0.0, 1e300])) == 2.0
+    assert scale_of(np.zeros(3)) == 1.0
+
+
+def endless(family, seed):
+    """The steps of a run that does not end before it is interrupted."""
+    goal = Goal(gamma=0.0, target_cov=1e-4)
+    return ICE(family=family, n_final=500).steps(half_space().problem, goal, np.random.default_rng(seed))
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("at", [1, 2, 3, 4, 5, 6])
+def test_interrupted_anywhere_it_answers_from_what_was_simulated(drive, family, at):
+    outcome, f = drive(endless(family, 2), half_space().problem, interrupt_at=at)
+    assert outcome.status is Status.STOPPED
+    assert sum(level.n_sim for level in outcome.trace) == len(f)
+    assert 0 <= outcome.interval[0] <= outcome.p <= outcome.interval[1] <= 1
+    sample = outcome.sample
+    assert sample.weights[sample.f <= 0].sum() == pytest.approx(outcome.p)
+
+
+@pytest.mark.parametrize("at", [2, 4, 6])
+def test_intervals_of_interrupted_runs_hold(drive, at):
+    """In the search (2), about its end (4) and among the final draws (6)."""
+    runs, p, problem = 25, half_space().p, half_space().problem
+    outcomes = [drive(endless("gaussian", seed), problem, interrupt_at=at).value for seed in range(runs)]
+    covered = sum(o.interval[0] <= p <= o.interval[1] for o in outcomes)
+    assert covered >= stats.binom.ppf(1e-3, runs, 0.92)
+
+
+def test_final_weights_are_bounded_by_the_base_draws(drive):
+    problem = four_branches().problem
+    sample = drive(ICE().steps(problem, Goal(gamma=0.0), np.random.default_rng(1)), problem).value.sample
+    assert sample.n_units == 4000
+    assert sample.weights.max() <= 10 / 4000 * (1 + 1e-9)
+    assert sample.weights.sum() == pytest.approx(1, abs=4 * np.sqrt((sample.weights**2).sum()))
+    assert (sample.weights**2).sum() < 0.01
+
+
+def test_stops_at_a_target():
+    result = samplers.estimate(half_space().problem, ICE(n_final=500), seed=1, target_cov=0.03)
+    assert result.cov <= 0.03
+    assert result.status == "converged"
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_one_dimension(family):
+    result = samplers.estimate(half_space(1).problem, ICE(family=family), seed=2)
+    assert result.p == pytest.approx(half_space(1).p, rel=0.15)
+
+
+def test_too_many_dimensions_are_warned_of():
+    result = samplers.estimate(half_space(1500).problem, ICE(n_round=200), seed=1, max_sim=2000)
+    assert any("independent ones" in text or "None of" in text for text in result.warnings)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"family": "student"},
+        {"components": 0},
+        {"weight_cov": 0.0},
+        {"n_round": 5},
+        {"max_rounds": 0},
+        {"n_final": 5},
+        {"base_share": 1.0},
+        {"wide_share": 0.9},
+        {"wide_factor": 1.0},
+    ],
+)
+def test_settings_out_of_range(settings):
+    with pytest.raises(ValueError, match=f"ImprovedCrossEntropy: expected .*{next(iter(settings))}"):
+        ICE(**settings)

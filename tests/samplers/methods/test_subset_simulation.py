@@ -1,0 +1,416 @@
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import samplers
+from samplers.limit_states import half_space, plateau, shell
+from samplers.mcmc.chains import Chains
+from samplers.method import Goal
+from samplers.methods.subset_levels import Passed, after, descent_cov, described, effective_roots, finish
+from samplers.problem import FunctionProblem
+from samplers.statistics.intervals import log_normal
+from samplers.trace import Status
+
+ADSS = samplers.AdaptiveSubsetSimulation
+SS = samplers.SubsetSimulation
+
+
+def run(problem, seed=1, **settings):
+    return samplers.estimate(problem, ADSS(**settings), seed=seed)
+
+
+def seeds_of(trace):
+    """Points that each level after the first took over from the one before."""
+    return [round(level.p * level.n_points) for level in trace[:-1]]
+
+
+BOTH = [SS(), ADSS(), ADSS(proposal="metropolis"), SS(law="normal")]
+IDS = ["ss", "adss", "adss metropolis", "ss normal"]
+
+
+def test_seeds_are_never_simulated_again(recorder):
+    f = recorder(half_space().problem.f)
+    result = run(FunctionProblem(f, 2))
+    assert len(np.unique(f.points, axis=0)) == f.rows
+    for seeds, level in zip(seeds_of(result.trace), result.trace[1:], strict=True):
+        assert level.n_sim == level.n_points - seeds
+        assert level.n_points == 1000
+    assert result.n_sim == 1000 + sum(1000 - seeds for seeds in seeds_of(result.trace))
+
+
+def test_calls_of_f_are_few_and_large(recorder):
+    f = recorder(half_space().problem.f)
+    result = run(FunctionProblem(f, 2))
+    assert len(f.batches) <= 1 + 10 * (len(result.trace) - 1)
+    assert min(len(batch) for batch in f.batches[1:]) >= 90 or len(f.batches[-1]) >= 1
+    assert np.median([len(batch) for batch in f.batches[1:]]) >= 100
+
+
+def test_no_level_after_the_answer_is_known(recorder):
+    """p = 0.3 is known at level 0, p = 0.02 at level 1."""
+    f = recorder(half_space(2, -stats.norm.ppf(0.3)).problem.f)
+    result = run(FunctionProblem(f, 2))
+    assert result.n_sim == f.rows == 1000
+    assert result.interval == samplers.statistics.intervals.clopper_pearson(round(1000 * result.p), 1000, 0.95)
+    result = run(half_space(2, -stats.norm.ppf(0.03)).problem)
+    assert [level.gamma == 0.0 for level in result.trace] == [False, True]
+
+
+def test_p_is_the_product_of_true_shares():
+    result = run(half_space().problem)
+    assert result.p == pytest.approx(math.prod(level.p for level in result.trace))
+    assert [level.gamma for level in result.trace] == sorted((level.gamma for level in result.trace), reverse=True)
+    assert result.trace[-1].gamma == 0.0
+
+
+def test_level_zero_is_part_of_the_cov():
+    result = run(half_space(2, -stats.norm.ppf(0.03)).problem)
+    zero, last = result.trace
+    assert zero.cov == pytest.approx(math.sqrt(0.9 / (0.1 * 1000)))
+    both = math.sqrt((1 + zero.cov**2) * (1 + last.cov**2) - 1)
+    assert result.cov >= both * (1 - 1e-12)
+    assert after(Passed(), zero).cov == pytest.approx(zero.cov)
+
+
+def frozen(chains, steps):
+    """One chain in ten below the threshold, all of its points."""
+    f = np.where(np.arange(chains)[:, None] < chains // 10, -1.0, 1.0) * np.ones((chains, steps))
+    u = np.zeros((chains, steps, 1))
+    return Chains(u, f, np.full(chains, steps), np.arange(chains), chains * (steps - 1), 0.4)
+
+
+def test_chain_correlation_is_in_the_cov_of_a_level():
+    """Chains that never leave their side are worth one point each."""
+    level = described(frozen(100, 10), 0.0, Passed())
+    assert level.p == 0.1
+    assert level.ess == pytest.approx(100)
+    assert level.cov == pytest.approx(math.sqrt(0.9 / (0.1 * 100)))
+
+
+def test_chains_are_kept_apart_end_to_end():
+    """Real chains are correlated: gamma is well above 0; it would vanish with mixed chains."""
+    ess = [level.ess for seed in range(20) for level in run(half_space().problem, seed).trace[1:]]
+    assert 200 < np.mean(ess) < 600
+
+
+def test_descent_cov():
+    """All descendants of one point: worth one point. One each: binomial."""
+    assert descent_cov(np.full(50, 7), 1000) == pytest.approx(math.sqrt(1 - 1 / 1000))
+    assert descent_cov(np.arange(100), 1000) == pytest.approx(math.sqrt(0.9 / (0.1 * 1000)))
+    assert math.isinf(descent_cov(np.empty(0, dtype=int), 1000))
+
+
+def test_effective_roots():
+    assert effective_roots(np.full(50, 7)) == 1
+    assert effective_roots(np.arange(100)) == 100
+    assert effective_roots(np.array([1, 1, 4, 9])) == pytest.approx(16 / 6)
+
+
+def test_cov_is_the_larger_of_chain_correlation_and_descent():
+    """100 chains that stay where they are; 10 fail. Either estimate can be the larger one."""
+    chains, goal = frozen(100, 10), Goal(gamma=0.0)
+
+    def outcome(roots, passed):
+        zero = replace(described(frozen(1000, 1), 0.0, Passed()), n_points=1000)
+        last = described(chains._replace(roots=roots), 0.0, passed)
+        return finish(chains._replace(roots=roots), goal, passed, [zero, last], Status.CONVERGED), last
+
+    one_root, passed = np.zeros(100, dtype=int), Passed(0.1, 0.1)
+    by_descent, last = outcome(one_root, passed)
+    assert by_descent.cov == descent_cov(np.zeros(100, dtype=int), 1000) > 2 * after(passed, last).cov
+    assert by_descent.interval == log_normal(by_descent.p, by_descent.cov, 0.95, df=1.0)
+
+    passed = Passed(0.1, 2.0)
+    by_levels, last = outcome(np.arange(100), passed)
+    assert by_levels.cov == after(passed, last).cov > 2 * descent_cov(np.repeat(np.arange(10), 10), 1000)
+
+
+def test_own_cov_matches_the_spread(study):
+    """40 % off would be seen; leaving out the chain correlation makes it 35 % too small."""
+    reference, runs = half_space(), 300
+    found = study(reference, ADSS(), runs)
+    spread = found.ratios.std(ddof=1)
+    assert 0.85 < found.own_cov / spread < 1.2
+
+
+@pytest.mark.parametrize("tied", [0.6, 0.9, 0.95])
+def test_ties_at_a_cap(study, tied):
+    reference, runs = plateau(3, 3.0, tied), 60
+    found = study(reference, ADSS(), runs)
+    assert all(result.status == "converged" for result in found.results)
+    error = found.ratios.std(ddof=1) / math.sqrt(runs)
+    assert abs(found.ratios.mean() - 1) < 4 * error + 0.05
+    if tied > 0.9:  # the first share is the true one, about 5 %
+        shares = [result.trace[0].p for result in found.results]
+        assert np.mean(shares) == pytest.approx(0.05, abs=0.005)
+        assert len(set(shares)) > 10
+
+
+def test_a_coarse_scale_of_outcomes(study):
+    """f in steps of 0.5: every threshold is tied."""
+
+    def f(x):
+        return np.ceil(2 * (3.0 - x[:, 0])) / 2
+
+    reference, runs = half_space(2, 3.0), 60
+    found = study(reference._replace(problem=FunctionProblem(f, 2)), ADSS(), runs)
+    error = found.ratios.std(ddof=1) / math.sqrt(runs)
+    assert abs(found.ratios.mean() - 1) < 4 * error + 0.05
+    assert found.covered >= stats.binom.ppf(1e-3, runs, 0.90)
+
+
+def test_stalls_honestly_where_everything_ties():
+    result = run(FunctionProblem(lambda x: np.full(len(x), 10.0), 2))
+    assert result.n_sim == 1000
+    assert result.status == "no_hits"
+    assert result.interval == samplers.statistics.intervals.clopper_pearson(0, 1000, 0.95)
+    assert any("No progress" in text for text in result.warnings)
+
+
+def test_gives_up_after_max_levels():
+    result = run(FunctionProblem(lambda x: 30 - x[:, 0], 2), max_levels=4)
+    assert len(result.trace) == 4
+    assert result.p == 0
+    # three levels passed, 1e-3 give or take, of which no hit in a dozen roots may be a quarter
+    assert 1e-4 < result.interval[1] < 1e-3
+
+
+def test_no_failure_from_one_path_excludes_nothing():
+    """One point in 1,000 leads down, to where nothing fails: how likely that is, a single root cannot tell."""
+
+    def f(x):
+        return np.where(x[:, 0] > 3.0, 10 - x[:, 0], 20 - 0.01 * x[:, 1])
+
+    for seed in range(3):
+        result = samplers.estimate(FunctionProblem(f, 2), ADSS(max_levels=6), seed=seed)
+        assert result.p == 0
+        assert result.interval[1] > 0.01
+
+
+def test_a_budget_in_the_middle_of_a_level_is_used_and_said():
+    result = samplers.estimate(half_space(2, 4.5).problem, ADSS(n=500), seed=1, max_sim=2150)
+    assert result.n_sim == 2150
+    assert [level.n_sim for level in result.trace] == [500, 450, 450, 450, 300]
+    assert result.trace[-1].n_points == 300 + seeds_of(result.trace)[-1]
+    assert any("max_sim was used up at level 4" in text for text in result.warnings)
+
+
+@pytest.mark.parametrize("max_sim", [1, 2, 5, 50, 99])
+def test_a_budget_under_level_zero_is_named_as_the_reason(max_sim):
+    result = samplers.estimate(half_space().problem, ADSS(), seed=1, max_sim=max_sim)
+    assert result.n_sim == max_sim
+    assert result.warnings[0] == (
+        f"max_sim leaves {max_sim} of the 100 simulations that level 0 needs at least: plain draws only."
+    )
+    assert "max_sim was used up at level 0" in result.warnings[1]
+    assert not any("ties" in text for text in result.warnings)
+    assert result.interval == samplers.statistics.intervals.clopper_pearson(0, max_sim, 0.95)
+
+
+def test_a_budget_for_few_points_has_the_status_budget():
+    """Two of 50 points fail, less than p0: the run would go on."""
+    problem = FunctionProblem(lambda x: np.arange(len(x)) - 1.5, 2)
+    result = samplers.estimate(problem, ADSS(), seed=1, max_sim=50)
+    assert (result.p, result.status) == (0.04, "budget")
+
+
+@pytest.mark.parametrize(("max_sim", "n"), [(100, 100), (370, 100), (740, 200), (1000, 270), (3699, 999), (3700, 1000)])
+def test_points_per_level_fit_the_budget(max_sim, n):
+    result = samplers.estimate(half_space(2, 4.5).problem, ADSS(), seed=1, max_sim=max_sim)
+    assert result.trace[0].n_points == n
+    assert len(result.trace) == (1 if max_sim == 100 else 4)
+    assert any(f"{n} points per level, not 1000" in text for text in result.warnings) == (n < 500)
+    assert samplers.estimate(half_space().problem, ADSS(n=50), seed=1, max_sim=80).trace[0].n_points == 50
+
+
+def test_a_small_budget_is_spent_well(study):
+    """A thousand simulations: Monte Carlo would have a c.o.v. of 0.86."""
+    reference, runs = half_space(2, 3.0), 200
+    found = study(reference, ADSS(), runs, max_sim=1000)
+    error = found.ratios.std(ddof=1) / math.sqrt(runs)
+    assert abs(found.ratios.mean() - 1) < 4 * error + 0.04 * 1000 / 270  # bias of order 1/N
+    assert found.ratios.std(ddof=1) < 0.7
+    assert found.covered >= stats.binom.ppf(1e-3, runs, 0.88)
+
+
+def test_noise_of_f_is_kept_with_the_point(study):
+    """Fresh noise at every call: simulating the seeds again would bias p by -20 % and more."""
+    noise = np.random.default_rng(3)
+
+    def f(x):
+        return 3.0 - x.sum(axis=1) / math.sqrt(6) + 0.4 * noise.standard_normal(len(x))
+
+    reference = half_space(6)._replace(problem=FunctionProblem(f, 6), p=float(stats.norm.sf(3.0 / math.hypot(1, 0.4))))
+    runs = 150
+    found = study(reference, ADSS(), runs)
+    error = found.ratios.std(ddof=1) / math.sqrt(runs)
+    assert abs(found.ratios.mean() - 1) < 4 * error + 0.04
+
+
+def test_number_of_points_need_not_be_a_multiple_of_the_seeds(study):
+    reference, runs = half_space(2, 2.5), 80
+    found = study(reference, ADSS(n=333, p0=0.13), runs)
+    error = found.ratios.std(ddof=1) / math.sqrt(runs)
+    assert abs(found.ratios.mean() - 1) < 4 * error + 0.1  # bias of order 1/N, three times that
+    assert all(level.n_points == 333 for level in found.results[0].trace)
+
+
+def test_many_dimensions(study):
+    reference, runs = half_space(100), 40
+    found = study(reference, ADSS(), runs)
+    error = found.ratios.std(ddof=1) / math.sqrt(runs)
+    assert abs(found.ratios.mean() - 1) < 4 * error + 0.05
+    assert found.covered >= stats.binom.ppf(1e-3, runs, 0.90)
+    acceptance = [level.acceptance for r in found.results for level in r.trace[1:]]
+    assert 0.3 < np.mean(acceptance) < 0.55  # steered to 0.44
+
+
+def test_no_chains_no_acceptance():
+    trace = run(half_space().problem).trace
+    assert trace[0].acceptance is None
+    assert all(0 < level.acceptance < 1 for level in trace[1:])
+
+
+@pytest.mark.parametrize(
+    "bad", [{"scale": 0.99, "target_acceptance": 1e-6}, {"scale": 1e-3, "target_acceptance": 0.999}]
+)
+def test_warns_of_bad_mixing(bad):
+    """Steps so large that nothing is accepted, and so small that everything is."""
+    problem = half_space(40).problem
+    good = samplers.estimate(problem, ADSS(n=500), seed=1)
+    assert not any("Acceptance" in text for text in good.warnings)
+    result = samplers.estimate(problem, ADSS(n=500, **bad), seed=1, max_sim=3000)
+    assert any("Acceptance" in text for text in result.warnings)
+
+
+def test_seed_deviations_as_in_the_paper(study):
+    reference, runs = half_space(), 60
+    found = study(reference, ADSS(sigma0="seeds"), runs)
+    error = found.ratios.std(ddof=1) / math.sqrt(runs)
+    assert abs(found.ratios.mean() - 1) < 4 * error + 0.05
+
+
+def test_one_dimension():
+    result = run(half_space(1).problem)
+    assert result.p == pytest.approx(half_space(1).p, rel=1.2)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"n": 5},
+        {"p0": 0.0},
+        {"p0": 0.5},
+        {"scale": 0.0},
+        {"target_acceptance": 1.0},
+        {"max_levels": 0},
+        {"sigma0": "sample"},
+        {"proposal": "ar1"},
+    ],
+)
+def test_settings_out_of_range(settings):
+    with pytest.raises(ValueError, match=f"AdaptiveSubsetSimulation: expected .*{next(iter(settings))}"):
+        ADSS(**settings)
+
+
+@pytest.mark.parametrize("at", [1, 2, 5, 10, 11, 12, 19, 20, 23])
+@pytest.mark.parametrize("method", [SS(), ADSS()], ids=["ss", "adss"])
+def test_interrupted_anywhere_it_answers_from_what_was_simulated(drive, method, at):
+    problem, levels = half_space().problem, []
+    steps = method.steps(problem, Goal(gamma=0.0, on_level=levels.append), np.random.default_rng(4))
+    outcome, f = drive(steps, problem, interrupt_at=at)
+    assert outcome.status is Status.STOPPED
+    assert sum(level.n_sim for level in outcome.trace) == len(f)
+    assert outcome.trace == tuple(levels)
+    low, high = outcome.interval
+    assert 0 <= low <= outcome.p <= high <= 1
+    assert low <= half_space().p <= high
+    assert any("Stopped at level" in text for text in outcome.warnings)
+    assert (outcome.p == 0) == any("No failure was seen" in text for text in outcome.warnings)
+    assert outcome.sample.weights.sum() == pytest.approx(1)
+
+
+@pytest.mark.parametrize("method", BOTH, ids=IDS)
+def test_the_weighted_points_give_p_at_every_threshold(drive, method):
+    reference = half_space(3)
+    outcome = drive(method.steps(reference.problem, Goal(gamma=0.0), np.random.default_rng(4)), reference.problem).value
+    sample = outcome.sample
+    assert sample.weights.sum() == pytest.approx(1)
+    assert sample.weights[sample.f <= 0].sum() == pytest.approx(outcome.p)
+    for level in outcome.trace:
+        assert sample.weights[sample.f <= level.gamma].sum() == pytest.approx(level.estimate)
+    np.testing.assert_allclose(reference.problem.evaluate(sample.x), sample.f[sample.f <= 0])
+    assert sample.n_units == 1000
+    assert sample.units.min() >= 0
+    assert sample.units.max() < 1000
+    assert len(sample.f) == len(sample.weights) == len(sample.units)
+    failing = sample.units[sample.f <= 0]  # descent as the c.o.v. sees it
+    assert outcome.cov >= descent_cov(failing, 1000)
+    median = reference.problem.evaluate(np.zeros((1, 3)))[0]
+    assert sample.weights[sample.f <= median].sum() == pytest.approx(0.5, abs=0.06)
+
+
+def test_the_curve_is_right_on_average(study):
+    """p of thresholds passed on the way, from the weighted points."""
+    reference, levels = half_space(2, 3.0), np.array([0.5, 1.0, 2.0])
+    samples = [result.sample for result in study(reference, ADSS(n=500), 60).results]
+    found = np.array([[s.weights[s.f <= g].sum() for g in levels] for s in samples]) / stats.norm.sf(3.0 - levels)
+    error = found.std(axis=0, ddof=1) / math.sqrt(len(samples))
+    assert (abs(found.mean(axis=0) - 1) < 4 * error + 0.03).all()
+
+
+@pytest.mark.parametrize("method", BOTH, ids=IDS)
+@pytest.mark.parametrize("reference", [half_space(1, 3.0), half_space(30, 3.0)], ids=["d1", "d30"])
+def test_every_kernel_gives_p(study, method, reference):
+    runs = 40
+    found = study(reference, method, runs)
+    error = found.ratios.std(ddof=1) / math.sqrt(runs)
+    assert abs(found.ratios.mean() - 1) < 4 * error + 0.05
+    assert found.covered >= stats.binom.ppf(1e-3, runs, 0.90)
+
+
+@pytest.mark.parametrize("method", [SS(n=500), ADSS(n=500)], ids=["ss", "adss"])
+def test_fifteen_hundred_dimensions(method):
+    reference = half_space(1500, 3.0)
+    result = samplers.estimate(reference.problem, method, seed=2)
+    assert result.interval[0] <= reference.p <= result.interval[1]
+    assert not any("Acceptance" in text for text in result.warnings)
+
+
+def test_a_candidate_that_did_not_move_is_not_simulated(recorder):
+    """In one dimension a good part of the Metropolis candidates are where they were."""
+    f = recorder(half_space(1, 3.0).problem.f)
+    result = samplers.estimate(FunctionProblem(f, 1), SS(), seed=1)
+    assert len(np.unique(f.points)) == f.rows == result.n_sim
+    for seeds, level in zip(seeds_of(result.trace), result.trace[1:], strict=True):
+        assert level.n_points == 1000
+        assert level.n_sim < 0.9 * (1000 - seeds)
+
+
+@pytest.mark.parametrize("settings", [{"n": 5}, {"p0": 0.5}, {"spread": 0.0}, {"max_levels": 0}, {"law": "cauchy"}])
+def test_settings_of_subset_simulation_out_of_range(settings):
+    with pytest.raises(ValueError, match=f"SubsetSimulation: expected .*{next(iter(settings))}"):
+        SS(**settings)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("reference", [half_space(2), half_space(10), half_space(100), shell(20)], ids=lambda r: r.name)
+@pytest.mark.parametrize("method", [SS(), ADSS()], ids=["ss", "adss"])
+def test_coverage_of_a_single_run(study, reference, method):
+    runs = 600
+    found = study(reference, method, runs)
+    assert found.covered >= stats.binom.ppf(1e-3, runs, 0.92)
+    least = 0.85 if isinstance(method, ADSS) else 0.72  # some runs of Metropolis chains are far too high, none says so
+    assert least < found.own_cov / found.ratios.std(ddof=1) < 1.15
+
+
+@pytest.mark.slow
+def test_bias_falls_with_the_number_of_points(study):
+    runs = 400
+    small, large = (study(half_space(), ADSS(n=n), runs) for n in (500, 4000))
+    error = large.ratios.std(ddof=1) / math.sqrt(runs)
+    assert abs(large.ratios.mean() - 1) < 4 * error
+    assert small.ratios.std() > 2 * large.ratios.std()

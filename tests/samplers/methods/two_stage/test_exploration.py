@@ -1,0 +1,287 @@
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from samplers.limit_states import four_branches, plateau, shell
+from samplers.methods.two_stage.exploration import (
+    BISECTIONS,
+    Sizes,
+    _descend,
+    _drawn_in,
+    _some,
+    first_draws,
+    regions_of,
+)
+from samplers.methods.two_stage.regions import MANY_REGIONS, MOST_CLONES, MOST_REGIONS, _clones, _same_region, _walk
+from samplers.methods.two_stage.simulator import Simulator
+from samplers.problem import FunctionProblem
+
+
+def half_spaces(dim, *betas):
+    """Beyond u_k >= beta_k, one coordinate for each."""
+    return FunctionProblem(lambda u: np.min([beta - u[:, k] for k, beta in enumerate(betas)], axis=0), dim)
+
+
+def rough(u):
+    """Looks like independent N(0, 1) noise, but is a function of u."""
+    share = 43758.5453 * np.sin(u @ np.linspace(9.1, 13.7, u.shape[1]))
+    return stats.norm.ppf(np.clip(share - np.floor(share), 1e-9, 1 - 1e-9))
+
+
+NOISY = FunctionProblem(lambda u: 3.5 - u.sum(axis=1) / math.sqrt(6) + 0.5 * rough(u), 6)
+INDICATOR = FunctionProblem(lambda u: np.where(u[:, 0] > 3.0, -1.0, 1.0), 5)
+
+
+def driven(steps, problem):
+    """Answer a generator that yields points with their outcomes; return what it returns."""
+    try:
+        u = next(steps)
+        while True:
+            u = steps.send(problem.evaluate(u))
+    except StopIteration as end:
+        return end.value
+
+
+def explored(problem, seed=0, budget=6000):
+    """Return the first draws, what was found and how many simulations that took."""
+    rng, simulator, sizes = np.random.default_rng(seed), Simulator(problem), Sizes.within(budget)
+    first = driven(first_draws(simulator, sizes, rng), problem)
+    found = driven(regions_of(simulator, first, 0.0, sizes, rng), problem)
+    return first, found, simulator.n_sim
+
+
+@pytest.mark.parametrize("dim", [2, 30, 300])
+def test_wide_draws_hit_a_half_space_at_the_predicted_rate(dim, rng):
+    """Phi(-beta / s), whatever the dimension."""
+    problem, sizes = half_spaces(dim, 3.0), Sizes.within(600_000)
+    first = driven(first_draws(Simulator(problem), sizes, rng), problem)
+    scales = [1.0, *(scale for scale, _ in sizes.wide)]
+    assert first.counts.sum() == len(first.f) == len(first.u)
+    for part, scale in zip(np.split(first.f, np.cumsum(first.counts)[:-1]), scales, strict=True):
+        hits = int((part <= 0).sum())
+        assert stats.binomtest(hits, len(part), stats.norm.sf(3.0 / scale)).pvalue > 1e-4
+
+
+@pytest.mark.parametrize("dim", [1, 2, 30, 100])
+def test_a_half_space_is_one_region(dim):
+    for seed in range(5):
+        _, found, _ = explored(half_spaces(dim, 3.5), seed)
+        assert len(found.regions) == 1
+        assert not found.noisy
+
+
+@pytest.mark.parametrize("betas", [(3.4, 3.4), (3.4, 3.8)])
+@pytest.mark.parametrize("dim", [2, 30])
+def test_two_half_spaces_are_told_apart(dim, betas):
+    """Orthogonal ones; half way between two typical points both coordinates are about beta / 2."""
+    numbers = []
+    for seed in range(8):
+        _, found, _ = explored(half_spaces(dim, *betas), seed)
+        numbers.append(len(found.regions))
+        if dim > 2 and numbers[-1] == 2:
+            beyond = np.array([(region.points[:, :2] >= betas).mean(axis=0) for region in found.regions])
+            assert sorted(beyond.argmax(axis=1)) == [0, 1]
+            assert (beyond.max(axis=1) > 0.9).all()
+    assert numbers.count(2) >= 7
+
+
+def test_no_region_where_nothing_fails():
+    _, found, n_sim = explored(FunctionProblem(lambda u: np.ones(len(u)), 3))
+    assert found.regions == []
+    assert n_sim == sum((Sizes.within(6000).base, *(n for _, n in Sizes.within(6000).wide)))
+
+
+PROBLEMS = {
+    "half-space": half_spaces(2, 3.5),
+    "half-space d=100": half_spaces(100, 3.5),
+    "half-space d=1": half_spaces(1, 3.0),
+    "far": half_spaces(10, 5.0),
+    "two": half_spaces(10, 3.0, 3.2),
+    "four branches": four_branches().problem,
+    "shell": shell().problem,
+    "circle": shell(2).problem,
+    "plateau": plateau().problem,
+    "indicator": INDICATOR,
+    "cube": FunctionProblem(lambda u: 3.3 - np.abs(u).max(axis=1), 10),
+    "eight corners": FunctionProblem(lambda u: 1.2 - np.abs(u[:, :3]).min(axis=1), 5),
+    "noisy": NOISY,
+}
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_chains_stay_among_the_failures_and_regions_are_whole(name):
+    problem = PROBLEMS[name]
+    _, found, n_sim = explored(problem)
+    assert n_sim <= 0.65 * 6000  # what is left is for the rounds and the estimate
+    assert 1 <= len(found.regions) <= MOST_REGIONS
+    for region in found.regions:
+        assert region.chains.ndim == 3
+        assert (problem.evaluate(region.points) <= 0).all()
+        np.testing.assert_array_equal(problem.evaluate(region.u), region.f)
+
+
+def spent(name, budgets):
+    """Of each budget, the most of two runs."""
+    return np.array(
+        [max(explored(PROBLEMS[name], seed, budget)[2] / budget for seed in range(2)) for budget in budgets]
+    )
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_something_is_left_of_a_budget_of_thousands(name):
+    assert (spent(name, [2500, 4000, 10_000]) < 0.85).all()
+
+
+def test_a_small_budget_is_not_exceeded():
+    for name in PROBLEMS:
+        assert (spent(name, [400, 450, 700, 1000, 1300]) < 1).all()
+
+
+def test_an_indicator_is_enough():
+    """f = -1 or 1: the chains know where failures are, and that it is one region."""
+    for seed in range(5):
+        _, found, _ = explored(INDICATOR, seed)
+        assert len(found.regions) == 1
+        along = found.regions[0].points[:, 0]
+        assert along.mean() == pytest.approx(stats.truncnorm(3, np.inf).mean(), abs=0.12)
+
+
+def test_noise_is_noticed_and_steps_are_not_noise():
+    assert explored(NOISY)[1].noisy
+    assert not explored(PROBLEMS["indicator"])[1].noisy
+    assert not explored(PROBLEMS["plateau"])[1].noisy
+    assert not explored(FunctionProblem(lambda u: np.floor(4 * (3.0 - u[:, 0])), 3))[1].noisy
+
+
+@pytest.mark.parametrize("dim", [1, 2, 20])
+@pytest.mark.parametrize("turned", [0.0, 0.5], ids=["along the axis", "off the axis"])
+def test_walk_leaves_the_law_of_failures_as_it_is(dim, turned, rng):
+    """From exact draws beyond a plane, with the direction given, right or wrong: still the same law."""
+    beta, n = 2.0, 4000
+    start = rng.standard_normal((n, dim))
+    start[:, 0] = stats.truncnorm(beta, np.inf).rvs(n, random_state=rng)
+    direction = np.eye(dim)[0] + turned * np.eye(dim)[-1]
+    direction /= np.linalg.norm(direction)
+    problem = half_spaces(dim, beta)
+    steps = _walk(Simulator(problem), start, np.full(n, 0.5), np.tile(direction, (n, 1)), 6, 0.0, rng)
+    walk = driven(steps, problem)
+    assert walk.states.shape == (n, 6, dim)
+    end = walk.states[:, -1]
+    assert stats.kstest(end[:, 0], stats.truncnorm(beta, np.inf).cdf).pvalue > 1e-4
+    for k in range(1, min(dim, 4)):
+        assert stats.kstest(end[:, k], stats.norm.cdf).pvalue > 1e-4
+    moved = (np.diff(walk.states, axis=1) != 0).any(axis=2).mean()
+    assert moved > 0.2
+
+
+def test_walk_without_a_direction_comes_from_a_wide_failure_to_likely_ones(rng):
+    """Started twice as far as failures are, in 20 dimensions; the step adapts to an acceptance of about a third."""
+    problem = half_spaces(20, 3.0)
+    start = 2.5 * rng.standard_normal((300, 20))
+    start[:, 0] = 6.0
+    walk = driven(_walk(Simulator(problem), start, np.full(300, 0.5), None, 30, 0.0, rng), problem)
+    end = walk.states[:, -1]
+    assert (end[:, 0] >= 3.0).all()
+    assert end[:, 0].mean() < 3.7
+    assert (end[:, 1:] ** 2).mean() < 1.5  # 6.25 at the start
+    assert 0.2 < (walk.f[:, 10:] <= 0).mean() < 0.5
+
+
+def test_descent_finds_what_plain_draws_cannot():
+    """p = 3e-7 in ten dimensions; the points it gives fail, are distinct, and their law is nearly that of failures."""
+    problem, sizes, found = half_spaces(10, 5.0), Sizes.within(6000), 0
+    for seed in range(6):
+        rng, simulator = np.random.default_rng(seed), Simulator(problem)
+        u = rng.standard_normal((sizes.base, 10))
+        descent = driven(_descend(simulator, u, problem.evaluate(u), 0.0, sizes, rng), problem)
+        assert simulator.n_sim == len(descent.u) == len(descent.f) <= sizes.most
+        assert (problem.evaluate(descent.failing) <= 0).all()
+        assert len(np.unique(descent.failing, axis=0)) == len(descent.failing)
+        np.testing.assert_array_equal(problem.evaluate(descent.u), descent.f)
+        found += len(descent.failing) >= 20
+    assert found >= 5
+
+
+def test_points_are_drawn_in_along_their_rays_and_still_fail(rng):
+    problem = half_spaces(3, 3.0)
+    u = rng.normal(0.0, 3.0, (200, 3))
+    u[:, 0] = rng.uniform(3.0, 12.0, 200)
+    near = driven(_drawn_in(Simulator(problem), u, 0.0), problem)
+    assert (near[:, 0] >= 3.0).all()
+    ratio = near[:, 0] / u[:, 0]
+    np.testing.assert_allclose(near, ratio[:, None] * u)
+    assert (ratio <= 1).all()
+    assert (ratio - 3.0 / u[:, 0] <= 0.5**BISECTIONS + 1e-12).all()
+
+
+def test_regions_are_told_apart_by_the_point_half_way(rng):
+    problem = half_spaces(4, 2.5, 2.5, 2.5)
+    u = np.concatenate([rng.normal(0, 0.1, (20, 4)) + 3.0 * np.eye(4)[k] for k in range(3)])
+    labels, scattered = driven(_same_region(Simulator(problem), u, 0.0, 10**6), problem)
+    assert not scattered
+    assert labels.shape == (60,)
+    assert all(len(set(labels[20 * k : 20 * (k + 1)])) == 1 for k in range(3))
+    assert set(labels) == {0, 1, 2}
+
+
+def test_a_far_point_and_one_in_two_regions_join_no_regions(rng):
+    """Half way from (8, 0) to (0, 3) lies within the first region; (4, 4) is in both."""
+    problem = half_spaces(2, 3.0, 3.0)
+    u = np.array([[8.0, 0.0], [4.0, 4.0], [3.1, 0.0], [0.0, 3.2], [3.3, 0.5], [-0.5, 3.1]])
+    for order in [rng.permutation(6) for _ in range(20)]:
+        labels, _ = driven(_same_region(Simulator(problem), u[order], 0.0, 10**6), problem)
+        found = labels[np.argsort(order)]
+        assert found[2] == found[4] != found[3] == found[5]
+
+
+@pytest.mark.parametrize("dim", [6, 10])
+def test_more_regions_than_a_shell_would_need_are_pieces_of_it(dim):
+    """The faces of a cube: 12 regions leave few points unsorted after the first eight, 20 leave most of them."""
+    problem = FunctionProblem(lambda u: 3.0 - np.abs(u).max(axis=1), dim)
+    u = np.concatenate([s * 3.3 * np.eye(dim) for s in (1, -1)])
+    per_face = np.repeat([6, 1], [8, 4]) if dim == 6 else np.full(20, 3)
+    labels, scattered = driven(_same_region(Simulator(problem), np.repeat(u, per_face, axis=0), 0.0, 10**6), problem)
+    assert scattered == (dim == 10)
+    assert set(labels) == set(range(12 if dim == 6 else MANY_REGIONS))
+
+
+def test_starts_are_half_the_least_wide_and_half_at_random(rng):
+    scale = rng.permutation(np.repeat([1, 2, 3], [15, 40, 100]))
+    chosen = _some(scale, 30, rng)
+    assert len(set(chosen)) == 30
+    assert np.count_nonzero(scale[chosen] == 1) == 15
+    assert np.count_nonzero(scale[chosen] == 3) >= 3
+    assert set(_some(scale[:10], 30, rng)) == set(range(10))
+
+
+def test_regions_with_few_chains_get_more(rng):
+    labels = np.repeat([0, 1, 2], [20, 3, 9])
+    more = _clones(labels, 10, 10**6, rng)
+    np.testing.assert_array_equal(np.sort(np.unique(more)), np.arange(32))
+    np.testing.assert_array_equal(np.bincount(labels[more]), [20, 10, 10])
+    assert len(_clones(np.arange(30), 24, 10**6, rng)) == 30 + MOST_CLONES
+
+
+@pytest.mark.parametrize("budget", [400, 2000, 6000, 24_000, 600_000])
+def test_sizes_leave_most_of_the_budget(budget):
+    sizes = Sizes.within(budget)
+    assert sizes.base + sum(n for _, n in sizes.wide) <= 0.15 * budget
+    assert sizes.most <= 0.5 * budget
+    more = Sizes.within(2 * budget)
+    assert sizes.base < more.base <= 2 * sizes.base + 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["half-space", "half-space d=100", "indicator", "plateau"])
+def test_one_region_is_one_in_nearly_all_runs(name):
+    numbers = [len(explored(PROBLEMS[name], seed)[1].regions) for seed in range(100)]
+    assert numbers.count(1) >= 97
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dim", [10, 30, 60])
+def test_two_half_spaces_are_told_apart_in_nearly_all_runs(dim):
+    numbers = [len(explored(half_spaces(dim, 3.4, 3.8), seed)[1].regions) for seed in range(100)]
+    assert numbers.count(2) >= 90

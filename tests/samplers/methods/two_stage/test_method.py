@@ -1,0 +1,470 @@
+import functools
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import samplers
+from benchmarks.estimators.catalogue import CASES
+from samplers.limit_states import Reference, four_branches, half_space, plateau, shell
+from samplers.problem import FunctionProblem
+
+TS = samplers.TwoStage
+PHI = stats.norm.cdf
+
+
+def reference(name, f, dim, p):
+    return Reference(name, FunctionProblem(f, dim), float(p))
+
+
+def two_regions(dim, first=3.4, second=3.5):
+    """Two orthogonal half-spaces; half of them is missed by whoever follows f downhill from one point."""
+    p = 1 - PHI(first) * PHI(second)
+    return reference(f"two_regions_d{dim}", lambda u: np.minimum(first - u[:, 0], second + u[:, 1]), dim, p)
+
+
+def deceptive():
+    """f falls gently towards a region of probability 3e-7 and steeply, close by, towards that of 2e-4."""
+    p = PHI(-5.0) + PHI(-3.5)
+    return reference("deceptive", lambda u: np.minimum(0.5 * (5 - u[:, 0]), 10 * (3.5 + u[:, 0])), 2, p)
+
+
+def noisy(dim=6, noise=0.5):
+    """f with noise of its own, a function of u that looks independent of it: p = Phi(-beta / sqrt(1 + noise^2))."""
+
+    def f(u):
+        share = 43758.5453 * np.sin(u @ np.linspace(9.1, 13.7, dim))
+        rough = stats.norm.ppf(np.clip(share - np.floor(share), 1e-9, 1 - 1e-9))
+        return 3.5 - u.sum(axis=1) / math.sqrt(dim) + noise * rough
+
+    return reference(f"noisy_d{dim}", f, dim, PHI(-3.5 / math.sqrt(1 + noise**2)))
+
+
+def linear(beta, dim=3):
+    return FunctionProblem(lambda u: beta - u[:, 0], dim)
+
+
+def near(result, p):
+    """Within four of its own standard errors."""
+    return abs(result.p / p - 1) < 4 * result.cov
+
+
+def sane(result, rows):
+    low, high = result.interval
+    assert result.n_sim == rows == sum(level.n_sim for level in result.trace)
+    assert 0 <= low <= result.p <= high <= 1
+    assert high > 0
+    assert result.cov >= 0
+
+
+def counted(recorder, problem, **options):
+    f = recorder(problem.f)
+    result = samplers.estimate(FunctionProblem(f, problem.dim), TS(), **options)
+    sane(result, f.rows)
+    return result
+
+
+# how much is simulated
+
+
+@pytest.mark.parametrize("max_sim", [1, 2, 7, 50, 399, 1500, 2000, 6000])
+def test_the_budget_is_used_up_and_not_exceeded(recorder, max_sim):
+    for problem in (half_space(100).problem, linear(3.0, 1)):
+        assert counted(recorder, problem, seed=1, max_sim=max_sim).n_sim == max_sim
+
+
+@pytest.mark.parametrize("max_sim", [400, 700, 1000])
+def test_a_budget_of_some_hundreds_is_used_up_and_not_exceeded(recorder, max_sim):
+    for problem in (half_space(100).problem, four_branches().problem, shell().problem):
+        assert counted(recorder, problem, seed=0, max_sim=max_sim).n_sim == max_sim
+
+
+@pytest.mark.slow
+def test_no_budget_is_exceeded_whatever_the_regions(recorder):
+    cube = FunctionProblem(lambda u: 3.3 - np.abs(u).max(axis=1), 10)
+    corners = FunctionProblem(lambda u: 1.6 - np.abs(u[:, :3]).min(axis=1), 5)
+    problems = [cube, corners, *(r.problem for r in (four_branches(), shell(2), shell(40), two_regions(60), noisy()))]
+    for problem in problems:
+        for max_sim in (400, 410, 450, 500, 600, 800, 1000, 1300, 2000, 3000):
+            for seed in range(3):
+                assert counted(recorder, problem, seed=seed, max_sim=max_sim).n_sim == max_sim
+
+
+def test_without_max_sim_it_makes_n():
+    assert samplers.estimate(half_space(100).problem, TS(n=2000), seed=1).n_sim == 2000
+    assert samplers.estimate(half_space(100).problem, TS(), seed=1).n_sim == 6000
+
+
+def test_too_small_a_budget_is_plain_monte_carlo_and_says_so():
+    result = samplers.estimate(half_space(2, 1.0).problem, TS(), seed=1, max_sim=300)
+    assert result.p * 300 == pytest.approx(round(result.p * 300))
+    assert any("too few for an exploration" in warning for warning in result.warnings)
+
+
+@pytest.mark.parametrize("n", [0, 399, 2.5, True, "6000"])
+def test_bad_settings_are_refused(n):
+    with pytest.raises(ValueError, match="TwoStage: expected n to be a whole number of at least 400"):
+        TS(n=n)
+
+
+def test_same_seed_same_answer_other_seed_another():
+    problem = half_space(100).problem
+    first, again, other = (samplers.estimate(problem, TS(), seed=seed, max_sim=2000) for seed in (1, 1, 2))
+    assert first == again
+    assert first.p != other.p
+
+
+def test_replicates_share_the_budget():
+    reference = half_space(100)
+    result = samplers.estimate(reference.problem, TS(), seed=1, max_sim=9001, replicates=4)
+    assert result.n_sim == 9001
+    assert result.interval[0] / 1.01 <= reference.p <= 1.01 * result.interval[1]
+
+
+# the target
+
+
+def test_target_is_met_with_fewer_simulations_than_n():
+    reference = half_space(100)
+    result = samplers.estimate(reference.problem, TS(), seed=1, target_cov=0.03)
+    assert result.cov <= 0.03
+    assert result.status == "converged"
+    assert result.n_sim < 6000
+    assert near(result, reference.p)
+
+
+def test_target_is_met_with_more_simulations_than_n():
+    reference = half_space(100)
+    result = samplers.estimate(reference.problem, TS(), seed=1, target_cov=0.003)
+    assert result.cov <= 0.003
+    assert result.n_sim > 6000
+    assert near(result, reference.p)
+
+
+def test_target_that_max_sim_does_not_allow():
+    result = samplers.estimate(half_space(100).problem, TS(), seed=1, target_cov=0.001, max_sim=7000)
+    assert result.n_sim == 7000
+    assert result.status == "budget"
+
+
+def test_target_where_failure_is_common():
+    result = samplers.estimate(linear(0.524), TS(), seed=1, target_cov=0.04)
+    assert result.cov <= 0.04
+    assert near(result, PHI(-0.524))
+
+
+def test_target_where_failure_is_common_takes_few_simulations():
+    assert samplers.estimate(linear(0.524), TS(), seed=1, target_cov=0.04).n_sim < 3000  # 1,460 would do
+
+
+# what is estimated
+
+
+def test_failure_is_common(recorder):
+    """Plain Monte Carlo from then on, with a binomial error."""
+    result = counted(recorder, linear(0.524), seed=1)
+    n = 6000 - sum(level.n_sim - level.n_points for level in result.trace[:1])
+    assert result.cov == pytest.approx(math.sqrt(0.7 / 0.3 / n), rel=0.1)
+    assert near(result, PHI(-0.524))
+
+
+def test_nothing_fails(recorder):
+    result = counted(recorder, FunctionProblem(lambda u: np.ones(len(u)), 3), seed=1)
+    assert result.p == 0
+    assert result.status == "no_hits"
+    assert result.interval[1] <= 4.0 / 5000  # Clopper and Pearson for the base draws
+
+
+def test_everything_fails(recorder):
+    result = counted(recorder, FunctionProblem(lambda u: -np.ones(len(u)), 3), seed=1)
+    assert result.p == result.interval[1] == 1
+    assert result.interval[0] > 0.999
+
+
+@pytest.mark.parametrize("beta", [2.0, 3.5, 5.0])
+def test_one_dimension(beta):
+    assert near(samplers.estimate(half_space(1, beta).problem, TS(), seed=1, max_sim=2000), PHI(-beta))
+
+
+def test_1500_dimensions(recorder):
+    """Fewer points than directions: coarse, but the interval holds p."""
+    reference = half_space(1500, 3.0)
+    result = counted(recorder, reference.problem, seed=1, max_sim=2500)
+    assert result.p > 0
+    assert result.interval[0] <= reference.p <= result.interval[1]
+
+
+@pytest.mark.parametrize(
+    "f",
+    [
+        lambda u: np.where(u[:, 0] > 3, -np.inf, np.inf),
+        lambda u: np.where(u[:, 0] > 3, -np.inf, 3 - u[:, 0]),
+        lambda u: np.where(u[:, 0] < 1, np.inf, 3 - u[:, 0]),
+        lambda u: np.where(u[:, 0] > 3, -1.0, 1.0),
+        lambda u: 1e100 * (3 - u[:, 0]),
+        lambda u: np.floor(2 * (3 - u[:, 0])) + 0.5,
+    ],
+    ids=["infinite", "-inf at failures", "+inf far away", "an indicator", "huge", "steps"],
+)
+def test_any_kind_of_outcome(f):
+    assert near(samplers.estimate(FunctionProblem(f, 3), TS(), seed=1, max_sim=2500), PHI(-3.0))
+
+
+def test_outcomes_near_the_largest_number():
+    problem = FunctionProblem(lambda u: 1e200 * (3 - u[:, 0]), 3)
+    assert near(samplers.estimate(problem, TS(), seed=1, max_sim=2500), PHI(-3.0))
+
+
+def test_gamma_shifts_the_threshold():
+    one, shifted = (samplers.estimate(linear(3.0 + g, 2), TS(), gamma=g, seed=1, max_sim=2000) for g in (0.0, 64.0))
+    for result in (one, shifted):
+        assert near(result, PHI(-3.0))
+    assert (shifted.failures.f <= 64.0).all()
+
+
+def test_missing_outcomes():
+    """NaN beyond u2 > 2.5: counted as failing, and left out of the lower end with "bound"."""
+
+    def f(u):
+        return np.where(u[:, 1] > 2.5, np.nan, 2.5 - u[:, 0])
+
+    problem, half = FunctionProblem(f, 3), PHI(-2.5)
+    with pytest.raises(samplers.EvaluationError):
+        samplers.estimate(problem, TS(), seed=1)
+    counts = samplers.estimate(problem, TS(), seed=1, max_sim=2500, on_error="failure")
+    bound = samplers.estimate(problem, TS(), seed=1, max_sim=2500, on_error="bound")
+    assert near(counts, 2 * half - half**2)
+    assert bound.p == counts.p
+    assert bound.interval[1] == counts.interval[1]
+    assert bound.interval[0] / counts.interval[0] == pytest.approx(0.5, abs=0.06)
+
+
+class Uniform:
+    """On the unit cube; u = Phi^-1(x)."""
+
+    def __init__(self, dim):
+        self.dim = dim
+
+    def sample(self, n, rng):
+        return rng.random((n, self.dim))
+
+    def log_prob(self, x):
+        return np.where(((x >= 0) & (x <= 1)).all(axis=1), 0.0, -np.inf)
+
+    def to_standard_normal(self, x):
+        return stats.norm.ppf(x)
+
+    def from_standard_normal(self, u):
+        return stats.norm.cdf(u)
+
+
+class Corner:
+    """x1 + x2 >= 1.97 on the unit cube: p = 0.03^2 / 2."""
+
+    dim, base = 3, Uniform(3)
+
+    def evaluate(self, x):
+        assert ((x >= 0) & (x <= 1)).all()
+        return 1.97 - x[:, 0] - x[:, 1]
+
+
+def test_nothing_is_simulated_outside_the_support():
+    result = samplers.estimate(Corner(), TS(), seed=1, max_sim=4000)
+    assert near(result, 0.03**2 / 2)
+    np.testing.assert_array_equal(result.failures.log_p0, 0.0)
+
+
+def test_sample_gives_p_and_higher_thresholds():
+    result = samplers.estimate(half_space(100, 3.5).problem, TS(), seed=1)
+    sample = result.sample
+    assert sample.weights[sample.f <= 0].sum() == pytest.approx(result.p, rel=1e-9)
+    for g in (0.5, 1.0, 2.0, 3.5):
+        weights = sample.weights[sample.f <= g]
+        assert weights.sum() == pytest.approx(PHI(g - 3.5), abs=4 * np.sqrt((weights**2).sum()))
+
+
+def test_estimate_rests_on_fresh_draws_alone():
+    """Its points are the last ones asked for; nothing of the exploration counts twice."""
+    reference, asked = half_space(100, 3.5), []
+    run = TS().start(reference.problem, seed=1)
+    while not run.done:
+        asked.append(run.ask())
+        run.tell(reference.problem.f(asked[-1]))
+    last = asked[-1]
+    result = run.result()
+    failing = last[reference.problem.f(last) <= 0]
+    np.testing.assert_array_equal(result.sample.x, failing)
+    assert result.trace[-1].n_sim == len(last)
+
+
+# ends before the end
+
+
+STOPPED = {r.name: r for r in (half_space(100, 3.0), two_regions(5, 2.8, 3.0))}
+
+
+@functools.cache
+def batches_of(name):
+    """How many batches the whole run takes."""
+    run, n = TS(n=4000).start(STOPPED[name].problem, seed=3), 0
+    while not run.done:
+        run.tell(STOPPED[name].problem.f(run.ask()))
+        n += 1
+    return n
+
+
+@pytest.mark.parametrize("after", [1, 2, 5, 20, 40, 44, 100])
+@pytest.mark.parametrize("reference", STOPPED.values(), ids=STOPPED)
+def test_stopped_in_any_phase(reference, after):
+    """What draws from known laws say so far: an interval that holds p, give or take."""
+    run, rows = TS(n=4000).start(reference.problem, seed=3), 0
+    for _ in range(min(after, batches_of(reference.name) - 1)):
+        u = run.ask()
+        rows += len(u)
+        run.tell(reference.problem.f(u))
+    assert not run.done
+    run.stop()
+    result = run.result()
+    sane(result, rows)
+    assert result.status == "stopped"
+    assert result.interval[0] / 1.3 <= reference.p <= 1.3 * result.interval[1]
+    if result.p > 0:
+        assert result.cov < 2
+        assert result.sample.weights[result.sample.f <= 0].sum() == pytest.approx(result.p)
+
+
+def test_stopped_in_the_estimate():
+    reference = half_space(100, 3.0)
+    run = TS(n=3000).start(reference.problem, seed=3, target_cov=0.004)
+    sizes = []
+    while len(sizes) < 3 or sizes[-3:] != [300] * 3:  # three batches of the estimate
+        u = run.ask()
+        sizes.append(len(u))
+        run.tell(reference.problem.f(u))
+    result = run.result()
+    assert result.status == "stopped"
+    assert near(result, reference.p)
+    assert result.trace[-1].n_sim == 300
+
+
+# where no proposal describes the failures
+
+
+def case(name):
+    """A problem of the benchmark for which no proposal is to be found."""
+    state = CASES[name].make()
+    return Reference(name, state.problem(), state.p)
+
+
+@pytest.mark.parametrize("name", ["slabs_d20", "squares_d50"])
+def test_subset_simulation_takes_over(recorder, name):
+    reference = case(name)
+    for seed in range(3):
+        result = counted(recorder, reference.problem, seed=seed, max_sim=6000)
+        assert result.warnings[0].startswith("No proposal describes the failures")
+        assert result.interval[0] < reference.p < result.interval[1]
+        assert 0.15 < result.cov < 1
+        assert result.n_sim <= 6000
+
+
+def test_a_region_so_far_out_that_its_weights_vanish(recorder):
+    """Wide draws in 800 dimensions reach |u| > 65, whose probability is below the smallest float."""
+
+    def f(u):
+        return np.minimum(3.3 - u[:, 0], (65.0**2 - (u**2).sum(axis=1)) / 50)
+
+    for seed in range(2):
+        result = counted(recorder, FunctionProblem(f, 800), seed=seed, max_sim=3000)
+        assert result.interval[0] < PHI(-3.3) < result.interval[1]
+
+
+def test_subset_simulation_takes_as_many_points_as_the_target_asks_for(recorder):
+    sizes = [counted(recorder, case("slabs_d20").problem, seed=0, target_cov=target).n_sim for target in (0.3, 0.5)]
+    assert 4000 < sizes[1] < sizes[0] < 12_000
+
+
+def test_subset_simulation_is_stopped():
+    reference = case("slabs_d20")
+    run = TS().start(reference.problem, seed=0)
+    while not run.done and run.progress.n_sim < 5000:
+        run.tell(reference.problem.f(run.ask()))
+    run.stop()
+    result = run.result()
+    assert result.status == "stopped"
+    assert result.n_sim == sum(level.n_sim for level in result.trace)
+
+
+@pytest.mark.parametrize("max_sim", [800, 1500])
+def test_a_small_exploration_says_so(max_sim):
+    result = samplers.estimate(linear(3.0), TS(), seed=0, max_sim=max_sim)
+    assert any("may miss regions" in text for text in result.warnings) == (max_sim < 1500)
+
+
+# studies
+
+
+def judge(found, bias=0.01):
+    """Mean within four standard errors and a little; intervals hold p no less often than nine in ten times."""
+    runs = len(found.results)
+    error = max(found.ratios.std(ddof=1), found.own_cov) / math.sqrt(runs)
+    assert abs(found.ratios.mean() - 1) < 4 * error + bias
+    assert found.covered >= stats.binom.ppf(1e-3, runs, 0.90)
+
+
+@pytest.mark.parametrize(
+    ("reference", "max_sim"),
+    [(half_space(100), 3000), (two_regions(10), 2500), (deceptive(), 3000), (plateau(), 2500), (noisy(), 3000)],
+    ids=lambda value: getattr(value, "name", ""),
+)
+def test_right_and_covered(study, reference, max_sim):
+    judge(study(reference, TS(), 6, max_sim=max_sim))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "reference",
+    [
+        half_space(2),
+        half_space(100),
+        half_space(6, 5.0),
+        two_regions(10),
+        two_regions(30),
+        four_branches(),
+        plateau(),
+        shell(),
+        shell(2),
+        deceptive(),
+        noisy(),
+    ],
+    ids=lambda r: r.name,
+)
+def test_right_and_covered_with_many_seeds(study, reference):
+    found = study(reference, TS(), 40)
+    judge(found, 0.005)
+    assert 0.6 < found.own_cov / found.ratios.std(ddof=1) < 1.6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["slabs_d20", "squares_d50"])
+def test_subset_simulation_is_right_and_covered(study, name):
+    judge(study(case(name), TS(), 40), 0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("p", [0.05, 0.1, 0.2])
+def test_hardly_any_bias_where_plain_draws_take_over(study, p):
+    """Whether a tenth of the base draws fails decides on the rest, and they count: 0.8 % too high at p = 0.1."""
+    beta = -stats.norm.ppf(p)
+    judge(study(reference("common", lambda u: beta - u[:, 0], 2, p), TS(), 100, max_sim=2000), 0.008)
+
+
+@pytest.mark.parametrize("regions", [1, 4])
+def test_ten_replicates_share_a_small_budget(recorder, regions):
+    def f(u):
+        return 3.5 - u[:, :regions].max(axis=1)
+
+    result = counted(recorder, FunctionProblem(f, 8), seed=1, max_sim=6000, replicates=10)
+    assert result.n_sim <= 6000
+    low, high = result.interval
+    assert low / 3 < regions * PHI(-3.5) < 3 * high

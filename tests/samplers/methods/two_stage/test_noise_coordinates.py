@@ -1,0 +1,114 @@
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import samplers
+from samplers.limit_states import Reference
+from samplers.methods.two_stage.noise_coordinates import noise_of, without_noise
+from samplers.problem import FunctionProblem, StandardNormal
+
+PHI = stats.norm.cdf
+
+
+@dataclasses.dataclass(frozen=True)
+class PartlyNoise(StandardNormal):
+    """N(0, I) of which all but the first coordinates are noise."""
+
+    first: int = 1
+
+    @property
+    def noise(self):
+        return np.arange(self.dim) >= self.first
+
+
+@dataclasses.dataclass(frozen=True)
+class WithNoise(FunctionProblem):
+    first: int = 1
+
+    @property
+    def base(self):
+        return PartlyNoise(self.dim, self.first)
+
+
+def sum_of(u):
+    """Standard normal, from all of the noise."""
+    return u[:, 3:].sum(axis=1) / np.sqrt(u.shape[1] - 3)
+
+
+def problem(f):
+    return WithNoise(f, 303, 3)
+
+
+PROBLEMS = {
+    "noise that does nothing": (lambda u: 3.5 - u[:, 0], PHI(-3.5)),
+    "noise beside a parameter": (lambda u: 3.5 - u[:, 0] - 0.3 * sum_of(u), PHI(-3.5 / np.sqrt(1.09))),
+    "two regions": (
+        lambda u: np.minimum(3.4 - u[:, 0], 3.5 + u[:, 1]) - 0.2 * sum_of(u),
+        1
+        - stats.norm.expect(
+            lambda z: stats.norm.cdf(3.4 - 0.2 * z) * stats.norm.cdf(3.5 - 0.2 * z),
+        ),
+    ),
+    "noise alone": (lambda u: 3.2 - sum_of(u), PHI(-3.2)),
+}
+GAINS = {"noise that does nothing": 1000, "noise beside a parameter": 10, "two regions": 10, "noise alone": 0.5}
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_probability(name):
+    f, p = PROBLEMS[name]
+    results = [samplers.estimate(problem(f), seed=seed, max_sim=6000) for seed in range(2)]
+    for result in results:
+        assert abs(np.log(result.p / p)) < 4 * result.cov
+        assert result.n_sim <= 6000
+        assert bool(result.warnings) == (name == "noise alone")
+    square = np.mean([(result.p / p - 1) ** 2 + result.cov**2 for result in results])
+    assert 1 / (p * 6000 * square) > GAINS[name]
+
+
+def test_failures_replay_and_their_noise_is_noise():
+    f, _ = PROBLEMS["noise beside a parameter"]
+    result = samplers.estimate(problem(f), seed=0, max_sim=3000)
+    x = np.array([failure.x for failure in result.failures])
+    np.testing.assert_array_equal(f(x), [failure.f for failure in result.failures])
+    size = (x[:, 3:] ** 2).mean(axis=1)  # wide draws of it would have 2 to 9
+    assert np.all(np.abs(size - 1) < 6 * np.sqrt(2 / 300))
+
+
+def test_the_same_seed_gives_the_same_noise_and_another_another():
+    f, _ = PROBLEMS["noise beside a parameter"]
+    first, again, other = (samplers.estimate(problem(f), seed=seed, max_sim=1500) for seed in (1, 1, 2))
+    assert first.p == again.p != other.p
+    np.testing.assert_array_equal(first.failures[0].x, again.failures[0].x)
+
+
+def test_points_keep_their_noise():
+    inputs = without_noise(problem(sum_of), np.random.default_rng(0))
+    assert inputs.dim == 3
+    u = np.random.default_rng(1).standard_normal((5, 3))
+    x = inputs.base.from_standard_normal(u)
+    again = inputs.base.from_standard_normal(np.concatenate([u[2:], u + 1e-9]))
+    np.testing.assert_array_equal(again[:3], x[2:])
+    assert np.abs(again[3:, 3:] - x[:, 3:]).min(axis=0).max() > 0
+    np.testing.assert_array_equal(inputs.base.to_standard_normal(x), u)
+    assert inputs.base.sample(4, np.random.default_rng(2)).shape == (4, 303)
+
+
+def test_inputs_without_noise_are_searched_as_they_are():
+    plain, rng = FunctionProblem(sum_of, 303), np.random.default_rng(0)
+    assert without_noise(plain, rng) is plain
+    assert not noise_of(plain).any()
+    all_noise = WithNoise(sum_of, 303, 0)
+    assert without_noise(all_noise, rng) is all_noise
+    assert rng.random() == np.random.default_rng(0).random()  # no number was drawn
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_right_and_covered(study, name):
+    f, p = PROBLEMS[name]
+    found = study(Reference(name, problem(f), float(p)), samplers.TwoStage(), 60)
+    assert abs(found.ratios.mean() - 1) < 4 * max(found.ratios.std(ddof=1), found.own_cov) / np.sqrt(60)
+    assert found.covered >= stats.binom.ppf(1e-3, 60, 0.95)

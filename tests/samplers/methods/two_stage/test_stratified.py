@@ -1,0 +1,188 @@
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.integrate import simpson
+
+from samplers.methods.two_stage.mixture.proposal import GATE_DRAWS, Candidate, Proposal
+from samplers.methods.two_stage.simulator import Batch
+from samplers.methods.two_stage.stratified import FEWEST, Strata
+from samplers.problem import FunctionProblem
+from samplers.proposals.components import Bump, Slice, Wide, draw, draw_counts
+
+BETA = 2.0
+P = stats.norm.sf(BETA)
+PROBLEM = FunctionProblem(lambda u: BETA - u[:, 0], 1)
+
+
+def on_the_line(mean, variance):
+    return Bump(np.eye(1), np.array([mean]), np.array([variance]))
+
+
+LAWS = [
+    (Wide(1), stats.norm(0, 1)),
+    (on_the_line(2.3, 0.5), stats.norm(2.3, math.sqrt(0.5))),
+    (on_the_line(-2.0, 1.0), stats.norm(-2.0, 1.0)),  # wasted: stratified, it adds no variance
+    (Slice(np.ones(1), 1.5), stats.truncnorm(1.5, np.inf)),
+]
+WEIGHTS = np.array([0.2, 0.3, 0.3, 0.2])
+PROPOSAL = Proposal([Candidate(component, "bump") for component, _ in LAWS], WEIGHTS)
+UNUSED = Proposal([*PROPOSAL.candidates, Candidate(Wide(1, 3.0), "wide")], np.append(WEIGHTS, 0.0))
+
+
+def mixture(x):
+    return sum(a * law.pdf(x) for a, (_, law) in zip(WEIGHTS, LAWS, strict=True))
+
+
+def moment(law, power):
+    """E[y^power], y = phi / q at failures, else 0, under one of the components."""
+    x = np.linspace(BETA, 12, 10_001)
+    return simpson(law.pdf(x) * (stats.norm.pdf(x) / mixture(x)) ** power, x=x)
+
+
+WITHIN = sum(a * (moment(law, 2) - moment(law, 1) ** 2) for a, (_, law) in zip(WEIGHTS, LAWS, strict=True))
+TOTAL = sum(a * moment(law, 2) for a, (_, law) in zip(WEIGHTS, LAWS, strict=True)) - P**2
+
+
+def batch(counts, rng, proposal=PROPOSAL):
+    counts = np.asarray(counts)
+    u = draw(proposal.components, counts, rng)
+    return Batch(proposal.components, counts, u, PROBLEM.evaluate(u))
+
+
+def strata(*batches, proposal=PROPOSAL):
+    found = Strata.none(len(proposal.weights), 1, np.empty(0))
+    for part in batches:
+        found = found.joined(part, proposal, PROBLEM, 0.0)
+    return found
+
+
+def variance_within(found):
+    """The variance of p-hat as estimated, without what is added for the largest term."""
+    largest = math.exp(float(found.draws.log_weights.max())) / found.draws.n
+    return (found.cov * found.p) ** 2 - largest**2
+
+
+def repeated(n, runs, rng, counts=None):
+    return [strata(batch(draw_counts(WEIGHTS, n, rng) if counts is None else counts(), rng)) for _ in range(runs)]
+
+
+@pytest.mark.parametrize("n", [100, 157])
+def test_right_on_average_with_the_variance_that_it_says(n, rng):
+    """Against integrals; 157 draws are not a whole number for each component."""
+    runs = 600
+    found = repeated(n, runs, rng)
+    p = np.array([one.p for one in found])
+    assert p.mean() == pytest.approx(P, abs=4 * math.sqrt(WITHIN / n / runs))
+    assert p.var(ddof=1) == pytest.approx(WITHIN / n, rel=4 * math.sqrt(2.5 / runs))
+    own = np.array([variance_within(one) for one in found])
+    assert own.mean() == pytest.approx(WITHIN / n, abs=4 * own.std() / math.sqrt(runs) + 0.01 * WITHIN / n)
+
+
+def test_its_variance_is_that_of_independent_draws_less_that_between_the_components(rng):
+    runs, n = 600, 100
+    independent = [one.p for one in repeated(n, runs, rng, lambda: rng.multinomial(n, WEIGHTS))]
+    assert np.mean(independent) == pytest.approx(P, abs=4 * math.sqrt(TOTAL / n / runs))
+    assert np.var(independent) == pytest.approx(TOTAL / n, rel=4 * math.sqrt(2.5 / runs))
+    assert WITHIN < 0.8 * TOTAL
+    one = repeated(20_000, 1, rng)[0]
+    assert variance_within(one) / (one.draws.cov * one.p) ** 2 == pytest.approx(WITHIN / TOTAL, abs=0.03)
+
+
+def test_components_with_few_draws_count_with_their_second_moment(rng):
+    """Too large rather than too small: a variance of a handful of draws is worth nothing."""
+    counts = np.array([FEWEST - 1] * 4)
+    own = [variance_within(strata(batch(counts, rng))) for _ in range(600)]
+    n = counts.sum()
+    second = sum(moment(law, 2) for _, law in LAWS) * (FEWEST - 1) / n**2
+    assert np.mean(own) == pytest.approx(second, abs=4 * np.std(own) / math.sqrt(600))
+
+
+def test_batches_together_are_one_sample(rng):
+    first, second = batch([20, 30, 30, 20], rng), batch([40, 60, 60, 40], rng)
+    found, swapped = strata(first, second), strata(second, first)
+    assert found.draws.n == 300
+    np.testing.assert_array_equal(found.counts, [60, 90, 90, 60])
+    assert found.p == pytest.approx(swapped.p, rel=1e-12)
+    assert found.cov == pytest.approx(swapped.cov, rel=1e-9)
+    y = np.exp(PROPOSAL.log_weights(np.concatenate([first.u, second.u]))) * (np.concatenate([first.f, second.f]) <= 0)
+    assert found.p == pytest.approx(y.mean(), rel=1e-12)
+
+
+def test_a_component_without_weight_changes_nothing():
+    with_it = strata(batch([20, 30, 30, 20, 0], np.random.default_rng(1), UNUSED), proposal=UNUSED)
+    without = strata(batch([20, 30, 30, 20], np.random.default_rng(1)))
+    assert with_it.p == without.p
+    assert with_it.cov == pytest.approx(without.cov)
+
+
+def test_without_a_failing_draw_nothing_is_known_of_the_spread(rng):
+    found = strata(batch([5, 0, 50, 0], np.random.default_rng(0)))
+    assert found.p == 0
+    assert found.cov == math.inf
+    assert Strata.none(4, 1, np.empty(0)).cov == math.inf
+
+
+def test_weights_of_base_draws_are_bounded(rng):
+    found = repeated(5000, 1, rng)[0]
+    everything = np.concatenate([found.draws.log_weights, found.draws.log_weights_safe])
+    assert math.exp(everything.max()) <= 1 / 0.2 + 1e-9
+
+
+def test_sample_adds_up_to_p_and_serves_higher_thresholds(rng):
+    """With base draws of an exploration for where the proposal hardly draws: P[f <= g] = P[u >= beta - g]."""
+    found = repeated(4000, 1, rng)[0]
+    base_u = rng.standard_normal((500, 1))
+    sample = found.sample(PROPOSAL, PROBLEM.evaluate(base_u), base_u, 0.0)
+    assert len(sample.f) == len(sample.weights) == len(sample.units) <= sample.n_units == 4500
+    assert len(np.unique(sample.units)) == len(sample.units)
+    assert sample.units.max() < sample.n_units
+    assert sample.weights[sample.f <= 0].sum() == pytest.approx(found.p, rel=1e-12)
+    np.testing.assert_allclose(PROBLEM.evaluate(sample.x), sample.f[sample.f <= 0])
+    for g in (0.5, 1.0, 2.0, 4.0, 10.0):
+        weights = sample.weights[sample.f <= g]
+        assert weights.sum() == pytest.approx(stats.norm.sf(BETA - g), abs=4 * np.sqrt((weights**2).sum()))
+
+
+def test_sample_without_base_draws(rng):
+    found = repeated(4000, 1, rng)[0]
+    sample = found.sample(PROPOSAL, np.empty(0), np.empty((0, 1)), 0.0)
+    assert sample.n_units == len(sample.f) == 4000
+    assert sample.weights.sum() == pytest.approx(1.0, abs=4 * np.sqrt((sample.weights**2).sum()))
+
+
+def gate(u):
+    """Lets most draws short of the threshold go, as a classifier would that is not quite right."""
+    return np.where(u[:, 0] > 2.1, 1.0, 0.3)
+
+
+def passed(law):
+    return law.sf(2.1) + 0.3 * law.cdf(2.1)
+
+
+def test_a_gate_thins_components_and_the_weights_account_for_it(rng):
+    """The shares that it lets through are estimated once, by drawing: their error is that of all runs together."""
+    proposal = PROPOSAL.behind(gate, rng)
+    for (_, law), mass, weight in zip(LAWS, proposal.mass, WEIGHTS, strict=True):
+        share, drawn = passed(law), max(GATE_DRAWS * weight, 500)
+        assert mass == pytest.approx(share, abs=4 * math.sqrt(0.25 / drawn))
+    found = []
+    for _ in range(300):
+        u, counts = proposal.drawn(100, rng)
+        found.append(strata(Batch(proposal.components, counts, u, PROBLEM.evaluate(u)), proposal=proposal))
+    p = np.array([one.p for one in found])
+    assert p.mean() == pytest.approx(P, abs=4 * math.hypot(p.std() / math.sqrt(300), proposal.mass_cov * P))
+    own = np.mean([variance_within(one) for one in found])
+    assert own == pytest.approx(p.var(), rel=4 * math.sqrt(2.5 / 300))
+    assert 0 < proposal.mass_cov < 0.02
+
+
+def test_base_and_wide_draws_pass_every_gate(rng):
+    candidates = [Candidate(Wide(1), "base"), Candidate(Wide(1, 1.5), "wide"), Candidate(LAWS[1][0], "bump")]
+    proposal = Proposal(candidates, np.array([0.2, 0.2, 0.6])).behind(gate, rng)
+    np.testing.assert_array_equal(proposal.mass[:2], 1.0)
+    u, counts = proposal.drawn(10_000, rng)
+    assert stats.kstest(u[: counts[0], 0], "norm").pvalue > 1e-4
+    weights = np.exp(proposal.log_weights(np.linspace(-10, 10, 500)[:, None]))
+    assert weights.max() <= 1 / 0.2

@@ -1,0 +1,284 @@
+import json
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+import samplers
+from samplers.limit_states import half_space
+
+PROBLEM = half_space().problem
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"gamma": float("nan")}, "gamma to be a finite number, got nan"),
+        ({"gamma": float("inf")}, "gamma to be a finite number"),
+        ({"gamma": "0"}, "gamma to be a finite number"),
+        ({"gamma": None}, "gamma to be a finite number, got None"),
+        ({"gamma": True}, "gamma to be a finite number, got True"),
+        ({"gamma": 10**400}, "gamma to be a finite number, got 10"),
+        ({"confidence": "0.9"}, "confidence to be a number between 0 and 1, got '0.9'"),
+        ({"confidence": True}, "confidence"),
+        ({"max_sim": "5"}, "max_sim to be a whole number of at least 1, got '5'"),
+        ({"max_sim": True}, "max_sim"),
+        ({"target_cov": "0.1"}, "target_cov to be a number between 0 and inf, got '0.1'"),
+        ({"target_cov": True}, "target_cov"),
+        ({"target_cov": 10**400}, "target_cov"),
+        ({"replicates": None}, "replicates to be a whole number of at least 1, got None"),
+        ({"replicates": 2.0}, "replicates"),
+        ({"replicates": True}, "replicates"),
+        ({"seed": "1"}, "seed to be a whole number of at least 0, got '1'"),
+        ({"seed": False}, "seed"),
+        ({"on_error": None}, "on_error None"),
+        ({"on_error": np.array(["raise"])}, "on_error"),
+        ({"confidence": 1.2}, "confidence to be a number between 0 and 1, got 1.2"),
+        ({"confidence": 0}, "confidence"),
+        ({"max_sim": -5}, "max_sim to be a whole number of at least 1, got -5"),
+        ({"max_sim": 0}, "max_sim"),
+        ({"max_sim": 1e4}, "max_sim"),
+        ({"max_sim": 3, "replicates": 4}, "max_sim to be a whole number of at least 4, got 3"),
+        ({"target_cov": 0.0}, "target_cov to be a number between 0 and inf, got 0.0"),
+        ({"target_cov": -0.1}, "target_cov"),
+        ({"target_cov": float("nan")}, "target_cov"),
+        ({"replicates": 0}, "replicates to be a whole number of at least 1, got 0"),
+        ({"seed": -1}, "seed to be a whole number of at least 0, got -1"),
+        ({"seed": 1.5}, "seed"),
+        ({"on_error": "ignore"}, "on_error 'ignore'.*Valid: raise, failure, bound"),
+        ({"method": "adds"}, "method 'adds'. Did you mean 'adss'.*Valid: two-stage, mc, .*adss"),
+        ({"method": samplers.MonteCarlo}, "the class MonteCarlo; add brackets"),
+        ({"method": 3}, "a method such as MonteCarlo"),
+        ({"progress": 1}, "progress to be True, False or a function"),
+        ({"time_limit": -1}, "time_limit to be a number between 0 and inf, got -1"),
+        ({"time_limit": 0}, "time_limit"),
+        ({"time_limit": float("nan")}, "time_limit"),
+        ({"time_limit": "3 s"}, "time_limit"),
+        ({"stop": True}, "stop to be a function of Progress, got True"),
+    ],
+)
+def test_bad_arguments_are_refused_before_any_simulation(options, expected, recorder):
+    f = recorder(PROBLEM.f)
+    with pytest.raises(ValueError, match=expected):
+        samplers.estimate(samplers.FunctionProblem(f, 2), **options)
+    assert f.rows == 0
+
+
+def test_a_problem_must_look_like_one():
+    with pytest.raises(ValueError, match="FunctionProblem"):
+        samplers.estimate(lambda x: x)
+
+    class NoBase:
+        dim, base = 2, None
+
+        def evaluate(self, x):
+            return x[:, 0]
+
+    with pytest.raises(ValueError, match=r"problem.base to have sample"):
+        samplers.estimate(NoBase())
+
+    class NoDim(NoBase):
+        dim, base = 0, samplers.StandardNormal(1)
+
+    with pytest.raises(ValueError, match="dim to be a whole number"):
+        samplers.estimate(NoDim())
+
+
+def test_unknown_setting_is_named():
+    with pytest.raises(ValueError, match=r"setting of CrossEntropy 'alfa'. Did you mean 'alpha'"):
+        samplers.get_method("ce", alfa=0.5)
+    assert samplers.get_method("ce", alpha=0.5) == samplers.CrossEntropy(alpha=0.5)
+
+
+@pytest.mark.parametrize(
+    ("cls", "name", "expected"),
+    [
+        (samplers.AdaptiveSubsetSimulation, "scale", "a number 0 < scale < inf"),
+        (samplers.AdaptiveSubsetSimulation, "p0", "a number 0 < p0 < 0.5"),
+        (samplers.AdaptiveSubsetSimulation, "target_acceptance", "a number 0 < target_acceptance < 1"),
+        (samplers.AdaptiveSubsetSimulation, "sigma0", 'sigma0 "unit" or "seeds"'),
+        (samplers.AdaptiveSubsetSimulation, "n", "n to be a whole number of at least 10"),
+        (samplers.CrossEntropy, "rho", "a number 0 < rho < 0.5"),
+        (samplers.CrossEntropy, "base_share", "a number 0 < base_share < 1"),
+        (samplers.CrossEntropy, "wide_share", "a number 0 < wide_share < 0.9"),
+        (samplers.CrossEntropy, "wide_factor", "a number 1 < wide_factor < inf"),
+        (samplers.CrossEntropy, "family", 'family "gaussian" or "mean"'),
+        (samplers.MonteCarlo, "n", "n to be a whole number of at least 1"),
+    ],
+)
+@pytest.mark.parametrize("value", [None, "a", True, [0.3], np.array([0.3, 0.4])], ids=repr)
+def test_settings_of_the_wrong_type_are_refused_by_name(cls, name, expected, value):
+    with pytest.raises(ValueError, match=f"{cls.__name__}: expected {expected}"):
+        cls(**{name: value})
+
+
+def test_step_size_is_named_and_may_be_one():
+    for wrong in (0, 0.0, -0.1, 1.0000001, float("nan"), 10**400):
+        with pytest.raises(ValueError, match=r"CrossEntropy: expected a number 0 < alpha <= 1, got"):
+            samplers.CrossEntropy(alpha=wrong)
+    assert samplers.CrossEntropy(alpha=1).alpha == 1
+
+
+def test_numbers_of_numpy_are_numbers():
+    method = samplers.MonteCarlo(n=np.int64(500), batch=np.int32(100))
+    result = samplers.estimate(
+        PROBLEM, method, gamma=np.float32(2.0), confidence=np.float32(0.5), seed=np.int64(1), replicates=np.int8(2)
+    )
+    assert result.n_sim == 1000
+    settings = json.loads(result.to_json())["method"]["settings"]
+    assert (settings["n"], settings["batch"]) == (500, 100)
+
+
+def test_default_method_and_name_as_string():
+    assert samplers.estimate(PROBLEM, seed=1) == samplers.estimate(PROBLEM, "two-stage", seed=1)
+
+
+def test_f_of_the_wrong_length():
+    with pytest.raises(ValueError, match=r"Expected f to return shape \(1000,\)"):
+        samplers.estimate(samplers.FunctionProblem(lambda x: np.zeros(3), 2), "adss", seed=1)
+
+
+def test_a_drawn_seed_repeats_the_run():
+    first = samplers.estimate(PROBLEM, "mc", max_sim=1000)
+    assert samplers.estimate(PROBLEM, "mc", max_sim=1000, seed=first.seed) == first
+    assert samplers.estimate(PROBLEM, "mc", max_sim=1000).seed != first.seed
+
+
+def test_confidence_widens_the_interval():
+    narrow, wide = (samplers.estimate(PROBLEM, seed=1, confidence=c) for c in (0.5, 0.99))
+    assert wide.interval[0] < narrow.interval[0] < narrow.p
+    assert narrow.p < narrow.interval[1] < wide.interval[1]
+
+
+def broken_where_u2_is_large(x):
+    """NaN in a tenth of the failing half-space and of everything else."""
+    f = 1.5 - x[:, 0]
+    f[x[:, 1] > 1.2815515655446004] = np.nan
+    return f
+
+
+def test_nan_raises_with_row_and_x():
+    problem = samplers.FunctionProblem(broken_where_u2_is_large, 2)
+    with pytest.raises(samplers.EvaluationError, match=r"NaN for row \d+ of a batch .* x = \["):
+        samplers.estimate(problem, seed=1)
+
+
+@pytest.mark.parametrize("method", sorted(samplers.METHODS))
+def test_nan_as_failure_or_bound(method):
+    """p = P[u1 >= 1.5 or u2 > 1.28] with NaN as failure; 0.9 x 0.0668 fail for certain."""
+    problem = samplers.FunctionProblem(broken_where_u2_is_large, 2)
+    certain, doubtful = 0.9 * 0.0668072, 0.1
+    counted, bound = (
+        samplers.estimate(problem, method, seed=2, max_sim=5000, on_error=on_error) for on_error in ("failure", "bound")
+    )
+    assert counted.p == pytest.approx(certain + doubtful, rel=4 * counted.cov)
+    assert counted.cov < 0.1
+    assert counted.interval[0] > 0.1
+    assert bound.p == counted.p
+    assert bound.interval[1] == counted.interval[1]
+    assert bound.interval[0] == pytest.approx(certain, rel=0.35)
+    assert any("gave no outcome" in text for text in bound.warnings)
+    assert np.isnan(bound.failures.f).any()
+
+
+def test_f_that_raises_is_searched_for_the_row():
+    def f(x):
+        if (x[:, 0] > 3).any():
+            raise ArithmeticError("ego left the map")
+        return 2.0 - x[:, 0]
+
+    problem = samplers.FunctionProblem(f, 1)
+    with pytest.raises(samplers.EvaluationError, match=r"row \d+ .*ego left the map"):
+        samplers.estimate(problem, "mc", seed=1, max_sim=20_000)
+    result = samplers.estimate(problem, "mc", seed=1, max_sim=5000, on_error="failure")
+    assert result.n_sim == 5000
+    assert any("handed to f again" in text for text in result.warnings)
+
+
+def test_a_method_of_your_own(recorder):
+    """Anything with name, stops_at_target and steps; it cannot overspend or hide calls."""
+
+    class Greedy:
+        name, stops_at_target = "greedy", True
+
+        def steps(self, inputs, goal, rng):
+            assert not hasattr(inputs, "evaluate")
+            f = yield rng.standard_normal((100, inputs.dim))
+            p = float(np.mean(f <= goal.gamma))
+            return samplers.Outcome(p=p, interval=(0.0, 1.0), cov=0.1, status=samplers.Status.CONVERGED)
+
+    f = recorder(PROBLEM.f)
+    problem = samplers.FunctionProblem(f, 2)
+    assert samplers.estimate(problem, Greedy(), seed=1).n_sim == 100
+    with pytest.raises(RuntimeError, match=r"must keep to goal\.max_sim"):
+        samplers.estimate(problem, Greedy(), seed=1, max_sim=99)
+    assert f.rows == 100
+
+
+def test_importing_it_imports_no_torch_and_no_driving():
+    code = (
+        "import sys, samplers;"
+        "print([m for m in ('torch', 'rare_envs', 'agents', 'rich', 'gymnasium') if m in sys.modules])"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.strip() == "[]"
+
+
+def slow(x):
+    time.sleep(0.02)
+    return 2.0 - x[:, 0]
+
+
+@pytest.mark.parametrize("replicates", [1, 3])
+def test_time_limit(replicates, recorder):
+    f = recorder(slow)
+    problem, method = samplers.FunctionProblem(f, 2), samplers.MonteCarlo(batch=100)
+    result = samplers.estimate(problem, method, seed=1, max_sim=10**6, time_limit=0.1, replicates=replicates)
+    assert result.status == "stopped"
+    assert result.n_sim == f.rows == 100 * replicates * len(f.batches)
+    assert 1 <= len(f.batches) <= 6
+    assert any(f"time limit of 0.1 s after {f.rows:,} simulations" in text for text in result.warnings)
+    assert result.p == result.failures.total / f.rows
+
+
+def test_time_enough_changes_nothing():
+    plain = samplers.estimate(PROBLEM, "mc", seed=1, max_sim=1000)
+    assert samplers.estimate(PROBLEM, "mc", seed=1, max_sim=1000, time_limit=100, stop=lambda progress: False) == plain
+
+
+@pytest.mark.parametrize("name", sorted(samplers.METHODS))
+@pytest.mark.parametrize("replicates", [1, 2])
+def test_stopped_by_a_callback(name, replicates, recorder):
+    f = recorder(PROBLEM.f)
+    seen = []
+
+    def after_1000(progress):
+        seen.append(progress.n_sim)
+        return progress.n_sim >= 1000
+
+    method = samplers.MonteCarlo(batch=400) if name == "mc" else samplers.get_method(name)
+    result = samplers.estimate(
+        samplers.FunctionProblem(f, 2), method, seed=1, max_sim=5000, replicates=replicates, stop=after_1000
+    )
+    assert result.status == "stopped"
+    assert result.n_sim == f.rows == seen[-1] == sum(level.n_sim for level in result.trace)
+    assert len(seen) == len(f.batches)
+    low, high = result.interval
+    assert 0 <= low <= result.p <= high <= 1
+    assert any(f"Stopped by the callback after {f.rows:,} simulations" in text for text in result.warnings)
+
+
+def test_a_stop_with_the_last_batch_is_none():
+    result = samplers.estimate(PROBLEM, "mc", seed=1, max_sim=1000, stop=lambda progress: True)
+    assert result == samplers.estimate(PROBLEM, "mc", seed=1, max_sim=1000)
+
+
+def test_a_target_that_is_met_in_fact():
+    """The spread of p-hat over 200 seeds is at most 1.3 times the target."""
+    target, runs = 0.2, 200
+    problem = half_space(2, 1.5).problem
+    method = samplers.MonteCarlo(batch=50)
+    p = np.array([samplers.estimate(problem, method, seed=seed, target_cov=target).p for seed in range(runs)])
+    assert p.std(ddof=1) / half_space(2, 1.5).p <= 1.3 * target

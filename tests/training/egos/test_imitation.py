@@ -1,0 +1,135 @@
+"""The shipped ego `imitation`: what it learns in, that its training repeats, and that it drives as it should."""
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+import agents
+import rare_envs
+from rare_envs.control.idm import IDM
+from rare_envs.egos.wrappers import observation_for
+from rare_envs.scenarios.cut_in import CUT_IN
+from rare_envs.simulation.observation import observation_space
+from rare_envs.simulation.rollout import drive
+from rare_envs.simulation.world import World
+from tests.training.imitation.synthetic_scenes import scene
+from training.egos.encounters import APART, Kind, encounters
+from training.egos.imitation import CONFIG, prepare, train
+from training.egos.nominal_driving import judge, summary_of
+from training.egos.nominal_traffic import CASES
+from training.imitation.algorithms.config import Config
+from training.imitation.fit import fit
+from training.imitation.traffic.recording import stack
+from training.imitation.traffic.replayed_traffic import start, step
+
+DATA = Path(__file__).parents[4] / "shared" / "data"
+
+
+def test_an_encounter_is_the_scenario_with_its_ego_free() -> None:
+    """Others move as in the scenario whatever the ego does; only egos are driven; every other scene is mirrored."""
+    plain, mirrored = encounters([Kind("cut_in", "us101", scenes=2, seconds=4.0)], np.random.default_rng(3))
+    world = World(CUT_IN, horizon=4.0)
+    x = rare_envs.DrivingProblem("rare_envs/CutIn-v0").base.sample(26, np.random.default_rng(3))
+    with torch.inference_mode():
+        states = [episode.state for episode in drive(world, IDM(), torch.from_numpy(x[:13]))]
+    expected = torch.stack([state.x[:, 1] for state in states]).numpy() + APART * np.arange(13)
+    np.testing.assert_allclose(plain.x[:, 1::3], expected)
+    assert plain.edges == (-2.0, 2.0, 6.0)
+    assert mirrored.edges == (-6.0, -2.0, 2.0)
+    assert (mirrored.y[:, 1::3] <= 0.0).all()
+
+    recording = stack([plain])
+    traffic = start(recording, torch.tensor([0]), torch.tensor([0]))
+    assert traffic.driven.sum() == 13
+    braking = torch.zeros(1, 39, 2)
+    braking[..., 0] = -2.0
+    for _ in range(30):
+        traffic = step(recording, traffic, braking)
+    at = traffic.vehicle[0].argsort()
+    others = np.arange(39) % 3 != 0
+    np.testing.assert_allclose(traffic.x[0, at].numpy()[others], plain.x[30][others], atol=0.01)
+    assert (traffic.x[0, at].numpy()[~others] < plain.x[30][~others]).any()
+
+
+def test_parameters_may_be_given() -> None:
+    (one,) = encounters([Kind("straight", None, 1, 1.0, {"gap": 140.0})], np.random.default_rng(0))
+    np.testing.assert_allclose(one.x[0, 1::5] - one.x[0, ::5], 145.0, atol=1e-3)
+
+
+@pytest.fixture(scope="module")
+def tiny() -> tuple[Config, list[Kind]]:
+    config = Config(
+        updates=2, pools=1, scenes=3, horizon=(4, 4), epochs=1, warm_up=1, headway_weight=8.0, lane_weight=8.0
+    )
+    return config, [Kind("cut_in", "us101", seconds=2.0), Kind("hard_brake", None, seconds=2.0)]
+
+
+def test_training_repeats_and_learns_from_people_only(tiny: tuple[Config, list[Kind]]) -> None:
+    config, kinds = tiny
+    scenes = [scene(vehicles=8, ticks=30, name=name) for name in "ab"]
+    learners = [prepare(scenes, kinds, config) for _ in range(2)]
+    assert learners[0].pairs.scene.max() < len(scenes)
+    assert set(learners[0].among.tolist()) == {0, 1, 2, 3}
+    one, other = (fit(learner).state_dict() for learner in learners)
+    assert all(torch.equal(one[name], other[name]) for name in one)
+
+
+def test_it_is_found_by_name_and_tells_where_it_comes_from() -> None:
+    ego = agents.load_ego("imitation")
+    assert isinstance(ego, agents.LearnedEgo)
+    assert ego.driver.name == "imitation"
+    told = agents.read_provenance(Path(agents.__file__).parent / "data" / "imitation.safetensors")
+    assert told.command == f"python -m training.egos.imitation --data data --seed {CONFIG.seed}"
+    assert set(told.metrics["ordinary"]) == set(CASES)
+
+
+def test_it_is_no_driver_of_the_traffic() -> None:
+    with pytest.raises(ValueError, match="expected one of 'bc', 'gail', 'idm', 'mgail'"):
+        rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", drivers="imitation")
+
+
+def test_it_needs_no_observation_in_a_process_of_its_own_either() -> None:
+    """Elsewhere it is an ego with `predict`, whose space tells that it wants the lidar."""
+    away = SimpleNamespace(
+        predict=agents.load_ego("imitation").predict, observation_space=observation_space(1, "lidar")
+    )
+    problem = rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego=away)
+    here = rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego=agents.load_ego("imitation"))
+    x = here.base.sample(32, np.random.default_rng(0))
+    gentle = here.evaluate(x) > 2.0  # where no more than the environment's 5 m/s^2 is needed
+    np.testing.assert_allclose(problem.evaluate(x)[gentle], here.evaluate(x)[gentle], atol=0.05)
+    assert observation_for(away, vehicles=13) == "features"  # as many of them as the lidar has
+
+
+@pytest.mark.parametrize("case", ["straight", "bends"])
+def test_it_keeps_its_lane_and_its_distance_for_a_minute(case: str) -> None:
+    found = summary_of(judge(agents.load_ego("imitation"), case, rollouts=32, seed=2026))
+    assert found.kept >= found.judged - 1
+    assert found.margin > 0.3
+
+
+def test_it_brakes_for_those_who_cut_in() -> None:
+    """The driver of the traffic, which never met encounters, collides in one of seven."""
+    collided = {}
+    for name in ("imitation", "mgail"):
+        problem = rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego=agents.load_ego(name))
+        collided[name] = (problem.evaluate(problem.base.sample(512, np.random.default_rng(2026))) < 0.0).mean()
+    assert collided["imitation"] < 0.03 < 0.1 < collided["mgail"]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not DATA.exists(), reason="the recorded trajectories are not here")
+def test_a_training_from_the_tables_gives_an_ego_and_refuses_another_s_folder(
+    tiny: tuple[Config, list[Kind]], tmp_path: Path
+) -> None:
+    config, kinds = tiny
+    path = train(DATA, config, tmp_path, kinds=kinds, rollouts=2)
+    ego = agents.load_ego(path)
+    assert isinstance(ego, agents.LearnedEgo)
+    assert agents.read_provenance(path).metrics["ordinary"]["straight"]["judged"] == 2
+    with pytest.raises(ValueError, match="another folder"):
+        train(DATA, replace(config, seed=1), tmp_path, kinds=kinds)

@@ -1,0 +1,409 @@
+"""The batched simulation behind Stable-Baselines3's `VecEnv`, and the training of egos."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from stable_baselines3 import PPO
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecMonitor, VecNormalize
+
+from agents import SavedEgo, load_ego
+from rare_envs import DrivingProblem
+from rare_envs.control.actions import DISCRETE_ACTIONS
+from training import sb3_vec_env, train_ego
+from training.train_ego import RECIPES
+from training.vec_env import BatchedVecEnv, info_row, merge_options
+
+IDS = ("rare_envs/CarFollowing-v0", "rare_envs/CutIn-v0")
+
+
+class Countdown(gym.Env[np.ndarray, np.ndarray]):
+    """Ends after `length` steps (truncated at `limit`); shows start, steps and action."""
+
+    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012 (Gymnasium's convention)
+    render_mode = "rgb_array"
+    observation_space = spaces.Box(-100.0, 100.0, (3,), np.float32)
+    action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
+    speed_limit = 30.0
+
+    def __init__(self, length: int, limit: int = 1000) -> None:
+        self.length, self.limit = length, limit
+
+    def _observe(self, action: Any = (0.0, 0.0)) -> np.ndarray:
+        return np.array([self.start, self.count, np.sum(action)], np.float32)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.start = float(self.np_random.uniform(0.0, 10.0))
+        self.start = float((options or {}).get("start", self.start))
+        self.count = 0
+        return self._observe(), {"x": np.array([self.start]), "scenario": {"start": self.start}}
+
+    def step(self, action: Any) -> Any:
+        self.count += 1
+        terminated, truncated = self.count >= self.length, self.count >= self.limit
+        info = {"measure": self.start, "scenario": {"start": self.start}}
+        return self._observe(action), float(self.count), terminated, truncated, info
+
+    def render(self) -> np.ndarray:  # type: ignore[override]
+        return np.full((4, 4, 3), self.count, np.uint8)
+
+
+def batch(*lengths: int, limit: int = 1000, mode: Any = AutoresetMode.SAME_STEP) -> Any:
+    """A batch of countdowns, run by Gymnasium's own vectorisation."""
+    makers = [lambda length=length: Countdown(length, limit) for length in lengths]
+    return SyncVectorEnv(makers, autoreset_mode=mode)
+
+
+def steps(env: VecEnv, count: int) -> Any:
+    """The result of the last of `count` steps."""
+    result: Any = None
+    for _ in range(count):
+        result = env.step(np.zeros((env.num_envs, 2), np.float32))
+    return result
+
+
+# --- the adapter, against a batch whose answers are known --------------------------------------
+
+
+def test_an_ended_episode_shows_its_end_and_the_next_one_begins() -> None:
+    env = BatchedVecEnv(batch(3, 5))
+    env.seed(0)
+    first = env.reset()
+    observation, reward, done, infos = steps(env, 3)
+    np.testing.assert_array_equal(done, [True, False])
+    np.testing.assert_array_equal(reward, [3.0, 3.0])
+    np.testing.assert_array_equal(infos[0]["terminal_observation"], [first[0, 0], 3, 0])
+    assert infos[0]["TimeLimit.truncated"] is False
+    assert infos[0]["measure"] == pytest.approx(first[0, 0])  # of the episode that ended
+    assert infos[0]["scenario"]["start"] == pytest.approx(first[0, 0])
+    assert infos[1] == {}
+    assert observation[0, 1] == 0  # the first observation of the next episode
+    assert observation[0, 0] != first[0, 0]
+    assert env.reset_infos[0]["scenario"]["start"] == pytest.approx(observation[0, 0])
+    np.testing.assert_array_equal(observation[1], [first[1, 0], 3, 0])
+
+
+def test_a_time_limit_is_told_from_an_end() -> None:
+    env = BatchedVecEnv(batch(9, 4, limit=4))  # the second ends on its own at the same step
+    env.reset()
+    _, _, done, infos = steps(env, 4)
+    assert done.all()
+    assert [info["TimeLimit.truncated"] for info in infos] == [True, False]
+
+
+def test_it_agrees_with_the_vec_env_of_stable_baselines() -> None:
+    rng = np.random.default_rng(0)
+    lengths = (2, 3, 7)
+    makers = [lambda length=length: Countdown(length, limit=5) for length in lengths]
+    ours, theirs = BatchedVecEnv(batch(*lengths, limit=5)), DummyVecEnv(makers)
+    ours.seed(4)
+    theirs.seed(4)
+    np.testing.assert_array_equal(ours.reset(), theirs.reset())
+    for _ in range(20):
+        actions = rng.uniform(-1.0, 1.0, (3, 2)).astype(np.float32)
+        mine, reference = ours.step(actions), theirs.step(actions)
+        for ours_part, their_part in zip(mine[:3], reference[:3], strict=True):
+            np.testing.assert_array_equal(ours_part, their_part)
+            assert ours_part.dtype == their_part.dtype  # type: ignore[union-attr]
+        for row in np.flatnonzero(mine[2]):
+            assert mine[3][row].keys() == reference[3][row].keys()
+            np.testing.assert_array_equal(
+                mine[3][row]["terminal_observation"], reference[3][row]["terminal_observation"]
+            )
+            truncated = "TimeLimit.truncated"
+            assert mine[3][row][truncated] == reference[3][row][truncated]
+
+
+def test_infos_are_separate_dictionaries() -> None:
+    env = BatchedVecEnv(batch(9, 9))
+    env.reset()
+    infos = steps(env, 1)[3]
+    infos[0]["note"] = 1  # wrappers of Stable-Baselines3 write into them
+    assert infos[1] == {}
+
+
+def test_the_monitor_sees_returns_and_lengths() -> None:
+    env = VecMonitor(BatchedVecEnv(batch(3, 4)))
+    env.reset()
+    infos = steps(env, 3)[3]
+    assert infos[0]["episode"]["r"] == 1 + 2 + 3
+    assert infos[0]["episode"]["l"] == 3
+    infos = steps(env, 1)[3]
+    assert infos[1]["episode"]["r"] == 1 + 2 + 3 + 4
+    returns, lengths = evaluate_policy(
+        PPO("MlpPolicy", env, n_steps=8, batch_size=16, device="cpu"),
+        env,
+        n_eval_episodes=4,
+        return_episode_rewards=True,
+    )
+    assert sorted(zip(returns, lengths, strict=True)) == [(6.0, 3)] * 2 + [(10.0, 4)] * 2
+
+
+def test_normalisation_of_stable_baselines_reaches_the_terminal_observation() -> None:
+    env = VecNormalize(BatchedVecEnv(batch(3, 5)))
+    env.reset()
+    infos = steps(env, 3)[3]
+    last = np.array([infos[0]["measure"], 3.0, 0.0])
+    np.testing.assert_allclose(infos[0]["terminal_observation"], env.normalize_obs(last), atol=1e-5)
+
+
+def test_discrete_actions_are_looked_up() -> None:
+    table = np.array([[-1.0, 0.0], [0.25, 0.5]], np.float32)
+    env = BatchedVecEnv(batch(9, 9), table)
+    assert env.action_space == spaces.Discrete(2)
+    env.reset()
+    observation = env.step(np.array([1, 0]))[0]
+    np.testing.assert_array_equal(observation[:, 2], [0.75, -1.0])
+
+
+def test_seeds_and_options_apply_to_one_reset() -> None:
+    env = BatchedVecEnv(batch(9, 9))
+    env.seed(7)
+    first = env.reset()
+    assert not np.array_equal(env.reset(), first)
+    env.seed(7)
+    np.testing.assert_array_equal(env.reset(), first)
+
+
+class Recorder(SyncVectorEnv):
+    """Keeps the options of the last reset, which our batches take as arrays."""
+
+    received: Any = None
+
+    def reset(self, *, seed: Any = None, options: Any = None) -> Any:
+        self.received = options
+        return super().reset(seed=seed)
+
+
+def test_options_reach_the_batch_once() -> None:
+    inner = Recorder([lambda: Countdown(9)] * 2, autoreset_mode=AutoresetMode.SAME_STEP)
+    env = VecMonitor(BatchedVecEnv(inner))
+    env.set_options({"start": 3.0})
+    env.reset()
+    np.testing.assert_array_equal(inner.received["start"], [3.0, 3.0])
+    env.reset()
+    assert inner.received is None
+
+
+def test_options_of_single_environments_are_joined() -> None:
+    joined = merge_options([{"gap": 9.0, "x": [1.0, 2.0]}, {"gap": 8.0, "x": [3.0, 4.0]}])
+    assert joined is not None
+    np.testing.assert_array_equal(joined["gap"], [9.0, 8.0])
+    np.testing.assert_array_equal(joined["x"], [[1.0, 2.0], [3.0, 4.0]])
+    assert merge_options([{}, {}]) is None
+    with pytest.raises(ValueError, match=r"same option names .* \['gap'\] on some"):
+        merge_options([{"gap": 9.0}, {}])
+
+
+def test_infos_of_one_row_follow_the_masks() -> None:
+    infos = {
+        "speed": np.array([1.0, 2.0]),
+        "kind": np.array([None, "rear"], dtype=object),
+        "_kind": np.array([False, True]),
+        "scenario": {"gap": np.array([5.0, 6.0]), "_gap": np.array([True, True])},
+        "final_obs": np.zeros((2, 3)),
+    }
+    assert info_row(infos, 0) == {"speed": 1.0, "scenario": {"gap": 5.0}}
+    assert info_row(infos, 1) == {"speed": 2.0, "kind": "rear", "scenario": {"gap": 6.0}}
+
+
+def test_attributes_and_methods_are_those_of_the_batch() -> None:
+    env = BatchedVecEnv(batch(9, 9, 9))
+    env.reset()
+    assert env.get_attr("num_envs", indices=[0, 2]) == [3, 3]
+    assert not env.has_attr("no_such_attribute")
+    env.set_attr("note", 5)
+    assert env.get_attr("note") == [5, 5, 5]
+    assert [len(images) for images in env.env_method("render")] == [3, 3, 3]
+    assert env.env_is_wrapped(Monitor, indices=0) == [False]
+    with pytest.raises(ValueError, match="'note' for all 3 environments"):
+        env.set_attr("note", 6, indices=[1])
+    with pytest.raises(ValueError, match="share one batched simulation"):
+        env.env_method("render", indices=0)
+
+
+def test_images_are_tiled() -> None:
+    env = BatchedVecEnv(batch(9, 9))
+    env.reset()
+    steps(env, 2)
+    image = env.render()
+    assert image is not None
+    assert image.shape == (8, 4, 3)
+    assert (image == 2).all()
+    env.close()
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.DISABLED])
+def test_other_autoreset_modes_are_refused(mode: AutoresetMode) -> None:
+    with pytest.raises(ValueError, match="same-step autoreset"):
+        BatchedVecEnv(batch(3, mode=mode))
+
+
+# --- our environments --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("id", IDS)
+def test_our_environments_behave_as_a_vec_env(id: str) -> None:
+    env = sb3_vec_env(id, 8, seed=1)
+    rng = np.random.default_rng(0)
+    assert isinstance(env, VecMonitor)
+    observation: Any = env.reset()
+    ended = 0
+    for _ in range(300):
+        assert observation.shape == (8, *env.observation_space.shape)  # type: ignore[misc]
+        assert observation.dtype == env.observation_space.dtype
+        assert all(env.observation_space.contains(row) for row in observation)
+        actions = rng.uniform(-1.0, 1.0, (8, 2)).astype(np.float32)
+        observation, reward, done, infos = env.step(actions)
+        assert reward.dtype == np.float32
+        assert np.isfinite(reward).all()
+        for row in range(8):
+            assert ("terminal_observation" in infos[row]) == done[row]
+        for row in np.flatnonzero(done):
+            ended += 1
+            info = infos[row]
+            assert env.observation_space.contains(info["terminal_observation"])
+            assert info["TimeLimit.truncated"] == (not info["collision"])
+            assert (info["measure"] < 0) == info["collision"]
+    assert ended > 16
+
+
+@pytest.mark.parametrize("id", IDS)
+def test_equal_seeds_give_equal_runs(id: str) -> None:
+    def run(seed: int) -> Any:
+        env = sb3_vec_env(id, 4, seed=seed)
+        env.reset()
+        return np.stack([steps(env, 1)[0] for _ in range(120)])  # into the second episode
+
+    np.testing.assert_array_equal(run(3), run(3))
+    assert not np.array_equal(run(3), run(4))
+
+
+def test_reset_options_reach_our_environments() -> None:
+    env = sb3_vec_env("rare_envs/CutIn-v0", 2)
+    env.set_options([{"cut_in_gap": 9.0}, {"cut_in_gap": 12.0}])
+    env.reset()
+    inner: Any = env.unwrapped
+    gaps = [info["scenario"]["cut_in_gap"] for info in inner.reset_infos]
+    assert gaps == pytest.approx([9.0, 12.0])
+
+
+def test_bad_arguments_are_refused() -> None:
+    with pytest.raises(ValueError, match="num_envs >= 1, got 0"):
+        sb3_vec_env("rare_envs/CutIn-v0", 0)
+
+
+# --- training ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("algo", ["ppo", "a2c", "sac", "td3", "dqn"])
+def test_every_algorithm_trains_saves_and_drives(algo: str, tmp_path: Path) -> None:
+    path = train_ego(
+        "rare_envs/CutIn-v0",
+        algo,
+        steps=400,
+        num_envs=16,
+        out=tmp_path / "new" / "ego",
+        progress=False,
+    )
+    assert path == tmp_path / "new" / "ego.zip"
+    ego = load_ego(path)
+    assert isinstance(ego, SavedEgo)
+    assert ego.algorithm == algo
+    env = sb3_vec_env("rare_envs/CutIn-v0", 4, seed=0, discrete=algo == "dqn")
+    assert ego.observation_space == env.observation_space
+    expected = spaces.Discrete(len(DISCRETE_ACTIONS)) if algo == "dqn" else env.action_space
+    assert ego.action_space == expected
+    returns, lengths = evaluate_policy(ego.model, env, n_eval_episodes=4, return_episode_rewards=True)
+    assert np.isfinite(returns).all()
+    assert min(lengths) > 0  # type: ignore[type-var]
+    problem = DrivingProblem("rare_envs/CutIn-v0", ego=ego)
+    f = problem.evaluate(problem.base.sample(8, np.random.default_rng(0)))
+    assert ((f == -1.0) | (f > 0.0)).all()
+
+
+def test_training_twice_gives_the_same_ego(tmp_path: Path) -> None:
+    def weights(name: str, seed: int) -> torch.Tensor:
+        path = tmp_path / f"{name}.zip"
+        train_ego(IDS[0], steps=2048, seed=seed, num_envs=16, out=path, progress=False)
+        ego: Any = load_ego(path)
+        return torch.cat([value.flatten() for value in ego.model.policy.state_dict().values()])
+
+    first = weights("first", 0)
+    assert torch.equal(weights("again", 0), first)
+    assert not torch.equal(weights("other", 1), first)
+
+
+def test_training_learns(tmp_path: Path) -> None:
+    """Forty rollouts teach far better driving than the untrained policy's, by any measure."""
+    path = train_ego(IDS[0], steps=40_000, num_envs=64, out=tmp_path / "ego.zip", progress=False)
+    ego: Any = load_ego(path)
+    env = sb3_vec_env(IDS[0], 64, seed=0)
+    untrained = PPO("MlpPolicy", env, seed=0, device="cpu")
+    learned, _ = evaluate_policy(ego.model, env, n_eval_episodes=64)
+    before, _ = evaluate_policy(untrained, env, n_eval_episodes=64, deterministic=False)
+    assert learned > before
+
+
+def test_progress_goes_to_standard_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    train_ego(IDS[1], steps=2048, num_envs=16, out=tmp_path / "ego.zip")
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert "steps" in captured.err
+    assert "collisions" in captured.err
+
+
+def test_the_number_of_threads_is_restored(tmp_path: Path) -> None:
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        train_ego(IDS[0], steps=64, num_envs=4, out=tmp_path / "ego.zip", progress=False)
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"steps": 0}, "steps >= 1, got 0"),
+        ({"steps": -5}, "steps >= 1, got -5"),
+        ({"algo": "pp0"}, r"Unknown algorithm 'pp0' \(did you mean 'ppo'\?\)"),
+        ({"num_envs": 0}, "num_envs >= 1, got 0"),
+        ({"out": "."}, "got the folder"),
+        ({"out": "file/ego.zip"}, "Cannot make the folder"),
+    ],
+)
+def test_bad_requests_are_refused_before_work(
+    arguments: dict[str, Any], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ValueError, match=message) as caught:
+        train_ego(IDS[0], **arguments)
+    assert "\n" not in str(caught.value)
+    assert not list(tmp_path.glob("*.zip"))
+
+
+def test_every_recipe_is_an_algorithm_of_stable_baselines() -> None:
+    import stable_baselines3
+
+    assert all(hasattr(stable_baselines3, name.upper()) for name in RECIPES)
+
+
+def test_import_training_is_light() -> None:
+    """The command line imports it for its help text."""
+    code = "import sys, training; sys.exit('stable_baselines3' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,0 +1,209 @@
+"""What the ego `vision` is taught in: following, cut-ins, hard brakes and the I-80, on many roads in all weathers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from agents.vision.ego import SEES
+from rare_envs.distributions.space import Parameter
+from rare_envs.scenarios.base import SPEED, Others, Scenario, columns
+from rare_envs.scenarios.base_distributions import load_base
+from rare_envs.scenarios.registry import named
+from rare_envs.sensors.camera.weather import CLEAR, SENSOR_NOISE_LAW, SUN_LAW
+from rare_envs.sensors.perception import look
+from rare_envs.simulation.background import Background, find_drivers
+from rare_envs.simulation.episode import Episode
+from rare_envs.simulation.world import World
+from rare_envs.traffic.reference_line import Curve
+from rare_envs.traffic.road import Road, i80
+from rare_envs.traffic.state import VEHICLE_LENGTH, State
+from training.egos.nominal_traffic import OrdinaryDrivers, ordinary, starts
+
+Array = NDArray[np.float64]
+TOP_SPEED = 32.0
+"""[m/s]."""
+CURVATURE = 1 / 400
+"""Largest of curved roads [1/m]; the I-80 has about a third."""
+
+
+class Lesson(NamedTuple):
+    """Traffic to learn in."""
+
+    scenario: Callable[[np.random.Generator], Scenario]
+    """On another road each time."""
+    sample: Callable[[int, np.random.Generator], Array]
+    """The scenario's own columns of x."""
+    drivers: Background | None = None
+
+
+def _initial(x: Tensor) -> State:
+    """Columns as in `FOLLOWING`; theta: swing [m/s^2], its length [m], the usual speed of the lead [m/s]."""
+    ego_speed, lead_speed, gap, swing, length, beside, ahead, other_speed = x.unbind(dim=1)
+    zero = torch.zeros_like(gap)
+    return State(
+        x=columns(zero, gap + VEHICLE_LENGTH, ahead),
+        y=columns(zero, zero, beside),
+        heading=columns(zero, zero, zero),
+        speed=columns(ego_speed, lead_speed, other_speed),
+        theta=columns(swing, length, lead_speed),
+    )
+
+
+def _others(state: State, dt: float) -> Others:
+    """The lead swings around its speed, the vehicle in the next lane keeps its own."""
+    swing, length, usual = state.theta.unbind(dim=1)
+    speed, x = state.speed[:, 1:], state.x[:, 1:]
+    wanted = swing * torch.sin(2 * math.pi / length * x[:, 0]) + 0.2 * (usual - speed[:, 0])
+    after = columns((speed[:, 0] + wanted * dt).clamp(min=0.0), speed[:, 1])
+    return Others(x + speed * dt, state.y[:, 1:], state.heading[:, 1:], after)
+
+
+FOLLOWING = Scenario(
+    name="following",
+    road=Road((-2.0, 2.0)),
+    vehicle_names=("ego", "lead", "other"),
+    horizon=20.0,
+    parameters=(
+        Parameter("ego_speed", *SPEED, "of the ego at the start"),
+        Parameter("lead_speed", *SPEED, "usual speed of the lead"),
+        Parameter("gap", "m", 1.0, 200.0, "from ego to lead at the start"),
+        Parameter("swing", "m/s^2", 0.0, 2.0, "largest acceleration of the lead"),
+        Parameter("length", "m", 50.0, 1000.0, "way of the lead from one of its swings to the next"),
+        Parameter("beside", "m", -5.0, 5.0, "lateral place of the vehicle in the next lane"),
+        Parameter("ahead", "m", -500.0, 200.0, "its place along the road"),
+        Parameter("other_speed", *SPEED, "its speed"),
+    ),
+    bases={"any": {"alpha": [1.0] * 8, "beta": [1.0] * 8}},
+    initial=_initial,
+    others=_others,
+    driven=lambda state, action, dt: _others(state, dt),
+)
+
+
+def _speeds(n: int, rng: np.random.Generator, spread: float = 4.0) -> tuple[Array, Array]:
+    """Speeds of the ego, one in four of them slow, and speeds near those [m/s]."""
+    own = np.where(rng.random(n) < 0.25, rng.uniform(0.0, 6.0, n), rng.uniform(2.0, TOP_SPEED, n))
+    return own, np.clip(own + rng.normal(0.0, spread, n), 0.0, TOP_SPEED + 5.0)
+
+
+def _following(n: int, rng: np.random.Generator) -> Array:
+    own, lead = _speeds(n, rng)
+    gap = np.where(rng.random(n) < 0.15, 200.0, 2.0 + own * rng.uniform(0.3, 3.5, n))
+    lead = np.where(gap == 200.0, TOP_SPEED + 10.0, lead)  # soon out of sight
+    swing = rng.uniform(0.0, 1.5, n) * (rng.random(n) < 0.6)
+    side = rng.choice((-1.0, 1.0), n) * 3.75
+    other = np.clip(own + rng.normal(0.0, 3.0, n), 0.0, 45.0)
+    return np.column_stack((own, lead, gap, swing, rng.uniform(100, 600, n), side, rng.uniform(-20.0, 60.0, n), other))
+
+
+def _cut_in(n: int, rng: np.random.Generator) -> Array:
+    own, lead = _speeds(n, rng)
+    cutter = np.clip(own + rng.normal(0.0, 3.0, n), 0.0, 45.0)
+    gaps = rng.uniform(2.0, 60.0, n), rng.uniform(5.0, 100.0, n)
+    return np.column_stack((own, cutter, lead, *gaps, rng.uniform(3.2, 4.5, n)))
+
+
+def _hard_brake(n: int, rng: np.random.Generator) -> Array:
+    own = rng.uniform(3.0, TOP_SPEED, n)
+    return np.column_stack((own, 3.0 + own * rng.uniform(0.8, 3.0, n), rng.uniform(0.5, 6.0, n)))
+
+
+def _highway(n: int, rng: np.random.Generator) -> Array:
+    return load_base(named("highway")).sample(n, rng)
+
+
+def lessons() -> tuple[Lesson, ...]:
+    """All that is taught, the commoner things more often."""
+
+    def somewhere(scenario: Scenario) -> Callable[[np.random.Generator], Scenario]:
+        return lambda rng: replace(scenario, road=some_road(rng))
+
+    def in_traffic(rng: np.random.Generator) -> Scenario:
+        if rng.random() < 1 / 3:
+            return ordinary("traffic", i80(), int(rng.integers(1, 5)))
+        road = some_road(rng, least=3)
+        inner = 1 if road.lanes == 3 else int(rng.integers(1, road.lanes - 1))
+        return ordinary("traffic", road, inner)
+
+    following, highway = Lesson(somewhere(FOLLOWING), _following), named("highway")
+    traffic = Lesson(in_traffic, starts, OrdinaryDrivers())
+    return (
+        traffic,
+        following,
+        Lesson(lambda rng: highway, _highway, find_drivers(highway.drivers)),
+        Lesson(somewhere(named("cut_in")), _cut_in),
+        traffic,
+        following,
+        Lesson(somewhere(named("hard_brake")), _hard_brake),
+    )
+
+
+def some_road(rng: np.random.Generator, least: int = 1) -> Road:
+    """At least so many lanes and at most four, one of which is centred on y = 0, straight in one of three cases."""
+    lanes, width = int(rng.integers(least, 5)), float(rng.choice((3.6, 3.75, 4.0)))
+    own = int(rng.integers(0, lanes))
+    edges = tuple(width * (k - own - 0.5) for k in range(lanes + 1))
+    if rng.random() < 1 / 3:
+        return Road(edges)
+    curvature = rng.uniform(-CURVATURE, CURVATURE, 7)
+    curvature -= curvature.mean()  # it comes back to its first direction
+    return Road(edges, Curve(80.0, (0.0, *(0.5 * curvature), 0.0)))
+
+
+def begin(lesson: Lesson, rows: int, seconds: float, rng: np.random.Generator) -> tuple[World, Episode]:
+    """Start a lesson from somewhere in or beside the lane.
+
+    Args:
+        lesson: What to learn in.
+        rows: Number of scenarios B.
+        seconds: Length of the episodes.
+        rng: Source of roads, scenarios and places.
+
+    Returns:
+        The world and the episodes at time 0.
+    """
+    scenario = lesson.scenario(rng)
+    world = World(scenario, horizon=seconds, drivers=lesson.drivers, observation=SEES, weather=True)
+    own = lesson.sample(rows, rng)
+    parts = [own, _weather(rows, rng)]
+    if world.drivers is not None and world.drivers.weights is not None:
+        parts.append(world.drivers.weights.sample(rows, rng))
+    parts.append(rng.standard_normal((rows, world.draws + world.keys)))
+    start = world.start(torch.from_numpy(np.concatenate(parts, axis=1)).float())
+    state = _elsewhere(start.state, scenario, rng)
+    perception = look(state, scenario.road) if world.sees else None
+    return world, world.first(state, perception, start.minds, start.sight)
+
+
+def _weather(n: int, rng: np.random.Generator) -> Array:
+    """Half of the days are clear; of the others the fog is thicker than usual."""
+    fog = np.exp(rng.uniform(math.log(5e-5), math.log(1e-2), (n, 1)))
+    some = np.concatenate((fog, SUN_LAW.sample(n, rng), SENSOR_NOISE_LAW.sample(n, rng)), axis=1)
+    clear = np.array([CLEAR[0], math.degrees(CLEAR[1]), math.degrees(CLEAR[2]), 0.0])
+    return np.where(rng.random((n, 1)) < 0.5, clear, some)
+
+
+def _elsewhere(state: State, scenario: Scenario, rng: np.random.Generator) -> State:
+    """The ego off the middle of its lane and not quite along it; behind the others in any lane on the highway."""
+    n = len(state.x)
+    y = state.y[:, 0].double().numpy() + np.clip(rng.normal(0.0, 0.5, n), -1.4, 1.4)
+    x, heading = state.x[:, 0].double().numpy(), np.clip(rng.normal(0.0, 0.03, n), -0.09, 0.09)
+    if scenario.vehicles == 6:
+        moved = rng.random(n) < 0.6
+        lane = np.array([scenario.road.centre(k) for k in range(scenario.road.lanes)])
+        old = np.asarray(scenario.road.centre_of(state.y[:, 0]))
+        y = np.where(moved, y - old + rng.choice(lane, n), y)
+        x = np.where(moved, x - rng.uniform(25.0, 70.0, n), x)
+
+    def with_ego(field: Tensor, values: Array) -> Tensor:
+        return torch.cat((torch.from_numpy(values).to(field)[:, None], field[:, 1:]), dim=1)
+
+    return state._replace(x=with_ego(state.x, x), y=with_ego(state.y, y), heading=with_ego(state.heading, heading))

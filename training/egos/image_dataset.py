@@ -1,0 +1,134 @@
+"""Pictures of a drive with what the expert would do: the data of imitation."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from agents.vision.ego import LAG, recall, to_actions
+from agents.vision.pilotnet import PilotNet, luma
+from rare_envs.control.actions import to_physical
+from rare_envs.sensors.camera import Weather, take_picture
+from rare_envs.simulation.episode import Episode
+from rare_envs.simulation.world import World
+from rare_envs.traffic.state import State
+from training.egos.curriculum import begin, lessons
+from training.egos.expert_driver import expert, truths
+
+
+class Pictures(NamedTuple):
+    """n moments."""
+
+    picture: Tensor
+    """uint8, shape (n, 66, 200, 3)."""
+    earlier: Tensor
+    """Luma of the picture before it, uint8, shape (n, 66, 200)."""
+    speed: Tensor
+    """Own speed [m/s], shape (n,)."""
+    wanted: Tensor
+    """What the expert does, as `lane_expert.expert` has it, shape (n, 2)."""
+    truth: Tensor
+    """As `lane_expert.truths` has it, shape (n, 5)."""
+
+    def rows(self, rows: Any) -> Pictures:
+        """Some of them."""
+        return Pictures(*(field[rows] for field in self))
+
+
+def joined(parts: list[Pictures]) -> Pictures:
+    """All of several."""
+    return Pictures(*(torch.cat(fields) for fields in zip(*parts, strict=True)))
+
+
+@torch.inference_mode()
+def collect(
+    network: PilotNet | None,
+    trust: float,
+    *,
+    drives: int,
+    rows: int,
+    ticks: int,
+    kept: float,
+    noise: float,
+    rng: np.random.Generator,
+) -> Iterator[Pictures]:
+    """Drive, and note pictures with what the expert would do there.
+
+    Args:
+        network: Drives together with the expert; None leaves it to the expert alone.
+        trust: Share of the ticks at which the network decides.
+        drives: Number of lessons, taken in turn.
+        rows: Scenarios of each.
+        ticks: Of each scenario.
+        kept: Share of the ticks that are noted.
+        noise: Of what is done, in standard deviations of 0.5 m/s^2 and 0.05 rad/s that last for half a second, so that
+            places beside the expert's way are seen.
+        rng: Source of everything that is random.
+
+    Yields:
+        What each lesson gave.
+    """
+    taught = lessons()
+    for number in range(drives):
+        world, episode = begin(taught[number % len(taught)], rows, ticks * 0.1, rng)
+        yield joined(list(_drive(world, episode, network, trust, ticks, kept, noise, rng)))
+
+
+def _drive(
+    world: World,
+    episode: Episode,
+    network: PilotNet | None,
+    trust: float,
+    ticks: int,
+    kept: float,
+    noise: float,
+    rng: np.random.Generator,
+) -> Iterator[Pictures]:
+    state, swing, before = None, np.zeros((len(episode.collided), 2)), deque([episode], LAG)
+    for _ in range(ticks):
+        speed, wanted = episode.state.speed[:, 0], expert(episode)
+        noted = ~episode.collided & bool(rng.random() < kept)
+        swing = 0.8 * swing + 0.6 * rng.standard_normal(swing.shape)
+        done = wanted + noise * torch.from_numpy(swing * (0.25, 0.5)).float()
+        if network is None:  # pictures that nobody drives by are taken only to be noted
+            if bool(noted.any()):
+                seen = _photographed(episode, noted), luma(_photographed(before[0], noted)), speed[noted]
+        else:
+            picture = _photographed(episode, torch.ones_like(noted))
+            past, state = recall(picture, state)
+            trusted = torch.from_numpy(rng.random(len(speed)) < trust)[:, None]
+            done = torch.where(trusted, network(picture, torch.from_numpy(past), speed), done)
+            seen = picture[noted], torch.from_numpy(past)[noted.numpy()], speed[noted]
+        if bool(noted.any()):
+            yield Pictures(*seen, wanted[noted], truths(episode)[noted])
+        before.append(episode)
+        episode = world.step(episode, to_physical(to_actions(done, speed), len(speed), episode.collided))
+
+
+def _photographed(episode: Episode, rows: Tensor) -> Tensor:
+    """What the cameras see in some rows, boolean, shape (B,)."""
+    assert episode.sight is not None
+    state, sight = episode.state, episode.sight
+    weather = Weather(*(field[rows] for field in sight.weather))
+    sight = sight._replace(weather=weather, tick=sight.tick[rows])
+    return take_picture(State(*(field[rows] for field in state)), episode.road, sight)
+
+
+def mirrored(pictures: Pictures, rows: Tensor) -> Pictures:
+    """The same with left and right exchanged in some rows, boolean, shape (n,)."""
+    sign = torch.where(rows, -1.0, 1.0)[:, None]
+    one = torch.ones_like(sign)
+    picture, earlier = pictures.picture.clone(), pictures.earlier.clone()
+    picture[rows], earlier[rows] = picture[rows].flip(2), earlier[rows].flip(2)
+    return Pictures(
+        picture,
+        earlier,
+        pictures.speed,
+        pictures.wanted * torch.cat((one, sign), dim=1),
+        pictures.truth * torch.cat((sign, sign, sign, one, one), dim=1),
+    )

@@ -1,0 +1,260 @@
+"""The judge of ordinary driving: does an ego keep its lane and its distance for a minute of ordinary traffic?
+
+    python -m training.egos.nominal_driving --ego idm
+    python -m training.egos.nominal_driving --ego vision --case straight --rollouts 100
+
+An ego keeps its lane if its body never crosses a line of the lane that it starts in. It keeps its distance if it runs
+into nobody and never follows its lead closer than 0.5 s or 1 m; a lead that cuts in closer than that leaves it 10 s.
+And it must get somewhere: an ego that covers less than half of its lead's way (of its own at the speed of the start,
+where it has no lead) is left behind. What others do to it, who run into it from behind or from the side, is not its
+fault: such rollouts count neither way, and their number is told.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections import Counter
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+import torch
+import typer
+from numpy.typing import NDArray
+from torch import Tensor
+
+from agents import load_ego
+from rare_envs.egos.policy import as_driver
+from rare_envs.egos.wrappers import observation_for
+from rare_envs.plugins import did_you_mean
+from rare_envs.sensors.kinds import kinds_of
+from rare_envs.simulation.episode import Episode
+from rare_envs.simulation.rollout import Driver, drive
+from rare_envs.simulation.world import World
+from rare_envs.traffic.crash import NONE, ROAD_EDGE
+from rare_envs.traffic.lead import lead_index
+from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
+from samplers.statistics.intervals import clopper_pearson
+from training.egos.nominal_traffic import CASES, FLOOR_GAP, FLOOR_HEADWAY, SECONDS, Case
+
+REASONS = ("kept", "left its lane", "collided", "too close", "left behind", "hit by others")
+"""Verdicts by number; a rollout gets the one that comes first in time, "left behind" at its end."""
+KEPT, LEFT_LANE, COLLIDED, TOO_CLOSE, LEFT_BEHIND, HIT = range(len(REASONS))
+GRACE = 10.0
+"""Time [s] that an ego has to open the distance to a lead that has cut in too close."""
+LEAST_WAY = 0.5
+"""Share of its lead's way that it must cover."""
+TILE, CAMERA_TILE = 256, 64
+"""Rollouts driven at once."""
+
+
+class Verdicts(NamedTuple):
+    """Of n rollouts."""
+
+    reason: NDArray[np.int64]
+    """Index of `REASONS`, shape (n,)."""
+    time: NDArray[np.float64]
+    """When that was found [s], shape (n,)."""
+    headway: NDArray[np.float64]
+    """Least time headway until then [s], inf without a lead, shape (n,)."""
+    margin: NDArray[np.float64]
+    """Least distance from the body to a line of the lane until then [m], negative beyond it, shape (n,)."""
+    speed: NDArray[np.float64]
+    """Mean speed of the whole rollout [m/s], shape (n,)."""
+    x: NDArray[np.float64]
+    """What each started from, shape (n, d)."""
+
+
+@dataclass(frozen=True)
+class Summary:
+    """How an ego did in one case."""
+
+    kept: int
+    judged: int
+    """Rollouts that others have not spoiled."""
+    spoiled: int
+    interval: tuple[float, float]
+    """Of the share of kept ones, Clopper and Pearson, 95 %."""
+    reasons: dict[str, int]
+    """Why the others were not kept."""
+    speed: float
+    """Mean [m/s]."""
+    headway: float
+    """Median over rollouts of the least time headway [s]."""
+    margin: float
+    """Median over rollouts of the least distance from the body to the lane's lines [m]."""
+
+    @property
+    def share(self) -> float:
+        """Of kept rollouts among the judged ones."""
+        return self.kept / max(self.judged, 1)
+
+
+def judge(
+    ego: Any,
+    case: str | Case = "straight",
+    rollouts: int = 400,
+    seed: int = 0,
+    seconds: float = SECONDS,
+    observation: str | None = None,
+    measured: World | None = None,
+) -> Verdicts:
+    """Drive an ego through ordinary traffic and say of each rollout whether it kept its lane and its distance.
+
+    Args:
+        ego: Whatever `rare_envs.DrivingProblem` takes, such as what `agents.load_ego` returns.
+        case: One of `CASES`, or a `Case`.
+        rollouts: How many.
+        seed: Of starts and of the others' noise.
+        seconds: Length of each [s].
+        observation: What an ego with `predict` observes; None for what it asks for itself.
+        measured: A world to be judged in instead of that of the case.
+
+    Raises:
+        ValueError: If there is no such case, or the ego does not fit.
+    """
+    if isinstance(case, str) and case not in CASES:
+        raise ValueError(f"Unknown case {case!r}{did_you_mean(case, CASES)}; expected one of {', '.join(CASES)}.")
+    case = CASES[case] if isinstance(case, str) else case
+    observation = observation or observation_for(ego)
+    world = measured or world_of(case, seconds, observation)
+    driver = as_driver(ego, world)
+    if getattr(driver, "sees", False):
+        world = replace(world, lidar=True)
+    x = draw(case, world, rollouts, getattr(driver, "columns", 0), np.random.default_rng(seed))
+    tile = CAMERA_TILE if "camera" in kinds_of(observation) else TILE
+    parts = [_judged(world, driver, part) for part in torch.split(torch.from_numpy(x).float(), tile)]
+    reason, time, headway, margin, speed = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return Verdicts(reason, time, headway, margin, speed, x)
+
+
+def world_of(case: Case, seconds: float = SECONDS, observation: str = "features") -> World:
+    """The world of a case; it tells who ran into whom."""
+    return World(
+        case.scenario, horizon=seconds, drivers=case.drivers(), observation=observation, lidar=True, witnessed=True
+    )
+
+
+def draw(case: Case, world: World, n: int, own: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Starts, drivers' weights, noise of drivers and (`own` columns) of the ego, side by side, shape (n, d)."""
+    parts = [case.starts(n, rng)]
+    if world.weights:
+        assert world.drivers is not None and world.drivers.weights is not None
+        parts.append(world.drivers.weights.sample(n, rng))
+    return np.concatenate((*parts, rng.standard_normal((n, world.draws + own))), axis=1)
+
+
+@torch.inference_mode()
+def _judged(world: World, driver: Driver, x: Tensor) -> tuple[NDArray[Any], ...]:
+    """The columns of `Verdicts` but for x, of one tile."""
+    reason = torch.full((len(x),), KEPT)
+    time = torch.full((len(x),), world.seconds)
+    least, room = torch.full_like(time, torch.inf), torch.full_like(time, torch.inf)
+    lead, since, had = torch.zeros_like(reason), torch.zeros_like(time), torch.zeros(len(x), dtype=torch.bool)
+    first: Episode | None = None
+    for tick, episode in enumerate(drive(world, driver, x)):
+        first = first or episode
+        state, now = episode.state, tick * world.dt
+        running = reason == KEPT
+        follows = lead_index(state, world.scenario.road)
+        gap, speed = episode.lead.gap, state.speed[:, 0]
+        headway = torch.where(gap < torch.inf, gap / speed.clamp(min=0.1), torch.inf)
+        far = (headway >= FLOOR_HEADWAY) & (gap >= FLOOR_GAP)
+        same = follows == lead
+        since, had = torch.where(same, since + world.dt, 0.0), (had & same) | far
+        margin = margin_of(state, first)
+        found = torch.full_like(reason, KEPT)
+        found[~far & (had | (since >= GRACE))] = TOO_CLOSE
+        found[margin < 0.0] = LEFT_LANE
+        found = torch.where(episode.collided, _blame(episode), found)
+        lead = follows
+        least = torch.where(running, torch.minimum(least, headway), least)
+        room = torch.where(running, torch.minimum(room, margin), room)
+        time = torch.where(running & (found != KEPT), now, time)
+        reason = torch.where(running, found, reason)
+    assert first is not None
+    way, due = _ways(first.state, episode.state, lead_index(first.state, world.scenario.road), world.seconds)
+    reason = torch.where((reason == KEPT) & (way < LEAST_WAY * due), LEFT_BEHIND, reason)
+    return tuple(column.numpy() for column in (reason, time.double(), least, room, way / world.seconds))
+
+
+def margin_of(state: State, first: Episode) -> Tensor:
+    """Distance from the ego's body to the nearer line of the lane that it was in at first [m], shape (B,)."""
+    road, y, heading = first.road, state.y[:, 0], state.heading[:, 0]
+    left, right = road.markers(first.state.y[:, 0])
+    middle, half_lane = first.state.y[:, 0] + 0.5 * (right - left), 0.5 * (left + right)
+    half = 0.5 * (VEHICLE_WIDTH * torch.cos(heading).abs() + VEHICLE_LENGTH * torch.sin(heading).abs())
+    return half_lane - (y - middle).abs() - half
+
+
+def _blame(episode: Episode) -> Tensor:
+    """`COLLIDED` where the ego ran into somebody, or into the road's edge; `HIT` where somebody ran into it."""
+    assert episode.witness is not None
+    crash = episode.witness.own
+    own = (crash.vehicles[:, 0] == 0) | (crash.kind == ROAD_EDGE)
+    return torch.where(crash.kind == NONE, KEPT, torch.where(own, COLLIDED, HIT))
+
+
+def _ways(first: State, last: State, lead: Tensor, seconds: float) -> tuple[Tensor, Tensor]:
+    """The ego's way [m], and that of its first lead, or at the speed of the start where it had none."""
+    ways = last.x - first.x
+    of_lead = ways.gather(1, lead[:, None])[:, 0]
+    return ways[:, 0], torch.where(lead > 0, of_lead, first.speed[:, 0] * seconds)
+
+
+def summary_of(found: Verdicts) -> Summary:
+    """Counts of verdicts, and the interval of the share of kept ones."""
+    counts = Counter(REASONS[k] for k in found.reason.tolist())
+    kept, spoiled = counts.pop(REASONS[KEPT], 0), counts.pop(REASONS[HIT], 0)
+    judged = len(found.reason) - spoiled
+    return Summary(
+        kept,
+        judged,
+        spoiled,
+        clopper_pearson(kept, judged, 0.95) if judged else (0.0, 1.0),
+        dict(counts),
+        float(found.speed.mean()),
+        float(np.median(found.headway)),
+        float(np.median(found.margin)),
+    )
+
+
+def in_ordinary_traffic(ego: Any, rollouts: int, seed: int) -> dict[str, dict[str, float]]:
+    """How an ego drives in each case, for the header of its file: drives kept, judged, and the interval's lower end."""
+    found = {case: summary_of(judge(ego, case, rollouts, seed)) for case in CASES}
+    return {case: {"kept": one.kept, "judged": one.judged, "at least": one.interval[0]} for case, one in found.items()}
+
+
+def command(
+    ego: Annotated[str, typer.Option(help="As in every command: idm, imitation, a file ...")] = "idm",
+    case: Annotated[list[str], typer.Option(help="Kinds of traffic; may be repeated.")] = list(CASES),  # noqa: B006
+    rollouts: Annotated[int, typer.Option(min=1)] = 400,
+    seed: Annotated[int, typer.Option()] = 0,
+    seconds: Annotated[float, typer.Option(help="Length of a rollout.")] = SECONDS,
+    observation: Annotated[str | None, typer.Option(help="What an ego with predict observes.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object.")] = False,
+) -> None:
+    """Judge an ego in ordinary traffic."""
+    try:
+        driver = load_ego(ego)
+        found = {name: summary_of(judge(driver, name, rollouts, seed, seconds, observation)) for name in case}
+    except (ValueError, OSError) as error:
+        print(f"nominal: {error}", file=sys.stderr)
+        raise typer.Exit(2) from None
+    if as_json:
+        print(json.dumps({name: {"share": one.share, **vars(one)} for name, one in found.items()}, allow_nan=True))
+        return
+    print("| case | kept | share (95 %) | why not | spoiled by others | mean speed | least headway | least margin |")
+    print("|---|---|---|---|---|---|---|---|")
+    for name, one in found.items():
+        why = ", ".join(f"{count} {reason}" for reason, count in one.reasons.items()) or "-"
+        share = f"{one.share:.4f} ({one.interval[0]:.4f} to {one.interval[1]:.4f})"
+        spread = f"{one.speed:.1f} m/s | {one.headway:.2f} s | {one.margin:.2f} m"
+        print(f"| {name} | {one.kept} of {one.judged} | {share} | {why} | {one.spoiled} | {spread} |")
+
+
+if __name__ == "__main__":
+    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+    app.command()(command)
+    app()

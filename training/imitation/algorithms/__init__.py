@@ -1,0 +1,1 @@
+"""Imitation algorithms: behaviour cloning, GAIL and MGAIL, and their parts."""

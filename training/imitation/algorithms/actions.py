@@ -1,0 +1,31 @@
+"""How a policy acts in training: bounds of its actions and their likelihood."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from agents.learned.networks import Policy
+
+LOW = (-8.0, -0.3)
+HIGH = (4.0, 0.3)
+"""Bounds of acceleration [m/s^2] and yaw rate [rad/s]."""
+
+
+def physical(policy: Policy, action: Tensor) -> Tensor:
+    """Normalised actions (..., 2) in m/s^2 and rad/s, within bounds."""
+    scaling = policy.scaling
+    low, high = action.new_tensor(LOW), action.new_tensor(HIGH)
+    return (scaling.action_mean + scaling.action_std * action).clamp(low, high)
+
+
+def normalised(policy: Policy, action: Tensor) -> Tensor:
+    """Inverse of `physical` within the bounds."""
+    scaling = policy.scaling
+    return (action - scaling.action_mean) / scaling.action_std
+
+
+def log_likelihood(mean: Tensor, log_std: Tensor, action: Tensor) -> Tensor:
+    """Log density of normalised actions under independent Gaussians, (..., 2) -> (...,)."""
+    z = (action - mean) * torch.exp(-log_std)
+    return -(0.5 * z.square() + log_std + 0.5 * math.log(2.0 * math.pi)).sum(dim=-1)

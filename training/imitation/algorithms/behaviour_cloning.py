@@ -1,0 +1,54 @@
+"""Behaviour cloning: the likelihood of recorded actions, maximised."""
+
+from collections.abc import Callable, Iterator
+from typing import TypeVar
+
+import torch
+
+from agents.learned.networks import Policy
+from training.imitation.algorithms.actions import log_likelihood, normalised
+from training.imitation.algorithms.config import Config
+from training.imitation.algorithms.expert_pairs import Pairs, emphasised, scaling_of
+
+
+def clone(pairs: Pairs, config: Config, generator: torch.Generator) -> Policy:
+    """A new policy that maximises the likelihood of recorded actions.
+
+    Args:
+        pairs: Recorded driving.
+        config: `epochs`, `batch`, `clone_rate`, `weight_decay`, `log_std_cap` and `lateral_weight` are used.
+        generator: Source of the initial weights and of the order of the pairs.
+    """
+    policy = seeded(lambda: Policy(scaling_of(pairs), config.log_std_cap), generator)
+    for _ in improve(policy, pairs, config, generator):
+        pass
+    return policy
+
+
+def improve(policy: Policy, pairs: Pairs, config: Config, generator: torch.Generator) -> Iterator[None]:
+    """Ascend the likelihood, epoch by epoch, with what of the policy requires gradients.
+
+    Few epochs: what 51 features say of the next action is little, and more is memorising.
+    """
+    pairs = emphasised(pairs, config.lateral_weight)
+    optimiser = torch.optim.Adam(policy.parameters(), lr=config.clone_rate, weight_decay=config.weight_decay)
+    action = normalised(policy, pairs.action)
+    for _ in range(config.epochs):
+        order = torch.randperm(len(action), generator=generator)
+        for rows in torch.split(order, config.batch):
+            mean, log_std = policy(pairs.features[rows])
+            loss = -log_likelihood(mean, log_std, action[rows]).mean()
+            optimiser.zero_grad()
+            torch.autograd.backward(loss)
+            optimiser.step()
+        yield
+
+
+Module = TypeVar("Module")
+
+
+def seeded(make: Callable[[], Module], generator: torch.Generator) -> Module:
+    """A network whose initial weights are drawn from a generator; PyTorch takes them from the global one."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(int(torch.randint(2**31, (), generator=generator)))
+        return make()

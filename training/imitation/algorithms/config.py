@@ -1,0 +1,154 @@
+"""Settings of one training, with the values that the shipped drivers were trained with."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+from agents.learned.coloured_noise import Colour
+
+Method = Literal["bc", "gail", "mgail"]
+
+
+HUMAN = Colour.swinging(frequency=(1.70, 1.57), damping=(0.845, 0.40))
+"""The autocorrelation of what cloning leaves unexplained in the record, within 0.03 up to 1 s."""
+
+
+_RANGES: tuple[tuple[tuple[str, ...], Callable[[float], bool], str], ...] = (
+    (
+        (
+            *("batch", "lateral_weight", "pools", "scenes", "horizon", "age", "drivers"),
+            *("critic_steps", "critic_batch", "memory", "model_steps", "ppo_epochs", "ppo_batch"),
+        ),
+        lambda value: value >= 1,
+        ">= 1",
+    ),
+    (("epochs", "warm_up", "weight_decay", "gradient_penalty"), lambda value: value >= 0, ">= 0"),
+    (
+        (
+            "critic_weight",
+            "collision_weight",
+            "edge_weight",
+            "brake_weight",
+            "headway_weight",
+            "lane_weight",
+            "speed_weight",
+        ),
+        lambda value: 0 <= value < math.inf,
+        ">= 0",
+    ),
+    (
+        ("clone_weight", "clone_rate", "policy_rate", "critic_rate", "model_rate", "value_rate", "clip"),
+        lambda value: 0 < value < math.inf,
+        "> 0",
+    ),
+    (("anneal", "last_rate"), lambda value: 0 < value <= 1, "in (0, 1]"),
+    (("credit", "discount", "gae"), lambda value: 0 <= value <= 1, "in [0, 1]"),
+)
+"""Settings, what holds of each of their values, and that in words. Schedules of weights are geometric, so not 0."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """How to learn a driver from recorded scenes. Pairs are values at the start and at the end of a schedule."""
+
+    method: Method = "mgail"
+    seed: int = 0
+    updates: int = 1500
+    """Updates of the policy after behaviour cloning."""
+
+    # behaviour cloning, which every method starts from
+    epochs: int = 6
+    batch: int = 512
+    clone_rate: float = 1e-3
+    weight_decay: float = 1e-4
+    log_std_cap: float = 0.0
+    """See `agents.learned.networks.Policy`."""
+    lateral_weight: int = 1
+    """How many times recorded moments of fast motion across the lane count in the likelihood, see
+    `training.imitation.algorithms.expert_pairs.emphasised`; more than once, and drivers finish more of the lane changes
+    under way."""
+
+    # rollouts
+    pools: int = 5
+    """Sets of scenes that are driven in turn and kept between updates, so that late moments are visited too."""
+    scenes: int = 8
+    """Scenes of a pool."""
+    horizon: tuple[int, int] = (15, 30)
+    """Ticks of one rollout."""
+    age: tuple[int, int] = (30, 150)
+    """Ticks after which a pool starts anew from the record."""
+    drivers: tuple[int, int] = (60, 60)
+    """Vehicles of a scene that are driven: the curriculum over the number of agents (Bhattacharyya et al. 2018)."""
+    colour: Colour = HUMAN
+    """Of the noise of acceleration and yaw rate; `Colour()` is white noise, as O'Kelly et al. have it."""
+
+    # costs of the policy
+    critic_weight: float = 3.0
+    clone_weight: tuple[float, float] = (0.1, 0.06)
+    """Of the likelihood of recorded actions; it falls geometrically."""
+    anneal: float = 0.7
+    """Share of the training in which the schedules run."""
+    collision_weight: float = 16.0
+    edge_weight: float = 16.0
+    brake_weight: float = 1.0
+    headway_weight: float = 0.0
+    """Of following closely, which people do; drivers of the traffic have neither this nor the next two."""
+    lane_weight: float = 0.0
+    """Of being beside the middle of the lane."""
+    speed_weight: float = 0.0
+    """Of being faster than the limit."""
+
+    # optimisation
+    policy_rate: float = 3e-4
+    critic_rate: float = 4e-4
+    last_rate: float = 0.1
+    """Share of the rates of policy and critic that is left at the end: they fall once the schedules have run. Only the
+    policy of the last update is kept, and this is what makes it settle."""
+    critic_steps: int = 3
+    critic_batch: int = 512
+    memory: int = 8
+    """Rollouts that the critic learns from."""
+    warm_up: int = 30
+    """Rounds in which only the critic learns."""
+    gradient_penalty: float = 0.5
+
+    # MGAIL
+    credit: float = 0.97
+    """Share of the gradient of the state that is passed on to the tick before."""
+    learned_model: bool = False
+    """Take the gradient through a learned forward model, as Baram et al. do, in place of the simulator."""
+    model_rate: float = 1e-3
+    model_steps: int = 10
+
+    # GAIL, by proximal policy optimisation
+    discount: float = 0.97
+    gae: float = 0.95
+    clip: float = 0.2
+    ppo_epochs: int = 4
+    ppo_batch: int = 2048
+    value_rate: float = 1e-3
+
+    def __post_init__(self) -> None:
+        if self.method not in ("bc", "gail", "mgail"):
+            raise ValueError(f"Expected method 'bc', 'gail' or 'mgail', got {self.method!r}.")
+        if self.learned_model and self.method != "mgail":
+            raise ValueError(f"Expected method 'mgail' with learned_model, got {self.method!r}.")
+        if self.updates < 1:
+            raise ValueError(f"Expected updates >= 1, got {self.updates}; a driver that is only cloned is method 'bc'.")
+        for names, holds, expected in _RANGES:
+            for name in names:
+                value = getattr(self, name)
+                if not all(holds(part) for part in (value if isinstance(value, tuple) else (value,))):
+                    raise ValueError(f"Expected {name} {expected}, got {value}.")
+
+    def rate(self, update: int) -> float:
+        """Factor of the learning rates at an update: 1, then linearly down to `last_rate`."""
+        start = self.anneal * self.updates
+        return 1.0 - (1.0 - self.last_rate) * min(max((update - start) / max(self.updates - start, 1.0), 0.0), 1.0)
+
+    def along(self, ends: tuple[float, float], update: int) -> float:
+        """Value of a geometric schedule at an update."""
+        share = min(update / max(self.anneal * self.updates, 1.0), 1.0)
+        first, last = ends
+        return float(first * (last / first) ** share)

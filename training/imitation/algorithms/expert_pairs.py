@@ -1,0 +1,68 @@
+"""Recorded driving as pairs of what was seen and what was done."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from agents.learned.networks import FEATURES, Scaling
+from rare_envs.sensors.perception import HEADING, SPEED
+from training.imitation.traffic.recording import Recording
+from training.imitation.traffic.replayed_traffic import look, start
+
+ACROSS = 0.4
+"""Speed across the lane [m/s], see `emphasised`."""
+
+
+class Pairs(NamedTuple):
+    """n moments of recorded driving."""
+
+    features: Tensor
+    """Shape (n, 51), SI units."""
+    action: Tensor
+    """Acceleration [m/s^2] and yaw rate [rad/s], shape (n, 2)."""
+    scene: Tensor
+    """Scene of each, shape (n,)."""
+
+
+def expert_pairs(recording: Recording) -> Pairs:
+    """Every moment of every vehicle whose surroundings and action are known."""
+    features, actions, scenes = [], [], []
+    for tick in range(recording.x.shape[1]):
+        scene = (tick < recording.ticks).nonzero().flatten()
+        traffic = start(recording, scene, torch.full_like(scene, tick))
+        m = traffic.drivers
+        driven = traffic.driven[:, :m]
+        vehicle = traffic.vehicle[:, :m]
+        action = torch.stack(
+            [field[scene, tick].gather(1, vehicle) for field in (recording.acceleration, recording.yaw_rate)], dim=-1
+        )
+        features.append(look(traffic, m)[driven])
+        actions.append(action[driven])
+        scenes.append(scene[:, None].expand_as(driven)[driven])
+    return Pairs(torch.cat(features), torch.cat(actions), torch.cat(scenes))
+
+
+def emphasised(pairs: Pairs, times: int) -> Pairs:
+    """The same pairs, those of vehicles that move across their lane at more than `ACROSS` several times.
+
+    They are one in twenty in the recordings of US 101, and most belong to lane changes.
+    """
+    if times == 1:
+        return pairs
+    fast = (torch.sin(pairs.features[:, HEADING]) * pairs.features[:, SPEED]).abs() > ACROSS
+    rows = torch.cat((torch.arange(len(fast)), fast.nonzero().flatten().repeat(times - 1)))
+    return Pairs(*(column[rows] for column in pairs))
+
+
+def scaling_of(pairs: Pairs) -> Scaling:
+    """Means and spreads of recorded features and actions; the spread of a constant is set to 1.
+
+    Raises:
+        ValueError: If there are fewer than two pairs.
+    """
+    if len(pairs.features) < 2:
+        raise ValueError(f"Expected two or more recorded pairs, got {len(pairs.features)}; are there any followers?")
+    std = pairs.features.std(dim=0)
+    std = torch.where(std > 1e-6, std, torch.ones(FEATURES))
+    return Scaling(pairs.features.mean(dim=0), std, pairs.action.mean(dim=0), pairs.action.std(dim=0).clamp(min=1e-6))

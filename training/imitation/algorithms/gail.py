@@ -1,0 +1,115 @@
+"""GAIL: the policy follows rewards, by proximal policy optimisation; all vehicles share its parameters.
+
+The reward of a moment is minus the costs that MGAIL descends: the critic's, and the penalties (reward augmentation,
+Bhattacharyya et al. 2019). The costs are added to the gradient of the recorded actions' likelihood, as there.
+
+References:
+    Ho and Ermon, "Generative adversarial imitation learning", NeurIPS 2016.
+    Bhattacharyya et al., "Multi-agent imitation learning for driving simulation", 2018 (parameter sharing, curriculum).
+    Schulman et al., "Proximal policy optimization algorithms", 2017; "High-dimensional continuous control using
+    generalized advantage estimation", 2016.
+"""
+
+import torch
+from torch import Tensor
+
+from agents.learned.coloured_noise import Colour
+from agents.learned.networks import Policy
+from training.imitation.algorithms.actions import log_likelihood
+from training.imitation.algorithms.critic import inputs, policy_cost
+from training.imitation.algorithms.learner import Learner, Log
+from training.imitation.algorithms.rollout import Steps
+
+
+def advantages(reward: Tensor, value: Tensor, discount: float, gae: float) -> Tensor:
+    """Generalised advantage estimates of rollouts that go on beyond their last moment.
+
+    Args:
+        reward: Shape (T, n).
+        value: Of each moment and of the one after the last, shape (T + 1, n).
+        discount: Per tick.
+        gae: Lambda.
+
+    Returns:
+        Shape (T, n).
+    """
+    error = reward + discount * value[1:] - value[:-1]
+    out = torch.empty_like(error)
+    running = torch.zeros_like(error[0])
+    for tick in reversed(range(len(error))):
+        running = error[tick] + discount * gae * running
+        out[tick] = running
+    return out
+
+
+def conditional(policy: Policy, features: Tensor, noise: Tensor, colour: Colour) -> tuple[Tensor, Tensor]:
+    """Mean and log standard deviation of actions, given the noise that was expected.
+
+    Coloured noise makes actions depend on each other; given the noise before, they are independent Gaussians again.
+    """
+    mean, log_std = policy(features)
+    return mean + torch.exp(log_std) * noise, log_std + torch.log(noise.new_tensor(colour.scale))
+
+
+def surrogate(ratio: Tensor, advantage: Tensor, clip: float) -> Tensor:
+    """PPO's clipped objective, to be maximised, shape (n,)."""
+    return torch.minimum(ratio * advantage, ratio.clamp(1.0 - clip, 1.0 + clip) * advantage)
+
+
+def seen_by_value(policy: Policy, steps: Steps) -> Tensor:
+    """What the value depends on: normalised features and the noise that goes on, shape (n, 53)."""
+    return torch.cat((policy.normalised(steps.features), steps.noise), dim=1)
+
+
+def rewards(learner: Learner, steps: Steps) -> Tensor:
+    """Minus the costs of each moment, shape (n,)."""
+    config = learner.config
+    likeness = policy_cost(learner.critic, inputs(learner.policy, steps.features, steps.action))
+    costs = config.collision_weight * steps.collision + config.edge_weight * steps.edge
+    manners = config.headway_weight * steps.headway + config.lane_weight * steps.lane
+    manners = manners + config.speed_weight * steps.speed
+    return -(config.critic_weight * likeness + costs + config.brake_weight * steps.brake + manners)
+
+
+def update(learner: Learner) -> Log:
+    """Drive, let the critic learn, then move the policy and the value by epochs over the rollout.
+
+    The last tick of the rollout is there for the value of what comes after it only.
+    """
+    config, policy, value = learner.config, learner.policy, learner.value
+    ticks = learner.now(config.horizon)
+    with torch.no_grad():
+        steps = learner.drive(1.0)
+    critic_error = learner.learn_critic(steps)
+    with torch.no_grad():
+        reward = rewards(learner, steps).view(ticks, -1)
+        seen = seen_by_value(policy, steps)
+        expected = value(seen).view(ticks, -1)
+        gain = advantages(reward[:-1], expected, config.discount, config.gae)
+        target = (gain + expected[:-1]).flatten()
+        kept = len(target)
+        old = log_likelihood(*conditional(policy, steps.features, steps.noise, config.colour), steps.action)[:kept]
+    gain = gain.flatten()
+    gain = (gain - gain.mean()) / gain.std().clamp(min=1e-6)
+    for _ in range(config.ppo_epochs):
+        for rows in torch.split(torch.randperm(kept, generator=learner.generator), config.ppo_batch):
+            law = conditional(policy, steps.features[rows], steps.noise[rows], config.colour)
+            ratio = torch.exp(log_likelihood(*law, steps.action[rows]) - old[rows])
+            clone = config.along(config.clone_weight, learner.update) * learner.clone_loss()
+            loss = clone - surrogate(ratio, gain[rows], config.clip).mean()
+            learner.policy_optimiser.zero_grad()
+            torch.autograd.backward(loss)
+            torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
+            learner.policy_optimiser.step()
+            error = (value(seen[rows])[:, 0] - target[rows]).square().mean()
+            learner.value_optimiser.zero_grad()
+            torch.autograd.backward(error)
+            learner.value_optimiser.step()
+    return {
+        "reward": float(reward.mean()),
+        "collision": float(steps.collision.mean()),
+        "edge": float(steps.edge.mean()),
+        "brake": float(steps.brake.mean()),
+        "value_error": float(error.detach()),
+        "critic": critic_error,
+    }

@@ -1,0 +1,213 @@
+"""What GAIL and MGAIL share: the state of a training, its rounds, and how it is kept and resumed."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from agents.learned.networks import ACTIONS, FEATURES, Policy
+from training.imitation.algorithms.actions import log_likelihood, normalised
+from training.imitation.algorithms.behaviour_cloning import seeded
+from training.imitation.algorithms.config import Config
+from training.imitation.algorithms.critic import Critic, inputs, train_critic
+from training.imitation.algorithms.expert_pairs import Pairs, emphasised
+from training.imitation.algorithms.forward_model import ForwardModel, train_model
+from training.imitation.algorithms.rollout import Steps, roll
+from training.imitation.traffic.recording import Recording
+from training.imitation.traffic.replayed_traffic import Traffic
+from training.imitation.traffic.scene_pool import Pool, fresh_pool
+
+Log = dict[str, float]
+_LEARNED = ("policy", "critic", "value", "policy_optimiser", "critic_optimiser", "value_optimiser")
+"""What has weights or moments of its own."""
+
+
+@dataclass
+class Learner:
+    """A training under way; everything random comes from `generator`, so that a resumed one goes on as it would."""
+
+    config: Config
+    recording: Recording
+    among: Tensor
+    """Scenes that are driven, with repetition if they are bootstrapped, shape (k,)."""
+    pairs: Pairs
+    """Recorded driving that the critic and the likelihood see."""
+    policy: Policy
+    critic: Critic
+    generator: torch.Generator
+    update: int = 0
+    simulated: int = 0
+    """Vehicle-steps so far."""
+
+    def __post_init__(self) -> None:
+        """Make optimisers, pools and the critic's memory."""
+        config = self.config
+        self.policy_optimiser = torch.optim.Adam(self.policy.parameters(), config.policy_rate, betas=(0.9, 0.99))
+        self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), config.critic_rate, betas=(0.5, 0.9))
+        self.value = seeded(_value, self.generator)
+        self.value_optimiser = torch.optim.Adam(self.value.parameters(), config.value_rate)
+        self.learned: tuple[str, ...] = _LEARNED
+        self.model: ForwardModel | None = None
+        if config.learned_model:
+            self.model = seeded(ForwardModel, self.generator)
+            self.model_optimiser = torch.optim.Adam(self.model.parameters(), config.model_rate)
+            self.learned += ("model", "model_optimiser")
+        self.pools: list[Pool] = []
+        self.rollouts: deque[Tensor] = deque(maxlen=config.memory)
+        self.recorded = inputs(self.policy, self.pairs.features, normalised(self.policy, self.pairs.action))
+        followed = emphasised(self.pairs, config.lateral_weight)
+        self.followed = followed.features, normalised(self.policy, followed.action)
+
+    def now(self, ends: tuple[int, int]) -> int:
+        """Value of a linear schedule of whole numbers."""
+        share = min(self.update / max(self.config.anneal * self.config.updates, 1.0), 1.0)
+        return round(ends[0] + (ends[1] - ends[0]) * share)
+
+    def set_rates(self) -> None:
+        """Learning rates of this update."""
+        factor = self.config.rate(self.update)
+        rates = (self.policy_optimiser, self.config.policy_rate), (self.critic_optimiser, self.config.critic_rate)
+        for optimiser, rate in rates:
+            for group in optimiser.param_groups:
+                group["lr"] = factor * rate
+
+    def drive(self, credit: float) -> Steps:
+        """Drive the next pool for a horizon; a pool that is old starts anew from the record."""
+        config = self.config
+        while len(self.pools) < config.pools:
+            self.pools.append(self._new_pool())
+        index = self.update % config.pools
+        if self.pools[index].age >= self.now(config.age):
+            self.pools[index] = self._new_pool()
+        horizon = self.now(config.horizon)
+        steps, self.pools[index] = roll(
+            self.recording, self.policy, self.pools[index], horizon, config.colour, credit, self.generator, self.model
+        )
+        self.simulated += len(steps.features)
+        return steps
+
+    def _new_pool(self) -> Pool:
+        config = self.config
+        return fresh_pool(
+            self.recording,
+            self.among,
+            config.scenes,
+            self.now(config.drivers),
+            self.now(config.horizon),
+            config.colour,
+            self.generator,
+        )
+
+    def learn_critic(self, steps: Steps) -> float:
+        """Let the critic learn from the rollout and the ones before, and return its loss."""
+        config = self.config
+        self.rollouts.append(inputs(self.policy, steps.features.detach(), steps.action.detach()))
+        return train_critic(
+            self.critic,
+            self.critic_optimiser,
+            self.recorded,
+            self.rollouts,
+            config.critic_steps,
+            config.critic_batch,
+            config.gradient_penalty,
+            self.generator,
+        )
+
+    def learn_model(self, steps: Steps) -> float:
+        """Let the forward model learn from the rollout, if there is one, and return its error."""
+        if self.model is None:
+            return 0.0
+        config, ticks = self.config, self.now(self.config.horizon)
+        seen, done = (part.detach().view(ticks, -1, part.shape[1]) for part in (steps.features, steps.action))
+        return train_model(
+            self.model, self.model_optimiser, self.policy, seen, done, config.model_steps, config.batch, self.generator
+        )
+
+    def warm_up(self) -> None:
+        """Let critic and forward model learn before the policy moves."""
+        for _ in range(self.config.warm_up):
+            with torch.no_grad():
+                steps = self.drive(1.0)
+            self.learn_critic(steps)
+            self.learn_model(steps)
+
+    def clone_loss(self) -> Tensor:
+        """Negative log likelihood of some recorded actions."""
+        features, action = self.followed
+        rows = torch.randint(len(features), (self.config.batch,), generator=self.generator)
+        mean, log_std = self.policy(features[rows])
+        return -log_likelihood(mean, log_std, action[rows]).mean()
+
+    def save(self, path: Path) -> None:
+        """Write everything that a resumed training needs."""
+        state = {
+            "update": self.update,
+            "simulated": self.simulated,
+            **{name: getattr(self, name).state_dict() for name in self.learned},
+            "generator": self.generator.get_state(),
+            "rollouts": list(self.rollouts),
+            "pools": [{"traffic": pool.traffic._asdict(), "noise": pool.noise, "age": pool.age} for pool in self.pools],
+        }
+        partial = path.with_suffix(".partial")
+        torch.save(state, partial)
+        partial.replace(path)
+
+    def load(self, path: Path) -> None:
+        """Take up where a training was saved.
+
+        Raises:
+            ValueError: If the file is of another training.
+        """
+        state = self.inherit(path)
+        self.update, self.simulated = state["update"], state["simulated"]
+        self.generator.set_state(state["generator"])
+        self.rollouts.extend(state["rollouts"])
+        self.pools = [Pool(Traffic(**pool["traffic"]), pool["noise"], pool["age"]) for pool in state["pools"]]
+
+    def inherit(self, path: Path) -> dict[str, Any]:
+        """Take what has been learned from a saved training, but neither its place in it nor its traffic.
+
+        Returns:
+            Everything that the file holds.
+
+        Raises:
+            ValueError: If the file is of another training.
+        """
+        state: dict[str, Any] = torch.load(path, weights_only=True)
+        if not state.keys() >= {"update", "pools", *self.learned}:
+            raise ValueError(f"Expected a checkpoint of a training in {str(path)!r}.")
+        for name in self.learned:
+            getattr(self, name).load_state_dict(state[name])
+        return state
+
+
+def _value() -> nn.Sequential:
+    """An estimate of the rewards to come, for GAIL."""
+    return nn.Sequential(
+        nn.Linear(FEATURES + ACTIONS, 128), nn.Tanh(), nn.Linear(128, 128), nn.Tanh(), nn.Linear(128, 1)
+    )
+
+
+Update = Callable[[Learner], Log]
+
+
+def updates(learner: Learner, update: Update) -> Iterator[Log]:
+    """Make the updates that are left, one by one.
+
+    Args:
+        learner: The training; it may have been resumed.
+        update: One round: drive, let the critic learn, move the policy.
+    """
+    if learner.update == 0:
+        learner.warm_up()
+    while learner.update < learner.config.updates:
+        learner.set_rates()
+        log = update(learner)
+        learner.update += 1
+        yield log

@@ -1,0 +1,110 @@
+"""What a driver must not do, as smooth costs with gradients through the simulator.
+
+Reward augmentation in the sense of RAIL, whose penalties are steps for collision and ramps for the rest; ours are ramps
+throughout, because a gradient has to see a collision come.
+
+References:
+    Bhattacharyya et al., "Simulating emergent properties of human driving behavior using multi-agent reward augmented
+    imitation learning", 2019.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from rare_envs.sensors.lidar import AHEAD
+from rare_envs.sensors.perception import LANE_OFFSET, RANGES, RATES, SPEED
+
+ALONG, ACROSS = 3.0, 0.8
+"""Gaps [m] to the front and to the side under which nearness costs."""
+MOST_ALONG, MOST_ACROSS = 3.0, 4.0
+"""Caps of the two ramps, reached only by bodies that overlap."""
+COMFORTABLE_BRAKING = 1.5
+"""Deceleration [m/s^2] that the vehicle ahead may make necessary at no cost."""
+MOST_BRAKING = 6.0
+EDGE = 1.0
+"""Distance [m] from the middle of the vehicle to the edge of the road under which it costs."""
+GENTLE_BRAKING = 2.0
+"""Deceleration [m/s^2] at no cost."""
+HEADWAY, STANDSTILL = 1.2, 2.0
+"""Gap at no cost to vehicles ahead that reach into the own path: so many seconds [s] and so many metres behind."""
+COMFORTABLE_APPROACH = 3.0
+"""Deceleration [m/s^2] by which the own speed first comes down to theirs; the way that it takes is no gap."""
+MOST_HEADWAY = 2.0
+OFF_CENTRE = 0.3
+"""Distance [m] from the middle of the lane at no cost."""
+LIMIT = 29.0
+"""Speed [m/s] at no cost, the limit of US 101 (65 mph)."""
+OVER = 10.0
+"""Speed above it [m/s] that costs 1."""
+
+
+class Penalties(NamedTuple):
+    """Costs of M vehicles in one tick, shape (B, M) each."""
+
+    collision: Tensor
+    edge: Tensor
+    brake: Tensor
+    headway: Tensor
+    lane: Tensor
+    speed: Tensor
+
+
+def penalties(
+    x: Tensor,
+    y: Tensor,
+    speed: Tensor,
+    length: Tensor,
+    width: Tensor,
+    edges: Tensor,
+    features: Tensor,
+    action: Tensor,
+    m: int,
+) -> Penalties:
+    """Costs of a moment and of what is done in it.
+
+    Args:
+        x: Along the road [m], shape (B, V), as the next four.
+        y: Across it [m].
+        speed: [m/s].
+        length: [m].
+        width: [m].
+        edges: Lane boundaries [m], shape (B, L + 1).
+        features: Of the first M vehicles, shape (B, M, 51).
+        action: Their acceleration [m/s^2] and yaw rate [rad/s], shape (B, M, 2).
+        m: M, the vehicles whose costs are asked for.
+    """
+    along = (x[:, :m, None] - x[:, None, :]).abs() - 0.5 * (length[:, :m, None] + length[:, None, :])
+    across = (y[:, :m, None] - y[:, None, :]).abs() - 0.5 * (width[:, :m, None] + width[:, None, :])
+    near = (1.0 - along / ALONG).clamp(0.0, MOST_ALONG) * (1.0 - across / ACROSS).clamp(0.0, MOST_ACROSS)
+    itself = torch.eye(m, x.shape[1], dtype=torch.bool, device=x.device)
+    contact = near.masked_fill(itself, 0.0).sum(dim=2)
+    gap = (features[..., RANGES][..., AHEAD] - 0.5 * length[:, :m]).clamp(min=0.5)
+    closing = (-features[..., RATES][..., AHEAD]).clamp(min=0.0)
+    needed = closing.square() / (2.0 * gap)
+    return Penalties(
+        collision=contact + 0.1 * (needed - COMFORTABLE_BRAKING).clamp(0.0, MOST_BRAKING),
+        edge=(EDGE - torch.minimum(y[:, :m] - edges[:, :1], edges[:, -1:] - y[:, :m])).clamp(min=0.0),
+        brake=(-action[..., 0] - GENTLE_BRAKING).clamp(min=0.0),
+        headway=_headway(x, speed, along, across, m),
+        lane=(features[..., LANE_OFFSET].abs() - OFF_CENTRE).clamp(min=0.0),
+        speed=(features[..., SPEED] - LIMIT).clamp(min=0.0) / OVER,
+    )
+
+
+def _headway(x: Tensor, speed: Tensor, along: Tensor, across: Tensor, m: int) -> Tensor:
+    """Cost of being close behind whoever reaches into the own path, or fast towards it, shape (B, M).
+
+    Args:
+        x: Along the road [m], shape (B, V).
+        speed: [m/s], shape (B, V).
+        along: Gaps along the road, shape (B, M, V).
+        across: Gaps across it.
+        m: M.
+    """
+    own = speed[:, :m, None]
+    approach = (own - speed[:, None, :]).clamp(min=0.0).square() / (2.0 * COMFORTABLE_APPROACH)
+    short = 1.0 - (along - approach) / (STANDSTILL + HEADWAY * own)
+    reaches = (1.0 - across / ACROSS).clamp(0.0, 1.0) * (x[:, None, :] > x[:, :m, None])
+    return (short.clamp(0.0, MOST_HEADWAY) * reaches).amax(dim=2)

@@ -1,0 +1,96 @@
+"""Rollouts of a policy in recorded traffic, with the gradient through the simulator."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from agents.learned.coloured_noise import Colour
+from agents.learned.networks import Policy
+from training.imitation.algorithms.actions import physical
+from training.imitation.algorithms.forward_model import ForwardModel
+from training.imitation.algorithms.penalties import Penalties, penalties
+from training.imitation.traffic.recording import Recording
+from training.imitation.traffic.replayed_traffic import Traffic, detached, look, step
+from training.imitation.traffic.scene_pool import Pool
+
+
+class Steps(NamedTuple):
+    """n moments of driven vehicles: T ticks, each with the same vehicles in the same order."""
+
+    features: Tensor
+    """Shape (n, 51), SI units."""
+    action: Tensor
+    """Normalised, shape (n, 2)."""
+    collision: Tensor
+    """Cost, shape (n,), as the next five."""
+    edge: Tensor
+    brake: Tensor
+    headway: Tensor
+    lane: Tensor
+    speed: Tensor
+    noise: Tensor
+    """What the noise of the action was expected to be from the ticks before, shape (n, 2)."""
+
+
+def roll(
+    recording: Recording,
+    policy: Policy,
+    pool: Pool,
+    ticks: int,
+    colour: Colour,
+    credit: float,
+    generator: torch.Generator,
+    model: ForwardModel | None = None,
+) -> tuple[Steps, Pool]:
+    """Drive a pool for some ticks.
+
+    Args:
+        recording: The scenes.
+        policy: The driver of all driven vehicles: parameters are shared.
+        pool: Where to begin; its traffic carries no gradient.
+        ticks: How long.
+        colour: Of the noise.
+        credit: Share of the gradient of the state that each tick passes on to the tick before.
+        generator: Source of the noise.
+        model: Take the gradient through it in place of the simulator.
+
+    Returns:
+        The moments, differentiable in the policy's weights, and the pool afterwards, which is not.
+    """
+    traffic, memory = pool.traffic, pool.noise
+    m = memory.shape[1]
+    driven = traffic.driven[:, :m]
+    unused = traffic.x.new_zeros(*traffic.x.shape[:1], traffic.x.shape[1] - m, 2)
+    rows = []
+    features: Tensor | None = None
+    action: Tensor | None = None
+    for _ in range(ticks):
+        before, features = features, look(traffic, m)
+        if model is not None and before is not None and action is not None:
+            features = model.substituted(policy, before, action, features, credit)
+        mean, log_std = policy(features)
+        expected = colour.expected(memory)
+        noise, memory = colour.next(memory, torch.randn(expected.shape, generator=generator))
+        action = mean + torch.exp(log_std) * noise
+        moved = torch.cat((physical(policy, action), unused), dim=1)
+        cost = _penalties(traffic, features if model is None else features.detach(), moved[:, :m], m)
+        rows.append([part[driven] for part in (features, action, *cost, expected)])
+        traffic = step(recording, traffic, moved)
+        traffic = _passing(traffic, credit) if model is None else detached(traffic)
+    columns = [torch.cat(column) for column in zip(*rows, strict=True)]
+    return Steps(*columns), Pool(detached(traffic), memory, pool.age + ticks)
+
+
+def _penalties(traffic: Traffic, features: Tensor, action: Tensor, m: int) -> Penalties:
+    bodies = traffic.x, traffic.y, traffic.speed, traffic.length, traffic.width
+    return penalties(*bodies, traffic.edges, features, action, m)
+
+
+def _passing(traffic: Traffic, credit: float) -> Traffic:
+    """The same traffic; on the way back its gradient is multiplied by `credit`."""
+    moved = {
+        name: (value := getattr(traffic, name)) * credit + value.detach() * (1.0 - credit)
+        for name in ("x", "y", "heading", "speed")
+    }
+    return traffic._replace(**moved)

@@ -1,0 +1,1 @@
+"""Evaluation of learned drivers: realism, prediction error, driving statistics, model card."""

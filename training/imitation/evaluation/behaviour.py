@@ -1,0 +1,184 @@
+"""What vehicles do in recorded scenes, tick by tick: all driven by one driver, or as recorded."""
+
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from agents import LearnedDriver
+from rare_envs.sensors.lidar import AHEAD
+from rare_envs.sensors.perception import RANGES, RATES
+from rare_envs.traffic.overlap import boxes_overlap
+from training.data.trajectories import DT
+from training.imitation.traffic.recording import Recording
+from training.imitation.traffic.replayed_traffic import Traffic, lane_of, look, start, step
+
+Act = Callable[[Tensor, "Tensor | None"], tuple[Tensor, "Tensor | None"]]
+"""From features (B, M, 51) and a memory, None at first, to actions (B, M, 2) [m/s^2, rad/s] and the new memory."""
+HARD_BRAKE = -3.0
+"""Acceleration [m/s^2]."""
+
+
+class Behaviour(NamedTuple):
+    """What n vehicles do in T ticks; shapes (T, n) unless said, NaN where something is not known."""
+
+    scene: Tensor
+    """Of each vehicle, shape (n,)."""
+    known: Tensor
+    """Whether the vehicle is there and counts, boolean; where not, nothing else of it means anything."""
+    speed: Tensor
+    """[m/s]."""
+    acceleration: Tensor
+    """[m/s^2]."""
+    yaw_rate: Tensor
+    """[rad/s]."""
+    ahead: Tensor
+    """Range of the beam ahead [m]."""
+    rate: Tensor
+    """Its range rate [m/s]."""
+    contact: Tensor
+    """Whether its body overlaps with another that it did not overlap with at the start, boolean."""
+    off_road: Tensor
+    """Whether its middle is beyond the edge, boolean."""
+    changed: Tensor
+    """Whether its lane is another than a tick before, boolean."""
+
+
+def sampled(driver: LearnedDriver, generator: torch.Generator, weights: Tensor | None = None) -> Act:
+    """A learned driver with its noise.
+
+    Args:
+        driver: The driver.
+        generator: Source of the noise.
+        weights: Last layers of each scene, shape (B, 404), or of all, shape (404,); None for the driver's own.
+    """
+
+    def act(features: Tensor, memory: Tensor | None) -> tuple[Tensor, Tensor | None]:
+        draws = (*features.shape[:2], 2)
+        if memory is None:
+            memory = driver.begin(torch.randn(*draws, 2, generator=generator))
+        last = None if weights is None else weights.expand(len(features), -1)
+        return driver.act(features, last, torch.randn(draws, generator=generator), memory)
+
+    return act
+
+
+def every(recording: Recording, seconds: float = 2.0) -> tuple[Tensor, Tensor]:
+    """Starts: (scene, tick) at whole multiples of some seconds from the start of every scene, shape (B,) each."""
+    stride = round(seconds / DT)
+    found = [
+        (scene, tick) for scene, ticks in enumerate(recording.ticks.tolist()) for tick in range(0, ticks - 1, stride)
+    ]
+    return torch.tensor([scene for scene, _ in found]), torch.tensor([tick for _, tick in found])
+
+
+class Moment(NamedTuple):
+    """Traffic at one tick."""
+
+    traffic: Traffic
+    """As it is when the action is taken."""
+    features: Tensor
+    """Of the first M vehicles, shape (B, M, 51)."""
+    action: Tensor
+    """Shape (B, M, 2)."""
+
+
+def drive(recording: Recording | None, traffic: Traffic, act: Act, ticks: int) -> Iterator[Moment]:
+    """Drive traffic from where it is, tick by tick; the recording says where those are who are not driven."""
+    m = traffic.drivers
+    unused = torch.zeros(*traffic.x.shape[:1], traffic.x.shape[1] - m, 2)
+    memory = None
+    for _ in range(ticks):
+        features = look(traffic, m)
+        action, memory = act(features, memory)
+        yield Moment(traffic, features, action)
+        traffic = step(recording, traffic, torch.cat((action, unused), dim=1))
+
+
+def overlaps(traffic: Traffic, m: int) -> Tensor:
+    """Which pairs of bodies share ground: the first m vehicles with all, boolean, shape (B, m, V)."""
+
+    def each(field: Tensor) -> Tensor:
+        return field[:, :m, None]
+
+    def other(field: Tensor) -> Tensor:
+        return field[:, None, :]
+
+    touching = boxes_overlap(
+        other(traffic.x) - each(traffic.x),
+        other(traffic.y) - each(traffic.y),
+        each(traffic.heading),
+        other(traffic.heading),
+        (each(traffic.length), each(traffic.width)),
+        (other(traffic.length), other(traffic.width)),
+    )
+    return touching & ~torch.eye(m, traffic.x.shape[1], dtype=torch.bool)
+
+
+def behaviour_of(moments: Iterator[Moment]) -> Behaviour:
+    """What driven vehicles do from a start on."""
+    rows: list[tuple[Tensor, ...]] = []
+    driven = overlapping = lane = torch.zeros(0)
+    scene = torch.zeros(0)
+    with torch.inference_mode():
+        for moment in moments:
+            traffic, m = moment.traffic, moment.action.shape[1]
+            now, touching = lane_of(traffic.y, traffic.edges)[:, :m], overlaps(traffic, m)
+            if not rows:
+                driven, overlapping, lane = traffic.driven[:, :m], touching, now
+                scene = traffic.scene[:, None].expand_as(driven)[driven]
+            row = _row(moment, (touching & ~overlapping).any(dim=2), now != lane)
+            rows.append(tuple(column[driven] for column in row))
+            lane = now
+    columns = [torch.stack(column) for column in zip(*rows, strict=True)]
+    return Behaviour(scene, torch.ones_like(columns[0], dtype=torch.bool), *columns)
+
+
+def recorded_behaviour(recording: Recording) -> Behaviour:
+    """What people did: every vehicle of the record at every tick at which it might have been driven.
+
+    What overlaps in the record is an error of measurement and counts as contact.
+    """
+    scenes, _, vehicles = recording.x.shape
+    known, rows = [], []
+    before = torch.full((scenes, vehicles), -1)
+    for tick in range(int(recording.ticks.max())):
+        scene = torch.arange(scenes)
+        at = recording.ticks.clamp(max=tick + 1) - 1
+        traffic = start(recording, scene, at)
+        m = traffic.drivers
+        action = torch.stack(
+            [
+                field[scene, at].gather(1, traffic.vehicle[:, :m])
+                for field in (recording.acceleration, recording.yaw_rate)
+            ],
+            dim=-1,
+        )
+        moment = Moment(traffic, look(traffic, m), action)
+        lane = lane_of(traffic.y, traffic.edges)[:, :m]
+        vehicle = traffic.vehicle[:, :m]
+        driven = traffic.driven[:, :m] & (at == tick)[:, None]
+        last = before.gather(1, vehicle)
+        row = _row(moment, overlaps(traffic, m).any(dim=2), (lane != last) & (last >= 0))
+        known.append(torch.zeros(scenes, vehicles, dtype=torch.bool).scatter(1, vehicle, driven).flatten())
+        rows.append([column.new_zeros(scenes, vehicles).scatter(1, vehicle, column).flatten() for column in row])
+        before = torch.full_like(before, -1).scatter(1, vehicle, torch.where(driven, lane, -1))
+    columns = [torch.stack(column) for column in zip(*rows, strict=True)]
+    return Behaviour(torch.arange(scenes).repeat_interleave(vehicles), torch.stack(known), *columns)
+
+
+def _row(moment: Moment, contact: Tensor, changed: Tensor) -> tuple[Tensor, ...]:
+    """Columns of `Behaviour` from `speed` on, shape (B, M) each."""
+    traffic, m = moment.traffic, moment.action.shape[1]
+    y = traffic.y[:, :m]
+    return (
+        traffic.speed[:, :m],
+        moment.action[..., 0],
+        moment.action[..., 1],
+        moment.features[..., RANGES][..., AHEAD],
+        moment.features[..., RATES][..., AHEAD],
+        contact,
+        (y < traffic.edges[:, :1]) | (y > traffic.edges[:, -1:]),
+        changed,
+    )

@@ -1,0 +1,117 @@
+"""Sums over what vehicles do in recorded scenes, scene by scene: rates, counts of bins, squared errors."""
+
+from types import MappingProxyType
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from rare_envs.sensors.lidar import MAX_RANGE
+from training.data.trajectories import DT
+from training.imitation.evaluation.behaviour import HARD_BRAKE, Behaviour
+from training.imitation.evaluation.prediction_error import Errors
+
+Array = NDArray[np.float64]
+
+BINS = MappingProxyType(
+    {
+        "speed": (0.0, 30.0, 60),
+        "acceleration": (-5.0, 4.0, 60),
+        "jerk": (-12.0, 12.0, 60),
+        "yaw_rate": (-0.12, 0.12, 60),
+        "inverse_ttc": (-1.0, 1.0, 60),
+        "gap": (0.0, 100.0, 50),
+    }
+)
+"""Lowest and highest edge and number of bins of each quantity; what is beyond counts in the outermost bin. Units are
+m/s, m/s^2, m/s^3, rad/s, 1/s (closing speed over range of the beam ahead) and m (of that beam)."""
+COMPARED = ("position", "speed", "lateral")
+"""Errors against the record that are summed."""
+
+
+class Tally(NamedTuple):
+    """Sums over the vehicle-steps of each of S scenes, from which everything else follows."""
+
+    steps: Array
+    """Vehicle-steps, shape (S,)."""
+    vehicles: Array
+    """Shape (S,)."""
+    sums: dict[str, Array]
+    """Hard braking, collision, off-road, lane changes and speed by vehicle-step, `ever` by vehicle, shape (S,)."""
+    counts: dict[str, Array]
+    """Of the bins of each quantity, shape (S, bins)."""
+    squared: dict[str, Array]
+    """Errors of position [m^2], speed and lateral position after 5 s, and how many, shape (S,)."""
+
+
+def quantities(behaviour: Behaviour) -> dict[str, tuple[Tensor, Tensor]]:
+    """The values of each quantity in `BINS` with the scenes that they are of, shape (k,) each."""
+    known = behaviour.known
+    both = known[1:] & known[:-1]
+    meets = known & (behaviour.ahead < MAX_RANGE)
+    scene = behaviour.scene.expand_as(known)
+    jerk = (behaviour.acceleration[1:] - behaviour.acceleration[:-1]) / DT
+    inverse_ttc = -behaviour.rate / behaviour.ahead.clamp(min=0.1)
+    return {
+        "speed": (behaviour.speed[known], scene[known]),
+        "acceleration": (behaviour.acceleration[known], scene[known]),
+        "jerk": (jerk[both], scene[1:][both]),
+        "yaw_rate": (behaviour.yaw_rate[known], scene[known]),
+        "inverse_ttc": (inverse_ttc[meets], scene[meets]),
+        "gap": (behaviour.ahead[known], scene[known]),
+    }
+
+
+def tally(behaviour: Behaviour, scenes: int, errors: Errors | None = None) -> Tally:
+    """Sum by scene.
+
+    Args:
+        behaviour: What vehicles did.
+        scenes: S.
+        errors: After 5 s.
+    """
+    known = behaviour.known
+
+    def by_scene(scene: Tensor, values: Tensor) -> Array:
+        return np.bincount(scene.numpy(), values.double().numpy(), minlength=scenes).astype(np.float64)
+
+    def steps(values: Tensor) -> Array:
+        return by_scene(behaviour.scene, (values.double() * known).sum(dim=0))
+
+    counts = {}
+    for name, (values, scene) in quantities(behaviour).items():
+        low, high, bins = BINS[name]
+        place = ((values.double() - low) / (high - low) * bins).floor().clamp(0, bins - 1).long()
+        flat = np.bincount((scene * bins + place).numpy(), minlength=scenes * bins)
+        counts[name] = flat.reshape(scenes, bins).astype(np.float64)
+    squared = {}
+    if errors is not None:
+        squared = {name: by_scene(errors.scene, getattr(errors, name).square()) for name in COMPARED}
+        squared["number"] = by_scene(errors.scene, torch.ones_like(errors.position))
+    return Tally(
+        steps=steps(known),
+        vehicles=by_scene(behaviour.scene, known.any(dim=0)),
+        sums={
+            "hard_brake": steps(behaviour.acceleration <= HARD_BRAKE),
+            "collision": steps(behaviour.contact),
+            "off_road": steps(behaviour.off_road),
+            "lane_changes": steps(behaviour.changed),
+            "speed": steps(behaviour.speed),
+            "ever": by_scene(behaviour.scene, (behaviour.contact & known).any(dim=0)),
+        },
+        counts=counts,
+        squared=squared,
+    )
+
+
+def together(tallies: list[Tally]) -> Tally:
+    """One tally of several, of the same scenes."""
+
+    def added(name: str) -> dict[str, Array]:
+        parts = [getattr(one, name) for one in tallies]
+        return {key: np.sum([part[key] for part in parts], axis=0) for key in parts[0]}
+
+    steps, vehicles = (np.sum([getattr(one, name) for one in tallies], axis=0) for name in ("steps", "vehicles"))
+    return Tally(steps, vehicles, added("sums"), added("counts"), added("squared"))

@@ -1,0 +1,95 @@
+"""How far a driver ends up from the person whose place it takes.
+
+As Kuefler et al. measure it, one vehicle is driven and all others do what is recorded; their cars do not react to it.
+
+References:
+    Kuefler, Morton, Wheeler and Kochenderfer, "Imitating driver behavior with generative adversarial networks", 2017.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from training.data.trajectories import DT
+from training.imitation.evaluation.behaviour import Act, drive, every
+from training.imitation.traffic.recording import Recording
+from training.imitation.traffic.replayed_traffic import Traffic, start
+
+TIMES = (0.5, 1.0, 2.0, 3.0, 4.0, 5.0, 10.0)
+"""Seconds after which drivers are compared."""
+ROLLOUTS = 20
+"""Of each segment."""
+
+
+class Errors(NamedTuple):
+    """Differences from the record, of n vehicles that it still has."""
+
+    scene: Tensor
+    """Shape (n,), as the others."""
+    position: Tensor
+    """[m]."""
+    speed: Tensor
+    """[m/s]."""
+    lateral: Tensor
+    """[m]."""
+
+
+def errors_of(recording: Recording, traffic: Traffic) -> Errors:
+    """Differences of driven vehicles from where the record has them at this tick."""
+    at = traffic.tick.minimum(recording.ticks[traffic.scene] - 1)
+    recorded = recording.present[traffic.scene, at].gather(1, traffic.vehicle)
+    known = recorded & traffic.driven & (traffic.tick == at)[:, None]
+
+    def off(name: str) -> Tensor:
+        record: Tensor = getattr(recording, name)[traffic.scene, at].gather(1, traffic.vehicle)
+        made: Tensor = getattr(traffic, name)
+        return (made - record)[known]
+
+    along, across = off("x"), off("y")
+    scene = traffic.scene[:, None].expand_as(known)[known]
+    return Errors(scene, (along.square() + across.square()).sqrt(), off("speed"), across)
+
+
+def segments(recording: Recording, seconds: float, each: int, generator: torch.Generator) -> tuple[Tensor, ...]:
+    """Some vehicles at moments of the record.
+
+    Args:
+        recording: The scenes.
+        seconds: From moment to moment.
+        each: Vehicles of a moment, at most.
+        generator: Chooses them.
+
+    Returns:
+        Scene, tick and vehicle of each segment, shape (n,) each.
+    """
+    scene, tick = every(recording, seconds)
+    traffic = start(recording, scene, tick)
+    rank = torch.where(traffic.driven, torch.rand(traffic.driven.shape, generator=generator), 2.0).argsort(1).argsort(1)
+    row, column = ((rank < each) & traffic.driven).nonzero(as_tuple=True)
+    return scene[row], tick[row], traffic.vehicle[row, column]
+
+
+def replayed_errors(
+    recording: Recording, act: Act, chosen: tuple[Tensor, ...], rollouts: int = ROLLOUTS
+) -> dict[float, Errors]:
+    """Drive one vehicle of each segment, some times over, among recorded others.
+
+    Args:
+        recording: The scenes.
+        act: The driver.
+        chosen: As `segments` gives them.
+        rollouts: Of each segment.
+
+    Returns:
+        Errors after each of `TIMES`.
+    """
+    scene, tick, vehicle = (part.repeat(rollouts) for part in chosen)
+    traffic = start(recording, scene, tick, only=vehicle)
+    ticks = {round(seconds / DT): seconds for seconds in TIMES}
+    with torch.inference_mode():
+        return {
+            ticks[passed]: errors_of(recording, moment.traffic)
+            for passed, moment in enumerate(drive(recording, traffic, act, max(ticks) + 1))
+            if passed in ticks
+        }

@@ -1,0 +1,169 @@
+"""How human a driver is: all vehicles of recorded scenes driven by it, compared with the record.
+
+Rates are per vehicle-step, as in RAIL; `ever` counts vehicles. Divergences are Jensen-Shannon, in nats, over fixed bins
+that fit smoothed data; Kuefler et al.'s are far wider.
+
+References:
+    Kuefler, Morton, Wheeler and Kochenderfer, "Imitating driver behavior with generative adversarial networks", 2017.
+    Bhattacharyya et al., "Simulating emergent properties of human driving behavior using multi-agent reward augmented
+    imitation learning", 2019.
+"""
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from agents import LearnedDriver
+from training.data.trajectories import DT
+from training.imitation.evaluation.behaviour import (
+    Act,
+    Behaviour,
+    Moment,
+    behaviour_of,
+    drive,
+    every,
+    recorded_behaviour,
+    sampled,
+)
+from training.imitation.evaluation.driving_statistics import BINS, COMPARED, Tally, tally
+from training.imitation.evaluation.prediction_error import Errors, errors_of
+from training.imitation.traffic.recording import Recording
+from training.imitation.traffic.replayed_traffic import start
+
+Array = NDArray[np.float64]
+
+_SHARES = ("hard_brake", "collision", "off_road")
+AFTER = 5.0
+"""Seconds after which positions are compared with the record, all vehicles driven."""
+
+
+@dataclass(frozen=True)
+class Realism:
+    """What a driver does in recorded scenes."""
+
+    vehicles: int
+    hard_brake: float
+    """Share of vehicle-steps at -3 m/s^2 or less."""
+    collision: float
+    """Share of vehicle-steps in which bodies overlap; pairs that overlap at the start are left out."""
+    ever: float
+    """Share of vehicles that collide at all."""
+    off_road: float
+    """Share of vehicle-steps with the middle of the vehicle beyond the edge."""
+    lane_changes: float
+    """Per vehicle and 10 s."""
+    mean_speed: float
+    """[m/s]."""
+    divergence: dict[str, float]
+    """Jensen-Shannon divergence from the record [nats], of each quantity in `BINS`."""
+    rmse: dict[str, float]
+    """Root mean square error against the record after 5 s: position [m], speed [m/s], lateral [m]."""
+
+
+def jensen_shannon(p: Array, q: Array) -> float:
+    """Divergence of two laws on the same bins [nats], 0 to log 2."""
+    middle = 0.5 * (p + q)
+
+    def kl(a: Array) -> float:
+        inside = a > 0
+        return float((a[inside] * np.log(a[inside] / middle[inside])).sum())
+
+    return 0.5 * kl(p) + 0.5 * kl(q)
+
+
+def summary(found: Tally, recorded: Tally, times: Array | None = None) -> Realism:
+    """Rates, divergences and errors of a tally.
+
+    Args:
+        found: Of a driver.
+        recorded: Of the record that it is compared with.
+        times: How often each scene counts, shape (S,); None for once.
+    """
+    times = np.ones_like(found.steps) if times is None else times
+    steps, vehicles = times @ found.steps, times @ found.vehicles
+
+    def share(counts: Array, of: Array) -> Array:
+        total = of @ counts
+        return np.asarray(total / max(total.sum(), 1.0))
+
+    ones = np.ones_like(recorded.steps)
+    shares = {name: float(times @ found.sums[name] / steps) for name in _SHARES}
+    rmse = {}
+    if found.squared and (number := times @ found.squared["number"]) > 0:
+        rmse = {name: float(np.sqrt(times @ found.squared[name] / number)) for name in COMPARED}
+    return Realism(
+        vehicles=int(vehicles),
+        **shares,
+        ever=float(times @ found.sums["ever"] / vehicles),
+        lane_changes=float(times @ found.sums["lane_changes"] / steps * 10.0 / DT),
+        mean_speed=float(times @ found.sums["speed"] / steps),
+        divergence={
+            name: jensen_shannon(share(found.counts[name], times), share(recorded.counts[name], ones)) for name in BINS
+        },
+        rmse=rmse,
+    )
+
+
+def tallies(
+    recording: Recording, act: Act, seconds: tuple[float, ...], starts: tuple[Tensor, Tensor] | None = None
+) -> dict[float, Tally]:
+    """Drive recorded scenes and sum up what happens within each of some times.
+
+    Args:
+        recording: Scenes that the driver has not learned from.
+        act: The driver of all vehicles.
+        seconds: Times [s], the longest last.
+        starts: Scenes and ticks to start from; None for every 2 s of every scene.
+    """
+    met: list[Errors] = []
+
+    def watched() -> Iterator[Moment]:
+        traffic = start(recording, *(every(recording) if starts is None else starts))
+        for tick, moment in enumerate(drive(recording, traffic, act, round(seconds[-1] / DT))):
+            if tick == round(AFTER / DT):
+                met.append(errors_of(recording, moment.traffic))
+            yield moment
+
+    whole = behaviour_of(watched())
+    out = {}
+    for time in seconds:
+        part = Behaviour(whole.scene, *(column[: round(time / DT)] for column in whole[1:]))
+        out[time] = tally(part, len(recording.x), met[0] if met else None)
+    return out
+
+
+def measure(
+    recording: Recording, act: Act, starts: tuple[Tensor, Tensor] | None = None, seconds: float = 10.0
+) -> Realism:
+    """Drive recorded scenes and compare with the record; arguments as in `tallies`."""
+    return summary(tallies(recording, act, (seconds,), starts)[seconds], recorded_tally(recording))
+
+
+def recorded_tally(recording: Recording) -> Tally:
+    """What people did in the recorded scenes."""
+    return tally(recorded_behaviour(recording), len(recording.x))
+
+
+def standard_errors(found: Tally, recorded: Tally, rng: np.random.Generator, draws: int = 200) -> Realism:
+    """Standard errors of `summary`, by bootstrap over scenes; scenes that share vehicles are taken as independent."""
+    scenes = len(found.steps)
+    drawn = [asdict(summary(found, recorded, times)) for times in rng.multinomial(scenes, [1 / scenes] * scenes, draws)]
+
+    def spread(values: list[Any]) -> Any:
+        if isinstance(values[0], dict):
+            return {key: spread([value[key] for value in values]) for key in values[0]}
+        return float(np.std(values, ddof=1))
+
+    return Realism(**{name: spread([one[name] for one in drawn]) for name in drawn[0]})
+
+
+def metrics(recording: Recording, driver: LearnedDriver, seed: int = 0) -> dict[str, dict[str, Any]]:
+    """What the header of a driver's file says: `Realism` over 10 s and 20 s, with one sequence of noise."""
+    found = tallies(recording, sampled(driver, torch.Generator().manual_seed(seed)), (10.0, 20.0))
+    recorded = recorded_tally(recording)
+    return {f"{seconds:g} s": asdict(summary(one, recorded)) for seconds, one in found.items()}

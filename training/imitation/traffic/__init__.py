@@ -1,0 +1,1 @@
+"""Recorded scenes as traffic in which drivers learn."""

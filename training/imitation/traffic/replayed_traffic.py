@@ -1,0 +1,149 @@
+"""Traffic of recorded scenes in which some vehicles are driven and the others replayed: differentiable, batch first.
+
+A recording shows a window of a road, so the first vehicle of each lane has a leader that nobody sees. It is replayed,
+and goes on at constant speed after its record ends; it is seen by the others but neither driven nor judged. Vehicles
+that enter the window later are left out.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from rare_envs.sensors.lidar import Bodies
+from rare_envs.sensors.perception import OnRoad, perceive
+from training.data.trajectories import DT
+from training.imitation.traffic.recording import Recording, parked
+
+
+class Traffic(NamedTuple):
+    """B scenes with V vehicles at one moment; driven vehicles come first."""
+
+    x: Tensor
+    """Shape (B, V), as the next three; frame and units as in `Scene`."""
+    y: Tensor
+    heading: Tensor
+    speed: Tensor
+    length: Tensor
+    """Shape (B, V) [m], as the next."""
+    width: Tensor
+    edges: Tensor
+    """Lane boundaries [m], shape (B, L + 1)."""
+    scene: Tensor
+    """Which scene of the recording, shape (B,)."""
+    tick: Tensor
+    """Which tick of it, shape (B,); may pass its end."""
+    vehicle: Tensor
+    """Which vehicle of the scene, shape (B, V)."""
+    there: Tensor
+    """Which vehicles exist, boolean, shape (B, V); the others are parked far away."""
+    driven: Tensor
+    """Which are driven, boolean, shape (B, V)."""
+
+    @property
+    def drivers(self) -> int:
+        """The first M vehicles hold all that are driven."""
+        return int(self.driven.sum(dim=1).max())
+
+
+def start(
+    recording: Recording, scene: Tensor, tick: Tensor, most: int | None = None, only: Tensor | None = None
+) -> Traffic:
+    """Traffic as recorded at a moment of some scenes.
+
+    Args:
+        recording: S scenes.
+        scene: Scene of each row, shape (B,).
+        tick: Tick of each row, shape (B,).
+        most: Drive no more than this many vehicles of a scene, the rearmost; None for all that may be driven.
+        only: Drive this vehicle of each row and no other, shape (B,).
+    """
+    edges = recording.edges[scene]
+    there = recording.present[scene, tick]
+    x, y = recording.x[scene, tick], recording.y[scene, tick]
+    driven = recording.acts[scene, tick] & ~first_in_lane(x, y, there, edges)
+    if most is not None:
+        rank = torch.where(driven, x, torch.inf).argsort(dim=1).argsort(dim=1)
+        driven = driven & (rank < most)
+    if only is not None:
+        driven = driven & (torch.arange(driven.shape[1]) == only[:, None])
+    order = (2 * driven.int() + there.int()).argsort(dim=1, descending=True, stable=True)
+    vehicle = order[:, : int(there.sum(dim=1).max())]
+
+    def of(field: Tensor) -> Tensor:
+        return field.gather(1, vehicle)
+
+    there, driven = of(there), of(driven)
+    x = torch.where(there, of(x), parked(vehicle.float()))
+    y, heading, speed = (
+        torch.where(there, of(field), 0.0)
+        for field in (y, recording.heading[scene, tick], recording.speed[scene, tick])
+    )
+    sizes = of(recording.length[scene]), of(recording.width[scene])
+    return Traffic(x, y, heading, speed, *sizes, edges, scene, tick, vehicle, there, driven)
+
+
+def first_in_lane(x: Tensor, y: Tensor, there: Tensor, edges: Tensor) -> Tensor:
+    """Which vehicles have nobody ahead in their lane; shapes (B, V) and edges (B, L + 1)."""
+    lane = lane_of(y, edges)
+    ahead = (x[:, None, :] > x[:, :, None]) & (lane[:, None, :] == lane[:, :, None]) & there[:, None, :]
+    return there & ~ahead.any(dim=2)
+
+
+def lane_of(y: Tensor, edges: Tensor) -> Tensor:
+    """Lane of each vehicle, 0 the leftmost; beside the road the nearest. Shapes (B, V) and (B, L + 1)."""
+    inner = torch.where(edges[:, 1:-1] < edges[:, -1:], edges[:, 1:-1], torch.inf)
+    return (y.detach()[:, :, None] > inner[:, None, :]).sum(dim=2)
+
+
+def on_road(y: Tensor, heading: Tensor, edges: Tensor) -> OnRoad:
+    """Where vehicles are on their straight road; shapes (B, M) and edges (B, L + 1)."""
+    lane = lane_of(y, edges)
+    left, right = edges.gather(1, lane), edges.gather(1, lane + 1)
+    return OnRoad(y - 0.5 * (left + right), heading, torch.zeros_like(y), y - left, right - y)
+
+
+def look(traffic: Traffic, observers: int | None = None) -> Tensor:
+    """The 51 features of the first vehicles, shape (B, M, 51); None for all."""
+    bodies = Bodies(traffic.x, traffic.y, traffic.heading, traffic.speed, traffic.length, traffic.width)
+    return perceive(bodies, on_road(traffic.y, traffic.heading, traffic.edges), observers)
+
+
+def step(recording: Recording | None, traffic: Traffic, action: Tensor) -> Traffic:
+    """Move everybody by one tick: explicit Euler with the old values, as recorded motion was inverted.
+
+    Args:
+        recording: The scenes; None for traffic that none has recorded: who is not driven keeps to its speed.
+        traffic: B scenes with V vehicles.
+        action: Acceleration [m/s^2] and yaw rate [rad/s], shape (B, V, 2); only that of driven vehicles counts.
+
+    Returns:
+        Traffic one tick later, differentiable in traffic and action.
+    """
+    moving = traffic.driven.to(traffic.x.dtype)
+    x = traffic.x + traffic.speed * torch.cos(traffic.heading) * DT
+    y = traffic.y + traffic.speed * torch.sin(traffic.heading) * DT * moving
+    heading = traffic.heading + action[..., 1] * DT * moving
+    speed = traffic.speed + action[..., 0] * DT * moving
+    speed = speed + (speed.clamp(min=0.0) - speed).detach()  # the gradient passes a standstill
+    moved = {"x": x, "y": y, "heading": heading, "speed": speed}
+    tick = traffic.tick + 1
+    if recording is not None and not bool(traffic.driven.all()):
+        moved = _replayed(recording, traffic, tick, moved)
+    return traffic._replace(**moved, tick=tick)
+
+
+def _replayed(recording: Recording, traffic: Traffic, tick: Tensor, moved: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Where the record goes on, it says where vehicles that are not driven are."""
+    scene, vehicle = traffic.scene, traffic.vehicle
+    at = tick.minimum(recording.ticks[scene] - 1)
+    goes_on = recording.present[scene, at].gather(1, vehicle) & (tick == at)[:, None] & traffic.there & ~traffic.driven
+    return {
+        name: torch.where(goes_on, getattr(recording, name)[scene, at].gather(1, vehicle), value)
+        for name, value in moved.items()
+    }
+
+
+def detached(traffic: Traffic) -> Traffic:
+    """The same traffic, with no gradient to how it came about."""
+    return Traffic(*(field.detach() for field in traffic))

@@ -1,0 +1,1 @@
+"""Fitting base distributions of scenarios to recorded traffic."""

@@ -1,0 +1,229 @@
+"""Fits base distributions to recorded traffic and writes them as JSON.
+
+    python -m training.scenario_fitting.fit --data DIR --out rare_envs/data
+    python -m training.scenario_fitting.fit --highd DIR --out bases
+
+The first line makes the files of the package from events of US 101. The second extracts the events of your own
+recordings first: of highD, or with --ngsim of raw NGSIM.
+
+Events (one per row of a CSV file) are filtered, standardised, and fitted with Gaussian mixtures with
+full covariances; the number of components is the one with the least Bayesian information criterion.
+Back in physical units the mixture is cut to the box of the scenario's parameters. The first line also
+writes the two `highway` files, which are assembled and not fitted (`training.scenario_fitting.published_highway`).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from types import MappingProxyType
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
+from rare_envs.scenarios.registry import named
+from training.data.events import EXTRACTORS, Events, pooled, write_events
+from training.data.highd import highd_recordings, load_highd
+from training.data.ngsim import load_ngsim
+from training.data.text_columns import Gaps
+from training.data.trajectories import Trajectories
+from training.scenario_fitting.event_filters import RECIPES, Recipe, filter_events, read_events
+from training.scenario_fitting.mixture import (
+    COVARIANCE_FLOOR,
+    EVENTS_PER_COMPONENT,
+    RESTARTS,
+    SMALLEST_COMPONENT,
+    Fit,
+    beside,
+    fit_mixture,
+    mass_outside,
+)
+from training.scenario_fitting.published_highway import highway_base
+
+COMMAND = "python -m training.scenario_fitting.fit --data DIR --out rare_envs/data"
+OWN_COMMAND = "python -m training.scenario_fitting.fit, with --highd or --ngsim"
+SOURCE = {
+    "data": "Next Generation Simulation (NGSIM) Vehicle Trajectories and Supporting Data, US 101 "
+    "(Los Angeles, southbound, 15 June 2005, 07:50 local time, congested)",
+    "publisher": "U.S. Department of Transportation, Federal Highway Administration (FHWA)",
+    "record": "8ect-6jqj",
+    "licence": "CC BY-SA 3.0 (as the data's public record was reported); these parameters are "
+    "derived from the data and are offered under the same licence",
+    "changes": "events extracted from the trajectories, filtered as listed, fitted with a mixture",
+}
+
+
+def base_file(
+    scenario: str,
+    mixture: TruncatedGaussianMixture,
+    provenance: Mapping[str, Any],
+    replaced: Mapping[str, Any] = MappingProxyType({}),
+) -> str:
+    """Text of a base distribution file, as `rare_envs.scenarios.base_distributions.load_base` reads it.
+
+    Args:
+        scenario: Name of the scenario, such as "cut_in".
+        mixture: The law, of logarithms where some coordinates are.
+        provenance: Where it comes from.
+        replaced: Entries in place of the mixture's own: the box of x, where some coordinates are logarithms.
+    """
+    content = {
+        "names": [p.name for p in named(scenario).parameters],
+        "units": [p.unit for p in named(scenario).parameters],
+        **mixture.to_dict(),
+        **replaced,
+        "provenance": {**provenance, "mass_outside_box": mass_outside(mixture)},
+    }
+    return json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def us101_base(scenario: str, data: Path, seed: int = 0, recipe: Recipe | None = None) -> str:
+    """Fits one scenario to the US 101 events and returns the text of its file; by its recipe in `RECIPES` if None."""
+    recipe = RECIPES[scenario] if recipe is None else recipe
+    return fitted_base(scenario, data / recipe.file, SOURCE, COMMAND, seed, recipe)
+
+
+def fitted_base(
+    scenario: str, path: Path, source: Mapping[str, str], command: str, seed: int = 0, recipe: Recipe | None = None
+) -> str:
+    """Fits one scenario to a file of events and returns the text of its file.
+
+    Args:
+        scenario: Its name, such as "cut_in".
+        path: CSV with the columns of the recipe.
+        source: Where the events come from, and under which licence.
+        command: What writes the file.
+        seed: Of the fits.
+        recipe: What of the events is fitted; the one in `RECIPES` if None.
+
+    Raises:
+        ValueError: The events cannot be read, or are too few.
+    """
+    recipe, box = RECIPES[scenario] if recipe is None else recipe, named(scenario).parameters
+    (together, own), log = filter_events(read_events(path, recipe), recipe, box)
+    low, high = (np.array([getattr(p, end) for p in box]) for end in ("low", "high"))
+    chosen = np.array([column in recipe.logarithmic for column in recipe.columns])
+    joint = together.shape[1]
+    together[:, chosen[:joint]] = np.log(together[:, chosen[:joint]])
+    bottom, top = (np.where(chosen, np.log(np.where(chosen, end, 1.0)), end) for end in (low, high))
+    try:
+        fit = fit_mixture(together, bottom[:joint], top[:joint], seed)
+        mixture = fit.mixture
+        if recipe.apart:
+            own_fit = fit_mixture(own, bottom[joint:], top[joint:], seed, most=1)
+            mixture = beside(mixture, own_fit.mixture)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    box_of_x = {"low": low.tolist(), "high": high.tolist(), "logarithmic": chosen.tolist()} if chosen.any() else {}
+    origin = {"source": source, "file": path.name, "command": command}
+    return base_file(scenario, mixture, _provenance(recipe, log, fit, seed, origin), box_of_x)
+
+
+def _provenance(recipe: Recipe, log: Sequence[Any], fit: Fit, seed: int, origin: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        "kind": "fitted to recorded events",
+        "source": origin["source"],
+        "file": origin["file"],
+        "columns": list(recipe.columns),
+        "moment": "start of the lane change" if recipe.phase else "first frame of the pair",
+        "events_read": log[0]["events"],
+        "events_used": {", ".join(e["columns"]): e["events"] for e in log if e["rule"] == "events used"},
+        "filters": [entry for entry in log if "dropped" in entry],
+        "selection": [
+            {
+                "components": candidate.components,
+                "bic": round(candidate.bic, 2),
+                "events_in_smallest": round(candidate.smallest, 1),
+                "accepted": candidate.accepted,
+            }
+            for candidate in fit.candidates
+        ],
+        "settings": {
+            "covariance_floor": COVARIANCE_FLOOR,
+            "restarts": RESTARTS,
+            "events_per_component_and_dimension": EVENTS_PER_COMPONENT,
+            "smallest_component_per_dimension": SMALLEST_COMPONENT,
+            "seed": seed,
+        },
+        "command": origin["command"],
+        "libraries": {name: version(name) for name in ("numpy", "scipy", "scikit-learn")},
+    }
+
+
+def own_bases(tables: Iterable[Trajectories], scenarios: Sequence[str], out: Path, name: str, seed: int = 0) -> None:
+    """Extracts the events of recordings and fits scenarios to them.
+
+    Writes `<scenario>_events.csv` and `<scenario>_<name>.json` into a folder; `load_base` reads the latter.
+
+    Raises:
+        ValueError: A recording is broken, or the events of a scenario are too few; their file is written all the same.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    names: set[str] = set()
+    parts: list[dict[str, Events]] = []
+    for table in tables:
+        names |= {str(recording) for recording in np.unique(table.recording)}
+        parts.append({scenario: EXTRACTORS[scenario](table) for scenario in scenarios})
+    source = {
+        "data": f"recordings {', '.join(sorted(names))}",
+        "licence": "that of the recordings; parameters derived from them may fall under it",
+        "changes": SOURCE["changes"],
+    }
+    files = {scenario: out / f"{scenario}_events.csv" for scenario in scenarios}
+    for scenario, path in files.items():
+        write_events(pooled([events[scenario] for events in parts]), path)
+        typer.echo(path)
+    for scenario, path in files.items():
+        base = out / f"{scenario}_{name}.json"
+        base.write_text(fitted_base(scenario, path, source, OWN_COMMAND, seed), encoding="utf-8")
+        typer.echo(base)
+
+
+def main(
+    out: Annotated[Path, typer.Option(help="Folder for the JSON files.")],
+    data: Annotated[Path | None, typer.Option(help="Folder with the US 101 events files.")] = None,
+    highd: Annotated[Path | None, typer.Option(help="Data folder of highD.")] = None,
+    ngsim: Annotated[Path | None, typer.Option(help="A raw NGSIM file.")] = None,
+    location: Annotated[str | None, typer.Option(help="Location, where an NGSIM file has several.")] = None,
+    cut_gaps: Annotated[bool, typer.Option("--cut-gaps", help="Cut tracks where frames are missing.")] = False,
+    scenario: Annotated[list[str] | None, typer.Option(help="Of your own recordings: which to fit.")] = None,
+    name: Annotated[str, typer.Option(help="Name of the bases of your own recordings.")] = "own",
+    seed: Annotated[int, typer.Option(help="Seed of the fits.", min=0)] = 0,
+) -> None:
+    """Writes base distributions: us101 (fitted) and highway (assembled), or those of your own recordings."""
+    try:
+        if sum(source is not None for source in (data, highd, ngsim)) != 1:
+            raise ValueError("Give one of --data, --highd and --ngsim.")
+        chosen = tuple(scenario or RECIPES)
+        if unknown := sorted(set(chosen) - set(RECIPES)):
+            raise ValueError(f"Unknown scenario {unknown[0]}; known are {', '.join(RECIPES)}.")
+        gaps: Gaps = "cut" if cut_gaps else "error"
+        if highd is not None:
+            tables = (load_highd(highd, recording, gaps=gaps) for recording in highd_recordings(highd))
+            own_bases(tables, chosen, out, name, seed)
+        elif ngsim is not None:
+            own_bases([load_ngsim(ngsim, location=location, gaps=gaps)], chosen, out, name, seed)
+        elif data is not None:
+            _package_bases(data, out, seed)
+    except (OSError, ValueError) as error:
+        typer.echo(f"Error: {error}", err=True)
+        raise typer.Exit(2) from None
+
+
+def _package_bases(data: Path, out: Path, seed: int) -> None:
+    texts = {}
+    for scenario in RECIPES:
+        texts[f"{scenario}_us101.json"] = us101_base(scenario, data, seed)
+        texts[f"{scenario}_highway.json"] = base_file(scenario, *highway_base(scenario))
+    out.mkdir(parents=True, exist_ok=True)
+    for name, text in texts.items():
+        (out / name).write_text(text, encoding="utf-8")
+        typer.echo(out / name)
+
+
+if __name__ == "__main__":
+    typer.run(main)

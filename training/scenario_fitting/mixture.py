@@ -1,0 +1,149 @@
+"""Gaussian mixtures fitted to events: the number of components by the Bayesian information criterion, cut to a box."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+from sklearn.mixture import GaussianMixture
+
+from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
+
+Array = NDArray[np.float64]
+
+MAX_COMPONENTS = 5
+EVENTS_PER_COMPONENT = 10  # times d: no more components are tried than there are events for
+SMALLEST_COMPONENT = 5  # times d: a component on fewer events has collapsed on a handful of them
+COVARIANCE_FLOOR = 0.01  # added to variances of standardised data: a tenth of a standard deviation
+RESTARTS = 20
+MASS_SAMPLES = 1_000_000
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One number of components that was tried."""
+
+    components: int
+    bic: float
+    smallest: float
+    """Events in the smallest component (sum of its responsibilities)."""
+    accepted: bool
+    """False if a component has collapsed on a handful of events."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A fitted base distribution and how it was chosen."""
+
+    mixture: TruncatedGaussianMixture
+    candidates: tuple[Candidate, ...]
+
+
+def fit_mixture(points: Array, low: Array, high: Array, seed: int = 0, most: int = MAX_COMPONENTS) -> Fit:
+    """Gaussian mixture chosen by BIC, cut to a box.
+
+    For K = 1, 2, ... while there are `EVENTS_PER_COMPONENT` d events per component: expectation
+    maximisation on standardised data from `RESTARTS` seeded starts, with a floor under the
+    covariances. Fits with a component of fewer than `SMALLEST_COMPONENT` d events are rejected.
+
+    Args:
+        points: Events, shape (n, d), with n > d.
+        low: Lower ends of the box, shape (d,).
+        high: Upper ends of the box, shape (d,).
+        seed: Of the starts; same seed, same fit.
+        most: Largest number of components to try.
+
+    Raises:
+        ValueError: There are no more events than parameters, or one of them does not vary.
+    """
+    n, d = points.shape
+    if n <= d:
+        raise ValueError(f"{n} events are too few to fit {d} parameters; more than {d} are needed.")
+    centre, scale = points.mean(axis=0), points.std(axis=0)
+    if (scale == 0).any():
+        raise ValueError(f"Parameter {int(np.argmin(scale))} is the same in all {n} events.")
+    standard = (points - centre) / scale
+    most = int(np.clip(n // (EVENTS_PER_COMPONENT * d), 1, most))
+    models = [_expectation_maximisation(standard, k, seed) for k in range(1, most + 1)]
+    candidates = tuple(_assess(model, standard) for model in models)
+    accepted = [i for i, candidate in enumerate(candidates) if candidate.accepted]
+    best = models[min(accepted, key=lambda i: candidates[i].bic)]
+    covariances = best.covariances_ * np.outer(scale, scale)
+    mixture = _rounded(best.weights_, centre + best.means_ * scale, covariances, low, high)
+    return Fit(mixture, candidates)
+
+
+def _expectation_maximisation(standard: Array, components: int, seed: int) -> Any:
+    model = GaussianMixture(
+        components,
+        covariance_type="full",
+        tol=1e-6,
+        reg_covar=COVARIANCE_FLOOR,
+        max_iter=5000,
+        n_init=RESTARTS,
+        random_state=seed,
+    )
+    return model.fit(standard)
+
+
+def _assess(model: Any, standard: Array) -> Candidate:
+    n, d = standard.shape
+    smallest = float(model.weights_.min() * n)
+    accepted = model.n_components == 1 or smallest >= SMALLEST_COMPONENT * d
+    return Candidate(model.n_components, float(model.bic(standard)), smallest, accepted)
+
+
+def _rounded(weights: Array, means: Array, covariances: Array, low: Array, high: Array) -> TruncatedGaussianMixture:
+    """The mixture to six significant digits, heaviest component first.
+
+    More digits would say nothing about the traffic and differ between machines.
+    """
+    order = np.argsort(-weights)
+    shares = np.round(weights[order], 6)
+    shares[0] = 1.0 - shares[1:].sum()
+    symmetric = 0.5 * (covariances + covariances.transpose(0, 2, 1))
+    return TruncatedGaussianMixture(shares, _significant(means[order]), _significant(symmetric[order]), low, high)
+
+
+def _significant(values: Array) -> Array:
+    rounded = np.vectorize(lambda value: float(f"{value:.6g}"), otypes=[np.float64])(values)
+    return np.asarray(rounded, dtype=np.float64)
+
+
+def beside(joint: TruncatedGaussianMixture, apart: TruncatedGaussianMixture) -> TruncatedGaussianMixture:
+    """The law of independent points side by side: a mixture, and behind it one of a single component."""
+    d, k = joint.dim + apart.dim, len(joint.weights)
+    covariances = np.zeros((k, d, d))
+    covariances[:, : joint.dim, : joint.dim] = joint.covariances
+    covariances[:, joint.dim :, joint.dim :] = apart.covariances
+    means = np.hstack([joint.means, np.repeat(apart.means, k, axis=0)])
+    low, high = np.append(joint.low, apart.low), np.append(joint.high, apart.high)
+    return TruncatedGaussianMixture(joint.weights, means, covariances, low, high)
+
+
+def mass_outside(mixture: TruncatedGaussianMixture, seed: int = 0) -> dict[str, Any]:
+    """How much of the untruncated mixture the box cuts away.
+
+    Returns:
+        `any`: probability that some coordinate is outside, with its `standard_error` (Monte Carlo);
+        `each`: the same per coordinate, from the marginals.
+    """
+    rng = np.random.default_rng(seed)
+    counts = rng.multinomial(MASS_SAMPLES, mixture.weights)
+    outside = 0
+    for n, mean, covariance in zip(counts, mixture.means, mixture.covariances, strict=True):
+        x = mean + rng.standard_normal((n, mixture.dim)) @ np.linalg.cholesky(covariance).T
+        outside += int(((x < mixture.low) | (x > mixture.high)).any(axis=1).sum())
+    p = outside / MASS_SAMPLES
+    scale = np.sqrt(np.diagonal(mixture.covariances, axis1=1, axis2=2))
+    below = ndtr((mixture.low - mixture.means) / scale)
+    above = ndtr((mixture.means - mixture.high) / scale)
+    each = mixture.weights @ (below + above)
+    return {
+        "any": p,
+        "standard_error": float(f"{np.sqrt(p * (1.0 - p) / MASS_SAMPLES):.2g}"),
+        "each": [float(f"{value:.3g}") for value in each],
+    }
