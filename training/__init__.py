@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from training.train_ego import train_ego
+from training.ego_training import train_ego
 
 if TYPE_CHECKING:
     from training.vec_env import sb3_agents_env, sb3_vec_env

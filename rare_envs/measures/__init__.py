@@ -2,7 +2,6 @@
 
 from rare_envs.measures.base import COLLISION, EpisodeMeasure, Measure
 from rare_envs.measures.braking import BRAKES, DECELERATION_MAX, btn, drac, required_deceleration, ttb
-from rare_envs.measures.clearance import clearance, margin, ttc_2d
 from rare_envs.measures.combination import Combined, minimum, weighted, with_collision
 from rare_envs.measures.encroachment import PET_MAX, pet
 from rare_envs.measures.episode_trace import Trace, TraceMeasure
@@ -12,6 +11,7 @@ from rare_envs.measures.registry import MEASURES, find_measure
 from rare_envs.measures.rss import MARGIN_MAX, RSS, rss_lateral, rss_longitudinal, rss_margin
 from rare_envs.measures.temporal_logic import SIGNALS, stl
 from rare_envs.measures.time_to_collision import TTC_MAX, lidar_ttc, mttc, thw, ttc
+from rare_envs.measures.two_dimensional import clearance, margin, ttc_2d
 
 __all__ = [
     "BRAKES",

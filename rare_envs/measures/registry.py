@@ -10,7 +10,6 @@ from torch import Tensor
 
 from rare_envs.measures.base import EpisodeMeasure, Measure
 from rare_envs.measures.braking import BRAKES, DECELERATION_MAX, btn, drac, required_deceleration, ttb
-from rare_envs.measures.clearance import clearance, margin, ttc_2d
 from rare_envs.measures.encroachment import pet
 from rare_envs.measures.episode_trace import TraceMeasure
 from rare_envs.measures.exposure import EXPOSURE_MAX, Exposure, tet, tit
@@ -18,6 +17,7 @@ from rare_envs.measures.moment import Moment
 from rare_envs.measures.rss import MARGIN_MAX, rss_lateral, rss_longitudinal, rss_margin
 from rare_envs.measures.temporal_logic import stl
 from rare_envs.measures.time_to_collision import TTC_MAX, lidar_ttc, mttc, thw, ttc
+from rare_envs.measures.two_dimensional import clearance, margin, ttc_2d
 from rare_envs.plugins import did_you_mean, working_directory_first
 from rare_envs.traffic.crash import crash_of
 

@@ -165,7 +165,7 @@ def straight(lanes: int, width: float = 4.0) -> Road:
 def i80() -> Road:
     """Interstate 80 at Emeryville, California: six curved lanes, 700 m, then straight on.
 
-    The reference line is the middle of the leftmost lane, fitted to the survey by `training/scenario_fitting/i80_road.py`.
+    The reference line is the middle of the leftmost lane; `training.scenario_fitting.i80_road` fitted it to the survey.
     """
     text = (resources.files("rare_envs") / "data" / "i80.json").read_text(encoding="utf-8")
     table = json.loads(text)

@@ -22,7 +22,7 @@ from agents import SavedEgo, load_ego
 from rare_envs import DrivingProblem
 from rare_envs.control.actions import DISCRETE_ACTIONS
 from training import sb3_vec_env, train_ego
-from training.train_ego import RECIPES
+from training.ego_training import RECIPES
 from training.vec_env import BatchedVecEnv, info_row, merge_options
 
 IDS = ("rare_envs/CarFollowing-v0", "rare_envs/CutIn-v0")
