@@ -7,7 +7,7 @@ import numpy as np
 from scipy import stats
 
 from samplers.importance.draws import Draws
-from samplers.methods.two_stage.stratified import Strata
+from samplers.methods.two_stage.stratified import StratifiedSample
 from samplers.statistics.weights import effective_sample_size
 
 FALSE_ALARM = 1e-3
@@ -21,7 +21,7 @@ LEFT_OUT = 0.05
 """Share of p that a single draw in a region may stand for."""
 
 
-def against_base_draws(p: float, hits: int, n: int) -> list[str]:
+def check_base_draws(p: float, hits: int, n: int) -> list[str]:
     """Warn where more of n plain base draws fail than an estimate p allows.
 
     Base draws know of no proposal: they hit a missed region as often as any other.
@@ -32,7 +32,7 @@ def against_base_draws(p: float, hits: int, n: int) -> list[str]:
     return [f"{hits} of {n:,} base draws failed where p = {p:.2e} lets expect {expected:.2g}: p misses failures."]
 
 
-def against_rounds(strata: Strata, rounds: Sequence[Draws]) -> list[str]:
+def check_rounds(strata: StratifiedSample, rounds: Sequence[Draws]) -> list[str]:
     """Warn where the rounds before, each weighed by its own proposal, together say something else.
 
     Weighed as draws from all rounds' proposals together they would be worth more, but are often too low by a third:
@@ -50,7 +50,7 @@ def against_rounds(strata: Strata, rounds: Sequence[Draws]) -> list[str]:
     return [f"The rounds before the estimate say {before:.2e}, {apart:.1f} standard errors from it."]
 
 
-def rarely_worth(strata: Strata) -> list[str]:
+def check_efficiency(strata: StratifiedSample) -> list[str]:
     """Warn where the draws are worth so little that the weights may have a tail that none of them has met."""
     draws = strata.draws
     if len(draws.f) == 0 or draws.ess >= LOW_RATE * draws.n:
@@ -58,7 +58,7 @@ def rarely_worth(strata: Strata) -> list[str]:
     return [f"{draws.n:,} draws are worth {draws.ess:.0f} failures: there may be heavier weights than any met."]
 
 
-def regions_left_out(strata: Strata) -> list[str]:
+def check_regions(strata: StratifiedSample) -> list[str]:
     """Warn of regions where the points that the exploration found have weights that p cannot do without.
 
     Where one draw is worth some per cent of p, the proposal does not describe the region, and that the final draws

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from samplers.mcmc.kernels import conditional_proposal
-from samplers.methods.two_stage.regions import Downhill, Found, grown
-from samplers.methods.two_stage.simulator import Batch, Simulator
+from samplers.methods.two_stage.regions import Downhill, Found, grow_regions
+from samplers.methods.two_stage.simulator import ComponentDraws, Simulator
 from samplers.problem import FloatArray
 from samplers.proposals.components import Component, Wide, draw
 from samplers.statistics.thresholds import next_level
@@ -68,18 +68,18 @@ class Sizes:
 
 def first_draws(
     simulator: Simulator, sizes: Sizes, rng: np.random.Generator
-) -> Generator[FloatArray, FloatArray, Batch]:
+) -> Generator[FloatArray, FloatArray, ComponentDraws]:
     """Simulate the base and the wide draws."""
     dim = simulator.inputs.dim
     components: list[Component] = [Wide(dim), *(Wide(dim, scale) for scale, _ in sizes.wide)]
     counts = np.array([sizes.base, *(n for _, n in sizes.wide)])
     u = draw(components, counts, rng)
-    f = yield from simulator.f(u)
-    return Batch(components, counts, u, f)
+    f = yield from simulator.evaluate(u)
+    return ComponentDraws(components, counts, u, f)
 
 
 def regions_of(
-    simulator: Simulator, first: Batch, gamma: float, sizes: Sizes, rng: np.random.Generator
+    simulator: Simulator, first: ComponentDraws, gamma: float, sizes: Sizes, rng: np.random.Generator
 ) -> Generator[FloatArray, FloatArray, Found]:
     """Find the regions of failure, starting from the first draws; none if nothing fails."""
     n_base = int(first.counts[0])
@@ -87,13 +87,13 @@ def regions_of(
     wide = np.flatnonzero(first.f[n_base:] <= gamma) + n_base
     scale = np.repeat(np.arange(len(first.counts)), first.counts)
     most = max(2, (sizes.limit - simulator.n_sim) // COST_OF_CHAIN)
-    chosen = wide[_some(scale[wide], min(sizes.starts, most), rng)]
+    chosen = wide[_subsample(scale[wide], min(sizes.starts, most), rng)]
     far = yield from _drawn_in(simulator, first.u[chosen], gamma)
     others = max(sizes.level_starts, sizes.starts + sizes.level_starts - len(far))
     starts = np.concatenate([far, rng.permutation(descent.failing)[: min(others, most - len(far))]])
     if len(starts) == 0:
         return Found([], noisy=False)
-    return (yield from grown(simulator, starts, descent, gamma, sizes.limit, rng))
+    return (yield from grow_regions(simulator, starts, descent, gamma, sizes.limit, rng))
 
 
 def _descend(
@@ -114,7 +114,7 @@ def _descend(
         states, at = [u_chain], [f_chain]
         for step in range(1, steps + 1):
             proposal = conditional_proposal(u_chain, np.full(u.shape[1], sigma), rng)
-            f_new = yield from simulator.f(proposal)
+            f_new = yield from simulator.evaluate(proposal)
             points.append(proposal)
             outcomes.append(f_new)
             accepted = f_new <= level
@@ -127,7 +127,7 @@ def _descend(
     return Downhill(np.unique(u[f <= gamma], axis=0), np.concatenate(points), np.concatenate(outcomes), levels)
 
 
-def _some(scale: NDArray[np.int64], n: int, rng: np.random.Generator) -> NDArray[np.int64]:
+def _subsample(scale: NDArray[np.int64], n: int, rng: np.random.Generator) -> NDArray[np.int64]:
     """Choose n of the wide failures: half of them the least wide ones, the rest at random."""
     order = np.lexsort((rng.random(len(scale)), scale))
     return np.concatenate([order[: n // 2], rng.permutation(order[n // 2 :])[: n - n // 2]])
@@ -138,6 +138,6 @@ def _drawn_in(simulator: Simulator, u: FloatArray, gamma: float) -> Generator[Fl
     safe, failing = np.zeros(len(u)), np.ones(len(u))
     for _ in range(BISECTIONS):
         middle = 0.5 * (safe + failing)
-        fails = (yield from simulator.f(u * middle[:, None])) <= gamma
+        fails = (yield from simulator.evaluate(u * middle[:, None])) <= gamma
         failing, safe = np.where(fails, middle, failing), np.where(fails, safe, middle)
     return u * failing[:, None]

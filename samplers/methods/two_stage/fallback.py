@@ -19,30 +19,30 @@ LARGEST_TYPICAL = 30.0
 is usual, 17 was seen to do."""
 ABSURD = 1e4
 """How many times p, whatever the rate: the draws all come from a place where hardly any failure is."""
-LEAST_BUDGET = 300
+MIN_FALLBACK_BUDGET = 300
 """Subset simulation is not worth its draws with less."""
 WORTH = 30.0
 """Points of a level at p0 = 0.1 for one that is independent: (1 - p0) / p0, and correlation along the chains."""
 
 
-def describes(last: Draws, typical: FloatArray) -> bool:
+def describes_failures(last: Draws, typical: FloatArray) -> bool:
     """Return whether a proposal describes the failures so well that the weights of its draws can be believed.
 
     Args:
         last: The draws of the last round.
         typical: Weights of the exploration's points as draws of the proposal, one for each region, shape (m,).
     """
-    if not meets(last):
+    if not meets_failures(last):
         return False
     return bool(np.median(typical) <= (ABSURD if last.ess >= LEAST_RATE * last.n else LARGEST_TYPICAL) * last.p)
 
 
-def meets(last: Draws) -> bool:
+def meets_failures(last: Draws) -> bool:
     """Return whether the draws of the last round meet failures often enough."""
     return len(last.f) > 0 and last.ess >= HOPELESS_RATE * last.n
 
 
-def reconciled(found: Outcome, before: Outcome) -> Outcome:
+def reconcile(found: Outcome, before: Outcome) -> Outcome:
     """Return what subset simulation found, or what was known before it, if that is more than it can be reconciled with.
 
     Subset simulation follows f downhill; wide draws find regions that f does not announce as well.
@@ -55,7 +55,7 @@ def reconciled(found: Outcome, before: Outcome) -> Outcome:
     return replace(before, interval=interval, status=found.status, warnings=warnings)
 
 
-def subset_simulation(inputs: Inputs, goal: Goal, levels: int, budget: int, rng: np.random.Generator) -> Steps:
+def run_subset_simulation(inputs: Inputs, goal: Goal, levels: int, budget: int, rng: np.random.Generator) -> Steps:
     """Run adaptive subset simulation with the points per level that a budget or a target c.o.v. asks for.
 
     Args:

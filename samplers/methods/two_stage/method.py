@@ -11,14 +11,14 @@ from samplers.importance.draws import Draws, doubts, interval_of
 from samplers.method import Goal, Interrupted, Outcome, Steps, no_outcome_share, share_of_failures
 from samplers.methods.base import Method
 from samplers.methods.two_stage import fallback
-from samplers.methods.two_stage.diagnostics import against_base_draws, against_rounds, rarely_worth, regions_left_out
+from samplers.methods.two_stage.diagnostics import check_base_draws, check_efficiency, check_regions, check_rounds
 from samplers.methods.two_stage.exploration import Sizes, first_draws, regions_of
-from samplers.methods.two_stage.mixture.proposal import Proposal
-from samplers.methods.two_stage.multiple_importance import History
-from samplers.methods.two_stage.noise_coordinates import without_noise
+from samplers.methods.two_stage.mixture.proposal import MixtureProposal
+from samplers.methods.two_stage.multiple_importance import MultipleImportanceSample
+from samplers.methods.two_stage.noise_coordinates import marginalise_noise
 from samplers.methods.two_stage.refinement import BASE_FLOOR, Refinement
-from samplers.methods.two_stage.simulator import Batch, Simulator
-from samplers.methods.two_stage.stratified import Strata
+from samplers.methods.two_stage.simulator import ComponentDraws, Simulator
+from samplers.methods.two_stage.stratified import StratifiedSample
 from samplers.problem import FloatArray, Inputs
 from samplers.sample import equal_draws
 from samplers.statistics.intervals import binomial_cov
@@ -26,7 +26,7 @@ from samplers.statistics.weights import effective_sample_size
 from samplers.trace import Level, Status
 from samplers.validation import check_count
 
-LEAST_BUDGET = 400
+MIN_EXPLORATION_BUDGET = 400
 """With less than this an exploration is not worth its draws."""
 FEW = 1500
 """With less than this one of two like regions is missed in 3 to 30 % of runs, and nothing tells."""
@@ -56,7 +56,7 @@ class TwoStage(Method):
     3. *Estimate* (`stratified.py`): fresh draws from the last mixture, stratified by component, and nothing else:
        given the first two stages p-hat is unbiased, but for two things. Behind a classifier the weights rest on the
        shares of draws that it lets through; these are found by draws that are not simulated, and their error, some
-       tenths of a per cent, is the same for all weights of a component (the c.o.v. holds it, `Proposal.mass_cov`).
+       tenths of a per cent, is the same for all weights of a component (it is part of the c.o.v.).
        And with a target c.o.v. the draws end where they say so. (Reusing the draws of earlier rounds, as adaptive
        multiple importance sampling does, biases p by some per cent and makes its intervals too short.)
 
@@ -97,17 +97,16 @@ class TwoStage(Method):
 
     def __post_init__(self) -> None:
         """Check the settings."""
-        check_count("TwoStage", "n", self.n, LEAST_BUDGET)
+        check_count("TwoStage", "n", self.n, MIN_EXPLORATION_BUDGET)
 
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Explore, refine, estimate."""
         budget = self.n if goal.max_sim is None else goal.max_sim
         run = _Run(inputs, goal, budget, rng)
-        if budget < LEAST_BUDGET:
+        if budget < MIN_EXPLORATION_BUDGET:
             outcome = yield from run.plain()
-            warning = (
-                f"max_sim leaves {budget} simulations, too few for an exploration ({LEAST_BUDGET}): base draws only."
-            )
+            least = MIN_EXPLORATION_BUDGET
+            warning = f"max_sim leaves {budget} simulations, too few for an exploration ({least}): base draws only."
             return replace(outcome, warnings=(warning, *outcome.warnings))
         try:
             refinement = yield from run.explored()
@@ -135,10 +134,10 @@ class _Run:
         self._end = budget + MOST_BATCHES * (budget // 10) if goes_on else budget
         self._rng = rng
         self._all = inputs
-        tilted = without_noise(inputs, rng)
+        tilted = marginalise_noise(inputs, rng)
         self._untilted = tilted is not inputs
         self._simulator = Simulator(tilted)
-        self._history = History(tilted.dim)
+        self._history = MultipleImportanceSample(tilted.dim)
         self._base_u = np.empty((0, tilted.dim))
         self._base_f = np.empty(0)
         self._set_aside = self._base_u, self._base_f
@@ -170,7 +169,7 @@ class _Run:
         self._note(fails / max(chains, 1), share, chains, math.inf)
         return Refinement(found, self._history, gamma, self._rng) if found.regions else None
 
-    def refined(self, refinement: Refinement) -> Generator[FloatArray, FloatArray, Proposal | None]:
+    def refined(self, refinement: Refinement) -> Generator[FloatArray, FloatArray, MixtureProposal | None]:
         """Draw and learn in rounds; return the mixture for the estimate, None if it would not serve."""
         room = self._left
         proposal = refinement.proposal()
@@ -186,28 +185,28 @@ class _Run:
             proposal = refinement.proposal(last=number == len(ROUNDS))
         return proposal if self._serves(refinement, proposal) else None
 
-    def _serves(self, refinement: Refinement, proposal: Proposal) -> bool:
+    def _serves(self, refinement: Refinement, proposal: MixtureProposal) -> bool:
         """Tell whether to go on with a proposal; where f is noisy by itself there is nothing better."""
-        if self._end - self._simulator.n_sim < fallback.LEAST_BUDGET or not self._rounds:
+        if self._end - self._simulator.n_sim < fallback.MIN_FALLBACK_BUDGET or not self._rounds:
             return True
         if refinement.noisy:
-            return not self._untilted or fallback.meets(self._rounds[-1])
-        return fallback.describes(self._rounds[-1], refinement.typical_weights(proposal))
+            return not self._untilted or fallback.meets_failures(self._rounds[-1])
+        return fallback.describes_failures(self._rounds[-1], refinement.typical_weights(proposal))
 
     def descended(self, levels: int) -> Steps:
         """Spend the rest on subset simulation in all coordinates, which needs no proposal."""
         left = self._end - self._simulator.n_sim
-        outcome = yield from fallback.subset_simulation(self._all, self._goal, levels, left, self._rng)
+        outcome = yield from fallback.run_subset_simulation(self._all, self._goal, levels, left, self._rng)
         trace, base_draws = self._closed_trace() + outcome.trace, self._n_base + outcome.base_draws
         before = self.interrupted()
         on_its_way = outcome.status is Status.STOPPED and outcome.p == 0  # no estimate, then
-        whole = before if on_its_way else fallback.reconciled(outcome, before)
+        whole = before if on_its_way else fallback.reconcile(outcome, before)
         return replace(whole, trace=trace, base_draws=base_draws)
 
-    def estimated(self, refinement: Refinement, proposal: Proposal) -> Steps:
+    def estimated(self, refinement: Refinement, proposal: MixtureProposal) -> Steps:
         """Draw from the last mixture until the budget is used or the target is met."""
         goal, inputs, stopped = self._goal, self._simulator.inputs, False
-        strata = Strata.none(len(proposal.weights), inputs.dim, refinement.typical_weights(proposal))
+        strata = StratifiedSample.empty(len(proposal.weights), inputs.dim, refinement.typical_weights(proposal))
         size = self._left if goal.target_cov is None else max(self._budget // 10, 100)
         while self._simulator.n_sim < self._end:
             try:
@@ -215,7 +214,7 @@ class _Run:
             except Interrupted:
                 stopped = True
                 break
-            strata = strata.joined(batch, proposal, inputs, goal.gamma)
+            strata = strata.add(batch, proposal, inputs, goal.gamma)
             self._note_draws(batch, strata.p, strata.cov, strata.draws.ess)
             if goal.target_cov is not None and strata.cov <= goal.target_cov:
                 break
@@ -225,10 +224,10 @@ class _Run:
         outcome = self._outcome(strata.draws, strata.cov, 1 / BASE_FLOOR)
         base_hits = int((self._base_f <= goal.gamma).sum())
         checks = (
-            *against_base_draws(strata.p, base_hits, len(self._base_f)),
-            *against_rounds(strata, self._rounds),
-            *regions_left_out(strata),
-            *(() if refinement.noisy else rarely_worth(strata)),
+            *check_base_draws(strata.p, base_hits, len(self._base_f)),
+            *check_rounds(strata, self._rounds),
+            *check_regions(strata),
+            *(() if refinement.noisy else check_efficiency(strata)),
         )
         sample = strata.sample(proposal, self._base_f, self._base_u, goal.gamma)
         status = Status.STOPPED if stopped else outcome.status
@@ -247,7 +246,7 @@ class _Run:
         while self._simulator.n_sim < self._end:
             u = self._rng.standard_normal((min(self._end - self._simulator.n_sim, size), inputs.dim))
             try:
-                f = yield from self._simulator.f(u)
+                f = yield from self._simulator.evaluate(u)
             except Interrupted:
                 stopped = True
                 break
@@ -278,13 +277,13 @@ class _Run:
             base_draws=self._n_base,
         )
 
-    def _drawn(self, proposal: Proposal, n: int) -> Generator[FloatArray, FloatArray, Batch]:
-        u, counts = proposal.drawn(n, self._rng)
-        f = yield from self._simulator.f(u)
+    def _drawn(self, proposal: MixtureProposal, n: int) -> Generator[FloatArray, FloatArray, ComponentDraws]:
+        u, counts = proposal.draw(n, self._rng)
+        f = yield from self._simulator.evaluate(u)
         self._n_base += int(counts[0])  # of a proposal the first component is the base law
-        return Batch(proposal.components, counts, u, f)
+        return ComponentDraws(proposal.components, counts, u, f)
 
-    def _note_draws(self, batch: Batch, estimate: float, cov: float, ess: float) -> None:
+    def _note_draws(self, batch: ComponentDraws, estimate: float, cov: float, ess: float) -> None:
         self._note(float((batch.f <= self._goal.gamma).mean()), estimate, len(batch.f), cov, ess)
 
     def _note(self, p: float, estimate: float, n: int, cov: float, ess: float | None = None) -> None:

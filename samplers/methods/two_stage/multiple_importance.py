@@ -5,18 +5,18 @@ import math
 import numpy as np
 
 from samplers.importance.draws import Draws
-from samplers.methods.two_stage.simulator import Batch
+from samplers.methods.two_stage.simulator import ComponentDraws
 from samplers.problem import FloatArray, Inputs
 from samplers.proposals.components import Component, log_ratios, mixed
 
 
-class History:
+class MultipleImportanceSample:
     """All draws from known components, weighed as draws from the mixture of all of them (Owen and Zhou 2000)."""
 
     def __init__(self, dim: int) -> None:
         self.u = np.empty((0, dim))
         """The failing ones, shape (k, d)."""
-        self.batches: list[Batch] = []
+        self.batches: list[ComponentDraws] = []
         self._log_density = np.empty(0)
         self._components: list[Component] = []
         self._counts = np.empty(0)
@@ -31,7 +31,7 @@ class History:
         """log(phi / q) - log(n) at the failing draws, shape (k,): their sum is an estimate of p."""
         return -self._log_density
 
-    def add(self, batch: Batch, gamma: float) -> None:
+    def add(self, batch: ComponentDraws, gamma: float) -> None:
         """Take in a batch of draws."""
         used = [c for c, n in zip(batch.components, batch.counts, strict=True) if n > 0]
         counts = batch.counts[batch.counts > 0].astype(np.float64)

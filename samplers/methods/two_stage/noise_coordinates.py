@@ -15,19 +15,19 @@ from numpy.typing import NDArray
 from samplers.problem import Distribution, FloatArray, Inputs
 
 
-def noise_of(inputs: Inputs) -> NDArray[np.bool_]:
+def noise_mask(inputs: Inputs) -> NDArray[np.bool_]:
     """Which coordinates of x are noise, shape (d,): what the base law says as `noise`, none where it says nothing."""
     noise = getattr(inputs.base, "noise", None)
     return np.zeros(inputs.dim, dtype=bool) if noise is None else np.asarray(noise, dtype=bool)
 
 
-def without_noise(inputs: Inputs, rng: np.random.Generator) -> Inputs:
+def marginalise_noise(inputs: Inputs, rng: np.random.Generator) -> Inputs:
     """The inputs that a search is to tilt: these themselves, where none of them is noise, or all of them are."""
-    noise = noise_of(inputs)
-    return inputs if not noise.any() or noise.all() else cast(Inputs, Untilted(inputs, noise, rng))
+    noise = noise_mask(inputs)
+    return inputs if not noise.any() or noise.all() else cast(Inputs, NoiseMarginalisedInputs(inputs, noise, rng))
 
 
-class Untilted:
+class NoiseMarginalisedInputs:
     """The coordinates that are not noise, as inputs of their own; points u (n, k) become x (n, d) with noise drawn.
 
     The same u gets the same noise again: rows of u are known by their bytes, and their noise is made anew from a

@@ -4,14 +4,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
-from samplers.methods.two_stage.mixture.linear_model import beyond, edge, quantile
-from samplers.methods.two_stage.mixture.mixture_weights import Floor, least_variance, with_floors
-from samplers.methods.two_stage.mixture.proposal import NO_REGION, Candidate, Proposal
-from samplers.methods.two_stage.mixture.screening import Gate, learned_gate
+from samplers.methods.two_stage.mixture.linear_model import failure_edge, half_space_proposals, weighted_quantile
+from samplers.methods.two_stage.mixture.mixture_weights import Floor, minimise_second_moment, raise_to_floors
+from samplers.methods.two_stage.mixture.proposal import NO_REGION, MixtureComponent, MixtureProposal
+from samplers.methods.two_stage.mixture.screening import FailureScreen, train_screen
 from samplers.methods.two_stage.mixture.subspace_em import HIGH_DIM, Points, clipped, fitted, refitted
-from samplers.methods.two_stage.multiple_importance import History
+from samplers.methods.two_stage.multiple_importance import MultipleImportanceSample
 from samplers.methods.two_stage.regions import Found, Region
-from samplers.methods.two_stage.simulator import Batch
+from samplers.methods.two_stage.simulator import ComponentDraws
 from samplers.problem import FloatArray
 from samplers.proposals.components import Bump, Shell, Slice, Wide, log_ratios
 
@@ -56,7 +56,7 @@ class Refinement:
         rng: Source of randomness.
     """
 
-    def __init__(self, found: Found, history: History, gamma: float, rng: np.random.Generator) -> None:
+    def __init__(self, found: Found, history: MultipleImportanceSample, gamma: float, rng: np.random.Generator) -> None:
         regions = found.regions
         self._dim = regions[0].u.shape[1]
         self._regions = regions
@@ -70,19 +70,19 @@ class Refinement:
         self._rng = rng
         self._sharp_hits = 1.0
         self._points = np.concatenate([region.points for region in regions])
-        bumps = [(bump, k) for k, region in enumerate(regions) for bump in self._first_bumps(region)]
-        self._first = [Candidate(bump, "first", k) for bump, k in bumps]
+        bumps = [(bump, k) for k, region in enumerate(regions) for bump in self._fit_region(region)]
+        self._first = [MixtureComponent(bump, "first", k) for bump, k in bumps]
         self._bumps = [bump for bump, _ in bumps]
         self._fresh: list[Bump] = []
         self._planes = [
-            Candidate(part, "plane", k)
+            MixtureComponent(part, "plane", k)
             for k, region in enumerate(regions)
-            for part in beyond(region.points, region.u, region.f, gamma)
+            for part in half_space_proposals(region.points, region.u, region.f, gamma)
         ]
         self._near: list[tuple[FloatArray, FloatArray]] = []
         self._near_log_weights = np.empty(0)
 
-    def proposal(self, *, last: bool = False) -> Proposal:
+    def proposal(self, *, last: bool = False) -> MixtureProposal:
         """Return the mixture for the next draws; `last`: for the estimate."""
         seen = len(self._near) > 0
         candidates = self._candidates(seen)
@@ -91,22 +91,22 @@ class Refinement:
         start = np.array([START[kind] / np.count_nonzero(kinds == kind) for kind in kinds])
         weights = start / start.sum()
         if not seen or len(self._history.u) == 0:
-            return Proposal(candidates, weights)
+            return MixtureProposal(candidates, weights)
         floors = self._floors(kinds, regions, REGION_FLOOR_LAST if last else REGION_FLOOR)
-        u, log_w = self._smoothed() if self.noisy else (self._history.u, self._history.log_weights)
+        u, log_w = self._smooth_indicators() if self.noisy else (self._history.u, self._history.log_weights)
         log_r = log_ratios([candidate.component for candidate in candidates], u)
-        weights = least_variance(log_r, log_w, weights, floors)
+        weights = minimise_second_moment(log_r, log_w, weights, floors)
         stays = kinds == "base"
         if not last:
             explored = np.isin(kinds, ["first", "plane"])
             weights = np.where(explored, np.maximum(weights, KEPT), weights)
             stays = stays | explored
         weights = np.where((weights < SMALLEST) & ~stays, 0.0, weights)
-        proposal = Proposal(candidates, with_floors(weights / weights.sum(), floors))
-        gate = self._gate() if last and not self.noisy and self._dim <= HIGH_DIM else None
-        return proposal if gate is None else proposal.behind(gate, self._rng)
+        proposal = MixtureProposal(candidates, raise_to_floors(weights / weights.sum(), floors))
+        screen = self._train_screen() if last and not self.noisy and self._dim <= HIGH_DIM else None
+        return proposal if screen is None else proposal.with_screen(screen, self._rng)
 
-    def typical_weights(self, proposal: Proposal) -> FloatArray:
+    def typical_weights(self, proposal: MixtureProposal) -> FloatArray:
         """Return what the exploration's points in each region would weigh on average as draws of a proposal, (m,).
 
         Without the heaviest of three chains or more: one may have strayed to where hardly any failure is.
@@ -117,14 +117,14 @@ class Refinement:
             typical.append(float(chains[:-1].mean() if len(chains) > 2 else chains.mean()))
         return np.array(typical)
 
-    def _gate(self) -> Gate | None:
-        """Return a gate that has learned from the chains and the draws of all rounds."""
+    def _train_screen(self) -> FailureScreen | None:
+        """Return a screen that has learned from the chains and the draws of all rounds."""
         u = np.concatenate([region.u for region in self._regions] + [u for u, _ in self._near[:-1]])
         f = np.concatenate([region.f for region in self._regions] + [f for _, f in self._near[:-1]])
         u_new, f_new = self._near[-1]
-        return learned_gate((u, f <= self._gamma), (u_new, f_new <= self._gamma), self._near_log_weights)
+        return train_screen((u, f <= self._gamma), (u_new, f_new <= self._gamma), self._near_log_weights)
 
-    def learn(self, proposal: Proposal, batch: Batch, *, afresh: bool) -> None:
+    def learn(self, proposal: MixtureProposal, batch: ComponentDraws, *, afresh: bool) -> None:
         """Take in the outcomes of draws; `afresh`: also fit new bumps to all failures."""
         self._history.add(batch, self._gamma)
         kinds = np.repeat([candidate.kind for candidate in proposal.candidates], batch.counts)
@@ -135,11 +135,11 @@ class Refinement:
         self._near_log_weights = proposal.log_weights(batch.u[near])
         if len(self._history.u) > 5:
             self._bumps = refitted(self._bumps, self._history.u, self._history.log_weights)
-            self._fresh = self._fresh_bumps() if afresh and self._dim <= HIGH_DIM else []
+            self._fresh = self._fit_failures() if afresh and self._dim <= HIGH_DIM else []
             if afresh or self._dim > HIGH_DIM or len(self._regions) > 1:
-                self._planes = self._new_planes()
+                self._planes = self._fit_planes()
 
-    def _smoothed(self) -> tuple[FloatArray, FloatArray]:
+    def _smooth_indicators(self) -> tuple[FloatArray, FloatArray]:
         """Return all draws u (n, d), weighted also by the probability that they fail, as logistic regression has it.
 
         With a noisy f the few failures among the draws near the origin carry large weights by chance. What the
@@ -155,7 +155,7 @@ class Refinement:
         # The logistic curve has far heavier tails than noise that is near normal: log_ndtr(odds / 1.702) has not.
         return u, log_w + log_ndtr(odds)
 
-    def _first_bumps(self, region: Region) -> list[Bump]:
+    def _fit_region(self, region: Region) -> list[Bump]:
         chains, steps, _ = region.chains.shape
         n = chains * steps
         points = Points(
@@ -167,7 +167,7 @@ class Refinement:
         most = 8 if self.noisy else 3
         return fitted(points, most if self._dim <= HIGH_DIM else 1, self._rng).bumps
 
-    def _fresh_bumps(self) -> list[Bump]:
+    def _fit_failures(self) -> list[Bump]:
         """Return a mixture fitted to all failures, where their weights carry one."""
         weights = clipped(self._history.log_weights)
         ess = 1 / float((weights**2).sum())
@@ -175,7 +175,7 @@ class Refinement:
             return []
         return fitted(Points(self._history.u, weights, ess, np.arange(len(weights))), 8, self._rng).bumps
 
-    def _new_planes(self) -> list[Candidate]:
+    def _fit_planes(self) -> list[MixtureComponent]:
         """Return planes from what was known of each region and the draws nearest to it."""
         u, f = np.concatenate([u for u, _ in self._near]), np.concatenate([f for _, f in self._near])
         log_r = log_ratios([first.component for first in self._first], u)
@@ -186,23 +186,25 @@ class Refinement:
         for k, region in enumerate(self._regions):
             own = owner == k
             points = np.concatenate([region.points, u[own & fails]])
-            parts = beyond(points, np.concatenate([region.u, u[own]]), np.concatenate([region.f, f[own]]), self._gamma)
-            planes += [Candidate(part, "plane", k) for part in parts]
+            parts = half_space_proposals(
+                points, np.concatenate([region.u, u[own]]), np.concatenate([region.f, f[own]]), self._gamma
+            )
+            planes += [MixtureComponent(part, "plane", k) for part in parts]
         return planes
 
-    def _candidates(self, seen: bool) -> list[Candidate]:
-        bumps = [Candidate(b, "bump", c.region) for b, c in zip(self._bumps, self._first, strict=True)]
-        bumps += [Candidate(bump, "bump") for bump in self._fresh]
+    def _candidates(self, seen: bool) -> list[MixtureComponent]:
+        bumps = [MixtureComponent(b, "bump", c.region) for b, c in zip(self._bumps, self._first, strict=True)]
+        bumps += [MixtureComponent(bump, "bump") for bump in self._fresh]
         planes = [] if self.noisy else self._planes
         first = self._first if seen else []
-        found = [Candidate(Wide(self._dim), "base"), Candidate(Wide(self._dim, 1.5), "wide")]
+        found = [MixtureComponent(Wide(self._dim), "base"), MixtureComponent(Wide(self._dim, 1.5), "wide")]
         found += self._shells() + bumps + planes + first
         if not self.noisy:
-            found += [Candidate(part, "slice") for part in self._slices(seen)]
+            found += [MixtureComponent(part, "slice") for part in self._slices(seen)]
         for candidate in bumps + planes + first:
             if isinstance(candidate.component, Bump):
                 for power in (0.5, 0.25) if self.noisy else (0.5,):
-                    found.append(Candidate(candidate.component.tempered(power), "tempered", candidate.region))
+                    found.append(MixtureComponent(candidate.component.tempered(power), "tempered", candidate.region))
         return found
 
     def _floors(self, kinds: NDArray[np.str_], regions: NDArray[np.int64], for_regions: float) -> list[Floor]:
@@ -216,14 +218,14 @@ class Refinement:
             floors += [Floor((regions == k) & (kinds != "tempered"), for_regions / n) for k in range(n)]
         return [*floors, Floor(kinds == "base", base)]
 
-    def _shells(self) -> list[Candidate]:
+    def _shells(self) -> list[MixtureComponent]:
         if self._dim < 2:
             return []
-        shells = [shell_around(self._points, np.ones(len(self._points)))]
+        shells = [fit_radial(self._points, np.ones(len(self._points)))]
         if len(self._history.u) >= 20:
             log_w = self._history.log_weights
-            shells.append(shell_around(self._history.u, np.exp(log_w - log_w.max())))
-        return [Candidate(shell, "shell") for shell in shells]
+            shells.append(fit_radial(self._history.u, np.exp(log_w - log_w.max())))
+        return [MixtureComponent(shell, "shell") for shell in shells]
 
     def _slices(self, seen: bool) -> list[Slice]:
         """Return slices through the edge of each bump's failures, plain and with the bump's shape across."""
@@ -238,18 +240,18 @@ class Refinement:
             part
             for bump, rows in zip(bumps, own, strict=True)
             if np.count_nonzero(rows) >= 10
-            for part in slices_of(bump, u[rows], np.exp(log_w[rows] - log_w[rows].max()))
+            for part in fit_half_spaces(bump, u[rows], np.exp(log_w[rows] - log_w[rows].max()))
         ]
 
 
-def slices_of(bump: Bump, u: FloatArray, weights: FloatArray) -> list[Slice]:
+def fit_half_spaces(bump: Bump, u: FloatArray, weights: FloatArray) -> list[Slice]:
     """Return slices that start at the 2 % quantile of failures u (n, d) with weights (n,) along a bump's centre."""
     centre, dim = bump.centre, len(bump.axes)
     norm = float(np.linalg.norm(centre))
     if norm < 1e-6:
         return []
     axis = centre / norm
-    start = edge(u @ axis, weights, float(weights.sum()) ** 2 / float((weights**2).sum()), 0.02) - 0.02
+    start = failure_edge(u @ axis, weights, float(weights.sum()) ** 2 / float((weights**2).sum()), 0.02) - 0.02
     if start < 0.5:
         return []
     parts = [Slice(axis, start)]
@@ -262,10 +264,10 @@ def slices_of(bump: Bump, u: FloatArray, weights: FloatArray) -> list[Slice]:
     return parts
 
 
-def shell_around(u: FloatArray, weights: FloatArray) -> Shell:
+def fit_radial(u: FloatArray, weights: FloatArray) -> Shell:
     """Return the shell whose |u|^2 has the moments of points u (n, d) with weights (n,)."""
     square = np.einsum("ij,ij->i", u, u)
-    start = 0.98 * quantile(square, weights, 0.01)
+    start = 0.98 * weighted_quantile(square, weights, 0.01)
     beyond_start = square > start
     s, w = square[beyond_start] - start, weights[beyond_start]
     mean = float(np.average(s, weights=w))

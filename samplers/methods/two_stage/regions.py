@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from samplers.methods.two_stage.mixture.linear_model import falling
+from samplers.methods.two_stage.mixture.linear_model import descent_direction
 from samplers.methods.two_stage.mixture.subspace_em import HIGH_DIM
 from samplers.methods.two_stage.simulator import Simulator
 from samplers.problem import FloatArray
@@ -21,7 +21,7 @@ MANY_REGIONS = 8
 MOST_REGIONS = 16
 SCATTERED = 0.25
 """Where this share of the points is in none of MANY_REGIONS regions, failure is something like a shell."""
-MOST_CLONES = 60
+MAX_REPLICATED_CHAINS = 60
 PROBES = 30
 NUDGE = 1e-6
 NOISY = 0.9
@@ -44,7 +44,7 @@ class Region(NamedTuple):
         return self.chains.reshape(-1, self.chains.shape[2])
 
 
-class Walk(NamedTuple):
+class ChainPaths(NamedTuple):
     """Where chains went."""
 
     states: FloatArray
@@ -56,9 +56,9 @@ class Walk(NamedTuple):
     sigma: FloatArray
     """Adapted steps, shape (chains,)."""
 
-    def of(self, which: NDArray[np.int64] | NDArray[np.bool_]) -> "Walk":
+    def of(self, which: NDArray[np.int64] | NDArray[np.bool_]) -> "ChainPaths":
         """Return some of the chains."""
-        return Walk(*(part[which] for part in self))
+        return ChainPaths(*(part[which] for part in self))
 
 
 class Downhill(NamedTuple):
@@ -85,27 +85,27 @@ class Found(NamedTuple):
     """Levels that subset simulation passed."""
 
 
-def grown(
+def grow_regions(
     simulator: Simulator, starts: FloatArray, descent: Downhill, gamma: float, limit: int, rng: np.random.Generator
 ) -> Generator[FloatArray, FloatArray, Found]:
     """Run chains from failing points, twice; sort them into regions after each time."""
     dim = starts.shape[1]
     steps = (5, 6) if dim <= HIGH_DIM else (8, 8)
-    walk = yield from _walk(simulator, starts, np.full(len(starts), 0.5), None, steps[0], gamma, rng)
+    walk = yield from _pcn_chains(simulator, starts, np.full(len(starts), 0.5), None, steps[0], gamma, rng)
     if (yield from _is_noisy(simulator, walk.states[:, -1], gamma, rng)):
-        last = yield from _walk(simulator, walk.states[:, -1], walk.sigma, None, steps[1], gamma, rng)
+        last = yield from _pcn_chains(simulator, walk.states[:, -1], walk.sigma, None, steps[1], gamma, rng)
         region = Region(last.states[:, 1:], last.proposals.reshape(-1, dim), last.f.ravel())
         return Found([region], noisy=True, levels=descent.levels)
     after = len(starts) * (steps[1] + 1)  # the second walk, and one look at where it ended
-    labels, _ = yield from _same_region(simulator, walk.states[:, -1], gamma, limit - after)
+    labels, _ = yield from _label_regions(simulator, walk.states[:, -1], gamma, limit - after)
     room = max(limit - simulator.n_sim - after, 0) // (steps[1] + 1)
-    more = _clones(labels, min(max(8, math.ceil(2.5 * dim / steps[1])), 24), room, rng)
+    more = _replicate_seeds(labels, min(max(8, math.ceil(2.5 * dim / steps[1])), 24), room, rng)
     walk, labels = walk.of(more), labels[more]
     alone = descent if labels.max() == 0 else None  # the points on the way down belong to the one region, then
-    directions = np.array([_direction(walk.of(labels == k), alone) for k in range(labels.max() + 1)])
+    directions = np.array([_estimate_direction(walk.of(labels == k), alone) for k in range(labels.max() + 1)])
     start, sigma = walk.states[:, -1], walk.sigma
-    last = yield from _walk(simulator, start, sigma, directions[labels], steps[1], gamma, rng)
-    labels, scattered = yield from _same_region(simulator, last.states[:, -1], gamma, limit)
+    last = yield from _pcn_chains(simulator, start, sigma, directions[labels], steps[1], gamma, rng)
+    labels, scattered = yield from _label_regions(simulator, last.states[:, -1], gamma, limit)
     late = 2 if dim <= HIGH_DIM else 4  # early proposals to wide failures are far from where failures are likely
     proposals = np.concatenate([walk.proposals[:, -late:], last.proposals], axis=1)
     f = np.concatenate([walk.f[:, -late:], last.f], axis=1)
@@ -113,11 +113,11 @@ def grown(
     for k in range(labels.max() + 1):
         own = labels == k
         regions.append(Region(last.states[own, 1:], proposals[own].reshape(-1, dim), f[own].ravel()))
-    regions = [_with_descent(regions[0], descent)] if len(regions) == 1 else regions
+    regions = [_add_subset_points(regions[0], descent)] if len(regions) == 1 else regions
     return Found(regions, noisy=False, scattered=scattered, levels=descent.levels)
 
 
-def _walk(
+def _pcn_chains(
     simulator: Simulator,
     u: FloatArray,
     sigma: FloatArray,
@@ -125,7 +125,7 @@ def _walk(
     steps: int,
     gamma: float,
     rng: np.random.Generator,
-) -> Generator[FloatArray, FloatArray, Walk]:
+) -> Generator[FloatArray, FloatArray, ChainPaths]:
     """Move chains inside the region of failure by pCN, each with its own step.
 
     With directions (n, d) the step sigma (n,) is that along them, and every other direction is drawn nearly afresh:
@@ -140,7 +140,7 @@ def _walk(
         if directions is not None:
             along = np.sqrt(1 - sigma**2) * (u * directions).sum(axis=1) + sigma * (xi * directions).sum(axis=1)
             proposal += (along - (proposal * directions).sum(axis=1))[:, None] * directions
-        f = yield from simulator.f(proposal)
+        f = yield from simulator.evaluate(proposal)
         fails = f <= gamma
         u = np.where(fails[:, None], proposal, u)
         if directions is None:
@@ -151,7 +151,7 @@ def _walk(
         states.append(u)
         proposals.append(proposal)
         outcomes.append(f)
-    return Walk(np.stack(states, axis=1), np.stack(proposals, axis=1), np.stack(outcomes, axis=1), sigma)
+    return ChainPaths(np.stack(states, axis=1), np.stack(proposals, axis=1), np.stack(outcomes, axis=1), sigma)
 
 
 def _is_noisy(
@@ -159,11 +159,11 @@ def _is_noisy(
 ) -> Generator[FloatArray, FloatArray, bool]:
     """Return whether points right beside failing ones (n, d) do not always fail."""
     u = rng.permutation(u)[:PROBES]
-    f = yield from simulator.f(u + NUDGE * rng.standard_normal(u.shape))
+    f = yield from simulator.evaluate(u + NUDGE * rng.standard_normal(u.shape))
     return float((f <= gamma).mean()) < NOISY
 
 
-def _same_region(
+def _label_regions(
     simulator: Simulator, u: FloatArray, gamma: float, limit: int
 ) -> Generator[FloatArray, FloatArray, tuple[NDArray[np.int64], bool]]:
     """Sort failing points (n, d) into regions, numbered from 0: those half way to whose first point fails.
@@ -187,7 +187,7 @@ def _same_region(
         others = free[free != first]
         if simulator.n_sim + len(others) > limit:
             break
-        fails = (yield from simulator.f(0.5 * (u[others] + u[first]))) <= gamma
+        fails = (yield from simulator.evaluate(0.5 * (u[others] + u[first]))) <= gamma
         labels[others[fails]] = k
     free = np.flatnonzero(labels < 0)
     if len(free):
@@ -196,29 +196,29 @@ def _same_region(
     return labels, scattered
 
 
-def _clones(labels: NDArray[np.int64], least: int, room: int, rng: np.random.Generator) -> NDArray[np.int64]:
+def _replicate_seeds(labels: NDArray[np.int64], least: int, room: int, rng: np.random.Generator) -> NDArray[np.int64]:
     """Return the numbers of all chains, those of regions with few repeated until there are `least` or no room is."""
     more = []
     for k in range(labels.max() + 1):
         own = np.flatnonzero(labels == k)
         more.append(rng.choice(own, max(least - len(own), 0)))
-    return np.concatenate([np.arange(len(labels)), np.concatenate(more)[: min(room, MOST_CLONES)]])
+    return np.concatenate([np.arange(len(labels)), np.concatenate(more)[: min(room, MAX_REPLICATED_CHAINS)]])
 
 
-def _direction(walk: Walk, descent: Downhill | None) -> FloatArray:
+def _estimate_direction(walk: ChainPaths, descent: Downhill | None) -> FloatArray:
     """Return the direction in which a region lies, shape (d,): where f falls if it does so linearly, else its mean."""
     dim = walk.states.shape[2]
     region = Region(walk.states, walk.proposals.reshape(-1, dim), walk.f.ravel())
     if descent is not None:
-        region = _with_descent(region, descent)
-    axis, r2 = falling(region.u, region.f)
+        region = _add_subset_points(region, descent)
+    axis, r2 = descent_direction(region.u, region.f)
     if r2 > 0.5:
         return axis
     mean = walk.states[:, -3:].mean(axis=(0, 1))
     return np.asarray(mean / max(float(np.linalg.norm(mean)), 1e-12))
 
 
-def _with_descent(region: Region, descent: Downhill) -> Region:
+def _add_subset_points(region: Region, descent: Downhill) -> Region:
     """Add the lower points of subset simulation where those around the region are too few for a regression."""
     if len(region.u) >= 3 * region.u.shape[1] or len(descent.f) == 0:
         return region

@@ -17,7 +17,7 @@ class Simulator:
         self.inputs = inputs
         self.n_sim = 0
 
-    def f(self, u: FloatArray) -> Generator[FloatArray, FloatArray, FloatArray]:
+    def evaluate(self, u: FloatArray) -> Generator[FloatArray, FloatArray, FloatArray]:
         """Ask for f at u (n, d), shape (n,)."""
         if len(u) == 0:
             return np.empty(0)
@@ -26,7 +26,7 @@ class Simulator:
         return f
 
 
-class Batch(NamedTuple):
+class ComponentDraws(NamedTuple):
     """Draws from known components."""
 
     components: list[Component]

@@ -6,17 +6,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from samplers.importance.draws import Draws
-from samplers.methods.two_stage.mixture.proposal import Proposal
-from samplers.methods.two_stage.simulator import Batch
+from samplers.methods.two_stage.mixture.proposal import MixtureProposal
+from samplers.methods.two_stage.simulator import ComponentDraws
 from samplers.problem import FloatArray, Inputs
 from samplers.sample import Sample
 
-FEWEST = 10
+MIN_STRATUM_DRAWS = 10
 """Components with fewer draws than this are one stratum."""
 
 
 @dataclass(frozen=True, eq=False)
-class Strata:
+class StratifiedSample:
     """Draws from a proposal, with the sums that the variance needs for each component."""
 
     draws: Draws
@@ -26,32 +26,32 @@ class Strata:
     """Of weight times indicator of failure, shape (k,)."""
     squares: FloatArray
     """Sums of their squares, shape (k,)."""
-    mass_cov: float
-    """What else is not exact: see `Proposal.mass_cov`."""
+    acceptance_cov: float
+    """What else is not exact: see `MixtureProposal.acceptance_cov`."""
     typical: FloatArray
     """Weights to be expected, whether or not a draw has shown them: one for each region found, shape (m,)."""
     u_safe: FloatArray
     """The draws that did not fail, in the order of `draws.f_safe`, shape (m, d)."""
 
     @classmethod
-    def none(cls, k: int, dim: int, typical: FloatArray) -> "Strata":
+    def empty(cls, k: int, dim: int, typical: FloatArray) -> "StratifiedSample":
         """No draws yet from a proposal of k components in d dimensions."""
         zero = np.zeros(k)
         return cls(Draws(0, np.empty(0), np.empty(0)), zero, zero, zero, 0.0, typical, np.empty((0, dim)))
 
-    def joined(self, batch: Batch, proposal: Proposal, inputs: Inputs, gamma: float) -> "Strata":
+    def add(self, batch: ComponentDraws, proposal: MixtureProposal, inputs: Inputs, gamma: float) -> "StratifiedSample":
         """Return these draws and another batch from the same proposal."""
         fails = batch.f <= gamma
         log_weights = proposal.log_weights(batch.u)
         y = np.where(fails, np.exp(np.minimum(log_weights, 700.0)), 0.0)
         owner, k = np.repeat(np.arange(len(batch.counts)), batch.counts), len(batch.counts)
         x = inputs.base.from_standard_normal(batch.u)
-        return Strata(
+        return StratifiedSample(
             self.draws.joined(Draws.weighted(batch.f, log_weights, x, gamma)),
             self.counts + batch.counts,
             self.sums + np.bincount(owner, weights=y, minlength=k),
             self.squares + np.bincount(owner, weights=y * y, minlength=k),
-            proposal.mass_cov,
+            proposal.acceptance_cov,
             self.typical,
             np.concatenate([self.u_safe, batch.u[~fails]]),
         )
@@ -70,13 +70,15 @@ class Strata:
         """
         if len(self.draws.f) == 0:
             return math.inf
-        many = self.counts >= FEWEST
+        many = self.counts >= MIN_STRATUM_DRAWS
         n, s1, s2 = self.counts[many], self.sums[many], self.squares[many]
         within = float(((s2 - s1 * s1 / n) * n / (n - 1)).sum()) + float(self.squares[~many].sum())
         largest = max(math.exp(float(self.draws.log_weights.max())), float(self.typical.max(initial=0.0)))
-        return math.hypot(math.sqrt(max(within, 0.0) + largest * largest) / (self.draws.n * self.p), self.mass_cov)
+        return math.hypot(
+            math.sqrt(max(within, 0.0) + largest * largest) / (self.draws.n * self.p), self.acceptance_cov
+        )
 
-    def sample(self, proposal: Proposal, base_f: FloatArray, base_u: FloatArray, gamma: float) -> Sample:
+    def sample(self, proposal: MixtureProposal, base_f: FloatArray, base_u: FloatArray, gamma: float) -> Sample:
         """Return the weighted points behind p: failing draws as they are, the others with the first base draws.
 
         Thresholds above gamma rest on draws that did not fail; of those, few are made where f is large, and the base

@@ -15,7 +15,7 @@ from samplers.problem import LOG_TWO_PI, FloatArray
 from samplers.proposals.components import Bump, Component, Slice
 
 RIDGES = (1.0, 1e-3)
-LAD_STEPS = 12
+LAD_ITERATIONS = 12
 EXACT = 0.999
 """Where a plane explains as much of f as this, f is linear."""
 LINEAR = 0.95
@@ -62,7 +62,7 @@ class Plane(NamedTuple):
         return self.at + (self.level - gamma - 2 * error) / self.steepness
 
 
-def plane_of(u: FloatArray, f: FloatArray) -> Plane:
+def fit_plane(u: FloatArray, f: FloatArray) -> Plane:
     """Return the plane that f follows at points u (n, d), f (n,); infinite f and the outer 2 % are left out."""
     dim = u.shape[1]
     none = Plane(np.zeros(dim), 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
@@ -75,7 +75,7 @@ def plane_of(u: FloatArray, f: FloatArray) -> Plane:
     if size == 0.0:
         return none
     x, y = u[usual], f[usual] / size
-    slope, r2, near = _robust_slope(x, y)
+    slope, r2, near = _fit_robust(x, y)
     norm = float(np.linalg.norm(slope))
     if norm == 0:
         return none
@@ -84,18 +84,18 @@ def plane_of(u: FloatArray, f: FloatArray) -> Plane:
     return Plane(axis, size * norm, at, level, r2, float(near.mean()), spread)
 
 
-def falling(u: FloatArray, f: FloatArray) -> tuple[FloatArray, float]:
+def descent_direction(u: FloatArray, f: FloatArray) -> tuple[FloatArray, float]:
     """Return the unit direction in which f falls, shape (d,), and the R^2 of the plane (leave-one-out).
 
     Args:
         u: Points, shape (n, d).
         f: Their outcomes, shape (n,); infinite ones and the outer 2 % on both sides are left out.
     """
-    plane = plane_of(u, f)
+    plane = fit_plane(u, f)
     return plane.axis, plane.explained
 
 
-def beyond(points: FloatArray, u: FloatArray, f: FloatArray, gamma: float = 0.0) -> list[Component]:
+def half_space_proposals(points: FloatArray, u: FloatArray, f: FloatArray, gamma: float = 0.0) -> list[Component]:
     """Return proposals beyond the plane of f around some failures, or none if no plane explains f.
 
     Args:
@@ -104,10 +104,10 @@ def beyond(points: FloatArray, u: FloatArray, f: FloatArray, gamma: float = 0.0)
         f: Outcomes of these, shape (n,).
         gamma: Threshold of failure.
     """
-    plane = plane_of(u, f)
+    plane = fit_plane(u, f)
     if plane.explained < EXACT:  # outside the region, f may be that of another one
         inside = f <= gamma
-        alone = plane_of(u[inside], f[inside])
+        alone = fit_plane(u[inside], f[inside])
         plane = alone if alone.clear and alone.explained > plane.explained else plane
     if plane.explained < LEAST_R2 or len(points) < 8:
         return []
@@ -120,7 +120,7 @@ def beyond(points: FloatArray, u: FloatArray, f: FloatArray, gamma: float = 0.0)
     if plane.clear:
         start = plane.crossing(gamma)
     else:
-        start = edge(along, np.ones(len(along)), len(np.unique(along)), NEAREST)
+        start = failure_edge(along, np.ones(len(along)), len(np.unique(along)), NEAREST)
     if start < 0.5:
         return []
     # Mean and variance of N(0, 1) beyond start: Mills' ratio.
@@ -129,25 +129,25 @@ def beyond(points: FloatArray, u: FloatArray, f: FloatArray, gamma: float = 0.0)
     return [Bump(axis[:, None], np.array([mean]), np.array([1.3 * variance])), Slice(axis, start - 0.02)]
 
 
-def edge(along: FloatArray, weights: FloatArray, ess: float, share: float) -> float:
+def failure_edge(along: FloatArray, weights: FloatArray, ess: float, share: float) -> float:
     """Return where weighted failures begin, given how far along a direction they lie, shape (n,).
 
     Their quantile at `share`, less what the least of a few lies beyond the edge of many: twice the mean excess over
     it divided by how many they are worth. Failures before the start of a proposal with an edge are the heavy draws
     that no estimate of its error knows of.
     """
-    first = quantile(along, weights, share)
+    first = weighted_quantile(along, weights, share)
     return first - 2 * max(float(np.average(along, weights=weights)) - first, 0.0) / max(ess, 2.0)
 
 
-def quantile(x: FloatArray, weights: FloatArray, share: float) -> float:
+def weighted_quantile(x: FloatArray, weights: FloatArray, share: float) -> float:
     """Return the smallest x (n,) up to which at least this share of the weights (n,) lies."""
     order = np.argsort(x)
     total = np.cumsum(weights[order])
     return float(x[order][min(int(np.searchsorted(total, share * total[-1])), len(x) - 1)])
 
 
-def _slope(x: FloatArray, y: FloatArray) -> tuple[FloatArray, float]:
+def _fit_ridge(x: FloatArray, y: FloatArray) -> tuple[FloatArray, float]:
     """Return the slope (d,) of the ridge regression of y (n,) on x (n, d), and its leave-one-out R^2.
 
     Of the ridges, where points are enough for both, the one that leaves the larger R^2: a high one turns and lifts a
@@ -158,11 +158,11 @@ def _slope(x: FloatArray, y: FloatArray) -> tuple[FloatArray, float]:
     total = float(yc @ yc)
     if total <= 0 or n < 5:
         return np.zeros(dim), 0.0
-    found = [_ridge(xc, yc, total, ridge) for ridge in (RIDGES if n >= 1.2 * dim + 5 else RIDGES[:1])]
+    found = [_solve_ridge(xc, yc, total, ridge) for ridge in (RIDGES if n >= 1.2 * dim + 5 else RIDGES[:1])]
     return max(found, key=lambda one: one[1])
 
 
-def _ridge(xc: FloatArray, yc: FloatArray, total: float, ridge: float) -> tuple[FloatArray, float]:
+def _solve_ridge(xc: FloatArray, yc: FloatArray, total: float, ridge: float) -> tuple[FloatArray, float]:
     n, dim = xc.shape
     if n >= dim:
         hat = xc @ np.linalg.inv(xc.T @ xc + ridge * np.eye(dim))
@@ -174,30 +174,30 @@ def _ridge(xc: FloatArray, yc: FloatArray, total: float, ridge: float) -> tuple[
     return slope, 1 - float(left_out @ left_out) / total
 
 
-def _robust_slope(x: FloatArray, y: FloatArray) -> tuple[FloatArray, float, NDArray[np.bool_]]:
-    """As `_slope`, unmoved by the few points that belong to another region, and which points (n,) are not these.
+def _fit_robust(x: FloatArray, y: FloatArray) -> tuple[FloatArray, float, NDArray[np.bool_]]:
+    """As `_fit_ridge`, unmoved by the few points that belong to another region, and which points (n,) are not these.
 
-    Least absolute deviations by reweighting, then `_slope` of the points that agree with it.
+    Least absolute deviations by reweighting, then `_fit_ridge` of the points that agree with it.
     """
     n, dim = x.shape
-    slope, r2 = _slope(x, y)
+    slope, r2 = _fit_ridge(x, y)
     everything = np.ones(n, dtype=bool)
     if r2 > EXACT or n < 1.2 * dim + 5:
         return slope, r2, everything
-    near = _in_agreement(x, y)
-    robust, robust_r2 = _slope(x[near], y[near])
+    near = _find_inliers(x, y)
+    robust, robust_r2 = _fit_ridge(x[near], y[near])
     share = float(near.mean())
     better = robust_r2 * share > r2 or (robust_r2 > EXACT and share > AGREEING)
     return (robust, robust_r2, near) if better else (slope, r2, everything)
 
 
-def _in_agreement(x: FloatArray, y: FloatArray) -> NDArray[np.bool_]:
+def _find_inliers(x: FloatArray, y: FloatArray) -> NDArray[np.bool_]:
     """Return which points (n,) lie on the plane of least absolute (leave-one-out) deviations."""
     n, dim = x.shape
     design = np.column_stack([x, np.ones(n)])
     penalty = np.diag(np.append(np.full(dim, 1e-3), 0.0))
     w = np.ones(n)
-    for _ in range(LAD_STEPS):
+    for _ in range(LAD_ITERATIONS):
         weighted = design * w[:, None]
         inverse = np.linalg.inv(weighted.T @ design + penalty)
         leverage = np.einsum("ij,ij->i", weighted @ inverse, design)

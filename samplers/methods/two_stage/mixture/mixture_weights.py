@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from samplers.problem import FloatArray
 
-STEPS = 60
+UPDATES = 60
 NEGLIGIBLE = 30.0
 """Points whose weight is e^-30 of the largest one do not matter."""
 
@@ -20,7 +20,7 @@ class Floor:
         self.least = least
 
 
-def least_variance(
+def minimise_second_moment(
     log_r: FloatArray, log_weights: FloatArray, start: FloatArray, floors: Sequence[Floor]
 ) -> FloatArray:
     """Return weights a (k,) of a mixture q_a = sum_k a_k q_k that minimise the second moment of its estimate.
@@ -41,14 +41,14 @@ def least_variance(
     ratio = np.exp(log_r - largest)
     scaled = np.exp(log_weights - largest - (log_weights - largest).max())
     a = start
-    for _ in range(STEPS):
+    for _ in range(UPDATES):
         q = np.maximum(a @ ratio, 1e-300)
         a = a * np.sqrt((ratio * (scaled / (q * q))).sum(axis=1))
-        a = with_floors(a / a.sum(), floors)
+        a = raise_to_floors(a / a.sum(), floors)
     return a
 
 
-def with_floors(a: FloatArray, floors: Sequence[Floor]) -> FloatArray:
+def raise_to_floors(a: FloatArray, floors: Sequence[Floor]) -> FloatArray:
     """Return weights (k,) raised to floors of disjoint members, the others lowered in proportion; they add up to 1."""
     raised: list[Floor] = []
     while True:

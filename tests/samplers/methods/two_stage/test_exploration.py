@@ -10,11 +10,18 @@ from samplers.methods.two_stage.exploration import (
     Sizes,
     _descend,
     _drawn_in,
-    _some,
+    _subsample,
     first_draws,
     regions_of,
 )
-from samplers.methods.two_stage.regions import MANY_REGIONS, MOST_CLONES, MOST_REGIONS, _clones, _same_region, _walk
+from samplers.methods.two_stage.regions import (
+    MANY_REGIONS,
+    MAX_REPLICATED_CHAINS,
+    MOST_REGIONS,
+    _label_regions,
+    _pcn_chains,
+    _replicate_seeds,
+)
 from samplers.methods.two_stage.simulator import Simulator
 from samplers.problem import FunctionProblem
 
@@ -165,7 +172,7 @@ def test_walk_leaves_the_law_of_failures_as_it_is(dim, turned, rng):
     direction = np.eye(dim)[0] + turned * np.eye(dim)[-1]
     direction /= np.linalg.norm(direction)
     problem = half_spaces(dim, beta)
-    steps = _walk(Simulator(problem), start, np.full(n, 0.5), np.tile(direction, (n, 1)), 6, 0.0, rng)
+    steps = _pcn_chains(Simulator(problem), start, np.full(n, 0.5), np.tile(direction, (n, 1)), 6, 0.0, rng)
     walk = driven(steps, problem)
     assert walk.states.shape == (n, 6, dim)
     end = walk.states[:, -1]
@@ -181,7 +188,7 @@ def test_walk_without_a_direction_comes_from_a_wide_failure_to_likely_ones(rng):
     problem = half_spaces(20, 3.0)
     start = 2.5 * rng.standard_normal((300, 20))
     start[:, 0] = 6.0
-    walk = driven(_walk(Simulator(problem), start, np.full(300, 0.5), None, 30, 0.0, rng), problem)
+    walk = driven(_pcn_chains(Simulator(problem), start, np.full(300, 0.5), None, 30, 0.0, rng), problem)
     end = walk.states[:, -1]
     assert (end[:, 0] >= 3.0).all()
     assert end[:, 0].mean() < 3.7
@@ -219,7 +226,7 @@ def test_points_are_drawn_in_along_their_rays_and_still_fail(rng):
 def test_regions_are_told_apart_by_the_point_half_way(rng):
     problem = half_spaces(4, 2.5, 2.5, 2.5)
     u = np.concatenate([rng.normal(0, 0.1, (20, 4)) + 3.0 * np.eye(4)[k] for k in range(3)])
-    labels, scattered = driven(_same_region(Simulator(problem), u, 0.0, 10**6), problem)
+    labels, scattered = driven(_label_regions(Simulator(problem), u, 0.0, 10**6), problem)
     assert not scattered
     assert labels.shape == (60,)
     assert all(len(set(labels[20 * k : 20 * (k + 1)])) == 1 for k in range(3))
@@ -231,7 +238,7 @@ def test_a_far_point_and_one_in_two_regions_join_no_regions(rng):
     problem = half_spaces(2, 3.0, 3.0)
     u = np.array([[8.0, 0.0], [4.0, 4.0], [3.1, 0.0], [0.0, 3.2], [3.3, 0.5], [-0.5, 3.1]])
     for order in [rng.permutation(6) for _ in range(20)]:
-        labels, _ = driven(_same_region(Simulator(problem), u[order], 0.0, 10**6), problem)
+        labels, _ = driven(_label_regions(Simulator(problem), u[order], 0.0, 10**6), problem)
         found = labels[np.argsort(order)]
         assert found[2] == found[4] != found[3] == found[5]
 
@@ -242,26 +249,26 @@ def test_more_regions_than_a_shell_would_need_are_pieces_of_it(dim):
     problem = FunctionProblem(lambda u: 3.0 - np.abs(u).max(axis=1), dim)
     u = np.concatenate([s * 3.3 * np.eye(dim) for s in (1, -1)])
     per_face = np.repeat([6, 1], [8, 4]) if dim == 6 else np.full(20, 3)
-    labels, scattered = driven(_same_region(Simulator(problem), np.repeat(u, per_face, axis=0), 0.0, 10**6), problem)
+    labels, scattered = driven(_label_regions(Simulator(problem), np.repeat(u, per_face, axis=0), 0.0, 10**6), problem)
     assert scattered == (dim == 10)
     assert set(labels) == set(range(12 if dim == 6 else MANY_REGIONS))
 
 
 def test_starts_are_half_the_least_wide_and_half_at_random(rng):
     scale = rng.permutation(np.repeat([1, 2, 3], [15, 40, 100]))
-    chosen = _some(scale, 30, rng)
+    chosen = _subsample(scale, 30, rng)
     assert len(set(chosen)) == 30
     assert np.count_nonzero(scale[chosen] == 1) == 15
     assert np.count_nonzero(scale[chosen] == 3) >= 3
-    assert set(_some(scale[:10], 30, rng)) == set(range(10))
+    assert set(_subsample(scale[:10], 30, rng)) == set(range(10))
 
 
 def test_regions_with_few_chains_get_more(rng):
     labels = np.repeat([0, 1, 2], [20, 3, 9])
-    more = _clones(labels, 10, 10**6, rng)
+    more = _replicate_seeds(labels, 10, 10**6, rng)
     np.testing.assert_array_equal(np.sort(np.unique(more)), np.arange(32))
     np.testing.assert_array_equal(np.bincount(labels[more]), [20, 10, 10])
-    assert len(_clones(np.arange(30), 24, 10**6, rng)) == 30 + MOST_CLONES
+    assert len(_replicate_seeds(np.arange(30), 24, 10**6, rng)) == 30 + MAX_REPLICATED_CHAINS
 
 
 @pytest.mark.parametrize("budget", [400, 2000, 6000, 24_000, 600_000])

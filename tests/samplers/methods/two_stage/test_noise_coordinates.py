@@ -6,7 +6,7 @@ from scipy import stats
 
 import samplers
 from samplers.limit_states import Reference
-from samplers.methods.two_stage.noise_coordinates import noise_of, without_noise
+from samplers.methods.two_stage.noise_coordinates import marginalise_noise, noise_mask
 from samplers.problem import FunctionProblem, StandardNormal
 
 PHI = stats.norm.cdf
@@ -85,7 +85,7 @@ def test_the_same_seed_gives_the_same_noise_and_another_another():
 
 
 def test_points_keep_their_noise():
-    inputs = without_noise(problem(sum_of), np.random.default_rng(0))
+    inputs = marginalise_noise(problem(sum_of), np.random.default_rng(0))
     assert inputs.dim == 3
     u = np.random.default_rng(1).standard_normal((5, 3))
     x = inputs.base.from_standard_normal(u)
@@ -98,10 +98,10 @@ def test_points_keep_their_noise():
 
 def test_inputs_without_noise_are_searched_as_they_are():
     plain, rng = FunctionProblem(sum_of, 303), np.random.default_rng(0)
-    assert without_noise(plain, rng) is plain
-    assert not noise_of(plain).any()
+    assert marginalise_noise(plain, rng) is plain
+    assert not noise_mask(plain).any()
     all_noise = WithNoise(sum_of, 303, 0)
-    assert without_noise(all_noise, rng) is all_noise
+    assert marginalise_noise(all_noise, rng) is all_noise
     assert rng.random() == np.random.default_rng(0).random()  # no number was drawn
 
 

@@ -5,9 +5,9 @@ import pytest
 from scipy import stats
 from scipy.integrate import simpson
 
-from samplers.methods.two_stage.mixture.proposal import GATE_DRAWS, Candidate, Proposal
-from samplers.methods.two_stage.simulator import Batch
-from samplers.methods.two_stage.stratified import FEWEST, Strata
+from samplers.methods.two_stage.mixture.proposal import ACCEPTANCE_DRAWS, MixtureComponent, MixtureProposal
+from samplers.methods.two_stage.simulator import ComponentDraws
+from samplers.methods.two_stage.stratified import MIN_STRATUM_DRAWS, StratifiedSample
 from samplers.problem import FunctionProblem
 from samplers.proposals.components import Bump, Slice, Wide, draw, draw_counts
 
@@ -27,8 +27,8 @@ LAWS = [
     (Slice(np.ones(1), 1.5), stats.truncnorm(1.5, np.inf)),
 ]
 WEIGHTS = np.array([0.2, 0.3, 0.3, 0.2])
-PROPOSAL = Proposal([Candidate(component, "bump") for component, _ in LAWS], WEIGHTS)
-UNUSED = Proposal([*PROPOSAL.candidates, Candidate(Wide(1, 3.0), "wide")], np.append(WEIGHTS, 0.0))
+PROPOSAL = MixtureProposal([MixtureComponent(component, "bump") for component, _ in LAWS], WEIGHTS)
+UNUSED = MixtureProposal([*PROPOSAL.candidates, MixtureComponent(Wide(1, 3.0), "wide")], np.append(WEIGHTS, 0.0))
 
 
 def mixture(x):
@@ -48,13 +48,13 @@ TOTAL = sum(a * moment(law, 2) for a, (_, law) in zip(WEIGHTS, LAWS, strict=True
 def batch(counts, rng, proposal=PROPOSAL):
     counts = np.asarray(counts)
     u = draw(proposal.components, counts, rng)
-    return Batch(proposal.components, counts, u, PROBLEM.evaluate(u))
+    return ComponentDraws(proposal.components, counts, u, PROBLEM.evaluate(u))
 
 
 def strata(*batches, proposal=PROPOSAL):
-    found = Strata.none(len(proposal.weights), 1, np.empty(0))
+    found = StratifiedSample.empty(len(proposal.weights), 1, np.empty(0))
     for part in batches:
-        found = found.joined(part, proposal, PROBLEM, 0.0)
+        found = found.add(part, proposal, PROBLEM, 0.0)
     return found
 
 
@@ -92,10 +92,10 @@ def test_its_variance_is_that_of_independent_draws_less_that_between_the_compone
 
 def test_components_with_few_draws_count_with_their_second_moment(rng):
     """Too large rather than too small: a variance of a handful of draws is worth nothing."""
-    counts = np.array([FEWEST - 1] * 4)
+    counts = np.array([MIN_STRATUM_DRAWS - 1] * 4)
     own = [variance_within(strata(batch(counts, rng))) for _ in range(600)]
     n = counts.sum()
-    second = sum(moment(law, 2) for _, law in LAWS) * (FEWEST - 1) / n**2
+    second = sum(moment(law, 2) for _, law in LAWS) * (MIN_STRATUM_DRAWS - 1) / n**2
     assert np.mean(own) == pytest.approx(second, abs=4 * np.std(own) / math.sqrt(600))
 
 
@@ -121,7 +121,7 @@ def test_without_a_failing_draw_nothing_is_known_of_the_spread(rng):
     found = strata(batch([5, 0, 50, 0], np.random.default_rng(0)))
     assert found.p == 0
     assert found.cov == math.inf
-    assert Strata.none(4, 1, np.empty(0)).cov == math.inf
+    assert StratifiedSample.empty(4, 1, np.empty(0)).cov == math.inf
 
 
 def test_weights_of_base_draws_are_bounded(rng):
@@ -152,7 +152,7 @@ def test_sample_without_base_draws(rng):
     assert sample.weights.sum() == pytest.approx(1.0, abs=4 * np.sqrt((sample.weights**2).sum()))
 
 
-def gate(u):
+def screen(u):
     """Lets most draws short of the threshold go, as a classifier would that is not quite right."""
     return np.where(u[:, 0] > 2.1, 1.0, 0.3)
 
@@ -163,26 +163,30 @@ def passed(law):
 
 def test_a_gate_thins_components_and_the_weights_account_for_it(rng):
     """The shares that it lets through are estimated once, by drawing: their error is that of all runs together."""
-    proposal = PROPOSAL.behind(gate, rng)
-    for (_, law), mass, weight in zip(LAWS, proposal.mass, WEIGHTS, strict=True):
-        share, drawn = passed(law), max(GATE_DRAWS * weight, 500)
-        assert mass == pytest.approx(share, abs=4 * math.sqrt(0.25 / drawn))
+    proposal = PROPOSAL.with_screen(screen, rng)
+    for (_, law), acceptance, weight in zip(LAWS, proposal.acceptance, WEIGHTS, strict=True):
+        share, drawn = passed(law), max(ACCEPTANCE_DRAWS * weight, 500)
+        assert acceptance == pytest.approx(share, abs=4 * math.sqrt(0.25 / drawn))
     found = []
     for _ in range(300):
-        u, counts = proposal.drawn(100, rng)
-        found.append(strata(Batch(proposal.components, counts, u, PROBLEM.evaluate(u)), proposal=proposal))
+        u, counts = proposal.draw(100, rng)
+        found.append(strata(ComponentDraws(proposal.components, counts, u, PROBLEM.evaluate(u)), proposal=proposal))
     p = np.array([one.p for one in found])
-    assert p.mean() == pytest.approx(P, abs=4 * math.hypot(p.std() / math.sqrt(300), proposal.mass_cov * P))
+    assert p.mean() == pytest.approx(P, abs=4 * math.hypot(p.std() / math.sqrt(300), proposal.acceptance_cov * P))
     own = np.mean([variance_within(one) for one in found])
     assert own == pytest.approx(p.var(), rel=4 * math.sqrt(2.5 / 300))
-    assert 0 < proposal.mass_cov < 0.02
+    assert 0 < proposal.acceptance_cov < 0.02
 
 
 def test_base_and_wide_draws_pass_every_gate(rng):
-    candidates = [Candidate(Wide(1), "base"), Candidate(Wide(1, 1.5), "wide"), Candidate(LAWS[1][0], "bump")]
-    proposal = Proposal(candidates, np.array([0.2, 0.2, 0.6])).behind(gate, rng)
-    np.testing.assert_array_equal(proposal.mass[:2], 1.0)
-    u, counts = proposal.drawn(10_000, rng)
+    candidates = [
+        MixtureComponent(Wide(1), "base"),
+        MixtureComponent(Wide(1, 1.5), "wide"),
+        MixtureComponent(LAWS[1][0], "bump"),
+    ]
+    proposal = MixtureProposal(candidates, np.array([0.2, 0.2, 0.6])).with_screen(screen, rng)
+    np.testing.assert_array_equal(proposal.acceptance[:2], 1.0)
+    u, counts = proposal.draw(10_000, rng)
     assert stats.kstest(u[: counts[0], 0], "norm").pvalue > 1e-4
     weights = np.exp(proposal.log_weights(np.linspace(-10, 10, 500)[:, None]))
     assert weights.max() <= 1 / 0.2

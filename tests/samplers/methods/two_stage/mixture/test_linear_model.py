@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from samplers.methods.two_stage.mixture.linear_model import LEAST_R2, beyond, edge, falling, plane_of
+from samplers.methods.two_stage.mixture.linear_model import (
+    LEAST_R2,
+    descent_direction,
+    failure_edge,
+    fit_plane,
+    half_space_proposals,
+)
 from samplers.proposals.components import Bump, Slice
 
 
@@ -28,7 +34,7 @@ def test_direction_of_a_linear_f(dim, n, rng):
     """The ridge turns it by about 1 / n times the ratio of variances."""
     axis = unit(dim)
     u = around(axis, n, rng)
-    found, r2 = falling(u, 7.0 * (3.0 - u @ axis))
+    found, r2 = descent_direction(u, 7.0 * (3.0 - u @ axis))
     assert np.linalg.norm(found) == pytest.approx(1.0)
     assert float(found @ axis) > 0  # f falls along it
     assert angle(found, axis) < 40 / n + 0.02
@@ -40,7 +46,7 @@ def test_fewer_points_than_dimensions_give_part_of_the_direction(n, rng):
     """n points span n of 300 directions: with normal u the cosine is about sqrt(n / d)."""
     axis = unit(300)
     u = rng.standard_normal((n, 300))
-    found, r2 = falling(u, 3.0 - u @ axis)
+    found, r2 = descent_direction(u, 3.0 - u @ axis)
     assert float(found @ axis) == pytest.approx(math.sqrt(0.96 * n / 300), abs=0.15)
     assert r2 < 0.6
 
@@ -50,7 +56,7 @@ def test_scale_and_shift_of_f_do_not_matter_much(rng):
     u = around(axis, 200, rng)
     f = 3.0 - u @ axis
     for scale in (1e-3, 1.0, 1e6):
-        found, r2 = falling(u, scale * f + 17.0 * scale)
+        found, r2 = descent_direction(u, scale * f + 17.0 * scale)
         assert angle(found, axis) < 0.05
         assert r2 > 0.95
 
@@ -69,7 +75,7 @@ def test_a_tenth_of_the_points_from_another_plane_do_not_turn_it(dim, n):
     for seed in range(10):
         rng = np.random.default_rng(seed)
         axis, other = unit(dim, 1), unit(dim, 2)
-        found, r2 = falling(*with_outliers(axis, other, n, 0.1, rng))
+        found, r2 = descent_direction(*with_outliers(axis, other, n, 0.1, rng))
         # in two dimensions it often fails to tell them apart, and is between both
         assert angle(found, axis) < (0.3 if dim == 2 else 0.01)
         assert LEAST_R2 < r2 < 0.95  # it is multiplied by the share of the points that agree
@@ -80,7 +86,7 @@ def test_infinite_outcomes_are_left_out(rng):
     u = around(axis, 300, rng)
     f = 3.0 - u @ axis
     f[:60], f[60:90], f[90:100] = np.inf, -np.inf, np.finfo(float).min
-    found, r2 = falling(u, f)
+    found, r2 = descent_direction(u, f)
     assert angle(found, axis) < 0.02
     assert r2 > 0.95
 
@@ -90,7 +96,7 @@ def test_a_few_wild_outcomes_do_no_harm(rng):
     u = around(axis, 300, rng)
     f = 3.0 - u @ axis
     f[:3], f[3:5] = 1e9, -1e9
-    found, r2 = falling(u, f)
+    found, r2 = descent_direction(u, f)
     assert angle(found, axis) < 0.05
     assert r2 > 0.9
 
@@ -100,7 +106,7 @@ def test_outcomes_of_any_size(scale, rng):
     """Also of one whose square overflows."""
     axis = unit(4)
     u = around(axis, 300, rng)
-    found, r2 = falling(u, scale * (3.0 - u @ axis))
+    found, r2 = descent_direction(u, scale * (3.0 - u @ axis))
     assert LEAST_R2 < r2 <= 1
     assert angle(found, axis) < 0.05
 
@@ -109,7 +115,7 @@ def test_outcomes_of_any_size(scale, rng):
     "f", [np.full(50, 2.0), np.full(50, np.inf), np.full(50, -np.inf), np.append(np.full(47, np.inf), [1.0, 2.0, 3.0])]
 )
 def test_without_outcomes_that_differ_there_is_no_plane(f, rng):
-    found, r2 = falling(rng.standard_normal((50, 3)), f)
+    found, r2 = descent_direction(rng.standard_normal((50, 3)), f)
     assert r2 == 0
     np.testing.assert_array_equal(found, 0.0)
 
@@ -119,10 +125,10 @@ def test_ties(rng):
     axis = unit(6)
     u = around(axis, 600, rng)
     f = 3.0 - u @ axis
-    capped, capped_r2 = falling(u, np.minimum(f, 0.2))
+    capped, capped_r2 = descent_direction(u, np.minimum(f, 0.2))
     assert angle(capped, axis) < 0.1
     assert 0.5 < capped_r2 < 0.999
-    rounded, rounded_r2 = falling(u, np.floor(2 * f))
+    rounded, rounded_r2 = descent_direction(u, np.floor(2 * f))
     assert angle(rounded, axis) < 0.15
     assert rounded_r2 > 0.5
 
@@ -130,7 +136,7 @@ def test_ties(rng):
 def test_an_indicator_has_a_direction_but_a_small_r2(rng):
     axis = unit(3)
     u = around(axis, 600, rng)
-    found, r2 = falling(u, np.where(u @ axis > 3.0, -1.0, 1.0))
+    found, r2 = descent_direction(u, np.where(u @ axis > 3.0, -1.0, 1.0))
     assert angle(found, axis) < 0.25
     assert 0 < r2 < 0.75
 
@@ -141,9 +147,9 @@ def test_noise_has_no_plane(dim, n):
     for seed in range(10):
         rng = np.random.default_rng(seed)
         u = rng.standard_normal((n, dim)) + 3 * unit(dim)
-        r2 = falling(u, rng.standard_normal(n))[1]
+        r2 = descent_direction(u, rng.standard_normal(n))[1]
         assert r2 < LEAST_R2
-        assert beyond(u, u, rng.standard_normal(n)) == []
+        assert half_space_proposals(u, u, rng.standard_normal(n)) == []
 
 
 @pytest.mark.parametrize("dim", [1, 2, 50])
@@ -153,7 +159,7 @@ def test_proposals_beyond_the_plane_of_a_half_space(dim, rng):
     tail = stats.truncnorm(beta, np.inf)
     xi = rng.standard_normal((400, dim))
     points = xi + (tail.rvs(400, random_state=rng) - xi @ axis)[:, None] * axis
-    bump, cut = beyond(points, u, beta - u @ axis)
+    bump, cut = half_space_proposals(points, u, beta - u @ axis)
     assert isinstance(bump, Bump)
     assert isinstance(cut, Slice)
     low, high = (tail.ppf(share) for share in (0.005, 0.08))  # the 3 % quantile of 400 points, 4 standard errors
@@ -169,9 +175,9 @@ def test_no_proposals_from_few_failures_or_a_plane_at_the_origin(rng):
     axis = unit(3)
     u = around(axis, 300, rng)
     f = 3.0 - u @ axis
-    assert beyond(u[f < 0][:7], u, f) == []
+    assert half_space_proposals(u[f < 0][:7], u, f) == []
     centred = around(axis, 300, rng, mean=0.0)
-    assert beyond(centred, centred, -(centred @ axis)) == []
+    assert half_space_proposals(centred, centred, -(centred @ axis)) == []
 
 
 def beyond_plane(axis, beta, n, rng):
@@ -189,7 +195,7 @@ def test_points_of_another_region_among_the_failures_change_nothing(dim):
         points = np.concatenate([beyond_plane(axis, 3.0, 180, rng), beyond_plane(other, 3.2, 20, rng)])
         u = np.concatenate([around(axis, 270, rng), around(other, 30, rng)])
         f = np.minimum(3.0 - u @ axis, 5.0 * (3.2 - u @ other))
-        _, cut = beyond(points, u, f)
+        _, cut = half_space_proposals(points, u, f)
         assert angle(cut.axis, axis) < (0.02 if dim == 8 else 0.06)
         assert 2.98 - (0.03 if dim == 8 else 0.2) < cut.start < 2.99  # it was not found at all
 
@@ -199,7 +205,7 @@ def test_a_region_whose_surroundings_fall_towards_another_one(rng):
     axis, other = np.eye(6)[0], np.eye(6)[1]
     u = around(axis, 80, rng, mean=3.2)
     f = np.minimum(2.0 * (3.0 - u @ axis), 0.3 * (3.0 - u @ other))
-    _, cut = beyond(beyond_plane(axis, 3.0, 40, rng), u, f)
+    _, cut = half_space_proposals(beyond_plane(axis, 3.0, 40, rng), u, f)
     assert angle(cut.axis, axis) < 0.01
     assert cut.start == pytest.approx(2.98, abs=0.02)
 
@@ -211,7 +217,7 @@ def test_hardly_any_failure_lies_before_the_start_of_a_plane_that_is_turned(n):
         rng = np.random.default_rng(seed)
         axis = unit(100)
         u = around(axis, n, rng, mean=3.2)
-        plane = plane_of(u, 3.0 - u @ axis + 0.05 * rng.standard_normal(n))
+        plane = fit_plane(u, 3.0 - u @ axis + 0.05 * rng.standard_normal(n))
         before = beyond_plane(axis, 3.0, 10_000, rng) @ plane.axis < plane.crossing(0.0)
         assert before.mean() < 0.03
 
@@ -219,6 +225,6 @@ def test_hardly_any_failure_lies_before_the_start_of_a_plane_that_is_turned(n):
 @pytest.mark.parametrize("n", [10, 40, 400])
 def test_the_edge_of_a_few_points_is_not_beyond_the_true_one(n, rng):
     """Exponential excess over 3: the least of n is 1 / n beyond."""
-    found = [edge(3.0 + rng.exponential(size=n), np.ones(n), n, 0.02) for _ in range(200)]
+    found = [failure_edge(3.0 + rng.exponential(size=n), np.ones(n), n, 0.02) for _ in range(200)]
     assert np.mean(np.array(found) > 3.0 + 0.05) < 0.15
     assert np.mean(found) > 3.0 - 3.0 / n

@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
-from samplers.methods.two_stage.mixture.mixture_weights import Floor, least_variance, with_floors
+from samplers.methods.two_stage.mixture.mixture_weights import Floor, minimise_second_moment, raise_to_floors
 
 
 def random_problem(seed, k=6, n=300):
@@ -61,7 +61,7 @@ def only(k, *members):
 def test_weights_are_nearly_the_best(seed, floors):
     """60 steps come within 2 % of the least second moment."""
     log_r, log_weights = random_problem(seed)
-    a = least_variance(log_r, log_weights, np.full(6, 1 / 6), floors)
+    a = minimise_second_moment(log_r, log_weights, np.full(6, 1 / 6), floors)
     assert a.sum() == pytest.approx(1.0, abs=1e-12)
     assert (a >= 0).all()
     for floor in floors:
@@ -73,7 +73,7 @@ def test_a_component_that_fits_gets_everything_and_a_useless_one_nothing():
     """Points with density q_0: phi / q_0 is the same for all of them."""
     rng = np.random.default_rng(0)
     log_r = np.stack([np.full(200, 3.0), rng.normal(1.0, 0.5, 200), np.full(200, -np.inf)])
-    a = least_variance(log_r, np.full(200, -5.0), np.full(3, 1 / 3), [])
+    a = minimise_second_moment(log_r, np.full(200, -5.0), np.full(3, 1 / 3), [])
     assert a[0] > 0.99
     assert a[2] == 0.0
 
@@ -82,24 +82,24 @@ def test_two_regions_are_weighed_by_the_root_of_their_second_moment():
     """Components that do not overlap: the least of sum_k m_k / a_k, with m_k = w n_k / r_k, is at a_k ~ sqrt(m_k)."""
     log_r = np.full((2, 50), -np.inf)
     log_r[0, :10], log_r[1, 10:] = 2.0, 0.5
-    a = least_variance(log_r, np.zeros(50), np.array([0.5, 0.5]), [])
+    a = minimise_second_moment(log_r, np.zeros(50), np.array([0.5, 0.5]), [])
     expected = np.sqrt([10 * np.exp(-2.0), 40 * np.exp(-0.5)])
     np.testing.assert_allclose(a, expected / expected.sum(), rtol=1e-9)
 
 
 def test_huge_logarithms_do_no_harm():
     log_r, log_weights = random_problem(3)
-    a = least_variance(log_r, log_weights, np.full(6, 1 / 6), [])
-    shifted = least_variance(log_r + 500, log_weights - 1500, np.full(6, 1 / 6), [])
+    a = minimise_second_moment(log_r, log_weights, np.full(6, 1 / 6), [])
+    shifted = minimise_second_moment(log_r + 500, log_weights - 1500, np.full(6, 1 / 6), [])
     np.testing.assert_allclose(shifted, a, rtol=1e-6)
 
 
 def test_points_of_no_weight_do_not_matter():
     log_r, log_weights = random_problem(4)
     more_r, more_weights = random_problem(5)
-    a = least_variance(log_r, log_weights, np.full(6, 1 / 6), [])
+    a = minimise_second_moment(log_r, log_weights, np.full(6, 1 / 6), [])
     joined = np.concatenate([log_r, more_r], axis=1), np.concatenate([log_weights, more_weights - 100])
-    np.testing.assert_array_equal(least_variance(*joined, np.full(6, 1 / 6), []), a)
+    np.testing.assert_array_equal(minimise_second_moment(*joined, np.full(6, 1 / 6), []), a)
 
 
 mixtures = st.lists(st.floats(0, 1), min_size=4, max_size=10).filter(lambda w: sum(w) > 1e-3)
@@ -109,7 +109,7 @@ mixtures = st.lists(st.floats(0, 1), min_size=4, max_size=10).filter(lambda w: s
 def test_a_floor_is_kept_and_the_rest_keeps_its_proportions(weights, least):
     a = np.array(weights) / sum(weights)
     members = only(len(a), 0, 2)
-    raised = with_floors(a, [Floor(members, least)])
+    raised = raise_to_floors(a, [Floor(members, least)])
     assert raised.sum() == pytest.approx(1.0, abs=1e-9)
     assert raised[members].sum() >= least - 1e-9
     if a[members].sum() >= least:
@@ -120,14 +120,14 @@ def test_a_floor_is_kept_and_the_rest_keeps_its_proportions(weights, least):
 
 
 def test_a_floor_of_members_without_weight_is_dealt_out_evenly():
-    raised = with_floors(np.array([0.0, 0.0, 0.4, 0.6]), [Floor(only(4, 0, 1), 0.2)])
+    raised = raise_to_floors(np.array([0.0, 0.0, 0.4, 0.6]), [Floor(only(4, 0, 1), 0.2)])
     np.testing.assert_allclose(raised, [0.1, 0.1, 0.32, 0.48])
 
 
 def test_several_floors_are_kept():
     floors = [Floor(only(6, 0), 0.05), Floor(only(6, 2, 3), 0.4), Floor(only(6, 4), 0.1)]
     for seed in range(8):
-        a = least_variance(*random_problem(seed), np.full(6, 1 / 6), floors)
+        a = minimise_second_moment(*random_problem(seed), np.full(6, 1 / 6), floors)
         assert a.sum() == pytest.approx(1.0, abs=1e-12)
         for floor in floors:
             assert a[floor.members].sum() >= 0.999 * floor.least
