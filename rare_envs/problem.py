@@ -94,10 +94,10 @@ class DrivingProblem:
         self.world: World
         self.space: ScenarioSpace
         vehicles = find_scenario(env_id).vehicles
-        with _told(ego):
+        with _ego_errors_as_value_errors(ego):
             make_kwargs["observation"] = make_kwargs.get("observation") or observation_for(ego, vehicles)
         self.world, self.space = set_up(env_id, measure=measure, base=base, noise=noise, **make_kwargs)
-        with _told(ego):
+        with _ego_errors_as_value_errors(ego):
             self.driver = as_driver(ego, self.world)
             self.varies: bool = getattr(ego, "deterministic", None) is False
         for note in self.notes:
@@ -186,7 +186,7 @@ class DrivingProblem:
         with torch.inference_mode():
             for first in range(0, len(x), self.tile):
                 rows = torch.from_numpy(x[first : first + self.tile]).float()
-                seen = rollout(world, self.driver, rows).witness
+                seen = rollout(world, self.driver, rows).statistics
                 assert seen is not None
                 found.append(seen.crash)
         return Crash(*(torch.cat(parts) for parts in zip(*found, strict=True)))
@@ -227,7 +227,7 @@ class DrivingProblem:
 
 
 @contextmanager
-def _told(ego: Any) -> Iterator[None]:
+def _ego_errors_as_value_errors(ego: Any) -> Iterator[None]:
     """Turn whatever happens when an ego is asked about itself into a ValueError: it is the user's."""
     try:
         yield

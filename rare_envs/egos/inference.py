@@ -12,7 +12,7 @@ from rare_envs.egos.faults import EgoGone, NoAnswer, part_size, reason_of
 from rare_envs.sensors.kinds import each
 
 
-class Asked(NamedTuple):
+class PolicyQuery(NamedTuple):
     """What a policy is asked: B rows."""
 
     observation: Any
@@ -24,12 +24,12 @@ class Asked(NamedTuple):
     over: Tensor
     """Rows whose action does not matter, boolean, shape (B,)."""
 
-    def rows(self, part: slice) -> "Asked":
+    def rows(self, part: slice) -> "PolicyQuery":
         """Some of the rows, for a policy without a memory."""
-        return Asked(each(lambda one: one[part], self.observation), None, self.start[part], self.over[part])
+        return PolicyQuery(each(lambda one: one[part], self.observation), None, self.start[part], self.over[part])
 
 
-def ask(policy: Any, kind: str, asked: Asked, lost: dict[int, str] | None = None) -> tuple[Tensor, Any]:
+def query_policy(policy: Any, kind: str, asked: PolicyQuery, lost: dict[int, str] | None = None) -> tuple[Tensor, Any]:
     """Let a policy act on a batch.
 
     Args:
@@ -58,7 +58,9 @@ def ask(policy: Any, kind: str, asked: Asked, lost: dict[int, str] | None = None
     except EgoGone:
         raise
     except (Exception, SystemExit) as error:  # the policy is the user's: anything may happen in it
-        found = None if asked.hidden is not None else _in_parts(policy, kind, asked, error, len(asked.start))
+        found = (
+            None if asked.hidden is not None else _isolate_failing_rows(policy, kind, asked, error, len(asked.start))
+        )
         if found is None:
             raise
         given, reasons = found
@@ -66,7 +68,7 @@ def ask(policy: Any, kind: str, asked: Asked, lost: dict[int, str] | None = None
         return given, None
 
 
-def _predict(policy: Any, asked: Asked) -> tuple[Tensor, Any]:
+def _predict(policy: Any, asked: PolicyQuery) -> tuple[Tensor, Any]:
     action, hidden = policy.predict(
         asked.observation, state=asked.hidden, episode_start=asked.start, deterministic=True
     )
@@ -82,8 +84,8 @@ def _not_finite(action: Tensor, over: Tensor, lost: dict[int, str]) -> Tensor:
     return bad
 
 
-def _in_parts(
-    policy: Any, kind: str, asked: Asked, error: BaseException, whole: int
+def _isolate_failing_rows(
+    policy: Any, kind: str, asked: PolicyQuery, error: BaseException, whole: int
 ) -> tuple[Tensor, dict[int, str]] | None:
     """Ask again, after an error, in parts until the rows that fail stand alone.
 
@@ -119,7 +121,7 @@ def _in_parts(
             if len(part.start) == 1:
                 done, mine = _idle(kind, part), {0: reason_of(error)}
             else:
-                deeper = _in_parts(policy, kind, part, error, whole)
+                deeper = _isolate_failing_rows(policy, kind, part, error, whole)
                 if deeper is None:
                     return None
                 done, mine = deeper
@@ -129,7 +131,7 @@ def _in_parts(
     return torch.cat(given), reasons
 
 
-def _idle(kind: str, asked: Asked) -> Tensor:
+def _idle(kind: str, asked: PolicyQuery) -> Tensor:
     """The action of rows whose action does not matter."""
     batch, everywhere = len(asked.start), torch.ones_like(asked.over)
     nothing = torch.zeros(batch, dtype=torch.int64) if kind == "meta" else torch.zeros(batch, 2)

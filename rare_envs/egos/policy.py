@@ -12,7 +12,7 @@ from torch import Tensor
 
 from rare_envs.control.actions import DISCRETE_ACTIONS, IDLE, META_ACTIONS
 from rare_envs.control.idm import IDM
-from rare_envs.egos.inference import Asked, ask
+from rare_envs.egos.inference import PolicyQuery, query_policy
 from rare_envs.egos.wrappers import fitted, frames_of, observation_for
 from rare_envs.sensors.kinds import each
 from rare_envs.simulation.background import Background
@@ -58,7 +58,7 @@ class PolicyDriver:
         seen = observe(episode, self.observation)
         observation = each(lambda part: _replaced(part, over).numpy(force=True), seen)
         start = np.full(batch, memory is None)
-        given, hidden = ask(self.policy, self.action, Asked(observation, hidden, start, over), self.lost)
+        given, hidden = query_policy(self.policy, self.action, PolicyQuery(observation, hidden, start, over), self.lost)
         return given.to(state.x) if given.is_floating_point() else given, (hidden, tick + 1)
 
 

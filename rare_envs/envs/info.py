@@ -21,12 +21,12 @@ def info_of(space: ScenarioSpace, x: NDArray[Any], episode: Episode) -> Info:
         x: They, shape (d,).
         episode: A batch of one, in a world with a witness.
     """
-    assert episode.witness is not None
+    assert episode.statistics is not None
     collided = bool(episode.collided)
     return {
         "scenario": space.named(x),
         "x": x.copy(),
-        "min_ttc": 0.0 if collided else float(episode.witness.least_ttc),
+        "min_ttc": 0.0 if collided else float(episode.statistics.least_ttc),
         "collision": collided,
     }
 
@@ -47,9 +47,9 @@ def step_info(
     info = info_of(space, x, episode)
     info["reward_terms"] = {name: float(value) for name, value in terms_of(reward).items()}
     if over:
-        assert episode.witness is not None
+        assert episode.statistics is not None
         info["measure"] = float(episode.f)
-        info["crash"] = crash = describe(episode.witness.crash)
+        info["crash"] = crash = describe(episode.statistics.crash)
         info["collision_type"] = None if crash is None else crash["kind"]
         if crash is not None and vehicle:
             order = order_of(vehicle, episode.state.x.shape[1])

@@ -16,9 +16,9 @@ from rare_envs.egos.policy import as_driver
 from rare_envs.envs.batch_rows import merged, put, rows_of
 from rare_envs.envs.parallel import chosen_agents, chosen_rewards
 from rare_envs.make import set_up
-from rare_envs.multi_agent.episode import Crowd, gather
+from rare_envs.multi_agent.episode import MultiAgentEpisode, start
 from rare_envs.multi_agent.rewards import Reward, total_of
-from rare_envs.multi_agent.step import carry_out
+from rare_envs.multi_agent.step import step_agents
 from rare_envs.sensors.kinds import each
 from rare_envs.simulation.observation import observe
 from rare_envs.simulation.world import space_of_observations
@@ -80,7 +80,7 @@ class AgentsVectorEnv(VectorEnv[NDArray[np.float32], Array, Array]):
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._tick = np.zeros(self.scenarios, dtype=np.int64)
         self._x = np.full((self.scenarios, self.space.dim), np.nan)
-        self._crowd: Crowd | None = None
+        self._episode: MultiAgentEpisode | None = None
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
@@ -98,8 +98,8 @@ class AgentsVectorEnv(VectorEnv[NDArray[np.float32], Array, Array]):
         self._x = self.space.scenario_x(options, self.scenarios, self.np_random)
         self._tick[:] = 0
         with torch.inference_mode():
-            self._crowd = gather(self.world, torch.from_numpy(self._x).float())
-            return self._observe(self._crowd), {}
+            self._episode = start(self.world, torch.from_numpy(self._x).float())
+            return self._observe(self._episode), {}
 
     def step(self, actions: Array) -> tuple[NDArray[np.float32], NDArray[np.float64], Array, Array, dict[str, Any]]:
         """Carry out one decision of each agent and replace the scenarios that ended.
@@ -107,18 +107,18 @@ class AgentsVectorEnv(VectorEnv[NDArray[np.float32], Array, Array]):
         Raises:
             ValueError: If the actions have the wrong shape or are NaN.
         """
-        if self._crowd is None:
+        if self._episode is None:
             raise RuntimeError("Expected reset() before step().")
         with torch.inference_mode():
             chosen, commanded = self._read(torch.as_tensor(np.asarray(actions)))
-            crowd, earned, memory = carry_out(
-                self.world, self._crowd, chosen, commanded, self._rewards, self._driver, None
+            episode, earned, memory = step_agents(
+                self.world, self._episode, chosen, commanded, self._rewards, self._driver, None
             )
             _refuse_memory(memory)
-            observation = self._observe(crowd)
+            observation = self._observe(episode)
             reward = self._by_row([total_of(earned[vehicle]) for vehicle in self._vehicles]).double().numpy()
         self._tick += self.world.stride
-        collided, ego = crowd.collided, crowd.views[0].collided
+        collided, ego = episode.collided, episode.views[0].collided
         own = self._by_row([collided[:, vehicle] for vehicle in self._vehicles]).numpy()
         crash = ego.numpy() | own.reshape(self.scenarios, -1).any(axis=1)
         done = crash | (self._tick >= self.world.ticks)
@@ -130,13 +130,13 @@ class AgentsVectorEnv(VectorEnv[NDArray[np.float32], Array, Array]):
             final: dict[str, Any] = {}
             put(final, "collision", own, done_rows)
             put(final, "ego_collision", ego_rows, done_rows)
-            measures = self._by_row([crowd.views[vehicle].f for vehicle in self._vehicles])
+            measures = self._by_row([episode.views[vehicle].f for vehicle in self._vehicles])
             put(final, "measure", measures.double().numpy(), done_rows)
             infos["final_info"], infos["_final_info"] = final, done_rows.copy()
-            crowd = self._replaced(crowd, np.flatnonzero(done))
+            episode = self._replaced(episode, np.flatnonzero(done))
             with torch.inference_mode():
-                observation = self._observe(crowd)
-        self._crowd = crowd
+                observation = self._observe(episode)
+        self._episode = episode
         return observation, reward, terminated, done_rows & ~terminated, infos
 
     def _read(self, actions: Tensor) -> tuple[Tensor, Tensor]:
@@ -154,16 +154,16 @@ class AgentsVectorEnv(VectorEnv[NDArray[np.float32], Array, Array]):
         """Values of the agents, (B, ...) each, as (B A, ...)."""
         return torch.stack(columns, dim=1).flatten(0, 1)
 
-    def _observe(self, crowd: Crowd) -> Any:
-        views = [observe(crowd.views[vehicle], self.world.observation) for vehicle in self._vehicles]
+    def _observe(self, episode: MultiAgentEpisode) -> Any:
+        views = [observe(episode.views[vehicle], self.world.observation) for vehicle in self._vehicles]
         return each(lambda *parts: self._by_row(list(parts)).numpy(), *views)
 
-    def _replaced(self, crowd: Crowd, rows: NDArray[np.intp]) -> Crowd:
+    def _replaced(self, episode: MultiAgentEpisode, rows: NDArray[np.intp]) -> MultiAgentEpisode:
         x = self.space.scenario_x(None, len(rows), self.np_random)
         self._x[rows], self._tick[rows] = x, 0
         with torch.inference_mode():
-            fresh = gather(self.world, torch.from_numpy(x).float())
-            return merged(crowd, torch.from_numpy(rows), fresh)
+            fresh = start(self.world, torch.from_numpy(x).float())
+            return merged(episode, torch.from_numpy(rows), fresh)
 
 
 def _refuse_memory(memory: Any) -> None:

@@ -18,9 +18,9 @@ from rare_envs.egos.policy import as_driver
 from rare_envs.envs.info import Info, info_of, step_info
 from rare_envs.envs.rendering import Renderer
 from rare_envs.make import set_up
-from rare_envs.multi_agent.episode import Crowd, gather
+from rare_envs.multi_agent.episode import MultiAgentEpisode, start
 from rare_envs.multi_agent.rewards import Reward, own_reward, total_of
-from rare_envs.multi_agent.step import carry_out
+from rare_envs.multi_agent.step import step_agents
 from rare_envs.plugins import did_you_mean
 from rare_envs.scenarios.base import Scenario
 from rare_envs.sensors.kinds import each
@@ -90,7 +90,7 @@ class DrivingParallelEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  #
         self._np_random: np.random.Generator | None = None
         self._renderer: Renderer | None = None
         self._x = np.full(self.space.dim, np.nan)
-        self._crowd: Crowd | None = None
+        self._episode: MultiAgentEpisode | None = None
         self._memory: Any = None
         self._tick = 0
 
@@ -124,9 +124,9 @@ class DrivingParallelEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  #
         self._x = self.space.scenario_x(options, 1, self._np_random)[0]
         self._tick, self._memory, self.agents = 0, None, list(self.possible_agents)
         with torch.inference_mode():
-            self._crowd = gather(self.world, torch.from_numpy(self._x[None]).float())
-            observations = {agent: self._observe(self._crowd, agent) for agent in self.agents}
-        infos = {agent: info_of(self.space, self._x, self._view(self._crowd, agent)) for agent in self.agents}
+            self._episode = start(self.world, torch.from_numpy(self._x[None]).float())
+            observations = {agent: self._observe(self._episode, agent) for agent in self.agents}
+        infos = {agent: info_of(self.space, self._x, self._view(self._episode, agent)) for agent in self.agents}
         self._show()
         return observations, infos
 
@@ -146,7 +146,7 @@ class DrivingParallelEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  #
             ValueError: If an agent does not exist or has left, or an action has the wrong shape or is NaN.
             RuntimeError: If all agents have left, or there was no `reset`.
         """
-        if self._crowd is None or not self.agents:
+        if self._episode is None or not self.agents:
             raise RuntimeError("Expected reset() before step(): no agent is there.")
         if not isinstance(actions, Mapping):
             raise ValueError(f"Expected actions as a mapping of agents to actions, got {type(actions).__name__}.")
@@ -156,10 +156,10 @@ class DrivingParallelEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  #
         with torch.inference_mode():
             chosen, commanded = self._read(given)
             rewards_of = {self._vehicles[agent]: self.rewards[agent] for agent in self.agents}
-            after, earned, self._memory = carry_out(
-                self.world, self._crowd, chosen, commanded, rewards_of, self._driver, self._memory
+            after, earned, self._memory = step_agents(
+                self.world, self._episode, chosen, commanded, rewards_of, self._driver, self._memory
             )
-            self._crowd = after
+            self._episode = after
             self._tick += self.world.stride
             terms = {agent: earned[self._vehicles[agent]] for agent in self.agents}
             rewards = {agent: float(total_of(reward)) for agent, reward in terms.items()}
@@ -193,19 +193,19 @@ class DrivingParallelEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  #
         if agent in self.agents:
             return
         if agent in self.possible_agents:
-            assert self._crowd is not None
+            assert self._episode is not None
             raise ValueError(
                 f"Expected actions of {', '.join(self.agents)} only: {agent!r} has left, because its vehicle collided."
             )
         hint = did_you_mean(str(agent), self.possible_agents)
         raise ValueError(f"There is no agent {agent!r}{hint}; the agents are {', '.join(self.possible_agents)}.")
 
-    def _view(self, crowd: Crowd, agent: str) -> Any:
-        return crowd.views[self._vehicles[agent]]
+    def _view(self, episode: MultiAgentEpisode, agent: str) -> Any:
+        return episode.views[self._vehicles[agent]]
 
-    def _observe(self, crowd: Crowd, agent: str) -> Observation:
+    def _observe(self, episode: MultiAgentEpisode, agent: str) -> Observation:
         observation: Observation = each(
-            lambda part: part[0].numpy(), observe(self._view(crowd, agent), self.world.observation)
+            lambda part: part[0].numpy(), observe(self._view(episode, agent), self.world.observation)
         )
         return observation
 
@@ -215,15 +215,15 @@ class DrivingParallelEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  #
 
     def render(self) -> NDArray[np.uint8] | None:
         """Draw the road with HighwayEnv's graphics: an (H, W, 3) image for "rgb_array", a window for "human"."""
-        if self.render_mode is None or self._crowd is None:
+        if self.render_mode is None or self._episode is None:
             gym.logger.warn("Nothing to render: pass render_mode='rgb_array' or 'human' and reset first.")
             return None
         if self._renderer is None:
             window = self.render_mode == "human"
             self._renderer = Renderer(self.world, window, self.metadata["render_fps"])
-        crashed = (self._crowd.collided | self._crowd.wrecked)[0].nonzero().flatten().tolist()
+        crashed = (self._episode.collided | self._episode.disabled)[0].nonzero().flatten().tolist()
         image = self._renderer.draw(
-            self._crowd.traffic,
+            self._episode.traffic,
             self._tick * self.world.dt,
             agents=[self._vehicles[agent] for agent in self.possible_agents],
             crashed=crashed,
@@ -232,9 +232,9 @@ class DrivingParallelEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  #
 
     def state(self) -> NDArray[np.float32]:
         """The whole traffic, for a central critic: x, y [m], heading [rad] and speed [m/s] of each, shape (N, 4)."""
-        if self._crowd is None:
+        if self._episode is None:
             raise RuntimeError("Expected reset() before state().")
-        traffic = torch.stack(self._crowd.traffic.state[:4], dim=-1)[0]
+        traffic = torch.stack(self._episode.traffic.state[:4], dim=-1)[0]
         whole: NDArray[np.float32] = traffic.float().numpy()
         return whole
 
@@ -273,11 +273,11 @@ def chosen_rewards(agents: Sequence[str], rewards: Mapping[str, Reward] | None) 
     """
     rewards = {} if rewards is None else rewards
     if not isinstance(rewards, Mapping):
-        raise ValueError(f"Expected rewards as a mapping of agents to functions of a Tick, got {rewards!r}.")
+        raise ValueError(f"Expected rewards as a mapping of agents to functions of a Transition, got {rewards!r}.")
     for agent, reward in rewards.items():
         if agent not in agents:
             hint = did_you_mean(str(agent), agents)
             raise ValueError(f"Reward for {agent!r}{hint}, but the agents are {', '.join(agents)}.")
         if not callable(reward):
-            raise ValueError(f"Expected the reward of {agent!r} as a function of a Tick, got {reward!r}.")
+            raise ValueError(f"Expected the reward of {agent!r} as a function of a Transition, got {reward!r}.")
     return {agent: rewards.get(agent, own_reward) for agent in agents}

@@ -142,7 +142,7 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         return with_rows(observation, rows, seen)
 
     def _info(self, episode: Episode, mask: NDArray[np.bool_]) -> Info:
-        assert episode.witness is not None
+        assert episode.statistics is not None
         collided = episode.collided.numpy()
         infos: Info = {}
         scenario: Info = {}
@@ -150,14 +150,14 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
             put(scenario, name, column, mask)
         put(infos, "scenario", scenario, mask)
         put(infos, "x", self._x.copy(), mask)
-        put(infos, "min_ttc", np.where(collided, 0.0, episode.witness.least_ttc.double().numpy()), mask)
+        put(infos, "min_ttc", np.where(collided, 0.0, episode.statistics.least_ttc.double().numpy()), mask)
         put(infos, "collision", collided.copy(), mask)
         return infos
 
     def _final_info(self, episode: Episode, terms: RewardTerms, done: NDArray[np.bool_]) -> Info:
         infos = self._info(episode, done)
-        assert episode.witness is not None
-        crash = episode.witness.crash
+        assert episode.statistics is not None
+        crash = episode.statistics.crash
         crashed = done & (crash.kind != NONE).numpy()
         kinds = np.array(KINDS, dtype=object)[crash.kind.numpy()]
         kinds[~crashed] = None

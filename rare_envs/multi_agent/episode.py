@@ -11,7 +11,7 @@ from rare_envs.simulation.world import World
 from rare_envs.traffic.overlap import overlaps
 
 
-class Crowd(NamedTuple):
+class MultiAgentEpisode(NamedTuple):
     """B episodes of N vehicles at one moment."""
 
     traffic: Episode
@@ -19,7 +19,7 @@ class Crowd(NamedTuple):
     views: tuple[Episode, ...]
     """The episodes as each vehicle lives them, itself in the ego's place with a lead, a measure and collisions of its
     own; after its collision they stay as they were then."""
-    wrecked: Tensor
+    disabled: Tensor
     """Whose agent has crashed, or who was hit by one that did, boolean, shape (B, N). A wreck obeys nobody: it rolls
     out as HighwayEnv's crashed vehicles do."""
 
@@ -29,19 +29,23 @@ class Crowd(NamedTuple):
         return torch.stack([view.collided for view in self.views], dim=1)
 
 
-def gather(world: World, x: Tensor) -> Crowd:
+def start(world: World, x: Tensor) -> MultiAgentEpisode:
     """Begin B episodes; x as in `World.start`."""
     own = world.start(x)
     nobody = torch.zeros_like(own.state.x, dtype=torch.bool)
-    own = own._replace(strayed=nobody)
+    own = own._replace(overridden=nobody)
     others = (
-        world.first(own.state.seen_by(j), _seen_by(own.perception, j), sight=own.sight and own.sight._replace(viewer=j))
+        world.first(
+            own.state.seen_by(j),
+            _seen_by(own.perception, j),
+            camera_context=own.camera_context and own.camera_context._replace(viewer=j),
+        )
         for j in range(1, world.scenario.vehicles)
     )
-    return Crowd(own, (own, *others), nobody)
+    return MultiAgentEpisode(own, (own, *others), nobody)
 
 
-def move(world: World, crowd: Crowd, action: Tensor, commanded: Tensor) -> Crowd:
+def step_traffic(world: World, episode: MultiAgentEpisode, action: Tensor, commanded: Tensor) -> MultiAgentEpisode:
     """Move every vehicle by one tick.
 
     Contacts between vehicles that keep to script or drivers are noted, and do not change their motion, as in an
@@ -50,18 +54,18 @@ def move(world: World, crowd: Crowd, action: Tensor, commanded: Tensor) -> Crowd
 
     Args:
         world: The world.
-        crowd: B episodes.
+        episode: B episodes.
         action: Acceleration [m/s^2] and steering angle [rad] of the vehicles, shape (B, N, 2); the ego's always counts.
         commanded: Which of them obey it, boolean, shape (B, N).
 
     Returns:
         The episodes one tick later.
     """
-    traffic, wrecked, road = crowd.traffic, crowd.wrecked, world.scenario.road
-    active = commanded | wrecked
+    traffic, disabled, road = episode.traffic, episode.disabled, world.scenario.road
+    active = commanded | disabled
     speed = traffic.state.speed
     rolling_out = torch.stack((-speed, torch.zeros_like(speed)), dim=-1)
-    traffic = world.step(traffic, torch.where(wrecked[..., None], rolling_out, action), active)
+    traffic = world.step(traffic, torch.where(disabled[..., None], rolling_out, action), active)
     state = traffic.state
     touching, off = overlaps(state, road), road.off_road(state.y)
     hit = touching.any(dim=2)
@@ -69,15 +73,15 @@ def move(world: World, crowd: Crowd, action: Tensor, commanded: Tensor) -> Crowd
         hit = hit.any(dim=1, keepdim=True)
     hit = hit | off
     views = [traffic]
-    for j, view in enumerate(crowd.views[1:], start=1):
+    for j, view in enumerate(episode.views[1:], start=1):
         views.append(world.next(view, state.seen_by(j), _seen_by(traffic.perception, j), hit[:, j]))
     lived = tuple(
         held(old.collided, old, new) if bool(old.collided.any()) else new
-        for old, new in zip(crowd.views, views, strict=True)
+        for old, new in zip(episode.views, views, strict=True)
     )
     active = active | (torch.arange(active.shape[1], device=active.device) == 0)
     struck = (touching & (active[:, :, None] | active[:, None, :])).any(dim=2) | (off & active)
-    return Crowd(traffic, lived, wrecked | struck)
+    return MultiAgentEpisode(traffic, lived, disabled | struck)
 
 
 def order_of(vehicle: int, vehicles: int) -> list[int]:

@@ -6,28 +6,28 @@ from typing import Any, NamedTuple, TypeAlias
 import torch
 from torch import Tensor
 
-from rare_envs.multi_agent.episode import Crowd
+from rare_envs.multi_agent.episode import MultiAgentEpisode
 from rare_envs.simulation.reward import RewardTerms, reward_terms
 
 
-class Tick(NamedTuple):
+class Transition(NamedTuple):
     """What one agent did in a tick, and what came of it: all that a reward may look at."""
 
-    before: Crowd
-    after: Crowd
+    before: MultiAgentEpisode
+    after: MultiAgentEpisode
     vehicle: int
     """Index of the agent's vehicle."""
     action: Tensor
     """Acceleration [m/s^2] and steering angle [rad] of its vehicle, shape (B, 2); 0 where its driver decided."""
 
 
-Reward: TypeAlias = Callable[[Tick], Any]
-"""A tick to a reward of shape (B,): a tensor, or a named tuple of terms with their sum as `total`."""
+Reward: TypeAlias = Callable[[Transition], Any]
+"""A function of a transition that returns a reward of shape (B,): a tensor, or a named tuple of terms with their sum as `total`."""
 
 
-def own_reward(tick: Tick) -> RewardTerms:
+def own_reward(transition: Transition) -> RewardTerms:
     """The reward that egos are trained on, for any vehicle: in its own view."""
-    return reward_terms(tick.after.views[tick.vehicle], tick.action)
+    return reward_terms(transition.after.views[transition.vehicle], transition.action)
 
 
 class AdversaryTerms(NamedTuple):
@@ -50,17 +50,17 @@ class AdversaryTerms(NamedTuple):
         return self.danger + self.collision + self.comfort + self.lane + self.fault
 
 
-def adversary_reward(tick: Tick) -> AdversaryTerms:
+def adversary_reward(transition: Transition) -> AdversaryTerms:
     """Reward of a vehicle that brings the ego into danger, and stays a road user while it does.
 
     Args:
-        tick: Of B episodes.
+        transition: Of B episodes.
     """
-    ego, view = tick.after.views[0], tick.after.views[tick.vehicle]
-    own = reward_terms(view, tick.action)
-    danger = -reward_terms(ego, torch.zeros_like(tick.action)).risk
-    crash = ego.collided & ~tick.before.views[0].collided
-    alone = view.collided & ~tick.before.views[tick.vehicle].collided & ~crash
+    ego, view = transition.after.views[0], transition.after.views[transition.vehicle]
+    own = reward_terms(view, transition.action)
+    danger = -reward_terms(ego, torch.zeros_like(transition.action)).risk
+    crash = ego.collided & ~transition.before.views[0].collided
+    alone = view.collided & ~transition.before.views[transition.vehicle].collided & ~crash
     return AdversaryTerms(
         danger=torch.where(ego.collided, torch.zeros_like(danger), danger),
         collision=30.0 * crash.to(danger.dtype),

@@ -9,17 +9,17 @@ from torch import Tensor
 from rare_envs.control.actions import IDLE
 from rare_envs.control.meta_actions import aim_of
 from rare_envs.egos.policy import PolicyDriver
-from rare_envs.multi_agent.episode import Crowd, gather, move
-from rare_envs.multi_agent.rewards import Reward, Tick
+from rare_envs.multi_agent.episode import MultiAgentEpisode, start, step_traffic
+from rare_envs.multi_agent.rewards import Reward, Transition
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.rollout import Driver
 from rare_envs.simulation.world import World
 
 
-class Outcome(NamedTuple):
+class JointStepResult(NamedTuple):
     """What came of the agents' decisions."""
 
-    crowd: Crowd
+    episode: MultiAgentEpisode
     rewards: dict[int, Any]
     """By vehicle, as its reward function gives them: their mean over the ticks, where ticks after its collision count
     as 0."""
@@ -27,20 +27,20 @@ class Outcome(NamedTuple):
     """Of the ego's driver."""
 
 
-def carry_out(
+def step_agents(
     world: World,
-    crowd: Crowd,
+    episode: MultiAgentEpisode,
     action: Tensor,
     commanded: Tensor,
     rewards: Mapping[int, Reward],
     ego: Driver,
     memory: Any = None,
-) -> Outcome:
+) -> JointStepResult:
     """Carry out decisions, as `rare_envs.simulation.decision.advance` does for one agent.
 
     Args:
         world: The world.
-        crowd: B episodes.
+        episode: B episodes.
         action: Of all vehicles: physical, shape (B, N, 2), or meta-actions, shape (B, N).
         commanded: Which of them obey it, boolean, shape (B, N).
         rewards: Reward functions by vehicle.
@@ -54,34 +54,34 @@ def carry_out(
     meta = not action.is_floating_point()
     for tick in range(world.stride):
         chosen = torch.full_like(action, IDLE) if meta and tick else action
-        traffic, physical, memory = _decided(world, crowd, chosen, commanded, ego, memory)
-        before = crowd
-        crowd = move(world, crowd._replace(traffic=traffic), physical, commanded)
+        traffic, physical, memory = _combine_actions(world, episode, chosen, commanded, ego, memory)
+        before = episode
+        episode = step_traffic(world, episode._replace(traffic=traffic), physical, commanded)
         for vehicle, reward in rewards.items():
-            terms = reward(Tick(before, crowd, vehicle, physical[:, vehicle]))
+            terms = reward(Transition(before, episode, vehicle, physical[:, vehicle]))
             if tick:
                 over = before.views[vehicle].collided
                 terms = _each(lambda term, over=over: term.masked_fill(over, 0.0), terms)
             sums[vehicle] = terms if tick == 0 else _each(torch.add, sums[vehicle], terms)
-        if world.stride > 1 and bool(crowd.collided.all()):
+        if world.stride > 1 and bool(episode.collided.all()):
             break
     if world.stride > 1:
         sums = {vehicle: _each(lambda term: term / world.stride, terms) for vehicle, terms in sums.items()}
-    return Outcome(crowd, sums, memory)
+    return JointStepResult(episode, sums, memory)
 
 
-def _decided(
-    world: World, crowd: Crowd, action: Tensor, commanded: Tensor, ego: Driver, memory: Any
+def _combine_actions(
+    world: World, episode: MultiAgentEpisode, action: Tensor, commanded: Tensor, ego: Driver, memory: Any
 ) -> tuple[Episode, Tensor, Any]:
     """The traffic with its new aims, accelerations and steering angles (B, N, 2), and the ego's driver's memory."""
     by_driver = ~commanded[:, 0]
     driven: Tensor | None = None
     if bool(by_driver.any()):
-        driven, memory = ego.act(crowd.views[0], memory)
+        driven, memory = ego.act(episode.views[0], memory)
         if not driven.is_floating_point():  # a policy with meta-actions in such a world
             mixed = torch.where(by_driver, driven, action[:, 0])
             action, driven = torch.cat((mixed[:, None], action[:, 1:]), dim=1), None
-    traffic, physical = world.obey(crowd.traffic, action, commanded)
+    traffic, physical = world.decode_meta_actions(episode.traffic, action, commanded)
     first = torch.arange(physical.shape[1], device=physical.device) == 0
     physical = torch.where((commanded | first)[..., None], physical, torch.zeros_like(physical))
     if driven is None:
@@ -101,7 +101,7 @@ def _each(function: Any, *terms: Any) -> Any:
     return type(terms[0])(*(function(*each) for each in zip(*terms, strict=True)))
 
 
-def play(world: World, x: Tensor, policies: Mapping[int, Any], ego: Driver) -> Crowd:
+def play(world: World, x: Tensor, policies: Mapping[int, Any], ego: Driver) -> MultiAgentEpisode:
     """Drive B scenarios from start to horizon with policies in some of the vehicles.
 
     Args:
@@ -114,16 +114,16 @@ def play(world: World, x: Tensor, policies: Mapping[int, Any], ego: Driver) -> C
         The episodes at the horizon.
     """
     drivers = {vehicle: PolicyDriver(policy, world.observation, world.action) for vehicle, policy in policies.items()}
-    crowd, memory = gather(world, x), None
+    episode, memory = start(world, x), None
     memories: dict[int, Any] = dict.fromkeys(drivers)
-    batch, n = crowd.wrecked.shape
+    batch, n = episode.disabled.shape
     commanded = torch.zeros(batch, n, dtype=torch.bool, device=x.device)
     commanded[:, list(drivers)] = True
     shape = (batch, n) if world.action == "meta" else (batch, n, 2)
     for _ in range(world.ticks // world.stride):
         action = torch.full(shape, IDLE) if world.action == "meta" else torch.zeros(shape)
         for vehicle, driver in drivers.items():
-            chosen, memories[vehicle] = driver.act(crowd.views[vehicle], memories[vehicle])
+            chosen, memories[vehicle] = driver.act(episode.views[vehicle], memories[vehicle])
             action[:, vehicle] = chosen
-        crowd, _, memory = carry_out(world, crowd, action, commanded, {}, ego, memory)
-    return crowd
+        episode, _, memory = step_agents(world, episode, action, commanded, {}, ego, memory)
+    return episode

@@ -1,4 +1,6 @@
-"""Drivers of the vehicles around the ego: what they are, how they are found by name, and what is random in them."""
+"""Background traffic: the drivers of the vehicles around the ego, their state and their noise."""
+
+from __future__ import annotations
 
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -10,14 +12,16 @@ from torch import Tensor
 from rare_envs.distributions.space import Distribution
 from rare_envs.plugins import did_you_mean
 
-GROUP = "rare_envs.drivers"
+DRIVERS_GROUP = "rare_envs.drivers"
 """Entry points by which packages offer drivers: name to a function that takes the name and returns a `Background`."""
 FIRST_DRAWS = 2
 """Draws of each action with which a coloured noise begins, before those of the ticks."""
+FIXED_SEED = 12345
+"""Seed of the one sequence of `noise="fixed"`; arbitrary, but results depend on it."""
 
 
-class Law(Distribution, Protocol):
-    """The law of a driver's weights."""
+class WeightDistribution(Distribution, Protocol):
+    """Distribution of the weights that tell one driver from another."""
 
     @property
     def dim(self) -> int:
@@ -29,15 +33,15 @@ class Background(Protocol):
     """Drives M vehicles in B scenarios by what each of them sees. Nothing in it is random."""
 
     @property
-    def weights(self) -> Law | None:
-        """Law of the weights that tell one driver from another; None if all are alike."""
+    def weights(self) -> WeightDistribution | None:
+        """Distribution of the weights that tell one driver from another; None if all are alike."""
 
     @property
     def noisy(self) -> bool:
         """Whether they act with noise if they are given draws."""
 
     def begin(self, draws: Tensor) -> Tensor:
-        """The memory at the start, (B, M, ...), from standard normal draws of shape (B, M, 2, 2)."""
+        """Return the memory at the start, (B, M, ...), from standard normal draws of shape (B, M, 2, 2)."""
 
     def act(
         self, features: Tensor, weights: Tensor | None, innovations: Tensor | None, memory: Tensor | None
@@ -55,8 +59,8 @@ class Background(Protocol):
         """
 
 
-class Minds(NamedTuple):
-    """What is going on in the drivers of M vehicles in B scenarios."""
+class BackgroundState(NamedTuple):
+    """State of the drivers of M vehicles in B scenarios."""
 
     weights: Tensor
     """Shape (B, W); W = 0 where all drivers are alike."""
@@ -67,53 +71,54 @@ class Minds(NamedTuple):
     tick: Tensor
     """Ticks driven so far, shape (B,)."""
 
+    @classmethod
+    def start(cls, drivers: Background, weights: Tensor, draws: Tensor) -> BackgroundState:
+        """Return the state at the start of an episode; shapes as of the fields."""
+        batch, ticks, vehicles, _ = draws.shape
+        first = draws[:, :FIRST_DRAWS] if ticks else draws.new_zeros(batch, FIRST_DRAWS, vehicles, 2)
+        memory = drivers.begin(first.movedim(1, -1))
+        return cls(weights, draws, memory, torch.zeros(batch, dtype=torch.int64, device=draws.device))
+
+
+def step_background(drivers: Background, state: BackgroundState, features: Tensor) -> tuple[Tensor, BackgroundState]:
+    """Query the drivers for one tick.
+
+    Args:
+        drivers: Of the M vehicles.
+        state: Theirs.
+        features: `rare_envs.sensors.perception.FEATURES` of each vehicle, shape (B, M, 51).
+
+    Returns:
+        Accelerations [m/s^2] and yaw rates [rad/s], shape (B, M, 2), and the state one tick later. Beyond the last
+        draw, where no episode goes, draws are repeated.
+    """
+    innovations = None
+    if state.draws.shape[1]:
+        row = torch.arange(len(state.tick), device=state.tick.device)
+        at = (state.tick + FIRST_DRAWS).clamp(max=state.draws.shape[1] - 1)
+        innovations = state.draws[row, at]
+    weights = state.weights if state.weights.shape[1] else None
+    action, memory = drivers.act(features, weights, innovations, state.memory)
+    memory = state.memory if memory is None else memory
+    return action, state._replace(memory=memory, tick=state.tick + 1)
+
 
 def noise_size(ticks: int, vehicles: int) -> int:
-    """Number of standard normal draws of an episode."""
+    """Return the number of standard normal draws of an episode."""
     return (FIRST_DRAWS + ticks) * vehicles * 2
 
 
 def fixed_draws(ticks: int, vehicles: int) -> Tensor:
-    """The one sequence of draws of `noise="fixed"`, shape (1, 2 + T, M, 2)."""
-    generator = torch.Generator().manual_seed(12345)
+    """Return the one sequence of draws of `noise="fixed"`, shape (1, 2 + T, M, 2)."""
+    generator = torch.Generator().manual_seed(FIXED_SEED)
     return torch.randn(1, FIRST_DRAWS + ticks, vehicles, 2, generator=generator, dtype=torch.float64)
 
 
-def begin(drivers: Background, weights: Tensor, draws: Tensor) -> Minds:
-    """Minds at the start of an episode; shapes as in `Minds`."""
-    batch, ticks, vehicles, _ = draws.shape
-    first = draws[:, :FIRST_DRAWS] if ticks else draws.new_zeros(batch, FIRST_DRAWS, vehicles, 2)
-    memory = drivers.begin(first.movedim(1, -1))
-    return Minds(weights, draws, memory, torch.zeros(batch, dtype=torch.int64, device=draws.device))
-
-
-def decide(drivers: Background, minds: Minds, features: Tensor) -> tuple[Tensor, Minds]:
-    """Let the drivers act on what they see.
-
-    Args:
-        drivers: Of the M vehicles.
-        minds: Theirs.
-        features: What they see, shape (B, M, 51).
-
-    Returns:
-        Accelerations and yaw rates, shape (B, M, 2), and their minds one tick later. Beyond the last draw, where no
-        episode goes, draws are repeated.
-    """
-    innovations = None
-    if minds.draws.shape[1]:
-        row = torch.arange(len(minds.tick), device=minds.tick.device)
-        at = (minds.tick + FIRST_DRAWS).clamp(max=minds.draws.shape[1] - 1)
-        innovations = minds.draws[row, at]
-    weights = minds.weights if minds.weights.shape[1] else None
-    action, memory = drivers.act(features, weights, innovations, minds.memory)
-    return action, Minds(minds.weights, minds.draws, minds.memory if memory is None else memory, minds.tick + 1)
-
-
 def find_drivers(drivers: Any) -> Background | None:
-    """The drivers that a keyword argument `drivers` stands for.
+    """Return the drivers that a keyword argument `drivers` names.
 
     Args:
-        drivers: None for those of the scenario's script, a `Background`, the name of an installed one ("mgail"), or
+        drivers: None for the scenario's script, a `Background`, the name of an installed one ("mgail"), or
             the path of a file that the package `agents` wrote.
 
     Raises:
@@ -125,7 +130,7 @@ def find_drivers(drivers: Any) -> Background | None:
         if isinstance(drivers, Background):
             return drivers
         raise ValueError(f"Expected drivers by name, or an object with weights, begin and act, got {drivers!r}.")
-    known = {entry.name: entry for entry in entry_points(group=GROUP)}
+    known = {entry.name: entry for entry in entry_points(group=DRIVERS_GROUP)}
     name = str(drivers)
     is_file = name.endswith(".safetensors")
     if name not in known and not (is_file and "file" in known):

@@ -14,7 +14,7 @@ from rare_envs.traffic.lead import Lead
 from rare_envs.traffic.state import State
 
 
-class Outcome(NamedTuple):
+class StepResult(NamedTuple):
     """What came of a decision in B episodes."""
 
     episode: Episode
@@ -29,7 +29,7 @@ def advance(
     action: Tensor,
     commanded: Tensor | None = None,
     watch: Callable[[Episode], None] | None = None,
-) -> Outcome:
+) -> StepResult:
     """Carry out a decision.
 
     A continuous action is one tick. A meta-action is a second: it is given to the controllers once, which then act at
@@ -48,7 +48,7 @@ def advance(
     sums: RewardTerms | None = None
     for tick in range(world.stride):
         chosen = action if tick == 0 else torch.full_like(action, IDLE)
-        ready, physical = world.obey(episode, chosen, commanded)
+        ready, physical = world.decode_meta_actions(episode, chosen, commanded)
         moved = world.step(ready, physical, commanded)
         terms = reward_terms(moved, physical if commanded is None else physical[:, 0])
         over = episode.collided
@@ -64,7 +64,7 @@ def advance(
     assert sums is not None
     if world.stride > 1:
         sums = RewardTerms(*(term / world.stride for term in sums))
-    return Outcome(episode, sums)
+    return StepResult(episode, sums)
 
 
 def held(over: Tensor, old: Episode, new: Episode) -> Episode:
@@ -73,12 +73,12 @@ def held(over: Tensor, old: Episode, new: Episode) -> Episode:
     def hold(before: Tensor, after: Tensor) -> Tensor:
         return torch.where(over.view(-1, *[1] * (after.ndim - 1)), before, after)
 
-    seen, sight = new.perception, new.sight
-    if sight is not None and old.sight is not None:
-        sight = sight._replace(tick=hold(old.sight.tick, sight.tick))
+    seen, camera_context = new.perception, new.camera_context
+    if camera_context is not None and old.camera_context is not None:
+        camera_context = camera_context._replace(tick=hold(old.camera_context.tick, camera_context.tick))
     return new._replace(
         state=State(*map(hold, old.state, new.state)),
         lead=Lead(*map(hold, old.lead, new.lead)),
         perception=seen if seen is None or old.perception is None else hold(old.perception, seen),
-        sight=sight,
+        camera_context=camera_context,
     )

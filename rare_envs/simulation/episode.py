@@ -9,9 +9,9 @@ from torch import Tensor
 from rare_envs.control.meta_actions import Aim
 from rare_envs.measures import EpisodeMeasure
 from rare_envs.measures.registry import MEASURES
-from rare_envs.sensors.camera import Sight
-from rare_envs.simulation.background import Minds
-from rare_envs.simulation.episode_statistics import Witness
+from rare_envs.sensors.camera import CameraContext
+from rare_envs.simulation.background import BackgroundState
+from rare_envs.simulation.episode_statistics import EpisodeStatistics
 from rare_envs.traffic.lead import Lead
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import State
@@ -23,7 +23,7 @@ class Episode(NamedTuple):
     state: State
     lead: Lead
     """The ego's lead in this state."""
-    kept: Any
+    measure_state: Any
     """What the measure keeps of the episode so far; see `f`."""
     collided: Tensor
     """Whether the ego has collided by now, boolean, shape (B,)."""
@@ -32,20 +32,20 @@ class Episode(NamedTuple):
     perception: Tensor | None = None
     """What the vehicles see in this state, `rare_envs.sensors.perception.FEATURES`, shape (B, N, 51), the ego first;
     None in a world in which nobody looks."""
-    minds: Minds | None = None
+    background_state: BackgroundState | None = None
     """What goes on in the drivers around the ego, if they are not the scenario's script."""
-    strayed: Tensor | None = None
+    overridden: Tensor | None = None
     """Which vehicles have been commanded, so that a script no longer knows them, boolean, shape (B, N); None before
     anyone but the ego has been."""
     measure: EpisodeMeasure = MEASURES["ttc"]
     aim: Aim | None = None
     """What the controllers of vehicles with meta-actions aim for, (B, N) each; None in a world without such actions."""
-    witness: Witness | None = None
-    """Least time to collision and crashes so far; None unless the world has a witness."""
-    sight: Sight | None = None
+    statistics: EpisodeStatistics | None = None
+    """Least time to collision and crashes so far; None unless the world keeps statistics."""
+    camera_context: CameraContext | None = None
     """What a camera sees beside the traffic; None in a world without a camera."""
 
     @property
     def f(self) -> Tensor:
         """The safety measure of the episode so far, shape (B,); after a collision it stays what it is."""
-        return self.measure.f(self.kept)
+        return self.measure.f(self.measure_state)

@@ -1,4 +1,6 @@
-"""What an onlooker keeps of an episode beside its measure: the least time to collision, and who crashed with whom."""
+"""Statistics of an episode beside its measure: the least time to collision, and who crashed with whom."""
+
+from __future__ import annotations
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -11,8 +13,8 @@ from rare_envs.traffic.crash import NONE, Crash, crash_of, crash_of_others, othe
 from rare_envs.traffic.state import State
 
 
-class Witness(NamedTuple):
-    """Of B episodes so far."""
+class EpisodeStatistics(NamedTuple):
+    """Statistics of B episodes up to one moment."""
 
     least_ttc: Tensor
     """Least time to collision [s], shape (B,), without meaning after a collision."""
@@ -26,36 +28,34 @@ class Witness(NamedTuple):
         """Crash of the ego; where it had none, that of others."""
         return self.own.replaced(self.own.kind == NONE, self.others)
 
+    @classmethod
+    def start(cls, moment: Moment, least_ttc: Tensor | None = None) -> EpisodeStatistics:
+        """Return the statistics at time 0; arguments as of `update`."""
+        nothing = Crash.nothing(moment.state.x[:, 0])
+        return cls(ttc(moment) if least_ttc is None else least_ttc, nothing, nothing)
 
-def begin(moment: Moment, least_ttc: Tensor | None = None) -> Witness:
-    """At time 0; arguments as of `fold`."""
-    nothing = Crash.nothing(moment.state.x[:, 0])
-    return Witness(ttc(moment) if least_ttc is None else least_ttc, nothing, nothing)
+    def update(self, moment: Moment, before: Tensor, now: Tensor, least_ttc: Tensor | None = None) -> EpisodeStatistics:
+        """Return the statistics one moment later.
 
-
-def fold(seen: Witness, moment: Moment, before: Tensor, now: Tensor, least_ttc: Tensor | None = None) -> Witness:
-    """One more moment.
-
-    Args:
-        seen: Of the moments before.
-        moment: The next.
-        before: Whether the episode had ended in a collision before this moment, boolean, shape (B,).
-        now: Whether it has by this moment, boolean, shape (B,).
-        least_ttc: The least time to collision where it is known already [s], shape (B,).
-    """
-    least = torch.minimum(seen.least_ttc, ttc(moment)) if least_ttc is None else least_ttc
-    own, others = seen.own, seen.others
-    new = now & ~before
-    if bool(new.any()):
-        own = _entered(own, new, crash_of, moment)
-    touch = others_touch(moment.state, moment.road) & (others.kind == NONE) & ~before
-    if bool(touch.any()):
-        others = _entered(others, touch, crash_of_others, moment)
-    return Witness(least, own, others)
+        Args:
+            moment: The next moment.
+            before: Whether the episode had ended in a collision before this moment, boolean, shape (B,).
+            now: Whether it has by this moment, boolean, shape (B,).
+            least_ttc: The least time to collision where it is known already [s], shape (B,).
+        """
+        least = torch.minimum(self.least_ttc, ttc(moment)) if least_ttc is None else least_ttc
+        own, others = self.own, self.others
+        new = now & ~before
+        if bool(new.any()):
+            own = _record_crashes(own, new, crash_of, moment)
+        touch = others_touch(moment.state, moment.road) & (others.kind == NONE) & ~before
+        if bool(touch.any()):
+            others = _record_crashes(others, touch, crash_of_others, moment)
+        return EpisodeStatistics(least, own, others)
 
 
-def _entered(crash: Crash, where: Tensor, find: Callable[..., Crash], moment: Moment) -> Crash:
-    """Crashes with those of the episodes `where`, boolean, shape (B,), found and put in."""
+def _record_crashes(crash: Crash, where: Tensor, find: Callable[..., Crash], moment: Moment) -> Crash:
+    """Return crashes with those found in the episodes `where`, boolean, shape (B,), put in."""
     rows = where.nonzero()[:, 0]
     state = State(*(field[rows] for field in moment.state))
     before = None if moment.before is None else State(*(field[rows] for field in moment.before))

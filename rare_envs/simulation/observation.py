@@ -89,9 +89,9 @@ def observe(episode: "Episode", observation: str, vehicle: int = 0) -> Any:
     if len(kinds) > 1:
         return {kind: observe(episode, kind, vehicle) for kind in kinds}
     if observation == "camera":
-        assert episode.sight is not None
-        sight = episode.sight if vehicle == 0 else episode.sight._replace(viewer=vehicle)
-        return take_picture(episode.state.seen_by(vehicle), episode.road, sight)
+        assert episode.camera_context is not None
+        camera_context = episode.camera_context if vehicle == 0 else episode.camera_context._replace(viewer=vehicle)
+        return take_picture(episode.state.seen_by(vehicle), episode.road, camera_context)
     if observation == "kinematics":
         return kinematics(episode.state, episode.road, vehicle)
     if observation == "lidar":

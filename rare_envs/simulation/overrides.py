@@ -1,4 +1,4 @@
-"""Vehicles around the ego that are commanded, and what drives them once nobody commands them any longer."""
+"""Overrides: vehicles around the ego that take an agent's actions, and what drives them afterwards."""
 
 from typing import TYPE_CHECKING
 
@@ -16,17 +16,22 @@ if TYPE_CHECKING:
 _RULE = IDM()
 
 
-def led(
-    episode: "Episode", action: Tensor, commanded: Tensor | None, kept: Others, decided: Tensor | None, dt: float
+def apply_overrides(
+    episode: "Episode",
+    action: Tensor,
+    commanded: Tensor | None,
+    scripted: Others,
+    driver_actions: Tensor | None,
+    dt: float,
 ) -> tuple[Others, Tensor]:
-    """The other vehicles after a tick in which some of them obey commands.
+    """Return the other vehicles after a tick in which some of them take an agent's actions.
 
     Args:
         episode: B episodes before the tick.
         action: Acceleration [m/s^2] and steering angle [rad] of all vehicles, shape (B, N, 2).
-        commanded: Which of them obey, boolean, shape (B, N); None for nobody.
-        kept: Where vehicles would be that have always kept to script or drivers.
-        decided: What the world's drivers want, accelerations and yaw rates, shape (B, N - 1, 2); None if it has none.
+        commanded: Which of them take it, boolean, shape (B, N); None for none.
+        scripted: Where the script or the drivers take vehicles that were never commanded.
+        driver_actions: Accelerations and yaw rates by the world's drivers, shape (B, N - 1, 2); None if it has none.
         dt: Tick [s].
 
     Returns:
@@ -36,22 +41,29 @@ def led(
     if commanded is None:
         commanded = torch.zeros_like(state.x, dtype=torch.bool)
         action = torch.zeros_like(state.x)[..., None].expand(-1, -1, 2)
-    strayed = commanded if episode.strayed is None else commanded | episode.strayed
-    alone = (strayed & ~commanded)[:, 1:]
-    if bool(alone.any()):
-        if decided is None:
-            action = torch.where((strayed & ~commanded)[..., None], by_rule(episode), action)
-            commanded = strayed
+    overridden = commanded if episode.overridden is None else commanded | episode.overridden
+    released = (overridden & ~commanded)[:, 1:]
+    if bool(released.any()):
+        if driver_actions is None:
+            action = torch.where((overridden & ~commanded)[..., None], rule_based_actions(episode), action)
+            commanded = overridden
         else:
-            kept = _choose(alone, roaming(state, decided, dt, road), kept)
+            scripted = _choose(released, roaming(state, driver_actions, dt, road), scripted)
     x, y, heading, speed = (field[:, 1:] for field in state[:4])
     curvature = None if road.curve is None else road.curvature(x)
     moved = Others(*bicycle(x, y, heading, speed, action[:, 1:, 0], action[:, 1:, 1], dt, curvature))
-    return _choose(commanded[:, 1:], moved, kept), strayed
+    return _choose(commanded[:, 1:], moved, scripted), overridden
 
 
-def by_rule(episode: "Episode") -> Tensor:
-    """What IDM and lane keeping would do in each vehicle's place: acceleration and steering angle, shape (B, N, 2)."""
+def rule_based_actions(episode: "Episode") -> Tensor:
+    """Return what IDM and lane keeping do in each vehicle's place.
+
+    Args:
+        episode: B episodes.
+
+    Returns:
+        Acceleration [m/s^2] and steering angle [rad], shape (B, N, 2).
+    """
     actions = []
     for vehicle in range(episode.state.x.shape[1]):
         state = episode.state.seen_by(vehicle)
@@ -61,4 +73,5 @@ def by_rule(episode: "Episode") -> Tensor:
 
 
 def _choose(which: Tensor, one: Others, other: Others) -> Others:
+    """Return one where `which` is set, boolean, shape (B, N - 1), and the other elsewhere."""
     return Others(*(torch.where(which, a, b) for a, b in zip(one, other, strict=True)))

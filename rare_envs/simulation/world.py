@@ -14,15 +14,15 @@ from rare_envs.distributions.space import Distribution, Parameter
 from rare_envs.measures import EpisodeMeasure, Moment
 from rare_envs.measures.registry import find_measure
 from rare_envs.scenarios.base import Scenario
-from rare_envs.sensors.camera import Camera, Sight, clear_day
+from rare_envs.sensors.camera import Camera, CameraContext, clear_day
 from rare_envs.sensors.camera.weather import read_weather, weather_parameters
 from rare_envs.sensors.kinds import kinds_of
 from rare_envs.sensors.perception import look
-from rare_envs.simulation import episode_statistics as witness
-from rare_envs.simulation.background import Background, Minds, begin, decide, fixed_draws, noise_size
+from rare_envs.simulation.background import Background, BackgroundState, fixed_draws, noise_size, step_background
 from rare_envs.simulation.episode import Episode
+from rare_envs.simulation.episode_statistics import EpisodeStatistics
 from rare_envs.simulation.observation import observation_space
-from rare_envs.simulation.overrides import led
+from rare_envs.simulation.overrides import apply_overrides
 from rare_envs.traffic.crash import others_touch
 from rare_envs.traffic.lead import lead_of
 from rare_envs.traffic.overlap import ego_overlaps
@@ -61,7 +61,7 @@ class World:
     collisions: str = "ego"
     """Which collisions count: those of the "ego", or "any", those between other vehicles too."""
     witnessed: bool = False
-    """Keep the least time to collision and who crashed with whom; see `Episode.witness`."""
+    """Keep the least time to collision and who crashed with whom; see `Episode.statistics`."""
     camera: Camera = Camera()  # noqa: RUF009  (frozen)
     """What takes the pictures where "camera" is observed."""
     weather: bool = False
@@ -169,37 +169,54 @@ class World:
         sizes = [self.scenario.size, self.conditions, self.weights, self.draws, self.keys]
         own, weather, weights, noise, key = torch.split(x, sizes, dim=1)
         state = self.scenario.initial(own)
-        minds = None
+        background_state = None
         if self.drivers is not None:
-            minds = begin(self.drivers, weights.contiguous(), self._draws(noise))
-        sight = None
+            background_state = BackgroundState.start(self.drivers, weights.contiguous(), self._draws(noise))
+        camera_context = None
         if "camera" in kinds_of(self.observation):
-            sight = Sight.at_start(self.camera, read_weather(weather, key) if self.weather else clear_day(x))
-        return self.first(state, self._look(state, self._placed(state)), minds, sight)
+            camera_context = CameraContext.at_start(
+                self.camera, read_weather(weather, key) if self.weather else clear_day(x)
+            )
+        return self.first(state, self._look(state, self._placed(state)), background_state, camera_context)
 
     def first(
-        self, state: State, perception: Tensor | None, minds: Minds | None = None, sight: Sight | None = None
+        self,
+        state: State,
+        perception: Tensor | None,
+        background_state: BackgroundState | None = None,
+        camera_context: CameraContext | None = None,
     ) -> Episode:
         """Episodes at time 0.
 
         Args:
             state: Of B scenarios; the vehicle in the ego's place is the one whose episodes these are.
             perception: What the vehicles see, in the same order.
-            minds: Of the drivers around the ego.
-            sight: Of a camera on the vehicle in the ego's place.
+            background_state: Of the drivers around the ego.
+            camera_context: Of a camera on the vehicle in the ego's place.
         """
         road = self.scenario.road
         collided = torch.zeros_like(state.x[:, 0], dtype=torch.bool)
         moment = Moment(state, lead_of(state, road), road, perception, None, self.dt)
-        kept = self._measure.begin(moment, self.ticks)
+        measure_state = self._measure.begin(moment, self.ticks)
         aim = aim_of(state, road) if self.action == "meta" else None
-        seen = witness.begin(moment, self._least_ttc(kept)) if self.witnessed else None
+        seen = EpisodeStatistics.start(moment, self._least_ttc(measure_state)) if self.witnessed else None
         return Episode(
-            state, moment.lead, kept, collided, road, perception, minds, None, self._measure, aim, seen, sight
+            state,
+            moment.lead,
+            measure_state,
+            collided,
+            road,
+            perception,
+            background_state,
+            None,
+            self._measure,
+            aim,
+            seen,
+            camera_context,
         )
 
     def next(self, episode: Episode, state: State, perception: Tensor | None, hit: Tensor) -> Episode:
-        """Episodes one tick later; minds and who has strayed stay as they were.
+        """Episodes one tick later; background_state and who has overridden stay as they were.
 
         Args:
             episode: Before the tick.
@@ -209,19 +226,24 @@ class World:
         """
         moment = Moment(state, lead_of(state, episode.road), episode.road, perception, episode.state, self.dt)
         collided = episode.collided | hit
-        kept = self._measure.fold(episode.kept, moment, episode.collided, collided)
-        seen = episode.witness
+        measure_state = self._measure.fold(episode.measure_state, moment, episode.collided, collided)
+        seen = episode.statistics
         if seen is not None:
-            seen = witness.fold(seen, moment, episode.collided, collided, self._least_ttc(kept))
-            episode = episode._replace(witness=seen)
-        sight = None if episode.sight is None else episode.sight.later()
+            seen = seen.update(moment, episode.collided, collided, self._least_ttc(measure_state))
+            episode = episode._replace(statistics=seen)
+        camera_context = None if episode.camera_context is None else episode.camera_context.later()
         return episode._replace(
-            state=state, lead=moment.lead, kept=kept, collided=collided, perception=perception, sight=sight
+            state=state,
+            lead=moment.lead,
+            measure_state=measure_state,
+            collided=collided,
+            perception=perception,
+            camera_context=camera_context,
         )
 
-    def _least_ttc(self, kept: Any) -> Tensor | None:
+    def _least_ttc(self, measure_state: Any) -> Tensor | None:
         """The least time to collision, where that is the measure."""
-        return kept if self.measure == "ttc" else None
+        return measure_state if self.measure == "ttc" else None
 
     def _draws(self, noise: Tensor) -> Tensor:
         """Draws of the drivers' noise as tensors, shape (B, 2 + T, M, 2), or (B, 0, M, 2)."""
@@ -238,7 +260,9 @@ class World:
         """Where the vehicles are in the flat world, if they look."""
         return self.scenario.road.place(state.x, state.y, state.heading) if self.sees else None
 
-    def obey(self, episode: Episode, action: Tensor, commanded: Tensor | None = None) -> tuple[Episode, Tensor]:
+    def decode_meta_actions(
+        self, episode: Episode, action: Tensor, commanded: Tensor | None = None
+    ) -> tuple[Episode, Tensor]:
         """Turn meta-actions, if such they are, into what the vehicles' controllers do in this tick.
 
         Args:
@@ -275,28 +299,28 @@ class World:
         Returns:
             The episodes one tick later.
         """
-        episode, action = self.obey(episode, action, commanded)
-        old, dt, road, minds = episode.state, self.dt, episode.road, episode.minds
+        episode, action = self.decode_meta_actions(episode, action, commanded)
+        old, dt, road, background_state = episode.state, self.dt, episode.road, episode.background_state
         steered = action if commanded is None else action[:, 0]
         ego = (old.x[:, 0], old.y[:, 0], old.heading[:, 0], old.speed[:, 0])
         curvature = None if road.curve is None else road.curvature(old.x[:, 0])
         moved = bicycle(*ego, steered[:, 0], steered[:, 1], dt, curvature)
         decided = None
-        if self.drivers is None or minds is None or episode.perception is None:
+        if self.drivers is None or background_state is None or episode.perception is None:
             others = self.scenario.others(old, dt)
         else:
-            decided, minds = decide(self.drivers, minds, episode.perception[:, 1:])
+            decided, background_state = step_background(self.drivers, background_state, episode.perception[:, 1:])
             others = self.scenario.driven(old, decided, dt)
-        strayed = episode.strayed
-        if commanded is not None or strayed is not None:
-            others, strayed = led(episode, action, commanded, others, decided, dt)
+        overridden = episode.overridden
+        if commanded is not None or overridden is not None:
+            others, overridden = apply_overrides(episode, action, commanded, others, decided, dt)
         x, y, heading, speed = (torch.cat((first[None], rest.T)).T for first, rest in zip(moved, others, strict=True))
         state = State(x, y, heading, speed, old.theta)
         placed = self._placed(state)
         hit = ego_overlaps(state, road, placed).any(dim=1) | road.off_road(state.y[:, 0])
         if self.collisions == "any":
             hit = hit | others_touch(state, road)
-        episode = episode._replace(minds=minds, strayed=strayed)
+        episode = episode._replace(background_state=background_state, overridden=overridden)
         return self.next(episode, state, self._look(state, placed), hit)
 
 

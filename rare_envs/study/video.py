@@ -65,8 +65,8 @@ class Drive(NamedTuple):
     @property
     def crash(self) -> dict[str, Any] | None:
         """What kind of crash it ended in."""
-        witness = self.episodes[-1].witness
-        return None if witness is None else describe(witness.crash)
+        statistics = self.episodes[-1].statistics
+        return None if statistics is None else describe(statistics.crash)
 
     def time(self, k: int) -> float:
         """Time of moment k [s]."""

@@ -180,7 +180,7 @@ def begin(lesson: Lesson, rows: int, seconds: float, rng: np.random.Generator) -
     start = world.start(torch.from_numpy(np.concatenate(parts, axis=1)).float())
     state = _elsewhere(start.state, scenario, rng)
     perception = look(state, scenario.road) if world.sees else None
-    return world, world.first(state, perception, start.minds, start.sight)
+    return world, world.first(state, perception, start.background_state, start.camera_context)
 
 
 def _weather(n: int, rng: np.random.Generator) -> Array:

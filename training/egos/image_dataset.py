@@ -112,11 +112,11 @@ def _drive(
 
 def _photographed(episode: Episode, rows: Tensor) -> Tensor:
     """What the cameras see in some rows, boolean, shape (B,)."""
-    assert episode.sight is not None
-    state, sight = episode.state, episode.sight
-    weather = Weather(*(field[rows] for field in sight.weather))
-    sight = sight._replace(weather=weather, tick=sight.tick[rows])
-    return take_picture(State(*(field[rows] for field in state)), episode.road, sight)
+    assert episode.camera_context is not None
+    state, context = episode.state, episode.camera_context
+    weather = Weather(*(field[rows] for field in context.weather))
+    context = context._replace(weather=weather, tick=context.tick[rows])
+    return take_picture(State(*(field[rows] for field in state)), episode.road, context)
 
 
 def mirrored(pictures: Pictures, rows: Tensor) -> Pictures:

@@ -190,8 +190,8 @@ def margin_of(state: State, first: Episode) -> Tensor:
 
 def _blame(episode: Episode) -> Tensor:
     """`COLLIDED` where the ego ran into somebody, or into the road's edge; `HIT` where somebody ran into it."""
-    assert episode.witness is not None
-    crash = episode.witness.own
+    assert episode.statistics is not None
+    crash = episode.statistics.own
     own = (crash.vehicles[:, 0] == 0) | (crash.kind == ROAD_EDGE)
     return torch.where(crash.kind == NONE, KEPT, torch.where(own, COLLIDED, HIT))
 

@@ -2,6 +2,6 @@
 
 from rare_envs.sensors.camera.picture import take_picture
 from rare_envs.sensors.camera.pinhole import Camera, find_camera
-from rare_envs.sensors.camera.weather import Sight, Weather, clear_day
+from rare_envs.sensors.camera.weather import CameraContext, Weather, clear_day
 
-__all__ = ["Camera", "Sight", "Weather", "clear_day", "find_camera", "take_picture"]
+__all__ = ["Camera", "CameraContext", "Weather", "clear_day", "find_camera", "take_picture"]

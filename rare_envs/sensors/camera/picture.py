@@ -10,7 +10,7 @@ from rare_envs.sensors.camera.light import Colour, Light, light_of, sky
 from rare_envs.sensors.camera.pinhole import Camera, Pixels, pixels
 from rare_envs.sensors.camera.sensor_noise import grain
 from rare_envs.sensors.camera.vehicles import PAINT, Boxes, paint, shadows
-from rare_envs.sensors.camera.weather import Sight
+from rare_envs.sensors.camera.weather import CameraContext
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import State
 
@@ -29,7 +29,7 @@ class Scene(NamedTuple):
 
 
 @torch.no_grad()
-def take_picture(state: State, road: Road, sight: Sight) -> Tensor:
+def take_picture(state: State, road: Road, context: CameraContext) -> Tensor:
     """What the cameras of the vehicles in the ego's place see.
 
     Every picture depends on its own row alone, bit for bit.
@@ -37,23 +37,23 @@ def take_picture(state: State, road: Road, sight: Sight) -> Tensor:
     Args:
         state: Traffic of B scenarios.
         road: Their road.
-        sight: Camera, weather and time; its `viewer` says which vehicle is in the ego's place, see `State.seen_by`.
+        context: Camera, weather and time; its `viewer` says which vehicle is in the ego's place, see `State.seen_by`.
 
     Returns:
         uint8, shape (B, H, W, 3): rows from the top, columns from the left, red, green and blue.
     """
-    camera, device = sight.camera, state.x.device
+    camera, device = context.camera, state.x.device
     seen = pixels(camera, device)
-    scene = _scene(state, road, sight, seen)
-    colours = torch.tensor(_colours(state.x.shape[1], sight.viewer), device=device).view(-1, 3)
-    noisy = bool(sight.weather.noise.any())
+    scene = _scene(state, road, context, seen)
+    colours = torch.tensor(_colours(state.x.shape[1], context.viewer), device=device).view(-1, 3)
+    noisy = bool(context.weather.noise.any())
     rows = max(1, TILE // (camera.height * camera.width))
     image = torch.empty(len(state.x), camera.height, camera.width, 3, dtype=torch.uint8, device=device)
     for first in range(0, len(image), rows):
         part = slice(first, first + rows)
         drawn = _draw(_rows(scene, part), road, camera, seen, colours).mul_(255.0)
         if noisy:
-            when = sight._replace(weather=_rows(sight.weather, part), tick=sight.tick[part])
+            when = context._replace(weather=_rows(context.weather, part), tick=context.tick[part])
             strength = when.weather.noise.float()[:, None, None]
             drawn.addcmul_(strength, grain(when, drawn[0].numel()).view(drawn.shape))
         image[part] = drawn.round_().clamp_(0.0, 255.0).to(torch.uint8).view(-1, *image.shape[1:])
@@ -68,10 +68,10 @@ def _rows(fields: Any, part: slice) -> Any:
     return type(fields)(*parts) if hasattr(fields, "_fields") else tuple(parts)
 
 
-def _scene(state: State, road: Road, sight: Sight, seen: Pixels) -> Scene:
+def _scene(state: State, road: Road, context: CameraContext, seen: Pixels) -> Scene:
     """Place vehicles, light and road in the frames of the cameras."""
     x, y, heading = road.to_world(state.x, state.y, state.heading)
-    own, camera = heading[:, :1], sight.camera
+    own, camera = heading[:, :1], context.camera
     cos, sin, ahead, right = torch.cos(own), torch.sin(own), camera.mount_ahead, camera.mount_right
     camera_x, camera_y = x[:, :1] + ahead * cos - right * sin, y[:, :1] + ahead * sin + right * cos
     gaze = own + camera.yaw
@@ -79,7 +79,7 @@ def _scene(state: State, road: Road, sight: Sight, seen: Pixels) -> Scene:
     dx, dy, turn = x - camera_x, y - camera_y, (heading - gaze).float()
     boxes = Boxes((dx * cos + dy * sin).float(), (dy * cos - dx * sin).float(), torch.cos(turn), torch.sin(turn))
     view = View(camera_x[:, 0], camera_y[:, 0], gaze[:, 0])
-    return Scene(boxes, light_of(sight.weather, view.heading), road_lines(view, road, seen))
+    return Scene(boxes, light_of(context.weather, view.heading), road_lines(view, road, seen))
 
 
 def _draw(scene: Scene, road: Road, camera: Camera, seen: Pixels, colours: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ A 32-bit hash of these gives four bytes; their sum, centred and scaled, has mean
 import torch
 from torch import Tensor
 
-from rare_envs.sensors.camera.weather import Sight
+from rare_envs.sensors.camera.weather import CameraContext
 
 _STEP = -1640531535
 """2^32 over the golden ratio, as int32: Weyl's sequence spreads consecutive numbers."""
@@ -17,10 +17,10 @@ _EVEN = 0x00FF00FF
 _MEAN, _DEVIATION = 4 * 127.5, (4 * (256**2 - 1) / 12) ** 0.5
 
 
-def grain(sight: Sight, values: int) -> Tensor:
+def grain(context: CameraContext, values: int) -> Tensor:
     """Noise of one picture for each of B cameras, shape (B, values), mean 0 and variance 1."""
-    key = sight.weather.key.to(torch.int32)
-    for number in (sight.tick, torch.full_like(sight.tick, sight.viewer)):
+    key = context.weather.key.to(torch.int32)
+    for number in (context.tick, torch.full_like(context.tick, context.viewer)):
         key = _mixed(key + (number.to(torch.int32) + 1) * _STEP)
     place = torch.arange(values, dtype=torch.int32, device=key.device) * _STEP
     bits = _mixed(place[None, :] + key[:, None])

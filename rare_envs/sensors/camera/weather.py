@@ -155,7 +155,7 @@ def _keys(column: Tensor) -> Tensor:
     return column[:, 0].float().contiguous().view(torch.int32).to(torch.int64)
 
 
-class Sight(NamedTuple):
+class CameraContext(NamedTuple):
     """What a camera's picture depends on beside the traffic."""
 
     camera: Camera
@@ -166,10 +166,10 @@ class Sight(NamedTuple):
     """Which vehicle carries the camera, 0 the ego."""
 
     @classmethod
-    def at_start(cls, camera: Camera, weather: Weather) -> "Sight":
+    def at_start(cls, camera: Camera, weather: Weather) -> "CameraContext":
         """At time 0."""
         return cls(camera, weather, torch.zeros_like(weather.key))
 
-    def later(self) -> "Sight":
+    def later(self) -> "CameraContext":
         """One tick later."""
         return self._replace(tick=self.tick + 1)

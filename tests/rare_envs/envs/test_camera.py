@@ -227,7 +227,7 @@ def test_meta_actions_and_a_camera() -> None:
 
 @pytest.mark.gpu
 def test_pictures_of_a_gpu_are_those_of_the_cpu() -> None:
-    from rare_envs.sensors.camera import Sight, Weather, clear_day, take_picture
+    from rare_envs.sensors.camera import CameraContext, Weather, clear_day, take_picture
     from rare_envs.traffic.road import i80
     from rare_envs.traffic.state import State
 
@@ -237,11 +237,11 @@ def test_pictures_of_a_gpu_are_those_of_the_cpu() -> None:
         State(x, y, heading, torch.zeros_like(x), x[:, :0]),
         clear_day(x)._replace(noise=torch.full((32,), 4.0)),
     )
-    here = take_picture(state, i80(), Sight.at_start(Camera(), sky)).int()
+    here = take_picture(state, i80(), CameraContext.at_start(Camera(), sky)).int()
     there = take_picture(
         State(*(field.cuda() for field in state)),
         i80(),
-        Sight.at_start(Camera(), Weather(*(field.cuda() for field in sky))),
+        CameraContext.at_start(Camera(), Weather(*(field.cuda() for field in sky))),
     )
     difference = (there.cpu().int() - here).abs()
     assert (difference > 1).float().mean() < 1e-3  # silhouettes

@@ -12,7 +12,7 @@ from pettingzoo.utils import parallel_to_aec
 
 import rare_envs
 from rare_envs.make import set_up
-from rare_envs.multi_agent.episode import gather, move
+from rare_envs.multi_agent.episode import start, step_traffic
 from rare_envs.multi_agent.rewards import adversary_reward, own_reward
 
 with warnings.catch_warnings():
@@ -175,31 +175,31 @@ def test_a_row_of_a_batch_is_the_episode_alone():
     rng = torch.Generator().manual_seed(0)
     action = torch.rand(50, 32, 3, 2, generator=rng) * torch.tensor([8.0, 0.04]) - torch.tensor([4.0, 0.02])
     commanded = torch.rand(50, 32, 3, generator=rng) < 0.5
-    together = gather(world, x)
-    alone = [gather(world, x[k : k + 1]) for k in range(4)]
+    together = start(world, x)
+    alone = [start(world, x[k : k + 1]) for k in range(4)]
     for t in range(50):
-        together = move(world, together, action[t], commanded[t])
+        together = step_traffic(world, together, action[t], commanded[t])
         for k in range(4):
-            alone[k] = move(world, alone[k], action[t, k : k + 1], commanded[t, k : k + 1])
+            alone[k] = step_traffic(world, alone[k], action[t, k : k + 1], commanded[t, k : k + 1])
             for view, own in zip(together.views, alone[k].views, strict=True):
                 assert torch.equal(view.f[k], own.f[0])
                 assert torch.equal(view.state.x[k], own.state.x[0])
-            assert torch.equal(together.wrecked[k], alone[k].wrecked[0])
-    assert together.wrecked.any()
-    assert not together.wrecked.all()
+            assert torch.equal(together.disabled[k], alone[k].disabled[0])
+    assert together.disabled.any()
+    assert not together.disabled.all()
 
 
 def test_contacts_of_others_are_noted_and_change_nothing():
     """A cutter much faster than the lead runs into it while the ego is far behind: as in the environment of one."""
     world, _ = set_up(CUT_IN)
     x = torch.tensor([[5.0, 40.0, 5.0, 60.0, 60.0, 2.2]])
-    crowd, episode = gather(world, x), world.start(x)
+    crowd, episode = start(world, x), world.start(x)
     nobody = torch.zeros(1, 3, dtype=torch.bool)
     for _ in range(60):
-        crowd = move(world, crowd, torch.zeros(1, 3, 2), nobody)
+        crowd = step_traffic(world, crowd, torch.zeros(1, 3, 2), nobody)
         episode = world.step(episode, torch.zeros(1, 2))
     assert crowd.collided.tolist() == [[False, True, True]]
-    assert not crowd.wrecked.any()
+    assert not crowd.disabled.any()
     assert torch.equal(crowd.traffic.state.x, episode.state.x)
 
 

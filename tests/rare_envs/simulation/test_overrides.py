@@ -46,18 +46,18 @@ def test_a_commanded_vehicle_moves_as_an_ego_in_its_place_would(env_id):
     world, episode = start(env_id, horizon=2.0, drivers="idm")
     batch, n = episode.state.x.shape
     for vehicle in range(1, n):
-        swapped = episode._replace(state=episode.state.seen_by(vehicle), minds=None)
-        led, commanded = episode, torch.zeros(batch, n, dtype=torch.bool)
+        swapped = episode._replace(state=episode.state.seen_by(vehicle), background_state=None)
+        driven, commanded = episode, torch.zeros(batch, n, dtype=torch.bool)
         commanded[:, vehicle] = True
         action = torch.zeros(batch, n, 2)
         action[:, vehicle] = ego_action(batch)
         for _ in range(5):
-            led = world.step(led, action, commanded)
+            driven = world.step(driven, action, commanded)
             swapped = world.step(swapped, ego_action(batch))
-        for one, other in zip(led.state[:4], swapped.state[:4], strict=True):
+        for one, other in zip(driven.state[:4], swapped.state[:4], strict=True):
             torch.testing.assert_close(one[:, vehicle], other[:, 0], rtol=1e-6, atol=1e-5)
-        others = [j for j in range(1, n) if j != vehicle]  # have not strayed
-        assert not led.strayed[:, others].any()
+        others = [j for j in range(1, n) if j != vehicle]  # were never commanded
+        assert not driven.overridden[:, others].any()
 
 
 @torch.inference_mode()

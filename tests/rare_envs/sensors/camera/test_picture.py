@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from rare_envs.sensors.camera import Camera, Sight, Weather, clear_day, find_camera, take_picture
+from rare_envs.sensors.camera import Camera, CameraContext, Weather, clear_day, find_camera, take_picture
 from rare_envs.sensors.camera.ground import ASPHALT, DASH, PERIOD, View, road_lines
 from rare_envs.sensors.camera.pinhole import pixels
 from rare_envs.sensors.camera.vehicles import HEIGHT
@@ -38,7 +38,7 @@ def weather(fog: float, elevation: float, azimuth: float, noise: float = 0.0, ke
 def shot(
     vehicles: list[list[float]] | Array, road: Road, camera: Camera = LARGE, sky: tuple[float, float, float] = OVERHEAD
 ) -> Array:
-    image = take_picture(traffic(vehicles), road, Sight.at_start(camera, weather(*sky)))
+    image = take_picture(traffic(vehicles), road, CameraContext.at_start(camera, weather(*sky)))
     return image[0].numpy().astype(float)
 
 
@@ -165,11 +165,11 @@ def test_pictures_do_not_depend_on_their_batch(road: Road) -> None:
     )
     state = State(x, y, heading, torch.zeros_like(x), torch.zeros(batch, 0))
     sky = clear_day(x)._replace(noise=torch.linspace(0.0, 9.0, batch), fog=torch.linspace(1e-4, 0.1, batch))
-    sight = Sight(Camera(), sky, torch.arange(batch))
-    images = take_picture(state, road, sight)
+    context = CameraContext(Camera(), sky, torch.arange(batch))
+    images = take_picture(state, road, context)
     for row in (0, 7, 44):
         own = [field[row : row + 1] for field in state], [field[row : row + 1] for field in sky]
-        alone = take_picture(State(*own[0]), road, Sight(Camera(), Weather(*own[1]), torch.tensor([row])))
+        alone = take_picture(State(*own[0]), road, CameraContext(Camera(), Weather(*own[1]), torch.tensor([row])))
         assert torch.equal(alone[0], images[row])
     assert len({image.numpy().tobytes() for image in images}) == batch
 
@@ -185,7 +185,7 @@ def test_any_heading_and_place_gives_a_picture() -> None:
     heading = torch.from_numpy(rng.uniform(-7.0, 7.0, (n, 6))).float()
     state = State(x, y, heading, torch.zeros_like(x), torch.zeros(n, 0))
     for road in (straight(1), i80(), BEND):
-        images = take_picture(state, road, Sight.at_start(Camera(20, 40), clear_day(x)))
+        images = take_picture(state, road, CameraContext.at_start(Camera(20, 40), clear_day(x)))
         assert images.float().std() > 10.0
 
 

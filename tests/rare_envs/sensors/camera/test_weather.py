@@ -18,7 +18,7 @@ from rare_envs.distributions.product import beside
 from rare_envs.make import space_of
 from rare_envs.scenarios.base_distributions import load_base
 from rare_envs.scenarios.registry import find_scenario
-from rare_envs.sensors.camera import Camera, Sight, Weather, take_picture
+from rare_envs.sensors.camera import Camera, CameraContext, Weather, take_picture
 from rare_envs.sensors.camera.sensor_noise import grain
 from rare_envs.sensors.camera.weather import CONDITIONS, FOG_LAW, SENSOR_NOISE, SENSOR_NOISE_LAW, SUN_LAW
 from rare_envs.simulation.world import World
@@ -39,7 +39,7 @@ def shots(**sky: Any) -> Tensor:
     x = torch.tensor([[0.0, 25.0]]).repeat(batch, 1)
     state = State(x, torch.zeros_like(x), torch.zeros_like(x), torch.zeros_like(x), x[:, :0])
     weather = Weather(**{name: column.long() if name == "key" else column.float() for name, column in columns.items()})
-    return take_picture(state, straight(3), Sight.at_start(Camera(), weather)).float()
+    return take_picture(state, straight(3), CameraContext.at_start(Camera(), weather)).float()
 
 
 def test_fog_hides_what_is_far_first() -> None:
@@ -89,15 +89,19 @@ def test_noise_is_as_strong_as_it_says_and_grows_with_it() -> None:
 
 def test_noise_is_white_and_nearly_normal() -> None:
     n, keys = 3 * 66 * 200, torch.tensor([0, 1, 2**30, 1065353216, 1065353217])
-    sight = Sight.at_start(Camera(), Weather(*torch.zeros(4, 5), keys))
-    for values in (grain(sight, n), grain(sight._replace(tick=sight.tick + 1), n), grain(sight._replace(viewer=3), n)):
+    context = CameraContext.at_start(Camera(), Weather(*torch.zeros(4, 5), keys))
+    for values in (
+        grain(context, n),
+        grain(context._replace(tick=context.tick + 1), n),
+        grain(context._replace(viewer=3), n),
+    ):
         assert values.mean(dim=1).abs().max() < 5 / math.sqrt(n)
         assert (values.var(dim=1) - 1).abs().max() < 5 * math.sqrt(2 / n)
         for lag in (1, 3, 600, 66 * 200):  # along rows, channels and columns
             together = (values[:, lag:] * values[:, :-lag]).mean(dim=1)
             assert together.abs().max() < 5 / math.sqrt(n - lag)
     pairs = torch.cat(
-        [grain(sight, n), grain(sight._replace(tick=sight.tick + 1), n), grain(sight._replace(viewer=1), n)]
+        [grain(context, n), grain(context._replace(tick=context.tick + 1), n), grain(context._replace(viewer=1), n)]
     )
     across = torch.corrcoef(pairs) - torch.eye(len(pairs))
     assert across.abs().max() < 5 / math.sqrt(n)
@@ -180,10 +184,12 @@ def test_on_the_highway_weather_stands_before_the_drivers_and_all_noise_behind()
     same = np.column_stack([parts[name] for name in without.space.names])
     np.testing.assert_array_equal(problem.evaluate(x), without.evaluate(same))  # an ego that does not look at it
     episode = problem.world.start(torch.from_numpy(x).float())
-    assert episode.sight is not None
-    np.testing.assert_allclose(episode.sight.weather.fog, parts["fog"], rtol=1e-6)
-    np.testing.assert_allclose(torch.rad2deg(episode.sight.weather.sun_azimuth), parts["sun_azimuth"], rtol=1e-6)
-    np.testing.assert_allclose(episode.sight.weather.noise, parts["sensor_noise"], rtol=1e-6)
+    assert episode.camera_context is not None
+    np.testing.assert_allclose(episode.camera_context.weather.fog, parts["fog"], rtol=1e-6)
+    np.testing.assert_allclose(
+        torch.rad2deg(episode.camera_context.weather.sun_azimuth), parts["sun_azimuth"], rtol=1e-6
+    )
+    np.testing.assert_allclose(episode.camera_context.weather.noise, parts["sensor_noise"], rtol=1e-6)
 
 
 def test_a_scenario_with_fog_of_its_own_has_to_rename_it() -> None:
