@@ -22,7 +22,7 @@ class Transition(NamedTuple):
 
 
 Reward: TypeAlias = Callable[[Transition], Any]
-"""A function of a transition that returns a reward of shape (B,): a tensor, or a named tuple of terms with their sum as `total`."""
+"""From a transition to a reward of shape (B,): a tensor, or a named tuple of terms with their sum as `total`."""
 
 
 def own_reward(transition: Transition) -> RewardTerms:
