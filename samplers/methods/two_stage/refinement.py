@@ -6,7 +6,7 @@ from scipy.special import log_ndtr
 
 from samplers.methods.two_stage.mixture.linear_model import failure_edge, half_space_proposals, weighted_quantile
 from samplers.methods.two_stage.mixture.mixture_weights import Floor, minimise_second_moment, raise_to_floors
-from samplers.methods.two_stage.mixture.proposal import NO_REGION, MixtureComponent, MixtureProposal
+from samplers.methods.two_stage.mixture.proposal import NO_REGION, MixtureProposal, ProposalComponent
 from samplers.methods.two_stage.mixture.screening import FailureScreen, train_screen
 from samplers.methods.two_stage.mixture.subspace_em import HIGH_DIM, Points, clipped, fitted, refitted
 from samplers.methods.two_stage.multiple_importance import MultipleImportanceSample
@@ -71,11 +71,11 @@ class Refinement:
         self._sharp_hits = 1.0
         self._points = np.concatenate([region.points for region in regions])
         bumps = [(bump, k) for k, region in enumerate(regions) for bump in self._fit_region(region)]
-        self._first = [MixtureComponent(bump, "first", k) for bump, k in bumps]
+        self._first = [ProposalComponent(bump, "first", k) for bump, k in bumps]
         self._bumps = [bump for bump, _ in bumps]
         self._fresh: list[Bump] = []
         self._planes = [
-            MixtureComponent(part, "plane", k)
+            ProposalComponent(part, "plane", k)
             for k, region in enumerate(regions)
             for part in half_space_proposals(region.points, region.u, region.f, gamma)
         ]
@@ -175,7 +175,7 @@ class Refinement:
             return []
         return fitted(Points(self._history.u, weights, ess, np.arange(len(weights))), 8, self._rng).bumps
 
-    def _fit_planes(self) -> list[MixtureComponent]:
+    def _fit_planes(self) -> list[ProposalComponent]:
         """Return planes from what was known of each region and the draws nearest to it."""
         u, f = np.concatenate([u for u, _ in self._near]), np.concatenate([f for _, f in self._near])
         log_r = log_ratios([first.component for first in self._first], u)
@@ -189,22 +189,22 @@ class Refinement:
             parts = half_space_proposals(
                 points, np.concatenate([region.u, u[own]]), np.concatenate([region.f, f[own]]), self._gamma
             )
-            planes += [MixtureComponent(part, "plane", k) for part in parts]
+            planes += [ProposalComponent(part, "plane", k) for part in parts]
         return planes
 
-    def _candidates(self, seen: bool) -> list[MixtureComponent]:
-        bumps = [MixtureComponent(b, "bump", c.region) for b, c in zip(self._bumps, self._first, strict=True)]
-        bumps += [MixtureComponent(bump, "bump") for bump in self._fresh]
+    def _candidates(self, seen: bool) -> list[ProposalComponent]:
+        bumps = [ProposalComponent(b, "bump", c.region) for b, c in zip(self._bumps, self._first, strict=True)]
+        bumps += [ProposalComponent(bump, "bump") for bump in self._fresh]
         planes = [] if self.noisy else self._planes
         first = self._first if seen else []
-        found = [MixtureComponent(Wide(self._dim), "base"), MixtureComponent(Wide(self._dim, 1.5), "wide")]
+        found = [ProposalComponent(Wide(self._dim), "base"), ProposalComponent(Wide(self._dim, 1.5), "wide")]
         found += self._shells() + bumps + planes + first
         if not self.noisy:
-            found += [MixtureComponent(part, "slice") for part in self._slices(seen)]
+            found += [ProposalComponent(part, "slice") for part in self._slices(seen)]
         for candidate in bumps + planes + first:
             if isinstance(candidate.component, Bump):
                 for power in (0.5, 0.25) if self.noisy else (0.5,):
-                    found.append(MixtureComponent(candidate.component.tempered(power), "tempered", candidate.region))
+                    found.append(ProposalComponent(candidate.component.tempered(power), "tempered", candidate.region))
         return found
 
     def _floors(self, kinds: NDArray[np.str_], regions: NDArray[np.int64], for_regions: float) -> list[Floor]:
@@ -218,14 +218,14 @@ class Refinement:
             floors += [Floor((regions == k) & (kinds != "tempered"), for_regions / n) for k in range(n)]
         return [*floors, Floor(kinds == "base", base)]
 
-    def _shells(self) -> list[MixtureComponent]:
+    def _shells(self) -> list[ProposalComponent]:
         if self._dim < 2:
             return []
         shells = [fit_radial(self._points, np.ones(len(self._points)))]
         if len(self._history.u) >= 20:
             log_w = self._history.log_weights
             shells.append(fit_radial(self._history.u, np.exp(log_w - log_w.max())))
-        return [MixtureComponent(shell, "shell") for shell in shells]
+        return [ProposalComponent(shell, "shell") for shell in shells]
 
     def _slices(self, seen: bool) -> list[Slice]:
         """Return slices through the edge of each bump's failures, plain and with the bump's shape across."""

@@ -16,7 +16,7 @@ ACCEPTANCE_DRAWS = 15_000
 """Draws that find what a screen lets through; they are not simulated."""
 
 
-class MixtureComponent(NamedTuple):
+class ProposalComponent(NamedTuple):
     """A component that may become part of the proposal."""
 
     component: Component
@@ -28,7 +28,7 @@ class MixtureComponent(NamedTuple):
 class MixtureProposal:
     """A mixture to draw from."""
 
-    candidates: list[MixtureComponent]
+    candidates: list[ProposalComponent]
     weights: FloatArray
     """Adding up to 1, shape (k,)."""
     screen: FailureScreen | None = None

@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 from scipy.integrate import simpson
 
-from samplers.methods.two_stage.mixture.proposal import ACCEPTANCE_DRAWS, MixtureComponent, MixtureProposal
+from samplers.methods.two_stage.mixture.proposal import ACCEPTANCE_DRAWS, MixtureProposal, ProposalComponent
 from samplers.methods.two_stage.simulator import ComponentDraws
 from samplers.methods.two_stage.stratified import MIN_STRATUM_DRAWS, StratifiedSample
 from samplers.problem import FunctionProblem
@@ -27,8 +27,8 @@ LAWS = [
     (Slice(np.ones(1), 1.5), stats.truncnorm(1.5, np.inf)),
 ]
 WEIGHTS = np.array([0.2, 0.3, 0.3, 0.2])
-PROPOSAL = MixtureProposal([MixtureComponent(component, "bump") for component, _ in LAWS], WEIGHTS)
-UNUSED = MixtureProposal([*PROPOSAL.candidates, MixtureComponent(Wide(1, 3.0), "wide")], np.append(WEIGHTS, 0.0))
+PROPOSAL = MixtureProposal([ProposalComponent(component, "bump") for component, _ in LAWS], WEIGHTS)
+UNUSED = MixtureProposal([*PROPOSAL.candidates, ProposalComponent(Wide(1, 3.0), "wide")], np.append(WEIGHTS, 0.0))
 
 
 def mixture(x):
@@ -180,9 +180,9 @@ def test_a_gate_thins_components_and_the_weights_account_for_it(rng):
 
 def test_base_and_wide_draws_pass_every_gate(rng):
     candidates = [
-        MixtureComponent(Wide(1), "base"),
-        MixtureComponent(Wide(1, 1.5), "wide"),
-        MixtureComponent(LAWS[1][0], "bump"),
+        ProposalComponent(Wide(1), "base"),
+        ProposalComponent(Wide(1, 1.5), "wide"),
+        ProposalComponent(LAWS[1][0], "bump"),
     ]
     proposal = MixtureProposal(candidates, np.array([0.2, 0.2, 0.6])).with_screen(screen, rng)
     np.testing.assert_array_equal(proposal.acceptance[:2], 1.0)
