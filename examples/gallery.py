@@ -40,7 +40,11 @@ from rare_envs.study.video import drive_again, write_film
 problem = rare_envs.DrivingProblem("rare_envs/CutIn-v0", horizon=2.0)
 drive = drive_again(problem, np.array([30.0, 24.0, 28.0, 1.7, 40.0, 3.9]))
 write_film("clip.gif", drive, width=480)
-print(drive.f, drive.crash)
+print(drive.f, drive.crash["kind"], f"{drive.crash['closing_speed']:.2f} m/s")
+```
+
+```text
+-1.0 side 1.33 m/s
 ```
 """
 

@@ -1,7 +1,15 @@
-"""The code on every page runs as it stands, block after block."""
+"""The code on every page runs as it stands, block after block, and prints what the page shows.
 
+What a ```python block prints stands in the ```text block that follows it; a block that prints nothing has none. `...`
+stands for any text. Numbers with a decimal point or an exponent are compared to the digits shown, so a page shows as
+many as are the same on every machine. The rest is compared character by character, apart from the width of white space.
+"""
+
+import contextlib
+import io
 import re
 from pathlib import Path
+from typing import NamedTuple
 
 import gymnasium as gym
 import pytest
@@ -12,10 +20,68 @@ from rare_envs.scenarios.registry import SCENARIOS
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
+OUTPUT_NOT_SHOWN = {
+    "agents.md",
+    "camera.md",
+    "data.md",
+    "egos.md",
+    "environments.md",
+    "estimates.md",
+    "imitation.md",
+    "measures.md",
+    "remote.md",
+    "scenarios.md",
+}
+"""Pages whose output still has to be written down; their code runs, what it prints is not compared."""
+NUMBER = r"[-+]?(?:\d+\.\d*|\.\d+|\d+(?=[eE][-+]?\d))(?:[eE][-+]?\d+)?"
 
 
-def blocks(page: Path) -> list[str]:
-    return re.findall(r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+class Block(NamedTuple):
+    """A block of Python, and the text shown after it ("" if there is none)."""
+
+    code: str
+    output: str
+
+
+def blocks(page: str) -> list[Block]:
+    fences = re.findall(r"^```(\w*)\n(.*?)^```$", page, flags=re.MULTILINE | re.DOTALL)
+    following = [*fences[1:], ("", "")]
+    return [
+        Block(code, after if kind == "text" else "")
+        for (language, code), (kind, after) in zip(fences, following, strict=True)
+        if language == "python"
+    ]
+
+
+def digit_place(number: str) -> float:
+    """Return the worth of the last digit shown: 0.01 of "3.14", 1e-6 of "2.33e-04"."""
+    mantissa, _, exponent = number.lower().partition("e")
+    return 10.0 ** (int(exponent or 0) - len(mantissa.partition(".")[2]))
+
+
+def same_text(shown: str, printed: str) -> bool:
+    """Return whether the printed text is the one that a page shows: see the module's docstring."""
+    parts = re.split(rf"({NUMBER}|\.\.\.|\s+)", _without_padding(shown))
+    patterns = {"...": r"[\s\S]*?"}
+    pattern, numbers = "", []
+    for part in parts:
+        if re.fullmatch(NUMBER, part):
+            pattern += rf"({NUMBER}|[-+]?\d+)"
+            numbers.append(part)
+        elif part.isspace():
+            pattern += r"\s+"
+        else:
+            pattern += patterns.get(part, re.escape(part))
+    match = re.fullmatch(pattern, _without_padding(printed))
+    return match is not None and all(
+        abs(float(got) - float(want)) <= 0.5001 * digit_place(want)
+        for got, want in zip(match.groups(), numbers, strict=True)
+    )
+
+
+def _without_padding(text: str) -> str:
+    """Return the text without the white space at its ends and inside brackets, with which NumPy fills columns."""
+    return re.sub(r"(?<=[\[(])\s+|\s+(?=[\])])", "", text.strip())
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -24,15 +90,21 @@ def test_code_of_a_page(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
         pytest.importorskip("rtamt", reason="rtamt, for temporal logic, runs on Python 3.11 or older")
     monkeypatch.chdir(tmp_path)
     torch.set_num_threads(1)
-    code = blocks(page)
+    code = blocks(page.read_text(encoding="utf-8"))
     assert code
     known = set(rare_envs.ENV_IDS)
     namespace: dict[str, object] = {"__name__": "__main__"}
+    wrong = []
     for number, block in enumerate(code):
-        exec(compile(block, f"{page.name}, block {number}", "exec"), namespace)
+        name = f"{page.name}, block {number}"
+        with contextlib.redirect_stdout(io.StringIO()) as printed:
+            exec(compile(block.code, name, "exec"), namespace)
+        if page.name not in OUTPUT_NOT_SHOWN and not same_text(block.output, printed.getvalue()):
+            wrong.append(f"{name} prints\n{printed.getvalue()}where the page shows\n{block.output}")
     for env_id in set(rare_envs.ENV_IDS) - known:  # a page's own scenarios are not there for other tests
         SCENARIOS.remove(env_id)
         del gym.registry[env_id]
+    assert not wrong, "\n".join(wrong)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -40,3 +112,41 @@ def test_links_of_a_page(page: Path) -> None:
     for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text(encoding="utf-8")):
         if not target.startswith("http"):
             assert (page.parent / target).exists(), target
+
+
+def test_only_the_next_text_block_is_the_output() -> None:
+    fences = [("python", "a"), ("text", "1"), ("python", "b"), ("python", "c"), ("", "d"), ("text", "2")]
+    page = "\n".join(f"```{language}\n{content}\n```\n" for language, content in fences)
+    assert blocks(page) == [("a\n", "1\n"), ("b\n", ""), ("c\n", "")]
+
+
+@pytest.mark.parametrize(
+    ("shown", "printed"),
+    [
+        ("", ""),
+        ("p = 2.33e-04, 694 draws\n", "p = 2.329e-04, 694 draws\n"),
+        ("[ 8.6 10.0]", "[ 8.58 10.  ]"),
+        ("first\n...\nlast", "first\none\ntwo\nlast\n"),
+        ("p = ... of 6,000", "p = 0.3 of 6,000"),
+        ("a line that the page breaks\nin two", "a line that the page breaks in two"),
+    ],
+)
+def test_same_text(shown: str, printed: str) -> None:
+    assert same_text(shown, printed)
+
+
+@pytest.mark.parametrize(
+    ("shown", "printed"),
+    [
+        ("", "0.5\n"),
+        ("0.5", ""),
+        ("p = 2.301e-04, 694 draws", "p = 2.329e-04, 694 draws"),
+        ("p = 2.329e-04, 693 draws", "p = 2.329e-04, 694 draws"),
+        ("0.12", "0.1251"),
+        ("1.0", "-1.0"),
+        ("first\n...\nlast", "first\none\ntwo"),
+        ("converged", "stopped"),
+    ],
+)
+def test_other_text(shown: str, printed: str) -> None:
+    assert not same_text(shown, printed)

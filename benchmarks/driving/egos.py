@@ -54,6 +54,13 @@ import samplers
 problem = rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego=agents.load_ego("imitation"))
 print(samplers.estimate(problem, seed=0, max_sim=1500))
 ```
+
+```text
+P[f <= 0] = 4.04e-03
+  95 % interval [3.73e-03, 4.39e-03], c.o.v. 0.042
+  1,500 simulations, gain over Monte Carlo 93.9; two-stage, seed 0, converged; 597 failing points
+  given that no region of more than 1.9e-02 was missed (160 base draws saw none other)
+```
 """
 
 

@@ -1,0 +1,188 @@
+"""The examples in docstrings print what they show, and everything public has one."""
+
+import doctest
+import importlib
+import importlib.util
+import inspect
+import pkgutil
+from collections.abc import Iterator
+
+import pytest
+import torch
+
+PACKAGES = ("samplers", "rare_envs", "agents", "training")
+
+
+def names_of_modules(package: str) -> Iterator[str]:
+    """Yield the dotted names of a package and all that stands in it."""
+    yield package
+    path = importlib.import_module(package).__path__
+    yield from (module.name for module in pkgutil.walk_packages(path, f"{package}.") if "__main__" not in module.name)
+
+
+MODULES = [name for package in PACKAGES for name in names_of_modules(package)]
+
+
+def source(name: str) -> str:
+    spec = importlib.util.find_spec(name)
+    assert spec is not None
+    assert spec.origin is not None
+    with open(spec.origin, encoding="utf-8") as file:
+        return file.read()
+
+
+def public_objects() -> dict[str, object]:
+    """Return classes and functions that a package exports, each by its shortest name."""
+    found: dict[int, tuple[str, object]] = {}
+    packages = [name for name in MODULES if hasattr(importlib.import_module(name), "__path__")]
+    for package in sorted(packages, key=lambda name: (name.count("."), name)):
+        module = importlib.import_module(package)
+        for name in getattr(module, "__all__", ()):
+            value = getattr(module, name)
+            if inspect.isclass(value) or inspect.isroutine(value):
+                found.setdefault(id(value), (f"{package}.{name}", value))
+    return dict(found.values())
+
+
+def has_example(value: object) -> bool:
+    """Return whether the docstring shows code and what it prints."""
+    own = vars(value).get("__doc__") if inspect.isclass(value) else value.__doc__
+    return any(example.want for example in doctest.DocTestParser().get_examples(own or ""))
+
+
+WITHOUT_EXAMPLE = {
+    "agents.Ego",
+    "agents.LearnedDriver",
+    "agents.LearnedEgo",
+    "agents.Provenance",
+    "agents.SavedEgo",
+    "agents.WeightDistribution",
+    "agents.load_driver",
+    "agents.load_ego",
+    "agents.read_driver",
+    "agents.read_provenance",
+    "agents.save_driver",
+    "rare_envs.DrivingProblem",
+    "rare_envs.FaultTolerant",
+    "rare_envs.HighwayEnvProblem",
+    "rare_envs.HighwayEnvScenario",
+    "rare_envs.ScenarioSpace",
+    "rare_envs.TruncatedGaussianMixture",
+    "rare_envs.highway_env_problem",
+    "rare_envs.make_batch",
+    "rare_envs.measures.Combined",
+    "rare_envs.measures.EpisodeMeasure",
+    "rare_envs.measures.Exposure",
+    "rare_envs.measures.Measure",
+    "rare_envs.measures.Moment",
+    "rare_envs.measures.RSS",
+    "rare_envs.measures.Trace",
+    "rare_envs.measures.TraceMeasure",
+    "rare_envs.measures.btn",
+    "rare_envs.measures.clearance",
+    "rare_envs.measures.drac",
+    "rare_envs.measures.find_measure",
+    "rare_envs.measures.lidar_ttc",
+    "rare_envs.measures.margin",
+    "rare_envs.measures.minimum",
+    "rare_envs.measures.mttc",
+    "rare_envs.measures.pet",
+    "rare_envs.measures.required_deceleration",
+    "rare_envs.measures.rss_lateral",
+    "rare_envs.measures.rss_longitudinal",
+    "rare_envs.measures.rss_margin",
+    "rare_envs.measures.stl",
+    "rare_envs.measures.tet",
+    "rare_envs.measures.thw",
+    "rare_envs.measures.tit",
+    "rare_envs.measures.ttb",
+    "rare_envs.measures.ttc",
+    "rare_envs.measures.ttc_2d",
+    "rare_envs.measures.weighted",
+    "rare_envs.measures.with_collision",
+    "rare_envs.parallel_env",
+    "rare_envs.register_scenario",
+    "rare_envs.scenarios.named",
+    "rare_envs.sensors.camera.Camera",
+    "rare_envs.sensors.camera.Sight",
+    "rare_envs.sensors.camera.Weather",
+    "rare_envs.sensors.camera.clear_day",
+    "rare_envs.sensors.camera.find_camera",
+    "rare_envs.sensors.camera.take_picture",
+    "rare_envs.study.cli.main",
+    "samplers.AdaptiveSubsetSimulation",
+    "samplers.BetaBlock",
+    "samplers.Comparison",
+    "samplers.CrossEntropy",
+    "samplers.Curve",
+    "samplers.Distribution",
+    "samplers.Estimate",
+    "samplers.EvaluationError",
+    "samplers.Failure",
+    "samplers.Failures",
+    "samplers.FunctionProblem",
+    "samplers.GaussianBlock",
+    "samplers.Goal",
+    "samplers.ImportanceSampling",
+    "samplers.ImprovedCrossEntropy",
+    "samplers.Interrupted",
+    "samplers.Layer",
+    "samplers.Level",
+    "samplers.Method",
+    "samplers.MixtureBlock",
+    "samplers.MonteCarlo",
+    "samplers.NormalBlock",
+    "samplers.Outcome",
+    "samplers.Problem",
+    "samplers.Product",
+    "samplers.Progress",
+    "samplers.Reweighted",
+    "samplers.Run",
+    "samplers.Sample",
+    "samplers.Share",
+    "samplers.StandardNormal",
+    "samplers.Status",
+    "samplers.Stepping",
+    "samplers.SubsetSimulation",
+    "samplers.TwoStage",
+    "samplers.compare",
+    "samplers.estimate",
+    "samplers.get_method",
+    "training.sb3_agents_env",
+    "training.sb3_vec_env",
+    "training.train_ego",
+}
+"""Public names that have no example yet."""
+
+
+@pytest.mark.parametrize("name", [name for name in MODULES if ">>> " in source(name)])
+def test_examples_of_a_module(name: str) -> None:
+    torch.set_num_threads(1)
+    result = doctest.testmod(importlib.import_module(name), report=True)
+    assert result.failed == 0
+    assert result.attempted > 0
+
+
+def test_everything_public_has_an_example() -> None:
+    without = {name for name, value in public_objects().items() if not has_example(value)}
+    assert without - WITHOUT_EXAMPLE == set()
+
+
+def test_an_example_is_told_from_none() -> None:
+    class Parent:
+        """A class.
+
+        >>> 1 + 1
+        2
+        """
+
+    class Child(Parent):
+        pass
+
+    def silent() -> None:
+        """Do nothing.
+
+        >>> x = 1
+        """
+
+    assert [has_example(value) for value in (Parent, Child, silent)] == [True, False, False]
