@@ -6,11 +6,11 @@ import json
 import socket
 import sys
 
-from agents.remote.request_handler import Answerer
+from agents.remote.request_handler import RequestHandler
 from agents.remote.subprocess_link import _SIZE
 
 
-def _serve(link: socket.socket, answerer: Answerer) -> None:
+def _serve(link: socket.socket, answerer: RequestHandler) -> None:
     """Answer until the other side is gone."""
     with link.makefile("rwb") as stream:
         while len(head := stream.read(_SIZE.size)) == _SIZE.size:
@@ -43,7 +43,7 @@ def _main(number: str, arguments: str) -> None:
     except (ValueError, OSError) as error:
         ego = _Unloaded(str(error))  # type: ignore[assignment]
     with socket.socket(fileno=int(number)) as link:
-        _serve(link, Answerer(ego))
+        _serve(link, RequestHandler(ego))
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ from rare_envs.simulation.world import World
 from rare_envs.traffic.lead import lead_of
 from rare_envs.traffic.state import State
 
-OWN, EACH = 3, 4
+OWN_ERRORS, ERRORS_PER_VEHICLE = 3, 4
 """Errors of the ego itself (across, heading, speed), and of each other vehicle (along, across, speed, missed)."""
 OUT_OF_SIGHT = 400.0
 """Where a missed vehicle is put [m ahead]: farther than any ego looks."""
@@ -128,7 +128,7 @@ class NoisyEgo:
         return NoisyDriver(as_driver(self.ego, world), self.stack, world)
 
 
-class _Memory(NamedTuple):
+class _StackMemory(NamedTuple):
     tick: int
     past: tuple[State, ...]
     """What was, up to the latency ago, the oldest first."""
@@ -164,7 +164,8 @@ class NoisyDriver:
     @property
     def shape(self) -> tuple[int, int]:
         """Of an episode's draws: plans and K."""
-        return math.ceil(self.world.ticks / self.every), OWN + EACH * (self.world.scenario.vehicles - 1)
+        others = self.world.scenario.vehicles - 1
+        return math.ceil(self.world.ticks / self.every), OWN_ERRORS + ERRORS_PER_VEHICLE * others
 
     @property
     def columns(self) -> int:
@@ -180,7 +181,7 @@ class NoisyDriver:
         state = episode.state
         if memory is None:
             nothing = state.x.new_zeros(len(state.x), 2)
-            memory = _Memory(0, (), state.x.new_zeros(len(state.x), self.shape[1]), None, nothing, nothing)
+            memory = _StackMemory(0, (), state.x.new_zeros(len(state.x), self.shape[1]), None, nothing, nothing)
         back = round(self.stack.latency / self.world.dt)
         past = (*memory.past, state)[-back - 1 :]
         plans = memory.tick % self.every == 0
@@ -192,7 +193,7 @@ class NoisyDriver:
         if not plans:  # the speed is planned now and then, the path is followed at every tick
             wanted = torch.stack((memory.wanted[:, 0], wanted[:, 1]), dim=1)
         done = self._done(memory.done, wanted)
-        return done, _Memory(memory.tick + 1, past, errors, inner, wanted, done)
+        return done, _StackMemory(memory.tick + 1, past, errors, inner, wanted, done)
 
     def _later(self, errors: Tensor, plan: int) -> Tensor:
         """Errors at a plan from those at the plan before: autoregressions with variance 1."""
@@ -201,7 +202,7 @@ class NoisyDriver:
         if self.draws is not None:
             fresh = self.draws[:, min(plan, self.draws.shape[1] - 1)]
         elif self.world.noise == "fixed":
-            fresh = _fixed(self.shape)[plan].to(errors).expand_as(errors)
+            fresh = _fixed_draws(self.shape)[plan].to(errors).expand_as(errors)
         else:
             raise ValueError("Expected the draws of its noise; begin with with_draws.")
         if plan == 0:
@@ -212,8 +213,9 @@ class NoisyDriver:
 
     def _seen(self, now: State, late: State, errors: Tensor) -> State:
         """The traffic as the stack has it: itself as of now, the others relative to itself as they were sensed."""
-        stack, own = self.stack, errors[:, :OWN]
-        along, across, speed, hidden = errors[:, OWN:].reshape(len(errors), -1, EACH).unbind(dim=-1)
+        stack, own = self.stack, errors[:, :OWN_ERRORS]
+        of_others = errors[:, OWN_ERRORS:].reshape(len(errors), -1, ERRORS_PER_VEHICLE)
+        along, across, speed, hidden = of_others.unbind(dim=-1)
         missed = torch.zeros_like(hidden, dtype=torch.bool)
         if stack.missed and self.world.noise is not False:
             missed = hidden < NormalDist().inv_cdf(stack.missed)
@@ -237,6 +239,6 @@ class NoisyDriver:
         return before + torch.maximum(torch.minimum(change, most), -most)
 
 
-def _fixed(shape: tuple[int, int]) -> Tensor:
+def _fixed_draws(shape: tuple[int, int]) -> Tensor:
     """The one sequence of draws of `noise="fixed"`."""
     return torch.randn(shape, generator=torch.Generator().manual_seed(54321), dtype=torch.float64)

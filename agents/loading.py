@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from agents.learned.checkpoints import SHIPPED, SHIPPED_EGOS, SUFFIX, load_driver
 from agents.learned.driver import LearnedDriver, LearnedEgo
 from agents.python_function import RULE_BASED, call_factory
-from agents.sb3.saved_ego import load_saved
+from agents.sb3.saved_ego import load_saved_ego
 from agents.vision.checkpoint import VISION, holds_vision, load_vision
 from rare_envs.egos.faults import EgoGone
 from rare_envs.plugins import did_you_mean
@@ -22,7 +22,9 @@ EXPECTED: Final = (
     "an .onnx file, module:function, tcp://host:port, or process:EGO for one of these in a process of its own, "
     "noisy:EGO for one behind the imperfections of a full stack"
 )
-Kind = Literal["rule", "learned", "vision", "url", "remote", "process", "noisy", "onnx", "zip", "function", "unknown"]
+EgoKind = Literal[
+    "rule", "learned", "vision", "url", "remote", "process", "noisy", "onnx", "zip", "function", "unknown"
+]
 
 
 @runtime_checkable
@@ -80,13 +82,13 @@ def load_ego(spec: str | Path, algo: str | None = None, trust: bool = False) -> 
             algo is given for something that is no `.zip`.
     """
     text = str(spec)
-    kind = kind_of(text)
+    kind = find_ego_kind(text)
     if kind == "url":
         raise ValueError(f"Will not load an ego from {text!r}: download the file, look where it comes from, name it.")
     if kind == "unknown":
         raise ValueError(f"Unknown ego {text!r}{_suggest_ego(text)}; expected {EXPECTED}.")
     if kind == "zip":
-        return load_saved(Path(text), algo, trust)
+        return load_saved_ego(Path(text), algo, trust)
     if algo is not None and kind != "process":
         raise ValueError(f"Expected algo for a Stable-Baselines3 .zip only, got {algo!r} for {text!r}; leave it out.")
     if kind == "noisy":
@@ -96,7 +98,7 @@ def load_ego(spec: str | Path, algo: str | None = None, trust: bool = False) -> 
         stack = Stack.read(settings if mark else "")
         return cast(Ego, NoisyEgo(load_ego(inner if mark else settings, algo, trust), stack))
     if kind in ("remote", "process"):
-        return _elsewhere(kind, text, algo, trust)
+        return _load_elsewhere(kind, text, algo, trust)
     if kind == "onnx":
         from agents.onnx.ego import OnnxEgo
 
@@ -108,7 +110,7 @@ def load_ego(spec: str | Path, algo: str | None = None, trust: bool = False) -> 
     return cast(Ego, call_factory(text)) if kind == "function" else "idm"
 
 
-def _elsewhere(kind: Kind, text: str, algo: str | None, trust: bool) -> Ego:
+def _load_elsewhere(kind: EgoKind, text: str, algo: str | None, trust: bool) -> Ego:
     """An ego in another process."""
     try:
         import msgpack  # noqa: F401
@@ -127,14 +129,14 @@ def _elsewhere(kind: Kind, text: str, algo: str | None, trust: bool) -> Ego:
         raise ValueError(str(error)) from error
 
 
-def innermost(spec: str) -> str:
+def strip_prefixes(spec: str) -> str:
     """The ego inside `noisy:` and `process:`, without their settings."""
     while spec.startswith(("noisy:", "process:")):
         spec = spec.partition(":")[2].rpartition("?")[0] or spec.partition(":")[2]
     return spec
 
 
-def kind_of(spec: str) -> Kind:
+def find_ego_kind(spec: str) -> EgoKind:
     """What a user means by an ego's name; of a `.safetensors` the header tells."""
     if spec == RULE_BASED:
         return "rule"

@@ -18,7 +18,7 @@ RECENT = 500
 
 
 @dataclass(frozen=True)
-class Recipe:
+class Hyperparameters:
     """How to train with one algorithm on a batched simulation and few CPU cores."""
 
     settings: Mapping[str, Any]
@@ -46,9 +46,9 @@ ACTOR_CRITIC: Mapping[str, Any] = {
     "log_std_init": -1.5,
 }
 OFF_POLICY_NETS: Mapping[str, Any] = {"net_arch": [64, 64]}
-RECIPES: Mapping[str, Recipe] = MappingProxyType(
+HYPERPARAMETERS: Mapping[str, Hyperparameters] = MappingProxyType(
     {
-        "ppo": Recipe(
+        "ppo": Hyperparameters(
             {
                 **ON_POLICY,
                 "n_steps": 32,
@@ -58,13 +58,13 @@ RECIPES: Mapping[str, Recipe] = MappingProxyType(
             },
             ACTOR_CRITIC,
         ),
-        "a2c": Recipe(
+        "a2c": Hyperparameters(
             {**ON_POLICY, "n_steps": 5, "learning_rate": 3e-3, "normalize_advantage": True},
             ACTOR_CRITIC,
         ),
-        "sac": Recipe({**OFF_POLICY, "learning_rate": 1e-3}, OFF_POLICY_NETS),
-        "td3": Recipe({**OFF_POLICY, "learning_rate": 1e-3}, OFF_POLICY_NETS, noise=0.2),
-        "dqn": Recipe(
+        "sac": Hyperparameters({**OFF_POLICY, "learning_rate": 1e-3}, OFF_POLICY_NETS),
+        "td3": Hyperparameters({**OFF_POLICY, "learning_rate": 1e-3}, OFF_POLICY_NETS, noise=0.2),
+        "dqn": Hyperparameters(
             {
                 **OFF_POLICY,
                 "learning_rate": 1e-3,
@@ -95,7 +95,7 @@ def train_ego(
 
     Args:
         env_id: Environment id, such as "rare_envs/CutIn-v0".
-        algo: One of `RECIPES`: "ppo", "a2c", "sac", "td3", "dqn".
+        algo: One of `HYPERPARAMETERS`: "ppo", "a2c", "sac", "td3", "dqn".
         steps: Environment steps, summed over the batch; rounded up to whole rollouts.
         seed: Seed of the networks, the exploration and the scenarios.
         num_envs: Episodes that run side by side.
@@ -109,7 +109,7 @@ def train_ego(
     Raises:
         ValueError: An argument is not usable; nothing has been simulated then.
     """
-    recipe = _recipe(algo)
+    recipe = _find_hyperparameters(algo)
     if steps < 1:
         raise ValueError(f"Expected steps >= 1, got {steps}.")
     if not 0 <= seed < 2**32:
@@ -117,7 +117,7 @@ def train_ego(
     from rare_envs.scenarios.registry import find_scenario
 
     find_scenario(env_id)
-    target = _writable(Path(out))
+    target = _prepare_target(Path(out))
 
     import stable_baselines3
     from torch import nn
@@ -133,7 +133,7 @@ def train_ego(
                 policy_kwargs={**recipe.policy, "activation_fn": nn.ReLU},
                 seed=seed,
                 device="cpu",
-                **_arguments(recipe, num_envs, steps),
+                **_fit_to_run(recipe, num_envs, steps),
             )
             model.learn(steps, callback=callback)
         model.save(target)
@@ -152,15 +152,15 @@ def _policy_name(space: Any) -> str:
     return "CnnPolicy" if is_image_space(space) else "MlpPolicy"
 
 
-def _recipe(algo: str) -> Recipe:
+def _find_hyperparameters(algo: str) -> Hyperparameters:
     """The recipe of an algorithm by its name."""
-    if algo not in RECIPES:
-        hint = did_you_mean(algo.lower(), RECIPES)
-        raise ValueError(f"Unknown algorithm {algo!r}{hint}; expected one of {', '.join(RECIPES)}.")
-    return RECIPES[algo]
+    if algo not in HYPERPARAMETERS:
+        hint = did_you_mean(algo.lower(), HYPERPARAMETERS)
+        raise ValueError(f"Unknown algorithm {algo!r}{hint}; expected one of {', '.join(HYPERPARAMETERS)}.")
+    return HYPERPARAMETERS[algo]
 
 
-def _arguments(recipe: Recipe, num_envs: int, steps: int) -> dict[str, Any]:
+def _fit_to_run(recipe: Hyperparameters, num_envs: int, steps: int) -> dict[str, Any]:
     """The recipe's settings, fitted to a run that may be smaller than the recipe has in mind."""
     arguments = dict(recipe.settings)
     if "train_freq" in arguments:  # off-policy: keep every transition, learn after a few steps
@@ -176,7 +176,7 @@ def _arguments(recipe: Recipe, num_envs: int, steps: int) -> dict[str, Any]:
     return arguments
 
 
-def _writable(out: Path) -> Path:
+def _prepare_target(out: Path) -> Path:
     """The file to write, with its folder made, or an error before any work is done."""
     if out.is_dir():
         raise ValueError(f"Expected a file to write, got the folder {str(out)!r}; name a .zip.")

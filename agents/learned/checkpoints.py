@@ -20,10 +20,10 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from agents.learned.coloured_noise import Colour
+from agents.learned.coloured_noise import AutoregressiveNoise
 from agents.learned.driver import LearnedDriver
-from agents.learned.networks import ACTIONS, CLIP, HEAD, Policy, Scaling
-from agents.learned.networks import FEATURES as WIDTH
+from agents.learned.networks import ACTION_SIZE, FEATURE_CLIP, HEAD_SIZE, Policy, Scaling
+from agents.learned.networks import FEATURE_SIZE as WIDTH
 from agents.learned.rule_driver import RuleDriver
 from agents.learned.weight_distribution import WeightDistribution
 from rare_envs.plugins import did_you_mean
@@ -112,7 +112,7 @@ def save_driver(driver: LearnedDriver, provenance: Provenance, path: str | PathL
         "format": FORMAT,
         "name": driver.name,
         "features": FEATURES,
-        "feature_clip": CLIP,
+        "feature_clip": FEATURE_CLIP,
         "log_std_cap": float(driver.policy.log_std_cap),
         "colour": asdict(driver.colour),
         "acceleration": driver.acceleration,
@@ -139,7 +139,7 @@ def read_driver(path: str | PathLike[str]) -> LearnedDriver:
     try:
         return LearnedDriver(
             policy,
-            colour=Colour(**{name: tuple(pair) for name, pair in header["colour"].items()}),
+            colour=AutoregressiveNoise(**{name: tuple(pair) for name, pair in header["colour"].items()}),
             acceleration=header["acceleration"],
             yaw_rate=header["yaw_rate"],
             weights=_weights(tensors, header["radius"], path),
@@ -234,8 +234,8 @@ def _check_header(header: Mapping[str, Any], path: Path) -> None:
         first = next((f"; the first difference is {a!r} for {b!r}" for a, b in pairs if a != b), "")
         count = len(theirs) if isinstance(theirs, list) else 0
         raise ValueError(f"{str(path)!r} is for {count} other features, expected the {len(FEATURES)} of today{first}.")
-    if header["feature_clip"] != CLIP:
-        raise ValueError(f"{str(path)!r} clips features at {header['feature_clip']!r}, this version at {CLIP}.")
+    if header["feature_clip"] != FEATURE_CLIP:
+        raise ValueError(f"{str(path)!r} clips features at {header['feature_clip']!r}, this version at {FEATURE_CLIP}.")
 
 
 def check_finite(tensors: Mapping[str, Tensor], path: Path) -> None:
@@ -247,7 +247,7 @@ def check_finite(tensors: Mapping[str, Tensor], path: Path) -> None:
 
 def _policy(tensors: Mapping[str, Tensor], path: Path) -> Policy:
     with torch.device("meta"):  # shapes only: initial weights would be drawn from the global generator
-        policy = Policy(Scaling(*(torch.empty(size) for size in (WIDTH, WIDTH, ACTIONS, ACTIONS))))
+        policy = Policy(Scaling(*(torch.empty(size) for size in (WIDTH, WIDTH, ACTION_SIZE, ACTION_SIZE))))
     expected = policy.state_dict()
     require(tensors, (_POLICY + name for name in expected), path)
     found = {name: tensors[_POLICY + name] for name in expected}
@@ -262,7 +262,7 @@ def _weights(tensors: Mapping[str, Tensor], radius: Any, path: Path) -> WeightDi
         return None
     names = ("mean", "rows", "columns", "precision")
     require(tensors, (_WEIGHTS + name for name in names), path)
-    check_tensor(f"{_WEIGHTS}mean", tensors[f"{_WEIGHTS}mean"], (HEAD,), torch.float64, path)
+    check_tensor(f"{_WEIGHTS}mean", tensors[f"{_WEIGHTS}mean"], (HEAD_SIZE,), torch.float64, path)
     return WeightDistribution.from_arrays({name: tensors[_WEIGHTS + name].numpy() for name in names}, radius)
 
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 
 @dataclass(frozen=True)
-class Colour:
+class AutoregressiveNoise:
     """noise_t = first noise_{t-1} + second noise_{t-2} + scale fresh_t, one pair of coefficients for each action.
 
     Raises:
@@ -30,7 +30,9 @@ class Colour:
                 raise ValueError(f"Expected the coefficients of a stationary noise, got {a} and {b}.")
 
     @classmethod
-    def swinging(cls, frequency: tuple[float, float], damping: tuple[float, float], dt: float = 0.1) -> "Colour":
+    def swinging(
+        cls, frequency: tuple[float, float], damping: tuple[float, float], dt: float = 0.1
+    ) -> "AutoregressiveNoise":
         """Noise with the poles of damped oscillators.
 
         Args:
@@ -74,5 +76,5 @@ class Colour:
         return value, torch.stack((value, memory[..., 0]), dim=-1)
 
 
-WHITE = Colour()
+WHITE_NOISE = AutoregressiveNoise()
 """Independent from tick to tick."""

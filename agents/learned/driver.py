@@ -9,8 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from agents.learned.coloured_noise import WHITE, Colour
-from agents.learned.networks import ACTIONS, FEATURES, HEAD, HIDDEN, Policy, with_head
+from agents.learned.coloured_noise import WHITE_NOISE, AutoregressiveNoise
+from agents.learned.networks import ACTION_SIZE, FEATURE_SIZE, HEAD_SIZE, HIDDEN_SIZES, Policy, apply_heads
 from agents.learned.weight_distribution import WeightDistribution
 from rare_envs.control import actions
 from rare_envs.sensors.perception import CURVATURE, SPEED
@@ -31,14 +31,15 @@ class LearnedDriver:
 
         action = action_mean + action_std (mean + exp(log_std) eps_t), within the limits,
 
-    where every eps_t is N(0, 1) and coloured, see `Colour`. O'Kelly et al. (2018) sample white noise, `Colour()`.
+    where every eps_t is N(0, 1) and autocorrelated, see `AutoregressiveNoise`. O'Kelly et al. (2018) sample white
+    noise, `AutoregressiveNoise()`.
 
     Raises:
         ValueError: If limits are out of order, or there are not 404 weights.
     """
 
     policy: Policy = field(repr=False)
-    colour: Colour = WHITE
+    colour: AutoregressiveNoise = WHITE_NOISE
     """Of the noise of acceleration and yaw rate."""
     acceleration: tuple[float, float] = (-8.0, 4.0)
     """Limits [m/s^2]."""
@@ -52,15 +53,15 @@ class LearnedDriver:
     def __post_init__(self) -> None:
         for name in ("acceleration", "yaw_rate"):
             pair = tuple(float(value) for value in getattr(self, name))
-            if len(pair) != ACTIONS:
+            if len(pair) != ACTION_SIZE:
                 raise ValueError(f"Expected {name} as two numbers, got {pair}.")
             object.__setattr__(self, name, pair)
         for name in ("acceleration", "yaw_rate"):
             low, high = getattr(self, name)
             if not low < high:
                 raise ValueError(f"Expected limits of {name} in ascending order, got {(low, high)}.")
-        if self.weights is not None and self.weights.dim != HEAD:
-            raise ValueError(f"Expected a distribution of {HEAD} weights, got one of {self.weights.dim}.")
+        if self.weights is not None and self.weights.dim != HEAD_SIZE:
+            raise ValueError(f"Expected a distribution of {HEAD_SIZE} weights, got one of {self.weights.dim}.")
 
     def act(
         self,
@@ -84,13 +85,13 @@ class LearnedDriver:
             TypeError: If something is no tensor.
             ValueError: If a shape is wrong, or innovations come without a memory.
         """
-        batch, vehicles = _checked_shapes(features, weights, innovations, memory)
+        batch, vehicles = _check_shapes(features, weights, innovations, memory)
         policy = self.policy
-        hidden = policy.trunk(features.to(policy.head.weight.dtype).reshape(batch * vehicles, FEATURES))
+        hidden = policy.trunk(features.to(policy.head.weight.dtype).reshape(batch * vehicles, FEATURE_SIZE))
         if weights is None:
-            output = policy.head(hidden).view(batch, vehicles, 2 * ACTIONS)
+            output = policy.head(hidden).view(batch, vehicles, 2 * ACTION_SIZE)
         else:
-            output = with_head(hidden.view(batch, vehicles, HIDDEN[-1]), weights.to(hidden.dtype).contiguous())
+            output = apply_heads(hidden.view(batch, vehicles, HIDDEN_SIZES[-1]), weights.to(hidden.dtype).contiguous())
         normal, log_std = policy.split(output)
         if innovations is not None and memory is not None:
             noise, memory = self.colour.next(memory.to(hidden.dtype), innovations.to(hidden.dtype))
@@ -105,7 +106,7 @@ class LearnedDriver:
         return self.colour.begin(draws)
 
 
-def _checked_shapes(
+def _check_shapes(
     features: Tensor, weights: Tensor | None, innovations: Tensor | None, memory: Tensor | None
 ) -> tuple[int, int]:
     """B and M."""
@@ -113,12 +114,12 @@ def _checked_shapes(
     for name, value in named.items():
         if not isinstance(value, Tensor) and (value is not None or name == "features"):
             raise TypeError(f"Expected {name} as a torch.Tensor, got {type(value).__name__}; use torch.as_tensor.")
-    if features.ndim != 3 or features.shape[-1] != FEATURES:
-        raise ValueError(f"Expected features of shape (B, M, {FEATURES}), got {tuple(features.shape)}.")
+    if features.ndim != 3 or features.shape[-1] != FEATURE_SIZE:
+        raise ValueError(f"Expected features of shape (B, M, {FEATURE_SIZE}), got {tuple(features.shape)}.")
     batch, vehicles, _ = features.shape
-    if weights is not None and weights.shape != (batch, HEAD):
-        raise ValueError(f"Expected weights of shape ({batch}, {HEAD}), got {tuple(weights.shape)}.")
-    expected = (batch, vehicles, ACTIONS)
+    if weights is not None and weights.shape != (batch, HEAD_SIZE):
+        raise ValueError(f"Expected weights of shape ({batch}, {HEAD_SIZE}), got {tuple(weights.shape)}.")
+    expected = (batch, vehicles, ACTION_SIZE)
     if innovations is not None and innovations.shape != expected:
         raise ValueError(f"Expected innovations of shape {expected}, got {tuple(innovations.shape)}.")
     if innovations is not None and memory is None:
@@ -128,12 +129,12 @@ def _checked_shapes(
     return batch, vehicles
 
 
-def with_weights(policy: Policy, weights: Tensor) -> Policy:
+def replace_head(policy: Policy, weights: Tensor) -> Policy:
     """A copy of a network with other weights (404,) in its last layer, as `head_weights` has them."""
-    if weights.shape != (HEAD,):
-        raise ValueError(f"Expected weights of shape ({HEAD},), got {tuple(weights.shape)}.")
+    if weights.shape != (HEAD_SIZE,):
+        raise ValueError(f"Expected weights of shape ({HEAD_SIZE},), got {tuple(weights.shape)}.")
     changed = copy.deepcopy(policy)
-    layer = weights.detach().view(2 * ACTIONS, HIDDEN[-1] + 1)
+    layer = weights.detach().view(2 * ACTION_SIZE, HIDDEN_SIZES[-1] + 1)
     with torch.no_grad():
         changed.head.weight.copy_(layer[:, :-1])
         changed.head.bias.copy_(layer[:, -1])
@@ -195,14 +196,14 @@ class LearnedEgo:
         """
         del episode_start, deterministic
         seen = torch.as_tensor(np.asarray(observation, dtype=np.float32))
-        if seen.ndim not in (1, 2) or seen.shape[-1] != FEATURES:
+        if seen.ndim not in (1, 2) or seen.shape[-1] != FEATURE_SIZE:
             raise ValueError(
-                f"Expected observations of shape (B, {FEATURES}), got {tuple(seen.shape)}; "
+                f"Expected observations of shape (B, {FEATURE_SIZE}), got {tuple(seen.shape)}; "
                 'make the environment with observation="lidar".'
             )
-        physical = self._decided(seen.reshape(-1, FEATURES) * seen.new_tensor(LIDAR_SCALES))
+        physical = self._decided(seen.reshape(-1, FEATURE_SIZE) * seen.new_tensor(LIDAR_SCALES))
         scaled = physical / physical.new_tensor((actions.MAX_ACCELERATION, actions.MAX_STEERING))
-        return scaled.clamp(-1.0, 1.0).reshape(*seen.shape[:-1], ACTIONS).numpy(), state
+        return scaled.clamp(-1.0, 1.0).reshape(*seen.shape[:-1], ACTION_SIZE).numpy(), state
 
     def _decided(self, features: Tensor) -> Tensor:
         """Acceleration [m/s^2] and steering angle [rad], shape (B, 2), by what the egos see, shape (B, 51)."""

@@ -5,13 +5,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-FEATURES = 51
-HIDDEN = (200, 100)
-ACTIONS = 2
+FEATURE_SIZE = 51
+HIDDEN_SIZES = (200, 100)
+ACTION_SIZE = 2
 """Acceleration and yaw rate."""
-HEAD = (HIDDEN[-1] + 1) * 2 * ACTIONS
+HEAD_SIZE = (HIDDEN_SIZES[-1] + 1) * 2 * ACTION_SIZE
 """Weights of the last layer, 404: what a search over drivers perturbs (O'Kelly et al. 2018, section 4)."""
-CLIP = 8.0
+FEATURE_CLIP = 8.0
 """Normalised features are clipped to +-this."""
 
 
@@ -47,13 +47,13 @@ class Policy(nn.Module):
         self.register_buffer("log_std_cap", torch.tensor(float(log_std_cap)))
         for name, value in scaling._asdict().items():
             self.register_buffer(name, value.detach().float().clone())
-        self.first = nn.Linear(FEATURES, HIDDEN[0])
-        self.second = nn.Linear(HIDDEN[0], HIDDEN[1])
-        self.head = nn.Linear(HIDDEN[1], 2 * ACTIONS)
+        self.first = nn.Linear(FEATURE_SIZE, HIDDEN_SIZES[0])
+        self.second = nn.Linear(HIDDEN_SIZES[0], HIDDEN_SIZES[1])
+        self.head = nn.Linear(HIDDEN_SIZES[1], 2 * ACTION_SIZE)
         with torch.no_grad():
             self.head.weight.mul_(0.1)
             self.head.bias.zero_()
-            self.head.bias[ACTIONS:] = -1.0
+            self.head.bias[ACTION_SIZE:] = -1.0
 
     @property
     def scaling(self) -> Scaling:
@@ -63,7 +63,7 @@ class Policy(nn.Module):
     def normalised(self, features: Tensor) -> Tensor:
         """Features (..., 51) from SI units to multiples of their spreads in the record, clipped."""
         scaling = self.scaling
-        return ((features - scaling.feature_mean) / scaling.feature_std).clamp(-CLIP, CLIP)
+        return ((features - scaling.feature_mean) / scaling.feature_std).clamp(-FEATURE_CLIP, FEATURE_CLIP)
 
     def trunk(self, features: Tensor) -> Tensor:
         """Features (..., 51) in SI units to hidden units (..., 100)."""
@@ -75,7 +75,7 @@ class Policy(nn.Module):
 
     def split(self, output: Tensor) -> tuple[Tensor, Tensor]:
         """The four outputs of the last layer (..., 4) as means and capped log standard deviations (..., 2)."""
-        mean, log_std = output[..., :ACTIONS], output[..., ACTIONS:]
+        mean, log_std = output[..., :ACTION_SIZE], output[..., ACTION_SIZE:]
         return mean, self.log_std_cap - nn.functional.softplus(self.log_std_cap - log_std)
 
 
@@ -84,7 +84,7 @@ def head_weights(policy: Policy) -> Tensor:
     return torch.cat((policy.head.weight, policy.head.bias[:, None]), dim=1).flatten()
 
 
-def with_head(hidden: Tensor, weights: Tensor) -> Tensor:
+def apply_heads(hidden: Tensor, weights: Tensor) -> Tensor:
     """The last layer with weights of its own for every scenario.
 
     Args:
@@ -94,5 +94,5 @@ def with_head(hidden: Tensor, weights: Tensor) -> Tensor:
     Returns:
         Outputs, shape (B, M, 4).
     """
-    layer = weights.view(len(weights), 2 * ACTIONS, HIDDEN[-1] + 1)
+    layer = weights.view(len(weights), 2 * ACTION_SIZE, HIDDEN_SIZES[-1] + 1)
     return torch.baddbmm(layer[:, None, :, -1], hidden, layer[:, :, :-1].mT)

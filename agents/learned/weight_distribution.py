@@ -15,14 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
-from agents.learned.networks import HIDDEN
+from agents.learned.networks import HIDDEN_SIZES
 
 Array = NDArray[np.float64]
 
 RADIUS = 0.01
 """How far a search may move each mean, O'Kelly et al.'s."""
-OUTPUTS = ("mean_acceleration", "mean_yaw_rate", "log_std_acceleration", "log_std_yaw_rate")
-WEIGHT_NAMES = tuple(f"{output}_{unit}" for output in OUTPUTS for unit in (*range(HIDDEN[-1]), "bias"))
+HEAD_OUTPUTS = ("mean_acceleration", "mean_yaw_rate", "log_std_acceleration", "log_std_yaw_rate")
+WEIGHT_NAMES = tuple(f"{output}_{unit}" for output in HEAD_OUTPUTS for unit in (*range(HIDDEN_SIZES[-1]), "bias"))
 """Names of the 404 weights, in the order of `head_weights`: each output's 100 weights, then its bias."""
 
 

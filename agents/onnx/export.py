@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from agents.onnx.ego import KEY, OnnxEgo
 from agents.sb3.saved_ego import SavedEgo
 
-TOLERANCE = 1e-5
+ACTION_TOLERANCE = 1e-5
 """Largest difference of an action that an export may make."""
 TICKS, BATCHES = 20, (1, 7, 64)
 
@@ -116,15 +116,19 @@ def export_onnx(ego: SavedEgo, path: Path, seed: int = 0) -> Exported:
     space = ego.observation_space
     if not isinstance(space, spaces.Box) or (ego.frames is not None and (ego.frames[1] or len(space.shape) != 1)):
         raise ValueError(f"Cannot export a policy that observes {space}; expected one Box of numbers.")
-    described = {"algorithm": ego.algorithm, "observation": list(space.shape), "action": _described(ego.action_space)}
+    described = {
+        "algorithm": ego.algorithm,
+        "observation": list(space.shape),
+        "action": _space_record(ego.action_space),
+    }
     draft = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         _trace(ego, draft)
         model = onnx.load(str(draft))
         model.metadata_props.add(key=KEY, value=json.dumps(described))
         onnx.save(model, str(draft))
-        difference, count = compare(ego, OnnxEgo(draft), np.random.default_rng(seed))
-        if not difference <= TOLERANCE:
+        difference, count = max_action_difference(ego, OnnxEgo(draft), np.random.default_rng(seed))
+        if not difference <= ACTION_TOLERANCE:
             raise ValueError(f"The exported graph acts otherwise, by up to {difference:.2g}; nothing was written.")
         draft.replace(path)
     finally:
@@ -133,7 +137,7 @@ def export_onnx(ego: SavedEgo, path: Path, seed: int = 0) -> Exported:
 
 
 def _trace(ego: SavedEgo, path: Path) -> None:
-    """Write the graph, traced on zeros; the tracer is fast, and whatever it may get wrong is found by `compare`."""
+    """Write the graph, traced on zeros; `max_action_difference` finds what the tracer may get wrong."""
     graph, space = _Graph(ego).eval(), ego.observation_space
     memory = graph.memory(space, 2)
     names = [f"memory_{part}" for part in range(len(memory))]
@@ -154,13 +158,13 @@ def _trace(ego: SavedEgo, path: Path) -> None:
             raise ValueError(f"Cannot export a policy of class {type(ego.model.policy).__name__}: {error}") from error
 
 
-def _described(space: Any) -> dict[str, Any]:
+def _space_record(space: Any) -> dict[str, Any]:
     if isinstance(space, spaces.Discrete):
         return {"n": int(space.n)}
     return {"low": space.low.tolist(), "high": space.high.tolist()}
 
 
-def compare(policy: Any, other: Any, rng: np.random.Generator) -> tuple[float, int]:
+def max_action_difference(policy: Any, other: Any, rng: np.random.Generator) -> tuple[float, int]:
     """The largest difference between two egos' actions on random observations, memories carried, and their number.
 
     Args:

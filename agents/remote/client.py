@@ -11,9 +11,9 @@ from urllib.parse import parse_qsl
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.remote import protocol as wire
-from agents.remote.protocol import Malformed, Message
-from agents.remote.request_handler import read_space
+from agents.remote import protocol
+from agents.remote.protocol import MalformedMessage, Message
+from agents.remote.request_handler import decode_space
 from rare_envs.egos.faults import EgoGone, NoAnswer
 from rare_envs.sensors.kinds import batch_size
 
@@ -25,11 +25,11 @@ MOST_NAME = 100
 """Letters of an ego's name that are kept."""
 
 
-class Lost(Exception):
+class LinkError(Exception):
     """No answer: the other side is silent, or the connection broke."""
 
 
-class Silent(Lost):
+class NoReply(LinkError):
     """No answer in time, or its process has died: perhaps because of what it was asked."""
 
 
@@ -62,7 +62,7 @@ class Link(Protocol):
         """End it."""
 
 
-def read_settings(spec: str) -> tuple[str, dict[str, float]]:
+def parse_address(spec: str) -> tuple[str, dict[str, float]]:
     """An address and the time-outs behind it, as in "tcp://127.0.0.1:5555?timeout=10&patience=30".
 
     Raises:
@@ -128,15 +128,15 @@ class RemoteEgo:
         self._ended: list[int] = []
         try:
             hello = self._connect()
-            self.observation_space = read_space(hello.get("observation"))
-            self.action_space = read_space(hello.get("action"))
+            self.observation_space = decode_space(hello.get("observation"))
+            self.action_space = decode_space(hello.get("action"))
         except RemoteError as error:
             link.close()
             raise ValueError(f"The ego at {link.where} refuses: {error}") from error
         except BaseException:
             link.close()
             raise
-        self._spaces = _spaces(hello)
+        self._spaces = _declared_spaces(hello)
         self.deterministic = None if hello.get("deterministic") is None else bool(hello["deterministic"])
         self.name = str(hello.get("name", "ego"))[:MOST_NAME]
 
@@ -171,7 +171,7 @@ class RemoteEgo:
         while self._ended and self._connected:  # batches with a memory that nobody refers to any more
             try:
                 self._ask({"type": "end", "session": self._ended.pop()})
-            except (Lost, Malformed, RemoteError):
+            except (LinkError, MalformedMessage, RemoteError):
                 self._connected = False
         if batch in self._spare:
             return self._spare[batch]
@@ -189,11 +189,11 @@ class RemoteEgo:
                     self._reconnect()
                 self._restore(session)
                 reply = self._send_act(session, session.step, observation, start)
-                action = wire.unpack_array(reply.get("action"))
-            except Silent as silent:
+                action = protocol.unpack_array(reply.get("action"))
+            except NoReply as silent:
                 self._connected, self._suspected = False, max(self._suspected, session.batch)
                 raise NoAnswer(f"The ego at {self._link.where}: {silent}.") from silent
-            except (Lost, Malformed) as lost:
+            except (LinkError, MalformedMessage) as lost:
                 self._connected, why = False, str(lost)
                 continue
             except RemoteError as error:
@@ -224,10 +224,10 @@ class RemoteEgo:
             "type": "act",
             "session": session.number,
             "step": step,
-            "observation": wire.pack_observation(observation),
+            "observation": protocol.pack_observation(observation),
         }
         if start is not None:
-            message["start"] = wire.pack_array(start)
+            message["start"] = protocol.pack_array(start)
         begun = time.monotonic()
         reply = self._ask(message, self._time_for(session.batch))
         self._longest, self._warm = max(self._longest, time.monotonic() - begun), True
@@ -257,8 +257,8 @@ class RemoteEgo:
     def _ask(self, message: Message, timeout: float | None = None) -> Message:
         """The answer to a message, if it is none of an error."""
         number = next(self._ids)
-        content = self._link.ask(wire.pack({**message, "id": number}), timeout or self._timeout)
-        return self._checked(wire.unpack(content), number)
+        content = self._link.ask(protocol.pack({**message, "id": number}), timeout or self._timeout)
+        return self._checked(protocol.unpack(content), number)
 
     @staticmethod
     def _checked(reply: Message, number: int) -> Message:
@@ -267,7 +267,7 @@ class RemoteEgo:
             error.code = reply.get("code")  # type: ignore[attr-defined]
             raise error
         if reply.get("id") != number:
-            raise Malformed(f"an answer to {reply.get('id')!r}, expected one to {number}")
+            raise MalformedMessage(f"an answer to {reply.get('id')!r}, expected one to {number}")
         return reply
 
     def _connect(self) -> Message:
@@ -278,15 +278,15 @@ class RemoteEgo:
             number = next(self._ids)
             left = max(deadline - time.monotonic(), 0.05)
             try:
-                greeting = {"type": "hello", "protocol": wire.PROTOCOL, "client": "rare-envs", "id": number}
+                greeting = {"type": "hello", "protocol": protocol.PROTOCOL, "client": "rare-envs", "id": number}
                 reply = self._checked(self._link.hello(greeting, min(_HELLO_EVERY, left)), number)
                 break
-            except Lost as lost:
+            except LinkError as lost:
                 why = str(lost)
             if time.monotonic() >= deadline:
                 raise EgoGone(f"No ego at {self._link.where} within {self._patience:g} s: {why}.")
-        if reply.get("protocol") != wire.PROTOCOL:
-            raise RemoteError(f"it speaks protocol {reply.get('protocol')!r}, expected {wire.PROTOCOL}")
+        if reply.get("protocol") != protocol.PROTOCOL:
+            raise RemoteError(f"it speaks protocol {reply.get('protocol')!r}, expected {protocol.PROTOCOL}")
         self._epoch += 1
         self._connected, self._warm = True, False
         return reply
@@ -299,9 +299,9 @@ class RemoteEgo:
         """
         try:
             hello = self._connect()
-        except (RemoteError, Malformed) as error:
+        except (RemoteError, MalformedMessage) as error:
             raise EgoGone(f"The ego at {self._link.where} went away, and what is there now refuses: {error}") from error
-        if _spaces(hello) != self._spaces:
+        if _declared_spaces(hello) != self._spaces:
             raise EgoGone(f"The ego at {self._link.where} went away, and one with other spaces is there now.")
 
     def close(self) -> None:
@@ -309,6 +309,6 @@ class RemoteEgo:
         self._link.close()
 
 
-def _spaces(hello: Message) -> tuple[Any, Any]:
+def _declared_spaces(hello: Message) -> tuple[Any, Any]:
     """What an ego says that it observes and how it acts."""
     return hello.get("observation"), hello.get("action")

@@ -28,7 +28,7 @@ _MOST_AXES = 5
 Message = dict[str, Any]
 
 
-class Malformed(ValueError):
+class MalformedMessage(ValueError):
     """A message that is not of the protocol's form."""
 
 
@@ -45,13 +45,13 @@ def unpack(content: bytes) -> Message:
         Malformed: They are no msgpack map with text for keys, or too many.
     """
     if len(content) > MAX_BYTES:
-        raise Malformed(f"a message of {len(content)} bytes, more than {MAX_BYTES}")
+        raise MalformedMessage(f"a message of {len(content)} bytes, more than {MAX_BYTES}")
     try:
         message = msgpack.unpackb(content, raw=False, strict_map_key=True, max_bin_len=len(content), **_LIMITS)
     except Exception as error:  # msgpack raises many kinds
-        raise Malformed(f"no msgpack: {type(error).__name__}: {error}") from error
+        raise MalformedMessage(f"no msgpack: {type(error).__name__}: {error}") from error
     if not isinstance(message, dict) or not all(isinstance(key, str) for key in message):
-        raise Malformed("no map from text")
+        raise MalformedMessage("no map from text")
     return message
 
 
@@ -68,7 +68,7 @@ def pack_array(values: NDArray[Any]) -> Message:
     elif np.issubdtype(values.dtype, np.floating):
         values = values.astype("<f8" if values.dtype == np.float64 else "<f4")
     if values.dtype.str not in DTYPES:
-        raise Malformed(f"an array of {values.dtype}, expected numbers")
+        raise MalformedMessage(f"an array of {values.dtype}, expected numbers")
     return {"dtype": values.dtype.str, "shape": list(values.shape), "data": values.tobytes()}
 
 
@@ -79,14 +79,14 @@ def unpack_array(given: Any) -> NDArray[Any]:
         Malformed: It is not of that form, or dtype, shape and bytes do not go together.
     """
     if not isinstance(given, dict) or set(given) != {"dtype", "shape", "data"}:
-        raise Malformed("an array is a map of dtype, shape and data")
+        raise MalformedMessage("an array is a map of dtype, shape and data")
     dtype, shape, data = given["dtype"], given["shape"], given["data"]
     if dtype not in DTYPES:
-        raise Malformed(f"dtype {dtype!r}, expected one of {', '.join(DTYPES)}")
+        raise MalformedMessage(f"dtype {dtype!r}, expected one of {', '.join(DTYPES)}")
     if not is_shape(shape):
-        raise Malformed(f"shape {shape!r:.100}")
+        raise MalformedMessage(f"shape {shape!r:.100}")
     if not isinstance(data, bytes) or len(data) != math.prod(shape) * np.dtype(dtype).itemsize:
-        raise Malformed(f"data do not fill shape {shape} of {dtype}")
+        raise MalformedMessage(f"data do not fill shape {shape} of {dtype}")
     return np.frombuffer(bytearray(data), dtype=dtype).reshape(shape)  # a bytearray, so that it can be written to
 
 
@@ -106,11 +106,11 @@ def unpack_observation(given: Any, batch: int) -> Any:
     named = isinstance(given, dict) and set(given) == {"parts"}
     parts = given["parts"] if named else {"": given}
     if not isinstance(parts, dict) or not parts or not all(isinstance(name, str) for name in parts):
-        raise Malformed("parts is a map from names to arrays")
+        raise MalformedMessage("parts is a map from names to arrays")
     found = {name: unpack_array(part) for name, part in parts.items()}
     for part in found.values():
         if part.ndim < 2 or len(part) != batch:
-            raise Malformed(f"expected observations of {batch} rows, got shape {part.shape}")
+            raise MalformedMessage(f"expected observations of {batch} rows, got shape {part.shape}")
     return found if named else found[""]
 
 

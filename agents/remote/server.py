@@ -9,7 +9,7 @@ from typing import Any
 import zmq
 
 from agents.remote.protocol import MAX_BYTES
-from agents.remote.request_handler import Answerer
+from agents.remote.request_handler import RequestHandler
 
 POLL = 100
 """How often the server looks whether it is to stop [ms]."""
@@ -41,7 +41,7 @@ class EgoServer:
         """
         if not is_loopback(bind) and not secret:
             raise ValueError(f"Listening on {bind!r} lets others in: set a shared secret, or bind to 127.0.0.1.")
-        self._answerer = Answerer(ego, name, secret or None)
+        self._answerer = RequestHandler(ego, name, secret or None)
         self._stop = threading.Event()
         self._context = zmq.Context()
         self._socket = self._context.socket(zmq.ROUTER)

@@ -10,11 +10,11 @@ import subprocess
 import sys
 import time
 
-from agents.remote import protocol as wire
-from agents.remote.client import RemoteEgo, Silent, read_settings
+from agents.remote import protocol
+from agents.remote.client import NoReply, RemoteEgo, parse_address
 from agents.remote.protocol import Message
 
-START = 60.0
+LOAD_TIMEOUT = 60.0
 """Seconds that a process may take to load its ego."""
 _SIZE = struct.Struct(">I")
 
@@ -50,7 +50,7 @@ class ChildLink:
 
     def hello(self, greeting: Message, timeout: float) -> Message:
         """Say hello, and wait until the ego is loaded."""
-        return wire.unpack(self.ask(wire.pack(greeting), max(timeout, START)))
+        return protocol.unpack(self.ask(protocol.pack(greeting), max(timeout, LOAD_TIMEOUT)))
 
     def ask(self, content: bytes, timeout: float) -> bytes:
         """Send a message and wait for its answer."""
@@ -62,11 +62,11 @@ class ChildLink:
             (size,) = _SIZE.unpack(self._receive(_SIZE.size, deadline))
             return self._receive(size, deadline)
         except TimeoutError as error:
-            raise Silent(f"no answer within {timeout:.3g} s") from error
+            raise NoReply(f"no answer within {timeout:.3g} s") from error
         except (OSError, EOFError) as error:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._process.wait(1.0)
-            raise Silent(f"its process ended (exit status {self._process.returncode})") from error
+            raise NoReply(f"its process ended (exit status {self._process.returncode})") from error
 
     def _receive(self, size: int, deadline: float) -> bytes:
         assert self._socket is not None
@@ -104,5 +104,5 @@ def isolate(spec: str, algo: str | None = None, trust: bool = False) -> RemoteEg
         ValueError: It cannot be loaded there.
         EgoGone: Its process does not stay alive.
     """
-    address, settings = read_settings(spec)
+    address, settings = parse_address(spec)
     return RemoteEgo(ChildLink(address, algo, trust), **settings)

@@ -10,9 +10,9 @@ import time
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
-from agents.remote import protocol as wire
-from agents.remote.client import Lost, RemoteEgo, Silent, read_settings
-from agents.remote.protocol import Malformed, Message
+from agents.remote import protocol
+from agents.remote.client import LinkError, NoReply, RemoteEgo, parse_address
+from agents.remote.protocol import MalformedMessage, Message
 
 SECRET = "RARE_ENVS_SECRET"
 """Environment variable with the shared secret; on a command line others could read it."""
@@ -46,7 +46,7 @@ class ZmqLink:
         self._socket = self._context.socket(zmq.DEALER)
         self._socket.setsockopt(zmq.LINGER, 0)
         self._socket.setsockopt(zmq.RECONNECT_IVL, 100)
-        self._socket.setsockopt(zmq.MAXMSGSIZE, wire.MAX_BYTES)
+        self._socket.setsockopt(zmq.MAXMSGSIZE, protocol.MAX_BYTES)
         self._monitor = self._socket.get_monitor_socket(zmq.EVENT_DISCONNECTED)
         try:
             self._socket.connect(self._address)
@@ -56,19 +56,19 @@ class ZmqLink:
 
     def hello(self, greeting: Message, timeout: float) -> Message:
         """Exchange nonces, from which the key of this connection follows."""
-        nonce = secrets.token_bytes(wire.NONCE)
-        reply = wire.unpack(self.ask(wire.pack({**greeting, "nonce": nonce}), timeout))
+        nonce = secrets.token_bytes(protocol.NONCE)
+        reply = protocol.unpack(self.ask(protocol.pack({**greeting, "nonce": nonce}), timeout))
         if self._secret is not None and reply.get("type") == "hello":
             theirs = reply.get("nonce")
-            if reply.get("client_nonce") != nonce or not isinstance(theirs, bytes) or len(theirs) != wire.NONCE:
-                raise Malformed("a hello with other nonces")
-            self._key = wire.session_key(self._secret, nonce, theirs)
+            if reply.get("client_nonce") != nonce or not isinstance(theirs, bytes) or len(theirs) != protocol.NONCE:
+                raise MalformedMessage("a hello with other nonces")
+            self._key = protocol.session_key(self._secret, nonce, theirs)
         return reply
 
     def ask(self, content: bytes, timeout: float) -> bytes:
         """Send a message and wait for its answer."""
         assert self._socket is not None and self._monitor is not None
-        frames = [content] if self._key is None else [wire.seal(self._key, wire.ASK, content), content]
+        frames = [content] if self._key is None else [protocol.seal(self._key, protocol.ASK, content), content]
         self._socket.send_multipart([b"", *frames])
         poller, deadline = zmq.Poller(), time.monotonic() + timeout
         poller.register(self._socket, zmq.POLLIN)
@@ -78,19 +78,19 @@ class ZmqLink:
             if self._socket in ready:
                 return self._content(self._socket.recv_multipart())
             if not ready:
-                raise Silent(f"no answer within {timeout:.3g} s")
+                raise NoReply(f"no answer within {timeout:.3g} s")
             recv_monitor_message(self._monitor)
-            raise Lost("the connection broke")
+            raise LinkError("the connection broke")
 
     def _content(self, frames: list[bytes]) -> bytes:
         """An answer without envelope and seal."""
         frames = frames[1:] if len(frames) > 1 and frames[0] == b"" else frames
         if self._key is None:
             if len(frames) != 1:
-                raise Malformed(f"an answer of {len(frames)} frames; it may want a secret: set {SECRET}")
+                raise MalformedMessage(f"an answer of {len(frames)} frames; it may want a secret: set {SECRET}")
             return frames[0]
-        if len(frames) != 2 or not wire.sealed(self._key, wire.ANSWER, *frames):
-            raise Malformed(f"an answer without the right seal; both sides need the same secret ({SECRET})")
+        if len(frames) != 2 or not protocol.sealed(self._key, protocol.ANSWER, *frames):
+            raise MalformedMessage(f"an answer without the right seal; both sides need the same secret ({SECRET})")
         return frames[1]
 
     def _close_socket(self) -> None:
@@ -119,5 +119,5 @@ def connect(spec: str) -> RemoteEgo:
         EgoGone: Nobody is there.
         ValueError: The address is none, or somebody else is there.
     """
-    address, settings = read_settings(spec)
+    address, settings = parse_address(spec)
     return RemoteEgo(ZmqLink(address, os.environ.get(SECRET, "").encode() or None), **settings)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 TRUSTED = "it is opened as Stable-Baselines3 does, and whatever code is in it runs"
 """What trust means."""
-ADVICE = (
+TRUST_ADVICE = (
     "others may have put something else there: copy it to a folder of your own, or take away their right to write "
     f"(chmod o-w). With --trust (trust=True) it is opened nevertheless; mind that {TRUSTED}, where otherwise only what "
     "is known to be harmless is made of it"
@@ -22,11 +22,11 @@ def check_origin(*files: Path | None) -> None:
     Raises:
         ValueError: One of them is doubtful; the message says why and what to do.
     """
-    if reasons := doubts(*files):
-        raise ValueError(f"Will not open it: {'; '.join(reasons)}; {ADVICE}.")
+    if reasons := find_origin_risks(*files):
+        raise ValueError(f"Will not open it: {'; '.join(reasons)}; {TRUST_ADVICE}.")
 
 
-def doubts(*files: Path | None) -> list[str]:
+def find_origin_risks(*files: Path | None) -> list[str]:
     """Reasons not to open files; empty if there are none. Files that do not exist give none.
 
     A file is doubtful if everybody may write to it or put another in its place, in its folder or one above. Where
@@ -34,11 +34,11 @@ def doubts(*files: Path | None) -> list[str]:
     """
     if os.name != "posix":  # others' rights are not in the mode
         return []
-    found = [doubt for file in files if file is not None and file.exists() for doubt in _doubts(file.resolve())]
+    found = [doubt for file in files if file is not None and file.exists() for doubt in _find_risks(file.resolve())]
     return list(dict.fromkeys(found))
 
 
-def _doubts(path: Path) -> list[str]:
+def _find_risks(path: Path) -> list[str]:
     status = path.stat()
     found = [f"{str(path)!r} is writable by everybody"] if status.st_mode & stat.S_IWOTH else []
     for folder in path.parents:

@@ -58,12 +58,12 @@ class _Reader(pickle.Unpickler):
             for package, bases in CLASSES.items():
                 if module == package or module.startswith(f"{package}."):
                     found = getattr(importlib.import_module(module), name, None)
-                    if isinstance(found, type) and issubclass(found, tuple(map(_named, bases))):
+                    if isinstance(found, type) and issubclass(found, tuple(map(_import_class, bases))):
                         return found
         raise ForeignObject(f"it asks for {module}.{name}, which may run code")
 
 
-def _named(path: str) -> type:
+def _import_class(path: str) -> type:
     module, _, name = path.rpartition(".")
     found: type = getattr(importlib.import_module(module), name)
     return found

@@ -82,7 +82,7 @@ class SavedEgo:
         return actions, state
 
 
-def load_saved(path: Path, algo: str | None, trust: bool = False) -> SavedEgo:
+def load_saved_ego(path: Path, algo: str | None, trust: bool = False) -> SavedEgo:
     """Read a `.zip`: what it says of itself first, then its weights, then its statistics.
 
     Args:
@@ -127,7 +127,7 @@ def _load_model(algorithm: Any, name: str, header: Mapping[str, Any], path: Path
     try:
         content = path.read_bytes()  # once, so that what is loaded is what was looked at
         if not trust:
-            given = {**opened_objects(read_header(io.BytesIO(content), str(path)), set(given)), **given}
+            given = {**open_objects(read_header(io.BytesIO(content), str(path)), set(given)), **given}
         return algorithm.load(io.BytesIO(content), device="cpu", custom_objects=given)
     except ForeignObject as error:
         raise ValueError(f"Will not load {str(path)!r}: {one_line(error).partition(': ')[2]}; {TRUST}.") from error
@@ -140,7 +140,7 @@ def _load_model(algorithm: Any, name: str, header: Mapping[str, Any], path: Path
         ) from error
 
 
-def opened_objects(header: Mapping[str, Any], without: set[str]) -> dict[str, Any]:
+def open_objects(header: Mapping[str, Any], without: set[str]) -> dict[str, Any]:
     """The pickled entries of a model's settings, opened safely.
 
     Raises:

@@ -23,7 +23,7 @@ SEES = "camera+speed"
 """What it observes."""
 LAG = 5
 """Ticks of 0.1 s that the earlier picture is old."""
-SLOW = 5.0
+MIN_STEERING_SPEED = 5.0
 """Below this speed [m/s] a turn steers as at it: the turn of a path of given curvature goes to 0 with the speed."""
 SPEED_SCALE = EGO_FEATURES[0].scale
 """[m/s] of an observed speed of 1."""
@@ -100,7 +100,7 @@ def recall(
 
 def to_actions(outputs: Tensor, speed: Tensor) -> Tensor:
     """Actions in [-1, 1] for the network's outputs (B, 2) at own speeds [m/s] (B,)."""
-    steering = steering_for(TURN * outputs[:, 1], speed.clamp(min=SLOW))
+    steering = steering_for(TURN * outputs[:, 1], speed.clamp(min=MIN_STEERING_SPEED))
     return torch.stack((ACCELERATION / MAX_ACCELERATION * outputs[:, 0], steering / MAX_STEERING), dim=1).clamp(-1, 1)
 
 

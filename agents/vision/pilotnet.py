@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 HEIGHT, WIDTH = 66, 200
 """Of the pictures, in pixels."""
-OUTPUTS = 2
+OUTPUT_SIZE = 2
 """Acceleration and turn."""
 UNITS = 50
 """Of the layer that `PilotNet.hidden` gives."""
@@ -55,7 +55,7 @@ class PilotNet(nn.Module):
         self.first = nn.Linear(64 * 18, 100)
         self.second = nn.Linear(100 + 1, UNITS)
         self.last = nn.Linear(UNITS, 10)
-        self.head = nn.Linear(10, OUTPUTS)
+        self.head = nn.Linear(10, OUTPUT_SIZE)
         for layer in (*self.convolutions, self.first, self.second, self.last):
             nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
             nn.init.zeros_(layer.bias)

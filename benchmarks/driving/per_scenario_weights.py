@@ -13,9 +13,9 @@ import typer
 from torch import Tensor
 
 from agents import LearnedDriver
-from agents.learned.coloured_noise import Colour
-from agents.learned.driver import with_weights
-from agents.learned.networks import ACTIONS, FEATURES, HEAD, Policy, Scaling, head_weights
+from agents.learned.coloured_noise import AutoregressiveNoise
+from agents.learned.driver import replace_head
+from agents.learned.networks import ACTION_SIZE, FEATURE_SIZE, HEAD_SIZE, Policy, Scaling, head_weights
 from benchmarks.simulation.throughput import seconds
 
 FLOOR = 20.0
@@ -24,13 +24,15 @@ FLOOR = 20.0
 def compare(batch: int, vehicles: int, rounds: int = 20) -> dict[str, float]:
     """Times [ms] of one tick both ways, their ratio, and the largest difference of an action."""
     generator = torch.Generator().manual_seed(0)
-    scaling = Scaling(torch.zeros(FEATURES), torch.ones(FEATURES), torch.zeros(ACTIONS), torch.ones(ACTIONS))
-    driver = LearnedDriver(Policy(scaling).requires_grad_(False), colour=Colour((0.95, 0.95)))
-    weights = head_weights(driver.policy) + 0.01 * torch.randn(batch, HEAD, generator=generator)
-    drivers = [LearnedDriver(with_weights(driver.policy, row), colour=driver.colour) for row in weights]
-    features = torch.randn(batch, vehicles, FEATURES, generator=generator)
-    innovations = torch.randn(batch, vehicles, ACTIONS, generator=generator)
-    memory = driver.begin(torch.randn(batch, vehicles, ACTIONS, 2, generator=generator))
+    scaling = Scaling(
+        torch.zeros(FEATURE_SIZE), torch.ones(FEATURE_SIZE), torch.zeros(ACTION_SIZE), torch.ones(ACTION_SIZE)
+    )
+    driver = LearnedDriver(Policy(scaling).requires_grad_(False), colour=AutoregressiveNoise((0.95, 0.95)))
+    weights = head_weights(driver.policy) + 0.01 * torch.randn(batch, HEAD_SIZE, generator=generator)
+    drivers = [LearnedDriver(replace_head(driver.policy, row), colour=driver.colour) for row in weights]
+    features = torch.randn(batch, vehicles, FEATURE_SIZE, generator=generator)
+    innovations = torch.randn(batch, vehicles, ACTION_SIZE, generator=generator)
+    memory = driver.begin(torch.randn(batch, vehicles, ACTION_SIZE, 2, generator=generator))
 
     def at_once() -> Tensor:
         return driver.act(features, weights, innovations, memory)[0]

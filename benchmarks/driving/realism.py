@@ -25,7 +25,7 @@ import typer
 from torch import Tensor
 
 from agents import LearnedDriver, load_driver, read_driver
-from agents.learned.networks import ACTIONS
+from agents.learned.networks import ACTION_SIZE
 from agents.learned.rule_driver import RuleDriver
 from benchmarks.driving.realism_figures import draw, tables
 from benchmarks.driving.realism_rows import Effort, Judge, accuracy, boxes, drawn, noisy, on_highway, people
@@ -40,7 +40,7 @@ from training.imitation.traffic.recording import Recording, stack
 
 def constant_velocity(features: Tensor, memory: Tensor | None) -> tuple[Tensor, Tensor | None]:
     """Neither speed nor heading changes."""
-    return features.new_zeros(*features.shape[:2], ACTIONS), None
+    return features.new_zeros(*features.shape[:2], ACTION_SIZE), None
 
 
 def by_rule(features: Tensor, memory: Tensor | None) -> tuple[Tensor, Tensor | None]:

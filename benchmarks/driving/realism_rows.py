@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from agents import LearnedDriver
-from agents.learned.networks import ACTIONS, HIDDEN
+from agents.learned.networks import ACTION_SIZE, HIDDEN_SIZES
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
 from training.data.ngsim_tables import US101_EDGES
 from training.imitation.evaluation.behaviour import Act, behaviour_of, drive, sampled
@@ -123,7 +123,7 @@ def moved(driver: LearnedDriver, features: Tensor, draws: int) -> Iterator[tuple
         yield radius, "corner", list(mean + radius * inside.sign())
         for output, name in enumerate(("acceleration", "yaw rate", "spread of acceleration", "spread of yaw rate")):
             for sign in (1.0, -1.0):
-                direction = torch.zeros(2 * ACTIONS, HIDDEN[-1] + 1)
+                direction = torch.zeros(2 * ACTION_SIZE, HIDDEN_SIZES[-1] + 1)
                 direction[output] = sign * signs
                 yield radius, f"{name} {'+' if sign > 0 else '-'}", [mean + radius * direction.flatten()]
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import samplers
-from agents.loading import kind_of
+from agents.loading import find_ego_kind
 from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.study.columns import SHOWN, columns_of
 from rare_envs.study.errors import BadInput, output_folder
@@ -83,7 +83,7 @@ def resume(
             question = Question(**{**journal.question, "trust": trust})
         except TypeError as error:
             raise BadInput(f"Cannot take up the run in {str(folder)!r}: {error}") from error
-        if ego is not None and {kind_of(ego), kind_of(question.ego)} != {"remote"}:
+        if ego is not None and {find_ego_kind(ego), find_ego_kind(question.ego)} != {"remote"}:
             raise BadInput(f"Expected --ego for one whose address has changed only; the run has {question.ego!r}.")
         question = replace(question, ego=ego or question.ego, on_error=on_error or question.on_error)
         return _run(folder, prepare(question), journal, progress)

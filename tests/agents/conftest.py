@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from agents.learned.networks import FEATURES, HEAD, Policy, Scaling
+from agents.learned.networks import FEATURE_SIZE, HEAD_SIZE, Policy, Scaling
 from agents.learned.weight_distribution import WeightDistribution
 
 
@@ -26,8 +26,8 @@ def generator() -> torch.Generator:
 def policy(generator: torch.Generator) -> Policy:
     """Random everywhere, the scaling included, so that nothing can be mixed up unnoticed."""
     scaling = Scaling(
-        torch.randn(FEATURES, generator=generator),
-        0.5 + torch.rand(FEATURES, generator=generator),
+        torch.randn(FEATURE_SIZE, generator=generator),
+        0.5 + torch.rand(FEATURE_SIZE, generator=generator),
         torch.tensor([0.1, 0.002]),
         torch.tensor([0.8, 0.02]),
     )
@@ -40,13 +40,13 @@ def policy(generator: torch.Generator) -> Policy:
 
 @pytest.fixture
 def features(generator: torch.Generator) -> Callable[[int, int], torch.Tensor]:
-    return lambda batch, vehicles: 2.0 * torch.randn(batch, vehicles, FEATURES, generator=generator)
+    return lambda batch, vehicles: 2.0 * torch.randn(batch, vehicles, FEATURE_SIZE, generator=generator)
 
 
 @pytest.fixture
 def law(rng: np.random.Generator) -> WeightDistribution:
     """A law of 404 weights with as sparse a precision as a graphical lasso gives."""
-    factor = np.diag(rng.uniform(100.0, 500.0, HEAD))
-    rows, columns = rng.integers(HEAD, size=(2, 400))
+    factor = np.diag(rng.uniform(100.0, 500.0, HEAD_SIZE))
+    rows, columns = rng.integers(HEAD_SIZE, size=(2, 400))
     factor[rows, columns] += 50.0 * rng.standard_normal(400)
-    return WeightDistribution(rng.normal(0.0, 0.1, HEAD), factor @ factor.T)
+    return WeightDistribution(rng.normal(0.0, 0.1, HEAD_SIZE), factor @ factor.T)

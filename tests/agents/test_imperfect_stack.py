@@ -13,7 +13,7 @@ import torch
 import rare_envs
 import samplers
 from agents import load_ego
-from agents.imperfect_stack import EACH, OWN, NoisyDriver, NoisyEgo, Stack
+from agents.imperfect_stack import ERRORS_PER_VEHICLE, OWN_ERRORS, NoisyDriver, NoisyEgo, Stack
 from rare_envs.simulation.rollout import drive, rollout
 
 ENV = "rare_envs/CutIn-v0"
@@ -101,7 +101,7 @@ def test_everything_random_is_in_x() -> None:
     other[:, 6:] = around.base.sample(40, np.random.default_rng(2))[:, 6:]
     assert (around.evaluate(other) != f).any()
     plans, size = around.driver.shape
-    assert (plans, size) == (20, OWN + EACH * 2)
+    assert (plans, size) == (20, OWN_ERRORS + ERRORS_PER_VEHICLE * 2)
     assert around.space.names[-1] == "ego_noise"
     assert around.dim == 6 + plans * size == len(around.space.low)
 

@@ -22,7 +22,7 @@ from agents import SavedEgo, load_ego
 from rare_envs import DrivingProblem
 from rare_envs.control.actions import DISCRETE_ACTIONS
 from training import sb3_vec_env, train_ego
-from training.ego_training import RECIPES
+from training.ego_training import HYPERPARAMETERS
 from training.vec_env import BatchedVecEnv, info_row, merge_options
 
 IDS = ("rare_envs/CarFollowing-v0", "rare_envs/CutIn-v0")
@@ -400,7 +400,7 @@ def test_bad_requests_are_refused_before_work(
 def test_every_recipe_is_an_algorithm_of_stable_baselines() -> None:
     import stable_baselines3
 
-    assert all(hasattr(stable_baselines3, name.upper()) for name in RECIPES)
+    assert all(hasattr(stable_baselines3, name.upper()) for name in HYPERPARAMETERS)
 
 
 def test_import_training_is_light() -> None:

@@ -25,12 +25,12 @@ from rare_envs.simulation.world import World
 from rare_envs.traffic.reference_line import Curve
 from rare_envs.traffic.road import Road, i80
 from rare_envs.traffic.state import VEHICLE_LENGTH, State
-from training.egos.nominal_traffic import OrdinaryDrivers, ordinary, starts
+from training.egos.nominal_traffic import OrdinaryDrivers, draw_starts, make_ordinary_traffic
 
 Array = NDArray[np.float64]
 TOP_SPEED = 32.0
 """[m/s]."""
-CURVATURE = 1 / 400
+MAX_CURVATURE = 1 / 400
 """Largest of curved roads [1/m]; the I-80 has about a third."""
 
 
@@ -57,7 +57,7 @@ def _initial(x: Tensor) -> State:
     )
 
 
-def _others(state: State, dt: float) -> Others:
+def _step_others(state: State, dt: float) -> Others:
     """The lead swings around its speed, the vehicle in the next lane keeps its own."""
     swing, length, usual = state.theta.unbind(dim=1)
     speed, x = state.speed[:, 1:], state.x[:, 1:]
@@ -83,19 +83,19 @@ FOLLOWING = Scenario(
     ),
     bases={"any": {"alpha": [1.0] * 8, "beta": [1.0] * 8}},
     initial=_initial,
-    others=_others,
-    driven=lambda state, action, dt: _others(state, dt),
+    others=_step_others,
+    driven=lambda state, action, dt: _step_others(state, dt),
 )
 
 
-def _speeds(n: int, rng: np.random.Generator, spread: float = 4.0) -> tuple[Array, Array]:
+def _draw_speeds(n: int, rng: np.random.Generator, spread: float = 4.0) -> tuple[Array, Array]:
     """Speeds of the ego, one in four of them slow, and speeds near those [m/s]."""
     own = np.where(rng.random(n) < 0.25, rng.uniform(0.0, 6.0, n), rng.uniform(2.0, TOP_SPEED, n))
     return own, np.clip(own + rng.normal(0.0, spread, n), 0.0, TOP_SPEED + 5.0)
 
 
-def _following(n: int, rng: np.random.Generator) -> Array:
-    own, lead = _speeds(n, rng)
+def _draw_following(n: int, rng: np.random.Generator) -> Array:
+    own, lead = _draw_speeds(n, rng)
     gap = np.where(rng.random(n) < 0.15, 200.0, 2.0 + own * rng.uniform(0.3, 3.5, n))
     lead = np.where(gap == 200.0, TOP_SPEED + 10.0, lead)  # soon out of sight
     swing = rng.uniform(0.0, 1.5, n) * (rng.random(n) < 0.6)
@@ -104,61 +104,61 @@ def _following(n: int, rng: np.random.Generator) -> Array:
     return np.column_stack((own, lead, gap, swing, rng.uniform(100, 600, n), side, rng.uniform(-20.0, 60.0, n), other))
 
 
-def _cut_in(n: int, rng: np.random.Generator) -> Array:
-    own, lead = _speeds(n, rng)
+def _draw_cut_in(n: int, rng: np.random.Generator) -> Array:
+    own, lead = _draw_speeds(n, rng)
     cutter = np.clip(own + rng.normal(0.0, 3.0, n), 0.0, 45.0)
     gaps = rng.uniform(2.0, 60.0, n), rng.uniform(5.0, 100.0, n)
     return np.column_stack((own, cutter, lead, *gaps, rng.uniform(3.2, 4.5, n)))
 
 
-def _hard_brake(n: int, rng: np.random.Generator) -> Array:
+def _draw_hard_brake(n: int, rng: np.random.Generator) -> Array:
     own = rng.uniform(3.0, TOP_SPEED, n)
     return np.column_stack((own, 3.0 + own * rng.uniform(0.8, 3.0, n), rng.uniform(0.5, 6.0, n)))
 
 
-def _highway(n: int, rng: np.random.Generator) -> Array:
+def _draw_highway(n: int, rng: np.random.Generator) -> Array:
     return load_base(named("highway")).sample(n, rng)
 
 
-def lessons() -> tuple[Lesson, ...]:
+def make_lessons() -> tuple[Lesson, ...]:
     """All that is taught, the commoner things more often."""
 
     def somewhere(scenario: Scenario) -> Callable[[np.random.Generator], Scenario]:
-        return lambda rng: replace(scenario, road=some_road(rng))
+        return lambda rng: replace(scenario, road=draw_road(rng))
 
     def in_traffic(rng: np.random.Generator) -> Scenario:
         if rng.random() < 1 / 3:
-            return ordinary("traffic", i80(), int(rng.integers(1, 5)))
-        road = some_road(rng, least=3)
+            return make_ordinary_traffic("traffic", i80(), int(rng.integers(1, 5)))
+        road = draw_road(rng, least=3)
         inner = 1 if road.lanes == 3 else int(rng.integers(1, road.lanes - 1))
-        return ordinary("traffic", road, inner)
+        return make_ordinary_traffic("traffic", road, inner)
 
-    following, highway = Lesson(somewhere(FOLLOWING), _following), named("highway")
-    traffic = Lesson(in_traffic, starts, OrdinaryDrivers())
+    following, highway = Lesson(somewhere(FOLLOWING), _draw_following), named("highway")
+    traffic = Lesson(in_traffic, draw_starts, OrdinaryDrivers())
     return (
         traffic,
         following,
-        Lesson(lambda rng: highway, _highway, find_drivers(highway.drivers)),
-        Lesson(somewhere(named("cut_in")), _cut_in),
+        Lesson(lambda rng: highway, _draw_highway, find_drivers(highway.drivers)),
+        Lesson(somewhere(named("cut_in")), _draw_cut_in),
         traffic,
         following,
-        Lesson(somewhere(named("hard_brake")), _hard_brake),
+        Lesson(somewhere(named("hard_brake")), _draw_hard_brake),
     )
 
 
-def some_road(rng: np.random.Generator, least: int = 1) -> Road:
+def draw_road(rng: np.random.Generator, least: int = 1) -> Road:
     """At least so many lanes and at most four, one of which is centred on y = 0, straight in one of three cases."""
     lanes, width = int(rng.integers(least, 5)), float(rng.choice((3.6, 3.75, 4.0)))
     own = int(rng.integers(0, lanes))
     edges = tuple(width * (k - own - 0.5) for k in range(lanes + 1))
     if rng.random() < 1 / 3:
         return Road(edges)
-    curvature = rng.uniform(-CURVATURE, CURVATURE, 7)
+    curvature = rng.uniform(-MAX_CURVATURE, MAX_CURVATURE, 7)
     curvature -= curvature.mean()  # it comes back to its first direction
     return Road(edges, Curve(80.0, (0.0, *(0.5 * curvature), 0.0)))
 
 
-def begin(lesson: Lesson, rows: int, seconds: float, rng: np.random.Generator) -> tuple[World, Episode]:
+def start_lesson(lesson: Lesson, rows: int, seconds: float, rng: np.random.Generator) -> tuple[World, Episode]:
     """Start a lesson from somewhere in or beside the lane.
 
     Args:
@@ -173,17 +173,17 @@ def begin(lesson: Lesson, rows: int, seconds: float, rng: np.random.Generator) -
     scenario = lesson.scenario(rng)
     world = World(scenario, horizon=seconds, drivers=lesson.drivers, observation=SEES, weather=True)
     own = lesson.sample(rows, rng)
-    parts = [own, _weather(rows, rng)]
+    parts = [own, _draw_weather(rows, rng)]
     if world.drivers is not None and world.drivers.weights is not None:
         parts.append(world.drivers.weights.sample(rows, rng))
     parts.append(rng.standard_normal((rows, world.draws + world.keys)))
     start = world.start(torch.from_numpy(np.concatenate(parts, axis=1)).float())
-    state = _elsewhere(start.state, scenario, rng)
+    state = _displace_ego(start.state, scenario, rng)
     perception = look(state, scenario.road) if world.sees else None
     return world, world.first(state, perception, start.background_state, start.camera_context)
 
 
-def _weather(n: int, rng: np.random.Generator) -> Array:
+def _draw_weather(n: int, rng: np.random.Generator) -> Array:
     """Half of the days are clear; of the others the fog is thicker than usual."""
     fog = np.exp(rng.uniform(math.log(5e-5), math.log(1e-2), (n, 1)))
     some = np.concatenate((fog, SUN_LAW.sample(n, rng), SENSOR_NOISE_LAW.sample(n, rng)), axis=1)
@@ -191,7 +191,7 @@ def _weather(n: int, rng: np.random.Generator) -> Array:
     return np.where(rng.random((n, 1)) < 0.5, clear, some)
 
 
-def _elsewhere(state: State, scenario: Scenario, rng: np.random.Generator) -> State:
+def _displace_ego(state: State, scenario: Scenario, rng: np.random.Generator) -> State:
     """The ego off the middle of its lane and not quite along it; behind the others in any lane on the highway."""
     n = len(state.x)
     y = state.y[:, 0].double().numpy() + np.clip(rng.normal(0.0, 0.5, n), -1.4, 1.4)

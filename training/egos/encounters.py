@@ -21,17 +21,17 @@ from rare_envs.simulation.rollout import drive
 from rare_envs.simulation.world import World
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
 from training.data.scenes import Scene
-from training.egos.nominal_driving import draw, world_of
+from training.egos.nominal_driving import draw_inputs, make_world
 from training.egos.nominal_traffic import CASES
 
 APART = 1500.0
 """Distance of neighbouring encounters at their start [m]."""
-VEHICLES = 39
+SCENE_VEHICLES = 39
 """Most vehicles of a scene."""
 
 
 @dataclass(frozen=True)
-class Kind:
+class EncounterSpec:
     """Encounters of one kind."""
 
     scenario: str
@@ -45,7 +45,7 @@ class Kind:
     """Parameters that are the same in all."""
 
 
-def encounters(kinds: Sequence[Kind], rng: np.random.Generator) -> list[Scene]:
+def make_scenes(kinds: Sequence[EncounterSpec], rng: np.random.Generator) -> list[Scene]:
     """Scenes full of encounters; every other one is mirrored, since scenarios know one side only.
 
     Args:
@@ -54,26 +54,26 @@ def encounters(kinds: Sequence[Kind], rng: np.random.Generator) -> list[Scene]:
     """
     scenes = []
     for kind in kinds:
-        world = _world(kind)
-        each = VEHICLES // world.scenario.vehicles
-        tracks = _tracks(world, _parameters(kind, world, each * kind.scenes, rng))
+        world = _make_world(kind)
+        each = SCENE_VEHICLES // world.scenario.vehicles
+        tracks = _simulate_tracks(world, _draw_parameters(kind, world, each * kind.scenes, rng))
         for number in range(kind.scenes):
             rows = slice(number * each, (number + 1) * each)
             side = -1.0 if number % 2 else 1.0
             name = f"{kind.scenario} {kind.base or ''} {number}"
-            scenes.append(_scene(name, world, tracks[:, rows], side))
+            scenes.append(_make_scene(name, world, tracks[:, rows], side))
     return scenes
 
 
-def _world(kind: Kind) -> World:
+def _make_world(kind: EncounterSpec) -> World:
     if kind.scenario in CASES:
-        return world_of(CASES[kind.scenario], kind.seconds)
+        return make_world(CASES[kind.scenario], kind.seconds)
     return World(named(kind.scenario), horizon=kind.seconds)
 
 
-def _parameters(kind: Kind, world: World, n: int, rng: np.random.Generator) -> NDArray[np.float64]:
+def _draw_parameters(kind: EncounterSpec, world: World, n: int, rng: np.random.Generator) -> NDArray[np.float64]:
     if kind.scenario in CASES:
-        x = draw(CASES[kind.scenario], world, n, 0, rng)
+        x = draw_inputs(CASES[kind.scenario], world, n, 0, rng)
     else:
         x = np.asarray(load_base(world.scenario, kind.base).sample(n, rng))
     names = [parameter.name for parameter in world.scenario.parameters]
@@ -82,7 +82,7 @@ def _parameters(kind: Kind, world: World, n: int, rng: np.random.Generator) -> N
     return x
 
 
-def _tracks(world: World, x: NDArray[np.float64]) -> NDArray[np.float64]:
+def _simulate_tracks(world: World, x: NDArray[np.float64]) -> NDArray[np.float64]:
     """x, y, heading and speed of everybody with IDM as ego, shape (T, n, N, 4)."""
     with torch.inference_mode():
         states = [episode.state for episode in drive(world, IDM(), torch.from_numpy(x))]
@@ -90,7 +90,7 @@ def _tracks(world: World, x: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(torch.stack(moments).numpy())
 
 
-def _scene(name: str, world: World, tracks: NDArray[np.float64], side: float) -> Scene:
+def _make_scene(name: str, world: World, tracks: NDArray[np.float64], side: float) -> Scene:
     """One scene of some encounters (T, n, N, 4), mirrored for side = -1."""
     road, (ticks, n, vehicles, _) = world.scenario.road, tracks.shape
     place = APART * np.arange(n)[:, None]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from agents.vision.ego import SLOW
+from agents.vision.ego import MIN_STEERING_SPEED
 from agents.vision.pilotnet import ACCELERATION, TURN
 from rare_envs.control.actions import MAX_STEERING
 from rare_envs.control.idm import IDM
@@ -15,15 +15,16 @@ OFFSET_TIME, HEADING_TIME = 0.6, 0.2
 """[s], as in `rare_envs.control.steering.lane_keeping`."""
 _IDM = IDM(jam_distance=2.0)
 """Treiber, Hennecke and Helbing's (2000) distance at standstill: 1 m, the suite's, leaves nothing to an imitator."""
-TRUTHS = 5
-"""Numbers of `truths`."""
+AUXILIARY_SIZE = 5
+"""Numbers of `auxiliary_targets`."""
 
 
-def expert(episode: Episode) -> Tensor:
+def expert_outputs(episode: Episode) -> Tensor:
     """What the network should say.
 
     IDM behind the lead. Across it is the lane keeping of the suite with the road's curvature fed forward, so that it
-    does not run wide, and gentle at low speed: below `SLOW` the law is that at `SLOW` for the curvature of the path.
+    does not run wide, and gentle at low speed: below `MIN_STEERING_SPEED` it uses that speed for the curvature of the
+    path.
 
     Args:
         episode: B scenarios.
@@ -32,7 +33,7 @@ def expert(episode: Episode) -> Tensor:
         Acceleration and turn in units of `ACCELERATION` and `TURN`, shape (B, 2).
     """
     state, road = episode.state, episode.road
-    speed, heading = state.speed[:, 0].clamp(min=SLOW), state.heading[:, 0]
+    speed, heading = state.speed[:, 0].clamp(min=MIN_STEERING_SPEED), state.heading[:, 0]
     offset = state.y[:, 0] - road.centre_of(state.y[:, 0])
     wanted = torch.asin((-offset / (OFFSET_TIME * speed)).clamp(-0.3, 0.3))
     turn = (wanted - heading) / HEADING_TIME + speed * road.curvature(state.x[:, 0])
@@ -41,7 +42,7 @@ def expert(episode: Episode) -> Tensor:
     return torch.stack((acceleration / ACCELERATION, torch.maximum(torch.minimum(turn, limit), -limit) / TURN), dim=1)
 
 
-def truths(episode: Episode) -> Tensor:
+def auxiliary_targets(episode: Episode) -> Tensor:
     """What a picture shows and the expert goes by, in units of about 1: for a second task in training.
 
     Args:

@@ -17,11 +17,11 @@ from rare_envs.sensors.camera import Weather, take_picture
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.world import World
 from rare_envs.traffic.state import State
-from training.egos.curriculum import begin, lessons
-from training.egos.expert_driver import expert, truths
+from training.egos.curriculum import make_lessons, start_lesson
+from training.egos.expert_driver import auxiliary_targets, expert_outputs
 
 
-class Pictures(NamedTuple):
+class LabelledPictures(NamedTuple):
     """n moments."""
 
     picture: Tensor
@@ -31,18 +31,18 @@ class Pictures(NamedTuple):
     speed: Tensor
     """Own speed [m/s], shape (n,)."""
     wanted: Tensor
-    """What the expert does, as `lane_expert.expert` has it, shape (n, 2)."""
+    """What the expert does, as `training.egos.expert_driver.expert_outputs` has it, shape (n, 2)."""
     truth: Tensor
-    """As `lane_expert.truths` has it, shape (n, 5)."""
+    """As `training.egos.expert_driver.auxiliary_targets` has it, shape (n, 5)."""
 
-    def rows(self, rows: Any) -> Pictures:
+    def rows(self, rows: Any) -> LabelledPictures:
         """Some of them."""
-        return Pictures(*(field[rows] for field in self))
+        return LabelledPictures(*(field[rows] for field in self))
 
 
-def joined(parts: list[Pictures]) -> Pictures:
+def concatenate(parts: list[LabelledPictures]) -> LabelledPictures:
     """All of several."""
-    return Pictures(*(torch.cat(fields) for fields in zip(*parts, strict=True)))
+    return LabelledPictures(*(torch.cat(fields) for fields in zip(*parts, strict=True)))
 
 
 @torch.inference_mode()
@@ -56,7 +56,7 @@ def collect(
     kept: float,
     noise: float,
     rng: np.random.Generator,
-) -> Iterator[Pictures]:
+) -> Iterator[LabelledPictures]:
     """Drive, and note pictures with what the expert would do there.
 
     Args:
@@ -73,10 +73,10 @@ def collect(
     Yields:
         What each lesson gave.
     """
-    taught = lessons()
+    taught = make_lessons()
     for number in range(drives):
-        world, episode = begin(taught[number % len(taught)], rows, ticks * 0.1, rng)
-        yield joined(list(_drive(world, episode, network, trust, ticks, kept, noise, rng)))
+        world, episode = start_lesson(taught[number % len(taught)], rows, ticks * 0.1, rng)
+        yield concatenate(list(_drive(world, episode, network, trust, ticks, kept, noise, rng)))
 
 
 def _drive(
@@ -88,29 +88,29 @@ def _drive(
     kept: float,
     noise: float,
     rng: np.random.Generator,
-) -> Iterator[Pictures]:
+) -> Iterator[LabelledPictures]:
     state, swing, before = None, np.zeros((len(episode.collided), 2)), deque([episode], LAG)
     for _ in range(ticks):
-        speed, wanted = episode.state.speed[:, 0], expert(episode)
+        speed, wanted = episode.state.speed[:, 0], expert_outputs(episode)
         noted = ~episode.collided & bool(rng.random() < kept)
         swing = 0.8 * swing + 0.6 * rng.standard_normal(swing.shape)
         done = wanted + noise * torch.from_numpy(swing * (0.25, 0.5)).float()
         if network is None:  # pictures that nobody drives by are taken only to be noted
             if bool(noted.any()):
-                seen = _photographed(episode, noted), luma(_photographed(before[0], noted)), speed[noted]
+                seen = _take_pictures(episode, noted), luma(_take_pictures(before[0], noted)), speed[noted]
         else:
-            picture = _photographed(episode, torch.ones_like(noted))
+            picture = _take_pictures(episode, torch.ones_like(noted))
             past, state = recall(picture, state)
             trusted = torch.from_numpy(rng.random(len(speed)) < trust)[:, None]
             done = torch.where(trusted, network(picture, torch.from_numpy(past), speed), done)
             seen = picture[noted], torch.from_numpy(past)[noted.numpy()], speed[noted]
         if bool(noted.any()):
-            yield Pictures(*seen, wanted[noted], truths(episode)[noted])
+            yield LabelledPictures(*seen, wanted[noted], auxiliary_targets(episode)[noted])
         before.append(episode)
         episode = world.step(episode, to_physical(to_actions(done, speed), len(speed), episode.collided))
 
 
-def _photographed(episode: Episode, rows: Tensor) -> Tensor:
+def _take_pictures(episode: Episode, rows: Tensor) -> Tensor:
     """What the cameras see in some rows, boolean, shape (B,)."""
     assert episode.camera_context is not None
     state, context = episode.state, episode.camera_context
@@ -119,13 +119,13 @@ def _photographed(episode: Episode, rows: Tensor) -> Tensor:
     return take_picture(State(*(field[rows] for field in state)), episode.road, context)
 
 
-def mirrored(pictures: Pictures, rows: Tensor) -> Pictures:
+def mirror(pictures: LabelledPictures, rows: Tensor) -> LabelledPictures:
     """The same with left and right exchanged in some rows, boolean, shape (n,)."""
     sign = torch.where(rows, -1.0, 1.0)[:, None]
     one = torch.ones_like(sign)
     picture, earlier = pictures.picture.clone(), pictures.earlier.clone()
     picture[rows], earlier[rows] = picture[rows].flip(2), earlier[rows].flip(2)
-    return Pictures(
+    return LabelledPictures(
         picture,
         earlier,
         pictures.speed,

@@ -26,8 +26,8 @@ import typer
 
 from agents import LearnedEgo, Provenance, save_driver
 from training.data.scenes import Scene
-from training.egos.encounters import Kind, encounters
-from training.egos.nominal_driving import in_ordinary_traffic
+from training.egos.encounters import EncounterSpec, make_scenes
+from training.egos.nominal_driving import judge_all_cases
 from training.imitation.algorithms.config import Config
 from training.imitation.algorithms.expert_pairs import expert_pairs
 from training.imitation.algorithms.learner import Learner
@@ -51,15 +51,15 @@ CONFIG = Config(
     lane_weight=8.0,
     speed_weight=8.0,
 )
-KINDS = (
-    Kind("cut_in", "us101", 20, 4.0),
-    Kind("cut_in", "highway", 10, 4.0),
-    Kind("hard_brake", "us101", 8, 8.0),
-    Kind("car_following", "us101", 2, 8.0),
-    Kind("car_following", "highway", 2, 8.0),
-    Kind("straight", None, 10, 30.0),
-    Kind("straight", None, 2, 30.0, {"gap": 140.0, "lead_speed": 25.0}),
-    Kind("car_following", "highway", 2, 8.0, {"gap": 140.0}),
+ENCOUNTERS = (
+    EncounterSpec("cut_in", "us101", 20, 4.0),
+    EncounterSpec("cut_in", "highway", 10, 4.0),
+    EncounterSpec("hard_brake", "us101", 8, 8.0),
+    EncounterSpec("car_following", "us101", 2, 8.0),
+    EncounterSpec("car_following", "highway", 2, 8.0),
+    EncounterSpec("straight", None, 10, 30.0),
+    EncounterSpec("straight", None, 2, 30.0, {"gap": 140.0, "lead_speed": 25.0}),
+    EncounterSpec("car_following", "highway", 2, 8.0, {"gap": 140.0}),
 )
 """Encounters; in the last two the lead is out of sight."""
 RECORDED = 0.4
@@ -68,7 +68,7 @@ JUDGED, JUDGED_SEED = 400, 1000
 """Rollouts of each case in the header of the file."""
 
 
-def prepare(scenes: Sequence[Scene], kinds: Sequence[Kind], config: Config) -> Learner:
+def prepare_learner(scenes: Sequence[Scene], kinds: Sequence[EncounterSpec], config: Config) -> Learner:
     """Everything of the training before its first update.
 
     Args:
@@ -77,19 +77,19 @@ def prepare(scenes: Sequence[Scene], kinds: Sequence[Kind], config: Config) -> L
         config: Settings; the encounters are drawn by its seed.
     """
     pairs = expert_pairs(stack(scenes))
-    met = encounters(kinds, np.random.default_rng(config.seed))
+    met = make_scenes(kinds, np.random.default_rng(config.seed))
     recorded = torch.unique(pairs.scene)
     times = round(RECORDED / (1.0 - RECORDED) * len(met) / len(recorded))
     among = torch.cat((recorded.repeat(max(times, 1)), len(scenes) + torch.arange(len(met))))
     return learner_of(Data(stack((*scenes, *met)), pairs, None), config, among)
 
 
-def train(
+def train_imitation_ego(
     data: Path,
     config: Config,
     out: Path,
     *,
-    kinds: Sequence[Kind] = KINDS,
+    kinds: Sequence[EncounterSpec] = ENCOUNTERS,
     rollouts: int = JUDGED,
     progress: bool = False,
 ) -> Path:
@@ -114,7 +114,7 @@ def train(
     check_folder(out, settings)
     learn, test = load(source)
     note_settings(out, settings)
-    driver = replace(driver_of(fit(prepare(learn, kinds, config), out, progress=progress), config), name=NAME)
+    driver = replace(driver_of(fit(prepare_learner(learn, kinds, config), out, progress=progress), config), name=NAME)
     provenance = Provenance(
         kind="mgail, with encounters",
         command=f"python -m training.egos.imitation --data {data.name} --seed {config.seed}",
@@ -122,13 +122,13 @@ def train(
         data_licence=source.licence,
         metrics={
             **metrics(stack(test), driver),
-            "ordinary": in_ordinary_traffic(LearnedEgo(driver), rollouts, JUDGED_SEED),
+            "ordinary": judge_all_cases(LearnedEgo(driver), rollouts, JUDGED_SEED),
         },
     )
     return save_driver(driver, provenance, out / DRIVER)
 
 
-def command(
+def main(
     out: Annotated[Path, typer.Option(help="Folder; a training that was stopped in it is taken up.")],
     data: Annotated[Path, typer.Option(help="Folder with the compact tables of US 101.")],
     seed: Annotated[int, typer.Option(help="The same seed gives the same weights.")] = CONFIG.seed,
@@ -136,7 +136,7 @@ def command(
     """Train the ego `imitation`."""
     torch.set_num_threads(1)
     try:
-        path = train(data, replace(CONFIG, seed=seed), out, progress=True)
+        path = train_imitation_ego(data, replace(CONFIG, seed=seed), out, progress=True)
     except ValueError as error:
         print(f"imitation: {error}", file=sys.stderr)
         raise typer.Exit(2) from None
@@ -145,5 +145,5 @@ def command(
 
 if __name__ == "__main__":
     app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-    app.command()(command)
+    app.command()(main)
     app()

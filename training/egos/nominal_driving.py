@@ -38,9 +38,9 @@ from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
 from samplers.statistics.intervals import clopper_pearson
 from training.egos.nominal_traffic import CASES, FLOOR_GAP, FLOOR_HEADWAY, SECONDS, Case
 
-REASONS = ("kept", "left its lane", "collided", "too close", "left behind", "hit by others")
+VERDICT_NAMES = ("kept", "left its lane", "collided", "too close", "left behind", "hit by others")
 """Verdicts by number; a rollout gets the one that comes first in time, "left behind" at its end."""
-KEPT, LEFT_LANE, COLLIDED, TOO_CLOSE, LEFT_BEHIND, HIT = range(len(REASONS))
+KEPT, LEFT_LANE, COLLIDED, TOO_CLOSE, LEFT_BEHIND, HIT = range(len(VERDICT_NAMES))
 GRACE = 10.0
 """Time [s] that an ego has to open the distance to a lead that has cut in too close."""
 LEAST_WAY = 0.5
@@ -53,7 +53,7 @@ class Verdicts(NamedTuple):
     """Of n rollouts."""
 
     reason: NDArray[np.int64]
-    """Index of `REASONS`, shape (n,)."""
+    """Index of `VERDICT_NAMES`, shape (n,)."""
     time: NDArray[np.float64]
     """When that was found [s], shape (n,)."""
     headway: NDArray[np.float64]
@@ -118,25 +118,25 @@ def judge(
         raise ValueError(f"Unknown case {case!r}{did_you_mean(case, CASES)}; expected one of {', '.join(CASES)}.")
     case = CASES[case] if isinstance(case, str) else case
     observation = observation or observation_for(ego)
-    world = measured or world_of(case, seconds, observation)
+    world = measured or make_world(case, seconds, observation)
     driver = as_driver(ego, world)
     if getattr(driver, "sees", False):
         world = replace(world, lidar=True)
-    x = draw(case, world, rollouts, getattr(driver, "columns", 0), np.random.default_rng(seed))
+    x = draw_inputs(case, world, rollouts, getattr(driver, "columns", 0), np.random.default_rng(seed))
     tile = CAMERA_TILE if "camera" in kinds_of(observation) else TILE
-    parts = [_judged(world, driver, part) for part in torch.split(torch.from_numpy(x).float(), tile)]
+    parts = [_judge_tile(world, driver, part) for part in torch.split(torch.from_numpy(x).float(), tile)]
     reason, time, headway, margin, speed = (np.concatenate(column) for column in zip(*parts, strict=True))
     return Verdicts(reason, time, headway, margin, speed, x)
 
 
-def world_of(case: Case, seconds: float = SECONDS, observation: str = "features") -> World:
+def make_world(case: Case, seconds: float = SECONDS, observation: str = "features") -> World:
     """The world of a case; it tells who ran into whom."""
     return World(
         case.scenario, horizon=seconds, drivers=case.drivers(), observation=observation, lidar=True, witnessed=True
     )
 
 
-def draw(case: Case, world: World, n: int, own: int, rng: np.random.Generator) -> NDArray[np.float64]:
+def draw_inputs(case: Case, world: World, n: int, own: int, rng: np.random.Generator) -> NDArray[np.float64]:
     """Starts, drivers' weights, noise of drivers and (`own` columns) of the ego, side by side, shape (n, d)."""
     parts = [case.starts(n, rng)]
     if world.weights:
@@ -146,7 +146,7 @@ def draw(case: Case, world: World, n: int, own: int, rng: np.random.Generator) -
 
 
 @torch.inference_mode()
-def _judged(world: World, driver: Driver, x: Tensor) -> tuple[NDArray[Any], ...]:
+def _judge_tile(world: World, driver: Driver, x: Tensor) -> tuple[NDArray[Any], ...]:
     """The columns of `Verdicts` but for x, of one tile."""
     reason = torch.full((len(x),), KEPT)
     time = torch.full((len(x),), world.seconds)
@@ -163,7 +163,7 @@ def _judged(world: World, driver: Driver, x: Tensor) -> tuple[NDArray[Any], ...]
         far = (headway >= FLOOR_HEADWAY) & (gap >= FLOOR_GAP)
         same = follows == lead
         since, had = torch.where(same, since + world.dt, 0.0), (had & same) | far
-        margin = margin_of(state, first)
+        margin = lane_margin(state, first)
         found = torch.full_like(reason, KEPT)
         found[~far & (had | (since >= GRACE))] = TOO_CLOSE
         found[margin < 0.0] = LEFT_LANE
@@ -174,12 +174,12 @@ def _judged(world: World, driver: Driver, x: Tensor) -> tuple[NDArray[Any], ...]
         time = torch.where(running & (found != KEPT), now, time)
         reason = torch.where(running, found, reason)
     assert first is not None
-    way, due = _ways(first.state, episode.state, lead_index(first.state, world.scenario.road), world.seconds)
+    way, due = _distances(first.state, episode.state, lead_index(first.state, world.scenario.road), world.seconds)
     reason = torch.where((reason == KEPT) & (way < LEAST_WAY * due), LEFT_BEHIND, reason)
     return tuple(column.numpy() for column in (reason, time.double(), least, room, way / world.seconds))
 
 
-def margin_of(state: State, first: Episode) -> Tensor:
+def lane_margin(state: State, first: Episode) -> Tensor:
     """Distance from the ego's body to the nearer line of the lane that it was in at first [m], shape (B,)."""
     road, y, heading = first.road, state.y[:, 0], state.heading[:, 0]
     left, right = road.markers(first.state.y[:, 0])
@@ -196,17 +196,17 @@ def _blame(episode: Episode) -> Tensor:
     return torch.where(crash.kind == NONE, KEPT, torch.where(own, COLLIDED, HIT))
 
 
-def _ways(first: State, last: State, lead: Tensor, seconds: float) -> tuple[Tensor, Tensor]:
+def _distances(first: State, last: State, lead: Tensor, seconds: float) -> tuple[Tensor, Tensor]:
     """The ego's way [m], and that of its first lead, or at the speed of the start where it had none."""
     ways = last.x - first.x
     of_lead = ways.gather(1, lead[:, None])[:, 0]
     return ways[:, 0], torch.where(lead > 0, of_lead, first.speed[:, 0] * seconds)
 
 
-def summary_of(found: Verdicts) -> Summary:
+def summarise(found: Verdicts) -> Summary:
     """Counts of verdicts, and the interval of the share of kept ones."""
-    counts = Counter(REASONS[k] for k in found.reason.tolist())
-    kept, spoiled = counts.pop(REASONS[KEPT], 0), counts.pop(REASONS[HIT], 0)
+    counts = Counter(VERDICT_NAMES[k] for k in found.reason.tolist())
+    kept, spoiled = counts.pop(VERDICT_NAMES[KEPT], 0), counts.pop(VERDICT_NAMES[HIT], 0)
     judged = len(found.reason) - spoiled
     return Summary(
         kept,
@@ -220,13 +220,13 @@ def summary_of(found: Verdicts) -> Summary:
     )
 
 
-def in_ordinary_traffic(ego: Any, rollouts: int, seed: int) -> dict[str, dict[str, float]]:
+def judge_all_cases(ego: Any, rollouts: int, seed: int) -> dict[str, dict[str, float]]:
     """How an ego drives in each case, for the header of its file: drives kept, judged, and the interval's lower end."""
-    found = {case: summary_of(judge(ego, case, rollouts, seed)) for case in CASES}
+    found = {case: summarise(judge(ego, case, rollouts, seed)) for case in CASES}
     return {case: {"kept": one.kept, "judged": one.judged, "at least": one.interval[0]} for case, one in found.items()}
 
 
-def command(
+def main(
     ego: Annotated[str, typer.Option(help="As in every command: idm, imitation, a file ...")] = "idm",
     case: Annotated[list[str], typer.Option(help="Kinds of traffic; may be repeated.")] = list(CASES),  # noqa: B006
     rollouts: Annotated[int, typer.Option(min=1)] = 400,
@@ -238,7 +238,7 @@ def command(
     """Judge an ego in ordinary traffic."""
     try:
         driver = load_ego(ego)
-        found = {name: summary_of(judge(driver, name, rollouts, seed, seconds, observation)) for name in case}
+        found = {name: summarise(judge(driver, name, rollouts, seed, seconds, observation)) for name in case}
     except (ValueError, OSError) as error:
         print(f"nominal: {error}", file=sys.stderr)
         raise typer.Exit(2) from None
@@ -256,5 +256,5 @@ def command(
 
 if __name__ == "__main__":
     app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-    app.command()(command)
+    app.command()(main)
     app()

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from agents import load_driver
-from agents.learned.coloured_noise import Colour
+from agents.learned.coloured_noise import AutoregressiveNoise
 from agents.learned.rule_driver import RuleDriver
 from rare_envs.distributions.space import Parameter
 from rare_envs.scenarios.base import SPEED as ANY_SPEED
@@ -55,7 +55,7 @@ class OrdinaryDrivers:
     """Speeds that wander about those at the start, with IDM behind whatever is ahead; steering is the scenario's."""
 
     rule: RuleDriver = RuleDriver()  # noqa: RUF009  (frozen)
-    colour: Colour = HUMAN
+    colour: AutoregressiveNoise = HUMAN
     weights: ClassVar[WeightDistribution | None] = None
     noisy: ClassVar[bool] = True
 
@@ -82,13 +82,13 @@ class OrdinaryDrivers:
 
 
 @cache
-def bends() -> Road:
+def make_bends() -> Road:
     """Three lanes that wind with radii down to 1 km, 3.6 times as sharply as the I-80 does anywhere, for 2.4 km."""
     sharpest = 1e-3
     return Road(straight(3).edges, Curve(75.0, (0.0, *(sharpest, 0.0, -sharpest, 0.0) * 8)))
 
 
-def ordinary(name: str, road: Road, lane: int) -> Scenario:
+def make_ordinary_traffic(name: str, road: Road, lane: int) -> Scenario:
     """Traffic around an ego in one of the inner lanes of a road."""
 
     def initial(x: Tensor) -> State:
@@ -134,8 +134,8 @@ def ordinary(name: str, road: Road, lane: int) -> Scenario:
     )
 
 
-def starts(n: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Starts of `ordinary`: speeds and gap of recorded car-following in which nobody is too close or comes too fast.
+def draw_starts(n: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Draw starts of `make_ordinary_traffic`: recorded car-following in which nobody is too close or comes too fast.
 
     Returns:
         Parameters, shape (n, 12).
@@ -180,9 +180,9 @@ def _highway_starts(n: int, rng: np.random.Generator) -> NDArray[np.float64]:
 
 CASES = MappingProxyType(
     {
-        "straight": Case(ordinary("straight", straight(3, LANE_WIDTH), 1), OrdinaryDrivers, starts),
-        "i80": Case(ordinary("i80", i80(), 2), OrdinaryDrivers, starts),
-        "bends": Case(ordinary("bends", bends(), 1), OrdinaryDrivers, starts),
+        "straight": Case(make_ordinary_traffic("straight", straight(3, LANE_WIDTH), 1), OrdinaryDrivers, draw_starts),
+        "i80": Case(make_ordinary_traffic("i80", i80(), 2), OrdinaryDrivers, draw_starts),
+        "bends": Case(make_ordinary_traffic("bends", make_bends(), 1), OrdinaryDrivers, draw_starts),
         "highway": Case(HIGHWAY, partial(load_driver, "mgail"), _highway_starts),
     }
 )

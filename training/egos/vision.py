@@ -32,9 +32,9 @@ from agents import Provenance
 from agents.vision.checkpoint import save_vision
 from agents.vision.ego import VisionEgo
 from agents.vision.pilotnet import UNITS, PilotNet
-from training.egos.expert_driver import TRUTHS
-from training.egos.image_dataset import Pictures, collect, joined, mirrored
-from training.egos.nominal_driving import in_ordinary_traffic
+from training.egos.expert_driver import AUXILIARY_SIZE
+from training.egos.image_dataset import LabelledPictures, collect, concatenate, mirror
+from training.egos.nominal_driving import judge_all_cases
 from training.imitation.fit import CHECKPOINT
 from training.imitation.run_folder import check_folder, note_settings
 
@@ -44,7 +44,7 @@ JUDGED = 2026
 
 
 @dataclass(frozen=True)
-class Config:
+class VisionConfig:
     """How the network is trained."""
 
     seed: int = 0
@@ -65,7 +65,7 @@ class Config:
     kept: float = 0.2
     """Likewise in later rounds."""
     noise: float = 1.0
-    """See `pictures.collect`."""
+    """See `training.egos.image_dataset.collect`."""
     mixing: float = 0.5
     """In round k the expert decides at a share `mixing`^k of the ticks."""
     first_visits: int = 40_000
@@ -76,7 +76,7 @@ class Config:
     rate: float = 1e-3
     """Of Adam, falling as a cosine to a hundredth."""
     truth_weight: float = 0.5
-    """Of the second task, see `lane_expert.truths`."""
+    """Of the second task, see `training.egos.expert_driver.auxiliary_targets`."""
 
     def __post_init__(self) -> None:
         for each in fields(self):
@@ -97,18 +97,18 @@ class Config:
 class Training:
     """A training under way."""
 
-    def __init__(self, config: Config, out: Path) -> None:
+    def __init__(self, config: VisionConfig, out: Path) -> None:
         self.config, self.out = config, out
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
             self.network = PilotNet()
-            self.probe = nn.Linear(UNITS, TRUTHS)
+            self.probe = nn.Linear(UNITS, AUXILIARY_SIZE)
         self.parameters = [*self.network.parameters(), *self.probe.parameters()]
         self.optimiser = torch.optim.Adam(self.parameters, config.rate)
         self.round = 0
         """The next to be done."""
         self.visited = 0
-        self.noted: list[Pictures] = []
+        self.noted: list[LabelledPictures] = []
 
     def take_up(self) -> None:
         """Go on where a training in the folder was stopped."""
@@ -120,7 +120,7 @@ class Training:
         self.probe.load_state_dict(found["probe"])
         self.optimiser.load_state_dict(found["optimiser"])
         self.round, self.visited = found["round"], found["visited"]
-        self.noted = [Pictures(*torch.load(self._noted(k), weights_only=True)) for k in range(self.round)]
+        self.noted = [LabelledPictures(*torch.load(self._noted(k), weights_only=True)) for k in range(self.round)]
 
     def do_round(self) -> Iterator[str]:
         """Collect, learn, and keep what was learned; yields after each part of the work with what is going on."""
@@ -129,7 +129,7 @@ class Training:
         for part in self._collect(rng):
             parts.append(part)
             yield f"round {self.round}: {sum(len(each.speed) for each in parts)} pictures taken"
-        self.noted.append(joined(parts))
+        self.noted.append(concatenate(parts))
         torch.save(tuple(self.noted[-1]), self._noted(self.round))
         yield from self._learn(rng)
         self.round += 1
@@ -147,7 +147,7 @@ class Training:
     def _noted(self, number: int) -> Path:
         return self.out / f"pictures_{number}.pt"
 
-    def _collect(self, rng: np.random.Generator) -> Iterator[Pictures]:
+    def _collect(self, rng: np.random.Generator) -> Iterator[LabelledPictures]:
         config, first = self.config, self.round == 0
         return collect(
             None if first else self.network,
@@ -161,7 +161,7 @@ class Training:
         )
 
     def _learn(self, rng: np.random.Generator) -> Iterator[str]:
-        config, data = self.config, joined(self.noted)
+        config, data = self.config, concatenate(self.noted)
         left = config.visits if self.round else config.first_visits
         losses: list[list[float]] = []
         while left > 0:
@@ -169,14 +169,14 @@ class Training:
                 group["lr"] = config.rate * (0.505 + 0.495 * math.cos(math.pi * self.visited / config.all_visits))
             size = min(config.batch, left)
             some = data.rows(torch.from_numpy(rng.integers(0, len(data.speed), size)))
-            losses.append(self._step(mirrored(some, torch.from_numpy(rng.random(size) < 0.5))))
+            losses.append(self._step(mirror(some, torch.from_numpy(rng.random(size) < 0.5))))
             left, self.visited = left - size, self.visited + size
             if len(losses) % 20 == 0 or left <= 0:
                 mean = np.mean(losses[-100:], axis=0)
                 words = ", ".join(f"{name} {value:.4f}" for name, value in zip(LOSSES, mean, strict=True))
                 yield f"round {self.round}: {words}"
 
-    def _step(self, some: Pictures) -> list[float]:
+    def _step(self, some: LabelledPictures) -> list[float]:
         hidden = self.network.hidden(some.picture, some.earlier, some.speed)
         error = nn.functional.smooth_l1_loss(self.network.out(hidden), some.wanted, reduction="none", beta=0.5)
         truth = nn.functional.smooth_l1_loss(self.probe(hidden), some.truth)
@@ -191,7 +191,7 @@ class Training:
 LOSSES = ("acceleration", "turn", "truths")
 
 
-def train(config: Config, out: Path, progress: bool = False) -> PilotNet:
+def train_vision_ego(config: VisionConfig, out: Path, progress: bool = False) -> PilotNet:
     """Train from the start, or from where a training in the folder was stopped.
 
     Args:
@@ -218,7 +218,7 @@ def train(config: Config, out: Path, progress: bool = False) -> PilotNet:
     return training.network.eval().requires_grad_(False)
 
 
-def provenance_of(config: Config, metrics: dict[str, Any]) -> Provenance:
+def make_provenance(config: VisionConfig, metrics: dict[str, Any]) -> Provenance:
     """Where a network comes from, for the header of its file."""
     return Provenance(
         kind="imitation of a driver by rule with on-policy corrections (DAgger)",
@@ -231,20 +231,20 @@ def provenance_of(config: Config, metrics: dict[str, Any]) -> Provenance:
 
 def main(
     out: Annotated[Path, typer.Option(help="Folder; a training that was stopped in it is taken up.")],
-    seed: Annotated[int, typer.Option(help="Of everything that is random.")] = Config.seed,
-    rounds: Annotated[int, typer.Option(help="Of corrections.")] = Config.rounds,
+    seed: Annotated[int, typer.Option(help="Of everything that is random.")] = VisionConfig.seed,
+    rounds: Annotated[int, typer.Option(help="Of corrections.")] = VisionConfig.rounds,
     judged: Annotated[int, typer.Option(help="Minutes of driving in each kind of ordinary traffic to judge it.")] = 0,
 ) -> None:
     """Train the ego `vision`, and write it to OUT/vision.safetensors."""
     torch.set_num_threads(1)
     try:
-        config = Config(seed=seed, rounds=rounds)
-        network = train(config, out, progress=True)
+        config = VisionConfig(seed=seed, rounds=rounds)
+        network = train_vision_ego(config, out, progress=True)
     except ValueError as error:
         print(f"vision: {error}", file=sys.stderr)
         raise typer.Exit(2) from None
-    metrics = in_ordinary_traffic(VisionEgo(network), judged, JUDGED) if judged else {}
-    print(f"Wrote {save_vision(network, provenance_of(config, metrics), out / FILE)}.")
+    metrics = judge_all_cases(VisionEgo(network), judged, JUDGED) if judged else {}
+    print(f"Wrote {save_vision(network, make_provenance(config, metrics), out / FILE)}.")
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from agents import LearnedDriver, Provenance, save_driver
-from agents.learned.coloured_noise import WHITE, Colour
+from agents.learned.coloured_noise import WHITE_NOISE, AutoregressiveNoise
 from agents.learned.networks import Policy
 from training.imitation.algorithms.actions import HIGH, LOW
 from training.imitation.algorithms.config import HUMAN, Config
@@ -24,7 +24,7 @@ from training.imitation.progress import summary_writer
 
 DRIVER, SETTINGS = "driver.safetensors", "training.json"
 """What a training leaves in its folder beside the checkpoint."""
-COLOURS = {"human": HUMAN, "white": WHITE}
+COLOURS = {"human": HUMAN, "white": WHITE_NOISE}
 """Names of noises on the command line."""
 
 
@@ -84,7 +84,7 @@ def command_of(source: Source, config: Config) -> str:
 
 
 def _option(name: str, value: Any) -> list[str]:
-    if isinstance(value, Colour):
+    if isinstance(value, AutoregressiveNoise):
         named = [word for word, colour in COLOURS.items() if colour == value]
         return ["--noise", *named] if named else []
     flag = "--" + name.replace("_", "-")
@@ -136,7 +136,7 @@ def read_settings(folder: Path) -> tuple[Source, Config]:
         raise ValueError(f"Expected a training in {str(folder)!r}, but there is no {SETTINGS}.")
     noted = json.loads(path.read_text(encoding="utf-8"))
     source, config = noted["source"], {name: _tuples(value) for name, value in noted["config"].items()}
-    config["colour"] = Colour(**{name: tuple(value) for name, value in noted["config"]["colour"].items()})
+    config["colour"] = AutoregressiveNoise(**{name: tuple(value) for name, value in noted["config"]["colour"].items()})
     return replace(
         Source(source["kind"], Path(source["path"])),
         **{name: _tuples(source[name]) for name in ("location", "recordings", "seconds")},

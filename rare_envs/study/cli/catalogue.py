@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 
 import samplers
-from agents.learned.networks import HEAD
+from agents.learned.networks import HEAD_SIZE
 from rare_envs.measures.registry import MEASURES
 from rare_envs.scenarios.registry import SCENARIOS, kinematics_id
 from rare_envs.sensors.camera.weather import CONDITIONS, SENSOR_NOISE
@@ -57,7 +57,7 @@ def catalogue() -> dict[str, Any]:
             "bases": list(scenario.bases),
             "drivers": scenario.drivers,
             "of_learned_drivers": [
-                {"name": "weights", "size": HEAD},
+                {"name": "weights", "size": HEAD_SIZE},
                 {"name": "noise", "size": noise_size(round(scenario.horizon / TICK), scenario.vehicles - 1)},
             ],
         }

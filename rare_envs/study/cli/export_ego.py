@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from agents.sb3.saved_ego import SavedEgo, load_saved
+from agents.sb3.saved_ego import SavedEgo, load_saved_ego
 from rare_envs.study.errors import BadInput
 
 
@@ -34,9 +34,9 @@ def export_ego(model: Path, out: Path, algo: str | None = None, trust: bool = Fa
     if not out.parent.is_dir() or not os.access(out.parent, os.W_OK):
         raise BadInput(f"Cannot write to the folder {str(out.parent)!r}.")
     try:
-        from agents.onnx.export import TOLERANCE, export_onnx
+        from agents.onnx.export import ACTION_TOLERANCE, export_onnx
 
-        ego: SavedEgo = load_saved(model, algo, trust)
+        ego: SavedEgo = load_saved_ego(model, algo, trust)
         exported = export_onnx(ego, out)
     except (ValueError, OSError) as error:
         raise BadInput(error) from error
@@ -46,6 +46,6 @@ def export_ego(model: Path, out: Path, algo: str | None = None, trust: bool = Fa
         "vec_normalize": None if ego.statistics_path is None else str(ego.statistics_path),
         "onnx": str(exported.path),
         "largest_difference": exported.difference,
-        "tolerance": TOLERANCE,
+        "tolerance": ACTION_TOLERANCE,
         "observations_tried": exported.observations,
     }

@@ -23,36 +23,36 @@ def conformance(spec: str) -> Iterator[Finding]:
         spec: "tcp://host:port", with time-outs as for `agents.load_ego`.
     """
     try:
-        from agents.remote import protocol as wire
-        from agents.remote.client import TIMEOUT, Lost, read_settings
+        from agents.remote import protocol
+        from agents.remote.client import TIMEOUT, LinkError, parse_address
         from agents.remote.zmq_link import SECRET, ZmqLink
     except ImportError:
         yield failed("protocol", "pyzmq and msgpack are not installed", "pip install 'rare-envs[remote]'")
         return
-    address, settings = read_settings(spec)
+    address, settings = parse_address(spec)
     timeout = settings.get("timeout", TIMEOUT)
     link = ZmqLink(address, os.environ.get(SECRET, "").encode() or None)
     numbers = iter(range(1, 10**6))
 
     def ask(message: Any) -> Any:
-        content = message if isinstance(message, bytes) else wire.pack({"id": next(numbers), **message})
-        return wire.unpack(link.ask(content, timeout))
+        content = message if isinstance(message, bytes) else protocol.pack({"id": next(numbers), **message})
+        return protocol.unpack(link.ask(content, timeout))
 
     try:
         link.open()
         before = ask({"type": "ping"})
         link.open()
         hello = link.hello(
-            {"type": "hello", "protocol": wire.PROTOCOL, "client": "check-ego", "id": next(numbers)}, timeout
+            {"type": "hello", "protocol": protocol.PROTOCOL, "client": "check-ego", "id": next(numbers)}, timeout
         )
-        if hello.get("type") != "hello" or hello.get("protocol") != wire.PROTOCOL:
+        if hello.get("type") != "hello" or hello.get("protocol") != protocol.PROTOCOL:
             yield failed("handshake", f"{hello.get('reason', hello)}", ADVICE)
             return
-        yield passed("handshake", f"protocol {wire.PROTOCOL}, {hello.get('name', 'no name')!r}")
+        yield passed("handshake", f"protocol {protocol.PROTOCOL}, {hello.get('name', 'no name')!r}")
         yield _expected("before hello", before, "error")
         for name, act in _questions(hello).items():
             yield from act(name, ask)
-    except (Lost, EgoGone, ValueError) as error:
+    except (LinkError, EgoGone, ValueError) as error:
         yield failed("protocol", reason_of(error), f"is it running at {address}? {ADVICE}")
     finally:
         link.close()
@@ -60,16 +60,16 @@ def conformance(spec: str) -> Iterator[Finding]:
 
 def _questions(hello: Any) -> dict[str, Callable[[str, Any], Iterator[Finding]]]:
     """What is asked after the hello."""
-    from agents.remote.request_handler import read_space
+    from agents.remote.request_handler import decode_space
 
-    space = read_space(hello.get("observation")) or spaces.Box(-5.0, 5.0, (7,), np.float32)
+    space = decode_space(hello.get("observation")) or spaces.Box(-5.0, 5.0, (7,), np.float32)
 
     def act(session: int, step: int, rows: int = 3) -> dict[str, Any]:
-        from agents.remote import protocol as wire
+        from agents.remote import protocol
 
         parts = dict(space.spaces) if isinstance(space, spaces.Dict) else space
         blank = each(lambda part: np.zeros((rows, *part.shape), part.dtype), parts)
-        return {"type": "act", "session": session, "step": step, "observation": wire.pack_observation(blank)}
+        return {"type": "act", "session": session, "step": step, "observation": protocol.pack_observation(blank)}
 
     def expect(kind: str, *messages: Any) -> Callable[[str, Any], Iterator[Finding]]:
         def run(name: str, ask: Any) -> Iterator[Finding]:

@@ -66,8 +66,8 @@ def check_ego(asked: Asked) -> list[Finding]:
     Raises:
         BadInput: The environment is unknown, or there is no such file.
     """
-    from agents.loading import innermost, kind_of
-    from agents.sb3.file_trust import ADVICE, TRUSTED, doubts
+    from agents.loading import find_ego_kind, strip_prefixes
+    from agents.sb3.file_trust import TRUST_ADVICE, TRUSTED, find_origin_risks
     from agents.sb3.saved_ego import find_statistics
     from rare_envs.scenarios.registry import find_scenario
 
@@ -77,14 +77,14 @@ def check_ego(asked: Asked) -> list[Finding]:
         raise BadInput(error) from error
     if asked.time_limit <= 0:
         raise BadInput(f"Expected a time limit of some seconds, got {asked.time_limit}.")
-    name = innermost(asked.ego)
-    findings, kind = [], kind_of(name)
+    name = strip_prefixes(asked.ego)
+    findings, kind = [], find_ego_kind(name)
     if kind == "url":
         return [failed("origin", f"{name!r} is a remote place", "download the file, look where it comes from, name it")]
     if kind == "zip":
-        reasons = doubts(Path(name), find_statistics(Path(name)))
+        reasons = find_origin_risks(Path(name), find_statistics(Path(name)))
         if reasons and not asked.trust:
-            return [failed("origin", "; ".join(reasons), ADVICE)]
+            return [failed("origin", "; ".join(reasons), TRUST_ADVICE)]
         place = f" ({'; '.join(reasons)})" if reasons else ""
         advice = f"you said --trust: {TRUSTED}" if asked.trust else "opened here is only what is known to be harmless"
         findings.append(warned("origin", f"a Stable-Baselines3 .zip can hold code{place}", advice, False))
@@ -132,7 +132,7 @@ def _pass_on(stream: Any, lines: queue.Queue[str | None]) -> None:
 def findings_of(asked: Asked) -> Iterator[Finding | str]:
     """Load the ego and check it: findings, and before each check its name."""
     import agents
-    from agents.loading import kind_of
+    from agents.loading import find_ego_kind
     from rare_envs import DrivingProblem
     from rare_envs.egos.faults import EgoGone, reason_of
     from rare_envs.problem import AmbiguousActions
@@ -140,7 +140,7 @@ def findings_of(asked: Asked) -> Iterator[Finding | str]:
     from rare_envs.study.ego_check.probe import Probe
     from rare_envs.study.ego_check.protocol import conformance
 
-    if kind_of(asked.ego) == "remote":
+    if find_ego_kind(asked.ego) == "remote":
         yield "protocol"
         found = list(conformance(asked.ego))
         yield from found

@@ -12,7 +12,7 @@ from safetensors import safe_open
 
 from agents import LearnedDriver, Provenance, load_driver, read_driver, read_provenance, save_driver
 from agents.learned.checkpoints import SHIPPED
-from agents.learned.coloured_noise import Colour
+from agents.learned.coloured_noise import AutoregressiveNoise
 from agents.learned.rule_driver import RuleDriver
 
 PROVENANCE = Provenance(
@@ -27,7 +27,7 @@ PROVENANCE = Provenance(
 
 @pytest.fixture
 def driver(policy, law):
-    return LearnedDriver(policy, Colour((0.95, 0.9)), (-7.0, 3.5), (-0.25, 0.3), law, "tester")
+    return LearnedDriver(policy, AutoregressiveNoise((0.95, 0.9)), (-7.0, 3.5), (-0.25, 0.3), law, "tester")
 
 
 @pytest.fixture

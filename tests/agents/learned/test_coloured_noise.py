@@ -5,9 +5,9 @@ import math
 import pytest
 import torch
 
-from agents.learned.coloured_noise import Colour
+from agents.learned.coloured_noise import AutoregressiveNoise
 
-SWINGING = Colour.swinging(frequency=(1.70, 1.57), damping=(0.845, 0.40))
+SWINGING = AutoregressiveNoise.swinging(frequency=(1.70, 1.57), damping=(0.845, 0.40))
 
 
 def sequence(colour, ticks, n=100_000, seed=0):
@@ -22,11 +22,11 @@ def sequence(colour, ticks, n=100_000, seed=0):
 
 def test_white_noise_is_the_fresh_draw():
     fresh = torch.randn(5, 2)
-    value, _ = Colour().next(Colour().begin(torch.randn(5, 2, 2)), fresh)
+    value, _ = AutoregressiveNoise().next(AutoregressiveNoise().begin(torch.randn(5, 2, 2)), fresh)
     torch.testing.assert_close(value, fresh)
 
 
-@pytest.mark.parametrize("colour", [SWINGING, Colour((0.95, 0.5), (0.0, 0.0)), Colour()])
+@pytest.mark.parametrize("colour", [SWINGING, AutoregressiveNoise((0.95, 0.5), (0.0, 0.0)), AutoregressiveNoise()])
 def test_stationary_from_the_first_tick(colour):
     values = sequence(colour, 30)
     # the variance of n = 1e5 draws has a standard error of sqrt(2 / n) = 0.0045
@@ -60,4 +60,4 @@ def test_the_expected_part_is_known_before_the_draw():
 
 def test_a_noise_that_grows_is_refused():
     with pytest.raises(ValueError, match="stationary"):
-        Colour((1.0, 0.5), (0.0, 0.0))
+        AutoregressiveNoise((1.0, 0.5), (0.0, 0.0))

@@ -5,22 +5,22 @@ import pytest
 import torch
 
 from agents import LearnedDriver
-from agents.learned.coloured_noise import Colour
-from agents.learned.driver import with_weights
-from agents.learned.networks import HEAD, head_weights
+from agents.learned.coloured_noise import AutoregressiveNoise
+from agents.learned.driver import replace_head
+from agents.learned.networks import HEAD_SIZE, head_weights
 from agents.learned.weight_distribution import WeightDistribution
 
 
 @pytest.fixture
 def driver(policy):
-    return LearnedDriver(policy, colour=Colour((0.95, 0.8), (0.0, -0.3)))
+    return LearnedDriver(policy, colour=AutoregressiveNoise((0.95, 0.8), (0.0, -0.3)))
 
 
 def test_one_pass_equals_a_loop_over_networks(driver, features, generator):
     """Three ticks with noise: each scenario by a network of its own, vehicle by vehicle."""
     batch, vehicles = 32, 5
-    weights = head_weights(driver.policy) + 0.01 * torch.randn(batch, HEAD, generator=generator)
-    networks = [with_weights(driver.policy, row) for row in weights]
+    weights = head_weights(driver.policy) + 0.01 * torch.randn(batch, HEAD_SIZE, generator=generator)
+    networks = [replace_head(driver.policy, row) for row in weights]
     memory = driver.begin(torch.randn(batch, vehicles, 2, 2, generator=generator))
     for _ in range(3):
         x = features(batch, vehicles)
@@ -40,13 +40,13 @@ def test_one_pass_equals_a_loop_over_networks(driver, features, generator):
 def test_the_network_runs_once_for_all(driver, features, generator):
     rows = []
     with driver.policy.first.register_forward_hook(lambda module, inputs, output: rows.append(len(output))):
-        driver.act(features(7, 3), torch.randn(7, HEAD, generator=generator))
+        driver.act(features(7, 3), torch.randn(7, HEAD_SIZE, generator=generator))
     assert rows == [21]
 
 
 def test_own_weights_and_none_agree(driver, features):
     x = features(4, 2)
-    weights = head_weights(driver.policy).expand(4, HEAD)
+    weights = head_weights(driver.policy).expand(4, HEAD_SIZE)
     torch.testing.assert_close(driver.act(x, weights)[0], driver.act(x)[0], atol=1e-6, rtol=0.0)
 
 
@@ -97,14 +97,14 @@ def test_actions_have_gradients_in_features_and_weights(driver, features, genera
     action, _ = driver.act(x, weights, torch.randn(2, 2, 2, generator=generator), torch.ones(2, 2, 2, 2))
     of_x, of_weights = torch.autograd.grad(action.sum(), (x, weights))
     assert bool(of_x.isfinite().all()) and of_x.abs().sum() > 0.0
-    assert of_weights.count_nonzero() == 2 * HEAD
+    assert of_weights.count_nonzero() == 2 * HEAD_SIZE
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"features": torch.zeros(4, 51)}, r"features of shape \(B, M, 51\), got \(4, 51\)"),
-        ({"weights": torch.zeros(HEAD)}, r"weights of shape \(4, 404\), got \(404,\)"),
+        ({"weights": torch.zeros(HEAD_SIZE)}, r"weights of shape \(4, 404\), got \(404,\)"),
         ({"innovations": torch.zeros(4, 2)}, r"innovations of shape \(4, 3, 2\)"),
         ({"innovations": torch.zeros(4, 3, 2)}, "memory beside the innovations"),
         ({"innovations": torch.zeros(4, 3, 2), "memory": torch.zeros(4, 3, 2)}, r"memory of shape \(4, 3, 2, 2\)"),
@@ -137,8 +137,8 @@ def test_impossible_drivers_are_refused(policy, change, message):
 
 def test_other_weights_leave_the_network_as_it_was(policy):
     before = head_weights(policy)
-    changed = with_weights(policy, before + 1.0)
+    changed = replace_head(policy, before + 1.0)
     torch.testing.assert_close(head_weights(policy), before, atol=0.0, rtol=0.0)
     torch.testing.assert_close(head_weights(changed), before + 1.0, atol=0.0, rtol=0.0)
     with pytest.raises(ValueError, match="404"):
-        with_weights(policy, before[:-1])
+        replace_head(policy, before[:-1])

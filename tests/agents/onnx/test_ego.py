@@ -20,8 +20,8 @@ from typer.testing import CliRunner
 
 import rare_envs
 from agents import load_ego
-from agents.onnx.export import TOLERANCE, compare, export_onnx
-from agents.sb3.saved_ego import load_saved
+from agents.onnx.export import ACTION_TOLERANCE, export_onnx, max_action_difference
+from agents.sb3.saved_ego import load_saved_ego
 from rare_envs.study.cli.app import app
 
 onnx = pytest.importorskip("onnx", reason="the extra onnx is optional")
@@ -85,7 +85,7 @@ def saved(tmp_path: Path) -> Callable[[str], Any]:
         model.save(tmp_path / "ego.zip")
         if model.get_vec_normalize_env() is not None:
             model.get_vec_normalize_env().save(str(tmp_path / "vecnormalize.pkl"))
-        return load_saved(tmp_path / "ego.zip", None)
+        return load_saved_ego(tmp_path / "ego.zip", None)
 
     return save
 
@@ -95,8 +95,8 @@ def test_an_exported_policy_acts_as_before(name: str, saved: Any, tmp_path: Path
     ego = saved(name)
     done = export_onnx(ego, tmp_path / "ego.onnx")
     again = load_ego(tmp_path / "ego.onnx")
-    assert compare(ego, again, np.random.default_rng(5))[0] <= TOLERANCE
-    assert done.difference <= TOLERANCE
+    assert max_action_difference(ego, again, np.random.default_rng(5))[0] <= ACTION_TOLERANCE
+    assert done.difference <= ACTION_TOLERANCE
     assert again.action_space == ego.action_space
     assert again.observation_space.shape == ego.observation_space.shape
     assert again.stateful == ("recurrent" in name or "normalised, then stacked" in name)
@@ -125,7 +125,7 @@ def test_a_memory_begins_anew_where_an_episode_does(saved: Any, tmp_path: Path) 
 
 
 def test_an_export_that_acts_otherwise_is_not_written(saved: Any, tmp_path: Path, monkeypatch: Any) -> None:
-    monkeypatch.setattr("agents.onnx.export.TOLERANCE", 1e-12)
+    monkeypatch.setattr("agents.onnx.export.ACTION_TOLERANCE", 1e-12)
     with pytest.raises(ValueError, match=r"acts otherwise, by up to .*; nothing was written"):
         export_onnx(saved("ppo"), tmp_path / "ego.onnx")
     assert list(tmp_path.glob("*onnx*")) == []
@@ -200,7 +200,7 @@ def test_the_command_writes_and_says_what_it_compared(saved: Any, tmp_path: Path
     done = CliRunner().invoke(app, [*words, "--json"])
     assert done.exit_code == 0, done.output
     answer = json.loads(done.stdout)
-    assert answer["largest_difference"] <= answer["tolerance"] == TOLERANCE
+    assert answer["largest_difference"] <= answer["tolerance"] == ACTION_TOLERANCE
     assert answer["vec_normalize"] == str(tmp_path / "vecnormalize.pkl")
     assert (tmp_path / "ego.onnx").stat().st_size > 1000
     assert "random observations" in CliRunner().invoke(app, words).stdout

@@ -24,9 +24,9 @@ from rare_envs.egos.faults import EgoGone, FaultTolerant, NoAnswer
 
 pytest.importorskip("zmq", reason="the extra remote is optional")
 msgpack = pytest.importorskip("msgpack", reason="the extra remote is optional")
-from agents.remote import protocol as wire  # noqa: E402
-from agents.remote.client import RemoteEgo, RemoteError, Silent  # noqa: E402
-from agents.remote.request_handler import Answerer, describe, read_space  # noqa: E402
+from agents.remote import protocol  # noqa: E402
+from agents.remote.client import NoReply, RemoteEgo, RemoteError  # noqa: E402
+from agents.remote.request_handler import RequestHandler, decode_space, encode_space  # noqa: E402
 from agents.remote.server import EgoServer, is_loopback  # noqa: E402
 from agents.remote.zmq_link import ZmqLink, connect  # noqa: E402
 
@@ -246,25 +246,25 @@ def test_a_secret_is_needed_beyond_this_machine() -> None:
 def test_messages_cannot_be_sent_again_or_changed() -> None:
     """By whoever listens on the way: seals cover the message, ids rise, and a hello's answer names both nonces."""
     secret = b"open sesame"
-    server = Answerer(Braking(), secret=secret)
+    server = RequestHandler(Braking(), secret=secret)
     nonce = bytes(range(16))
-    hello = wire.pack({"type": "hello", "protocol": 1, "id": 1, "nonce": nonce})
-    tag, content = server.answer(b"me", [wire.seal(secret, wire.ASK, hello), hello])
-    reply = wire.unpack(content)
-    assert wire.sealed(secret, wire.ANSWER, tag, content)
+    hello = protocol.pack({"type": "hello", "protocol": 1, "id": 1, "nonce": nonce})
+    tag, content = server.answer(b"me", [protocol.seal(secret, protocol.ASK, hello), hello])
+    reply = protocol.unpack(content)
+    assert protocol.sealed(secret, protocol.ANSWER, tag, content)
     assert reply["client_nonce"] == nonce
-    key = wire.session_key(secret, nonce, reply["nonce"])
-    ping = wire.pack({"type": "ping", "id": 2})
+    key = protocol.session_key(secret, nonce, reply["nonce"])
+    ping = protocol.pack({"type": "ping", "id": 2})
 
     def kind(frames: list[bytes], peer: bytes = b"me") -> str:
-        answer = wire.unpack(server.answer(peer, frames)[-1])
+        answer = protocol.unpack(server.answer(peer, frames)[-1])
         return str(answer.get("code", answer["type"]))
 
-    sealed_ping = [wire.seal(key, wire.ASK, ping), ping]
+    sealed_ping = [protocol.seal(key, protocol.ASK, ping), ping]
     assert kind(sealed_ping) == "pong"
     assert kind(sealed_ping) == "malformed"  # the same id again
-    assert kind([wire.seal(key, wire.ANSWER, ping), ping]) == "secret"
-    assert kind([wire.seal(secret, wire.ASK, ping), ping]) == "secret"  # that key is for hellos
+    assert kind([protocol.seal(key, protocol.ANSWER, ping), ping]) == "secret"
+    assert kind([protocol.seal(secret, protocol.ASK, ping), ping]) == "secret"  # that key is for hellos
     assert kind(sealed_ping, b"another") == "secret"
     assert kind([ping]) == "secret"
     assert kind([sealed_ping[0], ping[:-1] + b"\x03"]) == "secret"
@@ -275,7 +275,9 @@ def test_versions_have_to_agree(serve: Any, ask: Any, monkeypatch: Any) -> None:
     with monkeypatch.context() as changed:
         changed.setattr("agents.remote.protocol.PROTOCOL", 1)
         ask(address)
-    reply = wire.unpack(Answerer(Braking()).answer(b"", [wire.pack({"type": "hello", "protocol": 2, "id": 1})])[0])
+    reply = protocol.unpack(
+        RequestHandler(Braking()).answer(b"", [protocol.pack({"type": "hello", "protocol": 2, "id": 1})])[0]
+    )
     assert (reply["type"], reply["code"]) == ("error", "version")
     assert "speaks protocol 1, not 2" in reply["reason"]
 
@@ -284,7 +286,7 @@ def test_versions_have_to_agree(serve: Any, ask: Any, monkeypatch: Any) -> None:
 
 
 def good_messages() -> list[dict[str, Any]]:
-    observation = wire.pack_array(np.zeros((2, 7), np.float32))
+    observation = protocol.pack_array(np.zeros((2, 7), np.float32))
     return [
         {"type": "hello", "protocol": 1, "id": 1, "nonce": b"n" * 16},
         {"type": "reset", "id": 2, "session": 5, "batch": 2},
@@ -295,11 +297,11 @@ def good_messages() -> list[dict[str, Any]]:
 
 
 def test_a_conversation() -> None:
-    server = Answerer(Braking())
-    answers = [wire.unpack(server.answer(b"me", [wire.pack(message)])[0]) for message in good_messages()]
+    server = RequestHandler(Braking())
+    answers = [protocol.unpack(server.answer(b"me", [protocol.pack(message)])[0]) for message in good_messages()]
     assert [answer["type"] for answer in answers] == ["hello", "ready", "action", "pong", "ended"]
     assert [answer["id"] for answer in answers] == [1, 2, 3, 4, 5]
-    assert wire.unpack_array(answers[2]["action"]).shape == (2, 2)
+    assert protocol.unpack_array(answers[2]["action"]).shape == (2, 2)
 
 
 STRANGE = [
@@ -323,15 +325,15 @@ def test_strange_values_get_an_error() -> None:
         for key, value in itertools.product(message, STRANGE):
             if key == "nonce" and isinstance(value, bytes):
                 continue
-            server = Answerer(Braking())
+            server = RequestHandler(Braking())
             for before in good_messages()[:number]:
-                server.answer(b"me", [wire.pack(before)])
+                server.answer(b"me", [protocol.pack(before)])
             (content,) = server.answer(b"me", [msgpack.packb({**message, key: value})])
-            answer = wire.unpack(content)
+            answer = protocol.unpack(content)
             harmless = (message["type"], key) in {("end", "session"), ("act", "start")}
             assert answer["type"] == "error" or harmless, (message["type"], key, value)
             assert answer["type"] != "error" or answer["code"] != "internal", answer
-            last = wire.unpack(server.answer(b"me", [wire.pack({**good_messages()[0], "id": 99})])[0])
+            last = protocol.unpack(server.answer(b"me", [protocol.pack({**good_messages()[0], "id": 99})])[0])
             assert last["type"] == "hello"
 
 
@@ -352,18 +354,18 @@ def test_strange_values_get_an_error() -> None:
     ],
 )
 def test_arrays_that_do_not_add_up_get_an_error(name: str, value: Any) -> None:
-    server = Answerer(Braking())
+    server = RequestHandler(Braking())
     hello, reset, act = good_messages()[:3]
     for message in (hello, reset):
-        server.answer(b"me", [wire.pack(message)])
+        server.answer(b"me", [protocol.pack(message)])
     act["observation"][name] = value
-    assert wire.unpack(server.answer(b"me", [wire.pack(act)])[0])["code"] == "malformed"
+    assert protocol.unpack(server.answer(b"me", [protocol.pack(act)])[0])["code"] == "malformed"
 
 
 def test_random_bytes_get_an_error_and_are_never_run(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
-    server = Answerer(Braking())
-    whole = [wire.pack(message) for message in good_messages()]
+    server = RequestHandler(Braking())
+    whole = [protocol.pack(message) for message in good_messages()]
 
     class Run:
         def __reduce__(self) -> Any:
@@ -378,11 +380,11 @@ def test_random_bytes_get_an_error_and_are_never_run(tmp_path: Path) -> None:
         inputs.append(bytes(content))
     for content in inputs:
         frames = server.answer(b"me", [content])
-        assert wire.unpack(frames[0])["type"] in {"error", "hello", "ready", "action", "pong", "ended"}
+        assert protocol.unpack(frames[0])["type"] in {"error", "hello", "ready", "action", "pong", "ended"}
     for frames in ([], [b""] * 3, [b"a"] * 100):
-        assert wire.unpack(server.answer(b"me", frames)[0])["code"] == "malformed"
+        assert protocol.unpack(server.answer(b"me", frames)[0])["code"] == "malformed"
     assert not (tmp_path / "was_here").exists()
-    assert wire.unpack(server.answer(b"you", [whole[0]])[0])["type"] == "hello"
+    assert protocol.unpack(server.answer(b"you", [whole[0]])[0])["type"] == "hello"
 
 
 def test_noise_on_the_socket_does_not_end_the_server(serve: Any, ask: Any) -> None:
@@ -417,7 +419,7 @@ def test_a_server_that_answers_nonsense_is_a_fault(reply: bytes, serve: Any, ask
     answer = server._answerer.answer
 
     def nonsense(peer: bytes, frames: list[bytes]) -> list[bytes]:
-        return [reply] if wire.unpack(frames[0])["type"] == "act" else answer(peer, frames)
+        return [reply] if protocol.unpack(frames[0])["type"] == "act" else answer(peer, frames)
 
     server._answerer.answer = nonsense
     with pytest.raises(RemoteError, match="failed twice on this batch"):
@@ -469,7 +471,7 @@ class VirtualLink:
 
     def open(self) -> None:
         self.starts += 1
-        self.answerer = Answerer(self)
+        self.answerer = RequestHandler(self)
 
     def predict(self, observation: Any, state: Any, episode_start: Any, deterministic: bool) -> Any:
         gap = 50 * observation[:, 3]
@@ -481,7 +483,7 @@ class VirtualLink:
         return np.full((len(observation), 2), -0.1, np.float32), 1 if self.memory else None
 
     def hello(self, greeting: Any, timeout: float) -> Any:
-        return wire.unpack(self.ask(wire.pack(greeting), timeout))
+        return protocol.unpack(self.ask(protocol.pack(greeting), timeout))
 
     def ask(self, content: bytes, timeout: float) -> bytes:
         self.timeout = timeout
@@ -489,7 +491,7 @@ class VirtualLink:
             return self.answerer.answer(b"", [content])[0]
         except Hung:
             self.waits.append(timeout)
-            raise Silent(f"no answer within {timeout:.3g} s") from None
+            raise NoReply(f"no answer within {timeout:.3g} s") from None
 
     def close(self) -> None:
         pass
@@ -627,12 +629,12 @@ def test_observations_of_several_kinds_travel_by_name(serve: Any, ask: Any) -> N
     assert {name: part.shape for name, part in there.observation_space.items()} == {"near": (7,), "far": (2, 3)}
     observation = {"near": np.full((2, 7), 0.5, np.float32), "far": np.full((2, 2, 3), 200, np.uint8)}
     np.testing.assert_array_equal(there.predict(observation)[0], [[0.5, 1200.0], [0.5, 1200.0]])
-    server = Answerer(Two())
+    server = RequestHandler(Two())
     for message in good_messages()[:2]:
-        server.answer(b"me", [wire.pack(message)])
-    for parts in ({}, [1], {"near": None}, {"near": wire.pack_array(np.zeros((3, 7)))}):
+        server.answer(b"me", [protocol.pack(message)])
+    for parts in ({}, [1], {"near": None}, {"near": protocol.pack_array(np.zeros((3, 7)))}):
         bad = {**good_messages()[2], "observation": {"parts": parts}}
-        assert wire.unpack(server.answer(b"me", [wire.pack(bad)])[0])["type"] == "error"
+        assert protocol.unpack(server.answer(b"me", [protocol.pack(bad)])[0])["type"] == "error"
 
 
 @pytest.mark.parametrize("where", ["tcp", pytest.param("process", marks=pytest.mark.slow)])
@@ -660,18 +662,18 @@ def test_spaces_survive_the_journey_and_lies_do_not() -> None:
     shapes = spaces.Box(-5.0, 5.0, (3, 3)), uneven
     image = spaces.Box(0, 255, (36, 64, 3), np.uint8)
     for space in (*shapes, image, spaces.Discrete(5), spaces.Dict({"camera": image, "lidar": shapes[0]})):
-        described = wire.unpack(wire.pack({"space": describe(space)}))["space"]
-        assert read_space(described) == space
+        described = protocol.unpack(protocol.pack({"space": encode_space(space)}))["space"]
+        assert decode_space(described) == space
         assert len(str(described)) < 300
-    assert read_space({"shape": [2]}) == spaces.Box(-np.inf, np.inf, (2,))
+    assert decode_space({"shape": [2]}) == spaces.Box(-np.inf, np.inf, (2,))
     box: dict[str, Any] = {"shape": [2], "low": [0.0, 0.0], "high": 1.0}
     wrong: list[Any] = [7, "box", [], {}, {"n": 0}, {"n": -1}, {"n": True}, {"n": 1e9}, {"parts": []}]
     wrong += [{"parts": {"a": {"parts": {"b": {"n": 2}}}}}, {"parts": {"a": 3}}]
     wrong += [{**box, "shape": shape} for shape in ([-2], [2**40], [2**12, 2**12], "2", [[2]], [1.5])]
     wrong += [{**box, "low": low} for low in ([0.0] * 3, "zero", float("nan"), 2.0, {}, [[0.0], [0.0, 1.0]])]
     for given in wrong:
-        with pytest.raises(wire.Malformed, match="a space"):
-            read_space(given)
+        with pytest.raises(protocol.MalformedMessage, match="a space"):
+            decode_space(given)
 
 
 def test_another_ego_that_comes_back_is_not_taken_for_the_first(serve: Any, ask: Any, x: np.ndarray) -> None:

@@ -17,9 +17,9 @@ from rare_envs.simulation.observation import observation_space
 from rare_envs.simulation.rollout import drive
 from rare_envs.simulation.world import World
 from tests.training.imitation.synthetic_scenes import scene
-from training.egos.encounters import APART, Kind, encounters
-from training.egos.imitation import CONFIG, prepare, train
-from training.egos.nominal_driving import judge, summary_of
+from training.egos.encounters import APART, EncounterSpec, make_scenes
+from training.egos.imitation import CONFIG, prepare_learner, train_imitation_ego
+from training.egos.nominal_driving import judge, summarise
 from training.egos.nominal_traffic import CASES
 from training.imitation.algorithms.config import Config
 from training.imitation.fit import fit
@@ -31,7 +31,7 @@ DATA = Path(__file__).parents[4] / "shared" / "data"
 
 def test_an_encounter_is_the_scenario_with_its_ego_free() -> None:
     """Others move as in the scenario whatever the ego does; only egos are driven; every other scene is mirrored."""
-    plain, mirrored = encounters([Kind("cut_in", "us101", scenes=2, seconds=4.0)], np.random.default_rng(3))
+    plain, mirrored = make_scenes([EncounterSpec("cut_in", "us101", scenes=2, seconds=4.0)], np.random.default_rng(3))
     world = World(CUT_IN, horizon=4.0)
     x = rare_envs.DrivingProblem("rare_envs/CutIn-v0").base.sample(26, np.random.default_rng(3))
     with torch.inference_mode():
@@ -56,22 +56,22 @@ def test_an_encounter_is_the_scenario_with_its_ego_free() -> None:
 
 
 def test_parameters_may_be_given() -> None:
-    (one,) = encounters([Kind("straight", None, 1, 1.0, {"gap": 140.0})], np.random.default_rng(0))
+    (one,) = make_scenes([EncounterSpec("straight", None, 1, 1.0, {"gap": 140.0})], np.random.default_rng(0))
     np.testing.assert_allclose(one.x[0, 1::5] - one.x[0, ::5], 145.0, atol=1e-3)
 
 
 @pytest.fixture(scope="module")
-def tiny() -> tuple[Config, list[Kind]]:
+def tiny() -> tuple[Config, list[EncounterSpec]]:
     config = Config(
         updates=2, pools=1, scenes=3, horizon=(4, 4), epochs=1, warm_up=1, headway_weight=8.0, lane_weight=8.0
     )
-    return config, [Kind("cut_in", "us101", seconds=2.0), Kind("hard_brake", None, seconds=2.0)]
+    return config, [EncounterSpec("cut_in", "us101", seconds=2.0), EncounterSpec("hard_brake", None, seconds=2.0)]
 
 
-def test_training_repeats_and_learns_from_people_only(tiny: tuple[Config, list[Kind]]) -> None:
+def test_training_repeats_and_learns_from_people_only(tiny: tuple[Config, list[EncounterSpec]]) -> None:
     config, kinds = tiny
     scenes = [scene(vehicles=8, ticks=30, name=name) for name in "ab"]
-    learners = [prepare(scenes, kinds, config) for _ in range(2)]
+    learners = [prepare_learner(scenes, kinds, config) for _ in range(2)]
     assert learners[0].pairs.scene.max() < len(scenes)
     assert set(learners[0].among.tolist()) == {0, 1, 2, 3}
     one, other = (fit(learner).state_dict() for learner in learners)
@@ -107,7 +107,7 @@ def test_it_needs_no_observation_in_a_process_of_its_own_either() -> None:
 
 @pytest.mark.parametrize("case", ["straight", "bends"])
 def test_it_keeps_its_lane_and_its_distance_for_a_minute(case: str) -> None:
-    found = summary_of(judge(agents.load_ego("imitation"), case, rollouts=32, seed=2026))
+    found = summarise(judge(agents.load_ego("imitation"), case, rollouts=32, seed=2026))
     assert found.kept >= found.judged - 1
     assert found.margin > 0.3
 
@@ -124,12 +124,12 @@ def test_it_brakes_for_those_who_cut_in() -> None:
 @pytest.mark.slow
 @pytest.mark.skipif(not DATA.exists(), reason="the recorded trajectories are not here")
 def test_a_training_from_the_tables_gives_an_ego_and_refuses_another_s_folder(
-    tiny: tuple[Config, list[Kind]], tmp_path: Path
+    tiny: tuple[Config, list[EncounterSpec]], tmp_path: Path
 ) -> None:
     config, kinds = tiny
-    path = train(DATA, config, tmp_path, kinds=kinds, rollouts=2)
+    path = train_imitation_ego(DATA, config, tmp_path, kinds=kinds, rollouts=2)
     ego = agents.load_ego(path)
     assert isinstance(ego, agents.LearnedEgo)
     assert agents.read_provenance(path).metrics["ordinary"]["straight"]["judged"] == 2
     with pytest.raises(ValueError, match="another folder"):
-        train(DATA, replace(config, seed=1), tmp_path, kinds=kinds)
+        train_imitation_ego(DATA, replace(config, seed=1), tmp_path, kinds=kinds)

@@ -11,8 +11,8 @@ import agents
 from rare_envs.control.idm import IDM
 from rare_envs.simulation.rollout import drive
 from rare_envs.traffic.lead import lead_of
-from training.egos.nominal_driving import REASONS, judge, summary_of, world_of
-from training.egos.nominal_traffic import CASES, FLOOR_HEADWAY, OrdinaryDrivers, starts
+from training.egos.nominal_driving import VERDICT_NAMES, judge, make_world, summarise
+from training.egos.nominal_traffic import CASES, FLOOR_HEADWAY, OrdinaryDrivers, draw_starts
 
 
 @dataclass(frozen=True)
@@ -38,12 +38,12 @@ class Flawed:
 
 
 def reasons(found: Any) -> set[str]:
-    return {REASONS[k] for k in found.reason.tolist()}
+    return {VERDICT_NAMES[k] for k in found.reason.tolist()}
 
 
 @pytest.mark.parametrize("case", ["straight", "i80", "bends"])
 def test_a_driver_by_rule_is_nominal(case: str) -> None:
-    found = summary_of(judge("idm", case, rollouts=24, seed=3, seconds=30.0))
+    found = summarise(judge("idm", case, rollouts=24, seed=3, seconds=30.0))
     assert found.kept == found.judged == 24
     assert found.headway > FLOOR_HEADWAY
     assert found.margin > 0.4
@@ -75,7 +75,7 @@ def test_who_is_run_into_from_behind_is_not_to_blame() -> None:
     case = replace(CASES["straight"], drivers=Careless)
     found = judge(Flawed(acceleration=-1.0), case, rollouts=8, seed=0, seconds=20.0)
     assert reasons(found) == {"hit by others"}
-    assert summary_of(found).judged == 0
+    assert summarise(found).judged == 0
 
 
 def test_who_runs_into_its_lead_is_to_blame() -> None:
@@ -88,7 +88,7 @@ def test_who_runs_into_its_lead_is_to_blame() -> None:
             return torch.full_like(action, -1e4), memory
 
     def near(n: int, rng: np.random.Generator) -> Any:
-        x = starts(n, rng)
+        x = draw_starts(n, rng)
         x[:, 0], x[:, 2] = 20.0, 6.0
         return x
 
@@ -98,7 +98,7 @@ def test_who_runs_into_its_lead_is_to_blame() -> None:
 
 def test_starts_are_ordinary() -> None:
     """Nobody is too close, in the lane only, and a driver who keeps its speed for 2 s has not hit anybody."""
-    x = starts(500, np.random.default_rng(0))
+    x = draw_starts(500, np.random.default_rng(0))
     speed, lead_speed, gap = x[:, :3].T
     assert (gap >= 0.8 * speed).all()
     assert (gap - 2.0 * np.maximum(speed - lead_speed, 0.0) > 0.0).all()
@@ -110,9 +110,9 @@ def test_starts_are_ordinary() -> None:
 
 def test_speeds_of_leads_wander_as_recorded_ones_do() -> None:
     """Spread over a minute: 2.0 to 4.8 m/s between the deciles of what US 101 has over 640 m."""
-    world = world_of(CASES["straight"])
+    world = make_world(CASES["straight"])
     rng = np.random.default_rng(2)
-    x = np.concatenate((starts(64, rng), rng.standard_normal((64, world.draws))), axis=1)
+    x = np.concatenate((draw_starts(64, rng), rng.standard_normal((64, world.draws))), axis=1)
     with torch.inference_mode():
         moments = list(drive(world, IDM(), torch.from_numpy(x).float()))
         speeds = torch.stack([moment.state.speed[:, 1] for moment in moments])

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from agents import read_driver, read_provenance
-from agents.learned.networks import HEAD, head_weights
+from agents.learned.networks import HEAD_SIZE, head_weights
 from tests.training.imitation.synthetic_scenes import scenes
 from training.imitation import ensemble as module
 from training.imitation.algorithms.config import Config
@@ -53,7 +53,7 @@ def test_members_differ_and_the_whole_is_saved_with_its_law(run, monkeypatch):
     members = members_of(run, FEW)
     weights = np.stack([member.weights for member in members])
     base = read_driver(run / DRIVER)
-    assert weights.shape == (10, HEAD)
+    assert weights.shape == (10, HEAD_SIZE)
     assert (weights.std(axis=0) > 0).all()  # none inert
     assert (np.abs(weights - head_weights(base.policy).numpy()).max(axis=1) > 0).all()
     path = make_ensemble(run, FEW, run / "whole.safetensors")
@@ -75,7 +75,7 @@ def test_members_are_kept_and_are_the_same_when_trained_again(run):
     again = members_of(run, FEW)
     assert (kept / "003.npz").stat().st_mtime_ns == before
     np.testing.assert_array_equal(first[4].weights, again[4].weights)
-    np.savez(path, base=np.zeros(HEAD), weights=first[4].weights, within=first[4].within)
+    np.savez(path, base=np.zeros(HEAD_SIZE), weights=first[4].weights, within=first[4].within)
     with pytest.raises(ValueError, match="another driver"):
         members_of(run, FEW)
 

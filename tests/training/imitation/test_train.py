@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from agents import load_driver, read_provenance
-from agents.learned.coloured_noise import WHITE
+from agents.learned.coloured_noise import WHITE_NOISE
 from agents.learned.networks import head_weights
 from tests.training.data.recordings import simulate, write_ngsim
 from tests.training.imitation.synthetic_scenes import scenes
@@ -108,10 +108,10 @@ def made_up(monkeypatch):
 
 
 def test_a_folder_holds_a_driver_that_says_where_it_comes_from(made_up, tmp_path):
-    config = tiny(method="mgail", updates=1, colour=WHITE, horizon=(2, 3))
+    config = tiny(method="mgail", updates=1, colour=WHITE_NOISE, horizon=(2, 3))
     path = train_driver(made_up, config, tmp_path / "run")
     driver = load_driver(path)
-    assert driver.colour == WHITE
+    assert driver.colour == WHITE_NOISE
     assert driver.name == "mgail"
     provenance = read_provenance(path)
     assert provenance.kind == "mgail"
@@ -149,7 +149,7 @@ def test_a_command_repeats_its_training(made_up, monkeypatch, tmp_path):
     import typer
     from typer.testing import CliRunner
 
-    config = tiny(method="mgail", seed=4, learned_model=True, colour=WHITE, clone_weight=(0.2, 0.1))
+    config = tiny(method="mgail", seed=4, learned_model=True, colour=WHITE_NOISE, clone_weight=(0.2, 0.1))
     found = []
     monkeypatch.setattr(command_line, "train_driver", lambda *given, **how: found.append(given) or tmp_path)
     app = typer.Typer()

@@ -5,12 +5,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-from agents.learned.coloured_noise import Colour
+from agents.learned.coloured_noise import AutoregressiveNoise
 
 Method = Literal["bc", "gail", "mgail"]
 
 
-HUMAN = Colour.swinging(frequency=(1.70, 1.57), damping=(0.845, 0.40))
+HUMAN = AutoregressiveNoise.swinging(frequency=(1.70, 1.57), damping=(0.845, 0.40))
 """The autocorrelation of what cloning leaves unexplained in the record, within 0.03 up to 1 s."""
 
 
@@ -80,7 +80,7 @@ class Config:
     """Ticks after which a pool starts anew from the record."""
     drivers: tuple[int, int] = (60, 60)
     """Vehicles of a scene that are driven: the curriculum over the number of agents (Bhattacharyya et al. 2018)."""
-    colour: Colour = HUMAN
+    colour: AutoregressiveNoise = HUMAN
     """Of the noise of acceleration and yaw rate; `Colour()` is white noise, as O'Kelly et al. have it."""
 
     # costs of the policy

@@ -5,7 +5,7 @@ from collections import deque
 import torch
 from torch import Tensor, nn
 
-from agents.learned.networks import ACTIONS, FEATURES, Policy
+from agents.learned.networks import ACTION_SIZE, FEATURE_SIZE, Policy
 
 _HIDDEN = 128
 
@@ -16,7 +16,7 @@ class Critic(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.layers = nn.Sequential(
-            nn.Linear(FEATURES + ACTIONS, _HIDDEN),
+            nn.Linear(FEATURE_SIZE + ACTION_SIZE, _HIDDEN),
             nn.LeakyReLU(0.2),
             nn.Linear(_HIDDEN, _HIDDEN),
             nn.LeakyReLU(0.2),

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from agents.learned.networks import FEATURES, Scaling
+from agents.learned.networks import FEATURE_SIZE, Scaling
 from rare_envs.sensors.perception import HEADING, SPEED
 from training.imitation.traffic.recording import Recording
 from training.imitation.traffic.replayed_traffic import look, start
@@ -64,5 +64,5 @@ def scaling_of(pairs: Pairs) -> Scaling:
     if len(pairs.features) < 2:
         raise ValueError(f"Expected two or more recorded pairs, got {len(pairs.features)}; are there any followers?")
     std = pairs.features.std(dim=0)
-    std = torch.where(std > 1e-6, std, torch.ones(FEATURES))
+    std = torch.where(std > 1e-6, std, torch.ones(FEATURE_SIZE))
     return Scaling(pairs.features.mean(dim=0), std, pairs.action.mean(dim=0), pairs.action.std(dim=0).clamp(min=1e-6))

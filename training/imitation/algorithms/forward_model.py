@@ -15,7 +15,7 @@ References:
 import torch
 from torch import Tensor, nn
 
-from agents.learned.networks import ACTIONS, FEATURES, Policy
+from agents.learned.networks import ACTION_SIZE, FEATURE_SIZE, Policy
 from training.imitation.algorithms.critic import inputs
 
 _HIDDEN = 128
@@ -27,11 +27,11 @@ class ForwardModel(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.layers = nn.Sequential(
-            nn.Linear(FEATURES + ACTIONS, _HIDDEN),
+            nn.Linear(FEATURE_SIZE + ACTION_SIZE, _HIDDEN),
             nn.Tanh(),
             nn.Linear(_HIDDEN, _HIDDEN),
             nn.Tanh(),
-            nn.Linear(_HIDDEN, FEATURES),
+            nn.Linear(_HIDDEN, FEATURE_SIZE),
         )
 
     def forward(self, policy: Policy, features: Tensor, action: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ References:
 import torch
 from torch import Tensor
 
-from agents.learned.coloured_noise import Colour
+from agents.learned.coloured_noise import AutoregressiveNoise
 from agents.learned.networks import Policy
 from training.imitation.algorithms.actions import log_likelihood
 from training.imitation.algorithms.critic import inputs, policy_cost
@@ -42,7 +42,7 @@ def advantages(reward: Tensor, value: Tensor, discount: float, gae: float) -> Te
     return out
 
 
-def conditional(policy: Policy, features: Tensor, noise: Tensor, colour: Colour) -> tuple[Tensor, Tensor]:
+def conditional(policy: Policy, features: Tensor, noise: Tensor, colour: AutoregressiveNoise) -> tuple[Tensor, Tensor]:
     """Mean and log standard deviation of actions, given the noise that was expected.
 
     Coloured noise makes actions depend on each other; given the noise before, they are independent Gaussians again.

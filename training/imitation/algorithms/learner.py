@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from agents.learned.networks import ACTIONS, FEATURES, Policy
+from agents.learned.networks import ACTION_SIZE, FEATURE_SIZE, Policy
 from training.imitation.algorithms.actions import log_likelihood, normalised
 from training.imitation.algorithms.behaviour_cloning import seeded
 from training.imitation.algorithms.config import Config
@@ -190,7 +190,7 @@ class Learner:
 def _value() -> nn.Sequential:
     """An estimate of the rewards to come, for GAIL."""
     return nn.Sequential(
-        nn.Linear(FEATURES + ACTIONS, 128), nn.Tanh(), nn.Linear(128, 128), nn.Tanh(), nn.Linear(128, 1)
+        nn.Linear(FEATURE_SIZE + ACTION_SIZE, 128), nn.Tanh(), nn.Linear(128, 128), nn.Tanh(), nn.Linear(128, 1)
     )
 
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from agents.learned.coloured_noise import Colour
+from agents.learned.coloured_noise import AutoregressiveNoise
 from agents.learned.networks import Policy
 from training.imitation.algorithms.actions import physical
 from training.imitation.algorithms.forward_model import ForwardModel
@@ -38,7 +38,7 @@ def roll(
     policy: Policy,
     pool: Pool,
     ticks: int,
-    colour: Colour,
+    colour: AutoregressiveNoise,
     credit: float,
     generator: torch.Generator,
     model: ForwardModel | None = None,

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from agents.learned.coloured_noise import Colour
+from agents.learned.coloured_noise import AutoregressiveNoise
 from training.imitation.traffic.recording import Recording
 from training.imitation.traffic.replayed_traffic import Traffic, start
 
@@ -27,7 +27,7 @@ def fresh_pool(
     size: int,
     most: int,
     shortest: int,
-    colour: Colour,
+    colour: AutoregressiveNoise,
     generator: torch.Generator,
 ) -> Pool:
     """Start scenes at random moments of their records.

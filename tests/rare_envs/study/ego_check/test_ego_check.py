@@ -14,7 +14,7 @@ import pytest
 from typer.testing import Result
 
 import agents
-from agents.sb3.file_trust import doubts
+from agents.sb3.file_trust import find_origin_risks
 from rare_envs.study.ego_check.findings import Finding, exit_code
 from rare_envs.study.ego_check.subprocess_check import Asked, findings_of
 
@@ -262,10 +262,10 @@ def test_a_zip_that_others_can_write_to_is_refused_by_every_command(what: str, s
     statistics = saved.with_name("vecnormalize.pkl")
     if what == "statistics":
         statistics.write_bytes(b"")
-    assert doubts(saved, statistics) == []
+    assert find_origin_risks(saved, statistics) == []
     path = {"file": saved, "folder": saved.parent, "statistics": statistics}[what]
     path.chmod(path.stat().st_mode | 0o002)
-    (doubt,) = doubts(saved, statistics)
+    (doubt,) = find_origin_risks(saved, statistics)
     refused = cli("check-ego", saved, ENV, "--json")
     (finding,) = json.loads(refused.stdout)["findings"]
     assert (refused.exit_code, finding["check"], finding["status"]) == (2, "origin", "fail")
@@ -303,13 +303,13 @@ def test_trust_opens_it_all_the_same(saved: Path, cli: Cli) -> None:
 
 def test_where_everybody_may_add_files_ones_own_are_safe(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     saved.parent.chmod(0o1777)  # as /tmp is
-    assert doubts(saved) == []
+    assert find_origin_risks(saved) == []
     if os.getuid() == 0:
         os.chown(saved, 1234, -1)
     monkeypatch.setattr("os.getuid", lambda: 4321)
-    assert "belongs to another user" in doubts(saved)[0]
+    assert "belongs to another user" in find_origin_risks(saved)[0]
     saved.parent.chmod(0o755)  # a colleague's: nobody else can have put it there
-    assert doubts(saved) == []
+    assert find_origin_risks(saved) == []
 
 
 def test_a_remote_file_is_refused(cli: Cli) -> None:
@@ -344,12 +344,12 @@ def test_a_server_that_keeps_to_the_protocol_passes() -> None:
 
             def forgetful(peer: bytes, frames: list[bytes]) -> list[bytes]:
                 """Answers a step that is not the next as if it were."""
-                from agents.remote import protocol as wire
+                from agents.remote import protocol
 
                 content = answer(peer, frames)[0]
-                message = wire.unpack(content)
+                message = protocol.unpack(content)
                 if message.get("code") == "session":
-                    return [wire.pack({"type": "action", "id": message["id"]})]
+                    return [protocol.pack({"type": "action", "id": message["id"]})]
                 return [content]
 
             server._answerer.answer = forgetful  # type: ignore[method-assign]

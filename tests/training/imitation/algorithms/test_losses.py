@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from agents.learned.coloured_noise import Colour
+from agents.learned.coloured_noise import AutoregressiveNoise
 from agents.learned.networks import Policy, Scaling
 from tests.training.imitation.synthetic_scenes import scenes
 from training.imitation.algorithms import mgail
@@ -108,7 +108,7 @@ def gaussian_log_density(x, correlation):
 
 def test_white_noise_leaves_the_policy_as_it_is():
     policy, features = plain_policy(), torch.randn(4, 51, generator=generator())
-    mean, log_std = conditional(policy, features, torch.zeros(4, 2), Colour())
+    mean, log_std = conditional(policy, features, torch.zeros(4, 2), AutoregressiveNoise())
     torch.testing.assert_close((mean, log_std), policy(features))
 
 
@@ -193,7 +193,7 @@ def test_gail_brakes_less_when_braking_costs(data):
         method="gail",
         updates=25,
         scenes=8,
-        colour=Colour(),
+        colour=AutoregressiveNoise(),
         policy_rate=3e-3,
         clone_weight=(1e-9, 1e-9),
         critic_weight=0.0,

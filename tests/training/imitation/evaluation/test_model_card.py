@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from agents import LearnedDriver, Provenance, save_driver
-from agents.learned.coloured_noise import Colour
+from agents.learned.coloured_noise import AutoregressiveNoise
 from agents.learned.networks import Policy, Scaling
 from training.imitation.evaluation.model_card import main, model_card
 
@@ -20,7 +20,7 @@ def test_the_card_has_every_driver_with_its_command_metrics_and_licence(tmp_path
             metrics=metrics,
             ensemble={"penalty": 0.5, "tried": [{"penalty": 0.8}]} if kind == "mgail" else {},
         )
-        driver = LearnedDriver(Policy(scaling), colour=Colour((0.95, 0.0)), name=kind)
+        driver = LearnedDriver(Policy(scaling), colour=AutoregressiveNoise((0.95, 0.0)), name=kind)
         save_driver(driver, provenance, tmp_path / f"{kind}.safetensors")
     main(tmp_path)
     card = (tmp_path / "README.md").read_text(encoding="utf-8")
