@@ -35,11 +35,11 @@ class NoiseLaw:
         """The same points."""
         return u
 
-    def moved(self, x: Array, weights: Array, alpha: float) -> "NoiseLaw":
+    def project(self, x: Array, weights: Array, alpha: float) -> "NoiseLaw":
         """The same law: a block of cross-entropy that does not move."""
         return self
 
-    def widened(self, factor: float) -> "NoiseLaw":
+    def widen(self, factor: float) -> "NoiseLaw":
         """The same law."""
         return self
 

@@ -36,12 +36,12 @@ class Draws:
     """log(p0 / q) at the others, shape (n - k,)."""
 
     @classmethod
-    def weighted(cls, f: FloatArray, log_weights: FloatArray, x: FloatArray, gamma: float) -> Draws:
+    def from_outcomes(cls, f: FloatArray, log_weights: FloatArray, x: FloatArray, gamma: float) -> Draws:
         """Return draws with outcomes f (n,), log(p0 / q) (n,) and points x (n, d) in physical space."""
         fails = f <= gamma
         return cls(len(f), f[fails], log_weights[fails], x[fails], f[~fails], log_weights[~fails])
 
-    def joined(self, other: Draws) -> Draws:
+    def join(self, other: Draws) -> Draws:
         """Return these draws and others from the same proposal."""
         if self.n == 0:
             return other
@@ -89,7 +89,7 @@ def weighted_cov(n: int, log_weights: FloatArray) -> float:
     return math.sqrt(max(spread, 0.0) + 1.0 / (n * n)) / mean
 
 
-def interval_of(draws: Draws, confidence: float, largest_weight: float, cov: float | None = None) -> Interval:
+def weighted_interval(draws: Draws, confidence: float, largest_weight: float, cov: float | None = None) -> Interval:
     """Return the interval of p: log-normal, with t quantiles where few draws carry it.
 
     `cov` is the c.o.v. where it is not that of independent draws (None).
@@ -125,7 +125,7 @@ def bernstein_bound(draws: Draws, confidence: float, largest_weight: float) -> f
     return min(1.0, draws.p + math.sqrt(2 * variance * log_term / draws.n) + slack)
 
 
-def doubts(draws: Draws) -> list[str]:
+def weight_warnings(draws: Draws) -> list[str]:
     """Return warnings about the weights of the failing draws."""
     if len(draws.f) == 0:
         return [f"None of {draws.n:,} final draws failed: p = 0 with a one-sided interval."]

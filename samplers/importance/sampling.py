@@ -14,10 +14,10 @@ from samplers.importance.draws import Draws
 from samplers.method import Goal, Interrupted
 from samplers.problem import FloatArray, Inputs
 from samplers.proposals.gaussian import Gaussian
-from samplers.proposals.mixture import Law, Mixture
+from samplers.proposals.mixture import Mixture, ProposalDistribution
 from samplers.trace import Level
 
-MOST_BATCHES = 100
+MOST_FINAL_BATCHES = 100
 """Batches of final draws after which a target c.o.v. is given up where max_sim does not say."""
 
 
@@ -25,7 +25,7 @@ MOST_BATCHES = 100
 class Space:
     """Where a proposal lives, and the base law there."""
 
-    base: Law
+    base: ProposalDistribution
     """p0."""
     to_x: Callable[[FloatArray], FloatArray]
     """Maps points of this space, shape (n, d), to physical space."""
@@ -36,14 +36,14 @@ class Space:
         return cls(Gaussian.standard(inputs.dim), inputs.base.from_standard_normal)
 
     @classmethod
-    def physical(cls, base: Law) -> "Space":
+    def physical(cls, base: ProposalDistribution) -> "Space":
         """Physical space, where `base` is the law of x."""
         return cls(base, np.asarray)
 
 
-def draw(
+def simulate_draws(
     inputs: Inputs,
-    sampler: Law,
+    sampler: ProposalDistribution,
     gamma: float,
     n: int,
     rng: np.random.Generator,
@@ -54,12 +54,12 @@ def draw(
     u = sampler.sample(n, rng)
     x = space.to_x(u)
     f = yield x
-    return Draws.weighted(f, space.base.log_prob(u) - sampler.log_prob(u), x, gamma)
+    return Draws.from_outcomes(f, space.base.log_prob(u) - sampler.log_prob(u), x, gamma)
 
 
-def draw_until(
+def simulate_until(
     inputs: Inputs,
-    sampler: Law,
+    sampler: ProposalDistribution,
     goal: Goal,
     limit: int,
     batch: int,
@@ -74,10 +74,10 @@ def draw_until(
     trace: list[Level] = []
     while draws.n < limit:
         try:
-            new = yield from draw(inputs, sampler, goal.gamma, min(batch, limit - draws.n), rng, space)
+            new = yield from simulate_draws(inputs, sampler, goal.gamma, min(batch, limit - draws.n), rng, space)
         except Interrupted:
             return draws, trace, True
-        draws = draws.joined(new)
+        draws = draws.join(new)
         trace.append(
             Level(
                 gamma=goal.gamma,
@@ -95,7 +95,13 @@ def draw_until(
     return draws, trace, False
 
 
-def defensive(base: Law, wide: Law, proposal: Law, base_share: float, wide_share: float) -> Mixture:
+def defensive_mixture(
+    base: ProposalDistribution,
+    wide: ProposalDistribution,
+    proposal: ProposalDistribution,
+    base_share: float,
+    wide_share: float,
+) -> Mixture:
     """Return base_share of the base law + wide_share (may be 0) of a widened proposal + the rest proposal.
 
     Its density is at least base_share of the base, so that no weight exceeds 1 / base_share.
@@ -105,8 +111,8 @@ def defensive(base: Law, wide: Law, proposal: Law, base_share: float, wide_share
     return Mixture(np.array([base_share, wide_share, 1 - (base_share + wide_share)]), [base, wide, proposal])
 
 
-def final_draws(goal: Goal, spent: int, n_final: int) -> int:
+def count_final_draws(goal: Goal, spent: int, n_final: int) -> int:
     """Return how many final draws may be made after a search, in batches of n_final."""
     if goal.max_sim is not None:
         return goal.max_sim - spent
-    return n_final * (1 if goal.target_cov is None else MOST_BATCHES)
+    return n_final * (1 if goal.target_cov is None else MOST_FINAL_BATCHES)

@@ -7,11 +7,11 @@ import numpy as np
 
 from samplers.importance.draws import Draws, weighted_cov
 from samplers.problem import FloatArray, Inputs, StandardNormal
-from samplers.proposals.mixture import Law, Mixture
+from samplers.proposals.mixture import Mixture, ProposalDistribution
 from samplers.statistics.weights import effective_sample_size
 from samplers.trace import Level, Status
 
-LEAST_BUDGET = 100
+LEAST_SEARCH_BUDGET = 100
 """With less than this a search is not worth its draws."""
 SEARCH_SHARE = 2 / 3
 """Largest share of max_sim that a search may use."""
@@ -20,7 +20,7 @@ SEARCH_SHARE = 2 / 3
 class Round(NamedTuple):
     """Simulated draws from one proposal."""
 
-    law: Law
+    law: ProposalDistribution
     """The proposal, in standard normal space."""
     u: FloatArray
     """Shape (n, d)."""
@@ -52,7 +52,7 @@ class Search(NamedTuple):
         return len(self.rounds[0].f) if self.rounds else 0
 
 
-def described(found: Round, level: float) -> Level:
+def round_record(found: Round, level: float) -> Level:
     """Return the record of a round: what its draws say about P[f <= level]."""
     inside = found.f <= level
     log_weights = found.log_weights[inside]
@@ -67,7 +67,7 @@ def described(found: Round, level: float) -> Level:
     )
 
 
-def pooled(rounds: Sequence[Round], inputs: Inputs, gamma: float) -> Draws:
+def pool_rounds(rounds: Sequence[Round], inputs: Inputs, gamma: float) -> Draws:
     """Return the draws of all rounds as if from the mixture of their proposals.
 
     For a run that is stopped during its search. The first round being base draws, no weight exceeds N / n_0.
@@ -78,7 +78,7 @@ def pooled(rounds: Sequence[Round], inputs: Inputs, gamma: float) -> Draws:
     u, f = (np.concatenate(parts) for parts in zip(*((found.u, found.f) for found in rounds), strict=True))
     mixture = Mixture(n / n.sum(), [found.law for found in rounds])
     log_weights = StandardNormal(inputs.dim).log_prob(u) - mixture.log_prob(u)
-    return Draws.weighted(f, log_weights, inputs.base.from_standard_normal(u), gamma)
+    return Draws.from_outcomes(f, log_weights, inputs.base.from_standard_normal(u), gamma)
 
 
 def search_ended(status: Status) -> list[str]:

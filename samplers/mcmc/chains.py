@@ -32,13 +32,13 @@ class Chains(NamedTuple):
         """Mask of the used entries, shape (chains, steps)."""
         return np.arange(self.f.shape[1]) < self.lengths[:, None]
 
-    def where(self, mask: NDArray[np.bool_]) -> "Points":
+    def where(self, mask: NDArray[np.bool_]) -> "RootedPoints":
         """Return the used points in `mask`, shape (chains, steps)."""
         chain, step = np.nonzero(self.used & mask)
-        return Points(self.u[chain, step], self.f[chain, step], self.roots[chain])
+        return RootedPoints(self.u[chain, step], self.f[chain, step], self.roots[chain])
 
 
-class Points(NamedTuple):
+class RootedPoints(NamedTuple):
     """Points with where they come from; the seeds of a level, for one."""
 
     u: FloatArray
@@ -56,8 +56,8 @@ def first_level(inputs: Inputs, n: int, rng: np.random.Generator) -> Generator[F
     return Chains(u[:, None], f[:, None], np.ones(n, dtype=np.int64), np.arange(n), n, None)
 
 
-def grown(
-    inputs: Inputs, seeds: Points, level: float, total: int, kernel: Kernel, rng: np.random.Generator
+def grow_chains(
+    inputs: Inputs, seeds: RootedPoints, level: float, total: int, kernel: Kernel, rng: np.random.Generator
 ) -> Generator[FloatArray, FloatArray, tuple[Chains, Kernel, bool]]:
     """Grow a chain inside {f <= level} from every seed until there are `total` points.
 
@@ -73,13 +73,13 @@ def grown(
     u = np.zeros((n, int(lengths.max()), inputs.dim))
     f = np.full(u.shape[:2], np.inf)
     u[:, 0], f[:, 0] = seeds.u, seeds.f
-    kernel = kernel.started(seeds.u)
+    kernel = kernel.start_level(seeds.u)
     simulated = moved = 0
     interrupted = False
     for t in range(1, f.shape[1]):
         on = lengths > t
         here, f_here = u[on, t - 1], f[on, t - 1]
-        candidates = kernel.candidates(here, rng)
+        candidates = kernel.propose(here, rng)
         changed = (candidates != here).any(axis=1)
         f_candidates = np.full(len(here), np.inf)  # never accepted: a level is finite
         if changed.any():
@@ -93,7 +93,7 @@ def grown(
         step = accepted_step(here, f_here, candidates, f_candidates, level)
         u[on, t], f[on, t] = step.u, step.f
         simulated, moved = simulated + int(changed.sum()), moved + int(step.accepted.sum())
-        kernel = kernel.adapted(float(step.accepted.mean()), t)
+        kernel = kernel.adapt(float(step.accepted.mean()), t)
     moves = int(lengths.sum()) - n
     chains = Chains(u, f, lengths, seeds.roots, simulated, moved / moves if moves else None)
     return chains, kernel, interrupted

@@ -35,13 +35,13 @@ class Step(NamedTuple):
 class Kernel(Protocol):
     """How the chains of a level move."""
 
-    def started(self, seeds: FloatArray) -> "Kernel":
+    def start_level(self, seeds: FloatArray) -> "Kernel":
         """Return the kernel for a level whose chains start at these points (n, d)."""
 
-    def candidates(self, u: FloatArray, rng: np.random.Generator) -> FloatArray:
+    def propose(self, u: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Propose a move from each of the points u (n, d); a row equal to its point is a stay."""
 
-    def adapted(self, acceptance: float, iteration: int) -> "Kernel":
+    def adapt(self, acceptance: float, iteration: int) -> "Kernel":
         """Return the kernel after the iteration-th step of a level, of which this share was accepted."""
 
 
@@ -53,16 +53,16 @@ class FixedMetropolis:
     """Half-width of the uniform or standard deviation of the normal steps."""
     law: Literal["uniform", "normal"]
 
-    def started(self, seeds: FloatArray) -> "FixedMetropolis":
+    def start_level(self, seeds: FloatArray) -> "FixedMetropolis":
         """Return itself."""
         return self
 
-    def candidates(self, u: FloatArray, rng: np.random.Generator) -> FloatArray:
+    def propose(self, u: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Propose a move from each of the points u (n, d)."""
         unit = rng.uniform(-1, 1, u.shape) if self.law == "uniform" else rng.standard_normal(u.shape)
         return metropolis_candidates(u, self.spread * unit, rng)
 
-    def adapted(self, acceptance: float, iteration: int) -> "FixedMetropolis":
+    def adapt(self, acceptance: float, iteration: int) -> "FixedMetropolis":
         """Return itself."""
         return self
 
@@ -80,18 +80,18 @@ class ScaledKernel:
     deviations: FloatArray
     """sigma_0k of equation (14), shape (d,)."""
 
-    def started(self, seeds: FloatArray) -> "ScaledKernel":
+    def start_level(self, seeds: FloatArray) -> "ScaledKernel":
         """Return the kernel with the scale reached and, if asked for, the deviations of these seeds (n, d)."""
         return replace(self, deviations=deviations(seeds)) if self.sigma0 == "seeds" else self
 
-    def candidates(self, u: FloatArray, rng: np.random.Generator) -> FloatArray:
+    def propose(self, u: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Propose a move from each of the points u (n, d)."""
         sigma = proposal_sigma(self.scale, self.deviations)
         if self.proposal == "conditional":
             return conditional_proposal(u, sigma, rng)
         return metropolis_candidates(u, sigma * rng.standard_normal(u.shape), rng)
 
-    def adapted(self, acceptance: float, iteration: int) -> "ScaledKernel":
+    def adapt(self, acceptance: float, iteration: int) -> "ScaledKernel":
         """Return the kernel with the scale of equation (16)."""
         largest = 1 / float(self.deviations.min())
         return replace(self, scale=adapted_scale(self.scale, acceptance, iteration, self.target, largest))

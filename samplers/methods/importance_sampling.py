@@ -7,14 +7,22 @@ from typing import ClassVar
 
 import numpy as np
 
-from samplers.importance.draws import doubts, interval_of
-from samplers.importance.sampling import draw_until
-from samplers.importance.search import LEAST_BUDGET, SEARCH_SHARE, Round, Search, described, pooled, search_ended
+from samplers.importance.draws import weight_warnings, weighted_interval
+from samplers.importance.sampling import simulate_until
+from samplers.importance.search import (
+    LEAST_SEARCH_BUDGET,
+    SEARCH_SHARE,
+    Round,
+    Search,
+    pool_rounds,
+    round_record,
+    search_ended,
+)
 from samplers.method import Goal, Interrupted, Outcome, Steps, no_outcome_share
 from samplers.methods.base import Method
 from samplers.problem import FloatArray, Inputs
-from samplers.proposals.gaussian import Tilted
-from samplers.proposals.mixture import Law, Mixture
+from samplers.proposals.gaussian import TiltedNormal
+from samplers.proposals.mixture import Mixture, ProposalDistribution
 from samplers.statistics.intervals import binomial_cov
 from samplers.statistics.thresholds import next_level
 from samplers.statistics.weights import normalised
@@ -102,28 +110,32 @@ class ImportanceSampling(Method):
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Search for the tilt, then draw until the interval is narrow enough."""
         search, tilt = yield from self._search(inputs, goal, rng)
-        misled = far_share(search, tilt.shift, inputs, goal.gamma) if tilt else 0.0
-        base, largest = Tilted(np.zeros(inputs.dim)), 1.0
-        sampler: Law = base
+        misled = unreached_share(search, tilt.shift, inputs, goal.gamma) if tilt else 0.0
+        base, largest = TiltedNormal(np.zeros(inputs.dim)), 1.0
+        sampler: ProposalDistribution = base
         if tilt and misled <= FAR_SHARE:
             sampler = Mixture(np.array([self.base_share, 1 - self.base_share]), [base, tilt])
             largest = 1 / self.base_share
         target = self.half_width / QUANTILE if goal.target_cov is None else goal.target_cov
         limit = 0 if search.status is Status.STOPPED else min(goal.budget - search.n_sim, self._most(goal))
-        final = draw_until(inputs, sampler, replace(goal, target_cov=target), limit, self.batch, rng)
+        final = simulate_until(inputs, sampler, replace(goal, target_cov=target), limit, self.batch, rng)
         draws, trace, stopped = yield from final
         base_draws = search.base_draws + int(draws.n / largest)
         if draws.n == 0:  # stopped before the first batch
-            draws, largest = pooled(search.rounds, inputs, goal.gamma), float(len(search.rounds))
+            draws, largest = pool_rounds(search.rounds, inputs, goal.gamma), float(len(search.rounds))
         cov = binomial_cov(draws.p, draws.n) if largest == 1 else draws.cov
         stopped = stopped or search.status is Status.STOPPED
         status = Status.STOPPED if stopped else Status.CONVERGED if cov <= target else Status.BUDGET
         return Outcome(
             p=draws.p,
-            interval=interval_of(draws, goal.confidence, largest),
+            interval=weighted_interval(draws, goal.confidence, largest),
             cov=cov,
             status=status if len(draws.f) or stopped else Status.NO_HITS,
-            warnings=(*_about(search.status, misled), *_about_stop(status, cov, target), *doubts(draws)),
+            warnings=(
+                *_tilt_warnings(search.status, misled),
+                *_stop_warnings(status, cov, target),
+                *weight_warnings(draws),
+            ),
             trace=(*search.trace, *trace),
             no_outcome_share=no_outcome_share(draws.f, draws.log_weights),
             sample=draws.sample,
@@ -136,14 +148,14 @@ class ImportanceSampling(Method):
 
     def _search(
         self, inputs: Inputs, goal: Goal, rng: np.random.Generator
-    ) -> Generator[FloatArray, FloatArray, tuple[Search, Tilted | None]]:
+    ) -> Generator[FloatArray, FloatArray, tuple[Search, TiltedNormal | None]]:
         """Follow the level down to gamma and fit the shift there twice; None where base draws serve."""
         rounds, trace = list[Round](), list[Level]()
-        if goal.budget < LEAST_BUDGET:
+        if goal.budget < LEAST_SEARCH_BUDGET:
             return Search(rounds, trace, Status.BUDGET), None
         size = min(self.n_round, goal.budget // 10)
         affordable = int(SEARCH_SHARE * goal.budget) // size
-        law, reached = Tilted(np.zeros(inputs.dim)), 0
+        law, reached = TiltedNormal(np.zeros(inputs.dim)), 0
         for k in range(min(self.max_rounds, affordable)):
             u = law.sample(size, rng)
             try:
@@ -152,13 +164,13 @@ class ImportanceSampling(Method):
                 return Search(rounds, trace, Status.STOPPED), law
             rounds.append(Round(law, u, f))
             level = next_level(f, self.rho, goal.gamma)
-            trace.append(described(rounds[-1], float(f.min()) if level is None else level))
+            trace.append(round_record(rounds[-1], float(f.min()) if level is None else level))
             goal.on_level(trace[-1])
             if level is None or (k == 0 and level == goal.gamma):
                 status = Status.STALLED if level is None else Status.CONVERGED
                 return Search(rounds, trace, status), law if k else None
             inside = f <= level
-            law = Tilted(normalised(rounds[-1].log_weights[inside]) @ u[inside])
+            law = TiltedNormal(normalised(rounds[-1].log_weights[inside]) @ u[inside])
             reached += level == goal.gamma
             if reached == 2:
                 break
@@ -166,7 +178,7 @@ class ImportanceSampling(Method):
         return Search(rounds, trace, Status.CONVERGED if reached else ended), law
 
 
-def far_share(search: Search, theta: FloatArray, inputs: Inputs, gamma: float) -> float:
+def unreached_share(search: Search, theta: FloatArray, inputs: Inputs, gamma: float) -> float:
     """Return the share of what the search saw that lies where the tilt theta (d,) does not lead.
 
     The larger of two: of the base draws under the first level, those with theta' u < 0; of the mass of the
@@ -177,11 +189,11 @@ def far_share(search: Search, theta: FloatArray, inputs: Inputs, gamma: float) -
     failing = np.concatenate([found.u[found.f <= gamma] for found in search.rounds])
     if len(failing) == 0:
         return behind
-    weights = normalised(pooled(search.rounds, inputs, gamma).log_weights)
+    weights = normalised(pool_rounds(search.rounds, inputs, gamma).log_weights)
     return max(behind, float(weights[failing @ theta < 0.5 * float(theta @ theta)].sum()))
 
 
-def _about(status: Status, misled: float) -> list[str]:
+def _tilt_warnings(status: Status, misled: float) -> list[str]:
     """Return the warning about a search that did not end well."""
     if misled > FAR_SHARE:
         return [
@@ -190,7 +202,7 @@ def _about(status: Status, misled: float) -> list[str]:
     return search_ended(status)
 
 
-def _about_stop(status: Status, cov: float, target: float) -> list[str]:
+def _stop_warnings(status: Status, cov: float, target: float) -> list[str]:
     """Return the warning about draws that were used up before the stop."""
     if status is not Status.BUDGET:
         return []

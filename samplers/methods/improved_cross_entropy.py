@@ -8,16 +8,24 @@ from typing import ClassVar, Literal
 import numpy as np
 from scipy.special import log_ndtr
 
-from samplers.importance.draws import doubts, interval_of
-from samplers.importance.sampling import defensive, draw_until, final_draws
-from samplers.importance.search import LEAST_BUDGET, SEARCH_SHARE, Round, Search, described, pooled, search_ended
+from samplers.importance.draws import weight_warnings, weighted_interval
+from samplers.importance.sampling import count_final_draws, defensive_mixture, simulate_until
+from samplers.importance.search import (
+    LEAST_SEARCH_BUDGET,
+    SEARCH_SHARE,
+    Round,
+    Search,
+    pool_rounds,
+    round_record,
+    search_ended,
+)
 from samplers.method import Goal, Interrupted, Outcome, Steps, no_outcome_share
 from samplers.methods.base import Method
-from samplers.methods.mixture_em import Proposal, mixture_of, shrunk_gaussian, widened
+from samplers.methods.mixture_em import ProposalMixture, fit_mixture, fit_shrunk_gaussian, widen_mixture
 from samplers.problem import FloatArray, Inputs
-from samplers.proposals.gaussian import Tilted
-from samplers.proposals.mixture import Law
-from samplers.proposals.von_mises_fisher import Vmfn
+from samplers.proposals.gaussian import TiltedNormal
+from samplers.proposals.mixture import ProposalDistribution
+from samplers.proposals.von_mises_fisher import VonMisesFisherNakagami
 from samplers.statistics.intervals import binomial_cov
 from samplers.statistics.weights import normalised
 from samplers.trace import Level, Status
@@ -41,7 +49,7 @@ class ImprovedCrossEntropy(Method):
     weight_cov, and q_(k+1) is fitted to all draws with these weights. It ends when the
     c.o.v. of I[f <= gamma] / Phi(-(f - gamma) / sigma_k) falls to weight_cov.
     Estimate: fresh draws from base_share p0 + wide_share (q widened) + the rest q, with q fitted to the failing
-    draws of all rounds (`pooled`), so that p-hat given the search is unbiased and no weight exceeds 1 / base_share.
+    draws of all rounds (`pool_rounds`). Given the search, p-hat is unbiased and no weight exceeds 1 / base_share.
 
     Families: one Gaussian ("gaussian"); a mixture of Gaussians ("mixture"); a mixture of
     von Mises-Fisher-Nakagami laws ("vmfn"), a direction and a radius, for many dimensions and failure
@@ -63,11 +71,11 @@ class ImprovedCrossEntropy(Method):
       no difficulty, since no quantile is taken.
     - *Components.* The code starts with a given number and drops the small ones. Ours takes the number
       with the best Bayesian information criterion, up to `components`.
-    - *Covariances* are shrunk towards I but for the direction of the mean (`shrunk_gaussian`), which
+    - *Covariances* are shrunk towards I but for the direction of the mean (`fit_shrunk_gaussian`), which
       makes "gaussian" and "mixture" usable in a hundred dimensions, where those of the points alone are not.
 
     A region that the search did not see or lost in fitting is seen by base draws only, as a rare heavy
-    weight (then warned of) or not at all. The interval is log-normal (`interval_of`); where the base draws
+    weight (then warned of) or not at all. The interval is log-normal (`weighted_interval`); where the base draws
     themselves fail often enough, plain draws and Clopper-Pearson take over.
 
     Args:
@@ -116,25 +124,25 @@ class ImprovedCrossEntropy(Method):
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Search for a proposal, then estimate with fresh draws."""
         search, proposal = yield from self._search(inputs, goal, rng)
-        base, largest = Tilted(np.zeros(inputs.dim)), 1.0
-        sampler: Law = base
+        base, largest = TiltedNormal(np.zeros(inputs.dim)), 1.0
+        sampler: ProposalDistribution = base
         if proposal is not None:
-            wide = widened(proposal, self.wide_factor)
-            sampler = defensive(base, wide, proposal, self.base_share, self.wide_share)
+            wide = widen_mixture(proposal, self.wide_factor)
+            sampler = defensive_mixture(base, wide, proposal, self.base_share, self.wide_share)
             largest = 1 / self.base_share
-        limit = 0 if search.status is Status.STOPPED else final_draws(goal, search.n_sim, self.n_final)
-        draws, trace, stopped = yield from draw_until(inputs, sampler, goal, limit, self.n_final, rng)
+        limit = 0 if search.status is Status.STOPPED else count_final_draws(goal, search.n_sim, self.n_final)
+        draws, trace, stopped = yield from simulate_until(inputs, sampler, goal, limit, self.n_final, rng)
         base_draws = search.base_draws + int(draws.n / largest)
         if draws.n == 0:  # stopped before the first batch
-            draws, largest = pooled(search.rounds, inputs, goal.gamma), float(len(search.rounds))
+            draws, largest = pool_rounds(search.rounds, inputs, goal.gamma), float(len(search.rounds))
         stopped = stopped or search.status is Status.STOPPED
         status = Status.STOPPED if stopped else search.status if len(draws.f) else Status.NO_HITS
         return Outcome(
             p=draws.p,
-            interval=interval_of(draws, goal.confidence, largest),
+            interval=weighted_interval(draws, goal.confidence, largest),
             cov=binomial_cov(draws.p, draws.n) if largest == 1 else draws.cov,
             status=status,
-            warnings=(*search_ended(search.status), *doubts(draws)),
+            warnings=(*search_ended(search.status), *weight_warnings(draws)),
             trace=(*search.trace, *trace),
             no_outcome_share=no_outcome_share(draws.f, draws.log_weights),
             sample=draws.sample,
@@ -143,15 +151,15 @@ class ImprovedCrossEntropy(Method):
 
     def _search(
         self, inputs: Inputs, goal: Goal, rng: np.random.Generator
-    ) -> Generator[FloatArray, FloatArray, tuple[Search, Proposal | None]]:
+    ) -> Generator[FloatArray, FloatArray, tuple[Search, ProposalMixture | None]]:
         """Narrow the target down to failure; return the proposal fitted last, None where base draws serve."""
         rounds, trace = list[Round](), list[Level]()
-        if goal.budget < LEAST_BUDGET:
+        if goal.budget < LEAST_SEARCH_BUDGET:
             return Search(rounds, trace, Status.BUDGET), None
         size = min(self.n_round, goal.budget // 10)
         affordable = int(SEARCH_SHARE * goal.budget) // size
-        law: Law = Tilted(np.zeros(inputs.dim))
-        proposal: Proposal | None = None
+        law: ProposalDistribution = TiltedNormal(np.zeros(inputs.dim))
+        proposal: ProposalMixture | None = None
         width, narrowest = math.inf, 0.0
         for k in range(min(self.max_rounds, affordable)):
             u = law.sample(size, rng)
@@ -160,47 +168,47 @@ class ImprovedCrossEntropy(Method):
             except Interrupted:
                 return Search(rounds, trace, Status.STOPPED), None
             rounds.append(Round(law, u, f))
-            trace.append(described(rounds[-1], goal.gamma))
+            trace.append(round_record(rounds[-1], goal.gamma))
             goal.on_level(trace[-1])
             g, log_ratio = np.clip(f - goal.gamma, -HUGE, HUGE), rounds[-1].log_weights
-            reached = spread(np.where(g <= 0, -log_smooth(g, width), -np.inf)) <= self.weight_cov
+            reached = weights_cov(np.where(g <= 0, -log_smooth_indicator(g, width), -np.inf)) <= self.weight_cov
             if reached and k == 0:
                 return Search(rounds, trace, Status.CONVERGED), None
             if k == 0:
-                scale = scale_of(g)
+                scale = median_scale(g)
                 width, narrowest = WIDEST * scale, NARROWEST * scale
             width = next_width(g, log_ratio, self.weight_cov, narrowest, width)
             if reached or (width == narrowest and (g <= 0).any()):
                 points = np.concatenate([found.u[found.f <= goal.gamma] for found in rounds])
-                fitted = self._fitted(points, pooled(rounds, inputs, goal.gamma).log_weights, rng)
+                fitted = self._fitted(points, pool_rounds(rounds, inputs, goal.gamma).log_weights, rng)
                 return Search(rounds, trace, Status.CONVERGED), fitted
-            log_weights = log_smooth(g, width) + log_ratio
+            log_weights = log_smooth_indicator(g, width) + log_ratio
             if width == narrowest or not np.isfinite(log_weights).any():  # all outcomes alike
                 return Search(rounds, trace, Status.STALLED), proposal
             law = proposal = self._fitted(u, log_weights, rng)
         ended = Status.BUDGET if affordable < self.max_rounds else Status.STALLED
         return Search(rounds, trace, ended), proposal
 
-    def _fitted(self, u: FloatArray, log_weights: FloatArray, rng: np.random.Generator) -> Proposal:
+    def _fitted(self, u: FloatArray, log_weights: FloatArray, rng: np.random.Generator) -> ProposalMixture:
         """Return the law of the family nearest to points u (n, d) with these weights (n,)."""
         used = np.isfinite(log_weights)
         u, weights = u[used], normalised(log_weights[used])
         dim = u.shape[1]
         if self.family == "gaussian":
-            return mixture_of(shrunk_gaussian, u, weights, 1, 1, rng)
+            return fit_mixture(fit_shrunk_gaussian, u, weights, 1, 1, rng)
         if self.family == "mixture":
             size = dim + min(dim * (dim + 1) // 2, 2 * dim)  # shrinking leaves about so many
-            return mixture_of(shrunk_gaussian, u, weights, self.components, size, rng)
-        return mixture_of(Vmfn.fitted, u, weights, self.components, dim + 2, rng)
+            return fit_mixture(fit_shrunk_gaussian, u, weights, self.components, size, rng)
+        return fit_mixture(VonMisesFisherNakagami.fit, u, weights, self.components, dim + 2, rng)
 
 
-def log_smooth(g: FloatArray, width: float) -> FloatArray:
+def log_smooth_indicator(g: FloatArray, width: float) -> FloatArray:
     """Return log Phi(-g / width) of g = f - gamma (n,), a smooth indicator of g <= 0."""
     with np.errstate(over="ignore"):
         return np.asarray(log_ndtr(-g / width))
 
 
-def spread(log_weights: FloatArray) -> float:
+def weights_cov(log_weights: FloatArray) -> float:
     """Return the c.o.v. of weights given as logarithms (n,); inf where all are 0."""
     highest = float(log_weights.max())
     if highest == -math.inf:
@@ -221,20 +229,20 @@ def next_width(g: FloatArray, log_ratio: FloatArray, target: float, low: float, 
         low: Least width.
         high: Largest width, that of the round before.
     """
-    if spread(log_smooth(g, low) + log_ratio) <= target:
+    if weights_cov(log_smooth_indicator(g, low) + log_ratio) <= target:
         return low
-    if spread(log_smooth(g, high) + log_ratio) >= target:
+    if weights_cov(log_smooth_indicator(g, high) + log_ratio) >= target:
         return high
     for _ in range(HALVINGS):
         middle = math.sqrt(low) * math.sqrt(high)
-        if spread(log_smooth(g, middle) + log_ratio) > target:
+        if weights_cov(log_smooth_indicator(g, middle) + log_ratio) > target:
             low = middle
         else:
             high = middle
     return high
 
 
-def scale_of(g: FloatArray) -> float:
+def median_scale(g: FloatArray) -> float:
     """Return the median of |g| over finite g other than 0; 1 where there is none."""
     sizes = np.abs(g[(np.abs(g) < HUGE) & (g != 0)])
     return float(np.median(sizes)) if len(sizes) else 1.0

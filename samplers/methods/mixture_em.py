@@ -15,24 +15,24 @@ import numpy as np
 
 from samplers.problem import FloatArray
 from samplers.proposals.gaussian import Gaussian, weighted_moments
-from samplers.proposals.mixture import Law, Mixture
+from samplers.proposals.mixture import Mixture, ProposalDistribution
 
 
-class Component(Law, Protocol):
+class WidenableDistribution(ProposalDistribution, Protocol):
     """A law that a mixture is made of."""
 
-    def widened(self, factor: float) -> "Component":
+    def widen(self, factor: float) -> "WidenableDistribution":
         """Return the same, more spread out by about this factor."""
 
 
 @dataclass(frozen=True, eq=False)
-class Proposal(Mixture):
+class ProposalMixture(Mixture):
     """A mixture of laws that can be widened."""
 
-    components: Sequence[Component]
+    components: Sequence[WidenableDistribution]
 
 
-Fit = Callable[[FloatArray, FloatArray], Component]
+Fit = Callable[[FloatArray, FloatArray], WidenableDistribution]
 """Fits one component to points (n, d) with weights (n,) that add up to 1."""
 STEPS = 50
 """Steps of expectation-maximisation at most."""
@@ -44,7 +44,7 @@ LEAST_VARIANCE = 1e-8
 """Of a component, in any direction: points may coincide."""
 
 
-def shrunk_gaussian(u: FloatArray, weights: FloatArray) -> Gaussian:
+def fit_shrunk_gaussian(u: FloatArray, weights: FloatArray) -> Gaussian:
     """Return the Gaussian of weighted points, its covariance drawn towards a simple one.
 
     The target is I but for the variance along the mean, T = I + (l - 1) v v': what N(0, I) beyond a plane
@@ -68,9 +68,9 @@ def shrunk_gaussian(u: FloatArray, weights: FloatArray) -> Gaussian:
     return Gaussian.from_covariance(mean, (1 - pull) * s + pull * target + floor)
 
 
-def mixture_of(
+def fit_mixture(
     fit: Fit, u: FloatArray, weights: FloatArray, most: int, size: int, rng: np.random.Generator
-) -> Proposal:
+) -> ProposalMixture:
     """Return the mixture of 1 to `most` components with the best Bayesian information criterion.
 
     The criterion counts the effective number of points, (sum w)^2 / sum w^2. More components are tried for
@@ -85,11 +85,11 @@ def mixture_of(
         rng: Source of randomness, for the first centres.
     """
     points = 1 / float(weights @ weights)
-    best, highest = Proposal(np.ones(1), [fit(u, weights)]), -np.inf
+    best, highest = ProposalMixture(np.ones(1), [fit(u, weights)]), -np.inf
     for k in range(1, most + 1):
         if k * size >= points:  # the criterion means nothing there
             break
-        mixture = best if k == 1 else fitted(fit, u, weights, k, rng)
+        mixture = best if k == 1 else fit_mixture_of_size(fit, u, weights, k, rng)
         score = points * float(weights @ mixture.log_prob(u)) - 0.5 * (k * size + k - 1) * np.log(points)
         if score <= highest:
             break
@@ -97,16 +97,18 @@ def mixture_of(
     return best
 
 
-def fitted(fit: Fit, u: FloatArray, weights: FloatArray, k: int, rng: np.random.Generator) -> Proposal:
+def fit_mixture_of_size(
+    fit: Fit, u: FloatArray, weights: FloatArray, k: int, rng: np.random.Generator
+) -> ProposalMixture:
     """Return a mixture of at most k components by expectation-maximisation, from distant first centres."""
-    shares = first_shares(u, weights, k, rng)
+    shares = initial_responsibilities(u, weights, k, rng)
     reached = -np.inf
     for _ in range(STEPS):
         mass = weights[:, None] * shares
         kept = mass.sum(axis=0) > min(LEAST_WEIGHT, 0.5 / k)
         totals = mass.sum(axis=0)[kept]
         components = [fit(u, part / part.sum()) for part in mass.T[kept]]
-        mixture = Proposal(totals / totals.sum(), components)
+        mixture = ProposalMixture(totals / totals.sum(), components)
         terms = np.stack([np.log(w) + c.log_prob(u) for w, c in zip(mixture.weights, components, strict=True)], axis=1)
         highest = terms.max(axis=1, keepdims=True)
         odds = np.exp(terms - highest)
@@ -118,7 +120,7 @@ def fitted(fit: Fit, u: FloatArray, weights: FloatArray, k: int, rng: np.random.
     return mixture
 
 
-def first_shares(u: FloatArray, weights: FloatArray, k: int, rng: np.random.Generator) -> FloatArray:
+def initial_responsibilities(u: FloatArray, weights: FloatArray, k: int, rng: np.random.Generator) -> FloatArray:
     """Return to which of k centres each point is nearest in direction, as zeros and ones (n, k).
 
     Centres are points drawn by weight times squared distance from those before (k-means++). Directions, as
@@ -136,6 +138,6 @@ def first_shares(u: FloatArray, weights: FloatArray, k: int, rng: np.random.Gene
     return np.asarray(distances.argmin(axis=1)[:, None] == np.arange(k), dtype=np.float64)
 
 
-def widened(proposal: Proposal, factor: float) -> Proposal:
+def widen_mixture(proposal: ProposalMixture, factor: float) -> ProposalMixture:
     """Return the proposal with every component more spread out."""
-    return Proposal(proposal.weights, [component.widened(factor) for component in proposal.components])
+    return ProposalMixture(proposal.weights, [component.widen(factor) for component in proposal.components])

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from samplers.mcmc.chains import Chains, first_level, grown
+from samplers.mcmc.chains import Chains, first_level, grow_chains
 from samplers.mcmc.kernels import Kernel
 from samplers.method import Goal, Outcome, Steps, no_outcome_share
 from samplers.problem import FloatArray, Inputs
@@ -34,7 +34,7 @@ USUAL_LEVELS = 4
 """Levels that shall fit into a small budget: down to p = p0^4, 1e-4."""
 
 
-class Passed(NamedTuple):
+class LevelProduct(NamedTuple):
     """What the levels passed so far say."""
 
     p: float = 1.0
@@ -44,7 +44,7 @@ class Passed(NamedTuple):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Descent:
+class SubsetLevels:
     """The settings that all kinds of subset simulation share."""
 
     n: int
@@ -56,41 +56,41 @@ class Descent:
 
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator, kernel: Kernel) -> Steps:
         """Go from level to level until the share of failures among its points is p0 or more."""
-        fitted = replace(self, n=self._points(goal.budget))
-        outcome = yield from fitted._descend(inputs, goal, rng, kernel)
-        return replace(outcome, warnings=(*self._about_budget(fitted.n, goal.budget), *outcome.warnings))
+        fitted = replace(self, n=self._points_per_level(goal.budget))
+        outcome = yield from fitted._run_levels(inputs, goal, rng, kernel)
+        return replace(outcome, warnings=(*self._budget_warnings(fitted.n, goal.budget), *outcome.warnings))
 
-    def _points(self, budget: int) -> int:
+    def _points_per_level(self, budget: int) -> int:
         """Return the points per level: fewer than n where the budget does not hold the usual levels."""
         fitting = int(budget / (1 + (USUAL_LEVELS - 1) * (1 - self.p0)))  # seeds are not simulated again
         return min(self.n, max(math.ceil(FEWEST_SEEDS / self.p0), fitting))
 
-    def _about_budget(self, n: int, budget: int) -> list[str]:
+    def _budget_warnings(self, n: int, budget: int) -> list[str]:
         """Return the warning about a budget that is too small for n points per level."""
         if budget < n:
             return [f"max_sim leaves {budget} of the {n} simulations that level 0 needs at least: plain draws only."]
         coarse = n < self.n / 2
         return [f"max_sim leaves {budget} simulations: {n} points per level, not {self.n}."] if coarse else []
 
-    def _descend(self, inputs: Inputs, goal: Goal, rng: np.random.Generator, kernel: Kernel) -> Steps:
+    def _run_levels(self, inputs: Inputs, goal: Goal, rng: np.random.Generator, kernel: Kernel) -> Steps:
         """Run with n points per level, as far as the budget goes."""
         chains = yield from first_level(inputs, min(self.n, goal.budget), rng)
         left, stopped = goal.budget - chains.n_new, False
-        passed, trace, levels = Passed(), list[Level](), list[Chains]()
+        passed, trace, levels = LevelProduct(), list[Level](), list[Chains]()
         while True:
             levels.append(chains)
             level = next_level(chains.f[chains.used], self.p0, goal.gamma)
             stop = Status.STOPPED if stopped else self._reason_to_stop(chains, level, goal.gamma, left, len(trace))
             threshold = goal.gamma if stop is not None or level is None else level
-            trace.append(described(chains, threshold, passed))
+            trace.append(level_record(chains, threshold, passed))
             goal.on_level(trace[-1])
             if stop is not None:
                 sample = weighted_points(inputs, levels, trace, goal.gamma)
-                return replace(finish(chains, goal, passed, trace, stop), sample=sample)
-            passed = after(passed, trace[-1])
+                return replace(summarise(chains, goal, passed, trace, stop), sample=sample)
+            passed = include_level(passed, trace[-1])
             seeds = chains.where(chains.f <= threshold)
-            total = self._total(len(seeds.f), left)
-            chains, kernel, stopped = yield from grown(inputs, seeds, threshold, total, kernel, rng)
+            total = self._points_of_level(len(seeds.f), left)
+            chains, kernel, stopped = yield from grow_chains(inputs, seeds, threshold, total, kernel, rng)
             left -= chains.n_new
 
     def _reason_to_stop(
@@ -106,13 +106,13 @@ class Descent:
         n_seeds = int(np.count_nonzero(chains.f[chains.used] <= level))
         return Status.BUDGET if left < n_seeds else None  # not one step for every chain
 
-    def _total(self, n_seeds: int, left: int) -> int:
+    def _points_of_level(self, n_seeds: int, left: int) -> int:
         """Return how many points the next level shall have, its seeds included."""
         longest = max(LONGEST_CHAIN, math.ceil(1 / self.p0))
         return max(min(self.n, n_seeds + left, n_seeds * longest), n_seeds)
 
 
-def described(chains: Chains, threshold: float, passed: Passed) -> Level:
+def level_record(chains: Chains, threshold: float, passed: LevelProduct) -> Level:
     """Return the record of a level: the true share of its points with f <= threshold."""
     below = chains.used & (chains.f <= threshold)
     total = int(chains.lengths.sum())
@@ -130,10 +130,10 @@ def described(chains: Chains, threshold: float, passed: Passed) -> Level:
     )
 
 
-def after(passed: Passed, level: Level) -> Passed:
+def include_level(passed: LevelProduct, level: Level) -> LevelProduct:
     """Return the product with one more level, taken as independent of the others."""
     square = (1 + passed.cov**2) * (1 + level.cov**2) - 1
-    return Passed(p=passed.p * level.p, cov=math.sqrt(square))
+    return LevelProduct(p=passed.p * level.p, cov=math.sqrt(square))
 
 
 def weighted_points(inputs: Inputs, levels: list[Chains], trace: list[Level], gamma: float) -> Sample:
@@ -165,13 +165,13 @@ def _layers(levels: list[Chains], trace: list[Level], weights: FloatArray) -> It
         yield Layer(f=points.f, weights=np.full(len(points.f), weight), units=points.roots, low=low, high=high)
 
 
-def finish(chains: Chains, goal: Goal, passed: Passed, trace: list[Level], status: Status) -> Outcome:
+def summarise(chains: Chains, goal: Goal, passed: LevelProduct, trace: list[Level], status: Status) -> Outcome:
     """Return the outcome: the last of `trace` counted f <= gamma."""
     _, hits, roots = chains.where(chains.f <= goal.gamma)
-    cov = max(after(passed, trace[-1]).cov, descent_cov(roots, trace[0].n_points))
+    cov = max(include_level(passed, trace[-1]).cov, descent_cov(roots, trace[0].n_points))
     return Outcome(
         p=passed.p * trace[-1].p,
-        interval=interval(chains, len(hits), goal, passed, trace, cov),
+        interval=subset_interval(chains, len(hits), goal, passed, trace, cov),
         cov=cov,
         status=status if len(hits) or status is Status.STOPPED else Status.NO_HITS,
         warnings=tuple(_warnings(trace, status, len(hits), cov)),
@@ -181,7 +181,9 @@ def finish(chains: Chains, goal: Goal, passed: Passed, trace: list[Level], statu
     )
 
 
-def interval(chains: Chains, hits: int, goal: Goal, passed: Passed, trace: list[Level], cov: float) -> Interval:
+def subset_interval(
+    chains: Chains, hits: int, goal: Goal, passed: LevelProduct, trace: list[Level], cov: float
+) -> Interval:
     """Return the interval of p after a last level with `hits` failing points."""
     if len(trace) == 1:
         return clopper_pearson(hits, trace[0].n_points, goal.confidence)

@@ -9,7 +9,7 @@ import numpy as np
 from samplers.mcmc.kernels import FixedMetropolis, ScaledKernel
 from samplers.method import Goal, Steps
 from samplers.methods.base import Method
-from samplers.methods.subset_levels import Descent
+from samplers.methods.subset_levels import SubsetLevels
 from samplers.problem import Inputs
 from samplers.validation import check_choice, check_count, check_setting
 
@@ -73,7 +73,7 @@ class SubsetSimulation(Method):
 
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Go from level to level until the share of failures among its points is p0 or more."""
-        descent = Descent(n=self.n, p0=self.p0, max_levels=self.max_levels)
+        descent = SubsetLevels(n=self.n, p0=self.p0, max_levels=self.max_levels)
         return (yield from descent.steps(inputs, goal, rng, FixedMetropolis(self.spread, self.law)))
 
 
@@ -168,5 +168,5 @@ class AdaptiveSubsetSimulation(Method):
         kernel = ScaledKernel(
             self.proposal, self.sigma0, self.scale, self.target_acceptance, deviations=np.ones(inputs.dim)
         )
-        descent = Descent(n=self.n, p0=self.p0, max_levels=self.max_levels)
+        descent = SubsetLevels(n=self.n, p0=self.p0, max_levels=self.max_levels)
         return (yield from descent.steps(inputs, goal, rng, kernel))

@@ -16,7 +16,7 @@ from scipy.special import gammaln, log_ndtr, logsumexp, ndtri_exp
 from samplers.problem import FloatArray
 
 
-class Component(Protocol):
+class MixtureComponent(Protocol):
     """A law in standard normal space."""
 
     def log_ratio(self, u: FloatArray) -> FloatArray:
@@ -27,7 +27,7 @@ class Component(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Wide:
+class IsotropicNormal:
     """N(0, scale^2 I); the base law where scale is 1."""
 
     dim: int
@@ -44,7 +44,7 @@ class Wide:
 
 
 @dataclass(frozen=True, eq=False)
-class Bump:
+class SubspaceGaussian:
     """Independent Gaussians along some orthonormal axes, N(0, 1) in every direction outside their span."""
 
     axes: FloatArray
@@ -71,24 +71,24 @@ class Bump:
         t = xi @ self.axes
         return np.asarray(xi + (self.mean + np.sqrt(self.variance) * t - t) @ self.axes.T)
 
-    def tempered(self, power: float) -> "Bump":
+    def temper(self, power: float) -> "SubspaceGaussian":
         """Return q^power phi^(1 - power), normalised: nearer to the origin and wider.
 
         With a noisy f, where points fail with probability pi, failures have density q ~ phi pi and the best
         proposal is phi sqrt(pi): the tempered one with power 1/2.
         """
         precision = power / self.variance + (1 - power)
-        return Bump(self.axes, power * self.mean / self.variance / precision, 1 / precision)
+        return SubspaceGaussian(self.axes, power * self.mean / self.variance / precision, 1 / precision)
 
 
 @dataclass(frozen=True, eq=False)
-class Slice:
+class HalfSpaceNormal:
     """N(0, I) beyond a plane, axis . u >= start; exact for a half-space."""
 
     axis: FloatArray
     """Unit vector, shape (d,)."""
     start: float
-    across: Bump | None = None
+    across: SubspaceGaussian | None = None
     """Another law for the directions within the plane; its axes are orthogonal to `axis`."""
 
     def log_ratio(self, u: FloatArray) -> FloatArray:
@@ -104,7 +104,7 @@ class Slice:
 
 
 @dataclass(frozen=True, eq=False)
-class Shell:
+class RadialLaw:
     """Every direction alike, |u|^2 = start + Gamma(shape, scale): for failure beyond a radius."""
 
     dim: int
@@ -130,12 +130,12 @@ class Shell:
         return np.asarray(direction * np.sqrt(self.start + self.scale * rng.gamma(self.shape, size=n))[:, None])
 
 
-def log_ratios(components: Sequence[Component], u: FloatArray) -> FloatArray:
+def log_ratios(components: Sequence[MixtureComponent], u: FloatArray) -> FloatArray:
     """Return the log ratios of k components at u (n, d), shape (k, n)."""
     return np.array([component.log_ratio(u) for component in components]).reshape(len(components), len(u))
 
 
-def mixed(log_r: FloatArray, weights: FloatArray) -> FloatArray:
+def mixture_log_ratio(log_r: FloatArray, weights: FloatArray) -> FloatArray:
     """Return the log ratio of sum_k weights_k q_k from those of the q_k (k, n), shape (n,)."""
     return np.asarray(logsumexp(log_r, axis=0, b=weights[:, None]))
 
@@ -147,6 +147,8 @@ def draw_counts(weights: FloatArray, n: int, rng: np.random.Generator) -> NDArra
     return np.diff(np.concatenate([[0.0], np.minimum(bounds, n)])).astype(np.int64)
 
 
-def draw(components: Sequence[Component], counts: NDArray[np.int64], rng: np.random.Generator) -> FloatArray:
+def draw_components(
+    components: Sequence[MixtureComponent], counts: NDArray[np.int64], rng: np.random.Generator
+) -> FloatArray:
     """Draw counts_k points from each component, one component after the other."""
     return np.concatenate([c.sample(int(k), rng) for c, k in zip(components, counts, strict=True)])

@@ -22,7 +22,7 @@ class Moments(NamedTuple):
         """E[u u'] - E[u] E[u]', shape (d, d)."""
         return self.second - np.outer(self.first, self.first)
 
-    def mixed(self, other: "Moments", share: float) -> "Moments":
+    def mix_with(self, other: "Moments", share: float) -> "Moments":
         """Return the moments of the mixture of this law, with weight `share`, and another one."""
         return Moments(share * self.first + (1 - share) * other.first, share * self.second + (1 - share) * other.second)
 
@@ -61,7 +61,7 @@ class Gaussian:
         """E[u] and E[u u']."""
         return Moments(self.mean, self.covariance + np.outer(self.mean, self.mean))
 
-    def widened(self, factor: float) -> "Gaussian":
+    def widen(self, factor: float) -> "Gaussian":
         """Return the same with all standard deviations multiplied by factor."""
         return Gaussian(self.mean, factor * self.cholesky)
 
@@ -84,7 +84,7 @@ class Gaussian:
         return np.asarray(self.mean + z @ self.cholesky.T)
 
 
-def pulled_gaussian(target: Moments, present: Gaussian, points: float) -> Gaussian:
+def shrink_towards_present(target: Moments, present: Gaussian, points: float) -> Gaussian:
     """Return the Gaussian with the target's mean and its covariance, drawn towards the present one.
 
     The present covariance counts as (d + 1) max(1, d / 10) points beside the effectively `points`
@@ -102,7 +102,7 @@ def weighted_moments(u: FloatArray, weights: FloatArray) -> Moments:
 
 
 @dataclass(frozen=True, eq=False)
-class Tilted:
+class TiltedNormal:
     """N(shift, I), that is N(0, I) tilted by exp(shift' u - |shift|^2 / 2)."""
 
     shift: FloatArray

@@ -13,7 +13,7 @@ from samplers.problem import FloatArray
 from samplers.proposals.gaussian import Gaussian
 
 
-class Law(Protocol):
+class ProposalDistribution(Protocol):
     """What can be drawn from and has a density."""
 
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
@@ -29,7 +29,7 @@ class Mixture:
 
     weights: FloatArray
     """Shape (k,), adding up to 1."""
-    components: Sequence[Law]
+    components: Sequence[ProposalDistribution]
     """k of them."""
 
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
@@ -50,9 +50,9 @@ class GaussianMixture(Mixture):
 
     components: Sequence[Gaussian]
 
-    def widened(self, factor: float) -> GaussianMixture:
+    def widen(self, factor: float) -> GaussianMixture:
         """Return the same with the standard deviations of all components multiplied by factor."""
-        return GaussianMixture(self.weights, [component.widened(factor) for component in self.components])
+        return GaussianMixture(self.weights, [component.widen(factor) for component in self.components])
 
     def responsibilities(self, u: FloatArray) -> FloatArray:
         """Return how likely each point u (n, d) comes from each component, shape (n, k)."""

@@ -28,7 +28,7 @@ LARGE_ORDER = 50.0
 
 
 @dataclass(frozen=True, eq=False)
-class Vmfn:
+class VonMisesFisherNakagami:
     """u = r a with a ~ von Mises-Fisher(mu, kappa) on the unit sphere and r ~ Nakagami(m, omega)."""
 
     mu: FloatArray
@@ -41,12 +41,12 @@ class Vmfn:
     """E[r^2]."""
 
     @classmethod
-    def standard(cls, dim: int) -> "Vmfn":
+    def standard(cls, dim: int) -> "VonMisesFisherNakagami":
         """Return N(0, I), but for a concentration that cannot be 0."""
         return cls(np.eye(dim)[0], LEAST_CONCENTRATION, dim / 2, float(dim))
 
     @classmethod
-    def fitted(cls, u: FloatArray, weights: FloatArray) -> "Vmfn":
+    def fit(cls, u: FloatArray, weights: FloatArray) -> "VonMisesFisherNakagami":
         """Return the law of points u (n, d) under weights (n,): matched mean direction, E[r^2] and E[r^4].
 
         The squared length of the mean direction is on average 1 / n too large (for one without any; n the
@@ -64,10 +64,10 @@ class Vmfn:
         shape = min(square * square / spread, LARGEST_SHAPE) if spread > 0 else LARGEST_SHAPE
         return cls(mu, concentration(length, dim), max(shape, 0.5), square)
 
-    def widened(self, factor: float) -> "Vmfn":
+    def widen(self, factor: float) -> "VonMisesFisherNakagami":
         """Return the same with deviations of direction and radius about `factor` times as large."""
         kappa, m = self.kappa / factor**2, self.m / factor**2
-        return Vmfn(self.mu, max(kappa, LEAST_CONCENTRATION), max(m, 0.5), self.omega)
+        return VonMisesFisherNakagami(self.mu, max(kappa, LEAST_CONCENTRATION), max(m, 0.5), self.omega)
 
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw n independent points, shape (n, d)."""

@@ -65,7 +65,7 @@ class LogNormalLaw:
         """Inverse of `to_standard_normal`, (n, 1) -> (n, 1)."""
         return self._law.from_standard_normal(u)
 
-    def moved(self, x: Array, weights: Array, alpha: float) -> "LogNormalLaw":
+    def project(self, x: Array, weights: Array, alpha: float) -> "LogNormalLaw":
         """The law with its median moved towards that of weighted points, by the part alpha of the way in logarithms."""
         logs = np.log(np.clip(x[:, 0], self.low, self.high))
         wanted = float(np.sum(weights * logs) / np.sum(weights))
@@ -73,7 +73,7 @@ class LogNormalLaw:
             math.exp((1.0 - alpha) * math.log(self.median) + alpha * wanted), self.spread, self.low, self.high
         )
 
-    def widened(self, factor: float) -> "LogNormalLaw":
+    def widen(self, factor: float) -> "LogNormalLaw":
         """The law with a spread larger by a factor."""
         return LogNormalLaw(self.median, self.spread * factor, self.low, self.high)
 

@@ -78,14 +78,14 @@ class BetaBlock:
         y = np.where(u < 0, betaincinv(self.alpha, self.beta, ndtr(u)), betainccinv(self.alpha, self.beta, ndtr(-u)))
         return self._scaled(y)
 
-    def moved(self, x: FloatArray, weights: FloatArray, alpha: float) -> "BetaBlock":
+    def project(self, x: FloatArray, weights: FloatArray, alpha: float) -> "BetaBlock":
         """Return the projection of alpha Q + (1 - alpha) P in the box, see `project_beta`."""
         elite = np.stack([weights @ self._log_y(x), weights @ self._log_rest(x)], axis=-1)
         target = alpha * elite + (1 - alpha) * beta_statistics(self.alpha, self.beta)
         parameters = project_beta(target, *self.box)
         return replace(self, alpha=parameters[:, 0], beta=parameters[:, 1])
 
-    def widened(self, factor: float) -> "BetaBlock":
+    def widen(self, factor: float) -> "BetaBlock":
         """Return Beta laws of the same means and `factor` times the standard deviation, as far as the box allows."""
         total = self.alpha + self.beta  # the variance is mean (1 - mean) / (total + 1)
         shrink = np.maximum((total + 1) / factor**2 - 1, 0.0) / total

@@ -17,10 +17,10 @@ from typing import Any, Protocol, TypeVar, cast
 import numpy as np
 
 from samplers.methods.cross_entropy.beta_block import PAPERS_BOX, BetaBlock
-from samplers.methods.cross_entropy.gaussian_mixture_em import fitted_mixture
+from samplers.methods.cross_entropy.gaussian_mixture_em import fit_mixture_towards
 from samplers.methods.cross_entropy.kl_projection import project_mean
 from samplers.problem import FloatArray, Inputs
-from samplers.proposals.gaussian import Gaussian, pulled_gaussian, weighted_moments
+from samplers.proposals.gaussian import Gaussian, shrink_towards_present, weighted_moments
 from samplers.proposals.mixture import GaussianMixture
 
 
@@ -43,17 +43,17 @@ class Block(Protocol):
     def from_standard_normal(self, u: FloatArray, /) -> FloatArray:
         """Inverse of `to_standard_normal`."""
 
-    def moved(self, x: FloatArray, weights: FloatArray, alpha: float) -> "Block":
+    def project(self, x: FloatArray, weights: FloatArray, alpha: float) -> "Block":
         """Return the projection of alpha Q + (1 - alpha) P on the family (equation 2).
 
         P is the block's present law; Q the points x (n, b) with weights (n,) that add up to 1.
         """
 
-    def widened(self, factor: float) -> "Block":
+    def widen(self, factor: float) -> "Block":
         """Return a block whose present law has about `factor` times the standard deviations."""
 
 
-T = TypeVar("T", bound="_FromGaussian")
+BlockT = TypeVar("BlockT", bound="_FromGaussian")
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,9 +83,9 @@ class _FromGaussian:
         """Return mean + L u."""
         return self.law.from_standard_normal(u)
 
-    def widened(self: T, factor: float) -> T:
+    def widen(self: BlockT, factor: float) -> BlockT:
         """Return the block with `factor` times the standard deviations."""
-        return replace(self, law=self.law.widened(factor))
+        return replace(self, law=self.law.widen(factor))
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +101,7 @@ class NormalBlock(_FromGaussian):
     radius: float = math.inf
     centre: FloatArray | None = None
 
-    def moved(self, x: FloatArray, weights: FloatArray, alpha: float) -> "NormalBlock":
+    def project(self, x: FloatArray, weights: FloatArray, alpha: float) -> "NormalBlock":
         """Return the projection of alpha Q + (1 - alpha) P in the box, see `project_mean`."""
         centre = self.law.mean if self.centre is None else self.centre
         target = alpha * (weights @ x) + (1 - alpha) * self.law.mean
@@ -113,18 +113,18 @@ class NormalBlock(_FromGaussian):
 class GaussianBlock(_FromGaussian):
     """A Gaussian whose mean and covariance may move: E[x] and E[x x'] are matched.
 
-    The covariance is drawn towards the present one, see `pulled_gaussian`.
+    The covariance is drawn towards the present one, see `shrink_towards_present`.
     """
 
-    def moved(self, x: FloatArray, weights: FloatArray, alpha: float) -> "GaussianBlock":
+    def project(self, x: FloatArray, weights: FloatArray, alpha: float) -> "GaussianBlock":
         """Return the projection of alpha Q + (1 - alpha) P, its covariance pulled back."""
-        target = weighted_moments(x, weights).mixed(self.law.moments, alpha)
-        return GaussianBlock(pulled_gaussian(target, self.law, 1 / float(weights @ weights)))
+        target = weighted_moments(x, weights).mix_with(self.law.moments, alpha)
+        return GaussianBlock(shrink_towards_present(target, self.law, 1 / float(weights @ weights)))
 
 
 @dataclass(frozen=True, eq=False)
 class MixtureBlock(_FromGaussian):
-    """A mixture of k Gaussians, moved by expectation-maximisation, see `fitted_mixture`.
+    """A mixture of k Gaussians, moved by expectation-maximisation, see `fit_mixture_towards`.
 
     Args:
         law: The Gaussian of the base distribution.
@@ -147,13 +147,13 @@ class MixtureBlock(_FromGaussian):
         """Log density at x (n, b), shape (n,)."""
         return self._mixture.log_prob(x)
 
-    def moved(self, x: FloatArray, weights: FloatArray, alpha: float) -> "MixtureBlock":
+    def project(self, x: FloatArray, weights: FloatArray, alpha: float) -> "MixtureBlock":
         """Return a mixture nearer to alpha Q + (1 - alpha) P."""
-        return replace(self, mixture=fitted_mixture(self._mixture, self.k, x, weights, alpha))
+        return replace(self, mixture=fit_mixture_towards(self._mixture, self.k, x, weights, alpha))
 
-    def widened(self, factor: float) -> "MixtureBlock":
+    def widen(self, factor: float) -> "MixtureBlock":
         """Return the block with `factor` times the standard deviations of every component."""
-        return replace(self, mixture=self._mixture.widened(factor))
+        return replace(self, mixture=self._mixture.widen(factor))
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,7 +202,7 @@ class Product:
         """Inverse of `to_standard_normal`."""
         return np.hstack([b.from_standard_normal(part) for b, part in zip(self.blocks, self._parts(u), strict=True)])
 
-    def moved(self, x: FloatArray, weights: FloatArray, alpha: float) -> "Product":
+    def project(self, x: FloatArray, weights: FloatArray, alpha: float) -> "Product":
         """Return the projection of alpha Q + (1 - alpha) P, block by block (equation 2).
 
         Args:
@@ -211,11 +211,11 @@ class Product:
             alpha: Step size.
         """
         parts = zip(self.blocks, self._parts(x), weights, strict=True)
-        return Product(tuple(block.moved(part, w, alpha) for block, part, w in parts))
+        return Product(tuple(block.project(part, w, alpha) for block, part, w in parts))
 
-    def widened(self, factor: float) -> "Product":
+    def widen(self, factor: float) -> "Product":
         """Return independent blocks with standard deviations multiplied by about `factor`."""
-        return Product(tuple(block.widened(factor) for block in self.blocks))
+        return Product(tuple(block.widen(factor) for block in self.blocks))
 
     @cached_property
     def _ends(self) -> list[int]:
@@ -252,7 +252,7 @@ def announced_blocks(inputs: Inputs) -> Product:
 
 def _as_block(entry: Any) -> Block:
     """Return the block that an entry describes."""
-    if hasattr(entry, "moved"):
+    if hasattr(entry, "project"):
         return cast(Block, entry)
     if all(hasattr(entry, name) for name in ("alpha", "beta", "low", "high")):
         box = getattr(entry, "box", PAPERS_BOX)

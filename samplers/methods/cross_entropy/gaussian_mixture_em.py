@@ -10,14 +10,16 @@ References:
 import numpy as np
 
 from samplers.problem import FloatArray
-from samplers.proposals.gaussian import pulled_gaussian, weighted_moments
+from samplers.proposals.gaussian import shrink_towards_present, weighted_moments
 from samplers.proposals.mixture import GaussianMixture
 
 STEPS = 10
 """Steps of expectation-maximisation per step of cross-entropy; each one raises the objective."""
 
 
-def fitted_mixture(now: GaussianMixture, k: int, x: FloatArray, weights: FloatArray, alpha: float) -> GaussianMixture:
+def fit_mixture_towards(
+    now: GaussianMixture, k: int, x: FloatArray, weights: FloatArray, alpha: float
+) -> GaussianMixture:
     """Return a mixture of at most k Gaussians nearer to alpha Q + (1 - alpha) P than `now`, which is P.
 
     Maximises a lower bound of equation 2's objective: the points of Q are shared among the
@@ -39,14 +41,14 @@ def fitted_mixture(now: GaussianMixture, k: int, x: FloatArray, weights: FloatAr
     else:
         shares = now.responsibilities(x)
     for _ in range(STEPS):
-        fitted = _maximised(now, x, weights[:, None] * shares, alpha)
+        fitted = _maximise(now, x, weights[:, None] * shares, alpha)
         if len(fitted.components) < shares.shape[1]:
             return fitted
         shares = fitted.responsibilities(x)
     return fitted
 
 
-def _maximised(now: GaussianMixture, x: FloatArray, mass: FloatArray, alpha: float) -> GaussianMixture:
+def _maximise(now: GaussianMixture, x: FloatArray, mass: FloatArray, alpha: float) -> GaussianMixture:
     """Return weights, means and covariances for points shared as `mass` (n, k), which adds up to 1."""
     weights, components = [], []
     for weight, component, part in zip(now.weights, now.components, mass.T, strict=True):
@@ -55,9 +57,9 @@ def _maximised(now: GaussianMixture, x: FloatArray, mass: FloatArray, alpha: flo
         if share < np.finfo(np.float64).eps:
             continue
         part = part / total if total > 0 else np.full(len(x), 1 / len(x))
-        target = weighted_moments(x, part).mixed(component.moments, alpha * total / share)
+        target = weighted_moments(x, part).mix_with(component.moments, alpha * total / share)
         weights.append(share)
-        components.append(pulled_gaussian(target, component, 1 / float(part @ part)))
+        components.append(shrink_towards_present(target, component, 1 / float(part @ part)))
     return GaussianMixture(np.array(weights) / sum(weights), components)
 
 

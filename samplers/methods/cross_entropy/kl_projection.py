@@ -56,7 +56,7 @@ def project_beta(statistics: FloatArray, low: float, high: float) -> FloatArray:
         if np.abs(gradient).max() <= GRADIENT:
             break
         step = np.asarray(np.linalg.solve(_beta_curvature(theta, held), gradient[..., None])[..., 0], np.float64)
-        theta = _ascended(theta, step, gradient, statistics, low, high)
+        theta = _line_search(theta, step, gradient, statistics, low, high)
     return theta
 
 
@@ -70,7 +70,7 @@ def _beta_curvature(theta: FloatArray, held: np.ndarray) -> FloatArray:
     return hessian
 
 
-def _ascended(
+def _line_search(
     theta: FloatArray, step: FloatArray, gradient: FloatArray, statistics: FloatArray, low: float, high: float
 ) -> FloatArray:
     """Return theta + size * step, projected on the box, with size 1, 1/2, ... until the likelihood rises enough."""

@@ -7,23 +7,23 @@ from typing import ClassVar, Literal, TypeVar
 
 import numpy as np
 
-from samplers.importance.draws import doubts, interval_of
-from samplers.importance.sampling import Space, defensive, draw_until, final_draws
-from samplers.importance.search import LEAST_BUDGET, SEARCH_SHARE
+from samplers.importance.draws import weight_warnings, weighted_interval
+from samplers.importance.sampling import Space, count_final_draws, defensive_mixture, simulate_until
+from samplers.importance.search import LEAST_SEARCH_BUDGET, SEARCH_SHARE
 from samplers.method import Goal, Interrupted, Outcome, Steps, no_outcome_share
 from samplers.methods.base import Method
 from samplers.methods.cross_entropy.blocks import GaussianBlock, MixtureBlock, NormalBlock, Product, announced_blocks
 from samplers.methods.cross_entropy.search import Batch, Iterate, Search
 from samplers.problem import FloatArray, Inputs
 from samplers.proposals.gaussian import Gaussian
-from samplers.proposals.mixture import Law
+from samplers.proposals.mixture import ProposalDistribution
 from samplers.statistics.intervals import binomial_cov
 from samplers.statistics.thresholds import next_level
 from samplers.statistics.weights import normalised
 from samplers.trace import Status
 from samplers.validation import check_choice, check_count, check_setting, is_number
 
-T = TypeVar("T")
+SettingT = TypeVar("SettingT")
 FAMILIES = ("gaussian", "mean", "mixture", "blocks")
 
 
@@ -61,7 +61,7 @@ class CrossEntropy(Method):
       covariance where its inverse belongs, and its Beta box is [0.5, 5], the paper's [1.5, 7].
     - *Family.* The default is not the paper's: one Gaussian with its covariance covers curved
       and two-lobed regions better than products. The covariance is drawn towards the present
-      one (`pulled_gaussian`).
+      one (`shrink_towards_present`).
     - *End.* The paper runs K = 100 iterations of 5000; ours ends the search when two
       proposals have reached gamma, unless early_end=False. Search simulations are part of n_sim.
     - *Choice.* The paper takes the iterate with the lowest rho-quantile (choice="quantile"), the
@@ -129,9 +129,9 @@ class CrossEntropy(Method):
         check_count(who, "components", self.components, 1)
         check_count(who, "max_iterations", self.max_iterations, 1)
         check_count(who, "n_final", self.n_final, 10)
-        for size in several(self.n_iteration) or [None]:
+        for size in as_tuple(self.n_iteration) or [None]:
             check_count(who, "n_iteration", size, 10)
-        for step in several(self.alpha) or [None]:
+        for step in as_tuple(self.alpha) or [None]:
             check_setting(who, "alpha", step, 0.0, 1.0, or_equal_high=True)
         check_setting(who, "rho", self.rho, 0.0, 0.5)
         check_setting(who, "base_share", self.base_share, 0.0, 1.0)
@@ -147,12 +147,12 @@ class CrossEntropy(Method):
         best = search.best(self.choice)
         if search.status is Status.STOPPED:
             return search.outcome(space)
-        sampler: Law = base
+        sampler: ProposalDistribution = base
         if best is not None and not common:
-            wide = best.proposal.widened(self.wide_factor)
-            sampler = defensive(base, wide, best.proposal, self.base_share, self.wide_share)
-        limit = final_draws(goal, search.n_sim, self.n_final)
-        draws, final, stopped = yield from draw_until(inputs, sampler, goal, limit, self.n_final, rng, space)
+            wide = best.proposal.widen(self.wide_factor)
+            sampler = defensive_mixture(base, wide, best.proposal, self.base_share, self.wide_share)
+        limit = count_final_draws(goal, search.n_sim, self.n_final)
+        draws, final, stopped = yield from simulate_until(inputs, sampler, goal, limit, self.n_final, rng, space)
         if draws.n == 0:
             return search.outcome(space)
         reached = best is not None and best.level == goal.gamma
@@ -160,10 +160,10 @@ class CrossEntropy(Method):
         status = search.status if len(draws.f) else Status.NO_HITS
         return Outcome(
             p=draws.p,
-            interval=interval_of(draws, goal.confidence, 1 / base_share),
+            interval=weighted_interval(draws, goal.confidence, 1 / base_share),
             cov=binomial_cov(draws.p, draws.n) if common else draws.cov,
             status=Status.STOPPED if stopped else status,
-            warnings=tuple(([] if reached else [search_ended(best, search.status)]) + doubts(draws)),
+            warnings=tuple(([] if reached else [search_ended(best, search.status)]) + weight_warnings(draws)),
             trace=(*search.trace, *final),
             no_outcome_share=no_outcome_share(draws.f, draws.log_weights),
             sample=draws.sample,
@@ -187,11 +187,11 @@ class CrossEntropy(Method):
     ) -> Generator[FloatArray, FloatArray, Search]:
         """Run algorithm 1, as a rule until two proposals have reached gamma."""
         search = Search(goal, self.rho)
-        if goal.budget < LEAST_BUDGET:
+        if goal.budget < LEAST_SEARCH_BUDGET:
             return search.ended(Status.BUDGET)
         proposal = base
         for k in range(self.max_iterations):
-            size = min(at(self.n_iteration, k), goal.budget // 10)
+            size = min(value_at(self.n_iteration, k), goal.budget // 10)
             if search.n_sim + size > int(SEARCH_SHARE * goal.budget):
                 return search.ended(Status.BUDGET)
             u = proposal.sample(size, rng)
@@ -208,10 +208,10 @@ class CrossEntropy(Method):
                 return search.ended(Status.STALLED)
             if search.n_reached == 2 - (k == 0) and (self.early_end or k == 0):
                 return search.ended(Status.CONVERGED)
-            proposal = self._moved(proposal, elite, log_ratios, at(self.alpha, k))
+            proposal = self._project(proposal, elite, log_ratios, value_at(self.alpha, k))
         return search.ended(Status.CONVERGED if level == goal.gamma else Status.STALLED)
 
-    def _moved(self, proposal: Product, elite: FloatArray, log_ratios: FloatArray, alpha: float) -> Product:
+    def _project(self, proposal: Product, elite: FloatArray, log_ratios: FloatArray, alpha: float) -> Product:
         """Return the proposal after one step of equation 2 towards the elite points.
 
         Args:
@@ -222,23 +222,23 @@ class CrossEntropy(Method):
         """
         if self.likelihood_ratio == "joint":
             log_ratios = np.broadcast_to(log_ratios.sum(axis=0), log_ratios.shape)
-        return proposal.moved(elite, np.stack([normalised(ratios) for ratios in log_ratios]), alpha)
+        return proposal.project(elite, np.stack([normalised(ratios) for ratios in log_ratios]), alpha)
 
 
-def several(setting: T | tuple[T, ...]) -> tuple[T, ...]:
+def as_tuple(setting: SettingT | tuple[SettingT, ...]) -> tuple[SettingT, ...]:
     """Return a setting that may be one value or several as several."""
     return tuple(setting) if isinstance(setting, tuple | list) else (setting,)
 
 
-def at(setting: T | tuple[T, ...], k: int) -> T:
+def value_at(setting: SettingT | tuple[SettingT, ...], k: int) -> SettingT:
     """Return the value of a setting at iteration k; the last one given holds on."""
-    values = several(setting)
+    values = as_tuple(setting)
     return values[min(k, len(values) - 1)]
 
 
 def search_ended(best: Iterate | None, ended: Status) -> str:
     """Return the warning about a search that did not reach gamma."""
     if best is None:
-        return f"max_sim is under {LEAST_BUDGET}, too little for a search: plain draws only."
+        return f"max_sim is under {LEAST_SEARCH_BUDGET}, too little for a search: plain draws only."
     why = "max_sim was used up" if ended is Status.BUDGET else "no lower threshold was found"
     return f"The search ended at f <= {best.level:.4g}, before gamma: {why}."

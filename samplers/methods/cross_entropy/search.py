@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from samplers.importance.draws import Draws, doubts, interval_of, weighted_cov
+from samplers.importance.draws import Draws, weight_warnings, weighted_cov, weighted_interval
 from samplers.importance.sampling import Space
 from samplers.method import Goal, Outcome, no_outcome_share
 from samplers.methods.cross_entropy.blocks import Product
@@ -112,14 +112,14 @@ class Search:
         mixture = Mixture(sizes / sizes.sum(), [batch.proposal for batch in self.batches])
         u = np.concatenate([batch.u for batch in self.batches])
         f = np.concatenate([batch.f for batch in self.batches])
-        draws = Draws.weighted(f, space.base.log_prob(u) - mixture.log_prob(u), space.to_x(u), gamma)
+        draws = Draws.from_outcomes(f, space.base.log_prob(u) - mixture.log_prob(u), space.to_x(u), gamma)
         plain = len(self.batches) == 1
         return Outcome(
             p=draws.p,
-            interval=interval_of(draws, self.goal.confidence, float(sizes.sum() / sizes[0])),
+            interval=weighted_interval(draws, self.goal.confidence, float(sizes.sum() / sizes[0])),
             cov=binomial_cov(draws.p, draws.n) if plain else draws.cov,
             status=Status.STOPPED,
-            warnings=("Stopped before the final draws: the estimate is the search's own.", *doubts(draws)),
+            warnings=("Stopped before the final draws: the estimate is the search's own.", *weight_warnings(draws)),
             trace=tuple(self.trace),
             no_outcome_share=no_outcome_share(draws.f, draws.log_weights),
             sample=draws.sample,

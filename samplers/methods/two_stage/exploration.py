@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from samplers.mcmc.kernels import conditional_proposal
-from samplers.methods.two_stage.regions import Downhill, Found, grow_regions
+from samplers.methods.two_stage.regions import ExplorationResult, SubsetPoints, grow_regions
 from samplers.methods.two_stage.simulator import ComponentDraws, Simulator
 from samplers.problem import FloatArray
-from samplers.proposals.components import Component, Wide, draw
+from samplers.proposals.components import IsotropicNormal, MixtureComponent, draw_components
 from samplers.statistics.thresholds import next_level
 
 LEVEL_FRACTION = 0.1
@@ -71,16 +71,19 @@ def first_draws(
 ) -> Generator[FloatArray, FloatArray, ComponentDraws]:
     """Simulate the base and the wide draws."""
     dim = simulator.inputs.dim
-    components: list[Component] = [Wide(dim), *(Wide(dim, scale) for scale, _ in sizes.wide)]
+    components: list[MixtureComponent] = [
+        IsotropicNormal(dim),
+        *(IsotropicNormal(dim, scale) for scale, _ in sizes.wide),
+    ]
     counts = np.array([sizes.base, *(n for _, n in sizes.wide)])
-    u = draw(components, counts, rng)
+    u = draw_components(components, counts, rng)
     f = yield from simulator.evaluate(u)
     return ComponentDraws(components, counts, u, f)
 
 
-def regions_of(
+def find_regions(
     simulator: Simulator, first: ComponentDraws, gamma: float, sizes: Sizes, rng: np.random.Generator
-) -> Generator[FloatArray, FloatArray, Found]:
+) -> Generator[FloatArray, FloatArray, ExplorationResult]:
     """Find the regions of failure, starting from the first draws; none if nothing fails."""
     n_base = int(first.counts[0])
     descent = yield from _descend(simulator, first.u[:n_base], first.f[:n_base], gamma, sizes, rng)
@@ -88,17 +91,17 @@ def regions_of(
     scale = np.repeat(np.arange(len(first.counts)), first.counts)
     most = max(2, (sizes.limit - simulator.n_sim) // COST_OF_CHAIN)
     chosen = wide[_subsample(scale[wide], min(sizes.starts, most), rng)]
-    far = yield from _drawn_in(simulator, first.u[chosen], gamma)
+    far = yield from _bisect_towards_origin(simulator, first.u[chosen], gamma)
     others = max(sizes.level_starts, sizes.starts + sizes.level_starts - len(far))
     starts = np.concatenate([far, rng.permutation(descent.failing)[: min(others, most - len(far))]])
     if len(starts) == 0:
-        return Found([], noisy=False)
+        return ExplorationResult([], noisy=False)
     return (yield from grow_regions(simulator, starts, descent, gamma, sizes.limit, rng))
 
 
 def _descend(
     simulator: Simulator, u: FloatArray, f: FloatArray, gamma: float, sizes: Sizes, rng: np.random.Generator
-) -> Generator[FloatArray, FloatArray, Downhill]:
+) -> Generator[FloatArray, FloatArray, SubsetPoints]:
     """Run subset simulation from base draws u (n, d), f (n,), until a tenth of a level fails or the budget is used."""
     points, outcomes = [u[:0]], [f[:0]]
     sigma, levels = 0.6, 0
@@ -124,7 +127,7 @@ def _descend(
             sigma = min(sigma * math.exp((accepted.mean() - LEVEL_ACCEPTANCE) / math.sqrt(step)), 1.0)
         u, f = np.concatenate(states), np.concatenate(at)
         levels += 1
-    return Downhill(np.unique(u[f <= gamma], axis=0), np.concatenate(points), np.concatenate(outcomes), levels)
+    return SubsetPoints(np.unique(u[f <= gamma], axis=0), np.concatenate(points), np.concatenate(outcomes), levels)
 
 
 def _subsample(scale: NDArray[np.int64], n: int, rng: np.random.Generator) -> NDArray[np.int64]:
@@ -133,7 +136,9 @@ def _subsample(scale: NDArray[np.int64], n: int, rng: np.random.Generator) -> ND
     return np.concatenate([order[: n // 2], rng.permutation(order[n // 2 :])[: n - n // 2]])
 
 
-def _drawn_in(simulator: Simulator, u: FloatArray, gamma: float) -> Generator[FloatArray, FloatArray, FloatArray]:
+def _bisect_towards_origin(
+    simulator: Simulator, u: FloatArray, gamma: float
+) -> Generator[FloatArray, FloatArray, FloatArray]:
     """Draw failing points (n, d) towards the origin along their rays, by bisection; they still fail."""
     safe, failing = np.zeros(len(u)), np.ones(len(u))
     for _ in range(BISECTIONS):

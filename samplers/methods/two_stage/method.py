@@ -7,12 +7,12 @@ from typing import ClassVar
 
 import numpy as np
 
-from samplers.importance.draws import Draws, doubts, interval_of
+from samplers.importance.draws import Draws, weight_warnings, weighted_interval
 from samplers.method import Goal, Interrupted, Outcome, Steps, no_outcome_share, share_of_failures
 from samplers.methods.base import Method
 from samplers.methods.two_stage import fallback
 from samplers.methods.two_stage.diagnostics import check_base_draws, check_efficiency, check_regions, check_rounds
-from samplers.methods.two_stage.exploration import Sizes, first_draws, regions_of
+from samplers.methods.two_stage.exploration import Sizes, find_regions, first_draws
 from samplers.methods.two_stage.mixture.proposal import MixtureProposal
 from samplers.methods.two_stage.multiple_importance import MultipleImportanceSample
 from samplers.methods.two_stage.noise_coordinates import marginalise_noise
@@ -163,7 +163,7 @@ class _Run:
             self._base_u, self._base_f = self._base_u[:0], self._base_f[:0]
             return None
         self._history.add(first, gamma)
-        found = yield from regions_of(self._simulator, first, gamma, sizes, self._rng)
+        found = yield from find_regions(self._simulator, first, gamma, sizes, self._rng)
         chains = sum(len(region.f) for region in found.regions)
         fails = sum(int((region.f <= gamma).sum()) for region in found.regions)
         self._note(fails / max(chains, 1), share, chains, math.inf)
@@ -177,7 +177,9 @@ class _Run:
             n = int(share * room)
             if n > 0:
                 batch = yield from self._drawn(proposal, n)
-                self._rounds.append(Draws.weighted(batch.f, proposal.log_weights(batch.u), batch.u, self._goal.gamma))
+                self._rounds.append(
+                    Draws.from_outcomes(batch.f, proposal.log_weights(batch.u), batch.u, self._goal.gamma)
+                )
                 refinement.learn(proposal, batch, afresh=number > len(ROUNDS) - AFRESH)
                 log_w = self._history.log_weights
                 ess = effective_sample_size(log_w)
@@ -268,10 +270,10 @@ class _Run:
     def _outcome(self, draws: Draws, cov: float, largest_weight: float) -> Outcome:
         return Outcome(
             p=draws.p,
-            interval=interval_of(draws, self._goal.confidence, largest_weight, cov),
+            interval=weighted_interval(draws, self._goal.confidence, largest_weight, cov),
             cov=cov,
             status=Status.CONVERGED if len(draws.f) else Status.NO_HITS,
-            warnings=tuple(doubts(draws)),
+            warnings=tuple(weight_warnings(draws)),
             trace=self._closed_trace(),
             no_outcome_share=no_outcome_share(draws.f, draws.log_weights),
             base_draws=self._n_base,

@@ -7,7 +7,7 @@ import numpy as np
 from samplers.importance.draws import Draws
 from samplers.methods.two_stage.simulator import ComponentDraws
 from samplers.problem import FloatArray, Inputs
-from samplers.proposals.components import Component, log_ratios, mixed
+from samplers.proposals.components import MixtureComponent, log_ratios, mixture_log_ratio
 
 
 class MultipleImportanceSample:
@@ -18,7 +18,7 @@ class MultipleImportanceSample:
         """The failing ones, shape (k, d)."""
         self.batches: list[ComponentDraws] = []
         self._log_density = np.empty(0)
-        self._components: list[Component] = []
+        self._components: list[MixtureComponent] = []
         self._counts = np.empty(0)
 
     @property
@@ -35,21 +35,23 @@ class MultipleImportanceSample:
         """Take in a batch of draws."""
         used = [c for c, n in zip(batch.components, batch.counts, strict=True) if n > 0]
         counts = batch.counts[batch.counts > 0].astype(np.float64)
-        self._log_density = np.logaddexp(self._log_density, mixed(log_ratios(used, self.u), counts))
+        self._log_density = np.logaddexp(self._log_density, mixture_log_ratio(log_ratios(used, self.u), counts))
         self._components += used
         self._counts = np.concatenate([self._counts, counts])
         self.batches.append(batch)
         found = batch.u[batch.f <= gamma]
-        self._log_density = np.append(self._log_density, mixed(log_ratios(self._components, found), self._counts))
+        self._log_density = np.append(
+            self._log_density, mixture_log_ratio(log_ratios(self._components, found), self._counts)
+        )
         self.u = np.concatenate([self.u, found])
 
     def everything(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return all draws, failing or not: u (n, d), f (n,) and log(phi / q) - log(n), shape (n,)."""
         u = np.concatenate([batch.u for batch in self.batches])
         f = np.concatenate([batch.f for batch in self.batches])
-        return u, f, -mixed(log_ratios(self._components, u), self._counts)
+        return u, f, -mixture_log_ratio(log_ratios(self._components, u), self._counts)
 
     def draws(self, inputs: Inputs, gamma: float) -> Draws:
         """Return all draws as those from one proposal."""
         u, f, log_weights = self.everything()
-        return Draws.weighted(f, log_weights + math.log(self.n), inputs.base.from_standard_normal(u), gamma)
+        return Draws.from_outcomes(f, log_weights + math.log(self.n), inputs.base.from_standard_normal(u), gamma)

@@ -8,12 +8,18 @@ from samplers.methods.two_stage.mixture.linear_model import failure_edge, half_s
 from samplers.methods.two_stage.mixture.mixture_weights import Floor, minimise_second_moment, raise_to_floors
 from samplers.methods.two_stage.mixture.proposal import NO_REGION, MixtureProposal, ProposalComponent
 from samplers.methods.two_stage.mixture.screening import FailureScreen, train_screen
-from samplers.methods.two_stage.mixture.subspace_em import HIGH_DIM, Points, clipped, fitted, refitted
+from samplers.methods.two_stage.mixture.subspace_em import (
+    HIGH_DIM,
+    GroupedPoints,
+    fit_mixture,
+    refit_components,
+    truncate_weights,
+)
 from samplers.methods.two_stage.multiple_importance import MultipleImportanceSample
-from samplers.methods.two_stage.regions import Found, Region
+from samplers.methods.two_stage.regions import ExplorationResult, Region
 from samplers.methods.two_stage.simulator import ComponentDraws
 from samplers.problem import FloatArray
-from samplers.proposals.components import Bump, Shell, Slice, Wide, log_ratios
+from samplers.proposals.components import HalfSpaceNormal, IsotropicNormal, RadialLaw, SubspaceGaussian, log_ratios
 
 BASE_FLOOR = 0.05
 """Share of base draws: no weight exceeds 1 / BASE_FLOOR."""
@@ -56,7 +62,9 @@ class Refinement:
         rng: Source of randomness.
     """
 
-    def __init__(self, found: Found, history: MultipleImportanceSample, gamma: float, rng: np.random.Generator) -> None:
+    def __init__(
+        self, found: ExplorationResult, history: MultipleImportanceSample, gamma: float, rng: np.random.Generator
+    ) -> None:
         regions = found.regions
         self._dim = regions[0].u.shape[1]
         self._regions = regions
@@ -73,7 +81,7 @@ class Refinement:
         bumps = [(bump, k) for k, region in enumerate(regions) for bump in self._fit_region(region)]
         self._first = [ProposalComponent(bump, "first", k) for bump, k in bumps]
         self._bumps = [bump for bump, _ in bumps]
-        self._fresh: list[Bump] = []
+        self._fresh: list[SubspaceGaussian] = []
         self._planes = [
             ProposalComponent(part, "plane", k)
             for k, region in enumerate(regions)
@@ -134,7 +142,7 @@ class Refinement:
         self._near.append((batch.u[near], batch.f[near]))
         self._near_log_weights = proposal.log_weights(batch.u[near])
         if len(self._history.u) > 5:
-            self._bumps = refitted(self._bumps, self._history.u, self._history.log_weights)
+            self._bumps = refit_components(self._bumps, self._history.u, self._history.log_weights)
             self._fresh = self._fit_failures() if afresh and self._dim <= HIGH_DIM else []
             if afresh or self._dim > HIGH_DIM or len(self._regions) > 1:
                 self._planes = self._fit_planes()
@@ -155,25 +163,25 @@ class Refinement:
         # The logistic curve has far heavier tails than noise that is near normal: log_ndtr(odds / 1.702) has not.
         return u, log_w + log_ndtr(odds)
 
-    def _fit_region(self, region: Region) -> list[Bump]:
+    def _fit_region(self, region: Region) -> list[SubspaceGaussian]:
         chains, steps, _ = region.chains.shape
         n = chains * steps
-        points = Points(
+        points = GroupedPoints(
             u=region.points,
             weights=np.full(n, 1 / n),
             ess=2.0 * chains,
             groups=np.repeat(np.arange(chains), steps),
         )
         most = 8 if self.noisy else 3
-        return fitted(points, most if self._dim <= HIGH_DIM else 1, self._rng).bumps
+        return fit_mixture(points, most if self._dim <= HIGH_DIM else 1, self._rng).bumps
 
-    def _fit_failures(self) -> list[Bump]:
+    def _fit_failures(self) -> list[SubspaceGaussian]:
         """Return a mixture fitted to all failures, where their weights carry one."""
-        weights = clipped(self._history.log_weights)
+        weights = truncate_weights(self._history.log_weights)
         ess = 1 / float((weights**2).sum())
         if ess < max(60, 6 * self._dim):
             return []
-        return fitted(Points(self._history.u, weights, ess, np.arange(len(weights))), 8, self._rng).bumps
+        return fit_mixture(GroupedPoints(self._history.u, weights, ess, np.arange(len(weights))), 8, self._rng).bumps
 
     def _fit_planes(self) -> list[ProposalComponent]:
         """Return planes from what was known of each region and the draws nearest to it."""
@@ -197,14 +205,17 @@ class Refinement:
         bumps += [ProposalComponent(bump, "bump") for bump in self._fresh]
         planes = [] if self.noisy else self._planes
         first = self._first if seen else []
-        found = [ProposalComponent(Wide(self._dim), "base"), ProposalComponent(Wide(self._dim, 1.5), "wide")]
+        found = [
+            ProposalComponent(IsotropicNormal(self._dim), "base"),
+            ProposalComponent(IsotropicNormal(self._dim, 1.5), "wide"),
+        ]
         found += self._shells() + bumps + planes + first
         if not self.noisy:
             found += [ProposalComponent(part, "slice") for part in self._slices(seen)]
         for candidate in bumps + planes + first:
-            if isinstance(candidate.component, Bump):
+            if isinstance(candidate.component, SubspaceGaussian):
                 for power in (0.5, 0.25) if self.noisy else (0.5,):
-                    found.append(ProposalComponent(candidate.component.tempered(power), "tempered", candidate.region))
+                    found.append(ProposalComponent(candidate.component.temper(power), "tempered", candidate.region))
         return found
 
     def _floors(self, kinds: NDArray[np.str_], regions: NDArray[np.int64], for_regions: float) -> list[Floor]:
@@ -227,7 +238,7 @@ class Refinement:
             shells.append(fit_radial(self._history.u, np.exp(log_w - log_w.max())))
         return [ProposalComponent(shell, "shell") for shell in shells]
 
-    def _slices(self, seen: bool) -> list[Slice]:
+    def _slices(self, seen: bool) -> list[HalfSpaceNormal]:
         """Return slices through the edge of each bump's failures, plain and with the bump's shape across."""
         u = self._history.u if seen else self._points
         log_w = self._history.log_weights if seen else np.zeros(len(u))
@@ -244,7 +255,7 @@ class Refinement:
         ]
 
 
-def fit_half_spaces(bump: Bump, u: FloatArray, weights: FloatArray) -> list[Slice]:
+def fit_half_spaces(bump: SubspaceGaussian, u: FloatArray, weights: FloatArray) -> list[HalfSpaceNormal]:
     """Return slices that start at the 2 % quantile of failures u (n, d) with weights (n,) along a bump's centre."""
     centre, dim = bump.centre, len(bump.axes)
     norm = float(np.linalg.norm(centre))
@@ -254,17 +265,19 @@ def fit_half_spaces(bump: Bump, u: FloatArray, weights: FloatArray) -> list[Slic
     start = failure_edge(u @ axis, weights, float(weights.sum()) ** 2 / float((weights**2).sum()), 0.02) - 0.02
     if start < 0.5:
         return []
-    parts = [Slice(axis, start)]
+    parts = [HalfSpaceNormal(axis, start)]
     if bump.axes.shape[1] == dim > 1:
         across = np.eye(dim) - np.outer(axis, axis)
         values, vectors = np.linalg.eigh(across @ (bump.axes * bump.variance @ bump.axes.T) @ across)
         within = np.argsort(np.abs(vectors.T @ axis))[: dim - 1]
         axes = vectors[:, within]
-        parts.append(Slice(axis, start, Bump(axes, axes.T @ centre, np.maximum(values[within], 1e-6))))
+        parts.append(
+            HalfSpaceNormal(axis, start, SubspaceGaussian(axes, axes.T @ centre, np.maximum(values[within], 1e-6)))
+        )
     return parts
 
 
-def fit_radial(u: FloatArray, weights: FloatArray) -> Shell:
+def fit_radial(u: FloatArray, weights: FloatArray) -> RadialLaw:
     """Return the shell whose |u|^2 has the moments of points u (n, d) with weights (n,)."""
     square = np.einsum("ij,ij->i", u, u)
     start = 0.98 * weighted_quantile(square, weights, 0.01)
@@ -272,4 +285,4 @@ def fit_radial(u: FloatArray, weights: FloatArray) -> Shell:
     s, w = square[beyond_start] - start, weights[beyond_start]
     mean = float(np.average(s, weights=w))
     variance = max(float(np.average((s - mean) ** 2, weights=w)), 1e-6)
-    return Shell(u.shape[1], start, max(mean * mean / variance, 0.3), max(variance / mean, 1e-3))
+    return RadialLaw(u.shape[1], start, max(mean * mean / variance, 0.3), max(variance / mean, 1e-3))

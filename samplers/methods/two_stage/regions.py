@@ -61,7 +61,7 @@ class ChainPaths(NamedTuple):
         return ChainPaths(*(part[which] for part in self))
 
 
-class Downhill(NamedTuple):
+class SubsetPoints(NamedTuple):
     """What subset simulation saw."""
 
     failing: FloatArray
@@ -73,7 +73,7 @@ class Downhill(NamedTuple):
     """Levels passed."""
 
 
-class Found(NamedTuple):
+class ExplorationResult(NamedTuple):
     """What the exploration found."""
 
     regions: list[Region]
@@ -86,8 +86,8 @@ class Found(NamedTuple):
 
 
 def grow_regions(
-    simulator: Simulator, starts: FloatArray, descent: Downhill, gamma: float, limit: int, rng: np.random.Generator
-) -> Generator[FloatArray, FloatArray, Found]:
+    simulator: Simulator, starts: FloatArray, descent: SubsetPoints, gamma: float, limit: int, rng: np.random.Generator
+) -> Generator[FloatArray, FloatArray, ExplorationResult]:
     """Run chains from failing points, twice; sort them into regions after each time."""
     dim = starts.shape[1]
     steps = (5, 6) if dim <= HIGH_DIM else (8, 8)
@@ -95,7 +95,7 @@ def grow_regions(
     if (yield from _is_noisy(simulator, walk.states[:, -1], gamma, rng)):
         last = yield from _pcn_chains(simulator, walk.states[:, -1], walk.sigma, None, steps[1], gamma, rng)
         region = Region(last.states[:, 1:], last.proposals.reshape(-1, dim), last.f.ravel())
-        return Found([region], noisy=True, levels=descent.levels)
+        return ExplorationResult([region], noisy=True, levels=descent.levels)
     after = len(starts) * (steps[1] + 1)  # the second walk, and one look at where it ended
     labels, _ = yield from _label_regions(simulator, walk.states[:, -1], gamma, limit - after)
     room = max(limit - simulator.n_sim - after, 0) // (steps[1] + 1)
@@ -114,7 +114,7 @@ def grow_regions(
         own = labels == k
         regions.append(Region(last.states[own, 1:], proposals[own].reshape(-1, dim), f[own].ravel()))
     regions = [_add_subset_points(regions[0], descent)] if len(regions) == 1 else regions
-    return Found(regions, noisy=False, scattered=scattered, levels=descent.levels)
+    return ExplorationResult(regions, noisy=False, scattered=scattered, levels=descent.levels)
 
 
 def _pcn_chains(
@@ -205,7 +205,7 @@ def _replicate_seeds(labels: NDArray[np.int64], least: int, room: int, rng: np.r
     return np.concatenate([np.arange(len(labels)), np.concatenate(more)[: min(room, MAX_REPLICATED_CHAINS)]])
 
 
-def _estimate_direction(walk: ChainPaths, descent: Downhill | None) -> FloatArray:
+def _estimate_direction(walk: ChainPaths, descent: SubsetPoints | None) -> FloatArray:
     """Return the direction in which a region lies, shape (d,): where f falls if it does so linearly, else its mean."""
     dim = walk.states.shape[2]
     region = Region(walk.states, walk.proposals.reshape(-1, dim), walk.f.ravel())
@@ -218,7 +218,7 @@ def _estimate_direction(walk: ChainPaths, descent: Downhill | None) -> FloatArra
     return np.asarray(mean / max(float(np.linalg.norm(mean)), 1e-12))
 
 
-def _add_subset_points(region: Region, descent: Downhill) -> Region:
+def _add_subset_points(region: Region, descent: SubsetPoints) -> Region:
     """Add the lower points of subset simulation where those around the region are too few for a regression."""
     if len(region.u) >= 3 * region.u.shape[1] or len(descent.f) == 0:
         return region

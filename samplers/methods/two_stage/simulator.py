@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from samplers.problem import FloatArray, Inputs
-from samplers.proposals.components import Component
+from samplers.proposals.components import MixtureComponent
 
 
 class Simulator:
@@ -29,7 +29,7 @@ class Simulator:
 class ComponentDraws(NamedTuple):
     """Draws from known components."""
 
-    components: list[Component]
+    components: list[MixtureComponent]
     counts: NDArray[np.int64]
     """Draws of each, in this order."""
     u: FloatArray

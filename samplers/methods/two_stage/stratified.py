@@ -47,7 +47,7 @@ class StratifiedSample:
         owner, k = np.repeat(np.arange(len(batch.counts)), batch.counts), len(batch.counts)
         x = inputs.base.from_standard_normal(batch.u)
         return StratifiedSample(
-            self.draws.joined(Draws.weighted(batch.f, log_weights, x, gamma)),
+            self.draws.join(Draws.from_outcomes(batch.f, log_weights, x, gamma)),
             self.counts + batch.counts,
             self.sums + np.bincount(owner, weights=y, minlength=k),
             self.squares + np.bincount(owner, weights=y * y, minlength=k),

@@ -81,7 +81,7 @@ def test_it_is_a_block_whose_mean_stays_in_the_box(law, rng):
     x = product.sample(300, rng)
     wanted = np.full((2, 300), 1 / 300)
     x[:, :404] += 0.05  # asks for means far outside the box
-    moved = product.moved(x, wanted, 0.8)
+    moved = product.project(x, wanted, 0.8)
     shift = moved.sample(20_000, rng)[:, :404].mean(axis=0) - law.mean
     assert np.abs(shift).max() < RADIUS + 5 * law.std.max() / np.sqrt(20_000)
     assert np.abs(shift).max() > 0.5 * RADIUS

@@ -66,7 +66,7 @@ def test_cross_entropy_finds_the_blocks():
     assert [block.dim for block in blocks.blocks] == [24, 404, problem.space.sizes[-1]]
     x = draw(problem, 200)
     weights = np.tile(np.arange(1, 201) / (200 * 201 / 2), (3, 1))
-    moved = blocks.moved(x, weights, 0.8)
+    moved = blocks.project(x, weights, 0.8)
     change = moved.blocks[1].law.mean - blocks.blocks[1].law.mean
     assert 0 < np.abs(change).max() <= 0.01 + 1e-12
     assert moved.blocks[2] is blocks.blocks[2]

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from samplers.importance.draws import Draws, bernstein_bound, doubts, interval_of
-from samplers.importance.sampling import defensive, draw_until, final_draws
+from samplers.importance.draws import Draws, bernstein_bound, weight_warnings, weighted_interval
+from samplers.importance.sampling import count_final_draws, defensive_mixture, simulate_until
 from samplers.limit_states import half_space
 from samplers.method import Goal
 from samplers.problem import FunctionProblem
@@ -40,39 +40,41 @@ def test_p_and_cov_by_hand():
 
 def test_outcomes_at_gamma_fail_and_draws_join():
     f, log_weights, x = np.array([2.0, 1.0, 0.0]), np.log([1.0, 2.0, 3.0]), np.arange(6.0).reshape(3, 2)
-    draws = Draws.weighted(f, log_weights, x, gamma=1.0)
+    draws = Draws.from_outcomes(f, log_weights, x, gamma=1.0)
     np.testing.assert_array_equal(draws.x, x[1:])
-    both = draws.joined(draws)
+    both = draws.join(draws)
     assert (both.n, both.p) == (6, pytest.approx(5 / 3))
     sample = both.sample
     np.testing.assert_array_equal(sample.f, [1.0, 0.0, 1.0, 0.0, 2.0, 2.0])
     np.testing.assert_allclose(sample.weights, np.array([2.0, 3.0, 2.0, 3.0, 1.0, 1.0]) / 6)
-    assert Draws(0, np.empty(0), np.empty(0)).joined(draws) is draws
+    assert Draws(0, np.empty(0), np.empty(0)).join(draws) is draws
 
 
 @pytest.mark.parametrize(("ess", "df"), [(201, math.inf), (200, 50.0), (40, 10.0)])
 def test_quantiles_are_of_as_many_degrees_as_a_quarter_of_the_failing_draws_are_worth(ess, df):
     draws = equal(ess)
     expected = log_normal(draws.p, draws.cov, stats.t.ppf(0.95, df))
-    assert interval_of(draws, 0.9, 10.0) == pytest.approx(expected)
+    assert weighted_interval(draws, 0.9, 10.0) == pytest.approx(expected)
     wider = log_normal(draws.p, 0.5, stats.t.ppf(0.95, df))
-    assert interval_of(draws, 0.9, 10.0, cov=0.5) == pytest.approx((wider[0], wider[1]))
+    assert weighted_interval(draws, 0.9, 10.0, cov=0.5) == pytest.approx((wider[0], wider[1]))
 
 
 def test_of_few_draws_the_upper_end_is_guaranteed():
     few = equal(29)
-    low, high = interval_of(few, 0.95, 10.0)
+    low, high = weighted_interval(few, 0.95, 10.0)
     assert low == pytest.approx(log_normal(few.p, few.cov, stats.t.ppf(0.975, 29 / 4))[0])
     assert high == bernstein_bound(few, 0.95, 10.0)
-    assert interval_of(equal(31), 0.95, 10.0)[1] < bernstein_bound(equal(31), 0.95, 10.0)
+    assert weighted_interval(equal(31), 0.95, 10.0)[1] < bernstein_bound(equal(31), 0.95, 10.0)
     tiny = equal(8)
-    assert interval_of(tiny, 0.95, 10.0)[0] == pytest.approx(log_normal(tiny.p, tiny.cov, stats.t.ppf(0.975, 3))[0])
+    assert weighted_interval(tiny, 0.95, 10.0)[0] == pytest.approx(
+        log_normal(tiny.p, tiny.cov, stats.t.ppf(0.975, 3))[0]
+    )
 
 
 def test_without_a_failing_draw_and_without_weights_the_interval_is_the_binomial_one():
-    assert interval_of(weighing(), 0.95, 4.0) == (0.0, pytest.approx(4.0 * clopper_pearson(0, 1000, 0.95)[1]))
-    assert interval_of(weighing(n=5), 0.95, 10.0) == (0.0, 1.0)
-    assert interval_of(equal(7, weight=1.0), 0.95, 1.0) == clopper_pearson(7, 1000, 0.95)
+    assert weighted_interval(weighing(), 0.95, 4.0) == (0.0, pytest.approx(4.0 * clopper_pearson(0, 1000, 0.95)[1]))
+    assert weighted_interval(weighing(n=5), 0.95, 10.0) == (0.0, 1.0)
+    assert weighted_interval(equal(7, weight=1.0), 0.95, 1.0) == clopper_pearson(7, 1000, 0.95)
 
 
 def test_bernstein_bound_is_that_of_the_theorem():
@@ -89,26 +91,26 @@ def test_bernstein_bound_is_that_of_the_theorem():
 
 
 def test_doubts_are_of_few_and_of_heavy_draws():
-    assert "worth 29" in doubts(equal(29))[0]
-    assert doubts(equal(31)) == []
+    assert "worth 29" in weight_warnings(equal(29))[0]
+    assert weight_warnings(equal(31)) == []
     others = [1.0] * 100
-    assert doubts(weighing(*others, 17.5)) == []  # 14.9 %
-    (doubt,) = doubts(weighing(*others, 17.8))  # 15.1 %
+    assert weight_warnings(weighing(*others, 17.5)) == []  # 14.9 %
+    (doubt,) = weight_warnings(weighing(*others, 17.8))  # 15.1 %
     assert "One draw carries 15 %" in doubt
-    assert "None of 1,000 final draws failed" in doubts(weighing())[0]
+    assert "None of 1,000 final draws failed" in weight_warnings(weighing())[0]
 
 
 def test_final_draws_are_what_is_left_or_what_was_set():
-    assert final_draws(Goal(gamma=0.0, max_sim=5000), spent=1200, n_final=1000) == 3800
-    assert final_draws(Goal(gamma=0.0), spent=1200, n_final=1000) == 1000
-    assert final_draws(Goal(gamma=0.0, target_cov=0.1), spent=1200, n_final=1000) == 100_000
+    assert count_final_draws(Goal(gamma=0.0, max_sim=5000), spent=1200, n_final=1000) == 3800
+    assert count_final_draws(Goal(gamma=0.0), spent=1200, n_final=1000) == 1000
+    assert count_final_draws(Goal(gamma=0.0, target_cov=0.1), spent=1200, n_final=1000) == 100_000
 
 
 def test_no_weight_exceeds_one_over_the_base_s_share(rng):
     base, far, wide = (Gaussian(np.full(2, m), s * np.eye(2)) for m, s in ((0.0, 1.0), (3.0, 0.1), (3.0, 4.0)))
     u = 4.0 * rng.standard_normal((2000, 2))
     for wide_share in (0.0, 0.25):
-        mixture = defensive(base, wide, far, 0.125, wide_share)
+        mixture = defensive_mixture(base, wide, far, 0.125, wide_share)
         parts = [0.125 * np.exp(base.log_prob(u)), wide_share * np.exp(wide.log_prob(u))]
         density = sum(parts) + (0.875 - wide_share) * np.exp(far.log_prob(u))
         np.testing.assert_allclose(mixture.log_prob(u), np.log(density))
@@ -117,7 +119,7 @@ def test_no_weight_exceeds_one_over_the_base_s_share(rng):
 
 def until(drive, limit, batch, **goal):
     problem, told = half_space(2, 1.0).problem, []
-    steps = draw_until(
+    steps = simulate_until(
         problem,
         Gaussian(np.full(2, 0.7), np.eye(2)),
         Goal(gamma=0.0, on_level=told.append, **goal),
@@ -143,6 +145,6 @@ def test_batches_up_to_a_limit_or_a_target(drive):
 
 def test_stopped_on_the_way_there_is_what_was_drawn(drive):
     problem = FunctionProblem(lambda u: 1.0 - u[:, 0], 2)
-    steps = draw_until(problem, Gaussian.standard(2), Goal(gamma=0.0), 3000, 1000, np.random.default_rng(0))
+    steps = simulate_until(problem, Gaussian.standard(2), Goal(gamma=0.0), 3000, 1000, np.random.default_rng(0))
     draws, trace, stopped = drive(steps, problem, interrupt_at=2).value
     assert (draws.n, len(trace), stopped) == (2000, 2, True)

@@ -39,7 +39,7 @@ def test_every_kernel_leaves_the_conditioned_law_invariant(rng, kernel):
     u[:, 0] = stats.norm.isf(rng.random(n) * stats.norm.sf(-LEVEL))
     f = height(u)
     for _ in range(10):
-        candidates = kernel.candidates(u, rng)
+        candidates = kernel.propose(u, rng)
         u, f, _ = accepted_step(u, f, candidates, height(candidates), LEVEL)
     assert (f <= LEVEL).all()
     assert stats.kstest(u[:, 0], stats.truncnorm(-LEVEL, np.inf).cdf).pvalue > 1e-3
@@ -58,19 +58,19 @@ def test_the_printed_ratio_is_wrong_for_the_conditional_proposal(rng):
 
 def test_metropolis_moves_components_one_by_one(rng):
     u = rng.standard_normal((2000, 3))
-    stays = FixedMetropolis(1.0, "uniform").candidates(u, rng) == u
+    stays = FixedMetropolis(1.0, "uniform").propose(u, rng) == u
     assert 0.1 < stays.mean() < 0.4
     assert stays.all(axis=1).mean() < 0.1
 
 
 def test_only_the_adaptive_kernel_changes(rng):
     fixed, kernel = FixedMetropolis(1.0, "uniform"), scaled("conditional", 0.6)
-    assert fixed.adapted(1.0, 1) == fixed == fixed.started(np.ones((4, 2)))
-    assert kernel.adapted(0.64, 4).scale == pytest.approx(0.6 * np.exp(0.1))
-    assert kernel.adapted(1.0, 1).scale == 1.0
+    assert fixed.adapt(1.0, 1) == fixed == fixed.start_level(np.ones((4, 2)))
+    assert kernel.adapt(0.64, 4).scale == pytest.approx(0.6 * np.exp(0.1))
+    assert kernel.adapt(1.0, 1).scale == 1.0
     seeds = rng.standard_normal((50, 2)) * [0.2, 3.0]
-    np.testing.assert_array_equal(kernel.started(seeds).deviations, [1, 1])
-    own = ScaledKernel("conditional", "seeds", 0.6, 0.44, np.ones(2)).started(seeds).deviations
+    np.testing.assert_array_equal(kernel.start_level(seeds).deviations, [1, 1])
+    own = ScaledKernel("conditional", "seeds", 0.6, 0.44, np.ones(2)).start_level(seeds).deviations
     np.testing.assert_allclose(own, seeds.std(axis=0, ddof=1))
 
 

@@ -5,12 +5,12 @@ import pytest
 from scipy import stats
 
 import samplers
-from samplers.importance.search import Round, Search, described, pooled
+from samplers.importance.search import Round, Search, pool_rounds, round_record
 from samplers.limit_states import four_branches, half_space, parabola, plateau
 from samplers.method import Goal
-from samplers.methods.importance_sampling import far_share
+from samplers.methods.importance_sampling import unreached_share
 from samplers.problem import FunctionProblem, StandardNormal
-from samplers.proposals.gaussian import Tilted
+from samplers.proposals.gaussian import TiltedNormal
 from samplers.trace import Status
 
 IS = samplers.ImportanceSampling
@@ -18,7 +18,7 @@ IS = samplers.ImportanceSampling
 
 def test_a_tilt_of_the_standard_normal_law_is_a_shift(rng):
     theta = np.array([1.5, -0.5])
-    tilted, u = Tilted(theta), rng.standard_normal((5, 2))
+    tilted, u = TiltedNormal(theta), rng.standard_normal((5, 2))
     ratio = tilted.log_prob(u) - StandardNormal(2).log_prob(u)
     np.testing.assert_allclose(ratio, u @ theta - 0.5 * theta @ theta)
     np.testing.assert_allclose(tilted.sample(20_000, rng).mean(axis=0), theta, atol=0.04)
@@ -71,13 +71,13 @@ def test_base_draws_where_one_tilt_does_not_serve(study, reference):
 def test_far_share(rng):
     u = rng.standard_normal((4000, 2))
     f = 1.5 - abs(u[:, 0])  # two regions
-    first = Round(Tilted(np.zeros(2)), u, f)
-    search = Search([first], [described(first, 0.0)], Status.CONVERGED)
+    first = Round(TiltedNormal(np.zeros(2)), u, f)
+    search = Search([first], [round_record(first, 0.0)], Status.CONVERGED)
     inputs = FunctionProblem(lambda x: 1.5 - abs(x[:, 0]), 2)
-    assert far_share(search, np.array([2.0, 0.0]), inputs, 0.0) == pytest.approx(0.5, abs=0.06)
+    assert unreached_share(search, np.array([2.0, 0.0]), inputs, 0.0) == pytest.approx(0.5, abs=0.06)
     one = first._replace(f=1.5 - u[:, 0])
-    search = Search([one], [described(one, 0.0)], Status.CONVERGED)
-    assert far_share(search, np.array([2.0, 0.0]), inputs, 0.0) == 0
+    search = Search([one], [round_record(one, 0.0)], Status.CONVERGED)
+    assert unreached_share(search, np.array([2.0, 0.0]), inputs, 0.0) == 0
 
 
 def test_rounds_pool_into_one_sample(rng):
@@ -87,10 +87,10 @@ def test_rounds_pool_into_one_sample(rng):
     for _ in range(200):
         rounds = []
         for shift in ([0.0, 0.0], [1.5, 1.5], [3.0, 3.0]):
-            law = Tilted(np.array(shift))
+            law = TiltedNormal(np.array(shift))
             u = law.sample(200, rng)
             rounds.append(Round(law, u, inputs.problem.evaluate(u)))
-        draws = pooled(rounds, inputs.problem, 0.0)
+        draws = pool_rounds(rounds, inputs.problem, 0.0)
         assert draws.n == 600
         assert np.exp(draws.log_weights).max() <= 3
         estimates.append(draws.p)

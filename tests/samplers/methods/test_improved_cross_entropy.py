@@ -7,7 +7,7 @@ from scipy import stats
 import samplers
 from samplers.limit_states import four_branches, half_space, parabola, plateau, shell
 from samplers.method import Goal
-from samplers.methods.improved_cross_entropy import log_smooth, next_width, scale_of, spread
+from samplers.methods.improved_cross_entropy import log_smooth_indicator, median_scale, next_width, weights_cov
 from samplers.problem import FunctionProblem
 from samplers.trace import Status
 
@@ -83,25 +83,25 @@ def test_gamma_shifts_f():
 def test_the_width_gives_the_weights_their_spread(rng):
     g, log_ratio = 3.0 - rng.standard_normal(1000), 0.1 * rng.standard_normal(1000)
     width = next_width(g, log_ratio, 1.5, 1e-15, 30.0)
-    assert spread(log_smooth(g, width) + log_ratio) == pytest.approx(1.5, abs=1e-6)
+    assert weights_cov(log_smooth_indicator(g, width) + log_ratio) == pytest.approx(1.5, abs=1e-6)
     assert next_width(g, log_ratio, 1.5, 1e-15, 0.1) == 0.1  # as wide as allowed is too narrow
     assert next_width(-abs(g), log_ratio, 1.5, 1e-15, 30.0) == 1e-15  # all fail
 
 
 def test_spread():
-    assert spread(np.log([1.0, 3.0]) - 1000) == pytest.approx(0.5)
-    assert spread(np.full(3, -np.inf)) == math.inf
+    assert weights_cov(np.log([1.0, 3.0]) - 1000) == pytest.approx(0.5)
+    assert weights_cov(np.full(3, -np.inf)) == math.inf
 
 
 def test_smooth_indicator():
     g = np.array([-1e300, -1.0, 0.0, 1.0, 1e300])
-    np.testing.assert_allclose(np.exp(log_smooth(g, 1e-12)), [1, 1, 0.5, 0, 0])
-    np.testing.assert_allclose(np.exp(log_smooth(g, math.inf)), 0.5)
+    np.testing.assert_allclose(np.exp(log_smooth_indicator(g, 1e-12)), [1, 1, 0.5, 0, 0])
+    np.testing.assert_allclose(np.exp(log_smooth_indicator(g, math.inf)), 0.5)
 
 
 def test_scale():
-    assert scale_of(np.array([1.0, -2.0, 3.0, 0.0, 1e300])) == 2.0
-    assert scale_of(np.zeros(3)) == 1.0
+    assert median_scale(np.array([1.0, -2.0, 3.0, 0.0, 1e300])) == 2.0
+    assert median_scale(np.zeros(3)) == 1.0
 
 
 def endless(family, seed):

@@ -9,7 +9,14 @@ import samplers
 from samplers.limit_states import half_space, plateau, shell
 from samplers.mcmc.chains import Chains
 from samplers.method import Goal
-from samplers.methods.subset_levels import Passed, after, descent_cov, described, effective_roots, finish
+from samplers.methods.subset_levels import (
+    LevelProduct,
+    descent_cov,
+    effective_roots,
+    include_level,
+    level_record,
+    summarise,
+)
 from samplers.problem import FunctionProblem
 from samplers.statistics.intervals import log_normal
 from samplers.trace import Status
@@ -72,7 +79,7 @@ def test_level_zero_is_part_of_the_cov():
     assert zero.cov == pytest.approx(math.sqrt(0.9 / (0.1 * 1000)))
     both = math.sqrt((1 + zero.cov**2) * (1 + last.cov**2) - 1)
     assert result.cov >= both * (1 - 1e-12)
-    assert after(Passed(), zero).cov == pytest.approx(zero.cov)
+    assert include_level(LevelProduct(), zero).cov == pytest.approx(zero.cov)
 
 
 def frozen(chains, steps):
@@ -84,7 +91,7 @@ def frozen(chains, steps):
 
 def test_chain_correlation_is_in_the_cov_of_a_level():
     """Chains that never leave their side are worth one point each."""
-    level = described(frozen(100, 10), 0.0, Passed())
+    level = level_record(frozen(100, 10), 0.0, LevelProduct())
     assert level.p == 0.1
     assert level.ess == pytest.approx(100)
     assert level.cov == pytest.approx(math.sqrt(0.9 / (0.1 * 100)))
@@ -114,18 +121,18 @@ def test_cov_is_the_larger_of_chain_correlation_and_descent():
     chains, goal = frozen(100, 10), Goal(gamma=0.0)
 
     def outcome(roots, passed):
-        zero = replace(described(frozen(1000, 1), 0.0, Passed()), n_points=1000)
-        last = described(chains._replace(roots=roots), 0.0, passed)
-        return finish(chains._replace(roots=roots), goal, passed, [zero, last], Status.CONVERGED), last
+        zero = replace(level_record(frozen(1000, 1), 0.0, LevelProduct()), n_points=1000)
+        last = level_record(chains._replace(roots=roots), 0.0, passed)
+        return summarise(chains._replace(roots=roots), goal, passed, [zero, last], Status.CONVERGED), last
 
-    one_root, passed = np.zeros(100, dtype=int), Passed(0.1, 0.1)
+    one_root, passed = np.zeros(100, dtype=int), LevelProduct(0.1, 0.1)
     by_descent, last = outcome(one_root, passed)
-    assert by_descent.cov == descent_cov(np.zeros(100, dtype=int), 1000) > 2 * after(passed, last).cov
+    assert by_descent.cov == descent_cov(np.zeros(100, dtype=int), 1000) > 2 * include_level(passed, last).cov
     assert by_descent.interval == log_normal(by_descent.p, by_descent.cov, 0.95, df=1.0)
 
-    passed = Passed(0.1, 2.0)
+    passed = LevelProduct(0.1, 2.0)
     by_levels, last = outcome(np.arange(100), passed)
-    assert by_levels.cov == after(passed, last).cov > 2 * descent_cov(np.repeat(np.arange(10), 10), 1000)
+    assert by_levels.cov == include_level(passed, last).cov > 2 * descent_cov(np.repeat(np.arange(10), 10), 1000)
 
 
 def test_own_cov_matches_the_spread(study):

@@ -7,7 +7,16 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from samplers.limit_states import half_space
-from samplers.proposals.components import Bump, Shell, Slice, Wide, draw, draw_counts, log_ratios, mixed
+from samplers.proposals.components import (
+    HalfSpaceNormal,
+    IsotropicNormal,
+    RadialLaw,
+    SubspaceGaussian,
+    draw_components,
+    draw_counts,
+    log_ratios,
+    mixture_log_ratio,
+)
 
 N = 20_000
 
@@ -19,29 +28,31 @@ def rotation(dim, seed=0):
 def bump(dim, rank, seed=0):
     """Along `rank` of the directions: means to 1.5, variances 0.7 to 1.5."""
     axes = rotation(dim, seed)[:, :rank]
-    return Bump(axes, np.linspace(-0.5, 1.5, rank), np.linspace(0.7, 1.5, rank))
+    return SubspaceGaussian(axes, np.linspace(-0.5, 1.5, rank), np.linspace(0.7, 1.5, rank))
 
 
 def oblique_slice(start):
     axes = rotation(3, 5)
-    return Slice(axes[:, 0], start, Bump(axes[:, 1:], np.array([0.6, -0.4]), np.array([0.8, 1.4])))
+    return HalfSpaceNormal(
+        axes[:, 0], start, SubspaceGaussian(axes[:, 1:], np.array([0.6, -0.4]), np.array([0.8, 1.4]))
+    )
 
 
 COMPONENTS = {
-    "base": (Wide(4), 4),
-    "wide": (Wide(2, 1.5), 2),
-    "wide d=1": (Wide(1, 3.0), 1),
+    "base": (IsotropicNormal(4), 4),
+    "wide": (IsotropicNormal(2, 1.5), 2),
+    "wide d=1": (IsotropicNormal(1, 3.0), 1),
     "bump d=1": (bump(1, 1), 1),
     "bump": (bump(2, 2), 2),
     "one direction of 100": (bump(100, 1), 100),
     "three directions of 6": (bump(6, 3), 6),
-    "tempered": (bump(6, 3).tempered(0.5), 6),
-    "slice d=1": (Slice(np.array([-1.0]), 1.5), 1),
-    "slice": (Slice(rotation(3, 4)[:, 0], 2.0), 3),
-    "slice behind the origin": (Slice(rotation(3, 4)[:, 0], -0.5), 3),
+    "tempered": (bump(6, 3).temper(0.5), 6),
+    "slice d=1": (HalfSpaceNormal(np.array([-1.0]), 1.5), 1),
+    "slice": (HalfSpaceNormal(rotation(3, 4)[:, 0], 2.0), 3),
+    "slice behind the origin": (HalfSpaceNormal(rotation(3, 4)[:, 0], -0.5), 3),
     "slice with a bump across": (oblique_slice(1.0), 3),
-    "shell": (Shell(3, 1.0, 1.5, 2.5), 3),
-    "shell d=20": (Shell(20, 12.0, 2.0, 4.0), 20),
+    "shell": (RadialLaw(3, 1.0, 1.5, 2.5), 3),
+    "shell d=20": (RadialLaw(20, 12.0, 2.0, 4.0), 20),
 }
 each = pytest.mark.parametrize(("component", "dim"), COMPONENTS.values(), ids=COMPONENTS)
 
@@ -67,9 +78,9 @@ def test_draws_and_ratio_are_of_one_density(component, dim, rng):
 def test_weights_of_draws_average_to_the_base_s_probability_of_the_support(component, dim, rng):
     weights = np.exp(-component.log_ratio(component.sample(N, rng)))
     supported = 1.0
-    if isinstance(component, Slice):
+    if isinstance(component, HalfSpaceNormal):
         supported = stats.norm.sf(component.start)
-    if isinstance(component, Shell):
+    if isinstance(component, RadialLaw):
         supported = stats.chi2.sf(component.start, dim)
     assert weights.mean() == pytest.approx(supported, rel=1e-12, abs=4 * weights.std() / math.sqrt(N))
 
@@ -78,7 +89,7 @@ def test_weights_of_draws_average_to_the_base_s_probability_of_the_support(compo
 def test_density_integrates_to_one(name):
     component, dim = COMPONENTS[name]
     u, mass = grid(dim)
-    edge = 1e-3 if isinstance(component, Slice) else 0.0  # a cell that the edge of the slice cuts
+    edge = 1e-3 if isinstance(component, HalfSpaceNormal) else 0.0  # a cell that the edge of the slice cuts
     assert (mass * np.exp(component.log_ratio(u))).sum() == pytest.approx(1.0, abs=1e-6 + edge)
 
 
@@ -90,8 +101,8 @@ def test_ratio_is_that_of_the_densities():
     phi = stats.multivariate_normal(np.zeros(3), np.eye(3)).logpdf(u)
     np.testing.assert_allclose(component.log_ratio(u), q - phi, atol=1e-10)
     wide = stats.multivariate_normal(np.zeros(3), 2.25 * np.eye(3)).logpdf(u)
-    np.testing.assert_allclose(Wide(3, 1.5).log_ratio(u), wide - phi, atol=1e-10)
-    np.testing.assert_allclose(Wide(3).log_ratio(u), 0.0, atol=1e-12)
+    np.testing.assert_allclose(IsotropicNormal(3, 1.5).log_ratio(u), wide - phi, atol=1e-10)
+    np.testing.assert_allclose(IsotropicNormal(3).log_ratio(u), 0.0, atol=1e-12)
 
 
 def agrees(x, law):
@@ -115,7 +126,7 @@ def test_draws_of_a_bump_along_and_across_its_axes(component, rng):
 
 @pytest.mark.parametrize("start", [-1.0, 0.0, 2.0, 8.0, 30.0])
 def test_draws_of_a_slice_along_and_across_its_axis(start, rng):
-    component = Slice(rotation(4, 2)[:, 0], start)
+    component = HalfSpaceNormal(rotation(4, 2)[:, 0], start)
     u = component.sample(N, rng)
     along = u @ component.axis
     assert along.min() >= start - 1e-9
@@ -137,14 +148,14 @@ def test_draws_of_a_slice_with_a_bump_across(rng):
 
 def test_slice_of_a_half_space_has_weights_without_spread(rng):
     reference = half_space(50, 4.0)
-    component = Slice(np.full(50, 1 / math.sqrt(50)), 4.0)
+    component = HalfSpaceNormal(np.full(50, 1 / math.sqrt(50)), 4.0)
     weights = np.exp(-component.log_ratio(component.sample(1000, rng)))
     np.testing.assert_allclose(weights, reference.p, rtol=1e-9)
 
 
 @pytest.mark.parametrize("dim", [1, 3, 20])
 def test_draws_of_a_shell(dim, rng):
-    component = Shell(dim, 5.0, 1.7, 2.2)
+    component = RadialLaw(dim, 5.0, 1.7, 2.2)
     u = component.sample(N, rng)
     assert agrees((u * u).sum(axis=1) - 5.0, stats.gamma(1.7, scale=2.2))
     cosine = u[:, 0] / np.linalg.norm(u, axis=1)
@@ -157,24 +168,24 @@ def test_draws_of_a_shell(dim, rng):
 @pytest.mark.parametrize("dim", [1, 2])
 @pytest.mark.parametrize("power", [0.0, 0.3, 0.5, 1.0])
 def test_tempered_is_the_normalised_geometric_mean_with_the_base(dim, power):
-    component = Bump(rotation(dim, 3), np.array([2.5, -1.0])[:dim], np.array([0.3, 1.8])[:dim])
+    component = SubspaceGaussian(rotation(dim, 3), np.array([2.5, -1.0])[:dim], np.array([0.3, 1.8])[:dim])
     u, mass = grid(dim)
     log_q = power * component.log_ratio(u)
     expected = log_q - math.log((mass * np.exp(log_q)).sum())
     near = np.linalg.norm(u, axis=1) < 6
-    np.testing.assert_allclose(component.tempered(power).log_ratio(u)[near], expected[near], atol=1e-7)
+    np.testing.assert_allclose(component.temper(power).log_ratio(u)[near], expected[near], atol=1e-7)
 
 
 def test_all_is_finite_in_1500_dimensions(rng):
     axis = rotation(1500, 1)[:, :1]
     components = [
-        Wide(1500),
-        Wide(1500, 3.0),
-        Bump(axis, np.array([4.0]), np.array([0.1])),
-        Slice(axis[:, 0], 4.0),
-        Shell(1500, 1400.0, 2.0, 100.0),
+        IsotropicNormal(1500),
+        IsotropicNormal(1500, 3.0),
+        SubspaceGaussian(axis, np.array([4.0]), np.array([0.1])),
+        HalfSpaceNormal(axis[:, 0], 4.0),
+        RadialLaw(1500, 1400.0, 2.0, 100.0),
     ]
-    u = draw(components, np.full(5, 20), rng)
+    u = draw_components(components, np.full(5, 20), rng)
     log_r = log_ratios(components, u)
     assert log_r.shape == (5, 100)
     assert not np.isnan(log_r).any()
@@ -182,19 +193,19 @@ def test_all_is_finite_in_1500_dimensions(rng):
     for k in range(5):
         own = log_r[k, 20 * k : 20 * (k + 1)]
         assert np.isfinite(own).mean() > 0.9
-    assert np.isfinite(mixed(log_r, np.full(5, 0.2))).all()
+    assert np.isfinite(mixture_log_ratio(log_r, np.full(5, 0.2))).all()
 
 
 def test_mixture_is_the_sum_of_its_parts(rng):
     components, weights = (
-        [Wide(3), bump(3, 2), oblique_slice(1.0), Shell(3, 1.0, 1.5, 2.5)],
+        [IsotropicNormal(3), bump(3, 2), oblique_slice(1.0), RadialLaw(3, 1.0, 1.5, 2.5)],
         np.array([0.1, 0.4, 0.5, 0]),
     )
     u = 2 * rng.standard_normal((500, 3))
     log_r = log_ratios(components, u)
-    np.testing.assert_allclose(mixed(log_r, weights), np.log(weights @ np.exp(log_r)), atol=1e-12)
-    assert np.isneginf(mixed(np.full((2, 3), -np.inf), np.array([0.5, 0.5]))).all()
-    assert mixed(np.array([[900.0], [0.0]]), np.array([0.5, 0.5]))[0] == pytest.approx(900 - math.log(2))
+    np.testing.assert_allclose(mixture_log_ratio(log_r, weights), np.log(weights @ np.exp(log_r)), atol=1e-12)
+    assert np.isneginf(mixture_log_ratio(np.full((2, 3), -np.inf), np.array([0.5, 0.5]))).all()
+    assert mixture_log_ratio(np.array([[900.0], [0.0]]), np.array([0.5, 0.5]))[0] == pytest.approx(900 - math.log(2))
 
 
 @given(
@@ -220,12 +231,12 @@ def test_counts_are_right_on_average(rng):
 
 def test_draws_come_in_the_order_of_the_components(rng):
     far = [
-        Slice(np.array([1.0, 0.0]), 5.0),
-        Slice(np.array([-1.0, 0.0]), 5.0),
-        Wide(2),
-        Slice(np.array([0.0, 1.0]), 9.0),
+        HalfSpaceNormal(np.array([1.0, 0.0]), 5.0),
+        HalfSpaceNormal(np.array([-1.0, 0.0]), 5.0),
+        IsotropicNormal(2),
+        HalfSpaceNormal(np.array([0.0, 1.0]), 9.0),
     ]
-    u = draw(far, np.array([3, 2, 0, 4]), rng)
+    u = draw_components(far, np.array([3, 2, 0, 4]), rng)
     assert u.shape == (9, 2)
     assert (u[:3, 0] > 4.9).all()
     assert (u[3:5, 0] < -4.9).all()

@@ -25,7 +25,7 @@ def test_gaussian_draws_have_its_moments(rng):
 def test_moments_and_widening():
     gaussian = Gaussian.from_covariance(MEAN, COVARIANCE)
     np.testing.assert_allclose(gaussian.moments.covariance, COVARIANCE)
-    np.testing.assert_allclose(gaussian.widened(2.0).covariance, 4 * COVARIANCE)
+    np.testing.assert_allclose(gaussian.widen(2.0).covariance, 4 * COVARIANCE)
 
 
 def test_weighted_fit_recovers_the_truth(rng):

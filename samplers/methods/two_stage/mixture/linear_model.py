@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
 from samplers.problem import LOG_TWO_PI, FloatArray
-from samplers.proposals.components import Bump, Component, Slice
+from samplers.proposals.components import HalfSpaceNormal, MixtureComponent, SubspaceGaussian
 
 RIDGES = (1.0, 1e-3)
 LAD_ITERATIONS = 12
@@ -95,7 +95,9 @@ def descent_direction(u: FloatArray, f: FloatArray) -> tuple[FloatArray, float]:
     return plane.axis, plane.explained
 
 
-def half_space_proposals(points: FloatArray, u: FloatArray, f: FloatArray, gamma: float = 0.0) -> list[Component]:
+def half_space_proposals(
+    points: FloatArray, u: FloatArray, f: FloatArray, gamma: float = 0.0
+) -> list[MixtureComponent]:
     """Return proposals beyond the plane of f around some failures, or none if no plane explains f.
 
     Args:
@@ -126,7 +128,10 @@ def half_space_proposals(points: FloatArray, u: FloatArray, f: FloatArray, gamma
     # Mean and variance of N(0, 1) beyond start: Mills' ratio.
     mean = math.exp(-0.5 * (start * start + LOG_TWO_PI) - float(log_ndtr(-start)))
     variance = max(1 + start * mean - mean * mean, 0.01)
-    return [Bump(axis[:, None], np.array([mean]), np.array([1.3 * variance])), Slice(axis, start - 0.02)]
+    return [
+        SubspaceGaussian(axis[:, None], np.array([mean]), np.array([1.3 * variance])),
+        HalfSpaceNormal(axis, start - 0.02),
+    ]
 
 
 def failure_edge(along: FloatArray, weights: FloatArray, ess: float, share: float) -> float:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from samplers.methods.two_stage.mixture.screening import FailureScreen, draw_screened
 from samplers.problem import FloatArray
-from samplers.proposals.components import Component, draw, draw_counts, log_ratios, mixed
+from samplers.proposals.components import MixtureComponent, draw_components, draw_counts, log_ratios, mixture_log_ratio
 
 NO_REGION = -1
 ACCEPTANCE_DRAWS = 15_000
@@ -19,7 +19,7 @@ ACCEPTANCE_DRAWS = 15_000
 class ProposalComponent(NamedTuple):
     """A component that may become part of the proposal."""
 
-    component: Component
+    component: MixtureComponent
     kind: str
     region: int = NO_REGION
 
@@ -42,7 +42,7 @@ class MixtureProposal:
     """
 
     @property
-    def components(self) -> list[Component]:
+    def components(self) -> list[MixtureComponent]:
         """Its components."""
         return [candidate.component for candidate in self.candidates]
 
@@ -54,7 +54,7 @@ class MixtureProposal:
             log_r = log_r + np.where(
                 self.screened[used, None], np.log(self.screen(u)) - np.log(self.acceptance)[used, None], 0.0
             )
-        return -mixed(log_r, self.weights[used])
+        return -mixture_log_ratio(log_r, self.weights[used])
 
     @property
     def screened(self) -> NDArray[np.bool_]:
@@ -65,7 +65,7 @@ class MixtureProposal:
         """Draw n points (n, d), one component after the other; return them and how many are from which."""
         counts = draw_counts(self.weights, n, rng)
         if self.screen is None:
-            return draw(self.components, counts, rng), counts
+            return draw_components(self.components, counts, rng), counts
         return np.concatenate(
             [
                 draw_screened(self.screen, component, int(k), rng) if screened else component.sample(int(k), rng)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from samplers.problem import FloatArray
-from samplers.proposals.components import Component
+from samplers.proposals.components import MixtureComponent
 
 ACCEPTANCE_FLOORS = (0.5, 0.25)
 """Shares of the draws that may be kept where the classifier sees no failure."""
@@ -37,7 +37,7 @@ class FailureScreen:
         return np.asarray(np.maximum(np.exp(-0.5 * np.logaddexp(0.0, -odds)), self.floor))
 
 
-def draw_screened(screen: FailureScreen, component: Component, n: int, rng: np.random.Generator) -> FloatArray:
+def draw_screened(screen: FailureScreen, component: MixtureComponent, n: int, rng: np.random.Generator) -> FloatArray:
     """Draw n points (n, d) of a component that pass the screen, by rejection."""
     parts, missing = [component.sample(0, rng)], n
     while missing > 0:

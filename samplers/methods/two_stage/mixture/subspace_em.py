@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from samplers.problem import FloatArray
-from samplers.proposals.components import Bump, log_ratios
+from samplers.proposals.components import SubspaceGaussian, log_ratios
 from samplers.statistics.weights import normalised
 
 HIGH_DIM = 40
@@ -24,7 +24,7 @@ STEPS = 25
 RESTARTS = 3
 
 
-class Points(NamedTuple):
+class GroupedPoints(NamedTuple):
     """Weighted points to which bumps are fitted."""
 
     u: FloatArray
@@ -37,16 +37,16 @@ class Points(NamedTuple):
     """Points of one group (a chain) belong to one bump; numbers from 0, shape (n,)."""
 
 
-class Mix(NamedTuple):
+class SubspaceMixture(NamedTuple):
     """A mixture of bumps."""
 
-    bumps: list[Bump]
+    bumps: list[SubspaceGaussian]
     weights: FloatArray
     score: float
     """Log likelihood, in independent points, less the BIC penalty."""
 
 
-def shrunk_bump(u: FloatArray, weights: FloatArray, ess: float) -> tuple[Bump, float]:
+def fit_shrunk_subspace_gaussian(u: FloatArray, weights: FloatArray, ess: float) -> tuple[SubspaceGaussian, float]:
     """Return the bump of weighted points and how much of it is the shrinkage target.
 
     The covariance S is drawn towards T = I + (l - 1) v v', with v the direction of the mean and l the variance
@@ -67,7 +67,7 @@ def shrunk_bump(u: FloatArray, weights: FloatArray, ess: float) -> tuple[Bump, f
         # Noise makes the mean of few points too long, by (d - 1) / ess in the square, and turns it.
         excess = min((dim - 1) / (ess * max(norm, 1e-9) ** 2), 0.5)
         variance = np.array([min(along * (1 - excess) + excess, 4.0)])
-        return Bump(v[:, None], np.array([norm * (1 - excess)]), cautious(variance, ess)), 1.0
+        return SubspaceGaussian(v[:, None], np.array([norm * (1 - excess)]), inflate_variances(variance, ess)), 1.0
     centred = (u - mean) * np.sqrt(weights)[:, None]
     covariance = centred.T @ centred
     target = np.eye(dim) + (along - 1) * np.outer(v, v)
@@ -75,10 +75,10 @@ def shrunk_bump(u: FloatArray, weights: FloatArray, ess: float) -> tuple[Bump, f
     distance = float(((covariance - target) ** 2).sum())
     share = min(1.0, max(noise / distance if distance > 0 else 1.0, (dim + 1) / (2 * (dim + 1 + ess))))
     values, axes = np.linalg.eigh((1 - share) * covariance + share * target)
-    return Bump(axes, axes.T @ mean, cautious(values, ess)), share
+    return SubspaceGaussian(axes, axes.T @ mean, inflate_variances(values, ess)), share
 
 
-def cautious(variance: FloatArray, ess: float) -> FloatArray:
+def inflate_variances(variance: FloatArray, ess: float) -> FloatArray:
     """Return variances (r,), those under 1 raised by two of their standard errors.
 
     Too small a variance makes weights unbounded, too large a one costs a few draws.
@@ -88,7 +88,7 @@ def cautious(variance: FloatArray, ess: float) -> FloatArray:
     return np.where(variance < 1, raised, variance)
 
 
-def fitted(points: Points, most: int, rng: np.random.Generator) -> Mix:
+def fit_mixture(points: GroupedPoints, most: int, rng: np.random.Generator) -> SubspaceMixture:
     """Return a mixture of at most `most` bumps, their number chosen by BIC."""
     best = None
     worse = 0
@@ -96,7 +96,10 @@ def fitted(points: Points, most: int, rng: np.random.Generator) -> Mix:
         if k > 1 and (k > points.groups.max() + 1 or points.ess < 4 * k):
             break
         restarts = 1 if k == 1 else RESTARTS
-        found = max((_climbed(points, _started(points, k, rng)) for _ in range(restarts)), key=lambda mix: mix.score)
+        found = max(
+            (_run_em(points, _initial_responsibilities(points, k, rng)) for _ in range(restarts)),
+            key=lambda mix: mix.score,
+        )
         if best is None or found.score > best.score:
             best, worse = found, 0
         else:
@@ -107,7 +110,7 @@ def fitted(points: Points, most: int, rng: np.random.Generator) -> Mix:
     return best
 
 
-def _started(points: Points, k: int, rng: np.random.Generator) -> FloatArray:
+def _initial_responsibilities(points: GroupedPoints, k: int, rng: np.random.Generator) -> FloatArray:
     """Return responsibilities (k, n) to start from: clusters of the groups' means."""
     n_groups = int(points.groups.max()) + 1
     mass = np.bincount(points.groups, weights=points.weights, minlength=n_groups).astype(np.float64)
@@ -135,7 +138,7 @@ def _clusters(x: FloatArray, mass: FloatArray, k: int, rng: np.random.Generator)
     return np.asarray(near, dtype=np.int64)
 
 
-def _climbed(points: Points, shares: FloatArray) -> Mix:
+def _run_em(points: GroupedPoints, shares: FloatArray) -> SubspaceMixture:
     """Run expectation-maximisation from responsibilities (k, n) until the likelihood rises no more."""
     u, weights, ess, groups = points
     n_groups = int(groups.max()) + 1
@@ -143,7 +146,10 @@ def _climbed(points: Points, shares: FloatArray) -> Mix:
     for _ in range(STEPS):
         mass = (shares * weights).sum(axis=1)
         shares, mass = shares[mass * ess > 1], mass[mass * ess > 1]  # less than a point is no bump
-        fits = [shrunk_bump(u, s * weights / m, max(float(m) * ess, 2.0)) for s, m in zip(shares, mass, strict=True)]
+        fits = [
+            fit_shrunk_subspace_gaussian(u, s * weights / m, max(float(m) * ess, 2.0))
+            for s, m in zip(shares, mass, strict=True)
+        ]
         bumps, mixing = [bump for bump, _ in fits], mass / mass.sum()
         per_point = log_ratios(bumps, u) * (ess * weights)
         per_group = np.array([np.bincount(groups, weights=row, minlength=n_groups) for row in per_point])
@@ -156,16 +162,16 @@ def _climbed(points: Points, shares: FloatArray) -> Mix:
         shares = np.exp(per_group - total)[:, groups]
     dim = u.shape[1]
     parameters = len(fits) - 1 + sum(dim + 1 + min((1 - a) * dim * (dim + 1) / 2, 2 * dim) for _, a in fits)
-    return Mix(bumps, mixing, likelihood - 0.5 * math.log(max(ess, 3.0)) * parameters)
+    return SubspaceMixture(bumps, mixing, likelihood - 0.5 * math.log(max(ess, 3.0)) * parameters)
 
 
-def refitted(bumps: list[Bump], u: FloatArray, log_weights: FloatArray) -> list[Bump]:
+def refit_components(bumps: list[SubspaceGaussian], u: FloatArray, log_weights: FloatArray) -> list[SubspaceGaussian]:
     """Return bumps moved to weighted points u (n, d), each by those that are its own.
 
     Two steps of expectation-maximisation from the present bumps; their number stays, so that a bump with few points
     is not lost. Where the weights of a bump's points are too uneven to fit it, they are tempered until they are not.
     """
-    weights = clipped(log_weights)
+    weights = truncate_weights(log_weights)
     log_mixing = np.zeros(len(bumps))
     for _ in range(2):
         log_shares = log_ratios(bumps, u) + log_mixing[:, None]
@@ -175,7 +181,7 @@ def refitted(bumps: list[Bump], u: FloatArray, log_weights: FloatArray) -> list[
     return bumps
 
 
-def _moved(bump: Bump, u: FloatArray, shares: FloatArray, log_weights: FloatArray) -> Bump:
+def _moved(bump: SubspaceGaussian, u: FloatArray, shares: FloatArray, log_weights: FloatArray) -> SubspaceGaussian:
     count = float(shares.sum())
     if count < 5:
         return bump
@@ -186,10 +192,10 @@ def _moved(bump: Bump, u: FloatArray, shares: FloatArray, log_weights: FloatArra
         ess = 1 / float((w * w).sum())
         if ess >= wanted:
             break
-    return shrunk_bump(u, w, max(ess, 2.0))[0]
+    return fit_shrunk_subspace_gaussian(u, w, max(ess, 2.0))[0]
 
 
-def clipped(log_weights: FloatArray) -> FloatArray:
+def truncate_weights(log_weights: FloatArray) -> FloatArray:
     """Return weights that add up to 1, those over sqrt(n) times their mean cut to that (Ionides 2008)."""
     w = normalised(log_weights)
     w = np.minimum(w, 1 / math.sqrt(len(w)))

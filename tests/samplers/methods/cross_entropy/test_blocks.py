@@ -57,7 +57,7 @@ def test_beta_step_is_the_projection_of_the_mixture(rng):
     """Against the mixture's own likelihood: draws of Q and of P, weighted, in a generic solver."""
     block = BetaBlock(alpha=2.0, beta=2.0, low=0.0, high=1.0)
     elite = rng.beta(4.0, 1.8, size=(40_000, 1))
-    moved = block.moved(elite, uniform_weights(len(elite)), 0.8)
+    moved = block.project(elite, uniform_weights(len(elite)), 0.8)
     y = np.concatenate([elite[:, 0], rng.beta(2.0, 2.0, size=10_000)])  # 0.8 to 0.2
     generic = optimize.minimize(lambda t: -stats.beta(*t).logpdf(y).mean(), [2.0, 2.0], bounds=[(1.5, 7.0)] * 2)
     np.testing.assert_allclose([moved.alpha[0], moved.beta[0]], generic.x, rtol=0.03)
@@ -65,7 +65,7 @@ def test_beta_step_is_the_projection_of_the_mixture(rng):
 
 def test_beta_steps_stay_in_the_box(rng):
     elite = np.stack([80 + 1e-9 * rng.random(9), 0.25 - 1e-12 * rng.random(9)], axis=1)
-    moved = BETA.moved(elite, uniform_weights(9), 1.0)
+    moved = BETA.project(elite, uniform_weights(9), 1.0)
     np.testing.assert_array_equal(moved.alpha, [1.5, 7.0])
     np.testing.assert_array_equal(moved.beta, [7.0, 1.5])
     assert np.isfinite(moved.log_prob(elite)).all()
@@ -73,34 +73,34 @@ def test_beta_steps_stay_in_the_box(rng):
 
 def test_beta_widened():
     block = BetaBlock(alpha=6.0, beta=6.0, low=0.0, high=1.0)
-    wide = block.widened(1.3)
+    wide = block.widen(1.3)
     assert stats.beta(wide.alpha, wide.beta).std() == pytest.approx(1.3 * stats.beta(6, 6).std())
-    np.testing.assert_array_equal(block.widened(100.0).alpha, 1.5)
+    np.testing.assert_array_equal(block.widen(100.0).alpha, 1.5)
 
 
 def test_normal_steps_stay_in_the_box_around_the_base_mean():
     block = NORMAL
     for _ in range(5):
-        block = block.moved(np.tile(MEAN + 3, (4, 1)), uniform_weights(4), 0.8)
+        block = block.project(np.tile(MEAN + 3, (4, 1)), uniform_weights(4), 0.8)
     np.testing.assert_allclose(np.abs(block.law.mean - MEAN).max(), 0.4)
     np.testing.assert_array_equal(block.law.cholesky, NORMAL.law.cholesky)
 
 
 def test_a_normal_step_inside_the_box_matches_the_mean():
-    moved = NORMAL.moved(np.tile(MEAN + 0.1, (4, 1)), uniform_weights(4), 0.5)
+    moved = NORMAL.project(np.tile(MEAN + 0.1, (4, 1)), uniform_weights(4), 0.5)
     np.testing.assert_allclose(moved.law.mean, MEAN + 0.05)
 
 
 def test_a_block_of_radius_0_stays():
-    moved = NormalBlock(NORMAL.law, radius=0.0).moved(np.ones((4, 3)), uniform_weights(4), 1.0)
+    moved = NormalBlock(NORMAL.law, radius=0.0).project(np.ones((4, 3)), uniform_weights(4), 1.0)
     np.testing.assert_array_equal(moved.law.mean, MEAN)
 
 
 def test_blocks_move_on_their_own(rng):
     x, weights = BASE.sample(50, rng), rng.dirichlet(np.ones(50), size=2)
-    moved = BASE.moved(x, weights, 0.7)
-    np.testing.assert_array_equal(moved.blocks[0].alpha, BETA.moved(x[:, :2], weights[0], 0.7).alpha)
-    np.testing.assert_array_equal(moved.blocks[1].law.mean, NORMAL.moved(x[:, 2:], weights[1], 0.7).law.mean)
+    moved = BASE.project(x, weights, 0.7)
+    np.testing.assert_array_equal(moved.blocks[0].alpha, BETA.project(x[:, :2], weights[0], 0.7).alpha)
+    np.testing.assert_array_equal(moved.blocks[1].law.mean, NORMAL.project(x[:, 2:], weights[1], 0.7).law.mean)
 
 
 def test_blocks_by_attributes_alone(rng):
@@ -145,7 +145,7 @@ def test_no_blocks():
 def test_mixture_splits_into_two_regions(rng):
     """Two clusters and a step alpha = 1: one component each, with the share and the mean of its cluster."""
     elite = rng.standard_normal((4000, 2)) * 0.3 + np.where(rng.random((4000, 1)) < 0.25, [3.0, 0.0], [-3.0, 1.0])
-    moved = MixtureBlock(Gaussian.standard(2), 2).moved(elite, uniform_weights(4000), 1.0)
+    moved = MixtureBlock(Gaussian.standard(2), 2).project(elite, uniform_weights(4000), 1.0)
     order = np.argsort(moved.mixture.weights)
     np.testing.assert_allclose(moved.mixture.weights[order], [0.25, 0.75], atol=0.03)
     means = np.array([moved.mixture.components[j].mean for j in order])
@@ -156,11 +156,11 @@ def test_mixture_splits_into_two_regions(rng):
 def test_mixture_steps_raise_the_objective_of_equation_2(rng):
     """alpha E_Q[log p] + (1 - alpha) E_P[log p], by draws; no pull worth mentioning at 20,000 points."""
     elite = rng.standard_normal((20_000, 2)) + np.where(rng.random((20_000, 1)) < 0.3, [3.0, 0.0], [0.0, 3.0])
-    block = MixtureBlock(Gaussian.standard(2), 3).moved(elite, uniform_weights(20_000), 0.5)
+    block = MixtureBlock(Gaussian.standard(2), 3).project(elite, uniform_weights(20_000), 0.5)
     other = elite * [1.0, 0.6]
     values = []
     draws = block.sample(20_000, rng)
-    for law in (block, block.moved(other, uniform_weights(20_000), 0.7)):
+    for law in (block, block.project(other, uniform_weights(20_000), 0.7)):
         values.append(0.7 * law.log_prob(other).mean() + 0.3 * law.log_prob(draws).mean())
     assert values[1] > values[0] + 0.01
 
@@ -168,7 +168,7 @@ def test_mixture_steps_raise_the_objective_of_equation_2(rng):
 def test_mixture_keeps_the_share_1_minus_alpha_of_the_present_law():
     """All of Q in one point: with alpha = 0.8 the mean of the new mixture is 0.8 of the way there."""
     elite = np.tile([2.0, 1.0], (50, 1))
-    block = MixtureBlock(Gaussian.standard(2), 3).moved(elite, uniform_weights(50), 0.8)
+    block = MixtureBlock(Gaussian.standard(2), 3).project(elite, uniform_weights(50), 0.8)
     mean = sum(w * c.mean for w, c in zip(block.mixture.weights, block.mixture.components, strict=True))
     np.testing.assert_allclose(mean, [1.6, 0.8])
     x = np.random.default_rng(1).standard_normal((100, 2))
@@ -178,6 +178,6 @@ def test_mixture_keeps_the_share_1_minus_alpha_of_the_present_law():
 
 def test_gaussian_block_is_pulled_towards_its_present_covariance():
     elite = np.tile([2.0, 1.0], (10, 1))
-    moved = GaussianBlock(Gaussian.standard(2)).moved(elite, uniform_weights(10), 1.0)
+    moved = GaussianBlock(Gaussian.standard(2)).project(elite, uniform_weights(10), 1.0)
     np.testing.assert_allclose(moved.law.mean, [2.0, 1.0])
     np.testing.assert_allclose(moved.law.covariance, 3 / 13 * np.eye(2), atol=1e-12)

@@ -6,12 +6,12 @@ import pytest
 from scipy import stats
 
 import samplers
-from samplers.importance.draws import Draws, bernstein_bound, doubts, interval_of, weighted_cov
-from samplers.importance.sampling import Space, defensive, draw
+from samplers.importance.draws import Draws, bernstein_bound, weight_warnings, weighted_cov, weighted_interval
+from samplers.importance.sampling import Space, defensive_mixture, simulate_draws
 from samplers.limit_states import four_branches, half_space, parabola, plateau, two_modes
 from samplers.method import Goal
 from samplers.methods.cross_entropy.blocks import GaussianBlock, NormalBlock, Product
-from samplers.methods.cross_entropy.method import at
+from samplers.methods.cross_entropy.method import value_at
 from samplers.methods.cross_entropy.search import Batch, Search
 from samplers.problem import FunctionProblem
 from samplers.proposals.gaussian import Gaussian
@@ -148,8 +148,8 @@ def test_sizes_and_steps_may_change_from_iteration_to_iteration():
     result = samplers.estimate(half_space().problem, method, seed=1)
     assert [level.n_sim for level in result.trace[:-1]] == [400] + [700] * (len(result.trace) - 2)
     assert json.loads(result.to_json())["method"]["settings"]["alpha"] == [1.0, 0.5]
-    assert [at((1.0, 0.5), k) for k in range(3)] == [1.0, 0.5, 0.5]
-    assert at(0.8, 7) == 0.8
+    assert [value_at((1.0, 0.5), k) for k in range(3)] == [1.0, 0.5, 0.5]
+    assert value_at(0.8, 7) == 0.8
 
 
 def test_no_wide_draws():
@@ -161,10 +161,10 @@ def test_a_step_of_the_search_matches_moments():
     """Equation 2 for a Gaussian: with alpha = 1 and many points the moments of the elite."""
     elite = np.random.default_rng(1).standard_normal((100_000, 2)) * [0.5, 1.0] + [2.0, 0.0]
     start, ratios = Product((GaussianBlock(Gaussian.standard(2)),)), np.zeros((1, len(elite)))
-    moved = CE()._moved(start, elite, ratios, 1.0).blocks[0].law
+    moved = CE()._project(start, elite, ratios, 1.0).blocks[0].law
     np.testing.assert_allclose(moved.mean, elite.mean(axis=0))
     np.testing.assert_allclose(moved.covariance, np.cov(elite.T), atol=1e-3)
-    half = CE()._moved(start, elite, ratios, 0.5).blocks[0].law
+    half = CE()._project(start, elite, ratios, 0.5).blocks[0].law
     np.testing.assert_allclose(half.mean, elite.mean(axis=0) / 2)
     # mixture of N(0, I) and the elite: mean of the variances plus a quarter of the shift squared
     np.testing.assert_allclose(np.diag(half.covariance), [0.625 + 1.0, 1.0], atol=0.02)
@@ -179,12 +179,12 @@ def test_a_step_of_the_search_uses_the_likelihood_ratio(rng):
     u = proposal.sample(200_000, rng)
     u = u[u[:, 0] > 2.0]
     log_ratios = (Gaussian.standard(2).log_prob(u) - proposal.log_prob(u))[None]
-    moved = CE()._moved(Product((GaussianBlock(proposal),)), u, log_ratios, 1.0)
+    moved = CE()._project(Product((GaussianBlock(proposal),)), u, log_ratios, 1.0)
     np.testing.assert_allclose(moved.blocks[0].law.mean, [stats.norm.pdf(2) / stats.norm.sf(2), 0.0], atol=0.02)
 
 
 def test_mean_family_keeps_the_covariance():
-    block = NormalBlock(Gaussian.standard(2)).moved(np.full((9, 2), 3.0), np.full(9, 1 / 9), 0.8)
+    block = NormalBlock(Gaussian.standard(2)).project(np.full((9, 2), 3.0), np.full(9, 1 / 9), 0.8)
     np.testing.assert_allclose(block.law.mean, 0.8 * 3.0)
     np.testing.assert_array_equal(block.law.covariance, np.eye(2))
 
@@ -226,8 +226,8 @@ def test_weights_of_the_final_draws_give_p(drive, rng):
     reference, far = half_space(2, 3.0), Gaussian(np.full(2, 2.2), np.eye(2))
     base = Product((GaussianBlock(Gaussian.standard(2)),))
     proposal = Product((GaussianBlock(far),))
-    sampler = defensive(base, proposal.widened(1.5), proposal, 0.1, 0.2)
-    draws = drive(draw(reference.problem, sampler, 0.0, 50_000, rng), reference.problem).value
+    sampler = defensive_mixture(base, proposal.widen(1.5), proposal, 0.1, 0.2)
+    draws = drive(simulate_draws(reference.problem, sampler, 0.0, 50_000, rng), reference.problem).value
     assert draws.p == pytest.approx(reference.p, rel=4 * draws.cov)
     assert np.exp(draws.log_weights).max() <= 10.0
     assert draws.cov < 0.02
@@ -235,11 +235,11 @@ def test_weights_of_the_final_draws_give_p(drive, rng):
 
 def test_warns_when_few_draws_carry_the_estimate():
     heavy = Draws(1000, np.zeros(3), np.array([0.0, 0.0, 3.0]))
-    assert len(doubts(heavy)) == 2
-    assert doubts(Draws(1000, np.zeros(500), np.zeros(500))) == []
-    light = interval_of(Draws(1000, np.zeros(500), np.full(500, -5.0)), 0.95, 10.0)
+    assert len(weight_warnings(heavy)) == 2
+    assert weight_warnings(Draws(1000, np.zeros(500), np.zeros(500))) == []
+    light = weighted_interval(Draws(1000, np.zeros(500), np.full(500, -5.0)), 0.95, 10.0)
     assert light[1] / light[0] < 1.3
-    wide = interval_of(heavy, 0.95, 10.0)
+    wide = weighted_interval(heavy, 0.95, 10.0)
     assert wide[1] / wide[0] > 10
 
 

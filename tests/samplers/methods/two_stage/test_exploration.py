@@ -8,11 +8,11 @@ from samplers.limit_states import four_branches, plateau, shell
 from samplers.methods.two_stage.exploration import (
     BISECTIONS,
     Sizes,
+    _bisect_towards_origin,
     _descend,
-    _drawn_in,
     _subsample,
+    find_regions,
     first_draws,
-    regions_of,
 )
 from samplers.methods.two_stage.regions import (
     MANY_REGIONS,
@@ -55,7 +55,7 @@ def explored(problem, seed=0, budget=6000):
     """Return the first draws, what was found and how many simulations that took."""
     rng, simulator, sizes = np.random.default_rng(seed), Simulator(problem), Sizes.within(budget)
     first = driven(first_draws(simulator, sizes, rng), problem)
-    found = driven(regions_of(simulator, first, 0.0, sizes, rng), problem)
+    found = driven(find_regions(simulator, first, 0.0, sizes, rng), problem)
     return first, found, simulator.n_sim
 
 
@@ -215,7 +215,7 @@ def test_points_are_drawn_in_along_their_rays_and_still_fail(rng):
     problem = half_spaces(3, 3.0)
     u = rng.normal(0.0, 3.0, (200, 3))
     u[:, 0] = rng.uniform(3.0, 12.0, 200)
-    near = driven(_drawn_in(Simulator(problem), u, 0.0), problem)
+    near = driven(_bisect_towards_origin(Simulator(problem), u, 0.0), problem)
     assert (near[:, 0] >= 3.0).all()
     ratio = near[:, 0] / u[:, 0]
     np.testing.assert_allclose(near, ratio[:, None] * u)

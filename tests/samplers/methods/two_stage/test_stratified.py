@@ -9,7 +9,13 @@ from samplers.methods.two_stage.mixture.proposal import ACCEPTANCE_DRAWS, Mixtur
 from samplers.methods.two_stage.simulator import ComponentDraws
 from samplers.methods.two_stage.stratified import MIN_STRATUM_DRAWS, StratifiedSample
 from samplers.problem import FunctionProblem
-from samplers.proposals.components import Bump, Slice, Wide, draw, draw_counts
+from samplers.proposals.components import (
+    HalfSpaceNormal,
+    IsotropicNormal,
+    SubspaceGaussian,
+    draw_components,
+    draw_counts,
+)
 
 BETA = 2.0
 P = stats.norm.sf(BETA)
@@ -17,18 +23,20 @@ PROBLEM = FunctionProblem(lambda u: BETA - u[:, 0], 1)
 
 
 def on_the_line(mean, variance):
-    return Bump(np.eye(1), np.array([mean]), np.array([variance]))
+    return SubspaceGaussian(np.eye(1), np.array([mean]), np.array([variance]))
 
 
 LAWS = [
-    (Wide(1), stats.norm(0, 1)),
+    (IsotropicNormal(1), stats.norm(0, 1)),
     (on_the_line(2.3, 0.5), stats.norm(2.3, math.sqrt(0.5))),
     (on_the_line(-2.0, 1.0), stats.norm(-2.0, 1.0)),  # wasted: stratified, it adds no variance
-    (Slice(np.ones(1), 1.5), stats.truncnorm(1.5, np.inf)),
+    (HalfSpaceNormal(np.ones(1), 1.5), stats.truncnorm(1.5, np.inf)),
 ]
 WEIGHTS = np.array([0.2, 0.3, 0.3, 0.2])
 PROPOSAL = MixtureProposal([ProposalComponent(component, "bump") for component, _ in LAWS], WEIGHTS)
-UNUSED = MixtureProposal([*PROPOSAL.candidates, ProposalComponent(Wide(1, 3.0), "wide")], np.append(WEIGHTS, 0.0))
+UNUSED = MixtureProposal(
+    [*PROPOSAL.candidates, ProposalComponent(IsotropicNormal(1, 3.0), "wide")], np.append(WEIGHTS, 0.0)
+)
 
 
 def mixture(x):
@@ -47,7 +55,7 @@ TOTAL = sum(a * moment(law, 2) for a, (_, law) in zip(WEIGHTS, LAWS, strict=True
 
 def batch(counts, rng, proposal=PROPOSAL):
     counts = np.asarray(counts)
-    u = draw(proposal.components, counts, rng)
+    u = draw_components(proposal.components, counts, rng)
     return ComponentDraws(proposal.components, counts, u, PROBLEM.evaluate(u))
 
 
@@ -180,8 +188,8 @@ def test_a_gate_thins_components_and_the_weights_account_for_it(rng):
 
 def test_base_and_wide_draws_pass_every_gate(rng):
     candidates = [
-        ProposalComponent(Wide(1), "base"),
-        ProposalComponent(Wide(1, 1.5), "wide"),
+        ProposalComponent(IsotropicNormal(1), "base"),
+        ProposalComponent(IsotropicNormal(1, 1.5), "wide"),
         ProposalComponent(LAWS[1][0], "bump"),
     ]
     proposal = MixtureProposal(candidates, np.array([0.2, 0.2, 0.6])).with_screen(screen, rng)

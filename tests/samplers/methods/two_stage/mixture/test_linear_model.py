@@ -11,7 +11,7 @@ from samplers.methods.two_stage.mixture.linear_model import (
     fit_plane,
     half_space_proposals,
 )
-from samplers.proposals.components import Bump, Slice
+from samplers.proposals.components import HalfSpaceNormal, SubspaceGaussian
 
 
 def unit(dim, seed=0):
@@ -160,8 +160,8 @@ def test_proposals_beyond_the_plane_of_a_half_space(dim, rng):
     xi = rng.standard_normal((400, dim))
     points = xi + (tail.rvs(400, random_state=rng) - xi @ axis)[:, None] * axis
     bump, cut = half_space_proposals(points, u, beta - u @ axis)
-    assert isinstance(bump, Bump)
-    assert isinstance(cut, Slice)
+    assert isinstance(bump, SubspaceGaussian)
+    assert isinstance(cut, HalfSpaceNormal)
     low, high = (tail.ppf(share) for share in (0.005, 0.08))  # the 3 % quantile of 400 points, 4 standard errors
     assert low - 0.05 < cut.start < high
     assert bump.mean[0] == pytest.approx(stats.truncnorm(cut.start + 0.02, np.inf).mean(), rel=0.01)
