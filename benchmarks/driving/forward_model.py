@@ -18,13 +18,13 @@ import typer
 from torch import Tensor
 
 from agents import read_driver
-from training.imitation.algorithms.critic import Critic, inputs, policy_cost
+from training.imitation.algorithms.critic import Critic, critic_inputs, policy_cost
 from training.imitation.algorithms.learner import Learner
-from training.imitation.algorithms.rollout import roll
-from training.imitation.datasets import Source, load
-from training.imitation.fit import CHECKPOINT, prepare
-from training.imitation.run_folder import DRIVER, read_settings
-from training.imitation.traffic.scene_pool import fresh_pool
+from training.imitation.algorithms.rollout import roll_out
+from training.imitation.datasets import Source, load_scenes
+from training.imitation.fit import CHECKPOINT, prepare_data
+from training.imitation.run_folder import DRIVER, read_training_settings
+from training.imitation.traffic.scene_pool import draw_pool
 
 HORIZONS = (5, 15, 30)
 """Ticks."""
@@ -33,8 +33,8 @@ COLUMNS = ("learned", "other noise", "no state", "length, learned / simulator")
 
 def trained_model(data: Path, run: Path, rounds: int) -> Learner:
     """The driver of a finished training, its critic, and a forward model that has learned from its rollouts."""
-    _, config = read_settings(run)
-    prepared = prepare(load(Source("data", data))[0])
+    _, config = read_training_settings(run)
+    prepared = prepare_data(load_scenes(Source("data", data))[0])
     policy = copy.deepcopy(read_driver(run / DRIVER).policy).requires_grad_(True)
     critic = Critic()
     critic.load_state_dict(torch.load(run / CHECKPOINT, weights_only=True)["critic"])
@@ -52,11 +52,11 @@ def gradient(learner: Learner, horizon: int, start: int, noise: int, learned: bo
     """Of the critic's cost with respect to all weights, flat."""
     config = learner.config
     chance = torch.Generator().manual_seed(start)
-    pool = fresh_pool(learner.recording, learner.among, config.scenes, 60, horizon, config.colour, chance)
+    pool = draw_pool(learner.recording, learner.among, config.scenes, 60, horizon, config.colour, chance)
     chance = torch.Generator().manual_seed(1000 + noise)
     model = learner.model if learned else None
-    steps, _ = roll(learner.recording, learner.policy, pool, horizon, config.colour, credit, chance, model)
-    cost = policy_cost(learner.critic, inputs(learner.policy, steps.features, steps.action)).mean()
+    steps, _ = roll_out(learner.recording, learner.policy, pool, horizon, config.colour, credit, chance, model)
+    cost = policy_cost(learner.critic, critic_inputs(learner.policy, steps.features, steps.action)).mean()
     return torch.cat([part.flatten() for part in torch.autograd.grad(cost, list(learner.policy.parameters()))])
 
 

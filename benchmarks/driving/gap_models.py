@@ -18,8 +18,8 @@ import typer
 import rare_envs
 from rare_envs.distributions.log_mixture import LogMixture
 from rare_envs.scenarios.registry import named
-from training.scenario_fitting.event_filters import RECIPES, filter_events, read_events
-from training.scenario_fitting.fit import us101_base
+from training.scenario_fitting.event_filters import EVENT_RECIPES, filter_events, read_events
+from training.scenario_fitting.fit import fit_us101_base
 
 GAPS = {"car_following": ("gap",), "cut_in": ("gap_ego_cutin", "gap_cutin_lead")}
 ENV_IDS = {"car_following": "rare_envs/CarFollowing-v0", "cut_in": "rare_envs/CutIn-v0"}
@@ -30,14 +30,14 @@ def main(data: Path, rollouts: int = 1_000_000, seed: int = 0) -> None:
     torch.set_num_threads(1)
     for scenario, gaps in GAPS.items():
         for logarithmic in ((), gaps):
-            recipe = replace(RECIPES[scenario], logarithmic=logarithmic)
+            recipe = replace(EVENT_RECIPES[scenario], logarithmic=logarithmic)
             (events, _), _ = filter_events(read_events(data / recipe.file, recipe), recipe, named(scenario).parameters)
             columns = [recipe.columns.index(gap) for gap in logarithmic]
             # the density of x is that of the standardised coordinates times the Jacobian of getting there
             jacobian = np.log(events[:, columns]).sum()
             events[:, columns] = np.log(events[:, columns])
             jacobian += len(events) * np.log(events.std(axis=0)).sum()
-            text = us101_base(scenario, data, recipe=recipe)
+            text = fit_us101_base(scenario, data, recipe=recipe)
             content = json.loads(text)
             best = min(c["bic"] for c in content["provenance"]["selection"] if c["accepted"])
             with tempfile.NamedTemporaryFile("w", suffix=".json") as file:

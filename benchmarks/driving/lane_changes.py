@@ -26,11 +26,11 @@ from benchmarks.driving.realism import named, rounded
 from benchmarks.estimators.runs import about
 from rare_envs.sensors.perception import FEATURES, HEADING, SPEED
 from training.data.trajectories import DT
-from training.imitation.algorithms.expert_pairs import Pairs, expert_pairs
-from training.imitation.datasets import Source, load
-from training.imitation.evaluation.behaviour import Act, drive, sampled
-from training.imitation.traffic.recording import Recording, stack
-from training.imitation.traffic.replayed_traffic import lane_of, start
+from training.imitation.algorithms.expert_pairs import Pairs, collect_pairs
+from training.imitation.datasets import Source, load_scenes
+from training.imitation.evaluation.behaviour import Act, drive_traffic, sampling_driver
+from training.imitation.traffic.recording import Recording, stack_scenes
+from training.imitation.traffic.replayed_traffic import lane_of, start_replay
 
 BEFORE = (0.5, 1.0, 1.5, 2.0, 3.0)
 """Seconds before the crossing at which drivers take over."""
@@ -79,7 +79,7 @@ def completed(recording: Recording, crossings: Crossings, act: Act, seconds: flo
     """How many changes can be taken up some seconds before the crossing, and the share that the driver completes."""
     lead = round(seconds / DT)
     scene, tick, vehicle, side = (column[crossings.tick >= lead] for column in crossings)
-    traffic = start(recording, scene, tick - lead)
+    traffic = start_replay(recording, scene, tick - lead)
     chosen = traffic.driven & (traffic.vehicle == vehicle[:, None])
     rows = chosen.any(dim=1)  # the others have nobody ahead in their lane, and are replayed
     traffic = type(traffic)(*(field[rows] for field in traffic))
@@ -87,7 +87,7 @@ def completed(recording: Recording, crossings: Crossings, act: Act, seconds: flo
     first = lane_of(traffic.y, traffic.edges)[row, at]
     crossed = torch.zeros(len(row), dtype=torch.bool)
     with torch.inference_mode():
-        for moment in drive(recording, traffic, act, lead + round(AFTER / DT)):
+        for moment in drive_traffic(recording, traffic, act, lead + round(AFTER / DT)):
             now = lane_of(moment.traffic.y, moment.traffic.edges)[row, at]
             crossed |= (now - first) * side[rows] > 0
     return len(row), float(crossed.float().mean())
@@ -118,7 +118,7 @@ def report(recording: Recording, drivers: dict[str, LearnedDriver], noises: int)
         row: dict[str, float] = {}
         for name, driver in drivers.items():
             runs = [
-                completed(recording, crossings, sampled(driver, torch.Generator().manual_seed(seed)), seconds)
+                completed(recording, crossings, sampling_driver(driver, torch.Generator().manual_seed(seed)), seconds)
                 for seed in range(noises)
             ]
             row["changes"], row[name] = runs[0][0], float(np.mean([share for _, share in runs]))
@@ -126,7 +126,7 @@ def report(recording: Recording, drivers: dict[str, LearnedDriver], noises: int)
     return {
         "crossings": len(crossings.scene),
         "under_way": under_way,
-        "steering": steering(expert_pairs(recording), drivers),
+        "steering": steering(collect_pairs(recording), drivers),
     }
 
 
@@ -138,8 +138,8 @@ def main(
 ) -> None:
     """Measure on all scenes, those that the drivers learned from included: changes are few."""
     torch.set_num_threads(1)
-    learn, test = load(Source("data", data))
-    found = rounded(report(stack([*learn, *test]), named(drivers or ["mgail", "gail", "bc"]), noises))
+    learn, test = load_scenes(Source("data", data))
+    found = rounded(report(stack_scenes([*learn, *test]), named(drivers or ["mgail", "gail", "bc"]), noises))
     print(json.dumps(found, indent=1))
     if out is not None:
         out.write_text(json.dumps({"about": about(torch=torch.__version__), **found}, indent=1) + "\n", "utf-8")

@@ -30,12 +30,12 @@ from agents.learned.rule_driver import RuleDriver
 from benchmarks.driving.realism_figures import draw, tables
 from benchmarks.driving.realism_rows import Effort, Judge, accuracy, boxes, drawn, noisy, on_highway, people
 from benchmarks.estimators.runs import about
-from training.imitation.algorithms.expert_pairs import expert_pairs
-from training.imitation.datasets import Source, load
+from training.imitation.algorithms.expert_pairs import collect_pairs
+from training.imitation.datasets import Source, load_scenes
 from training.imitation.evaluation.behaviour import Act
 from training.imitation.evaluation.driving_statistics import BINS
-from training.imitation.evaluation.realism import recorded_tally
-from training.imitation.traffic.recording import Recording, stack
+from training.imitation.evaluation.realism import record_statistics
+from training.imitation.traffic.recording import Recording, stack_scenes
 
 
 def constant_velocity(features: Tensor, memory: Tensor | None) -> tuple[Tensor, Tensor | None]:
@@ -64,8 +64,8 @@ def report(
         effort: How much is simulated.
         say: Told what is being measured.
     """
-    judge = Judge(test, recorded_tally(test), effort)
-    features = expert_pairs(test).features
+    judge = Judge(test, record_statistics(test), effort)
+    features = collect_pairs(test).features
     rules: dict[str, Act] = {"constant velocity": constant_velocity, "IDM, lane keeping": by_rule}
     rows = [people(train, judge)]
     errors, highways = {}, []
@@ -116,7 +116,7 @@ def main(
     torch.set_num_threads(1)
     begun = time.perf_counter()
     effort = replace(Effort(), noises=noises, draws=draws, rollouts=rollouts)
-    train, test = (stack(scenes) for scenes in load(Source("data", data)))
+    train, test = (stack_scenes(scenes) for scenes in load_scenes(Source("data", data)))
     chosen = named(drivers or ["mgail", "gail", "bc"])
     found = report(
         train, test, chosen, effort, lambda text: print(f"{time.perf_counter() - begun:5.0f} s  {text}", flush=True)

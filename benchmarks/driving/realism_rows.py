@@ -14,10 +14,15 @@ from agents import LearnedDriver
 from agents.learned.networks import ACTION_SIZE, HIDDEN_SIZES
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
 from training.data.ngsim_tables import US101_EDGES
-from training.imitation.evaluation.behaviour import Act, behaviour_of, drive, sampled
-from training.imitation.evaluation.driving_statistics import BINS, Tally, tally, together
-from training.imitation.evaluation.prediction_error import Errors, replayed_errors, segments
-from training.imitation.evaluation.realism import recorded_tally, standard_errors, summary, tallies
+from training.imitation.evaluation.behaviour import Act, behaviour_of, drive_traffic, sampling_driver
+from training.imitation.evaluation.driving_statistics import BINS, DrivingStatistics, add_statistics, sum_by_scene
+from training.imitation.evaluation.prediction_error import Errors, draw_segments, prediction_errors
+from training.imitation.evaluation.realism import (
+    collect_statistics,
+    record_statistics,
+    standard_errors,
+    summarise_realism,
+)
 from training.imitation.traffic.recording import Recording
 from training.imitation.traffic.replayed_traffic import Traffic
 
@@ -48,7 +53,7 @@ class Judge:
     """Measures drivers against people."""
 
     test: Recording
-    recorded: Tally
+    recorded: DrivingStatistics
     """Of the test scenes."""
     effort: Effort
 
@@ -62,20 +67,20 @@ class Judge:
             seconds: Times [s], the longest last; None for `SECONDS`.
         """
         seconds = SECONDS if seconds is None else seconds
-        runs = [tallies(self.test, act, tuple(seconds)) for act in acts]
+        runs = [collect_statistics(self.test, act, tuple(seconds)) for act in acts]
         return {"name": name, "kind": kind, **self.figures({time: [run[time] for run in runs] for time in seconds})}
 
-    def figures(self, runs: dict[float, list[Tally]]) -> dict[str, Any]:
+    def figures(self, runs: dict[float, list[DrivingStatistics]]) -> dict[str, Any]:
         """Values and standard errors of several runs together, and the collision rate of each."""
         out: dict[str, Any] = {}
         for seconds, parts in runs.items():
-            whole = together(parts)
+            whole = add_statistics(parts)
             out[f"{seconds:g} s"] = {
-                **asdict(summary(whole, self.recorded)),
+                **asdict(summarise_realism(whole, self.recorded)),
                 "standard_error": asdict(standard_errors(whole, self.recorded, np.random.default_rng(0))),
-                "collisions": [summary(part, self.recorded).collision for part in parts],
+                "collisions": [summarise_realism(part, self.recorded).collision for part in parts],
             }
-        whole = together(runs[SECONDS[0]])
+        whole = add_statistics(runs[SECONDS[0]])
         out["shares"] = {
             name: (whole.counts[name].sum(0) / max(whole.counts[name].sum(), 1.0)).tolist() for name in BINS
         }
@@ -84,16 +89,16 @@ class Judge:
 
 def noisy(driver: LearnedDriver, number: int, weights: Tensor | None = None) -> list[Act]:
     """A driver with several sequences of noise."""
-    return [sampled(driver, torch.Generator().manual_seed(seed), weights) for seed in range(number)]
+    return [sampling_driver(driver, torch.Generator().manual_seed(seed), weights) for seed in range(number)]
 
 
 def people(train: Recording, judge: Judge) -> dict[str, Any]:
     """The record's own rates; divergences between its training and its test scenes."""
-    learned = recorded_tally(train)
+    learned = record_statistics(train)
     row = {"name": "people", "kind": "reference", **judge.figures({time: [judge.recorded] for time in SECONDS})}
     for seconds in SECONDS:
-        row[f"{seconds:g} s"]["divergence"] = summary(learned, judge.recorded).divergence
-        row[f"{seconds:g} s"]["hard_brake_in_training_scenes"] = summary(learned, judge.recorded).hard_brake
+        row[f"{seconds:g} s"]["divergence"] = summarise_realism(learned, judge.recorded).divergence
+        row[f"{seconds:g} s"]["hard_brake_in_training_scenes"] = summarise_realism(learned, judge.recorded).hard_brake
     return row
 
 
@@ -141,8 +146,8 @@ def boxes(name: str, driver: LearnedDriver, features: Tensor, judge: Judge) -> R
 
 def accuracy(test: Recording, act: Act, effort: Effort, rollouts: int | None = None) -> dict[str, dict[str, float]]:
     """Root mean square errors with one vehicle driven and the others replayed, by seconds."""
-    chosen = segments(test, 2.0, effort.each, torch.Generator().manual_seed(0))
-    found = replayed_errors(test, act, chosen, effort.rollouts if rollouts is None else rollouts)
+    chosen = draw_segments(test, 2.0, effort.each, torch.Generator().manual_seed(0))
+    found = prediction_errors(test, act, chosen, effort.rollouts if rollouts is None else rollouts)
     return {f"{seconds:g}": _rmse(errors, len(test.x)) for seconds, errors in found.items() if len(errors.scene)}
 
 
@@ -187,11 +192,11 @@ def on_highway(name: str, act: Act, judge: Judge) -> dict[str, Any]:
     """Behaviour at O'Kelly et al.'s starting speeds; divergences are from the people of US 101."""
     start = highway(judge.effort.highway)
     with torch.inference_mode():
-        whole = behaviour_of(drive(None, start, act, round(SECONDS[-1] / 0.1)))
+        whole = behaviour_of(drive_traffic(None, start, act, round(SECONDS[-1] / 0.1)))
     runs = {}
     for seconds in SECONDS:
         part = type(whole)(whole.scene, *(column[: round(seconds / 0.1)] for column in whole[1:]))
-        runs[seconds] = [tally(part, judge.effort.highway)]
+        runs[seconds] = [sum_by_scene(part, judge.effort.highway)]
     last = whole.speed[-1].double()
     figures = judge.figures(runs)
     del figures["shares"]

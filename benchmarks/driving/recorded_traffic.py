@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import typer
 
-from training.data.scenes import load_us101_scenes, split
+from training.data.scenes import load_us101_scenes, split_by_clock
 from training.data.trajectories import DT
 
 CUTOFFS = ((5.0, 5.0), (1.0, 1.0), (0.5, 0.5), (0.4, 0.35), (0.35, 0.25), (0.25, 0.2))
@@ -32,7 +32,7 @@ def main(data: Path) -> None:
         yaw_rate = np.concatenate([scene.yaw_rate[mask] for scene, mask in zip(scenes, chosen, strict=True)])
         share, jerk = (a <= HARD_BRAKE).mean(), np.concatenate(jerks).std()
         typer.echo(f"{along:g}/{across:g}  {a.std():.2f}  {share:.4f}  {jerk:.2f}  {yaw_rate.std():.3f}")
-    for name, scenes in zip(("train", "test"), split(load_us101_scenes(data)), strict=True):
+    for name, scenes in zip(("train", "test"), split_by_clock(load_us101_scenes(data)), strict=True):
         chosen = [scene.acted & ~scene.leads_lane() for scene in scenes]
         speed = np.concatenate([scene.speed[mask] for scene, mask in zip(scenes, chosen, strict=True)])
         steps = sum(int(scene.acted.sum()) for scene in scenes)

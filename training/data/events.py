@@ -14,33 +14,33 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from pyarrow import csv
 
+from samplers.problem import FloatArray
 from training.data.trajectories import DT, Trajectories
 
-Array = NDArray[np.float64]
 Events = dict[str, NDArray[Any]]
 
-SEEN = 20
+MIN_PAIR_FRAMES = 20
 """Frames a pair of ego and leader is seen in one lane for, at least: 2 s."""
-SETTLED = 8
+MIN_LANE_FRAMES = 8
 """Frames in one lane on either side of a lane change, at least: 0.8 s."""
 LATERAL_SPAN = 5
 """Frames over which the lateral speed is measured: 0.5 s."""
 LATERAL_SPEED = 0.2
 """A lane change has begun when the speed across exceeds this [m/s]."""
 
-CAR_FOLLOWING = ("recording", "frame", "lane", "ego", "lead", "v_ego", "v_lead", "gap", "a_ego", "a_lead", "n")
-CUT_IN = (
+CAR_FOLLOWING_COLUMNS = ("recording", "frame", "lane", "ego", "lead", "v_ego", "v_lead", "gap", "a_ego", "a_lead", "n")
+CUT_IN_COLUMNS = (
     *("recording", "frame", "phase", "vehicle", "from_lane", "to_lane", "start_seen", "v_cutin", "lateral_speed"),
     *("ego", "v_ego", "gap_ego_cutin", "lateral_offset", "lead", "v_lead", "gap_cutin_lead"),
 )
 
 
 def car_following_events(trajectories: Trajectories) -> Events:
-    """The first frame of each pair of ego and leader that is seen in one lane for `SEEN` frames or more.
+    """The first frame of each pair of ego and leader that is seen in one lane for `MIN_PAIR_FRAMES` frames or more.
 
     Returns:
-        Columns of `CAR_FOLLOWING`, each of shape (events,): speeds [m/s], accelerations [m/s^2], `gap` bumper to
-        bumper [m], `n` frames the pair was seen for. In the order of the table: by ego, then by time.
+        The columns `CAR_FOLLOWING_COLUMNS`, each of shape (events,): speeds [m/s], accelerations [m/s^2], `gap` from
+        bumper to bumper [m], `n` frames the pair was seen for. In the order of the table: by ego, then by time.
     """
     t = trajectories
     leader = t.find(t.leader)
@@ -49,7 +49,7 @@ def car_following_events(trajectories: Trajectories) -> Events:
     recording = np.unique(t.recording, return_inverse=True)[1].ravel()
     pairs = np.column_stack([recording[rows], t.vehicle[rows], t.leader[rows]])
     _, first, n = np.unique(pairs, axis=0, return_index=True, return_counts=True)
-    seen = n >= SEEN
+    seen = n >= MIN_PAIR_FRAMES
     order = np.argsort(first[seen])
     ego, n = rows[first[seen][order]], n[seen][order]
     lead = leader[ego]
@@ -61,35 +61,35 @@ def car_following_events(trajectories: Trajectories) -> Events:
         "lead": t.vehicle[lead],
         "v_ego": t.speed[ego],
         "v_lead": t.speed[lead],
-        "gap": gap(t, ego, lead),
+        "gap": bumper_gaps(t, ego, lead),
         "a_ego": t.acceleration[ego],
         "a_lead": t.acceleration[lead],
         "n": n,
     }
 
 
-def gap(trajectories: Trajectories, behind: NDArray[np.int64], before: NDArray[np.int64]) -> Array:
+def bumper_gaps(trajectories: Trajectories, behind: NDArray[np.int64], before: NDArray[np.int64]) -> FloatArray:
     """Bumper to bumper distance between rows [m]; NaN where a row is -1."""
     t = trajectories
     value = t.x[before] - t.x[behind] - 0.5 * (t.length[before] + t.length[behind])
     return np.where((behind >= 0) & (before >= 0), value, np.nan)
 
 
-def lane_changes(trajectories: Trajectories) -> NDArray[np.int64]:
-    """Rows that are the first in a neighbouring lane, `SETTLED` frames or more in one lane on either side."""
+def find_lane_changes(trajectories: Trajectories) -> NDArray[np.int64]:
+    """Rows that are the first in a neighbouring lane, `MIN_LANE_FRAMES` frames or more in one lane on either side."""
     t = trajectories
     new_track = np.zeros(len(t), dtype=bool)
     new_track[t.breaks()] = True
     runs = np.flatnonzero(new_track | np.append(True, np.diff(t.lane) != 0))
     length = np.diff(np.append(runs, len(t)))
-    settled = (length[1:] >= SETTLED) & (length[:-1] >= SETTLED)
+    settled = (length[1:] >= MIN_LANE_FRAMES) & (length[:-1] >= MIN_LANE_FRAMES)
     lane, before = t.lane[runs[1:]], t.lane[runs[:-1]]
     neighbours = (np.abs(lane - before) == 1) & (lane > 0) & (before > 0)
     crossings: NDArray[np.int64] = runs[1:][settled & neighbours & ~new_track[runs[1:]]]
     return crossings
 
 
-def start_of(trajectories: Trajectories, crossing: int, first: int) -> tuple[int, bool]:
+def find_start(trajectories: Trajectories, crossing: int, first: int) -> tuple[int, bool]:
     """Where the lane change that crosses at a row began, and whether that was seen.
 
     Walking back from the crossing: the last row before the speed towards the new lane, over the `LATERAL_SPAN`
@@ -109,20 +109,20 @@ def cut_in_events(trajectories: Trajectories) -> Events:
     """Lane changes, each at its start and at its crossing, between the vehicles they cut in between.
 
     Returns:
-        Columns of `CUT_IN`, each of shape (2 changes,): ego is the nearest vehicle behind in the new lane, lead the
-        nearest ahead in it, -1 and NaN where there is none; gaps bumper to bumper (negative: side by side) and the
-        lateral offset from ego [m]; `lateral_speed` towards the new lane over 0.8 s around the crossing [m/s].
+        The columns `CUT_IN_COLUMNS`, each of shape (2 changes,): ego is the nearest vehicle behind in the new lane,
+        lead the nearest ahead in it, -1 and NaN where there is none; gaps bumper to bumper (negative: side by side) and
+        the lateral offset from ego [m]; `lateral_speed` towards the new lane over 0.8 s around the crossing [m/s].
     """
     t = trajectories
     breaks = t.breaks()
-    crossings = lane_changes(t)
+    crossings = find_lane_changes(t)
     firsts = breaks[np.searchsorted(breaks, crossings, side="right") - 1]
-    starts = [start_of(t, int(c), int(first)) for c, first in zip(crossings, firsts, strict=True)]
+    starts = [find_start(t, int(c), int(first)) for c, first in zip(crossings, firsts, strict=True)]
     rows = np.column_stack([crossings, [row for row, _ in starts]]).ravel().astype(np.int64)
     change = np.repeat(crossings, 2)
-    ego, lead = _neighbours(t, rows, t.lane[change])
+    ego, lead = _find_neighbours(t, rows, t.lane[change])
     side = np.sign(t.lane[change] - t.lane[change - 1])
-    reach = SETTLED // 2
+    reach = MIN_LANE_FRAMES // 2
     return {
         "recording": t.recording[rows],
         "frame": t.frame[rows],
@@ -137,15 +137,15 @@ def cut_in_events(trajectories: Trajectories) -> Events:
         else t.y[:0],
         "ego": np.where(ego >= 0, t.vehicle[ego], -1),
         "v_ego": np.where(ego >= 0, t.speed[ego], np.nan),
-        "gap_ego_cutin": gap(t, ego, rows),
+        "gap_ego_cutin": bumper_gaps(t, ego, rows),
         "lateral_offset": np.where(ego >= 0, np.abs(t.y[rows] - t.y[ego]), np.nan),
         "lead": np.where(lead >= 0, t.vehicle[lead], -1),
         "v_lead": np.where(lead >= 0, t.speed[lead], np.nan),
-        "gap_cutin_lead": gap(t, rows, lead),
+        "gap_cutin_lead": bumper_gaps(t, rows, lead),
     }
 
 
-def _neighbours(
+def _find_neighbours(
     t: Trajectories, rows: NDArray[np.int64], lane: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Rows of the nearest vehicles behind and ahead in a lane, by their fronts, at the frames of rows; -1: none."""
@@ -170,7 +170,7 @@ EXTRACTORS = {"car_following": car_following_events, "cut_in": cut_in_events}
 """Events that `training.scenario_fitting.fit` fits a scenario to."""
 
 
-def pooled(parts: Sequence[Events]) -> Events:
+def concatenate_events(parts: Sequence[Events]) -> Events:
     """Events of several tables as one."""
     if not parts:
         raise ValueError("There are no events to pool: no recording was given.")

@@ -15,10 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from samplers.problem import FloatArray
 from training.data.text_columns import Gaps, Rows, check_lengths, check_tracks, read_numbers
 from training.data.trajectories import DT, NOBODY, Trajectories, tabulate
-
-Array = NDArray[np.float64]
 
 TRACK_NAMES = {
     "frame": ("frame",),
@@ -93,7 +92,7 @@ def load_highd(folder: Path | str, recording: str, *, gaps: Gaps = "error") -> T
     return tabulate(table, {name: edges[name] for name in sorted(present)})
 
 
-def lanes_of(y: Array, edges: tuple[float, ...]) -> NDArray[np.int64]:
+def lanes_of(y: FloatArray, edges: tuple[float, ...]) -> NDArray[np.int64]:
     """Lane of each position, 1 the leftmost, 0 outside."""
     lane = np.searchsorted(np.array(edges), y, side="right")
     return np.where(lane < len(edges), lane, 0)
@@ -137,12 +136,17 @@ def _direction_of(rows: Rows, directions: dict[int, int]) -> NDArray[np.int64]:
 
 
 def _resample(
-    vehicle: Array, time: Array, dt: float, values: Array, leader: Array, direction: NDArray[np.int64]
-) -> dict[str, Array]:
+    vehicle: FloatArray,
+    time: FloatArray,
+    dt: float,
+    values: FloatArray,
+    leader: FloatArray,
+    direction: NDArray[np.int64],
+) -> dict[str, FloatArray]:
     """Tracks at multiples of `DT`, cut at their holes; `values` in the order of the names below."""
     order = np.lexsort([time, vehicle])
     cuts = 1 + np.flatnonzero((np.diff(vehicle[order]) != 0) | (np.diff(time[order]) > 1.5 * dt))
-    parts: list[Array] = []
+    parts: list[FloatArray] = []
     for piece in np.split(order, cuts):
         t = time[piece]
         frame = np.arange(np.ceil(t[0] / DT - 1e-6), np.floor(t[-1] / DT + 1e-6) + 1.0)

@@ -13,19 +13,18 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from training.data.text_columns import Gaps, Rows, check_lengths, check_tracks, header_of, read_numbers
+from samplers.problem import FloatArray
+from training.data.text_columns import Gaps, Rows, check_lengths, check_tracks, read_header, read_numbers
 from training.data.trajectories import NOBODY, Trajectories, tabulate
-
-Array = NDArray[np.float64]
 
 FOOT = 0.3048
 STEP = 100.0
 """Time between frames [ms]."""
 PAUSE = 60_000.0
 """A number that comes back after so long [ms] belongs to another vehicle: each 15 minutes were numbered anew."""
-RENUMBERED = 1_000_000
+RENUMBER_OFFSET = 1_000_000
 """Added to the number of such a vehicle, once for each time it comes back."""
-NAMES = {
+COLUMN_NAMES = {
     "vehicle": ("Vehicle_ID",),
     "time": ("Global_Time",),
     "x_lateral": ("Local_X",),
@@ -52,7 +51,7 @@ def load_ngsim(path: Path | str, *, location: str | None = None, gaps: Gaps = "e
         gaps: Where a vehicle is missing for some frames: "error", or "cut" its track there.
 
     Returns:
-        The table, with lane boundaries estimated by `lane_edges`.
+        The table, with lane boundaries estimated by `estimate_lane_edges`.
 
     Raises:
         ValueError: The file cannot be read, lacks a column, holds impossible values, or has several locations.
@@ -61,21 +60,21 @@ def load_ngsim(path: Path | str, *, location: str | None = None, gaps: Gaps = "e
     if LOCATION not in rows.columns:
         if location is not None:
             raise ValueError(f"{path} has no column {LOCATION}; leave location out.")
-        return _table(rows, Path(path).stem, gaps)
+        return _to_table(rows, Path(path).stem, gaps)
     places = sorted({str(place) for place in rows[LOCATION]})
     if location is None and len(places) > 1:
         raise ValueError(f"{path} has the locations {', '.join(places)}; choose one with location=.")
     if location is not None and location not in places:
         raise ValueError(f"{path} has the locations {', '.join(places)}, not {location}.")
     location = location or places[0]
-    return _table(rows.where(rows[LOCATION] == location), location, gaps)
+    return _to_table(rows.where(rows[LOCATION] == location), location, gaps)
 
 
 def _read(path: Path) -> Rows:
-    header = header_of(path)
+    header = read_header(path)
     if any(character.isalpha() for character in header[0]):
         located = any(name.lower() == LOCATION.lower() for name in header)
-        names = NAMES | ({LOCATION: (LOCATION,)} if located else {})
+        names = COLUMN_NAMES | ({LOCATION: (LOCATION,)} if located else {})
         return read_numbers(path, names, text=(LOCATION,))
     try:
         values = np.loadtxt(path, ndmin=2, delimiter="," if len(header) > 1 else None)
@@ -83,16 +82,16 @@ def _read(path: Path) -> Rows:
         raise ValueError(f"Cannot read {path}: {error}") from None
     if values.shape[1] != _TEXT_COLUMNS:
         raise ValueError(f"{path} has no header and {values.shape[1]} columns; expected the {_TEXT_COLUMNS} of NGSIM.")
-    columns = {name: values[:, place] for name, place in zip(NAMES, _TEXT_ORDER, strict=True)}
+    columns = {name: values[:, place] for name, place in zip(COLUMN_NAMES, _TEXT_ORDER, strict=True)}
     return Rows(path, columns, np.arange(1, 1 + len(values)))
 
 
-def _table(rows: Rows, recording: str, gaps: Gaps) -> Trajectories:
+def _to_table(rows: Rows, recording: str, gaps: Gaps) -> Trajectories:
     """Feet and milliseconds become SI units, fronts become centres."""
     frame = np.rint(rows["time"] / STEP)
     length, y_along, speed = (FOOT * rows[name] for name in ("length", "y_along", "speed"))
     check_lengths(rows, length, "feet")
-    vehicle, leader = _renumbered(rows["vehicle"], rows["leader"], frame)
+    vehicle, leader = _renumber(rows["vehicle"], rows["leader"], frame)
     check_tracks(rows, vehicle, frame, y_along, speed, STEP / 1000.0, gaps)
     y, lane = FOOT * rows["x_lateral"], rows["lane"].astype(np.int64)
     columns = {
@@ -108,11 +107,11 @@ def _table(rows: Rows, recording: str, gaps: Gaps) -> Trajectories:
         "lane": lane,
         "leader": leader,
     }
-    edges = lane_edges(y, lane)
+    edges = estimate_lane_edges(y, lane)
     return tabulate(columns, {recording: edges} if edges else {})
 
 
-def _renumbered(vehicle: Array, leader: Array, frame: Array) -> tuple[Array, Array]:
+def _renumber(vehicle: FloatArray, leader: FloatArray, frame: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Numbers of vehicles and leaders, with new ones for numbers that were given again after a `PAUSE`."""
     order = np.lexsort([frame, vehicle])
     fresh = np.append(True, np.diff(vehicle[order]) != 0)
@@ -120,7 +119,7 @@ def _renumbered(vehicle: Array, leader: Array, frame: Array) -> tuple[Array, Arr
     times = np.cumsum(again)
     since = np.maximum.accumulate(np.where(fresh, np.arange(len(times)), 0))
     number = np.empty(len(vehicle))
-    number[order] = vehicle[order] + RENUMBERED * (times - times[since])
+    number[order] = vehicle[order] + RENUMBER_OFFSET * (times - times[since])
     unled = leader <= 0
     if not again.any():
         return number, np.where(unled, NOBODY, leader)
@@ -131,7 +130,7 @@ def _renumbered(vehicle: Array, leader: Array, frame: Array) -> tuple[Array, Arr
     return number, np.where(known, number[order][place], NOBODY)
 
 
-def lane_edges(y: Array, lane: NDArray[np.int64]) -> tuple[float, ...]:
+def estimate_lane_edges(y: FloatArray, lane: NDArray[np.int64]) -> tuple[float, ...]:
     """Lane boundaries where the format has none: halfway between the median positions of neighbouring lanes.
 
     The outer lanes get the width of the space to their neighbours. Lanes count from 1 as long as each lies 2.5 to

@@ -13,18 +13,16 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 from pyarrow import ArrowInvalid
 
-from training.data.trajectories import NOBODY, Trajectories, ahead, tabulate
+from training.data.trajectories import NOBODY, Trajectories, find_leaders, tabulate
 
-Array = NDArray[np.float64]
-
-SCENES = "ngsim_us101_scenes.parquet"
-VEHICLES = "ngsim_us101_vehicles.parquet"
-PAIRS = "ngsim_i80_pairs.parquet"
+SCENES_FILE = "ngsim_us101_scenes.parquet"
+VEHICLES_FILE = "ngsim_us101_vehicles.parquet"
+PAIRS_FILE = "ngsim_i80_pairs.parquet"
 US101_EDGES = (0.0, 3.49, 6.87, 10.20, 13.52, 17.25, 21.0)
 """Lane boundaries of US 101 [m], measured from the left edge of the road; lane 6 is the weaving lane."""
 
 
-def columns_of(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
+def read_columns(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
     """Columns of a parquet file.
 
     Raises:
@@ -45,7 +43,7 @@ def columns_of(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
     return {name: table[name].to_numpy() for name in names}
 
 
-def us101_scenes(folder: Path | str, merged: bool = True) -> Trajectories:
+def load_us101_trajectories(folder: Path | str, merged: bool = True) -> Trajectories:
     """The scenes of US 101, without scene 1, whose clock is unknown.
 
     Args:
@@ -54,15 +52,15 @@ def us101_scenes(folder: Path | str, merged: bool = True) -> Trajectories:
             recording of its own and copies stay.
     """
     names = ("scene", "vehicle", "epoch_ms", "y_along", "d", "speed", "accel", "length", "width", "lane")
-    rows = columns_of(Path(folder) / SCENES, names)
+    rows = read_columns(Path(folder) / SCENES_FILE, names)
     rows = {name: values[rows["scene"] != 1] for name, values in rows.items()}
     if merged:
-        rows = _averaged(rows)
+        rows = _average_copies(rows)
         recording = np.full(len(rows["vehicle"]), "us101")
     else:
         recording = np.char.add("us101-", np.char.zfill(rows["scene"].astype(np.str_), 2))
     frame, x = rows["epoch_ms"] // 100, rows["y_along"] - 0.5 * rows["length"]
-    lead = ahead(frame, rows["lane"], rows["y_along"], recording)
+    lead = find_leaders(frame, rows["lane"], rows["y_along"], recording)
     columns = {
         "recording": recording,
         "vehicle": rows["vehicle"],
@@ -79,7 +77,7 @@ def us101_scenes(folder: Path | str, merged: bool = True) -> Trajectories:
     return tabulate(columns, dict.fromkeys(np.unique(recording).tolist(), US101_EDGES))
 
 
-def _averaged(rows: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+def _average_copies(rows: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     keys = np.column_stack([rows["vehicle"], rows["epoch_ms"]])
     _, first, copy = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     count = np.bincount(copy.ravel())
@@ -89,10 +87,10 @@ def _averaged(rows: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     }
 
 
-def us101_vehicles(folder: Path | str) -> Trajectories:
+def load_us101_vehicles(folder: Path | str) -> Trajectories:
     """Single vehicles of US 101 over their whole passage: no lanes, no leaders, no sizes; x is the front."""
     names = ("vehicle", "epoch_ms", "x_lateral", "y_along", "speed", "accel")
-    rows = columns_of(Path(folder) / VEHICLES, names)
+    rows = read_columns(Path(folder) / VEHICLES_FILE, names)
     frame = rows["epoch_ms"] // 100
     columns = {
         "recording": "us101",
@@ -110,14 +108,14 @@ def us101_vehicles(folder: Path | str) -> Trajectories:
     return tabulate(columns)
 
 
-def i80_pairs(folder: Path | str) -> Trajectories:
+def load_i80_pairs(folder: Path | str) -> Trajectories:
     """Followers and leaders of I-80, as filtered by their author; use with care near the ends of a track.
 
     A leader's y and width are unknown unless it is recorded as a follower too.
     """
     own = ("vehicle", "leader", "frame", "lane", "x_lateral", "y_along", "speed", "accel", "length")
     lead = ("leader_y_along", "leader_speed", "leader_accel", "leader_length")
-    rows = columns_of(Path(folder) / PAIRS, (*own, *lead))
+    rows = read_columns(Path(folder) / PAIRS_FILE, (*own, *lead))
     nothing = np.full(len(rows["vehicle"]), np.nan)
     nobody = np.full(len(rows["vehicle"]), NOBODY)
     both = {

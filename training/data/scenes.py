@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from training.data.ngsim_tables import SCENES, US101_EDGES, columns_of
-from training.data.smoothing import CUTOFF_ACROSS, CUTOFF_ALONG, motion, smooth
+from samplers.problem import FloatArray
+from training.data.ngsim_tables import SCENES_FILE, US101_EDGES, read_columns
+from training.data.smoothing import CUTOFF_ACROSS, CUTOFF_ALONG, infer_motion, smooth_positions
 from training.data.trajectories import DT
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 US101_ZERO = 1_118_846_980
@@ -25,7 +25,7 @@ _US101_COLUMNS = ("scene", "vehicle", "epoch_ms", "y_along", "d", "lane", "lengt
 
 
 @dataclass(frozen=True)
-class Scene:
+class TrafficScene:
     """Vehicles V at steps T, 0.1 s apart, on a straight road.
 
     Positions are box centres: x along the road, y across and positive to the right [m], heading relative to the road
@@ -37,20 +37,20 @@ class Scene:
     """Clock of the recording at step 0 [s]."""
     edges: tuple[float, ...]
     """y of the lane boundaries, left to right [m]."""
-    x: Array
+    x: FloatArray
     """Shape (T, V), like the following."""
-    y: Array
-    heading: Array
-    speed: Array
-    acceleration: Array
+    y: FloatArray
+    heading: FloatArray
+    speed: FloatArray
+    acceleration: FloatArray
     """From this step to the next [m/s^2]; NaN where the record ends before it is known."""
-    yaw_rate: Array
+    yaw_rate: FloatArray
     """From this step to the next [rad/s]; NaN where the acceleration is."""
     present: Mask
     """True where x, y, heading and speed are known."""
-    length: Array
+    length: FloatArray
     """Shape (V,) [m]."""
-    width: Array
+    width: FloatArray
     """Shape (V,) [m]."""
 
     def __post_init__(self) -> None:
@@ -65,7 +65,7 @@ class Scene:
         for values in (*self._fields(), self.length, self.width):
             values.setflags(write=False)
 
-    def _fields(self) -> tuple[NDArray[np.float64] | Mask, ...]:
+    def _fields(self) -> tuple[FloatArray | Mask, ...]:
         return (self.x, self.y, self.heading, self.speed, self.acceleration, self.yaw_rate, self.present)
 
     @property
@@ -100,9 +100,14 @@ class Scene:
         return leads
 
 
-def assemble(
-    name: str, start: float, edges: Sequence[float], columns: Mapping[str, NDArray[Any]], length: Array, width: Array
-) -> Scene:
+def assemble_scene(
+    name: str,
+    start: float,
+    edges: Sequence[float],
+    columns: Mapping[str, NDArray[Any]],
+    length: FloatArray,
+    width: FloatArray,
+) -> TrafficScene:
     """Puts rows in the place that `step` and `vehicle` (column of the scene, 0 to V - 1) give them.
 
     Args:
@@ -117,20 +122,20 @@ def assemble(
     step, vehicle = (columns[key][known].astype(np.int64) for key in ("step", "vehicle"))
     shape = (int(columns["step"].max()) + 1, len(length))
 
-    def placed(key: str) -> Array:
+    def placed(key: str) -> FloatArray:
         values = np.full(shape, np.nan)
         values[step, vehicle] = columns[key][known]
         return values
 
     states = {key: placed(key) for key in ("x", "y", "heading", "speed", "acceleration", "yaw_rate")}
-    return Scene(
+    return TrafficScene(
         name, start, tuple(edges), **states, present=np.isfinite(states["x"]), length=length.copy(), width=width.copy()
     )
 
 
 def load_us101_scenes(
     folder: Path | str, along: float = CUTOFF_ALONG, across: float = CUTOFF_ACROSS
-) -> tuple[Scene, ...]:
+) -> tuple[TrafficScene, ...]:
     """The 28 usable scenes of US 101, smoothed.
 
     The scenes overlap, so the copies of a vehicle are first merged by vehicle and time, each track is cut at its
@@ -145,7 +150,7 @@ def load_us101_scenes(
     Raises:
         ValueError: The file is missing, cannot be read or lacks a column.
     """
-    rows = columns_of(Path(folder) / SCENES, _US101_COLUMNS)
+    rows = read_columns(Path(folder) / SCENES_FILE, _US101_COLUMNS)
     usable = (rows["scene"] != 1) & (rows["lane"] <= 6)
     rows = {key: values[usable] for key, values in rows.items()}
     track_rows = np.column_stack([rows["vehicle"], rows["epoch_ms"]])
@@ -157,12 +162,12 @@ def load_us101_scenes(
     smoothed = smooth_tracks(breaks, x - 0.5 * length, y, along, across)
     for key, values in smoothed.items():
         rows[key] = values[copy]
-    return tuple(_us101_scene(rows, int(number)) for number in np.unique(rows["scene"]))
+    return tuple(_cut_us101_scene(rows, int(number)) for number in np.unique(rows["scene"]))
 
 
 def smooth_tracks(
-    breaks: NDArray[np.int64], x: Array, y: Array, along: float = CUTOFF_ALONG, across: float = CUTOFF_ACROSS
-) -> dict[str, Array]:
+    breaks: NDArray[np.int64], x: FloatArray, y: FloatArray, along: float = CUTOFF_ALONG, across: float = CUTOFF_ACROSS
+) -> dict[str, FloatArray]:
     """Smooth states and actions of rows of tracks one after another.
 
     Args:
@@ -177,13 +182,13 @@ def smooth_tracks(
     """
     result = {key: np.empty(len(x)) for key in ("x", "y", "heading", "speed", "acceleration", "yaw_rate")}
     for piece in np.split(np.arange(len(x)), breaks[breaks > 0]):
-        px, py = smooth(x[piece], along, DT), smooth(y[piece], across, DT)
-        for key, values in zip(result, (px, py, *motion(px, py, DT)), strict=True):
+        px, py = smooth_positions(x[piece], along, DT), smooth_positions(y[piece], across, DT)
+        for key, values in zip(result, (px, py, *infer_motion(px, py, DT)), strict=True):
             result[key][piece] = values
     return result
 
 
-def _us101_scene(rows: Mapping[str, NDArray[Any]], number: int) -> Scene:
+def _cut_us101_scene(rows: Mapping[str, NDArray[Any]], number: int) -> TrafficScene:
     inside = rows["scene"] == number
     scene = {key: values[inside] for key, values in rows.items()}
     first = scene["epoch_ms"].min()
@@ -191,12 +196,12 @@ def _us101_scene(rows: Mapping[str, NDArray[Any]], number: int) -> Scene:
     scene["step"], scene["vehicle"] = np.rint((scene["epoch_ms"] - first) / 100.0), column.astype(np.float64)
     edges = US101_EDGES if (scene["lane"] == 6).any() else US101_EDGES[:-1]
     length, width = (scene[key][first_row] for key in ("length", "width"))
-    return assemble(f"us101-{number:02}", first / 1000.0 - US101_ZERO, edges, scene, length, width)
+    return assemble_scene(f"us101-{number:02}", first / 1000.0 - US101_ZERO, edges, scene, length, width)
 
 
-def split(
-    scenes: Sequence[Scene], test: Sequence[tuple[float, float]] = US101_TEST
-) -> tuple[tuple[Scene, ...], tuple[Scene, ...]]:
+def split_by_clock(
+    scenes: Sequence[TrafficScene], test: Sequence[tuple[float, float]] = US101_TEST
+) -> tuple[tuple[TrafficScene, ...], tuple[TrafficScene, ...]]:
     """Scenes to learn from and scenes to test on, apart by the recording's clock.
 
     Args:
@@ -209,7 +214,7 @@ def split(
     Raises:
         ValueError: A scene lies across the end of an interval, so one moment would be on both sides.
     """
-    kept: tuple[list[Scene], list[Scene]] = ([], [])
+    kept: tuple[list[TrafficScene], list[TrafficScene]] = ([], [])
     for scene in scenes:
         inside = any(low <= scene.start and scene.end <= high for low, high in test)
         if not inside and any(scene.start <= high and low <= scene.end for low, high in test):

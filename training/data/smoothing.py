@@ -12,33 +12,32 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_solve_banded, cholesky_banded
 
-Array = NDArray[np.float64]
+from samplers.problem import FloatArray
 
 CUTOFF_ALONG = 0.40
 """Frequency [Hz] at which half of a motion along the road is kept."""
 CUTOFF_ACROSS = 0.35
 """Frequency [Hz] at which half of a motion across the road is kept."""
-SLOWEST = 2.0
+MIN_HEADING_SPEED = 2.0
 """Speed [m/s] under which a heading would be noise; the heading is that of a vehicle so fast."""
 
 
 class Motion(NamedTuple):
     """What the simulator needs to replay a track; arrays of shape (T,), NaN where the track's end leaves no value."""
 
-    heading: Array
+    heading: FloatArray
     """Relative to the road [rad], positive towards +y; NaN in the last step."""
-    speed: Array
+    speed: FloatArray
     """Along the heading [m/s]; NaN in the last step."""
-    acceleration: Array
+    acceleration: FloatArray
     """[m/s^2]; NaN in the last two steps."""
-    yaw_rate: Array
+    yaw_rate: FloatArray
     """[rad/s]; NaN in the last two steps."""
 
 
-def smooth(positions: Array, cutoff: float, dt: float) -> Array:
+def smooth_positions(positions: FloatArray, cutoff: float, dt: float) -> FloatArray:
     """Positions z near the recorded y: the least of |y - z|^2 + lambda |third differences of z|^2.
 
     In the middle of a track that is a filter of gain 1 / (1 + lambda (2 - 2 cos(2 pi f dt))^3) without delay;
@@ -62,12 +61,12 @@ def smooth(positions: Array, cutoff: float, dt: float) -> Array:
         raise ValueError(f"Expected a cut-off in (0, {0.5 / dt:g}] Hz at steps of {dt:g} s, got {cutoff:g} Hz.")
     if len(positions) < 4:
         return positions.copy()
-    smoothed: Array = cho_solve_banded((_factor(len(positions), cutoff, dt), True), positions)
+    smoothed: FloatArray = cho_solve_banded((_penalty_factor(len(positions), cutoff, dt), True), positions)
     return smoothed
 
 
 @lru_cache(maxsize=1024)
-def _factor(n: int, cutoff: float, dt: float) -> Array:
+def _penalty_factor(n: int, cutoff: float, dt: float) -> FloatArray:
     """Cholesky factor of I + lambda D'D in lower banded form, D the (n - 3, n) third differences."""
     weight = (2.0 - 2.0 * np.cos(2.0 * np.pi * cutoff * dt)) ** -3
     stencil = np.array([-1.0, 3.0, -3.0, 1.0])
@@ -76,15 +75,15 @@ def _factor(n: int, cutoff: float, dt: float) -> Array:
     for i in range(4):
         for j in range(i + 1):
             bands[i - j, j : n - 3 + j] += weight * stencil[i] * stencil[j]
-    factor: Array = cholesky_banded(bands, lower=True)
+    factor: FloatArray = cholesky_banded(bands, lower=True)
     return factor
 
 
-def motion(x: Array, y: Array, dt: float) -> Motion:
+def infer_motion(x: FloatArray, y: FloatArray, dt: float) -> Motion:
     """Headings, speeds and actions that take a point mass through the given positions.
 
     The inverse of the simulator's step (explicit Euler, old values): x += v cos(h) dt, y += v sin(h) dt, h += w dt,
-    v += a dt. Exact while the vehicle moves along the road at `SLOWEST` or more; below, the heading is
+    v += a dt. Exact while the vehicle moves along the road at `MIN_HEADING_SPEED` or more; below, the heading is
     atan2(vy, SLOWEST) and the speed the part of (vx, vy) along it, so that a creeping vehicle does not spin.
 
     Args:
@@ -93,10 +92,10 @@ def motion(x: Array, y: Array, dt: float) -> Motion:
         dt: Time step [s].
     """
     vx, vy = np.diff(x) / dt, np.diff(y) / dt
-    heading = np.arctan2(vy, np.maximum(vx, SLOWEST))
+    heading = np.arctan2(vy, np.maximum(vx, MIN_HEADING_SPEED))
     speed = np.maximum(vx * np.cos(heading) + vy * np.sin(heading), 0.0)
-    return Motion(*(_padded(values, len(x)) for values in (heading, speed, np.diff(speed) / dt, np.diff(heading) / dt)))
+    return Motion(*(_pad(values, len(x)) for values in (heading, speed, np.diff(speed) / dt, np.diff(heading) / dt)))
 
 
-def _padded(values: Array, n: int) -> Array:
+def _pad(values: FloatArray, n: int) -> FloatArray:
     return np.concatenate([values, np.full(n - len(values), np.nan)])

@@ -15,16 +15,17 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from pyarrow import csv
 
-Array = NDArray[np.float64]
+from samplers.problem import FloatArray
+
 Gaps = Literal["error", "cut"]
 
-FASTEST = 70.0
+FASTEST_SPEED = 70.0
 """Speeds above this [m/s] (252 km/h) are taken for wrong units or broken tracking."""
 FASTEST_JUMP = 100.0
 """So are positions that move faster than this [m/s]."""
-SIZES = (2.5, 30.0)
+MEDIAN_LENGTHS = (2.5, 30.0)
 """Median length of vehicles [m]; outside, lengths are not in the expected unit."""
-AGREEMENT = (0.8, 1.25)
+SPEED_RATIOS = (0.8, 1.25)
 """How far positions move for each metre the recorded speeds say; outside, units differ."""
 
 
@@ -52,7 +53,7 @@ class Rows:
         return ValueError(f"{self.path}, line {self.lines[row]}: {text}")
 
 
-def header_of(path: Path) -> list[str]:
+def read_header(path: Path) -> list[str]:
     """Fields of the first line.
 
     Raises:
@@ -80,7 +81,7 @@ def read_numbers(path: Path | str, names: Mapping[str, Sequence[str]], text: Seq
         ValueError: The file cannot be read, is empty, lacks a column, or holds something else than a number.
     """
     path = Path(path)
-    header = header_of(path)
+    header = read_header(path)
     known = {name.lower(): i for i, name in enumerate(header)}
     found = {name: next((known[a.lower()] for a in also if a.lower() in known), None) for name, also in names.items()}
     missing = [names[name][0] for name, i in found.items() if i is None]
@@ -117,9 +118,9 @@ def read_numbers(path: Path | str, names: Mapping[str, Sequence[str]], text: Seq
     return rows
 
 
-def _numbers(column: pa.ChunkedArray, text: bool) -> NDArray[np.float64]:
+def _numbers(column: pa.ChunkedArray, text: bool) -> FloatArray:
     if text or not pa.types.is_string(column.type):
-        values: NDArray[np.float64] = column.to_numpy()
+        values: FloatArray = column.to_numpy()
         return values
     return np.array([_number(value) for value in column.to_pylist()], dtype=np.float64)
 
@@ -131,7 +132,9 @@ def _number(value: str) -> float:
         return np.nan
 
 
-def check_tracks(rows: Rows, vehicle: Array, frame: Array, x: Array, speed: Array, dt: float, gaps: Gaps) -> None:
+def check_tracks(
+    rows: Rows, vehicle: FloatArray, frame: FloatArray, x: FloatArray, speed: FloatArray, dt: float, gaps: Gaps
+) -> None:
     """Refuses tracks that cannot be: rows given twice, holes, impossible speeds, positions and speeds that disagree.
 
     Args:
@@ -146,10 +149,10 @@ def check_tracks(rows: Rows, vehicle: Array, frame: Array, x: Array, speed: Arra
     Raises:
         ValueError: Something of the above, with the line of its first occurrence.
     """
-    bad = (speed < 0.0) | (speed > FASTEST)
+    bad = (speed < 0.0) | (speed > FASTEST_SPEED)
     if bad.any():
         row = int(np.argmax(bad))
-        raise rows.error(row, f"speed is {speed[row]:.4g} m/s, expected 0 to {FASTEST:g}; are the units right?")
+        raise rows.error(row, f"speed is {speed[row]:.4g} m/s, expected 0 to {FASTEST_SPEED:g}; are the units right?")
     order = np.lexsort([frame, vehicle])
     same = np.diff(vehicle[order]) == 0
     step = np.diff(frame[order])
@@ -183,7 +186,7 @@ def check_tracks(rows: Rows, vehicle: Array, frame: Array, x: Array, speed: Arra
         raise rows.error(row, f"vehicle {vehicle[row]:g} moved {distance:.4g} m in {dt:g} s; are the units right?")
     total = said[next_frame].sum()
     ratio = moved[next_frame].sum() / total if total > 0.0 else 1.0
-    if not AGREEMENT[0] <= ratio <= AGREEMENT[1]:
+    if not SPEED_RATIOS[0] <= ratio <= SPEED_RATIOS[1]:
         found = first(next_frame & (np.abs(moved - ratio * said) <= 0.5 * ratio * said + 1e-9))
         row = found[0] if found else 0
         raise rows.error(
@@ -193,19 +196,19 @@ def check_tracks(rows: Rows, vehicle: Array, frame: Array, x: Array, speed: Arra
         )
 
 
-def check_lengths(rows: Rows, length: Array, unit: str) -> None:
+def check_lengths(rows: Rows, length: FloatArray, unit: str) -> None:
     """Refuses lengths that are not those of vehicles.
 
     Raises:
-        ValueError: A length is not positive, or their median is outside `SIZES`.
+        ValueError: A length is not positive, or their median is outside `MEDIAN_LENGTHS`.
     """
     if (length <= 0.0).any():
         row = int(np.argmax(length <= 0.0))
         raise rows.error(row, f"length of the vehicle is {length[row]:g} m.")
     median = float(np.median(length))
-    if not SIZES[0] <= median <= SIZES[1]:
+    if not MEDIAN_LENGTHS[0] <= median <= MEDIAN_LENGTHS[1]:
         raise rows.error(
             0,
-            f"the median length of vehicles is {median:.3g} m, expected {SIZES[0]:g} to {SIZES[1]:g}; "
-            f"lengths were taken to be in {unit}.",
+            f"the median length of vehicles is {median:.3g} m, expected "
+            f"{MEDIAN_LENGTHS[0]:g} to {MEDIAN_LENGTHS[1]:g}; lengths were taken to be in {unit}.",
         )

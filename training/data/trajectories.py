@@ -13,7 +13,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from samplers.problem import FloatArray
+
 Integers = NDArray[np.int64]
 
 DT = 0.1
@@ -41,17 +42,17 @@ class Trajectories:
     """Number within the recording."""
     frame: Integers
     """Number of the time step, `DT` apart and common to the vehicles of a recording; a gap is a hole in the track."""
-    x: Array
+    x: FloatArray
     """[m]"""
-    y: Array
+    y: FloatArray
     """[m]; NaN where it was not recorded."""
-    speed: Array
+    speed: FloatArray
     """As recorded [m/s], not negative."""
-    acceleration: Array
+    acceleration: FloatArray
     """As recorded, along the road [m/s^2]; NaN where it was not recorded."""
-    length: Array
+    length: FloatArray
     """[m]; NaN where it was not recorded (x is the front then)."""
-    width: Array
+    width: FloatArray
     """[m]; NaN where it was not recorded."""
     lane: Integers
     """1 is the leftmost; 0 outside the lanes or not recorded."""
@@ -100,7 +101,7 @@ class Trajectories:
         return replace(self, **{name: self.column(name)[chosen] for name in COLUMNS})
 
     @property
-    def time(self) -> Array:
+    def time(self) -> FloatArray:
         """Clock of the recording [s]."""
         return np.asarray(DT * self.frame, dtype=np.float64)
 
@@ -132,7 +133,7 @@ def tabulate(columns: Mapping[str, Any], edges: Mapping[str, tuple[float, ...]] 
     return Trajectories(**{name: values[order] for name, values in arrays.items()}, edges=dict(edges or {}))
 
 
-def ahead(frame: Integers, lane: Integers, x: Array, recording: NDArray[Any] | None = None) -> Integers:
+def find_leaders(frame: Integers, lane: Integers, x: FloatArray, recording: NDArray[Any] | None = None) -> Integers:
     """Rows of the nearest vehicle ahead in the same lane, shape (rows,); -1 where there is none, or no lane."""
     group = np.zeros(len(x), np.int64) if recording is None else np.unique(recording, return_inverse=True)[1].ravel()
     order = np.lexsort([x, lane, frame, group])

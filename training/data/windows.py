@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from training.data.scenes import Scene, assemble, smooth_tracks
+from training.data.scenes import TrafficScene, assemble_scene, smooth_tracks
 from training.data.trajectories import DT, Trajectories
 
-SHORTEST = 4
+MIN_STEPS = 4
 """Steps of a scene, at least."""
 
 
-def scenes_of(trajectories: Trajectories, seconds: float = 10.0) -> tuple[Scene, ...]:
+def scenes_of(trajectories: Trajectories, seconds: float = 10.0) -> tuple[TrafficScene, ...]:
     """Every recording in windows of time over its whole road, smoothed.
 
     Tracks are smoothed once over their whole length and then cut, so two windows agree where they meet. A scene
@@ -28,26 +28,27 @@ def scenes_of(trajectories: Trajectories, seconds: float = 10.0) -> tuple[Scene,
     """
     t = trajectories
     steps = round(seconds / DT)
-    if steps < SHORTEST:
-        raise ValueError(f"Expected scenes of {SHORTEST * DT:g} s or more, got {seconds:g} s.")
+    if steps < MIN_STEPS:
+        raise ValueError(f"Expected scenes of {MIN_STEPS * DT:g} s or more, got {seconds:g} s.")
     for name in ("y", "length", "width"):
         if np.isnan(t.column(name)).any():
             raise ValueError(f"Scenes need {name} in every row; this table lacks it in some.")
     smooth = smooth_tracks(t.breaks(), t.x, t.y)
-    scenes: list[Scene] = []
+    scenes: list[TrafficScene] = []
     for recording in np.unique(t.recording).tolist():
         own = t.recording == recording
         edges = t.edges.get(recording, ())
         if not edges:
             raise ValueError(
                 f"Recording {recording!r} has no lane boundaries, which scenes need. Give the y of each from left to "
-                f"right [m], as in tabulate(columns, edges={{{recording!r}: (0.0, 3.5, 7.0)}}); {_where(t, own)}."
+                f"right [m], as in tabulate(columns, edges={{{recording!r}: (0.0, 3.5, 7.0)}}); "
+                f"{_describe_positions(t, own)}."
             )
         inside = own & (smooth["y"] >= edges[0]) & (smooth["y"] < edges[-1])
         if not inside.any():
             raise ValueError(
                 f"Recording {recording!r} has nobody between its lane boundaries, {edges[0]:g} to {edges[-1]:g} m; "
-                f"{_where(t, own)}."
+                f"{_describe_positions(t, own)}."
             )
         inside &= np.isfinite(smooth["speed"])
         window = t.frame // steps
@@ -59,11 +60,11 @@ def scenes_of(trajectories: Trajectories, seconds: float = 10.0) -> tuple[Scene,
             columns["vehicle"] = column.ravel().astype(np.float64)
             start = DT * float(number * steps)
             name = f"{recording}-{start:.0f}"
-            scenes.append(assemble(name, start, edges, columns, t.length[rows[first]], t.width[rows[first]]))
+            scenes.append(assemble_scene(name, start, edges, columns, t.length[rows[first]], t.width[rows[first]]))
     return tuple(scenes)
 
 
-def _where(t: Trajectories, rows: NDArray[np.bool_]) -> str:
+def _describe_positions(t: Trajectories, rows: NDArray[np.bool_]) -> str:
     """Where the vehicles of a recording are across the road, in words."""
     lanes = np.unique(t.lane[rows & (t.lane > 0)])
     words = f"its vehicles are at y = {t.y[rows].min():.1f} to {t.y[rows].max():.1f} m"

@@ -20,7 +20,7 @@ from rare_envs.scenarios.registry import named
 from rare_envs.simulation.rollout import drive
 from rare_envs.simulation.world import World
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
-from training.data.scenes import Scene
+from training.data.scenes import TrafficScene
 from training.egos.nominal_driving import draw_inputs, make_world
 from training.egos.nominal_traffic import CASES
 
@@ -45,7 +45,7 @@ class EncounterSpec:
     """Parameters that are the same in all."""
 
 
-def make_scenes(kinds: Sequence[EncounterSpec], rng: np.random.Generator) -> list[Scene]:
+def make_scenes(kinds: Sequence[EncounterSpec], rng: np.random.Generator) -> list[TrafficScene]:
     """Scenes full of encounters; every other one is mirrored, since scenarios know one side only.
 
     Args:
@@ -90,7 +90,7 @@ def _simulate_tracks(world: World, x: NDArray[np.float64]) -> NDArray[np.float64
     return np.asarray(torch.stack(moments).numpy())
 
 
-def _make_scene(name: str, world: World, tracks: NDArray[np.float64], side: float) -> Scene:
+def _make_scene(name: str, world: World, tracks: NDArray[np.float64], side: float) -> TrafficScene:
     """One scene of some encounters (T, n, N, 4), mirrored for side = -1."""
     road, (ticks, n, vehicles, _) = world.scenario.road, tracks.shape
     place = APART * np.arange(n)[:, None]
@@ -104,7 +104,7 @@ def _make_scene(name: str, world: World, tracks: NDArray[np.float64], side: floa
     ego = np.arange(n * vehicles) % vehicles == 0
     # whose actions are not known is replayed; what the ego did is not learned from, so any number will do
     action = np.where(ego, 0.0, np.nan) * np.ones((ticks, 1))
-    return Scene(
+    return TrafficScene(
         name=name,
         start=0.0,
         edges=tuple(sorted(side * edge for edge in road.edges)),

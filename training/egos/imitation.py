@@ -25,17 +25,17 @@ import torch
 import typer
 
 from agents import LearnedEgo, Provenance, save_driver
-from training.data.scenes import Scene
+from training.data.scenes import TrafficScene
 from training.egos.encounters import EncounterSpec, make_scenes
 from training.egos.nominal_driving import judge_all_cases
 from training.imitation.algorithms.config import Config
-from training.imitation.algorithms.expert_pairs import expert_pairs
+from training.imitation.algorithms.expert_pairs import collect_pairs
 from training.imitation.algorithms.learner import Learner
-from training.imitation.datasets import Source, load
-from training.imitation.evaluation.realism import metrics
-from training.imitation.fit import Data, fit, learner_of
-from training.imitation.run_folder import DRIVER, check_folder, driver_of, note_settings, settings_of
-from training.imitation.traffic.recording import stack
+from training.imitation.datasets import Source, load_scenes
+from training.imitation.evaluation.realism import header_metrics
+from training.imitation.fit import Data, make_learner, train_learner
+from training.imitation.run_folder import DRIVER, check_folder, driver_of, format_settings, write_settings
+from training.imitation.traffic.recording import stack_scenes
 
 NAME = "imitation"
 CONFIG = Config(
@@ -68,7 +68,7 @@ JUDGED, JUDGED_SEED = 400, 1000
 """Rollouts of each case in the header of the file."""
 
 
-def prepare_learner(scenes: Sequence[Scene], kinds: Sequence[EncounterSpec], config: Config) -> Learner:
+def prepare_learner(scenes: Sequence[TrafficScene], kinds: Sequence[EncounterSpec], config: Config) -> Learner:
     """Everything of the training before its first update.
 
     Args:
@@ -76,12 +76,12 @@ def prepare_learner(scenes: Sequence[Scene], kinds: Sequence[EncounterSpec], con
         kinds: Encounters that are driven beside them.
         config: Settings; the encounters are drawn by its seed.
     """
-    pairs = expert_pairs(stack(scenes))
+    pairs = collect_pairs(stack_scenes(scenes))
     met = make_scenes(kinds, np.random.default_rng(config.seed))
     recorded = torch.unique(pairs.scene)
     times = round(RECORDED / (1.0 - RECORDED) * len(met) / len(recorded))
     among = torch.cat((recorded.repeat(max(times, 1)), len(scenes) + torch.arange(len(met))))
-    return learner_of(Data(stack((*scenes, *met)), pairs, None), config, among)
+    return make_learner(Data(stack_scenes((*scenes, *met)), pairs, None), config, among)
 
 
 def train_imitation_ego(
@@ -110,18 +110,20 @@ def train_imitation_ego(
         ValueError: If the data cannot be read, or the folder holds another training.
     """
     source = Source("data", data)
-    settings = settings_of(source, config)
+    settings = format_settings(source, config)
     check_folder(out, settings)
-    learn, test = load(source)
-    note_settings(out, settings)
-    driver = replace(driver_of(fit(prepare_learner(learn, kinds, config), out, progress=progress), config), name=NAME)
+    learn, test = load_scenes(source)
+    write_settings(out, settings)
+    driver = replace(
+        driver_of(train_learner(prepare_learner(learn, kinds, config), out, progress=progress), config), name=NAME
+    )
     provenance = Provenance(
         kind="mgail, with encounters",
         command=f"python -m training.egos.imitation --data {data.name} --seed {config.seed}",
         data=source.description,
         data_licence=source.licence,
         metrics={
-            **metrics(stack(test), driver),
+            **header_metrics(stack_scenes(test), driver),
             "ordinary": judge_all_cases(LearnedEgo(driver), rollouts, JUDGED_SEED),
         },
     )

@@ -31,7 +31,7 @@ from rare_envs.simulation.background import Background, WeightDistribution
 from rare_envs.traffic.reference_line import Curve
 from rare_envs.traffic.road import Road, i80, straight
 from rare_envs.traffic.state import LANE_WIDTH, VEHICLE_LENGTH, State
-from training.imitation.algorithms.config import HUMAN
+from training.imitation.algorithms.config import HUMAN_NOISE
 
 SECONDS = 60.0
 """Length of a rollout [s]."""
@@ -55,7 +55,7 @@ class OrdinaryDrivers:
     """Speeds that wander about those at the start, with IDM behind whatever is ahead; steering is the scenario's."""
 
     rule: RuleDriver = RuleDriver()  # noqa: RUF009  (frozen)
-    colour: AutoregressiveNoise = HUMAN
+    colour: AutoregressiveNoise = HUMAN_NOISE
     weights: ClassVar[WeightDistribution | None] = None
     noisy: ClassVar[bool] = True
 

@@ -36,7 +36,7 @@ from training.egos.expert_driver import AUXILIARY_SIZE
 from training.egos.image_dataset import LabelledPictures, collect, concatenate, mirror
 from training.egos.nominal_driving import judge_all_cases
 from training.imitation.fit import CHECKPOINT
-from training.imitation.run_folder import check_folder, note_settings
+from training.imitation.run_folder import check_folder, write_settings
 
 FILE = "vision.safetensors"
 JUDGED = 2026
@@ -207,7 +207,7 @@ def train_vision_ego(config: VisionConfig, out: Path, progress: bool = False) ->
     """
     settings = json.dumps(asdict(config), indent=1)
     check_folder(out, settings)
-    note_settings(out, settings)
+    write_settings(out, settings)
     training = Training(config, out)
     training.take_up()
     with Progress(console=Console(stderr=True), disable=not progress) as bar:

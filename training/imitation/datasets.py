@@ -9,11 +9,11 @@ from pathlib import Path
 
 from training.data.highd import highd_recordings, load_highd
 from training.data.ngsim import load_ngsim
-from training.data.scenes import Scene, load_us101_scenes, split
+from training.data.scenes import TrafficScene, load_us101_scenes, split_by_clock
 from training.data.windows import scenes_of
 
-KINDS = ("data", "ngsim", "highd")
-HELD_OUT = 0.2
+SOURCE_KINDS = ("data", "ngsim", "highd")
+TEST_SHARE = 0.2
 """Share of a user's recording, its end, that is kept for tests."""
 _NGSIM = "CC BY-SA 3.0, as reported of the NGSIM record 8ect-6jqj"
 _HIGHD = "highD's: non-commercial, and neither the data nor what derives from it is passed on without leave"
@@ -38,8 +38,8 @@ class Source:
     """Length of the scenes that a user's recording is cut into [s]."""
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise ValueError(f"Expected one of {', '.join(KINDS)}, got {self.kind!r}.")
+        if self.kind not in SOURCE_KINDS:
+            raise ValueError(f"Expected one of {', '.join(SOURCE_KINDS)}, got {self.kind!r}.")
 
     @property
     def description(self) -> str:
@@ -47,8 +47,8 @@ class Source:
         if self.kind == "data":
             return "NGSIM US 101, 15 June 2005, 07:49:51 to 07:52:53 without 64 to 88 s and 158 to 193 s of its clock"
         if self.kind == "ngsim":
-            return f"NGSIM, {self.location or self.path.stem}, the first {1 - HELD_OUT:.0%}"
-        return f"highD, {', '.join(self.recordings) or 'all recordings'}, the first {1 - HELD_OUT:.0%} of each"
+            return f"NGSIM, {self.location or self.path.stem}, the first {1 - TEST_SHARE:.0%}"
+        return f"highD, {', '.join(self.recordings) or 'all recordings'}, the first {1 - TEST_SHARE:.0%} of each"
 
     @property
     def licence(self) -> str:
@@ -66,14 +66,14 @@ class Source:
         return shlex.join(words)
 
 
-def load(source: Source) -> tuple[tuple[Scene, ...], tuple[Scene, ...]]:
+def load_scenes(source: Source) -> tuple[tuple[TrafficScene, ...], tuple[TrafficScene, ...]]:
     """Scenes to learn from and scenes to test on, which share no moment.
 
     Raises:
         ValueError: A file is missing or broken; see the loaders.
     """
     if source.kind == "data":
-        return split(load_us101_scenes(source.path))
+        return split_by_clock(load_us101_scenes(source.path))
     if source.kind == "ngsim":
         return split_end(scenes_of(load_ngsim(source.path, location=source.location, gaps="cut"), source.seconds))
     names = source.recordings or highd_recordings(source.path)
@@ -81,13 +81,15 @@ def load(source: Source) -> tuple[tuple[Scene, ...], tuple[Scene, ...]]:
     return split_end([scene for table in tables for scene in scenes_of(table, source.seconds)])
 
 
-def split_end(scenes: tuple[Scene, ...] | list[Scene]) -> tuple[tuple[Scene, ...], tuple[Scene, ...]]:
+def split_end(
+    scenes: tuple[TrafficScene, ...] | list[TrafficScene],
+) -> tuple[tuple[TrafficScene, ...], tuple[TrafficScene, ...]]:
     """The last fifth of every recording's scenes apart from the rest; of a single scene, none."""
-    learn: list[Scene] = []
-    test: list[Scene] = []
+    learn: list[TrafficScene] = []
+    test: list[TrafficScene] = []
     for _, group in groupby(scenes, key=lambda scene: scene.name.rsplit("-", 1)[0]):
         found = list(group)
-        kept = len(found) - (max(round(HELD_OUT * len(found)), 1) if len(found) > 1 else 0)
+        kept = len(found) - (max(round(TEST_SHARE * len(found)), 1) if len(found) > 1 else 0)
         learn += found[:kept]
         test += found[kept:]
     return tuple(learn), tuple(test)

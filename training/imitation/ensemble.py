@@ -29,15 +29,15 @@ from torch import Tensor
 
 from agents import LearnedDriver, read_driver, read_provenance, save_driver
 from agents.learned.networks import head_weights
-from agents.learned.weight_distribution import Array
-from training.imitation.algorithms.behaviour_cloning import improve
+from samplers.problem import FloatArray
+from training.imitation.algorithms.behaviour_cloning import clone_epochs
 from training.imitation.algorithms.config import Config
 from training.imitation.algorithms.critic import Critic
 from training.imitation.algorithms.expert_pairs import Pairs
-from training.imitation.algorithms.learner import Learner, updates
-from training.imitation.datasets import load
-from training.imitation.fit import CHECKPOINT, UPDATES, Data, prepare
-from training.imitation.run_folder import DRIVER, read_settings
+from training.imitation.algorithms.learner import Learner, run_updates
+from training.imitation.datasets import load_scenes
+from training.imitation.fit import CHECKPOINT, UPDATES, Data, prepare_data
+from training.imitation.run_folder import DRIVER, read_training_settings
 from training.imitation.weight_fit import FOLDS, fit_weights
 
 
@@ -64,13 +64,13 @@ class Ensemble:
 class Member(NamedTuple):
     """One trained member."""
 
-    weights: Array
+    weights: FloatArray
     """Its last layer, shape (404,)."""
-    within: Array
+    within: FloatArray
     """Standard deviation of each weight over the second half of its run, shape (404,)."""
 
 
-def settings_of(base: Config, ensemble: Ensemble) -> Config:
+def member_config(base: Config, ensemble: Ensemble) -> Config:
     """The base's settings with all schedules at their ends."""
     last: dict[str, Any] = {name: (getattr(base, name)[1],) * 2 for name in ("horizon", "age", "drivers")}
     clone_weight = (base.clone_weight[1], base.clone_weight[1])
@@ -94,40 +94,40 @@ def train_member(
     generator = torch.Generator().manual_seed(int(seed))
     scenes = torch.unique(data.pairs.scene)
     drawn = scenes[torch.randint(len(scenes), (len(scenes),), generator=generator)]
-    pairs, config = of_scenes(data.pairs, drawn), settings_of(base, ensemble)
+    pairs, config = select_scenes(data.pairs, drawn), member_config(base, ensemble)
     policy = copy.deepcopy(driver.policy)
     policy.head.requires_grad_(True)
     visited: list[Tensor] = []
     if config.method == "bc":
-        for _ in improve(policy, pairs, config, generator):
+        for _ in clone_epochs(policy, pairs, config, generator):
             visited.append(head_weights(policy).detach())
     else:
         learner = Learner(config, data.recording, drawn, pairs, policy, Critic(), generator)
         learner.inherit(checkpoint)
-        for _ in updates(learner, UPDATES[config.method]):
+        for _ in run_updates(learner, UPDATES[config.method]):
             visited.append(head_weights(policy).detach())
     late = torch.stack(visited[len(visited) // 2 :]).double().numpy()
     return Member(late[-1], late.std(axis=0))
 
 
-def of_scenes(pairs: Pairs, drawn: Tensor) -> Pairs:
+def select_scenes(pairs: Pairs, drawn: Tensor) -> Pairs:
     """The pairs of scenes that were drawn, as often as they were drawn."""
     rows = torch.cat([(pairs.scene == scene).nonzero().flatten() for scene in drawn])
     return Pairs(*(column[rows] for column in pairs))
 
 
-def members_of(folder: Path, ensemble: Ensemble, progress: bool = False) -> list[Member]:
+def train_members(folder: Path, ensemble: Ensemble, progress: bool = False) -> list[Member]:
     """Train an ensemble around the driver in a folder; members that are kept there are not trained again.
 
     Raises:
         ValueError: If the folder holds no finished training, or members of another driver.
     """
-    source, base = read_settings(folder)
+    source, base = read_training_settings(folder)
     driver = read_driver(folder / DRIVER)
     own = head_weights(driver.policy).double().numpy()
     kept = folder / f"members-{ensemble.updates}-{ensemble.seed}"
     kept.mkdir(exist_ok=True)
-    data = prepare(load(source)[0])
+    data = prepare_data(load_scenes(source)[0])
     members = []
     for number in track(range(ensemble.members), "members", console=Console(stderr=True), disable=not progress):
         path = kept / f"{number:03}.npz"
@@ -144,7 +144,7 @@ def members_of(folder: Path, ensemble: Ensemble, progress: bool = False) -> list
     return members
 
 
-def spread_of(members: list[Member], base: Array) -> dict[str, float]:
+def measure_spread(members: list[Member], base: FloatArray) -> dict[str, float]:
     """How far members are from each other, move within their runs, and are as a whole from the base."""
     weights = np.stack([member.weights for member in members])
     between, within = weights.std(axis=0, ddof=1), np.stack([member.within for member in members]).mean(axis=0)
@@ -175,16 +175,16 @@ def make_ensemble(folder: Path, ensemble: Ensemble, out: Path, progress: bool = 
     Raises:
         ValueError: If there is no finished training, or no law can be fitted.
     """
-    members = members_of(folder, ensemble, progress)
+    members = train_members(folder, ensemble, progress)
     driver, provenance = read_driver(folder / DRIVER), read_provenance(folder / DRIVER)
     fit = fit_weights(np.stack([member.weights for member in members]))
-    spread = spread_of(members, head_weights(driver.policy).double().numpy())
+    spread = measure_spread(members, head_weights(driver.policy).double().numpy())
     command = f"python -m training.imitation.ensemble RUN --members {ensemble.members} --updates {ensemble.updates}"
     about = {"command": f"{command} --seed {ensemble.seed}", **spread, **fit.metadata}
     return save_driver(replace(driver, weights=fit.distribution), replace(provenance, ensemble=about), out)
 
 
-def command(
+def main(
     run: Annotated[Path, typer.Argument(help="Folder of a finished training.")],
     out: Annotated[Path, typer.Option(help="The driver with the law of its weights, .safetensors.")],
     members: Annotated[int, typer.Option(help="Members to train.")] = Ensemble.members,
@@ -203,5 +203,5 @@ def command(
 
 if __name__ == "__main__":
     app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-    app.command()(command)
+    app.command()(main)
     app()

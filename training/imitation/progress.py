@@ -9,12 +9,12 @@ from typing import Any
 
 from training.imitation.algorithms.learner import Learner, Log
 
-After = Callable[[Learner, Log], None]
+Callback = Callable[[Learner, Log], None]
 """Called after every update."""
 
 
 @contextlib.contextmanager
-def bar(learner: Learner, show: bool) -> Iterator[After]:
+def progress_bar(learner: Learner, show: bool) -> Iterator[Callback]:
     """A progress bar on standard error."""
     if not show:
         yield lambda learner, entry: None
@@ -47,7 +47,7 @@ def summary_writer() -> Any:
 
 
 @contextlib.contextmanager
-def tensorboard(folder: Path | None, update: int) -> Iterator[After]:
+def tensorboard_logs(folder: Path | None, update: int) -> Iterator[Callback]:
     """TensorBoard logs in a folder; None writes none.
 
     Args:

@@ -15,16 +15,16 @@ from typing import Any
 from agents import LearnedDriver, Provenance, save_driver
 from agents.learned.coloured_noise import WHITE_NOISE, AutoregressiveNoise
 from agents.learned.networks import Policy
-from training.imitation.algorithms.actions import HIGH, LOW
-from training.imitation.algorithms.config import HUMAN, Config
-from training.imitation.datasets import Source, load
-from training.imitation.evaluation.realism import metrics
-from training.imitation.fit import CHECKPOINT, fit, learner_of, prepare
+from training.imitation.algorithms.actions import ACTION_HIGH, ACTION_LOW
+from training.imitation.algorithms.config import HUMAN_NOISE, Config
+from training.imitation.datasets import Source, load_scenes
+from training.imitation.evaluation.realism import header_metrics
+from training.imitation.fit import CHECKPOINT, make_learner, prepare_data, train_learner
 from training.imitation.progress import summary_writer
 
 DRIVER, SETTINGS = "driver.safetensors", "training.json"
 """What a training leaves in its folder beside the checkpoint."""
-COLOURS = {"human": HUMAN, "white": WHITE_NOISE}
+NOISES = {"human": HUMAN_NOISE, "white": WHITE_NOISE}
 """Names of noises on the command line."""
 
 
@@ -50,18 +50,18 @@ def train_driver(
     """
     if log:
         summary_writer()
-    settings = settings_of(source, config)
+    settings = format_settings(source, config)
     check_folder(out, settings)
-    data = prepare(*load(source))
-    note_settings(out, settings)
-    policy = fit(learner_of(data, config), out, log, progress)
+    data = prepare_data(*load_scenes(source))
+    write_settings(out, settings)
+    policy = train_learner(make_learner(data, config), out, log, progress)
     driver = driver_of(policy, config)
     provenance = Provenance(
         kind=config.method,
         command=command_of(source, config),
         data=source.description,
         data_licence=source.licence,
-        metrics=metrics(data.test, driver) if measured and data.test is not None else {},
+        metrics=header_metrics(data.test, driver) if measured and data.test is not None else {},
     )
     return save_driver(driver, provenance, out / DRIVER)
 
@@ -69,7 +69,7 @@ def train_driver(
 def driver_of(policy: Policy, config: Config) -> LearnedDriver:
     """The driver that a trained policy is, with the noise and the limits that it was trained with."""
     frozen = policy.eval().requires_grad_(False)
-    acceleration, yaw_rate = zip(LOW, HIGH, strict=True)
+    acceleration, yaw_rate = zip(ACTION_LOW, ACTION_HIGH, strict=True)
     return LearnedDriver(frozen, config.colour, acceleration, yaw_rate, name=config.method)
 
 
@@ -85,7 +85,7 @@ def command_of(source: Source, config: Config) -> str:
 
 def _option(name: str, value: Any) -> list[str]:
     if isinstance(value, AutoregressiveNoise):
-        named = [word for word, colour in COLOURS.items() if colour == value]
+        named = [word for word, colour in NOISES.items() if colour == value]
         return ["--noise", *named] if named else []
     flag = "--" + name.replace("_", "-")
     if isinstance(value, bool):
@@ -93,7 +93,7 @@ def _option(name: str, value: Any) -> list[str]:
     return [flag, *(str(part) for part in (value if isinstance(value, tuple) else (value,)))]
 
 
-def settings_of(source: Source, config: Config) -> str:
+def format_settings(source: Source, config: Config) -> str:
     """Source and settings as JSON."""
     return json.dumps({"source": {**asdict(source), "path": str(source.path)}, "config": asdict(config)}, indent=1)
 
@@ -112,7 +112,7 @@ def check_folder(out: Path, settings: str) -> None:
         raise ValueError(f"{str(out)!r} holds a training with other settings; choose another folder or remove it.")
 
 
-def note_settings(out: Path, settings: str) -> None:
+def write_settings(out: Path, settings: str) -> None:
     """Write settings into a folder, which is made if there is none.
 
     Raises:
@@ -125,7 +125,7 @@ def note_settings(out: Path, settings: str) -> None:
     (out / SETTINGS).write_text(settings + "\n", encoding="utf-8")
 
 
-def read_settings(folder: Path) -> tuple[Source, Config]:
+def read_training_settings(folder: Path) -> tuple[Source, Config]:
     """Source and settings of the training in a folder.
 
     Raises:

@@ -20,10 +20,10 @@ import typer
 
 from training.imitation.algorithms.config import Config
 from training.imitation.datasets import Source
-from training.imitation.run_folder import COLOURS, train_driver
+from training.imitation.run_folder import NOISES, train_driver
 
 
-class Method(str, Enum):
+class AlgorithmOption(str, Enum):
     """Ways to learn."""
 
     BC = "bc"
@@ -31,21 +31,21 @@ class Method(str, Enum):
     MGAIL = "mgail"
 
 
-class Noise(str, Enum):
+class NoiseOption(str, Enum):
     """Colours of the drivers' noise."""
 
     HUMAN = "human"
     WHITE = "white"
 
 
-D = Config()
+DEFAULTS = Config()
 Count = Annotated[int, typer.Option(min=1)]
 Number = Annotated[float, typer.Option()]
-Whole = Annotated[tuple[int, int], typer.Option(help="First and last value.")]
-Ends = Annotated[tuple[float, float], typer.Option(help="First and last value.")]
+TickRange = Annotated[tuple[int, int], typer.Option(help="First and last value.")]
+WeightRange = Annotated[tuple[float, float], typer.Option(help="First and last value.")]
 
 
-def command(
+def main(
     out: Annotated[Path, typer.Option(help="Folder; a training that was stopped in it is taken up.")],
     data: Annotated[Path | None, typer.Option(help="Folder with the compact tables of US 101.")] = None,
     ngsim: Annotated[Path | None, typer.Option(help="Or a raw NGSIM file, CSV or text.")] = None,
@@ -54,52 +54,52 @@ def command(
     recording: Annotated[list[str] | None, typer.Option(help="Of highD, such as 01; may be repeated.")] = None,
     seconds: Annotated[float, typer.Option(help="Length of the scenes of such files [s].")] = Source.seconds,
     log: Annotated[bool, typer.Option("--log", help="Write TensorBoard logs into the folder.")] = False,
-    method: Annotated[Method, typer.Option(help="How to learn.")] = Method.MGAIL,
-    seed: Annotated[int, typer.Option(help="The same seed gives the same weights.")] = D.seed,
-    updates: Annotated[int, typer.Option(min=1, help="After behaviour cloning.")] = D.updates,
-    noise: Annotated[Noise, typer.Option(help="Coloured as people's, or white.")] = Noise.HUMAN,
-    epochs: Annotated[int, typer.Option(min=0, help="Of behaviour cloning.")] = D.epochs,
-    batch: Count = D.batch,
-    clone_rate: Number = D.clone_rate,
-    weight_decay: Number = D.weight_decay,
-    log_std_cap: Number = D.log_std_cap,
-    lateral_weight: Count = D.lateral_weight,
-    pools: Count = D.pools,
-    scenes: Count = D.scenes,
-    horizon: Whole = D.horizon,
-    age: Whole = D.age,
-    drivers: Whole = D.drivers,
-    critic_weight: Number = D.critic_weight,
-    clone_weight: Ends = D.clone_weight,
-    anneal: Number = D.anneal,
-    collision_weight: Number = D.collision_weight,
-    edge_weight: Number = D.edge_weight,
-    brake_weight: Number = D.brake_weight,
-    headway_weight: Number = D.headway_weight,
-    lane_weight: Number = D.lane_weight,
-    speed_weight: Number = D.speed_weight,
-    policy_rate: Number = D.policy_rate,
-    critic_rate: Number = D.critic_rate,
-    last_rate: Number = D.last_rate,
-    critic_steps: Count = D.critic_steps,
-    critic_batch: Count = D.critic_batch,
-    memory: Count = D.memory,
-    warm_up: Annotated[int, typer.Option(min=0, help="Rounds of the critic alone.")] = D.warm_up,
-    gradient_penalty: Number = D.gradient_penalty,
-    credit: Number = D.credit,
-    learned_model: Annotated[bool, typer.Option(help="MGAIL: gradient of a learned model.")] = D.learned_model,
-    model_rate: Number = D.model_rate,
-    model_steps: Count = D.model_steps,
-    discount: Number = D.discount,
-    gae: Number = D.gae,
-    clip: Number = D.clip,
-    ppo_epochs: Count = D.ppo_epochs,
-    ppo_batch: Count = D.ppo_batch,
-    value_rate: Number = D.value_rate,
+    method: Annotated[AlgorithmOption, typer.Option(help="How to learn.")] = AlgorithmOption.MGAIL,
+    seed: Annotated[int, typer.Option(help="The same seed gives the same weights.")] = DEFAULTS.seed,
+    updates: Annotated[int, typer.Option(min=1, help="After behaviour cloning.")] = DEFAULTS.updates,
+    noise: Annotated[NoiseOption, typer.Option(help="Coloured as people's, or white.")] = NoiseOption.HUMAN,
+    epochs: Annotated[int, typer.Option(min=0, help="Of behaviour cloning.")] = DEFAULTS.epochs,
+    batch: Count = DEFAULTS.batch,
+    clone_rate: Number = DEFAULTS.clone_rate,
+    weight_decay: Number = DEFAULTS.weight_decay,
+    log_std_cap: Number = DEFAULTS.log_std_cap,
+    lateral_weight: Count = DEFAULTS.lateral_weight,
+    pools: Count = DEFAULTS.pools,
+    scenes: Count = DEFAULTS.scenes,
+    horizon: TickRange = DEFAULTS.horizon,
+    age: TickRange = DEFAULTS.age,
+    drivers: TickRange = DEFAULTS.drivers,
+    critic_weight: Number = DEFAULTS.critic_weight,
+    clone_weight: WeightRange = DEFAULTS.clone_weight,
+    anneal: Number = DEFAULTS.anneal,
+    collision_weight: Number = DEFAULTS.collision_weight,
+    edge_weight: Number = DEFAULTS.edge_weight,
+    brake_weight: Number = DEFAULTS.brake_weight,
+    headway_weight: Number = DEFAULTS.headway_weight,
+    lane_weight: Number = DEFAULTS.lane_weight,
+    speed_weight: Number = DEFAULTS.speed_weight,
+    policy_rate: Number = DEFAULTS.policy_rate,
+    critic_rate: Number = DEFAULTS.critic_rate,
+    last_rate: Number = DEFAULTS.last_rate,
+    critic_steps: Count = DEFAULTS.critic_steps,
+    critic_batch: Count = DEFAULTS.critic_batch,
+    memory: Count = DEFAULTS.memory,
+    warm_up: Annotated[int, typer.Option(min=0, help="Rounds of the critic alone.")] = DEFAULTS.warm_up,
+    gradient_penalty: Number = DEFAULTS.gradient_penalty,
+    credit: Number = DEFAULTS.credit,
+    learned_model: Annotated[bool, typer.Option(help="MGAIL: gradient of a learned model.")] = DEFAULTS.learned_model,
+    model_rate: Number = DEFAULTS.model_rate,
+    model_steps: Count = DEFAULTS.model_steps,
+    discount: Number = DEFAULTS.discount,
+    gae: Number = DEFAULTS.gae,
+    clip: Number = DEFAULTS.clip,
+    ppo_epochs: Count = DEFAULTS.ppo_epochs,
+    ppo_batch: Count = DEFAULTS.ppo_batch,
+    value_rate: Number = DEFAULTS.value_rate,
 ) -> None:
     """Train a driver from recorded traffic. training/imitation/algorithms/config.py says what the settings mean."""
     words: dict[str, Any] = dict(locals())
-    words |= {"method": method.value, "colour": COLOURS[noise.value]}
+    words |= {"method": method.value, "colour": NOISES[noise.value]}
     torch.set_num_threads(1)  # at these sizes more threads cost more than they give
     try:
         source = source_of(data, ngsim, highd, location, recording, seconds)
@@ -132,5 +132,5 @@ def source_of(
 
 if __name__ == "__main__":
     app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-    app.command()(command)
+    app.command()(main)
     app()

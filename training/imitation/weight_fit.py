@@ -20,7 +20,8 @@ import numpy as np
 from sklearn.covariance import graphical_lasso
 from sklearn.exceptions import ConvergenceWarning
 
-from agents.learned.weight_distribution import RADIUS, WEIGHT_NAMES, Array, WeightDistribution
+from agents.learned.weight_distribution import RADIUS, WEIGHT_NAMES, WeightDistribution
+from samplers.problem import FloatArray
 
 PENALTIES = (0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.25, 0.2, 0.15, 0.1)
 """Tried in this order, on correlations; with a quarter of the identity mixed in the first keeps no dependence."""
@@ -46,7 +47,7 @@ class WeightFit(NamedTuple):
 
 
 def fit_weights(
-    members: Array,
+    members: FloatArray,
     *,
     radius: float = RADIUS,
     penalties: Sequence[float] = PENALTIES,
@@ -88,12 +89,16 @@ def fit_weights(
     for penalty in penalties:
         try:
             precision = _lasso(everyone.correlation, penalty)
-            laws = [_law(part, _lasso(part.correlation, penalty), radius) for part in without]
+            laws = [_to_distribution(part, _lasso(part.correlation, penalty), radius) for part in without]
         except _FAILURES as failure:
             stopped = f"penalty {penalty} failed: {' '.join(str(failure).split())[:120]}"
             break
         scores = np.concatenate([law.log_prob(members[fold]) for law, fold in zip(laws, held_out, strict=True)])
-        row = {"penalty": float(penalty), "held_out_log_likelihood": float(scores.mean()), **_shape_of(precision)}
+        row = {
+            "penalty": float(penalty),
+            "held_out_log_likelihood": float(scores.mean()),
+            **_describe_precision(precision),
+        }
         if chosen is None or row["held_out_log_likelihood"] > max(r["held_out_log_likelihood"] for r in tried):
             chosen = row, precision
         tried.append(row)
@@ -110,18 +115,18 @@ def fit_weights(
         "stopped": stopped,
         "tried": tried,
     }
-    return WeightFit(_law(everyone, precision, radius), metadata)
+    return WeightFit(_to_distribution(everyone, precision, radius), metadata)
 
 
 class _Moments(NamedTuple):
-    mean: Array
-    spread: Array
+    mean: FloatArray
+    spread: FloatArray
     """Standard deviations."""
-    correlation: Array
+    correlation: FloatArray
     """Drawn towards the identity."""
 
 
-def _moments(members: Array, shrinkage: float, names: Sequence[str]) -> _Moments:
+def _moments(members: FloatArray, shrinkage: float, names: Sequence[str]) -> _Moments:
     inert = ~np.isfinite(members).all(axis=0) | (members == members[0]).all(axis=0)
     if inert.any():
         some = ", ".join(names[j] for j in np.flatnonzero(inert)[:5])
@@ -137,7 +142,7 @@ def _moments(members: Array, shrinkage: float, names: Sequence[str]) -> _Moments
     return _Moments(mean, spread, correlation)
 
 
-def _lasso(correlation: Array, penalty: float) -> Array:
+def _lasso(correlation: FloatArray, penalty: float) -> FloatArray:
     """Sparse precision of standardised weights.
 
     Raises:
@@ -145,11 +150,11 @@ def _lasso(correlation: Array, penalty: float) -> Array:
     """
     for tolerance in INNER_TOLERANCES[:-1]:
         with contextlib.suppress(*_FAILURES):
-            return _solved(correlation, penalty, tolerance)
-    return _solved(correlation, penalty, INNER_TOLERANCES[-1])
+            return _solve_lasso(correlation, penalty, tolerance)
+    return _solve_lasso(correlation, penalty, INNER_TOLERANCES[-1])
 
 
-def _solved(correlation: Array, penalty: float, tolerance: float) -> Array:
+def _solve_lasso(correlation: FloatArray, penalty: float, tolerance: float) -> FloatArray:
     state = np.random.get_state()  # noqa: NPY002 - scikit-learn draws a number that nothing depends on
     try:
         with warnings.catch_warnings():
@@ -161,10 +166,10 @@ def _solved(correlation: Array, penalty: float, tolerance: float) -> Array:
     return np.asarray(precision, dtype=np.float64)
 
 
-def _law(moments: _Moments, precision: Array, radius: float) -> WeightDistribution:
+def _to_distribution(moments: _Moments, precision: FloatArray, radius: float) -> WeightDistribution:
     return WeightDistribution(moments.mean, precision / np.outer(moments.spread, moments.spread), radius)
 
 
-def _shape_of(precision: Array) -> dict[str, float]:
+def _describe_precision(precision: FloatArray) -> dict[str, float]:
     beside = precision[~np.eye(len(precision), dtype=bool)]
     return {"nonzeros": float((beside != 0.0).mean()), "condition": float(np.linalg.cond(precision))}

@@ -12,13 +12,11 @@ from numpy.typing import NDArray
 from pyarrow import ArrowInvalid, csv
 
 from rare_envs.distributions.space import Parameter
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from samplers.problem import FloatArray
 
 
 @dataclass(frozen=True)
-class Recipe:
+class EventRecipe:
     """Where the parameters of a scenario are found in an events file."""
 
     file: str
@@ -34,9 +32,9 @@ class Recipe:
     """Rows kept by the column `phase`; None where the file has no such column."""
 
 
-RECIPES = {
-    "car_following": Recipe("us101_car_following_events.csv", ("v_ego", "v_lead", "gap")),
-    "cut_in": Recipe(
+EVENT_RECIPES = {
+    "car_following": EventRecipe("us101_car_following_events.csv", ("v_ego", "v_lead", "gap")),
+    "cut_in": EventRecipe(
         "us101_cut_in_events.csv",
         ("v_ego", "v_cutin", "v_lead", "gap_ego_cutin", "gap_cutin_lead", "lateral_offset"),
         apart=("lateral_offset",),
@@ -47,7 +45,7 @@ RECIPES = {
         phase="start",
     ),
 }
-REASONS = {
+FILTER_REASONS = {
     "missing": "no ego behind or no lead ahead was recorded, so the parameter has no value",
     "start_seen": "the track began during the lane change: speeds and gaps are as good as any, but the vehicle had "
     "already moved across",
@@ -59,7 +57,7 @@ REASONS = {
 }
 
 
-def read_events(path: Path, recipe: Recipe) -> dict[str, NDArray[Any]]:
+def read_events(path: Path, recipe: EventRecipe) -> dict[str, NDArray[Any]]:
     """Columns of an events file, numbers as float64 with NaN where a value is missing.
 
     Raises:
@@ -78,8 +76,8 @@ def read_events(path: Path, recipe: Recipe) -> dict[str, NDArray[Any]]:
 
 
 def filter_events(
-    events: Mapping[str, NDArray[Any]], recipe: Recipe, box: Sequence[Parameter]
-) -> tuple[tuple[Array, Array], list[dict[str, Any]]]:
+    events: Mapping[str, NDArray[Any]], recipe: EventRecipe, box: Sequence[Parameter]
+) -> tuple[tuple[FloatArray, FloatArray], list[dict[str, Any]]]:
     """Usable events and what each filter dropped.
 
     Returns:
@@ -92,25 +90,25 @@ def filter_events(
         keep &= events["phase"] == recipe.phase
     log: list[dict[str, Any]] = [{"rule": "events read", "events": int(keep.sum())}]
 
-    def apply(rule: str, reason: str, passes: Mask) -> None:
+    def apply(rule: str, reason: str, passes: NDArray[np.bool_]) -> None:
         dropped = int((keep & ~passes).sum())
         log.append({"rule": rule, "reason": reason, "dropped": dropped})
         np.logical_and(keep, passes, out=keep)
 
     def apply_range(column: str, p: Parameter) -> None:
         inside = (events[column] >= p.low) & (events[column] <= p.high)
-        reason = REASONS.get(p.name, REASONS[p.unit])
+        reason = FILTER_REASONS.get(p.name, FILTER_REASONS[p.unit])
         apply(f"{p.low:g} <= {column} <= {p.high:g} {p.unit}", reason, inside)
 
     joint = recipe.columns[: len(recipe.columns) - len(recipe.apart)]
     for column in recipe.columns:
-        apply(f"{column} is given", REASONS["missing"], ~np.isnan(events[column]))
+        apply(f"{column} is given", FILTER_REASONS["missing"], ~np.isnan(events[column]))
     for column, p in zip(joint, box, strict=False):
         apply_range(column, p)
     log.append({"rule": "events used", "columns": list(joint), "events": int(keep.sum())})
     together = np.column_stack([events[column][keep] for column in joint])
     for column in recipe.required:
-        apply(column, REASONS[column], events[column].astype(bool))
+        apply(column, FILTER_REASONS[column], events[column].astype(bool))
     for column, p in zip(recipe.apart, box[len(joint) :], strict=True):
         apply_range(column, p)
     if recipe.apart:

@@ -26,27 +26,27 @@ import typer
 
 from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
 from rare_envs.scenarios.registry import named
-from training.data.events import EXTRACTORS, Events, pooled, write_events
+from training.data.events import EXTRACTORS, Events, concatenate_events, write_events
 from training.data.highd import highd_recordings, load_highd
 from training.data.ngsim import load_ngsim
 from training.data.text_columns import Gaps
 from training.data.trajectories import Trajectories
-from training.scenario_fitting.event_filters import RECIPES, Recipe, filter_events, read_events
+from training.scenario_fitting.event_filters import EVENT_RECIPES, EventRecipe, filter_events, read_events
 from training.scenario_fitting.mixture import (
     COVARIANCE_FLOOR,
+    EM_STARTS,
     EVENTS_PER_COMPONENT,
-    RESTARTS,
     SMALLEST_COMPONENT,
-    Fit,
-    beside,
+    MixtureFit,
+    append_independent,
     fit_mixture,
     mass_outside,
 )
-from training.scenario_fitting.published_highway import highway_base
+from training.scenario_fitting.published_highway import build_highway_base
 
-COMMAND = "python -m training.scenario_fitting.fit --data DIR --out rare_envs/data"
+US101_COMMAND = "python -m training.scenario_fitting.fit --data DIR --out rare_envs/data"
 OWN_COMMAND = "python -m training.scenario_fitting.fit, with --highd or --ngsim"
-SOURCE = {
+US101_SOURCE = {
     "data": "Next Generation Simulation (NGSIM) Vehicle Trajectories and Supporting Data, US 101 "
     "(Los Angeles, southbound, 15 June 2005, 07:50 local time, congested)",
     "publisher": "U.S. Department of Transportation, Federal Highway Administration (FHWA)",
@@ -57,7 +57,7 @@ SOURCE = {
 }
 
 
-def base_file(
+def format_base(
     scenario: str,
     mixture: TruncatedGaussianMixture,
     provenance: Mapping[str, Any],
@@ -81,14 +81,14 @@ def base_file(
     return json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-def us101_base(scenario: str, data: Path, seed: int = 0, recipe: Recipe | None = None) -> str:
-    """Fits one scenario to the US 101 events and returns the text of its file; by its recipe in `RECIPES` if None."""
-    recipe = RECIPES[scenario] if recipe is None else recipe
-    return fitted_base(scenario, data / recipe.file, SOURCE, COMMAND, seed, recipe)
+def fit_us101_base(scenario: str, data: Path, seed: int = 0, recipe: EventRecipe | None = None) -> str:
+    """Return the text of the base file of a scenario fitted to the events of US 101; `EVENT_RECIPES` has its recipe."""
+    recipe = EVENT_RECIPES[scenario] if recipe is None else recipe
+    return fit_base(scenario, data / recipe.file, US101_SOURCE, US101_COMMAND, seed, recipe)
 
 
-def fitted_base(
-    scenario: str, path: Path, source: Mapping[str, str], command: str, seed: int = 0, recipe: Recipe | None = None
+def fit_base(
+    scenario: str, path: Path, source: Mapping[str, str], command: str, seed: int = 0, recipe: EventRecipe | None = None
 ) -> str:
     """Fits one scenario to a file of events and returns the text of its file.
 
@@ -98,12 +98,12 @@ def fitted_base(
         source: Where the events come from, and under which licence.
         command: What writes the file.
         seed: Of the fits.
-        recipe: What of the events is fitted; the one in `RECIPES` if None.
+        recipe: What of the events is fitted; the one in `EVENT_RECIPES` if None.
 
     Raises:
         ValueError: The events cannot be read, or are too few.
     """
-    recipe, box = RECIPES[scenario] if recipe is None else recipe, named(scenario).parameters
+    recipe, box = EVENT_RECIPES[scenario] if recipe is None else recipe, named(scenario).parameters
     (together, own), log = filter_events(read_events(path, recipe), recipe, box)
     low, high = (np.array([getattr(p, end) for p in box]) for end in ("low", "high"))
     chosen = np.array([column in recipe.logarithmic for column in recipe.columns])
@@ -115,15 +115,17 @@ def fitted_base(
         mixture = fit.mixture
         if recipe.apart:
             own_fit = fit_mixture(own, bottom[joint:], top[joint:], seed, most=1)
-            mixture = beside(mixture, own_fit.mixture)
+            mixture = append_independent(mixture, own_fit.mixture)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     box_of_x = {"low": low.tolist(), "high": high.tolist(), "logarithmic": chosen.tolist()} if chosen.any() else {}
     origin = {"source": source, "file": path.name, "command": command}
-    return base_file(scenario, mixture, _provenance(recipe, log, fit, seed, origin), box_of_x)
+    return format_base(scenario, mixture, _provenance(recipe, log, fit, seed, origin), box_of_x)
 
 
-def _provenance(recipe: Recipe, log: Sequence[Any], fit: Fit, seed: int, origin: Mapping[str, Any]) -> dict[str, Any]:
+def _provenance(
+    recipe: EventRecipe, log: Sequence[Any], fit: MixtureFit, seed: int, origin: Mapping[str, Any]
+) -> dict[str, Any]:
     return {
         "kind": "fitted to recorded events",
         "source": origin["source"],
@@ -144,7 +146,7 @@ def _provenance(recipe: Recipe, log: Sequence[Any], fit: Fit, seed: int, origin:
         ],
         "settings": {
             "covariance_floor": COVARIANCE_FLOOR,
-            "restarts": RESTARTS,
+            "restarts": EM_STARTS,
             "events_per_component_and_dimension": EVENTS_PER_COMPONENT,
             "smallest_component_per_dimension": SMALLEST_COMPONENT,
             "seed": seed,
@@ -154,7 +156,9 @@ def _provenance(recipe: Recipe, log: Sequence[Any], fit: Fit, seed: int, origin:
     }
 
 
-def own_bases(tables: Iterable[Trajectories], scenarios: Sequence[str], out: Path, name: str, seed: int = 0) -> None:
+def fit_own_bases(
+    tables: Iterable[Trajectories], scenarios: Sequence[str], out: Path, name: str, seed: int = 0
+) -> None:
     """Extracts the events of recordings and fits scenarios to them.
 
     Writes `<scenario>_events.csv` and `<scenario>_<name>.json` into a folder; `load_base` reads the latter.
@@ -171,15 +175,15 @@ def own_bases(tables: Iterable[Trajectories], scenarios: Sequence[str], out: Pat
     source = {
         "data": f"recordings {', '.join(sorted(names))}",
         "licence": "that of the recordings; parameters derived from them may fall under it",
-        "changes": SOURCE["changes"],
+        "changes": US101_SOURCE["changes"],
     }
     files = {scenario: out / f"{scenario}_events.csv" for scenario in scenarios}
     for scenario, path in files.items():
-        write_events(pooled([events[scenario] for events in parts]), path)
+        write_events(concatenate_events([events[scenario] for events in parts]), path)
         typer.echo(path)
     for scenario, path in files.items():
         base = out / f"{scenario}_{name}.json"
-        base.write_text(fitted_base(scenario, path, source, OWN_COMMAND, seed), encoding="utf-8")
+        base.write_text(fit_base(scenario, path, source, OWN_COMMAND, seed), encoding="utf-8")
         typer.echo(base)
 
 
@@ -198,27 +202,27 @@ def main(
     try:
         if sum(source is not None for source in (data, highd, ngsim)) != 1:
             raise ValueError("Give one of --data, --highd and --ngsim.")
-        chosen = tuple(scenario or RECIPES)
-        if unknown := sorted(set(chosen) - set(RECIPES)):
-            raise ValueError(f"Unknown scenario {unknown[0]}; known are {', '.join(RECIPES)}.")
+        chosen = tuple(scenario or EVENT_RECIPES)
+        if unknown := sorted(set(chosen) - set(EVENT_RECIPES)):
+            raise ValueError(f"Unknown scenario {unknown[0]}; known are {', '.join(EVENT_RECIPES)}.")
         gaps: Gaps = "cut" if cut_gaps else "error"
         if highd is not None:
             tables = (load_highd(highd, recording, gaps=gaps) for recording in highd_recordings(highd))
-            own_bases(tables, chosen, out, name, seed)
+            fit_own_bases(tables, chosen, out, name, seed)
         elif ngsim is not None:
-            own_bases([load_ngsim(ngsim, location=location, gaps=gaps)], chosen, out, name, seed)
+            fit_own_bases([load_ngsim(ngsim, location=location, gaps=gaps)], chosen, out, name, seed)
         elif data is not None:
-            _package_bases(data, out, seed)
+            _write_package_bases(data, out, seed)
     except (OSError, ValueError) as error:
         typer.echo(f"Error: {error}", err=True)
         raise typer.Exit(2) from None
 
 
-def _package_bases(data: Path, out: Path, seed: int) -> None:
+def _write_package_bases(data: Path, out: Path, seed: int) -> None:
     texts = {}
-    for scenario in RECIPES:
-        texts[f"{scenario}_us101.json"] = us101_base(scenario, data, seed)
-        texts[f"{scenario}_highway.json"] = base_file(scenario, *highway_base(scenario))
+    for scenario in EVENT_RECIPES:
+        texts[f"{scenario}_us101.json"] = fit_us101_base(scenario, data, seed)
+        texts[f"{scenario}_highway.json"] = format_base(scenario, *build_highway_base(scenario))
     out.mkdir(parents=True, exist_ok=True)
     for name, text in texts.items():
         (out / name).write_text(text, encoding="utf-8")

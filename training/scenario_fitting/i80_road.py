@@ -16,24 +16,22 @@ from typing import Annotated
 import numpy as np
 import torch
 import typer
-from numpy.typing import NDArray
 from pyarrow import ArrowInvalid, csv
 from scipy.optimize import least_squares
 
 from rare_envs.traffic.reference_line import Curve
 from rare_envs.traffic.road import Road
+from samplers.problem import FloatArray
 
-Array = NDArray[np.float64]
-
-COMMAND = "python -m training.scenario_fitting.i80_road FOLDER"
-SOURCE = (
+ROAD_COMMAND = "python -m training.scenario_fitting.i80_road FOLDER"
+SURVEY_SOURCE = (
     "Survey drawings of the NGSIM I-80 study section, Emeryville, California (FHWA), as released with "
     "travelbureau/RareSim (MIT licence); fitted by a curve with piecewise linear curvature and constant lane offsets."
 )
-LANES = 6
-SPACING = 50.0
+SURVEY_LANES = 6
+KNOT_SPACING = 50.0
 """Between knots of the curvature [m]; with half of it the fit is 1 cm better and the curvature twice as uneven."""
-LENGTH = 700.0
+CURVE_LENGTH = 700.0
 """Of the curve [m]: the survey's, rounded up to whole knots."""
 SURVEYED = 650.0
 """Up to here [m] all lanes and lines were surveyed."""
@@ -41,7 +39,7 @@ THINNING = 3
 """Every third point of the survey is fitted; they are 1.5 m apart."""
 
 
-def read_lines(path: Path, key: str) -> list[Array]:
+def read_lines(path: Path, key: str) -> list[FloatArray]:
     """The lines of a survey file, shape (n, 2) each, in the order of their numbers.
 
     Raises:
@@ -54,42 +52,42 @@ def read_lines(path: Path, key: str) -> list[Array]:
         number, x, y = (np.asarray(table[name], dtype=np.float64) for name in (key, "x", "y"))
     except (OSError, ArrowInvalid, KeyError) as error:
         raise ValueError(f"Cannot read {path}: {error}") from None
-    if np.unique(number).tolist() != list(range(LANES)) or not np.isfinite(x + y).all():
-        raise ValueError(f"{path}: expected {key} 0 to {LANES - 1} and numbers x and y in every row.")
+    if np.unique(number).tolist() != list(range(SURVEY_LANES)) or not np.isfinite(x + y).all():
+        raise ValueError(f"{path}: expected {key} 0 to {SURVEY_LANES - 1} and numbers x and y in every row.")
     points = np.column_stack((x, y))
-    return [points[number == k] for k in range(LANES)]
+    return [points[number == k] for k in range(SURVEY_LANES)]
 
 
-def in_frame(points: Array, origin: Array, angle: float) -> Array:
+def to_frame(points: FloatArray, origin: FloatArray, angle: float) -> FloatArray:
     """Survey coordinates to the frame at `origin` with x in direction `angle` and y to the right."""
     cos, sin = np.cos(angle), np.sin(angle)
     dx, dy = (points - origin).T
     return np.column_stack((dx * cos + dy * sin, dx * sin - dy * cos))
 
 
-def along_and_across(curve: Curve, points: Array) -> tuple[Array, Array]:
+def to_road_coordinates(curve: Curve, points: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Road coordinates of points, shape (n,) each."""
     x, y = torch.from_numpy(points).unbind(dim=1)
     s, across, _ = Road((-1.0, 1.0), curve).from_world(x, y, torch.zeros_like(x))
     return s.numpy(), across.numpy()
 
 
-def fit(lanes: list[Array]) -> tuple[Curve, Array, float]:
+def fit_reference_line(lanes: list[FloatArray]) -> tuple[Curve, FloatArray, float]:
     """The reference line, and origin and angle of its frame in the survey's."""
     leftmost = lanes[-1]
     origin = leftmost[0]
     angle = float(np.arctan2(*(leftmost[len(leftmost) // 10] - origin)[::-1]))
-    fitted = [in_frame(lane[::THINNING], origin, angle) for lane in lanes[1:]]
-    knots = round(LENGTH / SPACING) - 1
+    fitted = [to_frame(lane[::THINNING], origin, angle) for lane in lanes[1:]]
+    knots = round(CURVE_LENGTH / KNOT_SPACING) - 1
 
-    def unpack(z: Array) -> tuple[Curve, Array, float, Array]:
+    def unpack(z: FloatArray) -> tuple[Curve, FloatArray, float, FloatArray]:
         """Unknowns of order 1: curvatures [1e-4/m], turn [0.01 rad] and shift [m] of the frame, offsets [m]."""
-        curve = Curve(SPACING, (0.0, *(1e-4 * z[:knots]).tolist(), 0.0))
+        curve = Curve(KNOT_SPACING, (0.0, *(1e-4 * z[:knots]).tolist(), 0.0))
         return curve, np.array([0.0, z[knots + 1]]), 0.01 * z[knots], np.append(z[knots + 2 :], 0.0)
 
-    def residuals(z: Array) -> Array:
+    def residuals(z: FloatArray) -> FloatArray:
         curve, start, turn, offsets = unpack(z)
-        across = [along_and_across(curve, turned(lane, start, turn))[1] for lane in fitted]
+        across = [to_road_coordinates(curve, rotate_points(lane, start, turn))[1] for lane in fitted]
         return np.concatenate([y - offset for y, offset in zip(across, offsets, strict=True)])
 
     guess = [float(lane[0, 1]) for lane in fitted[:-1]]
@@ -98,30 +96,30 @@ def fit(lanes: list[Array]) -> tuple[Curve, Array, float]:
     return curve, origin + start[1] * right, angle - turn
 
 
-def turned(points: Array, start: Array, turn: float) -> Array:
+def rotate_points(points: FloatArray, start: FloatArray, turn: float) -> FloatArray:
     """Points in a frame that starts elsewhere and is turned to the right."""
     cos, sin = np.cos(turn), np.sin(turn)
     dx, dy = (points - start).T
     return np.column_stack((dx * cos + dy * sin, dy * cos - dx * sin))
 
 
-def lane_edges(lines: list[Array], rightmost: Array, curve: Curve) -> list[float]:
+def fit_lane_edges(lines: list[FloatArray], rightmost: FloatArray, curve: Curve) -> list[float]:
     """Lane edges from left to right, their y [m].
 
     The edge on the right was not surveyed: it is as far from the rightmost lane's median as the line on its left.
     """
 
-    def typical(points: Array) -> float:
-        s, y = along_and_across(curve, points)
+    def typical(points: FloatArray) -> float:
+        s, y = to_road_coordinates(curve, points)
         return float(np.median(y[(s >= 0.0) & (s <= SURVEYED)]))
 
     edges = [typical(line) for line in reversed(lines)]
     return [*edges, 2.0 * typical(rightmost) - edges[-1]]
 
 
-def report(name: str, points: Array, curve: Curve, expected: float) -> str:
+def describe_residuals(name: str, points: FloatArray, curve: Curve, expected: float) -> str:
     """One line on how far surveyed points are from where the road has them."""
-    s, y = along_and_across(curve, points)
+    s, y = to_road_coordinates(curve, points)
     error = y[(s >= 0.0) & (s <= SURVEYED)] - expected
     rms, largest = float(np.sqrt(np.mean(error**2))), float(np.abs(error).max())
     return f"{name} at y = {expected:7.3f} m: off by {rms:.3f} m rms, {largest:.3f} m at most"
@@ -137,18 +135,18 @@ def main(
     except ValueError as error:
         typer.echo(f"Error: {error}", err=True)
         raise typer.Exit(2) from None
-    curve, origin, angle = fit(lanes)
-    curve = Curve(SPACING, tuple(round(k, 9) for k in curve.curvature))
-    lanes, lines = ([in_frame(points, origin, angle) for points in group] for group in (lanes, lines))
-    road = Road(tuple(round(y, 3) for y in lane_edges(lines, lanes[0], curve)), curve)
-    for k in range(LANES):
-        typer.echo(report(f"left line of lane {k}", lines[LANES - 1 - k], curve, road.edges[k]))
-    for k in range(LANES):
-        typer.echo(report(f"centre of lane {k}", lanes[LANES - 1 - k], curve, road.centre(k)))
+    curve, origin, angle = fit_reference_line(lanes)
+    curve = Curve(KNOT_SPACING, tuple(round(k, 9) for k in curve.curvature))
+    lanes, lines = ([to_frame(points, origin, angle) for points in group] for group in (lanes, lines))
+    road = Road(tuple(round(y, 3) for y in fit_lane_edges(lines, lanes[0], curve)), curve)
+    for k in range(SURVEY_LANES):
+        typer.echo(describe_residuals(f"left line of lane {k}", lines[SURVEY_LANES - 1 - k], curve, road.edges[k]))
+    for k in range(SURVEY_LANES):
+        typer.echo(describe_residuals(f"centre of lane {k}", lanes[SURVEY_LANES - 1 - k], curve, road.centre(k)))
     table = {
-        "source": SOURCE,
-        "command": COMMAND,
-        "spacing": SPACING,
+        "source": SURVEY_SOURCE,
+        "command": ROAD_COMMAND,
+        "spacing": KNOT_SPACING,
         "edges": road.edges,
         "curvature": curve.curvature,
     }

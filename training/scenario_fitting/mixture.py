@@ -6,24 +6,22 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr
 from sklearn.mixture import GaussianMixture
 
 from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
-
-Array = NDArray[np.float64]
+from samplers.problem import FloatArray
 
 MAX_COMPONENTS = 5
 EVENTS_PER_COMPONENT = 10  # times d: no more components are tried than there are events for
 SMALLEST_COMPONENT = 5  # times d: a component on fewer events has collapsed on a handful of them
 COVARIANCE_FLOOR = 0.01  # added to variances of standardised data: a tenth of a standard deviation
-RESTARTS = 20
+EM_STARTS = 20
 MASS_SAMPLES = 1_000_000
 
 
 @dataclass(frozen=True)
-class Candidate:
+class MixtureCandidate:
     """One number of components that was tried."""
 
     components: int
@@ -35,18 +33,20 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class Fit:
+class MixtureFit:
     """A fitted base distribution and how it was chosen."""
 
     mixture: TruncatedGaussianMixture
-    candidates: tuple[Candidate, ...]
+    candidates: tuple[MixtureCandidate, ...]
 
 
-def fit_mixture(points: Array, low: Array, high: Array, seed: int = 0, most: int = MAX_COMPONENTS) -> Fit:
+def fit_mixture(
+    points: FloatArray, low: FloatArray, high: FloatArray, seed: int = 0, most: int = MAX_COMPONENTS
+) -> MixtureFit:
     """Gaussian mixture chosen by BIC, cut to a box.
 
     For K = 1, 2, ... while there are `EVENTS_PER_COMPONENT` d events per component: expectation
-    maximisation on standardised data from `RESTARTS` seeded starts, with a floor under the
+    maximisation on standardised data from `EM_STARTS` seeded starts, with a floor under the
     covariances. Fits with a component of fewer than `SMALLEST_COMPONENT` d events are rejected.
 
     Args:
@@ -67,36 +67,38 @@ def fit_mixture(points: Array, low: Array, high: Array, seed: int = 0, most: int
         raise ValueError(f"Parameter {int(np.argmin(scale))} is the same in all {n} events.")
     standard = (points - centre) / scale
     most = int(np.clip(n // (EVENTS_PER_COMPONENT * d), 1, most))
-    models = [_expectation_maximisation(standard, k, seed) for k in range(1, most + 1)]
+    models = [_run_em(standard, k, seed) for k in range(1, most + 1)]
     candidates = tuple(_assess(model, standard) for model in models)
     accepted = [i for i, candidate in enumerate(candidates) if candidate.accepted]
     best = models[min(accepted, key=lambda i: candidates[i].bic)]
     covariances = best.covariances_ * np.outer(scale, scale)
-    mixture = _rounded(best.weights_, centre + best.means_ * scale, covariances, low, high)
-    return Fit(mixture, candidates)
+    mixture = _round_mixture(best.weights_, centre + best.means_ * scale, covariances, low, high)
+    return MixtureFit(mixture, candidates)
 
 
-def _expectation_maximisation(standard: Array, components: int, seed: int) -> Any:
+def _run_em(standard: FloatArray, components: int, seed: int) -> Any:
     model = GaussianMixture(
         components,
         covariance_type="full",
         tol=1e-6,
         reg_covar=COVARIANCE_FLOOR,
         max_iter=5000,
-        n_init=RESTARTS,
+        n_init=EM_STARTS,
         random_state=seed,
     )
     return model.fit(standard)
 
 
-def _assess(model: Any, standard: Array) -> Candidate:
+def _assess(model: Any, standard: FloatArray) -> MixtureCandidate:
     n, d = standard.shape
     smallest = float(model.weights_.min() * n)
     accepted = model.n_components == 1 or smallest >= SMALLEST_COMPONENT * d
-    return Candidate(model.n_components, float(model.bic(standard)), smallest, accepted)
+    return MixtureCandidate(model.n_components, float(model.bic(standard)), smallest, accepted)
 
 
-def _rounded(weights: Array, means: Array, covariances: Array, low: Array, high: Array) -> TruncatedGaussianMixture:
+def _round_mixture(
+    weights: FloatArray, means: FloatArray, covariances: FloatArray, low: FloatArray, high: FloatArray
+) -> TruncatedGaussianMixture:
     """The mixture to six significant digits, heaviest component first.
 
     More digits would say nothing about the traffic and differ between machines.
@@ -105,15 +107,17 @@ def _rounded(weights: Array, means: Array, covariances: Array, low: Array, high:
     shares = np.round(weights[order], 6)
     shares[0] = 1.0 - shares[1:].sum()
     symmetric = 0.5 * (covariances + covariances.transpose(0, 2, 1))
-    return TruncatedGaussianMixture(shares, _significant(means[order]), _significant(symmetric[order]), low, high)
+    return TruncatedGaussianMixture(
+        shares, _round_significant(means[order]), _round_significant(symmetric[order]), low, high
+    )
 
 
-def _significant(values: Array) -> Array:
+def _round_significant(values: FloatArray) -> FloatArray:
     rounded = np.vectorize(lambda value: float(f"{value:.6g}"), otypes=[np.float64])(values)
     return np.asarray(rounded, dtype=np.float64)
 
 
-def beside(joint: TruncatedGaussianMixture, apart: TruncatedGaussianMixture) -> TruncatedGaussianMixture:
+def append_independent(joint: TruncatedGaussianMixture, apart: TruncatedGaussianMixture) -> TruncatedGaussianMixture:
     """The law of independent points side by side: a mixture, and behind it one of a single component."""
     d, k = joint.dim + apart.dim, len(joint.weights)
     covariances = np.zeros((k, d, d))

@@ -13,12 +13,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
 from rare_envs.scenarios.registry import named
-
-Array = NDArray[np.float64]
+from samplers.problem import FloatArray
 
 CAR_SPEED = 30.0  # [m/s] published: highD cars drive at about 30 m/s
 TRUCK_SPEED = 24.0  # [m/s] published: highD trucks drive at about 24 m/s
@@ -37,7 +35,7 @@ PROVENANCE: dict[str, Any] = {
 
 
 @dataclass(frozen=True)
-class Component:
+class TrafficSituation:
     """One kind of situation: a Gaussian given by moments that can be read."""
 
     meaning: str
@@ -47,7 +45,7 @@ class Component:
     correlation: Mapping[tuple[int, int], float]
     """Off-diagonal correlations by parameter numbers; others are 0."""
 
-    def covariance(self) -> Array:
+    def covariance(self) -> FloatArray:
         """Covariance matrix, shape (d, d)."""
         correlation = np.eye(len(self.mean))
         for (i, j), value in self.correlation.items():
@@ -55,73 +53,73 @@ class Component:
         return np.asarray(np.outer(self.deviation, self.deviation) * correlation, dtype=np.float64)
 
 
-def _following(speeds: float) -> dict[tuple[int, int], float]:
+def _following_correlation(speeds: float) -> dict[tuple[int, int], float]:
     """Correlation of the two speeds; a gap grows a little with both."""
     return {(0, 1): speeds, (0, 2): 0.2, (1, 2): 0.2}
 
 
-def _cutting_in(speeds: float) -> dict[tuple[int, int], float]:
+def _cut_in_correlation(speeds: float) -> dict[tuple[int, int], float]:
     """Correlation of the three speeds; a fast ego is given a little more room."""
     return {(0, 1): speeds, (0, 2): speeds, (1, 2): speeds, (0, 3): 0.2}
 
 
-COMPONENTS: dict[str, tuple[Component, ...]] = {
+SITUATIONS: dict[str, tuple[TrafficSituation, ...]] = {
     # ego_speed, lead_speed, gap: 38 m at 30 m/s is a headway of 1.27 s, in the published mode;
     # 75 m (2.5 s) stands for the long tail; trucks keep 40 m (1.67 s).
     "car_following": (
-        Component(
+        TrafficSituation(
             "car behind car, close",
             0.45,
             (CAR_SPEED, CAR_SPEED, 38.0),
             (3.5, 3.5, 14.0),
-            _following(0.6),
+            _following_correlation(0.6),
         ),
-        Component(
+        TrafficSituation(
             "car behind car, loose",
             0.25,
             (CAR_SPEED, CAR_SPEED, 75.0),
             (3.5, 3.5, 25.0),
-            _following(0.6),
+            _following_correlation(0.6),
         ),
-        Component(
+        TrafficSituation(
             "truck behind truck",
             0.2,
             (TRUCK_SPEED, TRUCK_SPEED, 40.0),
             (1.5, 1.5, 14.0),
-            _following(0.8),
+            _following_correlation(0.8),
         ),
-        Component(
+        TrafficSituation(
             "car closing on a truck",
             0.1,
             (28.0, TRUCK_SPEED, 45.0),
             (2.5, 1.5, 16.0),
-            _following(0.5),
+            _following_correlation(0.5),
         ),
     ),
     # ego_speed, cut_in_speed, lead_speed, cut_in_gap, lead_gap, lateral_offset: 30 m at 30 m/s is
     # a headway of 1 s, 45 m one of 1.5 s: the ends of the published mode.
     "cut_in": (
-        Component(
+        TrafficSituation(
             "car changes lane between cars",
             0.6,
             (CAR_SPEED, CAR_SPEED, 31.0, 30.0, 40.0, 3.75),
             (3.0, 3.0, 3.0, 12.0, 18.0, 0.3),
-            _cutting_in(0.6),
+            _cut_in_correlation(0.6),
         ),
-        Component(
+        TrafficSituation(
             "slower car pulls out to overtake",
             0.4,
             (CAR_SPEED, 26.0, 28.0, 45.0, 45.0, 3.75),
             (3.0, 2.5, 2.5, 16.0, 18.0, 0.3),
-            _cutting_in(0.6),
+            _cut_in_correlation(0.6),
         ),
     ),
 }
 
 
-def highway_base(scenario: str) -> tuple[TruncatedGaussianMixture, dict[str, Any]]:
+def build_highway_base(scenario: str) -> tuple[TruncatedGaussianMixture, dict[str, Any]]:
     """The assembled mixture of a scenario and its provenance."""
-    components, box = COMPONENTS[scenario], named(scenario).parameters
+    components, box = SITUATIONS[scenario], named(scenario).parameters
     mixture = TruncatedGaussianMixture(
         np.array([component.weight for component in components]),
         np.array([component.mean for component in components]),

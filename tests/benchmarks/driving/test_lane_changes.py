@@ -9,7 +9,7 @@ from benchmarks.driving.lane_changes import CLASSES, OFFSET, completed, crossing
 from rare_envs.sensors.perception import HEADING, SPEED
 from tests.training.imitation.synthetic_scenes import scenes
 from training.imitation.algorithms.expert_pairs import Pairs
-from training.imitation.traffic.recording import stack
+from training.imitation.traffic.recording import stack_scenes
 
 CROSSING = 30
 
@@ -17,7 +17,7 @@ CROSSING = 30
 @pytest.fixture
 def recording():
     """In the second of two scenes the rear vehicle of the left lane moves to the right at 1 m/s from tick 12 on."""
-    made = stack(scenes(2))
+    made = stack_scenes(scenes(2))
     y, heading = made.y.clone(), made.heading.clone()
     tick = torch.arange(y.shape[1])
     y[:, :, 0], heading[:, :, 0] = 1.8, 0.0

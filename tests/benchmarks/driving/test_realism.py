@@ -14,20 +14,20 @@ from benchmarks.driving.realism import named, report, rounded
 from benchmarks.driving.realism_figures import draw, tables
 from benchmarks.driving.realism_rows import Effort, highway, moved
 from tests.training.imitation.synthetic_scenes import scenes
-from training.imitation.algorithms.config import HUMAN, Config
-from training.imitation.fit import learner_of, prepare
+from training.imitation.algorithms.config import HUMAN_NOISE, Config
+from training.imitation.fit import make_learner, prepare_data
 
 
 @pytest.fixture(scope="module")
 def data():
-    return prepare(scenes(2))
+    return prepare_data(scenes(2))
 
 
 @pytest.fixture(scope="module")
 def driver(data):
-    policy = learner_of(data, Config(epochs=2)).policy.eval().requires_grad_(False)
+    policy = make_learner(data, Config(epochs=2)).policy.eval().requires_grad_(False)
     mean = head_weights(policy).double().numpy()
-    return LearnedDriver(policy, HUMAN, weights=WeightDistribution(mean, 1e6 * np.eye(404)), name="bc")
+    return LearnedDriver(policy, HUMAN_NOISE, weights=WeightDistribution(mean, 1e6 * np.eye(404)), name="bc")
 
 
 def test_a_report_has_every_row_table_and_figure(data, driver, tmp_path, monkeypatch):
@@ -92,7 +92,7 @@ def test_numbers_are_rounded():
 
 
 def test_gradients_of_both_ways_are_compared(data):
-    learner = learner_of(data, Config(learned_model=True, epochs=1, scenes=2))
+    learner = make_learner(data, Config(learned_model=True, epochs=1, scenes=2))
     learned, noise, blind, length = compare(learner, 3, starts=2)
     assert max(abs(learned), abs(noise), abs(blind)) <= 1 + 1e-5
     assert noise > 0

@@ -12,18 +12,26 @@ from typer.testing import CliRunner
 from rare_envs.scenarios.base_distributions import load_base
 from rare_envs.scenarios.registry import named
 from tests.training.data.recordings import simulate, write_highd, write_ngsim
-from training.data.events import CAR_FOLLOWING, CUT_IN, SEEN, car_following_events, cut_in_events, pooled, write_events
+from training.data.events import (
+    CAR_FOLLOWING_COLUMNS,
+    CUT_IN_COLUMNS,
+    MIN_PAIR_FRAMES,
+    car_following_events,
+    concatenate_events,
+    cut_in_events,
+    write_events,
+)
 from training.data.ngsim import load_ngsim
-from training.data.ngsim_tables import SCENES, us101_scenes
-from training.data.trajectories import COLUMNS, NOBODY, Trajectories, ahead, tabulate
+from training.data.ngsim_tables import SCENES_FILE, load_us101_trajectories
+from training.data.trajectories import COLUMNS, NOBODY, Trajectories, find_leaders, tabulate
 from training.data.windows import scenes_of
 from training.scenario_fitting import fit as fit_scenarios
 from training.scenario_fitting import mixture as mixture_fit
-from training.scenario_fitting.event_filters import RECIPES
+from training.scenario_fitting.event_filters import EVENT_RECIPES
 
 DATA = Path(__file__).parents[4] / "shared" / "data"
 needs_data = pytest.mark.skipif(
-    not (DATA / SCENES).is_file(), reason=f"recorded traffic is not part of the repository: {DATA} is absent"
+    not (DATA / SCENES_FILE).is_file(), reason=f"recorded traffic is not part of the repository: {DATA} is absent"
 )
 EDGES = (0.0, 3.5, 7.0)
 
@@ -34,17 +42,17 @@ def table_of(*tracks, edges=EDGES) -> Trajectories:
     vehicle = np.concatenate([np.full(len(track[0]), number + 1) for number, track in enumerate(tracks)])
     frame = np.concatenate([np.arange(len(track[0])) for track in tracks])
     lane = np.searchsorted(edges, y, side="right")
-    row = ahead(frame, lane, x)
+    row = find_leaders(frame, lane, x)
     columns = {"recording": "r", "vehicle": vehicle, "frame": frame, "x": x, "y": y, "speed": speed, "lane": lane}
     columns |= {"acceleration": 0.5, "length": 4.0, "width": 1.8, "leader": np.where(row >= 0, vehicle[row], NOBODY)}
     return tabulate(columns, {"r": edges})
 
 
 def test_a_pair_is_an_event_once_it_was_seen_for_two_seconds():
-    t = 0.1 * np.arange(SEEN)
+    t = 0.1 * np.arange(MIN_PAIR_FRAMES)
     follower, leader = (10.0 * t, 1.75, 10.0), (30.0 + 8.0 * t, 1.75, 8.0)
     events = car_following_events(table_of(follower, leader))
-    assert tuple(events) == CAR_FOLLOWING
+    assert tuple(events) == CAR_FOLLOWING_COLUMNS
     assert {name: values.tolist() for name, values in events.items()} == {
         "recording": ["r"],
         "frame": [0],
@@ -56,7 +64,7 @@ def test_a_pair_is_an_event_once_it_was_seen_for_two_seconds():
         "gap": [26.0],
         "a_ego": [0.5],
         "a_lead": [0.5],
-        "n": [SEEN],
+        "n": [MIN_PAIR_FRAMES],
     }
     shorter = [tuple(values[:-1] if np.ndim(values) else values for values in track) for track in (follower, leader)]
     assert len(car_following_events(table_of(*shorter))["gap"]) == 0
@@ -75,7 +83,7 @@ def cutting_in(sign=1.0, pause=20):
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_cut_in_has_a_start_and_a_crossing(sign):
     events = cut_in_events(cutting_in(sign))
-    assert tuple(events) == CUT_IN
+    assert tuple(events) == CUT_IN_COLUMNS
     assert events["phase"].tolist() == ["crossing", "start"]
     assert (events["vehicle"] == 1).all() and (events["ego"] == 2).all() and (events["lead"] == 3).all()
     assert events["from_lane"].tolist() == [1, 1] if sign > 0 else [2, 2]
@@ -106,13 +114,13 @@ def test_without_neighbours_values_are_missing(tmp_path):
     write_events(alone, tmp_path / "events.csv")
     with (tmp_path / "events.csv").open(encoding="utf-8") as file:
         assert [row["v_ego"] for row in csv.DictReader(file)] == ["", ""]
-    assert len(pooled([alone, alone])["ego"]) == 4
+    assert len(concatenate_events([alone, alone])["ego"]) == 4
 
 
 @needs_data
 def test_recorded_events_are_those_behind_the_shipped_bases():
     """The shipped events were found scene by scene; here all scenes are one recording, so a few differ."""
-    table = us101_scenes(DATA)
+    table = load_us101_trajectories(DATA)
     with (DATA / "us101_car_following_events.csv").open(encoding="utf-8") as file:
         shipped = {(int(row["ego"]), int(row["lead"])): row for row in csv.DictReader(file)}
     events = car_following_events(table)
@@ -121,7 +129,7 @@ def test_recorded_events_are_those_behind_the_shipped_bases():
     assert len(common) >= 465 and len(mine) <= 493
     same = [pair for pair in common if 100 * events["frame"][mine[pair]] == int(shipped[pair]["epoch_ms"])]
     assert len(same) >= 451
-    apart = car_following_events(us101_scenes(DATA, merged=False))
+    apart = car_following_events(load_us101_trajectories(DATA, merged=False))
     assert len(set(zip(apart["ego"].tolist(), apart["lead"].tolist(), strict=True)) & set(shipped)) == 468
     for column in ("v_ego", "v_lead", "gap"):
         differences = [events[column][mine[pair]] - float(shipped[pair][column]) for pair in same]
@@ -144,7 +152,7 @@ def simulated():
 
 @pytest.fixture
 def quick(monkeypatch):
-    monkeypatch.setattr(mixture_fit, "RESTARTS", 1)
+    monkeypatch.setattr(mixture_fit, "EM_STARTS", 1)
 
 
 def run_cli(*arguments):
@@ -157,7 +165,7 @@ def test_bases_are_fitted_to_a_highd_folder(simulated, quick, tmp_path):
     write_highd(tmp_path / "highD", simulated, simulate(1, lanes=2, per_lane=6, seconds=12.0))
     result = run_cli("--highd", tmp_path / "highD", "--out", tmp_path / "bases", "--name", "cologne")
     assert result.exit_code == 0, result.output
-    for scenario in RECIPES:
+    for scenario in EVENT_RECIPES:
         path = tmp_path / "bases" / f"{scenario}_cologne.json"
         points = load_base(named(scenario), path).sample(100, np.random.default_rng(0))
         assert np.isfinite(points).all()

@@ -7,13 +7,20 @@ import pytest
 
 from tests.training.data.recordings import DT, FOOT, LANE, simulate, write_csv, write_highd, write_ngsim
 from training.data.highd import highd_recordings, load_highd
-from training.data.ngsim import lane_edges, load_ngsim
-from training.data.ngsim_tables import PAIRS, SCENES, VEHICLES, i80_pairs, us101_scenes, us101_vehicles
-from training.data.trajectories import COLUMNS, NOBODY, ahead, read_trajectories, tabulate, write_trajectories
+from training.data.ngsim import estimate_lane_edges, load_ngsim
+from training.data.ngsim_tables import (
+    PAIRS_FILE,
+    SCENES_FILE,
+    VEHICLES_FILE,
+    load_i80_pairs,
+    load_us101_trajectories,
+    load_us101_vehicles,
+)
+from training.data.trajectories import COLUMNS, NOBODY, find_leaders, read_trajectories, tabulate, write_trajectories
 
 DATA = Path(__file__).parents[4] / "shared" / "data"
 needs_data = pytest.mark.skipif(
-    not all((DATA / name).is_file() for name in (SCENES, VEHICLES, PAIRS)),
+    not all((DATA / name).is_file() for name in (SCENES_FILE, VEHICLES_FILE, PAIRS_FILE)),
     reason=f"recorded traffic is not part of the repository: {DATA} is absent",
 )
 ROAD = 400.0
@@ -62,7 +69,7 @@ def test_ngsim_becomes_si_units_and_centres(traffic, ngsim):
     np.testing.assert_allclose(table.edges["trajectories-us101"], LANE * np.arange(4), atol=0.02)
     np.testing.assert_allclose(table.time[0], 0.1 * table.frame[0])
     # leaders in the file are the nearest ahead, by centres
-    row = ahead(table.frame, table.lane, table.x)
+    row = find_leaders(table.frame, table.lane, table.x)
     assert (table.leader == np.where(row >= 0, table.vehicle[row], NOBODY)).all()
     assert (table.find(table.leader) == row).all()
 
@@ -275,16 +282,16 @@ def test_a_table_is_sorted_and_checked():
 
 def test_lane_boundaries_lie_halfway_and_ramps_do_not_count():
     y = np.array([1.8, 5.4, 9.1, 12.0, 12.1])
-    np.testing.assert_allclose(lane_edges(y, np.arange(1, 6)), (0.0, 3.6, 7.25, 10.55, 13.45), atol=1e-12)
-    assert lane_edges(y[:1], np.array([1])) == ()
-    assert lane_edges(y[1:3], np.array([2, 3])) == ()
+    np.testing.assert_allclose(estimate_lane_edges(y, np.arange(1, 6)), (0.0, 3.6, 7.25, 10.55, 13.45), atol=1e-12)
+    assert estimate_lane_edges(y[:1], np.array([1])) == ()
+    assert estimate_lane_edges(y[1:3], np.array([2, 3])) == ()
 
 
 @needs_data
 def test_compact_tables_load():
-    scenes, vehicles, pairs = us101_scenes(DATA), us101_vehicles(DATA), i80_pairs(DATA)
+    scenes, vehicles, pairs = load_us101_trajectories(DATA), load_us101_vehicles(DATA), load_i80_pairs(DATA)
     assert [len(scenes), len(vehicles), len(pairs)] == [54_336, 214_267, 110_905]
-    assert len(us101_scenes(DATA, merged=False)) == 65_686
+    assert len(load_us101_trajectories(DATA, merged=False)) == 65_686
     assert len(set(vehicles.vehicle)) == 370
     assert np.isnan(vehicles.length).all()
     following = pairs.leader != NOBODY
@@ -293,5 +300,5 @@ def test_compact_tables_load():
 
 
 def test_a_missing_compact_table_is_named(tmp_path):
-    with pytest.raises(ValueError, match=PAIRS):
-        i80_pairs(tmp_path)
+    with pytest.raises(ValueError, match=PAIRS_FILE):
+        load_i80_pairs(tmp_path)

@@ -5,21 +5,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from training.data.ngsim_tables import SCENES
-from training.data.scenes import Scene, load_us101_scenes, split
-from training.data.smoothing import SLOWEST, motion, smooth
+from training.data.ngsim_tables import SCENES_FILE
+from training.data.scenes import TrafficScene, load_us101_scenes, split_by_clock
+from training.data.smoothing import MIN_HEADING_SPEED, infer_motion, smooth_positions
 from training.data.trajectories import DT
 
 DATA = Path(__file__).parents[4] / "shared" / "data"
 needs_data = pytest.mark.skipif(
-    not (DATA / SCENES).is_file(), reason=f"recorded traffic is not part of the repository: {DATA} is absent"
+    not (DATA / SCENES_FILE).is_file(), reason=f"recorded traffic is not part of the repository: {DATA} is absent"
 )
 
 
 def test_parabolas_pass_unchanged():
     t = DT * np.arange(80)
     positions = 3.0 + 12.0 * t - 0.7 * t**2
-    np.testing.assert_allclose(smooth(positions, 0.4, DT), positions, atol=1e-6)
+    np.testing.assert_allclose(smooth_positions(positions, 0.4, DT), positions, atol=1e-6)
 
 
 @pytest.mark.parametrize("frequency", [0.1, 0.4, 0.8])
@@ -28,15 +28,15 @@ def test_gain_of_a_wave_is_that_of_the_filter(frequency):
     wave = np.sin(2.0 * np.pi * frequency * t)
     gain = 1.0 / (1.0 + ((1 - np.cos(2 * np.pi * frequency * DT)) / (1 - np.cos(2 * np.pi * 0.4 * DT))) ** 3)
     middle = slice(500, 1500)
-    np.testing.assert_allclose(smooth(wave, 0.4, DT)[middle], gain * wave[middle], atol=1e-6)
+    np.testing.assert_allclose(smooth_positions(wave, 0.4, DT)[middle], gain * wave[middle], atol=1e-6)
 
 
 def test_short_tracks_come_back_and_holes_are_refused():
-    assert smooth(np.array([1.0, 5.0, 2.0]), 0.4, DT).tolist() == [1.0, 5.0, 2.0]
+    assert smooth_positions(np.array([1.0, 5.0, 2.0]), 0.4, DT).tolist() == [1.0, 5.0, 2.0]
     with pytest.raises(ValueError, match="cut the track"):
-        smooth(np.array([1.0, np.nan, 2.0, 3.0]), 0.4, DT)
+        smooth_positions(np.array([1.0, np.nan, 2.0, 3.0]), 0.4, DT)
     with pytest.raises(ValueError, match="cut-off"):
-        smooth(np.zeros(9), 6.0, DT)
+        smooth_positions(np.zeros(9), 6.0, DT)
 
 
 def replayed(track, x, y):
@@ -51,16 +51,16 @@ def replayed(track, x, y):
 def test_replaying_the_actions_gives_the_track():
     t = DT * np.arange(60)
     x, y = 10.0 * t + np.sin(t), 3.5 / (1.0 + np.exp(3.0 - t))
-    states = replayed(motion(x, y, DT), x, y)
+    states = replayed(infer_motion(x, y, DT), x, y)
     np.testing.assert_allclose(states[:, 0], x[:-1], atol=1e-10)
     np.testing.assert_allclose(states[:, 1], y[:-1], atol=1e-10)
 
 
 def test_a_creeping_vehicle_does_not_spin():
     jitter = 0.02 * np.random.default_rng(0).standard_normal((2, 50))
-    track = motion(np.cumsum(jitter[0]), jitter[1], DT)
+    track = infer_motion(np.cumsum(jitter[0]), jitter[1], DT)
     assert np.nanmin(track.speed) >= 0.0
-    assert np.nanmax(np.abs(track.heading)) <= np.arctan2(1.5, SLOWEST)
+    assert np.nanmax(np.abs(track.heading)) <= np.arctan2(1.5, MIN_HEADING_SPEED)
 
 
 def tiny_scene(**changes):
@@ -80,7 +80,7 @@ def tiny_scene(**changes):
         "length": np.full(3, 4.5),
         "width": np.full(3, 1.8),
     }
-    return Scene(**(fields | changes))
+    return TrafficScene(**(fields | changes))
 
 
 def test_lanes_and_leaders_of_a_scene():
@@ -100,15 +100,15 @@ def test_a_scene_with_states_missing_is_refused():
 
 def test_no_scene_lies_across_the_end_of_a_test_interval():
     early, late = tiny_scene(), tiny_scene(start=10.0)
-    assert split([early, late], [(9.0, 11.0)]) == ((early,), (late,))
+    assert split_by_clock([early, late], [(9.0, 11.0)]) == ((early,), (late,))
     with pytest.raises(ValueError, match="lies across"):
-        split([early, late], [(10.05, 11.0)])
+        split_by_clock([early, late], [(10.05, 11.0)])
 
 
 @needs_data
 def test_recorded_scenes_are_what_was_measured():
     scenes = load_us101_scenes(DATA)
-    train, test = split(scenes)
+    train, test = split_by_clock(scenes)
     assert [scene.name[-2:] for scene in test] == ["02", "11", "12", "17", "21", "22", "29"]
     assert len(train) == 21
     chosen = [[scene.acted & ~scene.leads_lane() for scene in part] for part in (train, test)]
@@ -123,9 +123,9 @@ def test_recorded_scenes_are_what_was_measured():
     for scene in scenes:
         assert scene.edges[:2] == (0.0, 3.49)
         moved = scene.x[:-1] + scene.speed[:-1] * np.cos(scene.heading[:-1]) * DT - scene.x[1:]
-        assert np.abs(moved[scene.acted[:-1] & scene.present[1:] & (scene.speed[:-1] > SLOWEST)]).max() < 1e-9
+        assert np.abs(moved[scene.acted[:-1] & scene.present[1:] & (scene.speed[:-1] > MIN_HEADING_SPEED)]).max() < 1e-9
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(ValueError, match=SCENES):
+    with pytest.raises(ValueError, match=SCENES_FILE):
         load_us101_scenes(tmp_path)

@@ -22,9 +22,9 @@ from training.egos.imitation import CONFIG, prepare_learner, train_imitation_ego
 from training.egos.nominal_driving import judge, summarise
 from training.egos.nominal_traffic import CASES
 from training.imitation.algorithms.config import Config
-from training.imitation.fit import fit
-from training.imitation.traffic.recording import stack
-from training.imitation.traffic.replayed_traffic import start, step
+from training.imitation.fit import train_learner
+from training.imitation.traffic.recording import stack_scenes
+from training.imitation.traffic.replayed_traffic import start_replay, step_replay
 
 DATA = Path(__file__).parents[4] / "shared" / "data"
 
@@ -42,13 +42,13 @@ def test_an_encounter_is_the_scenario_with_its_ego_free() -> None:
     assert mirrored.edges == (-6.0, -2.0, 2.0)
     assert (mirrored.y[:, 1::3] <= 0.0).all()
 
-    recording = stack([plain])
-    traffic = start(recording, torch.tensor([0]), torch.tensor([0]))
+    recording = stack_scenes([plain])
+    traffic = start_replay(recording, torch.tensor([0]), torch.tensor([0]))
     assert traffic.driven.sum() == 13
     braking = torch.zeros(1, 39, 2)
     braking[..., 0] = -2.0
     for _ in range(30):
-        traffic = step(recording, traffic, braking)
+        traffic = step_replay(recording, traffic, braking)
     at = traffic.vehicle[0].argsort()
     others = np.arange(39) % 3 != 0
     np.testing.assert_allclose(traffic.x[0, at].numpy()[others], plain.x[30][others], atol=0.01)
@@ -74,7 +74,7 @@ def test_training_repeats_and_learns_from_people_only(tiny: tuple[Config, list[E
     learners = [prepare_learner(scenes, kinds, config) for _ in range(2)]
     assert learners[0].pairs.scene.max() < len(scenes)
     assert set(learners[0].among.tolist()) == {0, 1, 2, 3}
-    one, other = (fit(learner).state_dict() for learner in learners)
+    one, other = (train_learner(learner).state_dict() for learner in learners)
     assert all(torch.equal(one[name], other[name]) for name in one)
 
 

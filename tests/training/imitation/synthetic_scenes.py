@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from training.data.scenes import Scene
+from training.data.scenes import TrafficScene
 
 DT = 0.1
 EDGES = (0.0, 3.6, 7.2, 10.8)
@@ -34,7 +34,7 @@ def scene(seed=0, ticks=60, vehicles=9, name="made up"):
         values[ticks // 2 - 1 :, -1] = np.nan
         values[-1] = np.nan
     sizes = np.full(vehicles, 4.5), np.full(vehicles, 1.9)
-    return Scene(name, 0.0, EDGES, x, y, heading, speed, acceleration, yaw_rate, present, *sizes)
+    return TrafficScene(name, 0.0, EDGES, x, y, heading, speed, acceleration, yaw_rate, present, *sizes)
 
 
 def scenes(number=3, **settings):

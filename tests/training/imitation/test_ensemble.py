@@ -13,8 +13,16 @@ from training.imitation import ensemble as module
 from training.imitation.algorithms.config import Config
 from training.imitation.algorithms.expert_pairs import Pairs
 from training.imitation.datasets import Source
-from training.imitation.ensemble import Ensemble, Member, make_ensemble, members_of, of_scenes, settings_of, spread_of
-from training.imitation.fit import prepare
+from training.imitation.ensemble import (
+    Ensemble,
+    Member,
+    make_ensemble,
+    measure_spread,
+    member_config,
+    select_scenes,
+    train_members,
+)
+from training.imitation.fit import prepare_data
 from training.imitation.run_folder import DRIVER, train_driver
 
 TINY = Config(
@@ -36,7 +44,7 @@ FEW = Ensemble(members=10, updates=2)
 def made_up():
     with pytest.MonkeyPatch.context() as patch:
         for place in ("run_folder", "ensemble"):
-            patch.setattr(f"training.imitation.{place}.load", lambda source: (scenes(3), ()))
+            patch.setattr(f"training.imitation.{place}.load_scenes", lambda source: (scenes(3), ()))
         yield
 
 
@@ -50,7 +58,7 @@ def run(request, made_up, tmp_path_factory):
 def test_members_differ_and_the_whole_is_saved_with_its_law(run, monkeypatch):
     fit = module.fit_weights
     monkeypatch.setattr(module, "fit_weights", lambda members: fit(members, penalties=(0.8,)))
-    members = members_of(run, FEW)
+    members = train_members(run, FEW)
     weights = np.stack([member.weights for member in members])
     base = read_driver(run / DRIVER)
     assert weights.shape == (10, HEAD_SIZE)
@@ -68,16 +76,16 @@ def test_members_differ_and_the_whole_is_saved_with_its_law(run, monkeypatch):
 
 def test_members_are_kept_and_are_the_same_when_trained_again(run):
     kept = run / "members-2-0"
-    first = members_of(run, FEW)
+    first = train_members(run, FEW)
     path = kept / "004.npz"
     path.unlink()
     before = (kept / "003.npz").stat().st_mtime_ns
-    again = members_of(run, FEW)
+    again = train_members(run, FEW)
     assert (kept / "003.npz").stat().st_mtime_ns == before
     np.testing.assert_array_equal(first[4].weights, again[4].weights)
     np.savez(path, base=np.zeros(HEAD_SIZE), weights=first[4].weights, within=first[4].within)
     with pytest.raises(ValueError, match="another driver"):
-        members_of(run, FEW)
+        train_members(run, FEW)
 
 
 def test_a_folder_without_a_training_is_refused(tmp_path):
@@ -86,9 +94,9 @@ def test_a_folder_without_a_training_is_refused(tmp_path):
 
 
 def test_scenes_are_drawn_with_their_pairs_as_often_as_they_are_drawn():
-    data = prepare(scenes(3))
+    data = prepare_data(scenes(3))
     drawn = torch.tensor([2, 0, 2])
-    pairs = of_scenes(data.pairs, drawn)
+    pairs = select_scenes(data.pairs, drawn)
     count = [(data.pairs.scene == scene).sum() for scene in drawn]
     assert len(pairs.scene) == sum(count)
     assert (pairs.scene == 2).sum() == 2 * count[0]
@@ -97,7 +105,7 @@ def test_scenes_are_drawn_with_their_pairs_as_often_as_they_are_drawn():
 
 
 def test_members_go_on_where_the_schedules_of_the_base_ended():
-    config = settings_of(Config(clone_weight=(0.1, 0.03), horizon=(15, 30)), Ensemble(updates=60))
+    config = member_config(Config(clone_weight=(0.1, 0.03), horizon=(15, 30)), Ensemble(updates=60))
     assert config.along(config.clone_weight, 0) == pytest.approx(0.03)
     assert config.horizon == (30, 30)
     assert config.warm_up == 0
@@ -106,7 +114,7 @@ def test_members_go_on_where_the_schedules_of_the_base_ended():
 
 def test_spread_on_paper():
     members = [Member(np.array([0.0, 1.0]), np.array([0.1, 0.2])), Member(np.array([2.0, 1.5]), np.array([0.3, 0.2]))]
-    spread = spread_of(members, base=np.array([0.0, 1.25]))
+    spread = measure_spread(members, base=np.array([0.0, 1.25]))
     assert spread["between_max"] == pytest.approx(np.sqrt(2))
     assert spread["within_median"] == pytest.approx(0.2)
     assert spread["bias_max"] == pytest.approx(1.0)

@@ -6,7 +6,7 @@ import torch
 from agents import load_driver, read_provenance
 from tests.training.data.recordings import simulate, write_highd, write_ngsim
 from training.imitation.algorithms.config import Config
-from training.imitation.datasets import Source, load
+from training.imitation.datasets import Source, load_scenes
 from training.imitation.run_folder import train_driver
 
 TINY = Config(updates=2, epochs=1, pools=1, scenes=2, horizon=(3, 3), critic_batch=64, warm_up=1)
@@ -41,10 +41,10 @@ def test_a_driver_learns_from_own_recordings(name, request, tmp_path):
 
 
 def test_both_directions_are_learned_from_and_their_ends_kept_for_tests(highd):
-    learn, test = load(highd)
+    learn, test = load_scenes(highd)
     sides = {scene.name.rsplit("-", 1)[0] for scene in learn}
     assert sides == {"01-upper", "01-lower"} == {scene.name.rsplit("-", 1)[0] for scene in test}
     for side in sides:
         ends = [[s for s in scenes if s.name.startswith(side)] for scenes in (learn, test)]
         assert max(scene.end for scene in ends[0]) < min(scene.start for scene in ends[1])
-    assert {scene.name for scene in load(Source("highd", highd.path, seconds=4.0))[0]} == {s.name for s in learn}
+    assert {scene.name for scene in load_scenes(Source("highd", highd.path, seconds=4.0))[0]} == {s.name for s in learn}

@@ -16,8 +16,8 @@ from tests.training.imitation.synthetic_scenes import scenes
 from training.imitation import train as command_line
 from training.imitation.algorithms.config import Config
 from training.imitation.datasets import Source, split_end
-from training.imitation.fit import fit, learner_of, prepare
-from training.imitation.run_folder import command_of, read_settings, train_driver
+from training.imitation.fit import make_learner, prepare_data, train_learner
+from training.imitation.run_folder import command_of, read_training_settings, train_driver
 
 TINY = Config(
     updates=6,
@@ -35,7 +35,7 @@ TINY = Config(
 
 @pytest.fixture(scope="module")
 def data():
-    return prepare(scenes())
+    return prepare_data(scenes())
 
 
 def tiny(**settings):
@@ -51,8 +51,8 @@ def weights(policy):
 )
 def test_a_killed_training_resumes_to_the_same_weights(data, settings, tmp_path):
     config = tiny(**settings)
-    whole = fit(learner_of(data, config))
-    stopped = learner_of(data, config)
+    whole = train_learner(make_learner(data, config))
+    stopped = make_learner(data, config)
 
     class Killed(Exception):
         pass
@@ -65,22 +65,22 @@ def test_a_killed_training_resumes_to_the_same_weights(data, settings, tmp_path)
 
     stopped.save = save_and_die
     with pytest.raises(Killed):
-        fit(stopped, tmp_path, every=3)
+        train_learner(stopped, tmp_path, every=3)
     assert stopped.update == 3
-    resumed = fit(learner_of(data, config), tmp_path, every=3)
+    resumed = train_learner(make_learner(data, config), tmp_path, every=3)
     assert torch.equal(weights(resumed), weights(whole))
-    assert not torch.equal(weights(learner_of(data, config).policy), weights(whole))
+    assert not torch.equal(weights(make_learner(data, config).policy), weights(whole))
 
 
 def test_seeds_decide_the_weights(data):
-    first, second, third = (fit(learner_of(data, tiny(method="bc", seed=seed))) for seed in (1, 1, 2))
+    first, second, third = (train_learner(make_learner(data, tiny(method="bc", seed=seed))) for seed in (1, 1, 2))
     assert torch.equal(weights(first), weights(second))
     assert not torch.equal(weights(first), weights(third))
 
 
 def test_nothing_is_drawn_from_the_global_generator(data):
     before = torch.get_rng_state()
-    fit(learner_of(data, tiny(method="gail", updates=1)))
+    train_learner(make_learner(data, tiny(method="gail", updates=1)))
     assert torch.equal(torch.get_rng_state(), before)
 
 
@@ -90,8 +90,8 @@ def test_learning_rates_fall_after_the_schedules():
 
 
 def test_the_learner_uses_them(data):
-    learner = learner_of(data, tiny(updates=2, anneal=0.5, policy_rate=3e-4, critic_rate=4e-4))
-    fit(learner)
+    learner = make_learner(data, tiny(updates=2, anneal=0.5, policy_rate=3e-4, critic_rate=4e-4))
+    train_learner(learner)
     (group,) = learner.policy_optimiser.param_groups
     assert group["lr"] == pytest.approx(3e-4)
     learner.update = 2
@@ -103,7 +103,7 @@ def test_the_learner_uses_them(data):
 @pytest.fixture
 def made_up(monkeypatch):
     """A source that reads nothing from files."""
-    monkeypatch.setattr("training.imitation.run_folder.load", lambda source: (scenes(2), scenes(3)[2:]))
+    monkeypatch.setattr("training.imitation.run_folder.load_scenes", lambda source: (scenes(2), scenes(3)[2:]))
     return Source("data", command_line.Path("somewhere/tables"))
 
 
@@ -120,7 +120,7 @@ def test_a_folder_holds_a_driver_that_says_where_it_comes_from(made_up, tmp_path
     assert "--horizon 2 3" in provenance.command
     assert provenance.metrics["10 s"]["vehicles"] > 0
     assert "NGSIM" in provenance.data
-    assert read_settings(tmp_path / "run") == (made_up, config)
+    assert read_training_settings(tmp_path / "run") == (made_up, config)
 
 
 def test_a_folder_keeps_to_its_settings(made_up, tmp_path):
@@ -131,11 +131,11 @@ def test_a_folder_keeps_to_its_settings(made_up, tmp_path):
     with pytest.raises(ValueError, match="other settings"):
         train_driver(made_up, tiny(updates=2), tmp_path, measured=False)
     with pytest.raises(ValueError, match=r"no training\.json"):
-        read_settings(tmp_path / "elsewhere")
+        read_training_settings(tmp_path / "elsewhere")
 
 
 def test_the_command_line_has_every_setting():
-    options = inspect.signature(command_line.command).parameters
+    options = inspect.signature(command_line.main).parameters
     names = {option.name for option in dataclasses.fields(Config)} - {"colour"} | {"noise"}
     assert names <= set(options)
     for option in dataclasses.fields(Config):
@@ -153,7 +153,7 @@ def test_a_command_repeats_its_training(made_up, monkeypatch, tmp_path):
     found = []
     monkeypatch.setattr(command_line, "train_driver", lambda *given, **how: found.append(given) or tmp_path)
     app = typer.Typer()
-    app.command()(command_line.command)
+    app.command()(command_line.main)
     words = command_of(made_up, config).split()[3:]
     result = CliRunner().invoke(app, [*words, "--out", str(tmp_path)])
     assert result.exit_code == 0, result.output
@@ -170,7 +170,7 @@ def test_the_command_line_says_what_is_missing(words, message, tmp_path):
     from typer.testing import CliRunner
 
     app = typer.Typer()
-    app.command()(command_line.command)
+    app.command()(command_line.main)
     result = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "run")])
     assert result.exit_code == 2
     assert message in result.output
@@ -215,14 +215,14 @@ def test_scenes_without_followers_are_refused():
     from tests.training.imitation.synthetic_scenes import scene
 
     with pytest.raises(ValueError, match="Nobody follows"):
-        prepare([scene(vehicles=3)])
+        prepare_data([scene(vehicles=3)])
     with pytest.raises(ValueError, match="got none"):
-        prepare([])
+        prepare_data([])
 
 
 def test_logs_go_to_tensorboard(data, tmp_path):
     pytest.importorskip("tensorboard", reason="the extra logs is optional")
-    fit(learner_of(data, tiny(updates=2)), tmp_path, log=True)
+    train_learner(make_learner(data, tiny(updates=2)), tmp_path, log=True)
     assert list(tmp_path.glob("events.out.*"))
 
 
@@ -231,7 +231,7 @@ def test_logs_without_tensorboard_are_refused(data, tmp_path, monkeypatch):
 
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
     with pytest.raises(ValueError, match=r"rare-envs\[logs\]"):
-        fit(learner_of(data, tiny(updates=1)), tmp_path, log=True)
+        train_learner(make_learner(data, tiny(updates=1)), tmp_path, log=True)
     with pytest.raises(ValueError, match=r"rare-envs\[logs\]"):  # before the data are even looked for
         train_driver(Source("data", tmp_path / "nowhere"), TINY, tmp_path / "run", log=True)
 

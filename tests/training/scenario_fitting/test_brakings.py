@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from rare_envs.scenarios.hard_brake import US101
-from training.data.ngsim_tables import VEHICLES
-from training.scenario_fitting.brakings import brakings, moments, recorded_brakings
+from training.data.ngsim_tables import VEHICLES_FILE
+from training.scenario_fitting.brakings import find_brakings, load_brakings, log_moments
 
 DATA = Path(__file__).parents[4] / "shared" / "data"
 
@@ -22,7 +22,7 @@ def track(deceleration, seconds, speed=20.0, gap=30.0, before=5.0, after=5.0):
 
 @pytest.mark.parametrize(("deceleration", "seconds"), [(2.0, 3.0), (4.0, 3.0), (1.0, 6.0)])
 def test_a_braking_is_found_with_its_size(deceleration, seconds):
-    found = brakings(*track(deceleration, seconds))
+    found = find_brakings(*track(deceleration, seconds))
     assert found.shape == (1, 3)
     np.testing.assert_allclose(found[0], [20.0, 30.0, deceleration], rtol=0.03)
 
@@ -30,20 +30,20 @@ def test_a_braking_is_found_with_its_size(deceleration, seconds):
 @pytest.mark.parametrize("case", [track(2.0, 1.0), track(0.4, 10.0), track(2.0, 3.0, gap=0.5), (np.arange(20.0),) * 2])
 def test_what_is_no_braking(case):
     """Less than 3 m/s, too gentle, too near to have been measured right, too short a track."""
-    assert brakings(*case).shape == (0, 3)
+    assert find_brakings(*case).shape == (0, 3)
 
 
 def test_moments_by_hand():
     events = np.array([[10.0, np.e, 1.0], [14.0, np.e**3, np.e**2]])
-    mean, covariance = moments(events)
+    mean, covariance = log_moments(events)
     np.testing.assert_allclose(mean, [12.0, 2.0, 1.0])
     np.testing.assert_allclose(covariance, [[8.0, 4.0, 4.0], [4.0, 2.0, 2.0], [4.0, 2.0, 2.0]])
 
 
-@pytest.mark.skipif(not (DATA / VEHICLES).is_file(), reason="recorded traffic is no part of the repository")
+@pytest.mark.skipif(not (DATA / VEHICLES_FILE).is_file(), reason="recorded traffic is no part of the repository")
 def test_the_shipped_moments_are_the_recorded_ones():
-    events = recorded_brakings(DATA)
+    events = load_brakings(DATA)
     assert len(events) == 265
-    mean, covariance = moments(events)
+    mean, covariance = log_moments(events)
     np.testing.assert_allclose(mean, US101["means"][0], atol=1e-4)
     np.testing.assert_allclose(covariance, US101["covariances"][0], atol=1e-4)

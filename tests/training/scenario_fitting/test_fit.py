@@ -14,14 +14,14 @@ from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
 from rare_envs.scenarios.registry import named
 from training.scenario_fitting import fit as fit_scenarios
 from training.scenario_fitting import mixture as mixture_fit
-from training.scenario_fitting.event_filters import RECIPES, filter_events, read_events
-from training.scenario_fitting.fit import base_file, us101_base
+from training.scenario_fitting.event_filters import EVENT_RECIPES, filter_events, read_events
+from training.scenario_fitting.fit import fit_us101_base, format_base
 from training.scenario_fitting.mixture import COVARIANCE_FLOOR, SMALLEST_COMPONENT, fit_mixture, mass_outside
-from training.scenario_fitting.published_highway import highway_base
+from training.scenario_fitting.published_highway import build_highway_base
 
 DATA = Path(__file__).parents[4] / "shared" / "data"
 needs_data = pytest.mark.skipif(
-    not (DATA / RECIPES["cut_in"].file).is_file(),
+    not (DATA / EVENT_RECIPES["cut_in"].file).is_file(),
     reason=f"recorded traffic is not part of the repository: {DATA} is absent",
 )
 
@@ -37,7 +37,7 @@ TRUTH = TruncatedGaussianMixture(
 @pytest.fixture
 def quick(monkeypatch):
     """Fewer starts: enough for well separated clusters."""
-    monkeypatch.setattr(mixture_fit, "RESTARTS", 2)
+    monkeypatch.setattr(mixture_fit, "EM_STARTS", 2)
 
 
 def fit_truth(n, seed=0):
@@ -97,7 +97,7 @@ def test_mass_outside_of_a_known_box():
 
 
 def write_events(path, rows):
-    columns = ["phase", *RECIPES["cut_in"].columns, "start_seen"]
+    columns = ["phase", *EVENT_RECIPES["cut_in"].columns, "start_seen"]
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(columns)
@@ -108,7 +108,7 @@ GOOD = [15.0, 14.0, 16.0, 12.0, 20.0, 3.0]
 
 
 def test_filters_drop_and_count(tmp_path):
-    path = tmp_path / RECIPES["cut_in"].file
+    path = tmp_path / EVENT_RECIPES["cut_in"].file
     write_events(
         path,
         [
@@ -121,7 +121,7 @@ def test_filters_drop_and_count(tmp_path):
             ["start", 16.0, *GOOD[1:], True],
         ],
     )
-    recipe, box = RECIPES["cut_in"], named("cut_in").parameters
+    recipe, box = EVENT_RECIPES["cut_in"], named("cut_in").parameters
     (points, offsets), log = filter_events(read_events(path, recipe), recipe, box)
     # speeds and gaps count even where the offset at the start was not seen or is out of range
     assert points.tolist() == [GOOD[:5], GOOD[:5], GOOD[:5], [16.0, *GOOD[1:5]]]
@@ -155,21 +155,21 @@ def test_missing_column_is_named(tmp_path):
     path = tmp_path / "events.csv"
     path.write_text("v_ego,v_lead\n1,2\n", encoding="utf-8")
     with pytest.raises(ValueError, match="lacks the columns gap"):
-        read_events(path, RECIPES["car_following"])
+        read_events(path, EVENT_RECIPES["car_following"])
 
 
 def shipped(name):
     return json.loads((resources.files("rare_envs") / "data" / name).read_text(encoding="utf-8"))
 
 
-@pytest.mark.parametrize("scenario", RECIPES)
+@pytest.mark.parametrize("scenario", EVENT_RECIPES)
 def test_highway_files_are_what_the_script_writes(scenario):
-    written = json.loads(base_file(scenario, *highway_base(scenario)))
+    written = json.loads(format_base(scenario, *build_highway_base(scenario)))
     assert written == shipped(f"{scenario}_highway.json")
     assert "NOT fitted" in written["provenance"]["kind"]
 
 
-@pytest.mark.parametrize("scenario", RECIPES)
+@pytest.mark.parametrize("scenario", EVENT_RECIPES)
 def test_fitted_files_say_where_they_come_from(scenario):
     provenance = shipped(f"{scenario}_us101.json")["provenance"]
     assert provenance["source"]["record"] == "8ect-6jqj"
@@ -193,7 +193,7 @@ def test_the_offset_of_a_cut_in_is_fitted_apart():
 @pytest.mark.parametrize("scenario", [pytest.param("car_following", marks=pytest.mark.slow), "cut_in"])
 def test_fit_of_the_recorded_events_is_the_shipped_file(scenario):
     """Up to the last digits, which other library versions may round differently."""
-    written = json.loads(us101_base(scenario, DATA))
+    written = json.loads(fit_us101_base(scenario, DATA))
     expected = shipped(f"{scenario}_us101.json")
     for key in ("weights", "means", "covariances"):
         np.testing.assert_allclose(written.pop(key), expected.pop(key), rtol=1e-4, atol=1e-4)

@@ -7,20 +7,20 @@ from torch import Tensor
 
 from agents.learned.networks import Policy
 
-LOW = (-8.0, -0.3)
-HIGH = (4.0, 0.3)
+ACTION_LOW = (-8.0, -0.3)
+ACTION_HIGH = (4.0, 0.3)
 """Bounds of acceleration [m/s^2] and yaw rate [rad/s]."""
 
 
-def physical(policy: Policy, action: Tensor) -> Tensor:
+def denormalise_action(policy: Policy, action: Tensor) -> Tensor:
     """Normalised actions (..., 2) in m/s^2 and rad/s, within bounds."""
     scaling = policy.scaling
-    low, high = action.new_tensor(LOW), action.new_tensor(HIGH)
+    low, high = action.new_tensor(ACTION_LOW), action.new_tensor(ACTION_HIGH)
     return (scaling.action_mean + scaling.action_std * action).clamp(low, high)
 
 
-def normalised(policy: Policy, action: Tensor) -> Tensor:
-    """Inverse of `physical` within the bounds."""
+def normalise_action(policy: Policy, action: Tensor) -> Tensor:
+    """Inverse of `denormalise_action` within the bounds."""
     scaling = policy.scaling
     return (action - scaling.action_mean) / scaling.action_std
 

@@ -6,12 +6,12 @@ from typing import TypeVar
 import torch
 
 from agents.learned.networks import Policy
-from training.imitation.algorithms.actions import log_likelihood, normalised
+from training.imitation.algorithms.actions import log_likelihood, normalise_action
 from training.imitation.algorithms.config import Config
-from training.imitation.algorithms.expert_pairs import Pairs, emphasised, scaling_of
+from training.imitation.algorithms.expert_pairs import Pairs, emphasise_lateral, scaling_of
 
 
-def clone(pairs: Pairs, config: Config, generator: torch.Generator) -> Policy:
+def clone_policy(pairs: Pairs, config: Config, generator: torch.Generator) -> Policy:
     """A new policy that maximises the likelihood of recorded actions.
 
     Args:
@@ -19,20 +19,20 @@ def clone(pairs: Pairs, config: Config, generator: torch.Generator) -> Policy:
         config: `epochs`, `batch`, `clone_rate`, `weight_decay`, `log_std_cap` and `lateral_weight` are used.
         generator: Source of the initial weights and of the order of the pairs.
     """
-    policy = seeded(lambda: Policy(scaling_of(pairs), config.log_std_cap), generator)
-    for _ in improve(policy, pairs, config, generator):
+    policy = make_seeded(lambda: Policy(scaling_of(pairs), config.log_std_cap), generator)
+    for _ in clone_epochs(policy, pairs, config, generator):
         pass
     return policy
 
 
-def improve(policy: Policy, pairs: Pairs, config: Config, generator: torch.Generator) -> Iterator[None]:
+def clone_epochs(policy: Policy, pairs: Pairs, config: Config, generator: torch.Generator) -> Iterator[None]:
     """Ascend the likelihood, epoch by epoch, with what of the policy requires gradients.
 
     Few epochs: what 51 features say of the next action is little, and more is memorising.
     """
-    pairs = emphasised(pairs, config.lateral_weight)
+    pairs = emphasise_lateral(pairs, config.lateral_weight)
     optimiser = torch.optim.Adam(policy.parameters(), lr=config.clone_rate, weight_decay=config.weight_decay)
-    action = normalised(policy, pairs.action)
+    action = normalise_action(policy, pairs.action)
     for _ in range(config.epochs):
         order = torch.randperm(len(action), generator=generator)
         for rows in torch.split(order, config.batch):
@@ -47,7 +47,7 @@ def improve(policy: Policy, pairs: Pairs, config: Config, generator: torch.Gener
 Module = TypeVar("Module")
 
 
-def seeded(make: Callable[[], Module], generator: torch.Generator) -> Module:
+def make_seeded(make: Callable[[], Module], generator: torch.Generator) -> Module:
     """A network whose initial weights are drawn from a generator; PyTorch takes them from the global one."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(torch.randint(2**31, (), generator=generator)))

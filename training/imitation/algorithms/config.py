@@ -7,10 +7,10 @@ from typing import Literal
 
 from agents.learned.coloured_noise import AutoregressiveNoise
 
-Method = Literal["bc", "gail", "mgail"]
+Algorithm = Literal["bc", "gail", "mgail"]
 
 
-HUMAN = AutoregressiveNoise.swinging(frequency=(1.70, 1.57), damping=(0.845, 0.40))
+HUMAN_NOISE = AutoregressiveNoise.swinging(frequency=(1.70, 1.57), damping=(0.845, 0.40))
 """The autocorrelation of what cloning leaves unexplained in the record, within 0.03 up to 1 s."""
 
 
@@ -52,7 +52,7 @@ _RANGES: tuple[tuple[tuple[str, ...], Callable[[float], bool], str], ...] = (
 class Config:
     """How to learn a driver from recorded scenes. Pairs are values at the start and at the end of a schedule."""
 
-    method: Method = "mgail"
+    method: Algorithm = "mgail"
     seed: int = 0
     updates: int = 1500
     """Updates of the policy after behaviour cloning."""
@@ -65,9 +65,9 @@ class Config:
     log_std_cap: float = 0.0
     """See `agents.learned.networks.Policy`."""
     lateral_weight: int = 1
-    """How many times recorded moments of fast motion across the lane count in the likelihood, see
-    `training.imitation.algorithms.expert_pairs.emphasised`; more than once, and drivers finish more of the lane changes
-    under way."""
+    """Number of times that recorded moments of fast lateral motion count in the likelihood, see
+    `training.imitation.algorithms.expert_pairs.emphasise_lateral`. With more than 1, drivers complete more of the lane
+    changes that are under way."""
 
     # rollouts
     pools: int = 5
@@ -80,8 +80,8 @@ class Config:
     """Ticks after which a pool starts anew from the record."""
     drivers: tuple[int, int] = (60, 60)
     """Vehicles of a scene that are driven: the curriculum over the number of agents (Bhattacharyya et al. 2018)."""
-    colour: AutoregressiveNoise = HUMAN
-    """Of the noise of acceleration and yaw rate; `Colour()` is white noise, as O'Kelly et al. have it."""
+    colour: AutoregressiveNoise = HUMAN_NOISE
+    """Of the noise of acceleration and yaw rate; `AutoregressiveNoise()` is white noise, as O'Kelly et al. have it."""
 
     # costs of the policy
     critic_weight: float = 3.0

@@ -24,12 +24,12 @@ class Critic(nn.Module):
         )
 
     def forward(self, pairs: Tensor) -> Tensor:
-        """Pairs (n, 53), see `inputs`, to logits (n,)."""
+        """Pairs (n, 53), see `critic_inputs`, to logits (n,)."""
         logits: Tensor = self.layers(pairs)[:, 0]
         return logits
 
 
-def inputs(policy: Policy, features: Tensor, action: Tensor) -> Tensor:
+def critic_inputs(policy: Policy, features: Tensor, action: Tensor) -> Tensor:
     """What the critic sees: normalised features (n, 51) beside normalised actions (n, 2)."""
     return torch.cat((policy.normalised(features), action), dim=1)
 

@@ -8,10 +8,10 @@ from torch import Tensor
 from agents.learned.networks import FEATURE_SIZE, Scaling
 from rare_envs.sensors.perception import HEADING, SPEED
 from training.imitation.traffic.recording import Recording
-from training.imitation.traffic.replayed_traffic import look, start
+from training.imitation.traffic.replayed_traffic import perceive_traffic, start_replay
 
-ACROSS = 0.4
-"""Speed across the lane [m/s], see `emphasised`."""
+FAST_LATERAL_SPEED = 0.4
+"""Speed across the lane [m/s], see `emphasise_lateral`."""
 
 
 class Pairs(NamedTuple):
@@ -25,32 +25,32 @@ class Pairs(NamedTuple):
     """Scene of each, shape (n,)."""
 
 
-def expert_pairs(recording: Recording) -> Pairs:
+def collect_pairs(recording: Recording) -> Pairs:
     """Every moment of every vehicle whose surroundings and action are known."""
     features, actions, scenes = [], [], []
     for tick in range(recording.x.shape[1]):
         scene = (tick < recording.ticks).nonzero().flatten()
-        traffic = start(recording, scene, torch.full_like(scene, tick))
+        traffic = start_replay(recording, scene, torch.full_like(scene, tick))
         m = traffic.drivers
         driven = traffic.driven[:, :m]
         vehicle = traffic.vehicle[:, :m]
         action = torch.stack(
             [field[scene, tick].gather(1, vehicle) for field in (recording.acceleration, recording.yaw_rate)], dim=-1
         )
-        features.append(look(traffic, m)[driven])
+        features.append(perceive_traffic(traffic, m)[driven])
         actions.append(action[driven])
         scenes.append(scene[:, None].expand_as(driven)[driven])
     return Pairs(torch.cat(features), torch.cat(actions), torch.cat(scenes))
 
 
-def emphasised(pairs: Pairs, times: int) -> Pairs:
-    """The same pairs, those of vehicles that move across their lane at more than `ACROSS` several times.
+def emphasise_lateral(pairs: Pairs, times: int) -> Pairs:
+    """The same pairs, those of vehicles that move across their lane at more than `FAST_LATERAL_SPEED` several times.
 
     They are one in twenty in the recordings of US 101, and most belong to lane changes.
     """
     if times == 1:
         return pairs
-    fast = (torch.sin(pairs.features[:, HEADING]) * pairs.features[:, SPEED]).abs() > ACROSS
+    fast = (torch.sin(pairs.features[:, HEADING]) * pairs.features[:, SPEED]).abs() > FAST_LATERAL_SPEED
     rows = torch.cat((torch.arange(len(fast)), fast.nonzero().flatten().repeat(times - 1)))
     return Pairs(*(column[rows] for column in pairs))
 

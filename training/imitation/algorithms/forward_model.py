@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from agents.learned.networks import ACTION_SIZE, FEATURE_SIZE, Policy
-from training.imitation.algorithms.critic import inputs
+from training.imitation.algorithms.critic import critic_inputs
 
 _HIDDEN = 128
 
@@ -36,7 +36,7 @@ class ForwardModel(nn.Module):
 
     def forward(self, policy: Policy, features: Tensor, action: Tensor) -> Tensor:
         """Features a tick later, (n, 51) in SI units, from features (n, 51) and normalised actions (n, 2)."""
-        change: Tensor = self.layers(inputs(policy, features, action))
+        change: Tensor = self.layers(critic_inputs(policy, features, action))
         return features + policy.scaling.feature_std * change
 
     def substituted(self, policy: Policy, before: Tensor, action: Tensor, now: Tensor, credit: float) -> Tensor:

@@ -16,9 +16,9 @@ from torch import Tensor
 from agents.learned.coloured_noise import AutoregressiveNoise
 from agents.learned.networks import Policy
 from training.imitation.algorithms.actions import log_likelihood
-from training.imitation.algorithms.critic import inputs, policy_cost
+from training.imitation.algorithms.critic import critic_inputs, policy_cost
 from training.imitation.algorithms.learner import Learner, Log
-from training.imitation.algorithms.rollout import Steps
+from training.imitation.algorithms.rollout import RolloutSteps
 
 
 def advantages(reward: Tensor, value: Tensor, discount: float, gae: float) -> Tensor:
@@ -42,7 +42,9 @@ def advantages(reward: Tensor, value: Tensor, discount: float, gae: float) -> Te
     return out
 
 
-def conditional(policy: Policy, features: Tensor, noise: Tensor, colour: AutoregressiveNoise) -> tuple[Tensor, Tensor]:
+def conditional_action(
+    policy: Policy, features: Tensor, noise: Tensor, colour: AutoregressiveNoise
+) -> tuple[Tensor, Tensor]:
     """Mean and log standard deviation of actions, given the noise that was expected.
 
     Coloured noise makes actions depend on each other; given the noise before, they are independent Gaussians again.
@@ -51,27 +53,27 @@ def conditional(policy: Policy, features: Tensor, noise: Tensor, colour: Autoreg
     return mean + torch.exp(log_std) * noise, log_std + torch.log(noise.new_tensor(colour.scale))
 
 
-def surrogate(ratio: Tensor, advantage: Tensor, clip: float) -> Tensor:
+def clipped_surrogate(ratio: Tensor, advantage: Tensor, clip: float) -> Tensor:
     """PPO's clipped objective, to be maximised, shape (n,)."""
     return torch.minimum(ratio * advantage, ratio.clamp(1.0 - clip, 1.0 + clip) * advantage)
 
 
-def seen_by_value(policy: Policy, steps: Steps) -> Tensor:
+def value_inputs(policy: Policy, steps: RolloutSteps) -> Tensor:
     """What the value depends on: normalised features and the noise that goes on, shape (n, 53)."""
     return torch.cat((policy.normalised(steps.features), steps.noise), dim=1)
 
 
-def rewards(learner: Learner, steps: Steps) -> Tensor:
+def rewards(learner: Learner, steps: RolloutSteps) -> Tensor:
     """Minus the costs of each moment, shape (n,)."""
     config = learner.config
-    likeness = policy_cost(learner.critic, inputs(learner.policy, steps.features, steps.action))
+    likeness = policy_cost(learner.critic, critic_inputs(learner.policy, steps.features, steps.action))
     costs = config.collision_weight * steps.collision + config.edge_weight * steps.edge
     manners = config.headway_weight * steps.headway + config.lane_weight * steps.lane
     manners = manners + config.speed_weight * steps.speed
     return -(config.critic_weight * likeness + costs + config.brake_weight * steps.brake + manners)
 
 
-def update(learner: Learner) -> Log:
+def update_gail(learner: Learner) -> Log:
     """Drive, let the critic learn, then move the policy and the value by epochs over the rollout.
 
     The last tick of the rollout is there for the value of what comes after it only.
@@ -83,20 +85,22 @@ def update(learner: Learner) -> Log:
     critic_error = learner.learn_critic(steps)
     with torch.no_grad():
         reward = rewards(learner, steps).view(ticks, -1)
-        seen = seen_by_value(policy, steps)
+        seen = value_inputs(policy, steps)
         expected = value(seen).view(ticks, -1)
         gain = advantages(reward[:-1], expected, config.discount, config.gae)
         target = (gain + expected[:-1]).flatten()
         kept = len(target)
-        old = log_likelihood(*conditional(policy, steps.features, steps.noise, config.colour), steps.action)[:kept]
+        old = log_likelihood(*conditional_action(policy, steps.features, steps.noise, config.colour), steps.action)[
+            :kept
+        ]
     gain = gain.flatten()
     gain = (gain - gain.mean()) / gain.std().clamp(min=1e-6)
     for _ in range(config.ppo_epochs):
         for rows in torch.split(torch.randperm(kept, generator=learner.generator), config.ppo_batch):
-            law = conditional(policy, steps.features[rows], steps.noise[rows], config.colour)
+            law = conditional_action(policy, steps.features[rows], steps.noise[rows], config.colour)
             ratio = torch.exp(log_likelihood(*law, steps.action[rows]) - old[rows])
             clone = config.along(config.clone_weight, learner.update) * learner.clone_loss()
-            loss = clone - surrogate(ratio, gain[rows], config.clip).mean()
+            loss = clone - clipped_surrogate(ratio, gain[rows], config.clip).mean()
             learner.policy_optimiser.zero_grad()
             torch.autograd.backward(loss)
             torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)

@@ -12,19 +12,19 @@ import torch
 from torch import Tensor, nn
 
 from agents.learned.networks import ACTION_SIZE, FEATURE_SIZE, Policy
-from training.imitation.algorithms.actions import log_likelihood, normalised
-from training.imitation.algorithms.behaviour_cloning import seeded
+from training.imitation.algorithms.actions import log_likelihood, normalise_action
+from training.imitation.algorithms.behaviour_cloning import make_seeded
 from training.imitation.algorithms.config import Config
-from training.imitation.algorithms.critic import Critic, inputs, train_critic
-from training.imitation.algorithms.expert_pairs import Pairs, emphasised
+from training.imitation.algorithms.critic import Critic, critic_inputs, train_critic
+from training.imitation.algorithms.expert_pairs import Pairs, emphasise_lateral
 from training.imitation.algorithms.forward_model import ForwardModel, train_model
-from training.imitation.algorithms.rollout import Steps, roll
+from training.imitation.algorithms.rollout import RolloutSteps, roll_out
 from training.imitation.traffic.recording import Recording
 from training.imitation.traffic.replayed_traffic import Traffic
-from training.imitation.traffic.scene_pool import Pool, fresh_pool
+from training.imitation.traffic.scene_pool import ScenePool, draw_pool
 
 Log = dict[str, float]
-_LEARNED = ("policy", "critic", "value", "policy_optimiser", "critic_optimiser", "value_optimiser")
+_TRAINED_PARTS = ("policy", "critic", "value", "policy_optimiser", "critic_optimiser", "value_optimiser")
 """What has weights or moments of its own."""
 
 
@@ -50,19 +50,21 @@ class Learner:
         config = self.config
         self.policy_optimiser = torch.optim.Adam(self.policy.parameters(), config.policy_rate, betas=(0.9, 0.99))
         self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), config.critic_rate, betas=(0.5, 0.9))
-        self.value = seeded(_value, self.generator)
+        self.value = make_seeded(_make_value_network, self.generator)
         self.value_optimiser = torch.optim.Adam(self.value.parameters(), config.value_rate)
-        self.learned: tuple[str, ...] = _LEARNED
+        self.learned: tuple[str, ...] = _TRAINED_PARTS
         self.model: ForwardModel | None = None
         if config.learned_model:
-            self.model = seeded(ForwardModel, self.generator)
+            self.model = make_seeded(ForwardModel, self.generator)
             self.model_optimiser = torch.optim.Adam(self.model.parameters(), config.model_rate)
             self.learned += ("model", "model_optimiser")
-        self.pools: list[Pool] = []
+        self.pools: list[ScenePool] = []
         self.rollouts: deque[Tensor] = deque(maxlen=config.memory)
-        self.recorded = inputs(self.policy, self.pairs.features, normalised(self.policy, self.pairs.action))
-        followed = emphasised(self.pairs, config.lateral_weight)
-        self.followed = followed.features, normalised(self.policy, followed.action)
+        self.recorded = critic_inputs(
+            self.policy, self.pairs.features, normalise_action(self.policy, self.pairs.action)
+        )
+        followed = emphasise_lateral(self.pairs, config.lateral_weight)
+        self.followed = followed.features, normalise_action(self.policy, followed.action)
 
     def now(self, ends: tuple[int, int]) -> int:
         """Value of a linear schedule of whole numbers."""
@@ -77,7 +79,7 @@ class Learner:
             for group in optimiser.param_groups:
                 group["lr"] = factor * rate
 
-    def drive(self, credit: float) -> Steps:
+    def drive(self, credit: float) -> RolloutSteps:
         """Drive the next pool for a horizon; a pool that is old starts anew from the record."""
         config = self.config
         while len(self.pools) < config.pools:
@@ -86,15 +88,15 @@ class Learner:
         if self.pools[index].age >= self.now(config.age):
             self.pools[index] = self._new_pool()
         horizon = self.now(config.horizon)
-        steps, self.pools[index] = roll(
+        steps, self.pools[index] = roll_out(
             self.recording, self.policy, self.pools[index], horizon, config.colour, credit, self.generator, self.model
         )
         self.simulated += len(steps.features)
         return steps
 
-    def _new_pool(self) -> Pool:
+    def _new_pool(self) -> ScenePool:
         config = self.config
-        return fresh_pool(
+        return draw_pool(
             self.recording,
             self.among,
             config.scenes,
@@ -104,10 +106,10 @@ class Learner:
             self.generator,
         )
 
-    def learn_critic(self, steps: Steps) -> float:
+    def learn_critic(self, steps: RolloutSteps) -> float:
         """Let the critic learn from the rollout and the ones before, and return its loss."""
         config = self.config
-        self.rollouts.append(inputs(self.policy, steps.features.detach(), steps.action.detach()))
+        self.rollouts.append(critic_inputs(self.policy, steps.features.detach(), steps.action.detach()))
         return train_critic(
             self.critic,
             self.critic_optimiser,
@@ -119,7 +121,7 @@ class Learner:
             self.generator,
         )
 
-    def learn_model(self, steps: Steps) -> float:
+    def learn_model(self, steps: RolloutSteps) -> float:
         """Let the forward model learn from the rollout, if there is one, and return its error."""
         if self.model is None:
             return 0.0
@@ -168,7 +170,7 @@ class Learner:
         self.update, self.simulated = state["update"], state["simulated"]
         self.generator.set_state(state["generator"])
         self.rollouts.extend(state["rollouts"])
-        self.pools = [Pool(Traffic(**pool["traffic"]), pool["noise"], pool["age"]) for pool in state["pools"]]
+        self.pools = [ScenePool(Traffic(**pool["traffic"]), pool["noise"], pool["age"]) for pool in state["pools"]]
 
     def inherit(self, path: Path) -> dict[str, Any]:
         """Take what has been learned from a saved training, but neither its place in it nor its traffic.
@@ -187,7 +189,7 @@ class Learner:
         return state
 
 
-def _value() -> nn.Sequential:
+def _make_value_network() -> nn.Sequential:
     """An estimate of the rewards to come, for GAIL."""
     return nn.Sequential(
         nn.Linear(FEATURE_SIZE + ACTION_SIZE, 128), nn.Tanh(), nn.Linear(128, 128), nn.Tanh(), nn.Linear(128, 1)
@@ -197,7 +199,7 @@ def _value() -> nn.Sequential:
 Update = Callable[[Learner], Log]
 
 
-def updates(learner: Learner, update: Update) -> Iterator[Log]:
+def run_updates(learner: Learner, update: Update) -> Iterator[Log]:
     """Make the updates that are left, one by one.
 
     Args:

@@ -9,15 +9,15 @@ References:
 
 import torch
 
-from training.imitation.algorithms.critic import inputs, policy_cost
+from training.imitation.algorithms.critic import critic_inputs, policy_cost
 from training.imitation.algorithms.learner import Learner, Log
 
 
-def update(learner: Learner) -> Log:
+def update_mgail(learner: Learner) -> Log:
     """Drive with gradients, move the policy down them, let the critic learn."""
     config = learner.config
     steps = learner.drive(config.credit)
-    likeness = policy_cost(learner.critic, inputs(learner.policy, steps.features, steps.action)).mean()
+    likeness = policy_cost(learner.critic, critic_inputs(learner.policy, steps.features, steps.action)).mean()
     collision, edge, brake = steps.collision.mean(), steps.edge.mean(), steps.brake.mean()
     clone = learner.clone_loss()
     loss = (

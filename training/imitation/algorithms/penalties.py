@@ -16,14 +16,14 @@ from torch import Tensor
 from rare_envs.sensors.lidar import AHEAD
 from rare_envs.sensors.perception import LANE_OFFSET, RANGES, RATES, SPEED
 
-ALONG, ACROSS = 3.0, 0.8
+NEAR_ALONG, NEAR_ACROSS = 3.0, 0.8
 """Gaps [m] to the front and to the side under which nearness costs."""
-MOST_ALONG, MOST_ACROSS = 3.0, 4.0
+MAX_NEARNESS_ALONG, MAX_NEARNESS_ACROSS = 3.0, 4.0
 """Caps of the two ramps, reached only by bodies that overlap."""
 COMFORTABLE_BRAKING = 1.5
 """Deceleration [m/s^2] that the vehicle ahead may make necessary at no cost."""
-MOST_BRAKING = 6.0
-EDGE = 1.0
+MAX_EXCESS_BRAKING = 6.0
+EDGE_DISTANCE = 1.0
 """Distance [m] from the middle of the vehicle to the edge of the road under which it costs."""
 GENTLE_BRAKING = 2.0
 """Deceleration [m/s^2] at no cost."""
@@ -31,12 +31,12 @@ HEADWAY, STANDSTILL = 1.2, 2.0
 """Gap at no cost to vehicles ahead that reach into the own path: so many seconds [s] and so many metres behind."""
 COMFORTABLE_APPROACH = 3.0
 """Deceleration [m/s^2] by which the own speed first comes down to theirs; the way that it takes is no gap."""
-MOST_HEADWAY = 2.0
-OFF_CENTRE = 0.3
+MAX_HEADWAY_COST = 2.0
+CENTRE_TOLERANCE = 0.3
 """Distance [m] from the middle of the lane at no cost."""
-LIMIT = 29.0
+SPEED_LIMIT = 29.0
 """Speed [m/s] at no cost, the limit of US 101 (65 mph)."""
-OVER = 10.0
+SPEEDING_SCALE = 10.0
 """Speed above it [m/s] that costs 1."""
 
 
@@ -51,7 +51,7 @@ class Penalties(NamedTuple):
     speed: Tensor
 
 
-def penalties(
+def compute_penalties(
     x: Tensor,
     y: Tensor,
     speed: Tensor,
@@ -77,23 +77,25 @@ def penalties(
     """
     along = (x[:, :m, None] - x[:, None, :]).abs() - 0.5 * (length[:, :m, None] + length[:, None, :])
     across = (y[:, :m, None] - y[:, None, :]).abs() - 0.5 * (width[:, :m, None] + width[:, None, :])
-    near = (1.0 - along / ALONG).clamp(0.0, MOST_ALONG) * (1.0 - across / ACROSS).clamp(0.0, MOST_ACROSS)
+    near = (1.0 - along / NEAR_ALONG).clamp(0.0, MAX_NEARNESS_ALONG) * (1.0 - across / NEAR_ACROSS).clamp(
+        0.0, MAX_NEARNESS_ACROSS
+    )
     itself = torch.eye(m, x.shape[1], dtype=torch.bool, device=x.device)
     contact = near.masked_fill(itself, 0.0).sum(dim=2)
     gap = (features[..., RANGES][..., AHEAD] - 0.5 * length[:, :m]).clamp(min=0.5)
     closing = (-features[..., RATES][..., AHEAD]).clamp(min=0.0)
     needed = closing.square() / (2.0 * gap)
     return Penalties(
-        collision=contact + 0.1 * (needed - COMFORTABLE_BRAKING).clamp(0.0, MOST_BRAKING),
-        edge=(EDGE - torch.minimum(y[:, :m] - edges[:, :1], edges[:, -1:] - y[:, :m])).clamp(min=0.0),
+        collision=contact + 0.1 * (needed - COMFORTABLE_BRAKING).clamp(0.0, MAX_EXCESS_BRAKING),
+        edge=(EDGE_DISTANCE - torch.minimum(y[:, :m] - edges[:, :1], edges[:, -1:] - y[:, :m])).clamp(min=0.0),
         brake=(-action[..., 0] - GENTLE_BRAKING).clamp(min=0.0),
-        headway=_headway(x, speed, along, across, m),
-        lane=(features[..., LANE_OFFSET].abs() - OFF_CENTRE).clamp(min=0.0),
-        speed=(features[..., SPEED] - LIMIT).clamp(min=0.0) / OVER,
+        headway=_headway_cost(x, speed, along, across, m),
+        lane=(features[..., LANE_OFFSET].abs() - CENTRE_TOLERANCE).clamp(min=0.0),
+        speed=(features[..., SPEED] - SPEED_LIMIT).clamp(min=0.0) / SPEEDING_SCALE,
     )
 
 
-def _headway(x: Tensor, speed: Tensor, along: Tensor, across: Tensor, m: int) -> Tensor:
+def _headway_cost(x: Tensor, speed: Tensor, along: Tensor, across: Tensor, m: int) -> Tensor:
     """Cost of being close behind whoever reaches into the own path, or fast towards it, shape (B, M).
 
     Args:
@@ -106,5 +108,5 @@ def _headway(x: Tensor, speed: Tensor, along: Tensor, across: Tensor, m: int) ->
     own = speed[:, :m, None]
     approach = (own - speed[:, None, :]).clamp(min=0.0).square() / (2.0 * COMFORTABLE_APPROACH)
     short = 1.0 - (along - approach) / (STANDSTILL + HEADWAY * own)
-    reaches = (1.0 - across / ACROSS).clamp(0.0, 1.0) * (x[:, None, :] > x[:, :m, None])
-    return (short.clamp(0.0, MOST_HEADWAY) * reaches).amax(dim=2)
+    reaches = (1.0 - across / NEAR_ACROSS).clamp(0.0, 1.0) * (x[:, None, :] > x[:, :m, None])
+    return (short.clamp(0.0, MAX_HEADWAY_COST) * reaches).amax(dim=2)

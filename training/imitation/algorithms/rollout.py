@@ -7,15 +7,15 @@ from torch import Tensor
 
 from agents.learned.coloured_noise import AutoregressiveNoise
 from agents.learned.networks import Policy
-from training.imitation.algorithms.actions import physical
+from training.imitation.algorithms.actions import denormalise_action
 from training.imitation.algorithms.forward_model import ForwardModel
-from training.imitation.algorithms.penalties import Penalties, penalties
+from training.imitation.algorithms.penalties import Penalties, compute_penalties
 from training.imitation.traffic.recording import Recording
-from training.imitation.traffic.replayed_traffic import Traffic, detached, look, step
-from training.imitation.traffic.scene_pool import Pool
+from training.imitation.traffic.replayed_traffic import Traffic, detach_traffic, perceive_traffic, step_replay
+from training.imitation.traffic.scene_pool import ScenePool
 
 
-class Steps(NamedTuple):
+class RolloutSteps(NamedTuple):
     """n moments of driven vehicles: T ticks, each with the same vehicles in the same order."""
 
     features: Tensor
@@ -33,16 +33,16 @@ class Steps(NamedTuple):
     """What the noise of the action was expected to be from the ticks before, shape (n, 2)."""
 
 
-def roll(
+def roll_out(
     recording: Recording,
     policy: Policy,
-    pool: Pool,
+    pool: ScenePool,
     ticks: int,
     colour: AutoregressiveNoise,
     credit: float,
     generator: torch.Generator,
     model: ForwardModel | None = None,
-) -> tuple[Steps, Pool]:
+) -> tuple[RolloutSteps, ScenePool]:
     """Drive a pool for some ticks.
 
     Args:
@@ -66,28 +66,28 @@ def roll(
     features: Tensor | None = None
     action: Tensor | None = None
     for _ in range(ticks):
-        before, features = features, look(traffic, m)
+        before, features = features, perceive_traffic(traffic, m)
         if model is not None and before is not None and action is not None:
             features = model.substituted(policy, before, action, features, credit)
         mean, log_std = policy(features)
         expected = colour.expected(memory)
         noise, memory = colour.next(memory, torch.randn(expected.shape, generator=generator))
         action = mean + torch.exp(log_std) * noise
-        moved = torch.cat((physical(policy, action), unused), dim=1)
+        moved = torch.cat((denormalise_action(policy, action), unused), dim=1)
         cost = _penalties(traffic, features if model is None else features.detach(), moved[:, :m], m)
         rows.append([part[driven] for part in (features, action, *cost, expected)])
-        traffic = step(recording, traffic, moved)
-        traffic = _passing(traffic, credit) if model is None else detached(traffic)
+        traffic = step_replay(recording, traffic, moved)
+        traffic = _scale_gradient(traffic, credit) if model is None else detach_traffic(traffic)
     columns = [torch.cat(column) for column in zip(*rows, strict=True)]
-    return Steps(*columns), Pool(detached(traffic), memory, pool.age + ticks)
+    return RolloutSteps(*columns), ScenePool(detach_traffic(traffic), memory, pool.age + ticks)
 
 
 def _penalties(traffic: Traffic, features: Tensor, action: Tensor, m: int) -> Penalties:
     bodies = traffic.x, traffic.y, traffic.speed, traffic.length, traffic.width
-    return penalties(*bodies, traffic.edges, features, action, m)
+    return compute_penalties(*bodies, traffic.edges, features, action, m)
 
 
-def _passing(traffic: Traffic, credit: float) -> Traffic:
+def _scale_gradient(traffic: Traffic, credit: float) -> Traffic:
     """The same traffic; on the way back its gradient is multiplied by `credit`."""
     moved = {
         name: (value := getattr(traffic, name)) * credit + value.detach() * (1.0 - credit)

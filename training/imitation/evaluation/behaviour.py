@@ -12,11 +12,11 @@ from rare_envs.sensors.perception import RANGES, RATES
 from rare_envs.traffic.overlap import boxes_overlap
 from training.data.trajectories import DT
 from training.imitation.traffic.recording import Recording
-from training.imitation.traffic.replayed_traffic import Traffic, lane_of, look, start, step
+from training.imitation.traffic.replayed_traffic import Traffic, lane_of, perceive_traffic, start_replay, step_replay
 
 Act = Callable[[Tensor, "Tensor | None"], tuple[Tensor, "Tensor | None"]]
 """From features (B, M, 51) and a memory, None at first, to actions (B, M, 2) [m/s^2, rad/s] and the new memory."""
-HARD_BRAKE = -3.0
+HARD_BRAKE_ACCELERATION = -3.0
 """Acceleration [m/s^2]."""
 
 
@@ -45,7 +45,7 @@ class Behaviour(NamedTuple):
     """Whether its lane is another than a tick before, boolean."""
 
 
-def sampled(driver: LearnedDriver, generator: torch.Generator, weights: Tensor | None = None) -> Act:
+def sampling_driver(driver: LearnedDriver, generator: torch.Generator, weights: Tensor | None = None) -> Act:
     """A learned driver with its noise.
 
     Args:
@@ -64,7 +64,7 @@ def sampled(driver: LearnedDriver, generator: torch.Generator, weights: Tensor |
     return act
 
 
-def every(recording: Recording, seconds: float = 2.0) -> tuple[Tensor, Tensor]:
+def regular_starts(recording: Recording, seconds: float = 2.0) -> tuple[Tensor, Tensor]:
     """Starts: (scene, tick) at whole multiples of some seconds from the start of every scene, shape (B,) each."""
     stride = round(seconds / DT)
     found = [
@@ -73,7 +73,7 @@ def every(recording: Recording, seconds: float = 2.0) -> tuple[Tensor, Tensor]:
     return torch.tensor([scene for scene, _ in found]), torch.tensor([tick for _, tick in found])
 
 
-class Moment(NamedTuple):
+class DrivingStep(NamedTuple):
     """Traffic at one tick."""
 
     traffic: Traffic
@@ -84,19 +84,19 @@ class Moment(NamedTuple):
     """Shape (B, M, 2)."""
 
 
-def drive(recording: Recording | None, traffic: Traffic, act: Act, ticks: int) -> Iterator[Moment]:
+def drive_traffic(recording: Recording | None, traffic: Traffic, act: Act, ticks: int) -> Iterator[DrivingStep]:
     """Drive traffic from where it is, tick by tick; the recording says where those are who are not driven."""
     m = traffic.drivers
     unused = torch.zeros(*traffic.x.shape[:1], traffic.x.shape[1] - m, 2)
     memory = None
     for _ in range(ticks):
-        features = look(traffic, m)
+        features = perceive_traffic(traffic, m)
         action, memory = act(features, memory)
-        yield Moment(traffic, features, action)
-        traffic = step(recording, traffic, torch.cat((action, unused), dim=1))
+        yield DrivingStep(traffic, features, action)
+        traffic = step_replay(recording, traffic, torch.cat((action, unused), dim=1))
 
 
-def overlaps(traffic: Traffic, m: int) -> Tensor:
+def find_overlaps(traffic: Traffic, m: int) -> Tensor:
     """Which pairs of bodies share ground: the first m vehicles with all, boolean, shape (B, m, V)."""
 
     def each(field: Tensor) -> Tensor:
@@ -116,7 +116,7 @@ def overlaps(traffic: Traffic, m: int) -> Tensor:
     return touching & ~torch.eye(m, traffic.x.shape[1], dtype=torch.bool)
 
 
-def behaviour_of(moments: Iterator[Moment]) -> Behaviour:
+def behaviour_of(moments: Iterator[DrivingStep]) -> Behaviour:
     """What driven vehicles do from a start on."""
     rows: list[tuple[Tensor, ...]] = []
     driven = overlapping = lane = torch.zeros(0)
@@ -124,7 +124,7 @@ def behaviour_of(moments: Iterator[Moment]) -> Behaviour:
     with torch.inference_mode():
         for moment in moments:
             traffic, m = moment.traffic, moment.action.shape[1]
-            now, touching = lane_of(traffic.y, traffic.edges)[:, :m], overlaps(traffic, m)
+            now, touching = lane_of(traffic.y, traffic.edges)[:, :m], find_overlaps(traffic, m)
             if not rows:
                 driven, overlapping, lane = traffic.driven[:, :m], touching, now
                 scene = traffic.scene[:, None].expand_as(driven)[driven]
@@ -146,7 +146,7 @@ def recorded_behaviour(recording: Recording) -> Behaviour:
     for tick in range(int(recording.ticks.max())):
         scene = torch.arange(scenes)
         at = recording.ticks.clamp(max=tick + 1) - 1
-        traffic = start(recording, scene, at)
+        traffic = start_replay(recording, scene, at)
         m = traffic.drivers
         action = torch.stack(
             [
@@ -155,12 +155,12 @@ def recorded_behaviour(recording: Recording) -> Behaviour:
             ],
             dim=-1,
         )
-        moment = Moment(traffic, look(traffic, m), action)
+        moment = DrivingStep(traffic, perceive_traffic(traffic, m), action)
         lane = lane_of(traffic.y, traffic.edges)[:, :m]
         vehicle = traffic.vehicle[:, :m]
         driven = traffic.driven[:, :m] & (at == tick)[:, None]
         last = before.gather(1, vehicle)
-        row = _row(moment, overlaps(traffic, m).any(dim=2), (lane != last) & (last >= 0))
+        row = _row(moment, find_overlaps(traffic, m).any(dim=2), (lane != last) & (last >= 0))
         known.append(torch.zeros(scenes, vehicles, dtype=torch.bool).scatter(1, vehicle, driven).flatten())
         rows.append([column.new_zeros(scenes, vehicles).scatter(1, vehicle, column).flatten() for column in row])
         before = torch.full_like(before, -1).scatter(1, vehicle, torch.where(driven, lane, -1))
@@ -168,7 +168,7 @@ def recorded_behaviour(recording: Recording) -> Behaviour:
     return Behaviour(torch.arange(scenes).repeat_interleave(vehicles), torch.stack(known), *columns)
 
 
-def _row(moment: Moment, contact: Tensor, changed: Tensor) -> tuple[Tensor, ...]:
+def _row(moment: DrivingStep, contact: Tensor, changed: Tensor) -> tuple[Tensor, ...]:
     """Columns of `Behaviour` from `speed` on, shape (B, M) each."""
     traffic, m = moment.traffic, moment.action.shape[1]
     y = traffic.y[:, :m]

@@ -5,15 +5,13 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from rare_envs.sensors.lidar import MAX_RANGE
+from samplers.problem import FloatArray
 from training.data.trajectories import DT
-from training.imitation.evaluation.behaviour import HARD_BRAKE, Behaviour
+from training.imitation.evaluation.behaviour import HARD_BRAKE_ACCELERATION, Behaviour
 from training.imitation.evaluation.prediction_error import Errors
-
-Array = NDArray[np.float64]
 
 BINS = MappingProxyType(
     {
@@ -31,22 +29,22 @@ COMPARED = ("position", "speed", "lateral")
 """Errors against the record that are summed."""
 
 
-class Tally(NamedTuple):
+class DrivingStatistics(NamedTuple):
     """Sums over the vehicle-steps of each of S scenes, from which everything else follows."""
 
-    steps: Array
+    steps: FloatArray
     """Vehicle-steps, shape (S,)."""
-    vehicles: Array
+    vehicles: FloatArray
     """Shape (S,)."""
-    sums: dict[str, Array]
+    sums: dict[str, FloatArray]
     """Hard braking, collision, off-road, lane changes and speed by vehicle-step, `ever` by vehicle, shape (S,)."""
-    counts: dict[str, Array]
+    counts: dict[str, FloatArray]
     """Of the bins of each quantity, shape (S, bins)."""
-    squared: dict[str, Array]
+    squared: dict[str, FloatArray]
     """Errors of position [m^2], speed and lateral position after 5 s, and how many, shape (S,)."""
 
 
-def quantities(behaviour: Behaviour) -> dict[str, tuple[Tensor, Tensor]]:
+def binned_quantities(behaviour: Behaviour) -> dict[str, tuple[Tensor, Tensor]]:
     """The values of each quantity in `BINS` with the scenes that they are of, shape (k,) each."""
     known = behaviour.known
     both = known[1:] & known[:-1]
@@ -64,7 +62,7 @@ def quantities(behaviour: Behaviour) -> dict[str, tuple[Tensor, Tensor]]:
     }
 
 
-def tally(behaviour: Behaviour, scenes: int, errors: Errors | None = None) -> Tally:
+def sum_by_scene(behaviour: Behaviour, scenes: int, errors: Errors | None = None) -> DrivingStatistics:
     """Sum by scene.
 
     Args:
@@ -74,14 +72,14 @@ def tally(behaviour: Behaviour, scenes: int, errors: Errors | None = None) -> Ta
     """
     known = behaviour.known
 
-    def by_scene(scene: Tensor, values: Tensor) -> Array:
+    def by_scene(scene: Tensor, values: Tensor) -> FloatArray:
         return np.bincount(scene.numpy(), values.double().numpy(), minlength=scenes).astype(np.float64)
 
-    def steps(values: Tensor) -> Array:
+    def steps(values: Tensor) -> FloatArray:
         return by_scene(behaviour.scene, (values.double() * known).sum(dim=0))
 
     counts = {}
-    for name, (values, scene) in quantities(behaviour).items():
+    for name, (values, scene) in binned_quantities(behaviour).items():
         low, high, bins = BINS[name]
         place = ((values.double() - low) / (high - low) * bins).floor().clamp(0, bins - 1).long()
         flat = np.bincount((scene * bins + place).numpy(), minlength=scenes * bins)
@@ -90,11 +88,11 @@ def tally(behaviour: Behaviour, scenes: int, errors: Errors | None = None) -> Ta
     if errors is not None:
         squared = {name: by_scene(errors.scene, getattr(errors, name).square()) for name in COMPARED}
         squared["number"] = by_scene(errors.scene, torch.ones_like(errors.position))
-    return Tally(
+    return DrivingStatistics(
         steps=steps(known),
         vehicles=by_scene(behaviour.scene, known.any(dim=0)),
         sums={
-            "hard_brake": steps(behaviour.acceleration <= HARD_BRAKE),
+            "hard_brake": steps(behaviour.acceleration <= HARD_BRAKE_ACCELERATION),
             "collision": steps(behaviour.contact),
             "off_road": steps(behaviour.off_road),
             "lane_changes": steps(behaviour.changed),
@@ -106,12 +104,12 @@ def tally(behaviour: Behaviour, scenes: int, errors: Errors | None = None) -> Ta
     )
 
 
-def together(tallies: list[Tally]) -> Tally:
+def add_statistics(tallies: list[DrivingStatistics]) -> DrivingStatistics:
     """One tally of several, of the same scenes."""
 
-    def added(name: str) -> dict[str, Array]:
+    def added(name: str) -> dict[str, FloatArray]:
         parts = [getattr(one, name) for one in tallies]
         return {key: np.sum([part[key] for part in parts], axis=0) for key in parts[0]}
 
     steps, vehicles = (np.sum([getattr(one, name) for one in tallies], axis=0) for name in ("steps", "vehicles"))
-    return Tally(steps, vehicles, added("sums"), added("counts"), added("squared"))
+    return DrivingStatistics(steps, vehicles, added("sums"), added("counts"), added("squared"))

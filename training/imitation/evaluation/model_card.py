@@ -25,13 +25,13 @@ USE = (
     "traffic on one road, know nothing of other roads, weather, people on foot or traffic lights, and must not drive a "
     "car."
 )
-SEEING = (
+VISION_USE = (
     "PilotNet on pictures of the front camera of this project, the own speed beside them, in imitation of a driver by "
     "rule. It knows no photographs, no other camera, no crossings and no people on foot, and must not drive a car."
 )
 
 
-def model_card(folder: Path) -> str:
+def format_model_card(folder: Path) -> str:
     """The card of all drivers, and egos that see, in a folder, as Markdown.
 
     Raises:
@@ -43,8 +43,8 @@ def model_card(folder: Path) -> str:
     if not paths:
         raise ValueError(f"Expected drivers (*.safetensors) in {str(folder)!r}, found none.")
     drivers = {path.stem: (read_driver(path), read_provenance(path)) for path in paths}
-    metrics = {name: dict(_flat(provenance.metrics)) for name, (_, provenance) in drivers.items()}
-    ensembles = {name: dict(_flat(provenance.ensemble)) for name, (_, provenance) in drivers.items()}
+    metrics = {name: dict(_flatten(provenance.metrics)) for name, (_, provenance) in drivers.items()}
+    ensembles = {name: dict(_flatten(provenance.ensemble)) for name, (_, provenance) in drivers.items()}
     parts = [
         "# Learned drivers",
         "Written by `python -m training.imitation.evaluation.model_card` from the headers of the files. "
@@ -61,20 +61,20 @@ def model_card(folder: Path) -> str:
         "\n".join(f"- {name}: `{provenance.command}`" for name, (_, provenance) in drivers.items()),
         *(["## Metrics", _table("metric", metrics)] if any(metrics.values()) else []),
         *(["## Law of the last layer's weights", _table("", ensembles)] if any(ensembles.values()) else []),
-        *(part for path in seeing for part in _seeing(path)),
+        *(part for path in seeing for part in _vision_sections(path)),
     ]
     return "\n\n".join(parts) + "\n"
 
 
-def _seeing(path: Path) -> Iterator[str]:
+def _vision_sections(path: Path) -> Iterator[str]:
     """Of a network that drives by pictures."""
     provenance = read_vision_provenance(path)
     yield f"## {path.stem}, an ego that sees"
-    yield f'{SEEING} Load it with `agents.load_ego("{path.stem}")`.'
+    yield f'{VISION_USE} Load it with `agents.load_ego("{path.stem}")`.'
     yield f"**Data.** {provenance.data} Licence of the file: {provenance.data_licence}."
     yield f"**Training.** {provenance.kind}, by `{provenance.command}`."
     if provenance.metrics:
-        yield _table("case", {name: dict(_flat(values)) for name, values in provenance.metrics.items()})
+        yield _table("case", {name: dict(_flatten(values)) for name, values in provenance.metrics.items()})
 
 
 def _drivers_table(drivers: Mapping[str, tuple[LearnedDriver, Provenance]]) -> str:
@@ -100,11 +100,11 @@ def _table(corner: str, columns: Mapping[str, Mapping[str, Any]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def _flatten(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Names and values of nested mappings, joined by spaces; lists, which are long, are left to the file."""
     for name, value in values.items():
         if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{name} ")
+            yield from _flatten(value, f"{prefix}{name} ")
         elif not isinstance(value, list):
             yield prefix + name, value
 
@@ -116,7 +116,7 @@ def _cell(value: Any) -> str:
 
 def main(folder: Annotated[Path, typer.Argument(help="Folder with the drivers.")]) -> None:
     """Write the model card of a folder of drivers."""
-    (folder / "README.md").write_text(model_card(folder), encoding="utf-8")
+    (folder / "README.md").write_text(format_model_card(folder), encoding="utf-8")
 
 
 if __name__ == "__main__":

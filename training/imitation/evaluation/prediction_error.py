@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from training.data.trajectories import DT
-from training.imitation.evaluation.behaviour import Act, drive, every
+from training.imitation.evaluation.behaviour import Act, drive_traffic, regular_starts
 from training.imitation.traffic.recording import Recording
-from training.imitation.traffic.replayed_traffic import Traffic, start
+from training.imitation.traffic.replayed_traffic import Traffic, start_replay
 
 TIMES = (0.5, 1.0, 2.0, 3.0, 4.0, 5.0, 10.0)
 """Seconds after which drivers are compared."""
@@ -51,7 +51,7 @@ def errors_of(recording: Recording, traffic: Traffic) -> Errors:
     return Errors(scene, (along.square() + across.square()).sqrt(), off("speed"), across)
 
 
-def segments(recording: Recording, seconds: float, each: int, generator: torch.Generator) -> tuple[Tensor, ...]:
+def draw_segments(recording: Recording, seconds: float, each: int, generator: torch.Generator) -> tuple[Tensor, ...]:
     """Some vehicles at moments of the record.
 
     Args:
@@ -63,14 +63,14 @@ def segments(recording: Recording, seconds: float, each: int, generator: torch.G
     Returns:
         Scene, tick and vehicle of each segment, shape (n,) each.
     """
-    scene, tick = every(recording, seconds)
-    traffic = start(recording, scene, tick)
+    scene, tick = regular_starts(recording, seconds)
+    traffic = start_replay(recording, scene, tick)
     rank = torch.where(traffic.driven, torch.rand(traffic.driven.shape, generator=generator), 2.0).argsort(1).argsort(1)
     row, column = ((rank < each) & traffic.driven).nonzero(as_tuple=True)
     return scene[row], tick[row], traffic.vehicle[row, column]
 
 
-def replayed_errors(
+def prediction_errors(
     recording: Recording, act: Act, chosen: tuple[Tensor, ...], rollouts: int = ROLLOUTS
 ) -> dict[float, Errors]:
     """Drive one vehicle of each segment, some times over, among recorded others.
@@ -78,18 +78,18 @@ def replayed_errors(
     Args:
         recording: The scenes.
         act: The driver.
-        chosen: As `segments` gives them.
+        chosen: As `draw_segments` gives them.
         rollouts: Of each segment.
 
     Returns:
         Errors after each of `TIMES`.
     """
     scene, tick, vehicle = (part.repeat(rollouts) for part in chosen)
-    traffic = start(recording, scene, tick, only=vehicle)
+    traffic = start_replay(recording, scene, tick, only=vehicle)
     ticks = {round(seconds / DT): seconds for seconds in TIMES}
     with torch.inference_mode():
         return {
             ticks[passed]: errors_of(recording, moment.traffic)
-            for passed, moment in enumerate(drive(recording, traffic, act, max(ticks) + 1))
+            for passed, moment in enumerate(drive_traffic(recording, traffic, act, max(ticks) + 1))
             if passed in ticks
         }

@@ -15,30 +15,28 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from agents import LearnedDriver
+from samplers.problem import FloatArray
 from training.data.trajectories import DT
 from training.imitation.evaluation.behaviour import (
     Act,
     Behaviour,
-    Moment,
+    DrivingStep,
     behaviour_of,
-    drive,
-    every,
+    drive_traffic,
     recorded_behaviour,
-    sampled,
+    regular_starts,
+    sampling_driver,
 )
-from training.imitation.evaluation.driving_statistics import BINS, COMPARED, Tally, tally
+from training.imitation.evaluation.driving_statistics import BINS, COMPARED, DrivingStatistics, sum_by_scene
 from training.imitation.evaluation.prediction_error import Errors, errors_of
 from training.imitation.traffic.recording import Recording
-from training.imitation.traffic.replayed_traffic import start
-
-Array = NDArray[np.float64]
+from training.imitation.traffic.replayed_traffic import start_replay
 
 _SHARES = ("hard_brake", "collision", "off_road")
-AFTER = 5.0
+ERROR_TIME = 5.0
 """Seconds after which positions are compared with the record, all vehicles driven."""
 
 
@@ -65,18 +63,20 @@ class Realism:
     """Root mean square error against the record after 5 s: position [m], speed [m/s], lateral [m]."""
 
 
-def jensen_shannon(p: Array, q: Array) -> float:
+def jensen_shannon(p: FloatArray, q: FloatArray) -> float:
     """Divergence of two laws on the same bins [nats], 0 to log 2."""
     middle = 0.5 * (p + q)
 
-    def kl(a: Array) -> float:
+    def kl(a: FloatArray) -> float:
         inside = a > 0
         return float((a[inside] * np.log(a[inside] / middle[inside])).sum())
 
     return 0.5 * kl(p) + 0.5 * kl(q)
 
 
-def summary(found: Tally, recorded: Tally, times: Array | None = None) -> Realism:
+def summarise_realism(
+    found: DrivingStatistics, recorded: DrivingStatistics, times: FloatArray | None = None
+) -> Realism:
     """Rates, divergences and errors of a tally.
 
     Args:
@@ -87,7 +87,7 @@ def summary(found: Tally, recorded: Tally, times: Array | None = None) -> Realis
     times = np.ones_like(found.steps) if times is None else times
     steps, vehicles = times @ found.steps, times @ found.vehicles
 
-    def share(counts: Array, of: Array) -> Array:
+    def share(counts: FloatArray, of: FloatArray) -> FloatArray:
         total = of @ counts
         return np.asarray(total / max(total.sum(), 1.0))
 
@@ -109,9 +109,9 @@ def summary(found: Tally, recorded: Tally, times: Array | None = None) -> Realis
     )
 
 
-def tallies(
+def collect_statistics(
     recording: Recording, act: Act, seconds: tuple[float, ...], starts: tuple[Tensor, Tensor] | None = None
-) -> dict[float, Tally]:
+) -> dict[float, DrivingStatistics]:
     """Drive recorded scenes and sum up what happens within each of some times.
 
     Args:
@@ -122,10 +122,10 @@ def tallies(
     """
     met: list[Errors] = []
 
-    def watched() -> Iterator[Moment]:
-        traffic = start(recording, *(every(recording) if starts is None else starts))
-        for tick, moment in enumerate(drive(recording, traffic, act, round(seconds[-1] / DT))):
-            if tick == round(AFTER / DT):
+    def watched() -> Iterator[DrivingStep]:
+        traffic = start_replay(recording, *(regular_starts(recording) if starts is None else starts))
+        for tick, moment in enumerate(drive_traffic(recording, traffic, act, round(seconds[-1] / DT))):
+            if tick == round(ERROR_TIME / DT):
                 met.append(errors_of(recording, moment.traffic))
             yield moment
 
@@ -133,26 +133,33 @@ def tallies(
     out = {}
     for time in seconds:
         part = Behaviour(whole.scene, *(column[: round(time / DT)] for column in whole[1:]))
-        out[time] = tally(part, len(recording.x), met[0] if met else None)
+        out[time] = sum_by_scene(part, len(recording.x), met[0] if met else None)
     return out
 
 
 def measure(
     recording: Recording, act: Act, starts: tuple[Tensor, Tensor] | None = None, seconds: float = 10.0
 ) -> Realism:
-    """Drive recorded scenes and compare with the record; arguments as in `tallies`."""
-    return summary(tallies(recording, act, (seconds,), starts)[seconds], recorded_tally(recording))
+    """Drive recorded scenes and compare with the record; arguments as in `collect_statistics`."""
+    return summarise_realism(
+        collect_statistics(recording, act, (seconds,), starts)[seconds], record_statistics(recording)
+    )
 
 
-def recorded_tally(recording: Recording) -> Tally:
+def record_statistics(recording: Recording) -> DrivingStatistics:
     """What people did in the recorded scenes."""
-    return tally(recorded_behaviour(recording), len(recording.x))
+    return sum_by_scene(recorded_behaviour(recording), len(recording.x))
 
 
-def standard_errors(found: Tally, recorded: Tally, rng: np.random.Generator, draws: int = 200) -> Realism:
-    """Standard errors of `summary`, by bootstrap over scenes; scenes that share vehicles are taken as independent."""
+def standard_errors(
+    found: DrivingStatistics, recorded: DrivingStatistics, rng: np.random.Generator, draws: int = 200
+) -> Realism:
+    """Return standard errors by bootstrap over scenes; scenes that share vehicles are taken as independent."""
     scenes = len(found.steps)
-    drawn = [asdict(summary(found, recorded, times)) for times in rng.multinomial(scenes, [1 / scenes] * scenes, draws)]
+    drawn = [
+        asdict(summarise_realism(found, recorded, times))
+        for times in rng.multinomial(scenes, [1 / scenes] * scenes, draws)
+    ]
 
     def spread(values: list[Any]) -> Any:
         if isinstance(values[0], dict):
@@ -162,8 +169,8 @@ def standard_errors(found: Tally, recorded: Tally, rng: np.random.Generator, dra
     return Realism(**{name: spread([one[name] for one in drawn]) for name in drawn[0]})
 
 
-def metrics(recording: Recording, driver: LearnedDriver, seed: int = 0) -> dict[str, dict[str, Any]]:
+def header_metrics(recording: Recording, driver: LearnedDriver, seed: int = 0) -> dict[str, dict[str, Any]]:
     """What the header of a driver's file says: `Realism` over 10 s and 20 s, with one sequence of noise."""
-    found = tallies(recording, sampled(driver, torch.Generator().manual_seed(seed)), (10.0, 20.0))
-    recorded = recorded_tally(recording)
-    return {f"{seconds:g} s": asdict(summary(one, recorded)) for seconds, one in found.items()}
+    found = collect_statistics(recording, sampling_driver(driver, torch.Generator().manual_seed(seed)), (10.0, 20.0))
+    recorded = record_statistics(recording)
+    return {f"{seconds:g} s": asdict(summarise_realism(one, recorded)) for seconds, one in found.items()}

@@ -7,15 +7,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from training.data.scenes import Scene
+from training.data.scenes import TrafficScene
 
-NOWHERE = -1e4
+PARKING_X = -1e4
 """x of vehicles that are not there [m]: further than any sensor reaches; each is parked apart from the others."""
-_APART = 300.0
+_PARKING_GAP = 300.0
 
 
 class Recording(NamedTuple):
-    """S scenes of at most T ticks, V vehicles and L lanes, single precision; units and frame as in `Scene`."""
+    """S scenes of at most T ticks, V vehicles and L lanes, single precision; units and frame as in `TrafficScene`."""
 
     x: Tensor
     """Shape (S, T, V), as the next five; 0 where absent."""
@@ -37,7 +37,7 @@ class Recording(NamedTuple):
     """Ticks of each scene, shape (S,)."""
 
 
-def stack(scenes: Sequence[Scene]) -> Recording:
+def stack_scenes(scenes: Sequence[TrafficScene]) -> Recording:
     """Put scenes side by side.
 
     Raises:
@@ -84,6 +84,6 @@ def stack(scenes: Sequence[Scene]) -> Recording:
     )
 
 
-def parked(like: Tensor) -> Tensor:
+def parking_positions(like: Tensor) -> Tensor:
     """Places x for vehicles that are not there, shape of the given tensor (..., V)."""
-    return (NOWHERE - _APART * torch.arange(like.shape[-1], dtype=like.dtype)).expand_as(like)
+    return (PARKING_X - _PARKING_GAP * torch.arange(like.shape[-1], dtype=like.dtype)).expand_as(like)

@@ -13,7 +13,7 @@ from torch import Tensor
 from rare_envs.sensors.lidar import Bodies
 from rare_envs.sensors.perception import OnRoad, perceive
 from training.data.trajectories import DT
-from training.imitation.traffic.recording import Recording, parked
+from training.imitation.traffic.recording import Recording, parking_positions
 
 
 class Traffic(NamedTuple):
@@ -46,7 +46,7 @@ class Traffic(NamedTuple):
         return int(self.driven.sum(dim=1).max())
 
 
-def start(
+def start_replay(
     recording: Recording, scene: Tensor, tick: Tensor, most: int | None = None, only: Tensor | None = None
 ) -> Traffic:
     """Traffic as recorded at a moment of some scenes.
@@ -74,7 +74,7 @@ def start(
         return field.gather(1, vehicle)
 
     there, driven = of(there), of(driven)
-    x = torch.where(there, of(x), parked(vehicle.float()))
+    x = torch.where(there, of(x), parking_positions(vehicle.float()))
     y, heading, speed = (
         torch.where(there, of(field), 0.0)
         for field in (y, recording.heading[scene, tick], recording.speed[scene, tick])
@@ -103,13 +103,13 @@ def on_road(y: Tensor, heading: Tensor, edges: Tensor) -> OnRoad:
     return OnRoad(y - 0.5 * (left + right), heading, torch.zeros_like(y), y - left, right - y)
 
 
-def look(traffic: Traffic, observers: int | None = None) -> Tensor:
+def perceive_traffic(traffic: Traffic, observers: int | None = None) -> Tensor:
     """The 51 features of the first vehicles, shape (B, M, 51); None for all."""
     bodies = Bodies(traffic.x, traffic.y, traffic.heading, traffic.speed, traffic.length, traffic.width)
     return perceive(bodies, on_road(traffic.y, traffic.heading, traffic.edges), observers)
 
 
-def step(recording: Recording | None, traffic: Traffic, action: Tensor) -> Traffic:
+def step_replay(recording: Recording | None, traffic: Traffic, action: Tensor) -> Traffic:
     """Move everybody by one tick: explicit Euler with the old values, as recorded motion was inverted.
 
     Args:
@@ -129,11 +129,11 @@ def step(recording: Recording | None, traffic: Traffic, action: Tensor) -> Traff
     moved = {"x": x, "y": y, "heading": heading, "speed": speed}
     tick = traffic.tick + 1
     if recording is not None and not bool(traffic.driven.all()):
-        moved = _replayed(recording, traffic, tick, moved)
+        moved = _replay(recording, traffic, tick, moved)
     return traffic._replace(**moved, tick=tick)
 
 
-def _replayed(recording: Recording, traffic: Traffic, tick: Tensor, moved: dict[str, Tensor]) -> dict[str, Tensor]:
+def _replay(recording: Recording, traffic: Traffic, tick: Tensor, moved: dict[str, Tensor]) -> dict[str, Tensor]:
     """Where the record goes on, it says where vehicles that are not driven are."""
     scene, vehicle = traffic.scene, traffic.vehicle
     at = tick.minimum(recording.ticks[scene] - 1)
@@ -144,6 +144,6 @@ def _replayed(recording: Recording, traffic: Traffic, tick: Tensor, moved: dict[
     }
 
 
-def detached(traffic: Traffic) -> Traffic:
+def detach_traffic(traffic: Traffic) -> Traffic:
     """The same traffic, with no gradient to how it came about."""
     return Traffic(*(field.detach() for field in traffic))

@@ -7,11 +7,11 @@ from torch import Tensor
 
 from agents.learned.coloured_noise import AutoregressiveNoise
 from training.imitation.traffic.recording import Recording
-from training.imitation.traffic.replayed_traffic import Traffic, start
+from training.imitation.traffic.replayed_traffic import Traffic, start_replay
 
 
 @dataclass
-class Pool:
+class ScenePool:
     """Some scenes that are driven together."""
 
     traffic: Traffic
@@ -21,7 +21,7 @@ class Pool:
     """Ticks driven since the record."""
 
 
-def fresh_pool(
+def draw_pool(
     recording: Recording,
     among: Tensor,
     size: int,
@@ -29,7 +29,7 @@ def fresh_pool(
     shortest: int,
     colour: AutoregressiveNoise,
     generator: torch.Generator,
-) -> Pool:
+) -> ScenePool:
     """Start scenes at random moments of their records.
 
     Args:
@@ -44,6 +44,6 @@ def fresh_pool(
     scene = among[torch.randint(len(among), (size,), generator=generator)]
     last = (recording.ticks[scene] - shortest).clamp(min=1)
     tick = (torch.rand(size, generator=generator) * last).long()
-    traffic = start(recording, scene, tick, most)
+    traffic = start_replay(recording, scene, tick, most)
     noise = colour.begin(torch.randn(size, traffic.drivers, 2, 2, generator=generator))
-    return Pool(traffic, noise)
+    return ScenePool(traffic, noise)

@@ -11,13 +11,13 @@ from agents.learned.coloured_noise import AutoregressiveNoise
 from agents.learned.networks import Policy, Scaling
 from tests.training.imitation.synthetic_scenes import scenes
 from training.imitation.algorithms import mgail
-from training.imitation.algorithms.actions import log_likelihood, normalised, physical
+from training.imitation.algorithms.actions import denormalise_action, log_likelihood, normalise_action
 from training.imitation.algorithms.config import Config
-from training.imitation.algorithms.critic import Critic, critic_loss, inputs, policy_cost
+from training.imitation.algorithms.critic import Critic, critic_inputs, critic_loss, policy_cost
 from training.imitation.algorithms.forward_model import ForwardModel, train_model
-from training.imitation.algorithms.gail import advantages, conditional, rewards, seen_by_value, surrogate
-from training.imitation.algorithms.learner import updates
-from training.imitation.fit import fit, learner_of, prepare
+from training.imitation.algorithms.gail import advantages, clipped_surrogate, conditional_action, rewards, value_inputs
+from training.imitation.algorithms.learner import run_updates
+from training.imitation.fit import make_learner, prepare_data, train_learner
 
 SMALL = Config(
     updates=12,
@@ -35,7 +35,7 @@ SMALL = Config(
 
 @pytest.fixture(scope="module")
 def data():
-    return prepare(scenes())
+    return prepare_data(scenes())
 
 
 def generator(seed=0):
@@ -65,7 +65,7 @@ def test_the_clipped_surrogate():
     ratio = torch.tensor([1.5, 0.5, 1.5, 0.5, 1.1])
     advantage = torch.tensor([2.0, 2.0, -2.0, -2.0, 1.0])
     # a gain is not followed beyond 1.2, a loss is counted in full
-    assert surrogate(ratio, advantage, 0.2).tolist() == pytest.approx([2.4, 1.0, -3.0, -1.6, 1.1])
+    assert clipped_surrogate(ratio, advantage, 0.2).tolist() == pytest.approx([2.4, 1.0, -3.0, -1.6, 1.1])
 
 
 def test_coloured_actions_have_the_joint_density_that_their_conditionals_multiply_to():
@@ -80,7 +80,7 @@ def test_coloured_actions_have_the_joint_density_that_their_conditionals_multipl
         expected = colour.expected(memory)
         noise, memory = colour.next(memory, torch.randn(1, 2, generator=generator(4 + t)).double())
         action = mean[t : t + 1] + torch.exp(log_std[t : t + 1]) * noise
-        law = conditional(policy, features[t : t + 1], expected, colour)
+        law = conditional_action(policy, features[t : t + 1], expected, colour)
         total += float(log_likelihood(*law, action).detach())
         noises.append(noise[0])
     for k in range(2):  # acceleration, yaw rate
@@ -108,7 +108,7 @@ def gaussian_log_density(x, correlation):
 
 def test_white_noise_leaves_the_policy_as_it_is():
     policy, features = plain_policy(), torch.randn(4, 51, generator=generator())
-    mean, log_std = conditional(policy, features, torch.zeros(4, 2), AutoregressiveNoise())
+    mean, log_std = conditional_action(policy, features, torch.zeros(4, 2), AutoregressiveNoise())
     torch.testing.assert_close((mean, log_std), policy(features))
 
 
@@ -120,8 +120,8 @@ def test_likelihood_is_that_of_torch():
 
 def test_actions_in_physical_units_and_back():
     policy, action = plain_policy(), torch.tensor([[0.3, -1.0]])
-    assert physical(policy, action)[0].tolist() == pytest.approx([1.1, -0.1])
-    torch.testing.assert_close(normalised(policy, physical(policy, action)), action)
+    assert denormalise_action(policy, action)[0].tolist() == pytest.approx([1.1, -0.1])
+    torch.testing.assert_close(normalise_action(policy, denormalise_action(policy, action)), action)
 
 
 def test_the_critic_s_loss_by_hand():
@@ -166,13 +166,13 @@ def test_the_critic_s_cost_falls_where_driving_looks_recorded():
 
 def test_rewards_are_the_costs_of_mgail_with_another_sign(data):
     weights = {"critic_weight": 3.0, "collision_weight": 8.0, "edge_weight": 4.0, "brake_weight": 2.0}
-    learner = learner_of(data, dataclasses.replace(SMALL, **weights))
+    learner = make_learner(data, dataclasses.replace(SMALL, **weights))
     with torch.no_grad():
         steps = learner.drive(1.0)
-        likeness = policy_cost(learner.critic, inputs(learner.policy, steps.features, steps.action))
+        likeness = policy_cost(learner.critic, critic_inputs(learner.policy, steps.features, steps.action))
         reward = rewards(learner, steps)
     torch.testing.assert_close(reward, -(3 * likeness + 8 * steps.collision + 4 * steps.edge + 2 * steps.brake))
-    assert seen_by_value(learner.policy, steps).shape == (len(reward), 53)
+    assert value_inputs(learner.policy, steps).shape == (len(reward), 53)
 
 
 def test_mgail_lowers_its_loss(data):
@@ -180,10 +180,10 @@ def test_mgail_lowers_its_loss(data):
     config = dataclasses.replace(
         SMALL, policy_rate=1e-2, clone_weight=(1e-9, 1e-9), critic_weight=0.0, collision_weight=0.0, edge_weight=0.0
     )
-    learner = learner_of(data, config)
+    learner = make_learner(data, config)
     with torch.no_grad():
         learner.policy.head.bias[0] = -10.0  # brakes at about 4 m/s^2
-    losses = [entry["brake"] for entry in updates(learner, mgail.update)]
+    losses = [entry["brake"] for entry in run_updates(learner, mgail.update_mgail)]
     assert losses[-1] < 0.7 * losses[0]
 
 
@@ -198,18 +198,18 @@ def test_gail_brakes_less_when_braking_costs(data):
         clone_weight=(1e-9, 1e-9),
         critic_weight=0.0,
     )
-    learner = learner_of(data, config)
+    learner = make_learner(data, config)
     with torch.no_grad():
         learner.policy.head.bias[0], learner.policy.head.bias[2] = -6.0, 1.0
         before = float(learner.drive(1.0).brake.mean())
-    fit(learner)
+    train_learner(learner)
     with torch.no_grad():
         after = float(learner.drive(1.0).brake.mean())
     assert after < 0.7 * before
 
 
 def test_the_forward_model_learns_and_leaves_values_alone(data):
-    learner = learner_of(data, dataclasses.replace(SMALL, learned_model=True))
+    learner = make_learner(data, dataclasses.replace(SMALL, learned_model=True))
     with torch.no_grad():
         steps = learner.drive(1.0)
     errors = [learner.learn_model(steps) for _ in range(30)]
@@ -241,7 +241,7 @@ def test_a_linear_world_is_learned_with_its_jacobian():
 
 
 def test_through_a_learned_model_the_state_s_penalties_have_no_gradient(data):
-    learner = learner_of(data, dataclasses.replace(SMALL, learned_model=True, scenes=4))
+    learner = make_learner(data, dataclasses.replace(SMALL, learned_model=True, scenes=4))
     steps = learner.drive(1.0)
     assert not steps.collision.requires_grad
     assert not steps.edge.requires_grad

@@ -6,7 +6,7 @@ import torch
 from agents import LearnedDriver, Provenance, save_driver
 from agents.learned.coloured_noise import AutoregressiveNoise
 from agents.learned.networks import Policy, Scaling
-from training.imitation.evaluation.model_card import main, model_card
+from training.imitation.evaluation.model_card import format_model_card, main
 
 
 def test_the_card_has_every_driver_with_its_command_metrics_and_licence(tmp_path):
@@ -24,7 +24,7 @@ def test_the_card_has_every_driver_with_its_command_metrics_and_licence(tmp_path
         save_driver(driver, provenance, tmp_path / f"{kind}.safetensors")
     main(tmp_path)
     card = (tmp_path / "README.md").read_text(encoding="utf-8")
-    assert card == model_card(tmp_path)
+    assert card == format_model_card(tmp_path)
     for line in (
         "|  | bc | mgail |",
         "| collision | 0.05235 | 0.004 |",
@@ -41,4 +41,4 @@ def test_the_card_has_every_driver_with_its_command_metrics_and_licence(tmp_path
 
 def test_a_folder_without_drivers_has_no_card(tmp_path):
     with pytest.raises(ValueError, match="found none"):
-        model_card(tmp_path)
+        format_model_card(tmp_path)

@@ -7,17 +7,23 @@ import pytest
 import torch
 
 from tests.training.imitation.synthetic_scenes import scenes
-from training.imitation.evaluation.behaviour import behaviour_of, drive, every, recorded_behaviour
-from training.imitation.evaluation.driving_statistics import BINS, quantities, tally, together
-from training.imitation.evaluation.prediction_error import TIMES, replayed_errors, segments
-from training.imitation.evaluation.realism import jensen_shannon, recorded_tally, standard_errors, summary, tallies
-from training.imitation.traffic.recording import stack
-from training.imitation.traffic.replayed_traffic import start
+from training.imitation.evaluation.behaviour import behaviour_of, drive_traffic, recorded_behaviour, regular_starts
+from training.imitation.evaluation.driving_statistics import BINS, add_statistics, binned_quantities, sum_by_scene
+from training.imitation.evaluation.prediction_error import TIMES, draw_segments, prediction_errors
+from training.imitation.evaluation.realism import (
+    collect_statistics,
+    jensen_shannon,
+    record_statistics,
+    standard_errors,
+    summarise_realism,
+)
+from training.imitation.traffic.recording import stack_scenes
+from training.imitation.traffic.replayed_traffic import start_replay
 
 
 @pytest.fixture(scope="module")
 def recording():
-    return stack(scenes(4))
+    return stack_scenes(scenes(4))
 
 
 def constant(features, memory):
@@ -25,7 +31,7 @@ def constant(features, memory):
 
 
 def test_the_record_has_no_divergence_from_itself(recording):
-    found = summary(recorded_tally(recording), recorded_tally(recording))
+    found = summarise_realism(record_statistics(recording), record_statistics(recording))
     assert max(found.divergence.values()) == 0
     assert found.collision == found.hard_brake == found.off_road == found.ever == 0
     assert found.vehicles == 4 * 6
@@ -36,55 +42,57 @@ def test_the_record_counts_every_moment_that_may_be_driven_and_no_more(recording
     assert behaviour.known.sum() == 4 * (6 * 59 - 29)
     accelerations = behaviour.acceleration[behaviour.known]
     assert accelerations.abs().max() <= 0.6 + 1e-6
-    jerk, _ = quantities(behaviour)["jerk"]
+    jerk, _ = binned_quantities(behaviour)["jerk"]
     assert jerk.abs().max() <= 0.6 * 1.3 + 0.05  # 0.6 cos(1.3 t)
 
 
 def test_bins_hold_everything_and_the_outermost_what_is_beyond(recording):
     rows = torch.arange(4)
-    behaviour = behaviour_of(drive(recording, start(recording, rows, torch.zeros_like(rows)), constant, 10))
+    behaviour = behaviour_of(
+        drive_traffic(recording, start_replay(recording, rows, torch.zeros_like(rows)), constant, 10)
+    )
     fast = behaviour._replace(speed=behaviour.speed + 100.0)
-    counts = tally(fast, 4).counts["speed"]
+    counts = sum_by_scene(fast, 4).counts["speed"]
     assert (counts[:, -1] == 60).all()
     assert counts.sum() == 4 * 6 * 10
-    assert set(tally(fast, 4).counts) == set(BINS)
+    assert set(sum_by_scene(fast, 4).counts) == set(BINS)
 
 
 def test_times_of_one_rollout_are_those_of_two(recording):
-    both = tallies(recording, constant, (1.0, 2.0))
-    alone = tallies(recording, constant, (1.0,))
+    both = collect_statistics(recording, constant, (1.0, 2.0))
+    alone = collect_statistics(recording, constant, (1.0,))
     for name in ("speed", "acceleration"):
         np.testing.assert_array_equal(both[1.0].counts[name], alone[1.0].counts[name])
     assert both[2.0].steps.sum() == 2 * both[1.0].steps.sum()
 
 
 def test_a_tally_of_two_runs_has_the_mean_rates(recording):
-    one, recorded = tallies(recording, constant, (1.0,))[1.0], recorded_tally(recording)
-    both = summary(together([one, one]), recorded)
-    assert dataclasses.replace(both, vehicles=0) == dataclasses.replace(summary(one, recorded), vehicles=0)
-    assert both.vehicles == 2 * summary(one, recorded).vehicles
+    one, recorded = collect_statistics(recording, constant, (1.0,))[1.0], record_statistics(recording)
+    both = summarise_realism(add_statistics([one, one]), recorded)
+    assert dataclasses.replace(both, vehicles=0) == dataclasses.replace(summarise_realism(one, recorded), vehicles=0)
+    assert both.vehicles == 2 * summarise_realism(one, recorded).vehicles
 
 
 def test_standard_errors_are_those_of_the_mean_over_scenes(recording):
     """Speeds of four scenes with equally many steps: the bootstrap's is the standard deviation over root n."""
-    one = tallies(recording, constant, (0.1,), (torch.arange(4), torch.zeros(4, dtype=torch.long)))[0.1]
-    spread = standard_errors(one, recorded_tally(recording), np.random.default_rng(0), 4000)
+    one = collect_statistics(recording, constant, (0.1,), (torch.arange(4), torch.zeros(4, dtype=torch.long)))[0.1]
+    spread = standard_errors(one, record_statistics(recording), np.random.default_rng(0), 4000)
     speeds = one.sums["speed"] / one.steps
     assert spread.mean_speed == pytest.approx(speeds.std() / 2.0, rel=0.05)
     assert spread.collision == 0
 
 
 def test_one_vehicle_is_driven_and_the_others_replayed(recording):
-    chosen = segments(recording, 2.0, 2, torch.Generator().manual_seed(0))
-    assert len(chosen[0]) == 2 * len(every(recording)[0])
-    traffic = start(recording, *chosen[:2], only=chosen[2])
+    chosen = draw_segments(recording, 2.0, 2, torch.Generator().manual_seed(0))
+    assert len(chosen[0]) == 2 * len(regular_starts(recording)[0])
+    traffic = start_replay(recording, *chosen[:2], only=chosen[2])
     assert (traffic.driven.sum(dim=1) == 1).all()
     assert torch.equal(traffic.vehicle[:, 0], chosen[2])
 
 
 def test_constant_speed_is_off_by_what_the_record_changed(recording):
-    chosen = segments(recording, 10.0, 3, torch.Generator().manual_seed(0))  # at the start of each scene
-    found = replayed_errors(recording, constant, chosen, rollouts=2)
+    chosen = draw_segments(recording, 10.0, 3, torch.Generator().manual_seed(0))  # at the start of each scene
+    found = prediction_errors(recording, constant, chosen, rollouts=2)
     scene, _, vehicle = chosen
     speed = recording.speed[scene, 20, vehicle] - recording.speed[scene, 0, vehicle]
     torch.testing.assert_close(found[2.0].speed[: len(scene)], -speed)
