@@ -19,7 +19,7 @@ from torch import Tensor
 
 from rare_envs.egos.policy import as_driver
 from rare_envs.plugins import did_you_mean
-from rare_envs.sensors.perception import look
+from rare_envs.sensors.perception import perceive_traffic
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.rollout import Driver
 from rare_envs.simulation.world import World
@@ -187,7 +187,7 @@ class NoisyDriver:
         plans = memory.tick % self.every == 0
         errors = self._later(memory.errors, memory.tick // self.every) if plans else memory.errors
         seen = self._seen(state, past[0], errors)
-        perception = None if episode.perception is None else look(seen, episode.road)
+        perception = None if episode.perception is None else perceive_traffic(seen, episode.road)
         shown = episode._replace(state=seen, lead=lead_of(seen, episode.road), perception=perception)
         wanted, inner = self.inner.act(shown, memory.inner)
         if not plans:  # the speed is planned now and then, the path is followed at every tick

@@ -18,7 +18,7 @@ import agents
 import rare_envs
 from rare_envs.envs.rendering import Renderer
 from rare_envs.simulation.rollout import drive
-from rare_envs.traffic.overlap import overlaps
+from rare_envs.traffic.overlap import pairwise_overlaps
 
 
 def main(
@@ -43,7 +43,7 @@ def main(
                 frames.append(Image.fromarray(image).quantize(64))
             if still is not None and tick == round(at / problem.world.dt):
                 Image.fromarray(image).save(still)
-            contacts += int(overlaps(episode.state, road).sum()) // 2
+            contacts += int(pairwise_overlaps(episode.state, road).sum()) // 2
             off += int(road.off_road(episode.state.y).sum())
     if out is not None:
         frames[0].save(out, save_all=True, append_images=frames[1:], duration=100, loop=0)

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from rare_envs.control.actions import ACTIONS
-from rare_envs.distributions.product import NoiseLaw, beside
+from rare_envs.distributions.product import NoiseDistribution, join_independent
 from rare_envs.distributions.space import Distribution, Parameter, ScenarioSpace
 from rare_envs.measures.registry import named_measure
 from rare_envs.plugins import did_you_mean
@@ -46,7 +46,7 @@ def set_up(
             `Measure` or another of its kind, or a function; see `rare_envs.measures.registry.find_measure`.
         horizon: Length of an episode [s]; None takes the scenario's.
         dt: Tick [s].
-        base: Law of the scenario's own parameters: the name of a shipped one, the path of a JSON file, or a
+        base: Distribution of the scenario's own parameters: the name of a shipped one, the path of a JSON file, or a
             distribution object; None takes the scenario's default.
         drivers: Of the vehicles around the ego: "mgail", "gail", "bc", the path of a driver's file, or a `Background`;
             None takes the scenario's default, which is its script but for the highway. The weights of learned drivers
@@ -118,21 +118,21 @@ def space_of(world: World, base: Distribution) -> ScenarioSpace:
 
     Args:
         world: The world.
-        base: Law of the scenario's own parameters.
+        base: Distribution of the scenario's own parameters.
     """
-    parameters, laws = list(world.scenario.parameters), [base]
-    for weather, law in world.weather_laws:
+    parameters, distributions = list(world.scenario.parameters), [base]
+    for weather, distribution in world.weather_distributions:
         parameters += weather
-        laws.append(law)
+        distributions.append(distribution)
     if world.drivers is not None and world.drivers.weights is not None:
         parameters.append(Parameter("weights", "", -np.inf, np.inf, "of the drivers' last layer", world.weights))
-        laws.append(world.drivers.weights)
+        distributions.append(world.drivers.weights)
     if world.draws:
         parameters.append(Parameter("noise", "", -np.inf, np.inf, "of the drivers, tick by tick", world.draws))
-        laws.append(NoiseLaw(world.draws))
+        distributions.append(NoiseDistribution(world.draws))
     if world.keys:
         parameters.append(Parameter("camera_noise", "", -np.inf, np.inf, "from which the noise of all pixels follows"))
-        laws.append(NoiseLaw(1))
+        distributions.append(NoiseDistribution(1))
     names = [p.name for p in parameters]
     twice = {name for name in names if names.count(name) > 1}
     if twice:
@@ -140,7 +140,7 @@ def space_of(world: World, base: Distribution) -> ScenarioSpace:
             f"{world.scenario.name} has parameters of its own named {', '.join(sorted(twice))}, as weather or drivers "
             "have; rename them."
         )
-    return ScenarioSpace.of(parameters, beside(*laws))
+    return ScenarioSpace.of(parameters, join_independent(*distributions))
 
 
 def with_noise(space: ScenarioSpace, name: str, size: int) -> ScenarioSpace:
@@ -152,7 +152,7 @@ def with_noise(space: ScenarioSpace, name: str, size: int) -> ScenarioSpace:
         units=(*space.units, ""),
         low=np.append(space.low, np.full(size, -np.inf)),
         high=np.append(space.high, np.full(size, np.inf)),
-        base=beside(space.base, NoiseLaw(size)),
+        base=join_independent(space.base, NoiseDistribution(size)),
         sizes=(*space.sizes, size),
     )
 

@@ -20,7 +20,7 @@ from rare_envs.scenarios.registry import find_scenario
 from rare_envs.sensors.kinds import kinds_of
 from rare_envs.simulation.rollout import rollout
 from rare_envs.simulation.world import World
-from rare_envs.traffic.crash import KINDS, Crash
+from rare_envs.traffic.crash import CRASH_KINDS, Crash
 
 RULE_TILE = 16384
 """Rollouts that a rule-based ego drives at once: where eager torch is fastest."""
@@ -175,7 +175,7 @@ class DrivingProblem:
             x: Scenario parameters, shape (n, d).
 
         Returns:
-            Who ran into whom, how fast and how bad that is; `rare_envs.traffic.crash.KINDS` has the words for the
+            Who ran into whom, how fast and how bad that is; `rare_envs.traffic.crash.CRASH_KINDS` has the words for the
             kinds. Of kind "others" are collisions between other vehicles in episodes in which the ego has none.
 
         Raises:
@@ -193,7 +193,7 @@ class DrivingProblem:
 
     def crash_kinds(self, x: NDArray[np.float64]) -> list[str]:
         """Words for the kinds of crash that scenarios x (n, d) end in, such as "rear_end"; see `crashes`."""
-        return [KINDS[kind] for kind in self.crashes(x).kind]
+        return [CRASH_KINDS[kind] for kind in self.crashes(x).kind]
 
     @property
     def tile(self) -> int:

@@ -13,7 +13,7 @@ from agents.learned.coloured_noise import WHITE_NOISE, AutoregressiveNoise
 from agents.learned.networks import ACTION_SIZE, FEATURE_SIZE, HEAD_SIZE, HIDDEN_SIZES, Policy, apply_heads
 from agents.learned.weight_distribution import WeightDistribution
 from rare_envs.control import actions
-from rare_envs.sensors.perception import CURVATURE, SPEED
+from rare_envs.sensors.perception import CURVATURE_COLUMN, SPEED_COLUMN
 from rare_envs.simulation.observation import LIDAR_SCALES, observation_space
 from rare_envs.traffic.vehicle_models import steering_for
 
@@ -209,6 +209,6 @@ class LearnedEgo:
         """Acceleration [m/s^2] and steering angle [rad], shape (B, 2), by what the egos see, shape (B, 51)."""
         decided, _ = self.driver.act(features[:, None])
         acceleration, yaw_rate = decided[:, 0].unbind(dim=-1)
-        speed = features[:, SPEED]
-        yaw_rate = yaw_rate + speed * features[:, CURVATURE]  # it has learned on a straight road
+        speed = features[:, SPEED_COLUMN]
+        yaw_rate = yaw_rate + speed * features[:, CURVATURE_COLUMN]  # it has learned on a straight road
         return torch.stack((acceleration, steering_for(yaw_rate, speed)), dim=1)

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from rare_envs.control.idm import IDM
-from rare_envs.sensors.lidar import AHEAD, MAX_RANGE
-from rare_envs.sensors.perception import FEATURES, RANGES, RATES
+from rare_envs.sensors.lidar import AHEAD_BEAM, MAX_RANGE
+from rare_envs.sensors.perception import FEATURES, RANGE_COLUMNS, RATE_COLUMNS
 from rare_envs.traffic.lead import Lead
 from rare_envs.traffic.vehicle_models import NEAR_ZERO
 
@@ -55,7 +55,7 @@ class RuleDriver:
         Returns:
             Accelerations [m/s^2] and yaw rates [rad/s], shape (B, M, 2), and the memory.
         """
-        ahead, rate = features[..., RANGES][..., AHEAD], features[..., RATES][..., AHEAD]
+        ahead, rate = features[..., RANGE_COLUMNS][..., AHEAD_BEAM], features[..., RATE_COLUMNS][..., AHEAD_BEAM]
         speed = features[..., _SPEED]
         gap = torch.where(ahead < MAX_RANGE, ahead - 0.5 * features[..., _LENGTH], torch.inf)
         acceleration = self.idm.acceleration(speed, Lead(gap, -rate))

@@ -17,7 +17,7 @@ import typer
 
 import rare_envs
 from rare_envs.distributions.log_mixture import LogMixture
-from rare_envs.scenarios.registry import named
+from rare_envs.scenarios.registry import scenario_named
 from training.scenario_fitting.event_filters import EVENT_RECIPES, filter_events, read_events
 from training.scenario_fitting.fit import fit_us101_base
 
@@ -31,7 +31,9 @@ def main(data: Path, rollouts: int = 1_000_000, seed: int = 0) -> None:
     for scenario, gaps in GAPS.items():
         for logarithmic in ((), gaps):
             recipe = replace(EVENT_RECIPES[scenario], logarithmic=logarithmic)
-            (events, _), _ = filter_events(read_events(data / recipe.file, recipe), recipe, named(scenario).parameters)
+            (events, _), _ = filter_events(
+                read_events(data / recipe.file, recipe), recipe, scenario_named(scenario).parameters
+            )
             columns = [recipe.columns.index(gap) for gap in logarithmic]
             # the density of x is that of the standardised coordinates times the Jacobian of getting there
             jacobian = np.log(events[:, columns]).sum()

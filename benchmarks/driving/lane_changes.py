@@ -24,7 +24,7 @@ from torch import Tensor
 from agents import LearnedDriver
 from benchmarks.driving.realism import named, rounded
 from benchmarks.estimators.runs import about
-from rare_envs.sensors.perception import FEATURES, HEADING, SPEED
+from rare_envs.sensors.perception import FEATURES, HEADING_COLUMN, SPEED_COLUMN
 from training.data.trajectories import DT
 from training.imitation.algorithms.expert_pairs import Pairs, collect_pairs
 from training.imitation.datasets import Source, load_scenes
@@ -95,9 +95,9 @@ def completed(recording: Recording, crossings: Crossings, act: Act, seconds: flo
 
 def steering(pairs: Pairs, drivers: dict[str, LearnedDriver]) -> dict[str, dict[str, float]]:
     """Mean yaw rates [rad/s] towards where vehicles move, by `CLASSES`, of people and of drivers' mean actions."""
-    heading = pairs.features[:, HEADING]
+    heading = pairs.features[:, HEADING_COLUMN]
     side = heading.sign()
-    across, offset = heading.abs() * pairs.features[:, SPEED], pairs.features[:, OFFSET] * side
+    across, offset = heading.abs() * pairs.features[:, SPEED_COLUMN], pairs.features[:, OFFSET] * side
     with torch.inference_mode():
         made = {name: driver.act(pairs.features[:, None])[0][:, 0, 1] for name, driver in drivers.items()}
     out = {}

@@ -10,7 +10,7 @@ from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.kinematics import Vehicle
 from numpy.typing import NDArray
 
-from rare_envs.scenarios.highway import LANES
+from rare_envs.scenarios.highway import START_LANES
 
 Array = NDArray[np.float64]
 
@@ -117,10 +117,11 @@ def highway(x: Array) -> Road:
     Args:
         x: Starts with six of each: places along the road, offsets in the lane, headings [deg] and speeds.
     """
-    road = _road(len(LANES))
-    s, t, heading, speed = x[: 4 * len(LANES)].reshape(4, len(LANES))
+    road = _road(len(START_LANES))
+    s, t, heading, speed = x[: 4 * len(START_LANES)].reshape(4, len(START_LANES))
     road.vehicles = [
-        IDMVehicle(road, [s[j], 4.0 * lane + t[j]], np.deg2rad(heading[j]), speed[j]) for j, lane in enumerate(LANES)
+        IDMVehicle(road, [s[j], 4.0 * lane + t[j]], np.deg2rad(heading[j]), speed[j])
+        for j, lane in enumerate(START_LANES)
     ]
     return road
 

@@ -15,7 +15,7 @@ from rare_envs.traffic.state import VEHICLE_LENGTH, State
 from rare_envs.traffic.vehicle_models import NEAR_ZERO
 
 
-class Scene(Protocol):
+class EgoScene(Protocol):
     """What a rule-based ego needs of an episode."""
 
     @property
@@ -88,7 +88,7 @@ class IDM:
         acceleration: Tensor = self.max_acceleration * (1.0 - free - crowding.square())
         return acceleration.clamp(min=-self.max_deceleration)
 
-    def act(self, episode: Scene, memory: Any) -> tuple[Tensor, Any]:
+    def act(self, episode: EgoScene, memory: Any) -> tuple[Tensor, Any]:
         """IDM behind the lead, lane keeping across; no memory."""
         state = episode.state
         speed = state.speed[:, 0]

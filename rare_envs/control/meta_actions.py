@@ -41,13 +41,15 @@ class Aim(NamedTuple):
     """Index of the target speed in `TARGET_SPEEDS`."""
 
 
-def aim_of(state: State, road: Road) -> Aim:
+def initial_aim(state: State, road: Road) -> Aim:
     """What controllers aim for at first, shape (B, N): the vehicle's lane, the target speed nearest to its speed."""
     return Aim(road.lane_of(state.y), _nearest_speed(state.speed))
 
 
-def follow(aim: Aim, action: Tensor, commanded: Tensor | None, state: State, road: Road) -> tuple[Aim, Tensor]:
-    """What meta-actions make of vehicles for one tick.
+def follow_meta_actions(
+    aim: Aim, action: Tensor, commanded: Tensor | None, state: State, road: Road
+) -> tuple[Aim, Tensor]:
+    """Turn meta-actions into what the controllers do in one tick.
 
     A vehicle that does not obey its action has no aim of its own: when it begins to obey, it aims for where it is.
 
@@ -63,7 +65,7 @@ def follow(aim: Aim, action: Tensor, commanded: Tensor | None, state: State, roa
     """
     if commanded is None:
         pad = state.x.shape[1] - 1
-        alone, physical = follow(
+        alone, physical = follow_meta_actions(
             aim,
             torch.nn.functional.pad(action[:, None], (0, pad), value=IDLE),
             torch.zeros_like(state.x, dtype=torch.bool),
@@ -73,12 +75,12 @@ def follow(aim: Aim, action: Tensor, commanded: Tensor | None, state: State, roa
         return alone, physical[:, 0]
     obeys = commanded.clone()
     obeys[:, 0] = True
-    aim = Aim(*(torch.where(obeys, old, new) for old, new in zip(aim, aim_of(state, road), strict=True)))
-    aim = decide(aim, torch.where(obeys, action, IDLE), state.y, state.speed, road)
-    return aim, control(aim, state.x, state.y, state.heading, state.speed, road)
+    aim = Aim(*(torch.where(obeys, old, new) for old, new in zip(aim, initial_aim(state, road), strict=True)))
+    aim = update_aim(aim, torch.where(obeys, action, IDLE), state.y, state.speed, road)
+    return aim, control_towards(aim, state.x, state.y, state.heading, state.speed, road)
 
 
-def decide(aim: Aim, action: Tensor, y: Tensor, speed: Tensor, road: Road) -> Aim:
+def update_aim(aim: Aim, action: Tensor, y: Tensor, speed: Tensor, road: Road) -> Aim:
     """Follow meta-actions.
 
     Left and right move the target lane by one from the present target, if there is such a lane and its middle is within
@@ -104,7 +106,7 @@ def decide(aim: Aim, action: Tensor, y: Tensor, speed: Tensor, road: Road) -> Ai
     return Aim(torch.where(reachable, wanted, aim.lane), torch.where(change != 0, changed, aim.speed))
 
 
-def control(aim: Aim, x: Tensor, y: Tensor, heading: Tensor, speed: Tensor, road: Road) -> Tensor:
+def control_towards(aim: Aim, x: Tensor, y: Tensor, heading: Tensor, speed: Tensor, road: Road) -> Tensor:
     """What HighwayEnv's two low-level controllers do for one tick.
 
     Acceleration is (target speed - speed) / 0.6 s, without a limit. Steering as in
@@ -123,8 +125,8 @@ def control(aim: Aim, x: Tensor, y: Tensor, heading: Tensor, speed: Tensor, road
     """
     acceleration = (speed.new_tensor(TARGET_SPEEDS)[aim.speed] - speed) / _TAU_SPEED
     centres, _ = _lanes(road, y.dtype, y.device)
-    if road.curve is not None:
-        ahead = road.curve.at(x + speed * _TAU_PURSUIT).heading - road.curve.at(x).heading
+    if road.reference_line is not None:
+        ahead = road.reference_line.at(x + speed * _TAU_PURSUIT).heading - road.reference_line.at(x).heading
         heading = heading - ahead
     return torch.stack((acceleration, steering_control(y - centres[aim.lane], heading, speed)), dim=-1)
 

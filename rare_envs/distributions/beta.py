@@ -15,7 +15,7 @@ FIELDS = ("alpha", "beta", "low", "high")
 
 
 @dataclass(frozen=True, eq=False)
-class BetaLaw:
+class BetaDistribution:
     """Independent Beta variables, each stretched to a range.
 
     Args:
@@ -47,7 +47,7 @@ class BetaLaw:
             raise ValueError(f"Expected low < high, got {self.low} and {self.high}.")
 
     @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> BetaLaw:
+    def from_dict(cls, data: Mapping[str, Any]) -> BetaDistribution:
         """From its four arrays by name.
 
         Raises:

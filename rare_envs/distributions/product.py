@@ -1,6 +1,7 @@
 """Base distributions made of independent blocks, and noise as one of them.
 
-Cross-entropy searches block by block (`samplers.CrossEntropy(family="blocks")`); it finds them in `Product.blocks`.
+Cross-entropy searches block by block (`samplers.CrossEntropy(family="blocks")`); it finds them in
+`ProductDistribution.blocks`.
 """
 
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from rare_envs.distributions.space import Array, Distribution
 
 
 @dataclass(frozen=True)
-class NoiseLaw:
+class NoiseDistribution:
     """Independent standard normal variables: noise, which a search over blocks leaves as it is."""
 
     dim: int
@@ -35,17 +36,17 @@ class NoiseLaw:
         """The same points."""
         return u
 
-    def project(self, x: Array, weights: Array, alpha: float) -> "NoiseLaw":
+    def project(self, x: Array, weights: Array, alpha: float) -> "NoiseDistribution":
         """The same law: a block of cross-entropy that does not move."""
         return self
 
-    def widen(self, factor: float) -> "NoiseLaw":
+    def widen(self, factor: float) -> "NoiseDistribution":
         """The same law."""
         return self
 
 
 @dataclass(frozen=True, eq=False)
-class Product:
+class ProductDistribution:
     """Independent blocks side by side."""
 
     blocks: tuple[Any, ...]
@@ -63,7 +64,9 @@ class Product:
     @cached_property
     def noise(self) -> NDArray[np.bool_]:
         """Which columns are noise, shape (d,): samplers may leave these as they are."""
-        return np.repeat([isinstance(block, NoiseLaw) for block in self.blocks], [block.dim for block in self.blocks])
+        return np.repeat(
+            [isinstance(block, NoiseDistribution) for block in self.blocks], [block.dim for block in self.blocks]
+        )
 
     def sample(self, n: int, rng: np.random.Generator) -> Array:
         """Independent points, shape (n, d)."""
@@ -90,7 +93,7 @@ class Product:
         return np.split(np.asarray(points), self._ends, axis=1)
 
 
-def beside(*laws: Distribution) -> Distribution:
+def join_independent(*laws: Distribution) -> Distribution:
     """Independent laws as one; their own blocks, if they have some, become its blocks."""
     blocks = [block for law in laws for block in getattr(law, "blocks", (law,))]
-    return blocks[0] if len(blocks) == 1 else Product(tuple(blocks))
+    return blocks[0] if len(blocks) == 1 else ProductDistribution(tuple(blocks))

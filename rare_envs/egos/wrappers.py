@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from rare_envs.sensors.kinds import KINDS, batch_size, each, read_kinds
+from rare_envs.sensors.kinds import OBSERVATIONS, batch_size, each, read_kinds
 from rare_envs.simulation.observation import observation_space
 
 Array = NDArray[Any]
@@ -100,7 +100,7 @@ def observation_for(ego: Any, vehicles: int = 1) -> str:
     if space == observation_space(vehicles, "lidar") != observation_space(vehicles, "features"):
         return "lidar"
     names = set(space.spaces) if isinstance(space, spaces.Dict) else set[str]()
-    return read_kinds(sorted(names)) if names and names <= set(KINDS) else "features"
+    return read_kinds(sorted(names)) if names and names <= set(OBSERVATIONS) else "features"
 
 
 def frames_of(given: spaces.Space[Any], wanted: Any) -> tuple[int, bool] | None:

@@ -8,7 +8,7 @@ from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.multi_agent.episode import order_of
 from rare_envs.multi_agent.rewards import terms_of
 from rare_envs.simulation.episode import Episode
-from rare_envs.traffic.crash import describe
+from rare_envs.traffic.crash import describe_crash
 
 Info = dict[str, Any]
 
@@ -49,7 +49,7 @@ def step_info(
     if over:
         assert episode.statistics is not None
         info["measure"] = float(episode.f)
-        info["crash"] = crash = describe(episode.statistics.crash)
+        info["crash"] = crash = describe_crash(episode.statistics.crash)
         info["collision_type"] = None if crash is None else crash["kind"]
         if crash is not None and vehicle:
             order = order_of(vehicle, episode.state.x.shape[1])

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rare_envs.scenarios.base import Scenario
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.world import World
-from rare_envs.traffic.overlap import overlaps
+from rare_envs.traffic.overlap import pairwise_overlaps
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
 
@@ -185,7 +185,7 @@ def caption(world: World, episode: Episode, time: float | None, row: int = 0) ->
 
 def _crashed(state: State, road: Road) -> set[int]:
     """The ego and whom it touches."""
-    return {0, *overlaps(state, road)[0, 0].nonzero().flatten().tolist()}
+    return {0, *pairwise_overlaps(state, road)[0, 0].nonzero().flatten().tolist()}
 
 
 def _corners(x: float, y: float, heading: float) -> list[tuple[float, float]]:
@@ -202,7 +202,7 @@ def _network(road: Road, x: float) -> Any:
     from highway_env.road.road import RoadNetwork
 
     here = x // _SEGMENT
-    cuts = [-1e3, 9e3] if road.curve is None else [_SEGMENT * (here + k) for k in range(-_BEHIND, _AHEAD + 2)]
+    cuts = [-1e3, 9e3] if road.reference_line is None else [_SEGMENT * (here + k) for k in range(-_BEHIND, _AHEAD + 2)]
     network = RoadNetwork()
     for lane in range(road.lanes):
         y, width = road.centre(lane), road.edges[lane + 1] - road.edges[lane]

@@ -21,7 +21,7 @@ from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.observation import observe
 from rare_envs.simulation.reward import RewardTerms
 from rare_envs.simulation.world import space_of_observations
-from rare_envs.traffic.crash import KINDS, NONE
+from rare_envs.traffic.crash import CRASH_KINDS, NONE
 
 Info = dict[str, Any]
 
@@ -159,7 +159,7 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         assert episode.statistics is not None
         crash = episode.statistics.crash
         crashed = done & (crash.kind != NONE).numpy()
-        kinds = np.array(KINDS, dtype=object)[crash.kind.numpy()]
+        kinds = np.array(CRASH_KINDS, dtype=object)[crash.kind.numpy()]
         kinds[~crashed] = None
         put(infos, "reward_terms", _terms(terms, done), done)
         put(infos, "measure", episode.f.double().numpy(), done)

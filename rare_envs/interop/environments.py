@@ -12,7 +12,7 @@ from highway_env.envs.merge_env import MergeEnv
 from highway_env.envs.roundabout_env import RoundaboutEnv
 from highway_env.utils import class_from_path
 
-from rare_envs.distributions.beta import BetaLaw
+from rare_envs.distributions.beta import BetaDistribution
 from rare_envs.distributions.space import Parameter
 from rare_envs.interop.parameters import LENGTH, Group, Layout, Values, beta, lane_number, move, normal
 from rare_envs.interop.spacing import SpacingLaw
@@ -22,7 +22,9 @@ _HIGHEST = 300.0
 """Longest gap that may be asked for [m]."""
 
 
-def _one(name: str, unit: str, low: float, high: float, law: BetaLaw, usual: float | None, meaning: str) -> Group:
+def _one(
+    name: str, unit: str, low: float, high: float, law: BetaDistribution, usual: float | None, meaning: str
+) -> Group:
     return Group((Parameter(name, unit, low, high, meaning),), law, usual)
 
 

@@ -10,7 +10,7 @@ from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.controller import ControlledVehicle, MDPVehicle
 from highway_env.vehicle.kinematics import Vehicle
 
-from rare_envs.distributions.beta import BetaLaw
+from rare_envs.distributions.beta import BetaDistribution
 from rare_envs.distributions.space import Distribution, Parameter
 from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
 
@@ -102,10 +102,10 @@ def class_kept(kind: type) -> Iterator[None]:
             setattr(kind, name, value)
 
 
-def beta(shape: float, low: list[float], high: list[float]) -> BetaLaw:
+def beta(shape: float, low: list[float], high: list[float]) -> BetaDistribution:
     """Independent Beta(shape, shape) on ranges; shape 1 is uniform."""
     size = len(low)
-    return BetaLaw(np.full(size, shape), np.full(size, shape), np.array(low), np.array(high))
+    return BetaDistribution(np.full(size, shape), np.full(size, shape), np.array(low), np.array(high))
 
 
 def normal(mean: list[float], deviation: list[float], reach: float = 4.0) -> TruncatedGaussianMixture:

@@ -12,7 +12,7 @@ from highway_env.envs.merge_env import MergeGenericEnv
 from highway_env.envs.roundabout_env import RoundaboutGenericEnv
 from highway_env.utils import class_from_path
 
-from rare_envs.distributions.product import NoiseLaw, beside
+from rare_envs.distributions.product import NoiseDistribution, join_independent
 from rare_envs.distributions.space import Array, Parameter, ScenarioSpace
 from rare_envs.interop.environments import LAYOUTS
 from rare_envs.interop.measures import CLOSENESS, COLLISION, TTC_MAX
@@ -233,10 +233,10 @@ def _space(groups: list[Group], noise: bool, base: Any) -> ScenarioSpace:
     laws = [group.law for group in groups] if base is None else [base]
     if noise:
         parameters.append(Parameter("noise", "", -np.inf, np.inf, "seeds what HighwayEnv still draws"))
-        laws.append(NoiseLaw(1))
+        laws.append(NoiseDistribution(1))
     if not parameters:
         raise ValueError("Every parameter is held; expected at least one that varies.")
-    return ScenarioSpace.of(parameters, beside(*laws))
+    return ScenarioSpace.of(parameters, join_independent(*laws))
 
 
 def _seed(noise: float | None) -> int:

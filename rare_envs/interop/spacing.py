@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rare_envs.distributions.beta import BetaLaw
+from rare_envs.distributions.beta import BetaDistribution
 from rare_envs.distributions.space import Array
 from rare_envs.interop.parameters import LENGTH, beta
 
@@ -39,7 +39,7 @@ class SpacingLaw:
         """The shortest gap [m]."""
         return 0.9 * self.factor * (12.0 + self.low) - LENGTH
 
-    def _uniform(self) -> BetaLaw:
+    def _uniform(self) -> BetaDistribution:
         k = self.vehicles
         return beta(1.0, [self.low] * k + [0.9] * k, [self.high] * k + [1.1] * k)
 

@@ -1,7 +1,7 @@
 """Safety measures: how close an episode came to a collision; small is dangerous, always finite."""
 
 from rare_envs.measures.base import COLLISION, EpisodeMeasure, Measure
-from rare_envs.measures.braking import BRAKES, DECELERATION_MAX, btn, drac, required_deceleration, ttb
+from rare_envs.measures.braking import DECELERATION_MAX, MAX_BRAKING, btn, drac, required_deceleration, ttb
 from rare_envs.measures.combination import Combined, minimum, weighted, with_collision
 from rare_envs.measures.encroachment import PET_MAX, pet
 from rare_envs.measures.episode_trace import Trace, TraceMeasure
@@ -14,11 +14,11 @@ from rare_envs.measures.time_to_collision import TTC_MAX, lidar_ttc, mttc, thw, 
 from rare_envs.measures.two_dimensional import clearance, margin, ttc_2d
 
 __all__ = [
-    "BRAKES",
     "COLLISION",
     "DECELERATION_MAX",
     "EXPOSURE_MAX",
     "MARGIN_MAX",
+    "MAX_BRAKING",
     "MEASURES",
     "PET_MAX",
     "RSS",

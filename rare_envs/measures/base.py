@@ -12,7 +12,7 @@ from rare_envs.measures.moment import Moment
 COLLISION = -1.0
 """f of an episode with a collision, unless a measure says otherwise (Tian et al. 2024, equation 3)."""
 
-Kept: TypeAlias = Any
+MeasureState: TypeAlias = Any
 """What a measure keeps of an episode so far: a tensor whose first axis is the scenario, a tuple of such, or an object
 with a method `put(rows, new)` that returns it with the scenarios `rows` replaced by those of another."""
 
@@ -24,10 +24,10 @@ class EpisodeMeasure(Protocol):
     def sees(self) -> bool:
         """Whether it needs what the ego sees, `Moment.perception`."""
 
-    def begin(self, moment: Moment, ticks: int) -> Kept:
+    def start(self, moment: Moment, ticks: int) -> MeasureState:
         """What it keeps of the first moment of episodes that are `ticks` long."""
 
-    def fold(self, kept: Kept, moment: Moment, before: Tensor, now: Tensor) -> Kept:
+    def update(self, kept: MeasureState, moment: Moment, before: Tensor, now: Tensor) -> MeasureState:
         """What it keeps after one more moment.
 
         Args:
@@ -37,7 +37,7 @@ class EpisodeMeasure(Protocol):
             now: Whether it has by this moment, boolean, shape (B,).
         """
 
-    def f(self, kept: Kept) -> Tensor:
+    def f(self, kept: MeasureState) -> Tensor:
         """The measure of the episodes so far, shape (B,)."""
 
 
@@ -78,11 +78,11 @@ class Measure:
         """The threshold of f that stands for a value in the measure's own unit and sign."""
         return value if self.critical is None else self.critical - value
 
-    def begin(self, moment: Moment, ticks: int) -> Tensor:
+    def start(self, moment: Moment, ticks: int) -> Tensor:
         """What it keeps is f, here of the first moment."""
         return self._danger(moment)
 
-    def fold(self, kept: Tensor, moment: Moment, before: Tensor, now: Tensor) -> Tensor:
+    def update(self, kept: Tensor, moment: Moment, before: Tensor, now: Tensor) -> Tensor:
         """The lesser of f so far and f of the moment, and what a collision counts as after one."""
         return self._ended(kept, torch.minimum(kept, self._danger(moment)), moment, before, now)
 

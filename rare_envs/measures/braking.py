@@ -7,7 +7,7 @@ from rare_envs.control.actions import MAX_ACCELERATION
 from rare_envs.measures.moment import STILL, Moment, acceleration_of_lead, gap_of
 from rare_envs.measures.time_to_collision import TTC_MAX
 
-BRAKES = MAX_ACCELERATION
+MAX_BRAKING = MAX_ACCELERATION
 """The hardest braking that an action can ask for [m/s^2]."""
 DECELERATION_MAX = 100.0
 """Cap of decelerations [m/s^2], ten times what tyres can do; with a centimetre left they would be in the thousands."""
@@ -65,7 +65,7 @@ def required_deceleration(moment: Moment) -> Tensor:
     return required.clamp(max=DECELERATION_MAX)
 
 
-def btn(moment: Moment, brakes: float = BRAKES) -> Tensor:
+def btn(moment: Moment, brakes: float = MAX_BRAKING) -> Tensor:
     """Brake threat number: the required deceleration as a share of what the brakes can do.
 
     Critical value: 1, above which braking alone cannot prevent the collision.
@@ -83,7 +83,7 @@ def btn(moment: Moment, brakes: float = BRAKES) -> Tensor:
     return required_deceleration(moment) / brakes
 
 
-def ttb(moment: Moment, brakes: float = BRAKES) -> Tensor:
+def ttb(moment: Moment, brakes: float = MAX_BRAKING) -> Tensor:
     """Time to brake: how long the ego can wait until it must brake fully for its lead, which keeps its speed.
 
     gap / closing speed - closing speed / (2 brakes). Negative past the point of no return: by how much it is too late.

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from rare_envs.measures.base import COLLISION, EpisodeMeasure, Kept
+from rare_envs.measures.base import COLLISION, EpisodeMeasure, MeasureState
 from rare_envs.measures.moment import Moment
 
 
@@ -37,17 +37,19 @@ class Combined:
         units = {getattr(part, "unit", "") for part in self.parts}
         return units.pop() if len(units) == 1 else ""
 
-    def begin(self, moment: Moment, ticks: int) -> tuple[Kept, ...]:
+    def start(self, moment: Moment, ticks: int) -> tuple[MeasureState, ...]:
         """What each part keeps, and that nobody has collided."""
         nobody = torch.zeros(len(moment.state.x), dtype=torch.bool, device=moment.state.x.device)
-        return (nobody, *(part.begin(moment, ticks) for part in self.parts))
+        return (nobody, *(part.start(moment, ticks) for part in self.parts))
 
-    def fold(self, kept: tuple[Kept, ...], moment: Moment, before: Tensor, now: Tensor) -> tuple[Kept, ...]:
+    def update(
+        self, kept: tuple[MeasureState, ...], moment: Moment, before: Tensor, now: Tensor
+    ) -> tuple[MeasureState, ...]:
         """What each part keeps after one more moment, and who has collided."""
-        folded = (part.fold(own, moment, before, now) for part, own in zip(self.parts, kept[1:], strict=True))
+        folded = (part.update(own, moment, before, now) for part, own in zip(self.parts, kept[1:], strict=True))
         return (now, *folded)
 
-    def f(self, kept: tuple[Kept, ...]) -> Tensor:
+    def f(self, kept: tuple[MeasureState, ...]) -> Tensor:
         """The function of what the parts say."""
         f = self.how(torch.stack([part.f(own) for part, own in zip(self.parts, kept[1:], strict=True)]))
         return f if self.collision is None else torch.where(kept[0], self.collision, f)

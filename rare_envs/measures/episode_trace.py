@@ -150,12 +150,12 @@ class TraceMeasure:
         """The threshold of f that stands for a value in the measure's own unit and sign."""
         return value if self.critical is None else self.critical - value
 
-    def begin(self, moment: Moment, ticks: int) -> Record:
+    def start(self, moment: Moment, ticks: int) -> Record:
         """Record the first moment."""
         at = torch.zeros(len(moment.state.x), dtype=torch.int64, device=moment.state.x.device)
         return Record((moment,), at, at, at > 0, ticks)
 
-    def fold(self, kept: Record, moment: Moment, before: Tensor, now: Tensor) -> Record:
+    def update(self, kept: Record, moment: Moment, before: Tensor, now: Tensor) -> Record:
         """Record one more moment."""
         return kept.added(moment, before, now)
 

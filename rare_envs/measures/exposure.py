@@ -26,11 +26,11 @@ class Exposure(Measure):
 
     critical: float = 1.0
 
-    def begin(self, moment: Moment, ticks: int) -> Tensor:
+    def start(self, moment: Moment, ticks: int) -> Tensor:
         """Nothing has been added up yet."""
         return torch.full_like(moment.state.x[:, 0], self.critical)
 
-    def fold(self, kept: Tensor, moment: Moment, before: Tensor, now: Tensor) -> Tensor:
+    def update(self, kept: Tensor, moment: Moment, before: Tensor, now: Tensor) -> Tensor:
         """Take one more tick from f."""
         f = (kept - self.of(moment) * moment.dt).clamp(min=self.critical - EXPOSURE_MAX)
         return self._ended(kept, f, moment, before, now)

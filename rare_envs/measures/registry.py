@@ -9,7 +9,7 @@ from typing import Any
 from torch import Tensor
 
 from rare_envs.measures.base import EpisodeMeasure, Measure
-from rare_envs.measures.braking import BRAKES, DECELERATION_MAX, btn, drac, required_deceleration, ttb
+from rare_envs.measures.braking import DECELERATION_MAX, MAX_BRAKING, btn, drac, required_deceleration, ttb
 from rare_envs.measures.encroachment import pet
 from rare_envs.measures.episode_trace import TraceMeasure
 from rare_envs.measures.exposure import EXPOSURE_MAX, Exposure, tet, tit
@@ -68,7 +68,7 @@ MEASURES: MappingProxyType[str, EpisodeMeasure] = MappingProxyType(
         "thw": Measure(thw),
         "drac": Measure(drac, collision=-DECELERATION_MAX, critical=3.4, unit="m/s^2"),
         "required_deceleration": Measure(
-            required_deceleration, collision=-DECELERATION_MAX, critical=BRAKES, unit="m/s^2"
+            required_deceleration, collision=-DECELERATION_MAX, critical=MAX_BRAKING, unit="m/s^2"
         ),
         "btn": Measure(btn, collision=-DECELERATION_MAX, critical=1.0, unit=""),
         "ttb": Measure(ttb, collision=-TTC_MAX),
@@ -98,7 +98,7 @@ def find_measure(measure: Any) -> EpisodeMeasure:
     if isinstance(measure, str) and measure in MEASURES:
         return MEASURES[measure]
     if not isinstance(measure, str | type):
-        if all(callable(getattr(measure, name, None)) for name in ("begin", "fold", "f")):
+        if all(callable(getattr(measure, name, None)) for name in ("start", "update", "f")):
             found: EpisodeMeasure = measure
             return found
         if callable(measure):

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from rare_envs.measures.moment import GAP_MIN, STILL, Moment, acceleration_of_lead, gap_of
-from rare_envs.sensors.perception import RANGES, RATES
+from rare_envs.sensors.perception import RANGE_COLUMNS, RATE_COLUMNS
 
 TTC_MAX = 10.0
 """Cap of the time to collision [s]; what is further away, or not closing, counts as this."""
@@ -66,8 +66,8 @@ def lidar_ttc(moment: Moment) -> Tensor:
     """
     assert moment.perception is not None
     ego = moment.perception[:, 0]
-    closing = -ego[:, RATES]
-    time = torch.where(closing > 0.0, ego[:, RANGES] / closing.clamp(min=STILL), TTC_MAX)
+    closing = -ego[:, RATE_COLUMNS]
+    time = torch.where(closing > 0.0, ego[:, RANGE_COLUMNS] / closing.clamp(min=STILL), TTC_MAX)
     return time.amin(dim=1).clamp(max=TTC_MAX)
 
 

@@ -5,7 +5,7 @@ from torch import Tensor
 
 from rare_envs.measures.moment import GAP_MIN, Moment
 from rare_envs.measures.time_to_collision import TTC_MAX, time_to_edge
-from rare_envs.traffic.oriented_boxes import clearance as distance
+from rare_envs.traffic.oriented_boxes import box_distance as distance
 from rare_envs.traffic.oriented_boxes import time_to_contact
 from rare_envs.traffic.pairs import encounter, least
 

@@ -8,7 +8,7 @@ from torch import Tensor
 from rare_envs.simulation.decision import held
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.world import World
-from rare_envs.traffic.overlap import overlaps
+from rare_envs.traffic.overlap import pairwise_overlaps
 
 
 class MultiAgentEpisode(NamedTuple):
@@ -67,7 +67,7 @@ def step_traffic(world: World, episode: MultiAgentEpisode, action: Tensor, comma
     rolling_out = torch.stack((-speed, torch.zeros_like(speed)), dim=-1)
     traffic = world.step(traffic, torch.where(disabled[..., None], rolling_out, action), active)
     state = traffic.state
-    touching, off = overlaps(state, road), road.off_road(state.y)
+    touching, off = pairwise_overlaps(state, road), road.off_road(state.y)
     hit = touching.any(dim=2)
     if world.collisions == "any":
         hit = hit.any(dim=1, keepdim=True)

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from rare_envs.control.actions import IDLE
-from rare_envs.control.meta_actions import aim_of
+from rare_envs.control.meta_actions import initial_aim
 from rare_envs.egos.policy import PolicyDriver
 from rare_envs.multi_agent.episode import MultiAgentEpisode, start, step_traffic
 from rare_envs.multi_agent.rewards import Reward, Transition
@@ -88,7 +88,7 @@ def _combine_actions(
         return traffic, physical, memory
     physical = torch.where((first & by_driver[:, None])[..., None], driven[:, None].to(physical), physical)
     if traffic.aim is not None:  # the ego aims for nothing while a driver drives it
-        where = aim_of(traffic.state, traffic.road)
+        where = initial_aim(traffic.state, traffic.road)
         aim = (torch.where(first & by_driver[:, None], new, old) for new, old in zip(where, traffic.aim, strict=True))
         traffic = traffic._replace(aim=type(where)(*aim))
     return traffic, physical, memory

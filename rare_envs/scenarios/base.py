@@ -28,7 +28,7 @@ DATA = resources.files("rare_envs") / "data"
 """Files that come with the package."""
 # None backwards, and 45 m/s (162 km/h) is above what congested US 101 (at most 27 m/s in the events) and free-flow
 # traffic reach.
-SPEED = ("m/s", 0.0, 45.0)
+SPEED_RANGE = ("m/s", 0.0, 45.0)
 """Unit and range of a speed as a parameter."""
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from rare_envs.distributions.beta import BetaLaw
+from rare_envs.distributions.beta import BetaDistribution
 from rare_envs.distributions.log_mixture import LogMixture
 from rare_envs.distributions.space import Distribution, Parameter
 from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
@@ -19,7 +19,7 @@ from rare_envs.plugins import did_you_mean
 if TYPE_CHECKING:
     from rare_envs.scenarios.base import Scenario
 
-Law = TruncatedGaussianMixture | LogMixture | BetaLaw
+FileDistribution = TruncatedGaussianMixture | LogMixture | BetaDistribution
 _TRIAL_DRAWS = 1000
 """Draws by which a user's distribution is tried before it is used."""
 METHODS = ("sample", "log_prob", "to_standard_normal", "from_standard_normal")
@@ -30,7 +30,7 @@ def load_base(scenario: Scenario, base: str | PathLike[str] | Distribution | Non
 
     A JSON file holds what the shipped ones do: names, low, high, weights, means, covariances, and
     if wanted units, provenance (see `TruncatedGaussianMixture`) and logarithmic (see `LogMixture`); or, for independent
-    Beta laws, names, low, high, alpha and beta, one for each column of x (see `BetaLaw`).
+    Beta laws, names, low, high, alpha and beta, one for each column of x (see `BetaDistribution`).
 
     Args:
         scenario: The scenario.
@@ -74,7 +74,7 @@ def columns_of(scenario: Scenario) -> list[Parameter]:
     return [parameter for parameter in scenario.parameters for _ in range(parameter.size)]
 
 
-def _from_json(scenario: Scenario, source: str, text: str) -> Law:
+def _from_json(scenario: Scenario, source: str, text: str) -> FileDistribution:
     try:
         data = json.loads(text)
     except json.JSONDecodeError as error:
@@ -84,7 +84,7 @@ def _from_json(scenario: Scenario, source: str, text: str) -> Law:
     return _from_dict(scenario, source, data)
 
 
-def _from_dict(scenario: Scenario, source: str, data: Mapping[str, Any]) -> Law:
+def _from_dict(scenario: Scenario, source: str, data: Mapping[str, Any]) -> FileDistribution:
     wanted = [p.name for p in scenario.parameters]
     names = data.get("names")
     if names != wanted:
@@ -93,8 +93,10 @@ def _from_dict(scenario: Scenario, source: str, data: Mapping[str, Any]) -> Law:
             f"expected names {wanted} in this order, got {names}."
         )
     try:
-        kind = BetaLaw if "alpha" in data else LogMixture if data.get("logarithmic") else TruncatedGaussianMixture
-        law: Law = kind.from_dict(data)
+        kind = (
+            BetaDistribution if "alpha" in data else LogMixture if data.get("logarithmic") else TruncatedGaussianMixture
+        )
+        law: FileDistribution = kind.from_dict(data)
     except ValueError as error:
         raise ValueError(f"Base distribution {source}: {error}") from None
     columns = len(columns_of(scenario))
@@ -106,7 +108,7 @@ def _from_dict(scenario: Scenario, source: str, data: Mapping[str, Any]) -> Law:
     return law
 
 
-def _check_box(scenario: Scenario, source: str, law: Law) -> None:
+def _check_box(scenario: Scenario, source: str, law: FileDistribution) -> None:
     box = columns_of(scenario)
     for parameter, low, high in zip(box, law.low, law.high, strict=True):
         if low < parameter.low or high > parameter.high:

@@ -4,7 +4,7 @@ import torch
 from torch import Tensor
 
 from rare_envs.distributions.space import Parameter
-from rare_envs.scenarios.base import DATA, SPEED, Others, Scenario, columns, straight_on
+from rare_envs.scenarios.base import DATA, SPEED_RANGE, Others, Scenario, columns, straight_on
 from rare_envs.traffic.road import straight
 from rare_envs.traffic.state import VEHICLE_LENGTH, State
 
@@ -40,8 +40,8 @@ CAR_FOLLOWING = Scenario(
     # Gaps: under 1 m is below IDM's standstill distance and of the order of the position error of the recordings (1.2 m
     # along the road); beyond 150 m the lead no longer matters within 10 s.
     parameters=(
-        Parameter("ego_speed", *SPEED, "initial speed of the ego"),
-        Parameter("lead_speed", *SPEED, "speed of the lead, which keeps it"),
+        Parameter("ego_speed", *SPEED_RANGE, "initial speed of the ego"),
+        Parameter("lead_speed", *SPEED_RANGE, "speed of the lead, which keeps it"),
         Parameter("gap", "m", 1.0, 150.0, "initial gap from ego to lead, bumper to bumper"),
     ),
     bases={"us101": DATA / "car_following_us101.json", "highway": DATA / "car_following_highway.json"},

@@ -5,7 +5,7 @@ from torch import Tensor
 
 from rare_envs.control.idm import IDM
 from rare_envs.distributions.space import Parameter
-from rare_envs.scenarios.base import DATA, SPEED, Others, Scenario, columns
+from rare_envs.scenarios.base import DATA, SPEED_RANGE, Others, Scenario, columns
 from rare_envs.traffic.lead import Lead
 from rare_envs.traffic.road import straight
 from rare_envs.traffic.state import VEHICLE_LENGTH, State
@@ -99,9 +99,9 @@ CUT_IN = Scenario(
     # offset: vehicles 2 m wide with at least 0.2 m between their sides, and at most one lane (4 m) plus half a metre
     # off-centre each.
     parameters=(
-        Parameter("ego_speed", *SPEED, "initial speed of the ego"),
-        Parameter("cut_in_speed", *SPEED, "initial speed of the vehicle that cuts in"),
-        Parameter("lead_speed", *SPEED, "speed of the lead in the ego's lane, which keeps it"),
+        Parameter("ego_speed", *SPEED_RANGE, "initial speed of the ego"),
+        Parameter("cut_in_speed", *SPEED_RANGE, "initial speed of the vehicle that cuts in"),
+        Parameter("lead_speed", *SPEED_RANGE, "speed of the lead in the ego's lane, which keeps it"),
         Parameter("cut_in_gap", "m", 1.0, 120.0, "initial gap from ego to cutter along the road"),
         Parameter("lead_gap", "m", 1.0, 150.0, "initial gap from cutter to lead along the road"),
         Parameter("lateral_offset", "m", 2.2, 5.0, "initial distance of the centres across"),

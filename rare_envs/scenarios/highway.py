@@ -17,15 +17,15 @@ from rare_envs.scenarios.base import DATA, Others, Scenario, roaming
 from rare_envs.traffic.road import i80
 from rare_envs.traffic.state import State
 
-VEHICLES = 6
-LANES = (2, 0, 1, 3, 4, 5)
+VEHICLE_COUNT = 6
+START_LANES = (2, 0, 1, 3, 4, 5)
 """Lane of each vehicle at the start, the ego's first; 0 is the leftmost."""
 
 
 def initial(x: Tensor) -> State:
     """Six columns each: s along the road [m], t off the middle of the lane [m], heading [deg] and speed [m/s]."""
-    s, t, heading, speed = x.view(len(x), 4, VEHICLES).unbind(dim=1)
-    middle = x.new_tensor([i80().centre(lane) for lane in LANES])
+    s, t, heading, speed = x.view(len(x), 4, VEHICLE_COUNT).unbind(dim=1)
+    middle = x.new_tensor([i80().centre(lane) for lane in START_LANES])
     return State(s.T.contiguous().T, t + middle, heading * (math.pi / 180.0), speed.clone(), theta=x[:, :0])
 
 
@@ -42,15 +42,17 @@ def others(state: State, dt: float) -> Others:
 HIGHWAY = Scenario(
     name="highway",
     road=i80(),
-    vehicle_names=("ego", *(f"vehicle_{j}" for j in range(1, VEHICLES))),
-    labels=("the ego", *(f"lane {lane + 1}'s car" for lane in LANES[1:])),
+    vehicle_names=("ego", *(f"vehicle_{j}" for j in range(1, VEHICLE_COUNT))),
+    labels=("the ego", *(f"lane {lane + 1}'s car" for lane in START_LANES[1:])),
     horizon=10.0,
     # the ranges of the paper, which are those of its Beta laws
     parameters=(
-        Parameter("s", "m", 80.0, 120.0, "initial place along the road, the ego's first", VEHICLES),
-        Parameter("t", "m", -0.25, 0.25, "initial place to the right of the lane's middle", VEHICLES),
-        Parameter("heading", "deg", -3.6, 3.6, "initial heading relative to the road, positive to the right", VEHICLES),
-        Parameter("speed", "m/s", 10.0, 20.0, "initial speed", VEHICLES),
+        Parameter("s", "m", 80.0, 120.0, "initial place along the road, the ego's first", VEHICLE_COUNT),
+        Parameter("t", "m", -0.25, 0.25, "initial place to the right of the lane's middle", VEHICLE_COUNT),
+        Parameter(
+            "heading", "deg", -3.6, 3.6, "initial heading relative to the road, positive to the right", VEHICLE_COUNT
+        ),
+        Parameter("speed", "m/s", 10.0, 20.0, "initial speed", VEHICLE_COUNT),
     ),
     bases={"okelly2018": DATA / "highway_okelly2018.json"},
     initial=initial,

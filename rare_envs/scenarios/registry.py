@@ -56,7 +56,7 @@ SCENARIOS = Registry(
 )
 
 
-def named(name: str) -> Scenario:
+def scenario_named(name: str) -> Scenario:
     """The scenario of a short name, such as "cut_in".
 
     Raises:

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
-KINDS = ("features", "lidar", "kinematics", "camera", "speed")
+OBSERVATIONS = ("features", "lidar", "kinematics", "camera", "speed")
 """What can be observed."""
 
 
@@ -11,16 +11,16 @@ def read_kinds(observation: Any) -> str:
     """The kinds of an observation in the alphabetical order of their names, joined by "+".
 
     Args:
-        observation: One of `KINDS`, several joined by "+", or a list or tuple of them.
+        observation: One of `OBSERVATIONS`, several joined by "+", or a list or tuple of them.
 
     Raises:
         ValueError: If it is none of these, or one is named twice.
     """
     names = observation.split("+") if isinstance(observation, str) else observation
-    if not isinstance(names, list | tuple) or not names or not all(name in KINDS for name in names):
+    if not isinstance(names, list | tuple) or not names or not all(name in OBSERVATIONS for name in names):
         raise ValueError(
-            f"Unknown observation {observation!r}; expected one of {', '.join(map(repr, KINDS))}, or several, such as "
-            '"camera+lidar".'
+            f"Unknown observation {observation!r}; expected one of {', '.join(map(repr, OBSERVATIONS))}, or several, "
+            'such as "camera+lidar".'
         )
     if len(set(names)) < len(names):
         raise ValueError(f"Expected different observations, got {observation!r}.")

@@ -17,9 +17,9 @@ from torch import Tensor
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import LANE_WIDTH, VEHICLE_LENGTH, State
 
-ROWS = 5
+KINEMATICS_ROWS = 5
 """Vehicles in the observation, the observer first; missing ones are rows of zeros."""
-FEATURES = ("presence", "x", "y", "vx", "vy")
+KINEMATICS_FEATURES = ("presence", "x", "y", "vx", "vy")
 """Columns: 1 for a vehicle that is there; place [m] and velocity [m/s] along and across the road, of the observer as
 they are, of the others less the observer's."""
 MAX_SPEED = 40.0
@@ -32,11 +32,11 @@ BEHIND = 2 * VEHICLE_LENGTH
 
 
 def kinematics_space() -> "spaces.Box[np.float32]":
-    """The space of `kinematics`, as HighwayEnv declares it: `ROWS` x `FEATURES`, without bounds.
+    """The space of `kinematics`, as HighwayEnv declares it: `KINEMATICS_ROWS` x `KINEMATICS_FEATURES`, without bounds.
 
     What is observed is clipped to [-1, 1] here as there, but Stable-Baselines3's `load(path, env)` wants equal spaces.
     """
-    return spaces.Box(-np.inf, np.inf, (ROWS, len(FEATURES)), np.float32)
+    return spaces.Box(-np.inf, np.inf, (KINEMATICS_ROWS, len(KINEMATICS_FEATURES)), np.float32)
 
 
 def kinematics(state: State, road: Road, vehicle: int = 0) -> Tensor:
@@ -51,7 +51,7 @@ def kinematics(state: State, road: Road, vehicle: int = 0) -> Tensor:
         vehicle: Which of the N vehicles observes.
 
     Returns:
-        Shape (B, 5, 5), float32, in [-1, 1]: rows of `FEATURES`, the observer's first.
+        Shape (B, 5, 5), float32, in [-1, 1]: rows of `KINEMATICS_FEATURES`, the observer's first.
     """
     moving = (state.x, state.y, state.speed * torch.cos(state.heading), state.speed * torch.sin(state.heading))
     values = torch.stack((torch.ones_like(state.x), *moving), dim=-1)
@@ -61,10 +61,10 @@ def kinematics(state: State, road: Road, vehicle: int = 0) -> Tensor:
 
     along, across = others[..., 1], others[..., 2]
     seen = (torch.hypot(along, across) < VIEW) & (along > -BEHIND)
-    nearest = torch.where(seen, along.abs(), torch.inf).sort(dim=1, stable=True).indices[:, : ROWS - 1]
-    others = (others * seen[..., None]).gather(1, nearest[..., None].expand(-1, -1, len(FEATURES)))
+    nearest = torch.where(seen, along.abs(), torch.inf).sort(dim=1, stable=True).indices[:, : KINEMATICS_ROWS - 1]
+    others = (others * seen[..., None]).gather(1, nearest[..., None].expand(-1, -1, len(KINEMATICS_FEATURES)))
 
     rows = torch.cat((own, others), dim=1)
-    rows = torch.nn.functional.pad(rows, (0, 0, 0, ROWS - rows.shape[1]))
+    rows = torch.nn.functional.pad(rows, (0, 0, 0, KINEMATICS_ROWS - rows.shape[1]))
     scales = rows.new_tensor((1.0, VIEW, LANE_WIDTH * road.lanes, 2 * MAX_SPEED, 2 * MAX_SPEED))
     return (rows / scales).clamp(-1.0, 1.0).float()

@@ -19,17 +19,17 @@ import torch
 from torch import Tensor
 
 BEAMS = 20
-SPACING = 2.0 * math.pi / BEAMS
+BEAM_SPACING = 2.0 * math.pi / BEAMS
 """Angle between neighbouring beams [rad]."""
-FIRST = -0.9 * math.pi
-"""Angle of beam 0 [rad], -162 degrees; positive is to the right, as y is. Beam `AHEAD` looks straight ahead."""
-AHEAD = 9
+FIRST_BEAM_ANGLE = -0.9 * math.pi
+"""Angle of beam 0 [rad], -162 degrees; positive is to the right, as y is. Beam `AHEAD_BEAM` looks straight ahead."""
+AHEAD_BEAM = 9
 MAX_RANGE = 100.0
 """Range of a beam that meets nothing [m]; its rate is 0."""
 
 _WINDOWS = (
-    ((0,), math.sin(0.5 * SPACING)),
-    ((-1, 0, 1), math.sin(1.5 * SPACING)),
+    ((0,), math.sin(0.5 * BEAM_SPACING)),
+    ((-1, 0, 1), math.sin(1.5 * BEAM_SPACING)),
     (tuple(range(BEAMS)), 0.0),
 )
 """Beams that may meet a body, counted from the one nearest to its bearing, while the sine of half the angle that it
@@ -71,7 +71,7 @@ class Readings(NamedTuple):
 
 def beam_angles(like: Tensor) -> Tensor:
     """Angles of the beams relative to the heading [rad], shape (20,), with dtype and device of a tensor."""
-    return FIRST + SPACING * torch.arange(BEAMS, dtype=like.dtype, device=like.device)
+    return FIRST_BEAM_ANGLE + BEAM_SPACING * torch.arange(BEAMS, dtype=like.dtype, device=like.device)
 
 
 def sense(bodies: Bodies, observers: int | None = None) -> Readings:
@@ -149,7 +149,7 @@ def _first_met(bodies: Bodies, m: int) -> tuple[Tensor, Tensor]:
     distance.diagonal(dim1=1, dim2=2).fill_(torch.inf)  # its own body a vehicle does not see
     half_diagonal = 0.5 * (bodies.length.square() + bodies.width.square()).sqrt()[:, None, :]
     bearing = torch.atan2(dy, dx) - bodies.heading[:, :m, None]
-    facing = torch.round((bearing - FIRST) / SPACING).to(torch.int64)
+    facing = torch.round((bearing - FIRST_BEAM_ANGLE) / BEAM_SPACING).to(torch.int64)
 
     relative = bodies.heading[:, :m, None] - bodies.heading[:, None, :]
     keys = torch.full((batch * m * BEAMS,), _NOTHING, dtype=torch.int64, device=dx.device)
@@ -168,7 +168,7 @@ def _first_met(bodies: Bodies, m: int) -> tuple[Tensor, Tensor]:
             _taken(dx, pair),
             _taken(dy, pair),
             _taken(bodies.heading, body),
-            _taken(relative, pair) + (FIRST + SPACING * beam),
+            _taken(relative, pair) + (FIRST_BEAM_ANGLE + BEAM_SPACING * beam),
             _taken(bodies.length, body),
             _taken(bodies.width, body),
         )

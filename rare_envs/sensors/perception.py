@@ -12,11 +12,11 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from rare_envs.sensors.lidar import AHEAD, BEAMS, SPACING, Bodies, sense
-from rare_envs.traffic.road import Placed, Road
+from rare_envs.sensors.lidar import AHEAD_BEAM, BEAM_SPACING, BEAMS, Bodies, sense
+from rare_envs.traffic.road import Road, WorldPose
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
 
-BEAM_NAMES = tuple(round(math.degrees(SPACING * (k - AHEAD))) for k in range(BEAMS))
+BEAM_NAMES = tuple(round(math.degrees(BEAM_SPACING * (k - AHEAD_BEAM))) for k in range(BEAMS))
 FEATURES = (
     "lane_offset",
     "heading",
@@ -34,12 +34,12 @@ FEATURES = (
 )
 """Names in order. The three flags are always 0: in recorded traffic they are constant, so no policy can learn what they
 mean; they are kept so that the layout is the published one."""
-LANE_OFFSET = FEATURES.index("lane_offset")
-HEADING = FEATURES.index("heading")
-SPEED = FEATURES.index("speed")
-CURVATURE = FEATURES.index("curvature")
-RANGES = slice(11, 11 + BEAMS)
-RATES = slice(11 + BEAMS, 11 + 2 * BEAMS)
+LANE_OFFSET_COLUMN = FEATURES.index("lane_offset")
+HEADING_COLUMN = FEATURES.index("heading")
+SPEED_COLUMN = FEATURES.index("speed")
+CURVATURE_COLUMN = FEATURES.index("curvature")
+RANGE_COLUMNS = slice(11, 11 + BEAMS)
+RATE_COLUMNS = slice(11 + BEAMS, 11 + 2 * BEAMS)
 
 
 class OnRoad(NamedTuple):
@@ -87,7 +87,7 @@ def perceive(bodies: Bodies, on_road: OnRoad, observers: int | None = None) -> T
     return torch.cat((torch.stack(core, dim=-1)[:, :m], readings.range, readings.rate), dim=-1)
 
 
-def look(state: State, road: Road, placed: Placed | None = None) -> Tensor:
+def perceive_traffic(state: State, road: Road, placed: WorldPose | None = None) -> Tensor:
     """The 51 features of all vehicles, shape (B, N, 51); where they are is found out unless it is `placed`."""
     x, y, heading, curvature = placed or road.place(state.x, state.y, state.heading)
     bodies = Bodies(x, y, heading, state.speed, x.new_tensor(VEHICLE_LENGTH), x.new_tensor(VEHICLE_WIDTH))

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from rare_envs.measures import Moment, ttc
-from rare_envs.traffic.crash import NONE, Crash, crash_of, crash_of_others, others_touch
+from rare_envs.traffic.crash import NONE, Crash, crash_of, crash_of_others, others_overlap
 from rare_envs.traffic.state import State
 
 
@@ -48,7 +48,7 @@ class EpisodeStatistics(NamedTuple):
         new = now & ~before
         if bool(new.any()):
             own = _record_crashes(own, new, crash_of, moment)
-        touch = others_touch(moment.state, moment.road) & (others.kind == NONE) & ~before
+        touch = others_overlap(moment.state, moment.road) & (others.kind == NONE) & ~before
         if bool(touch.any()):
             others = _record_crashes(others, touch, crash_of_others, moment)
         return EpisodeStatistics(least, own, others)

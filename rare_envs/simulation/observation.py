@@ -78,7 +78,7 @@ def observe(episode: "Episode", observation: str, vehicle: int = 0) -> Any:
 
     Args:
         episode: B episodes.
-        observation: A kind of observation, or several joined by "+", see `rare_envs.sensors.kinds.KINDS`.
+        observation: A kind of observation, or several joined by "+", see `rare_envs.sensors.kinds.OBSERVATIONS`.
         vehicle: Index of the vehicle that looks.
 
     Returns:

@@ -50,7 +50,7 @@ def apply_overrides(
         else:
             scripted = _choose(released, roaming(state, driver_actions, dt, road), scripted)
     x, y, heading, speed = (field[:, 1:] for field in state[:4])
-    curvature = None if road.curve is None else road.curvature(x)
+    curvature = None if road.reference_line is None else road.curvature(x)
     moved = Others(*bicycle(x, y, heading, speed, action[:, 1:, 0], action[:, 1:, 1], dt, curvature))
     return _choose(commanded[:, 1:], moved, scripted), overridden
 

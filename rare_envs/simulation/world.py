@@ -9,7 +9,7 @@ import torch
 from gymnasium import spaces
 from torch import Tensor
 
-from rare_envs.control.meta_actions import DECISION, aim_of, follow
+from rare_envs.control.meta_actions import DECISION, follow_meta_actions, initial_aim
 from rare_envs.distributions.space import Distribution, Parameter
 from rare_envs.measures import EpisodeMeasure, Moment
 from rare_envs.measures.registry import find_measure
@@ -17,20 +17,20 @@ from rare_envs.scenarios.base import Scenario
 from rare_envs.sensors.camera import Camera, CameraContext, clear_day
 from rare_envs.sensors.camera.weather import read_weather, weather_parameters
 from rare_envs.sensors.kinds import kinds_of
-from rare_envs.sensors.perception import look
+from rare_envs.sensors.perception import perceive_traffic
 from rare_envs.simulation.background import Background, BackgroundState, fixed_draws, noise_size, step_background
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.episode_statistics import EpisodeStatistics
 from rare_envs.simulation.observation import observation_space
 from rare_envs.simulation.overrides import apply_overrides
-from rare_envs.traffic.crash import others_touch
+from rare_envs.traffic.crash import others_overlap
 from rare_envs.traffic.lead import lead_of
 from rare_envs.traffic.overlap import ego_overlaps
-from rare_envs.traffic.road import Placed
+from rare_envs.traffic.road import WorldPose
 from rare_envs.traffic.state import State
 from rare_envs.traffic.vehicle_models import bicycle
 
-WeatherLaws = tuple[tuple[tuple[Parameter, ...], Distribution], ...]
+WeatherDistributions = tuple[tuple[tuple[Parameter, ...], Distribution], ...]
 
 
 def _is_number(value: object) -> bool:
@@ -53,7 +53,7 @@ class World:
     noise: bool | str = True
     """Drivers' noise: True, part of x; "fixed", one sequence for all x; False, mean actions."""
     observation: str = "features"
-    """What the ego observes: one of `rare_envs.sensors.kinds.KINDS`, or several joined by "+"."""
+    """What the ego observes: one of `rare_envs.sensors.kinds.OBSERVATIONS`, or several joined by "+"."""
     action: str = "continuous"
     """What a policy decides: "continuous", each tick, or "meta", each second."""
     lidar: bool = False
@@ -132,10 +132,10 @@ class World:
     @property
     def conditions(self) -> int:
         """Number of columns of x that are weather."""
-        return sum(each.size for parameters, _ in self.weather_laws for each in parameters)
+        return sum(each.size for parameters, _ in self.weather_distributions for each in parameters)
 
     @property
-    def weather_laws(self) -> WeatherLaws:
+    def weather_distributions(self) -> WeatherDistributions:
         """Parameters of the weather with their laws, in the order of x."""
         return tuple(weather_parameters(self.noise is not False)) if self.weather else ()
 
@@ -197,8 +197,8 @@ class World:
         road = self.scenario.road
         collided = torch.zeros_like(state.x[:, 0], dtype=torch.bool)
         moment = Moment(state, lead_of(state, road), road, perception, None, self.dt)
-        measure_state = self._measure.begin(moment, self.ticks)
-        aim = aim_of(state, road) if self.action == "meta" else None
+        measure_state = self._measure.start(moment, self.ticks)
+        aim = initial_aim(state, road) if self.action == "meta" else None
         seen = EpisodeStatistics.start(moment, self._least_ttc(measure_state)) if self.witnessed else None
         return Episode(
             state,
@@ -226,7 +226,7 @@ class World:
         """
         moment = Moment(state, lead_of(state, episode.road), episode.road, perception, episode.state, self.dt)
         collided = episode.collided | hit
-        measure_state = self._measure.fold(episode.measure_state, moment, episode.collided, collided)
+        measure_state = self._measure.update(episode.measure_state, moment, episode.collided, collided)
         seen = episode.statistics
         if seen is not None:
             seen = seen.update(moment, episode.collided, collided, self._least_ttc(measure_state))
@@ -252,11 +252,11 @@ class World:
             return self._fixed.to(noise).expand(batch, -1, -1, -1)
         return noise.reshape(batch, -1 if self._noisy else 0, *shape)
 
-    def _look(self, state: State, placed: Placed | None) -> Tensor | None:
+    def _look(self, state: State, placed: WorldPose | None) -> Tensor | None:
         """What the vehicles see, if they look."""
-        return look(state, self.scenario.road, placed) if self.sees else None
+        return perceive_traffic(state, self.scenario.road, placed) if self.sees else None
 
-    def _placed(self, state: State) -> Placed | None:
+    def _placed(self, state: State) -> WorldPose | None:
         """Where the vehicles are in the flat world, if they look."""
         return self.scenario.road.place(state.x, state.y, state.heading) if self.sees else None
 
@@ -275,7 +275,7 @@ class World:
         """
         if episode.aim is None or action.is_floating_point():
             return episode, action
-        aim, action = follow(episode.aim, action, commanded, episode.state, episode.road)
+        aim, action = follow_meta_actions(episode.aim, action, commanded, episode.state, episode.road)
         return episode._replace(aim=aim), action
 
     def step(self, episode: Episode, action: Tensor, commanded: Tensor | None = None) -> Episode:
@@ -303,7 +303,7 @@ class World:
         old, dt, road, background_state = episode.state, self.dt, episode.road, episode.background_state
         steered = action if commanded is None else action[:, 0]
         ego = (old.x[:, 0], old.y[:, 0], old.heading[:, 0], old.speed[:, 0])
-        curvature = None if road.curve is None else road.curvature(old.x[:, 0])
+        curvature = None if road.reference_line is None else road.curvature(old.x[:, 0])
         moved = bicycle(*ego, steered[:, 0], steered[:, 1], dt, curvature)
         decided = None
         if self.drivers is None or background_state is None or episode.perception is None:
@@ -319,7 +319,7 @@ class World:
         placed = self._placed(state)
         hit = ego_overlaps(state, road, placed).any(dim=1) | road.off_road(state.y[:, 0])
         if self.collisions == "any":
-            hit = hit | others_touch(state, road)
+            hit = hit | others_overlap(state, road)
         episode = episode._replace(background_state=background_state, overridden=overridden)
         return self.next(episode, state, self._look(state, placed), hit)
 

@@ -12,7 +12,7 @@ import numpy as np
 import samplers
 from rare_envs import DrivingProblem
 from rare_envs.egos.faults import EgoGone
-from rare_envs.traffic.crash import describe
+from rare_envs.traffic.crash import describe_crash
 
 LOOKED_AT = 10_000
 """Failing points that are driven again, evenly spaced among all."""
@@ -37,7 +37,7 @@ class Kinds:
     shares: Mapping[str, samplers.Share] = field(default_factory=dict)
     """p by kind of crash; its parts add up to p. Empty if nothing failed, or it is not known."""
     listed: tuple[dict[str, Any] | None, ...] = ()
-    """The crash of each failure of the list, see `rare_envs.traffic.crash.describe`; empty if it is not known."""
+    """The crash of each failure of the list, see `rare_envs.traffic.crash.describe_crash`; empty if it is not known."""
     unknown: str = ""
     """Why it is not known."""
 
@@ -55,5 +55,5 @@ def look_again(problem: DrivingProblem, estimate: samplers.Estimate) -> Kinds:
     except (Exception, SystemExit, EgoGone) as error:  # the ego is the user's, and need not do again what it did before
         return Kinds(unknown=f"{type(error).__name__}: {error}")
     row = np.cumsum(known) - 1
-    listed = (describe(crashes, int(at)) if one else None for at, one in zip(row, known, strict=True))
+    listed = (describe_crash(crashes, int(at)) if one else None for at, one in zip(row, known, strict=True))
     return Kinds(shares, tuple(listed))

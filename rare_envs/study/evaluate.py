@@ -115,7 +115,7 @@ class Report:
 
     @property
     def crashes(self) -> tuple[dict[str, Any] | None, ...]:
-        """The crash of each listed failure, see `rare_envs.traffic.crash.describe`; None where nobody crashed."""
+        """The crash of each listed failure, see `rare_envs.traffic.crash.describe_crash`; None where nobody crashed."""
         return self.kinds.listed or (None,) * len(self.estimate.failures)
 
     @property

@@ -25,7 +25,7 @@ from rare_envs.study.errors import BadInput, output_folder
 from rare_envs.study.evaluate import Question, Report, Study, prepare, run
 from rare_envs.study.journal import Journal
 from rare_envs.study.plots import save_plot
-from rare_envs.traffic.crash import KINDS, NONE
+from rare_envs.traffic.crash import CRASH_KINDS, NONE
 
 RESULT, FAILURES, BLOCKS, PLOT = "result.json", "failures.csv", "failures.npz", "plot.png"
 """Blocks are what a table has no room for: of more than `columns.SHOWN` values, drivers' weights and noise."""
@@ -160,7 +160,7 @@ def read_failures(folder: Path) -> dict[str, NDArray[Any]]:
 
 def _write_failures(folder: Path, report: Report) -> None:
     """One failure a row, the most likely first: x, f, log p0 and the crash."""
-    kind = "" if report.kinds.unknown else KINDS[NONE]
+    kind = "" if report.kinds.unknown else CRASH_KINDS[NONE]
     crashes = [_crash(crash, kind) for crash in report.crashes]
     write_failures(folder, report.study.problem.space, report.estimate.failures, CRASH, crashes)
 

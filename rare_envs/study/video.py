@@ -23,7 +23,7 @@ from rare_envs.study.columns import SHOWN, digits
 from rare_envs.study.errors import BadInput
 from rare_envs.study.evaluate import Question, prepare
 from rare_envs.study.run_directory import FAILURES, RESULT, read_failures
-from rare_envs.traffic.crash import describe
+from rare_envs.traffic.crash import describe_crash
 
 STRIP = 144
 """Height of the curves below the road [pixels]."""
@@ -66,7 +66,7 @@ class Drive(NamedTuple):
     def crash(self) -> dict[str, Any] | None:
         """What kind of crash it ended in."""
         statistics = self.episodes[-1].statistics
-        return None if statistics is None else describe(statistics.crash)
+        return None if statistics is None else describe_crash(statistics.crash)
 
     def time(self, k: int) -> float:
         """Time of moment k [s]."""
@@ -121,7 +121,7 @@ def drive_again(problem: DrivingProblem, x: NDArray[np.float64]) -> Drive:
     for before, episode in zip([None, *episodes], episodes, strict=False):
         state = None if before is None else before.state
         moment = Moment(episode.state, episode.lead, episode.road, episode.perception, state, world.dt)
-        alone.append(float(episode.measure.f(episode.measure.begin(moment, world.ticks))))
+        alone.append(float(episode.measure.f(episode.measure.start(moment, world.ticks))))
     return Drive(problem, episodes, np.array([float(each.f) for each in episodes]), np.array(alone))
 
 

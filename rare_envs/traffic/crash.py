@@ -9,15 +9,15 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from rare_envs.traffic.oriented_boxes import DIAGONAL, axes_of, crossing, project, separation
+from rare_envs.traffic.oriented_boxes import DIAGONAL, axes_of, crossing, project_on_axes, separation
 from rare_envs.traffic.pairs import pairs, velocities
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import State
 
-KINDS = ("none", "rear_end", "rear_ended", "side", "road_edge", "others")
+CRASH_KINDS = ("none", "rear_end", "rear_ended", "side", "road_edge", "others")
 """Kinds of crash by number: none; the ego runs into a vehicle ahead; it is run into from behind; flank against flank
 (side-swipe); the ego leaves the road; only other vehicles collided."""
-NONE, REAR_END, REAR_ENDED, SIDE, ROAD_EDGE, OTHERS = range(len(KINDS))
+NONE, REAR_END, REAR_ENDED, SIDE, ROAD_EDGE, OTHERS = range(len(CRASH_KINDS))
 RESTITUTION = 0.0
 """Share of the closing speed with which bodies part again: 0, a plastic impact, as usual above 10 m/s; near 0.3 at
 walking pace."""
@@ -35,7 +35,7 @@ class Crash(NamedTuple):
     """
 
     kind: Tensor
-    """Index of `KINDS`, int64, shape (B,)."""
+    """Index of `CRASH_KINDS`, int64, shape (B,)."""
     vehicles: Tensor
     """Indices of the two vehicles, int64, shape (B, 2); -1 for the edge of the road, and for nobody."""
     impact_speed: Tensor
@@ -113,7 +113,7 @@ def crash_of_others(state: State, road: Road, before: State | None = None, dt: f
     return found._replace(kind=torch.where(found.kind == NONE, NONE, OTHERS))
 
 
-def others_touch(state: State, road: Road) -> Tensor:
+def others_overlap(state: State, road: Road) -> Tensor:
     """Whether two vehicles other than the ego overlap, boolean, shape (B,)."""
     n = state.x.shape[1] - 1
     first, second = (list(index[n:]) for index in pairs(n + 1))
@@ -138,7 +138,7 @@ def _pair_crash(state: State, road: Road, before: State | None, dt: float, which
     one, other = heading[:, first], heading[:, second]
     axes = axes_of(x[:, second] - x[:, first], y[:, second] - y[:, first], one, other)
     dvx, dvy = along[:, second] - along[:, first], across[:, second] - across[:, first]
-    rate = project(dvx, dvy, one, other)
+    rate = project_on_axes(dvx, dvy, one, other)
     enter = crossing(axes, rate).enter
     since, axis = enter.max(-1)
     resting = torch.isinf(since)  # nothing moves: the axis along which they overlap least
@@ -207,14 +207,14 @@ def _edge_crash(state: State, before: State | None, dt: float) -> Crash:
     return Crash(torch.full_like(crash.kind, ROAD_EDGE), edge, state.speed[:, 0], across.abs(), change, risk)
 
 
-def describe(crash: Crash, row: int = 0) -> dict[str, Any] | None:
+def describe_crash(crash: Crash, row: int = 0) -> dict[str, Any] | None:
     """One crash in plain values, for `info` and for files; None where there was none.
 
     Returns:
-        "kind" (of `KINDS`), "vehicles" (who ran into whom), "impact_speed", "closing_speed", "delta_v" [m/s] and
+        "kind" (of `CRASH_KINDS`), "vehicles" (who ran into whom), "impact_speed", "closing_speed", "delta_v" [m/s] and
         "injury_risk" (both of the two vehicles in this order).
     """
-    kind = KINDS[int(crash.kind[row])]
-    if kind == KINDS[NONE]:
+    kind = CRASH_KINDS[int(crash.kind[row])]
+    if kind == CRASH_KINDS[NONE]:
         return None
     return {name: kind if name == "kind" else values[row].tolist() for name, values in crash._asdict().items()}

@@ -41,7 +41,7 @@ class Crossing(NamedTuple):
     """... until this one."""
 
 
-def project(x: Tensor, y: Tensor, heading: Tensor, other_heading: Tensor) -> Tensor:
+def project_on_axes(x: Tensor, y: Tensor, heading: Tensor, other_heading: Tensor) -> Tensor:
     """A vector along the four axes.
 
     Args:
@@ -74,7 +74,7 @@ def axes_of(dx: Tensor, dy: Tensor, heading: Tensor, other_heading: Tensor) -> A
     half_length, half_width = _LENGTHS
     along = half_length + half_length * cos + half_width * sin
     across = half_width + half_length * sin + half_width * cos
-    return Axes(project(dx, dy, heading, other_heading), torch.stack((along, across, along, across), -1))
+    return Axes(project_on_axes(dx, dy, heading, other_heading), torch.stack((along, across, along, across), -1))
 
 
 def separation(axes: Axes) -> Tensor:
@@ -86,7 +86,7 @@ def separation(axes: Axes) -> Tensor:
     return axes.gap.amax(-1)
 
 
-def clearance(axes: Axes, turn: Tensor) -> Tensor:
+def box_distance(axes: Axes, turn: Tensor) -> Tensor:
     """Exact distance between two bodies [m], the negative depth of their overlap if they do.
 
     The distance of two convex polygons that are apart is that of a corner of one from the other.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from rare_envs.traffic.road import Placed, Road
+from rare_envs.traffic.road import Road, WorldPose
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
 
 _DIAGONAL = (VEHICLE_LENGTH**2 + VEHICLE_WIDTH**2) ** 0.5
@@ -45,7 +45,7 @@ def boxes_overlap(
     return overlap & (other_across.abs() < other_width + length * sin + width * cos)
 
 
-def ego_overlaps(state: State, road: Road, placed: Placed | None = None) -> Tensor:
+def ego_overlaps(state: State, road: Road, placed: WorldPose | None = None) -> Tensor:
     """Which vehicles' bodies overlap the ego's.
 
     They are compared in the world: where the road turns, distances along it are not those between bodies. Boxes are
@@ -69,7 +69,7 @@ def ego_overlaps(state: State, road: Road, placed: Placed | None = None) -> Tens
     return near
 
 
-def overlaps(state: State, road: Road, placed: Placed | None = None) -> Tensor:
+def pairwise_overlaps(state: State, road: Road, placed: WorldPose | None = None) -> Tensor:
     """Which vehicles' bodies overlap which.
 
     Args:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from rare_envs.traffic.oriented_boxes import Axes, axes_of, project
+from rare_envs.traffic.oriented_boxes import Axes, axes_of, project_on_axes
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import State
 
@@ -48,4 +48,6 @@ def encounter(state: State, road: Road) -> Encounter:
     along, across = velocities(state, heading)
     ego, other = heading[:, :1].expand_as(heading[:, 1:]), heading[:, 1:]
     axes = axes_of(x[:, 1:] - x[:, :1], y[:, 1:] - y[:, :1], ego, other)
-    return Encounter(axes, project(along[:, 1:] - along[:, :1], across[:, 1:] - across[:, :1], ego, other), other - ego)
+    return Encounter(
+        axes, project_on_axes(along[:, 1:] - along[:, :1], across[:, 1:] - across[:, :1], ego, other), other - ego
+    )

@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 MAX_CURVATURE = 0.005
-"""Largest curvature [1/m], a radius of 200 m: below it the series in `Curve` are good to 1e-4 m a metre."""
+"""Largest curvature [1/m], a radius of 200 m: below it the series in `ReferenceLine` are good to 1e-4 m a metre."""
 MAX_TURN = 0.5
-"""Most that a curve may turn away from its start [rad], so that `Curve.nearest` finds its way."""
+"""Most that a curve may turn away from its start [rad], so that `ReferenceLine.nearest` finds its way."""
 _CELL = 10.0
 """Longest cell of the table [m]."""
 _NEWTON_STEPS = 4
 
 
-class Point(NamedTuple):
+class LinePoint(NamedTuple):
     """Points of a curve, all of one shape."""
 
     x: Tensor
@@ -33,7 +33,7 @@ class Point(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Curve:
+class ReferenceLine:
     """A line whose curvature is linear between equally spaced knots, and which is straight before and after them.
 
     So heading and curvature are continuous. The line is tabulated in cells of at most 10 m, in which positions are
@@ -56,7 +56,7 @@ class Curve:
         if turn > MAX_TURN:
             raise ValueError(f"Expected a curve that turns by at most {MAX_TURN} rad from its start, got {turn:.3g}.")
 
-    def at(self, s: Tensor) -> Point:
+    def at(self, s: Tensor) -> LinePoint:
         """The points of the curve.
 
         Args:
@@ -66,7 +66,7 @@ class Curve:
             The points, of the same shape, differentiable in s.
         """
         (x0, x1, x2, x3, y0, y1, y2, y3, heading, curvature, slope), ds = self._cell(s)
-        return Point(
+        return LinePoint(
             torch.addcmul(x0, ds, torch.addcmul(x1, ds, torch.addcmul(x2, ds, x3))),
             torch.addcmul(y0, ds, torch.addcmul(y1, ds, torch.addcmul(y2, ds, y3))),
             torch.addcmul(heading, ds, torch.addcmul(curvature, ds, slope, value=0.5)),
@@ -108,7 +108,7 @@ class Curve:
         return rows.unbind(-1), s - number * step
 
 
-def _nodes(curve: Curve) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
+def _nodes(curve: ReferenceLine) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
     """Length of a cell [m], curvatures and headings at the ends of the cells."""
     parts = math.ceil(curve.spacing / _CELL)
     knots = np.arange(len(curve.curvature))
@@ -120,7 +120,7 @@ def _nodes(curve: Curve) -> tuple[float, NDArray[np.float64], NDArray[np.float64
 
 
 @lru_cache(maxsize=32)
-def _table(curve: Curve, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, float]:
+def _table(curve: ReferenceLine, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, float]:
     """Coefficients, shape (cells, 11), and the length of a cell [m].
 
     With heading h, curvature k and its slope c at the start of a cell, the curve goes u = s - k^2 s^3 / 6 along h and

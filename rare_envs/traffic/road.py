@@ -15,10 +15,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from rare_envs.traffic.reference_line import Curve
+from rare_envs.traffic.reference_line import ReferenceLine
 
 
-class Placed(NamedTuple):
+class WorldPose(NamedTuple):
     """Vehicles in the flat world; all of one shape."""
 
     x: Tensor
@@ -37,7 +37,7 @@ class Road:
 
     edges: tuple[float, ...]
     """y of the lines that bound the lanes [m], from left to right: one more than there are lanes."""
-    curve: Curve | None = None
+    reference_line: ReferenceLine | None = None
     """The reference line, y = 0; None for a straight one."""
 
     def __post_init__(self) -> None:
@@ -98,7 +98,7 @@ class Road:
 
     def curvature(self, x: Tensor) -> Tensor:
         """Curvature of the reference line [1/m], positive where the road turns to the right."""
-        return torch.zeros_like(x) if self.curve is None else self.curve.curvature_at(x)
+        return torch.zeros_like(x) if self.reference_line is None else self.reference_line.curvature_at(x)
 
     def to_world(self, x: Tensor, y: Tensor, heading: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """From road to world coordinates.
@@ -113,16 +113,16 @@ class Road:
         Returns:
             X [m], Y [m] and the heading relative to the X axis [rad].
         """
-        if self.curve is None:
+        if self.reference_line is None:
             return x, y, heading
         return self.place(x, y, heading)[:3]
 
-    def place(self, x: Tensor, y: Tensor, heading: Tensor) -> "Placed":
+    def place(self, x: Tensor, y: Tensor, heading: Tensor) -> "WorldPose":
         """`to_world`, and the curvature of the reference line at x, in one."""
-        if self.curve is None:
-            return Placed(x, y, heading, torch.zeros_like(x))
-        point = self.curve.at(x)
-        return Placed(
+        if self.reference_line is None:
+            return WorldPose(x, y, heading, torch.zeros_like(x))
+        point = self.reference_line.at(x)
+        return WorldPose(
             torch.addcmul(point.x, y, torch.sin(point.heading), value=-1.0),
             torch.addcmul(point.y, y, torch.cos(point.heading)),
             point.heading + heading,
@@ -140,10 +140,10 @@ class Road:
         Returns:
             x and y in the road [m], and the heading relative to the road [rad].
         """
-        if self.curve is None:
+        if self.reference_line is None:
             return x, y, heading
-        s = self.curve.nearest(x, y)
-        point = self.curve.at(s)
+        s = self.reference_line.nearest(x, y)
+        point = self.reference_line.at(s)
         across = (y - point.y) * torch.cos(point.heading) - (x - point.x) * torch.sin(point.heading)
         return s, across, heading - point.heading
 
@@ -169,4 +169,4 @@ def i80() -> Road:
     """
     text = (resources.files("rare_envs") / "data" / "i80.json").read_text(encoding="utf-8")
     table = json.loads(text)
-    return Road(tuple(table["edges"]), Curve(table["spacing"], tuple(table["curvature"])))
+    return Road(tuple(table["edges"]), ReferenceLine(table["spacing"], tuple(table["curvature"])))

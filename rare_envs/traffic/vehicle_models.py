@@ -11,9 +11,9 @@ from torch import Tensor
 
 from rare_envs.traffic.state import VEHICLE_LENGTH
 
-MAX_STEERING = math.pi / 3
+STEERING_LIMIT = math.pi / 3
 """Largest steering angle [rad], HighwayEnv's."""
-_MAX_SLIP_SINE = math.sin(math.atan(0.5 * math.tan(MAX_STEERING)))
+_MAX_SLIP_SINE = math.sin(math.atan(0.5 * math.tan(STEERING_LIMIT)))
 """Sine of the slip angle at the largest steering angle. Near 1 single precision may give a slip beyond pi / 2, and its
 tangent the other sign."""
 NEAR_ZERO = 0.01
@@ -69,7 +69,7 @@ def steering_for(yaw_rate: Tensor, speed: Tensor) -> Tensor:
     """The steering angle with which `bicycle` turns at a yaw rate.
 
     Inverts yaw rate = v sin(beta) / (l / 2), beta = atan(tan(steering) / 2), with l the vehicle's length. A vehicle
-    too slow to turn as fast as wanted steers by `MAX_STEERING`.
+    too slow to turn as fast as wanted steers by `STEERING_LIMIT`.
 
     Args:
         yaw_rate: Wanted [rad/s], shape (B,).
@@ -80,7 +80,7 @@ def steering_for(yaw_rate: Tensor, speed: Tensor) -> Tensor:
     """
     sine = VEHICLE_LENGTH / 2 / speed.clamp(min=NEAR_ZERO) * yaw_rate
     slip = torch.asin(sine.clamp(-_MAX_SLIP_SINE, _MAX_SLIP_SINE))
-    return torch.atan(2.0 * torch.tan(slip)).clamp(-MAX_STEERING, MAX_STEERING)
+    return torch.atan(2.0 * torch.tan(slip)).clamp(-STEERING_LIMIT, STEERING_LIMIT)
 
 
 def point_mass(

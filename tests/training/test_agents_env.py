@@ -8,7 +8,7 @@ from stable_baselines3.common.vec_env import VecEnv
 import rare_envs
 import training
 from examples import adversary, shared_policy
-from rare_envs.distributions.beta import BetaLaw
+from rare_envs.distributions.beta import BetaDistribution
 from rare_envs.envs.multi_agent_vector import AgentsVectorEnv
 from rare_envs.multi_agent.rewards import adversary_reward
 
@@ -99,7 +99,7 @@ def test_an_adversary_raises_the_collision_rate():
     """Starts side by side, so that little training is enough; from ordinary starts docs/agents.md has the numbers."""
     torch.set_num_threads(1)
     low, high = np.array([14.0, 14.0, 14.0, 1.0, 30.0, 3.0]), np.array([16.0, 16.0, 16.0, 4.0, 50.0, 4.0])
-    near = {"base": BetaLaw(np.full(6, 2.0), np.full(6, 2.0), low, high), "horizon": 5.0}
+    near = {"base": BetaDistribution(np.full(6, 2.0), np.full(6, 2.0), low, high), "horizon": 5.0}
     n = 400
     model = adversary.train(CUT_IN, "cutter", 16_000, num_scenarios=32, n_steps=50, batch_size=400, **near)
     scripted = adversary.collisions(CUT_IN, {}, n, seed=1, **near)

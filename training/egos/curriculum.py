@@ -14,15 +14,15 @@ from torch import Tensor
 
 from agents.vision.ego import SEES
 from rare_envs.distributions.space import Parameter
-from rare_envs.scenarios.base import SPEED, Others, Scenario, columns
+from rare_envs.scenarios.base import SPEED_RANGE, Others, Scenario, columns
 from rare_envs.scenarios.base_distributions import load_base
-from rare_envs.scenarios.registry import named
-from rare_envs.sensors.camera.weather import CLEAR, SENSOR_NOISE_LAW, SUN_LAW
-from rare_envs.sensors.perception import look
+from rare_envs.scenarios.registry import scenario_named
+from rare_envs.sensors.camera.weather import CLEAR, SENSOR_NOISE_DISTRIBUTION, SUN_DISTRIBUTION
+from rare_envs.sensors.perception import perceive_traffic
 from rare_envs.simulation.background import Background, find_drivers
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.world import World
-from rare_envs.traffic.reference_line import Curve
+from rare_envs.traffic.reference_line import ReferenceLine
 from rare_envs.traffic.road import Road, i80
 from rare_envs.traffic.state import VEHICLE_LENGTH, State
 from training.egos.nominal_traffic import OrdinaryDrivers, draw_starts, make_ordinary_traffic
@@ -72,14 +72,14 @@ FOLLOWING = Scenario(
     vehicle_names=("ego", "lead", "other"),
     horizon=20.0,
     parameters=(
-        Parameter("ego_speed", *SPEED, "of the ego at the start"),
-        Parameter("lead_speed", *SPEED, "usual speed of the lead"),
+        Parameter("ego_speed", *SPEED_RANGE, "of the ego at the start"),
+        Parameter("lead_speed", *SPEED_RANGE, "usual speed of the lead"),
         Parameter("gap", "m", 1.0, 200.0, "from ego to lead at the start"),
         Parameter("swing", "m/s^2", 0.0, 2.0, "largest acceleration of the lead"),
         Parameter("length", "m", 50.0, 1000.0, "way of the lead from one of its swings to the next"),
         Parameter("beside", "m", -5.0, 5.0, "lateral place of the vehicle in the next lane"),
         Parameter("ahead", "m", -500.0, 200.0, "its place along the road"),
-        Parameter("other_speed", *SPEED, "its speed"),
+        Parameter("other_speed", *SPEED_RANGE, "its speed"),
     ),
     bases={"any": {"alpha": [1.0] * 8, "beta": [1.0] * 8}},
     initial=_initial,
@@ -117,7 +117,7 @@ def _draw_hard_brake(n: int, rng: np.random.Generator) -> Array:
 
 
 def _draw_highway(n: int, rng: np.random.Generator) -> Array:
-    return load_base(named("highway")).sample(n, rng)
+    return load_base(scenario_named("highway")).sample(n, rng)
 
 
 def make_lessons() -> tuple[Lesson, ...]:
@@ -133,16 +133,16 @@ def make_lessons() -> tuple[Lesson, ...]:
         inner = 1 if road.lanes == 3 else int(rng.integers(1, road.lanes - 1))
         return make_ordinary_traffic("traffic", road, inner)
 
-    following, highway = Lesson(somewhere(FOLLOWING), _draw_following), named("highway")
+    following, highway = Lesson(somewhere(FOLLOWING), _draw_following), scenario_named("highway")
     traffic = Lesson(in_traffic, draw_starts, OrdinaryDrivers())
     return (
         traffic,
         following,
         Lesson(lambda rng: highway, _draw_highway, find_drivers(highway.drivers)),
-        Lesson(somewhere(named("cut_in")), _draw_cut_in),
+        Lesson(somewhere(scenario_named("cut_in")), _draw_cut_in),
         traffic,
         following,
-        Lesson(somewhere(named("hard_brake")), _draw_hard_brake),
+        Lesson(somewhere(scenario_named("hard_brake")), _draw_hard_brake),
     )
 
 
@@ -155,7 +155,7 @@ def draw_road(rng: np.random.Generator, least: int = 1) -> Road:
         return Road(edges)
     curvature = rng.uniform(-MAX_CURVATURE, MAX_CURVATURE, 7)
     curvature -= curvature.mean()  # it comes back to its first direction
-    return Road(edges, Curve(80.0, (0.0, *(0.5 * curvature), 0.0)))
+    return Road(edges, ReferenceLine(80.0, (0.0, *(0.5 * curvature), 0.0)))
 
 
 def start_lesson(lesson: Lesson, rows: int, seconds: float, rng: np.random.Generator) -> tuple[World, Episode]:
@@ -179,14 +179,14 @@ def start_lesson(lesson: Lesson, rows: int, seconds: float, rng: np.random.Gener
     parts.append(rng.standard_normal((rows, world.draws + world.keys)))
     start = world.start(torch.from_numpy(np.concatenate(parts, axis=1)).float())
     state = _displace_ego(start.state, scenario, rng)
-    perception = look(state, scenario.road) if world.sees else None
+    perception = perceive_traffic(state, scenario.road) if world.sees else None
     return world, world.first(state, perception, start.background_state, start.camera_context)
 
 
 def _draw_weather(n: int, rng: np.random.Generator) -> Array:
     """Half of the days are clear; of the others the fog is thicker than usual."""
     fog = np.exp(rng.uniform(math.log(5e-5), math.log(1e-2), (n, 1)))
-    some = np.concatenate((fog, SUN_LAW.sample(n, rng), SENSOR_NOISE_LAW.sample(n, rng)), axis=1)
+    some = np.concatenate((fog, SUN_DISTRIBUTION.sample(n, rng), SENSOR_NOISE_DISTRIBUTION.sample(n, rng)), axis=1)
     clear = np.array([CLEAR[0], math.degrees(CLEAR[1]), math.degrees(CLEAR[2]), 0.0])
     return np.where(rng.random((n, 1)) < 0.5, clear, some)
 

@@ -21,14 +21,13 @@ from agents import load_driver
 from agents.learned.coloured_noise import AutoregressiveNoise
 from agents.learned.rule_driver import RuleDriver
 from rare_envs.distributions.space import Parameter
-from rare_envs.scenarios.base import SPEED as ANY_SPEED
-from rare_envs.scenarios.base import Others, Scenario, columns
+from rare_envs.scenarios.base import SPEED_RANGE, Others, Scenario, columns
 from rare_envs.scenarios.base_distributions import load_base
 from rare_envs.scenarios.car_following import CAR_FOLLOWING
 from rare_envs.scenarios.highway import HIGHWAY
-from rare_envs.sensors.perception import SPEED
+from rare_envs.sensors.perception import SPEED_COLUMN
 from rare_envs.simulation.background import Background, WeightDistribution
-from rare_envs.traffic.reference_line import Curve
+from rare_envs.traffic.reference_line import ReferenceLine
 from rare_envs.traffic.road import Road, i80, straight
 from rare_envs.traffic.state import LANE_WIDTH, VEHICLE_LENGTH, State
 from training.imitation.algorithms.config import HUMAN_NOISE
@@ -69,7 +68,7 @@ class OrdinaryDrivers:
     ) -> tuple[Tensor, Tensor | None]:
         """Decide for one tick; see `rare_envs.simulation.background.Background`."""
         assert memory is not None
-        speed = features[..., SPEED]
+        speed = features[..., SPEED_COLUMN]
         wanted = torch.where(memory[..., 4].isnan(), speed, memory[..., 4])
         noise, swings = torch.zeros_like(features[..., :2]), memory[..., :4].reshape(*speed.shape, 2, 2)
         if innovations is not None:
@@ -85,7 +84,7 @@ class OrdinaryDrivers:
 def make_bends() -> Road:
     """Three lanes that wind with radii down to 1 km, 3.6 times as sharply as the I-80 does anywhere, for 2.4 km."""
     sharpest = 1e-3
-    return Road(straight(3).edges, Curve(75.0, (0.0, *(sharpest, 0.0, -sharpest, 0.0) * 8)))
+    return Road(straight(3).edges, ReferenceLine(75.0, (0.0, *(sharpest, 0.0, -sharpest, 0.0) * 8)))
 
 
 def make_ordinary_traffic(name: str, road: Road, lane: int) -> Scenario:
@@ -125,7 +124,7 @@ def make_ordinary_traffic(name: str, road: Road, lane: int) -> Scenario:
             Parameter("follower_gap", "m", 1.0, 150.0, "initial gap from the follower to the ego"),
             Parameter("left", "m", -60.0, 60.0, "initial place of the vehicle on the left relative to the ego"),
             Parameter("right", "m", -60.0, 60.0, "and of that on the right"),
-            *(Parameter(f"{who}_speed", *ANY_SPEED, "initial speed") for who in _NEIGHBOURS),
+            *(Parameter(f"{who}_speed", *SPEED_RANGE, "initial speed") for who in _NEIGHBOURS),
         ),
         bases=CAR_FOLLOWING.bases,
         initial=initial,

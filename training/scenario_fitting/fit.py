@@ -25,7 +25,7 @@ import numpy as np
 import typer
 
 from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
-from rare_envs.scenarios.registry import named
+from rare_envs.scenarios.registry import scenario_named
 from training.data.events import EXTRACTORS, Events, concatenate_events, write_events
 from training.data.highd import highd_recordings, load_highd
 from training.data.ngsim import load_ngsim
@@ -72,8 +72,8 @@ def format_base(
         replaced: Entries in place of the mixture's own: the box of x, where some coordinates are logarithms.
     """
     content = {
-        "names": [p.name for p in named(scenario).parameters],
-        "units": [p.unit for p in named(scenario).parameters],
+        "names": [p.name for p in scenario_named(scenario).parameters],
+        "units": [p.unit for p in scenario_named(scenario).parameters],
         **mixture.to_dict(),
         **replaced,
         "provenance": {**provenance, "mass_outside_box": mass_outside(mixture)},
@@ -103,7 +103,7 @@ def fit_base(
     Raises:
         ValueError: The events cannot be read, or are too few.
     """
-    recipe, box = EVENT_RECIPES[scenario] if recipe is None else recipe, named(scenario).parameters
+    recipe, box = EVENT_RECIPES[scenario] if recipe is None else recipe, scenario_named(scenario).parameters
     (together, own), log = filter_events(read_events(path, recipe), recipe, box)
     low, high = (np.array([getattr(p, end) for p in box]) for end in ("low", "high"))
     chosen = np.array([column in recipe.logarithmic for column in recipe.columns])

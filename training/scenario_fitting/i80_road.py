@@ -4,8 +4,8 @@
 
 FOLDER holds `lanes.csv` (lane, s, x, y: points on the centre lines of six lanes, lane 0 the rightmost) and
 `boundaries.csv` (boundary, x, y: the lines to the left of those lanes), in metres, y positive to the left of x. The
-reference line is a `rare_envs.traffic.reference_line.Curve` in the middle of the leftmost lane. Its curvatures, its
-start and a constant distance to each other lane are fitted by least squares to all lanes but the rightmost, which
+reference line is a `rare_envs.traffic.reference_line.ReferenceLine` in the middle of the leftmost lane. Its curvatures,
+its start and a constant distance to each other lane are fitted by least squares to all lanes but the rightmost, which
 swerves towards two ramps.
 """
 
@@ -19,7 +19,7 @@ import typer
 from pyarrow import ArrowInvalid, csv
 from scipy.optimize import least_squares
 
-from rare_envs.traffic.reference_line import Curve
+from rare_envs.traffic.reference_line import ReferenceLine
 from rare_envs.traffic.road import Road
 from samplers.problem import FloatArray
 
@@ -65,14 +65,14 @@ def to_frame(points: FloatArray, origin: FloatArray, angle: float) -> FloatArray
     return np.column_stack((dx * cos + dy * sin, dx * sin - dy * cos))
 
 
-def to_road_coordinates(curve: Curve, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+def to_road_coordinates(curve: ReferenceLine, points: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Road coordinates of points, shape (n,) each."""
     x, y = torch.from_numpy(points).unbind(dim=1)
     s, across, _ = Road((-1.0, 1.0), curve).from_world(x, y, torch.zeros_like(x))
     return s.numpy(), across.numpy()
 
 
-def fit_reference_line(lanes: list[FloatArray]) -> tuple[Curve, FloatArray, float]:
+def fit_reference_line(lanes: list[FloatArray]) -> tuple[ReferenceLine, FloatArray, float]:
     """The reference line, and origin and angle of its frame in the survey's."""
     leftmost = lanes[-1]
     origin = leftmost[0]
@@ -80,9 +80,9 @@ def fit_reference_line(lanes: list[FloatArray]) -> tuple[Curve, FloatArray, floa
     fitted = [to_frame(lane[::THINNING], origin, angle) for lane in lanes[1:]]
     knots = round(CURVE_LENGTH / KNOT_SPACING) - 1
 
-    def unpack(z: FloatArray) -> tuple[Curve, FloatArray, float, FloatArray]:
+    def unpack(z: FloatArray) -> tuple[ReferenceLine, FloatArray, float, FloatArray]:
         """Unknowns of order 1: curvatures [1e-4/m], turn [0.01 rad] and shift [m] of the frame, offsets [m]."""
-        curve = Curve(KNOT_SPACING, (0.0, *(1e-4 * z[:knots]).tolist(), 0.0))
+        curve = ReferenceLine(KNOT_SPACING, (0.0, *(1e-4 * z[:knots]).tolist(), 0.0))
         return curve, np.array([0.0, z[knots + 1]]), 0.01 * z[knots], np.append(z[knots + 2 :], 0.0)
 
     def residuals(z: FloatArray) -> FloatArray:
@@ -103,7 +103,7 @@ def rotate_points(points: FloatArray, start: FloatArray, turn: float) -> FloatAr
     return np.column_stack((dx * cos + dy * sin, dy * cos - dx * sin))
 
 
-def fit_lane_edges(lines: list[FloatArray], rightmost: FloatArray, curve: Curve) -> list[float]:
+def fit_lane_edges(lines: list[FloatArray], rightmost: FloatArray, curve: ReferenceLine) -> list[float]:
     """Lane edges from left to right, their y [m].
 
     The edge on the right was not surveyed: it is as far from the rightmost lane's median as the line on its left.
@@ -117,7 +117,7 @@ def fit_lane_edges(lines: list[FloatArray], rightmost: FloatArray, curve: Curve)
     return [*edges, 2.0 * typical(rightmost) - edges[-1]]
 
 
-def describe_residuals(name: str, points: FloatArray, curve: Curve, expected: float) -> str:
+def describe_residuals(name: str, points: FloatArray, curve: ReferenceLine, expected: float) -> str:
     """One line on how far surveyed points are from where the road has them."""
     s, y = to_road_coordinates(curve, points)
     error = y[(s >= 0.0) & (s <= SURVEYED)] - expected
@@ -136,7 +136,7 @@ def main(
         typer.echo(f"Error: {error}", err=True)
         raise typer.Exit(2) from None
     curve, origin, angle = fit_reference_line(lanes)
-    curve = Curve(KNOT_SPACING, tuple(round(k, 9) for k in curve.curvature))
+    curve = ReferenceLine(KNOT_SPACING, tuple(round(k, 9) for k in curve.curvature))
     lanes, lines = ([to_frame(points, origin, angle) for points in group] for group in (lanes, lines))
     road = Road(tuple(round(y, 3) for y in fit_lane_edges(lines, lanes[0], curve)), curve)
     for k in range(SURVEY_LANES):

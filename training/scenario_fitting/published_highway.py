@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
-from rare_envs.scenarios.registry import named
+from rare_envs.scenarios.registry import scenario_named
 from samplers.problem import FloatArray
 
 CAR_SPEED = 30.0  # [m/s] published: highD cars drive at about 30 m/s
@@ -119,7 +119,7 @@ SITUATIONS: dict[str, tuple[TrafficSituation, ...]] = {
 
 def build_highway_base(scenario: str) -> tuple[TruncatedGaussianMixture, dict[str, Any]]:
     """The assembled mixture of a scenario and its provenance."""
-    components, box = SITUATIONS[scenario], named(scenario).parameters
+    components, box = SITUATIONS[scenario], scenario_named(scenario).parameters
     mixture = TruncatedGaussianMixture(
         np.array([component.weight for component in components]),
         np.array([component.mean for component in components]),

@@ -9,14 +9,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from rare_envs.sensors.camera.light import AIR, Colour, Light
+from rare_envs.sensors.camera.light import AIR, RGB, Light
 from rare_envs.sensors.camera.pinhole import Pixels
 from rare_envs.traffic.road import Road
 
-ASPHALT: Colour = (0.36, 0.36, 0.38)
-VERGE: Colour = (0.38, 0.43, 0.25)
-WHITE: Colour = (0.92, 0.92, 0.92)
-YELLOW: Colour = (0.90, 0.72, 0.18)
+ASPHALT: RGB = (0.36, 0.36, 0.38)
+VERGE: RGB = (0.38, 0.43, 0.25)
+WHITE_LINE: RGB = (0.92, 0.92, 0.92)
+YELLOW_LINE: RGB = (0.90, 0.72, 0.18)
 LINE_WIDTH = 0.15
 """Of lane lines [m]: 6 inches, the upper end of a normal line (MUTCD, chapter 3A)."""
 DASH, PERIOD = 3.05, 12.19
@@ -157,8 +157,8 @@ def ground(cover: Cover, shade: Tensor | None, light: Light, seen: Pixels) -> Te
     image = clear.new_empty(len(clear), 3, *clear.shape[1:])
     for channel in range(3):
         colour = cover.road * (ASPHALT[channel] - VERGE[channel]) + VERGE[channel]
-        colour.add_(cover.white, alpha=WHITE[channel] - ASPHALT[channel])
-        colour.add_(cover.yellow, alpha=YELLOW[channel] - ASPHALT[channel])
+        colour.add_(cover.white, alpha=WHITE_LINE[channel] - ASPHALT[channel])
+        colour.add_(cover.yellow, alpha=YELLOW_LINE[channel] - ASPHALT[channel])
         air = (AIR[channel] * light.brightness).view(-1, 1, 1)
         torch.addcmul(air * (1.0 - clear), colour, lit, out=image[:, channel])
     return image

@@ -19,11 +19,11 @@ FOG_DEPTH = 100.0
 """Height of the foggy layer [m]."""
 SKY_PATH = 10_000.0
 """Longest way through the air to the sky [m]."""
-Colour = tuple[float, float, float]
-AIR: Colour = (0.80, 0.82, 0.84)
-ZENITH: Colour = (0.36, 0.55, 0.86)
-HORIZON: Colour = (0.74, 0.83, 0.92)
-SUN: Colour = (1.30, 1.25, 1.10)
+RGB = tuple[float, float, float]
+AIR: RGB = (0.80, 0.82, 0.84)
+ZENITH: RGB = (0.36, 0.55, 0.86)
+HORIZON: RGB = (0.74, 0.83, 0.92)
+SUN: RGB = (1.30, 1.25, 1.10)
 STEEP = 0.35
 """Sine of the angle above the horizon from which on the sky has the colour of the zenith."""
 GLOW = 64

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from rare_envs.sensors.camera.ground import Lines, View, cover_of, ground, road_lines
-from rare_envs.sensors.camera.light import Colour, Light, light_of, sky
+from rare_envs.sensors.camera.light import RGB, Light, light_of, sky
 from rare_envs.sensors.camera.pinhole import Camera, Pixels, pixels
 from rare_envs.sensors.camera.sensor_noise import grain
 from rare_envs.sensors.camera.vehicles import PAINT, Boxes, paint, shadows
@@ -18,7 +18,7 @@ TILE = 2**17
 """Pixels that are drawn at once: few enough for the cache."""
 
 
-class Scene(NamedTuple):
+class PictureScene(NamedTuple):
     """What T cameras see."""
 
     boxes: Boxes
@@ -68,7 +68,7 @@ def _rows(fields: Any, part: slice) -> Any:
     return type(fields)(*parts) if hasattr(fields, "_fields") else tuple(parts)
 
 
-def _scene(state: State, road: Road, context: CameraContext, seen: Pixels) -> Scene:
+def _scene(state: State, road: Road, context: CameraContext, seen: Pixels) -> PictureScene:
     """Place vehicles, light and road in the frames of the cameras."""
     x, y, heading = road.to_world(state.x, state.y, state.heading)
     own, camera = heading[:, :1], context.camera
@@ -79,10 +79,10 @@ def _scene(state: State, road: Road, context: CameraContext, seen: Pixels) -> Sc
     dx, dy, turn = x - camera_x, y - camera_y, (heading - gaze).float()
     boxes = Boxes((dx * cos + dy * sin).float(), (dy * cos - dx * sin).float(), torch.cos(turn), torch.sin(turn))
     view = View(camera_x[:, 0], camera_y[:, 0], gaze[:, 0])
-    return Scene(boxes, light_of(context.weather, view.heading), road_lines(view, road, seen))
+    return PictureScene(boxes, light_of(context.weather, view.heading), road_lines(view, road, seen))
 
 
-def _draw(scene: Scene, road: Road, camera: Camera, seen: Pixels, colours: Tensor) -> Tensor:
+def _draw(scene: PictureScene, road: Road, camera: Camera, seen: Pixels, colours: Tensor) -> Tensor:
     """Colours from 0 to 1, shape (T, H W, 3), without noise."""
     boxes, light, lines = scene
     image = torch.empty(len(light.fog), camera.height * camera.width, 3, device=colours.device)
@@ -96,6 +96,6 @@ def _draw(scene: Scene, road: Road, camera: Camera, seen: Pixels, colours: Tenso
     return image
 
 
-def _colours(vehicles: int, viewer: int) -> list[Colour]:
+def _colours(vehicles: int, viewer: int) -> list[RGB]:
     """Colours of the vehicles that a viewer sees, in the order of `State.seen_by`."""
     return [PAINT[(j - 1) % len(PAINT)] for j in range(vehicles) if j != viewer]

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-SIGHT = 2000.0
+GROUND_RANGE = 2000.0
 """How far the ground is drawn [m]; beyond it there is sky."""
 
 
@@ -123,7 +123,7 @@ def pixels(camera: Camera, device: torch.device) -> Pixels:
         forward, up = cos - down * sin, -sin - down * cos
         ray = torch.stack([part.expand(camera.height, camera.width) for part in (forward, across, up)])
 
-        seen = ((up < 0.0) & (forward > 0.0) & (-up * SIGHT >= forward * camera.mount_height))[:, 0]
+        seen = ((up < 0.0) & (forward > 0.0) & (-up * GROUND_RANGE >= forward * camera.mount_height))[:, 0]
         sky = camera.height - int(seen.sum())
         way = camera.mount_height / -up[sky:]
         change = way * cos / -up[sky:] / focal  # of -way, from a row to the next

@@ -10,13 +10,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from rare_envs.sensors.camera.light import AIR, Colour, Light
+from rare_envs.sensors.camera.light import AIR, RGB, Light
 from rare_envs.sensors.camera.pinhole import Camera, Pixels
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
 
 HEIGHT = 1.5
 """Of every vehicle [m], a usual car's."""
-PAINT: tuple[Colour, ...] = (
+PAINT: tuple[RGB, ...] = (
     (0.62, 0.12, 0.10),
     (0.16, 0.27, 0.52),
     (0.78, 0.78, 0.76),
@@ -25,7 +25,7 @@ PAINT: tuple[Colour, ...] = (
     (0.70, 0.60, 0.32),
 )
 """Colours of vehicles 1, 2, ..., in turn."""
-GLASS: Colour = (0.10, 0.13, 0.16)
+GLASS: RGB = (0.10, 0.13, 0.16)
 WINDOWS = (0.90, 1.35)
 """Between these heights [m] the sides are windows."""
 _NEAR = 0.3
@@ -62,7 +62,7 @@ class Candidates(NamedTuple):
     """Number of the pixel in the picture, row by row."""
 
 
-def project(camera: Camera, forward: Tensor, right: Tensor, up: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def project_points(camera: Camera, forward: Tensor, right: Tensor, up: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Points in the camera's frame, seen along its axis.
 
     Args:
@@ -87,12 +87,12 @@ def around(camera: Camera, forward: Tensor, right: Tensor, up: Tensor, first_row
 
     Args:
         camera: The camera.
-        forward: As in `project`, shape (T, N, K), as the others.
+        forward: As in `project_points`, shape (T, N, K), as the others.
         right: Likewise.
         up: Likewise.
         first_row: First row that counts.
     """
-    right, down, depth = project(camera, forward, right, up)
+    right, down, depth = project_points(camera, forward, right, up)
     scale = camera.focal / depth.clamp(min=_NEAR)
     near = torch.where((depth < _NEAR).any(-1), camera.focal / _NEAR, 0.0)
     some = (depth > _NEAR).any(-1)  # else the rectangle is empty

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rare_envs.distributions.beta import BetaLaw
+from rare_envs.distributions.beta import BetaDistribution
 from rare_envs.distributions.log_mixture import LogMixture
 from rare_envs.distributions.space import Array, Distribution, Parameter
 from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
@@ -21,7 +21,7 @@ from rare_envs.sensors.camera.pinhole import Camera
 
 
 @dataclass(frozen=True)
-class LogNormalLaw:
+class LogNormalDistribution:
     """A positive variable whose logarithm is normal, cut to a range; to cross-entropy a block that moves its median."""
 
     median: float
@@ -65,20 +65,20 @@ class LogNormalLaw:
         """Inverse of `to_standard_normal`, (n, 1) -> (n, 1)."""
         return self._law.from_standard_normal(u)
 
-    def project(self, x: Array, weights: Array, alpha: float) -> "LogNormalLaw":
+    def project(self, x: Array, weights: Array, alpha: float) -> "LogNormalDistribution":
         """The law with its median moved towards that of weighted points, by the part alpha of the way in logarithms."""
         logs = np.log(np.clip(x[:, 0], self.low, self.high))
         wanted = float(np.sum(weights * logs) / np.sum(weights))
-        return LogNormalLaw(
+        return LogNormalDistribution(
             math.exp((1.0 - alpha) * math.log(self.median) + alpha * wanted), self.spread, self.low, self.high
         )
 
-    def widen(self, factor: float) -> "LogNormalLaw":
+    def widen(self, factor: float) -> "LogNormalDistribution":
         """The law with a spread larger by a factor."""
-        return LogNormalLaw(self.median, self.spread * factor, self.low, self.high)
+        return LogNormalDistribution(self.median, self.spread * factor, self.low, self.high)
 
 
-class WeatherBeta(BetaLaw):
+class WeatherBeta(BetaDistribution):
     """Independent Beta laws; a cross-entropy search keeps their shape parameters from 1 to 7."""
 
     box: ClassVar[tuple[float, float]] = (1.0, 7.0)
@@ -92,11 +92,11 @@ CONDITIONS = (
 """Parameters of the scenario with `weather=True`, behind its own."""
 SENSOR_NOISE = Parameter("sensor_noise", "levels", 0.0, 10.0, "standard deviation of the noise of a pixel, of 255")
 """One more, unless `noise=False`."""
-FOG_LAW = LogNormalLaw(1.9e-4, 1.2, 1e-5, 0.3)
+FOG_DISTRIBUTION = LogNormalDistribution(1.9e-4, 1.2, 1e-5, 0.3)
 """Median visibility 16 km; less than 1 km, which is fog by definition, in 1 of 100 cases."""
-SUN_LAW = WeatherBeta(*map(np.array, ([1.1, 1.0], [1.58, 1.0], [5.0, -180.0], [76.0, 180.0])))
+SUN_DISTRIBUTION = WeatherBeta(*map(np.array, ([1.1, 1.0], [1.58, 1.0], [5.0, -180.0], [76.0, 180.0])))
 """Elevation as over the year's days at the latitude of the I-80 site, azimuth uniform."""
-SENSOR_NOISE_LAW = WeatherBeta(*map(np.array, ([2.0], [5.0], [0.0], [10.0])))
+SENSOR_NOISE_DISTRIBUTION = WeatherBeta(*map(np.array, ([2.0], [5.0], [0.0], [10.0])))
 """Mean 2.9 levels: a signal-to-noise ratio of 39 dB at full scale."""
 
 
@@ -106,10 +106,10 @@ def weather_parameters(noisy: bool) -> Iterator[tuple[tuple[Parameter, ...], Dis
     Args:
         noisy: Whether the camera has noise.
     """
-    yield CONDITIONS[:1], FOG_LAW
-    yield CONDITIONS[1:], SUN_LAW
+    yield CONDITIONS[:1], FOG_DISTRIBUTION
+    yield CONDITIONS[1:], SUN_DISTRIBUTION
     if noisy:
-        yield (SENSOR_NOISE,), SENSOR_NOISE_LAW
+        yield (SENSOR_NOISE,), SENSOR_NOISE_DISTRIBUTION
 
 
 class Weather(NamedTuple):

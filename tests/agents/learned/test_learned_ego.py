@@ -10,9 +10,9 @@ import torch
 import rare_envs
 from agents import LearnedDriver, LearnedEgo, load_driver
 from rare_envs.control.actions import MAX_ACCELERATION
-from rare_envs.sensors.perception import CURVATURE, SPEED
+from rare_envs.sensors.perception import CURVATURE_COLUMN, SPEED_COLUMN
 from rare_envs.simulation.observation import LIDAR_SCALES
-from rare_envs.traffic.vehicle_models import MAX_STEERING, bicycle, steering_for
+from rare_envs.traffic.vehicle_models import STEERING_LIMIT, bicycle, steering_for
 
 DT = 0.1
 
@@ -24,9 +24,9 @@ def driver(policy):
 
 def test_the_ego_moves_the_bicycle_as_its_driver_wants(driver, features):
     perception = features(8, 3)
-    perception[..., CURVATURE] = 0.0
+    perception[..., CURVATURE_COLUMN] = 0.0
     speed = torch.linspace(5.0, 30.0, 8)
-    perception[:, 0, SPEED] = speed
+    perception[:, 0, SPEED_COLUMN] = speed
     action, memory = LearnedEgo(driver).act(SimpleNamespace(perception=perception), None)
     wanted = driver.act(perception)[0][:, 0]
     zero = torch.zeros(8)
@@ -40,10 +40,10 @@ def test_the_ego_turns_with_the_road(driver, features):
     """A bend of 1/500 m to the right is steered on top of what the driver does, and the driver sees it as a feature."""
     straight = features(4, 1)
     speed = torch.full((4,), 20.0)
-    straight[:, 0, SPEED] = speed
-    straight[..., CURVATURE] = 0.0
+    straight[:, 0, SPEED_COLUMN] = speed
+    straight[..., CURVATURE_COLUMN] = 0.0
     bend = straight.clone()
-    bend[..., CURVATURE] = 0.002
+    bend[..., CURVATURE_COLUMN] = 0.002
     yaw_rates = []
     for perception in (straight, bend):
         action, _ = LearnedEgo(driver).act(SimpleNamespace(perception=perception), None)
@@ -58,7 +58,7 @@ def test_the_ego_predicts_what_it_does(driver, generator):
     """The environment's units and limits, one observation or many, and nothing random or remembered."""
     ego = LearnedEgo(driver)
     observation = 0.3 * torch.randn(16, 51, generator=generator)
-    observation[:, SPEED] = 0.5
+    observation[:, SPEED_COLUMN] = 0.5
     perception = (observation * torch.tensor(LIDAR_SCALES))[:, None]
     observation = observation.numpy()
     physical, _ = ego.act(SimpleNamespace(perception=perception), None)
@@ -98,6 +98,6 @@ def test_steering_at_low_speed(dtype):
     speed = torch.zeros(3, dtype=dtype, requires_grad=True)
     wanted = torch.tensor([-0.3, 0.0, 0.3], dtype=dtype, requires_grad=True)
     steering = steering_for(wanted, speed)
-    torch.testing.assert_close(steering, torch.tensor([-MAX_STEERING, 0.0, MAX_STEERING], dtype=dtype))
+    torch.testing.assert_close(steering, torch.tensor([-STEERING_LIMIT, 0.0, STEERING_LIMIT], dtype=dtype))
     for gradient in torch.autograd.grad(steering.sum(), (speed, wanted)):
         assert bool(gradient.isfinite().all())

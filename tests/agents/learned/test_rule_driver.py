@@ -5,16 +5,16 @@ import torch
 
 from agents.learned.rule_driver import RuleDriver
 from rare_envs.control.idm import IDM
-from rare_envs.sensors.lidar import AHEAD
-from rare_envs.sensors.perception import RANGES, RATES
+from rare_envs.sensors.lidar import AHEAD_BEAM
+from rare_envs.sensors.perception import RANGE_COLUMNS, RATE_COLUMNS
 from rare_envs.traffic.lead import Lead
 
 
 def seen(offset=0.0, heading=0.0, speed=15.0, ahead=100.0, rate=0.0):
     features = torch.zeros(1, 1, 51)
     features[..., :5] = torch.tensor([offset, heading, speed, 5.0, 2.0])
-    features[..., RANGES] = 100.0
-    features[..., RANGES.start + AHEAD], features[..., RATES.start + AHEAD] = ahead, rate
+    features[..., RANGE_COLUMNS] = 100.0
+    features[..., RANGE_COLUMNS.start + AHEAD_BEAM], features[..., RATE_COLUMNS.start + AHEAD_BEAM] = ahead, rate
     return features
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from benchmarks.driving.lane_changes import CLASSES, OFFSET, completed, crossings_of, steering
-from rare_envs.sensors.perception import HEADING, SPEED
+from rare_envs.sensors.perception import HEADING_COLUMN, SPEED_COLUMN
 from tests.training.imitation.synthetic_scenes import scenes
 from training.imitation.algorithms.expert_pairs import Pairs
 from training.imitation.traffic.recording import stack_scenes
@@ -40,7 +40,7 @@ def test_who_goes_straight_on_completes_it_and_who_turns_back_does_not(recording
 
     def back(features, memory):
         action = torch.zeros(*features.shape[:2], 2)
-        action[..., 1] = -features[..., HEADING] / 0.1 - 0.01
+        action[..., 1] = -features[..., HEADING_COLUMN] / 0.1 - 0.01
         return action, None
 
     found = crossings_of(recording)
@@ -51,8 +51,8 @@ def test_who_goes_straight_on_completes_it_and_who_turns_back_does_not(recording
 def test_steering_is_counted_towards_where_a_vehicle_moves():
     """Two vehicles move out, to the right and to the left, at 1 m/s across; one keeps its lane."""
     features = torch.zeros(3, 51)
-    features[:, SPEED] = 20.0
-    features[:, HEADING] = torch.tensor([0.05, -0.05, 0.001])
+    features[:, SPEED_COLUMN] = 20.0
+    features[:, HEADING_COLUMN] = torch.tensor([0.05, -0.05, 0.001])
     features[:, OFFSET] = torch.tensor([0.5, -0.5, 0.0])
     pairs = Pairs(features, torch.tensor([[0.0, 0.02], [0.0, -0.01], [0.0, 0.3]]), torch.zeros(3))
     driver = SimpleNamespace(act=lambda seen: (torch.full((*seen.shape[:2], 2), 0.04), None))

@@ -15,7 +15,7 @@ from stable_baselines3 import DQN
 import rare_envs
 from benchmarks.simulation.highway_env_scene import Scene
 from rare_envs.control.actions import FASTER, IDLE, LANE_LEFT, LANE_RIGHT, SLOWER
-from rare_envs.control.meta_actions import TARGET_SPEEDS, aim_of, follow
+from rare_envs.control.meta_actions import TARGET_SPEEDS, follow_meta_actions, initial_aim
 from rare_envs.make import set_up
 from rare_envs.sensors.kinematics import kinematics
 from rare_envs.traffic.road import i80, straight
@@ -54,13 +54,13 @@ def random_traffic(rng: np.random.Generator, vehicles: int, lanes: int) -> Array
 def drive_by_hand(tracks: Array, lanes: int, decisions: list[int], ego: int) -> tuple[Array, Array]:
     """Motion of one vehicle (T + 1, 4) and its observations (6, 5, 5) by the functions alone."""
     road, state = straight(lanes), state_of(tracks[0])
-    aim, motion, seen = aim_of(state, road), [tracks[0, ego]], [kinematics(state, road, ego)]
+    aim, motion, seen = initial_aim(state, road), [tracks[0, ego]], [kinematics(state, road, ego)]
     obeys = torch.zeros_like(state.x, dtype=torch.bool)
     obeys[:, ego] = True
     for tick in range(TICKS):
         action = torch.full(state.x.shape, IDLE)
         action[:, ego] = IDLE if tick % 10 else decisions[tick // 10]
-        aim, physical = follow(aim, action, obeys, state, road)
+        aim, physical = follow_meta_actions(aim, action, obeys, state, road)
         own = [field[:, ego] for field in state[:4]]
         moved = bicycle(*own, physical[:, ego, 0], physical[:, ego, 1], 0.1)  # type: ignore[arg-type]
         traffic = tracks[tick + 1].copy()
@@ -124,9 +124,9 @@ def test_lane_changes_need_a_lane_and_speeds_follow_the_present_speed() -> None:
 
     def aimed(y: float, speed: float, *actions: int) -> tuple[int, float]:
         state = state_of(np.array([[0.0, y, 0.0, speed]]))
-        aim = aim_of(state, road)
+        aim = initial_aim(state, road)
         for action in actions:
-            aim, _ = follow(aim, torch.tensor([action]), None, state, road)
+            aim, _ = follow_meta_actions(aim, torch.tensor([action]), None, state, road)
         return int(aim.lane), TARGET_SPEEDS[int(aim.speed)]
 
     assert aimed(0.0, 24.0) == (0, 25.0)
@@ -140,9 +140,9 @@ def test_lane_changes_need_a_lane_and_speeds_follow_the_present_speed() -> None:
     wide = straight(4)
     for y, lane in ((0.1, 2), (-0.1, 1)):  # the third lane is more than two widths away from y = -0.1
         state = state_of(np.array([[0.0, y, 0.0, 25.0]]))
-        aim = aim_of(state, wide)
+        aim = initial_aim(state, wide)
         for _ in range(2):
-            aim, _ = follow(aim, torch.tensor([LANE_RIGHT]), None, state, wide)
+            aim, _ = follow_meta_actions(aim, torch.tensor([LANE_RIGHT]), None, state, wide)
         assert int(aim.lane) == lane
 
 

@@ -10,19 +10,19 @@ from rare_envs.distributions.log_mixture import LogMixture
 from rare_envs.distributions.space import Distribution, ScenarioSpace
 from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
 from rare_envs.scenarios.base_distributions import load_base
-from rare_envs.scenarios.registry import SCENARIOS, named
+from rare_envs.scenarios.registry import SCENARIOS, scenario_named
 
-NAMES = [p.name for p in named("cut_in").parameters]
+NAMES = [p.name for p in scenario_named("cut_in").parameters]
 
 
 def make_space(scenario="cut_in", base="us101"):
-    box = named(scenario).parameters
+    box = scenario_named(scenario).parameters
     return ScenarioSpace(
         names=tuple(p.name for p in box),
         units=tuple(p.unit for p in box),
         low=np.array([p.low for p in box for _ in range(p.size)]),
         high=np.array([p.high for p in box for _ in range(p.size)]),
-        base=load_base(named(scenario), base),
+        base=load_base(scenario_named(scenario), base),
         sizes=tuple(p.size for p in box),
     )
 
@@ -37,7 +37,7 @@ def rng():
 def test_shipped_bases_fit_their_scenario(scenario, base):
     space = make_space(scenario, base)
     assert isinstance(space.base, Distribution)
-    assert space.dim == sum(parameter.size for parameter in named(scenario).parameters)
+    assert space.dim == sum(parameter.size for parameter in scenario_named(scenario).parameters)
     x = space.sample(1000, rng())
     assert (space.validate(x) == x).all()
     assert np.isfinite(space.log_prob(x)).all()
@@ -46,15 +46,15 @@ def test_shipped_bases_fit_their_scenario(scenario, base):
 
 
 def test_parameter_names_and_order():
-    assert [p.name for p in named("car_following").parameters] == ["ego_speed", "lead_speed", "gap"]
+    assert [p.name for p in scenario_named("car_following").parameters] == ["ego_speed", "lead_speed", "gap"]
     assert NAMES == [
         "ego_speed", "cut_in_speed", "lead_speed", "cut_in_gap", "lead_gap", "lateral_offset",
     ]  # fmt: skip
 
 
 def test_named():
-    named = make_space().named([20, 18, 19, 15, 30, 3.5])
-    assert named == dict(zip(NAMES, [20.0, 18.0, 19.0, 15.0, 30.0, 3.5], strict=True))
+    scenario_named = make_space().named([20, 18, 19, 15, 30, 3.5])
+    assert scenario_named == dict(zip(NAMES, [20.0, 18.0, 19.0, 15.0, 30.0, 3.5], strict=True))
     with pytest.raises(ValueError, match=r"one scenario of shape \(6,\), got \(2, 6\)"):
         make_space().named(np.zeros((2, 6)))
 
@@ -111,15 +111,15 @@ def test_bad_options_are_refused(options, message):
 
 
 def test_space_checks_its_own_lengths():
-    base = load_base(named("car_following"), "us101")
+    base = load_base(scenario_named("car_following"), "us101")
     with pytest.raises(ValueError, match="2 names, 3 units"):
         ScenarioSpace(("a", "b"), ("m", "m", "m"), np.zeros(3), np.ones(3), base)
 
 
 def shipped_dict(scenario="car_following"):
-    law = load_base(named(scenario), "us101")
+    law = load_base(scenario_named(scenario), "us101")
     assert isinstance(law, TruncatedGaussianMixture | LogMixture)
-    return {"names": [p.name for p in named(scenario).parameters], **law.to_dict()}
+    return {"names": [p.name for p in scenario_named(scenario).parameters], **law.to_dict()}
 
 
 def write(path: Path, content) -> Path:
@@ -129,10 +129,10 @@ def write(path: Path, content) -> Path:
 
 def test_a_users_json(tmp_path):
     path = write(tmp_path / "mine.json", shipped_dict())
-    x = load_base(named("car_following"), "us101").sample(10, rng())
+    x = load_base(scenario_named("car_following"), "us101").sample(10, rng())
     for base in (path, str(path)):
-        law = load_base(named("car_following"), base)
-        assert (law.log_prob(x) == load_base(named("car_following"), "us101").log_prob(x)).all()
+        law = load_base(scenario_named("car_following"), base)
+        assert (law.log_prob(x) == load_base(scenario_named("car_following"), "us101").log_prob(x)).all()
 
 
 @pytest.mark.parametrize(
@@ -148,7 +148,7 @@ def test_a_users_json(tmp_path):
 def test_json_that_does_not_fit(tmp_path, change, message):
     path = write(tmp_path / "mine.json", {**shipped_dict(), **change})
     with pytest.raises(ValueError, match=message) as caught:
-        load_base(named("car_following"), path)
+        load_base(scenario_named("car_following"), path)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -157,7 +157,7 @@ def test_json_with_the_wrong_dimension(tmp_path):
     content = {**shipped_dict("cut_in"), "names": shipped_dict()["names"]}
     path = write(tmp_path / "mine.json", content)
     with pytest.raises(ValueError, match="does not fit car_following: expected 3 columns, got 6"):
-        load_base(named("car_following"), path)
+        load_base(scenario_named("car_following"), path)
 
 
 def test_files_that_are_no_base(tmp_path):
@@ -173,13 +173,13 @@ def test_files_that_are_no_base(tmp_path):
         (write(tmp_path / "list.json", [1]), "expected a JSON object, got list"),
     ]:
         with pytest.raises(ValueError, match=message) as caught:
-            load_base(named("cut_in"), base)
+            load_base(scenario_named("cut_in"), base)
         assert "\n" not in str(caught.value)
 
 
 def test_unknown_scenario():
     with pytest.raises(ValueError, match="Unknown scenario 'cutin'; there are car_following, cut_in"):
-        named("cutin")
+        scenario_named("cutin")
 
 
 class Partial:
@@ -188,12 +188,15 @@ class Partial:
 
 
 def test_a_users_object():
-    law = load_base(named("car_following"), "highway")
-    assert load_base(named("car_following"), law) is law
+    law = load_base(scenario_named("car_following"), "highway")
+    assert load_base(scenario_named("car_following"), law) is law
     with pytest.raises(ValueError, match=r"does not fit cut_in: sample.*must have shape \(1000, 6\)"):
-        load_base(named("cut_in"), law)
+        load_base(scenario_named("cut_in"), law)
     with pytest.raises(ValueError, match="Partial without log_prob, to_standard_normal, from_sta"):
-        load_base(named("car_following"), Partial())
+        load_base(scenario_named("car_following"), Partial())
     with pytest.raises(ValueError, match="got int without sample"):
-        load_base(named("car_following"), 3)
-    assert load_base(named("car_following"), None).to_dict() == load_base(named("car_following"), "us101").to_dict()
+        load_base(scenario_named("car_following"), 3)
+    assert (
+        load_base(scenario_named("car_following"), None).to_dict()
+        == load_base(scenario_named("car_following"), "us101").to_dict()
+    )

@@ -12,7 +12,7 @@ from rare_envs.distributions.log_mixture import LogMixture
 from rare_envs.distributions.truncated_mixture import CHUNK, TruncatedGaussianMixture
 from rare_envs.distributions.truncated_normal import log_interval
 from rare_envs.scenarios.base_distributions import load_base
-from rare_envs.scenarios.registry import SCENARIOS, named
+from rare_envs.scenarios.registry import SCENARIOS, scenario_named
 
 SHIPPED = [(each.name, base) for each in SCENARIOS.values() if each.drivers is None for base in each.bases]
 
@@ -87,7 +87,7 @@ def test_density_integrates_to_one(case):
 
 @pytest.mark.parametrize(("scenario", "base"), SHIPPED)
 def test_shipped_density_integrates_to_one_by_importance_sampling(scenario, base):
-    law = load_base(named(scenario), base)
+    law = load_base(scenario_named(scenario), base)
     mixture = getattr(law, "mixture", law)  # of logarithms, in a LogMixture
     rng = np.random.default_rng(11)
     n = 100_000
@@ -133,7 +133,7 @@ def test_samples_follow_the_integrated_density(case):
 
 @pytest.mark.parametrize(("scenario", "base"), SHIPPED)
 def test_mapped_samples_are_standard_normal(scenario, base):
-    law = load_base(named(scenario), base)
+    law = load_base(scenario_named(scenario), base)
     n = 50_000
     u = law.to_standard_normal(law.sample(n, np.random.default_rng(7)))
     tests = law.dim * len(SHIPPED)
@@ -161,7 +161,7 @@ def test_mapped_normals_follow_the_samples(case):
 @pytest.mark.parametrize(("scenario", "base"), SHIPPED)
 def test_round_trips_of_shipped_bases(scenario, base):
     """Typical points, and each coordinate in turn out to 5 standard deviations."""
-    law = load_base(named(scenario), base)
+    law = load_base(scenario_named(scenario), base)
     rng = np.random.default_rng(8)
     u = rng.standard_normal((20_000, law.dim))
     column = rng.integers(0, law.dim, 10_000)
@@ -175,7 +175,7 @@ def test_round_trips_of_shipped_bases(scenario, base):
 
 
 LAWS = [pytest.param(random_mixture(*case), id=f"random-{case[0]}") for case in CASES]
-SHIPPED_LAWS = [load_base(named(name), base) for name, base in SHIPPED]
+SHIPPED_LAWS = [load_base(scenario_named(name), base) for name, base in SHIPPED]
 LAWS += [
     # the floats of a LogMixture are those of its mixture of logarithms
     pytest.param(law.mixture if isinstance(law, LogMixture) else law, id="-".join(pair))

@@ -19,7 +19,7 @@ import samplers
 from rare_envs.egos.wrappers import fitted
 from rare_envs.interop.measures import CLOSENESS, contact_time
 from rare_envs.interop.simulation import make, portable
-from rare_envs.traffic.oriented_boxes import axes_of, project, time_to_contact
+from rare_envs.traffic.oriented_boxes import axes_of, project_on_axes, time_to_contact
 from tests.rare_envs.interop.egos import Always, faster
 
 FAST = {"vehicles_count": 3, "duration": 4}
@@ -172,7 +172,7 @@ def test_contact_time_is_that_of_the_tensor_implementation() -> None:
     drift: NDArray[np.float64] = np.array([other.velocity - one.velocity for one, other in pairs])
     headings = column([one.heading for one, _ in pairs]), column([other.heading for _, other in pairs])
     axes = axes_of(column(way[:, 0]), column(way[:, 1]), *headings)  # type: ignore[arg-type]
-    rate = project(column(drift[:, 0]), column(drift[:, 1]), *headings)  # type: ignore[arg-type]
+    rate = project_on_axes(column(drift[:, 0]), column(drift[:, 1]), *headings)  # type: ignore[arg-type]
     theirs = time_to_contact(axes, rate).numpy()
     meet = ours < 10.0
     assert 20 < meet.sum() < 280

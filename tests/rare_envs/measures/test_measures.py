@@ -262,7 +262,7 @@ def test_values_are_finite_and_keep_their_dtype_anywhere(name: str, dtype: torch
             assert value.shape == (300,)
             assert value.dtype == dtype
             assert torch.isfinite(value).all()
-            f = MEASURES[name].f(MEASURES[name].begin(now, 10))
+            f = MEASURES[name].f(MEASURES[name].start(now, 10))
             assert (f > MEASURES[name].collision).all() if name != "margin" else (f > 0).all()  # type: ignore[attr-defined]
 
 

@@ -10,11 +10,11 @@ import agents
 import rare_envs
 import samplers
 from rare_envs.control.idm import IDM
-from rare_envs.distributions.beta import BetaLaw
-from rare_envs.distributions.product import NoiseLaw, Product
+from rare_envs.distributions.beta import BetaDistribution
+from rare_envs.distributions.product import NoiseDistribution, ProductDistribution
 from rare_envs.measures import TTC_MAX, Moment, lidar_ttc
-from rare_envs.scenarios.highway import LANES
-from rare_envs.sensors.perception import look
+from rare_envs.scenarios.highway import START_LANES
+from rare_envs.sensors.perception import perceive_traffic
 from rare_envs.simulation.background import BackgroundState, fixed_draws, step_background
 from rare_envs.simulation.rollout import drive
 from rare_envs.traffic.road import i80
@@ -41,9 +41,9 @@ def test_parameters_are_the_papers_then_weights_and_noise():
 def test_the_ego_starts_in_the_third_lane_and_everybody_has_one():
     problem = rare_envs.DrivingProblem(HIGHWAY, noise=False)
     state = problem.world.start(torch.from_numpy(draw(problem, 50))).state
-    assert sorted(LANES) == list(range(6))
+    assert sorted(START_LANES) == list(range(6))
     lanes = i80().lane_of(state.y)
-    assert (lanes == torch.tensor(LANES)).all()
+    assert (lanes == torch.tensor(START_LANES)).all()
     assert lanes[0, 0] == 2
     assert state.heading.abs().max() <= np.deg2rad(3.6)
 
@@ -166,7 +166,7 @@ def test_drivers_by_rule_have_neither_weights_nor_noise():
     last = list(drive(problem.world, problem.driver, torch.from_numpy(x)))[-1]
     road = problem.world.scenario.road
     # they keep the lanes that they started in, on the curve too
-    torch.testing.assert_close(road.lane_of(last.state.y), torch.tensor(LANES).expand(64, -1))
+    torch.testing.assert_close(road.lane_of(last.state.y), torch.tensor(START_LANES).expand(64, -1))
     assert (last.state.y - road.centre_of(last.state.y)).abs().max() < 0.1
 
 
@@ -197,7 +197,7 @@ def test_lidar_ttc_on_paper():
     world = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", measure="lidar_ttc").world
     episode = world.start(torch.tensor([[20.0, 15.0, 30.0], [15.0, 20.0, 30.0]]))
     assert episode.f.tolist() == pytest.approx([32.5 / 5.0, TTC_MAX])
-    moment = Moment(episode.state, episode.lead, episode.road, look(episode.state, episode.road))
+    moment = Moment(episode.state, episode.lead, episode.road, perceive_traffic(episode.state, episode.road))
     torch.testing.assert_close(lidar_ttc(moment), episode.f)
 
 
@@ -255,7 +255,7 @@ def test_an_ego_by_name_is_told_where_names_become_egos():
 
 
 def test_beta_law_against_scipy():
-    law = BetaLaw([2.0, 5.0], [2.0, 1.5], [80.0, -1.0], [120.0, 1.0])
+    law = BetaDistribution([2.0, 5.0], [2.0, 1.5], [80.0, -1.0], [120.0, 1.0])
     x = law.sample(2000, np.random.default_rng(0))
     marginals = [stats.beta(2, 2, 80, 40), stats.beta(5, 1.5, -1, 2)]
     np.testing.assert_allclose(law.log_prob(x), sum(m.logpdf(x[:, j]) for j, m in enumerate(marginals)))
@@ -278,13 +278,13 @@ def test_beta_law_against_scipy():
 def test_beta_laws_that_are_none(change, message):
     law = {"alpha": [2.0, 2.0], "beta": [2.0, 2.0], "low": [80.0, -1.0], "high": [120.0, 1.0]}
     with pytest.raises(ValueError, match=message):
-        BetaLaw.from_dict({**law, **change})
+        BetaDistribution.from_dict({**law, **change})
     with pytest.raises(ValueError, match="no alpha, beta"):
-        BetaLaw.from_dict({"low": [0.0], "high": [1.0]})
+        BetaDistribution.from_dict({"low": [0.0], "high": [1.0]})
 
 
 def test_product_of_blocks():
-    law = Product((BetaLaw([2.0], [3.0], [0.0], [1.0]), NoiseLaw(2)))
+    law = ProductDistribution((BetaDistribution([2.0], [3.0], [0.0], [1.0]), NoiseDistribution(2)))
     x = law.sample(500, np.random.default_rng(0))
     expected = stats.beta(2, 3).logpdf(x[:, 0]) + stats.norm.logpdf(x[:, 1:]).sum(axis=1)
     np.testing.assert_allclose(law.log_prob(x), expected)

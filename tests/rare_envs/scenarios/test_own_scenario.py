@@ -19,7 +19,7 @@ import rare_envs
 import samplers
 from rare_envs.distributions.space import Parameter
 from rare_envs.scenarios.base import Others, Scenario, columns
-from rare_envs.scenarios.registry import SCENARIOS, named
+from rare_envs.scenarios.registry import SCENARIOS, scenario_named
 from rare_envs.study.cli.app import app
 from rare_envs.study.cli.catalogue import catalogue
 from rare_envs.traffic.road import straight
@@ -75,7 +75,7 @@ def registered():
 
 def test_it_is_known_everywhere(registered):
     assert registered in rare_envs.ENV_IDS
-    assert named("standing") is STANDING
+    assert scenario_named("standing") is STANDING
     entry = catalogue()["environments"][registered]
     assert [p["name"] for p in entry["parameters"]] == ["speed", "distance"]
     assert entry["bases"] == ["even"]

@@ -6,9 +6,9 @@ import torch
 
 import rare_envs
 from rare_envs.make import set_up
-from rare_envs.sensors.perception import look
+from rare_envs.sensors.perception import perceive_traffic
 from rare_envs.simulation.observation import observe
-from rare_envs.traffic.overlap import ego_overlaps, overlaps
+from rare_envs.traffic.overlap import ego_overlaps, pairwise_overlaps
 from rare_envs.traffic.state import State
 
 every = pytest.mark.parametrize("env_id", rare_envs.ENV_IDS)
@@ -97,7 +97,7 @@ def test_contacts_of_all_pairs_are_those_of_each_vehicle_as_ego():
     world, _ = start("rare_envs/Highway-v0", n=1, noise=False)
     fields = [rng.uniform(low, high, (500, 6)) for low, high in ((0, 25), (0, 12), (-0.5, 0.5), (0, 20))]
     state = State(*map(torch.from_numpy, fields), theta=torch.zeros(500, 0))
-    both = overlaps(state, world.scenario.road)
+    both = pairwise_overlaps(state, world.scenario.road)
     assert torch.equal(both, both.mT)
     assert not both.diagonal(dim1=1, dim2=2).any()
     assert 0.05 < both.double().mean() < 0.5
@@ -121,7 +121,7 @@ def test_every_vehicle_observes_what_an_ego_in_its_place_would(env_id):
     world, episode = start(env_id, observation="lidar", horizon=1.0)
     for vehicle in range(world.scenario.vehicles):
         state = episode.state.seen_by(vehicle)
-        looking = look(state, world.scenario.road)
+        looking = perceive_traffic(state, world.scenario.road)
         as_ego = episode._replace(state=state, perception=looking)
         for observation in ("features", "lidar"):
             torch.testing.assert_close(observe(episode, observation, vehicle), observe(as_ego, observation))

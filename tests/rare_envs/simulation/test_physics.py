@@ -17,7 +17,7 @@ from rare_envs.traffic.lead import Lead, lead_of
 from rare_envs.traffic.overlap import boxes_overlap
 from rare_envs.traffic.road import straight
 from rare_envs.traffic.state import State
-from rare_envs.traffic.vehicle_models import MAX_STEERING, NEAR_ZERO, bicycle, steering_for
+from rare_envs.traffic.vehicle_models import NEAR_ZERO, STEERING_LIMIT, bicycle, steering_for
 
 F64 = torch.float64
 
@@ -48,7 +48,7 @@ def test_steering_for_a_yaw_rate_is_how_the_bicycle_turns_at_it() -> None:
     torch.testing.assert_close(heading, 0.1 * rate)
     # whoever is too slow for it, a vehicle at rest for one, steers as far as it goes
     largest = steering_for(tensor(0.5, -0.5, 0.5), tensor(1.0, 0.0, 0.0))
-    torch.testing.assert_close(largest, MAX_STEERING * tensor(1.0, -1.0, 1.0))
+    torch.testing.assert_close(largest, STEERING_LIMIT * tensor(1.0, -1.0, 1.0))
 
 
 def test_nothing_is_divided_by_less_than_in_highway_env() -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
-from rare_envs.scenarios.registry import named
+from rare_envs.scenarios.registry import scenario_named
 from rare_envs.study.cli.app import app
 
 EGOS = """
@@ -74,7 +74,7 @@ def wrong_shape():
 
 def write_base(path: Path, gap: float) -> Path:
     """A base for car-following at 20 m/s behind 10 m/s with gaps around the one given."""
-    parameters = named("car_following").parameters
+    parameters = scenario_named("car_following").parameters
     spread = [[4.0, 0.0, 0.0], [0.0, 4.0, 0.0], [0.0, 0.0, 25.0]]
     base = {
         "names": [p.name for p in parameters],

@@ -10,7 +10,15 @@ import torch
 
 import rare_envs
 import samplers
-from rare_envs.traffic.crash import KINDS, Crash, crash_of, crash_of_others, describe, injury_risk, others_touch
+from rare_envs.traffic.crash import (
+    CRASH_KINDS,
+    Crash,
+    crash_of,
+    crash_of_others,
+    describe_crash,
+    injury_risk,
+    others_overlap,
+)
 from rare_envs.traffic.road import straight
 from rare_envs.traffic.state import State
 from tests.rare_envs.traffic.slow_boxes import corners, nearest, overlap
@@ -29,7 +37,7 @@ def traffic(*vehicles: Vehicle) -> State:
 def tick(*vehicles: Vehicle, lanes: int = 2) -> dict[str, object]:
     """The crash at the end of a tick in which vehicles drove straight to where they are."""
     before = tuple((x - v * math.cos(h) * 0.1, y - v * math.sin(h) * 0.1, h, v) for x, y, h, v in vehicles)
-    found = describe(crash_of(traffic(*vehicles), straight(lanes), traffic(*before), 0.1))
+    found = describe_crash(crash_of(traffic(*vehicles), straight(lanes), traffic(*before), 0.1))
     assert found is not None
     return found
 
@@ -98,7 +106,7 @@ def test_without_the_tick_before_speeds_and_headings_tell() -> None:
         ((0.0, 0.0, 0.0, 20.0), (1.0, 1.95, -0.05, 20.0)),
         ((0.0, 2.1, 0.2, 15.0), (60.0, 0.0, 0.0, 20.0)),
     ):
-        found, expected = describe(crash_of(traffic(*vehicles), road)), tick(*vehicles, lanes=1)
+        found, expected = describe_crash(crash_of(traffic(*vehicles), road)), tick(*vehicles, lanes=1)
         assert found is not None
         assert found.pop("kind") == expected.pop("kind")
         for name, value in found.items():
@@ -112,15 +120,15 @@ def test_others_touch_where_their_bodies_overlap() -> None:
     state = State(*(torch.from_numpy(each) for each in (x, y, heading, np.ones((batch, 4)), x[:, :0])))
     bodies = [[corners(*pose) for pose in zip(*row, strict=True)] for row in zip(x, y, heading, strict=True)]
     expected = [any(overlap(row[i], row[j]) for i, j in ((1, 2), (1, 3), (2, 3))) for row in bodies]
-    assert others_touch(state, straight(9)).tolist() == expected
+    assert others_overlap(state, straight(9)).tolist() == expected
     assert 60 < sum(expected) < 240
 
 
 def test_a_crash_of_others_is_without_the_ego() -> None:
     state = traffic((0.0, 0.0, 0.0, 20.0), (4.5, 0.0, 0.0, 10.0), (-4.5, 0.0, 0.0, 30.0))
-    assert describe(crash_of_others(state, straight(1))) is None
-    assert others_touch(state, straight(1)).tolist() == [False]
-    assert describe(crash_of(state, straight(1))) is not None
+    assert describe_crash(crash_of_others(state, straight(1))) is None
+    assert others_overlap(state, straight(1)).tolist() == [False]
+    assert describe_crash(crash_of(state, straight(1))) is not None
 
 
 def test_the_edge_is_a_wall() -> None:
@@ -133,11 +141,11 @@ def test_the_edge_is_a_wall() -> None:
 
 def test_no_crash_no_description() -> None:
     state = traffic((0.0, 0.0, 0.0, 20.0), (30.0, 0.0, 0.0, 20.0), (31.0, 1.0, 0.0, 20.0))
-    assert describe(crash_of(state, straight(1))) is None
-    others = describe(crash_of_others(state, straight(1)))
+    assert describe_crash(crash_of(state, straight(1))) is None
+    others = describe_crash(crash_of_others(state, straight(1)))
     assert others is not None
     assert (others["kind"], sorted(others["vehicles"])) == ("others", [1, 2])
-    assert others_touch(state, straight(1)).tolist() == [True]
+    assert others_overlap(state, straight(1)).tolist() == [True]
 
 
 def test_injury_risk_is_the_published_curve() -> None:
@@ -177,7 +185,7 @@ def test_the_first_contact_is_found_as_small_steps_find_it() -> None:
         assert other in touched
         way = nearest(bodies(first - 0.00026)[0], bodies(first - 0.00026)[other])[1]
         lengthwise = abs(way[0]) > abs(way[1])
-        kind = KINDS[int(crash.kind[0])]
+        kind = CRASH_KINDS[int(crash.kind[0])]
         seen.add(kind)
         assert kind == (("rear_end" if way[0] > 0 else "rear_ended") if lengthwise else "side")
         normal = way / np.hypot(*way)
@@ -202,7 +210,7 @@ INTO_CUTTER = (35.0, 15.0, 20.0, 60.0, 40.0, 2.3)
 
 
 def crashed(crash: Crash, row: int) -> tuple[str, list[int]]:
-    found = describe(crash, row)
+    found = describe_crash(crash, row)
     assert found is not None
     return found["kind"], found["vehicles"]
 
@@ -239,7 +247,7 @@ def test_info_says_the_same_alone_in_a_batch_and_in_a_problem() -> None:
     problem = rare_envs.DrivingProblem(CUT_IN, ego=Coasting())
     x = problem.base.sample(5, np.random.default_rng(3))
     x[:2], x[2, :4], x[4] = (OTHERS_ONLY, INTO_CUTTER), (32.0, 15.0, 14.0, 6.0), (10.0, 20.0, 25.0, 30.0, 30.0, 3.0)
-    expected = [describe(problem.crashes(x), row) for row in range(5)]
+    expected = [describe_crash(problem.crashes(x), row) for row in range(5)]
     assert expected[4] is None
     batch = gym.make_vec(CUT_IN, 5, vectorization_mode="vector_entry_point")
     batch.reset(options={"x": x})

@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from rare_envs.traffic.oriented_boxes import Axes, axes_of, clearance, project, separation, time_to_contact
+from rare_envs.traffic.oriented_boxes import Axes, axes_of, box_distance, project_on_axes, separation, time_to_contact
 from tests.rare_envs.traffic.slow_boxes import corners, nearest, overlap
 
 F64 = torch.float64
@@ -45,12 +45,12 @@ def bodies(scene: np.ndarray, time: float = 0.0) -> tuple[np.ndarray, np.ndarray
     ],
 )
 def test_clearance_by_hand(place: tuple[float, ...], gap: float) -> None:
-    assert clearance(axes(*place), torch.tensor(place[3] - place[2], dtype=F64)).item() == pytest.approx(gap)
+    assert box_distance(axes(*place), torch.tensor(place[3] - place[2], dtype=F64)).item() == pytest.approx(gap)
 
 
 def test_clearance_is_the_distance_of_the_nearest_corner_and_side(scenes: np.ndarray) -> None:
     dx, dy, heading, other, _, _ = tensors(scenes)
-    found = clearance(axes_of(dx, dy, heading, other), other - heading).numpy()
+    found = box_distance(axes_of(dx, dy, heading, other), other - heading).numpy()
     for scene, gap in zip(scenes[:250], found, strict=False):
         one, two = bodies(scene)
         assert overlap(one, two) == (gap < 0)
@@ -89,13 +89,13 @@ def test_depth_of_an_overlap_is_the_least_way_out(scenes: np.ndarray) -> None:
 )
 def test_time_to_contact_by_hand(place: tuple[float, ...], velocity: tuple[float, float], time: float) -> None:
     headings = (torch.tensor(place[2], dtype=F64), torch.tensor(place[3], dtype=F64))
-    rate = project(*(torch.tensor(v, dtype=F64) for v in velocity), *headings)
+    rate = project_on_axes(*(torch.tensor(v, dtype=F64) for v in velocity), *headings)
     assert time_to_contact(axes(*place), rate).item() == pytest.approx(time)
 
 
 def test_time_to_contact_is_when_small_steps_in_time_first_touch(scenes: np.ndarray) -> None:
     dx, dy, heading, other, vx, vy = tensors(scenes)
-    found = time_to_contact(axes_of(dx, dy, heading, other), project(vx, vy, heading, other)).numpy()
+    found = time_to_contact(axes_of(dx, dy, heading, other), project_on_axes(vx, vy, heading, other)).numpy()
     assert 50 < (np.isfinite(found) & (found > 0)).sum() < 450
     for scene, time in zip(scenes[:150], found, strict=False):
         grid = np.arange(0.0, 3.0, 0.01)
@@ -116,16 +116,16 @@ def test_gradients_are_those_of_finite_differences(scenes: np.ndarray) -> None:
     dx, dy, heading, other, vx, vy = (values.requires_grad_() for values in tensors(scenes[:25]))
 
     def apart(*values: Tensor) -> Tensor:
-        return clearance(axes_of(*values), values[3] - values[2])
+        return box_distance(axes_of(*values), values[3] - values[2])
 
     assert torch.autograd.gradcheck(apart, (dx, dy, heading, other))
     with torch.no_grad():
-        times = time_to_contact(axes_of(dx, dy, heading, other), project(vx, vy, heading, other))
+        times = time_to_contact(axes_of(dx, dy, heading, other), project_on_axes(vx, vy, heading, other))
     meeting = torch.isfinite(times) & (times > 0.01)
     inputs = tuple(v.detach()[meeting].requires_grad_() for v in (dx, dy, heading, other, vx, vy))
 
     def meet(*values: Tensor) -> Tensor:
-        return time_to_contact(axes_of(*values[:4]), project(*values[4:], values[2], values[3]))
+        return time_to_contact(axes_of(*values[:4]), project_on_axes(*values[4:], values[2], values[3]))
 
     assert len(inputs[0]) > 5
     assert torch.autograd.gradcheck(meet, inputs)

@@ -18,14 +18,14 @@ from rare_envs.scenarios.highway import HIGHWAY
 from rare_envs.simulation.rollout import drive
 from rare_envs.simulation.world import World
 from rare_envs.traffic.overlap import ego_overlaps
-from rare_envs.traffic.reference_line import Curve
+from rare_envs.traffic.reference_line import ReferenceLine
 from rare_envs.traffic.road import Road, i80, straight
 from rare_envs.traffic.state import State
 from rare_envs.traffic.vehicle_models import bicycle, point_mass
 from training.scenario_fitting import i80_road
 
 F64 = torch.float64
-BEND = Road((-2.0, 2.0, 5.0), Curve(25.0, (0.0, 0.002, 0.004, -0.002, 0.0)))
+BEND = Road((-2.0, 2.0, 5.0), ReferenceLine(25.0, (0.0, 0.002, 0.004, -0.002, 0.0)))
 CURVED = pytest.mark.parametrize("road", [i80(), BEND], ids=["i80", "bend"])
 
 
@@ -85,15 +85,15 @@ def test_edges_must_increase(edges: tuple[float, ...]) -> None:
 )
 def test_curves_are_gentle(spacing: float, curvature: tuple[float, ...], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        Curve(spacing, curvature)
+        ReferenceLine(spacing, curvature)
 
 
 @CURVED
 def test_curve_is_the_integral_of_its_heading_and_curvature(road: Road) -> None:
-    assert road.curve is not None
+    assert road.reference_line is not None
     step = 0.01
     s = torch.arange(-30.0, 800.0, step, dtype=F64)
-    points = road.curve.at(s)
+    points = road.reference_line.at(s)
 
     def integral(values: torch.Tensor) -> torch.Tensor:
         return torch.cumsum((values[1:] + values[:-1]) * (step / 2), 0)
@@ -108,11 +108,13 @@ def test_curve_is_the_integral_of_its_heading_and_curvature(road: Road) -> None:
 
 
 def test_curve_has_the_curvature_of_its_knots_and_is_straight_elsewhere() -> None:
-    assert BEND.curve is not None
+    assert BEND.reference_line is not None
     s = torch.tensor([-1e3, -1.0, 0.0, 12.5, 25.0, 50.0, 62.5, 75.0, 100.0, 101.0, 1e4], dtype=F64)
     wanted = [0, 0, 0, 0.001, 0.002, 0.004, 0.001, -0.002, 0, 0, 0]
     torch.testing.assert_close(BEND.curvature(s), torch.tensor(wanted, dtype=F64))
-    before, start, end, after = BEND.curve.at(torch.tensor([-500.0, 0.0, 100.0, 2e3], dtype=F64)).heading.tolist()
+    before, start, end, after = BEND.reference_line.at(
+        torch.tensor([-500.0, 0.0, 100.0, 2e3], dtype=F64)
+    ).heading.tolist()
     assert (before, start) == (0.0, 0.0)
     assert after == end == pytest.approx(0.004 * 25)  # the sum of the curvatures at the knots times their spacing
 
@@ -169,7 +171,7 @@ def test_gradients(road: Road) -> None:
 
 
 def test_gradients_after_inference_mode() -> None:
-    road = Road((-2.0, 2.0, 5.0), Curve(30.0, (0.0, 0.001, 0.0)))
+    road = Road((-2.0, 2.0, 5.0), ReferenceLine(30.0, (0.0, 0.001, 0.0)))
     x, y = spread(0, 100), spread(-2, 5)
     with torch.inference_mode():
         road.to_world(x, y, y)
@@ -229,9 +231,9 @@ def test_a_car_that_turns_with_the_road_stays_in_its_lane(road: Road) -> None:
         state = list(point_mass(*state, zero, rate, dt, curvature))
     assert (state[1].item(), state[2].item()) == pytest.approx((y0, 0.0), abs=1e-12)
     # in the world it went 600 m along its own line, which is longer than the reference line where that turns left
-    assert road.curve is not None
+    assert road.reference_line is not None
     s = torch.arange(0.0, state[0].item(), 0.01, dtype=F64)
-    own_line = state[0].item() - y0 * float(road.curve.at(s[-1]).heading)
+    own_line = state[0].item() - y0 * float(road.reference_line.at(s[-1]).heading)
     assert own_line == pytest.approx(600.0, abs=0.05)
 
 
@@ -282,7 +284,7 @@ def test_an_ego_keeps_its_lane_of_the_i80(dtype: torch.dtype) -> None:
 
 def test_bodies_overlap_in_the_world_not_along_the_road() -> None:
     """Where 5 m of the road's line are 5 (1 - k y) m at y."""
-    road = Road((-30.0, 0.0, 30.0), Curve(50.0, (0.0, 0.004, 0.004, 0.0)))
+    road = Road((-30.0, 0.0, 30.0), ReferenceLine(50.0, (0.0, 0.004, 0.004, 0.0)))
     for y, other_x, overlap in [(20.0, 5.3, True), (20.0, 5.5, False), (-20.0, 4.7, False), (-20.0, 4.55, True)]:
         assert ego_overlaps(pair(75.0, y, 75.0 + other_x, y), road).item() is overlap
     state = pair(75.0, 20.0, 75.0, 21.9)
@@ -332,7 +334,7 @@ def test_fast_enough_to_be_called_every_tick() -> None:
 
 def test_command_recovers_a_road_and_names_broken_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A survey drawn from a known road, in a frame of its own."""
-    true = Road(tuple(3.6 * (k - 0.5) for k in range(7)), i80().curve)
+    true = Road(tuple(3.6 * (k - 0.5) for k in range(7)), i80().reference_line)
     x = torch.arange(0.0, 700.0, 10.0, dtype=F64)
 
     def write(name: str, key: str, offsets: list[float]) -> None:
@@ -347,8 +349,8 @@ def test_command_recovers_a_road_and_names_broken_files(tmp_path: Path, capsys: 
     i80_road.main(tmp_path, tmp_path / "road.json")
     table = json.loads((tmp_path / "road.json").read_text())
     assert table["edges"] == pytest.approx(true.edges, abs=0.002)
-    assert true.curve is not None
-    assert table["curvature"] == pytest.approx(true.curve.curvature, abs=1e-6)
+    assert true.reference_line is not None
+    assert table["curvature"] == pytest.approx(true.reference_line.curvature, abs=1e-6)
     assert capsys.readouterr().out.count(" m rms") == 12
     with pytest.raises(ValueError, match=r"Cannot read .*lanes.csv: .*boundary"):
         i80_road.read_lines(tmp_path / "lanes.csv", "boundary")

@@ -10,7 +10,7 @@ from typer import Typer
 from typer.testing import CliRunner
 
 from rare_envs.scenarios.base_distributions import load_base
-from rare_envs.scenarios.registry import named
+from rare_envs.scenarios.registry import scenario_named
 from tests.training.data.recordings import simulate, write_highd, write_ngsim
 from training.data.events import (
     CAR_FOLLOWING_COLUMNS,
@@ -167,7 +167,7 @@ def test_bases_are_fitted_to_a_highd_folder(simulated, quick, tmp_path):
     assert result.exit_code == 0, result.output
     for scenario in EVENT_RECIPES:
         path = tmp_path / "bases" / f"{scenario}_cologne.json"
-        points = load_base(named(scenario), path).sample(100, np.random.default_rng(0))
+        points = load_base(scenario_named(scenario), path).sample(100, np.random.default_rng(0))
         assert np.isfinite(points).all()
         # simulated speeds are between 9 and 27 m/s
         assert 12.0 < points[:, 0].mean() < 25.0

@@ -49,7 +49,7 @@ def test_on_a_curve_the_expert_does_not_run_wide() -> None:
     rng = np.random.default_rng(0)
     lesson = make_lessons()[1]
     world, episode = start_lesson(lesson, 4, 8.0, rng)
-    while world.scenario.road.curve is None:
+    while world.scenario.road.reference_line is None:
         world, episode = start_lesson(lesson, 4, 8.0, rng)
     with torch.inference_mode():
         for _ in range(world.ticks):
@@ -64,7 +64,7 @@ def test_roads_have_lanes_of_which_one_is_the_egos() -> None:
     rng = np.random.default_rng(1)
     roads = [draw_road(rng) for _ in range(60)]
     assert {road.lanes for road in roads} == {1, 2, 3, 4}
-    assert 10 < sum(road.curve is None for road in roads) < 35
+    assert 10 < sum(road.reference_line is None for road in roads) < 35
     for road in roads:
         assert float(road.centre_of(torch.zeros(1))[0]) == pytest.approx(0.0, abs=1e-5)
 

@@ -11,7 +11,7 @@ from typer import Typer
 from typer.testing import CliRunner
 
 from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
-from rare_envs.scenarios.registry import named
+from rare_envs.scenarios.registry import scenario_named
 from training.scenario_fitting import fit as fit_scenarios
 from training.scenario_fitting import mixture as mixture_fit
 from training.scenario_fitting.event_filters import EVENT_RECIPES, filter_events, read_events
@@ -121,7 +121,7 @@ def test_filters_drop_and_count(tmp_path):
             ["start", 16.0, *GOOD[1:], True],
         ],
     )
-    recipe, box = EVENT_RECIPES["cut_in"], named("cut_in").parameters
+    recipe, box = EVENT_RECIPES["cut_in"], scenario_named("cut_in").parameters
     (points, offsets), log = filter_events(read_events(path, recipe), recipe, box)
     # speeds and gaps count even where the offset at the start was not seen or is out of range
     assert points.tolist() == [GOOD[:5], GOOD[:5], GOOD[:5], [16.0, *GOOD[1:5]]]

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from agents.learned.networks import FEATURE_SIZE, Scaling
-from rare_envs.sensors.perception import HEADING, SPEED
+from rare_envs.sensors.perception import HEADING_COLUMN, SPEED_COLUMN
 from training.imitation.traffic.recording import Recording
 from training.imitation.traffic.replayed_traffic import perceive_traffic, start_replay
 
@@ -50,7 +50,7 @@ def emphasise_lateral(pairs: Pairs, times: int) -> Pairs:
     """
     if times == 1:
         return pairs
-    fast = (torch.sin(pairs.features[:, HEADING]) * pairs.features[:, SPEED]).abs() > FAST_LATERAL_SPEED
+    fast = (torch.sin(pairs.features[:, HEADING_COLUMN]) * pairs.features[:, SPEED_COLUMN]).abs() > FAST_LATERAL_SPEED
     rows = torch.cat((torch.arange(len(fast)), fast.nonzero().flatten().repeat(times - 1)))
     return Pairs(*(column[rows] for column in pairs))
 

@@ -13,8 +13,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from rare_envs.sensors.lidar import AHEAD
-from rare_envs.sensors.perception import LANE_OFFSET, RANGES, RATES, SPEED
+from rare_envs.sensors.lidar import AHEAD_BEAM
+from rare_envs.sensors.perception import LANE_OFFSET_COLUMN, RANGE_COLUMNS, RATE_COLUMNS, SPEED_COLUMN
 
 NEAR_ALONG, NEAR_ACROSS = 3.0, 0.8
 """Gaps [m] to the front and to the side under which nearness costs."""
@@ -82,16 +82,16 @@ def compute_penalties(
     )
     itself = torch.eye(m, x.shape[1], dtype=torch.bool, device=x.device)
     contact = near.masked_fill(itself, 0.0).sum(dim=2)
-    gap = (features[..., RANGES][..., AHEAD] - 0.5 * length[:, :m]).clamp(min=0.5)
-    closing = (-features[..., RATES][..., AHEAD]).clamp(min=0.0)
+    gap = (features[..., RANGE_COLUMNS][..., AHEAD_BEAM] - 0.5 * length[:, :m]).clamp(min=0.5)
+    closing = (-features[..., RATE_COLUMNS][..., AHEAD_BEAM]).clamp(min=0.0)
     needed = closing.square() / (2.0 * gap)
     return Penalties(
         collision=contact + 0.1 * (needed - COMFORTABLE_BRAKING).clamp(0.0, MAX_EXCESS_BRAKING),
         edge=(EDGE_DISTANCE - torch.minimum(y[:, :m] - edges[:, :1], edges[:, -1:] - y[:, :m])).clamp(min=0.0),
         brake=(-action[..., 0] - GENTLE_BRAKING).clamp(min=0.0),
         headway=_headway_cost(x, speed, along, across, m),
-        lane=(features[..., LANE_OFFSET].abs() - CENTRE_TOLERANCE).clamp(min=0.0),
-        speed=(features[..., SPEED] - SPEED_LIMIT).clamp(min=0.0) / SPEEDING_SCALE,
+        lane=(features[..., LANE_OFFSET_COLUMN].abs() - CENTRE_TOLERANCE).clamp(min=0.0),
+        speed=(features[..., SPEED_COLUMN] - SPEED_LIMIT).clamp(min=0.0) / SPEEDING_SCALE,
     )
 
 

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from agents import LearnedDriver
-from rare_envs.sensors.lidar import AHEAD
-from rare_envs.sensors.perception import RANGES, RATES
+from rare_envs.sensors.lidar import AHEAD_BEAM
+from rare_envs.sensors.perception import RANGE_COLUMNS, RATE_COLUMNS
 from rare_envs.traffic.overlap import boxes_overlap
 from training.data.trajectories import DT
 from training.imitation.traffic.recording import Recording
@@ -176,8 +176,8 @@ def _row(moment: DrivingStep, contact: Tensor, changed: Tensor) -> tuple[Tensor,
         traffic.speed[:, :m],
         moment.action[..., 0],
         moment.action[..., 1],
-        moment.features[..., RANGES][..., AHEAD],
-        moment.features[..., RATES][..., AHEAD],
+        moment.features[..., RANGE_COLUMNS][..., AHEAD_BEAM],
+        moment.features[..., RATE_COLUMNS][..., AHEAD_BEAM],
         contact,
         (y < traffic.edges[:, :1]) | (y > traffic.edges[:, -1:]),
         changed,

@@ -15,7 +15,7 @@ from rare_envs.sensors.camera import Camera
 from rare_envs.sensors.camera import ground as g
 from rare_envs.sensors.camera import light as li
 from rare_envs.sensors.camera import vehicles as b
-from rare_envs.sensors.camera.pinhole import SIGHT
+from rare_envs.sensors.camera.pinhole import GROUND_RANGE
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
 
@@ -30,11 +30,11 @@ class SlowRoad:
 
     def __init__(self, road: Road) -> None:
         self.road = road
-        if road.curve is not None:
+        if road.reference_line is not None:
             s = np.arange(0.0, 2500.0, STEP)
             fine = np.linspace(0.0, 2500.0, 20 * len(s))
-            knots = np.arange(len(road.curve.curvature)) * road.curve.spacing
-            bend = np.interp(fine, knots, road.curve.curvature, right=0.0)
+            knots = np.arange(len(road.reference_line.curvature)) * road.reference_line.spacing
+            bend = np.interp(fine, knots, road.reference_line.curvature, right=0.0)
             ds = fine[1] - fine[0]
             heading = np.concatenate(([0.0], np.cumsum((bend[1:] + bend[:-1]) / 2 * ds)))
             slopes = np.cos(heading), np.sin(heading)
@@ -43,7 +43,7 @@ class SlowRoad:
 
     def coordinates(self, x: float, y: float) -> tuple[float, float]:
         """s and t of a point of the world."""
-        if self.road.curve is None:
+        if self.road.reference_line is None:
             return x, y
         i = int(np.argmin((self.x - x) ** 2 + (self.y - y) ** 2))
         cos, sin = math.cos(self.heading[i]), math.sin(self.heading[i])
@@ -52,7 +52,7 @@ class SlowRoad:
 
     def world(self, s: float, t: float, heading: float) -> tuple[float, float, float]:
         """Place and heading in the world."""
-        if self.road.curve is None:
+        if self.road.reference_line is None:
             return s, t, heading
         x, y, turn = (float(np.interp(s, self.s, w)) for w in (self.x, self.y, self.heading))
         return x - t * math.sin(turn), y + t * math.cos(turn), turn + heading
@@ -132,7 +132,7 @@ class Scene:
         if nearest < math.inf:
             return self.seen(colour, nearest)
         level = math.hypot(way[0], way[1])
-        if way[2] < 0.0 and eye[2] / -way[2] * level <= SIGHT:
+        if way[2] < 0.0 and eye[2] / -way[2] * level <= GROUND_RANGE:
             return self.ground(eye, ray, row, column)
         steep = min(max(way[2] / li.STEEP, 0.0), 1.0)
         blue = (np.array(li.HORIZON) * (1 - steep) + np.array(li.ZENITH) * steep) * (0.6 + 0.4 * self.sun[2])
@@ -171,7 +171,7 @@ class Scene:
         road = float(((places > left - g.LINE_WIDTH / 2) & (places < right + g.LINE_WIDTH / 2)).mean())
         white, yellow = sum(map(part, inner)) * dash + part(right), part(left)
         colour = np.array(g.VERGE) * (1 - road) + np.array(g.ASPHALT) * (road - white - yellow)
-        colour = colour + white * np.array(g.WHITE) + yellow * np.array(g.YELLOW)
+        colour = colour + white * np.array(g.WHITE_LINE) + yellow * np.array(g.YELLOW_LINE)
         dark = any(within(polygon, middle[:2]) for polygon in self.shadows)
         light = self.diffuse + (0.0 if dark else self.direct * self.sun[2])
         return self.seen(colour * light, float(np.linalg.norm(middle - eye)))

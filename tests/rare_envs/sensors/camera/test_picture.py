@@ -12,7 +12,7 @@ from rare_envs.sensors.camera import Camera, CameraContext, Weather, clear_day, 
 from rare_envs.sensors.camera.ground import ASPHALT, DASH, PERIOD, View, road_lines
 from rare_envs.sensors.camera.pinhole import pixels
 from rare_envs.sensors.camera.vehicles import HEIGHT
-from rare_envs.traffic.reference_line import MAX_CURVATURE, Curve
+from rare_envs.traffic.reference_line import MAX_CURVATURE, ReferenceLine
 from rare_envs.traffic.road import Road, i80, straight
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
 from tests.rare_envs.sensors.camera.slow_camera import picture
@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 LARGE = Camera(264, 800)
 OVERHEAD = (0.0, math.pi / 2, 0.0)
 """No fog, and the sun where shadows are under their bodies."""
-BEND = Road((-2.0, 2.0, 6.0), Curve(50.0, (0.0, MAX_CURVATURE, MAX_CURVATURE, 0.0)))
+BEND = Road((-2.0, 2.0, 6.0), ReferenceLine(50.0, (0.0, MAX_CURVATURE, MAX_CURVATURE, 0.0)))
 
 
 def traffic(vehicles: list[list[float]] | Array) -> State:

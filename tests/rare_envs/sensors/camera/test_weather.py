@@ -14,19 +14,25 @@ from torch import Tensor
 
 import rare_envs
 import samplers
-from rare_envs.distributions.product import beside
+from rare_envs.distributions.product import join_independent
 from rare_envs.make import space_of
 from rare_envs.scenarios.base_distributions import load_base
 from rare_envs.scenarios.registry import find_scenario
 from rare_envs.sensors.camera import Camera, CameraContext, Weather, take_picture
 from rare_envs.sensors.camera.sensor_noise import grain
-from rare_envs.sensors.camera.weather import CONDITIONS, FOG_LAW, SENSOR_NOISE, SENSOR_NOISE_LAW, SUN_LAW
+from rare_envs.sensors.camera.weather import (
+    CONDITIONS,
+    FOG_DISTRIBUTION,
+    SENSOR_NOISE,
+    SENSOR_NOISE_DISTRIBUTION,
+    SUN_DISTRIBUTION,
+)
 from rare_envs.simulation.world import World
 from rare_envs.traffic.road import straight
 from rare_envs.traffic.state import State
 
 CUT_IN, HIGHWAY = "rare_envs/CutIn-v0", "rare_envs/Highway-v0"
-LAWS = [FOG_LAW, SUN_LAW, SENSOR_NOISE_LAW]
+LAWS = [FOG_DISTRIBUTION, SUN_DISTRIBUTION, SENSOR_NOISE_DISTRIBUTION]
 VISIBILITY = 2.996
 """Visibility times extinction coefficient: 5 % of the contrast is left (WMO's meteorological optical range)."""
 
@@ -127,7 +133,7 @@ def test_laws_and_their_maps(law: Any) -> None:
 
 def test_fog_is_as_frequent_as_said() -> None:
     extinction = VISIBILITY / np.array([[16_000.0], [1_000.0]])
-    above = stats.norm.sf(FOG_LAW.to_standard_normal(extinction)[:, 0])
+    above = stats.norm.sf(FOG_DISTRIBUTION.to_standard_normal(extinction)[:, 0])
     np.testing.assert_allclose(above, [0.5, 0.01], rtol=0.1)
 
 
@@ -141,7 +147,7 @@ def test_sun_elevations_are_those_of_a_year_of_days() -> None:
     elevation = np.degrees(np.arcsin(sine))
     elevation = elevation[elevation > 5.0]
     levels = np.array([0.1, 0.25, 0.5, 0.75, 0.9])
-    law = SUN_LAW.from_standard_normal(np.column_stack((stats.norm.ppf(levels), np.zeros(5))))
+    law = SUN_DISTRIBUTION.from_standard_normal(np.column_stack((stats.norm.ppf(levels), np.zeros(5))))
     np.testing.assert_allclose(law[:, 0], np.quantile(elevation, levels), atol=1.5)
     assert elevation.max() < CONDITIONS[1].high
 
@@ -151,7 +157,7 @@ def test_a_search_by_blocks_moves_the_weather() -> None:
 
     class FoggyEvening:
         dim = 3
-        base = beside(FOG_LAW, SUN_LAW)
+        base = join_independent(FOG_DISTRIBUTION, SUN_DISTRIBUTION)
 
         def evaluate(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
             u = self.base.to_standard_normal(x)
