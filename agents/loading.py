@@ -8,16 +8,17 @@ from typing import Any, Final, Literal, Protocol, cast, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.learned.checkpoints import SHIPPED, SHIPPED_EGOS, SUFFIX, load_driver
+from agents.learned.checkpoints import SUFFIX, load_driver
 from agents.learned.driver import LearnedDriver, LearnedEgo
-from agents.python_function import RULE_BASED, call_factory
+from agents.names import RULE_BASED, SHIPPED_DRIVERS, SHIPPED_EGOS, VISION
+from agents.python_function import call_factory
 from agents.sb3.saved_ego import load_saved_ego
-from agents.vision.checkpoint import VISION, holds_vision, load_vision
+from agents.vision.checkpoint import holds_vision, load_vision
 from rare_envs.egos.faults import EgoGone
 from rare_envs.plugins import did_you_mean
 
 EXPECTED: Final = (
-    f"{', '.join(map(repr, (RULE_BASED, *SHIPPED_EGOS, VISION, *SHIPPED)))}, a path to a {SUFFIX} or "
+    f"{', '.join(map(repr, (RULE_BASED, *SHIPPED_EGOS, VISION, *SHIPPED_DRIVERS)))}, a path to a {SUFFIX} or "
     "Stable-Baselines3 .zip, "
     "an .onnx file, module:function, tcp://host:port, or process:EGO for one of these in a process of its own, "
     "noisy:EGO for one behind the imperfections of a full stack"
@@ -142,7 +143,7 @@ def find_ego_kind(spec: str) -> EgoKind:
         return "rule"
     if spec == VISION or (spec.endswith(SUFFIX) and holds_vision(spec)):
         return "vision"
-    if spec in (*SHIPPED, *SHIPPED_EGOS) or spec.endswith(SUFFIX):
+    if spec in (*SHIPPED_DRIVERS, *SHIPPED_EGOS) or spec.endswith(SUFFIX):
         return "learned"
     if spec.startswith("process:"):
         return "process"
@@ -164,4 +165,4 @@ def _suggest_ego(text: str) -> str:
     saved = Path(f"{text}.zip")
     if saved.is_file():
         return f" (did you mean {str(saved)!r}?)"
-    return did_you_mean(text.lower(), [RULE_BASED, *SHIPPED_EGOS, VISION, *SHIPPED])
+    return did_you_mean(text.lower(), [RULE_BASED, *SHIPPED_EGOS, VISION, *SHIPPED_DRIVERS])

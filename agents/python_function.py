@@ -5,9 +5,8 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
+from agents.names import RULE_BASED
 from rare_envs.plugins import did_you_mean, working_directory_first
-
-RULE_BASED = "idm"
 
 
 def call_factory(spec: str) -> Any:

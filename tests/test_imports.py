@@ -53,6 +53,7 @@ FLOORS = {
         study.cli
     """,
     "agents": """
+        names
         python_function
         learned sb3 remote imperfect_stack
         vision onnx

@@ -1,8 +1,8 @@
-"""Learned drivers in files: one safetensors file each, with everything that decides how it drives.
+"""Files of learned drivers: one safetensors file each, with everything that decides how it drives.
 
-The tensors are the network's, its scaling and the cap of its log standard deviation included, and, if there is a law of
-the last layer's weights, its mean and the non-zero entries of its precision. The rest is JSON in the header: features,
-noise colour, limits of the actions, and where the driver comes from. Reading a file runs none of its content.
+The tensors are those of the network, with its scaling and the cap of its log standard deviation. If the last layer's
+weights have a distribution, its mean and the non-zero entries of its precision follow. The rest is JSON in the header:
+features, noise colour, limits of the actions, and where the driver comes from. Reading a file runs no code in it.
 """
 
 import difflib
@@ -22,18 +22,13 @@ from torch import Tensor
 
 from agents.learned.coloured_noise import AutoregressiveNoise
 from agents.learned.driver import LearnedDriver
-from agents.learned.networks import ACTION_SIZE, FEATURE_CLIP, HEAD_SIZE, Policy, Scaling
-from agents.learned.networks import FEATURE_SIZE as WIDTH
+from agents.learned.networks import ACTION_SIZE, FEATURE_CLIP, FEATURE_SIZE, HEAD_SIZE, Policy, Scaling
 from agents.learned.rule_driver import RuleDriver
 from agents.learned.weight_distribution import WeightDistribution
+from agents.names import RULE_BASED, SHIPPED_DRIVERS, SHIPPED_EGOS
 from rare_envs.plugins import did_you_mean
 from rare_envs.sensors.perception import FEATURES
 
-RULE_BASED = "idm"
-SHIPPED = ("mgail", "gail", "bc")
-"""Drivers of the traffic."""
-SHIPPED_EGOS = ("imitation",)
-"""Drivers that were trained to be egos: by their mean actions they keep lane and distance, see docs/egos.md."""
 SUFFIX = ".safetensors"
 FORMAT = 1
 """Version of the header."""
@@ -44,24 +39,29 @@ _POLICY, _WEIGHTS = "policy.", "weights."
 
 @dataclass(frozen=True, kw_only=True)
 class Provenance:
-    """Where a driver comes from."""
+    """Origin of a driver: data, training and measured quality.
+
+    Example:
+        >>> Provenance(kind="bc", command="python train.py", data="own recordings", data_licence="CC0").metrics
+        {}
+    """
 
     kind: str
-    """How it learned, such as "mgail"."""
+    """Training method, such as "mgail"."""
     command: str
-    """What was run to train it."""
+    """Command that repeats the training."""
     data: str
-    """What it learned from."""
+    """Recordings that it was trained on."""
     data_licence: str
     """Of the data; the driver is passed on under its terms."""
     metrics: Mapping[str, Any] = field(default_factory=dict)
-    """How well it drives: names to numbers, or to names and numbers."""
+    """Measured quality: names to numbers, or to names and numbers."""
     ensemble: Mapping[str, Any] = field(default_factory=dict)
-    """How the law of its weights was fitted."""
+    """Settings of the fit of the distribution of its weights."""
 
 
 def load_driver(name: str | PathLike[str]) -> LearnedDriver | RuleDriver:
-    """Find a driver by name.
+    """Load a driver by its name or from its file.
 
     Args:
         name: "mgail", "gail" or "bc", which are shipped, and "imitation", which was trained to be an ego; "idm", the
@@ -73,16 +73,22 @@ def load_driver(name: str | PathLike[str]) -> LearnedDriver | RuleDriver:
     Raises:
         FileNotFoundError: The file does not exist.
         ValueError: The name is none of these, or the file is no driver.
+
+    Example:
+        >>> load_driver("bc").name
+        'bc'
+        >>> load_driver("idm").noisy
+        False
     """
     text = str(name)
     if text == RULE_BASED:
         return RuleDriver()
-    if text in (*SHIPPED, *SHIPPED_EGOS):
+    if text in (*SHIPPED_DRIVERS, *SHIPPED_EGOS):
         with resources.as_file(resources.files("agents") / "data" / f"{text}{SUFFIX}") as path:
             return read_driver(path)
     if text.endswith(SUFFIX) or Path(text).is_file():
         return read_driver(text)
-    names = (*SHIPPED, *SHIPPED_EGOS, RULE_BASED)
+    names = (*SHIPPED_DRIVERS, *SHIPPED_EGOS, RULE_BASED)
     hint = did_you_mean(text.lower(), names)
     if Path(f"{text}{SUFFIX}").is_file():
         hint = f" (did you mean {text + SUFFIX!r}?)"
@@ -90,11 +96,11 @@ def load_driver(name: str | PathLike[str]) -> LearnedDriver | RuleDriver:
 
 
 def save_driver(driver: LearnedDriver, provenance: Provenance, path: str | PathLike[str]) -> Path:
-    """Write a driver to one file; an interrupted call leaves no half of it.
+    """Write a driver to one file; an interrupted call leaves no partial file.
 
     Args:
         driver: The driver.
-        provenance: Where it comes from; plain numbers, texts, lists and mappings.
+        provenance: Its origin; numbers, strings, lists and mappings only.
         path: Ends with .safetensors.
 
     Returns:
@@ -102,6 +108,14 @@ def save_driver(driver: LearnedDriver, provenance: Provenance, path: str | PathL
 
     Raises:
         ValueError: If the path has another ending, or something is NaN or infinite.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     origin = Provenance(kind="bc", command="-", data="-", data_licence="CC0")
+        ...     path = save_driver(load_driver("bc"), origin, Path(folder) / "mine.safetensors")
+        ...     print(read_driver(path).name, read_provenance(path).data_licence)
+        bc CC0
     """
     path = Path(path)
     tensors = {_POLICY + name: value.detach().cpu().contiguous() for name, value in driver.policy.state_dict().items()}
@@ -130,6 +144,11 @@ def read_driver(path: str | PathLike[str]) -> LearnedDriver:
         FileNotFoundError: There is no such file.
         ValueError: It is not a safetensors file, lacks something, has a tensor of the wrong shape or type, or was made
             for other features; the message says which.
+
+    Example:
+        >>> from importlib import resources
+        >>> read_driver(resources.files("agents") / "data" / "gail.safetensors").acceleration
+        (-8.0, 4.0)
     """
     path = Path(path)
     header, tensors = read_file(path)
@@ -150,7 +169,13 @@ def read_driver(path: str | PathLike[str]) -> LearnedDriver:
 
 
 def read_provenance(path: str | PathLike[str]) -> Provenance:
-    """Read where a driver comes from; errors as in `read_driver`."""
+    """Read the origin of a driver; raises as `read_driver` does.
+
+    Example:
+        >>> from importlib import resources
+        >>> read_provenance(resources.files("agents") / "data" / "gail.safetensors").kind
+        'gail'
+    """
     path = Path(path)
     header, _ = read_file(path)
     require(header, (f.name for f in fields(Provenance)), path)
@@ -161,13 +186,13 @@ def read_provenance(path: str | PathLike[str]) -> Provenance:
 
 
 def write_file(path: Path, tensors: Mapping[str, Tensor], entry: str, header: Mapping[str, Any]) -> Path:
-    """Write tensors and a header to a file; an interrupted call leaves no half of it.
+    """Write tensors and a header to a file; an interrupted call leaves no partial file.
 
     Args:
         path: Ends with .safetensors.
         tensors: By name.
         entry: What the file holds, such as "driver": the header's one name.
-        header: Plain numbers, texts, lists and mappings.
+        header: Numbers, strings, lists and mappings only.
 
     Raises:
         ValueError: If the path has another ending, or something is NaN or infinite.
@@ -183,11 +208,11 @@ def write_file(path: Path, tensors: Mapping[str, Tensor], entry: str, header: Ma
 
 
 def read_file(path: Path, entry: str = _HEADER) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Header and tensors of a file that `write_file` wrote.
+    """Read header and tensors of a file that `write_file` wrote.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: It is no safetensors file, or holds something else.
+        ValueError: It is no safetensors file, or has no such entry in its header.
     """
     if not path.is_file():
         near = [] if not path.parent.is_dir() else sorted(each.name for each in path.parent.glob(f"*{SUFFIX}"))
@@ -217,7 +242,7 @@ def _is_zip(path: Path) -> bool:
 
 
 def require(found: Mapping[str, Any], names: Any, path: Path) -> None:
-    """Refuse a file that lacks something."""
+    """Refuse a file that lacks one of the names."""
     missing = [name for name in names if name not in found]
     if missing:
         raise ValueError(f"{str(path)!r} lacks {', '.join(missing)}.")
@@ -239,7 +264,7 @@ def _check_header(header: Mapping[str, Any], path: Path) -> None:
 
 
 def check_finite(tensors: Mapping[str, Tensor], path: Path) -> None:
-    """Refuse tensors that are not finite."""
+    """Refuse tensors with NaN or infinite entries."""
     wrong = [name for name, value in tensors.items() if not bool(torch.isfinite(value).all())]
     if wrong:
         raise ValueError(f"{str(path)!r}: expected finite numbers, got inf or NaN in {', '.join(wrong)}.")
@@ -247,7 +272,9 @@ def check_finite(tensors: Mapping[str, Tensor], path: Path) -> None:
 
 def _policy(tensors: Mapping[str, Tensor], path: Path) -> Policy:
     with torch.device("meta"):  # shapes only: initial weights would be drawn from the global generator
-        policy = Policy(Scaling(*(torch.empty(size) for size in (WIDTH, WIDTH, ACTION_SIZE, ACTION_SIZE))))
+        policy = Policy(
+            Scaling(*(torch.empty(size) for size in (FEATURE_SIZE, FEATURE_SIZE, ACTION_SIZE, ACTION_SIZE)))
+        )
     expected = policy.state_dict()
     require(tensors, (_POLICY + name for name in expected), path)
     found = {name: tensors[_POLICY + name] for name in expected}

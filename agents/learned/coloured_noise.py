@@ -1,8 +1,8 @@
 """Coloured noise of learned drivers: autoregressions of order 2 with unit variance.
 
-Recorded accelerations and yaw rates, less what 51 features explain, swing: their autocorrelation is 0.98 after 0.1 s,
-0.7 after 0.5 s, and negative between 1.1 and 3 s. White noise (O'Kelly et al.'s) has none of this, and a first-order
-noise of the same smoothness makes a car wander off, because nothing swings it back.
+Recorded accelerations and yaw rates, less what 51 features explain, oscillate: their autocorrelation is 0.98 after
+0.1 s, 0.7 after 0.5 s, and negative between 1.1 and 3 s. White noise (O'Kelly et al.'s) has none of this, and a
+first-order noise of the same smoothness makes a car wander off, because nothing brings it back.
 """
 
 import math
@@ -14,15 +14,25 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class AutoregressiveNoise:
-    """noise_t = first noise_{t-1} + second noise_{t-2} + scale fresh_t, one pair of coefficients for each action.
+    """Stationary noise with variance 1: noise_t = first noise_{t-1} + second noise_{t-2} + scale fresh_t.
+
+    There is one pair of coefficients for each of the two actions.
 
     Raises:
         ValueError: If a noise is not stationary.
+
+    Example:
+        >>> noise = AutoregressiveNoise.from_oscillators(frequency=(1.70, 1.57), damping=(0.845, 0.40))
+        >>> [round(value, 4) for value in noise.first]
+        [1.8114, 1.8979]
+        >>> [round(value, 4) for value in noise.scale]
+        [0.1009, 0.062]
     """
 
     first: tuple[float, float] = (0.0, 0.0)
-    """Of acceleration and of yaw rate; white noise has 0 here and below."""
+    """Coefficients of lag 1 of acceleration and of yaw rate; white noise has 0 here and below."""
     second: tuple[float, float] = (0.0, 0.0)
+    """Coefficients of lag 2."""
 
     def __post_init__(self) -> None:
         for a, b in zip(self.first, self.second, strict=True):
@@ -30,13 +40,13 @@ class AutoregressiveNoise:
                 raise ValueError(f"Expected the coefficients of a stationary noise, got {a} and {b}.")
 
     @classmethod
-    def swinging(
+    def from_oscillators(
         cls, frequency: tuple[float, float], damping: tuple[float, float], dt: float = 0.1
     ) -> "AutoregressiveNoise":
-        """Noise with the poles of damped oscillators.
+        """Return the noise with the poles of damped oscillators.
 
         Args:
-            frequency: Of the damped swing [rad/s], for acceleration and yaw rate.
+            frequency: Of the damped oscillation [rad/s], for acceleration and yaw rate.
             damping: Rate of decay [1/s].
             dt: Tick [s].
         """
@@ -54,7 +64,7 @@ class AutoregressiveNoise:
         return a, b
 
     def begin(self, fresh: Tensor) -> Tensor:
-        """Two stationary values in a row from independent standard normal ones.
+        """Return two consecutive stationary values made of independent standard normal ones.
 
         Args:
             fresh: Shape (..., 2, 2): action, then draw.
@@ -66,13 +76,13 @@ class AutoregressiveNoise:
         earlier = fresh[..., 1]
         return torch.stack((correlation * earlier + (1 - correlation.square()).sqrt() * fresh[..., 0], earlier), dim=-1)
 
-    def expected(self, memory: Tensor) -> Tensor:
-        """Mean of the next value given the last two: (..., 2, 2) -> (..., 2)."""
+    def predict_mean(self, memory: Tensor) -> Tensor:
+        """Return the mean of the next value given the last two: (..., 2, 2) -> (..., 2)."""
         return memory[..., 0] * memory.new_tensor(self.first) + memory[..., 1] * memory.new_tensor(self.second)
 
-    def next(self, memory: Tensor, fresh: Tensor) -> tuple[Tensor, Tensor]:
-        """The next value (..., 2) from standard normal draws (..., 2), and the memory after it."""
-        value = self.expected(memory) + fresh.new_tensor(self.scale) * fresh
+    def step(self, memory: Tensor, fresh: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the next value (..., 2) from standard normal draws (..., 2), and the memory after it."""
+        value = self.predict_mean(memory) + fresh.new_tensor(self.scale) * fresh
         return value, torch.stack((value, memory[..., 0]), dim=-1)
 
 

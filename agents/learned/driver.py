@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class LearnedDriver:
-    """A Gaussian policy with the colour of its noise and the limits of its actions.
+    """A driver of the traffic: a Gaussian policy with the colour of its noise and the limits of its actions.
 
     The actions of a vehicle at tick t are
 
@@ -36,6 +36,15 @@ class LearnedDriver:
 
     Raises:
         ValueError: If limits are out of order, or there are not 404 weights.
+
+    Example:
+        >>> from agents import load_driver
+        >>> driver = load_driver("mgail")
+        >>> driver.weights
+        WeightDistribution(404 weights, radius=0.01)
+        >>> action, memory = driver.act(torch.zeros(4, 6, 51))
+        >>> tuple(action.shape), memory
+        ((4, 6, 2), None)
     """
 
     policy: Policy = field(repr=False)
@@ -46,8 +55,9 @@ class LearnedDriver:
     yaw_rate: tuple[float, float] = (-0.3, 0.3)
     """Limits [rad/s]."""
     weights: WeightDistribution | None = None
-    """Law of the 404 weights of the last layer, if an ensemble has given one."""
+    """Distribution of the 404 weights of the last layer; None if no ensemble was fitted."""
     name: str = "learned"
+    """Names the driver in results, such as "mgail"."""
     noisy: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
@@ -70,13 +80,13 @@ class LearnedDriver:
         innovations: Tensor | None = None,
         memory: Tensor | None = None,
     ) -> tuple[Tensor, Tensor | None]:
-        """Decide for one tick; the networks of all vehicles are one forward pass, also when weights differ.
+        """Decide for one tick, in one forward pass of all vehicles, also when their weights differ.
 
         Args:
             features: What M vehicles in B scenarios perceive, shape (B, M, 51).
             weights: Last layers of the scenarios, shape (B, 404) as `head_weights` has them; None for the policy's own.
             innovations: Independent standard normal draws, shape (B, M, 2); None for the mean actions.
-            memory: Of the noise, shape (B, M, 2, 2), as the last call returned it, at the start `begin`.
+            memory: Of the noise, shape (B, M, 2, 2), as the last call returned it; at the start that of `begin`.
 
         Returns:
             Accelerations [m/s^2] and yaw rates [rad/s], shape (B, M, 2), and the new memory.
@@ -94,7 +104,7 @@ class LearnedDriver:
             output = apply_heads(hidden.view(batch, vehicles, HIDDEN_SIZES[-1]), weights.to(hidden.dtype).contiguous())
         normal, log_std = policy.split(output)
         if innovations is not None and memory is not None:
-            noise, memory = self.colour.next(memory.to(hidden.dtype), innovations.to(hidden.dtype))
+            noise, memory = self.colour.step(memory.to(hidden.dtype), innovations.to(hidden.dtype))
             normal = normal + log_std.exp() * noise
         scaling = policy.scaling
         action = scaling.action_mean + scaling.action_std * normal
@@ -102,14 +112,14 @@ class LearnedDriver:
         return action.clamp(low, high).to(features.dtype), memory
 
     def begin(self, draws: Tensor) -> Tensor:
-        """The memory of the noise at the start, from independent standard normal draws of shape (B, M, 2, 2)."""
+        """Return the memory of the noise at the start, from independent standard normal draws (B, M, 2, 2)."""
         return self.colour.begin(draws)
 
 
 def _check_shapes(
     features: Tensor, weights: Tensor | None, innovations: Tensor | None, memory: Tensor | None
 ) -> tuple[int, int]:
-    """B and M."""
+    """Return B and M."""
     named = {"features": features, "weights": weights, "innovations": innovations, "memory": memory}
     for name, value in named.items():
         if not isinstance(value, Tensor) and (value is not None or name == "features"):
@@ -130,7 +140,11 @@ def _check_shapes(
 
 
 def replace_head(policy: Policy, weights: Tensor) -> Policy:
-    """A copy of a network with other weights (404,) in its last layer, as `head_weights` has them."""
+    """Return a copy of a network with other weights (404,) in its last layer, as `head_weights` has them.
+
+    Raises:
+        ValueError: If there are not 404 weights.
+    """
     if weights.shape != (HEAD_SIZE,):
         raise ValueError(f"Expected weights of shape ({HEAD_SIZE},), got {tuple(weights.shape)}.")
     changed = copy.deepcopy(policy)
@@ -145,8 +159,15 @@ def replace_head(policy: Policy, weights: Tensor) -> Policy:
 class LearnedEgo:
     """A learned driver as ego: a Driver that acts by its mean actions and has no memory.
 
-    In simulations `act` is asked, whatever the environment observes. `predict` is for those who step an environment
+    Simulations call `act`, whatever the environment observes. `predict` is for those who step an environment
     themselves, made with `observation="lidar"`.
+
+    Example:
+        >>> from agents import load_ego
+        >>> ego = load_ego("imitation")
+        >>> action, state = ego.predict(np.zeros((3, 51), np.float32))
+        >>> action.shape, state
+        ((3, 2), None)
     """
 
     driver: LearnedDriver
@@ -167,7 +188,7 @@ class LearnedEgo:
         """Perceive and decide for one tick; see `rare_envs.simulation.rollout.Driver`."""
         if episode.perception is None:
             raise ValueError('Expected a world in which vehicles look: make it with observation="lidar".')
-        return self._decided(episode.perception[:, 0]), memory
+        return self._decide(episode.perception[:, 0]), memory
 
     @torch.inference_mode()
     def predict(
@@ -184,9 +205,9 @@ class LearnedEgo:
 
         Args:
             observation: Of one environment, shape (51,), or of B, shape (B, 51).
-            state: Passed through.
-            episode_start: Passed over.
-            deterministic: Passed over; the actions are the mean ones either way.
+            state: Returned as it is.
+            episode_start: Not used.
+            deterministic: Not used; the actions are the mean ones either way.
 
         Returns:
             Actions in [-1, 1], shape (2,) or (B, 2), and the state.
@@ -201,14 +222,14 @@ class LearnedEgo:
                 f"Expected observations of shape (B, {FEATURE_SIZE}), got {tuple(seen.shape)}; "
                 'make the environment with observation="lidar".'
             )
-        physical = self._decided(seen.reshape(-1, FEATURE_SIZE) * seen.new_tensor(LIDAR_SCALES))
+        physical = self._decide(seen.reshape(-1, FEATURE_SIZE) * seen.new_tensor(LIDAR_SCALES))
         scaled = physical / physical.new_tensor((actions.MAX_ACCELERATION, actions.MAX_STEERING))
         return scaled.clamp(-1.0, 1.0).reshape(*seen.shape[:-1], ACTION_SIZE).numpy(), state
 
-    def _decided(self, features: Tensor) -> Tensor:
-        """Acceleration [m/s^2] and steering angle [rad], shape (B, 2), by what the egos see, shape (B, 51)."""
-        decided, _ = self.driver.act(features[:, None])
-        acceleration, yaw_rate = decided[:, 0].unbind(dim=-1)
+    def _decide(self, features: Tensor) -> Tensor:
+        """Return acceleration [m/s^2] and steering angle [rad], shape (B, 2), for features of the egos (B, 51)."""
+        action, _ = self.driver.act(features[:, None])
+        acceleration, yaw_rate = action[:, 0].unbind(dim=-1)
         speed = features[:, SPEED_COLUMN]
-        yaw_rate = yaw_rate + speed * features[:, CURVATURE_COLUMN]  # it has learned on a straight road
+        yaw_rate = yaw_rate + speed * features[:, CURVATURE_COLUMN]  # it was trained on a straight road
         return torch.stack((acceleration, steering_for(yaw_rate, speed)), dim=1)

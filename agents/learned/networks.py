@@ -6,13 +6,19 @@ import torch
 from torch import Tensor, nn
 
 FEATURE_SIZE = 51
+"""Features of `rare_envs.sensors.perception.FEATURES`."""
 HIDDEN_SIZES = (200, 100)
+"""Units of the two hidden layers (O'Kelly et al. 2018, section 4)."""
 ACTION_SIZE = 2
 """Acceleration and yaw rate."""
 HEAD_SIZE = (HIDDEN_SIZES[-1] + 1) * 2 * ACTION_SIZE
 """Weights of the last layer, 404: what a search over drivers perturbs (O'Kelly et al. 2018, section 4)."""
 FEATURE_CLIP = 8.0
-"""Normalised features are clipped to +-this."""
+"""Normalised features are clipped to +-this, so that a scene far from the record cannot saturate every unit."""
+
+HEAD_GAIN, LOG_STD_BIAS = 0.1, -1.0
+"""Factor on the first weights of the last layer, and its first biases of log standard deviations: a new network acts
+almost alike everywhere, with noise of about a quarter of the recorded spread, from which cloning starts smoothly."""
 
 
 class Scaling(NamedTuple):
@@ -25,10 +31,11 @@ class Scaling(NamedTuple):
     action_mean: Tensor
     """Shape (2,): [m/s^2] and [rad/s]."""
     action_std: Tensor
+    """Likewise."""
 
 
 class Policy(nn.Module):
-    """51-200-100 tanh units, then one linear layer to two means and two log standard deviations.
+    """The network: 51-200-100 tanh units, then one linear layer to two means and two log standard deviations.
 
     O'Kelly et al. have the same sizes with ReLU; on the data that the shipped drivers learned from, tanh overfits less.
     Everything is in normalised units, see `Scaling`.
@@ -51,41 +58,41 @@ class Policy(nn.Module):
         self.second = nn.Linear(HIDDEN_SIZES[0], HIDDEN_SIZES[1])
         self.head = nn.Linear(HIDDEN_SIZES[1], 2 * ACTION_SIZE)
         with torch.no_grad():
-            self.head.weight.mul_(0.1)
+            self.head.weight.mul_(HEAD_GAIN)
             self.head.bias.zero_()
-            self.head.bias[ACTION_SIZE:] = -1.0
+            self.head.bias[ACTION_SIZE:] = LOG_STD_BIAS
 
     @property
     def scaling(self) -> Scaling:
         """The normalisation that the weights belong to."""
         return Scaling(*(self.get_buffer(name) for name in Scaling._fields))
 
-    def normalised(self, features: Tensor) -> Tensor:
-        """Features (..., 51) from SI units to multiples of their spreads in the record, clipped."""
+    def normalise(self, features: Tensor) -> Tensor:
+        """Return features (..., 51), given in SI units, as multiples of their spreads in the record, clipped."""
         scaling = self.scaling
         return ((features - scaling.feature_mean) / scaling.feature_std).clamp(-FEATURE_CLIP, FEATURE_CLIP)
 
     def trunk(self, features: Tensor) -> Tensor:
-        """Features (..., 51) in SI units to hidden units (..., 100)."""
-        return torch.tanh(self.second(torch.tanh(self.first(self.normalised(features)))))
+        """Return the hidden units (..., 100) of features (..., 51) in SI units."""
+        return torch.tanh(self.second(torch.tanh(self.first(self.normalise(features)))))
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Features (..., 51) in SI units to means and log standard deviations (..., 2) of normalised actions."""
+        """Return means and log standard deviations (..., 2) of actions (both normalised) for features (..., 51)."""
         return self.split(self.head(self.trunk(features)))
 
     def split(self, output: Tensor) -> tuple[Tensor, Tensor]:
-        """The four outputs of the last layer (..., 4) as means and capped log standard deviations (..., 2)."""
+        """Return the four outputs of the last layer (..., 4) as means and capped log standard deviations (..., 2)."""
         mean, log_std = output[..., :ACTION_SIZE], output[..., ACTION_SIZE:]
         return mean, self.log_std_cap - nn.functional.softplus(self.log_std_cap - log_std)
 
 
 def head_weights(policy: Policy) -> Tensor:
-    """The 404 weights of the last layer: for each of the four outputs its 100 weights and its bias."""
+    """Return the 404 weights of the last layer: for each of the four outputs its 100 weights and its bias."""
     return torch.cat((policy.head.weight, policy.head.bias[:, None]), dim=1).flatten()
 
 
 def apply_heads(hidden: Tensor, weights: Tensor) -> Tensor:
-    """The last layer with weights of its own for every scenario.
+    """Apply the last layer, with weights of its own for every scenario.
 
     Args:
         hidden: Hidden units of M vehicles in B scenarios, shape (B, M, 100).

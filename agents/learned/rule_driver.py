@@ -1,4 +1,4 @@
-"""A driver by rule that sees what learned drivers see."""
+"""The rule-based driver of learned drivers' observations: IDM and lane keeping on 51 features."""
 
 from dataclasses import dataclass, field
 from typing import ClassVar
@@ -14,17 +14,23 @@ from rare_envs.traffic.vehicle_models import NEAR_ZERO
 
 _OFFSET, _HEADING, _SPEED, _LENGTH = (FEATURES.index(name) for name in ("lane_offset", "heading", "speed", "length"))
 OFFSET_TIME = 0.6
-"""[s]: an offset from the middle of the lane asks for offset / time of lateral speed."""
+"""The lateral speed that is aimed at is lane offset / this [s], as in `rare_envs.control.steering`."""
 HEADING_TIME = 0.2
-"""[s]: an error of heading asks for error / time of yaw rate."""
+"""The yaw rate is heading error / this [s], as in `rare_envs.control.steering`."""
 
 
 @dataclass(frozen=True)
 class RuleDriver:
     """IDM behind what the beam ahead meets, and the lane keeping of `rare_envs.control.steering` as a yaw rate.
 
-    It takes the place of a `LearnedDriver`, so that one harness measures both; it has no weights and no noise, and
+    It has the interface of a `LearnedDriver`, so that one harness measures both; it has no weights and no noise, and
     knows vehicles in its lane only where the beam meets them.
+
+    Example:
+        >>> features = torch.zeros(1, 1, 51)
+        >>> action, _ = RuleDriver().act(features)
+        >>> tuple(action.shape)
+        (1, 1, 2)
     """
 
     idm: IDM = field(default_factory=IDM)
@@ -34,7 +40,7 @@ class RuleDriver:
     noisy: ClassVar[bool] = False
 
     def begin(self, draws: Tensor) -> Tensor:
-        """No memory: (B, M, 2, 2) -> (B, M, 0)."""
+        """Return an empty memory: (B, M, 2, 2) -> (B, M, 0)."""
         return draws[..., 0, :0]
 
     def act(
@@ -48,9 +54,9 @@ class RuleDriver:
 
         Args:
             features: Shape (B, M, 51).
-            weights: Passed over.
-            innovations: Passed over.
-            memory: Passed through.
+            weights: Not used.
+            innovations: Not used.
+            memory: Returned as it is.
 
         Returns:
             Accelerations [m/s^2] and yaw rates [rad/s], shape (B, M, 2), and the memory.

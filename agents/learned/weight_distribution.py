@@ -1,4 +1,4 @@
-"""The law of the last layer's 404 weights: what a search over drivers moves.
+"""Normal distribution of the 404 weights of a driver's last layer, which a search over drivers moves.
 
 References:
     O'Kelly, Sinha, Namkoong, Duchi and Tedrake, "Scalable end-to-end autonomous vehicle testing via rare-event
@@ -20,7 +20,9 @@ from agents.learned.networks import HIDDEN_SIZES
 Array = NDArray[np.float64]
 
 RADIUS = 0.01
-"""How far a search may move each mean, O'Kelly et al.'s."""
+"""Largest shift of each mean in a search (O'Kelly et al. 2018, section 4)."""
+SYMMETRY = 1e-9
+"""Relative difference of mirrored entries that rounding may leave in a precision."""
 HEAD_OUTPUTS = ("mean_acceleration", "mean_yaw_rate", "log_std_acceleration", "log_std_yaw_rate")
 WEIGHT_NAMES = tuple(f"{output}_{unit}" for output in HEAD_OUTPUTS for unit in (*range(HIDDEN_SIZES[-1]), "bias"))
 """Names of the 404 weights, in the order of `head_weights`: each output's 100 weights, then its bias."""
@@ -28,12 +30,22 @@ WEIGHT_NAMES = tuple(f"{output}_{unit}" for output in HEAD_OUTPUTS for unit in (
 
 @dataclass(frozen=True, eq=False)
 class WeightDistribution:
-    """N(mean, precision^-1), and how far its mean may be moved.
+    """Normal distribution N(mean, precision^-1), and how far its mean may be moved.
 
     Cross-entropy takes it as a block as it is: `mean`, `covariance` and `radius` say what it is and how it may move.
 
     Raises:
         ValueError: If the mean is not finite, the precision not symmetric positive definite, or the radius negative.
+
+    Example:
+        >>> weights = WeightDistribution(np.zeros(2), np.array([[2.0, 1.0], [1.0, 2.0]]))
+        >>> weights.covariance.round(4)
+        array([[ 0.6667, -0.3333],
+               [-0.3333,  0.6667]])
+        >>> weights.sample(3, np.random.default_rng(0)).shape
+        (3, 2)
+        >>> weights.log_prob(np.zeros((1, 2))).round(4)
+        array([-1.2886])
     """
 
     mean: Array
@@ -49,7 +61,7 @@ class WeightDistribution:
             raise ValueError(f"Expected mean (d,) and precision (d, d), got {mean.shape} and {precision.shape}.")
         if not (np.isfinite(mean).all() and np.isfinite(precision).all()):
             raise ValueError("Expected a finite mean and precision, got inf or NaN.")
-        if not np.allclose(precision, precision.T, rtol=1e-9, atol=0.0):
+        if not np.allclose(precision, precision.T, rtol=SYMMETRY, atol=0.0):
             raise ValueError("Expected a symmetric precision.")
         if not self.radius >= 0.0:
             raise ValueError(f"Expected radius >= 0, got {self.radius!r}.")
@@ -125,7 +137,7 @@ class WeightDistribution:
         return x
 
     def to_arrays(self) -> dict[str, NDArray[np.generic]]:
-        """What a file keeps: the mean, and rows, columns and values of the precision's upper triangle but its zeros."""
+        """Return the mean, and rows, columns and values of the non-zero entries of the precision's upper triangle."""
         rows, columns = np.nonzero(np.triu(self.precision))
         index = np.int16 if self.dim <= np.iinfo(np.int16).max else np.int64
         return {
@@ -137,10 +149,10 @@ class WeightDistribution:
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, NDArray[np.generic]], radius: float = RADIUS) -> "WeightDistribution":
-        """Inverse of `to_arrays`.
+        """Return the distribution of which `to_arrays` gave the arrays.
 
         Raises:
-            ValueError: If the arrays are not such.
+            ValueError: If shapes or indices do not fit together.
         """
         mean, values = arrays["mean"].astype(np.float64), arrays["precision"].astype(np.float64)
         rows, columns = arrays["rows"].astype(np.int64), arrays["columns"].astype(np.int64)

@@ -13,11 +13,10 @@ import torch
 from safetensors import SafetensorError, safe_open
 
 from agents.learned.checkpoints import SUFFIX, Provenance, check_finite, check_tensor, read_file, require, write_file
+from agents.names import VISION
 from agents.vision.ego import LAG, SEES, VisionEgo
 from agents.vision.pilotnet import HEIGHT, WIDTH, PilotNet
 
-VISION = "vision"
-"""Name of the shipped one."""
 _ENTRY = "vision"
 _FORM: Mapping[str, Any] = {"format": 1, "observation": SEES, "picture": [HEIGHT, WIDTH], "lag": LAG}
 """What a network was made for; another one cannot be read."""

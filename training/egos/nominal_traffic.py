@@ -72,7 +72,7 @@ class OrdinaryDrivers:
         wanted = torch.where(memory[..., 4].isnan(), speed, memory[..., 4])
         noise, swings = torch.zeros_like(features[..., :2]), memory[..., :4].reshape(*speed.shape, 2, 2)
         if innovations is not None:
-            noise, swings = self.colour.next(swings, innovations)
+            noise, swings = self.colour.step(swings, innovations)
         action, _ = self.rule.act(features)
         freely = SWAY * noise[..., 0] + (wanted - speed) / RETURN
         acceleration = torch.minimum(freely, action[..., 0])

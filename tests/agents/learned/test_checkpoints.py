@@ -11,9 +11,9 @@ import torch
 from safetensors import safe_open
 
 from agents import LearnedDriver, Provenance, load_driver, read_driver, read_provenance, save_driver
-from agents.learned.checkpoints import SHIPPED
 from agents.learned.coloured_noise import AutoregressiveNoise
 from agents.learned.rule_driver import RuleDriver
+from agents.names import SHIPPED_DRIVERS
 
 PROVENANCE = Provenance(
     kind="mgail",
@@ -187,7 +187,7 @@ def test_unknown_names_get_a_suggestion(file, monkeypatch):
         load_driver("driver")
 
 
-@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize("name", SHIPPED_DRIVERS)
 def test_shipped_drivers_load(name):
     driver = load_driver(name)
     assert isinstance(driver, LearnedDriver)

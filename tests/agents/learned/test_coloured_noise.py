@@ -7,7 +7,7 @@ import torch
 
 from agents.learned.coloured_noise import AutoregressiveNoise
 
-SWINGING = AutoregressiveNoise.swinging(frequency=(1.70, 1.57), damping=(0.845, 0.40))
+OSCILLATING = AutoregressiveNoise.from_oscillators(frequency=(1.70, 1.57), damping=(0.845, 0.40))
 
 
 def sequence(colour, ticks, n=100_000, seed=0):
@@ -15,18 +15,18 @@ def sequence(colour, ticks, n=100_000, seed=0):
     memory = colour.begin(torch.randn(n, 2, 2, generator=generator))
     values = []
     for _ in range(ticks):
-        value, memory = colour.next(memory, torch.randn(n, 2, generator=generator))
+        value, memory = colour.step(memory, torch.randn(n, 2, generator=generator))
         values.append(value)
     return torch.stack(values)
 
 
 def test_white_noise_is_the_fresh_draw():
     fresh = torch.randn(5, 2)
-    value, _ = AutoregressiveNoise().next(AutoregressiveNoise().begin(torch.randn(5, 2, 2)), fresh)
+    value, _ = AutoregressiveNoise().step(AutoregressiveNoise().begin(torch.randn(5, 2, 2)), fresh)
     torch.testing.assert_close(value, fresh)
 
 
-@pytest.mark.parametrize("colour", [SWINGING, AutoregressiveNoise((0.95, 0.5), (0.0, 0.0)), AutoregressiveNoise()])
+@pytest.mark.parametrize("colour", [OSCILLATING, AutoregressiveNoise((0.95, 0.5), (0.0, 0.0)), AutoregressiveNoise()])
 def test_stationary_from_the_first_tick(colour):
     values = sequence(colour, 30)
     # the variance of n = 1e5 draws has a standard error of sqrt(2 / n) = 0.0045
@@ -34,8 +34,8 @@ def test_stationary_from_the_first_tick(colour):
 
 
 def test_autocorrelation_obeys_the_recursion():
-    values = sequence(SWINGING, 21)
-    for action, (a, b) in enumerate(zip(SWINGING.first, SWINGING.second, strict=True)):
+    values = sequence(OSCILLATING, 21)
+    for action, (a, b) in enumerate(zip(OSCILLATING.first, OSCILLATING.second, strict=True)):
         expected = [1.0, a / (1 - b)]
         for _ in range(19):
             expected.append(a * expected[-1] + b * expected[-2])
@@ -46,14 +46,14 @@ def test_autocorrelation_obeys_the_recursion():
 
 def test_swings_back():
     # half a period after a large value, a large one of the other sign is expected
-    values = sequence(SWINGING, 21)
+    values = sequence(OSCILLATING, 21)
     assert float((values[0, :, 1] * values[20, :, 1]).mean()) < -0.4
 
 
 def test_the_expected_part_is_known_before_the_draw():
-    memory = SWINGING.begin(torch.randn(7, 2, 2, generator=torch.Generator().manual_seed(1)))
-    value, after = SWINGING.next(memory, torch.zeros(7, 2))
-    torch.testing.assert_close(value, SWINGING.expected(memory))
+    memory = OSCILLATING.begin(torch.randn(7, 2, 2, generator=torch.Generator().manual_seed(1)))
+    value, after = OSCILLATING.step(memory, torch.zeros(7, 2))
+    torch.testing.assert_close(value, OSCILLATING.predict_mean(memory))
     torch.testing.assert_close(after[..., 0], value)
     torch.testing.assert_close(after[..., 1], memory[..., 0])
 

@@ -25,7 +25,7 @@ def test_one_pass_equals_a_loop_over_networks(driver, features, generator):
     for _ in range(3):
         x = features(batch, vehicles)
         xi = torch.randn(batch, vehicles, 2, generator=generator)
-        eps, after = driver.colour.next(memory, xi)
+        eps, after = driver.colour.step(memory, xi)
         action, memory = driver.act(x, weights, xi, memory)
         for b, network in enumerate(networks):
             for m in range(vehicles):

@@ -10,7 +10,7 @@ from agents.learned.coloured_noise import AutoregressiveNoise
 Algorithm = Literal["bc", "gail", "mgail"]
 
 
-HUMAN_NOISE = AutoregressiveNoise.swinging(frequency=(1.70, 1.57), damping=(0.845, 0.40))
+HUMAN_NOISE = AutoregressiveNoise.from_oscillators(frequency=(1.70, 1.57), damping=(0.845, 0.40))
 """The autocorrelation of what cloning leaves unexplained in the record, within 0.03 up to 1 s."""
 
 

@@ -31,7 +31,7 @@ class Critic(nn.Module):
 
 def critic_inputs(policy: Policy, features: Tensor, action: Tensor) -> Tensor:
     """What the critic sees: normalised features (n, 51) beside normalised actions (n, 2)."""
-    return torch.cat((policy.normalised(features), action), dim=1)
+    return torch.cat((policy.normalise(features), action), dim=1)
 
 
 def policy_cost(critic: Critic, pairs: Tensor) -> Tensor:

@@ -60,7 +60,7 @@ def clipped_surrogate(ratio: Tensor, advantage: Tensor, clip: float) -> Tensor:
 
 def value_inputs(policy: Policy, steps: RolloutSteps) -> Tensor:
     """What the value depends on: normalised features and the noise that goes on, shape (n, 53)."""
-    return torch.cat((policy.normalised(steps.features), steps.noise), dim=1)
+    return torch.cat((policy.normalise(steps.features), steps.noise), dim=1)
 
 
 def rewards(learner: Learner, steps: RolloutSteps) -> Tensor:

@@ -70,8 +70,8 @@ def roll_out(
         if model is not None and before is not None and action is not None:
             features = model.substituted(policy, before, action, features, credit)
         mean, log_std = policy(features)
-        expected = colour.expected(memory)
-        noise, memory = colour.next(memory, torch.randn(expected.shape, generator=generator))
+        expected = colour.predict_mean(memory)
+        noise, memory = colour.step(memory, torch.randn(expected.shape, generator=generator))
         action = mean + torch.exp(log_std) * noise
         moved = torch.cat((denormalise_action(policy, action), unused), dim=1)
         cost = _penalties(traffic, features if model is None else features.detach(), moved[:, :m], m)

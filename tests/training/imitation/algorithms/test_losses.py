@@ -77,8 +77,8 @@ def test_coloured_actions_have_the_joint_density_that_their_conditionals_multipl
     memory = colour.begin(torch.randn(1, 2, 2, generator=generator(3)).double())
     start, total, noises = memory.clone(), 0.0, []
     for t in range(ticks):
-        expected = colour.expected(memory)
-        noise, memory = colour.next(memory, torch.randn(1, 2, generator=generator(4 + t)).double())
+        expected = colour.predict_mean(memory)
+        noise, memory = colour.step(memory, torch.randn(1, 2, generator=generator(4 + t)).double())
         action = mean[t : t + 1] + torch.exp(log_std[t : t + 1]) * noise
         law = conditional_action(policy, features[t : t + 1], expected, colour)
         total += float(log_likelihood(*law, action).detach())

@@ -1,0 +1,10 @@
+"""Names of the egos and drivers that `load_ego` and `load_driver` know without a file."""
+
+RULE_BASED = "idm"
+"""The Intelligent Driver Model with lane keeping."""
+VISION = "vision"
+"""The shipped ego with a camera."""
+SHIPPED_EGOS = ("imitation",)
+"""Shipped drivers that were trained to be egos: by their mean actions they keep lane and distance, see docs/egos.md."""
+SHIPPED_DRIVERS = ("mgail", "gail", "bc")
+"""Shipped drivers of the traffic."""
