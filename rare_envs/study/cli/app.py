@@ -349,11 +349,13 @@ def check_ego_command(
     from dataclasses import asdict
 
     from rare_envs.study.ego_check.findings import exit_code
-    from rare_envs.study.ego_check.subprocess_check import Asked, check_ego
+    from rare_envs.study.ego_check.subprocess_check import EgoCheckRequest, check_ego
     from rare_envs.study.ego_check.table import VERDICTS, print_findings
 
     findings = check_ego(
-        Asked(ego, env, algo, trust, observation, action, time_limit, base=base, drivers=drivers, horizon=horizon)
+        EgoCheckRequest(
+            ego, env, algo, trust, observation, action, time_limit, base=base, drivers=drivers, horizon=horizon
+        )
     )
     code = exit_code(findings)
     if as_json:

@@ -1,45 +1,50 @@
-"""What a check of an ego has found."""
+"""Findings of the checks of an ego, and the exit code that they amount to."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Literal
 
-Status = Literal["pass", "warn", "fail"]
+FindingStatus = Literal["pass", "warn", "fail"]
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of a check's table."""
+    """One line of the table of a check.
+
+    Example:
+        >>> exit_code([report_pass("memory", "none"), report_warning("actions", "NaN", "check the weights")])
+        3
+    """
 
     check: str
-    """What was looked at."""
-    status: Status
+    """The property that was checked."""
+    status: FindingStatus
     found: str
-    """What was found."""
+    """The result, in words."""
     advice: str = ""
-    """What to do about it."""
+    """The remedy."""
     doubtful: bool = True
-    """Whether, as a warning, it makes a number doubtful."""
+    """Whether, as a warning, it makes an estimate doubtful."""
 
 
-def passed(check: str, found: str) -> Finding:
-    """Nothing to do."""
+def report_pass(check: str, found: str) -> Finding:
+    """Return a finding that needs no action."""
     return Finding(check, "pass", found)
 
 
-def warned(check: str, found: str, advice: str, doubtful: bool = True) -> Finding:
-    """Something to know; doubtful if a number from this ego may mislead."""
+def report_warning(check: str, found: str, advice: str, doubtful: bool = True) -> Finding:
+    """Return a warning; doubtful if an estimate for this ego may mislead."""
     return Finding(check, "warn", found, advice, doubtful)
 
 
-def failed(check: str, found: str, advice: str) -> Finding:
-    """The ego cannot be used like this."""
+def report_failure(check: str, found: str, advice: str) -> Finding:
+    """Return a finding that rules the ego out."""
     return Finding(check, "fail", found, advice)
 
 
 def exit_code(findings: list[Finding]) -> int:
-    """0: the ego can be used; 2: it cannot; 3: it can, but a number from it is doubtful."""
+    """Return 0 if the ego can be used, 2 if it cannot, 3 if it can but an estimate for it is doubtful."""
     if any(finding.status == "fail" for finding in findings):
         return 2
     return 3 if any(finding.status == "warn" and finding.doubtful for finding in findings) else 0

@@ -1,4 +1,4 @@
-"""An ego in an environment, as the checks of `check-ego` ask it."""
+"""Probe: an ego in its environment with observations to query it with, for the checks of `check-ego`."""
 
 from __future__ import annotations
 
@@ -18,14 +18,15 @@ from rare_envs.simulation.observation import observe
 from rare_envs.simulation.rollout import drive
 from rare_envs.simulation.world import space_of_observations
 
-ROWS = 32
+BATCH_ROWS = 32
+"""Observations in a query."""
 
 Array = NDArray[Any]
 
 
 @dataclass(frozen=True)
 class Probe:
-    """An ego in its environment, and observations to ask it about."""
+    """An ego in its environment, and observations to query it with."""
 
     ego: Any
     problem: DrivingProblem
@@ -34,8 +35,8 @@ class Probe:
 
     @classmethod
     def of(cls, ego: Any, problem: DrivingProblem) -> Probe:
-        """Take observations."""
-        x = problem.base.sample(ROWS, np.random.default_rng(0))
+        """Return a probe with observations of ordinary scenarios at time 0."""
+        x = problem.base.sample(BATCH_ROWS, np.random.default_rng(0))
         with torch.inference_mode():
             start = next(drive(problem.world, problem.driver, torch.from_numpy(x).float()))
             seen = each(torch.Tensor.numpy, observe(start, problem.world.observation))
@@ -43,24 +44,24 @@ class Probe:
 
     @property
     def space(self) -> spaces.Space[Any]:
-        """What the environment observes."""
+        """Space of the environment's observations."""
         return space_of_observations(self.problem.world)
 
-    def changed(self, change: Callable[[Array], Any]) -> Any:
-        """The observations changed by a function, and of their own types."""
+    def transform_seen(self, change: Callable[[Array], Any]) -> Any:
+        """Return the observations after a function, each of its own type."""
         return each(lambda part: np.asarray(change(part)).astype(part.dtype), self.seen)
 
-    def rows(self, size: int) -> Any:
-        """So many observations."""
-        return self.changed(lambda part: np.resize(part, (size, *part.shape[1:])))
+    def repeat_seen(self, size: int) -> Any:
+        """Return as many observations as `size`, repeating those that there are."""
+        return self.transform_seen(lambda part: np.resize(part, (size, *part.shape[1:])))
 
     @property
     def policy(self) -> Any:
-        """The ego behind the wrappers of its training."""
+        """Policy of the ego with the wrappers of its training; None if the ego is a driver."""
         return self.problem.driver.policy if isinstance(self.problem.driver, PolicyDriver) else None
 
-    def ask(self, observation: Any, state: Any = None, start: Any = None) -> tuple[Array, Any]:
-        """Actions as numbers, and the memory."""
+    def query(self, observation: Any, state: Any = None, start: Any = None) -> tuple[Array, Any]:
+        """Return the actions as numbers, and the memory."""
         begun = np.full(batch_size(observation), state is None) if start is None else start
         action, state = self.policy.predict(
             each(np.copy, observation), state=state, episode_start=begun, deterministic=True
@@ -68,8 +69,8 @@ class Probe:
         return np.asarray(action), state
 
 
-def differ(one: Array, other: Array) -> float:
-    """Largest difference of actions; infinite where shapes or NaN differ."""
+def largest_difference(one: Array, other: Array) -> float:
+    """Return the largest difference of actions; infinite where shapes or NaN differ."""
     if one.shape != other.shape:
         return np.inf
     apart = np.abs(one.astype(float) - other.astype(float))

@@ -1,4 +1,4 @@
-"""Does a server keep to the protocol of docs/remote.md? Asked over the socket, message by message."""
+"""Conformance of a server to the protocol of docs/remote.md, tested over its socket message by message."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from gymnasium import spaces
 
 from rare_envs.egos.faults import EgoGone, reason_of
 from rare_envs.sensors.kinds import each
-from rare_envs.study.ego_check.findings import Finding, failed, passed
+from rare_envs.study.ego_check.findings import Finding, report_failure, report_pass
 
-ADVICE = "docs/remote.md has the protocol"
+PROTOCOL_ADVICE = "docs/remote.md has the protocol"
 
 
-def conformance(spec: str) -> Iterator[Finding]:
+def check_protocol(spec: str) -> Iterator[Finding]:
     """Check a server.
 
     Args:
@@ -27,7 +27,7 @@ def conformance(spec: str) -> Iterator[Finding]:
         from agents.remote.client import TIMEOUT, LinkError, parse_address
         from agents.remote.zmq_link import SECRET, ZmqLink
     except ImportError:
-        yield failed("protocol", "pyzmq and msgpack are not installed", "pip install 'rare-envs[remote]'")
+        yield report_failure("protocol", "pyzmq and msgpack are not installed", "pip install 'rare-envs[remote]'")
         return
     address, settings = parse_address(spec)
     timeout = settings.get("timeout", TIMEOUT)
@@ -46,20 +46,20 @@ def conformance(spec: str) -> Iterator[Finding]:
             {"type": "hello", "protocol": protocol.PROTOCOL, "client": "check-ego", "id": next(numbers)}, timeout
         )
         if hello.get("type") != "hello" or hello.get("protocol") != protocol.PROTOCOL:
-            yield failed("handshake", f"{hello.get('reason', hello)}", ADVICE)
+            yield report_failure("handshake", f"{hello.get('reason', hello)}", PROTOCOL_ADVICE)
             return
-        yield passed("handshake", f"protocol {protocol.PROTOCOL}, {hello.get('name', 'no name')!r}")
-        yield _expected("before hello", before, "error")
-        for name, act in _questions(hello).items():
+        yield report_pass("handshake", f"protocol {protocol.PROTOCOL}, {hello.get('name', 'no name')!r}")
+        yield _compare_reply("before hello", before, "error")
+        for name, act in _protocol_cases(hello).items():
             yield from act(name, ask)
     except (LinkError, EgoGone, ValueError) as error:
-        yield failed("protocol", reason_of(error), f"is it running at {address}? {ADVICE}")
+        yield report_failure("protocol", reason_of(error), f"is it running at {address}? {PROTOCOL_ADVICE}")
     finally:
         link.close()
 
 
-def _questions(hello: Any) -> dict[str, Callable[[str, Any], Iterator[Finding]]]:
-    """What is asked after the hello."""
+def _protocol_cases(hello: Any) -> dict[str, Callable[[str, Any], Iterator[Finding]]]:
+    """Return the cases after the handshake, name to test."""
     from agents.remote.request_handler import decode_space
 
     space = decode_space(hello.get("observation")) or spaces.Box(-5.0, 5.0, (7,), np.float32)
@@ -75,7 +75,7 @@ def _questions(hello: Any) -> dict[str, Callable[[str, Any], Iterator[Finding]]]
         def run(name: str, ask: Any) -> Iterator[Finding]:
             for message in messages:
                 reply = ask(message)
-            yield _expected(name, reply, kind)
+            yield _compare_reply(name, reply, kind)
 
         return run
 
@@ -83,7 +83,7 @@ def _questions(hello: Any) -> dict[str, Callable[[str, Any], Iterator[Finding]]]
         for session in (11, 12):
             ask({"type": "reset", "session": session, "batch": 3})
         kinds = [ask(act(session, step)).get("type") for step in (0, 1) for session in (11, 12)]
-        yield _expected(name, {"type": kinds[0] if len(set(kinds)) == 1 else kinds}, "action")
+        yield _compare_reply(name, {"type": kinds[0] if len(set(kinds)) == 1 else kinds}, "action")
 
     reset = {"type": "reset", "session": 1, "batch": 3}
     empty = {"dtype": "<f4", "shape": [3, 7], "data": b""}
@@ -105,9 +105,9 @@ def _questions(hello: Any) -> dict[str, Callable[[str, Any], Iterator[Finding]]]
     }
 
 
-def _expected(name: str, reply: Any, kind: str) -> Finding:
-    """Whether an answer is of the kind that the protocol says."""
+def _compare_reply(name: str, reply: Any, kind: str) -> Finding:
+    """Return whether a reply is of the kind that the protocol demands."""
     found = reply.get("type")
     if found == kind:
-        return passed(name, f"{kind}: {reply['reason']}" if kind == "error" and "reason" in reply else kind)
-    return failed(name, f"got {found!r} ({reply.get('reason', '')}), expected {kind!r}", ADVICE)
+        return report_pass(name, f"{kind}: {reply['reason']}" if kind == "error" and "reason" in reply else kind)
+    return report_failure(name, f"got {found!r} ({reply.get('reason', '')}), expected {kind!r}", PROTOCOL_ADVICE)

@@ -18,26 +18,26 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from rare_envs.study.ego_check.findings import Finding, failed, passed, warned
+from rare_envs.study.ego_check.findings import Finding, report_failure, report_pass, report_warning
 from rare_envs.study.errors import BadInput
 
-START = 60.0
-"""Seconds that the process may take before its first check."""
+START_TIMEOUT = 60.0
+"""Duration that the process may take before its first check [s]."""
 
 
 @dataclass(frozen=True)
-class Asked:
-    """What is to be checked.
+class EgoCheckRequest:
+    """An ego, and the environment in which it is checked.
 
     Attributes:
         ego: As for `agents.load_ego`.
         env_id: Environment.
         algo: Algorithm of a `.zip`, if the file does not tell.
         trust: As for `agents.load_ego`.
-        observation: What the ego observes; None for what it asks for itself.
-        action: What it decides.
-        time_limit: Seconds that one check may take.
-        base: Base distribution of the scenarios it is tried on; the environment's default when None.
+        observation: Observation of the ego; None for the one that it declares.
+        action: Kind of its actions.
+        time_limit: Duration that one check may take [s].
+        base: Base distribution of the scenarios that it drives; the environment's default when None.
         drivers: Of the vehicles around it; the environment's default when None.
         horizon: Length of an episode [s]; the environment's when None.
     """
@@ -54,14 +54,14 @@ class Asked:
     horizon: float | None = None
 
 
-def check_ego(asked: Asked) -> list[Finding]:
+def check_ego(request: EgoCheckRequest) -> list[Finding]:
     """Check an ego.
 
     Args:
-        asked: What is to be checked.
+        request: The ego and its environment.
 
     Returns:
-        What was found, in order; the last finding is a failure if the ego cannot even be loaded, hangs or dies.
+        The findings in order; the last one is a failure if the ego cannot be loaded, hangs or dies.
 
     Raises:
         BadInput: The environment is unknown, or there is no such file.
@@ -72,55 +72,59 @@ def check_ego(asked: Asked) -> list[Finding]:
     from rare_envs.scenarios.registry import find_scenario
 
     try:
-        find_scenario(asked.env_id)
+        find_scenario(request.env_id)
     except ValueError as error:
         raise BadInput(error) from error
-    if asked.time_limit <= 0:
-        raise BadInput(f"Expected a time limit of some seconds, got {asked.time_limit}.")
-    name = strip_prefixes(asked.ego)
+    if request.time_limit <= 0:
+        raise BadInput(f"Expected a time limit of some seconds, got {request.time_limit}.")
+    name = strip_prefixes(request.ego)
     findings, kind = [], find_ego_kind(name)
     if kind == "url":
-        return [failed("origin", f"{name!r} is a remote place", "download the file, look where it comes from, name it")]
+        return [
+            report_failure(
+                "origin", f"{name!r} is a remote place", "download the file, look where it comes from, name it"
+            )
+        ]
     if kind == "zip":
         reasons = find_origin_risks(Path(name), find_statistics(Path(name)))
-        if reasons and not asked.trust:
-            return [failed("origin", "; ".join(reasons), TRUST_ADVICE)]
+        if reasons and not request.trust:
+            return [report_failure("origin", "; ".join(reasons), TRUST_ADVICE)]
         place = f" ({'; '.join(reasons)})" if reasons else ""
-        advice = f"you said --trust: {TRUSTED}" if asked.trust else "opened here is only what is known to be harmless"
-        findings.append(warned("origin", f"a Stable-Baselines3 .zip can hold code{place}", advice, False))
-    return findings + list(_in_a_process(asked))
+        advice = f"you said --trust: {TRUSTED}" if request.trust else "opened here is only what is known to be harmless"
+        findings.append(report_warning("origin", f"a Stable-Baselines3 .zip can hold code{place}", advice, False))
+    return findings + list(_check_in_subprocess(request))
 
 
-def _in_a_process(asked: Asked) -> Iterator[Finding]:
-    """Findings of a process of its own; of the process itself, if it hangs or dies."""
-    words = [sys.executable, "-m", "rare_envs.study.ego_check.subprocess_check", json.dumps(asdict(asked))]
+def _check_in_subprocess(request: EgoCheckRequest) -> Iterator[Finding]:
+    """Yield the findings of a subprocess, and a failure if it hangs or dies."""
+    words = [sys.executable, "-m", "rare_envs.study.ego_check.subprocess_check", json.dumps(asdict(request))]
     with subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True) as process:
         lines: queue.Queue[str | None] = queue.Queue()
-        threading.Thread(target=_pass_on, args=(process.stdout, lines), daemon=True).start()
-        doing, limit, done = "loading", max(START, asked.time_limit), False
+        threading.Thread(target=_forward_lines, args=(process.stdout, lines), daemon=True).start()
+        doing, limit, done = "loading", max(START_TIMEOUT, request.time_limit), False
         while not done:
             try:
                 line = lines.get(timeout=limit)
             except queue.Empty:
                 process.kill()
                 advice = "an ego that hangs stops the run; process:EGO?timeout=SECONDS would end it there"
-                yield failed(doing, f"no end after {limit:g} s", advice)
+                yield report_failure(doing, f"no end after {limit:g} s", advice)
                 return
             if line is None:
                 break
-            with suppress(json.JSONDecodeError):  # what else might be written
+            with suppress(json.JSONDecodeError):  # other output of libraries
                 event = json.loads(line)
-                doing, limit = event.get("doing", doing), asked.time_limit
+                doing, limit = event.get("doing", doing), request.time_limit
                 done = event.get("done", False)
                 if "finding" in event:
                     yield Finding(**event["finding"])
         if not done:
             status = process.wait()
             advice = "an ego that ends its process ends the run; process:EGO would survive it"
-            yield failed(doing, f"the process ended (exit status {status})", advice)
+            yield report_failure(doing, f"the process ended (exit status {status})", advice)
 
 
-def _pass_on(stream: Any, lines: queue.Queue[str | None]) -> None:
+def _forward_lines(stream: Any, lines: queue.Queue[str | None]) -> None:
     for line in stream:
         lines.put(line)
     lines.put(None)
@@ -129,54 +133,54 @@ def _pass_on(stream: Any, lines: queue.Queue[str | None]) -> None:
 # --- in that process ---------------------------------------------------------------------------
 
 
-def findings_of(asked: Asked) -> Iterator[Finding | str]:
-    """Load the ego and check it: findings, and before each check its name."""
+def run_checks(request: EgoCheckRequest) -> Iterator[Finding | str]:
+    """Load the ego and check it: yield findings, and before each check its name."""
     import agents
     from agents.loading import find_ego_kind
     from rare_envs import DrivingProblem
     from rare_envs.egos.faults import EgoGone, reason_of
     from rare_envs.problem import AmbiguousActions
-    from rare_envs.study.ego_check.behaviour import CHECKS, drives
+    from rare_envs.study.ego_check.behaviour import EGO_CHECKS, check_driving
     from rare_envs.study.ego_check.probe import Probe
-    from rare_envs.study.ego_check.protocol import conformance
+    from rare_envs.study.ego_check.protocol import check_protocol
 
-    if find_ego_kind(asked.ego) == "remote":
+    if find_ego_kind(request.ego) == "remote":
         yield "protocol"
-        found = list(conformance(asked.ego))
+        found = list(check_protocol(request.ego))
         yield from found
         if any(finding.status == "fail" for finding in found):
             return
     yield "loading"
     try:
-        ego = agents.load_ego(asked.ego, algo=asked.algo, trust=asked.trust)
-        yield passed("loading", f"{type(ego).__name__}" if not isinstance(ego, str) else ego)
+        ego = agents.load_ego(request.ego, algo=request.algo, trust=request.trust)
+        yield report_pass("loading", f"{type(ego).__name__}" if not isinstance(ego, str) else ego)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", AmbiguousActions)
             problem = DrivingProblem(
-                asked.env_id,
+                request.env_id,
                 ego=ego,
-                observation=asked.observation,
-                action=asked.action,
-                base=asked.base,
-                drivers=asked.drivers,
-                horizon=asked.horizon,
+                observation=request.observation,
+                action=request.action,
+                base=request.base,
+                drivers=request.drivers,
+                horizon=request.horizon,
             )
         for note in problem.notes:
-            yield warned("action space", note, "say --action meta if it was trained there")
+            yield report_warning("action space", note, "say --action meta if it was trained there")
         probe = Probe.of(ego, problem)
     except (Exception, SystemExit, EgoGone) as error:  # the ego is the user's: anything may happen in it
-        yield failed("loading", reason_of(error), "see docs/egos.md for what an ego is")
+        yield report_failure("loading", reason_of(error), "see docs/egos.md for what an ego is")
         return
-    for check in CHECKS if probe.policy is not None else (drives,):
-        name = check.__name__.replace("_", " ")
+    for check in EGO_CHECKS if probe.policy is not None else (check_driving,):
+        name = check.__name__.removeprefix("check_").replace("_", " ")
         yield name
         try:
             yield from check(probe)
         except EgoGone as error:
-            yield failed(name, reason_of(error), "start it again")
+            yield report_failure(name, reason_of(error), "start it again")
             return
         except (Exception, SystemExit) as error:  # likewise
-            yield failed(name, reason_of(error), "the ego failed when it was asked")
+            yield report_failure(name, reason_of(error), "the ego failed in this check")
 
 
 def _main(arguments: str) -> None:
@@ -185,7 +189,7 @@ def _main(arguments: str) -> None:
     import torch
 
     torch.set_num_threads(1)
-    for each in findings_of(Asked(**json.loads(arguments))):
+    for each in run_checks(EgoCheckRequest(**json.loads(arguments))):
         out.write(json.dumps({"doing": each} if isinstance(each, str) else {"finding": asdict(each)}) + "\n")
     out.write(json.dumps({"done": True}) + "\n")
 

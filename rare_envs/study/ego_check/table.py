@@ -1,4 +1,4 @@
-"""The table of a check, for a person."""
+"""Table of the findings, printed for a person."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ VERDICTS = {
 
 
 def print_findings(findings: list[Finding], title: str) -> None:
-    """Print what was found, and what to do about it."""
+    """Print findings with their remedies, and the verdict."""
     console = Console(highlight=False)
     table = Table("check", "", "found", "what to do", title=Text(title), title_justify="left", title_style="bold")
     for each in findings:

@@ -13,7 +13,7 @@ from agents import Provenance, load_ego
 from agents.vision.checkpoint import load_vision, read_vision_provenance, save_vision
 from agents.vision.ego import LAG, SPEED_SCALE, VisionEgo, recall, to_actions
 from agents.vision.pilotnet import HEIGHT, WIDTH, PilotNet, luma
-from rare_envs.study.ego_check.subprocess_check import Asked, check_ego
+from rare_envs.study.ego_check.subprocess_check import EgoCheckRequest, check_ego
 
 CUT_IN = "rare_envs/CutIn-v0"
 
@@ -145,7 +145,7 @@ def test_it_drives_behind_a_stack_and_in_a_process_of_its_own(spec: str) -> None
 
 
 def test_check_ego_finds_nothing_wrong_with_it() -> None:
-    findings = check_ego(Asked("vision", CUT_IN, horizon=0.5))
+    findings = check_ego(EgoCheckRequest("vision", CUT_IN, horizon=0.5))
     assert {finding.check for finding in findings} >= {"memory", "latency", "driving"}
     assert {finding.status for finding in findings if finding.check != "latency"} == {"pass"}
 

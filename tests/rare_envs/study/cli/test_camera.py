@@ -14,7 +14,7 @@ from typer.testing import Result
 
 import rare_envs
 from rare_envs.study.columns import digits
-from rare_envs.study.ego_check.behaviour import CHECKS
+from rare_envs.study.ego_check.behaviour import EGO_CHECKS
 from rare_envs.study.ego_check.probe import Probe
 
 Cli = Callable[..., Result]
@@ -45,8 +45,8 @@ def test_an_ego_that_sees_is_checked(observation: str) -> None:
     ego = Sees(space)
     problem = rare_envs.DrivingProblem(CUT_IN, ego=ego, **settings)
     probe = Probe.of(ego, problem)
-    findings = [finding for check in CHECKS for finding in check(probe)]
-    assert len(findings) >= len(CHECKS) - 1
+    findings = [finding for check in EGO_CHECKS for finding in check(probe)]
+    assert len(findings) >= len(EGO_CHECKS) - 1
     assert [finding for finding in findings if finding.status != "pass"] == []
 
 

@@ -15,7 +15,7 @@ import agents
 import rare_envs
 from rare_envs.problem import AmbiguousActions
 from rare_envs.study.ego_check.findings import Finding
-from rare_envs.study.ego_check.subprocess_check import Asked, findings_of
+from rare_envs.study.ego_check.subprocess_check import EgoCheckRequest, run_checks
 from rare_envs.study.run_directory import CRASH, read_failures
 
 Cli = Callable[..., Result]
@@ -152,8 +152,8 @@ def test_what_actions_are_taken_for_is_pointed_out(cli: Cli, tmp_path: Path, mon
     )
     assert json.loads(cli(*both, "--json").stdout)["notes"] == [f"A: {note}"]
     assert f"note: A: {note}" in cli(*both).stdout
-    asked = Asked("idle_egos:Idle", FOLLOWING, observation="kinematics")
-    (found,) = (each for each in findings_of(asked) if isinstance(each, Finding) and each.found == note)
+    asked = EgoCheckRequest("idle_egos:Idle", FOLLOWING, observation="kinematics")
+    (found,) = (each for each in run_checks(asked) if isinstance(each, Finding) and each.found == note)
     assert (found.check, found.status) == ("action space", "warn")
     with pytest.warns(AmbiguousActions, match="--action meta"):
         rare_envs.DrivingProblem(FOLLOWING, ego=agents.load_ego("idle_egos:Idle"), observation="kinematics")

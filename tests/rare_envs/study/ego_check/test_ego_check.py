@@ -16,7 +16,7 @@ from typer.testing import Result
 import agents
 from agents.sb3.file_trust import find_origin_risks
 from rare_envs.study.ego_check.findings import Finding, exit_code
-from rare_envs.study.ego_check.subprocess_check import Asked, findings_of
+from rare_envs.study.ego_check.subprocess_check import EgoCheckRequest, run_checks
 
 Cli = Callable[..., Result]
 ENV = "rare_envs/CarFollowing-v0"
@@ -139,7 +139,7 @@ def broken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
 
 
 def findings(ego: str) -> dict[str, Finding]:
-    return {each.check: each for each in findings_of(Asked(ego, ENV)) if isinstance(each, Finding)}
+    return {each.check: each for each in run_checks(EgoCheckRequest(ego, ENV)) if isinstance(each, Finding)}
 
 
 @pytest.mark.parametrize(
@@ -149,7 +149,7 @@ def findings(ego: str) -> dict[str, Finding]:
         ("another_unit", "action space", "warn", "from [-5.0, -5.0] to [5.0, 5.0]"),
         ("another_shape", "loading", "fail", "expects observations"),
         ("lies_about_actions", "actions", "fail", "says Discrete(5)"),
-        ("lies_about_observations", "acts", "fail", "ValueError"),
+        ("lies_about_observations", "actions", "fail", "ValueError"),
         ("short", "actions", "fail", "shape (31, 2)"),
         ("nan", "actions", "fail", "NaN or infinite for 32 of 32"),
         ("nan_at_zero", "range", "fail", "zeros: NaN"),
@@ -161,7 +161,7 @@ def findings(ego: str) -> dict[str, Finding]:
         ("never_begins_anew", "memory", "warn", "rows that begin an episode are off"),
         ("wild", "driving", "warn", "collides in"),
         ("leaking", "space", "warn", "MB more after 100 calls"),
-        ("raising", "acts", "fail", "RuntimeError: no weights"),
+        ("raising", "actions", "fail", "RuntimeError: no weights"),
         ("no_ego", "loading", "fail", "an object with predict, got int"),
     ],
 )
@@ -170,7 +170,7 @@ def findings(ego: str) -> dict[str, Finding]:
 def test_each_rule_finds_the_ego_that_breaks_it(broken: str, ego: str, check: str, status: str, found: str) -> None:
     result = findings(f"{broken}:{ego}")
     assert result[check].status == status, result
-    assert found in result[check].found or (check == "acts" and result[check].found), result[check]
+    assert found in result[check].found or (check == "actions" and result[check].found), result[check]
     assert result[check].advice
     assert exit_code(list(result.values())) in ((2,) if status == "fail" else (0, 2, 3))
 
@@ -197,7 +197,7 @@ def test_the_check_outlives_the_ego(broken: str, ego: str, cli: Cli) -> None:
     answer = json.loads(result.stdout)
     assert result.exit_code == 2
     last = answer["findings"][-1]
-    assert (last["check"], last["status"]) == ("acts", "fail")
+    assert (last["check"], last["status"]) == ("actions", "fail")
     assert ("exit status 9" if ego == "dying" else "no end after 2 s") in last["found"]
     assert "process:EGO" in last["advice"]
 
@@ -240,7 +240,7 @@ def test_an_ego_that_is_not_what_it_says_is_one_line_and_one_finding(
         ego = f"liars_here:{name}"
         result = cli("estimate", ENV, "--ego", ego, "--method", "mc", "--max-sim", 5, "--horizon", 1)
         assert (result.exit_code, result.stdout, result.stderr.count("\n")) == (2, "", 1), (name, result.output)
-        found = [each for each in findings_of(Asked(ego, ENV, horizon=1.0)) if isinstance(each, Finding)]
+        found = [each for each in run_checks(EgoCheckRequest(ego, ENV, horizon=1.0)) if isinstance(each, Finding)]
         assert exit_code(found) == 2, (name, found)
 
 
