@@ -123,8 +123,8 @@ class NoisyEgo:
         Raises:
             ValueError: The ego does not fit the world, or decides meta-actions.
         """
-        if world.action != "continuous":
-            raise ValueError(f'Expected action="continuous" for an ego behind a stack, got {world.action!r}.')
+        if world.clock.action != "continuous":
+            raise ValueError(f'Expected action="continuous" for an ego behind a stack, got {world.clock.action!r}.')
         return NoisyDriver(as_driver(self.ego, world), self.stack, world)
 
 
@@ -159,13 +159,13 @@ class NoisyDriver:
     @property
     def every(self) -> int:
         """Ticks from plan to plan."""
-        return max(1, round(self.stack.period / self.world.dt))
+        return max(1, round(self.stack.period / self.world.clock.dt))
 
     @property
     def shape(self) -> tuple[int, int]:
         """Of an episode's draws: plans and K."""
         others = self.world.scenario.vehicles - 1
-        return math.ceil(self.world.ticks / self.every), OWN_ERRORS + ERRORS_PER_VEHICLE * others
+        return math.ceil(self.world.clock.ticks / self.every), OWN_ERRORS + ERRORS_PER_VEHICLE * others
 
     @property
     def columns(self) -> int:
@@ -182,7 +182,7 @@ class NoisyDriver:
         if memory is None:
             nothing = state.x.new_zeros(len(state.x), 2)
             memory = _StackMemory(0, (), state.x.new_zeros(len(state.x), self.shape[1]), None, nothing, nothing)
-        back = round(self.stack.latency / self.world.dt)
+        back = round(self.stack.latency / self.world.clock.dt)
         past = (*memory.past, state)[-back - 1 :]
         plans = memory.tick % self.every == 0
         errors = self._later(memory.errors, memory.tick // self.every) if plans else memory.errors
@@ -208,7 +208,7 @@ class NoisyDriver:
         if plan == 0:
             return fresh
         tau = self.stack.correlation
-        kept = math.exp(-self.every * self.world.dt / tau) if tau else 0.0
+        kept = math.exp(-self.every * self.world.clock.dt / tau) if tau else 0.0
         return kept * errors + math.sqrt(1.0 - kept * kept) * fresh
 
     def _seen(self, now: State, late: State, errors: Tensor) -> State:
@@ -232,7 +232,7 @@ class NoisyDriver:
 
     def _done(self, before: Tensor, wanted: Tensor) -> Tensor:
         """What the actuators make of it within a tick: first-order lags with limited rates."""
-        stack, dt = self.stack, self.world.dt
+        stack, dt = self.stack, self.world.clock.dt
         shares = [1.0 - math.exp(-dt / lag) if lag else 1.0 for lag in (stack.lag, stack.steering_lag)]
         most = before.new_tensor([stack.jerk * dt, stack.steering_rate * dt])
         change = (wanted - before) * before.new_tensor(shares)

@@ -38,10 +38,10 @@ def main(
     renderer, frames, contacts, off = Renderer(problem.world), [], 0, 0
     with torch.inference_mode():
         for tick, episode in enumerate(drive(problem.world, problem.driver, x)):
-            image = renderer.draw(episode, tick * problem.world.dt)
+            image = renderer.draw(episode, tick * problem.world.clock.dt)
             if out is not None:
                 frames.append(Image.fromarray(image).quantize(64))
-            if still is not None and tick == round(at / problem.world.dt):
+            if still is not None and tick == round(at / problem.world.clock.dt):
                 Image.fromarray(image).save(still)
             contacts += int(pairwise_overlaps(episode.state, road).sum()) // 2
             off += int(road.off_road(episode.state.y).sum())

@@ -16,6 +16,9 @@ from rare_envs.scenarios.registry import find_scenario
 from rare_envs.sensors.camera import find_camera
 from rare_envs.sensors.kinds import read_kinds
 from rare_envs.simulation.background import find_drivers
+from rare_envs.simulation.clock import Clock
+from rare_envs.simulation.measurement import Measurement
+from rare_envs.simulation.sensing import Sensing
 from rare_envs.simulation.world import World
 
 
@@ -80,19 +83,14 @@ def set_up(
     background = find_drivers(scenario.drivers if drivers is None else drivers)
     world = World(
         scenario,
-        dt=dt,
-        horizon=horizon,
-        measure=named_measure(measure),
-        drivers=background,
+        sensing=Sensing(kinds, find_camera(camera), weather),
+        background=background,
+        measurement=Measurement(named_measure(measure), collisions),
+        clock=Clock(dt, scenario.horizon if horizon is None else horizon, action),
         noise=noise,
-        observation=kinds,
-        action=action,
-        collisions=collisions,
-        camera=find_camera(camera),
-        weather=weather,
     )
     space = space_of(world, load_base(scenario, base))
-    if not isinstance(world.measure, str):
+    if not isinstance(world.measurement.measure, str):
         _try_measure(world, space)
     return world, space
 
@@ -105,12 +103,13 @@ def _try_measure(world: World, space: ScenarioSpace) -> None:
         ValueError: If it raises, or does not give one finite number for each.
     """
     x = torch.from_numpy(space.sample(2, np.random.default_rng(0))).float()
+    measure = world.measurement.measure
     try:
         f = world.step(world.start(x), torch.zeros(2, 2)).f
     except Exception as error:  # the function is the user's: anything may happen in it
-        raise ValueError(f"The measure {world.measure!r} fails on two ordinary scenarios: {error}") from error
+        raise ValueError(f"The measure {measure!r} fails on two ordinary scenarios: {error}") from error
     if not bool(torch.isfinite(f).all()):
-        raise ValueError(f"Expected finite numbers from the measure {world.measure!r}, got {f.tolist()}.")
+        raise ValueError(f"Expected finite numbers from the measure {measure!r}, got {f.tolist()}.")
 
 
 def space_of(world: World, base: Distribution) -> ScenarioSpace:
@@ -120,17 +119,17 @@ def space_of(world: World, base: Distribution) -> ScenarioSpace:
         world: The world.
         base: Distribution of the scenario's own parameters.
     """
-    parameters, distributions = list(world.scenario.parameters), [base]
+    parameters, distributions, sizes = list(world.scenario.parameters), [base], world.columns
     for weather, distribution in world.weather_distributions:
         parameters += weather
         distributions.append(distribution)
-    if world.drivers is not None and world.drivers.weights is not None:
-        parameters.append(Parameter("weights", "", -np.inf, np.inf, "of the drivers' last layer", world.weights))
-        distributions.append(world.drivers.weights)
-    if world.draws:
-        parameters.append(Parameter("noise", "", -np.inf, np.inf, "of the drivers, tick by tick", world.draws))
-        distributions.append(NoiseDistribution(world.draws))
-    if world.keys:
+    if world.background is not None and world.background.weights is not None:
+        parameters.append(Parameter("weights", "", -np.inf, np.inf, "of the drivers' last layer", sizes.weights))
+        distributions.append(world.background.weights)
+    if sizes.noise:
+        parameters.append(Parameter("noise", "", -np.inf, np.inf, "of the drivers, tick by tick", sizes.noise))
+        distributions.append(NoiseDistribution(sizes.noise))
+    if sizes.camera_noise:
         parameters.append(Parameter("camera_noise", "", -np.inf, np.inf, "from which the noise of all pixels follows"))
         distributions.append(NoiseDistribution(1))
     names = [p.name for p in parameters]

@@ -18,6 +18,7 @@ from rare_envs.egos.wrappers import observation_for
 from rare_envs.make import set_up, with_noise
 from rare_envs.scenarios.registry import find_scenario
 from rare_envs.sensors.kinds import kinds_of
+from rare_envs.simulation.measurement import Measurement
 from rare_envs.simulation.rollout import rollout
 from rare_envs.simulation.world import World
 from rare_envs.traffic.crash import CRASH_KINDS, Crash
@@ -104,7 +105,7 @@ class DrivingProblem:
             warnings.warn(note, AmbiguousActions, stacklevel=2)
         self.space = with_noise(self.space, "ego_noise", getattr(self.driver, "columns", 0))
         if getattr(self.driver, "sees", False):
-            self.world = replace(self.world, lidar=True)
+            self.world = self.world.with_lidar()
 
     @property
     def dim(self) -> int:
@@ -114,7 +115,7 @@ class DrivingProblem:
     @property
     def notes(self) -> tuple[str, ...]:
         """What could not be checked and may be meant otherwise; an `AmbiguousActions` warning has said it."""
-        meant = self.world.action == "continuous" and "kinematics" in kinds_of(self.world.observation)
+        meant = self.world.clock.action == "continuous" and "kinematics" in kinds_of(self.world.sensing.observation)
         return (AMBIGUOUS,) if meant and isinstance(getattr(self.ego, "action_space", None), spaces.Discrete) else ()
 
     @property
@@ -125,9 +126,9 @@ class DrivingProblem:
             return ", ".join(fixed)
         if hasattr(self.driver, "columns"):
             fixed.append("the ego's noise is one fixed sequence")
-        if self.world.drivers is not None and self.world.drivers.noisy:
+        if self.world.background is not None and self.world.background.noisy:
             fixed.append("the drivers' noise is one fixed sequence")
-        if self.world.weather:
+        if self.world.sensing.weather:
             fixed.append("the camera's noise is one fixed pattern of each tick")
         return ", ".join(fixed)
 
@@ -182,7 +183,8 @@ class DrivingProblem:
             ValueError: If x has the wrong shape, is NaN or outside the physical box, or if the policy returns NaN.
         """
         x = self.space.validate(np.atleast_2d(x))
-        world, found = replace(self.world, measure="ttc", witnessed=True), []
+        measurement = Measurement("ttc", self.world.measurement.collisions, statistics=True)
+        world, found = replace(self.world, measurement=measurement), list[Crash]()
         with torch.inference_mode():
             for first in range(0, len(x), self.tile):
                 rows = torch.from_numpy(x[first : first + self.tile]).float()
@@ -199,9 +201,9 @@ class DrivingProblem:
     def tile(self) -> int:
         """Rollouts at once: `evaluate` simulates so many rows together, then the next."""
         asked = getattr(self.driver, "inner", self.driver)
-        if isinstance(asked, PolicyDriver) and "camera" in kinds_of(self.world.observation):
+        if isinstance(asked, PolicyDriver) and "camera" in kinds_of(self.world.sensing.observation):
             return CAMERA_TILE
-        if self.world.sees or self.world.recorded:
+        if self.world.uses_lidar or self.world.measurement.records:
             return LIDAR_TILE
         return POLICY_TILE if isinstance(self.driver, PolicyDriver) else RULE_TILE
 
@@ -221,7 +223,9 @@ class DrivingProblem:
         for row in np.flatnonzero(np.isnan(f)):
             if lost is None:
                 named = {name: value for name, value in self.space.named(x[row]).items() if np.size(value) == 1}
-                raise ValueError(f"The measure {self.world.measure!r} gave NaN, first at row {row}: {named}.")
+                raise ValueError(
+                    f"The measure {self.world.measurement.measure!r} gave NaN, first at row {row}: {named}."
+                )
             lost.setdefault(int(row), "the measure gave NaN")
         return f
 

@@ -70,12 +70,12 @@ def behaviour(problem: rare_envs.DrivingProblem, x: FloatArray) -> dict[str, flo
             speed = episode.state.speed[:, 1:]
             lane = road.lane_of(episode.state.y[:, 1:])
             if before is not None and lanes is not None:
-                hard.append(((speed - before) / problem.world.dt <= -3.0).float().mean())
+                hard.append(((speed - before) / problem.world.clock.dt <= -3.0).float().mean())
                 changes.append((lane != lanes).float().mean())
             before, lanes = speed, lane
             speeds.append(speed.mean())
     return {
         "hard_brake": float(torch.stack(hard).mean()),
-        "lane_changes": float(torch.stack(changes).sum()) * 10.0 / problem.world.seconds,
+        "lane_changes": float(torch.stack(changes).sum()) * 10.0 / problem.world.clock.seconds,
         "speed": float(torch.stack(speeds).mean()),
     }

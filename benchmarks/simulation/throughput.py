@@ -150,7 +150,7 @@ def latency_ratio() -> dict[str, float]:
     result = samplers.estimate(problem, samplers.AdaptiveSubsetSimulation(), seed=0)
     ours = time.process_time() - start
     x = problem.base.sample(20, np.random.default_rng(0))
-    theirs = seconds(lambda: [reference.drive(reference.cut_in(row), problem.world.ticks) for row in x]) / len(x)
+    theirs = seconds(lambda: [reference.drive(reference.cut_in(row), problem.world.clock.ticks) for row in x]) / len(x)
     return {
         "seconds": ours,
         "n_sim": result.n_sim,
@@ -165,7 +165,7 @@ def highway(batch: int, rounds: int) -> dict[str, float]:
     Rates are seconds of traffic over seconds of work.
     """
     problem = rare_envs.DrivingProblem(HIGHWAY, measure="lidar_ttc")
-    seconds_of_traffic = problem.world.seconds
+    seconds_of_traffic = problem.world.clock.seconds
     x = problem.base.sample(batch, np.random.default_rng(0))
     problem.evaluate(x)
     repeat = 1 if batch > 64 else 3
@@ -174,7 +174,7 @@ def highway(batch: int, rounds: int) -> dict[str, float]:
         ours.append(batch * seconds_of_traffic / seconds(lambda: problem.evaluate(x), repeat))
         road = reference.highway(x[0])
         theirs.append(
-            seconds_of_traffic / seconds(lambda road=road: reference.drive_looking(road, problem.world.ticks))
+            seconds_of_traffic / seconds(lambda road=road: reference.drive_looking(road, problem.world.clock.ticks))
         )
     return {**_rates(ours, theirs), "batch": batch}
 
@@ -203,7 +203,7 @@ def camera(batch: int, rounds: int, weather: bool = False) -> dict[str, float]:
         for kind, problem in problems.items():
             x = problem.base.sample(batch, np.random.default_rng(0))
             work = seconds(lambda problem=problem, x=x: problem.evaluate(x))  # type: ignore[misc]
-            rates.setdefault(kind, []).append(batch * problem.world.seconds / work)
+            rates.setdefault(kind, []).append(batch * problem.world.clock.seconds / work)
     return {
         "per_second": float(np.median(rates["camera"])),
         "lidar_per_second": float(np.median(rates["lidar"])),

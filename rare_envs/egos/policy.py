@@ -18,7 +18,7 @@ from rare_envs.sensors.kinds import each
 from rare_envs.simulation.background import Background
 from rare_envs.simulation.observation import observe
 from rare_envs.simulation.rollout import Driver
-from rare_envs.simulation.world import World, space_of_observations
+from rare_envs.simulation.world import World
 
 if TYPE_CHECKING:
     from rare_envs.simulation.episode import Episode
@@ -92,12 +92,12 @@ def as_driver(ego: Any, world: World) -> Driver:
         looking: Driver = ego
         return looking
     if callable(getattr(ego, "predict", None)):
-        expected = space_of_observations(world)
-        check_spaces(ego, expected, world.action)
+        expected = world.observation_space
+        check_spaces(ego, expected, world.clock.action)
         tick = getattr(ego, "dt", None)
-        if tick is not None and tick != world.dt:
-            raise ValueError(f"Expected dt={tick:g} s, which this ego remembers pictures by, got {world.dt:g} s.")
-        return PolicyDriver(fitted(ego, expected), world.observation, world.action, world.stride)
+        if tick is not None and tick != world.clock.dt:
+            raise ValueError(f"Expected dt={tick:g} s, which this ego remembers pictures by, got {world.clock.dt:g} s.")
+        return PolicyDriver(fitted(ego, expected), world.sensing.observation, world.clock.action, world.clock.stride)
     if isinstance(ego, Background):
         raise ValueError("These drivers drive the traffic around an ego; as an ego take agents.LearnedEgo(driver).")
     if callable(getattr(ego, "act", None)):

@@ -1,7 +1,6 @@
 """Several agents in many scenarios: a `gymnasium.vector.VectorEnv` whose rows are agents that share one policy."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rare_envs.control.actions import IDLE, read_actions, space_of_actions
+from rare_envs.control.actions import IDLE, read_actions
 from rare_envs.egos.policy import as_driver
 from rare_envs.envs.batch_rows import merged, put, rows_of
 from rare_envs.envs.parallel import chosen_agents, chosen_rewards
@@ -21,7 +20,6 @@ from rare_envs.multi_agent.rewards import Reward, total_of
 from rare_envs.multi_agent.step import step_agents
 from rare_envs.sensors.kinds import each
 from rare_envs.simulation.observation import observe
-from rare_envs.simulation.world import space_of_observations
 
 Array = NDArray[Any]
 
@@ -65,7 +63,7 @@ class AgentsVectorEnv(VectorEnv[NDArray[np.float32], Array, Array]):
         if not isinstance(scenarios, (int, np.integer)) or isinstance(scenarios, bool) or scenarios < 1:
             raise ValueError(f"Expected one or more scenarios, got {scenarios!r}.")
         world, self.space = set_up(env_id, **kwargs)
-        self.world = replace(world, witnessed=True)
+        self.world = world.with_statistics()
         scenario = self.world.scenario
         self.agents = chosen_agents(scenario, agents)
         self.scenarios = int(scenarios)
@@ -74,8 +72,8 @@ class AgentsVectorEnv(VectorEnv[NDArray[np.float32], Array, Array]):
         by_name = chosen_rewards(self.agents, rewards)
         self._rewards = {vehicle: by_name[agent] for vehicle, agent in zip(self._vehicles, self.agents, strict=True)}
         self._driver = as_driver(ego, self.world)
-        self.single_observation_space = space_of_observations(self.world)
-        self.single_action_space = space_of_actions(self.world.action)
+        self.single_observation_space = self.world.observation_space
+        self.single_action_space = self.world.action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._tick = np.zeros(self.scenarios, dtype=np.int64)
@@ -117,11 +115,11 @@ class AgentsVectorEnv(VectorEnv[NDArray[np.float32], Array, Array]):
             _refuse_memory(memory)
             observation = self._observe(episode)
             reward = self._by_row([total_of(earned[vehicle]) for vehicle in self._vehicles]).double().numpy()
-        self._tick += self.world.stride
+        self._tick += self.world.clock.stride
         collided, ego = episode.collided, episode.views[0].collided
         own = self._by_row([collided[:, vehicle] for vehicle in self._vehicles]).numpy()
         crash = ego.numpy() | own.reshape(self.scenarios, -1).any(axis=1)
-        done = crash | (self._tick >= self.world.ticks)
+        done = crash | (self._tick >= self.world.clock.ticks)
         done_rows, ego_rows = (each.repeat(len(self.agents)) for each in (done, ego.numpy()))
         terminated = own | ego_rows
         infos: dict[str, Any] = {}
@@ -141,10 +139,10 @@ class AgentsVectorEnv(VectorEnv[NDArray[np.float32], Array, Array]):
 
     def _read(self, actions: Tensor) -> tuple[Tensor, Tensor]:
         """Actions of all vehicles, (B, N, 2) or (B, N), and who is commanded (B, N)."""
-        given = read_actions(self.world.action, actions, self.num_envs)
+        given = read_actions(self.world.clock.action, actions, self.num_envs)
         given = given.view(self.scenarios, len(self.agents), *given.shape[1:])
         shape = (self.scenarios, self.world.scenario.vehicles)
-        chosen = torch.full(shape, IDLE) if self.world.action == "meta" else torch.zeros(*shape, 2)
+        chosen = torch.full(shape, IDLE) if self.world.clock.action == "meta" else torch.zeros(*shape, 2)
         chosen[:, self._vehicles] = given
         commanded = torch.zeros(shape, dtype=torch.bool)
         commanded[:, self._vehicles] = True
@@ -155,7 +153,7 @@ class AgentsVectorEnv(VectorEnv[NDArray[np.float32], Array, Array]):
         return torch.stack(columns, dim=1).flatten(0, 1)
 
     def _observe(self, episode: MultiAgentEpisode) -> Any:
-        views = [observe(episode.views[vehicle], self.world.observation) for vehicle in self._vehicles]
+        views = [observe(episode.views[vehicle], self.world.sensing.observation) for vehicle in self._vehicles]
         return each(lambda *parts: self._by_row(list(parts)).numpy(), *views)
 
     def _replaced(self, episode: MultiAgentEpisode, rows: NDArray[np.intp]) -> MultiAgentEpisode:

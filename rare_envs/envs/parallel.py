@@ -1,7 +1,6 @@
 """Several agents at a time: a PettingZoo `ParallelEnv` over the same world as the environment of one."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 from pettingzoo import ParallelEnv
 from torch import Tensor
 
-from rare_envs.control.actions import IDLE, read_actions, space_of_actions
+from rare_envs.control.actions import IDLE, read_actions
 from rare_envs.egos.policy import as_driver
 from rare_envs.envs.info import Info, info_of, step_info
 from rare_envs.envs.rendering import Renderer
@@ -25,7 +24,6 @@ from rare_envs.plugins import did_you_mean
 from rare_envs.scenarios.base import Scenario
 from rare_envs.sensors.kinds import each
 from rare_envs.simulation.observation import observe
-from rare_envs.simulation.world import space_of_observations
 
 Observation = NDArray[np.float32]
 Actions = Mapping[str, Any]
@@ -70,7 +68,7 @@ class DrivingParallelEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  #
             ValueError: If an argument is invalid.
         """
         world, self.space = set_up(env_id, **kwargs)
-        self.world = replace(world, witnessed=True)
+        self.world = world.with_statistics()
         scenario = self.world.scenario
         self.possible_agents = chosen_agents(scenario, agents)
         self.rewards = chosen_rewards(self.possible_agents, rewards)
@@ -78,14 +76,14 @@ class DrivingParallelEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  #
         self.metadata = {
             **self.metadata,
             "name": env_id,
-            "render_fps": round(1.0 / (self.world.dt * self.world.stride)),
+            "render_fps": round(1.0 / (self.world.clock.dt * self.world.clock.stride)),
         }
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"Expected render_mode None, 'rgb_array' or 'human', got {render_mode!r}.")
         self.render_mode = render_mode
         self.agents: list[str] = []
-        self.observation_spaces = {agent: space_of_observations(self.world) for agent in self.possible_agents}
-        self.action_spaces = {agent: space_of_actions(self.world.action) for agent in self.possible_agents}
+        self.observation_spaces = {agent: self.world.observation_space for agent in self.possible_agents}
+        self.action_spaces = {agent: self.world.action_space for agent in self.possible_agents}
         self._vehicles = {agent: scenario.vehicle_names.index(agent) for agent in self.possible_agents}
         self._np_random: np.random.Generator | None = None
         self._renderer: Renderer | None = None
@@ -160,13 +158,13 @@ class DrivingParallelEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  #
                 self.world, self._episode, chosen, commanded, rewards_of, self._driver, self._memory
             )
             self._episode = after
-            self._tick += self.world.stride
+            self._tick += self.world.clock.stride
             terms = {agent: earned[self._vehicles[agent]] for agent in self.agents}
             rewards = {agent: float(total_of(reward)) for agent, reward in terms.items()}
             observations = {agent: self._observe(after, agent) for agent in self.agents}
         views = {agent: self._view(after, agent) for agent in self.agents}
         terminated = {agent: bool(view.collided) for agent, view in views.items()}
-        over = self._tick >= self.world.ticks
+        over = self._tick >= self.world.clock.ticks
         truncated = {agent: over and not terminated[agent] for agent in self.agents}
         infos = {
             agent: step_info(self.space, self._x, view, terms[agent], terminated[agent] or over, self._vehicles[agent])
@@ -178,7 +176,7 @@ class DrivingParallelEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  #
 
     def _read(self, given: Actions) -> tuple[Tensor, Tensor]:
         """Actions of all vehicles, (1, N, 2) or (1, N), and who is commanded (1, N)."""
-        n, kind = self.world.scenario.vehicles, self.world.action
+        n, kind = self.world.scenario.vehicles, self.world.clock.action
         chosen = torch.full((1, n), IDLE) if kind == "meta" else torch.zeros(1, n, 2)
         commanded = torch.zeros(1, n, dtype=torch.bool)
         for agent, action in given.items():
@@ -205,7 +203,7 @@ class DrivingParallelEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  #
 
     def _observe(self, episode: MultiAgentEpisode, agent: str) -> Observation:
         observation: Observation = each(
-            lambda part: part[0].numpy(), observe(self._view(episode, agent), self.world.observation)
+            lambda part: part[0].numpy(), observe(self._view(episode, agent), self.world.sensing.observation)
         )
         return observation
 
@@ -224,7 +222,7 @@ class DrivingParallelEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  #
         crashed = (self._episode.collided | self._episode.disabled)[0].nonzero().flatten().tolist()
         image = self._renderer.draw(
             self._episode.traffic,
-            self._tick * self.world.dt,
+            self._tick * self.world.clock.dt,
             agents=[self._vehicles[agent] for agent in self.possible_agents],
             crashed=crashed,
         )

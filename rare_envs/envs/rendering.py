@@ -178,7 +178,7 @@ def caption(world: World, episode: Episode, time: float | None, row: int = 0) ->
     parts.append(f"ego {float(episode.state.speed[row, 0]):4.1f} m/s")
     parts.append(f"gap {gap:5.1f} m" if np.isfinite(gap) else "nobody ahead")
     parts.append(f"TTC {ttc:4.1f} s" if ttc < 100 else "TTC   -  ")
-    measure = f" ({world.measure})" if isinstance(world.measure, str) else ""
+    measure = f" ({world.measurement.measure})" if isinstance(world.measurement.measure, str) else ""
     parts.append(f"f so far{measure} {float(episode.f[row]):.2f}")
     return "    ".join(parts)
 

@@ -1,6 +1,5 @@
 """One scenario at a time: a `gymnasium.Env` over a batch of one."""
 
-from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -8,7 +7,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from rare_envs.control.actions import read_actions, space_of_actions
+from rare_envs.control.actions import read_actions
 from rare_envs.envs.info import info_of, step_info
 from rare_envs.envs.rendering import Renderer
 from rare_envs.make import set_up
@@ -16,7 +15,6 @@ from rare_envs.sensors.kinds import each
 from rare_envs.simulation.decision import advance
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.observation import observe
-from rare_envs.simulation.world import space_of_observations
 
 Observation = NDArray[np.float32]
 
@@ -46,10 +44,10 @@ class DrivingEnv(gym.Env[Observation, Any]):
             ValueError: If an argument is invalid.
         """
         world, self.space = set_up(env_id, **kwargs)
-        self.world = replace(world, witnessed=True)
-        self.observation_space = space_of_observations(self.world)
-        self.action_space = space_of_actions(self.world.action)
-        self.metadata = {**self.metadata, "render_fps": round(1.0 / (self.world.dt * self.world.stride))}
+        self.world = world.with_statistics()
+        self.observation_space = self.world.observation_space
+        self.action_space = self.world.action_space
+        self.metadata = {**self.metadata, "render_fps": round(1.0 / (self.world.clock.dt * self.world.clock.stride))}
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"Expected render_mode None, 'rgb_array' or 'human', got {render_mode!r}.")
         self.render_mode = render_mode
@@ -67,7 +65,7 @@ class DrivingEnv(gym.Env[Observation, Any]):
             wrapper: The `RecordVideo`, as HighwayEnv's method of this name takes it.
         """
         self._recorder = wrapper
-        wrapper.frames_per_sec = round(1.0 / self.world.dt)
+        wrapper.frames_per_sec = round(1.0 / self.world.clock.dt)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -90,7 +88,7 @@ class DrivingEnv(gym.Env[Observation, Any]):
         self._tick = 0
         with torch.inference_mode():
             self._episode = self.world.start(torch.from_numpy(self._x[None]).float())
-            observation = each(lambda part: part[0].numpy(), observe(self._episode, self.world.observation))
+            observation = each(lambda part: part[0].numpy(), observe(self._episode, self.world.sensing.observation))
         self._show()
         return observation, info_of(self.space, self._x, self._episode)
 
@@ -106,15 +104,15 @@ class DrivingEnv(gym.Env[Observation, Any]):
             wanted = "of shape (2,) (acceleration, steering)" if self.action_space.shape else "as one whole number"
             raise ValueError(f"Expected an action {wanted}, got shape {np.shape(action)}.")
         with torch.inference_mode():
-            given = read_actions(self.world.action, torch.as_tensor(np.asarray(action))[None], 1)
+            given = read_actions(self.world.clock.action, torch.as_tensor(np.asarray(action))[None], 1)
             self._between = False
-            watch = self._watch if self.world.stride > 1 and (self._recorder or self.render_mode == "human") else None
-            episode, terms = advance(self.world, self._episode, given, watch=watch)
-            observation = each(lambda part: part[0].numpy(), observe(episode, self.world.observation))
+            watched = self.world.clock.stride > 1 and (self._recorder or self.render_mode == "human")
+            episode, terms = advance(self.world, self._episode, given, watch=self._watch if watched else None)
+            observation = each(lambda part: part[0].numpy(), observe(episode, self.world.sensing.observation))
             reward = float(terms.total)
-        self._episode, self._tick = episode, self._tick + self.world.stride
+        self._episode, self._tick = episode, self._tick + self.world.clock.stride
         terminated = bool(episode.collided)
-        truncated = not terminated and self._tick >= self.world.ticks
+        truncated = not terminated and self._tick >= self.world.clock.ticks
         info = step_info(self.space, self._x, episode, terms, terminated or truncated)
         self._show()
         return observation, reward, terminated, truncated, info
@@ -139,7 +137,7 @@ class DrivingEnv(gym.Env[Observation, Any]):
         if self._renderer is None:
             window = self.render_mode == "human"
             self._renderer = Renderer(self.world, window, self.metadata["render_fps"])
-        image = self._renderer.draw(self._episode, self._tick * self.world.dt)
+        image = self._renderer.draw(self._episode, self._tick * self.world.clock.dt)
         return None if self.render_mode == "human" else image
 
     def close(self) -> None:

@@ -1,6 +1,5 @@
 """Many scenarios at once: a `gymnasium.vector.VectorEnv` that is one batch, not many environments."""
 
-from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -11,7 +10,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rare_envs.control.actions import read_actions, space_of_actions
+from rare_envs.control.actions import read_actions
 from rare_envs.envs.batch_rows import merged, put, rows_of, with_rows
 from rare_envs.envs.rendering import Renderer
 from rare_envs.make import set_up
@@ -20,7 +19,6 @@ from rare_envs.simulation.decision import advance
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.observation import observe
 from rare_envs.simulation.reward import RewardTerms
-from rare_envs.simulation.world import space_of_observations
 from rare_envs.traffic.crash import CRASH_KINDS, NONE
 
 Info = dict[str, Any]
@@ -56,12 +54,12 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"Expected render_mode None or 'rgb_array' for a batch, got {render_mode!r}.")
         world, self.space = set_up(env_id, **kwargs)
-        self.world = replace(world, witnessed=True)
-        self.metadata = {**self.metadata, "render_fps": round(1.0 / (self.world.dt * self.world.stride))}
+        self.world = world.with_statistics()
+        self.metadata = {**self.metadata, "render_fps": round(1.0 / (self.world.clock.dt * self.world.clock.stride))}
         self.num_envs = int(num_envs)
         self.render_mode = render_mode
-        self.single_observation_space = space_of_observations(self.world)
-        self.single_action_space = space_of_actions(self.world.action)
+        self.single_observation_space = self.world.observation_space
+        self.single_action_space = self.world.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._x = np.full((num_envs, self.space.dim), np.nan)
@@ -93,7 +91,7 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         self._tick[:] = 0
         with torch.inference_mode():
             self._episode = self._start(self._x)
-            observation = each(Tensor.numpy, observe(self._episode, self.world.observation))
+            observation = each(Tensor.numpy, observe(self._episode, self.world.sensing.observation))
         return observation, self._info(self._episode, np.ones(self.num_envs, dtype=bool))
 
     def step(
@@ -107,14 +105,14 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         if self._episode is None:
             raise RuntimeError("Expected reset() before step().")
         with torch.inference_mode():
-            given = read_actions(self.world.action, torch.as_tensor(np.asarray(actions)), self.num_envs)
+            given = read_actions(self.world.clock.action, torch.as_tensor(np.asarray(actions)), self.num_envs)
             episode, terms = advance(self.world, self._episode, given)
-            observation = each(Tensor.numpy, observe(episode, self.world.observation))
+            observation = each(Tensor.numpy, observe(episode, self.world.sensing.observation))
             reward = terms.total.double().numpy()
         self._episode = episode
-        self._tick += self.world.stride
+        self._tick += self.world.clock.stride
         terminated = episode.collided.numpy()
-        truncated = (self._tick >= self.world.ticks) & ~terminated
+        truncated = (self._tick >= self.world.clock.ticks) & ~terminated
         done = terminated | truncated
         infos: Info = {}
         if done.any():
@@ -138,7 +136,7 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         with torch.inference_mode():
             fresh = self._start(x)
             self._episode = merged(self._episode, torch.from_numpy(rows), fresh)
-            seen = each(Tensor.numpy, observe(fresh, self.world.observation))
+            seen = each(Tensor.numpy, observe(fresh, self.world.sensing.observation))
         return with_rows(observation, rows, seen)
 
     def _info(self, episode: Episode, mask: NDArray[np.bool_]) -> Info:
@@ -177,7 +175,7 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
             return None
         if self._renderer is None:
             self._renderer = Renderer(self.world, False, self.metadata["render_fps"])
-        episode, draw, dt = self._episode, self._renderer.draw, self.world.dt
+        episode, draw, dt = self._episode, self._renderer.draw, self.world.clock.dt
         return tuple(draw(episode, self._tick[row] * dt, row).copy() for row in range(self.num_envs))
 
 

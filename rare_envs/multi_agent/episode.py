@@ -35,7 +35,7 @@ def start(world: World, x: Tensor) -> MultiAgentEpisode:
     nobody = torch.zeros_like(own.state.x, dtype=torch.bool)
     own = own._replace(overridden=nobody)
     others = (
-        world.first(
+        world.start_from(
             own.state.seen_by(j),
             _seen_by(own.perception, j),
             camera_context=own.camera_context and own.camera_context._replace(viewer=j),
@@ -69,12 +69,12 @@ def step_traffic(world: World, episode: MultiAgentEpisode, action: Tensor, comma
     state = traffic.state
     touching, off = pairwise_overlaps(state, road), road.off_road(state.y)
     hit = touching.any(dim=2)
-    if world.collisions == "any":
+    if world.measurement.collisions == "any":
         hit = hit.any(dim=1, keepdim=True)
     hit = hit | off
     views = [traffic]
     for j, view in enumerate(episode.views[1:], start=1):
-        views.append(world.next(view, state.seen_by(j), _seen_by(traffic.perception, j), hit[:, j]))
+        views.append(world.update(view, state.seen_by(j), _seen_by(traffic.perception, j), hit[:, j]))
     lived = tuple(
         held(old.collided, old, new) if bool(old.collided.any()) else new
         for old, new in zip(episode.views, views, strict=True)

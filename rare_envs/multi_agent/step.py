@@ -52,7 +52,7 @@ def step_agents(
     """
     sums: dict[int, Any] = {}
     meta = not action.is_floating_point()
-    for tick in range(world.stride):
+    for tick in range(world.clock.stride):
         chosen = torch.full_like(action, IDLE) if meta and tick else action
         traffic, physical, memory = _combine_actions(world, episode, chosen, commanded, ego, memory)
         before = episode
@@ -63,10 +63,10 @@ def step_agents(
                 over = before.views[vehicle].collided
                 terms = _each(lambda term, over=over: term.masked_fill(over, 0.0), terms)
             sums[vehicle] = terms if tick == 0 else _each(torch.add, sums[vehicle], terms)
-        if world.stride > 1 and bool(episode.collided.all()):
+        if world.clock.stride > 1 and bool(episode.collided.all()):
             break
-    if world.stride > 1:
-        sums = {vehicle: _each(lambda term: term / world.stride, terms) for vehicle, terms in sums.items()}
+    if world.clock.stride > 1:
+        sums = {vehicle: _each(lambda term: term / world.clock.stride, terms) for vehicle, terms in sums.items()}
     return JointStepResult(episode, sums, memory)
 
 
@@ -113,15 +113,16 @@ def play(world: World, x: Tensor, policies: Mapping[int, Any], ego: Driver) -> M
     Returns:
         The episodes at the horizon.
     """
-    drivers = {vehicle: PolicyDriver(policy, world.observation, world.action) for vehicle, policy in policies.items()}
+    observation, action_kind = world.sensing.observation, world.clock.action
+    drivers = {vehicle: PolicyDriver(policy, observation, action_kind) for vehicle, policy in policies.items()}
     episode, memory = start(world, x), None
     memories: dict[int, Any] = dict.fromkeys(drivers)
     batch, n = episode.disabled.shape
     commanded = torch.zeros(batch, n, dtype=torch.bool, device=x.device)
     commanded[:, list(drivers)] = True
-    shape = (batch, n) if world.action == "meta" else (batch, n, 2)
-    for _ in range(world.ticks // world.stride):
-        action = torch.full(shape, IDLE) if world.action == "meta" else torch.zeros(shape)
+    shape = (batch, n) if action_kind == "meta" else (batch, n, 2)
+    for _ in range(world.clock.ticks // world.clock.stride):
+        action = torch.full(shape, IDLE) if action_kind == "meta" else torch.zeros(shape)
         for vehicle, driver in drivers.items():
             chosen, memories[vehicle] = driver.act(episode.views[vehicle], memories[vehicle])
             action[:, vehicle] = chosen

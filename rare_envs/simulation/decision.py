@@ -46,7 +46,7 @@ def advance(
         The episodes at the time of the next decision, and the reward.
     """
     sums: RewardTerms | None = None
-    for tick in range(world.stride):
+    for tick in range(world.clock.stride):
         chosen = action if tick == 0 else torch.full_like(action, IDLE)
         ready, physical = world.decode_meta_actions(episode, chosen, commanded)
         moved = world.step(ready, physical, commanded)
@@ -59,11 +59,11 @@ def advance(
         episode = moved
         if watch is not None:
             watch(episode)
-        if world.stride > 1 and bool(episode.collided.all()):
+        if world.clock.stride > 1 and bool(episode.collided.all()):
             break
     assert sums is not None
-    if world.stride > 1:
-        sums = RewardTerms(*(term / world.stride for term in sums))
+    if world.clock.stride > 1:
+        sums = RewardTerms(*(term / world.clock.stride for term in sums))
     return StepResult(episode, sums)
 
 

@@ -30,10 +30,10 @@ class Episode(NamedTuple):
     road: Road
     """The road that all are on."""
     perception: Tensor | None = None
-    """What the vehicles see in this state, `rare_envs.sensors.perception.FEATURES`, shape (B, N, 51), the ego first;
-    None in a world in which nobody looks."""
+    """Lidar features of the vehicles in this state, `rare_envs.sensors.perception.FEATURES`, shape (B, N, 51), the ego
+    first; None in a world without lidar."""
     background_state: BackgroundState | None = None
-    """What goes on in the drivers around the ego, if they are not the scenario's script."""
+    """State of the drivers around the ego, if they are not the scenario's script."""
     overridden: Tensor | None = None
     """Which vehicles have been commanded, so that a script no longer knows them, boolean, shape (B, N); None before
     anyone but the ego has been."""
@@ -41,9 +41,9 @@ class Episode(NamedTuple):
     aim: Aim | None = None
     """What the controllers of vehicles with meta-actions aim for, (B, N) each; None in a world without such actions."""
     statistics: EpisodeStatistics | None = None
-    """Least time to collision and crashes so far; None unless the world keeps statistics."""
+    """Least time to collision and crashes so far; None unless the world keeps them."""
     camera_context: CameraContext | None = None
-    """What a camera sees beside the traffic; None in a world without a camera."""
+    """What a camera's picture depends on beside the traffic; None in a world without a camera."""
 
     @property
     def f(self) -> Tensor:

@@ -32,8 +32,9 @@ def drive(world: World, driver: Driver, x: Tensor) -> Iterator[Episode]:
         x, driver = x[:, :-own], driver.with_draws(x[:, -own:])  # type: ignore[attr-defined]
     episode, memory = world.start(x), None
     yield episode
-    for _ in range(world.ticks):
+    for _ in range(world.clock.ticks):
         action, memory = driver.act(episode, memory)
+        episode, action = world.decode_meta_actions(episode, action)
         episode = world.step(episode, action)
         yield episode
 

@@ -127,7 +127,7 @@ class Report:
     @property
     def _idle_words(self) -> tuple[str, ...]:
         world, noise = self.study.problem.world, self.study.question.noise
-        if noise is True or world.weather or (world.drivers is not None and world.drivers.noisy):
+        if noise is True or world.sensing.weather or (world.background is not None and world.background.noisy):
             return ()
         word = "off" if noise is False else noise
         return (f"--noise {word} changes nothing: nobody in this traffic drives with noise (see --drivers)",)
@@ -210,7 +210,7 @@ def prepare(question: Question) -> Study:
     except (ValueError, OSError) as error:
         raise BadInput(error) from error
     _try_ego(problem)
-    return Study(replace(question, observation=problem.world.observation), problem, method)
+    return Study(replace(question, observation=problem.world.sensing.observation), problem, method)
 
 
 def _check_on_error(word: str) -> None:

@@ -60,7 +60,7 @@ def replay(problem: DrivingProblem, x: NDArray[np.float64]) -> Replay:
     states = [each.state for each in episodes]
     x_y = torch.stack([torch.stack((s.x[0], s.y[0]), dim=-1) for s in states])
     return Replay(
-        time=np.arange(len(episodes), dtype=np.float64) * world.dt,
+        time=np.arange(len(episodes), dtype=np.float64) * world.clock.dt,
         position=x_y.double().numpy(),
         heading=torch.stack([s.heading[0] for s in states]).double().numpy(),
         speed=torch.stack([s.speed[0] for s in states]).double().numpy(),

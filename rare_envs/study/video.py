@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -70,7 +70,7 @@ class Drive(NamedTuple):
 
     def time(self, k: int) -> float:
         """Time of moment k [s]."""
-        return k * self.problem.world.dt
+        return k * self.problem.world.clock.dt
 
 
 def find(folder: Path, number: int, trust: bool = False) -> Found:
@@ -110,7 +110,7 @@ def drive_again(problem: DrivingProblem, x: NDArray[np.float64]) -> Drive:
         problem: The world and its ego.
         x: Scenario parameters, shape (d,).
     """
-    world = replace(problem.world, witnessed=True)
+    world = problem.world.with_statistics()
     episodes: list[Episode] = []
     # single precision, as in `DrivingProblem.evaluate`, so that f comes out the same
     for episode in drive(world, problem.driver, torch.from_numpy(x).float()[None]):
@@ -120,8 +120,8 @@ def drive_again(problem: DrivingProblem, x: NDArray[np.float64]) -> Drive:
     alone = []
     for before, episode in zip([None, *episodes], episodes, strict=False):
         state = None if before is None else before.state
-        moment = Moment(episode.state, episode.lead, episode.road, episode.perception, state, world.dt)
-        alone.append(float(episode.measure.f(episode.measure.start(moment, world.ticks))))
+        moment = Moment(episode.state, episode.lead, episode.road, episode.perception, state, world.clock.dt)
+        alone.append(float(episode.measure.f(episode.measure.start(moment, world.clock.ticks))))
     return Drive(problem, episodes, np.array([float(each.f) for each in episodes]), np.array(alone))
 
 
@@ -146,14 +146,14 @@ def pictures(drive: Drive) -> list[Image.Image]:
 def _curves(drive: Drive) -> tuple[Image.Image, Any]:
     """The measure over time, and where a time is in that picture: column, top and bottom [pixels]."""
     world = drive.problem.world
-    time = np.arange(len(drive.so_far)) * world.dt
-    name = world.measure if isinstance(world.measure, str) else "measure"
+    time = np.arange(len(drive.so_far)) * world.clock.dt
+    name = world.measurement.measure if isinstance(world.measurement.measure, str) else "measure"
     figure = Figure(figsize=(WIDTH / 100, STRIP / 100), dpi=100)
     canvas: Any = FigureCanvasAgg(figure)
     axes = figure.add_axes((0.08, 0.3, 0.9, 0.62))
     axes.plot(time, drive.alone, color="tab:blue", linewidth=1, label="this moment")
     axes.step(time, drive.so_far, where="post", color="black", linewidth=1.5, label="f so far")
-    axes.set_xlim(0.0, max(world.dt, float(time[-1])))
+    axes.set_xlim(0.0, max(world.clock.dt, float(time[-1])))
     axes.set_xlabel("time [s]", fontsize=8)
     axes.set_ylabel(name, fontsize=8)
     axes.tick_params(labelsize=8)
@@ -230,7 +230,7 @@ def write_film(path: Path | str, drive: Drive, width: int = WIDTH, every: int = 
     if path.suffix.lower() == ".png":
         shown[int(np.argmin(drive.so_far))].save(path)
         return
-    tick = round(1000 * drive.problem.world.dt)
+    tick = round(1000 * drive.problem.world.clock.dt)
     kept = shown[:-1:every]
     frames = [each.quantize(COLOURS) for each in (*kept, shown[-1])]
     durations = [tick * every] * len(kept) + [tick * LAST]

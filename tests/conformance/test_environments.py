@@ -136,7 +136,7 @@ def test_same_seed_same_trajectory_however_it_is_asked_for(env_id, action):
     x = torch.from_numpy(info["x"]).float()[None]
     with torch.inference_mode():
         moments = list(drive(problem.world, problem.driver, x))
-    stride = problem.world.stride
+    stride = problem.world.clock.stride
     for k, state in enumerate(states[:-1], start=1):  # a decision may end before its last tick
         for one_field, other in zip(state[:4], moments[k * stride].state[:4], strict=True):
             assert torch.equal(one_field, other)

@@ -20,7 +20,9 @@ from rare_envs.scenarios.registry import scenario_named
 from rare_envs.sensors.camera.weather import CLEAR, SENSOR_NOISE_DISTRIBUTION, SUN_DISTRIBUTION
 from rare_envs.sensors.perception import perceive_traffic
 from rare_envs.simulation.background import Background, find_drivers
+from rare_envs.simulation.clock import Clock
 from rare_envs.simulation.episode import Episode
+from rare_envs.simulation.sensing import Sensing
 from rare_envs.simulation.world import World
 from rare_envs.traffic.reference_line import ReferenceLine
 from rare_envs.traffic.road import Road, i80
@@ -171,16 +173,16 @@ def start_lesson(lesson: Lesson, rows: int, seconds: float, rng: np.random.Gener
         The world and the episodes at time 0.
     """
     scenario = lesson.scenario(rng)
-    world = World(scenario, horizon=seconds, drivers=lesson.drivers, observation=SEES, weather=True)
+    world = World(scenario, Sensing(SEES, weather=True), lesson.drivers, clock=Clock(horizon=seconds))
     own = lesson.sample(rows, rng)
     parts = [own, _draw_weather(rows, rng)]
-    if world.drivers is not None and world.drivers.weights is not None:
-        parts.append(world.drivers.weights.sample(rows, rng))
-    parts.append(rng.standard_normal((rows, world.draws + world.keys)))
+    if world.background is not None and world.background.weights is not None:
+        parts.append(world.background.weights.sample(rows, rng))
+    parts.append(rng.standard_normal((rows, world.columns.noise + world.columns.camera_noise)))
     start = world.start(torch.from_numpy(np.concatenate(parts, axis=1)).float())
     state = _displace_ego(start.state, scenario, rng)
-    perception = perceive_traffic(state, scenario.road) if world.sees else None
-    return world, world.first(state, perception, start.background_state, start.camera_context)
+    perception = perceive_traffic(state, scenario.road) if world.uses_lidar else None
+    return world, world.start_from(state, perception, start.background_state, start.camera_context)
 
 
 def _draw_weather(n: int, rng: np.random.Generator) -> Array:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from rare_envs.control.idm import IDM
 from rare_envs.scenarios.base_distributions import load_base
 from rare_envs.scenarios.registry import scenario_named
+from rare_envs.simulation.clock import Clock
 from rare_envs.simulation.rollout import drive
 from rare_envs.simulation.world import World
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
@@ -68,7 +69,7 @@ def make_scenes(kinds: Sequence[EncounterSpec], rng: np.random.Generator) -> lis
 def _make_world(kind: EncounterSpec) -> World:
     if kind.scenario in CASES:
         return make_world(CASES[kind.scenario], kind.seconds)
-    return World(scenario_named(kind.scenario), horizon=kind.seconds)
+    return World(scenario_named(kind.scenario), clock=Clock(horizon=kind.seconds))
 
 
 def _draw_parameters(kind: EncounterSpec, world: World, n: int, rng: np.random.Generator) -> NDArray[np.float64]:

@@ -15,7 +15,7 @@ from __future__ import annotations
 import json
 import sys
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -29,8 +29,11 @@ from rare_envs.egos.policy import as_driver
 from rare_envs.egos.wrappers import observation_for
 from rare_envs.plugins import did_you_mean
 from rare_envs.sensors.kinds import kinds_of
+from rare_envs.simulation.clock import Clock
 from rare_envs.simulation.episode import Episode
+from rare_envs.simulation.measurement import Measurement
 from rare_envs.simulation.rollout import Driver, drive
+from rare_envs.simulation.sensing import Sensing
 from rare_envs.simulation.world import World
 from rare_envs.traffic.crash import NONE, ROAD_EDGE
 from rare_envs.traffic.lead import lead_index
@@ -121,7 +124,7 @@ def judge(
     world = measured or make_world(case, seconds, observation)
     driver = as_driver(ego, world)
     if getattr(driver, "sees", False):
-        world = replace(world, lidar=True)
+        world = world.with_lidar()
     x = draw_inputs(case, world, rollouts, getattr(driver, "columns", 0), np.random.default_rng(seed))
     tile = CAMERA_TILE if "camera" in kinds_of(observation) else TILE
     parts = [_judge_tile(world, driver, part) for part in torch.split(torch.from_numpy(x).float(), tile)]
@@ -132,37 +135,41 @@ def judge(
 def make_world(case: Case, seconds: float = SECONDS, observation: str = "features") -> World:
     """The world of a case; it tells who ran into whom."""
     return World(
-        case.scenario, horizon=seconds, drivers=case.drivers(), observation=observation, lidar=True, witnessed=True
+        case.scenario,
+        Sensing(observation, lidar=True),
+        case.drivers(),
+        Measurement(statistics=True),
+        Clock(horizon=seconds),
     )
 
 
 def draw_inputs(case: Case, world: World, n: int, own: int, rng: np.random.Generator) -> NDArray[np.float64]:
     """Starts, drivers' weights, noise of drivers and (`own` columns) of the ego, side by side, shape (n, d)."""
     parts = [case.starts(n, rng)]
-    if world.weights:
-        assert world.drivers is not None and world.drivers.weights is not None
-        parts.append(world.drivers.weights.sample(n, rng))
-    return np.concatenate((*parts, rng.standard_normal((n, world.draws + own))), axis=1)
+    if world.columns.weights:
+        assert world.background is not None and world.background.weights is not None
+        parts.append(world.background.weights.sample(n, rng))
+    return np.concatenate((*parts, rng.standard_normal((n, world.columns.noise + own))), axis=1)
 
 
 @torch.inference_mode()
 def _judge_tile(world: World, driver: Driver, x: Tensor) -> tuple[NDArray[Any], ...]:
     """The columns of `Verdicts` but for x, of one tile."""
     reason = torch.full((len(x),), KEPT)
-    time = torch.full((len(x),), world.seconds)
+    time = torch.full((len(x),), world.clock.seconds)
     least, room = torch.full_like(time, torch.inf), torch.full_like(time, torch.inf)
     lead, since, had = torch.zeros_like(reason), torch.zeros_like(time), torch.zeros(len(x), dtype=torch.bool)
     first: Episode | None = None
     for tick, episode in enumerate(drive(world, driver, x)):
         first = first or episode
-        state, now = episode.state, tick * world.dt
+        state, now = episode.state, tick * world.clock.dt
         running = reason == KEPT
         follows = lead_index(state, world.scenario.road)
         gap, speed = episode.lead.gap, state.speed[:, 0]
         headway = torch.where(gap < torch.inf, gap / speed.clamp(min=0.1), torch.inf)
         far = (headway >= FLOOR_HEADWAY) & (gap >= FLOOR_GAP)
         same = follows == lead
-        since, had = torch.where(same, since + world.dt, 0.0), (had & same) | far
+        since, had = torch.where(same, since + world.clock.dt, 0.0), (had & same) | far
         margin = lane_margin(state, first)
         found = torch.full_like(reason, KEPT)
         found[~far & (had | (since >= GRACE))] = TOO_CLOSE
@@ -174,9 +181,9 @@ def _judge_tile(world: World, driver: Driver, x: Tensor) -> tuple[NDArray[Any], 
         time = torch.where(running & (found != KEPT), now, time)
         reason = torch.where(running, found, reason)
     assert first is not None
-    way, due = _distances(first.state, episode.state, lead_index(first.state, world.scenario.road), world.seconds)
+    way, due = _distances(first.state, episode.state, lead_index(first.state, world.scenario.road), world.clock.seconds)
     reason = torch.where((reason == KEPT) & (way < LEAST_WAY * due), LEFT_BEHIND, reason)
-    return tuple(column.numpy() for column in (reason, time.double(), least, room, way / world.seconds))
+    return tuple(column.numpy() for column in (reason, time.double(), least, room, way / world.clock.seconds))
 
 
 def lane_margin(state: State, first: Episode) -> Tensor:

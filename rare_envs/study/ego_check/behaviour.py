@@ -105,7 +105,7 @@ def check_row_independence(probe: Probe) -> Iterator[Finding]:
 def check_latency(probe: Probe) -> Iterator[Finding]:
     """Measure the duration of a call by batch size."""
     times = {}
-    sizes = CAMERA_BATCH_SIZES if "camera" in kinds_of(probe.problem.world.observation) else BATCH_SIZES
+    sizes = CAMERA_BATCH_SIZES if "camera" in kinds_of(probe.problem.world.sensing.observation) else BATCH_SIZES
     for size in sizes:
         observation = probe.repeat_seen(size)
         probe.query(observation)
@@ -116,7 +116,7 @@ def check_latency(probe: Probe) -> Iterator[Finding]:
             durations.append(time.perf_counter() - begun)
         times[size] = float(np.median(durations))
     found = ", ".join(f"{1e3 * seconds:.2g} ms for {size}" for size, seconds in times.items())
-    needed = TYPICAL_SIMULATIONS / sizes[-1] * times[sizes[-1]] * probe.problem.world.ticks
+    needed = TYPICAL_SIMULATIONS / sizes[-1] * times[sizes[-1]] * probe.problem.world.clock.ticks
     if needed > SLOW_SECONDS:
         yield report_warning(
             "latency", f"{found}: {needed / 3600:.1f} h for {TYPICAL_SIMULATIONS} simulations", "batch its work", False
@@ -127,7 +127,7 @@ def check_latency(probe: Probe) -> Iterator[Finding]:
 
 def check_memory_growth(probe: Probe) -> Iterator[Finding]:
     """Measure by how much the process grows over 100 calls."""
-    pictures = "camera" in kinds_of(probe.problem.world.observation)
+    pictures = "camera" in kinds_of(probe.problem.world.sensing.observation)
     observation = probe.repeat_seen(4 if pictures else 256)
     for _ in range(20):
         probe.query(observation)

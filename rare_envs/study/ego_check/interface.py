@@ -8,7 +8,6 @@ import numpy as np
 from gymnasium import spaces
 
 from agents.sb3.saved_ego import SavedEgo
-from rare_envs.control.actions import space_of_actions
 from rare_envs.egos.faults import reason_of
 from rare_envs.egos.wrappers import frames_of
 from rare_envs.sensors.kinds import each
@@ -24,7 +23,7 @@ MANY_OUTLYING = 0.2
 def check_declared_spaces(probe: Probe) -> Iterator[Finding]:
     """Compare declared spaces with the environment's; that they fit at all was found when the problem was made."""
     world = probe.problem.world
-    ours = probe.space, space_of_actions(world.action)
+    ours = probe.space, world.action_space
     observed, acted = (getattr(probe.ego, f"{name}_space", None) for name in ("observation", "action"))
     if observed is None or acted is None:
         missing = " and ".join(

@@ -16,7 +16,6 @@ from rare_envs.egos.policy import PolicyDriver
 from rare_envs.sensors.kinds import batch_size, each
 from rare_envs.simulation.observation import observe
 from rare_envs.simulation.rollout import drive
-from rare_envs.simulation.world import space_of_observations
 
 BATCH_ROWS = 32
 """Observations in a query."""
@@ -39,13 +38,13 @@ class Probe:
         x = problem.base.sample(BATCH_ROWS, np.random.default_rng(0))
         with torch.inference_mode():
             start = next(drive(problem.world, problem.driver, torch.from_numpy(x).float()))
-            seen = each(torch.Tensor.numpy, observe(start, problem.world.observation))
+            seen = each(torch.Tensor.numpy, observe(start, problem.world.sensing.observation))
         return cls(ego, problem, seen)
 
     @property
     def space(self) -> spaces.Space[Any]:
         """Space of the environment's observations."""
-        return space_of_observations(self.problem.world)
+        return self.problem.world.observation_space
 
     def transform_seen(self, change: Callable[[Array], Any]) -> Any:
         """Return the observations after a function, each of its own type."""

@@ -135,7 +135,7 @@ def test_it_is_shown_its_own_speed_and_nothing_else_beside_the_picture() -> None
 @pytest.mark.parametrize("spec", ["noisy:vision", "process:vision"])
 def test_it_drives_behind_a_stack_and_in_a_process_of_its_own(spec: str) -> None:
     problem = rare_envs.DrivingProblem(CUT_IN, ego=load_ego(spec), horizon=0.3)
-    assert problem.world.observation == "camera+speed"
+    assert problem.world.sensing.observation == "camera+speed"
     x = problem.base.sample(2, np.random.default_rng(4))
     f = problem.evaluate(x)
     assert np.isfinite(f).all()

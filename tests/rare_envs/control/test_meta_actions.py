@@ -101,7 +101,7 @@ def test_our_scenarios_are_highway_envs_until_contact(env_id: str) -> None:
     episodes = [world.start(torch.from_numpy(x))]
     for tick in range(TICKS):
         action = torch.full((len(x),), IDLE) if tick % 10 else decisions[:, tick // 10]
-        episodes.append(world.step(episodes[-1], action))
+        episodes.append(world.step(*world.decode_meta_actions(episodes[-1], action)))
     compared = 0
     for row in range(len(x)):
         fields = [torch.stack([e.state[k][row] for e in episodes]) for k in range(4)]
@@ -154,7 +154,8 @@ def test_on_the_curved_highway_lanes_are_changed_and_held() -> None:
     x[0, 19:] = 10.0
     episode, offsets = world.start(x), []
     for tick in range(200):
-        episode = world.step(episode, torch.tensor([LANE_RIGHT if tick == 0 else IDLE]))
+        action = torch.tensor([LANE_RIGHT if tick == 0 else IDLE])
+        episode = world.step(*world.decode_meta_actions(episode, action))
         offsets.append(float(episode.state.y[0, 0]) - i80().centre(3))
     assert not bool(episode.collided)
     assert abs(offsets[0]) > 3.0
@@ -166,12 +167,12 @@ def test_a_vehicle_that_begins_to_obey_aims_for_where_it_is() -> None:
     x = torch.tensor([[15.0, 24.0, 24.0, 40.0, 40.0, 4.0]], dtype=torch.float64)
     episode = world.start(x)
     for _ in range(35):  # the script brings the cutter into the ego's lane
-        episode = world.step(episode, torch.tensor([IDLE]))
+        episode = world.step(*world.decode_meta_actions(episode, torch.tensor([IDLE])))
     none = torch.zeros(1, 3, dtype=torch.bool)
     cutter = none.clone()
     cutter[0, 1] = True
     for _ in range(20):
-        episode = world.step(episode, torch.full((1, 3), IDLE), cutter)
+        episode = world.step(*world.decode_meta_actions(episode, torch.full((1, 3), IDLE), cutter), cutter)
     assert episode.aim is not None
     assert episode.aim.lane[0].tolist() == [0, 0, 0]
     assert abs(float(episode.state.y[0, 1])) < 0.2

@@ -68,7 +68,7 @@ def test_env_and_rollout_agree_bit_for_bit_with_a_rule_based_ego(env_id: str) ->
             action = IDM().act(episode, None)[0]
             env.unwrapped._episode = env.unwrapped.world.step(episode, action)  # type: ignore[attr-defined]
             env.unwrapped._tick += 1  # type: ignore[attr-defined]
-            done = bool(env.unwrapped._episode.collided) or env.unwrapped._tick == env.unwrapped.world.ticks  # type: ignore[attr-defined]
+            done = bool(env.unwrapped._episode.collided) or env.unwrapped._tick == env.unwrapped.world.clock.ticks  # type: ignore[attr-defined]
         assert float(env.unwrapped._episode.f) == f[row]  # type: ignore[attr-defined]
 
 

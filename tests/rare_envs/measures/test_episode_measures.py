@@ -25,6 +25,8 @@ from rare_envs.measures import (
     with_collision,
 )
 from rare_envs.measures.registry import MEASURES, find_measure
+from rare_envs.simulation.clock import Clock
+from rare_envs.simulation.measurement import Measurement
 from rare_envs.simulation.rollout import drive
 from rare_envs.simulation.world import World
 from rare_envs.traffic.lead import lead_of
@@ -377,9 +379,9 @@ def test_a_measure_that_breaks_later_names_the_scenario() -> None:
 def test_every_measure_serves_a_world() -> None:
     x = torch.tensor([HIT, CLOSE, AWAY])
     for name in MEASURES:
-        world = World(problem("ttc").world.scenario, measure=name, horizon=1.0)
+        world = World(problem("ttc").world.scenario, measurement=Measurement(name), clock=Clock(horizon=1.0))
         episode = world.start(x)
-        for _ in range(world.ticks):
+        for _ in range(world.clock.ticks):
             episode = world.step(episode, torch.zeros(3, 2))
         assert episode.f.shape == (3,)
         assert torch.isfinite(episode.f).all()

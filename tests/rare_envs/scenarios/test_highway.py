@@ -87,7 +87,7 @@ def test_environment_and_rollout_agree_and_x_replays():
             episode = env._episode
             env._episode = env.world.step(episode, IDM().act(episode, None)[0])
             env._tick += 1
-            done = bool(env._episode.collided) or env._tick == env.world.ticks
+            done = bool(env._episode.collided) or env._tick == env.world.clock.ticks
         assert float(env._episode.f) == pytest.approx(f[row], abs=1e-3)  # products round differently by batch size
 
 
@@ -173,7 +173,7 @@ def test_drivers_by_rule_have_neither_weights_nor_noise():
 def test_a_learned_ego_looks():
     ego = agents.LearnedEgo(agents.load_driver("mgail"))
     problem = rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego=ego, **SHORT)
-    assert problem.world.sees
+    assert problem.world.uses_lidar
     assert np.isfinite(problem.evaluate(draw(problem, 16))).all()
 
 

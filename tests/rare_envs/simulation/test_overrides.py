@@ -32,7 +32,7 @@ def test_nobody_commanded_is_as_without_commands(env_id):
     batch, n = episode.state.x.shape
     action = torch.full((batch, n, 2), 3.0)
     action[:, 0] = ego_action(batch)
-    for _ in range(world.ticks):
+    for _ in range(world.clock.ticks):
         alone = world.step(alone, ego_action(batch))
         episode = world.step(episode, action, torch.zeros(batch, n, dtype=torch.bool))
         for one, other in zip(alone.state, episode.state, strict=True):
@@ -67,7 +67,7 @@ def test_a_commanded_lead_brakes_as_in_the_textbook():
     action = torch.tensor([[[0.0, 0.0], [-4.0, 0.0]]])
     for _ in range(30):
         episode = world.step(episode, action, torch.tensor([[False, True]]))
-    t, dt = 3.0, world.dt
+    t, dt = 3.0, world.clock.dt
     assert float(episode.state.speed[0, 1]) == pytest.approx(20.0 - 4.0 * t, abs=1e-4)
     # explicit Euler moves with the old speed: half a tick of the acceleration more than v t - a t^2 / 2
     way = 20.0 * t - 2.0 * t**2 + 4.0 * t * dt / 2
@@ -83,12 +83,12 @@ def test_a_vehicle_that_is_commanded_no_longer_goes_on_from_where_it_is(env_id, 
     batch, n = episode.state.x.shape
     action = torch.zeros(batch, n, 2)
     action[:, 1:] = torch.tensor([-1.0, 0.01])
-    for tick in range(world.ticks):
+    for tick in range(world.clock.ticks):
         before = episode.state
         commanded = torch.full((batch, n), tick < 10)
         episode = world.step(episode, action, commanded) if tick < 20 else world.step(episode, action[:, 0])
         moved = torch.hypot(episode.state.x - before.x, episode.state.y - before.y)
-        assert (moved <= before.speed * world.dt * 1.05 + 1e-3).all()  # the I-80 is longer on its outer lanes
+        assert (moved <= before.speed * world.clock.dt * 1.05 + 1e-3).all()  # the I-80 is longer on its outer lanes
         assert ((episode.state.speed - before.speed).abs() <= 1.0).all()
 
 

@@ -12,6 +12,8 @@ from rare_envs.control.steering import lane_keeping
 from rare_envs.measures import TTC_MAX, Moment, ttc
 from rare_envs.scenarios.car_following import CAR_FOLLOWING
 from rare_envs.scenarios.cut_in import CUT_IN, bezier
+from rare_envs.simulation.clock import Clock
+from rare_envs.simulation.measurement import Measurement
 from rare_envs.simulation.world import World
 from rare_envs.traffic.lead import Lead, lead_of
 from rare_envs.traffic.overlap import boxes_overlap
@@ -237,7 +239,7 @@ def test_car_following_without_brakes_collides_when_the_gap_is_used_up() -> None
 def test_cutter_arrives_in_the_lane_and_minds_its_lead() -> None:
     world = World(CUT_IN)
     episode = world.start(tensor(10.0, 20.0, 12.0, 40.0, 25.0, 3.5)[None])
-    for _ in range(world.ticks):
+    for _ in range(world.clock.ticks):
         episode = world.step(episode, torch.zeros(1, 2, dtype=F64))
     state = episode.state
     assert state.y[0, 1].item() == 0.0
@@ -249,6 +251,6 @@ def test_cutter_arrives_in_the_lane_and_minds_its_lead() -> None:
 def test_worlds_refuse_nonsense() -> None:
     for kwargs in ({"dt": 0.0}, {"dt": float("nan")}, {"horizon": 0.01}, {"horizon": float("inf")}):
         with pytest.raises(ValueError, match="Expected"):
-            World(CAR_FOLLOWING, **kwargs)
+            World(CAR_FOLLOWING, clock=Clock(**kwargs))
     with pytest.raises(ValueError, match="ttc"):
-        World(CAR_FOLLOWING, measure="tcc")
+        Measurement("tcc")

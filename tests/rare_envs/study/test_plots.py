@@ -23,7 +23,7 @@ FOLLOWING = "rare_envs/CarFollowing-v0"
 @pytest.mark.parametrize("env_id", rare_envs.ENV_IDS)
 def test_a_replay_gives_the_same_f_bit_for_bit(env_id: str) -> None:
     problem = rare_envs.DrivingProblem(env_id)
-    learned = problem.world.drivers is not None  # whose products round differently by batch size
+    learned = problem.world.background is not None  # whose products round differently by batch size
     x = problem.base.sample(3 if learned else 20, np.random.default_rng(0))
     tolerance = 1e-3 if learned else 0.0
     assert [replay(problem, row).f for row in x] == pytest.approx(problem.evaluate(x).tolist(), abs=tolerance)

@@ -298,7 +298,7 @@ def test_a_curved_road_is_drawn_in_the_world() -> None:
     renderer = Renderer(world)
     for x in (0.0, 400.0, 1500.0):
         state = pair(x, road.centre(1), x + 30.0, road.centre(4))
-        image = renderer.draw(world.first(state, None))
+        image = renderer.draw(world.start_from(state, None))
         assert image.shape == (240 + 2 * STRIP, WIDTH, 3)
         image = image[STRIP:-STRIP]
         at = {}

@@ -13,6 +13,7 @@ import rare_envs
 from rare_envs.control.idm import IDM
 from rare_envs.egos.wrappers import observation_for
 from rare_envs.scenarios.cut_in import CUT_IN
+from rare_envs.simulation.clock import Clock
 from rare_envs.simulation.observation import observation_space
 from rare_envs.simulation.rollout import drive
 from rare_envs.simulation.world import World
@@ -32,7 +33,7 @@ DATA = Path(__file__).parents[4] / "shared" / "data"
 def test_an_encounter_is_the_scenario_with_its_ego_free() -> None:
     """Others move as in the scenario whatever the ego does; only egos are driven; every other scene is mirrored."""
     plain, mirrored = make_scenes([EncounterSpec("cut_in", "us101", scenes=2, seconds=4.0)], np.random.default_rng(3))
-    world = World(CUT_IN, horizon=4.0)
+    world = World(CUT_IN, clock=Clock(horizon=4.0))
     x = rare_envs.DrivingProblem("rare_envs/CutIn-v0").base.sample(26, np.random.default_rng(3))
     with torch.inference_mode():
         states = [episode.state for episode in drive(world, IDM(), torch.from_numpy(x[:13]))]

@@ -112,7 +112,7 @@ def test_speeds_of_leads_wander_as_recorded_ones_do() -> None:
     """Spread over a minute: 2.0 to 4.8 m/s between the deciles of what US 101 has over 640 m."""
     world = make_world(CASES["straight"])
     rng = np.random.default_rng(2)
-    x = np.concatenate((draw_starts(64, rng), rng.standard_normal((64, world.draws))), axis=1)
+    x = np.concatenate((draw_starts(64, rng), rng.standard_normal((64, world.columns.noise))), axis=1)
     with torch.inference_mode():
         moments = list(drive(world, IDM(), torch.from_numpy(x).float()))
         speeds = torch.stack([moment.state.speed[:, 1] for moment in moments])

@@ -34,7 +34,7 @@ def test_the_expert_keeps_lane_and_distance_from_wherever_lessons_begin() -> Non
     for number, lesson in enumerate(make_lessons()[:3]):
         world, episode = start_lesson(lesson, 16, 15.0, np.random.default_rng(number))
         with torch.inference_mode():
-            for _ in range(world.ticks):
+            for _ in range(world.clock.ticks):
                 speed = episode.state.speed[:, 0]
                 action = to_physical(to_actions(expert_outputs(episode), speed), 16, episode.collided)
                 episode = world.step(episode, action)
@@ -52,7 +52,7 @@ def test_on_a_curve_the_expert_does_not_run_wide() -> None:
     while world.scenario.road.reference_line is None:
         world, episode = start_lesson(lesson, 4, 8.0, rng)
     with torch.inference_mode():
-        for _ in range(world.ticks):
+        for _ in range(world.clock.ticks):
             speed = episode.state.speed[:, 0]
             episode = world.step(episode, to_physical(to_actions(expert_outputs(episode), speed), 4, episode.collided))
         seen = auxiliary_targets(episode)[~episode.collided]

@@ -27,6 +27,7 @@ from rare_envs.sensors.camera.weather import (
     SENSOR_NOISE_DISTRIBUTION,
     SUN_DISTRIBUTION,
 )
+from rare_envs.simulation.sensing import Sensing
 from rare_envs.simulation.world import World
 from rare_envs.traffic.road import straight
 from rare_envs.traffic.state import State
@@ -205,7 +206,7 @@ def test_a_scenario_with_fog_of_its_own_has_to_rename_it() -> None:
     base = load_base(scenario, None)
     assert "fog" in space_of(World(foggy), base).names
     with pytest.raises(ValueError, match="fog"):
-        space_of(World(foggy, weather=True), base)
+        space_of(World(foggy, Sensing(weather=True)), base)
 
 
 def test_weather_is_a_reset_option() -> None:
