@@ -9,6 +9,7 @@ from samplers.analysis.reweighting import Reweighted
 from samplers.comparison import Comparison, compare
 from samplers.errors import EvaluationError
 from samplers.estimation import estimate
+from samplers.execution.arguments import RunArguments
 from samplers.execution.progress import Progress
 from samplers.execution.run import Run
 from samplers.method import Goal, Interrupted, Outcome, Stepping, Steps
@@ -57,6 +58,7 @@ __all__ = [
     "Progress",
     "Reweighted",
     "Run",
+    "RunArguments",
     "Sample",
     "Share",
     "StandardNormal",

@@ -1,30 +1,30 @@
 """Two functions on the same draws: how many times likelier is failure of one than of the other?"""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from samplers.analysis.base import inflation, sample_of
-from samplers.analysis.reweighting import LARGEST_LOG
+from samplers.analysis.base import cov_inflation, require_sample
+from samplers.analysis.reweighting import MAX_LOG
 from samplers.estimation import estimate
 from samplers.execution.arguments import check_problem
 from samplers.execution.progress import Listener
 from samplers.method import Stepping
 from samplers.methods.two_stage.method import TwoStage
-from samplers.problem import Distribution, FloatArray, Problem
+from samplers.problem import Distribution, FloatArray, Problem, condition_of
 from samplers.result import Estimate
-from samplers.serialization import plain
-from samplers.statistics.cluster_sums import alone, interval_of_sum
-from samplers.statistics.intervals import Interval, degrees_of_freedom, nothing_in
-from samplers.statistics.weights import effective
+from samplers.serialization import to_json_value
+from samplers.statistics.cluster_sums import has_independent_points, interval_of_sum
+from samplers.statistics.intervals import Interval, degrees_of_freedom, zero_hit_bound
+from samplers.statistics.weights import effective_number
 
-FEW = 30.0
+MIN_SIDE_ESS = 30.0
 """Effective failing units below which a probability is called coarse."""
-CHECKED = 16
+BASE_CHECK_DRAWS = 16
 """Draws at which the two base laws are compared."""
 
 
@@ -70,7 +70,7 @@ class Comparison:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain numbers for JSON; NaN and infinities become None."""
-        sides = {name: {key: plain(value) for key, value in vars(getattr(self, name)).items()} for name in ("a", "b")}
+        sides = {name: to_json_value(asdict(side)) for name, side in (("a", self.a), ("b", self.b))}
         data = {
             "ratio": self.ratio,
             "interval": list(self.interval),
@@ -80,10 +80,10 @@ class Comparison:
             "warnings": list(self.warnings),
             "either": self.either.to_dict(),
         }
-        return {**{key: plain(value) for key, value in data.items()}, **sides}
+        return {**{key: to_json_value(value) for key, value in data.items()}, **sides}
 
 
-class Either:
+class EitherFails:
     """The problem that fails where A or B does: f = min(f_A, f_B), and which of them it was.
 
     Args:
@@ -94,7 +94,7 @@ class Either:
 
     def __init__(self, a: Problem, b: Problem, gamma: float) -> None:
         self.dim, self.base = int(a.dim), a.base
-        self.given = ", ".join(dict.fromkeys(str(given) for p in (a, b) if (given := getattr(p, "given", ""))))
+        self.given = ", ".join(dict.fromkeys(given for problem in (a, b) if (given := condition_of(problem))))
         self.n_sim = 0
         self._problems, self._gamma = (a, b), gamma
         self._known: dict[bytes, tuple[bool, bool]] = {}
@@ -154,35 +154,35 @@ def compare(
     for problem in (a, b):
         check_problem(problem, ("dim", "base", "evaluate"))
     _check_same_base(a, b)
-    problem = Either(a, b, gamma)
+    problem = EitherFails(a, b, gamma)
     limit = None if max_sim is None else max_sim // 2
     found = estimate(problem, method, gamma, seed, limit, confidence=confidence, progress=progress)
-    return _compared(found, problem)
+    return _summarise(found, problem)
 
 
 def _check_same_base(a: Problem, b: Problem) -> None:
     """Raise a ValueError unless X has the same law in both problems, as far as a few draws tell."""
     if int(a.dim) != int(b.dim):
         raise ValueError(f"Expected two problems with the same x, got {a.dim} and {b.dim} dimensions.")
-    x = a.base.sample(CHECKED, np.random.default_rng(0))
+    x = a.base.sample(BASE_CHECK_DRAWS, np.random.default_rng(0))
     laws: tuple[Distribution, Distribution] = (a.base, b.base)
     log_p = [law.log_prob(x) for law in laws]
     if not np.allclose(log_p[0], log_p[1], rtol=1e-9, atol=1e-9):
         raise ValueError("Expected two problems with the same base distribution; their densities differ.")
 
 
-def _compared(found: Estimate, problem: Either) -> Comparison:
+def _summarise(found: Estimate, problem: EitherFails) -> Comparison:
     """Return what the points of an estimate of P[A or B fails] say of the two."""
-    sample = sample_of(found)
+    sample = require_sample(found)
     fails = sample.f <= found.gamma
     weights, units = sample.weights[fails], sample.units[fails]
     which = problem.who_fails(sample.x)
     totals = np.array([np.bincount(units, weights=weights * hit, minlength=sample.n_units) for hit in which])
     own = float(np.bincount(units, weights=weights, minlength=sample.n_units).std()) * math.sqrt(sample.n_units)
-    factor = inflation(found, own / found.p if found.p > 0 else math.inf)
-    single = alone(sample)
+    factor = cov_inflation(found, own / found.p if found.p > 0 else math.inf)
+    single = has_independent_points(sample)
     a, b = (_side(total, factor, single, found) for total in totals)
-    few = [f"{name} failed in draws worth {s.ess:.0f} only" for name, s in (("A", a), ("B", b)) if s.ess < FEW]
+    few = [f"{name} failed in draws worth {s.ess:.0f} only" for name, s in (("A", a), ("B", b)) if s.ess < MIN_SIDE_ESS]
     about = [f"{' and '.join(few)}: the ratio is coarse; estimate each by itself."] if few else []
     return Comparison(
         ratio=_ratio(a.p, b.p),
@@ -205,7 +205,7 @@ def _ratio(a: float, b: float) -> float:
 
 def _side(totals: FloatArray, factor: float, single: bool, found: Estimate) -> Side:
     """Return the probability that unit totals (n_units,) add up to."""
-    p, ess = float(totals.sum()), effective(totals)
+    p, ess = float(totals.sum()), effective_number(totals)
     if p == 0:
         return Side(p=0.0, interval=(0.0, found.interval[1]), cov=math.inf, ess=0.0)
     cov = factor * _error(totals) / p
@@ -220,15 +220,15 @@ def _interval(totals: FloatArray, factor: float, single: bool, found: Estimate) 
     apart = totals[0] != totals[1]  # units that tell the two from one another
     if p_a == 0 or p_b == 0 or not apart.any():
         # Of `ess` draws none was such that ...: of such draws there are at most
-        share = nothing_in(max(round(effective(totals.max(axis=0))), 1), found.confidence)
+        share = zero_hit_bound(max(round(effective_number(totals.max(axis=0))), 1), found.confidence)
         if p_a == 0:
             return 0.0, share
         return (1 / share, math.inf) if p_b == 0 else (1 - share, 1 / (1 - share))
     z = totals[0] / p_a - totals[1] / p_b
     spread, ratio = factor * _error(z), float(p_a / p_b)
-    ess = effective(np.where(apart, np.abs(z), 0.0))
+    ess = effective_number(np.where(apart, np.abs(z), 0.0))
     quantile = float(stats.t.ppf(0.5 + found.confidence / 2, degrees_of_freedom(ess, single)))
-    half = min(quantile * spread, LARGEST_LOG)
+    half = min(quantile * spread, MAX_LOG)
     return ratio * math.exp(-half), ratio * math.exp(half)
 
 

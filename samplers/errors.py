@@ -1,13 +1,26 @@
-"""What f returns, checked: one number for each row of x."""
+"""Errors of evaluations: what is wrong with the values that f returned, and the rules for rows on which it fails."""
 
-from typing import Literal, get_args
+from typing import Literal, Protocol, get_args, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+OnError = Literal["raise", "failure", "bound"]
+"""Where f raises or gives NaN: stop, count the row as failing, or count it so in p and the upper end only."""
+ON_ERROR: tuple[str, ...] = get_args(OnError)
+
+
+@runtime_checkable
+class FinalError(Protocol):
+    """An exception that says whether calling f again is of no use: it has been tried, or f cannot answer at all."""
+
+    final: bool
+
 
 class EvaluationError(ValueError):
     """f raised, returned NaN or returned something that is not one number per row."""
+
+    final = True
 
 
 def one_per_row(outcomes: ArrayLike, n: int) -> NDArray[np.float64]:
@@ -27,13 +40,7 @@ def one_per_row(outcomes: ArrayLike, n: int) -> NDArray[np.float64]:
     return f
 
 
-def where(x: NDArray[np.float64], row: int) -> str:
+def describe_row(x: NDArray[np.float64], row: int) -> str:
     """Return words that name a row of a batch x (n, d)."""
     shown = np.array2string(x[row], precision=6, threshold=8, separator=", ", max_line_width=10**6)
     return f"row {row} of a batch of {len(x)}, x = {shown}"
-
-
-OnError = Literal["raise", "failure", "bound"]
-
-
-ON_ERROR: tuple[str, ...] = get_args(OnError)

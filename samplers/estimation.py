@@ -1,13 +1,13 @@
-"""`estimate`: the front door."""
+"""Estimation: `estimate`, which runs a method on a problem that it can evaluate itself."""
 
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from samplers.errors import OnError
-from samplers.execution.arguments import check_problem, checked
-from samplers.execution.fault_isolation import Guarded
+from samplers.execution.arguments import RunArguments, check_problem
+from samplers.execution.fault_isolation import FaultIsolation
 from samplers.execution.progress import Listener, Progress, listening
 from samplers.execution.run import Run
 from samplers.method import Stepping
@@ -21,13 +21,13 @@ from samplers.validation import check_number
 def estimate(
     problem: Problem,
     method: Stepping | str = TwoStage(),  # noqa: B008  (frozen, so safe to share)
-    gamma: float = 0.0,
-    seed: int | None = None,
-    max_sim: int | None = None,
-    target_cov: float | None = None,
-    confidence: float = 0.95,
-    replicates: int = 1,
-    on_error: OnError = "raise",
+    gamma: float = RunArguments.gamma,
+    seed: int | None = RunArguments.seed,
+    max_sim: int | None = RunArguments.max_sim,
+    target_cov: float | None = RunArguments.target_cov,
+    confidence: float = RunArguments.confidence,
+    replicates: int = RunArguments.replicates,
+    on_error: OnError = RunArguments.on_error,
     progress: bool | Listener = False,
     *,
     time_limit: float | None = None,
@@ -64,54 +64,66 @@ def estimate(
 
     Returns:
         The probability, its interval, its cost and the failures. Of a run that was stopped (status
-        "stopped"), what its simulations say: see `combined` for replicates.
+        "stopped"), what its simulations say: see `combine` for replicates.
 
     Raises:
         ValueError: If an argument is not as described, or f does not return one number per row.
     """
     check_problem(problem, ("dim", "base", "evaluate"))
     chosen = get_method(method) if isinstance(method, str) else method
-    plan = checked(problem, chosen, gamma, seed, max_sim, target_cov, confidence, replicates, on_error)
-    stops = _Stops.checked(time_limit, stop)
+    arguments = RunArguments(
+        gamma=gamma,
+        seed=seed,
+        max_sim=max_sim,
+        target_cov=target_cov,
+        confidence=confidence,
+        replicates=replicates,
+        on_error=on_error,
+    )
+    conditions = _StopConditions(time_limit, stop)
     if not (callable(progress) or isinstance(progress, bool)):
         raise ValueError(f"Expected progress to be True, False or a function, got {progress!r}.")
-    guarded = Guarded(problem.evaluate, plan.on_error)
+    isolation = FaultIsolation(problem.evaluate, on_error)
     with listening(progress, max_sim) as listener:
-        run = Run(plan, listener)
+        run = Run(problem, chosen, arguments, listener)
         while not run.done:
-            run.tell(guarded.evaluate(run.ask()))
-            why = stops.why(run.progress)
+            run.tell(isolation.evaluate(run.ask()))
+            why = conditions.reason(run.progress)
             if why is not None:
                 run.stop(why)
-    return _with_retries(run.result(), guarded.n_retried)
+    return _add_retry_note(run.result(), isolation.n_retried)
 
 
-@dataclass(frozen=True)
-class _Stops:
-    """What may end a run before its time."""
+class _StopConditions:
+    """Conditions that end a run before its time.
 
-    time_limit: float
-    stop: Callable[[Progress], bool] | None
-    started: float
+    Args:
+        time_limit: Seconds from now on; None for no limit.
+        stop: Returns True to end the run; None for never.
 
-    @classmethod
-    def checked(cls, time_limit: float | None, stop: Callable[[Progress], bool] | None) -> "_Stops":
+    Raises:
+        ValueError: If time_limit is not a positive number, or stop is not a function.
+    """
+
+    def __init__(self, time_limit: float | None, stop: Callable[[Progress], bool] | None) -> None:
         if time_limit is not None:
             check_number("time_limit", time_limit, 0.0, math.inf)
         if not (stop is None or callable(stop)):
             raise ValueError(f"Expected stop to be a function of Progress, got {stop!r}.")
-        return cls(math.inf if time_limit is None else float(time_limit), stop, time.monotonic())
+        self._time_limit = math.inf if time_limit is None else float(time_limit)
+        self._stop = stop
+        self._started = time.monotonic()
 
-    def why(self, progress: Progress) -> str | None:
+    def reason(self, progress: Progress) -> str | None:
         """Return the reason to stop now, in words, or None."""
-        if self.stop is not None and self.stop(progress):
+        if self._stop is not None and self._stop(progress):
             return "Stopped by the callback"
-        if time.monotonic() - self.started >= self.time_limit:
-            return f"Stopped by the time limit of {self.time_limit:g} s"
+        if time.monotonic() - self._started >= self._time_limit:
+            return f"Stopped by the time limit of {self._time_limit:g} s"
         return None
 
 
-def _with_retries(result: Estimate, n_retried: int) -> Estimate:
+def _add_retry_note(result: Estimate, n_retried: int) -> Estimate:
     """Return the result with a note on rows that f was handed more than once."""
     if n_retried == 0:
         return result

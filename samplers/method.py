@@ -3,18 +3,15 @@
 import sys
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Protocol, runtime_checkable
+from typing import ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 
 from samplers.problem import FloatArray, Inputs
 from samplers.sample import Sample
 from samplers.statistics.intervals import binomial_cov, clopper_pearson
-from samplers.statistics.weights import normalised
+from samplers.statistics.weights import normalise_weights
 from samplers.trace import Level, Status
-
-if TYPE_CHECKING:
-    pass
 
 
 def ignore_level(level: Level) -> None:
@@ -62,6 +59,36 @@ class Outcome:
     """Independent draws from the base law that the run made, wherever: they bound what `Estimate.unseen` says. Of
     draws from a mixture, the expected number from its base component."""
 
+    @classmethod
+    def of_counts(
+        cls, hits: int, n: int, confidence: float, trace: Sequence[Level], no_outcome_share: float = 0.0
+    ) -> "Outcome":
+        """Return the outcome of n independent draws of which `hits` fail: p = hits / n, Clopper-Pearson interval.
+
+        Args:
+            hits: Failing draws.
+            n: Draws.
+            confidence: Nominal coverage of the interval.
+            trace: Levels of the run.
+            no_outcome_share: Share of the hits that are points without an outcome.
+
+        Example:
+            >>> outcome = Outcome.of_counts(10, 1000, confidence=0.95, trace=())
+            >>> outcome.p, [round(end, 4) for end in outcome.interval], round(outcome.cov, 3)
+            (0.01, [0.0048, 0.0183], 0.315)
+        """
+        return cls(
+            p=hits / n,
+            interval=clopper_pearson(hits, n, confidence),
+            cov=binomial_cov(hits / n, n),
+            status=Status.CONVERGED if hits else Status.NO_HITS,
+            warnings=_count_warnings(hits, n),
+            trace=tuple(trace),
+            no_outcome_share=no_outcome_share,
+            counts=(hits, n),
+            base_draws=n,
+        )
+
 
 class Interrupted(Exception):
     """Thrown into a method where it waits for outcomes: there will be no more of them."""
@@ -94,29 +121,15 @@ def no_outcome_share(f: FloatArray, log_weights: FloatArray | None = None) -> fl
     missing = np.isneginf(f)
     if log_weights is None or missing.all() or not missing.any():  # exactly 1 or 0, whatever the weights
         return float(missing.mean()) if len(f) else 0.0
-    return min(float(normalised(log_weights)[missing].sum()), 1.0)
+    return min(float(normalise_weights(log_weights)[missing].sum()), 1.0)
 
 
 MANY_FAILURES = 5
 """Fewer hits than this leave a c.o.v. above about 0.45 (half, in subset simulation): worth a warning."""
 
 
-def share_of_failures(hits: int, n: int, confidence: float, trace: Sequence[Level], no_outcome_share: float) -> Outcome:
-    """Return the outcome of `hits` failing points among n independent draws."""
-    return Outcome(
-        p=hits / n,
-        interval=clopper_pearson(hits, n, confidence),
-        cov=binomial_cov(hits / n, n),
-        status=Status.CONVERGED if hits else Status.NO_HITS,
-        warnings=_warnings(hits, n),
-        trace=tuple(trace),
-        no_outcome_share=no_outcome_share,
-        counts=(hits, n),
-        base_draws=n,
-    )
-
-
-def _warnings(hits: int, n: int) -> tuple[str, ...]:
+def _count_warnings(hits: int, n: int) -> tuple[str, ...]:
+    """Return the warning that few or none of n draws failed, if so."""
     if hits == 0:
         return (f"None of {n:,} simulations failed: p = 0 with a one-sided interval.",)
     if hits < MANY_FAILURES:

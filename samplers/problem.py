@@ -59,6 +59,20 @@ class Problem(Inputs, Protocol):
         """Simulate the rows of x (n, d); return f, shape (n,), float64."""
 
 
+@runtime_checkable
+class Conditional(Protocol):
+    """A problem that holds something fixed, so that its p is conditional on it."""
+
+    @property
+    def given(self) -> str:
+        """What is fixed, in words; empty for nothing."""
+
+
+def condition_of(problem: Inputs) -> str:
+    """Return what a problem holds fixed, in words; empty for nothing."""
+    return str(problem.given) if isinstance(problem, Conditional) else ""
+
+
 @dataclass(frozen=True)
 class StandardNormal:
     """The law N(0, I) in `dim` dimensions; its map to standard normal space is the identity.

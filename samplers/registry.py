@@ -16,7 +16,7 @@ from samplers.methods.subset_simulation import AdaptiveSubsetSimulation, SubsetS
 from samplers.methods.two_stage.method import TwoStage
 from samplers.validation import check_name
 
-GROUP = "rare_envs.samplers"
+ENTRY_POINT_GROUP = "rare_envs.samplers"
 """Entry points of this group name methods of other packages."""
 
 
@@ -47,13 +47,13 @@ class Methods(Mapping[str, type[Stepping]]):
     @cached_property
     def _offered(self) -> dict[str, type[Stepping]]:
         found: dict[str, type[Stepping]] = {}
-        for entry in sorted(entry_points(group=GROUP), key=lambda entry: entry.name):
+        for entry in sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda entry: entry.name):
             try:
                 if entry.name in self._own or entry.name in found:
                     raise ValueError("that name is taken")
-                found[entry.name] = _loaded(entry)
+                found[entry.name] = _load_method(entry)
             except Exception as error:  # whatever another package does must not break this one
-                message = f"The method {_origin(entry)} cannot be used: {type(error).__name__}: {error}"
+                message = f"The method {_describe_entry(entry)} cannot be used: {type(error).__name__}: {error}"
                 warnings.warn(message, RuntimeWarning, stacklevel=2)
         return found
 
@@ -93,7 +93,7 @@ def get_method(name: str, **settings: Any) -> Stepping:
     return cls(**settings)
 
 
-def _loaded(entry: EntryPoint) -> type[Stepping]:
+def _load_method(entry: EntryPoint) -> type[Stepping]:
     """Import the class that an entry point names."""
     loaded: object = entry.load()
     if not isinstance(loaded, type):
@@ -107,6 +107,6 @@ def _loaded(entry: EntryPoint) -> type[Stepping]:
     return cls
 
 
-def _origin(entry: EntryPoint) -> str:
+def _describe_entry(entry: EntryPoint) -> str:
     package = "" if entry.dist is None else f" of {entry.dist.name}"
     return f"{entry.name!r}{package} ({entry.value})"

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from samplers.analysis.curve import curve_of
-from samplers.analysis.failure_modes import shares_of
-from samplers.analysis.reweighting import reweighted
+from samplers.analysis.curve import compute_curve
+from samplers.analysis.failure_modes import split_by_kind
+from samplers.analysis.reweighting import reweight
 from samplers.problem import Distribution, FloatArray
-from samplers.serialization import plain
-from samplers.statistics.intervals import nothing_in
+from samplers.serialization import to_json_value
+from samplers.statistics.intervals import zero_hit_bound
 from samplers.trace import Level, Status
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ class Failures:
         """No failures of a problem with `dim` dimensions."""
         return cls(x=np.empty((0, dim)), f=np.empty(0), log_p0=np.empty(0), total=0)
 
-    def merged(self, x: FloatArray, f: FloatArray, log_p0: FloatArray, *, keep: int) -> "Failures":
+    def merge(self, x: FloatArray, f: FloatArray, log_p0: FloatArray, *, keep: int) -> "Failures":
         """Add points x (k, d), f (k,), log_p0 (k,) and keep the `keep` most likely of all."""
         all_log_p0 = np.concatenate([self.log_p0, log_p0])
         best = np.argsort(-all_log_p0, kind="stable")[:keep]
@@ -141,7 +141,7 @@ class Estimate:
         to failures other than base draws (levels of f, wide draws, chains) may find far smaller regions, but
         guarantees nothing.
         """
-        return nothing_in(self.base_draws, self.confidence)
+        return zero_hit_bound(self.base_draws, self.confidence)
 
     def curve(self, gammas: ArrayLike) -> "Curve":
         """Return P[f(X) <= g] for other thresholds g from the same simulations, with a simultaneous band.
@@ -156,7 +156,7 @@ class Estimate:
             ValueError: If a threshold lies below what is known (the text says from where on it is),
                 or the method gave no weighted points.
         """
-        return curve_of(self, gammas)
+        return compute_curve(self, gammas)
 
     def reweight(self, new_base: "HasLogProb") -> "Reweighted":
         """Return P[f(X) <= gamma] with X from another base distribution, from the same simulations.
@@ -176,7 +176,7 @@ class Estimate:
                 density where the old has none, it does not fit, nothing failed, or the method gave
                 no weighted points.
         """
-        return reweighted(self, new_base)
+        return reweight(self, new_base)
 
     def shares(self, label: "Callable[[FloatArray], Sequence[str]]", most: int | None = None) -> "dict[str, Share]":
         """Return p by kind of failure, from the same simulations; the kinds' p add up to p.
@@ -188,7 +188,7 @@ class Estimate:
         Raises:
             ValueError: If the method gave no weighted points, or label does not give k words.
         """
-        return shares_of(self, label, most)
+        return split_by_kind(self, label, most)
 
     @property
     def proviso(self) -> str:
@@ -238,7 +238,7 @@ class Estimate:
             "method": {"name": self.method.name, "settings": method_settings(self.method)},
             "seed": self.seed,
         }
-        return {key: plain(value) for key, value in data.items()}
+        return {key: to_json_value(value) for key, value in data.items()}
 
     def to_json(self) -> str:
         """Return `to_dict` as one line of JSON."""

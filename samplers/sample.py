@@ -55,8 +55,17 @@ class Sample:
         """The layers; the sample itself as one where it has none."""
         return self.layers or (Layer(f=self.f, weights=self.weights, units=self.units),)
 
+    @classmethod
+    def of_equal_draws(cls, f: FloatArray, x: FloatArray) -> Sample:
+        """Return n independent draws of equal weight, each a unit of its own.
 
-def equal_draws(f: FloatArray, x: FloatArray) -> Sample:
-    """Return independent draws of equal weight: outcomes f (n,) of all, the failing points x (k, d)."""
-    n = len(f)
-    return Sample(f=f, weights=np.broadcast_to(1 / n, n), units=np.arange(n), n_units=n, x=x)
+        Args:
+            f: Outcomes of all draws, shape (n,).
+            x: The failing ones of them, shape (k, d).
+
+        Example:
+            >>> Sample.of_equal_draws(np.array([2.0, -1.0]), np.array([[0.5, 3.0]])).weights
+            array([0.5, 0.5])
+        """
+        n = len(f)
+        return cls(f=f, weights=np.broadcast_to(1 / n, n), units=np.arange(n), n_units=n, x=x)

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 
 
-def plain(value: Any) -> Any:
+def to_json_value(value: Any) -> Any:
     """Replace NaN and infinities inside value by None, numbers of NumPy by Python's."""
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, dict):
-        return {key: plain(item) for key, item in value.items()}
+        return {key: to_json_value(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
+        return [to_json_value(item) for item in value]
     return value

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from samplers.estimation import estimate
-from samplers.execution.arguments import checked
+from samplers.execution.arguments import RunArguments
 from samplers.execution.replicate import NOT_KNOWN
 from samplers.execution.run import Run
 from samplers.limit_states import half_space, two_modes
@@ -36,7 +36,7 @@ def check_method(method: Stepping) -> None:
     Raises:
         AssertionError: The method does not do what a method must; the text says what.
     """
-    for check in CHECKS:
+    for check in METHOD_CHECKS:
         check(method)
 
 
@@ -140,14 +140,14 @@ def check_dimensions(method: Stepping) -> None:
 def check_interruption(method: Stepping) -> None:
     """Stopped after any batch, what has been simulated is in the result."""
     reference = half_space(2, 3.0)
-    plan = checked(reference.problem, method, seed=2, max_sim=4000)
-    whole = Run(plan)
+    arguments = RunArguments(seed=2, max_sim=4000)
+    whole = Run(reference.problem, method, arguments)
     batches = 0
     while not whole.done:
         whole.tell(reference.problem.f(whole.ask()))
         batches += 1
     for after in sorted({math.ceil(batches * i / 12) for i in range(1, 12)} & set(range(1, batches))):
-        run = Run(plan)
+        run = Run(reference.problem, method, arguments)
         rows = 0
         for _ in range(after):
             x = run.ask()
@@ -190,7 +190,7 @@ def check_right(method: Stepping) -> None:
     _expect(held >= 6, method, f"{held} of 10 intervals hold the true p")
 
 
-CHECKS: tuple[Callable[[Stepping], None], ...] = (
+METHOD_CHECKS: tuple[Callable[[Stepping], None], ...] = (
     check_form,
     check_counts,
     check_budget,

@@ -29,7 +29,7 @@ import rare_envs
 import samplers
 from benchmarks.driving.failing_traffic import behaviour, failing_points, failures
 from benchmarks.estimators.runs import about
-from samplers.serialization import plain
+from samplers.serialization import to_json_value
 
 PAPER = samplers.CrossEntropy(family="blocks", rho=0.01, alpha=0.8, early_end=False, choice="quantile", wide_share=0)
 METHODS: dict[str, Any] = {
@@ -189,7 +189,7 @@ def main(
 def write(path: Path | None, data: dict[str, Any]) -> None:
     """Write what was measured, if a path is given."""
     if path is not None:
-        path.write_text(json.dumps(plain(data), indent=1) + "\n")
+        path.write_text(json.dumps(to_json_value(data), indent=1) + "\n")
 
 
 if __name__ == "__main__":

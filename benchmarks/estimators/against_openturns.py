@@ -29,7 +29,7 @@ from benchmarks.estimators.report import table
 from benchmarks.estimators.runs import Job, Meter, Run, about, failed, limit_state, rotation_of, run_all
 from benchmarks.estimators.summary import Cell, cells_of
 from samplers.problem import FloatArray
-from samplers.serialization import plain
+from samplers.serialization import to_json_value
 
 ALGORITHMS = {
     "openturns-ss": openturns.SubsetSampling,
@@ -139,7 +139,7 @@ def main(
             "cells": [asdict(cell) for cell in cells],
             "runs": [asdict(run) for run in all_runs],
         }
-        out.write_text(json.dumps(plain(data), indent=1, allow_nan=False) + "\n")
+        out.write_text(json.dumps(to_json_value(data), indent=1, allow_nan=False) + "\n")
 
 
 if __name__ == "__main__":

@@ -18,8 +18,6 @@ import typer
 import rare_envs
 import samplers
 from benchmarks.estimators.truth import RESULT as TRUTH
-from samplers.execution.arguments import checked
-from samplers.execution.run import Run
 from samplers.registry import get_method
 
 RESULT = Path(__file__).parents[1] / "results" / "against_truth.json"
@@ -64,7 +62,8 @@ def compare(row: dict[str, Any], method: str, seeds: range) -> Cell:
     """
     problem = rare_envs.DrivingProblem(row["env_id"], base=row["base"])
     max_sim = MONTE_CARLO_BUDGET if method == "mc" else None
-    started = [Run(checked(problem, get_method(method), seed=seed, max_sim=max_sim)) for seed in seeds]
+    arguments = [samplers.RunArguments(seed=seed, max_sim=max_sim) for seed in seeds]
+    started = [samplers.Run(problem, get_method(method), each) for each in arguments]
     runs = side_by_side(problem, started)
     p, truth = np.array([run.p for run in runs]), row["p"]
     error = np.hypot(p.std(ddof=1) / len(p) ** 0.5, row["standard_error"])

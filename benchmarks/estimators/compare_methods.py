@@ -27,7 +27,7 @@ from benchmarks.estimators.catalogue import CASES
 from benchmarks.estimators.report import summary, table
 from benchmarks.estimators.runs import Job, about, run_all
 from benchmarks.estimators.summary import cells_of, power_of, verdicts
-from samplers.serialization import plain
+from samplers.serialization import to_json_value
 
 
 def main(
@@ -73,7 +73,7 @@ def main(
             "cells": [asdict(cell) for cell in cells],
             "runs": [asdict(run) for run in results],
         }
-        out.write_text(json.dumps(plain(data), indent=1, allow_nan=False) + "\n")
+        out.write_text(json.dumps(to_json_value(data), indent=1, allow_nan=False) + "\n")
 
 
 def selected(names: str, known: list[str], kind: str) -> list[str]:

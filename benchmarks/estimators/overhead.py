@@ -25,7 +25,7 @@ from benchmarks.estimators.compare_methods import selected
 from benchmarks.estimators.runs import Meter, about
 from samplers.limit_states import half_space
 from samplers.problem import FunctionProblem
-from samplers.serialization import plain
+from samplers.serialization import to_json_value
 
 TARGETS = {6: 1.0, 428: 10.0}
 """Seconds for the default method, by dimension."""
@@ -108,7 +108,7 @@ def main(
     if out:
         command = f"python -m benchmarks.estimators.overhead {' '.join(sys.argv[1:])}"
         data = {"about": about(command=command, max_sim=max_sim), "rows": [asdict(row) for row in rows]}
-        out.write_text(json.dumps(plain(data), indent=1, allow_nan=False) + "\n")
+        out.write_text(json.dumps(to_json_value(data), indent=1, allow_nan=False) + "\n")
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from samplers.problem import Distribution
 from samplers.sample import Sample
 
 
-class Named(Protocol):
+class HasName(Protocol):
     """A method, as far as messages name it."""
 
     @property
@@ -19,7 +19,7 @@ class Named(Protocol):
         """Name on the command line."""
 
 
-class Failing(Protocol):
+class HasTotal(Protocol):
     """Failing points, as far as messages count them."""
 
     @property
@@ -58,7 +58,7 @@ class WeightedEstimate(Protocol):
         """What was done where f raised or gave NaN."""
 
     @property
-    def method(self) -> Named:
+    def method(self) -> HasName:
         """The method."""
 
     @property
@@ -70,11 +70,11 @@ class WeightedEstimate(Protocol):
         """Distribution of X."""
 
     @property
-    def failures(self) -> Failing:
+    def failures(self) -> HasTotal:
         """Failing points that were kept."""
 
 
-def sample_of(estimate: WeightedEstimate) -> Sample:
+def require_sample(estimate: WeightedEstimate) -> Sample:
     """Return the weighted points of an estimate, or raise a ValueError that says there are none."""
     if estimate.sample is None:
         raise ValueError(
@@ -84,13 +84,13 @@ def sample_of(estimate: WeightedEstimate) -> Sample:
     return estimate.sample
 
 
-def inflation(estimate: WeightedEstimate, own_cov: float) -> float:
+def cov_inflation(estimate: WeightedEstimate, own_cov: float) -> float:
     """Return by what the c.o.v. of units at gamma must grow to be the estimate's own; 1 where it is larger."""
     if not math.isfinite(estimate.cov) or not 0 < own_cov < math.inf:
         return 1.0
     return max(1.0, estimate.cov / own_cov)
 
 
-def without_outcome(estimate: WeightedEstimate, sample: Sample) -> float:
+def no_outcome_weight(estimate: WeightedEstimate, sample: Sample) -> float:
     """Return the weight of points without an outcome, where these do not count in the lower end; else 0."""
     return float(sample.weights[np.isneginf(sample.f)].sum()) if estimate.on_error == "bound" else 0.0

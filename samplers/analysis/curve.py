@@ -13,20 +13,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
-from samplers.analysis.base import WeightedEstimate, inflation, sample_of, without_outcome
+from samplers.analysis.base import WeightedEstimate, cov_inflation, no_outcome_weight, require_sample
 from samplers.problem import FloatArray
 from samplers.sample import Sample
-from samplers.serialization import plain
+from samplers.serialization import to_json_value
 from samplers.statistics.cluster_sums import interval_of_count, interval_of_sum, unit_sums
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-LEAST_ESS = 5.0
+MIN_UNITS = 5.0
 """Effective number of units that a threshold below gamma must have."""
-DRAWS = 10_000
+BAND_DRAWS = 10_000
 """Draws of the largest deviation; its 95 % quantile is then good to about 1 %."""
-STREAM = 2**31
+BAND_STREAM = 2**31
 """Spawn key of the generator for these draws; the runs have 0, 1, 2, ..."""
 
 
@@ -62,7 +62,7 @@ class Curve:
     def to_dict(self) -> dict[str, Any]:
         """Return plain lists and numbers for JSON; infinities become None."""
         arrays = ("gammas", "p", "low", "high", "cov", "ess")
-        data = {key: plain(getattr(self, key).tolist()) for key in arrays}
+        data = {key: to_json_value(getattr(self, key).tolist()) for key in arrays}
         return {**data, "confidence": self.confidence}
 
     def plot(self, ax: "Axes | None" = None) -> "Axes":
@@ -85,7 +85,7 @@ class Curve:
         return ax
 
 
-def curve_of(estimate: WeightedEstimate, gammas: ArrayLike) -> Curve:
+def compute_curve(estimate: WeightedEstimate, gammas: ArrayLike) -> Curve:
     """Return the curve of a finished estimation; see `Estimate.curve`.
 
     p is the sum of the weights of the points with f <= g, moved below gamma in proportion (above it
@@ -105,23 +105,23 @@ def curve_of(estimate: WeightedEstimate, gammas: ArrayLike) -> Curve:
     Raises:
         ValueError: As described in `Estimate.curve`.
     """
-    sample = sample_of(estimate)
-    asked = checked(gammas)
+    sample = require_sample(estimate)
+    asked = as_thresholds(gammas)
     check_known(sample, estimate.gamma, asked)
     grid, place = np.unique(np.append(asked, estimate.gamma), return_inverse=True)
     sums, at_gamma = unit_sums(sample, grid), int(place[-1])
     use = np.unique(place[:-1])
-    p = through(estimate, sums.p, at_gamma)
-    cov = np.where(sums.counted, 1.0, inflation(estimate, float(sums.cov[at_gamma]))) * sums.cov
-    rng = np.random.default_rng(np.random.SeedSequence(estimate.seed, spawn_key=(STREAM,)))
-    level = common_level(sums.correlation[np.ix_(use, use)], estimate.confidence, rng)
+    p = anchor_at_estimate(estimate, sums.p, at_gamma)
+    cov = np.where(sums.is_count, 1.0, cov_inflation(estimate, float(sums.cov[at_gamma]))) * sums.cov
+    rng = np.random.default_rng(np.random.SeedSequence(estimate.seed, spawn_key=(BAND_STREAM,)))
+    level = simultaneous_level(sums.correlation[np.ix_(use, use)], estimate.confidence, rng)
     low, high = np.zeros(len(grid)), np.ones(len(grid))
     for i in use:
-        if sums.counted[i]:
+        if sums.is_count[i]:
             low[i], high[i] = interval_of_count(float(sums.p[i]), sums.n_units, level)
         else:
-            low[i], high[i] = interval_of_sum(float(p[i]), float(cov[i]), float(sums.ess[i]), sums.alone, level)
-    low[use] = np.maximum.accumulate(low[use] * (1 - without_outcome(estimate, sample) / sums.p[use]))
+            low[i], high[i] = interval_of_sum(float(p[i]), float(cov[i]), float(sums.ess[i]), sums.independent, level)
+    low[use] = np.maximum.accumulate(low[use] * (1 - no_outcome_weight(estimate, sample) / sums.p[use]))
     high[use] = np.minimum.accumulate(high[use][::-1])[::-1]
     here = place[:-1]
     return Curve(
@@ -135,7 +135,7 @@ def curve_of(estimate: WeightedEstimate, gammas: ArrayLike) -> Curve:
     )
 
 
-def checked(gammas: ArrayLike) -> FloatArray:
+def as_thresholds(gammas: ArrayLike) -> FloatArray:
     """Return thresholds as an array of shape (k,) with k > 0, all finite."""
     try:
         values = np.array(gammas, dtype=np.float64, ndmin=1)
@@ -148,19 +148,19 @@ def checked(gammas: ArrayLike) -> FloatArray:
 
 def check_known(sample: Sample, gamma: float, gammas: FloatArray) -> None:
     """Raise a ValueError if a threshold lies below what the sample knows."""
-    start = known_from(sample, gamma)
+    start = lowest_known_threshold(sample, gamma)
     lowest = float(gammas.min())
     if lowest >= start:
         return
     known = f"the curve is known from g = {start!r} on" if math.isfinite(start) else "no threshold is known"
     more = f"gamma={lowest!r}" if lowest < gamma else "more simulations"
     raise ValueError(
-        f"Threshold {lowest!r} is too low for this run: {known}. Below, fewer than {LEAST_ESS:g} effective "
+        f"Threshold {lowest!r} is too low for this run: {known}. Below, fewer than {MIN_UNITS:g} effective "
         f"independent points speak; estimate again with {more}."
     )
 
 
-def known_from(sample: Sample, gamma: float) -> float:
+def lowest_known_threshold(sample: Sample, gamma: float) -> float:
     """Return the least threshold known: gamma if there is a failing point, or one with LEAST_ESS effective units."""
     order = np.lexsort((sample.f, sample.units))  # within each unit by f
     w, unit = sample.weights[order], sample.units[order]
@@ -171,13 +171,13 @@ def known_from(sample: Sample, gamma: float) -> float:
     added[order] = w * (2 * within + w)  # to the sum of squares
     rising = np.argsort(sample.f, kind="stable")
     squares, p = np.cumsum(added[rising]), np.cumsum(sample.weights[rising])
-    enough = (squares > 0) & (p * p >= LEAST_ESS * squares)
+    enough = (squares > 0) & (p * p >= MIN_UNITS * squares)
     start = float(sample.f[rising][np.argmax(enough)]) if enough.any() else math.inf
     start = max(start, float(np.finfo(np.float64).min))  # points without an outcome count at any threshold
     return min(start, gamma) if (sample.weights[sample.f <= gamma] > 0).any() else start
 
 
-def through(estimate: WeightedEstimate, sums: FloatArray, at_gamma: int) -> FloatArray:
+def anchor_at_estimate(estimate: WeightedEstimate, sums: FloatArray, at_gamma: int) -> FloatArray:
     """Return the sums (G,) at rising thresholds made to go through the estimate at gamma, cut at 1."""
     own = float(sums[at_gamma])
     if own == 0 or math.isclose(own, estimate.p, rel_tol=1e-9):
@@ -186,7 +186,7 @@ def through(estimate: WeightedEstimate, sums: FloatArray, at_gamma: int) -> Floa
     return np.asarray(np.minimum(moved, 1.0))
 
 
-def common_level(correlation: NDArray[np.float64], confidence: float, rng: np.random.Generator) -> float:
+def simultaneous_level(correlation: NDArray[np.float64], confidence: float, rng: np.random.Generator) -> float:
     """Return the level of pointwise intervals that together hold with probability `confidence`.
 
     Args:
@@ -199,6 +199,6 @@ def common_level(correlation: NDArray[np.float64], confidence: float, rng: np.ra
     if np.count_nonzero(some) <= 1:
         return confidence
     roots = vectors[:, some] * np.sqrt(values[some])
-    largest = np.abs(rng.standard_normal((DRAWS, roots.shape[1])) @ roots.T).max(axis=1)
+    largest = np.abs(rng.standard_normal((BAND_DRAWS, roots.shape[1])) @ roots.T).max(axis=1)
     level = 1 - 2 * float(stats.norm.sf(np.quantile(largest, confidence)))
     return max(level, confidence)

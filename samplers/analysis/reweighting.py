@@ -6,20 +6,20 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from samplers.analysis.base import WeightedEstimate, inflation, sample_of
+from samplers.analysis.base import WeightedEstimate, cov_inflation, require_sample
 from samplers.problem import Distribution, FloatArray
-from samplers.serialization import plain
-from samplers.statistics.cluster_sums import alone, interval_of_sum
+from samplers.serialization import to_json_value
+from samplers.statistics.cluster_sums import has_independent_points, interval_of_sum
 from samplers.statistics.intervals import Interval
-from samplers.statistics.weights import effective
+from samplers.statistics.weights import effective_number
 
-LEAST_ESS = 30.0
+MIN_POINTS = 30.0
 """Effective number of failing points that the answer must rest on."""
-LEAST_UNITS = 5.0
+MIN_UNITS = 5.0
 """Effective number of independent units (draws; paths of chains) that these points must come from."""
-LARGEST_LOG = 600.0
+MAX_LOG = 600.0
 """exp of this, or of its negative, is still a float."""
-DRAWS = 10_000
+SUPPORT_DRAWS = 10_000
 """Draws from the new base that look for places where the old one has no density."""
 
 
@@ -64,10 +64,10 @@ class Reweighted:
     def to_dict(self) -> dict[str, Any]:
         """Return plain numbers for JSON."""
         data = {name: getattr(self, name) for name in self.__dataclass_fields__}
-        return {key: plain(value) for key, value in data.items()}
+        return {key: to_json_value(value) for key, value in data.items()}
 
 
-def reweighted(estimate: WeightedEstimate, new_base: HasLogProb) -> Reweighted:
+def reweight(estimate: WeightedEstimate, new_base: HasLogProb) -> Reweighted:
     """Return p under another base; see `Estimate.reweight`.
 
     p1 = sum of w r over the failing points, r = p1(x) / p0(x). With T_c the sums over units, its
@@ -78,23 +78,23 @@ def reweighted(estimate: WeightedEstimate, new_base: HasLogProb) -> Reweighted:
     Raises:
         ValueError: As described in `Estimate.reweight`.
     """
-    sample = sample_of(estimate)
+    sample = require_sample(estimate)
     failing = sample.f <= estimate.gamma
     f, old, owners = sample.f[failing], sample.weights[failing], sample.units[failing]
-    log_ratios = ratios(estimate, new_base, sample.x)
+    log_ratios = log_density_ratios(estimate, new_base, sample.x)
     highest = float(log_ratios.max())
     largest = highest if math.isfinite(highest) else 0.0  # taken out, so that nothing overflows
     terms = old * np.exp(log_ratios - largest)
     totals = np.bincount(owners, weights=terms, minlength=1).astype(np.float64)
-    ess, units = effective(terms), effective(totals)
+    ess, units = effective_number(terms), effective_number(totals)
     check_enough(estimate, ess, units)
     total = float(terms.sum())
     square = 1 / units - 1 / sample.n_units + (float(totals.max()) / total) ** 2
-    own = 1 / effective(np.bincount(owners, weights=old).astype(np.float64)) - 1 / sample.n_units
-    cov = math.sqrt(max(square, 0.0)) * inflation(estimate, math.sqrt(max(own, 0.0)))
-    ratio = total / float(old.sum()) * math.exp(min(max(largest, -LARGEST_LOG), LARGEST_LOG))
+    own = 1 / effective_number(np.bincount(owners, weights=old).astype(np.float64)) - 1 / sample.n_units
+    cov = math.sqrt(max(square, 0.0)) * cov_inflation(estimate, math.sqrt(max(own, 0.0)))
+    ratio = total / float(old.sum()) * math.exp(min(max(largest, -MAX_LOG), MAX_LOG))
     p = min(1.0, estimate.p * ratio)
-    low, high = interval_of_sum(p, cov, units, alone(sample), estimate.confidence)
+    low, high = interval_of_sum(p, cov, units, has_independent_points(sample), estimate.confidence)
     if estimate.on_error == "bound":
         low *= 1 - float(terms[np.isneginf(f)].sum()) / total
     return Reweighted(
@@ -109,7 +109,7 @@ def reweighted(estimate: WeightedEstimate, new_base: HasLogProb) -> Reweighted:
     )
 
 
-def ratios(estimate: WeightedEstimate, new_base: HasLogProb, x: FloatArray) -> FloatArray:
+def log_density_ratios(estimate: WeightedEstimate, new_base: HasLogProb, x: FloatArray) -> FloatArray:
     """Return log(p1 / p0) at the failing points x (k, d), shape (k,), or raise a ValueError where that cannot be."""
     base = estimate.base
     if base is None:
@@ -143,9 +143,11 @@ def check_support(base: Distribution, new_base: HasLogProb, dim: int, seed: int)
     draw = getattr(new_base, "sample", None)
     if not callable(draw):
         return
-    x = np.asarray(draw(DRAWS, np.random.default_rng(seed)), dtype=np.float64)
-    if x.shape != (DRAWS, dim):
-        raise ValueError(f"Expected a distribution in {dim} dimensions; {DRAWS} draws of this have shape {x.shape}.")
+    x = np.asarray(draw(SUPPORT_DRAWS, np.random.default_rng(seed)), dtype=np.float64)
+    if x.shape != (SUPPORT_DRAWS, dim):
+        raise ValueError(
+            f"Expected a distribution in {dim} dimensions; {SUPPORT_DRAWS} draws of this have shape {x.shape}."
+        )
     outside = float(np.mean(np.isneginf(base.log_prob(x))))
     if outside > 0:
         raise ValueError(
@@ -164,10 +166,10 @@ def log_density(law: HasLogProb, x: FloatArray) -> FloatArray:
 
 def check_enough(estimate: WeightedEstimate, ess: float, units: float) -> None:
     """Raise a ValueError where too few points or units carry the new estimate."""
-    if ess >= LEAST_ESS and units >= LEAST_UNITS:
+    if ess >= MIN_POINTS and units >= MIN_UNITS:
         return
     raise ValueError(
         f"The failing points of this run are worth {ess:.1f} points from {units:.1f} independent units under the new "
-        f"base; at least {LEAST_ESS:g} and {LEAST_UNITS:g} are needed. Estimate again with the new base, or start "
+        f"base; at least {MIN_POINTS:g} and {MIN_UNITS:g} are needed. Estimate again with the new base, or start "
         f"from a run with more failing points (it has {estimate.failures.total:,})."
     )

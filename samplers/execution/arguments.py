@@ -1,8 +1,7 @@
-"""The arguments of `estimate` and of `Method.start`, checked."""
+"""Arguments of a run: what `estimate` and `Method.start` take, with their defaults and ranges in one place."""
 
 import math
 from dataclasses import dataclass
-from typing import cast
 
 import numpy as np
 
@@ -13,17 +12,59 @@ from samplers.validation import check_name, check_number, check_whole
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan:
-    """What a run is asked: problem, method, goal, seed and the number of replicates."""
+class RunArguments:
+    """Arguments of one run; their defaults are those of `estimate`, `Method.start` and the command line.
 
-    inputs: Inputs
-    method: Stepping
-    goal: Goal
-    seed: int
-    replicates: int
-    on_error: OnError
-    given: str = ""
-    """What the problem holds fixed, see `Estimate.given`."""
+    Raises:
+        ValueError: If an argument is out of range; the text says what was expected.
+
+    Example:
+        >>> arguments = RunArguments(max_sim=6000, seed=1)
+        >>> arguments.gamma, arguments.confidence, arguments.replicates
+        (0.0, 0.95, 1)
+        >>> RunArguments(confidence=95)
+        Traceback (most recent call last):
+            ...
+        ValueError: Expected confidence to be a number between 0 and 1, got 95.
+    """
+
+    gamma: float = 0.0
+    """Threshold of failure, f <= gamma."""
+    seed: int | None = None
+    """Same seed, same answer; None draws one."""
+    max_sim: int | None = None
+    """Simulations that are never exceeded, over all replicates; None leaves it to the method."""
+    target_cov: float | None = None
+    """Coefficient of variation to stop at; None leaves it to the method."""
+    confidence: float = Goal.confidence
+    """Nominal coverage of the interval."""
+    replicates: int = 1
+    """Independent runs, side by side."""
+    on_error: OnError = "raise"
+    """Where f raises or gives NaN: raise, count as failing, or count as failing in p and the upper end only."""
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        check_number("gamma", self.gamma, -math.inf, math.inf)
+        check_number("confidence", self.confidence, 0.0, 1.0)
+        if self.target_cov is not None:
+            check_number("target_cov", self.target_cov, 0.0, math.inf)
+        check_whole("replicates", self.replicates, 1)
+        if self.max_sim is not None:
+            check_whole("max_sim", self.max_sim, self.replicates)
+        if self.seed is not None:
+            check_whole("seed", self.seed, 0)
+        check_name("on_error", self.on_error, list(ON_ERROR))
+
+    @property
+    def goal(self) -> Goal:
+        """The goal of all replicates together."""
+        return Goal(
+            gamma=float(self.gamma),
+            confidence=float(self.confidence),
+            max_sim=None if self.max_sim is None else int(self.max_sim),
+            target_cov=None if self.target_cov is None else float(self.target_cov),
+        )
 
 
 @dataclass(frozen=True)
@@ -34,71 +75,31 @@ class InputsOnly:
     base: Distribution
 
 
-def checked(
-    problem: Inputs,
-    method: Stepping,
-    gamma: float = 0.0,
-    seed: int | None = None,
-    max_sim: int | None = None,
-    target_cov: float | None = None,
-    confidence: float = 0.95,
-    replicates: int = 1,
-    on_error: str = "raise",
-) -> Plan:
-    """Return the arguments as a plan; a seed is drawn where there is none. The defaults are those of `estimate`.
-
-    Raises:
-        ValueError: If an argument is not as described in `estimate`; it says what was expected.
-    """
+def check_arguments(problem: Inputs, method: Stepping) -> None:
+    """Raise a ValueError unless the problem has dim and base and the method is one, not its class or its name."""
     check_problem(problem, ("dim", "base"))
     if isinstance(method, type):
         raise ValueError(f"Expected a method, got the class {method.__name__}; add brackets: ().")
     if not isinstance(method, Stepping):
         raise ValueError(f"Expected a method such as MonteCarlo(), got {method!r}.")
-    check_number("gamma", gamma, -math.inf, math.inf)
-    check_number("confidence", confidence, 0.0, 1.0)
-    if target_cov is not None:
-        check_number("target_cov", target_cov, 0.0, math.inf)
-    check_whole("replicates", replicates, 1)
-    if max_sim is not None:
-        check_whole("max_sim", max_sim, replicates)
-    if seed is not None:
-        check_whole("seed", seed, 0)
-    check_name("on_error", on_error, list(ON_ERROR))
-    goal = Goal(
-        gamma=float(gamma),
-        confidence=float(confidence),
-        max_sim=None if max_sim is None else int(max_sim),
-        target_cov=None if target_cov is None else float(target_cov),
-    )
-    return Plan(
-        inputs=InputsOnly(int(problem.dim), problem.base),
-        method=method,
-        goal=goal,
-        seed=_fresh_seed() if seed is None else int(seed),
-        replicates=int(replicates),
-        on_error=cast(OnError, on_error),
-        given=str(getattr(problem, "given", "")),
-    )
 
 
-def check_problem(problem: object, needed: tuple[str, ...]) -> None:
-    """Raise a ValueError unless the problem has what is needed, a dimension and a base distribution."""
+def check_problem(problem: Inputs, needed: tuple[str, ...]) -> None:
+    """Raise a ValueError unless the problem has the attributes needed, a dimension and a base distribution."""
     for name in needed:
-        if not hasattr(problem, name):
+        if not hasattr(problem, name):  # a user's object: say which attribute it lacks
             raise ValueError(
                 f"Expected a problem with {', '.join(needed[:-1])} and {needed[-1]}, got {type(problem).__name__} "
                 f"without {name}; FunctionProblem(f, dim) wraps a function."
             )
-    inputs = cast(Inputs, problem)
-    check_whole("dim", inputs.dim, 1)
-    if not isinstance(inputs.base, Distribution):
+    check_whole("dim", problem.dim, 1)
+    if not isinstance(problem.base, Distribution):
         raise ValueError(
             "Expected problem.base to have sample, log_prob, to_standard_normal and "
-            f"from_standard_normal, got {type(inputs.base).__name__}."
+            f"from_standard_normal, got {type(problem.base).__name__}."
         )
 
 
-def _fresh_seed() -> int:
-    """Return a seed that nobody chose, short enough to type."""
-    return int(np.random.SeedSequence().generate_state(1)[0])
+def choose_seed(seed: int | None) -> int:
+    """Return the seed, or a random one where there is none, short enough to type."""
+    return int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else int(seed)

@@ -8,24 +8,24 @@ from dataclasses import replace
 import numpy as np
 from scipy import stats
 
-from samplers.method import Outcome, share_of_failures
+from samplers.method import Outcome
 from samplers.sample import Sample
 from samplers.statistics.intervals import Interval, binomial_cov
 from samplers.trace import Level, Status
 
-OWN_ERROR_SHORT = 1.5
+OWN_ERROR_FACTOR = 1.5
 """Runs are taken to understate their own errors by this factor before they are said to disagree."""
-LEAST_SPREAD = 1 / 3
+MIN_SPREAD = 1 / 3
 """Runs closer together than this share of their own errors are so by chance, such as counts that tie."""
-WORTHLESS = 1.0
+UNINFORMATIVE_COV = 1.0
 """A run with a c.o.v. from here on knows no more of p than its interval says."""
-FALSE_ALARM = 1e-4
+DISAGREEMENT_LEVEL = 1e-4
 """Probability with which runs whose errors are right would be said to."""
-BY_CONCERN = (Status.STOPPED, Status.STALLED, Status.BUDGET, Status.CONVERGED)
+STATUS_PRIORITY = (Status.STOPPED, Status.STALLED, Status.BUDGET, Status.CONVERGED)
 """The status of the whole is the first of these that a run has."""
 
 
-def combined(outcomes: Sequence[Outcome], confidence: float) -> Outcome:
+def combine(outcomes: Sequence[Outcome], confidence: float) -> Outcome:
     """Return R independent runs as one: pooled counts, or their mean with a t interval.
 
     Where every run is a share k_i / n_i of independent draws, the draws are those of one longer
@@ -44,14 +44,14 @@ def combined(outcomes: Sequence[Outcome], confidence: float) -> Outcome:
     """
     if len(outcomes) == 1:
         return outcomes[0]
-    trace = tuple(_numbered(outcomes))
-    counts = pooled_counts(outcomes)
+    trace = tuple(_number_levels(outcomes))
+    counts = pool_counts(outcomes)
     if counts is not None:
         hits, n = counts
         without = sum(o.no_outcome_share * o.counts[0] for o in outcomes if o.counts)
-        whole = share_of_failures(hits, n, confidence, trace, without / hits if hits else 0.0)
-        return replace(whole, sample=merged_sample(outcomes, [o.counts[1] / n for o in outcomes if o.counts]))
-    used = ended(outcomes)
+        whole = Outcome.of_counts(hits, n, confidence, trace, without / hits if hits else 0.0)
+        return replace(whole, sample=merge_samples(outcomes, [o.counts[1] / n for o in outcomes if o.counts]))
+    used = select_finished(outcomes)
     left_out = len(outcomes) - len(used)
     about = (f"{left_out} of {len(outcomes)} runs were stopped before their end and left out.",) if left_out else ()
     if len(used) == 1:
@@ -62,34 +62,34 @@ def combined(outcomes: Sequence[Outcome], confidence: float) -> Outcome:
         p=mean,
         interval=_interval(used, p, confidence),
         cov=combined_cov(used),
-        status=_status(used) if mean > 0 else Status.NO_HITS,
-        warnings=(*_counted(used), *about, *_disagreement(used)),
+        status=_first_by_priority(used) if mean > 0 else Status.NO_HITS,
+        warnings=(*_count_warnings(used), *about, *_warn_of_disagreement(used)),
         trace=trace,
         no_outcome_share=(float(np.average([o.no_outcome_share for o in used], weights=p)) if mean else 0.0),
-        sample=merged_sample(used, [1 / len(used)] * len(used)),
+        sample=merge_samples(used, [1 / len(used)] * len(used)),
         base_draws=sum(outcome.base_draws for outcome in used),
     )
 
 
-def _disagreement(outcomes: Sequence[Outcome]) -> list[str]:
+def _warn_of_disagreement(outcomes: Sequence[Outcome]) -> list[str]:
     """Warn where runs lie further apart than their own errors allow: a region was found by some of them only."""
     p = np.array([outcome.p for outcome in outcomes])
-    error = OWN_ERROR_SHORT * np.array([outcome.p * outcome.cov if outcome.p > 0 else 0.0 for outcome in outcomes])
+    error = OWN_ERROR_FACTOR * np.array([outcome.p * outcome.cov if outcome.p > 0 else 0.0 for outcome in outcomes])
     if len(p) < 3 or not (error > 0).all():
         return []
     with np.errstate(over="ignore"):  # inf is far enough apart
         apart = float((((p - p.mean()) / error) ** 2).sum())
-    if stats.chi2.sf(apart, len(p) - 1) > FALSE_ALARM:
+    if stats.chi2.sf(apart, len(p) - 1) > DISAGREEMENT_LEVEL:
         return []
     return [f"The runs disagree ({p.min():.2e} to {p.max():.2e}): some of them may have missed a region of failure."]
 
 
-def ended(outcomes: Sequence[Outcome]) -> Sequence[Outcome]:
+def select_finished(outcomes: Sequence[Outcome]) -> Sequence[Outcome]:
     """Return the runs that came to their end or, where there is none, all of them."""
     return [outcome for outcome in outcomes if outcome.status is not Status.STOPPED] or outcomes
 
 
-def merged_sample(outcomes: Sequence[Outcome], shares: Sequence[float]) -> Sample | None:
+def merge_samples(outcomes: Sequence[Outcome], shares: Sequence[float]) -> Sample | None:
     """Return the points behind a weighted mean of runs, or None if a run does not give its own.
 
     Args:
@@ -116,7 +116,7 @@ def merged_sample(outcomes: Sequence[Outcome], shares: Sequence[float]) -> Sampl
     )
 
 
-def pooled_counts(outcomes: Sequence[Outcome]) -> tuple[int, int] | None:
+def pool_counts(outcomes: Sequence[Outcome]) -> tuple[int, int] | None:
     """Return failing and all draws of the runs together; None if a run is no share of plain draws."""
     counts = [outcome.counts for outcome in outcomes if outcome.counts is not None]
     if len(counts) < len(outcomes):
@@ -129,7 +129,7 @@ def combined_cov(outcomes: Sequence[Outcome]) -> float:
 
     That of the pooled counts or, for a mean, the own or empirical one, whichever is larger.
     """
-    counts = pooled_counts(outcomes)
+    counts = pool_counts(outcomes)
     if counts is not None:
         hits, n = counts
         return binomial_cov(hits / n, n)
@@ -149,25 +149,25 @@ def _own_error(outcomes: Sequence[Outcome]) -> float:
 
 def _interval(outcomes: Sequence[Outcome], p: np.ndarray, confidence: float) -> Interval:
     mean, runs = float(p.mean()), len(p)
-    if np.ptp(p) == 0 or min(outcome.cov for outcome in outcomes) >= WORTHLESS:
+    if np.ptp(p) == 0 or min(outcome.cov for outcome in outcomes) >= UNINFORMATIVE_COV:
         # no spread to go by: all runs' own intervals together
         return min(o.interval[0] for o in outcomes), max(o.interval[1] for o in outcomes)
     spread = float(np.log(p).std(ddof=1)) if p.all() else float((p / mean).std(ddof=1))
-    spread = max(spread, LEAST_SPREAD * _own_error(outcomes))
+    spread = max(spread, MIN_SPREAD * _own_error(outcomes))
     half = float(stats.t.ppf(0.5 + confidence / 2, runs - 1)) * spread / math.sqrt(runs)
     return mean * math.exp(-half), min(1.0, mean * math.exp(half))
 
 
-def _status(outcomes: Sequence[Outcome]) -> Status:
+def _first_by_priority(outcomes: Sequence[Outcome]) -> Status:
     present = {outcome.status for outcome in outcomes}
-    return next((status for status in BY_CONCERN if status in present), Status.BUDGET)
+    return next((status for status in STATUS_PRIORITY if status in present), Status.BUDGET)
 
 
-def _counted(outcomes: Sequence[Outcome]) -> tuple[str, ...]:
+def _count_warnings(outcomes: Sequence[Outcome]) -> tuple[str, ...]:
     """Return the warnings of the runs, each once, with the number of runs that have it."""
     texts = Counter(text for outcome in outcomes for text in outcome.warnings)
     return tuple(f"In {count} of {len(outcomes)} runs: {text}" for text, count in texts.items())
 
 
-def _numbered(outcomes: Sequence[Outcome]) -> list[Level]:
+def _number_levels(outcomes: Sequence[Outcome]) -> list[Level]:
     return [replace(level, run=i) for i, o in enumerate(outcomes) for level in o.trace]

@@ -1,4 +1,4 @@
-"""Guarded: calls an f that may raise, so that every row has an outcome or the culprit a name."""
+"""FaultIsolation: calls an f that may raise, and finds the rows of a batch on which it does."""
 
 from collections.abc import Callable
 from typing import NoReturn
@@ -6,88 +6,114 @@ from typing import NoReturn
 import numpy as np
 from numpy.typing import ArrayLike
 
-from samplers.errors import EvaluationError, OnError, one_per_row, where
+from samplers.errors import EvaluationError, FinalError, OnError, describe_row, one_per_row
 from samplers.problem import FloatArray
 
+Evaluate = Callable[[FloatArray], ArrayLike]
 
-class Guarded:
+
+class FaultIsolation:
     """f with a rule for rows on which it raises.
 
-    With on_error "failure" or "bound" a batch on which f raised is handed to f again in halves
-    until the raising rows stand alone; they get NaN. Rows handed over again are in `n_retried`.
+    With on_error "failure" or "bound" such rows get NaN, see `isolate_failing_rows`; with "raise" the error names the
+    first of them. f always gets a copy of x, so that it may write on it.
 
     Args:
         evaluate: Maps points of shape (n, d) to values of shape (n,).
-        on_error: "raise" names the first row that raises.
+        on_error: What to do where f raises.
+
+    Attributes:
+        n_retried: Rows that were handed to f again to find those that raise.
+
+    Example:
+        >>> def f(x):
+        ...     if (x > 1).any():
+        ...         raise ArithmeticError("off the map")
+        ...     return x[:, 0]
+        >>> isolation = FaultIsolation(f, on_error="failure")
+        >>> isolation.evaluate(np.array([[0.0], [2.0], [1.0], [0.5]]))
+        array([0. , nan, 1. , 0.5])
+        >>> isolation.n_retried
+        6
     """
 
-    def __init__(self, evaluate: Callable[[FloatArray], ArrayLike], on_error: OnError = "raise") -> None:
+    def __init__(self, evaluate: Evaluate, on_error: OnError = "raise") -> None:
         self.n_retried = 0
         self._evaluate = evaluate
         self._on_error = on_error
 
-    def evaluate(self, x: FloatArray) -> FloatArray:
-        """Simulate the rows of x (n, d); return f, shape (n,), NaN for rows on which it raised.
+    def evaluate(self, x: FloatArray) -> ArrayLike:
+        """Simulate the rows of x (n, d); return what f returned, with NaN for rows on which it raised.
 
         Raises:
-            EvaluationError: If f raises (on_error "raise") or has the wrong shape. An error with a true attribute
-                `final` is passed on as it is.
+            EvaluationError: If f raises and on_error is "raise". An error with a true attribute `final` is passed on
+                as it is: f says that calling it again is of no use.
         """
         try:
-            return self._call(x)
-        except EvaluationError:
-            raise
+            return self._evaluate(x.copy())
         except Exception as error:
             if _is_final(error):
                 raise
             if self._on_error == "raise":
-                self._raise_named(x, error)
-            return self._by_halves(x)
+                _raise_for_first_row(self._evaluate, x, error)
+        f, n_retried = isolate_failing_rows(self._evaluate, x)
+        self.n_retried += n_retried
+        return f
 
-    def _call(self, x: FloatArray) -> FloatArray:
-        return one_per_row(self._evaluate(x.copy()), len(x))  # a copy: f may write on what it is given
 
-    def _by_halves(self, x: FloatArray) -> FloatArray:
-        """Outcomes of a batch on which f has raised: split until the raising rows are alone."""
-        if len(x) == 1:
-            return np.array([np.nan])
-        parts = []
-        for half in np.array_split(x, 2):
-            self.n_retried += len(half)
-            try:
-                parts.append(self._call(half))
-            except EvaluationError:
-                raise
-            except Exception as error:
-                if _is_final(error):
-                    raise
-                parts.append(self._by_halves(half))
-        return np.concatenate(parts)
+def isolate_failing_rows(evaluate: Evaluate, x: FloatArray) -> tuple[FloatArray, int]:
+    """Return f (n,) of a batch x (n, d) on which `evaluate` raises, NaN for the rows that raise alone.
 
-    def _raise_named(self, x: FloatArray, error: Exception) -> NoReturn:
-        """Raise with the first row that raises again, and what f says of that row alone."""
-        start, stop = 0, len(x)
-        while stop - start > 1:
-            middle = (start + stop) // 2
-            start, stop = (start, middle) if self._raised(x[start:middle]) else (middle, stop)
-        alone = self._raised(x[start:stop])  # the batch may have raised for another row
-        if alone is None:
-            raise EvaluationError(f"f raised on a batch of {len(x)} rows, not repeatably; {_kind(error)}") from error
-        raise EvaluationError(f"f raised for {where(x, start)}; {_kind(alone)}") from alone
+    The batch is handed over in halves, those that raise in halves again, until the raising rows stand alone: at most
+    2 k ceil(log2(n)) calls for k of them.
 
-    def _raised(self, x: FloatArray) -> Exception | None:
-        """Return what f raises for the rows of x, None if nothing."""
+    Returns:
+        f, and how many rows were handed over again.
+
+    Raises:
+        EvaluationError: If `evaluate` does not return one number per row.
+    """
+    if len(x) == 1:
+        return np.array([np.nan]), 0
+    parts, n_retried = [], len(x)
+    for half in np.array_split(x, 2):
         try:
-            self._evaluate(x.copy())
+            f, again = one_per_row(evaluate(half.copy()), len(half)), 0
         except Exception as error:
-            return error
-        return None
+            if _is_final(error):
+                raise
+            f, again = isolate_failing_rows(evaluate, half)
+        parts.append(f)
+        n_retried += again
+    return np.concatenate(parts), n_retried
+
+
+def _raise_for_first_row(evaluate: Evaluate, x: FloatArray, error: Exception) -> NoReturn:
+    """Raise an EvaluationError for the first row that raises again, with what f says of that row alone."""
+    start, stop = 0, len(x)
+    while stop - start > 1:
+        middle = (start + stop) // 2
+        start, stop = (start, middle) if _exception_of(evaluate, x[start:middle]) else (middle, stop)
+    alone = _exception_of(evaluate, x[start:stop])  # the batch may have raised for another row
+    if alone is None:
+        raise EvaluationError(f"f raised on a batch of {len(x)} rows, not repeatably; {_describe(error)}") from error
+    raise EvaluationError(f"f raised for {describe_row(x, start)}; {_describe(alone)}") from alone
+
+
+def _exception_of(evaluate: Evaluate, x: FloatArray) -> Exception | None:
+    """Return what f raises for the rows of x, None if nothing."""
+    try:
+        evaluate(x.copy())
+    except Exception as error:
+        return error
+    return None
 
 
 def _is_final(error: Exception) -> bool:
-    """Return whether f says that asking again is of no use: it has done so, or there is nobody to ask."""
-    return bool(getattr(error, "final", False))
+    """Return whether f says that calling it again is of no use."""
+    return isinstance(error, FinalError) and bool(error.final)
 
 
-def _kind(error: Exception) -> str:
+def _describe(error: Exception) -> str:
+    """Return the type and the text of an error."""
     return f"{type(error).__name__}: {error}"

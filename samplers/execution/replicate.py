@@ -1,4 +1,4 @@
-"""Lane: one run of a method on its way, held between two calls of f."""
+"""Replicate: one run of a method, paused while its points are simulated."""
 
 import math
 from collections.abc import Callable
@@ -16,71 +16,83 @@ NOT_KNOWN = Outcome(
     status=Status.STOPPED,
     warnings=("The run was stopped before its method could say anything: p = 0 stands for not known.",),
 )
-"""Stands in for the outcome of a run that was stopped too early, or whose method does not handle that."""
+"""Outcome of a run that was stopped before its first values of f, or whose method does not handle `Interrupted`."""
 
 
-class Lane:
-    """The steps of a method: which points they wait for and, at the end, their outcome.
+class Replicate:
+    """The steps of one run of a method: the points it requests next and, at the end, its outcome.
 
     Args:
-        steps: What `Method.steps` gave.
+        steps: What `Method.steps` returned.
         goal: The goal it was given; more than goal.max_sim points are refused.
         dim: Number of dimensions of x.
 
+    Attributes:
+        goal: As given.
+        requested: Points whose f the method waits for, shape (n, d); none once it has its outcome.
+        n_sim: Points simulated for it so far.
+        outcome: Its outcome; None while it runs.
+
     Raises:
-        ValueError: If the method asks for points that are not of shape (n, dim).
-        RuntimeError: If it asks for more of them than goal.max_sim leaves.
+        ValueError: If the method requests points that are not of shape (n, dim).
+        RuntimeError: If it requests more points than goal.max_sim leaves.
     """
 
     def __init__(self, steps: Steps, goal: Goal, dim: int) -> None:
         self.goal = goal
         self.n_sim = 0
         self.outcome: Outcome | None = None
-        self.waiting: FloatArray = np.empty((0, dim))
+        self.requested: FloatArray = np.empty((0, dim))
         self._steps = steps
-        self._go_on(lambda: next(steps))
+        self._advance(lambda: next(steps))
 
     @property
-    def live(self) -> bool:
-        """Whether the method waits for outcomes."""
+    def running(self) -> bool:
+        """Whether the method waits for values of f."""
         return self.outcome is None
 
     def tell(self, f: FloatArray) -> None:
-        """Tell the outcomes f (n,) of the points waited for; what errors there are is said above."""
+        """Give the method f (n,) of the points it requested, and let it run to its next request or its end.
+
+        Raises:
+            ValueError: If it requests points that are not of shape (n, dim).
+            RuntimeError: If it requests more points than goal.max_sim leaves.
+        """
         self.n_sim += len(f)
-        self._go_on(lambda: self._steps.send(f))
+        self._advance(lambda: self._steps.send(f))
 
     def interrupt(self) -> None:
-        """Let the method conclude from what it has been told."""
-        self.outcome = self._last_words() if self.n_sim else NOT_KNOWN
+        """End the run: its outcome is what the method concludes from the values of f so far."""
+        self.outcome = self._conclude() if self.n_sim else NOT_KNOWN
         self._steps.close()
-        self.waiting = self.waiting[:0]
+        self.requested = self.requested[:0]
 
-    def _last_words(self) -> Outcome:
+    def _conclude(self) -> Outcome:
+        """Return the outcome of the interrupted method, NOT_KNOWN if it gives none."""
         try:
             self._steps.throw(Interrupted())
         except StopIteration as end:
-            return _checked_outcome(end.value)
+            return _check_outcome(end.value)
         except Interrupted:
             pass
         return NOT_KNOWN
 
-    def _go_on(self, ask: Callable[[], FloatArray]) -> None:
-        """Let the method run until it waits for at least one point or has its outcome."""
+    def _advance(self, resume: Callable[[], FloatArray]) -> None:
+        """Resume the method until it requests at least one point or returns its outcome."""
         try:
-            x = self._checked(ask())
+            x = self._check_points(resume())
             while len(x) == 0:
-                x = self._checked(self._steps.send(np.empty(0)))
-            self.waiting = x
+                x = self._check_points(self._steps.send(np.empty(0)))
+            self.requested = x
         except StopIteration as end:
-            self.outcome = _checked_outcome(end.value)
-            self.waiting = self.waiting[:0]
+            self.outcome = _check_outcome(end.value)
+            self.requested = self.requested[:0]
 
-    def _checked(self, x: FloatArray) -> FloatArray:
-        """Return x, its shape and size checked."""
+    def _check_points(self, x: FloatArray) -> FloatArray:
+        """Return x as float64; raise unless its shape is (n, dim) and the budget allows n points."""
         x = np.asarray(x, dtype=np.float64)
-        if x.ndim != 2 or x.shape[1] != self.waiting.shape[1]:
-            raise ValueError(f"Expected x of shape (n, {self.waiting.shape[1]}), got {x.shape}.")
+        if x.ndim != 2 or x.shape[1] != self.requested.shape[1]:
+            raise ValueError(f"Expected x of shape (n, {self.requested.shape[1]}), got {x.shape}.")
         if self.n_sim + len(x) > self.goal.budget:
             raise RuntimeError(
                 f"The method asked for {len(x)} simulations with {self.goal.budget - self.n_sim} of "
@@ -89,7 +101,8 @@ class Lane:
         return x
 
 
-def _checked_outcome(value: object) -> Outcome:
+def _check_outcome(value: object) -> Outcome:
+    """Return the value; raise a TypeError unless it is an Outcome."""
     if not isinstance(value, Outcome):
         raise TypeError(f"Expected the steps of the method to return an Outcome, got {value!r}.")
     return value

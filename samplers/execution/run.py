@@ -1,60 +1,80 @@
-"""Run: the dialogue between methods and whoever makes the simulations."""
+"""Run: the dialogue between the replicates of a method and whoever makes the simulations (ask and tell)."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from samplers.execution.arguments import Plan
-from samplers.execution.combination import combined, combined_cov, pooled_counts
-from samplers.execution.evaluation_log import Ledger
+from samplers.errors import one_per_row
+from samplers.execution.arguments import InputsOnly, RunArguments, check_arguments, choose_seed
+from samplers.execution.combination import combine, combined_cov, pool_counts
+from samplers.execution.evaluation_log import EvaluationLog
 from samplers.execution.progress import Listener, Monitor, Progress
-from samplers.execution.replicate import Lane
+from samplers.execution.replicate import Replicate
 from samplers.method import Goal, Outcome, Stepping
-from samplers.problem import FloatArray
+from samplers.problem import FloatArray, Inputs, condition_of
 from samplers.result import Estimate
 from samplers.statistics.intervals import gain_over_monte_carlo
 from samplers.trace import Status
 
-LEAST_REPLICATES = 5
+MIN_REPLICATES = 5
 """Runs made at least where those asked for miss target_cov: fewer give a useless t interval."""
-MOST_REPLICATES = 200
+MAX_REPLICATES = 200
 """Runs after which target_cov is given up."""
 
 
 class Run:
-    """An estimation whose simulations are made elsewhere.
+    """An estimation whose simulations are made elsewhere; `Method.start` makes one.
 
-        run = CrossEntropy().start(problem, seed=0)
-        while not run.done:
-            run.tell(simulate(run.ask()))
-        print(run.result())
-
-    Replicates run side by side: `ask` gives the points that all of them wait for, one after the
+    Replicates run side by side: `ask` returns the points that all of them wait for, one after the
     other. Each has its own generator and its own share of max_sim, fixed beforehand, so that the
     answer is that of the same runs one after another. Runs added for target_cov come one at a time.
 
     Args:
-        plan: The arguments, as `checked` returns them.
+        problem: Has `dim` and `base`.
+        method: A method with its settings.
+        arguments: Threshold, seed, budget and the rest; see `RunArguments`.
         listener: Given `Progress` after every batch and every level.
+
+    Raises:
+        ValueError: If the problem has no `dim` or `base`, or method is not a method.
+
+    Example:
+        >>> import samplers
+        >>> problem = samplers.FunctionProblem(lambda x: 2.0 - x[:, 0], dim=2)
+        >>> run = samplers.CrossEntropy().start(problem, seed=0, max_sim=4000)
+        >>> while not run.done:
+        ...     x = run.ask()
+        ...     run.tell(2.0 - x[:, 0])
+        >>> run.result() == samplers.estimate(problem, "ce", seed=0, max_sim=4000)
+        True
     """
 
-    def __init__(self, plan: Plan, listener: Listener | None = None) -> None:
-        self._plan = plan
-        self._ledger = Ledger(plan.inputs.dim, plan.inputs.base, plan.goal.gamma, plan.on_error)
-        self._monitor = Monitor(listener, plan.goal.max_sim)
-        self._asked: FloatArray | None = None
+    def __init__(
+        self, problem: Inputs, method: Stepping, arguments: RunArguments, listener: Listener | None = None
+    ) -> None:
+        check_arguments(problem, method)
+        self._inputs = InputsOnly(int(problem.dim), problem.base)
+        self._given = condition_of(problem)
+        self._method = method
+        self._goal, self._on_error = arguments.goal, arguments.on_error
+        self._seed = choose_seed(arguments.seed)
+        self._n_wanted = int(arguments.replicates)
+        self._log = EvaluationLog(self._inputs.dim, self._inputs.base, self._goal.gamma, self._on_error)
+        self._monitor = Monitor(listener, self._goal.max_sim)
+        self._requested: FloatArray | None = None
         self._stopped: str | None = None
-        self._lanes: list[Lane] = []
-        for share in shares(plan.goal.max_sim, plan.replicates):
-            self._add_lane(share)
-        self._add_lanes_for_target()
+        self._replicates: list[Replicate] = []
+        for max_sim in split_budget(self._goal.max_sim, self._n_wanted):
+            self._start_replicate(max_sim)
+        self._start_more_for_target()
 
     @property
     def done(self) -> bool:
         """Whether there is nothing more to simulate."""
-        return not any(lane.live for lane in self._lanes)
+        return not any(replicate.running for replicate in self._replicates)
 
     @property
     def progress(self) -> Progress:
@@ -69,12 +89,12 @@ class Run:
         """
         if self.done:
             raise RuntimeError("The run is done: nothing more to simulate; see result().")
-        if self._asked is None:
-            self._asked = np.concatenate([lane.waiting for lane in self._lanes])
-        return self._asked.copy()
+        if self._requested is None:
+            self._requested = np.concatenate([replicate.requested for replicate in self._replicates])
+        return self._requested.copy()
 
     def tell(self, f: ArrayLike) -> None:
-        """Tell the outcomes f, shape (n,), of the points that `ask` gave, in their order.
+        """Take the outcomes f, shape (n,), of the points that `ask` returned, in their order.
 
         After an `EvaluationError` nothing has been taken in and f can be told again.
 
@@ -82,17 +102,17 @@ class Run:
             EvaluationError: If there is not one number per point, or one is NaN (on_error "raise").
             RuntimeError: If nothing has been asked for, or the method asks for more than max_sim.
         """
-        if self._asked is None:
+        if self._requested is None:
             raise RuntimeError("Nothing has been asked for: call ask() for points, then tell() their outcomes.")
-        x = self._asked
-        seen = self._ledger.enter(x, f)
-        self._asked = None
-        self._monitor.on_batch(self._ledger.n_sim)
-        live = [lane for lane in self._lanes if lane.live]
-        ends = np.cumsum([len(lane.waiting) for lane in live])
-        for lane, part in zip(live, np.split(seen, ends[:-1]), strict=True):
-            lane.tell(part)
-        self._add_lanes_for_target()
+        x = self._requested
+        seen = self._log.record(x, one_per_row(f, len(x)))
+        self._requested = None
+        self._monitor.on_batch(self._log.n_sim)
+        running = [replicate for replicate in self._replicates if replicate.running]
+        ends = np.cumsum([len(replicate.requested) for replicate in running])
+        for replicate, part in zip(running, np.split(seen, ends[:-1]), strict=True):
+            replicate.tell(part)
+        self._start_more_for_target()
 
     def stop(self, why: str = "Stopped") -> None:
         """End the run here; the result is what has been told so far. Nothing happens to a run that is done.
@@ -102,113 +122,122 @@ class Run:
         """
         if self.done:
             return
-        self._stopped = f"{why} after {self._ledger.n_sim:,} simulations, before the method had come to its end."
-        self._asked = None
-        self._lanes = [lane for lane in self._lanes if lane.n_sim] or self._lanes[:1]
-        for lane in self._lanes:
-            if lane.live:
-                lane.interrupt()
+        self._stopped = f"{why} after {self._log.n_sim:,} simulations, before the method had come to its end."
+        self._requested = None
+        self._replicates = [replicate for replicate in self._replicates if replicate.n_sim] or self._replicates[:1]
+        for replicate in self._replicates:
+            if replicate.running:
+                replicate.interrupt()
 
     def result(self) -> Estimate:
         """Return the estimate; a run that is not done is stopped."""
         self.stop()
-        plan, outcomes = self._plan, self._outcomes()
-        whole = combined(outcomes, plan.goal.confidence)
+        goal, outcomes = self._goal, self._outcomes()
+        whole = combine(outcomes, goal.confidence)
         low, high = whole.interval
-        if plan.on_error == "bound":
+        if self._on_error == "bound":
             low *= 1 - whole.no_outcome_share
-        status, doubts = self._ending(whole, met_target(plan, outcomes))
+        status, doubts = self._final_status(whole, meets_target(outcomes, goal.target_cov, self._n_wanted))
         return Estimate(
             p=whole.p,
             interval=(low, high),
-            confidence=plan.goal.confidence,
+            confidence=goal.confidence,
             cov=whole.cov,
-            gamma=plan.goal.gamma,
-            n_sim=self._ledger.n_sim,
-            gain=gain_over_monte_carlo(whole.p, whole.cov, self._ledger.n_sim),
+            gamma=goal.gamma,
+            n_sim=self._log.n_sim,
+            gain=gain_over_monte_carlo(whole.p, whole.cov, self._log.n_sim),
             status=status,
-            warnings=(*whole.warnings, *self._about_errors(), *doubts),
+            warnings=(*whole.warnings, *self._error_warnings(), *doubts),
             trace=whole.trace,
-            failures=self._ledger.failures,
-            method=plan.method,
-            seed=plan.seed,
+            failures=self._log.failures,
+            method=self._method,
+            seed=self._seed,
             sample=whole.sample,
-            base=plan.inputs.base,
-            on_error=plan.on_error,
+            base=self._inputs.base,
+            on_error=self._on_error,
             base_draws=whole.base_draws,
-            given=plan.given,
+            given=self._given,
         )
 
     def _outcomes(self) -> list[Outcome]:
-        return [lane.outcome for lane in self._lanes if lane.outcome is not None]
+        """Return the outcomes of the replicates that have one."""
+        return [replicate.outcome for replicate in self._replicates if replicate.outcome is not None]
 
-    def _ending(self, whole: Outcome, met: bool) -> tuple[Status, list[str]]:
+    def _final_status(self, whole: Outcome, met: bool) -> tuple[Status, list[str]]:
         """Return the status of the whole and the warnings that go with it."""
         if self._stopped is not None:
             return Status.STOPPED, [self._stopped]
         if met:
             return whole.status, []
         status = Status.BUDGET if whole.status is Status.CONVERGED else whole.status
-        return status, [f"The target c.o.v. {self._plan.goal.target_cov:g} was not met: {whole.cov:.3g}."]
+        return status, [f"The target c.o.v. {self._goal.target_cov:g} was not met: {whole.cov:.3g}."]
 
-    def _about_errors(self) -> list[str]:
-        if self._ledger.n_errors == 0:
+    def _error_warnings(self) -> list[str]:
+        """Return the warning of simulations without an outcome, if there were any."""
+        if self._log.n_errors == 0:
             return []
-        text = f"{self._ledger.n_errors} simulations gave no outcome and were counted as failing"
-        return [f"{text} (not in the lower end of the interval)." if self._plan.on_error == "bound" else f"{text}."]
+        text = f"{self._log.n_errors} simulations gave no outcome and were counted as failing"
+        bounded = self._on_error == "bound"
+        return [f"{text} (not in the lower end of the interval)." if bounded else f"{text}."]
 
-    def _add_lane(self, max_sim: int | None) -> None:
+    def _start_replicate(self, max_sim: int | None) -> None:
         """Start one more run of the method, with a generator of its own."""
-        plan, number = self._plan, len(self._lanes)
-        target = None if plan.goal.target_cov is None else plan.goal.target_cov * math.sqrt(plan.replicates)
+        number, target = len(self._replicates), self._goal.target_cov
         goal = replace(
-            plan.goal,
+            self._goal,
             max_sim=max_sim,
-            target_cov=target,
+            target_cov=None if target is None else target * math.sqrt(self._n_wanted),
             on_level=lambda level: self._monitor.on_level(replace(level, run=number)),
         )
-        rng = np.random.default_rng(np.random.SeedSequence(plan.seed, spawn_key=(number,)))
-        self._lanes.append(Lane(plan.method.steps(plan.inputs, goal, rng), goal, plan.inputs.dim))
+        rng = np.random.default_rng(np.random.SeedSequence(self._seed, spawn_key=(number,)))
+        steps = self._method.steps(self._inputs, goal, rng)
+        self._replicates.append(Replicate(steps, goal, self._inputs.dim))
 
-    def _add_lanes_for_target(self) -> None:
-        """Where all runs are done, the target is missed and the budget allows, start one more."""
-        while self.done and wants_another(self._plan, self._lanes):
-            max_sim = self._plan.goal.max_sim
-            self._add_lane(None if max_sim is None else max_sim - self._ledger.n_sim)
+    def _start_more_for_target(self) -> None:
+        """Start one more run where all are done, the target is missed and the budget allows it."""
+        while self.done and needs_another(self._replicates, self._method, self._goal, self._n_wanted):
+            max_sim = self._goal.max_sim
+            self._start_replicate(None if max_sim is None else max_sim - self._log.n_sim)
 
 
-def shares(max_sim: int | None, replicates: int) -> list[int | None]:
+def split_budget(max_sim: int | None, replicates: int) -> list[int | None]:
     """Return each replicate's part of max_sim; they differ by 1 at most and add up to it."""
     if max_sim is None:
         return [None] * replicates
     return [max_sim * (i + 1) // replicates - max_sim * i // replicates for i in range(replicates)]
 
 
-def met_target(plan: Plan, outcomes: list[Outcome]) -> bool:
-    """Return whether these runs together meet target_cov (as they do where there is none)."""
-    if plan.goal.target_cov is None:
+def meets_target(outcomes: Sequence[Outcome], target_cov: float | None, replicates: int) -> bool:
+    """Return whether these runs together meet target_cov (as they do where there is none).
+
+    Args:
+        outcomes: Of the runs made so far.
+        target_cov: Coefficient of variation to stop at.
+        replicates: Runs asked for; with more than these, at least MIN_REPLICATES are made unless their counts pool.
+    """
+    if target_cov is None:
         return True
-    few = plan.replicates < len(outcomes) < LEAST_REPLICATES and pooled_counts(outcomes) is None
-    return not few and combined_cov(outcomes) <= plan.goal.target_cov
+    few = replicates < len(outcomes) < MIN_REPLICATES and pool_counts(outcomes) is None
+    return not few and combined_cov(outcomes) <= target_cov
 
 
-def wants_another(plan: Plan, lanes: list[Lane]) -> bool:
+def needs_another(runs: Sequence[Replicate], method: Stepping, goal: Goal, replicates: int) -> bool:
     """Return whether finished runs miss the target and one more may be made.
 
     It may not where as many runs as `replicates` have come to the limit of their method, 200 are
-    made, or too little of max_sim is left: less than the longest run took, save for runs that
+    made, or too little of max_sim is left: less than the longest run took, except for runs that
     pool, which can be cut short (beside longer ones, a short run would spoil a mean).
     """
-    outcomes = [lane.outcome for lane in lanes if lane.outcome is not None]
-    if met_target(plan, outcomes) or len(lanes) >= MOST_REPLICATES:
+    outcomes = [run.outcome for run in runs if run.outcome is not None]
+    if meets_target(outcomes, goal.target_cov, replicates) or len(runs) >= MAX_REPLICATES:
         return False
-    if sum(at_limit(plan.method, lane.goal, lane.outcome) for lane in lanes) >= plan.replicates:
+    if sum(ended_without_target(method, run.goal, run.outcome) for run in runs) >= replicates:
         return False
-    left = plan.goal.budget - sum(lane.n_sim for lane in lanes)
-    return left >= (1 if pooled_counts(outcomes) is not None else max(lane.n_sim for lane in lanes))
+    left = goal.budget - sum(run.n_sim for run in runs)
+    return left >= (1 if pool_counts(outcomes) is not None else max(run.n_sim for run in runs))
 
 
-def at_limit(method: Stepping, goal: Goal, outcome: Outcome | None) -> bool:
+def ended_without_target(method: Stepping, goal: Goal, outcome: Outcome | None) -> bool:
     """Return whether a run that goes on until its target ended without it."""
     target = goal.target_cov
     return method.stops_at_target and target is not None and outcome is not None and outcome.cov > target

@@ -9,8 +9,8 @@ import numpy as np
 
 from samplers.problem import FloatArray
 from samplers.sample import Sample
-from samplers.statistics.intervals import Interval, clopper_pearson, degrees_of_freedom, log_normal
-from samplers.statistics.weights import effective_sample_size, largest_share
+from samplers.statistics.intervals import Interval, clopper_pearson, degrees_of_freedom, log_normal_interval
+from samplers.statistics.weights import effective_sample_size, largest_weight_share
 
 LOW_ESS = 30
 
@@ -105,7 +105,7 @@ def weighted_interval(draws: Draws, confidence: float, largest_weight: float, co
         low, high = clopper_pearson(hits, draws.n, confidence)
         return low, min(1.0, high * largest_weight)
     spread = draws.cov if cov is None else cov
-    low, high = log_normal(draws.p, spread, confidence, degrees_of_freedom(draws.ess, alone=True))
+    low, high = log_normal_interval(draws.p, spread, confidence, degrees_of_freedom(draws.ess, independent=True))
     if draws.ess < LOW_ESS:
         high = max(high, bernstein_bound(draws, confidence, largest_weight))
     return low, high
@@ -132,7 +132,7 @@ def weight_warnings(draws: Draws) -> list[str]:
     found = []
     if draws.ess < LOW_ESS:
         found.append(f"The failing draws are worth {draws.ess:.0f} independent ones: the estimate is coarse.")
-    share = largest_share(draws.log_weights)
+    share = largest_weight_share(draws.log_weights)
     if share > LARGE_SHARE:
         found.append(f"One draw carries {100 * share:.0f} % of p: failures lie where the proposal hardly reaches.")
     return found

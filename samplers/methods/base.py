@@ -1,16 +1,12 @@
 """Method: the base class of the methods, with `start` for simulations that the user makes."""
 
-from __future__ import annotations
+from typing import Protocol, runtime_checkable
 
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
-
-from samplers.execution.arguments import checked
+from samplers.errors import OnError
+from samplers.execution.arguments import RunArguments
 from samplers.execution.run import Run
 from samplers.method import Stepping
 from samplers.problem import Inputs
-
-if TYPE_CHECKING:
-    from samplers.errors import OnError
 
 
 @runtime_checkable
@@ -20,13 +16,13 @@ class Method(Stepping, Protocol):
     def start(
         self,
         problem: Inputs,
-        gamma: float = 0.0,
-        seed: int | None = None,
-        max_sim: int | None = None,
-        target_cov: float | None = None,
-        confidence: float = 0.95,
-        replicates: int = 1,
-        on_error: OnError = "raise",
+        gamma: float = RunArguments.gamma,
+        seed: int | None = RunArguments.seed,
+        max_sim: int | None = RunArguments.max_sim,
+        target_cov: float | None = RunArguments.target_cov,
+        confidence: float = RunArguments.confidence,
+        replicates: int = RunArguments.replicates,
+        on_error: OnError = RunArguments.on_error,
     ) -> Run:
         """Start a run whose simulations you make yourself: `ask` for points, `tell` their outcomes.
 
@@ -46,4 +42,13 @@ class Method(Stepping, Protocol):
         Raises:
             ValueError: If an argument is not as described in `estimate`.
         """
-        return Run(checked(problem, self, gamma, seed, max_sim, target_cov, confidence, replicates, on_error))
+        arguments = RunArguments(
+            gamma=gamma,
+            seed=seed,
+            max_sim=max_sim,
+            target_cov=target_cov,
+            confidence=confidence,
+            replicates=replicates,
+            on_error=on_error,
+        )
+        return Run(problem, self, arguments)

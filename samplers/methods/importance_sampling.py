@@ -25,7 +25,7 @@ from samplers.proposals.gaussian import TiltedNormal
 from samplers.proposals.mixture import Mixture, ProposalDistribution
 from samplers.statistics.intervals import binomial_cov
 from samplers.statistics.thresholds import next_level
-from samplers.statistics.weights import normalised
+from samplers.statistics.weights import normalise_weights
 from samplers.trace import Level, Status
 from samplers.validation import check_count, check_setting
 
@@ -170,7 +170,7 @@ class ImportanceSampling(Method):
                 status = Status.STALLED if level is None else Status.CONVERGED
                 return Search(rounds, trace, status), law if k else None
             inside = f <= level
-            law = TiltedNormal(normalised(rounds[-1].log_weights[inside]) @ u[inside])
+            law = TiltedNormal(normalise_weights(rounds[-1].log_weights[inside]) @ u[inside])
             reached += level == goal.gamma
             if reached == 2:
                 break
@@ -189,7 +189,7 @@ def unreached_share(search: Search, theta: FloatArray, inputs: Inputs, gamma: fl
     failing = np.concatenate([found.u[found.f <= gamma] for found in search.rounds])
     if len(failing) == 0:
         return behind
-    weights = normalised(pool_rounds(search.rounds, inputs, gamma).log_weights)
+    weights = normalise_weights(pool_rounds(search.rounds, inputs, gamma).log_weights)
     return max(behind, float(weights[failing @ theta < 0.5 * float(theta @ theta)].sum()))
 
 

@@ -27,7 +27,7 @@ from samplers.proposals.gaussian import TiltedNormal
 from samplers.proposals.mixture import ProposalDistribution
 from samplers.proposals.von_mises_fisher import VonMisesFisherNakagami
 from samplers.statistics.intervals import binomial_cov
-from samplers.statistics.weights import normalised
+from samplers.statistics.weights import normalise_weights
 from samplers.trace import Level, Status
 from samplers.validation import check_choice, check_count, check_setting
 
@@ -192,7 +192,7 @@ class ImprovedCrossEntropy(Method):
     def _fitted(self, u: FloatArray, log_weights: FloatArray, rng: np.random.Generator) -> ProposalMixture:
         """Return the law of the family nearest to points u (n, d) with these weights (n,)."""
         used = np.isfinite(log_weights)
-        u, weights = u[used], normalised(log_weights[used])
+        u, weights = u[used], normalise_weights(log_weights[used])
         dim = u.shape[1]
         if self.family == "gaussian":
             return fit_mixture(fit_shrunk_gaussian, u, weights, 1, 1, rng)

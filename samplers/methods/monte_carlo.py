@@ -5,10 +5,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from samplers.method import Goal, Interrupted, Steps, no_outcome_share, share_of_failures
+from samplers.method import Goal, Interrupted, Outcome, Steps, no_outcome_share
 from samplers.methods.base import Method
 from samplers.problem import FloatArray, Inputs
-from samplers.sample import equal_draws
+from samplers.sample import Sample
 from samplers.statistics.intervals import binomial_cov
 from samplers.trace import Level, Status
 from samplers.validation import check_count
@@ -71,7 +71,7 @@ class MonteCarlo(Method):
                 )
             )
             goal.on_level(trace[-1])
-        sample = equal_draws(np.concatenate(outcomes), np.concatenate(failing))
+        sample = Sample.of_equal_draws(np.concatenate(outcomes), np.concatenate(failing))
         without = no_outcome_share(sample.f[sample.f <= goal.gamma])
-        outcome = share_of_failures(hits, n, goal.confidence, trace, without)
+        outcome = Outcome.of_counts(hits, n, goal.confidence, trace, without)
         return replace(outcome, sample=sample, status=Status.STOPPED if stopped else outcome.status)

@@ -19,7 +19,13 @@ from samplers.mcmc.kernels import Kernel
 from samplers.method import Goal, Outcome, Steps, no_outcome_share
 from samplers.problem import FloatArray, Inputs
 from samplers.sample import Layer, Sample
-from samplers.statistics.intervals import Interval, binomial_cov, clopper_pearson, correlation_factor, log_normal
+from samplers.statistics.intervals import (
+    Interval,
+    binomial_cov,
+    clopper_pearson,
+    correlation_factor,
+    log_normal_interval,
+)
 from samplers.statistics.thresholds import next_level
 from samplers.trace import Level, Status
 
@@ -192,10 +198,10 @@ def subset_interval(
         roots = chains.where(chains.used).roots
         independent = effective_roots(roots)
         cov = max(passed.cov, descent_cov(roots, trace[0].n_points))
-        reached = log_normal(passed.p, cov, goal.confidence, df=max(independent - 1, 1.0))[1]
+        reached = log_normal_interval(passed.p, cov, goal.confidence, df=max(independent - 1, 1.0))[1]
         return 0.0, reached * clopper_pearson(0, max(int(independent), 1), goal.confidence)[1]
     roots = chains.where(chains.f <= goal.gamma).roots
-    return log_normal(passed.p * trace[-1].p, cov, goal.confidence, df=max(effective_roots(roots) - 1, 1.0))
+    return log_normal_interval(passed.p * trace[-1].p, cov, goal.confidence, df=max(effective_roots(roots) - 1, 1.0))
 
 
 def effective_roots(roots: NDArray[np.int64]) -> float:

@@ -15,7 +15,7 @@ from scipy.sparse import csr_array
 
 from samplers.problem import FloatArray
 from samplers.sample import Sample
-from samplers.statistics.intervals import Interval, clopper_pearson, degrees_of_freedom, log_normal
+from samplers.statistics.intervals import Interval, clopper_pearson, degrees_of_freedom, log_normal_interval
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +28,7 @@ class UnitSums:
     """Sum over units of T_c(g) T_c(g'), shape (G, G)."""
     n_units: int
     """Units drawn."""
-    alone: bool
+    independent: bool
     """Whether every point is a unit of its own."""
 
     @property
@@ -45,7 +45,7 @@ class UnitSums:
         return np.divide(self.p**2, second, out=np.zeros(len(self.p)), where=second > 0)
 
     @property
-    def counted(self) -> NDArray[np.bool_]:
+    def is_count(self) -> NDArray[np.bool_]:
         """Where `p` is a share of n_units equal draws, one point each: T_c is 0 or 1 / n, shape (G,)."""
         return np.isclose(np.diag(self.second) * self.n_units, self.p, rtol=1e-9, atol=0.0)
 
@@ -81,18 +81,18 @@ def unit_sums(sample: Sample, gammas: FloatArray) -> UnitSums:
         p=np.cumsum(np.asarray(increments.sum(axis=0)))[:-1],
         second=np.cumsum(np.cumsum(products, axis=0), axis=1)[:-1, :-1],
         n_units=sample.n_units,
-        alone=alone(sample),
+        independent=has_independent_points(sample),
     )
 
 
-def alone(sample: Sample) -> bool:
+def has_independent_points(sample: Sample) -> bool:
     """Return whether every point of a sample is a unit of its own (a draw, no chain)."""
     return not sample.layers and len(np.unique(sample.units)) == len(sample.units)
 
 
-def interval_of_sum(p: float, cov: float, ess: float, alone: bool, confidence: float) -> Interval:
+def interval_of_sum(p: float, cov: float, ess: float, independent: bool, confidence: float) -> Interval:
     """Return a log-normal interval of p > 0 with the t quantile that `ess` effective units deserve."""
-    return log_normal(p, cov, confidence, df=degrees_of_freedom(ess, alone))
+    return log_normal_interval(p, cov, confidence, df=degrees_of_freedom(ess, independent))
 
 
 def interval_of_count(p: float, n: int, confidence: float) -> Interval:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 Interval = tuple[float, float]
-MANY_ESS = 200
+LARGE_ESS = 200
 """From this effective number of units on, normal quantiles serve; below, t quantiles."""
 
 
@@ -27,7 +27,7 @@ def clopper_pearson(hits: int, n: int, confidence: float) -> Interval:
     return low, high
 
 
-def nothing_in(n: int, confidence: float) -> float:
+def zero_hit_bound(n: int, confidence: float) -> float:
     """Return the upper bound of a probability of which n independent draws showed nothing; 1 where n = 0.
 
     The one-sided interval of Clopper and Pearson, with all of 1 - confidence at the upper end.
@@ -35,7 +35,7 @@ def nothing_in(n: int, confidence: float) -> float:
     return -math.expm1(math.log1p(-confidence) / n) if n else 1.0
 
 
-def log_normal(p: float, cov: float, confidence: float, df: float = math.inf) -> Interval:
+def log_normal_interval(p: float, cov: float, confidence: float, df: float = math.inf) -> Interval:
     """Return p exp(-+ q s), s^2 = log(1 + cov^2), q the normal (or, with finite df, t) quantile.
 
     For estimators whose logarithm is nearly normal; p must be positive. Cut at 1.
@@ -45,15 +45,15 @@ def log_normal(p: float, cov: float, confidence: float, df: float = math.inf) ->
     return p * math.exp(-half), min(1.0, p * math.exp(half))
 
 
-def degrees_of_freedom(ess: float, alone: bool) -> float:
+def degrees_of_freedom(ess: float, independent: bool) -> float:
     """Return the degrees of freedom of a sum over `ess` effective units; inf where they are many.
 
     Sums of chains have ess - 1, as in subset simulation; single draws, whose weights are skewed, a quarter of ess
     but at least 3, as in importance sampling.
     """
-    if ess > MANY_ESS:
+    if ess > LARGE_ESS:
         return math.inf
-    return max(ess / 4, 3.0) if alone else max(ess - 1, 1.0)
+    return max(ess / 4, 3.0) if independent else max(ess - 1, 1.0)
 
 
 def binomial_cov(p: float, n: float) -> float:

@@ -6,7 +6,7 @@ import numpy as np
 
 from samplers.problem import FloatArray
 
-LARGEST_SHARE = 0.5
+MAX_TIED_SHARE = 0.5
 """A tied level that keeps more than this share of the points is no progress."""
 
 
@@ -30,7 +30,7 @@ def next_level(f: FloatArray, fraction: float, gamma: float) -> float | None:
         return gamma
     quantile = float(np.partition(f, math.ceil(wanted) - 1)[math.ceil(wanted) - 1])
     up_to, below = int(np.count_nonzero(f <= quantile)), int(np.count_nonzero(f < quantile))
-    usable = up_to <= LARGEST_SHARE * n
+    usable = up_to <= MAX_TIED_SHARE * n
     if below > 0 and (not usable or up_to * below > wanted * wanted):
         return max(gamma, float(f[f < quantile].max()))
     return max(gamma, quantile) if usable else None

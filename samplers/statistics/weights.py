@@ -6,7 +6,7 @@ from scipy.special import logsumexp
 from samplers.problem import FloatArray
 
 
-def normalised(log_weights: FloatArray) -> FloatArray:
+def normalise_weights(log_weights: FloatArray) -> FloatArray:
     """Return weights proportional to exp(log_weights) (n,) that add up to 1."""
     return np.exp(log_weights - logsumexp(log_weights))
 
@@ -18,12 +18,12 @@ def effective_sample_size(log_weights: FloatArray) -> float:
     return float(np.exp(2 * logsumexp(log_weights) - logsumexp(2 * log_weights)))
 
 
-def largest_share(log_weights: FloatArray) -> float:
+def largest_weight_share(log_weights: FloatArray) -> float:
     """Return the largest weight as a share of their sum; 0 for none."""
-    return float(normalised(log_weights).max()) if log_weights.size else 0.0
+    return float(normalise_weights(log_weights).max()) if log_weights.size else 0.0
 
 
-def effective(terms: FloatArray) -> float:
+def effective_number(terms: FloatArray) -> float:
     """Return (sum t)^2 / sum t^2 of terms (n,); 0 where all are 0."""
     total, squares = float(terms.sum()), float((terms**2).sum())
     return total**2 / squares if squares > 0 else 0.0

@@ -2,6 +2,7 @@ import json
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -138,6 +139,14 @@ def test_default_method_and_name_as_string():
 def test_f_of_the_wrong_length():
     with pytest.raises(ValueError, match=r"Expected f to return shape \(1000,\)"):
         samplers.estimate(samplers.FunctionProblem(lambda x: np.zeros(3), 2), "adss", seed=1)
+
+
+@pytest.mark.parametrize("f", [lambda x: 1.0, lambda x: x, lambda x: x[1:, 0], lambda x: None, lambda x: 1j * x[:, 0]])
+@pytest.mark.parametrize("on_error", ["raise", "failure", "bound"])
+def test_a_problem_that_does_not_check_its_own_f(f, on_error):
+    problem = SimpleNamespace(dim=2, base=samplers.StandardNormal(2), evaluate=f)
+    with pytest.raises(samplers.EvaluationError, match=r"Expected f to return shape \(50,\), one"):
+        samplers.estimate(problem, "mc", seed=1, max_sim=50, on_error=on_error)
 
 
 def test_a_drawn_seed_repeats_the_run():

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 import samplers
 from rare_envs.study.cli.app import app
-from samplers.registry import GROUP, METHODS, Methods
+from samplers.registry import ENTRY_POINT_GROUP, METHODS, Methods
 from samplers.testing import check_method
 
 LATTICE = """
@@ -66,7 +66,7 @@ def installed(tmp_path, monkeypatch):
         info.mkdir()
         (info / "METADATA").write_text("Metadata-Version: 2.1\nName: lattice-methods\nVersion: 1.0\n")
         lines = [f"{name.replace('_', '-')} = {value}" for name, value in entries.items()]
-        (info / "entry_points.txt").write_text("\n".join([f"[{GROUP}]", *lines]) + "\n")
+        (info / "entry_points.txt").write_text("\n".join([f"[{ENTRY_POINT_GROUP}]", *lines]) + "\n")
         monkeypatch.syspath_prepend(tmp_path)
         return tmp_path
 

@@ -9,7 +9,7 @@ import pytest
 import samplers
 from samplers.limit_states import half_space
 from samplers.result import Failures
-from samplers.serialization import plain
+from samplers.serialization import to_json_value
 
 
 def result(**options):
@@ -87,7 +87,7 @@ def failures(log_p0, f=None, total=None):
 
 def test_the_most_likely_failures_are_kept():
     new = np.array([-2.0, -9.0, -1.0, -3.0])
-    kept = failures([-1.0, -5.0], [0.0, -1.0], total=7).merged(new[:, None], new, new, keep=4)
+    kept = failures([-1.0, -5.0], [0.0, -1.0], total=7).merge(new[:, None], new, new, keep=4)
     np.testing.assert_array_equal(kept.log_p0, [-1.0, -1.0, -2.0, -3.0])
     np.testing.assert_array_equal(kept.f, [0.0, -1.0, -2.0, -3.0])  # of equals the earlier first
     np.testing.assert_array_equal(kept.x[:, 0], kept.log_p0)
@@ -108,9 +108,9 @@ def test_failures_are_equal_value_by_value():
 
 def test_plain_values_keep_their_shape():
     value = {"a": (np.float64(1.5), np.int64(2), math.inf, -math.inf, math.nan), "b": [{"c": True}, None, "word"]}
-    assert plain(value) == {"a": [1.5, 2, None, None, None], "b": [{"c": True}, None, "word"]}
-    assert type(plain(np.float64(1.5))) is float
-    assert type(plain(np.int64(2))) is int
+    assert to_json_value(value) == {"a": [1.5, 2, None, None, None], "b": [{"c": True}, None, "word"]}
+    assert type(to_json_value(np.float64(1.5))) is float
+    assert type(to_json_value(np.int64(2))) is int
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from samplers.proposals.gaussian import Gaussian
 from samplers.proposals.mixture import ProposalDistribution
 from samplers.statistics.intervals import binomial_cov
 from samplers.statistics.thresholds import next_level
-from samplers.statistics.weights import normalised
+from samplers.statistics.weights import normalise_weights
 from samplers.trace import Status
 from samplers.validation import check_choice, check_count, check_setting, is_number
 
@@ -222,7 +222,7 @@ class CrossEntropy(Method):
         """
         if self.likelihood_ratio == "joint":
             log_ratios = np.broadcast_to(log_ratios.sum(axis=0), log_ratios.shape)
-        return proposal.project(elite, np.stack([normalised(ratios) for ratios in log_ratios]), alpha)
+        return proposal.project(elite, np.stack([normalise_weights(ratios) for ratios in log_ratios]), alpha)
 
 
 def as_tuple(setting: SettingT | tuple[SettingT, ...]) -> tuple[SettingT, ...]:

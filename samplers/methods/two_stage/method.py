@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from samplers.importance.draws import Draws, weight_warnings, weighted_interval
-from samplers.method import Goal, Interrupted, Outcome, Steps, no_outcome_share, share_of_failures
+from samplers.method import Goal, Interrupted, Outcome, Steps, no_outcome_share
 from samplers.methods.base import Method
 from samplers.methods.two_stage import fallback
 from samplers.methods.two_stage.diagnostics import check_base_draws, check_efficiency, check_regions, check_rounds
@@ -20,7 +20,7 @@ from samplers.methods.two_stage.refinement import BASE_FLOOR, Refinement
 from samplers.methods.two_stage.simulator import ComponentDraws, Simulator
 from samplers.methods.two_stage.stratified import StratifiedSample
 from samplers.problem import FloatArray, Inputs
-from samplers.sample import equal_draws
+from samplers.sample import Sample
 from samplers.statistics.intervals import binomial_cov
 from samplers.statistics.weights import effective_sample_size
 from samplers.trace import Level, Status
@@ -261,8 +261,8 @@ class _Run:
             self._base_u, self._base_f = self._set_aside
         fails = self._base_f <= goal.gamma
         without = no_outcome_share(self._base_f[fails])
-        outcome = share_of_failures(int(fails.sum()), len(fails), goal.confidence, self._closed_trace(), without)
-        sample = equal_draws(self._base_f, inputs.base.from_standard_normal(self._base_u[fails]))
+        outcome = Outcome.of_counts(int(fails.sum()), len(fails), goal.confidence, self._closed_trace(), without)
+        sample = Sample.of_equal_draws(self._base_f, inputs.base.from_standard_normal(self._base_u[fails]))
         # A share of draws, but only in runs that came to this: it must not be pooled with others.
         outcome = replace(outcome, sample=sample, counts=None)
         return replace(outcome, status=Status.STOPPED) if stopped else outcome

@@ -9,7 +9,7 @@ from scipy import stats
 from scipy.special import ndtr, ndtri
 
 import samplers
-from samplers.analysis.curve import known_from
+from samplers.analysis.curve import lowest_known_threshold
 from samplers.limit_states import half_space, parabola, plateau
 from samplers.sample import Layer, Sample
 from samplers.statistics.cluster_sums import unit_sums
@@ -113,7 +113,7 @@ def test_sums_of_units_by_hand():
     assert found.ess[1] == pytest.approx(0.35**2 / within)
     assert found.cov[0] == np.inf
     assert found.cov[3] == pytest.approx(math.sqrt((within + 0.09) / 0.65**2 - 0.1))
-    assert not found.counted[1:].any()
+    assert not found.is_count[1:].any()
 
 
 def test_a_layer_counts_where_it_speaks():
@@ -126,7 +126,7 @@ def test_a_layer_counts_where_it_speaks():
 @pytest.mark.parametrize("method", ["mc", "ce", "adss"])
 def test_too_low_a_threshold_is_refused_with_what_is_known(method):
     result = run(method, max_sim=3000)
-    start = known_from(result.sample, 0.0)
+    start = lowest_known_threshold(result.sample, 0.0)
     assert result.curve([start, 1.0]).ess[0] >= 4.99
     with pytest.raises(ValueError, match=rf"-9\.0 is too low .* known from g = {start!r} on.*gamma=-9\.0"):
         result.curve([0.0, -9.0])
@@ -235,7 +235,7 @@ def runs_inside(method, case, runs, **options):
     exact, inside = truth(grid), 0
     for seed in range(runs):
         result = samplers.estimate(reference.problem, method, seed=5000 + seed, **options)
-        known = grid >= known_from(result.sample, 0.0)
+        known = grid >= lowest_known_threshold(result.sample, 0.0)
         curve = result.curve(grid[known])
         inside += bool(((curve.low <= exact[known]) & (exact[known] <= curve.high)).all())
     return inside

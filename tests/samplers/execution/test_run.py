@@ -5,7 +5,7 @@ import pytest
 
 import samplers
 from samplers.errors import EvaluationError
-from samplers.execution.run import shares
+from samplers.execution.run import split_budget
 from samplers.limit_states import half_space
 
 EASY = half_space(2, 2.0).problem
@@ -211,9 +211,9 @@ def test_a_method_without_an_outcome():
 
 
 def test_shares_add_up():
-    assert shares(None, 3) == [None] * 3
+    assert split_budget(None, 3) == [None] * 3
     for max_sim, replicates in ((1000, 3), (7, 7), (20, 6), (1, 1)):
-        parts = shares(max_sim, replicates)
+        parts = split_budget(max_sim, replicates)
         assert sum(parts) == max_sim
         assert max(parts) - min(parts) <= 1
         assert len(parts) == replicates

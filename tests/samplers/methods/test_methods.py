@@ -11,7 +11,7 @@ import samplers
 from samplers.limit_states import four_branches, half_space, parabola, plateau, two_modes
 from samplers.problem import FunctionProblem
 from samplers.registry import METHODS
-from samplers.testing import CHECKS
+from samplers.testing import METHOD_CHECKS
 
 
 @pytest.fixture(params=sorted(METHODS))  # those of other packages too, where any are installed
@@ -33,7 +33,7 @@ def test_our_own_are_frozen_documented_dataclasses_that_can_be_asked(name):
         assert f"{field.name}:" in type(method).__doc__
 
 
-@pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
+@pytest.mark.parametrize("check", METHOD_CHECKS, ids=lambda check: check.__name__)
 def test_does_what_every_method_must_do(method, check):
     check(method)
 

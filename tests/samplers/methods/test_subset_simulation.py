@@ -18,7 +18,7 @@ from samplers.methods.subset_levels import (
     summarise,
 )
 from samplers.problem import FunctionProblem
-from samplers.statistics.intervals import log_normal
+from samplers.statistics.intervals import log_normal_interval
 from samplers.trace import Status
 
 ADSS = samplers.AdaptiveSubsetSimulation
@@ -128,7 +128,7 @@ def test_cov_is_the_larger_of_chain_correlation_and_descent():
     one_root, passed = np.zeros(100, dtype=int), LevelProduct(0.1, 0.1)
     by_descent, last = outcome(one_root, passed)
     assert by_descent.cov == descent_cov(np.zeros(100, dtype=int), 1000) > 2 * include_level(passed, last).cov
-    assert by_descent.interval == log_normal(by_descent.p, by_descent.cov, 0.95, df=1.0)
+    assert by_descent.interval == log_normal_interval(by_descent.p, by_descent.cov, 0.95, df=1.0)
 
     passed = LevelProduct(0.1, 2.0)
     by_levels, last = outcome(np.arange(100), passed)

@@ -1,10 +1,12 @@
 """Sums over independent units, against the same written out unit by unit."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from samplers.sample import Layer, Sample
-from samplers.statistics.cluster_sums import alone, unit_sums
+from samplers.statistics.cluster_sums import has_independent_points, unit_sums
 
 
 def plain(f):
@@ -33,8 +35,8 @@ def test_sums_are_those_over_units(families):
     # p is 20 times a mean: its variance is that of 20 totals, (n - 1) / n of what is unbiased
     np.testing.assert_allclose(sums.cov, np.sqrt(20 * totals.var(axis=0)) / totals.sum(axis=0))
     np.testing.assert_allclose(sums.correlation, np.corrcoef(totals.T))
-    assert not sums.alone
-    assert not sums.counted.any()
+    assert not sums.independent
+    assert not sums.is_count.any()
 
 
 def test_shares_of_plain_draws_are_binomial():
@@ -43,7 +45,7 @@ def test_shares_of_plain_draws_are_binomial():
     np.testing.assert_allclose(sums.p, [0.0, 0.5, 0.9, 1.0])
     np.testing.assert_allclose(sums.cov, [np.inf, np.sqrt(0.5 / 5), np.sqrt(0.1 / 9), 0.0], atol=1e-7)
     np.testing.assert_allclose(sums.ess, [0.0, 5.0, 9.0, 10.0])
-    assert sums.counted[1:].all()
+    assert sums.is_count[1:].all()
     r = np.sqrt(0.5 * 0.1 / (0.9 * 0.5))
     expected = np.zeros((4, 4))  # what does not vary is correlated with nothing
     expected[1:3, 1:3] = [[1.0, r], [r, 1.0]]
@@ -69,7 +71,7 @@ def test_a_layer_speaks_for_its_own_thresholds():
 
 def test_whether_every_point_stands_alone(families):
     draws = plain([1.0, -1.0])
-    assert alone(draws)
-    assert not alone(families)
+    assert has_independent_points(draws)
+    assert not has_independent_points(families)
     layer = Layer(f=draws.f, weights=draws.weights, units=draws.units)
-    assert not alone(Sample(f=draws.f, weights=draws.weights, units=draws.units, n_units=2, x=draws.x, layers=(layer,)))
+    assert not has_independent_points(replace(draws, layers=(layer,)))

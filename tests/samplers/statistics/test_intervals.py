@@ -10,7 +10,7 @@ from samplers.statistics.intervals import (
     correlation_factor,
     degrees_of_freedom,
     gain_over_monte_carlo,
-    log_normal,
+    log_normal_interval,
 )
 
 
@@ -38,13 +38,13 @@ def test_log_normal_covers_a_log_normal_estimate(rng):
     cov, p, runs = 0.3, 1e-4, 4000
     sigma = math.sqrt(math.log1p(cov**2))
     estimates = p * np.exp(sigma * rng.standard_normal(runs))
-    inside = [low <= p <= high for low, high in (log_normal(e, cov, 0.95) for e in estimates)]
+    inside = [low <= p <= high for low, high in (log_normal_interval(e, cov, 0.95) for e in estimates)]
     assert abs(np.mean(inside) - 0.95) < 4 * math.sqrt(0.95 * 0.05 / runs)
 
 
 def test_log_normal_is_cut_at_one_and_wider_with_few_degrees_of_freedom():
-    assert log_normal(0.9, 0.5, 0.95)[1] == 1.0
-    narrow, wide = log_normal(1e-3, 0.2, 0.95), log_normal(1e-3, 0.2, 0.95, df=4)
+    assert log_normal_interval(0.9, 0.5, 0.95)[1] == 1.0
+    narrow, wide = log_normal_interval(1e-3, 0.2, 0.95), log_normal_interval(1e-3, 0.2, 0.95, df=4)
     assert wide[0] < narrow[0] < 1e-3 < narrow[1] < wide[1]
 
 
@@ -53,8 +53,8 @@ def test_log_normal_is_cut_at_one_and_wider_with_few_degrees_of_freedom():
     [(1.0, 3.0, 1.0), (5.0, 3.0, 4.0), (40.0, 10.0, 39.0), (200.0, 50.0, 199.0), (201.0, math.inf, math.inf)],
 )
 def test_degrees_of_freedom_grow_with_what_the_units_are_worth(ess, of_draws, of_chains):
-    assert degrees_of_freedom(ess, alone=True) == of_draws
-    assert degrees_of_freedom(ess, alone=False) == of_chains
+    assert degrees_of_freedom(ess, independent=True) == of_draws
+    assert degrees_of_freedom(ess, independent=False) == of_chains
 
 
 def test_gain_of_monte_carlo_itself_is_one():

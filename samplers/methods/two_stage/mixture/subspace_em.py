@@ -15,7 +15,7 @@ from scipy.special import logsumexp
 
 from samplers.problem import FloatArray
 from samplers.proposals.components import SubspaceGaussian, log_ratios
-from samplers.statistics.weights import normalised
+from samplers.statistics.weights import normalise_weights
 
 HIGH_DIM = 40
 """Above this many dimensions a bump has one direction of its own: more cannot be learned from some hundred points."""
@@ -188,7 +188,7 @@ def _moved(bump: SubspaceGaussian, u: FloatArray, shares: FloatArray, log_weight
     wanted = min(max(30.0, 3.0 * u.shape[1]), count / 3)
     log_shares = np.log(np.maximum(shares, 1e-300))
     for power in np.arange(1.0, 0.0, -0.1):
-        w = normalised(log_shares + power * log_weights)
+        w = normalise_weights(log_shares + power * log_weights)
         ess = 1 / float((w * w).sum())
         if ess >= wanted:
             break
@@ -197,6 +197,6 @@ def _moved(bump: SubspaceGaussian, u: FloatArray, shares: FloatArray, log_weight
 
 def truncate_weights(log_weights: FloatArray) -> FloatArray:
     """Return weights that add up to 1, those over sqrt(n) times their mean cut to that (Ionides 2008)."""
-    w = normalised(log_weights)
+    w = normalise_weights(log_weights)
     w = np.minimum(w, 1 / math.sqrt(len(w)))
     return np.asarray(w / w.sum())
