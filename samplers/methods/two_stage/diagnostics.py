@@ -1,4 +1,4 @@
-"""Checks of a `TwoStage` estimate against what else was simulated: what would show had a region been missed."""
+"""Diagnostics of an estimate: what else was simulated would show if a failure region had been missed."""
 
 import math
 from collections.abc import Sequence
@@ -7,66 +7,58 @@ import numpy as np
 from scipy import stats
 
 from samplers.importance.draws import Draws
+from samplers.methods.two_stage.settings import DiagnosticSettings
 from samplers.methods.two_stage.stratified import StratifiedSample
 from samplers.statistics.weights import effective_sample_size
 
-FALSE_ALARM = 1e-3
-"""Probability with which a check warns of a right estimate."""
-ROUNDS_APART = 4.0
-"""Standard errors between the rounds and the estimate."""
-ENOUGH_ESS = 30.0
-LOW_RATE = 0.025
-"""Independent failures for each final draw. With less, weights are so uneven that heavy ones may not have been met."""
-LEFT_OUT = 0.05
-"""Share of p that a single draw in a region may stand for."""
+DEFAULT = DiagnosticSettings()
 
 
-def check_base_draws(p: float, hits: int, n: int) -> list[str]:
-    """Warn where more of n plain base draws fail than an estimate p allows.
+def check_base_draws(p: float, hits: int, n: int, settings: DiagnosticSettings = DEFAULT) -> list[str]:
+    """Return a warning if more of n base draws failed than an estimate p allows, by a binomial test.
 
-    Base draws know of no proposal: they hit a missed region as often as any other.
+    Base draws do not depend on the proposal: they hit a missed region as often as any other of its probability.
     """
-    if hits == 0 or stats.binom.sf(hits - 1, n, min(p, 1.0)) > FALSE_ALARM:
+    if hits == 0 or stats.binom.sf(hits - 1, n, min(p, 1.0)) > settings.false_alarm:
         return []
     expected = n * p
     return [f"{hits} of {n:,} base draws failed where p = {p:.2e} lets expect {expected:.2g}: p misses failures."]
 
 
-def check_rounds(strata: StratifiedSample, rounds: Sequence[Draws]) -> list[str]:
-    """Warn where the rounds before, each weighed by its own proposal, together say something else.
+def check_rounds(final: StratifiedSample, rounds: Sequence[Draws], settings: DiagnosticSettings = DEFAULT) -> list[str]:
+    """Return a warning if the rounds before, each weighted by its own proposal, contradict the estimate.
 
-    Weighed as draws from all rounds' proposals together they would be worth more, but are often too low by a third:
-    later proposals depend on earlier draws.
+    Weighted as draws from the mixture of all rounds' proposals they would be worth more, but give a p that is often too
+    low by a third, for later proposals depend on earlier draws.
     """
     n = sum(draws.n for draws in rounds)
     log_weights = np.concatenate([np.empty(0), *(draws.log_weights for draws in rounds)])
-    if len(strata.draws.f) == 0 or effective_sample_size(log_weights) < ENOUGH_ESS:
+    if len(final.draws.f) == 0 or effective_sample_size(log_weights) < settings.min_rounds_ess:
         return []
     w = np.exp(log_weights)
     before, error = float(w.sum()) / n, math.sqrt(float((w * w).sum())) / n
-    apart = abs(before - strata.p) / math.hypot(error, strata.cov * strata.p)
-    if apart < ROUNDS_APART:
+    apart = abs(before - final.p) / math.hypot(error, final.cov * final.p)
+    if apart < settings.max_deviation:
         return []
     return [f"The rounds before the estimate say {before:.2e}, {apart:.1f} standard errors from it."]
 
 
-def check_efficiency(strata: StratifiedSample) -> list[str]:
-    """Warn where the draws are worth so little that the weights may have a tail that none of them has met."""
-    draws = strata.draws
-    if len(draws.f) == 0 or draws.ess >= LOW_RATE * draws.n:
+def check_efficiency(final: StratifiedSample, settings: DiagnosticSettings = DEFAULT) -> list[str]:
+    """Return a warning if the draws are worth so few failures that there may be weights heavier than any met."""
+    draws = final.draws
+    if len(draws.f) == 0 or draws.ess >= settings.min_rate * draws.n:
         return []
     return [f"{draws.n:,} draws are worth {draws.ess:.0f} failures: there may be heavier weights than any met."]
 
 
-def check_regions(strata: StratifiedSample) -> list[str]:
-    """Warn of regions where the points that the exploration found have weights that p cannot do without.
+def check_regions(final: StratifiedSample, settings: DiagnosticSettings = DEFAULT) -> list[str]:
+    """Return a warning if a point of the exploration in some region would be a large share of p as a draw.
 
-    Where one draw is worth some per cent of p, the proposal does not describe the region, and that the final draws
-    met hardly any of that weight says nothing.
+    The proposal does not describe such a region, and that the final draws met hardly any of that weight says nothing.
     """
-    share = strata.typical / max(strata.draws.n * strata.p, 1e-300)
-    lost = int((share > LEFT_OUT).sum())
-    if lost == 0 or len(strata.draws.f) == 0:
+    share = final.expected / max(final.draws.n * final.p, 1e-300)
+    lost = int((share > settings.max_point_share).sum())
+    if lost == 0 or len(final.draws.f) == 0:
         return []
     return [
         f"The draws hardly reach {lost} of {len(share)} regions found: a point there would be {share.max():.0%} of p."

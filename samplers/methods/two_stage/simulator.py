@@ -1,7 +1,7 @@
-"""Asking for simulations in standard normal space, and the draws that come of it."""
+"""Simulator: points of standard normal space become outcomes, and every simulation is counted."""
 
 from collections.abc import Generator
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,16 +9,28 @@ from numpy.typing import NDArray
 from samplers.problem import FloatArray, Inputs
 from samplers.proposals.components import MixtureComponent
 
+T = TypeVar("T")
+SimulationSteps = Generator[FloatArray, FloatArray, T]
+"""A computation that needs simulations: yields points x (n, d), is sent their outcomes f (n,), returns a T."""
+
 
 class Simulator:
-    """Turns points of standard normal space into outcomes, and counts."""
+    """The way to f from standard normal space, and its count: the only part of a run that is changed in place.
+
+    An `Interrupted` that ends a step midway discards the step's state, not the simulations that it made; so the count
+    stands outside the state.
+
+    Attributes:
+        inputs: Coordinates that are searched, and the map from u to x.
+        n_sim: Simulations made so far.
+    """
 
     def __init__(self, inputs: Inputs) -> None:
         self.inputs = inputs
         self.n_sim = 0
 
-    def evaluate(self, u: FloatArray) -> Generator[FloatArray, FloatArray, FloatArray]:
-        """Ask for f at u (n, d), shape (n,)."""
+    def evaluate(self, u: FloatArray) -> SimulationSteps[FloatArray]:
+        """Return f at u (n, d), shape (n,); no batch is yielded where n = 0."""
         if len(u) == 0:
             return np.empty(0)
         f = yield self.inputs.base.from_standard_normal(u)
@@ -27,10 +39,12 @@ class Simulator:
 
 
 class ComponentDraws(NamedTuple):
-    """Draws from known components."""
+    """Draws from known components, one component after the other, and their outcomes."""
 
     components: list[MixtureComponent]
     counts: NDArray[np.int64]
-    """Draws of each, in this order."""
+    """Draws of each component, shape (k,); they add up to n."""
     u: FloatArray
+    """Shape (n, d)."""
     f: FloatArray
+    """Shape (n,)."""

@@ -28,16 +28,16 @@ class StratifiedSample:
     """Sums of their squares, shape (k,)."""
     acceptance_cov: float
     """What else is not exact: see `MixtureProposal.acceptance_cov`."""
-    typical: FloatArray
+    expected: FloatArray
     """Weights to be expected, whether or not a draw has shown them: one for each region found, shape (m,)."""
     u_safe: FloatArray
     """The draws that did not fail, in the order of `draws.f_safe`, shape (m, d)."""
 
     @classmethod
-    def empty(cls, k: int, dim: int, typical: FloatArray) -> "StratifiedSample":
+    def empty(cls, k: int, dim: int, expected: FloatArray) -> "StratifiedSample":
         """No draws yet from a proposal of k components in d dimensions."""
         zero = np.zeros(k)
-        return cls(Draws(0, np.empty(0), np.empty(0)), zero, zero, zero, 0.0, typical, np.empty((0, dim)))
+        return cls(Draws(0, np.empty(0), np.empty(0)), zero, zero, zero, 0.0, expected, np.empty((0, dim)))
 
     def add(self, batch: ComponentDraws, proposal: MixtureProposal, inputs: Inputs, gamma: float) -> "StratifiedSample":
         """Return these draws and another batch from the same proposal."""
@@ -52,7 +52,7 @@ class StratifiedSample:
             self.sums + np.bincount(owner, weights=y, minlength=k),
             self.squares + np.bincount(owner, weights=y * y, minlength=k),
             proposal.acceptance_cov,
-            self.typical,
+            self.expected,
             np.concatenate([self.u_safe, batch.u[~fails]]),
         )
 
@@ -66,19 +66,19 @@ class StratifiedSample:
         """Coefficient of variation of `p`; inf without a failing draw.
 
         The variance within the components: how many draws come from which is no matter of chance. The square of
-        the largest term, seen or typical of a region, is added, for what draws as heavy as that have not shown yet.
+        the largest term, seen or expected of a region, is added, for what draws as heavy as that have not shown yet.
         """
         if len(self.draws.f) == 0:
             return math.inf
         many = self.counts >= MIN_STRATUM_DRAWS
         n, s1, s2 = self.counts[many], self.sums[many], self.squares[many]
         within = float(((s2 - s1 * s1 / n) * n / (n - 1)).sum()) + float(self.squares[~many].sum())
-        largest = max(math.exp(float(self.draws.log_weights.max())), float(self.typical.max(initial=0.0)))
+        largest = max(math.exp(float(self.draws.log_weights.max())), float(self.expected.max(initial=0.0)))
         return math.hypot(
             math.sqrt(max(within, 0.0) + largest * largest) / (self.draws.n * self.p), self.acceptance_cov
         )
 
-    def sample(self, proposal: MixtureProposal, base_f: FloatArray, base_u: FloatArray, gamma: float) -> Sample:
+    def to_sample(self, proposal: MixtureProposal, base_f: FloatArray, base_u: FloatArray, gamma: float) -> Sample:
         """Return the weighted points behind p: failing draws as they are, the others with the first base draws.
 
         Thresholds above gamma rest on draws that did not fail; of those, few are made where f is large, and the base

@@ -1,7 +1,12 @@
-"""Planes near which f changes sign: from linear regression of f around one region of failure.
+"""Linear model of f: the hyperplane near which f changes sign, from robust regression around one failure region.
 
-A plane is only ever the source of a proposal; whether f is linear there decides how good it is, not whether the
-estimate is right.
+The hyperplane is only the source of a proposal. Whether f is linear there decides how good the proposal is, not
+whether the estimate is right.
+
+References:
+    Allen, "The relationship between variable selection and data augmentation and a method for prediction",
+    Technometrics 16, 1974 (leave-one-out residuals from one fit).
+    Rousseeuw and Leroy, "Robust regression and outlier detection", 1987 (inliers within a multiple of the MAD).
 """
 
 import math
@@ -15,31 +20,68 @@ from samplers.problem import LOG_TWO_PI, FloatArray
 from samplers.proposals.components import HalfSpaceNormal, MixtureComponent, SubspaceGaussian
 
 RIDGES = (1.0, 1e-3)
+"""Ridge penalties; the smaller one is tried where points are enough for ordinary regression (`MIN_POINTS_PER_DIM`)."""
 LAD_ITERATIONS = 12
+"""Steps of iteratively reweighted least squares towards least absolute deviations."""
+LAD_RIDGE = 1e-3
+LAD_SMOOTHING = 1e-3
+"""Share of the median deviation that is added to each before it divides: exact points have no infinite weight."""
+MAD_TO_SIGMA = 1.4826
+"""Standard deviation of a normal distribution over its median absolute deviation."""
+INLIER_SIGMAS = 3.0
+"""Deviation up to which a point agrees with a hyperplane (Rousseeuw and Leroy use 2.5)."""
+MIN_POINTS = 5
+"""Points that a regression needs."""
+MIN_POINTS_PER_DIM = 1.2
+"""With MIN_POINTS + this many points per dimension the small ridge and outliers can be judged."""
+TRIMMED = 0.02
+"""Share of the outcomes left out at either end: f may be capped or wild there."""
+LARGEST_OUTCOME = 1e300
+"""An f of -inf arrives as the lowest number, about -1.8e308."""
 EXACT = 0.999
-"""Where a plane explains as much of f as this, f is linear."""
+"""R^2 from which f is linear."""
 LINEAR = 0.95
-"""Where it explains as much as this, it also tells of points nearby."""
+"""R^2 from which the hyperplane also tells where failure begins."""
 LEAST_R2 = 0.3
-"""A plane that explains less of f is no help."""
+"""R^2 under which a hyperplane is no help; that of pure noise stays below (`test_noise_has_no_plane`)."""
 AGREEING = 0.6
-"""Share of the points that must lie on a plane for it to be more than chance."""
+"""Share of the points that must agree with a hyperplane for it to be more than chance."""
+CROSSING_ERRORS = 2.0
+"""Standard errors of a prediction by which a half-space begins before the hyperplane."""
 NEAREST = 0.03
-"""Share of the failures that may lie before a plane's proposals start."""
+"""Share of the failures that may lie before the edge, where the hyperplane does not tell it."""
+MIN_FAILURES = 8
+"""Failures that half-space proposals need."""
+MIN_DISTANCE = 0.5
+"""Nearer to the origin than this a half-space holds 31 % of N(0, I): base draws serve as well."""
+SAME_REGION = 0.5
+"""Failures nearer than this share of the median distance along the axis are another region's."""
+WIDENING = 1.3
+"""Variance of the Gaussian over that of N(0, 1) beyond the edge: too small a variance makes weights unbounded, too
+large a one costs a few draws."""
+LEAST_VARIANCE = 0.01
+"""Rounding may leave next to nothing of 1 + beta m - m^2 far out, where it is about 1 / beta^2."""
+EDGE_SLACK = 0.02
+"""By how much a half-space begins before the edge, in standard deviations of N(0, I)."""
+EDGE_EXCESSES = 2.0
+"""Mean excesses over the quantile, divided by the number of failures, by which an edge is put back."""
 
 
 class Plane(NamedTuple):
-    """A plane fitted to f: f = level - steepness (axis . u - at)."""
+    """A hyperplane fitted to f: f = level - steepness (axis . u - at)."""
 
     axis: FloatArray
     """Unit direction in which f falls, shape (d,); zeros if there is none."""
     steepness: float
+    """By how much f falls along the axis, per standard deviation."""
     at: float
+    """Mean of the points along the axis."""
     level: float
+    """Mean of f."""
     r2: float
     """Leave-one-out R^2 among the points that agree with it."""
     share: float
-    """How many of the points do."""
+    """Share of the points that agree."""
     spread: float
     """Standard deviation of f among them."""
 
@@ -54,22 +96,25 @@ class Plane(NamedTuple):
         return self.r2 > LINEAR and self.share > AGREEING
 
     def crossing(self, gamma: float) -> float:
-        """Return where along the axis f falls to gamma, less two standard errors of a prediction of that.
+        """Return where along the axis f falls to gamma, less CROSSING_ERRORS standard errors of a prediction of that.
 
         A plane that is turned by some degrees has failures before it all along its edge.
         """
         error = math.sqrt(max(1 - self.r2, 0.0)) * self.spread
-        return self.at + (self.level - gamma - 2 * error) / self.steepness
+        return self.at + (self.level - gamma - CROSSING_ERRORS * error) / self.steepness
 
 
 def fit_plane(u: FloatArray, f: FloatArray) -> Plane:
-    """Return the plane that f follows at points u (n, d), f (n,); infinite f and the outer 2 % are left out."""
+    """Return the hyperplane that f follows at points u (n, d), f (n,); axis 0 and R^2 0 where there is none.
+
+    Infinite outcomes and the share TRIMMED at either end are left out.
+    """
     dim = u.shape[1]
     none = Plane(np.zeros(dim), 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
-    finite = np.isfinite(f) & (np.abs(f) < 1e300)  # an f of -inf arrives as the lowest number
-    if finite.sum() < 5:
+    finite = np.isfinite(f) & (np.abs(f) < LARGEST_OUTCOME)
+    if finite.sum() < MIN_POINTS:
         return none
-    low, high = np.quantile(f[finite], [0.02, 0.98])
+    low, high = np.quantile(f[finite], [TRIMMED, 1 - TRIMMED])
     usual = finite & (f >= low) & (f <= high)
     size = float(np.abs(f[usual]).max()) if usual.any() else 0.0
     if size == 0.0:
@@ -85,24 +130,31 @@ def fit_plane(u: FloatArray, f: FloatArray) -> Plane:
 
 
 def descent_direction(u: FloatArray, f: FloatArray) -> tuple[FloatArray, float]:
-    """Return the unit direction in which f falls, shape (d,), and the R^2 of the plane (leave-one-out).
+    """Return the unit direction in which f falls, shape (d,), and how much of f it explains.
+
+    That is R^2 (leave-one-out) times the share of the points that agree; direction 0 where there is none.
 
     Args:
-        u: Points, shape (n, d).
-        f: Their outcomes, shape (n,); infinite ones and the outer 2 % on both sides are left out.
+        u: GroupedPoints, shape (n, d).
+        f: Their outcomes, shape (n,); infinite ones and the share TRIMMED at either end are left out.
     """
     plane = fit_plane(u, f)
     return plane.axis, plane.explained
 
 
 def half_space_proposals(
-    points: FloatArray, u: FloatArray, f: FloatArray, gamma: float = 0.0
+    failures: FloatArray, u: FloatArray, f: FloatArray, gamma: float = 0.0
 ) -> list[MixtureComponent]:
-    """Return proposals beyond the plane of f around some failures, or none if no plane explains f.
+    """Return proposals for a failure region that a hyperplane bounds, or [] if f is not nearly linear there.
+
+    Fits f(u) = a + b.u around the failures. With R^2 (leave-one-out, times the share of the points that agree) of at
+    least LEAST_R2 the region is taken for {u : n.u >= beta}, n = -b / |b|: a Gaussian with the moments of N(0, 1)
+    beyond beta along n (Mills' ratio m: mean m, variance 1 + beta m - m^2, times WIDENING), and N(0, I) given
+    n.u >= beta - EDGE_SLACK.
 
     Args:
-        points: Failing points, shape (m, d).
-        u: Points around them, failing or not, shape (n, d).
+        failures: Failing points, shape (m, d).
+        u: GroupedPoints around them, failing or not, shape (n, d).
         f: Outcomes of these, shape (n,).
         gamma: Threshold of failure.
     """
@@ -111,38 +163,46 @@ def half_space_proposals(
         inside = f <= gamma
         alone = fit_plane(u[inside], f[inside])
         plane = alone if alone.clear and alone.explained > plane.explained else plane
-    if plane.explained < LEAST_R2 or len(points) < 8:
+    if plane.explained < LEAST_R2 or len(failures) < MIN_FAILURES:
         return []
-    axis = plane.axis
-    along = points @ axis
+    beta = _distance(plane, failures @ plane.axis, gamma)
+    if beta < MIN_DISTANCE:
+        return []
+    mean = math.exp(-0.5 * (beta * beta + LOG_TWO_PI) - float(log_ndtr(-beta)))
+    variance = max(1 + beta * mean - mean * mean, LEAST_VARIANCE)
+    gaussian = SubspaceGaussian(plane.axis[:, None], np.array([mean]), np.array([WIDENING * variance]))
+    return [gaussian, HalfSpaceNormal(plane.axis, beta - EDGE_SLACK)]
+
+
+def _distance(plane: Plane, along: FloatArray, gamma: float) -> float:
+    """Return where along its axis a half-space of failures begins, given how far the failures are along it, (m,).
+
+    0 where the failures are around the origin.
+    """
     middle = float(np.median(along))
-    if middle < 0.5:
-        return []
-    along = along[along > 0.5 * middle]  # the others are another region's
+    if middle < MIN_DISTANCE:
+        return 0.0
     if plane.clear:
-        start = plane.crossing(gamma)
-    else:
-        start = failure_edge(along, np.ones(len(along)), len(np.unique(along)), NEAREST)
-    if start < 0.5:
-        return []
-    # Mean and variance of N(0, 1) beyond start: Mills' ratio.
-    mean = math.exp(-0.5 * (start * start + LOG_TWO_PI) - float(log_ndtr(-start)))
-    variance = max(1 + start * mean - mean * mean, 0.01)
-    return [
-        SubspaceGaussian(axis[:, None], np.array([mean]), np.array([1.3 * variance])),
-        HalfSpaceNormal(axis, start - 0.02),
-    ]
+        return plane.crossing(gamma)
+    along = along[along > SAME_REGION * middle]
+    return failure_edge(along, np.ones(len(along)), len(np.unique(along)), NEAREST)
 
 
 def failure_edge(along: FloatArray, weights: FloatArray, ess: float, share: float) -> float:
     """Return where weighted failures begin, given how far along a direction they lie, shape (n,).
 
-    Their quantile at `share`, less what the least of a few lies beyond the edge of many: twice the mean excess over
-    it divided by how many they are worth. Failures before the start of a proposal with an edge are the heavy draws
-    that no estimate of its error knows of.
+    Their quantile at `share`, less EDGE_EXCESSES times the mean excess over it, divided by how many they are worth:
+    the least of a few lies beyond the edge of many. (Failures before the start of a proposal with an edge are the
+    heavy draws that no estimate of its error knows of.)
+
+    Args:
+        along: Distances along the direction, shape (n,).
+        weights: Importance weights, of any scale, shape (n,).
+        ess: How many independent failures they are worth.
+        share: Share of the weights that may lie before the quantile.
     """
     first = weighted_quantile(along, weights, share)
-    return first - 2 * max(float(np.average(along, weights=weights)) - first, 0.0) / max(ess, 2.0)
+    return first - EDGE_EXCESSES * max(float(np.average(along, weights=weights)) - first, 0.0) / max(ess, 2.0)
 
 
 def weighted_quantile(x: FloatArray, weights: FloatArray, share: float) -> float:
@@ -155,19 +215,20 @@ def weighted_quantile(x: FloatArray, weights: FloatArray, share: float) -> float
 def _fit_ridge(x: FloatArray, y: FloatArray) -> tuple[FloatArray, float]:
     """Return the slope (d,) of the ridge regression of y (n,) on x (n, d), and its leave-one-out R^2.
 
-    Of the ridges, where points are enough for both, the one that leaves the larger R^2: a high one turns and lifts a
-    plane that fits exactly.
+    Of the RIDGES, where points are enough for both, the one with the larger R^2: a large ridge turns and lifts a
+    hyperplane that fits exactly.
     """
     n, dim = x.shape
     xc, yc = x - x.mean(axis=0), y - y.mean()
     total = float(yc @ yc)
-    if total <= 0 or n < 5:
+    if total <= 0 or n < MIN_POINTS:
         return np.zeros(dim), 0.0
-    found = [_solve_ridge(xc, yc, total, ridge) for ridge in (RIDGES if n >= 1.2 * dim + 5 else RIDGES[:1])]
-    return max(found, key=lambda one: one[1])
+    ridges = RIDGES if n >= MIN_POINTS_PER_DIM * dim + MIN_POINTS else RIDGES[:1]
+    return max((_solve_ridge(xc, yc, total, ridge) for ridge in ridges), key=lambda fit: fit[1])
 
 
 def _solve_ridge(xc: FloatArray, yc: FloatArray, total: float, ridge: float) -> tuple[FloatArray, float]:
+    """Return slope and leave-one-out R^2 for centred x (n, d), y (n,) with sum of squares `total` (Allen 1974)."""
     n, dim = xc.shape
     if n >= dim:
         hat = xc @ np.linalg.inv(xc.T @ xc + ridge * np.eye(dim))
@@ -180,14 +241,14 @@ def _solve_ridge(xc: FloatArray, yc: FloatArray, total: float, ridge: float) -> 
 
 
 def _fit_robust(x: FloatArray, y: FloatArray) -> tuple[FloatArray, float, NDArray[np.bool_]]:
-    """As `_fit_ridge`, unmoved by the few points that belong to another region, and which points (n,) are not these.
+    """Return slope and R^2 as `_fit_ridge` does, without the few points of another region, and the points used (n,).
 
-    Least absolute deviations by reweighting, then `_fit_ridge` of the points that agree with it.
+    Least absolute deviations by reweighting find the points that agree; `_fit_ridge` is fitted to these.
     """
     n, dim = x.shape
     slope, r2 = _fit_ridge(x, y)
     everything = np.ones(n, dtype=bool)
-    if r2 > EXACT or n < 1.2 * dim + 5:
+    if r2 > EXACT or n < MIN_POINTS_PER_DIM * dim + MIN_POINTS:
         return slope, r2, everything
     near = _find_inliers(x, y)
     robust, robust_r2 = _fit_ridge(x[near], y[near])
@@ -197,10 +258,10 @@ def _fit_robust(x: FloatArray, y: FloatArray) -> tuple[FloatArray, float, NDArra
 
 
 def _find_inliers(x: FloatArray, y: FloatArray) -> NDArray[np.bool_]:
-    """Return which points (n,) lie on the plane of least absolute (leave-one-out) deviations."""
+    """Return which points (n,) lie on the hyperplane of least absolute (leave-one-out) deviations."""
     n, dim = x.shape
     design = np.column_stack([x, np.ones(n)])
-    penalty = np.diag(np.append(np.full(dim, 1e-3), 0.0))
+    penalty = np.diag(np.append(np.full(dim, LAD_RIDGE), 0.0))
     w = np.ones(n)
     for _ in range(LAD_ITERATIONS):
         weighted = design * w[:, None]
@@ -208,6 +269,6 @@ def _find_inliers(x: FloatArray, y: FloatArray) -> NDArray[np.bool_]:
         leverage = np.einsum("ij,ij->i", weighted @ inverse, design)
         deviation = np.abs(y - design @ (inverse @ (weighted.T @ y))) / np.maximum(1 - leverage, 1e-2)
         typical = float(np.median(deviation))
-        w = 1 / (deviation + 1e-3 * typical + 1e-12)
+        w = 1 / (deviation + LAD_SMOOTHING * typical + 1e-12)
         w *= n / w.sum()
-    return np.asarray(deviation <= 3 * 1.4826 * typical + 1e-9 * np.ptp(y))
+    return np.asarray(deviation <= INLIER_SIGMAS * MAD_TO_SIGMA * typical + 1e-9 * np.ptp(y))

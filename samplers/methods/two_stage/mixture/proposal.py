@@ -1,8 +1,8 @@
-"""The mixtures that `TwoStage` draws from."""
+"""Proposal: the mixture that a round or the estimate draws from, with a screen if one pays."""
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,29 +11,49 @@ from samplers.methods.two_stage.mixture.screening import FailureScreen, draw_scr
 from samplers.problem import FloatArray
 from samplers.proposals.components import MixtureComponent, draw_components, draw_counts, log_ratios, mixture_log_ratio
 
+Kind = Literal["base", "wide", "radial", "gaussian", "linear", "explored", "tempered", "half-space"]
+"""Where a component of a proposal comes from:
+
+    base        N(0, I), which bounds all weights
+    wide        N(0, s^2 I)
+    radial      every direction alike, from the radius of the failures on
+    gaussian    fitted to weighted failures
+    linear      a half-space and its Gaussian, from linear regression of f
+    explored    fitted to the chains of the exploration, never changed
+    tempered    q^t phi^(1 - t) of a Gaussian q, which bounds weights where q is a bad description
+    half-space  N(0, I) beyond the edge of a Gaussian's failures
+"""
+
 NO_REGION = -1
+"""Region of a component that belongs to none in particular."""
+UNSCREENED = ("base", "wide")
+"""Kinds that no screen thins: they guard against what the classifier does not know."""
 ACCEPTANCE_DRAWS = 15_000
-"""Draws that find what a screen lets through; they are not simulated."""
+"""Draws, shared among the components by weight, that find what a screen accepts; they are not simulated. The c.o.v. of
+an acceptance of a half is then under 1 % of itself for a component of any weight that matters."""
+MIN_ACCEPTANCE_DRAWS = 500
+"""Such draws of a component at least."""
 
 
 class ProposalComponent(NamedTuple):
-    """A component that may become part of the proposal."""
+    """A component of a proposal, and where it comes from."""
 
     component: MixtureComponent
-    kind: str
+    kind: Kind
     region: int = NO_REGION
 
 
 @dataclass(frozen=True)
 class MixtureProposal:
-    """A mixture to draw from."""
+    """A mixture sum_k a_k q_k to draw from; behind a screen each q_k becomes q_k a(u) / E_qk[a]."""
 
     candidates: list[ProposalComponent]
+    """The components; those of weight 0 are not drawn from."""
     weights: FloatArray
-    """Adding up to 1, shape (k,)."""
+    """a_k, adding up to 1, shape (k,)."""
     screen: FailureScreen | None = None
     acceptance: FloatArray = field(default_factory=lambda: np.ones(0))
-    """Share of each component's draws that the screen lets through, shape (k,)."""
+    """E_qk[a], the share of each component's draws that the screen accepts, shape (k,)."""
     acceptance_cov: float = 0.0
     """What the error of `acceptance` adds to the c.o.v. of p, as far as it is known before the draws.
 
@@ -43,43 +63,42 @@ class MixtureProposal:
 
     @property
     def components(self) -> list[MixtureComponent]:
-        """Its components."""
+        """Its components q_k."""
         return [candidate.component for candidate in self.candidates]
-
-    def log_weights(self, u: FloatArray) -> FloatArray:
-        """log(phi / q) at u (n, d), shape (n,)."""
-        used = self.weights > 0
-        log_r = log_ratios([c for c, a in zip(self.components, used, strict=True) if a], u)
-        if self.screen is not None:
-            log_r = log_r + np.where(
-                self.screened[used, None], np.log(self.screen(u)) - np.log(self.acceptance)[used, None], 0.0
-            )
-        return -mixture_log_ratio(log_r, self.weights[used])
 
     @property
     def screened(self) -> NDArray[np.bool_]:
-        """Which components the screen thins: not those that guard against what the classifier does not know."""
-        return np.array([candidate.kind not in ("base", "wide") for candidate in self.candidates])
+        """Which components the screen thins, shape (k,)."""
+        return np.array([candidate.kind not in UNSCREENED for candidate in self.candidates])
+
+    def log_weights(self, u: FloatArray) -> FloatArray:
+        """Return log(phi / q) at u (n, d), shape (n,)."""
+        used = self.weights > 0
+        log_r = log_ratios([c for c, a in zip(self.components, used, strict=True) if a], u)
+        if self.screen is not None:
+            thinned = np.log(self.screen(u)) - np.log(self.acceptance)[used, None]
+            log_r = log_r + np.where(self.screened[used, None], thinned, 0.0)
+        return -mixture_log_ratio(log_r, self.weights[used])
 
     def draw(self, n: int, rng: np.random.Generator) -> tuple[FloatArray, NDArray[np.int64]]:
-        """Draw n points (n, d), one component after the other; return them and how many are from which."""
+        """Draw n points (n, d), one component after the other; return them and how many are from which (k,)."""
         counts = draw_counts(self.weights, n, rng)
         if self.screen is None:
             return draw_components(self.components, counts, rng), counts
-        return np.concatenate(
-            [
-                draw_screened(self.screen, component, int(k), rng) if screened else component.sample(int(k), rng)
-                for component, k, screened in zip(self.components, counts, self.screened, strict=True)
-                if k > 0
-            ]
-        ), counts
+        parts = [
+            draw_screened(self.screen, component, int(k), rng) if screened else component.sample(int(k), rng)
+            for component, k, screened in zip(self.components, counts, self.screened, strict=True)
+            if k > 0
+        ]
+        return np.concatenate(parts), counts
 
     def with_screen(self, screen: FailureScreen, rng: np.random.Generator) -> "MixtureProposal":
-        """Return the same with a screen; what it lets through of each component is found by drawing, not simulating."""
+        """Return the mixture behind a screen; what it accepts of each component is found by draws, not simulations."""
         acceptance, error = np.ones(len(self.weights)), 0.0
         for k, component in enumerate(self.components):
             if self.screened[k] and self.weights[k] > 0:
-                accepted = screen(component.sample(max(int(self.weights[k] * ACCEPTANCE_DRAWS), 500), rng))
+                n = max(int(self.weights[k] * ACCEPTANCE_DRAWS), MIN_ACCEPTANCE_DRAWS)
+                accepted = screen(component.sample(n, rng))
                 acceptance[k] = accepted.mean()
                 error += (self.weights[k] / acceptance[k]) ** 2 * float(accepted.var()) / len(accepted)
         return replace(self, screen=screen, acceptance=acceptance, acceptance_cov=math.sqrt(error))

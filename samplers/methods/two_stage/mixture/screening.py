@@ -56,7 +56,7 @@ def train_screen(
     seen, and then learns from all.
 
     Args:
-        known: Points u (n, d) and whether they fail (n,).
+        known: GroupedPoints u (n, d) and whether they fail (n,).
         fresh: Draws from the last proposal u (m, d) and whether they fail (m,).
         log_weights: log(phi / q) of the fresh draws, shape (m,).
     """

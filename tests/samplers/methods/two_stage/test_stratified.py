@@ -33,7 +33,7 @@ LAWS = [
     (HalfSpaceNormal(np.ones(1), 1.5), stats.truncnorm(1.5, np.inf)),
 ]
 WEIGHTS = np.array([0.2, 0.3, 0.3, 0.2])
-PROPOSAL = MixtureProposal([ProposalComponent(component, "bump") for component, _ in LAWS], WEIGHTS)
+PROPOSAL = MixtureProposal([ProposalComponent(component, "gaussian") for component, _ in LAWS], WEIGHTS)
 UNUSED = MixtureProposal(
     [*PROPOSAL.candidates, ProposalComponent(IsotropicNormal(1, 3.0), "wide")], np.append(WEIGHTS, 0.0)
 )
@@ -142,7 +142,7 @@ def test_sample_adds_up_to_p_and_serves_higher_thresholds(rng):
     """With base draws of an exploration for where the proposal hardly draws: P[f <= g] = P[u >= beta - g]."""
     found = repeated(4000, 1, rng)[0]
     base_u = rng.standard_normal((500, 1))
-    sample = found.sample(PROPOSAL, PROBLEM.evaluate(base_u), base_u, 0.0)
+    sample = found.to_sample(PROPOSAL, PROBLEM.evaluate(base_u), base_u, 0.0)
     assert len(sample.f) == len(sample.weights) == len(sample.units) <= sample.n_units == 4500
     assert len(np.unique(sample.units)) == len(sample.units)
     assert sample.units.max() < sample.n_units
@@ -155,7 +155,7 @@ def test_sample_adds_up_to_p_and_serves_higher_thresholds(rng):
 
 def test_sample_without_base_draws(rng):
     found = repeated(4000, 1, rng)[0]
-    sample = found.sample(PROPOSAL, np.empty(0), np.empty((0, 1)), 0.0)
+    sample = found.to_sample(PROPOSAL, np.empty(0), np.empty((0, 1)), 0.0)
     assert sample.n_units == len(sample.f) == 4000
     assert sample.weights.sum() == pytest.approx(1.0, abs=4 * np.sqrt((sample.weights**2).sum()))
 
@@ -190,7 +190,7 @@ def test_base_and_wide_draws_pass_every_gate(rng):
     candidates = [
         ProposalComponent(IsotropicNormal(1), "base"),
         ProposalComponent(IsotropicNormal(1, 1.5), "wide"),
-        ProposalComponent(LAWS[1][0], "bump"),
+        ProposalComponent(LAWS[1][0], "gaussian"),
     ]
     proposal = MixtureProposal(candidates, np.array([0.2, 0.2, 0.6])).with_screen(screen, rng)
     np.testing.assert_array_equal(proposal.acceptance[:2], 1.0)

@@ -1,0 +1,163 @@
+"""Candidates: the components that a proposal may be mixed from, and the shares that minimise its variance."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import log_ndtr
+
+from samplers.methods.two_stage.mixture.boundary import fit_half_spaces, fit_radial
+from samplers.methods.two_stage.mixture.mixture_weights import Floor, minimise_second_moment, raise_to_floors
+from samplers.methods.two_stage.mixture.proposal import MixtureProposal, ProposalComponent
+from samplers.methods.two_stage.mixture.screening import FailureScreen, train_screen
+from samplers.methods.two_stage.mixture.subspace_em import HIGH_DIM
+from samplers.methods.two_stage.multiple_importance import MultipleImportanceSample
+from samplers.methods.two_stage.refinement import RefinementState
+from samplers.methods.two_stage.settings import RefinementSettings
+from samplers.problem import FloatArray
+from samplers.proposals.components import HalfSpaceNormal, IsotropicNormal, SubspaceGaussian, log_ratios
+
+
+def build_proposal(
+    state: RefinementState,
+    history: MultipleImportanceSample,
+    settings: RefinementSettings,
+    rng: np.random.Generator,
+    *,
+    final: bool = False,
+) -> MixtureProposal:
+    """Return the mixture for the next draws.
+
+    Its weights minimise the second moment of the estimate over the failures in `history`, with lower limits; before
+    the first round they are `settings.initial_shares`.
+
+    Args:
+        state: What is known of the regions.
+        history: All draws so far.
+        settings: Shares and lower limits.
+        rng: Source of randomness: what a screen accepts is found by drawing.
+        final: For the estimate: what is no use is dropped, and a classifier may screen the draws.
+    """
+    candidates = list_candidates(state, history, settings)
+    kinds = np.array([candidate.kind for candidate in candidates])
+    start = np.array([settings.initial_shares[c.kind] / np.count_nonzero(kinds == c.kind) for c in candidates])
+    weights = start / start.sum()
+    if not state.rounds or len(history.u) == 0:
+        return MixtureProposal(candidates, weights)
+    floors = _floors(state, candidates, settings, final=final)
+    u, log_w = _smooth_indicators(history, state.gamma, settings) if state.noisy else (history.u, history.log_weights)
+    log_r = log_ratios([candidate.component for candidate in candidates], u)
+    weights = minimise_second_moment(log_r, log_w, weights, floors)
+    keeps = kinds == "base"
+    if not final:
+        explored = np.isin(kinds, ["explored", "linear"])
+        weights = np.where(explored, np.maximum(weights, settings.explored_share), weights)
+        keeps = keeps | explored
+    weights = np.where((weights < settings.min_share) & ~keeps, 0.0, weights)
+    proposal = MixtureProposal(candidates, raise_to_floors(weights / weights.sum(), floors))
+    screen = _screen(state) if final and not state.noisy and state.dim <= HIGH_DIM else None
+    return proposal if screen is None else proposal.with_screen(screen, rng)
+
+
+def list_candidates(
+    state: RefinementState, history: MultipleImportanceSample, settings: RefinementSettings
+) -> list[ProposalComponent]:
+    """Return the components that the next proposal may have; the first is the base distribution."""
+    gaussians = [
+        ProposalComponent(gaussian, "gaussian", explored.region)
+        for gaussian, explored in zip(state.gaussians, state.explored, strict=True)
+    ]
+    gaussians += [ProposalComponent(gaussian, "gaussian") for gaussian in state.fresh_gaussians]
+    regional = gaussians + ([] if state.noisy else list(state.linear)) + (list(state.explored) if state.rounds else [])
+    return [
+        ProposalComponent(IsotropicNormal(state.dim), "base"),
+        ProposalComponent(IsotropicNormal(state.dim, settings.wide_scale), "wide"),
+        *_radial(state, history, settings),
+        *regional,
+        *([] if state.noisy else _half_spaces(state, history, settings)),
+        *_tempered(regional, settings.noisy_tempering if state.noisy else settings.tempering),
+    ]
+
+
+def _tempered(components: list[ProposalComponent], powers: tuple[float, ...]) -> list[ProposalComponent]:
+    """Return the tempered versions of the Gaussians among the components."""
+    return [
+        ProposalComponent(candidate.component.temper(power), "tempered", candidate.region)
+        for candidate in components
+        if isinstance(candidate.component, SubspaceGaussian)
+        for power in powers
+    ]
+
+
+def _radial(
+    state: RefinementState, history: MultipleImportanceSample, settings: RefinementSettings
+) -> list[ProposalComponent]:
+    """Return radial components around the chains' points and around the weighted failures; none in one dimension."""
+    if state.dim < 2:
+        return []
+    radial = [fit_radial(state.points, np.ones(len(state.points)))]
+    if len(history.u) >= settings.min_radial_failures:
+        log_w = history.log_weights
+        radial.append(fit_radial(history.u, np.exp(log_w - log_w.max())))
+    return [ProposalComponent(component, "radial") for component in radial]
+
+
+def _half_spaces(
+    state: RefinementState, history: MultipleImportanceSample, settings: RefinementSettings
+) -> list[ProposalComponent]:
+    """Return half-spaces through the edge of the failures that each Gaussian describes."""
+    u = history.u if state.rounds else state.points
+    log_w = history.log_weights if state.rounds else np.zeros(len(u))
+    if len(u) == 0:
+        return []
+    gaussians = state.gaussians + state.fresh_gaussians
+    owner = log_ratios(gaussians, u).argmax(axis=0)
+    found: list[HalfSpaceNormal] = []
+    for k, gaussian in enumerate(gaussians):
+        own = owner == k
+        if np.count_nonzero(own) >= settings.min_owned_failures:
+            found += fit_half_spaces(gaussian, u[own], np.exp(log_w[own] - log_w[own].max()))
+    return [ProposalComponent(half_space, "half-space") for half_space in found]
+
+
+def _floors(
+    state: RefinementState, candidates: list[ProposalComponent], settings: RefinementSettings, *, final: bool
+) -> list[Floor]:
+    """Return the least shares: of tempered Gaussians, of each region (or of radial components), of base draws."""
+    kinds = np.array([candidate.kind for candidate in candidates])
+    regions = np.array([candidate.region for candidate in candidates])
+    tempered = settings.tempered_share + settings.extra_tempered_share * (1 - state.hit_rate)
+    floors = [Floor(kinds == "tempered", settings.noisy_tempered_share if state.noisy else tempered)]
+    n = len(state.regions)
+    if state.scattered:
+        floors.append(Floor(kinds == "radial", settings.radial_share))
+    elif n > 1:
+        share = settings.final_region_share if final else settings.region_share
+        floors += [Floor((regions == k) & (kinds != "tempered"), share / n) for k in range(n)]
+    return [*floors, Floor(kinds == "base", settings.noisy_base_share if state.noisy else settings.base_share)]
+
+
+def _smooth_indicators(
+    history: MultipleImportanceSample, gamma: float, settings: RefinementSettings
+) -> tuple[FloatArray, FloatArray]:
+    """Return all draws u (n, d), and log weights (n,) that hold the probability that they fail, by logistic regression.
+
+    With a noisy f the few failures among the draws near the origin carry large weights by chance. What the weights of
+    the mixture have to guard against is how likely such draws are to fail.
+    """
+    from sklearn.linear_model import LogisticRegression  # slow to import, and seldom needed
+    from sklearn.preprocessing import PolynomialFeatures
+
+    u, f, log_w = history.all_draws()
+    degree = 2 if u.shape[1] <= settings.quadratic_dim else 1
+    x = PolynomialFeatures(degree, include_bias=False).fit_transform(u)
+    model = LogisticRegression(C=settings.logistic_penalty, max_iter=settings.logistic_iterations, random_state=0)
+    odds = model.fit(x, f <= gamma).decision_function(x) / settings.probit_scale
+    return u, log_w + log_ndtr(odds)
+
+
+def _screen(state: RefinementState) -> FailureScreen | None:
+    """Return a screen trained on the chains and the draws of all rounds, or None if none is worth it."""
+    *earlier, last = state.rounds
+    u = np.concatenate([region.u for region in state.regions] + [draws.u for draws in earlier])
+    f = np.concatenate([region.f for region in state.regions] + [draws.f for draws in earlier])
+    known: tuple[FloatArray, NDArray[np.bool_]] = (u, f <= state.gamma)
+    return train_screen(known, (last.u, last.f <= state.gamma), last.log_weights)

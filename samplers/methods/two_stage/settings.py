@@ -1,0 +1,210 @@
+"""Settings of two-stage: the numbers of its stages, each with its reason.
+
+Users set `TwoStage.n` only. The numbers were chosen together on the problems of `benchmarks/estimators/catalogue.py` at
+6,000 simulations, where factors of less than two in one of them make no difference that 40 runs would show, unless it
+is said otherwise. What belongs to one algorithm alone stands in its module (`mixture/`, the sizes of `exploration.py`).
+"""
+
+from dataclasses import dataclass, field
+
+from samplers.methods.two_stage.mixture.proposal import Kind
+
+
+def _initial_shares() -> dict[Kind, float]:
+    return {
+        "base": 0.1,
+        "wide": 0.05,
+        "radial": 0.1,
+        "gaussian": 0.5,
+        "linear": 0.5,
+        "explored": 0.2,
+        "tempered": 0.25,
+        "half-space": 0.1,
+    }
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegionSettings:
+    """Chains inside the failure region, and how regions are told apart (`regions.py`)."""
+
+    initial_step: float = 0.5
+    """pCN step before any adaptation."""
+    steps: tuple[int, int] = (5, 6)
+    """Steps of the chains before and after they are sorted into regions."""
+    steps_high_dim: tuple[int, int] = (8, 8)
+    """The same above HIGH_DIM dimensions, where a wide failure has further to go."""
+    target_acceptance: float = 0.35
+    """Acceptance that the step is adapted to; 0.44 is the optimum for random walks (Papaioannou et al. 2015), and a
+    lower one forgets the starting point sooner."""
+    adaptation: float = 0.7
+    """Change of the log step per unit of acceptance in the first step; it falls with the root of their number."""
+    min_step: float = 0.02
+    """Least pCN step."""
+    across_factors: tuple[float, float] = (1.1, 0.75)
+    """Factors of the step across the given direction after a failing proposal and after another one: in balance at an
+    acceptance of ln(1 / 0.75) / ln(1.1 / 0.75) = 0.75, for across the direction fresh draws are nearly always right."""
+    min_across: float = 0.05
+    """Least step across the given direction."""
+    along_factors: tuple[float, float] = (1.05, 0.9)
+    """The same along the given direction: in balance at 0.68."""
+    many_regions: int = 8
+    """Number of regions from which failure may be something like a shell."""
+    scattered_share: float = 0.25
+    """Where this share of the points is in none of `many_regions` regions, it is."""
+    max_regions: int = 16
+    """Regions that are told apart at most."""
+    chains_per_region: tuple[int, int] = (8, 24)
+    """Chains of each region at least, in few dimensions and in many."""
+    points_per_dim: float = 2.5
+    """Points of each region per dimension, within `chains_per_region`: as a covariance and a regression need them."""
+    max_replicated: int = 60
+    """Chains that are added to reach it at most, over all regions."""
+    probes: int = 30
+    """Points beside failing ones that tell whether f is noisy."""
+    probe_distance: float = 1e-6
+    """How far beside, in standard deviations: no f of a simulation changes over it, save at jumps or by noise."""
+    noisy_share: float = 0.9
+    """Where less than this share of the probes fail, f is noisy."""
+    late_steps: int = 2
+    """Of the steps before sorting, the last ones whose proposals describe f around a region."""
+    late_steps_high_dim: int = 4
+    """The same above HIGH_DIM dimensions."""
+    direction_r2: float = 0.5
+    """From this R^2 on, chains follow the direction in which f falls, else that of their mean."""
+    mean_steps: int = 3
+    """Last steps of the chains that this mean is of."""
+    min_points_per_dim: int = 3
+    """With fewer points per dimension around the only region, points of subset simulation join them."""
+    lower_share: float = 0.7
+    """Share of the points of subset simulation that do, those with the lowest f."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefinementSettings:
+    """Rounds of draws, and the shares of the components in a proposal (`refinement.py`, `candidates.py`)."""
+
+    round_shares: tuple[float, ...] = (0.09, 0.12, 0.14)
+    """Share of what the exploration leaves that each round draws; the rest is for the estimate."""
+    fresh_rounds: int = 2
+    """After so many of the last rounds a mixture is also fitted to all failures anew."""
+    base_share: float = 0.05
+    """Least share of base draws: no weight exceeds 20."""
+    noisy_base_share: float = 0.1
+    """The same where f is noisy."""
+    tempered_share: float = 0.1
+    """Least share of tempered Gaussians."""
+    extra_tempered_share: float = 0.2
+    """How much more of them, times the share of the draws from sharp components that did not fail."""
+    noisy_tempered_share: float = 0.5
+    """Least share of tempered Gaussians where f is noisy; q^(1/2) phi^(1/2) is then the best proposal."""
+    region_share: float = 0.5
+    """Share of the draws of a round that is dealt out evenly among the regions. Weights of a region's first draws can
+    be so uneven that it seems to have no mass: it must not be lost by that."""
+    final_region_share: float = 0.2
+    """The same for the estimate."""
+    radial_share: float = 0.1
+    """Least share of radial components where the regions are no more than pieces of a shell."""
+    explored_share: float = 0.01
+    """Share that components from the exploration keep until the last round."""
+    min_share: float = 0.004
+    """Components with less of the draws are left out."""
+    initial_shares: dict[Kind, float] = field(default_factory=_initial_shares)
+    """Shares of the kinds where nothing is known yet; of those present, in proportion."""
+    wide_scale: float = 1.5
+    """Standard deviation of the wide component."""
+    tempering: tuple[float, ...] = (0.5,)
+    """Powers t of q^t phi^(1 - t)."""
+    noisy_tempering: tuple[float, ...] = (0.5, 0.25)
+    """The same where f is noisy."""
+    gaussians_per_region: int = 3
+    """Gaussians fitted to the chains of a region at most: it has some dozens of them."""
+    max_gaussians: int = 8
+    """Gaussians fitted to all failures at most, and to the chains where f is noisy: all of them are one region then."""
+    points_per_chain: float = 2.0
+    """Independent points that a chain is worth."""
+    min_refit_failures: int = 6
+    """Failures, all in all, from which on Gaussians and half-spaces are fitted again."""
+    min_fresh_ess: float = 60.0
+    """Independent failures that a mixture fitted anew needs ..."""
+    min_fresh_ess_per_dim: float = 6.0
+    """... and per dimension."""
+    min_owned_failures: int = 10
+    """Failures of a Gaussian that a half-space through their edge needs."""
+    min_radial_failures: int = 20
+    """Failures that a radial component needs."""
+    min_log_ratio: float = 1.0
+    """A draw belongs to the region whose Gaussian has the largest density there, if that is e times phi or more."""
+    probit_scale: float = 1.702
+    """Log odds over the argument of Phi that is next to them: noise is near normal, and the logistic curve has far
+    heavier tails (Camilli, "Origin of the scaling constant d = 1.7 in item response theory", 1994)."""
+    logistic_penalty: float = 100.0
+    """Inverse strength of the penalty (C of scikit-learn): hardly any."""
+    logistic_iterations: int = 2000
+    """Enough for any of the catalogue's problems to converge."""
+    quadratic_dim: int = 20
+    """Dimension up to which the log odds of failure are quadratic in u, not linear: 231 coefficients at most."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FallbackSettings:
+    """When a proposal is given up for subset simulation (`fallback.py`)."""
+
+    min_budget: int = 300
+    """Simulations under which subset simulation is not worth it."""
+    min_rate: float = 0.005
+    """What the last round of draws must be worth, in independent failures for each draw. Proposals that describe the
+    failures reach 0.01 to 0.9; with less, the spread of the weights is that of the failures met, not of all."""
+    good_rate: float = 0.1
+    """From this rate on, `max_region_weight` does not apply."""
+    max_region_weight: float = 30.0
+    """How many times p a point of the exploration may weigh as a draw: 1 to 3 is usual, 17 was seen to do."""
+    max_weight: float = 1e4
+    """How many times p, whatever the rate: all draws come from a place where hardly any failure is."""
+    chain_points: float = 30.0
+    """Points of a level at p0 = 0.1 for one that is independent: (1 - p0) / p0, and correlation along the chains."""
+    level_share: float = 0.9
+    """Share of a level that is simulated; its seeds, p0 = 0.1 of it, are not simulated again."""
+    min_levels: int = 2
+    """Levels to plan for at least."""
+    min_points: int = 10
+    """Points of a level at least."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DiagnosticSettings:
+    """When an estimate is doubted (`diagnostics.py`)."""
+
+    false_alarm: float = 1e-3
+    """Probability with which a check of the base draws warns of a right estimate."""
+    max_deviation: float = 4.0
+    """Standard errors between the rounds and the estimate; a normal distribution exceeds it once in 16,000 runs."""
+    min_rounds_ess: float = 30.0
+    """Independent failures that the rounds must be worth to be compared."""
+    min_rate: float = 0.025
+    """Independent failures for each final draw; with less, there may be heavier weights than any met."""
+    max_point_share: float = 0.05
+    """Share of p that a single draw in a region may stand for."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TwoStageSettings:
+    """All settings of a run."""
+
+    min_budget: int = 400
+    """With fewer simulations an exploration is not worth its draws."""
+    sufficient_budget: int = 1500
+    """With fewer, one of two like regions is missed in 3 to 30 % of runs, and nothing tells."""
+    common_share: float = 0.1
+    """Where this share of the base draws fails, plain Monte Carlo is as good as anything."""
+    monte_carlo_batch: int = 10_000
+    """Base draws of a batch of plain Monte Carlo."""
+    target_batches: int = 10
+    """With a target c.o.v., a batch of the estimate is the budget divided by this ..."""
+    min_target_batch: int = 100
+    """... but at least so many draws."""
+    max_batches: int = 100
+    """Batches after which a target c.o.v. is given up where max_sim does not say."""
+    regions: RegionSettings = RegionSettings()
+    refinement: RefinementSettings = RefinementSettings()
+    fallback: FallbackSettings = FallbackSettings()
+    diagnostics: DiagnosticSettings = DiagnosticSettings()

@@ -1,0 +1,316 @@
+"""Stages of two-stage: what a run knows, as a frozen state, and the steps that lead from one state to the next.
+
+A step that needs simulations is a generator: `state = yield from draw_first(context, state)`. Where `Interrupted`
+ends it, the caller goes on with the state before the step.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from samplers.importance.draws import Draws, weight_warnings, weighted_interval
+from samplers.method import Goal, Interrupted, Outcome, Steps, no_outcome_share
+from samplers.methods.two_stage import fallback
+from samplers.methods.two_stage.candidates import build_proposal
+from samplers.methods.two_stage.diagnostics import check_base_draws, check_efficiency, check_regions, check_rounds
+from samplers.methods.two_stage.exploration import Sizes, find_regions, first_draws
+from samplers.methods.two_stage.mixture.proposal import MixtureProposal
+from samplers.methods.two_stage.multiple_importance import MultipleImportanceSample
+from samplers.methods.two_stage.noise_coordinates import marginalise_noise
+from samplers.methods.two_stage.refinement import RefinementState, expected_weights, refine_once
+from samplers.methods.two_stage.regions import ExplorationResult
+from samplers.methods.two_stage.settings import TwoStageSettings
+from samplers.methods.two_stage.simulator import ComponentDraws, SimulationSteps, Simulator
+from samplers.methods.two_stage.stratified import StratifiedSample
+from samplers.problem import FloatArray, Inputs
+from samplers.sample import Sample
+from samplers.statistics.intervals import binomial_cov
+from samplers.statistics.weights import effective_sample_size
+from samplers.trace import Level, Status
+
+
+@dataclass(frozen=True, eq=False)
+class RunContext:
+    """What is fixed for a run, and the simulator that counts."""
+
+    inputs: Inputs
+    """All of x."""
+    simulator: Simulator
+    """Of the coordinates that are not noise."""
+    goal: Goal
+    settings: TwoStageSettings
+    budget: int
+    """Simulations that the exploration and the rounds are planned for."""
+    end: int
+    """Simulations that are never exceeded; more than `budget` where only a target c.o.v. is given."""
+    rng: np.random.Generator
+
+    @property
+    def left(self) -> int:
+        """Simulations left of the budget."""
+        return self.budget - self.simulator.n_sim
+
+    @property
+    def left_at_all(self) -> int:
+        """Simulations left before the end."""
+        return self.end - self.simulator.n_sim
+
+    @property
+    def target_batch(self) -> int:
+        """Draws after which a target c.o.v. is looked at."""
+        return max(self.budget // self.settings.target_batches, self.settings.min_target_batch)
+
+    @property
+    def noise_marginalised(self) -> bool:
+        """Whether x has coordinates of noise that are not searched."""
+        return self.simulator.inputs is not self.inputs
+
+    def meets_target(self, cov: float) -> bool:
+        """Return whether there is a target c.o.v. and this one meets it."""
+        return self.goal.target_cov is not None and cov <= self.goal.target_cov
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RunState:
+    """What has been simulated so far, and its record."""
+
+    history: MultipleImportanceSample
+    """All draws from known components."""
+    base_u: FloatArray
+    """Base draws of the exploration, shape (n0, d)."""
+    base_f: FloatArray
+    """Their outcomes, shape (n0,)."""
+    base_draws: int = 0
+    """Base draws in all: of a proposal those of its first component."""
+    rounds: tuple[Draws, ...] = ()
+    """Draws of the rounds, each weighted as draws of its own proposal."""
+    trace: tuple[Level, ...] = ()
+
+    def base_share(self, gamma: float) -> float:
+        """Return the share of the base draws with f <= gamma."""
+        return float((self.base_f <= gamma).mean())
+
+
+def start_run(
+    inputs: Inputs, goal: Goal, budget: int, settings: TwoStageSettings, rng: np.random.Generator
+) -> tuple[RunContext, RunState]:
+    """Return the run and its state before the first simulation; noise that is part of x is left to chance."""
+    open_ended = goal.max_sim is None and goal.target_cov is not None
+    end = budget + settings.max_batches * (budget // settings.target_batches) if open_ended else budget
+    searched = marginalise_noise(inputs, rng)
+    context = RunContext(inputs, Simulator(searched), goal, settings, budget, end, rng)
+    empty = MultipleImportanceSample.empty(searched.dim)
+    return context, RunState(history=empty, base_u=np.empty((0, searched.dim)), base_f=np.empty(0))
+
+
+def draw_first(context: RunContext, state: RunState) -> SimulationSteps[RunState]:
+    """Make the base draws and the wide draws of the exploration."""
+    gamma, sizes = context.goal.gamma, Sizes.within(context.budget)
+    first = yield from first_draws(context.simulator, sizes, context.rng)
+    state = replace(
+        state,
+        history=state.history.add(first, gamma),
+        base_u=first.u[: sizes.base],
+        base_f=first.f[: sizes.base],
+        base_draws=sizes.base,
+    )
+    share = state.base_share(gamma)
+    return _record(context, state, share, share, len(first.f), binomial_cov(share, sizes.base))
+
+
+def explore(context: RunContext, state: RunState) -> SimulationSteps[tuple[RunState, ExplorationResult]]:
+    """Find the failure regions, starting from the first draws; there are none where nothing fails."""
+    gamma, sizes = context.goal.gamma, Sizes.within(context.budget)
+    found = yield from find_regions(context.simulator, state.history.batches[0], gamma, sizes, context.rng)
+    n = sum(len(region.f) for region in found.regions)
+    fails = sum(int((region.f <= gamma).sum()) for region in found.regions)
+    return _record(context, state, fails / max(n, 1), state.base_share(gamma), n, math.inf), found
+
+
+def draw_round(
+    context: RunContext, state: RunState, refinement: RefinementState, proposal: MixtureProposal, n: int, *, fresh: bool
+) -> SimulationSteps[tuple[RunState, RefinementState]]:
+    """Draw n points from a proposal and learn from them; `fresh`: also fit a mixture to all failures anew."""
+    state, batch = yield from _draw(context, state, proposal, n)
+    gamma, settings = context.goal.gamma, context.settings.refinement
+    draws = Draws.from_outcomes(batch.f, proposal.log_weights(batch.u), batch.u, gamma)
+    history = state.history.add(batch, gamma)
+    refinement = refine_once(refinement, history, proposal, batch, settings, context.rng, fresh=fresh)
+    ess = effective_sample_size(history.log_weights)
+    state = replace(state, history=history, rounds=(*state.rounds, draws))
+    p = float(np.exp(history.log_weights).sum())
+    return _record_draws(context, state, batch, p, 1 / math.sqrt(ess) if ess else math.inf, ess), refinement
+
+
+def refine(
+    context: RunContext, state: RunState, refinement: RefinementState, number: int, room: int, proposal: MixtureProposal
+) -> SimulationSteps[tuple[RunState, RefinementState, MixtureProposal]]:
+    """Run one round of refinement and build the proposal that follows from it.
+
+    Args:
+        context: What is fixed for the run.
+        state: Draws so far.
+        refinement: What is known of the regions.
+        number: Of the round, from 1.
+        room: Simulations that the exploration has left.
+        proposal: What to draw from.
+    """
+    settings = context.settings.refinement
+    rounds = settings.round_shares
+    n = int(rounds[number - 1] * room)
+    if n > 0:
+        fresh = number > len(rounds) - settings.fresh_rounds
+        state, refinement = yield from draw_round(context, state, refinement, proposal, n, fresh=fresh)
+    final = number == len(rounds)
+    return state, refinement, build_proposal(refinement, state.history, settings, context.rng, final=final)
+
+
+def serves(context: RunContext, state: RunState, refinement: RefinementState, proposal: MixtureProposal) -> bool:
+    """Return whether to estimate with a proposal; where f is noisy by itself there is nothing better."""
+    settings = context.settings.fallback
+    if context.left_at_all < settings.min_budget or not state.rounds:
+        return True
+    if refinement.noisy:
+        return not context.noise_marginalised or fallback.meets_failures(state.rounds[-1], settings)
+    return fallback.describes_failures(state.rounds[-1], expected_weights(refinement, proposal), settings)
+
+
+def fall_back(context: RunContext, state: RunState, levels: int) -> Steps:
+    """Spend the rest on subset simulation in all coordinates, which needs no proposal."""
+    outcome = yield from fallback.run_subset_simulation(
+        context.inputs, context.goal, levels, context.left_at_all, context.rng, context.settings.fallback
+    )
+    state = _close_trace(context, state)
+    before = estimate_early(context, state)
+    unfinished = outcome.status is Status.STOPPED and outcome.p == 0  # no estimate, then
+    whole = before if unfinished else fallback.reconcile(outcome, before)
+    return replace(whole, trace=state.trace + outcome.trace, base_draws=state.base_draws + outcome.base_draws)
+
+
+def estimate(context: RunContext, state: RunState, refinement: RefinementState, proposal: MixtureProposal) -> Steps:
+    """Draw from the last proposal until the budget is used or the target is met; p rests on these draws alone."""
+    goal, inputs, stopped = context.goal, context.simulator.inputs, False
+    sample = StratifiedSample.empty(len(proposal.weights), inputs.dim, expected_weights(refinement, proposal))
+    size = context.left if goal.target_cov is None else context.target_batch
+    while context.left_at_all > 0:
+        try:
+            state, batch = yield from _draw(context, state, proposal, min(size, context.left_at_all))
+        except Interrupted:
+            stopped = True
+            break
+        sample = sample.add(batch, proposal, inputs, goal.gamma)
+        state = _record_draws(context, state, batch, sample.p, sample.cov, sample.draws.ess)
+        if context.meets_target(sample.cov):
+            break
+    if sample.draws.n == 0:
+        early = estimate_early(context, state)
+        return early if stopped else replace(early, status=Status.BUDGET)
+    outcome = _outcome(context, state, sample.draws, sample.cov, 1 / context.settings.refinement.base_share)
+    return replace(
+        outcome,
+        warnings=(*outcome.warnings, *_check(context, state, refinement, sample)),
+        sample=sample.to_sample(proposal, state.base_f, state.base_u, goal.gamma),
+        status=Status.STOPPED if stopped else outcome.status,
+    )
+
+
+def estimate_early(context: RunContext, state: RunState) -> Outcome:
+    """Return what all draws from known components say, for a run that ends before its estimate."""
+    draws = state.history.to_draws(context.simulator.inputs, context.goal.gamma)
+    outcome = _outcome(context, state, draws, draws.cov, draws.n / max(len(state.base_f), 1))
+    return replace(outcome, sample=draws.sample, status=Status.STOPPED)
+
+
+def run_monte_carlo(context: RunContext, state: RunState, *, counted: bool = True) -> Steps:
+    """Spend the rest on base draws.
+
+    Args:
+        context: What is fixed for the run.
+        state: Draws so far.
+        counted: Whether the base draws made so far count. They must not where they have decided that plain Monte Carlo
+            follows, for that would bias p; unless the run is stopped before it has any other.
+    """
+    goal, inputs, stopped = context.goal, context.simulator.inputs, False
+    u, f = (state.base_u, state.base_f) if counted else (state.base_u[:0], state.base_f[:0])
+    size = context.settings.monte_carlo_batch if goal.target_cov is None else context.target_batch
+    while context.left_at_all > 0:
+        new_u = context.rng.standard_normal((min(context.left_at_all, size), inputs.dim))
+        try:
+            new_f = yield from context.simulator.evaluate(new_u)
+        except Interrupted:
+            stopped = True
+            break
+        u, f = np.concatenate([u, new_u]), np.concatenate([f, new_f])
+        share = float((f <= goal.gamma).mean())
+        cov = binomial_cov(share, len(f))
+        state = _record(context, state, float((new_f <= goal.gamma).mean()), share, len(new_f), cov)
+        if context.meets_target(cov):
+            break
+    if len(f) == 0:
+        u, f = state.base_u, state.base_f
+    fails = f <= goal.gamma
+    trace = _close_trace(context, state).trace
+    outcome = Outcome.of_counts(int(fails.sum()), len(fails), goal.confidence, trace, no_outcome_share(f[fails]))
+    sample = Sample.of_equal_draws(f, inputs.base.from_standard_normal(u[fails]))
+    # A share of draws, but only in runs that came to this: it must not be pooled with others.
+    outcome = replace(outcome, sample=sample, counts=None)
+    return replace(outcome, status=Status.STOPPED) if stopped else outcome
+
+
+def _draw(
+    context: RunContext, state: RunState, proposal: MixtureProposal, n: int
+) -> SimulationSteps[tuple[RunState, ComponentDraws]]:
+    """Make n draws of a proposal; those from its first component, the base distribution, are counted."""
+    u, counts = proposal.draw(n, context.rng)
+    f = yield from context.simulator.evaluate(u)
+    batch = ComponentDraws(proposal.components, counts, u, f)
+    return replace(state, base_draws=state.base_draws + int(counts[0])), batch
+
+
+def _check(context: RunContext, state: RunState, refinement: RefinementState, sample: StratifiedSample) -> list[str]:
+    """Return the warnings of all checks of an estimate."""
+    settings, hits = context.settings.diagnostics, int((state.base_f <= context.goal.gamma).sum())
+    return [
+        *check_base_draws(sample.p, hits, len(state.base_f), settings),
+        *check_rounds(sample, state.rounds, settings),
+        *check_regions(sample, settings),
+        *([] if refinement.noisy else check_efficiency(sample, settings)),
+    ]
+
+
+def _outcome(context: RunContext, state: RunState, draws: Draws, cov: float, largest_weight: float) -> Outcome:
+    """Return what weighted draws say of p; no weight exceeds `largest_weight`."""
+    return Outcome(
+        p=draws.p,
+        interval=weighted_interval(draws, context.goal.confidence, largest_weight, cov),
+        cov=cov,
+        status=Status.CONVERGED if len(draws.f) else Status.NO_HITS,
+        warnings=tuple(weight_warnings(draws)),
+        trace=_close_trace(context, state).trace,
+        no_outcome_share=no_outcome_share(draws.f, draws.log_weights),
+        base_draws=state.base_draws,
+    )
+
+
+def _record_draws(
+    context: RunContext, state: RunState, batch: ComponentDraws, estimate: float, cov: float, ess: float
+) -> RunState:
+    """Return the state with draws of a proposal in its trace."""
+    return _record(context, state, float((batch.f <= context.goal.gamma).mean()), estimate, len(batch.f), cov, ess)
+
+
+def _record(
+    context: RunContext, state: RunState, p: float, estimate: float, n: int, cov: float, ess: float | None = None
+) -> RunState:
+    """Return the state with one more level: of all simulations that no earlier level of the trace has."""
+    n_sim = context.simulator.n_sim - sum(level.n_sim for level in state.trace)
+    level = Level(gamma=context.goal.gamma, p=p, estimate=estimate, n_sim=n_sim, n_points=n, cov=cov, ess=ess)
+    context.goal.on_level(level)
+    return replace(state, trace=(*state.trace, level))
+
+
+def _close_trace(context: RunContext, state: RunState) -> RunState:
+    """Return the state with the simulations of a step that was interrupted as a level of their own."""
+    loose = context.simulator.n_sim - sum(level.n_sim for level in state.trace)
+    return _record(context, state, math.nan, math.nan, loose, math.inf) if loose else state
