@@ -1,17 +1,94 @@
-"""Modules of the user's own, by name."""
+"""Modules and objects of a user, imported by name, and the nearest valid name for one that is misspelt."""
 
 from __future__ import annotations
 
 import contextlib
 import difflib
+import importlib
 import os
 import sys
 from collections.abc import Iterable, Iterator
+from types import ModuleType
+from typing import Any
+
+_MAX_WORDS = 200
+"""Characters of an exception's message that `one_line` keeps: a line of a terminal or two."""
+
+
+def import_module(name: str, purpose: str) -> ModuleType:
+    """Return a module that a user names; the working directory is searched first.
+
+    Args:
+        name: Dotted name of the module.
+        purpose: What needs it, for the message: "the ego 'mine:make'", for example.
+
+    Raises:
+        ValueError: If importing it fails in whatever way, which the message says in one line.
+
+    Example:
+        >>> round(import_module("math", "this example").pi, 4)
+        3.1416
+    """
+    try:
+        with _working_directory_first():
+            return importlib.import_module(name)
+    except (Exception, SystemExit) as error:  # the module is the user's: anything may happen in it
+        raise ValueError(f"Cannot import {name!r} for {purpose}: {one_line(error)}.") from error
+
+
+def import_object(spec: str, purpose: str) -> Any:
+    """Return what "module:name" stands for: a function, class or other object of a user's module.
+
+    Args:
+        spec: "module:name"; the module may be dotted.
+        purpose: What needs it, as in `import_module`.
+
+    Raises:
+        ValueError: If spec has another form, the module cannot be imported or has nothing of that name.
+
+    Example:
+        >>> import_object("math:hypot", "this example")(3.0, 4.0)
+        5.0
+    """
+    module_name, _, name = spec.partition(":")
+    if not module_name or not name:
+        raise ValueError(f"Expected module:name for {purpose}, got {spec!r}.")
+    module = import_module(module_name, purpose)
+    try:
+        return getattr(module, name)  # of a module of the user's
+    except AttributeError:
+        hint = did_you_mean(name, [word for word in vars(module) if not word.startswith("__")])
+        raise ValueError(f"{module_name!r} has nothing called {name!r}{hint}.") from None
+
+
+def did_you_mean(name: str, valid: Iterable[str]) -> str:
+    """Return `" (did you mean 'x'?)"` for the nearest valid name, or "" if none is near.
+
+    Example:
+        >>> did_you_mean("CutIm-v0", ["rare_envs/CutIn-v0", "rare_envs/Highway-v0"])
+        " (did you mean 'rare_envs/CutIn-v0'?)"
+    """
+    names = {v: v for v in valid}
+    names |= {v.split("/")[-1]: v for v in names}  # an id without its namespace
+    near = difflib.get_close_matches(name, list(names), n=1)
+    return f" (did you mean {names[near[0]]!r}?)" if near else ""
+
+
+def one_line(error: BaseException) -> str:
+    """Return an exception as one line without a full stop: its class, and up to 200 characters of its message.
+
+    Example:
+        >>> one_line(RuntimeError("no   weights."))
+        'RuntimeError: no weights'
+    """
+    words = " ".join(str(error).split()).rstrip(".")
+    kind = type(error).__name__
+    return f"{kind}: {words[:_MAX_WORDS]}" if words else kind
 
 
 @contextlib.contextmanager
-def working_directory_first() -> Iterator[None]:
-    """Find modules in the working directory, as `python -m` does and console scripts do not."""
+def _working_directory_first() -> Iterator[None]:
+    """Search modules in the working directory first, as `python -m` does and console scripts do not."""
     here = os.getcwd()
     sys.path.insert(0, here)
     try:
@@ -19,11 +96,3 @@ def working_directory_first() -> Iterator[None]:
     finally:
         with contextlib.suppress(ValueError):
             sys.path.remove(here)
-
-
-def did_you_mean(name: str, valid: Iterable[str]) -> str:
-    """`" (did you mean 'x'?)"` for the nearest valid name, empty if none is near."""
-    names = {v: v for v in valid}
-    names |= {v.split("/")[-1]: v for v in names}  # an id without its namespace
-    near = difflib.get_close_matches(name, list(names), n=1)
-    return f" (did you mean {names[near[0]]!r}?)" if near else ""

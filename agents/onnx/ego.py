@@ -11,8 +11,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from agents.python_function import one_line
 from rare_envs.control.actions import DISCRETE_ACTIONS
+from rare_envs.plugins import one_line
 
 KEY = "rare_envs"
 """Entry of a file's metadata in which `agents.onnx.export` says what the policy observes and how it acts."""

@@ -20,11 +20,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.python_function import one_line
 from agents.sb3.file_trust import check_origin
 from agents.sb3.safe_pickle import ForeignObject, open_pickle
 from agents.sb3.zip_header import algorithm_class, algorithm_of, read_header, weights_only_objects
 from rare_envs.egos.wrappers import Normalised, Stacked, stacking
+from rare_envs.plugins import one_line
 
 TRUST = "if you trust where the file comes from, load it with trust=True (--trust)"
 

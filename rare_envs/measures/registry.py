@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from types import MappingProxyType
 from typing import Any
 
@@ -18,7 +17,7 @@ from rare_envs.measures.rss import MARGIN_MAX, rss_lateral, rss_longitudinal, rs
 from rare_envs.measures.temporal_logic import stl
 from rare_envs.measures.time_to_collision import TTC_MAX, lidar_ttc, mttc, thw, ttc
 from rare_envs.measures.two_dimensional import clearance, margin, ttc_2d
-from rare_envs.plugins import did_you_mean, working_directory_first
+from rare_envs.plugins import did_you_mean, import_object
 from rare_envs.traffic.crash import crash_of
 
 FORMULA = "stl:"
@@ -41,17 +40,7 @@ def named_measure(measure: Any) -> Any:
             return stl(measure.removeprefix(FORMULA).strip())
         except ImportError as error:
             raise ValueError(str(error)) from error
-    module_name, _, name = measure.partition(":")
-    try:
-        with working_directory_first():
-            module = importlib.import_module(module_name)
-    except (Exception, SystemExit) as error:  # the module is the user's: anything may happen in it
-        words = " ".join(f"{type(error).__name__}: {error}".split())
-        raise ValueError(f"Cannot import {module_name!r} for the measure {measure!r}: {words}") from error
-    found = getattr(module, name, None)
-    if found is None:
-        raise ValueError(f"{module_name!r} has nothing called {name!r}{did_you_mean(name, list(vars(module)))}.")
-    return found
+    return import_object(measure, f"the measure {measure!r}")
 
 
 def _met_at(moment: Moment) -> Tensor:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import importlib
 import re
 from collections.abc import Iterator, Mapping
-from importlib import import_module
 from typing import TYPE_CHECKING
 
-from rare_envs.plugins import did_you_mean, working_directory_first
+from rare_envs.plugins import did_you_mean, import_module, import_object
 
 if TYPE_CHECKING:
     from rare_envs.scenarios.base import Scenario
@@ -25,8 +23,7 @@ class Registry(Mapping[str, "Scenario"]):
         """The scenario of an id."""
         entry = self._entries[env_id]
         if isinstance(entry, str):
-            module, _, name = entry.partition(":")
-            entry = self._entries[env_id] = getattr(import_module(module), name)
+            entry = self._entries[env_id] = import_object(entry, f"the environment {env_id!r}")
         return entry
 
     def __iter__(self) -> Iterator[str]:
@@ -80,7 +77,7 @@ def find_scenario(env_id: str) -> Scenario:
     """
     module, _, name = env_id.rpartition(":") if isinstance(env_id, str) else ("", "", env_id)
     if module:
-        _import_for(env_id, module)
+        import_module(module, f"the environment {env_id!r}")
     if isinstance(name, str) and name in SCENARIOS:
         return SCENARIOS[name]
     layouts = {kinematics_id(each): each for each in SCENARIOS}
@@ -96,15 +93,6 @@ def find_scenario(env_id: str) -> Scenario:
         )
     hint = did_you_mean(str(name), SCENARIOS)
     raise ValueError(f"Unknown environment {env_id!r}{hint}; the environments are {', '.join(SCENARIOS)}.")
-
-
-def _import_for(env_id: str, module: str) -> None:
-    try:
-        with working_directory_first():
-            importlib.import_module(module)
-    except (Exception, SystemExit) as error:  # the module is the user's: anything may happen in it
-        reason = " ".join(f"{type(error).__name__}: {error}".split())
-        raise ValueError(f"Cannot import {module!r} for the environment {env_id!r}: {reason}") from error
 
 
 HIGHWAY_ENV_LAYOUT = {"observation": "kinematics", "action": "meta"}

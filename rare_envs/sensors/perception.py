@@ -87,9 +87,9 @@ def perceive(bodies: Bodies, on_road: OnRoad, observers: int | None = None) -> T
     return torch.cat((torch.stack(core, dim=-1)[:, :m], readings.range, readings.rate), dim=-1)
 
 
-def perceive_traffic(state: State, road: Road, placed: WorldPose | None = None) -> Tensor:
-    """The 51 features of all vehicles, shape (B, N, 51); where they are is found out unless it is `placed`."""
-    x, y, heading, curvature = placed or road.place(state.x, state.y, state.heading)
+def perceive_traffic(state: State, road: Road, pose: WorldPose | None = None) -> Tensor:
+    """The 51 features of all vehicles, shape (B, N, 51); where they are is found out unless `pose` says it."""
+    x, y, heading, curvature = pose or road.place(state.x, state.y, state.heading)
     bodies = Bodies(x, y, heading, state.speed, x.new_tensor(VEHICLE_LENGTH), x.new_tensor(VEHICLE_WIDTH))
     left, right = road.markers(state.y)
     return perceive(bodies, OnRoad(0.5 * (left - right), state.heading, curvature, left, right))

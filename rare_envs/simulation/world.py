@@ -23,9 +23,8 @@ from rare_envs.simulation.episode_statistics import EpisodeStatistics
 from rare_envs.simulation.measurement import Measurement
 from rare_envs.simulation.overrides import apply_overrides
 from rare_envs.simulation.sensing import Sensing, WeatherDistributions
-from rare_envs.traffic.crash import others_overlap
 from rare_envs.traffic.lead import lead_of
-from rare_envs.traffic.overlap import ego_overlaps
+from rare_envs.traffic.overlap import ego_overlaps, others_overlap
 from rare_envs.traffic.road import WorldPose
 from rare_envs.traffic.state import State
 from rare_envs.traffic.vehicle_models import bicycle

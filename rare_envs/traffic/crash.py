@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from rare_envs.traffic.oriented_boxes import DIAGONAL, axes_of, crossing, project_on_axes, separation
+from rare_envs.traffic.oriented_boxes import axes_of, boxes_overlap, crossing, project_on_axes
 from rare_envs.traffic.pairs import pairs, velocities
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import State
@@ -113,20 +113,6 @@ def crash_of_others(state: State, road: Road, before: State | None = None, dt: f
     return found._replace(kind=torch.where(found.kind == NONE, NONE, OTHERS))
 
 
-def others_overlap(state: State, road: Road) -> Tensor:
-    """Whether two vehicles other than the ego overlap, boolean, shape (B,)."""
-    n = state.x.shape[1] - 1
-    first, second = (list(index[n:]) for index in pairs(n + 1))
-    x, y, heading = road.to_world(state.x, state.y, state.heading)
-    dx, dy = x[:, second] - x[:, first], y[:, second] - y[:, first]
-    touch = (dx.abs() < DIAGONAL) & (dy.abs() < DIAGONAL)
-    if bool(touch.any()):
-        one, other = heading[:, first][touch], heading[:, second][touch]
-        touch[touch.clone()] = separation(axes_of(dx[touch], dy[touch], one, other)) < 0
-    touching: Tensor = touch.any(1)
-    return touching
-
-
 def _pair_crash(state: State, road: Road, before: State | None, dt: float, which: slice) -> Crash:
     """The first contact among some pairs of vehicles."""
     first, second = (list(index[which]) for index in pairs(state.x.shape[1]))
@@ -136,14 +122,15 @@ def _pair_crash(state: State, road: Road, before: State | None, dt: float, which
     x, y, heading = road.to_world(state.x, state.y, state.heading)
     along, across = _moved(state, road, heading, before, dt)
     one, other = heading[:, first], heading[:, second]
-    axes = axes_of(x[:, second] - x[:, first], y[:, second] - y[:, first], one, other)
+    dx, dy = x[:, second] - x[:, first], y[:, second] - y[:, first]
+    axes = axes_of(dx, dy, one, other)
     dvx, dvy = along[:, second] - along[:, first], across[:, second] - across[:, first]
     rate = project_on_axes(dvx, dvy, one, other)
     enter = crossing(axes, rate).enter
     since, axis = enter.max(-1)
     resting = torch.isinf(since)  # nothing moves: the axis along which they overlap least
     axis = torch.where(resting, axes.gap.argmax(-1), axis)
-    touching = separation(axes) < 0
+    touching = boxes_overlap(dx, dy, one, other)
     at = torch.where(touching, torch.where(resting, torch.finfo(since.dtype).min, since), torch.inf)
     pair = at.argmin(1, keepdim=True)
 

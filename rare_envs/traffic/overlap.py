@@ -1,95 +1,79 @@
-"""Overlap of vehicles: which bodies touch, of the ego and of all pairs."""
+"""Overlap of vehicles: which bodies touch, of the ego and of all pairs.
+
+Bodies are compared in the flat world: where the road turns, differences along it are not distances between bodies.
+Boxes are only compared where centres are closer than a diagonal, so that the usual tick costs a comparison.
+"""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
+from rare_envs.traffic.oriented_boxes import DIAGONAL, boxes_overlap
+from rare_envs.traffic.pairs import pairs
 from rare_envs.traffic.road import Road, WorldPose
-from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
-
-_DIAGONAL = (VEHICLE_LENGTH**2 + VEHICLE_WIDTH**2) ** 0.5
+from rare_envs.traffic.state import State
 
 
-def boxes_overlap(
-    dx: Tensor,
-    dy: Tensor,
-    heading: Tensor,
-    other_heading: Tensor,
-    size: tuple[Tensor | float, Tensor | float] = (VEHICLE_LENGTH, VEHICLE_WIDTH),
-    other_size: tuple[Tensor | float, Tensor | float] = (VEHICLE_LENGTH, VEHICLE_WIDTH),
-) -> Tensor:
-    """Whether two vehicles' bodies overlap, by the separating axis theorem on the boxes' four axes.
-
-    Args:
-        dx: Centre of the other less centre of the first [m], any shape; the other tensors have the same.
-        dy: Likewise across the road [m].
-        heading: Headings of the first [rad].
-        other_heading: Headings of the other [rad].
-        size: Length and width of the first [m].
-        other_size: Of the other [m].
-
-    Returns:
-        True where the boxes share more than their edges.
-    """
-    cos, sin = torch.cos(heading), torch.sin(heading)
-    turn = other_heading - heading
-    along, across = dx * cos + dy * sin, dy * cos - dx * sin
-    cos, sin = torch.cos(turn), torch.sin(turn)
-    other_along, other_across = along * cos + across * sin, across * cos - along * sin
-    cos, sin = cos.abs(), sin.abs()
-    (length, width), (other_length, other_width) = ((0.5 * long, 0.5 * wide) for long, wide in (size, other_size))
-    overlap = along.abs() < length + other_length * cos + other_width * sin
-    overlap = overlap & (across.abs() < width + other_length * sin + other_width * cos)
-    overlap = overlap & (other_along.abs() < other_length + length * cos + width * sin)
-    return overlap & (other_across.abs() < other_width + length * sin + width * cos)
-
-
-def ego_overlaps(state: State, road: Road, placed: WorldPose | None = None) -> Tensor:
-    """Which vehicles' bodies overlap the ego's.
-
-    They are compared in the world: where the road turns, distances along it are not those between bodies. Boxes are
-    only compared where centres are closer than a diagonal, so the usual tick costs a comparison.
+def ego_overlaps(state: State, road: Road, pose: WorldPose | None = None) -> Tensor:
+    """Return which vehicles' bodies overlap the ego's.
 
     Args:
         state: Traffic of B scenarios.
         road: Their road.
-        placed: Where they are in the world, if that is known already.
+        pose: Where they are in the world, if that is known already.
 
     Returns:
         Boolean, shape (B, N - 1).
     """
-    x, y, heading = road.to_world(state.x, state.y, state.heading) if placed is None else placed[:3]
+    x, y, heading = _in_world(state, road, pose)
     dx, dy = x[:, 1:] - x[:, :1], y[:, 1:] - y[:, :1]
-    near: Tensor = (dx.abs() < _DIAGONAL) & (dy.abs() < _DIAGONAL)
-    if not bool(near.any()):
-        return near
-    row, column = near.nonzero(as_tuple=True)
-    near[row, column] = boxes_overlap(dx[row, column], dy[row, column], heading[row, 0], heading[row, column + 1])
-    return near
+    return _overlap_where_near(dx, dy, heading[:, :1].expand_as(dx), heading[:, 1:])
 
 
-def pairwise_overlaps(state: State, road: Road, placed: WorldPose | None = None) -> Tensor:
-    """Which vehicles' bodies overlap which.
+def others_overlap(state: State, road: Road, pose: WorldPose | None = None) -> Tensor:
+    """Return whether two vehicles other than the ego overlap, boolean, shape (B,); arguments as of `ego_overlaps`."""
+    n = state.x.shape[1] - 1
+    first, second = (list(index[n:]) for index in pairs(n + 1))
+    overlapping: Tensor = _overlap_of(_in_world(state, road, pose), first, second).any(1)
+    return overlapping
+
+
+def pairwise_overlaps(state: State, road: Road, pose: WorldPose | None = None) -> Tensor:
+    """Return which vehicles' bodies overlap which.
 
     Args:
         state: Traffic of B scenarios.
         road: Their road.
-        placed: Where they are in the world, if that is known already.
+        pose: Where they are in the world, if that is known already.
 
     Returns:
         Boolean, shape (B, N, N), symmetric, nobody with itself; row 0 is `ego_overlaps`.
     """
-    x, y, heading = road.to_world(state.x, state.y, state.heading) if placed is None else placed[:3]
-    n = x.shape[1]
-    i, j = torch.triu_indices(n, n, 1, device=x.device)
-    dx, dy = x[:, j] - x[:, i], y[:, j] - y[:, i]
-    near = (dx.abs() < _DIAGONAL) & (dy.abs() < _DIAGONAL)
-    both = torch.zeros(len(x), n, n, dtype=torch.bool, device=x.device)
-    row, pair = near.nonzero(as_tuple=True)
-    if len(row):
-        i, j = i[pair], j[pair]
-        hit = boxes_overlap(dx[row, pair], dy[row, pair], heading[row, i], heading[row, j])
-        both[row, i, j] = hit
-        both[row, j, i] = hit
+    batch, n = state.x.shape
+    first, second = map(list, pairs(n))
+    overlapping = _overlap_of(_in_world(state, road, pose), first, second)
+    both = torch.zeros(batch, n, n, dtype=torch.bool, device=state.x.device)
+    both[:, first, second] = overlapping
+    both[:, second, first] = overlapping
     return both
+
+
+def _in_world(state: State, road: Road, pose: WorldPose | None) -> tuple[Tensor, Tensor, Tensor]:
+    return road.to_world(state.x, state.y, state.heading) if pose is None else pose[:3]
+
+
+def _overlap_of(place: tuple[Tensor, Tensor, Tensor], first: list[int], second: list[int]) -> Tensor:
+    """Return which of P pairs of vehicles overlap, boolean, shape (B, P)."""
+    x, y, heading = place
+    dx, dy = x[:, second] - x[:, first], y[:, second] - y[:, first]
+    return _overlap_where_near(dx, dy, heading[:, first], heading[:, second])
+
+
+def _overlap_where_near(dx: Tensor, dy: Tensor, heading: Tensor, other_heading: Tensor) -> Tensor:
+    """Return `boxes_overlap` of pairs (B, P), compared only where centres are near."""
+    near: Tensor = (dx.abs() < DIAGONAL) & (dy.abs() < DIAGONAL)
+    if bool(near.any()):
+        at = near.nonzero(as_tuple=True)
+        near[at] = boxes_overlap(dx[at], dy[at], heading[at], other_heading[at])
+    return near

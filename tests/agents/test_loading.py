@@ -405,7 +405,7 @@ def test_learned_drivers_are_egos_by_name_and_by_file(tmp_path: Path, monkeypatc
         ("idn", r"Unknown ego 'idn' \(did you mean 'idm'\?\); expected 'idm', 'imitation', 'vision', 'mgail',"),
         ("", "Unknown ego ''"),
         ("runs/ego", "Unknown ego 'runs/ego'"),
-        (":make", "Expected module:function"),
+        (":make", "Expected module:name"),
         ("no_such_module:make", "Cannot import 'no_such_module'"),
     ],
 )
@@ -450,8 +450,8 @@ def test_a_function_of_the_user_makes_the_ego(own_module: str) -> None:
 @pytest.mark.parametrize(
     ("function", "message"),
     [
-        ("mak", r"has no function 'mak' \(did you mean 'make'\?\)\."),
-        ("zzz", r"has no function 'zzz'\."),
+        ("mak", r"has nothing called 'mak' \(did you mean 'make'\?\)\."),
+        ("zzz", r"has nothing called 'zzz'\."),
         ("make_nothing", "an object with predict, got NoneType"),
         ("make_trouble", "failed to make an ego: RuntimeError: no weights"),
         ("make_exit", "failed to make an ego: SystemExit: 7"),

@@ -318,7 +318,7 @@ def test_measures_by_what_a_user_types(tmp_path: Path, monkeypatch: pytest.Monke
         ("measures_here:gpa", "nothing called 'gpa' .did you mean 'gap'"),
         ("measures_here:number", "Unknown measure 3"),
         ("no_such_module:gap", "Cannot import 'no_such_module'"),
-        (":gap", "Cannot import ''"),
+        (":gap", "Expected module:name for the measure ':gap'"),
     ):
         with pytest.raises(ValueError, match=words):
             of(wrong)

@@ -8,8 +8,6 @@ import rare_envs
 from rare_envs.make import set_up
 from rare_envs.sensors.perception import perceive_traffic
 from rare_envs.simulation.observation import observe
-from rare_envs.traffic.overlap import ego_overlaps, pairwise_overlaps
-from rare_envs.traffic.state import State
 
 every = pytest.mark.parametrize("env_id", rare_envs.ENV_IDS)
 
@@ -90,22 +88,6 @@ def test_a_vehicle_that_is_commanded_no_longer_goes_on_from_where_it_is(env_id, 
         moved = torch.hypot(episode.state.x - before.x, episode.state.y - before.y)
         assert (moved <= before.speed * world.clock.dt * 1.05 + 1e-3).all()  # the I-80 is longer on its outer lanes
         assert ((episode.state.speed - before.speed).abs() <= 1.0).all()
-
-
-def test_contacts_of_all_pairs_are_those_of_each_vehicle_as_ego():
-    rng = np.random.default_rng(0)
-    world, _ = start("rare_envs/Highway-v0", n=1, noise=False)
-    fields = [rng.uniform(low, high, (500, 6)) for low, high in ((0, 25), (0, 12), (-0.5, 0.5), (0, 20))]
-    state = State(*map(torch.from_numpy, fields), theta=torch.zeros(500, 0))
-    both = pairwise_overlaps(state, world.scenario.road)
-    assert torch.equal(both, both.mT)
-    assert not both.diagonal(dim1=1, dim2=2).any()
-    assert 0.05 < both.double().mean() < 0.5
-    assert torch.equal(both[:, 0, 1:], ego_overlaps(state, world.scenario.road))
-    for vehicle in range(1, 6):
-        others = [j for j in range(6) if j != vehicle]
-        expected = ego_overlaps(state.seen_by(vehicle), world.scenario.road)
-        assert torch.equal(both[:, vehicle][:, others], expected)
 
 
 def test_what_the_cutter_observes_by_hand():

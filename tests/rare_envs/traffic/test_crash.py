@@ -17,8 +17,8 @@ from rare_envs.traffic.crash import (
     crash_of_others,
     describe_crash,
     injury_risk,
-    others_overlap,
 )
+from rare_envs.traffic.overlap import others_overlap
 from rare_envs.traffic.road import straight
 from rare_envs.traffic.state import State
 from tests.rare_envs.traffic.slow_boxes import corners, nearest, overlap
@@ -111,17 +111,6 @@ def test_without_the_tick_before_speeds_and_headings_tell() -> None:
         assert found.pop("kind") == expected.pop("kind")
         for name, value in found.items():
             assert value == pytest.approx(expected[name]), name
-
-
-def test_others_touch_where_their_bodies_overlap() -> None:
-    rng, batch = np.random.default_rng(4), 300
-    x, y = rng.uniform(-8.0, 8.0, (batch, 4)), rng.uniform(10.0, 18.0, (batch, 4))
-    heading = rng.uniform(-0.6, 0.6, (batch, 4))
-    state = State(*(torch.from_numpy(each) for each in (x, y, heading, np.ones((batch, 4)), x[:, :0])))
-    bodies = [[corners(*pose) for pose in zip(*row, strict=True)] for row in zip(x, y, heading, strict=True)]
-    expected = [any(overlap(row[i], row[j]) for i, j in ((1, 2), (1, 3), (2, 3))) for row in bodies]
-    assert others_overlap(state, straight(9)).tolist() == expected
-    assert 60 < sum(expected) < 240
 
 
 def test_a_crash_of_others_is_without_the_ego() -> None:

@@ -17,7 +17,6 @@ from rare_envs.scenarios.base import Others, Scenario, columns
 from rare_envs.scenarios.highway import HIGHWAY
 from rare_envs.simulation.rollout import drive
 from rare_envs.simulation.world import World
-from rare_envs.traffic.overlap import ego_overlaps
 from rare_envs.traffic.reference_line import ReferenceLine
 from rare_envs.traffic.road import Road, i80, straight
 from rare_envs.traffic.state import State
@@ -282,16 +281,6 @@ def test_an_ego_keeps_its_lane_of_the_i80(dtype: torch.dtype) -> None:
     assert (off > 0.005).all()  # the road does turn
 
 
-def test_bodies_overlap_in_the_world_not_along_the_road() -> None:
-    """Where 5 m of the road's line are 5 (1 - k y) m at y."""
-    road = Road((-30.0, 0.0, 30.0), ReferenceLine(50.0, (0.0, 0.004, 0.004, 0.0)))
-    for y, other_x, overlap in [(20.0, 5.3, True), (20.0, 5.5, False), (-20.0, 4.7, False), (-20.0, 4.55, True)]:
-        assert ego_overlaps(pair(75.0, y, 75.0 + other_x, y), road).item() is overlap
-    state = pair(75.0, 20.0, 75.0, 21.9)
-    assert ego_overlaps(state, road).item() is True
-    assert ego_overlaps(state._replace(y=torch.tensor([[20.0, 22.1]], dtype=F64)), road).item() is False
-
-
 def test_a_curved_road_is_drawn_in_the_world() -> None:
     road = i80()
     world = World(replace(HIGHWAY, vehicle_names=("ego", "lead"), labels=(), drivers=None))
@@ -354,3 +343,8 @@ def test_command_recovers_a_road_and_names_broken_files(tmp_path: Path, capsys: 
     assert capsys.readouterr().out.count(" m rms") == 12
     with pytest.raises(ValueError, match=r"Cannot read .*lanes.csv: .*boundary"):
         i80_road.read_lines(tmp_path / "lanes.csv", "boundary")
+
+
+def test_off_road() -> None:
+    for lanes, y, outside in [(1, 1.9, False), (1, 2.1, True), (1, -2.1, True), (2, 5.9, False), (2, 6.1, True)]:
+        assert straight(lanes).off_road(torch.tensor([y])).item() is outside

@@ -1,0 +1,36 @@
+"""Times to collision, with leads and with the edge of the road, worked by hand."""
+
+import math
+
+import pytest
+
+from rare_envs.measures import TTC_MAX, Moment, ttc
+from rare_envs.traffic.lead import Lead
+from rare_envs.traffic.road import straight
+from tests.rare_envs.traffic_states import tensor, traffic
+
+
+def test_ttc_of_two_cars() -> None:
+    state = traffic((0.0, 0.0, 0.0, 20.0))
+    assert ttc(Moment(state, Lead(tensor(30.0), tensor(10.0)), straight(1), None)).item() == pytest.approx(3.0)
+    assert ttc(Moment(state, Lead(tensor(30.0), tensor(-1.0)), straight(1), None)).item() == TTC_MAX
+    assert ttc(Moment(state, Lead(tensor(500.0), tensor(10.0)), straight(1), None)).item() == TTC_MAX
+    assert ttc(Moment(state, Lead(tensor(math.inf), tensor(0.0)), straight(1), None)).item() == TTC_MAX
+    assert (
+        0.0 < ttc(Moment(state, Lead(tensor(-2.0), tensor(10.0)), straight(1), None)).item() < 0.01
+    )  # beside, not a collision
+
+
+@pytest.mark.parametrize(
+    ("y", "heading", "lanes", "expected"),
+    [
+        (0.0, 0.05, 1, 2.0 / (20.0 * math.sin(0.05))),  # to the right edge, 2 m away
+        (0.5, -0.05, 1, 2.5 / (20.0 * math.sin(0.05))),  # back to the left one
+        (0.0, 0.05, 2, 6.0 / (20.0 * math.sin(0.05))),  # a second lane on the right
+        (1.9, 0.0, 1, TTC_MAX),  # along the edge, not towards it
+        (3.0, 0.05, 1, 0.01 / (20.0 * math.sin(0.05))),  # beyond it
+    ],
+)
+def test_ttc_of_the_edge_of_the_road(y: float, heading: float, lanes: int, expected: float) -> None:
+    state, nobody = traffic((0.0, y, heading, 20.0)), Lead(tensor(math.inf), tensor(0.0))
+    assert ttc(Moment(state, nobody, straight(lanes), None)).item() == pytest.approx(expected)
