@@ -1,4 +1,4 @@
-"""HighwayEnv's `Kinematics` observation without pandas, which takes most of a short drive's time: the same bits."""
+"""HighwayEnv's `Kinematics` observation computed without pandas, to the same bits."""
 
 from functools import partial
 from typing import Any
@@ -9,28 +9,28 @@ from highway_env.utils import lmap
 from numpy.typing import NDArray
 
 
-def quicken(scene: Any, blind: bool = False) -> None:
-    """Let a HighwayEnv environment observe quickly from its next reset on; other kinds of observations stay.
+def install_fast_observation(env: Any, blind: bool = False) -> None:
+    """Replace the `Kinematics` observation of a HighwayEnv environment, from its next reset on; other kinds stay.
 
     Args:
-        scene: The environment.
-        blind: Observe zeros: nobody looks at them.
+        env: The environment.
+        blind: Observe zeros, for an ego that uses no observation.
     """
-    define = scene.define_spaces
+    define_spaces = env.define_spaces
 
-    def defined() -> None:
-        define()
-        kind = scene.observation_type
+    def define_spaces_fast() -> None:
+        define_spaces()
+        kind = env.observation_type
         if blind and isinstance(kind, KinematicObservation):
             kind.observe = partial(np.zeros, kind.space().shape, kind.space().dtype)
         elif type(kind) is KinematicObservation:
-            kind.observe = partial(rows, kind)
+            kind.observe = partial(observe_kinematics, kind)
 
-    scene.define_spaces = defined
+    env.define_spaces = define_spaces_fast
 
 
-def rows(kind: Any) -> NDArray[np.float32]:
-    """What `KinematicObservation.observe` returns.
+def observe_kinematics(kind: Any) -> NDArray[np.float32]:
+    """Return what `KinematicObservation.observe` returns.
 
     Args:
         kind: A `KinematicObservation`.

@@ -1,4 +1,4 @@
-"""How close the ego of a HighwayEnv scene is to a collision, from HighwayEnv's own state; small is dangerous."""
+"""Safety measures of a HighwayEnv scene, from HighwayEnv's own state; small is dangerous."""
 
 import math
 from collections.abc import Callable
@@ -8,19 +8,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rare_envs.measures.time_to_collision import TTC_MAX
+
 Array = NDArray[np.float64]
 
-TTC_MAX = 10.0
-"""Cap of the times to collision [s]; what is further away, or not closing, counts as this."""
 TTC_MIN = 0.01
 """They are at least this [s], so that only a collision comes to 0 or less."""
-COLLISION = -1.0
-"""The measure of a drive in which the ego has crashed."""
 _STILL = 1e-9
+"""Speeds below this [m/s] do not close a gap."""
 
 
-def ttc(env: Any) -> float:
-    """Time until the ego's body would touch any other's if speeds and headings stayed: the least over all of them.
+def ttc_to_any(env: Any) -> float:
+    """Return the time until the ego's body would touch any other's at constant speed and heading, over all of them.
 
     Args:
         env: An environment of HighwayEnv.
@@ -34,8 +33,8 @@ def ttc(env: Any) -> float:
     return float(np.clip(min(times, default=np.inf), TTC_MIN, TTC_MAX))
 
 
-def front_ttc(env: Any) -> float:
-    """Time to collision of the ego with the vehicle that HighwayEnv finds in front of it in its lane.
+def ttc_to_front(env: Any) -> float:
+    """Return the time to collision of the ego with the vehicle that HighwayEnv finds in front of it in its lane.
 
     Bumper gap along the lane / closing speed along the ego's heading.
 
@@ -55,7 +54,7 @@ def front_ttc(env: Any) -> float:
 
 
 def contact_time(one: Any, other: Any) -> float:
-    """When two bodies that keep their velocities and headings begin to overlap.
+    """Return the time at which two bodies that keep their velocities and headings begin to overlap.
 
     Two rectangles overlap while their shadows on each of their four axes do (separating axes). Each pair of shadows
     overlaps during one interval of time, so the bodies do during what the four intervals have in common.
@@ -83,7 +82,7 @@ def contact_time(one: Any, other: Any) -> float:
 
 
 def _may_meet(one: Any, other: Any) -> bool:
-    """Whether two bodies are near enough to touch within `TTC_MAX` at all: circles around them, speeds added."""
+    """Return whether two bodies are near enough to touch within `TTC_MAX`: circles around them, speeds added."""
     way = math.dist(one.position, other.position) - (one.diagonal + other.diagonal) / 2
     return bool(way <= TTC_MAX * math.dist(one.velocity, other.velocity))
 
@@ -92,5 +91,7 @@ def _axis(angle: float) -> Array:
     return np.array([np.cos(angle), np.sin(angle)])
 
 
-CLOSENESS: MappingProxyType[str, Callable[[Any], float]] = MappingProxyType({"ttc": ttc, "front_ttc": front_ttc})
+HIGHWAY_ENV_MEASURES: MappingProxyType[str, Callable[[Any], float]] = MappingProxyType(
+    {"ttc": ttc_to_any, "front_ttc": ttc_to_front}
+)
 """Measures of a moment by name; that of a drive is the least of them, or -1 if the ego crashes."""

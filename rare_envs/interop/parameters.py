@@ -1,4 +1,4 @@
-"""What a HighwayEnv environment has for parameters, and how they are put into its scene."""
+"""Parameters of HighwayEnv's environments, and their values put into a scene."""
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -16,7 +16,8 @@ from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
 
 Values = Mapping[str, Any]
 """Names to numbers, or to arrays for parameters of several vehicles."""
-LENGTH: float = Vehicle.LENGTH
+HIGHWAY_ENV_LENGTH: float = Vehicle.LENGTH
+"""Length of HighwayEnv's vehicles [m]."""
 
 
 @dataclass(frozen=True)
@@ -24,9 +25,9 @@ class Group:
     """Parameters that are drawn together, independent of all others."""
 
     parameters: tuple[Parameter, ...]
-    law: Distribution
+    distribution: Distribution
     usual: float | None = None
-    """What HighwayEnv always takes; None where it draws."""
+    """HighwayEnv's value; None where it draws."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ class Layout:
     vehicles: tuple[int, int | None]
     """Default number of vehicles with parameters, and the largest; None for as many as there are."""
     idm: tuple[float, float, float, float] = (1.5, 5.0, 3.0, 5.0)
-    """HighwayEnv's values of `IDM`, in its order."""
+    """HighwayEnv's values of `IDM_PARAMETERS`, in its order."""
     leftover: bool = True
     """Whether anything is left that HighwayEnv draws."""
     prepare: Callable[[Any], None] = lambda env: None
@@ -61,40 +62,42 @@ class _Setting:
     shift: float = 0.0
 
 
-IDM = {
+IDM_PARAMETERS = {
     "time_headway": _Setting("TIME_WANTED", "s", 0.1, 5.0, 1.0, "time gap that the others want"),
     "jam_distance": _Setting(
-        "DISTANCE_WANTED", "m", 0.0, 20.0, 2.0, "bumper gap that they want at standstill", shift=LENGTH
+        "DISTANCE_WANTED", "m", 0.0, 20.0, 2.0, "bumper gap that they want at standstill", shift=HIGHWAY_ENV_LENGTH
     ),
     "max_acceleration": _Setting("COMFORT_ACC_MAX", "m/s^2", 0.5, 10.0, 1.5, "their largest acceleration"),
     "comfortable_deceleration": _Setting("COMFORT_ACC_MIN", "m/s^2", 0.5, 10.0, 1.5, "their comfortable one", -1.0),
 }
-"""Parameters of the Intelligent Driver Model that all vehicles but the ego share; the law of each is a Beta(2, 2)
+"""Parameters of the Intelligent Driver Model that all vehicles but the ego share; each has a Beta(2, 2) distribution
 around HighwayEnv's value."""
 
 
 def idm_groups(layout: Layout) -> list[Group]:
-    """One group for each parameter of IDM."""
+    """Return one group for each parameter of IDM."""
     found = []
-    for usual, (name, it) in zip(layout.idm, IDM.items(), strict=True):
+    for usual, (name, it) in zip(layout.idm, IDM_PARAMETERS.items(), strict=True):
         spread = min(it.spread, usual - it.low, it.high - usual)
         parameter = Parameter(name, it.unit, it.low, it.high, it.meaning)
-        found.append(Group((parameter,), beta(2.0, [usual - spread], [usual + spread]), usual))
+        found.append(Group((parameter,), make_beta(2.0, [usual - spread], [usual + spread]), usual))
     return found
 
 
 def set_idm(vehicles: list[Any], values: Values) -> None:
-    """Give vehicles their parameters. They are set on the vehicles: HighwayEnv's intersection changes the class."""
+    """Set the parameters of IDM on the vehicles themselves: HighwayEnv's intersection changes their class."""
     for vehicle in vehicles:
         if isinstance(vehicle, IDMVehicle):
-            for name, it in IDM.items():
+            for name, it in IDM_PARAMETERS.items():
                 setattr(vehicle, it.attribute, it.sign * float(values[name]) + it.shift)
 
 
 @contextmanager
-def class_kept(kind: type) -> Iterator[None]:
+def restore_class_parameters(kind: type) -> Iterator[None]:
     """Put the parameters of IDM of a class back afterwards: HighwayEnv's intersection changes them for good."""
-    before = {it.attribute: getattr(kind, it.attribute) for it in IDM.values() if hasattr(kind, it.attribute)}
+    before = {
+        it.attribute: getattr(kind, it.attribute) for it in IDM_PARAMETERS.values() if hasattr(kind, it.attribute)
+    }
     try:
         yield
     finally:
@@ -102,14 +105,14 @@ def class_kept(kind: type) -> Iterator[None]:
             setattr(kind, name, value)
 
 
-def beta(shape: float, low: list[float], high: list[float]) -> BetaDistribution:
-    """Independent Beta(shape, shape) on ranges; shape 1 is uniform."""
+def make_beta(shape: float, low: list[float], high: list[float]) -> BetaDistribution:
+    """Return independent Beta(shape, shape) distributions on ranges; shape 1 is uniform."""
     size = len(low)
     return BetaDistribution(np.full(size, shape), np.full(size, shape), np.array(low), np.array(high))
 
 
-def normal(mean: list[float], deviation: list[float], reach: float = 4.0) -> TruncatedGaussianMixture:
-    """Independent normal variables, cut off at `reach` standard deviations (6e-5 of the mass at 4)."""
+def make_normal(mean: list[float], deviation: list[float], reach: float = 4.0) -> TruncatedGaussianMixture:
+    """Return independent normal distributions, cut off at `reach` standard deviations (6e-5 of the mass at 4)."""
     centre, sd = np.array(mean), np.array(deviation)
     return TruncatedGaussianMixture(
         np.ones(1), centre[None], np.diag(sd**2)[None], centre - reach * sd, centre + reach * sd
@@ -117,7 +120,7 @@ def normal(mean: list[float], deviation: list[float], reach: float = 4.0) -> Tru
 
 
 def lane_number(coordinate: float, lanes: int) -> int:
-    """The lane of a coordinate in [0, lanes]: its whole part, so that lanes are equally likely under a uniform law."""
+    """Return the lane of a coordinate in [0, lanes]: its whole part, so lanes are equally likely if it is uniform."""
     return min(int(coordinate), lanes - 1)
 
 

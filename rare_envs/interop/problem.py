@@ -1,4 +1,4 @@
-"""`highway_env_problem`: how often does an ego crash in one of HighwayEnv's own environments?"""
+"""Problem for samplers: the probability that an ego crashes in one of HighwayEnv's own environments."""
 
 import multiprocessing
 import os
@@ -13,8 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rare_envs.distributions.space import Distribution, ScenarioSpace
-from rare_envs.interop import simulation
-from rare_envs.interop.simulation import MAX_SECONDS, Driven, Simulation, one_thread, portable
+from rare_envs.interop.simulation import (
+    MAX_SECONDS,
+    DriveRunner,
+    DriveTask,
+    drive_in_worker,
+    one_thread,
+    start_worker,
+    strip_ego,
+)
 
 Array = NDArray[np.float64]
 
@@ -33,11 +40,11 @@ class HighwayEnvProblem:
         fixed: Parameters that are held, and their values.
     """
 
-    def __init__(self, task: Simulation, ego: Any, workers: int) -> None:
+    def __init__(self, task: DriveTask, ego: Any, workers: int) -> None:
         """Make the environment once, here, so that what does not fit is known before the work.
 
         Args:
-            task: What a drive is made of.
+            task: Description of a drive.
             ego: As the user gave it.
             workers: Number of processes.
 
@@ -49,8 +56,8 @@ class HighwayEnvProblem:
         self.env_id, self.ego, self.workers = task.env_id, ego, workers
         self._task = task
         if workers > 1:
-            _packed(task)
-        self._driven: Driven | None = task.ready()
+            _pickle_task(task)
+        self._driven: DriveRunner | None = task.build()
         self.space: ScenarioSpace = self._driven.env.space
         self.fixed: dict[str, Any] = self._driven.env.fixed
         self._noise = task.settings["noise"]
@@ -68,12 +75,12 @@ class HighwayEnvProblem:
 
     @property
     def given(self) -> str:
-        """What p is conditional on, in words for `samplers.Estimate.given`; empty if nothing is held fixed."""
+        """Condition of p in words, for `samplers.Estimate.given`; empty if nothing is held fixed."""
         fixed = self._random and self._noise == "fixed"
         return "what HighwayEnv draws beyond x is one fixed draw" if fixed else ""
 
     def evaluate(self, x: Array) -> Array:
-        """Drive.
+        """Return the measure of the drive from each x.
 
         Args:
             x: Scenario parameters, shape (n, d).
@@ -87,12 +94,12 @@ class HighwayEnvProblem:
         """
         x = self.space.validate(np.atleast_2d(x))
         if self.workers == 1 or len(x) == 1:
-            self._driven = self._driven or self._task.ready()
+            self._driven = self._driven or self._task.build()
             with one_thread():
-                return np.array([self._driven.f(row) for row in x])
+                return np.array([self._driven.measure_drive(row) for row in x])
         chunk = max(1, min(8, len(x) // (4 * self.workers)))
         try:
-            return np.array(list(self._pool.map(simulation.drive, x, chunksize=chunk)))
+            return np.array(list(self._pool.map(drive_in_worker, x, chunksize=chunk)))
         except BrokenProcessPool as error:
             self.close()
             raise RuntimeError(
@@ -105,8 +112,8 @@ class HighwayEnvProblem:
         pool = ProcessPoolExecutor(
             self.workers,
             mp_context=multiprocessing.get_context("spawn"),
-            initializer=simulation.begin,
-            initargs=(_packed(self._task),),
+            initializer=start_worker,
+            initargs=(_pickle_task(self._task),),
         )
         self._end = weakref.finalize(self, pool.shutdown, wait=False, cancel_futures=True)
         return pool
@@ -128,8 +135,8 @@ class HighwayEnvProblem:
         return {**{k: v for k, v in self.__dict__.items() if k not in ("_pool", "_end")}, "_driven": None}
 
 
-def _packed(task: Simulation) -> bytes:
-    """A task as it goes to worker processes.
+def _pickle_task(task: DriveTask) -> bytes:
+    """Return a task as bytes, as it goes to worker processes.
 
     Raises:
         ValueError: If something in it cannot be pickled.
@@ -159,10 +166,10 @@ def highway_env_problem(
     horizon: float = MAX_SECONDS,
     workers: int | None = 1,
 ) -> HighwayEnvProblem:
-    """A HighwayEnv environment and an ego as a function f(x) of scenario parameters, for `samplers.estimate`.
+    """Return a HighwayEnv environment with an ego as a problem for `samplers.estimate`.
 
-    f(x) is -1 if the ego crashes, else the least measure over all simulation steps. It is a deterministic function of
-    x: what HighwayEnv draws beyond the named parameters is seeded by the parameter `noise`.
+    x are scenario parameters; f(x) is -1 if the ego crashes, else the least measure over all simulation steps. It is
+    a deterministic function of x: what HighwayEnv draws beyond the named parameters is seeded by the parameter `noise`.
 
     Args:
         env_id: "highway-v0", "highway-fast-v0", "merge-v0", "intersection-v0", "roundabout-v0" or a later version of
@@ -176,7 +183,7 @@ def highway_env_problem(
         fixed: Values of parameters that are held, or "highway_env" for those that HighwayEnv itself holds: p is then
             the share of crashes in the environment as it is (up to what docs/highway_env.md says of each).
         noise: True, what is left random is seeded by the parameter `noise`; "fixed", by one number for all x.
-        base: Law of the parameters without noise; HighwayEnv's own by default.
+        base: Distribution of the parameters without noise; HighwayEnv's own by default.
         horizon: Drives are cut off here [s], if the environment does not end them before.
         workers: Processes, each with one thread; None for one per core. They are started afresh, so a script that uses
             them needs `if __name__ == "__main__":`.
@@ -190,5 +197,5 @@ def highway_env_problem(
     if isinstance(horizon, bool) or not isinstance(horizon, int | float) or not 0.0 < horizon <= 1e4:
         raise ValueError(f"Expected a horizon in seconds, positive and at most 10,000, got {horizon!r}.")
     settings = {"vehicles": vehicles, "measure": measure, "fixed": fixed, "noise": noise, "base": base}
-    task = Simulation(env_id, portable(ego), config, settings, float(horizon))
+    task = DriveTask(env_id, strip_ego(ego), config, settings, float(horizon))
     return HighwayEnvProblem(task, ego, (os.cpu_count() or 1) if workers is None else workers)

@@ -1,4 +1,4 @@
-"""`HighwayEnvScenario`: a HighwayEnv environment whose start is set by parameters."""
+"""Scenarios of HighwayEnv: an environment whose start is set by parameters."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -15,8 +15,10 @@ from highway_env.utils import class_from_path
 from rare_envs.distributions.product import NoiseDistribution, join_independent
 from rare_envs.distributions.space import Array, Parameter, ScenarioSpace
 from rare_envs.interop.environments import LAYOUTS
-from rare_envs.interop.measures import CLOSENESS, COLLISION, TTC_MAX
-from rare_envs.interop.parameters import IDM, Group, Layout, class_kept, idm_groups, set_idm
+from rare_envs.interop.measures import HIGHWAY_ENV_MEASURES
+from rare_envs.interop.parameters import IDM_PARAMETERS, Group, Layout, idm_groups, restore_class_parameters, set_idm
+from rare_envs.measures.base import COLLISION
+from rare_envs.measures.time_to_collision import TTC_MAX
 from rare_envs.plugins import did_you_mean
 
 SUPPORTED = (
@@ -36,7 +38,7 @@ class HighwayEnvScenario(gym.Wrapper[Any, Any, Any, Any]):
     parameter `noise`, a standard normal number of which every bit counts.
 
     `info` carries `scenario` (names to values), `x`, `collision`, `min_measure` (so far), and at the end `measure`: -1
-    if the ego crashed, else the least measure over all simulation steps, not only those at which the policy is asked.
+    if the ego crashed, else the least measure over all simulation steps, not only those at which the policy is queried.
 
     Attributes:
         space: Names, units, bounds and base distribution of x.
@@ -62,25 +64,25 @@ class HighwayEnvScenario(gym.Wrapper[Any, Any, Any, Any]):
             measure: "ttc", "front_ttc", or a function of HighwayEnv's environment, called at each simulation step;
                 small is dangerous, and 0 or less is for collisions only if gamma = 0 is to count just them.
             fixed: Values of parameters that are to be held, or "highway_env" for all that HighwayEnv itself holds: x is
-                then what it draws, with the law by which it draws it.
+                then what it draws, with the distribution from which it draws it.
             noise: True, what is left random is seeded by the parameter `noise`; "fixed", by one number for all x.
-            base: Law of the parameters without noise, in place of HighwayEnv's: an object with the four methods of
-                `rare_envs.distributions.space.Distribution`.
+            base: Distribution of the parameters without noise, in place of HighwayEnv's: an object with the methods
+                of `rare_envs.distributions.space.Distribution`.
 
         Raises:
             ValueError: If the environment is not one of HighwayEnv's that are known here, or an argument is invalid.
         """
         super().__init__(env)
-        self.layout = _layout_of(env)
-        self._measure = _measure_of(measure)
+        self.layout = _find_layout(env)
+        self._measure = _find_measure(measure)
         if noise is not True and noise != "fixed":
             raise ValueError(f"Expected noise True or 'fixed', got {noise!r}.")
         self._rng = np.random.default_rng()
         self.layout.prepare(self.scene)
         groups = self._groups(vehicles)
-        self.fixed = _fixed(groups, fixed)
+        self.fixed = _hold_parameters(groups, fixed)
         varying = [group for group in groups if group.parameters[0].name not in self.fixed]
-        self.space = _space(varying, self.layout.leftover and noise is True, base)
+        self.space = _make_space(varying, self.layout.leftover and noise is True, base)
         self._x: Array = np.full(self.space.dim, np.nan)
         self._least = TTC_MAX
 
@@ -116,18 +118,18 @@ class HighwayEnvScenario(gym.Wrapper[Any, Any, Any, Any]):
         self._x = self.space.scenario_x(options, 1, self._rng)[0]
         values = {**self.fixed, **self.space.named(self._x)}
         scene = self.scene
-        with class_kept(class_from_path(scene.config["other_vehicles_type"])):
-            self.env.reset(seed=_seed(values.pop("noise", None)))
+        with restore_class_parameters(class_from_path(scene.config["other_vehicles_type"])):
+            self.env.reset(seed=_seed_from_number(values.pop("noise", None)))
         self.layout.arrange(scene, values)
         self._set_idm(values)
-        self._watch()
+        self._measure_every_step()
         scene.define_spaces()  # links observation and action to the scene again, as HighwayEnv's own reset does
         observation = scene.observation_type.observe()
         info = scene._info(observation, action=scene.action_space.sample())
         return observation, info | self._info()
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """One decision of the policy, as in HighwayEnv."""
+        """Take one decision of the policy, as in HighwayEnv."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         self._set_idm({**self.fixed, **self.space.named(self._x)})  # of vehicles that came during the step
         info = info | self._info()
@@ -138,7 +140,7 @@ class HighwayEnvScenario(gym.Wrapper[Any, Any, Any, Any]):
     @property
     def usual_idm(self) -> dict[str, float]:
         """HighwayEnv's own parameters of IDM in this environment."""
-        return dict(zip(IDM, self.layout.idm, strict=True))
+        return dict(zip(IDM_PARAMETERS, self.layout.idm, strict=True))
 
     @property
     def measured(self) -> float:
@@ -149,20 +151,20 @@ class HighwayEnvScenario(gym.Wrapper[Any, Any, Any, Any]):
         ego = self.scene.vehicle
         set_idm([vehicle for vehicle in self.scene.road.vehicles if vehicle is not ego], values)
 
-    def _watch(self) -> None:
+    def _measure_every_step(self) -> None:
         """Measure now and after every simulation step of this episode."""
         scene, road = self.scene, self.scene.road
         step = road.step
-        self._least = self._look()
+        self._least = self._measure_now()
 
-        def watched(dt: float) -> None:
+        def step_and_measure(dt: float) -> None:
             step(dt)
             if not scene.vehicle.crashed:
-                self._least = min(self._least, self._look())
+                self._least = min(self._least, self._measure_now())
 
-        road.step = watched
+        road.step = step_and_measure
 
-    def _look(self) -> float:
+    def _measure_now(self) -> float:
         value = float(self._measure(self.scene))
         if math.isnan(value):
             raise ValueError(f"The measure {self._measure!r} gave NaN; expected a number that is small in danger.")
@@ -174,8 +176,8 @@ class HighwayEnvScenario(gym.Wrapper[Any, Any, Any, Any]):
         return {"scenario": scenario, "x": self._x.copy(), "min_measure": self.measured, "collision": crashed}
 
 
-def _layout_of(env: gym.Env[Any, Any]) -> Layout:
-    """The layout of an environment.
+def _find_layout(env: gym.Env[Any, Any]) -> Layout:
+    """Return the layout of an environment.
 
     Raises:
         ValueError: If there is none for it.
@@ -196,17 +198,17 @@ def _layout_of(env: gym.Env[Any, Any]) -> Layout:
     return found[0]
 
 
-def _measure_of(measure: str | Callable[[Any], float]) -> Callable[[Any], float]:
+def _find_measure(measure: str | Callable[[Any], float]) -> Callable[[Any], float]:
     if callable(measure):
         return measure
-    if measure in CLOSENESS:
-        return CLOSENESS[measure]
-    hint = did_you_mean(str(measure), CLOSENESS)
-    raise ValueError(f"Unknown measure {measure!r}{hint}; expected {', '.join(CLOSENESS)} or a function.")
+    if measure in HIGHWAY_ENV_MEASURES:
+        return HIGHWAY_ENV_MEASURES[measure]
+    hint = did_you_mean(str(measure), HIGHWAY_ENV_MEASURES)
+    raise ValueError(f"Unknown measure {measure!r}{hint}; expected {', '.join(HIGHWAY_ENV_MEASURES)} or a function.")
 
 
-def _fixed(groups: list[Group], fixed: Mapping[str, Any] | str | None) -> dict[str, Any]:
-    """Values of the parameters that are held, checked against their ranges.
+def _hold_parameters(groups: list[Group], fixed: Mapping[str, Any] | str | None) -> dict[str, Any]:
+    """Return the values of the parameters that are held, checked against their ranges.
 
     Raises:
         ValueError: If a parameter is unknown, is drawn together with others, or its value is outside its range.
@@ -223,22 +225,22 @@ def _fixed(groups: list[Group], fixed: Mapping[str, Any] | str | None) -> dict[s
             raise ValueError(f"Cannot hold {name!r}{hint}; what can be held is {', '.join(alone)}.")
     if not fixed:
         return {}
-    held = _space([alone[name] for name in fixed], False, None)
+    held = _make_space([alone[name] for name in fixed], False, None)
     return held.named(held.scenario_x(dict(fixed), 1, np.random.default_rng(0))[0])
 
 
-def _space(groups: list[Group], noise: bool, base: Any) -> ScenarioSpace:
-    """The parameters that vary and their law."""
+def _make_space(groups: list[Group], noise: bool, base: Any) -> ScenarioSpace:
+    """Return the space of the parameters that vary."""
     parameters = [parameter for group in groups for parameter in group.parameters]
-    laws = [group.law for group in groups] if base is None else [base]
+    distributions = [group.distribution for group in groups] if base is None else [base]
     if noise:
         parameters.append(Parameter("noise", "", -np.inf, np.inf, "seeds what HighwayEnv still draws"))
-        laws.append(NoiseDistribution(1))
+        distributions.append(NoiseDistribution(1))
     if not parameters:
         raise ValueError("Every parameter is held; expected at least one that varies.")
-    return ScenarioSpace.of(parameters, join_independent(*laws))
+    return ScenarioSpace.of(parameters, join_independent(*distributions))
 
 
-def _seed(noise: float | None) -> int:
-    """A seed from the bits of a number."""
+def _seed_from_number(noise: float | None) -> int:
+    """Return a seed made of the bits of a number; one fixed seed for None."""
     return _FIXED_SEED if noise is None else int(np.float64(noise).view(np.uint64))

@@ -1,4 +1,4 @@
-"""One drive of an ego in a HighwayEnv scenario, from x to f; what a worker process holds."""
+"""Drives of an ego in a HighwayEnv scenario: from x to f, here or in a worker process."""
 
 import contextlib
 import sys
@@ -14,8 +14,8 @@ from highway_env.vehicle.behavior import IDMVehicle
 from numpy.typing import NDArray
 
 from rare_envs.egos.wrappers import fitted
-from rare_envs.interop.fast_observation import quicken
-from rare_envs.interop.parameters import class_kept, set_idm
+from rare_envs.interop.fast_observation import install_fast_observation
+from rare_envs.interop.parameters import restore_class_parameters, set_idm
 from rare_envs.interop.scenario import HighwayEnvScenario
 from rare_envs.plugins import did_you_mean
 
@@ -24,8 +24,8 @@ MAX_SECONDS = 100.0
 
 
 @dataclass(frozen=True)
-class Simulation:
-    """What a drive is made of. It can be pickled; the environment is made where it is first needed."""
+class DriveTask:
+    """Description of a drive. It can be pickled; the environment is made where it is first needed."""
 
     env_id: str
     ego: Any
@@ -34,27 +34,27 @@ class Simulation:
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Keyword arguments of `HighwayEnvScenario`."""
     seconds: float = MAX_SECONDS
-    """Drives are cut off here."""
+    """Duration after which drives are cut off [s]."""
 
-    def ready(self) -> "Driven":
+    def build(self) -> "DriveRunner":
         """Make the environment and the ego.
 
         Raises:
             ValueError: If the environment, the ego or their spaces are not what is expected.
         """
-        env = HighwayEnvScenario(make(self.env_id, self.config), **self.settings)
-        quicken(env.scene, blind=self.ego == "idm")
+        env = HighwayEnvScenario(make_highway_env(self.env_id, self.config), **self.settings)
+        install_fast_observation(env.scene, blind=self.ego == "idm")
         if self.ego == "idm":
-            return Driven(env, None, self.seconds)
+            return DriveRunner(env, None, self.seconds)
         ego = self.ego if callable(getattr(self.ego, "predict", None)) else self.ego()
         if not callable(getattr(ego, "predict", None)):
             raise ValueError(f"Expected an ego with predict from {self.ego!r}, got {type(ego).__name__}.")
-        check_spaces(ego, env)
-        return Driven(env, fitted(ego, env.observation_space), self.seconds)
+        check_ego_spaces(ego, env)
+        return DriveRunner(env, fitted(ego, env.observation_space), self.seconds)
 
 
 @dataclass(frozen=True)
-class Bare:
+class BarePolicy:
     """The policy of a Stable-Baselines3 model and its `VecNormalize` statistics, without environment and buffers."""
 
     policy: Any
@@ -62,35 +62,35 @@ class Bare:
 
     @property
     def observation_space(self) -> Any:
-        """What the policy was trained on."""
+        """Observations that the policy was trained on."""
         return self.policy.observation_space
 
     @property
     def action_space(self) -> Any:
-        """Likewise."""
+        """Actions that the policy was trained on."""
         return self.policy.action_space
 
     def get_vec_normalize_env(self) -> Any:
-        """The statistics, or None."""
+        """Return the statistics, or None."""
         return self.statistics
 
     def predict(self, *args: Any, **kwargs: Any) -> Any:
-        """The policy's."""
+        """Return what the policy predicts."""
         return self.policy.predict(*args, **kwargs)
 
 
-def make(env_id: str, config: Mapping[str, Any] | None) -> gym.Env[Any, Any]:
-    """An environment of HighwayEnv.
+def make_highway_env(env_id: str, config: Mapping[str, Any] | None) -> gym.Env[Any, Any]:
+    """Return a new environment of HighwayEnv.
 
     Raises:
-        ValueError: If there is none of this name, or the configuration has a word that it does not know, which
-            HighwayEnv itself would pass over in silence.
+        ValueError: If there is none of this name, or the configuration has a key that it does not know, which
+            HighwayEnv itself would ignore.
     """
     known = [name for name, spec in gym.registry.items() if str(spec.entry_point).startswith("highway_env.")]
     if env_id not in known:
         raise ValueError(f"Unknown environment of HighwayEnv {env_id!r}{did_you_mean(str(env_id), known)}.")
     with (
-        class_kept(IDMVehicle),
+        restore_class_parameters(IDMVehicle),
         warnings.catch_warnings(),
     ):  # an older version is asked for on purpose: results belong to a version
         warnings.filterwarnings("ignore", message=".*is out of date", category=DeprecationWarning)
@@ -102,8 +102,8 @@ def make(env_id: str, config: Mapping[str, Any] | None) -> gym.Env[Any, Any]:
     return env
 
 
-def portable(ego: Any) -> Any:
-    """An ego without what training hung on it: of a Stable-Baselines3 model the policy, with its statistics."""
+def strip_ego(ego: Any) -> Any:
+    """Return an ego without the objects of its training: of a Stable-Baselines3 model the policy and its statistics."""
     if isinstance(ego, str):
         if ego == "idm":
             return ego
@@ -115,11 +115,11 @@ def portable(ego: Any) -> Any:
             return ego
         raise ValueError(f"Expected an ego with a method predict(observation, ...), got {type(ego).__name__}.")
     statistics = getattr(ego, "get_vec_normalize_env", None)
-    return ego if statistics is None else Bare(ego.policy, statistics())
+    return ego if statistics is None else BarePolicy(ego.policy, statistics())
 
 
-def check_spaces(ego: Any, env: gym.Env[Any, Any]) -> None:
-    """Refuse an ego that was made for other observations or actions; one that does not tell is taken at its word.
+def check_ego_spaces(ego: Any, env: gym.Env[Any, Any]) -> None:
+    """Refuse an ego that was made for other observations or actions; one that declares no spaces is accepted.
 
     Raises:
         ValueError: If its spaces do not fit.
@@ -135,15 +135,15 @@ def check_spaces(ego: Any, env: gym.Env[Any, Any]) -> None:
 
 
 @dataclass(frozen=True)
-class Driven:
+class DriveRunner:
     """An environment and its ego, ready to drive."""
 
     env: HighwayEnvScenario
     ego: Any
     seconds: float
 
-    def f(self, x: NDArray[np.float64]) -> float:
-        """The measure of the drive from x, shape (d,).
+    def measure_drive(self, x: NDArray[np.float64]) -> float:
+        """Return the measure of the drive from x, shape (d,).
 
         Raises:
             ValueError: If the ego's action is not finite.
@@ -151,10 +151,10 @@ class Driven:
         env = self.env
         observation, _ = env.reset(options={"x": x})
         if self.ego is None:
-            let_idm_drive(env)
+            replace_ego_by_idm(env)
         period, memory = 1.0 / env.scene.config["policy_frequency"], None
         for step in range(round(self.seconds / period)):
-            action: Any = idle(env.action_space)
+            action: Any = make_idle_action(env.action_space)
             if self.ego is not None:
                 action, memory = self.ego.predict(
                     np.asarray(observation)[None], state=memory, episode_start=np.array([step == 0]), deterministic=True
@@ -168,12 +168,12 @@ class Driven:
         return env.measured
 
 
-def idle(space: gym.Space[Any]) -> Any:
-    """An action that an ego which decides for itself ignores."""
+def make_idle_action(space: gym.Space[Any]) -> Any:
+    """Return an action for an ego that ignores it because it decides itself."""
     return 1 if isinstance(space, gym.spaces.Discrete) else np.zeros(space.shape or (), dtype=np.float32)
 
 
-def let_idm_drive(env: HighwayEnvScenario) -> None:
+def replace_ego_by_idm(env: HighwayEnvScenario) -> None:
     """Put HighwayEnv's own `IDMVehicle`, with HighwayEnv's parameters, in the place of the ego."""
     inner = env.scene
     old = inner.vehicle
@@ -198,20 +198,20 @@ def one_thread() -> Iterator[None]:
             torch.set_num_threads(before)
 
 
-_driven: Driven | None = None
-"""Of a worker process."""
+_worker_runner: DriveRunner | None = None
+"""The environment and ego of a worker process."""
 
 
-def begin(blob: bytes) -> None:
-    """Make environment and ego in a worker process."""
-    global _driven
+def start_worker(blob: bytes) -> None:
+    """Make environment and ego in a worker process, from the bytes of a pickled `DriveTask`."""
+    global _worker_runner
     import cloudpickle
 
-    _driven = cloudpickle.loads(blob).ready()
+    _worker_runner = cloudpickle.loads(blob).build()
 
 
-def drive(x: NDArray[np.float64]) -> float:
-    """One drive in a worker process."""
-    assert _driven is not None
+def drive_in_worker(x: NDArray[np.float64]) -> float:
+    """Return f(x) of one drive in a worker process."""
+    assert _worker_runner is not None
     with one_thread():
-        return _driven.f(x)
+        return _worker_runner.measure_drive(x)

@@ -1,4 +1,4 @@
-"""How HighwayEnv spaces vehicles on its highway, as a distribution."""
+"""Distribution of speeds and gaps on HighwayEnv's highway."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -7,11 +7,14 @@ import numpy as np
 
 from rare_envs.distributions.beta import BetaDistribution
 from rare_envs.distributions.space import Array
-from rare_envs.interop.parameters import LENGTH, beta
+from rare_envs.interop.parameters import HIGHWAY_ENV_LENGTH, make_beta
+
+STANDSTILL_SPACING, TIME_SPACING, JITTER = 12.0, 1.0, (0.9, 1.1)
+"""Spacing of `Vehicle.create_random`: at standstill [m], per speed [s], and the range of its random factor."""
 
 
 @dataclass(frozen=True, eq=False)
-class SpacingLaw:
+class SpacingDistribution:
     """Speeds and gaps of vehicles as `Vehicle.create_random` draws them, speeds first.
 
     Speeds are uniform; a vehicle of speed v is put (12 m + 1 s x v) x factor x U ahead of the one before it, centre to
@@ -37,32 +40,32 @@ class SpacingLaw:
     @property
     def least(self) -> float:
         """The shortest gap [m]."""
-        return 0.9 * self.factor * (12.0 + self.low) - LENGTH
+        return JITTER[0] * self.factor * (STANDSTILL_SPACING + TIME_SPACING * self.low) - HIGHWAY_ENV_LENGTH
 
     def _uniform(self) -> BetaDistribution:
         k = self.vehicles
-        return beta(1.0, [self.low] * k + [0.9] * k, [self.high] * k + [1.1] * k)
+        return make_beta(1.0, [self.low] * k + [JITTER[0]] * k, [self.high] * k + [JITTER[1]] * k)
 
     def _scale(self, speed: Array) -> Array:
-        return self.factor * (12.0 + speed)
+        return self.factor * (STANDSTILL_SPACING + TIME_SPACING * speed)
 
     def _gaps(self, points: Array, change: Callable[[Array, Array], Array]) -> Array:
-        """Points with their second half changed, given the scale that their first half makes."""
+        """Return points with their second half changed, given the scale that their first half makes."""
         speed, rest = np.split(np.array(points, dtype=np.float64), 2, axis=1)
         return np.hstack([speed, change(rest, self._scale(speed))])
 
     def _in_metres(self, points: Array) -> Array:
-        return self._gaps(points, lambda u, scale: u * scale - LENGTH)
+        return self._gaps(points, lambda u, scale: u * scale - HIGHWAY_ENV_LENGTH)
 
     def _in_spacings(self, points: Array) -> Array:
-        return self._gaps(points, lambda gap, scale: (gap + LENGTH) / scale)
+        return self._gaps(points, lambda gap, scale: (gap + HIGHWAY_ENV_LENGTH) / scale)
 
     def sample(self, n: int, rng: np.random.Generator) -> Array:
-        """Independent points, shape (n, 2 K)."""
+        """Draw independent points, shape (n, 2 K)."""
         return self._in_metres(self._uniform().sample(n, rng))
 
     def log_prob(self, x: Array) -> Array:
-        """Log density, (n, 2 K) -> (n,)."""
+        """Return the log density, (n, 2 K) -> (n,)."""
         scale = self._scale(np.asarray(x)[:, : self.vehicles])
         return np.asarray(self._uniform().log_prob(self._in_spacings(x)) - np.log(scale).sum(axis=1))
 

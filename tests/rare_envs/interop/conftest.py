@@ -5,10 +5,10 @@ from collections.abc import Iterator
 import pytest
 from highway_env.vehicle.behavior import IDMVehicle
 
-from rare_envs.interop.parameters import class_kept
+from rare_envs.interop.parameters import restore_class_parameters
 
 
 @pytest.fixture(autouse=True)
 def unchanged_class() -> Iterator[None]:
-    with class_kept(IDMVehicle):
+    with restore_class_parameters(IDMVehicle):
         yield

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rare_envs.interop.fast_observation import quicken
-from rare_envs.interop.simulation import make
+from rare_envs.interop.fast_observation import install_fast_observation
+from rare_envs.interop.simulation import make_highway_env
 
 FEATURES = ["presence", "x", "y", "vx", "vy", "heading", "cos_h", "sin_h", "long_off", "cos_d"]
 KINDS: dict[str, tuple[str, dict[str, Any]]] = {
@@ -29,8 +29,8 @@ KINDS: dict[str, tuple[str, dict[str, Any]]] = {
 @pytest.mark.parametrize("kind", list(KINDS))
 def test_same_bits(kind: str) -> None:
     env_id, config = KINDS[kind]
-    slow, fast = make(env_id, config), make(env_id, config)
-    quicken(fast.unwrapped)
+    slow, fast = make_highway_env(env_id, config), make_highway_env(env_id, config)
+    install_fast_observation(fast.unwrapped)
     np.testing.assert_array_equal(slow.reset(seed=3)[0], fast.reset(seed=3)[0])
     for action in (1, 0, 2, 1):
         one, other = slow.step(action), fast.step(action)
@@ -41,8 +41,8 @@ def test_same_bits(kind: str) -> None:
 
 
 def test_blind_egos_see_zeros() -> None:
-    env = make("highway-fast-v0", {"vehicles_count": 2})
-    quicken(env.unwrapped, blind=True)
+    env = make_highway_env("highway-fast-v0", {"vehicles_count": 2})
+    install_fast_observation(env.unwrapped, blind=True)
     observation = env.reset(seed=0)[0]
     assert observation.shape == (5, 5)
     assert not observation.any()

@@ -17,8 +17,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 import rare_envs
 import samplers
 from rare_envs.egos.wrappers import fitted
-from rare_envs.interop.measures import CLOSENESS, contact_time
-from rare_envs.interop.simulation import make, portable
+from rare_envs.interop.measures import HIGHWAY_ENV_MEASURES, contact_time
+from rare_envs.interop.simulation import make_highway_env, strip_ego
 from rare_envs.traffic.oriented_boxes import axes_of, project_on_axes, time_to_contact
 from tests.rare_envs.interop.egos import Always, faster
 
@@ -34,7 +34,7 @@ def fast(ego: Any = IDLE, **kwargs: Any) -> rare_envs.HighwayEnvProblem:
 
 def test_f_is_the_measure_of_the_drive_that_the_wrapper_shows() -> None:
     problem = fast(Always(3))
-    env = rare_envs.HighwayEnvScenario(make("highway-fast-v0", FAST), vehicles=2)
+    env = rare_envs.HighwayEnvScenario(make_highway_env("highway-fast-v0", FAST), vehicles=2)
     x = problem.base.sample(6, np.random.default_rng(0))
     x[:2, problem.space.names.index("speed")] = 5.0  # slow vehicles ahead
     f = problem.evaluate(x)
@@ -60,13 +60,13 @@ def test_workers_and_their_number_change_no_bit() -> None:
 
 
 def test_a_model_of_stable_baselines3_is_an_ego() -> None:
-    env = make("highway-fast-v0", FAST)
+    env = make_highway_env("highway-fast-v0", FAST)
     model = DQN("MlpPolicy", env, seed=0, buffer_size=10, policy_kwargs={"net_arch": [8]})
     problem = fast(model)
     x = problem.base.sample(2, np.random.default_rng(2))
     f = problem.evaluate(x)
     assert np.isfinite(f).all()
-    scenario = rare_envs.HighwayEnvScenario(make("highway-fast-v0", FAST), vehicles=2)
+    scenario = rare_envs.HighwayEnvScenario(make_highway_env("highway-fast-v0", FAST), vehicles=2)
     observation, _ = scenario.reset(options={"x": x[0]})
     over = False
     while not over:
@@ -76,12 +76,12 @@ def test_a_model_of_stable_baselines3_is_an_ego() -> None:
 
 
 def test_statistics_of_a_model_travel_without_its_environment() -> None:
-    vec_env = VecNormalize(DummyVecEnv([lambda: make("highway-fast-v0", FAST)]))
+    vec_env = VecNormalize(DummyVecEnv([lambda: make_highway_env("highway-fast-v0", FAST)]))
     model = DQN("MlpPolicy", vec_env, seed=0, buffer_size=10, policy_kwargs={"net_arch": [8]})
     vec_env.obs_rms.mean[...] = 0.5  # type: ignore[union-attr]
     seen = np.random.default_rng(0).uniform(-1.0, 1.0, (1, 5, 5)).astype(np.float32)
     expected = model.predict(np.asarray(vec_env.normalize_obs(seen)), deterministic=True)[0]
-    there = fitted(pickle.loads(pickle.dumps(portable(model))), vec_env.observation_space)
+    there = fitted(pickle.loads(pickle.dumps(strip_ego(model))), vec_env.observation_space)
     assert there.normalise(seen)[0, 0, 0] == pytest.approx(vec_env.normalize_obs(seen)[0, 0, 0])  # type: ignore[call-overload]
     np.testing.assert_array_equal(there.predict(seen)[0], expected)
 
@@ -181,12 +181,14 @@ def test_contact_time_is_that_of_the_tensor_implementation() -> None:
 
 
 def test_measures_by_hand() -> None:
-    env = rare_envs.HighwayEnvScenario(make("highway-fast-v0", {**FAST, "vehicles_count": 2}), vehicles=2)
+    env = rare_envs.HighwayEnvScenario(make_highway_env("highway-fast-v0", {**FAST, "vehicles_count": 2}), vehicles=2)
     env.reset(options={"ego_lane": 0, "ego_speed": 30.0, "speed": [20.0, 10.0], "gap": [30.0, 2.0], "lane": [1, 0]})
-    assert CLOSENESS["front_ttc"](env.scene) == pytest.approx(37.0 / 20.0)  # the second one: 30 + 5 + 2 m ahead
-    assert CLOSENESS["ttc"](env.scene) == pytest.approx(37.0 / 20.0)  # the other lane's is passed by
+    assert HIGHWAY_ENV_MEASURES["front_ttc"](env.scene) == pytest.approx(
+        37.0 / 20.0
+    )  # the second one: 30 + 5 + 2 m ahead
+    assert HIGHWAY_ENV_MEASURES["ttc"](env.scene) == pytest.approx(37.0 / 20.0)  # the other lane's is passed by
     env.reset(options={"ego_lane": 0, "ego_speed": 30.0, "speed": [20.0, 10.0], "gap": [30.0, 2.0], "lane": [1, 1]})
-    assert (CLOSENESS["front_ttc"](env.scene), CLOSENESS["ttc"](env.scene)) == (10.0, 10.0)
+    assert (HIGHWAY_ENV_MEASURES["front_ttc"](env.scene), HIGHWAY_ENV_MEASURES["ttc"](env.scene)) == (10.0, 10.0)
 
 
 def test_a_measure_of_ones_own() -> None:
@@ -205,7 +207,7 @@ def test_what_p_is_conditional_on() -> None:
 
 
 def test_bad_input_is_refused_at_the_door() -> None:
-    wide = make("highway-fast-v0", {**FAST, "observation": {"type": "Kinematics", "vehicles_count": 7}})
+    wide = make_highway_env("highway-fast-v0", {**FAST, "observation": {"type": "Kinematics", "vehicles_count": 7}})
     model = DQN("MlpPolicy", wide, buffer_size=10)
     cases: list[tuple[Any, dict[str, Any], str]] = [
         (model, {}, "made for observations .* config that the ego was trained with"),

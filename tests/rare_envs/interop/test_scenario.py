@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from rare_envs import HighwayEnvScenario
-from rare_envs.interop.simulation import make
+from rare_envs.interop.simulation import make_highway_env
 
 SMALL = {"vehicles_count": 6, "duration": 5}
 CONFIGS: dict[str, dict[str, Any] | None] = {
@@ -24,7 +24,7 @@ CONFIGS: dict[str, dict[str, Any] | None] = {
 
 
 def scenario(env_id: str, **kwargs: Any) -> Any:
-    return HighwayEnvScenario(make(env_id, CONFIGS[env_id]), **kwargs)
+    return HighwayEnvScenario(make_highway_env(env_id, CONFIGS[env_id]), **kwargs)
 
 
 def others(env: Any) -> list[Any]:
@@ -121,7 +121,7 @@ def read_back(env: Any, env_id: str) -> dict[str, Any]:
 
 @pytest.mark.parametrize("env_id", ["highway-fast-v0", "merge-v1", "roundabout-v1"])
 def test_a_scene_of_highway_env_put_back_by_its_parameters_drives_the_same(env_id: str) -> None:
-    plain, env = make(env_id, CONFIGS[env_id]), scenario(env_id, fixed="highway_env")
+    plain, env = make_highway_env(env_id, CONFIGS[env_id]), scenario(env_id, fixed="highway_env")
     for seed in (3, 4):
         observation, _ = plain.reset(seed=seed)
         given = read_back(plain, env_id)
@@ -141,7 +141,7 @@ def test_a_scene_of_highway_env_put_back_by_its_parameters_drives_the_same(env_i
 
 
 def draws(env_id: str, n: int) -> NDArray[np.float64]:
-    plain, rows = make(env_id, CONFIGS[env_id]), []
+    plain, rows = make_highway_env(env_id, CONFIGS[env_id]), []
     for seed in range(n):
         plain.reset(seed=seed)
         given = read_back(plain, env_id)
@@ -229,7 +229,7 @@ def test_wrong_environments_and_settings_are_refused() -> None:
         (gym.make("CartPole-v1"), "Expected an environment of HighwayEnv"),
         (gym.make("parking-v0"), "No parameters are known for ParkingEnv"),
         (gym.make("merge-generic-v1"), "No parameters are known"),
-        (gym.wrappers.FlattenObservation(make("highway-fast-v0", SMALL)), "put wrappers around this one"),
+        (gym.wrappers.FlattenObservation(make_highway_env("highway-fast-v0", SMALL)), "put wrappers around this one"),
     ):
         with pytest.raises(ValueError, match=message):
             HighwayEnvScenario(env)
@@ -246,7 +246,7 @@ def test_wrong_environments_and_settings_are_refused() -> None:
     with pytest.raises(ValueError, match="vehicles from 4 to 4"):
         scenario("merge-v1", vehicles=2)
     with pytest.raises(ValueError, match="did you mean 'highway-fast-v0'"):
-        make("highway-fst-v0", None)
+        make_highway_env("highway-fst-v0", None)
 
 
 def test_equal_seeds_draw_equal_scenarios() -> None:

@@ -19,7 +19,7 @@ import agents
 import rare_envs
 import samplers
 from rare_envs import HighwayEnvScenario
-from rare_envs.interop.parameters import class_kept
+from rare_envs.interop.parameters import restore_class_parameters
 from rare_envs.scenarios.registry import SCENARIOS
 
 Cli = Callable[..., Result]
@@ -257,7 +257,7 @@ def test_list_shows_what_there_is(cli: Cli) -> None:
         assert all(each["unit"] and each["meaning"] for each in listed)
         assert environment["kinematics_id"] in gym.registry
         assert environment["kinematics_id"] in shown
-    with class_kept(IDMVehicle):  # the intersection changes it for all
+    with restore_class_parameters(IDMVehicle):  # the intersection changes it for all
         for env_id in entries["highway_env"]:
             assert HighwayEnvScenario(gym.make(env_id)).space.dim > 0
             assert env_id in " ".join(shown.split())
