@@ -100,6 +100,17 @@ class Stack:
         return cls(**given)
 
 
+def ticks_per_plan(stack: Stack, world: World) -> int:
+    """Return the number of ticks from plan to plan."""
+    return max(1, round(stack.period / world.clock.dt))
+
+
+def noise_shape(stack: Stack, world: World) -> tuple[int, int]:
+    """Return the shape of an episode's standard normal draws: plans, and errors K of the ego and the other vehicles."""
+    plans = math.ceil(world.clock.ticks / ticks_per_plan(stack, world))
+    return plans, OWN_ERRORS + ERRORS_PER_VEHICLE * (world.scenario.vehicles - 1)
+
+
 @dataclass(frozen=True)
 class NoisyEgo:
     """An ego behind a stack; a `DrivingProblem` turns it into a driver of its world."""
@@ -117,8 +128,12 @@ class NoisyEgo:
         """Whether the ego behind the stack says that its answers repeat; the stack's own noise does, by x."""
         return getattr(self.ego, "deterministic", None)
 
+    def noise_columns(self, world: World) -> int:
+        """Return how many standard normal columns of x are the stack's noise in a world."""
+        return math.prod(noise_shape(self.stack, world)) if world.noise is True else 0
+
     def in_world(self, world: World) -> NoisyDriver:
-        """The driver that it is in a world.
+        """Return the driver that it is in a world.
 
         Raises:
             ValueError: The ego does not fit the world, or decides meta-actions.
@@ -152,29 +167,23 @@ class NoisyDriver:
     """Standard normal, shape (B, plans, K); None for what the world's noise says without columns of x."""
 
     @property
-    def sees(self) -> bool:
-        """Whether the ego looks by itself."""
-        return bool(getattr(self.inner, "sees", False))
-
-    @property
     def every(self) -> int:
         """Ticks from plan to plan."""
-        return max(1, round(self.stack.period / self.world.clock.dt))
+        return ticks_per_plan(self.stack, self.world)
 
     @property
     def shape(self) -> tuple[int, int]:
         """Of an episode's draws: plans and K."""
-        others = self.world.scenario.vehicles - 1
-        return math.ceil(self.world.clock.ticks / self.every), OWN_ERRORS + ERRORS_PER_VEHICLE * others
+        return noise_shape(self.stack, self.world)
 
     @property
-    def columns(self) -> int:
+    def noise_columns(self) -> int:
         """How many columns of x are its noise, the last ones."""
         return math.prod(self.shape) if self.world.noise is True else 0
 
-    def with_draws(self, columns: Tensor) -> NoisyDriver:
-        """The driver in B episodes, from standard normal columns (B, `columns`)."""
-        return replace(self, draws=columns.reshape(-1, *self.shape))
+    def with_draws(self, draws: Tensor) -> NoisyDriver:
+        """Return the driver of B episodes with standard normal draws, shape (B, `noise_columns`)."""
+        return replace(self, draws=draws.reshape(-1, *self.shape))
 
     def act(self, episode: Episode, memory: Any) -> tuple[Tensor, Any]:
         """See late and wrongly, plan now and then, and do it with a lag; see `rare_envs.simulation.rollout.Driver`."""

@@ -14,7 +14,7 @@ from agents.names import RULE_BASED, SHIPPED_DRIVERS, SHIPPED_EGOS, VISION
 from agents.python_function import call_factory
 from agents.sb3.saved_ego import load_saved_ego
 from agents.vision.checkpoint import holds_vision, load_vision
-from rare_envs.egos.faults import EgoGone
+from rare_envs.egos.errors import EgoGone
 from rare_envs.plugins import did_you_mean
 
 EXPECTED: Final = (

@@ -17,13 +17,18 @@ from rare_envs.sensors.camera import find_camera
 from rare_envs.sensors.kinds import read_kinds
 from rare_envs.simulation.background import find_drivers
 from rare_envs.simulation.clock import Clock
+from rare_envs.simulation.ego_needs import EgoNeeds
 from rare_envs.simulation.measurement import Measurement
 from rare_envs.simulation.sensing import Sensing
 from rare_envs.simulation.world import World
 
+NO_NEEDS = EgoNeeds()
+
 
 def set_up(
     env_id: str,
+    needs: EgoNeeds = NO_NEEDS,
+    /,
     *,
     observation: str | list[str] | tuple[str, ...] = "features",
     action: str = "continuous",
@@ -42,6 +47,7 @@ def set_up(
 
     Args:
         env_id: For example "rare_envs/CutIn-v0".
+        needs: What the ego needs beside the keyword arguments.
         observation: "features", "lidar", "kinematics" (HighwayEnv's) or "camera"; several, such as "camera+lidar" or
             ("camera", "lidar"), make a `Dict`.
         action: "continuous" or "meta" (HighwayEnv's, see `rare_envs.control.meta_actions`: a step is then one second).
@@ -72,7 +78,7 @@ def set_up(
     """
     scenario = find_scenario(env_id)
     for name in unknown:
-        known = [word for word in inspect.signature(set_up).parameters if word not in ("env_id", "unknown")]
+        known = [word for word in inspect.signature(set_up).parameters if word not in ("env_id", "needs", "unknown")]
         of_reset = name in (parameter.name for parameter in scenario.parameters)
         hint = " (reset takes it as an option)" if of_reset else did_you_mean(name, known)
         raise TypeError(f"{env_id} takes no keyword argument {name!r}{hint}; it takes {', '.join(known)}.")
@@ -83,13 +89,13 @@ def set_up(
     background = find_drivers(scenario.drivers if drivers is None else drivers)
     world = World(
         scenario,
-        sensing=Sensing(kinds, find_camera(camera), weather),
+        sensing=Sensing(kinds, find_camera(camera), weather, needs.lidar),
         background=background,
         measurement=Measurement(named_measure(measure), collisions),
         clock=Clock(dt, scenario.horizon if horizon is None else horizon, action),
         noise=noise,
     )
-    space = space_of(world, load_base(scenario, base))
+    space = space_of(world, load_base(scenario, base), needs.noise_columns(world))
     if not isinstance(world.measurement.measure, str):
         _try_measure(world, space)
     return world, space
@@ -112,12 +118,13 @@ def _try_measure(world: World, space: ScenarioSpace) -> None:
         raise ValueError(f"Expected finite numbers from the measure {measure!r}, got {f.tolist()}.")
 
 
-def space_of(world: World, base: Distribution) -> ScenarioSpace:
+def space_of(world: World, base: Distribution, ego_noise: int = 0) -> ScenarioSpace:
     """The parameters of a world: the scenario's, then the weather's, its drivers' weights and all noise.
 
     Args:
         world: The world.
         base: Distribution of the scenario's own parameters.
+        ego_noise: Number of columns of the ego's own noise, the last ones.
     """
     parameters, distributions, sizes = list(world.scenario.parameters), [base], world.columns
     for weather, distribution in world.weather_distributions:
@@ -132,6 +139,9 @@ def space_of(world: World, base: Distribution) -> ScenarioSpace:
     if sizes.camera_noise:
         parameters.append(Parameter("camera_noise", "", -np.inf, np.inf, "from which the noise of all pixels follows"))
         distributions.append(NoiseDistribution(1))
+    if ego_noise:
+        parameters.append(Parameter("ego_noise", "", -np.inf, np.inf, "of the ego", ego_noise))
+        distributions.append(NoiseDistribution(ego_noise))
     names = [p.name for p in parameters]
     twice = {name for name in names if names.count(name) > 1}
     if twice:
@@ -140,20 +150,6 @@ def space_of(world: World, base: Distribution) -> ScenarioSpace:
             "have; rename them."
         )
     return ScenarioSpace.of(parameters, join_independent(*distributions))
-
-
-def with_noise(space: ScenarioSpace, name: str, size: int) -> ScenarioSpace:
-    """The space with a further block of noise, standard normal columns behind the others; as it is for size 0."""
-    if not size:
-        return space
-    return ScenarioSpace(
-        names=(*space.names, name),
-        units=(*space.units, ""),
-        low=np.append(space.low, np.full(size, -np.inf)),
-        high=np.append(space.high, np.full(size, np.inf)),
-        base=join_independent(space.base, NoiseDistribution(size)),
-        sizes=(*space.sizes, size),
-    )
 
 
 def _one_of(what: str, value: object, valid: tuple[str, ...]) -> None:

@@ -12,14 +12,13 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rare_envs.distributions.space import Distribution, ScenarioSpace
-from rare_envs.egos.faults import reason_of
+from rare_envs.egos.errors import reason_of
+from rare_envs.egos.needs import resolve
 from rare_envs.egos.policy import PolicyDriver, as_driver
-from rare_envs.egos.wrappers import observation_for
-from rare_envs.make import set_up, with_noise
+from rare_envs.make import set_up
 from rare_envs.scenarios.registry import find_scenario
-from rare_envs.sensors.kinds import kinds_of
 from rare_envs.simulation.measurement import Measurement
-from rare_envs.simulation.rollout import rollout
+from rare_envs.simulation.rollout import StochasticDriver, rollout
 from rare_envs.simulation.world import World
 from rare_envs.traffic.crash import CRASH_KINDS, Crash
 
@@ -94,18 +93,16 @@ class DrivingProblem:
         self.ego = ego
         self.world: World
         self.space: ScenarioSpace
-        vehicles = find_scenario(env_id).vehicles
+        scenario = find_scenario(env_id)
         with _ego_errors_as_value_errors(ego):
-            make_kwargs["observation"] = make_kwargs.get("observation") or observation_for(ego, vehicles)
-        self.world, self.space = set_up(env_id, measure=measure, base=base, noise=noise, **make_kwargs)
+            self.needs = resolve(ego, scenario.vehicles)
+        make_kwargs["observation"] = make_kwargs.get("observation") or self.needs.observation
+        self.world, self.space = set_up(env_id, self.needs, measure=measure, base=base, noise=noise, **make_kwargs)
         with _ego_errors_as_value_errors(ego):
             self.driver = as_driver(ego, self.world)
-            self.varies: bool = getattr(ego, "deterministic", None) is False
+        self.varies = self.needs.varies
         for note in self.notes:
             warnings.warn(note, AmbiguousActions, stacklevel=2)
-        self.space = with_noise(self.space, "ego_noise", getattr(self.driver, "columns", 0))
-        if getattr(self.driver, "sees", False):
-            self.world = self.world.with_lidar()
 
     @property
     def dim(self) -> int:
@@ -115,8 +112,8 @@ class DrivingProblem:
     @property
     def notes(self) -> tuple[str, ...]:
         """What could not be checked and may be meant otherwise; an `AmbiguousActions` warning has said it."""
-        meant = self.world.clock.action == "continuous" and "kinematics" in kinds_of(self.world.sensing.observation)
-        return (AMBIGUOUS,) if meant and isinstance(getattr(self.ego, "action_space", None), spaces.Discrete) else ()
+        accelerations = self.world.clock.action == "continuous" and "kinematics" in self.world.sensing.kinds
+        return (AMBIGUOUS,) if accelerations and isinstance(self.needs.action_space, spaces.Discrete) else ()
 
     @property
     def given(self) -> str:
@@ -124,7 +121,7 @@ class DrivingProblem:
         fixed = ["the ego's own noise is not part of x, so that failures may not replay"] if self.varies else []
         if self.world.noise != "fixed":
             return ", ".join(fixed)
-        if hasattr(self.driver, "columns"):
+        if isinstance(self.driver, StochasticDriver):
             fixed.append("the ego's noise is one fixed sequence")
         if self.world.background is not None and self.world.background.noisy:
             fixed.append("the drivers' noise is one fixed sequence")
@@ -200,8 +197,7 @@ class DrivingProblem:
     @property
     def tile(self) -> int:
         """Rollouts at once: `evaluate` simulates so many rows together, then the next."""
-        asked = getattr(self.driver, "inner", self.driver)
-        if isinstance(asked, PolicyDriver) and "camera" in kinds_of(self.world.sensing.observation):
+        if self.needs.queries_policy and "camera" in self.world.sensing.kinds:
             return CAMERA_TILE
         if self.world.uses_lidar or self.world.measurement.records:
             return LIDAR_TILE
@@ -216,7 +212,7 @@ class DrivingProblem:
                 rows = torch.from_numpy(x[first : first + tile]).float()
                 driver, mine = self.driver, dict[int, str]()
                 if lost is not None and isinstance(driver, PolicyDriver):
-                    driver = replace(driver, lost=mine)
+                    driver = replace(driver, failed_rows=mine)
                 f[first : first + tile] = rollout(self.world, driver, rows).f.numpy()
                 if lost is not None:
                     lost.update({first + row: reason for row, reason in mine.items()})

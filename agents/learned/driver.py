@@ -171,7 +171,7 @@ class LearnedEgo:
     """
 
     driver: LearnedDriver
-    sees: ClassVar[bool] = True
+    needs_lidar: ClassVar[bool] = True
     """It needs a world in which vehicles look."""
 
     @property

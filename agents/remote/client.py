@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from agents.remote import protocol
 from agents.remote.protocol import MalformedMessage, Message
 from agents.remote.request_handler import decode_space
-from rare_envs.egos.faults import EgoGone, NoAnswer
+from rare_envs.egos.errors import EgoGone, NoAnswer
 from rare_envs.sensors.kinds import batch_size
 
 TIMEOUT, PATIENCE = 10.0, 30.0

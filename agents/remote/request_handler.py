@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from agents.remote import protocol
 from agents.remote.protocol import MalformedMessage, Message
-from rare_envs.egos.faults import EgoGone, reason_of
+from rare_envs.egos.errors import EgoGone, reason_of
 
 MAX_PEERS, MAX_SESSIONS = 64, 64
 """How many are remembered; the one unused for longest makes room."""

@@ -1,56 +1,63 @@
-"""What becomes of scenarios on which an ego fails: found, tried again, written down, and the others kept."""
+"""Faults: scenarios on which an ego fails are found, repeated and recorded, and the others kept."""
 
 from __future__ import annotations
 
-import math
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-ON_ERROR = ("raise", "failure", "bound")
+from rare_envs.egos.errors import EgoFault
+from rare_envs.egos.isolation import isolate_failing_rows
 
-
-class EgoGone(BaseException):
-    """The ego cannot be asked any more, whatever the scenario.
-
-    Like KeyboardInterrupt it is no `Exception`: nobody who makes the best of failing scenarios may take it for one.
-    """
-
-
-class NoAnswer(RuntimeError):
-    """The ego has not answered in time, or has died: perhaps because of one of the rows that it was asked about."""
-
-
-class EgoFault(ValueError):
-    """The ego has failed on a scenario, twice."""
-
-    final = True
-    """It has been asked again."""
+ON_FAULT = ("raise", "failure", "bound")
+"""Ways with a scenario on which the ego fails twice: an error, or NaN that counts as a failure or bounds p."""
 
 
 class Fault(NamedTuple):
     """A scenario on which the ego failed."""
 
-    x: FloatArray
+    x: NDArray[np.float64]
     """Its parameters, shape (d,)."""
     reason: str
     """What went wrong, in one line."""
 
 
+@runtime_checkable
+class RowwiseProblem(Protocol):
+    """A problem that goes on with the other rows when the ego fails on some."""
+
+    def attempt(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], dict[int, str]]:
+        """Return f of x (n, d), shape (n,), NaN in rows that failed, and the reasons by row."""
+
+
+@runtime_checkable
+class ConditionalProblem(Protocol):
+    """A problem whose probability is conditional on something."""
+
+    @property
+    def given(self) -> str:
+        """What p is conditional on, in words; empty if on nothing."""
+
+
 class FaultTolerant:
     """A problem around one whose ego may raise, hang (if remote), die, or give NaN or actions of a wrong shape.
 
-    Rows on which it fails are found: at the tick at which they do if it has no memory, else by handing the batch over
-    in parts (see `part_size`) until they stand alone. They are simulated once more. If the ego fails on them again f
-    is NaN, which `samplers.estimate(..., on_error="failure" or "bound")` counts, and what happened is kept. The
-    simulations that this costs are not in `n_sim`; they are counted here.
+    Rows on which it fails are found: at the tick at which they do if it has no memory, else by splitting the batch
+    (see `rare_envs.egos.isolation.part_size`) until they stand alone. They are simulated once more. If the ego fails
+    on them again f is NaN, which `samplers.estimate(..., on_error="failure" or "bound")` counts, and what happened is
+    recorded. The simulations that this costs are not in `n_sim`; they are counted here.
 
     Attributes:
-        problem: What is asked.
+        problem: The problem that is evaluated.
         faults: Scenarios that failed twice, in the order they were met.
-        n_retried: Rows handed over again.
+        n_retried: Rows simulated again.
+
+    Example:
+        >>> import rare_envs
+        >>> problem = FaultTolerant(rare_envs.DrivingProblem("rare_envs/CarFollowing-v0"))
+        >>> problem.evaluate([[20.0, 15.0, 30.0]]).shape, problem.faults
+        ((1,), [])
     """
 
     def __init__(self, problem: Any, on_error: str = "failure") -> None:
@@ -64,8 +71,8 @@ class FaultTolerant:
         Raises:
             ValueError: If on_error is none of these.
         """
-        if on_error not in ON_ERROR:
-            raise ValueError(f"Expected on_error {', '.join(map(repr, ON_ERROR))}, got {on_error!r}.")
+        if on_error not in ON_FAULT:
+            raise ValueError(f"Expected on_error {', '.join(map(repr, ON_FAULT))}, got {on_error!r}.")
         self.problem = problem
         self.faults: list[Fault] = []
         self.n_retried = 0
@@ -84,9 +91,9 @@ class FaultTolerant:
     @property
     def given(self) -> str:
         """What p is conditional on, as the problem says."""
-        return str(getattr(self.problem, "given", ""))
+        return self.problem.given if isinstance(self.problem, ConditionalProblem) else ""
 
-    def evaluate(self, x: FloatArray) -> FloatArray:
+    def evaluate(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Simulate.
 
         Args:
@@ -97,74 +104,43 @@ class FaultTolerant:
 
         Raises:
             EgoFault: If it failed twice and on_error is "raise".
-            EgoGone: If there is nobody to ask any more.
+            EgoGone: If the ego cannot be queried any more.
         """
         x = np.atleast_2d(np.asarray(x, dtype=np.float64))
-        f, reasons = self._in_parts(x, len(x))
+        f, reasons = self._evaluate_isolated(x)
         if not reasons:
             return f
         rows = sorted(reasons)
         self.n_retried += len(rows)
-        f[rows], again = self._in_parts(x[rows], len(rows))
+        f[rows], again = self._evaluate_isolated(x[rows])
         for number, reason in sorted(again.items()):
             fault = Fault(x[rows[number]].copy(), reason)
             if self._on_error == "raise":
-                raise EgoFault(f"The ego failed twice on x = {_shown(fault.x)}: {fault.reason}")
+                raise EgoFault(f"The ego failed twice on x = {_format_x(fault.x)}: {fault.reason}")
             self.faults.append(fault)
         return f
 
-    def _in_parts(self, x: FloatArray, whole: int) -> tuple[FloatArray, dict[int, str]]:
-        """f, NaN where a row failed, and the reasons by row; x is part of a batch of so many."""
-        try:
-            return self._attempt(x.copy())
-        except EgoGone:
-            raise
-        except (Exception, SystemExit) as error:  # the ego is the user's: anything may happen in it
-            if len(x) == 1:
-                return np.full(1, np.nan), {0: reason_of(error)}
-            size = part_size(len(x), error, whole)
-        self.n_retried += len(x)
-        parts, reasons = [], dict[int, str]()
-        for first in range(0, len(x), size):
-            f, found = self._in_parts(x[first : first + size], whole)
-            parts.append(f)
-            reasons |= {first + row: reason for row, reason in found.items()}
-        return np.concatenate(parts), reasons
+    def _evaluate_isolated(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], dict[int, str]]:
+        """Return f of x (n, d), shape (n,), NaN where a row failed, and the reasons by row."""
 
-    def _attempt(self, x: FloatArray) -> tuple[FloatArray, dict[int, str]]:
-        """F of a batch, and reasons where rows alone have failed, by the problem's `attempt` if it has one."""
-        attempt = getattr(self.problem, "attempt", None)
-        f, reasons = (self.problem.evaluate(x), {}) if attempt is None else attempt(x)
+        def attempt(rows: range) -> tuple[NDArray[np.float64], dict[int, str]]:
+            if len(rows) < len(x):
+                self.n_retried += len(rows)
+            f, reasons = self._attempt(x[rows.start : rows.stop].copy())
+            return f, {rows.start + row: reason for row, reason in reasons.items()}
+
+        found = isolate_failing_rows(attempt, lambda row: np.full(1, np.nan), range(len(x)))
+        assert found is not None
+        return np.concatenate(found[0]), found[1]
+
+    def _attempt(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], dict[int, str]]:
+        """Return f of a batch, and reasons where rows alone have failed, by the problem's `attempt` if it has one."""
+        f, reasons = (
+            self.problem.attempt(x) if isinstance(self.problem, RowwiseProblem) else (self.problem.evaluate(x), {})
+        )
         f = np.array(f, dtype=np.float64)
         return f, dict.fromkeys(np.flatnonzero(np.isnan(f)).tolist(), "f is NaN") | reasons
 
 
-def part_size(n: int, error: BaseException, whole: int) -> int:
-    """How many rows to ask about at a time after an error on n of them, to find those on which it happens.
-
-    Half of them, which takes the fewest questions. Where the error is that no answer came, questions are cheap, but
-    waiting for one that does not come, or for a process that starts again, is not: then the square root of the whole
-    batch, and after that each row alone. So a row is found by two more waits, not by one for each halving, in about
-    twice that root of questions.
-
-    Args:
-        n: Rows, 2 or more.
-        error: What happened.
-        whole: Rows of the batch that they are part of.
-    """
-    if not isinstance(error, NoAnswer):
-        return (n + 1) // 2
-    root = math.isqrt(whole)
-    return root if 1 < root < n else 1
-
-
-def reason_of(error: BaseException) -> str:
-    """What went wrong, in one line."""
-    words = " ".join(str(error).split())
-    if isinstance(error, ValueError) and words:  # ours say what is wrong by themselves
-        return words
-    return f"{type(error).__name__}: {words}" if words and not isinstance(error, SystemExit) else repr(error)
-
-
-def _shown(x: FloatArray) -> str:
+def _format_x(x: NDArray[np.float64]) -> str:
     return np.array2string(x, precision=6, threshold=8, separator=", ", max_line_width=10**6)

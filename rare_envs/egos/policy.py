@@ -13,7 +13,8 @@ from torch import Tensor
 from rare_envs.control.actions import DISCRETE_ACTIONS, IDLE, META_ACTIONS
 from rare_envs.control.idm import IDM
 from rare_envs.egos.inference import PolicyQuery, query_policy
-from rare_envs.egos.wrappers import fitted, frames_of, observation_for
+from rare_envs.egos.needs import WrappedEgo, observation_for, resolve
+from rare_envs.egos.wrappers import fitted, frames_of
 from rare_envs.sensors.kinds import each
 from rare_envs.simulation.background import Background
 from rare_envs.simulation.observation import observe
@@ -34,36 +35,38 @@ class PolicyDriver:
     action: str = "continuous"
     """What its actions are."""
     stride: int = 1
-    """It is asked every so many ticks; meta-actions only are carried out in between."""
-    lost: dict[int, str] | None = None
-    """Where rows are written down on which the policy fails, with the reason; None if such a failure is raised."""
+    """Ticks from one query to the next; in between meta-actions go on."""
+    failed_rows: dict[int, str] | None = None
+    """Takes the rows on which the policy fails, with the reason; None if such a failure is raised."""
 
     def act(self, episode: Episode, memory: Any) -> tuple[Tensor, Any]:
-        """Observe, and ask the policy for its mean action; a recurrent policy's hidden state is the memory.
+        """Observe, and query the policy for its mean action; a recurrent policy's hidden state is the memory.
 
         No episode shows a policy what comes after its collision, so those rows are shown what another row sees, and
-        their actions are ignored. So it is with rows that are lost.
+        their actions are ignored. The same holds for rows on which it failed before.
 
         Raises:
-            ValueError: If the policy's actions are not finite or have the wrong shape, and rows cannot be lost.
+            ValueError: If the policy's actions are not finite or have the wrong shape, and `failed_rows` is None.
         """
         state, over = episode.state, episode.collided
         batch = len(over)
         hidden, tick = (None, 0) if memory is None else memory
         if tick % self.stride:
             return torch.full((batch,), IDLE, device=state.x.device), (hidden, tick + 1)
-        if self.lost:
+        if self.failed_rows:
             over = over.clone()
-            over[list(self.lost)] = True
+            over[list(self.failed_rows)] = True
         seen = observe(episode, self.observation)
-        observation = each(lambda part: _replaced(part, over).numpy(force=True), seen)
+        observation = each(lambda part: _replace_rows(part, over).numpy(force=True), seen)
         start = np.full(batch, memory is None)
-        given, hidden = query_policy(self.policy, self.action, PolicyQuery(observation, hidden, start, over), self.lost)
+        given, hidden = query_policy(
+            self.policy, self.action, PolicyQuery(observation, hidden, start, over), self.failed_rows
+        )
         return given.to(state.x) if given.is_floating_point() else given, (hidden, tick + 1)
 
 
-def _replaced(observation: Tensor, rows: Tensor) -> Tensor:
-    """An observation with what the first other row sees in some rows; zeros if there is no other."""
+def _replace_rows(observation: Tensor, rows: Tensor) -> Tensor:
+    """Return an observation with what the first other row sees in some rows; zeros if there is no other."""
     wide = rows.view(-1, *[1] * (observation.ndim - 1))
     if bool(rows.all()):
         return observation.masked_fill(wide, 0)
@@ -71,10 +74,19 @@ def _replaced(observation: Tensor, rows: Tensor) -> Tensor:
 
 
 def as_driver(ego: Any, world: World) -> Driver:
-    """The Driver that an ego stands for.
+    """Return the Driver that an ego stands for in a world.
+
+    Args:
+        ego: "idm", a `Driver`, an object with `predict`, or a `rare_envs.egos.needs.WrappedEgo`.
+        world: The world; what `resolve` says that the ego needs it has.
+
+    Example:
+        >>> from rare_envs.scenarios.cut_in import CUT_IN
+        >>> type(as_driver("idm", World(CUT_IN))).__name__
+        'IDM'
 
     Raises:
-        ValueError: If it is neither "idm", nor a Driver, nor an object with `predict` whose spaces fit.
+        ValueError: If it is none of these, or its spaces do not fit.
     """
     if isinstance(ego, str):
         if ego == "idm":
@@ -85,36 +97,34 @@ def as_driver(ego: Any, world: World) -> Driver:
         )
     if isinstance(ego, type):
         raise ValueError(f"Expected an ego, got the class {ego.__name__}; make or train one of it first.")
-    if callable(getattr(ego, "in_world", None)):
-        made: Driver = ego.in_world(world)
-        return made
-    if getattr(ego, "sees", False):  # a Driver that looks by itself, whatever the environment observes
-        looking: Driver = ego
-        return looking
-    if callable(getattr(ego, "predict", None)):
-        expected = world.observation_space
-        check_spaces(ego, expected, world.clock.action)
-        tick = getattr(ego, "dt", None)
-        if tick is not None and tick != world.clock.dt:
-            raise ValueError(f"Expected dt={tick:g} s, which this ego remembers pictures by, got {world.clock.dt:g} s.")
-        return PolicyDriver(fitted(ego, expected), world.sensing.observation, world.clock.action, world.clock.stride)
+    if isinstance(ego, WrappedEgo):
+        return ego.in_world(world)
+    needs = resolve(ego, world.scenario.vehicles)
+    if needs.queries_policy:
+        check_spaces(ego, world.observation_space, world.clock.action)
+        if needs.dt is not None and needs.dt != world.clock.dt:
+            raise ValueError(
+                f"Expected dt={needs.dt:g} s, which this ego remembers pictures by, got {world.clock.dt:g} s."
+            )
+        policy = fitted(ego, world.observation_space)
+        return PolicyDriver(policy, world.sensing.observation, world.clock.action, world.clock.stride)
     if isinstance(ego, Background):
         raise ValueError("These drivers drive the traffic around an ego; as an ego take agents.LearnedEgo(driver).")
-    if callable(getattr(ego, "act", None)):
+    if callable(getattr(ego, "act", None)):  # anybody's object
         driver: Driver = ego
         return driver
     raise ValueError(f"Expected an ego with a method predict(observation, ...), got {type(ego).__name__}.")
 
 
 def check_spaces(ego: Any, expected: spaces.Space[Any], action: str = "continuous") -> None:
-    """Refuse an ego that was made for other observations or actions; one that does not tell is taken at its word.
+    """Refuse an ego that was made for other observations or actions; one that declares none is accepted.
 
     Bounds may differ: HighwayEnv declares none for the observations that are clipped here as there.
 
     Raises:
         ValueError: If its `observation_space` or `action_space` does not fit.
     """
-    observed = getattr(ego, "observation_space", None)
+    observed = getattr(ego, "observation_space", None)  # a Stable-Baselines3 model, or anybody's object
     if observed is not None and frames_of(expected, observed) is None:
         wanted = observation_for(ego)
         which = "another observation" if wanted == "features" else f"observation={wanted!r}"

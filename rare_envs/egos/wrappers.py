@@ -8,8 +8,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from rare_envs.sensors.kinds import OBSERVATIONS, batch_size, each, read_kinds
-from rare_envs.simulation.observation import observation_space
+from rare_envs.sensors.kinds import batch_size, each
 
 Array = NDArray[Any]
 Shape = tuple[int, ...]
@@ -87,20 +86,6 @@ def stacking(given: Shape, wanted: Shape) -> tuple[int, bool] | None:
         return None
     frames, rest = divmod(wanted[-1], given[-1])
     return (frames, False) if frames and not rest else None
-
-
-def observation_for(ego: Any, vehicles: int = 1) -> str:
-    """What to show an ego where nobody says: what its space tells, else "features".
-
-    Args:
-        ego: A `Dict` names the kinds, such as "camera+speed"; the space of "lidar" is known by its shape.
-        vehicles: Of the scenario, whose features may have that shape too.
-    """
-    space = getattr(ego, "observation_space", None)
-    if space == observation_space(vehicles, "lidar") != observation_space(vehicles, "features"):
-        return "lidar"
-    names = set(space.spaces) if isinstance(space, spaces.Dict) else set[str]()
-    return read_kinds(sorted(names)) if names and names <= set(OBSERVATIONS) else "features"
 
 
 def frames_of(given: spaces.Space[Any], wanted: Any) -> tuple[int, bool] | None:

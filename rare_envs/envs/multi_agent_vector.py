@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rare_envs.control.actions import IDLE, read_actions
+from rare_envs.egos.needs import resolve
 from rare_envs.egos.policy import as_driver
 from rare_envs.envs.batch_rows import merged, put, rows_of
 from rare_envs.envs.parallel import chosen_agents, chosen_rewards
@@ -19,6 +20,7 @@ from rare_envs.multi_agent.episode import MultiAgentEpisode, start
 from rare_envs.multi_agent.rewards import Reward, total_of
 from rare_envs.multi_agent.step import step_agents
 from rare_envs.sensors.kinds import each
+from rare_envs.simulation.ego_needs import EgoNeeds
 from rare_envs.simulation.observation import observe
 
 Array = NDArray[Any]
@@ -62,7 +64,7 @@ class AgentsVectorEnv(VectorEnv[NDArray[np.float32], Array, Array]):
         """
         if not isinstance(scenarios, (int, np.integer)) or isinstance(scenarios, bool) or scenarios < 1:
             raise ValueError(f"Expected one or more scenarios, got {scenarios!r}.")
-        world, self.space = set_up(env_id, **kwargs)
+        world, self.space = set_up(env_id, EgoNeeds(lidar=resolve(ego).lidar), **kwargs)
         self.world = world.with_statistics()
         scenario = self.world.scenario
         self.agents = chosen_agents(scenario, agents)

@@ -13,6 +13,7 @@ from pettingzoo import ParallelEnv
 from torch import Tensor
 
 from rare_envs.control.actions import IDLE, read_actions
+from rare_envs.egos.needs import resolve
 from rare_envs.egos.policy import as_driver
 from rare_envs.envs.info import Info, info_of, step_info
 from rare_envs.envs.rendering import Renderer
@@ -23,6 +24,7 @@ from rare_envs.multi_agent.step import step_agents
 from rare_envs.plugins import did_you_mean
 from rare_envs.scenarios.base import Scenario
 from rare_envs.sensors.kinds import each
+from rare_envs.simulation.ego_needs import EgoNeeds
 from rare_envs.simulation.observation import observe
 
 Observation = NDArray[np.float32]
@@ -67,7 +69,7 @@ class DrivingParallelEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  #
         Raises:
             ValueError: If an argument is invalid.
         """
-        world, self.space = set_up(env_id, **kwargs)
+        world, self.space = set_up(env_id, EgoNeeds(lidar=resolve(ego).lidar), **kwargs)
         self.world = world.with_statistics()
         scenario = self.world.scenario
         self.possible_agents = chosen_agents(scenario, agents)

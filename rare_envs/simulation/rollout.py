@@ -1,18 +1,43 @@
-"""The one time loop."""
+"""Rollout: the one time loop, and the driver that decides in it."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Protocol
+from collections.abc import Iterator
+from typing import Any, Protocol, runtime_checkable
 
 from torch import Tensor
 
-if TYPE_CHECKING:
-    from rare_envs.simulation.episode import Episode
-
-from collections.abc import Iterator
-
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.world import World
+
+
+class Driver(Protocol):
+    """An ego. Its memory, if it has any, goes in and out, so that one driver serves any number of rollouts."""
+
+    def act(self, episode: Episode, memory: Any) -> tuple[Tensor, Any]:
+        """Decide for one tick.
+
+        Args:
+            episode: B scenarios at this moment; what is decided for those that have collided does not matter.
+            memory: What the last call returned, None at the start.
+
+        Returns:
+            Acceleration [m/s^2] and steering angle [rad], shape (B, 2), or in a world with meta-actions these, shape
+            (B,); and the new memory.
+        """
+        ...
+
+
+@runtime_checkable
+class StochasticDriver(Driver, Protocol):
+    """A driver with noise of its own, which can be part of x."""
+
+    @property
+    def noise_columns(self) -> int:
+        """How many columns of x are its noise, the last ones; 0 where its noise is fixed or off."""
+
+    def with_draws(self, draws: Tensor) -> Driver:
+        """Return the driver of B episodes with standard normal draws, shape (B, `noise_columns`)."""
 
 
 def drive(world: World, driver: Driver, x: Tensor) -> Iterator[Episode]:
@@ -21,15 +46,23 @@ def drive(world: World, driver: Driver, x: Tensor) -> Iterator[Episode]:
     Args:
         world: The world.
         driver: The ego.
-        x: Scenario parameters, shape (B, d), and behind them the noise of the ego, if it has `columns` of its own.
+        x: Scenario parameters, shape (B, d), and behind them the noise of the ego, if it has `noise_columns`.
 
     Yields:
         The episodes at time 0 and after each tick up to the horizon. Rows in which the ego has collided are moved on
-        with the others, but their f stays -1.
+        with the others, but their f does not change any more.
+
+    Example:
+        >>> import torch
+        >>> from rare_envs.control.idm import IDM
+        >>> from rare_envs.scenarios.car_following import CAR_FOLLOWING
+        >>> x = torch.tensor([[20.0, 15.0, 30.0]])  # ego and lead speed [m/s], gap [m]
+        >>> len(list(drive(World(CAR_FOLLOWING), IDM(), x)))  # time 0 and 100 ticks
+        101
     """
-    own = getattr(driver, "columns", 0)
-    if own:
-        x, driver = x[:, :-own], driver.with_draws(x[:, -own:])  # type: ignore[attr-defined]
+    if isinstance(driver, StochasticDriver) and driver.noise_columns:
+        own = driver.noise_columns
+        x, driver = x[:, :-own], driver.with_draws(x[:, -own:])
     episode, memory = world.start(x), None
     yield episode
     for _ in range(world.clock.ticks):
@@ -53,20 +86,3 @@ def rollout(world: World, driver: Driver, x: Tensor) -> Episode:
     for episode in drive(world, driver, x):
         last = episode
     return last
-
-
-class Driver(Protocol):
-    """An ego. Its memory, if it has any, goes in and out, so that one driver serves any number of rollouts."""
-
-    def act(self, episode: Episode, memory: Any) -> tuple[Tensor, Any]:
-        """Decide for one tick.
-
-        Args:
-            episode: B scenarios at this moment; what is decided for those that have collided does not matter.
-            memory: What the last call returned, None at the start.
-
-        Returns:
-            Acceleration [m/s^2] and steering angle [rad], shape (B, 2), or in a world with meta-actions these, shape
-            (B,); and the new memory.
-        """
-        ...

@@ -9,7 +9,7 @@ from typing import Any
 
 import rare_envs
 import samplers
-from rare_envs.egos.faults import EgoGone
+from rare_envs.egos.errors import EgoGone
 from rare_envs.study.errors import BadInput, output_folder
 from rare_envs.study.evaluate import Question, prepare
 from rare_envs.study.run_directory import to_text, write_failures

@@ -11,7 +11,7 @@ import numpy as np
 
 import samplers
 from rare_envs import DrivingProblem
-from rare_envs.egos.faults import EgoGone
+from rare_envs.egos.errors import EgoGone
 from rare_envs.traffic.crash import describe_crash
 
 LOOKED_AT = 10_000

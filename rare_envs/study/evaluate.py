@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 import agents
 import rare_envs
 import samplers
-from rare_envs.egos.faults import ON_ERROR, EgoGone, Fault, FaultTolerant
+from rare_envs.egos.errors import EgoGone
+from rare_envs.egos.faults import ON_FAULT, Fault, FaultTolerant
 from rare_envs.plugins import did_you_mean
 from rare_envs.problem import AmbiguousActions
 from rare_envs.scenarios.registry import find_scenario
@@ -214,8 +215,8 @@ def prepare(question: Question) -> Study:
 
 
 def _check_on_error(word: str) -> None:
-    if word not in ON_ERROR:
-        raise ValueError(f"Unknown on_error {word!r}{did_you_mean(word, ON_ERROR)}; expected {', '.join(ON_ERROR)}.")
+    if word not in ON_FAULT:
+        raise ValueError(f"Unknown on_error {word!r}{did_you_mean(word, ON_FAULT)}; expected {', '.join(ON_FAULT)}.")
 
 
 @torch.inference_mode()

@@ -14,7 +14,7 @@ from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
 
 from rare_envs.distributions.space import ScenarioSpace
-from rare_envs.egos.faults import EgoGone, reason_of
+from rare_envs.egos.errors import EgoGone, reason_of
 from rare_envs.study.columns import columns_of
 from rare_envs.study.evaluate import Report
 from rare_envs.study.replay import Replay, replay

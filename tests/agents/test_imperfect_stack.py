@@ -38,7 +38,7 @@ def test_the_probability_is_that_of_fresh_noise() -> None:
     by_columns = samplers.estimate(around, samplers.MonteCarlo(), gamma=gamma, seed=0, max_sim=n)
     bare = problem("idm")
     x = torch.from_numpy(bare.base.sample(n, np.random.default_rng(5))).float()
-    fresh = torch.randn(n, around.driver.columns, generator=torch.Generator().manual_seed(5))
+    fresh = torch.randn(n, around.driver.noise_columns, generator=torch.Generator().manual_seed(5))
     with torch.inference_mode():
         f = rollout(around.world, around.driver, torch.cat((x, fresh), dim=1)).f
     p = float((f <= gamma).float().mean())
@@ -66,7 +66,7 @@ def monte_carlo(around: rare_envs.DrivingProblem, gamma: float, n: int) -> tuple
     """P[f <= gamma] with fresh noise in each drive, and its standard error."""
     assert isinstance(around.driver, NoisyDriver)
     driver = Fresh(around.driver.inner, around.driver.stack, around.world)
-    x = torch.from_numpy(around.base.sample(n, np.random.default_rng(5))[:, : around.dim - around.driver.columns])
+    x = torch.from_numpy(around.base.sample(n, np.random.default_rng(5))[:, : around.dim - around.driver.noise_columns])
     with torch.inference_mode():
         f = torch.cat([rollout(around.world, driver, part).f for part in x.float().split(10_000)])
     p = float((f <= gamma).double().mean())
@@ -121,7 +121,7 @@ def test_errors_have_the_law_that_they_are_said_to_have() -> None:
     stack = Stack(missed=0.05, correlation=0.4)
     driver = problem(NoisyEgo("idm", stack)).driver
     n = 20_000
-    draws = torch.randn(n, driver.columns, generator=torch.Generator().manual_seed(0))
+    draws = torch.randn(n, driver.noise_columns, generator=torch.Generator().manual_seed(0))
     driver = driver.with_draws(draws)
     errors = [driver._later(torch.zeros(n, driver.shape[1]), 0)]
     for plan in range(1, 4):

@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from agents import load_ego
+from rare_envs.egos.needs import resolve
 from rare_envs.egos.policy import as_driver
-from rare_envs.egos.wrappers import observation_for
 from rare_envs.plugins import did_you_mean
 from rare_envs.sensors.kinds import kinds_of
 from rare_envs.simulation.clock import Clock
@@ -120,12 +120,13 @@ def judge(
     if isinstance(case, str) and case not in CASES:
         raise ValueError(f"Unknown case {case!r}{did_you_mean(case, CASES)}; expected one of {', '.join(CASES)}.")
     case = CASES[case] if isinstance(case, str) else case
-    observation = observation or observation_for(ego)
+    needs = resolve(ego)
+    observation = observation or needs.observation
     world = measured or make_world(case, seconds, observation)
     driver = as_driver(ego, world)
-    if getattr(driver, "sees", False):
+    if needs.lidar:
         world = world.with_lidar()
-    x = draw_inputs(case, world, rollouts, getattr(driver, "columns", 0), np.random.default_rng(seed))
+    x = draw_inputs(case, world, rollouts, needs.noise_columns(world), np.random.default_rng(seed))
     tile = CAMERA_TILE if "camera" in kinds_of(observation) else TILE
     parts = [_judge_tile(world, driver, part) for part in torch.split(torch.from_numpy(x).float(), tile)]
     reason, time, headway, margin, speed = (np.concatenate(column) for column in zip(*parts, strict=True))

@@ -9,7 +9,7 @@ from typing import Any, NoReturn
 import typer
 from typer.core import TyperGroup
 
-from rare_envs.egos.faults import EgoGone
+from rare_envs.egos.errors import EgoGone
 from rare_envs.study.errors import BadInput
 
 _UsageError: type[Exception] = typer.BadParameter.__bases__[0]

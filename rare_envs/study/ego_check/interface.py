@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium import spaces
 
 from agents.sb3.saved_ego import SavedEgo
-from rare_envs.egos.faults import reason_of
+from rare_envs.egos.errors import reason_of
 from rare_envs.egos.wrappers import frames_of
 from rare_envs.sensors.kinds import each
 from rare_envs.study.ego_check.findings import Finding, report_failure, report_pass, report_warning

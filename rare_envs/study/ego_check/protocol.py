@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from rare_envs.egos.faults import EgoGone, reason_of
+from rare_envs.egos.errors import EgoGone, reason_of
 from rare_envs.sensors.kinds import each
 from rare_envs.study.ego_check.findings import Finding, report_failure, report_pass
 

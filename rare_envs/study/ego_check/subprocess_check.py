@@ -138,7 +138,7 @@ def run_checks(request: EgoCheckRequest) -> Iterator[Finding | str]:
     import agents
     from agents.loading import find_ego_kind
     from rare_envs import DrivingProblem
-    from rare_envs.egos.faults import EgoGone, reason_of
+    from rare_envs.egos.errors import EgoGone, reason_of
     from rare_envs.problem import AmbiguousActions
     from rare_envs.study.ego_check.behaviour import EGO_CHECKS, check_driving
     from rare_envs.study.ego_check.probe import Probe

@@ -20,7 +20,8 @@ from gymnasium import spaces
 
 import rare_envs
 from agents import load_ego
-from rare_envs.egos.faults import EgoGone, FaultTolerant, NoAnswer
+from rare_envs.egos.errors import EgoGone, NoAnswer
+from rare_envs.egos.faults import FaultTolerant
 
 pytest.importorskip("zmq", reason="the extra remote is optional")
 msgpack = pytest.importorskip("msgpack", reason="the extra remote is optional")

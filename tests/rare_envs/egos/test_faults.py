@@ -9,7 +9,8 @@ import pytest
 
 import rare_envs
 import samplers
-from rare_envs.egos.faults import EgoFault, EgoGone, FaultTolerant
+from rare_envs.egos.errors import EgoFault, EgoGone
+from rare_envs.egos.faults import FaultTolerant
 
 ENV = "rare_envs/CarFollowing-v0"
 GAP = 30.0

@@ -11,7 +11,7 @@ import torch
 import agents
 import rare_envs
 from rare_envs.control.idm import IDM
-from rare_envs.egos.wrappers import observation_for
+from rare_envs.egos.needs import observation_for
 from rare_envs.scenarios.cut_in import CUT_IN
 from rare_envs.simulation.clock import Clock
 from rare_envs.simulation.observation import observation_space

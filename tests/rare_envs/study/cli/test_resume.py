@@ -29,7 +29,7 @@ FRAIL = """
 import os
 from pathlib import Path
 import numpy as np
-from rare_envs.egos.faults import EgoGone
+from rare_envs.egos.errors import EgoGone
 
 LEFT = Path("left")  # calls until it fails
 

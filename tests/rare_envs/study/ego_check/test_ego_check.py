@@ -227,7 +227,7 @@ three_results = made(predict=lambda self, *a, **k: (None, None, None))
 objects = made(predict=lambda self, o, **k: (np.full((len(o), 2), None), None))
 imaginary = made(predict=lambda self, o, **k: (np.full((len(o), 2), 1j), None))
 odd_statistics = made(get_vec_normalize_env=lambda self: 7)
-no_driver = made(in_world=property(boom))
+no_driver = made(in_world=property(boom), ego="idm", noise_columns=lambda self, world: 0)
 """
 
 

@@ -1,0 +1,44 @@
+"""EgoNeeds: what an ego needs of its world and of x, known before world and space are built."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from rare_envs.simulation.world import World
+
+
+class NoiseSource(Protocol):
+    """Something with noise of its own, which becomes part of x."""
+
+    def noise_columns(self, world: World) -> int:
+        """Return how many standard normal columns of x are its noise in a world."""
+
+
+@dataclass(frozen=True)
+class EgoNeeds:
+    """What an ego needs, and what it says about itself; `rare_envs.egos.needs.resolve` finds it out.
+
+    Example:
+        >>> EgoNeeds().observation
+        'features'
+    """
+
+    observation: str = "features"
+    """Kinds of observation that it takes, as `rare_envs.sensors.kinds.read_kinds` writes them."""
+    lidar: bool = False
+    """Whether it reads `Episode.perception` by itself, whatever is observed."""
+    dt: float | None = None
+    """The tick [s] that it was made for; None for any."""
+    action_space: Any = None
+    """The space of its actions, as it declares it; None if it does not."""
+    queries_policy: bool = False
+    """Whether a policy with `predict` decides, be it behind other parts of the ego."""
+    varies: bool = False
+    """Whether it says that its answers differ from run to run, by randomness that is not part of x."""
+    noise: NoiseSource | None = None
+    """What of it has noise that is part of x; None for nothing."""
+
+    def noise_columns(self, world: World) -> int:
+        """Return how many columns of x are its own noise, the last ones."""
+        return 0 if self.noise is None else self.noise.noise_columns(world)
