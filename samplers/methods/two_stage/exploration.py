@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from samplers.mcmc.kernels import conditional_proposal
-from samplers.methods.two_stage.regions import ExplorationResult, SubsetPoints, grow_regions
+from samplers.methods.two_stage.regions import DEFAULT, ExplorationResult, SubsetPoints, grow_regions
+from samplers.methods.two_stage.settings import RegionSettings
 from samplers.methods.two_stage.simulator import ComponentDraws, Simulator
 from samplers.problem import FloatArray
 from samplers.proposals.components import IsotropicNormal, MixtureComponent, draw_components
@@ -82,7 +83,12 @@ def first_draws(
 
 
 def find_regions(
-    simulator: Simulator, first: ComponentDraws, gamma: float, sizes: Sizes, rng: np.random.Generator
+    simulator: Simulator,
+    first: ComponentDraws,
+    gamma: float,
+    sizes: Sizes,
+    rng: np.random.Generator,
+    settings: RegionSettings = DEFAULT,
 ) -> Generator[FloatArray, FloatArray, ExplorationResult]:
     """Find the regions of failure, starting from the first draws; none if nothing fails."""
     n_base = int(first.counts[0])
@@ -96,7 +102,7 @@ def find_regions(
     starts = np.concatenate([far, rng.permutation(descent.failing)[: min(others, most - len(far))]])
     if len(starts) == 0:
         return ExplorationResult([], noisy=False)
-    return (yield from grow_regions(simulator, starts, descent, gamma, sizes.limit, rng))
+    return (yield from grow_regions(simulator, starts, descent, gamma, sizes.limit, rng, settings))
 
 
 def _descend(

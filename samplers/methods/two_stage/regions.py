@@ -1,11 +1,10 @@
-"""Regions of failure: chains grow inside them and are told apart by the points half way between them.
+"""Failure regions: chains grow inside them, and the points half way between failing points tell them apart.
 
-The half way points ask no more of f than whether it fails: if the one between two failing points does, the two belong
-to one region. Near convex regions are kept apart by this in any dimension, however alike they look.
+A half way point uses f by its sign only: if it fails, the two points are of one region. Near convex regions are told
+apart by this in any dimension, however alike they look.
 """
 
 import math
-from collections.abc import Generator
 from typing import NamedTuple
 
 import numpy as np
@@ -13,23 +12,17 @@ from numpy.typing import NDArray
 
 from samplers.methods.two_stage.mixture.linear_model import descent_direction
 from samplers.methods.two_stage.mixture.subspace_em import HIGH_DIM
-from samplers.methods.two_stage.simulator import Simulator
+from samplers.methods.two_stage.settings import RegionSettings
+from samplers.methods.two_stage.simulator import SimulationSteps, Simulator
 from samplers.problem import FloatArray
 
-CHAIN_ACCEPTANCE = 0.35
-MANY_REGIONS = 8
-MOST_REGIONS = 16
-SCATTERED = 0.25
-"""Where this share of the points is in none of MANY_REGIONS regions, failure is something like a shell."""
-MAX_REPLICATED_CHAINS = 60
-PROBES = 30
-NUDGE = 1e-6
-NOISY = 0.9
-"""Where less than this share of the points right beside failing ones fail, f is noisy."""
+DEFAULT = RegionSettings()
+Labels = NDArray[np.int64]
+"""Number of the region of each point or chain, from 0, shape (n,)."""
 
 
 class Region(NamedTuple):
-    """One region of failure."""
+    """One failure region."""
 
     chains: FloatArray
     """States of chains inside it, shape (chains, steps, d)."""
@@ -45,7 +38,7 @@ class Region(NamedTuple):
 
 
 class ChainPaths(NamedTuple):
-    """Where chains went."""
+    """States of chains and what was proposed to them."""
 
     states: FloatArray
     """Shape (chains, steps, d)."""
@@ -54,67 +47,110 @@ class ChainPaths(NamedTuple):
     f: FloatArray
     """Outcomes of the proposals, shape (chains, steps)."""
     sigma: FloatArray
-    """Adapted steps, shape (chains,)."""
+    """Adapted pCN steps, shape (chains,)."""
 
-    def of(self, which: NDArray[np.int64] | NDArray[np.bool_]) -> "ChainPaths":
+    @property
+    def ends(self) -> FloatArray:
+        """Last states, shape (chains, d)."""
+        return self.states[:, -1]
+
+    def select(self, which: NDArray[np.int64] | NDArray[np.bool_]) -> "ChainPaths":
         """Return some of the chains."""
         return ChainPaths(*(part[which] for part in self))
 
+    def to_region(self) -> Region:
+        """Return the region that these chains are in."""
+        return Region(self.states, self.proposals.reshape(-1, self.states.shape[2]), self.f.ravel())
+
 
 class SubsetPoints(NamedTuple):
-    """What subset simulation saw."""
+    """Points of subset simulation."""
 
     failing: FloatArray
     """Distinct failing points of its last level, shape (k, d)."""
     u: FloatArray
     """All points simulated, shape (n, d)."""
     f: FloatArray
+    """Outcomes of these, shape (n,)."""
     levels: int = 0
     """Levels passed."""
 
 
 class ExplorationResult(NamedTuple):
-    """What the exploration found."""
+    """Failure regions and what else the exploration found out about f."""
 
     regions: list[Region]
     noisy: bool
     """Whether f has noise of its own: then regions cannot be told apart, and all of it is one."""
     scattered: bool = False
-    """Whether they are no more than pieces of something like a shell."""
+    """Whether the regions are no more than pieces of something like a shell."""
     levels: int = 0
     """Levels that subset simulation passed."""
 
 
 def grow_regions(
-    simulator: Simulator, starts: FloatArray, descent: SubsetPoints, gamma: float, limit: int, rng: np.random.Generator
-) -> Generator[FloatArray, FloatArray, ExplorationResult]:
-    """Run chains from failing points, twice; sort them into regions after each time."""
+    simulator: Simulator,
+    starts: FloatArray,
+    descent: SubsetPoints,
+    gamma: float,
+    limit: int,
+    rng: np.random.Generator,
+    settings: RegionSettings = DEFAULT,
+) -> SimulationSteps[ExplorationResult]:
+    """Run chains from failing points, twice; sort them into regions after each time.
+
+    The first chains come from wide failures to likely ones. The second start where these ended, follow the direction
+    of their region, and are more for regions that have few.
+
+    Args:
+        simulator: Gives outcomes.
+        starts: Failing points, shape (n, d).
+        descent: Points of subset simulation.
+        gamma: Threshold of failure.
+        limit: Simulations after which points are no longer compared.
+        rng: Source of randomness.
+        settings: Numbers and steps of chains.
+    """
     dim = starts.shape[1]
-    steps = (5, 6) if dim <= HIGH_DIM else (8, 8)
-    walk = yield from _pcn_chains(simulator, starts, np.full(len(starts), 0.5), None, steps[0], gamma, rng)
-    if (yield from _is_noisy(simulator, walk.states[:, -1], gamma, rng)):
-        last = yield from _pcn_chains(simulator, walk.states[:, -1], walk.sigma, None, steps[1], gamma, rng)
-        region = Region(last.states[:, 1:], last.proposals.reshape(-1, dim), last.f.ravel())
+    steps = settings.steps if dim <= HIGH_DIM else settings.steps_high_dim
+    sigma = np.full(len(starts), settings.initial_step)
+    first = yield from _pcn_chains(simulator, starts, sigma, None, steps[0], gamma, rng, settings)
+    if (yield from _is_noisy(simulator, first.ends, gamma, rng, settings)):
+        last = yield from _pcn_chains(simulator, first.ends, first.sigma, None, steps[1], gamma, rng, settings)
+        region = last.to_region()._replace(chains=last.states[:, 1:])
         return ExplorationResult([region], noisy=True, levels=descent.levels)
-    after = len(starts) * (steps[1] + 1)  # the second walk, and one look at where it ended
-    labels, _ = yield from _label_regions(simulator, walk.states[:, -1], gamma, limit - after)
-    room = max(limit - simulator.n_sim - after, 0) // (steps[1] + 1)
-    more = _replicate_seeds(labels, min(max(8, math.ceil(2.5 * dim / steps[1])), 24), room, rng)
-    walk, labels = walk.of(more), labels[more]
-    alone = descent if labels.max() == 0 else None  # the points on the way down belong to the one region, then
-    directions = np.array([_estimate_direction(walk.of(labels == k), alone) for k in range(labels.max() + 1)])
-    start, sigma = walk.states[:, -1], walk.sigma
-    last = yield from _pcn_chains(simulator, start, sigma, directions[labels], steps[1], gamma, rng)
-    labels, scattered = yield from _label_regions(simulator, last.states[:, -1], gamma, limit)
-    late = 2 if dim <= HIGH_DIM else 4  # early proposals to wide failures are far from where failures are likely
-    proposals = np.concatenate([walk.proposals[:, -late:], last.proposals], axis=1)
-    f = np.concatenate([walk.f[:, -late:], last.f], axis=1)
+    reserve = len(starts) * (steps[1] + 1)  # for the second chains, and one look at where they end
+    labels, _ = yield from _label_regions(simulator, first.ends, gamma, limit - reserve, settings)
+    room = max(limit - simulator.n_sim - reserve, 0) // (steps[1] + 1)
+    few, many = settings.chains_per_region
+    wanted = min(max(few, math.ceil(settings.points_per_dim * dim / steps[1])), many)
+    chosen = _replicate_seeds(labels, wanted, min(room, settings.max_replicated), rng)
+    first, labels = first.select(chosen), labels[chosen]
+    directions = _estimate_directions(first, labels, descent, settings)
+    last = yield from _pcn_chains(
+        simulator, first.ends, first.sigma, directions[labels], steps[1], gamma, rng, settings
+    )
+    labels, scattered = yield from _label_regions(simulator, last.ends, gamma, limit, settings)
+    regions = _collect_regions(first, last, labels, settings)
+    if len(regions) == 1:
+        regions = [_add_subset_points(regions[0], descent, settings)]
+    return ExplorationResult(regions, noisy=False, scattered=scattered, levels=descent.levels)
+
+
+def _collect_regions(first: ChainPaths, last: ChainPaths, labels: Labels, settings: RegionSettings) -> list[Region]:
+    """Return the regions: states of the last chains but their first, proposals to them and late ones to the first.
+
+    Early proposals to wide failures are far from where failures are likely.
+    """
+    dim = last.states.shape[2]
+    late = settings.late_steps if dim <= HIGH_DIM else settings.late_steps_high_dim
+    proposals = np.concatenate([first.proposals[:, -late:], last.proposals], axis=1)
+    f = np.concatenate([first.f[:, -late:], last.f], axis=1)
     regions = []
     for k in range(labels.max() + 1):
         own = labels == k
         regions.append(Region(last.states[own, 1:], proposals[own].reshape(-1, dim), f[own].ravel()))
-    regions = [_add_subset_points(regions[0], descent)] if len(regions) == 1 else regions
-    return ExplorationResult(regions, noisy=False, scattered=scattered, levels=descent.levels)
+    return regions
 
 
 def _pcn_chains(
@@ -125,11 +161,23 @@ def _pcn_chains(
     steps: int,
     gamma: float,
     rng: np.random.Generator,
-) -> Generator[FloatArray, FloatArray, ChainPaths]:
-    """Move chains inside the region of failure by pCN, each with its own step.
+    settings: RegionSettings = DEFAULT,
+) -> SimulationSteps[ChainPaths]:
+    """Move chains inside the failure region by pCN, each with its own step.
 
-    With directions (n, d) the step sigma (n,) is that along them, and every other direction is drawn nearly afresh:
-    failures beyond a plane are standard normal there, and chains forget where they started at once.
+    The proposal sqrt(1 - sigma^2) u + sigma xi, xi ~ N(0, I), leaves N(0, I) invariant; it is accepted if it fails.
+    With directions the step sigma is that along them, and every other direction is drawn nearly afresh: failures
+    beyond a plane are standard normal there, and chains forget where they started at once.
+
+    Args:
+        simulator: Gives outcomes.
+        u: Failing points, shape (n, d).
+        sigma: First steps, shape (n,).
+        directions: Unit vectors, shape (n, d), or None.
+        steps: Number of steps.
+        gamma: Threshold of failure.
+        rng: Source of randomness.
+        settings: Adaptation of the steps.
     """
     across = np.ones(len(u))
     states, proposals, outcomes = [], [], []
@@ -144,10 +192,11 @@ def _pcn_chains(
         fails = f <= gamma
         u = np.where(fails[:, None], proposal, u)
         if directions is None:
-            sigma = np.clip(sigma * np.exp(0.7 * (fails - CHAIN_ACCEPTANCE) / math.sqrt(step)), 0.02, 1.0)
+            change = settings.adaptation * (fails - settings.target_acceptance) / math.sqrt(step)
+            sigma = np.clip(sigma * np.exp(change), settings.min_step, 1.0)
         else:
-            across = np.clip(across * np.where(fails, 1.1, 0.75), 0.05, 1.0)
-            sigma = np.clip(sigma * np.where(fails, 1.05, 0.9), 0.02, 1.0)
+            across = np.clip(across * np.where(fails, *settings.across_factors), settings.min_across, 1.0)
+            sigma = np.clip(sigma * np.where(fails, *settings.along_factors), settings.min_step, 1.0)
         states.append(u)
         proposals.append(proposal)
         outcomes.append(f)
@@ -155,17 +204,17 @@ def _pcn_chains(
 
 
 def _is_noisy(
-    simulator: Simulator, u: FloatArray, gamma: float, rng: np.random.Generator
-) -> Generator[FloatArray, FloatArray, bool]:
+    simulator: Simulator, u: FloatArray, gamma: float, rng: np.random.Generator, settings: RegionSettings = DEFAULT
+) -> SimulationSteps[bool]:
     """Return whether points right beside failing ones (n, d) do not always fail."""
-    u = rng.permutation(u)[:PROBES]
-    f = yield from simulator.evaluate(u + NUDGE * rng.standard_normal(u.shape))
-    return float((f <= gamma).mean()) < NOISY
+    u = rng.permutation(u)[: settings.probes]
+    f = yield from simulator.evaluate(u + settings.probe_distance * rng.standard_normal(u.shape))
+    return float((f <= gamma).mean()) < settings.noisy_share
 
 
 def _label_regions(
-    simulator: Simulator, u: FloatArray, gamma: float, limit: int
-) -> Generator[FloatArray, FloatArray, tuple[NDArray[np.int64], bool]]:
+    simulator: Simulator, u: FloatArray, gamma: float, limit: int, settings: RegionSettings = DEFAULT
+) -> SimulationSteps[tuple[Labels, bool]]:
     """Sort failing points (n, d) into regions, numbered from 0: those half way to whose first point fails.
 
     The first point of a region is the one nearest to the origin: far ones may lie in two regions, or reach into
@@ -177,9 +226,9 @@ def _label_regions(
     """
     labels = np.full(len(u), -1)
     scattered = False
-    for k in range(MOST_REGIONS):
+    for k in range(settings.max_regions):
         free = np.flatnonzero(labels < 0)
-        scattered = k >= MANY_REGIONS and len(free) > SCATTERED * len(u)
+        scattered = k >= settings.many_regions and len(free) > settings.scattered_share * len(u)
         if len(free) == 0 or scattered:
             break
         first = free[np.argmin((u[free] ** 2).sum(axis=1))]
@@ -192,35 +241,47 @@ def _label_regions(
     free = np.flatnonzero(labels < 0)
     if len(free):
         means = np.array([u[labels == k].mean(axis=0) for k in range(labels.max() + 1)])
+        # |u - m|^2 is least where u . m - |m|^2 / 2 is largest.
         labels[free] = np.argmax(u[free] @ means.T - 0.5 * (means**2).sum(axis=1), axis=1)
     return labels, scattered
 
 
-def _replicate_seeds(labels: NDArray[np.int64], least: int, room: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Return the numbers of all chains, those of regions with few repeated until there are `least` or no room is."""
+def _replicate_seeds(labels: Labels, wanted: int, room: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Return the indices of all chains, those of small regions repeated until each has `wanted`, or `room` is used."""
     more = []
     for k in range(labels.max() + 1):
         own = np.flatnonzero(labels == k)
-        more.append(rng.choice(own, max(least - len(own), 0)))
-    return np.concatenate([np.arange(len(labels)), np.concatenate(more)[: min(room, MAX_REPLICATED_CHAINS)]])
+        more.append(rng.choice(own, max(wanted - len(own), 0)))
+    return np.concatenate([np.arange(len(labels)), np.concatenate(more)[:room]])
 
 
-def _estimate_direction(walk: ChainPaths, descent: SubsetPoints | None) -> FloatArray:
+def _estimate_directions(
+    paths: ChainPaths, labels: Labels, descent: SubsetPoints, settings: RegionSettings
+) -> FloatArray:
+    """Return the direction of each region, shape (m, d); the points of subset simulation belong to the only one."""
+    n = labels.max() + 1
+    return np.array(
+        [_estimate_direction(paths.select(labels == k), descent if n == 1 else None, settings) for k in range(n)]
+    )
+
+
+def _estimate_direction(
+    paths: ChainPaths, descent: SubsetPoints | None, settings: RegionSettings = DEFAULT
+) -> FloatArray:
     """Return the direction in which a region lies, shape (d,): where f falls if it does so linearly, else its mean."""
-    dim = walk.states.shape[2]
-    region = Region(walk.states, walk.proposals.reshape(-1, dim), walk.f.ravel())
+    region = paths.to_region()
     if descent is not None:
-        region = _add_subset_points(region, descent)
+        region = _add_subset_points(region, descent, settings)
     axis, r2 = descent_direction(region.u, region.f)
-    if r2 > 0.5:
+    if r2 > settings.direction_r2:
         return axis
-    mean = walk.states[:, -3:].mean(axis=(0, 1))
+    mean = paths.states[:, -settings.mean_steps :].mean(axis=(0, 1))
     return np.asarray(mean / max(float(np.linalg.norm(mean)), 1e-12))
 
 
-def _add_subset_points(region: Region, descent: SubsetPoints) -> Region:
-    """Add the lower points of subset simulation where those around the region are too few for a regression."""
-    if len(region.u) >= 3 * region.u.shape[1] or len(descent.f) == 0:
+def _add_subset_points(region: Region, descent: SubsetPoints, settings: RegionSettings = DEFAULT) -> Region:
+    """Return a region with the lower points of subset simulation, if its own are too few for a regression."""
+    if len(region.u) >= settings.min_points_per_dim * region.u.shape[1] or len(descent.f) == 0:
         return region
-    low = descent.f <= np.quantile(descent.f, 0.7, method="lower")  # f may be infinite
+    low = descent.f <= np.quantile(descent.f, settings.lower_share, method="lower")  # f may be infinite
     return Region(region.chains, np.concatenate([region.u, descent.u[low]]), np.concatenate([region.f, descent.f[low]]))

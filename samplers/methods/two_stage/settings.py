@@ -34,8 +34,8 @@ class RegionSettings:
     steps_high_dim: tuple[int, int] = (8, 8)
     """The same above HIGH_DIM dimensions, where a wide failure has further to go."""
     target_acceptance: float = 0.35
-    """Acceptance that the step is adapted to; 0.44 is the optimum for random walks (Papaioannou et al. 2015), and a
-    lower one forgets the starting point sooner."""
+    """Acceptance that the step is adapted to. Papaioannou et al. 2015 take 0.44 for chains of stationary length; these
+    are short, and longer steps bring them sooner from wide failures to likely ones."""
     adaptation: float = 0.7
     """Change of the log step per unit of acceptance in the first step; it falls with the root of their number."""
     min_step: float = 0.02

@@ -122,7 +122,9 @@ def draw_first(context: RunContext, state: RunState) -> SimulationSteps[RunState
 def explore(context: RunContext, state: RunState) -> SimulationSteps[tuple[RunState, ExplorationResult]]:
     """Find the failure regions, starting from the first draws; there are none where nothing fails."""
     gamma, sizes = context.goal.gamma, Sizes.within(context.budget)
-    found = yield from find_regions(context.simulator, state.history.batches[0], gamma, sizes, context.rng)
+    found = yield from find_regions(
+        context.simulator, state.history.batches[0], gamma, sizes, context.rng, context.settings.regions
+    )
     n = sum(len(region.f) for region in found.regions)
     fails = sum(int((region.f <= gamma).sum()) for region in found.regions)
     return _record(context, state, fails / max(n, 1), state.base_share(gamma), n, math.inf), found

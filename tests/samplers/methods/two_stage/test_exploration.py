@@ -14,14 +14,7 @@ from samplers.methods.two_stage.exploration import (
     find_regions,
     first_draws,
 )
-from samplers.methods.two_stage.regions import (
-    MANY_REGIONS,
-    MAX_REPLICATED_CHAINS,
-    MOST_REGIONS,
-    _label_regions,
-    _pcn_chains,
-    _replicate_seeds,
-)
+from samplers.methods.two_stage.settings import RegionSettings
 from samplers.methods.two_stage.simulator import Simulator
 from samplers.problem import FunctionProblem
 
@@ -122,7 +115,7 @@ def test_chains_stay_among_the_failures_and_regions_are_whole(name):
     problem = PROBLEMS[name]
     _, found, n_sim = explored(problem)
     assert n_sim <= 0.65 * 6000  # what is left is for the rounds and the estimate
-    assert 1 <= len(found.regions) <= MOST_REGIONS
+    assert 1 <= len(found.regions) <= RegionSettings().max_regions
     for region in found.regions:
         assert region.chains.ndim == 3
         assert (problem.evaluate(region.points) <= 0).all()
@@ -162,40 +155,6 @@ def test_noise_is_noticed_and_steps_are_not_noise():
     assert not explored(FunctionProblem(lambda u: np.floor(4 * (3.0 - u[:, 0])), 3))[1].noisy
 
 
-@pytest.mark.parametrize("dim", [1, 2, 20])
-@pytest.mark.parametrize("turned", [0.0, 0.5], ids=["along the axis", "off the axis"])
-def test_walk_leaves_the_law_of_failures_as_it_is(dim, turned, rng):
-    """From exact draws beyond a plane, with the direction given, right or wrong: still the same law."""
-    beta, n = 2.0, 4000
-    start = rng.standard_normal((n, dim))
-    start[:, 0] = stats.truncnorm(beta, np.inf).rvs(n, random_state=rng)
-    direction = np.eye(dim)[0] + turned * np.eye(dim)[-1]
-    direction /= np.linalg.norm(direction)
-    problem = half_spaces(dim, beta)
-    steps = _pcn_chains(Simulator(problem), start, np.full(n, 0.5), np.tile(direction, (n, 1)), 6, 0.0, rng)
-    walk = driven(steps, problem)
-    assert walk.states.shape == (n, 6, dim)
-    end = walk.states[:, -1]
-    assert stats.kstest(end[:, 0], stats.truncnorm(beta, np.inf).cdf).pvalue > 1e-4
-    for k in range(1, min(dim, 4)):
-        assert stats.kstest(end[:, k], stats.norm.cdf).pvalue > 1e-4
-    moved = (np.diff(walk.states, axis=1) != 0).any(axis=2).mean()
-    assert moved > 0.2
-
-
-def test_walk_without_a_direction_comes_from_a_wide_failure_to_likely_ones(rng):
-    """Started twice as far as failures are, in 20 dimensions; the step adapts to an acceptance of about a third."""
-    problem = half_spaces(20, 3.0)
-    start = 2.5 * rng.standard_normal((300, 20))
-    start[:, 0] = 6.0
-    walk = driven(_pcn_chains(Simulator(problem), start, np.full(300, 0.5), None, 30, 0.0, rng), problem)
-    end = walk.states[:, -1]
-    assert (end[:, 0] >= 3.0).all()
-    assert end[:, 0].mean() < 3.7
-    assert (end[:, 1:] ** 2).mean() < 1.5  # 6.25 at the start
-    assert 0.2 < (walk.f[:, 10:] <= 0).mean() < 0.5
-
-
 def test_descent_finds_what_plain_draws_cannot():
     """p = 3e-7 in ten dimensions; the points it gives fail, are distinct, and their law is nearly that of failures."""
     problem, sizes, found = half_spaces(10, 5.0), Sizes.within(6000), 0
@@ -223,37 +182,6 @@ def test_points_are_drawn_in_along_their_rays_and_still_fail(rng):
     assert (ratio - 3.0 / u[:, 0] <= 0.5**BISECTIONS + 1e-12).all()
 
 
-def test_regions_are_told_apart_by_the_point_half_way(rng):
-    problem = half_spaces(4, 2.5, 2.5, 2.5)
-    u = np.concatenate([rng.normal(0, 0.1, (20, 4)) + 3.0 * np.eye(4)[k] for k in range(3)])
-    labels, scattered = driven(_label_regions(Simulator(problem), u, 0.0, 10**6), problem)
-    assert not scattered
-    assert labels.shape == (60,)
-    assert all(len(set(labels[20 * k : 20 * (k + 1)])) == 1 for k in range(3))
-    assert set(labels) == {0, 1, 2}
-
-
-def test_a_far_point_and_one_in_two_regions_join_no_regions(rng):
-    """Half way from (8, 0) to (0, 3) lies within the first region; (4, 4) is in both."""
-    problem = half_spaces(2, 3.0, 3.0)
-    u = np.array([[8.0, 0.0], [4.0, 4.0], [3.1, 0.0], [0.0, 3.2], [3.3, 0.5], [-0.5, 3.1]])
-    for order in [rng.permutation(6) for _ in range(20)]:
-        labels, _ = driven(_label_regions(Simulator(problem), u[order], 0.0, 10**6), problem)
-        found = labels[np.argsort(order)]
-        assert found[2] == found[4] != found[3] == found[5]
-
-
-@pytest.mark.parametrize("dim", [6, 10])
-def test_more_regions_than_a_shell_would_need_are_pieces_of_it(dim):
-    """The faces of a cube: 12 regions leave few points unsorted after the first eight, 20 leave most of them."""
-    problem = FunctionProblem(lambda u: 3.0 - np.abs(u).max(axis=1), dim)
-    u = np.concatenate([s * 3.3 * np.eye(dim) for s in (1, -1)])
-    per_face = np.repeat([6, 1], [8, 4]) if dim == 6 else np.full(20, 3)
-    labels, scattered = driven(_label_regions(Simulator(problem), np.repeat(u, per_face, axis=0), 0.0, 10**6), problem)
-    assert scattered == (dim == 10)
-    assert set(labels) == set(range(12 if dim == 6 else MANY_REGIONS))
-
-
 def test_starts_are_half_the_least_wide_and_half_at_random(rng):
     scale = rng.permutation(np.repeat([1, 2, 3], [15, 40, 100]))
     chosen = _subsample(scale, 30, rng)
@@ -261,14 +189,6 @@ def test_starts_are_half_the_least_wide_and_half_at_random(rng):
     assert np.count_nonzero(scale[chosen] == 1) == 15
     assert np.count_nonzero(scale[chosen] == 3) >= 3
     assert set(_subsample(scale[:10], 30, rng)) == set(range(10))
-
-
-def test_regions_with_few_chains_get_more(rng):
-    labels = np.repeat([0, 1, 2], [20, 3, 9])
-    more = _replicate_seeds(labels, 10, 10**6, rng)
-    np.testing.assert_array_equal(np.sort(np.unique(more)), np.arange(32))
-    np.testing.assert_array_equal(np.bincount(labels[more]), [20, 10, 10])
-    assert len(_replicate_seeds(np.arange(30), 24, 10**6, rng)) == 30 + MAX_REPLICATED_CHAINS
 
 
 @pytest.mark.parametrize("budget", [400, 2000, 6000, 24_000, 600_000])
