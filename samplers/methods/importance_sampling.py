@@ -7,23 +7,20 @@ from typing import ClassVar
 
 import numpy as np
 
-from samplers.importance.draws import weight_warnings, weighted_interval
-from samplers.importance.sampling import simulate_until
 from samplers.importance.search import (
-    LEAST_SEARCH_BUDGET,
-    SEARCH_SHARE,
     Round,
     Search,
+    draw_after_search,
+    plan_rounds,
     pool_rounds,
     round_record,
-    search_ended,
+    search_warnings,
 )
-from samplers.method import Goal, Interrupted, Outcome, Steps, no_outcome_share
+from samplers.method import Goal, Interrupted, Steps
 from samplers.methods.base import Method
-from samplers.problem import FloatArray, Inputs
+from samplers.problem import FloatArray, Inputs, StandardNormal
 from samplers.proposals.gaussian import TiltedNormal
 from samplers.proposals.mixture import Mixture, ProposalDistribution
-from samplers.statistics.intervals import binomial_cov
 from samplers.statistics.thresholds import next_level
 from samplers.statistics.weights import normalise_weights
 from samplers.trace import Level, Status
@@ -31,8 +28,10 @@ from samplers.validation import check_count, check_setting
 
 QUANTILE = 1.96
 """Half-widths are those of 95 % intervals."""
-FAR_SHARE = 0.05
+MOST_UNREACHED = 0.05
 """Share of the points on the way to failure that may lie where the tilt does not lead."""
+FITS_AT_GAMMA = 2
+"""Rounds with the level at gamma: the second fit is to draws from a proposal that reaches the failures."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,72 +109,53 @@ class ImportanceSampling(Method):
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Search for the tilt, then draw until the interval is narrow enough."""
         search, tilt = yield from self._search(inputs, goal, rng)
-        misled = unreached_share(search, tilt.shift, inputs, goal.gamma) if tilt else 0.0
-        base, largest = TiltedNormal(np.zeros(inputs.dim)), 1.0
+        missed = unreached_share(search, tilt.shift, inputs, goal.gamma) if tilt else 0.0
+        base = TiltedNormal(np.zeros(inputs.dim))
         sampler: ProposalDistribution = base
-        if tilt and misled <= FAR_SHARE:
-            sampler = Mixture(np.array([self.base_share, 1 - self.base_share]), [base, tilt])
-            largest = 1 / self.base_share
+        base_share = 1.0
+        if tilt and missed <= MOST_UNREACHED:
+            base_share = self.base_share
+            sampler = Mixture(np.array([base_share, 1 - base_share]), [base, tilt])
         target = self.half_width / QUANTILE if goal.target_cov is None else goal.target_cov
-        limit = 0 if search.status is Status.STOPPED else min(goal.budget - search.n_sim, self._most(goal))
-        final = simulate_until(inputs, sampler, replace(goal, target_cov=target), limit, self.batch, rng)
-        draws, trace, stopped = yield from final
-        base_draws = search.base_draws + int(draws.n / largest)
-        if draws.n == 0:  # stopped before the first batch
-            draws, largest = pool_rounds(search.rounds, inputs, goal.gamma), float(len(search.rounds))
-        cov = binomial_cov(draws.p, draws.n) if largest == 1 else draws.cov
-        stopped = stopped or search.status is Status.STOPPED
-        status = Status.STOPPED if stopped else Status.CONVERGED if cov <= target else Status.BUDGET
-        return Outcome(
-            p=draws.p,
-            interval=weighted_interval(draws, goal.confidence, largest),
-            cov=cov,
-            status=status if len(draws.f) or stopped else Status.NO_HITS,
-            warnings=(
-                *_tilt_warnings(search.status, misled),
-                *_stop_warnings(status, cov, target),
-                *weight_warnings(draws),
-            ),
-            trace=(*search.trace, *trace),
-            no_outcome_share=no_outcome_share(draws.f, draws.log_weights),
-            sample=draws.sample,
-            base_draws=base_draws,
-        )
-
-    def _most(self, goal: Goal) -> int:
-        """Return how many final draws may be made where max_sim does not matter."""
-        return self.n if goal.max_sim is None else goal.max_sim
+        limit = min(goal.budget - search.n_sim, self.n if goal.max_sim is None else goal.max_sim)
+        to_target = replace(goal, target_cov=target)
+        final = yield from draw_after_search(inputs, to_target, search, sampler, base_share, limit, self.batch, rng)
+        status = Status.CONVERGED if final.cov <= target else Status.BUDGET
+        warnings = _tilt_warnings(search, goal.gamma, missed)
+        if not final.stopped:
+            warnings += _stop_warnings(status, final.cov, target)
+        return final.outcome(goal, status, warnings)
 
     def _search(
         self, inputs: Inputs, goal: Goal, rng: np.random.Generator
     ) -> Generator[FloatArray, FloatArray, tuple[Search, TiltedNormal | None]]:
         """Follow the level down to gamma and fit the shift there twice; None where base draws serve."""
         rounds, trace = list[Round](), list[Level]()
-        if goal.budget < LEAST_SEARCH_BUDGET:
+        size, n_rounds = plan_rounds(goal, self.n_round, self.max_rounds)
+        if n_rounds == 0:
             return Search(rounds, trace, Status.BUDGET), None
-        size = min(self.n_round, goal.budget // 10)
-        affordable = int(SEARCH_SHARE * goal.budget) // size
-        law, reached = TiltedNormal(np.zeros(inputs.dim)), 0
-        for k in range(min(self.max_rounds, affordable)):
-            u = law.sample(size, rng)
+        base = StandardNormal(inputs.dim)
+        proposal, reached = TiltedNormal(np.zeros(inputs.dim)), 0
+        for k in range(n_rounds):
+            u = proposal.sample(size, rng)
             try:
                 f = yield inputs.base.from_standard_normal(u)
             except Interrupted:
-                return Search(rounds, trace, Status.STOPPED), law
-            rounds.append(Round(law, u, f))
+                return Search(rounds, trace, Status.STOPPED), proposal
+            rounds.append(Round(base, proposal, u, f))
             level = next_level(f, self.rho, goal.gamma)
-            trace.append(round_record(rounds[-1], float(f.min()) if level is None else level))
+            inside, log_weights = f <= (float(f.min()) if level is None else level), rounds[-1].log_weights
+            trace.append(round_record(float(f.min()) if level is None else level, size, log_weights[inside]))
             goal.on_level(trace[-1])
             if level is None or (k == 0 and level == goal.gamma):
                 status = Status.STALLED if level is None else Status.CONVERGED
-                return Search(rounds, trace, status), law if k else None
-            inside = f <= level
-            law = TiltedNormal(normalise_weights(rounds[-1].log_weights[inside]) @ u[inside])
+                return Search(rounds, trace, status), proposal if k else None
+            proposal = TiltedNormal(normalise_weights(log_weights[inside]) @ u[inside])
             reached += level == goal.gamma
-            if reached == 2:
+            if reached == FITS_AT_GAMMA:
                 break
-        ended = Status.BUDGET if affordable < self.max_rounds else Status.STALLED
-        return Search(rounds, trace, Status.CONVERGED if reached else ended), law
+        ended = Status.BUDGET if n_rounds < self.max_rounds else Status.STALLED
+        return Search(rounds, trace, Status.CONVERGED if reached else ended), proposal
 
 
 def unreached_share(search: Search, theta: FloatArray, inputs: Inputs, gamma: float) -> float:
@@ -186,24 +166,23 @@ def unreached_share(search: Search, theta: FloatArray, inputs: Inputs, gamma: fl
     """
     first = search.rounds[0]
     behind = float((first.u[first.f <= search.trace[0].gamma] @ theta < 0).mean())
-    failing = np.concatenate([found.u[found.f <= gamma] for found in search.rounds])
+    failing = np.concatenate([one.u[one.f <= gamma] for one in search.rounds])
     if len(failing) == 0:
         return behind
-    weights = normalise_weights(pool_rounds(search.rounds, inputs, gamma).log_weights)
+    weights = normalise_weights(pool_rounds(search.rounds, inputs.base.from_standard_normal, gamma).log_weights)
     return max(behind, float(weights[failing @ theta < 0.5 * float(theta @ theta)].sum()))
 
 
-def _tilt_warnings(status: Status, misled: float) -> list[str]:
+def _tilt_warnings(search: Search, gamma: float, missed: float) -> list[str]:
     """Return the warning about a search that did not end well."""
-    if misled > FAR_SHARE:
-        return [
-            f"{100 * misled:.0f} % of the points found lie where the tilt does not lead: base draws take its place."
-        ]
-    return search_ended(status)
+    if missed > MOST_UNREACHED:
+        where = f"{100 * missed:.0f} % of the points found lie where the tilt does not lead"
+        return [f"{where}: base draws take its place."]
+    return search_warnings(search, gamma)
 
 
 def _stop_warnings(status: Status, cov: float, target: float) -> list[str]:
-    """Return the warning about draws that were used up before the stop."""
+    """Return the warning about draws that were used up before the target was met."""
     if status is not Status.BUDGET:
         return []
     return [f"The draws were used up at a c.o.v. of {cov:.3g}, not {target:.3g}: the interval is wider than asked for."]

@@ -8,25 +8,23 @@ from typing import ClassVar, Literal
 import numpy as np
 from scipy.special import log_ndtr
 
-from samplers.importance.draws import weight_warnings, weighted_interval
-from samplers.importance.sampling import count_final_draws, defensive_mixture, simulate_until
+from samplers.importance.sampling import count_final_draws, defensive_mixture
 from samplers.importance.search import (
-    LEAST_SEARCH_BUDGET,
-    SEARCH_SHARE,
     Round,
     Search,
+    draw_after_search,
+    plan_rounds,
     pool_rounds,
     round_record,
-    search_ended,
+    search_warnings,
 )
-from samplers.method import Goal, Interrupted, Outcome, Steps, no_outcome_share
+from samplers.method import Goal, Interrupted, Steps
 from samplers.methods.base import Method
-from samplers.methods.mixture_em import ProposalMixture, fit_mixture, fit_shrunk_gaussian, widen_mixture
-from samplers.problem import FloatArray, Inputs
+from samplers.methods.mixture_em import WidenableMixture, fit_mixture, fit_shrunk_gaussian
+from samplers.problem import FloatArray, Inputs, StandardNormal
 from samplers.proposals.gaussian import TiltedNormal
 from samplers.proposals.mixture import ProposalDistribution
 from samplers.proposals.von_mises_fisher import VonMisesFisherNakagami
-from samplers.statistics.intervals import binomial_cov
 from samplers.statistics.weights import normalise_weights
 from samplers.trace import Level, Status
 from samplers.validation import check_choice, check_count, check_setting
@@ -124,53 +122,39 @@ class ImprovedCrossEntropy(Method):
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Search for a proposal, then estimate with fresh draws."""
         search, proposal = yield from self._search(inputs, goal, rng)
-        base, largest = TiltedNormal(np.zeros(inputs.dim)), 1.0
-        sampler: ProposalDistribution = base
+        sampler: ProposalDistribution = TiltedNormal(np.zeros(inputs.dim))
+        base_share = 1.0
         if proposal is not None:
-            wide = widen_mixture(proposal, self.wide_factor)
-            sampler = defensive_mixture(base, wide, proposal, self.base_share, self.wide_share)
-            largest = 1 / self.base_share
-        limit = 0 if search.status is Status.STOPPED else count_final_draws(goal, search.n_sim, self.n_final)
-        draws, trace, stopped = yield from simulate_until(inputs, sampler, goal, limit, self.n_final, rng)
-        base_draws = search.base_draws + int(draws.n / largest)
-        if draws.n == 0:  # stopped before the first batch
-            draws, largest = pool_rounds(search.rounds, inputs, goal.gamma), float(len(search.rounds))
-        stopped = stopped or search.status is Status.STOPPED
-        status = Status.STOPPED if stopped else search.status if len(draws.f) else Status.NO_HITS
-        return Outcome(
-            p=draws.p,
-            interval=weighted_interval(draws, goal.confidence, largest),
-            cov=binomial_cov(draws.p, draws.n) if largest == 1 else draws.cov,
-            status=status,
-            warnings=(*search_ended(search.status), *weight_warnings(draws)),
-            trace=(*search.trace, *trace),
-            no_outcome_share=no_outcome_share(draws.f, draws.log_weights),
-            sample=draws.sample,
-            base_draws=base_draws,
-        )
+            base_share = self.base_share
+            wide = proposal.widen(self.wide_factor)
+            sampler = defensive_mixture(sampler, wide, proposal, base_share, self.wide_share)
+        limit = count_final_draws(goal, search.n_sim, self.n_final)
+        final = yield from draw_after_search(inputs, goal, search, sampler, base_share, limit, self.n_final, rng)
+        return final.outcome(goal, search.status, search_warnings(search, goal.gamma))
 
     def _search(
         self, inputs: Inputs, goal: Goal, rng: np.random.Generator
-    ) -> Generator[FloatArray, FloatArray, tuple[Search, ProposalMixture | None]]:
+    ) -> Generator[FloatArray, FloatArray, tuple[Search, WidenableMixture | None]]:
         """Narrow the target down to failure; return the proposal fitted last, None where base draws serve."""
         rounds, trace = list[Round](), list[Level]()
-        if goal.budget < LEAST_SEARCH_BUDGET:
+        size, n_rounds = plan_rounds(goal, self.n_round, self.max_rounds)
+        if n_rounds == 0:
             return Search(rounds, trace, Status.BUDGET), None
-        size = min(self.n_round, goal.budget // 10)
-        affordable = int(SEARCH_SHARE * goal.budget) // size
-        law: ProposalDistribution = TiltedNormal(np.zeros(inputs.dim))
-        proposal: ProposalMixture | None = None
+        base, to_x = StandardNormal(inputs.dim), inputs.base.from_standard_normal
+        sampler: ProposalDistribution = TiltedNormal(np.zeros(inputs.dim))
+        proposal: WidenableMixture | None = None
         width, narrowest = math.inf, 0.0
-        for k in range(min(self.max_rounds, affordable)):
-            u = law.sample(size, rng)
+        for k in range(n_rounds):
+            u = sampler.sample(size, rng)
             try:
-                f = yield inputs.base.from_standard_normal(u)
+                f = yield to_x(u)
             except Interrupted:
                 return Search(rounds, trace, Status.STOPPED), None
-            rounds.append(Round(law, u, f))
-            trace.append(round_record(rounds[-1], goal.gamma))
+            rounds.append(Round(base, sampler, u, f))
+            log_ratio = rounds[-1].log_weights
+            trace.append(round_record(goal.gamma, size, log_ratio[f <= goal.gamma]))
             goal.on_level(trace[-1])
-            g, log_ratio = np.clip(f - goal.gamma, -HUGE, HUGE), rounds[-1].log_weights
+            g = np.clip(f - goal.gamma, -HUGE, HUGE)
             reached = weights_cov(np.where(g <= 0, -log_smooth_indicator(g, width), -np.inf)) <= self.weight_cov
             if reached and k == 0:
                 return Search(rounds, trace, Status.CONVERGED), None
@@ -179,18 +163,18 @@ class ImprovedCrossEntropy(Method):
                 width, narrowest = WIDEST * scale, NARROWEST * scale
             width = next_width(g, log_ratio, self.weight_cov, narrowest, width)
             if reached or (width == narrowest and (g <= 0).any()):
-                points = np.concatenate([found.u[found.f <= goal.gamma] for found in rounds])
-                fitted = self._fitted(points, pool_rounds(rounds, inputs, goal.gamma).log_weights, rng)
-                return Search(rounds, trace, Status.CONVERGED), fitted
+                failures = np.concatenate([one.u[one.f <= goal.gamma] for one in rounds])
+                last = self._fit(failures, pool_rounds(rounds, to_x, goal.gamma).log_weights, rng)
+                return Search(rounds, trace, Status.CONVERGED), last
             log_weights = log_smooth_indicator(g, width) + log_ratio
             if width == narrowest or not np.isfinite(log_weights).any():  # all outcomes alike
                 return Search(rounds, trace, Status.STALLED), proposal
-            law = proposal = self._fitted(u, log_weights, rng)
-        ended = Status.BUDGET if affordable < self.max_rounds else Status.STALLED
+            sampler = proposal = self._fit(u, log_weights, rng)
+        ended = Status.BUDGET if n_rounds < self.max_rounds else Status.STALLED
         return Search(rounds, trace, ended), proposal
 
-    def _fitted(self, u: FloatArray, log_weights: FloatArray, rng: np.random.Generator) -> ProposalMixture:
-        """Return the law of the family nearest to points u (n, d) with these weights (n,)."""
+    def _fit(self, u: FloatArray, log_weights: FloatArray, rng: np.random.Generator) -> WidenableMixture:
+        """Return the member of the family nearest to points u (n, d) with these weights (n,)."""
         used = np.isfinite(log_weights)
         u, weights = u[used], normalise_weights(log_weights[used])
         dim = u.shape[1]

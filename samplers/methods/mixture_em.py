@@ -26,10 +26,14 @@ class WidenableDistribution(ProposalDistribution, Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class ProposalMixture(Mixture):
-    """A mixture of laws that can be widened."""
+class WidenableMixture(Mixture):
+    """A mixture of distributions that can be widened."""
 
     components: Sequence[WidenableDistribution]
+
+    def widen(self, factor: float) -> "WidenableMixture":
+        """Return the mixture with every component more spread out by about this factor."""
+        return WidenableMixture(self.weights, [component.widen(factor) for component in self.components])
 
 
 Fit = Callable[[FloatArray, FloatArray], WidenableDistribution]
@@ -70,7 +74,7 @@ def fit_shrunk_gaussian(u: FloatArray, weights: FloatArray) -> Gaussian:
 
 def fit_mixture(
     fit: Fit, u: FloatArray, weights: FloatArray, most: int, size: int, rng: np.random.Generator
-) -> ProposalMixture:
+) -> WidenableMixture:
     """Return the mixture of 1 to `most` components with the best Bayesian information criterion.
 
     The criterion counts the effective number of points, (sum w)^2 / sum w^2. More components are tried for
@@ -85,7 +89,7 @@ def fit_mixture(
         rng: Source of randomness, for the first centres.
     """
     points = 1 / float(weights @ weights)
-    best, highest = ProposalMixture(np.ones(1), [fit(u, weights)]), -np.inf
+    best, highest = WidenableMixture(np.ones(1), [fit(u, weights)]), -np.inf
     for k in range(1, most + 1):
         if k * size >= points:  # the criterion means nothing there
             break
@@ -99,7 +103,7 @@ def fit_mixture(
 
 def fit_mixture_of_size(
     fit: Fit, u: FloatArray, weights: FloatArray, k: int, rng: np.random.Generator
-) -> ProposalMixture:
+) -> WidenableMixture:
     """Return a mixture of at most k components by expectation-maximisation, from distant first centres."""
     shares = initial_responsibilities(u, weights, k, rng)
     reached = -np.inf
@@ -108,7 +112,7 @@ def fit_mixture_of_size(
         kept = mass.sum(axis=0) > min(LEAST_WEIGHT, 0.5 / k)
         totals = mass.sum(axis=0)[kept]
         components = [fit(u, part / part.sum()) for part in mass.T[kept]]
-        mixture = ProposalMixture(totals / totals.sum(), components)
+        mixture = WidenableMixture(totals / totals.sum(), components)
         terms = np.stack([np.log(w) + c.log_prob(u) for w, c in zip(mixture.weights, components, strict=True)], axis=1)
         highest = terms.max(axis=1, keepdims=True)
         odds = np.exp(terms - highest)
@@ -136,8 +140,3 @@ def initial_responsibilities(u: FloatArray, weights: FloatArray, k: int, rng: np
         if not odds.sum() > 0:  # fewer distinct directions than centres
             break
     return np.asarray(distances.argmin(axis=1)[:, None] == np.arange(k), dtype=np.float64)
-
-
-def widen_mixture(proposal: ProposalMixture, factor: float) -> ProposalMixture:
-    """Return the proposal with every component more spread out."""
-    return ProposalMixture(proposal.weights, [component.widen(factor) for component in proposal.components])

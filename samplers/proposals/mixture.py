@@ -13,14 +13,18 @@ from samplers.problem import FloatArray
 from samplers.proposals.gaussian import Gaussian
 
 
-class ProposalDistribution(Protocol):
-    """What can be drawn from and has a density."""
+class SupportsLogProb(Protocol):
+    """A distribution whose density is known."""
+
+    def log_prob(self, u: FloatArray, /) -> FloatArray:
+        """Return the log density at u (n, d), shape (n,)."""
+
+
+class ProposalDistribution(SupportsLogProb, Protocol):
+    """A distribution that can be drawn from and whose density is known."""
 
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw n independent points, shape (n, d)."""
-
-    def log_prob(self, u: FloatArray, /) -> FloatArray:
-        """Log density at u (n, d), shape (n,)."""
 
 
 @dataclass(frozen=True, eq=False)

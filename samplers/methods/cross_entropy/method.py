@@ -7,17 +7,23 @@ from typing import ClassVar, Literal, TypeVar
 
 import numpy as np
 
-from samplers.importance.draws import weight_warnings, weighted_interval
-from samplers.importance.sampling import Space, count_final_draws, defensive_mixture, simulate_until
-from samplers.importance.search import LEAST_SEARCH_BUDGET, SEARCH_SHARE
-from samplers.method import Goal, Interrupted, Outcome, Steps, no_outcome_share
+from samplers.importance.sampling import Space, count_final_draws, defensive_mixture
+from samplers.importance.search import (
+    LEAST_ROUNDS,
+    LEAST_SEARCH_BUDGET,
+    SEARCH_SHARE,
+    Round,
+    Search,
+    draw_after_search,
+    search_warnings,
+)
+from samplers.method import Goal, Interrupted, Steps
 from samplers.methods.base import Method
 from samplers.methods.cross_entropy.blocks import GaussianBlock, MixtureBlock, NormalBlock, Product, announced_blocks
-from samplers.methods.cross_entropy.search import Batch, Iterate, Search
+from samplers.methods.cross_entropy.search import Iterate, best_iterate, iterate_of
 from samplers.problem import FloatArray, Inputs
 from samplers.proposals.gaussian import Gaussian
 from samplers.proposals.mixture import ProposalDistribution
-from samplers.statistics.intervals import binomial_cov
 from samplers.statistics.thresholds import next_level
 from samplers.statistics.weights import normalise_weights
 from samplers.trace import Status
@@ -142,33 +148,18 @@ class CrossEntropy(Method):
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Search for a proposal, then estimate with fresh draws."""
         base, space = self._start(inputs)
-        search = yield from self._search(base, space, goal, rng)
-        common = len(search.iterates) < 2  # the base draws fail often enough, or there is no way on
-        best = search.best(self.choice)
-        if search.status is Status.STOPPED:
-            return search.outcome(space)
+        search, iterates = yield from self._search(base, space, goal, rng)
+        best = best_iterate(iterates, self.choice)
         sampler: ProposalDistribution = base
-        if best is not None and not common:
+        base_share = 1.0
+        if best is not None and len(iterates) > 1:  # else the base draws fail often enough, or there is no way on
+            base_share = self.base_share
             wide = best.proposal.widen(self.wide_factor)
-            sampler = defensive_mixture(base, wide, best.proposal, self.base_share, self.wide_share)
+            sampler = defensive_mixture(base, wide, best.proposal, base_share, self.wide_share)
         limit = count_final_draws(goal, search.n_sim, self.n_final)
-        draws, final, stopped = yield from simulate_until(inputs, sampler, goal, limit, self.n_final, rng, space)
-        if draws.n == 0:
-            return search.outcome(space)
+        final = yield from draw_after_search(inputs, goal, search, sampler, base_share, limit, self.n_final, rng, space)
         reached = best is not None and best.level == goal.gamma
-        base_share = 1.0 if common else self.base_share
-        status = search.status if len(draws.f) else Status.NO_HITS
-        return Outcome(
-            p=draws.p,
-            interval=weighted_interval(draws, goal.confidence, 1 / base_share),
-            cov=binomial_cov(draws.p, draws.n) if common else draws.cov,
-            status=Status.STOPPED if stopped else status,
-            warnings=tuple(([] if reached else [search_ended(best, search.status)]) + weight_warnings(draws)),
-            trace=(*search.trace, *final),
-            no_outcome_share=no_outcome_share(draws.f, draws.log_weights),
-            sample=draws.sample,
-            base_draws=search.base_draws + int(base_share * draws.n),
-        )
+        return final.outcome(goal, search.status, [] if reached else search_warnings(search, goal.gamma))
 
     def _start(self, inputs: Inputs) -> tuple[Product, Space]:
         """Return the base law by blocks, theta_0, and the space that the search works in."""
@@ -184,32 +175,40 @@ class CrossEntropy(Method):
 
     def _search(
         self, base: Product, space: Space, goal: Goal, rng: np.random.Generator
-    ) -> Generator[FloatArray, FloatArray, Search]:
+    ) -> Generator[FloatArray, FloatArray, tuple[Search, list[Iterate]]]:
         """Run algorithm 1, as a rule until two proposals have reached gamma."""
-        search = Search(goal, self.rho)
+        rounds, iterates = list[Round](), list[Iterate]()
+
+        def ended(status: Status) -> tuple[Search, list[Iterate]]:
+            return Search(rounds, [iterate.record for iterate in iterates], status), iterates
+
         if goal.budget < LEAST_SEARCH_BUDGET:
-            return search.ended(Status.BUDGET)
-        proposal = base
+            return ended(Status.BUDGET)
+        proposal, spent = base, 0
         for k in range(self.max_iterations):
-            size = min(value_at(self.n_iteration, k), goal.budget // 10)
-            if search.n_sim + size > int(SEARCH_SHARE * goal.budget):
-                return search.ended(Status.BUDGET)
+            size = min(value_at(self.n_iteration, k), goal.budget // LEAST_ROUNDS)
+            if spent + size > int(SEARCH_SHARE * goal.budget):
+                return ended(Status.BUDGET)
             u = proposal.sample(size, rng)
             try:
                 f = yield space.to_x(u)
             except Interrupted:
-                return search.ended(Status.STOPPED)
+                return ended(Status.STOPPED)
+            spent += size
             level = next_level(f, self.rho, goal.gamma)
             lowest = float(f.min()) if level is None else level
             elite = u[f <= lowest]
             log_ratios = base.log_probs(elite) - proposal.log_probs(elite)
-            search.add(Batch(proposal, u, f), lowest, log_ratios.sum(axis=0))
+            rounds = [*rounds[:1], Round(base, proposal, u, f)]  # those that `pool_rounds` needs
+            iterates.append(iterate_of(rounds[-1], proposal, lowest, self.rho, log_ratios.sum(axis=0)))
+            goal.on_level(iterates[-1].record)
             if level is None:
-                return search.ended(Status.STALLED)
-            if search.n_reached == 2 - (k == 0) and (self.early_end or k == 0):
-                return search.ended(Status.CONVERGED)
+                return ended(Status.STALLED)
+            n_reached = sum(iterate.level == goal.gamma for iterate in iterates)
+            if n_reached == 2 - (k == 0) and (self.early_end or k == 0):
+                return ended(Status.CONVERGED)
             proposal = self._project(proposal, elite, log_ratios, value_at(self.alpha, k))
-        return search.ended(Status.CONVERGED if level == goal.gamma else Status.STALLED)
+        return ended(Status.CONVERGED if level == goal.gamma else Status.STALLED)
 
     def _project(self, proposal: Product, elite: FloatArray, log_ratios: FloatArray, alpha: float) -> Product:
         """Return the proposal after one step of equation 2 towards the elite points.
@@ -234,11 +233,3 @@ def value_at(setting: SettingT | tuple[SettingT, ...], k: int) -> SettingT:
     """Return the value of a setting at iteration k; the last one given holds on."""
     values = as_tuple(setting)
     return values[min(k, len(values) - 1)]
-
-
-def search_ended(best: Iterate | None, ended: Status) -> str:
-    """Return the warning about a search that did not reach gamma."""
-    if best is None:
-        return f"max_sim is under {LEAST_SEARCH_BUDGET}, too little for a search: plain draws only."
-    why = "max_sim was used up" if ended is Status.BUDGET else "no lower threshold was found"
-    return f"The search ended at f <= {best.level:.4g}, before gamma: {why}."

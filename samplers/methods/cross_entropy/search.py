@@ -1,23 +1,18 @@
-"""What the search of the cross-entropy method has found so far."""
+"""Iterates of the cross-entropy search, and the choice among them."""
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from samplers.importance.draws import Draws, weight_warnings, weighted_cov, weighted_interval
-from samplers.importance.sampling import Space
-from samplers.method import Goal, Outcome, no_outcome_share
+from samplers.importance.search import Round, round_record
 from samplers.methods.cross_entropy.blocks import Product
 from samplers.problem import FloatArray
-from samplers.proposals.mixture import Mixture
-from samplers.statistics.intervals import binomial_cov
-from samplers.statistics.weights import effective_sample_size
-from samplers.trace import Level, Status
+from samplers.trace import Level
 
 
 class Iterate(NamedTuple):
-    """One proposal of the search and what its draws showed."""
+    """One proposal of the search, with the results of its draws."""
 
     proposal: Product
     quantile: float
@@ -27,101 +22,30 @@ class Iterate(NamedTuple):
     record: Level
 
 
-class Batch(NamedTuple):
-    """The draws of one iteration."""
+def iterate_of(drawn: Round, proposal: Product, level: float, rho: float, log_weights: FloatArray) -> Iterate:
+    """Return the iterate that one round of draws describes.
 
-    proposal: Product
-    u: FloatArray
-    """Shape (n, d), in the space of the search."""
-    f: FloatArray
-    """Shape (n,)."""
+    Args:
+        drawn: The draws.
+        proposal: theta_k, where they are from.
+        level: gamma_k.
+        rho: Elite fraction.
+        log_weights: log(p0 / p_theta) of the draws with f <= gamma_k, shape (k,).
+    """
+    n = len(drawn.f)
+    rank = int(np.ceil(rho * n)) - 1
+    quantile = float(np.partition(drawn.f, rank)[rank])
+    return Iterate(proposal, quantile, level, round_record(level, n, log_weights))
 
 
-@dataclass(eq=False)
-class Search:
-    """The iterates of algorithm 1, and as many of their draws as an estimate needs if the run is stopped."""
+def best_iterate(iterates: Sequence[Iterate], choice: str) -> Iterate | None:
+    """Return the iterate to sample from; None if there is none.
 
-    goal: Goal
-    rho: float
-    iterates: list[Iterate] = field(default_factory=list)
-    batches: list[Batch] = field(default_factory=list)
-    """The first, from the base law, and the latest."""
-    status: Status = Status.STALLED
+    The one with the lowest rho-quantile, with choice "cov" not counted below gamma; among equals that with the
+    smallest c.o.v.
+    """
 
-    @property
-    def trace(self) -> list[Level]:
-        """The records of all iterates."""
-        return [iterate.record for iterate in self.iterates]
+    def rank(iterate: Iterate) -> tuple[float, float]:
+        return (iterate.quantile if choice == "quantile" else iterate.level, iterate.record.cov)
 
-    @property
-    def n_sim(self) -> int:
-        """Simulations made."""
-        return sum(level.n_sim for level in self.trace)
-
-    @property
-    def base_draws(self) -> int:
-        """How many of them are base draws: the first batch."""
-        return len(self.batches[0].f) if self.batches else 0
-
-    @property
-    def n_reached(self) -> int:
-        """How many proposals have reached gamma."""
-        return sum(iterate.level == self.goal.gamma for iterate in self.iterates)
-
-    def add(self, batch: Batch, level: float, log_weights: FloatArray) -> None:
-        """Note an iteration: its draws, gamma_k and log(p0 / p_theta) of those with f <= gamma_k, shape (k,)."""
-        n = len(batch.f)
-        record = Level(
-            gamma=level,
-            p=len(log_weights) / n,
-            estimate=float(np.exp(log_weights).sum()) / n,
-            n_sim=n,
-            n_points=n,
-            cov=weighted_cov(n, log_weights),
-            ess=effective_sample_size(log_weights),
-        )
-        rank = int(np.ceil(self.rho * n)) - 1
-        quantile = float(np.partition(batch.f, rank)[rank])
-        self.iterates.append(Iterate(batch.proposal, quantile, level, record))
-        self.batches = [*self.batches[:1], batch]
-        self.goal.on_level(record)
-
-    def ended(self, status: Status) -> "Search":
-        """Return the search with its ending."""
-        self.status = status
-        return self
-
-    def best(self, choice: str) -> Iterate | None:
-        """Return the iterate to sample from; None before the first.
-
-        The lowest rho-quantile, with choice "cov" not counted below gamma; the smallest c.o.v. among equals.
-        """
-
-        def rank(iterate: Iterate) -> tuple[float, float]:
-            return (iterate.quantile if choice == "quantile" else iterate.level, iterate.record.cov)
-
-        return min(self.iterates, key=rank, default=None)
-
-    def outcome(self, space: Space) -> Outcome:
-        """Return what the draws of the search say, for a run that was stopped.
-
-        The base draws and the latest proposal's count as one sample from the mixture of the two
-        laws, so that no weight exceeds the number of draws by that of base draws.
-        """
-        gamma, sizes = self.goal.gamma, np.array([len(batch.f) for batch in self.batches])
-        mixture = Mixture(sizes / sizes.sum(), [batch.proposal for batch in self.batches])
-        u = np.concatenate([batch.u for batch in self.batches])
-        f = np.concatenate([batch.f for batch in self.batches])
-        draws = Draws.from_outcomes(f, space.base.log_prob(u) - mixture.log_prob(u), space.to_x(u), gamma)
-        plain = len(self.batches) == 1
-        return Outcome(
-            p=draws.p,
-            interval=weighted_interval(draws, self.goal.confidence, float(sizes.sum() / sizes[0])),
-            cov=binomial_cov(draws.p, draws.n) if plain else draws.cov,
-            status=Status.STOPPED,
-            warnings=("Stopped before the final draws: the estimate is the search's own.", *weight_warnings(draws)),
-            trace=tuple(self.trace),
-            no_outcome_share=no_outcome_share(draws.f, draws.log_weights),
-            sample=draws.sample,
-            base_draws=self.base_draws,
-        )
+    return min(iterates, key=rank, default=None)

@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 import samplers
-from samplers.importance.search import Round, Search, pool_rounds, round_record
+from samplers.importance.search import Round, Search, round_record
 from samplers.limit_states import four_branches, half_space, parabola, plateau
 from samplers.method import Goal
 from samplers.methods.importance_sampling import unreached_share
@@ -68,34 +68,17 @@ def test_base_draws_where_one_tilt_does_not_serve(study, reference):
     assert found.covered >= 16
 
 
-def test_far_share(rng):
+def test_share_of_points_where_the_tilt_does_not_lead(rng):
+    """Half of two opposite regions, nothing of one region."""
     u = rng.standard_normal((4000, 2))
     f = 1.5 - abs(u[:, 0])  # two regions
-    first = Round(TiltedNormal(np.zeros(2)), u, f)
-    search = Search([first], [round_record(first, 0.0)], Status.CONVERGED)
+    first = Round(StandardNormal(2), TiltedNormal(np.zeros(2)), u, f)
+    search = Search([first], [round_record(0.0, 4000, np.zeros((first.f <= 0).sum()))], Status.CONVERGED)
     inputs = FunctionProblem(lambda x: 1.5 - abs(x[:, 0]), 2)
     assert unreached_share(search, np.array([2.0, 0.0]), inputs, 0.0) == pytest.approx(0.5, abs=0.06)
     one = first._replace(f=1.5 - u[:, 0])
-    search = Search([one], [round_record(one, 0.0)], Status.CONVERGED)
+    search = Search([one], [round_record(0.0, 4000, np.zeros((one.f <= 0).sum()))], Status.CONVERGED)
     assert unreached_share(search, np.array([2.0, 0.0]), inputs, 0.0) == 0
-
-
-def test_rounds_pool_into_one_sample(rng):
-    """Weights by the mixture of the proposals: right on average and bounded by the share of base draws."""
-    inputs = half_space(2, 2.0)
-    estimates = []
-    for _ in range(200):
-        rounds = []
-        for shift in ([0.0, 0.0], [1.5, 1.5], [3.0, 3.0]):
-            law = TiltedNormal(np.array(shift))
-            u = law.sample(200, rng)
-            rounds.append(Round(law, u, inputs.problem.evaluate(u)))
-        draws = pool_rounds(rounds, inputs.problem, 0.0)
-        assert draws.n == 600
-        assert np.exp(draws.log_weights).max() <= 3
-        estimates.append(draws.p)
-    error = np.std(estimates, ddof=1) / math.sqrt(200)
-    assert abs(np.mean(estimates) - inputs.p) < 4 * error
 
 
 @pytest.mark.parametrize("at", [1, 2, 3, 4, 5, 6])

@@ -2,11 +2,10 @@ import numpy as np
 import pytest
 
 from samplers.methods.mixture_em import (
-    ProposalMixture,
+    WidenableMixture,
     fit_mixture,
     fit_mixture_of_size,
     fit_shrunk_gaussian,
-    widen_mixture,
 )
 from samplers.proposals.gaussian import Gaussian
 from samplers.proposals.mixture import Mixture
@@ -80,6 +79,6 @@ def test_few_or_equal_points_give_a_proper_law(rng, n):
 
 
 def test_widened(rng):
-    wide = widen_mixture(ProposalMixture(TWO.weights, TWO.components), 2.0)
+    wide = WidenableMixture(TWO.weights, TWO.components).widen(2.0)
     np.testing.assert_allclose(wide.components[0].covariance, 4 * TWO.components[0].covariance)
     np.testing.assert_array_equal(wide.weights, TWO.weights)

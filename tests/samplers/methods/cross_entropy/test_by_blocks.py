@@ -11,7 +11,6 @@ import samplers
 from samplers.method import Goal
 from samplers.methods.cross_entropy.beta_block import BetaBlock
 from samplers.methods.cross_entropy.blocks import NormalBlock, Product
-from samplers.methods.cross_entropy.search import Batch, Search
 from samplers.proposals.gaussian import Gaussian
 
 CE = samplers.CrossEntropy
@@ -65,15 +64,14 @@ def test_the_paper_s_highway_of_428_dimensions():
     assert final.weights.sum() == pytest.approx(1.0, abs=4 * final.weights.std() * np.sqrt(len(final.weights)))
 
 
-def test_every_proposal_keeps_to_the_boxes(monkeypatch):
-    kept = []
-    original = Search.add
-    monkeypatch.setattr(Search, "add", lambda self, batch, *rest: (kept.append(batch), original(self, batch, *rest)))
-    problem = BlockProblem(4, 12, 5.0, radius=0.01)
-    samplers.estimate(problem, CE(family="blocks"), seed=1)
+def test_every_proposal_keeps_to_the_boxes(drive):
+    problem, method = BlockProblem(4, 12, 5.0, radius=0.01), CE(family="blocks")
+    base, space = method._start(problem)
+    steps = method._search(base, space, Goal(gamma=0.0), np.random.default_rng(1))
+    _, kept = drive(steps, problem).value
     assert len(kept) > 3
-    for batch in kept:
-        beta, normal = batch.proposal.blocks
+    for iterate in kept:
+        beta, normal = iterate.proposal.blocks
         assert min(beta.alpha.min(), beta.beta.min()) >= 1.5
         assert max(beta.alpha.max(), beta.beta.max()) <= 7.0
         assert np.abs(normal.law.mean - problem.mean).max() <= 0.01 * (1 + 1e-9)
@@ -127,13 +125,3 @@ def test_works_from_the_base_law_s_own_map_as_well():
 def test_needs_announced_blocks():
     with pytest.raises(ValueError, match='family "blocks" needs a base distribution with an attribute blocks'):
         samplers.estimate(samplers.FunctionProblem(lambda x: x[:, 0], 2), CE(family="blocks"), seed=1)
-
-
-def test_choice_of_the_iterate():
-    """Lowest rho-quantile, or the smallest c.o.v. among those that reached gamma."""
-    search = Search(Goal(gamma=0.0), 0.5)
-    for shift, weights in ((1.0, [0.0, 0.0]), (-1.0, [0.0, 0.0]), (-3.0, [0.0, 2.0])):
-        f = shift + np.array([0.0, 0.0, 1.0, 1.0])
-        search.add(Batch(None, np.empty((4, 1)), f), max(shift, 0.0), np.array(weights))
-    assert search.best("quantile").quantile == -3.0
-    assert search.best("cov").quantile == -1.0

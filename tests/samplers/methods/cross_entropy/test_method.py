@@ -7,12 +7,10 @@ from scipy import stats
 
 import samplers
 from samplers.importance.draws import Draws, bernstein_bound, weight_warnings, weighted_cov, weighted_interval
-from samplers.importance.sampling import Space, defensive_mixture, simulate_draws
+from samplers.importance.sampling import defensive_mixture, simulate_draws
 from samplers.limit_states import four_branches, half_space, parabola, plateau, two_modes
-from samplers.method import Goal
 from samplers.methods.cross_entropy.blocks import GaussianBlock, NormalBlock, Product
 from samplers.methods.cross_entropy.method import value_at
-from samplers.methods.cross_entropy.search import Batch, Search
 from samplers.problem import FunctionProblem
 from samplers.proposals.gaussian import Gaussian
 
@@ -106,20 +104,6 @@ def test_a_run_stopped_in_the_search_gives_what_there_is(family):
         assert result.n_sim == sum(level.n_sim for level in result.trace) == 1000 * after
         assert result.interval[0] / 1.2 <= reference.p <= 1.2 * result.interval[1]
         assert result.warnings if after < 4 else 0 < result.cov < 0.2
-
-
-def test_a_stopped_search_weighs_base_and_proposal_as_one_mixture(rng):
-    """E[w] = 1 and E[w 1{f <= 0}] = p for draws of both laws, with weights of at most 2."""
-    reference, law = half_space(2, 2.0), Gaussian(np.full(2, 1.5), 0.7 * np.eye(2))
-    base = Product((GaussianBlock(Gaussian.standard(2)),))
-    search = Search(Goal(gamma=0.0), 0.1)
-    for proposal in (base, Product((GaussianBlock(law),))):
-        u = proposal.sample(20_000, rng)
-        search.add(Batch(proposal, u, reference.problem.f(u)), 0.0, np.zeros(9))
-    outcome = search.outcome(Space(base, np.asarray))
-    assert outcome.p == pytest.approx(reference.p, rel=4 * outcome.cov)
-    assert outcome.sample.weights.max() * 40_000 <= 2.0
-    assert outcome.sample.weights.sum() == pytest.approx(1.0, abs=0.02)
 
 
 def test_final_draws_serve_higher_thresholds():
@@ -264,7 +248,7 @@ def test_bernstein_bound_holds(rng):
 
 def test_warns_when_the_search_ends_early():
     result = samplers.estimate(half_space(2, 4.5).problem, CE(max_iterations=2), seed=1)
-    assert any("The search ended at f <=" in text for text in result.warnings)
+    assert any("The search for a proposal ended at f <=" in text for text in result.warnings)
     assert result.status in ("stalled", "no_hits")
 
 
