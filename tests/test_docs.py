@@ -23,11 +23,9 @@ PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
 OUTPUT_NOT_SHOWN = {
     "agents.md",
     "camera.md",
-    "data.md",
     "egos.md",
     "environments.md",
     "estimates.md",
-    "imitation.md",
     "measures.md",
     "remote.md",
     "scenarios.md",

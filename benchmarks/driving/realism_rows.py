@@ -18,9 +18,9 @@ from training.imitation.evaluation.behaviour import Act, behaviour_of, drive_tra
 from training.imitation.evaluation.driving_statistics import BINS, DrivingStatistics, add_statistics, sum_by_scene
 from training.imitation.evaluation.prediction_error import Errors, draw_segments, prediction_errors
 from training.imitation.evaluation.realism import (
+    bootstrap_errors,
     collect_statistics,
     record_statistics,
-    standard_errors,
     summarise_realism,
 )
 from training.imitation.traffic.recording import Recording
@@ -77,7 +77,7 @@ class Judge:
             whole = add_statistics(parts)
             out[f"{seconds:g} s"] = {
                 **asdict(summarise_realism(whole, self.recorded)),
-                "standard_error": asdict(standard_errors(whole, self.recorded, np.random.default_rng(0))),
+                "standard_error": asdict(bootstrap_errors(whole, self.recorded, np.random.default_rng(0))),
                 "collisions": [summarise_realism(part, self.recorded).collision for part in parts],
             }
         whole = add_statistics(runs[SECONDS[0]])

@@ -1,1 +1,27 @@
 """Recorded traffic: trajectory tables, smoothing, scenes and events."""
+
+from training.data.events import car_following_events, cut_in_events
+from training.data.highd import highd_recordings, load_highd
+from training.data.ngsim import load_ngsim
+from training.data.scenes import TrafficScene, load_us101_scenes, split_by_clock
+from training.data.synthetic import synthetic_traffic
+from training.data.trajectories import NOBODY, Trajectories, read_trajectories, tabulate, write_trajectories
+from training.data.windows import scenes_of
+
+__all__ = [
+    "NOBODY",
+    "TrafficScene",
+    "Trajectories",
+    "car_following_events",
+    "cut_in_events",
+    "highd_recordings",
+    "load_highd",
+    "load_ngsim",
+    "load_us101_scenes",
+    "read_trajectories",
+    "scenes_of",
+    "split_by_clock",
+    "synthetic_traffic",
+    "tabulate",
+    "write_trajectories",
+]

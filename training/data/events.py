@@ -1,4 +1,4 @@
-"""Car-following and cut-in events in a table of trajectories.
+"""Events in recorded traffic: pairs of a follower and its leader, and cut-ins.
 
 The definitions are those behind the shipped `us101` distributions; docs/data.md states them in full.
 """
@@ -20,13 +20,13 @@ from training.data.trajectories import DT, Trajectories
 Events = dict[str, NDArray[Any]]
 
 MIN_PAIR_FRAMES = 20
-"""Frames a pair of ego and leader is seen in one lane for, at least: 2 s."""
+"""Least number of frames for which a pair of ego and leader is seen in one lane: 2 s."""
 MIN_LANE_FRAMES = 8
-"""Frames in one lane on either side of a lane change, at least: 0.8 s."""
+"""Least number of frames in one lane on either side of a lane change: 0.8 s."""
 LATERAL_SPAN = 5
-"""Frames over which the lateral speed is measured: 0.5 s."""
+"""Number of frames over which the lateral speed is measured: 0.5 s."""
 LATERAL_SPEED = 0.2
-"""A lane change has begun when the speed across exceeds this [m/s]."""
+"""Lateral speed above which a lane change has begun [m/s]."""
 
 CAR_FOLLOWING_COLUMNS = ("recording", "frame", "lane", "ego", "lead", "v_ego", "v_lead", "gap", "a_ego", "a_lead", "n")
 CUT_IN_COLUMNS = (
@@ -36,14 +36,20 @@ CUT_IN_COLUMNS = (
 
 
 def car_following_events(trajectories: Trajectories) -> Events:
-    """The first frame of each pair of ego and leader that is seen in one lane for `MIN_PAIR_FRAMES` frames or more.
+    """Return the first frame of each pair of ego and leader that is seen in one lane for `MIN_PAIR_FRAMES` or more.
 
     Returns:
         The columns `CAR_FOLLOWING_COLUMNS`, each of shape (events,): speeds [m/s], accelerations [m/s^2], `gap` from
         bumper to bumper [m], `n` frames the pair was seen for. In the order of the table: by ego, then by time.
+
+    Example:
+        >>> from training.data import synthetic_traffic
+        >>> pairs = car_following_events(synthetic_traffic(seconds=4.0, per_lane=2))
+        >>> pairs["ego"].tolist(), pairs["lead"].tolist(), pairs["gap"].round(1).tolist()
+        ([0, 1, 2], [3, 4, 5], [20.3, 20.4, 20.6])
     """
     t = trajectories
-    leader = t.find(t.leader)
+    leader = t.find_rows(t.leader)
     rows = np.flatnonzero(leader >= 0)
     rows = rows[t.lane[leader[rows]] == t.lane[rows]]
     recording = np.unique(t.recording, return_inverse=True)[1].ravel()
@@ -69,17 +75,23 @@ def car_following_events(trajectories: Trajectories) -> Events:
 
 
 def bumper_gaps(trajectories: Trajectories, behind: NDArray[np.int64], before: NDArray[np.int64]) -> FloatArray:
-    """Bumper to bumper distance between rows [m]; NaN where a row is -1."""
+    """Return distances from bumper to bumper between two rows each [m], NaN where a row is -1.
+
+    Args:
+        trajectories: The table.
+        behind: Rows of the rear vehicles, shape (n,).
+        before: Rows of the front vehicles, shape (n,).
+    """
     t = trajectories
     value = t.x[before] - t.x[behind] - 0.5 * (t.length[before] + t.length[behind])
     return np.where((behind >= 0) & (before >= 0), value, np.nan)
 
 
 def find_lane_changes(trajectories: Trajectories) -> NDArray[np.int64]:
-    """Rows that are the first in a neighbouring lane, `MIN_LANE_FRAMES` frames or more in one lane on either side."""
+    """Return rows that are the first in a neighbouring lane, `MIN_LANE_FRAMES` or more in one lane on either side."""
     t = trajectories
     new_track = np.zeros(len(t), dtype=bool)
-    new_track[t.breaks()] = True
+    new_track[t.track_starts()] = True
     runs = np.flatnonzero(new_track | np.append(True, np.diff(t.lane) != 0))
     length = np.diff(np.append(runs, len(t)))
     settled = (length[1:] >= MIN_LANE_FRAMES) & (length[:-1] >= MIN_LANE_FRAMES)
@@ -90,10 +102,16 @@ def find_lane_changes(trajectories: Trajectories) -> NDArray[np.int64]:
 
 
 def find_start(trajectories: Trajectories, crossing: int, first: int) -> tuple[int, bool]:
-    """Where the lane change that crosses at a row began, and whether that was seen.
+    """Return the row at which a lane change began, and whether its beginning was recorded.
 
-    Walking back from the crossing: the last row before the speed towards the new lane, over the `LATERAL_SPAN`
-    frames around it, fell to `LATERAL_SPEED` or less; the first row of the track (unseen) if it never did.
+    Going back from the crossing, that is the last row before the speed towards the new lane, over the `LATERAL_SPAN`
+    frames up to it, fell to `LATERAL_SPEED` or less. If it never did, the first row of the track is returned, and
+    False.
+
+    Args:
+        trajectories: The table.
+        crossing: First row in the new lane.
+        first: First row of the vehicle's track.
     """
     t = trajectories
     side = np.sign(t.lane[crossing] - t.lane[crossing - 1])
@@ -106,15 +124,25 @@ def find_start(trajectories: Trajectories, crossing: int, first: int) -> tuple[i
 
 
 def cut_in_events(trajectories: Trajectories) -> Events:
-    """Lane changes, each at its start and at its crossing, between the vehicles they cut in between.
+    """Return lane changes, each at its start and at its crossing, with the vehicles behind and ahead in the new lane.
 
     Returns:
         The columns `CUT_IN_COLUMNS`, each of shape (2 changes,): ego is the nearest vehicle behind in the new lane,
         lead the nearest ahead in it, -1 and NaN where there is none; gaps bumper to bumper (negative: side by side) and
         the lateral offset from ego [m]; `lateral_speed` towards the new lane over 0.8 s around the crossing [m/s].
+
+    Example:
+        >>> from dataclasses import replace
+        >>> from training.data import synthetic_traffic
+        >>> table = synthetic_traffic(seconds=6.0)
+        >>> moved = 3.6 * np.clip((table.time - 2.0) / 3.0, 0.0, 1.0) * (table.vehicle == 4)
+        >>> lane = 1 + np.searchsorted([3.6, 7.2], table.y + moved)
+        >>> cuts = cut_in_events(replace(table, y=table.y + moved, lane=lane))
+        >>> cuts["phase"].tolist(), cuts["vehicle"].tolist(), cuts["to_lane"].tolist()
+        (['crossing', 'start'], [4, 4], [3, 3])
     """
     t = trajectories
-    breaks = t.breaks()
+    breaks = t.track_starts()
     crossings = find_lane_changes(t)
     firsts = breaks[np.searchsorted(breaks, crossings, side="right") - 1]
     starts = [find_start(t, int(c), int(first)) for c, first in zip(crossings, firsts, strict=True)]
@@ -148,7 +176,16 @@ def cut_in_events(trajectories: Trajectories) -> Events:
 def _find_neighbours(
     t: Trajectories, rows: NDArray[np.int64], lane: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows of the nearest vehicles behind and ahead in a lane, by their fronts, at the frames of rows; -1: none."""
+    """Return the rows of the nearest vehicles behind and ahead in a lane, by their fronts, at the frames of rows.
+
+    Args:
+        t: The table.
+        rows: Rows of the vehicles whose neighbours are sought, shape (n,).
+        lane: Lane that is searched for each, shape (n,).
+
+    Returns:
+        Rows behind and rows ahead, shape (n,) each; -1 where there is none.
+    """
     front = t.x + 0.5 * np.nan_to_num(t.length)
     recording = np.unique(t.recording, return_inverse=True)[1].ravel()
     moment = recording * (np.ptp(t.frame) + 1) + t.frame - t.frame.min()
@@ -167,18 +204,22 @@ def _find_neighbours(
 
 
 EXTRACTORS = {"car_following": car_following_events, "cut_in": cut_in_events}
-"""Events that `training.scenario_fitting.fit` fits a scenario to."""
+"""Functions that extract the events of a scenario, by the scenario's name."""
 
 
 def concatenate_events(parts: Sequence[Events]) -> Events:
-    """Events of several tables as one."""
+    """Return the events of several tables as one.
+
+    Raises:
+        ValueError: No table is given.
+    """
     if not parts:
         raise ValueError("There are no events to pool: no recording was given.")
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
 def write_events(events: Mapping[str, NDArray[Any]], path: Path | str) -> None:
-    """Writes events as CSV, missing values as empty fields."""
+    """Write events to a CSV file, missing values as empty fields."""
     columns = {
         name: pa.array(np.round(values, 4) if values.dtype.kind == "f" else values, from_pandas=True)
         for name, values in events.items()

@@ -31,15 +31,21 @@ TRACK_NAMES = {
     "acceleration": ("xAcceleration",),
     "leader": ("precedingId",),
 }
+"""Headers in the file of tracks, by name of column."""
 SIDES = {1: "upper", 2: "lower"}
-"""Lanes by drivingDirection."""
+"""Names of the two carriageways by drivingDirection."""
 
 
 def highd_recordings(folder: Path | str) -> tuple[str, ...]:
-    """Numbers of the recordings in a folder, such as "01".
+    """Return the numbers of the recordings in a folder, such as "01".
 
     Raises:
-        ValueError: There is none.
+        ValueError: The folder holds none.
+
+    Example:
+        >>> highd_recordings("no_such_folder")
+        Traceback (most recent call last):
+        ValueError: no_such_folder has no files XX_tracks.csv; is it the data folder of highD?
     """
     found = tuple(sorted(path.name.removesuffix("_tracks.csv") for path in Path(folder).glob("*_tracks.csv")))
     if not found:
@@ -48,18 +54,23 @@ def highd_recordings(folder: Path | str) -> tuple[str, ...]:
 
 
 def load_highd(folder: Path | str, recording: str, *, gaps: Gaps = "error") -> Trajectories:
-    """Reads one recording as two, such as "01-upper" and "01-lower", brought from 25 Hz to 10 Hz.
+    """Return one recording of highD as a table of two carriageways, such as "01-upper" and "01-lower", at 10 Hz.
 
-    Positions are interpolated by cubic splines, speeds and accelerations linearly, the leader is that of the nearest
-    frame. Lanes are counted from the left in the direction of travel, by the lane markings.
+    The files have 25 Hz. Positions are interpolated by cubic splines, speeds and accelerations linearly; the leader is
+    that of the nearest frame. Lanes are counted from the left in the direction of travel, by the lane markings.
 
     Args:
-        folder: Where the three files are.
+        folder: Folder with the three files of the recording.
         recording: Its number, such as "01".
-        gaps: Where a vehicle is missing for some frames: "error", or "cut" its track there.
+        gaps: What is done where a vehicle is missing for some frames: "error" raises, "cut" cuts its track.
 
     Raises:
         ValueError: A file cannot be read, lacks a column or holds impossible values.
+
+    Example:
+        >>> load_highd("no_such_folder", "01")  # doctest: +ELLIPSIS
+        Traceback (most recent call last):
+        ValueError: Cannot read no_such_folder/01_recordingMeta.csv: ...
     """
     folder = Path(folder)
     rate, markings = _recording_meta(folder / f"{recording}_recordingMeta.csv")
@@ -93,13 +104,18 @@ def load_highd(folder: Path | str, recording: str, *, gaps: Gaps = "error") -> T
 
 
 def lanes_of(y: FloatArray, edges: tuple[float, ...]) -> NDArray[np.int64]:
-    """Lane of each position, 1 the leftmost, 0 outside."""
+    """Return the lane of each position, 1 the leftmost, 0 outside.
+
+    Args:
+        y: Position across the road [m], shape (n,).
+        edges: Lane boundaries from left to right [m].
+    """
     lane = np.searchsorted(np.array(edges), y, side="right")
     return np.where(lane < len(edges), lane, 0)
 
 
 def _recording_meta(path: Path) -> tuple[float, tuple[tuple[float, ...], tuple[float, ...]]]:
-    """Frame rate [Hz] and lane markings [m] of the upper and the lower lanes, top to bottom."""
+    """Return the frame rate [Hz], and the lane markings [m] of the upper and of the lower lanes, top to bottom."""
     rows = read_numbers(
         path,
         {"rate": ("frameRate",), "upper": ("upperLaneMarkings",), "lower": ("lowerLaneMarkings",)},
@@ -118,6 +134,7 @@ def _recording_meta(path: Path) -> tuple[float, tuple[tuple[float, ...], tuple[f
 
 
 def _directions(path: Path) -> dict[int, int]:
+    """Return the driving direction of each vehicle, 1 or 2."""
     rows = read_numbers(path, {"vehicle": ("id",), "direction": ("drivingDirection",)})
     bad = ~np.isin(rows["direction"], list(SIDES))
     if bad.any():
@@ -127,6 +144,7 @@ def _directions(path: Path) -> dict[int, int]:
 
 
 def _direction_of(rows: Rows, directions: dict[int, int]) -> NDArray[np.int64]:
+    """Return the driving direction of each row, shape (rows,)."""
     vehicles, index = np.unique(rows["vehicle"], return_inverse=True)
     found = np.array([directions.get(int(vehicle), 0) for vehicle in vehicles])[index.ravel()]
     if (found == 0).any():
@@ -143,7 +161,7 @@ def _resample(
     leader: FloatArray,
     direction: NDArray[np.int64],
 ) -> dict[str, FloatArray]:
-    """Tracks at multiples of `DT`, cut at their holes; `values` in the order of the names below."""
+    """Return tracks at multiples of `DT`, cut at their holes; `values` has the columns from "x" to "width"."""
     order = np.lexsort([time, vehicle])
     cuts = 1 + np.flatnonzero((np.diff(vehicle[order]) != 0) | (np.diff(time[order]) > 1.5 * dt))
     parts: list[FloatArray] = []

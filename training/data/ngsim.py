@@ -14,16 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from samplers.problem import FloatArray
-from training.data.text_columns import Gaps, Rows, check_lengths, check_tracks, read_header, read_numbers
+from training.data.text_columns import Gaps, Rows, check_lengths, check_tracks, read_column_names, read_numbers
 from training.data.trajectories import NOBODY, Trajectories, tabulate
 
 FOOT = 0.3048
+"""Length of a foot [m]."""
 STEP = 100.0
 """Time between frames [ms]."""
 PAUSE = 60_000.0
-"""A number that comes back after so long [ms] belongs to another vehicle: each 15 minutes were numbered anew."""
+"""Time [ms] after which a number that comes back belongs to another vehicle: each 15 minutes were numbered anew."""
 RENUMBER_OFFSET = 1_000_000
-"""Added to the number of such a vehicle, once for each time it comes back."""
+"""Number added to that of such a vehicle, once for each time it comes back."""
 COLUMN_NAMES = {
     "vehicle": ("Vehicle_ID",),
     "time": ("Global_Time",),
@@ -36,25 +37,37 @@ COLUMN_NAMES = {
     "lane": ("Lane_ID",),
     "leader": ("Preceding",),
 }
+"""Published headers by name of column."""
 LOCATION = "Location"
 _TEXT_ORDER = (0, 3, 4, 5, 8, 9, 11, 12, 13, 14)  # of NAMES, in the 18 columns of the files without a header
 _TEXT_COLUMNS = 18
 
 
 def load_ngsim(path: Path | str, *, location: str | None = None, gaps: Gaps = "error") -> Trajectories:
-    """Reads one file; the recording is named after the file, or after the location.
+    r"""Return the trajectories of one raw NGSIM file; the recording is named after the file, or after the location.
 
     Args:
-        path: CSV with the published header (the order of columns does not matter, others are passed over), or text
-            with the 18 published columns and no header, separated by blanks or commas.
-        location: Which of the file's locations, such as "us-101", where it has several.
-        gaps: Where a vehicle is missing for some frames: "error", or "cut" its track there.
+        path: CSV with the published header (the order of columns does not matter, others are ignored), or text with the
+            18 published columns and no header, separated by blanks or commas.
+        location: Which of the file's locations to read, such as "us-101", where it has several.
+        gaps: What is done where a vehicle is missing for some frames: "error" raises, "cut" cuts its track.
 
     Returns:
         The table, with lane boundaries estimated by `estimate_lane_edges`.
 
     Raises:
         ValueError: The file cannot be read, lacks a column, holds impossible values, or has several locations.
+
+    Example:
+        >>> import pathlib, tempfile
+        >>> header = "Vehicle_ID,Global_Time,Local_X,Local_Y,v_Length,v_Width,v_Vel,v_Acc,Lane_ID,Preceding"
+        >>> rows = [f"7,{100 * k},6,{5 * k},15,6,50,0,1,0" for k in range(3)]
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = pathlib.Path(folder) / "road.csv"
+        ...     _ = path.write_text("\n".join([header, *rows]))
+        ...     table = load_ngsim(path)
+        >>> table.speed.round(2).tolist()
+        [15.24, 15.24, 15.24]
     """
     rows = _read(Path(path))
     if LOCATION not in rows.columns:
@@ -67,11 +80,12 @@ def load_ngsim(path: Path | str, *, location: str | None = None, gaps: Gaps = "e
     if location is not None and location not in places:
         raise ValueError(f"{path} has the locations {', '.join(places)}, not {location}.")
     location = location or places[0]
-    return _to_table(rows.where(rows[LOCATION] == location), location, gaps)
+    return _to_table(rows.select(rows[LOCATION] == location), location, gaps)
 
 
 def _read(path: Path) -> Rows:
-    header = read_header(path)
+    """Return the rows of a file with or without a header."""
+    header = read_column_names(path)
     if any(character.isalpha() for character in header[0]):
         located = any(name.lower() == LOCATION.lower() for name in header)
         names = COLUMN_NAMES | ({LOCATION: (LOCATION,)} if located else {})
@@ -87,7 +101,7 @@ def _read(path: Path) -> Rows:
 
 
 def _to_table(rows: Rows, recording: str, gaps: Gaps) -> Trajectories:
-    """Feet and milliseconds become SI units, fronts become centres."""
+    """Return rows in SI units, with centres in place of fronts."""
     frame = np.rint(rows["time"] / STEP)
     length, y_along, speed = (FOOT * rows[name] for name in ("length", "y_along", "speed"))
     check_lengths(rows, length, "feet")
@@ -112,7 +126,7 @@ def _to_table(rows: Rows, recording: str, gaps: Gaps) -> Trajectories:
 
 
 def _renumber(vehicle: FloatArray, leader: FloatArray, frame: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Numbers of vehicles and leaders, with new ones for numbers that were given again after a `PAUSE`."""
+    """Return the numbers of vehicles and leaders, with new ones where a number was given again after a `PAUSE`."""
     order = np.lexsort([frame, vehicle])
     fresh = np.append(True, np.diff(vehicle[order]) != 0)
     again = np.append(False, (np.diff(vehicle[order]) == 0) & (np.diff(frame[order]) > PAUSE / STEP))
@@ -131,14 +145,14 @@ def _renumber(vehicle: FloatArray, leader: FloatArray, frame: FloatArray) -> tup
 
 
 def estimate_lane_edges(y: FloatArray, lane: NDArray[np.int64]) -> tuple[float, ...]:
-    """Lane boundaries where the format has none: halfway between the median positions of neighbouring lanes.
+    """Return lane boundaries halfway between the median positions of neighbouring lanes; NGSIM records none.
 
-    The outer lanes get the width of the space to their neighbours. Lanes count from 1 as long as each lies 2.5 to
+    The outer lanes get the width of the space to their neighbours. Lanes are counted from 1 as long as each lies 2.5 to
     5 m to the right of the one before it; ramps, which lie beside each other, do not.
 
     Args:
-        y: Across the road [m], shape (rows,).
-        lane: 1 is the leftmost.
+        y: Position across the road [m], shape (rows,).
+        lane: Number of the lane, 1 the leftmost, shape (rows,).
 
     Returns:
         Boundaries [m], left to right; none if fewer than two lanes are found.

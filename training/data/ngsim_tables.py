@@ -1,4 +1,4 @@
-"""The compact tables of recorded NGSIM traffic: scenes and single vehicles of US 101, pairs of I-80.
+"""Compact tables of recorded NGSIM traffic: scenes and single vehicles of US 101, pairs of I-80.
 
 All are parquet files in SI units at 10 Hz; positions are those of the front centre.
 """
@@ -23,7 +23,7 @@ US101_EDGES = (0.0, 3.49, 6.87, 10.20, 13.52, 17.25, 21.0)
 
 
 def read_columns(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
-    """Columns of a parquet file.
+    """Return columns of a parquet file.
 
     Raises:
         ValueError: The file is missing, cannot be read or lacks a column.
@@ -44,12 +44,15 @@ def read_columns(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
 
 
 def load_us101_trajectories(folder: Path | str, merged: bool = True) -> Trajectories:
-    """The scenes of US 101, without scene 1, whose clock is unknown.
+    """Return the scenes of US 101, without scene 1, whose clock is unknown.
 
     Args:
-        folder: Where the file is.
-        merged: All scenes as one recording, copies of a vehicle at one time averaged; otherwise each scene is a
-            recording of its own and copies stay.
+        folder: Folder with the file.
+        merged: Return all scenes as one recording and average the copies of a vehicle at one time; otherwise each scene
+            is a recording of its own, and copies stay.
+
+    Raises:
+        ValueError: The file is missing, cannot be read or lacks a column.
     """
     names = ("scene", "vehicle", "epoch_ms", "y_along", "d", "speed", "accel", "length", "width", "lane")
     rows = read_columns(Path(folder) / SCENES_FILE, names)
@@ -78,6 +81,7 @@ def load_us101_trajectories(folder: Path | str, merged: bool = True) -> Trajecto
 
 
 def _average_copies(rows: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    """Return one row for each vehicle and time: the mean of its copies in overlapping scenes."""
     keys = np.column_stack([rows["vehicle"], rows["epoch_ms"]])
     _, first, copy = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     count = np.bincount(copy.ravel())
@@ -88,7 +92,11 @@ def _average_copies(rows: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
 
 
 def load_us101_vehicles(folder: Path | str) -> Trajectories:
-    """Single vehicles of US 101 over their whole passage: no lanes, no leaders, no sizes; x is the front."""
+    """Return single vehicles of US 101 over their whole passage, without lanes, leaders and sizes; x is the front.
+
+    Raises:
+        ValueError: The file is missing, cannot be read or lacks a column.
+    """
     names = ("vehicle", "epoch_ms", "x_lateral", "y_along", "speed", "accel")
     rows = read_columns(Path(folder) / VEHICLES_FILE, names)
     frame = rows["epoch_ms"] // 100
@@ -109,9 +117,12 @@ def load_us101_vehicles(folder: Path | str) -> Trajectories:
 
 
 def load_i80_pairs(folder: Path | str) -> Trajectories:
-    """Followers and leaders of I-80, as filtered by their author; use with care near the ends of a track.
+    """Return followers and leaders of I-80, as their author filtered them; unreliable near the ends of a track.
 
     A leader's y and width are unknown unless it is recorded as a follower too.
+
+    Raises:
+        ValueError: The file is missing, cannot be read or lacks a column.
     """
     own = ("vehicle", "leader", "frame", "lane", "x_lateral", "y_along", "speed", "accel", "length")
     lead = ("leader_y_along", "leader_speed", "leader_accel", "leader_length")

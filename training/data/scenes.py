@@ -26,10 +26,21 @@ _US101_COLUMNS = ("scene", "vehicle", "epoch_ms", "y_along", "d", "lane", "lengt
 
 @dataclass(frozen=True)
 class TrafficScene:
-    """Vehicles V at steps T, 0.1 s apart, on a straight road.
+    """States and actions of V vehicles at T steps, 0.1 s apart, on a straight road.
 
     Positions are box centres: x along the road, y across and positive to the right [m], heading relative to the road
     [rad], positive to the right. Arrays are float64 and NaN where there is no value.
+
+    Raises:
+        ValueError: Arrays differ in shape, or a state is missing where a vehicle is present.
+
+    Example:
+        >>> from training.data import scenes_of, synthetic_traffic
+        >>> scene = scenes_of(synthetic_traffic(seconds=5.0), seconds=5.0)[0]
+        >>> scene.name, scene.x.shape, round(scene.end, 1)
+        ('synthetic-0', (49, 9), 4.8)
+        >>> int(scene.leads_lane().any(axis=0).sum())
+        3
     """
 
     name: str
@@ -79,17 +90,17 @@ class TrafficScene:
         known: Mask = self.present & np.isfinite(self.acceleration)
         return known
 
-    def lane(self) -> NDArray[np.int64]:
-        """Lane of each centre, 0 the leftmost, shape (T, V); -1 off the road or not present."""
+    def lane_numbers(self) -> NDArray[np.int64]:
+        """Return the lane of each centre, 0 the leftmost, shape (T, V); -1 off the road or not present."""
         inner = np.searchsorted(np.array(self.edges), np.nan_to_num(self.y, nan=-np.inf), side="right") - 1
         return np.where(self.present & (inner < len(self.edges) - 1), inner, -1)
 
     def leads_lane(self) -> Mask:
-        """True where nobody ahead is recorded in the vehicle's lane, shape (T, V).
+        """Return True where nobody ahead is recorded in the vehicle's lane, shape (T, V).
 
-        Such a vehicle may have reacted to someone outside the window: its actions are no examples.
+        Such a vehicle may have reacted to somebody outside the window, so its actions are no examples to learn from.
         """
-        lane = self.lane()
+        lane = self.lane_numbers()
         x = np.where(self.present, self.x, -np.inf)
         leads = np.zeros_like(self.present)
         steps = np.arange(len(x))
@@ -108,15 +119,15 @@ def assemble_scene(
     length: FloatArray,
     width: FloatArray,
 ) -> TrafficScene:
-    """Puts rows in the place that `step` and `vehicle` (column of the scene, 0 to V - 1) give them.
+    """Return a scene with each row at its `step` and `vehicle` (column of the scene, 0 to V - 1).
 
     Args:
-        name: Of the scene.
+        name: Name of the scene.
         start: Clock at step 0 [s].
         edges: Lane boundaries [m].
         columns: `step`, `vehicle`, `x`, `y`, `heading`, `speed`, `acceleration`, `yaw_rate`, each of shape (rows,).
-        length: Of each vehicle [m], shape (V,).
-        width: Of each vehicle [m], shape (V,).
+        length: Length of each vehicle [m], shape (V,).
+        width: Width of each vehicle [m], shape (V,).
     """
     known = np.isfinite(columns["speed"])
     step, vehicle = (columns[key][known].astype(np.int64) for key in ("step", "vehicle"))
@@ -136,19 +147,24 @@ def assemble_scene(
 def load_us101_scenes(
     folder: Path | str, along: float = CUTOFF_ALONG, across: float = CUTOFF_ACROSS
 ) -> tuple[TrafficScene, ...]:
-    """The 28 usable scenes of US 101, smoothed.
+    """Return the 28 usable scenes of US 101, smoothed.
 
-    The scenes overlap, so the copies of a vehicle are first merged by vehicle and time, each track is cut at its
-    holes and smoothed once over its whole length, and then the scenes are cut from the tracks. x is NGSIM's Local_Y
-    [m], the same in all scenes, moved from the front to the centre; scene 1 (two vehicles) and ramps are left out.
+    The scenes overlap, so the copies of a vehicle are first merged by vehicle and time. Each track is then cut at its
+    holes and smoothed once over its whole length, and the scenes are cut from the tracks. x is NGSIM's Local_Y [m], the
+    same in all scenes, moved from the front to the centre. Scene 1 (two vehicles) and ramps are left out.
 
     Args:
-        folder: Where the file is.
+        folder: Folder with the file.
         along: Cut-off of the smoother along the road [Hz].
         across: Cut-off across the road [Hz].
 
     Raises:
         ValueError: The file is missing, cannot be read or lacks a column.
+
+    Example:
+        >>> load_us101_scenes("no_such_folder")  # doctest: +ELLIPSIS
+        Traceback (most recent call last):
+        ValueError: There is no ngsim_us101_scenes.parquet in the folder 'no_such_folder'. ...
     """
     rows = read_columns(Path(folder) / SCENES_FILE, _US101_COLUMNS)
     usable = (rows["scene"] != 1) & (rows["lane"] <= 6)
@@ -168,17 +184,17 @@ def load_us101_scenes(
 def smooth_tracks(
     breaks: NDArray[np.int64], x: FloatArray, y: FloatArray, along: float = CUTOFF_ALONG, across: float = CUTOFF_ACROSS
 ) -> dict[str, FloatArray]:
-    """Smooth states and actions of rows of tracks one after another.
+    """Return smooth states and actions for rows of tracks, one track after another.
 
     Args:
         breaks: Rows at which a track begins; the first need not be among them.
-        x: Along the road [m], shape (rows,).
-        y: Across the road [m], shape (rows,).
+        x: Position along the road [m], shape (rows,).
+        y: Position across the road [m], shape (rows,).
         along: Cut-off along the road [Hz].
         across: Cut-off across the road [Hz].
 
     Returns:
-        `x`, `y`, `heading`, `speed`, `acceleration`, `yaw_rate` of each row.
+        `x`, `y`, `heading`, `speed`, `acceleration`, `yaw_rate`, shape (rows,) each.
     """
     result = {key: np.empty(len(x)) for key in ("x", "y", "heading", "speed", "acceleration", "yaw_rate")}
     for piece in np.split(np.arange(len(x)), breaks[breaks > 0]):
@@ -189,6 +205,7 @@ def smooth_tracks(
 
 
 def _cut_us101_scene(rows: Mapping[str, NDArray[Any]], number: int) -> TrafficScene:
+    """Return the scene of a number, cut from smoothed tracks."""
     inside = rows["scene"] == number
     scene = {key: values[inside] for key, values in rows.items()}
     first = scene["epoch_ms"].min()
@@ -202,10 +219,10 @@ def _cut_us101_scene(rows: Mapping[str, NDArray[Any]], number: int) -> TrafficSc
 def split_by_clock(
     scenes: Sequence[TrafficScene], test: Sequence[tuple[float, float]] = US101_TEST
 ) -> tuple[tuple[TrafficScene, ...], tuple[TrafficScene, ...]]:
-    """Scenes to learn from and scenes to test on, apart by the recording's clock.
+    """Split the scenes of one recording by its clock, into those to learn from and those to test on.
 
     Args:
-        scenes: Of one recording.
+        scenes: Scenes of one recording.
         test: Intervals of the clock [s] that are kept for tests.
 
     Returns:
@@ -213,6 +230,13 @@ def split_by_clock(
 
     Raises:
         ValueError: A scene lies across the end of an interval, so one moment would be on both sides.
+
+    Example:
+        >>> from training.data import scenes_of, synthetic_traffic
+        >>> scenes = scenes_of(synthetic_traffic(seconds=12.0), seconds=4.0)
+        >>> learn, test = split_by_clock(scenes, test=[(8.0, 12.0)])
+        >>> [scene.name for scene in test]
+        ['synthetic-8']
     """
     kept: tuple[list[TrafficScene], list[TrafficScene]] = ([], [])
     for scene in scenes:

@@ -1,9 +1,9 @@
-"""Recorded positions made smooth, and the actions that replay them exactly.
+"""Smoothing of recorded positions, and the actions that reproduce the smooth track.
 
-Positions from video jitter by centimetres, which two differences at 0.1 s turn into metres per second squared. They
-are smoothed before anything is differentiated (Thiemann, Treiber, Kesting, "Estimating acceleration and lane-changing
-dynamics from next generation simulation trajectory data", 2008), here by penalised least squares (Eilers, "A perfect
-smoother", 2003), which behaves at the ends of a track where moving averages do not.
+Positions from video jitter by centimetres, which two differences at 0.1 s turn into metres per second squared. They are
+smoothed before they are differentiated (Thiemann, Treiber, Kesting, "Estimating acceleration and lane-changing dynamics
+from next generation simulation trajectory data", 2008), here by penalised least squares (Eilers, "A perfect smoother",
+2003), which, unlike a moving average, needs no special treatment at the ends of a track.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from scipy.linalg import cho_solve_banded, cholesky_banded
 from samplers.problem import FloatArray
 
 CUTOFF_ALONG = 0.40
-"""Frequency [Hz] at which half of a motion along the road is kept."""
+"""Frequency [Hz] at which the gain along the road is one half; docs/data.md has accelerations by cut-off."""
 CUTOFF_ACROSS = 0.35
-"""Frequency [Hz] at which half of a motion across the road is kept."""
+"""Frequency [Hz] at which the gain across the road is one half."""
 MIN_HEADING_SPEED = 2.0
-"""Speed [m/s] under which a heading would be noise; the heading is that of a vehicle so fast."""
+"""Speed [m/s] along the road below which the heading is computed as at this speed, because it would be noise."""
 
 
 class Motion(NamedTuple):
-    """What the simulator needs to replay a track; arrays of shape (T,), NaN where the track's end leaves no value."""
+    """Headings, speeds and actions of a track, arrays of shape (T,); NaN where the end of the track leaves no value."""
 
     heading: FloatArray
     """Relative to the road [rad], positive towards +y; NaN in the last step."""
@@ -38,18 +38,18 @@ class Motion(NamedTuple):
 
 
 def smooth_positions(positions: FloatArray, cutoff: float, dt: float) -> FloatArray:
-    """Positions z near the recorded y: the least of |y - z|^2 + lambda |third differences of z|^2.
+    """Return smooth positions z near the recorded y: the minimiser of |y - z|^2 + lambda |third differences of z|^2.
 
-    In the middle of a track that is a filter of gain 1 / (1 + lambda (2 - 2 cos(2 pi f dt))^3) without delay;
-    lambda makes the gain one half (-6 dB) at the cut-off. Parabolas pass unchanged, at the ends too.
+    In the middle of a track this is a filter of gain 1 / (1 + lambda (2 - 2 cos(2 pi f dt))^3) without delay; lambda
+    makes the gain one half (-6 dB) at the cut-off. Parabolas pass unchanged, at the ends too.
 
     Args:
         positions: One coordinate of one track without holes [m], shape (T,).
-        cutoff: Frequency that is halved [Hz], below half the sampling rate.
+        cutoff: Frequency at which the gain is one half [Hz], at most half the sampling rate.
         dt: Time step [s].
 
     Returns:
-        Smooth positions [m], shape (T,); tracks of fewer than four steps come back as they are.
+        Smooth positions [m], shape (T,); tracks of fewer than four steps are returned as they are.
 
     Raises:
         ValueError: A position is not finite, or the cut-off is not between 0 and 1 / (2 dt).
@@ -67,7 +67,7 @@ def smooth_positions(positions: FloatArray, cutoff: float, dt: float) -> FloatAr
 
 @lru_cache(maxsize=1024)
 def _penalty_factor(n: int, cutoff: float, dt: float) -> FloatArray:
-    """Cholesky factor of I + lambda D'D in lower banded form, D the (n - 3, n) third differences."""
+    """Return the Cholesky factor of I + lambda D'D in lower banded form, D the (n - 3, n) third differences."""
     weight = (2.0 - 2.0 * np.cos(2.0 * np.pi * cutoff * dt)) ** -3
     stencil = np.array([-1.0, 3.0, -3.0, 1.0])
     bands = np.zeros((4, n))
@@ -80,11 +80,11 @@ def _penalty_factor(n: int, cutoff: float, dt: float) -> FloatArray:
 
 
 def infer_motion(x: FloatArray, y: FloatArray, dt: float) -> Motion:
-    """Headings, speeds and actions that take a point mass through the given positions.
+    """Return the headings, speeds and actions that move a point mass through the given positions.
 
-    The inverse of the simulator's step (explicit Euler, old values): x += v cos(h) dt, y += v sin(h) dt, h += w dt,
-    v += a dt. Exact while the vehicle moves along the road at `MIN_HEADING_SPEED` or more; below, the heading is
-    atan2(vy, SLOWEST) and the speed the part of (vx, vy) along it, so that a creeping vehicle does not spin.
+    This inverts the simulator's step (explicit Euler, old values): x += v cos(h) dt, y += v sin(h) dt, h += w dt,
+    v += a dt. It is exact while the vehicle moves along the road at `MIN_HEADING_SPEED` or more. Below, the heading is
+    atan2(vy, MIN_HEADING_SPEED) and the speed the part of (vx, vy) along it, so that a creeping vehicle does not spin.
 
     Args:
         x: Smooth positions along the road [m], shape (T,).
@@ -98,4 +98,5 @@ def infer_motion(x: FloatArray, y: FloatArray, dt: float) -> Motion:
 
 
 def _pad(values: FloatArray, n: int) -> FloatArray:
+    """Return the values followed by NaN, shape (n,)."""
     return np.concatenate([values, np.full(n - len(values), np.nan)])

@@ -1,4 +1,4 @@
-"""Columns of text files, and the checks every recording passes before it becomes a table.
+"""Text files of numbers, and the checks that every recording passes before it becomes a table.
 
 Errors name the file and the line, counted from 1 as editors do.
 """
@@ -20,23 +20,23 @@ from samplers.problem import FloatArray
 Gaps = Literal["error", "cut"]
 
 FASTEST_SPEED = 70.0
-"""Speeds above this [m/s] (252 km/h) are taken for wrong units or broken tracking."""
+"""Speed [m/s] above which (252 km/h) units are taken to be wrong, or tracking to be broken."""
 FASTEST_JUMP = 100.0
-"""So are positions that move faster than this [m/s]."""
+"""Speed [m/s] above which a change of position is an error."""
 MEDIAN_LENGTHS = (2.5, 30.0)
-"""Median length of vehicles [m]; outside, lengths are not in the expected unit."""
+"""Least and greatest median length of vehicles [m]; outside, lengths are not in the expected unit."""
 SPEED_RATIOS = (0.8, 1.25)
-"""How far positions move for each metre the recorded speeds say; outside, units differ."""
+"""Least and greatest ratio of distance moved to recorded speed times time; outside, units differ."""
 
 
 @dataclass(frozen=True)
 class Rows:
-    """Columns of a file that remember their lines."""
+    """Columns of a file, with the line that each row stands in."""
 
     path: Path
     columns: Mapping[str, NDArray[Any]]
     lines: NDArray[np.int64]
-    """Line of each row."""
+    """Line of each row, shape (rows,)."""
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         return self.columns[name]
@@ -44,17 +44,17 @@ class Rows:
     def __len__(self) -> int:
         return len(self.lines)
 
-    def where(self, chosen: NDArray[np.bool_]) -> Rows:
-        """The chosen rows."""
+    def select(self, chosen: NDArray[np.bool_]) -> Rows:
+        """Return the chosen rows."""
         return Rows(self.path, {name: values[chosen] for name, values in self.columns.items()}, self.lines[chosen])
 
     def error(self, row: int, text: str) -> ValueError:
-        """An error that names the line of a row."""
+        """Return an error that names the file and the line of a row."""
         return ValueError(f"{self.path}, line {self.lines[row]}: {text}")
 
 
-def read_header(path: Path) -> list[str]:
-    """Fields of the first line.
+def read_column_names(path: Path) -> list[str]:
+    """Return the fields of the first line.
 
     Raises:
         ValueError: The file cannot be read or is empty.
@@ -70,18 +70,18 @@ def read_header(path: Path) -> list[str]:
 
 
 def read_numbers(path: Path | str, names: Mapping[str, Sequence[str]], text: Sequence[str] = ()) -> Rows:
-    """Columns of a CSV file with a header, as float64.
+    """Return columns of a CSV file with a header, as float64.
 
     Args:
         path: The file.
-        names: For each column wanted, the headers it goes by; upper and lower case are the same.
-        text: Those of the columns to give as strings instead.
+        names: Accepted headers by name of column, in upper or lower case.
+        text: Columns that are returned as strings instead.
 
     Raises:
         ValueError: The file cannot be read, is empty, lacks a column, or holds something else than a number.
     """
     path = Path(path)
-    header = read_header(path)
+    header = read_column_names(path)
     known = {name.lower(): i for i, name in enumerate(header)}
     found = {name: next((known[a.lower()] for a in also if a.lower() in known), None) for name, also in names.items()}
     missing = [names[name][0] for name, i in found.items() if i is None]
@@ -135,19 +135,19 @@ def _number(value: str) -> float:
 def check_tracks(
     rows: Rows, vehicle: FloatArray, frame: FloatArray, x: FloatArray, speed: FloatArray, dt: float, gaps: Gaps
 ) -> None:
-    """Refuses tracks that cannot be: rows given twice, holes, impossible speeds, positions and speeds that disagree.
+    """Check that no row is given twice, no frame is missing, and positions and speeds are possible and agree.
 
     Args:
         rows: The file, for its name and lines.
-        vehicle: Number, shape (rows,), like the following.
+        vehicle: Number of the vehicle, shape (rows,), as the next.
         frame: Number of the time step in the file.
-        x: Along the road [m].
-        speed: As recorded [m/s].
+        x: Position along the road [m], shape (rows,).
+        speed: Recorded speed [m/s], shape (rows,).
         dt: Time between frames [s].
-        gaps: What to do where a vehicle is missing for some frames: "error", or "cut" the track there.
+        gaps: What is done where a vehicle is missing for some frames: "error" raises, "cut" is allowed.
 
     Raises:
-        ValueError: Something of the above, with the line of its first occurrence.
+        ValueError: A check fails; the message names the line of the first row at fault.
     """
     bad = (speed < 0.0) | (speed > FASTEST_SPEED)
     if bad.any():
@@ -197,7 +197,7 @@ def check_tracks(
 
 
 def check_lengths(rows: Rows, length: FloatArray, unit: str) -> None:
-    """Refuses lengths that are not those of vehicles.
+    """Check that lengths are those of vehicles.
 
     Raises:
         ValueError: A length is not positive, or their median is outside `MEDIAN_LENGTHS`.

@@ -1,4 +1,4 @@
-"""The one table of recorded trajectories that every loader makes and everything else reads."""
+"""Trajectory tables: the one form that every loader returns and all other modules read."""
 
 from __future__ import annotations
 
@@ -27,21 +27,28 @@ _TYPES: dict[str, Any] = {"recording": np.str_} | dict.fromkeys(("vehicle", "fra
 
 @dataclass(frozen=True)
 class Trajectories:
-    """Vehicles at frames, one row each, sorted by recording, vehicle and frame; every column of shape (rows,).
+    """Positions of vehicles, one row per vehicle and frame, sorted by recording, vehicle and frame.
 
-    x runs along the road in the direction of travel, y across and positive to the right; both are those of the centre
-    of the vehicle's box.
+    x runs along the road in the direction of travel, y across it, positive to the right. Both are those of the centre
+    of the vehicle's box. Every column has shape (rows,).
 
     Raises:
         ValueError: Columns differ in length, rows are not sorted or occur twice, or values are impossible.
+
+    Example:
+        >>> from training.data import synthetic_traffic
+        >>> table = synthetic_traffic(seconds=2.0)
+        >>> second = table.select(table.vehicle == 1)
+        >>> len(second), int(second.lane[0]), round(float(second.time[-1]), 1)
+        (20, 2, 1.9)
     """
 
     recording: NDArray[np.str_]
-    """Name of one carriageway recorded without a break."""
+    """Name of the recording: one carriageway, recorded without a break."""
     vehicle: Integers
-    """Number within the recording."""
+    """Number of the vehicle within the recording."""
     frame: Integers
-    """Number of the time step, `DT` apart and common to the vehicles of a recording; a gap is a hole in the track."""
+    """Number of the time step, `DT` apart, common to all vehicles of a recording; a missing frame is a hole."""
     x: FloatArray
     """[m]"""
     y: FloatArray
@@ -55,9 +62,9 @@ class Trajectories:
     width: FloatArray
     """[m]; NaN where it was not recorded."""
     lane: Integers
-    """1 is the leftmost; 0 outside the lanes or not recorded."""
+    """Number of the lane, 1 the leftmost; 0 outside the lanes or not recorded."""
     leader: Integers
-    """Number of the vehicle ahead in the same lane, `NOBODY` where there is none in the record."""
+    """Number of the vehicle ahead in the same lane, `NOBODY` where none is recorded."""
     edges: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     """y of the lane boundaries of a recording, left to right [m]: lane n is between the n-th and the next."""
 
@@ -92,12 +99,12 @@ class Trajectories:
         return len(self.vehicle)
 
     def column(self, name: str) -> NDArray[Any]:
-        """A column by name."""
+        """Return a column by its name."""
         values: NDArray[Any] = getattr(self, name)
         return values
 
-    def rows(self, chosen: NDArray[Any]) -> Trajectories:
-        """The chosen rows, as a mask or as increasing indices."""
+    def select(self, chosen: NDArray[Any]) -> Trajectories:
+        """Return the chosen rows, given as a mask or as increasing indices."""
         return replace(self, **{name: self.column(name)[chosen] for name in COLUMNS})
 
     @property
@@ -105,13 +112,17 @@ class Trajectories:
         """Clock of the recording [s]."""
         return np.asarray(DT * self.frame, dtype=np.float64)
 
-    def breaks(self) -> NDArray[np.int64]:
-        """Rows at which a track begins: another recording, another vehicle, or the first frame after a hole."""
+    def track_starts(self) -> NDArray[np.int64]:
+        """Return the rows at which a track starts: another recording or vehicle, or the first frame after a hole."""
         same = (self.recording[1:] == self.recording[:-1]) & (self.vehicle[1:] == self.vehicle[:-1])
         return np.append(0, 1 + np.flatnonzero(~(same & (np.diff(self.frame) == 1))))
 
-    def find(self, vehicle: Integers) -> Integers:
-        """Rows of other vehicles of the same recording and frame, shape (rows,); -1 where there is none."""
+    def find_rows(self, vehicle: Integers) -> Integers:
+        """Return the rows of other vehicles at the same recording and frame, shape (rows,); -1 where there is none.
+
+        Args:
+            vehicle: Number of the vehicle to find for each row, shape (rows,).
+        """
         recordings = np.unique(self.recording, return_inverse=True)[1].ravel()
         vehicles, frames = np.ptp(self.vehicle) + 1, np.ptp(self.frame) + 1
         frame = self.frame - self.frame.min()
@@ -123,10 +134,38 @@ class Trajectories:
 
 
 COLUMNS = tuple(f.name for f in fields(Trajectories) if f.name != "edges")
+"""Names of the columns."""
 
 
 def tabulate(columns: Mapping[str, Any], edges: Mapping[str, tuple[float, ...]] | None = None) -> Trajectories:
-    """A table of columns in any order of rows; columns may be one number or name for all rows."""
+    """Return a table made of columns in any order of rows.
+
+    Args:
+        columns: Values by name of column; one number or name stands for all rows, except in "vehicle".
+        edges: Lane boundaries of each recording, see `Trajectories.edges`.
+
+    Raises:
+        ValueError: A row occurs twice, or a value is impossible.
+
+    Example:
+        >>> table = tabulate(
+        ...     {
+        ...         "recording": "my road",
+        ...         "vehicle": [2, 1, 1],
+        ...         "frame": [0, 1, 0],
+        ...         "x": [30.0, 11.5, 10.0],
+        ...         "y": 1.75,
+        ...         "speed": 15.0,
+        ...         "acceleration": 0.0,
+        ...         "length": 4.5,
+        ...         "width": 1.8,
+        ...         "lane": 1,
+        ...         "leader": [NOBODY, NOBODY, 2],
+        ...     }
+        ... )
+        >>> table.x.tolist()
+        [10.0, 11.5, 30.0]
+    """
     size = np.shape(columns["vehicle"])
     arrays = {name: np.broadcast_to(np.asarray(columns[name], _TYPES.get(name, np.float64)), size) for name in COLUMNS}
     order = np.lexsort([arrays[name] for name in ("frame", "vehicle", "recording")])
@@ -134,7 +173,17 @@ def tabulate(columns: Mapping[str, Any], edges: Mapping[str, tuple[float, ...]] 
 
 
 def find_leaders(frame: Integers, lane: Integers, x: FloatArray, recording: NDArray[Any] | None = None) -> Integers:
-    """Rows of the nearest vehicle ahead in the same lane, shape (rows,); -1 where there is none, or no lane."""
+    """Return the rows of the nearest vehicles ahead in the same lane, shape (rows,).
+
+    Args:
+        frame: Number of the time step, shape (rows,).
+        lane: Number of the lane, shape (rows,); 0 is no lane.
+        x: Position along the road [m], shape (rows,).
+        recording: Name of the recording, shape (rows,); None if all rows are of one.
+
+    Returns:
+        -1 where nobody is ahead, or the vehicle is in no lane.
+    """
     group = np.zeros(len(x), np.int64) if recording is None else np.unique(recording, return_inverse=True)[1].ravel()
     order = np.lexsort([x, lane, frame, group])
     sames = [np.diff(values[order]) == 0 for values in (lane, frame, group)]
@@ -145,17 +194,31 @@ def find_leaders(frame: Integers, lane: Integers, x: FloatArray, recording: NDAr
 
 
 def write_trajectories(trajectories: Trajectories, path: Path | str) -> None:
-    """Writes a table as parquet, lane boundaries in its metadata."""
+    """Write a table to a parquet file, with the lane boundaries in its metadata.
+
+    Example:
+        >>> import tempfile
+        >>> from training.data import synthetic_traffic
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_trajectories(synthetic_traffic(seconds=2.0), f"{folder}/table.parquet")
+        ...     len(read_trajectories(f"{folder}/table.parquet"))
+        180
+    """
     edges = json.dumps({name: list(values) for name, values in trajectories.edges.items()})
     table = pa.table({name: pa.array(trajectories.column(name)) for name in COLUMNS})
     pq.write_table(table.replace_schema_metadata({_METADATA: edges.encode()}), path)
 
 
 def read_trajectories(path: Path | str) -> Trajectories:
-    """Reads what `write_trajectories` wrote.
+    """Return a table from a file of `write_trajectories`.
 
     Raises:
         ValueError: The file cannot be read, lacks a column or holds impossible values.
+
+    Example:
+        >>> read_trajectories("no_such_table.parquet")  # doctest: +ELLIPSIS
+        Traceback (most recent call last):
+        ValueError: Cannot read trajectories from no_such_table.parquet: ...
     """
     try:
         table = pq.read_table(path)

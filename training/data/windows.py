@@ -1,4 +1,4 @@
-"""Scenes from any table of trajectories: its recordings cut into windows of time."""
+"""Windows: the recordings of a table cut into scenes of some seconds."""
 
 from __future__ import annotations
 
@@ -9,22 +9,27 @@ from training.data.scenes import TrafficScene, assemble_scene, smooth_tracks
 from training.data.trajectories import DT, Trajectories
 
 MIN_STEPS = 4
-"""Steps of a scene, at least."""
+"""Least number of steps of a scene: the smoother leaves shorter tracks as they are."""
 
 
 def scenes_of(trajectories: Trajectories, seconds: float = 10.0) -> tuple[TrafficScene, ...]:
-    """Every recording in windows of time over its whole road, smoothed.
+    """Return scenes of some seconds over the whole road of every recording, smoothed.
 
-    Tracks are smoothed once over their whole length and then cut, so two windows agree where they meet. A scene
-    starts at a multiple of `seconds` of the recording's clock. Rows outside the lanes are left out.
+    Tracks are smoothed once over their whole length and then cut, so two windows agree where they meet. A scene starts
+    at a multiple of `seconds` of the recording's clock. Rows outside the lanes are left out.
 
     Args:
-        trajectories: With lane boundaries, and positions and sizes in every row.
+        trajectories: Table with lane boundaries, and with positions and sizes in every row.
         seconds: Length of a scene [s]; the last one of a recording is shorter.
 
     Raises:
-        ValueError: A recording has no lane boundaries or nobody between them, a row has no position across or size,
-            or the length is less than a few steps.
+        ValueError: A recording has no lane boundaries or nobody between them, a row lacks its lateral position or a
+            size, or the scenes are shorter than `MIN_STEPS` steps.
+
+    Example:
+        >>> from training.data import synthetic_traffic
+        >>> [scene.name for scene in scenes_of(synthetic_traffic(seconds=12.0), seconds=4.0)]
+        ['synthetic-0', 'synthetic-4', 'synthetic-8']
     """
     t = trajectories
     steps = round(seconds / DT)
@@ -33,7 +38,7 @@ def scenes_of(trajectories: Trajectories, seconds: float = 10.0) -> tuple[Traffi
     for name in ("y", "length", "width"):
         if np.isnan(t.column(name)).any():
             raise ValueError(f"Scenes need {name} in every row; this table lacks it in some.")
-    smooth = smooth_tracks(t.breaks(), t.x, t.y)
+    smooth = smooth_tracks(t.track_starts(), t.x, t.y)
     scenes: list[TrafficScene] = []
     for recording in np.unique(t.recording).tolist():
         own = t.recording == recording
@@ -65,7 +70,7 @@ def scenes_of(trajectories: Trajectories, seconds: float = 10.0) -> tuple[Traffi
 
 
 def _describe_positions(t: Trajectories, rows: NDArray[np.bool_]) -> str:
-    """Where the vehicles of a recording are across the road, in words."""
+    """Return a phrase that says where across the road the vehicles of a recording are."""
     lanes = np.unique(t.lane[rows & (t.lane > 0)])
     words = f"its vehicles are at y = {t.y[rows].min():.1f} to {t.y[rows].max():.1f} m"
     medians = ", ".join(f"lane {lane} at {np.median(t.y[rows & (t.lane == lane)]):.1f} m" for lane in lanes[:8])

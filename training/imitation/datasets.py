@@ -1,4 +1,4 @@
-"""Where recorded scenes come from: the tables of US 101, or a user's own NGSIM or highD files."""
+"""Sources of recorded scenes: the tables of US 101, or a user's own NGSIM or highD files."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from training.data.windows import scenes_of
 
 SOURCE_KINDS = ("data", "ngsim", "highd")
 TEST_SHARE = 0.2
-"""Share of a user's recording, its end, that is kept for tests."""
+"""Share at the end of a user's recording that is kept for tests."""
 _NGSIM = "CC BY-SA 3.0, as reported of the NGSIM record 8ect-6jqj"
 _HIGHD = "highD's: non-commercial, and neither the data nor what derives from it is passed on without leave"
 
@@ -24,18 +24,23 @@ class Source:
     """Recorded traffic in files.
 
     Raises:
-        ValueError: If the kind is unknown.
+        ValueError: The kind is unknown.
+
+    Example:
+        >>> source = Source("highd", Path("highD/data"), recordings=("01", "02"))
+        >>> source.options
+        '--highd data --recording 01 --recording 02'
     """
 
     kind: str
     """"data" for a folder with the compact tables of US 101, "ngsim" for a raw file, "highd" for a folder."""
     path: Path
     location: str | None = None
-    """Of a raw NGSIM file that has several."""
+    """Location to read from a raw NGSIM file that has several."""
     recordings: tuple[str, ...] = ()
-    """Of highD, such as "01"; none for all that are in the folder."""
+    """Numbers of highD recordings, such as "01"; empty for all that are in the folder."""
     seconds: float = 10.0
-    """Length of the scenes that a user's recording is cut into [s]."""
+    """Duration of the scenes that a user's recording is cut into [s]."""
 
     def __post_init__(self) -> None:
         if self.kind not in SOURCE_KINDS:
@@ -43,7 +48,7 @@ class Source:
 
     @property
     def description(self) -> str:
-        """What it is, for those who get a driver without it."""
+        """Description of the data, for users of a driver who do not have them."""
         if self.kind == "data":
             return "NGSIM US 101, 15 June 2005, 07:49:51 to 07:52:53 without 64 to 88 s and 158 to 193 s of its clock"
         if self.kind == "ngsim":
@@ -52,12 +57,12 @@ class Source:
 
     @property
     def licence(self) -> str:
-        """Of the data."""
+        """Licence of the data."""
         return _HIGHD if self.kind == "highd" else _NGSIM
 
     @property
     def options(self) -> str:
-        """The source as options of the command line; of the path its name only."""
+        """The source as options of the command line; of the path only its name."""
         words = [f"--{self.kind}", self.path.name or str(self.path)]
         words += ["--location", self.location] if self.location else []
         for recording in self.recordings:
@@ -67,10 +72,15 @@ class Source:
 
 
 def load_scenes(source: Source) -> tuple[tuple[TrafficScene, ...], tuple[TrafficScene, ...]]:
-    """Scenes to learn from and scenes to test on, which share no moment.
+    """Return scenes to learn from and scenes to test on, which share no moment.
 
     Raises:
         ValueError: A file is missing or broken; see the loaders.
+
+    Example:
+        >>> load_scenes(Source("ngsim", Path("no_such_file.csv")))  # doctest: +ELLIPSIS
+        Traceback (most recent call last):
+        ValueError: Cannot read no_such_file.csv: ...
     """
     if source.kind == "data":
         return split_by_clock(load_us101_scenes(source.path))
@@ -84,7 +94,7 @@ def load_scenes(source: Source) -> tuple[tuple[TrafficScene, ...], tuple[Traffic
 def split_end(
     scenes: tuple[TrafficScene, ...] | list[TrafficScene],
 ) -> tuple[tuple[TrafficScene, ...], tuple[TrafficScene, ...]]:
-    """The last fifth of every recording's scenes apart from the rest; of a single scene, none."""
+    """Split scenes into those to learn from and the last fifth of every recording; of a single scene none is kept."""
     learn: list[TrafficScene] = []
     test: list[TrafficScene] = []
     for _, group in groupby(scenes, key=lambda scene: scene.name.rsplit("-", 1)[0]):

@@ -1,15 +1,15 @@
-"""An ensemble of drivers around a trained one, and the law of their last layers.
+"""An ensemble of drivers around a trained one, and the distribution of their last layers.
 
     python -m training.imitation.ensemble runs/mgail --members 32 --out mgail.safetensors
 
-A member is the base's training taken up once more: from the base's weights, with the base's critic, optimisers and
-losses as they were at its end, and with the trunk frozen. Only chance differs: its scenes are drawn from the base's
-with repetition, those that it starts in and those whose driving it compares with. Anything else that differed (new
+A member continues the training of the base: from the base's weights, with the base's critic, optimisers and losses as
+they were at its end, and with the trunk frozen. Members differ by chance alone: each draws its scenes from the base's
+with repetition, both those that it drives in and those that its driving is compared with. Any other difference (new
 critics, other weights of the losses) would move all members the same way, and their mean away from the base.
 
-Scenes of one recording overlap in vehicles and time, and a run is short: the spread says how far the last layer can
-move at no loss, not what a posterior would say. Metadata record how far a member moves within its run beside how far
-members are from each other, and how far their mean is from the base.
+Scenes of one recording overlap in vehicles and time, and a run is short. So the spread says how far the last layer can
+move without loss; it is no posterior. The metadata record how far a member moves within its run, how far members are
+from each other, and how far their mean is from the base.
 """
 
 from __future__ import annotations
@@ -36,42 +36,42 @@ from training.imitation.algorithms.critic import Critic
 from training.imitation.algorithms.expert_pairs import Pairs
 from training.imitation.algorithms.learner import Learner, run_updates
 from training.imitation.datasets import load_scenes
-from training.imitation.fit import CHECKPOINT, UPDATES, Data, prepare_data
+from training.imitation.fit import CHECKPOINT, UPDATE_RULES, Data, prepare_data
 from training.imitation.run_folder import DRIVER, read_training_settings
 from training.imitation.weight_fit import FOLDS, fit_weights
 
 
 @dataclass(frozen=True)
 class Ensemble:
-    """How to make an ensemble.
+    """Settings of an ensemble.
 
     Raises:
-        ValueError: If there are too few members to fit a law, or updates.
+        ValueError: There are too few members to fit a distribution, or too few updates.
     """
 
     members: int = 32
     updates: int = 60
-    """Of each member; one of a driver that was only cloned makes the epochs of its base."""
+    """Number of updates of each member; one of a driver that was only cloned makes as many epochs as its base."""
     seed: int = 0
 
     def __post_init__(self) -> None:
         if self.members < 2 * FOLDS:
-            raise ValueError(f"Expected {2 * FOLDS} or more members, for a law to be fitted, got {self.members}.")
+            raise ValueError(f"Expected {2 * FOLDS} or more members to fit a distribution, got {self.members}.")
         if self.updates < 2:
             raise ValueError(f"Expected 2 or more updates of each member, got {self.updates}.")
 
 
 class Member(NamedTuple):
-    """One trained member."""
+    """A trained member."""
 
     weights: FloatArray
-    """Its last layer, shape (404,)."""
+    """Weights of its last layer, shape (404,)."""
     within: FloatArray
     """Standard deviation of each weight over the second half of its run, shape (404,)."""
 
 
 def member_config(base: Config, ensemble: Ensemble) -> Config:
-    """The base's settings with all schedules at their ends."""
+    """Return the base's settings with all schedules at their ends."""
     last: dict[str, Any] = {name: (getattr(base, name)[1],) * 2 for name in ("horizon", "age", "drivers")}
     clone_weight = (base.clone_weight[1], base.clone_weight[1])
     return replace(base, updates=ensemble.updates, warm_up=0, clone_weight=clone_weight, **last)
@@ -83,12 +83,12 @@ def train_member(
     """Train a member.
 
     Args:
-        data: What the base learned from.
+        data: Data that the base learned from.
         driver: The base.
-        base: Its settings.
-        checkpoint: Of its training.
+        base: Settings of the base.
+        checkpoint: Checkpoint of the base's training.
         ensemble: Settings of the ensemble.
-        number: Decides, with the ensemble's seed, everything random.
+        number: Number of the member; with the ensemble's seed it decides everything random.
     """
     (seed,) = np.random.SeedSequence([ensemble.seed, number]).generate_state(1)
     generator = torch.Generator().manual_seed(int(seed))
@@ -104,14 +104,14 @@ def train_member(
     else:
         learner = Learner(config, data.recording, drawn, pairs, policy, Critic(), generator)
         learner.inherit(checkpoint)
-        for _ in run_updates(learner, UPDATES[config.method]):
+        for _ in run_updates(learner, UPDATE_RULES[config.method]):
             visited.append(head_weights(policy).detach())
     late = torch.stack(visited[len(visited) // 2 :]).double().numpy()
     return Member(late[-1], late.std(axis=0))
 
 
 def select_scenes(pairs: Pairs, drawn: Tensor) -> Pairs:
-    """The pairs of scenes that were drawn, as often as they were drawn."""
+    """Return the pairs of the scenes that were drawn, as often as they were drawn."""
     rows = torch.cat([(pairs.scene == scene).nonzero().flatten() for scene in drawn])
     return Pairs(*(column[rows] for column in pairs))
 
@@ -120,7 +120,7 @@ def train_members(folder: Path, ensemble: Ensemble, progress: bool = False) -> l
     """Train an ensemble around the driver in a folder; members that are kept there are not trained again.
 
     Raises:
-        ValueError: If the folder holds no finished training, or members of another driver.
+        ValueError: The folder holds no finished training, or members of another driver.
     """
     source, base = read_training_settings(folder)
     driver = read_driver(folder / DRIVER)
@@ -145,7 +145,7 @@ def train_members(folder: Path, ensemble: Ensemble, progress: bool = False) -> l
 
 
 def measure_spread(members: list[Member], base: FloatArray) -> dict[str, float]:
-    """How far members are from each other, move within their runs, and are as a whole from the base."""
+    """Return how far members are from each other, move within their runs, and are on average from the base."""
     weights = np.stack([member.weights for member in members])
     between, within = weights.std(axis=0, ddof=1), np.stack([member.within for member in members]).mean(axis=0)
     bias = np.abs(weights.mean(axis=0) - base)
@@ -161,10 +161,10 @@ def measure_spread(members: list[Member], base: FloatArray) -> dict[str, float]:
 
 
 def make_ensemble(folder: Path, ensemble: Ensemble, out: Path, progress: bool = False) -> Path:
-    """Write the driver in a folder anew, with the law of its weights.
+    """Write a copy of the driver in a folder that has a distribution of its weights.
 
     Args:
-        folder: Of a finished training.
+        folder: Folder of a finished training.
         ensemble: Settings.
         out: File to write, `.safetensors`.
         progress: Show a bar on standard error.
@@ -173,7 +173,7 @@ def make_ensemble(folder: Path, ensemble: Ensemble, out: Path, progress: bool = 
         The file.
 
     Raises:
-        ValueError: If there is no finished training, or no law can be fitted.
+        ValueError: There is no finished training, or no distribution can be fitted.
     """
     members = train_members(folder, ensemble, progress)
     driver, provenance = read_driver(folder / DRIVER), read_provenance(folder / DRIVER)
@@ -186,12 +186,12 @@ def make_ensemble(folder: Path, ensemble: Ensemble, out: Path, progress: bool = 
 
 def main(
     run: Annotated[Path, typer.Argument(help="Folder of a finished training.")],
-    out: Annotated[Path, typer.Option(help="The driver with the law of its weights, .safetensors.")],
+    out: Annotated[Path, typer.Option(help="The driver with the distribution of its weights, .safetensors.")],
     members: Annotated[int, typer.Option(help="Members to train.")] = Ensemble.members,
     updates: Annotated[int, typer.Option(help="Of each member.")] = Ensemble.updates,
-    seed: Annotated[int, typer.Option(help="The same seed gives the same law.")] = Ensemble.seed,
+    seed: Annotated[int, typer.Option(help="The same seed gives the same distribution.")] = Ensemble.seed,
 ) -> None:
-    """Train an ensemble around a driver and fit the law of its last layer's weights."""
+    """Train an ensemble around a driver and fit the distribution of its last layer's weights."""
     torch.set_num_threads(1)
     try:
         path = make_ensemble(run, Ensemble(members, updates, seed), out, progress=True)

@@ -1,4 +1,4 @@
-"""Fitting a driver to recorded scenes, from data to the last update."""
+"""Training of a driver on recorded scenes, from data to the last update."""
 
 from __future__ import annotations
 
@@ -20,28 +20,46 @@ from training.imitation.algorithms.mgail import update_mgail
 from training.imitation.progress import progress_bar, tensorboard_logs
 from training.imitation.traffic.recording import Recording, stack_scenes
 
-UPDATES: dict[str, Update] = {"gail": update_gail, "mgail": update_mgail}
+UPDATE_RULES: dict[str, Update] = {"gail": update_gail, "mgail": update_mgail}
+"""Update of each adversarial method."""
 CHECKPOINT_INTERVAL = 50
-"""Updates between checkpoints."""
+"""Number of updates between checkpoints."""
 CHECKPOINT = "checkpoint.pt"
-"""Its name in the folder of a training."""
+"""Name of the checkpoint in the folder of a training."""
 
 
 @dataclass(frozen=True)
 class Data:
-    """Recorded traffic, ready for trainings."""
+    """Recorded traffic, prepared for trainings.
+
+    Example:
+        >>> from training.data import scenes_of, synthetic_traffic
+        >>> data = prepare_data(scenes_of(synthetic_traffic(), seconds=4.0))
+        >>> data.test is None
+        True
+    """
 
     recording: Recording
     pairs: Pairs
     test: Recording | None
-    """None if there are too few scenes to keep some apart."""
+    """Scenes for tests; None if there are too few to keep some."""
 
 
 def prepare_data(scenes: Sequence[TrafficScene], test: Sequence[TrafficScene] = ()) -> Data:
-    """Stack scenes and pair what was seen with what was done in them.
+    """Return scenes as one recording, with the pairs of features and actions in them.
+
+    Args:
+        scenes: Scenes to learn from.
+        test: Scenes kept for tests.
 
     Raises:
-        ValueError: If nobody follows anybody in any scene.
+        ValueError: There is no scene, or nobody follows anybody in any of them.
+
+    Example:
+        >>> from training.data import scenes_of, synthetic_traffic
+        >>> data = prepare_data(scenes_of(synthetic_traffic(), seconds=4.0))
+        >>> data.recording.x.shape, data.pairs.features.shape
+        (torch.Size([3, 40, 9]), torch.Size([708, 51]))
     """
     if not scenes:
         raise ValueError("Expected scenes to learn from, got none.")
@@ -53,12 +71,19 @@ def prepare_data(scenes: Sequence[TrafficScene], test: Sequence[TrafficScene] = 
 
 
 def make_learner(data: Data, config: Config, among: torch.Tensor | None = None) -> Learner:
-    """Everything of a training before its first update: a cloned policy, a new critic.
+    """Return a training before its first update: a cloned policy and a new critic.
 
     Args:
         data: Recorded traffic.
         config: Settings.
-        among: Scenes that are driven, the oftener listed the oftener, shape (k,); None for all that have pairs.
+        among: Scenes that are driven, with repetition, shape (k,); None for all that have pairs.
+
+    Example:
+        >>> from training.data import scenes_of, synthetic_traffic
+        >>> data = prepare_data(scenes_of(synthetic_traffic(), seconds=4.0))
+        >>> learner = make_learner(data, Config(epochs=1))
+        >>> learner.update
+        0
     """
     generator = torch.Generator().manual_seed(config.seed)
     policy = clone_policy(data.pairs, config, generator)
@@ -74,19 +99,27 @@ def train_learner(
     progress: bool = False,
     every: int = CHECKPOINT_INTERVAL,
 ) -> Policy:
-    """Make the updates of a training.
+    """Make the remaining updates of a training and return its policy.
 
-    The policy is the one after the last update, never the best of several.
+    The policy is that after the last update, never the best of several.
 
     Args:
-        learner: As `make_learner` makes it.
-        out: Folder of the checkpoint; a training that is found there is taken up. None keeps nothing.
-        log: Write TensorBoard logs there.
+        learner: A training, as `make_learner` returns it.
+        out: Folder of the checkpoint; a training found there is resumed. None keeps no checkpoint.
+        log: Write TensorBoard logs to the folder.
         progress: Show a bar on standard error.
-        every: Updates between checkpoints.
+        every: Number of updates between checkpoints.
 
     Raises:
-        ValueError: If logs are asked for and TensorBoard is not installed.
+        ValueError: Logs are to be written and TensorBoard is not installed.
+
+    Example:
+        >>> from training.data import scenes_of, synthetic_traffic
+        >>> data = prepare_data(scenes_of(synthetic_traffic(), seconds=4.0))
+        >>> policy = train_learner(make_learner(data, Config(method="bc", epochs=1)))
+        >>> mean, log_std = policy(data.pairs.features)
+        >>> mean.shape
+        torch.Size([708, 2])
     """
     if learner.config.method == "bc":
         if out is not None:
@@ -95,7 +128,7 @@ def train_learner(
     if out is not None and (out / CHECKPOINT).exists():
         learner.load(out / CHECKPOINT)
     with progress_bar(learner, progress) as show, tensorboard_logs(out if log else None, learner.update) as write:
-        for entry in run_updates(learner, UPDATES[learner.config.method]):
+        for entry in run_updates(learner, UPDATE_RULES[learner.config.method]):
             show(learner, entry)
             write(learner, entry)
             if out is not None and (learner.update % every == 0 or learner.update == learner.config.updates):

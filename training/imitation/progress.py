@@ -1,4 +1,4 @@
-"""What a training shows while it runs: a bar, and TensorBoard logs."""
+"""Progress of a training: a bar, and TensorBoard logs."""
 
 from __future__ import annotations
 
@@ -9,13 +9,21 @@ from typing import Any
 
 from training.imitation.algorithms.learner import Learner, Log
 
-Callback = Callable[[Learner, Log], None]
-"""Called after every update."""
+AfterUpdate = Callable[[Learner, Log], None]
+"""Function that is called after every update."""
 
 
 @contextlib.contextmanager
-def progress_bar(learner: Learner, show: bool) -> Iterator[Callback]:
-    """A progress bar on standard error."""
+def progress_bar(learner: Learner, show: bool) -> Iterator[AfterUpdate]:
+    """Open a progress bar on standard error.
+
+    Args:
+        learner: The training.
+        show: False gives a function that does nothing.
+
+    Yields:
+        Function to call after every update.
+    """
     if not show:
         yield lambda learner, entry: None
         return
@@ -34,10 +42,10 @@ def progress_bar(learner: Learner, show: bool) -> Iterator[Callback]:
 
 
 def summary_writer() -> Any:
-    """TensorBoard's class of writers.
+    """Return TensorBoard's class of writers.
 
     Raises:
-        ValueError: If TensorBoard is not installed.
+        ValueError: TensorBoard is not installed.
     """
     try:
         from torch.utils.tensorboard import SummaryWriter
@@ -47,15 +55,18 @@ def summary_writer() -> Any:
 
 
 @contextlib.contextmanager
-def tensorboard_logs(folder: Path | None, update: int) -> Iterator[Callback]:
-    """TensorBoard logs in a folder; None writes none.
+def tensorboard_logs(folder: Path | None, update: int) -> Iterator[AfterUpdate]:
+    """Open TensorBoard logs in a folder.
 
     Args:
-        folder: Where to.
-        update: Updates that were made before; entries of later ones, which a killed run left, are dropped.
+        folder: Folder of the logs; None gives a function that does nothing.
+        update: Number of updates made before; entries of later ones, left by a run that was stopped, are dropped.
+
+    Yields:
+        Function to call after every update.
 
     Raises:
-        ValueError: If TensorBoard is not installed.
+        ValueError: TensorBoard is not installed.
     """
     if folder is None:
         yield lambda learner, entry: None

@@ -1,7 +1,7 @@
-"""Trainings in folders: from recorded files to a driver's file.
+"""Folders of trainings: from recorded files to the file of a driver.
 
 A folder holds `driver.safetensors` (see `agents.load_driver`), `training.json` (source and settings) and a checkpoint,
-from which a training that was stopped goes on to the same weights.
+from which a stopped training is resumed to the same weights.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from training.imitation.fit import CHECKPOINT, make_learner, prepare_data, train
 from training.imitation.progress import summary_writer
 
 DRIVER, SETTINGS = "driver.safetensors", "training.json"
-"""What a training leaves in its folder beside the checkpoint."""
+"""Names of the files in the folder of a training, beside the checkpoint."""
 NOISES = {"human": HUMAN_NOISE, "white": WHITE_NOISE}
-"""Names of noises on the command line."""
+"""Noises by their names on the command line."""
 
 
 def train_driver(
@@ -37,16 +37,21 @@ def train_driver(
         source: Recorded traffic.
         config: Settings.
         out: Folder; it is made if there is none.
-        log: Write TensorBoard logs there.
+        log: Write TensorBoard logs to it.
         progress: Show a bar on standard error.
         measured: Measure the driver in the scenes kept for tests, for the header of its file.
 
     Returns:
-        The driver's file.
+        The file of the driver.
 
     Raises:
-        ValueError: If the data cannot be read, the folder holds another training, or logs are asked for and
+        ValueError: The data cannot be read, the folder holds another training, or logs are to be written and
             TensorBoard is not installed.
+
+    Example:
+        >>> train_driver(Source("data", Path("no_such_folder")), Config(), Path("out"))  # doctest: +ELLIPSIS
+        Traceback (most recent call last):
+        ValueError: There is no ngsim_us101_scenes.parquet in the folder 'no_such_folder'. ...
     """
     if log:
         summary_writer()
@@ -67,14 +72,23 @@ def train_driver(
 
 
 def driver_of(policy: Policy, config: Config) -> LearnedDriver:
-    """The driver that a trained policy is, with the noise and the limits that it was trained with."""
+    """Return the driver of a trained policy, with the noise and the bounds of actions that it was trained with.
+
+    Example:
+        >>> from training.data import scenes_of, synthetic_traffic
+        >>> data = prepare_data(scenes_of(synthetic_traffic(), seconds=4.0))
+        >>> config = Config(method="bc", epochs=1)
+        >>> driver = driver_of(train_learner(make_learner(data, config)), config)
+        >>> driver.name, driver.acceleration
+        ('bc', (-8.0, 4.0))
+    """
     frozen = policy.eval().requires_grad_(False)
     acceleration, yaw_rate = zip(ACTION_LOW, ACTION_HIGH, strict=True)
     return LearnedDriver(frozen, config.colour, acceleration, yaw_rate, name=config.method)
 
 
 def command_of(source: Source, config: Config) -> str:
-    """The command that repeats a training, but for the folders."""
+    """Return the command that repeats a training, without its folders."""
     words = []
     for option in fields(Config):
         value = getattr(config, option.name)
@@ -84,6 +98,7 @@ def command_of(source: Source, config: Config) -> str:
 
 
 def _option(name: str, value: Any) -> list[str]:
+    """Return a setting as words of the command line."""
     if isinstance(value, AutoregressiveNoise):
         named = [word for word, colour in NOISES.items() if colour == value]
         return ["--noise", *named] if named else []
@@ -94,15 +109,15 @@ def _option(name: str, value: Any) -> list[str]:
 
 
 def format_settings(source: Source, config: Config) -> str:
-    """Source and settings as JSON."""
+    """Return source and settings as JSON."""
     return json.dumps({"source": {**asdict(source), "path": str(source.path)}, "config": asdict(config)}, indent=1)
 
 
 def check_folder(out: Path, settings: str) -> None:
-    """Refuse a folder for a training.
+    """Check that a folder can take a training.
 
     Raises:
-        ValueError: If it is a file, or holds a training with other settings.
+        ValueError: It is a file, or holds a training with other settings.
     """
     if out.exists() and not out.is_dir():
         raise ValueError(f"Expected a folder for the training, got the file {str(out)!r}.")
@@ -113,10 +128,10 @@ def check_folder(out: Path, settings: str) -> None:
 
 
 def write_settings(out: Path, settings: str) -> None:
-    """Write settings into a folder, which is made if there is none.
+    """Write settings to a folder, which is made if there is none.
 
     Raises:
-        ValueError: If it cannot be made.
+        ValueError: It cannot be made.
     """
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -126,10 +141,10 @@ def write_settings(out: Path, settings: str) -> None:
 
 
 def read_training_settings(folder: Path) -> tuple[Source, Config]:
-    """Source and settings of the training in a folder.
+    """Return source and settings of the training in a folder.
 
     Raises:
-        ValueError: If there is none.
+        ValueError: It holds none.
     """
     path = folder / SETTINGS
     if not path.is_file():
@@ -144,4 +159,5 @@ def read_training_settings(folder: Path) -> tuple[Source, Config]:
 
 
 def _tuples(value: Any) -> Any:
+    """Return a list as a tuple, as JSON has none; other values as they are."""
     return tuple(value) if isinstance(value, list) else value

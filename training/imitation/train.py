@@ -24,15 +24,15 @@ from training.imitation.run_folder import NOISES, train_driver
 
 
 class AlgorithmOption(str, Enum):
-    """Ways to learn."""
+    """Algorithms, as an option of the command line."""
 
     BC = "bc"
     GAIL = "gail"
     MGAIL = "mgail"
 
 
-class NoiseOption(str, Enum):
-    """Colours of the drivers' noise."""
+class TrainingNoise(str, Enum):
+    """Noises, as an option of the command line."""
 
     HUMAN = "human"
     WHITE = "white"
@@ -57,7 +57,7 @@ def main(
     method: Annotated[AlgorithmOption, typer.Option(help="How to learn.")] = AlgorithmOption.MGAIL,
     seed: Annotated[int, typer.Option(help="The same seed gives the same weights.")] = DEFAULTS.seed,
     updates: Annotated[int, typer.Option(min=1, help="After behaviour cloning.")] = DEFAULTS.updates,
-    noise: Annotated[NoiseOption, typer.Option(help="Coloured as people's, or white.")] = NoiseOption.HUMAN,
+    noise: Annotated[TrainingNoise, typer.Option(help="Coloured as people's, or white.")] = TrainingNoise.HUMAN,
     epochs: Annotated[int, typer.Option(min=0, help="Of behaviour cloning.")] = DEFAULTS.epochs,
     batch: Count = DEFAULTS.batch,
     clone_rate: Number = DEFAULTS.clone_rate,
@@ -119,10 +119,10 @@ def source_of(
     recording: list[str] | None = None,
     seconds: float = Source.seconds,
 ) -> Source:
-    """The one source that is named.
+    """Return the one source that is given.
 
     Raises:
-        ValueError: If none is, or several are.
+        ValueError: None is given, or several are.
     """
     named = [(kind, path) for kind, path in (("data", data), ("ngsim", ngsim), ("highd", highd)) if path is not None]
     if len(named) != 1:

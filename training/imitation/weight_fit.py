@@ -1,8 +1,8 @@
-"""From an ensemble of drivers to the law of their last layers, by graphical lasso.
+"""Distribution of the last layers' weights of an ensemble, by graphical lasso.
 
-A few dozen members say next to nothing about most of the 81 406 correlations of 404 weights. So the correlations are
-drawn towards 0 first, the graphical lasso keeps the dependences that stand out, and how many it keeps is what predicts
-members best that were held out.
+A few dozen members say next to nothing about most of the 81,406 correlations of 404 weights. So the correlations are
+first shrunk towards 0, the graphical lasso keeps the dependences that stand out, and the penalty that decides how many
+it keeps is the one with the greatest likelihood of held-out members.
 
 References:
     Friedman, Hastie and Tibshirani, "Sparse inverse covariance estimation with the graphical lasso", Biostatistics
@@ -24,26 +24,28 @@ from agents.learned.weight_distribution import RADIUS, WEIGHT_NAMES, WeightDistr
 from samplers.problem import FloatArray
 
 PENALTIES = (0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.25, 0.2, 0.15, 0.1)
-"""Tried in this order, on correlations; with a quarter of the identity mixed in the first keeps no dependence."""
+"""Penalties on correlations, in the order they are tried; with `SHRINKAGE` the first keeps no dependence."""
 SHRINKAGE = 0.25
+"""Share of the identity that is mixed into the correlations."""
 FOLDS = 5
+"""Number of parts that members are held out in."""
 DUALITY_GAP = 0.05
-"""[nats] at which the lasso has converged: far less than the likelihoods of two penalties differ by."""
+"""Duality gap [nats] at which the lasso has converged: far less than the likelihoods of two penalties differ by."""
 INNER_TOLERANCES = (1e-6, 1e-4)
-"""Of the lasso's inner problems: the finer one needs fewer rounds, the coarser one manages cases that it cannot."""
+"""Tolerances of the lasso's inner problems: the first needs fewer rounds, the second succeeds where the first fails."""
 _FAILURES = (FloatingPointError, ConvergenceWarning, RuntimeWarning, np.linalg.LinAlgError)
-"""How the lasso says that it has no answer, or one that is not positive definite."""
+"""Exceptions of the lasso if it has no answer, or one that is not positive definite."""
 
 
 class WeightFit(NamedTuple):
-    """A fitted law and how it came about."""
+    """A fitted distribution and a record of the fit."""
 
     distribution: WeightDistribution
     metadata: dict[str, Any]
-    """Ready for JSON: members, folds, shrinkage, penalty (chosen), nonzeros (fraction of the off-diagonal entries of
-    the precision), condition (of the precision of standardised weights), spread_median, spread_max, stopped (why no
-    smaller penalty was tried), tried: for each penalty its nonzeros, condition and held-out log-likelihood per
-    member."""
+    """Record of the fit, ready for JSON: members, folds, shrinkage, penalty (chosen), nonzeros (share of the
+    off-diagonal entries of the precision), condition (of the precision of standardised weights), spread_median,
+    spread_max, stopped (why no smaller penalty was tried), tried: for each penalty its nonzeros, condition and
+    held-out log-likelihood per member."""
 
 
 def fit_weights(
@@ -55,23 +57,29 @@ def fit_weights(
     folds: int = FOLDS,
     names: Sequence[str] = WEIGHT_NAMES,
 ) -> WeightFit:
-    """Fit N(mean, precision^-1) to the weights of an ensemble.
+    """Return the Gaussian N(mean, precision^-1) fitted to the weights of an ensemble.
 
     Penalties are tried in descending order until one fails, on all members or without one of the folds; the one with
     the greatest held-out log-likelihood is taken.
 
     Args:
-        members: Last layers of K drivers, shape (K, 404); those that depend on each other (iterates of one run) beside
-            each other, because a fold holds out members that follow each other.
-        radius: How far a search may move each mean.
-        penalties: To try, in descending order.
+        members: Last layers of K drivers, shape (K, 404). Members that depend on each other (iterates of one run) must
+            be neighbours, because a fold holds out consecutive members.
+        radius: Distance by which a search may move each mean.
+        penalties: Penalties to try, in descending order.
         shrinkage: Share of the identity mixed into the correlations.
         folds: Number of times that members are held out.
-        names: What the columns are called in errors.
+        names: Names of the columns in error messages.
 
     Raises:
-        ValueError: If there are too few members, a weight is not finite or the same in all members of a fit, or not
-            even the first penalty succeeds.
+        ValueError: There are too few members, a weight is not finite or the same in all members of a fit, or not even
+            the first penalty succeeds.
+
+    Example:
+        >>> members = np.random.default_rng(0).standard_normal((20, 3))
+        >>> fit = fit_weights(members, names=("a", "b", "c"))
+        >>> fit.metadata["members"], fit.distribution.mean.shape
+        (20, (3,))
     """
     members = np.asarray(members, dtype=np.float64)
     if members.ndim != 2 or members.shape[1] != len(names):
@@ -89,11 +97,11 @@ def fit_weights(
     for penalty in penalties:
         try:
             precision = _lasso(everyone.correlation, penalty)
-            laws = [_to_distribution(part, _lasso(part.correlation, penalty), radius) for part in without]
+            fitted = [_to_distribution(part, _lasso(part.correlation, penalty), radius) for part in without]
         except _FAILURES as failure:
             stopped = f"penalty {penalty} failed: {' '.join(str(failure).split())[:120]}"
             break
-        scores = np.concatenate([law.log_prob(members[fold]) for law, fold in zip(laws, held_out, strict=True)])
+        scores = np.concatenate([part.log_prob(members[fold]) for part, fold in zip(fitted, held_out, strict=True)])
         row = {
             "penalty": float(penalty),
             "held_out_log_likelihood": float(scores.mean()),
@@ -103,7 +111,7 @@ def fit_weights(
             chosen = row, precision
         tried.append(row)
     if chosen is None:
-        raise ValueError(f"No law could be fitted: {stopped}. Start at a larger penalty or shrink more.")
+        raise ValueError(f"No distribution could be fitted: {stopped}. Start at a larger penalty or shrink more.")
     row, precision = chosen
     metadata = {
         "members": len(members),
@@ -119,14 +127,21 @@ def fit_weights(
 
 
 class _Moments(NamedTuple):
+    """Moments of the weights of members, of shape (404,) and (404, 404)."""
+
     mean: FloatArray
     spread: FloatArray
     """Standard deviations."""
     correlation: FloatArray
-    """Drawn towards the identity."""
+    """Correlations, shrunk towards the identity."""
 
 
 def _moments(members: FloatArray, shrinkage: float, names: Sequence[str]) -> _Moments:
+    """Return the moments of members.
+
+    Raises:
+        ValueError: A weight is not finite, or the same in all members.
+    """
     inert = ~np.isfinite(members).all(axis=0) | (members == members[0]).all(axis=0)
     if inert.any():
         some = ", ".join(names[j] for j in np.flatnonzero(inert)[:5])
@@ -143,10 +158,10 @@ def _moments(members: FloatArray, shrinkage: float, names: Sequence[str]) -> _Mo
 
 
 def _lasso(correlation: FloatArray, penalty: float) -> FloatArray:
-    """Sparse precision of standardised weights.
+    """Return the sparse precision of standardised weights.
 
     Raises:
-        Exception: One of `_FAILURES`, if the solver manages with none of the inner tolerances.
+        Exception: One of `_FAILURES`, if the solver succeeds with none of the inner tolerances.
     """
     for tolerance in INNER_TOLERANCES[:-1]:
         with contextlib.suppress(*_FAILURES):
@@ -155,6 +170,7 @@ def _lasso(correlation: FloatArray, penalty: float) -> FloatArray:
 
 
 def _solve_lasso(correlation: FloatArray, penalty: float, tolerance: float) -> FloatArray:
+    """Return the precision at one inner tolerance."""
     state = np.random.get_state()  # noqa: NPY002 - scikit-learn draws a number that nothing depends on
     try:
         with warnings.catch_warnings():
@@ -167,9 +183,11 @@ def _solve_lasso(correlation: FloatArray, penalty: float, tolerance: float) -> F
 
 
 def _to_distribution(moments: _Moments, precision: FloatArray, radius: float) -> WeightDistribution:
+    """Return the distribution with a precision of standardised weights."""
     return WeightDistribution(moments.mean, precision / np.outer(moments.spread, moments.spread), radius)
 
 
 def _describe_precision(precision: FloatArray) -> dict[str, float]:
+    """Return the share of nonzero off-diagonal entries, and the condition number."""
     beside = precision[~np.eye(len(precision), dtype=bool)]
     return {"nonzeros": float((beside != 0.0).mean()), "condition": float(np.linalg.cond(precision))}

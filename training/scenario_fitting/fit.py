@@ -39,8 +39,8 @@ from training.scenario_fitting.mixture import (
     SMALLEST_COMPONENT,
     MixtureFit,
     append_independent,
-    fit_mixture,
     mass_outside,
+    select_mixture,
 )
 from training.scenario_fitting.published_highway import build_highway_base
 
@@ -111,10 +111,10 @@ def fit_base(
     together[:, chosen[:joint]] = np.log(together[:, chosen[:joint]])
     bottom, top = (np.where(chosen, np.log(np.where(chosen, end, 1.0)), end) for end in (low, high))
     try:
-        fit = fit_mixture(together, bottom[:joint], top[:joint], seed)
+        fit = select_mixture(together, bottom[:joint], top[:joint], seed)
         mixture = fit.mixture
         if recipe.apart:
-            own_fit = fit_mixture(own, bottom[joint:], top[joint:], seed, most=1)
+            own_fit = select_mixture(own, bottom[joint:], top[joint:], seed, most=1)
             mixture = append_independent(mixture, own_fit.mixture)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None

@@ -40,7 +40,7 @@ class MixtureFit:
     candidates: tuple[MixtureCandidate, ...]
 
 
-def fit_mixture(
+def select_mixture(
     points: FloatArray, low: FloatArray, high: FloatArray, seed: int = 0, most: int = MAX_COMPONENTS
 ) -> MixtureFit:
     """Gaussian mixture chosen by BIC, cut to a box.

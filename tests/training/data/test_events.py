@@ -191,9 +191,9 @@ def test_bases_are_fitted_to_a_raw_ngsim_file(simulated, quick, tmp_path):
     assert {len(scene.x) for scene in scenes[:-1]} == {50}
     for scene in scenes:
         assert np.abs(scene.acceleration[scene.acted]).max() < 8.0
-        assert (scene.lane()[scene.present] >= 0).all()
+        assert (scene.lane_numbers()[scene.present] >= 0).all()
     states = sum(int(scene.present.sum()) for scene in scenes)
-    assert states == len(table) - len(table.breaks())  # the last position of a track has no speed
+    assert states == len(table) - len(table.track_starts())  # the last position of a track has no speed
 
 
 def test_scenes_follow_the_record_and_meet_where_they_were_cut(simulated, tmp_path):

@@ -71,7 +71,7 @@ def test_ngsim_becomes_si_units_and_centres(traffic, ngsim):
     # leaders in the file are the nearest ahead, by centres
     row = find_leaders(table.frame, table.lane, table.x)
     assert (table.leader == np.where(row >= 0, table.vehicle[row], NOBODY)).all()
-    assert (table.find(table.leader) == row).all()
+    assert (table.find_rows(table.leader) == row).all()
 
 
 def test_columns_in_another_order_and_spelling_and_the_text_form_are_the_same(ngsim, tmp_path):
@@ -150,7 +150,7 @@ def test_gaps_are_cut_on_request(ngsim, tmp_path):
     path = tmp_path / "gap.csv"
     write_csv(path, ngsim[1][:10] + ngsim[1][13:30])
     table = load_ngsim(path, gaps="cut")
-    assert table.breaks().tolist() == [0, 10]
+    assert table.track_starts().tolist() == [0, 10]
 
 
 @pytest.mark.parametrize(
@@ -178,7 +178,7 @@ def test_highd_turns_both_directions_into_the_road_frame(traffic, highd):
     table = load_highd(folder, "01")
     assert set(table.recording) == {"01-upper", "01-lower"}
     for side, simulated, first in (("upper", traffic, 1), ("lower", lower, 25)):
-        part = table.rows(table.recording == f"01-{side}")
+        part = table.select(table.recording == f"01-{side}")
         # time 0.04 s is the first frame, which was simulated at 0 s
         at = 5 * part.frame - 2
         values = expected(simulated, part, at, first)
@@ -192,8 +192,8 @@ def test_highd_turns_both_directions_into_the_road_frame(traffic, highd):
         np.testing.assert_allclose(np.diff(part.edges[f"01-{side}"]), LANE)
         assert (part.lane == values["lane"]).mean() > 0.999
         assert (part.leader == NOBODY).any()
-        known = part.find(part.leader) >= 0
-        assert (part.x[part.find(part.leader)[known]] > part.x[known]).all()
+        known = part.find_rows(part.leader) >= 0
+        assert (part.x[part.find_rows(part.leader)[known]] > part.x[known]).all()
     assert (np.abs(np.diff(table.frame[table.vehicle == table.vehicle[0]])) == 1).all()
     assert len(table) < len(rows) / 2.4
 
@@ -266,7 +266,7 @@ GOOD = {
 def test_a_table_is_sorted_and_checked():
     shuffled = {**GOOD, "vehicle": [2, 1, 1], "frame": [1, 2, 1], "x": [9.0, 1.0, 0.0], "leader": [-1, -1, 2]}
     assert tabulate(shuffled).x.tolist() == [0.0, 1.0, 9.0]
-    assert tabulate(GOOD).find(tabulate(GOOD).leader).tolist() == [2, -1, -1]
+    assert tabulate(GOOD).find_rows(tabulate(GOOD).leader).tolist() == [2, -1, -1]
     for changes, message in (
         ({"frame": [1, 1, 1]}, "Rows 0 and 1 are not in order"),
         ({"x": [0.0, np.nan, 9.0]}, "Row 1: x is nan"),
@@ -296,7 +296,7 @@ def test_compact_tables_load():
     assert np.isnan(vehicles.length).all()
     following = pairs.leader != NOBODY
     assert following.sum() == 68_339
-    assert (pairs.find(pairs.leader)[following] >= 0).all()
+    assert (pairs.find_rows(pairs.leader)[following] >= 0).all()
 
 
 def test_a_missing_compact_table_is_named(tmp_path):

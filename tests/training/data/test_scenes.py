@@ -85,7 +85,7 @@ def tiny_scene(**changes):
 
 def test_lanes_and_leaders_of_a_scene():
     scene = tiny_scene()
-    assert scene.lane().tolist() == [[0, 0, 1]] * 2
+    assert scene.lane_numbers().tolist() == [[0, 0, 1]] * 2
     assert scene.leads_lane().tolist() == [[False, True, True]] * 2
     assert scene.acted.tolist() == [[True] * 3, [False] * 3]
     assert scene.end == pytest.approx(0.1)
@@ -119,7 +119,7 @@ def test_recorded_scenes_are_what_was_measured():
     assert acceleration.std() == pytest.approx(0.79, abs=0.01)
     assert (acceleration <= -3.0).mean() == pytest.approx(0.0006, abs=0.0001)
     assert yaw_rate.std() == pytest.approx(0.019, abs=0.001)
-    assert sum(int((scene.present & (scene.lane() < 0)).sum()) for scene in scenes) <= 1
+    assert sum(int((scene.present & (scene.lane_numbers() < 0)).sum()) for scene in scenes) <= 1
     for scene in scenes:
         assert scene.edges[:2] == (0.0, 3.49)
         moved = scene.x[:-1] + scene.speed[:-1] * np.cos(scene.heading[:-1]) * DT - scene.x[1:]

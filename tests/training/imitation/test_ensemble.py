@@ -106,7 +106,7 @@ def test_scenes_are_drawn_with_their_pairs_as_often_as_they_are_drawn():
 
 def test_members_go_on_where_the_schedules_of_the_base_ended():
     config = member_config(Config(clone_weight=(0.1, 0.03), horizon=(15, 30)), Ensemble(updates=60))
-    assert config.along(config.clone_weight, 0) == pytest.approx(0.03)
+    assert config.geometric_schedule(config.clone_weight, 0) == pytest.approx(0.03)
     assert config.horizon == (30, 30)
     assert config.warm_up == 0
     assert config.critic_weight == Config().critic_weight

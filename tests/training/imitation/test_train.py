@@ -86,7 +86,7 @@ def test_nothing_is_drawn_from_the_global_generator(data):
 
 def test_learning_rates_fall_after_the_schedules():
     config = Config(updates=1000, anneal=0.7, last_rate=0.1)
-    assert [config.rate(update) for update in (0, 700, 850, 1000)] == pytest.approx([1.0, 1.0, 0.55, 0.1])
+    assert [config.rate_factor(update) for update in (0, 700, 850, 1000)] == pytest.approx([1.0, 1.0, 0.55, 0.1])
 
 
 def test_the_learner_uses_them(data):

@@ -16,7 +16,7 @@ from training.scenario_fitting import fit as fit_scenarios
 from training.scenario_fitting import mixture as mixture_fit
 from training.scenario_fitting.event_filters import EVENT_RECIPES, filter_events, read_events
 from training.scenario_fitting.fit import fit_us101_base, format_base
-from training.scenario_fitting.mixture import COVARIANCE_FLOOR, SMALLEST_COMPONENT, fit_mixture, mass_outside
+from training.scenario_fitting.mixture import COVARIANCE_FLOOR, SMALLEST_COMPONENT, mass_outside, select_mixture
 from training.scenario_fitting.published_highway import build_highway_base
 
 DATA = Path(__file__).parents[4] / "shared" / "data"
@@ -42,7 +42,7 @@ def quick(monkeypatch):
 
 def fit_truth(n, seed=0):
     points = TRUTH.sample(n, np.random.default_rng(1))
-    return fit_mixture(points, TRUTH.low, TRUTH.high, seed)
+    return select_mixture(points, TRUTH.low, TRUTH.high, seed)
 
 
 def test_fit_recovers_a_known_mixture(quick):
@@ -70,7 +70,7 @@ def test_a_component_on_a_handful_of_events_is_rejected(quick):
     few = 2 * SMALLEST_COMPONENT - 4
     far = np.array([60.0, 60.0]) + 0.01 * rng.standard_normal((few, 2))
     points = np.concatenate([rng.standard_normal((200, 2)), far])
-    fit = fit_mixture(points, np.full(2, -99.0), np.full(2, 99.0))
+    fit = select_mixture(points, np.full(2, -99.0), np.full(2, 99.0))
     second = fit.candidates[1]
     assert second.smallest == pytest.approx(few)
     assert second.bic < fit.candidates[0].bic
@@ -81,12 +81,12 @@ def test_a_component_on_a_handful_of_events_is_rejected(quick):
 
 def test_few_events_get_one_component_and_too_few_an_error():
     points = np.random.default_rng(0).standard_normal((15, 6))
-    assert len(fit_mixture(points, np.full(6, -9.0), np.full(6, 9.0)).candidates) == 1
+    assert len(select_mixture(points, np.full(6, -9.0), np.full(6, 9.0)).candidates) == 1
     with pytest.raises(ValueError, match="6 events are too few to fit 6 parameters"):
-        fit_mixture(points[:6], np.full(6, -9.0), np.full(6, 9.0))
+        select_mixture(points[:6], np.full(6, -9.0), np.full(6, 9.0))
     points[:, 2] = 1.0
     with pytest.raises(ValueError, match="Parameter 2 is the same in all 15 events"):
-        fit_mixture(points, np.full(6, -9.0), np.full(6, 9.0))
+        select_mixture(points, np.full(6, -9.0), np.full(6, 9.0))
 
 
 def test_mass_outside_of_a_known_box():

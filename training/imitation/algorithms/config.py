@@ -1,4 +1,4 @@
-"""Settings of one training, with the values that the shipped drivers were trained with."""
+"""Settings of a training, with the values that the shipped drivers were trained with."""
 
 import math
 from collections.abc import Callable
@@ -11,10 +11,10 @@ Algorithm = Literal["bc", "gail", "mgail"]
 
 
 HUMAN_NOISE = AutoregressiveNoise.from_oscillators(frequency=(1.70, 1.57), damping=(0.845, 0.40))
-"""The autocorrelation of what cloning leaves unexplained in the record, within 0.03 up to 1 s."""
+"""Noise with the autocorrelation of what cloning leaves unexplained in the record, within 0.03 up to 1 s."""
 
 
-_RANGES: tuple[tuple[tuple[str, ...], Callable[[float], bool], str], ...] = (
+_VALID_RANGES: tuple[tuple[tuple[str, ...], Callable[[float], bool], str], ...] = (
     (
         (
             *("batch", "lateral_weight", "pools", "scenes", "horizon", "age", "drivers"),
@@ -45,17 +45,26 @@ _RANGES: tuple[tuple[tuple[str, ...], Callable[[float], bool], str], ...] = (
     (("anneal", "last_rate"), lambda value: 0 < value <= 1, "in (0, 1]"),
     (("credit", "discount", "gae"), lambda value: 0 <= value <= 1, "in [0, 1]"),
 )
-"""Settings, what holds of each of their values, and that in words. Schedules of weights are geometric, so not 0."""
+"""Names of settings, the condition on each value, and its text. Schedules of weights are geometric, so not 0."""
 
 
 @dataclass(frozen=True)
 class Config:
-    """How to learn a driver from recorded scenes. Pairs are values at the start and at the end of a schedule."""
+    """Settings of the training of a driver. Pairs are values at the start and at the end of a schedule.
+
+    Raises:
+        ValueError: A setting is outside its range.
+
+    Example:
+        >>> config = Config(method="gail", updates=1000)
+        >>> config.rate_factor(0), round(config.rate_factor(1000), 2)
+        (1.0, 0.1)
+    """
 
     method: Algorithm = "mgail"
     seed: int = 0
     updates: int = 1500
-    """Updates of the policy after behaviour cloning."""
+    """Number of updates of the policy after behaviour cloning."""
 
     # behaviour cloning, which every method starts from
     epochs: int = 6
@@ -63,7 +72,7 @@ class Config:
     clone_rate: float = 1e-3
     weight_decay: float = 1e-4
     log_std_cap: float = 0.0
-    """See `agents.learned.networks.Policy`."""
+    """Upper bound of the logarithm of the standard deviation, see `agents.learned.networks.Policy`."""
     lateral_weight: int = 1
     """Number of times that recorded moments of fast lateral motion count in the likelihood, see
     `training.imitation.algorithms.expert_pairs.emphasise_lateral`. With more than 1, drivers complete more of the lane
@@ -71,53 +80,54 @@ class Config:
 
     # rollouts
     pools: int = 5
-    """Sets of scenes that are driven in turn and kept between updates, so that late moments are visited too."""
+    """Number of sets of scenes that are driven in turn and continued from update to update, so that late moments are
+    visited."""
     scenes: int = 8
-    """Scenes of a pool."""
+    """Number of scenes in a pool."""
     horizon: tuple[int, int] = (15, 30)
-    """Ticks of one rollout."""
+    """Number of ticks of a rollout."""
     age: tuple[int, int] = (30, 150)
-    """Ticks after which a pool starts anew from the record."""
+    """Number of ticks after which a pool is restarted from the record."""
     drivers: tuple[int, int] = (60, 60)
-    """Vehicles of a scene that are driven: the curriculum over the number of agents (Bhattacharyya et al. 2018)."""
+    """Most vehicles of a scene that are driven: a curriculum over the number of agents (Bhattacharyya et al. 2018)."""
     colour: AutoregressiveNoise = HUMAN_NOISE
-    """Of the noise of acceleration and yaw rate; `AutoregressiveNoise()` is white noise, as O'Kelly et al. have it."""
+    """Noise of acceleration and yaw rate; `WHITE_NOISE` is that of O'Kelly et al."""
 
     # costs of the policy
     critic_weight: float = 3.0
     clone_weight: tuple[float, float] = (0.1, 0.06)
-    """Of the likelihood of recorded actions; it falls geometrically."""
+    """Weight of the likelihood of recorded actions, a geometric schedule."""
     anneal: float = 0.7
     """Share of the training in which the schedules run."""
     collision_weight: float = 16.0
     edge_weight: float = 16.0
     brake_weight: float = 1.0
     headway_weight: float = 0.0
-    """Of following closely, which people do; drivers of the traffic have neither this nor the next two."""
+    """Weight of following closely, which people do: 0 for drivers of the traffic, as the next two."""
     lane_weight: float = 0.0
-    """Of being beside the middle of the lane."""
+    """Weight of being away from the middle of the lane."""
     speed_weight: float = 0.0
-    """Of being faster than the limit."""
+    """Weight of exceeding the speed limit."""
 
     # optimisation
     policy_rate: float = 3e-4
     critic_rate: float = 4e-4
     last_rate: float = 0.1
-    """Share of the rates of policy and critic that is left at the end: they fall once the schedules have run. Only the
-    policy of the last update is kept, and this is what makes it settle."""
+    """Share of the learning rates of policy and critic that is left at the end. They fall once the schedules have
+    ended, so that the policy settles: only that of the last update is kept."""
     critic_steps: int = 3
     critic_batch: int = 512
     memory: int = 8
-    """Rollouts that the critic learns from."""
+    """Number of rollouts that the critic learns from."""
     warm_up: int = 30
-    """Rounds in which only the critic learns."""
+    """Number of rounds in which only the critic learns."""
     gradient_penalty: float = 0.5
 
     # MGAIL
     credit: float = 0.97
     """Share of the gradient of the state that is passed on to the tick before."""
     learned_model: bool = False
-    """Take the gradient through a learned forward model, as Baram et al. do, in place of the simulator."""
+    """Take the gradient through a learned forward model, as Baram et al. do, instead of the simulator."""
     model_rate: float = 1e-3
     model_steps: int = 10
 
@@ -136,19 +146,19 @@ class Config:
             raise ValueError(f"Expected method 'mgail' with learned_model, got {self.method!r}.")
         if self.updates < 1:
             raise ValueError(f"Expected updates >= 1, got {self.updates}; a driver that is only cloned is method 'bc'.")
-        for names, holds, expected in _RANGES:
+        for names, holds, expected in _VALID_RANGES:
             for name in names:
                 value = getattr(self, name)
                 if not all(holds(part) for part in (value if isinstance(value, tuple) else (value,))):
                     raise ValueError(f"Expected {name} {expected}, got {value}.")
 
-    def rate(self, update: int) -> float:
-        """Factor of the learning rates at an update: 1, then linearly down to `last_rate`."""
+    def rate_factor(self, update: int) -> float:
+        """Return the factor of the learning rates at an update: 1, then linearly down to `last_rate`."""
         start = self.anneal * self.updates
         return 1.0 - (1.0 - self.last_rate) * min(max((update - start) / max(self.updates - start, 1.0), 0.0), 1.0)
 
-    def along(self, ends: tuple[float, float], update: int) -> float:
-        """Value of a geometric schedule at an update."""
+    def geometric_schedule(self, ends: tuple[float, float], update: int) -> float:
+        """Return the value at an update of a schedule between two ends."""
         share = min(update / max(self.anneal * self.updates, 1.0), 1.0)
         first, last = ends
         return float(first * (last / first) ** share)

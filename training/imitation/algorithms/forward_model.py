@@ -39,7 +39,7 @@ class ForwardModel(nn.Module):
         change: Tensor = self.layers(critic_inputs(policy, features, action))
         return features + policy.scaling.feature_std * change
 
-    def substituted(self, policy: Policy, before: Tensor, action: Tensor, now: Tensor, credit: float) -> Tensor:
+    def substitute_gradient(self, policy: Policy, before: Tensor, action: Tensor, now: Tensor, credit: float) -> Tensor:
         """The features of now with the model's gradient to what was seen and done a tick before.
 
         Args:

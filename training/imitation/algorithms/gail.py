@@ -79,7 +79,7 @@ def update_gail(learner: Learner) -> Log:
     The last tick of the rollout is there for the value of what comes after it only.
     """
     config, policy, value = learner.config, learner.policy, learner.value
-    ticks = learner.now(config.horizon)
+    ticks = learner.linear_schedule(config.horizon)
     with torch.no_grad():
         steps = learner.drive(1.0)
     critic_error = learner.learn_critic(steps)
@@ -99,7 +99,7 @@ def update_gail(learner: Learner) -> Log:
         for rows in torch.split(torch.randperm(kept, generator=learner.generator), config.ppo_batch):
             law = conditional_action(policy, steps.features[rows], steps.noise[rows], config.colour)
             ratio = torch.exp(log_likelihood(*law, steps.action[rows]) - old[rows])
-            clone = config.along(config.clone_weight, learner.update) * learner.clone_loss()
+            clone = config.geometric_schedule(config.clone_weight, learner.update) * learner.clone_loss()
             loss = clone - clipped_surrogate(ratio, gain[rows], config.clip).mean()
             learner.policy_optimiser.zero_grad()
             torch.autograd.backward(loss)

@@ -64,16 +64,16 @@ class Learner:
             self.policy, self.pairs.features, normalise_action(self.policy, self.pairs.action)
         )
         followed = emphasise_lateral(self.pairs, config.lateral_weight)
-        self.followed = followed.features, normalise_action(self.policy, followed.action)
+        self.clone_pairs = followed.features, normalise_action(self.policy, followed.action)
 
-    def now(self, ends: tuple[int, int]) -> int:
+    def linear_schedule(self, ends: tuple[int, int]) -> int:
         """Value of a linear schedule of whole numbers."""
         share = min(self.update / max(self.config.anneal * self.config.updates, 1.0), 1.0)
         return round(ends[0] + (ends[1] - ends[0]) * share)
 
     def set_rates(self) -> None:
         """Learning rates of this update."""
-        factor = self.config.rate(self.update)
+        factor = self.config.rate_factor(self.update)
         rates = (self.policy_optimiser, self.config.policy_rate), (self.critic_optimiser, self.config.critic_rate)
         for optimiser, rate in rates:
             for group in optimiser.param_groups:
@@ -85,9 +85,9 @@ class Learner:
         while len(self.pools) < config.pools:
             self.pools.append(self._new_pool())
         index = self.update % config.pools
-        if self.pools[index].age >= self.now(config.age):
+        if self.pools[index].age >= self.linear_schedule(config.age):
             self.pools[index] = self._new_pool()
-        horizon = self.now(config.horizon)
+        horizon = self.linear_schedule(config.horizon)
         steps, self.pools[index] = roll_out(
             self.recording, self.policy, self.pools[index], horizon, config.colour, credit, self.generator, self.model
         )
@@ -100,8 +100,8 @@ class Learner:
             self.recording,
             self.among,
             config.scenes,
-            self.now(config.drivers),
-            self.now(config.horizon),
+            self.linear_schedule(config.drivers),
+            self.linear_schedule(config.horizon),
             config.colour,
             self.generator,
         )
@@ -125,7 +125,7 @@ class Learner:
         """Let the forward model learn from the rollout, if there is one, and return its error."""
         if self.model is None:
             return 0.0
-        config, ticks = self.config, self.now(self.config.horizon)
+        config, ticks = self.config, self.linear_schedule(self.config.horizon)
         seen, done = (part.detach().view(ticks, -1, part.shape[1]) for part in (steps.features, steps.action))
         return train_model(
             self.model, self.model_optimiser, self.policy, seen, done, config.model_steps, config.batch, self.generator
@@ -141,7 +141,7 @@ class Learner:
 
     def clone_loss(self) -> Tensor:
         """Negative log likelihood of some recorded actions."""
-        features, action = self.followed
+        features, action = self.clone_pairs
         rows = torch.randint(len(features), (self.config.batch,), generator=self.generator)
         mean, log_std = self.policy(features[rows])
         return -log_likelihood(mean, log_std, action[rows]).mean()

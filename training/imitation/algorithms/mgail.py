@@ -28,7 +28,7 @@ def update_mgail(learner: Learner) -> Log:
         + config.headway_weight * steps.headway.mean()
         + config.lane_weight * steps.lane.mean()
         + config.speed_weight * steps.speed.mean()
-        + config.along(config.clone_weight, learner.update) * clone
+        + config.geometric_schedule(config.clone_weight, learner.update) * clone
     )
     learner.policy_optimiser.zero_grad()
     torch.autograd.backward(loss)

@@ -68,7 +68,7 @@ def roll_out(
     for _ in range(ticks):
         before, features = features, perceive_traffic(traffic, m)
         if model is not None and before is not None and action is not None:
-            features = model.substituted(policy, before, action, features, credit)
+            features = model.substitute_gradient(policy, before, action, features, credit)
         mean, log_std = policy(features)
         expected = colour.predict_mean(memory)
         noise, memory = colour.step(memory, torch.randn(expected.shape, generator=generator))

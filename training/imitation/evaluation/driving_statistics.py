@@ -25,7 +25,7 @@ BINS = MappingProxyType(
 )
 """Lowest and highest edge and number of bins of each quantity; what is beyond counts in the outermost bin. Units are
 m/s, m/s^2, m/s^3, rad/s, 1/s (closing speed over range of the beam ahead) and m (of that beam)."""
-COMPARED = ("position", "speed", "lateral")
+ERROR_NAMES = ("position", "speed", "lateral")
 """Errors against the record that are summed."""
 
 
@@ -86,7 +86,7 @@ def sum_by_scene(behaviour: Behaviour, scenes: int, errors: Errors | None = None
         counts[name] = flat.reshape(scenes, bins).astype(np.float64)
     squared = {}
     if errors is not None:
-        squared = {name: by_scene(errors.scene, getattr(errors, name).square()) for name in COMPARED}
+        squared = {name: by_scene(errors.scene, getattr(errors, name).square()) for name in ERROR_NAMES}
         squared["number"] = by_scene(errors.scene, torch.ones_like(errors.position))
     return DrivingStatistics(
         steps=steps(known),

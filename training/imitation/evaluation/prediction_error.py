@@ -35,7 +35,7 @@ class Errors(NamedTuple):
     """[m]."""
 
 
-def errors_of(recording: Recording, traffic: Traffic) -> Errors:
+def current_errors(recording: Recording, traffic: Traffic) -> Errors:
     """Differences of driven vehicles from where the record has them at this tick."""
     at = traffic.tick.minimum(recording.ticks[traffic.scene] - 1)
     recorded = recording.present[traffic.scene, at].gather(1, traffic.vehicle)
@@ -89,7 +89,7 @@ def prediction_errors(
     ticks = {round(seconds / DT): seconds for seconds in TIMES}
     with torch.inference_mode():
         return {
-            ticks[passed]: errors_of(recording, moment.traffic)
+            ticks[passed]: current_errors(recording, moment.traffic)
             for passed, moment in enumerate(drive_traffic(recording, traffic, act, max(ticks) + 1))
             if passed in ticks
         }

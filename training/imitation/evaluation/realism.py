@@ -30,8 +30,8 @@ from training.imitation.evaluation.behaviour import (
     regular_starts,
     sampling_driver,
 )
-from training.imitation.evaluation.driving_statistics import BINS, COMPARED, DrivingStatistics, sum_by_scene
-from training.imitation.evaluation.prediction_error import Errors, errors_of
+from training.imitation.evaluation.driving_statistics import BINS, ERROR_NAMES, DrivingStatistics, sum_by_scene
+from training.imitation.evaluation.prediction_error import Errors, current_errors
 from training.imitation.traffic.recording import Recording
 from training.imitation.traffic.replayed_traffic import start_replay
 
@@ -95,7 +95,7 @@ def summarise_realism(
     shares = {name: float(times @ found.sums[name] / steps) for name in _SHARES}
     rmse = {}
     if found.squared and (number := times @ found.squared["number"]) > 0:
-        rmse = {name: float(np.sqrt(times @ found.squared[name] / number)) for name in COMPARED}
+        rmse = {name: float(np.sqrt(times @ found.squared[name] / number)) for name in ERROR_NAMES}
     return Realism(
         vehicles=int(vehicles),
         **shares,
@@ -126,7 +126,7 @@ def collect_statistics(
         traffic = start_replay(recording, *(regular_starts(recording) if starts is None else starts))
         for tick, moment in enumerate(drive_traffic(recording, traffic, act, round(seconds[-1] / DT))):
             if tick == round(ERROR_TIME / DT):
-                met.append(errors_of(recording, moment.traffic))
+                met.append(current_errors(recording, moment.traffic))
             yield moment
 
     whole = behaviour_of(watched())
@@ -151,7 +151,7 @@ def record_statistics(recording: Recording) -> DrivingStatistics:
     return sum_by_scene(recorded_behaviour(recording), len(recording.x))
 
 
-def standard_errors(
+def bootstrap_errors(
     found: DrivingStatistics, recorded: DrivingStatistics, rng: np.random.Generator, draws: int = 200
 ) -> Realism:
     """Return standard errors by bootstrap over scenes; scenes that share vehicles are taken as independent."""

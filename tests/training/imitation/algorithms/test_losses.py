@@ -216,10 +216,10 @@ def test_the_forward_model_learns_and_leaves_values_alone(data):
     assert errors[-1] < 0.5 * errors[0]
     now = torch.randn(2, 3, 51, generator=generator())
     action = torch.zeros(2, 3, 2, requires_grad=True)
-    found = learner.model.substituted(learner.policy, now, action, now + 1, 0.5)
+    found = learner.model.substitute_gradient(learner.policy, now, action, now + 1, 0.5)
     torch.testing.assert_close(found, now + 1)
     (slope,) = torch.autograd.grad(found.sum(), action)
-    whole = learner.model.substituted(learner.policy, now, action, now + 1, 1.0)
+    whole = learner.model.substitute_gradient(learner.policy, now, action, now + 1, 1.0)
     torch.testing.assert_close(slope * 2, torch.autograd.grad(whole.sum(), action)[0])
 
 

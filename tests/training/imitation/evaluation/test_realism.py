@@ -11,10 +11,10 @@ from training.imitation.evaluation.behaviour import behaviour_of, drive_traffic,
 from training.imitation.evaluation.driving_statistics import BINS, add_statistics, binned_quantities, sum_by_scene
 from training.imitation.evaluation.prediction_error import TIMES, draw_segments, prediction_errors
 from training.imitation.evaluation.realism import (
+    bootstrap_errors,
     collect_statistics,
     jensen_shannon,
     record_statistics,
-    standard_errors,
     summarise_realism,
 )
 from training.imitation.traffic.recording import stack_scenes
@@ -76,7 +76,7 @@ def test_a_tally_of_two_runs_has_the_mean_rates(recording):
 def test_standard_errors_are_those_of_the_mean_over_scenes(recording):
     """Speeds of four scenes with equally many steps: the bootstrap's is the standard deviation over root n."""
     one = collect_statistics(recording, constant, (0.1,), (torch.arange(4), torch.zeros(4, dtype=torch.long)))[0.1]
-    spread = standard_errors(one, record_statistics(recording), np.random.default_rng(0), 4000)
+    spread = bootstrap_errors(one, record_statistics(recording), np.random.default_rng(0), 4000)
     speeds = one.sums["speed"] / one.steps
     assert spread.mean_speed == pytest.approx(speeds.std() / 2.0, rel=0.05)
     assert spread.collision == 0
