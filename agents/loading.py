@@ -1,4 +1,4 @@
-"""Egos by name: the rule-based driver, learned drivers, Stable-Baselines3 files, functions that make an ego."""
+"""Loading of egos by name, file, address or function."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from agents.vision.checkpoint import holds_vision, load_vision
 from rare_envs.egos.errors import EgoGone
 from rare_envs.plugins import did_you_mean
 
-EXPECTED: Final = (
+EXPECTED_EGO: Final = (
     f"{', '.join(map(repr, (RULE_BASED, *SHIPPED_EGOS, VISION, *SHIPPED_DRIVERS)))}, a path to a {SUFFIX} or "
     "Stable-Baselines3 .zip, "
     "an .onnx file, module:function, tcp://host:port, or process:EGO for one of these in a process of its own, "
@@ -30,7 +30,15 @@ EgoKind = Literal[
 
 @runtime_checkable
 class Ego(Protocol):
-    """What drives the ego vehicle: Stable-Baselines3's `predict`, called on whole batches."""
+    """Policy that drives the ego vehicle: Stable-Baselines3's `predict`, called on whole batches.
+
+    Example:
+        >>> class Coasting:
+        ...     def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        ...         return np.zeros((len(observation), 2), np.float32), None
+        >>> isinstance(Coasting(), Ego)
+        True
+    """
 
     def predict(
         self,
@@ -45,7 +53,7 @@ class Ego(Protocol):
             observation: Observations of B scenarios, shape (B, F).
             state: Memory of a recurrent policy from the step before; None at the start.
             episode_start: Rows that begin a new episode, shape (B,).
-            deterministic: Act by the mean (or best) action, without exploration noise.
+            deterministic: Take the mean (or best) action, without exploration noise.
 
         Returns:
             Actions, shape (B, 2) in [-1, 1] or (B,) integers, and the memory to pass on.
@@ -54,7 +62,7 @@ class Ego(Protocol):
 
 
 def load_ego(spec: str | Path, algo: str | None = None, trust: bool = False) -> Ego | LearnedEgo | Literal["idm"]:
-    """Find an ego by what a user would type.
+    """Load an ego by its name, file, address or function.
 
     Args:
         spec: "idm"; "imitation", the shipped ego with lidar; "vision", PilotNet on the front camera; "mgail", "gail" or
@@ -81,13 +89,24 @@ def load_ego(spec: str | Path, algo: str | None = None, trust: bool = False) -> 
         ValueError: The spec is none of these, the file is not a model of Stable-Baselines3 or no driver or is
             damaged or not trusted, the function is missing, fails or returns something without `predict`, or
             algo is given for something that is no `.zip`.
+
+    Example:
+        >>> load_ego("idm")
+        'idm'
+        >>> ego = load_ego("imitation")
+        >>> ego.predict(np.zeros((2, 51), np.float32))[0].shape
+        (2, 2)
+        >>> load_ego("imitatoin")  # doctest: +ELLIPSIS
+        Traceback (most recent call last):
+        ...
+        ValueError: Unknown ego 'imitatoin' (did you mean 'imitation'?); expected ...
     """
     text = str(spec)
     kind = find_ego_kind(text)
     if kind == "url":
         raise ValueError(f"Will not load an ego from {text!r}: download the file, look where it comes from, name it.")
     if kind == "unknown":
-        raise ValueError(f"Unknown ego {text!r}{_suggest_ego(text)}; expected {EXPECTED}.")
+        raise ValueError(f"Unknown ego {text!r}{_suggest_ego(text)}; expected {EXPECTED_EGO}.")
     if kind == "zip":
         return load_saved_ego(Path(text), algo, trust)
     if algo is not None and kind != "process":
@@ -112,7 +131,7 @@ def load_ego(spec: str | Path, algo: str | None = None, trust: bool = False) -> 
 
 
 def _load_elsewhere(kind: EgoKind, text: str, algo: str | None, trust: bool) -> Ego:
-    """An ego in another process."""
+    """Connect to an ego in another process."""
     try:
         import msgpack  # noqa: F401
         import zmq  # noqa: F401
@@ -131,14 +150,19 @@ def _load_elsewhere(kind: EgoKind, text: str, algo: str | None, trust: bool) -> 
 
 
 def strip_prefixes(spec: str) -> str:
-    """The ego inside `noisy:` and `process:`, without their settings."""
+    """Return the ego inside `noisy:` and `process:`, without their settings."""
     while spec.startswith(("noisy:", "process:")):
         spec = spec.partition(":")[2].rpartition("?")[0] or spec.partition(":")[2]
     return spec
 
 
 def find_ego_kind(spec: str) -> EgoKind:
-    """What a user means by an ego's name; of a `.safetensors` the header tells."""
+    """Return the kind of ego that a name, file, address or function means; of a `.safetensors` the header tells.
+
+    Example:
+        >>> [find_ego_kind(spec) for spec in ("idm", "bc", "tcp://host:5555", "noisy:idm", "ego.onnx", "file:make")]
+        ['rule', 'learned', 'remote', 'noisy', 'onnx', 'function']
+    """
     if spec == RULE_BASED:
         return "rule"
     if spec == VISION or (spec.endswith(SUFFIX) and holds_vision(spec)):
@@ -161,7 +185,7 @@ def find_ego_kind(spec: str) -> EgoKind:
 
 
 def _suggest_ego(text: str) -> str:
-    """A "did you mean" for a misspelt ego: a driver by name or a `.zip` saved nearby."""
+    """Return a hint at the ego that a misspelt name may mean: a known name or a `.zip` saved nearby."""
     saved = Path(f"{text}.zip")
     if saved.is_file():
         return f" (did you mean {str(saved)!r}?)"

@@ -1,4 +1,4 @@
-"""Egos made by a function of the user's own: `module:function`."""
+"""Egos from a function of the user's own, `module:function`."""
 
 from __future__ import annotations
 

@@ -51,17 +51,6 @@ def has_example(value: object) -> bool:
 
 
 WITHOUT_EXAMPLE = {
-    "agents.Ego",
-    "agents.LearnedDriver",
-    "agents.LearnedEgo",
-    "agents.Provenance",
-    "agents.SavedEgo",
-    "agents.WeightDistribution",
-    "agents.load_driver",
-    "agents.load_ego",
-    "agents.read_driver",
-    "agents.read_provenance",
-    "agents.save_driver",
     "rare_envs.DrivingProblem",
     "rare_envs.FaultTolerant",
     "rare_envs.HighwayEnvProblem",

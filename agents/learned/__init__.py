@@ -1,1 +1,25 @@
 """Learned drivers: networks, coloured noise, checkpoints and the distribution of their weights."""
+
+from agents.learned.checkpoints import Provenance, load_driver, read_driver, read_provenance, save_driver
+from agents.learned.coloured_noise import AutoregressiveNoise
+from agents.learned.driver import LearnedDriver, LearnedEgo, replace_head
+from agents.learned.networks import Policy, Scaling, head_weights
+from agents.learned.rule_driver import RuleDriver
+from agents.learned.weight_distribution import WeightDistribution
+
+__all__ = [
+    "AutoregressiveNoise",
+    "LearnedDriver",
+    "LearnedEgo",
+    "Policy",
+    "Provenance",
+    "RuleDriver",
+    "Scaling",
+    "WeightDistribution",
+    "head_weights",
+    "load_driver",
+    "read_driver",
+    "read_provenance",
+    "replace_head",
+    "save_driver",
+]

@@ -144,6 +144,12 @@ def replace_head(policy: Policy, weights: Tensor) -> Policy:
 
     Raises:
         ValueError: If there are not 404 weights.
+
+    Example:
+        >>> from agents import load_driver
+        >>> changed = replace_head(load_driver("bc").policy, torch.zeros(404))
+        >>> changed(torch.zeros(1, 51))[0].tolist()
+        [[0.0, 0.0]]
     """
     if weights.shape != (HEAD_SIZE,):
         raise ValueError(f"Expected weights of shape ({HEAD_SIZE},), got {tuple(weights.shape)}.")

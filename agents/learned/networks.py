@@ -22,7 +22,13 @@ almost alike everywhere, with noise of about a quarter of the recorded spread, f
 
 
 class Scaling(NamedTuple):
-    """Means and spreads of recorded driving, by which features and actions are normalised."""
+    """Means and spreads of recorded driving, by which features and actions are normalised.
+
+    Example:
+        >>> scaling = Scaling(torch.zeros(51), torch.ones(51), torch.zeros(2), torch.ones(2))
+        >>> Policy(scaling).normalise(torch.full((1, 51), 20.0)).max().item()
+        8.0
+    """
 
     feature_mean: Tensor
     """Shape (51,)."""
@@ -39,6 +45,12 @@ class Policy(nn.Module):
 
     O'Kelly et al. have the same sizes with ReLU; on the data that the shipped drivers learned from, tanh overfits less.
     Everything is in normalised units, see `Scaling`.
+
+    Example:
+        >>> scaling = Scaling(torch.zeros(51), torch.ones(51), torch.zeros(2), torch.ones(2))
+        >>> mean, log_std = Policy(scaling)(torch.zeros(4, 51))
+        >>> tuple(mean.shape), bool((log_std < 0.0).all())
+        ((4, 2), True)
     """
 
     def __init__(self, scaling: Scaling, log_std_cap: float = 0.0) -> None:
@@ -87,7 +99,13 @@ class Policy(nn.Module):
 
 
 def head_weights(policy: Policy) -> Tensor:
-    """Return the 404 weights of the last layer: for each of the four outputs its 100 weights and its bias."""
+    """Return the 404 weights of the last layer: for each of the four outputs its 100 weights and its bias.
+
+    Example:
+        >>> scaling = Scaling(torch.zeros(51), torch.ones(51), torch.zeros(2), torch.ones(2))
+        >>> tuple(head_weights(Policy(scaling)).shape)
+        (404,)
+    """
     return torch.cat((policy.head.weight, policy.head.bias[:, None]), dim=1).flatten()
 
 

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from rare_envs.control.actions import DISCRETE_ACTIONS
 from rare_envs.plugins import one_line
 
-KEY = "rare_envs"
-"""Entry of a file's metadata in which `agents.onnx.export` says what the policy observes and how it acts."""
+METADATA_KEY = "rare_envs"
+"""Entry of a file's metadata in which `agents.onnx.export` describes observations and actions."""
 _TYPES = {"tensor(float)": np.float32, "tensor(double)": np.float64}
 
 
@@ -32,6 +32,22 @@ class OnnxEgo:
         path: The file.
         observation_space: From the file.
         action_space: From the file, None if it does not tell.
+
+    Example:
+        >>> import onnx
+        >>> import tempfile
+        >>> from onnx import helper
+        >>> ports = [helper.make_tensor_value_info(name, 1, ["batch", 2]) for name in ("observation", "action")]
+        >>> nodes = [helper.make_node("Tanh", ["observation"], ["action"])]
+        >>> graph = helper.make_graph(nodes, "ego", ports[:1], ports[1:])
+        >>> model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     onnx.save(model, f"{folder}/ego.onnx")
+        ...     ego = OnnxEgo(Path(folder) / "ego.onnx")
+        >>> ego.observation_space.shape, ego.stateful, ego.fixed_batch
+        ((2,), False, None)
+        >>> ego.predict(np.full((1, 2), 0.5))[0].round(3)
+        array([[0.462, 0.462]], dtype=float32)
     """
 
     def __init__(self, path: Path) -> None:
@@ -59,6 +75,7 @@ class OnnxEgo:
         self._check()
 
     def _check(self) -> None:
+        """Refuse a graph whose inputs and outputs are of another form."""
         memory = len(self._inputs) - 1
         if memory < 0 or memory != len(self._outputs) - 1:
             raise ValueError(
@@ -79,8 +96,8 @@ class OnnxEgo:
 
     @cached_property
     def described(self) -> dict[str, Any]:
-        """What `agents.onnx.export` has written into the file; empty for other files."""
-        text = self._session.get_modelmeta().custom_metadata_map.get(KEY, "{}")
+        """Metadata that `agents.onnx.export` wrote into the file; empty for other files."""
+        text = self._session.get_modelmeta().custom_metadata_map.get(METADATA_KEY, "{}")
         try:
             found = json.loads(text)
         except json.JSONDecodeError:
@@ -89,19 +106,19 @@ class OnnxEgo:
 
     @property
     def observation_space(self) -> spaces.Box:
-        """What it observes; without bounds, which the file does not tell."""
+        """Space of one observation; without bounds, which the file does not tell."""
         return spaces.Box(-np.inf, np.inf, tuple(self._inputs[0].shape[1:]), np.float32)
 
     @property
     def action_space(self) -> spaces.Space[Any] | None:
-        """How it acts, if the file tells."""
+        """Space of one action, None if the file does not tell."""
         action = self.described.get("action", {})
         if "n" in action:
             return spaces.Discrete(int(action["n"]))
         if "low" in action:
             return spaces.Box(np.float32(action["low"]), np.float32(action["high"]), dtype=np.float32)
         sizes = self._outputs[0].shape[1:]
-        return spaces.Discrete(len(DISCRETE_ACTIONS)) if self._scores(sizes) else None
+        return spaces.Discrete(len(DISCRETE_ACTIONS)) if self._are_scores(sizes) else None
 
     @property
     def stateful(self) -> bool:
@@ -121,20 +138,21 @@ class OnnxEgo:
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[Any], Any]:
-        """Choose an action for each row of a batch; see `agents.Ego`. What the graph does is always deterministic."""
+        """Choose an action for each row of a batch; see `agents.Ego.predict`. The graph is always deterministic."""
         observation = np.asarray(observation)
         memory = self._begin(len(observation)) if state is None else list(state)
         if state is not None and episode_start is not None and np.any(episode_start):
             anew = np.asarray(episode_start, dtype=bool)
             memory = [np.where(anew.reshape(-1, *[1] * (part.ndim - 1)), 0, part).astype(part.dtype) for part in memory]
-        outputs = self._in_portions([observation, *memory])
-        return self._action(outputs[0]), tuple(outputs[1:]) or None
+        outputs = self._run_in_portions([observation, *memory])
+        return self._read_action(outputs[0]), tuple(outputs[1:]) or None
 
     def _begin(self, batch: int) -> list[NDArray[Any]]:
+        """Return the memory at the start of an episode: zeros."""
         return [np.zeros((batch, *port.shape[1:]), _TYPES[port.type]) for port in self._inputs[1:]]
 
-    def _in_portions(self, values: list[NDArray[Any]]) -> list[NDArray[Any]]:
-        """Run all rows, in portions if the file fixes the batch size; the last one is filled up with its last row."""
+    def _run_in_portions(self, values: list[NDArray[Any]]) -> list[NDArray[Any]]:
+        """Run all rows, in portions if the file fixes the batch size; the last portion is padded with its last row."""
         size = self.fixed_batch
         if size is None:
             return self._run(values)
@@ -149,14 +167,16 @@ class OnnxEgo:
             port.name: np.ascontiguousarray(value, _TYPES[port.type])
             for port, value in zip(self._inputs, values, strict=True)
         }
-        found: list[NDArray[Any]] = self._session.run(None, feed)
-        return found
+        outputs: list[NDArray[Any]] = self._session.run(None, feed)
+        return outputs
 
     @staticmethod
-    def _scores(sizes: Any) -> bool:
+    def _are_scores(sizes: Any) -> bool:
+        """Return whether an output of these sizes holds one score for each discrete action."""
         return list(sizes) == [len(DISCRETE_ACTIONS)]
 
-    def _action(self, output: NDArray[Any]) -> NDArray[Any]:
+    def _read_action(self, output: NDArray[Any]) -> NDArray[Any]:
+        """Return actions (B, 2) or (B,) made of the first output."""
         if np.issubdtype(output.dtype, np.integer):
             return output[:, 0] if output.ndim == 2 and output.shape[1] == 1 else output
-        return output.argmax(axis=1) if self._scores(output.shape[1:]) else output
+        return output.argmax(axis=1) if self._are_scores(output.shape[1:]) else output

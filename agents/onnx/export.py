@@ -1,7 +1,7 @@
-"""A saved Stable-Baselines3 policy as an ONNX file that takes raw observations and gives actions ready to be used.
+"""Export of a saved Stable-Baselines3 policy to ONNX, from raw observations to actions ready to be used.
 
-Stable-Baselines3's own recipe leaves out what `predict` does around the network. Here normalisation of observations,
-frames stacked behind it, the squashed or clipped action and a recurrent policy's memory are in the graph.
+Stable-Baselines3's own export has the bare network. Here normalisation of observations, frames stacked behind it, the
+squashed or clipped action and a recurrent policy's memory are part of the graph.
 """
 
 from __future__ import annotations
@@ -18,37 +18,43 @@ import torch
 from gymnasium import spaces
 from torch import Tensor, nn
 
-from agents.onnx.ego import KEY, OnnxEgo
+from agents.onnx.ego import METADATA_KEY, OnnxEgo
 from agents.sb3.saved_ego import SavedEgo
 
 ACTION_TOLERANCE = 1e-5
-"""Largest difference of an action that an export may make."""
-TICKS, BATCHES = 20, (1, 7, 64)
+"""Largest difference between actions of the policy and of its export: single precision rounds by about 1e-7 in each of
+a few layers."""
+TRIAL_TICKS, TRIAL_BATCHES = 20, (1, 7, 64)
+"""Ticks and batch sizes of the comparison: a memory builds up, and sizes differ from that of the trace."""
+TRIAL_RANGE = 10.0
+"""Observations of the comparison lie within +-this where a space has wider bounds: VecNormalize clips there."""
 
 
 @dataclass(frozen=True)
-class Exported:
-    """What an export has written.
+class ExportReport:
+    """Result of an export.
 
-    Attributes:
-        path: The file.
-        difference: Largest difference of its actions from those of the policy, on random observations.
-        observations: How many were tried.
+    Example:
+        >>> ExportReport(Path("ego.onnx"), 1e-7, 1440).observations
+        1440
     """
 
     path: Path
+    """The file."""
     difference: float
+    """Largest difference of its actions from those of the policy, on random observations."""
     observations: int
+    """Number of observations that were compared."""
 
 
 class _Graph(nn.Module):
-    """Raw observations and memory to actions and memory, batch first throughout."""
+    """The graph: raw observations and memory to actions and memory, batch first throughout."""
 
     def __init__(self, ego: SavedEgo) -> None:
         super().__init__()
         self.policy = ego.model.policy
         self.policy.set_training_mode(False)
-        self.recurrent = hasattr(self.policy, "lstm_actor")
+        self.recurrent = hasattr(self.policy, "lstm_actor")  # sb3_contrib's policies have no common class
         self.frames = 1 if ego.frames is None else ego.frames[0]
         self.mean: Tensor | None = None
         statistics = ego.statistics
@@ -58,7 +64,7 @@ class _Graph(nn.Module):
             self.clip = float(statistics.clip_obs)
 
     def memory(self, observation: Any, batch: int) -> list[Tensor]:
-        """Zeros of the memory's shapes."""
+        """Return a memory of zeros."""
         parts = []
         if self.frames > 1:
             parts.append(torch.zeros(batch, (self.frames - 1) * observation.shape[0]))
@@ -68,6 +74,7 @@ class _Graph(nn.Module):
         return parts
 
     def forward(self, observation: Tensor, *memory: Tensor) -> tuple[Tensor, ...]:
+        """Return the action and the new memory."""
         seen = observation
         if self.mean is not None:  # in double precision, as VecNormalize does
             seen = ((seen.double() - self.mean) / self.scale).clamp(-self.clip, self.clip).float()
@@ -82,10 +89,10 @@ class _Graph(nn.Module):
             carried = (*carried, *(state.transpose(0, 1) for state in states))
         else:
             action = self.policy._predict(seen, deterministic=True)
-        return (self._finished(action), *carried)
+        return (self._finish_action(action), *carried)
 
-    def _finished(self, action: Tensor) -> Tensor:
-        """What `predict` makes of the network's action."""
+    def _finish_action(self, action: Tensor) -> Tensor:
+        """Return the action as `predict` gives it: unsquashed or clipped to the space."""
         space = self.policy.action_space
         if not isinstance(space, spaces.Box):
             return action
@@ -95,19 +102,32 @@ class _Graph(nn.Module):
         return torch.minimum(torch.maximum(action, low), high)
 
 
-def export_onnx(ego: SavedEgo, path: Path, seed: int = 0) -> Exported:
-    """Write a policy as ONNX and compare the file with it on random observations, over several ticks and batch sizes.
+def export_onnx(ego: SavedEgo, path: Path, seed: int = 0) -> ExportReport:
+    """Write a policy as ONNX, and compare the file with the policy over several ticks and batch sizes.
 
     Args:
         ego: The policy.
         path: Where to write; it is written only if the comparison holds.
-        seed: Of the observations.
+        seed: Of the random observations of the comparison.
 
     Returns:
-        What was found.
+        The file and the largest difference.
 
     Raises:
-        ValueError: The policy cannot be written, or the file acts otherwise.
+        ValueError: The policy cannot be written, or the file acts differently.
+
+    Example:
+        >>> import tempfile
+        >>> from stable_baselines3 import PPO
+        >>> from agents import load_ego
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     PPO("MlpPolicy", "Pendulum-v1", n_steps=8, batch_size=8, device="cpu").save(f"{folder}/ppo.zip")
+        ...     report = export_onnx(load_ego(f"{folder}/ppo.zip"), Path(folder) / "ppo.onnx")
+        ...     ego = load_ego(report.path)
+        >>> report.difference < 1e-5, report.observations
+        (True, 1440)
+        >>> ego.predict(np.zeros((5, 3), np.float32))[0].shape
+        (5, 1)
     """
     try:
         import onnx
@@ -116,34 +136,34 @@ def export_onnx(ego: SavedEgo, path: Path, seed: int = 0) -> Exported:
     space = ego.observation_space
     if not isinstance(space, spaces.Box) or (ego.frames is not None and (ego.frames[1] or len(space.shape) != 1)):
         raise ValueError(f"Cannot export a policy that observes {space}; expected one Box of numbers.")
-    described = {
+    description = {
         "algorithm": ego.algorithm,
         "observation": list(space.shape),
-        "action": _space_record(ego.action_space),
+        "action": _describe_space(ego.action_space),
     }
     draft = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         _trace(ego, draft)
         model = onnx.load(str(draft))
-        model.metadata_props.add(key=KEY, value=json.dumps(described))
+        model.metadata_props.add(key=METADATA_KEY, value=json.dumps(description))
         onnx.save(model, str(draft))
-        difference, count = max_action_difference(ego, OnnxEgo(draft), np.random.default_rng(seed))
+        difference, count = compare_actions(ego, OnnxEgo(draft), np.random.default_rng(seed))
         if not difference <= ACTION_TOLERANCE:
-            raise ValueError(f"The exported graph acts otherwise, by up to {difference:.2g}; nothing was written.")
+            raise ValueError(f"The exported graph acts differently, by up to {difference:.2g}; nothing was written.")
         draft.replace(path)
     finally:
         draft.unlink(missing_ok=True)
-    return Exported(path, difference, count)
+    return ExportReport(path, difference, count)
 
 
 def _trace(ego: SavedEgo, path: Path) -> None:
-    """Write the graph, traced on zeros; `max_action_difference` finds what the tracer may get wrong."""
+    """Write the graph, traced on zeros; `compare_actions` finds what the tracer may get wrong."""
     graph, space = _Graph(ego).eval(), ego.observation_space
     memory = graph.memory(space, 2)
     names = [f"memory_{part}" for part in range(len(memory))]
     ports = ["observation", *names, "action", *(f"next_{name}" for name in names)]
     with torch.no_grad(), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of the tracer, about branches that do not depend on the observation
+        warnings.simplefilter("ignore")  # the tracer warns of branches that do not depend on the observation
         try:
             torch.onnx.export(
                 graph,
@@ -158,14 +178,17 @@ def _trace(ego: SavedEgo, path: Path) -> None:
             raise ValueError(f"Cannot export a policy of class {type(ego.model.policy).__name__}: {error}") from error
 
 
-def _space_record(space: Any) -> dict[str, Any]:
+def _describe_space(space: Any) -> dict[str, Any]:
+    """Return an action space as JSON, from which `agents.onnx.ego` rebuilds it."""
     if isinstance(space, spaces.Discrete):
         return {"n": int(space.n)}
     return {"low": space.low.tolist(), "high": space.high.tolist()}
 
 
-def max_action_difference(policy: Any, other: Any, rng: np.random.Generator) -> tuple[float, int]:
-    """The largest difference between two egos' actions on random observations, memories carried, and their number.
+def compare_actions(policy: Any, other: Any, rng: np.random.Generator) -> tuple[float, int]:
+    """Return the largest difference between two egos' actions on random observations, and their number.
+
+    Each ego carries its own memory from tick to tick.
 
     Args:
         policy: An ego with a bounded `observation_space`.
@@ -173,15 +196,15 @@ def max_action_difference(policy: Any, other: Any, rng: np.random.Generator) -> 
         rng: Draws the observations.
     """
     space, worst, count = policy.observation_space, 0.0, 0
-    low, high = np.clip(space.low, -10.0, 10.0), np.clip(space.high, -10.0, 10.0)
-    for batch in BATCHES:
+    low, high = (np.clip(bound, -TRIAL_RANGE, TRIAL_RANGE) for bound in (space.low, space.high))
+    for batch in TRIAL_BATCHES:
         states: list[Any] = [None, None]
-        for tick in range(TICKS):
+        for tick in range(TRIAL_TICKS):
             observation = rng.uniform(low, high, (batch, *space.shape)).astype(np.float32)
             start = np.full(batch, tick == 0)
-            found = []
+            actions = []
             for which, ego in enumerate((policy, other)):
                 action, states[which] = ego.predict(observation, states[which], start, True)
-                found.append(np.asarray(action, dtype=np.float64))
-            worst, count = max(worst, float(np.abs(found[0] - found[1]).max())), count + batch
+                actions.append(np.asarray(action, dtype=np.float64))
+            worst, count = max(worst, float(np.abs(actions[0] - actions[1]).max())), count + batch
     return worst, count

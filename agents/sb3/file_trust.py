@@ -1,4 +1,4 @@
-"""Where a file that can run code comes from: whether others could have put another in its place."""
+"""Trust in a file that can run code: whether other users could have written it or replaced it."""
 
 from __future__ import annotations
 
@@ -6,36 +6,40 @@ import os
 import stat
 from pathlib import Path
 
-TRUSTED = "it is opened as Stable-Baselines3 does, and whatever code is in it runs"
-"""What trust means."""
+TRUST_CONSEQUENCE = "it is opened as Stable-Baselines3 does, and whatever code is in it runs"
+"""Consequence of trust=True."""
 TRUST_ADVICE = (
     "others may have put something else there: copy it to a folder of your own, or take away their right to write "
-    f"(chmod o-w). With --trust (trust=True) it is opened nevertheless; mind that {TRUSTED}, where otherwise only what "
-    "is known to be harmless is made of it"
+    f"(chmod o-w). With --trust (trust=True) it is opened nevertheless; mind that {TRUST_CONSEQUENCE}, "
+    "where otherwise only what is known to be harmless is made of it"
 )
-"""What to do about a doubt."""
+"""Advice on a risk."""
 
 
 def check_origin(*files: Path | None) -> None:
-    """Refuse files that others may have written.
+    """Refuse files that other users may have written.
 
     Raises:
-        ValueError: One of them is doubtful; the message says why and what to do.
+        ValueError: One of them is at risk; the message says why and what to do.
     """
     if reasons := find_origin_risks(*files):
         raise ValueError(f"Will not open it: {'; '.join(reasons)}; {TRUST_ADVICE}.")
 
 
 def find_origin_risks(*files: Path | None) -> list[str]:
-    """Reasons not to open files; empty if there are none. Files that do not exist give none.
+    """Return reasons not to open files; empty if there are none. Files that do not exist give none.
 
-    A file is doubtful if everybody may write to it or put another in its place, in its folder or one above. Where
-    everybody may add files but not replace those of others (/tmp), one that belongs to somebody else is.
+    A file is at risk if everybody may write to it or replace it, in its folder or one above. Where everybody may add
+    files but not replace those of others (/tmp), a file of another user is at risk.
+
+    Example:
+        >>> find_origin_risks(None, Path("/no/such/file"))
+        []
     """
     if os.name != "posix":  # others' rights are not in the mode
         return []
-    found = [doubt for file in files if file is not None and file.exists() for doubt in _find_risks(file.resolve())]
-    return list(dict.fromkeys(found))
+    risks = [risk for file in files if file is not None and file.exists() for risk in _find_risks(file.resolve())]
+    return list(dict.fromkeys(risks))
 
 
 def _find_risks(path: Path) -> list[str]:

@@ -1,7 +1,7 @@
-"""Pickles opened without running what their author may have put there.
+"""Restricted unpickling: only classes and functions of a short list are called, so a pickle cannot run code.
 
-A pickle names the classes and functions that it wants to call. Here it gets those of a short list: spaces, networks,
-optimisers and statistics of Gymnasium, PyTorch and Stable-Baselines3, and what NumPy rebuilds its arrays with.
+A pickle names the classes and functions that it wants to call. The list holds spaces, networks, optimisers and
+statistics of Gymnasium, PyTorch and Stable-Baselines3, and what NumPy rebuilds its arrays with.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import pickle
 import re
 from typing import Any
 
-ARRAYS = {
+ALLOWED_NAMES = {
     "numpy": {"dtype", "ndarray"},
     "numpy._core.numeric": {"_frombuffer"},
     "numpy._core.multiarray": {"scalar", "_reconstruct"},
@@ -24,8 +24,8 @@ ARRAYS = {
     "builtins": {"set", "frozenset", "slice", "bytearray", "complex", "object"},
     "copyreg": {"_reconstructor"},
 }
-"""Module to names of what is harmless to call."""
-CLASSES = {
+"""Module to names that are harmless to call."""
+ALLOWED_BASES = {
     "gymnasium.spaces": ("gymnasium.spaces.Space",),
     "torch.nn": ("torch.nn.Module",),
     "torch.optim": ("torch.optim.Optimizer",),
@@ -42,38 +42,56 @@ CLASSES = {
 """Package to the classes whose subclasses in it may be made."""
 
 
-class ForeignObject(pickle.UnpicklingError):
-    """A pickle asks for something that is not on the list."""
+class ForbiddenObject(pickle.UnpicklingError):
+    """A pickle names a class or function that is not on the list.
+
+    Example:
+        >>> try:
+        ...     open_pickle(pickle.dumps(pickle.Pickler))
+        ... except ForbiddenObject as error:
+        ...     print(error)
+        it asks for _pickle.Pickler, which may run code
+    """
 
 
-class _Reader(pickle.Unpickler):
-    """Finds listed classes and functions only."""
+class _RestrictedUnpickler(pickle.Unpickler):
+    """Unpickler that finds listed classes and functions only."""
 
     def find_class(self, module: str, name: str) -> Any:
-        """The class or function of that name, if it is listed."""
+        """Return the class or function of that name, if it is listed."""
         if "." not in name:
             module = re.sub(r"^numpy\.core\.", "numpy._core.", module)  # what NumPy 1 called it
-            if name in ARRAYS.get(module, ()):
+            if name in ALLOWED_NAMES.get(module, ()):
                 return getattr(importlib.import_module(module), name)
-            for package, bases in CLASSES.items():
+            for package, bases in ALLOWED_BASES.items():
                 if module == package or module.startswith(f"{package}."):
                     found = getattr(importlib.import_module(module), name, None)
                     if isinstance(found, type) and issubclass(found, tuple(map(_import_class, bases))):
                         return found
-        raise ForeignObject(f"it asks for {module}.{name}, which may run code")
+        raise ForbiddenObject(f"it asks for {module}.{name}, which may run code")
 
 
 def _import_class(path: str) -> type:
+    """Import `module.Class`."""
     module, _, name = path.rpartition(".")
     found: type = getattr(importlib.import_module(module), name)
     return found
 
 
 def open_pickle(content: bytes) -> Any:
-    """The object in a pickle.
+    """Return the object in a pickle.
 
     Raises:
-        ForeignObject: It asks for a class or function that is not listed; nothing of it has been called.
+        ForbiddenObject: It names a class or function that is not listed; nothing has been called then.
         Exception: The pickle is damaged; anything may be raised.
+
+    Example:
+        >>> import fractions
+        >>> open_pickle(pickle.dumps({"gamma": 0.98}))
+        {'gamma': 0.98}
+        >>> open_pickle(pickle.dumps(fractions.Fraction(1, 2)))
+        Traceback (most recent call last):
+        ...
+        agents.sb3.safe_pickle.ForbiddenObject: it asks for fractions.Fraction, which may run code
     """
-    return _Reader(io.BytesIO(content)).load()
+    return _RestrictedUnpickler(io.BytesIO(content)).load()

@@ -1,7 +1,7 @@
 """Policies saved by Stable-Baselines3: a `.zip`, and the `VecNormalize` statistics beside it.
 
-Both hold pickles. They are opened by `agents.sb3.safe_pickle`, so that a file from somewhere else cannot run code; one
-that needs classes of its author's own is opened as Stable-Baselines3 would only if the caller trusts it.
+Both hold pickles. They are opened by `agents.sb3.safe_pickle`, so that a file from somewhere else cannot run code. One
+that needs classes of its author's own is opened as Stable-Baselines3 does, and only if the caller trusts it.
 """
 
 from __future__ import annotations
@@ -21,35 +21,46 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.sb3.file_trust import check_origin
-from agents.sb3.safe_pickle import ForeignObject, open_pickle
-from agents.sb3.zip_header import algorithm_class, algorithm_of, read_header, weights_only_objects
+from agents.sb3.safe_pickle import ForbiddenObject, open_pickle
+from agents.sb3.zip_header import find_algorithm, find_algorithm_class, make_training_stubs, read_header
 from rare_envs.egos.wrappers import Normalised, Stacked, stacking
 from rare_envs.plugins import one_line
 
 TRUST = "if you trust where the file comes from, load it with trust=True (--trust)"
+"""Advice on a file that was not opened."""
 
 
 @dataclass(frozen=True)
 class SavedEgo:
     """A Stable-Baselines3 policy read from a file, with its observation statistics if it has any.
 
-    Attributes:
-        model: The Stable-Baselines3 algorithm, on the CPU.
-        algorithm: Its name, such as "ppo".
-        path: Where it came from.
-        statistics: Its `VecNormalize` statistics, or None; observations pass through them first.
-        statistics_path: Where the statistics came from, or None.
+    Example:
+        >>> import tempfile
+        >>> from stable_baselines3 import PPO
+        >>> from agents import load_ego
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     PPO("MlpPolicy", "Pendulum-v1", n_steps=8, batch_size=8, device="cpu").save(f"{folder}/ego.zip")
+        ...     ego = load_ego(f"{folder}/ego.zip")
+        >>> ego.algorithm, ego.observation_space.shape, ego.statistics
+        ('ppo', (3,), None)
+        >>> ego.predict(np.zeros((5, 3), np.float32))[0].shape
+        (5, 1)
     """
 
     model: Any
+    """The Stable-Baselines3 algorithm, on the CPU."""
     algorithm: str
+    """Its name, such as "ppo"."""
     path: Path
+    """The `.zip`."""
     statistics: Any = None
+    """Its `VecNormalize` statistics, or None; observations pass through them first."""
     statistics_path: Path | None = None
+    """The file of the statistics, or None."""
 
     @property
     def observation_space(self) -> Any:
-        """What it observes: what the policy was trained on, of single frames if they were normalised one by one."""
+        """Observations of the policy; those of single frames if they were normalised one by one."""
         return self.model.observation_space if self.frames is None else self.statistics.observation_space
 
     @property
@@ -77,23 +88,29 @@ class SavedEgo:
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[Any], Any]:
-        """Choose an action for each row of a batch; see `Ego.predict`."""
+        """Choose an action for each row of a batch; see `agents.Ego.predict`."""
         actions, state = self.policy.predict(observation, state, episode_start, deterministic)
         return actions, state
 
 
 def load_saved_ego(path: Path, algo: str | None, trust: bool = False) -> SavedEgo:
-    """Read a `.zip`: what it says of itself first, then its weights, then its statistics.
+    """Read a `.zip`: its header first, then its weights, then its statistics.
 
     Args:
         path: The file.
-        algo: Its algorithm; None finds it.
+        algo: Its algorithm; found in the file if None.
         trust: Open its pickles as Stable-Baselines3 does, which runs whatever code is in them.
 
     Raises:
         FileNotFoundError: The file does not exist.
-        ValueError: It is no model, is damaged, or needs trust: for what is in it, or because others may write to it or
-            its statistics (`agents.sb3.file_trust`).
+        ValueError: It is no model, is damaged, or needs trust: because of its content, or because other users may write
+            to it or its statistics (`agents.sb3.file_trust`).
+
+    Example:
+        >>> load_saved_ego(Path("no/such/ego.zip"), None)
+        Traceback (most recent call last):
+        ...
+        FileNotFoundError: No ego at 'no/such/ego.zip': the folder 'no/such' does not exist.
     """
     if not path.exists():
         raise FileNotFoundError(f"No ego at {str(path)!r}{_suggest_file(path)}.")
@@ -103,15 +120,15 @@ def load_saved_ego(path: Path, algo: str | None, trust: bool = False) -> SavedEg
     if not trust:
         check_origin(path, found)
     header = read_header(path)
-    name = algo.lower() if algo is not None else algorithm_of(header, path)
-    algorithm = algorithm_class(name, path)
+    name = algo.lower() if algo is not None else find_algorithm(header, path)
+    algorithm = find_algorithm_class(name, path)
     model = _load_model(algorithm, name, header, path, trust)
     statistics = None if found is None else _load_statistics(found, model.observation_space, trust)
     return SavedEgo(model, name, path, statistics, found)
 
 
 def _suggest_file(path: Path) -> str:
-    """Names in the same folder that a mistyped path may have meant."""
+    """Return a hint at files in the same folder that a mistyped path may have meant."""
     if not path.parent.is_dir():
         return f": the folder {str(path.parent)!r} does not exist"
     names = sorted(entry.name for entry in path.parent.glob("*.zip"))
@@ -122,15 +139,15 @@ def _suggest_file(path: Path) -> str:
 
 
 def _load_model(algorithm: Any, name: str, header: Mapping[str, Any], path: Path, trust: bool) -> Any:
-    """Build the algorithm and put the saved weights in."""
-    given = weights_only_objects()
+    """Build the algorithm and load the saved weights."""
+    given = make_training_stubs()
     try:
         content = path.read_bytes()  # once, so that what is loaded is what was looked at
         if not trust:
             given = {**open_objects(read_header(io.BytesIO(content), str(path)), set(given)), **given}
         return algorithm.load(io.BytesIO(content), device="cpu", custom_objects=given)
-    except ForeignObject as error:
-        raise ValueError(f"Will not load {str(path)!r}: {one_line(error).partition(': ')[2]}; {TRUST}.") from error
+    except ForbiddenObject as error:
+        raise ValueError(f"Will not load {str(path)!r}: {error}; {TRUST}.") from error
     except Exception as error:  # a damaged or foreign pickle can raise anything at all
         version = header.get("version", "unknown")
         raise ValueError(
@@ -141,10 +158,10 @@ def _load_model(algorithm: Any, name: str, header: Mapping[str, Any], path: Path
 
 
 def open_objects(header: Mapping[str, Any], without: set[str]) -> dict[str, Any]:
-    """The pickled entries of a model's settings, opened safely.
+    """Open the pickled entries of a model's settings safely.
 
     Raises:
-        ForeignObject: One asks for something that may run code; the message names the entry.
+        ForbiddenObject: One names a class or function that is not listed; the message names the entry.
     """
     opened = {}
     for key, value in header.items():
@@ -152,8 +169,8 @@ def open_objects(header: Mapping[str, Any], without: set[str]) -> dict[str, Any]
             continue
         try:
             opened[key] = open_pickle(base64.b64decode(str(value[":serialized:"])))
-        except ForeignObject as error:
-            raise ForeignObject(f"in its {key!r} {error}") from error
+        except ForbiddenObject as error:
+            raise ForbiddenObject(f"in its {key!r} {error}") from error
     return opened
 
 
@@ -161,7 +178,7 @@ def open_objects(header: Mapping[str, Any], without: set[str]) -> dict[str, Any]
 
 
 def _statistics_candidates(path: Path) -> Iterator[Path]:
-    """Places where `VecNormalize` statistics of a model are kept, most specific first."""
+    """Yield the places where `VecNormalize` statistics of a model are kept, most specific first."""
     folder, stem = path.parent, path.stem
     yield folder / f"{stem}_vecnormalize.pkl"
     checkpoint = re.fullmatch(r"(.+)_(\d+_steps)", stem)  # Stable-Baselines3's CheckpointCallback
@@ -175,7 +192,7 @@ def _statistics_candidates(path: Path) -> Iterator[Path]:
 
 
 def find_statistics(path: Path) -> Path | None:
-    """The `VecNormalize` statistics of a model, or None."""
+    """Return the file of the `VecNormalize` statistics of a model, or None."""
     return next((found for found in _statistics_candidates(path) if found.is_file()), None)
 
 
@@ -186,10 +203,8 @@ def _load_statistics(path: Path, observation_space: Any, trust: bool) -> Any:
     try:
         content = path.read_bytes()
         statistics = pickle.loads(content) if trust else open_pickle(content)
-    except ForeignObject as error:
-        raise ValueError(
-            f"Will not read the VecNormalize statistics {str(path)!r}: {one_line(error).partition(': ')[2]}; {TRUST}."
-        ) from error
+    except ForbiddenObject as error:
+        raise ValueError(f"Will not read the VecNormalize statistics {str(path)!r}: {error}; {TRUST}.") from error
     except Exception as error:  # a damaged pickle can raise anything at all
         raise ValueError(
             f"Cannot read the VecNormalize statistics {str(path)!r}: {one_line(error)}. "

@@ -1,8 +1,8 @@
-"""What a Stable-Baselines3 `.zip` says of itself, read without unpickling anything.
+"""Header of a Stable-Baselines3 `.zip`: settings and algorithm, read without unpickling anything.
 
-The archive has a member `data`: JSON whose simple values are written as they are and whose other
-values appear as `{":type:": ..., "__module__": ..., ":serialized:": <pickle>}`. Names of settings
-and the policy's module are enough to tell the algorithms apart.
+The archive has a member `data`: JSON with simple values as they are and other values as
+`{":type:": ..., "__module__": ..., ":serialized:": <pickle>}`. Names of settings and the policy's module are enough to
+tell the algorithms apart.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from typing import Any, BinaryIO
 
 from rare_envs.plugins import did_you_mean
 
-CORE = ("ppo", "a2c", "sac", "td3", "ddpg", "dqn")  # in stable_baselines3
-CONTRIB = {  # in sb3_contrib, an optional package: name -> class
+CORE_ALGORITHMS = ("ppo", "a2c", "sac", "td3", "ddpg", "dqn")  # in stable_baselines3
+CONTRIB_CLASSES = {  # in sb3_contrib, an optional package: name -> class
     "recurrent_ppo": "RecurrentPPO",
     "maskable_ppo": "MaskablePPO",
     "trpo": "TRPO",
@@ -42,7 +42,7 @@ POLICY_MODULES = {  # start of the policy's module -> algorithm; "common" polici
     "sb3_contrib.ars.": "ars",
 }
 
-SETTINGS = (  # a setting that only this algorithm has; the first that is present decides
+SETTINGS_OF_ALGORITHM = (  # a setting that only this algorithm has; the first that is present decides
     ("top_quantiles_to_drop_per_net", "tqc"),
     ("cg_max_steps", "trpo"),
     ("n_delta", "ars"),
@@ -54,20 +54,21 @@ SETTINGS = (  # a setting that only this algorithm has; the first that is presen
 )
 
 
-UNPACKED, MOST_PACKED = 64 * 2**20, 20
-"""Bytes that any archive may unpack to, and how many times its size a larger one may."""
+MAX_UNPACKED, MAX_RATIO = 64 * 2**20, 20
+"""Bytes that any archive may unpack to, and the factor by which a larger one may grow: Stable-Baselines3 stores its
+members uncompressed, so 20 refuses no policy."""
 
 
-class TooLarge(ValueError):
-    """An archive that is far larger unpacked."""
+class ArchiveTooLarge(ValueError):
+    """An archive that unpacks to far more than its own size."""
 
 
 def read_header(file: Path | BinaryIO, name: str | None = None) -> dict[str, Any]:
-    """Read the settings of a saved model, pickles left closed.
+    """Read the settings of a saved model without opening its pickles.
 
     Args:
         file: A file that exists, or its content.
-        name: What to call it in messages; the path when None.
+        name: Its name in messages; the path when None.
 
     Returns:
         The entries of the member `data`, and "version" (of Stable-Baselines3).
@@ -84,7 +85,7 @@ def read_header(file: Path | BinaryIO, name: str | None = None) -> dict[str, Any
             members = set(archive.namelist())
             header = json.loads(archive.read("data")) if "data" in members else None
             version = _read_text(archive, members, "_stable_baselines3_version")
-    except TooLarge:
+    except ArchiveTooLarge:
         raise
     except (zipfile.BadZipFile, zlib.error, ValueError, RuntimeError, RecursionError, OSError) as error:
         raise ValueError(f"{name!r} is damaged ({error}); save the model again.") from error
@@ -97,11 +98,11 @@ def read_header(file: Path | BinaryIO, name: str | None = None) -> dict[str, Any
 
 
 def _check_size(archive: zipfile.ZipFile, name: str) -> None:
-    """Refuse an archive that would fill the memory: Stable-Baselines3 stores its members as they are."""
+    """Refuse an archive that would fill the memory."""
     unpacked = sum(member.file_size for member in archive.infolist())
     packed = sum(member.compress_size for member in archive.infolist())
-    if unpacked > max(UNPACKED, MOST_PACKED * packed):
-        raise TooLarge(
+    if unpacked > max(MAX_UNPACKED, MAX_RATIO * packed):
+        raise ArchiveTooLarge(
             f"{name!r} would unpack from {packed / 1e6:.1f} to {unpacked / 1e6:,.0f} MB; no policy does that."
         )
 
@@ -110,15 +111,15 @@ def _read_text(archive: zipfile.ZipFile, members: set[str], name: str) -> str:
     return archive.read(name).decode().strip() if name in members else "unknown"
 
 
-def algorithm_of(header: Mapping[str, Any], path: Path) -> str:
-    """Name the algorithm of a saved model.
+def find_algorithm(header: Mapping[str, Any], path: Path) -> str:
+    """Return the name of the algorithm of a saved model.
 
     Args:
         header: From `read_header`.
         path: The file, for messages.
 
     Returns:
-        One of `CORE` or `CONTRIB`.
+        One of `CORE_ALGORITHMS` or `CONTRIB_CLASSES`.
 
     Raises:
         ValueError: No algorithm fits.
@@ -128,20 +129,20 @@ def algorithm_of(header: Mapping[str, Any], path: Path) -> str:
     for start, name in POLICY_MODULES.items():
         if module.startswith(start):
             return name
-    for setting, name in SETTINGS:
+    for setting, name in SETTINGS_OF_ALGORITHM:
         if setting in header:
             return name
     raise ValueError(
         f"Cannot tell which algorithm saved {str(path)!r} (policy from {module or 'unknown'!r}); "
-        f"name it with algo: {', '.join((*CORE, *CONTRIB))}."
+        f"name it with algo: {', '.join((*CORE_ALGORITHMS, *CONTRIB_CLASSES))}."
     )
 
 
-def algorithm_class(name: str, path: Path) -> Any:
-    """The class of an algorithm.
+def find_algorithm_class(name: str, path: Path) -> Any:
+    """Return the class of an algorithm.
 
     Args:
-        name: One of `CORE` or `CONTRIB`.
+        name: One of `CORE_ALGORITHMS` or `CONTRIB_CLASSES`.
         path: The file that needs it, for messages.
 
     Returns:
@@ -150,27 +151,26 @@ def algorithm_class(name: str, path: Path) -> Any:
     Raises:
         ValueError: The name is unknown, or its package is not installed.
     """
-    if name in CORE:
+    if name in CORE_ALGORITHMS:
         return getattr(importlib.import_module("stable_baselines3"), name.upper())
-    if name in CONTRIB:
+    if name in CONTRIB_CLASSES:
         try:
-            return getattr(importlib.import_module("sb3_contrib"), CONTRIB[name])
+            return getattr(importlib.import_module("sb3_contrib"), CONTRIB_CLASSES[name])
         except ImportError as error:
             raise ValueError(
-                f"{str(path)!r} holds {CONTRIB[name]}, which needs a package that is not "
+                f"{str(path)!r} holds {CONTRIB_CLASSES[name]}, which needs a package that is not "
                 "installed: pip install sb3-contrib."
             ) from error
-    known = (*CORE, *CONTRIB)
+    known = (*CORE_ALGORITHMS, *CONTRIB_CLASSES)
     raise ValueError(f"Unknown algorithm {name!r}{did_you_mean(name, known)}; expected one of {', '.join(known)}.")
 
 
-def weights_only_objects() -> dict[str, Any]:
-    """Stand-ins for what training needs and driving does not.
+def make_training_stubs() -> dict[str, Any]:
+    """Return stand-ins for the entries that only training needs.
 
-    Passed as `custom_objects` of `load`, they keep schedules, noise and buffers of a saved model
-    closed: those pickles are what breaks between versions of Python, a replay buffer would ask
-    for its full memory, and a seed would reset the global generators. Entries that a model lacks
-    are ignored.
+    Passed as `custom_objects` of `load`, they keep schedules, noise and buffers of a saved model closed. Those pickles
+    break between versions of Python, a replay buffer would allocate its full memory, and a seed would reset the global
+    generators. Entries that a model lacks are ignored.
     """
     return {
         "seed": None,

@@ -1,4 +1,4 @@
-"""PilotNet: pictures of a front camera to acceleration and turning.
+"""PilotNet: a convolutional network from pictures of a front camera to acceleration and yaw rate.
 
 References:
     Bojarski et al., "End to end learning for self-driving cars", 2016 (arXiv 1604.07316): the layers, and pictures of
@@ -14,47 +14,60 @@ import torch
 from torch import Tensor, nn
 
 HEIGHT, WIDTH = 66, 200
-"""Of the pictures, in pixels."""
+"""Height and width of the pictures [pixels]."""
 OUTPUT_SIZE = 2
-"""Acceleration and turn."""
-UNITS = 50
-"""Of the layer that `PilotNet.hidden` gives."""
-ACCELERATION, TURN = 2.0, 0.1
+"""Acceleration and yaw rate."""
+HIDDEN_UNITS = 50
+"""Units of the layer that `PilotNet.hidden` gives."""
+ACCELERATION_UNIT, TURN_UNIT = 2.0, 0.1
 """Outputs are in these units [m/s^2, rad/s]."""
 YUV = ((0.299, 0.587, 0.114), (-0.14713, -0.28886, 0.436), (0.615, -0.51499, -0.10001))
 """Luma and colour differences of red, green and blue (ITU-R BT.601, analogue scales)."""
 _USUAL_SPEED, _SPEED_SPREAD = 15.0, 7.5
-"""[m/s]."""
+"""Speeds are normalised by these [m/s]: about the mean and spread of the speeds in training."""
+_BYTE_CENTRE = 127.5
+"""Half of the range of a byte."""
 
 
 def luma(picture: Tensor) -> Tensor:
-    """Brightness of pictures, in whole numbers: the same bits whatever the batch.
+    """Return the brightness of pictures, computed in integers: the same bits whatever the batch.
+
+    The coefficients are those of `YUV` times 256, rounded.
 
     Args:
         picture: uint8, red, green and blue last, shape (B, H, W, 3).
 
     Returns:
         uint8, shape (B, H, W).
+
+    Example:
+        >>> luma(torch.tensor([[[[255, 0, 0], [255, 255, 255]]]], dtype=torch.uint8)).tolist()
+        [[[77, 255]]]
     """
     red, green, blue = picture.to(torch.int32).unbind(-1)
     return ((77 * red + 150 * green + 29 * blue + 128) >> 8).to(torch.uint8)
 
 
 class PilotNet(nn.Module):
-    """Normalisation, five convolutions and three dense layers, as published; one input and the output differ.
+    """Normalisation, five convolutions and three dense layers, as published; the input and the output differ.
 
-    Beside the YUV of the picture there is a fourth channel, by how much brighter it is than an earlier picture, because
-    one picture does not tell how fast a gap closes; and the own speed, which every car knows, joins the units of the
-    first dense layer.
+    Beside the YUV of the picture there is a fourth channel, the change of brightness since an earlier picture, because
+    one picture does not tell how fast a gap closes. The ego's own speed joins the units of the first dense layer.
+
+    Example:
+        >>> picture = torch.zeros(2, HEIGHT, WIDTH, 3, dtype=torch.uint8)
+        >>> tuple(PilotNet()(picture, luma(picture), torch.tensor([10.0, 20.0])).shape)
+        (2, 2)
     """
 
     def __init__(self) -> None:
+        """Draw the weights from the global generator of torch."""
         super().__init__()
         sizes = ((4, 24, 5, 2), (24, 36, 5, 2), (36, 48, 5, 2), (48, 64, 3, 1), (64, 64, 3, 1))
         self.convolutions = nn.ModuleList(nn.Conv2d(a, b, kernel, stride) for a, b, kernel, stride in sizes)
         self.first = nn.Linear(64 * 18, 100)
-        self.second = nn.Linear(100 + 1, UNITS)
-        self.last = nn.Linear(UNITS, 10)
+        self.second = nn.Linear(100 + 1, HIDDEN_UNITS)
+        self.last = nn.Linear(HIDDEN_UNITS, 10)
         self.head = nn.Linear(10, OUTPUT_SIZE)
         for layer in (*self.convolutions, self.first, self.second, self.last):
             nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
@@ -62,13 +75,13 @@ class PilotNet(nn.Module):
         self.arrange()
 
     def arrange(self) -> PilotNet:
-        """Lay weights out in memory as the pictures are, channels last, which convolves twice as fast."""
+        """Lay the weights out as the pictures are, channels last, which convolves twice as fast; return the network."""
         for layer in cast(Iterable[nn.Conv2d], self.convolutions):
             layer.weight.data = layer.weight.data.contiguous(memory_format=torch.channels_last)
         return self
 
     def channels(self, picture: Tensor, earlier: Tensor) -> Tensor:
-        """The four channels of the input, about -1 to 1.
+        """Return the four channels of the input, about -1 to 1.
 
         Args:
             picture: uint8, red, green and blue last, shape (B, 66, 200, 3).
@@ -81,12 +94,12 @@ class PilotNet(nn.Module):
         image = like.new_empty(*picture.shape[:3], 4)
         image[..., :3] = picture.to(like.dtype) @ like.new_tensor(YUV).T
         image[..., 3] = image[..., 0] - earlier
-        image.mul_(1.0 / 127.5)
+        image.mul_(1.0 / _BYTE_CENTRE)
         image[..., 0] -= 1.0
         return image.movedim(3, 1)  # in memory channels stay last
 
     def hidden(self, picture: Tensor, earlier: Tensor, speed: Tensor) -> Tensor:
-        """What the network makes of what is seen, shape (B, 50); arguments as in `forward`."""
+        """Return the hidden units (B, 50); arguments as in `forward`."""
         features = self.channels(picture, earlier)
         for convolution in self.convolutions:
             features = torch.relu(convolution(features))
@@ -95,12 +108,12 @@ class PilotNet(nn.Module):
         return torch.relu(self.second(torch.cat((units, scaled[:, None]), dim=1)))
 
     def out(self, hidden: Tensor) -> Tensor:
-        """Outputs (B, 2) of what `hidden` gives."""
+        """Return the outputs (B, 2) of hidden units (B, 50)."""
         outputs: Tensor = self.head(torch.relu(self.last(hidden)))
         return outputs
 
     def forward(self, picture: Tensor, earlier: Tensor, speed: Tensor) -> Tensor:
-        """Decide.
+        """Return acceleration and yaw rate.
 
         Args:
             picture: uint8, red, green and blue last, shape (B, 66, 200, 3).
@@ -108,6 +121,6 @@ class PilotNet(nn.Module):
             speed: Own speed [m/s], shape (B,).
 
         Returns:
-            Acceleration and turn in units of `ACCELERATION` and `TURN`, shape (B, 2).
+            Acceleration and yaw rate in units of `ACCELERATION_UNIT` and `TURN_UNIT`, shape (B, 2).
         """
         return self.out(self.hidden(picture, earlier, speed))

@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import rare_envs
 from agents import Ego, LearnedEgo, Provenance, SavedEgo, load_driver, load_ego, save_driver
-from agents.sb3.zip_header import algorithm_of, read_header
+from agents.sb3.zip_header import find_algorithm, read_header
 
 FEATURES = 5
 CONTINUOUS = spaces.Box(-1.0, 1.0, (2,), np.float32)
@@ -110,7 +110,7 @@ def test_a_saved_model_is_recognised_and_acts_as_before(algo: str, recognised: s
 
 def test_an_a2c_with_adam_is_not_taken_for_ppo(tmp_path: Path) -> None:
     path = save(make_model("a2c", use_rms_prop=False), tmp_path / "ego.zip")
-    assert algorithm_of(read_header(path), path) == "a2c"
+    assert find_algorithm(read_header(path), path) == "a2c"
 
 
 class OwnPolicy(stable_baselines3.sac.policies.SACPolicy):
@@ -165,12 +165,12 @@ def test_algo_overrides_what_the_file_says(ppo_zip: Path) -> None:
 )
 def test_algorithms_are_told_apart(module: str, settings: dict[str, Any], expected: str) -> None:
     header = {"policy_class": {"__module__": module}, **settings}
-    assert algorithm_of(header, Path("ego.zip")) == expected
+    assert find_algorithm(header, Path("ego.zip")) == expected
 
 
 def test_an_unknown_algorithm_asks_for_its_name() -> None:
     with pytest.raises(ValueError, match=r"Cannot tell which algorithm .* name it with algo: ppo"):
-        algorithm_of({"policy_class": {"__module__": "mine"}}, Path("ego.zip"))
+        find_algorithm({"policy_class": {"__module__": "mine"}}, Path("ego.zip"))
 
 
 @pytest.mark.parametrize("spec", ["idm", "no_such_module:make"])
@@ -366,7 +366,7 @@ def test_nothing_is_unpickled_before_the_file_is_known_to_be_a_model(ppo_zip: Pa
     header = json.loads(zipfile.ZipFile(ppo_zip).read("data"))
     header["observation_space"][":serialized:"] = "!"  # would fail as soon as it is opened
     path = rewrite(ppo_zip, tmp_path / "ego2.zip", {"data": json.dumps(header).encode()})
-    assert algorithm_of(read_header(path), path) == "ppo"
+    assert find_algorithm(read_header(path), path) == "ppo"
     shutil.copy(path, tmp_path / "copy.zip")
     with pytest.raises(ValueError, match="Cannot load"):
         load_ego(tmp_path / "copy.zip")

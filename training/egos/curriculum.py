@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from agents.vision.ego import SEES
+from agents.vision.ego import OBSERVATION
 from rare_envs.distributions.space import Parameter
 from rare_envs.scenarios.base import SPEED_RANGE, Others, Scenario, columns
 from rare_envs.scenarios.base_distributions import load_base
@@ -173,7 +173,7 @@ def start_lesson(lesson: Lesson, rows: int, seconds: float, rng: np.random.Gener
         The world and the episodes at time 0.
     """
     scenario = lesson.scenario(rng)
-    world = World(scenario, Sensing(SEES, weather=True), lesson.drivers, clock=Clock(horizon=seconds))
+    world = World(scenario, Sensing(OBSERVATION, weather=True), lesson.drivers, clock=Clock(horizon=seconds))
     own = lesson.sample(rows, rng)
     parts = [own, _draw_weather(rows, rng)]
     if world.background is not None and world.background.weights is not None:

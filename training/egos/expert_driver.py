@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from agents.vision.ego import MIN_STEERING_SPEED
-from agents.vision.pilotnet import ACCELERATION, TURN
+from agents.vision.pilotnet import ACCELERATION_UNIT, TURN_UNIT
 from rare_envs.control.actions import MAX_STEERING
 from rare_envs.control.idm import IDM
 from rare_envs.simulation.episode import Episode
@@ -30,7 +30,7 @@ def expert_outputs(episode: Episode) -> Tensor:
         episode: B scenarios.
 
     Returns:
-        Acceleration and turn in units of `ACCELERATION` and `TURN`, shape (B, 2).
+        Acceleration and turn in units of `ACCELERATION_UNIT` and `TURN_UNIT`, shape (B, 2).
     """
     state, road = episode.state, episode.road
     speed, heading = state.speed[:, 0].clamp(min=MIN_STEERING_SPEED), state.heading[:, 0]
@@ -39,7 +39,8 @@ def expert_outputs(episode: Episode) -> Tensor:
     turn = (wanted - heading) / HEADING_TIME + speed * road.curvature(state.x[:, 0])
     limit = speed * torch.sin(torch.atan(0.5 * torch.tan(torch.tensor(MAX_STEERING)))) / 2.5
     acceleration = _IDM.acceleration(state.speed[:, 0], episode.lead)
-    return torch.stack((acceleration / ACCELERATION, torch.maximum(torch.minimum(turn, limit), -limit) / TURN), dim=1)
+    turn = torch.maximum(torch.minimum(turn, limit), -limit)
+    return torch.stack((acceleration / ACCELERATION_UNIT, turn / TURN_UNIT), dim=1)
 
 
 def auxiliary_targets(episode: Episode) -> Tensor:

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from agents.vision.ego import LAG, recall, to_actions
+from agents.vision.ego import LAG, to_actions, update_memory
 from agents.vision.pilotnet import PilotNet, luma
 from rare_envs.control.actions import to_physical
 from rare_envs.sensors.camera import Weather, take_picture
@@ -100,7 +100,7 @@ def _drive(
                 seen = _take_pictures(episode, noted), luma(_take_pictures(before[0], noted)), speed[noted]
         else:
             picture = _take_pictures(episode, torch.ones_like(noted))
-            past, state = recall(picture, state)
+            past, state = update_memory(picture, state)
             trusted = torch.from_numpy(rng.random(len(speed)) < trust)[:, None]
             done = torch.where(trusted, network(picture, torch.from_numpy(past), speed), done)
             seen = picture[noted], torch.from_numpy(past)[noted.numpy()], speed[noted]

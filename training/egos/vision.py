@@ -31,7 +31,7 @@ from torch import nn
 from agents import Provenance
 from agents.vision.checkpoint import save_vision
 from agents.vision.ego import VisionEgo
-from agents.vision.pilotnet import UNITS, PilotNet
+from agents.vision.pilotnet import HIDDEN_UNITS, PilotNet
 from training.egos.expert_driver import AUXILIARY_SIZE
 from training.egos.image_dataset import LabelledPictures, collect, concatenate, mirror
 from training.egos.nominal_driving import judge_all_cases
@@ -102,7 +102,7 @@ class Training:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
             self.network = PilotNet()
-            self.probe = nn.Linear(UNITS, AUXILIARY_SIZE)
+            self.probe = nn.Linear(HIDDEN_UNITS, AUXILIARY_SIZE)
         self.parameters = [*self.network.parameters(), *self.probe.parameters()]
         self.optimiser = torch.optim.Adam(self.parameters, config.rate)
         self.round = 0

@@ -67,7 +67,7 @@ def check_ego(request: EgoCheckRequest) -> list[Finding]:
         BadInput: The environment is unknown, or there is no such file.
     """
     from agents.loading import find_ego_kind, strip_prefixes
-    from agents.sb3.file_trust import TRUST_ADVICE, TRUSTED, find_origin_risks
+    from agents.sb3.file_trust import TRUST_ADVICE, TRUST_CONSEQUENCE, find_origin_risks
     from agents.sb3.saved_ego import find_statistics
     from rare_envs.scenarios.registry import find_scenario
 
@@ -90,7 +90,8 @@ def check_ego(request: EgoCheckRequest) -> list[Finding]:
         if reasons and not request.trust:
             return [report_failure("origin", "; ".join(reasons), TRUST_ADVICE)]
         place = f" ({'; '.join(reasons)})" if reasons else ""
-        advice = f"you said --trust: {TRUSTED}" if request.trust else "opened here is only what is known to be harmless"
+        harmless = "opened here is only what is known to be harmless"
+        advice = f"you said --trust: {TRUST_CONSEQUENCE}" if request.trust else harmless
         findings.append(report_warning("origin", f"a Stable-Baselines3 .zip can hold code{place}", advice, False))
     return findings + list(_check_in_subprocess(request))
 

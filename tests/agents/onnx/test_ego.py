@@ -20,7 +20,7 @@ from typer.testing import CliRunner
 
 import rare_envs
 from agents import load_ego
-from agents.onnx.export import ACTION_TOLERANCE, export_onnx, max_action_difference
+from agents.onnx.export import ACTION_TOLERANCE, compare_actions, export_onnx
 from agents.sb3.saved_ego import load_saved_ego
 from rare_envs.study.cli.app import app
 
@@ -95,7 +95,7 @@ def test_an_exported_policy_acts_as_before(name: str, saved: Any, tmp_path: Path
     ego = saved(name)
     done = export_onnx(ego, tmp_path / "ego.onnx")
     again = load_ego(tmp_path / "ego.onnx")
-    assert max_action_difference(ego, again, np.random.default_rng(5))[0] <= ACTION_TOLERANCE
+    assert compare_actions(ego, again, np.random.default_rng(5))[0] <= ACTION_TOLERANCE
     assert done.difference <= ACTION_TOLERANCE
     assert again.action_space == ego.action_space
     assert again.observation_space.shape == ego.observation_space.shape
@@ -126,7 +126,7 @@ def test_a_memory_begins_anew_where_an_episode_does(saved: Any, tmp_path: Path) 
 
 def test_an_export_that_acts_otherwise_is_not_written(saved: Any, tmp_path: Path, monkeypatch: Any) -> None:
     monkeypatch.setattr("agents.onnx.export.ACTION_TOLERANCE", 1e-12)
-    with pytest.raises(ValueError, match=r"acts otherwise, by up to .*; nothing was written"):
+    with pytest.raises(ValueError, match=r"acts differently, by up to .*; nothing was written"):
         export_onnx(saved("ppo"), tmp_path / "ego.onnx")
     assert list(tmp_path.glob("*onnx*")) == []
 

@@ -21,7 +21,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNorm
 
 import rare_envs
 from agents import SavedEgo, load_ego
-from agents.sb3.safe_pickle import ForeignObject, open_pickle
+from agents.sb3.safe_pickle import ForbiddenObject, open_pickle
 from rare_envs.egos.wrappers import Stacked, stacking
 
 contrib = pytest.importorskip("sb3_contrib", reason="sb3-contrib is optional")
@@ -278,7 +278,7 @@ def test_hostile_statistics_are_refused_and_run_nothing(tmp_path: Path) -> None:
     ],
 )
 def test_only_listed_classes_are_opened(content: bytes) -> None:
-    with pytest.raises(ForeignObject, match="which may run code"):
+    with pytest.raises(ForbiddenObject, match="which may run code"):
         open_pickle(content)
 
 

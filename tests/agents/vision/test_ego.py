@@ -11,7 +11,7 @@ import torch
 import rare_envs
 from agents import Provenance, load_ego
 from agents.vision.checkpoint import load_vision, read_vision_provenance, save_vision
-from agents.vision.ego import LAG, SPEED_SCALE, VisionEgo, recall, to_actions
+from agents.vision.ego import LAG, SPEED_SCALE, VisionEgo, to_actions, update_memory
 from agents.vision.pilotnet import HEIGHT, WIDTH, PilotNet, luma
 from rare_envs.study.ego_check.subprocess_check import EgoCheckRequest, check_ego
 
@@ -74,7 +74,7 @@ def test_the_memory_is_of_the_last_pictures_row_by_row() -> None:
     state: Any = None
     for tick, shot in enumerate(shots):
         start = np.array([tick == 0, tick in (0, 4)])
-        earlier, state = recall(shot, state, start)
+        earlier, state = update_memory(shot, state, start)
         assert np.array_equal(earlier[0], luma(shots[max(tick - LAG, 0)])[0])
         assert np.array_equal(earlier[1], luma(shots[max(tick - LAG, 0 if tick < 4 else 4)])[1])
     assert state.shape == (2, LAG, HEIGHT, WIDTH)
