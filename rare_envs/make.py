@@ -95,7 +95,7 @@ def set_up(
         clock=Clock(dt, scenario.horizon if horizon is None else horizon, action),
         noise=noise,
     )
-    space = space_of(world, load_base(scenario, base), needs.noise_columns(world))
+    space = build_space(world, load_base(scenario, base), needs.noise_columns(world))
     if not isinstance(world.measurement.measure, str):
         _try_measure(world, space)
     return world, space
@@ -118,7 +118,7 @@ def _try_measure(world: World, space: ScenarioSpace) -> None:
         raise ValueError(f"Expected finite numbers from the measure {measure!r}, got {f.tolist()}.")
 
 
-def space_of(world: World, base: Distribution, ego_noise: int = 0) -> ScenarioSpace:
+def build_space(world: World, base: Distribution, ego_noise: int = 0) -> ScenarioSpace:
     """The parameters of a world: the scenario's, then the weather's, its drivers' weights and all noise.
 
     Args:

@@ -147,7 +147,7 @@ class DrivingProblem:
             ValueError: If x has the wrong shape, is NaN or outside the physical box, or if the policy or the measure
                 returns NaN.
         """
-        return self._simulated(x, None)
+        return self._simulate(x, None)
 
     def attempt(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], dict[int, str]]:
         """Simulate, and let rows go on which the policy fails.
@@ -156,15 +156,15 @@ class DrivingProblem:
             x: Scenario parameters, shape (n, d).
 
         Returns:
-            Safety measures, shape (n,), NaN in rows that are lost, and the reasons by row.
+            Safety measures, shape (n,), NaN in rows on which it fails, and the reasons by row.
 
         Raises:
             Exception: A policy with a memory has failed on the batch, which may be the fault of any row.
         """
-        lost: dict[int, str] = {}
-        f = self._simulated(x, lost)
-        f[list(lost)] = np.nan
-        return f, lost
+        failed_rows: dict[int, str] = {}
+        f = self._simulate(x, failed_rows)
+        f[list(failed_rows)] = np.nan
+        return f, failed_rows
 
     def crashes(self, x: NDArray[np.float64]) -> Crash:
         """Simulate again and tell what kind of crash each scenario ends in.
@@ -203,7 +203,7 @@ class DrivingProblem:
             return LIDAR_TILE
         return POLICY_TILE if isinstance(self.driver, PolicyDriver) else RULE_TILE
 
-    def _simulated(self, x: NDArray[np.float64], lost: dict[int, str] | None) -> NDArray[np.float64]:
+    def _simulate(self, x: NDArray[np.float64], failed_rows: dict[int, str] | None) -> NDArray[np.float64]:
         x = self.space.validate(np.atleast_2d(x))
         tile = self.tile
         f = np.empty(len(x))
@@ -211,18 +211,18 @@ class DrivingProblem:
             for first in range(0, len(x), tile):
                 rows = torch.from_numpy(x[first : first + tile]).float()
                 driver, mine = self.driver, dict[int, str]()
-                if lost is not None and isinstance(driver, PolicyDriver):
+                if failed_rows is not None and isinstance(driver, PolicyDriver):
                     driver = replace(driver, failed_rows=mine)
                 f[first : first + tile] = rollout(self.world, driver, rows).f.numpy()
-                if lost is not None:
-                    lost.update({first + row: reason for row, reason in mine.items()})
+                if failed_rows is not None:
+                    failed_rows.update({first + row: reason for row, reason in mine.items()})
         for row in np.flatnonzero(np.isnan(f)):
-            if lost is None:
+            if failed_rows is None:
                 named = {name: value for name, value in self.space.named(x[row]).items() if np.size(value) == 1}
                 raise ValueError(
                     f"The measure {self.world.measurement.measure!r} gave NaN, first at row {row}: {named}."
                 )
-            lost.setdefault(int(row), "the measure gave NaN")
+            failed_rows.setdefault(int(row), "the measure gave NaN")
         return f
 
 

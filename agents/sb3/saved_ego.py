@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from agents.sb3.file_trust import check_origin
 from agents.sb3.safe_pickle import ForbiddenObject, open_pickle
 from agents.sb3.zip_header import find_algorithm, find_algorithm_class, make_training_stubs, read_header
-from rare_envs.egos.wrappers import Normalised, Stacked, stacking
+from rare_envs.egos.wrappers import FrameStackedPolicy, NormalisedPolicy, find_stacking
 from rare_envs.plugins import one_line
 
 TRUST = "if you trust where the file comes from, load it with trust=True (--trust)"
@@ -70,16 +70,16 @@ class SavedEgo:
 
     @property
     def frames(self) -> tuple[int, bool] | None:
-        """Frames that were stacked behind `VecNormalize`, as `rare_envs.egos.wrappers.stacking` says; None without."""
+        """Frames stacked behind `VecNormalize`, as `rare_envs.egos.wrappers.find_stacking` says; None without."""
         if self.statistics is None or self.statistics.observation_space.shape == self.model.observation_space.shape:
             return None
-        return stacking(self.statistics.observation_space.shape, self.model.observation_space.shape)
+        return find_stacking(self.statistics.observation_space.shape, self.model.observation_space.shape)
 
     @cached_property
     def policy(self) -> Any:
         """The model behind its statistics and stacks."""
-        policy = self.model if self.frames is None else Stacked(self.model, *self.frames)
-        return policy if self.statistics is None else Normalised(policy, self.statistics.normalize_obs)
+        policy = self.model if self.frames is None else FrameStackedPolicy(self.model, *self.frames)
+        return policy if self.statistics is None else NormalisedPolicy(policy, self.statistics.normalize_obs)
 
     def predict(
         self,
@@ -215,7 +215,7 @@ def _load_statistics(path: Path, observation_space: Any, trust: bool) -> Any:
             f"Expected VecNormalize statistics in {str(path)!r}, got {type(statistics).__name__}; "
             "move the file away if it does not belong to this ego."
         )
-    if stacking(statistics.observation_space.shape or (), observation_space.shape) is None:
+    if find_stacking(statistics.observation_space.shape or (), observation_space.shape) is None:
         raise ValueError(
             f"VecNormalize statistics {str(path)!r} are for observations of shape "
             f"{statistics.observation_space.shape}, the ego's have {observation_space.shape}; "

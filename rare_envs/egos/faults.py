@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rare_envs.egos.errors import EgoFault
-from rare_envs.egos.isolation import isolate_failing_rows
+from rare_envs.egos.isolation import attempt_in_parts
 
 ON_FAULT = ("raise", "failure", "bound")
 """Ways with a scenario on which the ego fails twice: an error, or NaN that counts as a failure or bounds p."""
@@ -129,7 +129,7 @@ class FaultTolerant:
             f, reasons = self._attempt(x[rows.start : rows.stop].copy())
             return f, {rows.start + row: reason for row, reason in reasons.items()}
 
-        found = isolate_failing_rows(attempt, lambda row: np.full(1, np.nan), range(len(x)))
+        found = attempt_in_parts(attempt, lambda row: np.full(1, np.nan), range(len(x)))
         assert found is not None
         return np.concatenate(found[0]), found[1]
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from rare_envs.control.actions import read_actions
 from rare_envs.egos.errors import EgoGone, NoAnswer
-from rare_envs.egos.isolation import isolate_failing_rows
+from rare_envs.egos.isolation import attempt_in_parts
 from rare_envs.sensors.kinds import each
 
 
@@ -116,7 +116,7 @@ def _isolate_failing_rows(
     def give_up(row: int) -> Tensor:
         return _ignored_action(kind, query.over[row : row + 1])
 
-    found = isolate_failing_rows(attempt, give_up, range(len(query.start)), error)
+    found = attempt_in_parts(attempt, give_up, range(len(query.start)), error)
     return None if found is None else (torch.cat(found[0]), found[1])
 
 

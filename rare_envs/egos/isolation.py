@@ -8,18 +8,18 @@ from typing import TypeVar
 
 from rare_envs.egos.errors import EgoGone, NoAnswer, reason_of
 
-T = TypeVar("T")
-Attempt = tuple[T, dict[int, str]]
+_T = TypeVar("_T")
+Attempt = tuple[_T, dict[int, str]]
 """Values of some rows, and reasons by row of the batch where rows alone have failed."""
 
 
-def isolate_failing_rows(
-    attempt: Callable[[range], Attempt[T] | None],
-    give_up: Callable[[int], T],
+def attempt_in_parts(
+    attempt: Callable[[range], Attempt[_T] | None],
+    give_up: Callable[[int], _T],
     rows: range,
     error: BaseException | None = None,
     whole: int | None = None,
-) -> tuple[list[T], dict[int, str]] | None:
+) -> tuple[list[_T], dict[int, str]] | None:
     """Attempt some rows, and after an error their parts, until the rows that fail stand alone.
 
     Args:
@@ -46,15 +46,15 @@ def isolate_failing_rows(
         except (Exception, SystemExit) as raised:  # the ego is the user's: anything may happen in it
             error = raised
     elif alone and not isinstance(error, NoAnswer):
-        return isolate_failing_rows(attempt, give_up, rows, None, whole)  # once more
+        return attempt_in_parts(attempt, give_up, rows, None, whole)  # once more
     if alone:
         return [give_up(rows.start)], {rows.start: reason_of(error)}
-    values: list[T] = []
+    values: list[_T] = []
     reasons: dict[int, str] = {}
     size = part_size(len(rows), error, whole)
     for first in range(rows.start, rows.stop, size):
         part = range(first, min(first + size, rows.stop))
-        found = isolate_failing_rows(attempt, give_up, part, None, whole)
+        found = attempt_in_parts(attempt, give_up, part, None, whole)
         if found is None:
             return None
         values += found[0]

@@ -14,7 +14,7 @@ from rare_envs.control.actions import DISCRETE_ACTIONS, IDLE, META_ACTIONS
 from rare_envs.control.idm import IDM
 from rare_envs.egos.inference import PolicyQuery, query_policy
 from rare_envs.egos.needs import WrappedEgo, observation_for, resolve
-from rare_envs.egos.wrappers import fitted, frames_of
+from rare_envs.egos.wrappers import find_frame_stacking, wrap_policy
 from rare_envs.sensors.kinds import each
 from rare_envs.simulation.background import Background
 from rare_envs.simulation.observation import observe
@@ -106,7 +106,7 @@ def as_driver(ego: Any, world: World) -> Driver:
             raise ValueError(
                 f"Expected dt={needs.dt:g} s, which this ego remembers pictures by, got {world.clock.dt:g} s."
             )
-        policy = fitted(ego, world.observation_space)
+        policy = wrap_policy(ego, world.observation_space)
         return PolicyDriver(policy, world.sensing.observation, world.clock.action, world.clock.stride)
     if isinstance(ego, Background):
         raise ValueError("These drivers drive the traffic around an ego; as an ego take agents.LearnedEgo(driver).")
@@ -125,7 +125,7 @@ def check_spaces(ego: Any, expected: spaces.Space[Any], action: str = "continuou
         ValueError: If its `observation_space` or `action_space` does not fit.
     """
     observed = getattr(ego, "observation_space", None)  # a Stable-Baselines3 model, or anybody's object
-    if observed is not None and frames_of(expected, observed) is None:
+    if observed is not None and find_frame_stacking(expected, observed) is None:
         wanted = observation_for(ego)
         which = "another observation" if wanted == "features" else f"observation={wanted!r}"
         raise ValueError(

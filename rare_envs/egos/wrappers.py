@@ -15,7 +15,7 @@ Shape = tuple[int, ...]
 
 
 @dataclass(frozen=True)
-class Normalised:
+class NormalisedPolicy:
     """A policy whose observations first go through a function, such as SB3's `VecNormalize.normalize_obs`."""
 
     policy: Any
@@ -33,7 +33,7 @@ class Normalised:
 
 
 @dataclass(frozen=True)
-class Stacked:
+class FrameStackedPolicy:
     """A policy that sees the last k observations; they are kept in its state, oldest first.
 
     With one axis as in SB3's `VecFrameStack` (side by side along the last axis, zeros before the first observation),
@@ -72,7 +72,7 @@ class Stacked:
         return action, (seen, inner)
 
 
-def stacking(given: Shape, wanted: Shape) -> tuple[int, bool] | None:
+def find_stacking(given: Shape, wanted: Shape) -> tuple[int, bool] | None:
     """How many frames of shape `given` make an observation of shape `wanted`.
 
     Returns:
@@ -88,7 +88,7 @@ def stacking(given: Shape, wanted: Shape) -> tuple[int, bool] | None:
     return (frames, False) if frames and not rest else None
 
 
-def frames_of(given: spaces.Space[Any], wanted: Any) -> tuple[int, bool] | None:
+def find_frame_stacking(given: spaces.Space[Any], wanted: Any) -> tuple[int, bool] | None:
     """`stacking` for spaces: mappings by name, where all have to agree, and images also with their channels first.
 
     Args:
@@ -98,18 +98,18 @@ def frames_of(given: spaces.Space[Any], wanted: Any) -> tuple[int, bool] | None:
     if isinstance(given, spaces.Dict):
         if not isinstance(wanted, spaces.Dict) or set(given.spaces) != set(wanted.spaces):
             return None
-        found = {frames_of(space, wanted[name]) for name, space in given.spaces.items()}
+        found = {find_frame_stacking(space, wanted[name]) for name, space in given.spaces.items()}
         return found.pop() if len(found) == 1 else None
     if given.shape is None or getattr(wanted, "shape", None) is None:
         return None
     shape = tuple(wanted.shape)
-    straight = stacking(given.shape, shape)
+    straight = find_stacking(given.shape, shape)
     if straight is None and given.dtype == wanted.dtype == np.uint8 and len(shape) == 3:  # SB3 transposes by itself
-        return stacking(given.shape, (*shape[1:], shape[0]))
+        return find_stacking(given.shape, (*shape[1:], shape[0]))
     return straight
 
 
-def fitted(policy: Any, given: spaces.Space[Any]) -> Any:
+def wrap_policy(policy: Any, given: spaces.Space[Any]) -> Any:
     """The policy behind the wrappers that it was trained with, so that it takes the environment's observations.
 
     Args:
@@ -119,14 +119,14 @@ def fitted(policy: Any, given: spaces.Space[Any]) -> Any:
         given: Space of the environment's observations.
     """
     wanted = getattr(policy, "observation_space", None)
-    frames, new_axis = (frames_of(given, wanted) if wanted is not None else None) or (1, False)
+    frames, new_axis = (find_frame_stacking(given, wanted) if wanted is not None else None) or (1, False)
     statistics: Any = getattr(policy, "get_vec_normalize_env", lambda: None)()
     normalise = statistics.normalize_obs if statistics is not None and statistics.norm_obs else None
-    whole = normalise is not None and frames_of(statistics.observation_space, wanted) == (1, False)
+    whole = normalise is not None and find_frame_stacking(statistics.observation_space, wanted) == (1, False)
     if normalise is not None and whole:
-        policy = Normalised(policy, normalise)
+        policy = NormalisedPolicy(policy, normalise)
     if frames > 1 or new_axis:
-        policy = Stacked(policy, frames, new_axis)
+        policy = FrameStackedPolicy(policy, frames, new_axis)
     if normalise is not None and not whole:
-        policy = Normalised(policy, normalise)
+        policy = NormalisedPolicy(policy, normalise)
     return policy

@@ -11,24 +11,24 @@ from rare_envs.sensors.kinds import each
 T = TypeVar("T")
 
 
-def merged(old: T, rows: Tensor, new: T) -> T:
+def merge_rows(old: T, rows: Tensor, new: T) -> T:
     """Tensors, tuples of such or what knows how (`put`), with some rows replaced; the rest, as the road, is common."""
-    result: T = _merged(old, rows, new)
+    result: T = _merge_rows(old, rows, new)
     return result
 
 
-def _merged(old: Any, rows: Tensor, new: Any) -> Any:
+def _merge_rows(old: Any, rows: Tensor, new: Any) -> Any:
     if isinstance(old, Tensor):
         old = old.clone()
         old[rows] = new
         return old
     if isinstance(old, tuple):
-        parts = [_merged(a, rows, b) for a, b in zip(old, new, strict=True)]
+        parts = [_merge_rows(a, rows, b) for a, b in zip(old, new, strict=True)]
         return type(old)(*parts) if hasattr(old, "_fields") else tuple(parts)
     return old.put(rows, new) if hasattr(old, "put") else old
 
 
-def rows_of(observation: Any, mask: NDArray[np.bool_]) -> NDArray[Any]:
+def to_object_rows(observation: Any, mask: NDArray[np.bool_]) -> NDArray[Any]:
     """Rows of an observation as objects, None where the mask is not set: Gymnasium's form of `final_obs`."""
     rows = np.full(len(mask), None, dtype=object)
     for row in np.flatnonzero(mask):
@@ -36,7 +36,7 @@ def rows_of(observation: Any, mask: NDArray[np.bool_]) -> NDArray[Any]:
     return rows
 
 
-def with_rows(observation: Any, rows: NDArray[np.intp], fresh: Any) -> Any:
+def replace_rows(observation: Any, rows: NDArray[np.intp], fresh: Any) -> Any:
     """An observation with some of its rows replaced."""
 
     def replaced(old: NDArray[Any], new: NDArray[Any]) -> NDArray[Any]:
@@ -47,7 +47,7 @@ def with_rows(observation: Any, rows: NDArray[np.intp], fresh: Any) -> Any:
     return each(replaced, observation, fresh)
 
 
-def put(infos: dict[str, Any], key: str, value: Any, mask: NDArray[np.bool_]) -> None:
+def put_masked(infos: dict[str, Any], key: str, value: Any, mask: NDArray[np.bool_]) -> None:
     """An entry with its mask, in Gymnasium's vector form."""
     infos[key] = value
     infos[f"_{key}"] = mask.copy()

@@ -5,7 +5,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from rare_envs.distributions.space import ScenarioSpace
-from rare_envs.multi_agent.episode import order_of
+from rare_envs.multi_agent.episode import view_order
 from rare_envs.multi_agent.rewards import terms_of
 from rare_envs.simulation.episode import Episode
 from rare_envs.traffic.crash import describe_crash
@@ -13,7 +13,7 @@ from rare_envs.traffic.crash import describe_crash
 Info = dict[str, Any]
 
 
-def info_of(space: ScenarioSpace, x: NDArray[Any], episode: Episode) -> Info:
+def episode_info(space: ScenarioSpace, x: NDArray[Any], episode: Episode) -> Info:
     """Info of one episode at any moment: `scenario`, `x`, `min_ttc` [s] and `collision`.
 
     Args:
@@ -44,7 +44,7 @@ def step_info(
         over: Whether this is the end.
         vehicle: Whose episode it is.
     """
-    info = info_of(space, x, episode)
+    info = episode_info(space, x, episode)
     info["reward_terms"] = {name: float(value) for name, value in terms_of(reward).items()}
     if over:
         assert episode.statistics is not None
@@ -52,6 +52,6 @@ def step_info(
         info["crash"] = crash = describe_crash(episode.statistics.crash)
         info["collision_type"] = None if crash is None else crash["kind"]
         if crash is not None and vehicle:
-            order = order_of(vehicle, episode.state.x.shape[1])
+            order = view_order(vehicle, episode.state.x.shape[1])
             crash["vehicles"] = [each if each < 0 else order[each] for each in crash["vehicles"]]
     return info

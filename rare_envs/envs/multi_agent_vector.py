@@ -13,8 +13,8 @@ from torch import Tensor
 from rare_envs.control.actions import IDLE, read_actions
 from rare_envs.egos.needs import resolve
 from rare_envs.egos.policy import as_driver
-from rare_envs.envs.batch_rows import merged, put, rows_of
-from rare_envs.envs.parallel import chosen_agents, chosen_rewards
+from rare_envs.envs.batch_rows import merge_rows, put_masked, to_object_rows
+from rare_envs.envs.parallel import select_agents, select_rewards
 from rare_envs.make import set_up
 from rare_envs.multi_agent.episode import MultiAgentEpisode, start
 from rare_envs.multi_agent.rewards import Reward, total_of
@@ -67,11 +67,11 @@ class AgentsVectorEnv(VectorEnv[NDArray[np.float32], Array, Array]):
         world, self.space = set_up(env_id, EgoNeeds(lidar=resolve(ego).lidar), **kwargs)
         self.world = world.with_statistics()
         scenario = self.world.scenario
-        self.agents = chosen_agents(scenario, agents)
+        self.agents = select_agents(scenario, agents)
         self.scenarios = int(scenarios)
         self.num_envs = self.scenarios * len(self.agents)
         self._vehicles = [scenario.vehicle_names.index(agent) for agent in self.agents]
-        by_name = chosen_rewards(self.agents, rewards)
+        by_name = select_rewards(self.agents, rewards)
         self._rewards = {vehicle: by_name[agent] for vehicle, agent in zip(self._vehicles, self.agents, strict=True)}
         self._driver = as_driver(ego, self.world)
         self.single_observation_space = self.world.observation_space
@@ -126,14 +126,14 @@ class AgentsVectorEnv(VectorEnv[NDArray[np.float32], Array, Array]):
         terminated = own | ego_rows
         infos: dict[str, Any] = {}
         if done.any():
-            infos["final_obs"], infos["_final_obs"] = rows_of(observation, done_rows), done_rows.copy()
+            infos["final_obs"], infos["_final_obs"] = to_object_rows(observation, done_rows), done_rows.copy()
             final: dict[str, Any] = {}
-            put(final, "collision", own, done_rows)
-            put(final, "ego_collision", ego_rows, done_rows)
+            put_masked(final, "collision", own, done_rows)
+            put_masked(final, "ego_collision", ego_rows, done_rows)
             measures = self._by_row([episode.views[vehicle].f for vehicle in self._vehicles])
-            put(final, "measure", measures.double().numpy(), done_rows)
+            put_masked(final, "measure", measures.double().numpy(), done_rows)
             infos["final_info"], infos["_final_info"] = final, done_rows.copy()
-            episode = self._replaced(episode, np.flatnonzero(done))
+            episode = self._replace_scenarios(episode, np.flatnonzero(done))
             with torch.inference_mode():
                 observation = self._observe(episode)
         self._episode = episode
@@ -158,12 +158,12 @@ class AgentsVectorEnv(VectorEnv[NDArray[np.float32], Array, Array]):
         views = [observe(episode.views[vehicle], self.world.sensing.observation) for vehicle in self._vehicles]
         return each(lambda *parts: self._by_row(list(parts)).numpy(), *views)
 
-    def _replaced(self, episode: MultiAgentEpisode, rows: NDArray[np.intp]) -> MultiAgentEpisode:
+    def _replace_scenarios(self, episode: MultiAgentEpisode, rows: NDArray[np.intp]) -> MultiAgentEpisode:
         x = self.space.scenario_x(None, len(rows), self.np_random)
         self._x[rows], self._tick[rows] = x, 0
         with torch.inference_mode():
             fresh = start(self.world, torch.from_numpy(x).float())
-            return merged(episode, torch.from_numpy(rows), fresh)
+            return merge_rows(episode, torch.from_numpy(rows), fresh)
 
 
 def _refuse_memory(memory: Any) -> None:

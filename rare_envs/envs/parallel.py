@@ -15,7 +15,7 @@ from torch import Tensor
 from rare_envs.control.actions import IDLE, read_actions
 from rare_envs.egos.needs import resolve
 from rare_envs.egos.policy import as_driver
-from rare_envs.envs.info import Info, info_of, step_info
+from rare_envs.envs.info import Info, episode_info, step_info
 from rare_envs.envs.rendering import Renderer
 from rare_envs.make import set_up
 from rare_envs.multi_agent.episode import MultiAgentEpisode, start
@@ -72,8 +72,8 @@ class DrivingParallelEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  #
         world, self.space = set_up(env_id, EgoNeeds(lidar=resolve(ego).lidar), **kwargs)
         self.world = world.with_statistics()
         scenario = self.world.scenario
-        self.possible_agents = chosen_agents(scenario, agents)
-        self.rewards = chosen_rewards(self.possible_agents, rewards)
+        self.possible_agents = select_agents(scenario, agents)
+        self.rewards = select_rewards(self.possible_agents, rewards)
         self._driver = as_driver(ego, self.world)
         self.metadata = {
             **self.metadata,
@@ -126,7 +126,7 @@ class DrivingParallelEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  #
         with torch.inference_mode():
             self._episode = start(self.world, torch.from_numpy(self._x[None]).float())
             observations = {agent: self._observe(self._episode, agent) for agent in self.agents}
-        infos = {agent: info_of(self.space, self._x, self._view(self._episode, agent)) for agent in self.agents}
+        infos = {agent: episode_info(self.space, self._x, self._view(self._episode, agent)) for agent in self.agents}
         self._show()
         return observations, infos
 
@@ -245,7 +245,7 @@ class DrivingParallelEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  #
             self._renderer = None
 
 
-def chosen_agents(scenario: Scenario, agents: Sequence[str] | None) -> list[str]:
+def select_agents(scenario: Scenario, agents: Sequence[str] | None) -> list[str]:
     """The agents that an argument `agents` stands for.
 
     Raises:
@@ -265,7 +265,7 @@ def chosen_agents(scenario: Scenario, agents: Sequence[str] | None) -> list[str]
     return list(agents)
 
 
-def chosen_rewards(agents: Sequence[str], rewards: Mapping[str, Reward] | None) -> dict[str, Reward]:
+def select_rewards(agents: Sequence[str], rewards: Mapping[str, Reward] | None) -> dict[str, Reward]:
     """The reward of each agent.
 
     Raises:

@@ -17,7 +17,7 @@ from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
 
 WIDTH, HEIGHT = 800, 160
 """Size of the picture of the road [pixels]; it is higher where the road asks for it."""
-STRIP = 24
+TEXT_HEIGHT = 24
 """Height of the lines of text above and below [pixels]; all heights are multiples of 16, as video codecs want."""
 _SCALING = 8.0
 """Pixels per metre."""
@@ -29,7 +29,7 @@ _AHEAD, _BEHIND = 4, 2
 """Pieces drawn ahead of the ego's and behind it."""
 
 Colour = tuple[int, int, int]
-COLOURS: dict[str, Colour] = {
+ROLE_COLOURS: dict[str, Colour] = {
     "ego": (50, 200, 0),
     "lead": (100, 200, 255),
     "cutter": (200, 200, 0),
@@ -47,7 +47,7 @@ class Cast(NamedTuple):
     """Who is drawn how."""
 
     roles: tuple[str, ...]
-    """A key of `COLOURS` for each vehicle."""
+    """A key of `ROLE_COLOURS` for each vehicle."""
     agents: frozenset[int]
     """Vehicles other than the ego that agents drive."""
 
@@ -75,7 +75,7 @@ class Renderer:
         self._surface = WorldSurface((WIDTH, height), 0, pygame.Surface((WIDTH, height)))
         self._surface.scaling = _SCALING
         self._surface.centering_position = [0.3, 0.5]
-        self._canvas = pygame.Surface((WIDTH, height + 2 * STRIP))
+        self._canvas = pygame.Surface((WIDTH, height + 2 * TEXT_HEIGHT))
         pygame.freetype.init()
         self._font = pygame.freetype.Font(None, 14)
         self._font.origin = True  # texts are placed by their base line
@@ -108,11 +108,11 @@ class Renderer:
         """
         state = State(*(field[row : row + 1] for field in episode.state))
         if crashed is None:
-            crashed = _crashed(state, self._road) if bool(episode.collided[row]) else ()
-        cast = self._cast(agents, crashed)
+            crashed = _find_crashed(state, self._road) if bool(episode.collided[row]) else ()
+        cast = self._assign_roles(agents, crashed)
         self._draw_road(state, cast)
         self._canvas.fill(_PAPER)
-        self._canvas.blit(self._surface, (0, STRIP))
+        self._canvas.blit(self._surface, (0, TEXT_HEIGHT))
         self._write(8, 17, caption(self._world, episode, time, row))
         self._draw_legend(cast)
         if self._screen is not None:
@@ -123,8 +123,8 @@ class Renderer:
         image: NDArray[np.uint8] = np.moveaxis(self._pygame.surfarray.array3d(self._canvas), 0, 1)
         return image
 
-    def _cast(self, agents: Collection[int], crashed: Collection[int]) -> Cast:
-        names = (name if name in COLOURS else "others" for name in self._scenario.vehicle_names)
+    def _assign_roles(self, agents: Collection[int], crashed: Collection[int]) -> Cast:
+        names = (name if name in ROLE_COLOURS else "others" for name in self._scenario.vehicle_names)
         roles = tuple("crashed" if j in crashed else name for j, name in enumerate(names))
         return Cast(roles, frozenset(agents) - {0})
 
@@ -138,7 +138,7 @@ class Renderer:
         places = torch.stack(self._road.to_world(state.x[0], state.y[0], state.heading[0]), dim=1).tolist()
         for j, (x, y, heading) in enumerate(places):
             vehicle = Vehicle(traffic, [x, y], heading, float(state.speed[0, j]))
-            vehicle.color = COLOURS[cast.roles[j]]
+            vehicle.color = ROLE_COLOURS[cast.roles[j]]
             traffic.vehicles.append(vehicle)
         self._surface.move_display_window_to(_point(self._road, ego_x, self._road.middle))
         RoadGraphics.display(traffic, self._surface)
@@ -149,10 +149,10 @@ class Renderer:
 
     def _draw_legend(self, cast: Cast) -> None:
         """Colours and what they mean, in a line below the road."""
-        x, y = 8, self._canvas.get_height() - STRIP + 6
-        for role in COLOURS:
+        x, y = 8, self._canvas.get_height() - TEXT_HEIGHT + 6
+        for role in ROLE_COLOURS:
             if role in cast.roles:
-                self._pygame.draw.rect(self._canvas, COLOURS[role], (x, y, 20, 11))
+                self._pygame.draw.rect(self._canvas, ROLE_COLOURS[role], (x, y, 20, 11))
                 x += 26 + self._write(x + 26, y + 10, role) + 18
         if cast.agents:
             self._pygame.draw.rect(self._canvas, AGENT, (x, y, 20, 11), width=3)
@@ -183,7 +183,7 @@ def caption(world: World, episode: Episode, time: float | None, row: int = 0) ->
     return "    ".join(parts)
 
 
-def _crashed(state: State, road: Road) -> set[int]:
+def _find_crashed(state: State, road: Road) -> set[int]:
     """The ego and whom it touches."""
     return {0, *pairwise_overlaps(state, road)[0, 0].nonzero().flatten().tolist()}
 

@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 
 from rare_envs.control.actions import read_actions
-from rare_envs.envs.info import info_of, step_info
+from rare_envs.envs.info import episode_info, step_info
 from rare_envs.envs.rendering import Renderer
 from rare_envs.make import set_up
 from rare_envs.sensors.kinds import each
@@ -90,7 +90,7 @@ class DrivingEnv(gym.Env[Observation, Any]):
             self._episode = self.world.start(torch.from_numpy(self._x[None]).float())
             observation = each(lambda part: part[0].numpy(), observe(self._episode, self.world.sensing.observation))
         self._show()
-        return observation, info_of(self.space, self._x, self._episode)
+        return observation, episode_info(self.space, self._x, self._episode)
 
     def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Carry out one decision; see the class for what comes back.

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rare_envs.control.actions import read_actions
-from rare_envs.envs.batch_rows import merged, put, rows_of, with_rows
+from rare_envs.envs.batch_rows import merge_rows, put_masked, replace_rows, to_object_rows
 from rare_envs.envs.rendering import Renderer
 from rare_envs.make import set_up
 from rare_envs.sensors.kinds import each
@@ -116,11 +116,11 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         done = terminated | truncated
         infos: Info = {}
         if done.any():
-            infos["final_obs"], infos["_final_obs"] = rows_of(observation, done), done.copy()
+            infos["final_obs"], infos["_final_obs"] = to_object_rows(observation, done), done.copy()
             infos["final_info"], infos["_final_info"] = self._final_info(episode, terms, done), done.copy()
             observation = self._replace(observation, done)
         infos.update(self._info(self._episode, np.ones(self.num_envs, dtype=bool)))
-        put(infos, "reward_terms", _terms(terms, ~done), ~done)
+        put_masked(infos, "reward_terms", _terms(terms, ~done), ~done)
         return observation, reward, terminated.copy(), truncated, infos
 
     def _start(self, x: NDArray[np.float64]) -> Episode:
@@ -135,9 +135,9 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         self._tick[rows] = 0
         with torch.inference_mode():
             fresh = self._start(x)
-            self._episode = merged(self._episode, torch.from_numpy(rows), fresh)
+            self._episode = merge_rows(self._episode, torch.from_numpy(rows), fresh)
             seen = each(Tensor.numpy, observe(fresh, self.world.sensing.observation))
-        return with_rows(observation, rows, seen)
+        return replace_rows(observation, rows, seen)
 
     def _info(self, episode: Episode, mask: NDArray[np.bool_]) -> Info:
         assert episode.statistics is not None
@@ -145,11 +145,11 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         infos: Info = {}
         scenario: Info = {}
         for name, column in self.space.columns(self._x).items():
-            put(scenario, name, column, mask)
-        put(infos, "scenario", scenario, mask)
-        put(infos, "x", self._x.copy(), mask)
-        put(infos, "min_ttc", np.where(collided, 0.0, episode.statistics.least_ttc.double().numpy()), mask)
-        put(infos, "collision", collided.copy(), mask)
+            put_masked(scenario, name, column, mask)
+        put_masked(infos, "scenario", scenario, mask)
+        put_masked(infos, "x", self._x.copy(), mask)
+        put_masked(infos, "min_ttc", np.where(collided, 0.0, episode.statistics.least_ttc.double().numpy()), mask)
+        put_masked(infos, "collision", collided.copy(), mask)
         return infos
 
     def _final_info(self, episode: Episode, terms: RewardTerms, done: NDArray[np.bool_]) -> Info:
@@ -159,13 +159,13 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         crashed = done & (crash.kind != NONE).numpy()
         kinds = np.array(CRASH_KINDS, dtype=object)[crash.kind.numpy()]
         kinds[~crashed] = None
-        put(infos, "reward_terms", _terms(terms, done), done)
-        put(infos, "measure", episode.f.double().numpy(), done)
-        put(infos, "collision_type", kinds, crashed)
+        put_masked(infos, "reward_terms", _terms(terms, done), done)
+        put_masked(infos, "measure", episode.f.double().numpy(), done)
+        put_masked(infos, "collision_type", kinds, crashed)
         details: Info = {}
         for name, values in {**crash._asdict(), "kind": kinds}.items():
-            put(details, name, values if name == "kind" else values.numpy(), crashed)
-        put(infos, "crash", details, crashed)
+            put_masked(details, name, values if name == "kind" else values.numpy(), crashed)
+        put_masked(infos, "crash", details, crashed)
         return infos
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
@@ -182,5 +182,5 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
 def _terms(terms: RewardTerms, mask: NDArray[np.bool_]) -> Info:
     infos: Info = {}
     for name, value in terms._asdict().items():
-        put(infos, name, value.double().numpy(), mask)
+        put_masked(infos, name, value.double().numpy(), mask)
     return infos

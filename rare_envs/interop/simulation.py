@@ -13,7 +13,7 @@ import numpy as np
 from highway_env.vehicle.behavior import IDMVehicle
 from numpy.typing import NDArray
 
-from rare_envs.egos.wrappers import fitted
+from rare_envs.egos.wrappers import wrap_policy
 from rare_envs.interop.fast_observation import install_fast_observation
 from rare_envs.interop.parameters import restore_class_parameters, set_idm
 from rare_envs.interop.scenario import HighwayEnvScenario
@@ -50,7 +50,7 @@ class DriveTask:
         if not callable(getattr(ego, "predict", None)):
             raise ValueError(f"Expected an ego with predict from {self.ego!r}, got {type(ego).__name__}.")
         check_ego_spaces(ego, env)
-        return DriveRunner(env, fitted(ego, env.observation_space), self.seconds)
+        return DriveRunner(env, wrap_policy(ego, env.observation_space), self.seconds)
 
 
 @dataclass(frozen=True)

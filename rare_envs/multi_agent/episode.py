@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from rare_envs.simulation.decision import held
+from rare_envs.simulation.decision import hold_finished
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.world import World
 from rare_envs.traffic.overlap import pairwise_overlaps
@@ -76,7 +76,7 @@ def step_traffic(world: World, episode: MultiAgentEpisode, action: Tensor, comma
     for j, view in enumerate(episode.views[1:], start=1):
         views.append(world.update(view, state.seen_by(j), _seen_by(traffic.perception, j), hit[:, j]))
     lived = tuple(
-        held(old.collided, old, new) if bool(old.collided.any()) else new
+        hold_finished(old.collided, old, new) if bool(old.collided.any()) else new
         for old, new in zip(episode.views, views, strict=True)
     )
     active = active | (torch.arange(active.shape[1], device=active.device) == 0)
@@ -84,11 +84,11 @@ def step_traffic(world: World, episode: MultiAgentEpisode, action: Tensor, comma
     return MultiAgentEpisode(traffic, lived, disabled | struck)
 
 
-def order_of(vehicle: int, vehicles: int) -> list[int]:
+def view_order(vehicle: int, vehicles: int) -> list[int]:
     """The vehicles in the order of `State.seen_by`."""
     return [vehicle, *(j for j in range(vehicles) if j != vehicle)]
 
 
 def _seen_by(perception: Tensor | None, vehicle: int) -> Tensor | None:
     """What the vehicles see, in the order of `State.seen_by`."""
-    return None if perception is None else perception[:, order_of(vehicle, perception.shape[1])]
+    return None if perception is None else perception[:, view_order(vehicle, perception.shape[1])]

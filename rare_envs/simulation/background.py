@@ -20,7 +20,7 @@ FIXED_SEED = 12345
 """Seed of the one sequence of `noise="fixed"`; arbitrary, but results depend on it."""
 
 
-class WeightDistribution(Distribution, Protocol):
+class DriverWeights(Distribution, Protocol):
     """Distribution of the weights that tell one driver from another."""
 
     @property
@@ -33,7 +33,7 @@ class Background(Protocol):
     """Drives M vehicles in B scenarios by what each of them sees. Nothing in it is random."""
 
     @property
-    def weights(self) -> WeightDistribution | None:
+    def weights(self) -> DriverWeights | None:
         """Distribution of the weights that tell one driver from another; None if all are alike."""
 
     @property

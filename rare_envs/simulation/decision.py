@@ -53,7 +53,7 @@ def advance(
         terms = reward_terms(moved, physical if commanded is None else physical[:, 0])
         over = episode.collided
         if tick:
-            moved = held(over, episode, moved)
+            moved = hold_finished(over, episode, moved)
             terms = RewardTerms(*(term.masked_fill(over, 0.0) for term in terms))
         sums = terms if sums is None else RewardTerms(*map(torch.add, sums, terms))
         episode = moved
@@ -67,7 +67,7 @@ def advance(
     return StepResult(episode, sums)
 
 
-def held(over: Tensor, old: Episode, new: Episode) -> Episode:
+def hold_finished(over: Tensor, old: Episode, new: Episode) -> Episode:
     """The new episodes, but the traffic of those that are over as it was."""
 
     def hold(before: Tensor, after: Tensor) -> Tensor:

@@ -26,7 +26,7 @@ from rare_envs.scenarios.base_distributions import load_base
 from rare_envs.scenarios.car_following import CAR_FOLLOWING
 from rare_envs.scenarios.highway import HIGHWAY
 from rare_envs.sensors.perception import SPEED_COLUMN
-from rare_envs.simulation.background import Background, WeightDistribution
+from rare_envs.simulation.background import Background, DriverWeights
 from rare_envs.traffic.reference_line import ReferenceLine
 from rare_envs.traffic.road import Road, i80, straight
 from rare_envs.traffic.state import LANE_WIDTH, VEHICLE_LENGTH, State
@@ -55,7 +55,7 @@ class OrdinaryDrivers:
 
     rule: RuleDriver = RuleDriver()  # noqa: RUF009  (frozen)
     colour: AutoregressiveNoise = HUMAN_NOISE
-    weights: ClassVar[WeightDistribution | None] = None
+    weights: ClassVar[DriverWeights | None] = None
     noisy: ClassVar[bool] = True
 
     def begin(self, draws: Tensor) -> Tensor:

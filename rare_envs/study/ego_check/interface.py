@@ -9,7 +9,7 @@ from gymnasium import spaces
 
 from agents.sb3.saved_ego import SavedEgo
 from rare_envs.egos.errors import reason_of
-from rare_envs.egos.wrappers import frames_of
+from rare_envs.egos.wrappers import find_frame_stacking
 from rare_envs.sensors.kinds import each
 from rare_envs.study.ego_check.findings import Finding, report_failure, report_pass, report_warning
 from rare_envs.study.ego_check.probe import BATCH_ROWS, Array, Probe
@@ -36,7 +36,7 @@ def check_declared_spaces(probe: Probe) -> Iterator[Finding]:
             False,
         )
     if observed is not None:
-        frames, _ = frames_of(ours[0], observed) or (1, False)
+        frames, _ = find_frame_stacking(ours[0], observed) or (1, False)
         stacked = f", {frames} frames of {ours[0].shape or ours[0]}" if frames > 1 else ""
         words = f"{observed.shape} {observed.dtype}" if observed.shape is not None else str(observed)
         yield report_pass("observations", f"{words}{stacked}")

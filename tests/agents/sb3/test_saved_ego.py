@@ -22,7 +22,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNorm
 import rare_envs
 from agents import SavedEgo, load_ego
 from agents.sb3.safe_pickle import ForbiddenObject, open_pickle
-from rare_envs.egos.wrappers import Stacked, stacking
+from rare_envs.egos.wrappers import FrameStackedPolicy, find_stacking
 
 contrib = pytest.importorskip("sb3_contrib", reason="sb3-contrib is optional")
 ENV = "rare_envs/CarFollowing-v0"
@@ -188,7 +188,7 @@ def test_gymnasiums_frames_have_an_axis_of_their_own(tmp_path: Path) -> None:
     ],
 )
 def test_the_number_of_frames_is_read_from_the_shapes(wanted: tuple[int, ...], found: Any) -> None:
-    assert stacking((7,), wanted) == found
+    assert find_stacking((7,), wanted) == found
 
 
 def test_frames_of_one_row_begin_anew_where_its_episode_does() -> None:
@@ -196,7 +196,7 @@ def test_frames_of_one_row_begin_anew_where_its_episode_does() -> None:
         def predict(self, observation: Any, state: Any, episode_start: Any, deterministic: bool) -> Any:
             return observation, state
 
-    stacked, state = Stacked(Echo(), 2), None
+    stacked, state = FrameStackedPolicy(Echo(), 2), None
     starts = [[True, True], [False, False], [False, True]]
     for tick, start in enumerate(starts):
         observation = np.array([[10.0 + tick], [20.0 + tick]])

@@ -14,7 +14,7 @@ from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from stable_baselines3.common.vec_env import VecFrameStack
 
 import rare_envs
-from rare_envs.egos.wrappers import frames_of
+from rare_envs.egos.wrappers import find_frame_stacking
 from rare_envs.envs.multi_agent_vector import AgentsVectorEnv
 from rare_envs.problem import CAMERA_TILE
 from rare_envs.sensors.camera import Camera
@@ -149,14 +149,14 @@ def test_stacked_frames_of_a_camera() -> None:
 def test_frames_of_spaces() -> None:
     image, row = spaces.Box(0, 255, (*SMALL, 3), np.uint8), spaces.Box(-5.0, 5.0, (51,))
     first = spaces.Box(0, 255, (6, *SMALL), np.uint8)
-    assert frames_of(image, image) == (1, False)
-    assert frames_of(image, first) == (2, False)
-    assert frames_of(row, spaces.Box(-5.0, 5.0, (102,))) == (2, False)
+    assert find_frame_stacking(image, image) == (1, False)
+    assert find_frame_stacking(image, first) == (2, False)
+    assert find_frame_stacking(row, spaces.Box(-5.0, 5.0, (102,))) == (2, False)
     both = spaces.Dict({"camera": image, "lidar": row})
-    assert frames_of(both, both) == (1, False)
-    assert frames_of(both, spaces.Dict({"camera": first, "lidar": row})) is None  # not the same number
-    assert frames_of(both, spaces.Dict({"camera": image})) is None
-    assert frames_of(both, image) is None
+    assert find_frame_stacking(both, both) == (1, False)
+    assert find_frame_stacking(both, spaces.Dict({"camera": first, "lidar": row})) is None  # not the same number
+    assert find_frame_stacking(both, spaces.Dict({"camera": image})) is None
+    assert find_frame_stacking(both, image) is None
 
 
 def test_a_camera_on_every_agent() -> None:
@@ -190,8 +190,8 @@ def test_a_batch_of_agents_that_see() -> None:
 
 def test_a_network_that_does_not_transpose_is_not_taken_for_one_that_does() -> None:
     image = spaces.Box(0, 255, (*SMALL, 3), np.uint8)
-    assert frames_of(image, spaces.Box(-np.inf, np.inf, (3, *SMALL))) is None  # an .onnx file's
-    assert frames_of(image, spaces.Box(-np.inf, np.inf, (*SMALL, 3))) == (1, False)
+    assert find_frame_stacking(image, spaces.Box(-np.inf, np.inf, (3, *SMALL))) is None  # an .onnx file's
+    assert find_frame_stacking(image, spaces.Box(-np.inf, np.inf, (*SMALL, 3))) == (1, False)
 
 
 def test_an_ego_for_other_pictures_is_refused() -> None:

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import rare_envs
-from rare_envs.envs.rendering import AGENT, COLOURS, STRIP, WIDTH, Renderer, caption
+from rare_envs.envs.rendering import AGENT, ROLE_COLOURS, TEXT_HEIGHT, WIDTH, Renderer, caption
 from rare_envs.make import set_up
 from rare_envs.scenarios.registry import SCENARIOS
 
@@ -17,7 +17,7 @@ CUT_IN = "rare_envs/CutIn-v0"
 
 
 def road_of(image):
-    return image[STRIP:-STRIP]
+    return image[TEXT_HEIGHT:-TEXT_HEIGHT]
 
 
 def colours(image):
@@ -31,10 +31,10 @@ def test_every_vehicle_has_the_colour_of_its_role(env_id):
     image = env.render()
     scenario = SCENARIOS[env_id]
     height = max(160, 16 * round((scenario.road.lanes * scenario.road.width + 8) / 2))
-    assert (image.shape, image.dtype) == ((height + 2 * STRIP, WIDTH, 3), np.uint8)
-    roles = {name if name in COLOURS else "others" for name in scenario.vehicle_names}
-    assert {COLOURS[role] for role in roles} <= colours(road_of(image))
-    assert colours(image[:STRIP]) > {(255, 255, 255)}  # text
+    assert (image.shape, image.dtype) == ((height + 2 * TEXT_HEIGHT, WIDTH, 3), np.uint8)
+    roles = {name if name in ROLE_COLOURS else "others" for name in scenario.vehicle_names}
+    assert {ROLE_COLOURS[role] for role in roles} <= colours(road_of(image))
+    assert colours(image[:TEXT_HEIGHT]) > {(255, 255, 255)}  # text
     env.close()
 
 
@@ -50,12 +50,12 @@ def test_the_picture_shows_where_vehicles_are_and_who_has_crashed():
     for j, role in enumerate(("ego", "cutter", "lead")):
         ahead = float(episode.state.x[0, j] - episode.state.x[0, 0])
         across = float(episode.state.y[0, j]) - world.scenario.road.middle
-        assert tuple(image[round(80 + 8 * across), round(240 + 8 * ahead)]) == COLOURS[role]
+        assert tuple(image[round(80 + 8 * across), round(240 + 8 * ahead)]) == ROLE_COLOURS[role]
     crashed = colours(road_of(renderer.draw(episode, row=1)))
-    assert COLOURS["crashed"] in crashed
-    assert COLOURS["ego"] not in crashed
-    assert COLOURS["cutter"] not in crashed  # which it ran into
-    assert COLOURS["lead"] in crashed
+    assert ROLE_COLOURS["crashed"] in crashed
+    assert ROLE_COLOURS["ego"] not in crashed
+    assert ROLE_COLOURS["cutter"] not in crashed  # which it ran into
+    assert ROLE_COLOURS["lead"] in crashed
 
 
 def test_agents_are_outlined():

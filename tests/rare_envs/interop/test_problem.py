@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import rare_envs
 import samplers
-from rare_envs.egos.wrappers import fitted
+from rare_envs.egos.wrappers import wrap_policy
 from rare_envs.interop.measures import HIGHWAY_ENV_MEASURES, contact_time
 from rare_envs.interop.simulation import make_highway_env, strip_ego
 from rare_envs.traffic.oriented_boxes import axes_of, project_on_axes, time_to_contact
@@ -81,7 +81,7 @@ def test_statistics_of_a_model_travel_without_its_environment() -> None:
     vec_env.obs_rms.mean[...] = 0.5  # type: ignore[union-attr]
     seen = np.random.default_rng(0).uniform(-1.0, 1.0, (1, 5, 5)).astype(np.float32)
     expected = model.predict(np.asarray(vec_env.normalize_obs(seen)), deterministic=True)[0]
-    there = fitted(pickle.loads(pickle.dumps(strip_ego(model))), vec_env.observation_space)
+    there = wrap_policy(pickle.loads(pickle.dumps(strip_ego(model))), vec_env.observation_space)
     assert there.normalise(seen)[0, 0, 0] == pytest.approx(vec_env.normalize_obs(seen)[0, 0, 0])  # type: ignore[call-overload]
     np.testing.assert_array_equal(there.predict(seen)[0], expected)
 

@@ -15,7 +15,7 @@ from torch import Tensor
 import rare_envs
 import samplers
 from rare_envs.distributions.product import join_independent
-from rare_envs.make import space_of
+from rare_envs.make import build_space
 from rare_envs.scenarios.base_distributions import load_base
 from rare_envs.scenarios.registry import find_scenario
 from rare_envs.sensors.camera import Camera, CameraContext, Weather, take_picture
@@ -204,9 +204,9 @@ def test_a_scenario_with_fog_of_its_own_has_to_rename_it() -> None:
     first = replace(scenario.parameters[0], name="fog")
     foggy = replace(scenario, parameters=(first, *scenario.parameters[1:]))
     base = load_base(scenario, None)
-    assert "fog" in space_of(World(foggy), base).names
+    assert "fog" in build_space(World(foggy), base).names
     with pytest.raises(ValueError, match="fog"):
-        space_of(World(foggy, Sensing(weather=True)), base)
+        build_space(World(foggy, Sensing(weather=True)), base)
 
 
 def test_weather_is_a_reset_option() -> None:
