@@ -1,13 +1,12 @@
 """Candidates: the components that a proposal may be mixed from, and the shares that minimise its variance."""
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import log_ndtr
 
 from samplers.methods.two_stage.mixture.boundary import fit_half_spaces, fit_radial
 from samplers.methods.two_stage.mixture.mixture_weights import Floor, minimise_second_moment, raise_to_floors
 from samplers.methods.two_stage.mixture.proposal import MixtureProposal, ProposalComponent
-from samplers.methods.two_stage.mixture.screening import FailureScreen, train_screen
+from samplers.methods.two_stage.mixture.screening import FailureScreen, LabelledPoints, train_screen
 from samplers.methods.two_stage.mixture.subspace_em import HIGH_DIM
 from samplers.methods.two_stage.multiple_importance import MultipleImportanceSample
 from samplers.methods.two_stage.refinement import RefinementState
@@ -42,7 +41,7 @@ def build_proposal(
     weights = start / start.sum()
     if not state.rounds or len(history.u) == 0:
         return MixtureProposal(candidates, weights)
-    floors = _floors(state, candidates, settings, final=final)
+    floors = _set_floors(state, candidates, settings, final=final)
     u, log_w = _smooth_indicators(history, state.gamma, settings) if state.noisy else (history.u, history.log_weights)
     log_r = log_ratios([candidate.component for candidate in candidates], u)
     weights = minimise_second_moment(log_r, log_w, weights, floors)
@@ -53,7 +52,7 @@ def build_proposal(
         keeps = keeps | explored
     weights = np.where((weights < settings.min_share) & ~keeps, 0.0, weights)
     proposal = MixtureProposal(candidates, raise_to_floors(weights / weights.sum(), floors))
-    screen = _screen(state) if final and not state.noisy and state.dim <= HIGH_DIM else None
+    screen = _train_screen(state) if final and not state.noisy and state.dim <= HIGH_DIM else None
     return proposal if screen is None else proposal.with_screen(screen, rng)
 
 
@@ -70,14 +69,14 @@ def list_candidates(
     return [
         ProposalComponent(IsotropicNormal(state.dim), "base"),
         ProposalComponent(IsotropicNormal(state.dim, settings.wide_scale), "wide"),
-        *_radial(state, history, settings),
+        *_fit_radial_components(state, history, settings),
         *regional,
-        *([] if state.noisy else _half_spaces(state, history, settings)),
-        *_tempered(regional, settings.noisy_tempering if state.noisy else settings.tempering),
+        *([] if state.noisy else _fit_half_space_components(state, history, settings)),
+        *_temper_gaussians(regional, settings.noisy_tempering if state.noisy else settings.tempering),
     ]
 
 
-def _tempered(components: list[ProposalComponent], powers: tuple[float, ...]) -> list[ProposalComponent]:
+def _temper_gaussians(components: list[ProposalComponent], powers: tuple[float, ...]) -> list[ProposalComponent]:
     """Return the tempered versions of the Gaussians among the components."""
     return [
         ProposalComponent(candidate.component.temper(power), "tempered", candidate.region)
@@ -87,7 +86,7 @@ def _tempered(components: list[ProposalComponent], powers: tuple[float, ...]) ->
     ]
 
 
-def _radial(
+def _fit_radial_components(
     state: RefinementState, history: MultipleImportanceSample, settings: RefinementSettings
 ) -> list[ProposalComponent]:
     """Return radial components around the chains' points and around the weighted failures; none in one dimension."""
@@ -100,7 +99,7 @@ def _radial(
     return [ProposalComponent(component, "radial") for component in radial]
 
 
-def _half_spaces(
+def _fit_half_space_components(
     state: RefinementState, history: MultipleImportanceSample, settings: RefinementSettings
 ) -> list[ProposalComponent]:
     """Return half-spaces through the edge of the failures that each Gaussian describes."""
@@ -118,7 +117,7 @@ def _half_spaces(
     return [ProposalComponent(half_space, "half-space") for half_space in found]
 
 
-def _floors(
+def _set_floors(
     state: RefinementState, candidates: list[ProposalComponent], settings: RefinementSettings, *, final: bool
 ) -> list[Floor]:
     """Return the least shares: of tempered Gaussians, of each region (or of radial components), of base draws."""
@@ -154,10 +153,10 @@ def _smooth_indicators(
     return u, log_w + log_ndtr(odds)
 
 
-def _screen(state: RefinementState) -> FailureScreen | None:
+def _train_screen(state: RefinementState) -> FailureScreen | None:
     """Return a screen trained on the chains and the draws of all rounds, or None if none is worth it."""
     *earlier, last = state.rounds
     u = np.concatenate([region.u for region in state.regions] + [draws.u for draws in earlier])
     f = np.concatenate([region.f for region in state.regions] + [draws.f for draws in earlier])
-    known: tuple[FloatArray, NDArray[np.bool_]] = (u, f <= state.gamma)
-    return train_screen(known, (last.u, last.f <= state.gamma), last.log_weights)
+    known, fresh = LabelledPoints(u, f <= state.gamma), LabelledPoints(last.u, last.f <= state.gamma)
+    return train_screen(known, fresh, last.log_weights)

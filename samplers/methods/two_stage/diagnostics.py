@@ -7,14 +7,14 @@ import numpy as np
 from scipy import stats
 
 from samplers.importance.draws import Draws
-from samplers.methods.two_stage.settings import DiagnosticSettings
+from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, DiagnosticSettings
 from samplers.methods.two_stage.stratified import StratifiedSample
 from samplers.statistics.weights import effective_sample_size
 
-DEFAULT = DiagnosticSettings()
 
-
-def check_base_draws(p: float, hits: int, n: int, settings: DiagnosticSettings = DEFAULT) -> list[str]:
+def check_base_draws(
+    p: float, hits: int, n: int, settings: DiagnosticSettings = DEFAULT_SETTINGS.diagnostics
+) -> list[str]:
     """Return a warning if more of n base draws failed than an estimate p allows, by a binomial test.
 
     Base draws do not depend on the proposal: they hit a missed region as often as any other of its probability.
@@ -25,7 +25,9 @@ def check_base_draws(p: float, hits: int, n: int, settings: DiagnosticSettings =
     return [f"{hits} of {n:,} base draws failed where p = {p:.2e} lets expect {expected:.2g}: p misses failures."]
 
 
-def check_rounds(final: StratifiedSample, rounds: Sequence[Draws], settings: DiagnosticSettings = DEFAULT) -> list[str]:
+def check_rounds(
+    final: StratifiedSample, rounds: Sequence[Draws], settings: DiagnosticSettings = DEFAULT_SETTINGS.diagnostics
+) -> list[str]:
     """Return a warning if the rounds before, each weighted by its own proposal, contradict the estimate.
 
     Weighted as draws from the mixture of all rounds' proposals they would be worth more, but give a p that is often too
@@ -43,7 +45,7 @@ def check_rounds(final: StratifiedSample, rounds: Sequence[Draws], settings: Dia
     return [f"The rounds before the estimate say {before:.2e}, {apart:.1f} standard errors from it."]
 
 
-def check_efficiency(final: StratifiedSample, settings: DiagnosticSettings = DEFAULT) -> list[str]:
+def check_efficiency(final: StratifiedSample, settings: DiagnosticSettings = DEFAULT_SETTINGS.diagnostics) -> list[str]:
     """Return a warning if the draws are worth so few failures that there may be weights heavier than any met."""
     draws = final.draws
     if len(draws.f) == 0 or draws.ess >= settings.min_rate * draws.n:
@@ -51,7 +53,7 @@ def check_efficiency(final: StratifiedSample, settings: DiagnosticSettings = DEF
     return [f"{draws.n:,} draws are worth {draws.ess:.0f} failures: there may be heavier weights than any met."]
 
 
-def check_regions(final: StratifiedSample, settings: DiagnosticSettings = DEFAULT) -> list[str]:
+def check_regions(final: StratifiedSample, settings: DiagnosticSettings = DEFAULT_SETTINGS.diagnostics) -> list[str]:
     """Return a warning if a point of the exploration in some region would be a large share of p as a draw.
 
     The proposal does not describe such a region, and that the final draws met hardly any of that weight says nothing.

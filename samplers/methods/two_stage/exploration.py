@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from samplers.mcmc.kernels import conditional_proposal
-from samplers.methods.two_stage.regions import DEFAULT, ExplorationResult, SubsetPoints, grow_regions
-from samplers.methods.two_stage.settings import RegionSettings
+from samplers.methods.two_stage.regions import ExplorationResult, SubsetPoints, grow_regions
+from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, RegionSettings
 from samplers.methods.two_stage.simulator import ComponentDraws, Simulator
 from samplers.problem import FloatArray
 from samplers.proposals.components import IsotropicNormal, MixtureComponent, draw_components
@@ -88,7 +88,7 @@ def find_regions(
     gamma: float,
     sizes: Sizes,
     rng: np.random.Generator,
-    settings: RegionSettings = DEFAULT,
+    settings: RegionSettings = DEFAULT_SETTINGS.regions,
 ) -> Generator[FloatArray, FloatArray, ExplorationResult]:
     """Find the regions of failure, starting from the first draws; none if nothing fails."""
     n_base = int(first.counts[0])

@@ -1,4 +1,4 @@
-"""Where no proposal describes the failures: subset simulation, which needs none."""
+"""Fallback: adaptive subset simulation, which needs no proposal, where none describes the failures."""
 
 import math
 from dataclasses import replace
@@ -8,13 +8,13 @@ import numpy as np
 from samplers.importance.draws import Draws
 from samplers.method import Goal, Outcome, Steps
 from samplers.methods.subset_simulation import AdaptiveSubsetSimulation
-from samplers.methods.two_stage.settings import FallbackSettings
+from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, FallbackSettings
 from samplers.problem import FloatArray, Inputs
 
-DEFAULT = FallbackSettings()
 
-
-def describes_failures(last: Draws, expected: FloatArray, settings: FallbackSettings = DEFAULT) -> bool:
+def describes_failures(
+    last: Draws, expected: FloatArray, settings: FallbackSettings = DEFAULT_SETTINGS.fallback
+) -> bool:
     """Return whether a proposal describes the failures so well that the weights of its draws can be believed.
 
     Args:
@@ -29,20 +29,25 @@ def describes_failures(last: Draws, expected: FloatArray, settings: FallbackSett
     return bool(np.median(expected) <= limit * last.p)
 
 
-def meets_failures(last: Draws, settings: FallbackSettings = DEFAULT) -> bool:
+def meets_failures(last: Draws, settings: FallbackSettings = DEFAULT_SETTINGS.fallback) -> bool:
     """Return whether the draws of the last round meet failures often enough."""
     return len(last.f) > 0 and last.ess >= settings.min_rate * last.n
 
 
 def reconcile(found: Outcome, before: Outcome) -> Outcome:
-    """Return what subset simulation found, or what was known before it, if that is more than it can be reconciled with.
+    """Return the outcome of subset simulation, or the earlier one where its interval lies above it.
 
-    Subset simulation follows f downhill; wide draws find regions that f does not announce as well.
+    Subset simulation follows f downhill; wide draws also find regions that f does not announce. The interval of the
+    earlier outcome then grows to hold both.
+
+    Args:
+        found: By subset simulation.
+        before: From all draws of the exploration and the rounds.
     """
     if before.interval[0] <= found.p:
         return found
     interval = min(before.interval[0], found.interval[0]), max(before.interval[1], found.interval[1])
-    about = f"Subset simulation, with the rest, missed regions that were found before: p was {found.p:.1e} there."
+    about = f"Subset simulation, with the rest, missed regions that were found before: its p is {found.p:.1e}."
     warnings = (*before.warnings, *found.warnings, about)
     return replace(before, interval=interval, status=found.status, warnings=warnings)
 
@@ -53,14 +58,14 @@ def run_subset_simulation(
     levels: int,
     budget: int,
     rng: np.random.Generator,
-    settings: FallbackSettings = DEFAULT,
+    settings: FallbackSettings = DEFAULT_SETTINGS.fallback,
 ) -> Steps:
     """Run adaptive subset simulation with the points per level that a budget or a target c.o.v. asks for.
 
     Args:
-        inputs: Dimension and base law.
-        goal: What the method was asked for.
-        levels: Levels that the exploration passed on its way down.
+        inputs: Dimension and base distribution.
+        goal: Threshold, confidence and target.
+        levels: Levels that subset simulation passed in the exploration.
         budget: Simulations that are never exceeded.
         rng: Source of randomness.
         settings: How points per level follow from the budget.

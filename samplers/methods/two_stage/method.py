@@ -10,11 +10,9 @@ from samplers.methods.base import Method
 from samplers.methods.two_stage import stages
 from samplers.methods.two_stage.candidates import build_proposal
 from samplers.methods.two_stage.refinement import start_refinement
-from samplers.methods.two_stage.settings import TwoStageSettings
+from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, TwoStageSettings
 from samplers.problem import Inputs
 from samplers.validation import check_count
-
-SETTINGS = TwoStageSettings()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,7 +83,7 @@ class TwoStage(Method):
 
     def __post_init__(self) -> None:
         """Check the settings."""
-        check_count("TwoStage", "n", self.n, SETTINGS.min_budget)
+        check_count("TwoStage", "n", self.n, DEFAULT_SETTINGS.min_budget)
 
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Explore, refine, estimate."""
@@ -93,13 +91,13 @@ class TwoStage(Method):
 
 
 def run_two_stage(
-    inputs: Inputs, goal: Goal, budget: int, rng: np.random.Generator, settings: TwoStageSettings = SETTINGS
+    inputs: Inputs, goal: Goal, budget: int, rng: np.random.Generator, settings: TwoStageSettings = DEFAULT_SETTINGS
 ) -> Steps:
     """Estimate P[f(X) <= goal.gamma] with settings that need not be the default ones.
 
     Args:
         inputs: Dimension and base distribution.
-        goal: What is asked for.
+        goal: Threshold, confidence, target and budget.
         budget: Simulations to plan for.
         rng: Source of randomness.
         settings: Of all stages.
@@ -125,7 +123,7 @@ def run_two_stage(
             return (yield from stages.fall_back(context, state, found.levels))
     except Interrupted:
         return stages.estimate_early(context, state)
-    outcome = yield from stages.estimate(context, state, refinement, proposal)
+    outcome = yield from stages.estimate_afresh(context, state, refinement, proposal)
     if budget >= settings.sufficient_budget:
         return outcome
     enough = settings.sufficient_budget

@@ -1,13 +1,13 @@
-"""Searching a part of x only: noise that is part of x is drawn afresh for every point, and kept with it.
+"""Noise coordinates: the part of x that is a simulation's own randomness is drawn afresh for every point, not searched.
 
-A simulation's own randomness (of learned drivers, of a stack of sensors) is hundreds of coordinates of x that are
-standard normal and matter little one by one. Wide draws of all of them are nothing like noise, and no proposal
-describes failures in so many dimensions. Left as they are, they cost nothing: with Z ~ N(0, I) for the noise,
+The randomness of learned drivers, or of a stack of sensors, is hundreds of coordinates of x that are standard normal
+and matter little one by one. Wide draws of all of them are nothing like noise, and no proposal describes failures in so
+many dimensions. Drawn from their own distribution they cost nothing: with Z ~ N(0, I) for the noise,
 p = E[P(f(X, Z) <= gamma | X)], and weights are those of X alone. f is then noisy for the search, and still every
 simulated x replays.
 """
 
-from typing import cast
+from typing import Protocol, cast, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,14 +15,23 @@ from numpy.typing import NDArray
 from samplers.problem import Distribution, FloatArray, Inputs
 
 
+@runtime_checkable
+class MarksNoise(Protocol):
+    """A base distribution that says which coordinates of x are noise."""
+
+    @property
+    def noise(self) -> NDArray[np.bool_]:
+        """Which coordinates are noise, shape (d,)."""
+
+
 def noise_mask(inputs: Inputs) -> NDArray[np.bool_]:
-    """Which coordinates of x are noise, shape (d,): what the base law says as `noise`, none where it says nothing."""
-    noise = getattr(inputs.base, "noise", None)
-    return np.zeros(inputs.dim, dtype=bool) if noise is None else np.asarray(noise, dtype=bool)
+    """Return which coordinates of x are noise, shape (d,): none where the base distribution does not say."""
+    base = inputs.base
+    return np.asarray(base.noise, dtype=bool) if isinstance(base, MarksNoise) else np.zeros(inputs.dim, dtype=bool)
 
 
 def marginalise_noise(inputs: Inputs, rng: np.random.Generator) -> Inputs:
-    """The inputs that a search is to tilt: these themselves, where none of them is noise, or all of them are."""
+    """Return the inputs to search: these themselves where none of them is noise, or all are."""
     noise = noise_mask(inputs)
     return inputs if not noise.any() or noise.all() else cast(Inputs, NoiseMarginalisedInputs(inputs, noise, rng))
 
@@ -32,24 +41,22 @@ class NoiseMarginalisedInputs:
 
     The same u gets the same noise again: rows of u are known by their bytes, and their noise is made anew from a
     counter, so that nothing large is kept.
+
+    Args:
+        inputs: All of x.
+        noise: Which coordinates are noise, shape (d,).
+        rng: Seeds the noise.
     """
 
     def __init__(self, inputs: Inputs, noise: NDArray[np.bool_], rng: np.random.Generator) -> None:
-        """For one run.
-
-        Args:
-            inputs: All of x.
-            noise: Which coordinates are noise, shape (d,).
-            rng: Seeds the noise.
-        """
         self.dim = int(np.count_nonzero(~noise))
         self._base, self._noise = inputs.base, noise
         self._seed = int(rng.integers(2**63))
-        self._number: dict[bytes, int] = {}
+        self._numbers: dict[bytes, int] = {}
 
     @property
     def base(self) -> Distribution:
-        """Their law."""
+        """Their distribution."""
         return self
 
     def from_standard_normal(self, u: FloatArray) -> FloatArray:
@@ -58,7 +65,7 @@ class NoiseMarginalisedInputs:
         whole[:, ~self._noise] = u
         count = len(self._noise) - self.dim
         for row, key in enumerate(map(bytes, np.ascontiguousarray(u))):
-            number = self._number.setdefault(key, len(self._number))
+            number = self._numbers.setdefault(key, len(self._numbers))
             whole[row, self._noise] = np.random.default_rng((self._seed, number)).standard_normal(count)
         return self._base.from_standard_normal(whole)
 
@@ -71,5 +78,5 @@ class NoiseMarginalisedInputs:
         return self.from_standard_normal(rng.standard_normal((n, self.dim)))
 
     def log_prob(self, x: FloatArray) -> FloatArray:
-        """Log density of x (n, d), noise included, shape (n,)."""
+        """Return the log density of x (n, d), noise included, shape (n,)."""
         return self._base.log_prob(x)

@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 
 from samplers.methods.two_stage.mixture.linear_model import descent_direction
 from samplers.methods.two_stage.mixture.subspace_em import HIGH_DIM
-from samplers.methods.two_stage.settings import RegionSettings
+from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, RegionSettings
 from samplers.methods.two_stage.simulator import SimulationSteps, Simulator
 from samplers.problem import FloatArray
 
-DEFAULT = RegionSettings()
 Labels = NDArray[np.int64]
 """Number of the region of each point or chain, from 0, shape (n,)."""
 
@@ -95,7 +94,7 @@ def grow_regions(
     gamma: float,
     limit: int,
     rng: np.random.Generator,
-    settings: RegionSettings = DEFAULT,
+    settings: RegionSettings = DEFAULT_SETTINGS.regions,
 ) -> SimulationSteps[ExplorationResult]:
     """Run chains from failing points, twice; sort them into regions after each time.
 
@@ -161,7 +160,7 @@ def _pcn_chains(
     steps: int,
     gamma: float,
     rng: np.random.Generator,
-    settings: RegionSettings = DEFAULT,
+    settings: RegionSettings = DEFAULT_SETTINGS.regions,
 ) -> SimulationSteps[ChainPaths]:
     """Move chains inside the failure region by pCN, each with its own step.
 
@@ -204,7 +203,11 @@ def _pcn_chains(
 
 
 def _is_noisy(
-    simulator: Simulator, u: FloatArray, gamma: float, rng: np.random.Generator, settings: RegionSettings = DEFAULT
+    simulator: Simulator,
+    u: FloatArray,
+    gamma: float,
+    rng: np.random.Generator,
+    settings: RegionSettings = DEFAULT_SETTINGS.regions,
 ) -> SimulationSteps[bool]:
     """Return whether points right beside failing ones (n, d) do not always fail."""
     u = rng.permutation(u)[: settings.probes]
@@ -213,7 +216,7 @@ def _is_noisy(
 
 
 def _label_regions(
-    simulator: Simulator, u: FloatArray, gamma: float, limit: int, settings: RegionSettings = DEFAULT
+    simulator: Simulator, u: FloatArray, gamma: float, limit: int, settings: RegionSettings = DEFAULT_SETTINGS.regions
 ) -> SimulationSteps[tuple[Labels, bool]]:
     """Sort failing points (n, d) into regions, numbered from 0: those half way to whose first point fails.
 
@@ -266,7 +269,7 @@ def _estimate_directions(
 
 
 def _estimate_direction(
-    paths: ChainPaths, descent: SubsetPoints | None, settings: RegionSettings = DEFAULT
+    paths: ChainPaths, descent: SubsetPoints | None, settings: RegionSettings = DEFAULT_SETTINGS.regions
 ) -> FloatArray:
     """Return the direction in which a region lies, shape (d,): where f falls if it does so linearly, else its mean."""
     region = paths.to_region()
@@ -279,7 +282,9 @@ def _estimate_direction(
     return np.asarray(mean / max(float(np.linalg.norm(mean)), 1e-12))
 
 
-def _add_subset_points(region: Region, descent: SubsetPoints, settings: RegionSettings = DEFAULT) -> Region:
+def _add_subset_points(
+    region: Region, descent: SubsetPoints, settings: RegionSettings = DEFAULT_SETTINGS.regions
+) -> Region:
     """Return a region with the lower points of subset simulation, if its own are too few for a regression."""
     if len(region.u) >= settings.min_points_per_dim * region.u.shape[1] or len(descent.f) == 0:
         return region

@@ -208,3 +208,6 @@ class TwoStageSettings:
     refinement: RefinementSettings = RefinementSettings()
     fallback: FallbackSettings = FallbackSettings()
     diagnostics: DiagnosticSettings = DiagnosticSettings()
+
+
+DEFAULT_SETTINGS = TwoStageSettings()

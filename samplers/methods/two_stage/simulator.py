@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from samplers.problem import FloatArray, Inputs
 from samplers.proposals.components import MixtureComponent
 
-T = TypeVar("T")
-SimulationSteps = Generator[FloatArray, FloatArray, T]
-"""A computation that needs simulations: yields points x (n, d), is sent their outcomes f (n,), returns a T."""
+_T = TypeVar("_T")
+SimulationSteps = Generator[FloatArray, FloatArray, _T]
+"""A computation that needs simulations: yields points x (n, d), is sent their outcomes f (n,), returns a result."""
 
 
 class Simulator:

@@ -190,7 +190,9 @@ def fall_back(context: RunContext, state: RunState, levels: int) -> Steps:
     return replace(whole, trace=state.trace + outcome.trace, base_draws=state.base_draws + outcome.base_draws)
 
 
-def estimate(context: RunContext, state: RunState, refinement: RefinementState, proposal: MixtureProposal) -> Steps:
+def estimate_afresh(
+    context: RunContext, state: RunState, refinement: RefinementState, proposal: MixtureProposal
+) -> Steps:
     """Draw from the last proposal until the budget is used or the target is met; p rests on these draws alone."""
     goal, inputs, stopped = context.goal, context.simulator.inputs, False
     sample = StratifiedSample.empty(len(proposal.weights), inputs.dim, expected_weights(refinement, proposal))

@@ -1,4 +1,8 @@
-"""Estimating p with fresh draws from a mixture, so many from each of its components."""
+"""Stratified sample: fresh draws from a mixture, a fixed number from each component, and p with its error.
+
+With n_k of n draws from component k and y = weight times indicator of failure, p-hat = sum(y) / n, and its variance is
+sum_k n_k var_k(y) / n^2: that between the components, which independent draws of the mixture would add, is none.
+"""
 
 import math
 from dataclasses import dataclass
@@ -12,38 +16,40 @@ from samplers.problem import FloatArray, Inputs
 from samplers.sample import Sample
 
 MIN_STRATUM_DRAWS = 10
-"""Components with fewer draws than this are one stratum."""
+"""Of components with fewer draws the second moment stands in for the variance: that of a handful is worth nothing."""
+MAX_LOG_WEIGHT = 700.0
+"""exp(709) is the largest number; base draws bound all weights that matter far below."""
 
 
 @dataclass(frozen=True, eq=False)
 class StratifiedSample:
-    """Draws from a proposal, with the sums that the variance needs for each component."""
+    """Draws from a proposal, with the sums that the variance needs for each component; `add` returns it with more."""
 
     draws: Draws
     counts: FloatArray
     """Draws of each component, shape (k,)."""
     sums: FloatArray
-    """Of weight times indicator of failure, shape (k,)."""
+    """Of y in each component, shape (k,)."""
     squares: FloatArray
-    """Sums of their squares, shape (k,)."""
+    """Of y^2 in each component, shape (k,)."""
     acceptance_cov: float
-    """What else is not exact: see `MixtureProposal.acceptance_cov`."""
+    """Error that all draws have in common: see `MixtureProposal.acceptance_cov`."""
     expected: FloatArray
-    """Weights to be expected, whether or not a draw has shown them: one for each region found, shape (m,)."""
+    """Weight of a typical point of each region, whether or not a draw has met one, shape (m,)."""
     u_safe: FloatArray
     """The draws that did not fail, in the order of `draws.f_safe`, shape (m, d)."""
 
     @classmethod
     def empty(cls, k: int, dim: int, expected: FloatArray) -> "StratifiedSample":
-        """No draws yet from a proposal of k components in d dimensions."""
+        """Return a sample without draws, of a proposal of k components in d dimensions."""
         zero = np.zeros(k)
         return cls(Draws(0, np.empty(0), np.empty(0)), zero, zero, zero, 0.0, expected, np.empty((0, dim)))
 
     def add(self, batch: ComponentDraws, proposal: MixtureProposal, inputs: Inputs, gamma: float) -> "StratifiedSample":
-        """Return these draws and another batch from the same proposal."""
+        """Return the sample with another batch from the same proposal."""
         fails = batch.f <= gamma
         log_weights = proposal.log_weights(batch.u)
-        y = np.where(fails, np.exp(np.minimum(log_weights, 700.0)), 0.0)
+        y = np.where(fails, np.exp(np.minimum(log_weights, MAX_LOG_WEIGHT)), 0.0)
         owner, k = np.repeat(np.arange(len(batch.counts)), batch.counts), len(batch.counts)
         x = inputs.base.from_standard_normal(batch.u)
         return StratifiedSample(
@@ -65,8 +71,8 @@ class StratifiedSample:
     def cov(self) -> float:
         """Coefficient of variation of `p`; inf without a failing draw.
 
-        The variance within the components: how many draws come from which is no matter of chance. The square of
-        the largest term, seen or expected of a region, is added, for what draws as heavy as that have not shown yet.
+        From the variance within the components. The square of the largest term, met or expected of a region, is added
+        for draws as heavy as that which have not been met.
         """
         if len(self.draws.f) == 0:
             return math.inf
@@ -79,15 +85,22 @@ class StratifiedSample:
         )
 
     def to_sample(self, proposal: MixtureProposal, base_f: FloatArray, base_u: FloatArray, gamma: float) -> Sample:
-        """Return the weighted points behind p: failing draws as they are, the others with the first base draws.
+        """Return the weighted points behind p: failing draws as they are, the others together with base draws.
 
-        Thresholds above gamma rest on draws that did not fail; of those, few are made where f is large, and the base
-        draws f (n0,), u (n0, d) of the exploration help.
+        Thresholds above gamma rest on draws that did not fail. The proposal makes few of those where f is large; base
+        draws of the exploration help there, weighted together with them by multiple importance sampling.
+
+        Args:
+            proposal: Of these draws.
+            base_f: Outcomes of the base draws, shape (n0,).
+            base_u: The base draws, shape (n0, d).
+            gamma: Threshold of failure.
         """
         n, n_base = self.draws.n, len(base_f)
         more = base_f > gamma
         u = np.concatenate([self.u_safe, base_u[more]])
-        log_density = np.logaddexp(math.log(n) - proposal.log_weights(u), _log(n_base))
+        log_base = math.log(n_base) if n_base else -math.inf
+        log_density = np.logaddexp(math.log(n) - proposal.log_weights(u), log_base)
         k = len(self.draws.f)
         units = np.concatenate([np.arange(n), n + np.flatnonzero(more)])
         return Sample(
@@ -97,7 +110,3 @@ class StratifiedSample:
             n_units=n + n_base,
             x=self.draws.x,
         )
-
-
-def _log(n: int) -> float:
-    return math.log(n) if n else -math.inf

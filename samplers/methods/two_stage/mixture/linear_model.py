@@ -30,10 +30,10 @@ MAD_TO_SIGMA = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
 INLIER_SIGMAS = 3.0
 """Deviation up to which a point agrees with a hyperplane (Rousseeuw and Leroy use 2.5)."""
-MIN_POINTS = 5
+MIN_REGRESSION_POINTS = 5
 """Points that a regression needs."""
 MIN_POINTS_PER_DIM = 1.2
-"""With MIN_POINTS + this many points per dimension the small ridge and outliers can be judged."""
+"""With MIN_REGRESSION_POINTS + this many points per dimension the small ridge and outliers can be judged."""
 TRIMMED = 0.02
 """Share of the outcomes left out at either end: f may be capped or wild there."""
 LARGEST_OUTCOME = 1e300
@@ -59,7 +59,7 @@ SAME_REGION = 0.5
 WIDENING = 1.3
 """Variance of the Gaussian over that of N(0, 1) beyond the edge: too small a variance makes weights unbounded, too
 large a one costs a few draws."""
-LEAST_VARIANCE = 0.01
+MIN_GAUSSIAN_VARIANCE = 0.01
 """Rounding may leave next to nothing of 1 + beta m - m^2 far out, where it is about 1 / beta^2."""
 EDGE_SLACK = 0.02
 """By how much a half-space begins before the edge, in standard deviations of N(0, I)."""
@@ -112,7 +112,7 @@ def fit_plane(u: FloatArray, f: FloatArray) -> Plane:
     dim = u.shape[1]
     none = Plane(np.zeros(dim), 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
     finite = np.isfinite(f) & (np.abs(f) < LARGEST_OUTCOME)
-    if finite.sum() < MIN_POINTS:
+    if finite.sum() < MIN_REGRESSION_POINTS:
         return none
     low, high = np.quantile(f[finite], [TRIMMED, 1 - TRIMMED])
     usual = finite & (f >= low) & (f <= high)
@@ -165,16 +165,16 @@ def half_space_proposals(
         plane = alone if alone.clear and alone.explained > plane.explained else plane
     if plane.explained < LEAST_R2 or len(failures) < MIN_FAILURES:
         return []
-    beta = _distance(plane, failures @ plane.axis, gamma)
+    beta = _find_boundary(plane, failures @ plane.axis, gamma)
     if beta < MIN_DISTANCE:
         return []
     mean = math.exp(-0.5 * (beta * beta + LOG_TWO_PI) - float(log_ndtr(-beta)))
-    variance = max(1 + beta * mean - mean * mean, LEAST_VARIANCE)
+    variance = max(1 + beta * mean - mean * mean, MIN_GAUSSIAN_VARIANCE)
     gaussian = SubspaceGaussian(plane.axis[:, None], np.array([mean]), np.array([WIDENING * variance]))
     return [gaussian, HalfSpaceNormal(plane.axis, beta - EDGE_SLACK)]
 
 
-def _distance(plane: Plane, along: FloatArray, gamma: float) -> float:
+def _find_boundary(plane: Plane, along: FloatArray, gamma: float) -> float:
     """Return where along its axis a half-space of failures begins, given how far the failures are along it, (m,).
 
     0 where the failures are around the origin.
@@ -221,9 +221,9 @@ def _fit_ridge(x: FloatArray, y: FloatArray) -> tuple[FloatArray, float]:
     n, dim = x.shape
     xc, yc = x - x.mean(axis=0), y - y.mean()
     total = float(yc @ yc)
-    if total <= 0 or n < MIN_POINTS:
+    if total <= 0 or n < MIN_REGRESSION_POINTS:
         return np.zeros(dim), 0.0
-    ridges = RIDGES if n >= MIN_POINTS_PER_DIM * dim + MIN_POINTS else RIDGES[:1]
+    ridges = RIDGES if n >= MIN_POINTS_PER_DIM * dim + MIN_REGRESSION_POINTS else RIDGES[:1]
     return max((_solve_ridge(xc, yc, total, ridge) for ridge in ridges), key=lambda fit: fit[1])
 
 
@@ -248,7 +248,7 @@ def _fit_robust(x: FloatArray, y: FloatArray) -> tuple[FloatArray, float, NDArra
     n, dim = x.shape
     slope, r2 = _fit_ridge(x, y)
     everything = np.ones(n, dtype=bool)
-    if r2 > EXACT or n < MIN_POINTS_PER_DIM * dim + MIN_POINTS:
+    if r2 > EXACT or n < MIN_POINTS_PER_DIM * dim + MIN_REGRESSION_POINTS:
         return slope, r2, everything
     near = _find_inliers(x, y)
     robust, robust_r2 = _fit_ridge(x[near], y[near])

@@ -1,23 +1,34 @@
-"""Weights of a mixture of proposals that minimise the variance of importance sampling."""
+"""Mixture weights that minimise the variance of importance sampling, with lower limits for groups of components.
+
+References:
+    Cappé, Douc, Guillin, Marin and Robert, "Adaptive importance sampling in general mixture classes", Statistics and
+    Computing 18, 2008 (adapts the weights by EM, to the Kullback-Leibler divergence; here the second moment itself).
+"""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from samplers.problem import FloatArray
 
-UPDATES = 60
+WEIGHT_UPDATES = 60
+"""Multiplicative updates: they come within 2 % of the least second moment (`test_weights_are_nearly_the_best`)."""
 NEGLIGIBLE = 30.0
 """Points whose weight is e^-30 of the largest one do not matter."""
+LEAST_DENSITY_RATIO = 1e-300
+"""Least ratio of densities to divide by."""
 
 
+@dataclass(frozen=True, eq=False)
 class Floor:
     """Components that together get at least some share of the draws."""
 
-    def __init__(self, members: NDArray[np.bool_], least: float) -> None:
-        self.members = members
-        self.least = least
+    members: NDArray[np.bool_]
+    """Which components, shape (k,)."""
+    least: float
+    """Their least share."""
 
 
 def minimise_second_moment(
@@ -25,7 +36,7 @@ def minimise_second_moment(
 ) -> FloatArray:
     """Return weights a (k,) of a mixture q_a = sum_k a_k q_k that minimise the second moment of its estimate.
 
-    That is sum_i w_i (phi / q_a)(u_i) over failing points u_i with importance weights w_i, convex in a. Each step
+    That is sum_i w_i (phi / q_a)(u_i) over failing points u_i with importance weights w_i, convex in a. Each update
     multiplies a_k by the square root of G_k = sum_i w_i (phi q_k / q_a^2)(u_i); at the optimum all G_k with a_k > 0
     are equal.
 
@@ -33,7 +44,7 @@ def minimise_second_moment(
         log_r: log(q_k / phi) at the failing points, shape (k, n).
         log_weights: Of the failing points, shape (n,).
         start: First weights, shape (k,).
-        floors: Lower limits, kept in every step.
+        floors: Lower limits of disjoint groups, kept in every update.
     """
     matter = log_weights > log_weights.max() - NEGLIGIBLE
     log_r, log_weights = log_r[:, matter], log_weights[matter]
@@ -41,15 +52,19 @@ def minimise_second_moment(
     ratio = np.exp(log_r - largest)
     scaled = np.exp(log_weights - largest - (log_weights - largest).max())
     a = start
-    for _ in range(UPDATES):
-        q = np.maximum(a @ ratio, 1e-300)
+    for _ in range(WEIGHT_UPDATES):
+        q = np.maximum(a @ ratio, LEAST_DENSITY_RATIO)
         a = a * np.sqrt((ratio * (scaled / (q * q))).sum(axis=1))
         a = raise_to_floors(a / a.sum(), floors)
     return a
 
 
 def raise_to_floors(a: FloatArray, floors: Sequence[Floor]) -> FloatArray:
-    """Return weights (k,) raised to floors of disjoint members, the others lowered in proportion; they add up to 1."""
+    """Return weights (k,) raised to the floors, the others lowered in proportion; they add up to 1.
+
+    Members of a floor keep their proportions; without any weight they share the floor evenly. Lowering may bring
+    another group under its floor, which is then raised too.
+    """
     raised: list[Floor] = []
     while True:
         low = [f for f in floors if f not in raised and float(a[f.members].sum()) < f.least - 1e-12]

@@ -1,7 +1,18 @@
-"""Sparing draws that would hardly fail: a classifier thins the proposal, the weights account for it."""
+"""Screening: a classifier rejects draws that are unlikely to fail, and the importance weights correct for it.
+
+A draw u from a component q is kept with probability a(u) = max(sqrt(P[fail | u]), a_min), which minimises the variance
+of the weighted mean if the classifier is right; the density of what is kept is q(u) a(u) / E_q[a]. If it is wrong,
+weights grow by 1 / a_min at most, and p-hat stays unbiased. Rejected draws cost no simulation.
+
+References:
+    Dubourg, Sudret and Deheeger, "Metamodel-based importance sampling for structural reliability analysis",
+    Probabilistic Engineering Mechanics 33, 2013 (the same density with P[fail | u], from a Gaussian process, in place
+    of its root, and no a_min: what is rejected is corrected for by a second estimate).
+    Platt, "Probabilistic outputs for support vector machines", 1999 (calibration).
+"""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,80 +20,109 @@ from numpy.typing import NDArray
 from samplers.problem import FloatArray
 from samplers.proposals.components import MixtureComponent
 
-ACCEPTANCE_FLOORS = (0.5, 0.25)
-"""Shares of the draws that may be kept where the classifier sees no failure."""
+MIN_ACCEPTANCES = (0.5, 0.25)
+"""Values of a_min to choose from: no weight grows by more than 4."""
 MAX_VARIANCE_RATIO = 0.9
-"""A screen is used where it promises less than this of the variance without it."""
+"""A screen is used where it promises less than this share of the variance without it."""
 MIN_CLASS_SIZE = 40
-"""Failing, and safe, points that a classifier needs."""
+"""Failing, and other, points that a classifier needs."""
+SVM_PENALTY = 10.0
+"""C of the support vector machine: points on the wrong side are few, for f has no noise where a screen is trained."""
+CALIBRATION_PENALTY = 100.0
+"""C of the logistic regression that calibrates it: two coefficients from dozens of points need hardly any penalty."""
+SPARE_FACTOR = 2
+"""Draws per missing one in each pass of the rejection, as an acceptance of a half asks for."""
+SPARE_DRAWS = 20
+"""Draws more than that: a pass for the last missing one is seldom the last without them."""
 
 
 @dataclass(frozen=True, eq=False)
 class FailureScreen:
-    """With what probability a draw is kept: sqrt of the probability that it fails, but at least `floor`.
-
-    sqrt(pi) is what minimises the variance of a weighted mean of outcomes that fail with probability pi.
-    """
+    """Acceptance probability of a draw: the root of the probability that it fails, but at least `min_acceptance`."""
 
     classifier: Any
-    """Fitted, with `decision_function`."""
+    """Fitted, with scikit-learn's `decision_function`."""
     intercept: float
-    slope: float
     """Of the log odds of failure on the decision function."""
-    floor: float
+    slope: float
+    """Likewise."""
+    min_acceptance: float
 
     def __call__(self, u: FloatArray) -> FloatArray:
-        """Return the probabilities at u (n, d), shape (n,)."""
+        """Return the acceptance probabilities at u (n, d), shape (n,)."""
         odds = self.intercept + self.slope * self.classifier.decision_function(u)
-        return np.asarray(np.maximum(np.exp(-0.5 * np.logaddexp(0.0, -odds)), self.floor))
+        return np.asarray(np.maximum(np.exp(-0.5 * np.logaddexp(0.0, -odds)), self.min_acceptance))
+
+
+class LabelledPoints(NamedTuple):
+    """Points and whether they fail."""
+
+    u: FloatArray
+    """Shape (n, d)."""
+    fails: NDArray[np.bool_]
+    """Shape (n,)."""
+
+    @property
+    def min_class(self) -> int:
+        """Number of points in the smaller class."""
+        n_failing = int(np.count_nonzero(self.fails))
+        return min(n_failing, len(self.fails) - n_failing)
 
 
 def draw_screened(screen: FailureScreen, component: MixtureComponent, n: int, rng: np.random.Generator) -> FloatArray:
-    """Draw n points (n, d) of a component that pass the screen, by rejection."""
+    """Draw n points (n, d) of a component that the screen accepts, by rejection."""
     parts, missing = [component.sample(0, rng)], n
     while missing > 0:
-        u = component.sample(2 * missing + 20, rng)
+        u = component.sample(SPARE_FACTOR * missing + SPARE_DRAWS, rng)
         parts.append(u[rng.random(len(u)) < screen(u)][:missing])
         missing -= len(parts[-1])
     return np.concatenate(parts)
 
 
-def train_screen(
-    known: tuple[FloatArray, NDArray[np.bool_]], fresh: tuple[FloatArray, NDArray[np.bool_]], log_weights: FloatArray
-) -> FailureScreen | None:
+def train_screen(known: LabelledPoints, fresh: LabelledPoints, log_weights: FloatArray) -> FailureScreen | None:
     """Return the screen for the next draws, or None if none is worth it.
 
-    A support vector machine learns from the known points, is calibrated and judged on fresh ones that it has not
-    seen, and then learns from all.
+    A support vector machine is trained on the known points, calibrated and judged on fresh ones that it has not seen,
+    and then trained on all.
 
     Args:
-        known: GroupedPoints u (n, d) and whether they fail (n,).
-        fresh: Draws from the last proposal u (m, d) and whether they fail (m,).
+        known: Points seen so far.
+        fresh: Draws from the last proposal.
         log_weights: log(phi / q) of the fresh draws, shape (m,).
     """
     from sklearn.linear_model import LogisticRegression  # slow to import
     from sklearn.svm import SVC
 
-    (u, fails), (u_new, fails_new) = known, fresh
-    for seen in (fails, fails_new):
-        if min(np.count_nonzero(seen), np.count_nonzero(~seen)) < MIN_CLASS_SIZE:
-            return None
-    classifier = SVC(C=10.0, random_state=0).fit(u, fails)
-    decision = classifier.decision_function(u_new)
-    line = LogisticRegression(C=100.0, random_state=0).fit(decision[:, None], fails_new)
+    if min(known.min_class, fresh.min_class) < MIN_CLASS_SIZE:
+        return None
+    classifier = SVC(C=SVM_PENALTY, random_state=0).fit(known.u, known.fails)
+    decision = classifier.decision_function(fresh.u)
+    line = LogisticRegression(C=CALIBRATION_PENALTY, random_state=0).fit(decision[:, None], fresh.fails)
     intercept, slope = float(line.intercept_[0]), float(line.coef_[0, 0])
     if slope <= 0:
         return None
-    w = np.where(fails_new, np.exp(log_weights - log_weights[fails_new].max()), 0.0)
-    mean, square = float(w.mean()), w * w
-    best, least = None, MAX_VARIANCE_RATIO * (float(square.mean()) - mean**2)
-    for floor in ACCEPTANCE_FLOORS:
-        screen = FailureScreen(classifier, intercept, slope, floor)
-        accepted = screen(u_new)
-        variance = float((square / accepted).mean()) * float(accepted.mean()) - mean**2
-        if variance < least:
-            best, least = floor, variance
+    screens = [FailureScreen(classifier, intercept, slope, least) for least in MIN_ACCEPTANCES]
+    best = _choose_screen(screens, fresh, log_weights)
     if best is None:
         return None
-    both = SVC(C=10.0, random_state=0).fit(np.concatenate([u, u_new]), np.concatenate([fails, fails_new]))
-    return FailureScreen(both, intercept, slope, best)
+    u, fails = (np.concatenate(parts) for parts in zip(known, fresh, strict=True))
+    both = SVC(C=SVM_PENALTY, random_state=0).fit(u, fails)
+    return FailureScreen(both, intercept, slope, best.min_acceptance)
+
+
+def _choose_screen(
+    screens: list[FailureScreen], fresh: LabelledPoints, log_weights: FloatArray
+) -> FailureScreen | None:
+    """Return the screen with the least variance per simulation, None where none promises enough.
+
+    Behind a screen a term y becomes y E[a] / a(u), drawn with density q a / E[a]: its second moment is E[y^2 / a] E[a].
+    """
+    w = np.where(fresh.fails, np.exp(log_weights - log_weights[fresh.fails].max()), 0.0)
+    mean, square = float(w.mean()), w * w
+    best, least = None, MAX_VARIANCE_RATIO * (float(square.mean()) - mean**2)
+    for screen in screens:
+        accepted = screen(fresh.u)
+        variance = float((square / accepted).mean()) * float(accepted.mean()) - mean**2
+        if variance < least:
+            best, least = screen, variance
+    return best
