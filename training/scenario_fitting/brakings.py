@@ -1,9 +1,9 @@
-"""Recorded brakings, and the moments that the base distribution of the hard-brake scenario has.
+"""Recorded brakings, and the moments from which the base distribution of the hard-brake scenario is made.
 
     python -m training.scenario_fitting.brakings DATA
 
-DATA is the folder with the compact table of single vehicles on US 101 (docs/data.md). Prints how many brakings there
-are, and means and covariances of speed, log gap and log deceleration.
+DATA is the folder with the compact table of single vehicles on US 101 (docs/data.md). Prints the number of brakings,
+and means and covariances of speed, log gap and log deceleration.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ from training.data.ngsim_tables import VEHICLES_FILE, read_columns
 from training.data.trajectories import DT
 
 POSITION_WINDOW = 11
-"""Positions, and then speeds, are averaged over so many ticks: recorded accelerations are mostly noise."""
+"""Number of ticks over which positions, and then speeds, are averaged: recorded accelerations are mostly noise."""
 ACCELERATION_WINDOW = 5
-"""Accelerations over so many."""
+"""Number of ticks over which accelerations are averaged."""
 BRAKING_ONSET = 0.5
-"""A vehicle brakes while its deceleration is above this [m/s^2] ..."""
+"""Deceleration [m/s^2] above which a vehicle brakes."""
 MIN_SPEED_LOSS = 3.0
-"""... and a braking counts if it takes at least this off the speed [m/s]."""
+"""Least loss of speed [m/s] of a braking that counts."""
 END_TICKS = 10
-"""Ticks at both ends of a track in which means are incomplete."""
+"""Number of ticks at both ends of a track in which means are incomplete."""
 
 
 def find_brakings(position: FloatArray, headway: FloatArray) -> FloatArray:
-    """The brakings of one vehicle.
+    """Return the brakings of one vehicle.
 
     Args:
-        position: Along the road, at every tick without a gap [m], shape (T,).
-        headway: Front to front to its own lead [m], NaN without one, shape (T,).
+        position: Position along the road at consecutive ticks [m], shape (T,).
+        headway: Distance from front to front to the vehicle's leader [m], NaN without one, shape (T,).
 
     Returns:
-        Speed at the beginning [m/s], gap at the beginning [m] and strongest deceleration [m/s^2], shape (n, 3).
+        Speed and gap at the beginning [m/s, m] and strongest deceleration [m/s^2], shape (n, 3).
     """
     half = POSITION_WINDOW // 2
     if len(position) < 2 * END_TICKS + 2 * POSITION_WINDOW:
@@ -61,7 +61,14 @@ def find_brakings(position: FloatArray, headway: FloatArray) -> FloatArray:
 
 
 def load_brakings(folder: Path) -> FloatArray:
-    """The brakings of all vehicles of the table, shape (n, 3)."""
+    """Return the brakings of all vehicles of the table, shape (n, 3).
+
+    Args:
+        folder: Folder with the compact table of single vehicles.
+
+    Raises:
+        ValueError: The table is missing or cannot be read.
+    """
     table = read_columns(folder / VEHICLES_FILE, ("vehicle", "frame", "y_along", "space_headway"))
     parts = []
     for vehicle in np.unique(table["vehicle"]):
@@ -73,7 +80,7 @@ def load_brakings(folder: Path) -> FloatArray:
 
 
 def log_moments(events: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Mean, shape (3,), and covariance, shape (3, 3), of speed, log gap and log deceleration."""
+    """Return mean, shape (3,), and covariance, shape (3, 3), of speed, log gap and log deceleration."""
     points = np.column_stack((events[:, 0], np.log(events[:, 1:])))
     return points.mean(axis=0), np.cov(points.T)
 

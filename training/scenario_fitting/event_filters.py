@@ -1,4 +1,4 @@
-"""Which events a base distribution is fitted to: columns of events files, and the filters that events have to pass."""
+"""Filters of events: columns of events files, and the conditions on events that a base distribution is fitted to."""
 
 from __future__ import annotations
 
@@ -17,19 +17,24 @@ from samplers.problem import FloatArray
 
 @dataclass(frozen=True)
 class EventRecipe:
-    """Where the parameters of a scenario are found in an events file."""
+    """Columns and filters of the events of a scenario.
+
+    Example:
+        >>> EventRecipe("pairs.csv", ("v_ego", "v_lead", "gap")).apart
+        ()
+    """
 
     file: str
     columns: tuple[str, ...]
     """Columns in the order of the scenario's parameters."""
     apart: tuple[str, ...] = ()
-    """The last of the columns, if they are fitted apart: independent of the others, from events of their own."""
+    """Last of the columns, if they are fitted separately: independent of the others, from events of their own."""
     required: tuple[str, ...] = ()
-    """Columns of truth values that must hold for the columns apart."""
+    """Columns of truth values that must hold for the columns fitted separately."""
     logarithmic: tuple[str, ...] = ()
     """Columns whose logarithms are fitted."""
     phase: str | None = None
-    """Rows kept by the column `phase`; None where the file has no such column."""
+    """Value of the column `phase` in the rows that are used; None where the file has no such column."""
 
 
 EVENT_RECIPES = {
@@ -39,12 +44,13 @@ EVENT_RECIPES = {
         ("v_ego", "v_cutin", "v_lead", "gap_ego_cutin", "gap_cutin_lead", "lateral_offset"),
         apart=("lateral_offset",),
         required=("start_seen",),
-        # So few events allow one component only, and one normal law cannot be skewed as gaps are: fitted to plain
-        # gaps it has a BIC 63 higher, a quarter of its mass outside the box, and puts vehicles at gaps never seen.
+        # So few events allow one component only, and a normal distribution is not skewed as gaps are: fitted to plain
+        # gaps it has a BIC 63 higher, a quarter of its mass outside the box, and gaps that were never recorded.
         logarithmic=("gap_ego_cutin", "gap_cutin_lead"),
         phase="start",
     ),
 }
+"""Recipes by scenario."""
 FILTER_REASONS = {
     "missing": "no ego behind or no lead ahead was recorded, so the parameter has no value",
     "start_seen": "the track began during the lane change: speeds and gaps are as good as any, but the vehicle had "
@@ -55,10 +61,11 @@ FILTER_REASONS = {
     "lateral_offset": "bodies that overlap across (errors of lane position, or an ego far from its "
     "lane's centre), or more than one lane apart",
 }
+"""Reasons of filters, by kind of filter, unit of the parameter, or its name."""
 
 
 def read_events(path: Path, recipe: EventRecipe) -> dict[str, NDArray[Any]]:
-    """Columns of an events file, numbers as float64 with NaN where a value is missing.
+    """Return the columns of an events file, numbers as float64 with NaN where a value is missing.
 
     Raises:
         ValueError: The file cannot be read or lacks a column.
@@ -78,12 +85,17 @@ def read_events(path: Path, recipe: EventRecipe) -> dict[str, NDArray[Any]]:
 def filter_events(
     events: Mapping[str, NDArray[Any]], recipe: EventRecipe, box: Sequence[Parameter]
 ) -> tuple[tuple[FloatArray, FloatArray], list[dict[str, Any]]]:
-    """Usable events and what each filter dropped.
+    """Return the usable events, and a record of what each filter dropped.
+
+    Args:
+        events: Columns of an events file.
+        recipe: Columns and filters.
+        box: Parameters of the scenario with their ranges.
 
     Returns:
-        Events of the joint columns, shape (n, d - a), and of the a columns apart, shape (m, a); and per filter its
-        rule, its reason and the number of events it dropped of those that passed the filters before. The filters
-        of the columns apart come last, and say so.
+        Events of the joint columns, shape (n, d - a), and of the a columns fitted separately, shape (m, a); and per
+        filter its rule, its reason and the number of events it dropped of those that passed the filters before. The
+        filters of the separate columns come last.
     """
     keep = np.ones(len(events[recipe.columns[0]]), dtype=bool)
     if recipe.phase is not None:

@@ -1,15 +1,15 @@
-"""Fits base distributions to recorded traffic and writes them as JSON.
+"""Fit of base distributions to recorded traffic, written as JSON.
 
     python -m training.scenario_fitting.fit --data DIR --out rare_envs/data
     python -m training.scenario_fitting.fit --highd DIR --out bases
 
-The first line makes the files of the package from events of US 101. The second extracts the events of your own
-recordings first: of highD, or with --ngsim of raw NGSIM.
+The first line makes the files of the package from events of US 101. The second first extracts the events of your own
+recordings: of highD, or with --ngsim of raw NGSIM.
 
-Events (one per row of a CSV file) are filtered, standardised, and fitted with Gaussian mixtures with
-full covariances; the number of components is the one with the least Bayesian information criterion.
-Back in physical units the mixture is cut to the box of the scenario's parameters. The first line also
-writes the two `highway` files, which are assembled and not fitted (`training.scenario_fitting.published_highway`).
+Events (one per row of a CSV file) are filtered, standardised, and fitted with Gaussian mixtures with full
+covariances; the number of components is the one with the least Bayesian information criterion. Back in physical
+units the mixture is truncated to the box of the scenario's parameters. The first line also writes the two `highway`
+files, which are assembled and not fitted (`training.scenario_fitting.published_highway`).
 """
 
 from __future__ import annotations
@@ -45,7 +45,9 @@ from training.scenario_fitting.mixture import (
 from training.scenario_fitting.published_highway import build_highway_base
 
 US101_COMMAND = "python -m training.scenario_fitting.fit --data DIR --out rare_envs/data"
+"""Command that writes the files of the package."""
 OWN_COMMAND = "python -m training.scenario_fitting.fit, with --highd or --ngsim"
+"""Command that writes bases of a user's own recordings."""
 US101_SOURCE = {
     "data": "Next Generation Simulation (NGSIM) Vehicle Trajectories and Supporting Data, US 101 "
     "(Los Angeles, southbound, 15 June 2005, 07:50 local time, congested)",
@@ -55,6 +57,7 @@ US101_SOURCE = {
     "derived from the data and are offered under the same licence",
     "changes": "events extracted from the trajectories, filtered as listed, fitted with a mixture",
 }
+"""Provenance of the events of US 101."""
 
 
 def format_base(
@@ -63,13 +66,13 @@ def format_base(
     provenance: Mapping[str, Any],
     replaced: Mapping[str, Any] = MappingProxyType({}),
 ) -> str:
-    """Text of a base distribution file, as `rare_envs.scenarios.base_distributions.load_base` reads it.
+    """Return the text of a base distribution file, which `rare_envs.scenarios.base_distributions.load_base` reads.
 
     Args:
         scenario: Name of the scenario, such as "cut_in".
-        mixture: The law, of logarithms where some coordinates are.
-        provenance: Where it comes from.
-        replaced: Entries in place of the mixture's own: the box of x, where some coordinates are logarithms.
+        mixture: The distribution, in logarithms of those coordinates that are fitted so.
+        provenance: Provenance of the distribution.
+        replaced: Entries that replace the mixture's own: the box of x, where some coordinates are logarithms.
     """
     content = {
         "names": [p.name for p in scenario_named(scenario).parameters],
@@ -82,7 +85,14 @@ def format_base(
 
 
 def fit_us101_base(scenario: str, data: Path, seed: int = 0, recipe: EventRecipe | None = None) -> str:
-    """Return the text of the base file of a scenario fitted to the events of US 101; `EVENT_RECIPES` has its recipe."""
+    """Return the text of the base file of a scenario fitted to the events of US 101.
+
+    Args:
+        scenario: Name of the scenario, such as "cut_in".
+        data: Folder with the events files.
+        seed: Seed of the fits.
+        recipe: Columns and filters of the events; those in `EVENT_RECIPES` if None.
+    """
     recipe = EVENT_RECIPES[scenario] if recipe is None else recipe
     return fit_base(scenario, data / recipe.file, US101_SOURCE, US101_COMMAND, seed, recipe)
 
@@ -90,15 +100,15 @@ def fit_us101_base(scenario: str, data: Path, seed: int = 0, recipe: EventRecipe
 def fit_base(
     scenario: str, path: Path, source: Mapping[str, str], command: str, seed: int = 0, recipe: EventRecipe | None = None
 ) -> str:
-    """Fits one scenario to a file of events and returns the text of its file.
+    """Return the text of the base file of a scenario fitted to a file of events.
 
     Args:
-        scenario: Its name, such as "cut_in".
-        path: CSV with the columns of the recipe.
-        source: Where the events come from, and under which licence.
-        command: What writes the file.
-        seed: Of the fits.
-        recipe: What of the events is fitted; the one in `EVENT_RECIPES` if None.
+        scenario: Name of the scenario, such as "cut_in".
+        path: CSV file with the columns of the recipe.
+        source: Provenance and licence of the events.
+        command: Command that writes the file.
+        seed: Seed of the fits.
+        recipe: Columns and filters of the events; those in `EVENT_RECIPES` if None.
 
     Raises:
         ValueError: The events cannot be read, or are too few.
@@ -126,6 +136,7 @@ def fit_base(
 def _provenance(
     recipe: EventRecipe, log: Sequence[Any], fit: MixtureFit, seed: int, origin: Mapping[str, Any]
 ) -> dict[str, Any]:
+    """Return the record of a fit, for the header of its file."""
     return {
         "kind": "fitted to recorded events",
         "source": origin["source"],
@@ -159,12 +170,20 @@ def _provenance(
 def fit_own_bases(
     tables: Iterable[Trajectories], scenarios: Sequence[str], out: Path, name: str, seed: int = 0
 ) -> None:
-    """Extracts the events of recordings and fits scenarios to them.
+    """Extract the events of recordings and fit scenarios to them.
 
     Writes `<scenario>_events.csv` and `<scenario>_<name>.json` into a folder; `load_base` reads the latter.
 
+    Args:
+        tables: The recordings.
+        scenarios: Names of the scenarios to fit.
+        out: Folder of the files.
+        name: Name of the bases.
+        seed: Seed of the fits.
+
     Raises:
-        ValueError: A recording is broken, or the events of a scenario are too few; their file is written all the same.
+        ValueError: A recording is broken, or the events of a scenario are too few; the file of events is written
+            nevertheless.
     """
     out.mkdir(parents=True, exist_ok=True)
     names: set[str] = set()
@@ -198,7 +217,7 @@ def main(
     name: Annotated[str, typer.Option(help="Name of the bases of your own recordings.")] = "own",
     seed: Annotated[int, typer.Option(help="Seed of the fits.", min=0)] = 0,
 ) -> None:
-    """Writes base distributions: us101 (fitted) and highway (assembled), or those of your own recordings."""
+    """Write base distributions: us101 (fitted) and highway (assembled), or those of your own recordings."""
     try:
         if sum(source is not None for source in (data, highd, ngsim)) != 1:
             raise ValueError("Give one of --data, --highd and --ngsim.")
@@ -219,6 +238,7 @@ def main(
 
 
 def _write_package_bases(data: Path, out: Path, seed: int) -> None:
+    """Write the bases of the package."""
     texts = {}
     for scenario in EVENT_RECIPES:
         texts[f"{scenario}_us101.json"] = fit_us101_base(scenario, data, seed)

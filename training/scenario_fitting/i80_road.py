@@ -1,12 +1,12 @@
-"""Fits the road of Interstate 80 at Emeryville to its survey and writes the table of the package.
+"""Road of Interstate 80 at Emeryville, fitted to its survey and written as the table of the package.
 
     python -m training.scenario_fitting.i80_road FOLDER [--out rare_envs/data/i80.json]
 
 FOLDER holds `lanes.csv` (lane, s, x, y: points on the centre lines of six lanes, lane 0 the rightmost) and
 `boundaries.csv` (boundary, x, y: the lines to the left of those lanes), in metres, y positive to the left of x. The
-reference line is a `rare_envs.traffic.reference_line.ReferenceLine` in the middle of the leftmost lane. Its curvatures,
-its start and a constant distance to each other lane are fitted by least squares to all lanes but the rightmost, which
-swerves towards two ramps.
+reference line is a `rare_envs.traffic.reference_line.Curve` in the middle of the leftmost lane. Its curvatures, its
+start and a constant distance to each other lane are fitted by least squares to all lanes but the rightmost, which
+bends towards two ramps.
 """
 
 import json
@@ -29,21 +29,27 @@ SURVEY_SOURCE = (
     "travelbureau/RareSim (MIT licence); fitted by a curve with piecewise linear curvature and constant lane offsets."
 )
 SURVEY_LANES = 6
+"""Number of surveyed lanes."""
 KNOT_SPACING = 50.0
-"""Between knots of the curvature [m]; with half of it the fit is 1 cm better and the curvature twice as uneven."""
+"""Distance between knots of the curvature [m]. With half of it the fit is 1 cm better and the curvature twice as
+uneven."""
 CURVE_LENGTH = 700.0
-"""Of the curve [m]: the survey's, rounded up to whole knots."""
+"""Length of the curve [m]: that of the survey, rounded up to whole knots."""
 SURVEYED = 650.0
-"""Up to here [m] all lanes and lines were surveyed."""
+"""Distance along the road [m] up to which all lanes and lines were surveyed."""
 THINNING = 3
 """Every third point of the survey is fitted; they are 1.5 m apart."""
 
 
 def read_lines(path: Path, key: str) -> list[FloatArray]:
-    """The lines of a survey file, shape (n, 2) each, in the order of their numbers.
+    """Return the lines of a survey file, shape (n, 2) each, in the order of their numbers.
+
+    Args:
+        path: CSV file.
+        key: Name of the column with the line's number.
 
     Raises:
-        ValueError: If the file cannot be read, lacks a column, or does not have six lines.
+        ValueError: The file cannot be read, lacks a column, or does not have six lines.
     """
     try:
         table = csv.read_csv(
@@ -59,21 +65,21 @@ def read_lines(path: Path, key: str) -> list[FloatArray]:
 
 
 def to_frame(points: FloatArray, origin: FloatArray, angle: float) -> FloatArray:
-    """Survey coordinates to the frame at `origin` with x in direction `angle` and y to the right."""
+    """Return points in the frame at `origin` with x in direction `angle` and y to the right, shape (n, 2)."""
     cos, sin = np.cos(angle), np.sin(angle)
     dx, dy = (points - origin).T
     return np.column_stack((dx * cos + dy * sin, dx * sin - dy * cos))
 
 
 def to_road_coordinates(curve: ReferenceLine, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Road coordinates of points, shape (n,) each."""
+    """Return distances along and across the road of points, shape (n,) each [m]."""
     x, y = torch.from_numpy(points).unbind(dim=1)
     s, across, _ = Road((-1.0, 1.0), curve).from_world(x, y, torch.zeros_like(x))
     return s.numpy(), across.numpy()
 
 
 def fit_reference_line(lanes: list[FloatArray]) -> tuple[ReferenceLine, FloatArray, float]:
-    """The reference line, and origin and angle of its frame in the survey's."""
+    """Return the reference line, and the origin and angle of its frame in the survey's."""
     leftmost = lanes[-1]
     origin = leftmost[0]
     angle = float(np.arctan2(*(leftmost[len(leftmost) // 10] - origin)[::-1]))
@@ -97,16 +103,17 @@ def fit_reference_line(lanes: list[FloatArray]) -> tuple[ReferenceLine, FloatArr
 
 
 def rotate_points(points: FloatArray, start: FloatArray, turn: float) -> FloatArray:
-    """Points in a frame that starts elsewhere and is turned to the right."""
+    """Return points in a frame that starts elsewhere and is turned to the right."""
     cos, sin = np.cos(turn), np.sin(turn)
     dx, dy = (points - start).T
     return np.column_stack((dx * cos + dy * sin, dy * cos - dx * sin))
 
 
 def fit_lane_edges(lines: list[FloatArray], rightmost: FloatArray, curve: ReferenceLine) -> list[float]:
-    """Lane edges from left to right, their y [m].
+    """Return lane edges from left to right, their y [m].
 
-    The edge on the right was not surveyed: it is as far from the rightmost lane's median as the line on its left.
+    The edge on the right was not surveyed: it is set as far from the rightmost lane's median as the line on its
+    left.
     """
 
     def typical(points: FloatArray) -> float:
@@ -118,7 +125,7 @@ def fit_lane_edges(lines: list[FloatArray], rightmost: FloatArray, curve: Refere
 
 
 def describe_residuals(name: str, points: FloatArray, curve: ReferenceLine, expected: float) -> str:
-    """One line on how far surveyed points are from where the road has them."""
+    """Return a line of text on the distance of surveyed points from where the road has them."""
     s, y = to_road_coordinates(curve, points)
     error = y[(s >= 0.0) & (s <= SURVEYED)] - expected
     rms, largest = float(np.sqrt(np.mean(error**2))), float(np.abs(error).max())

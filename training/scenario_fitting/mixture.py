@@ -1,4 +1,4 @@
-"""Gaussian mixtures fitted to events: the number of components by the Bayesian information criterion, cut to a box."""
+"""Gaussian mixtures fitted to events, truncated to a box; the Bayesian information criterion selects the components."""
 
 from __future__ import annotations
 
@@ -13,16 +13,22 @@ from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
 from samplers.problem import FloatArray
 
 MAX_COMPONENTS = 5
-EVENTS_PER_COMPONENT = 10  # times d: no more components are tried than there are events for
-SMALLEST_COMPONENT = 5  # times d: a component on fewer events has collapsed on a handful of them
-COVARIANCE_FLOOR = 0.01  # added to variances of standardised data: a tenth of a standard deviation
+"""Most components that are tried."""
+EVENTS_PER_COMPONENT = 10
+"""Events per component and dimension that a number of components needs to be tried."""
+SMALLEST_COMPONENT = 5
+"""Events per dimension below which a component has collapsed on a handful of them."""
+COVARIANCE_FLOOR = 0.01
+"""Added to variances of standardised data: a tenth of a standard deviation."""
 EM_STARTS = 20
+"""Starts of expectation maximisation for each number of components."""
 MASS_SAMPLES = 1_000_000
+"""Draws from which the mass outside the box is estimated."""
 
 
 @dataclass(frozen=True)
 class MixtureCandidate:
-    """One number of components that was tried."""
+    """A fit with one number of components."""
 
     components: int
     bic: float
@@ -34,7 +40,14 @@ class MixtureCandidate:
 
 @dataclass(frozen=True)
 class MixtureFit:
-    """A fitted base distribution and how it was chosen."""
+    """A fitted base distribution, and the fits that it was selected from.
+
+    Example:
+        >>> points = np.random.default_rng(0).standard_normal((60, 2))
+        >>> fit = select_mixture(points, np.full(2, -5.0), np.full(2, 5.0))
+        >>> [candidate.components for candidate in fit.candidates]
+        [1, 2, 3]
+    """
 
     mixture: TruncatedGaussianMixture
     candidates: tuple[MixtureCandidate, ...]
@@ -43,21 +56,27 @@ class MixtureFit:
 def select_mixture(
     points: FloatArray, low: FloatArray, high: FloatArray, seed: int = 0, most: int = MAX_COMPONENTS
 ) -> MixtureFit:
-    """Gaussian mixture chosen by BIC, cut to a box.
+    """Return the Gaussian mixture with the least BIC, truncated to a box.
 
-    For K = 1, 2, ... while there are `EVENTS_PER_COMPONENT` d events per component: expectation
-    maximisation on standardised data from `EM_STARTS` seeded starts, with a floor under the
-    covariances. Fits with a component of fewer than `SMALLEST_COMPONENT` d events are rejected.
+    For K = 1, 2, ... while there are `EVENTS_PER_COMPONENT` d events per component: expectation maximisation on
+    standardised data from `EM_STARTS` seeded starts, with a floor under the covariances. Fits with a component of
+    fewer than `SMALLEST_COMPONENT` d events are rejected.
 
     Args:
         points: Events, shape (n, d), with n > d.
         low: Lower ends of the box, shape (d,).
         high: Upper ends of the box, shape (d,).
-        seed: Of the starts; same seed, same fit.
+        seed: Seed of the starts; the same seed gives the same fit.
         most: Largest number of components to try.
 
     Raises:
         ValueError: There are no more events than parameters, or one of them does not vary.
+
+    Example:
+        >>> points = np.random.default_rng(0).standard_normal((60, 2))
+        >>> fit = select_mixture(points, np.full(2, -5.0), np.full(2, 5.0))
+        >>> fit.mixture.weights.tolist()
+        [1.0]
     """
     n, d = points.shape
     if n <= d:
@@ -77,6 +96,7 @@ def select_mixture(
 
 
 def _run_em(standard: FloatArray, components: int, seed: int) -> Any:
+    """Return the best model of several runs of expectation maximisation."""
     model = GaussianMixture(
         components,
         covariance_type="full",
@@ -90,6 +110,7 @@ def _run_em(standard: FloatArray, components: int, seed: int) -> Any:
 
 
 def _assess(model: Any, standard: FloatArray) -> MixtureCandidate:
+    """Return BIC and smallest component of a model."""
     n, d = standard.shape
     smallest = float(model.weights_.min() * n)
     accepted = model.n_components == 1 or smallest >= SMALLEST_COMPONENT * d
@@ -99,7 +120,7 @@ def _assess(model: Any, standard: FloatArray) -> MixtureCandidate:
 def _round_mixture(
     weights: FloatArray, means: FloatArray, covariances: FloatArray, low: FloatArray, high: FloatArray
 ) -> TruncatedGaussianMixture:
-    """The mixture to six significant digits, heaviest component first.
+    """Return the mixture to six significant digits, heaviest component first.
 
     More digits would say nothing about the traffic and differ between machines.
     """
@@ -113,12 +134,13 @@ def _round_mixture(
 
 
 def _round_significant(values: FloatArray) -> FloatArray:
+    """Return values to six significant digits."""
     rounded = np.vectorize(lambda value: float(f"{value:.6g}"), otypes=[np.float64])(values)
     return np.asarray(rounded, dtype=np.float64)
 
 
 def append_independent(joint: TruncatedGaussianMixture, apart: TruncatedGaussianMixture) -> TruncatedGaussianMixture:
-    """The law of independent points side by side: a mixture, and behind it one of a single component."""
+    """Return the joint distribution of two independent parts: a mixture, followed by one of a single component."""
     d, k = joint.dim + apart.dim, len(joint.weights)
     covariances = np.zeros((k, d, d))
     covariances[:, : joint.dim, : joint.dim] = joint.covariances
@@ -129,7 +151,7 @@ def append_independent(joint: TruncatedGaussianMixture, apart: TruncatedGaussian
 
 
 def mass_outside(mixture: TruncatedGaussianMixture, seed: int = 0) -> dict[str, Any]:
-    """How much of the untruncated mixture the box cuts away.
+    """Return the probability that the box cuts away from the untruncated mixture.
 
     Returns:
         `any`: probability that some coordinate is outside, with its `standard_error` (Monte Carlo);

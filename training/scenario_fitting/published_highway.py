@@ -1,9 +1,9 @@
 """Base distributions `highway`: free-flow traffic, assembled from published statistics, not fitted.
 
-Naturalistic free-flow data (highD) may not be passed on, nor fitted here. Its published summary
-numbers fix the means; spreads and correlations, which those summaries do not give, are chosen, such
-that the IDM ego collides with a probability between 1e-4 and 1e-3 (as in Tian et al. 2024, who
-fitted mixtures to highD). Each number below says which of the two it is.
+Naturalistic free-flow data (highD) may not be passed on, and nothing is fitted to them here. Their published summary
+numbers determine the means. Spreads and correlations, which those summaries do not give, are chosen such that the
+IDM ego collides with a probability between 1e-4 and 1e-3 (as in Tian et al. 2024, who fitted mixtures to highD).
+Each number below says which of the two it is.
 """
 
 from __future__ import annotations
@@ -18,8 +18,10 @@ from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
 from rare_envs.scenarios.registry import scenario_named
 from samplers.problem import FloatArray
 
-CAR_SPEED = 30.0  # [m/s] published: highD cars drive at about 30 m/s
-TRUCK_SPEED = 24.0  # [m/s] published: highD trucks drive at about 24 m/s
+CAR_SPEED = 30.0
+"""Speed of cars [m/s], published for highD."""
+TRUCK_SPEED = 24.0
+"""Speed of trucks [m/s], published for highD."""
 PROVENANCE: dict[str, Any] = {
     "kind": "assembled from published statistics and stated choices, NOT fitted to data",
     "published": {
@@ -32,21 +34,22 @@ PROVENANCE: dict[str, Any] = {
     "chosen": "component weights, standard deviations, correlations, the mean gaps of cut-ins: so "
     "that the IDM ego's collision probability is between 1e-4 and 1e-3",
 }
+"""Provenance of both files."""
 
 
 @dataclass(frozen=True)
 class TrafficSituation:
-    """One kind of situation: a Gaussian given by moments that can be read."""
+    """One kind of situation: a Gaussian given by weight, means, standard deviations and correlations."""
 
     meaning: str
     weight: float
     mean: tuple[float, ...]
     deviation: tuple[float, ...]
     correlation: Mapping[tuple[int, int], float]
-    """Off-diagonal correlations by parameter numbers; others are 0."""
+    """Correlations of pairs of parameters, by their numbers; others are 0."""
 
     def covariance(self) -> FloatArray:
-        """Covariance matrix, shape (d, d)."""
+        """Return the covariance matrix, shape (d, d)."""
         correlation = np.eye(len(self.mean))
         for (i, j), value in self.correlation.items():
             correlation[i, j] = correlation[j, i] = value
@@ -54,12 +57,12 @@ class TrafficSituation:
 
 
 def _following_correlation(speeds: float) -> dict[tuple[int, int], float]:
-    """Correlation of the two speeds; a gap grows a little with both."""
+    """Return correlations of car following: the two speeds go together, and a gap grows a little with both."""
     return {(0, 1): speeds, (0, 2): 0.2, (1, 2): 0.2}
 
 
 def _cut_in_correlation(speeds: float) -> dict[tuple[int, int], float]:
-    """Correlation of the three speeds; a fast ego is given a little more room."""
+    """Return correlations of cut-ins: the three speeds go together, and a fast ego has a little more room."""
     return {(0, 1): speeds, (0, 2): speeds, (1, 2): speeds, (0, 3): 0.2}
 
 
@@ -115,10 +118,11 @@ SITUATIONS: dict[str, tuple[TrafficSituation, ...]] = {
         ),
     ),
 }
+"""Situations of each scenario, the components of its mixture."""
 
 
 def build_highway_base(scenario: str) -> tuple[TruncatedGaussianMixture, dict[str, Any]]:
-    """The assembled mixture of a scenario and its provenance."""
+    """Return the assembled mixture of a scenario and its provenance."""
     components, box = SITUATIONS[scenario], scenario_named(scenario).parameters
     mixture = TruncatedGaussianMixture(
         np.array([component.weight for component in components]),

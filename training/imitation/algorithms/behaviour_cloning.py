@@ -1,4 +1,4 @@
-"""Behaviour cloning: the likelihood of recorded actions, maximised."""
+"""Behaviour cloning: maximum likelihood of recorded actions."""
 
 from collections.abc import Callable, Iterator
 from typing import TypeVar
@@ -12,11 +12,12 @@ from training.imitation.algorithms.expert_pairs import Pairs, emphasise_lateral,
 
 
 def clone_policy(pairs: Pairs, config: Config, generator: torch.Generator) -> Policy:
-    """A new policy that maximises the likelihood of recorded actions.
+    """Return a new policy that maximises the likelihood of recorded actions.
 
     Args:
         pairs: Recorded driving.
-        config: `epochs`, `batch`, `clone_rate`, `weight_decay`, `log_std_cap` and `lateral_weight` are used.
+        config: Settings, of which `epochs`, `batch`, `clone_rate`, `weight_decay`, `log_std_cap` and
+            `lateral_weight` are used.
         generator: Source of the initial weights and of the order of the pairs.
     """
     policy = make_seeded(lambda: Policy(scaling_of(pairs), config.log_std_cap), generator)
@@ -26,9 +27,12 @@ def clone_policy(pairs: Pairs, config: Config, generator: torch.Generator) -> Po
 
 
 def clone_epochs(policy: Policy, pairs: Pairs, config: Config, generator: torch.Generator) -> Iterator[None]:
-    """Ascend the likelihood, epoch by epoch, with what of the policy requires gradients.
+    """Ascend the likelihood epoch by epoch, in those weights of the policy that require gradients.
 
-    Few epochs: what 51 features say of the next action is little, and more is memorising.
+    Few epochs are made: 51 features say little about the next action, and further epochs overfit.
+
+    Yields:
+        None after each epoch.
     """
     pairs = emphasise_lateral(pairs, config.lateral_weight)
     optimiser = torch.optim.Adam(policy.parameters(), lr=config.clone_rate, weight_decay=config.weight_decay)
@@ -48,7 +52,7 @@ Module = TypeVar("Module")
 
 
 def make_seeded(make: Callable[[], Module], generator: torch.Generator) -> Module:
-    """A network whose initial weights are drawn from a generator; PyTorch takes them from the global one."""
+    """Return a network whose initial weights are drawn from a generator; PyTorch draws them from the global one."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(int(torch.randint(2**31, (), generator=generator)))
         return make()

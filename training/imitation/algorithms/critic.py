@@ -1,4 +1,4 @@
-"""The critic: tells recorded driving from a policy's by what is seen and done in one moment."""
+"""The critic: a network that tells recorded driving from a policy's, by the features and the action of one moment."""
 
 from collections import deque
 
@@ -11,7 +11,7 @@ _HIDDEN = 128
 
 
 class Critic(nn.Module):
-    """53-128-128-1, LeakyReLU; large where driving looks recorded."""
+    """Network of 53-128-128-1 units with LeakyReLU; its output is large where driving looks recorded."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -24,30 +24,31 @@ class Critic(nn.Module):
         )
 
     def forward(self, pairs: Tensor) -> Tensor:
-        """Pairs (n, 53), see `critic_inputs`, to logits (n,)."""
+        """Return the logits (n,) of pairs (n, 53), see `critic_inputs`."""
         logits: Tensor = self.layers(pairs)[:, 0]
         return logits
 
 
 def critic_inputs(policy: Policy, features: Tensor, action: Tensor) -> Tensor:
-    """What the critic sees: normalised features (n, 51) beside normalised actions (n, 2)."""
+    """Return the critic's input: normalised features (n, 51) beside normalised actions (n, 2)."""
     return torch.cat((policy.normalise(features), action), dim=1)
 
 
 def policy_cost(critic: Critic, pairs: Tensor) -> Tensor:
-    """-log of the probability that a pair is recorded, softplus(-logit), shape (n,).
+    """Return -log of the probability that a pair is recorded, softplus(-logit), shape (n,).
 
-    GAIL's paper minimises log(1 - D) for D the probability of being the policy's; in our sign, D of being recorded,
-    -log D keeps a gradient where the policy is easily told, as in the papers' code.
+    GAIL's paper minimises log(1 - D), where D is the probability that the pair is the policy's. In our sign D is
+    that of being recorded, and -log D keeps a gradient where the policy is easily recognised, as in the code of the
+    papers.
     """
     return nn.functional.softplus(-critic(pairs))
 
 
 def critic_loss(critic: Critic, recorded: Tensor, made: Tensor, penalty: float, generator: torch.Generator) -> Tensor:
-    """Logistic loss with a penalty on the gradient between recorded and made pairs, (n, 53) each.
+    """Return the logistic loss with a penalty on the gradient between recorded and made pairs, (n, 53) each.
 
-    The penalty is on the mean squared norm itself, not on its distance to 1 as in WGAN-GP: with a logistic loss there
-    is no reason for a slope of 1.
+    The penalty is on the mean squared norm itself, not on its distance to 1 as in WGAN-GP: with a logistic loss
+    nothing favours a slope of 1.
     """
     share = torch.rand(len(recorded), 1, generator=generator)
     between = (share * recorded + (1.0 - share) * made).requires_grad_(True)
@@ -66,7 +67,17 @@ def train_critic(
     penalty: float,
     generator: torch.Generator,
 ) -> float:
-    """Some steps on random pairs of the record and of the last rollouts.
+    """Make some steps on random pairs of the record and of the last rollouts.
+
+    Args:
+        critic: The critic.
+        optimiser: Optimiser of its weights.
+        recorded: Pairs of the record, shape (n, 53).
+        rollouts: Pairs of the last rollouts, shape (m, 53) each.
+        steps: Number of steps.
+        batch: Pairs of each kind in a step.
+        penalty: Weight of the penalty on the gradient.
+        generator: Source of the choice of pairs.
 
     Returns:
         The last loss.

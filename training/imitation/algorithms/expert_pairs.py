@@ -1,4 +1,4 @@
-"""Recorded driving as pairs of what was seen and what was done."""
+"""Expert pairs: recorded driving as pairs of features and actions."""
 
 from typing import NamedTuple
 
@@ -11,22 +11,22 @@ from training.imitation.traffic.recording import Recording
 from training.imitation.traffic.replayed_traffic import perceive_traffic, start_replay
 
 FAST_LATERAL_SPEED = 0.4
-"""Speed across the lane [m/s], see `emphasise_lateral`."""
+"""Lateral speed [m/s] above which a moment is repeated, see `emphasise_lateral`."""
 
 
 class Pairs(NamedTuple):
-    """n moments of recorded driving."""
+    """Features and actions of n moments of recorded driving."""
 
     features: Tensor
     """Shape (n, 51), SI units."""
     action: Tensor
     """Acceleration [m/s^2] and yaw rate [rad/s], shape (n, 2)."""
     scene: Tensor
-    """Scene of each, shape (n,)."""
+    """Scene of each moment, shape (n,)."""
 
 
 def collect_pairs(recording: Recording) -> Pairs:
-    """Every moment of every vehicle whose surroundings and action are known."""
+    """Return every moment of every vehicle whose surroundings and action are known."""
     features, actions, scenes = [], [], []
     for tick in range(recording.x.shape[1]):
         scene = (tick < recording.ticks).nonzero().flatten()
@@ -44,9 +44,13 @@ def collect_pairs(recording: Recording) -> Pairs:
 
 
 def emphasise_lateral(pairs: Pairs, times: int) -> Pairs:
-    """The same pairs, those of vehicles that move across their lane at more than `FAST_LATERAL_SPEED` several times.
+    """Return the pairs with those repeated in which a vehicle moves across its lane faster than `FAST_LATERAL_SPEED`.
 
     They are one in twenty in the recordings of US 101, and most belong to lane changes.
+
+    Args:
+        pairs: Recorded driving.
+        times: Number of times that such a moment is in the result.
     """
     if times == 1:
         return pairs

@@ -1,12 +1,12 @@
-"""MGAIL's learned forward model: what a driver sees next, from what it sees and does.
+"""Learned forward model of MGAIL: a driver's next features from its features and its action.
 
 As published, the simulator gives the value of the next features and the model their Jacobian:
 
     s' = f(s, a) + stop_gradient(s'_simulator - f(s, a)).
 
-Only what depends on features and actions has a gradient then: the critic's cost, the likelihood of recorded actions
-and the cost of hard braking. The costs of collision and of the road edge depend on the state, which the model does not
-know, and lose theirs.
+Then only what depends on features and actions has a gradient: the critic's cost, the likelihood of recorded actions
+and the cost of hard braking. The costs of collision and of the road edge depend on the state, which the model does
+not know, and lose theirs.
 
 References:
     Baram, Anschel, Caspi and Mannor, "End-to-end differentiable adversarial imitation learning", ICML 2017.
@@ -22,7 +22,7 @@ _HIDDEN = 128
 
 
 class ForwardModel(nn.Module):
-    """53-128-128-51 tanh units, from normalised features and actions to the change of the normalised features."""
+    """Network of 53-128-128-51 tanh units: normalised features and actions to the change of the features."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -35,17 +35,17 @@ class ForwardModel(nn.Module):
         )
 
     def forward(self, policy: Policy, features: Tensor, action: Tensor) -> Tensor:
-        """Features a tick later, (n, 51) in SI units, from features (n, 51) and normalised actions (n, 2)."""
+        """Return features a tick later, (n, 51) in SI units, from features (n, 51) and normalised actions (n, 2)."""
         change: Tensor = self.layers(critic_inputs(policy, features, action))
         return features + policy.scaling.feature_std * change
 
     def substitute_gradient(self, policy: Policy, before: Tensor, action: Tensor, now: Tensor, credit: float) -> Tensor:
-        """The features of now with the model's gradient to what was seen and done a tick before.
+        """Return the current features with the model's gradient to features and actions a tick before.
 
         Args:
-            policy: Whose normalisation is used.
+            policy: Policy whose normalisation is used.
             before: Features a tick before, shape (B, M, 51).
-            action: What was done then, normalised, shape (B, M, 2).
+            action: Normalised actions a tick before, shape (B, M, 2).
             now: Features that the simulator gives, shape (B, M, 51).
             credit: Share of the gradient that is passed on.
         """
@@ -63,20 +63,20 @@ def train_model(
     batch: int,
     generator: torch.Generator,
 ) -> float:
-    """Some steps of least squares on a rollout.
+    """Make some steps of least squares on a rollout.
 
     Args:
-        model: What learns.
-        optimiser: Of its weights.
-        policy: Whose normalisation is used.
-        features: Of T ticks, shape (T, n, 51), without gradient.
-        action: Likewise, normalised, shape (T, n, 2).
+        model: The model.
+        optimiser: Optimiser of its weights.
+        policy: Policy whose normalisation is used.
+        features: Features of T ticks, shape (T, n, 51), without gradient.
+        action: Normalised actions, shape (T, n, 2).
         steps: Number of steps.
-        batch: Moments of each.
-        generator: Source of the moments.
+        batch: Moments in a step.
+        generator: Source of the choice of moments.
 
     Returns:
-        The last mean squared error, in units of the features' spreads.
+        The last mean squared error, in units of the features' standard deviations.
     """
     before, done, after = features[:-1].flatten(0, 1), action[:-1].flatten(0, 1), features[1:].flatten(0, 1)
     error = torch.zeros(())

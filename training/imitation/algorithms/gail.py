@@ -1,13 +1,13 @@
-"""GAIL: the policy follows rewards, by proximal policy optimisation; all vehicles share its parameters.
+"""GAIL: the policy follows rewards by proximal policy optimisation; all vehicles share its parameters.
 
 The reward of a moment is minus the costs that MGAIL descends: the critic's, and the penalties (reward augmentation,
-Bhattacharyya et al. 2019). The costs are added to the gradient of the recorded actions' likelihood, as there.
+Bhattacharyya et al. 2019). As there, the gradient of the likelihood of recorded actions is added.
 
 References:
-    Ho and Ermon, "Generative adversarial imitation learning", NeurIPS 2016.
-    Bhattacharyya et al., "Multi-agent imitation learning for driving simulation", 2018 (parameter sharing, curriculum).
-    Schulman et al., "Proximal policy optimization algorithms", 2017; "High-dimensional continuous control using
-    generalized advantage estimation", 2016.
+    Ho and Ermon, "Generative adversarial imitation learning", NeurIPS 2016. Bhattacharyya et al., "Multi-agent
+    imitation learning for driving simulation", 2018 (parameter sharing, curriculum). Schulman et al., "Proximal
+    policy optimization algorithms", 2017; "High-dimensional continuous control using generalized advantage
+    estimation", 2016.
 """
 
 import torch
@@ -22,16 +22,16 @@ from training.imitation.algorithms.rollout import RolloutSteps
 
 
 def advantages(reward: Tensor, value: Tensor, discount: float, gae: float) -> Tensor:
-    """Generalised advantage estimates of rollouts that go on beyond their last moment.
+    """Return generalised advantage estimates of rollouts that continue beyond their last moment.
 
     Args:
-        reward: Shape (T, n).
-        value: Of each moment and of the one after the last, shape (T + 1, n).
-        discount: Per tick.
-        gae: Lambda.
+        reward: Reward of each moment, shape (T, n).
+        value: Value of each moment and of the one after the last, shape (T + 1, n).
+        discount: Discount per tick.
+        gae: Lambda of the estimates.
 
     Returns:
-        Shape (T, n).
+        Advantages, shape (T, n).
     """
     error = reward + discount * value[1:] - value[:-1]
     out = torch.empty_like(error)
@@ -45,7 +45,7 @@ def advantages(reward: Tensor, value: Tensor, discount: float, gae: float) -> Te
 def conditional_action(
     policy: Policy, features: Tensor, noise: Tensor, colour: AutoregressiveNoise
 ) -> tuple[Tensor, Tensor]:
-    """Mean and log standard deviation of actions, given the noise that was expected.
+    """Return mean and log standard deviation of actions, given the expected noise.
 
     Coloured noise makes actions depend on each other; given the noise before, they are independent Gaussians again.
     """
@@ -54,17 +54,17 @@ def conditional_action(
 
 
 def clipped_surrogate(ratio: Tensor, advantage: Tensor, clip: float) -> Tensor:
-    """PPO's clipped objective, to be maximised, shape (n,)."""
+    """Return PPO's clipped objective, to be maximised, shape (n,)."""
     return torch.minimum(ratio * advantage, ratio.clamp(1.0 - clip, 1.0 + clip) * advantage)
 
 
 def value_inputs(policy: Policy, steps: RolloutSteps) -> Tensor:
-    """What the value depends on: normalised features and the noise that goes on, shape (n, 53)."""
+    """Return the input of the value network: normalised features and the expected noise, shape (n, 53)."""
     return torch.cat((policy.normalise(steps.features), steps.noise), dim=1)
 
 
 def rewards(learner: Learner, steps: RolloutSteps) -> Tensor:
-    """Minus the costs of each moment, shape (n,)."""
+    """Return minus the costs of each moment, shape (n,)."""
     config = learner.config
     likeness = policy_cost(learner.critic, critic_inputs(learner.policy, steps.features, steps.action))
     costs = config.collision_weight * steps.collision + config.edge_weight * steps.edge
@@ -74,9 +74,9 @@ def rewards(learner: Learner, steps: RolloutSteps) -> Tensor:
 
 
 def update_gail(learner: Learner) -> Log:
-    """Drive, let the critic learn, then move the policy and the value by epochs over the rollout.
+    """Drive, train the critic, then train policy and value by epochs over the rollout.
 
-    The last tick of the rollout is there for the value of what comes after it only.
+    The last tick of the rollout only gives the value of what comes after the one before it.
     """
     config, policy, value = learner.config, learner.policy, learner.value
     ticks = learner.linear_schedule(config.horizon)

@@ -1,4 +1,4 @@
-"""What GAIL and MGAIL share: the state of a training, its rounds, and how it is kept and resumed."""
+"""The learner of GAIL and MGAIL: the state of a training, its rounds, and how it is saved and resumed."""
 
 from __future__ import annotations
 
@@ -25,25 +25,25 @@ from training.imitation.traffic.scene_pool import ScenePool, draw_pool
 
 Log = dict[str, float]
 _TRAINED_PARTS = ("policy", "critic", "value", "policy_optimiser", "critic_optimiser", "value_optimiser")
-"""What has weights or moments of its own."""
+"""Attributes that have weights, or moments of an optimiser."""
 
 
 @dataclass
 class Learner:
-    """A training under way; everything random comes from `generator`, so that a resumed one goes on as it would."""
+    """A training in progress; everything random comes from `generator`, so that a resumed one continues unchanged."""
 
     config: Config
     recording: Recording
     among: Tensor
     """Scenes that are driven, with repetition if they are bootstrapped, shape (k,)."""
     pairs: Pairs
-    """Recorded driving that the critic and the likelihood see."""
+    """Recorded driving for the critic and the likelihood."""
     policy: Policy
     critic: Critic
     generator: torch.Generator
     update: int = 0
     simulated: int = 0
-    """Vehicle-steps so far."""
+    """Number of vehicle-steps so far."""
 
     def __post_init__(self) -> None:
         """Make optimisers, pools and the critic's memory."""
@@ -67,12 +67,12 @@ class Learner:
         self.clone_pairs = followed.features, normalise_action(self.policy, followed.action)
 
     def linear_schedule(self, ends: tuple[int, int]) -> int:
-        """Value of a linear schedule of whole numbers."""
+        """Return the value at this update of a linear schedule of whole numbers."""
         share = min(self.update / max(self.config.anneal * self.config.updates, 1.0), 1.0)
         return round(ends[0] + (ends[1] - ends[0]) * share)
 
     def set_rates(self) -> None:
-        """Learning rates of this update."""
+        """Set the learning rates of this update."""
         factor = self.config.rate_factor(self.update)
         rates = (self.policy_optimiser, self.config.policy_rate), (self.critic_optimiser, self.config.critic_rate)
         for optimiser, rate in rates:
@@ -80,7 +80,7 @@ class Learner:
                 group["lr"] = factor * rate
 
     def drive(self, credit: float) -> RolloutSteps:
-        """Drive the next pool for a horizon; a pool that is old starts anew from the record."""
+        """Drive the next pool for a horizon; a pool that is too old is restarted from the record."""
         config = self.config
         while len(self.pools) < config.pools:
             self.pools.append(self._new_pool())
@@ -107,7 +107,7 @@ class Learner:
         )
 
     def learn_critic(self, steps: RolloutSteps) -> float:
-        """Let the critic learn from the rollout and the ones before, and return its loss."""
+        """Train the critic on this rollout and the ones before, and return its loss."""
         config = self.config
         self.rollouts.append(critic_inputs(self.policy, steps.features.detach(), steps.action.detach()))
         return train_critic(
@@ -122,7 +122,7 @@ class Learner:
         )
 
     def learn_model(self, steps: RolloutSteps) -> float:
-        """Let the forward model learn from the rollout, if there is one, and return its error."""
+        """Train the forward model on the rollout, if there is one, and return its error."""
         if self.model is None:
             return 0.0
         config, ticks = self.config, self.linear_schedule(self.config.horizon)
@@ -132,7 +132,7 @@ class Learner:
         )
 
     def warm_up(self) -> None:
-        """Let critic and forward model learn before the policy moves."""
+        """Train critic and forward model before the policy moves."""
         for _ in range(self.config.warm_up):
             with torch.no_grad():
                 steps = self.drive(1.0)
@@ -140,14 +140,14 @@ class Learner:
             self.learn_model(steps)
 
     def clone_loss(self) -> Tensor:
-        """Negative log likelihood of some recorded actions."""
+        """Return the negative log likelihood of a batch of recorded actions."""
         features, action = self.clone_pairs
         rows = torch.randint(len(features), (self.config.batch,), generator=self.generator)
         mean, log_std = self.policy(features[rows])
         return -log_likelihood(mean, log_std, action[rows]).mean()
 
     def save(self, path: Path) -> None:
-        """Write everything that a resumed training needs."""
+        """Write the state of the training."""
         state = {
             "update": self.update,
             "simulated": self.simulated,
@@ -161,10 +161,10 @@ class Learner:
         partial.replace(path)
 
     def load(self, path: Path) -> None:
-        """Take up where a training was saved.
+        """Resume a saved training.
 
         Raises:
-            ValueError: If the file is of another training.
+            ValueError: The file is no checkpoint of such a training.
         """
         state = self.inherit(path)
         self.update, self.simulated = state["update"], state["simulated"]
@@ -173,13 +173,13 @@ class Learner:
         self.pools = [ScenePool(Traffic(**pool["traffic"]), pool["noise"], pool["age"]) for pool in state["pools"]]
 
     def inherit(self, path: Path) -> dict[str, Any]:
-        """Take what has been learned from a saved training, but neither its place in it nor its traffic.
+        """Take over networks and optimisers of a saved training, but neither its progress nor its traffic.
 
         Returns:
-            Everything that the file holds.
+            Content of the file.
 
         Raises:
-            ValueError: If the file is of another training.
+            ValueError: The file is no checkpoint of such a training.
         """
         state: dict[str, Any] = torch.load(path, weights_only=True)
         if not state.keys() >= {"update", "pools", *self.learned}:
@@ -190,7 +190,7 @@ class Learner:
 
 
 def _make_value_network() -> nn.Sequential:
-    """An estimate of the rewards to come, for GAIL."""
+    """Return a network that estimates future rewards, for GAIL."""
     return nn.Sequential(
         nn.Linear(FEATURE_SIZE + ACTION_SIZE, 128), nn.Tanh(), nn.Linear(128, 128), nn.Tanh(), nn.Linear(128, 1)
     )
@@ -200,11 +200,14 @@ Update = Callable[[Learner], Log]
 
 
 def run_updates(learner: Learner, update: Update) -> Iterator[Log]:
-    """Make the updates that are left, one by one.
+    """Make the remaining updates, one by one.
 
     Args:
         learner: The training; it may have been resumed.
-        update: One round: drive, let the critic learn, move the policy.
+        update: One round: drive, train the critic, change the policy.
+
+    Yields:
+        Figures of each update.
     """
     if learner.update == 0:
         learner.warm_up()

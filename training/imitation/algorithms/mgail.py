@@ -1,7 +1,7 @@
 """MGAIL: the policy follows the gradient of its costs through the simulator.
 
-Baram et al. learn a forward model, because their simulator has no gradient. Ours has one, so nothing has to be learned
-and nothing is approximated; their way is kept for comparison (`Config.learned_model`, see `forward_model`).
+Baram et al. learn a forward model, because their simulator has no gradient. Ours has one, so no model is needed and
+nothing is approximated; their way is kept for comparison (`Config.learned_model`, see `forward_model`).
 
 References:
     Baram, Anschel, Caspi and Mannor, "End-to-end differentiable adversarial imitation learning", ICML 2017.
@@ -14,7 +14,7 @@ from training.imitation.algorithms.learner import Learner, Log
 
 
 def update_mgail(learner: Learner) -> Log:
-    """Drive with gradients, move the policy down them, let the critic learn."""
+    """Drive with gradients, move the policy down them, train the critic."""
     config = learner.config
     steps = learner.drive(config.credit)
     likeness = policy_cost(learner.critic, critic_inputs(learner.policy, steps.features, steps.action)).mean()

@@ -1,11 +1,11 @@
-"""What a driver must not do, as smooth costs with gradients through the simulator.
+"""Penalties: unwanted behaviour of a driver as smooth costs, with gradients through the simulator.
 
-Reward augmentation in the sense of RAIL, whose penalties are steps for collision and ramps for the rest; ours are ramps
-throughout, because a gradient has to see a collision come.
+Reward augmentation in the sense of RAIL, whose penalties are steps for collision and ramps for the rest. Ours are
+ramps throughout, because a gradient has to grow before a collision.
 
 References:
-    Bhattacharyya et al., "Simulating emergent properties of human driving behavior using multi-agent reward augmented
-    imitation learning", 2019.
+    Bhattacharyya et al., "Simulating emergent properties of human driving behavior using multi-agent reward
+    augmented imitation learning", 2019.
 """
 
 from typing import NamedTuple
@@ -17,31 +17,33 @@ from rare_envs.sensors.lidar import AHEAD_BEAM
 from rare_envs.sensors.perception import LANE_OFFSET_COLUMN, RANGE_COLUMNS, RATE_COLUMNS, SPEED_COLUMN
 
 NEAR_ALONG, NEAR_ACROSS = 3.0, 0.8
-"""Gaps [m] to the front and to the side under which nearness costs."""
+"""Gaps [m] to the front and to the side below which nearness costs."""
 MAX_NEARNESS_ALONG, MAX_NEARNESS_ACROSS = 3.0, 4.0
-"""Caps of the two ramps, reached only by bodies that overlap."""
+"""Greatest values of the two ramps, reached only by bodies that overlap."""
 COMFORTABLE_BRAKING = 1.5
-"""Deceleration [m/s^2] that the vehicle ahead may make necessary at no cost."""
+"""Deceleration [m/s^2] towards the vehicle ahead that costs nothing."""
 MAX_EXCESS_BRAKING = 6.0
+"""Greatest deceleration [m/s^2] above it that counts."""
 EDGE_DISTANCE = 1.0
-"""Distance [m] from the middle of the vehicle to the edge of the road under which it costs."""
+"""Distance [m] from the middle of the vehicle to the edge of the road below which it costs."""
 GENTLE_BRAKING = 2.0
-"""Deceleration [m/s^2] at no cost."""
+"""Deceleration [m/s^2] of the vehicle itself that costs nothing."""
 HEADWAY, STANDSTILL = 1.2, 2.0
-"""Gap at no cost to vehicles ahead that reach into the own path: so many seconds [s] and so many metres behind."""
+"""Gap that costs nothing to vehicles ahead that reach into the own path: so many seconds [s] and metres [m]."""
 COMFORTABLE_APPROACH = 3.0
-"""Deceleration [m/s^2] by which the own speed first comes down to theirs; the way that it takes is no gap."""
+"""Deceleration [m/s^2] by which the own speed first comes down to theirs; the way that this takes is no gap."""
 MAX_HEADWAY_COST = 2.0
+"""Greatest cost of following closely."""
 CENTRE_TOLERANCE = 0.3
-"""Distance [m] from the middle of the lane at no cost."""
+"""Distance [m] from the middle of the lane that costs nothing."""
 SPEED_LIMIT = 29.0
-"""Speed [m/s] at no cost, the limit of US 101 (65 mph)."""
+"""Speed [m/s] that costs nothing, the limit of US 101 (65 mph)."""
 SPEEDING_SCALE = 10.0
-"""Speed above it [m/s] that costs 1."""
+"""Speed [m/s] above the limit that costs 1."""
 
 
 class Penalties(NamedTuple):
-    """Costs of M vehicles in one tick, shape (B, M) each."""
+    """Costs of vehicles in one tick, shape (B, M) each, or of n moments, shape (n,)."""
 
     collision: Tensor
     edge: Tensor
@@ -62,18 +64,18 @@ def compute_penalties(
     action: Tensor,
     m: int,
 ) -> Penalties:
-    """Costs of a moment and of what is done in it.
+    """Return the costs of a moment and of the actions in it.
 
     Args:
-        x: Along the road [m], shape (B, V), as the next four.
-        y: Across it [m].
-        speed: [m/s].
-        length: [m].
-        width: [m].
+        x: Position along the road [m], shape (B, V), as the next four.
+        y: Position across it [m].
+        speed: Speed [m/s].
+        length: Length [m].
+        width: Width [m].
         edges: Lane boundaries [m], shape (B, L + 1).
-        features: Of the first M vehicles, shape (B, M, 51).
+        features: Features of the first M vehicles, shape (B, M, 51).
         action: Their acceleration [m/s^2] and yaw rate [rad/s], shape (B, M, 2).
-        m: M, the vehicles whose costs are asked for.
+        m: M, the number of vehicles whose costs are returned.
     """
     along = (x[:, :m, None] - x[:, None, :]).abs() - 0.5 * (length[:, :m, None] + length[:, None, :])
     across = (y[:, :m, None] - y[:, None, :]).abs() - 0.5 * (width[:, :m, None] + width[:, None, :])
@@ -96,13 +98,13 @@ def compute_penalties(
 
 
 def _headway_cost(x: Tensor, speed: Tensor, along: Tensor, across: Tensor, m: int) -> Tensor:
-    """Cost of being close behind whoever reaches into the own path, or fast towards it, shape (B, M).
+    """Return the cost of being close behind whoever reaches into the own path, or fast towards it, shape (B, M).
 
     Args:
-        x: Along the road [m], shape (B, V).
-        speed: [m/s], shape (B, V).
-        along: Gaps along the road, shape (B, M, V).
-        across: Gaps across it.
+        x: Position along the road [m], shape (B, V).
+        speed: Speed [m/s], shape (B, V).
+        along: Gaps along the road [m], shape (B, M, V).
+        across: Gaps across it [m], shape (B, M, V).
         m: M.
     """
     own = speed[:, :m, None]

@@ -16,7 +16,7 @@ from training.imitation.traffic.scene_pool import ScenePool
 
 
 class RolloutSteps(NamedTuple):
-    """n moments of driven vehicles: T ticks, each with the same vehicles in the same order."""
+    """Moments of driven vehicles, n in all: T ticks, each with the same vehicles in the same order."""
 
     features: Tensor
     """Shape (n, 51), SI units."""
@@ -30,7 +30,7 @@ class RolloutSteps(NamedTuple):
     lane: Tensor
     speed: Tensor
     noise: Tensor
-    """What the noise of the action was expected to be from the ticks before, shape (n, 2)."""
+    """Expected noise of the action given the ticks before, shape (n, 2)."""
 
 
 def roll_out(
@@ -47,13 +47,13 @@ def roll_out(
 
     Args:
         recording: The scenes.
-        policy: The driver of all driven vehicles: parameters are shared.
-        pool: Where to begin; its traffic carries no gradient.
-        ticks: How long.
-        colour: Of the noise.
+        policy: Driver of all driven vehicles, which share its parameters.
+        pool: Traffic to start from, without gradient.
+        ticks: Number of ticks.
+        colour: Noise of the actions.
         credit: Share of the gradient of the state that each tick passes on to the tick before.
         generator: Source of the noise.
-        model: Take the gradient through it in place of the simulator.
+        model: Forward model whose gradient replaces that of the simulator.
 
     Returns:
         The moments, differentiable in the policy's weights, and the pool afterwards, which is not.
@@ -83,12 +83,13 @@ def roll_out(
 
 
 def _penalties(traffic: Traffic, features: Tensor, action: Tensor, m: int) -> Penalties:
+    """Return the costs of a moment of traffic, shape (B, M) each."""
     bodies = traffic.x, traffic.y, traffic.speed, traffic.length, traffic.width
     return compute_penalties(*bodies, traffic.edges, features, action, m)
 
 
 def _scale_gradient(traffic: Traffic, credit: float) -> Traffic:
-    """The same traffic; on the way back its gradient is multiplied by `credit`."""
+    """Return the same traffic, through which gradients are multiplied by `credit`."""
     moved = {
         name: (value := getattr(traffic, name)) * credit + value.detach() * (1.0 - credit)
         for name in ("x", "y", "heading", "speed")

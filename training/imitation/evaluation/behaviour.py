@@ -1,4 +1,4 @@
-"""What vehicles do in recorded scenes, tick by tick: all driven by one driver, or as recorded."""
+"""Behaviour of vehicles in recorded scenes, tick by tick: driven by one driver, or as recorded."""
 
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
@@ -15,18 +15,19 @@ from training.imitation.traffic.recording import Recording
 from training.imitation.traffic.replayed_traffic import Traffic, lane_of, perceive_traffic, start_replay, step_replay
 
 Act = Callable[[Tensor, "Tensor | None"], tuple[Tensor, "Tensor | None"]]
-"""From features (B, M, 51) and a memory, None at first, to actions (B, M, 2) [m/s^2, rad/s] and the new memory."""
+"""Function from features (B, M, 51) and a memory, None at first, to actions (B, M, 2) [m/s^2, rad/s] and the new
+memory."""
 HARD_BRAKE_ACCELERATION = -3.0
-"""Acceleration [m/s^2]."""
+"""Acceleration [m/s^2] from which on a brake is hard."""
 
 
 class Behaviour(NamedTuple):
-    """What n vehicles do in T ticks; shapes (T, n) unless said, NaN where something is not known."""
+    """Motion and contacts of n vehicles in T ticks; shapes (T, n) unless said, NaN where a value is not known."""
 
     scene: Tensor
-    """Of each vehicle, shape (n,)."""
+    """Scene of each vehicle, shape (n,)."""
     known: Tensor
-    """Whether the vehicle is there and counts, boolean; where not, nothing else of it means anything."""
+    """True where the vehicle is there and counts; elsewhere its other values mean nothing."""
     speed: Tensor
     """[m/s]."""
     acceleration: Tensor
@@ -36,22 +37,29 @@ class Behaviour(NamedTuple):
     ahead: Tensor
     """Range of the beam ahead [m]."""
     rate: Tensor
-    """Its range rate [m/s]."""
+    """Range rate of the beam ahead [m/s]."""
     contact: Tensor
-    """Whether its body overlaps with another that it did not overlap with at the start, boolean."""
+    """True where its body overlaps with another that it did not overlap with at the start."""
     off_road: Tensor
-    """Whether its middle is beyond the edge, boolean."""
+    """True where its middle is beyond the edge of the road."""
     changed: Tensor
-    """Whether its lane is another than a tick before, boolean."""
+    """True where its lane differs from that of the tick before."""
 
 
 def sampling_driver(driver: LearnedDriver, generator: torch.Generator, weights: Tensor | None = None) -> Act:
-    """A learned driver with its noise.
+    """Return a function that draws the actions of a learned driver, with its noise.
 
     Args:
         driver: The driver.
         generator: Source of the noise.
         weights: Last layers of each scene, shape (B, 404), or of all, shape (404,); None for the driver's own.
+
+    Example:
+        >>> from agents import load_driver
+        >>> act = sampling_driver(load_driver("mgail"), torch.Generator().manual_seed(0))
+        >>> actions, memory = act(torch.zeros(1, 3, 51), None)
+        >>> actions.shape
+        torch.Size([1, 3, 2])
     """
 
     def act(features: Tensor, memory: Tensor | None) -> tuple[Tensor, Tensor | None]:
@@ -65,7 +73,7 @@ def sampling_driver(driver: LearnedDriver, generator: torch.Generator, weights: 
 
 
 def regular_starts(recording: Recording, seconds: float = 2.0) -> tuple[Tensor, Tensor]:
-    """Starts: (scene, tick) at whole multiples of some seconds from the start of every scene, shape (B,) each."""
+    """Return scenes and ticks of starts every few seconds from the start of every scene, shape (B,) each."""
     stride = round(seconds / DT)
     found = [
         (scene, tick) for scene, ticks in enumerate(recording.ticks.tolist()) for tick in range(0, ticks - 1, stride)
@@ -74,18 +82,28 @@ def regular_starts(recording: Recording, seconds: float = 2.0) -> tuple[Tensor, 
 
 
 class DrivingStep(NamedTuple):
-    """Traffic at one tick."""
+    """Traffic at one tick, and the actions taken in it."""
 
     traffic: Traffic
-    """As it is when the action is taken."""
+    """Traffic before the action."""
     features: Tensor
-    """Of the first M vehicles, shape (B, M, 51)."""
+    """Features of the first M vehicles, shape (B, M, 51)."""
     action: Tensor
-    """Shape (B, M, 2)."""
+    """Actions of the first M vehicles, shape (B, M, 2)."""
 
 
 def drive_traffic(recording: Recording | None, traffic: Traffic, act: Act, ticks: int) -> Iterator[DrivingStep]:
-    """Drive traffic from where it is, tick by tick; the recording says where those are who are not driven."""
+    """Drive traffic tick by tick.
+
+    Args:
+        recording: The scenes, from which vehicles that are not driven are replayed; None if there are none.
+        traffic: Traffic to start from.
+        act: Driver of all driven vehicles.
+        ticks: Number of ticks.
+
+    Yields:
+        Each tick, before its action.
+    """
     m = traffic.drivers
     unused = torch.zeros(*traffic.x.shape[:1], traffic.x.shape[1] - m, 2)
     memory = None
@@ -97,7 +115,7 @@ def drive_traffic(recording: Recording | None, traffic: Traffic, act: Act, ticks
 
 
 def find_overlaps(traffic: Traffic, m: int) -> Tensor:
-    """Which pairs of bodies share ground: the first m vehicles with all, boolean, shape (B, m, V)."""
+    """Return True for pairs of bodies that overlap: the first m vehicles with all, shape (B, m, V)."""
 
     def each(field: Tensor) -> Tensor:
         return field[:, :m, None]
@@ -117,7 +135,7 @@ def find_overlaps(traffic: Traffic, m: int) -> Tensor:
 
 
 def behaviour_of(moments: Iterator[DrivingStep]) -> Behaviour:
-    """What driven vehicles do from a start on."""
+    """Return the behaviour of driven vehicles from a start on."""
     rows: list[tuple[Tensor, ...]] = []
     driven = overlapping = lane = torch.zeros(0)
     scene = torch.zeros(0)
@@ -136,9 +154,9 @@ def behaviour_of(moments: Iterator[DrivingStep]) -> Behaviour:
 
 
 def recorded_behaviour(recording: Recording) -> Behaviour:
-    """What people did: every vehicle of the record at every tick at which it might have been driven.
+    """Return the behaviour of people: every vehicle of the record at every tick at which it could have been driven.
 
-    What overlaps in the record is an error of measurement and counts as contact.
+    Overlaps in the record are errors of measurement and count as contact.
     """
     scenes, _, vehicles = recording.x.shape
     known, rows = [], []
@@ -169,7 +187,7 @@ def recorded_behaviour(recording: Recording) -> Behaviour:
 
 
 def _row(moment: DrivingStep, contact: Tensor, changed: Tensor) -> tuple[Tensor, ...]:
-    """Columns of `Behaviour` from `speed` on, shape (B, M) each."""
+    """Return the columns of `Behaviour` from `speed` on, shape (B, M) each."""
     traffic, m = moment.traffic, moment.action.shape[1]
     y = traffic.y[:, :m]
     return (

@@ -1,4 +1,4 @@
-"""Sums over what vehicles do in recorded scenes, scene by scene: rates, counts of bins, squared errors."""
+"""Driving statistics: sums over the behaviour in recorded scenes, by scene: rates, histograms, squared errors."""
 
 from types import MappingProxyType
 from typing import NamedTuple
@@ -23,29 +23,29 @@ BINS = MappingProxyType(
         "gap": (0.0, 100.0, 50),
     }
 )
-"""Lowest and highest edge and number of bins of each quantity; what is beyond counts in the outermost bin. Units are
-m/s, m/s^2, m/s^3, rad/s, 1/s (closing speed over range of the beam ahead) and m (of that beam)."""
+"""Lowest and highest edge and number of bins of each quantity; values beyond count in the outermost bin. Units are m/s,
+m/s^2, m/s^3, rad/s, 1/s (closing speed over range of the beam ahead) and m (of that beam)."""
 ERROR_NAMES = ("position", "speed", "lateral")
 """Errors against the record that are summed."""
 
 
 class DrivingStatistics(NamedTuple):
-    """Sums over the vehicle-steps of each of S scenes, from which everything else follows."""
+    """Sums over the vehicle-steps of each of S scenes, from which rates, divergences and errors follow."""
 
     steps: FloatArray
-    """Vehicle-steps, shape (S,)."""
+    """Number of vehicle-steps, shape (S,)."""
     vehicles: FloatArray
-    """Shape (S,)."""
+    """Number of vehicles, shape (S,)."""
     sums: dict[str, FloatArray]
-    """Hard braking, collision, off-road, lane changes and speed by vehicle-step, `ever` by vehicle, shape (S,)."""
+    """Hard braking, collision, off-road, lane changes and speed by vehicle-step, `ever` by vehicle, shape (S,) each."""
     counts: dict[str, FloatArray]
-    """Of the bins of each quantity, shape (S, bins)."""
+    """Histogram of each quantity, shape (S, bins)."""
     squared: dict[str, FloatArray]
-    """Errors of position [m^2], speed and lateral position after 5 s, and how many, shape (S,)."""
+    """Squared errors of position [m^2], speed and lateral position after 5 s, and their number, shape (S,) each."""
 
 
 def binned_quantities(behaviour: Behaviour) -> dict[str, tuple[Tensor, Tensor]]:
-    """The values of each quantity in `BINS` with the scenes that they are of, shape (k,) each."""
+    """Return the values of each quantity in `BINS` with their scenes, shape (k,) each."""
     known = behaviour.known
     both = known[1:] & known[:-1]
     meets = known & (behaviour.ahead < MAX_RANGE)
@@ -63,12 +63,12 @@ def binned_quantities(behaviour: Behaviour) -> dict[str, tuple[Tensor, Tensor]]:
 
 
 def sum_by_scene(behaviour: Behaviour, scenes: int, errors: Errors | None = None) -> DrivingStatistics:
-    """Sum by scene.
+    """Return the statistics of some behaviour.
 
     Args:
-        behaviour: What vehicles did.
-        scenes: S.
-        errors: After 5 s.
+        behaviour: Behaviour of vehicles.
+        scenes: S, the number of scenes.
+        errors: Errors after 5 s.
     """
     known = behaviour.known
 
@@ -105,7 +105,7 @@ def sum_by_scene(behaviour: Behaviour, scenes: int, errors: Errors | None = None
 
 
 def add_statistics(tallies: list[DrivingStatistics]) -> DrivingStatistics:
-    """One tally of several, of the same scenes."""
+    """Return the sum of several statistics of the same scenes."""
 
     def added(name: str) -> dict[str, FloatArray]:
         parts = [getattr(one, name) for one in tallies]

@@ -1,4 +1,4 @@
-"""The model card of a folder of drivers, written from what their files say of themselves.
+"""Model card of a folder of drivers, written from the headers of their files.
 
     python -m training.imitation.evaluation.model_card agents/data
 
@@ -32,10 +32,10 @@ VISION_USE = (
 
 
 def format_model_card(folder: Path) -> str:
-    """The card of all drivers, and egos that see, in a folder, as Markdown.
+    """Return the card of all drivers, and egos that see, in a folder, as Markdown.
 
     Raises:
-        ValueError: If there is no driver, or a file is neither.
+        ValueError: The folder holds no driver, or a file is neither.
     """
     found = sorted(folder.glob("*.safetensors"))
     seeing = [path for path in found if holds_vision(path)]
@@ -60,14 +60,14 @@ def format_model_card(folder: Path) -> str:
         "## Training",
         "\n".join(f"- {name}: `{provenance.command}`" for name, (_, provenance) in drivers.items()),
         *(["## Metrics", _table("metric", metrics)] if any(metrics.values()) else []),
-        *(["## Law of the last layer's weights", _table("", ensembles)] if any(ensembles.values()) else []),
+        *(["## Distribution of the last layer's weights", _table("", ensembles)] if any(ensembles.values()) else []),
         *(part for path in seeing for part in _vision_sections(path)),
     ]
     return "\n\n".join(parts) + "\n"
 
 
 def _vision_sections(path: Path) -> Iterator[str]:
-    """Of a network that drives by pictures."""
+    """Yield the sections on a network that drives by pictures."""
     provenance = read_vision_provenance(path)
     yield f"## {path.stem}, an ego that sees"
     yield f'{VISION_USE} Load it with `agents.load_ego("{path.stem}")`.'
@@ -78,6 +78,7 @@ def _vision_sections(path: Path) -> Iterator[str]:
 
 
 def _drivers_table(drivers: Mapping[str, tuple[LearnedDriver, Provenance]]) -> str:
+    """Return a table of kinds, noises and bounds."""
     columns = {
         name: {
             "kind": provenance.kind,
@@ -85,7 +86,7 @@ def _drivers_table(drivers: Mapping[str, tuple[LearnedDriver, Provenance]]) -> s
             "noise, coefficients of lag 2": ", ".join(f"{value:.3g}" for value in driver.colour.second),
             "acceleration [m/s^2]": f"{driver.acceleration[0]:g} to {driver.acceleration[1]:g}",
             "yaw rate [rad/s]": f"{driver.yaw_rate[0]:g} to {driver.yaw_rate[1]:g}",
-            "law of the weights": "no" if driver.weights is None else "yes",
+            "distribution of the weights": "no" if driver.weights is None else "yes",
         }
         for name, (driver, provenance) in drivers.items()
     }
@@ -93,7 +94,7 @@ def _drivers_table(drivers: Mapping[str, tuple[LearnedDriver, Provenance]]) -> s
 
 
 def _table(corner: str, columns: Mapping[str, Mapping[str, Any]]) -> str:
-    """One column for each driver, one row for everything that any of them has."""
+    """Return a table with one column for each driver and one row for everything that any of them has."""
     rows = dict.fromkeys(row for column in columns.values() for row in column)
     lines = [[corner, *columns], ["---"] * (len(columns) + 1)]
     lines += [[row, *(_cell(column.get(row)) for column in columns.values())] for row in rows]
@@ -101,7 +102,7 @@ def _table(corner: str, columns: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 def _flatten(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Names and values of nested mappings, joined by spaces; lists, which are long, are left to the file."""
+    """Yield names and values of nested mappings, names joined by spaces; lists, which are long, are left out."""
     for name, value in values.items():
         if isinstance(value, Mapping):
             yield from _flatten(value, f"{prefix}{name} ")
@@ -110,6 +111,7 @@ def _flatten(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str,
 
 
 def _cell(value: Any) -> str:
+    """Return a value as the text of a cell."""
     text = "" if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
     return text.replace("|", "\\|")
 

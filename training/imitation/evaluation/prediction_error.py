@@ -1,9 +1,10 @@
-"""How far a driver ends up from the person whose place it takes.
+"""Prediction error: the distance of a driver from the person whose place it takes.
 
-As Kuefler et al. measure it, one vehicle is driven and all others do what is recorded; their cars do not react to it.
+As Kuefler et al. measure it, one vehicle is driven and all others are replayed; they do not react to it.
 
 References:
-    Kuefler, Morton, Wheeler and Kochenderfer, "Imitating driver behavior with generative adversarial networks", 2017.
+    Kuefler, Morton, Wheeler and Kochenderfer, "Imitating driver behavior with generative adversarial networks",
+    2017.
 """
 
 from typing import NamedTuple
@@ -17,16 +18,16 @@ from training.imitation.traffic.recording import Recording
 from training.imitation.traffic.replayed_traffic import Traffic, start_replay
 
 TIMES = (0.5, 1.0, 2.0, 3.0, 4.0, 5.0, 10.0)
-"""Seconds after which drivers are compared."""
+"""Times [s] after which drivers are compared."""
 ROLLOUTS = 20
-"""Of each segment."""
+"""Number of rollouts of each segment."""
 
 
 class Errors(NamedTuple):
-    """Differences from the record, of n vehicles that it still has."""
+    """Differences from the record, of the n vehicles that are still recorded."""
 
     scene: Tensor
-    """Shape (n,), as the others."""
+    """Scene of each vehicle, shape (n,), as the others."""
     position: Tensor
     """[m]."""
     speed: Tensor
@@ -36,7 +37,7 @@ class Errors(NamedTuple):
 
 
 def current_errors(recording: Recording, traffic: Traffic) -> Errors:
-    """Differences of driven vehicles from where the record has them at this tick."""
+    """Return differences of driven vehicles from their recorded places at this tick."""
     at = traffic.tick.minimum(recording.ticks[traffic.scene] - 1)
     recorded = recording.present[traffic.scene, at].gather(1, traffic.vehicle)
     known = recorded & traffic.driven & (traffic.tick == at)[:, None]
@@ -52,13 +53,13 @@ def current_errors(recording: Recording, traffic: Traffic) -> Errors:
 
 
 def draw_segments(recording: Recording, seconds: float, each: int, generator: torch.Generator) -> tuple[Tensor, ...]:
-    """Some vehicles at moments of the record.
+    """Return some vehicles at moments of the record.
 
     Args:
         recording: The scenes.
-        seconds: From moment to moment.
-        each: Vehicles of a moment, at most.
-        generator: Chooses them.
+        seconds: Time between moments [s].
+        each: Largest number of vehicles at a moment.
+        generator: Source of the choice.
 
     Returns:
         Scene, tick and vehicle of each segment, shape (n,) each.
@@ -73,13 +74,13 @@ def draw_segments(recording: Recording, seconds: float, each: int, generator: to
 def prediction_errors(
     recording: Recording, act: Act, chosen: tuple[Tensor, ...], rollouts: int = ROLLOUTS
 ) -> dict[float, Errors]:
-    """Drive one vehicle of each segment, some times over, among recorded others.
+    """Drive one vehicle of each segment several times, among replayed others, and return its errors.
 
     Args:
         recording: The scenes.
         act: The driver.
-        chosen: As `draw_segments` gives them.
-        rollouts: Of each segment.
+        chosen: Segments, as `draw_segments` returns them.
+        rollouts: Number of rollouts of each segment.
 
     Returns:
         Errors after each of `TIMES`.

@@ -1,12 +1,12 @@
-"""How human a driver is: all vehicles of recorded scenes driven by it, compared with the record.
+"""Realism of a driver: all vehicles of recorded scenes are driven by it and compared with the record.
 
-Rates are per vehicle-step, as in RAIL; `ever` counts vehicles. Divergences are Jensen-Shannon, in nats, over fixed bins
-that fit smoothed data; Kuefler et al.'s are far wider.
+Rates are per vehicle-step, as in RAIL; `ever` counts vehicles. Divergences are Jensen-Shannon, in nats, over fixed
+bins that fit smoothed data; Kuefler et al.'s bins are far wider.
 
 References:
-    Kuefler, Morton, Wheeler and Kochenderfer, "Imitating driver behavior with generative adversarial networks", 2017.
-    Bhattacharyya et al., "Simulating emergent properties of human driving behavior using multi-agent reward augmented
-    imitation learning", 2019.
+    Kuefler, Morton, Wheeler and Kochenderfer, "Imitating driver behavior with generative adversarial networks",
+    2017. Bhattacharyya et al., "Simulating emergent properties of human driving behavior using multi-agent reward
+    augmented imitation learning", 2019.
 """
 
 from collections.abc import Iterator
@@ -37,12 +37,18 @@ from training.imitation.traffic.replayed_traffic import start_replay
 
 _SHARES = ("hard_brake", "collision", "off_road")
 ERROR_TIME = 5.0
-"""Seconds after which positions are compared with the record, all vehicles driven."""
+"""Time [s] after which positions are compared with the record, all vehicles driven."""
 
 
 @dataclass(frozen=True)
 class Realism:
-    """What a driver does in recorded scenes."""
+    """Rates of a driver in recorded scenes, and its differences from people.
+
+    Example:
+        >>> shares = {"hard_brake": 0.0, "collision": 0.01, "ever": 0.05, "off_road": 0.0}
+        >>> Realism(vehicles=20, **shares, lane_changes=0.1, mean_speed=14.0, divergence={}, rmse={}).collision
+        0.01
+    """
 
     vehicles: int
     hard_brake: float
@@ -54,7 +60,7 @@ class Realism:
     off_road: float
     """Share of vehicle-steps with the middle of the vehicle beyond the edge."""
     lane_changes: float
-    """Per vehicle and 10 s."""
+    """Lane changes per vehicle and 10 s."""
     mean_speed: float
     """[m/s]."""
     divergence: dict[str, float]
@@ -64,7 +70,12 @@ class Realism:
 
 
 def jensen_shannon(p: FloatArray, q: FloatArray) -> float:
-    """Divergence of two laws on the same bins [nats], 0 to log 2."""
+    """Return the Jensen-Shannon divergence of two distributions on the same bins [nats], 0 to log 2.
+
+    Example:
+        >>> round(jensen_shannon(np.array([1.0, 0.0]), np.array([0.0, 1.0])), 4)
+        0.6931
+    """
     middle = 0.5 * (p + q)
 
     def kl(a: FloatArray) -> float:
@@ -77,12 +88,12 @@ def jensen_shannon(p: FloatArray, q: FloatArray) -> float:
 def summarise_realism(
     found: DrivingStatistics, recorded: DrivingStatistics, times: FloatArray | None = None
 ) -> Realism:
-    """Rates, divergences and errors of a tally.
+    """Return rates, divergences and errors from the statistics of a driver.
 
     Args:
-        found: Of a driver.
-        recorded: Of the record that it is compared with.
-        times: How often each scene counts, shape (S,); None for once.
+        found: Statistics of the driver.
+        recorded: Statistics of the record that it is compared with.
+        times: Number of times that each scene counts, shape (S,); None for once.
     """
     times = np.ones_like(found.steps) if times is None else times
     steps, vehicles = times @ found.steps, times @ found.vehicles
@@ -112,11 +123,11 @@ def summarise_realism(
 def collect_statistics(
     recording: Recording, act: Act, seconds: tuple[float, ...], starts: tuple[Tensor, Tensor] | None = None
 ) -> dict[float, DrivingStatistics]:
-    """Drive recorded scenes and sum up what happens within each of some times.
+    """Drive recorded scenes and return the statistics up to each of some times.
 
     Args:
         recording: Scenes that the driver has not learned from.
-        act: The driver of all vehicles.
+        act: Driver of all vehicles.
         seconds: Times [s], the longest last.
         starts: Scenes and ticks to start from; None for every 2 s of every scene.
     """
@@ -140,14 +151,30 @@ def collect_statistics(
 def measure(
     recording: Recording, act: Act, starts: tuple[Tensor, Tensor] | None = None, seconds: float = 10.0
 ) -> Realism:
-    """Drive recorded scenes and compare with the record; arguments as in `collect_statistics`."""
+    """Drive recorded scenes and compare with the record.
+
+    Args:
+        recording: Scenes that the driver has not learned from.
+        act: Driver of all vehicles.
+        starts: Scenes and ticks to start from; None for every 2 s of every scene.
+        seconds: Time for which each start is driven [s].
+
+    Example:
+        >>> from training.data import scenes_of, synthetic_traffic
+        >>> from training.imitation import prepare_data
+        >>> recording = prepare_data(scenes_of(synthetic_traffic(), seconds=4.0)).recording
+        >>> act = lambda features, memory: (torch.zeros(*features.shape[:2], 2), None)
+        >>> found = measure(recording, act, seconds=1.0)
+        >>> found.vehicles, found.collision
+        (36, 0.0)
+    """
     return summarise_realism(
         collect_statistics(recording, act, (seconds,), starts)[seconds], record_statistics(recording)
     )
 
 
 def record_statistics(recording: Recording) -> DrivingStatistics:
-    """What people did in the recorded scenes."""
+    """Return the statistics of people in the recorded scenes."""
     return sum_by_scene(recorded_behaviour(recording), len(recording.x))
 
 
@@ -170,7 +197,7 @@ def bootstrap_errors(
 
 
 def header_metrics(recording: Recording, driver: LearnedDriver, seed: int = 0) -> dict[str, dict[str, Any]]:
-    """What the header of a driver's file says: `Realism` over 10 s and 20 s, with one sequence of noise."""
+    """Return the metrics in the header of a driver's file: `Realism` over 10 s and 20 s, with one sequence of noise."""
     found = collect_statistics(recording, sampling_driver(driver, torch.Generator().manual_seed(seed)), (10.0, 20.0))
     recorded = record_statistics(recording)
     return {f"{seconds:g} s": asdict(summarise_realism(one, recorded)) for seconds, one in found.items()}

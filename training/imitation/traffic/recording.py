@@ -1,4 +1,4 @@
-"""Recorded scenes as tensors, padded to one number of vehicles and ticks."""
+"""Recordings: scenes as tensors, padded to one number of vehicles and ticks."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -10,7 +10,7 @@ from torch import Tensor
 from training.data.scenes import TrafficScene
 
 PARKING_X = -1e4
-"""x of vehicles that are not there [m]: further than any sensor reaches; each is parked apart from the others."""
+"""Position [m] of vehicles that do not exist: beyond the range of any sensor, each `_PARKING_GAP` from the next."""
 _PARKING_GAP = 300.0
 
 
@@ -25,23 +25,23 @@ class Recording(NamedTuple):
     acceleration: Tensor
     yaw_rate: Tensor
     present: Tensor
-    """Whether a vehicle is there, boolean, shape (S, T, V)."""
+    """True where a vehicle is recorded, shape (S, T, V)."""
     acts: Tensor
-    """Whether its acceleration and yaw rate are known there, boolean, shape (S, T, V)."""
+    """True where its acceleration and yaw rate are known, shape (S, T, V)."""
     length: Tensor
     """Shape (S, V)."""
     width: Tensor
     edges: Tensor
-    """Lane boundaries from left to right [m], shape (S, L + 1); beyond the last lane they repeat the last edge."""
+    """Lane boundaries from left to right [m], shape (S, L + 1); beyond the last lane the last edge is repeated."""
     ticks: Tensor
-    """Ticks of each scene, shape (S,)."""
+    """Number of ticks of each scene, shape (S,)."""
 
 
 def stack_scenes(scenes: Sequence[TrafficScene]) -> Recording:
-    """Put scenes side by side.
+    """Return scenes as one recording.
 
     Raises:
-        ValueError: If there are none.
+        ValueError: There is no scene.
     """
     if not scenes:
         raise ValueError("Expected at least one scene.")
@@ -85,5 +85,5 @@ def stack_scenes(scenes: Sequence[TrafficScene]) -> Recording:
 
 
 def parking_positions(like: Tensor) -> Tensor:
-    """Places x for vehicles that are not there, shape of the given tensor (..., V)."""
+    """Return x of vehicles that do not exist [m], of the shape of the given tensor, (..., V)."""
     return (PARKING_X - _PARKING_GAP * torch.arange(like.shape[-1], dtype=like.dtype)).expand_as(like)

@@ -1,8 +1,8 @@
 """Traffic of recorded scenes in which some vehicles are driven and the others replayed: differentiable, batch first.
 
-A recording shows a window of a road, so the first vehicle of each lane has a leader that nobody sees. It is replayed,
-and goes on at constant speed after its record ends; it is seen by the others but neither driven nor judged. Vehicles
-that enter the window later are left out.
+A recording shows a window of a road, so the leader of the first vehicle in each lane is not recorded. That vehicle
+is replayed, and continues at constant speed after its record ends; others see it, but it is neither driven nor
+judged. Vehicles that enter the window later are left out.
 """
 
 from typing import NamedTuple
@@ -17,7 +17,7 @@ from training.imitation.traffic.recording import Recording, parking_positions
 
 
 class Traffic(NamedTuple):
-    """B scenes with V vehicles at one moment; driven vehicles come first."""
+    """Vehicles of B scenes, V each, at one moment; driven vehicles come first."""
 
     x: Tensor
     """Shape (B, V), as the next three; frame and units as in `Scene`."""
@@ -30,33 +30,33 @@ class Traffic(NamedTuple):
     edges: Tensor
     """Lane boundaries [m], shape (B, L + 1)."""
     scene: Tensor
-    """Which scene of the recording, shape (B,)."""
+    """Scene of the recording, shape (B,)."""
     tick: Tensor
-    """Which tick of it, shape (B,); may pass its end."""
+    """Tick of the scene, shape (B,); may pass its end."""
     vehicle: Tensor
-    """Which vehicle of the scene, shape (B, V)."""
+    """Vehicle of the scene, shape (B, V)."""
     there: Tensor
-    """Which vehicles exist, boolean, shape (B, V); the others are parked far away."""
+    """True for vehicles that exist, shape (B, V); the others are parked far away."""
     driven: Tensor
-    """Which are driven, boolean, shape (B, V)."""
+    """True for vehicles that are driven, shape (B, V)."""
 
     @property
     def drivers(self) -> int:
-        """The first M vehicles hold all that are driven."""
+        """Number M of first vehicles that holds all driven ones."""
         return int(self.driven.sum(dim=1).max())
 
 
 def start_replay(
     recording: Recording, scene: Tensor, tick: Tensor, most: int | None = None, only: Tensor | None = None
 ) -> Traffic:
-    """Traffic as recorded at a moment of some scenes.
+    """Return traffic as recorded at a moment of some scenes.
 
     Args:
         recording: S scenes.
         scene: Scene of each row, shape (B,).
         tick: Tick of each row, shape (B,).
-        most: Drive no more than this many vehicles of a scene, the rearmost; None for all that may be driven.
-        only: Drive this vehicle of each row and no other, shape (B,).
+        most: Largest number of driven vehicles in a scene, the rearmost; None for all that can be driven.
+        only: The one vehicle that is driven in each row, shape (B,).
     """
     edges = recording.edges[scene]
     there = recording.present[scene, tick]
@@ -84,38 +84,56 @@ def start_replay(
 
 
 def first_in_lane(x: Tensor, y: Tensor, there: Tensor, edges: Tensor) -> Tensor:
-    """Which vehicles have nobody ahead in their lane; shapes (B, V) and edges (B, L + 1)."""
+    """Return True for vehicles with nobody ahead in their lane, shape (B, V).
+
+    Args:
+        x: Position along the road [m], shape (B, V).
+        y: Position across it [m], shape (B, V).
+        there: True for vehicles that exist, shape (B, V).
+        edges: Lane boundaries [m], shape (B, L + 1).
+    """
     lane = lane_of(y, edges)
     ahead = (x[:, None, :] > x[:, :, None]) & (lane[:, None, :] == lane[:, :, None]) & there[:, None, :]
     return there & ~ahead.any(dim=2)
 
 
 def lane_of(y: Tensor, edges: Tensor) -> Tensor:
-    """Lane of each vehicle, 0 the leftmost; beside the road the nearest. Shapes (B, V) and (B, L + 1)."""
+    """Return the lane of each vehicle, 0 the leftmost, and the nearest if it is off the road, shape (B, V).
+
+    Args:
+        y: Position across the road [m], shape (B, V).
+        edges: Lane boundaries [m], shape (B, L + 1).
+    """
     inner = torch.where(edges[:, 1:-1] < edges[:, -1:], edges[:, 1:-1], torch.inf)
     return (y.detach()[:, :, None] > inner[:, None, :]).sum(dim=2)
 
 
 def on_road(y: Tensor, heading: Tensor, edges: Tensor) -> OnRoad:
-    """Where vehicles are on their straight road; shapes (B, M) and edges (B, L + 1)."""
+    """Return the places of vehicles on their straight road; shapes (B, M) and edges (B, L + 1)."""
     lane = lane_of(y, edges)
     left, right = edges.gather(1, lane), edges.gather(1, lane + 1)
     return OnRoad(y - 0.5 * (left + right), heading, torch.zeros_like(y), y - left, right - y)
 
 
 def perceive_traffic(traffic: Traffic, observers: int | None = None) -> Tensor:
-    """The 51 features of the first vehicles, shape (B, M, 51); None for all."""
+    """Return the 51 features of the first vehicles, shape (B, M, 51).
+
+    Args:
+        traffic: B scenes.
+        observers: M; None for all vehicles.
+    """
     bodies = Bodies(traffic.x, traffic.y, traffic.heading, traffic.speed, traffic.length, traffic.width)
     return perceive(bodies, on_road(traffic.y, traffic.heading, traffic.edges), observers)
 
 
 def step_replay(recording: Recording | None, traffic: Traffic, action: Tensor) -> Traffic:
-    """Move everybody by one tick: explicit Euler with the old values, as recorded motion was inverted.
+    """Move all vehicles by one tick: explicit Euler with the old values, which `infer_motion` inverts.
 
     Args:
-        recording: The scenes; None for traffic that none has recorded: who is not driven keeps to its speed.
+        recording: The scenes; None for traffic that is not recorded, where vehicles that are not driven keep their
+        speed.
         traffic: B scenes with V vehicles.
-        action: Acceleration [m/s^2] and yaw rate [rad/s], shape (B, V, 2); only that of driven vehicles counts.
+        action: Acceleration [m/s^2] and yaw rate [rad/s], shape (B, V, 2); only those of driven vehicles count.
 
     Returns:
         Traffic one tick later, differentiable in traffic and action.
@@ -134,7 +152,7 @@ def step_replay(recording: Recording | None, traffic: Traffic, action: Tensor) -
 
 
 def _replay(recording: Recording, traffic: Traffic, tick: Tensor, moved: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Where the record goes on, it says where vehicles that are not driven are."""
+    """Return the motion with vehicles that are not driven at their recorded places, where the record continues."""
     scene, vehicle = traffic.scene, traffic.vehicle
     at = tick.minimum(recording.ticks[scene] - 1)
     goes_on = recording.present[scene, at].gather(1, vehicle) & (tick == at)[:, None] & traffic.there & ~traffic.driven
@@ -145,5 +163,5 @@ def _replay(recording: Recording, traffic: Traffic, tick: Tensor, moved: dict[st
 
 
 def detach_traffic(traffic: Traffic) -> Traffic:
-    """The same traffic, with no gradient to how it came about."""
+    """Return the same traffic without gradients."""
     return Traffic(*(field.detach() for field in traffic))

@@ -1,4 +1,4 @@
-"""Pools of driven scenes that go on between updates, so that a policy also meets what it has led to."""
+"""Pools of scenes that are driven on from update to update, so that a policy also meets its own late moments."""
 
 from dataclasses import dataclass
 
@@ -12,13 +12,13 @@ from training.imitation.traffic.replayed_traffic import Traffic, start_replay
 
 @dataclass
 class ScenePool:
-    """Some scenes that are driven together."""
+    """Scenes that are driven together."""
 
     traffic: Traffic
     noise: Tensor
-    """Memory of the drivers' coloured noise, shape (B, M, 2, 2)."""
+    """Memory of the drivers' noise, shape (B, M, 2, 2)."""
     age: int = 0
-    """Ticks driven since the record."""
+    """Number of ticks driven since the record."""
 
 
 def draw_pool(
@@ -30,15 +30,15 @@ def draw_pool(
     colour: AutoregressiveNoise,
     generator: torch.Generator,
 ) -> ScenePool:
-    """Start scenes at random moments of their records.
+    """Return scenes at random moments of their records.
 
     Args:
         recording: The scenes.
         among: Scenes to choose from, with repetition if they are listed more than once, shape (k,).
-        size: Scenes of the pool.
-        most: Vehicles of a scene that are driven at most.
-        shortest: Ticks of record that are left at least, if the scene is that long.
-        colour: Of the drivers' noise.
+        size: Number of scenes in the pool.
+        most: Largest number of driven vehicles in a scene.
+        shortest: Least number of ticks of record that remain, if the scene is that long.
+        colour: Noise of the drivers.
         generator: Source of scenes and moments.
     """
     scene = among[torch.randint(len(among), (size,), generator=generator)]
