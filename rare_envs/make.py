@@ -9,7 +9,7 @@ import torch
 from rare_envs.control.actions import ACTIONS
 from rare_envs.distributions.product import NoiseDistribution, join_independent
 from rare_envs.distributions.space import Distribution, Parameter, ScenarioSpace
-from rare_envs.measures.registry import named_measure
+from rare_envs.measures.registry import load_measure
 from rare_envs.plugins import did_you_mean
 from rare_envs.scenarios.base_distributions import load_base
 from rare_envs.scenarios.registry import find_scenario
@@ -91,7 +91,7 @@ def set_up(
         scenario,
         sensing=Sensing(kinds, find_camera(camera), weather, needs.lidar),
         background=background,
-        measurement=Measurement(named_measure(measure), collisions),
+        measurement=Measurement(load_measure(measure), collisions),
         clock=Clock(dt, scenario.horizon if horizon is None else horizon, action),
         noise=noise,
     )

@@ -6,13 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from rare_envs.measures.base import RowsReplaceable
 from rare_envs.sensors.kinds import each
 
 T = TypeVar("T")
 
 
 def merge_rows(old: T, rows: Tensor, new: T) -> T:
-    """Tensors, tuples of such or what knows how (`put`), with some rows replaced; the rest, as the road, is common."""
+    """Tensors, tuples of such or a `RowsReplaceable`, with some rows replaced; the rest, as the road, is common."""
     result: T = _merge_rows(old, rows, new)
     return result
 
@@ -25,7 +26,7 @@ def _merge_rows(old: Any, rows: Tensor, new: Any) -> Any:
     if isinstance(old, tuple):
         parts = [_merge_rows(a, rows, b) for a, b in zip(old, new, strict=True)]
         return type(old)(*parts) if hasattr(old, "_fields") else tuple(parts)
-    return old.put(rows, new) if hasattr(old, "put") else old
+    return old.replace_rows(rows, new) if isinstance(old, RowsReplaceable) else old
 
 
 def to_object_rows(observation: Any, mask: NDArray[np.bool_]) -> NDArray[Any]:

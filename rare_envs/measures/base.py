@@ -1,8 +1,8 @@
-"""From the moments of an episode to its f: small is dangerous, always finite."""
+"""Safety measures: from the moments of an episode to its f, which is small where it is dangerous and always finite."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeAlias
+from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -13,39 +13,80 @@ COLLISION = -1.0
 """f of an episode with a collision, unless a measure says otherwise (Tian et al. 2024, equation 3)."""
 
 MeasureState: TypeAlias = Any
-"""What a measure keeps of an episode so far: a tensor whose first axis is the scenario, a tuple of such, or an object
-with a method `put(rows, new)` that returns it with the scenarios `rows` replaced by those of another."""
+"""State of a measure in B episodes: a tensor (B, ...), a tuple of such, or a `RowsReplaceable`."""
 
 
+@runtime_checkable
+class RowsReplaceable(Protocol):
+    """A state of B episodes, some of which can be replaced by those of another state."""
+
+    def replace_rows(self, rows: Tensor, new: Any) -> Any:
+        """Return the state with the episodes `rows` (indices or mask) replaced by the episodes of `new`."""
+
+
+@runtime_checkable
 class EpisodeMeasure(Protocol):
-    """Folds the moments of B episodes, as they come, into one number each. Nothing in it changes."""
+    """A safety measure as a fold over the moments of B episodes, as they come. Nothing in it changes.
+
+    A class of your own may inherit from it, and then needs the three methods only.
+
+    Example:
+        >>> class LastSpeed(EpisodeMeasure):
+        ...     def start(self, moment, ticks):
+        ...         return moment.state.speed[:, 0]
+        ...
+        ...     def update(self, state, moment, before, now):
+        ...         return torch.where(before, state, moment.state.speed[:, 0])
+        ...
+        ...     def f(self, state):
+        ...         return state
+        >>> import rare_envs
+        >>> problem = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", measure=LastSpeed(), horizon=1.0)
+        >>> problem.evaluate([[20.0, 20.0, 100.0]]).round(1).tolist()  # [m/s] after 1 s
+        [20.4]
+    """
 
     @property
     def sees(self) -> bool:
-        """Whether it needs what the ego sees, `Moment.perception`."""
+        """Whether it needs the lidar features of the vehicles, `Moment.perception`."""
+        return False
+
+    @property
+    def records(self) -> bool:
+        """Whether it keeps whole episodes, which are then simulated in smaller batches."""
+        return False
+
+    @property
+    def unit(self) -> str:
+        """Unit of f; empty for a number without one."""
+        return ""
 
     def start(self, moment: Moment, ticks: int) -> MeasureState:
-        """What it keeps of the first moment of episodes that are `ticks` long."""
+        """Return the state after the first moment of episodes that are `ticks` long."""
 
-    def update(self, kept: MeasureState, moment: Moment, before: Tensor, now: Tensor) -> MeasureState:
-        """What it keeps after one more moment.
+    def update(self, state: MeasureState, moment: Moment, before: Tensor, now: Tensor) -> MeasureState:
+        """Return the state after one more moment.
 
         Args:
-            kept: Of the moments before.
-            moment: The next.
-            before: Whether the ego had collided before this moment, boolean, shape (B,): what came after means nothing.
+            state: After the moments before.
+            moment: The next moment.
+            before: Whether the ego had collided before this moment, boolean, shape (B,): what follows is meaningless.
             now: Whether it has by this moment, boolean, shape (B,).
         """
 
-    def f(self, kept: MeasureState) -> Tensor:
-        """The measure of the episodes so far, shape (B,)."""
+    def f(self, state: MeasureState) -> Tensor:
+        """Return the measure of the episodes so far, shape (B,)."""
 
 
-def one_each(value: Any, like: Tensor) -> Tensor:
-    """What a measure's function returned, if it is one number for each of B episodes.
+def check_one_each(value: Any, like: Tensor) -> Tensor:
+    """Return what a measure's function gave, if it is one number for each of B episodes.
+
+    Args:
+        value: What the function returned.
+        like: A tensor of shape (B,).
 
     Raises:
-        ValueError: If it is not.
+        ValueError: If it is not a tensor of shape (B,).
     """
     if isinstance(value, Tensor) and value.shape == like.shape:
         return value
@@ -57,51 +98,68 @@ def one_each(value: Any, like: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Measure:
-    """The most dangerous moment of an episode decides: f is the least over its moments.
+    """A measure that is decided by the most dangerous moment of an episode: f is the least over its moments.
 
     Where large values are dangerous, such as those of a deceleration, f is the critical value less the value, so that
     f <= 0 says that the critical value was reached.
+
+    Example:
+        >>> import rare_envs
+        >>> from rare_envs.measures import drac
+        >>> comfort = Measure(drac, critical=2.0, collision=-100.0, unit="m/s^2")
+        >>> comfort.gamma(3.0)  # f <= -1 where avoiding a crash takes 3 m/s^2
+        -1.0
+        >>> problem = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", measure=comfort)
+        >>> problem.evaluate([[20.0, 10.0, 25.0]]).round(2).tolist()  # at first 10^2 / (2 25) = 2 m/s^2, then less
+        [0.0]
     """
 
     of: Callable[[Moment], Tensor]
     """A moment to the measure in its own unit and sign, shape (B,)."""
     sees: bool = False
-    """Whether it needs what the ego sees."""
+    """Whether it needs the lidar features of the vehicles."""
     collision: float | Callable[[Moment], Tensor] | None = COLLISION
     """f of an episode with a collision: a number, a function of the moment of the collision, or None for the least of
     the moments before it."""
     critical: float | None = None
     """The critical value of a measure whose large values are dangerous; None where small ones are."""
     unit: str = "s"
+    """Unit of f."""
+
+    @property
+    def records(self) -> bool:
+        """False: one number of each episode is kept."""
+        return False
 
     def gamma(self, value: float) -> float:
-        """The threshold of f that stands for a value in the measure's own unit and sign."""
+        """Return the threshold of f that stands for a value in the measure's own unit and sign."""
         return value if self.critical is None else self.critical - value
 
     def start(self, moment: Moment, ticks: int) -> Tensor:
-        """What it keeps is f, here of the first moment."""
-        return self._danger(moment)
+        """Return f of the first moment, which is the whole state."""
+        return self._f_of_moment(moment)
 
-    def update(self, kept: Tensor, moment: Moment, before: Tensor, now: Tensor) -> Tensor:
-        """The lesser of f so far and f of the moment, and what a collision counts as after one."""
-        return self._ended(kept, torch.minimum(kept, self._danger(moment)), moment, before, now)
+    def update(self, state: Tensor, moment: Moment, before: Tensor, now: Tensor) -> Tensor:
+        """Return the lesser of f so far and f of the moment, or what a collision counts as after one."""
+        f = torch.minimum(state, self._f_of_moment(moment))
+        return self._with_collisions(state, f, moment, before, now)
 
-    def f(self, kept: Tensor) -> Tensor:
-        """It keeps f itself."""
-        return kept
+    def f(self, state: Tensor) -> Tensor:
+        """Return the state, which is f."""
+        return state
 
-    def _danger(self, moment: Moment) -> Tensor:
-        value = one_each(self.of(moment), moment.lead.gap)
+    def _f_of_moment(self, moment: Moment) -> Tensor:
+        value = check_one_each(self.of(moment), moment.lead.gap)
         return value if self.critical is None else self.critical - value
 
-    def _ended(self, kept: Tensor, f: Tensor, moment: Moment, before: Tensor, now: Tensor) -> Tensor:
-        """Take f of the moments, or what a collision is worth."""
+    def _with_collisions(self, state: Tensor, f: Tensor, moment: Moment, before: Tensor, now: Tensor) -> Tensor:
+        """Return f of the moments, but in episodes with a collision what that counts as."""
         worth: Tensor | float
         if self.collision is None:
-            worth = kept
+            worth = state
         elif callable(self.collision):
             new = now & ~before
-            worth = torch.where(new, self.collision(moment), kept) if bool(new.any()) else kept
+            worth = torch.where(new, self.collision(moment), state) if bool(new.any()) else state
         else:
             worth = self.collision
         return torch.where(now, worth, f)

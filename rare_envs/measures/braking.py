@@ -1,4 +1,4 @@
-"""How hard the ego has to brake for its lead, and how long it can wait with it."""
+"""Braking: how hard the ego has to brake for its lead, and how long it can wait."""
 
 import torch
 from torch import Tensor
@@ -10,11 +10,11 @@ from rare_envs.measures.time_to_collision import TTC_MAX
 MAX_BRAKING = MAX_ACCELERATION
 """The hardest braking that an action can ask for [m/s^2]."""
 DECELERATION_MAX = 100.0
-"""Cap of decelerations [m/s^2], ten times what tyres can do; with a centimetre left they would be in the thousands."""
+"""Cap of decelerations [m/s^2], ten times what tyres can do: with a centimetre left they would be in the thousands."""
 
 
 def drac(moment: Moment) -> Tensor:
-    """Deceleration rate to avoid a crash: by which the ego just reaches its lead's speed when the gap is used up.
+    """Return the deceleration rate to avoid a crash (DRAC): it just reaches the lead's speed when the gap is used up.
 
     closing speed^2 / (2 gap) while closing, else 0; the lead keeps its speed.
 
@@ -30,13 +30,18 @@ def drac(moment: Moment) -> Tensor:
         Almqvist, Hyden and Risser, "Use of speed limiters in cars for increased safety and a better environment",
         Transportation Research Record 1318, 1991; Archer, "Indicators for traffic safety assessment and prediction",
         2005.
+
+    Example:
+        >>> from rare_envs.measures import Moment
+        >>> drac(Moment.of_two(gap=25.0, speed=20.0, lead_speed=10.0)).item()
+        2.0
     """
     closing = moment.lead.closing_speed.clamp(min=0.0)
     return (closing.square() / (2.0 * gap_of(moment))).clamp(max=DECELERATION_MAX)
 
 
 def required_deceleration(moment: Moment) -> Tensor:
-    """The least constant deceleration of the ego with which it never touches its lead, which keeps its own.
+    """Return the least constant deceleration with which the ego never touches its lead, which keeps its own.
 
     With b the deceleration of the lead over the last tick (b = 0 where it speeds up), v the ego's speed, w the lead's
     and dv = v - w, two cases. The speeds become equal while the lead still moves: b + dv^2 / (2 gap). The lead stops
@@ -53,6 +58,14 @@ def required_deceleration(moment: Moment) -> Tensor:
     References:
         Jansson, "Collision avoidance theory with application to automotive collision mitigation", 2005 (the first case,
         as the required longitudinal acceleration).
+
+    Example:
+        >>> from rare_envs.measures import Moment
+        >>> moment = Moment.of_two(gap=25.0, speed=20.0, lead_speed=20.0)
+        >>> faster = moment.state.speed + torch.tensor([0.0, 0.4])  # the lead brakes by 4 m/s^2
+        >>> before = moment.state._replace(speed=faster)
+        >>> round(required_deceleration(moment._replace(before=before)).item(), 2)  # 20^2 / (2 (25 + 20^2 / 8))
+        2.67
     """
     gap, dv, speed = gap_of(moment), moment.lead.closing_speed, moment.state.speed[:, 0]
     lead_speed = (speed - dv).clamp(min=0.0)
@@ -66,7 +79,7 @@ def required_deceleration(moment: Moment) -> Tensor:
 
 
 def btn(moment: Moment, brakes: float = MAX_BRAKING) -> Tensor:
-    """Brake threat number: the required deceleration as a share of what the brakes can do.
+    """Return the brake threat number (BTN): the required deceleration as a share of what the brakes can do.
 
     Critical value: 1, above which braking alone cannot prevent the collision.
 
@@ -79,12 +92,19 @@ def btn(moment: Moment, brakes: float = MAX_BRAKING) -> Tensor:
 
     References:
         Jansson, "Collision avoidance theory with application to automotive collision mitigation", 2005.
+
+    Example:
+        >>> from rare_envs.measures import Moment
+        >>> round(btn(Moment.of_two(gap=25.0, speed=20.0, lead_speed=10.0)).item(), 3)  # 2 of 5 m/s^2
+        0.4
     """
     return required_deceleration(moment) / brakes
 
 
 def ttb(moment: Moment, brakes: float = MAX_BRAKING) -> Tensor:
-    """Time to brake: how long the ego can wait until it must brake fully for its lead, which keeps its speed.
+    """Return the time to brake (TTB): how long the ego can wait until it must brake fully for its lead.
+
+    The lead keeps its speed.
 
     gap / closing speed - closing speed / (2 brakes). Negative past the point of no return: by how much it is too late.
 
@@ -100,6 +120,11 @@ def ttb(moment: Moment, brakes: float = MAX_BRAKING) -> Tensor:
     References:
         Hillenbrand, Spieker and Kroschel, "A multilevel collision mitigation approach: its situation assessment,
         decision making, and performance tradeoffs", IEEE Transactions on Intelligent Transportation Systems 7, 2006.
+
+    Example:
+        >>> from rare_envs.measures import Moment
+        >>> ttb(Moment.of_two(gap=25.0, speed=20.0, lead_speed=10.0)).item()  # 25 / 10 - 10 / (2 5)
+        1.5
     """
     closing = moment.lead.closing_speed.clamp(min=STILL)
     return (gap_of(moment) / closing - closing / (2.0 * brakes)).clamp(-0.99 * TTC_MAX, TTC_MAX)

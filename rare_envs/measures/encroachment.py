@@ -10,14 +10,14 @@ PET_MAX = 5.0
 """Cap of the post-encroachment time [s]; whoever comes later is no conflict."""
 NEAR = 25.0
 """Centres further apart than this [m] are not looked at: no tick of delay brings bodies from there to contact."""
-THIRDS = 16
-"""Steps of the search within a tick: to 0.2 % of it."""
+TERNARY_STEPS = 16
+"""Steps of the search within a tick: to (2/3)^16 = 0.2 % of it."""
 PET_MIN = 1e-3
 """And its floor [s], so that only a collision comes to 0 or less."""
 
 
 def pet(trace: Trace) -> Tensor:
-    """Post-encroachment time: the least time between one vehicle leaving a place and another taking it.
+    """Return the post-encroachment time (PET): the least time between one body leaving a place and another taking it.
 
     The place is ground that the bodies of the ego and of another vehicle both cover in the course of the episode,
     either of them first. For every delay the ego's body is compared with where the other was (or will be) that much
@@ -35,6 +35,12 @@ def pet(trace: Trace) -> Tensor:
     References:
         Allen, Shin and Cooper, "Analysis of traffic conflicts and collisions", Transportation Research Record 667,
         1978.
+
+    Example:
+        >>> import rare_envs
+        >>> problem = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", measure="pet", horizon=4.0)
+        >>> problem.evaluate([[20.0, 20.0, 30.0]]).round(2).tolist()  # the lead's rear was there so long ago
+        [1.55]
     """
     x, y, heading = trace.road.to_world(trace.state.x, trace.state.y, trace.state.heading)
     found = torch.full_like(x[0, :, 0], PET_MAX)
@@ -60,7 +66,7 @@ def pet(trace: Trace) -> Tensor:
 
 
 def _apart(x: Tensor, y: Tensor, heading: Tensor, valid: Tensor, delay: int) -> Tensor:
-    """How far apart bodies are at a delay [m], the ego second and the ego first; `NEAR` where not driven.
+    """Return how far apart bodies are at a delay [m], the ego second and the ego first; `NEAR` where not driven.
 
     Of each moment the least since the moment before: for one delay both bodies move on together.
 
@@ -87,13 +93,13 @@ def _apart(x: Tensor, y: Tensor, heading: Tensor, valid: Tensor, delay: int) -> 
 
 
 def _least_between(before: Tensor, now: Tensor) -> Tensor:
-    """Least separation of bodies on their straight way between two poses (4, K), shape (K,): a search by thirds.
+    """Return the least separation on the straight ways between two poses (4, K), shape (K,), by ternary search.
 
     The separation is a convex function of the time, so of two inner points the one that is further apart is left out.
     """
     low, high = torch.zeros_like(now[0]), torch.ones_like(now[0])
     apart = torch.full_like(low, NEAR)
-    for _ in range(THIRDS):
+    for _ in range(TERNARY_STEPS):
         third = (high - low) / 3
         left, right = (separation(axes_of(*torch.lerp(before, now, at))) for at in (low + third, high - third))
         low, high = torch.where(left > right, low + third, low), torch.where(left > right, high, high - third)

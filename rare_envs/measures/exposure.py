@@ -1,4 +1,4 @@
-"""How long, and how far, an episode stayed under a critical time to collision.
+"""Exposure: how long, and by how much, an episode stayed under a critical time to collision.
 
 References:
     Minderhoud and Bovy, "Extended time-to-collision measures for road traffic safety assessment", Accident Analysis and
@@ -22,25 +22,35 @@ EXPOSURE_MAX = 1000.0
 
 @dataclass(frozen=True)
 class Exposure(Measure):
-    """Adds up over an episode: f is the critical value less the time integral of `of`, by rectangles of one tick."""
+    """A measure that adds up over an episode: f is the critical value less the time integral of `of`.
+
+    The integral is a sum of rectangles of one tick.
+
+    Example:
+        >>> import rare_envs
+        >>> slow = Exposure(lambda moment: (moment.state.speed[:, 0] < 19.9).float(), critical=2.0)
+        >>> problem = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", measure=slow)
+        >>> problem.evaluate([[20.0, 10.0, 150.0]]).round(1).tolist()  # 6.5 s of the 10 s
+        [-4.5]
+    """
 
     critical: float = 1.0
 
     def start(self, moment: Moment, ticks: int) -> Tensor:
-        """Nothing has been added up yet."""
+        """Return the critical value: nothing has been added up yet."""
         return torch.full_like(moment.state.x[:, 0], self.critical)
 
-    def update(self, kept: Tensor, moment: Moment, before: Tensor, now: Tensor) -> Tensor:
-        """Take one more tick from f."""
-        f = (kept - self.of(moment) * moment.dt).clamp(min=self.critical - EXPOSURE_MAX)
-        return self._ended(kept, f, moment, before, now)
+    def update(self, state: Tensor, moment: Moment, before: Tensor, now: Tensor) -> Tensor:
+        """Return f less one more tick."""
+        f = (state - self.of(moment) * moment.dt).clamp(min=self.critical - EXPOSURE_MAX)
+        return self._with_collisions(state, f, moment, before, now)
 
 
 def tet(moment: Moment, threshold: float = TTC_CRITICAL) -> Tensor:
-    """Time exposed time to collision (TET): how long the time to collision was under its critical value.
+    """Return the integrand of the time exposed time-to-collision (TET), 1 where TTC is under its critical value.
 
-    The sum over ticks of their length where TTC < threshold; this is 1 at such a moment, else 0. It is a step of TTC,
-    so its gradient is 0.
+    TET is the time for which TTC < threshold: the sum of the lengths of such ticks. The integrand is a step of TTC, so
+    its gradient is 0.
 
     Critical value: 3 s of TTC is the threshold here; that an episode has failed with 1 s under it is our choice.
 
@@ -50,15 +60,21 @@ def tet(moment: Moment, threshold: float = TTC_CRITICAL) -> Tensor:
 
     Returns:
         Share of the moment that is exposed, 0 or 1, shape (B,).
+
+    Example:
+        >>> from rare_envs.measures import Moment
+        >>> tet(Moment.of_two(gap=25.0, speed=20.0, lead_speed=10.0)).item()  # TTC 2.5 s
+        1.0
     """
     time = ttc(moment)
     return (time < threshold).to(time.dtype)
 
 
 def tit(moment: Moment, threshold: float = TTC_CRITICAL) -> Tensor:
-    """Time integrated time to collision (TIT): the area between the critical time to collision and the TTC under it.
+    """Return the integrand of the time integrated time-to-collision (TIT), by how much TTC is under its critical value.
 
-    The sum over ticks of (threshold - TTC) times their length where TTC < threshold; this is that height.
+    TIT is the area between the threshold and the TTC under it: the sum over ticks of (threshold - TTC) times their
+    length where TTC < threshold.
 
     Critical value: 3 s of TTC is the threshold here; that an episode has failed with 1 s^2 is our choice.
 
@@ -68,5 +84,10 @@ def tit(moment: Moment, threshold: float = TTC_CRITICAL) -> Tensor:
 
     Returns:
         By how much TTC is under the threshold [s], shape (B,).
+
+    Example:
+        >>> from rare_envs.measures import Moment
+        >>> tit(Moment.of_two(gap=25.0, speed=20.0, lead_speed=10.0)).item()  # TTC 2.5 s
+        0.5
     """
     return (threshold - ttc(moment)).clamp(min=0.0)

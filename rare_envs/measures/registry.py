@@ -1,4 +1,4 @@
-"""Measures by what a user would type: a name, `module:measure`, or `stl:FORMULA`."""
+"""The registry of measures: by name, `module:measure`, or `stl:FORMULA`."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from rare_envs.traffic.crash import crash_of
 FORMULA = "stl:"
 
 
-def named_measure(measure: Any) -> Any:
-    """What a keyword argument `measure` means, for `rare_envs.measures.registry.find_measure`.
+def load_measure(measure: Any) -> Any:
+    """Return what a text such as "stl:FORMULA" or "module:name" stands for; `find_measure` takes what it returns.
 
     Args:
         measure: "stl:always (gap > 2)", a formula of signal temporal logic; "module:name", a function of a `Moment` or
@@ -43,8 +43,8 @@ def named_measure(measure: Any) -> Any:
     return import_object(measure, f"the measure {measure!r}")
 
 
-def _met_at(moment: Moment) -> Tensor:
-    """The negative speed at which bodies meet in a collision [m/s], shape (B,)."""
+def _negative_contact_speed(moment: Moment) -> Tensor:
+    """Return the negative speed at which bodies meet in a collision [m/s], shape (B,)."""
     return -crash_of(moment.state, moment.road, moment.before, moment.dt).closing_speed
 
 
@@ -68,28 +68,33 @@ MEASURES: MappingProxyType[str, EpisodeMeasure] = MappingProxyType(
         "clearance": Measure(clearance, unit="m"),
         "tet": Exposure(tet, collision=-EXPOSURE_MAX, unit="s"),
         "tit": Exposure(tit, collision=-EXPOSURE_MAX, unit="s^2"),
-        "margin": Measure(margin, collision=_met_at),
+        "margin": Measure(margin, collision=_negative_contact_speed),
     }
 )
 """Measures by name. Where large values are dangerous, f is the critical value less the value."""
 
 
 def find_measure(measure: Any) -> EpisodeMeasure:
-    """The measure that a keyword argument `measure` stands for.
+    """Return the measure that a keyword argument `measure` stands for.
 
     Args:
-        measure: Name of one, a `Measure` or another object with its methods, or a function from a `Moment` of B
-            scenarios to shape (B,): small is dangerous, the least over the moments counts, a collision counts as -1.
+        measure: Name of one, a `Measure` or another `EpisodeMeasure`, or a function from a `Moment` of B scenarios to
+            shape (B,): small is dangerous, the least over the moments counts, a collision counts as -1.
 
     Raises:
         ValueError: If it is none of these; an unknown name comes with the nearest known one.
+
+    Example:
+        >>> find_measure("drac").unit
+        'm/s^2'
+        >>> find_measure(lambda moment: moment.lead.gap).collision
+        -1.0
     """
     if isinstance(measure, str) and measure in MEASURES:
         return MEASURES[measure]
     if not isinstance(measure, str | type):
-        if all(callable(getattr(measure, name, None)) for name in ("start", "update", "f")):
-            found: EpisodeMeasure = measure
-            return found
+        if isinstance(measure, EpisodeMeasure):
+            return measure
         if callable(measure):
             return Measure(measure, unit="")
     hint = did_you_mean(measure, MEASURES) if isinstance(measure, str) else ""

@@ -1,4 +1,4 @@
-"""Responsibility-Sensitive Safety: distances that are kept by whoever is not to blame.
+"""Responsibility-Sensitive Safety (RSS): distance less the safe distance, along and across the road.
 
 References:
     Shalev-Shwartz, Shammah and Shashua, "On a formal model of safe and scalable self-driving cars", 2017: safe
@@ -21,7 +21,15 @@ MARGIN_MAX = 1000.0
 
 @dataclass(frozen=True)
 class RSS:
-    """Parameters of the model. The paper leaves them open; these are the starting values of Intel's ad-rss-lib."""
+    """Parameters of the model. The paper leaves them open; these are the starting values of Intel's ad-rss-lib.
+
+    Example:
+        >>> from functools import partial
+        >>> from rare_envs.measures import Measure
+        >>> stricter = Measure(partial(rss_margin, rss=RSS(response=2.0)), collision=-1000.0, unit="m")
+        >>> stricter.of.keywords["rss"].brake_most
+        8.0
+    """
 
     response: float = 1.0
     """Response time rho of the ego [s]."""
@@ -51,7 +59,7 @@ class Margins(NamedTuple):
 
 
 def margins(moment: Moment, rss: RSS) -> Margins:
-    """Margins of the ego with every other vehicle, along and across the road.
+    """Return the margins of the ego with every other vehicle, along and across the road.
 
     d_along = [v_r rho + a rho^2 / 2 + (v_r + a rho)^2 / (2 b_least) - v_f^2 / (2 b_most)]+ with v_r the speed of the
     rear vehicle and v_f of the front one.
@@ -81,13 +89,13 @@ def margins(moment: Moment, rss: RSS) -> Margins:
 
 
 def _sway(towards: Tensor, response: float, rss: RSS) -> Tensor:
-    """Lateral way [m] until at rest of a vehicle that first accelerates towards the other."""
+    """Return the lateral way [m] until at rest of a vehicle that first accelerates towards the other."""
     faster = towards + rss.swerve * response
     return (towards + faster) / 2 * response + faster.clamp(min=0.0).square() / (2 * rss.steady)
 
 
 def rss_longitudinal(moment: Moment, rss: RSS = RSS()) -> Tensor:
-    """Longitudinal RSS margin: distance less the safe one, of vehicles whose lateral distance is not safe.
+    """Return the longitudinal RSS margin: distance less the safe one, of vehicles whose lateral distance is not safe.
 
     Critical value: 0.
 
@@ -97,13 +105,19 @@ def rss_longitudinal(moment: Moment, rss: RSS = RSS()) -> Tensor:
 
     Returns:
         The least margin over the other vehicles [m], shape (B,).
+
+    Example:
+        >>> from rare_envs.measures import Moment
+        >>> moment = Moment.of_two(gap=60.0, speed=20.0, lead_speed=20.0)
+        >>> round(rss_longitudinal(moment).item(), 3)  # 60 - (21.75 + 23.5^2 / 8 - 20^2 / 16)
+        -5.781
     """
     of = margins(moment, rss)
     return least(torch.where(of.across < 0, of.along, MARGIN_MAX), MARGIN_MAX)
 
 
 def rss_lateral(moment: Moment, rss: RSS = RSS()) -> Tensor:
-    """Lateral RSS margin: distance less the safe one, of vehicles whose longitudinal distance is not safe.
+    """Return the lateral RSS margin: distance less the safe one, of vehicles whose longitudinal distance is not safe.
 
     Critical value: 0.
 
@@ -113,13 +127,19 @@ def rss_lateral(moment: Moment, rss: RSS = RSS()) -> Tensor:
 
     Returns:
         The least margin over the other vehicles [m], shape (B,).
+
+    Example:
+        >>> from rare_envs.measures import Moment
+        >>> moment = Moment.of_two(gap=60.0, speed=20.0, lead_speed=20.0)
+        >>> round(rss_lateral(moment).item(), 3)  # level across, and 0.725 m of safe distance
+        -0.725
     """
     of = margins(moment, rss)
     return least(torch.where(of.along < 0, of.across, MARGIN_MAX), MARGIN_MAX)
 
 
 def rss_margin(moment: Moment, rss: RSS = RSS()) -> Tensor:
-    """RSS margin: a situation is dangerous where neither distance to a vehicle is safe.
+    """Return the RSS margin: a situation is dangerous where neither distance to a vehicle is safe.
 
     The larger of the two margins with each vehicle, the least over vehicles: negative exactly in a dangerous situation.
 
@@ -131,5 +151,11 @@ def rss_margin(moment: Moment, rss: RSS = RSS()) -> Tensor:
 
     Returns:
         The margin [m], shape (B,).
+
+    Example:
+        >>> from rare_envs.measures import Moment
+        >>> moment = Moment.of_two(gap=60.0, speed=20.0, lead_speed=20.0)
+        >>> round(rss_margin(moment).item(), 3)  # the larger of both
+        -0.725
     """
     return least(torch.maximum(*margins(moment, rss)), MARGIN_MAX)

@@ -1,4 +1,4 @@
-"""Signal temporal logic: f is the robustness of a formula over an episode, by rtamt (`pip install rare-envs[stl]`).
+"""Signal temporal logic: the robustness of a formula over an episode, by rtamt (`pip install rare-envs[stl]`).
 
 References:
     Donze and Maler, "Robust satisfaction of temporal logic over real-valued signals", 2010; Nickovic and Yamaguchi,
@@ -53,7 +53,7 @@ _NAME = re.compile(r"[A-Za-z_]\w*")
 
 
 def stl(formula: str) -> TraceMeasure:
-    """Robustness of a formula of signal temporal logic over the episode, at its start: by how much it holds.
+    """Return the robustness of a formula of signal temporal logic over the episode: by how much it holds at its start.
 
     Negative where the formula is violated, so f <= 0 counts episodes that violate it (or just hold it), and a collision
     counts only if the formula speaks of it, as "always (clearance > 0)" does not quite: its signal is over 0 until
@@ -66,8 +66,13 @@ def stl(formula: str) -> TraceMeasure:
     Raises:
         ValueError: If it does not parse or names an unknown signal.
         ImportError: If rtamt is not installed.
+
+    Example:
+        >>> import rare_envs
+        >>> measure = stl("always (gap > 2)")  # doctest: +SKIP
+        >>> rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", measure=measure)  # doctest: +SKIP
     """
-    _parsed(formula, 1e-3)
+    _parse(formula, 1e-3)
     return TraceMeasure(Robustness(formula), collision=None)
 
 
@@ -78,12 +83,12 @@ class Robustness:
     formula: str
 
     def __call__(self, trace: Trace) -> Tensor:
-        """From a trace of B episodes to shape (B,).
+        """Return the robustness in B episodes, shape (B,).
 
         Raises:
             ValueError: If a time in the formula is no multiple of the tick, or a vehicle in it does not exist.
         """
-        monitor, names = _parsed(self.formula, trace.dt)
+        monitor, names = _parse(self.formula, trace.dt)
         columns = {name: _signal(trace, name).T.tolist() for name in names}
         ticks = [trace.dt * k for k in range(len(trace.valid))]
         found = []
@@ -94,7 +99,7 @@ class Robustness:
 
 
 def _signal(trace: Trace, name: str) -> Tensor:
-    """One signal, shape (T, B)."""
+    """Return one signal, shape (T, B)."""
     if name in SIGNALS:
         return trace.of(SIGNALS[name])
     field, _, vehicle = name.rpartition("_")
@@ -104,8 +109,8 @@ def _signal(trace: Trace, name: str) -> Tensor:
     return values[:, :, int(vehicle)]
 
 
-def _parsed(formula: str, dt: float) -> tuple[Any, list[str]]:
-    """A monitor for a formula, and the signals that it names."""
+def _parse(formula: str, dt: float) -> tuple[Any, list[str]]:
+    """Return a monitor for a formula, and the signals that it names."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DeprecationWarning)  # of the parser that it uses
@@ -123,7 +128,7 @@ def _parsed(formula: str, dt: float) -> tuple[Any, list[str]]:
     monitor.spec = formula
     monitor.set_sampling_period(dt, "s", 0.1)
     try:
-        with _silent():
+        with _without_logging():
             monitor.parse()
     except KeyError as error:
         unknown = str(error.args[0])
@@ -141,7 +146,7 @@ def _parsed(formula: str, dt: float) -> tuple[Any, list[str]]:
 
 
 @contextmanager
-def _silent() -> Iterator[None]:
+def _without_logging() -> Iterator[None]:
     """Keep rtamt from logging what is raised as an error here."""
     level = logging.root.manager.disable
     logging.disable(logging.WARNING)

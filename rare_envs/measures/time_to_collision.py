@@ -1,4 +1,4 @@
-"""Times until the ego meets what is ahead of it: its lead, the edge of the road, what its lidar sees."""
+"""Times to collision of the ego: with its lead, with the edge of the road, with the bodies that its lidar meets."""
 
 import torch
 from torch import Tensor
@@ -11,7 +11,7 @@ TTC_MAX = 10.0
 
 
 def ttc(moment: Moment) -> Tensor:
-    """Time to collision of the ego with its lead, or with the edge of the road, if speeds and headings stay.
+    """Return the time to collision (TTC) with the lead or the edge of the road, if speeds and headings stay.
 
     To the lead: gap / closing speed while closing. To the edge, which is a wall: way to it / speed across the road
     towards it; for an ego that drives straight there is none. The smaller of the two, at most `TTC_MAX`. Gaps are at
@@ -28,6 +28,11 @@ def ttc(moment: Moment) -> Tensor:
 
     References:
         Hayward, "Near-miss determination through use of a scale of danger", 1972.
+
+    Example:
+        >>> from rare_envs.measures import Moment
+        >>> ttc(Moment.of_two(gap=25.0, speed=20.0, lead_speed=10.0)).item()
+        2.5
     """
     lead = moment.lead
     to_lead = lead.gap.clamp(min=GAP_MIN) / lead.closing_speed.clamp(min=STILL)
@@ -35,7 +40,7 @@ def ttc(moment: Moment) -> Tensor:
 
 
 def time_to_edge(moment: Moment) -> Tensor:
-    """Time until the ego's centre leaves the road if speed and heading stay [s], shape (B,).
+    """Return the time until the ego's centre leaves the road if speed and heading stay [s], shape (B,).
 
     Way to the edge / speed across the road towards it; without a cap, up to 20 000 s for an ego that drives straight.
     """
@@ -47,7 +52,7 @@ def time_to_edge(moment: Moment) -> Tensor:
 
 
 def lidar_ttc(moment: Moment) -> Tensor:
-    """Least time to collision along the ego's lidar beams: range / closing speed of each that closes, at most 10 s.
+    """Return the least time to collision along the ego's lidar beams: range / closing speed, at most 10 s.
 
     The beams start at the ego's centre, so at contact about 1 m is left at the side and 2.5 m ahead: small values come
     with violent contacts, side-swipes above all. The moment of a collision is not measured, and a collision is worth
@@ -63,6 +68,14 @@ def lidar_ttc(moment: Moment) -> Tensor:
     References:
         O'Kelly, Sinha, Namkoong, Duchi and Tedrake, "Scalable end-to-end autonomous vehicle testing via rare-event
         simulation", 2018, appendix A and released code.
+
+    Example:
+        >>> from rare_envs.measures import Moment
+        >>> from rare_envs.sensors.perception import perceive_traffic
+        >>> moment = Moment.of_two(gap=25.0, speed=20.0, lead_speed=10.0)
+        >>> seen = perceive_traffic(moment.state, moment.road)
+        >>> lidar_ttc(moment._replace(perception=seen)).item()  # the beam starts 2.5 m behind the bumper
+        2.75
     """
     assert moment.perception is not None
     ego = moment.perception[:, 0]
@@ -72,7 +85,7 @@ def lidar_ttc(moment: Moment) -> Tensor:
 
 
 def mttc(moment: Moment) -> Tensor:
-    """Modified time to collision of the ego with its lead: if both keep their accelerations.
+    """Return the modified time to collision (MTTC) with the lead: if both keep their accelerations.
 
     The least t > 0 with gap - dv t - da t^2 / 2 = 0, dv the closing speed, da the ego's acceleration less the lead's:
     t = 2 gap / (dv + sqrt(dv^2 + 2 da gap)); there is none where the root is not real or the denominator not positive.
@@ -89,6 +102,14 @@ def mttc(moment: Moment) -> Tensor:
     References:
         Ozbay, Yang, Bartin and Mudigonda, "Derivation and validation of new simulation-based surrogate safety measure",
         Transportation Research Record 2083, 2008.
+
+    Example:
+        >>> from rare_envs.measures import Moment
+        >>> moment = Moment.of_two(gap=20.0, speed=20.0, lead_speed=20.0)
+        >>> faster = moment.state.speed + torch.tensor([0.0, 0.4])  # the lead brakes by 4 m/s^2
+        >>> before = moment.state._replace(speed=faster)
+        >>> round(mttc(moment._replace(before=before)).item(), 2)  # sqrt(2 20 / 4)
+        3.16
     """
     gap, dv = gap_of(moment), moment.lead.closing_speed
     da = moment.acceleration[:, 0] - acceleration_of_lead(moment)
@@ -100,7 +121,7 @@ def mttc(moment: Moment) -> Tensor:
 
 
 def thw(moment: Moment) -> Tensor:
-    """Time headway of the ego: how long until it is where its lead's rear bumper is now, gap / speed.
+    """Return the time headway (THW), gap / speed: how long until the ego is where its lead's rear bumper is now.
 
     SAE J2944 calls this the time gap and keeps "headway" for bumper-to-same-bumper, which would not be 0 in contact.
 
@@ -115,5 +136,10 @@ def thw(moment: Moment) -> Tensor:
     References:
         Vogel, "A comparison of headway and time to collision as safety indicators", Accident Analysis and Prevention
         35, 2003.
+
+    Example:
+        >>> from rare_envs.measures import Moment
+        >>> thw(Moment.of_two(gap=25.0, speed=20.0, lead_speed=10.0)).item()
+        1.25
     """
     return (gap_of(moment) / moment.state.speed[:, 0].clamp(min=STILL)).clamp(max=TTC_MAX)

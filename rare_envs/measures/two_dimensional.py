@@ -1,12 +1,11 @@
-"""How near the ego is to every other vehicle, as boxes in the plane."""
+"""Measures in two dimensions: the ego and every other vehicle as oriented boxes in the plane."""
 
 import torch
 from torch import Tensor
 
 from rare_envs.measures.moment import GAP_MIN, Moment
 from rare_envs.measures.time_to_collision import TTC_MAX, time_to_edge
-from rare_envs.traffic.oriented_boxes import box_distance as distance
-from rare_envs.traffic.oriented_boxes import time_to_contact
+from rare_envs.traffic.oriented_boxes import box_distance, time_to_contact
 from rare_envs.traffic.pairs import encounter, least
 
 CLEARANCE_MAX = 1000.0
@@ -18,7 +17,7 @@ TIME_MIN = 1e-3
 
 
 def ttc_2d(moment: Moment) -> Tensor:
-    """Time to collision of oriented boxes: until the ego touches any other vehicle, if velocities and headings stay.
+    """Return the time until the ego's box touches that of any other vehicle, if velocities and headings stay.
 
     An exact swept test (`rare_envs.traffic.oriented_boxes.time_to_contact`) with every vehicle, whatever its lane, and
     the way to the edge of the road as in `ttc`; the least of them, at most `TTC_MAX`.
@@ -34,6 +33,11 @@ def ttc_2d(moment: Moment) -> Tensor:
     References:
         Hayward, "Near-miss determination through use of a scale of danger", 1972; Ericson, "Real-time collision
         detection", 2005, section 5.5 (separating axes of moving bodies).
+
+    Example:
+        >>> from rare_envs.measures import Moment
+        >>> ttc_2d(Moment.of_two(gap=25.0, speed=20.0, lead_speed=10.0)).item()
+        2.5
     """
     met = encounter(moment.state, moment.road)
     times = least(time_to_contact(met.axes, met.rate).clamp(min=TIME_MIN), TTC_MAX)
@@ -41,7 +45,7 @@ def ttc_2d(moment: Moment) -> Tensor:
 
 
 def clearance(moment: Moment) -> Tensor:
-    """Clearance: the exact distance between the ego's body and the nearest other.
+    """Return the exact distance between the ego's body and the nearest other.
 
     Critical value: none is agreed on; 0.5 m beside and 2 m ahead are small.
 
@@ -50,13 +54,18 @@ def clearance(moment: Moment) -> Tensor:
 
     Returns:
         Distance [m], in [0.01, CLEARANCE_MAX], shape (B,).
+
+    Example:
+        >>> from rare_envs.measures import Moment
+        >>> clearance(Moment.of_two(gap=25.0, speed=20.0, lead_speed=10.0)).item()
+        25.0
     """
     met = encounter(moment.state, moment.road)
-    return least(distance(met.axes, met.turn).clamp(min=GAP_MIN), CLEARANCE_MAX)
+    return least(box_distance(met.axes, met.turn).clamp(min=GAP_MIN), CLEARANCE_MAX)
 
 
 def margin(moment: Moment) -> Tensor:
-    """Time to contact without a cap: it tells vehicles apart that are far, level or on their way apart.
+    """Return the time to contact without a cap: it tells vehicles apart that are far, level or on their way apart.
 
     Along each of the four axes on which two boxes can be apart, the time in which the gap g closes at the rate c:
     2 g / (c + sqrt(c^2 + 4 d^2)) with d = `DRIFT`, about g / c where it closes, g / d where it stays, g |c| / d^2 where
@@ -73,6 +82,13 @@ def margin(moment: Moment) -> Tensor:
 
     Returns:
         Margin [s], positive, shape (B,).
+
+    Example:
+        >>> from rare_envs.measures import Moment
+        >>> round(margin(Moment.of_two(gap=25.0, speed=20.0, lead_speed=10.0)).item(), 2)  # closing: about 25 / 10
+        2.5
+        >>> round(margin(Moment.of_two(gap=25.0, speed=20.0, lead_speed=20.0)).item(), 2)  # not closing: 25 / 0.2
+        125.0
     """
     met = encounter(moment.state, moment.road)
     gap, closing = met.axes.gap, -met.rate * torch.sign(met.axes.offset)

@@ -19,7 +19,7 @@ class Measurement:
 
     Example:
         >>> Measurement("pet").records
-        False
+        True
 
     Raises:
         ValueError: If the measure is unknown, or `collisions` is not one of `COLLISIONS`.
@@ -45,4 +45,4 @@ class Measurement:
     @property
     def records(self) -> bool:
         """Whether the measure keeps whole episodes."""
-        return bool(getattr(self.episode_measure, "records", False))
+        return self.episode_measure.records

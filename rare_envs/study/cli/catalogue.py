@@ -75,5 +75,6 @@ def catalogue() -> dict[str, Any]:
 
 
 def _first_line(documented: object) -> str:
-    """First line of a docstring."""
-    return (documented.__doc__ or "").strip().partition("\n")[0]
+    """Return the first line of a docstring, as a noun: "Return the gap ..." becomes "Gap ..."."""
+    line = (documented.__doc__ or "").strip().partition("\n")[0].removeprefix("Return the ")
+    return line[:1].upper() + line[1:]
