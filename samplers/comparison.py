@@ -1,4 +1,4 @@
-"""Two functions on the same draws: how many times likelier is failure of one than of the other?"""
+"""Comparison: the ratio of two probabilities of failure, from the same draws for both."""
 
 import math
 from dataclasses import asdict, dataclass, field
@@ -15,7 +15,7 @@ from samplers.execution.arguments import check_problem
 from samplers.execution.progress import Listener
 from samplers.method import Stepping
 from samplers.methods.two_stage.method import TwoStage
-from samplers.problem import Distribution, FloatArray, Problem, condition_of
+from samplers.problem import FloatArray, Problem, condition_of
 from samplers.result import Estimate
 from samplers.serialization import to_json_value
 from samplers.statistics.cluster_sums import has_independent_points, interval_of_sum
@@ -23,33 +23,49 @@ from samplers.statistics.intervals import Interval, degrees_of_freedom, zero_hit
 from samplers.statistics.weights import effective_number
 
 MIN_SIDE_ESS = 30.0
-"""Effective failing units below which a probability is called coarse."""
+"""Effective failing units below which a probability is called coarse: its c.o.v. is then about 0.2 or more."""
 BASE_CHECK_DRAWS = 16
-"""Draws at which the two base laws are compared."""
+"""Draws at which the densities of the two base distributions are compared."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Side:
-    """P[f(X) <= gamma] of one of the two."""
+    """P[f(X) <= gamma] of one of the two problems."""
 
     p: float
+    """Estimated probability."""
     interval: Interval
+    """Interval that should hold the true p with probability `confidence` of the comparison."""
     cov: float
+    """Coefficient of variation of p; inf where p = 0."""
     ess: float
     """Effective number of independent failing units behind p."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Comparison:
-    """p_A / p_B from the same draws with the same weights."""
+    """p_A / p_B from the same draws with the same weights.
+
+    Example:
+        >>> import samplers
+        >>> a, b = (samplers.FunctionProblem(lambda x, at=at: at - x[:, 0], dim=2) for at in (3.0, 3.2))
+        >>> found = samplers.compare(a, b, seed=0, max_sim=8000)
+        >>> found.n_sim, found.interval[0] < 1.965 < found.interval[1]  # Phi(-3) / Phi(-3.2)
+        (8000, True)
+        >>> round(found.both / found.b.p, 2)  # B fails where A does
+        1.0
+    """
 
     ratio: float
     """p_A / p_B; inf where p_B = 0, NaN where both are 0."""
     interval: Interval
     """Interval that should hold the true ratio with probability `confidence`."""
     confidence: float
+    """Nominal coverage of the intervals."""
     a: Side
+    """A by itself."""
     b: Side
+    """B by itself."""
     both: float
     """P[both fail]."""
     n_sim: int
@@ -84,12 +100,15 @@ class Comparison:
 
 
 class EitherFails:
-    """The problem that fails where A or B does: f = min(f_A, f_B), and which of them it was.
+    """The problem that fails where A or B does, f = min(f_A, f_B); it remembers which of them failed.
 
     Args:
         a: Problem A.
-        b: Problem B, with the same base law.
+        b: Problem B, with the same base distribution.
         gamma: Threshold of failure.
+
+    Attributes:
+        n_sim: Simulations of A and of B together.
     """
 
     def __init__(self, a: Problem, b: Problem, gamma: float) -> None:
@@ -108,11 +127,11 @@ class EitherFails:
             self._known[x[row].tobytes()] = (bool(f[0, row] <= self._gamma), bool(f[1, row] <= self._gamma))
         return least
 
-    def who_fails(self, x: FloatArray) -> NDArray[np.bool_]:
+    def failing_sides(self, x: FloatArray) -> NDArray[np.bool_]:
         """Return whether A and whether B fails at points x (k, d) that were simulated, shape (2, k)."""
-        lost = np.array([row.tobytes() not in self._known for row in x], dtype=bool)
-        if lost.any():  # mapped there and back in another batch, some coordinate differs by its last bit
-            self.evaluate(x[lost])
+        unknown = np.array([row.tobytes() not in self._known for row in x], dtype=bool)
+        if unknown.any():  # mapped there and back in another batch, some coordinate differs by its last bit
+            self.evaluate(x[unknown])
         return np.array([self._known.get(row.tobytes(), (False, False)) for row in x], dtype=bool).reshape(-1, 2).T
 
 
@@ -140,7 +159,7 @@ def compare(
 
     Args:
         a: Problem A: `dim`, `base`, `evaluate`.
-        b: Problem B, with the same base law.
+        b: Problem B, with the same base distribution.
         method: One that gives weighted points (`Estimate.sample`), as all of `METHODS` do.
         gamma: Threshold of failure, for both.
         seed: Same seed, same answer.
@@ -149,7 +168,14 @@ def compare(
         progress: As in `estimate`.
 
     Raises:
-        ValueError: If an argument is not as described in `estimate`, or the base laws differ.
+        ValueError: If an argument is not as described in `estimate`, or the base distributions differ.
+
+    Example:
+        >>> import samplers
+        >>> a = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
+        >>> b = samplers.FunctionProblem(lambda x: 3.2 - x[:, 0], dim=2)
+        >>> print(f"{samplers.compare(a, b, seed=0, max_sim=8000).ratio:.1f}")  # Phi(-3) / Phi(-3.2) = 1.96
+        2.0
     """
     for problem in (a, b):
         check_problem(problem, ("dim", "base", "evaluate"))
@@ -161,22 +187,20 @@ def compare(
 
 
 def _check_same_base(a: Problem, b: Problem) -> None:
-    """Raise a ValueError unless X has the same law in both problems, as far as a few draws tell."""
+    """Raise a ValueError if the densities of X in the two problems differ at some draws of A's."""
     if int(a.dim) != int(b.dim):
         raise ValueError(f"Expected two problems with the same x, got {a.dim} and {b.dim} dimensions.")
     x = a.base.sample(BASE_CHECK_DRAWS, np.random.default_rng(0))
-    laws: tuple[Distribution, Distribution] = (a.base, b.base)
-    log_p = [law.log_prob(x) for law in laws]
-    if not np.allclose(log_p[0], log_p[1], rtol=1e-9, atol=1e-9):
+    if not np.allclose(a.base.log_prob(x), b.base.log_prob(x), rtol=1e-9, atol=1e-9):
         raise ValueError("Expected two problems with the same base distribution; their densities differ.")
 
 
 def _summarise(found: Estimate, problem: EitherFails) -> Comparison:
-    """Return what the points of an estimate of P[A or B fails] say of the two."""
+    """Return the comparison that the points of an estimate of P[A or B fails] give."""
     sample = require_sample(found)
     fails = sample.f <= found.gamma
     weights, units = sample.weights[fails], sample.units[fails]
-    which = problem.who_fails(sample.x)
+    which = problem.failing_sides(sample.x)
     totals = np.array([np.bincount(units, weights=weights * hit, minlength=sample.n_units) for hit in which])
     own = float(np.bincount(units, weights=weights, minlength=sample.n_units).std()) * math.sqrt(sample.n_units)
     factor = cov_inflation(found, own / found.p if found.p > 0 else math.inf)
@@ -198,6 +222,7 @@ def _summarise(found: Estimate, problem: EitherFails) -> Comparison:
 
 
 def _ratio(a: float, b: float) -> float:
+    """Return a / b; inf where b alone is 0, NaN where both are."""
     if b > 0:
         return a / b
     return math.inf if a > 0 else math.nan
@@ -219,7 +244,7 @@ def _interval(totals: FloatArray, factor: float, single: bool, found: Estimate) 
         return 0.0, math.inf
     apart = totals[0] != totals[1]  # units that tell the two from one another
     if p_a == 0 or p_b == 0 or not apart.any():
-        # Of `ess` draws none was such that ...: of such draws there are at most
+        # none of `ess` effective draws was of the kind that is missing: its share is at most
         share = zero_hit_bound(max(round(effective_number(totals.max(axis=0))), 1), found.confidence)
         if p_a == 0:
             return 0.0, share

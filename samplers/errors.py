@@ -18,7 +18,16 @@ class FinalError(Protocol):
 
 
 class EvaluationError(ValueError):
-    """f raised, returned NaN or returned something that is not one number per row."""
+    """f raised, returned NaN or returned something that is not one number per row.
+
+    Example:
+        >>> import samplers
+        >>> problem = samplers.FunctionProblem(lambda x: x, dim=2)
+        >>> samplers.estimate(problem, "mc", seed=0, max_sim=100)
+        Traceback (most recent call last):
+            ...
+        samplers.errors.EvaluationError: Expected f to return shape (100,), one value per row of x, got (100, 2).
+    """
 
     final = True
 

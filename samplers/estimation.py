@@ -54,9 +54,9 @@ def estimate(
             of all runs by draws of all runs, with the Clopper-Pearson interval of these counts.
             All others are combined by their mean with a t interval on the log scale, which with
             2 or 3 runs is very wide.
-        on_error: Where f raises or gives NaN: "raise" stops and names the row; "failure" counts
-            the point as failing; "bound" also counts it as failing in p and in the upper end of
-            the interval, but not in the lower end.
+        on_error: Where f raises or returns NaN: "raise" stops and names the row; "failure" counts
+            the point as failing; "bound" counts it as failing in p and in the upper end of the
+            interval, but not in the lower end.
         progress: True for a bar on standard error, or a function that is given `Progress`.
         time_limit: Seconds after which the run is stopped. Looked at after every batch: one that
             is under way is not cut short.
@@ -64,10 +64,22 @@ def estimate(
 
     Returns:
         The probability, its interval, its cost and the failures. Of a run that was stopped (status
-        "stopped"), what its simulations say: see `combine` for replicates.
+        "stopped"), the estimate from the simulations made so far.
 
     Raises:
         ValueError: If an argument is not as described, or f does not return one number per row.
+
+    Example:
+        The half-space f = 3.5 - sum(x) / sqrt(10) in ten dimensions, P[f <= 0] = Phi(-3.5) = 2.326e-4:
+
+        >>> import samplers
+        >>> problem = samplers.FunctionProblem(lambda x: 3.5 - x.sum(axis=1) / 10**0.5, dim=10)
+        >>> result = samplers.estimate(problem, seed=0, max_sim=6000)
+        >>> print(f"{result.p:.2e} from {result.n_sim} simulations, {result.status}")
+        2.33e-04 from 6000 simulations, converged
+        >>> checked = samplers.estimate(problem, "mc", seed=0, max_sim=100_000)
+        >>> [round(end, 6) for end in checked.interval]
+        [9.9e-05, 0.000272]
     """
     check_problem(problem, ("dim", "base", "evaluate"))
     chosen = get_method(method) if isinstance(method, str) else method

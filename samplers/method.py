@@ -1,4 +1,4 @@
-"""What a method is: settings with `steps`, given a goal, asking for simulations and giving an outcome."""
+"""Contract of a method: `steps` takes a goal, requests points, receives their f and returns an outcome."""
 
 import sys
 from collections.abc import Callable, Generator, Sequence
@@ -20,7 +20,14 @@ def ignore_level(level: Level) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Goal:
-    """What a method is asked for."""
+    """The probability that a method shall estimate, how well, and with how many simulations.
+
+    Example:
+        >>> import samplers
+        >>> goal = samplers.Goal(gamma=0.0, max_sim=500)
+        >>> goal.budget, goal.confidence
+        (500, 0.95)
+    """
 
     gamma: float
     """Threshold of failure, f <= gamma."""
@@ -29,7 +36,7 @@ class Goal:
     max_sim: int | None = None
     """Simulations that the run may use; None leaves it to the method."""
     target_cov: float | None = None
-    """Coefficient of variation to stop at, for methods with `stops_at_target`; `estimate` judges if it is met."""
+    """Coefficient of variation to stop at, for methods with `stops_at_target`; the run decides whether it is met."""
     on_level: Callable[[Level], None] = ignore_level
     """Called with every finished level."""
 
@@ -41,14 +48,27 @@ class Goal:
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """What one run of a method found."""
+    """Result of one run of a method.
+
+    Example:
+        >>> import samplers
+        >>> outcome = samplers.Outcome.of_counts(10, 1000, confidence=0.95, trace=())
+        >>> outcome.p, [round(end, 4) for end in outcome.interval], round(outcome.cov, 3)
+        (0.01, [0.0048, 0.0183], 0.315)
+    """
 
     p: float
+    """Estimated probability P[f(X) <= goal.gamma]."""
     interval: tuple[float, float]
+    """Interval that should hold the true p with probability goal.confidence."""
     cov: float
+    """Estimated coefficient of variation of p; inf where p = 0."""
     status: Status
+    """How the run ended."""
     warnings: tuple[str, ...] = ()
+    """What makes the numbers doubtful, a sentence each."""
     trace: tuple[Level, ...] = ()
+    """One entry per level, iteration or batch."""
     no_outcome_share: float = 0.0
     """Share of p that comes from points without an outcome (f raised or gave NaN)."""
     counts: tuple[int, int] | None = None
@@ -56,8 +76,8 @@ class Outcome:
     sample: Sample | None = None
     """The points behind p; None if the method cannot give them."""
     base_draws: int = 0
-    """Independent draws from the base law that the run made, wherever: they bound what `Estimate.unseen` says. Of
-    draws from a mixture, the expected number from its base component."""
+    """Independent draws from the base distribution that the run made, search included: `Estimate.unseen` follows from
+    them. Of draws from a mixture, the expected number from its base component."""
 
     @classmethod
     def of_counts(
@@ -71,11 +91,6 @@ class Outcome:
             confidence: Nominal coverage of the interval.
             trace: Levels of the run.
             no_outcome_share: Share of the hits that are points without an outcome.
-
-        Example:
-            >>> outcome = Outcome.of_counts(10, 1000, confidence=0.95, trace=())
-            >>> outcome.p, [round(end, 4) for end in outcome.interval], round(outcome.cov, 3)
-            (0.01, [0.0048, 0.0183], 0.315)
         """
         return cls(
             p=hits / n,
@@ -91,20 +106,45 @@ class Outcome:
 
 
 class Interrupted(Exception):
-    """Thrown into a method where it waits for outcomes: there will be no more of them."""
+    """Thrown into the steps of a method where it waits for f: there will be no more values of it.
+
+    Example:
+        >>> import numpy as np, samplers
+        >>> class OneByOne(samplers.Method):
+        ...     name, stops_at_target = "one-by-one", False
+        ...     def steps(self, inputs, goal, rng):
+        ...         hits, status = 0, samplers.Status.CONVERGED
+        ...         for n in range(1, goal.budget + 1):
+        ...             try:
+        ...                 f = yield inputs.base.sample(1, rng)
+        ...             except samplers.Interrupted:
+        ...                 n, status = n - 1, samplers.Status.STOPPED
+        ...                 break
+        ...             hits += int(f[0] <= goal.gamma)
+        ...         return samplers.Outcome(p=hits / n, interval=(0.0, 1.0), cov=1.0, status=status)
+        >>> problem = samplers.FunctionProblem(lambda x: x[:, 0], dim=1)
+        >>> result = samplers.estimate(problem, OneByOne(), seed=0, max_sim=99, stop=lambda at: at.n_sim == 4)
+        >>> result.n_sim, str(result.status)
+        (4, 'stopped')
+    """
 
 
 Steps = Generator[FloatArray, FloatArray, Outcome]
-"""Yields points x (n, d) to be simulated, is sent their f (n,), returns the outcome."""
+"""Generator that yields points x (n, d) to be simulated, is sent their f (n,) and returns the outcome."""
 
 
 @runtime_checkable
 class Stepping(Protocol):
-    """What `estimate` needs of a method: a name and its steps. As a rule a frozen dataclass of settings.
+    """The attributes that `estimate` needs of a method. As a rule a method is a frozen dataclass of settings.
 
     `steps` keeps to `goal.max_sim`, draws only from `rng` and yields as few and as large batches
     as it can. `Interrupted` may be thrown in at any yield but the first (time limit, callback): it
-    then returns what the simulations made so far say, with Status.STOPPED, and yields no more.
+    then returns the outcome of the simulations made so far, with Status.STOPPED, and yields no more.
+
+    Example:
+        >>> import samplers
+        >>> isinstance(samplers.MonteCarlo(), samplers.Stepping)
+        True
     """
 
     name: ClassVar[str]

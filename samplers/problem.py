@@ -1,7 +1,4 @@
-"""What a sampler needs to know about the world: a base distribution and a function f.
-
-P[f(X) <= gamma] with X ~ base; small f is dangerous.
-"""
+"""Problem: the probability P[f(X) <= gamma] of a function f and a base distribution of X; small f is dangerous."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,10 +16,27 @@ LOG_TWO_PI = float(np.log(2 * np.pi))
 
 @runtime_checkable
 class Distribution(Protocol):
-    """A law on R^d with an exact map to and from standard normal space.
+    """A distribution on R^d with an exact map to and from standard normal space.
 
-    It may say which coordinates are a simulation's own randomness, by an attribute `noise`, booleans of shape (d,);
-    `TwoStage` draws those as they come.
+    Example:
+        Half-normal in each coordinate: x = Phi^-1((1 + Phi(u)) / 2).
+
+        >>> import numpy as np, samplers
+        >>> from scipy import stats
+        >>> class HalfNormal:
+        ...     def sample(self, n, rng):
+        ...         return np.abs(rng.standard_normal((n, 2)))
+        ...     def log_prob(self, x):
+        ...         return stats.halfnorm.logpdf(x).sum(axis=1)
+        ...     def to_standard_normal(self, x):
+        ...         return stats.norm.ppf(stats.halfnorm.cdf(x))
+        ...     def from_standard_normal(self, u):
+        ...         return stats.halfnorm.ppf(stats.norm.cdf(u))
+        >>> base = HalfNormal()
+        >>> isinstance(base, samplers.Distribution)
+        True
+        >>> base.from_standard_normal(np.zeros((1, 2))).round(4)
+        array([[0.6745, 0.6745]])
     """
 
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
@@ -32,10 +46,10 @@ class Distribution(Protocol):
         """Log density at x (n, d), shape (n,)."""
 
     def to_standard_normal(self, x: FloatArray) -> FloatArray:
-        """Map x ~ this law, shape (n, d), to u ~ N(0, I), shape (n, d)."""
+        """Map x from this distribution, shape (n, d), to u ~ N(0, I), shape (n, d)."""
 
     def from_standard_normal(self, u: FloatArray) -> FloatArray:
-        """Map u ~ N(0, I), shape (n, d), to x ~ this law, shape (n, d)."""
+        """Map u ~ N(0, I), shape (n, d), to x from this distribution, shape (n, d)."""
 
 
 @runtime_checkable
@@ -48,12 +62,40 @@ class Inputs(Protocol):
 
     @property
     def base(self) -> Distribution:
-        """The law of X."""
+        """Distribution of X."""
+
+
+@runtime_checkable
+class HasNoise(Protocol):
+    """A base distribution some of whose coordinates are the simulation's own randomness.
+
+    They are independent standard normal. `TwoStage` does not search among them: it draws them as they come.
+    """
+
+    @property
+    def noise(self) -> NDArray[np.bool_] | None:
+        """Which coordinates of x are noise, shape (d,); None for none."""
 
 
 @runtime_checkable
 class Problem(Inputs, Protocol):
-    """P[f(X) <= gamma] for X ~ base; small f is dangerous."""
+    """P[f(X) <= gamma] for X ~ base; small f is dangerous.
+
+    Any object with these three attributes is one; nothing has to be inherited.
+
+    Example:
+        >>> import samplers
+        >>> class Disc:
+        ...     dim = 2
+        ...     base = samplers.StandardNormal(2)
+        ...     def evaluate(self, x):
+        ...         return 3.0 - (x**2).sum(axis=1) ** 0.5
+        >>> isinstance(Disc(), samplers.Problem)
+        True
+        >>> result = samplers.estimate(Disc(), seed=0, max_sim=3000)  # P = exp(-9 / 2) = 0.0111
+        >>> print(f"{result.p:.3f}")
+        0.011
+    """
 
     def evaluate(self, x: FloatArray) -> FloatArray:
         """Simulate the rows of x (n, d); return f, shape (n,), float64."""
@@ -75,13 +117,20 @@ def condition_of(problem: Inputs) -> str:
 
 @dataclass(frozen=True)
 class StandardNormal:
-    """The law N(0, I) in `dim` dimensions; its map to standard normal space is the identity.
+    """N(0, I) in `dim` dimensions; its map to standard normal space is the identity.
 
     Raises:
         ValueError: If dim is not a positive whole number.
+
+    Example:
+        >>> import numpy as np, samplers
+        >>> base = samplers.StandardNormal(2)
+        >>> base.log_prob(np.zeros((1, 2))).round(4)  # -log(2 pi)
+        array([-1.8379])
     """
 
     dim: int
+    """Number of dimensions d."""
 
     def __post_init__(self) -> None:
         """Check the dimension."""
@@ -114,6 +163,12 @@ class FunctionProblem:
 
     Raises:
         ValueError: If f is not callable or dim is not a positive whole number.
+
+    Example:
+        >>> import numpy as np, samplers
+        >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
+        >>> problem.evaluate(np.array([[1.0, 0.0], [4.0, 0.0]]))
+        array([ 2., -1.])
     """
 
     f: Callable[[FloatArray], ArrayLike]

@@ -1,4 +1,4 @@
-"""The methods by the names that the command line uses, those of other packages included."""
+"""Registry: methods by the names that the command line uses, those of other packages included."""
 
 import inspect
 import warnings
@@ -84,6 +84,11 @@ def get_method(name: str, **settings: Any) -> Stepping:
     Raises:
         ValueError: If the name or a setting is not known (the nearest one is suggested) or a
             setting has a value out of range.
+
+    Example:
+        >>> import samplers
+        >>> samplers.get_method("mc", n=5000)
+        MonteCarlo(n=5000, batch=10000)
     """
     if not isinstance(name, str) or name not in METHODS:
         check_name("method", name, list(METHODS))

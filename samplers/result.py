@@ -1,36 +1,42 @@
-"""What comes back from `estimate`: the probability, how far to trust it, and the failures."""
+"""Result: the estimate that `estimate` returns, and the failing points that it lists."""
 
 import json
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from samplers.analysis.curve import compute_curve
-from samplers.analysis.failure_modes import split_by_kind
-from samplers.analysis.reweighting import reweight
+from samplers.analysis.curve import Curve, compute_curve
+from samplers.analysis.failure_modes import Share, split_by_kind
+from samplers.analysis.reweighting import HasLogProb, Reweighted, reweight
+from samplers.method import Stepping
 from samplers.problem import Distribution, FloatArray
+from samplers.sample import Sample
 from samplers.serialization import to_json_value
 from samplers.statistics.intervals import zero_hit_bound
 from samplers.trace import Level, Status
 
-if TYPE_CHECKING:
-    from samplers.analysis.curve import Curve
-    from samplers.analysis.failure_modes import Share
-    from samplers.analysis.reweighting import HasLogProb, Reweighted
-    from samplers.method import Stepping
-    from samplers.sample import Sample
-
 
 class Failure(NamedTuple):
-    """One failing point."""
+    """One failing point.
+
+    Example:
+        >>> import samplers
+        >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
+        >>> failure = samplers.estimate(problem, seed=0, max_sim=2000).failures[0]
+        >>> failure.x.shape, bool(failure.f <= 0.0), round(failure.log_p0, 2)
+        ((2,), True, -6.34)
+    """
 
     x: FloatArray
+    """The point, shape (d,)."""
     f: float
+    """Its outcome; NaN where f raised or gave NaN and was counted as failing."""
     log_p0: float
+    """Log density under the base distribution."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +44,15 @@ class Failures:
     """Failing points, the most likely under the base distribution first.
 
     Iterating or indexing gives `Failure(x, f, log_p0)`.
+
+    Example:
+        >>> import samplers
+        >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
+        >>> failures = samplers.estimate(problem, "mc", seed=0, max_sim=10_000).failures
+        >>> len(failures), failures.total
+        (16, 16)
+        >>> failures.x[0].round(2)  # the most likely one
+        array([3.03, 0.28])
     """
 
     x: FloatArray
@@ -51,11 +66,11 @@ class Failures:
 
     @classmethod
     def empty(cls, dim: int) -> "Failures":
-        """No failures of a problem with `dim` dimensions."""
+        """Return no failures, of a problem with `dim` dimensions."""
         return cls(x=np.empty((0, dim)), f=np.empty(0), log_p0=np.empty(0), total=0)
 
     def merge(self, x: FloatArray, f: FloatArray, log_p0: FloatArray, *, keep: int) -> "Failures":
-        """Add points x (k, d), f (k,), log_p0 (k,) and keep the `keep` most likely of all."""
+        """Return these failures and points x (k, d), f (k,), log_p0 (k,), the `keep` most likely of all."""
         all_log_p0 = np.concatenate([self.log_p0, log_p0])
         best = np.argsort(-all_log_p0, kind="stable")[:keep]
         return Failures(
@@ -93,7 +108,18 @@ class Failures:
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
-    """P[f(X) <= gamma] with its interval, its cost and its failures."""
+    """P[f(X) <= gamma] with its interval, its cost and its failures.
+
+    Example:
+        >>> import samplers
+        >>> problem = samplers.FunctionProblem(lambda x: 3.5 - x.sum(axis=1) / 10**0.5, dim=10)
+        >>> result = samplers.estimate(problem, seed=0, max_sim=6000)  # P = Phi(-3.5) = 2.326e-4
+        >>> print(f"{result.p:.2e}, c.o.v. {result.cov:.2f}, {result.n_sim} simulations, {result.status}")
+        2.33e-04, c.o.v. 0.01, 6000 simulations, converged
+        >>> low, high = result.interval
+        >>> low < 2.326e-4 < high, result.warnings
+        (True, ())
+    """
 
     p: float
     """Estimated probability."""
@@ -117,14 +143,14 @@ class Estimate:
     """One entry per level, iteration or batch."""
     failures: Failures
     """Failing points, the most likely first."""
-    method: "Stepping"
+    method: Stepping
     """The method and its settings."""
     seed: int
     """Seed that gives the same run again."""
-    sample: "Sample | None" = field(default=None, compare=False, repr=False)
+    sample: Sample | None = field(default=None, compare=False, repr=False)
     """The weighted points behind p; None if the method cannot give them."""
-    base: "Distribution | None" = field(default=None, compare=False, repr=False)
-    """The law of X."""
+    base: Distribution | None = field(default=None, compare=False, repr=False)
+    """Distribution of X."""
     on_error: str = field(default="raise", repr=False)
     """What was done where f raised or gave NaN."""
     base_draws: int = 0
@@ -134,16 +160,15 @@ class Estimate:
 
     @property
     def unseen(self) -> float:
-        """Largest probability M that a region of failure may have and yet hold none of the base draws.
+        """Largest probability M of a region of failure that may have been missed by all base draws.
 
-        With a larger one the chance to see none of it is under 1 - confidence: M = 1 - (1 - confidence)^(1 / n) for
-        n base draws, the one-sided Clopper-Pearson bound without a hit. 1 without base draws. What leads a method
-        to failures other than base draws (levels of f, wide draws, chains) may find far smaller regions, but
-        guarantees nothing.
+        M = 1 - (1 - confidence)^(1 / n) for n base draws, the one-sided Clopper-Pearson bound without a hit: n draws
+        all miss a larger region with probability under 1 - confidence. M = 1 without base draws. Levels of f, wide
+        draws and chains may find far smaller regions, but guarantee nothing.
         """
         return zero_hit_bound(self.base_draws, self.confidence)
 
-    def curve(self, gammas: ArrayLike) -> "Curve":
+    def curve(self, gammas: ArrayLike) -> Curve:
         """Return P[f(X) <= g] for other thresholds g from the same simulations, with a simultaneous band.
 
         Thresholds above gamma were passed on the way. Below gamma the curve goes on as long as the
@@ -155,10 +180,20 @@ class Estimate:
         Raises:
             ValueError: If a threshold lies below what is known (the text says from where on it is),
                 or the method gave no weighted points.
+
+        Example:
+            >>> import samplers
+            >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
+            >>> result = samplers.estimate(problem, "ce", seed=0, max_sim=10_000)
+            >>> print(result.curve([0.0, 1.0]))  # Phi(-3) and Phi(-2): 1.35e-3 and 2.28e-2
+                       g  P[f <= g]   95 % band
+                       0  1.338e-03   [1.286e-03, 1.392e-03]
+                       1  2.211e-02   [2.037e-02, 2.399e-02]
+
         """
         return compute_curve(self, gammas)
 
-    def reweight(self, new_base: "HasLogProb") -> "Reweighted":
+    def reweight(self, new_base: HasLogProb) -> Reweighted:
         """Return P[f(X) <= gamma] with X from another base distribution, from the same simulations.
 
         Every failing point counts with the ratio of the densities. That works near the old base:
@@ -169,16 +204,28 @@ class Estimate:
         support.
 
         Args:
-            new_base: The other law of X: `log_prob` of points (n, d) in physical space gives (n,).
+            new_base: The other distribution of X: `log_prob` of points (n, d) in physical space gives (n,).
 
         Raises:
             ValueError: If the effective number of units or points is too small, the new base has
                 density where the old has none, it does not fit, nothing failed, or the method gave
                 no weighted points.
+
+        Example:
+            >>> import samplers
+            >>> from scipy import stats
+            >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
+            >>> result = samplers.estimate(problem, seed=0, max_sim=4000)
+            >>> shifted = stats.multivariate_normal([0.5, 0.0])
+            >>> class Shifted:
+            ...     def log_prob(self, x):
+            ...         return shifted.logpdf(x)
+            >>> print(f"{result.reweight(Shifted()).p:.4f}")  # Phi(-2.5) = 0.0062
+            0.0062
         """
         return reweight(self, new_base)
 
-    def shares(self, label: "Callable[[FloatArray], Sequence[str]]", most: int | None = None) -> "dict[str, Share]":
+    def shares(self, label: Callable[[FloatArray], Sequence[str]], most: int | None = None) -> dict[str, Share]:
         """Return p by kind of failure, from the same simulations; the kinds' p add up to p.
 
         Args:
@@ -187,12 +234,22 @@ class Estimate:
 
         Raises:
             ValueError: If the method gave no weighted points, or label does not give k words.
+
+        Example:
+            >>> import numpy as np, samplers
+            >>> problem = samplers.FunctionProblem(lambda x: 3.0 - np.abs(x[:, 0]), dim=2)
+            >>> result = samplers.estimate(problem, seed=0, max_sim=4000)
+            >>> shares = result.shares(lambda x: np.where(x[:, 0] > 0, "right", "left").tolist())
+            >>> for side in ("left", "right"):
+            ...     print(f"{side} {shares[side].p:.5f}, {shares[side].of_failures:.0%} of p")
+            left 0.00136, 50% of p
+            right 0.00135, 50% of p
         """
         return split_by_kind(self, label, most)
 
     @property
     def proviso(self) -> str:
-        """What p and its interval take for granted, in words."""
+        """Conditions under which p and its interval hold, in words."""
         fixed = f"{self.given} and " if self.given else ""
         if self.base_draws == 0:
             return f"{fixed}no region of failure was missed (no base draws bound its size)"
@@ -245,6 +302,6 @@ class Estimate:
         return json.dumps(self.to_dict(), allow_nan=False)
 
 
-def method_settings(method: "Stepping") -> dict[str, Any]:
+def method_settings(method: Stepping) -> dict[str, Any]:
     """Return the settings of a method as plain values."""
     return {each.name: getattr(method, each.name) for each in fields(method)} if is_dataclass(method) else {}

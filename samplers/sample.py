@@ -13,7 +13,18 @@ from samplers.problem import FloatArray
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Layer:
-    """All points of one level, and the thresholds it speaks for: P[f(X) <= g] for low <= g < high."""
+    """All points of one level, and the thresholds g for which they estimate P[f(X) <= g]: low <= g < high.
+
+    Example:
+        >>> import samplers
+        >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=1)
+        >>> result = samplers.estimate(problem, samplers.AdaptiveSubsetSimulation(n=1000), seed=0)
+        >>> for layer in result.sample.layers:
+        ...     print(f"{len(layer.f)} points for {layer.low:.1f} <= g < {layer.high:.1f}")
+        1000 points for 1.8 <= g < inf
+        1000 points for 0.7 <= g < 1.8
+        1000 points for -inf <= g < 0.7
+    """
 
     f: FloatArray
     """Outcomes, shape (m,)."""
@@ -22,17 +33,25 @@ class Layer:
     units: NDArray[np.int64]
     """As in `Sample`, shape (m,)."""
     low: float = -math.inf
-    """Where the next level takes over."""
+    """Least threshold of this layer; the next level has those below."""
     high: float = math.inf
-    """Threshold of this level, where the one before takes over."""
+    """Threshold of this level; the level before has those from here on."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Sample:
     """Weighted points of one run: P[f(X) <= g] is the sum of the weights of the points with f <= g.
 
-    At g = gamma the sum is p-hat, save for control variates. What `Estimate.curve` and
-    `Estimate.reweight` work with.
+    At g = gamma the sum is p-hat, except where p-hat has control variates. `Estimate.curve`,
+    `Estimate.reweight` and `Estimate.shares` start from it.
+
+    Example:
+        >>> import samplers
+        >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=1)
+        >>> result = samplers.estimate(problem, "mc", seed=0, max_sim=10_000)
+        >>> sample = result.sample
+        >>> len(sample.f), len(sample.x), result.p, round(float(sample.weights[sample.f <= 0.0].sum()), 6)
+        (10000, 15, 0.0015, 0.0015)
     """
 
     f: FloatArray
@@ -64,7 +83,8 @@ class Sample:
             x: The failing ones of them, shape (k, d).
 
         Example:
-            >>> Sample.of_equal_draws(np.array([2.0, -1.0]), np.array([[0.5, 3.0]])).weights
+            >>> import numpy as np, samplers
+            >>> samplers.Sample.of_equal_draws(np.array([2.0, -1.0]), np.array([[0.5, 3.0]])).weights
             array([0.5, 0.5])
         """
         n = len(f)

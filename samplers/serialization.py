@@ -9,7 +9,11 @@ import numpy as np
 
 
 def to_json_value(value: Any) -> Any:
-    """Replace NaN and infinities inside value by None, numbers of NumPy by Python's."""
+    """Return value with None for NaN and infinities inside it, and Python's numbers for those of NumPy.
+
+    Args:
+        value: A number, a string, None, or lists, tuples and dicts of these.
+    """
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, float):

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    pass
 
 
 class Status(str, Enum):
-    """How a run ended; prints as its value."""
+    """How a run ended; prints as its value.
+
+    Example:
+        >>> import samplers
+        >>> problem = samplers.FunctionProblem(lambda x: 9.0 - x[:, 0], dim=1)
+        >>> print(samplers.estimate(problem, "mc", seed=0, max_sim=100).status)
+        no_hits
+        >>> samplers.Status.NO_HITS == "no_hits"
+        True
+    """
 
     CONVERGED = "converged"
     """The method came to its own end (and met target_cov, if one was given)."""
@@ -30,7 +35,18 @@ class Status(str, Enum):
 
 @dataclass(frozen=True, kw_only=True)
 class Level:
-    """One level of subset simulation, one iteration of cross-entropy, one batch of Monte Carlo."""
+    """One level of subset simulation, one iteration of cross-entropy, one batch of Monte Carlo.
+
+    Example:
+        >>> import samplers
+        >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=1)
+        >>> result = samplers.estimate(problem, samplers.AdaptiveSubsetSimulation(n=1000), seed=0)
+        >>> for level in result.trace:
+        ...     print(f"P[f <= {level.gamma:.1f}] = {level.estimate:.4f} after {level.n_sim} more simulations")
+        P[f <= 1.8] = 0.1000 after 1000 more simulations
+        P[f <= 0.7] = 0.0101 after 900 more simulations
+        P[f <= 0.0] = 0.0010 after 899 more simulations
+    """
 
     gamma: float
     """Threshold of this level."""

@@ -1,4 +1,4 @@
-"""WeightedEstimate: the part of an estimate that the analyses read, and what they share."""
+"""WeightedEstimate: the attributes of an estimate that the analyses read, and functions that they share."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from samplers.sample import Sample
 
 
 class HasName(Protocol):
-    """A method, as far as messages name it."""
+    """An object with a name, for messages."""
 
     @property
     def name(self) -> str:
@@ -20,7 +20,7 @@ class HasName(Protocol):
 
 
 class HasTotal(Protocol):
-    """Failing points, as far as messages count them."""
+    """Failing points with their number, for messages."""
 
     @property
     def total(self) -> int:
@@ -28,7 +28,7 @@ class HasTotal(Protocol):
 
 
 class WeightedEstimate(Protocol):
-    """An estimate with its weighted points, as far as a curve, a reweighting or shares by kind need it.
+    """The attributes of an estimate that curves, reweighting and shares by kind read.
 
     `samplers.Estimate` is one; each attribute is described there.
     """
@@ -55,7 +55,7 @@ class WeightedEstimate(Protocol):
 
     @property
     def on_error(self) -> str:
-        """What was done where f raised or gave NaN."""
+        """Rule for points where f raised or gave NaN."""
 
     @property
     def method(self) -> HasName:
@@ -85,12 +85,12 @@ def require_sample(estimate: WeightedEstimate) -> Sample:
 
 
 def cov_inflation(estimate: WeightedEstimate, own_cov: float) -> float:
-    """Return by what the c.o.v. of units at gamma must grow to be the estimate's own; 1 where it is larger."""
+    """Return the factor max(1, c.o.v. of the estimate / c.o.v. of its units at gamma); 1 where either is not known."""
     if not math.isfinite(estimate.cov) or not 0 < own_cov < math.inf:
         return 1.0
     return max(1.0, estimate.cov / own_cov)
 
 
 def no_outcome_weight(estimate: WeightedEstimate, sample: Sample) -> float:
-    """Return the weight of points without an outcome, where these do not count in the lower end; else 0."""
+    """Return the weight of points without an outcome if they do not count in the lower end ("bound"); else 0."""
     return float(sample.weights[np.isneginf(sample.f)].sum()) if estimate.on_error == "bound" else 0.0

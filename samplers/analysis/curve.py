@@ -1,4 +1,4 @@
-"""The whole curve of probabilities over thresholds from one run.
+"""Curve: P[f(X) <= g] over thresholds g from one run, with a simultaneous band.
 
 References:
     Montiel Olea and Plagborg-Moller, "Simultaneous confidence bands: theory, implementation, and an
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 MIN_UNITS = 5.0
-"""Effective number of units that a threshold below gamma must have."""
+"""Effective number of units that a threshold below gamma must have: fewer give a useless t interval."""
 BAND_DRAWS = 10_000
 """Draws of the largest deviation; its 95 % quantile is then good to about 1 %."""
 BAND_STREAM = 2**31
@@ -32,7 +32,18 @@ BAND_STREAM = 2**31
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Curve:
-    """P[f(X) <= g] at several thresholds, with a band that should hold all of them at once."""
+    """P[f(X) <= g] at several thresholds, with a band that should hold all of them at once.
+
+    Example:
+        >>> import samplers
+        >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
+        >>> curve = samplers.estimate(problem, "adss", seed=0).curve([0.0, 1.0, 2.0])
+        >>> for g, low, high in zip(curve.gammas, curve.low, curve.high):
+        ...     print(f"{g:.0f} {low:.1e} {high:.1e}")
+        0 5.1e-04 1.7e-03
+        1 1.4e-02 2.7e-02
+        2 1.3e-01 1.8e-01
+    """
 
     gammas: FloatArray
     """Thresholds g, shape (k,), in the order asked for."""
@@ -86,7 +97,7 @@ class Curve:
 
 
 def compute_curve(estimate: WeightedEstimate, gammas: ArrayLike) -> Curve:
-    """Return the curve of a finished estimation; see `Estimate.curve`.
+    """Return the curve of an estimate at thresholds; see `Estimate.curve`.
 
     p is the sum of the weights of the points with f <= g, moved below gamma in proportion (above it
     by as much as at it) where the estimate at gamma is not that sum, as with control variates. Its
@@ -161,7 +172,7 @@ def check_known(sample: Sample, gamma: float, gammas: FloatArray) -> None:
 
 
 def lowest_known_threshold(sample: Sample, gamma: float) -> float:
-    """Return the least threshold known: gamma if there is a failing point, or one with LEAST_ESS effective units."""
+    """Return the smallest threshold known: gamma if a point fails, or the first with MIN_UNITS effective units."""
     order = np.lexsort((sample.f, sample.units))  # within each unit by f
     w, unit = sample.weights[order], sample.units[order]
     before = np.cumsum(w) - w
@@ -178,7 +189,7 @@ def lowest_known_threshold(sample: Sample, gamma: float) -> float:
 
 
 def anchor_at_estimate(estimate: WeightedEstimate, sums: FloatArray, at_gamma: int) -> FloatArray:
-    """Return the sums (G,) at rising thresholds made to go through the estimate at gamma, cut at 1."""
+    """Return the sums (G,) at rising thresholds, moved so that they equal the estimate at gamma, and cut at 1."""
     own = float(sums[at_gamma])
     if own == 0 or math.isclose(own, estimate.p, rel_tol=1e-9):
         return np.minimum(sums, 1.0)
@@ -192,7 +203,7 @@ def simultaneous_level(correlation: NDArray[np.float64], confidence: float, rng:
     Args:
         correlation: Of the estimates, shape (G, G); rows of zeros for those that do not vary.
         confidence: Nominal coverage of all.
-        rng: Where the draws come from.
+        rng: Generator of the draws.
     """
     values, vectors = np.linalg.eigh(correlation)
     some = values > 1e-10 * max(len(values), 1)

@@ -1,7 +1,7 @@
-"""The probability of failure under another base distribution, from the same simulations."""
+"""Reweighting: the probability of failure under another base distribution, from the same simulations."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -14,26 +14,43 @@ from samplers.statistics.intervals import Interval
 from samplers.statistics.weights import effective_number
 
 MIN_POINTS = 30.0
-"""Effective number of failing points that the answer must rest on."""
+"""Effective number of failing points that the estimate must rest on."""
 MIN_UNITS = 5.0
 """Effective number of independent units (draws; paths of chains) that these points must come from."""
 MAX_LOG = 600.0
 """exp of this, or of its negative, is still a float."""
 SUPPORT_DRAWS = 10_000
-"""Draws from the new base that look for places where the old one has no density."""
+"""Draws from the new base that are checked for a density of 0 under the old one."""
 
 
 @runtime_checkable
 class HasLogProb(Protocol):
-    """A law that can be evaluated."""
+    """A distribution whose log density can be evaluated."""
 
     def log_prob(self, x: FloatArray, /) -> FloatArray:
         """Log density at x (n, d), shape (n,)."""
 
 
+@runtime_checkable
+class CanSample(Protocol):
+    """A distribution that can be sampled."""
+
+    def sample(self, n: int, rng: np.random.Generator, /) -> FloatArray:
+        """Draw n independent points, shape (n, d)."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Reweighted:
-    """P[f(X) <= gamma] with X from another base distribution."""
+    """P[f(X) <= gamma] with X from another base distribution.
+
+    Example:
+        >>> import samplers
+        >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=1)
+        >>> result = samplers.estimate(problem, "mc", seed=0, max_sim=100_000)
+        >>> same = result.reweight(problem.base)
+        >>> same.ratio, same.p == result.p, round(same.units) == result.failures.total
+        (1.0, True, True)
+    """
 
     p: float
     """Estimated probability under the new base."""
@@ -63,8 +80,7 @@ class Reweighted:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain numbers for JSON."""
-        data = {name: getattr(self, name) for name in self.__dataclass_fields__}
-        return {key: to_json_value(value) for key, value in data.items()}
+        return {name: to_json_value(value) for name, value in asdict(self).items()}
 
 
 def reweight(estimate: WeightedEstimate, new_base: HasLogProb) -> Reweighted:
@@ -110,7 +126,12 @@ def reweight(estimate: WeightedEstimate, new_base: HasLogProb) -> Reweighted:
 
 
 def log_density_ratios(estimate: WeightedEstimate, new_base: HasLogProb, x: FloatArray) -> FloatArray:
-    """Return log(p1 / p0) at the failing points x (k, d), shape (k,), or raise a ValueError where that cannot be."""
+    """Return log(p1 / p0) at the failing points x (k, d), shape (k,).
+
+    Raises:
+        ValueError: If the estimate has no base or no failing point, the new base does not fit, or a density is not
+            finite.
+    """
     base = estimate.base
     if base is None:
         raise ValueError("The estimate does not know its base distribution (`Estimate.base`).")
@@ -130,20 +151,19 @@ def log_density_ratios(estimate: WeightedEstimate, new_base: HasLogProb, x: Floa
 
 
 def check_fits(new_base: object, dim: int) -> None:
-    """Raise a ValueError unless the new base has a log_prob and, as far as it says, `dim` dimensions."""
+    """Raise a ValueError unless the new base has a log_prob and, if it has an attribute dim, `dim` dimensions."""
     if not isinstance(new_base, HasLogProb):
         raise ValueError(f"Expected a distribution with log_prob, got {new_base!r}.")
-    own = getattr(new_base, "dim", dim)
+    own = getattr(new_base, "dim", dim)  # the user's own class
     if own != dim:
         raise ValueError(f"Expected a distribution in {dim} dimensions, got one in {own}.")
 
 
 def check_support(base: Distribution, new_base: HasLogProb, dim: int, seed: int) -> None:
-    """Raise a ValueError if draws from the new base, where there is a way to make them, fall outside the old one."""
-    draw = getattr(new_base, "sample", None)
-    if not callable(draw):
+    """Raise a ValueError if the new base has `sample` and draws from it fall outside the old one."""
+    if not isinstance(new_base, CanSample):
         return
-    x = np.asarray(draw(SUPPORT_DRAWS, np.random.default_rng(seed)), dtype=np.float64)
+    x = np.asarray(new_base.sample(SUPPORT_DRAWS, np.random.default_rng(seed)), dtype=np.float64)
     if x.shape != (SUPPORT_DRAWS, dim):
         raise ValueError(
             f"Expected a distribution in {dim} dimensions; {SUPPORT_DRAWS} draws of this have shape {x.shape}."
@@ -156,9 +176,13 @@ def check_support(base: Distribution, new_base: HasLogProb, dim: int, seed: int)
         )
 
 
-def log_density(law: HasLogProb, x: FloatArray) -> FloatArray:
-    """Return log_prob at x (k, d), its shape (k,) checked."""
-    values = np.asarray(law.log_prob(x), dtype=np.float64)
+def log_density(distribution: HasLogProb, x: FloatArray) -> FloatArray:
+    """Return log_prob at x (k, d), shape (k,).
+
+    Raises:
+        ValueError: If it is not one number per point.
+    """
+    values = np.asarray(distribution.log_prob(x), dtype=np.float64)
     if values.shape != (len(x),):
         raise ValueError(f"Expected log_prob to give one number per point, shape ({len(x)},), got {values.shape}.")
     return values

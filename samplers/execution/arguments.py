@@ -19,6 +19,7 @@ class RunArguments:
         ValueError: If an argument is out of range; the text says what was expected.
 
     Example:
+        >>> from samplers import RunArguments
         >>> arguments = RunArguments(max_sim=6000, seed=1)
         >>> arguments.gamma, arguments.confidence, arguments.replicates
         (0.0, 0.95, 1)

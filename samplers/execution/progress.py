@@ -1,4 +1,4 @@
-"""Telling people how far a run has come."""
+"""Progress: how far a run has come, for a listener or a bar on standard error."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -10,7 +10,16 @@ from samplers.trace import Level
 
 @dataclass(frozen=True, kw_only=True)
 class Progress:
-    """How far a run has come."""
+    """How far a run has come.
+
+    Example:
+        >>> import samplers
+        >>> problem = samplers.FunctionProblem(lambda x: 2.0 - x[:, 0], dim=2)
+        >>> seen = []
+        >>> result = samplers.estimate(problem, "mc", seed=0, max_sim=2000, progress=seen.append)
+        >>> seen[-1].n_sim, seen[-1].max_sim, seen[-1].p == result.p
+        (2000, 2000, True)
+    """
 
     n_sim: int
     """Simulations done."""
@@ -28,11 +37,14 @@ Listener = Callable[[Progress], None]
 
 
 class Monitor:
-    """Puts together what the counter and the methods report and passes it on.
+    """Keeps the progress of a run and passes every change to a listener.
 
     Args:
         listener: Given `progress` whenever it changes.
         max_sim: Simulations allowed; None for no limit.
+
+    Attributes:
+        progress: The latest state.
     """
 
     def __init__(self, listener: Listener | None, max_sim: int | None) -> None:
@@ -40,14 +52,15 @@ class Monitor:
         self._listener = listener
 
     def on_batch(self, n_sim: int) -> None:
-        """Note that n_sim simulations are done."""
-        self._tell(replace(self.progress, n_sim=n_sim))
+        """Record that n_sim simulations are done."""
+        self._update(replace(self.progress, n_sim=n_sim))
 
     def on_level(self, level: Level) -> None:
-        """Note a finished level."""
-        self._tell(replace(self.progress, level=level.gamma, p=level.estimate, run=level.run))
+        """Record a finished level."""
+        self._update(replace(self.progress, level=level.gamma, p=level.estimate, run=level.run))
 
-    def _tell(self, progress: Progress) -> None:
+    def _update(self, progress: Progress) -> None:
+        """Replace the progress and pass it to the listener."""
         self.progress = progress
         if self._listener is not None:
             self._listener(progress)
@@ -55,7 +68,7 @@ class Monitor:
 
 @contextmanager
 def listening(progress: bool | Listener, max_sim: int | None) -> Iterator[Listener | None]:
-    """Give the listener that `progress` asks for: none, a bar on standard error, or itself."""
+    """Yield the listener that `progress` stands for: None, one that shows a bar on standard error, or itself."""
     if callable(progress):
         yield progress
     elif progress:

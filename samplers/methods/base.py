@@ -11,7 +11,21 @@ from samplers.problem import Inputs
 
 @runtime_checkable
 class Method(Stepping, Protocol):
-    """A method to subclass: write `steps`, and `start` comes with it."""
+    """A method to subclass: write `steps`, and `start` comes with it.
+
+    Example:
+        >>> import numpy as np, samplers
+        >>> class OneBatch(samplers.Method):
+        ...     name, stops_at_target = "one-batch", False
+        ...     def steps(self, inputs, goal, rng):
+        ...         n = min(goal.budget, 4000)
+        ...         f = yield inputs.base.sample(n, rng)
+        ...         return samplers.Outcome.of_counts(int((f <= goal.gamma).sum()), n, goal.confidence, trace=())
+        >>> problem = samplers.FunctionProblem(lambda x: 2.0 - x[:, 0], dim=1)
+        >>> result = samplers.estimate(problem, OneBatch(), seed=0)
+        >>> result.n_sim, result.p
+        (4000, 0.01975)
+    """
 
     def start(
         self,
@@ -41,6 +55,17 @@ class Method(Stepping, Protocol):
 
         Raises:
             ValueError: If an argument is not as described in `estimate`.
+
+        Example:
+            >>> import samplers
+            >>> problem = samplers.FunctionProblem(lambda x: 2.0 - x[:, 0], dim=2)
+            >>> run = samplers.MonteCarlo(batch=1000).start(problem, seed=0, max_sim=2000)
+            >>> while not run.done:
+            ...     x = run.ask()
+            ...     print(x.shape)
+            ...     run.tell(2.0 - x[:, 0])
+            (1000, 2)
+            (1000, 2)
         """
         arguments = RunArguments(
             gamma=gamma,

@@ -1,4 +1,4 @@
-"""What independent units say about P[f <= g]: sums, their spread, and an interval.
+"""Cluster sums: P[f <= g] as a sum over independent units, with the spread and the interval of that sum.
 
 A unit is what was drawn independently: a draw, or a point of level 0 with all that descends from it.
 With T_c the sum of the weights in unit c, p-hat = sum T_c and its variance is sum T_c^2 - p^2 / n.
@@ -91,7 +91,7 @@ def has_independent_points(sample: Sample) -> bool:
 
 
 def interval_of_sum(p: float, cov: float, ess: float, independent: bool, confidence: float) -> Interval:
-    """Return a log-normal interval of p > 0 with the t quantile that `ess` effective units deserve."""
+    """Return a log-normal interval of p > 0 with the t quantile of `ess` effective units."""
     return log_normal_interval(p, cov, confidence, df=degrees_of_freedom(ess, independent))
 
 

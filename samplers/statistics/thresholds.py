@@ -1,4 +1,4 @@
-"""The next intermediate threshold, safe where many outcomes are equal."""
+"""Thresholds: the next intermediate level of a search, also where many outcomes are equal."""
 
 import math
 
@@ -23,6 +23,11 @@ def next_level(f: FloatArray, fraction: float, gamma: float) -> float | None:
         f: Outcomes; +inf is allowed.
         fraction: Wanted share, p0 or rho, in (0, 1).
         gamma: Final threshold; never passed.
+
+    Example:
+        >>> f = np.arange(10.0)
+        >>> next_level(f, fraction=0.2, gamma=-1.0), next_level(f, fraction=0.2, gamma=3.0)
+        (1.0, 3.0)
     """
     n = len(f)
     wanted = fraction * n
