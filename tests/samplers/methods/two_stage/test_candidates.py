@@ -1,0 +1,161 @@
+"""Candidates and shares of a proposal, for regions whose failures are known."""
+
+from collections import Counter
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from samplers.methods.two_stage.candidates import _smooth_indicators, build_proposal, list_candidates
+from samplers.methods.two_stage.multiple_importance import MultipleImportanceSample
+from samplers.methods.two_stage.refinement import refine_once, start_refinement
+from samplers.methods.two_stage.regions import ExplorationResult, Region
+from samplers.methods.two_stage.settings import RefinementSettings
+from samplers.methods.two_stage.simulator import ComponentDraws
+from samplers.problem import FunctionProblem
+from samplers.proposals.components import IsotropicNormal, SubspaceGaussian
+
+SETTINGS = RefinementSettings()
+BETA = 3.0
+
+
+def half_spaces(dim, regions):
+    return FunctionProblem(lambda u: BETA - u[:, :regions].max(axis=1), dim)
+
+
+def region(problem, axis, rng):
+    states = rng.standard_normal((20, 5, problem.dim))
+    states[..., axis] = stats.truncnorm(BETA, np.inf).rvs((20, 5), random_state=rng)
+    u = rng.standard_normal((120, problem.dim))
+    u[:, axis] = BETA + 0.5 * rng.standard_normal(120)
+    return Region(states, u, problem.evaluate(u))
+
+
+def started(rng, dim=3, regions=1, noisy=False, scattered=False):
+    """Return the state before any round, an empty history and the problem."""
+    problem = half_spaces(dim, regions)
+    found = ExplorationResult([region(problem, k, rng) for k in range(regions)], noisy, scattered)
+    return start_refinement(found, 0.0, SETTINGS, rng), MultipleImportanceSample.empty(dim), problem
+
+
+def after_round(rng, n=800, **kwargs):
+    """Return state and history after a round."""
+    state, history, problem = started(rng, **kwargs)
+    proposal = build_proposal(state, history, SETTINGS, rng)
+    u, counts = proposal.draw(n, rng)
+    batch = ComponentDraws(proposal.components, counts, u, problem.evaluate(u))
+    history = history.add(batch, 0.0)
+    return refine_once(state, history, proposal, batch, SETTINGS, rng, fresh=True), history, problem
+
+
+def share(proposal, *kinds):
+    return sum(a for a, candidate in zip(proposal.weights, proposal.candidates, strict=True) if candidate.kind in kinds)
+
+
+def kinds_of(candidates):
+    return Counter(candidate.kind for candidate in candidates)
+
+
+def test_the_first_proposal_has_the_initial_shares(rng):
+    """Of the kinds that are there, in proportion; `explored` is the same as `gaussian` before the first round."""
+    state, history, _ = started(rng)
+    proposal = build_proposal(state, history, SETTINGS, rng)
+    present = {kind: a for kind, a in SETTINGS.initial_shares.items() if kind in kinds_of(proposal.candidates)}
+    assert set(SETTINGS.initial_shares) - set(present) == {"explored"}
+    for kind, a in present.items():
+        assert share(proposal, kind) == pytest.approx(a / sum(present.values()))
+
+
+def test_candidates_of_a_linear_region(rng):
+    """One of each kind at least; the base distribution stands first, for its draws are counted."""
+    state, history, _ = after_round(rng)
+    candidates = list_candidates(state, history, SETTINGS)
+    assert candidates[0].kind == "base"
+    kinds = kinds_of(candidates)
+    assert set(kinds) == set(SETTINGS.initial_shares)
+    assert kinds["radial"] == 2
+    gaussian = [c for c in candidates if isinstance(c.component, SubspaceGaussian) and c.kind != "tempered"]
+    assert kinds["tempered"] == len(gaussian) * len(SETTINGS.tempering)
+
+
+def test_in_one_dimension_nothing_is_radial(rng):
+    state, history, _ = started(rng, dim=1)
+    assert "radial" not in kinds_of(list_candidates(state, history, SETTINGS))
+
+
+def test_a_noisy_f_has_no_edges_and_more_tempered_gaussians(rng):
+    state, history, _ = after_round(rng, noisy=True)
+    kinds = kinds_of(list_candidates(state, history, SETTINGS))
+    assert not {"linear", "half-space"} & set(kinds)
+    assert kinds["tempered"] == 2 * (kinds["gaussian"] + kinds["explored"])
+    proposal = build_proposal(state, history, SETTINGS, rng, final=True)
+    assert share(proposal, "tempered") >= SETTINGS.noisy_tempered_share - 1e-9
+    assert share(proposal, "base") >= SETTINGS.noisy_base_share - 1e-9
+    assert proposal.screen is None
+
+
+@pytest.mark.parametrize("final", [False, True])
+def test_lower_limits_of_one_region(rng, final):
+    state, history, _ = after_round(rng)
+    proposal = build_proposal(state, history, SETTINGS, rng, final=final)
+    assert proposal.weights.sum() == pytest.approx(1.0)
+    assert share(proposal, "base") >= SETTINGS.base_share - 1e-9
+    assert share(proposal, "tempered") >= SETTINGS.tempered_share - 1e-9
+    used = proposal.weights[1:][proposal.weights[1:] > 0]
+    assert used.min() > 0.9 * SETTINGS.min_share  # but for raising others to their limits
+    kept = [a for a, c in zip(proposal.weights, proposal.candidates, strict=True) if c.kind in ("explored", "linear")]
+    assert final or min(kept) > 0.8 * SETTINGS.explored_share
+
+
+def test_more_tempered_draws_where_the_others_miss(rng):
+    state, history, _ = after_round(rng)
+    missing = build_proposal(replace(state, hit_rate=0.0), history, SETTINGS, rng)
+    assert share(missing, "tempered") >= SETTINGS.tempered_share + SETTINGS.extra_tempered_share - 1e-9
+
+
+@pytest.mark.parametrize(("final", "least"), [(False, 0.25), (True, 0.1)])
+def test_no_region_is_lost(rng, final, least):
+    """The second region has no failure in the history: it keeps half of what is dealt out all the same."""
+    state, history, _ = started(rng, regions=2)
+    proposal = build_proposal(state, history, SETTINGS, rng)
+    u, counts = proposal.draw(800, rng)
+    batch = ComponentDraws(proposal.components, counts, u, BETA - u[:, 0])
+    history = history.add(batch, 0.0)
+    state = refine_once(state, history, proposal, batch, SETTINGS, rng, fresh=True)
+    shares = build_proposal(state, history, SETTINGS, rng, final=final)
+    for k in range(2):
+        own = [a for a, c in zip(shares.weights, shares.candidates, strict=True) if c.region == k]
+        assert sum(own) >= least - 1e-9
+
+
+def test_pieces_of_a_shell_share_one_limit(rng):
+    state, history, _ = after_round(rng, regions=2, scattered=True)
+    proposal = build_proposal(state, history, SETTINGS, rng)
+    assert share(proposal, "radial") >= SETTINGS.radial_share - 1e-9
+
+
+def test_the_last_proposal_is_nearly_the_best_for_a_half_space(rng):
+    """Weights under it vary as the floors for base and tempered draws let them: E[w^2] / E[w]^2 < 1.5 at failures."""
+    state, history, problem = after_round(rng, n=2000)
+    proposal = build_proposal(state, history, SETTINGS, rng, final=True)
+    u, _ = proposal.draw(20_000, rng)
+    w = np.where(problem.evaluate(u) <= 0, np.exp(proposal.log_weights(u)), 0.0)
+    error = w.std() / np.sqrt(20_000)
+    assert w.mean() == pytest.approx(stats.norm.sf(BETA), abs=4 * error + 4 * proposal.acceptance_cov * w.mean())
+    assert (w**2).mean() / w.mean() ** 2 < 1.5
+
+
+def test_smoothed_weights_count_draws_by_how_likely_they_fail(rng):
+    """Failure with probability Phi(u1 - 3) whatever else: all draws carry weight, in proportion to it."""
+    n = 6000
+    u = 2.0 * rng.standard_normal((n, 2))
+    f = np.where(rng.random(n) < stats.norm.cdf(u[:, 0] - 3), -1.0, 1.0)
+    history = MultipleImportanceSample.empty(2).add(ComponentDraws([IsotropicNormal(2, 2.0)], np.array([n]), u, f), 0.0)
+    points, log_weights = _smooth_indicators(history, 0.0, SETTINGS)
+    probability = log_weights - history.all_draws()[2]
+    near = np.abs(points[:, 0] - 3) < 1.5
+    found, expected = np.exp(probability[near]), stats.norm.cdf(points[near, 0] - 3)
+    assert np.abs(found - expected).mean() < 0.05
+    # P[U1 + noise > 3] with two standard normals
+    assert np.exp(log_weights).sum() == pytest.approx(stats.norm.sf(3 / np.sqrt(2)), rel=0.25)

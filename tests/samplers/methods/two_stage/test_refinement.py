@@ -1,0 +1,169 @@
+"""Refinement of one or two regions whose failures are known: half-spaces in a few dimensions."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from samplers.methods.two_stage.candidates import build_proposal
+from samplers.methods.two_stage.mixture.proposal import MixtureProposal, ProposalComponent
+from samplers.methods.two_stage.multiple_importance import MultipleImportanceSample
+from samplers.methods.two_stage.refinement import (
+    SHARP_KINDS,
+    RefinementState,
+    expected_weights,
+    refine_once,
+    start_refinement,
+)
+from samplers.methods.two_stage.regions import ExplorationResult, Region
+from samplers.methods.two_stage.settings import RefinementSettings
+from samplers.methods.two_stage.simulator import ComponentDraws
+from samplers.problem import FunctionProblem
+from samplers.proposals.components import HalfSpaceNormal, IsotropicNormal, SubspaceGaussian
+
+SETTINGS = RefinementSettings()
+BETA = 3.0
+
+
+def half_spaces(dim, regions):
+    return FunctionProblem(lambda u: BETA - u[:, :regions].max(axis=1), dim)
+
+
+def region(problem, axis, rng, chains=20, steps=5):
+    """Exact failures beyond u_axis = BETA in place of chains, and points around the plane."""
+    states = rng.standard_normal((chains, steps, problem.dim))
+    states[..., axis] = stats.truncnorm(BETA, np.inf).rvs((chains, steps), random_state=rng)
+    u = rng.standard_normal((6 * chains, problem.dim))
+    u[:, axis] = BETA + 0.5 * rng.standard_normal(6 * chains)
+    return Region(states, u, problem.evaluate(u))
+
+
+def explored(problem, regions, rng, **kwargs):
+    return ExplorationResult([region(problem, k, rng) for k in range(regions)], **{"noisy": False} | kwargs)
+
+
+def draws(proposal, n, problem, rng):
+    u, counts = proposal.draw(n, rng)
+    return ComponentDraws(proposal.components, counts, u, problem.evaluate(u))
+
+
+def refined(problem, regions, rng, fresh=True, n=600):
+    """Return the state before and after a round, and the draws."""
+    before = start_refinement(explored(problem, regions, rng), 0.0, SETTINGS, rng)
+    proposal = build_proposal(before, MultipleImportanceSample.empty(problem.dim), SETTINGS, rng)
+    batch = draws(proposal, n, problem, rng)
+    history = MultipleImportanceSample.empty(problem.dim).add(batch, 0.0)
+    after = refine_once(before, history, proposal, batch, SETTINGS, rng, fresh=fresh)
+    return before, after, history, batch
+
+
+@pytest.mark.parametrize("regions", [1, 2])
+def test_the_exploration_gives_each_region_its_gaussians_and_its_half_space(regions, rng):
+    state = start_refinement(explored(half_spaces(4, regions), regions, rng), 0.0, SETTINGS, rng)
+    assert {candidate.region for candidate in state.explored} == set(range(regions))
+    assert len(state.gaussians) == len(state.explored) <= regions * SETTINGS.gaussians_per_region
+    for k in range(regions):
+        gaussian, half_space = (candidate.component for candidate in state.linear if candidate.region == k)
+        assert isinstance(gaussian, SubspaceGaussian)
+        assert isinstance(half_space, HalfSpaceNormal)
+        assert half_space.axis[k] > 0.99
+        assert half_space.start == pytest.approx(BETA, abs=0.1)
+    assert (state.dim, state.rounds, state.fresh_gaussians) == (4, (), [])
+    assert state.points.shape == (100 * regions, 4)
+
+
+def test_where_f_is_noisy_one_region_may_have_many_gaussians(rng):
+    """Eight far clusters of chains are told apart by BIC."""
+    centres = 6.0 * np.concatenate([np.eye(4), -np.eye(4)])
+    chains = np.repeat(centres, 12, axis=0)[:, None] + 0.3 * rng.standard_normal((96, 5, 4))
+    clusters = Region(chains, chains.reshape(-1, 4), rng.standard_normal(480))
+    found = ExplorationResult([clusters], noisy=True)
+    assert len(start_refinement(found, 0.0, SETTINGS, rng).explored) == SETTINGS.max_gaussians
+    found = found._replace(noisy=False)
+    assert len(start_refinement(found, 0.0, SETTINGS, rng).explored) == SETTINGS.gaussians_per_region
+
+
+def test_a_round_moves_the_gaussians_and_leaves_the_state_before_as_it_was(rng):
+    problem = half_spaces(4, 1)
+    before, after, history, batch = refined(problem, 1, rng)
+    assert before.rounds == ()
+    assert len(after.rounds) == 1
+    assert after.explored is before.explored
+    centre = after.gaussians[0].centre
+    assert not np.array_equal(centre, before.gaussians[0].centre)
+    tail = stats.truncnorm(BETA, np.inf).mean()
+    weights = np.exp(history.log_weights)
+    error = 4 / np.sqrt(weights.sum() ** 2 / (weights**2).sum())
+    if len(after.gaussians) == 1:
+        np.testing.assert_allclose(centre, [tail, 0, 0, 0], atol=error)
+    near = after.rounds[0]
+    assert len(near.u) < len(batch.u)
+    np.testing.assert_array_equal(problem.evaluate(near.u), near.f)
+
+
+def test_hit_rate_is_that_of_the_sharp_components(rng):
+    """Two components: sharp draws of which 70 % fail, base draws of which none does."""
+    state = start_refinement(explored(half_spaces(2, 1), 1, rng), 0.0, SETTINGS, rng)
+    gaussian = SubspaceGaussian(np.eye(2), np.array([3.0, 0.0]), np.ones(2))
+    proposal = MixtureProposal(
+        [ProposalComponent(IsotropicNormal(2), "base"), ProposalComponent(gaussian, SHARP_KINDS[0], 0)],
+        np.array([0.5, 0.5]),
+    )
+    f = np.concatenate([np.ones(100), np.where(np.arange(100) < 70, -1.0, 1.0)])
+    batch = ComponentDraws(proposal.components, np.array([100, 100]), rng.standard_normal((200, 2)), f)
+    history = MultipleImportanceSample.empty(2).add(batch, 0.0)
+    after = refine_once(state, history, proposal, batch, SETTINGS, rng, fresh=False)
+    assert after.hit_rate == pytest.approx(0.7)
+    np.testing.assert_array_equal(after.rounds[0].u, batch.u[100:])
+    np.testing.assert_array_equal(after.rounds[0].log_weights, proposal.log_weights(batch.u[100:]))
+
+
+def test_without_failures_a_round_changes_no_component(rng):
+    problem = half_spaces(3, 1)
+    state = start_refinement(explored(problem, 1, rng), 0.0, SETTINGS, rng)
+    proposal = MixtureProposal([ProposalComponent(IsotropicNormal(3), "base")], np.ones(1))
+    u = rng.standard_normal((100, 3))
+    batch = ComponentDraws(proposal.components, np.array([100]), u, np.ones(100))
+    history = MultipleImportanceSample.empty(3).add(batch, 0.0)
+    after = refine_once(state, history, proposal, batch, SETTINGS, rng, fresh=True)
+    assert after.gaussians is state.gaussians
+    assert after.linear is state.linear
+    assert after.hit_rate == 0.0
+
+
+def test_fresh_gaussians_are_fitted_where_they_are_asked_for(rng):
+    problem = half_spaces(3, 1)
+    assert refined(problem, 1, np.random.default_rng(1), fresh=False)[1].fresh_gaussians == []
+    fresh = refined(problem, 1, np.random.default_rng(1))[1].fresh_gaussians
+    tail = stats.truncnorm(BETA, np.inf)
+    assert len(fresh) >= 1
+    mean = np.mean([gaussian.centre[0] for gaussian in fresh])
+    assert mean == pytest.approx(tail.mean(), abs=0.3)
+
+
+def test_linear_proposals_of_two_regions_are_learned_from_the_draws_nearest_to_each(rng):
+    after = refined(half_spaces(4, 2), 2, rng)[1]
+    for k in range(2):
+        half_space = next(
+            c.component for c in after.linear if c.region == k and isinstance(c.component, HalfSpaceNormal)
+        )
+        assert half_space.axis[k] > 0.995
+        assert half_space.start == pytest.approx(BETA, abs=0.06)
+
+
+def test_expected_weight_of_a_region_leaves_out_its_heaviest_chain(rng):
+    """Under N(0, I) itself all weights are 1; under a Gaussian far away the chain at the origin is the heaviest."""
+    chains = np.zeros((4, 2, 2))
+    chains[1:, :, 0] = 3.0
+    found = ExplorationResult([Region(chains, chains.reshape(-1, 2), -np.ones(8))], noisy=False)
+    state = RefinementState(found=found, gamma=0.0, explored=(), gaussians=[], linear=(), fresh_gaussians=[])
+    plain = MixtureProposal([ProposalComponent(IsotropicNormal(2), "base")], np.ones(1))
+    np.testing.assert_allclose(expected_weights(state, plain), 1.0)
+    far = SubspaceGaussian(np.eye(2), np.array([3.0, 0.0]), np.ones(2))
+    proposal = MixtureProposal([ProposalComponent(far, "gaussian", 0)], np.ones(1))
+    # phi / q = exp(9/2 - 3 u1): e^-4.5 at u1 = 3, e^4.5 at the origin
+    np.testing.assert_allclose(expected_weights(state, proposal), np.exp(-4.5))
+    two = found._replace(regions=[Region(chains[:2], found.regions[0].u, found.regions[0].f)])
+    both = expected_weights(
+        RefinementState(found=two, gamma=0.0, explored=(), gaussians=[], linear=(), fresh_gaussians=[]), proposal
+    )
+    np.testing.assert_allclose(both, (np.exp(-4.5) + np.exp(4.5)) / 2)
