@@ -61,7 +61,7 @@ FLOORS = {
         ego_process
     """,
     "training": """
-        data vec_env
+        command_line data vec_env
         scenario_fitting imitation.traffic ego_training
         imitation.algorithms imitation.evaluation
         imitation

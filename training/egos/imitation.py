@@ -14,7 +14,6 @@ weights.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -25,6 +24,7 @@ import torch
 import typer
 
 from agents import LearnedEgo, Provenance, save_driver
+from training.command_line import report_errors, run_command
 from training.data.scenes import TrafficScene
 from training.egos.encounters import EncounterSpec, make_scenes
 from training.egos.nominal_driving import judge_all_cases
@@ -137,15 +137,10 @@ def main(
 ) -> None:
     """Train the ego `imitation`."""
     torch.set_num_threads(1)
-    try:
+    with report_errors("imitation"):
         path = train_imitation_ego(data, replace(CONFIG, seed=seed), out, progress=True)
-    except ValueError as error:
-        print(f"imitation: {error}", file=sys.stderr)
-        raise typer.Exit(2) from None
     print(f"Saved {path}. Next: python -m training.egos.nominal_driving --ego {path}")
 
 
 if __name__ == "__main__":
-    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-    app.command()(main)
-    app()
+    run_command(main)

@@ -13,7 +13,6 @@ fault: such rollouts count neither way, and their number is told.
 from __future__ import annotations
 
 import json
-import sys
 from collections import Counter
 from dataclasses import dataclass
 from typing import Annotated, Any, NamedTuple
@@ -39,6 +38,7 @@ from rare_envs.traffic.crash import NONE, ROAD_EDGE
 from rare_envs.traffic.lead import lead_index
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
 from samplers.statistics.intervals import clopper_pearson
+from training.command_line import report_errors, run_command
 from training.egos.nominal_traffic import CASES, FLOOR_GAP, FLOOR_HEADWAY, SECONDS, Case
 
 VERDICT_NAMES = ("kept", "left its lane", "collided", "too close", "left behind", "hit by others")
@@ -244,12 +244,9 @@ def main(
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object.")] = False,
 ) -> None:
     """Judge an ego in ordinary traffic."""
-    try:
+    with report_errors("nominal"):
         driver = load_ego(ego)
         found = {name: summarise(judge(driver, name, rollouts, seed, seconds, observation)) for name in case}
-    except (ValueError, OSError) as error:
-        print(f"nominal: {error}", file=sys.stderr)
-        raise typer.Exit(2) from None
     if as_json:
         print(json.dumps({name: {"share": one.share, **vars(one)} for name, one in found.items()}, allow_nan=True))
         return
@@ -263,6 +260,4 @@ def main(
 
 
 if __name__ == "__main__":
-    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-    app.command()(main)
-    app()
+    run_command(main)

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -32,6 +31,7 @@ from agents import Provenance
 from agents.vision.checkpoint import save_vision
 from agents.vision.ego import VisionEgo
 from agents.vision.pilotnet import HIDDEN_UNITS, PilotNet
+from training.command_line import report_errors, run_command
 from training.egos.expert_driver import AUXILIARY_SIZE
 from training.egos.image_dataset import LabelledPictures, collect, concatenate, mirror
 from training.egos.nominal_driving import judge_all_cases
@@ -237,15 +237,12 @@ def main(
 ) -> None:
     """Train the ego `vision`, and write it to OUT/vision.safetensors."""
     torch.set_num_threads(1)
-    try:
+    with report_errors("vision"):
         config = VisionConfig(seed=seed, rounds=rounds)
         network = train_vision_ego(config, out, progress=True)
-    except ValueError as error:
-        print(f"vision: {error}", file=sys.stderr)
-        raise typer.Exit(2) from None
     metrics = judge_all_cases(VisionEgo(network), judged, JUDGED) if judged else {}
     print(f"Wrote {save_vision(network, make_provenance(config, metrics), out / FILE)}.")
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_command(main)

@@ -15,7 +15,6 @@ from each other, and how far their mean is from the base.
 from __future__ import annotations
 
 import copy
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -30,6 +29,7 @@ from torch import Tensor
 from agents import LearnedDriver, read_driver, read_provenance, save_driver
 from agents.learned.networks import head_weights
 from samplers.problem import FloatArray
+from training.command_line import report_errors, run_command
 from training.imitation.algorithms.behaviour_cloning import clone_epochs
 from training.imitation.algorithms.config import Config
 from training.imitation.algorithms.critic import Critic
@@ -193,15 +193,10 @@ def main(
 ) -> None:
     """Train an ensemble around a driver and fit the distribution of its last layer's weights."""
     torch.set_num_threads(1)
-    try:
+    with report_errors("ensemble"):
         path = make_ensemble(run, Ensemble(members, updates, seed), out, progress=True)
-    except (ValueError, FileNotFoundError) as error:
-        print(f"ensemble: {error}", file=sys.stderr)
-        raise typer.Exit(2) from None
     print(f"Saved {path}.")
 
 
 if __name__ == "__main__":
-    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-    app.command()(main)
-    app()
+    run_command(main)

@@ -9,7 +9,6 @@ checkpoint. The same command on the same folder takes up a training that was sto
 
 from __future__ import annotations
 
-import sys
 from dataclasses import fields
 from enum import Enum
 from pathlib import Path
@@ -18,6 +17,7 @@ from typing import Annotated, Any
 import torch
 import typer
 
+from training.command_line import report_errors, run_command
 from training.imitation.algorithms.config import Config
 from training.imitation.datasets import Source
 from training.imitation.run_folder import NOISES, train_driver
@@ -101,13 +101,10 @@ def main(
     words: dict[str, Any] = dict(locals())
     words |= {"method": method.value, "colour": NOISES[noise.value]}
     torch.set_num_threads(1)  # at these sizes more threads cost more than they give
-    try:
+    with report_errors("train"):
         source = source_of(data, ngsim, highd, location, recording, seconds)
         config = Config(**{option.name: words[option.name] for option in fields(Config)})
         path = train_driver(source, config, out, log=log, progress=True)
-    except ValueError as error:
-        print(f"train: {error}", file=sys.stderr)
-        raise typer.Exit(2) from None
     print(f"Saved {path}. Next: agents.load_driver({str(path)!r})")
 
 
@@ -131,6 +128,4 @@ def source_of(
 
 
 if __name__ == "__main__":
-    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-    app.command()(main)
-    app()
+    run_command(main)

@@ -16,6 +16,7 @@ import typer
 
 from rare_envs.traffic.state import VEHICLE_LENGTH
 from samplers.problem import FloatArray
+from training.command_line import run_command
 from training.data.ngsim_tables import VEHICLES_FILE, read_columns
 from training.data.trajectories import DT
 
@@ -94,4 +95,4 @@ def main(data: Annotated[Path, typer.Argument(help="Folder with ngsim_us101_vehi
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_command(main)

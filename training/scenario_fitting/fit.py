@@ -26,6 +26,7 @@ import typer
 
 from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
 from rare_envs.scenarios.registry import scenario_named
+from training.command_line import report_errors, run_command
 from training.data.events import EXTRACTORS, Events, concatenate_events, write_events
 from training.data.highd import highd_recordings, load_highd
 from training.data.ngsim import load_ngsim
@@ -218,7 +219,7 @@ def main(
     seed: Annotated[int, typer.Option(help="Seed of the fits.", min=0)] = 0,
 ) -> None:
     """Write base distributions: us101 (fitted) and highway (assembled), or those of your own recordings."""
-    try:
+    with report_errors("fit"):
         if sum(source is not None for source in (data, highd, ngsim)) != 1:
             raise ValueError("Give one of --data, --highd and --ngsim.")
         chosen = tuple(scenario or EVENT_RECIPES)
@@ -232,9 +233,6 @@ def main(
             fit_own_bases([load_ngsim(ngsim, location=location, gaps=gaps)], chosen, out, name, seed)
         elif data is not None:
             _write_package_bases(data, out, seed)
-    except (OSError, ValueError) as error:
-        typer.echo(f"Error: {error}", err=True)
-        raise typer.Exit(2) from None
 
 
 def _write_package_bases(data: Path, out: Path, seed: int) -> None:
@@ -250,4 +248,4 @@ def _write_package_bases(data: Path, out: Path, seed: int) -> None:
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_command(main)

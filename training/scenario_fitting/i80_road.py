@@ -22,6 +22,7 @@ from scipy.optimize import least_squares
 from rare_envs.traffic.reference_line import ReferenceLine
 from rare_envs.traffic.road import Road
 from samplers.problem import FloatArray
+from training.command_line import report_errors, run_command
 
 ROAD_COMMAND = "python -m training.scenario_fitting.i80_road FOLDER"
 SURVEY_SOURCE = (
@@ -137,11 +138,8 @@ def main(
     out: Annotated[Path, typer.Option(help="The file to write.")] = Path("rare_envs/data/i80.json"),
 ) -> None:
     """Fit the road, print how well it fits, and write the table."""
-    try:
+    with report_errors("i80_road"):
         lanes, lines = read_lines(folder / "lanes.csv", "lane"), read_lines(folder / "boundaries.csv", "boundary")
-    except ValueError as error:
-        typer.echo(f"Error: {error}", err=True)
-        raise typer.Exit(2) from None
     curve, origin, angle = fit_reference_line(lanes)
     curve = ReferenceLine(KNOT_SPACING, tuple(round(k, 9) for k in curve.curvature))
     lanes, lines = ([to_frame(points, origin, angle) for points in group] for group in (lanes, lines))
@@ -162,4 +160,4 @@ def main(
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_command(main)

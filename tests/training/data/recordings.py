@@ -8,9 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
+from training.data.trajectories import NOBODY, Trajectories, find_leaders, tabulate
+
 FOOT = 0.3048
 LANE = 3.75
 DT = 0.02
+ROAD = 400.0
+"""Recorded stretch of road [m]."""
+EDGES = (0.0, 3.5, 7.0)
 
 
 @dataclass(frozen=True)
@@ -179,3 +184,41 @@ def write_highd(folder, upper, lower, recording="01", road=420.0):
         [{"id": 1, "frameRate": 25, "upperLaneMarkings": markings[0], "lowerLaneMarkings": markings[1]}],
     )
     return rows
+
+
+def expected(traffic, table, steps, first=0):
+    """Simulated values at the rows of a table, by name."""
+    k, i = steps, table.vehicle - first
+    names = ("x", "y", "speed", "acceleration")
+    values = {name: getattr(traffic, name)[k, i] for name in names}
+    return values | {"length": traffic.length[i], "width": traffic.width[i], "lane": traffic.lane[k, i] + 1}
+
+
+def check_values(table, values, x_offset=0.0, atol=2e-3):
+    for name in ("x", "y", "length", "width", "speed"):
+        offset = x_offset if name == "x" else 0.0
+        np.testing.assert_allclose(table.column(name), values[name] + offset, atol=atol, err_msg=name)
+
+
+def change(rows, index, **values):
+    return [{**row, **values} if i == index else row for i, row in enumerate(rows)]
+
+
+def table_of(*tracks, edges=EDGES) -> Trajectories:
+    """Tracks as (x, y, speed), each of shape (T,), all from frame 0; vehicles 1, 2, ... of 4 m length."""
+    x, y, speed = (np.concatenate([np.broadcast_to(track[i], len(track[0])) for track in tracks]) for i in range(3))
+    vehicle = np.concatenate([np.full(len(track[0]), number + 1) for number, track in enumerate(tracks)])
+    frame = np.concatenate([np.arange(len(track[0])) for track in tracks])
+    lane = np.searchsorted(edges, y, side="right")
+    row = find_leaders(frame, lane, x)
+    columns = {"recording": "r", "vehicle": vehicle, "frame": frame, "x": x, "y": y, "speed": speed, "lane": lane}
+    columns |= {"acceleration": 0.5, "length": 4.0, "width": 1.8, "leader": np.where(row >= 0, vehicle[row], NOBODY)}
+    return tabulate(columns, {"r": edges})
+
+
+def cutting_in(sign=1.0, pause=20):
+    """Vehicle 1 moves across at 1.3 m/s from second 2 on, between vehicles 2 (behind) and 3 (ahead)."""
+    t = 0.1 * np.arange(90)
+    across = 1.75 + np.clip(1.3 * (t - 0.1 * pause), 0.0, 3.5)
+    y, other = (across, 5.25) if sign > 0 else (7.0 - across, 1.75)
+    return table_of((20.0 + 10.0 * t, y, 10.0), (9.0 * t, other, 9.0), (50.0 + 12.0 * t, other, 12.0))

@@ -1,66 +1,13 @@
-"""Smoothing against its transfer function, exact replay, and the recorded scenes against what is known of them."""
-
-from pathlib import Path
+"""Scenes: lanes, leaders, the split by the clock, and the recorded ones against what is known of them."""
 
 import numpy as np
 import pytest
 
+from tests.training.shared_data import DATA, needs_data
 from training.data.ngsim_tables import SCENES_FILE
 from training.data.scenes import TrafficScene, load_us101_scenes, split_by_clock
-from training.data.smoothing import MIN_HEADING_SPEED, infer_motion, smooth_positions
+from training.data.smoothing import MIN_HEADING_SPEED
 from training.data.trajectories import DT
-
-DATA = Path(__file__).parents[4] / "shared" / "data"
-needs_data = pytest.mark.skipif(
-    not (DATA / SCENES_FILE).is_file(), reason=f"recorded traffic is not part of the repository: {DATA} is absent"
-)
-
-
-def test_parabolas_pass_unchanged():
-    t = DT * np.arange(80)
-    positions = 3.0 + 12.0 * t - 0.7 * t**2
-    np.testing.assert_allclose(smooth_positions(positions, 0.4, DT), positions, atol=1e-6)
-
-
-@pytest.mark.parametrize("frequency", [0.1, 0.4, 0.8])
-def test_gain_of_a_wave_is_that_of_the_filter(frequency):
-    t = DT * np.arange(2000)
-    wave = np.sin(2.0 * np.pi * frequency * t)
-    gain = 1.0 / (1.0 + ((1 - np.cos(2 * np.pi * frequency * DT)) / (1 - np.cos(2 * np.pi * 0.4 * DT))) ** 3)
-    middle = slice(500, 1500)
-    np.testing.assert_allclose(smooth_positions(wave, 0.4, DT)[middle], gain * wave[middle], atol=1e-6)
-
-
-def test_short_tracks_come_back_and_holes_are_refused():
-    assert smooth_positions(np.array([1.0, 5.0, 2.0]), 0.4, DT).tolist() == [1.0, 5.0, 2.0]
-    with pytest.raises(ValueError, match="cut the track"):
-        smooth_positions(np.array([1.0, np.nan, 2.0, 3.0]), 0.4, DT)
-    with pytest.raises(ValueError, match="cut-off"):
-        smooth_positions(np.zeros(9), 6.0, DT)
-
-
-def replayed(track, x, y):
-    """The simulator's step: explicit Euler, old values."""
-    states = [(x[0], y[0], track.heading[0], track.speed[0])]
-    for a, w in zip(track.acceleration[:-2], track.yaw_rate[:-2], strict=True):
-        px, py, h, v = states[-1]
-        states.append((px + v * np.cos(h) * DT, py + v * np.sin(h) * DT, h + w * DT, v + a * DT))
-    return np.array(states)
-
-
-def test_replaying_the_actions_gives_the_track():
-    t = DT * np.arange(60)
-    x, y = 10.0 * t + np.sin(t), 3.5 / (1.0 + np.exp(3.0 - t))
-    states = replayed(infer_motion(x, y, DT), x, y)
-    np.testing.assert_allclose(states[:, 0], x[:-1], atol=1e-10)
-    np.testing.assert_allclose(states[:, 1], y[:-1], atol=1e-10)
-
-
-def test_a_creeping_vehicle_does_not_spin():
-    jitter = 0.02 * np.random.default_rng(0).standard_normal((2, 50))
-    track = infer_motion(np.cumsum(jitter[0]), jitter[1], DT)
-    assert np.nanmin(track.speed) >= 0.0
-    assert np.nanmax(np.abs(track.heading)) <= np.arctan2(1.5, MIN_HEADING_SPEED)
 
 
 def tiny_scene(**changes):
@@ -105,7 +52,7 @@ def test_no_scene_lies_across_the_end_of_a_test_interval():
         split_by_clock([early, late], [(10.05, 11.0)])
 
 
-@needs_data
+@needs_data(SCENES_FILE)
 def test_recorded_scenes_are_what_was_measured():
     scenes = load_us101_scenes(DATA)
     train, test = split_by_clock(scenes)

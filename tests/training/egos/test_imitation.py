@@ -18,6 +18,8 @@ from rare_envs.simulation.observation import observation_space
 from rare_envs.simulation.rollout import drive
 from rare_envs.simulation.world import World
 from tests.training.imitation.synthetic_scenes import scene
+from tests.training.shared_data import DATA, needs_data
+from training.data.ngsim_tables import SCENES_FILE
 from training.egos.encounters import APART, EncounterSpec, make_scenes
 from training.egos.imitation import CONFIG, prepare_learner, train_imitation_ego
 from training.egos.nominal_driving import judge, summarise
@@ -26,8 +28,6 @@ from training.imitation.algorithms.config import Config
 from training.imitation.fit import train_learner
 from training.imitation.traffic.recording import stack_scenes
 from training.imitation.traffic.replayed_traffic import start_replay, step_replay
-
-DATA = Path(__file__).parents[4] / "shared" / "data"
 
 
 def test_an_encounter_is_the_scenario_with_its_ego_free() -> None:
@@ -123,7 +123,7 @@ def test_it_brakes_for_those_who_cut_in() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not DATA.exists(), reason="the recorded trajectories are not here")
+@needs_data(SCENES_FILE)
 def test_a_training_from_the_tables_gives_an_ego_and_refuses_another_s_folder(
     tiny: tuple[Config, list[EncounterSpec]], tmp_path: Path
 ) -> None:

@@ -1,11 +1,28 @@
-"""Scenes made up for tests: cars in three lanes that speed up, slow down and sway, recorded exactly."""
+"""Small trainings for tests: scenes of cars that speed up, slow down and sway, recorded exactly, and settings."""
+
+import dataclasses
 
 import numpy as np
+import torch
 
+from agents.learned.networks import Policy, Scaling
 from training.data.scenes import TrafficScene
+from training.imitation.algorithms.config import Config
 
 DT = 0.1
 EDGES = (0.0, 3.6, 7.2, 10.8)
+TINY = Config(
+    updates=6,
+    epochs=1,
+    batch=64,
+    pools=2,
+    scenes=2,
+    horizon=(3, 5),
+    age=(6, 9),
+    critic_batch=32,
+    warm_up=2,
+    ppo_batch=40,
+)
 
 
 def scene(seed=0, ticks=60, vehicles=9, name="made up"):
@@ -39,3 +56,22 @@ def scene(seed=0, ticks=60, vehicles=9, name="made up"):
 
 def scenes(number=3, **settings):
     return tuple(scene(seed, name=f"made up {seed}", **settings) for seed in range(number))
+
+
+def tiny(**settings):
+    return dataclasses.replace(TINY, **settings)
+
+
+SMALL = tiny(updates=12, pools=1, horizon=(6, 6), age=(6, 6), warm_up=0, ppo_batch=80)
+"""One pool that is always new, and the policy moves from the first round on."""
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def plain_policy():
+    scaling = Scaling(torch.zeros(51), torch.ones(51), torch.tensor([0.5, 0.0]), torch.tensor([2.0, 0.1]))
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        return Policy(scaling)

@@ -8,7 +8,7 @@ import torch
 
 from agents import read_driver, read_provenance
 from agents.learned.networks import HEAD_SIZE, head_weights
-from tests.training.imitation.synthetic_scenes import scenes
+from tests.training.imitation.synthetic_scenes import scenes, tiny
 from training.imitation import ensemble as module
 from training.imitation.algorithms.config import Config
 from training.imitation.algorithms.expert_pairs import Pairs
@@ -25,18 +25,7 @@ from training.imitation.ensemble import (
 from training.imitation.fit import prepare_data
 from training.imitation.run_folder import DRIVER, train_driver
 
-TINY = Config(
-    updates=2,
-    epochs=2,
-    batch=64,
-    pools=2,
-    scenes=2,
-    horizon=(2, 3),
-    age=(6, 9),
-    critic_batch=32,
-    warm_up=1,
-    ppo_batch=40,
-)
+BASE = tiny(updates=2, epochs=2, horizon=(2, 3), warm_up=1)
 FEW = Ensemble(members=10, updates=2)
 
 
@@ -51,7 +40,7 @@ def made_up():
 @pytest.fixture(scope="module", params=["bc", "gail", "mgail"])
 def run(request, made_up, tmp_path_factory):
     folder = tmp_path_factory.mktemp(request.param)
-    train_driver(Source("data", folder), dataclasses.replace(TINY, method=request.param), folder)
+    train_driver(Source("data", folder), dataclasses.replace(BASE, method=request.param), folder)
     return folder
 
 

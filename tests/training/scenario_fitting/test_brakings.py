@@ -1,15 +1,12 @@
 """Recorded brakings: a made-up one is found, and the shipped moments are those of the recordings."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from rare_envs.scenarios.hard_brake import US101
+from tests.training.shared_data import DATA, needs_data
 from training.data.ngsim_tables import VEHICLES_FILE
 from training.scenario_fitting.brakings import find_brakings, load_brakings, log_moments
-
-DATA = Path(__file__).parents[4] / "shared" / "data"
 
 
 def track(deceleration, seconds, speed=20.0, gap=30.0, before=5.0, after=5.0):
@@ -40,7 +37,7 @@ def test_moments_by_hand():
     np.testing.assert_allclose(covariance, [[8.0, 4.0, 4.0], [4.0, 2.0, 2.0], [4.0, 2.0, 2.0]])
 
 
-@pytest.mark.skipif(not (DATA / VEHICLES_FILE).is_file(), reason="recorded traffic is no part of the repository")
+@needs_data(VEHICLES_FILE)
 def test_the_shipped_moments_are_the_recorded_ones():
     events = load_brakings(DATA)
     assert len(events) == 265

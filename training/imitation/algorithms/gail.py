@@ -18,6 +18,7 @@ from agents.learned.networks import Policy
 from training.imitation.algorithms.actions import log_likelihood
 from training.imitation.algorithms.critic import critic_inputs, policy_cost
 from training.imitation.algorithms.learner import Learner, Log
+from training.imitation.algorithms.penalties import total_cost
 from training.imitation.algorithms.rollout import RolloutSteps
 
 
@@ -65,12 +66,8 @@ def value_inputs(policy: Policy, steps: RolloutSteps) -> Tensor:
 
 def rewards(learner: Learner, steps: RolloutSteps) -> Tensor:
     """Return minus the costs of each moment, shape (n,)."""
-    config = learner.config
     likeness = policy_cost(learner.critic, critic_inputs(learner.policy, steps.features, steps.action))
-    costs = config.collision_weight * steps.collision + config.edge_weight * steps.edge
-    manners = config.headway_weight * steps.headway + config.lane_weight * steps.lane
-    manners = manners + config.speed_weight * steps.speed
-    return -(config.critic_weight * likeness + costs + config.brake_weight * steps.brake + manners)
+    return -total_cost(learner.config, likeness, steps.costs)
 
 
 def update_gail(learner: Learner) -> Log:
@@ -111,9 +108,9 @@ def update_gail(learner: Learner) -> Log:
             learner.value_optimiser.step()
     return {
         "reward": float(reward.mean()),
-        "collision": float(steps.collision.mean()),
-        "edge": float(steps.edge.mean()),
-        "brake": float(steps.brake.mean()),
+        "collision": float(steps.costs.collision.mean()),
+        "edge": float(steps.costs.edge.mean()),
+        "brake": float(steps.costs.brake.mean()),
         "value_error": float(error.detach()),
         "critic": critic_error,
     }

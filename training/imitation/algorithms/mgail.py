@@ -11,6 +11,7 @@ import torch
 
 from training.imitation.algorithms.critic import critic_inputs, policy_cost
 from training.imitation.algorithms.learner import Learner, Log
+from training.imitation.algorithms.penalties import Penalties, total_cost
 
 
 def update_mgail(learner: Learner) -> Log:
@@ -18,18 +19,9 @@ def update_mgail(learner: Learner) -> Log:
     config = learner.config
     steps = learner.drive(config.credit)
     likeness = policy_cost(learner.critic, critic_inputs(learner.policy, steps.features, steps.action)).mean()
-    collision, edge, brake = steps.collision.mean(), steps.edge.mean(), steps.brake.mean()
+    costs = Penalties(*(cost.mean() for cost in steps.costs))
     clone = learner.clone_loss()
-    loss = (
-        config.critic_weight * likeness
-        + config.collision_weight * collision
-        + config.edge_weight * edge
-        + config.brake_weight * brake
-        + config.headway_weight * steps.headway.mean()
-        + config.lane_weight * steps.lane.mean()
-        + config.speed_weight * steps.speed.mean()
-        + config.geometric_schedule(config.clone_weight, learner.update) * clone
-    )
+    loss = total_cost(config, likeness, costs) + config.geometric_schedule(config.clone_weight, learner.update) * clone
     learner.policy_optimiser.zero_grad()
     torch.autograd.backward(loss)
     norm = torch.nn.utils.clip_grad_norm_(learner.policy.parameters(), 1.0)
@@ -38,12 +30,7 @@ def update_mgail(learner: Learner) -> Log:
     return {
         "loss": float(loss.detach()),
         "likeness": float(likeness.detach()),
-        "collision": float(collision.detach()),
-        "edge": float(edge.detach()),
-        "brake": float(brake.detach()),
-        "headway": float(steps.headway.detach().mean()),
-        "lane": float(steps.lane.detach().mean()),
-        "speed": float(steps.speed.detach().mean()),
+        **{name: float(cost.detach()) for name, cost in costs._asdict().items()},
         "clone": float(clone.detach()),
         "gradient_norm": float(norm),
         "critic": critic,

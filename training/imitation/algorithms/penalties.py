@@ -15,6 +15,7 @@ from torch import Tensor
 
 from rare_envs.sensors.lidar import AHEAD_BEAM
 from rare_envs.sensors.perception import LANE_OFFSET_COLUMN, RANGE_COLUMNS, RATE_COLUMNS, SPEED_COLUMN
+from training.imitation.algorithms.config import Config
 
 NEAR_ALONG, NEAR_ACROSS = 3.0, 0.8
 """Gaps [m] to the front and to the side below which nearness costs."""
@@ -24,6 +25,10 @@ COMFORTABLE_BRAKING = 1.5
 """Deceleration [m/s^2] towards the vehicle ahead that costs nothing."""
 MAX_EXCESS_BRAKING = 6.0
 """Greatest deceleration [m/s^2] above it that counts."""
+BRAKING_SHARE = 0.1
+"""Cost of 1 m/s^2 of it, as a share of the cost of collision: closing in costs before contact does."""
+LEAST_GAP = 0.5
+"""Gap [m] to which smaller ones are raised in the deceleration that is needed."""
 EDGE_DISTANCE = 1.0
 """Distance [m] from the middle of the vehicle to the edge of the road below which it costs."""
 GENTLE_BRAKING = 2.0
@@ -51,6 +56,25 @@ class Penalties(NamedTuple):
     headway: Tensor
     lane: Tensor
     speed: Tensor
+
+
+def total_cost(config: Config, likeness: Tensor, costs: Penalties) -> Tensor:
+    """Return the weighted sum of all costs, of each moment or of their means.
+
+    Args:
+        config: Settings, with the weight of each cost.
+        likeness: Cost of the critic.
+        costs: Penalties, of the shape of `likeness` each.
+    """
+    return (
+        config.critic_weight * likeness
+        + config.collision_weight * costs.collision
+        + config.edge_weight * costs.edge
+        + config.brake_weight * costs.brake
+        + config.headway_weight * costs.headway
+        + config.lane_weight * costs.lane
+        + config.speed_weight * costs.speed
+    )
 
 
 def compute_penalties(
@@ -84,11 +108,11 @@ def compute_penalties(
     )
     itself = torch.eye(m, x.shape[1], dtype=torch.bool, device=x.device)
     contact = near.masked_fill(itself, 0.0).sum(dim=2)
-    gap = (features[..., RANGE_COLUMNS][..., AHEAD_BEAM] - 0.5 * length[:, :m]).clamp(min=0.5)
+    gap = (features[..., RANGE_COLUMNS][..., AHEAD_BEAM] - 0.5 * length[:, :m]).clamp(min=LEAST_GAP)
     closing = (-features[..., RATE_COLUMNS][..., AHEAD_BEAM]).clamp(min=0.0)
     needed = closing.square() / (2.0 * gap)
     return Penalties(
-        collision=contact + 0.1 * (needed - COMFORTABLE_BRAKING).clamp(0.0, MAX_EXCESS_BRAKING),
+        collision=contact + BRAKING_SHARE * (needed - COMFORTABLE_BRAKING).clamp(0.0, MAX_EXCESS_BRAKING),
         edge=(EDGE_DISTANCE - torch.minimum(y[:, :m] - edges[:, :1], edges[:, -1:] - y[:, :m])).clamp(min=0.0),
         brake=(-action[..., 0] - GENTLE_BRAKING).clamp(min=0.0),
         headway=_headway_cost(x, speed, along, across, m),

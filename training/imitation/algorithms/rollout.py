@@ -22,13 +22,8 @@ class RolloutSteps(NamedTuple):
     """Shape (n, 51), SI units."""
     action: Tensor
     """Normalised, shape (n, 2)."""
-    collision: Tensor
-    """Cost, shape (n,), as the next five."""
-    edge: Tensor
-    brake: Tensor
-    headway: Tensor
-    lane: Tensor
-    speed: Tensor
+    costs: Penalties
+    """Costs of each moment, shape (n,) each."""
     noise: Tensor
     """Expected noise of the action given the ticks before, shape (n, 2)."""
 
@@ -78,8 +73,10 @@ def roll_out(
         rows.append([part[driven] for part in (features, action, *cost, expected)])
         traffic = step_replay(recording, traffic, moved)
         traffic = _scale_gradient(traffic, credit) if model is None else detach_traffic(traffic)
-    columns = [torch.cat(column) for column in zip(*rows, strict=True)]
-    return RolloutSteps(*columns), ScenePool(detach_traffic(traffic), memory, pool.age + ticks)
+    features, action, *costs, expected = (torch.cat(column) for column in zip(*rows, strict=True))
+    return RolloutSteps(features, action, Penalties(*costs), expected), ScenePool(
+        detach_traffic(traffic), memory, pool.age + ticks
+    )
 
 
 def _penalties(traffic: Traffic, features: Tensor, action: Tensor, m: int) -> Penalties:

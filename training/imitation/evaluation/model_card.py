@@ -13,6 +13,7 @@ import typer
 
 from agents import LearnedDriver, Provenance, read_driver, read_provenance
 from agents.vision.checkpoint import holds_vision, read_vision_provenance
+from training.command_line import run_command
 
 ATTRIBUTION = (
     "Derived from recorded trajectories of the Next Generation Simulation (NGSIM) programme: U.S. Department of "
@@ -122,4 +123,4 @@ def main(folder: Annotated[Path, typer.Argument(help="Folder with the drivers.")
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    run_command(main)

@@ -1,0 +1,56 @@
+"""Filters of events: what they drop and count, and files that lack a column."""
+
+import csv
+
+import pytest
+
+from rare_envs.scenarios.registry import scenario_named
+from training.scenario_fitting.event_filters import EVENT_RECIPES, filter_events, read_events
+
+
+def write_events(path, rows):
+    columns = ["phase", *EVENT_RECIPES["cut_in"].columns, "start_seen"]
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(columns)
+        writer.writerows(rows)
+
+
+GOOD = [15.0, 14.0, 16.0, 12.0, 20.0, 3.0]
+
+
+def test_filters_drop_and_count(tmp_path):
+    path = tmp_path / EVENT_RECIPES["cut_in"].file
+    write_events(
+        path,
+        [
+            ["start", *GOOD, True],
+            ["crossing", *GOOD, True],
+            ["start", *GOOD, False],
+            ["start", "", *GOOD[1:], True],  # no ego
+            ["start", *GOOD[:3], -2.0, *GOOD[4:], True],  # side by side
+            ["start", *GOOD[:5], 1.5, True],  # bodies overlap across
+            ["start", 16.0, *GOOD[1:], True],
+        ],
+    )
+    recipe, box = EVENT_RECIPES["cut_in"], scenario_named("cut_in").parameters
+    (points, offsets), log = filter_events(read_events(path, recipe), recipe, box)
+    # speeds and gaps count even where the offset at the start was not seen or is out of range
+    assert points.tolist() == [GOOD[:5], GOOD[:5], GOOD[:5], [16.0, *GOOD[1:5]]]
+    assert offsets.tolist() == [[3.0], [3.0]]
+    assert log[0]["events"] == 6
+    assert [entry["events"] for entry in log if entry["rule"] == "events used"] == [4, 2]
+    dropped = {entry["rule"]: entry["dropped"] for entry in log if entry.get("dropped")}
+    assert dropped == {
+        "v_ego is given": 1,
+        "start_seen": 1,
+        "1 <= gap_ego_cutin <= 120 m": 1,
+        "2.2 <= lateral_offset <= 5 m": 1,
+    }
+
+
+def test_missing_column_is_named(tmp_path):
+    path = tmp_path / "events.csv"
+    path.write_text("v_ego,v_lead\n1,2\n", encoding="utf-8")
+    with pytest.raises(ValueError, match="lacks the columns gap"):
+        read_events(path, EVENT_RECIPES["car_following"])
