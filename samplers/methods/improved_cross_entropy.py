@@ -20,10 +20,11 @@ from samplers.importance.search import (
 )
 from samplers.method import Goal, Interrupted, Steps
 from samplers.methods.base import Method
-from samplers.methods.mixture_em import WidenableMixture, fit_mixture, fit_shrunk_gaussian
+from samplers.methods.mixture_em import WidenableMixture, fit_proposal_mixture
 from samplers.problem import FloatArray, Inputs, StandardNormal
 from samplers.proposals.gaussian import TiltedNormal
 from samplers.proposals.mixture import ProposalDistribution
+from samplers.proposals.shrinkage import fit_shrunk_gaussian
 from samplers.proposals.von_mises_fisher import VonMisesFisherNakagami
 from samplers.statistics.weights import normalise_weights
 from samplers.trace import Level, Status
@@ -179,11 +180,11 @@ class ImprovedCrossEntropy(Method):
         u, weights = u[used], normalise_weights(log_weights[used])
         dim = u.shape[1]
         if self.family == "gaussian":
-            return fit_mixture(fit_shrunk_gaussian, u, weights, 1, 1, rng)
+            return fit_proposal_mixture(fit_shrunk_gaussian, u, weights, 1, 1, rng)
         if self.family == "mixture":
             size = dim + min(dim * (dim + 1) // 2, 2 * dim)  # shrinking leaves about so many
-            return fit_mixture(fit_shrunk_gaussian, u, weights, self.components, size, rng)
-        return fit_mixture(VonMisesFisherNakagami.fit, u, weights, self.components, dim + 2, rng)
+            return fit_proposal_mixture(fit_shrunk_gaussian, u, weights, self.components, size, rng)
+        return fit_proposal_mixture(VonMisesFisherNakagami.fit, u, weights, self.components, dim + 2, rng)
 
 
 def log_smooth_indicator(g: FloatArray, width: float) -> FloatArray:

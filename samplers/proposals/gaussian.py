@@ -84,18 +84,6 @@ class Gaussian:
         return np.asarray(self.mean + z @ self.cholesky.T)
 
 
-def shrink_towards_present(target: Moments, present: Gaussian, points: float) -> Gaussian:
-    """Return the Gaussian with the target's mean and its covariance, drawn towards the present one.
-
-    The present covariance counts as (d + 1) max(1, d / 10) points beside the effectively `points`
-    that are behind the target: in many dimensions the noise of the d (d + 1) / 2 entries of a
-    covariance ruins importance weights.
-    """
-    prior = (present.dim + 1) * max(1.0, present.dim / 10)
-    pull = prior / (prior + points)
-    return Gaussian.from_covariance(target.first, (1 - pull) * target.covariance + pull * present.covariance)
-
-
 def weighted_moments(u: FloatArray, weights: FloatArray) -> Moments:
     """Return E[u] and E[u u'] of points u (n, d) under weights (n,) that add up to 1."""
     return Moments(weights @ u, (u * weights[:, None]).T @ u)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from scipy.special import logsumexp, softmax
+from scipy.special import logsumexp
 
 from samplers.problem import FloatArray
 from samplers.proposals.gaussian import Gaussian
@@ -42,10 +42,13 @@ class Mixture:
         parts = [c.sample(int(k), rng) for c, k in zip(self.components, counts, strict=True)]
         return rng.permutation(np.concatenate(parts))
 
-    def log_prob(self, u: FloatArray) -> FloatArray:
-        """Log density at u (n, d), shape (n,)."""
-        terms = [np.log(w) + c.log_prob(u) for w, c in zip(self.weights, self.components, strict=True)]
-        return np.asarray(logsumexp(terms, axis=0))
+    def log_prob(self, u: FloatArray, /) -> FloatArray:
+        """Return the log density at u (n, d), shape (n,)."""
+        return np.asarray(logsumexp(self.log_terms(u), axis=0))
+
+    def log_terms(self, u: FloatArray) -> FloatArray:
+        """Return log(weight_j q_j) of the components at u (n, d), shape (k, n)."""
+        return np.stack([np.log(w) + c.log_prob(u) for w, c in zip(self.weights, self.components, strict=True)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,8 +60,3 @@ class GaussianMixture(Mixture):
     def widen(self, factor: float) -> GaussianMixture:
         """Return the same with the standard deviations of all components multiplied by factor."""
         return GaussianMixture(self.weights, [component.widen(factor) for component in self.components])
-
-    def responsibilities(self, u: FloatArray) -> FloatArray:
-        """Return how likely each point u (n, d) comes from each component, shape (n, k)."""
-        terms = [np.log(w) + c.log_prob(u) for w, c in zip(self.weights, self.components, strict=True)]
-        return np.asarray(softmax(np.stack(terms, axis=1), axis=1))

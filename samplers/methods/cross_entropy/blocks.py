@@ -20,8 +20,9 @@ from samplers.methods.cross_entropy.beta_block import PAPERS_BOX, BetaBlock
 from samplers.methods.cross_entropy.gaussian_mixture_em import fit_mixture_towards
 from samplers.methods.cross_entropy.kl_projection import project_mean
 from samplers.problem import FloatArray, Inputs
-from samplers.proposals.gaussian import Gaussian, shrink_towards_present, weighted_moments
+from samplers.proposals.gaussian import Gaussian, weighted_moments
 from samplers.proposals.mixture import GaussianMixture
+from samplers.proposals.shrinkage import shrink_towards_present
 
 
 class Block(Protocol):

@@ -1,26 +1,61 @@
-"""A step of cross-entropy in a family of Gaussian mixtures, by expectation-maximisation.
+"""A step of cross-entropy in a family of Gaussian mixtures, by expectation-maximisation."""
 
-References:
-    Dempster, Laird and Rubin, "Maximum likelihood from incomplete data via the EM algorithm",
-    JRSS B 39, 1977.
-    Geyer, Papaioannou and Straub, "Cross entropy-based importance sampling using Gaussian densities
-    revisited", Structural Safety 76, 2019 (weighted points).
-"""
+from dataclasses import dataclass
 
 import numpy as np
 
 from samplers.problem import FloatArray
-from samplers.proposals.gaussian import shrink_towards_present, weighted_moments
+from samplers.proposals.em import expectation_maximisation, k_means, one_hot, posterior
+from samplers.proposals.gaussian import weighted_moments
 from samplers.proposals.mixture import GaussianMixture
+from samplers.proposals.shrinkage import shrink_towards_present
 
-STEPS = 10
-"""Steps of expectation-maximisation per step of cross-entropy; each one raises the objective."""
+EM_STEPS = 10
+"""M-steps per step of cross-entropy, always all of them; each one raises the objective."""
+RESTARTS = 3
+"""Starts of k-means, of which the best is taken: one alone may put two centres into one region."""
+KMEANS_STEPS = 300
+"""Steps of k-means at most."""
+EMPTY = float(np.finfo(np.float64).eps)
+"""A component with less weight has no points left."""
+
+
+@dataclass(frozen=True, eq=False)
+class _TowardsPoints:
+    """Mixtures between the present one and weighted points, see `samplers.proposals.em.Family`."""
+
+    present: GaussianMixture
+    """P, with as many components as there are responsibilities."""
+    x: FloatArray
+    weights: FloatArray
+    alpha: float
+    """Share of the points."""
+
+    def maximise(self, responsibilities: FloatArray) -> GaussianMixture:
+        """Return weights, means and covariances; a component without any weight stays as it is."""
+        shares, components = [], []
+        parts = zip(self.present.weights, self.present.components, self.weights * responsibilities, strict=True)
+        for weight, component, mass in parts:
+            total = float(mass.sum())
+            share = self.alpha * total + (1 - self.alpha) * weight
+            shares.append(share)
+            if share < EMPTY:
+                components.append(component)
+                continue
+            mass = mass / total if total > 0 else np.full(len(self.x), 1 / len(self.x))
+            target = weighted_moments(self.x, mass).mix_with(component.moments, self.alpha * total / share)
+            components.append(shrink_towards_present(target, component, 1 / float(mass @ mass)))
+        return GaussianMixture(np.maximum(shares, np.finfo(np.float64).tiny) / sum(shares), components)
+
+    def log_terms(self, mixture: GaussianMixture) -> FloatArray:
+        """Return log(weight_j q_j) of the components at the points, shape (k, n)."""
+        return mixture.log_terms(self.x)
 
 
 def fit_mixture_towards(
-    now: GaussianMixture, k: int, x: FloatArray, weights: FloatArray, alpha: float
+    present: GaussianMixture, k: int, x: FloatArray, weights: FloatArray, alpha: float
 ) -> GaussianMixture:
-    """Return a mixture of at most k Gaussians nearer to alpha Q + (1 - alpha) P than `now`, which is P.
+    """Return a mixture of at most k Gaussians nearer to alpha Q + (1 - alpha) P than P, the present one.
 
     Maximises a lower bound of equation 2's objective: the points of Q are shared among the
     components anew in every step, the mass of P stays with the components that it comes from, so
@@ -28,45 +63,22 @@ def fit_mixture_towards(
     are copies of it, and the points are first shared by k-means.
 
     Args:
-        now: The present mixture.
+        present: P.
         k: Components at most; fewer where Q has fewer distinct points or alpha = 1 leaves one empty.
         x: Points of Q, shape (n, d).
         weights: Their weights, adding up to 1, shape (n,).
         alpha: Share of Q.
     """
-    if len(now.components) == 1:
-        shares = _clusters(x, weights, k)
-        k = shares.shape[1]
-        now = GaussianMixture(np.full(k, 1 / k), [now.components[0]] * k)
+    if len(present.components) == 1:
+        rng = np.random.default_rng(0)  # fixed: equal points give equal mixtures
+        labels = k_means(x, weights, k, rng, RESTARTS, KMEANS_STEPS)
+        k = int(labels.max()) + 1
+        start = one_hot(labels, k)
+        present = GaussianMixture(np.full(k, 1 / k), [present.components[0]] * k)
     else:
-        shares = now.responsibilities(x)
-    for _ in range(STEPS):
-        fitted = _maximise(now, x, weights[:, None] * shares, alpha)
-        if len(fitted.components) < shares.shape[1]:
-            return fitted
-        shares = fitted.responsibilities(x)
-    return fitted
-
-
-def _maximise(now: GaussianMixture, x: FloatArray, mass: FloatArray, alpha: float) -> GaussianMixture:
-    """Return weights, means and covariances for points shared as `mass` (n, k), which adds up to 1."""
-    weights, components = [], []
-    for weight, component, part in zip(now.weights, now.components, mass.T, strict=True):
-        total = float(part.sum())
-        share = alpha * total + (1 - alpha) * weight
-        if share < np.finfo(np.float64).eps:
-            continue
-        part = part / total if total > 0 else np.full(len(x), 1 / len(x))
-        target = weighted_moments(x, part).mix_with(component.moments, alpha * total / share)
-        weights.append(share)
-        components.append(shrink_towards_present(target, component, 1 / float(part @ part)))
-    return GaussianMixture(np.array(weights) / sum(weights), components)
-
-
-def _clusters(x: FloatArray, weights: FloatArray, k: int) -> FloatArray:
-    """Return to which of at most k clusters each point of x (n, d) belongs, as zeros and ones (n, k)."""
-    from sklearn.cluster import KMeans  # over a second to import
-
-    k = min(k, len(np.unique(x, axis=0)))
-    labels = KMeans(k, n_init=3, random_state=0).fit(x, sample_weight=weights).labels_
-    return np.asarray(labels[:, None] == np.arange(k), dtype=np.float64)
+        start = posterior(present.log_terms(x))
+    family = _TowardsPoints(present, x, weights, alpha)
+    mixture, _ = expectation_maximisation(family, start, weights, EM_STEPS, lambda _: -np.inf)
+    used = mixture.weights > EMPTY
+    components = [component for component, kept in zip(mixture.components, used, strict=True) if kept]
+    return GaussianMixture(mixture.weights[used] / mixture.weights[used].sum(), components)

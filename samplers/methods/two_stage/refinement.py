@@ -15,7 +15,7 @@ from samplers.methods.two_stage.mixture.proposal import NO_REGION, MixturePropos
 from samplers.methods.two_stage.mixture.subspace_em import (
     HIGH_DIM,
     GroupedPoints,
-    fit_mixture,
+    fit_subspace_mixture,
     refit_components,
     truncate_weights,
 )
@@ -180,7 +180,7 @@ def _fit_chains(region: Region, most: int, points_per_chain: float, rng: np.rand
         ess=points_per_chain * chains,
         groups=np.repeat(np.arange(chains), steps),
     )
-    return fit_mixture(points, most if dim <= HIGH_DIM else 1, rng).bumps
+    return fit_subspace_mixture(points, most if dim <= HIGH_DIM else 1, rng).components
 
 
 def _fit_failures(
@@ -192,7 +192,7 @@ def _fit_failures(
     if ess < max(settings.min_fresh_ess, settings.min_fresh_ess_per_dim * dim):
         return []
     points = GroupedPoints(history.u, weights, ess, np.arange(len(weights)))
-    return fit_mixture(points, settings.max_gaussians, rng).bumps
+    return fit_subspace_mixture(points, settings.max_gaussians, rng).components
 
 
 def _fit_linear(state: RefinementState, settings: RefinementSettings) -> tuple[ProposalComponent, ...]:

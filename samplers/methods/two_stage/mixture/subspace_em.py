@@ -1,31 +1,60 @@
-"""Fitting mixtures of bumps to points: expectation-maximisation with careful covariances.
+"""Mixtures of `SubspaceGaussian` components, fitted to weighted points with cautious covariances.
 
 References:
-    Ledoit and Wolf, "A well-conditioned estimator for large-dimensional covariance matrices", Journal of
-    Multivariate Analysis 88, 2004 (how much to shrink).
     Schwarz, "Estimating the dimension of a model", Annals of Statistics 6, 1978 (BIC).
+    Ionides, "Truncated importance sampling", Journal of Computational and Graphical Statistics 17, 2008.
 """
 
 import math
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import logsumexp
 
 from samplers.problem import FloatArray
 from samplers.proposals.components import SubspaceGaussian, log_ratios
+from samplers.proposals.em import expectation_maximisation, k_means, one_hot, posterior
+from samplers.proposals.shrinkage import shrink_covariance
 from samplers.statistics.weights import normalise_weights
 
 HIGH_DIM = 40
-"""Above this many dimensions a bump has one direction of its own: more cannot be learned from some hundred points."""
-STEPS = 25
-"""Steps of expectation-maximisation at most."""
+"""Above this many dimensions a component has one direction of its own: some hundred points do not show more."""
+SIZES = (1, 2, 3, 4, 6, 8)
+"""Numbers of components that are tried; MOST_WORSE of them without a better score end the search."""
+MOST_WORSE = 2
+MAX_EM_ITERATIONS = 25
+"""M-steps at most; most fits end after 5 to 10."""
+LEAST_RELATIVE_GAIN = 1e-3
+"""Expectation-maximisation ends where a step raises the log likelihood by less than this share of it."""
 RESTARTS = 3
+"""Starts for each number of components; k-means++ draws its centres."""
+LEAST_ESS = 2.0
+"""Points that any component is taken to rest on: the formulae divide by their number."""
+REFIT_STEPS = 2
+"""M-steps between two rounds of draws; the rounds go on from there."""
+LEAST_REFIT_POINTS = 5
+"""A component with fewer points stays where it is."""
+REFIT_ESS = 30.0
+REFIT_ESS_PER_DIM = 3.0
+"""Effective points that a component is fitted to, of at most a third of its own: as many as its mean needs, and its
+covariance with shrinkage. Where the weights are less even, they are raised to a power less than 1."""
+LEAST_MIXING = 1e-6
+"""Least weight of a component while others move; none is given up."""
+MOST_SPREAD = 4.0
+"""Largest variance along the one direction in high dimensions; a few points of another region give more."""
+LEAST_VARIANCE_OF_COMPONENT = 1e-6
+"""Points may coincide."""
+STANDARD_ERRORS = 2
+"""By how many of them a variance under 1 is raised: too small a variance makes weights unbounded."""
+POINTS_PER_COMPONENT = 4
+"""Effective points for each component at least."""
+TINY = 1e-300
+"""Stands for 0 where a logarithm or a quotient is taken."""
 
 
 class GroupedPoints(NamedTuple):
-    """Weighted points to which bumps are fitted."""
+    """Weighted points to which components are fitted."""
 
     u: FloatArray
     """Shape (n, d)."""
@@ -34,24 +63,28 @@ class GroupedPoints(NamedTuple):
     ess: float
     """How many independent points they are worth."""
     groups: NDArray[np.int64]
-    """Points of one group (a chain) belong to one bump; numbers from 0, shape (n,)."""
+    """Points of one group (a chain) belong to one component; numbers from 0, shape (n,)."""
+
+    @property
+    def n_groups(self) -> int:
+        """Number of groups."""
+        return int(self.groups.max()) + 1
 
 
 class SubspaceMixture(NamedTuple):
-    """A mixture of bumps."""
+    """A fitted mixture."""
 
-    bumps: list[SubspaceGaussian]
+    components: list[SubspaceGaussian]
     weights: FloatArray
     score: float
     """Log likelihood, in independent points, less the BIC penalty."""
 
 
 def fit_shrunk_subspace_gaussian(u: FloatArray, weights: FloatArray, ess: float) -> tuple[SubspaceGaussian, float]:
-    """Return the bump of weighted points and how much of it is the shrinkage target.
+    """Return the component of weighted points, and the share of the shrinkage target in its covariance.
 
-    The covariance S is drawn towards T = I + (l - 1) v v', with v the direction of the mean and l the variance
-    along it: one special direction, else standard normal, as beyond a plane. Its share is Ledoit and Wolf's
-    b^2 / d^2. Above HIGH_DIM dimensions it is all of it.
+    Its covariance is shrunk as by `shrink_covariance`. Above HIGH_DIM dimensions it is the target alone: one direction,
+    that of the mean, and N(0, 1) across it.
 
     Args:
         u: Points, shape (n, d).
@@ -66,15 +99,11 @@ def fit_shrunk_subspace_gaussian(u: FloatArray, weights: FloatArray, ess: float)
     if dim > HIGH_DIM:
         # Noise makes the mean of few points too long, by (d - 1) / ess in the square, and turns it.
         excess = min((dim - 1) / (ess * max(norm, 1e-9) ** 2), 0.5)
-        variance = np.array([min(along * (1 - excess) + excess, 4.0)])
+        variance = np.array([min(along * (1 - excess) + excess, MOST_SPREAD)])
         return SubspaceGaussian(v[:, None], np.array([norm * (1 - excess)]), inflate_variances(variance, ess)), 1.0
     centred = (u - mean) * np.sqrt(weights)[:, None]
-    covariance = centred.T @ centred
-    target = np.eye(dim) + (along - 1) * np.outer(v, v)
-    noise = (float(np.trace(covariance)) ** 2 + float((covariance * covariance).sum())) / ess
-    distance = float(((covariance - target) ** 2).sum())
-    share = min(1.0, max(noise / distance if distance > 0 else 1.0, (dim + 1) / (2 * (dim + 1 + ess))))
-    values, axes = np.linalg.eigh((1 - share) * covariance + share * target)
+    shrunk, share = shrink_covariance(centred.T @ centred, v, along, ess)
+    values, axes = np.linalg.eigh(shrunk)
     return SubspaceGaussian(axes, axes.T @ mean, inflate_variances(values, ess)), share
 
 
@@ -83,116 +112,122 @@ def inflate_variances(variance: FloatArray, ess: float) -> FloatArray:
 
     Too small a variance makes weights unbounded, too large a one costs a few draws.
     """
-    variance = np.maximum(variance, 1e-6)
-    raised = np.minimum(variance * (1 + 2 * math.sqrt(2 / max(ess, 2.0))), 1.0)
+    variance = np.maximum(variance, LEAST_VARIANCE_OF_COMPONENT)
+    raised = np.minimum(variance * (1 + STANDARD_ERRORS * math.sqrt(2 / max(ess, LEAST_ESS))), 1.0)
     return np.where(variance < 1, raised, variance)
 
 
-def fit_mixture(points: GroupedPoints, most: int, rng: np.random.Generator) -> SubspaceMixture:
-    """Return a mixture of at most `most` bumps, their number chosen by BIC."""
+def fit_subspace_mixture(points: GroupedPoints, most: int, rng: np.random.Generator) -> SubspaceMixture:
+    """Return a mixture of at most `most` components, their number chosen by BIC."""
     best = None
     worse = 0
-    for k in (k for k in (1, 2, 3, 4, 6, 8) if k <= most):
-        if k > 1 and (k > points.groups.max() + 1 or points.ess < 4 * k):
+    for k in (size for size in SIZES if size <= most):
+        if k > 1 and (k > points.n_groups or points.ess < POINTS_PER_COMPONENT * k):
             break
         restarts = 1 if k == 1 else RESTARTS
         found = max(
-            (_run_em(points, _initial_responsibilities(points, k, rng)) for _ in range(restarts)),
+            (_fit_from(points, _initial_responsibilities(points, k, rng)) for _ in range(restarts)),
             key=lambda mix: mix.score,
         )
         if best is None or found.score > best.score:
             best, worse = found, 0
         else:
             worse += 1
-        if worse == 2:
+        if worse == MOST_WORSE:
             break
-    assert best is not None  # one bump can always be fitted
+    assert best is not None  # one component can always be fitted
     return best
 
 
 def _initial_responsibilities(points: GroupedPoints, k: int, rng: np.random.Generator) -> FloatArray:
     """Return responsibilities (k, n) to start from: clusters of the groups' means."""
-    n_groups = int(points.groups.max()) + 1
+    n_groups = points.n_groups
     mass = np.bincount(points.groups, weights=points.weights, minlength=n_groups).astype(np.float64)
     means = np.zeros((n_groups, points.u.shape[1]))
     np.add.at(means, points.groups, points.u * points.weights[:, None])
-    nearest = _clusters(means / np.maximum(mass, 1e-300)[:, None], mass, k, rng)
-    return np.equal(nearest[points.groups], np.arange(k)[:, None]).astype(np.float64)
+    return one_hot(k_means(means / np.maximum(mass, TINY)[:, None], mass / mass.sum(), k, rng)[points.groups], k)
 
 
-def _clusters(x: FloatArray, mass: FloatArray, k: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Return clusters (n,) of points x (n, d): k-means++ and five steps of Lloyd."""
-    mass = mass / mass.sum()
-    centres = [x[rng.choice(len(x), p=mass)]]
-    while len(centres) < k:
-        far = np.min([((x - c) ** 2).sum(axis=1) for c in centres], axis=0) * mass
-        if far.sum() <= 0:
-            break
-        centres.append(x[rng.choice(len(x), p=far / far.sum())])
-    middle = np.array(centres)
-    for _ in range(5):
-        near = np.argmin(-2 * x @ middle.T + (middle**2).sum(axis=1), axis=1)
-        for j in range(len(middle)):
-            if mass[near == j].sum() > 0:
-                middle[j] = np.average(x[near == j], axis=0, weights=mass[near == j])
-    return np.asarray(near, dtype=np.int64)
+class _Fitted(NamedTuple):
+    """Components with the share of the shrinkage target in each, and their weights."""
+
+    components: list[SubspaceGaussian]
+    target_shares: list[float]
+    weights: FloatArray
 
 
-def _run_em(points: GroupedPoints, shares: FloatArray) -> SubspaceMixture:
-    """Run expectation-maximisation from responsibilities (k, n) until the likelihood rises no more."""
-    u, weights, ess, groups = points
-    n_groups = int(groups.max()) + 1
-    last = -math.inf
-    for _ in range(STEPS):
-        mass = (shares * weights).sum(axis=1)
-        shares, mass = shares[mass * ess > 1], mass[mass * ess > 1]  # less than a point is no bump
+@dataclass(frozen=True)
+class _GroupedFamily:
+    """Mixtures in which all points of a group come from one component, see `samplers.proposals.em.Family`."""
+
+    points: GroupedPoints
+
+    def maximise(self, responsibilities: FloatArray) -> _Fitted:
+        """Return the components that have at least one point, from responsibilities (k, n)."""
+        u, weights, ess, _ = self.points
+        mass = (responsibilities * weights).sum(axis=1)
+        shares, mass = responsibilities[mass * ess > 1], mass[mass * ess > 1]
         fits = [
-            fit_shrunk_subspace_gaussian(u, s * weights / m, max(float(m) * ess, 2.0))
-            for s, m in zip(shares, mass, strict=True)
+            fit_shrunk_subspace_gaussian(u, share * weights / m, max(float(m) * ess, LEAST_ESS))
+            for share, m in zip(shares, mass, strict=True)
         ]
-        bumps, mixing = [bump for bump, _ in fits], mass / mass.sum()
-        per_point = log_ratios(bumps, u) * (ess * weights)
-        per_group = np.array([np.bincount(groups, weights=row, minlength=n_groups) for row in per_point])
-        per_group += np.log(mixing)[:, None]
-        total = logsumexp(per_group, axis=0)
-        likelihood = float(total.sum())
-        if likelihood - last < 1e-3 * abs(likelihood):
-            break
-        last = likelihood
-        shares = np.exp(per_group - total)[:, groups]
-    dim = u.shape[1]
-    parameters = len(fits) - 1 + sum(dim + 1 + min((1 - a) * dim * (dim + 1) / 2, 2 * dim) for _, a in fits)
-    return SubspaceMixture(bumps, mixing, likelihood - 0.5 * math.log(max(ess, 3.0)) * parameters)
+        return _Fitted([one for one, _ in fits], [share for _, share in fits], mass / mass.sum())
+
+    def log_terms(self, mixture: _Fitted) -> FloatArray:
+        """Return log(weight_j) and the log ratio to N(0, I) of each point's group, in independent points, (k, n)."""
+        u, weights, ess, groups = self.points
+        per_point = log_ratios(mixture.components, u) * (ess * weights)
+        per_group = np.array([np.bincount(groups, weights=row, minlength=self.points.n_groups) for row in per_point])
+        return np.asarray((per_group + np.log(mixture.weights)[:, None])[:, groups])
 
 
-def refit_components(bumps: list[SubspaceGaussian], u: FloatArray, log_weights: FloatArray) -> list[SubspaceGaussian]:
-    """Return bumps moved to weighted points u (n, d), each by those that are its own.
+def _fit_from(points: GroupedPoints, start: FloatArray) -> SubspaceMixture:
+    """Return the mixture that expectation-maximisation reaches from responsibilities (k, n)."""
+    once_per_group = 1 / np.bincount(points.groups)[points.groups]
+    fit, log_likelihood = expectation_maximisation(
+        _GroupedFamily(points), start, once_per_group, MAX_EM_ITERATIONS, lambda total: LEAST_RELATIVE_GAIN * abs(total)
+    )
+    dim = points.u.shape[1]
+    covariances = [min((1 - share) * dim * (dim + 1) / 2, 2 * dim) for share in fit.target_shares]
+    parameters = len(fit.components) - 1 + sum(dim + 1 + size for size in covariances)
+    penalty = 0.5 * math.log(max(points.ess, 3.0)) * parameters
+    return SubspaceMixture(fit.components, fit.weights, log_likelihood - penalty)
 
-    Two steps of expectation-maximisation from the present bumps; their number stays, so that a bump with few points
-    is not lost. Where the weights of a bump's points are too uneven to fit it, they are tempered until they are not.
+
+def refit_components(
+    components: list[SubspaceGaussian], u: FloatArray, log_weights: FloatArray
+) -> list[SubspaceGaussian]:
+    """Return components moved to weighted points u (n, d), each by those that are its own.
+
+    Two steps of expectation-maximisation from the present components; their number stays, so that one with few
+    points is not lost.
     """
     weights = truncate_weights(log_weights)
-    log_mixing = np.zeros(len(bumps))
-    for _ in range(2):
-        log_shares = log_ratios(bumps, u) + log_mixing[:, None]
-        shares = np.exp(log_shares - logsumexp(log_shares, axis=0))
-        bumps = [_moved(b, u, s, np.log(np.maximum(weights, 1e-300))) for b, s in zip(bumps, shares, strict=True)]
-        log_mixing = np.log(np.maximum((shares * weights).sum(axis=1), 1e-6))
-    return bumps
+    log_mixing = np.zeros(len(components))
+    for _ in range(REFIT_STEPS):
+        shares = posterior(log_ratios(components, u) + log_mixing[:, None])
+        log_w = np.log(np.maximum(weights, TINY))
+        components = [_refit(one, u, share, log_w) for one, share in zip(components, shares, strict=True)]
+        log_mixing = np.log(np.maximum((shares * weights).sum(axis=1), LEAST_MIXING))
+    return components
 
 
-def _moved(bump: SubspaceGaussian, u: FloatArray, shares: FloatArray, log_weights: FloatArray) -> SubspaceGaussian:
+def _refit(component: SubspaceGaussian, u: FloatArray, shares: FloatArray, log_weights: FloatArray) -> SubspaceGaussian:
+    """Return a component fitted to its share (n,) of weighted points.
+
+    Where the weights are too uneven to fit it, they are raised to powers less than 1 until they are not.
+    """
     count = float(shares.sum())
-    if count < 5:
-        return bump
-    wanted = min(max(30.0, 3.0 * u.shape[1]), count / 3)
-    log_shares = np.log(np.maximum(shares, 1e-300))
+    if count < LEAST_REFIT_POINTS:
+        return component
+    wanted = min(max(REFIT_ESS, REFIT_ESS_PER_DIM * u.shape[1]), count / 3)
+    log_shares = np.log(np.maximum(shares, TINY))
     for power in np.arange(1.0, 0.0, -0.1):
         w = normalise_weights(log_shares + power * log_weights)
         ess = 1 / float((w * w).sum())
         if ess >= wanted:
             break
-    return fit_shrunk_subspace_gaussian(u, w, max(ess, 2.0))[0]
+    return fit_shrunk_subspace_gaussian(u, w, max(ess, LEAST_ESS))[0]
 
 
 def truncate_weights(log_weights: FloatArray) -> FloatArray:

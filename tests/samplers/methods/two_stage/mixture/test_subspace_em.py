@@ -9,8 +9,8 @@ from scipy.special import logsumexp
 from samplers.methods.two_stage.mixture.subspace_em import (
     HIGH_DIM,
     GroupedPoints,
-    fit_mixture,
     fit_shrunk_subspace_gaussian,
+    fit_subspace_mixture,
     inflate_variances,
     refit_components,
     truncate_weights,
@@ -148,9 +148,9 @@ def test_two_clusters_are_two_bumps():
     for seed in range(10):
         rng = np.random.default_rng(seed)
         u = two_clusters(rng)
-        mix = fit_mixture(equal(u), 8, rng)
-        assert len(mix.bumps) == 2
-        first, second = sorted(mix.bumps, key=lambda bump: bump.centre[0])
+        mix = fit_subspace_mixture(equal(u), 8, rng)
+        assert len(mix.components) == 2
+        first, second = sorted(mix.components, key=lambda bump: bump.centre[0])
         np.testing.assert_allclose(first.centre, [-3, 2], atol=4 * 0.6 / math.sqrt(400) + 0.02)
         np.testing.assert_allclose(second.centre, [3, 2], atol=4 / math.sqrt(400) + 0.02)
         np.testing.assert_allclose(first.variance, 0.36, atol=8 * 0.36 * math.sqrt(2 / 400))
@@ -163,16 +163,16 @@ def test_one_gaussian_is_one_bump():
     for seed in range(20):
         rng = np.random.default_rng(seed)
         u = gaussian(300, np.array([3.0, 0.0]), np.array([[0.5, 0.2], [0.2, 1.0]]), rng)
-        numbers.append(len(fit_mixture(equal(u), 8, rng).bumps))
+        numbers.append(len(fit_subspace_mixture(equal(u), 8, rng).components))
     assert numbers.count(1) >= 18
 
 
 def test_no_more_bumps_than_asked_for_than_groups_or_than_points_carry(rng):
     u = two_clusters(rng)
-    assert len(fit_mixture(equal(u), 1, rng).bumps) == 1
-    assert len(fit_mixture(equal(u, np.zeros(len(u), dtype=int)), 8, rng).bumps) == 1
+    assert len(fit_subspace_mixture(equal(u), 1, rng).components) == 1
+    assert len(fit_subspace_mixture(equal(u, np.zeros(len(u), dtype=int)), 8, rng).components) == 1
     few = GroupedPoints(u, np.full(len(u), 1 / len(u)), 7.0, np.arange(len(u)))
-    assert len(fit_mixture(few, 8, rng).bumps) == 1
+    assert len(fit_subspace_mixture(few, 8, rng).components) == 1
 
 
 def test_points_of_a_chain_stay_together(rng):
@@ -180,8 +180,8 @@ def test_points_of_a_chain_stay_together(rng):
     u = two_clusters(rng, 200)
     within = np.repeat(np.arange(40), 10)
     across = np.tile(np.arange(40), 10)
-    assert len(fit_mixture(equal(u, within)._replace(ess=80.0), 3, rng).bumps) == 2
-    assert len(fit_mixture(equal(u, across)._replace(ess=80.0), 3, rng).bumps) == 1
+    assert len(fit_subspace_mixture(equal(u, within)._replace(ess=80.0), 3, rng).components) == 2
+    assert len(fit_subspace_mixture(equal(u, across)._replace(ess=80.0), 3, rng).components) == 1
 
 
 def test_a_fit_is_nearly_as_likely_as_the_truth_and_more_than_one_bump(rng):
@@ -190,10 +190,10 @@ def test_a_fit_is_nearly_as_likely_as_the_truth_and_more_than_one_bump(rng):
         SubspaceGaussian(np.eye(2), np.array([-3.0, 2.0]), np.full(2, 0.36)),
     ]
     u = two_clusters(rng, 2000)
-    mix = fit_mixture(equal(u), 8, rng)
+    mix = fit_subspace_mixture(equal(u), 8, rng)
     # the maximum exceeds the truth by chi2_9 / (2 n); shrinkage and caution cost about as much
-    assert log_likelihood(mix.bumps, mix.weights, u) > log_likelihood(truth, [0.5, 0.5], u) - 10 / len(u)
-    assert log_likelihood(mix.bumps, mix.weights, u) > log_likelihood(
+    assert log_likelihood(mix.components, mix.weights, u) > log_likelihood(truth, [0.5, 0.5], u) - 10 / len(u)
+    assert log_likelihood(mix.components, mix.weights, u) > log_likelihood(
         [fit_shrunk_subspace_gaussian(u, np.full(4000, 1 / 4000), 4000)[0]], [1.0], u
     )
 

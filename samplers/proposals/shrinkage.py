@@ -1,0 +1,71 @@
+"""Shrinkage of a covariance that is estimated from few weighted points.
+
+Two targets: N(0, I) with one special direction, for points of one failure region, and the present Gaussian of a
+search, for a step of it.
+
+References:
+    Ledoit and Wolf, "A well-conditioned estimator for large-dimensional covariance matrices",
+    Journal of Multivariate Analysis 88, 2004 (the share of the target).
+"""
+
+import numpy as np
+
+from samplers.problem import FloatArray
+from samplers.proposals.gaussian import Gaussian, Moments, weighted_moments
+
+LEAST_VARIANCE = 1e-8
+"""Added to the variance in every direction: points may coincide."""
+
+
+def shrink_covariance(
+    covariance: FloatArray, direction: FloatArray, along: float, n: float
+) -> tuple[FloatArray, float]:
+    """Return the covariance S drawn towards T = I + (along - 1) v v', and the share of T.
+
+    T is the covariance of N(0, I) beyond a plane with normal v. Its share is the expected square error of S over the
+    square distance between S and T (Ledoit and Wolf), but at least that of (d + 1) / 2 points, counted beside n of S:
+    T where n is small for d, S where n is large.
+
+    Args:
+        covariance: S, of weighted points, shape (d, d).
+        direction: v, the unit vector of their mean, shape (d,).
+        along: Their variance along v.
+        n: Number of independent points that they are worth.
+    """
+    dim = len(direction)
+    target = np.eye(dim) + (along - 1) * np.outer(direction, direction)
+    noise = (float(np.trace(covariance)) ** 2 + float((covariance * covariance).sum())) / n
+    distance = float(((covariance - target) ** 2).sum())
+    share = max(noise / distance if distance > noise else 1.0, (dim + 1) / (2 * (dim + 1 + n)))
+    return (1 - share) * covariance + share * target, share
+
+
+def fit_shrunk_gaussian(u: FloatArray, weights: FloatArray) -> Gaussian:
+    """Return the Gaussian of weighted points with its covariance shrunk, see `shrink_covariance`.
+
+    Args:
+        u: Points, shape (n, d).
+        weights: Adding up to 1, shape (n,).
+    """
+    moments = weighted_moments(u, weights)
+    mean, s = moments.first, moments.covariance
+    v = mean / max(float(np.linalg.norm(mean)), np.finfo(np.float64).tiny)
+    along = max(float(v @ s @ v), LEAST_VARIANCE)
+    shrunk, _ = shrink_covariance(s, v, along, 1 / float(weights @ weights))
+    return Gaussian.from_covariance(mean, shrunk + LEAST_VARIANCE * np.eye(len(mean)))
+
+
+def shrink_towards_present(target: Moments, present: Gaussian, n: float) -> Gaussian:
+    """Return the Gaussian with the target's mean and its covariance drawn towards the present one.
+
+    The present covariance counts as (d + 1) max(1, d / 10) points beside the n behind the target: in many dimensions
+    the noise of the d (d + 1) / 2 entries of a covariance ruins importance weights.
+
+    Args:
+        target: Moments of weighted points.
+        present: The Gaussian that the points are drawn from.
+        n: Number of independent points that they are worth.
+    """
+    prior = (present.dim + 1) * max(1.0, present.dim / 10)
+    share = prior / (prior + n)
+    return Gaussian.from_covariance(target.first, (1 - share) * target.covariance + share * present.covariance)
