@@ -14,9 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 import rare_envs
-from rare_envs.study.cli import printing as show
-from rare_envs.study.evaluate import Question, prepare, run
-from rare_envs.study.run_directory import write_run
+from rare_envs.study import Question, prepare, print_report, run, write_run
 from training import train_ego
 
 ENV_ID = "rare_envs/CutIn-v0"
@@ -64,7 +62,7 @@ def demo(steps: int, out: Path) -> None:
     write_run(out, report)
 
     print()
-    show.print_report(report, out)
+    print_report(report, out)
     random_rate = random_collision_rate()
     print(f"for comparison: a policy that acts at random collides in {random_rate:.0%} of 1,000 scenarios")
     print("\nNext, from the folder of this repository (the commands are in .venv/bin):")

@@ -17,8 +17,10 @@ import rare_envs
 from examples import adversary
 from rare_envs.envs.rendering import WIDTH
 from rare_envs.scenarios.registry import SCENARIOS
-from rare_envs.study.video import COLOURS, Drive, drive_again, write_film
+from rare_envs.study import Drive, drive_again, write_film
 
+COLOURS = 64
+"""Colours of a picture in a GIF."""
 WIDE = 2.5
 """Draws are taken this many times as far from the mean, in standard normal space, to meet failures."""
 NARROW = 480
@@ -35,7 +37,7 @@ has found.
 import numpy as np
 
 import rare_envs
-from rare_envs.study.video import drive_again, write_film
+from rare_envs.study import drive_again, write_film
 
 problem = rare_envs.DrivingProblem("rare_envs/CutIn-v0", horizon=2.0)
 drive = drive_again(problem, np.array([30.0, 24.0, 28.0, 1.7, 40.0, 3.9]))

@@ -19,8 +19,7 @@ import typer
 
 import rare_envs
 from rare_envs.scenarios.registry import SCENARIOS
-from rare_envs.study.evaluate import Question, Report, prepare, run
-from rare_envs.study.video import drive_again, write_film
+from rare_envs.study import Question, Report, drive_again, prepare, run, write_film
 from training import train_ego
 
 RESULT = Path(__file__).parents[1] / "results" / "egos.json"

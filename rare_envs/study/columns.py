@@ -1,4 +1,4 @@
-"""The columns of x one by one: their names, and which of them a person looks at."""
+"""Columns of x one by one: their names and units, and which are shown to a person."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from rare_envs.distributions.space import ScenarioSpace
 
-SHOWN = 12
+MAX_SHOWN = 12
 """Blocks of more values than this, drivers' weights and noise, are summarised instead of shown."""
 
 
@@ -25,15 +25,15 @@ class Column(NamedTuple):
         return f"{self.name} [{self.unit}]" if self.unit else self.name
 
 
-def columns_of(space: ScenarioSpace) -> list[Column]:
-    """The columns in the order of x."""
+def list_columns(space: ScenarioSpace) -> list[Column]:
+    """Return the columns in the order of x."""
     return [
-        Column(name if size == 1 else f"{name}[{k}]", unit, size <= SHOWN)
+        Column(name if size == 1 else f"{name}[{k}]", unit, size <= MAX_SHOWN)
         for name, unit, size in zip(space.names, space.units, space.sizes, strict=True)
         for k in range(size)
     ]
 
 
-def digits(value: float, places: int = 2) -> str:
-    """A value with so many decimal places, or with two digits where these would be zeros (fog is 1e-4 per metre)."""
+def format_value(value: float, places: int = 2) -> str:
+    """Return a value with `places` decimals, or with two digits where these would be zeros (fog is 1e-4 per metre)."""
     return f"{value:.2g}" if 0.0 < abs(value) < 10.0**-places else f"{value:.{places}f}"

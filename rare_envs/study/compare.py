@@ -1,41 +1,51 @@
-"""Two egos in the same scenarios."""
+"""Comparison of two egos in the same scenarios."""
 
 from __future__ import annotations
 
 import contextlib
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import rare_envs
 import samplers
 from rare_envs.egos.errors import EgoGone
-from rare_envs.study.errors import BadInput, output_folder
+from rare_envs.study.errors import as_bad_input, output_folder
 from rare_envs.study.evaluate import Question, prepare
-from rare_envs.study.run_directory import to_text, write_failures
+from rare_envs.study.run_directory import format_json, write_failures
 
 COMPARISON = "comparison.json"
-NOT_ASKED = ("target_cov", "replicates", "on_error")
+UNUSED_FIELDS = ("target_cov", "replicates", "on_error")
+"""Fields of a question that a comparison does not use."""
 
 
-def compare(question: Question, ego_b: str, progress: bool = False, out: Path | None = None) -> dict[str, Any]:
-    """Estimate p_A / p_B, see `samplers.compare`.
+class EgoComparison(NamedTuple):
+    """Two egos compared."""
+
+    comparison: samplers.Comparison
+    """The estimate of p_A / p_B."""
+    answer: dict[str, Any]
+    """The same with the question, JSON-ready."""
+
+
+def compare_egos(question: Question, ego_b: str, progress: bool = False, out: Path | None = None) -> EgoComparison:
+    """Estimate p_A / p_B, see `samplers.compare_egos`.
 
     Args:
-        question: What is asked of ego A; what is `NOT_ASKED` is not used.
+        question: The question about ego A, without its `UNUSED_FIELDS`.
         ego_b: The other ego.
         progress: Show a bar on standard error.
         out: Folder for `COMPARISON` and the scenarios on which one of them fails; is made, if need be.
 
     Returns:
-        What the comparison found (`comparison`) and, JSON-ready, all of it with the question (`json`).
+        The estimate, and all of it with the question.
 
     Raises:
         BadInput: An argument cannot be used, or an ego failed on some x or is gone.
     """
     a, b = prepare(question), prepare(replace(question, ego=ego_b))
     with contextlib.nullcontext() if out is None else output_folder(out):
-        try:
+        with as_bad_input(ValueError, EgoGone):
             found = samplers.compare(
                 a.problem,
                 b.problem,
@@ -45,16 +55,14 @@ def compare(question: Question, ego_b: str, progress: bool = False, out: Path | 
                 max_sim=question.max_sim,
                 progress=progress,
             )
-        except (ValueError, EgoGone) as error:
-            raise BadInput(error) from error
-        asked = {key: value for key, value in asdict(question).items() if key not in NOT_ASKED}
+        inputs = {key: value for key, value in asdict(question).items() if key not in UNUSED_FIELDS}
         answer = {
             **found.to_dict(),
-            "question": {"ego_a": asked.pop("ego"), "ego_b": ego_b, **asked},
+            "question": {"ego_a": inputs.pop("ego"), "ego_b": ego_b, **inputs},
             "notes": [f"{name}: {note}" for name, study in (("A", a), ("B", b)) for note in study.problem.notes],
             "version": rare_envs.__version__,
         }
         if out is not None:
-            (out / COMPARISON).write_text(to_text(answer) + "\n", encoding="utf-8")
+            (out / COMPARISON).write_text(format_json(answer) + "\n", encoding="utf-8")
             write_failures(out, a.problem.space, found.either.failures)
-    return {"comparison": found, "json": answer}
+    return EgoComparison(found, answer)

@@ -1,4 +1,4 @@
-"""Input that a person typed and that cannot be used."""
+"""Errors in the input of a person, and folders for output."""
 
 from __future__ import annotations
 
@@ -9,17 +9,34 @@ from pathlib import Path
 
 
 class BadInput(Exception):
-    """Something the user gave cannot be used; the message is one line that says what to do."""
+    """Input that cannot be used; the message is one line that says what to do."""
 
     def __init__(self, message: object) -> None:
         super().__init__(" ".join(str(message).split()))
 
 
 @contextlib.contextmanager
+def as_bad_input(*kinds: type[BaseException]) -> Iterator[None]:
+    r"""Raise errors of these kinds as `BadInput`.
+
+    Example:
+        >>> with as_bad_input(ValueError):
+        ...     raise ValueError("Expected seed\n  to be a whole number.")
+        Traceback (most recent call last):
+            ...
+        rare_envs.study.errors.BadInput: Expected seed to be a whole number.
+    """
+    try:
+        yield
+    except kinds as error:
+        raise BadInput(error) from error
+
+
+@contextlib.contextmanager
 def output_folder(path: Path) -> Iterator[None]:
     """Make the folder for results before the work, so that no run ends without a place to write to.
 
-    What was made goes again, as far as it is empty, if the work fails.
+    If the work fails, new folders are removed again, as far as they are empty.
 
     Args:
         path: The folder; it may exist.

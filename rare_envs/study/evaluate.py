@@ -1,4 +1,4 @@
-"""One evaluation: what is asked, checked in full before the first simulation, and what came out."""
+"""Evaluation of an ego: the question, checked in full before the first simulation, and the report."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import time
 import warnings
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any, Literal, cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -17,20 +17,22 @@ from numpy.typing import NDArray
 import agents
 import rare_envs
 import samplers
+from agents.sb3.saved_ego import SavedEgo
 from rare_envs.egos.errors import EgoGone
-from rare_envs.egos.faults import ON_FAULT, Fault, FaultTolerant
-from rare_envs.plugins import did_you_mean
+from rare_envs.egos.faults import Fault, FaultTolerant
 from rare_envs.problem import AmbiguousActions
 from rare_envs.scenarios.registry import find_scenario
 from rare_envs.simulation.rollout import drive
-from rare_envs.study.crash_kinds import Kinds, look_again
-from rare_envs.study.errors import BadInput
-from rare_envs.study.journal import Journal, Journaled
+from rare_envs.study.crash_kinds import CrashKinds, classify_failures
+from rare_envs.study.errors import BadInput, as_bad_input
+from rare_envs.study.journal import Journal, JournaledProblem
+from samplers.errors import OnError
+from samplers.execution.arguments import RunArguments
 
 
 @dataclass(frozen=True, kw_only=True)
 class Question:
-    """What an evaluation is asked: all of it, so that the same question gives the same answer.
+    """All inputs of an evaluation: the same question gives the same answer.
 
     Attributes:
         env_id: Environment, such as "rare_envs/CutIn-v0".
@@ -49,12 +51,12 @@ class Question:
         noise: Noise of the drivers, as in `DrivingProblem`: True, "fixed" or False.
         drivers: Of the vehicles around the ego: the name of installed ones or a file; the scenario's default when None.
         horizon: Length of an episode [s]; the scenario's when None.
-        observation: What the ego observes: "features", "lidar", "kinematics", "camera" or "speed"; several joined by
-            "+"; None for what it asks for itself, else "features".
-        action: What a policy decides: "continuous" or "meta".
+        observation: Observation of the ego: "features", "lidar", "kinematics", "camera" or "speed"; several joined by
+            "+"; None for the one that it declares, else "features".
+        action: Actions of a policy: "continuous" or "meta".
         collisions: Which collisions count: those of the "ego", or "any", those between two other vehicles too.
         weather: Whether weather and the camera's noise are parameters.
-        on_error: What scenarios count as on which the ego fails twice: "raise" ends the run, "failure" counts them as
+        on_error: Treatment of scenarios on which the ego fails twice: "raise" ends the run, "failure" counts them as
             failing, "bound" as failing in p and the upper end of the interval, but not in the lower end.
     """
 
@@ -65,19 +67,35 @@ class Question:
     method: str = "two-stage"
     base: str | None = None
     measure: str = "ttc"
-    gamma: float = 0.0
+    gamma: float = RunArguments.gamma
     seed: int = 0
-    max_sim: int | None = None
-    target_cov: float | None = None
-    replicates: int = 1
+    max_sim: int | None = RunArguments.max_sim
+    target_cov: float | None = RunArguments.target_cov
+    replicates: int = RunArguments.replicates
     noise: bool | str = True
     drivers: str | None = None
     horizon: float | None = None
     observation: str | None = None
     action: str = "continuous"
-    on_error: str = "raise"
+    on_error: str = RunArguments.on_error
     collisions: str = "ego"
     weather: bool = False
+
+    @property
+    def run_arguments(self) -> RunArguments:
+        """The arguments of `samplers.estimate`.
+
+        Raises:
+            ValueError: If one of them is out of range.
+        """
+        return RunArguments(
+            gamma=self.gamma,
+            seed=self.seed,
+            max_sim=self.max_sim,
+            target_cov=self.target_cov,
+            replicates=self.replicates,
+            on_error=cast(OnError, self.on_error),
+        )
 
 
 @dataclass(frozen=True)
@@ -91,22 +109,22 @@ class Study:
 
 @dataclass(frozen=True)
 class Report:
-    """The answer to a question.
+    """Answer to a question.
 
     Attributes:
-        study: What was asked.
-        estimate: What the method found.
+        study: The question and what it names.
+        estimate: The estimate of the method.
         seconds: Wall time of the estimation [s].
         faults: Scenarios on which the ego failed twice.
         n_retried: Simulations that were repeated to find them; not in n_sim.
-        kinds: What the failures ended in.
+        kinds: Crashes in which the failures ended.
     """
 
     study: Study
     estimate: samplers.Estimate
     seconds: float
     faults: tuple[Fault, ...] = ()
-    kinds: Kinds = field(default_factory=Kinds)
+    kinds: CrashKinds = field(default_factory=CrashKinds)
     n_retried: int = 0
 
     @property
@@ -121,12 +139,12 @@ class Report:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What was asked for and makes no difference here, and what is not known."""
+        """Options that make no difference here, notes of the problem, and what is not known."""
         unknown = (f"kinds of crash are not known: {self.kinds.unknown}",) if self.kinds.unknown else ()
-        return (*self._idle_words, *self.study.problem.notes, *unknown)
+        return (*self._unused_options, *self.study.problem.notes, *unknown)
 
     @property
-    def _idle_words(self) -> tuple[str, ...]:
+    def _unused_options(self) -> tuple[str, ...]:
         world, noise = self.study.problem.world, self.study.question.noise
         if noise is True or world.sensing.weather or (world.background is not None and world.background.noisy):
             return ()
@@ -136,11 +154,11 @@ class Report:
     @property
     def vec_normalize(self) -> str | None:
         """File of the `VecNormalize` statistics that were applied to a saved ego's observations, if there was one."""
-        path = getattr(self.study.problem.ego, "statistics_path", None)
-        return None if path is None else str(path)
+        ego = self.study.problem.ego
+        return str(ego.statistics_path) if isinstance(ego, SavedEgo) and ego.statistics_path else None
 
     def to_dict(self, top: int = 10) -> dict[str, Any]:
-        """The report as JSON-ready values: question, estimate and the `top` most likely failures."""
+        """Return the report as JSON-ready values: question, estimate and the `top` most likely failures."""
         failures = self.estimate.failures
         space = self.study.problem.space
         ranked = [
@@ -180,7 +198,7 @@ def prepare(question: Question) -> Study:
     """Check a question and load what it names; nothing is simulated.
 
     Args:
-        question: What is asked.
+        question: The question.
 
     Returns:
         The study, ready to run.
@@ -188,8 +206,8 @@ def prepare(question: Question) -> Study:
     Raises:
         BadInput: Something in the question cannot be used.
     """
-    try:
-        _check_on_error(question.on_error)
+    with as_bad_input(ValueError, OSError):
+        question.run_arguments  # noqa: B018  (checks them)
         method = samplers.get_method(question.method)
         find_scenario(question.env_id)  # before the ego, which takes seconds to load
         ego = agents.load_ego(question.ego, algo=question.algo, trust=question.trust)
@@ -208,22 +226,15 @@ def prepare(question: Question) -> Study:
                 weather=question.weather,
                 action=question.action,
             )
-    except (ValueError, OSError) as error:
-        raise BadInput(error) from error
     _try_ego(problem)
     return Study(replace(question, observation=problem.world.sensing.observation), problem, method)
 
 
-def _check_on_error(word: str) -> None:
-    if word not in ON_FAULT:
-        raise ValueError(f"Unknown on_error {word!r}{did_you_mean(word, ON_FAULT)}; expected {', '.join(ON_FAULT)}.")
-
-
 @torch.inference_mode()
 def _try_ego(problem: rare_envs.DrivingProblem) -> None:
-    """Let the ego decide twice, on ordinary traffic at time 0.
+    """Query the ego twice with ordinary traffic at time 0.
 
-    So a broken one is found before the simulations, and one that answers differently from run to run.
+    This finds a broken ego before the simulations, and one whose answers vary from run to run.
 
     Raises:
         BadInput: It raised, or its actions are not actions.
@@ -250,32 +261,29 @@ def run(
     Args:
         study: From `prepare`.
         progress: True for a bar on standard error, or a function, as in `samplers.estimate`.
-        journal: Takes what is simulated, and gives what an earlier run had simulated.
+        journal: Keeps finished simulations, and has those of an interrupted run.
 
     Returns:
         The report.
 
     Raises:
-        BadInput: A number in the question is out of range (nothing is simulated then), or the ego failed on some x.
+        BadInput: The ego failed on some x, or is gone.
     """
     question, start = study.question, time.perf_counter()
     problem = FaultTolerant(study.problem, question.on_error)
     try:
         estimate = samplers.estimate(
-            problem if journal is None else Journaled(problem, journal, study.problem.tile),
+            problem if journal is None else JournaledProblem(problem, journal, study.problem.tile),
             study.method,
-            gamma=question.gamma,
-            seed=question.seed,
-            max_sim=question.max_sim,
-            target_cov=question.target_cov,
-            replicates=question.replicates,
-            on_error=cast("Literal['raise', 'failure', 'bound']", question.on_error),
+            **asdict(question.run_arguments),
             progress=progress,
         )
     except EgoGone as error:
-        raise BadInput(f"{error}{'' if journal else ' With --out what was simulated would have been kept.'}") from error
+        raise BadInput(
+            f"{error}{'' if journal else ' With --out finished simulations would have been kept.'}"
+        ) from error
     except ValueError as error:
         raise BadInput(error) from error
     seconds = time.perf_counter() - start
-    kinds = look_again(study.problem, estimate)
+    kinds = classify_failures(study.problem, estimate)
     return Report(study, estimate, seconds, tuple(problem.faults), kinds, problem.n_retried)

@@ -1,8 +1,8 @@
-"""What a run has simulated so far, so that one that ends before its time can be taken up.
+"""Journal: the finished simulations of a run, so that one that was interrupted can be continued.
 
-The journal lies in the run's folder until the run is done. Methods draw by their seed alone: a run that is taken up
-asks for the same scenarios in the same order, gets the outcomes of the journal for as long as it has any, and so comes
-to the answer of a run that nothing has disturbed.
+The journal lies in the run's folder until the run is done. Methods draw by their seed alone: a continued run draws the
+same scenarios in the same order, takes their outcomes from the journal for as long as it has any, and so ends with the
+estimate of an undisturbed run.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from numpy.typing import NDArray
 import rare_envs
 from rare_envs.egos.faults import Fault, FaultTolerant
 from rare_envs.study.errors import BadInput
+from samplers.problem import FloatArray
 
 JOURNAL = "journal.npy"
 """Arrays one behind the other: the question, then for each batch x, f, and what is known of faults."""
-FloatArray = NDArray[np.float64]
 
 
 class JournalError(ValueError):
     """The journal cannot be written, or belongs to another run."""
 
     final = True
-    """Simulating again is of no use."""
+    """Simulating again would not help."""
 
 
-class Batch(NamedTuple):
+class JournalEntry(NamedTuple):
     """Finished simulations."""
 
     x: NDArray[np.float32]
@@ -38,7 +38,7 @@ class Batch(NamedTuple):
     f: FloatArray
     """Outcomes, shape (n,), NaN where the ego failed twice."""
     reasons: list[str]
-    """Of these failures, in their order."""
+    """Reasons of these failures, in their order."""
     n_retried: int
     """Simulations that were repeated to find them."""
 
@@ -47,19 +47,19 @@ class Journal:
     """Finished simulations of a run, in their order, in a file.
 
     Attributes:
-        question: What the run was asked.
+        question: The question of the run.
         n: Simulations that have been read or written so far.
     """
 
     def __init__(self, folder: Path, question: dict[str, Any] | None = None) -> None:
-        """Begin a journal, or take one up.
+        """Begin a journal, or continue one.
 
         Args:
             folder: Of the run.
-            question: What it is asked, JSON-ready, of a new run; None takes up an unfinished one.
+            question: Of a new run, JSON-ready; None continues an unfinished one.
 
         Raises:
-            BadInput: There is a journal already, or none to take up, or by another version of this program.
+            BadInput: There is a journal already, or none to continue, or one of another version of this program.
         """
         self._path, self.n = folder / JOURNAL, 0
         self._file: IO[bytes] | None = None
@@ -86,11 +86,11 @@ class Journal:
             raise ValueError(f"it was begun by version {head['version']}, this is {rare_envs.__version__}.")
         return dict(head["question"])
 
-    def next(self, x: FloatArray) -> Batch | None:
-        """What the journal has on the batch that is asked for next; None at its end.
+    def read_next(self, x: FloatArray) -> JournalEntry | None:
+        """Return the entry of the next batch; None at the end of the journal.
 
         Raises:
-            JournalError: It has another batch there.
+            JournalError: If the entry is of another batch.
         """
         batch = self._read()
         if batch is not None and not np.array_equal(batch.x, x.astype(np.float32)):
@@ -101,7 +101,7 @@ class Journal:
         self.n += 0 if batch is None else len(batch.f)
         return batch
 
-    def add(self, batch: Batch) -> None:
+    def append(self, batch: JournalEntry) -> None:
         """Write finished simulations.
 
         Raises:
@@ -124,19 +124,19 @@ class Journal:
             self._file.close()
 
     def remove(self) -> None:
-        """The run is done."""
+        """Remove the journal of a run that is done."""
         self.close()
         self._path.unlink(missing_ok=True)
 
-    def _read(self) -> Batch | None:
-        """The next batch; None at the end, where what was cut short is cut off."""
+    def _read(self) -> JournalEntry | None:
+        """Return the next entry; None at the end, where an incomplete entry is removed."""
         if self._file is None:
             return None
         whole = self._file.tell()
         try:
             x, f = (np.lib.format.read_array(self._file, allow_pickle=False) for _ in range(2))
             notes = self._read_json()
-            return Batch(x, f, notes["reasons"], notes["n_retried"])
+            return JournalEntry(x, f, notes["reasons"], notes["n_retried"])
         except (ValueError, EOFError):
             self._file.seek(whole)
             self._file.truncate()
@@ -157,14 +157,14 @@ def _json(value: dict[str, Any]) -> NDArray[np.uint8]:
     return np.frombuffer(json.dumps(value).encode(), np.uint8)
 
 
-class Journaled:
+class JournaledProblem:
     """A problem whose finished simulations are kept; see `samplers.Problem`."""
 
     def __init__(self, problem: FaultTolerant, journal: Journal, tile: int) -> None:
         """Wrap a problem.
 
         Args:
-            problem: What is asked.
+            problem: The problem.
             journal: Keeps what has been simulated.
             tile: Simulations at once. Those of a tile are finished together.
         """
@@ -182,16 +182,16 @@ class Journaled:
 
     @property
     def given(self) -> str:
-        """What p is conditional on, as the problem says."""
+        """Condition of p, from the problem."""
         return self.problem.given
 
     def evaluate(self, x: FloatArray) -> FloatArray:
-        """Remember or simulate: (n, d) -> (n,)."""
+        """Return f from the journal, or simulate: (n, d) -> (n,)."""
         tiles = [x[first : first + self._tile] for first in range(0, max(len(x), 1), self._tile)]
-        return np.concatenate([self._remembered(tile) for tile in tiles])
+        return np.concatenate([self._evaluate_tile(tile) for tile in tiles])
 
-    def _remembered(self, x: FloatArray) -> FloatArray:
-        known, problem = self.journal.next(x), self.problem
+    def _evaluate_tile(self, x: FloatArray) -> FloatArray:
+        known, problem = self.journal.read_next(x), self.problem
         if known is not None:
             lost = x[np.isnan(known.f)]
             problem.faults += [Fault(row.copy(), reason) for row, reason in zip(lost, known.reasons, strict=True)]
@@ -200,5 +200,5 @@ class Journaled:
         before, retried = len(problem.faults), problem.n_retried
         f = problem.evaluate(x)
         reasons = [fault.reason for fault in problem.faults[before:]]
-        self.journal.add(Batch(x.astype(np.float32), f, reasons, problem.n_retried - retried))
+        self.journal.append(JournalEntry(x.astype(np.float32), f, reasons, problem.n_retried - retried))
         return f

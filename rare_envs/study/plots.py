@@ -1,4 +1,4 @@
-"""One picture of one evaluation: how the number came about, what the failures have in common, how it happens."""
+"""Picture of an evaluation: convergence, failures among ordinary traffic, and the likeliest failure from above."""
 
 from __future__ import annotations
 
@@ -15,16 +15,17 @@ from numpy.typing import NDArray
 
 from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.egos.errors import EgoGone, reason_of
-from rare_envs.study.columns import columns_of
+from rare_envs.study.columns import list_columns
 from rare_envs.study.evaluate import Report
-from rare_envs.study.replay import Replay, replay
+from rare_envs.study.replay import Drive, drive_again
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
+from samplers.problem import FloatArray
 
 if TYPE_CHECKING:
     from samplers.result import Failures
 
-ORDINARY = 2000
+BACKGROUND_DRAWS = 2000
 """Ordinary scenarios drawn behind the failures."""
 MOMENTS, LAST_SECONDS = 4, 3.0
 """Bird's-eye views of a failure, spread over the seconds [s] up to its worst moment."""
@@ -39,7 +40,7 @@ NORMAL_QUANTILE, WIDEST_COV = 1.96, 3.0
 HEADROOM = 1.5
 """Upper ends of the curves' axes over their largest values: room for the legend."""
 LINE, HIT, GREY = "#3b6fb5", "#c0392b", "#b8b8b8"
-VEHICLES = ("#2a9d3a", "#3b6fb5", "#e08a1e", "#8e5aa8", "#3aa6a6", "#7a7a7a")
+VEHICLE_COLOURS = ("#2a9d3a", "#3b6fb5", "#e08a1e", "#8e5aa8", "#3aa6a6", "#7a7a7a")
 """Colours of vehicles, the ego's first."""
 
 
@@ -52,39 +53,39 @@ def save_plot(path: Path, report: Report) -> None:
     """
     # a Figure of its own, without pyplot: no window, no global state, whatever backend the user has
     with matplotlib.rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
-        view = _view_height(report.study.problem.world.scenario.road)
+        view = _relative_view_height(report.study.problem.world.scenario.road)
         figure = Figure(figsize=(16, 5.4 * (MOMENTS * view + CURVES) / (MOMENTS + CURVES)), layout="constrained")
         columns = figure.subfigures(1, 3, squeeze=False, width_ratios=(1.0, 1.05, 1.25), wspace=0.03)
         left, middle, right = columns[0]
-        figure.suptitle(_headline(report), fontsize=12, fontweight="bold")
+        figure.suptitle(_format_title(report), fontsize=12, fontweight="bold")
         draw_convergence(left.subplots(), report)
         draw_failures(middle.subplots(), report.study.problem.space, report.estimate.failures)
-        drive = _likeliest_drive(report)
+        drive = _replay_likeliest_failure(report)
         if isinstance(drive, str):
-            _say(right.subplots(), drive)
+            _write_message(right.subplots(), drive)
         else:
             draw_drive(list(right.subplots(MOMENTS + 1, height_ratios=[view] * MOMENTS + [CURVES])), drive)
         figure.savefig(path, dpi=120)
 
 
-def _likeliest_drive(report: Report) -> Replay | str:
-    """The likeliest failure driven again, or why it cannot be shown."""
+def _replay_likeliest_failure(report: Report) -> Drive | str:
+    """Return the likeliest failure driven again, or the reason why it cannot be shown."""
     failures = report.estimate.failures
     driven = np.flatnonzero(~np.isnan(failures.f))  # not those on which the ego failed
     if not len(driven):
         return "no failure found that can be shown"
     try:
-        return replay(report.study.problem, failures.x[driven[0]])
+        return drive_again(report.study.problem, failures.x[driven[0]])
     except (Exception, SystemExit, EgoGone) as error:  # the ego is the user's, and need not do again what it did before
         return f"the failure cannot be shown: {reason_of(error)}"
 
 
-def _view_height(road: Road) -> float:
-    """Height of a bird's-eye view over that of an ordinary road."""
+def _relative_view_height(road: Road) -> float:
+    """Return the height of a bird's-eye view relative to that of an ordinary road."""
     return max(1.0, road.lanes * road.width / ORDINARY_ROAD)
 
 
-def _headline(report: Report) -> str:
+def _format_title(report: Report) -> str:
     question, estimate = report.study.question, report.estimate
     low, high = estimate.interval
     return (
@@ -139,8 +140,8 @@ def _label_thresholds(axes: Axes, spent: NDArray[np.int64], values: NDArray[np.f
             axes.annotate(f"f ≤ {gamma:.3g}", (n, value), (5, 5), textcoords="offset points", fontsize=8)
 
 
-def most_shifted(space: ScenarioSpace, ordinary: NDArray[np.float64], failures: NDArray[np.float64]) -> list[int]:
-    """Parameters in which failures differ most from ordinary traffic, the most shifted first.
+def rank_shifted_parameters(space: ScenarioSpace, ordinary: FloatArray, failures: FloatArray) -> list[int]:
+    """Return the parameters in which failures differ most from ordinary traffic, the most shifted first.
 
     Args:
         space: Of the parameters.
@@ -150,7 +151,7 @@ def most_shifted(space: ScenarioSpace, ordinary: NDArray[np.float64], failures: 
     Returns:
         Indices of columns of x, by |mean shift| / standard deviation; those of large blocks are left out.
     """
-    shown = np.flatnonzero([column.shown for column in columns_of(space)])
+    shown = np.flatnonzero([column.shown for column in list_columns(space)])
     spread = np.maximum(ordinary[:, shown].std(axis=0), 1e-12)
     shift = np.abs(failures[:, shown].mean(axis=0) - ordinary[:, shown].mean(axis=0)) / spread
     return [int(i) for i in shown[np.argsort(-shift, kind="stable")]]
@@ -158,10 +159,10 @@ def most_shifted(space: ScenarioSpace, ordinary: NDArray[np.float64], failures: 
 
 def draw_failures(axes: Axes, space: ScenarioSpace, failures: Failures) -> None:
     """Draw failures over ordinary traffic in the two parameters in which they differ most."""
-    ordinary = space.sample(ORDINARY, np.random.default_rng(0))
-    a, b = most_shifted(space, ordinary, failures.x)[:2] if len(failures) else (0, 1)
+    ordinary = space.sample(BACKGROUND_DRAWS, np.random.default_rng(0))
+    a, b = rank_shifted_parameters(space, ordinary, failures.x)[:2] if len(failures) else (0, 1)
     axes.scatter(ordinary[:, a], ordinary[:, b], s=6, color=GREY, label="ordinary traffic", linewidths=0)
-    columns = columns_of(space)
+    columns = list_columns(space)
     axes.set_xlabel(columns[a].label)
     axes.set_ylabel(columns[b].label)
     if len(failures):
@@ -178,12 +179,12 @@ def draw_failures(axes: Axes, space: ScenarioSpace, failures: Failures) -> None:
     axes.legend(loc="best", fontsize=8)
 
 
-def draw_drive(axes: list[Axes], drive: Replay) -> None:
+def draw_drive(axes: list[Axes], drive: Drive) -> None:
     """Draw the seconds up to the worst moment of a drive from above, and its gap and speeds over time.
 
     Args:
         axes: `MOMENTS` views from above, then one for the curves.
-        drive: What happened.
+        drive: The drive.
     """
     first = int(np.argmin(np.abs(drive.time - (drive.time[drive.worst] - LAST_SECONDS))))
     for view, t in zip(axes[:MOMENTS], np.linspace(first, drive.worst, MOMENTS).round(), strict=True):
@@ -192,7 +193,7 @@ def draw_drive(axes: list[Axes], drive: Replay) -> None:
     _draw_curves(axes[-1], drive)
 
 
-def draw_moment(axes: Axes, drive: Replay, t: int) -> None:
+def draw_moment(axes: Axes, drive: Drive, t: int) -> None:
     """Draw the vehicles at moment t (an index of `drive.time`) from above, the ego at 0 m; bends are straightened."""
     origin = drive.position[t, 0, 0]
     hit = drive.collided and t == drive.worst
@@ -201,7 +202,7 @@ def draw_moment(axes: Axes, drive: Replay, t: int) -> None:
             (-VEHICLE_LENGTH / 2, -VEHICLE_WIDTH / 2),
             VEHICLE_LENGTH,
             VEHICLE_WIDTH,
-            facecolor=colour(j),
+            facecolor=vehicle_colour(j),
             edgecolor=HIT if hit and j == 0 else "none",
         )
         body.set_transform(Affine2D().rotate(heading).translate(x - origin, y) + axes.transData)
@@ -230,15 +231,15 @@ def draw_moment(axes: Axes, drive: Replay, t: int) -> None:
         axes.text(AHEAD, lane, "collision" if hit else "closest", color=HIT, ha="right", va="center", fontweight="bold")
 
 
-def colour(vehicle: int) -> str:
-    """The colour of a vehicle; 0 is the ego."""
-    return VEHICLES[0] if vehicle == 0 else VEHICLES[1 + (vehicle - 1) % (len(VEHICLES) - 1)]
+def vehicle_colour(vehicle: int) -> str:
+    """Return the colour of a vehicle; 0 is the ego."""
+    return VEHICLE_COLOURS[0] if vehicle == 0 else VEHICLE_COLOURS[1 + (vehicle - 1) % (len(VEHICLE_COLOURS) - 1)]
 
 
-def _draw_curves(axes: Axes, drive: Replay) -> None:
+def _draw_curves(axes: Axes, drive: Drive) -> None:
     """Draw speeds (left axis) and the gap to the vehicle ahead (right axis) over time."""
     for j, name in enumerate(drive.names):
-        axes.plot(drive.time, drive.speed[:, j], color=colour(j), label=f"speed of {name}")
+        axes.plot(drive.time, drive.speed[:, j], color=vehicle_colour(j), label=f"speed of {name}")
     axes.set_xlabel("time [s]")
     axes.set_ylabel("speed [m/s]")
     axes.set_ylim(0, HEADROOM * max(1.0, float(drive.speed.max())))
@@ -253,7 +254,7 @@ def _draw_curves(axes: Axes, drive: Replay) -> None:
     axes.legend(handles, labels, loc="upper center", ncols=2 if len(drive.names) < 5 else 3, fontsize=8, frameon=False)
 
 
-def _say(axes: Axes, text: str) -> None:
-    """Put a sentence where a drawing would be."""
+def _write_message(axes: Axes, text: str) -> None:
+    """Write a sentence in place of a drawing."""
     axes.set_axis_off()
     axes.text(0.5, 0.5, text, ha="center", va="center", transform=axes.transAxes)

@@ -1,74 +1,139 @@
-"""One scenario driven again, every moment of it kept."""
+"""Replay: one scenario driven again, every moment of it kept."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from rare_envs import DrivingProblem
+from rare_envs.measures import Moment
+from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.rollout import drive
+from rare_envs.traffic.crash import describe_crash
 from rare_envs.traffic.road import Road
+from samplers.problem import FloatArray
 
 
-class Replay(NamedTuple):
-    """T + 1 moments of N vehicles, the ego first; the last one is the collision, if there is one."""
+@dataclass(frozen=True)
+class Drive:
+    """T + 1 moments of N vehicles, the ego first; the last one is the collision, if there is one.
 
-    time: NDArray[np.float64]
-    """Time [s], shape (T + 1,)."""
-    position: NDArray[np.float64]
-    """Centres, along and across the road [m], shape (T + 1, N, 2)."""
-    heading: NDArray[np.float64]
-    """Heading [rad], shape (T + 1, N)."""
-    speed: NDArray[np.float64]
-    """Speed [m/s], shape (T + 1, N)."""
-    gap: NDArray[np.float64]
-    """Bumper to bumper from the ego to its lead [m], shape (T + 1,)."""
-    closing_speed: NDArray[np.float64]
-    """Of the ego on its lead, positive when closing [m/s], shape (T + 1,)."""
-    worst: int
-    """The moment at which f is decided: the collision, else the least measure; an index of `time`."""
-    f: float
-    """The safety measure of the drive."""
-    collided: bool
-    """Whether the ego collided."""
-    road: Road
-    """The road that they are on."""
-    names: tuple[str, ...]
-    """What the vehicles are called, length N."""
+    Attributes:
+        problem: The world and its ego.
+        episodes: The moments, each a batch of one.
+    """
+
+    problem: DrivingProblem
+    episodes: tuple[Episode, ...]
+
+    @cached_property
+    def time(self) -> FloatArray:
+        """Time [s], shape (T + 1,)."""
+        return np.arange(len(self.episodes), dtype=np.float64) * self.problem.world.clock.dt
+
+    @cached_property
+    def position(self) -> FloatArray:
+        """Centres, along and across the road [m], shape (T + 1, N, 2)."""
+        return self._stack(lambda each: torch.stack((each.state.x[0], each.state.y[0]), dim=-1))
+
+    @cached_property
+    def heading(self) -> FloatArray:
+        """Heading [rad], shape (T + 1, N)."""
+        return self._stack(lambda each: each.state.heading[0])
+
+    @cached_property
+    def speed(self) -> FloatArray:
+        """Speed [m/s], shape (T + 1, N)."""
+        return self._stack(lambda each: each.state.speed[0])
+
+    @cached_property
+    def gap(self) -> FloatArray:
+        """Bumper to bumper from the ego to its lead [m], shape (T + 1,)."""
+        return self._stack(lambda each: each.lead.gap[0])
+
+    @cached_property
+    def closing_speed(self) -> FloatArray:
+        """Of the ego on its lead, positive when closing [m/s], shape (T + 1,)."""
+        return self._stack(lambda each: each.lead.closing_speed[0])
+
+    @cached_property
+    def f_so_far(self) -> FloatArray:
+        """Safety measure of the episode up to each moment, shape (T + 1,)."""
+        return self._stack(lambda each: each.f[0])
+
+    @cached_property
+    def f_alone(self) -> FloatArray:
+        """Safety measure of each moment as if it were the whole episode, shape (T + 1,)."""
+        clock, values = self.problem.world.clock, []
+        for before, episode in zip([None, *self.episodes], self.episodes, strict=False):
+            state = None if before is None else before.state
+            moment = Moment(episode.state, episode.lead, episode.road, episode.perception, state, clock.dt)
+            values.append(float(episode.measure.f(episode.measure.start(moment, clock.ticks))))
+        return np.array(values)
+
+    @property
+    def worst(self) -> int:
+        """Index of the moment that decides f: the collision, else the least measure."""
+        return int(self.f_so_far.argmin())
+
+    @property
+    def f(self) -> float:
+        """Safety measure of the whole drive."""
+        return float(self.f_so_far[-1])
+
+    @property
+    def collided(self) -> bool:
+        """Whether the ego collided."""
+        return bool(self.episodes[-1].collided)
+
+    @property
+    def crash(self) -> dict[str, Any] | None:
+        """The crash, as `rare_envs.traffic.crash.describe_crash` gives it; None if nobody crashed."""
+        statistics = self.episodes[-1].statistics
+        return None if statistics is None else describe_crash(statistics.crash)
+
+    @property
+    def road(self) -> Road:
+        """The road that the vehicles are on."""
+        return self.problem.world.scenario.road
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the vehicles, length N."""
+        return self.problem.world.scenario.labels
+
+    def _stack(self, value: Callable[[Episode], Tensor]) -> FloatArray:
+        return torch.stack([value(each) for each in self.episodes]).double().numpy()
 
 
 @torch.inference_mode()
-def replay(problem: DrivingProblem, x: NDArray[np.float64]) -> Replay:
-    """Drive one scenario again and keep every moment up to the collision or the horizon.
+def drive_again(problem: DrivingProblem, x: NDArray[np.float64]) -> Drive:
+    """Drive one scenario and keep every moment up to the collision or the horizon.
 
     Args:
         problem: The world and its ego.
         x: Scenario parameters, shape (d,).
 
     Returns:
-        The drive.
+        The drive; its f is that of `problem.evaluate`.
+
+    Example:
+        >>> problem = DrivingProblem("rare_envs/CarFollowing-v0", horizon=3.0)
+        >>> drive = drive_again(problem, np.array([20.0, 5.0, 10.0]))  # ego at 20 m/s, 10 m behind a lead at 5 m/s
+        >>> drive.f, drive.crash["kind"], round(float(drive.time[-1]), 1)
+        (-1.0, 'rear_end', 0.8)
     """
-    world, episodes = problem.world, []
+    episodes: list[Episode] = []
     # single precision, as in `DrivingProblem.evaluate`, so that f comes out the same
-    for episode in drive(world, problem.driver, torch.from_numpy(x).float()[None]):
+    for episode in drive(problem.world.with_statistics(), problem.driver, torch.from_numpy(x).float()[None]):
         episodes.append(episode)
         if bool(episode.collided):
             break
-    states = [each.state for each in episodes]
-    x_y = torch.stack([torch.stack((s.x[0], s.y[0]), dim=-1) for s in states])
-    return Replay(
-        time=np.arange(len(episodes), dtype=np.float64) * world.clock.dt,
-        position=x_y.double().numpy(),
-        heading=torch.stack([s.heading[0] for s in states]).double().numpy(),
-        speed=torch.stack([s.speed[0] for s in states]).double().numpy(),
-        gap=torch.stack([each.lead.gap[0] for each in episodes]).double().numpy(),
-        closing_speed=torch.stack([each.lead.closing_speed[0] for each in episodes]).double().numpy(),
-        worst=int(torch.cat([each.f for each in episodes]).argmin()),
-        f=float(episodes[-1].f),
-        collided=bool(episodes[-1].collided),
-        road=world.scenario.road,
-        names=world.scenario.labels,
-    )
+    return Drive(problem, tuple(episodes))

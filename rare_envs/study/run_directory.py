@@ -1,6 +1,6 @@
-"""The folder a run leaves behind: result.json, failures.csv (and failures.npz), plot.png, faults.csv.
+"""Folder of a run: result.json, failures.csv (and failures.npz), plot.png, faults.csv.
 
-Until it is done its finished simulations are there, see `rare_envs.study.journal`.
+Until the run is done, its finished simulations are there too, see `rare_envs.study.journal`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 import samplers
 from agents.loading import find_ego_kind
 from rare_envs.distributions.space import ScenarioSpace
-from rare_envs.study.columns import SHOWN, columns_of
+from rare_envs.study.columns import MAX_SHOWN, list_columns
 from rare_envs.study.errors import BadInput, output_folder
 from rare_envs.study.evaluate import Question, Report, Study, prepare, run
 from rare_envs.study.journal import Journal
@@ -28,7 +28,7 @@ from rare_envs.study.plots import save_plot
 from rare_envs.traffic.crash import CRASH_KINDS, NONE
 
 RESULT, FAILURES, BLOCKS, PLOT = "result.json", "failures.csv", "failures.npz", "plot.png"
-"""Blocks are what a table has no room for: of more than `columns.SHOWN` values, drivers' weights and noise."""
+"""Blocks are what a table has no room for: of more than `columns.MAX_SHOWN` values, drivers' weights and noise."""
 CRASH = (
     "crash",
     "striking",
@@ -42,11 +42,11 @@ CRASH = (
 )
 """Columns of failures.csv that say what a failure ended in: `rare_envs.traffic.crash.Crash`."""
 FAULTS, FAULT_BLOCKS = "faults.csv", "faults.npz"
-"""Likewise, scenarios on which the ego failed."""
+"""The same for scenarios on which the ego failed."""
 
 
 def run_into(folder: Path, study: Study, progress: bool = False) -> Report:
-    """Answer a question and write the answer; what is simulated is kept, should the run end before its time.
+    """Answer a question and write the answer; finished simulations are kept if the run is interrupted.
 
     Args:
         folder: Is made, if need be; files of an earlier run in it are replaced.
@@ -66,7 +66,7 @@ def run_into(folder: Path, study: Study, progress: bool = False) -> Report:
 def resume(
     folder: Path, ego: str | None = None, on_error: str | None = None, trust: bool = False, progress: bool = False
 ) -> Report:
-    """Take up a run that has ended before its time, and come to the answer of one that has not.
+    """Continue an interrupted run; the answer is that of an undisturbed one.
 
     Args:
         folder: Of the run.
@@ -76,7 +76,7 @@ def resume(
         progress: Show a bar on standard error.
 
     Raises:
-        BadInput: There is no unfinished run, it cannot be taken up, or it ends again.
+        BadInput: There is no unfinished run, it cannot be continued, or it is interrupted again.
     """
     with closing(Journal(folder)) as journal:
         try:
@@ -94,16 +94,16 @@ def _run(folder: Path, study: Study, journal: Journal, progress: bool) -> Report
         report = run(study, progress, journal)
         write_run(folder, report)
     except BadInput as error:
-        raise BadInput(f"{error}{_advice(journal, folder)}") from error
+        raise BadInput(f"{error}{_resume_hint(journal, folder)}") from error
     except KeyboardInterrupt:
-        print(f"Stopped.{_advice(journal, folder)}", file=sys.stderr)
+        print(f"Stopped.{_resume_hint(journal, folder)}", file=sys.stderr)
         raise
     journal.remove()
     return report
 
 
-def _advice(journal: Journal, folder: Path) -> str:
-    """What is left of a run that has ended, and what to do about it."""
+def _resume_hint(journal: Journal, folder: Path) -> str:
+    """Return the number of simulations kept and the command that continues the run."""
     if not journal.n:
         return ""
     return f" {journal.n:,} simulations are kept; go on with: rare-envs resume {folder}"
@@ -116,14 +116,14 @@ def write_run(folder: Path, report: Report) -> None:
         folder: An existing folder; files of an earlier run in it are replaced.
         report: What to write.
     """
-    (folder / RESULT).write_text(to_text(report.to_dict()) + "\n", encoding="utf-8")
+    (folder / RESULT).write_text(format_json(report.to_dict()) + "\n", encoding="utf-8")
     _write_failures(folder, report)
     _write_faults(folder, report)
     save_plot(folder / PLOT, report)
 
 
-def to_text(value: dict[str, Any]) -> str:
-    """JSON with one entry a line, but lists of numbers in one, however long."""
+def format_json(value: dict[str, Any]) -> str:
+    """Return JSON with one entry per line, but lists of numbers in one line."""
     text = json.dumps(value, indent=2, allow_nan=False)
     # a line that ends with a bracket is no part of a string, which would have no line breaks
     return re.sub(r"\[\n([^\[\]{}\"]*)\n *\]", lambda found: f"[{' '.join(found[1].split())}]", text)
@@ -159,9 +159,9 @@ def read_failures(folder: Path) -> dict[str, NDArray[Any]]:
 
 
 def _write_failures(folder: Path, report: Report) -> None:
-    """One failure a row, the most likely first: x, f, log p0 and the crash."""
+    """Write one failure per row, the most likely first: x, f, log p0 and the crash."""
     kind = "" if report.kinds.unknown else CRASH_KINDS[NONE]
-    crashes = [_crash(crash, kind) for crash in report.crashes]
+    crashes = [_crash_columns(crash, kind) for crash in report.crashes]
     write_failures(folder, report.study.problem.space, report.estimate.failures, CRASH, crashes)
 
 
@@ -178,8 +178,8 @@ def write_failures(
     _write_table(folder / FAILURES, space, failures.x, ("f", "log_p0", *names), rest)
 
 
-def _crash(crash: dict[str, Any] | None, kind: str) -> tuple[Any, ...]:
-    """A crash as the columns `CRASH`; only the kind that is given where there is none."""
+def _crash_columns(crash: dict[str, Any] | None, kind: str) -> tuple[Any, ...]:
+    """Return a crash as the columns `CRASH`; `kind` and blanks where there is none."""
     if crash is None:
         return (kind, *("" for _ in CRASH[1:]))
     speeds = (crash["impact_speed"], crash["closing_speed"])
@@ -187,7 +187,7 @@ def _crash(crash: dict[str, Any] | None, kind: str) -> tuple[Any, ...]:
 
 
 def _write_faults(folder: Path, report: Report) -> None:
-    """One scenario a row on which the ego failed: x and the reason; no file without one."""
+    """Write one scenario per row on which the ego failed: x and the reason; no file without one."""
     space, faults = report.study.problem.space, report.faults
     for name in (FAULTS, FAULT_BLOCKS):
         (folder / name).unlink(missing_ok=True)
@@ -199,18 +199,18 @@ def _write_faults(folder: Path, report: Report) -> None:
 def _write_table(
     path: Path, space: ScenarioSpace, x: NDArray[np.float64], names: tuple[str, ...], rest: list[tuple[Any, ...]]
 ) -> None:
-    """Scenarios, one a row.
+    """Write scenarios, one per row.
 
     The table has the columns of x by name but for large blocks, then the rest. Large blocks go row by row into a file
     of arrays beside it, in single precision, in which they are simulated, so that they replay to the same f.
     """
-    columns = columns_of(space)
+    columns = list_columns(space)
     shown = [column.shown for column in columns]
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow([*(column.name for column in columns if column.shown), *names])
         writer.writerows([*row[shown].tolist(), *more] for row, more in zip(x, rest, strict=True))
-    large = {name for name, size in zip(space.names, space.sizes, strict=True) if size > SHOWN}
+    large = {name for name, size in zip(space.names, space.sizes, strict=True) if size > MAX_SHOWN}
     blocks_path = path.with_suffix(".npz")
     blocks_path.unlink(missing_ok=True)
     if large:

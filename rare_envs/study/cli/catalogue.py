@@ -1,4 +1,4 @@
-"""What there is to choose from: environments, methods, egos, measures, base distributions."""
+"""Catalogue of the names that the command line takes: environments, methods, egos, measures, base distributions."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ DRIVERS = {
 }
 
 
-def catalogue() -> dict[str, Any]:
-    """Everything that can be named on the command line, as JSON-ready values.
+def list_names() -> dict[str, Any]:
+    """Return everything that can be named on the command line, as JSON-ready values.
 
     Returns:
         "environments" (id to parameters, vehicles, bases, drivers and what learned drivers add to x, with their noise

@@ -1,15 +1,29 @@
-"""Words that several commands of the command line take, with what their help says of them."""
+"""Options that several commands of the command line take, each written once, and their spreading into a command.
+
+Typer reads the options of a command from its signature. A command here may take a whole group of options as one
+parameter, annotated with a dataclass of this module; `spread_options` puts the fields of the class into the signature.
+The defaults are those of `rare_envs.study.Question`, written out because importing that takes seconds.
+"""
 
 from __future__ import annotations
 
+import functools
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass, fields, is_dataclass
 from enum import Enum
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 
-class Noise(str, Enum):
-    """Words for the `noise` argument of `DrivingProblem`: True, "fixed" and False."""
+class NoiseChoice(str, Enum):
+    """Names for the `noise` argument of `DrivingProblem`: True, "fixed" and False.
+
+    Example:
+        >>> NoiseChoice("off").argument
+        False
+    """
 
     ON = "on"
     FIXED = "fixed"
@@ -17,38 +31,114 @@ class Noise(str, Enum):
 
     @property
     def argument(self) -> bool | str:
-        """What `DrivingProblem` takes for the word."""
+        """The argument that the name stands for."""
         return {"on": True, "off": False}.get(self.value, self.value)
 
 
-Env = Annotated[str, typer.Argument(metavar="ENV", help="Environment, such as rare_envs/CutIn-v0.")]
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
-Trust = Annotated[
+EnvArgument = Annotated[str, typer.Argument(metavar="ENV", help="Environment, such as rare_envs/CutIn-v0.")]
+EgoArgument = Annotated[str, typer.Argument(metavar="EGO", help="An ego, as for estimate --ego.")]
+AlgoOption = Annotated[str | None, typer.Option(help="Algorithm of the .zip, if the file does not tell.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
+SeedOption = Annotated[int, typer.Option(help="Seed; the same seed gives the same answer.")]
+TrustOption = Annotated[
     bool, typer.Option("--trust", help="Let the ego's .zip run code; open it though others can write to it.")
 ]
-Seed = Annotated[int, typer.Option(help="Seed; the same seed gives the same answer.")]
-Base = Annotated[str | None, typer.Option(help="Base distribution: a name or a JSON file.")]
-Drivers = Annotated[str | None, typer.Option(help="Of the vehicles around the ego: mgail, gail, bc, idm or a file.")]
-NoiseOption = Annotated[Noise, typer.Option("--noise", help="The drivers' noise: part of x, one fixed sequence, none.")]
-Observation = Annotated[
-    str, typer.Option(help="What the ego observes: features, lidar, kinematics, camera, or camera+lidar.")
-]
-Shown = Annotated[
-    str | None,
-    typer.Option(
-        "--observation",
-        help="What the ego observes: features, lidar, kinematics, camera, speed, or camera+lidar; by default what it "
-        "asks for, else features.",
-    ),
-]
-Weather = Annotated[bool, typer.Option("--weather", help="Make weather and the camera's noise parameters.")]
-Action = Annotated[str, typer.Option(help="What it decides: continuous, each tick, or HighwayEnv's meta, each second.")]
-Horizon = Annotated[float | None, typer.Option(help="Length of an episode in seconds.")]
-Algo = Annotated[str | None, typer.Option(help="Algorithm of the .zip, if the file does not tell.")]
-Method = Annotated[str, typer.Option(help="Estimation method; see rare-envs list.")]
-Measure = Annotated[
-    str, typer.Option(help="Safety measure f, small is dangerous: a name, module:function or stl:FORMULA.")
-]
-Collisions = Annotated[str, typer.Option(help="Which count: ego, or any, between others too.")]
-Gamma = Annotated[float, typer.Option(help="Threshold: P[f <= gamma]; 0 counts collisions.")]
-Ego = Annotated[str, typer.Argument(metavar="EGO", help="An ego, as for estimate --ego.")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScenarioOptions:
+    """Options of each command that drives an ego: the scenario, and the interface of the ego."""
+
+    base: Annotated[str | None, typer.Option(help="Base distribution: a name or a JSON file.")] = None
+    drivers: Annotated[
+        str | None, typer.Option(help="Of the vehicles around the ego: mgail, gail, bc, idm or a file.")
+    ] = None
+    observation: Annotated[
+        str | None,
+        typer.Option(
+            help="Observation of the ego: features, lidar, kinematics, camera, speed, or camera+lidar; by default the "
+            "one that the ego declares, else features.",
+        ),
+    ] = None
+    action: Annotated[
+        str, typer.Option(help="Actions of the ego: continuous, each tick, or HighwayEnv's meta, each second.")
+    ] = "continuous"
+    horizon: Annotated[float | None, typer.Option(help="Length of an episode in seconds.")] = None
+
+    def arguments(self) -> dict[str, Any]:
+        """Return the options as keyword arguments of `Question` and of `gym.make`."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: value.argument if isinstance(value, NoiseChoice) else value for name, value in values.items()}
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorldOptions(ScenarioOptions):
+    """With what is random in the world beside the scenario, for training and estimation."""
+
+    noise: Annotated[
+        NoiseChoice, typer.Option("--noise", help="The drivers' noise: part of x, one fixed sequence, none.")
+    ] = NoiseChoice.ON
+    weather: Annotated[bool, typer.Option("--weather", help="Make weather and the camera's noise parameters.")] = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class QuestionOptions(WorldOptions):
+    """With what is estimated, and how: for `estimate` and `compare`."""
+
+    method: Annotated[str, typer.Option(help="Estimation method; see rare-envs list.")] = "two-stage"
+    measure: Annotated[
+        str, typer.Option(help="Safety measure f, small is dangerous: a name, module:function or stl:FORMULA.")
+    ] = "ttc"
+    gamma: Annotated[float, typer.Option(help="Threshold: P[f <= gamma]; 0 counts collisions.")] = 0.0
+    seed: SeedOption = 0
+    collisions: Annotated[str, typer.Option(help="Which count: ego, or any, between others too.")] = "ego"
+    trust: TrustOption = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class EstimateOptions(QuestionOptions):
+    """With what only `estimate` takes."""
+
+    ego: Annotated[
+        str, typer.Option(help="A name, a .zip or .onnx, module:function, tcp://..., noisy:EGO; see rare-envs list.")
+    ] = "idm"
+    algo: AlgoOption = None
+    max_sim: Annotated[int | None, typer.Option(help="Largest number of simulations.")] = None
+    target_cov: Annotated[float | None, typer.Option(help="Stop at this coefficient of variation.")] = None
+    replicates: Annotated[int, typer.Option(help="Independent runs, combined by their mean.")] = 1
+    on_error: Annotated[str, typer.Option(help="Where the ego fails twice: raise, failure or bound.")] = "raise"
+
+
+def spread_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Return the command with the fields of its option classes as options of its own.
+
+    Example:
+        >>> def command(env: str, options: ScenarioOptions) -> None:
+        ...     print(env, options.base)
+        >>> list(inspect.signature(spread_options(command)).parameters)
+        ['env', 'base', 'drivers', 'observation', 'action', 'horizon']
+        >>> spread_options(command)(env="rare_envs/CutIn-v0", base="highway")
+        rare_envs/CutIn-v0 highway
+    """
+    groups: dict[str, type[Any]] = {}
+    parameters: list[inspect.Parameter] = []
+    for name, parameter in inspect.signature(command, eval_str=True).parameters.items():
+        group = parameter.annotation
+        if isinstance(group, type) and is_dataclass(group):
+            groups[name] = group
+            parameters += inspect.signature(group, eval_str=True).parameters.values()
+        else:
+            parameters.append(parameter)
+
+    @functools.wraps(command)
+    def spread(**values: Any) -> None:
+        for name, group in groups.items():
+            taken = {field.name: values.pop(field.name) for field in fields(group) if field.name in values}
+            values[name] = group(**taken)
+        command(**values)
+
+    keyword_only = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in parameters]
+    spread.__signature__ = inspect.Signature(keyword_only)  # type: ignore[attr-defined]
+    spread.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    del spread.__wrapped__
+    return spread

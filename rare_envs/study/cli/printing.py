@@ -1,4 +1,4 @@
-"""What a person reads on standard output: tables and results."""
+"""Tables and results on standard output, for a person."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from rich.console import Console
 from rich.table import Table
 
 import samplers
-from rare_envs.study.columns import SHOWN, digits
-from rare_envs.study.crash_kinds import NAMES
+from rare_envs.study.columns import MAX_SHOWN, format_value
+from rare_envs.study.crash_kinds import KIND_DESCRIPTIONS
 from rare_envs.study.evaluate import Report
 from samplers.problem import FloatArray
 
-ORDINARY = 4000
-"""Scenarios drawn from the base distribution to say what is ordinary."""
+RANGE_DRAWS = 4000
+"""Scenarios drawn from the base distribution for the range of ordinary values."""
 ENOUGH, MANY = 3.0, 300_000
 """Simulations over p that show with 95 % a region of failure as probable as all that was found; what they may cost."""
 
 
 def print_catalogue(entries: dict[str, Any]) -> None:
-    """Print what `catalogue` gives as tables."""
+    """Print what `list_names` returns as tables."""
     console = Console(highlight=False)
     for env_id, environment in entries["environments"].items():
-        console.print(_parameters(env_id, environment["parameters"]))
+        console.print(_make_parameter_table(env_id, environment["parameters"]))
         console.print(f"  vehicles, each of which can be an agent: {', '.join(environment['vehicles'])}")
         console.print(f"  base distributions: {', '.join(environment['bases'])}, or your own JSON file")
         around = environment["drivers"] or "a script, unless told otherwise"
@@ -37,7 +37,7 @@ def print_catalogue(entries: dict[str, Any]) -> None:
     console.print(
         f"HighwayEnv's own, by rare_envs.highway_env_problem in Python: {', '.join(entries['highway_env'])}\n"
     )
-    console.print(_parameters("Weather, which --weather adds for egos with a camera", entries["weather"]))
+    console.print(_make_parameter_table("Weather, which --weather adds for egos with a camera", entries["weather"]))
     titles = {
         "methods": "Methods",
         "egos": "Egos",
@@ -51,8 +51,8 @@ def print_catalogue(entries: dict[str, Any]) -> None:
         console.print(table)
 
 
-def _parameters(title: str, parameters: list[dict[str, Any]]) -> Table:
-    """Names, units, ranges and meanings."""
+def _make_parameter_table(title: str, parameters: list[dict[str, Any]]) -> Table:
+    """Return a table of names, units, ranges and meanings."""
     table = Table("parameter", "unit", "range", "meaning", title=title, title_justify="left", title_style="bold")
     for each in parameters:
         name = each["name"] if each["size"] == 1 else f"{each['name']} ({each['size']} values)"
@@ -67,7 +67,8 @@ def print_report(report: Report, out: Path | None = None) -> None:
     estimate, question = report.estimate, report.study.question
     low, high = estimate.interval
     console.print(
-        f"P[f <= {estimate.gamma:g}] = {estimate.p:.3e}{_one_in(estimate.p)}   {question.env_id}, ego {question.ego}",
+        f"P[f <= {estimate.gamma:g}] = {estimate.p:.3e}{_format_odds(estimate.p)}   "
+        f"{question.env_id}, ego {question.ego}",
         style="bold",
     )
     rows = (
@@ -75,7 +76,7 @@ def print_report(report: Report, out: Path | None = None) -> None:
         ("c.o.v.", "not known" if math.isinf(estimate.cov) else f"{estimate.cov:.3f}"),
         ("simulations", f"{estimate.n_sim:,} in {report.seconds:.1f} s"),
         ("given that", estimate.proviso),
-        ("gain", _gain(estimate)),
+        ("gain", _format_gain(estimate)),
         ("method", f"{estimate.method.name}, seed {estimate.seed}, {estimate.status}"),
     )
     for name, value in rows:
@@ -104,24 +105,25 @@ def _print_kinds(console: Console, report: Report) -> None:
     """Print p by kind of crash, and how bad the listed ones are."""
     for number, (kind, share) in enumerate(report.kinds.shares.items()):
         low, high = share.interval
-        text = f"{share.p:.1e} [{low:.1e}, {high:.1e}], {100 * share.of_failures:.3g} %: {NAMES.get(kind, kind)}"
+        share_of_p = f"{share.p:.1e} [{low:.1e}, {high:.1e}], {100 * share.of_failures:.3g} %"
+        text = f"{share_of_p}: {KIND_DESCRIPTIONS.get(kind, kind)}"
         console.print(f"  {'of which' if number == 0 else '':<15} {text}")
 
 
-def _in_words(crash: dict[str, Any]) -> str:
-    """Who ran into whom, how fast, and what that means for the ego's people."""
+def _summarise_crash(crash: dict[str, Any]) -> str:
+    """Return who ran into whom, how fast, and the risk of injury, in words."""
     who = ["the edge of the road" if one < 0 else f"vehicle {one}" if one else "the ego" for one in crash["vehicles"]]
     speeds = f"{crash['impact_speed']:.1f} m/s at contact, delta-v {max(crash['delta_v']):.1f} m/s"
     return f"{who[0]} runs into {who[1]}: {speeds}, serious injury {100 * max(crash['injury_risk']):.2g} %"
 
 
-def _one_in(p: float) -> str:
-    """A small probability in words."""
+def _format_odds(p: float) -> str:
+    """Return a small probability in words."""
     return f" (1 in {1 / p:,.0f} scenarios)" if 0 < p < 0.1 else ""
 
 
-def _gain(estimate: samplers.Estimate) -> str:
-    """The gain over plain Monte Carlo, and what it means."""
+def _format_gain(estimate: samplers.Estimate) -> str:
+    """Return the gain over plain Monte Carlo, and the simulations that it stands for."""
     if math.isnan(estimate.gain):
         return "not known"
     needed = estimate.gain * estimate.n_sim
@@ -135,26 +137,28 @@ def _print_failure(console: Console, report: Report) -> None:
     if not len(failures):
         console.print("  no failure found")
         return
-    ordinary = space.sample(ORDINARY, np.random.default_rng(0))
+    ordinary = space.sample(RANGE_DRAWS, np.random.default_rng(0))
     console.print(
         f"  most likely of {failures.total:,} failures found (f = {failures.f[0]:.3g}; "
         "in brackets where nine of ten ordinary scenarios lie):"
     )
     if report.crashes[0] is not None:
-        console.print(f"    {_in_words(report.crashes[0])}")
+        console.print(f"    {_summarise_crash(report.crashes[0])}")
     normal = space.columns(space.to_standard_normal(np.vstack((failures.x[:1], ordinary))))
     found, usual = space.columns(failures.x[:1]), space.columns(ordinary)
     for j, name in enumerate(space.names):
-        if space.sizes[j] <= SHOWN:
+        if space.sizes[j] <= MAX_SHOWN:
             low, high = np.quantile(usual[name], (0.05, 0.95))
-            values = " ".join(f"{digits(value):>8}" for value in found[name].flat)
-            console.print(f"    {name:<15} {values} {space.units[j]:<4} [{digits(low, 1)} to {digits(high, 1)}]")
+            values = " ".join(f"{format_value(value):>8}" for value in found[name].flat)
+            console.print(
+                f"    {name:<15} {values} {space.units[j]:<4} [{format_value(low, 1)} to {format_value(high, 1)}]"
+            )
         else:
-            console.print(f"    {name:<15} {_summary(name, found[name][0], usual[name], normal[name])}")
+            console.print(f"    {name:<15} {_summarise_block(name, found[name][0], usual[name], normal[name])}")
 
 
-def _summary(name: str, values: FloatArray, ordinary: FloatArray, normal: FloatArray) -> str:
-    """What there is to say about a block of many values.
+def _summarise_block(name: str, values: FloatArray, ordinary: FloatArray, normal: FloatArray) -> str:
+    """Return a summary of a block of many values.
 
     Args:
         name: Of the parameter.

@@ -1,4 +1,4 @@
-"""What every command of the command line does alike: errors in one line, answers as JSON, one thread."""
+"""Behaviour that all commands share: errors in one line, answers as JSON, one thread."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ class OneLineErrors(TyperGroup):
 
 
 def _fail(message: str) -> NoReturn:
-    """Say what is wrong in one line, and exit."""
+    """Print an error in one line, and exit."""
     print("rare-envs: " + " ".join(message.split()), file=sys.stderr)
     sys.exit(2)
 
 
-def one_thread() -> None:
+def use_one_thread() -> None:
     """Keep torch to one thread: at these batch sizes more threads cost more than they give."""
     import torch
 

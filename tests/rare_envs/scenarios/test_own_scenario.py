@@ -21,7 +21,7 @@ from rare_envs.distributions.space import Parameter
 from rare_envs.scenarios.base import Others, Scenario, columns
 from rare_envs.scenarios.registry import SCENARIOS, scenario_named
 from rare_envs.study.cli.app import app
-from rare_envs.study.cli.catalogue import catalogue
+from rare_envs.study.cli.catalogue import list_names
 from rare_envs.traffic.road import straight
 from rare_envs.traffic.state import VEHICLE_LENGTH, State
 
@@ -76,7 +76,7 @@ def registered():
 def test_it_is_known_everywhere(registered):
     assert registered in rare_envs.ENV_IDS
     assert scenario_named("standing") is STANDING
-    entry = catalogue()["environments"][registered]
+    entry = list_names()["environments"][registered]
     assert [p["name"] for p in entry["parameters"]] == ["speed", "distance"]
     assert entry["bases"] == ["even"]
     with pytest.raises(ValueError, match="did you mean 'tests/Standing-v0'"):

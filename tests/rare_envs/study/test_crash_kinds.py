@@ -12,7 +12,7 @@ import pytest
 import rare_envs
 import samplers
 from rare_envs.control.idm import IDM
-from rare_envs.study.crash_kinds import look_again
+from rare_envs.study.crash_kinds import classify_failures
 from rare_envs.study.evaluate import Question, Report, Study
 from rare_envs.study.run_directory import CRASH, read_failures, write_run
 
@@ -36,7 +36,7 @@ def report() -> Report:
     problem = rare_envs.DrivingProblem(CUT_IN, ego=IDM(max_deceleration=1.0))
     estimate = samplers.estimate(problem, "mc", max_sim=3000, gamma=0.5, seed=0)
     study = Study(Question(env_id=CUT_IN, gamma=0.5, method="mc"), problem, samplers.get_method("mc"))
-    return Report(study, estimate, 1.0, kinds=look_again(problem, estimate))
+    return Report(study, estimate, 1.0, kinds=classify_failures(problem, estimate))
 
 
 def test_shares_in_the_result_add_up_to_p(report: Report) -> None:
@@ -73,7 +73,7 @@ def test_each_failure_of_the_list_has_its_crash(
 def test_what_cannot_be_driven_again_is_not_known_and_said() -> None:
     problem = rare_envs.DrivingProblem(CUT_IN, ego=Forgetful())
     estimate = samplers.estimate(problem, "mc", max_sim=200, seed=0)
-    kinds = look_again(problem, estimate)
+    kinds = classify_failures(problem, estimate)
     assert kinds.shares == {}
     study = Study(Question(env_id=CUT_IN, method="mc"), problem, samplers.get_method("mc"))
     report = Report(study, estimate, 1.0, kinds=kinds)
@@ -83,5 +83,5 @@ def test_what_cannot_be_driven_again_is_not_known_and_said() -> None:
 
 def test_no_failures_no_kinds() -> None:
     problem = rare_envs.DrivingProblem(CUT_IN)
-    kinds = look_again(problem, samplers.estimate(problem, "mc", max_sim=50, seed=0))
+    kinds = classify_failures(problem, samplers.estimate(problem, "mc", max_sim=50, seed=0))
     assert (kinds.shares, kinds.listed, kinds.unknown) == ({}, (), "")

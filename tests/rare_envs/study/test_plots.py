@@ -11,11 +11,11 @@ import agents
 import rare_envs
 from rare_envs.scenarios.cut_in import CUT_IN
 from rare_envs.scenarios.highway import HIGHWAY
-from rare_envs.study.columns import columns_of
+from rare_envs.study.columns import list_columns
 from rare_envs.study.errors import BadInput
 from rare_envs.study.evaluate import Question, prepare, run
-from rare_envs.study.plots import MOMENTS, draw_drive, most_shifted, save_plot
-from rare_envs.study.replay import replay
+from rare_envs.study.plots import MOMENTS, draw_drive, rank_shifted_parameters, save_plot
+from rare_envs.study.replay import drive_again
 
 FOLLOWING = "rare_envs/CarFollowing-v0"
 
@@ -26,12 +26,12 @@ def test_a_replay_gives_the_same_f_bit_for_bit(env_id: str) -> None:
     learned = problem.world.background is not None  # whose products round differently by batch size
     x = problem.base.sample(3 if learned else 20, np.random.default_rng(0))
     tolerance = 1e-3 if learned else 0.0
-    assert [replay(problem, row).f for row in x] == pytest.approx(problem.evaluate(x).tolist(), abs=tolerance)
+    assert [drive_again(problem, row).f for row in x] == pytest.approx(problem.evaluate(x).tolist(), abs=tolerance)
 
 
 def test_a_replay_ends_at_the_collision(risky: str) -> None:
     problem = rare_envs.DrivingProblem(FOLLOWING, base=risky)
-    drive = replay(problem, np.array([20.0, 5.0, 10.0]))
+    drive = drive_again(problem, np.array([20.0, 5.0, 10.0]))
     assert drive.collided
     assert drive.f == -1.0
     # both keep braking or speed for a tick of 0.1 s; the bodies touch within the last one
@@ -44,7 +44,7 @@ def test_a_replay_ends_at_the_collision(risky: str) -> None:
 
 def test_the_worst_moment_of_a_near_miss_is_where_its_time_to_collision_is_least() -> None:
     problem = rare_envs.DrivingProblem(FOLLOWING)
-    drive = replay(problem, np.array([20.0, 0.0, 60.0]))
+    drive = drive_again(problem, np.array([20.0, 0.0, 60.0]))
     closing = drive.closing_speed > 0
     ttc = np.where(closing, drive.gap / np.where(closing, drive.closing_speed, 1.0), np.inf)
     assert not drive.collided
@@ -54,7 +54,7 @@ def test_the_worst_moment_of_a_near_miss_is_where_its_time_to_collision_is_least
 
 def test_a_replay_without_a_collision_ends_at_the_horizon() -> None:
     problem = rare_envs.DrivingProblem(FOLLOWING, horizon=3.0)
-    drive = replay(problem, np.array([10.0, 10.0, 100.0]))
+    drive = drive_again(problem, np.array([10.0, 10.0, 100.0]))
     assert not drive.collided
     assert drive.time[-1] == pytest.approx(3.0)
     assert drive.f > 0
@@ -63,16 +63,16 @@ def test_a_replay_without_a_collision_ends_at_the_horizon() -> None:
 def test_a_replay_asks_a_policy_as_the_rollout_does(here: Path, risky: str) -> None:
     problem = rare_envs.DrivingProblem(FOLLOWING, ego=agents.load_ego("egos_here:coasting"))
     x = np.array([[20.0, 10.0, 25.0], [20.0, 19.0, 50.0]])
-    assert [replay(problem, row).f for row in x] == problem.evaluate(x).tolist()
+    assert [drive_again(problem, row).f for row in x] == problem.evaluate(x).tolist()
     # coasting closes 25 m at 10 m/s
-    assert replay(problem, x[0]).time[-1] == pytest.approx(2.5, abs=0.15)
+    assert drive_again(problem, x[0]).time[-1] == pytest.approx(2.5, abs=0.15)
 
 
 @pytest.mark.parametrize("env_id", rare_envs.ENV_IDS)
 def test_the_legend_says_which_vehicle_is_which(env_id: str) -> None:
     problem = rare_envs.DrivingProblem(env_id, horizon=3.0)
     axes = list(Figure().subplots(MOMENTS + 1))
-    draw_drive(axes, replay(problem, problem.base.sample(1, np.random.default_rng(0))[0]))
+    draw_drive(axes, drive_again(problem, problem.base.sample(1, np.random.default_rng(0))[0]))
     legend = axes[-1].get_legend()
     assert legend is not None
     speeds = [f"speed of {label}" for label in problem.world.scenario.labels]
@@ -92,7 +92,7 @@ def test_the_most_shifted_parameters_come_first() -> None:
     failures = space.sample(400, np.random.default_rng(1))
     failures[:, 3] -= 2.0 * ordinary[:, 3].std()
     failures[:, 1] += 1.0 * ordinary[:, 1].std()
-    assert most_shifted(space, ordinary, failures)[:2] == [3, 1]
+    assert rank_shifted_parameters(space, ordinary, failures)[:2] == [3, 1]
 
 
 def test_weights_and_noise_are_never_the_most_shifted() -> None:
@@ -101,17 +101,17 @@ def test_weights_and_noise_are_never_the_most_shifted() -> None:
     failures = space.sample(50, np.random.default_rng(1))
     failures[:, 24:] += 100.0
     failures[:, 18:20] += (10.0, -20.0)
-    order = most_shifted(space, ordinary, failures)
+    order = rank_shifted_parameters(space, ordinary, failures)
     assert order[:2] == [19, 18]
     assert sorted(order) == list(range(24))
 
 
 def test_columns_have_the_names_of_their_blocks() -> None:
-    columns = columns_of(rare_envs.DrivingProblem("rare_envs/Highway-v0", horizon=2.0).space)
+    columns = list_columns(rare_envs.DrivingProblem("rare_envs/Highway-v0", horizon=2.0).space)
     assert [column.label for column in columns[:2]] == ["s[0] [m]", "s[1] [m]"]
     assert (columns[23].label, columns[24].label) == ("speed[5] [m/s]", "weights[0]")
     assert [column.shown for column in columns] == [True] * 24 + [False] * (404 + 220)
-    assert [column.name for column in columns_of(rare_envs.DrivingProblem(FOLLOWING).space)] == [
+    assert [column.name for column in list_columns(rare_envs.DrivingProblem(FOLLOWING).space)] == [
         "ego_speed",
         "lead_speed",
         "gap",

@@ -9,7 +9,15 @@ from PIL import Image
 import rare_envs
 from rare_envs.study.errors import BadInput
 from rare_envs.study.run_directory import read_failures
-from rare_envs.study.video import LAST, STRIP, drive_again, find, in_words, pictures, write_film
+from rare_envs.study.video import (
+    CURVES_HEIGHT,
+    LAST_FRAME_TICKS,
+    describe_drive,
+    draw_frames,
+    drive_again,
+    find_failure,
+    write_film,
+)
 
 FOLLOWING = "rare_envs/CarFollowing-v0"
 
@@ -31,25 +39,25 @@ def test_a_failure_of_a_run_is_shown(cli, run, tmp_path):
     assert answer["crash"]["kind"] == "rear_end"
     assert answer["crash"]["vehicles"] == [0, 1]
     with Image.open(clip) as film:
-        assert film.size == (800, 160 + 48 + STRIP)
+        assert film.size == (800, 160 + 48 + CURVES_HEIGHT)
         length = 0
         for k in range(film.n_frames):
             film.seek(k)
             length += film.info["duration"]
-    assert length == pytest.approx(1000 * answer["seconds"] + 100 * LAST, abs=1)  # equal neighbours are one frame
+    assert length == pytest.approx(1000 * answer["seconds"] + 100 * LAST_FRAME_TICKS, abs=1)  # equal frames are one
     words = cli("replay", run, "--out", tmp_path / "worst.png").stdout
     for said in ("Failure 0 of", "ego_speed", "the ego into the lead (rear_end", f"Wrote {tmp_path / 'worst.png'}"):
         assert said in words
 
 
 def test_a_drive_that_comes_out_otherwise_says_why(run):
-    found = find(run, 0)
+    found = find_failure(run, 0)
     drive = drive_again(found.problem, found.x)
     other = found._replace(f=found.f + 1.0)
-    assert "have changed since" in in_words(other, drive, 0)[-1]
+    assert "have changed since" in describe_drive(other, drive, 0)[-1]
     found.problem.varies = True
-    assert "what was recorded is what counts" in in_words(other, drive, 0)[-1]
-    assert "recorded" not in in_words(found, drive, 0)[-1]
+    assert "what was recorded is what counts" in describe_drive(other, drive, 0)[-1]
+    assert "recorded" not in describe_drive(found, drive, 0)[-1]
 
 
 def test_bad_input_is_one_line(cli, run):
@@ -67,7 +75,7 @@ def test_bad_input_is_one_line(cli, run):
 
 def test_no_run(tmp_path):
     with pytest.raises(BadInput, match="No run in"):
-        find(tmp_path, 0)
+        find_failure(tmp_path, 0)
 
 
 def test_another_f_than_recorded_is_a_warning(cli, run):
@@ -88,12 +96,12 @@ def test_moments_by_hand():
 
     problem = rare_envs.DrivingProblem(FOLLOWING, ego=Coasting())
     drive = drive_again(problem, np.array([20.0, 10.0, 30.0]))
-    k = np.arange(len(drive.so_far) - 1)
+    k = np.arange(len(drive.f_so_far) - 1)
     expected = np.maximum(3.0 - 0.1 * k, 0.001)  # gaps are at least 1 cm
-    np.testing.assert_allclose(drive.alone[:-1], expected, atol=1e-4)
-    np.testing.assert_allclose(drive.so_far[:-1], expected, atol=1e-4)
+    np.testing.assert_allclose(drive.f_alone[:-1], expected, atol=1e-4)
+    np.testing.assert_allclose(drive.f_so_far[:-1], expected, atol=1e-4)
     assert drive.f == -1.0
-    assert drive.time(len(k)) == pytest.approx(3.0, abs=0.11)
+    assert drive.time[len(k)] == pytest.approx(3.0, abs=0.11)
     assert drive.f == problem.evaluate(np.array([[20.0, 10.0, 30.0]]))[0]
 
 
@@ -101,7 +109,7 @@ def test_moments_by_hand():
 def test_every_scenario_and_a_drive_without_a_crash(env_id, tmp_path):
     problem = rare_envs.DrivingProblem(env_id, horizon=1.0, noise=False)
     drive = drive_again(problem, problem.base.sample(1, np.random.default_rng(0))[0])
-    shown = pictures(drive)
+    shown = draw_frames(drive)
     assert len(shown) == 11
     assert drive.crash is None
     cursor = [np.flatnonzero((np.asarray(each)[-60] == (200, 0, 150)).all(axis=-1)).mean() for each in shown]

@@ -13,7 +13,7 @@ from gymnasium import spaces
 from typer.testing import Result
 
 import rare_envs
-from rare_envs.study.columns import digits
+from rare_envs.study.columns import format_value
 from rare_envs.study.ego_check.behaviour import EGO_CHECKS
 from rare_envs.study.ego_check.probe import Probe
 
@@ -59,14 +59,14 @@ def test_weather_on_the_command_line(cli: Cli, tmp_path: Path) -> None:
 
 
 def test_thin_air_is_not_shown_as_none() -> None:
-    assert [digits(value) for value in (1.9e-4, 0.03, 0.0, -12.345, -0.001)] == [
+    assert [format_value(value) for value in (1.9e-4, 0.03, 0.0, -12.345, -0.001)] == [
         "0.00019",
         "0.03",
         "0.00",
         "-12.35",
         "-0.001",
     ]
-    assert [digits(value, 1) for value in (0.002, 21.04)] == ["0.002", "21.0"]
+    assert [format_value(value, 1) for value in (0.002, 21.04)] == ["0.002", "21.0"]
 
 
 def test_the_list_has_the_weather(cli: Cli) -> None:
