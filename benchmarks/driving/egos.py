@@ -40,8 +40,8 @@ and the likeliest failure that was found (`python -m benchmarks.driving.egos`).
 
 `vision` has {most:,} simulations at most. Wall times are from a busy machine of two cores. `dqn` chooses among five
 accelerations and cannot steer: on the I-80's curves it leaves its lane, or the road. In the 1,448 dimensions of
-`Highway-v0` nothing announces a collision, so that all methods can do is count: intervals are wide there, and warnings
-say so.
+`Highway-v0` no intermediate value of f predicts a collision, so all methods can do is count: intervals are wide
+there, and warnings say so.
 
 A row of it in Python, with a quarter of the simulations:
 

@@ -29,7 +29,7 @@ class EgoComparison(NamedTuple):
 
 
 def compare_egos(question: Question, ego_b: str, progress: bool = False, out: Path | None = None) -> EgoComparison:
-    """Estimate p_A / p_B, see `samplers.compare_egos`.
+    """Estimate p_A / p_B, see `samplers.compare`.
 
     Args:
         question: The question about ego A, without its `UNUSED_FIELDS`.

@@ -1,4 +1,4 @@
-"""`rare-envs export-ego`: a saved policy as an ONNX file."""
+"""Export of a saved policy as an ONNX file (`rare-envs export-ego`)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`rare-envs serve-ego`: an ego lent to simulations elsewhere."""
+"""Server of an ego for simulations in other processes or on other machines (`rare-envs serve-ego`)."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def serve_ego(spec: str, bind: str, algo: str | None = None, trust: bool = False
         raise BadInput("Serving needs pyzmq and msgpack: pip install 'rare-envs[remote]'.") from error
     try:
         ego = agents.load_ego(spec, algo=algo, trust=trust)
-        if not callable(getattr(ego, "predict", None)):
+        if not callable(getattr(ego, "predict", None)):  # an object of the user's
             raise ValueError(f"Expected an ego with predict, got {spec!r}, which needs more than observations.")
         server = EgoServer(ego, bind, os.environ.get(SECRET, "").encode() or None, name=spec)
     except (ValueError, OSError) as error:

@@ -8,13 +8,13 @@ from PIL import Image
 
 import rare_envs
 from rare_envs.study.errors import BadInput
+from rare_envs.study.replay import drive_again
 from rare_envs.study.run_directory import read_failures
 from rare_envs.study.video import (
     CURVES_HEIGHT,
     LAST_FRAME_TICKS,
     describe_drive,
     draw_frames,
-    drive_again,
     find_failure,
     write_film,
 )

@@ -45,7 +45,7 @@ def test_scenarios_on_which_the_ego_fails_are_listed(cli: Cli, here: Path, risky
 def test_an_unknown_word_is_refused(cli: Cli) -> None:
     result = cli(*SMALL, "--on-error", "bonud")
     assert (result.exit_code, result.stdout) == (2, "")
-    assert "did you mean 'bound'" in result.stderr
+    assert "Did you mean 'bound'" in result.stderr
 
 
 def test_an_ego_that_answers_differently_each_time_is_noticed(cli: Cli, here: Path) -> None:
