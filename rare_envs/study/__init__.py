@@ -6,10 +6,7 @@ The names are imported when they are used, so that the command line starts witho
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from rare_envs.study.cli.printing import print_report
     from rare_envs.study.compare import EgoComparison, compare_egos
-    from rare_envs.study.ego_check.findings import Finding
-    from rare_envs.study.ego_check.subprocess_check import EgoCheckRequest, check_ego
     from rare_envs.study.errors import BadInput
     from rare_envs.study.evaluate import Question, Report, Study, prepare, run
     from rare_envs.study.replay import Drive, drive_again
@@ -19,17 +16,13 @@ if TYPE_CHECKING:
 __all__ = [
     "BadInput",
     "Drive",
-    "EgoCheckRequest",
     "EgoComparison",
-    "Finding",
     "Question",
     "Report",
     "Study",
-    "check_ego",
     "compare_egos",
     "drive_again",
     "prepare",
-    "print_report",
     "read_failures",
     "resume",
     "run",
@@ -39,10 +32,7 @@ __all__ = [
 ]
 
 _MODULES = {
-    "cli.printing": ("print_report",),
     "compare": ("EgoComparison", "compare_egos"),
-    "ego_check.findings": ("Finding",),
-    "ego_check.subprocess_check": ("EgoCheckRequest", "check_ego"),
     "errors": ("BadInput",),
     "evaluate": ("Question", "Report", "Study", "prepare", "run"),
     "replay": ("Drive", "drive_again"),
