@@ -25,7 +25,6 @@ OUTPUT_NOT_SHOWN = {
     "camera.md",
     "egos.md",
     "environments.md",
-    "estimates.md",
     "measures.md",
     "remote.md",
     "scenarios.md",

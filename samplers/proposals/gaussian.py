@@ -29,7 +29,15 @@ class Moments(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Gaussian:
-    """N(mean, L L') with lower triangular L."""
+    """N(mean, L L') with lower triangular L.
+
+    Example:
+        >>> import numpy as np
+        >>> from samplers.proposals import Gaussian
+        >>> proposal = Gaussian.from_covariance(np.zeros(2), np.array([[4.0, 0.0], [0.0, 1.0]]))
+        >>> proposal.log_prob(np.zeros((1, 2))).round(4)  # -log(2 pi sqrt(4))
+        array([-2.531])
+    """
 
     mean: FloatArray
     """Shape (d,)."""
