@@ -26,31 +26,34 @@ def on_the_line(mean, variance):
     return SubspaceGaussian(np.eye(1), np.array([mean]), np.array([variance]))
 
 
-LAWS = [
+PARTS = [
     (IsotropicNormal(1), stats.norm(0, 1)),
     (on_the_line(2.3, 0.5), stats.norm(2.3, math.sqrt(0.5))),
     (on_the_line(-2.0, 1.0), stats.norm(-2.0, 1.0)),  # wasted: stratified, it adds no variance
     (HalfSpaceNormal(np.ones(1), 1.5), stats.truncnorm(1.5, np.inf)),
 ]
 WEIGHTS = np.array([0.2, 0.3, 0.3, 0.2])
-PROPOSAL = MixtureProposal([ProposalComponent(component, "gaussian") for component, _ in LAWS], WEIGHTS)
+PROPOSAL = MixtureProposal([ProposalComponent(component, "gaussian") for component, _ in PARTS], WEIGHTS)
 UNUSED = MixtureProposal(
     [*PROPOSAL.candidates, ProposalComponent(IsotropicNormal(1, 3.0), "wide")], np.append(WEIGHTS, 0.0)
 )
 
 
 def mixture(x):
-    return sum(a * law.pdf(x) for a, (_, law) in zip(WEIGHTS, LAWS, strict=True))
+    return sum(a * distribution.pdf(x) for a, (_, distribution) in zip(WEIGHTS, PARTS, strict=True))
 
 
-def moment(law, power):
+def moment(distribution, power):
     """E[y^power], y = phi / q at failures, else 0, under one of the components."""
     x = np.linspace(BETA, 12, 10_001)
-    return simpson(law.pdf(x) * (stats.norm.pdf(x) / mixture(x)) ** power, x=x)
+    return simpson(distribution.pdf(x) * (stats.norm.pdf(x) / mixture(x)) ** power, x=x)
 
 
-WITHIN = sum(a * (moment(law, 2) - moment(law, 1) ** 2) for a, (_, law) in zip(WEIGHTS, LAWS, strict=True))
-TOTAL = sum(a * moment(law, 2) for a, (_, law) in zip(WEIGHTS, LAWS, strict=True)) - P**2
+WITHIN = sum(
+    a * (moment(distribution, 2) - moment(distribution, 1) ** 2)
+    for a, (_, distribution) in zip(WEIGHTS, PARTS, strict=True)
+)
+TOTAL = sum(a * moment(distribution, 2) for a, (_, distribution) in zip(WEIGHTS, PARTS, strict=True)) - P**2
 
 
 def batch(counts, rng, proposal=PROPOSAL):
@@ -103,7 +106,7 @@ def test_components_with_few_draws_count_with_their_second_moment(rng):
     counts = np.array([MIN_STRATUM_DRAWS - 1] * 4)
     own = [variance_within(strata(batch(counts, rng))) for _ in range(600)]
     n = counts.sum()
-    second = sum(moment(law, 2) for _, law in LAWS) * (MIN_STRATUM_DRAWS - 1) / n**2
+    second = sum(moment(distribution, 2) for _, distribution in PARTS) * (MIN_STRATUM_DRAWS - 1) / n**2
     assert np.mean(own) == pytest.approx(second, abs=4 * np.std(own) / math.sqrt(600))
 
 
@@ -165,15 +168,15 @@ def screen(u):
     return np.where(u[:, 0] > 2.1, 1.0, 0.3)
 
 
-def passed(law):
-    return law.sf(2.1) + 0.3 * law.cdf(2.1)
+def passed(distribution):
+    return distribution.sf(2.1) + 0.3 * distribution.cdf(2.1)
 
 
 def test_a_gate_thins_components_and_the_weights_account_for_it(rng):
     """The shares that it lets through are estimated once, by drawing: their error is that of all runs together."""
     proposal = PROPOSAL.with_screen(screen, rng)
-    for (_, law), acceptance, weight in zip(LAWS, proposal.acceptance, WEIGHTS, strict=True):
-        share, drawn = passed(law), max(ACCEPTANCE_DRAWS * weight, 500)
+    for (_, distribution), acceptance, weight in zip(PARTS, proposal.acceptance, WEIGHTS, strict=True):
+        share, drawn = passed(distribution), max(ACCEPTANCE_DRAWS * weight, 500)
         assert acceptance == pytest.approx(share, abs=4 * math.sqrt(0.25 / drawn))
     found = []
     for _ in range(300):
@@ -190,7 +193,7 @@ def test_base_and_wide_draws_pass_every_gate(rng):
     candidates = [
         ProposalComponent(IsotropicNormal(1), "base"),
         ProposalComponent(IsotropicNormal(1, 1.5), "wide"),
-        ProposalComponent(LAWS[1][0], "gaussian"),
+        ProposalComponent(PARTS[1][0], "gaussian"),
     ]
     proposal = MixtureProposal(candidates, np.array([0.2, 0.2, 0.6])).with_screen(screen, rng)
     np.testing.assert_array_equal(proposal.acceptance[:2], 1.0)

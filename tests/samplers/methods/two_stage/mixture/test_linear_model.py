@@ -5,7 +5,9 @@ import pytest
 from scipy import stats
 
 from samplers.methods.two_stage.mixture.linear_model import (
+    EDGE_SLACK,
     LEAST_R2,
+    WIDENING,
     descent_direction,
     failure_edge,
     fit_plane,
@@ -159,16 +161,17 @@ def test_proposals_beyond_the_plane_of_a_half_space(dim, rng):
     tail = stats.truncnorm(beta, np.inf)
     xi = rng.standard_normal((400, dim))
     points = xi + (tail.rvs(400, random_state=rng) - xi @ axis)[:, None] * axis
-    bump, cut = half_space_proposals(points, u, beta - u @ axis)
-    assert isinstance(bump, SubspaceGaussian)
-    assert isinstance(cut, HalfSpaceNormal)
+    gaussian, half_space = half_space_proposals(points, u, beta - u @ axis)
+    assert isinstance(gaussian, SubspaceGaussian)
+    assert isinstance(half_space, HalfSpaceNormal)
     low, high = (tail.ppf(share) for share in (0.005, 0.08))  # the 3 % quantile of 400 points, 4 standard errors
-    assert low - 0.05 < cut.start < high
-    assert bump.mean[0] == pytest.approx(stats.truncnorm(cut.start + 0.02, np.inf).mean(), rel=0.01)
-    assert bump.variance[0] == pytest.approx(1.3 * stats.truncnorm(cut.start + 0.02, np.inf).var(), rel=0.02)
-    assert angle(cut.axis, axis) < 0.05
-    weights = np.exp(-cut.log_ratio(cut.sample(100, rng)))
-    np.testing.assert_allclose(weights, stats.norm.sf(cut.start), rtol=1e-9)
+    assert low - 0.05 < half_space.start < high
+    beyond = stats.truncnorm(half_space.start + EDGE_SLACK, np.inf)
+    assert gaussian.mean[0] == pytest.approx(beyond.mean(), rel=0.01)
+    assert gaussian.variance[0] == pytest.approx(WIDENING * beyond.var(), rel=0.02)
+    assert angle(half_space.axis, axis) < 0.05
+    weights = np.exp(-half_space.log_ratio(half_space.sample(100, rng)))
+    np.testing.assert_allclose(weights, stats.norm.sf(half_space.start), rtol=1e-9)
 
 
 def test_no_proposals_from_few_failures_or_a_plane_at_the_origin(rng):
@@ -195,9 +198,9 @@ def test_points_of_another_region_among_the_failures_change_nothing(dim):
         points = np.concatenate([beyond_plane(axis, 3.0, 180, rng), beyond_plane(other, 3.2, 20, rng)])
         u = np.concatenate([around(axis, 270, rng), around(other, 30, rng)])
         f = np.minimum(3.0 - u @ axis, 5.0 * (3.2 - u @ other))
-        _, cut = half_space_proposals(points, u, f)
-        assert angle(cut.axis, axis) < (0.02 if dim == 8 else 0.06)
-        assert 2.98 - (0.03 if dim == 8 else 0.2) < cut.start < 2.99  # it was not found at all
+        _, half_space = half_space_proposals(points, u, f)
+        assert angle(half_space.axis, axis) < (0.02 if dim == 8 else 0.06)
+        assert 2.98 - (0.03 if dim == 8 else 0.2) < half_space.start < 2.99  # it was not found at all
 
 
 def test_a_region_whose_surroundings_fall_towards_another_one(rng):
@@ -205,9 +208,9 @@ def test_a_region_whose_surroundings_fall_towards_another_one(rng):
     axis, other = np.eye(6)[0], np.eye(6)[1]
     u = around(axis, 80, rng, mean=3.2)
     f = np.minimum(2.0 * (3.0 - u @ axis), 0.3 * (3.0 - u @ other))
-    _, cut = half_space_proposals(beyond_plane(axis, 3.0, 40, rng), u, f)
-    assert angle(cut.axis, axis) < 0.01
-    assert cut.start == pytest.approx(2.98, abs=0.02)
+    _, half_space = half_space_proposals(beyond_plane(axis, 3.0, 40, rng), u, f)
+    assert angle(half_space.axis, axis) < 0.01
+    assert half_space.start == pytest.approx(2.98, abs=0.02)
 
 
 @pytest.mark.parametrize("n", [150, 300])
