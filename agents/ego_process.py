@@ -1,4 +1,9 @@
-"""The program of the process in which an untrusted ego answers; `agents.remote.subprocess_link` starts it."""
+"""Program of the process in which an untrusted ego answers; `agents.remote.subprocess_link` starts it.
+
+    python -m agents.ego_process SOCKET ARGUMENTS
+
+SOCKET is the number of an inherited socket, ARGUMENTS are those of `agents.load_ego` as JSON.
+"""
 
 from __future__ import annotations
 
@@ -6,45 +11,61 @@ import json
 import socket
 import sys
 
+from agents.remote.framing import add_length, read_message
 from agents.remote.request_handler import RequestHandler
-from agents.remote.subprocess_link import _SIZE
 
 
-def _serve(link: socket.socket, answerer: RequestHandler) -> None:
+def serve_socket(link: socket.socket, handler: RequestHandler) -> None:
     """Answer until the other side is gone."""
     with link.makefile("rwb") as stream:
-        while len(head := stream.read(_SIZE.size)) == _SIZE.size:
-            (content,) = answerer.answer(b"", [stream.read(_SIZE.unpack(head)[0])])
-            stream.write(_SIZE.pack(len(content)) + content)
+        while True:
+            try:
+                content = read_message(stream.read)
+            except EOFError:
+                return
+            stream.write(add_length(handler.handle(b"", content)))
             stream.flush()
 
 
-class _Unloaded:
-    """Stands for an ego that could not be loaded."""
+class FailedEgo:
+    """Stands for an ego that could not be loaded: it answers the hello with the reason."""
 
     def __init__(self, reason: str) -> None:
+        """Keep the reason."""
         self.reason = reason
 
     @property
     def observation_space(self) -> None:
+        """No space.
+
+        Raises:
+            ValueError: Always, with the reason.
+        """
         raise ValueError(self.reason)
 
 
-def _main(number: str, arguments: str) -> None:
+def main(number: str, arguments: str) -> None:
+    """Load an ego and answer for it.
+
+    Args:
+        number: Of the inherited socket.
+        arguments: Of `agents.load_ego`, as JSON.
+    """
     import torch
 
-    from agents.loading import load_ego
+    from agents.loading import Ego, load_ego
 
     torch.set_num_threads(1)
+    ego: object
     try:
         ego = load_ego(**json.loads(arguments))
-        if not callable(getattr(ego, "predict", None)):
+        if not isinstance(ego, Ego):
             raise ValueError(f"Expected an ego with predict for a process of its own, got {ego!r}.")
     except (ValueError, OSError) as error:
-        ego = _Unloaded(str(error))  # type: ignore[assignment]
+        ego = FailedEgo(str(error))
     with socket.socket(fileno=int(number)) as link:
-        _serve(link, RequestHandler(ego))
+        serve_socket(link, RequestHandler(ego))
 
 
 if __name__ == "__main__":
-    _main(*sys.argv[1:])
+    main(*sys.argv[1:])

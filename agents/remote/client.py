@@ -1,4 +1,4 @@
-"""Egos elsewhere: in another program, another language or a process of their own. See docs/remote.md."""
+"""Client of a remote ego: in another program, another language or a process of its own. See docs/remote.md."""
 
 from __future__ import annotations
 
@@ -13,60 +13,88 @@ from numpy.typing import NDArray
 
 from agents.remote import protocol
 from agents.remote.protocol import MalformedMessage, Message
-from agents.remote.request_handler import decode_space
+from agents.remote.space_encoding import decode_space
 from rare_envs.egos.errors import EgoGone, NoAnswer
 from rare_envs.sensors.kinds import batch_size
 
 TIMEOUT, PATIENCE = 10.0, 30.0
 """Seconds to wait for an answer, and for an ego that has gone to come back."""
-_HELLO_EVERY = 1.0
-_HURRY = 0.5
-MOST_NAME = 100
+MAX_NAME = 100
 """Letters of an ego's name that are kept."""
+_MAX_REASON = 500
+"""Letters of an error's reason that are kept."""
+_HELLO_INTERVAL = 1.0
+"""Time [s] after which a hello without an answer is sent again."""
+_HANDSHAKES = 2
+"""Failed handshakes in a row after which the server is taken to refuse; one may fail because the server has died."""
+_PART_FACTOR, _MIN_PART_TIMEOUT = 10.0, 0.5
+"""A part of a batch that was not answered gets this multiple of the longest answer so far, and at least so long [s]."""
 
 
 class LinkError(Exception):
-    """No answer: the other side is silent, or the connection broke."""
+    """A request without an answer: the server is silent, or the connection broke."""
 
 
 class NoReply(LinkError):
-    """No answer in time, or its process has died: perhaps because of what it was asked."""
+    """A request that was not answered in time, or at which the ego's process ended: perhaps the request caused it."""
+
+
+class HandshakeError(LinkError):
+    """A connection that was refused: one side has a secret and the other none or another one."""
 
 
 class RemoteError(RuntimeError):
-    """The other side has answered with an error, or twice not at all."""
+    """A request that was answered with an error, or twice not at all.
+
+    Attributes:
+        code: Code of the error, see docs/remote.md; "" without one.
+
+    Example:
+        >>> RemoteError("no road", "ego").code
+        'ego'
+    """
+
+    def __init__(self, reason: str, code: str = "") -> None:
+        """Make an error."""
+        super().__init__(reason)
+        self.code = code
 
 
 class Link(Protocol):
-    """A way to the other side."""
+    """A connection that carries requests and answers."""
 
     @property
-    def where(self) -> str:
-        """What it leads to, in words."""
+    def address(self) -> str:
+        """Where it leads, for messages."""
+
+    @property
+    def load_timeout(self) -> float:
+        """Least time [s] to wait for the first answer, in which an ego may have to be loaded."""
 
     def open(self) -> None:
-        """Begin anew; what was under way is forgotten."""
+        """Begin anew; a request under way is dropped."""
 
-    def ask(self, content: bytes, timeout: float) -> bytes:
-        """Send a message and wait for the answer.
+    def request(self, content: bytes, timeout: float) -> bytes:
+        """Send a message and return its answer.
 
         Raises:
-            Silent: There is none within the time [s], or its process has died.
-            Lost: The connection broke.
+            NoReply: There is none within the time [s], or the ego's process has ended.
+            LinkError: The connection broke, or was refused.
         """
-
-    def hello(self, greeting: Message, timeout: float) -> Message:
-        """Exchange hellos, which may settle a key."""
 
     def close(self) -> None:
         """End it."""
 
 
 def parse_address(spec: str) -> tuple[str, dict[str, float]]:
-    """An address and the time-outs behind it, as in "tcp://127.0.0.1:5555?timeout=10&patience=30".
+    """Split "tcp://127.0.0.1:5555?timeout=10&patience=30" into the address and the time-outs.
 
     Raises:
-        ValueError: What is behind the address are no such settings.
+        ValueError: The part after "?" has other settings.
+
+    Example:
+        >>> parse_address("tcp://127.0.0.1:5555?timeout=10")
+        ('tcp://127.0.0.1:5555', {'timeout': 10.0})
     """
     address, mark, query = spec.partition("?")
     try:
@@ -79,52 +107,63 @@ def parse_address(spec: str) -> tuple[str, dict[str, float]]:
 
 
 class _Session:
-    """One batch of episodes on the other side, and what it takes to begin it again there."""
+    """One batch of episodes on the server, and what it takes to begin it again there."""
 
     def __init__(self, number: int, batch: int) -> None:
         self.number = number
         self.batch = batch
         self.step = 0
         self.epoch = -1
+        """Connection on which the server knows it."""
         self.memory = False
         self.history: list[tuple[Any, NDArray[np.bool_] | None]] = []
+        """Observations and starts of the episode up to now, if the session has a memory."""
 
 
 class RemoteEgo:
     """An ego on the other side of a link.
 
     If an answer does not come in time or the connection breaks, the link is opened again, for as long as `patience`
-    says, and the batch is sent anew from its reset: an ego that was killed and started again loses nothing. If it then
-    fails again on the same question that is a fault of the ego on this batch.
+    says, and the batch is sent anew from its reset: an ego that was killed and started again loses nothing. If the
+    same request then fails again, that is a fault of the ego on this batch.
 
     Attributes:
-        name: What the ego calls itself.
-        observation_space: What it says it observes, None if it does not.
-        action_space: Likewise how it acts.
-        deterministic: Whether it says that its answers repeat; None if it does not say.
+        name: Name of the ego.
+        observation_space: Its observations, None if it does not say.
+        action_space: Its actions, None if it does not say.
+        deterministic: Whether its answers repeat, None if it does not say.
+
+    Example:
+        >>> import agents
+        >>> with_ego = agents.load_ego("process:imitation")
+        >>> type(with_ego).__name__, with_ego.observation_space.shape
+        ('RemoteEgo', (51,))
+        >>> with_ego.predict(np.zeros((3, 51), np.float32))[0].shape
+        (3, 2)
+        >>> with_ego.close()
     """
 
     def __init__(self, link: Link, timeout: float = TIMEOUT, patience: float = PATIENCE) -> None:
         """Connect.
 
         Args:
-            link: To the other side.
+            link: To the server.
             timeout: Seconds to wait for an answer.
             patience: Seconds to wait for an ego to appear, or come back.
 
         Raises:
-            EgoGone: It does not appear.
-            ValueError: It speaks another version, or something else.
+            EgoGone: No server answers.
+            ValueError: The server refuses, speaks another version or another protocol.
         """
         self._link = link
         self._timeout, self._patience = timeout, patience
         self._ids, self._numbers = itertools.count(1), itertools.count(1)
         self._epoch = 0
-        self._suspected = 0
-        self._longest = 0.0
+        self._smallest_unanswered = 0
+        self._longest_answer = 0.0
         self._warm = False
         self._connected = False
-        self._spare: dict[int, _Session] = {}
+        self._reusable: dict[int, _Session] = {}
         self._ended: list[int] = []
         try:
             hello = self._connect()
@@ -132,13 +171,13 @@ class RemoteEgo:
             self.action_space = decode_space(hello.get("action"))
         except RemoteError as error:
             link.close()
-            raise ValueError(f"The ego at {link.where} refuses: {error}") from error
+            raise ValueError(f"The ego at {link.address} refuses: {error}") from error
         except BaseException:
             link.close()
             raise
         self._spaces = _declared_spaces(hello)
         self.deterministic = None if hello.get("deterministic") is None else bool(hello["deterministic"])
-        self.name = str(hello.get("name", "ego"))[:MOST_NAME]
+        self.name = str(hello.get("name", "ego"))[:MAX_NAME]
 
     def predict(
         self,
@@ -147,42 +186,43 @@ class RemoteEgo:
         episode_start: NDArray[np.bool_] | None = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[Any], Any]:
-        """Choose an action for each row of a batch; see `agents.Ego`.
+        """Choose an action for each row of a batch; see `agents.Ego.predict`.
 
         Raises:
             NoAnswer: It does not answer in time, or its process dies.
             RemoteError: The ego failed on this batch.
             EgoGone: It is not there any more.
         """
-        session = self._session(batch_size(observation)) if state is None else state
+        session = self._find_session(batch_size(observation)) if state is None else state
         start = None if episode_start is None or session.step == 0 else np.asarray(episode_start, dtype=bool)
         if start is not None and not start.any():
             start = None
         action = self._act(session, observation, start)
         if session.memory:
-            self._spare.pop(session.batch, None)
+            self._reusable.pop(session.batch, None)
             return action, session
-        self._spare[session.batch] = session
+        self._reusable[session.batch] = session
         session.history.clear()
         return action, None
 
-    def _session(self, batch: int) -> _Session:
-        """One that has no memory, if there is one, else a new one."""
+    def _find_session(self, batch: int) -> _Session:
+        """Return a session without a memory, if there is one of this size, else a new one."""
         while self._ended and self._connected:  # batches with a memory that nobody refers to any more
             try:
-                self._ask({"type": "end", "session": self._ended.pop()})
+                self._request({"type": "end", "session": self._ended.pop()})
             except (LinkError, MalformedMessage, RemoteError):
                 self._connected = False
-        if batch in self._spare:
-            return self._spare[batch]
+        if batch in self._reusable:
+            return self._reusable[batch]
         session = _Session(next(self._numbers), batch)
         weakref.finalize(session, self._ended.append, session.number)
         return session
 
     def _act(self, session: _Session, observation: Any, start: NDArray[np.bool_] | None) -> NDArray[Any]:
-        why = ""
-        if session.batch >= self._suspected:
-            self._suspected = 0
+        """Return the actions for one tick of a session; try again on a new connection where that may help."""
+        reason = ""
+        if session.batch >= self._smallest_unanswered:
+            self._smallest_unanswered = 0
         for _ in range(2):
             try:
                 if not self._connected:
@@ -190,29 +230,29 @@ class RemoteEgo:
                 self._restore(session)
                 reply = self._send_act(session, session.step, observation, start)
                 action = protocol.unpack_array(reply.get("action"))
-            except NoReply as silent:
-                self._connected, self._suspected = False, max(self._suspected, session.batch)
-                raise NoAnswer(f"The ego at {self._link.where}: {silent}.") from silent
-            except (LinkError, MalformedMessage) as lost:
-                self._connected, why = False, str(lost)
+            except NoReply as error:
+                self._connected = False
+                self._smallest_unanswered = max(self._smallest_unanswered, session.batch)
+                raise NoAnswer(f"The ego at {self._link.address}: {error}.") from error
+            except (LinkError, MalformedMessage) as error:
+                self._connected, reason = False, str(error)
                 continue
             except RemoteError as error:
-                if getattr(error, "code", "") != "session":
-                    session.epoch = -1
+                session.epoch, reason = -1, str(error)
+                if error.code != "session":
                     raise
-                session.epoch, why = -1, str(error)
                 continue
             session.history.append((observation, start))
             session.step += 1
             session.memory = session.memory or bool(reply.get("memory"))
             return action
-        raise RemoteError(f"The ego at {self._link.where} failed twice on this batch: {why}")
+        raise RemoteError(f"The ego at {self._link.address} failed twice on this batch: {reason}")
 
     def _restore(self, session: _Session) -> None:
-        """Begin a session on the other side, and bring it to where it was."""
+        """Begin a session on the server if it does not know it, and bring it to the present tick."""
         if session.epoch == self._epoch:
             return
-        self._ask({"type": "reset", "session": session.number, "batch": session.batch})
+        self._request({"type": "reset", "session": session.number, "batch": session.batch})
         if not session.memory:
             session.step = 0
         for step, (observation, start) in enumerate(session.history):
@@ -220,6 +260,7 @@ class RemoteEgo:
         session.epoch = self._epoch
 
     def _send_act(self, session: _Session, step: int, observation: Any, start: NDArray[np.bool_] | None) -> Message:
+        """Return the answer for one tick of a session."""
         message: Message = {
             "type": "act",
             "session": session.number,
@@ -228,63 +269,67 @@ class RemoteEgo:
         }
         if start is not None:
             message["start"] = protocol.pack_array(start)
-        begun = time.monotonic()
-        reply = self._ask(message, self._time_for(session.batch))
-        self._longest, self._warm = max(self._longest, time.monotonic() - begun), True
+        sent = time.monotonic()
+        reply = self._request(message, self._timeout_of(session.batch))
+        self._longest_answer, self._warm = max(self._longest_answer, time.monotonic() - sent), True
         return reply
 
-    def _time_for(self, batch: int) -> float:
-        """Seconds to wait for the actions of a batch.
+    def _timeout_of(self, batch: int) -> float:
+        """Return how many seconds to wait for the actions of a batch.
 
-        Parts of a batch that was not answered in time get less: what it has ever taken, ten times over. A part that
-        might have been answered a little later is no harm done, as its rows are asked about one by one, with all the
-        time that they may take.
+        Parts of a batch that was not answered in time get less, some multiple of the longest answer so far. A part
+        that would have been answered a little later does no harm: its rows are sent one by one, with the full time.
         """
-        if not (self._warm and 1 < batch < self._suspected):
+        if not (self._warm and 1 < batch < self._smallest_unanswered):
             return self._timeout
-        return min(self._timeout, max(_HURRY, 10.0 * self._longest))
+        return min(self._timeout, max(_MIN_PART_TIMEOUT, _PART_FACTOR * self._longest_answer))
 
     def ping(self) -> float:
-        """Ask whether anybody is there; the seconds until the answer.
+        """Return the seconds that the server takes to answer a ping.
 
         Raises:
-            Lost: Nobody is.
+            LinkError: It does not answer.
         """
-        begun = time.perf_counter()
-        self._ask({"type": "ping"})
-        return time.perf_counter() - begun
+        sent = time.perf_counter()
+        self._request({"type": "ping"})
+        return time.perf_counter() - sent
 
-    def _ask(self, message: Message, timeout: float | None = None) -> Message:
-        """The answer to a message, if it is none of an error."""
+    def _request(self, message: Message, timeout: float | None = None) -> Message:
+        """Send a message and return its answer.
+
+        Raises:
+            LinkError: There is no answer.
+            MalformedMessage: The answer is malformed, or one to another message.
+            RemoteError: The answer is an error.
+        """
         number = next(self._ids)
-        content = self._link.ask(protocol.pack({**message, "id": number}), timeout or self._timeout)
-        return self._checked(protocol.unpack(content), number)
-
-    @staticmethod
-    def _checked(reply: Message, number: int) -> Message:
+        content = self._link.request(protocol.pack({**message, "id": number}), timeout or self._timeout)
+        reply = protocol.unpack(content)
         if reply.get("type") == "error":
-            error = RemoteError(str(reply.get("reason", "no reason given"))[:500])
-            error.code = reply.get("code")  # type: ignore[attr-defined]
-            raise error
+            reason = str(reply.get("reason", "no reason given"))[:_MAX_REASON]
+            raise RemoteError(reason, str(reply.get("code", "")))
         if reply.get("id") != number:
             raise MalformedMessage(f"an answer to {reply.get('id')!r}, expected one to {number}")
         return reply
 
     def _connect(self) -> Message:
-        """Open the link and say hello, again and again while patience lasts."""
-        deadline, why = time.monotonic() + self._patience, "no answer"
+        """Open the link and say hello, repeatedly while patience lasts; return the server's hello."""
+        deadline, reason, refused = time.monotonic() + self._patience, "no answer", 0
+        greeting = {"type": "hello", "protocol": protocol.PROTOCOL, "client": "rare-envs"}
         while True:
             self._link.open()
-            number = next(self._ids)
             left = max(deadline - time.monotonic(), 0.05)
             try:
-                greeting = {"type": "hello", "protocol": protocol.PROTOCOL, "client": "rare-envs", "id": number}
-                reply = self._checked(self._link.hello(greeting, min(_HELLO_EVERY, left)), number)
+                reply = self._request(greeting, max(min(_HELLO_INTERVAL, left), self._link.load_timeout))
                 break
-            except LinkError as lost:
-                why = str(lost)
+            except HandshakeError as error:
+                reason, refused = str(error), refused + 1
+                if refused == _HANDSHAKES:
+                    raise RemoteError(reason) from error
+            except LinkError as error:
+                reason, refused = str(error), 0
             if time.monotonic() >= deadline:
-                raise EgoGone(f"No ego at {self._link.where} within {self._patience:g} s: {why}.")
+                raise EgoGone(f"No ego at {self._link.address} within {self._patience:g} s: {reason}.")
         if reply.get("protocol") != protocol.PROTOCOL:
             raise RemoteError(f"it speaks protocol {reply.get('protocol')!r}, expected {protocol.PROTOCOL}")
         self._epoch += 1
@@ -297,12 +342,13 @@ class RemoteEgo:
         Raises:
             EgoGone: Another one is there, or it refuses.
         """
+        address = self._link.address
         try:
             hello = self._connect()
         except (RemoteError, MalformedMessage) as error:
-            raise EgoGone(f"The ego at {self._link.where} went away, and what is there now refuses: {error}") from error
+            raise EgoGone(f"The ego at {address} went away, and what is there now refuses: {error}") from error
         if _declared_spaces(hello) != self._spaces:
-            raise EgoGone(f"The ego at {self._link.where} went away, and one with other spaces is there now.")
+            raise EgoGone(f"The ego at {address} went away, and one with other spaces is there now.")
 
     def close(self) -> None:
         """End the connection."""
@@ -310,5 +356,5 @@ class RemoteEgo:
 
 
 def _declared_spaces(hello: Message) -> tuple[Any, Any]:
-    """What an ego says that it observes and how it acts."""
+    """Return the spaces that a hello declares, as maps."""
     return hello.get("observation"), hello.get("action")

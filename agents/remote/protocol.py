@@ -1,9 +1,7 @@
-"""Messages between the simulation and an ego elsewhere: msgpack maps, arrays as bytes, seals. See docs/remote.md."""
+"""Messages between the simulation and a remote ego: msgpack maps, with arrays as bytes. See docs/remote.md."""
 
 from __future__ import annotations
 
-import hashlib
-import hmac
 import math
 from typing import Any, TypeGuard
 
@@ -17,13 +15,12 @@ MAX_BYTES = 256 * 2**20
 """Largest message."""
 MAX_BATCH = 2**16
 """Most rows of a batch."""
-MOST = 2**63 - 1
+MAX_COUNT = 2**63 - 1
 """Largest number of a session or message."""
-NONCE = 16
-"""Bytes of a nonce."""
 DTYPES = ("<f4", "<f8", "<i4", "<i8", "|u1")
+"""Types of arrays, by NumPy's names."""
 _LIMITS = {"max_array_len": 4096, "max_map_len": 64, "max_str_len": 2**16, "max_ext_len": 0}
-_MOST_AXES = 5
+_MAX_AXES = 5
 
 Message = dict[str, Any]
 
@@ -33,13 +30,13 @@ class MalformedMessage(ValueError):
 
 
 def pack(message: Message) -> bytes:
-    """A message as bytes."""
+    """Return a message as bytes."""
     content: bytes = msgpack.packb(message, use_bin_type=True)
     return content
 
 
 def unpack(content: bytes) -> Message:
-    """The message in some bytes, whoever wrote them.
+    """Return the message in some bytes, whoever wrote them.
 
     Raises:
         Malformed: They are no msgpack map with text for keys, or too many.
@@ -56,7 +53,7 @@ def unpack(content: bytes) -> Message:
 
 
 def pack_array(values: NDArray[Any]) -> Message:
-    """An array as a map of dtype, shape and little-endian bytes in C order.
+    """Return an array as a map of dtype, shape and little-endian bytes in C order.
 
     Raises:
         Malformed: It holds something else than numbers.
@@ -73,7 +70,7 @@ def pack_array(values: NDArray[Any]) -> Message:
 
 
 def unpack_array(given: Any) -> NDArray[Any]:
-    """The array in such a map.
+    """Return the array in a map that `pack_array` made.
 
     Raises:
         Malformed: It is not of that form, or dtype, shape and bytes do not go together.
@@ -91,17 +88,17 @@ def unpack_array(given: Any) -> NDArray[Any]:
 
 
 def pack_observation(observed: Any) -> Message:
-    """An array, or a mapping from names to arrays as a map with the entry "parts"."""
+    """Return an array, or a mapping from names to arrays, as a map; the latter has the entry "parts"."""
     if isinstance(observed, dict):
         return {"parts": {name: pack_array(np.asarray(part)) for name, part in observed.items()}}
     return pack_array(np.asarray(observed))
 
 
 def unpack_observation(given: Any, batch: int) -> Any:
-    """The observations in such a map.
+    """Return the observations in a map that `pack_observation` made.
 
     Raises:
-        Malformed: It is not of that form, or not of so many rows.
+        Malformed: It is not of that form, or has another number of rows.
     """
     named = isinstance(given, dict) and set(given) == {"parts"}
     parts = given["parts"] if named else {"": given}
@@ -114,34 +111,13 @@ def unpack_observation(given: Any, batch: int) -> Any:
     return found if named else found[""]
 
 
-def is_count(value: object, most: int = MOST) -> TypeGuard[int]:
-    """Whether a value is a whole number from 0 to most; a bool is none."""
+def is_count(value: object, most: int = MAX_COUNT) -> TypeGuard[int]:
+    """Return whether a value is an integer from 0 to most; a bool is none."""
     return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= most
 
 
 def is_shape(value: object, most: int = MAX_BYTES) -> TypeGuard[list[int]]:
-    """Whether a value is a list of sizes, of no more than so many numbers."""
-    if not isinstance(value, list) or len(value) > _MOST_AXES or not all(is_count(size, most) for size in value):
+    """Return whether a value is a list of sizes with a product of at most `most`."""
+    if not isinstance(value, list) or len(value) > _MAX_AXES or not all(is_count(size, most) for size in value):
         return False
     return math.prod(value) <= most
-
-
-# --- seals -------------------------------------------------------------------------------------
-
-ASK, ANSWER = b"ask:", b"answer:"
-"""What a seal covers before the message, so that an answer cannot be sent back as a question."""
-
-
-def seal(key: bytes, direction: bytes, content: bytes) -> bytes:
-    """HMAC-SHA256 of a message, 32 bytes."""
-    return hmac.new(key, direction + content, hashlib.sha256).digest()
-
-
-def sealed(key: bytes, direction: bytes, tag: bytes, content: bytes) -> bool:
-    """Whether a seal is right, compared in constant time."""
-    return hmac.compare_digest(seal(key, direction, content), tag)
-
-
-def session_key(secret: bytes, client_nonce: bytes, server_nonce: bytes) -> bytes:
-    """The key of a connection, after its hello."""
-    return hmac.new(secret, b"key:" + client_nonce + server_nonce, hashlib.sha256).digest()

@@ -1,29 +1,32 @@
-"""An ego in a process of its own, so that one that hangs or dies takes nothing with it."""
+"""Link to an ego in a process of its own, so that one that hangs or dies takes nothing with it."""
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import socket
-import struct
 import subprocess
 import sys
 import time
+from typing import ClassVar
 
-from agents.remote import protocol
 from agents.remote.client import NoReply, RemoteEgo, parse_address
-from agents.remote.protocol import Message
+from agents.remote.framing import add_length, read_message
 
-LOAD_TIMEOUT = 60.0
-"""Seconds that a process may take to load its ego."""
-_SIZE = struct.Struct(">I")
+_CHUNK = 2**20
+"""Bytes read at a time."""
+_EXIT_WAIT = 1.0
+"""Time [s] for a process that has closed its socket to end, so that its exit status is known."""
 
 
-class ChildLink:
+class SubprocessLink:
     """A process that answers the messages of docs/remote.md over a pair of sockets, each behind its length."""
 
+    load_timeout: ClassVar[float] = 60.0
+
     def __init__(self, spec: str, algo: str | None = None, trust: bool = False) -> None:
-        """Make one; nothing is started yet.
+        """Make a link; `open` starts the process.
 
         Args:
             spec: What `agents.load_ego` is to load there.
@@ -36,7 +39,7 @@ class ChildLink:
         self._socket: socket.socket | None = None
 
     @property
-    def where(self) -> str:
+    def address(self) -> str:
         """What runs there."""
         return f"process:{self._spec}"
 
@@ -48,34 +51,30 @@ class ChildLink:
         with theirs:  # an ego may print: to standard error, because standard output is for answers
             self._process = subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=2, pass_fds=[theirs.fileno()])
 
-    def hello(self, greeting: Message, timeout: float) -> Message:
-        """Say hello, and wait until the ego is loaded."""
-        return protocol.unpack(self.ask(protocol.pack(greeting), max(timeout, LOAD_TIMEOUT)))
-
-    def ask(self, content: bytes, timeout: float) -> bytes:
-        """Send a message and wait for its answer."""
+    def request(self, content: bytes, timeout: float) -> bytes:
+        """Send a message and return its answer; see `agents.remote.client.Link`."""
         assert self._socket is not None and self._process is not None
         deadline = time.monotonic() + timeout
         try:
             self._socket.settimeout(timeout)
-            self._socket.sendall(_SIZE.pack(len(content)) + content)
-            (size,) = _SIZE.unpack(self._receive(_SIZE.size, deadline))
-            return self._receive(size, deadline)
+            self._socket.sendall(add_length(content))
+            return read_message(functools.partial(self._receive, deadline=deadline))
         except TimeoutError as error:
             raise NoReply(f"no answer within {timeout:.3g} s") from error
         except (OSError, EOFError) as error:
             with contextlib.suppress(subprocess.TimeoutExpired):
-                self._process.wait(1.0)
+                self._process.wait(_EXIT_WAIT)
             raise NoReply(f"its process ended (exit status {self._process.returncode})") from error
 
     def _receive(self, size: int, deadline: float) -> bytes:
+        """Return so many bytes, fewer if the process ends."""
         assert self._socket is not None
         content = bytearray()
         while len(content) < size:
             self._socket.settimeout(max(deadline - time.monotonic(), 1e-3))
-            part = self._socket.recv(min(size - len(content), 2**20))
+            part = self._socket.recv(min(size - len(content), _CHUNK))
             if not part:
-                raise EOFError
+                break
             content += part
         return bytes(content)
 
@@ -89,11 +88,12 @@ class ChildLink:
         self._socket = self._process = None
 
     def __del__(self) -> None:
+        """End the process."""
         self.close()
 
 
 def isolate(spec: str, algo: str | None = None, trust: bool = False) -> RemoteEgo:
-    """An ego in a process of its own.
+    """Load an ego in a process of its own.
 
     Args:
         spec: As for `agents.load_ego`; "?timeout=10" behind it sets how many seconds an answer may take.
@@ -105,4 +105,4 @@ def isolate(spec: str, algo: str | None = None, trust: bool = False) -> RemoteEg
         EgoGone: Its process does not stay alive.
     """
     address, settings = parse_address(spec)
-    return RemoteEgo(ChildLink(address, algo, trust), **settings)
+    return RemoteEgo(SubprocessLink(address, algo, trust), **settings)

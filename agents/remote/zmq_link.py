@@ -1,123 +1,124 @@
-"""The way to an ego over ZeroMQ."""
+"""Link to an ego over ZeroMQ."""
 
 from __future__ import annotations
 
 import math
 import os
-import secrets
 import time
+from typing import ClassVar
 
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
-from agents.remote import protocol
-from agents.remote.client import LinkError, NoReply, RemoteEgo, parse_address
-from agents.remote.protocol import MalformedMessage, Message
+from agents.remote.client import HandshakeError, LinkError, NoReply, RemoteEgo, parse_address
+from agents.remote.curve import SECRET_VARIABLE, secure_client
+from agents.remote.protocol import MAX_BYTES, MalformedMessage
 
-SECRET = "RARE_ENVS_SECRET"
-"""Environment variable with the shared secret; on a command line others could read it."""
+_BROKEN = (
+    zmq.EVENT_DISCONNECTED
+    | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
+    | zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL
+    | zmq.EVENT_HANDSHAKE_FAILED_AUTH
+)
+"""Events after which no answer will come."""
 
 
 class ZmqLink:
-    """A DEALER socket that speaks as REQ does, so that any REP or ROUTER can answer."""
+    """A DEALER socket that sends as REQ does, so that any REP or ROUTER can answer."""
+
+    load_timeout: ClassVar[float] = 0.0
 
     def __init__(self, address: str, secret: bytes | None = None) -> None:
-        """Make one; nothing is connected yet.
+        """Make a link; `open` connects it.
 
         Args:
             address: Such as "tcp://127.0.0.1:5555".
-            secret: Shared with the server.
+            secret: Shared with the server; None for a server without one.
         """
         self._address, self._secret = address, secret
         # one for all links: ending a context may wait, closing a socket does not
         self._context: zmq.Context[zmq.Socket[bytes]] = zmq.Context.instance()
         self._socket: zmq.Socket[bytes] | None = None
         self._monitor: zmq.Socket[bytes] | None = None
-        self._key: bytes | None = None
 
     @property
-    def where(self) -> str:
-        """The address."""
+    def address(self) -> str:
+        """Where it leads."""
         return self._address
 
     def open(self) -> None:
         """Connect anew."""
-        self._close_socket()
+        self.close()
         self._socket = self._context.socket(zmq.DEALER)
         self._socket.setsockopt(zmq.LINGER, 0)
         self._socket.setsockopt(zmq.RECONNECT_IVL, 100)
-        self._socket.setsockopt(zmq.MAXMSGSIZE, protocol.MAX_BYTES)
-        self._monitor = self._socket.get_monitor_socket(zmq.EVENT_DISCONNECTED)
+        self._socket.setsockopt(zmq.MAXMSGSIZE, MAX_BYTES)
+        if self._secret is not None:
+            secure_client(self._socket, self._secret)
+        self._monitor = self._socket.get_monitor_socket(_BROKEN)
         try:
             self._socket.connect(self._address)
         except zmq.ZMQError as error:
             raise ValueError(f"Cannot connect to {self._address!r}: {error}; expected tcp://host:port.") from error
-        self._key = self._secret
 
-    def hello(self, greeting: Message, timeout: float) -> Message:
-        """Exchange nonces, from which the key of this connection follows."""
-        nonce = secrets.token_bytes(protocol.NONCE)
-        reply = protocol.unpack(self.ask(protocol.pack({**greeting, "nonce": nonce}), timeout))
-        if self._secret is not None and reply.get("type") == "hello":
-            theirs = reply.get("nonce")
-            if reply.get("client_nonce") != nonce or not isinstance(theirs, bytes) or len(theirs) != protocol.NONCE:
-                raise MalformedMessage("a hello with other nonces")
-            self._key = protocol.session_key(self._secret, nonce, theirs)
-        return reply
-
-    def ask(self, content: bytes, timeout: float) -> bytes:
-        """Send a message and wait for its answer."""
+    def request(self, content: bytes, timeout: float) -> bytes:
+        """Send a message and return its answer; see `agents.remote.client.Link`."""
         assert self._socket is not None and self._monitor is not None
-        frames = [content] if self._key is None else [protocol.seal(self._key, protocol.ASK, content), content]
-        self._socket.send_multipart([b"", *frames])
+        self._socket.send_multipart([b"", content])
         poller, deadline = zmq.Poller(), time.monotonic() + timeout
         poller.register(self._socket, zmq.POLLIN)
         poller.register(self._monitor, zmq.POLLIN)
         while True:
             ready = dict(poller.poll(max(0, math.ceil(1000 * (deadline - time.monotonic())))))
             if self._socket in ready:
-                return self._content(self._socket.recv_multipart())
+                return _open_envelope(self._socket.recv_multipart())
             if not ready:
                 raise NoReply(f"no answer within {timeout:.3g} s")
-            recv_monitor_message(self._monitor)
+            self._raise_broken(recv_monitor_message(self._monitor)["event"])
+
+    def _raise_broken(self, event: int) -> None:
+        """Raise the error that an event of the connection means."""
+        undetailed = event == zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL  # a wrong secret, or the server has just died
+        if event == zmq.EVENT_DISCONNECTED or (undetailed and self._secret is None):
             raise LinkError("the connection broke")
+        raise HandshakeError(f"the handshake failed; both sides need the same secret ({SECRET_VARIABLE}), or none")
 
-    def _content(self, frames: list[bytes]) -> bytes:
-        """An answer without envelope and seal."""
-        frames = frames[1:] if len(frames) > 1 and frames[0] == b"" else frames
-        if self._key is None:
-            if len(frames) != 1:
-                raise MalformedMessage(f"an answer of {len(frames)} frames; it may want a secret: set {SECRET}")
-            return frames[0]
-        if len(frames) != 2 or not protocol.sealed(self._key, protocol.ANSWER, *frames):
-            raise MalformedMessage(f"an answer without the right seal; both sides need the same secret ({SECRET})")
-        return frames[1]
-
-    def _close_socket(self) -> None:
+    def close(self) -> None:
+        """Disconnect."""
         if self._socket is not None and self._monitor is not None:
             self._socket.disable_monitor()
             self._monitor.close(0)
             self._socket.close(0)
         self._socket = self._monitor = None
 
-    def close(self) -> None:
-        """Disconnect."""
-        self._close_socket()
-
     def __del__(self) -> None:
-        self._close_socket()
+        """Disconnect."""
+        self.close()
+
+
+def _open_envelope(frames: list[bytes]) -> bytes:
+    """Return the message behind the empty delimiter of REQ, which a server may leave out."""
+    frames = frames[1:] if len(frames) > 1 and frames[0] == b"" else frames
+    if len(frames) != 1:
+        raise MalformedMessage(f"an answer of {len(frames)} frames, expected 1")
+    return frames[0]
+
+
+def read_secret() -> bytes | None:
+    """Return the shared secret from the environment; None without one."""
+    return os.environ.get(SECRET_VARIABLE, "").encode() or None
 
 
 def connect(spec: str) -> RemoteEgo:
-    """The ego at an address.
+    """Connect to the ego at an address.
 
     Args:
         spec: "tcp://host:port"; "?timeout=10&patience=30" behind it sets how many seconds to wait for an answer, and
             for the ego to come back. The shared secret, if there is one, is in the environment: RARE_ENVS_SECRET.
 
     Raises:
-        EgoGone: Nobody is there.
-        ValueError: The address is none, or somebody else is there.
+        EgoGone: No server answers.
+        ValueError: The address is malformed, or something else than an ego answers.
     """
     address, settings = parse_address(spec)
-    return RemoteEgo(ZmqLink(address, os.environ.get(SECRET, "").encode() or None), **settings)
+    return RemoteEgo(ZmqLink(address, read_secret()), **settings)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 
 import agents
@@ -23,14 +22,14 @@ def serve_ego(spec: str, bind: str, algo: str | None = None, trust: bool = False
     """
     try:
         from agents.remote.server import EgoServer
-        from agents.remote.zmq_link import SECRET
+        from agents.remote.zmq_link import read_secret
     except ImportError as error:
         raise BadInput("Serving needs pyzmq and msgpack: pip install 'rare-envs[remote]'.") from error
     try:
         ego = agents.load_ego(spec, algo=algo, trust=trust)
         if not callable(getattr(ego, "predict", None)):  # an object of the user's
             raise ValueError(f"Expected an ego with predict, got {spec!r}, which needs more than observations.")
-        server = EgoServer(ego, bind, os.environ.get(SECRET, "").encode() or None, name=spec)
+        server = EgoServer(ego, bind, read_secret(), name=spec)
     except (ValueError, OSError) as error:
         raise BadInput(error) from error
     with server:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -25,26 +24,24 @@ def check_protocol(spec: str) -> Iterator[Finding]:
     try:
         from agents.remote import protocol
         from agents.remote.client import TIMEOUT, LinkError, parse_address
-        from agents.remote.zmq_link import SECRET, ZmqLink
+        from agents.remote.zmq_link import ZmqLink, read_secret
     except ImportError:
         yield report_failure("protocol", "pyzmq and msgpack are not installed", "pip install 'rare-envs[remote]'")
         return
     address, settings = parse_address(spec)
     timeout = settings.get("timeout", TIMEOUT)
-    link = ZmqLink(address, os.environ.get(SECRET, "").encode() or None)
+    link = ZmqLink(address, read_secret())
     numbers = iter(range(1, 10**6))
 
     def ask(message: Any) -> Any:
         content = message if isinstance(message, bytes) else protocol.pack({"id": next(numbers), **message})
-        return protocol.unpack(link.ask(content, timeout))
+        return protocol.unpack(link.request(content, timeout))
 
     try:
         link.open()
         before = ask({"type": "ping"})
         link.open()
-        hello = link.hello(
-            {"type": "hello", "protocol": protocol.PROTOCOL, "client": "check-ego", "id": next(numbers)}, timeout
-        )
+        hello = ask({"type": "hello", "protocol": protocol.PROTOCOL, "client": "check-ego"})
         if hello.get("type") != "hello" or hello.get("protocol") != protocol.PROTOCOL:
             yield report_failure("handshake", f"{hello.get('reason', hello)}", PROTOCOL_ADVICE)
             return
@@ -60,7 +57,7 @@ def check_protocol(spec: str) -> Iterator[Finding]:
 
 def _protocol_cases(hello: Any) -> dict[str, Callable[[str, Any], Iterator[Finding]]]:
     """Return the cases after the handshake, name to test."""
-    from agents.remote.request_handler import decode_space
+    from agents.remote.space_encoding import decode_space
 
     space = decode_space(hello.get("observation")) or spaces.Box(-5.0, 5.0, (7,), np.float32)
 

@@ -1,0 +1,200 @@
+"""A request handler answers whatever comes in, and nothing that comes in ends it."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import pickle
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from agents.remote import protocol
+from agents.remote.request_handler import MAX_CLIENTS, MAX_SESSIONS, RequestHandler
+from tests.agents.remote.egos import Averaging, Braking, good_messages
+
+
+def test_a_conversation() -> None:
+    server = RequestHandler(Braking())
+    answers = [protocol.unpack(server.handle(b"me", protocol.pack(message))) for message in good_messages()]
+    assert [answer["type"] for answer in answers] == ["hello", "ready", "action", "pong", "ended"]
+    assert [answer["id"] for answer in answers] == [1, 2, 3, 4, 5]
+    assert protocol.unpack_array(answers[2]["action"]).shape == (2, 2)
+
+
+def test_versions_have_to_agree(serve: Any, connect_ego: Any, monkeypatch: Any) -> None:
+    address = serve(Braking()).address
+    with monkeypatch.context() as changed:
+        changed.setattr("agents.remote.protocol.PROTOCOL", 1)
+        connect_ego(address)
+    reply = protocol.unpack(
+        RequestHandler(Braking()).handle(b"", protocol.pack({"type": "hello", "protocol": 2, "id": 1}))
+    )
+    assert (reply["type"], reply["code"]) == ("error", "version")
+    assert "speaks protocol 1, not 2" in reply["reason"]
+
+
+STRANGE = [
+    None,
+    True,
+    -1,
+    2**63,
+    1.5,
+    "x" * 70_000,
+    b"\xff" * 40,
+    [],
+    [[]] * 9,
+    {},
+    {"a": {"b": []}},
+    msgpack.Timestamp(1),
+]
+
+
+def test_strange_values_get_an_error() -> None:
+    for number, message in enumerate(good_messages()):
+        for key, value in itertools.product(message, STRANGE):
+            server = RequestHandler(Braking())
+            for before in good_messages()[:number]:
+                server.handle(b"me", protocol.pack(before))
+            answer = protocol.unpack(server.handle(b"me", msgpack.packb({**message, key: value})))
+            harmless = (message["type"], key) in {("end", "session"), ("act", "start")}
+            assert answer["type"] == "error" or harmless, (message["type"], key, value)
+            assert answer["type"] != "error" or answer["code"] != "internal", answer
+            last = protocol.unpack(server.handle(b"me", protocol.pack({**good_messages()[0], "id": 99})))
+            assert last["type"] == "hello"
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("dtype", "|O"),
+        ("dtype", "<U8"),
+        ("dtype", ["<f4"]),
+        ("shape", [2, 8]),
+        ("shape", [2, -7]),
+        ("shape", [2**40, 2**40]),
+        ("shape", [2, 7, 1, 1, 1, 1]),
+        ("shape", [14]),
+        ("shape", "27"),
+        ("data", b""),
+        ("data", "text"),
+    ],
+)
+def test_arrays_that_do_not_add_up_get_an_error(name: str, value: Any) -> None:
+    server = RequestHandler(Braking())
+    hello, reset, act = good_messages()[:3]
+    for message in (hello, reset):
+        server.handle(b"me", protocol.pack(message))
+    act["observation"][name] = value
+    assert protocol.unpack(server.handle(b"me", protocol.pack(act)))["code"] == "malformed"
+
+
+def test_random_bytes_get_an_error_and_are_never_run(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    server = RequestHandler(Braking())
+    whole = [protocol.pack(message) for message in good_messages()]
+
+    class Run:
+        def __reduce__(self) -> Any:
+            return os.mkdir, (str(tmp_path / "was_here"),)
+
+    inputs = [pickle.dumps(Run()), b"", b"\x81" * 5000, b"\xdd\xff\xff\xff\xff", b"\xc6\xff\xff\xff\xff"]
+    inputs += [message[: int(cut)] for message in whole for cut in range(len(message))]
+    for _ in range(1500):
+        content = bytearray(whole[rng.integers(len(whole))])
+        for _ in range(rng.integers(1, 5)):
+            content[rng.integers(len(content))] = rng.integers(256)
+        inputs.append(bytes(content))
+    for content in inputs:
+        assert protocol.unpack(server.handle(b"me", content))["type"] in {
+            "error",
+            "hello",
+            "ready",
+            "action",
+            "pong",
+            "ended",
+        }
+    assert not (tmp_path / "was_here").exists()
+    assert protocol.unpack(server.handle(b"you", whole[0]))["type"] == "hello"
+
+
+def test_observations_of_several_kinds_travel_by_name(serve: Any, connect_ego: Any) -> None:
+    class Two:
+        observation_space = spaces.Dict(
+            {"near": Braking.observation_space, "far": spaces.Box(0, 255, (2, 3), np.uint8)}
+        )
+
+        def predict(self, observation: Any, **_: Any) -> Any:
+            return np.stack((observation["near"][:, 0], observation["far"].sum(axis=(1, 2))), axis=1), None
+
+    there = connect_ego(serve(Two()).address)
+    assert {name: part.shape for name, part in there.observation_space.items()} == {"near": (7,), "far": (2, 3)}
+    observation = {"near": np.full((2, 7), 0.5, np.float32), "far": np.full((2, 2, 3), 200, np.uint8)}
+    np.testing.assert_array_equal(there.predict(observation)[0], [[0.5, 1200.0], [0.5, 1200.0]])
+    server = RequestHandler(Two())
+    for message in good_messages()[:2]:
+        server.handle(b"me", protocol.pack(message))
+    for parts in ({}, [1], {"near": None}, {"near": protocol.pack_array(np.zeros((3, 7)))}):
+        bad = {**good_messages()[2], "observation": {"parts": parts}}
+        assert protocol.unpack(server.handle(b"me", protocol.pack(bad)))["type"] == "error"
+
+
+def ask(handler: RequestHandler, connection: bytes = b"me", **message: Any) -> dict[str, Any]:
+    return protocol.unpack(handler.handle(connection, protocol.pack(message)))
+
+
+def test_a_hello_comes_first_and_ids_rise() -> None:
+    handler = RequestHandler(Braking(), "braking")
+    assert ask(handler, type="ping", id=1)["code"] == "hello"
+    assert ask(handler, type="hello", protocol=1, id=5)["name"] == "braking"
+    assert ask(handler, type="ping", id=5)["code"] == "malformed"
+    assert ask(handler, type="ping", id=6)["type"] == "pong"
+    assert ask(handler, b"another", type="ping", id=7)["code"] == "hello"
+    assert ask(handler, type="dance", id=8)["code"] == "unknown"
+
+
+def test_a_session_counts_its_steps_and_remembers() -> None:
+    handler, local = RequestHandler(Averaging()), Averaging()
+    ask(handler, type="hello", protocol=1, id=1)
+    ask(handler, type="reset", id=2, session=9, batch=2)
+    state = None
+    for step in range(3):
+        observation = np.full((2, 7), step + 1, np.float32)
+        act = {"type": "act", "session": 9, "observation": protocol.pack_array(observation)}
+        assert ask(handler, id=10 * step + 3, step=step + 1, **act)["code"] == "session"
+        reply = ask(handler, id=10 * step + 4, step=step, **act)
+        expected, state = local.predict(observation, state, np.full(2, step == 0))
+        np.testing.assert_array_equal(protocol.unpack_array(reply["action"]), expected)
+        assert reply["memory"] is True
+
+
+def test_the_least_recently_used_sessions_and_connections_are_forgotten() -> None:
+    handler = RequestHandler(Braking())
+    ask(handler, type="hello", protocol=1, id=1)
+    for number in range(MAX_SESSIONS + 2):
+        ask(handler, type="reset", id=number + 2, session=number, batch=1)
+    observation = protocol.pack_array(np.zeros((1, 7), np.float32))
+    replies = [ask(handler, type="act", id=1000 + k, session=k, step=0, observation=observation) for k in (1, 2)]
+    assert [reply["type"] for reply in replies] == ["error", "action"]
+    for number in range(MAX_CLIENTS):
+        ask(handler, str(number).encode(), type="hello", protocol=1, id=1)
+    assert ask(handler, type="ping", id=2000)["code"] == "hello"
+
+
+def test_an_ego_that_fails_ends_its_session_only() -> None:
+    class Failing(Braking):
+        def predict(self, observation: Any, **_: Any) -> Any:
+            raise SystemExit(3) if observation[0, 0] else RuntimeError("no road")
+
+    handler = RequestHandler(Failing())
+    ask(handler, type="hello", protocol=1, id=1)
+    for number, (value, reason) in enumerate(((0.0, "RuntimeError: no road"), (1.0, "SystemExit(3)"))):
+        ask(handler, type="reset", id=10 * number + 2, session=1, batch=1)
+        act = {"type": "act", "session": 1, "step": 0, "observation": protocol.pack_array(np.full((1, 7), value))}
+        reply = ask(handler, id=10 * number + 3, **act)
+        assert (reply["code"], reply["reason"]) == ("ego", reason)
+        assert ask(handler, id=10 * number + 4, **act)["code"] == "session"
