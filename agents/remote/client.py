@@ -25,8 +25,8 @@ _MAX_REASON = 500
 """Letters of an error's reason that are kept."""
 _HELLO_INTERVAL = 1.0
 """Time [s] after which a hello without an answer is sent again."""
-_HANDSHAKES = 2
-"""Failed handshakes in a row after which the server is taken to refuse; one may fail because the server has died."""
+_RETRY_PAUSE = 0.1
+"""Time [s] between attempts to connect where they fail at once."""
 _PART_FACTOR, _MIN_PART_TIMEOUT = 10.0, 0.5
 """A part of a batch that was not answered gets this multiple of the longest answer so far, and at least so long [s]."""
 
@@ -40,7 +40,7 @@ class NoReply(LinkError):
 
 
 class HandshakeError(LinkError):
-    """A connection that was refused: one side has a secret and the other none or another one."""
+    """A connection that the server will never accept: one side has a secret and the other none, say."""
 
 
 class RemoteError(RuntimeError):
@@ -314,7 +314,7 @@ class RemoteEgo:
 
     def _connect(self) -> Message:
         """Open the link and say hello, repeatedly while patience lasts; return the server's hello."""
-        deadline, reason, refused = time.monotonic() + self._patience, "no answer", 0
+        deadline, reason = time.monotonic() + self._patience, "no answer"
         greeting = {"type": "hello", "protocol": protocol.PROTOCOL, "client": "rare-envs"}
         while True:
             self._link.open()
@@ -323,13 +323,12 @@ class RemoteEgo:
                 reply = self._request(greeting, max(min(_HELLO_INTERVAL, left), self._link.load_timeout))
                 break
             except HandshakeError as error:
-                reason, refused = str(error), refused + 1
-                if refused == _HANDSHAKES:
-                    raise RemoteError(reason) from error
+                raise RemoteError(str(error)) from error
             except LinkError as error:
-                reason, refused = str(error), 0
+                reason = str(error)
             if time.monotonic() >= deadline:
                 raise EgoGone(f"No ego at {self._link.address} within {self._patience:g} s: {reason}.")
+            time.sleep(_RETRY_PAUSE)
         if reply.get("protocol") != protocol.PROTOCOL:
             raise RemoteError(f"it speaks protocol {reply.get('protocol')!r}, expected {protocol.PROTOCOL}")
         self._epoch += 1

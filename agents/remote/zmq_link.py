@@ -76,12 +76,15 @@ class ZmqLink:
                 raise NoReply(f"no answer within {timeout:.3g} s")
             self._raise_broken(recv_monitor_message(self._monitor)["event"])
 
-    def _raise_broken(self, event: int) -> None:
+    @staticmethod
+    def _raise_broken(event: int) -> None:
         """Raise the error that an event of the connection means."""
-        undetailed = event == zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL  # a wrong secret, or the server has just died
-        if event == zmq.EVENT_DISCONNECTED or (undetailed and self._secret is None):
+        if event == zmq.EVENT_DISCONNECTED:
             raise LinkError("the connection broke")
-        raise HandshakeError(f"the handshake failed; both sides need the same secret ({SECRET_VARIABLE}), or none")
+        reason = f"the handshake failed; both sides need the same secret ({SECRET_VARIABLE}), or none"
+        if event == zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL:  # or a tunnel or proxy whose server is not there yet
+            raise LinkError(reason)
+        raise HandshakeError(reason)
 
     def close(self) -> None:
         """Disconnect."""

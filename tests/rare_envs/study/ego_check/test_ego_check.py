@@ -340,19 +340,19 @@ def test_a_server_that_keeps_to_the_protocol_passes() -> None:
         thread.start()
         try:
             result = findings(f"{server.address}?timeout=20")
-            answer = server._answerer.answer
+            handle = server._handler.handle
 
-            def forgetful(peer: bytes, frames: list[bytes]) -> list[bytes]:
+            def forgetful(connection: bytes, request: bytes) -> bytes:
                 """Answers a step that is not the next as if it were."""
                 from agents.remote import protocol
 
-                content = answer(peer, frames)[0]
+                content = handle(connection, request)
                 message = protocol.unpack(content)
                 if message.get("code") == "session":
-                    return [protocol.pack({"type": "action", "id": message["id"]})]
-                return [content]
+                    return protocol.pack({"type": "action", "id": message["id"]})
+                return content
 
-            server._answerer.answer = forgetful  # type: ignore[method-assign]
+            server._handler.handle = forgetful  # type: ignore[method-assign]
             worse = findings(f"{server.address}?timeout=20")
         finally:
             server.stop()
