@@ -1,4 +1,4 @@
-"""Driving environments whose scenarios are points x with a probability: how often would this policy crash?"""
+"""Driving environments whose scenarios are points x with a probability: how often does a policy crash?"""
 
 from typing import TYPE_CHECKING, Any
 
@@ -6,6 +6,7 @@ from rare_envs.registration import make_batch, parallel_env, register_envs, regi
 from rare_envs.scenarios.registry import SCENARIOS
 
 if TYPE_CHECKING:
+    from rare_envs.control.idm import IDM
     from rare_envs.distributions.space import ScenarioSpace
     from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
     from rare_envs.egos.faults import FaultTolerant
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ENV_IDS",
+    "IDM",
     "DrivingProblem",
     "FaultTolerant",
     "HighwayEnvProblem",

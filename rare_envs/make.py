@@ -1,4 +1,4 @@
-"""From the keyword arguments of `gym.make` to a world and its scenario space."""
+"""World and scenario space from the keyword arguments of `gym.make`."""
 
 import inspect
 from typing import Any
@@ -43,7 +43,7 @@ def set_up(
     weather: bool = False,
     **unknown: Any,
 ) -> tuple[World, ScenarioSpace]:
-    """The world and the scenario space of an environment.
+    """Return the world and the scenario space of an environment.
 
     Args:
         env_id: For example "rare_envs/CutIn-v0".
@@ -57,20 +57,25 @@ def set_up(
         dt: Tick [s].
         base: Distribution of the scenario's own parameters: the name of a shipped one, the path of a JSON file, or a
             distribution object; None takes the scenario's default.
-        drivers: Of the vehicles around the ego: "mgail", "gail", "bc", the path of a driver's file, or a `Background`;
-            None takes the scenario's default, which is its script but for the highway. The weights of learned drivers
-            are parameters of the scenario.
+        drivers: Drivers of the vehicles around the ego: "mgail", "gail", "bc", the path of a driver's file, or a
+            `Background`; None takes the scenario's default, which is its script but for the highway. The weights of
+            learned drivers are parameters of the scenario.
         noise: What becomes of the drivers' noise. True: it is part of x, standard normal columns behind the others.
             "fixed": one sequence for all x, so that probabilities are conditional on it. False: mean actions.
         collisions: Which count: those of the "ego", or "any", those between two other vehicles too.
         camera: Of the observation "camera": a `rare_envs.sensors.camera.Camera`, or the size (height, width) of its
             pictures; None for 66 x 200.
         weather: Whether weather and the camera's noise are part of x, see `rare_envs.sensors.camera.weather`; without
-            it there is a clear day. Traffic does not mind the weather.
-        **unknown: What is none of these, and refused.
+            it there is a clear day. Weather does not change the traffic.
+        **unknown: Any other argument, which is refused.
 
     Returns:
         The world and the space of its parameters.
+
+    Example:
+        >>> world, space = set_up("rare_envs/CutIn-v0", horizon=4.0)
+        >>> world.clock.ticks, space.dim
+        (40, 6)
 
     Raises:
         TypeError: If there is no such argument; the message suggests the nearest and lists all.
@@ -83,7 +88,7 @@ def set_up(
         hint = " (reset takes it as an option)" if of_reset else did_you_mean(name, known)
         raise TypeError(f"{env_id} takes no keyword argument {name!r}{hint}; it takes {', '.join(known)}.")
     kinds = read_kinds(observation)
-    _one_of("action", action, ACTIONS)
+    _check_one_of("action", action, ACTIONS)
     if not isinstance(weather, bool):
         raise ValueError(f"Expected weather True or False, got {weather!r}.")
     background = find_drivers(scenario.drivers if drivers is None else drivers)
@@ -103,7 +108,7 @@ def set_up(
 
 @torch.inference_mode()
 def _try_measure(world: World, space: ScenarioSpace) -> None:
-    """Let a user's measure judge two drives of one tick, so that a broken one is found before the simulations.
+    """Evaluate a user's measure on two drives of one tick, so that a broken one is found before the simulations.
 
     Raises:
         ValueError: If it raises, or does not give one finite number for each.
@@ -119,7 +124,7 @@ def _try_measure(world: World, space: ScenarioSpace) -> None:
 
 
 def build_space(world: World, base: Distribution, ego_noise: int = 0) -> ScenarioSpace:
-    """The parameters of a world: the scenario's, then the weather's, its drivers' weights and all noise.
+    """Return the parameters of a world: the scenario's, then the weather's, its drivers' weights and all noise.
 
     Args:
         world: The world.
@@ -152,6 +157,6 @@ def build_space(world: World, base: Distribution, ego_noise: int = 0) -> Scenari
     return ScenarioSpace.of(parameters, join_independent(*distributions))
 
 
-def _one_of(what: str, value: object, valid: tuple[str, ...]) -> None:
+def _check_one_of(what: str, value: object, valid: tuple[str, ...]) -> None:
     if value not in valid:
         raise ValueError(f"Unknown {what} {value!r}; expected one of {', '.join(map(repr, valid))}.")

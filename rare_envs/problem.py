@@ -23,21 +23,19 @@ from rare_envs.simulation.world import World
 from rare_envs.traffic.crash import CRASH_KINDS, Crash
 
 RULE_TILE = 16384
-"""Rollouts that a rule-based ego drives at once: where eager torch is fastest."""
+"""Rollouts that a rule-based ego drives at once: the number at which eager torch is fastest."""
 POLICY_TILE = 4096
 """Likewise with a policy; fixed, because matrix products round differently by batch size."""
 LIDAR_TILE = 512
-"""Likewise where vehicles look, or whole episodes are kept: small enough for what is needed to stay in the cache."""
-
+"""Likewise with lidar, or a measure that keeps whole episodes: small enough for all of it to stay in the cache."""
 CAMERA_TILE = 128
-"""Likewise with a policy that sees pictures: its layers' values for all of them have to fit into memory."""
-
+"""Likewise with a policy that takes pictures: its layers' values for all of them have to fit into memory."""
 
 AMBIGUOUS = (
     "the ego's actions 0 to 4 were taken as five accelerations; one that was trained in HighwayEnv needs "
     "action='meta' (--action meta)"
 )
-"""HighwayEnv's meta-actions and our discrete ones are both numbers from 0 to 4: no space tells them apart."""
+"""HighwayEnv's meta-actions and our discrete ones are both numbers from 0 to 4, and their spaces are equal."""
 
 
 class AmbiguousActions(UserWarning):
@@ -52,13 +50,20 @@ class DrivingProblem:
 
     Attributes:
         env_id: The environment's id.
-        ego: What was given.
+        ego: The ego as it was given.
+        needs: What the ego needs of the world, and says about itself.
         world: The simulation.
         driver: The ego as a Driver.
         space: Names, units, bounds and base distribution of x.
         varies: Whether the ego answers differently from run to run, by randomness that is not part of x: an attribute
             `deterministic` of it that is False says so. Then p is over that randomness as well, outcomes count as they
             fell, and failures may not replay.
+
+    Example:
+        >>> problem = DrivingProblem("rare_envs/CarFollowing-v0", ego="idm")
+        >>> x = [[20.0, 15.0, 30.0], [30.0, 5.0, 20.0]]  # speed of the ego and of its lead [m/s], gap [m]
+        >>> problem.evaluate(x).round(2)  # time to collision 30 m / (5 m/s), and a collision
+        array([ 6., -1.])
     """
 
     def __init__(
@@ -78,13 +83,13 @@ class DrivingProblem:
             measure: The safety measure: a name, an object or a function, see
                 `rare_envs.measures.registry.find_measure`.
             base: Base distribution of x; None takes the environment's default ("us101").
-            noise: What becomes of the randomness of learned drivers: True, it is part of x, standard normal columns
+            noise: How the randomness of learned drivers is treated: True, it is part of x, standard normal columns
                 behind the others; "fixed", one sequence for all x, so that p is conditional on it; False, mean
                 actions. Scripts and most egos have none (policies act by their means), so there the three agree; the
                 noise of an ego behind a stack (`noisy:EGO`) goes with it.
-            **make_kwargs: Further keyword arguments of `gym.make` for this id. Without an `observation` an ego whose
-                `observation_space` is a `Dict` is shown what its names ask for, one whose space is that of the lidar
-                this, another "features".
+            **make_kwargs: Further keyword arguments of `gym.make` for this id. Without an `observation` the ego's
+                `observation_space` decides: a `Dict` names the kinds, the space of the lidar stands for "lidar", and
+                any other for "features".
 
         Raises:
             ValueError: If an argument is invalid or the ego's spaces are not the environment's.
@@ -111,7 +116,7 @@ class DrivingProblem:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What could not be checked and may be meant otherwise; an `AmbiguousActions` warning has said it."""
+        """What could not be checked and may be meant otherwise; an `AmbiguousActions` warning was given for each."""
         accelerations = self.world.clock.action == "continuous" and "kinematics" in self.world.sensing.kinds
         return (AMBIGUOUS,) if accelerations and isinstance(self.needs.action_space, spaces.Discrete) else ()
 
@@ -150,7 +155,7 @@ class DrivingProblem:
         return self._simulate(x, None)
 
     def attempt(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], dict[int, str]]:
-        """Simulate, and let rows go on which the policy fails.
+        """Simulate, and go on with the other rows when the policy fails on some.
 
         Args:
             x: Scenario parameters, shape (n, d).
@@ -167,7 +172,7 @@ class DrivingProblem:
         return f, failed_rows
 
     def crashes(self, x: NDArray[np.float64]) -> Crash:
-        """Simulate again and tell what kind of crash each scenario ends in.
+        """Simulate again and return the kind of crash that each scenario ends in.
 
         Args:
             x: Scenario parameters, shape (n, d).
@@ -191,7 +196,7 @@ class DrivingProblem:
         return Crash(*(torch.cat(parts) for parts in zip(*found, strict=True)))
 
     def crash_kinds(self, x: NDArray[np.float64]) -> list[str]:
-        """Words for the kinds of crash that scenarios x (n, d) end in, such as "rear_end"; see `crashes`."""
+        """Return words for the kinds of crash that scenarios x (n, d) end in, such as "rear_end"; see `crashes`."""
         return [CRASH_KINDS[kind] for kind in self.crashes(x).kind]
 
     @property
@@ -228,7 +233,7 @@ class DrivingProblem:
 
 @contextmanager
 def _ego_errors_as_value_errors(ego: Any) -> Iterator[None]:
-    """Turn whatever happens when an ego is asked about itself into a ValueError: it is the user's."""
+    """Turn any error of an ego that is read or wrapped into a ValueError: the ego is the user's."""
     try:
         yield
     except ValueError:

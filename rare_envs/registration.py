@@ -1,4 +1,4 @@
-"""Registered ids. Data only: entry points are strings, so importing is cheap."""
+"""Registration of ids. Entry points are strings, so importing is cheap."""
 
 from __future__ import annotations
 
@@ -28,11 +28,19 @@ def register_envs() -> None:
 
 
 def register_scenario(env_id: str, scenario: Scenario) -> None:
-    """Make a scenario of your own known under an id: to `gym.make`, `parallel_env`, `DrivingProblem` and the rest.
+    """Register a scenario of your own under an id, for `gym.make`, `parallel_env`, `DrivingProblem` and the rest.
 
     Args:
         env_id: In Gymnasium's form, such as "my_namespace/Overtaking-v0".
         scenario: The scenario; it is tried on a few draws of its default base distribution.
+
+    Example:
+        >>> import dataclasses
+        >>> from rare_envs.scenarios import scenario_named
+        >>> register_scenario("docs/LongCutIn-v0", dataclasses.replace(scenario_named("cut_in"), horizon=20.0))
+        >>> gym.make("docs/LongCutIn-v0").unwrapped.world.clock.seconds
+        20.0
+        >>> SCENARIOS.remove("docs/LongCutIn-v0")
 
     Raises:
         ValueError: If the id is taken, or the scenario does not work.
@@ -47,12 +55,17 @@ def register_scenario(env_id: str, scenario: Scenario) -> None:
 
 
 def parallel_env(env_id: str, **kwargs: Any) -> DrivingParallelEnv:
-    """The PettingZoo `ParallelEnv` of an id: every vehicle an agent.
+    """Return the PettingZoo `ParallelEnv` of an id: every vehicle is an agent.
 
     Args:
         env_id: For example "rare_envs/CutIn-v0".
         **kwargs: `agents`, `ego`, `rewards` and `render_mode`, see `rare_envs.envs.parallel.DrivingParallelEnv`, and
             keyword arguments of `gym.make` for the id.
+
+    Example:
+        >>> env = parallel_env("rare_envs/CutIn-v0")
+        >>> env.possible_agents
+        ['ego', 'cutter', 'lead']
 
     Raises:
         ValueError: If the id or an argument is unknown.
@@ -63,7 +76,7 @@ def parallel_env(env_id: str, **kwargs: Any) -> DrivingParallelEnv:
 
 
 def make_batch(env_id: str, num_envs: int, **kwargs: Any) -> VectorEnv[Any, Any, Any]:
-    """The batched VectorEnv of an id: `gym.make_vec` with its vector entry point.
+    """Return the batched VectorEnv of an id: `gym.make_vec` with its vector entry point.
 
     Args:
         env_id: For example "rare_envs/CutIn-v0".
@@ -72,6 +85,11 @@ def make_batch(env_id: str, num_envs: int, **kwargs: Any) -> VectorEnv[Any, Any,
 
     Returns:
         The environment, autoreset mode SAME_STEP.
+
+    Example:
+        >>> batch = make_batch("rare_envs/CutIn-v0", num_envs=8)
+        >>> batch.reset(seed=0)[0].shape
+        (8, 11)
 
     Raises:
         ValueError: If the id or an argument is unknown.

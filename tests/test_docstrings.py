@@ -51,17 +51,12 @@ def has_example(value: object) -> bool:
 
 
 WITHOUT_EXAMPLE = {
-    "rare_envs.DrivingProblem",
-    "rare_envs.FaultTolerant",
     "rare_envs.HighwayEnvProblem",
     "rare_envs.HighwayEnvScenario",
     "rare_envs.ScenarioSpace",
     "rare_envs.TruncatedGaussianMixture",
     "rare_envs.highway_env_problem",
-    "rare_envs.make_batch",
     "rare_envs.measures.stl",
-    "rare_envs.parallel_env",
-    "rare_envs.register_scenario",
     "rare_envs.scenarios.scenario_named",
     "rare_envs.sensors.camera.Camera",
     "rare_envs.sensors.camera.CameraContext",

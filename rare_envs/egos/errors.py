@@ -9,15 +9,29 @@ class EgoGone(BaseException):
     """The ego cannot be queried any more, whatever the scenario.
 
     Like KeyboardInterrupt it is no `Exception`: code that survives failing scenarios must not take it for one.
+
+    Example:
+        >>> issubclass(EgoGone, Exception)
+        False
     """
 
 
 class NoAnswer(RuntimeError):
-    """The ego has not answered in time, or has died: perhaps because of one of the rows of the query."""
+    """The ego has not answered in time, or has died: perhaps because of one of the rows of the query.
+
+    Example:
+        >>> reason_of(NoAnswer("no answer within 10 s"))
+        'NoAnswer: no answer within 10 s'
+    """
 
 
 class EgoFault(ValueError):
-    """The ego has failed on a scenario, twice."""
+    """The ego has failed on a scenario, twice.
+
+    Example:
+        >>> EgoFault("The ego failed twice.").final
+        True
+    """
 
     final: ClassVar[bool] = True
     """The ego has been queried again already, so nobody needs to; `samplers` reads this attribute."""

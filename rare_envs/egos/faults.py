@@ -15,7 +15,12 @@ ON_FAULT = ("raise", "failure", "bound")
 
 
 class Fault(NamedTuple):
-    """A scenario on which the ego failed."""
+    """A scenario on which the ego failed.
+
+    Example:
+        >>> Fault(np.array([20.0, 15.0, 30.0]), "RuntimeError: no road").reason
+        'RuntimeError: no road'
+    """
 
     x: NDArray[np.float64]
     """Its parameters, shape (d,)."""

@@ -24,7 +24,19 @@ class PerceivingDriver(Driver, Protocol):
 
 @runtime_checkable
 class WrappedEgo(Protocol):
-    """An ego behind something that stands between it and its world, such as an imperfect stack."""
+    """An ego behind something that stands between it and its world, such as an imperfect stack.
+
+    Example:
+        >>> from rare_envs.control.idm import IDM
+        >>> class SameAsEver:
+        ...     ego = "idm"
+        ...     def noise_columns(self, world):
+        ...         return 0
+        ...     def in_world(self, world):
+        ...         return IDM()
+        >>> isinstance(SameAsEver(), WrappedEgo)
+        True
+    """
 
     @property
     def ego(self) -> Any:

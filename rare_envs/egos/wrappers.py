@@ -1,4 +1,4 @@
-"""What stands between an environment and a policy trained behind wrappers: normalised and stacked observations."""
+"""Wrappers between an environment and a policy that was trained behind them: normalised and stacked observations."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,20 +10,23 @@ from numpy.typing import NDArray
 
 from rare_envs.sensors.kinds import batch_size, each
 
-Array = NDArray[Any]
 Shape = tuple[int, ...]
 
 
 @dataclass(frozen=True)
 class NormalisedPolicy:
-    """A policy whose observations first go through a function, such as SB3's `VecNormalize.normalize_obs`."""
+    """A policy whose observations are first normalised by a function, such as SB3's `VecNormalize.normalize_obs`."""
 
     policy: Any
-    normalise: Callable[[Array], Array]
+    normalise: Callable[[NDArray[Any]], NDArray[Any]]
 
     def predict(
-        self, observation: Array, state: Any = None, episode_start: Array | None = None, deterministic: bool = True
-    ) -> tuple[Array, Any]:
+        self,
+        observation: NDArray[Any],
+        state: Any = None,
+        episode_start: NDArray[Any] | None = None,
+        deterministic: bool = True,
+    ) -> tuple[NDArray[Any], Any]:
         """Stable-Baselines3's `predict` on observations as the environment gives them."""
         shown = self.normalise(observation)
         action, state = self.policy.predict(
@@ -46,19 +49,19 @@ class FrameStackedPolicy:
     new_axis: bool = False
 
     def predict(
-        self, observation: Any, state: Any = None, episode_start: Array | None = None, deterministic: bool = True
-    ) -> tuple[Array, Any]:
+        self, observation: Any, state: Any = None, episode_start: NDArray[Any] | None = None, deterministic: bool = True
+    ) -> tuple[NDArray[Any], Any]:
         """Stable-Baselines3's `predict` on single observations."""
         starts = np.full(batch_size(observation), state is None)
         if episode_start is not None:
             starts |= np.asarray(episode_start, dtype=bool)
 
-        def later(old: Array, now: Array) -> Array:
-            new: Array = np.concatenate((old[1:], now[None]))
+        def later(old: NDArray[Any], now: NDArray[Any]) -> NDArray[Any]:
+            new: NDArray[Any] = np.concatenate((old[1:], now[None]))
             new[:-1, starts] = now[starts] if self.new_axis else 0
             return new
 
-        def side_by_side(frames: Array) -> Array:
+        def side_by_side(frames: NDArray[Any]) -> NDArray[Any]:
             shown = np.moveaxis(frames, 0, 1) if self.new_axis else np.concatenate(tuple(frames), axis=-1)
             return np.ascontiguousarray(shown)
 
@@ -73,10 +76,14 @@ class FrameStackedPolicy:
 
 
 def find_stacking(given: Shape, wanted: Shape) -> tuple[int, bool] | None:
-    """How many frames of shape `given` make an observation of shape `wanted`.
+    """Find how many frames of shape `given` make an observation of shape `wanted`.
 
     Returns:
         Their number, and whether they lie along an axis of their own; None if the shapes do not go together.
+
+    Example:
+        >>> find_stacking((11,), (44,)), find_stacking((11,), (4, 11)), find_stacking((11,), (12,))
+        ((4, False), (4, True), None)
     """
     if wanted == given:
         return 1, False
@@ -89,7 +96,7 @@ def find_stacking(given: Shape, wanted: Shape) -> tuple[int, bool] | None:
 
 
 def find_frame_stacking(given: spaces.Space[Any], wanted: Any) -> tuple[int, bool] | None:
-    """`stacking` for spaces: mappings by name, where all have to agree, and images also with their channels first.
+    """Find the stacking of spaces: mappings by name, which all have to agree, and images also with channels first.
 
     Args:
         given: Space of the environment's observations.
@@ -100,7 +107,7 @@ def find_frame_stacking(given: spaces.Space[Any], wanted: Any) -> tuple[int, boo
             return None
         found = {find_frame_stacking(space, wanted[name]) for name, space in given.spaces.items()}
         return found.pop() if len(found) == 1 else None
-    if given.shape is None or getattr(wanted, "shape", None) is None:
+    if given.shape is None or getattr(wanted, "shape", None) is None:  # declared by anybody
         return None
     shape = tuple(wanted.shape)
     straight = find_stacking(given.shape, shape)
@@ -110,7 +117,7 @@ def find_frame_stacking(given: spaces.Space[Any], wanted: Any) -> tuple[int, boo
 
 
 def wrap_policy(policy: Any, given: spaces.Space[Any]) -> Any:
-    """The policy behind the wrappers that it was trained with, so that it takes the environment's observations.
+    """Return the policy behind the wrappers that it was trained with, so that it takes the environment's observations.
 
     Args:
         policy: Has `predict`; its `observation_space`, if it has one, tells how many frames it sees, and
@@ -118,6 +125,7 @@ def wrap_policy(policy: Any, given: spaces.Space[Any]) -> Any:
             normalised before or after they are stacked.
         given: Space of the environment's observations.
     """
+    # A Stable-Baselines3 model has both; anybody else's object need not.
     wanted = getattr(policy, "observation_space", None)
     frames, new_axis = (find_frame_stacking(given, wanted) if wanted is not None else None) or (1, False)
     statistics: Any = getattr(policy, "get_vec_normalize_env", lambda: None)()

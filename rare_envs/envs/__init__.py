@@ -1,1 +1,29 @@
-"""Gymnasium shells over the world."""
+"""Environments: one scenario, batches, several agents, and their pictures."""
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rare_envs.envs.multi_agent_vector import AgentsVectorEnv
+    from rare_envs.envs.parallel import DrivingParallelEnv
+    from rare_envs.envs.rendering import Renderer
+    from rare_envs.envs.single import DrivingEnv
+    from rare_envs.envs.vector import DrivingVectorEnv
+
+__all__ = ["AgentsVectorEnv", "DrivingEnv", "DrivingParallelEnv", "DrivingVectorEnv", "Renderer"]
+
+_LAZY = {
+    "AgentsVectorEnv": "rare_envs.envs.multi_agent_vector",
+    "DrivingEnv": "rare_envs.envs.single",
+    "DrivingParallelEnv": "rare_envs.envs.parallel",
+    "DrivingVectorEnv": "rare_envs.envs.vector",
+    "Renderer": "rare_envs.envs.rendering",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import an environment only when it is used: each needs a library of its own."""
+    if name in _LAZY:
+        from importlib import import_module
+
+        return getattr(import_module(_LAZY[name]), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,7 +1,8 @@
-"""What environments say beside observation and reward: `info` of one episode."""
+"""Info of one episode: what environments give beside observation and reward."""
 
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from rare_envs.distributions.space import ScenarioSpace
@@ -11,15 +12,17 @@ from rare_envs.simulation.episode import Episode
 from rare_envs.traffic.crash import describe_crash
 
 Info = dict[str, Any]
+SingleObservation = NDArray[np.float32]
+"""Observation of one environment; in a world of several kinds a mapping of such by name."""
 
 
 def episode_info(space: ScenarioSpace, x: NDArray[Any], episode: Episode) -> Info:
-    """Info of one episode at any moment: `scenario`, `x`, `min_ttc` [s] and `collision`.
+    """Return the info of one episode at any moment: `scenario`, `x`, `min_ttc` [s] and `collision`.
 
     Args:
         space: Of its parameters.
-        x: They, shape (d,).
-        episode: A batch of one, in a world with a witness.
+        x: Their values, shape (d,).
+        episode: A batch of one, in a world with statistics.
     """
     assert episode.statistics is not None
     collided = bool(episode.collided)
@@ -34,12 +37,15 @@ def episode_info(space: ScenarioSpace, x: NDArray[Any], episode: Episode) -> Inf
 def step_info(
     space: ScenarioSpace, x: NDArray[Any], episode: Episode, reward: Any, over: bool, vehicle: int = 0
 ) -> Info:
-    """Info after a step: `reward_terms` too, and at the end of the episode `measure`, `crash` and `collision_type`.
+    """Return the info after a step.
+
+    It adds `reward_terms` to that of `episode_info`, and at the end of an episode `measure`, `crash` and
+    `collision_type`.
 
     Args:
         space: Of the scenario's parameters.
-        x: They, shape (d,).
-        episode: A batch of one, as a vehicle lives it.
+        x: Their values, shape (d,).
+        episode: A batch of one, as a vehicle sees it.
         reward: Of the step, with its terms.
         over: Whether this is the end.
         vehicle: Whose episode it is.

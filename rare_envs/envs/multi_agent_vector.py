@@ -23,15 +23,18 @@ from rare_envs.sensors.kinds import each
 from rare_envs.simulation.ego_needs import EgoNeeds
 from rare_envs.simulation.observation import observe
 
-Array = NDArray[Any]
 
-
-class AgentsVectorEnv(VectorEnv[NDArray[np.float32], Array, Array]):
+class AgentsVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]]):
     """`DrivingParallelEnv` for a batch of B scenarios with A agents each, with Gymnasium's SAME_STEP autoreset.
 
     Row b A + a is agent a of scenario b. A scenario is replaced within the step when the ego or an agent collides, or
     at the horizon. That terminates the rows of agents that have collided, all rows if it was the ego, and truncates the
-    others: what they lived through is cut short, so a learner should bootstrap there.
+    others: their episodes are cut short, so a learner should bootstrap there.
+
+    Example:
+        >>> env = AgentsVectorEnv("rare_envs/CutIn-v0", scenarios=2, agents=["ego", "cutter"])
+        >>> env.num_envs, env.reset(seed=0)[0].shape
+        (4, (4, 11))
     """
 
     metadata = {  # noqa: RUF012  (Gymnasium's own form)
@@ -55,7 +58,7 @@ class AgentsVectorEnv(VectorEnv[NDArray[np.float32], Array, Array]):
             env_id: The scenario's registered id.
             scenarios: B.
             agents: Names of the vehicles that act, as in `DrivingParallelEnv`; None for all.
-            ego: Who drives the ego if it is no agent; without memory, because scenarios begin at different times.
+            ego: What drives the ego if it is no agent; without memory, because scenarios begin at different times.
             rewards: Rewards of agents by name, as in `DrivingParallelEnv`.
             **kwargs: See `rare_envs.make.set_up`.
 
@@ -101,7 +104,9 @@ class AgentsVectorEnv(VectorEnv[NDArray[np.float32], Array, Array]):
             self._episode = start(self.world, torch.from_numpy(self._x).float())
             return self._observe(self._episode), {}
 
-    def step(self, actions: Array) -> tuple[NDArray[np.float32], NDArray[np.float64], Array, Array, dict[str, Any]]:
+    def step(
+        self, actions: NDArray[Any]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[Any], NDArray[Any], dict[str, Any]]:
         """Carry out one decision of each agent and replace the scenarios that ended.
 
         Raises:
@@ -140,7 +145,7 @@ class AgentsVectorEnv(VectorEnv[NDArray[np.float32], Array, Array]):
         return observation, reward, terminated, done_rows & ~terminated, infos
 
     def _read(self, actions: Tensor) -> tuple[Tensor, Tensor]:
-        """Actions of all vehicles, (B, N, 2) or (B, N), and who is commanded (B, N)."""
+        """Return actions of all vehicles, (B, N, 2) or (B, N), and which are commanded (B, N)."""
         given = read_actions(self.world.clock.action, actions, self.num_envs)
         given = given.view(self.scenarios, len(self.agents), *given.shape[1:])
         shape = (self.scenarios, self.world.scenario.vehicles)
@@ -151,7 +156,7 @@ class AgentsVectorEnv(VectorEnv[NDArray[np.float32], Array, Array]):
         return chosen, commanded
 
     def _by_row(self, columns: list[Tensor]) -> Tensor:
-        """Values of the agents, (B, ...) each, as (B A, ...)."""
+        """Return values of the agents, (B, ...) each, as (B A, ...)."""
         return torch.stack(columns, dim=1).flatten(0, 1)
 
     def _observe(self, episode: MultiAgentEpisode) -> Any:
@@ -167,6 +172,7 @@ class AgentsVectorEnv(VectorEnv[NDArray[np.float32], Array, Array]):
 
 
 def _refuse_memory(memory: Any) -> None:
+    """Raise a ValueError if the ego's driver has a memory."""
     kept = memory[0] if isinstance(memory, tuple) else memory
     if kept is not None:
         raise ValueError(

@@ -1,4 +1,4 @@
-"""Several agents at a time: a PettingZoo `ParallelEnv` over the same world as the environment of one."""
+"""Environment of several agents: a PettingZoo `ParallelEnv` over the same world as the environment of one."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -15,7 +15,7 @@ from torch import Tensor
 from rare_envs.control.actions import IDLE, read_actions
 from rare_envs.egos.needs import resolve
 from rare_envs.egos.policy import as_driver
-from rare_envs.envs.info import Info, episode_info, step_info
+from rare_envs.envs.info import Info, SingleObservation, episode_info, step_info
 from rare_envs.envs.rendering import Renderer
 from rare_envs.make import set_up
 from rare_envs.multi_agent.episode import MultiAgentEpisode, start
@@ -27,16 +27,21 @@ from rare_envs.sensors.kinds import each
 from rare_envs.simulation.ego_needs import EgoNeeds
 from rare_envs.simulation.observation import observe
 
-Observation = NDArray[np.float32]
 Actions = Mapping[str, Any]
 
 
-class DrivingParallelEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  # type: ignore[misc]
+class DrivingParallelEnv(ParallelEnv[str, SingleObservation, NDArray[np.float32]]):  # type: ignore[misc]
     """Every vehicle is an agent, or those named; each observes, acts, is rewarded and ends as an ego in its place.
 
     A vehicle without an action keeps its driver: the scenario's script or learned drivers, and for the ego the driver
     `ego`. An agent terminates when its vehicle touches another one or leaves the road, is truncated at the horizon,
     and then leaves `agents`; its vehicle rolls out, see `rare_envs.multi_agent.episode`.
+
+    Example:
+        >>> env = DrivingParallelEnv("rare_envs/CutIn-v0")
+        >>> observations, infos = env.reset(seed=0)
+        >>> env.agents, observations["cutter"].shape
+        (['ego', 'cutter', 'lead'], (11,))
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012  (PettingZoo's own form)
@@ -61,7 +66,7 @@ class DrivingParallelEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  #
         Args:
             env_id: The scenario's registered id.
             agents: Names of the vehicles that may act (`Scenario.vehicle_names`); None for all.
-            ego: Who drives the ego when it gets no action: "idm", a `Driver` or an object with `predict`.
+            ego: What drives the ego when it gets no action: "idm", a `Driver` or an object with `predict`.
             rewards: Rewards of agents by name; by default each has the reward of an ego, in its own view.
             render_mode: None, "rgb_array" or "human".
             **kwargs: See `rare_envs.make.set_up`.
@@ -95,16 +100,16 @@ class DrivingParallelEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  #
         self._tick = 0
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
-        """The space of an agent's observations."""
+        """Return the space of an agent's observations."""
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> spaces.Space[Any]:
-        """The space of an agent's actions."""
+        """Return the space of an agent's actions."""
         return self.action_spaces[agent]
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, Observation], dict[str, Info]]:
+    ) -> tuple[dict[str, SingleObservation], dict[str, Info]]:
         """Start an episode; the same seed draws the same scenario as in `gym.make`.
 
         Args:
@@ -132,7 +137,7 @@ class DrivingParallelEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  #
 
     def step(
         self, actions: Actions
-    ) -> tuple[dict[str, Observation], dict[str, float], dict[str, bool], dict[str, bool], dict[str, Info]]:
+    ) -> tuple[dict[str, SingleObservation], dict[str, float], dict[str, bool], dict[str, bool], dict[str, Info]]:
         """Move by one tick.
 
         Args:
@@ -177,7 +182,7 @@ class DrivingParallelEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  #
         return observations, rewards, terminated, truncated, infos
 
     def _read(self, given: Actions) -> tuple[Tensor, Tensor]:
-        """Actions of all vehicles, (1, N, 2) or (1, N), and who is commanded (1, N)."""
+        """Return actions of all vehicles, (1, N, 2) or (1, N), and which are commanded (1, N)."""
         n, kind = self.world.scenario.vehicles, self.world.clock.action
         chosen = torch.full((1, n), IDLE) if kind == "meta" else torch.zeros(1, n, 2)
         commanded = torch.zeros(1, n, dtype=torch.bool)
@@ -203,8 +208,8 @@ class DrivingParallelEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  #
     def _view(self, episode: MultiAgentEpisode, agent: str) -> Any:
         return episode.views[self._vehicles[agent]]
 
-    def _observe(self, episode: MultiAgentEpisode, agent: str) -> Observation:
-        observation: Observation = each(
+    def _observe(self, episode: MultiAgentEpisode, agent: str) -> SingleObservation:
+        observation: SingleObservation = each(
             lambda part: part[0].numpy(), observe(self._view(episode, agent), self.world.sensing.observation)
         )
         return observation
@@ -231,7 +236,7 @@ class DrivingParallelEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  #
         return None if self.render_mode == "human" else image
 
     def state(self) -> NDArray[np.float32]:
-        """The whole traffic, for a central critic: x, y [m], heading [rad] and speed [m/s] of each, shape (N, 4)."""
+        """Return x, y [m], heading [rad] and speed [m/s] of all vehicles, for a central critic; shape (N, 4)."""
         if self._episode is None:
             raise RuntimeError("Expected reset() before state().")
         traffic = torch.stack(self._episode.traffic.state[:4], dim=-1)[0]
@@ -246,7 +251,7 @@ class DrivingParallelEnv(ParallelEnv[str, Observation, NDArray[np.float32]]):  #
 
 
 def select_agents(scenario: Scenario, agents: Sequence[str] | None) -> list[str]:
-    """The agents that an argument `agents` stands for.
+    """Return the agents that an argument `agents` names.
 
     Raises:
         ValueError: If there is no such vehicle, none is named or one twice.
@@ -266,7 +271,7 @@ def select_agents(scenario: Scenario, agents: Sequence[str] | None) -> list[str]
 
 
 def select_rewards(agents: Sequence[str], rewards: Mapping[str, Reward] | None) -> dict[str, Reward]:
-    """The reward of each agent.
+    """Return the reward of each agent.
 
     Raises:
         ValueError: If one is given for somebody who is no agent, or is no function.

@@ -1,4 +1,4 @@
-"""Pictures of episodes: roads and vehicles by HighwayEnv's own graphics, numbers above, who is who below."""
+"""Pictures of episodes: roads and vehicles by HighwayEnv's own graphics, numbers above, a legend below."""
 
 from collections.abc import Collection
 from itertools import pairwise
@@ -36,24 +36,32 @@ ROLE_COLOURS: dict[str, Colour] = {
     "others": (190, 190, 205),
     "crashed": (255, 100, 100),
 }
-"""Of vehicles by what they are called, HighwayEnv's green, blue, yellow and red; "others" for other names."""
+"""Colours of vehicles by what they are called, HighwayEnv's green, blue, yellow and red; "others" for other names."""
 AGENT: Colour = (200, 0, 150)
 """Outline of vehicles other than the ego that an agent drives, HighwayEnv's purple."""
 _PAPER: Colour = (255, 255, 255)
 _INK: Colour = (30, 30, 30)
 
 
-class Cast(NamedTuple):
-    """Who is drawn how."""
+class Roles(NamedTuple):
+    """Roles of the vehicles of a picture."""
 
-    roles: tuple[str, ...]
+    names: tuple[str, ...]
     """A key of `ROLE_COLOURS` for each vehicle."""
     agents: frozenset[int]
     """Vehicles other than the ego that agents drive."""
 
 
 class Renderer:
-    """Draws episodes of a world onto one surface that follows the ego."""
+    """Painter of episodes of a world, on one surface that follows the ego.
+
+    Example:
+        >>> import gymnasium
+        >>> env = gymnasium.make("rare_envs/CutIn-v0", render_mode="rgb_array")
+        >>> _ = env.reset(seed=0)
+        >>> env.render().shape  # by a Renderer
+        (208, 800, 3)
+    """
 
     def __init__(self, world: World, window: bool = False, fps: int = 10) -> None:
         """Prepare a surface.
@@ -109,12 +117,12 @@ class Renderer:
         state = State(*(field[row : row + 1] for field in episode.state))
         if crashed is None:
             crashed = _find_crashed(state, self._road) if bool(episode.collided[row]) else ()
-        cast = self._assign_roles(agents, crashed)
-        self._draw_road(state, cast)
+        roles = self._assign_roles(agents, crashed)
+        self._draw_road(state, roles)
         self._canvas.fill(_PAPER)
         self._canvas.blit(self._surface, (0, TEXT_HEIGHT))
         self._write(8, 17, caption(self._world, episode, time, row))
-        self._draw_legend(cast)
+        self._draw_legend(roles)
         if self._screen is not None:
             self._screen.blit(self._canvas, (0, 0))
             self._pygame.event.pump()
@@ -123,12 +131,12 @@ class Renderer:
         image: NDArray[np.uint8] = np.moveaxis(self._pygame.surfarray.array3d(self._canvas), 0, 1)
         return image
 
-    def _assign_roles(self, agents: Collection[int], crashed: Collection[int]) -> Cast:
+    def _assign_roles(self, agents: Collection[int], crashed: Collection[int]) -> Roles:
         names = (name if name in ROLE_COLOURS else "others" for name in self._scenario.vehicle_names)
-        roles = tuple("crashed" if j in crashed else name for j, name in enumerate(names))
-        return Cast(roles, frozenset(agents) - {0})
+        drawn = tuple("crashed" if j in crashed else name for j, name in enumerate(names))
+        return Roles(drawn, frozenset(agents) - {0})
 
-    def _draw_road(self, state: State, cast: Cast) -> None:
+    def _draw_road(self, state: State, roles: Roles) -> None:
         from highway_env.road.graphics import RoadGraphics
         from highway_env.road.road import Road as Traffic
         from highway_env.vehicle.kinematics import Vehicle
@@ -138,23 +146,23 @@ class Renderer:
         places = torch.stack(self._road.to_world(state.x[0], state.y[0], state.heading[0]), dim=1).tolist()
         for j, (x, y, heading) in enumerate(places):
             vehicle = Vehicle(traffic, [x, y], heading, float(state.speed[0, j]))
-            vehicle.color = ROLE_COLOURS[cast.roles[j]]
+            vehicle.color = ROLE_COLOURS[roles.names[j]]
             traffic.vehicles.append(vehicle)
         self._surface.move_display_window_to(_point(self._road, ego_x, self._road.middle))
         RoadGraphics.display(traffic, self._surface)
         RoadGraphics.display_traffic(traffic, self._surface, offscreen=True)
-        for j in cast.agents:
+        for j in roles.agents:
             corners = [self._surface.pos2pix(x, y) for x, y in _corners(*places[j])]
             self._pygame.draw.polygon(self._surface, AGENT, corners, width=3)
 
-    def _draw_legend(self, cast: Cast) -> None:
-        """Colours and what they mean, in a line below the road."""
+    def _draw_legend(self, roles: Roles) -> None:
+        """Draw colours and what they mean, in a line below the road."""
         x, y = 8, self._canvas.get_height() - TEXT_HEIGHT + 6
         for role in ROLE_COLOURS:
-            if role in cast.roles:
+            if role in roles.names:
                 self._pygame.draw.rect(self._canvas, ROLE_COLOURS[role], (x, y, 20, 11))
                 x += 26 + self._write(x + 26, y + 10, role) + 18
-        if cast.agents:
+        if roles.agents:
             self._pygame.draw.rect(self._canvas, AGENT, (x, y, 20, 11), width=3)
             self._write(x + 26, y + 10, "driven by an agent")
 
@@ -171,7 +179,7 @@ class Renderer:
 
 
 def caption(world: World, episode: Episode, time: float | None, row: int = 0) -> str:
-    """The numbers of a moment: time, speed, gap and time to collision of the ego, the measure of the episode so far."""
+    """Return time, speed, gap and time to collision of the ego, and the measure of the episode so far, as text."""
     gap, closing = float(episode.lead.gap[row]), float(episode.lead.closing_speed[row])
     ttc = gap / closing if closing > 0 and gap > 0 else np.inf
     parts = [] if time is None else [f"{time:4.1f} s"]
@@ -184,12 +192,12 @@ def caption(world: World, episode: Episode, time: float | None, row: int = 0) ->
 
 
 def _find_crashed(state: State, road: Road) -> set[int]:
-    """The ego and whom it touches."""
+    """Return the ego and the vehicles that it touches."""
     return {0, *pairwise_overlaps(state, road)[0, 0].nonzero().flatten().tolist()}
 
 
 def _corners(x: float, y: float, heading: float) -> list[tuple[float, float]]:
-    """Corners of a vehicle in the world [m]."""
+    """Return the corners of a vehicle in the world [m]."""
     along, across = VEHICLE_LENGTH / 2, VEHICLE_WIDTH / 2
     cos, sin = np.cos(heading), np.sin(heading)
     box = ((along, across), (along, -across), (-along, -across), (-along, across))
@@ -197,7 +205,7 @@ def _corners(x: float, y: float, heading: float) -> list[tuple[float, float]]:
 
 
 def _network(road: Road, x: float) -> Any:
-    """HighwayEnv's road network of the lanes around x [m]."""
+    """Return HighwayEnv's road network of the lanes around x [m]."""
     from highway_env.road.lane import LineType, StraightLane
     from highway_env.road.road import RoadNetwork
 
@@ -215,7 +223,7 @@ def _network(road: Road, x: float) -> Any:
 
 
 def _point(road: Road, x: float, y: float) -> NDArray[np.float64]:
-    """World coordinates [m], shape (2,), of a point of the road."""
+    """Return world coordinates [m], shape (2,), of a point of the road."""
     zero = torch.zeros((), dtype=torch.float64)
     world_x, world_y, _ = road.to_world(zero + x, zero + y, zero)
     return np.array([float(world_x), float(world_y)])

@@ -1,4 +1,4 @@
-"""One scenario at a time: a `gymnasium.Env` over a batch of one."""
+"""Environment of one scenario at a time: a `gymnasium.Env` over a batch of one."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 
 from rare_envs.control.actions import read_actions
-from rare_envs.envs.info import episode_info, step_info
+from rare_envs.envs.info import SingleObservation, episode_info, step_info
 from rare_envs.envs.rendering import Renderer
 from rare_envs.make import set_up
 from rare_envs.sensors.kinds import each
@@ -16,11 +16,9 @@ from rare_envs.simulation.decision import advance
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.observation import observe
 
-Observation = NDArray[np.float32]
 
-
-class DrivingEnv(gym.Env[Observation, Any]):
-    """The ego drives, everything else follows the scenario.
+class DrivingEnv(gym.Env[SingleObservation, Any]):
+    """Environment of the ego; everything else follows the scenario.
 
     Observation: `features`, see `rare_envs.simulation.observation`. Action: acceleration and steering in [-1, 1], see
     `rare_envs.control.actions`, for one tick; with `action="meta"` one of HighwayEnv's meta-actions, see
@@ -28,6 +26,13 @@ class DrivingEnv(gym.Env[Observation, Any]):
     with a collision and is truncated at the horizon. `info` carries `scenario`, `x`, `min_ttc` [s], `collision`,
     `reward_terms`, and at the end `measure` (f(x)), `collision_type` and `crash`, which say who ran into whom and how
     hard (`rare_envs.traffic.crash`), or None.
+
+    Example:
+        >>> import gymnasium
+        >>> env = gymnasium.make("rare_envs/CutIn-v0")
+        >>> observation, info = env.reset(seed=0, options={"cut_in_gap": 9.0})
+        >>> observation.shape, info["scenario"]["cut_in_gap"], info["collision"]
+        ((11,), 9.0, False)
     """
 
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 10}  # noqa: RUF012  (Gymnasium's own form)
@@ -69,7 +74,7 @@ class DrivingEnv(gym.Env[Observation, Any]):
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
+    ) -> tuple[SingleObservation, dict[str, Any]]:
         """Start an episode.
 
         Args:
@@ -92,7 +97,7 @@ class DrivingEnv(gym.Env[Observation, Any]):
         self._show()
         return observation, episode_info(self.space, self._x, self._episode)
 
-    def step(self, action: Any) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[SingleObservation, float, bool, bool, dict[str, Any]]:
         """Carry out one decision; see the class for what comes back.
 
         Raises:
@@ -118,7 +123,7 @@ class DrivingEnv(gym.Env[Observation, Any]):
         return observation, reward, terminated, truncated, info
 
     def _watch(self, episode: Episode) -> None:
-        """Show the ticks within a decision; its last one is shown after it."""
+        """Render the ticks within a decision; its last one is rendered after it."""
         if self._between and self.render_mode == "human":
             self.render()
         elif self._between:

@@ -1,4 +1,4 @@
-"""Many scenarios at once: a `gymnasium.vector.VectorEnv` that is one batch, not many environments."""
+"""Environment of many scenarios at once: a `gymnasium.vector.VectorEnv` that is one batch, not many environments."""
 
 from typing import Any
 
@@ -12,6 +12,7 @@ from torch import Tensor
 
 from rare_envs.control.actions import read_actions
 from rare_envs.envs.batch_rows import merge_rows, put_masked, replace_rows, to_object_rows
+from rare_envs.envs.info import Info
 from rare_envs.envs.rendering import Renderer
 from rare_envs.make import set_up
 from rare_envs.sensors.kinds import each
@@ -21,14 +22,18 @@ from rare_envs.simulation.observation import observe
 from rare_envs.simulation.reward import RewardTerms
 from rare_envs.traffic.crash import CRASH_KINDS, NONE
 
-Info = dict[str, Any]
-
 
 class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]]):
     """`DrivingEnv` for a whole batch, with Gymnasium's SAME_STEP autoreset.
 
     An episode that ends is replaced within the step by one drawn from the base distribution; its last observation
     and info are in `infos["final_obs"]` and `infos["final_info"]`. One generator draws for the whole batch.
+
+    Example:
+        >>> env = DrivingVectorEnv("rare_envs/CutIn-v0", num_envs=3)
+        >>> observations, infos = env.reset(seed=0, options={"cut_in_gap": [9.0, 20.0, 40.0]})
+        >>> observations.shape, infos["scenario"]["cut_in_gap"].tolist()
+        ((3, 11), [9.0, 20.0, 40.0])
     """
 
     metadata = {  # noqa: RUF012  (Gymnasium's own form)
@@ -180,6 +185,7 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
 
 
 def _terms(terms: RewardTerms, mask: NDArray[np.bool_]) -> Info:
+    """Return the terms of the reward in Gymnasium's vector form."""
     infos: Info = {}
     for name, value in terms._asdict().items():
         put_masked(infos, name, value.double().numpy(), mask)

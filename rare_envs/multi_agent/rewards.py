@@ -1,17 +1,24 @@
-"""What agents are rewarded for: driving well themselves, or bringing the ego into danger."""
+"""Rewards of agents: for driving well themselves, or for bringing the ego into danger."""
+
+from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import torch
 from torch import Tensor
 
 from rare_envs.multi_agent.episode import MultiAgentEpisode
-from rare_envs.simulation.reward import RewardTerms, reward_terms
+from rare_envs.simulation.reward import COLLISION_COST, RewardTerms, reward_terms
 
 
 class Transition(NamedTuple):
-    """What one agent did in a tick, and what came of it: all that a reward may look at."""
+    """A tick of one agent: all that a reward may depend on.
+
+    Example:
+        >>> Transition._fields
+        ('before', 'after', 'vehicle', 'action')
+    """
 
     before: MultiAgentEpisode
     after: MultiAgentEpisode
@@ -25,13 +32,43 @@ Reward: TypeAlias = Callable[[Transition], Any]
 """From a transition to a reward of shape (B,): a tensor, or a named tuple of terms with their sum as `total`."""
 
 
+@runtime_checkable
+class Terms(Protocol):
+    """A reward as a named tuple of terms."""
+
+    @property
+    def total(self) -> Tensor:
+        """The reward, shape (B,)."""
+
+    def _asdict(self) -> dict[str, Tensor]:
+        """Return the terms by name, shape (B,) each."""
+
+
 def own_reward(transition: Transition) -> RewardTerms:
-    """The reward that egos are trained on, for any vehicle: in its own view."""
+    """Return the reward that egos are trained on, for any vehicle: in its own view.
+
+    Args:
+        transition: Of B episodes.
+
+    Example:
+        >>> import rare_envs
+        >>> env = rare_envs.parallel_env("rare_envs/CutIn-v0", agents=["cutter"], rewards={"cutter": own_reward})
+        >>> _ = env.reset(seed=0)
+        >>> *_, infos = env.step({"cutter": [0.0, 0.0]})
+        >>> list(infos["cutter"]["reward_terms"])
+        ['progress', 'comfort', 'lane', 'risk', 'headway', 'collision']
+    """
     return reward_terms(transition.after.views[transition.vehicle], transition.action)
 
 
 class AdversaryTerms(NamedTuple):
-    """Terms of an adversary's reward of one tick, shape (B,) each; the reward is their sum."""
+    """Terms of an adversary's reward of one tick, shape (B,) each; the reward is their sum.
+
+    Example:
+        >>> import torch
+        >>> float(AdversaryTerms(*torch.tensor([[0.5], [0.0], [-0.25], [-0.125], [0.0]])).total)
+        0.125
+    """
 
     danger: Tensor
     """1 - TTC / 4 s where the ego's time to collision is shorter than that."""
@@ -51,10 +88,18 @@ class AdversaryTerms(NamedTuple):
 
 
 def adversary_reward(transition: Transition) -> AdversaryTerms:
-    """Reward of a vehicle that brings the ego into danger, and stays a road user while it does.
+    """Return the reward of a vehicle that brings the ego into danger, and stays a road user while it does.
 
     Args:
         transition: Of B episodes.
+
+    Example:
+        >>> import rare_envs
+        >>> env = rare_envs.parallel_env("rare_envs/CutIn-v0", agents=["cutter"], rewards={"cutter": adversary_reward})
+        >>> _ = env.reset(seed=0)
+        >>> *_, infos = env.step({"cutter": [0.0, 0.0]})
+        >>> infos["cutter"]["reward_terms"]["collision"]
+        0.0
     """
     ego, view = transition.after.views[0], transition.after.views[transition.vehicle]
     own = reward_terms(view, transition.action)
@@ -63,21 +108,28 @@ def adversary_reward(transition: Transition) -> AdversaryTerms:
     alone = view.collided & ~transition.before.views[transition.vehicle].collided & ~crash
     return AdversaryTerms(
         danger=torch.where(ego.collided, torch.zeros_like(danger), danger),
-        collision=30.0 * crash.to(danger.dtype),
+        collision=COLLISION_COST * crash.to(danger.dtype),
         comfort=own.comfort,
         lane=own.lane,
-        fault=-30.0 * alone.to(danger.dtype),
+        fault=-COLLISION_COST * alone.to(danger.dtype),
     )
 
 
 def total_of(reward: Any) -> Tensor:
-    """The reward as a tensor of shape (B,)."""
-    total = getattr(reward, "total", reward)
+    """Return a reward as a tensor of shape (B,).
+
+    Args:
+        reward: What a reward function returned.
+
+    Raises:
+        ValueError: If it is neither a tensor of shape (B,) nor terms with such a `total`.
+    """
+    total = reward.total if isinstance(reward, Terms) else reward
     if not isinstance(total, Tensor) or total.ndim != 1:
         raise ValueError(f"Expected a reward of shape (B,) or terms with a `total`, got {reward!r}.")
     return total
 
 
 def terms_of(reward: Any) -> dict[str, Tensor]:
-    """Its terms by name; one, "reward", if it has none."""
-    return dict(reward._asdict()) if hasattr(reward, "_asdict") else {"reward": reward}
+    """Return the terms of a reward by name; one, "reward", if it has none."""
+    return dict(reward._asdict()) if isinstance(reward, Terms) else {"reward": reward}

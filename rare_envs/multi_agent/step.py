@@ -1,4 +1,4 @@
-"""One step of an environment of several agents: a decision of each, and the ticks until the next."""
+"""Step of an environment of several agents: a decision of each, and the ticks until the next."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -17,7 +17,7 @@ from rare_envs.simulation.world import World
 
 
 class JointStepResult(NamedTuple):
-    """What came of the agents' decisions."""
+    """Result of the agents' decisions."""
 
     episode: MultiAgentEpisode
     rewards: dict[int, Any]
@@ -42,7 +42,7 @@ def step_agents(
         world: The world.
         episode: B episodes.
         action: Of all vehicles: physical, shape (B, N, 2), or meta-actions, shape (B, N).
-        commanded: Which of them obey it, boolean, shape (B, N).
+        commanded: Which vehicles take their action, boolean, shape (B, N).
         rewards: Reward functions by vehicle.
         ego: Drives the ego where it is not commanded.
         memory: The ego's driver's.
@@ -51,8 +51,8 @@ def step_agents(
         The episodes at the time of the next decision, rewards and memory.
     """
     sums: dict[int, Any] = {}
-    meta = not action.is_floating_point()
-    for tick in range(world.clock.stride):
+    meta, stride = not action.is_floating_point(), world.clock.stride
+    for tick in range(stride):
         chosen = torch.full_like(action, IDLE) if meta and tick else action
         traffic, physical, memory = _combine_actions(world, episode, chosen, commanded, ego, memory)
         before = episode
@@ -61,19 +61,23 @@ def step_agents(
             terms = reward(Transition(before, episode, vehicle, physical[:, vehicle]))
             if tick:
                 over = before.views[vehicle].collided
-                terms = _each(lambda term, over=over: term.masked_fill(over, 0.0), terms)
-            sums[vehicle] = terms if tick == 0 else _each(torch.add, sums[vehicle], terms)
-        if world.clock.stride > 1 and bool(episode.collided.all()):
+                terms = _map_terms(lambda term, over=over: term.masked_fill(over, 0.0), terms)
+            sums[vehicle] = terms if tick == 0 else _map_terms(torch.add, sums[vehicle], terms)
+        if stride > 1 and bool(episode.collided.all()):
             break
-    if world.clock.stride > 1:
-        sums = {vehicle: _each(lambda term: term / world.clock.stride, terms) for vehicle, terms in sums.items()}
+    if stride > 1:
+        sums = {vehicle: _map_terms(lambda term: term / stride, terms) for vehicle, terms in sums.items()}
     return JointStepResult(episode, sums, memory)
 
 
 def _combine_actions(
     world: World, episode: MultiAgentEpisode, action: Tensor, commanded: Tensor, ego: Driver, memory: Any
 ) -> tuple[Episode, Tensor, Any]:
-    """The traffic with its new aims, accelerations and steering angles (B, N, 2), and the ego's driver's memory."""
+    """Combine the agents' actions with those of the ego's driver.
+
+    Returns:
+        The traffic with its new aims, accelerations and steering angles (B, N, 2), and the memory of the ego's driver.
+    """
     by_driver = ~commanded[:, 0]
     driven: Tensor | None = None
     if bool(by_driver.any()):
@@ -94,7 +98,7 @@ def _combine_actions(
     return traffic, physical, memory
 
 
-def _each(function: Any, *terms: Any) -> Any:
+def _map_terms(function: Any, *terms: Any) -> Any:
     """Apply a function term by term."""
     if isinstance(terms[0], Tensor):
         return function(*terms)
@@ -103,6 +107,13 @@ def _each(function: Any, *terms: Any) -> Any:
 
 def play(world: World, x: Tensor, policies: Mapping[int, Any], ego: Driver) -> MultiAgentEpisode:
     """Drive B scenarios from start to horizon with policies in some of the vehicles.
+
+    Example:
+        >>> from rare_envs.control.idm import IDM
+        >>> from rare_envs.scenarios.car_following import CAR_FOLLOWING
+        >>> x = torch.tensor([[20.0, 15.0, 30.0]])  # ego and lead speed [m/s], gap [m]
+        >>> play(World(CAR_FOLLOWING), x, {}, IDM()).collided  # of ego and lead
+        tensor([[False, False]])
 
     Args:
         world: The world.

@@ -30,7 +30,18 @@ class DriverWeights(Distribution, Protocol):
 
 @runtime_checkable
 class Background(Protocol):
-    """Drives M vehicles in B scenarios by what each of them sees. Nothing in it is random."""
+    """Drivers of M vehicles in B scenarios, which act by the lidar features of each. Nothing in it is random.
+
+    Example:
+        >>> class Coasting:
+        ...     weights, noisy = None, False
+        ...     def begin(self, draws):
+        ...         return draws[..., 0]
+        ...     def act(self, features, weights, innovations, memory):
+        ...         return features.new_zeros(*features.shape[:2], 2), memory
+        >>> isinstance(Coasting(), Background)
+        True
+    """
 
     @property
     def weights(self) -> DriverWeights | None:

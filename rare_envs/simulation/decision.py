@@ -1,4 +1,4 @@
-"""One step of an environment: one decision of the policy, and the ticks until the next."""
+"""Step of an environment: one decision of the policy, and the ticks until the next."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -15,7 +15,7 @@ from rare_envs.traffic.state import State
 
 
 class StepResult(NamedTuple):
-    """What came of a decision in B episodes."""
+    """Result of a decision in B episodes."""
 
     episode: Episode
     """After it; those with a collision stay as they were in its tick."""
@@ -32,13 +32,13 @@ def advance(
 ) -> StepResult:
     """Carry out a decision.
 
-    A continuous action is one tick. A meta-action is a second: it is given to the controllers once, which then act at
-    every tick, and the measure looks at every tick too.
+    A continuous action lasts one tick. A meta-action lasts a second: it is given to the controllers once, which then
+    act at every tick, and the measure is updated at every tick too.
 
     Args:
         world: The world.
         episode: B episodes, none of which has collided.
-        action: As in `World.step`.
+        action: As in `World.decode_meta_actions`.
         commanded: As in `World.step`.
         watch: Called with the episodes after each tick.
 
@@ -68,17 +68,23 @@ def advance(
 
 
 def hold_finished(over: Tensor, old: Episode, new: Episode) -> Episode:
-    """The new episodes, but the traffic of those that are over as it was."""
+    """Return the new episodes, with the traffic of those that are over as it was.
+
+    Args:
+        over: Which are over, boolean, shape (B,).
+        old: Before the tick.
+        new: After it.
+    """
 
     def hold(before: Tensor, after: Tensor) -> Tensor:
         return torch.where(over.view(-1, *[1] * (after.ndim - 1)), before, after)
 
-    seen, camera_context = new.perception, new.camera_context
+    perception, camera_context = new.perception, new.camera_context
     if camera_context is not None and old.camera_context is not None:
         camera_context = camera_context._replace(tick=hold(old.camera_context.tick, camera_context.tick))
     return new._replace(
         state=State(*map(hold, old.state, new.state)),
         lead=Lead(*map(hold, old.lead, new.lead)),
-        perception=seen if seen is None or old.perception is None else hold(old.perception, seen),
+        perception=perception if perception is None or old.perception is None else hold(old.perception, perception),
         camera_context=camera_context,
     )

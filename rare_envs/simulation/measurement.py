@@ -18,8 +18,8 @@ class Measurement:
     """What is measured of an episode.
 
     Example:
-        >>> Measurement("pet").records
-        True
+        >>> Measurement("ttc").records, Measurement("pet").records
+        (False, True)
 
     Raises:
         ValueError: If the measure is unknown, or `collisions` is not one of `COLLISIONS`.
@@ -45,4 +45,4 @@ class Measurement:
     @property
     def records(self) -> bool:
         """Whether the measure keeps whole episodes."""
-        return self.episode_measure.records
+        return bool(getattr(self.episode_measure, "records", False))

@@ -1,4 +1,4 @@
-"""What an ego observes: `features`, its own state and the others' relative to it, `lidar`, `camera` and others."""
+"""Observations of an ego: `features`, its own state and the others' relative to it, `lidar`, `camera` and others."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -50,7 +50,7 @@ LIDAR_SCALES = (*_CORE_SCALES, *(MAX_RANGE,) * BEAMS, *(10.0,) * BEAMS)
 
 
 def observation_space(vehicles: int, observation: str = "features", camera: Camera | None = None) -> spaces.Space[Any]:
-    """The space of an observation.
+    """Return the space of an observation.
 
     Args:
         vehicles: N.
@@ -58,6 +58,10 @@ def observation_space(vehicles: int, observation: str = "features", camera: Came
             HighwayEnv's 5 x 5; "camera": an image, uint8, H x W x 3; "speed": the ego's own, all that a camera does
             not show of it. Several joined by "+" make a `Dict`.
         camera: Says how large the image is; None for the usual one.
+
+    Example:
+        >>> observation_space(3).shape, observation_space(3, "camera").shape
+        ((11,), (66, 200, 3))
     """
     kinds = kinds_of(observation)
     if len(kinds) > 1:
@@ -74,16 +78,24 @@ def observation_space(vehicles: int, observation: str = "features", camera: Came
 
 
 def observe(episode: "Episode", observation: str, vehicle: int = 0) -> Any:
-    """What one vehicle observes in each of B episodes: the ego, or another one as if it were the ego.
+    """Return what one vehicle observes in each of B episodes: the ego, or another one as if it were the ego.
 
     Args:
         episode: B episodes.
         observation: A kind of observation, or several joined by "+", see `rare_envs.sensors.kinds.OBSERVATIONS`.
-        vehicle: Index of the vehicle that looks.
+        vehicle: Index of the observing vehicle.
 
     Returns:
         Shape (B, F), float32, within +-`CLIP`; (B, 5, 5) for "kinematics"; (B, H, W, 3), uint8, red, green and blue,
         for "camera". Of several a mapping from their names.
+
+    Example:
+        >>> import torch
+        >>> from rare_envs.scenarios.car_following import CAR_FOLLOWING
+        >>> from rare_envs.simulation.world import World
+        >>> episode = World(CAR_FOLLOWING).start(torch.tensor([[15.0, 20.0, 25.0]]))  # speeds [m/s] and gap [m]
+        >>> observe(episode, "features")  # 15/30, 0, 0, then 25/50, (20 - 15)/10, 0, 0
+        tensor([[0.5000, 0.0000, 0.0000, 0.5000, 0.5000, 0.0000, 0.0000]])
     """
     kinds = kinds_of(observation)
     if len(kinds) > 1:
@@ -100,11 +112,11 @@ def observe(episode: "Episode", observation: str, vehicle: int = 0) -> Any:
         return (episode.perception[:, vehicle] / scales).clamp(-CLIP, CLIP).float()
     if observation == "speed":
         return (episode.state.speed[:, vehicle, None] / EGO_FEATURES[0].scale).clamp(-CLIP, CLIP).float()
-    return features(episode.state.seen_by(vehicle))
+    return observe_features(episode.state.seen_by(vehicle))
 
 
-def features(state: State) -> Tensor:
-    """The `features` observation of the ego.
+def observe_features(state: State) -> Tensor:
+    """Return the `features` observation of the ego.
 
     Args:
         state: Traffic of B scenarios with N vehicles.
@@ -125,5 +137,6 @@ def features(state: State) -> Tensor:
 
 
 def _scales(state: State) -> Tensor:
+    """Return the scales of the entries of `features`, shape (3 + 4 (N - 1),)."""
     features = EGO_FEATURES + OTHER_FEATURES * (state.x.shape[1] - 1)
     return torch.tensor([feature.scale for feature in features], dtype=state.x.dtype, device=state.x.device)

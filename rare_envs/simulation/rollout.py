@@ -12,7 +12,19 @@ from rare_envs.simulation.world import World
 
 
 class Driver(Protocol):
-    """An ego. Its memory, if it has any, goes in and out, so that one driver serves any number of rollouts."""
+    """An ego. Its memory, if it has any, goes in and out, so that one driver serves any number of rollouts.
+
+    Example:
+        >>> import torch
+        >>> from rare_envs.scenarios.car_following import CAR_FOLLOWING
+        >>> class Brake:
+        ...     def act(self, episode, memory):
+        ...         action = torch.tensor([-2.0, 0.0])  # acceleration [m/s^2], steering angle [rad]
+        ...         return action.expand(len(episode.collided), 2), memory
+        >>> x = torch.tensor([[20.0, 0.0, 120.0]])  # ego and lead speed [m/s], gap [m]
+        >>> float(rollout(World(CAR_FOLLOWING), Brake(), x).state.speed[0, 0])  # after 10 s
+        0.0
+    """
 
     def act(self, episode: Episode, memory: Any) -> tuple[Tensor, Any]:
         """Decide for one tick.

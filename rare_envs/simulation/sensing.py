@@ -30,7 +30,7 @@ class Sensing:
     """
 
     observation: str = "features"
-    """One of `rare_envs.sensors.kinds.KINDS`, or several joined by "+"."""
+    """One of `rare_envs.sensors.kinds.OBSERVATIONS`, or several joined by "+"."""
     camera: Camera = Camera()  # noqa: RUF009  (frozen)
     """The camera that takes the pictures where "camera" is observed."""
     weather: bool = False
