@@ -1,4 +1,4 @@
-"""The points of one level of subset simulation, chain by chain, and how they are made."""
+"""Markov chains of one level of subset simulation: their points, and their growth from seeds."""
 
 from collections.abc import Generator
 from typing import NamedTuple
@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from samplers.mcmc.kernels import Kernel, accepted_step
+from samplers.mcmc.kernels import Kernel, accept_candidates
 from samplers.method import Interrupted
 from samplers.problem import FloatArray, Inputs
 
@@ -39,43 +39,75 @@ class Chains(NamedTuple):
 
 
 class RootedPoints(NamedTuple):
-    """Points with where they come from; the seeds of a level, for one."""
+    """Points with the point of level 0 that each descends from; the seeds of a level, for example."""
 
     u: FloatArray
     """Shape (n, d)."""
     f: FloatArray
     """Their stored outcomes, shape (n,)."""
     roots: NDArray[np.int64]
-    """Points of level 0 from which they descend, shape (n,)."""
+    """Index of that point, shape (n,)."""
 
 
-def first_level(inputs: Inputs, n: int, rng: np.random.Generator) -> Generator[FloatArray, FloatArray, Chains]:
-    """Draw the n independent points of level 0."""
-    u = rng.standard_normal((n, inputs.dim))
-    f = yield inputs.base.from_standard_normal(u)
+class Growth(NamedTuple):
+    """Chains that were grown, with all that was simulated for them."""
+
+    chains: Chains
+    """As far as they got."""
+    kernel: Kernel
+    """After the last step."""
+    interrupted: bool
+    """Whether the run was interrupted on the way."""
+    candidates: FloatArray
+    """Points that were simulated, accepted or not, shape (m, d)."""
+    f_candidates: FloatArray
+    """Their outcomes, shape (m,)."""
+
+
+def independent_chains(u: FloatArray, f: FloatArray) -> Chains:
+    """Return level 0: each of the independent points u (n, d), f (n,) is a chain of length 1."""
+    n = len(f)
     return Chains(u[:, None], f[:, None], np.ones(n, dtype=np.int64), np.arange(n), n, None)
 
 
+def draw_first_level(inputs: Inputs, n: int, rng: np.random.Generator) -> Generator[FloatArray, FloatArray, Chains]:
+    """Simulate the n independent points of level 0."""
+    u = rng.standard_normal((n, inputs.dim))
+    f = yield inputs.base.from_standard_normal(u)
+    return independent_chains(u, f)
+
+
+def chain_lengths(total: int, n: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Return the lengths of n chains with `total` points together, equal or differing by one at random, shape (n,)."""
+    return np.asarray(total // n + (rng.permutation(n) < total % n), dtype=np.int64)
+
+
 def grow_chains(
-    inputs: Inputs, seeds: RootedPoints, level: float, total: int, kernel: Kernel, rng: np.random.Generator
-) -> Generator[FloatArray, FloatArray, tuple[Chains, Kernel, bool]]:
-    """Grow a chain inside {f <= level} from every seed until there are `total` points.
+    inputs: Inputs,
+    seeds: RootedPoints,
+    level: float,
+    lengths: NDArray[np.int64],
+    kernel: Kernel,
+    rng: np.random.Generator,
+) -> Generator[FloatArray, FloatArray, Growth]:
+    """Grow a chain inside {f <= level} from every seed.
 
-    All chains move together, one step per call of f. Where total is no multiple of the number of seeds,
-    randomly chosen chains get one step more. A candidate that equals the present point needs no simulation.
+    All chains move together, one step per call of f. A candidate that equals the present point needs no simulation.
 
-    Returns:
-        The chains, the kernel after the last step and whether the run was interrupted; the chains then hold
-        the steps made so far.
+    Args:
+        inputs: Of the problem.
+        seeds: Points with f <= level.
+        level: Threshold.
+        lengths: Points of each chain, its seed included, shape (n,).
+        kernel: Proposes the moves.
+        rng: Source of randomness.
     """
     n = len(seeds.f)
-    lengths = total // n + (rng.permutation(n) < total % n)
     u = np.zeros((n, int(lengths.max()), inputs.dim))
     f = np.full(u.shape[:2], np.inf)
     u[:, 0], f[:, 0] = seeds.u, seeds.f
     kernel = kernel.start_level(seeds.u)
-    simulated = moved = 0
-    interrupted = False
+    simulated, outcomes, moved, interrupted = [u[:0, 0]], [f[:0, 0]], 0, False
     for t in range(1, f.shape[1]):
         on = lengths > t
         here, f_here = u[on, t - 1], f[on, t - 1]
@@ -90,10 +122,13 @@ def grow_chains(
                 lengths = np.minimum(lengths, t)
                 u, f = u[:, :t], f[:, :t]
                 break
-        step = accepted_step(here, f_here, candidates, f_candidates, level)
+            simulated.append(candidates[changed])
+            outcomes.append(f_candidates[changed])
+        step = accept_candidates(here, f_here, candidates, f_candidates, level)
         u[on, t], f[on, t] = step.u, step.f
-        simulated, moved = simulated + int(changed.sum()), moved + int(step.accepted.sum())
+        moved += int(step.accepted.sum())
         kernel = kernel.adapt(float(step.accepted.mean()), t)
     moves = int(lengths.sum()) - n
-    chains = Chains(u, f, lengths, seeds.roots, simulated, moved / moves if moves else None)
-    return chains, kernel, interrupted
+    n_new = sum(len(part) for part in outcomes)
+    chains = Chains(u, f, lengths, seeds.roots, n_new, moved / moves if moves else None)
+    return Growth(chains, kernel, interrupted, np.concatenate(simulated), np.concatenate(outcomes))

@@ -1,7 +1,7 @@
 """Markov kernels in standard normal space that stay inside {f <= level}.
 
 A kernel proposes candidates that leave N(0, I) invariant; a candidate is taken if its outcome is <= level
-(`accepted_step`), which makes N(0, I) given f <= level the invariant law.
+(`accept_candidates`), which makes N(0, I) given f <= level the invariant law.
 
 References:
     Au and Beck, "Estimation of small failure probabilities in high dimensions by subset simulation",
@@ -118,7 +118,7 @@ def conditional_proposal(u: FloatArray, sigma: FloatArray, rng: np.random.Genera
     """Propose a move of every chain by conditional sampling (pCN).
 
     v = rho u + sigma xi with xi ~ N(0, I) and rho = sqrt(1 - sigma^2) leaves N(0, I) invariant.
-    Taken if f(v) <= level (`accepted_step`) it leaves N(0, I) given f <= level invariant, without
+    Taken if f(v) <= level (`accept_candidates`) it leaves N(0, I) given f <= level invariant, without
     a ratio test.
 
     Args:
@@ -129,7 +129,7 @@ def conditional_proposal(u: FloatArray, sigma: FloatArray, rng: np.random.Genera
     return np.asarray(np.sqrt(1.0 - sigma * sigma) * u + sigma * rng.standard_normal(u.shape))
 
 
-def accepted_step(u: FloatArray, f: FloatArray, proposal: FloatArray, f_proposal: FloatArray, level: float) -> Step:
+def accept_candidates(u: FloatArray, f: FloatArray, proposal: FloatArray, f_proposal: FloatArray, level: float) -> Step:
     """Return where the chains stand: at the proposal if its outcome is <= level, else where they were.
 
     A chain that stays keeps its stored outcome, so the kernel is also right for an f with noise of

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from samplers.mcmc.chains import Chains, first_level, grow_chains
+from samplers.mcmc.chains import Chains, chain_lengths, draw_first_level, grow_chains
 from samplers.mcmc.kernels import Kernel
 from samplers.method import Goal, Outcome, Steps, no_outcome_share
 from samplers.problem import FloatArray, Inputs
@@ -80,7 +80,7 @@ class SubsetLevels:
 
     def _run_levels(self, inputs: Inputs, goal: Goal, rng: np.random.Generator, kernel: Kernel) -> Steps:
         """Run with n points per level, as far as the budget goes."""
-        chains = yield from first_level(inputs, min(self.n, goal.budget), rng)
+        chains = yield from draw_first_level(inputs, min(self.n, goal.budget), rng)
         left, stopped = goal.budget - chains.n_new, False
         passed, trace, levels = LevelProduct(), list[Level](), list[Chains]()
         while True:
@@ -95,8 +95,9 @@ class SubsetLevels:
                 return replace(summarise(chains, goal, passed, trace, stop), sample=sample)
             passed = include_level(passed, trace[-1])
             seeds = chains.where(chains.f <= threshold)
-            total = self._points_of_level(len(seeds.f), left)
-            chains, kernel, stopped = yield from grow_chains(inputs, seeds, threshold, total, kernel, rng)
+            lengths = chain_lengths(self._points_of_level(len(seeds.f), left), len(seeds.f), rng)
+            growth = yield from grow_chains(inputs, seeds, threshold, lengths, kernel, rng)
+            chains, kernel, stopped = growth.chains, growth.kernel, growth.interrupted
             left -= chains.n_new
 
     def _reason_to_stop(

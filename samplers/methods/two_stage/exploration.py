@@ -1,14 +1,14 @@
-"""Finding every region of failure: the first stage of `TwoStage`.
+"""Exploration: the search for every region of failure, the first stage of `TwoStage`.
 
-Four sources, of which only subset simulation follows f downhill; the others ask no more than whether a point fails,
-so that plateaus, ties, jumps and level sets that lead astray do not matter to them:
+Four sources. Only subset simulation follows f downhill; the others use no more than whether a point fails, so that
+plateaus, ties, jumps and misleading level sets do not matter to them:
 
-1. Draws from the base law, and wide ones from N(0, s^2 I): a half-space at distance beta fails with probability
-   Phi(-beta / s), whatever the dimension.
+1. Draws from the base distribution, and wide ones from N(0, s^2 I): a half-space at distance beta fails with
+   probability Phi(-beta / s), whatever the dimension.
 2. Subset simulation from the base draws, for regions too small to be hit by wide draws.
 3. Chains inside the region of failure (pCN), started from both, so that wide failures become likely ones
    (`regions.py`).
-4. Whether the point half way between two failing points fails as well: then they belong to one region (`regions.py`).
+4. The points half way between two failing points: if one fails, the two belong to one region (`regions.py`).
 """
 
 import math
@@ -18,7 +18,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from samplers.mcmc.kernels import conditional_proposal
+from samplers.mcmc.chains import RootedPoints, grow_chains
+from samplers.mcmc.kernels import Kernel, ScaledKernel
+from samplers.method import Interrupted
 from samplers.methods.two_stage.regions import ExplorationResult, SubsetPoints, grow_regions
 from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, RegionSettings
 from samplers.methods.two_stage.simulator import ComponentDraws, Simulator
@@ -26,19 +28,56 @@ from samplers.problem import FloatArray
 from samplers.proposals.components import IsotropicNormal, MixtureComponent, draw_components
 from samplers.statistics.thresholds import next_level
 
-LEVEL_FRACTION = 0.1
-LEVEL_ACCEPTANCE = 0.35
-MOST_LEVELS = 30
-BISECTIONS = 3
-COST_OF_CHAIN = 25
-"""Simulations that a chain needs at most before it is sorted: bisection, two walks, looks at its region."""
+
+@dataclass(frozen=True, kw_only=True)
+class ExplorationSettings:
+    """Numbers of the exploration; those of draws hold for `usual_budget` simulations."""
+
+    usual_budget: int = 6000
+    """Up to here sizes grow in proportion to the budget, above with its square root: regions that many draws miss
+    are found by more levels of subset simulation, not by more of the same draws."""
+    base: int = 500
+    """Base draws; five levels of a tenth each reach 1e-5 from there."""
+    wide: tuple[tuple[float, int], ...] = ((1.5, 120), (2.2, 120), (3.0, 80))
+    """Wide draws: (s, number). At s = 3 a half-space at beta = 4.5 is hit by one draw in 15."""
+    level: int = 250
+    """Points of each level of subset simulation; `least_level` where the budget is small."""
+    least_level: int = 100
+    level_fraction: float = 0.1
+    """Conditional probability of a level (Au and Beck 2001)."""
+    points_per_seed: int = 3
+    """Points of a level for each of its seeds at least: chains take two steps or more."""
+    initial_scale: float = 0.6
+    """First step of the chains of subset simulation, as in `AdaptiveSubsetSimulation`."""
+    target_acceptance: float = 0.35
+    """Acceptance that it is adapted to; less than for long chains, as in `RegionSettings`."""
+    max_levels: int = 30
+    """Levels at most; the share of the budget ends the descent first unless f ties."""
+    starts: int = 60
+    """Chains from wide failures at most; `least_starts` where the budget is small."""
+    least_starts: int = 10
+    level_starts: int = 16
+    """The same for failures of subset simulation; they take the place of wide failures that are missing."""
+    least_level_starts: int = 6
+    bisections: int = 3
+    """Steps of a wide failure towards the origin: to an eighth of its distance from the edge of the region."""
+    chain_cost: int = 25
+    """Simulations that a chain needs at most before it is sorted: bisection, two walks, points half way."""
+    descent_share: float = 0.45
+    """Share of the budget after which no further level is begun."""
+    share: float = 0.65
+    """Share of the budget for the whole exploration."""
+
+
+DEFAULT_EXPLORATION = ExplorationSettings()
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """How many simulations the parts of the exploration use."""
+    """Simulations for each part of the exploration."""
 
     base: int
+    """Base draws."""
     wide: tuple[tuple[float, int], ...]
     """(s, draws)."""
     level: int
@@ -53,17 +92,18 @@ class Sizes:
     """Simulations of the whole exploration."""
 
     @classmethod
-    def within(cls, budget: int) -> "Sizes":
-        """Return sizes for a budget: in proportion up to 6,000, with its square root above."""
-        scale = budget / 6000 if budget < 6000 else math.sqrt(budget / 6000)
+    def within(cls, budget: int, settings: ExplorationSettings = DEFAULT_EXPLORATION) -> "Sizes":
+        """Return the sizes for a budget."""
+        usual = settings.usual_budget
+        scale = budget / usual if budget < usual else math.sqrt(budget / usual)
         return cls(
-            base=round(500 * scale),
-            wide=((1.5, round(120 * scale)), (2.2, round(120 * scale)), (3.0, round(80 * scale))),
-            level=max(100, round(250 * scale)),
-            starts=max(10, round(60 * scale)),
-            level_starts=max(6, round(16 * scale)),
-            most=int(0.45 * budget),
-            limit=int(0.65 * budget),
+            base=round(settings.base * scale),
+            wide=tuple((width, round(n * scale)) for width, n in settings.wide),
+            level=max(settings.least_level, round(settings.level * scale)),
+            starts=max(settings.least_starts, round(settings.starts * scale)),
+            level_starts=max(settings.least_level_starts, round(settings.level_starts * scale)),
+            most=int(settings.descent_share * budget),
+            limit=int(settings.share * budget),
         )
 
 
@@ -89,15 +129,16 @@ def find_regions(
     sizes: Sizes,
     rng: np.random.Generator,
     settings: RegionSettings = DEFAULT_SETTINGS.regions,
+    explore: ExplorationSettings = DEFAULT_EXPLORATION,
 ) -> Generator[FloatArray, FloatArray, ExplorationResult]:
     """Find the regions of failure, starting from the first draws; none if nothing fails."""
     n_base = int(first.counts[0])
-    descent = yield from _descend(simulator, first.u[:n_base], first.f[:n_base], gamma, sizes, rng)
+    descent = yield from _descend(simulator, first.u[:n_base], first.f[:n_base], gamma, sizes, rng, explore)
     wide = np.flatnonzero(first.f[n_base:] <= gamma) + n_base
     scale = np.repeat(np.arange(len(first.counts)), first.counts)
-    most = max(2, (sizes.limit - simulator.n_sim) // COST_OF_CHAIN)
+    most = max(2, (sizes.limit - simulator.n_sim) // explore.chain_cost)
     chosen = wide[_subsample(scale[wide], min(sizes.starts, most), rng)]
-    far = yield from _bisect_towards_origin(simulator, first.u[chosen], gamma)
+    far = yield from _bisect_towards_origin(simulator, first.u[chosen], gamma, explore.bisections)
     others = max(sizes.level_starts, sizes.starts + sizes.level_starts - len(far))
     starts = np.concatenate([far, rng.permutation(descent.failing)[: min(others, most - len(far))]])
     if len(starts) == 0:
@@ -106,33 +147,42 @@ def find_regions(
 
 
 def _descend(
-    simulator: Simulator, u: FloatArray, f: FloatArray, gamma: float, sizes: Sizes, rng: np.random.Generator
+    simulator: Simulator,
+    u: FloatArray,
+    f: FloatArray,
+    gamma: float,
+    sizes: Sizes,
+    rng: np.random.Generator,
+    explore: ExplorationSettings,
 ) -> Generator[FloatArray, FloatArray, SubsetPoints]:
-    """Run subset simulation from base draws u (n, d), f (n,), until a tenth of a level fails or the budget is used."""
-    points, outcomes = [u[:0]], [f[:0]]
-    sigma, levels = 0.6, 0
-    for _ in range(MOST_LEVELS):
-        level = next_level(f, LEVEL_FRACTION, gamma)
+    """Run subset simulation from base draws u (n, d), f (n,), until a tenth of a level fails or the budget is used.
+
+    Unlike `samplers.methods.subset_levels` it makes no estimate: seeds are a random third of a level at most, and all
+    candidates are kept, as the regressions around the regions use them.
+    """
+    dim = u.shape[1]
+    kernel: Kernel = ScaledKernel(
+        "conditional", "unit", explore.initial_scale, explore.target_acceptance, deviations=np.ones(dim)
+    )
+    points, outcomes, levels = [u[:0]], [f[:0]], 0
+    for _ in range(explore.max_levels):
+        level = next_level(f, explore.level_fraction, gamma)
         if level is None or level == gamma:
             break
-        seeds = rng.permutation(np.flatnonzero(f <= level))[: sizes.level // 3]
+        seeds = rng.permutation(np.flatnonzero(f <= level))[: sizes.level // explore.points_per_seed]
         steps = max(1, math.ceil(sizes.level / len(seeds)) - 1)
         if simulator.n_sim + steps * len(seeds) > sizes.most:
             break
-        u_chain, f_chain = u[seeds], f[seeds]
-        states, at = [u_chain], [f_chain]
-        for step in range(1, steps + 1):
-            proposal = conditional_proposal(u_chain, np.full(u.shape[1], sigma), rng)
-            f_new = yield from simulator.evaluate(proposal)
-            points.append(proposal)
-            outcomes.append(f_new)
-            accepted = f_new <= level
-            u_chain, f_chain = np.where(accepted[:, None], proposal, u_chain), np.where(accepted, f_new, f_chain)
-            states.append(u_chain)
-            at.append(f_chain)
-            sigma = min(sigma * math.exp((accepted.mean() - LEVEL_ACCEPTANCE) / math.sqrt(step)), 1.0)
-        u, f = np.concatenate(states), np.concatenate(at)
-        levels += 1
+        lengths = np.full(len(seeds), steps + 1)
+        start = RootedPoints(u[seeds], f[seeds], seeds)
+        growth = yield from grow_chains(simulator.inputs, start, level, lengths, kernel, rng)
+        simulator.n_sim += growth.chains.n_new
+        if growth.interrupted:
+            raise Interrupted
+        kernel, levels = growth.kernel, levels + 1
+        points.append(growth.candidates)
+        outcomes.append(growth.f_candidates)
+        u, f = growth.chains.u.swapaxes(0, 1).reshape(-1, dim), growth.chains.f.T.ravel()  # in the order of simulation
     return SubsetPoints(np.unique(u[f <= gamma], axis=0), np.concatenate(points), np.concatenate(outcomes), levels)
 
 
@@ -143,11 +193,11 @@ def _subsample(scale: NDArray[np.int64], n: int, rng: np.random.Generator) -> ND
 
 
 def _bisect_towards_origin(
-    simulator: Simulator, u: FloatArray, gamma: float
+    simulator: Simulator, u: FloatArray, gamma: float, steps: int
 ) -> Generator[FloatArray, FloatArray, FloatArray]:
-    """Draw failing points (n, d) towards the origin along their rays, by bisection; they still fail."""
+    """Move failing points (n, d) towards the origin along their rays, by bisection; they still fail."""
     safe, failing = np.zeros(len(u)), np.ones(len(u))
-    for _ in range(BISECTIONS):
+    for _ in range(steps):
         middle = 0.5 * (safe + failing)
         fails = (yield from simulator.evaluate(u * middle[:, None])) <= gamma
         failing, safe = np.where(fails, middle, failing), np.where(fails, safe, middle)

@@ -5,7 +5,7 @@ from scipy import stats
 from samplers.mcmc.kernels import (
     FixedMetropolis,
     ScaledKernel,
-    accepted_step,
+    accept_candidates,
     adapted_scale,
     conditional_proposal,
     metropolis_candidates,
@@ -40,7 +40,7 @@ def test_every_kernel_leaves_the_conditioned_law_invariant(rng, kernel):
     f = height(u)
     for _ in range(10):
         candidates = kernel.propose(u, rng)
-        u, f, _ = accepted_step(u, f, candidates, height(candidates), LEVEL)
+        u, f, _ = accept_candidates(u, f, candidates, height(candidates), LEVEL)
     assert (f <= LEVEL).all()
     assert stats.kstest(u[:, 0], stats.truncnorm(-LEVEL, np.inf).cdf).pvalue > 1e-3
     assert stats.kstest(u[:, 1], stats.norm.cdf).pvalue > 1e-3
@@ -76,7 +76,7 @@ def test_only_the_adaptive_kernel_changes(rng):
 
 def conditional_step(evaluate, u, f, level, sigma, rng):
     proposal = conditional_proposal(u, sigma, rng)
-    return accepted_step(u, f, proposal, evaluate(proposal), level)
+    return accept_candidates(u, f, proposal, evaluate(proposal), level)
 
 
 def test_forgets_where_it_started(rng):
