@@ -10,7 +10,7 @@ from scipy import stats
 from samplers.methods.two_stage.candidates import _smooth_indicators, build_proposal, list_candidates
 from samplers.methods.two_stage.multiple_importance import MultipleImportanceSample
 from samplers.methods.two_stage.refinement import refine_once, start_refinement
-from samplers.methods.two_stage.regions import ExplorationResult, Region
+from samplers.methods.two_stage.regions import ExplorationResult
 from samplers.methods.two_stage.settings import RefinementSettings
 from samplers.methods.two_stage.simulator import ComponentDraws
 from samplers.problem import FunctionProblem
@@ -24,24 +24,16 @@ def half_spaces(dim, regions):
     return FunctionProblem(lambda u: BETA - u[:, :regions].max(axis=1), dim)
 
 
-def region(problem, axis, rng):
-    states = rng.standard_normal((20, 5, problem.dim))
-    states[..., axis] = stats.truncnorm(BETA, np.inf).rvs((20, 5), random_state=rng)
-    u = rng.standard_normal((120, problem.dim))
-    u[:, axis] = BETA + 0.5 * rng.standard_normal(120)
-    return Region(states, u, problem.evaluate(u))
-
-
-def started(rng, dim=3, regions=1, noisy=False, scattered=False):
+def started(exact_region, rng, dim=3, regions=1, noisy=False, scattered=False):
     """Return the state before any round, an empty history and the problem."""
     problem = half_spaces(dim, regions)
-    found = ExplorationResult([region(problem, k, rng) for k in range(regions)], noisy, scattered)
+    found = ExplorationResult([exact_region(problem, k, BETA) for k in range(regions)], noisy, scattered)
     return start_refinement(found, 0.0, SETTINGS, rng), MultipleImportanceSample.empty(dim), problem
 
 
-def after_round(rng, n=800, **kwargs):
+def after_round(exact_region, rng, n=800, **kwargs):
     """Return state and history after a round."""
-    state, history, problem = started(rng, **kwargs)
+    state, history, problem = started(exact_region, rng, **kwargs)
     proposal = build_proposal(state, history, SETTINGS, rng)
     u, counts = proposal.draw(n, rng)
     batch = ComponentDraws(proposal.components, counts, u, problem.evaluate(u))
@@ -57,9 +49,9 @@ def kinds_of(candidates):
     return Counter(candidate.kind for candidate in candidates)
 
 
-def test_the_first_proposal_has_the_initial_shares(rng):
+def test_the_first_proposal_has_the_initial_shares(exact_region, rng):
     """Of the kinds that are there, in proportion; `explored` is the same as `gaussian` before the first round."""
-    state, history, _ = started(rng)
+    state, history, _ = started(exact_region, rng)
     proposal = build_proposal(state, history, SETTINGS, rng)
     present = {kind: a for kind, a in SETTINGS.initial_shares.items() if kind in kinds_of(proposal.candidates)}
     assert set(SETTINGS.initial_shares) - set(present) == {"explored"}
@@ -67,9 +59,9 @@ def test_the_first_proposal_has_the_initial_shares(rng):
         assert share(proposal, kind) == pytest.approx(a / sum(present.values()))
 
 
-def test_candidates_of_a_linear_region(rng):
+def test_candidates_of_a_linear_region(exact_region, rng):
     """One of each kind at least; the base distribution stands first, for its draws are counted."""
-    state, history, _ = after_round(rng)
+    state, history, _ = after_round(exact_region, rng)
     candidates = list_candidates(state, history, SETTINGS)
     assert candidates[0].kind == "base"
     kinds = kinds_of(candidates)
@@ -79,13 +71,13 @@ def test_candidates_of_a_linear_region(rng):
     assert kinds["tempered"] == len(gaussian) * len(SETTINGS.tempering)
 
 
-def test_in_one_dimension_nothing_is_radial(rng):
-    state, history, _ = started(rng, dim=1)
+def test_in_one_dimension_nothing_is_radial(exact_region, rng):
+    state, history, _ = started(exact_region, rng, dim=1)
     assert "radial" not in kinds_of(list_candidates(state, history, SETTINGS))
 
 
-def test_a_noisy_f_has_no_edges_and_more_tempered_gaussians(rng):
-    state, history, _ = after_round(rng, noisy=True)
+def test_a_noisy_f_has_no_edges_and_more_tempered_gaussians(exact_region, rng):
+    state, history, _ = after_round(exact_region, rng, noisy=True)
     kinds = kinds_of(list_candidates(state, history, SETTINGS))
     assert not {"linear", "half-space"} & set(kinds)
     assert kinds["tempered"] == 2 * (kinds["gaussian"] + kinds["explored"])
@@ -96,8 +88,8 @@ def test_a_noisy_f_has_no_edges_and_more_tempered_gaussians(rng):
 
 
 @pytest.mark.parametrize("final", [False, True])
-def test_lower_limits_of_one_region(rng, final):
-    state, history, _ = after_round(rng)
+def test_lower_limits_of_one_region(exact_region, rng, final):
+    state, history, _ = after_round(exact_region, rng)
     proposal = build_proposal(state, history, SETTINGS, rng, final=final)
     assert proposal.weights.sum() == pytest.approx(1.0)
     assert share(proposal, "base") >= SETTINGS.base_share - 1e-9
@@ -108,16 +100,16 @@ def test_lower_limits_of_one_region(rng, final):
     assert final or min(kept) > 0.8 * SETTINGS.explored_share
 
 
-def test_more_tempered_draws_where_the_others_miss(rng):
-    state, history, _ = after_round(rng)
+def test_more_tempered_draws_where_the_others_miss(exact_region, rng):
+    state, history, _ = after_round(exact_region, rng)
     missing = build_proposal(replace(state, hit_rate=0.0), history, SETTINGS, rng)
     assert share(missing, "tempered") >= SETTINGS.tempered_share + SETTINGS.extra_tempered_share - 1e-9
 
 
 @pytest.mark.parametrize(("final", "least"), [(False, 0.25), (True, 0.1)])
-def test_no_region_is_lost(rng, final, least):
+def test_no_region_is_lost(exact_region, rng, final, least):
     """The second region has no failure in the history: it keeps half of what is dealt out all the same."""
-    state, history, _ = started(rng, regions=2)
+    state, history, _ = started(exact_region, rng, regions=2)
     proposal = build_proposal(state, history, SETTINGS, rng)
     u, counts = proposal.draw(800, rng)
     batch = ComponentDraws(proposal.components, counts, u, BETA - u[:, 0])
@@ -129,15 +121,15 @@ def test_no_region_is_lost(rng, final, least):
         assert sum(own) >= least - 1e-9
 
 
-def test_pieces_of_a_shell_share_one_limit(rng):
-    state, history, _ = after_round(rng, regions=2, scattered=True)
+def test_pieces_of_a_shell_share_one_limit(exact_region, rng):
+    state, history, _ = after_round(exact_region, rng, regions=2, scattered=True)
     proposal = build_proposal(state, history, SETTINGS, rng)
     assert share(proposal, "radial") >= SETTINGS.radial_share - 1e-9
 
 
-def test_the_last_proposal_is_nearly_the_best_for_a_half_space(rng):
+def test_the_last_proposal_is_nearly_the_best_for_a_half_space(exact_region, rng):
     """Weights under it vary as the floors for base and tempered draws let them: E[w^2] / E[w]^2 < 1.5 at failures."""
-    state, history, problem = after_round(rng, n=2000)
+    state, history, problem = after_round(exact_region, rng, n=2000)
     proposal = build_proposal(state, history, SETTINGS, rng, final=True)
     u, _ = proposal.draw(20_000, rng)
     w = np.where(problem.evaluate(u) <= 0, np.exp(proposal.log_weights(u)), 0.0)

@@ -28,17 +28,8 @@ def half_spaces(dim, regions):
     return FunctionProblem(lambda u: BETA - u[:, :regions].max(axis=1), dim)
 
 
-def region(problem, axis, rng, chains=20, steps=5):
-    """Exact failures beyond u_axis = BETA in place of chains, and points around the plane."""
-    states = rng.standard_normal((chains, steps, problem.dim))
-    states[..., axis] = stats.truncnorm(BETA, np.inf).rvs((chains, steps), random_state=rng)
-    u = rng.standard_normal((6 * chains, problem.dim))
-    u[:, axis] = BETA + 0.5 * rng.standard_normal(6 * chains)
-    return Region(states, u, problem.evaluate(u))
-
-
-def explored(problem, regions, rng, **kwargs):
-    return ExplorationResult([region(problem, k, rng) for k in range(regions)], **{"noisy": False} | kwargs)
+def explored(exact_region, problem, regions, **kwargs):
+    return ExplorationResult([exact_region(problem, k, BETA) for k in range(regions)], **{"noisy": False} | kwargs)
 
 
 def draws(proposal, n, problem, rng):
@@ -46,9 +37,9 @@ def draws(proposal, n, problem, rng):
     return ComponentDraws(proposal.components, counts, u, problem.evaluate(u))
 
 
-def refined(problem, regions, rng, fresh=True, n=600):
+def refined(exact_region, problem, regions, rng, fresh=True, n=600):
     """Return the state before and after a round, and the draws."""
-    before = start_refinement(explored(problem, regions, rng), 0.0, SETTINGS, rng)
+    before = start_refinement(explored(exact_region, problem, regions), 0.0, SETTINGS, rng)
     proposal = build_proposal(before, MultipleImportanceSample.empty(problem.dim), SETTINGS, rng)
     batch = draws(proposal, n, problem, rng)
     history = MultipleImportanceSample.empty(problem.dim).add(batch, 0.0)
@@ -57,8 +48,8 @@ def refined(problem, regions, rng, fresh=True, n=600):
 
 
 @pytest.mark.parametrize("regions", [1, 2])
-def test_the_exploration_gives_each_region_its_gaussians_and_its_half_space(regions, rng):
-    state = start_refinement(explored(half_spaces(4, regions), regions, rng), 0.0, SETTINGS, rng)
+def test_the_exploration_gives_each_region_its_gaussians_and_its_half_space(exact_region, regions, rng):
+    state = start_refinement(explored(exact_region, half_spaces(4, regions), regions), 0.0, SETTINGS, rng)
     assert {candidate.region for candidate in state.explored} == set(range(regions))
     assert len(state.gaussians) == len(state.explored) <= regions * SETTINGS.gaussians_per_region
     for k in range(regions):
@@ -82,9 +73,9 @@ def test_where_f_is_noisy_one_region_may_have_many_gaussians(rng):
     assert len(start_refinement(found, 0.0, SETTINGS, rng).explored) == SETTINGS.gaussians_per_region
 
 
-def test_a_round_moves_the_gaussians_and_leaves_the_state_before_as_it_was(rng):
+def test_a_round_moves_the_gaussians_and_leaves_the_state_before_as_it_was(exact_region, rng):
     problem = half_spaces(4, 1)
-    before, after, history, batch = refined(problem, 1, rng)
+    before, after, history, batch = refined(exact_region, problem, 1, rng)
     assert before.rounds == ()
     assert len(after.rounds) == 1
     assert after.explored is before.explored
@@ -100,9 +91,9 @@ def test_a_round_moves_the_gaussians_and_leaves_the_state_before_as_it_was(rng):
     np.testing.assert_array_equal(problem.evaluate(near.u), near.f)
 
 
-def test_hit_rate_is_that_of_the_sharp_components(rng):
+def test_hit_rate_is_that_of_the_sharp_components(exact_region, rng):
     """Two components: sharp draws of which 70 % fail, base draws of which none does."""
-    state = start_refinement(explored(half_spaces(2, 1), 1, rng), 0.0, SETTINGS, rng)
+    state = start_refinement(explored(exact_region, half_spaces(2, 1), 1), 0.0, SETTINGS, rng)
     gaussian = SubspaceGaussian(np.eye(2), np.array([3.0, 0.0]), np.ones(2))
     proposal = MixtureProposal(
         [ProposalComponent(IsotropicNormal(2), "base"), ProposalComponent(gaussian, SHARP_KINDS[0], 0)],
@@ -117,9 +108,9 @@ def test_hit_rate_is_that_of_the_sharp_components(rng):
     np.testing.assert_array_equal(after.rounds[0].log_weights, proposal.log_weights(batch.u[100:]))
 
 
-def test_without_failures_a_round_changes_no_component(rng):
+def test_without_failures_a_round_changes_no_component(exact_region, rng):
     problem = half_spaces(3, 1)
-    state = start_refinement(explored(problem, 1, rng), 0.0, SETTINGS, rng)
+    state = start_refinement(explored(exact_region, problem, 1), 0.0, SETTINGS, rng)
     proposal = MixtureProposal([ProposalComponent(IsotropicNormal(3), "base")], np.ones(1))
     u = rng.standard_normal((100, 3))
     batch = ComponentDraws(proposal.components, np.array([100]), u, np.ones(100))
@@ -130,18 +121,18 @@ def test_without_failures_a_round_changes_no_component(rng):
     assert after.hit_rate == 0.0
 
 
-def test_fresh_gaussians_are_fitted_where_they_are_asked_for(rng):
+def test_fresh_gaussians_are_fitted_where_they_are_asked_for(exact_region, rng):
     problem = half_spaces(3, 1)
-    assert refined(problem, 1, np.random.default_rng(1), fresh=False)[1].fresh_gaussians == []
-    fresh = refined(problem, 1, np.random.default_rng(1))[1].fresh_gaussians
+    assert refined(exact_region, problem, 1, np.random.default_rng(1), fresh=False)[1].fresh_gaussians == []
+    fresh = refined(exact_region, problem, 1, np.random.default_rng(1))[1].fresh_gaussians
     tail = stats.truncnorm(BETA, np.inf)
     assert len(fresh) >= 1
     mean = np.mean([gaussian.centre[0] for gaussian in fresh])
     assert mean == pytest.approx(tail.mean(), abs=0.3)
 
 
-def test_linear_proposals_of_two_regions_are_learned_from_the_draws_nearest_to_each(rng):
-    after = refined(half_spaces(4, 2), 2, rng)[1]
+def test_linear_proposals_of_two_regions_are_learned_from_the_draws_nearest_to_each(exact_region, rng):
+    after = refined(exact_region, half_spaces(4, 2), 2, rng)[1]
     for k in range(2):
         half_space = next(
             c.component for c in after.linear if c.region == k and isinstance(c.component, HalfSpaceNormal)
