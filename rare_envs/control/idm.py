@@ -40,6 +40,12 @@ class IDM:
 
     The defaults are Tian et al.'s (2024, Table I; as found in their group's public code). The last term of s* is not
     cut off at 0: a lead that pulls away fast from a short gap is braked for, as in HighwayEnv and in their code.
+
+    Example:
+        >>> import math
+        >>> nobody_ahead = Lead(gap=torch.tensor([math.inf]), closing_speed=torch.tensor([0.0]))
+        >>> IDM(desired_speed=20.0).acceleration(torch.tensor([20.0]), nobody_ahead)
+        tensor([0.])
     """
 
     desired_speed: float = 21.72

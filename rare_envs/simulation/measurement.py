@@ -45,4 +45,4 @@ class Measurement:
     @property
     def records(self) -> bool:
         """Whether the measure keeps whole episodes."""
-        return bool(getattr(self.episode_measure, "records", False))
+        return self.episode_measure.records
