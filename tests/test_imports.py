@@ -40,7 +40,7 @@ FLOORS = {
         comparison testing
     """,
     "rare_envs": """
-        traffic plugins
+        traffic plugins arrays
         distributions control sensors
         sensors.camera scenarios measures
         simulation

@@ -1,1 +1,25 @@
-"""Distributions of scenario parameters and the spaces that they live on."""
+"""Distributions of scenario parameters, with exact maps to standard normal space, and the spaces they live on."""
+
+from rare_envs.distributions.beta import BetaDistribution
+from rare_envs.distributions.log_mixture import LogMixture
+from rare_envs.distributions.product import (
+    BlockDistribution,
+    NoiseDistribution,
+    ProductDistribution,
+    join_independent,
+)
+from rare_envs.distributions.space import Distribution, Parameter, ScenarioSpace
+from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
+
+__all__ = [
+    "BetaDistribution",
+    "BlockDistribution",
+    "Distribution",
+    "LogMixture",
+    "NoiseDistribution",
+    "Parameter",
+    "ProductDistribution",
+    "ScenarioSpace",
+    "TruncatedGaussianMixture",
+    "join_independent",
+]

@@ -1,4 +1,4 @@
-"""Independent Beta laws, each stretched to a range: the start of O'Kelly et al.'s highway scenario."""
+"""Independent Beta variables, each stretched to a range: the start of O'Kelly et al.'s highway scenario."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
-Array = NDArray[np.float64]
-FIELDS = ("alpha", "beta", "low", "high")
+from rare_envs.arrays import FloatArray
+
+BETA_FIELDS = ("alpha", "beta", "low", "high")
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,19 +26,26 @@ class BetaDistribution:
 
     Raises:
         ValueError: If the shapes differ, a shape parameter is not positive, or a range is empty.
+
+    Example:
+        >>> start = BetaDistribution([2.0], [2.0], [10.0], [20.0])
+        >>> start.log_prob([[15.0]]).round(4).tolist()  # log of 1.5 / 10
+        [-1.8971]
+        >>> start.from_standard_normal([[0.0], [1.0]]).round(2).tolist()
+        [[15.0], [17.48]]
     """
 
-    alpha: Array
-    beta: Array
-    low: Array
-    high: Array
+    alpha: FloatArray
+    beta: FloatArray
+    low: FloatArray
+    high: FloatArray
 
     def __post_init__(self) -> None:
-        for name in FIELDS:
+        for name in BETA_FIELDS:
             values = np.atleast_1d(np.array(getattr(self, name), dtype=np.float64))
             values.setflags(write=False)
             object.__setattr__(self, name, values)
-        shapes = {getattr(self, name).shape for name in FIELDS}
+        shapes = {getattr(self, name).shape for name in BETA_FIELDS}
         if len(shapes) != 1 or self.low.ndim != 1:
             raise ValueError(f"Expected alpha, beta, low and high of one shape (d,), got {sorted(shapes)}.")
         if not (np.isfinite(self.alpha + self.beta).all() and (self.alpha > 0).all() and (self.beta > 0).all()):
@@ -48,27 +55,27 @@ class BetaDistribution:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> BetaDistribution:
-        """From its four arrays by name.
+        """Return the distribution of four arrays by name: alpha, beta, low and high.
 
         Raises:
             ValueError: If one is missing or they do not fit.
         """
-        missing = [name for name in FIELDS if name not in data]
+        missing = [name for name in BETA_FIELDS if name not in data]
         if missing:
             raise ValueError(f"Expected alpha, beta, low and high, got no {', '.join(missing)}.")
-        return cls(*(np.asarray(data[name], dtype=np.float64) for name in FIELDS))
+        return cls(*(np.asarray(data[name], dtype=np.float64) for name in BETA_FIELDS))
 
     @property
     def dim(self) -> int:
         """Number of variables d."""
         return len(self.low)
 
-    def sample(self, n: int, rng: np.random.Generator) -> Array:
-        """Independent points, shape (n, d)."""
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw independent points, shape (n, d)."""
         return self.low + (self.high - self.low) * rng.beta(self.alpha, self.beta, (n, self.dim))
 
-    def log_prob(self, x: Array) -> Array:
-        """Log density, (n, d) -> (n,); -inf outside the ranges."""
+    def log_prob(self, x: FloatArray) -> FloatArray:
+        """Return the log density, (n, d) -> (n,); -inf outside the ranges."""
         z = (np.asarray(x) - self.low) / (self.high - self.low)
         inside = (z >= 0.0) & (z <= 1.0)
         z = np.where(inside, z, 0.5)
@@ -76,14 +83,14 @@ class BetaDistribution:
         terms = terms - special.betaln(self.alpha, self.beta) - np.log(self.high - self.low)
         return np.asarray(np.where(inside, terms, -np.inf).sum(axis=1))
 
-    def to_standard_normal(self, x: Array) -> Array:
-        """Map (n, d) -> (n, d), from the nearer tail, so that both are accurate."""
+    def to_standard_normal(self, x: FloatArray) -> FloatArray:
+        """Map to standard normal space, (n, d) -> (n, d), from the nearer tail, so that both are accurate."""
         z = np.clip((np.asarray(x) - self.low) / (self.high - self.low), 0.0, 1.0)
         below, above = special.betainc(self.alpha, self.beta, z), special.betaincc(self.alpha, self.beta, z)
         return np.where(below < 0.5, special.ndtri(below), -special.ndtri(above))
 
-    def from_standard_normal(self, u: Array) -> Array:
-        """Inverse of `to_standard_normal`, (n, d) -> (n, d)."""
+    def from_standard_normal(self, u: FloatArray) -> FloatArray:
+        """Map from standard normal space, (n, d) -> (n, d)."""
         u = np.asarray(u)
         tail = special.ndtr(-np.abs(u))
         left, right = special.betaincinv(self.alpha, self.beta, tail), special.betaincinv(self.beta, self.alpha, tail)

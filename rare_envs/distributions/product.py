@@ -4,50 +4,84 @@ Cross-entropy searches block by block (`samplers.CrossEntropy(family="blocks")`)
 `ProductDistribution.blocks`.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rare_envs.distributions.space import Array, Distribution
+from rare_envs.arrays import FloatArray
+from rare_envs.distributions.space import Distribution
 
 
 @dataclass(frozen=True)
 class NoiseDistribution:
-    """Independent standard normal variables: noise, which a search over blocks leaves as it is."""
+    """Independent standard normal variables: noise, which a search over blocks leaves as it is.
+
+    Example:
+        >>> NoiseDistribution(2).log_prob(np.zeros((1, 2))).round(4).tolist()  # -log(2 pi)
+        [-1.8379]
+    """
 
     dim: int
+    """Number of variables d."""
 
-    def sample(self, n: int, rng: np.random.Generator) -> Array:
-        """Independent points, shape (n, d)."""
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw independent points, shape (n, d)."""
         return rng.standard_normal((n, self.dim))
 
-    def log_prob(self, x: Array) -> Array:
-        """Log density, (n, d) -> (n,)."""
+    def log_prob(self, x: FloatArray) -> FloatArray:
+        """Return the log density, (n, d) -> (n,)."""
         return np.asarray(-0.5 * (np.einsum("ij,ij->i", x, x) + self.dim * np.log(2.0 * np.pi)))
 
-    def to_standard_normal(self, x: Array) -> Array:
-        """The same points."""
+    def to_standard_normal(self, x: FloatArray) -> FloatArray:
+        """Return the same points."""
         return x
 
-    def from_standard_normal(self, u: Array) -> Array:
-        """The same points."""
+    def from_standard_normal(self, u: FloatArray) -> FloatArray:
+        """Return the same points."""
         return u
 
-    def project(self, x: Array, weights: Array, alpha: float) -> "NoiseDistribution":
-        """The same law: a block of cross-entropy that does not move."""
+    def project(self, x: FloatArray, weights: FloatArray, alpha: float) -> "NoiseDistribution":
+        """Return the same distribution: a block of cross-entropy that does not move."""
         return self
 
     def widen(self, factor: float) -> "NoiseDistribution":
-        """The same law."""
+        """Return the same distribution."""
         return self
+
+
+@runtime_checkable
+class BlockDistribution(Distribution, Protocol):
+    """A distribution that announces independent blocks and noise, as cross-entropy and two-stage look for them.
+
+    Example:
+        >>> isinstance(ProductDistribution((NoiseDistribution(1),)), BlockDistribution)
+        True
+        >>> isinstance(NoiseDistribution(1), BlockDistribution)
+        False
+    """
+
+    @property
+    def blocks(self) -> Sequence[Any]:
+        """Distributions with `dim`, in the order of the columns of x."""
+
+    @property
+    def noise(self) -> NDArray[np.bool_]:
+        """Which columns of x are noise, shape (d,): samplers may leave these as they are."""
 
 
 @dataclass(frozen=True, eq=False)
 class ProductDistribution:
-    """Independent blocks side by side."""
+    """Independent blocks side by side.
+
+    Example:
+        >>> both = ProductDistribution((NoiseDistribution(1), NoiseDistribution(2)))
+        >>> both.dim, both.noise.tolist()
+        (3, [True, True, True])
+    """
 
     blocks: tuple[Any, ...]
     """Distributions with `dim`, in the order of the columns of x."""
@@ -64,36 +98,41 @@ class ProductDistribution:
     @cached_property
     def noise(self) -> NDArray[np.bool_]:
         """Which columns are noise, shape (d,): samplers may leave these as they are."""
-        return np.repeat(
-            [isinstance(block, NoiseDistribution) for block in self.blocks], [block.dim for block in self.blocks]
-        )
+        is_noise = [isinstance(block, NoiseDistribution) for block in self.blocks]
+        return np.repeat(is_noise, [block.dim for block in self.blocks])
 
-    def sample(self, n: int, rng: np.random.Generator) -> Array:
-        """Independent points, shape (n, d)."""
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw independent points, shape (n, d)."""
         return np.hstack([block.sample(n, rng) for block in self.blocks])
 
-    def log_prob(self, x: Array) -> Array:
-        """Log density, (n, d) -> (n,)."""
-        parts = zip(self.blocks, self._parts(x), strict=True)
-        return np.asarray(sum(block.log_prob(part) for block, part in parts))
+    def log_prob(self, x: FloatArray) -> FloatArray:
+        """Return the log density, (n, d) -> (n,)."""
+        return np.asarray(sum(block.log_prob(part) for block, part in self._with_parts(x)))
 
-    def to_standard_normal(self, x: Array) -> Array:
-        """Map (n, d) -> (n, d), block by block."""
-        return self._mapped("to_standard_normal", x)
+    def to_standard_normal(self, x: FloatArray) -> FloatArray:
+        """Map to standard normal space block by block, (n, d) -> (n, d)."""
+        return np.hstack([block.to_standard_normal(part) for block, part in self._with_parts(x)])
 
-    def from_standard_normal(self, u: Array) -> Array:
-        """Inverse of `to_standard_normal`, (n, d) -> (n, d)."""
-        return self._mapped("from_standard_normal", u)
+    def from_standard_normal(self, u: FloatArray) -> FloatArray:
+        """Map from standard normal space block by block, (n, d) -> (n, d)."""
+        return np.hstack([block.from_standard_normal(part) for block, part in self._with_parts(u)])
 
-    def _mapped(self, how: str, points: Array) -> Array:
-        parts = zip(self.blocks, self._parts(points), strict=True)
-        return np.hstack([getattr(block, how)(part) for block, part in parts])
+    def _with_parts(self, points: FloatArray) -> list[tuple[Any, FloatArray]]:
+        """Return each block with its columns."""
+        return list(zip(self.blocks, self._split(points), strict=True))
 
-    def _parts(self, points: Array) -> list[Array]:
+    def _split(self, points: FloatArray) -> list[FloatArray]:
         return np.split(np.asarray(points), self._ends, axis=1)
 
 
-def join_independent(*laws: Distribution) -> Distribution:
-    """Independent laws as one; their own blocks, if they have some, become its blocks."""
-    blocks = [block for law in laws for block in getattr(law, "blocks", (law,))]
+def join_independent(*distributions: Distribution) -> Distribution:
+    """Return independent distributions side by side as one; their own blocks, if they have some, become its blocks.
+
+    Example:
+        >>> join_independent(NoiseDistribution(3), NoiseDistribution(2)).dim
+        5
+    """
+    blocks: list[Any] = []
+    for each in distributions:
+        blocks += each.blocks if isinstance(each, BlockDistribution) else (each,)
     return blocks[0] if len(blocks) == 1 else ProductDistribution(tuple(blocks))

@@ -1,4 +1,4 @@
-"""Scenario parameters: names, units, ranges, and the law over them, which a scenario exposes as its `space`."""
+"""Scenario spaces: parameters with names, units and ranges, and their distribution; `env.unwrapped.space` is one."""
 
 from __future__ import annotations
 
@@ -8,39 +8,54 @@ from functools import cached_property
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from rare_envs.arrays import FloatArray
 from rare_envs.plugins import did_you_mean
-
-Array = NDArray[np.float64]
 
 
 @runtime_checkable
 class Distribution(Protocol):
-    """A law on d-dimensional points with an exact map to standard normal space."""
+    """A distribution of d-dimensional points with an exact map to and from standard normal space.
 
-    def sample(self, n: int, rng: np.random.Generator) -> Array:
-        """Independent points, shape (n, d)."""
+    Example:
+        >>> from rare_envs.distributions import BetaDistribution
+        >>> isinstance(BetaDistribution([2.0], [2.0], [0.0], [1.0]), Distribution)
+        True
+    """
 
-    def log_prob(self, x: Array) -> Array:
-        """Log density, (n, d) -> (n,); -inf outside the support."""
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw independent points, shape (n, d)."""
 
-    def to_standard_normal(self, x: Array) -> Array:
-        """Map (n, d) -> (n, d) under which the law becomes N(0, I)."""
+    def log_prob(self, x: FloatArray) -> FloatArray:
+        """Return the log density, (n, d) -> (n,); -inf outside the support."""
 
-    def from_standard_normal(self, u: Array) -> Array:
-        """Inverse of `to_standard_normal`, (n, d) -> (n, d)."""
+    def to_standard_normal(self, x: FloatArray) -> FloatArray:
+        """Map points to u ~ N(0, I), (n, d) -> (n, d)."""
+
+    def from_standard_normal(self, u: FloatArray) -> FloatArray:
+        """Map u ~ N(0, I) to points, (n, d) -> (n, d)."""
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """One named scenario parameter and the physical range it is allowed."""
+    """A named scenario parameter and the physical range it is allowed.
+
+    Example:
+        >>> Parameter("gap", "m", 1.0, 150.0, "from ego to lead, bumper to bumper").size
+        1
+    """
 
     name: str
+    """As in reset options."""
     unit: str
+    """Empty for a number without one."""
     low: float
+    """Lower end of the range."""
     high: float
+    """Upper end of the range."""
     meaning: str
+    """In words."""
     size: int = 1
     """Columns of x that it takes: 1 for a scalar, more for a block of like values, one for each vehicle, say."""
 
@@ -54,14 +69,26 @@ class ScenarioSpace:
         units: Their units.
         low: Lower ends of the allowed ranges, one for each column of x, shape (d,).
         high: Upper ends, shape (d,).
-        base: Law of x; the methods of the same name go to it.
+        base: Distribution of x; the methods of the same name go to it.
         sizes: Columns of x that each parameter takes; by default one each.
-    """
+
+    Example:
+        >>> import gymnasium as gym, rare_envs
+        >>> space = gym.make("rare_envs/CarFollowing-v0").unwrapped.space
+        >>> space.describe()
+        'ego_speed [0, 45] m/s, lead_speed [0, 45] m/s, gap [1, 150] m'
+        >>> space.named([20.0, 10.0, 30.0])
+        {'ego_speed': 20.0, 'lead_speed': 10.0, 'gap': 30.0}
+        >>> space.validate([20.0, 10.0, 300.0])
+        Traceback (most recent call last):
+        ...
+        ValueError: gap = 300 is outside its range [1, 150] m; the parameters are ego_speed [0, 45] m/s, lead_speed [0, 45] m/s, gap [1, 150] m.
+    """  # noqa: E501 (the example shows a whole message)
 
     names: tuple[str, ...]
     units: tuple[str, ...]
-    low: Array
-    high: Array
+    low: FloatArray
+    high: FloatArray
     base: Distribution
     sizes: tuple[int, ...] = ()
 
@@ -82,7 +109,7 @@ class ScenarioSpace:
 
     @classmethod
     def of(cls, parameters: Sequence[Parameter], base: Distribution) -> ScenarioSpace:
-        """The space of some parameters, in the order of x, and of their law."""
+        """Return the space of some parameters, in the order of x, with their distribution."""
         sizes = tuple(p.size for p in parameters)
         return cls(
             names=tuple(p.name for p in parameters),
@@ -98,35 +125,35 @@ class ScenarioSpace:
         """Number of columns of x, d."""
         return sum(self.sizes)
 
-    def sample(self, n: int, rng: np.random.Generator) -> Array:
-        """Independent scenarios from the base distribution, shape (n, d)."""
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw independent scenarios from the base distribution, shape (n, d)."""
         return self.base.sample(n, rng)
 
-    def log_prob(self, x: Array) -> Array:
-        """Log density of the base distribution, (n, d) -> (n,)."""
+    def log_prob(self, x: FloatArray) -> FloatArray:
+        """Return the log density of the base distribution, (n, d) -> (n,)."""
         return self.base.log_prob(x)
 
-    def to_standard_normal(self, x: Array) -> Array:
+    def to_standard_normal(self, x: FloatArray) -> FloatArray:
         """Map to standard normal space, (n, d) -> (n, d)."""
         return self.base.to_standard_normal(x)
 
-    def from_standard_normal(self, u: Array) -> Array:
+    def from_standard_normal(self, u: FloatArray) -> FloatArray:
         """Map from standard normal space, (n, d) -> (n, d)."""
         return self.base.from_standard_normal(u)
 
     def named(self, x_row: ArrayLike) -> dict[str, Any]:
-        """One scenario, shape (d,), as a mapping from names to numbers, or to arrays for blocks."""
+        """Return one scenario, shape (d,), as a mapping from names to numbers, or to arrays for blocks."""
         row = np.asarray(x_row, dtype=np.float64)
         if row.shape != (self.dim,):
             raise ValueError(f"Expected one scenario of shape ({self.dim},), got {row.shape}.")
         return {name: float(part[0]) if size == 1 else part for name, size, part in self._parts(row)}
 
-    def columns(self, x: Array) -> dict[str, Array]:
-        """Scenarios (n, d) as a mapping from names to columns: (n,), or (n, size) for blocks."""
+    def columns(self, x: FloatArray) -> dict[str, FloatArray]:
+        """Return scenarios (n, d) as a mapping from names to columns: (n,), or (n, size) for blocks."""
         return {name: part[:, 0] if size == 1 else part for name, size, part in self._parts(x)}
 
-    def _parts(self, x: Array) -> list[tuple[str, int, Array]]:
-        """Name, size and columns of each parameter."""
+    def _parts(self, x: FloatArray) -> list[tuple[str, int, FloatArray]]:
+        """Return name, size and columns of each parameter."""
         parts = zip(self.names, self.sizes, self._slices, strict=True)
         return [(name, size, x[..., at].copy()) for name, size, at in parts]
 
@@ -137,14 +164,14 @@ class ScenarioSpace:
         return tuple(slice(end - size, end) for size, end in zip(self.sizes, ends, strict=True))
 
     def describe(self) -> str:
-        """All valid names with their ranges, in the order of x."""
+        """Return all valid names with their ranges, in the order of x."""
         return ", ".join(f"{self._title(j)} {self._range(j)}" for j in range(len(self.names)))
 
     def _title(self, j: int) -> str:
         return self.names[j] if self.sizes[j] == 1 else f"{self.names[j]} ({self.sizes[j]} values)"
 
-    def validate(self, x: ArrayLike) -> Array:
-        """Checks shape and ranges.
+    def validate(self, x: ArrayLike) -> FloatArray:
+        """Check shape and ranges.
 
         Args:
             x: Scenarios, shape (n, d), or one of shape (d,).
@@ -167,8 +194,8 @@ class ScenarioSpace:
             self._check_range(j, points[:, self._slices[j]])
         return points
 
-    def scenario_x(self, options: Mapping[str, Any] | None, n: int, rng: np.random.Generator) -> Array:
-        """Scenarios with some parameters given and the others drawn from the base distribution.
+    def scenario_x(self, options: Mapping[str, Any] | None, n: int, rng: np.random.Generator) -> FloatArray:
+        """Return scenarios with some parameters given and the others drawn from the base distribution.
 
         The given values replace drawn ones: the rest is not conditioned on them.
 
@@ -195,7 +222,7 @@ class ScenarioSpace:
             points[:, self._slices[j]] = column
         return self.validate(points)
 
-    def _given_x(self, options: Mapping[str, Any], n: int) -> Array:
+    def _given_x(self, options: Mapping[str, Any], n: int) -> FloatArray:
         others = sorted(str(name) for name in options if name != "x")
         if others:
             raise ValueError(f"x gives every parameter, so {', '.join(others)} cannot be given beside it.")
@@ -204,7 +231,7 @@ class ScenarioSpace:
             raise ValueError(f"Expected x with 1 or {n} rows, one per scenario, got {len(points)}.")
         return np.repeat(points, n, axis=0) if len(points) == 1 else points
 
-    def _column(self, name: str, value: Any, n: int) -> Array:
+    def _column(self, name: str, value: Any, n: int) -> FloatArray:
         values, j = _as_numbers(name, value), self._index(name)
         size = self.sizes[j]
         if size == 1:
@@ -230,7 +257,7 @@ class ScenarioSpace:
         at = self._slices[j].start
         return f"[{self.low[at]:g}, {self.high[at]:g}] {self.units[j]}".rstrip()
 
-    def _check_range(self, j: int, values: Array) -> None:
+    def _check_range(self, j: int, values: FloatArray) -> None:
         """Check the columns of a parameter, shape (n, size)."""
         low, high = self.low[self._slices[j]], self.high[self._slices[j]]
         wrong = ~((values >= low) & (values <= high) & np.isfinite(values))  # True for NaN too
@@ -244,8 +271,8 @@ class ScenarioSpace:
             )
 
 
-def _as_numbers(name: str, value: Any) -> Array:
-    """Float64 array of any shape; text, booleans and ragged lists are refused."""
+def _as_numbers(name: str, value: Any) -> FloatArray:
+    """Return a float64 array of any shape; text, booleans and ragged lists are refused."""
     try:
         raw = np.asarray(value)
         if raw.dtype.kind not in "iuf":

@@ -1,4 +1,4 @@
-"""The base law of a scenario: a Gaussian mixture cut to a box, exact in every direction.
+"""Truncated Gaussian mixture: the base distribution of most scenarios, exact in every direction.
 
 Density, sampling and the map to and from standard normal space use one-dimensional normal
 distribution functions only. They are evaluated in logarithms of the smaller tail, so they stay
@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from rare_envs.arrays import FloatArray
 from rare_envs.distributions.truncated_normal import (
-    Array,
-    Conditional,
+    TruncatedConditional,
     choose,
     log_interval,
     log_sum,
@@ -25,20 +25,21 @@ from rare_envs.distributions.truncated_normal import (
     truncated_quantile,
 )
 
-CHUNK = 8192  # rows worked on together: the temporaries of one chunk stay in the cache
-FIELDS = ("weights", "means", "covariances", "low", "high")
+CHUNK_ROWS = 8192
+"""Rows worked on together: the temporaries of one chunk stay in the cache."""
+MIXTURE_FIELDS = ("weights", "means", "covariances", "low", "high")
 
 
 @dataclass(frozen=True, eq=False)
 class TruncatedGaussianMixture:
     """Gaussian mixture with full covariances, truncated to a box coordinate by coordinate.
 
-    With f the density of the untruncated mixture, the law has the density
+    With f the density of the untruncated mixture, the density is
 
         p(x) = prod_j f(x_j | x_1, ..., x_{j-1}) / P_f(low_j <= X_j <= high_j | x_1, ..., x_{j-1})
 
     inside the box and 0 outside: each conditional of the mixture, in the order of x, is cut to its
-    range and renormalised. The jointly truncated law, f(x) / P_f(box), divides by one constant
+    range and renormalised. The jointly truncated distribution, f(x) / P_f(box), divides by one constant
     instead; the two agree up to factors 1 / (1 - mass outside the box), so they differ little when
     that mass is small (the provenance of a fitted file states it), and are equal for d = 1. Cut
     conditionals are one-dimensional, which is what makes the Rosenblatt map exact.
@@ -53,26 +54,40 @@ class TruncatedGaussianMixture:
     Raises:
         ValueError: A shape, weight, covariance or bound is not as above.
 
+    Example:
+        >>> speed_and_gap = TruncatedGaussianMixture(
+        ...     weights=[1.0],
+        ...     means=[[20.0, 40.0]],
+        ...     covariances=[[[9.0, 12.0], [12.0, 100.0]]],
+        ...     low=[0.0, 1.0],
+        ...     high=[45.0, 150.0],
+        ... )
+        >>> x = speed_and_gap.from_standard_normal([[0.0, 0.0], [1.0, 0.0]])
+        >>> x.round(2).tolist()  # the mean; one standard deviation of the speed, and the gap that goes with it
+        [[20.0, 40.0], [23.0, 44.0]]
+        >>> bool(np.abs(speed_and_gap.to_standard_normal(x) - [[0.0, 0.0], [1.0, 0.0]]).max() < 1e-8)
+        True
+
     References:
         Rosenblatt, "Remarks on a multivariate transformation", 1952.
     """
 
-    weights: Array
-    means: Array
-    covariances: Array
-    low: Array
-    high: Array
-    _factors: Array = field(init=False, repr=False)  # Cholesky factors, (K, d, d)
-    _regressions: tuple[Array, ...] = field(init=False, repr=False)  # j -> (K, j), for sampling
+    weights: FloatArray
+    means: FloatArray
+    covariances: FloatArray
+    low: FloatArray
+    high: FloatArray
+    _factors: FloatArray = field(init=False, repr=False)  # Cholesky factors, (K, d, d)
+    _regressions: tuple[FloatArray, ...] = field(init=False, repr=False)  # j -> (K, j), for sampling
 
     def __post_init__(self) -> None:
-        for name in FIELDS:
+        for name in MIXTURE_FIELDS:
             object.__setattr__(self, name, _as_finite(name, getattr(self, name)))
         _check_shapes(self.weights, self.means, self.covariances, self.low, self.high)
         _check_values(self.weights, self.low, self.high)
         object.__setattr__(self, "_factors", _cholesky(self.covariances))
         object.__setattr__(self, "_regressions", _regressions(self.covariances))
-        for name in FIELDS:
+        for name in MIXTURE_FIELDS:
             getattr(self, name).setflags(write=False)
 
     @property
@@ -80,8 +95,8 @@ class TruncatedGaussianMixture:
         """Number of coordinates d."""
         return int(self.means.shape[1])
 
-    def log_prob(self, x: ArrayLike) -> Array:
-        """Log density, -inf outside the box.
+    def log_prob(self, x: ArrayLike) -> FloatArray:
+        """Return the log density, -inf outside the box.
 
         Args:
             x: Points, shape (n, d).
@@ -95,8 +110,8 @@ class TruncatedGaussianMixture:
         out[inside] = _by_chunks(self._log_prob_inside, points[inside], 1)[:, 0]
         return out
 
-    def to_standard_normal(self, x: ArrayLike) -> Array:
-        """Rosenblatt map: u_j = Phi^-1(P(X_j <= x_j | x_1, ..., x_{j-1})).
+    def to_standard_normal(self, x: ArrayLike) -> FloatArray:
+        """Map to standard normal space by Rosenblatt: u_j = Phi^-1(P(X_j <= x_j | x_1, ..., x_{j-1})).
 
         A point on a face of the box, whose exact image is infinite, is taken one float inside.
 
@@ -119,8 +134,8 @@ class TruncatedGaussianMixture:
             )
         return _by_chunks(self._to_normal, points, self.dim)
 
-    def from_standard_normal(self, u: ArrayLike) -> Array:
-        """Inverse Rosenblatt map; the image is strictly inside the box.
+    def from_standard_normal(self, u: ArrayLike) -> FloatArray:
+        """Map from standard normal space by the inverse Rosenblatt map; the image is strictly inside the box.
 
         u -> x -> u returns to 1e-8 for |u| <= 6, unless the box cuts the bulk so hard that
         neighbouring floats next to its face are further apart than that.
@@ -140,8 +155,8 @@ class TruncatedGaussianMixture:
             raise ValueError(f"u[{i}, {j}] = {points[i, j]} must be finite.")
         return _by_chunks(self._from_normal, points, self.dim)
 
-    def sample(self, n: int, rng: np.random.Generator) -> Array:
-        """Ancestral sampling: per coordinate a component, then its truncated normal.
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw by ancestral sampling: per coordinate a component, then its truncated normal.
 
         The first rows do not depend on n: the same generator state gives the same leading rows.
 
@@ -156,84 +171,84 @@ class TruncatedGaussianMixture:
         return _by_chunks(self._ancestral, uniforms, self.dim)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain lists under the names of the constructor's arguments, ready for JSON."""
-        return {name: getattr(self, name).tolist() for name in FIELDS}
+        """Return plain lists under the names of the constructor's arguments, ready for JSON."""
+        return {name: getattr(self, name).tolist() for name in MIXTURE_FIELDS}
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> TruncatedGaussianMixture:
-        """Inverse of `to_dict`; other keys (names, units, provenance) are left alone.
+        """Return the distribution that `to_dict` describes; other keys (names, units, provenance) are left alone.
 
         Raises:
             ValueError: A key is missing or its value is not valid.
         """
-        missing = [name for name in FIELDS if name not in data]
+        missing = [name for name in MIXTURE_FIELDS if name not in data]
         if missing:
-            raise ValueError(f"Missing {', '.join(missing)}; needed are {', '.join(FIELDS)}.")
-        return cls(*(data[name] for name in FIELDS))
+            raise ValueError(f"Missing {', '.join(missing)}; needed are {', '.join(MIXTURE_FIELDS)}.")
+        return cls(*(data[name] for name in MIXTURE_FIELDS))
 
-    def _rows(self, name: str, points: ArrayLike) -> Array:
+    def _rows(self, name: str, points: ArrayLike) -> FloatArray:
         array = np.asarray(points, dtype=np.float64)
         if array.ndim != 2 or array.shape[1] != self.dim:
             hint = "; add a batch axis" if array.shape == (self.dim,) else ""
             raise ValueError(f"Expected {name} of shape (n, {self.dim}), got {array.shape}{hint}.")
         return array
 
-    def _interior(self, j: int, x: Array) -> Array:
-        """Moves coordinate j off the faces of the box, by one float."""
+    def _interior(self, j: int, x: FloatArray) -> FloatArray:
+        """Move coordinate j off the faces of the box, by one float."""
         low, high = self.low[j], self.high[j]
         return np.clip(x, np.nextafter(low, high), np.nextafter(high, low))
 
-    def _start(self, n: int) -> Array:
+    def _start(self, n: int) -> FloatArray:
         return np.repeat(np.log(self.weights)[:, None], n, axis=1)
 
-    def _conditional(self, j: int, log_weights: Array, residuals: list[Array]) -> Conditional:
-        """Law of coordinate j given the earlier ones, by their standardised residuals (K, n)."""
+    def _conditional(self, j: int, log_weights: FloatArray, residuals: list[FloatArray]) -> TruncatedConditional:
+        """Return the distribution of coordinate j given the earlier ones, by their standardised residuals (K, n)."""
         mean = np.repeat(self.means[:, j, None], log_weights.shape[1], axis=1)
         for i, residual in enumerate(residuals):
             mean = mean + self._factors[:, j, i, None] * residual
         scale = self._factors[:, j, j, None]
-        return Conditional(log_weights, mean, scale, self.low[j], self.high[j])
+        return TruncatedConditional(log_weights, mean, scale, self.low[j], self.high[j])
 
-    def _log_prob_inside(self, x: Array) -> Array:
+    def _log_prob_inside(self, x: FloatArray) -> FloatArray:
         log_weights = self._start(len(x))
-        residuals: list[Array] = []
+        residuals: list[FloatArray] = []
         total = np.zeros(len(x))
         for j in range(self.dim):
-            law = self._conditional(j, log_weights, residuals)
-            residual = (x[:, j] - law.mean) / law.scale
-            total = total - log_sum(log_weights + law.log_mass())
-            log_weights = reweight(log_weights, residual, law.scale)
+            conditional = self._conditional(j, log_weights, residuals)
+            residual = (x[:, j] - conditional.mean) / conditional.scale
+            total = total - log_sum(log_weights + conditional.log_mass())
+            log_weights = reweight(log_weights, residual, conditional.scale)
             total = total + log_sum(log_weights)
             # Kept relative to the largest, so that far points do not run away.
             log_weights = log_weights - log_sum(log_weights)
             residuals.append(residual)
         return total[:, None]
 
-    def _to_normal(self, x: Array) -> Array:
+    def _to_normal(self, x: FloatArray) -> FloatArray:
         log_weights = self._start(len(x))
-        residuals: list[Array] = []
+        residuals: list[FloatArray] = []
         u = np.empty_like(x)
         for j in range(self.dim):
-            law = self._conditional(j, log_weights, residuals)
+            conditional = self._conditional(j, log_weights, residuals)
             inner = self._interior(j, x[:, j])
-            u[:, j] = law.to_normal(inner)
-            residuals.append((inner - law.mean) / law.scale)
-            log_weights = reweight(log_weights, residuals[-1], law.scale)
+            u[:, j] = conditional.to_normal(inner)
+            residuals.append((inner - conditional.mean) / conditional.scale)
+            log_weights = reweight(log_weights, residuals[-1], conditional.scale)
         return u
 
-    def _from_normal(self, u: Array) -> Array:
+    def _from_normal(self, u: FloatArray) -> FloatArray:
         log_weights = self._start(len(u))
-        residuals: list[Array] = []
+        residuals: list[FloatArray] = []
         x = np.empty_like(u)
         for j in range(self.dim):
-            law = self._conditional(j, log_weights, residuals)
-            x[:, j] = self._interior(j, law.from_normal(u[:, j]))
-            residuals.append((x[:, j] - law.mean) / law.scale)
-            log_weights = reweight(log_weights, residuals[-1], law.scale)
+            conditional = self._conditional(j, log_weights, residuals)
+            x[:, j] = self._interior(j, conditional.from_normal(u[:, j]))
+            residuals.append((x[:, j] - conditional.mean) / conditional.scale)
+            log_weights = reweight(log_weights, residuals[-1], conditional.scale)
         return x
 
-    def _ancestral(self, uniforms: Array) -> Array:
-        """Draws from uniforms of shape (n, 2 d).
+    def _ancestral(self, uniforms: FloatArray) -> FloatArray:
+        """Return draws from uniforms of shape (n, 2 d).
 
         Conditions by regression coefficients, not by the Cholesky residuals of the map, so that
         comparing samples with the map tests both.
@@ -258,14 +273,14 @@ class TruncatedGaussianMixture:
         return x
 
 
-def _by_chunks(function: Callable[[Array], Array], points: Array, columns: int) -> Array:
+def _by_chunks(function: Callable[[FloatArray], FloatArray], points: FloatArray, columns: int) -> FloatArray:
     out = np.empty((len(points), columns))
-    for start in range(0, len(points), CHUNK):
-        out[start : start + CHUNK] = function(points[start : start + CHUNK])
+    for start in range(0, len(points), CHUNK_ROWS):
+        out[start : start + CHUNK_ROWS] = function(points[start : start + CHUNK_ROWS])
     return out
 
 
-def _as_finite(name: str, values: ArrayLike) -> Array:
+def _as_finite(name: str, values: ArrayLike) -> FloatArray:
     try:
         array = np.array(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -275,7 +290,7 @@ def _as_finite(name: str, values: ArrayLike) -> Array:
     return array
 
 
-def _check_shapes(weights: Array, means: Array, covariances: Array, *bounds: Array) -> None:
+def _check_shapes(weights: FloatArray, means: FloatArray, covariances: FloatArray, *bounds: FloatArray) -> None:
     if means.ndim != 2 or means.size == 0:
         raise ValueError(f"Expected means of shape (K, d), got {means.shape}.")
     k, d = means.shape
@@ -285,7 +300,7 @@ def _check_shapes(weights: Array, means: Array, covariances: Array, *bounds: Arr
             raise ValueError(f"Expected {name} of shape {shape} to go with means {means.shape}, got {array.shape}.")
 
 
-def _check_values(weights: Array, low: Array, high: Array) -> None:
+def _check_values(weights: FloatArray, low: FloatArray, high: FloatArray) -> None:
     if (weights <= 0).any():
         raise ValueError(f"weights must be positive, got {weights.min():g}; drop that component.")
     if abs(weights.sum() - 1.0) > 1e-9:
@@ -295,7 +310,7 @@ def _check_values(weights: Array, low: Array, high: Array) -> None:
         raise ValueError(f"low must be below high, got [{low[j]:g}, {high[j]:g}] at coordinate {j}.")
 
 
-def _cholesky(covariances: Array) -> Array:
+def _cholesky(covariances: FloatArray) -> FloatArray:
     for k, covariance in enumerate(covariances):
         if not np.allclose(covariance, covariance.T, rtol=1e-9, atol=0.0):
             raise ValueError(f"covariances[{k}] is not symmetric.")
@@ -308,8 +323,8 @@ def _cholesky(covariances: Array) -> Array:
         raise ValueError("A covariance is too close to singular; add to its diagonal.") from None
 
 
-def _regressions(covariances: Array) -> tuple[Array, ...]:
-    """Coefficients of coordinate j on the earlier ones, per component: (K, j) for each j."""
+def _regressions(covariances: FloatArray) -> tuple[FloatArray, ...]:
+    """Return the coefficients of coordinate j on the earlier ones, per component: (K, j) for each j."""
     out = []
     for j in range(covariances.shape[1]):
         solution = np.linalg.solve(covariances[:, :j, :j], covariances[:, :j, j, None])

@@ -1,4 +1,4 @@
-"""One-dimensional normal mixtures cut to an interval: mass, quantile and their inverses.
+"""Truncated normals: one-dimensional normal mixtures cut to an interval, their masses, quantiles and inverses.
 
 Arrays hold components in rows and points in columns, (K, n). Everything is in logarithms of the
 smaller tail, and every column is computed on its own: no sum, and no stopping rule, depends on how
@@ -14,60 +14,68 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_ndtr, ndtri_exp
 
-Array = NDArray[np.float64]
+from rare_envs.arrays import FloatArray
 
 LOG_SQRT_2PI = 0.5 * np.log(2.0 * np.pi)
-MAX_ITERATIONS = 200  # of the root search; bisection alone would need about 60
+MAX_ITERATIONS = 200
+"""Of the root search; bisection alone would need about 60."""
+ROOT_TOLERANCE = 1e-9
+"""Of the root search, relative to 1 + |u|: three digits more than the 1e-6 to which samplers compare coordinates."""
+MIN_CONTRACTION = 0.75
+"""A step of Newton's method that does not shrink at least by this factor is left for a bisection, which halves."""
+NARROW = 1e-3
+"""Intervals of less than this over (1 + |a|) are integrated by the midpoint rule: its error, (width a)^4, is then as
+small as the cancellation in a difference of distribution functions, 1e-12."""
 
 
-class Conditional(NamedTuple):
+class TruncatedConditional(NamedTuple):
     """One coordinate given the earlier ones: a one-dimensional mixture cut to [low, high].
 
     Rows are columns here: log_weights and mean have shape (K, n), scale (K, 1); low and high are
     scalars or (n,). log_weights need not be normalised.
     """
 
-    log_weights: Array
-    mean: Array
-    scale: Array
+    log_weights: FloatArray
+    mean: FloatArray
+    scale: FloatArray
     low: Any
     high: Any
 
-    def log_mass(self) -> Array:
-        """Log mass of each component in [low, high], (K, n)."""
+    def log_mass(self) -> FloatArray:
+        """Return the log mass of each component in [low, high], (K, n)."""
         a = (self.low - self.mean) / self.scale
         width = np.broadcast_to((self.high - self.low) / self.scale, a.shape)
         return log_interval(a, a + width, width)
 
-    def to_normal(self, x: Array) -> Array:
-        """Phi^-1 of the conditional distribution function at x (n,), by the smaller tail."""
+    def to_normal(self, x: FloatArray) -> FloatArray:
+        """Return Phi^-1 of the distribution function at x (n,), by the smaller tail."""
         a, b, c = ((end - self.mean) / self.scale for end in (self.low, x, self.high))
         below, above = (x - self.low) / self.scale, (self.high - x) / self.scale
         lower = log_sum(self.log_weights + log_interval(a, b, below))
         upper = log_sum(self.log_weights + log_interval(b, c, above))
         total = np.logaddexp(lower, upper)
         tail = np.minimum(lower, upper) - total
-        return cast(Array, np.where(lower <= upper, 1.0, -1.0) * ndtri_exp(tail))
+        return cast(FloatArray, np.where(lower <= upper, 1.0, -1.0) * ndtri_exp(tail))
 
-    def from_normal(self, u: Array) -> Array:
-        """Inverse of `to_normal`, (n,) -> (n,); positive u are solved in the mirror image."""
+    def from_normal(self, u: FloatArray) -> FloatArray:
+        """Invert `to_normal`, (n,) -> (n,); positive u are solved in the mirror image."""
         sign = np.where(u > 0, -1.0, 1.0)
         low = np.where(u > 0, -self.high, self.low)
         high = np.where(u > 0, -self.low, self.high)
-        mirrored = Conditional(self.log_weights, sign * self.mean, self.scale, low, high)
+        mirrored = TruncatedConditional(self.log_weights, sign * self.mean, self.scale, low, high)
         return sign * _solve_lower_tail(mirrored, sign * u)
 
 
-def _solve_lower_tail(law: Conditional, u: Array) -> Array:
-    """Root x of law.to_normal(x) = u for u <= 0, row by row.
+def _solve_lower_tail(conditional: TruncatedConditional, u: FloatArray) -> FloatArray:
+    """Return the root x of conditional.to_normal(x) = u for u <= 0, row by row.
 
     Newton's method on the quantile scale (exact for one component far from the box), else on the
     mass scale (exact where the box cuts a flat density), else bisection; each row stops by itself.
     """
-    mass = log_sum(law.log_weights + law.log_mass())
-    root = _first_guess(law, u)
+    mass = log_sum(conditional.log_weights + conditional.log_mass())
+    root = _first_guess(conditional, u)
     rows = np.arange(len(u))
-    search = _Search.begin(law, mass, u, root)
+    search = _Search.start(conditional, mass, u, root)
     for _ in range(MAX_ITERATIONS):
         search, done = search.advance()
         root[rows] = search.x
@@ -79,56 +87,57 @@ def _solve_lower_tail(law: Conditional, u: Array) -> Array:
     return root
 
 
-def _first_guess(law: Conditional, u: Array) -> Array:
-    """Quantile of the truncated normal with the moments of the mixture; exact for K = 1."""
-    score = law.log_weights + law.log_mass()
+def _first_guess(conditional: TruncatedConditional, u: FloatArray) -> FloatArray:
+    """Return the quantile of the truncated normal with the moments of the mixture; exact for K = 1."""
+    score = conditional.log_weights + conditional.log_mass()
     weights = np.exp(score - log_sum(score))
-    mean = sum_components(weights * law.mean)
-    scale = np.sqrt(sum_components(weights * (law.scale**2 + (law.mean - mean) ** 2)))
-    a, b = (law.low - mean) / scale, (law.high - mean) / scale
+    mean = sum_components(weights * conditional.mean)
+    scale = np.sqrt(sum_components(weights * (conditional.scale**2 + (conditional.mean - mean) ** 2)))
+    a, b = (conditional.low - mean) / scale, (conditional.high - mean) / scale
     guess = mean + scale * truncated_quantile(a, b, log_ndtr(u), log_ndtr(-u))
-    return np.clip(guess, law.low, law.high)
+    return np.clip(guess, conditional.low, conditional.high)
 
 
 class _Search(NamedTuple):
     """State of the root search, one column per row still running."""
 
-    law: Conditional
-    log_cdf_low: Array  # (K, n) log Phi at the lower end, and of its mirror image
-    log_sf_low: Array
-    mass: Array  # (n,) log mass of the box under the unnormalised weights
-    u: Array
-    x: Array
-    left: Array
-    right: Array
-    step: Array  # (n,) size of the last step
+    conditional: TruncatedConditional
+    log_cdf_low: FloatArray  # (K, n) log Phi at the lower end, and of its mirror image
+    log_sf_low: FloatArray
+    mass: FloatArray  # (n,) log mass of the box under the unnormalised weights
+    u: FloatArray
+    x: FloatArray
+    left: FloatArray
+    right: FloatArray
+    step: FloatArray  # (n,) size of the last step
 
     @classmethod
-    def begin(cls, law: Conditional, mass: Array, u: Array, x: Array) -> _Search:
-        a = (law.low - law.mean) / law.scale
-        width = law.high - law.low
-        return cls(law, log_ndtr(a), log_ndtr(-a), mass, u, x, law.low, law.high, width)
+    def start(cls, conditional: TruncatedConditional, mass: FloatArray, u: FloatArray, x: FloatArray) -> _Search:
+        a = (conditional.low - conditional.mean) / conditional.scale
+        width = conditional.high - conditional.low
+        return cls(conditional, log_ndtr(a), log_ndtr(-a), mass, u, x, conditional.low, conditional.high, width)
 
     def take(self, keep: NDArray[np.intp]) -> _Search:
-        law = self.law
-        part = Conditional(law.log_weights[:, keep], law.mean[:, keep], law.scale, law.low[keep], law.high[keep])
+        """Return the search of some rows."""
+        log_weights, mean, scale, low, high = self.conditional
+        part = TruncatedConditional(log_weights[:, keep], mean[:, keep], scale, low[keep], high[keep])
         columns = (self.log_cdf_low[:, keep], self.log_sf_low[:, keep])
         return _Search(part, *columns, *(array[keep] for array in self[3:]))
 
-    def log_cdf_and_density(self) -> tuple[Array, Array]:
-        """Log mass of [low, x] and log density at x under the unnormalised weights, (n,)."""
-        law = self.law
-        a, b = (law.low - law.mean) / law.scale, (self.x - law.mean) / law.scale
-        width = (self.x - law.low) / law.scale
+    def log_cdf_and_density(self) -> tuple[FloatArray, FloatArray]:
+        """Return the log mass of [low, x] and log density at x under the unnormalised weights, (n,)."""
+        conditional = self.conditional
+        a, b = (conditional.low - conditional.mean) / conditional.scale, (self.x - conditional.mean) / conditional.scale
+        width = (self.x - conditional.low) / conditional.scale
         flip = a + b > 0
         end = log_ndtr(np.where(flip, -b, b))
         lower = np.where(flip, end, self.log_cdf_low)
         upper = np.where(flip, self.log_sf_low, end)
-        log_cdf = log_sum(law.log_weights + log_difference(lower, upper, a, width))
-        return log_cdf, log_sum(reweight(law.log_weights, b, law.scale))
+        log_cdf = log_sum(conditional.log_weights + log_difference(lower, upper, a, width))
+        return log_cdf, log_sum(reweight(conditional.log_weights, b, conditional.scale))
 
     def advance(self) -> tuple[_Search, NDArray[np.bool_]]:
-        """One step of every row; also says which rows have converged."""
+        """Return the search after one step of every row, and which rows have converged."""
         log_cdf, log_density = self.log_cdf_and_density()
         tail = np.minimum(log_cdf - self.mass, 0.0)
         with np.errstate(all="ignore"):  # the ends of the box give inf and nan: bisected below
@@ -144,28 +153,28 @@ class _Search(NamedTuple):
         fits |= self._fits(by_mass, left, right)
         middle = left + 0.5 * (right - left)
         x = np.where(fits, self.x + move, middle)
-        done = fits & (np.abs(error) <= 1e-9 * (1.0 + np.abs(self.u)))
+        done = fits & (np.abs(error) <= ROOT_TOLERANCE * (1.0 + np.abs(self.u)))
         done |= (right - left <= 2.0 * np.spacing(np.abs(self.x))) | (x == self.x)
         return self._replace(x=x, left=left, right=right, step=np.abs(x - self.x)), done
 
-    def _fits(self, move: Array, left: Array, right: Array) -> NDArray[np.bool_]:
-        """Whether a step stays in the bracket and shrinks; where not, bisection is faster."""
+    def _fits(self, move: FloatArray, left: FloatArray, right: FloatArray) -> NDArray[np.bool_]:
+        """Return whether a step stays in the bracket and shrinks; where not, bisection is faster."""
         target = self.x + move
-        return (target >= left) & (target <= right) & (np.abs(move) <= 0.75 * self.step)
+        return (target >= left) & (target <= right) & (np.abs(move) <= MIN_CONTRACTION * self.step)
 
 
-def log_interval(a: Array, b: Array, width: Array) -> Array:
-    """log(Phi(b) - Phi(a)) for a < b, accurate in both tails; `width` is b - a without rounding."""
+def log_interval(a: FloatArray, b: FloatArray, width: FloatArray) -> FloatArray:
+    """Return log(Phi(b) - Phi(a)) for a < b, accurate in both tails; `width` is b - a without rounding."""
     flip = a + b > 0  # mirrored, so that both ends are read from the lower tail
     lower, upper = log_ndtr(np.where(flip, -b, a)), log_ndtr(np.where(flip, -a, b))
     return log_difference(lower, upper, a, width)
 
 
-def log_difference(lower: Array, upper: Array, a: Array, width: Array) -> Array:
-    """log(exp(upper) - exp(lower)), replaced by a series for narrow intervals at a."""
+def log_difference(lower: FloatArray, upper: FloatArray, a: FloatArray, width: FloatArray) -> FloatArray:
+    """Return log(exp(upper) - exp(lower)), replaced by a series for narrow intervals at a."""
     with np.errstate(divide="ignore"):  # an empty interval has log mass -inf
         out = upper + np.log(-np.expm1(np.minimum(lower - upper, 0.0)))
-        narrow = width * (1.0 + np.abs(a)) < 1e-3
+        narrow = width * (1.0 + np.abs(a)) < NARROW
         if narrow.any():  # cancellation: midpoint rule with its first correction, error w^4 a^4
             w = width[narrow]
             square = (a[narrow] + 0.5 * w) ** 2
@@ -174,22 +183,22 @@ def log_difference(lower: Array, upper: Array, a: Array, width: Array) -> Array:
     return out
 
 
-def truncated_quantile(a: Array, b: Array, log_v: Array, log_1mv: Array) -> Array:
-    """v-quantile of the standard normal cut to [a, b], from log v and log(1 - v)."""
+def truncated_quantile(a: FloatArray, b: FloatArray, log_v: FloatArray, log_1mv: FloatArray) -> FloatArray:
+    """Return the v-quantile of the standard normal cut to [a, b], from log v and log(1 - v)."""
     flip = a + b > 0
     lower, upper = log_ndtr(np.where(flip, -b, a)), log_ndtr(np.where(flip, -a, b))
     low_part, high_part = np.where(flip, log_v, log_1mv), np.where(flip, log_1mv, log_v)
     z = ndtri_exp(np.minimum(np.logaddexp(lower + low_part, upper + high_part), upper))
-    return cast(Array, np.clip(np.where(flip, -z, z), a, b))
+    return cast(FloatArray, np.clip(np.where(flip, -z, z), a, b))
 
 
-def reweight(log_weights: Array, residual: Array, scale: Array) -> Array:
-    """Log weights after seeing a coordinate: plus its log density per component."""
-    return cast(Array, log_weights - 0.5 * residual * residual - np.log(scale) - LOG_SQRT_2PI)
+def reweight(log_weights: FloatArray, residual: FloatArray, scale: FloatArray) -> FloatArray:
+    """Return log weights after seeing a coordinate: plus its log density per component."""
+    return cast(FloatArray, log_weights - 0.5 * residual * residual - np.log(scale) - LOG_SQRT_2PI)
 
 
-def choose(score: Array, v: Array) -> NDArray[np.intp]:
-    """Component index per column with probability proportional to exp(score), from uniform v."""
+def choose(score: FloatArray, v: FloatArray) -> NDArray[np.intp]:
+    """Return a component index per column with probability proportional to exp(score), from uniform v."""
     probability = np.exp(score - log_sum(score))
     threshold = v * sum_components(probability)
     pick = np.zeros(len(v), dtype=np.intp)
@@ -200,14 +209,14 @@ def choose(score: Array, v: Array) -> NDArray[np.intp]:
     return pick
 
 
-def sum_components(values: Array) -> Array:
+def sum_components(values: FloatArray) -> FloatArray:
     """Sum over components, (K, n) -> (n,), in a fixed order: np.sum picks it by the shape."""
     return reduce(np.add, values)
 
 
-def log_sum(values: Array) -> Array:
-    """Log of the sum of exponentials over components, (K, n) -> (n,)."""
+def log_sum(values: FloatArray) -> FloatArray:
+    """Return the log of the sum of exponentials over components, (K, n) -> (n,)."""
     top = values.max(axis=0)
     top = np.where(np.isfinite(top), top, 0.0)
     with np.errstate(divide="ignore"):
-        return cast(Array, top + np.log(sum_components(np.exp(values - top))))
+        return cast(FloatArray, top + np.log(sum_components(np.exp(values - top))))

@@ -6,11 +6,9 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rare_envs.arrays import FloatArray
 from rare_envs.measures.time_to_collision import TTC_MAX
-
-Array = NDArray[np.float64]
 
 TTC_MIN = 0.01
 """They are at least this [s], so that only a collision comes to 0 or less."""
@@ -87,7 +85,7 @@ def _may_meet(one: Any, other: Any) -> bool:
     return bool(way <= TTC_MAX * math.dist(one.velocity, other.velocity))
 
 
-def _axis(angle: float) -> Array:
+def _axis(angle: float) -> FloatArray:
     return np.array([np.cos(angle), np.sin(angle)])
 
 

@@ -10,8 +10,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from rare_envs.arrays import FloatArray
 from rare_envs.distributions.space import Distribution, ScenarioSpace
 from rare_envs.interop.simulation import (
     MAX_SECONDS,
@@ -22,8 +22,6 @@ from rare_envs.interop.simulation import (
     start_worker,
     strip_ego,
 )
-
-Array = NDArray[np.float64]
 
 
 class HighwayEnvProblem:
@@ -79,7 +77,7 @@ class HighwayEnvProblem:
         fixed = self._random and self._noise == "fixed"
         return "what HighwayEnv draws beyond x is one fixed draw" if fixed else ""
 
-    def evaluate(self, x: Array) -> Array:
+    def evaluate(self, x: FloatArray) -> FloatArray:
         """Return the measure of the drive from each x.
 
         Args:

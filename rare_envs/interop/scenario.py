@@ -12,8 +12,9 @@ from highway_env.envs.merge_env import MergeGenericEnv
 from highway_env.envs.roundabout_env import RoundaboutGenericEnv
 from highway_env.utils import class_from_path
 
+from rare_envs.arrays import FloatArray
 from rare_envs.distributions.product import NoiseDistribution, join_independent
-from rare_envs.distributions.space import Array, Parameter, ScenarioSpace
+from rare_envs.distributions.space import Parameter, ScenarioSpace
 from rare_envs.interop.environments import LAYOUTS
 from rare_envs.interop.measures import HIGHWAY_ENV_MEASURES
 from rare_envs.interop.parameters import IDM_PARAMETERS, Group, Layout, idm_groups, restore_class_parameters, set_idm
@@ -83,7 +84,7 @@ class HighwayEnvScenario(gym.Wrapper[Any, Any, Any, Any]):
         self.fixed = _hold_parameters(groups, fixed)
         varying = [group for group in groups if group.parameters[0].name not in self.fixed]
         self.space = _make_space(varying, self.layout.leftover and noise is True, base)
-        self._x: Array = np.full(self.space.dim, np.nan)
+        self._x: FloatArray = np.full(self.space.dim, np.nan)
         self._least = TTC_MAX
 
     @property

@@ -1,4 +1,4 @@
-"""What a scenario is: parameters, an initial state, and the motion of the vehicles around the ego."""
+"""Scenarios: parameters, an initial state, and the motion of the vehicles around the ego."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -16,33 +16,55 @@ from rare_envs.traffic.vehicle_models import point_mass
 
 
 class Others(NamedTuple):
-    """Vehicles 1 to N - 1 after a tick; shapes (B, N - 1), units as in `State`."""
+    """Vehicles 1 to N - 1 after a tick; shapes (B, N - 1).
+
+    Example:
+        >>> one = torch.full((1, 1), 12.0)
+        >>> Others(x=one, y=0 * one, heading=0 * one, speed=one).speed.tolist()
+        [[12.0]]
+    """
 
     x: Tensor
+    """Centres along the road [m]."""
     y: Tensor
+    """Centres across the road [m], positive to the right."""
     heading: Tensor
+    """Headings relative to the road [rad]."""
     speed: Tensor
+    """Speeds along the headings [m/s]."""
 
 
 DATA = resources.files("rare_envs") / "data"
 """Files that come with the package."""
-# None backwards, and 45 m/s (162 km/h) is above what congested US 101 (at most 27 m/s in the events) and free-flow
-# traffic reach.
 SPEED_RANGE = ("m/s", 0.0, 45.0)
-"""Unit and range of a speed as a parameter."""
+"""Unit and range of a speed as a parameter. Nobody drives backwards, and 45 m/s (162 km/h) is above what congested
+US 101 (at most 27 m/s in the events) and free-flow traffic reach."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scenario:
-    """Everything that the project knows of a scenario; one file makes one, and `rare_envs.scenarios` lists it.
+    """A scenario: all that the project knows of it in one object.
+
+    The shipped ones are a file each and a line in `SCENARIOS`; `rare_envs.register_scenario` adds one of your own, and
+    `docs/scenarios.md` shows how to write it.
 
     Raises:
         ValueError: If it contradicts itself.
+
+    Example:
+        >>> from rare_envs.scenarios import scenario_named
+        >>> cut_in = scenario_named("cut_in")
+        >>> cut_in.vehicle_names, cut_in.labels
+        (('ego', 'cutter', 'lead'), ('the ego', 'the cutter', 'the lead'))
+        >>> state = cut_in.initial(torch.tensor([[20.0, 15.0, 25.0, 10.0, 50.0, 3.5]]))
+        >>> cut_in.others(state, 0.1).x.round(decimals=1).tolist()  # cutter and lead one tick later
+        [[16.5, 72.5]]
     """
 
     name: str
     """Short name, such as "cut_in"."""
     road: Road
+    """The road that all vehicles are on."""
     vehicle_names: tuple[str, ...]
     """Names of the N vehicles, "ego" first; agents are called by them."""
     labels: tuple[str, ...] = ()
@@ -90,42 +112,69 @@ class Scenario:
         """Number of columns of x."""
         return sum(p.size for p in self.parameters)
 
+    @property
+    def column_parameters(self) -> list[Parameter]:
+        """The parameter of each column of x."""
+        return [parameter for parameter in self.parameters for _ in range(parameter.size)]
+
 
 def _distinct(names: tuple[str, ...]) -> bool:
+    """Return whether no name stands twice."""
     return len(set(names)) == len(names)
 
 
 def _in_words(vehicle: str) -> str:
+    """Return a vehicle's name in words: "the cutter", "vehicle 1"."""
     words = vehicle.replace("_", " ")
     return words if words[-1].isdigit() else f"the {words}"
 
 
 def columns(*values: Tensor) -> Tensor:
-    """Columns (B,) side by side as (B, N), each contiguous in memory: ticks work on one vehicle's column at a time."""
+    """Return columns (B,) side by side as (B, N), each contiguous in memory: ticks work on one vehicle's at a time.
+
+    Example:
+        >>> columns(torch.tensor([1.0, 2.0]), torch.tensor([3.0, 4.0])).tolist()
+        [[1.0, 3.0], [2.0, 4.0]]
+    """
     return torch.stack(values).T
 
 
-def straight_on(state: State, acceleration: Tensor | float, dt: float) -> Others:
-    """Vehicles 1 to N - 1 straight on along a straight road, down to a standstill.
+def keep_straight(state: State, acceleration: Tensor | float, dt: float) -> Others:
+    """Move vehicles 1 to N - 1 straight on along a straight road, down to a standstill.
 
     Args:
         state: Traffic of B scenarios.
         acceleration: Theirs [m/s^2], shape (B, N - 1).
         dt: Tick [s].
+
+    Example:
+        >>> from rare_envs.scenarios import State
+        >>> x = torch.tensor([[0.0, 30.0]])
+        >>> state = State(x, 0 * x, 0 * x, torch.full((1, 2), 20.0), theta=x[:, :0])
+        >>> keep_straight(state, -2.0, dt=0.5).speed.tolist()
+        [[19.0]]
     """
     speed = state.speed[:, 1:]
     after = (speed + acceleration * dt).clamp(min=0.0)
     return Others(state.x[:, 1:] + speed * dt, state.y[:, 1:], state.heading[:, 1:], after)
 
 
-def roaming(state: State, action: Tensor, dt: float, road: Road) -> Others:
-    """Vehicles 1 to N - 1 as points that turn at will, wherever they are on the road.
+def drive_points(state: State, action: Tensor, dt: float, road: Road) -> Others:
+    """Move vehicles 1 to N - 1 as points that turn at will, wherever they are on the road.
 
     Args:
         state: Traffic of B scenarios.
         action: Their accelerations [m/s^2] and yaw rates relative to the road [rad/s], shape (B, N - 1, 2).
         dt: Tick [s].
         road: The road.
+
+    Example:
+        >>> from rare_envs.scenarios import State, straight
+        >>> x = torch.tensor([[0.0, 30.0]])
+        >>> state = State(x, 0 * x, 0 * x, torch.full((1, 2), 20.0), theta=x[:, :0])
+        >>> after = drive_points(state, torch.tensor([[[1.0, 0.2]]]), 0.5, straight(2))
+        >>> round(after.heading.item(), 3), after.speed.item()
+        (0.1, 20.5)
     """
     x, y, heading, speed = (field[:, 1:] for field in (state.x, state.y, state.heading, state.speed))
     curvature = road.curvature(x)

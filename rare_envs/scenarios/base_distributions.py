@@ -6,13 +6,13 @@ import json
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Protocol, cast, runtime_checkable
 
 import numpy as np
 
 from rare_envs.distributions.beta import BetaDistribution
 from rare_envs.distributions.log_mixture import LogMixture
-from rare_envs.distributions.space import Distribution, Parameter
+from rare_envs.distributions.space import Distribution
 from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
 from rare_envs.plugins import did_you_mean
 
@@ -22,15 +22,23 @@ if TYPE_CHECKING:
 FileDistribution = TruncatedGaussianMixture | LogMixture | BetaDistribution
 _TRIAL_DRAWS = 1000
 """Draws by which a user's distribution is tried before it is used."""
-METHODS = ("sample", "log_prob", "to_standard_normal", "from_standard_normal")
+DISTRIBUTION_METHODS = ("sample", "log_prob", "to_standard_normal", "from_standard_normal")
+
+
+@runtime_checkable
+class TextFile(Protocol):
+    """A file of the package or a path."""
+
+    def read_text(self, encoding: str | None = None) -> str:
+        """Return the content."""
 
 
 def load_base(scenario: Scenario, base: str | PathLike[str] | Distribution | None = None) -> Distribution:
-    """The base distribution of a scenario.
+    """Return the base distribution of a scenario.
 
     A JSON file holds what the shipped ones do: names, low, high, weights, means, covariances, and
     if wanted units, provenance (see `TruncatedGaussianMixture`) and logarithmic (see `LogMixture`); or, for independent
-    Beta laws, names, low, high, alpha and beta, one for each column of x (see `BetaDistribution`).
+    Beta variables, names, low, high, alpha and beta, one for each column of x (see `BetaDistribution`).
 
     Args:
         scenario: The scenario.
@@ -39,23 +47,28 @@ def load_base(scenario: Scenario, base: str | PathLike[str] | Distribution | Non
 
     Raises:
         ValueError: There is no such file, or it does not fit the scenario.
+
+    Example:
+        >>> from rare_envs.scenarios import scenario_named
+        >>> load_base(scenario_named("hard_brake"), "us101").dim
+        3
     """
     base = next(iter(scenario.bases)) if base is None else base
     if not isinstance(base, str | PathLike):
-        return _checked_object(scenario, base)
+        return _check_object(scenario, base)
     shipped = scenario.bases.get(str(base))
     if isinstance(shipped, Mapping):
-        box = columns_of(scenario)
+        box = scenario.column_parameters
         own = {
             "names": [p.name for p in scenario.parameters],
             "low": [p.low for p in box],
             "high": [p.high for p in box],
         }
         return _from_dict(scenario, str(base), {**own, **shipped})
-    if shipped is not None and hasattr(shipped, "read_text"):
+    if isinstance(shipped, TextFile):
         return _from_json(scenario, str(base), shipped.read_text(encoding="utf-8"))
     if shipped is not None:
-        return _checked_object(scenario, shipped)
+        return _check_object(scenario, shipped)
     path = Path(base)
     if not path.is_file():
         raise ValueError(
@@ -67,11 +80,6 @@ def load_base(scenario: Scenario, base: str | PathLike[str] | Distribution | Non
     except (OSError, UnicodeDecodeError) as error:
         raise ValueError(f"Cannot read the base distribution {path}: {error}.") from None
     return _from_json(scenario, str(path), text)
-
-
-def columns_of(scenario: Scenario) -> list[Parameter]:
-    """The parameter of each column of x."""
-    return [parameter for parameter in scenario.parameters for _ in range(parameter.size)]
 
 
 def _from_json(scenario: Scenario, source: str, text: str) -> FileDistribution:
@@ -96,21 +104,22 @@ def _from_dict(scenario: Scenario, source: str, data: Mapping[str, Any]) -> File
         kind = (
             BetaDistribution if "alpha" in data else LogMixture if data.get("logarithmic") else TruncatedGaussianMixture
         )
-        law: FileDistribution = kind.from_dict(data)
+        distribution: FileDistribution = kind.from_dict(data)
     except ValueError as error:
         raise ValueError(f"Base distribution {source}: {error}") from None
-    columns = len(columns_of(scenario))
-    if law.dim != columns:
+    columns = len(scenario.column_parameters)
+    if distribution.dim != columns:
         raise ValueError(
-            f"Base distribution {source} does not fit {scenario.name}: expected {columns} columns, got {law.dim}."
+            f"Base distribution {source} does not fit {scenario.name}: "
+            f"expected {columns} columns, got {distribution.dim}."
         )
-    _check_box(scenario, source, law)
-    return law
+    _check_box(scenario, source, distribution)
+    return distribution
 
 
-def _check_box(scenario: Scenario, source: str, law: FileDistribution) -> None:
-    box = columns_of(scenario)
-    for parameter, low, high in zip(box, law.low, law.high, strict=True):
+def _check_box(scenario: Scenario, source: str, distribution: FileDistribution) -> None:
+    box = scenario.column_parameters
+    for parameter, low, high in zip(box, distribution.low, distribution.high, strict=True):
         if low < parameter.low or high > parameter.high:
             raise ValueError(
                 f"Base distribution {source} gives {parameter.name} the range [{low:g}, {high:g}] "
@@ -118,17 +127,17 @@ def _check_box(scenario: Scenario, source: str, law: FileDistribution) -> None:
             )
 
 
-def _checked_object(scenario: Scenario, base: object) -> Distribution:
-    missing = [name for name in METHODS if not callable(getattr(base, name, None))]
+def _check_object(scenario: Scenario, base: object) -> Distribution:
+    missing = [name for name in DISTRIBUTION_METHODS if not callable(getattr(base, name, None))]
     if missing:
         raise ValueError(
             f"A base distribution must be one of {', '.join(scenario.bases)}, a path to a JSON file, or an "
-            f"object with {', '.join(METHODS)}; got {type(base).__name__} without "
+            f"object with {', '.join(DISTRIBUTION_METHODS)}; got {type(base).__name__} without "
             f"{', '.join(missing)}."
         )
-    law = cast(Distribution, base)
-    box = columns_of(scenario)
-    draws = np.asarray(law.sample(_TRIAL_DRAWS, np.random.default_rng(0)), dtype=np.float64)
+    distribution = cast(Distribution, base)
+    box = scenario.column_parameters
+    draws = np.asarray(distribution.sample(_TRIAL_DRAWS, np.random.default_rng(0)), dtype=np.float64)
     wrong = f"Base distribution {type(base).__name__} does not fit {scenario.name}: "
     if draws.shape != (_TRIAL_DRAWS, len(box)):
         raise ValueError(
@@ -138,4 +147,4 @@ def _checked_object(scenario: Scenario, base: object) -> Distribution:
     for p, column in zip(box, draws.T, strict=True):
         if not ((column >= p.low) & (column <= p.high)).all():  # NaN is outside too
             raise ValueError(f"{wrong}it draws {p.name} outside [{p.low:g}, {p.high:g}] {p.unit}; truncate it.")
-    return law
+    return distribution

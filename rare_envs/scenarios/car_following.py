@@ -4,13 +4,13 @@ import torch
 from torch import Tensor
 
 from rare_envs.distributions.space import Parameter
-from rare_envs.scenarios.base import DATA, SPEED_RANGE, Others, Scenario, columns, straight_on
+from rare_envs.scenarios.base import DATA, SPEED_RANGE, Others, Scenario, columns, keep_straight
 from rare_envs.traffic.road import straight
 from rare_envs.traffic.state import VEHICLE_LENGTH, State
 
 
 def initial(x: Tensor) -> State:
-    """ego_speed, lead_speed [m/s], gap [m]; both vehicles in the middle of the one lane. theta is empty."""
+    """Place both vehicles in the middle of the one lane: ego_speed, lead_speed [m/s], gap [m]. theta is empty."""
     ego_speed, lead_speed, gap = x.unbind(dim=1)
     zero = torch.zeros_like(gap)
     return State(
@@ -23,13 +23,13 @@ def initial(x: Tensor) -> State:
 
 
 def others(state: State, dt: float) -> Others:
-    """The lead keeps its speed."""
-    return straight_on(state, 0.0, dt)
+    """Move the lead at its speed."""
+    return keep_straight(state, 0.0, dt)
 
 
 def driven(state: State, action: Tensor, dt: float) -> Others:
-    """The lead accelerates as its driver wants and stays in the middle of the lane."""
-    return straight_on(state, action[..., 0], dt)
+    """Move the lead with the acceleration of its driver, in the middle of the lane."""
+    return keep_straight(state, action[..., 0], dt)
 
 
 CAR_FOLLOWING = Scenario(

@@ -18,10 +18,11 @@ _CUTTER_IDM = IDM()
 
 
 def initial(x: Tensor) -> State:
-    """ego_speed, cut_in_speed, lead_speed [m/s], cut_in_gap (ego to cutter), lead_gap (cutter to lead), lateral_offset.
+    """Place ego and lead in one lane and the cutter beside them.
 
-    Vehicles: 0 ego, 1 cutter, 2 lead. theta columns: start of the cutter's path [m], its length [m], lateral offset
-    [m], the cutter's desired speed [m/s].
+    Columns of x: ego_speed, cut_in_speed, lead_speed [m/s], cut_in_gap (ego to cutter), lead_gap (cutter to lead) and
+    lateral_offset [m]. Vehicles: 0 ego, 1 cutter, 2 lead. Columns of theta: start of the cutter's path [m], its length
+    [m], lateral offset [m], the cutter's desired speed [m/s].
     """
     ego_speed, cut_in_speed, lead_speed, cut_in_gap, lead_gap, lateral_offset = x.unbind(dim=1)
     zero = torch.zeros_like(ego_speed)
@@ -38,7 +39,7 @@ def initial(x: Tensor) -> State:
 
 
 def bezier(progress: Tensor, length: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
-    """Cubic Bezier from (0, offset) to (length, 0) with both inner control points at thirds: level at both ends.
+    """Return the cubic Bezier from (0, offset) to (length, 0) with inner control points at thirds: level at both ends.
 
     With t = progress / length it is y = offset (1 - 3 t^2 + 2 t^3), before and after it straight on.
 
@@ -57,7 +58,7 @@ def bezier(progress: Tensor, length: Tensor, offset: Tensor) -> tuple[Tensor, Te
 
 
 def others(state: State, dt: float) -> Others:
-    """The lead keeps its speed; the cutter follows its path, its speed is IDM's behind the lead.
+    """Move the lead at its speed and the cutter on its path, with IDM's acceleration behind the lead.
 
     The released code of Tian et al. also steers the cutter along a Bezier (30 m long, by pure pursuit, with the ego's
     IDM); ours is exactly on the curve, whose length grows with the speed, and its desired speed is its initial one.
@@ -67,17 +68,17 @@ def others(state: State, dt: float) -> Others:
     distance = state.x[:, 2] - state.x[:, 1]
     lead = Lead(distance - VEHICLE_LENGTH, speed - lead_speed * torch.cos(state.heading[:, 1]))
     acceleration = _CUTTER_IDM.acceleration(speed, lead, desired_speed)
-    return _moved(state, (speed + acceleration * dt).clamp(min=0.0), lead_speed, dt)
+    return _advance(state, (speed + acceleration * dt).clamp(min=0.0), lead_speed, dt)
 
 
 def driven(state: State, action: Tensor, dt: float) -> Others:
-    """Both accelerate as their drivers want; the cutter stays on its path, the lead in its lane."""
+    """Move both with the accelerations of their drivers, the cutter on its path, the lead in its lane."""
     speed = (state.speed[:, 1:] + action[..., 0] * dt).clamp(min=0.0)
-    return _moved(state, speed[:, 0], speed[:, 1], dt)
+    return _advance(state, speed[:, 0], speed[:, 1], dt)
 
 
-def _moved(state: State, speed: Tensor, lead_speed: Tensor, dt: float) -> Others:
-    """Cutter and lead after the tick: the cutter on its path, the lead straight on, with new speeds (B,)."""
+def _advance(state: State, speed: Tensor, lead_speed: Tensor, dt: float) -> Others:
+    """Return both after the tick: the cutter on its path, the lead straight on, with new speeds (B,)."""
     start, length, offset, _ = state.theta.unbind(dim=1)
     x = state.x[:, 1] + state.speed[:, 1] * torch.cos(state.heading[:, 1]) * dt
     y, slope = bezier(x - start, length, offset)

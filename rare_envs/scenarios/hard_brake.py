@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from rare_envs.distributions.space import Parameter
-from rare_envs.scenarios.base import Others, Scenario, columns, straight_on
+from rare_envs.scenarios.base import Others, Scenario, columns, keep_straight
 from rare_envs.traffic.road import straight
 from rare_envs.traffic.state import VEHICLE_LENGTH, State
 
@@ -30,7 +30,7 @@ US101 = {
 
 
 def initial(x: Tensor) -> State:
-    """Speed [m/s] of both, gap [m], deceleration [m/s^2] of the lead, which is theta's only column."""
+    """Place both in the lane: speed [m/s] of both, gap [m], deceleration [m/s^2] of the lead, theta's only column."""
     speed, gap, deceleration = x.unbind(dim=1)
     zero = torch.zeros_like(gap)
     return State(
@@ -43,13 +43,13 @@ def initial(x: Tensor) -> State:
 
 
 def others(state: State, dt: float) -> Others:
-    """The lead brakes until it stands."""
-    return straight_on(state, -state.theta, dt)
+    """Move the lead, which brakes until it stands."""
+    return keep_straight(state, -state.theta, dt)
 
 
 def driven(state: State, action: Tensor, dt: float) -> Others:
-    """The lead accelerates as its driver wants and stays in the middle of the lane."""
-    return straight_on(state, action[..., 0], dt)
+    """Move the lead with the acceleration of its driver, in the middle of the lane."""
+    return keep_straight(state, action[..., 0], dt)
 
 
 HARD_BRAKE = Scenario(

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from rare_envs.distributions.space import Parameter
-from rare_envs.scenarios.base import DATA, Others, Scenario, roaming
+from rare_envs.scenarios.base import DATA, Others, Scenario, drive_points
 from rare_envs.traffic.road import i80
 from rare_envs.traffic.state import State
 
@@ -23,19 +23,19 @@ START_LANES = (2, 0, 1, 3, 4, 5)
 
 
 def initial(x: Tensor) -> State:
-    """Six columns each: s along the road [m], t off the middle of the lane [m], heading [deg] and speed [m/s]."""
+    """Place six vehicles; six columns each: s along the road, t off the lane [m], heading [deg], speed [m/s]."""
     s, t, heading, speed = x.view(len(x), 4, VEHICLE_COUNT).unbind(dim=1)
     middle = x.new_tensor([i80().centre(lane) for lane in START_LANES])
     return State(s.T.contiguous().T, t + middle, heading * (math.pi / 180.0), speed.clone(), theta=x[:, :0])
 
 
 def driven(state: State, action: Tensor, dt: float) -> Others:
-    """Points that turn at will. Yaw rates are relative to the road: the drivers have learned on a straight one."""
-    return roaming(state, action, dt, i80())
+    """Move points that turn at will. Yaw rates are relative to the road: the drivers have learned on a straight one."""
+    return drive_points(state, action, dt, i80())
 
 
 def others(state: State, dt: float) -> Others:
-    """Without drivers everybody keeps speed and heading relative to the road."""
+    """Move everybody at its speed and heading relative to the road."""
     return driven(state, torch.zeros_like(state.x[:, 1:, None]).expand(-1, -1, 2), dt)
 
 
@@ -45,7 +45,7 @@ HIGHWAY = Scenario(
     vehicle_names=("ego", *(f"vehicle_{j}" for j in range(1, VEHICLE_COUNT))),
     labels=("the ego", *(f"lane {lane + 1}'s car" for lane in START_LANES[1:])),
     horizon=10.0,
-    # the ranges of the paper, which are those of its Beta laws
+    # the ranges of the paper, which are those of its Beta variables
     parameters=(
         Parameter("s", "m", 80.0, 120.0, "initial place along the road, the ego's first", VEHICLE_COUNT),
         Parameter("t", "m", -0.25, 0.25, "initial place to the right of the lane's middle", VEHICLE_COUNT),

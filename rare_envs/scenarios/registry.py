@@ -1,4 +1,4 @@
-"""The registry of scenarios: environment ids, short names, and the module that registers an id of a user's own."""
+"""The registry of scenarios: by environment id or short name, and an id of your own by the module that registers it."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ class Registry(Mapping[str, "Scenario"]):
     """Environment ids to scenarios; a file is imported, and torch with it, when its scenario is first asked for."""
 
     def __init__(self, entries: Mapping[str, str]) -> None:
-        """From ids to "module:name"."""
+        """Register ids with the places of their scenarios, "module:name"."""
         self._entries: dict[str, str | Scenario] = dict(entries)
 
     def __getitem__(self, env_id: str) -> Scenario:
-        """The scenario of an id."""
+        """Return the scenario of an id."""
         entry = self._entries[env_id]
         if isinstance(entry, str):
             entry = self._entries[env_id] = import_object(entry, f"the environment {env_id!r}")
         return entry
 
     def __iter__(self) -> Iterator[str]:
-        """The ids in the order of their registration."""
+        """Iterate over the ids in the order of their registration."""
         return iter(self._entries)
 
     def __len__(self) -> int:
-        """How many there are."""
+        """Return the number of scenarios."""
         return len(self._entries)
 
     def add(self, env_id: str, scenario: Scenario) -> None:
@@ -54,10 +54,14 @@ SCENARIOS = Registry(
 
 
 def scenario_named(name: str) -> Scenario:
-    """The scenario of a short name, such as "cut_in".
+    """Return the scenario of a short name, such as "cut_in".
 
     Raises:
         ValueError: If there is none.
+
+    Example:
+        >>> scenario_named("cut_in").vehicle_names
+        ('ego', 'cutter', 'lead')
     """
     for scenario in SCENARIOS.values():
         if scenario.name == name:
@@ -66,7 +70,7 @@ def scenario_named(name: str) -> Scenario:
 
 
 def find_scenario(env_id: str) -> Scenario:
-    """The scenario of an environment id.
+    """Return the scenario of an environment id.
 
     Args:
         env_id: For example "rare_envs/CutIn-v0"; "module:my_namespace/Overtaking-v0", as for `gym.make`, imports first
@@ -74,6 +78,10 @@ def find_scenario(env_id: str) -> Scenario:
 
     Raises:
         ValueError: If there is none; the message suggests the nearest id and lists all.
+
+    Example:
+        >>> find_scenario("rare_envs/HardBrake-v0").name
+        'hard_brake'
     """
     module, _, name = env_id.rpartition(":") if isinstance(env_id, str) else ("", "", env_id)
     if module:
@@ -100,9 +108,13 @@ HIGHWAY_ENV_LAYOUT = {"observation": "kinematics", "action": "meta"}
 
 
 def kinematics_id(env_id: str) -> str:
-    """The id under which an environment has HighwayEnv's layout: "rare_envs/CutIn-kinematics-v0", for example.
+    """Return the id under which an environment has HighwayEnv's layout.
 
     For `gym.make` and `gym.make_vec`, so that scripts written for HighwayEnv run with nothing but the id changed.
+
+    Example:
+        >>> kinematics_id("rare_envs/CutIn-v0")
+        'rare_envs/CutIn-kinematics-v0'
     """
     name, _, version = env_id.rpartition("-v")
     return f"{name}-kinematics-v{version}"

@@ -1,4 +1,4 @@
-"""Trying a scenario before it is registered."""
+"""Validation of a scenario before it is registered: a few episodes, one tick each."""
 
 import torch
 from torch import Tensor
@@ -8,7 +8,9 @@ from rare_envs.scenarios.base_distributions import load_base
 from rare_envs.traffic.state import State
 
 _DRAWS = 8
+"""Episodes of the trial."""
 _DT = 0.1
+"""Its tick [s], the default of environments."""
 
 
 def try_scenario(scenario: Scenario) -> None:
@@ -35,14 +37,16 @@ def try_scenario(scenario: Scenario) -> None:
             f"Scenario {scenario.name!r}: expected theta of {_DRAWS} rows, got {tuple(state.theta.shape)}."
         )
     _check(scenario, "others(state, dt)", scenario.others(state, _DT), n - 1)
-    _check(scenario, "driven(state, action, dt)", scenario.driven(state, _still(state), _DT), n - 1)
+    _check(scenario, "driven(state, action, dt)", scenario.driven(state, _zero_action(state), _DT), n - 1)
 
 
-def _still(state: State) -> Tensor:
+def _zero_action(state: State) -> Tensor:
+    """Return accelerations and yaw rates of 0 for the vehicles around the ego, shape (B, N - 1, 2)."""
     return torch.zeros_like(state.x[:, 1:, None]).expand(-1, -1, 2)
 
 
 def _check(scenario: Scenario, what: str, fields: tuple[Tensor, ...], vehicles: int) -> None:
+    """Check that fields are tensors (B, vehicles) of finite numbers."""
     if not isinstance(fields, tuple) or not all(isinstance(field, Tensor) for field in fields[:4]) or len(fields) < 4:
         raise ValueError(
             f"Scenario {scenario.name!r}: expected {what} to give x, y, heading and speed, as State or Others; "

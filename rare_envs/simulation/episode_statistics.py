@@ -27,7 +27,7 @@ class EpisodeStatistics(NamedTuple):
     @property
     def crash(self) -> Crash:
         """Crash of the ego; where it had none, that of others."""
-        return self.own.replaced(self.own.kind == NONE, self.others)
+        return self.own.replace_where(self.own.kind == NONE, self.others)
 
     @classmethod
     def start(cls, moment: Moment, least_ttc: Tensor | None = None) -> EpisodeStatistics:

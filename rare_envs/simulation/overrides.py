@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from rare_envs.control.idm import IDM
-from rare_envs.scenarios.base import Others, roaming
+from rare_envs.scenarios.base import Others, drive_points
 from rare_envs.traffic.lead import lead_of
 from rare_envs.traffic.vehicle_models import bicycle
 
@@ -48,7 +48,7 @@ def apply_overrides(
             action = torch.where((overridden & ~commanded)[..., None], rule_based_actions(episode), action)
             commanded = overridden
         else:
-            scripted = _choose(released, roaming(state, driver_actions, dt, road), scripted)
+            scripted = _choose(released, drive_points(state, driver_actions, dt, road), scripted)
     x, y, heading, speed = (field[:, 1:] for field in state[:4])
     curvature = None if road.reference_line is None else road.curvature(x)
     moved = Others(*bicycle(x, y, heading, speed, action[:, 1:, 0], action[:, 1:, 1], dt, curvature))

@@ -1,4 +1,4 @@
-"""What kind of crash it was: who hit whom and where, how fast, and how bad that is for the people inside.
+"""Crashes: who hit whom and where, how fast, and the risk of an injury.
 
 Two bodies touch when they begin to overlap along the last of the four axes on which they can be apart; that axis is the
 normal of the contact. Along the tick bodies are taken to move straight, from where they were to where they are.
@@ -32,6 +32,15 @@ class Crash(NamedTuple):
 
     Of two vehicles, the first is the one that runs into the other: it moves faster towards it than the other towards
     the first, along the road, or across it where flanks meet.
+
+    Example:
+        >>> import rare_envs
+        >>> problem = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0")
+        >>> crash = problem.crashes([[30.0, 10.0, 5.0]])
+        >>> problem.crash_kinds([[30.0, 10.0, 5.0]]), crash.vehicles.tolist()
+        (['rear_end'], [[0, 1]])
+        >>> describe_crash(crash)["impact_speed"] == crash.impact_speed.item()
+        True
     """
 
     kind: Tensor
@@ -51,15 +60,15 @@ class Crash(NamedTuple):
 
     @classmethod
     def nothing(cls, like: Tensor) -> "Crash":
-        """No crash, in B = len(like) episodes of the dtype and device of `like`."""
+        """Return no crash in B = len(like) episodes of the dtype and device of `like`."""
         batch, whole = len(like), torch.int64
         zero = torch.zeros(batch, dtype=like.dtype, device=like.device)
         both = zero[:, None].expand(batch, 2)
         nobody = torch.full((batch, 2), -1, dtype=whole, device=like.device)
         return cls(torch.full_like(zero, NONE, dtype=whole), nobody, zero, zero, both, both)
 
-    def replaced(self, where: Tensor, by: "Crash") -> "Crash":
-        """These crashes, but `by` in the episodes `where`, boolean, shape (B,)."""
+    def replace_where(self, where: Tensor, by: "Crash") -> "Crash":
+        """Return these crashes, but `by` in the episodes `where`, boolean, shape (B,)."""
         return Crash(
             *(
                 torch.where(where if old.ndim == 1 else where[:, None], new, old)
@@ -69,7 +78,7 @@ class Crash(NamedTuple):
 
 
 def injury_risk(delta_v: Tensor, mode: str = "all") -> Tensor:
-    """Probability of a serious injury (MAIS 3 or more) of an occupant, by the delta-v of the vehicle.
+    """Return the probability of a serious injury (MAIS 3 or more) of an occupant by the delta-v of the vehicle.
 
     Logistic, 1 / (1 + exp(-(a + b delta-v))), from tow-away crashes of light vehicles in the United States, 2010 to
     2015 (NASS-CDS); restraint, age and intrusion are averaged over. That sample has few light crashes, and the curve
@@ -84,13 +93,17 @@ def injury_risk(delta_v: Tensor, mode: str = "all") -> Tensor:
 
     References:
         Wang, "MAIS(05/08) injury probability curves as functions of delta V", NHTSA, DOT HS 813 219, 2022.
+
+    Example:
+        >>> round(injury_risk(torch.tensor(19.0)).item(), 3)  # 42.5 mph
+        0.501
     """
     intercept, slope = _MAIS3[mode]
     return torch.sigmoid(intercept + slope * _MPH * delta_v)
 
 
 def crash_of(state: State, road: Road, before: State | None = None, dt: float = 0.1) -> Crash:
-    """The crash of the ego in each of B scenarios at the moment in which it happened.
+    """Return the crash of the ego in each of B scenarios at the moment in which it happened.
 
     Args:
         state: Traffic at that moment.
@@ -104,23 +117,23 @@ def crash_of(state: State, road: Road, before: State | None = None, dt: float = 
     """
     found = _pair_crash(state, road, before, dt, slice(0, state.x.shape[1] - 1))
     off = (found.kind == NONE) & road.off_road(state.y[:, 0])
-    return found.replaced(off, _edge_crash(state, before, dt))
+    return found.replace_where(off, _edge_crash(state, before, dt))
 
 
 def crash_of_others(state: State, road: Road, before: State | None = None, dt: float = 0.1) -> Crash:
-    """As `crash_of`, but between vehicles other than the ego, of kind "others"."""
+    """Return the crash of vehicles other than the ego, of kind "others"; arguments as of `crash_of`."""
     found = _pair_crash(state, road, before, dt, slice(state.x.shape[1] - 1, None))
     return found._replace(kind=torch.where(found.kind == NONE, NONE, OTHERS))
 
 
 def _pair_crash(state: State, road: Road, before: State | None, dt: float, which: slice) -> Crash:
-    """The first contact among some pairs of vehicles."""
+    """Return the first contact among some pairs of vehicles."""
     first, second = (list(index[which]) for index in pairs(state.x.shape[1]))
     nothing = Crash.nothing(state.x[:, 0])
     if not first:
         return nothing
     x, y, heading = road.to_world(state.x, state.y, state.heading)
-    along, across = _moved(state, road, heading, before, dt)
+    along, across = _velocities(state, road, heading, before, dt)
     one, other = heading[:, first], heading[:, second]
     dx, dy = x[:, second] - x[:, first], y[:, second] - y[:, first]
     axes = axes_of(dx, dy, one, other)
@@ -153,11 +166,11 @@ def _pair_crash(state: State, road: Road, before: State | None, dt: float, which
     risk = torch.where(lengthwise, risk, injury_risk(change))
     speed = of((dvx.square() + dvy.square()).sqrt())
     crash = Crash(kind, vehicles, speed, closing, change, risk)
-    return nothing.replaced(touching.any(1), crash)
+    return nothing.replace_where(touching.any(1), crash)
 
 
-def _moved(state: State, road: Road, heading: Tensor, before: State | None, dt: float) -> tuple[Tensor, Tensor]:
-    """Velocities in the world over the last tick [m/s], shape (B, N) each."""
+def _velocities(state: State, road: Road, heading: Tensor, before: State | None, dt: float) -> tuple[Tensor, Tensor]:
+    """Return velocities in the world over the last tick [m/s], shape (B, N) each."""
     if before is None:
         return velocities(state, heading)
     x, y, _ = road.to_world(state.x, state.y, state.heading)
@@ -166,7 +179,7 @@ def _moved(state: State, road: Road, heading: Tensor, before: State | None, dt: 
 
 
 def _approach(state: State, before: State | None, dt: float, side: Tensor, couple: Tensor) -> Tensor:
-    """Speed of the first of two vehicles towards the second, across the road or along it [m/s], shape (B,)."""
+    """Return the speed of the first of two towards the second, across the road or along it [m/s], shape (B,)."""
     along, across = velocities(state, state.heading)
     if before is not None:
         along, across = (state.x - before.x) / dt, (state.y - before.y) / dt
@@ -176,14 +189,14 @@ def _approach(state: State, before: State | None, dt: float, side: Tensor, coupl
 
 
 def _kind(axis: Tensor, turn: Tensor, ahead: Tensor) -> Tensor:
-    """Kind by the normal's angle to the heading of the first, and by whether the second is ahead of it."""
+    """Return the kind by the normal's angle to the heading of the first, and by whether the second is ahead of it."""
     angle = torch.where(axis >= 2, turn, 0.0)
     lengthwise = (torch.cos(angle).abs() >= torch.sin(angle).abs()) == (axis % 2 == 0)
     return torch.where(lengthwise, torch.where(ahead > 0, REAR_END, REAR_ENDED), SIDE)
 
 
 def _edge_crash(state: State, before: State | None, dt: float) -> Crash:
-    """The ego against the edge of the road, a wall along it."""
+    """Return the crash of the ego with the edge of the road, a wall along it."""
     crash = Crash.nothing(state.x[:, 0])
     across = state.speed[:, 0] * torch.sin(state.heading[:, 0])
     if before is not None:
@@ -195,11 +208,19 @@ def _edge_crash(state: State, before: State | None, dt: float) -> Crash:
 
 
 def describe_crash(crash: Crash, row: int = 0) -> dict[str, Any] | None:
-    """One crash in plain values, for `info` and for files; None where there was none.
+    """Return one crash in plain values, for `info` and for files; None where there was none.
 
     Returns:
         "kind" (of `CRASH_KINDS`), "vehicles" (who ran into whom), "impact_speed", "closing_speed", "delta_v" [m/s] and
         "injury_risk" (both of the two vehicles in this order).
+
+    Example:
+        >>> from rare_envs.traffic import State, straight
+        >>> x = torch.tensor([[0.0, 4.9]])  # bodies of 5 m
+        >>> state = State(x, 0 * x, 0 * x, torch.tensor([[20.0, 10.0]]), theta=x[:, :0])
+        >>> found = describe_crash(crash_of(state, straight(1)))
+        >>> found["kind"], found["vehicles"], found["delta_v"]
+        ('rear_end', [0, 1], [5.0, 5.0])
     """
     kind = CRASH_KINDS[int(crash.kind[row])]
     if kind == CRASH_KINDS[NONE]:

@@ -1,4 +1,4 @@
-"""Where vehicles are relative to each other: the lead, overlap of oriented boxes."""
+"""The lead: the vehicle ahead that a follower has to keep a distance from."""
 
 from typing import NamedTuple
 
@@ -10,7 +10,12 @@ from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
 
 
 class Lead(NamedTuple):
-    """The vehicle that a follower has to mind."""
+    """The lead of a follower.
+
+    Example:
+        >>> Lead(gap=torch.tensor([25.0]), closing_speed=torch.tensor([5.0])).gap.item()
+        25.0
+    """
 
     gap: Tensor
     """Bumper to bumper along the road [m], shape (B,); inf without a lead, negative side by side."""
@@ -19,7 +24,7 @@ class Lead(NamedTuple):
 
 
 def lead_of(state: State, road: Road) -> Lead:
-    """The ego's lead: the nearest vehicle ahead whose body reaches into the ego's lane.
+    """Return the ego's lead: the nearest vehicle ahead whose body reaches into the ego's lane.
 
     "Ahead" compares centres. A body reaches into a lane when its centre is within half a lane and half a vehicle of
     the lane's centre, which for a 4 m lane is HighwayEnv's `on_lane` with its margin of 1 m. Gaps are measured along
@@ -31,24 +36,32 @@ def lead_of(state: State, road: Road) -> Lead:
 
     Returns:
         Gap and closing speed, shape (B,) each.
+
+    Example:
+        >>> from rare_envs.traffic import straight
+        >>> x = torch.tensor([[0.0, 30.0]])
+        >>> state = State(x, 0 * x, 0 * x, torch.tensor([[20.0, 15.0]]), theta=x[:, :0])
+        >>> lead = lead_of(state, straight(1))
+        >>> lead.gap.item(), lead.closing_speed.item()  # vehicles are 5 m long
+        (25.0, 5.0)
     """
     x, y = state.x[:, 0], state.y[:, 0]
     lane_y, reach = road.centre_of(y), (road.width + VEHICLE_WIDTH) / 2
     ahead = state.x[:, 1:] - x[:, None]
-    minded = (ahead >= 0) & ((state.y[:, 1:] - lane_y[:, None]).abs() <= reach)
+    relevant = (ahead >= 0) & ((state.y[:, 1:] - lane_y[:, None]).abs() <= reach)
     along = state.speed[:, 1:] * torch.cos(state.heading[:, 1:] - state.heading[:, :1])
     nearest, lead_speed = torch.full_like(x, torch.inf), state.speed[:, 0]
-    for way, seen, speed in zip(ahead.unbind(1), minded.unbind(1), along.unbind(1), strict=True):
+    for way, seen, speed in zip(ahead.unbind(1), relevant.unbind(1), along.unbind(1), strict=True):
         nearer = seen & (way <= nearest)
         nearest, lead_speed = torch.where(nearer, way, nearest), torch.where(nearer, speed, lead_speed)
     return Lead(nearest - VEHICLE_LENGTH, state.speed[:, 0] - lead_speed)
 
 
 def lead_index(state: State, road: Road) -> Tensor:
-    """Which vehicle is the ego's lead, see `lead_of`: its index, int64, shape (B,); 0, the ego, if there is none."""
+    """Return the index of the ego's lead, see `lead_of`, int64, shape (B,); 0, the ego, if there is none."""
     x, y = state.x[:, :1], state.y[:, :1]
     ahead, reach = state.x - x, (road.width + VEHICLE_WIDTH) / 2
-    minded = (ahead >= 0) & ((state.y - road.centre_of(y)).abs() <= reach)
-    way = torch.where(minded, ahead, torch.inf)[:, 1:]
+    relevant = (ahead >= 0) & ((state.y - road.centre_of(y)).abs() <= reach)
+    way = torch.where(relevant, ahead, torch.inf)[:, 1:]
     least, found = way.flip(1).min(1)  # of vehicles level with each other the last one, as in `lead_of`
     return torch.where(least < torch.inf, way.shape[1] - found, 0)

@@ -88,7 +88,7 @@ def boxes_overlap(
 
 
 def project_on_axes(x: Tensor, y: Tensor, heading: Tensor, other_heading: Tensor) -> Tensor:
-    """A vector along the four axes.
+    """Return a vector along the four axes.
 
     Args:
         x: Component along the world's X axis, any shape; the other tensors have the same.
@@ -107,7 +107,7 @@ def project_on_axes(x: Tensor, y: Tensor, heading: Tensor, other_heading: Tensor
 
 
 def axes_of(dx: Tensor, dy: Tensor, heading: Tensor, other_heading: Tensor) -> Axes:
-    """Two bodies along their four axes.
+    """Return two bodies along their four axes.
 
     Args:
         dx: Centre of the other less centre of the first [m], any shape; the other tensors have the same.
@@ -124,7 +124,7 @@ def axes_of(dx: Tensor, dy: Tensor, heading: Tensor, other_heading: Tensor) -> A
 
 
 def separation(axes: Axes) -> Tensor:
-    """The largest gap along an axis [m], shape (...).
+    """Return the largest gap along an axis [m], shape (...).
 
     Positive if and only if the bodies are apart, then at most their distance; else the negative depth of their overlap:
     the least way that one has to be moved to be clear of the other.
@@ -133,7 +133,7 @@ def separation(axes: Axes) -> Tensor:
 
 
 def box_distance(axes: Axes, turn: Tensor) -> Tensor:
-    """Exact distance between two bodies [m], the negative depth of their overlap if they do.
+    """Return the exact distance between two bodies [m], the negative depth of their overlap if they do.
 
     The distance of two convex polygons that are apart is that of a corner of one from the other.
 
@@ -152,7 +152,7 @@ def box_distance(axes: Axes, turn: Tensor) -> Tensor:
 
 
 def _corner_distance(along: Tensor, across: Tensor, turn: Tensor) -> Tensor:
-    """Least distance [m] of a corner of a turned box, centred at (along, across), from an unturned one at 0."""
+    """Return the least distance [m] of a corner of a turned box at (along, across) from an unturned one at 0."""
     half_length, half_width = _LENGTHS
     cos, sin = torch.cos(turn)[..., None], torch.sin(turn)[..., None]
     u = cos.new_tensor([half_length, half_length, -half_length, -half_length])
@@ -166,7 +166,7 @@ def _corner_distance(along: Tensor, across: Tensor, turn: Tensor) -> Tensor:
 
 
 def crossing(axes: Axes, rate: Tensor) -> Crossing:
-    """When the bodies overlap along each axis.
+    """Return when the bodies overlap along each axis.
 
     Args:
         axes: Of the two bodies now.
@@ -180,7 +180,7 @@ def crossing(axes: Axes, rate: Tensor) -> Crossing:
 
 
 def time_to_contact(axes: Axes, rate: Tensor) -> Tensor:
-    """Exact time until two bodies touch if velocities and headings stay [s]: a swept test on the four axes.
+    """Return the exact time until two bodies touch if velocities and headings stay [s]: a swept test on the four axes.
 
     They overlap while they do along every axis: from the last entry to the first exit.
 

@@ -1,4 +1,4 @@
-"""Vehicles pair by pair in the flat world: where their bodies are to each other, and how they move."""
+"""Pairs of vehicles in the flat world: relative pose and relative velocity of their bodies."""
 
 from functools import lru_cache
 from typing import NamedTuple
@@ -24,23 +24,23 @@ class Encounter(NamedTuple):
 
 @lru_cache(maxsize=32)
 def pairs(vehicles: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Every pair of vehicles once, the lower index first; those of the ego come first."""
+    """Return every pair of vehicles once, the lower index first; those of the ego come first."""
     both = [(i, j) for i in range(vehicles) for j in range(i + 1, vehicles)]
     return tuple(i for i, _ in both), tuple(j for _, j in both)
 
 
 def velocities(state: State, heading: Tensor) -> tuple[Tensor, Tensor]:
-    """Velocities along the axes that headings (B, N) are measured from [m/s], shape (B, N) each."""
+    """Return velocities along the axes that headings (B, N) are measured from [m/s], shape (B, N) each."""
     return state.speed * torch.cos(heading), state.speed * torch.sin(heading)
 
 
 def least(values: Tensor, nobody: float) -> Tensor:
-    """The least over pairs (B, P), shape (B,), and at most what it is where there is nobody else."""
+    """Return the least over pairs (B, P), shape (B,), and at most the value for nobody."""
     return torch.nn.functional.pad(values, (0, 1), value=nobody).amin(1)
 
 
 def encounter(state: State, road: Road) -> Encounter:
-    """The ego with each of the N - 1 other vehicles.
+    """Return the ego with each of the N - 1 other vehicles.
 
     They are compared in the world: where the road turns, ways along it are not distances.
     """

@@ -1,4 +1,4 @@
-"""Roads: where their lanes are, and from road coordinates to those of a flat world and back.
+"""Roads: their lanes, and the transformation from road coordinates to a flat world and back.
 
 Road coordinates are x along the road's reference line [m], y across it and positive to the right, headings relative to
 it. In a straight road they are world coordinates too.
@@ -19,7 +19,13 @@ from rare_envs.traffic.reference_line import ReferenceLine
 
 
 class WorldPose(NamedTuple):
-    """Vehicles in the flat world; all of one shape."""
+    """Vehicles in the flat world; all of one shape.
+
+    Example:
+        >>> zero = torch.zeros(1)
+        >>> i80().place(zero + 300.0, zero, zero).heading.sign().tolist()  # the road has turned to the left
+        [-1.0]
+    """
 
     x: Tensor
     """[m]."""
@@ -33,7 +39,15 @@ class WorldPose(NamedTuple):
 
 @dataclass(frozen=True)
 class Road:
-    """Lanes beside each other along a line. Lane 0 is the leftmost; all tensors may have any shape."""
+    """Lanes beside each other along a line. Lane 0 is the leftmost; all tensors may have any shape.
+
+    Example:
+        >>> road = Road(edges=(-2.0, 2.0, 5.5))
+        >>> road.lanes, road.width, road.centre(1)
+        (2, 3.75, 3.75)
+        >>> road.lane_of(torch.tensor([0.0, 3.0])).tolist(), road.off_road(torch.tensor([6.0])).tolist()
+        ([0, 1], [True])
+    """
 
     edges: tuple[float, ...]
     """y of the lines that bound the lanes [m], from left to right: one more than there are lanes."""
@@ -66,16 +80,16 @@ class Road:
         return all(abs(right - left - self.width) < 1e-9 for left, right in pairwise(self.edges))
 
     def centre(self, lane: int) -> float:
-        """Centre of a lane, its y [m]."""
+        """Return the centre of a lane, its y [m]."""
         return (self.edges[lane] + self.edges[lane + 1]) / 2
 
     def lane_of(self, y: Tensor) -> Tensor:
-        """Index of the lane that y is in, int64; beyond the road's edge it is the outermost lane."""
+        """Return the index of the lane that y is in, int64; beyond the road's edge it is the outermost lane."""
         inner, _, _ = _lane_table(self, y.dtype, y.device)
         return (y >= inner.view(-1, *[1] * y.ndim)).sum(0)  # three times as fast as a search
 
     def centre_of(self, y: Tensor) -> Tensor:
-        """Centre of the lane that y is in, its y [m]."""
+        """Return the centre of the lane that y is in, its y [m]."""
         if not self.equal:
             _, left, right = _lane_table(self, y.dtype, y.device)
             lane = self.lane_of(y)
@@ -87,21 +101,21 @@ class Road:
         return lane * self.width + first if first else lane * self.width
 
     def markers(self, y: Tensor) -> tuple[Tensor, Tensor]:
-        """Distances to the left and right marker of the own lane [m], negative beyond it, which is off the road."""
+        """Return the distances to the left and right marker of the own lane [m], negative beyond it: off the road."""
         _, left, right = _lane_table(self, y.dtype, y.device)
         lane = self.lane_of(y)
         return y - left[lane], right[lane] - y
 
     def off_road(self, y: Tensor) -> Tensor:
-        """Whether y is beyond an outer edge of the road."""
+        """Return whether y is beyond an outer edge of the road."""
         return (y - self.middle).abs() > (self.edges[-1] - self.edges[0]) / 2
 
     def curvature(self, x: Tensor) -> Tensor:
-        """Curvature of the reference line [1/m], positive where the road turns to the right."""
+        """Return the curvature of the reference line [1/m], positive where the road turns to the right."""
         return torch.zeros_like(x) if self.reference_line is None else self.reference_line.curvature_at(x)
 
     def to_world(self, x: Tensor, y: Tensor, heading: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """From road to world coordinates.
+        """Transform road to world coordinates.
 
         The world is flat. Its X axis is the reference line's tangent at x = 0, its Y axis points to the right of it.
 
@@ -118,7 +132,7 @@ class Road:
         return self.place(x, y, heading)[:3]
 
     def place(self, x: Tensor, y: Tensor, heading: Tensor) -> "WorldPose":
-        """`to_world`, and the curvature of the reference line at x, in one."""
+        """Return world coordinates as `to_world` does, and with them the curvature of the reference line at x."""
         if self.reference_line is None:
             return WorldPose(x, y, heading, torch.zeros_like(x))
         point = self.reference_line.at(x)
@@ -130,7 +144,7 @@ class Road:
         )
 
     def from_world(self, x: Tensor, y: Tensor, heading: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """From world to road coordinates, the inverse of `to_world`.
+        """Transform world to road coordinates, the inverse of `to_world`.
 
         Args:
             x: X [m].
@@ -150,22 +164,35 @@ class Road:
 
 @lru_cache(maxsize=32)
 def _lane_table(road: Road, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-    """Lines between lanes, and the left and the right line of each lane."""
+    """Return the lines between lanes, and the left and the right line of each lane."""
     with torch.inference_mode(False):  # tables made under it could not be used for gradients later
         edges = torch.tensor(road.edges, dtype=dtype, device=device)
         return edges[1:-1].contiguous(), edges[:-1].contiguous(), edges[1:].contiguous()
 
 
 def straight(lanes: int, width: float = 4.0) -> Road:
-    """A straight road of equal lanes; lane 0 is centred on y = 0."""
+    """Return a straight road of equal lanes; lane 0 is centred on y = 0.
+
+    Args:
+        lanes: Number of lanes.
+        width: Of each [m].
+
+    Example:
+        >>> straight(2).edges
+        (-2.0, 2.0, 6.0)
+    """
     return Road(tuple((k - 0.5) * width for k in range(lanes + 1)))
 
 
 @cache
 def i80() -> Road:
-    """Interstate 80 at Emeryville, California: six curved lanes, 700 m, then straight on.
+    """Return Interstate 80 at Emeryville, California: six curved lanes, 700 m, then straight on.
 
     The reference line is the middle of the leftmost lane; `training.scenario_fitting.i80_road` fitted it to the survey.
+
+    Example:
+        >>> i80().lanes, round(i80().width, 2)
+        (6, 3.66)
     """
     text = (resources.files("rare_envs") / "data" / "i80.json").read_text(encoding="utf-8")
     table = json.loads(text)

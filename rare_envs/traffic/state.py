@@ -1,4 +1,4 @@
-"""The state of B traffic scenarios with N vehicles each."""
+"""Traffic states: B scenarios with N vehicles each."""
 
 from typing import NamedTuple
 
@@ -17,6 +17,13 @@ class State(NamedTuple):
 
     The frame is HighwayEnv's: x along the road, y across it and positive to the right, the ego's first lane centred
     on y = 0. Tensors are updated by `_replace`, never in place.
+
+    Example:
+        >>> import torch
+        >>> x = torch.tensor([[0.0, 30.0]])  # one scenario, two vehicles
+        >>> state = State(x, y=0 * x, heading=0 * x, speed=torch.tensor([[20.0, 15.0]]), theta=x[:, :0])
+        >>> state.seen_by(1).speed.tolist()
+        [[15.0, 20.0]]
     """
 
     x: Tensor
@@ -31,7 +38,7 @@ class State(NamedTuple):
     """What the scenario fixes for the whole episode, shape (B, P); the scenario says what the P columns are."""
 
     def seen_by(self, vehicle: int) -> "State":
-        """The same traffic with another vehicle in the ego's place; the others follow in their order.
+        """Return the same traffic with another vehicle in the ego's place; the others follow in their order.
 
         Args:
             vehicle: Index of the vehicle that becomes number 0.

@@ -50,6 +50,12 @@ def bicycle(
 
     References:
         Polack et al., "The kinematic bicycle model", 2017; HighwayEnv, `vehicle/kinematics.py`.
+
+    Example:
+        >>> zero = torch.zeros(1)
+        >>> x, y, heading, speed = bicycle(zero, zero, zero, zero + 20.0, zero + 1.0, zero, dt=0.1)
+        >>> round(x.item(), 2), round(speed.item(), 2)
+        (2.0, 20.1)
     """
     slip = torch.atan(torch.tan(steering) * 0.5)
     course = heading + slip
@@ -66,7 +72,7 @@ def bicycle(
 
 
 def steering_for(yaw_rate: Tensor, speed: Tensor) -> Tensor:
-    """The steering angle with which `bicycle` turns at a yaw rate.
+    """Return the steering angle with which `bicycle` turns at a yaw rate.
 
     Inverts yaw rate = v sin(beta) / (l / 2), beta = atan(tan(steering) / 2), with l the vehicle's length. A vehicle
     too slow to turn as fast as wanted steers by `STEERING_LIMIT`.
@@ -111,6 +117,12 @@ def point_mass(
     References:
         O'Kelly, Sinha, Namkoong, Duchi and Tedrake, "Scalable end-to-end autonomous vehicle testing via rare-event
         simulation", 2018: the model of their released simulator.
+
+    Example:
+        >>> zero = torch.zeros(1)
+        >>> x, y, heading, speed = point_mass(zero, zero, zero, zero + 20.0, zero, zero + 0.3, dt=0.1)
+        >>> round(heading.item(), 3)
+        0.03
     """
     distance = speed * dt
     ahead, turn = distance * torch.cos(heading), yaw_rate * dt
@@ -120,6 +132,6 @@ def point_mass(
 
 
 def _along_curve(ahead: Tensor, turn: Tensor, y: Tensor, curvature: Tensor) -> tuple[Tensor, Tensor]:
-    """Way of the reference line [m] and turn relative to it [rad] of vehicles that go `ahead` [m] and `turn` [rad]."""
+    """Return the way along the reference line [m] and the turn relative to it [rad], for way and turn in the world."""
     ahead = ahead / (1.0 - curvature * y)
     return ahead, turn - curvature * ahead

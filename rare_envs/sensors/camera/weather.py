@@ -13,9 +13,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from rare_envs.arrays import FloatArray
 from rare_envs.distributions.beta import BetaDistribution
 from rare_envs.distributions.log_mixture import LogMixture
-from rare_envs.distributions.space import Array, Distribution, Parameter
+from rare_envs.distributions.space import Distribution, Parameter
 from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
 from rare_envs.sensors.camera.pinhole import Camera
 
@@ -49,23 +50,23 @@ class LogNormalDistribution:
         """The law of the logarithm."""
         return self._law.mixture
 
-    def sample(self, n: int, rng: np.random.Generator) -> Array:
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Independent points, shape (n, 1)."""
         return self._law.sample(n, rng)
 
-    def log_prob(self, x: Array) -> Array:
+    def log_prob(self, x: FloatArray) -> FloatArray:
         """Log density, (n, 1) -> (n,); -inf outside the range."""
         return self._law.log_prob(x)
 
-    def to_standard_normal(self, x: Array) -> Array:
+    def to_standard_normal(self, x: FloatArray) -> FloatArray:
         """Map (n, 1) -> (n, 1)."""
         return self._law.to_standard_normal(x)
 
-    def from_standard_normal(self, u: Array) -> Array:
+    def from_standard_normal(self, u: FloatArray) -> FloatArray:
         """Inverse of `to_standard_normal`, (n, 1) -> (n, 1)."""
         return self._law.from_standard_normal(u)
 
-    def project(self, x: Array, weights: Array, alpha: float) -> "LogNormalDistribution":
+    def project(self, x: FloatArray, weights: FloatArray, alpha: float) -> "LogNormalDistribution":
         """The law with its median moved towards that of weighted points, by the part alpha of the way in logarithms."""
         logs = np.log(np.clip(x[:, 0], self.low, self.high))
         wanted = float(np.sum(weights * logs) / np.sum(weights))

@@ -8,11 +8,12 @@ import numpy as np
 from gymnasium import spaces
 
 from agents.sb3.saved_ego import SavedEgo
+from rare_envs.arrays import AnyArray
 from rare_envs.egos.errors import reason_of
 from rare_envs.egos.wrappers import find_frame_stacking
 from rare_envs.sensors.kinds import each
 from rare_envs.study.ego_check.findings import Finding, report_failure, report_pass, report_warning
-from rare_envs.study.ego_check.probe import BATCH_ROWS, Array, Probe
+from rare_envs.study.ego_check.probe import BATCH_ROWS, Probe
 
 OUTLYING = 5.0
 """Standard deviations of the training; observations beyond are unlike those that the ego was trained on."""
@@ -174,6 +175,6 @@ def check_extreme_observations(probe: Probe) -> Iterator[Finding]:
         yield report_pass("NaN", f"refused: {reason_of(error)}")
 
 
-def _fill_with_bound(bound: Array, unbounded: float, part: Array) -> Array:
+def _fill_with_bound(bound: AnyArray, unbounded: float, part: AnyArray) -> AnyArray:
     """Return observations at a bound of their space, or at `unbounded` where it has none."""
     return np.broadcast_to(np.where(np.isfinite(bound), bound, unbounded), part.shape).astype(part.dtype)

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import torch
 from gymnasium import spaces
-from numpy.typing import NDArray
 
 from rare_envs import DrivingProblem
+from rare_envs.arrays import AnyArray
 from rare_envs.egos.policy import PolicyDriver
 from rare_envs.sensors.kinds import batch_size, each
 from rare_envs.simulation.observation import observe
@@ -19,8 +19,6 @@ from rare_envs.simulation.rollout import drive
 
 BATCH_ROWS = 32
 """Observations in a query."""
-
-Array = NDArray[Any]
 
 
 @dataclass(frozen=True)
@@ -46,7 +44,7 @@ class Probe:
         """Space of the environment's observations."""
         return self.problem.world.observation_space
 
-    def transform_seen(self, change: Callable[[Array], Any]) -> Any:
+    def transform_seen(self, change: Callable[[AnyArray], Any]) -> Any:
         """Return the observations after a function, each of its own type."""
         return each(lambda part: np.asarray(change(part)).astype(part.dtype), self.seen)
 
@@ -59,7 +57,7 @@ class Probe:
         """Policy of the ego with the wrappers of its training; None if the ego is a driver."""
         return self.problem.driver.policy if isinstance(self.problem.driver, PolicyDriver) else None
 
-    def query(self, observation: Any, state: Any = None, start: Any = None) -> tuple[Array, Any]:
+    def query(self, observation: Any, state: Any = None, start: Any = None) -> tuple[AnyArray, Any]:
         """Return the actions as numbers, and the memory."""
         begun = np.full(batch_size(observation), state is None) if start is None else start
         action, state = self.policy.predict(
@@ -68,7 +66,7 @@ class Probe:
         return np.asarray(action), state
 
 
-def largest_difference(one: Array, other: Array) -> float:
+def largest_difference(one: AnyArray, other: AnyArray) -> float:
     """Return the largest difference of actions; infinite where shapes or NaN differ."""
     if one.shape != other.shape:
         return np.inf

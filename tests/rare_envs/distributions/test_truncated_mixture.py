@@ -9,7 +9,7 @@ from scipy import stats
 from scipy.special import ndtri_exp
 
 from rare_envs.distributions.log_mixture import LogMixture
-from rare_envs.distributions.truncated_mixture import CHUNK, TruncatedGaussianMixture
+from rare_envs.distributions.truncated_mixture import CHUNK_ROWS, TruncatedGaussianMixture
 from rare_envs.distributions.truncated_normal import log_interval
 from rare_envs.scenarios.base_distributions import load_base
 from rare_envs.scenarios.registry import SCENARIOS, scenario_named
@@ -273,7 +273,7 @@ def test_rows_stand_alone_bit_for_bit(case):
 
 def test_sample_is_seeded_and_its_first_rows_do_not_depend_on_n():
     law = random_mixture(*CUT_3D)
-    long = law.sample(CHUNK + 100, np.random.default_rng(1))
+    long = law.sample(CHUNK_ROWS + 100, np.random.default_rng(1))
     assert (long[:50] == law.sample(50, np.random.default_rng(1))).all()
     assert not (long[:50] == law.sample(50, np.random.default_rng(2))).any()
     assert ((long > law.low) & (long < law.high)).all()

@@ -10,7 +10,7 @@ import torch
 
 from rare_envs.control.idm import IDM
 from rare_envs.distributions.space import Parameter
-from rare_envs.envs.rendering import STRIP, WIDTH, Renderer
+from rare_envs.envs.rendering import TEXT_HEIGHT, WIDTH, Renderer
 from rare_envs.scenarios.base import Others, Scenario, columns
 from rare_envs.scenarios.highway import HIGHWAY
 from rare_envs.simulation.rollout import drive
@@ -285,8 +285,8 @@ def test_a_curved_road_is_drawn_in_the_world() -> None:
     for x in (0.0, 400.0, 1500.0):
         state = pair(x, road.centre(1), x + 30.0, road.centre(4))
         image = renderer.draw(world.start_from(state, None))
-        assert image.shape == (240 + 2 * STRIP, WIDTH, 3)
-        image = image[STRIP:-STRIP]
+        assert image.shape == (240 + 2 * TEXT_HEIGHT, WIDTH, 3)
+        image = image[TEXT_HEIGHT:-TEXT_HEIGHT]
         at = {}
         for name, ahead, y in [
             ("ego", 0.0, road.centre(1)),
