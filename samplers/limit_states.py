@@ -25,7 +25,7 @@ class Reference(NamedTuple):
 
 
 def half_space(dim: int = 2, beta: float = 3.5) -> Reference:
-    """Half-space, f = beta - sum(u) / sqrt(d): p = Phi(-beta) in any dimension."""
+    """Return the half-space f = beta - sum(u) / sqrt(d): p = Phi(-beta) in any dimension."""
 
     def f(u: FloatArray) -> FloatArray:
         return np.asarray(beta - u.sum(axis=1) / math.sqrt(dim))
@@ -34,7 +34,7 @@ def half_space(dim: int = 2, beta: float = 3.5) -> Reference:
 
 
 def two_modes(distance: float = 2.0) -> Reference:
-    """Two quarter planes of equal weight: f = distance - max(min(u1, u2), min(-u1, u2)).
+    """Return two quarter planes of equal weight: f = distance - max(min(u1, u2), min(-u1, u2)).
 
     p = 2 Phi(-distance)^2, 1.035e-3 for distance 2. The demonstration problem of Norden,
     O'Kelly and Sinha, "Efficient black-box assessment of autonomous vehicle safety", 2019.
@@ -47,7 +47,7 @@ def two_modes(distance: float = 2.0) -> Reference:
 
 
 def parabola(beta: float = 3.3, curvature: float = 0.2) -> Reference:
-    """One design point with a boundary that curves away: f = beta + curvature u1^2 - u2."""
+    """Return one design point with a boundary that curves away: f = beta + curvature u1^2 - u2."""
 
     def f(u: FloatArray) -> FloatArray:
         return np.asarray(beta + curvature * u[:, 0] ** 2 - u[:, 1])
@@ -56,7 +56,7 @@ def parabola(beta: float = 3.3, curvature: float = 0.2) -> Reference:
 
 
 def four_branches(k: float = 3.5) -> Reference:
-    """Series system of four branches: two parabolas and two planes around the origin."""
+    """Return a series system of four branches: two parabolas and two planes around the origin."""
 
     def f(u: FloatArray) -> FloatArray:
         s, t = (u[:, 0] - u[:, 1]) / math.sqrt(2), (u[:, 0] + u[:, 1]) / math.sqrt(2)
@@ -68,7 +68,7 @@ def four_branches(k: float = 3.5) -> Reference:
 
 
 def plateau(dim: int = 3, beta: float = 3.5, tied: float = 0.6) -> Reference:
-    """Like a time to collision: -1 on failure, else in [0.5, cap], the share `tied` at the cap."""
+    """Return an f like a time to collision: -1 on failure, else in [0.5, cap], the share `tied` at the cap."""
     direction = np.arange(1.0, dim + 1) / np.linalg.norm(np.arange(1.0, dim + 1))
     cap = 0.5 + 3 * (beta - float(ndtri(tied)))
 
@@ -80,7 +80,7 @@ def plateau(dim: int = 3, beta: float = 3.5, tied: float = 0.6) -> Reference:
 
 
 def shell(dim: int = 20, p: float = 1e-4) -> Reference:
-    """Failure in every direction, beyond a radius: f = r - |u|."""
+    """Return failure in every direction, beyond a radius: f = r - |u|."""
     radius = math.sqrt(float(chi2.isf(p, dim)))
 
     def f(u: FloatArray) -> FloatArray:
@@ -89,15 +89,14 @@ def shell(dim: int = 20, p: float = 1e-4) -> Reference:
     return _reference(f"shell_d{dim}", f, dim, p)
 
 
-def unannounced(announced: float = 4.0, hidden: float = 3.1) -> Reference:
-    """Two ways to fail, of which f announces the rarer one only: 3 % of p.
+def unannounced_region(announced: float = 4.0, hidden: float = 3.1) -> Reference:
+    """Return two regions of failure, of which f announces only the rarer one: 3 % of p.
 
     f = announced - u1 falls towards u1 > announced; u1 < -hidden, on the far side, where f is
     largest, fails without a sign (f = -1). Methods that follow f downhill find the hidden region
-    by a lucky early draw or not at all, and then answer with P[u1 > announced] = 3.2e-5 and a
-    narrow interval that does not hold p = 9.99e-4. This problem is for measuring that: how often
-    a method misses such a region and whether anything warns of it. No method here is expected to
-    cover p.
+    by a lucky early draw or not at all, and then return P[u1 > announced] = 3.2e-5 and a
+    narrow interval that does not hold p = 9.99e-4. This problem measures how often a method misses
+    such a region and whether it warns of that. No method here is expected to cover p.
     """
 
     def f(u: FloatArray) -> FloatArray:
@@ -107,8 +106,8 @@ def unannounced(announced: float = 4.0, hidden: float = 3.1) -> Reference:
 
 
 def references() -> list[Reference]:
-    """Return one of each kind, for benchmarks; intervals need not hold the p of `unannounced`."""
-    return [half_space(), two_modes(), parabola(), four_branches(), plateau(), shell(), unannounced()]
+    """Return one of each kind, for benchmarks; intervals need not hold the p of `unannounced_region`."""
+    return [half_space(), two_modes(), parabola(), four_branches(), plateau(), shell(), unannounced_region()]
 
 
 def _reference(name: str, f: Callable[[FloatArray], ArrayLike], dim: int, p: float) -> Reference:

@@ -102,7 +102,7 @@ class Problem(Inputs, Protocol):
 
 
 @runtime_checkable
-class Conditional(Protocol):
+class ConditionalProblem(Protocol):
     """A problem that holds something fixed, so that its p is conditional on it."""
 
     @property
@@ -112,7 +112,7 @@ class Conditional(Protocol):
 
 def condition_of(problem: Inputs) -> str:
     """Return what a problem holds fixed, in words; empty for nothing."""
-    return str(problem.given) if isinstance(problem, Conditional) else ""
+    return str(problem.given) if isinstance(problem, ConditionalProblem) else ""
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from samplers.analysis.curve import Curve, compute_curve
 from samplers.analysis.failure_modes import Share, split_by_kind
-from samplers.analysis.reweighting import HasLogProb, Reweighted, reweight
+from samplers.analysis.reweighting import HasLogProb, Reweighted, reweight_estimate
 from samplers.method import Stepping
 from samplers.problem import Distribution, FloatArray
 from samplers.sample import Sample
@@ -223,7 +223,7 @@ class Estimate:
             >>> print(f"{result.reweight(Shifted()).p:.4f}")  # Phi(-2.5) = 0.0062
             0.0062
         """
-        return reweight(self, new_base)
+        return reweight_estimate(self, new_base)
 
     def shares(self, label: Callable[[FloatArray], Sequence[str]], most: int | None = None) -> dict[str, Share]:
         """Return p by kind of failure, from the same simulations; the kinds' p add up to p.

@@ -1,6 +1,4 @@
-"""What every method must do, as checks to run on a method of your own.
-
-    check_method(Lattice(points=100))
+"""Testing: checks that every method must pass, for a method of your own.
 
 A method that fails raises an AssertionError that says what was expected. The seeds are fixed, so
 the same method passes or fails every time. All runs together take a few 100,000 calls of cheap
@@ -34,22 +32,31 @@ def check_method(method: Stepping) -> None:
         method: With the settings to check; `check_counts` also runs it without max_sim.
 
     Raises:
-        AssertionError: The method does not do what a method must; the text says what.
+        AssertionError: If a check fails; the text says what was expected.
+
+    Example:
+        >>> import samplers
+        >>> from samplers import testing
+        >>> testing.check_form(samplers.MonteCarlo())  # check_method(...) runs this check and all others
+        >>> testing.check_form("mc")
+        Traceback (most recent call last):
+            ...
+        AssertionError: 'mc': expected the attributes name, stops_at_target and steps.
     """
     for check in METHOD_CHECKS:
         check(method)
 
 
 def check_form(method: Stepping) -> None:
-    """It has a name, says whether it stops at the target, and has steps."""
+    """Check that the method has a name, says whether it stops at the target, and has steps."""
     _expect(isinstance(method, Stepping), method, "expected the attributes name, stops_at_target and steps")
     _expect(isinstance(method.name, str) and method.name != "", method, f"expected a name, got {method.name!r}")
-    told = method.stops_at_target
-    _expect(isinstance(told, bool), method, f"expected stops_at_target to be True or False, got {told!r}")
+    stops = method.stops_at_target
+    _expect(isinstance(stops, bool), method, f"expected stops_at_target to be True or False, got {stops!r}")
 
 
 def check_counts(method: Stepping) -> None:
-    """Every simulation is in n_sim and in exactly one level of the trace; points with f <= gamma are failures."""
+    """Check that every simulation is in n_sim and in one level of the trace, every failing point in the failures."""
     for max_sim in (None, 2500):
         f = _Counting(half_space(2, 3.0).problem.f)
         result = estimate(FunctionProblem(f, 2), method, seed=3, max_sim=max_sim)
@@ -59,7 +66,7 @@ def check_counts(method: Stepping) -> None:
 
 
 def check_budget(method: Stepping) -> None:
-    """max_sim is never exceeded, however small, and alone or shared by replicates."""
+    """Check that max_sim is never exceeded, however small, by one run or by replicates together."""
     for max_sim, replicates in [(1, 1), (2, 1), (7, 1), (7, 7), (50, 1), (500, 1), (1001, 3), (1950, 1), (3000, 1)]:
         f = _Counting(half_space(2, 3.0).problem.f)
         result = estimate(FunctionProblem(f, 2), method, seed=3, max_sim=max_sim, replicates=replicates)
@@ -70,7 +77,7 @@ def check_budget(method: Stepping) -> None:
 
 
 def check_seed(method: Stepping) -> None:
-    """The same seed gives the same answer, another seed another; nothing comes from global generators.
+    """Check that the seed alone decides the result: nothing is drawn from global generators.
 
     The generators are watched in a run that repeats one made before: a first run may import a library, and some draw
     while they are imported.
@@ -85,16 +92,16 @@ def check_seed(method: Stepping) -> None:
 
 
 def check_no_failure(method: Stepping) -> None:
-    """Nothing fails: p = 0 with a one-sided interval and a warning, also where f goes downhill."""
+    """Check that p = 0 with a one-sided interval and a warning where nothing fails, also where f goes downhill."""
     for dim in (1, 2, 6):
         result = estimate(_constant(10.0, dim), method, seed=1, max_sim=5000)
-        _expect_none(method, result)
+        _expect_no_failure(method, result)
         _expect(result.interval[1] < 0.02, method, f"5000 points without failure bound p by {result.interval[1]:.2g}")
-    _expect_none(method, estimate(FunctionProblem(lambda x: 30 - x[:, 0], 3), method, seed=1, max_sim=3000))
+    _expect_no_failure(method, estimate(FunctionProblem(lambda x: 30 - x[:, 0], 3), method, seed=1, max_sim=3000))
 
 
 def check_failure_everywhere(method: Stepping) -> None:
-    """Everything fails: p = 1 without error, the interval reaches down a little."""
+    """Check that p = 1 with an interval that reaches down a little where everything fails."""
     for dim in (1, 2):
         result = estimate(_constant(-1.0, dim), method, seed=1, max_sim=3000)
         low, high = result.interval
@@ -104,20 +111,20 @@ def check_failure_everywhere(method: Stepping) -> None:
 
 
 def check_ties(method: Stepping) -> None:
-    """Equality with gamma is failure; a handful of distinct outcomes do not confuse it."""
+    """Check that equality with gamma is failure, on an f with few distinct values."""
     for seed in range(5):
         problem = FunctionProblem(lambda x: np.floor(x[:, 0] + 4.5), 2)
         _expect_near(method, estimate(problem, method, gamma=2.0, seed=seed, max_sim=5000), _phi(-1.5), "whole numbers")
 
 
 def check_infinite(method: Stepping) -> None:
-    """Outcomes may be +inf and -inf."""
+    """Check that outcomes may be +inf and -inf."""
     problem = FunctionProblem(lambda x: np.where(x[:, 0] > 1.5, -np.inf, np.inf), 2)
     _expect_near(method, estimate(problem, method, seed=1, max_sim=5000), _phi(-1.5), "infinite outcomes")
 
 
 def check_missing(method: Stepping) -> None:
-    """Rows without an outcome count as failing."""
+    """Check that rows without an outcome count as failing."""
 
     def f(x: FloatArray) -> FloatArray:
         return np.where(x[:, 1] > 1.5, np.nan, 10.0 - x[:, 0])
@@ -127,7 +134,7 @@ def check_missing(method: Stepping) -> None:
 
 
 def check_dimensions(method: Stepping) -> None:
-    """One dimension is enough, and with 1,500 the result is right or warns."""
+    """Check that one dimension is enough, and that with 1,500 the result is right or has a warning."""
     result = estimate(half_space(1, 2.0).problem, method, seed=1, max_sim=5000)
     _expect_near(method, result, _phi(-2.0), "one dimension")
     f = _Counting(half_space(1500, 2.0).problem.f)
@@ -138,7 +145,7 @@ def check_dimensions(method: Stepping) -> None:
 
 
 def check_interruption(method: Stepping) -> None:
-    """Stopped after any batch, what has been simulated is in the result."""
+    """Check that a run that is stopped after any batch has a result with all that was simulated."""
     reference = half_space(2, 3.0)
     arguments = RunArguments(seed=2, max_sim=4000)
     whole = Run(reference.problem, method, arguments)
@@ -160,7 +167,7 @@ def check_interruption(method: Stepping) -> None:
 
 
 def check_sample(method: Stepping) -> None:
-    """The weighted points behind p, where it gives them, fit together and give p, also at thresholds passed."""
+    """Check that the weighted points behind p, if there are any, add up to p and give a curve that holds the truth."""
     result = estimate(half_space(2, 2.0).problem, method, seed=4, max_sim=3000, replicates=2)
     sample = result.sample
     if sample is None:
@@ -179,8 +186,8 @@ def check_sample(method: Stepping) -> None:
     _expect(bool(held.all()), method, f"the curve misses {truth}:\n{curve}")
 
 
-def check_right(method: Stepping) -> None:
-    """Ten runs on an easy problem are not wildly wrong: a first look, no proof."""
+def check_accuracy(method: Stepping) -> None:
+    """Check ten runs on an easy problem for gross errors; this does not prove that the method is right."""
     reference = half_space(2, 2.0)
     results = [estimate(reference.problem, method, seed=seed, max_sim=2000) for seed in range(10)]
     ratios = np.array([result.p for result in results]) / reference.p
@@ -203,12 +210,12 @@ METHOD_CHECKS: tuple[Callable[[Stepping], None], ...] = (
     check_dimensions,
     check_interruption,
     check_sample,
-    check_right,
+    check_accuracy,
 )
 
 
 class _Counting:
-    """f with its own books."""
+    """f that counts its rows and those of them that fail."""
 
     def __init__(self, f: Callable[[FloatArray], object]) -> None:
         self.rows = self.failing = 0
@@ -223,7 +230,7 @@ class _Counting:
 
 def _expect(holds: bool, method: Stepping, otherwise: str) -> None:
     if not holds:
-        raise AssertionError(f"{getattr(method, 'name', method)!r}: {otherwise}.")
+        raise AssertionError(f"{getattr(method, 'name', method)!r}: {otherwise}.")  # a user's object
 
 
 def _expect_sound(method: Stepping, result: Estimate, rows: int) -> None:
@@ -235,10 +242,10 @@ def _expect_sound(method: Stepping, result: Estimate, rows: int) -> None:
     _expect(0 <= drawn <= rows, method, f"expected at most {rows} base draws, the result has {drawn}")
     _expect(0 < result.unseen <= 1, method, f"expected unseen in (0, 1], got {result.unseen}")
     _expect(result.cov >= 0, method, f"expected a c.o.v. of at least 0, got {result.cov}")
-    _expect(result.p > 0 or high > 0, method, "p = 0 is no certainty: expected an upper end above 0")
+    _expect(result.p > 0 or high > 0, method, "p = 0 is never certain: expected an upper end above 0")
 
 
-def _expect_none(method: Stepping, result: Estimate) -> None:
+def _expect_no_failure(method: Stepping, result: Estimate) -> None:
     low, high = result.interval
     _expect(result.p == low == 0 < high, method, f"nothing failed: expected p = 0, interval (0, more), got\n{result}")
     _expect(len(result.failures) == 0, method, "nothing failed, but the result has failures")

@@ -10,6 +10,10 @@ import numpy as np
 from samplers.problem import Distribution
 from samplers.sample import Sample
 
+MIN_UNITS = 5.0
+"""Effective number of independent units (draws; paths of chains) that a result must rest on: fewer give a useless t
+interval."""
+
 
 class HasName(Protocol):
     """An object with a name, for messages."""

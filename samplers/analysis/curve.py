@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
-from samplers.analysis.base import WeightedEstimate, cov_inflation, no_outcome_weight, require_sample
+from samplers.analysis.base import MIN_UNITS, WeightedEstimate, cov_inflation, no_outcome_weight, require_sample
 from samplers.problem import FloatArray
 from samplers.sample import Sample
 from samplers.serialization import to_json_value
@@ -22,8 +22,6 @@ from samplers.statistics.cluster_sums import interval_of_count, interval_of_sum,
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-MIN_UNITS = 5.0
-"""Effective number of units that a threshold below gamma must have: fewer give a useless t interval."""
 BAND_DRAWS = 10_000
 """Draws of the largest deviation; its 95 % quantile is then good to about 1 %."""
 BAND_STREAM = 2**31

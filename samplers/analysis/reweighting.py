@@ -6,7 +6,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from samplers.analysis.base import WeightedEstimate, cov_inflation, require_sample
+from samplers.analysis.base import MIN_UNITS, WeightedEstimate, cov_inflation, require_sample
 from samplers.problem import Distribution, FloatArray
 from samplers.serialization import to_json_value
 from samplers.statistics.cluster_sums import has_independent_points, interval_of_sum
@@ -15,8 +15,6 @@ from samplers.statistics.weights import effective_number
 
 MIN_POINTS = 30.0
 """Effective number of failing points that the estimate must rest on."""
-MIN_UNITS = 5.0
-"""Effective number of independent units (draws; paths of chains) that these points must come from."""
 MAX_LOG = 600.0
 """exp of this, or of its negative, is still a float."""
 SUPPORT_DRAWS = 10_000
@@ -83,7 +81,7 @@ class Reweighted:
         return {name: to_json_value(value) for name, value in asdict(self).items()}
 
 
-def reweight(estimate: WeightedEstimate, new_base: HasLogProb) -> Reweighted:
+def reweight_estimate(estimate: WeightedEstimate, new_base: HasLogProb) -> Reweighted:
     """Return p under another base; see `Estimate.reweight`.
 
     p1 = sum of w r over the failing points, r = p1(x) / p0(x). With T_c the sums over units, its
@@ -137,7 +135,7 @@ def log_density_ratios(estimate: WeightedEstimate, new_base: HasLogProb, x: Floa
         raise ValueError("The estimate does not know its base distribution (`Estimate.base`).")
     if len(x) == 0:
         raise ValueError(f"No point failed (f <= {estimate.gamma:g}): there is nothing to weigh anew.")
-    check_fits(new_base, x.shape[1])
+    check_dimensions_fit(new_base, x.shape[1])
     check_support(base, new_base, x.shape[1], estimate.seed)
     new, old = log_density(new_base, x), log_density(base, x)
     wrong = np.isnan(new) | np.isposinf(new) | ~np.isfinite(old)
@@ -150,7 +148,7 @@ def log_density_ratios(estimate: WeightedEstimate, new_base: HasLogProb, x: Floa
     return new - old
 
 
-def check_fits(new_base: object, dim: int) -> None:
+def check_dimensions_fit(new_base: object, dim: int) -> None:
     """Raise a ValueError unless the new base has a log_prob and, if it has an attribute dim, `dim` dimensions."""
     if not isinstance(new_base, HasLogProb):
         raise ValueError(f"Expected a distribution with log_prob, got {new_base!r}.")

@@ -1,4 +1,4 @@
-"""Combining independent runs of one method."""
+"""Combination: independent runs of one method as one outcome."""
 
 import math
 from collections import Counter
@@ -14,32 +14,32 @@ from samplers.statistics.intervals import Interval, binomial_cov
 from samplers.trace import Level, Status
 
 OWN_ERROR_FACTOR = 1.5
-"""Runs are taken to understate their own errors by this factor before they are said to disagree."""
+"""Factor by which runs may understate their own errors before they are said to disagree."""
 MIN_SPREAD = 1 / 3
-"""Runs closer together than this share of their own errors are so by chance, such as counts that tie."""
+"""Least spread of runs, as a share of their own errors: they are closer together by chance, such as counts that tie."""
 UNINFORMATIVE_COV = 1.0
-"""A run with a c.o.v. from here on knows no more of p than its interval says."""
+"""From this c.o.v. on the p of a run tells no more than its interval."""
 DISAGREEMENT_LEVEL = 1e-4
-"""Probability with which runs whose errors are right would be said to."""
+"""Probability that runs whose errors are right are said to disagree."""
 STATUS_PRIORITY = (Status.STOPPED, Status.STALLED, Status.BUDGET, Status.CONVERGED)
-"""The status of the whole is the first of these that a run has."""
+"""The status of the combined runs is the first of these that one of them has."""
 
 
 def combine(outcomes: Sequence[Outcome], confidence: float) -> Outcome:
     """Return R independent runs as one: pooled counts, or their mean with a t interval.
 
     Where every run is a share k_i / n_i of independent draws, the draws are those of one longer
-    run: p = sum k_i / sum n_i with the Clopper-Pearson interval. (A t interval would throw away
-    what binomial counts say of their own spread; with R = 2 its quantile is 12.7.)
+    run: p = sum k_i / sum n_i with the Clopper-Pearson interval. (A t interval would ignore that the
+    spread of binomial counts is known; with R = 2 its quantile is 12.7.)
 
     Otherwise p is the arithmetic mean p_bar (each run's p-hat is unbiased, its logarithm is not).
-    Its c.o.v. is the larger of what the runs say of themselves and of what their spread shows. The
+    Its c.o.v. is the larger of the runs' own and of that of their spread. The
     interval is p_bar exp(-+ t s / sqrt(R)) with s the standard deviation of log p-hat (of
     p-hat / p_bar, where a run has p-hat = 0), but at least a third of the runs' own c.o.v., and t the
-    quantile with R - 1 degrees of freedom. Where no run has a c.o.v. under 1 their spread says nothing
-    either: the interval is that of all runs' intervals together.
-    Runs that were stopped before their end have no part in the mean if any run came to its end: one
-    that is still on its way to the failures has p-hat = 0, which is no estimate. Their levels stay
+    quantile with R - 1 degrees of freedom. Where no run has a c.o.v. under 1 their spread is not known
+    either: the interval then covers the intervals of all runs.
+    Runs that were stopped before their end are left out of the mean if any run came to its end: one
+    that has not reached the failures has p-hat = 0, which is no estimate. Their levels stay
     in the trace.
     """
     if len(outcomes) == 1:
@@ -48,8 +48,8 @@ def combine(outcomes: Sequence[Outcome], confidence: float) -> Outcome:
     counts = pool_counts(outcomes)
     if counts is not None:
         hits, n = counts
-        without = sum(o.no_outcome_share * o.counts[0] for o in outcomes if o.counts)
-        whole = Outcome.of_counts(hits, n, confidence, trace, without / hits if hits else 0.0)
+        no_outcome = sum(o.no_outcome_share * o.counts[0] for o in outcomes if o.counts)
+        whole = Outcome.of_counts(hits, n, confidence, trace, no_outcome / hits if hits else 0.0)
         return replace(whole, sample=merge_samples(outcomes, [o.counts[1] / n for o in outcomes if o.counts]))
     used = select_finished(outcomes)
     left_out = len(outcomes) - len(used)
@@ -72,7 +72,7 @@ def combine(outcomes: Sequence[Outcome], confidence: float) -> Outcome:
 
 
 def _warn_of_disagreement(outcomes: Sequence[Outcome]) -> list[str]:
-    """Warn where runs lie further apart than their own errors allow: a region was found by some of them only."""
+    """Return a warning if runs lie further apart than their own errors allow: some of them missed a region."""
     p = np.array([outcome.p for outcome in outcomes])
     error = OWN_ERROR_FACTOR * np.array([outcome.p * outcome.cov if outcome.p > 0 else 0.0 for outcome in outcomes])
     if len(p) < 3 or not (error > 0).all():
@@ -141,16 +141,17 @@ def combined_cov(outcomes: Sequence[Outcome]) -> float:
 
 
 def _own_error(outcomes: Sequence[Outcome]) -> float:
-    """Return what the runs say of themselves: the root mean square of their errors, relative to their mean."""
+    """Return the root mean square of the errors that the runs state, relative to the mean of their p."""
     mean = float(np.mean([outcome.p for outcome in outcomes]))
     errors = [outcome.p / mean * outcome.cov for outcome in outcomes if outcome.p > 0]  # p squared might underflow
     return math.hypot(*errors) / math.sqrt(len(outcomes))
 
 
 def _interval(outcomes: Sequence[Outcome], p: np.ndarray, confidence: float) -> Interval:
+    """Return the t interval of the mean of p (R,), see `combine`."""
     mean, runs = float(p.mean()), len(p)
     if np.ptp(p) == 0 or min(outcome.cov for outcome in outcomes) >= UNINFORMATIVE_COV:
-        # no spread to go by: all runs' own intervals together
+        # their spread is not known
         return min(o.interval[0] for o in outcomes), max(o.interval[1] for o in outcomes)
     spread = float(np.log(p).std(ddof=1)) if p.all() else float((p / mean).std(ddof=1))
     spread = max(spread, MIN_SPREAD * _own_error(outcomes))
@@ -159,6 +160,7 @@ def _interval(outcomes: Sequence[Outcome], p: np.ndarray, confidence: float) -> 
 
 
 def _first_by_priority(outcomes: Sequence[Outcome]) -> Status:
+    """Return the status of the combined runs."""
     present = {outcome.status for outcome in outcomes}
     return next((status for status in STATUS_PRIORITY if status in present), Status.BUDGET)
 
@@ -170,4 +172,5 @@ def _count_warnings(outcomes: Sequence[Outcome]) -> tuple[str, ...]:
 
 
 def _number_levels(outcomes: Sequence[Outcome]) -> list[Level]:
+    """Return the levels of all runs, each with the number of its run."""
     return [replace(level, run=i) for i, o in enumerate(outcomes) for level in o.trace]

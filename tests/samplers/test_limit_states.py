@@ -9,7 +9,7 @@ from samplers.limit_states import (
     references,
     shell,
     two_modes,
-    unannounced,
+    unannounced_region,
 )
 
 
@@ -22,7 +22,7 @@ from samplers.limit_states import (
         four_branches(k=1.8),
         plateau(beta=1.5),
         shell(5, p=0.05),
-        unannounced(1.5, 1.2),
+        unannounced_region(1.5, 1.2),
     ],
     ids=lambda r: r.name,
 )
@@ -45,7 +45,7 @@ def test_plateau_ties_as_stated(rng, tied):
 
 
 def test_unannounced_region_is_the_likelier_one_and_f_rises_towards_it():
-    reference = unannounced()
+    reference = unannounced_region()
     assert reference.p == pytest.approx(9.99e-4, rel=1e-3)
     u = np.array([[-3.2, 0.0], [-3.0, 0.0], [0.0, 0.0], [3.9, 0.0], [4.1, 0.0]])
     f = reference.problem.evaluate(u)

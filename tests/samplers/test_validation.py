@@ -41,7 +41,7 @@ def test_both_ends_of_a_range_are_excluded():
 
 def test_the_upper_end_of_a_setting_may_be_included():
     check_setting("M", "alpha", 1, 0.0, 1.0, or_equal_high=True)
-    with pytest.raises(ValueError, match="M: expected a number 0 < alpha <= 1, got 1.5"):
+    with pytest.raises(ValueError, match=r"M: expected a number 0 < alpha <= 1, got 1\.5"):
         check_setting("M", "alpha", 1.5, 0.0, 1.0, or_equal_high=True)
     with pytest.raises(ValueError, match="M: expected a number 0 < alpha < 1, got 1"):
         check_setting("M", "alpha", 1, 0.0, 1.0)
