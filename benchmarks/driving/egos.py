@@ -18,11 +18,12 @@ import torch
 import typer
 
 import rare_envs
+from benchmarks import RESULTS
 from rare_envs.scenarios.registry import SCENARIOS
 from rare_envs.study import Question, Report, drive_again, prepare, run, write_film
 from training import train_ego
 
-RESULT = Path(__file__).parents[1] / "results" / "egos.json"
+RESULT = RESULTS / "egos.json"
 STEPS = 400_000
 """Of the training of an ego, as in the demo."""
 EGOS = ("idm", "imitation", "vision", "noisy:idm", "ppo", "dqn")
@@ -83,8 +84,8 @@ class Cell:
     """What it is."""
 
 
-def trained(algo: str, env_id: str, folder: Path) -> Path:
-    """The ego that `rare-envs train-ego ENV --algo ALGO --steps 400000` makes."""
+def train_cached(algo: str, env_id: str, folder: Path) -> Path:
+    """Return the ego of `rare-envs train-ego ENV --algo ALGO --steps 400000`; one that was trained before is kept."""
     path = folder / f"{algo}_{SCENARIOS[env_id].name}.zip"
     return path if path.exists() else train_ego(env_id, algo=algo, steps=STEPS, seed=0, out=path)
 
@@ -102,7 +103,7 @@ def ask(env_id: str, ego: str, method: str, runs: Path, images: Path) -> Cell:
     Returns:
         What came out.
     """
-    spec = str(trained(ego, env_id, runs)) if ego in ("ppo", "dqn") else ego
+    spec = str(train_cached(ego, env_id, runs)) if ego in ("ppo", "dqn") else ego
     report = run(prepare(Question(env_id=env_id, ego=spec, method=method, max_sim=MOST.get(ego))), progress=True)
     estimate = report.estimate
     picture, words = likeliest(report, images / f"ego_{SCENARIOS[env_id].name}_{ego.replace(':', '_')}.png")
@@ -131,14 +132,14 @@ def likeliest(report: Report, path: Path) -> tuple[str, str]:
     return path.name, "no crash" if crash is None else f"{crash['kind']}, {crash['closing_speed']:.1f} m/s"
 
 
-def page(cells: Iterable[Cell]) -> str:
-    """The page of all results."""
+def format_page(cells: Iterable[Cell]) -> str:
+    """Return the page of all results."""
     cells = list(cells)
     horizon = max(scenario.horizon for scenario in SCENARIOS.values())
     parts = [HEAD.format(horizon=horizon, steps=STEPS, most=MOST["vision"])]
     for env_id in SCENARIOS:
         own = [cell for cell in cells if cell.env_id == env_id]
-        rows = [line(cell) for cell in own]
+        rows = [format_row(cell) for cell in own]
         shown = [cell for cell in own if cell.method == METHODS[0] and cell.picture]
         pictures = [
             f"**{cell.ego}**: {cell.words}\n\n![{cell.ego}: {cell.words}](images/{cell.picture})" for cell in shown
@@ -150,16 +151,16 @@ def page(cells: Iterable[Cell]) -> str:
     return "\n".join(parts)
 
 
-def line(cell: Cell) -> str:
-    """A row of the table."""
+def format_row(cell: Cell) -> str:
+    """Return a row of the table."""
     return (
         f"| `{cell.ego}` | `{cell.method}` | {cell.p:.2e} | {cell.low:.2e} to {cell.high:.2e} | {cell.n_sim:,} "
         f"| {cell.seconds:.0f} s | {len(cell.warnings) or ''} |"
     )
 
 
-def read() -> dict[tuple[str, str, str], Cell]:
-    """What has been measured so far, by scenario, ego and method."""
+def read_cells() -> dict[tuple[str, str, str], Cell]:
+    """Return what has been measured so far, by scenario, ego and method."""
     cells = json.loads(RESULT.read_text())["cells"] if RESULT.exists() else []
     found = [Cell(**{**cell, "warnings": tuple(cell["warnings"])}) for cell in cells]
     return {(cell.env_id, cell.ego, cell.method): cell for cell in found}
@@ -181,16 +182,16 @@ def main(
     """Measure what is not measured yet and write the page."""
     torch.set_num_threads(1)
     chosen = only.split(",") if only else []
-    measured = {key for key, cell in read().items() if cell.ego not in chosen or env not in cell.env_id}
+    measured = {key for key, cell in read_cells().items() if cell.ego not in chosen or env not in cell.env_id}
     for key in [(env_id, ego, method) for env_id in SCENARIOS for ego in EGOS for method in METHODS]:
         if key in measured or env not in key[0] or (chosen and key[1] not in chosen):
             continue
         cell = ask(*key, runs=runs, images=docs / "images")
-        print(line(cell), flush=True)
-        write({**read(), key: cell})  # read anew: another process may measure other egos
+        print(format_row(cell), flush=True)
+        write({**read_cells(), key: cell})  # read anew: another process may measure other egos
     order = {ego: place for place, ego in enumerate(EGOS)}
-    in_order = sorted(read().values(), key=lambda cell: (order[cell.ego], METHODS.index(cell.method)))
-    (docs / "shipped_egos.md").write_text(page(in_order), encoding="utf-8")
+    in_order = sorted(read_cells().values(), key=lambda cell: (order[cell.ego], METHODS.index(cell.method)))
+    (docs / "shipped_egos.md").write_text(format_page(in_order), encoding="utf-8")
 
 
 if __name__ == "__main__":

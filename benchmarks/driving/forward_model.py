@@ -31,8 +31,8 @@ HORIZONS = (5, 15, 30)
 COLUMNS = ("learned", "other noise", "no state", "length, learned / simulator")
 
 
-def trained_model(data: Path, run: Path, rounds: int) -> Learner:
-    """The driver of a finished training, its critic, and a forward model that has learned from its rollouts."""
+def train_forward_model(data: Path, run: Path, rounds: int) -> Learner:
+    """Return the learner of a finished training, and a forward model that has learned from its rollouts."""
     _, config = read_training_settings(run)
     prepared = prepare_data(load_scenes(Source("data", data))[0])
     policy = copy.deepcopy(read_driver(run / DRIVER).policy).requires_grad_(True)
@@ -49,7 +49,7 @@ def trained_model(data: Path, run: Path, rounds: int) -> Learner:
 
 
 def gradient(learner: Learner, horizon: int, start: int, noise: int, learned: bool, credit: float) -> Tensor:
-    """Of the critic's cost with respect to all weights, flat."""
+    """Return the gradient of the critic's cost with respect to all weights, flat."""
     config = learner.config
     chance = torch.Generator().manual_seed(start)
     pool = draw_pool(learner.recording, learner.among, config.scenes, 60, horizon, config.colour, chance)
@@ -61,7 +61,7 @@ def gradient(learner: Learner, horizon: int, start: int, noise: int, learned: bo
 
 
 def compare(learner: Learner, horizon: int, starts: int) -> list[float]:
-    """Means of `COLUMNS` over some starts."""
+    """Return means of `COLUMNS` over some starts."""
     rows = []
     for start in range(starts):
         credit = learner.config.credit
@@ -85,7 +85,7 @@ def main(
 ) -> None:
     """Compare the two gradients."""
     torch.set_num_threads(1)
-    learner = trained_model(data, run, rounds)
+    learner = train_forward_model(data, run, rounds)
     print(f"| ticks | {' | '.join(COLUMNS)} |\n|{'---|' * (len(COLUMNS) + 1)}")
     for horizon in HORIZONS:
         print(

@@ -1,8 +1,9 @@
 """Do drivers finish the lane changes that people have begun? Why learned drivers change lanes so rarely.
 
-    python -m benchmarks.driving.lane_changes DATA [DRIVER ...] --json lane_changes.json
+    python -m benchmarks.driving.lane_changes DATA [DRIVER ...]
 
-DATA is the folder with the tables of US 101; drivers are files or the names of shipped ones. Two questions:
+DATA is the folder with the tables of US 101; drivers are files or the names of shipped ones. Writes
+`benchmarks/results/lane_changes.json`. Two questions:
 
 - *Under way.* Every lane change in the record is taken up some time before the crossing, all vehicles driven by the
   driver: how many of these vehicles cross in that time and 2 s more? Of the people all do.
@@ -22,7 +23,8 @@ import typer
 from torch import Tensor
 
 from agents import LearnedDriver
-from benchmarks.driving.realism import named, rounded
+from benchmarks import RESULTS
+from benchmarks.driving.realism import load_named, round_numbers
 from benchmarks.estimators.runs import about
 from rare_envs.sensors.perception import FEATURES, HEADING_COLUMN, SPEED_COLUMN
 from training.data.trajectories import DT
@@ -59,8 +61,8 @@ class Crossings(NamedTuple):
     """1 to the right, -1 to the left."""
 
 
-def crossings_of(recording: Recording) -> Crossings:
-    """Changes of lane with `SETTLED` ticks in one lane on either side."""
+def find_crossings(recording: Recording) -> Crossings:
+    """Return changes of lane with `SETTLED` ticks in one lane on either side."""
     ticks = recording.x.shape[1]
     lane = torch.stack([lane_of(recording.y[:, tick], recording.edges) for tick in range(ticks)], dim=1)
     lane = torch.where(recording.present, lane, -1)
@@ -75,8 +77,8 @@ def crossings_of(recording: Recording) -> Crossings:
     return Crossings(*torch.cat(found, dim=1))
 
 
-def completed(recording: Recording, crossings: Crossings, act: Act, seconds: float) -> tuple[int, float]:
-    """How many changes can be taken up some seconds before the crossing, and the share that the driver completes."""
+def count_completed(recording: Recording, crossings: Crossings, act: Act, seconds: float) -> tuple[int, float]:
+    """Return the number of changes recorded that long before the crossing, and the share that the driver completes."""
     lead = round(seconds / DT)
     scene, tick, vehicle, side = (column[crossings.tick >= lead] for column in crossings)
     traffic = start_replay(recording, scene, tick - lead)
@@ -93,8 +95,8 @@ def completed(recording: Recording, crossings: Crossings, act: Act, seconds: flo
     return len(row), float(crossed.float().mean())
 
 
-def steering(pairs: Pairs, drivers: dict[str, LearnedDriver]) -> dict[str, dict[str, float]]:
-    """Mean yaw rates [rad/s] towards where vehicles move, by `CLASSES`, of people and of drivers' mean actions."""
+def measure_steering(pairs: Pairs, drivers: dict[str, LearnedDriver]) -> dict[str, dict[str, float]]:
+    """Return mean yaw rates [rad/s] in the direction of motion, by `CLASSES`, of people and of drivers' means."""
     heading = pairs.features[:, HEADING_COLUMN]
     side = heading.sign()
     across, offset = heading.abs() * pairs.features[:, SPEED_COLUMN], pairs.features[:, OFFSET] * side
@@ -110,15 +112,17 @@ def steering(pairs: Pairs, drivers: dict[str, LearnedDriver]) -> dict[str, dict[
     return out
 
 
-def report(recording: Recording, drivers: dict[str, LearnedDriver], noises: int) -> dict[str, Any]:
-    """Both questions, ready for JSON."""
-    crossings = crossings_of(recording)
+def measure_changes(recording: Recording, drivers: dict[str, LearnedDriver], noises: int) -> dict[str, Any]:
+    """Return the answers to both questions, ready for JSON."""
+    crossings = find_crossings(recording)
     under_way: dict[str, dict[str, float]] = {}
     for seconds in BEFORE:
         row: dict[str, float] = {}
         for name, driver in drivers.items():
             runs = [
-                completed(recording, crossings, sampling_driver(driver, torch.Generator().manual_seed(seed)), seconds)
+                count_completed(
+                    recording, crossings, sampling_driver(driver, torch.Generator().manual_seed(seed)), seconds
+                )
                 for seed in range(noises)
             ]
             row["changes"], row[name] = runs[0][0], float(np.mean([share for _, share in runs]))
@@ -126,7 +130,7 @@ def report(recording: Recording, drivers: dict[str, LearnedDriver], noises: int)
     return {
         "crossings": len(crossings.scene),
         "under_way": under_way,
-        "steering": steering(collect_pairs(recording), drivers),
+        "steering": measure_steering(collect_pairs(recording), drivers),
     }
 
 
@@ -134,15 +138,16 @@ def main(
     data: Annotated[Path, typer.Argument(help="Folder with the compact tables of US 101.")],
     drivers: Annotated[list[str] | None, typer.Argument(help="Files or shipped names.")] = None,
     noises: Annotated[int, typer.Option(help="Sequences of noise of each driver.")] = 5,
-    out: Annotated[Path | None, typer.Option("--json")] = None,
+    out: Annotated[Path, typer.Option("--json", help="File for the result.")] = RESULTS / "lane_changes.json",
 ) -> None:
     """Measure on all scenes, those that the drivers learned from included: changes are few."""
     torch.set_num_threads(1)
     learn, test = load_scenes(Source("data", data))
-    found = rounded(report(stack_scenes([*learn, *test]), named(drivers or ["mgail", "gail", "bc"]), noises))
+    found = round_numbers(
+        measure_changes(stack_scenes([*learn, *test]), load_named(drivers or ["mgail", "gail", "bc"]), noises)
+    )
     print(json.dumps(found, indent=1))
-    if out is not None:
-        out.write_text(json.dumps({"about": about(torch=torch.__version__), **found}, indent=1) + "\n", "utf-8")
+    out.write_text(json.dumps({"about": about(torch=torch.__version__), **found}, indent=1) + "\n", "utf-8")
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ FLOOR = 20.0
 
 
 def compare(batch: int, vehicles: int, rounds: int = 20) -> dict[str, float]:
-    """Times [ms] of one tick both ways, their ratio, and the largest difference of an action."""
+    """Return times [ms] of one tick both ways, their ratio, and the largest difference of an action."""
     generator = torch.Generator().manual_seed(0)
     scaling = Scaling(
         torch.zeros(FEATURE_SIZE), torch.ones(FEATURE_SIZE), torch.zeros(ACTION_SIZE), torch.ones(ACTION_SIZE)

@@ -31,8 +31,8 @@ ERRORS = {"position": "position [m]", "speed": "speed [m/s]", "lateral": "latera
 STYLE = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "svg.hashsalt": "imitation"}
 
 
-def tables(found: Found) -> str:
-    """All tables as Markdown."""
+def format_tables(found: Found) -> str:
+    """Return all tables as Markdown."""
     main = [row for row in found["realism"] if row["kind"] != "box"]
     boxed = [row for row in found["realism"] if row["kind"] == "box"]
     parts = ["## All vehicles driven", *(f"{s}:\n\n{_realism(main, s)}" for s in _times(main))]
@@ -44,7 +44,7 @@ def tables(found: Found) -> str:
 
 
 def _times(rows: Sequence[Found]) -> list[str]:
-    """What the figures of rows are called that belong to one time, such as "10 s"."""
+    """Return the names of figures of rows that belong to one time, such as "10 s"."""
     return [name for name in rows[0] if name.endswith(" s")]
 
 
@@ -53,7 +53,7 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def _plus(row: Found, name: str) -> str:
-    """A value with its standard error."""
+    """Return a value with its standard error."""
     value, error = row[name], row["standard_error"][name]
     return f"{value:.4f} ({error:.4f})" if name not in ("lane_changes", "ever") else f"{value:.3f} ({error:.3f})"
 
@@ -122,8 +122,8 @@ def _boxes(rows: Sequence[Found]) -> str:
     )
 
 
-def draw(found: Found, out: Path) -> None:
-    """Write `rates.svg`, `distributions.svg`, `errors.svg` and, if there are laws of weights, `boxes.svg`."""
+def write_figures(found: Found, out: Path) -> None:
+    """Write `rates.svg`, `distributions.svg`, `errors.svg` and, if weights have a distribution, `boxes.svg`."""
     with matplotlib.rc_context(STYLE):
         figures = {"rates": _rates(found), "distributions": _distributions(found), "errors": _errors(found)}
         if any(row["kind"] == "box" for row in found["realism"]):
@@ -133,7 +133,7 @@ def draw(found: Found, out: Path) -> None:
 
 
 def _rates(found: Found) -> Figure:
-    """Without constant velocity, beside which nothing could be told apart."""
+    """Draw rates of all rows but constant velocity, beside which the others could not be told apart."""
     rows = [row for row in found["realism"] if row["kind"] != "box" and row["name"] != "constant velocity"]
     figure = Figure(figsize=(12, 1.2 + 0.3 * len(rows)), layout="constrained")
     axes = figure.subplots(1, len(RATES), sharey=True)
@@ -186,7 +186,7 @@ def _errors(found: Found) -> Figure:
 
 
 def _box_figure(found: Found) -> Figure:
-    """Of the first driver that has a law: rates over the radius, for each direction."""
+    """Draw rates of the first driver with a distribution of weights over the radius, for each direction."""
     rows = [row for row in found["realism"] if row["kind"] == "box"]
     rows = [row for row in rows if row["driver"] == rows[0]["driver"]]
     base = next(row for row in found["realism"] if row["name"] == rows[0]["driver"])

@@ -1,4 +1,4 @@
-"""Rows of the report on human likeness: how each is measured, for people, drivers, laws, boxes and other starts."""
+"""Rows of the report on realism: measurements of people, drivers, drawn weights, search boxes and other starts."""
 
 from __future__ import annotations
 
@@ -34,36 +34,36 @@ Rows = list[dict[str, Any]]
 
 @dataclass(frozen=True)
 class Effort:
-    """How much is simulated."""
+    """Amount of simulation."""
 
     noises: int = 3
     """Sequences of noise of each driver."""
     draws: int = 6
-    """Policies drawn from a law, and from the inside and the corners of a box."""
+    """Policies drawn from a distribution of weights, and from the inside and the corners of a box."""
     rollouts: int = 20
-    """Of each segment in which one vehicle is driven among recorded others."""
+    """Rollouts of each segment in which one vehicle is driven among replayed others."""
     each: int = 4
-    """Such vehicles every 2 s of a scene."""
+    """Number of such vehicles every 2 s of a scene."""
     highway: int = 200
-    """Starts at O'Kelly et al.'s speeds."""
+    """Number of starts at O'Kelly et al.'s speeds."""
 
 
 @dataclass(frozen=True)
 class Judge:
-    """Measures drivers against people."""
+    """Comparison of drivers with people."""
 
     test: Recording
     recorded: DrivingStatistics
-    """Of the test scenes."""
+    """Statistics of the people in the test scenes."""
     effort: Effort
 
     def row(self, name: str, kind: str, acts: Sequence[Act], seconds: Sequence[float] | None = None) -> dict[str, Any]:
-        """Realism of one driver over some times.
+        """Return the realism of one driver over some times.
 
         Args:
-            name: Of the row.
-            kind: What it is: "reference", "driver", "law" or "box".
-            acts: One for each sequence of noise, or for each policy.
+            name: Name of the row.
+            kind: Kind of the row: "reference", "driver", "distribution" or "box".
+            acts: One driver for each sequence of noise, or for each policy.
             seconds: Times [s], the longest last; None for `SECONDS`.
         """
         seconds = SECONDS if seconds is None else seconds
@@ -71,7 +71,7 @@ class Judge:
         return {"name": name, "kind": kind, **self.figures({time: [run[time] for run in runs] for time in seconds})}
 
     def figures(self, runs: dict[float, list[DrivingStatistics]]) -> dict[str, Any]:
-        """Values and standard errors of several runs together, and the collision rate of each."""
+        """Return values and standard errors of several runs together, and the collision rate of each."""
         out: dict[str, Any] = {}
         for seconds, parts in runs.items():
             whole = add_statistics(parts)
@@ -87,13 +87,13 @@ class Judge:
         return out
 
 
-def noisy(driver: LearnedDriver, number: int, weights: Tensor | None = None) -> list[Act]:
-    """A driver with several sequences of noise."""
+def noisy_drivers(driver: LearnedDriver, number: int, weights: Tensor | None = None) -> list[Act]:
+    """Return a driver with several sequences of noise."""
     return [sampling_driver(driver, torch.Generator().manual_seed(seed), weights) for seed in range(number)]
 
 
-def people(train: Recording, judge: Judge) -> dict[str, Any]:
-    """The record's own rates; divergences between its training and its test scenes."""
+def measure_people(train: Recording, judge: Judge) -> dict[str, Any]:
+    """Return the record's own rates, and divergences between its training and its test scenes."""
     learned = record_statistics(train)
     row = {"name": "people", "kind": "reference", **judge.figures({time: [judge.recorded] for time in SECONDS})}
     for seconds in SECONDS:
@@ -102,16 +102,16 @@ def people(train: Recording, judge: Judge) -> dict[str, Any]:
     return row
 
 
-def drawn(name: str, driver: LearnedDriver, judge: Judge) -> dict[str, Any]:
-    """Policies drawn from the law of a driver's weights, one sequence of noise each."""
+def measure_drawn(name: str, driver: LearnedDriver, judge: Judge) -> dict[str, Any]:
+    """Return the realism of policies drawn from the distribution of a driver's weights, one sequence of noise each."""
     assert driver.weights is not None
     weights = torch.from_numpy(driver.weights.sample(judge.effort.draws, np.random.default_rng(0))).float()
-    acts = [noisy(driver, 1, row)[0] for row in weights]
-    return judge.row(f"{name}, drawn from its law", "law", acts)
+    acts = [noisy_drivers(driver, 1, row)[0] for row in weights]
+    return judge.row(f"{name}, drawn from its distribution", "distribution", acts)
 
 
-def moved(driver: LearnedDriver, features: Tensor, draws: int) -> Iterator[tuple[float, str, list[Tensor]]]:
-    """Weights moved within boxes around their mean: radius, direction, and the weights (404,) that belong to them.
+def move_weights(driver: LearnedDriver, features: Tensor, draws: int) -> Iterator[tuple[float, str, list[Tensor]]]:
+    """Yield weights moved within boxes around their mean: radius, direction, and the moved weights (404,).
 
     A direction is "uniform" or "corner" (random ones), or names an output and a sign: all weights of that output are
     moved with the signs of its mean inputs, which shifts it the furthest.
@@ -133,26 +133,28 @@ def moved(driver: LearnedDriver, features: Tensor, draws: int) -> Iterator[tuple
                 yield radius, f"{name} {'+' if sign > 0 else '-'}", [mean + radius * direction.flatten()]
 
 
-def boxes(name: str, driver: LearnedDriver, features: Tensor, judge: Judge) -> Rows:
-    """How policies drive that a search may move to, over 10 s."""
+def measure_boxes(name: str, driver: LearnedDriver, features: Tensor, judge: Judge) -> Rows:
+    """Return the realism over 10 s of policies within search boxes."""
     rows = []
-    for radius, direction, weights in moved(driver, features, max(judge.effort.draws // 2, 1)):
-        acts = [noisy(driver, 1, row)[0] for row in weights]
+    for radius, direction, weights in move_weights(driver, features, max(judge.effort.draws // 2, 1)):
+        acts = [noisy_drivers(driver, 1, row)[0] for row in weights]
         row = judge.row(f"{name}, box {radius:g}, {direction}", "box", acts, SECONDS[:1])
         del row["shares"]
         rows.append({**row, "driver": name, "radius": radius, "direction": direction})
     return rows
 
 
-def accuracy(test: Recording, act: Act, effort: Effort, rollouts: int | None = None) -> dict[str, dict[str, float]]:
-    """Root mean square errors with one vehicle driven and the others replayed, by seconds."""
+def measure_errors(
+    test: Recording, act: Act, effort: Effort, rollouts: int | None = None
+) -> dict[str, dict[str, float]]:
+    """Return root mean square errors with one vehicle driven and the others replayed, by seconds."""
     chosen = draw_segments(test, 2.0, effort.each, torch.Generator().manual_seed(0))
     found = prediction_errors(test, act, chosen, effort.rollouts if rollouts is None else rollouts)
     return {f"{seconds:g}": _rmse(errors, len(test.x)) for seconds, errors in found.items() if len(errors.scene)}
 
 
 def _rmse(errors: Errors, scenes: int, draws: int = 200) -> dict[str, float]:
-    """Root mean squares and their standard errors, by bootstrap over scenes."""
+    """Return root mean squares and their standard errors, by bootstrap over scenes."""
     times = np.random.default_rng(0).multinomial(scenes, [1 / scenes] * scenes, draws)
     number = np.bincount(errors.scene.numpy(), minlength=scenes)
     out = {"vehicles": float(len(errors.scene))}
@@ -166,8 +168,8 @@ def _rmse(errors: Errors, scenes: int, draws: int = 200) -> dict[str, float]:
     return out
 
 
-def highway(number: int) -> Traffic:
-    """Six cars within 40 m, one in each lane, at 10 to 20 m/s: how O'Kelly et al. start, on the lanes of US 101."""
+def highway_starts(number: int) -> Traffic:
+    """Return O'Kelly et al.'s starts on the lanes of US 101: six cars within 40 m, one per lane, 10 to 20 m/s."""
     rng = np.random.default_rng(0)
     along, across, heading, speed = (torch.from_numpy(rng.beta(2, 2, (number, 6))).float() for _ in range(4))
     edges = torch.tensor(US101_EDGES)
@@ -188,9 +190,9 @@ def highway(number: int) -> Traffic:
     )
 
 
-def on_highway(name: str, act: Act, judge: Judge) -> dict[str, Any]:
-    """Behaviour at O'Kelly et al.'s starting speeds; divergences are from the people of US 101."""
-    start = highway(judge.effort.highway)
+def measure_on_highway(name: str, act: Act, judge: Judge) -> dict[str, Any]:
+    """Return the behaviour from O'Kelly et al.'s starts; divergences are from the people of US 101."""
+    start = highway_starts(judge.effort.highway)
     with torch.inference_mode():
         whole = behaviour_of(drive_traffic(None, start, act, round(SECONDS[-1] / 0.1)))
     runs = {}

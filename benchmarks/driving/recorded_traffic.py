@@ -19,7 +19,7 @@ HARD_BRAKE = -3.0
 
 
 def main(data: Path) -> None:
-    """Smooth, count, print."""
+    """Print accelerations by cut-off, and the sizes of the scenes."""
     typer.echo("cut-off along/across [Hz]  std a [m/s^2]  share a <= -3  std jerk [m/s^3]  std yaw rate [rad/s]")
     for along, across in CUTOFFS:
         scenes = load_us101_scenes(data, along, across)

@@ -1,15 +1,16 @@
 """Can a search find how drivers make an ego crash, and does it pay? Highway-v0 with learned drivers.
 
-    python -m benchmarks.driving.search_over_drivers --ego idm --noise fixed --gamma 0.56 --json search.json
+    python -m benchmarks.driving.search_over_drivers --ego idm --noise fixed --gamma 0.56
     python -m benchmarks.driving.search_over_drivers --ego mgail --noise fixed --methods ce-paper --json paper.json
 
-The second has O'Kelly et al.'s settings: a learned ego with lidar, 428 dimensions, 600,000 simulations.
+The first writes `benchmarks/results/search_idm_fixed.json`. The second has O'Kelly et al.'s settings: a learned ego
+with lidar, 428 dimensions, 600,000 simulations.
 
 P[lidar_ttc <= gamma] by several methods, each with `--runs` seeds, beside a long Monte Carlo reference. Every
 simulation counts, those of the search too; the gain is that over Monte Carlo at equal error. Then what the failures
-look like: the law of the scenario parameters given f <= gamma from the failing points of the last method's runs
-(O'Kelly et al. 2018, section 4: vehicles box in the ego, those behind are 20 % faster, variances are half), and what
-the drivers' weights among them do to hard brakes and lane changes.
+look like: the distribution of the scenario parameters given f <= gamma from the failing points of the last method's
+runs (O'Kelly et al. 2018, section 4: vehicles box in the ego, those behind are 20 % faster, variances are half), and
+the effect of the drivers' weights among them on hard brakes and lane changes.
 """
 
 import json
@@ -27,7 +28,8 @@ import typer
 import agents
 import rare_envs
 import samplers
-from benchmarks.driving.failing_traffic import behaviour, failing_points, failures
+from benchmarks import RESULTS
+from benchmarks.driving.failing_traffic import describe_failures, failing_points, measure_drivers
 from benchmarks.estimators.runs import about
 from samplers.serialization import to_json_value
 
@@ -78,34 +80,34 @@ class Row:
     """The interval of each run."""
 
 
-def known(word: str, words: Iterable[str]) -> str:
-    """The word, if it is one of some; before hours of simulation."""
+def check_word(word: str, words: Iterable[str]) -> str:
+    """Return the word, if it is one of some; checked before hours of simulation."""
     if word not in words:
         raise typer.BadParameter(f"{word!r} is none of {', '.join(words)}.")
     return word
 
 
-def reference(problem: rare_envs.DrivingProblem, gamma: float, n: int, seed: int) -> dict[str, Any]:
-    """Long plain Monte Carlo, in pieces that fit into memory."""
+def run_reference(problem: rare_envs.DrivingProblem, gamma: float, n: int, seed: int) -> dict[str, Any]:
+    """Return the result of long plain Monte Carlo, run in batches that fit into memory."""
     rng, hits = np.random.default_rng(seed), 0
-    for size in pieces(n, 8192):
+    for size in split_sizes(n, 8192):
         f = problem.evaluate(problem.base.sample(size, rng))
         hits += int((f <= gamma).sum())
     p = hits / n
     return {"p": p, "standard_error": float(np.sqrt(p * (1 - p) / n)), "rollouts": n, "seed": seed}
 
 
-def earlier(path: Path, question: dict[str, Any]) -> dict[str, Any]:
-    """The reference of an earlier report on the same question."""
+def read_reference(path: Path, question: dict[str, Any]) -> dict[str, Any]:
+    """Return the reference of an earlier report on the same question."""
     found = json.loads(path.read_text())
     if found.get("question") != question:
-        raise typer.BadParameter(f"{path} asks {found.get('question')}, not {question}.")
+        raise typer.BadParameter(f"{path} answers {found.get('question')}, not {question}.")
     truth: dict[str, Any] = found["reference"]
     return truth
 
 
-def pieces(n: int, size: int) -> Iterator[int]:
-    """Sizes of pieces that add up to n."""
+def split_sizes(n: int, size: int) -> Iterator[int]:
+    """Yield sizes of batches that add up to n."""
     while n > 0:
         yield min(n, size)
         n -= size
@@ -148,12 +150,15 @@ def main(
     methods: Annotated[str, typer.Option(help="Names with commas between.")] = "ce-50-elites,two-stage,adss",
     seed: int = 1,
     truth_of: Annotated[Path | None, typer.Option("--reference", help="Report whose reference is taken.")] = None,
-    out: Annotated[Path | None, typer.Option("--json")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--json", help="File for the result; search_EGO_NOISE.json without it.")
+    ] = None,
 ) -> None:
-    """Measure, print and, if asked for, write."""
+    """Measure, print and write."""
     torch.set_num_threads(1)
-    chosen = [known(name, METHODS) for name in methods.split(",")]
-    how = NOISES[known(noise, NOISES)]
+    out = RESULTS / f"search_{ego}_{noise}.json" if out is None else out
+    chosen = [check_word(name, METHODS) for name in methods.split(",")]
+    how = NOISES[check_word(noise, NOISES)]
     who: Any = "idm" if ego == "idm" else agents.LearnedEgo(agents.load_driver(ego))  # type: ignore[arg-type]
     problem = rare_envs.DrivingProblem(
         "rare_envs/Highway-v0",
@@ -163,7 +168,7 @@ def main(
         drivers=drivers,
     )
     question = {"ego": ego, "drivers": drivers, "noise": noise, "gamma": gamma}
-    truth = earlier(truth_of, question) if truth_of else reference(problem, gamma, rollouts, seed)
+    truth = read_reference(truth_of, question) if truth_of else run_reference(problem, gamma, rollouts, seed)
     error = f"{truth['standard_error']:.1g} ({truth['rollouts']:,} rollouts)"
     print(f"{problem.dim} dimensions, p = {truth['p']:.3g} +- {error}")
     command = f"python -m benchmarks.driving.search_over_drivers {' '.join(sys.argv[1:])}"
@@ -176,20 +181,19 @@ def main(
         write(out, data)  # a run at the paper's setting takes half an hour: nothing that was measured is lost
     rng = np.random.default_rng(seed)
     x, weights = failing_points(found)
-    law = failures(problem, x, weights, rng)
+    failing = describe_failures(problem, x, weights, rng)
     base = problem.base.sample(2000, rng)
     searched = base.copy()
     at = slice(24, 24 + 404)
     searched[:, at] = x[rng.choice(len(x), 2000, p=weights)][:, at]
-    acts = {"base": behaviour(problem, base), "weights of failures": behaviour(problem, searched)}
-    print(json.dumps({"failures": law, "behaviour": acts}, indent=1))
-    write(out, {**data, "failures": law, "behaviour": acts})
+    acts = {"base": measure_drivers(problem, base), "weights of failures": measure_drivers(problem, searched)}
+    print(json.dumps({"failures": failing, "behaviour": acts}, indent=1))
+    write(out, {**data, "failures": failing, "behaviour": acts})
 
 
-def write(path: Path | None, data: dict[str, Any]) -> None:
-    """Write what was measured, if a path is given."""
-    if path is not None:
-        path.write_text(json.dumps(to_json_value(data), indent=1) + "\n")
+def write(path: Path, data: dict[str, Any]) -> None:
+    """Write what was measured."""
+    path.write_text(json.dumps(to_json_value(data), indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -17,10 +17,11 @@ import typer
 
 import rare_envs
 import samplers
+from benchmarks import RESULTS
 from benchmarks.estimators.truth import RESULT as TRUTH
 from samplers.registry import get_method
 
-RESULT = Path(__file__).parents[1] / "results" / "against_truth.json"
+RESULT = RESULTS / "against_truth.json"
 MONTE_CARLO_BUDGET = 100_000
 """Plain Monte Carlo gets this many simulations, the others their defaults."""
 

@@ -1,12 +1,12 @@
 """Are the estimates and their intervals right, do warnings tell which are not, and what do they cost?
 
-    python -m benchmarks.estimators.compare_methods --runs 200 --max-sim 6000 --workers 2 --json estimators.json
+    python -m benchmarks.estimators.compare_methods --runs 200 --max-sim 6000 --workers 2
 
 Runs every method many times on every problem of `benchmarks.estimators.catalogue` and prints, for each: mean / p, the
 spread of the estimates (c.o.v.) beside the mean c.o.v. that the runs state, gain over plain Monte Carlo at equal error,
 how often the 95 % interval holds p, the share of runs with a warning, the worst error, simulations, calls of f, and the
 method's own processor time; then, for each method, coverage over all problems, the power of the warnings, the targets
-missed.
+missed. `benchmarks/results/estimators_two_stage.json` is what `--runs 200 --methods two-stage --json FILE` wrote.
 
 `--methods two-stage,adss --problems two_d30,six_d8` selects; `--rotation 7` turns the input space of every problem by
 another random rotation than the catalogue's, which changes no probability.

@@ -149,7 +149,7 @@ _RANGES = np.array([[5.0, 40.0], [5.0, 45.0], [4.0, 120.0]])
 def traffic_states(u: FloatArray) -> FloatArray:
     """Map u ~ N(0, I), shape (n, 3), to car-following scenarios by the Rosenblatt transform.
 
-    Each value in turn is drawn from its law given those before, a mixture of two normal laws cut to its range.
+    Each value in turn is drawn from its distribution given those before, a truncated mixture of two Gaussians.
     """
     x = np.empty_like(u)
     log_weights = np.repeat(np.log(_WEIGHTS)[:, None], len(u), axis=1)
@@ -213,7 +213,7 @@ _CUT_IN_CORRELATION = np.array(
 
 
 def cut_in_scenarios(u: FloatArray) -> FloatArray:
-    """Map u ~ N(0, I), shape (n, 6), to cut-in scenarios: normal laws cut to a range under a Gaussian copula."""
+    """Map u ~ N(0, I), shape (n, 6), to cut-in scenarios: truncated Gaussians under a Gaussian copula."""
     z = u @ np.linalg.cholesky(_CUT_IN_CORRELATION).T
     low, high = ndtr((_CUT_IN_RANGES.T - _CUT_IN_MEANS) / _CUT_IN_SCALES)
     return np.asarray(_CUT_IN_MEANS + _CUT_IN_SCALES * ndtri(low + ndtr(z) * (high - low)))

@@ -86,7 +86,7 @@ def cell_of(runs: Sequence[Run], p: float) -> Cell:
 
 
 def covers(run: Run, p: float) -> bool:
-    """Does the interval hold p?"""
+    """Return whether the interval holds p."""
     return run.low <= p <= run.high
 
 

@@ -15,9 +15,10 @@ import typer
 from rich.progress import track
 
 import rare_envs
+from benchmarks import RESULTS
 from rare_envs.scenarios.registry import SCENARIOS
 
-RESULT = Path(__file__).parents[1] / "results" / "truth.json"
+RESULT = RESULTS / "truth.json"
 CHUNK = 131_072
 
 ENV_IDS = ("rare_envs/CarFollowing-v0", "rare_envs/CutIn-v0")

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
-class Played(Vehicle):  # type: ignore[misc]
-    """A vehicle that goes where it is told: x, y, heading and speed at each tick, shape (T + 1, 4)."""
+class ReplayedVehicle(Vehicle):  # type: ignore[misc]
+    """A vehicle that follows a given track: x, y, heading and speed at each tick, shape (T + 1, 4)."""
 
     def __init__(self, road: Road, track: Array) -> None:
         """At the start of its track."""
@@ -29,7 +29,7 @@ class Played(Vehicle):  # type: ignore[misc]
         self.on_state_update()
 
 
-class Scene:
+class HighwayEnvScene:
     """A straight road of HighwayEnv with an `MDPVehicle` and vehicles that are played; 10 Hz, decisions at 1 Hz."""
 
     def __init__(self, lanes: int, tracks: Array, ego: int = 0, frequency: int = 10) -> None:
@@ -46,7 +46,7 @@ class Scene:
         self.env.reset(seed=0)
         network = RoadNetwork.straight_road_network(lanes, start=-100.0, length=20_000.0, speed_limit=100.0)
         road = self.env.road = Road(network, np_random=np.random.RandomState(0))
-        vehicles = [Played(road, tracks[:, j]) for j in range(tracks.shape[1])]
+        vehicles = [ReplayedVehicle(road, tracks[:, j]) for j in range(tracks.shape[1])]
         x, y, heading, speed = tracks[0, ego]
         vehicles[ego] = MDPVehicle(road, [x, y], heading, speed)
         vehicles[ego].check_collisions = False
@@ -67,9 +67,9 @@ class Scene:
         return [*ego.position, ego.heading, ego.speed]
 
     def observe(self) -> Array:
-        """HighwayEnv's observation now, shape (5, 5)."""
+        """Return HighwayEnv's current observation, shape (5, 5)."""
         return np.asarray(self.env.observation_type.observe())
 
     def step(self, action: int) -> Array:
-        """One decision, which is ten ticks; the observation after it."""
+        """Take one decision, which lasts ten ticks, and return the observation after it."""
         return np.asarray(self.env.step(action)[0])

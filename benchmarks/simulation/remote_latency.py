@@ -29,14 +29,14 @@ ENV = "rare_envs/CutIn-v0"
 
 
 def saved_policy(folder: Path) -> Path:
-    """An untrained policy; weights do not matter for speed."""
+    """Save an untrained policy; weights do not matter for speed."""
     path = folder / "ego.zip"
     PPO("MlpPolicy", training.sb3_vec_env(ENV, 2), n_steps=8, batch_size=16, seed=0, device="cpu").save(path)
     return path
 
 
 def measure(batch: int, repeats: int) -> dict[str, Any]:
-    """Rollouts per second of each way, medians over the repeats, and the ratio of in-process to remote."""
+    """Return rollouts per second of each way, medians over the repeats, and the ratio of in-process to remote."""
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as folder:
         path = saved_policy(Path(folder))

@@ -52,7 +52,7 @@ MEMORY_LIMIT = 2.0
 
 
 def seconds(work: Callable[[], object], repeat: int = 1) -> float:
-    """Process time [s] of one call, the least of several."""
+    """Return the process time [s] of one call, the least of several."""
     best = float("inf")
     for _ in range(repeat):
         start = time.process_time()
@@ -62,14 +62,14 @@ def seconds(work: Callable[[], object], repeat: int = 1) -> float:
 
 
 def ppo(env_id: str) -> Any:
-    """An untrained SB3 PPO policy of the default size; its speed does not depend on its weights."""
+    """Return an untrained SB3 PPO policy of the default size; its speed does not depend on its weights."""
     from stable_baselines3 import PPO
 
     return PPO("MlpPolicy", gym.make(env_id), device="cpu", seed=0)
 
 
 def rollout_ratio(env_id: str, rounds: int, reference_rollouts: int = 10) -> dict[str, float]:
-    """Rollouts with the IDM ego, 16384 at a time, against HighwayEnv's."""
+    """Compare rollouts with the IDM ego, 16384 at a time, with HighwayEnv's."""
     problem = rare_envs.DrivingProblem(env_id, horizon=HORIZON)
     x = problem.base.sample(16_384, np.random.default_rng(0))
     problem.evaluate(x[:100])
@@ -84,7 +84,7 @@ def rollout_ratio(env_id: str, rounds: int, reference_rollouts: int = 10) -> dic
 
 
 def policy_ratio(rounds: int) -> dict[str, float]:
-    """Car-following with an SB3 PPO ego, 4096 rollouts at a time, against `predict` in HighwayEnv's loop."""
+    """Compare car following with an SB3 PPO ego, 4096 rollouts at a time, with `predict` in HighwayEnv's loop."""
     model = ppo(CAR_FOLLOWING)
     problem = rare_envs.DrivingProblem(CAR_FOLLOWING, ego=model, horizon=HORIZON)
     x = problem.base.sample(4_096, np.random.default_rng(0))
@@ -96,7 +96,7 @@ def policy_ratio(rounds: int) -> dict[str, float]:
 
 
 def _drive_by_policy(model: Any, x: np.ndarray[Any, Any]) -> None:
-    """HighwayEnv's vehicles, a plain one driven by the policy on the same observation."""
+    """Drive HighwayEnv's vehicles, a plain one by the policy on the same observation."""
     from highway_env.vehicle.kinematics import Vehicle
 
     road = reference.car_following(x)
@@ -115,7 +115,7 @@ def _drive_by_policy(model: Any, x: np.ndarray[Any, Any]) -> None:
 
 
 def step_ratio(steps: int) -> dict[str, float]:
-    """One `env.step` of `gym.make` against HighwayEnv's with two vehicles and the same frequencies."""
+    """Compare one `env.step` of `gym.make` with HighwayEnv's with two vehicles and the same frequencies."""
     import highway_env  # noqa: F401  (registers its ids)
 
     ours = gym.make(CAR_FOLLOWING)
@@ -143,7 +143,7 @@ def step_ratio(steps: int) -> dict[str, float]:
 
 
 def latency_ratio() -> dict[str, float]:
-    """One subset simulation of the cut-in with the IDM ego against as many rollouts of HighwayEnv's objects."""
+    """Compare one subset simulation of the cut-in with the IDM ego with as many rollouts of HighwayEnv's objects."""
     problem = rare_envs.DrivingProblem(CUT_IN)
     samplers.estimate(problem, samplers.AdaptiveSubsetSimulation(), seed=1)
     start = time.process_time()
@@ -160,10 +160,7 @@ def latency_ratio() -> dict[str, float]:
 
 
 def highway(batch: int, rounds: int) -> dict[str, float]:
-    """Highway-v0 with the IDM ego and five learned drivers, against HighwayEnv's six IDM vehicles with its own lidar.
-
-    Rates are seconds of traffic over seconds of work.
-    """
+    """Compare Highway-v0, the IDM ego and five learned drivers, with HighwayEnv's six IDM vehicles and lidar."""
     problem = rare_envs.DrivingProblem(HIGHWAY, measure="lidar_ttc")
     seconds_of_traffic = problem.world.clock.seconds
     x = problem.base.sample(batch, np.random.default_rng(0))
@@ -188,10 +185,7 @@ class Cruise:
 
 
 def camera(batch: int, rounds: int, weather: bool = False) -> dict[str, float]:
-    """Highway-v0 with five learned drivers and an ego that looks: through a camera, and through lidar, in turn.
-
-    Rates are seconds of traffic over seconds of work.
-    """
+    """Compare a camera with lidar as the ego's sensor, in Highway-v0 with five learned drivers."""
     rates: dict[str, list[float]] = {}
     problems = {
         kind: rare_envs.DrivingProblem(HIGHWAY, ego=Cruise(), observation=kind, weather=weather)
@@ -213,7 +207,7 @@ def camera(batch: int, rounds: int, weather: bool = False) -> dict[str, float]:
 
 
 def highway_memory(rollouts: int = 1024) -> dict[str, float]:
-    """Peak memory of this process after 1,024 rollouts of the highway in one batch."""
+    """Return the peak memory of this process after 1,024 rollouts of the highway in one batch."""
     problem = rare_envs.DrivingProblem(HIGHWAY, measure="lidar_ttc")
     x = torch.from_numpy(problem.base.sample(rollouts, np.random.default_rng(0))).float()
     with torch.inference_mode():
@@ -226,7 +220,7 @@ def _peak_gib() -> float:
 
 
 def memory(rollouts: int = 1_000_000) -> dict[str, float]:
-    """Peak memory of this process after a million cut-in rollouts in one call."""
+    """Return the peak memory of this process after a million cut-in rollouts in one call."""
     problem = rare_envs.DrivingProblem(CUT_IN)
     x = problem.base.sample(rollouts, np.random.default_rng(0))
     elapsed = seconds(lambda: problem.evaluate(x))

@@ -4,8 +4,8 @@
 
 FOLDER holds `lanes.csv` (lane, s, x, y: points on the centre lines of six lanes, lane 0 the rightmost) and
 `boundaries.csv` (boundary, x, y: the lines to the left of those lanes), in metres, y positive to the left of x. The
-reference line is a `rare_envs.traffic.reference_line.Curve` in the middle of the leftmost lane. Its curvatures, its
-start and a constant distance to each other lane are fitted by least squares to all lanes but the rightmost, which
+reference line is a `rare_envs.traffic.reference_line.ReferenceLine` in the middle of the leftmost lane. Its curvatures,
+its start and a constant distance to each other lane are fitted by least squares to all lanes but the rightmost, which
 bends towards two ramps.
 """
 

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from benchmarks.driving.lane_changes import CLASSES, OFFSET, completed, crossings_of, steering
+from benchmarks.driving.lane_changes import CLASSES, OFFSET, count_completed, find_crossings, measure_steering
 from rare_envs.sensors.perception import HEADING_COLUMN, SPEED_COLUMN
 from tests.training.imitation.synthetic_scenes import scenes
 from training.imitation.algorithms.expert_pairs import Pairs
@@ -27,11 +27,11 @@ def recording():
 
 
 def test_a_crossing_is_found_where_it_is(recording):
-    found = crossings_of(recording)
+    found = find_crossings(recording)
     assert [column.tolist() for column in found] == [[1], [CROSSING], [0], [1]]
     y = recording.y.clone()
     y[1, CROSSING + 4 :, 0] = 1.8
-    assert len(crossings_of(recording._replace(y=y)).scene) == 0  # back again before it has settled
+    assert len(find_crossings(recording._replace(y=y)).scene) == 0  # back again before it has settled
 
 
 def test_who_goes_straight_on_completes_it_and_who_turns_back_does_not(recording):
@@ -43,9 +43,9 @@ def test_who_goes_straight_on_completes_it_and_who_turns_back_does_not(recording
         action[..., 1] = -features[..., HEADING_COLUMN] / 0.1 - 0.01
         return action, None
 
-    found = crossings_of(recording)
-    assert completed(recording, found, straight, 1.0) == (1, 1.0)
-    assert completed(recording, found, back, 1.0) == (1, 0.0)
+    found = find_crossings(recording)
+    assert count_completed(recording, found, straight, 1.0) == (1, 1.0)
+    assert count_completed(recording, found, back, 1.0) == (1, 0.0)
 
 
 def test_steering_is_counted_towards_where_a_vehicle_moves():
@@ -56,7 +56,7 @@ def test_steering_is_counted_towards_where_a_vehicle_moves():
     features[:, OFFSET] = torch.tensor([0.5, -0.5, 0.0])
     pairs = Pairs(features, torch.tensor([[0.0, 0.02], [0.0, -0.01], [0.0, 0.3]]), torch.zeros(3))
     driver = SimpleNamespace(act=lambda seen: (torch.full((*seen.shape[:2], 2), 0.04), None))
-    found = steering(pairs, {"always right": driver})
+    found = measure_steering(pairs, {"always right": driver})
     keeps, _, out, comes = (found[name] for name in CLASSES)
     assert out == pytest.approx({"moments": 2, "people": 0.015, "always right": 0.0}, abs=1e-6)
     assert keeps == pytest.approx({"moments": 1, "people": 0.3, "always right": 0.04}, abs=1e-6)

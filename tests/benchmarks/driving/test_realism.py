@@ -10,9 +10,9 @@ from agents import LearnedDriver, WeightDistribution
 from agents.learned.networks import head_weights
 from benchmarks.driving import realism_rows as imitation_rows
 from benchmarks.driving.forward_model import compare
-from benchmarks.driving.realism import named, report, rounded
-from benchmarks.driving.realism_figures import draw, tables
-from benchmarks.driving.realism_rows import Effort, highway, moved
+from benchmarks.driving.realism import load_named, measure_all, round_numbers
+from benchmarks.driving.realism_figures import format_tables, write_figures
+from benchmarks.driving.realism_rows import Effort, highway_starts, move_weights
 from tests.training.imitation.synthetic_scenes import scenes
 from training.imitation.algorithms.config import HUMAN_NOISE, Config
 from training.imitation.fit import make_learner, prepare_data
@@ -34,10 +34,10 @@ def test_a_report_has_every_row_table_and_figure(data, driver, tmp_path, monkeyp
     monkeypatch.setattr(imitation_rows, "RADII", (0.1,))
     monkeypatch.setattr(imitation_rows, "SECONDS", (2.0, 3.0))
     effort = Effort(noises=2, draws=2, rollouts=2, each=1, highway=5)
-    found = report(data.recording, data.recording, {"bc": driver}, effort)
+    found = measure_all(data.recording, data.recording, {"bc": driver}, effort)
     json.dumps(found, allow_nan=False)
     names = [row["name"] for row in found["realism"] if row["kind"] != "box"]
-    assert names == ["people", "constant velocity", "IDM, lane keeping", "bc", "bc, drawn from its law"]
+    assert names == ["people", "constant velocity", "IDM, lane keeping", "bc", "bc, drawn from its distribution"]
     one = next(row for row in found["realism"] if row["name"] == "bc")["2 s"]
     assert one["vehicles"] == 2 * (6 + 6 + 5) * 2  # scenes, starts at 0, 2 and 4 s, sequences of noise
     assert one["collision"] == pytest.approx(np.mean(one["collisions"]))
@@ -46,10 +46,10 @@ def test_a_report_has_every_row_table_and_figure(data, driver, tmp_path, monkeyp
     assert len(boxes) == 10
     speeds = {row["direction"]: row["2 s"]["mean_speed"] for row in boxes}
     assert speeds["acceleration -"] < one["mean_speed"] < speeds["acceleration +"]
-    text = tables(found)
+    text = format_tables(found)
     for name in [*names, "yaw rate +", "One vehicle driven"]:
         assert name in text
-    draw(found, tmp_path)
+    write_figures(found, tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {"rates.svg", "distributions.svg", "errors.svg", "boxes.svg"}
 
 
@@ -57,7 +57,7 @@ def test_moves_stay_in_their_box_and_aligned_ones_move_one_output_the_furthest(d
     features = torch.randn(20, 51, generator=torch.Generator().manual_seed(0))
     mean = torch.from_numpy(np.array(driver.weights.mean)).float()
     hidden = torch.cat((driver.policy.trunk(features).mean(dim=0), torch.ones(1)))
-    for radius, direction, weights in moved(driver, features, 2):
+    for radius, direction, weights in move_weights(driver, features, 2):
         for row in weights:
             assert (row - mean).abs().max() <= radius * (1 + 1e-4)
         if direction == "yaw rate -":
@@ -67,7 +67,7 @@ def test_moves_stay_in_their_box_and_aligned_ones_move_one_output_the_furthest(d
 
 
 def test_six_cars_start_within_40_m_one_in_each_lane():
-    start = highway(50)
+    start = highway_starts(50)
     assert start.x.min() > 0
     assert start.x.max() < 40
     assert ((start.y > start.edges[:, :-1]) & (start.y < start.edges[:, 1:])).all()
@@ -83,12 +83,12 @@ def test_drivers_are_named_by_their_files(driver, tmp_path):
     (tmp_path / "second").mkdir()
     for path in (tmp_path / "mine.safetensors", tmp_path / "second" / "driver.safetensors"):
         save_driver(driver, about, path)
-    found = named([str(tmp_path / "mine.safetensors"), str(tmp_path / "second" / "driver.safetensors")])
+    found = load_named([str(tmp_path / "mine.safetensors"), str(tmp_path / "second" / "driver.safetensors")])
     assert list(found) == ["mine", "second"]
 
 
 def test_numbers_are_rounded():
-    assert rounded({"a": [1.23456789, 3], "b": "c"}) == {"a": [1.2346, 3], "b": "c"}
+    assert round_numbers({"a": [1.23456789, 3], "b": "c"}) == {"a": [1.2346, 3], "b": "c"}
 
 
 def test_gradients_of_both_ways_are_compared(data):

@@ -9,7 +9,7 @@ import typer
 from typer.testing import CliRunner
 
 from benchmarks.driving import search_over_drivers as study
-from benchmarks.driving.failing_traffic import average, failing_points, spread
+from benchmarks.driving.failing_traffic import failing_points, weighted_mean, weighted_variance
 from samplers import CrossEntropy
 
 
@@ -43,18 +43,18 @@ def test_failing_points_of_several_runs_are_weighted_together():
 
 def test_weighted_statistics_by_hand():
     values, weights = np.array([[0.0, 1.0], [2.0, 5.0]]), np.array([0.25, 0.75])
-    np.testing.assert_allclose(spread(values, weights), [0.75, 3.0])
+    np.testing.assert_allclose(weighted_variance(values, weights), [0.75, 3.0])
     chosen = np.array([[True, False], [True, True]])
-    assert average(values, chosen, weights) == pytest.approx((0.75 * 2.0 + 0.75 * 5.0) / 1.75)
+    assert weighted_mean(values, chosen, weights) == pytest.approx((0.75 * 2.0 + 0.75 * 5.0) / 1.75)
 
 
 def test_pieces_add_up():
-    assert list(study.pieces(20_000, 8192)) == [8192, 8192, 3616]
+    assert list(study.split_sizes(20_000, 8192)) == [8192, 8192, 3616]
 
 
 @pytest.mark.parametrize(("option", "word"), [("--methods", "cee"), ("--noise", "loud")])
 def test_words_are_checked_before_anything_is_simulated(option, word, monkeypatch):
-    monkeypatch.setattr(study, "reference", lambda *_: pytest.fail("simulated"))
+    monkeypatch.setattr(study, "run_reference", lambda *_: pytest.fail("simulated"))
     app = typer.Typer()
     app.command()(study.main)
     result = CliRunner().invoke(app, [option, word])
@@ -66,6 +66,6 @@ def test_a_reference_of_another_question_is_refused(tmp_path):
     question = {"ego": "idm", "gamma": 0.5}
     path = tmp_path / "report.json"
     path.write_text(json.dumps({"question": question, "reference": {"p": 1e-3}}))
-    assert study.earlier(path, question) == {"p": 1e-3}
+    assert study.read_reference(path, question) == {"p": 1e-3}
     with pytest.raises(typer.BadParameter, match=r"'gamma': 0\.5"):
-        study.earlier(path, {**question, "gamma": 0.4})
+        study.read_reference(path, {**question, "gamma": 0.4})

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from stable_baselines3 import DQN
 
 import rare_envs
-from benchmarks.simulation.highway_env_scene import Scene
+from benchmarks.simulation.highway_env_scene import HighwayEnvScene
 from rare_envs.control.actions import FASTER, IDLE, LANE_LEFT, LANE_RIGHT, SLOWER
 from rare_envs.control.meta_actions import TARGET_SPEEDS, follow_meta_actions, initial_aim
 from rare_envs.make import set_up
@@ -80,7 +80,7 @@ def test_observation_and_motion_are_highway_envs_in_random_scenes() -> None:
         tracks = random_traffic(rng, vehicles, lanes)
         decisions = rng.choice(5, SECONDS, p=[0.3, 0.1, 0.3, 0.15, 0.15]).tolist()
         ego = int(rng.integers(vehicles))
-        scene = Scene(lanes, tracks, ego)
+        scene = HighwayEnvScene(lanes, tracks, ego)
         theirs = np.array([scene.observe(), *(scene.step(action) for action in decisions)])
         motion, ours = drive_by_hand(tracks, lanes, decisions, ego)
         np.testing.assert_allclose(motion, scene.states, atol=TOLERANCE, rtol=0)
@@ -108,7 +108,7 @@ def test_our_scenarios_are_highway_envs_until_contact(env_id: str) -> None:
         tracks = torch.stack(fields, dim=-1).numpy()
         free = [not bool(e.collided[row]) for e in episodes]
         seconds = (free.index(False) - 1 if False in free else TICKS) // 10
-        scene = Scene(world.scenario.road.lanes, tracks)
+        scene = HighwayEnvScene(world.scenario.road.lanes, tracks)
         theirs = [scene.observe(), *(scene.step(int(a)) for a in decisions[row, :seconds])]
         for second, observed in enumerate(theirs):
             episode = episodes[10 * second]

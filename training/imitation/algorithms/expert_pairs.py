@@ -8,7 +8,7 @@ from torch import Tensor
 from agents.learned.networks import FEATURE_SIZE, Scaling
 from rare_envs.sensors.perception import HEADING_COLUMN, SPEED_COLUMN
 from training.imitation.traffic.recording import Recording
-from training.imitation.traffic.replayed_traffic import perceive_traffic, start_replay
+from training.imitation.traffic.replayed_traffic import replay_features, start_replay
 
 FAST_LATERAL_SPEED = 0.4
 """Lateral speed [m/s] above which a moment is repeated, see `emphasise_lateral`."""
@@ -37,7 +37,7 @@ def collect_pairs(recording: Recording) -> Pairs:
         action = torch.stack(
             [field[scene, tick].gather(1, vehicle) for field in (recording.acceleration, recording.yaw_rate)], dim=-1
         )
-        features.append(perceive_traffic(traffic, m)[driven])
+        features.append(replay_features(traffic, m)[driven])
         actions.append(action[driven])
         scenes.append(scene[:, None].expand_as(driven)[driven])
     return Pairs(torch.cat(features), torch.cat(actions), torch.cat(scenes))

@@ -11,7 +11,7 @@ from training.imitation.algorithms.actions import denormalise_action
 from training.imitation.algorithms.forward_model import ForwardModel
 from training.imitation.algorithms.penalties import Penalties, compute_penalties
 from training.imitation.traffic.recording import Recording
-from training.imitation.traffic.replayed_traffic import Traffic, detach_traffic, perceive_traffic, step_replay
+from training.imitation.traffic.replayed_traffic import Traffic, detach_traffic, replay_features, step_replay
 from training.imitation.traffic.scene_pool import ScenePool
 
 
@@ -61,7 +61,7 @@ def roll_out(
     features: Tensor | None = None
     action: Tensor | None = None
     for _ in range(ticks):
-        before, features = features, perceive_traffic(traffic, m)
+        before, features = features, replay_features(traffic, m)
         if model is not None and before is not None and action is not None:
             features = model.substitute_gradient(policy, before, action, features, credit)
         mean, log_std = policy(features)

@@ -12,7 +12,7 @@ from rare_envs.sensors.perception import RANGE_COLUMNS, RATE_COLUMNS
 from rare_envs.traffic.oriented_boxes import boxes_overlap
 from training.data.trajectories import DT
 from training.imitation.traffic.recording import Recording
-from training.imitation.traffic.replayed_traffic import Traffic, lane_of, perceive_traffic, start_replay, step_replay
+from training.imitation.traffic.replayed_traffic import Traffic, lane_of, replay_features, start_replay, step_replay
 
 Act = Callable[[Tensor, "Tensor | None"], tuple[Tensor, "Tensor | None"]]
 """Function from features (B, M, 51) and a memory, None at first, to actions (B, M, 2) [m/s^2, rad/s] and the new
@@ -108,7 +108,7 @@ def drive_traffic(recording: Recording | None, traffic: Traffic, act: Act, ticks
     unused = torch.zeros(*traffic.x.shape[:1], traffic.x.shape[1] - m, 2)
     memory = None
     for _ in range(ticks):
-        features = perceive_traffic(traffic, m)
+        features = replay_features(traffic, m)
         action, memory = act(features, memory)
         yield DrivingStep(traffic, features, action)
         traffic = step_replay(recording, traffic, torch.cat((action, unused), dim=1))
@@ -173,7 +173,7 @@ def recorded_behaviour(recording: Recording) -> Behaviour:
             ],
             dim=-1,
         )
-        moment = DrivingStep(traffic, perceive_traffic(traffic, m), action)
+        moment = DrivingStep(traffic, replay_features(traffic, m), action)
         lane = lane_of(traffic.y, traffic.edges)[:, :m]
         vehicle = traffic.vehicle[:, :m]
         driven = traffic.driven[:, :m] & (at == tick)[:, None]

@@ -115,7 +115,7 @@ def on_road(y: Tensor, heading: Tensor, edges: Tensor) -> OnRoad:
     return OnRoad(y - 0.5 * (left + right), heading, torch.zeros_like(y), y - left, right - y)
 
 
-def perceive_traffic(traffic: Traffic, observers: int | None = None) -> Tensor:
+def replay_features(traffic: Traffic, observers: int | None = None) -> Tensor:
     """Return the 51 features of the first vehicles, shape (B, M, 51).
 
     Args:

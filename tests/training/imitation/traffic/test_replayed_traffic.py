@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from training.imitation.traffic.replayed_traffic import perceive_traffic, start_replay, step_replay
+from training.imitation.traffic.replayed_traffic import replay_features, start_replay, step_replay
 
 
 def at_start(recording, tick=0):
@@ -64,7 +64,7 @@ def test_features_are_where_the_names_say(recording):
     from rare_envs.sensors.perception import FEATURES
 
     traffic = at_start(recording)
-    features = perceive_traffic(traffic)
+    features = replay_features(traffic)
     assert len(FEATURES) == features.shape[-1] == 51
     torch.testing.assert_close(features[..., FEATURES.index("speed")], traffic.speed)
     left, right = (features[..., FEATURES.index(name)] for name in ("left_marker", "right_marker"))
