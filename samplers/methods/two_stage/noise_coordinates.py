@@ -7,27 +7,18 @@ p = E[P(f(X, Z) <= gamma | X)], and weights are those of X alone. f is then nois
 simulated x replays.
 """
 
-from typing import Protocol, cast, runtime_checkable
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from samplers.problem import Distribution, FloatArray, Inputs
-
-
-@runtime_checkable
-class MarksNoise(Protocol):
-    """A base distribution that says which coordinates of x are noise."""
-
-    @property
-    def noise(self) -> NDArray[np.bool_]:
-        """Which coordinates are noise, shape (d,)."""
+from samplers.problem import Distribution, FloatArray, HasNoise, Inputs
 
 
 def noise_mask(inputs: Inputs) -> NDArray[np.bool_]:
     """Return which coordinates of x are noise, shape (d,): none where the base distribution does not say."""
-    base = inputs.base
-    return np.asarray(base.noise, dtype=bool) if isinstance(base, MarksNoise) else np.zeros(inputs.dim, dtype=bool)
+    noise = inputs.base.noise if isinstance(inputs.base, HasNoise) else None
+    return np.zeros(inputs.dim, dtype=bool) if noise is None else np.asarray(noise, dtype=bool)
 
 
 def marginalise_noise(inputs: Inputs, rng: np.random.Generator) -> Inputs:
