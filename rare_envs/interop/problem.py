@@ -36,6 +36,13 @@ class HighwayEnvProblem:
         workers: Number of processes.
         space: Names, units, bounds and base distribution of x.
         fixed: Parameters that are held, and their values.
+
+    Example:
+        >>> problem = highway_env_problem("highway-fast-v0", config={"vehicles_count": 5}, fixed="highway_env")
+        >>> problem.space.names
+        ('ego_lane', 'speed', 'gap', 'lane', 'noise')
+        >>> problem.fixed["ego_speed"]
+        25.0
     """
 
     def __init__(self, task: DriveTask, ego: Any, workers: int) -> None:
@@ -191,6 +198,11 @@ def highway_env_problem(
 
     Raises:
         ValueError: If an argument is invalid, or the ego's spaces are not the environment's.
+
+    Example:
+        >>> problem = highway_env_problem("highway-fast-v0", config={"vehicles_count": 5, "duration": 3})
+        >>> problem.evaluate(problem.base.sample(3, np.random.default_rng(0))).shape
+        (3,)
     """
     if isinstance(horizon, bool) or not isinstance(horizon, int | float) or not 0.0 < horizon <= 1e4:
         raise ValueError(f"Expected a horizon in seconds, positive and at most 10,000, got {horizon!r}.")

@@ -20,7 +20,13 @@ UNUSED_FIELDS = ("target_cov", "replicates", "on_error")
 
 
 class EgoComparison(NamedTuple):
-    """Two egos compared."""
+    """Two egos compared.
+
+    Example:
+        >>> question = Question(env_id="rare_envs/CarFollowing-v0", gamma=3.0, horizon=3.0, method="mc", max_sim=1000)
+        >>> compare_egos(question, "idm").answer["question"]["ego_b"]
+        'idm'
+    """
 
     comparison: samplers.Comparison
     """The estimate of p_A / p_B."""
@@ -42,6 +48,12 @@ def compare_egos(question: Question, ego_b: str, progress: bool = False, out: Pa
 
     Raises:
         BadInput: An argument cannot be used, or an ego failed on some x or is gone.
+
+    Example:
+        >>> question = Question(env_id="rare_envs/CarFollowing-v0", gamma=3.0, horizon=3.0, method="mc", max_sim=1000)
+        >>> comparison = compare_egos(question, "idm").comparison
+        >>> comparison.ratio
+        1.0
     """
     a, b = prepare(question), prepare(replace(question, ego=ego_b))
     with contextlib.nullcontext() if out is None else output_folder(out):

@@ -9,7 +9,14 @@ from pathlib import Path
 
 
 class BadInput(Exception):
-    """Input that cannot be used; the message is one line that says what to do."""
+    r"""Input that cannot be used; the message is one line that says what to do.
+
+    Example:
+        >>> raise BadInput("Expected a seed,\n  got None.")
+        Traceback (most recent call last):
+            ...
+        rare_envs.study.errors.BadInput: Expected a seed, got None.
+    """
 
     def __init__(self, message: object) -> None:
         super().__init__(" ".join(str(message).split()))

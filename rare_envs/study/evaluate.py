@@ -58,6 +58,11 @@ class Question:
         weather: Whether weather and the camera's noise are parameters.
         on_error: Treatment of scenarios on which the ego fails twice: "raise" ends the run, "failure" counts them as
             failing, "bound" as failing in p and the upper end of the interval, but not in the lower end.
+
+    Example:
+        >>> question = Question(env_id="rare_envs/CarFollowing-v0", ego="idm", gamma=3.0, seed=1)
+        >>> question.run_arguments.gamma, question.method
+        (3.0, 'two-stage')
     """
 
     env_id: str
@@ -100,7 +105,13 @@ class Question:
 
 @dataclass(frozen=True)
 class Study:
-    """A question with everything that it names, loaded and checked."""
+    """A question with everything that it names, loaded and checked.
+
+    Example:
+        >>> study = prepare(Question(env_id="rare_envs/CarFollowing-v0", method="mc"))
+        >>> study.problem.space.names, study.method.name
+        (('ego_speed', 'lead_speed', 'gap'), 'mc')
+    """
 
     question: Question
     problem: rare_envs.DrivingProblem
@@ -118,6 +129,13 @@ class Report:
         faults: Scenarios on which the ego failed twice.
         n_retried: Simulations that were repeated to find them; not in n_sim.
         kinds: Crashes in which the failures ended.
+
+    Example:
+        >>> question = Question(env_id="rare_envs/CarFollowing-v0", gamma=3.0, horizon=3.0, method="mc", max_sim=1000)
+        >>> report = run(prepare(question))
+        >>> answer = report.to_dict()
+        >>> answer["n_failures"], answer["doubtful"], answer["failures"][0]["crash"]
+        (21, False, None)
     """
 
     study: Study
@@ -205,6 +223,12 @@ def prepare(question: Question) -> Study:
 
     Raises:
         BadInput: Something in the question cannot be used.
+
+    Example:
+        >>> prepare(Question(env_id="rare_envs/CutIn-v0", seed=-1))
+        Traceback (most recent call last):
+            ...
+        rare_envs.study.errors.BadInput: Expected seed to be a whole number of at least 0, got -1.
     """
     with as_bad_input(ValueError, OSError):
         question.run_arguments  # noqa: B018  (checks them)
@@ -268,6 +292,14 @@ def run(
 
     Raises:
         BadInput: The ego failed on some x, or is gone.
+
+    Example:
+        How often does the rule-based ego come within 3 s of a collision in the first 3 s?
+
+        >>> question = Question(env_id="rare_envs/CarFollowing-v0", gamma=3.0, horizon=3.0, method="mc", max_sim=1000)
+        >>> report = run(prepare(question))
+        >>> report.estimate.p, report.estimate.n_sim
+        (0.021, 1000)
     """
     question, start = study.question, time.perf_counter()
     problem = FaultTolerant(study.problem, question.on_error)

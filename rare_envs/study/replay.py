@@ -28,6 +28,12 @@ class Drive:
     Attributes:
         problem: The world and its ego.
         episodes: The moments, each a batch of one.
+
+    Example:
+        >>> problem = DrivingProblem("rare_envs/CarFollowing-v0", horizon=1.0)
+        >>> drive = drive_again(problem, np.array([10.0, 10.0, 50.0]))
+        >>> drive.position.shape, float(drive.gap[0]), drive.collided, drive.names
+        ((11, 2, 2), 50.0, False, ('the ego', 'the lead'))
     """
 
     problem: DrivingProblem

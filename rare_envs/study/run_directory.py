@@ -58,6 +58,14 @@ def run_into(folder: Path, study: Study, progress: bool = False) -> Report:
 
     Raises:
         BadInput: See `rare_envs.study.evaluate.run`; or the folder cannot be used, or has an unfinished run.
+
+    Example:
+        >>> from tempfile import TemporaryDirectory
+        >>> question = Question(env_id="rare_envs/CarFollowing-v0", gamma=3.0, horizon=3.0, method="mc", max_sim=1000)
+        >>> with TemporaryDirectory() as folder:
+        ...     report = run_into(Path(folder), prepare(question))
+        ...     sorted(path.name for path in Path(folder).iterdir())
+        ['failures.csv', 'plot.png', 'result.json']
     """
     with output_folder(folder), closing(Journal(folder, asdict(study.question))) as journal:
         return _run(folder, study, journal, progress)
@@ -77,6 +85,12 @@ def resume(
 
     Raises:
         BadInput: There is no unfinished run, it cannot be continued, or it is interrupted again.
+
+    Example:
+        >>> resume(Path("runs/nowhere"))
+        Traceback (most recent call last):
+            ...
+        rare_envs.study.errors.BadInput: There is no unfinished run in 'runs/nowhere': it has no journal.npy.
     """
     with closing(Journal(folder)) as journal:
         try:
@@ -115,6 +129,14 @@ def write_run(folder: Path, report: Report) -> None:
     Args:
         folder: An existing folder; files of an earlier run in it are replaced.
         report: What to write.
+
+    Example:
+        >>> from tempfile import TemporaryDirectory
+        >>> report = run(prepare(Question(env_id="rare_envs/CarFollowing-v0", method="mc", max_sim=100, horizon=1.0)))
+        >>> with TemporaryDirectory() as folder:
+        ...     write_run(Path(folder), report)
+        ...     json.loads((Path(folder) / "result.json").read_text())["status"]
+        'no_hits'
     """
     (folder / RESULT).write_text(format_json(report.to_dict()) + "\n", encoding="utf-8")
     _write_failures(folder, report)
@@ -142,6 +164,15 @@ def read_failures(folder: Path) -> dict[str, NDArray[Any]]:
 
     Raises:
         FileNotFoundError: There is no such run.
+
+    Example:
+        >>> from tempfile import TemporaryDirectory
+        >>> question = Question(env_id="rare_envs/CarFollowing-v0", gamma=3.0, horizon=3.0, method="mc", max_sim=1000)
+        >>> with TemporaryDirectory() as folder:
+        ...     report = run_into(Path(folder), prepare(question))
+        ...     failures = read_failures(Path(folder))
+        >>> failures["gap"].shape, str(failures["crash"][0]), round(float(failures["f"][0]), 2)
+        ((21,), 'none', 2.57)
     """
     with (folder / FAILURES).open(newline="", encoding="utf-8") as file:
         header, *rows = csv.reader(file)

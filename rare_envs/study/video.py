@@ -170,6 +170,15 @@ def write_film(path: Path | str, drive: Drive, width: int = WIDTH, every: int = 
 
     Raises:
         BadInput: See `check_film_path`.
+
+    Example:
+        >>> from tempfile import TemporaryDirectory
+        >>> from rare_envs.study import drive_again
+        >>> drive = drive_again(DrivingProblem("rare_envs/CarFollowing-v0", horizon=1.0), np.array([20.0, 5.0, 10.0]))
+        >>> with TemporaryDirectory() as folder:
+        ...     write_film(Path(folder) / "worst.png", drive, width=300)
+        ...     Image.open(Path(folder) / "worst.png").size
+        (300, 132)
     """
     check_film_path(path)
     path = Path(path)

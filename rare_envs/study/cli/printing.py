@@ -61,7 +61,15 @@ def _make_parameter_table(title: str, parameters: list[dict[str, Any]]) -> Table
 
 
 def print_report(report: Report, out: Path | None = None) -> None:
-    """Print the number, what it rests on, the most likely failure, and where the files are."""
+    """Print the number, what it rests on, the most likely failure, and where the files are.
+
+    Example:
+        >>> from rare_envs.study import Question, prepare, run
+        >>> report = run(prepare(Question(env_id="rare_envs/CarFollowing-v0", method="mc", max_sim=100, horizon=1.0)))
+        >>> print_report(report)  # doctest: +ELLIPSIS
+        P[f <= 0] = 0.000e+00   rare_envs/CarFollowing-v0, ego idm
+          95 % interval   0.000e+00 to ...
+    """
     # markup off: P[f <= 0] and what warnings quote would be read as tags
     console = Console(highlight=False, soft_wrap=True, markup=False)
     estimate, question = report.estimate, report.study.question

@@ -40,6 +40,10 @@ class EgoCheckRequest:
         base: Base distribution of the scenarios that it drives; the environment's default when None.
         drivers: Of the vehicles around it; the environment's default when None.
         horizon: Length of an episode [s]; the environment's when None.
+
+    Example:
+        >>> EgoCheckRequest("ppo.zip", "rare_envs/CutIn-v0").time_limit
+        30.0
     """
 
     ego: str
@@ -65,6 +69,11 @@ def check_ego(request: EgoCheckRequest) -> list[Finding]:
 
     Raises:
         BadInput: The environment is unknown, or there is no such file.
+
+    Example:
+        >>> for finding in check_ego(EgoCheckRequest("https://example.org/ego.zip", "rare_envs/CutIn-v0")):
+        ...     print(finding.check, finding.status, finding.found)
+        origin fail 'https://example.org/ego.zip' is a remote place
     """
     from agents.loading import find_ego_kind, strip_prefixes
     from agents.sb3.file_trust import TRUST_ADVICE, TRUST_CONSEQUENCE, find_origin_risks

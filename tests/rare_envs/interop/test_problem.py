@@ -2,25 +2,17 @@
 
 import pickle
 import threading
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
-from highway_env.vehicle.kinematics import Vehicle
-from numpy.typing import NDArray
 from scipy import integrate
 from stable_baselines3 import DQN
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import rare_envs
 import samplers
-from rare_envs.egos.wrappers import wrap_policy
-from rare_envs.interop.measures import HIGHWAY_ENV_MEASURES, contact_time
-from rare_envs.interop.simulation import make_highway_env, strip_ego
-from rare_envs.traffic.oriented_boxes import axes_of, project_on_axes, time_to_contact
-from tests.rare_envs.interop.egos import Always, faster
+from rare_envs.interop.simulation import make_highway_env
+from tests.rare_envs.interop.egos import Always
 
 FAST = {"vehicles_count": 3, "duration": 4}
 
@@ -49,41 +41,6 @@ def test_f_is_the_measure_of_the_drive_that_the_wrapper_shows() -> None:
     assert len(set(f)) > 2
     np.testing.assert_array_equal(problem.evaluate(x[::-1])[::-1], f)
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(problem)).evaluate(x[:2]), f[:2])
-
-
-def test_workers_and_their_number_change_no_bit() -> None:
-    x = fast().base.sample(5, np.random.default_rng(1))
-    expected = fast(Always(3)).evaluate(x)
-    with fast(faster, workers=2) as problem:
-        np.testing.assert_array_equal(problem.evaluate(x), expected)
-        np.testing.assert_array_equal(problem.evaluate(x[::-1])[::-1], expected)
-
-
-def test_a_model_of_stable_baselines3_is_an_ego() -> None:
-    env = make_highway_env("highway-fast-v0", FAST)
-    model = DQN("MlpPolicy", env, seed=0, buffer_size=10, policy_kwargs={"net_arch": [8]})
-    problem = fast(model)
-    x = problem.base.sample(2, np.random.default_rng(2))
-    f = problem.evaluate(x)
-    assert np.isfinite(f).all()
-    scenario = rare_envs.HighwayEnvScenario(make_highway_env("highway-fast-v0", FAST), vehicles=2)
-    observation, _ = scenario.reset(options={"x": x[0]})
-    over = False
-    while not over:
-        observation, _, terminated, truncated, info = scenario.step(model.predict(observation, deterministic=True)[0])
-        over = terminated or truncated
-    assert info["measure"] == f[0]
-
-
-def test_statistics_of_a_model_travel_without_its_environment() -> None:
-    vec_env = VecNormalize(DummyVecEnv([lambda: make_highway_env("highway-fast-v0", FAST)]))
-    model = DQN("MlpPolicy", vec_env, seed=0, buffer_size=10, policy_kwargs={"net_arch": [8]})
-    vec_env.obs_rms.mean[...] = 0.5  # type: ignore[union-attr]
-    seen = np.random.default_rng(0).uniform(-1.0, 1.0, (1, 5, 5)).astype(np.float32)
-    expected = model.predict(np.asarray(vec_env.normalize_obs(seen)), deterministic=True)[0]
-    there = wrap_policy(pickle.loads(pickle.dumps(strip_ego(model))), vec_env.observation_space)
-    assert there.normalise(seen)[0, 0, 0] == pytest.approx(vec_env.normalize_obs(seen)[0, 0, 0])  # type: ignore[call-overload]
-    np.testing.assert_array_equal(there.predict(seen)[0], expected)
 
 
 @pytest.mark.parametrize("env_id", ["merge-v1", "roundabout-v1", "intersection-v2"])
@@ -147,55 +104,6 @@ def test_long_monte_carlo_agrees_with_the_integral_and_the_sampler() -> None:
     p, n = truth(), 6000
     f = truth_problem(workers=2).evaluate(truth_problem().base.sample(n, np.random.default_rng(5)))
     assert abs((f <= 0.0).mean() - p) < 4.0 * (p * (1.0 - p) / n) ** 0.5
-
-
-def body(rng: np.random.Generator) -> SimpleNamespace:
-    heading, speed = rng.uniform(-np.pi, np.pi), rng.uniform(0.0, 30.0)
-    return SimpleNamespace(
-        position=rng.uniform(-8.0, 8.0, 2),
-        heading=heading,
-        velocity=speed * np.array([np.cos(heading), np.sin(heading)]),
-        LENGTH=Vehicle.LENGTH,
-        WIDTH=Vehicle.WIDTH,
-    )
-
-
-def test_contact_time_is_that_of_the_tensor_implementation() -> None:
-    rng = np.random.default_rng(6)
-    pairs = [(body(rng), body(rng)) for _ in range(300)]
-    ours = np.array([contact_time(one, other) for one, other in pairs])
-
-    def column(values: list[Any]) -> torch.Tensor:
-        return torch.tensor(np.array(values), dtype=torch.float64)
-
-    way: NDArray[np.float64] = np.array([other.position - one.position for one, other in pairs])
-    drift: NDArray[np.float64] = np.array([other.velocity - one.velocity for one, other in pairs])
-    headings = column([one.heading for one, _ in pairs]), column([other.heading for _, other in pairs])
-    axes = axes_of(column(way[:, 0]), column(way[:, 1]), *headings)  # type: ignore[arg-type]
-    rate = project_on_axes(column(drift[:, 0]), column(drift[:, 1]), *headings)  # type: ignore[arg-type]
-    theirs = time_to_contact(axes, rate).numpy()
-    meet = ours < 10.0
-    assert 20 < meet.sum() < 280
-    np.testing.assert_allclose(ours[meet], theirs[meet], atol=1e-9)
-    assert (theirs[~meet] >= 10.0).all()
-
-
-def test_measures_by_hand() -> None:
-    env = rare_envs.HighwayEnvScenario(make_highway_env("highway-fast-v0", {**FAST, "vehicles_count": 2}), vehicles=2)
-    env.reset(options={"ego_lane": 0, "ego_speed": 30.0, "speed": [20.0, 10.0], "gap": [30.0, 2.0], "lane": [1, 0]})
-    assert HIGHWAY_ENV_MEASURES["front_ttc"](env.scene) == pytest.approx(
-        37.0 / 20.0
-    )  # the second one: 30 + 5 + 2 m ahead
-    assert HIGHWAY_ENV_MEASURES["ttc"](env.scene) == pytest.approx(37.0 / 20.0)  # the other lane's is passed by
-    env.reset(options={"ego_lane": 0, "ego_speed": 30.0, "speed": [20.0, 10.0], "gap": [30.0, 2.0], "lane": [1, 1]})
-    assert (HIGHWAY_ENV_MEASURES["front_ttc"](env.scene), HIGHWAY_ENV_MEASURES["ttc"](env.scene)) == (10.0, 10.0)
-
-
-def test_a_measure_of_ones_own() -> None:
-    problem = fast(measure=lambda env: 40.0 - env.vehicle.speed)
-    assert (problem.evaluate(problem.base.sample(1, np.random.default_rng(0))) >= 10.0 - 1e-9).all()
-    with pytest.raises(ValueError, match="gave NaN"):
-        fast(measure=lambda env: np.nan).evaluate(problem.base.sample(1, np.random.default_rng(0)))
 
 
 def test_what_p_is_conditional_on() -> None:

@@ -87,24 +87,6 @@ def test_another_f_than_recorded_is_a_warning(cli, run):
     assert "warning: the run recorded f = -1" in answer.stdout
 
 
-def test_moments_by_hand():
-    """Closing 30 m at 10 m/s while the ego coasts: f so far falls by the tick, and each moment's is the same."""
-
-    class Coasting:
-        def predict(self, observation, state=None, episode_start=None, deterministic=True):
-            return np.zeros((len(observation), 2), np.float32), None
-
-    problem = rare_envs.DrivingProblem(FOLLOWING, ego=Coasting())
-    drive = drive_again(problem, np.array([20.0, 10.0, 30.0]))
-    k = np.arange(len(drive.f_so_far) - 1)
-    expected = np.maximum(3.0 - 0.1 * k, 0.001)  # gaps are at least 1 cm
-    np.testing.assert_allclose(drive.f_alone[:-1], expected, atol=1e-4)
-    np.testing.assert_allclose(drive.f_so_far[:-1], expected, atol=1e-4)
-    assert drive.f == -1.0
-    assert drive.time[len(k)] == pytest.approx(3.0, abs=0.11)
-    assert drive.f == problem.evaluate(np.array([[20.0, 10.0, 30.0]]))[0]
-
-
 @pytest.mark.parametrize("env_id", rare_envs.ENV_IDS)
 def test_every_scenario_and_a_drive_without_a_crash(env_id, tmp_path):
     problem = rare_envs.DrivingProblem(env_id, horizon=1.0, noise=False)

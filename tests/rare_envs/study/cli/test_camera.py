@@ -13,7 +13,6 @@ from gymnasium import spaces
 from typer.testing import Result
 
 import rare_envs
-from rare_envs.study.columns import format_value
 from rare_envs.study.ego_check.behaviour import EGO_CHECKS
 from rare_envs.study.ego_check.probe import Probe
 
@@ -56,23 +55,6 @@ def test_weather_on_the_command_line(cli: Cli, tmp_path: Path) -> None:
     found = json.loads(cli(*words, "--horizon", "1", "--out", str(out), "--json").stdout)
     assert found["question"]["weather"] is True
     assert found["question"]["observation"] == "camera+lidar"
-
-
-def test_thin_air_is_not_shown_as_none() -> None:
-    assert [format_value(value) for value in (1.9e-4, 0.03, 0.0, -12.345, -0.001)] == [
-        "0.00019",
-        "0.03",
-        "0.00",
-        "-12.35",
-        "-0.001",
-    ]
-    assert [format_value(value, 1) for value in (0.002, 21.04)] == ["0.002", "21.0"]
-
-
-def test_the_list_has_the_weather(cli: Cli) -> None:
-    listed = json.loads(cli("list", "--json").stdout)["weather"]
-    assert [each["name"] for each in listed] == ["fog", "sun_elevation", "sun_azimuth", "sensor_noise"]
-    assert "sun_elevation" in cli("list").stdout
 
 
 def test_training_on_pictures(cli: Cli, tmp_path: Path) -> None:

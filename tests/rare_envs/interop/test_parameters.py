@@ -1,0 +1,40 @@
+"""Parameters of HighwayEnv's vehicles."""
+
+from typing import Any
+
+import highway_env  # noqa: F401  (registers the ids)
+from highway_env.vehicle.behavior import IDMVehicle
+
+from rare_envs import HighwayEnvScenario
+from rare_envs.interop.simulation import make_highway_env
+
+SMALL = {"vehicles_count": 6, "duration": 5}
+
+CONFIGS: dict[str, dict[str, Any] | None] = {
+    "highway-v0": SMALL,
+    "highway-fast-v0": SMALL,
+    "merge-v1": None,
+    "intersection-v2": {"initial_vehicle_count": 4, "duration": 4},
+    "roundabout-v1": None,
+}
+
+
+def scenario(env_id: str, **kwargs: Any) -> Any:
+    return HighwayEnvScenario(make_highway_env(env_id, CONFIGS[env_id]), **kwargs)
+
+
+def others(env: Any) -> list[Any]:
+    return [v for v in env.unwrapped.road.vehicles if v is not env.unwrapped.vehicle]
+
+
+def test_idm_options_are_the_vehicles_own_and_those_of_vehicles_that_come_later() -> None:
+    env = scenario("intersection-v2")
+    idm = {"time_headway": 0.7, "jam_distance": 3.0, "max_acceleration": 4.0, "comfortable_deceleration": 2.0}
+    env.unwrapped.config["spawn_probability"] = 1.0
+    env.reset(seed=0, options=idm)
+    env.step(1)
+    for vehicle in others(env):
+        assert (vehicle.TIME_WANTED, vehicle.DISTANCE_WANTED) == (0.7, 8.0)
+        assert (vehicle.COMFORT_ACC_MAX, vehicle.COMFORT_ACC_MIN) == (4.0, -2.0)
+    assert (IDMVehicle.TIME_WANTED, IDMVehicle.DISTANCE_WANTED, IDMVehicle.COMFORT_ACC_MIN) == (1.5, 10.0, -5.0)
+    assert "TIME_WANTED" not in vars(env.unwrapped.vehicle)

@@ -1,0 +1,72 @@
+"""Errors in one line, answers as one JSON object."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from typer.testing import Result
+
+Cli = Callable[..., Result]
+
+FOLLOWING = "rare_envs/CarFollowing-v0"
+
+SMALL = ("estimate", FOLLOWING, "--method", "mc", "--max-sim", 2000)
+
+
+def assert_refused(result: Result, *words: str) -> None:
+    """Exit code 2, nothing on standard output, one line without a traceback that says what is wrong."""
+    assert result.exit_code == 2, result.output
+    assert result.stdout == ""
+    assert result.stderr.startswith("rare-envs: ")
+    assert result.stderr.count("\n") == 1
+    for word in words:
+        assert word in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+def run(*words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-m", "rare_envs", *words], capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize("words", [["estimat"], ["--loud"], ["list", "extra"]])
+def test_a_wrong_command_is_one_line(cli: Cli, words: list[str]) -> None:
+    assert_refused(cli(*words), words[-1])
+
+
+def test_json_is_one_object_and_nothing_else(cli: Cli, risky: str) -> None:
+    result = cli(*SMALL, "--base", risky, "--json")
+    assert result.exit_code == 0
+    answer = json.loads(result.stdout)
+    low, high = answer["interval"]
+    assert 0.01 < low < answer["p"] < high < 0.1
+    assert answer["n_sim"] == 2000
+    assert answer["n_failures"] == round(answer["p"] * 2000)
+    assert answer["question"]["env_id"] == FOLLOWING
+    assert list(answer["units"]) == ["ego_speed", "lead_speed", "gap"]
+    assert len(answer["failures"]) == 10
+    likely = [failure["log_p0"] for failure in answer["failures"]]
+    assert likely == sorted(likely, reverse=True)
+    assert "2,000 simulations" in result.stderr
+
+
+def test_what_an_ego_prints_is_no_part_of_the_answer(cli: Cli, here: Path, risky: str) -> None:
+    (here / "talking_ego.py").write_text(
+        "import egos_here\n"
+        "print('says the module')\n"
+        "class Talking(egos_here.Ego):\n"
+        "    def choose(self, observation):\n"
+        "        print('says the policy')\n"
+        "        return egos_here.np.zeros((len(observation), 2))\n"
+        "def make():\n"
+        "    print('says the function')\n"
+        "    return Talking()\n"
+    )
+    result = cli(*SMALL, "--base", risky, "--ego", "talking_ego:make", "--out", "run", "--json")
+    assert json.loads(result.stdout)["n_sim"] == 2000
+    for speaker in ("module", "function", "policy"):
+        assert f"says the {speaker}" in result.stderr

@@ -1,0 +1,13 @@
+"""The table of a check."""
+
+import pytest
+
+from rare_envs.study.ego_check.findings import report_failure, report_pass
+from rare_envs.study.ego_check.table import VERDICTS, print_findings
+
+
+def test_findings_remedies_and_verdict_are_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    print_findings([report_pass("memory", "none"), report_failure("actions", "NaN", "check [weights]")], "mine in here")
+    printed = capsys.readouterr().out
+    for text in ("mine in here", "memory", "none", "check [weights]", VERDICTS[2]):
+        assert text in printed

@@ -1,0 +1,46 @@
+"""Errors in input become one line; folders are made before the work and removed if it fails."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from rare_envs.study.errors import BadInput, as_bad_input, output_folder
+
+
+def test_errors_of_these_kinds_become_one_line() -> None:
+    with pytest.raises(BadInput, match=r"^two lines$") as caught, as_bad_input(ValueError, OSError):
+        raise ValueError("two\n   lines")
+    assert isinstance(caught.value.__cause__, ValueError)
+
+
+def test_other_errors_pass() -> None:
+    with pytest.raises(KeyError), as_bad_input(ValueError):
+        raise KeyError("x")
+
+
+def test_a_folder_is_there_during_the_work_and_stays(tmp_path: Path) -> None:
+    with output_folder(tmp_path / "a" / "b"):
+        assert (tmp_path / "a" / "b").is_dir()
+    assert (tmp_path / "a" / "b").is_dir()
+
+
+def test_new_empty_folders_go_if_the_work_fails(tmp_path: Path) -> None:
+    (tmp_path / "old").mkdir()
+    with pytest.raises(RuntimeError), output_folder(tmp_path / "old" / "new" / "newer"):
+        raise RuntimeError
+    assert list(tmp_path.rglob("*")) == [tmp_path / "old"]
+    with pytest.raises(RuntimeError), output_folder(tmp_path / "kept"):
+        (tmp_path / "kept" / "result").write_text("1")
+        raise RuntimeError
+    assert (tmp_path / "kept" / "result").exists()
+
+
+def test_a_folder_that_cannot_be_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(BadInput, match="there is a file of that name"), output_folder(tmp_path / "file"):
+        pass
+    if os.getuid():  # the superuser may write everywhere
+        (tmp_path / "locked").mkdir(mode=0o500)
+        with pytest.raises(BadInput, match="Cannot"), output_folder(tmp_path / "locked"):
+            pass

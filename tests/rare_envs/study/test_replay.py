@@ -1,0 +1,80 @@
+"""A scenario driven again: f is that of the rollout, and every moment is kept."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import agents
+import rare_envs
+from rare_envs.study.replay import drive_again
+
+FOLLOWING = "rare_envs/CarFollowing-v0"
+
+
+@pytest.mark.parametrize("env_id", rare_envs.ENV_IDS)
+def test_a_replay_gives_the_same_f_bit_for_bit(env_id: str) -> None:
+    problem = rare_envs.DrivingProblem(env_id)
+    learned = problem.world.background is not None  # whose products round differently by batch size
+    x = problem.base.sample(3 if learned else 20, np.random.default_rng(0))
+    tolerance = 1e-3 if learned else 0.0
+    assert [drive_again(problem, row).f for row in x] == pytest.approx(problem.evaluate(x).tolist(), abs=tolerance)
+
+
+def test_a_replay_ends_at_the_collision(risky: str) -> None:
+    problem = rare_envs.DrivingProblem(FOLLOWING, base=risky)
+    drive = drive_again(problem, np.array([20.0, 5.0, 10.0]))
+    assert drive.collided
+    assert drive.f == -1.0
+    # both keep braking or speed for a tick of 0.1 s; the bodies touch within the last one
+    assert drive.gap[-2] > 0.0 >= drive.gap[-1]
+    assert drive.worst == len(drive.time) - 1
+    assert drive.time[-1] == pytest.approx(0.1 * (len(drive.time) - 1))
+    np.testing.assert_allclose(drive.speed[:, 1], 5.0)
+    np.testing.assert_allclose(np.diff(drive.position[:, 1, 0]), 0.5, atol=1e-4)
+
+
+def test_the_worst_moment_of_a_near_miss_is_where_its_time_to_collision_is_least() -> None:
+    problem = rare_envs.DrivingProblem(FOLLOWING)
+    drive = drive_again(problem, np.array([20.0, 0.0, 60.0]))
+    closing = drive.closing_speed > 0
+    ttc = np.where(closing, drive.gap / np.where(closing, drive.closing_speed, 1.0), np.inf)
+    assert not drive.collided
+    assert 0 < drive.worst == int(np.argmin(ttc))
+    assert drive.f == pytest.approx(ttc.min(), rel=1e-5)
+
+
+def test_a_replay_without_a_collision_ends_at_the_horizon() -> None:
+    problem = rare_envs.DrivingProblem(FOLLOWING, horizon=3.0)
+    drive = drive_again(problem, np.array([10.0, 10.0, 100.0]))
+    assert not drive.collided
+    assert drive.time[-1] == pytest.approx(3.0)
+    assert drive.f > 0
+
+
+def test_a_replay_asks_a_policy_as_the_rollout_does(here: Path, risky: str) -> None:
+    problem = rare_envs.DrivingProblem(FOLLOWING, ego=agents.load_ego("egos_here:coasting"))
+    x = np.array([[20.0, 10.0, 25.0], [20.0, 19.0, 50.0]])
+    assert [drive_again(problem, row).f for row in x] == problem.evaluate(x).tolist()
+    # coasting closes 25 m at 10 m/s
+    assert drive_again(problem, x[0]).time[-1] == pytest.approx(2.5, abs=0.15)
+
+
+def test_moments_by_hand():
+    """Closing 30 m at 10 m/s while the ego coasts: f so far falls by the tick, and each moment's is the same."""
+
+    class Coasting:
+        def predict(self, observation, state=None, episode_start=None, deterministic=True):
+            return np.zeros((len(observation), 2), np.float32), None
+
+    problem = rare_envs.DrivingProblem(FOLLOWING, ego=Coasting())
+    drive = drive_again(problem, np.array([20.0, 10.0, 30.0]))
+    k = np.arange(len(drive.f_so_far) - 1)
+    expected = np.maximum(3.0 - 0.1 * k, 0.001)  # gaps are at least 1 cm
+    np.testing.assert_allclose(drive.f_alone[:-1], expected, atol=1e-4)
+    np.testing.assert_allclose(drive.f_so_far[:-1], expected, atol=1e-4)
+    assert drive.f == -1.0
+    assert drive.time[len(k)] == pytest.approx(3.0, abs=0.11)
+    assert drive.f == problem.evaluate(np.array([[20.0, 10.0, 30.0]]))[0]
