@@ -17,9 +17,8 @@ from scipy.stats import beta
 
 import rare_envs
 import training
-from rare_envs.control.idm import IDM
-from rare_envs.multi_agent.rewards import adversary_reward
-from rare_envs.multi_agent.step import play
+from rare_envs import IDM
+from rare_envs.multi_agent import adversary_reward, play
 
 
 def train(
@@ -32,7 +31,7 @@ def train(
     batch_size: int = 800,
     **make_kwargs: Any,
 ) -> Any:
-    """A PPO policy for one background vehicle against the IDM ego."""
+    """Train a PPO policy for one background vehicle against the IDM ego."""
     from stable_baselines3 import PPO
 
     rewards = {agent: adversary_reward}
@@ -42,17 +41,17 @@ def train(
 
 
 def collisions(env_id: str, policies: dict[str, Any], n: int, seed: int, **make_kwargs: Any) -> int:
-    """In how many of n scenarios from the base distribution the IDM ego collides."""
+    """Return in how many of n scenarios from the base distribution the IDM ego collides."""
     problem = rare_envs.DrivingProblem(env_id, **make_kwargs)
     x = torch.from_numpy(problem.base.sample(n, np.random.default_rng(seed))).float()
     names = problem.world.scenario.vehicle_names
     with torch.inference_mode():
-        crowd = play(problem.world, x, {names.index(agent): policy for agent, policy in policies.items()}, IDM())
-    return int(crowd.views[0].collided.sum())
+        episode = play(problem.world, x, {names.index(agent): policy for agent, policy in policies.items()}, IDM())
+    return int(episode.views[0].collided.sum())
 
 
 def interval(hits: int, n: int) -> tuple[float, float]:
-    """95 % Clopper-Pearson interval of a share."""
+    """Return the 95 % Clopper-Pearson interval of a share."""
     low = float(beta.ppf(0.025, hits, n - hits + 1)) if hits else 0.0
     high = float(beta.ppf(0.975, hits + 1, n - hits)) if hits < n else 1.0
     return low, high

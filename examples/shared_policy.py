@@ -16,7 +16,7 @@ import training
 
 
 def train(env_id: str, steps: int, seed: int = 0, num_scenarios: int = 32) -> Any:
-    """A PPO policy shared by all vehicles."""
+    """Train a PPO policy shared by all vehicles."""
     from stable_baselines3 import PPO
 
     env = training.sb3_agents_env(env_id, num_scenarios)
@@ -24,7 +24,7 @@ def train(env_id: str, steps: int, seed: int = 0, num_scenarios: int = 32) -> An
 
 
 def mean_return(env_id: str, policy: Any, episodes: int, seed: int) -> tuple[float, float]:
-    """Mean return of an agent's episode, and its standard error."""
+    """Return the mean return of an agent's episode, and its standard error."""
     from stable_baselines3.common.evaluation import evaluate_policy
 
     env = training.sb3_agents_env(env_id, 32, seed=seed)

@@ -21,10 +21,8 @@ from rare_envs.scenarios.registry import SCENARIOS
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
 OUTPUT_NOT_SHOWN = {
-    "agents.md",
     "camera.md",
     "egos.md",
-    "environments.md",
     "measures.md",
     "remote.md",
     "scenarios.md",
