@@ -1,9 +1,8 @@
-"""`noisy:EGO`: an ego behind the imperfections of a full stack, the stand-in for one such as Apollo.
+"""`noisy:EGO`: an ego behind the imperfections of a full driving stack.
 
-A stack does not see the world as it is, nor at once, nor does the car do at once what it decides. Here any ego gets
-errors of localisation and perception, vehicles it misses, latency, a planner that plans less often than the world
-ticks, and actuators with lag and limited rates. All of its randomness is standard normal draws, which a
-`DrivingProblem` makes part of x: f stays a function of x, and what a sampler finds replays.
+Any ego gets errors of localisation and perception, vehicles that it does not detect, latency, a planner that plans less
+often than the world ticks, and actuators with lag and limited rates. All randomness is standard normal draws, which a
+`DrivingProblem` makes part of x: f stays a function of x, and the failures that a sampler finds replay.
 """
 
 from __future__ import annotations
@@ -27,14 +26,16 @@ from rare_envs.traffic.lead import lead_of
 from rare_envs.traffic.state import State
 
 OWN_ERRORS, ERRORS_PER_VEHICLE = 3, 4
-"""Errors of the ego itself (across, heading, speed), and of each other vehicle (along, across, speed, missed)."""
+"""Numbers of errors: of the ego (across, heading, speed), of each other vehicle (along, across, speed, missed)."""
 OUT_OF_SIGHT = 400.0
-"""Where a missed vehicle is put [m ahead]: farther than any ego looks."""
+"""Distance ahead at which a missed vehicle is placed [m]: beyond the range of every sensor."""
+FIXED_SEED = 54321
+"""Seed of the one sequence of draws of `noise="fixed"`; any number would do."""
 
 
 @dataclass(frozen=True)
 class Stack:
-    """How imperfect a stack is.
+    """Size of a stack's imperfections.
 
     Errors are normal, with the correlation exp(-t / `correlation`) in time. That errors of perception are put between
     the world and the driver is what Piazzoni et al. propose (2020, "Modeling perception errors towards robust decision
@@ -44,6 +45,10 @@ class Stack:
 
     Raises:
         ValueError: If a number is negative or a probability is not below 1.
+
+    Example:
+        >>> Stack.read("latency=0.3&missed=0.05").missed
+        0.05
     """
 
     across: float = 0.1
@@ -62,10 +67,10 @@ class Stack:
     correlation: float = 0.5
     """Correlation time of all errors and misses [s]; our choice."""
     latency: float = 0.2
-    """From what is sensed of others to what is decided [s]; our choice. Lin et al. (2018, "The architectural
+    """From the observation of other vehicles to the decision [s]; our choice. Lin et al. (2018, "The architectural
     implications of autonomous driving", ASPLOS) design for about 0.1 s; the cruise controls of five cars on sale
-    responded after 1.7 to 2.5 s (doi:10.1177/0361198120911047, abstract), lags included. Its own position and speed a
-    stack has at once here."""
+    responded after 1.7 to 2.5 s (doi:10.1177/0361198120911047, abstract), lags included. A stack
+    knows its own position and speed without latency here."""
     period: float = 0.2
     """Between two plans of the speed [s], our choice; steering follows the path at every tick."""
     lag: float = 0.3
@@ -87,7 +92,11 @@ class Stack:
 
     @classmethod
     def read(cls, query: str) -> Stack:
-        """Settings as in "latency=0.3&missed=0.05"."""
+        """Return the stack of settings such as "latency=0.3&missed=0.05".
+
+        Raises:
+            ValueError: If a name is unknown or a value is no number.
+        """
         known = [each.name for each in fields(cls)]
         given = {}
         for name, value in parse_qsl(query, keep_blank_values=True):
@@ -113,14 +122,23 @@ def noise_shape(stack: Stack, world: World) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class NoisyEgo:
-    """An ego behind a stack; a `DrivingProblem` turns it into a driver of its world."""
+    """An ego behind a stack; a `DrivingProblem` turns it into a driver of its world.
+
+    Example:
+        >>> from agents import load_ego
+        >>> load_ego("noisy:idm?latency=0.3").stack.latency
+        0.3
+    """
 
     ego: Any
+    """Whatever `rare_envs.DrivingProblem` takes."""
     stack: Stack = field(default_factory=Stack)
+    """Its imperfections."""
 
     @property
     def observation_space(self) -> Any:
-        """That of the ego behind it, None if it has none."""
+        """Space of the ego behind the stack, None if it has none."""
+        # the ego is the user's: it need not declare anything
         return getattr(self.ego, "observation_space", None)
 
     @property
@@ -144,16 +162,20 @@ class NoisyEgo:
 
 
 class _StackMemory(NamedTuple):
+    """State of a stack between two ticks."""
+
     tick: int
+    """Of the next action."""
     past: tuple[State, ...]
-    """What was, up to the latency ago, the oldest first."""
+    """True states up to the latency ago, the oldest first."""
     errors: Tensor
     """Standard normal, shape (B, K)."""
     inner: Any
-    wanted: Tensor
+    """Memory of the driver behind the stack."""
+    planned: Tensor
     """Acceleration of the last plan and steering, shape (B, 2)."""
-    done: Tensor
-    """What the actuators do, shape (B, 2)."""
+    actuated: Tensor
+    """Present acceleration and steering of the actuators, shape (B, 2)."""
 
 
 @dataclass(frozen=True)
@@ -168,17 +190,17 @@ class NoisyDriver:
 
     @property
     def every(self) -> int:
-        """Ticks from plan to plan."""
+        """Number of ticks from plan to plan."""
         return ticks_per_plan(self.stack, self.world)
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Of an episode's draws: plans and K."""
+        """Shape of an episode's draws: plans and K."""
         return noise_shape(self.stack, self.world)
 
     @property
     def noise_columns(self) -> int:
-        """How many columns of x are its noise, the last ones."""
+        """Number of columns of x that are its noise, the last ones."""
         return math.prod(self.shape) if self.world.noise is True else 0
 
     def with_draws(self, draws: Tensor) -> NoisyDriver:
@@ -186,26 +208,26 @@ class NoisyDriver:
         return replace(self, draws=draws.reshape(-1, *self.shape))
 
     def act(self, episode: Episode, memory: Any) -> tuple[Tensor, Any]:
-        """See late and wrongly, plan now and then, and do it with a lag; see `rare_envs.simulation.rollout.Driver`."""
+        """Decide by delayed and erroneous perception, at the plan's rate, through lagging actuators; see `Driver`."""
         state = episode.state
         if memory is None:
             nothing = state.x.new_zeros(len(state.x), 2)
             memory = _StackMemory(0, (), state.x.new_zeros(len(state.x), self.shape[1]), None, nothing, nothing)
         back = round(self.stack.latency / self.world.clock.dt)
         past = (*memory.past, state)[-back - 1 :]
-        plans = memory.tick % self.every == 0
-        errors = self._later(memory.errors, memory.tick // self.every) if plans else memory.errors
-        seen = self._seen(state, past[0], errors)
+        replan = memory.tick % self.every == 0
+        errors = self._step_errors(memory.errors, memory.tick // self.every) if replan else memory.errors
+        seen = self._perceive(state, past[0], errors)
         perception = None if episode.perception is None else perceive_traffic(seen, episode.road)
         shown = episode._replace(state=seen, lead=lead_of(seen, episode.road), perception=perception)
-        wanted, inner = self.inner.act(shown, memory.inner)
-        if not plans:  # the speed is planned now and then, the path is followed at every tick
-            wanted = torch.stack((memory.wanted[:, 0], wanted[:, 1]), dim=1)
-        done = self._done(memory.done, wanted)
-        return done, _StackMemory(memory.tick + 1, past, errors, inner, wanted, done)
+        planned, inner = self.inner.act(shown, memory.inner)
+        if not replan:  # the speed keeps the last plan, the path is followed at every tick
+            planned = torch.stack((memory.planned[:, 0], planned[:, 1]), dim=1)
+        actuated = self._actuate(memory.actuated, planned)
+        return actuated, _StackMemory(memory.tick + 1, past, errors, inner, planned, actuated)
 
-    def _later(self, errors: Tensor, plan: int) -> Tensor:
-        """Errors at a plan from those at the plan before: autoregressions with variance 1."""
+    def _step_errors(self, errors: Tensor, plan: int) -> Tensor:
+        """Return the errors at a plan from those at the plan before: autoregressions of order 1 with variance 1."""
         if self.world.noise is False:
             return errors
         if self.draws is not None:
@@ -213,15 +235,21 @@ class NoisyDriver:
         elif self.world.noise == "fixed":
             fresh = _fixed_draws(self.shape)[plan].to(errors).expand_as(errors)
         else:
-            raise ValueError("Expected the draws of its noise; begin with with_draws.")
+            raise ValueError("Expected the draws of its noise: call with_draws first.")
         if plan == 0:
             return fresh
         tau = self.stack.correlation
-        kept = math.exp(-self.every * self.world.clock.dt / tau) if tau else 0.0
-        return kept * errors + math.sqrt(1.0 - kept * kept) * fresh
+        correlation = math.exp(-self.every * self.world.clock.dt / tau) if tau else 0.0
+        return correlation * errors + math.sqrt(1.0 - correlation * correlation) * fresh
 
-    def _seen(self, now: State, late: State, errors: Tensor) -> State:
-        """The traffic as the stack has it: itself as of now, the others relative to itself as they were sensed."""
+    def _perceive(self, now: State, late: State, errors: Tensor) -> State:
+        """Return the traffic as the stack perceives it: the ego as of now, the others relative to it, with delay.
+
+        Args:
+            now: True state.
+            late: True state when the others were sensed.
+            errors: Standard normal, shape (B, K).
+        """
         stack, own = self.stack, errors[:, :OWN_ERRORS]
         of_others = errors[:, OWN_ERRORS:].reshape(len(errors), -1, ERRORS_PER_VEHICLE)
         along, across, speed, hidden = of_others.unbind(dim=-1)
@@ -239,15 +267,15 @@ class NoisyDriver:
             speed=torch.cat((my_speed, others), dim=1).clamp(min=0.0),
         )
 
-    def _done(self, before: Tensor, wanted: Tensor) -> Tensor:
-        """What the actuators make of it within a tick: first-order lags with limited rates."""
+    def _actuate(self, before: Tensor, planned: Tensor) -> Tensor:
+        """Return the actuators' output (B, 2) after a tick: first-order lags with limited rates."""
         stack, dt = self.stack, self.world.clock.dt
         shares = [1.0 - math.exp(-dt / lag) if lag else 1.0 for lag in (stack.lag, stack.steering_lag)]
         most = before.new_tensor([stack.jerk * dt, stack.steering_rate * dt])
-        change = (wanted - before) * before.new_tensor(shares)
+        change = (planned - before) * before.new_tensor(shares)
         return before + torch.maximum(torch.minimum(change, most), -most)
 
 
 def _fixed_draws(shape: tuple[int, int]) -> Tensor:
-    """The one sequence of draws of `noise="fixed"`."""
-    return torch.randn(shape, generator=torch.Generator().manual_seed(54321), dtype=torch.float64)
+    """Return the one sequence of draws of `noise="fixed"`."""
+    return torch.randn(shape, generator=torch.Generator().manual_seed(FIXED_SEED), dtype=torch.float64)

@@ -77,9 +77,6 @@ WITHOUT_EXAMPLE = {
     "samplers.Product",
     "samplers.SubsetSimulation",
     "samplers.TwoStage",
-    "training.sb3_agents_env",
-    "training.sb3_vec_env",
-    "training.train_ego",
 }
 """Public names that have no example yet."""
 

@@ -1,4 +1,4 @@
-"""Train an ego by reinforcement learning in the batched simulation and save it as a `.zip`."""
+"""Reinforcement learning of an ego in the batched simulation, saved as a `.zip`."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from typing import Any
 from rare_envs.plugins import did_you_mean
 
 RECENT = 500
-"""Episodes that the collision rate beside the progress bar looks back on."""
+"""Number of last episodes in the collision rate beside the progress bar."""
 
 
 @dataclass(frozen=True)
 class Hyperparameters:
-    """How to train with one algorithm on a batched simulation and few CPU cores."""
+    """Settings of one algorithm for a batched simulation and few CPU cores."""
 
     settings: Mapping[str, Any]
     """Arguments of the Stable-Baselines3 algorithm."""
     policy: Mapping[str, Any] = field(default_factory=dict)
     """Arguments of its policy, `policy_kwargs`; ReLU is added, the fastest activation on a CPU."""
     discrete: bool = False
-    """Whether it chooses among `rare_envs.control.actions.DISCRETE_ACTIONS`."""
+    """Whether it acts by rows of `rare_envs.control.actions.DISCRETE_ACTIONS`."""
     noise: float = 0.0
     """Standard deviation of the exploration noise of a policy that has none of its own."""
 
@@ -108,8 +108,16 @@ def train_ego(
 
     Raises:
         ValueError: An argument is not usable; nothing has been simulated then.
+
+    Example:
+        >>> import tempfile
+        >>> from agents import load_ego
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = train_ego("rare_envs/CutIn-v0", "a2c", 20, num_envs=4, out=f"{folder}/ego", progress=False)
+        ...     print(path.name, load_ego(path).algorithm)
+        ego.zip a2c
     """
-    recipe = _find_hyperparameters(algo)
+    hyperparameters = _find_hyperparameters(algo)
     if steps < 1:
         raise ValueError(f"Expected steps >= 1, got {steps}.")
     if not 0 <= seed < 2**32:
@@ -124,16 +132,16 @@ def train_ego(
 
     from training.vec_env import sb3_vec_env
 
-    env = sb3_vec_env(env_id, num_envs, discrete=recipe.discrete, **make_kwargs)
+    env = sb3_vec_env(env_id, num_envs, discrete=hyperparameters.discrete, **make_kwargs)
     try:
         with _one_thread(), _progress_bar(steps, progress) as callback:
             model = getattr(stable_baselines3, algo.upper())(
                 _policy_name(env.observation_space),
                 env,
-                policy_kwargs={**recipe.policy, "activation_fn": nn.ReLU},
+                policy_kwargs={**hyperparameters.policy, "activation_fn": nn.ReLU},
                 seed=seed,
                 device="cpu",
-                **_fit_to_run(recipe, num_envs, steps),
+                **_fit_to_run(hyperparameters, num_envs, steps),
             )
             model.learn(steps, callback=callback)
         model.save(target)
@@ -143,7 +151,7 @@ def train_ego(
 
 
 def _policy_name(space: Any) -> str:
-    """Stable-Baselines3's name for a policy that takes such observations."""
+    """Return Stable-Baselines3's name of a policy for such observations."""
     from gymnasium.spaces import Dict
     from stable_baselines3.common.preprocessing import is_image_space
 
@@ -153,31 +161,35 @@ def _policy_name(space: Any) -> str:
 
 
 def _find_hyperparameters(algo: str) -> Hyperparameters:
-    """The recipe of an algorithm by its name."""
+    """Return the hyperparameters of an algorithm."""
     if algo not in HYPERPARAMETERS:
         hint = did_you_mean(algo.lower(), HYPERPARAMETERS)
         raise ValueError(f"Unknown algorithm {algo!r}{hint}; expected one of {', '.join(HYPERPARAMETERS)}.")
     return HYPERPARAMETERS[algo]
 
 
-def _fit_to_run(recipe: Hyperparameters, num_envs: int, steps: int) -> dict[str, Any]:
-    """The recipe's settings, fitted to a run that may be smaller than the recipe has in mind."""
-    arguments = dict(recipe.settings)
+def _fit_to_run(hyperparameters: Hyperparameters, num_envs: int, steps: int) -> dict[str, Any]:
+    """Return arguments of the algorithm, adapted to a run that may be smaller than the settings assume."""
+    arguments = dict(hyperparameters.settings)
     if "train_freq" in arguments:  # off-policy: keep every transition, learn after a few steps
         arguments["buffer_size"] = max(steps + num_envs, 1024)
         arguments["learning_starts"] = min(10 * num_envs, steps // 10)
     elif "batch_size" in arguments:
         arguments["batch_size"] = min(arguments["batch_size"], arguments["n_steps"] * num_envs)
-    if recipe.noise:
+    if hyperparameters.noise:
         import numpy as np
         from stable_baselines3.common.noise import NormalActionNoise
 
-        arguments["action_noise"] = NormalActionNoise(np.zeros(2), np.full(2, recipe.noise))
+        arguments["action_noise"] = NormalActionNoise(np.zeros(2), np.full(2, hyperparameters.noise))
     return arguments
 
 
 def _prepare_target(out: Path) -> Path:
-    """The file to write, with its folder made, or an error before any work is done."""
+    """Return the file to write, with its folder made.
+
+    Raises:
+        ValueError: It cannot be written.
+    """
     if out.is_dir():
         raise ValueError(f"Expected a file to write, got the folder {str(out)!r}; name a .zip.")
     target = out if out.suffix == ".zip" else out.with_name(f"{out.name}.zip")
@@ -209,7 +221,7 @@ Callback = Callable[[dict[str, Any], dict[str, Any]], bool]
 
 @contextlib.contextmanager
 def _progress_bar(steps: int, show: bool) -> Iterator[Callback | None]:
-    """A bar on standard error, moved by the callback that it gives."""
+    """Show a bar on standard error; yield the callback that advances it."""
     if not show:
         yield None
         return
@@ -238,7 +250,7 @@ def _progress_bar(steps: int, show: bool) -> Iterator[Callback | None]:
 
 
 def _summary(episodes: deque[dict[str, Any]] | None, crashes: deque[bool]) -> str:
-    """Mean return and collision rate of the last episodes, in words."""
+    """Return a line with mean return and collision rate of the last episodes."""
     words = []
     if episodes:
         words.append(f"return {sum(end['r'] for end in episodes) / len(episodes):.1f}")

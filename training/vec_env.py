@@ -38,6 +38,14 @@ def sb3_vec_env(
 
     Raises:
         ValueError: `num_envs` is not positive, or the environment refuses an argument.
+
+    Example:
+        >>> env = sb3_vec_env("rare_envs/CutIn-v0", num_envs=4, seed=0)
+        >>> env.reset().shape, env.action_space
+        ((4, 11), Box(-1.0, 1.0, (2,), float32))
+        >>> observation, reward, done, infos = env.step(np.zeros((4, 2), np.float32))
+        >>> done.tolist()
+        [False, False, False, False]
     """
     import rare_envs
     from rare_envs.control.actions import DISCRETE_ACTIONS
@@ -68,7 +76,7 @@ def sb3_agents_env(
         num_scenarios: B, scenarios side by side in one simulation; each agent of each is a row.
         agents: Names of the vehicles that act, of A; None for all. With one of them in the background this is the
             training of an adversary.
-        ego: Who drives the ego if it is no agent: "idm", a driver or a policy.
+        ego: Driver of the ego if it is no agent: "idm", a driver or a policy.
         rewards: Reward functions by agent (`rare_envs.multi_agent.rewards`); by default that of an ego, in its own
             view.
         seed: Seed of the first reset; an algorithm's own seed replaces it.
@@ -79,6 +87,11 @@ def sb3_agents_env(
 
     Raises:
         ValueError: An argument is refused.
+
+    Example:
+        >>> env = sb3_agents_env("rare_envs/CutIn-v0", num_scenarios=2, agents=["cutter"], seed=0)
+        >>> env.num_envs, len(env.reset())
+        (2, 2)
     """
     from rare_envs.envs.multi_agent_vector import AgentsVectorEnv
 
@@ -130,7 +143,7 @@ class BatchedVecEnv(VecEnv):
         return each(np.asarray, observation)
 
     def step_async(self, actions: NDArray[Any]) -> None:
-        """Take note of the actions, shape (B, 2), or (B,) for discrete ones."""
+        """Keep the actions for `step_wait`, shape (B, 2), or (B,) for discrete ones."""
         self._actions = actions if self._table is None else self._table[actions]
 
     def step_wait(self) -> tuple[Any, NDArray[Any], NDArray[Any], list[dict[str, Any]]]:
@@ -150,12 +163,12 @@ class BatchedVecEnv(VecEnv):
         self.env.close()
 
     def get_images(self) -> Sequence[NDArray[Any] | None]:
-        """Images of the environments, as many as the batch renders."""
+        """Return images of the environments, as many as the batch renders."""
         frames: Any = self.env.render()
         return list(frames or ())
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
-        """The batch's attribute, once for each environment asked for."""
+        """Return the batch's attribute, once for each of the environments."""
         value = self._find(attr_name)
         return [value for _ in self._get_indices(indices)]
 
@@ -183,16 +196,16 @@ class BatchedVecEnv(VecEnv):
     def env_is_wrapped(
         self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: Indices = None
     ) -> list[bool]:
-        """Single-environment wrappers cannot be inside a batch."""
+        """Return False for each: single-environment wrappers cannot be inside a batch."""
         del wrapper_class
         return [False for _ in self._get_indices(indices)]
 
     def _find(self, name: str) -> Any:
-        """An attribute of the batch or of what its wrappers hold."""
+        """Return an attribute of the batch or of the environment inside its wrappers."""
         return getattr(self.env if hasattr(self.env, name) else self.env.unwrapped, name)
 
     def _refuse_part(self, indices: Indices, name: str) -> None:
-        """The environments share one simulation, so they cannot differ in attributes."""
+        """Refuse indices that leave some out: the environments share one simulation and cannot differ."""
         asked = set(self._get_indices(indices))
         if asked != set(range(self.num_envs)):
             raise ValueError(
@@ -225,11 +238,16 @@ def merge_options(options: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None
 
 
 def info_row(infos: Mapping[str, Any], row: int) -> dict[str, Any]:
-    """The info of one environment, taken out of the infos of a batch.
+    """Return the info of one environment, taken out of the infos of a batch.
 
     Gymnasium writes a batch's infos as arrays, with a mask `_name` beside `name` that says whose
     value is there; nested mappings likewise. `final_obs` and `final_info` belong to the episode
     before, not to this one.
+
+    Example:
+        >>> infos = {"x": np.array([1.0, 2.0]), "end": np.array(["a", ""]), "_end": np.array([True, False])}
+        >>> {name: str(value) for name, value in info_row(infos, 1).items()}
+        {'x': '2.0'}
     """
     single: dict[str, Any] = {}
     for name, value in infos.items():

@@ -1,4 +1,4 @@
-"""What the ego `vision` is taught in: following, cut-ins, hard brakes and the I-80, on many roads in all weathers."""
+"""Curriculum of the ego `vision`: following, cut-ins, hard brakes and the I-80, on many roads in all weathers."""
 
 from __future__ import annotations
 
@@ -31,23 +31,29 @@ from training.egos.nominal_traffic import OrdinaryDrivers, draw_starts, make_ord
 
 Array = NDArray[np.float64]
 TOP_SPEED = 32.0
-"""[m/s]."""
-MAX_CURVATURE = 1 / 400
+"""Largest speed of the ego at the start [m/s]."""
+LEAD_RETURN_RATE = 0.2
+"""Rate [1/s] at which the lead returns to its usual speed."""
+LARGEST_ROAD_CURVATURE = 1 / 400
 """Largest of curved roads [1/m]; the I-80 has about a third."""
 
 
 class Lesson(NamedTuple):
-    """Traffic to learn in."""
+    """Traffic to train in."""
 
     scenario: Callable[[np.random.Generator], Scenario]
-    """On another road each time."""
+    """Draws a scenario, with another road each time."""
     sample: Callable[[int, np.random.Generator], Array]
-    """The scenario's own columns of x."""
+    """Draws the scenario's own columns of x, shape (n, d)."""
     drivers: Background | None = None
+    """Drivers of the other vehicles; None for those of the scenario."""
 
 
 def _initial(x: Tensor) -> State:
-    """Columns as in `FOLLOWING`; theta: swing [m/s^2], its length [m], the usual speed of the lead [m/s]."""
+    """Return the initial state; columns as in `FOLLOWING`.
+
+    theta: amplitude of the lead's acceleration [m/s^2], wave length [m] and usual speed of the lead [m/s].
+    """
     ego_speed, lead_speed, gap, swing, length, beside, ahead, other_speed = x.unbind(dim=1)
     zero = torch.zeros_like(gap)
     return State(
@@ -60,11 +66,11 @@ def _initial(x: Tensor) -> State:
 
 
 def _step_others(state: State, dt: float) -> Others:
-    """The lead swings around its speed, the vehicle in the next lane keeps its own."""
+    """Step the others: the lead oscillates about its usual speed, the vehicle in the next lane keeps its speed."""
     swing, length, usual = state.theta.unbind(dim=1)
     speed, x = state.speed[:, 1:], state.x[:, 1:]
-    wanted = swing * torch.sin(2 * math.pi / length * x[:, 0]) + 0.2 * (usual - speed[:, 0])
-    after = columns((speed[:, 0] + wanted * dt).clamp(min=0.0), speed[:, 1])
+    acceleration = swing * torch.sin(2 * math.pi / length * x[:, 0]) + LEAD_RETURN_RATE * (usual - speed[:, 0])
+    after = columns((speed[:, 0] + acceleration * dt).clamp(min=0.0), speed[:, 1])
     return Others(x + speed * dt, state.y[:, 1:], state.heading[:, 1:], after)
 
 
@@ -91,12 +97,13 @@ FOLLOWING = Scenario(
 
 
 def _draw_speeds(n: int, rng: np.random.Generator, spread: float = 4.0) -> tuple[Array, Array]:
-    """Speeds of the ego, one in four of them slow, and speeds near those [m/s]."""
+    """Draw speeds of the ego, one in four of them slow, and speeds near those [m/s]."""
     own = np.where(rng.random(n) < 0.25, rng.uniform(0.0, 6.0, n), rng.uniform(2.0, TOP_SPEED, n))
     return own, np.clip(own + rng.normal(0.0, spread, n), 0.0, TOP_SPEED + 5.0)
 
 
 def _draw_following(n: int, rng: np.random.Generator) -> Array:
+    """Draw columns of `FOLLOWING`, shape (n, 8)."""
     own, lead = _draw_speeds(n, rng)
     gap = np.where(rng.random(n) < 0.15, 200.0, 2.0 + own * rng.uniform(0.3, 3.5, n))
     lead = np.where(gap == 200.0, TOP_SPEED + 10.0, lead)  # soon out of sight
@@ -107,6 +114,7 @@ def _draw_following(n: int, rng: np.random.Generator) -> Array:
 
 
 def _draw_cut_in(n: int, rng: np.random.Generator) -> Array:
+    """Draw columns of the cut-in, shape (n, 6)."""
     own, lead = _draw_speeds(n, rng)
     cutter = np.clip(own + rng.normal(0.0, 3.0, n), 0.0, 45.0)
     gaps = rng.uniform(2.0, 60.0, n), rng.uniform(5.0, 100.0, n)
@@ -114,16 +122,18 @@ def _draw_cut_in(n: int, rng: np.random.Generator) -> Array:
 
 
 def _draw_hard_brake(n: int, rng: np.random.Generator) -> Array:
+    """Draw columns of the hard brake, shape (n, 3)."""
     own = rng.uniform(3.0, TOP_SPEED, n)
     return np.column_stack((own, 3.0 + own * rng.uniform(0.8, 3.0, n), rng.uniform(0.5, 6.0, n)))
 
 
 def _draw_highway(n: int, rng: np.random.Generator) -> Array:
+    """Draw columns of the highway from its own base."""
     return load_base(scenario_named("highway")).sample(n, rng)
 
 
 def make_lessons() -> tuple[Lesson, ...]:
-    """All that is taught, the commoner things more often."""
+    """Return all lessons, in the order in which they are taken; the common ones twice."""
 
     def somewhere(scenario: Scenario) -> Callable[[np.random.Generator], Scenario]:
         return lambda rng: replace(scenario, road=draw_road(rng))
@@ -149,22 +159,22 @@ def make_lessons() -> tuple[Lesson, ...]:
 
 
 def draw_road(rng: np.random.Generator, least: int = 1) -> Road:
-    """At least so many lanes and at most four, one of which is centred on y = 0, straight in one of three cases."""
+    """Draw a road of `least` to four lanes, one of them centred on y = 0; one in three is straight."""
     lanes, width = int(rng.integers(least, 5)), float(rng.choice((3.6, 3.75, 4.0)))
     own = int(rng.integers(0, lanes))
     edges = tuple(width * (k - own - 0.5) for k in range(lanes + 1))
     if rng.random() < 1 / 3:
         return Road(edges)
-    curvature = rng.uniform(-MAX_CURVATURE, MAX_CURVATURE, 7)
-    curvature -= curvature.mean()  # it comes back to its first direction
+    curvature = rng.uniform(-LARGEST_ROAD_CURVATURE, LARGEST_ROAD_CURVATURE, 7)
+    curvature -= curvature.mean()  # it returns to its first direction
     return Road(edges, ReferenceLine(80.0, (0.0, *(0.5 * curvature), 0.0)))
 
 
 def start_lesson(lesson: Lesson, rows: int, seconds: float, rng: np.random.Generator) -> tuple[World, Episode]:
-    """Start a lesson from somewhere in or beside the lane.
+    """Start a lesson with egos in or beside their lanes.
 
     Args:
-        lesson: What to learn in.
+        lesson: Traffic to train in.
         rows: Number of scenarios B.
         seconds: Length of the episodes.
         rng: Source of roads, scenarios and places.
@@ -186,7 +196,7 @@ def start_lesson(lesson: Lesson, rows: int, seconds: float, rng: np.random.Gener
 
 
 def _draw_weather(n: int, rng: np.random.Generator) -> Array:
-    """Half of the days are clear; of the others the fog is thicker than usual."""
+    """Draw weather: half of the days are clear; on the others the fog is thicker than in the base distribution."""
     fog = np.exp(rng.uniform(math.log(5e-5), math.log(1e-2), (n, 1)))
     some = np.concatenate((fog, SUN_DISTRIBUTION.sample(n, rng), SENSOR_NOISE_DISTRIBUTION.sample(n, rng)), axis=1)
     clear = np.array([CLEAR[0], math.degrees(CLEAR[1]), math.degrees(CLEAR[2]), 0.0])
@@ -194,7 +204,7 @@ def _draw_weather(n: int, rng: np.random.Generator) -> Array:
 
 
 def _displace_ego(state: State, scenario: Scenario, rng: np.random.Generator) -> State:
-    """The ego off the middle of its lane and not quite along it; behind the others in any lane on the highway."""
+    """Displace and turn the ego in its lane; on the highway also move it back and into any lane."""
     n = len(state.x)
     y = state.y[:, 0].double().numpy() + np.clip(rng.normal(0.0, 0.5, n), -1.4, 1.4)
     x, heading = state.x[:, 0].double().numpy(), np.clip(rng.normal(0.0, 0.03, n), -0.09, 0.09)

@@ -1,7 +1,7 @@
-"""Encounters of this project's scenarios as scenes, so that a driver learns in them as it does in recorded ones.
+"""Encounters of this project's scenarios as scenes, in which a driver is trained as in recorded ones.
 
-The ego is driven, by IDM where a scene is made and by whoever learns later on; the others are replayed. Many encounters
-make one scene: they stand behind each other on one road, too far apart to see each other.
+The ego is driven by IDM when a scene is made, and by the trained driver later; the others are replayed. One scene holds
+many encounters one behind the other on one road, too far apart to perceive each other.
 """
 
 from __future__ import annotations
@@ -26,31 +26,32 @@ from training.egos.nominal_driving import draw_inputs, make_world
 from training.egos.nominal_traffic import CASES
 
 APART = 1500.0
-"""Distance of neighbouring encounters at their start [m]."""
+"""Distance of neighbouring encounters at their start [m], several times the range of every sensor."""
 SCENE_VEHICLES = 39
 """Most vehicles of a scene."""
 
 
 @dataclass(frozen=True)
 class EncounterSpec:
-    """Encounters of one kind."""
+    """Settings of encounters of one kind."""
 
     scenario: str
     """Short name of a scenario, or one of `training.egos.nominal_traffic.CASES` on a straight road."""
     base: str | None = None
     """Base distribution of the scenario."""
     scenes: int = 1
+    """Number of scenes."""
     seconds: float = 6.0
-    """Length [s]; the others go on at constant speed after it."""
+    """Length [s]; the others keep their speed afterwards."""
     given: Mapping[str, float] = field(default_factory=dict)
-    """Parameters that are the same in all."""
+    """Parameters with a fixed value."""
 
 
 def make_scenes(kinds: Sequence[EncounterSpec], rng: np.random.Generator) -> list[TrafficScene]:
-    """Scenes full of encounters; every other one is mirrored, since scenarios know one side only.
+    """Return scenes full of encounters; every other one is mirrored, since scenarios have one side only.
 
     Args:
-        kinds: Which, and how many.
+        kinds: Settings of each kind.
         rng: Source of their parameters.
     """
     scenes = []
@@ -67,12 +68,14 @@ def make_scenes(kinds: Sequence[EncounterSpec], rng: np.random.Generator) -> lis
 
 
 def _make_world(kind: EncounterSpec) -> World:
+    """Return the world of one kind."""
     if kind.scenario in CASES:
         return make_world(CASES[kind.scenario], kind.seconds)
     return World(scenario_named(kind.scenario), clock=Clock(horizon=kind.seconds))
 
 
 def _draw_parameters(kind: EncounterSpec, world: World, n: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Draw n rows of x, from the base or the starts of ordinary traffic."""
     if kind.scenario in CASES:
         x = draw_inputs(CASES[kind.scenario], world, n, 0, rng)
     else:
@@ -84,7 +87,7 @@ def _draw_parameters(kind: EncounterSpec, world: World, n: int, rng: np.random.G
 
 
 def _simulate_tracks(world: World, x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """x, y, heading and speed of everybody with IDM as ego, shape (T, n, N, 4)."""
+    """Return x, y, heading and speed of all vehicles with IDM as ego, shape (T, n, N, 4)."""
     with torch.inference_mode():
         states = [episode.state for episode in drive(world, IDM(), torch.from_numpy(x))]
         moments = [torch.stack((s.x, s.y, s.heading, s.speed), dim=-1) for s in states]
@@ -92,7 +95,7 @@ def _simulate_tracks(world: World, x: NDArray[np.float64]) -> NDArray[np.float64
 
 
 def _make_scene(name: str, world: World, tracks: NDArray[np.float64], side: float) -> TrafficScene:
-    """One scene of some encounters (T, n, N, 4), mirrored for side = -1."""
+    """Return one scene of some encounters (T, n, N, 4), mirrored for side = -1."""
     road, (ticks, n, vehicles, _) = world.scenario.road, tracks.shape
     place = APART * np.arange(n)[:, None]
     flat: dict[str, Any] = {
@@ -103,7 +106,7 @@ def _make_scene(name: str, world: World, tracks: NDArray[np.float64], side: floa
     }
     flat = {key: values.reshape(ticks, n * vehicles) for key, values in flat.items()}
     ego = np.arange(n * vehicles) % vehicles == 0
-    # whose actions are not known is replayed; what the ego did is not learned from, so any number will do
+    # vehicles without actions are replayed; the actions of the ego are not learned from, so zeros do
     action = np.where(ego, 0.0, np.nan) * np.ones((ticks, 1))
     return TrafficScene(
         name=name,

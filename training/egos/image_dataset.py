@@ -1,4 +1,4 @@
-"""Pictures of a drive with what the expert would do: the data of imitation."""
+"""Data set of the ego `vision`: pictures of drives with the expert's outputs."""
 
 from __future__ import annotations
 
@@ -20,9 +20,14 @@ from rare_envs.traffic.state import State
 from training.egos.curriculum import make_lessons, start_lesson
 from training.egos.expert_driver import auxiliary_targets, expert_outputs
 
+SWING_CORRELATION, SWING_SCALE = 0.8, 0.6
+"""Of the noise from tick to tick, with variance 1: it lasts for 0.1 s / -log(0.8), about half a second."""
+SWING_STD = (0.25, 0.5)
+"""Standard deviations of the noise in units of the outputs: 0.5 m/s^2 and 0.05 rad/s."""
+
 
 class LabelledPictures(NamedTuple):
-    """n moments."""
+    """Pictures and labels of n moments."""
 
     picture: Tensor
     """uint8, shape (n, 66, 200, 3)."""
@@ -31,17 +36,17 @@ class LabelledPictures(NamedTuple):
     speed: Tensor
     """Own speed [m/s], shape (n,)."""
     wanted: Tensor
-    """What the expert does, as `training.egos.expert_driver.expert_outputs` has it, shape (n, 2)."""
+    """Outputs of the expert, as `training.egos.expert_driver.expert_outputs` has it, shape (n, 2)."""
     truth: Tensor
-    """As `training.egos.expert_driver.auxiliary_targets` has it, shape (n, 5)."""
+    """Auxiliary targets, as `training.egos.expert_driver.auxiliary_targets` has them, shape (n, 5)."""
 
     def rows(self, rows: Any) -> LabelledPictures:
-        """Some of them."""
+        """Return some of the moments."""
         return LabelledPictures(*(field[rows] for field in self))
 
 
 def concatenate(parts: list[LabelledPictures]) -> LabelledPictures:
-    """All of several."""
+    """Return all moments of several parts."""
     return LabelledPictures(*(torch.cat(fields) for fields in zip(*parts, strict=True)))
 
 
@@ -57,21 +62,21 @@ def collect(
     noise: float,
     rng: np.random.Generator,
 ) -> Iterator[LabelledPictures]:
-    """Drive, and note pictures with what the expert would do there.
+    """Drive, and yield pictures with the outputs of the expert.
 
     Args:
-        network: Drives together with the expert; None leaves it to the expert alone.
+        network: Drives together with the expert; with None the expert drives alone.
         trust: Share of the ticks at which the network decides.
         drives: Number of lessons, taken in turn.
         rows: Scenarios of each.
         ticks: Of each scenario.
-        kept: Share of the ticks that are noted.
-        noise: Of what is done, in standard deviations of 0.5 m/s^2 and 0.05 rad/s that last for half a second, so that
-            places beside the expert's way are seen.
+        kept: Share of the ticks that are recorded.
+        noise: Of the actions, in standard deviations of 0.5 m/s^2 and 0.05 rad/s that last for half a second, so that
+            places off the expert's path are seen.
         rng: Source of everything that is random.
 
     Yields:
-        What each lesson gave.
+        The moments of each lesson.
     """
     taught = make_lessons()
     for number in range(drives):
@@ -89,13 +94,14 @@ def _drive(
     noise: float,
     rng: np.random.Generator,
 ) -> Iterator[LabelledPictures]:
+    """Yield the recorded moments of one lesson; arguments as in `collect`."""
     state, swing, before = None, np.zeros((len(episode.collided), 2)), deque([episode], LAG)
     for _ in range(ticks):
         speed, wanted = episode.state.speed[:, 0], expert_outputs(episode)
         noted = ~episode.collided & bool(rng.random() < kept)
-        swing = 0.8 * swing + 0.6 * rng.standard_normal(swing.shape)
-        done = wanted + noise * torch.from_numpy(swing * (0.25, 0.5)).float()
-        if network is None:  # pictures that nobody drives by are taken only to be noted
+        swing = SWING_CORRELATION * swing + SWING_SCALE * rng.standard_normal(swing.shape)
+        done = wanted + noise * torch.from_numpy(swing * SWING_STD).float()
+        if network is None:  # the expert needs no pictures: only recorded ones are taken
             if bool(noted.any()):
                 seen = _take_pictures(episode, noted), luma(_take_pictures(before[0], noted)), speed[noted]
         else:
@@ -111,7 +117,7 @@ def _drive(
 
 
 def _take_pictures(episode: Episode, rows: Tensor) -> Tensor:
-    """What the cameras see in some rows, boolean, shape (B,)."""
+    """Take the pictures of some rows, boolean, shape (B,)."""
     assert episode.camera_context is not None
     state, context = episode.state, episode.camera_context
     weather = Weather(*(field[rows] for field in context.weather))
@@ -120,7 +126,7 @@ def _take_pictures(episode: Episode, rows: Tensor) -> Tensor:
 
 
 def mirror(pictures: LabelledPictures, rows: Tensor) -> LabelledPictures:
-    """The same with left and right exchanged in some rows, boolean, shape (n,)."""
+    """Exchange left and right in some rows, boolean, shape (n,)."""
     sign = torch.where(rows, -1.0, 1.0)[:, None]
     one = torch.ones_like(sign)
     picture, earlier = pictures.picture.clone(), pictures.earlier.clone()

@@ -1,15 +1,14 @@
-"""Train the ego `imitation`: a driver that has learned from people, and from encounters that people seldom have.
+"""Training of the ego `imitation`: a driver learned from recorded people and from encounters that are rare in records.
 
     python -m training.egos.imitation --data FOLDER --out runs/imitation
 
-It learns as the drivers of the traffic do (`training.imitation`): its likelihood and its critic know recorded people
-only, and the gradient goes through the simulator. Two things differ. Beside recorded scenes it drives encounters
-(`training.egos.encounters`): vehicles that cut in, brake hard, or are not there at all. And it pays for following
-closely, for leaving the middle of its lane and for speeding, which people do not mind as much as we do.
+It is trained as the drivers of the traffic are (`training.imitation`): likelihood and critic use recorded people only,
+and the gradient goes through the simulator. Two things differ. Beside recorded scenes it drives encounters
+(`training.egos.encounters`): vehicles that cut in, brake hard, or are absent. And its loss has penalties on following
+closely, leaving the middle of the lane and speeding, which are stricter than recorded driving.
 
 Writes `driver.safetensors` into the folder, with how it does in ordinary traffic (`training.egos.nominal_driving`) in
-its header, and a checkpoint. The same command on the same folder takes up a training that was stopped, to the same
-weights.
+its header, and a checkpoint. The same command on the same folder resumes an interrupted training, to the same weights.
 """
 
 from __future__ import annotations
@@ -61,15 +60,15 @@ ENCOUNTERS = (
     EncounterSpec("straight", None, 2, 30.0, {"gap": 140.0, "lead_speed": 25.0}),
     EncounterSpec("car_following", "highway", 2, 8.0, {"gap": 140.0}),
 )
-"""Encounters; in the last two the lead is out of sight."""
+"""Encounters of the training; in the last two the lead is out of sight."""
 RECORDED = 0.4
 """Share of recorded ones among the scenes that are driven."""
 JUDGED, JUDGED_SEED = 400, 1000
-"""Rollouts of each case in the header of the file."""
+"""Rollouts of each case in the header of the file, and their seed."""
 
 
 def prepare_learner(scenes: Sequence[TrafficScene], kinds: Sequence[EncounterSpec], config: Config) -> Learner:
-    """Everything of the training before its first update.
+    """Return the learner before its first update.
 
     Args:
         scenes: Recorded ones; likelihood and critic know these only.
@@ -93,7 +92,7 @@ def train_imitation_ego(
     rollouts: int = JUDGED,
     progress: bool = False,
 ) -> Path:
-    """Train the ego from the tables of US 101, from the first update or from where a training was stopped.
+    """Train the ego from the tables of US 101, from the first update or from an interrupted training.
 
     Args:
         data: Folder with the tables.
@@ -108,6 +107,14 @@ def train_imitation_ego(
 
     Raises:
         ValueError: If the data cannot be read, or the folder holds another training.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:  # doctest: +ELLIPSIS
+        ...     train_imitation_ego(Path("no/such/folder"), CONFIG, Path(folder))
+        Traceback (most recent call last):
+        ...
+        ValueError: There is no ngsim_us101_scenes.parquet in the folder ...
     """
     source = Source("data", data)
     settings = format_settings(source, config)

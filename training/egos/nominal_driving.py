@@ -1,13 +1,13 @@
-"""The judge of ordinary driving: does an ego keep its lane and its distance for a minute of ordinary traffic?
+"""Nominal driving: the share of minutes of ordinary traffic in which an ego keeps its lane and its distance.
 
     python -m training.egos.nominal_driving --ego idm
     python -m training.egos.nominal_driving --ego vision --case straight --rollouts 100
 
 An ego keeps its lane if its body never crosses a line of the lane that it starts in. It keeps its distance if it runs
-into nobody and never follows its lead closer than 0.5 s or 1 m; a lead that cuts in closer than that leaves it 10 s.
-And it must get somewhere: an ego that covers less than half of its lead's way (of its own at the speed of the start,
-where it has no lead) is left behind. What others do to it, who run into it from behind or from the side, is not its
-fault: such rollouts count neither way, and their number is told.
+into nobody and never follows its lead closer than 0.5 s or 1 m; after a lead cuts in closer than that it has 10 s.
+It must also advance: an ego that covers less than half of the distance of its lead (or, without a lead, of that at its
+first speed) is left behind. If another vehicle runs into it from behind or from the side, the rollout counts neither
+way, and is reported as spoiled.
 """
 
 from __future__ import annotations
@@ -45,20 +45,26 @@ VERDICT_NAMES = ("kept", "left its lane", "collided", "too close", "left behind"
 """Verdicts by number; a rollout gets the one that comes first in time, "left behind" at its end."""
 KEPT, LEFT_LANE, COLLIDED, TOO_CLOSE, LEFT_BEHIND, HIT = range(len(VERDICT_NAMES))
 GRACE = 10.0
-"""Time [s] that an ego has to open the distance to a lead that has cut in too close."""
+"""Time [s] in which an ego must open the gap to a lead that has cut in too close."""
 LEAST_WAY = 0.5
-"""Share of its lead's way that it must cover."""
+"""Share of its lead's distance that it must cover."""
 TILE, CAMERA_TILE = 256, 64
 """Rollouts driven at once."""
 
 
 class Verdicts(NamedTuple):
-    """Of n rollouts."""
+    """Verdicts of n rollouts.
+
+    Example:
+        >>> verdicts = judge("idm", "straight", rollouts=3, seed=0, seconds=2.0)
+        >>> [VERDICT_NAMES[number] for number in verdicts.reason]
+        ['kept', 'kept', 'kept']
+    """
 
     reason: NDArray[np.int64]
     """Index of `VERDICT_NAMES`, shape (n,)."""
     time: NDArray[np.float64]
-    """When that was found [s], shape (n,)."""
+    """Time of the verdict [s], shape (n,)."""
     headway: NDArray[np.float64]
     """Least time headway until then [s], inf without a lead, shape (n,)."""
     margin: NDArray[np.float64]
@@ -66,21 +72,28 @@ class Verdicts(NamedTuple):
     speed: NDArray[np.float64]
     """Mean speed of the whole rollout [m/s], shape (n,)."""
     x: NDArray[np.float64]
-    """What each started from, shape (n, d)."""
+    """Inputs, shape (n, d)."""
 
 
 @dataclass(frozen=True)
 class Summary:
-    """How an ego did in one case."""
+    """Summary of an ego in one case.
+
+    Example:
+        >>> summary = summarise_verdicts(judge("idm", "straight", rollouts=3, seed=0, seconds=2.0))
+        >>> summary.kept, summary.judged, summary.share, round(summary.interval[0], 3)
+        (3, 3, 1.0, 0.292)
+    """
 
     kept: int
     judged: int
-    """Rollouts that others have not spoiled."""
+    """Rollouts that count."""
     spoiled: int
+    """Rollouts in which another vehicle ran into the ego."""
     interval: tuple[float, float]
     """Of the share of kept ones, Clopper and Pearson, 95 %."""
     reasons: dict[str, int]
-    """Why the others were not kept."""
+    """Number of the other verdicts, by name."""
     speed: float
     """Mean [m/s]."""
     headway: float
@@ -103,7 +116,7 @@ def judge(
     observation: str | None = None,
     measured: World | None = None,
 ) -> Verdicts:
-    """Drive an ego through ordinary traffic and say of each rollout whether it kept its lane and its distance.
+    """Return for each rollout in ordinary traffic whether an ego keeps its lane and its distance.
 
     Args:
         ego: Whatever `rare_envs.DrivingProblem` takes, such as what `agents.load_ego` returns.
@@ -116,6 +129,10 @@ def judge(
 
     Raises:
         ValueError: If there is no such case, or the ego does not fit.
+
+    Example:
+        >>> judge("idm", "bends", rollouts=2, seed=0, seconds=1.0).x.shape[0]
+        2
     """
     if isinstance(case, str) and case not in CASES:
         raise ValueError(f"Unknown case {case!r}{did_you_mean(case, CASES)}; expected one of {', '.join(CASES)}.")
@@ -134,7 +151,7 @@ def judge(
 
 
 def make_world(case: Case, seconds: float = SECONDS, observation: str = "features") -> World:
-    """The world of a case; it tells who ran into whom."""
+    """Return the world of a case, with the vehicles of each collision."""
     return World(
         case.scenario,
         Sensing(observation, lidar=True),
@@ -145,7 +162,7 @@ def make_world(case: Case, seconds: float = SECONDS, observation: str = "feature
 
 
 def draw_inputs(case: Case, world: World, n: int, own: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Starts, drivers' weights, noise of drivers and (`own` columns) of the ego, side by side, shape (n, d)."""
+    """Draw starts, drivers' weights, noise of drivers and (`own` columns) of the ego, side by side, shape (n, d)."""
     parts = [case.starts(n, rng)]
     if world.columns.weights:
         assert world.background is not None and world.background.weights is not None
@@ -155,7 +172,7 @@ def draw_inputs(case: Case, world: World, n: int, own: int, rng: np.random.Gener
 
 @torch.inference_mode()
 def _judge_tile(world: World, driver: Driver, x: Tensor) -> tuple[NDArray[Any], ...]:
-    """The columns of `Verdicts` but for x, of one tile."""
+    """Return the columns of `Verdicts` without x, of one tile."""
     reason = torch.full((len(x),), KEPT)
     time = torch.full((len(x),), world.clock.seconds)
     least, room = torch.full_like(time, torch.inf), torch.full_like(time, torch.inf)
@@ -188,7 +205,7 @@ def _judge_tile(world: World, driver: Driver, x: Tensor) -> tuple[NDArray[Any], 
 
 
 def lane_margin(state: State, first: Episode) -> Tensor:
-    """Distance from the ego's body to the nearer line of the lane that it was in at first [m], shape (B,)."""
+    """Return the distance from the ego's body to the nearer line of its first lane [m], shape (B,)."""
     road, y, heading = first.road, state.y[:, 0], state.heading[:, 0]
     left, right = road.markers(first.state.y[:, 0])
     middle, half_lane = first.state.y[:, 0] + 0.5 * (right - left), 0.5 * (left + right)
@@ -197,7 +214,7 @@ def lane_margin(state: State, first: Episode) -> Tensor:
 
 
 def _blame(episode: Episode) -> Tensor:
-    """`COLLIDED` where the ego ran into somebody, or into the road's edge; `HIT` where somebody ran into it."""
+    """Return `COLLIDED` where the ego ran into a vehicle or the road's edge, `HIT` where a vehicle ran into it."""
     assert episode.statistics is not None
     crash = episode.statistics.own
     own = (crash.vehicles[:, 0] == 0) | (crash.kind == ROAD_EDGE)
@@ -205,14 +222,21 @@ def _blame(episode: Episode) -> Tensor:
 
 
 def _distances(first: State, last: State, lead: Tensor, seconds: float) -> tuple[Tensor, Tensor]:
-    """The ego's way [m], and that of its first lead, or at the speed of the start where it had none."""
+    """Return the ego's distance [m], and that of its first lead, or at its first speed where it had none."""
     ways = last.x - first.x
     of_lead = ways.gather(1, lead[:, None])[:, 0]
     return ways[:, 0], torch.where(lead > 0, of_lead, first.speed[:, 0] * seconds)
 
 
-def summarise(found: Verdicts) -> Summary:
-    """Counts of verdicts, and the interval of the share of kept ones."""
+def summarise_verdicts(found: Verdicts) -> Summary:
+    """Return counts of verdicts, and the interval of the share of kept rollouts.
+
+    Example:
+        >>> columns = [np.array([1.0, 2.0])] * 4
+        >>> verdicts = Verdicts(np.array([KEPT, TOO_CLOSE]), *columns, x=np.zeros((2, 3)))
+        >>> summarise_verdicts(verdicts).reasons
+        {'too close': 1}
+    """
     counts = Counter(VERDICT_NAMES[k] for k in found.reason.tolist())
     kept, spoiled = counts.pop(VERDICT_NAMES[KEPT], 0), counts.pop(VERDICT_NAMES[HIT], 0)
     judged = len(found.reason) - spoiled
@@ -229,8 +253,8 @@ def summarise(found: Verdicts) -> Summary:
 
 
 def judge_all_cases(ego: Any, rollouts: int, seed: int) -> dict[str, dict[str, float]]:
-    """How an ego drives in each case, for the header of its file: drives kept, judged, and the interval's lower end."""
-    found = {case: summarise(judge(ego, case, rollouts, seed)) for case in CASES}
+    """Return rollouts kept, judged, and the interval's lower end for each case, for the header of an ego's file."""
+    found = {case: summarise_verdicts(judge(ego, case, rollouts, seed)) for case in CASES}
     return {case: {"kept": one.kept, "judged": one.judged, "at least": one.interval[0]} for case, one in found.items()}
 
 
@@ -246,7 +270,7 @@ def main(
     """Judge an ego in ordinary traffic."""
     with report_errors("nominal"):
         driver = load_ego(ego)
-        found = {name: summarise(judge(driver, name, rollouts, seed, seconds, observation)) for name in case}
+        found = {name: summarise_verdicts(judge(driver, name, rollouts, seed, seconds, observation)) for name in case}
     if as_json:
         print(json.dumps({name: {"share": one.share, **vars(one)} for name, one in found.items()}, allow_nan=True))
         return

@@ -1,7 +1,7 @@
-"""Ordinary traffic: roads, starts and drivers in which an ego that drives properly has nothing to fear for minutes.
+"""Ordinary traffic: roads, starts and drivers in which an ego that drives properly is safe for minutes.
 
 The ego follows a lead in the middle of several lanes, with a follower behind it and a vehicle in each lane beside it.
-All of them keep to their lanes. Their speeds wander as recorded ones do, and whoever comes up to somebody brakes.
+All of them keep to their lanes. Their speeds vary as recorded ones do, and a vehicle that approaches another brakes.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ _NEIGHBOURS = ("follower", "left", "right")
 
 @dataclass(frozen=True)
 class OrdinaryDrivers:
-    """Speeds that wander about those at the start, with IDM behind whatever is ahead; steering is the scenario's."""
+    """Drivers whose speeds vary about those at the start, with IDM behind a lead; steering is the scenario's."""
 
     rule: RuleDriver = RuleDriver()  # noqa: RUF009  (frozen)
     colour: AutoregressiveNoise = HUMAN_NOISE
@@ -59,7 +59,7 @@ class OrdinaryDrivers:
     noisy: ClassVar[bool] = True
 
     def begin(self, draws: Tensor) -> Tensor:
-        """Of the noise, and behind it the speed at the start, unknown yet: (B, M, 2, 2) -> (B, M, 5)."""
+        """Return the memory: of the noise, then the speed at the start, NaN as yet: (B, M, 2, 2) -> (B, M, 5)."""
         noise = self.colour.begin(draws).flatten(-2)
         return torch.cat((noise, torch.full_like(noise[..., :1], torch.nan)), dim=-1)
 
@@ -82,13 +82,13 @@ class OrdinaryDrivers:
 
 @cache
 def make_bends() -> Road:
-    """Three lanes that wind with radii down to 1 km, 3.6 times as sharply as the I-80 does anywhere, for 2.4 km."""
+    """Return three lanes that wind with radii down to 1 km, 3.6 times as sharply as the I-80 does, for 2.4 km."""
     sharpest = 1e-3
     return Road(straight(3).edges, ReferenceLine(75.0, (0.0, *(sharpest, 0.0, -sharpest, 0.0) * 8)))
 
 
 def make_ordinary_traffic(name: str, road: Road, lane: int) -> Scenario:
-    """Traffic around an ego in one of the inner lanes of a road."""
+    """Return the scenario of traffic around an ego in one of the inner lanes of a road."""
 
     def initial(x: Tensor) -> State:
         speed, lead_speed, gap, start, offset, heading, behind, left, right, *others = x.unbind(dim=1)
@@ -156,7 +156,7 @@ def draw_starts(n: int, rng: np.random.Generator) -> NDArray[np.float64]:
 
 
 def _is_nominal(x: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Starts (n, 3) that leave the floor to an ego that brakes comfortably, shape (n,)."""
+    """Return which starts (n, 3) leave the floor to an ego that brakes comfortably, shape (n,)."""
     speed, lead_speed, gap = x.T
     left = gap - np.maximum(speed - lead_speed, 0.0) ** 2 / (2.0 * COMFORTABLE)
     floor = np.maximum(FLOOR_HEADWAY * np.minimum(speed, lead_speed), 2.0 * FLOOR_GAP)

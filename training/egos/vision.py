@@ -1,10 +1,10 @@
-"""Train the ego `vision`: imitation of a driver by rule, with corrections where the network itself leads.
+"""Training of the ego `vision`: imitation of a rule-based driver, with corrections where the network itself drives.
 
     python -m training.egos.vision --out runs/vision
 
 Round 0 imitates the expert in its own drives. In each later round the network drives, mixed with the expert less and
-less, the expert says what it would have done there, and the network learns from all that was ever noted: DAgger. A
-training that was stopped is taken up at the last round that was finished, to the same weights.
+less, the expert labels the pictures, and the network learns from those of all rounds: DAgger. An interrupted training
+resumes after the last finished round, to the same weights.
 
 References:
     Ross, Gordon and Bagnell, "A reduction of imitation learning and structured prediction to no-regret online
@@ -40,12 +40,21 @@ from training.imitation.run_folder import check_folder, write_settings
 
 FILE = "vision.safetensors"
 JUDGED = 2026
-"""Seed of the drives by which the result is judged, which no training uses."""
+"""Seed of the drives that evaluate the result, which no training uses."""
 
 
 @dataclass(frozen=True)
 class VisionConfig:
-    """How the network is trained."""
+    """Settings of the training.
+
+    Example:
+        >>> VisionConfig(rounds=2).all_visits
+        80000
+        >>> VisionConfig(kept=1.5)
+        Traceback (most recent call last):
+        ...
+        ValueError: Expected kept of at most 1, got 1.5.
+    """
 
     seed: int = 0
     rounds: int = 5
@@ -61,7 +70,7 @@ class VisionConfig:
     ticks: int = 120
     """Length of the others."""
     first_kept: float = 0.1
-    """Share of the moments that are noted."""
+    """Share of the moments that are recorded."""
     kept: float = 0.2
     """Likewise in later rounds."""
     noise: float = 1.0
@@ -95,7 +104,7 @@ class VisionConfig:
 
 
 class Training:
-    """A training under way."""
+    """State of a training: network, optimiser and recorded pictures; changed in place, and saved after each round."""
 
     def __init__(self, config: VisionConfig, out: Path) -> None:
         self.config, self.out = config, out
@@ -106,12 +115,12 @@ class Training:
         self.parameters = [*self.network.parameters(), *self.probe.parameters()]
         self.optimiser = torch.optim.Adam(self.parameters, config.rate)
         self.round = 0
-        """The next to be done."""
+        """Next round."""
         self.visited = 0
-        self.noted: list[LabelledPictures] = []
+        self.recorded: list[LabelledPictures] = []
 
-    def take_up(self) -> None:
-        """Go on where a training in the folder was stopped."""
+    def resume(self) -> None:
+        """Resume a training that was interrupted in the folder."""
         path = self.out / CHECKPOINT
         if not path.is_file():
             return
@@ -120,17 +129,19 @@ class Training:
         self.probe.load_state_dict(found["probe"])
         self.optimiser.load_state_dict(found["optimiser"])
         self.round, self.visited = found["round"], found["visited"]
-        self.noted = [LabelledPictures(*torch.load(self._noted(k), weights_only=True)) for k in range(self.round)]
+        self.recorded = [
+            LabelledPictures(*torch.load(self._recorded_path(k), weights_only=True)) for k in range(self.round)
+        ]
 
     def do_round(self) -> Iterator[str]:
-        """Collect, learn, and keep what was learned; yields after each part of the work with what is going on."""
+        """Collect pictures, train, and save; yield a progress line after each part of the work."""
         rng = np.random.default_rng((self.config.seed, self.round))
         parts = []
         for part in self._collect(rng):
             parts.append(part)
             yield f"round {self.round}: {sum(len(each.speed) for each in parts)} pictures taken"
-        self.noted.append(concatenate(parts))
-        torch.save(tuple(self.noted[-1]), self._noted(self.round))
+        self.recorded.append(concatenate(parts))
+        torch.save(tuple(self.recorded[-1]), self._recorded_path(self.round))
         yield from self._learn(rng)
         self.round += 1
         state = {
@@ -144,7 +155,8 @@ class Training:
         torch.save(state, unfinished)
         unfinished.replace(self.out / CHECKPOINT)
 
-    def _noted(self, number: int) -> Path:
+    def _recorded_path(self, number: int) -> Path:
+        """Return the file of the pictures of a round."""
         return self.out / f"pictures_{number}.pt"
 
     def _collect(self, rng: np.random.Generator) -> Iterator[LabelledPictures]:
@@ -161,7 +173,7 @@ class Training:
         )
 
     def _learn(self, rng: np.random.Generator) -> Iterator[str]:
-        config, data = self.config, concatenate(self.noted)
+        config, data = self.config, concatenate(self.recorded)
         left = config.visits if self.round else config.first_visits
         losses: list[list[float]] = []
         while left > 0:
@@ -192,7 +204,7 @@ LOSSES = ("acceleration", "turn", "truths")
 
 
 def train_vision_ego(config: VisionConfig, out: Path, progress: bool = False) -> PilotNet:
-    """Train from the start, or from where a training in the folder was stopped.
+    """Train the ego, from the start or from an interrupted training in the folder.
 
     Args:
         config: Settings.
@@ -204,12 +216,21 @@ def train_vision_ego(config: VisionConfig, out: Path, progress: bool = False) ->
 
     Raises:
         ValueError: The folder cannot be made, or holds a training with other settings.
+
+    Example:
+        >>> import tempfile
+        >>> config = VisionConfig(
+        ...     rounds=0, first_drives=1, rows=1, first_ticks=2, first_kept=1.0, first_visits=2, batch=2
+        ... )
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     type(train_vision_ego(config, Path(folder))).__name__
+        'PilotNet'
     """
     settings = json.dumps(asdict(config), indent=1)
     check_folder(out, settings)
     write_settings(out, settings)
     training = Training(config, out)
-    training.take_up()
+    training.resume()
     with Progress(console=Console(stderr=True), disable=not progress) as bar:
         task = bar.add_task("", total=config.all_visits, completed=training.visited)
         while training.round <= config.rounds:
@@ -219,7 +240,7 @@ def train_vision_ego(config: VisionConfig, out: Path, progress: bool = False) ->
 
 
 def make_provenance(config: VisionConfig, metrics: dict[str, Any]) -> Provenance:
-    """Where a network comes from, for the header of its file."""
+    """Return the origin of a network, for the header of its file."""
     return Provenance(
         kind="imitation of a driver by rule with on-policy corrections (DAgger)",
         command=f"python -m training.egos.vision --out OUT --seed {config.seed} --rounds {config.rounds}",

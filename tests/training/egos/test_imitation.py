@@ -22,7 +22,7 @@ from tests.training.shared_data import DATA, needs_data
 from training.data.ngsim_tables import SCENES_FILE
 from training.egos.encounters import APART, EncounterSpec, make_scenes
 from training.egos.imitation import CONFIG, prepare_learner, train_imitation_ego
-from training.egos.nominal_driving import judge, summarise
+from training.egos.nominal_driving import judge, summarise_verdicts
 from training.egos.nominal_traffic import CASES
 from training.imitation.algorithms.config import Config
 from training.imitation.fit import train_learner
@@ -108,7 +108,7 @@ def test_it_needs_no_observation_in_a_process_of_its_own_either() -> None:
 
 @pytest.mark.parametrize("case", ["straight", "bends"])
 def test_it_keeps_its_lane_and_its_distance_for_a_minute(case: str) -> None:
-    found = summarise(judge(agents.load_ego("imitation"), case, rollouts=32, seed=2026))
+    found = summarise_verdicts(judge(agents.load_ego("imitation"), case, rollouts=32, seed=2026))
     assert found.kept >= found.judged - 1
     assert found.margin > 0.3
 

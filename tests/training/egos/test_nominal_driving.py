@@ -11,7 +11,7 @@ import agents
 from rare_envs.control.idm import IDM
 from rare_envs.simulation.rollout import drive
 from rare_envs.traffic.lead import lead_of
-from training.egos.nominal_driving import VERDICT_NAMES, judge, make_world, summarise
+from training.egos.nominal_driving import VERDICT_NAMES, judge, make_world, summarise_verdicts
 from training.egos.nominal_traffic import CASES, FLOOR_HEADWAY, OrdinaryDrivers, draw_starts
 
 
@@ -43,7 +43,7 @@ def reasons(found: Any) -> set[str]:
 
 @pytest.mark.parametrize("case", ["straight", "i80", "bends"])
 def test_a_driver_by_rule_is_nominal(case: str) -> None:
-    found = summarise(judge("idm", case, rollouts=24, seed=3, seconds=30.0))
+    found = summarise_verdicts(judge("idm", case, rollouts=24, seed=3, seconds=30.0))
     assert found.kept == found.judged == 24
     assert found.headway > FLOOR_HEADWAY
     assert found.margin > 0.4
@@ -75,7 +75,7 @@ def test_who_is_run_into_from_behind_is_not_to_blame() -> None:
     case = replace(CASES["straight"], drivers=Careless)
     found = judge(Flawed(acceleration=-1.0), case, rollouts=8, seed=0, seconds=20.0)
     assert reasons(found) == {"hit by others"}
-    assert summarise(found).judged == 0
+    assert summarise_verdicts(found).judged == 0
 
 
 def test_who_runs_into_its_lead_is_to_blame() -> None:

@@ -12,7 +12,7 @@ from rare_envs.control.actions import to_physical
 from training.egos.curriculum import draw_road, make_lessons, start_lesson
 from training.egos.expert_driver import auxiliary_targets, expert_outputs
 from training.egos.image_dataset import collect, concatenate, mirror
-from training.egos.nominal_driving import judge, summarise
+from training.egos.nominal_driving import judge, summarise_verdicts
 from training.egos.vision import Training, VisionConfig, train_vision_ego
 
 TINY = VisionConfig(
@@ -128,7 +128,7 @@ def test_settings_out_of_range_are_refused() -> None:
 
 @pytest.mark.parametrize("case", ["straight", "bends"])
 def test_the_shipped_ego_keeps_lane_and_distance(case: str) -> None:
-    found = summarise(judge(load_ego("vision"), case, rollouts=6, seed=11, seconds=6.0))
+    found = summarise_verdicts(judge(load_ego("vision"), case, rollouts=6, seed=11, seconds=6.0))
     assert found.kept == found.judged == 6
     assert found.margin > 0.4
 
@@ -136,7 +136,7 @@ def test_the_shipped_ego_keeps_lane_and_distance(case: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("case", ["straight", "i80", "bends"])
 def test_the_shipped_ego_keeps_lane_and_distance_for_a_minute(case: str) -> None:
-    found = summarise(judge(load_ego("vision"), case, rollouts=64, seed=12))
+    found = summarise_verdicts(judge(load_ego("vision"), case, rollouts=64, seed=12))
     assert found.kept >= found.judged - 2
 
 
