@@ -157,6 +157,14 @@ def half_space_proposals(
         u: GroupedPoints around them, failing or not, shape (n, d).
         f: Outcomes of these, shape (n,).
         gamma: Threshold of failure.
+
+    Example:
+        f = 3 - u1: a Gaussian at E[Z | Z > 3] = 3.28, and N(0, I) given u1 >= 3 - EDGE_SLACK.
+
+        >>> u = np.random.default_rng(0).normal([3, 0], 1, (200, 2))
+        >>> gaussian, half_space = half_space_proposals(u[u[:, 0] > 3], u, 3 - u[:, 0])
+        >>> gaussian.centre.round(2) + 0.0, half_space.axis.round(2) + 0.0, round(half_space.start, 2)
+        (array([3.28, 0.  ]), array([1., 0.]), 2.98)
     """
     plane = fit_plane(u, f)
     if plane.explained < EXACT:  # outside the region, f may be that of another one
@@ -206,7 +214,12 @@ def failure_edge(along: FloatArray, weights: FloatArray, ess: float, share: floa
 
 
 def weighted_quantile(x: FloatArray, weights: FloatArray, share: float) -> float:
-    """Return the smallest x (n,) up to which at least this share of the weights (n,) lies."""
+    """Return the smallest x (n,) up to which at least this share of the weights (n,) lies.
+
+    Example:
+        >>> weighted_quantile(np.array([3.0, 1.0, 2.0]), np.array([1.0, 1.0, 2.0]), 0.5)
+        2.0
+    """
     order = np.argsort(x)
     total = np.cumsum(weights[order])
     return float(x[order][min(int(np.searchsorted(total, share * total[-1])), len(x) - 1)])

@@ -45,6 +45,15 @@ def minimise_second_moment(
         log_weights: Of the failing points, shape (n,).
         start: First weights, shape (k,).
         floors: Lower limits of disjoint groups, kept in every update.
+
+    Example:
+        Two components without overlap, 10 points of ratio 4 and 40 of ratio 1: weights are as the roots of 10 / 4 and
+        40 / 1, 1 to 4.
+
+        >>> log_r = np.full((2, 50), -np.inf)
+        >>> log_r[0, :10], log_r[1, 10:] = np.log(4), 0.0
+        >>> minimise_second_moment(log_r, np.zeros(50), np.array([0.5, 0.5]), []).round(3)
+        array([0.2, 0.8])
     """
     matter = log_weights > log_weights.max() - NEGLIGIBLE
     log_r, log_weights = log_r[:, matter], log_weights[matter]
@@ -64,6 +73,11 @@ def raise_to_floors(a: FloatArray, floors: Sequence[Floor]) -> FloatArray:
 
     Members of a floor keep their proportions; without any weight they share the floor evenly. Lowering may bring
     another group under its floor, which is then raised too.
+
+    Example:
+        >>> floor = Floor(np.array([True, True, False, False]), 0.2)
+        >>> raise_to_floors(np.array([0.0, 0.0, 0.4, 0.6]), [floor]).round(2)
+        array([0.1 , 0.1 , 0.32, 0.48])
     """
     raised: list[Floor] = []
     while True:
