@@ -3,7 +3,7 @@
     python examples/clip.py --out clip.gif                    # 20 s as a moving picture
     python examples/clip.py --still docs/images/highway.png   # one moment of it
 
-Prints what happened: who left the road, who touched whom, how fast they were.
+Prints what happened: who left the road, the first crash, how fast they were.
 """
 
 from pathlib import Path
@@ -16,9 +16,9 @@ from PIL import Image
 
 import agents
 import rare_envs
-from rare_envs.envs.rendering import Renderer
-from rare_envs.simulation.rollout import drive
-from rare_envs.traffic.overlap import pairwise_overlaps
+from rare_envs.envs import Renderer
+from rare_envs.simulation import drive
+from rare_envs.traffic import describe_crash
 
 
 def main(
@@ -35,21 +35,20 @@ def main(
     problem = rare_envs.DrivingProblem(env, ego=agents.load_ego(ego), drivers=drivers, horizon=seconds)
     x = torch.from_numpy(problem.base.sample(1, np.random.default_rng(seed))).float()
     road = problem.world.scenario.road
-    renderer, frames, contacts, off = Renderer(problem.world), [], 0, 0
+    renderer, frames, off = Renderer(problem.world), [], 0
     with torch.inference_mode():
-        for tick, episode in enumerate(drive(problem.world, problem.driver, x)):
+        for tick, episode in enumerate(drive(problem.world.with_statistics(), problem.driver, x)):
             image = renderer.draw(episode, tick * problem.world.clock.dt)
             if out is not None:
                 frames.append(Image.fromarray(image).quantize(64))
             if still is not None and tick == round(at / problem.world.clock.dt):
                 Image.fromarray(image).save(still)
-            contacts += int(pairwise_overlaps(episode.state, road).sum()) // 2
             off += int(road.off_road(episode.state.y).sum())
     if out is not None:
         frames[0].save(out, save_all=True, append_images=frames[1:], duration=100, loop=0)
-    speed = episode.state.speed[0]
+    speed, crash = episode.state.speed[0], describe_crash(episode.statistics.crash)
     print(
-        f"seed {seed}: {off} vehicle-steps off the road, {contacts} pair-steps in contact, "
+        f"seed {seed}: {off} vehicle-steps off the road, {crash['kind'] if crash else 'no crash'}, "
         f"speeds after {seconds:g} s from {float(speed.min()):.1f} to {float(speed.max()):.1f} m/s"
     )
 

@@ -15,8 +15,7 @@ from PIL import Image
 
 import rare_envs
 from examples import adversary
-from rare_envs.envs.rendering import WIDTH
-from rare_envs.scenarios.registry import SCENARIOS
+from rare_envs.scenarios import SCENARIOS
 from rare_envs.study import Drive, drive_again, write_film
 
 COLOURS = 64
@@ -81,7 +80,9 @@ def attack(steps: int, out: Path) -> str:
         if hit and len(frames) > 15:
             break
     pictures = [
-        Image.fromarray(frame).resize((NARROW, round(frame.shape[0] * NARROW / WIDTH)), Image.Resampling.LANCZOS)
+        Image.fromarray(frame).resize(
+            (NARROW, round(frame.shape[0] * NARROW / frame.shape[1])), Image.Resampling.LANCZOS
+        )
         for frame in frames
         if frame is not None
     ]
