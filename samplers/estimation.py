@@ -83,15 +83,7 @@ def estimate(
     """
     check_problem(problem, ("dim", "base", "evaluate"))
     chosen = get_method(method) if isinstance(method, str) else method
-    arguments = RunArguments(
-        gamma=gamma,
-        seed=seed,
-        max_sim=max_sim,
-        target_cov=target_cov,
-        confidence=confidence,
-        replicates=replicates,
-        on_error=on_error,
-    )
+    arguments = RunArguments(gamma, seed, max_sim, target_cov, confidence, replicates, on_error)
     conditions = _StopConditions(time_limit, stop)
     if not (callable(progress) or isinstance(progress, bool)):
         raise ValueError(f"Expected progress to be True, False or a function, got {progress!r}.")

@@ -18,6 +18,8 @@ LOG_TWO_PI = float(np.log(2 * np.pi))
 class Distribution(Protocol):
     """A distribution on R^d with an exact map to and from standard normal space.
 
+    One that is also `HasNoise` says which coordinates are the simulation's own randomness.
+
     Example:
         Half-normal in each coordinate: x = Phi^-1((1 + Phi(u)) / 2).
 

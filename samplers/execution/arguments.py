@@ -11,7 +11,7 @@ from samplers.problem import Distribution, Inputs
 from samplers.validation import check_name, check_number, check_whole
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class RunArguments:
     """Arguments of one run; their defaults are those of `estimate`, `Method.start` and the command line.
 

@@ -67,13 +67,5 @@ class Method(Stepping, Protocol):
             (1000, 2)
             (1000, 2)
         """
-        arguments = RunArguments(
-            gamma=gamma,
-            seed=seed,
-            max_sim=max_sim,
-            target_cov=target_cov,
-            confidence=confidence,
-            replicates=replicates,
-            on_error=on_error,
-        )
+        arguments = RunArguments(gamma, seed, max_sim, target_cov, confidence, replicates, on_error)
         return Run(problem, self, arguments)
