@@ -133,12 +133,12 @@ def assemble_scene(
     step, vehicle = (columns[key][known].astype(np.int64) for key in ("step", "vehicle"))
     shape = (int(columns["step"].max()) + 1, len(length))
 
-    def placed(key: str) -> FloatArray:
+    def place(key: str) -> FloatArray:
         values = np.full(shape, np.nan)
         values[step, vehicle] = columns[key][known]
         return values
 
-    states = {key: placed(key) for key in ("x", "y", "heading", "speed", "acceleration", "yaw_rate")}
+    states = {key: place(key) for key in ("x", "y", "heading", "speed", "acceleration", "yaw_rate")}
     return TrafficScene(
         name, start, tuple(edges), **states, present=np.isfinite(states["x"]), length=length.copy(), width=width.copy()
     )

@@ -56,7 +56,7 @@ def test_cut_in_school_physics():
     np.testing.assert_array_equal(cut_in_front(np.array([far, into_the_ego])), [10.0, -1.0])
 
 
-def test_first_value_of_the_mixture_has_its_law():
+def test_first_value_of_the_mixture_has_its_distribution():
     u = np.random.default_rng(7).standard_normal((20_000, 3))
     lead = traffic_states(u)[:, 0]
 

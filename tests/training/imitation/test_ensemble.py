@@ -44,7 +44,7 @@ def run(request, made_up, tmp_path_factory):
     return folder
 
 
-def test_members_differ_and_the_whole_is_saved_with_its_law(run, monkeypatch):
+def test_members_differ_and_the_driver_is_saved_with_their_distribution(run, monkeypatch):
     fit = module.fit_weights
     monkeypatch.setattr(module, "fit_weights", lambda members: fit(members, penalties=(0.8,)))
     members = train_members(run, FEW)

@@ -1,4 +1,4 @@
-"""The law of the last layer's weights from an ensemble: what it recovers, which penalty it takes, what it refuses."""
+"""The distribution of the last layers' weights of an ensemble: dependences recovered, penalty chosen, input refused."""
 
 import json
 
@@ -59,7 +59,7 @@ def test_the_penalty_with_the_best_held_out_likelihood_is_taken(truth, rng):
 
 
 def test_held_out_likelihood_by_hand(truth, rng):
-    """With a penalty over all correlations the law is independent weights, fold by fold."""
+    """With a penalty over all correlations the weights are independent, fold by fold."""
     members = truth.sample(10, rng)
     fit = fit_weights(members, names=NAMES, penalties=(0.8,), folds=2)
     scores = []
@@ -138,7 +138,7 @@ def test_the_global_generator_is_left_alone(truth, rng):
 
 
 def test_all_404_weights_of_few_members(rng):
-    """As many members and as dependent as ensembles are: a law comes out, and its draws look like members."""
+    """As many members and as dependent as ensembles are: a distribution is fitted, and its draws look like members."""
     directions = rng.standard_normal((5, 404))
     members = 0.003 * (rng.standard_normal((24, 5)) @ directions + 2.0 * rng.standard_normal((24, 404)))
     fit = fit_weights(members, penalties=(0.8, 0.5), folds=2)

@@ -30,17 +30,17 @@ def fit_truth(n, seed=0):
 def test_fit_recovers_a_known_mixture(quick):
     n = 2000
     fit = fit_truth(n)
-    law = fit.mixture
-    assert len(law.weights) == 2
-    assert abs(law.weights[0] - 0.65) < 4.0 * np.sqrt(0.65 * 0.35 / n)
+    mixture = fit.mixture
+    assert len(mixture.weights) == 2
+    assert abs(mixture.weights[0] - 0.65) < 4.0 * np.sqrt(0.65 * 0.35 / n)
     counts = n * TRUTH.weights
     for k in range(2):
         variance = np.diag(TRUTH.covariances[k])
-        assert (np.abs(law.means[k] - TRUTH.means[k]) < 4.0 * np.sqrt(variance / counts[k])).all()
+        assert (np.abs(mixture.means[k] - TRUTH.means[k]) < 4.0 * np.sqrt(variance / counts[k])).all()
         # Sampling error of a covariance, and the floor: 1 % of the overall variance.
         error = 4.0 * np.sqrt(2.0 / counts[k]) * np.sqrt(np.outer(variance, variance))
         floor = COVARIANCE_FLOOR * np.diag([30.0, 15.0])
-        assert (np.abs(law.covariances[k] - TRUTH.covariances[k]) < error + floor).all()
+        assert (np.abs(mixture.covariances[k] - TRUTH.covariances[k]) < error + floor).all()
 
 
 def test_fit_is_deterministic(quick):
@@ -72,7 +72,7 @@ def test_few_events_get_one_component_and_too_few_an_error():
 
 
 def test_mass_outside_of_a_known_box():
-    law = TruncatedGaussianMixture([1.0], [[0.0, 0.0]], [np.eye(2)], [-1.0, -9.0], [9.0, 9.0])
-    mass = mass_outside(law)
+    mixture = TruncatedGaussianMixture([1.0], [[0.0, 0.0]], [np.eye(2)], [-1.0, -9.0], [9.0, 9.0])
+    mass = mass_outside(mixture)
     assert abs(mass["any"] - 0.15865525) < 4.0 * mass["standard_error"]
     assert mass["each"] == pytest.approx([0.15865525, 0.0], abs=1e-3)

@@ -5,9 +5,11 @@ from collections import deque
 import torch
 from torch import Tensor, nn
 
-from agents.learned.networks import ACTION_SIZE, FEATURE_SIZE, Policy
+from agents.learned.networks import Policy
+from training.imitation.algorithms.layers import two_hidden_layers
 
-_HIDDEN = 128
+LEAK = 0.2
+"""Slope of the activations below 0."""
 
 
 class Critic(nn.Module):
@@ -15,13 +17,7 @@ class Critic(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.layers = nn.Sequential(
-            nn.Linear(FEATURE_SIZE + ACTION_SIZE, _HIDDEN),
-            nn.LeakyReLU(0.2),
-            nn.Linear(_HIDDEN, _HIDDEN),
-            nn.LeakyReLU(0.2),
-            nn.Linear(_HIDDEN, 1),
-        )
+        self.layers = two_hidden_layers(1, lambda: nn.LeakyReLU(LEAK))
 
     def forward(self, pairs: Tensor) -> Tensor:
         """Return the logits (n,) of pairs (n, 53), see `critic_inputs`."""

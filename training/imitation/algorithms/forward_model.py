@@ -15,10 +15,9 @@ References:
 import torch
 from torch import Tensor, nn
 
-from agents.learned.networks import ACTION_SIZE, FEATURE_SIZE, Policy
+from agents.learned.networks import FEATURE_SIZE, Policy
 from training.imitation.algorithms.critic import critic_inputs
-
-_HIDDEN = 128
+from training.imitation.algorithms.layers import two_hidden_layers
 
 
 class ForwardModel(nn.Module):
@@ -26,13 +25,7 @@ class ForwardModel(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.layers = nn.Sequential(
-            nn.Linear(FEATURE_SIZE + ACTION_SIZE, _HIDDEN),
-            nn.Tanh(),
-            nn.Linear(_HIDDEN, _HIDDEN),
-            nn.Tanh(),
-            nn.Linear(_HIDDEN, FEATURE_SIZE),
-        )
+        self.layers = two_hidden_layers(FEATURE_SIZE, nn.Tanh)
 
     def forward(self, policy: Policy, features: Tensor, action: Tensor) -> Tensor:
         """Return features a tick later, (n, 51) in SI units, from features (n, 51) and normalised actions (n, 2)."""

@@ -94,8 +94,8 @@ def update_gail(learner: Learner) -> Log:
     gain = (gain - gain.mean()) / gain.std().clamp(min=1e-6)
     for _ in range(config.ppo_epochs):
         for rows in torch.split(torch.randperm(kept, generator=learner.generator), config.ppo_batch):
-            law = conditional_action(policy, steps.features[rows], steps.noise[rows], config.colour)
-            ratio = torch.exp(log_likelihood(*law, steps.action[rows]) - old[rows])
+            moments = conditional_action(policy, steps.features[rows], steps.noise[rows], config.colour)
+            ratio = torch.exp(log_likelihood(*moments, steps.action[rows]) - old[rows])
             clone = config.geometric_schedule(config.clone_weight, learner.update) * learner.clone_loss()
             loss = clone - clipped_surrogate(ratio, gain[rows], config.clip).mean()
             learner.policy_optimiser.zero_grad()

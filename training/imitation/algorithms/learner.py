@@ -11,13 +11,14 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from agents.learned.networks import ACTION_SIZE, FEATURE_SIZE, Policy
+from agents.learned.networks import Policy
 from training.imitation.algorithms.actions import log_likelihood, normalise_action
 from training.imitation.algorithms.behaviour_cloning import make_seeded
 from training.imitation.algorithms.config import Config
 from training.imitation.algorithms.critic import Critic, critic_inputs, train_critic
 from training.imitation.algorithms.expert_pairs import Pairs, emphasise_lateral
 from training.imitation.algorithms.forward_model import ForwardModel, train_model
+from training.imitation.algorithms.layers import two_hidden_layers
 from training.imitation.algorithms.rollout import RolloutSteps, roll_out
 from training.imitation.traffic.recording import Recording
 from training.imitation.traffic.replayed_traffic import Traffic
@@ -191,9 +192,7 @@ class Learner:
 
 def _make_value_network() -> nn.Sequential:
     """Return a network that estimates future rewards, for GAIL."""
-    return nn.Sequential(
-        nn.Linear(FEATURE_SIZE + ACTION_SIZE, 128), nn.Tanh(), nn.Linear(128, 128), nn.Tanh(), nn.Linear(128, 1)
-    )
+    return two_hidden_layers(1, nn.Tanh)
 
 
 Update = Callable[[Learner], Log]

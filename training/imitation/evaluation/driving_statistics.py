@@ -107,9 +107,9 @@ def sum_by_scene(behaviour: Behaviour, scenes: int, errors: Errors | None = None
 def add_statistics(tallies: list[DrivingStatistics]) -> DrivingStatistics:
     """Return the sum of several statistics of the same scenes."""
 
-    def added(name: str) -> dict[str, FloatArray]:
+    def add(name: str) -> dict[str, FloatArray]:
         parts = [getattr(one, name) for one in tallies]
         return {key: np.sum([part[key] for part in parts], axis=0) for key in parts[0]}
 
     steps, vehicles = (np.sum([getattr(one, name) for one in tallies], axis=0) for name in ("steps", "vehicles"))
-    return DrivingStatistics(steps, vehicles, added("sums"), added("counts"), added("squared"))
+    return DrivingStatistics(steps, vehicles, add("sums"), add("counts"), add("squared"))

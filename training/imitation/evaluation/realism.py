@@ -133,14 +133,14 @@ def collect_statistics(
     """
     met: list[Errors] = []
 
-    def watched() -> Iterator[DrivingStep]:
+    def watch() -> Iterator[DrivingStep]:
         traffic = start_replay(recording, *(regular_starts(recording) if starts is None else starts))
         for tick, moment in enumerate(drive_traffic(recording, traffic, act, round(seconds[-1] / DT))):
             if tick == round(ERROR_TIME / DT):
                 met.append(current_errors(recording, moment.traffic))
             yield moment
 
-    whole = behaviour_of(watched())
+    whole = behaviour_of(watch())
     out = {}
     for time in seconds:
         part = Behaviour(whole.scene, *(column[: round(time / DT)] for column in whole[1:]))

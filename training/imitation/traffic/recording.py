@@ -49,7 +49,7 @@ def stack_scenes(scenes: Sequence[TrafficScene]) -> Recording:
     vehicles = max(scene.x.shape[1] for scene in scenes)
     lanes = max(len(scene.edges) for scene in scenes)
 
-    def padded(name: str) -> Tensor:
+    def pad(name: str) -> Tensor:
         out = np.zeros((len(scenes), ticks, vehicles), dtype=np.float32)
         for row, scene in zip(out, scenes, strict=True):
             values = getattr(scene, name)
@@ -62,19 +62,19 @@ def stack_scenes(scenes: Sequence[TrafficScene]) -> Recording:
             row[: len(getattr(scene, name))] = getattr(scene, name)
         return torch.from_numpy(out)
 
-    present = padded("present") > 0
+    present = pad("present") > 0
     known = np.zeros(present.shape, dtype=bool)
     for row, scene in zip(known, scenes, strict=True):
         whole = np.isfinite(scene.acceleration) & np.isfinite(scene.yaw_rate) & scene.present
         row[: whole.shape[0], : whole.shape[1]] = whole
     edges = [tuple(scene.edges) + (scene.edges[-1],) * (lanes - len(scene.edges)) for scene in scenes]
     return Recording(
-        x=padded("x"),
-        y=padded("y"),
-        heading=padded("heading"),
-        speed=padded("speed"),
-        acceleration=padded("acceleration"),
-        yaw_rate=padded("yaw_rate"),
+        x=pad("x"),
+        y=pad("y"),
+        heading=pad("heading"),
+        speed=pad("speed"),
+        acceleration=pad("acceleration"),
+        yaw_rate=pad("yaw_rate"),
         present=present,
         acts=torch.from_numpy(known),
         length=sizes("length", 1.0),

@@ -62,8 +62,8 @@ def test_coloured_actions_have_the_joint_density_that_their_conditionals_multipl
         expected = colour.predict_mean(memory)
         noise, memory = colour.step(memory, torch.randn(1, 2, generator=generator(4 + t)).double())
         action = mean[t : t + 1] + torch.exp(log_std[t : t + 1]) * noise
-        law = conditional_action(policy, features[t : t + 1], expected, colour)
-        total += float(log_likelihood(*law, action).detach())
+        moments = conditional_action(policy, features[t : t + 1], expected, colour)
+        total += float(log_likelihood(*moments, action).detach())
         noises.append(noise[0])
     for k in range(2):  # acceleration, yaw rate
         correlation = autocorrelation(colour, k, ticks + 2)

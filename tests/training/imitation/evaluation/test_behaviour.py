@@ -2,19 +2,13 @@
 
 import math
 
-import pytest
 import torch
 
-from tests.training.imitation.synthetic_scenes import scene, scenes
+from tests.training.imitation.synthetic_scenes import scene
 from training.imitation.evaluation.behaviour import find_overlaps, recorded_behaviour
 from training.imitation.evaluation.driving_statistics import binned_quantities
 from training.imitation.traffic.recording import stack_scenes
 from training.imitation.traffic.replayed_traffic import start_replay
-
-
-@pytest.fixture(scope="module")
-def recording():
-    return stack_scenes(scenes(4))
 
 
 def at_start(recording, tick=0):

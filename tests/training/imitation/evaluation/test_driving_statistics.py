@@ -2,10 +2,8 @@
 
 import dataclasses
 
-import pytest
 import torch
 
-from tests.training.imitation.synthetic_scenes import scenes
 from training.imitation.evaluation.behaviour import behaviour_of, drive_traffic
 from training.imitation.evaluation.driving_statistics import BINS, add_statistics, sum_by_scene
 from training.imitation.evaluation.realism import (
@@ -13,20 +11,10 @@ from training.imitation.evaluation.realism import (
     record_statistics,
     summarise_realism,
 )
-from training.imitation.traffic.recording import stack_scenes
 from training.imitation.traffic.replayed_traffic import start_replay
 
 
-@pytest.fixture(scope="module")
-def recording():
-    return stack_scenes(scenes(4))
-
-
-def constant(features, memory):
-    return torch.zeros(*features.shape[:2], 2), None
-
-
-def test_bins_hold_everything_and_the_outermost_what_is_beyond(recording):
+def test_bins_hold_everything_and_the_outermost_what_is_beyond(recording, constant):
     rows = torch.arange(4)
     behaviour = behaviour_of(
         drive_traffic(recording, start_replay(recording, rows, torch.zeros_like(rows)), constant, 10)
@@ -38,7 +26,7 @@ def test_bins_hold_everything_and_the_outermost_what_is_beyond(recording):
     assert set(sum_by_scene(fast, 4).counts) == set(BINS)
 
 
-def test_a_tally_of_two_runs_has_the_mean_rates(recording):
+def test_a_tally_of_two_runs_has_the_mean_rates(recording, constant):
     one, recorded = collect_statistics(recording, constant, (1.0,))[1.0], record_statistics(recording)
     both = summarise_realism(add_statistics([one, one]), recorded)
     assert dataclasses.replace(both, vehicles=0) == dataclasses.replace(summarise_realism(one, recorded), vehicles=0)

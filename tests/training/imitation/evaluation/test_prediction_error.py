@@ -1,22 +1,10 @@
 """Errors of one driven vehicle among replayed others."""
 
-import pytest
 import torch
 
-from tests.training.imitation.synthetic_scenes import scenes
 from training.imitation.evaluation.behaviour import regular_starts
 from training.imitation.evaluation.prediction_error import TIMES, draw_segments, prediction_errors
-from training.imitation.traffic.recording import stack_scenes
 from training.imitation.traffic.replayed_traffic import start_replay
-
-
-@pytest.fixture(scope="module")
-def recording():
-    return stack_scenes(scenes(4))
-
-
-def constant(features, memory):
-    return torch.zeros(*features.shape[:2], 2), None
 
 
 def test_one_vehicle_is_driven_and_the_others_replayed(recording):
@@ -27,7 +15,7 @@ def test_one_vehicle_is_driven_and_the_others_replayed(recording):
     assert torch.equal(traffic.vehicle[:, 0], chosen[2])
 
 
-def test_constant_speed_is_off_by_what_the_record_changed(recording):
+def test_constant_speed_is_off_by_what_the_record_changed(recording, constant):
     chosen = draw_segments(recording, 10.0, 3, torch.Generator().manual_seed(0))  # at the start of each scene
     found = prediction_errors(recording, constant, chosen, rollouts=2)
     scene, _, vehicle = chosen

@@ -21,17 +21,8 @@ from training.imitation.traffic.replayed_traffic import start_replay
 
 
 @pytest.fixture(scope="module")
-def recording():
-    return stack_scenes(scenes(4))
-
-
-@pytest.fixture(scope="module")
 def three():
     return stack_scenes(scenes(3))
-
-
-def constant(features, memory):
-    return torch.zeros(*features.shape[:2], 2), None
 
 
 def at_start(recording, tick=0):
@@ -46,7 +37,7 @@ def test_the_record_has_no_divergence_from_itself(recording):
     assert found.vehicles == 4 * 6
 
 
-def test_times_of_one_rollout_are_those_of_two(recording):
+def test_times_of_one_rollout_are_those_of_two(recording, constant):
     both = collect_statistics(recording, constant, (1.0, 2.0))
     alone = collect_statistics(recording, constant, (1.0,))
     for name in ("speed", "acceleration"):
@@ -54,7 +45,7 @@ def test_times_of_one_rollout_are_those_of_two(recording):
     assert both[2.0].steps.sum() == 2 * both[1.0].steps.sum()
 
 
-def test_standard_errors_are_those_of_the_mean_over_scenes(recording):
+def test_standard_errors_are_those_of_the_mean_over_scenes(recording, constant):
     """Speeds of four scenes with equally many steps: the bootstrap's is the standard deviation over root n."""
     one = collect_statistics(recording, constant, (0.1,), (torch.arange(4), torch.zeros(4, dtype=torch.long)))[0.1]
     spread = bootstrap_errors(one, record_statistics(recording), np.random.default_rng(0), 4000)
@@ -66,7 +57,7 @@ def test_standard_errors_are_those_of_the_mean_over_scenes(recording):
 def test_divergence_is_symmetric_and_knows_empty_bins():
     p, q = np.array([0.2, 0.8, 0.0]), np.array([0.5, 0.25, 0.25])
     middle = 0.5 * (p + q)
-    expected = 0.5 * sum(a * np.log(a / m) for law in (p, q) for a, m in zip(law, middle, strict=True) if a > 0)
+    expected = 0.5 * sum(a * np.log(a / m) for shares in (p, q) for a, m in zip(shares, middle, strict=True) if a > 0)
     assert jensen_shannon(p, q) == pytest.approx(expected)
     assert jensen_shannon(q, p) == pytest.approx(expected)
 
@@ -91,7 +82,7 @@ def test_driving_as_recorded_is_perfectly_realistic(three):
     assert max(found.divergence.values()) < 0.02
 
 
-def test_divergence_of_disjoint_laws_is_log_two():
+def test_divergence_of_disjoint_distributions_is_log_two():
     p = np.array([0.5, 0.5, 0.0, 0.0])
     assert jensen_shannon(p, p) == 0
     assert jensen_shannon(p, p[::-1].copy()) == pytest.approx(math.log(2))
