@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv, VecMonitor
 
-from rare_envs.sensors.kinds import each
+from rare_envs.sensors.kinds import map_kinds
 
 Indices = int | Iterable[int] | None
 
@@ -140,7 +140,7 @@ class BatchedVecEnv(VecEnv):
         self.reset_infos = [info_row(infos, row) for row in range(self.num_envs)]
         self._reset_seeds()
         self._reset_options()
-        return each(np.asarray, observation)
+        return map_kinds(np.asarray, observation)
 
     def step_async(self, actions: NDArray[Any]) -> None:
         """Keep the actions for `step_wait`, shape (B, 2), or (B,) for discrete ones."""
@@ -153,10 +153,10 @@ class BatchedVecEnv(VecEnv):
         rows: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for row in np.flatnonzero(done).tolist():
             rows[row] = info_row(infos.get("final_info", {}), row)
-            rows[row]["terminal_observation"] = each(np.asarray, infos["final_obs"][row])
+            rows[row]["terminal_observation"] = map_kinds(np.asarray, infos["final_obs"][row])
             rows[row]["TimeLimit.truncated"] = bool(truncated[row] and not terminated[row])
             self.reset_infos[row] = info_row(infos, row)
-        return each(np.asarray, observation), np.asarray(reward, dtype=np.float32), done, rows
+        return map_kinds(np.asarray, observation), np.asarray(reward, dtype=np.float32), done, rows
 
     def close(self) -> None:
         """Close the batch."""

@@ -1,1 +1,23 @@
-"""Control: actions, meta-actions, the Intelligent Driver Model and steering."""
+"""Control: actions of policies, HighwayEnv's meta-actions and steering, and the Intelligent Driver Model."""
+
+from rare_envs.control.actions import (
+    ACTIONS,
+    DISCRETE_ACTIONS,
+    MAX_ACCELERATION,
+    MAX_STEERING,
+    META_ACTIONS,
+    action_space,
+)
+from rare_envs.control.idm import IDM
+from rare_envs.control.steering import lane_keeping
+
+__all__ = [
+    "ACTIONS",
+    "DISCRETE_ACTIONS",
+    "IDM",
+    "MAX_ACCELERATION",
+    "MAX_STEERING",
+    "META_ACTIONS",
+    "action_space",
+    "lane_keeping",
+]

@@ -1,4 +1,4 @@
-"""From a policy's action in [-1, 1] to an acceleration and a steering angle."""
+"""Actions of policies: their kinds and spaces, checks, and scaling to an acceleration and a steering angle."""
 
 from typing import Any
 
@@ -25,22 +25,27 @@ LANE_LEFT, IDLE, LANE_RIGHT, FASTER, SLOWER = range(len(META_ACTIONS))
 
 
 def action_space() -> "spaces.Box[np.float32]":
-    """The continuous action: acceleration and steering, each in [-1, 1]."""
+    """Return the space of the continuous action: acceleration and steering, each in [-1, 1].
+
+    Example:
+        >>> action_space()
+        Box(-1.0, 1.0, (2,), float32)
+    """
     return spaces.Box(-1.0, 1.0, (2,), np.float32)
 
 
 def space_of_actions(kind: str) -> spaces.Space[Any]:
-    """The space of a kind of action: `action_space`, or for "meta" the indices of `META_ACTIONS`."""
+    """Return the space of a kind of action: `action_space`, or for "meta" the indices of `META_ACTIONS`."""
     return spaces.Discrete(len(META_ACTIONS)) if kind == "meta" else action_space()
 
 
 def read_actions(kind: str, actions: Tensor, batch: int, ignored: Tensor | None = None) -> Tensor:
-    """What a world steps with, of what a policy returns: `to_meta` or `to_physical` by the kind of action."""
+    """Return what a world steps with, from what a policy returns: `to_meta` or `to_physical` by the kind of action."""
     return (to_meta if kind == "meta" else to_physical)(actions, batch, ignored)
 
 
 def to_meta(action: Tensor, batch: int, ignored: Tensor | None = None) -> Tensor:
-    """Check meta-actions.
+    """Return meta-actions as int64, checked.
 
     Args:
         action: Indices of `META_ACTIONS`, whole numbers of shape (B,).

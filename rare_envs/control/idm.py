@@ -14,9 +14,12 @@ from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import VEHICLE_LENGTH, State
 from rare_envs.traffic.vehicle_models import NEAR_ZERO
 
+_MIN_RATIO = 1e-24
+"""Floor of speed / desired speed under the root: its slope stays finite at standstill, in single precision too."""
+
 
 class EgoScene(Protocol):
-    """What a rule-based ego needs of an episode."""
+    """The part of an episode that a rule-based ego reads."""
 
     @property
     def state(self) -> State:
@@ -69,11 +72,11 @@ class IDM:
 
     @classmethod
     def highway_env(cls, desired_speed: float) -> IDM:
-        """HighwayEnv's `IDMVehicle`: distance between centres, jam distance 10 m, accelerations within 6 m/s^2."""
+        """Return HighwayEnv's `IDMVehicle`: distances of centres, jam distance 10 m, accelerations within 6 m/s^2."""
         return cls(desired_speed, 1.5, 3.0, 5.0, 4.0, 10.0, 0.0, 6.0, VEHICLE_LENGTH)
 
     def acceleration(self, speed: Tensor, lead: Lead, desired_speed: Tensor | None = None) -> Tensor:
-        """The IDM acceleration.
+        """Return the IDM acceleration.
 
         Args:
             speed: Speed of the follower [m/s], shape (B,).
@@ -86,16 +89,16 @@ class IDM:
         v0 = self.desired_speed if desired_speed is None else desired_speed
         ratio = speed / v0
         closing_gain = 0.5 / (self.max_acceleration * self.comfortable_deceleration) ** 0.5
-        wanted = self.jam_distance + speed * (self.time_headway + lead.closing_speed * closing_gain)
+        desired_gap = self.jam_distance + speed * (self.time_headway + lead.closing_speed * closing_gain)
         if self.jam_distance_speed:
-            wanted = wanted + self.jam_distance_speed * ratio.clamp(min=1e-24).sqrt()  # a finite slope at standstill
-        crowding = wanted / (lead.gap + self.added_length).clamp(min=NEAR_ZERO)
+            desired_gap = desired_gap + self.jam_distance_speed * ratio.clamp(min=_MIN_RATIO).sqrt()
+        interaction = desired_gap / (lead.gap + self.added_length).clamp(min=NEAR_ZERO)
         free = ratio.square().square() if self.exponent == 4.0 else ratio.pow(self.exponent)
-        acceleration: Tensor = self.max_acceleration * (1.0 - free - crowding.square())
+        acceleration: Tensor = self.max_acceleration * (1.0 - free - interaction.square())
         return acceleration.clamp(min=-self.max_deceleration)
 
     def act(self, episode: EgoScene, memory: Any) -> tuple[Tensor, Any]:
-        """IDM behind the lead, lane keeping across; no memory."""
+        """Return IDM behind the lead and lane keeping across, shape (B, 2); there is no memory."""
         state = episode.state
         speed = state.speed[:, 0]
         steering = lane_keeping(state.y[:, 0], state.heading[:, 0], speed, episode.road)

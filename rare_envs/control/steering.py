@@ -1,4 +1,8 @@
-"""Steering: HighwayEnv's controller towards a line, and lane keeping."""
+"""Steering: HighwayEnv's controller towards a line, and lane keeping.
+
+References:
+    Leurent, "An environment for autonomous driving decision-making", 2018: HighwayEnv, `vehicle/controller.py`.
+"""
 
 from __future__ import annotations
 
@@ -9,9 +13,16 @@ from torch import Tensor
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.vehicle_models import NEAR_ZERO, steering_for
 
+TAU_LATERAL = 0.6
+"""Time constant of the way back to the line [s], HighwayEnv's `TAU_LATERAL`."""
+TAU_HEADING = 0.2
+"""Time constant of the heading [s], HighwayEnv's `TAU_HEADING`."""
+MAX_HEADING_COMMAND = np.pi / 4
+"""Largest angle towards the line that is asked for [rad], HighwayEnv's."""
+
 
 def lane_keeping(y: Tensor, heading: Tensor, speed: Tensor, road: Road) -> Tensor:
-    """HighwayEnv's steering controller, towards the centre of the nearest lane.
+    """Return the steering angle of HighwayEnv's controller towards the centre of the nearest lane.
 
     Offset to heading command (proportional, 0.6 s), heading error to yaw rate (0.2 s), yaw rate to steering angle.
     On a curve of radius R it runs wide by 0.12 s^2 v^2 / R, 3 cm at 30 m/s on the I-80.
@@ -24,12 +35,18 @@ def lane_keeping(y: Tensor, heading: Tensor, speed: Tensor, road: Road) -> Tenso
 
     Returns:
         Steering angle [rad], shape (B,).
+
+    Example:
+        >>> from rare_envs.traffic import straight
+        >>> zero = torch.zeros(1)
+        >>> round(lane_keeping(zero + 0.5, zero, zero + 20.0, straight(1)).item(), 4)  # to the left, back to the lane
+        -0.0521
     """
     return steering_control(y - road.centre_of(y), heading, speed)
 
 
 def steering_control(offset: Tensor, heading: Tensor, speed: Tensor) -> Tensor:
-    """HighwayEnv's steering controller (`ControlledVehicle.steering_control`) towards a line.
+    """Return the steering angle of HighwayEnv's controller (`ControlledVehicle.steering_control`) towards a line.
 
     Args:
         offset: Place to the right of the line [m], any shape; the other tensors have the same.
@@ -40,6 +57,7 @@ def steering_control(offset: Tensor, heading: Tensor, speed: Tensor) -> Tensor:
         Steering angle [rad].
     """
     speed = speed.clamp(min=NEAR_ZERO)
-    heading_command = torch.asin((offset / (-0.6 * speed)).clamp(-1.0, 1.0)).clamp(-np.pi / 4, np.pi / 4)
-    yaw_rate = 5.0 * (heading_command - heading)
+    heading_command = torch.asin((offset / (-TAU_LATERAL * speed)).clamp(-1.0, 1.0))
+    heading_command = heading_command.clamp(-MAX_HEADING_COMMAND, MAX_HEADING_COMMAND)
+    yaw_rate = (1.0 / TAU_HEADING) * (heading_command - heading)
     return steering_for(yaw_rate, speed)

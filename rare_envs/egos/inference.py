@@ -12,7 +12,7 @@ from torch import Tensor
 from rare_envs.control.actions import read_actions
 from rare_envs.egos.errors import EgoGone, NoAnswer
 from rare_envs.egos.isolation import attempt_in_parts
-from rare_envs.sensors.kinds import each
+from rare_envs.sensors.kinds import map_kinds
 
 
 class PolicyQuery(NamedTuple):
@@ -29,7 +29,7 @@ class PolicyQuery(NamedTuple):
 
     def rows(self, part: slice) -> PolicyQuery:
         """Return some of the rows, for a policy without a memory."""
-        return PolicyQuery(each(lambda one: one[part], self.observation), None, self.start[part], self.over[part])
+        return PolicyQuery(map_kinds(lambda one: one[part], self.observation), None, self.start[part], self.over[part])
 
 
 def query_policy(

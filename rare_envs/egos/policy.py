@@ -15,7 +15,7 @@ from rare_envs.control.idm import IDM
 from rare_envs.egos.inference import PolicyQuery, query_policy
 from rare_envs.egos.needs import WrappedEgo, observation_for, resolve
 from rare_envs.egos.wrappers import find_frame_stacking, wrap_policy
-from rare_envs.sensors.kinds import each
+from rare_envs.sensors.kinds import map_kinds
 from rare_envs.simulation.background import Background
 from rare_envs.simulation.observation import observe
 from rare_envs.simulation.rollout import Driver
@@ -57,7 +57,7 @@ class PolicyDriver:
             over = over.clone()
             over[list(self.failed_rows)] = True
         seen = observe(episode, self.observation)
-        observation = each(lambda part: _replace_rows(part, over).numpy(force=True), seen)
+        observation = map_kinds(lambda part: _replace_rows(part, over).numpy(force=True), seen)
         start = np.full(batch, memory is None)
         given, hidden = query_policy(
             self.policy, self.action, PolicyQuery(observation, hidden, start, over), self.failed_rows

@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from rare_envs.sensors.kinds import batch_size, each
+from rare_envs.sensors.kinds import batch_size, map_kinds
 
 Shape = tuple[int, ...]
 
@@ -65,10 +65,10 @@ class FrameStackedPolicy:
             shown = np.moveaxis(frames, 0, 1) if self.new_axis else np.concatenate(tuple(frames), axis=-1)
             return np.ascontiguousarray(shown)
 
-        fresh = each(lambda now: np.zeros((self.frames, *now.shape), now.dtype), observation)  # (k, B, ...)
+        fresh = map_kinds(lambda now: np.zeros((self.frames, *now.shape), now.dtype), observation)  # (k, B, ...)
         seen, inner = (fresh, None) if state is None else state
-        seen = each(later, seen, observation)
-        shown = each(side_by_side, seen)
+        seen = map_kinds(later, seen, observation)
+        shown = map_kinds(side_by_side, seen)
         action, inner = self.policy.predict(
             shown, state=inner, episode_start=episode_start, deterministic=deterministic
         )

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rare_envs.measures.base import RowsReplaceable
-from rare_envs.sensors.kinds import each
+from rare_envs.sensors.kinds import map_kinds
 
 _T = TypeVar("_T")
 
@@ -51,7 +51,7 @@ def to_object_rows(observation: Any, mask: NDArray[np.bool_]) -> NDArray[Any]:
     """
     rows = np.full(len(mask), None, dtype=object)
     for row in np.flatnonzero(mask):
-        rows[row] = each(lambda part, row=row: part[row].copy(), observation)
+        rows[row] = map_kinds(lambda part, row=row: part[row].copy(), observation)
     return rows
 
 
@@ -69,7 +69,7 @@ def replace_rows(observation: Any, rows: NDArray[np.intp], fresh: Any) -> Any:
         old[rows] = new
         return old
 
-    return each(replace, observation, fresh)
+    return map_kinds(replace, observation, fresh)
 
 
 def put_masked(infos: dict[str, Any], key: str, value: Any, mask: NDArray[np.bool_]) -> None:

@@ -19,7 +19,7 @@ from rare_envs.make import set_up
 from rare_envs.multi_agent.episode import MultiAgentEpisode, start
 from rare_envs.multi_agent.rewards import Reward, total_of
 from rare_envs.multi_agent.step import step_agents
-from rare_envs.sensors.kinds import each
+from rare_envs.sensors.kinds import map_kinds
 from rare_envs.simulation.ego_needs import EgoNeeds
 from rare_envs.simulation.observation import observe
 
@@ -127,7 +127,7 @@ class AgentsVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]]
         own = self._by_row([collided[:, vehicle] for vehicle in self._vehicles]).numpy()
         crash = ego.numpy() | own.reshape(self.scenarios, -1).any(axis=1)
         done = crash | (self._tick >= self.world.clock.ticks)
-        done_rows, ego_rows = (each.repeat(len(self.agents)) for each in (done, ego.numpy()))
+        done_rows, ego_rows = (map_kinds.repeat(len(self.agents)) for map_kinds in (done, ego.numpy()))
         terminated = own | ego_rows
         infos: dict[str, Any] = {}
         if done.any():
@@ -161,7 +161,7 @@ class AgentsVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]]
 
     def _observe(self, episode: MultiAgentEpisode) -> Any:
         views = [observe(episode.views[vehicle], self.world.sensing.observation) for vehicle in self._vehicles]
-        return each(lambda *parts: self._by_row(list(parts)).numpy(), *views)
+        return map_kinds(lambda *parts: self._by_row(list(parts)).numpy(), *views)
 
     def _replace_scenarios(self, episode: MultiAgentEpisode, rows: NDArray[np.intp]) -> MultiAgentEpisode:
         x = self.space.scenario_x(None, len(rows), self.np_random)

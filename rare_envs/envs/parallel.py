@@ -23,7 +23,7 @@ from rare_envs.multi_agent.rewards import Reward, own_reward, total_of
 from rare_envs.multi_agent.step import step_agents
 from rare_envs.plugins import did_you_mean
 from rare_envs.scenarios.base import Scenario
-from rare_envs.sensors.kinds import each
+from rare_envs.sensors.kinds import map_kinds
 from rare_envs.simulation.ego_needs import EgoNeeds
 from rare_envs.simulation.observation import observe
 
@@ -209,7 +209,7 @@ class DrivingParallelEnv(ParallelEnv[str, SingleObservation, NDArray[np.float32]
         return episode.views[self._vehicles[agent]]
 
     def _observe(self, episode: MultiAgentEpisode, agent: str) -> SingleObservation:
-        observation: SingleObservation = each(
+        observation: SingleObservation = map_kinds(
             lambda part: part[0].numpy(), observe(self._view(episode, agent), self.world.sensing.observation)
         )
         return observation

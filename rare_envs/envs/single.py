@@ -11,7 +11,7 @@ from rare_envs.control.actions import read_actions
 from rare_envs.envs.info import SingleObservation, episode_info, step_info
 from rare_envs.envs.rendering import Renderer
 from rare_envs.make import set_up
-from rare_envs.sensors.kinds import each
+from rare_envs.sensors.kinds import map_kinds
 from rare_envs.simulation.decision import advance
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.observation import observe
@@ -93,7 +93,9 @@ class DrivingEnv(gym.Env[SingleObservation, Any]):
         self._tick = 0
         with torch.inference_mode():
             self._episode = self.world.start(torch.from_numpy(self._x[None]).float())
-            observation = each(lambda part: part[0].numpy(), observe(self._episode, self.world.sensing.observation))
+            observation = map_kinds(
+                lambda part: part[0].numpy(), observe(self._episode, self.world.sensing.observation)
+            )
         self._show()
         return observation, episode_info(self.space, self._x, self._episode)
 
@@ -113,7 +115,7 @@ class DrivingEnv(gym.Env[SingleObservation, Any]):
             self._between = False
             watched = self.world.clock.stride > 1 and (self._recorder or self.render_mode == "human")
             episode, terms = advance(self.world, self._episode, given, watch=self._watch if watched else None)
-            observation = each(lambda part: part[0].numpy(), observe(episode, self.world.sensing.observation))
+            observation = map_kinds(lambda part: part[0].numpy(), observe(episode, self.world.sensing.observation))
             reward = float(terms.total)
         self._episode, self._tick = episode, self._tick + self.world.clock.stride
         terminated = bool(episode.collided)

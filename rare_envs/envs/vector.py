@@ -15,7 +15,7 @@ from rare_envs.envs.batch_rows import merge_rows, put_masked, replace_rows, to_o
 from rare_envs.envs.info import Info
 from rare_envs.envs.rendering import Renderer
 from rare_envs.make import set_up
-from rare_envs.sensors.kinds import each
+from rare_envs.sensors.kinds import map_kinds
 from rare_envs.simulation.decision import advance
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.observation import observe
@@ -96,7 +96,7 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         self._tick[:] = 0
         with torch.inference_mode():
             self._episode = self._start(self._x)
-            observation = each(Tensor.numpy, observe(self._episode, self.world.sensing.observation))
+            observation = map_kinds(Tensor.numpy, observe(self._episode, self.world.sensing.observation))
         return observation, self._info(self._episode, np.ones(self.num_envs, dtype=bool))
 
     def step(
@@ -112,7 +112,7 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         with torch.inference_mode():
             given = read_actions(self.world.clock.action, torch.as_tensor(np.asarray(actions)), self.num_envs)
             episode, terms = advance(self.world, self._episode, given)
-            observation = each(Tensor.numpy, observe(episode, self.world.sensing.observation))
+            observation = map_kinds(Tensor.numpy, observe(episode, self.world.sensing.observation))
             reward = terms.total.double().numpy()
         self._episode = episode
         self._tick += self.world.clock.stride
@@ -141,7 +141,7 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         with torch.inference_mode():
             fresh = self._start(x)
             self._episode = merge_rows(self._episode, torch.from_numpy(rows), fresh)
-            seen = each(Tensor.numpy, observe(fresh, self.world.sensing.observation))
+            seen = map_kinds(Tensor.numpy, observe(fresh, self.world.sensing.observation))
         return replace_rows(observation, rows, seen)
 
     def _info(self, episode: Episode, mask: NDArray[np.bool_]) -> Info:

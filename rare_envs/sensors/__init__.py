@@ -1,1 +1,20 @@
-"""Sensors: lidar, perception, kinematics, camera, and the kinds of observation made of them."""
+"""Sensors: lidar and perception of learned drivers, HighwayEnv's kinematics, the camera, and kinds of observation."""
+
+from rare_envs.sensors.kinds import OBSERVATIONS, read_kinds
+from rare_envs.sensors.kinematics import KINEMATICS_FEATURES, observe_kinematics
+from rare_envs.sensors.lidar import AHEAD_BEAM, BEAMS, MAX_RANGE
+from rare_envs.sensors.perception import FEATURES, RANGE_COLUMNS, RATE_COLUMNS, perceive_traffic
+
+__all__ = [
+    "AHEAD_BEAM",
+    "BEAMS",
+    "FEATURES",
+    "KINEMATICS_FEATURES",
+    "MAX_RANGE",
+    "OBSERVATIONS",
+    "RANGE_COLUMNS",
+    "RATE_COLUMNS",
+    "observe_kinematics",
+    "perceive_traffic",
+    "read_kinds",
+]

@@ -1,20 +1,24 @@
-"""Observations of one kind, or of several together by name."""
+"""Kinds of observation: their names, and functions of one kind or of several together by name."""
 
 from collections.abc import Callable
 from typing import Any
 
 OBSERVATIONS = ("features", "lidar", "kinematics", "camera", "speed")
-"""What can be observed."""
+"""Kinds of observation by name."""
 
 
 def read_kinds(observation: Any) -> str:
-    """The kinds of an observation in the alphabetical order of their names, joined by "+".
+    """Return the kinds of an observation in the alphabetical order of their names, joined by "+".
 
     Args:
         observation: One of `OBSERVATIONS`, several joined by "+", or a list or tuple of them.
 
     Raises:
         ValueError: If it is none of these, or one is named twice.
+
+    Example:
+        >>> read_kinds(["speed", "camera"])
+        'camera+speed'
     """
     names = observation.split("+") if isinstance(observation, str) else observation
     if not isinstance(names, list | tuple) or not names or not all(name in OBSERVATIONS for name in names):
@@ -28,11 +32,11 @@ def read_kinds(observation: Any) -> str:
 
 
 def kinds_of(observation: str) -> tuple[str, ...]:
-    """The kinds of an observation as `read_kinds` writes it."""
+    """Return the kinds of an observation that `read_kinds` has written."""
     return tuple(observation.split("+"))
 
 
-def each(function: Callable[..., Any], *observed: Any) -> Any:
+def map_kinds(function: Callable[..., Any], *observed: Any) -> Any:
     """Apply a function to an observation, or to each of those in a mapping.
 
     Args:
@@ -45,5 +49,5 @@ def each(function: Callable[..., Any], *observed: Any) -> Any:
 
 
 def batch_size(observed: Any) -> int:
-    """Number of rows of an observation."""
+    """Return the number of rows of an observation."""
     return len(next(iter(observed.values()))) if isinstance(observed, dict) else len(observed)

@@ -32,15 +32,15 @@ BEHIND = 2 * VEHICLE_LENGTH
 
 
 def kinematics_space() -> "spaces.Box[np.float32]":
-    """The space of `kinematics`, as HighwayEnv declares it: `KINEMATICS_ROWS` x `KINEMATICS_FEATURES`, without bounds.
+    """Return the space of `observe_kinematics`, as HighwayEnv declares it, without bounds.
 
     What is observed is clipped to [-1, 1] here as there, but Stable-Baselines3's `load(path, env)` wants equal spaces.
     """
     return spaces.Box(-np.inf, np.inf, (KINEMATICS_ROWS, len(KINEMATICS_FEATURES)), np.float32)
 
 
-def kinematics(state: State, road: Road, vehicle: int = 0) -> Tensor:
-    """What a vehicle observes.
+def observe_kinematics(state: State, road: Road, vehicle: int = 0) -> Tensor:
+    """Return what a vehicle observes.
 
     The others are those within `VIEW` and less than `BEHIND` behind, nearest along the road first (vehicles at one
     distance in the order of the state), at most four of them.
@@ -52,6 +52,13 @@ def kinematics(state: State, road: Road, vehicle: int = 0) -> Tensor:
 
     Returns:
         Shape (B, 5, 5), float32, in [-1, 1]: rows of `KINEMATICS_FEATURES`, the observer's first.
+
+    Example:
+        >>> from rare_envs.traffic import straight
+        >>> x = torch.tensor([[0.0, 100.0]])
+        >>> state = State(x, 0 * x, 0 * x, torch.tensor([[20.0, 10.0]]), theta=x[:, :0])
+        >>> observe_kinematics(state, straight(1))[0, :2].tolist()  # presence, x / 200, y, vx / 80, vy
+        [[1.0, 0.0, 0.0, 0.25, 0.0], [1.0, 0.5, 0.0, -0.125, 0.0]]
     """
     moving = (state.x, state.y, state.speed * torch.cos(state.heading), state.speed * torch.sin(state.heading))
     values = torch.stack((torch.ones_like(state.x), *moving), dim=-1)

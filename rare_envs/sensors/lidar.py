@@ -70,12 +70,12 @@ class Readings(NamedTuple):
 
 
 def beam_angles(like: Tensor) -> Tensor:
-    """Angles of the beams relative to the heading [rad], shape (20,), with dtype and device of a tensor."""
+    """Return the angles of the beams relative to the heading [rad], shape (20,), with dtype and device of a tensor."""
     return FIRST_BEAM_ANGLE + BEAM_SPACING * torch.arange(BEAMS, dtype=like.dtype, device=like.device)
 
 
 def sense(bodies: Bodies, observers: int | None = None) -> Readings:
-    """Measure with the lidars of the first vehicles.
+    """Return what the lidars of the first vehicles measure.
 
     Vehicles that are not there are parked further than `MAX_RANGE` from all others.
 
@@ -110,7 +110,7 @@ def sense(bodies: Bodies, observers: int | None = None) -> Readings:
 def _crossing(
     dx: Tensor, dy: Tensor, heading: Tensor, turn: Tensor, length: Tensor, width: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Where a beam enters and leaves a box, as distances along the beam (slab method).
+    """Return where a beam enters and leaves a box, as distances along the beam (slab method; Kay and Kajiya, 1986).
 
     Args:
         dx: Middle of the box less the beam's origin [m].
@@ -133,11 +133,12 @@ def _crossing(
 
 
 def _away_from_zero(value: Tensor) -> Tensor:
+    """Return components of directions, none of them nearer to 0 than `_FLAT`."""
     return value.masked_fill(value.abs() < _FLAT, _FLAT)
 
 
 def _first_met(bodies: Bodies, m: int) -> tuple[Tensor, Tensor]:
-    """What each beam of the first m vehicles meets first.
+    """Return what each beam of the first m vehicles meets first.
 
     Returns:
         Index of the vehicle, -1 for none, and the distance to it [m] in single precision, shapes (B, m, 20).
@@ -163,14 +164,14 @@ def _first_met(bodies: Bodies, m: int) -> tuple[Tensor, Tensor]:
         observer = torch.div(pair, v, rounding_mode="floor")
         vehicle = pair - observer * v
         body = vehicle + torch.div(observer, m, rounding_mode="floor") * v
-        beam = (_taken(facing, pair) + _offsets(offsets, dx.device)) % BEAMS
+        beam = (_take(facing, pair) + _offsets(offsets, dx.device)) % BEAMS
         enters, leaves = _crossing(
-            _taken(dx, pair),
-            _taken(dy, pair),
-            _taken(bodies.heading, body),
-            _taken(relative, pair) + (FIRST_BEAM_ANGLE + BEAM_SPACING * beam),
-            _taken(bodies.length, body),
-            _taken(bodies.width, body),
+            _take(dx, pair),
+            _take(dy, pair),
+            _take(bodies.heading, body),
+            _take(relative, pair) + (FIRST_BEAM_ANGLE + BEAM_SPACING * beam),
+            _take(bodies.length, body),
+            _take(bodies.width, body),
         )
         meets = (enters <= leaves) & (leaves > 0.0) & (enters < MAX_RANGE)
         key = torch.where(meets, _key(enters, vehicle[:, None]), _NOTHING)
@@ -181,8 +182,8 @@ def _first_met(bodies: Bodies, m: int) -> tuple[Tensor, Tensor]:
     return torch.where(keys == _NOTHING, -1, keys & (2**_VEHICLE_BITS - 1)), found
 
 
-def _taken(field: Tensor, numbers: Tensor) -> Tensor:
-    """Entries of a field by their numbers in it (n,), as a column (n, 1)."""
+def _take(field: Tensor, numbers: Tensor) -> Tensor:
+    """Return entries of a field by their numbers in it (n,), as a column (n, 1)."""
     return field.flatten().index_select(0, numbers)[:, None]
 
 
@@ -192,7 +193,7 @@ def _offsets(offsets: tuple[int, ...], device: torch.device) -> Tensor:
 
 
 def _key(distance: Tensor, vehicle: Tensor) -> Tensor:
-    """Integers that are ordered as the distances are, with the vehicle in the last bits.
+    """Return integers that are ordered as the distances are, with the vehicle in the last bits.
 
     The bits of positive single-precision numbers, read as integers, are ordered as the numbers are.
     """

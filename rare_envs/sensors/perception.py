@@ -1,4 +1,4 @@
-"""What a driver sees: the 51 features of learned drivers.
+"""Perception: the 51 features of learned drivers, their own state, the road and a lidar.
 
 References:
     Kuefler, Morton, Wheeler and Kochenderfer, "Imitating driver behavior with generative adversarial networks", 2017.
@@ -58,7 +58,7 @@ class OnRoad(NamedTuple):
 
 
 def perceive(bodies: Bodies, on_road: OnRoad, observers: int | None = None) -> Tensor:
-    """The 51 features of the first vehicles.
+    """Return the 51 features of the first vehicles.
 
     Args:
         bodies: V vehicles in B scenes.
@@ -88,7 +88,21 @@ def perceive(bodies: Bodies, on_road: OnRoad, observers: int | None = None) -> T
 
 
 def perceive_traffic(state: State, road: Road, pose: WorldPose | None = None) -> Tensor:
-    """The 51 features of all vehicles, shape (B, N, 51); where they are is found out unless `pose` says it."""
+    """Return the 51 features of all vehicles, shape (B, N, 51).
+
+    Args:
+        state: Traffic of B scenarios.
+        road: Their road.
+        pose: Where they are in the world, if that is known already.
+
+    Example:
+        >>> from rare_envs.traffic import straight
+        >>> x = torch.tensor([[0.0, 30.0]])
+        >>> state = State(x, 0 * x, 0 * x, torch.tensor([[20.0, 10.0]]), theta=x[:, :0])
+        >>> seen = perceive_traffic(state, straight(1))
+        >>> seen[0, 0, RANGE_COLUMNS][AHEAD_BEAM].item(), seen[0, 0, RATE_COLUMNS][AHEAD_BEAM].item()
+        (27.5, -10.0)
+    """
     x, y, heading, curvature = pose or road.place(state.x, state.y, state.heading)
     bodies = Bodies(x, y, heading, state.speed, x.new_tensor(VEHICLE_LENGTH), x.new_tensor(VEHICLE_WIDTH))
     left, right = road.markers(state.y)

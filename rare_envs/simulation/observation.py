@@ -10,7 +10,7 @@ from torch import Tensor
 
 from rare_envs.sensors.camera import Camera, take_picture
 from rare_envs.sensors.kinds import kinds_of
-from rare_envs.sensors.kinematics import kinematics, kinematics_space
+from rare_envs.sensors.kinematics import kinematics_space, observe_kinematics
 from rare_envs.sensors.lidar import BEAMS, MAX_RANGE
 from rare_envs.traffic.state import LANE_WIDTH, VEHICLE_LENGTH, State
 
@@ -105,7 +105,7 @@ def observe(episode: "Episode", observation: str, vehicle: int = 0) -> Any:
         camera_context = episode.camera_context if vehicle == 0 else episode.camera_context._replace(viewer=vehicle)
         return take_picture(episode.state.seen_by(vehicle), episode.road, camera_context)
     if observation == "kinematics":
-        return kinematics(episode.state, episode.road, vehicle)
+        return observe_kinematics(episode.state, episode.road, vehicle)
     if observation == "lidar":
         assert episode.perception is not None
         scales = episode.perception.new_tensor(LIDAR_SCALES)

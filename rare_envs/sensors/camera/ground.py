@@ -50,7 +50,7 @@ class Lines(NamedTuple):
 
 
 def road_lines(view: View, road: Road, seen: Pixels) -> Lines:
-    """Road coordinates of what the rows of ground pixels look at."""
+    """Return road coordinates of what the rows of ground pixels look at."""
     x, y, heading = (part[:, None] for part in view)
     forward = seen.forward[:, 0].to(x)
     cos, sin = torch.cos(heading), torch.sin(heading)
@@ -77,7 +77,7 @@ def road_lines(view: View, road: Road, seen: Pixels) -> Lines:
 
 
 def _quadratic(values: Tensor, middle: Tensor, reach: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Coefficients of the parabola through values (3, T, R) at middle - reach, middle and middle + reach."""
+    """Return the coefficients of the parabola through values (3, T, R) at middle - reach, middle and middle + reach."""
     left, centre, right = values
     slope, bend = (right - left) / (2 * reach), (right + left - 2 * centre) / (2 * reach.square())
     constant = centre - middle * (slope - middle * bend)
@@ -95,7 +95,7 @@ class Cover(NamedTuple):
 
 
 def cover_of(lines: Lines, road: Road, seen: Pixels) -> Cover:
-    """What covers the pixels' footprints on the ground.
+    """Return what covers the pixels' footprints on the ground.
 
     A pixel sees a strip across the road as wide as the change of t over the pixel, in which a line covers its overlap;
     so far lines fade rather than flicker. The left edge is a yellow line, the right edge a white one, the lines between
@@ -108,7 +108,7 @@ def cover_of(lines: Lines, road: Road, seen: Pixels) -> Cover:
     share = strip.reciprocal()
 
     def band(middle: float, reach: Tensor, most: Tensor) -> Tensor:
-        """Width of a band's overlap with the strip [m]; `reach` is half of both, `most` the less of both."""
+        """Return the width of a band's overlap with the strip [m]; `reach` is half of both, `most` the less of both."""
         distance = (t - middle).abs_()
         overlap = torch.sub(reach, distance, out=distance).clamp_(min=0.0)
         return torch.minimum(overlap, most, out=overlap)
@@ -128,19 +128,19 @@ def cover_of(lines: Lines, road: Road, seen: Pixels) -> Cover:
 
 
 def _dashes(s: Tensor, length: Tensor) -> Tensor:
-    """Part of the stretches of road with these middles and lengths (of any sign) [m] on which there are dashes."""
+    """Return the part of stretches of road, by middle and length (of any sign) [m], on which there are dashes."""
     length = length.abs().clamp(min=1e-3)
 
     def before(way: Tensor) -> Tensor:
-        """Length of dashes from 0 to a place."""
+        """Return the length of dashes from 0 to a place."""
         periods = torch.floor(way / PERIOD)
         return (way - periods * PERIOD).clamp_(max=DASH).add_(periods, alpha=DASH)
 
     return before(s + 0.5 * length).sub_(before(s - 0.5 * length)).div_(length)
 
 
-def ground(cover: Cover, shade: Tensor | None, light: Light, seen: Pixels) -> Tensor:
-    """Colours of the ground.
+def colour_ground(cover: Cover, shade: Tensor | None, light: Light, seen: Pixels) -> Tensor:
+    """Return the colours of the ground.
 
     Args:
         cover: What covers it.

@@ -45,7 +45,7 @@ class Light(NamedTuple):
     """Of sky and air, shape (T,)."""
 
     def through(self, distance: Tensor, frame: Tensor | None = None) -> Tensor:
-        """Part of the light that passes a way through the air.
+        """Return the part of the light that passes a way through the air.
 
         Args:
             distance: Its length [m], shape (...) for all pictures, or one for each entry of `frame`.
@@ -60,7 +60,7 @@ class Light(NamedTuple):
 
 
 def light_of(weather: Weather, heading: Tensor) -> Light:
-    """Light in the frame of cameras with these headings [rad], shape (T,)."""
+    """Return the light in the frame of cameras with these headings [rad], shape (T,)."""
     fog, elevation = weather.fog.float(), weather.sun_elevation.float()
     turn = (weather.sun_azimuth - heading).float()
     level, up = torch.cos(elevation), torch.sin(elevation)
@@ -70,8 +70,8 @@ def light_of(weather: Weather, heading: Tensor) -> Light:
     return Light(fog, sun, DIRECT * passed, diffuse, 0.6 + 0.4 * up)
 
 
-def sky(light: Light, ray: Tensor, norm: Tensor) -> Tensor:
-    """Colours of the sky.
+def colour_sky(light: Light, ray: Tensor, norm: Tensor) -> Tensor:
+    """Return the colours of the sky.
 
     Args:
         light: Of T pictures.

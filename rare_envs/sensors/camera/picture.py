@@ -5,11 +5,11 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from rare_envs.sensors.camera.ground import Lines, View, cover_of, ground, road_lines
-from rare_envs.sensors.camera.light import RGB, Light, light_of, sky
+from rare_envs.sensors.camera.ground import Lines, View, colour_ground, cover_of, road_lines
+from rare_envs.sensors.camera.light import RGB, Light, colour_sky, light_of
 from rare_envs.sensors.camera.pinhole import Camera, Pixels, pixels
-from rare_envs.sensors.camera.sensor_noise import grain
-from rare_envs.sensors.camera.vehicles import PAINT, Boxes, paint, shadows
+from rare_envs.sensors.camera.sensor_noise import draw_pixel_noise
+from rare_envs.sensors.camera.vehicles import PAINT, Boxes, cast_shadows, draw_boxes
 from rare_envs.sensors.camera.weather import CameraContext
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import State
@@ -19,7 +19,7 @@ TILE = 2**17
 
 
 class PictureScene(NamedTuple):
-    """What T cameras see."""
+    """Scenes in front of T cameras."""
 
     boxes: Boxes
     """All N vehicles, the camera's own first."""
@@ -30,7 +30,7 @@ class PictureScene(NamedTuple):
 
 @torch.no_grad()
 def take_picture(state: State, road: Road, context: CameraContext) -> Tensor:
-    """What the cameras of the vehicles in the ego's place see.
+    """Return the pictures of the cameras of the vehicles in the ego's place.
 
     Every picture depends on its own row alone, bit for bit.
 
@@ -41,6 +41,15 @@ def take_picture(state: State, road: Road, context: CameraContext) -> Tensor:
 
     Returns:
         uint8, shape (B, H, W, 3): rows from the top, columns from the left, red, green and blue.
+
+    Example:
+        >>> from rare_envs.sensors.camera import Camera, clear_day
+        >>> from rare_envs.traffic import straight
+        >>> x = torch.tensor([[0.0, 30.0]])
+        >>> state = State(x, 0 * x, 0 * x, torch.tensor([[20.0, 10.0]]), theta=x[:, :0])
+        >>> image = take_picture(state, straight(1), CameraContext.at_start(Camera(), clear_day(x)))
+        >>> image.shape, image[0, 0, 0].tolist()  # the sky
+        (torch.Size([1, 66, 200, 3]), [144, 169, 201])
     """
     camera, device = context.camera, state.x.device
     seen = pixels(camera, device)
@@ -55,17 +64,17 @@ def take_picture(state: State, road: Road, context: CameraContext) -> Tensor:
         if noisy:
             when = context._replace(weather=_rows(context.weather, part), tick=context.tick[part])
             strength = when.weather.noise.float()[:, None, None]
-            drawn.addcmul_(strength, grain(when, drawn[0].numel()).view(drawn.shape))
+            drawn.addcmul_(strength, draw_pixel_noise(when, drawn[0].numel()).view(drawn.shape))
         image[part] = drawn.round_().clamp_(0.0, 255.0).to(torch.uint8).view(-1, *image.shape[1:])
     return image
 
 
 def _rows(fields: Any, part: slice) -> Any:
-    """Some rows of tensors, which may lie in tuples of tuples."""
+    """Return some rows of tensors, which may lie in tuples of tuples."""
     if isinstance(fields, Tensor):
         return fields[part]
     parts = [_rows(field, part) for field in fields]
-    return type(fields)(*parts) if hasattr(fields, "_fields") else tuple(parts)
+    return tuple(parts) if type(fields) is tuple else type(fields)(*parts)  # a NamedTuple takes its fields one by one
 
 
 def _scene(state: State, road: Road, context: CameraContext, seen: Pixels) -> PictureScene:
@@ -83,19 +92,19 @@ def _scene(state: State, road: Road, context: CameraContext, seen: Pixels) -> Pi
 
 
 def _draw(scene: PictureScene, road: Road, camera: Camera, seen: Pixels, colours: Tensor) -> Tensor:
-    """Colours from 0 to 1, shape (T, H W, 3), without noise."""
+    """Return colours from 0 to 1, shape (T, H W, 3), without noise."""
     boxes, light, lines = scene
     image = torch.empty(len(light.fog), camera.height * camera.width, 3, device=colours.device)
     above = seen.sky * camera.width
     if seen.sky:
-        image[:, :above] = sky(light, seen.ray[:, :above], seen.norm[:above]).movedim(1, 2)
+        image[:, :above] = colour_sky(light, seen.ray[:, :above], seen.norm[:above]).movedim(1, 2)
     if seen.sky < camera.height:
-        shade = shadows(boxes, light, camera, seen)
-        image[:, above:] = ground(cover_of(lines, road, seen), shade, light, seen).flatten(2).movedim(1, 2)
-    paint(image, Boxes(*(part[:, 1:] for part in boxes)), light, camera, seen, colours)
+        shade = cast_shadows(boxes, light, camera, seen)
+        image[:, above:] = colour_ground(cover_of(lines, road, seen), shade, light, seen).flatten(2).movedim(1, 2)
+    draw_boxes(image, Boxes(*(part[:, 1:] for part in boxes)), light, camera, seen, colours)
     return image
 
 
 def _colours(vehicles: int, viewer: int) -> list[RGB]:
-    """Colours of the vehicles that a viewer sees, in the order of `State.seen_by`."""
+    """Return the colours of the vehicles that a viewer sees, in the order of `State.seen_by`."""
     return [PAINT[(j - 1) % len(PAINT)] for j in range(vehicles) if j != viewer]

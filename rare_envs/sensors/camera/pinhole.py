@@ -1,4 +1,4 @@
-"""The camera: a pinhole at the front of a vehicle, its pixels' rays and where those meet flat ground."""
+"""Pinhole camera: a mount on a vehicle, the rays of its pixels, and the ground that those see."""
 
 import math
 from dataclasses import dataclass
@@ -20,10 +20,14 @@ class Camera:
     of view and pitch show the ground from 4.3 m ahead, and put the horizon at three tenths of the picture.
 
     Raises:
-        ValueError: If it is no such camera.
+        ValueError: If a size is not a whole number of pixels, or another setting is out of its range.
 
     References:
         Bojarski et al., "End to end learning for self-driving cars", 2016.
+
+    Example:
+        >>> round(Camera(height=40, width=120).focal, 1)  # of a field of view of 70 degrees
+        85.7
     """
 
     height: int = 66
@@ -67,13 +71,17 @@ class Camera:
 
 
 def find_camera(camera: object) -> Camera:
-    """The camera that a keyword argument `camera` stands for.
+    """Return the camera that a keyword argument `camera` stands for.
 
     Args:
         camera: A `Camera`, the size of its pictures as (height, width), or None for the usual one.
 
     Raises:
         ValueError: If it is none of these.
+
+    Example:
+        >>> find_camera((40, 120)).width
+        120
     """
     if camera is None:
         return Camera()
@@ -85,7 +93,7 @@ def find_camera(camera: object) -> Camera:
 
 
 class Pixels(NamedTuple):
-    """What the H x W pixels of a camera see, in a level frame (forward, right, up) with the camera as origin.
+    """Views of the H x W pixels of a camera, in a level frame (forward, right, up) with the camera as origin.
 
     Ground is seen by the last R of the H rows. As the camera does not roll, each of these looks at a straight line
     across its heading.
@@ -113,7 +121,7 @@ class Pixels(NamedTuple):
 
 @lru_cache(maxsize=16)
 def pixels(camera: Camera, device: torch.device) -> Pixels:
-    """Rays and ground points of a camera, in single precision."""
+    """Return rays and ground points of a camera, in single precision."""
     with torch.inference_mode(False):
         focal, cos, sin = camera.focal, math.cos(camera.pitch), math.sin(camera.pitch)
         column = torch.arange(camera.width, dtype=torch.float64, device=device)

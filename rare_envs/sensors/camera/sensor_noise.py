@@ -1,7 +1,7 @@
-"""Noise of a camera: a function of key, tick, viewer and pixel, so that nothing is random but the key.
+"""Sensor noise: a function of key, tick, viewer and pixel, so that nothing is random but the key.
 
-A 32-bit hash of these gives four bytes; their sum, centred and scaled, has mean 0, variance 1 and nearly a normal law
-(that of Irwin and Hall for four terms, which ends at 3.5 standard deviations).
+A 32-bit hash of these gives four bytes; their sum, centred and scaled, has mean 0, variance 1 and is nearly normal
+(the Irwin-Hall distribution of four terms, which ends at 3.5 standard deviations).
 """
 
 import torch
@@ -17,19 +17,19 @@ _EVEN = 0x00FF00FF
 _MEAN, _DEVIATION = 4 * 127.5, (4 * (256**2 - 1) / 12) ** 0.5
 
 
-def grain(context: CameraContext, values: int) -> Tensor:
-    """Noise of one picture for each of B cameras, shape (B, values), mean 0 and variance 1."""
+def draw_pixel_noise(context: CameraContext, values: int) -> Tensor:
+    """Return the noise of one picture for each of B cameras, shape (B, values), mean 0 and variance 1."""
     key = context.weather.key.to(torch.int32)
     for number in (context.tick, torch.full_like(context.tick, context.viewer)):
-        key = _mixed(key + (number.to(torch.int32) + 1) * _STEP)
+        key = _mix(key + (number.to(torch.int32) + 1) * _STEP)
     place = torch.arange(values, dtype=torch.int32, device=key.device) * _STEP
-    bits = _mixed(place[None, :] + key[:, None])
+    bits = _mix(place[None, :] + key[:, None])
     pairs = (bits >> 8).bitwise_and_(_EVEN).add_(bits.bitwise_and_(_EVEN))  # bytes 0 + 1 and 2 + 3
     total = (pairs >> 16).add_(pairs.bitwise_and_(0xFFFF))
     return total.float().sub_(_MEAN).div_(_DEVIATION)
 
 
-def _mixed(bits: Tensor) -> Tensor:
+def _mix(bits: Tensor) -> Tensor:
     """Scramble 32-bit integers, in place; multiplication wraps around."""
     bits.bitwise_xor_((bits >> 16).bitwise_and_(0xFFFF)).mul_(_FACTORS[0])
     bits.bitwise_xor_((bits >> 15).bitwise_and_(0x1FFFF)).mul_(_FACTORS[1])

@@ -44,7 +44,7 @@ class Boxes(NamedTuple):
     sin: Tensor
 
     def corners(self) -> tuple[Tensor, Tensor]:
-        """Places of the four vertical edges, forward and right, shapes (T, N, 4)."""
+        """Return places of the four vertical edges, forward and right, shapes (T, N, 4)."""
         along = self.cos.new_tensor((0.5, 0.5, -0.5, -0.5)) * VEHICLE_LENGTH
         across = self.cos.new_tensor((0.5, -0.5, 0.5, -0.5)) * VEHICLE_WIDTH
         cos, sin = self.cos[..., None], self.sin[..., None]
@@ -52,7 +52,7 @@ class Boxes(NamedTuple):
 
 
 class Candidates(NamedTuple):
-    """Pixels in which a box or its shadow may be; shapes (C,)."""
+    """Pixels that a box or its shadow may cover; shapes (C,)."""
 
     box: Tensor
     """Number of the box, frame by frame, 0 to T N - 1."""
@@ -63,7 +63,7 @@ class Candidates(NamedTuple):
 
 
 def project_points(camera: Camera, forward: Tensor, right: Tensor, up: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Points in the camera's frame, seen along its axis.
+    """Return points in the camera's frame, along its axis.
 
     Args:
         camera: The camera.
@@ -80,7 +80,7 @@ def project_points(camera: Camera, forward: Tensor, right: Tensor, up: Tensor) -
     return right, -forward * sin - above * cos, forward * cos - above * sin
 
 
-def around(camera: Camera, forward: Tensor, right: Tensor, up: Tensor, first_row: int = 0) -> Candidates:
+def find_candidates(camera: Camera, forward: Tensor, right: Tensor, up: Tensor, first_row: int = 0) -> Candidates:
     """Pixels in the rectangles around the convex hulls of sets of K points.
 
     What is behind the camera is cut off at a plane just ahead of it, where the hull is no wider than the points are.
@@ -106,23 +106,23 @@ def around(camera: Camera, forward: Tensor, right: Tensor, up: Tensor, first_row
 
     left, end = limits(right, 0, camera.width, camera.width)
     top, bottom = limits(down, first_row, camera.height, camera.height)
-    box, line = _counted(torch.where(end > left, bottom - top, 0))
+    box, line = _enumerate_groups(torch.where(end > left, bottom - top, 0))
     row = line + top.index_select(0, box)
-    stretch, place = _counted((end - left).index_select(0, box))
+    stretch, place = _enumerate_groups((end - left).index_select(0, box))
     start = row * camera.width + left.index_select(0, box)
     return Candidates(
         box.index_select(0, stretch), row.index_select(0, stretch), start.index_select(0, stretch) + place
     )
 
 
-def _counted(count: Tensor) -> tuple[Tensor, Tensor]:
-    """For each of n groups of some members: the group of every member, and its number within it, from 0."""
+def _enumerate_groups(count: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the group of every member of n groups, and its number within it from 0, of the sizes of the groups."""
     group = torch.repeat_interleave(count)
     return group, torch.arange(len(group), device=count.device) - (count.cumsum(0) - count).index_select(0, group)
 
 
 def _slab(origin: Tensor, inverse: Tensor, size: float) -> tuple[Tensor, Tensor]:
-    """Where rays enter and leave the space between two planes at +-size / 2, in lengths of their directions.
+    """Return where rays enter and leave the space between planes at +-size / 2, in lengths of their directions.
 
     Args:
         origin: Of the rays, across the planes [m].
@@ -133,18 +133,18 @@ def _slab(origin: Tensor, inverse: Tensor, size: float) -> tuple[Tensor, Tensor]
     return torch.minimum(one, other), torch.maximum(one, other)
 
 
-def _turned(forward: Tensor, right: Tensor, cos: Tensor, sin: Tensor) -> tuple[Tensor, Tensor]:
-    """A vector in a box's own frame."""
+def _to_box_frame(forward: Tensor, right: Tensor, cos: Tensor, sin: Tensor) -> tuple[Tensor, Tensor]:
+    """Return a vector in a box's own frame."""
     return forward * cos + right * sin, right * cos - forward * sin
 
 
-def _picked(numbers: Tensor, *values: Tensor) -> tuple[Tensor, ...]:
-    """Entries of flat tensors by their numbers (C,)."""
+def _pick(numbers: Tensor, *values: Tensor) -> tuple[Tensor, ...]:
+    """Return entries of flat tensors by their numbers (C,)."""
     return tuple(value.flatten().index_select(0, numbers) for value in values)
 
 
-def shadows(boxes: Boxes, light: Light, camera: Camera, seen: Pixels) -> Tensor | None:
-    """Which ground pixels see no sun because of a box, boolean, shape (T, R, W); None if all do.
+def cast_shadows(boxes: Boxes, light: Light, camera: Camera, seen: Pixels) -> Tensor | None:
+    """Return which ground pixels see no sun because of a box, boolean, shape (T, R, W); None if all do.
 
     Shadows count for all N boxes, that of the camera's own vehicle included.
     """
@@ -153,30 +153,30 @@ def shadows(boxes: Boxes, light: Light, camera: Camera, seen: Pixels) -> Tensor 
     steep = (HEIGHT / sun_up)[..., None]
     moved = forward - sun_forward[..., None] * steep, right - sun_right[..., None] * steep
     forward, right = torch.cat((forward, moved[0]), -1), torch.cat((right, moved[1]), -1)
-    at = around(camera, forward, right, torch.zeros_like(forward), seen.sky)
+    at = find_candidates(camera, forward, right, torch.zeros_like(forward), seen.sky)
     if not len(at.box):
         return None
-    origin = _turned(boxes.forward, boxes.right, boxes.cos, boxes.sin)
-    sun = _turned(sun_forward, sun_right, boxes.cos, boxes.sin)
+    origin = _to_box_frame(boxes.forward, boxes.right, boxes.cos, boxes.sin)
+    sun = _to_box_frame(sun_forward, sun_right, boxes.cos, boxes.sin)
     above = (HEIGHT / sun_up).expand_as(boxes.cos)
-    x0, y0, cos, sin, inverse_x, inverse_y, leaves = _picked(
+    x0, y0, cos, sin, inverse_x, inverse_y, leaves = _pick(
         at.box, *origin, boxes.cos, boxes.sin, 1.0 / sun[0], 1.0 / sun[1], above
     )
     pixel = at.pixel - seen.sky * camera.width
-    (ground_forward,), (ground_right,) = _picked(at.row - seen.sky, seen.forward), _picked(pixel, seen.right)
-    x, y = _turned(ground_forward, ground_right, cos, sin)
+    (ground_forward,), (ground_right,) = _pick(at.row - seen.sky, seen.forward), _pick(pixel, seen.right)
+    x, y = _to_box_frame(ground_forward, ground_right, cos, sin)
     near_x, far_x = _slab(x - x0, inverse_x, VEHICLE_LENGTH)
     near_y, far_y = _slab(y - y0, inverse_y, VEHICLE_WIDTH)
     enters = torch.maximum(near_x, near_y).clamp_(min=0.0)
     (dark,) = (enters <= torch.minimum(torch.minimum(far_x, far_y), leaves)).nonzero(as_tuple=True)
     shade = torch.zeros(len(boxes.cos), *seen.right.shape, dtype=torch.bool, device=x.device)
-    box, pixel = _picked(dark, at.box, pixel)
+    box, pixel = _pick(dark, at.box, pixel)
     frame = torch.div(box, boxes.cos.shape[1], rounding_mode="floor")
     shade.view(-1).index_fill_(0, frame * seen.right.numel() + pixel, True)
     return shade
 
 
-def paint(image: Tensor, boxes: Boxes, light: Light, camera: Camera, seen: Pixels, colours: Tensor) -> None:
+def draw_boxes(image: Tensor, boxes: Boxes, light: Light, camera: Camera, seen: Pixels, colours: Tensor) -> None:
     """Draw boxes into pictures.
 
     Args:
@@ -190,23 +190,23 @@ def paint(image: Tensor, boxes: Boxes, light: Light, camera: Camera, seen: Pixel
     forward, right = (torch.cat((part, part), -1) for part in boxes.corners())
     up = torch.zeros_like(forward)
     up[..., 4:] = HEIGHT
-    at = around(camera, forward, right, up)
+    at = find_candidates(camera, forward, right, up)
     if not len(at.box):
         return
-    origin = _turned(-boxes.forward, -boxes.right, boxes.cos, boxes.sin)
+    origin = _to_box_frame(-boxes.forward, -boxes.right, boxes.cos, boxes.sin)
     ray_forward, ray_right, ray_up = seen.ray
     middle = camera.mount_height - 0.5 * HEIGHT
     near_z, far_z = _slab(torch.full_like(ray_up, middle), 1.0 / ray_up, HEIGHT)  # the same for all boxes
-    x0, y0, cos, sin = _picked(at.box, *origin, boxes.cos, boxes.sin)
-    way_forward, way_right, near_z, far_z = _picked(at.pixel, ray_forward, ray_right, near_z, far_z)
-    x, y = _turned(way_forward, way_right, cos, sin)
+    x0, y0, cos, sin = _pick(at.box, *origin, boxes.cos, boxes.sin)
+    way_forward, way_right, near_z, far_z = _pick(at.pixel, ray_forward, ray_right, near_z, far_z)
+    x, y = _to_box_frame(way_forward, way_right, cos, sin)
     near_x, far_x = _slab(x0, x.reciprocal_(), VEHICLE_LENGTH)
     near_y, far_y = _slab(y0, y.reciprocal_(), VEHICLE_WIDTH)
     enters = torch.maximum(torch.maximum(near_x, near_y), near_z)
     (hit,) = ((enters <= torch.minimum(torch.minimum(far_x, far_y), far_z)) & (enters > 0.0)).nonzero(as_tuple=True)
 
     n, size = boxes.cos.shape[1], image.shape[1]
-    box, pixel, enters, near_y, near_z = _picked(hit, at.box, at.pixel, enters, near_y, near_z)
+    box, pixel, enters, near_y, near_z = _pick(hit, at.box, at.pixel, enters, near_y, near_z)
     frame = torch.div(box, n, rounding_mode="floor")
     slot = frame * size + pixel
     key = enters.view(torch.int32).to(torch.int64) * (n * len(image)) + box
@@ -214,9 +214,9 @@ def paint(image: Tensor, boxes: Boxes, light: Light, camera: Camera, seen: Pixel
     nearest.scatter_reduce_(0, slot, key, "amin")
     (won,) = (nearest.index_select(0, slot) == key).nonzero(as_tuple=True)
 
-    box, frame, pixel, slot, enters, near_y, near_z = _picked(won, box, frame, pixel, slot, enters, near_y, near_z)
+    box, frame, pixel, slot, enters, near_y, near_z = _pick(won, box, frame, pixel, slot, enters, near_y, near_z)
     axis = torch.where(near_z == enters, 2, (near_y == enters).long())
-    (climb,) = _picked(pixel, ray_up)
+    (climb,) = _pick(pixel, ray_up)
     level = camera.mount_height + enters * climb
     glass = (axis < 2) & (level > WINDOWS[0]) & (level < WINDOWS[1])
     colour = _faces(boxes, origin, light, colours).index_select(0, (box * 3 + axis) * 2 + glass)
@@ -226,7 +226,7 @@ def paint(image: Tensor, boxes: Boxes, light: Light, camera: Camera, seen: Pixel
 
 
 def _faces(boxes: Boxes, origin: tuple[Tensor, Tensor], light: Light, colours: Tensor) -> Tensor:
-    """Colours that the faces of boxes show to the camera: front or rear, a side and the roof, body and windows.
+    """Return the colours of the faces that a camera sees: front or rear, a side and the roof, body and windows.
 
     Args:
         boxes: N boxes in T pictures.
@@ -238,7 +238,7 @@ def _faces(boxes: Boxes, origin: tuple[Tensor, Tensor], light: Light, colours: T
         Shape (T N 3 2, 3).
     """
     sun_forward, sun_right, sun_up = light.sun[:, :, None].unbind(1)
-    along, across = _turned(sun_forward, sun_right, boxes.cos, boxes.sin)
+    along, across = _to_box_frame(sun_forward, sun_right, boxes.cos, boxes.sin)
     facing = torch.stack((along * origin[0].sign(), across * origin[1].sign(), sun_up.expand_as(along)), dim=-1)
     bright = light.diffuse[:, None, None] + light.direct[:, None, None] * facing.clamp(min=0.0)
     paints = torch.stack((colours, colours.new_tensor(GLASS).expand_as(colours)), dim=1)

@@ -1,6 +1,6 @@
-"""Weather: what changes what a camera sees, as parameters of a scenario with their base law.
+"""Weather: conditions of a camera's pictures, as parameters of a scenario with their base distributions.
 
-The law is assembled from published statistics and definitions, not fitted; `docs/camera.md` gives the reasons.
+They are assembled from published statistics and definitions, not fitted; `docs/camera.md` gives the reasons.
 """
 
 import math
@@ -33,7 +33,7 @@ class LogNormalDistribution:
     dim: ClassVar[int] = 1
 
     @cached_property
-    def _law(self) -> LogMixture:
+    def _log_mixture(self) -> LogMixture:
         return LogMixture.from_dict(
             {
                 "weights": [1.0],
@@ -47,27 +47,27 @@ class LogNormalDistribution:
 
     @property
     def mixture(self) -> TruncatedGaussianMixture:
-        """The law of the logarithm."""
-        return self._law.mixture
+        """Distribution of the logarithm."""
+        return self._log_mixture.mixture
 
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
-        """Independent points, shape (n, 1)."""
-        return self._law.sample(n, rng)
+        """Draw independent points, shape (n, 1)."""
+        return self._log_mixture.sample(n, rng)
 
     def log_prob(self, x: FloatArray) -> FloatArray:
-        """Log density, (n, 1) -> (n,); -inf outside the range."""
-        return self._law.log_prob(x)
+        """Return the log density, (n, 1) -> (n,); -inf outside the range."""
+        return self._log_mixture.log_prob(x)
 
     def to_standard_normal(self, x: FloatArray) -> FloatArray:
-        """Map (n, 1) -> (n, 1)."""
-        return self._law.to_standard_normal(x)
+        """Map to standard normal space, (n, 1) -> (n, 1)."""
+        return self._log_mixture.to_standard_normal(x)
 
     def from_standard_normal(self, u: FloatArray) -> FloatArray:
-        """Inverse of `to_standard_normal`, (n, 1) -> (n, 1)."""
-        return self._law.from_standard_normal(u)
+        """Map from standard normal space, (n, 1) -> (n, 1)."""
+        return self._log_mixture.from_standard_normal(u)
 
     def project(self, x: FloatArray, weights: FloatArray, alpha: float) -> "LogNormalDistribution":
-        """The law with its median moved towards that of weighted points, by the part alpha of the way in logarithms."""
+        """Return it with the median moved towards that of weighted points, by alpha of the way in logarithms."""
         logs = np.log(np.clip(x[:, 0], self.low, self.high))
         wanted = float(np.sum(weights * logs) / np.sum(weights))
         return LogNormalDistribution(
@@ -75,12 +75,12 @@ class LogNormalDistribution:
         )
 
     def widen(self, factor: float) -> "LogNormalDistribution":
-        """The law with a spread larger by a factor."""
+        """Return it with a spread larger by a factor."""
         return LogNormalDistribution(self.median, self.spread * factor, self.low, self.high)
 
 
 class WeatherBeta(BetaDistribution):
-    """Independent Beta laws; a cross-entropy search keeps their shape parameters from 1 to 7."""
+    """Independent Beta variables; a cross-entropy search keeps their shape parameters from 1 to 7."""
 
     box: ClassVar[tuple[float, float]] = (1.0, 7.0)
 
@@ -102,7 +102,7 @@ SENSOR_NOISE_DISTRIBUTION = WeatherBeta(*map(np.array, ([2.0], [5.0], [0.0], [10
 
 
 def weather_parameters(noisy: bool) -> Iterator[tuple[tuple[Parameter, ...], Distribution]]:
-    """Parameters of the weather with their laws, in the order of x.
+    """Yield parameters of the weather with their distributions, in the order of x.
 
     Args:
         noisy: Whether the camera has noise.
@@ -114,7 +114,13 @@ def weather_parameters(noisy: bool) -> Iterator[tuple[tuple[Parameter, ...], Dis
 
 
 class Weather(NamedTuple):
-    """The weather of B scenarios, and the noise of their cameras; shapes (B,)."""
+    """The weather of B scenarios, and the noise of their cameras; shapes (B,).
+
+    Example:
+        >>> fog = Weather(*(torch.full((2,), value) for value in (0.03, 0.5, 1.0, 0.0)), key=torch.zeros(2).long())
+        >>> (3.0 / fog.fog).round().tolist()  # visibility [m]
+        [100.0, 100.0]
+    """
 
     fog: Tensor
     """Extinction coefficient of the air [1/m]."""
@@ -133,13 +139,18 @@ CLEAR = (1.5e-4, math.radians(45.0), math.radians(120.0))
 
 
 def clear_day(like: Tensor) -> Weather:
-    """The weather without weather, for the B rows of a tensor; no noise."""
+    """Return the weather of a clear day without sensor noise, for the B rows of a tensor.
+
+    Example:
+        >>> round(3.0 / clear_day(torch.zeros(1, 3)).fog.item())  # visibility [m]
+        20000
+    """
     fog, elevation, azimuth = (like.new_full((len(like),), value) for value in CLEAR)
     return Weather(fog, elevation, azimuth, torch.zeros_like(fog), _keys(fog[:, None]))
 
 
 def read_weather(x: Tensor, key: Tensor) -> Weather:
-    """Weather from columns of x.
+    """Return the weather in columns of x.
 
     Args:
         x: Fog, elevation and azimuth [deg], and the noise if there is any; shape (B, 3) or (B, 4).
@@ -152,15 +163,23 @@ def read_weather(x: Tensor, key: Tensor) -> Weather:
 
 
 def _keys(column: Tensor) -> Tensor:
-    """The bits of single-precision numbers (B, 1), as int64 of shape (B,)."""
+    """Return the bits of single-precision numbers (B, 1), as int64 of shape (B,)."""
     return column[:, 0].float().contiguous().view(torch.int32).to(torch.int64)
 
 
 class CameraContext(NamedTuple):
-    """What a camera's picture depends on beside the traffic."""
+    """Camera, weather and time: all that pictures depend on beside the traffic.
+
+    Example:
+        >>> context = CameraContext.at_start(Camera(), clear_day(torch.zeros(2, 3)))
+        >>> context.later().tick.tolist()
+        [1, 1]
+    """
 
     camera: Camera
+    """The camera."""
     weather: Weather
+    """Of B scenarios."""
     tick: Tensor
     """Ticks since the start of the episode, int64, shape (B,)."""
     viewer: int = 0
@@ -168,9 +187,9 @@ class CameraContext(NamedTuple):
 
     @classmethod
     def at_start(cls, camera: Camera, weather: Weather) -> "CameraContext":
-        """At time 0."""
+        """Return the context at time 0."""
         return cls(camera, weather, torch.zeros_like(weather.key))
 
     def later(self) -> "CameraContext":
-        """One tick later."""
+        """Return the context one tick later."""
         return self._replace(tick=self.tick + 1)

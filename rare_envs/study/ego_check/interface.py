@@ -11,7 +11,7 @@ from agents.sb3.saved_ego import SavedEgo
 from rare_envs.arrays import AnyArray
 from rare_envs.egos.errors import reason_of
 from rare_envs.egos.wrappers import find_frame_stacking
-from rare_envs.sensors.kinds import each
+from rare_envs.sensors.kinds import map_kinds
 from rare_envs.study.ego_check.findings import Finding, report_failure, report_pass, report_warning
 from rare_envs.study.ego_check.probe import BATCH_ROWS, Probe
 
@@ -145,8 +145,8 @@ def check_extreme_observations(probe: Probe) -> Iterator[Finding]:
     boxes = dict(space.spaces) if isinstance(space, spaces.Dict) else space
     cases = {
         "zeros": probe.transform_seen(np.zeros_like),
-        "the lower end": each(lambda part, box: _fill_with_bound(box.low, -1.0, part), probe.seen, boxes),
-        "the upper end": each(lambda part, box: _fill_with_bound(box.high, 1.0, part), probe.seen, boxes),
+        "the lower end": map_kinds(lambda part, box: _fill_with_bound(box.low, -1.0, part), probe.seen, boxes),
+        "the upper end": map_kinds(lambda part, box: _fill_with_bound(box.high, 1.0, part), probe.seen, boxes),
     }
     bad = []
     for name, case in cases.items():
@@ -166,7 +166,7 @@ def check_extreme_observations(probe: Probe) -> Iterator[Finding]:
     if not isinstance(probe.seen, dict) and probe.seen.dtype == np.uint8:
         return
     try:
-        action, _ = probe.query(each(lambda part: part if part.dtype == np.uint8 else part * np.nan, probe.seen))
+        action, _ = probe.query(map_kinds(lambda part: part if part.dtype == np.uint8 else part * np.nan, probe.seen))
         finite = bool(np.isfinite(action).all())
         yield report_pass(
             "NaN", "answered by numbers; the environment never gives NaN" if finite else "answered by NaN"

@@ -13,7 +13,7 @@ from gymnasium import spaces
 from rare_envs import DrivingProblem
 from rare_envs.arrays import AnyArray
 from rare_envs.egos.policy import PolicyDriver
-from rare_envs.sensors.kinds import batch_size, each
+from rare_envs.sensors.kinds import batch_size, map_kinds
 from rare_envs.simulation.observation import observe
 from rare_envs.simulation.rollout import drive
 
@@ -36,7 +36,7 @@ class Probe:
         x = problem.base.sample(BATCH_ROWS, np.random.default_rng(0))
         with torch.inference_mode():
             start = next(drive(problem.world, problem.driver, torch.from_numpy(x).float()))
-            seen = each(torch.Tensor.numpy, observe(start, problem.world.sensing.observation))
+            seen = map_kinds(torch.Tensor.numpy, observe(start, problem.world.sensing.observation))
         return cls(ego, problem, seen)
 
     @property
@@ -46,7 +46,7 @@ class Probe:
 
     def transform_seen(self, change: Callable[[AnyArray], Any]) -> Any:
         """Return the observations after a function, each of its own type."""
-        return each(lambda part: np.asarray(change(part)).astype(part.dtype), self.seen)
+        return map_kinds(lambda part: np.asarray(change(part)).astype(part.dtype), self.seen)
 
     def repeat_seen(self, size: int) -> Any:
         """Return as many observations as `size`, repeating those that there are."""
@@ -61,7 +61,7 @@ class Probe:
         """Return the actions as numbers, and the memory."""
         begun = np.full(batch_size(observation), state is None) if start is None else start
         action, state = self.policy.predict(
-            each(np.copy, observation), state=state, episode_start=begun, deterministic=True
+            map_kinds(np.copy, observation), state=state, episode_start=begun, deterministic=True
         )
         return np.asarray(action), state
 

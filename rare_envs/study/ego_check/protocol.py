@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 
 from rare_envs.egos.errors import EgoGone, reason_of
-from rare_envs.sensors.kinds import each
+from rare_envs.sensors.kinds import map_kinds
 from rare_envs.study.ego_check.findings import Finding, report_failure, report_pass
 
 PROTOCOL_ADVICE = "docs/remote.md has the protocol"
@@ -65,7 +65,7 @@ def _protocol_cases(hello: Any) -> dict[str, Callable[[str, Any], Iterator[Findi
         from agents.remote import protocol
 
         parts = dict(space.spaces) if isinstance(space, spaces.Dict) else space
-        blank = each(lambda part: np.zeros((rows, *part.shape), part.dtype), parts)
+        blank = map_kinds(lambda part: np.zeros((rows, *part.shape), part.dtype), parts)
         return {"type": "act", "session": session, "step": step, "observation": protocol.pack_observation(blank)}
 
     def expect(kind: str, *messages: Any) -> Callable[[str, Any], Iterator[Finding]]:

@@ -17,7 +17,7 @@ from benchmarks.simulation.highway_env_scene import HighwayEnvScene
 from rare_envs.control.actions import FASTER, IDLE, LANE_LEFT, LANE_RIGHT, SLOWER
 from rare_envs.control.meta_actions import TARGET_SPEEDS, follow_meta_actions, initial_aim
 from rare_envs.make import set_up
-from rare_envs.sensors.kinematics import kinematics
+from rare_envs.sensors.kinematics import observe_kinematics
 from rare_envs.traffic.road import i80, straight
 from rare_envs.traffic.state import State
 from rare_envs.traffic.vehicle_models import bicycle
@@ -54,7 +54,7 @@ def random_traffic(rng: np.random.Generator, vehicles: int, lanes: int) -> Array
 def drive_by_hand(tracks: Array, lanes: int, decisions: list[int], ego: int) -> tuple[Array, Array]:
     """Motion of one vehicle (T + 1, 4) and its observations (6, 5, 5) by the functions alone."""
     road, state = straight(lanes), state_of(tracks[0])
-    aim, motion, seen = initial_aim(state, road), [tracks[0, ego]], [kinematics(state, road, ego)]
+    aim, motion, seen = initial_aim(state, road), [tracks[0, ego]], [observe_kinematics(state, road, ego)]
     obeys = torch.zeros_like(state.x, dtype=torch.bool)
     obeys[:, ego] = True
     for tick in range(TICKS):
@@ -68,7 +68,7 @@ def drive_by_hand(tracks: Array, lanes: int, decisions: list[int], ego: int) -> 
         state = state_of(traffic)
         motion.append(traffic[ego])
         if tick % 10 == 9:
-            seen.append(kinematics(state, road, ego))
+            seen.append(observe_kinematics(state, road, ego))
     return np.array(motion), torch.cat(seen).numpy()
 
 
@@ -112,7 +112,7 @@ def test_our_scenarios_are_highway_envs_until_contact(env_id: str) -> None:
         theirs = [scene.observe(), *(scene.step(int(a)) for a in decisions[row, :seconds])]
         for second, observed in enumerate(theirs):
             episode = episodes[10 * second]
-            ours = kinematics(episode.state, episode.road)[row].numpy()
+            ours = observe_kinematics(episode.state, episode.road)[row].numpy()
             np.testing.assert_allclose(ours, observed, atol=TOLERANCE, rtol=0)
         np.testing.assert_allclose(tracks[: 10 * seconds + 1, 0], scene.states, atol=TOLERANCE, rtol=0)
         compared += seconds

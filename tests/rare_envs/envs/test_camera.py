@@ -18,7 +18,7 @@ from rare_envs.egos.wrappers import find_frame_stacking
 from rare_envs.envs.multi_agent_vector import AgentsVectorEnv
 from rare_envs.problem import CAMERA_TILE
 from rare_envs.sensors.camera import Camera
-from rare_envs.sensors.kinds import each, read_kinds
+from rare_envs.sensors.kinds import map_kinds, read_kinds
 from training import sb3_vec_env
 
 CUT_IN = "rare_envs/CutIn-v0"
@@ -59,7 +59,7 @@ def test_env_and_batch_see_the_same(env_id: str) -> None:
     seen, _ = batch.reset(options={"x": infos["x"]})
     rows = [env.reset(options={"x": x})[0] for x in infos["x"]]
     for row in range(3):
-        each(np.testing.assert_array_equal, rows[row], each(lambda part, row=row: part[row], seen))
+        map_kinds(np.testing.assert_array_equal, rows[row], map_kinds(lambda part, row=row: part[row], seen))
     env.reset(options={"x": infos["x"][1]})
     for _ in range(4):
         action = np.array([0.3, 0.05])
@@ -179,13 +179,13 @@ def test_a_batch_of_agents_that_see() -> None:
     assert batch.observation_space.contains(seen)
     alone, _ = env.reset(options={"x": x[1]})
     for number, agent in enumerate(env.agents):
-        each(np.testing.assert_array_equal, each(lambda part, row=3 + number: part[row], seen), alone[agent])
+        map_kinds(np.testing.assert_array_equal, map_kinds(lambda part, row=3 + number: part[row], seen), alone[agent])
     for _ in range(2):
         seen, _, _, truncated, infos = batch.step(np.zeros((batch.num_envs, 2)))
         alone, *_ = env.step(dict.fromkeys(env.agents, np.zeros(2)))
     assert truncated.all()
     for number, agent in enumerate(env.possible_agents):
-        each(np.testing.assert_array_equal, infos["final_obs"][3 + number], alone[agent])
+        map_kinds(np.testing.assert_array_equal, infos["final_obs"][3 + number], alone[agent])
 
 
 def test_a_network_that_does_not_transpose_is_not_taken_for_one_that_does() -> None:

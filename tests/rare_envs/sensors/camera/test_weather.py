@@ -19,7 +19,7 @@ from rare_envs.make import build_space
 from rare_envs.scenarios.base_distributions import load_base
 from rare_envs.scenarios.registry import find_scenario
 from rare_envs.sensors.camera import Camera, CameraContext, Weather, take_picture
-from rare_envs.sensors.camera.sensor_noise import grain
+from rare_envs.sensors.camera.sensor_noise import draw_pixel_noise
 from rare_envs.sensors.camera.weather import (
     CONDITIONS,
     FOG_DISTRIBUTION,
@@ -98,9 +98,9 @@ def test_noise_is_white_and_nearly_normal() -> None:
     n, keys = 3 * 66 * 200, torch.tensor([0, 1, 2**30, 1065353216, 1065353217])
     context = CameraContext.at_start(Camera(), Weather(*torch.zeros(4, 5), keys))
     for values in (
-        grain(context, n),
-        grain(context._replace(tick=context.tick + 1), n),
-        grain(context._replace(viewer=3), n),
+        draw_pixel_noise(context, n),
+        draw_pixel_noise(context._replace(tick=context.tick + 1), n),
+        draw_pixel_noise(context._replace(viewer=3), n),
     ):
         assert values.mean(dim=1).abs().max() < 5 / math.sqrt(n)
         assert (values.var(dim=1) - 1).abs().max() < 5 * math.sqrt(2 / n)
@@ -108,7 +108,11 @@ def test_noise_is_white_and_nearly_normal() -> None:
             together = (values[:, lag:] * values[:, :-lag]).mean(dim=1)
             assert together.abs().max() < 5 / math.sqrt(n - lag)
     pairs = torch.cat(
-        [grain(context, n), grain(context._replace(tick=context.tick + 1), n), grain(context._replace(viewer=1), n)]
+        [
+            draw_pixel_noise(context, n),
+            draw_pixel_noise(context._replace(tick=context.tick + 1), n),
+            draw_pixel_noise(context._replace(viewer=1), n),
+        ]
     )
     across = torch.corrcoef(pairs) - torch.eye(len(pairs))
     assert across.abs().max() < 5 / math.sqrt(n)
