@@ -8,26 +8,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from rare_envs import HighwayEnvScenario
 from rare_envs.interop.simulation import make_highway_env
-
-SMALL = {"vehicles_count": 6, "duration": 5}
-
-CONFIGS: dict[str, dict[str, Any] | None] = {
-    "highway-v0": SMALL,
-    "highway-fast-v0": SMALL,
-    "merge-v1": None,
-    "intersection-v2": {"initial_vehicle_count": 4, "duration": 4},
-    "roundabout-v1": None,
-}
-
-
-def scenario(env_id: str, **kwargs: Any) -> Any:
-    return HighwayEnvScenario(make_highway_env(env_id, CONFIGS[env_id]), **kwargs)
-
-
-def others(env: Any) -> list[Any]:
-    return [v for v in env.unwrapped.road.vehicles if v is not env.unwrapped.vehicle]
+from tests.rare_envs.interop.scenes import CONFIGS, others, scenario
 
 
 def read_back(env: Any, env_id: str) -> dict[str, Any]:

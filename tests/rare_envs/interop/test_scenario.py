@@ -10,19 +10,7 @@ from highway_env.vehicle.behavior import IDMVehicle
 
 from rare_envs import HighwayEnvScenario
 from rare_envs.interop.simulation import make_highway_env
-
-SMALL = {"vehicles_count": 6, "duration": 5}
-CONFIGS: dict[str, dict[str, Any] | None] = {
-    "highway-v0": SMALL,
-    "highway-fast-v0": SMALL,
-    "merge-v1": None,
-    "intersection-v2": {"initial_vehicle_count": 4, "duration": 4},
-    "roundabout-v1": None,
-}
-
-
-def scenario(env_id: str, **kwargs: Any) -> Any:
-    return HighwayEnvScenario(make_highway_env(env_id, CONFIGS[env_id]), **kwargs)
+from tests.rare_envs.interop.scenes import CONFIGS, SMALL, scenario
 
 
 @pytest.mark.parametrize("env_id", list(CONFIGS))
