@@ -56,17 +56,6 @@ WITHOUT_EXAMPLE = {
     "rare_envs.highway_env_problem",
     "rare_envs.measures.stl",
     "rare_envs.study.cli.main",
-    "samplers.AdaptiveSubsetSimulation",
-    "samplers.BetaBlock",
-    "samplers.CrossEntropy",
-    "samplers.GaussianBlock",
-    "samplers.ImportanceSampling",
-    "samplers.ImprovedCrossEntropy",
-    "samplers.MixtureBlock",
-    "samplers.MonteCarlo",
-    "samplers.NormalBlock",
-    "samplers.Product",
-    "samplers.SubsetSimulation",
     "samplers.TwoStage",
 }
 """Public names that have no example yet."""

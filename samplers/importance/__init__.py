@@ -1,1 +1,5 @@
-"""Importance sampling from a fixed proposal, and the search for one."""
+"""Importance sampling: weighted draws from a fixed proposal, and the search for a proposal."""
+
+from samplers.importance.draws import Draws, bernstein_bound, weighted_interval
+
+__all__ = ["Draws", "bernstein_bound", "weighted_interval"]

@@ -1,4 +1,4 @@
-"""Estimating p with fresh draws from a fixed proposal.
+"""Importance sampling with fresh draws from a fixed proposal.
 
 References:
     Owen and Zhou, "Safe and effective importance sampling", JASA 95, 2000 (defensive mixtures).
@@ -23,7 +23,7 @@ MOST_FINAL_BATCHES = 100
 
 @dataclass(frozen=True, eq=False)
 class Space:
-    """Where a proposal lives, and the base law there."""
+    """The space of a proposal, and the base distribution there."""
 
     base: ProposalDistribution
     """p0."""
@@ -32,12 +32,12 @@ class Space:
 
     @classmethod
     def standard_normal(cls, inputs: Inputs) -> "Space":
-        """Standard normal space of some inputs."""
+        """Return standard normal space of some inputs."""
         return cls(Gaussian.standard(inputs.dim), inputs.base.from_standard_normal)
 
     @classmethod
     def physical(cls, base: ProposalDistribution) -> "Space":
-        """Physical space, where `base` is the law of x."""
+        """Return physical space, where `base` is the distribution of x."""
         return cls(base, np.asarray)
 
 
@@ -49,7 +49,7 @@ def simulate_draws(
     rng: np.random.Generator,
     space: Space | None = None,
 ) -> Generator[FloatArray, FloatArray, Draws]:
-    """Simulate n draws from `sampler`, a law in `space` (None: standard normal space), in one batch."""
+    """Simulate n draws from `sampler`, a distribution in `space` (None: standard normal space), in one batch."""
     space = space or Space.standard_normal(inputs)
     u = sampler.sample(n, rng)
     x = space.to_x(u)
@@ -102,7 +102,7 @@ def defensive_mixture(
     base_share: float,
     wide_share: float,
 ) -> Mixture:
-    """Return base_share of the base law + wide_share (may be 0) of a widened proposal + the rest proposal.
+    """Return base_share of the base distribution + wide_share (may be 0) of a widened proposal + the rest proposal.
 
     Its density is at least base_share of the base, so that no weight exceeds 1 / base_share.
     """

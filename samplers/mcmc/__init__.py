@@ -1,1 +1,5 @@
-"""Markov chains: kernels that leave a conditioned distribution invariant, and the chains they drive."""
+"""Markov chains: kernels that leave a conditioned distribution invariant, and the chains that they move."""
+
+from samplers.mcmc.kernels import FixedMetropolis, Kernel, ScaledKernel
+
+__all__ = ["FixedMetropolis", "Kernel", "ScaledKernel"]

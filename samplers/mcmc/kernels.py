@@ -1,7 +1,7 @@
 """Markov kernels in standard normal space that stay inside {f <= level}.
 
 A kernel proposes candidates that leave N(0, I) invariant; a candidate is taken if its outcome is <= level
-(`accept_candidates`), which makes N(0, I) given f <= level the invariant law.
+(`accept_candidates`), which makes N(0, I) given f <= level the invariant distribution.
 
 References:
     Au and Beck, "Estimation of small failure probabilities in high dimensions by subset simulation",
@@ -22,7 +22,7 @@ from samplers.problem import FloatArray
 
 
 class Step(NamedTuple):
-    """Where a set of chains stands after one move."""
+    """A set of chains after one move."""
 
     u: FloatArray
     """Points, shape (n, d)."""
@@ -33,7 +33,14 @@ class Step(NamedTuple):
 
 
 class Kernel(Protocol):
-    """How the chains of a level move."""
+    """Proposal of the moves of a level's chains, with its adaptation.
+
+    Example:
+        >>> import numpy as np
+        >>> kernel: Kernel = ScaledKernel("conditional", "unit", 0.6, 0.44, deviations=np.ones(2))
+        >>> kernel.start_level(np.zeros((3, 2))).propose(np.zeros((3, 2)), np.random.default_rng(0)).shape
+        (3, 2)
+    """
 
     def start_level(self, seeds: FloatArray) -> "Kernel":
         """Return the kernel for a level whose chains start at these points (n, d)."""
@@ -47,11 +54,20 @@ class Kernel(Protocol):
 
 @dataclass(frozen=True)
 class FixedMetropolis:
-    """Component-wise Metropolis whose spread never changes (Au and Beck)."""
+    """Component-wise Metropolis whose spread never changes (Au and Beck).
+
+    Example:
+        >>> import numpy as np
+        >>> kernel, rng = FixedMetropolis(spread=1.0, distribution="uniform"), np.random.default_rng(0)
+        >>> moved = kernel.propose(np.zeros((1000, 2)), rng)
+        >>> bool((np.abs(moved) <= 1.0).all()), bool((moved == 0).any())  # some components stay
+        (True, True)
+    """
 
     spread: float
     """Half-width of the uniform or standard deviation of the normal steps."""
-    law: Literal["uniform", "normal"]
+    distribution: Literal["uniform", "normal"]
+    """Of the steps of a component."""
 
     def start_level(self, seeds: FloatArray) -> "FixedMetropolis":
         """Return itself."""
@@ -59,7 +75,7 @@ class FixedMetropolis:
 
     def propose(self, u: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Propose a move from each of the points u (n, d)."""
-        unit = rng.uniform(-1, 1, u.shape) if self.law == "uniform" else rng.standard_normal(u.shape)
+        unit = rng.uniform(-1, 1, u.shape) if self.distribution == "uniform" else rng.standard_normal(u.shape)
         return metropolis_candidates(u, self.spread * unit, rng)
 
     def adapt(self, acceptance: float, iteration: int) -> "FixedMetropolis":
@@ -69,7 +85,17 @@ class FixedMetropolis:
 
 @dataclass(frozen=True, eq=False)
 class ScaledKernel:
-    """Conditional sampling or component-wise Metropolis with an adaptive scale (Tian et al. 2024)."""
+    """Conditional sampling or component-wise Metropolis with an adaptive scale (Tian et al. 2024).
+
+    Example:
+        >>> import numpy as np
+        >>> kernel = ScaledKernel("conditional", "unit", scale=0.6, target=0.44, deviations=np.ones(2))
+        >>> round(kernel.adapt(acceptance=0.24, iteration=4).scale, 3)  # 0.6 exp((0.24 - 0.44) / 2)
+        0.543
+        >>> u = kernel.propose(np.random.default_rng(0).standard_normal((10_000, 2)), np.random.default_rng(1))
+        >>> round(float(u.std()), 1)  # leaves N(0, I) invariant
+        1.0
+    """
 
     proposal: Literal["conditional", "metropolis"]
     sigma0: Literal["unit", "seeds"]
@@ -106,7 +132,7 @@ def metropolis_candidates(u: FloatArray, steps: FloatArray, rng: np.random.Gener
 
     Args:
         u: Present points, shape (n, d).
-        steps: Draws of a law symmetric about 0, shape (n, d).
+        steps: Draws of a distribution symmetric about 0, shape (n, d).
         rng: Source of randomness.
     """
     moved = u + steps
@@ -130,7 +156,7 @@ def conditional_proposal(u: FloatArray, sigma: FloatArray, rng: np.random.Genera
 
 
 def accept_candidates(u: FloatArray, f: FloatArray, proposal: FloatArray, f_proposal: FloatArray, level: float) -> Step:
-    """Return where the chains stand: at the proposal if its outcome is <= level, else where they were.
+    """Return the chains after a move: at the proposal if its outcome is <= level, else where they were.
 
     A chain that stays keeps its stored outcome, so the kernel is also right for an f with noise of
     its own: on (point, noise) together it is exact.

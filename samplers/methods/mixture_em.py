@@ -12,7 +12,7 @@ from samplers.proposals.mixture import Mixture, ProposalDistribution
 
 
 class WidenableDistribution(ProposalDistribution, Protocol):
-    """A law that a mixture is made of."""
+    """A component of a mixture that can be widened."""
 
     def widen(self, factor: float) -> "WidenableDistribution":
         """Return the same, more spread out by about this factor."""

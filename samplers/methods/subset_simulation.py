@@ -44,13 +44,20 @@ class SubsetSimulation(Method):
     Args:
         n: Points per level, N. (Tian et al. have 500.)
         p0: Wanted conditional probability of each level.
-        law: Steps of the components: "uniform" as Au and Beck, "normal" as Tian et al.
-        spread: Half-width of the uniform, standard deviation of the normal law.
+        law: Distribution of a component's steps: "uniform" as Au and Beck, "normal" as Tian et al.
+        spread: Half-width of the uniform, standard deviation of the normal distribution.
         max_levels: Levels after which the method gives up.
 
     References:
         Au and Beck, "Estimation of small failure probabilities in high dimensions by subset
         simulation", Probabilistic Engineering Mechanics 16, 2001.
+
+    Example:
+        >>> import samplers
+        >>> problem = samplers.FunctionProblem(lambda u: 3.5 - u.sum(axis=1) / 10**0.5, dim=10)  # P = 2.33e-4
+        >>> result = samplers.estimate(problem, samplers.SubsetSimulation(n=500), seed=0)
+        >>> result.interval[0] < 2.326e-4 < result.interval[1], len(result.trace), result.n_sim < 2000
+        (True, 4, True)
     """
 
     n: int = 1000
@@ -74,7 +81,7 @@ class SubsetSimulation(Method):
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Go from level to level until the share of failures among its points is p0 or more."""
         descent = SubsetLevels(n=self.n, p0=self.p0, max_levels=self.max_levels)
-        return (yield from descent.steps(inputs, goal, rng, FixedMetropolis(self.spread, self.law)))
+        return (yield from descent.steps(inputs, goal, rng, FixedMetropolis(self.spread, distribution=self.law)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,7 +100,7 @@ class AdaptiveSubsetSimulation(Method):
       19, 20); the code draws the conditional (AR-1) proposal rho u + sigma xi, rho^2 = 1 - sigma^2,
       and has no ratio. Only one of the two is right at a time. The AR-1 proposal leaves N(0, 1)
       invariant on its own (its own Metropolis ratio is 1 everywhere); with r on top the invariant
-      law would be phi^2, N(0, 1/2), and p far too small. The ratio r is exact for a symmetric step
+      distribution would be phi^2, N(0, 1/2), and p far too small. The ratio r is exact for a symmetric step
       u + sigma xi. So "conditional" is the code's reading and "metropolis" the printed one with the
       step that it is right for. The default is "conditional": no component ever stays, so every
       candidate is new. A level of 1000 points is then worth 381 independent ones against 299 in 2
@@ -139,6 +146,15 @@ class AdaptiveSubsetSimulation(Method):
         Papaioannou, Betz, Zwirglmaier and Straub, "MCMC algorithms for subset simulation",
         Probabilistic Engineering Mechanics 41, 2015.
         Lee and Whiteley, "Variance estimation in the particle filter", Biometrika 105, 2018.
+
+    Example:
+        >>> import samplers
+        >>> problem = samplers.FunctionProblem(lambda u: 3.5 - u.sum(axis=1) / 10**0.5, dim=10)  # P = 2.33e-4
+        >>> result = samplers.estimate(problem, samplers.AdaptiveSubsetSimulation(), seed=0)
+        >>> result.interval[0] < 2.326e-4 < result.interval[1], result.n_sim
+        (True, 3700)
+        >>> [f"{level.gamma:.2f}" for level in result.trace]  # thresholds b_1, b_2, ... down to gamma
+        ['2.17', '1.15', '0.34', '0.00']
     """
 
     n: int = 1000

@@ -1,5 +1,26 @@
-"""Proposal distributions: Gaussians, mixtures, the von Mises-Fisher-Nakagami distribution."""
+"""Proposal distributions: Gaussians, mixtures, components for failure regions, von Mises-Fisher-Nakagami."""
 
-from samplers.proposals.gaussian import Gaussian
+from samplers.proposals.components import (
+    HalfSpaceNormal,
+    IsotropicNormal,
+    MixtureComponent,
+    RadialLaw,
+    SubspaceGaussian,
+)
+from samplers.proposals.gaussian import Gaussian, TiltedNormal
+from samplers.proposals.mixture import GaussianMixture, Mixture, ProposalDistribution
+from samplers.proposals.von_mises_fisher import VonMisesFisherNakagami
 
-__all__ = ["Gaussian"]
+__all__ = [
+    "Gaussian",
+    "GaussianMixture",
+    "HalfSpaceNormal",
+    "IsotropicNormal",
+    "Mixture",
+    "MixtureComponent",
+    "ProposalDistribution",
+    "RadialLaw",
+    "SubspaceGaussian",
+    "TiltedNormal",
+    "VonMisesFisherNakagami",
+]

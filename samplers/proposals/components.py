@@ -1,7 +1,7 @@
-"""What the proposals of `TwoStage` are mixed from, each described by its ratio to N(0, I).
+"""Components of proposal mixtures in standard normal space, each with its density ratio to N(0, I).
 
-All live in standard normal space. Where a component is N(0, I) in most directions, its ratio needs the few others
-only, which keeps weights exact and cheap in hundreds of dimensions.
+Where a component is N(0, I) in most directions, its ratio depends on the few others only, which keeps weights exact
+and cheap in hundreds of dimensions.
 """
 
 import math
@@ -17,10 +17,17 @@ from samplers.problem import FloatArray
 
 
 class MixtureComponent(Protocol):
-    """A law in standard normal space."""
+    """A distribution in standard normal space with a known density ratio to N(0, I).
+
+    Example:
+        >>> import numpy as np
+        >>> base: MixtureComponent = IsotropicNormal(dim=2)
+        >>> base.log_ratio(np.array([[1.0, 2.0]]))  # N(0, I) itself
+        array([0.])
+    """
 
     def log_ratio(self, u: FloatArray) -> FloatArray:
-        """Log of its density over that of N(0, I) at u (n, d), shape (n,); -inf where it has none."""
+        """Return log(q / phi) at u (n, d), shape (n,); -inf where the density q is 0."""
 
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw n independent points, shape (n, d)."""
@@ -28,13 +35,19 @@ class MixtureComponent(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class IsotropicNormal:
-    """N(0, scale^2 I); the base law where scale is 1."""
+    """N(0, scale^2 I); the base distribution where scale is 1.
+
+    Example:
+        >>> import numpy as np
+        >>> IsotropicNormal(dim=2, scale=2.0).log_ratio(np.zeros((1, 2))).round(4)  # -2 log 2
+        array([-1.3863])
+    """
 
     dim: int
     scale: float = 1.0
 
     def log_ratio(self, u: FloatArray) -> FloatArray:
-        """0.5 |u|^2 (1 - scale^-2) - d log(scale)."""
+        """Return 0.5 |u|^2 (1 - scale^-2) - d log(scale)."""
         square = np.einsum("ij,ij->i", u, u)
         return np.asarray(0.5 * square * (1 - self.scale**-2) - self.dim * math.log(self.scale))
 
@@ -45,7 +58,17 @@ class IsotropicNormal:
 
 @dataclass(frozen=True, eq=False)
 class SubspaceGaussian:
-    """Independent Gaussians along some orthonormal axes, N(0, 1) in every direction outside their span."""
+    """Independent Gaussians along some orthonormal axes, N(0, 1) in every direction outside their span.
+
+    Example:
+        >>> import numpy as np
+        >>> component = SubspaceGaussian(np.eye(100)[:, :1], mean=np.array([3.0]), variance=np.array([0.1]))
+        >>> u = component.sample(1000, np.random.default_rng(0))
+        >>> u.shape, round(float(u[:, 0].mean()), 1), round(float(u[:, 1:].std()), 1)
+        ((1000, 100), 3.0, 1.0)
+        >>> component.centre[:3]
+        array([3., 0., 0.])
+    """
 
     axes: FloatArray
     """Orthonormal columns, shape (d, r)."""
@@ -56,11 +79,11 @@ class SubspaceGaussian:
 
     @property
     def centre(self) -> FloatArray:
-        """Its mean, shape (d,)."""
+        """Mean, shape (d,)."""
         return self.axes @ self.mean
 
     def log_ratio(self, u: FloatArray) -> FloatArray:
-        """Depends on the coordinates along the axes only."""
+        """Return the log ratio; it depends on the coordinates along the axes only."""
         t = u @ self.axes
         terms = t * t - (t - self.mean) ** 2 / self.variance - np.log(self.variance)
         return np.asarray(0.5 * terms.sum(axis=1))
@@ -83,16 +106,25 @@ class SubspaceGaussian:
 
 @dataclass(frozen=True, eq=False)
 class HalfSpaceNormal:
-    """N(0, I) beyond a plane, axis . u >= start; exact for a half-space."""
+    """N(0, I) beyond a plane, axis . u >= start: the optimal proposal for a failure half-space.
+
+    Example:
+        >>> import numpy as np
+        >>> component = HalfSpaceNormal(np.array([1.0, 0.0]), start=3.0)
+        >>> bool((component.sample(100, np.random.default_rng(0))[:, 0] >= 3.0).all())
+        True
+        >>> np.exp(-component.log_ratio(np.array([[4.0, 1.0], [2.0, 0.0]]))).round(5)  # Phi(-3) beyond, else no density
+        array([0.00135,     inf])
+    """
 
     axis: FloatArray
     """Unit vector, shape (d,)."""
     start: float
     across: SubspaceGaussian | None = None
-    """Another law for the directions within the plane; its axes are orthogonal to `axis`."""
+    """Distribution within the plane if it is not N(0, I); its axes are orthogonal to `axis`."""
 
     def log_ratio(self, u: FloatArray) -> FloatArray:
-        """1 / Phi(-start) beyond the plane, none before it."""
+        """Return the logarithm of 1 / Phi(-start) beyond the plane, -inf before it."""
         ratio = np.where(u @ self.axis >= self.start, -float(log_ndtr(-self.start)), -np.inf)
         return ratio if self.across is None else ratio + self.across.log_ratio(u)
 
@@ -105,7 +137,17 @@ class HalfSpaceNormal:
 
 @dataclass(frozen=True, eq=False)
 class RadialLaw:
-    """Every direction alike, |u|^2 = start + Gamma(shape, scale): for failure beyond a radius."""
+    """Uniform directions with |u|^2 = start + Gamma(shape, scale): for failure beyond a radius.
+
+    Example:
+        >>> import numpy as np
+        >>> component = RadialLaw(dim=6, start=25.0, shape=1.0, scale=2.0)
+        >>> u = component.sample(100, np.random.default_rng(0))
+        >>> bool((np.linalg.norm(u, axis=1) > 5.0).all())
+        True
+        >>> component.log_ratio(np.zeros((1, 6)))
+        array([-inf])
+    """
 
     dim: int
     start: float
@@ -113,7 +155,7 @@ class RadialLaw:
     scale: float
 
     def log_ratio(self, u: FloatArray) -> FloatArray:
-        """Ratio of the densities of |u|^2: shifted Gamma over chi-squared with d degrees of freedom."""
+        """Return the log ratio of the densities of |u|^2: shifted Gamma over chi-squared with d degrees of freedom."""
         square = np.einsum("ij,ij->i", u, u)
         beyond = square > self.start
         ratio = np.full(len(u), -np.inf)
@@ -141,7 +183,7 @@ def mixture_log_ratio(log_r: FloatArray, weights: FloatArray) -> FloatArray:
 
 
 def draw_counts(weights: FloatArray, n: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Share n draws among components: n weights_k rounded up or down, n weights_k on average."""
+    """Share n draws among components: n weights_k rounded up or down, n weights_k on average (systematic sampling)."""
     bounds = np.floor(np.cumsum(weights / weights.sum() * n) + rng.random())
     bounds[-1] = n  # but for rounding errors
     return np.diff(np.concatenate([[0.0], np.minimum(bounds, n)])).astype(np.int64)

@@ -1,4 +1,4 @@
-"""Laws to draw from: Gaussians and mixtures, with their densities and moments."""
+"""Gaussians with their densities and moments."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -23,7 +23,7 @@ class Moments(NamedTuple):
         return self.second - np.outer(self.first, self.first)
 
     def mix_with(self, other: "Moments", share: float) -> "Moments":
-        """Return the moments of the mixture of this law, with weight `share`, and another one."""
+        """Return the moments of the mixture of this distribution, with weight `share`, and another one."""
         return Moments(share * self.first + (1 - share) * other.first, share * self.second + (1 - share) * other.second)
 
 
@@ -46,12 +46,12 @@ class Gaussian:
 
     @classmethod
     def standard(cls, dim: int) -> "Gaussian":
-        """N(0, I)."""
+        """Return N(0, I)."""
         return cls(np.zeros(dim), np.eye(dim))
 
     @classmethod
     def from_covariance(cls, mean: FloatArray, covariance: FloatArray) -> "Gaussian":
-        """N(mean (d,), covariance (d, d))."""
+        """Return N(mean, covariance) from a mean (d,) and a positive definite covariance (d, d)."""
         return cls(mean, np.asarray(np.linalg.cholesky(covariance), dtype=np.float64))
 
     @property
@@ -78,7 +78,7 @@ class Gaussian:
         return self.from_standard_normal(rng.standard_normal((n, self.dim)))
 
     def log_prob(self, u: FloatArray) -> FloatArray:
-        """Log density at u (n, d), shape (n,)."""
+        """Return the log density at u (n, d), shape (n,)."""
         z = self.to_standard_normal(u)
         log_det = float(np.log(np.diag(self.cholesky)).sum())
         return np.asarray(-0.5 * np.einsum("ij,ij->i", z, z) - log_det - 0.5 * self.dim * LOG_TWO_PI)
@@ -99,7 +99,15 @@ def weighted_moments(u: FloatArray, weights: FloatArray) -> Moments:
 
 @dataclass(frozen=True, eq=False)
 class TiltedNormal:
-    """N(shift, I), that is N(0, I) tilted by exp(shift' u - |shift|^2 / 2)."""
+    """N(shift, I), that is N(0, I) tilted by exp(shift' u - |shift|^2 / 2).
+
+    Example:
+        >>> import numpy as np
+        >>> tilted = TiltedNormal(np.array([3.0, 0.0]))
+        >>> u = np.array([[3.0, 1.0]])
+        >>> (tilted.log_prob(u) - TiltedNormal(np.zeros(2)).log_prob(u)).round(6)  # shift' u - |shift|^2 / 2
+        array([4.5])
+    """
 
     shift: FloatArray
     """Shape (d,)."""
@@ -109,5 +117,5 @@ class TiltedNormal:
         return self.shift + rng.standard_normal((n, len(self.shift)))
 
     def log_prob(self, u: FloatArray, /) -> FloatArray:
-        """Log density at u (n, d), shape (n,)."""
+        """Return the log density at u (n, d), shape (n,)."""
         return StandardNormal(len(self.shift)).log_prob(u - self.shift)

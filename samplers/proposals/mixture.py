@@ -21,7 +21,15 @@ class SupportsLogProb(Protocol):
 
 
 class ProposalDistribution(SupportsLogProb, Protocol):
-    """A distribution that can be drawn from and whose density is known."""
+    """A distribution that can be drawn from and whose density is known; all that importance sampling needs.
+
+    Example:
+        >>> import numpy as np
+        >>> from samplers.proposals.gaussian import TiltedNormal
+        >>> proposal: ProposalDistribution = TiltedNormal(np.array([3.0]))
+        >>> proposal.sample(5, np.random.default_rng(0)).shape
+        (5, 1)
+    """
 
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw n independent points, shape (n, d)."""
@@ -29,7 +37,18 @@ class ProposalDistribution(SupportsLogProb, Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Mixture:
-    """A mixture of laws."""
+    """A mixture of distributions.
+
+    Example:
+        >>> import numpy as np
+        >>> from samplers.proposals.gaussian import Gaussian
+        >>> left, right = (Gaussian(np.array([mean]), np.eye(1)) for mean in (-4.0, 4.0))
+        >>> mixture = Mixture(np.array([0.25, 0.75]), [left, right])
+        >>> bool(0.2 < (mixture.sample(1000, np.random.default_rng(0)) < 0).mean() < 0.3)
+        True
+        >>> np.exp(mixture.log_prob(np.array([[4.0]]))).round(3)  # 0.75 / sqrt(2 pi)
+        array([0.299])
+    """
 
     weights: FloatArray
     """Shape (k,), adding up to 1."""
@@ -53,7 +72,15 @@ class Mixture:
 
 @dataclass(frozen=True, eq=False)
 class GaussianMixture(Mixture):
-    """A mixture of Gaussians."""
+    """A mixture of Gaussians.
+
+    Example:
+        >>> import numpy as np
+        >>> from samplers.proposals.gaussian import Gaussian
+        >>> mixture = GaussianMixture(np.ones(1), [Gaussian.standard(2)])
+        >>> mixture.widen(1.5).components[0].covariance.diagonal()
+        array([2.25, 2.25])
+    """
 
     components: Sequence[Gaussian]
 

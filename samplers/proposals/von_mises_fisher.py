@@ -1,6 +1,6 @@
-"""The von Mises-Fisher-Nakagami law: a direction and, independent of it, a radius.
+"""The von Mises-Fisher-Nakagami distribution: a direction and, independent of it, a radius.
 
-N(0, I) is one, with every direction alike and a squared radius of chi-square law. d + 3 parameters describe
+N(0, I) is one, with uniform directions and a chi-squared square of the radius. d + 3 parameters describe
 a component where a Gaussian needs d (d + 3) / 2.
 
 References:
@@ -23,13 +23,27 @@ from samplers.problem import LOG_TWO_PI, FloatArray
 LARGEST_RESULTANT = 0.999
 """Mean resultant lengths above this are cut: the concentration would run away on a few close points."""
 LEAST_CONCENTRATION = 1e-3
+"""Stands for 0, where the direction is uniform: the formulae divide by it."""
+LEAST_SHAPE = 0.5
+"""Least m of a Nakagami distribution."""
 LARGEST_SHAPE = 1e4
+"""A radius with a c.o.v. of 0.5 %; points at one radius would give an infinite m."""
 LARGE_ORDER = 50.0
+"""Order of the Bessel function from which on its asymptotic expansion is exact to 1e-9 of its logarithm."""
 
 
 @dataclass(frozen=True, eq=False)
 class VonMisesFisherNakagami:
-    """u = r a with a ~ von Mises-Fisher(mu, kappa) on the unit sphere and r ~ Nakagami(m, omega)."""
+    """u = r a with a ~ von Mises-Fisher(mu, kappa) on the unit sphere and r ~ Nakagami(m, omega).
+
+    Example:
+        >>> import numpy as np
+        >>> towards = VonMisesFisherNakagami(mu=np.eye(50)[0], kappa=200.0, m=25.0, omega=50.0)
+        >>> u = towards.sample(2000, np.random.default_rng(0))
+        >>> radius = np.linalg.norm(u, axis=1)
+        >>> round(float((radius**2).mean())), round(float((u[:, 0] / radius).mean()), 1)  # E[r^2], E[mu' a]
+        (50, 0.9)
+    """
 
     mu: FloatArray
     """Mean direction, of length 1, shape (d,)."""
@@ -47,7 +61,7 @@ class VonMisesFisherNakagami:
 
     @classmethod
     def fit(cls, u: FloatArray, weights: FloatArray) -> "VonMisesFisherNakagami":
-        """Return the law of points u (n, d) under weights (n,): matched mean direction, E[r^2] and E[r^4].
+        """Fit to points u (n, d) with weights (n,): matched mean direction, E[r^2] and E[r^4].
 
         The squared length of the mean direction is on average 1 / n too large (for one without any; n the
         effective number of points), which in many dimensions would be a concentration of its own: it is taken off.
@@ -62,12 +76,12 @@ class VonMisesFisherNakagami:
         square = float(weights @ radius**2)
         spread = float(weights @ (radius**2 - square) ** 2)
         shape = min(square * square / spread, LARGEST_SHAPE) if spread > 0 else LARGEST_SHAPE
-        return cls(mu, concentration(length, dim), max(shape, 0.5), square)
+        return cls(mu, concentration(length, dim), max(shape, LEAST_SHAPE), square)
 
     def widen(self, factor: float) -> "VonMisesFisherNakagami":
         """Return the same with deviations of direction and radius about `factor` times as large."""
         kappa, m = self.kappa / factor**2, self.m / factor**2
-        return VonMisesFisherNakagami(self.mu, max(kappa, LEAST_CONCENTRATION), max(m, 0.5), self.omega)
+        return VonMisesFisherNakagami(self.mu, max(kappa, LEAST_CONCENTRATION), max(m, LEAST_SHAPE), self.omega)
 
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw n independent points, shape (n, d)."""
@@ -75,7 +89,7 @@ class VonMisesFisherNakagami:
         return radius[:, None] * directions(self.mu, self.kappa, n, rng)
 
     def log_prob(self, u: FloatArray, /) -> FloatArray:
-        """Log density at u (n, d), shape (n,)."""
+        """Return the log density at u (n, d), shape (n,)."""
         dim = len(self.mu)
         radius = np.maximum(np.linalg.norm(u, axis=1), np.finfo(np.float64).tiny)
         m, omega = self.m, self.omega
@@ -114,9 +128,9 @@ def log_normaliser(kappa: float, dim: int) -> float:
 
 
 def directions(mu: FloatArray, kappa: float, n: int, rng: np.random.Generator) -> FloatArray:
-    """Draw n directions from the von Mises-Fisher law, shape (n, d)."""
+    """Draw n directions from the von Mises-Fisher distribution, shape (n, d)."""
     if len(mu) == 1:  # two directions
         with_mu = rng.random(n) < 1 / (1 + math.exp(-2 * kappa))
         return np.asarray(np.where(with_mu, mu[0], -mu[0])[:, None])
-    law = stats.vonmises_fisher(mu, kappa)  # type: ignore[arg-type]  # the stubs ask for a whole kappa
-    return np.asarray(law.rvs(n, random_state=rng)).reshape(n, len(mu))
+    distribution = stats.vonmises_fisher(mu, kappa)  # type: ignore[arg-type]  # the stubs ask for a whole kappa
+    return np.asarray(distribution.rvs(n, random_state=rng)).reshape(n, len(mu))

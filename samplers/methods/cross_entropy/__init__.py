@@ -1,1 +1,7 @@
-"""Cross-entropy: the search for a proposal block by block, and the estimate from it."""
+"""Cross-entropy method of O'Kelly et al. 2018, and the blocks of coordinates that it can search by."""
+
+from samplers.methods.cross_entropy.beta_block import BetaBlock
+from samplers.methods.cross_entropy.blocks import GaussianBlock, MixtureBlock, NormalBlock, Product
+from samplers.methods.cross_entropy.method import CrossEntropy
+
+__all__ = ["BetaBlock", "CrossEntropy", "GaussianBlock", "MixtureBlock", "NormalBlock", "Product"]

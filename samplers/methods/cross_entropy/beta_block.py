@@ -1,4 +1,4 @@
-"""Beta laws on intervals, moved with both parameters in a box."""
+"""Beta distributions on intervals, with both parameters in a box."""
 
 import math
 from dataclasses import dataclass, replace
@@ -10,8 +10,9 @@ from samplers.methods.cross_entropy.kl_projection import beta_statistics, projec
 from samplers.problem import FloatArray
 
 PAPERS_BOX = (1.5, 7.0)
-"""Where O'Kelly et al. look for alpha and beta."""
-TINY = float(np.finfo(np.float64).tiny)
+"""Range of alpha and beta in O'Kelly et al. 2018; their released code has [0.5, 5]."""
+SMALLEST = float(np.finfo(np.float64).tiny)
+"""Stands for 0 where the logarithm is taken."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -25,10 +26,19 @@ class BetaBlock:
         beta: Second parameter.
         low: Lower end of the support.
         high: Upper end.
-        box: Bounds of both parameters of every law in the family.
+        box: Bounds of both parameters throughout the family.
 
     Raises:
         ValueError: If a parameter is not in the box, the box not in (0, inf) or low not < high.
+
+    Example:
+        >>> import numpy as np
+        >>> gap = BetaBlock(alpha=2.0, beta=2.0, low=0.0, high=40.0)  # [m]
+        >>> gap.from_standard_normal(np.array([[0.0]]))
+        array([[20.]])
+        >>> near = gap.project(np.array([[2.0], [4.0]]), np.array([0.5, 0.5]), alpha=0.8)
+        >>> near.alpha.round(2), near.beta.round(2)  # towards small gaps
+        (array([1.5]), array([6.31]))
     """
 
     alpha: FloatArray
@@ -58,7 +68,7 @@ class BetaBlock:
 
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw n independent points, shape (n, b)."""
-        return self._scaled(rng.beta(self.alpha, self.beta, size=(n, self.dim)))
+        return self._to_interval(rng.beta(self.alpha, self.beta, size=(n, self.dim)))
 
     def log_prob(self, x: FloatArray, /) -> FloatArray:
         """Log density at x (n, b), shape (n,); -inf outside the support."""
@@ -76,7 +86,7 @@ class BetaBlock:
     def from_standard_normal(self, u: FloatArray, /) -> FloatArray:
         """Inverse of `to_standard_normal`."""
         y = np.where(u < 0, betaincinv(self.alpha, self.beta, ndtr(u)), betainccinv(self.alpha, self.beta, ndtr(-u)))
-        return self._scaled(y)
+        return self._to_interval(y)
 
     def project(self, x: FloatArray, weights: FloatArray, alpha: float) -> "BetaBlock":
         """Return the projection of alpha Q + (1 - alpha) P in the box, see `project_beta`."""
@@ -86,12 +96,12 @@ class BetaBlock:
         return replace(self, alpha=parameters[:, 0], beta=parameters[:, 1])
 
     def widen(self, factor: float) -> "BetaBlock":
-        """Return Beta laws of the same means and `factor` times the standard deviation, as far as the box allows."""
+        """Return the same means with `factor` times the standard deviations, as far as the box allows."""
         total = self.alpha + self.beta  # the variance is mean (1 - mean) / (total + 1)
         shrink = np.maximum((total + 1) / factor**2 - 1, 0.0) / total
         return replace(self, alpha=np.clip(shrink * self.alpha, *self.box), beta=np.clip(shrink * self.beta, *self.box))
 
-    def _scaled(self, y: FloatArray) -> FloatArray:
+    def _to_interval(self, y: FloatArray) -> FloatArray:
         """Return low + (high - low) y, one float inside the support, where the statistics are finite."""
         x = self.low + (self.high - self.low) * y
         return np.clip(x, np.nextafter(self.low, self.high), np.nextafter(self.high, self.low))
@@ -100,7 +110,7 @@ class BetaBlock:
         return np.asarray((x - self.low) / (self.high - self.low))
 
     def _log_y(self, x: FloatArray) -> FloatArray:
-        return np.log(np.maximum(self._y(x), TINY))
+        return np.log(np.maximum(self._y(x), SMALLEST))
 
     def _log_rest(self, x: FloatArray) -> FloatArray:
-        return np.log(np.maximum((self.high - x) / (self.high - self.low), TINY))
+        return np.log(np.maximum((self.high - x) / (self.high - self.low), SMALLEST))

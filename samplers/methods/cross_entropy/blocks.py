@@ -1,8 +1,8 @@
-"""Blocks of coordinates, each with the family in which cross-entropy moves its law, and their product.
+"""Blocks of coordinates, each with the family of distributions that cross-entropy searches, and their product.
 
-Equation 2 of O'Kelly et al. (2018) separates by block: the Kullback-Leibler projection of a law on
-a product of families is the product of the projections of its marginals. A block is a law of the
-base distribution and knows how far a search may take it.
+Equation 2 of O'Kelly et al. (2018) separates by block: the Kullback-Leibler projection of a distribution on
+a product of families is the product of the projections of its marginals. A block is one factor of the
+base distribution; its family limits how far a search may move it.
 
 References:
     O'Kelly, Sinha, Namkoong, Duchi and Tedrake, "Scalable end-to-end autonomous vehicle testing
@@ -10,9 +10,10 @@ References:
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol, TypeVar, cast
+from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
@@ -25,8 +26,9 @@ from samplers.proposals.mixture import GaussianMixture
 from samplers.proposals.shrinkage import shrink_towards_present
 
 
+@runtime_checkable
 class Block(Protocol):
-    """A law of b coordinates and the family in which it may be moved."""
+    """A distribution of b coordinates with the family in which it may be moved."""
 
     @property
     def dim(self) -> int:
@@ -47,11 +49,52 @@ class Block(Protocol):
     def project(self, x: FloatArray, weights: FloatArray, alpha: float) -> "Block":
         """Return the projection of alpha Q + (1 - alpha) P on the family (equation 2).
 
-        P is the block's present law; Q the points x (n, b) with weights (n,) that add up to 1.
+        P is the block's present distribution; Q the points x (n, b) with weights (n,) that add up to 1.
         """
 
     def widen(self, factor: float) -> "Block":
-        """Return a block whose present law has about `factor` times the standard deviations."""
+        """Return a block whose present distribution has about `factor` times the standard deviations."""
+
+
+@runtime_checkable
+class AnnouncesBlocks(Protocol):
+    """A base distribution made of independent blocks."""
+
+    @property
+    def blocks(self) -> Sequence[object]:
+        """The blocks, in the order of the coordinates: `Block`, `BetaParameters` or `NormalParameters`."""
+
+
+@runtime_checkable
+class BetaParameters(Protocol):
+    """Independent coordinates low + (high - low) Beta(alpha, beta), described by a class of another package."""
+
+    alpha: FloatArray
+    beta: FloatArray
+    low: FloatArray
+    high: FloatArray
+
+
+@runtime_checkable
+class HasBox(Protocol):
+    """Parameters of a Beta block that also bound its family, see `BetaBlock`."""
+
+    box: tuple[float, float]
+
+
+@runtime_checkable
+class NormalParameters(Protocol):
+    """A Normal, described by a class of another package."""
+
+    mean: FloatArray
+    covariance: FloatArray
+
+
+@runtime_checkable
+class HasRadius(Protocol):
+    """Parameters of a Normal block that also bound its mean, see `NormalBlock`."""
+
+    radius: float
 
 
 BlockT = TypeVar("BlockT", bound="_FromGaussian")
@@ -59,34 +102,35 @@ BlockT = TypeVar("BlockT", bound="_FromGaussian")
 
 @dataclass(frozen=True, eq=False)
 class _FromGaussian:
-    """What blocks share whose law in the base distribution is a Gaussian."""
+    """Common part of the blocks that are Gaussian in the base distribution."""
 
-    law: Gaussian
+    gaussian: Gaussian
+    """N(mean, L L')."""
 
     @property
     def dim(self) -> int:
         """Number of coordinates b."""
-        return self.law.dim
+        return self.gaussian.dim
 
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw n independent points, shape (n, b)."""
-        return self.law.sample(n, rng)
+        return self.gaussian.sample(n, rng)
 
     def log_prob(self, x: FloatArray, /) -> FloatArray:
         """Log density at x (n, b), shape (n,)."""
-        return self.law.log_prob(x)
+        return self.gaussian.log_prob(x)
 
     def to_standard_normal(self, x: FloatArray, /) -> FloatArray:
         """Return L^-1 (x - mean)."""
-        return self.law.to_standard_normal(x)
+        return self.gaussian.to_standard_normal(x)
 
     def from_standard_normal(self, u: FloatArray, /) -> FloatArray:
         """Return mean + L u."""
-        return self.law.from_standard_normal(u)
+        return self.gaussian.from_standard_normal(u)
 
     def widen(self: BlockT, factor: float) -> BlockT:
         """Return the block with `factor` times the standard deviations."""
-        return replace(self, law=self.law.widen(factor))
+        return replace(self, gaussian=self.gaussian.widen(factor))
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,9 +138,17 @@ class NormalBlock(_FromGaussian):
     """A Normal with fixed covariance whose mean may move in a box |mean - centre|_inf <= radius.
 
     Args:
-        law: The law at present; in the base distribution the one to start from.
+        gaussian: The present Gaussian; in the base distribution the one to start from.
         radius: In the units of x (0.01 in the paper); inf for no box, 0 for a block that stays.
-        centre: Centre of the box; None takes the mean of `law`.
+        centre: Centre of the box; None takes the mean of `gaussian`.
+
+    Example:
+        >>> import numpy as np
+        >>> from samplers.proposals import Gaussian
+        >>> block = NormalBlock(Gaussian.standard(2), radius=0.5)
+        >>> elite = np.array([[3.0, 0.1], [1.0, 0.1]])
+        >>> block.project(elite, np.array([0.5, 0.5]), alpha=1.0).gaussian.mean
+        array([0.5, 0.1])
     """
 
     radius: float = math.inf
@@ -104,10 +156,10 @@ class NormalBlock(_FromGaussian):
 
     def project(self, x: FloatArray, weights: FloatArray, alpha: float) -> "NormalBlock":
         """Return the projection of alpha Q + (1 - alpha) P in the box, see `project_mean`."""
-        centre = self.law.mean if self.centre is None else self.centre
-        target = alpha * (weights @ x) + (1 - alpha) * self.law.mean
-        mean = project_mean(target, centre, self.law.cholesky, self.radius)
-        return replace(self, law=Gaussian(mean, self.law.cholesky), centre=centre)
+        centre = self.gaussian.mean if self.centre is None else self.centre
+        target = alpha * (weights @ x) + (1 - alpha) * self.gaussian.mean
+        mean = project_mean(target, centre, self.gaussian.cholesky, self.radius)
+        return replace(self, gaussian=Gaussian(mean, self.gaussian.cholesky), centre=centre)
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,12 +167,22 @@ class GaussianBlock(_FromGaussian):
     """A Gaussian whose mean and covariance may move: E[x] and E[x x'] are matched.
 
     The covariance is drawn towards the present one, see `shrink_towards_present`.
+
+    Example:
+        Ten points in one place have no covariance; the present one counts as three points.
+
+        >>> import numpy as np
+        >>> from samplers.proposals import Gaussian
+        >>> elite = np.tile([2.0, 1.0], (10, 1))
+        >>> block = GaussianBlock(Gaussian.standard(2)).project(elite, np.full(10, 0.1), alpha=1.0)
+        >>> block.gaussian.mean, block.gaussian.covariance.diagonal().round(3)
+        (array([2., 1.]), array([0.231, 0.231]))
     """
 
     def project(self, x: FloatArray, weights: FloatArray, alpha: float) -> "GaussianBlock":
         """Return the projection of alpha Q + (1 - alpha) P, its covariance pulled back."""
-        target = weighted_moments(x, weights).mix_with(self.law.moments, alpha)
-        return GaussianBlock(shrink_towards_present(target, self.law, 1 / float(weights @ weights)))
+        target = weighted_moments(x, weights).mix_with(self.gaussian.moments, alpha)
+        return GaussianBlock(shrink_towards_present(target, self.gaussian, 1 / float(weights @ weights)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,9 +190,17 @@ class MixtureBlock(_FromGaussian):
     """A mixture of k Gaussians, moved by expectation-maximisation, see `fit_mixture_towards`.
 
     Args:
-        law: The Gaussian of the base distribution.
+        gaussian: The Gaussian of the base distribution.
         k: Number of components at most.
-        mixture: The law at present; None stands for `law`.
+        mixture: The present mixture; None stands for `gaussian`.
+
+    Example:
+        >>> import numpy as np
+        >>> from samplers.proposals import Gaussian
+        >>> elite = np.repeat([[4.0, 0.0], [-4.0, 0.0]], 100, axis=0)
+        >>> block = MixtureBlock(Gaussian.standard(2), k=2).project(elite, np.full(200, 1 / 200), alpha=1.0)
+        >>> sorted(float(component.mean[0].round(2)) for component in block.mixture.components)
+        [-4.0, 4.0]
     """
 
     k: int
@@ -138,7 +208,7 @@ class MixtureBlock(_FromGaussian):
 
     @property
     def _mixture(self) -> GaussianMixture:
-        return GaussianMixture(np.ones(1), (self.law,)) if self.mixture is None else self.mixture
+        return GaussianMixture(np.ones(1), (self.gaussian,)) if self.mixture is None else self.mixture
 
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw n independent points, shape (n, b)."""
@@ -168,6 +238,16 @@ class Product:
 
     Raises:
         ValueError: If there is no block.
+
+    Example:
+        >>> import numpy as np
+        >>> from samplers.proposals import Gaussian
+        >>> gap = BetaBlock(alpha=2.0, beta=2.0, low=1.0, high=40.0)
+        >>> base = Product((gap, NormalBlock(Gaussian.standard(3))))
+        >>> base.dim, base.sample(5, np.random.default_rng(0)).shape
+        (4, (5, 4))
+        >>> base.from_standard_normal(np.zeros((1, 4)))
+        array([[20.5,  0. ,  0. ,  0. ]])
     """
 
     blocks: tuple[Block, ...]
@@ -196,7 +276,7 @@ class Product:
         return np.asarray(self.log_probs(x).sum(axis=0))
 
     def to_standard_normal(self, x: FloatArray, /) -> FloatArray:
-        """Map x ~ this law, shape (n, d), to u ~ N(0, I), shape (n, d)."""
+        """Map x ~ this distribution, shape (n, d), to u ~ N(0, I), shape (n, d)."""
         return np.hstack([b.to_standard_normal(part) for b, part in zip(self.blocks, self._parts(x), strict=True)])
 
     def from_standard_normal(self, u: FloatArray, /) -> FloatArray:
@@ -229,37 +309,37 @@ class Product:
 
 
 def announced_blocks(inputs: Inputs) -> Product:
-    """Return the base law of some inputs as the product of the blocks that it announces.
+    """Return the base distribution of some inputs as the product of the blocks that it announces.
 
     `inputs.base.blocks` holds one entry per block, in the order of the coordinates: a `Block`, or
     any object with the attributes alpha, beta, low and high (and box, if that is not the paper's),
     or with mean and covariance (and radius, if the mean is to stay in a box).
 
     Raises:
-        ValueError: If there are no blocks, one is not as described, or they are not the base law.
+        ValueError: If there are no blocks, one is not as described, or their product is not the base distribution.
     """
-    entries = getattr(inputs.base, "blocks", None)
-    if entries is None:
+    if not isinstance(inputs.base, AnnouncesBlocks):
         raise ValueError(
             f'CrossEntropy: family "blocks" needs a base distribution with an attribute blocks, as Product has; '
             f'{type(inputs.base).__name__} has none. The family "gaussian" works with any.'
         )
-    product = Product(tuple(_as_block(entry) for entry in entries))
+    product = Product(tuple(_as_block(entry) for entry in inputs.base.blocks))
     trial = product.sample(4, np.random.default_rng(0))
     if product.dim != inputs.dim or not np.allclose(product.log_prob(trial), inputs.base.log_prob(trial)):
-        raise ValueError(f"CrossEntropy: the blocks of {type(inputs.base).__name__} are not its law.")
+        raise ValueError(f"CrossEntropy: the blocks of {type(inputs.base).__name__} are not its distribution.")
     return product
 
 
-def _as_block(entry: Any) -> Block:
+def _as_block(entry: object) -> Block:
     """Return the block that an entry describes."""
-    if hasattr(entry, "project"):
-        return cast(Block, entry)
-    if all(hasattr(entry, name) for name in ("alpha", "beta", "low", "high")):
-        box = getattr(entry, "box", PAPERS_BOX)
+    if isinstance(entry, Block):
+        return entry
+    if isinstance(entry, BetaParameters):
+        box = entry.box if isinstance(entry, HasBox) else PAPERS_BOX
         return BetaBlock(alpha=entry.alpha, beta=entry.beta, low=entry.low, high=entry.high, box=box)
-    if hasattr(entry, "mean") and hasattr(entry, "covariance"):
-        return NormalBlock(Gaussian.from_covariance(entry.mean, entry.covariance), getattr(entry, "radius", math.inf))
+    if isinstance(entry, NormalParameters):
+        radius = entry.radius if isinstance(entry, HasRadius) else math.inf
+        return NormalBlock(Gaussian.from_covariance(entry.mean, entry.covariance), radius)
     raise ValueError(
         "CrossEntropy: expected a block with alpha, beta, low and high or with mean and covariance, "
         f"got {type(entry).__name__}."

@@ -1,6 +1,6 @@
 """Kullback-Leibler projections onto exponential families whose parameters lie in a box.
 
-The projection of any law P on a family with sufficient statistic Gamma and log partition
+The projection of any distribution P on a family with sufficient statistic Gamma and log partition
 function A maximises theta' E_P[Gamma] - A(theta): it depends on P through E_P[Gamma] alone
 (O'Kelly et al. 2018, equation 2).
 
@@ -26,6 +26,14 @@ GRADIENT = 1e-10
 """Largest entry of the free gradient at which Newton's iteration ends."""
 
 
+HALVINGS = 40
+"""Of a step at most; 2^-40 of a step is rounding."""
+ARMIJO = 1e-4
+"""Share of the promised rise that a step must reach (Nocedal and Wright, "Numerical Optimization", section 3.1)."""
+ROUNDING = 1e-14
+"""Relative error of the likelihood, in which a rise near the top is lost."""
+
+
 def beta_statistics(alpha: FloatArray, beta: FloatArray) -> FloatArray:
     """Return E[log y] and E[log(1 - y)] for y ~ Beta(alpha, beta), each (m,), as (m, 2): the gradient of log B."""
     together = digamma(alpha + beta)
@@ -33,7 +41,7 @@ def beta_statistics(alpha: FloatArray, beta: FloatArray) -> FloatArray:
 
 
 def project_beta(statistics: FloatArray, low: float, high: float) -> FloatArray:
-    """Return the Beta laws in a box whose likelihood for the given statistics is largest.
+    """Return the Beta distributions in a box whose likelihood for the given statistics is largest.
 
     Maximises (alpha, beta) . statistics - log B(alpha, beta) over low <= alpha, beta <= high, for
     each row on its own, by Newton's method with the exact Hessian: coordinates at a bound whose
@@ -80,11 +88,10 @@ def _line_search(
 
     start = likelihood(theta)
     size = np.ones(len(theta))
-    for _ in range(40):
+    for _ in range(HALVINGS):
         trial = np.clip(theta + size[:, None] * step, low, high)
         promised = (gradient * (trial - theta)).sum(axis=1)
-        # near the top a rise is lost in rounding: allow for it
-        risen = likelihood(trial) - start >= 1e-4 * promised - 1e-14 * np.abs(start)
+        risen = likelihood(trial) - start >= ARMIJO * promised - ROUNDING * np.abs(start)
         if risen.all():
             break
         size = np.where(risen, size, size / 2)
@@ -92,9 +99,9 @@ def _line_search(
 
 
 def project_mean(target: FloatArray, centre: FloatArray, cholesky: FloatArray, radius: float) -> FloatArray:
-    """Return the mean of the Normal with fixed covariance, in a box around `centre`, nearest to a law.
+    """Return the mean of the Normal with fixed covariance, in a box around `centre`, nearest to a distribution.
 
-    Maximises mu' S^-1 m - mu' S^-1 mu / 2 over |mu - centre|_inf <= radius, where m is the law's
+    Maximises mu' S^-1 m - mu' S^-1 mu / 2 over |mu - centre|_inf <= radius, where m is the distribution's
     mean and S = L L' the covariance. A mean inside the box is its own projection and a diagonal S
     clips each coordinate; otherwise a quadratic programme, solved by OSQP through cvxpy.
 

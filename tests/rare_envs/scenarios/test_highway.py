@@ -67,7 +67,7 @@ def test_cross_entropy_finds_the_blocks():
     x = draw(problem, 200)
     weights = np.tile(np.arange(1, 201) / (200 * 201 / 2), (3, 1))
     moved = blocks.project(x, weights, 0.8)
-    change = moved.blocks[1].law.mean - blocks.blocks[1].law.mean
+    change = moved.blocks[1].gaussian.mean - blocks.blocks[1].gaussian.mean
     assert 0 < np.abs(change).max() <= 0.01 + 1e-12
     assert moved.blocks[2] is blocks.blocks[2]
     method = samplers.CrossEntropy(family="blocks", n_iteration=100, max_iterations=2, n_final=100)

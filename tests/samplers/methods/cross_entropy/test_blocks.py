@@ -82,25 +82,27 @@ def test_normal_steps_stay_in_the_box_around_the_base_mean():
     block = NORMAL
     for _ in range(5):
         block = block.project(np.tile(MEAN + 3, (4, 1)), uniform_weights(4), 0.8)
-    np.testing.assert_allclose(np.abs(block.law.mean - MEAN).max(), 0.4)
-    np.testing.assert_array_equal(block.law.cholesky, NORMAL.law.cholesky)
+    np.testing.assert_allclose(np.abs(block.gaussian.mean - MEAN).max(), 0.4)
+    np.testing.assert_array_equal(block.gaussian.cholesky, NORMAL.gaussian.cholesky)
 
 
 def test_a_normal_step_inside_the_box_matches_the_mean():
     moved = NORMAL.project(np.tile(MEAN + 0.1, (4, 1)), uniform_weights(4), 0.5)
-    np.testing.assert_allclose(moved.law.mean, MEAN + 0.05)
+    np.testing.assert_allclose(moved.gaussian.mean, MEAN + 0.05)
 
 
 def test_a_block_of_radius_0_stays():
-    moved = NormalBlock(NORMAL.law, radius=0.0).project(np.ones((4, 3)), uniform_weights(4), 1.0)
-    np.testing.assert_array_equal(moved.law.mean, MEAN)
+    moved = NormalBlock(NORMAL.gaussian, radius=0.0).project(np.ones((4, 3)), uniform_weights(4), 1.0)
+    np.testing.assert_array_equal(moved.gaussian.mean, MEAN)
 
 
 def test_blocks_move_on_their_own(rng):
     x, weights = BASE.sample(50, rng), rng.dirichlet(np.ones(50), size=2)
     moved = BASE.project(x, weights, 0.7)
     np.testing.assert_array_equal(moved.blocks[0].alpha, BETA.project(x[:, :2], weights[0], 0.7).alpha)
-    np.testing.assert_array_equal(moved.blocks[1].law.mean, NORMAL.project(x[:, 2:], weights[1], 0.7).law.mean)
+    np.testing.assert_array_equal(
+        moved.blocks[1].gaussian.mean, NORMAL.project(x[:, 2:], weights[1], 0.7).gaussian.mean
+    )
 
 
 def test_blocks_by_attributes_alone(rng):
@@ -179,5 +181,5 @@ def test_mixture_keeps_the_share_1_minus_alpha_of_the_present_law():
 def test_gaussian_block_is_pulled_towards_its_present_covariance():
     elite = np.tile([2.0, 1.0], (10, 1))
     moved = GaussianBlock(Gaussian.standard(2)).project(elite, uniform_weights(10), 1.0)
-    np.testing.assert_allclose(moved.law.mean, [2.0, 1.0])
-    np.testing.assert_allclose(moved.law.covariance, 3 / 13 * np.eye(2), atol=1e-12)
+    np.testing.assert_allclose(moved.gaussian.mean, [2.0, 1.0])
+    np.testing.assert_allclose(moved.gaussian.covariance, 3 / 13 * np.eye(2), atol=1e-12)

@@ -74,10 +74,10 @@ def test_every_proposal_keeps_to_the_boxes(drive):
         beta, normal = iterate.proposal.blocks
         assert min(beta.alpha.min(), beta.beta.min()) >= 1.5
         assert max(beta.alpha.max(), beta.beta.max()) <= 7.0
-        assert np.abs(normal.law.mean - problem.mean).max() <= 0.01 * (1 + 1e-9)
+        assert np.abs(normal.gaussian.mean - problem.mean).max() <= 0.01 * (1 + 1e-9)
     last = kept[-1].proposal.blocks
     assert last[0].alpha[0] < 2.0 < last[0].beta[0]
-    assert (last[1].law.mean - problem.mean).mean() > 0.005  # of at most 0.01
+    assert (last[1].gaussian.mean - problem.mean).mean() > 0.005  # of at most 0.01
 
 
 def test_joint_ratio_is_the_projection_of_equation_2(rng):

@@ -145,10 +145,10 @@ def test_a_step_of_the_search_matches_moments():
     """Equation 2 for a Gaussian: with alpha = 1 and many points the moments of the elite."""
     elite = np.random.default_rng(1).standard_normal((100_000, 2)) * [0.5, 1.0] + [2.0, 0.0]
     start, ratios = Product((GaussianBlock(Gaussian.standard(2)),)), np.zeros((1, len(elite)))
-    moved = CE()._project(start, elite, ratios, 1.0).blocks[0].law
+    moved = CE()._project(start, elite, ratios, 1.0).blocks[0].gaussian
     np.testing.assert_allclose(moved.mean, elite.mean(axis=0))
     np.testing.assert_allclose(moved.covariance, np.cov(elite.T), atol=1e-3)
-    half = CE()._project(start, elite, ratios, 0.5).blocks[0].law
+    half = CE()._project(start, elite, ratios, 0.5).blocks[0].gaussian
     np.testing.assert_allclose(half.mean, elite.mean(axis=0) / 2)
     # mixture of N(0, I) and the elite: mean of the variances plus a quarter of the shift squared
     np.testing.assert_allclose(np.diag(half.covariance), [0.625 + 1.0, 1.0], atol=0.02)
@@ -164,13 +164,13 @@ def test_a_step_of_the_search_uses_the_likelihood_ratio(rng):
     u = u[u[:, 0] > 2.0]
     log_ratios = (Gaussian.standard(2).log_prob(u) - proposal.log_prob(u))[None]
     moved = CE()._project(Product((GaussianBlock(proposal),)), u, log_ratios, 1.0)
-    np.testing.assert_allclose(moved.blocks[0].law.mean, [stats.norm.pdf(2) / stats.norm.sf(2), 0.0], atol=0.02)
+    np.testing.assert_allclose(moved.blocks[0].gaussian.mean, [stats.norm.pdf(2) / stats.norm.sf(2), 0.0], atol=0.02)
 
 
 def test_mean_family_keeps_the_covariance():
     block = NormalBlock(Gaussian.standard(2)).project(np.full((9, 2), 3.0), np.full(9, 1 / 9), 0.8)
-    np.testing.assert_allclose(block.law.mean, 0.8 * 3.0)
-    np.testing.assert_array_equal(block.law.covariance, np.eye(2))
+    np.testing.assert_allclose(block.gaussian.mean, 0.8 * 3.0)
+    np.testing.assert_array_equal(block.gaussian.covariance, np.eye(2))
 
 
 def test_a_common_event_is_left_to_plain_draws():
