@@ -11,7 +11,7 @@ from scipy import stats
 from samplers.analysis.base import cov_inflation, require_sample
 from samplers.analysis.reweighting import MAX_LOG
 from samplers.estimation import estimate
-from samplers.execution.arguments import check_problem
+from samplers.execution.arguments import RunArguments, check_problem
 from samplers.execution.progress import Listener
 from samplers.method import Stepping
 from samplers.methods.two_stage.method import TwoStage
@@ -139,23 +139,23 @@ def compare(
     a: Problem,
     b: Problem,
     method: Stepping | str = TwoStage(),  # noqa: B008  (frozen, so safe to share)
-    gamma: float = 0.0,
-    seed: int | None = None,
-    max_sim: int | None = None,
-    confidence: float = 0.95,
+    gamma: float = RunArguments.gamma,
+    seed: int | None = RunArguments.seed,
+    max_sim: int | None = RunArguments.max_sim,
+    confidence: float = RunArguments.confidence,
     progress: bool | Listener = False,
 ) -> Comparison:
     """Estimate P[f_A(X) <= gamma] / P[f_B(X) <= gamma] for two functions of the same X.
 
     The method estimates P[A or B fails], f = min(f_A, f_B), and both are simulated at every draw. With weights w_i and
     indicators a_i, b_i of the draws, p_A = sum w a and p_B = sum w b; the error of log(p_A / p_B) is that of
-    sum w (a / p_A - b / p_B), to which draws where both fail contribute next to nothing: the more alike the two are,
-    the better their ratio is known, where errors of two runs of their own would add up. The interval is log-normal
-    with the t quantile of the effective number of draws where one of them fails; where there is none it is the
-    Clopper-Pearson bound on how often that can be.
+    sum w (a / p_A - b / p_B), to which draws where both fail contribute next to nothing. The more alike the two are,
+    the smaller is the error of their ratio; the errors of two separate runs would add up. The interval is log-normal
+    with the t quantile of the effective number of draws where only one of them fails; without such draws it follows
+    from the Clopper-Pearson bound on their probability.
 
-    Where one fails hundreds of times less often than the other few draws show it failing, and a warning says so:
-    then estimate each by itself.
+    If one fails hundreds of times less often than the other, few draws show it failing and the result has a warning:
+    then estimate each separately.
 
     Args:
         a: Problem A: `dim`, `base`, `evaluate`.
@@ -206,8 +206,10 @@ def _summarise(found: Estimate, problem: EitherFails) -> Comparison:
     factor = cov_inflation(found, own / found.p if found.p > 0 else math.inf)
     single = has_independent_points(sample)
     a, b = (_side(total, factor, single, found) for total in totals)
-    few = [f"{name} failed in draws worth {s.ess:.0f} only" for name, s in (("A", a), ("B", b)) if s.ess < MIN_SIDE_ESS]
-    about = [f"{' and '.join(few)}: the ratio is coarse; estimate each by itself."] if few else []
+    few = [
+        f"{name} failed in only {s.ess:.0f} effective draws" for name, s in (("A", a), ("B", b)) if s.ess < MIN_SIDE_ESS
+    ]
+    about = [f"{' and '.join(few)}: the ratio is coarse; estimate each separately."] if few else []
     return Comparison(
         ratio=_ratio(a.p, b.p),
         interval=_interval(totals, factor, single, found),

@@ -12,9 +12,10 @@ ON_ERROR: tuple[str, ...] = get_args(OnError)
 
 @runtime_checkable
 class FinalError(Protocol):
-    """An exception that says whether calling f again is of no use: it has been tried, or f cannot answer at all."""
+    """An exception with an attribute `final`: True if calling f again cannot help."""
 
     final: bool
+    """Whether f has been called again already, or cannot return a value at all."""
 
 
 class EvaluationError(ValueError):

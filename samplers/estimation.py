@@ -41,26 +41,27 @@ def estimate(
         gamma: Threshold of failure.
         seed: Same seed, same answer. None draws one, which the result states.
         max_sim: Simulations that are never exceeded, over all replicates.
-        target_cov: Coefficient of variation to stop at. Methods that can go on drawing do so.
-            Where the runs asked for are not enough, further runs with fresh randomness are made
-            (at least 5 in all, unless counts are pooled) and combined as replicates are, until it
-            is met, what is left of max_sim is too little for one more run (pooled runs use it
-            all), 200 runs are made, or as many runs as `replicates` have come to the limit of
-            their method (`n` of MonteCarlo without max_sim, 100 batches of CrossEntropy). If it
-            is then not met the status is "budget".
+        target_cov: Coefficient of variation to stop at. Methods that can go on drawing do so. If
+            the replicates together miss it, further independent runs are made and combined with
+            them (at least 5 in all, unless counts are pooled). They end when the target is met,
+            the rest of max_sim is too small for one more run (pooled runs use all of it), 200
+            runs are made, or as many runs as `replicates` have come to the limit of their method
+            (`n` of MonteCarlo without max_sim, 100 batches of CrossEntropy). If the target is
+            then not met the status is "budget".
         confidence: Nominal coverage of the interval.
-        replicates: Independent runs, side by side: f is handed the points of all of them in one
-            batch, and max_sim is shared out evenly. Runs of MonteCarlo are pooled: failing draws
+        replicates: Independent runs, side by side: f gets the points of all of them in one batch,
+            and each has an equal share of max_sim. Runs of MonteCarlo are pooled: failing draws
             of all runs by draws of all runs, with the Clopper-Pearson interval of these counts.
-            All others are combined by their mean with a t interval on the log scale, which with
-            2 or 3 runs is very wide.
+            All others are combined by their mean with a t interval on the log scale, which is
+            very wide with 2 or 3 runs.
         on_error: Where f raises or returns NaN: "raise" stops and names the row; "failure" counts
             the point as failing; "bound" counts it as failing in p and in the upper end of the
             interval, but not in the lower end.
-        progress: True for a bar on standard error, or a function that is given `Progress`.
-        time_limit: Seconds after which the run is stopped. Looked at after every batch: one that
-            is under way is not cut short.
-        stop: Given `Progress` after every batch; the run is stopped where it returns True.
+        progress: True for a bar on standard error, or a function that gets `Progress`.
+        time_limit: Seconds after which the run is stopped. It is checked after every batch; a batch
+            that has begun is not cut short.
+        stop: Function that gets `Progress` after every batch; the run is stopped when it returns
+            True.
 
     Returns:
         The probability, its interval, its cost and the failures. Of a run that was stopped (status
@@ -128,8 +129,8 @@ class _StopConditions:
 
 
 def _add_retry_note(result: Estimate, n_retried: int) -> Estimate:
-    """Return the result with a note on rows that f was handed more than once."""
+    """Return the result with a note on rows that were simulated again."""
     if n_retried == 0:
         return result
-    note = f"{n_retried} rows were handed to f again to find those that raise."
+    note = f"{n_retried} rows were simulated again to find those on which f raises."
     return replace(result, warnings=(*result.warnings, note))

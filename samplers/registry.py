@@ -28,9 +28,9 @@ class Methods(Mapping[str, type[Stepping]]):
         [project.entry-points."rare_envs.samplers"]
         lattice = "their_package:Lattice"
 
-    with the `name` of the class on the left. Others' code is imported when someone first asks
-    for a name that is not ours, or for all names. An entry point that cannot be used is left out
-    with a `RuntimeWarning` that names it.
+    with the `name` of the class on the left. Other packages are imported when a name that is not
+    ours, or the list of all names, is first requested. An entry point that cannot be used is left
+    out with a `RuntimeWarning` that names it.
 
     Args:
         own: Our own methods.
@@ -45,26 +45,27 @@ class Methods(Mapping[str, type[Stepping]]):
         return list(self._own)
 
     @cached_property
-    def _offered(self) -> dict[str, type[Stepping]]:
+    def _installed(self) -> dict[str, type[Stepping]]:
+        """Methods of other packages by name."""
         found: dict[str, type[Stepping]] = {}
         for entry in sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda entry: entry.name):
             try:
                 if entry.name in self._own or entry.name in found:
                     raise ValueError("that name is taken")
                 found[entry.name] = _load_method(entry)
-            except Exception as error:  # whatever another package does must not break this one
+            except Exception as error:  # an error of another package must not break this one
                 message = f"The method {_describe_entry(entry)} cannot be used: {type(error).__name__}: {error}"
                 warnings.warn(message, RuntimeWarning, stacklevel=2)
         return found
 
     def __getitem__(self, name: str) -> type[Stepping]:
-        return self._own[name] if name in self._own else self._offered[name]
+        return self._own[name] if name in self._own else self._installed[name]
 
     def __iter__(self) -> Iterator[str]:
-        return iter([*self._own, *self._offered])
+        return iter([*self._own, *self._installed])
 
     def __len__(self) -> int:
-        return len(self._own) + len(self._offered)
+        return len(self._own) + len(self._installed)
 
 
 METHODS = Methods(
@@ -113,5 +114,6 @@ def _load_method(entry: EntryPoint) -> type[Stepping]:
 
 
 def _describe_entry(entry: EntryPoint) -> str:
+    """Return the name, package and value of an entry point, in words."""
     package = "" if entry.dist is None else f" of {entry.dist.name}"
     return f"{entry.name!r}{package} ({entry.value})"

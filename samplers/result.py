@@ -172,13 +172,13 @@ class Estimate:
         """Return P[f(X) <= g] for other thresholds g from the same simulations, with a simultaneous band.
 
         Thresholds above gamma were passed on the way. Below gamma the curve goes on as long as the
-        points there are worth 5 independent units (draws; paths, in subset simulation).
+        points there have at least 5 effective independent units (draws; paths, in subset simulation).
 
         Args:
             gammas: Thresholds, shape (k,), in any order.
 
         Raises:
-            ValueError: If a threshold lies below what is known (the text says from where on it is),
+            ValueError: If a threshold lies below what is known (the text names the smallest one),
                 or the method gave no weighted points.
 
         Example:

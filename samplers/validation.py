@@ -1,4 +1,4 @@
-"""Checks of arguments and settings: a ValueError says what was expected and what came."""
+"""Validation: checks of arguments and settings, whose ValueError states what was expected and what was given."""
 
 import difflib
 import math

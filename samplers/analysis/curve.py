@@ -97,16 +97,16 @@ class Curve:
 def compute_curve(estimate: WeightedEstimate, gammas: ArrayLike) -> Curve:
     """Return the curve of an estimate at thresholds; see `Estimate.curve`.
 
-    p is the sum of the weights of the points with f <= g, moved below gamma in proportion (above it
-    by as much as at it) where the estimate at gamma is not that sum, as with control variates. Its
-    spread is that of the independent units, but at least as large as the estimate's own at gamma
-    says.
+    p is the sum of the weights of the points with f <= g. Where the estimate at gamma is not that sum
+    (control variates), p is scaled below gamma, and shifted by the difference at gamma above it. Its
+    c.o.v. is that of the sum over independent units, times the factor by which the estimate's c.o.v.
+    exceeds it at gamma.
 
     The band consists of pointwise intervals at one common level: Clopper-Pearson where p is a share
-    of plain draws, else log-normal with the t quantile of the effective units. That level is the
-    one at which normal deviations with the correlation of the curve's own exceed it nowhere with
-    probability `confidence` (sup-t); 10,000 draws of a generator that comes from the seed find it.
-    As the truth rises with g, the band's ends are made to do so too, which only narrows it.
+    of plain draws, else log-normal with the t quantile of the effective units. At that level normal
+    deviations with the correlation of the curve stay inside all intervals with probability
+    `confidence` (sup-t); it is found from 10,000 draws, whose generator comes from the seed.
+    The truth rises with g, so the ends of the band are made to rise too, which only narrows it.
 
     The units of replicates are taken together: with 2 or 3 runs the band can be narrower at gamma
     than the t interval of their mean.
@@ -156,7 +156,7 @@ def as_thresholds(gammas: ArrayLike) -> FloatArray:
 
 
 def check_known(sample: Sample, gamma: float, gammas: FloatArray) -> None:
-    """Raise a ValueError if a threshold lies below what the sample knows."""
+    """Raise a ValueError if a threshold lies below the smallest one that the sample can estimate."""
     start = lowest_known_threshold(sample, gamma)
     lowest = float(gammas.min())
     if lowest >= start:
@@ -164,8 +164,8 @@ def check_known(sample: Sample, gamma: float, gammas: FloatArray) -> None:
     known = f"the curve is known from g = {start!r} on" if math.isfinite(start) else "no threshold is known"
     more = f"gamma={lowest!r}" if lowest < gamma else "more simulations"
     raise ValueError(
-        f"Threshold {lowest!r} is too low for this run: {known}. Below, fewer than {MIN_UNITS:g} effective "
-        f"independent points speak; estimate again with {more}."
+        f"Threshold {lowest!r} is too low for this run: {known}. Below it there are fewer than {MIN_UNITS:g} "
+        f"effective independent points; estimate again with {more}."
     )
 
 

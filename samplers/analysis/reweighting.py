@@ -86,7 +86,7 @@ def reweight_estimate(estimate: WeightedEstimate, new_base: HasLogProb) -> Rewei
 
     p1 = sum of w r over the failing points, r = p1(x) / p0(x). With T_c the sums over units, its
     variance is sum T_c^2 - p1^2 / n, to which the largest T_c^2 is added: where one term dominates, the
-    spread of those seen is too small most of the time. The interval is log-normal with the t
+    sample variance is too small most of the time. The interval is log-normal with the t
     quantile of the effective units.
 
     Raises:
@@ -134,7 +134,7 @@ def log_density_ratios(estimate: WeightedEstimate, new_base: HasLogProb, x: Floa
     if base is None:
         raise ValueError("The estimate does not know its base distribution (`Estimate.base`).")
     if len(x) == 0:
-        raise ValueError(f"No point failed (f <= {estimate.gamma:g}): there is nothing to weigh anew.")
+        raise ValueError(f"No point failed (f <= {estimate.gamma:g}): there is nothing to reweight.")
     check_dimensions_fit(new_base, x.shape[1])
     check_support(base, new_base, x.shape[1], estimate.seed)
     new, old = log_density(new_base, x), log_density(base, x)

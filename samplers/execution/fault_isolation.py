@@ -23,7 +23,7 @@ class FaultIsolation:
         on_error: What to do where f raises.
 
     Attributes:
-        n_retried: Rows that were handed to f again to find those that raise.
+        n_retried: Rows that were simulated again to find those that raise.
 
     Example:
         >>> def f(x):
@@ -46,8 +46,8 @@ class FaultIsolation:
         """Simulate the rows of x (n, d); return what f returned, with NaN for rows on which it raised.
 
         Raises:
-            EvaluationError: If f raises and on_error is "raise". An error with a true attribute `final` is passed on
-                as it is: f says that calling it again is of no use.
+            EvaluationError: If f raises and on_error is "raise". A `FinalError` whose `final` is True is passed on
+                unchanged, whatever on_error is.
         """
         try:
             return self._evaluate(x.copy())
@@ -64,11 +64,11 @@ class FaultIsolation:
 def isolate_failing_rows(evaluate: Evaluate, x: FloatArray) -> tuple[FloatArray, int]:
     """Return f (n,) of a batch x (n, d) on which `evaluate` raises, NaN for the rows that raise alone.
 
-    The batch is handed over in halves, those that raise in halves again, until the raising rows stand alone: at most
+    The batch is split in halves, and those that raise are split again, until the raising rows stand alone: at most
     2 k ceil(log2(n)) calls for k of them.
 
     Returns:
-        f, and how many rows were handed over again.
+        f, and how many rows were simulated again.
 
     Raises:
         EvaluationError: If `evaluate` does not return one number per row.
@@ -89,7 +89,7 @@ def isolate_failing_rows(evaluate: Evaluate, x: FloatArray) -> tuple[FloatArray,
 
 
 def _raise_for_first_row(evaluate: Evaluate, x: FloatArray, error: Exception) -> NoReturn:
-    """Raise an EvaluationError for the first row that raises again, with what f says of that row alone."""
+    """Raise an EvaluationError for the first row that raises again, with the error of that row alone."""
     start, stop = 0, len(x)
     while stop - start > 1:
         middle = (start + stop) // 2
@@ -110,7 +110,7 @@ def _exception_of(evaluate: Evaluate, x: FloatArray) -> Exception | None:
 
 
 def _is_final(error: Exception) -> bool:
-    """Return whether f says that calling it again is of no use."""
+    """Return whether the error says that calling f again cannot help."""
     return isinstance(error, FinalError) and bool(error.final)
 
 

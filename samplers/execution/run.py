@@ -1,4 +1,4 @@
-"""Run: the dialogue between the replicates of a method and whoever makes the simulations (ask and tell)."""
+"""Run: replicates of a method side by side, with simulations made outside (ask for points, tell their outcomes)."""
 
 import math
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ from samplers.trace import Status
 MIN_REPLICATES = 5
 """Runs made at least where those asked for miss target_cov: fewer give a useless t interval."""
 MAX_REPLICATES = 200
-"""Runs after which target_cov is given up."""
+"""Runs made at most for target_cov: if they miss it, each run is too small."""
 
 
 class Run:

@@ -70,9 +70,9 @@ def installed(tmp_path, monkeypatch):
         monkeypatch.syspath_prepend(tmp_path)
         return tmp_path
 
-    vars(METHODS).pop("_offered", None)  # as in a new process
+    vars(METHODS).pop("_installed", None)  # as in a new process
     yield install
-    vars(METHODS).pop("_offered", None)
+    vars(METHODS).pop("_installed", None)
     sys.modules.pop("lattice_methods", None)
 
 
