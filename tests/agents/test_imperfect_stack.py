@@ -117,21 +117,21 @@ def test_noise_can_be_fixed_or_left_out() -> None:
     assert (f[False] != problem("idm").evaluate(x)).any()  # the lags remain
 
 
-def test_errors_have_the_law_that_they_are_said_to_have() -> None:
+def test_errors_have_the_declared_distribution() -> None:
     stack = Stack(missed=0.05, correlation=0.4)
     driver = problem(NoisyEgo("idm", stack)).driver
     n = 20_000
     draws = torch.randn(n, driver.noise_columns, generator=torch.Generator().manual_seed(0))
     driver = driver.with_draws(draws)
-    errors = [driver._later(torch.zeros(n, driver.shape[1]), 0)]
+    errors = [driver._step_errors(torch.zeros(n, driver.shape[1]), 0)]
     for plan in range(1, 4):
-        errors.append(driver._later(errors[-1], plan))
+        errors.append(driver._step_errors(errors[-1], plan))
     for late, each in enumerate(errors):
         np.testing.assert_allclose(each.std(dim=0), 1.0, atol=0.03)
         kept = (each * errors[0]).mean(dim=0)
         np.testing.assert_allclose(kept, math.exp(-late * 0.2 / 0.4), atol=0.04)
     state = driver.world.start(torch.from_numpy(problem("idm").base.sample(n, np.random.default_rng(0))).float()).state
-    seen = driver._seen(state, state, errors[-1])
+    seen = driver._perceive(state, state, errors[-1])
     missed = seen.x[:, 1:] - seen.x[:, :1] > 300.0
     np.testing.assert_allclose(missed.float().mean(dim=0), 0.05, atol=5 * math.sqrt(0.05 / n))
     np.testing.assert_allclose((seen.y[:, 0] - state.y[:, 0]).std(), stack.across, rtol=0.03)
@@ -172,11 +172,11 @@ def test_actuators_follow_with_a_lag_and_within_their_rates() -> None:
     driver = problem(NoisyEgo("idm", Stack(lag=0.5, steering_lag=0.2, jerk=1e6, steering_rate=1e6))).driver
     done, wanted = torch.zeros(1, 2), torch.tensor([[-4.0, 0.05]])
     for tick in range(1, 30):
-        done = driver._done(done, wanted)
+        done = driver._actuate(done, wanted)
         expected = [-4.0 * (1 - math.exp(-tick * 0.1 / 0.5)), 0.05 * (1 - math.exp(-tick * 0.1 / 0.2))]
         np.testing.assert_allclose(done[0], expected, rtol=1e-4)
     slow = problem(NoisyEgo("idm", Stack(lag=0.0, steering_lag=0.0, jerk=10.0, steering_rate=0.2))).driver
-    np.testing.assert_allclose(slow._done(torch.zeros(1, 2), wanted)[0], [-1.0, 0.02], rtol=1e-5)
+    np.testing.assert_allclose(slow._actuate(torch.zeros(1, 2), wanted)[0], [-1.0, 0.02], rtol=1e-5)
 
 
 def test_any_ego_can_be_behind_a_stack() -> None:
