@@ -53,13 +53,13 @@ def test_the_probability_is_that_of_fresh_noise() -> None:
 class Fresh(NoisyDriver):
     """The same stack, whose noise is drawn as the drive goes and is no part of x: an autoregression by hand."""
 
-    columns = 0  # type: ignore[assignment]
+    noise_columns = 0  # type: ignore[assignment]
     generator = torch.Generator().manual_seed(11)
 
-    def _later(self, errors: torch.Tensor, plan: int) -> torch.Tensor:
+    def _step_errors(self, errors: torch.Tensor, plan: int) -> torch.Tensor:
         fresh = torch.randn(errors.shape, generator=self.generator)
-        kept = math.exp(-self.stack.period / self.stack.correlation) if plan else 0.0
-        return kept * errors + math.sqrt(1 - kept**2) * fresh
+        correlation = math.exp(-self.stack.period / self.stack.correlation) if plan else 0.0
+        return correlation * errors + math.sqrt(1 - correlation**2) * fresh
 
 
 def monte_carlo(around: rare_envs.DrivingProblem, gamma: float, n: int) -> tuple[float, float]:

@@ -152,27 +152,6 @@ def test_algo_overrides_what_the_file_says(ppo_zip: Path) -> None:
         load_ego(ppo_zip, algo="pp0")
 
 
-@pytest.mark.parametrize(
-    ("module", "settings", "expected"),
-    [
-        ("sb3_contrib.common.recurrent.policies", {"clip_range": 0.2}, "recurrent_ppo"),
-        ("sb3_contrib.common.maskable.policies", {"clip_range": 0.2}, "maskable_ppo"),
-        ("sb3_contrib.qrdqn.policies", {"exploration_initial_eps": 1.0}, "qrdqn"),
-        ("stable_baselines3.common.policies", {"cg_max_steps": 15, "gae_lambda": 1.0}, "trpo"),
-        ("mine", {"top_quantiles_to_drop_per_net": 2, "target_entropy": "auto"}, "tqc"),
-        ("mine", {"clip_range": 0.2, "gae_lambda": 0.95}, "ppo"),
-    ],
-)
-def test_algorithms_are_told_apart(module: str, settings: dict[str, Any], expected: str) -> None:
-    header = {"policy_class": {"__module__": module}, **settings}
-    assert find_algorithm(header, Path("ego.zip")) == expected
-
-
-def test_an_unknown_algorithm_asks_for_its_name() -> None:
-    with pytest.raises(ValueError, match=r"Cannot tell which algorithm .* name it with algo: ppo"):
-        find_algorithm({"policy_class": {"__module__": "mine"}}, Path("ego.zip"))
-
-
 @pytest.mark.parametrize("spec", ["idm", "no_such_module:make"])
 def test_algo_is_for_files_only(spec: str) -> None:
     with pytest.raises(ValueError, match=rf"algo for a Stable-Baselines3 \.zip only, got 'ppo' for '{spec}'"):
@@ -418,54 +397,3 @@ def test_an_unknown_spec_is_refused(spec: str, message: str) -> None:
 def test_a_forgotten_suffix_is_pointed_out(ppo_zip: Path) -> None:
     with pytest.raises(ValueError, match=r"did you mean '.*ego\.zip'"):
         load_ego(ppo_zip.with_suffix(""))
-
-
-@pytest.fixture
-def own_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    """A module of the user in the working directory; its name."""
-    (tmp_path / "own_egos_for_test.py").write_text(
-        "import sys\n"
-        "import numpy as np\n"
-        "class Straight:\n"
-        "    def predict(self, observation, state=None, episode_start=None, deterministic=True):\n"
-        "        return [[0.0, 0.0]] * len(observation), state\n"
-        "def make():\n    return Straight()\n"
-        "def make_rule_based():\n    return 'idm'\n"
-        "def make_nothing():\n    return None\n"
-        "def make_trouble():\n    raise RuntimeError('no\\nweights')\n"
-        "def make_exit():\n    sys.exit(7)\n"
-        "def make_array():\n    return np.zeros(2)\n"
-    )
-    monkeypatch.chdir(tmp_path)
-    return "own_egos_for_test"
-
-
-def test_a_function_of_the_user_makes_the_ego(own_module: str) -> None:
-    ego = load_ego(f"{own_module}:make")
-    assert isinstance(ego, Ego)
-    assert ego.predict(observations(2))[0] == [[0.0, 0.0]] * 2
-    assert load_ego(f"{own_module}:make_rule_based") == "idm"
-
-
-@pytest.mark.parametrize(
-    ("function", "message"),
-    [
-        ("mak", r"has nothing called 'mak' \(did you mean 'make'\?\)\."),
-        ("zzz", r"has nothing called 'zzz'\."),
-        ("make_nothing", "an object with predict, got NoneType"),
-        ("make_trouble", "failed to make an ego: RuntimeError: no weights"),
-        ("make_exit", "failed to make an ego: SystemExit: 7"),
-        ("make_array", "an object with predict, got ndarray"),
-    ],
-)
-def test_a_function_that_does_not_serve_is_refused(function: str, message: str, own_module: str) -> None:
-    with pytest.raises(ValueError, match=message) as caught:
-        load_ego(f"{own_module}:{function}")
-    one_line(caught)
-
-
-def test_a_module_that_exits_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "script_for_test.py").write_text("import sys\nsys.exit('usage: script')\n")
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(ValueError, match=r"Cannot import 'script_for_test' .*SystemExit: usage: script"):
-        load_ego("script_for_test:make")

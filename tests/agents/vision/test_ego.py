@@ -1,6 +1,5 @@
 """The ego that sees: its network, its memory, its file, and that it is shown what it needs wherever it is named."""
 
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -9,10 +8,10 @@ import pytest
 import torch
 
 import rare_envs
-from agents import Provenance, load_ego
-from agents.vision.checkpoint import load_vision, read_vision_provenance, save_vision
+from agents import load_ego
+from agents.vision.checkpoint import load_vision
 from agents.vision.ego import LAG, SPEED_SCALE, VisionEgo, to_actions, update_memory
-from agents.vision.pilotnet import HEIGHT, WIDTH, PilotNet, luma
+from agents.vision.pilotnet import HEIGHT, WIDTH, luma
 from rare_envs.study.ego_check.subprocess_check import EgoCheckRequest, check_ego
 
 CUT_IN = "rare_envs/CutIn-v0"
@@ -30,33 +29,6 @@ def pictures(n: int, seed: int = 0) -> torch.Tensor:
 def seen(n: int, seed: int = 0) -> dict[str, Any]:
     speed = np.random.default_rng(seed).uniform(0.0, 1.0, (n, 1)).astype(np.float32)
     return {"camera": pictures(n, seed).numpy(), "speed": speed}
-
-
-def test_the_network_is_that_of_the_paper() -> None:
-    """Bojarski et al., Fig. 4: sizes of the feature maps, and about 250,000 parameters."""
-    network, maps = PilotNet(), []
-    for convolution in network.convolutions:
-        convolution.register_forward_hook(lambda _module, _given, out: maps.append(tuple(out.shape[1:])))
-    with torch.no_grad():
-        out = network(pictures(2), pictures(2)[..., 0], torch.tensor([3.0, 20.0]))
-    assert out.shape == (2, 2)
-    assert maps == [(24, 31, 98), (36, 14, 47), (48, 5, 22), (64, 3, 20), (64, 1, 18)]
-    assert sum(weight.numel() for weight in network.parameters()) == 252_880
-
-
-def test_channels_are_the_yuv_of_itu_bt_601() -> None:
-    """U and V by their definitions as scaled differences of blue and red to the luma."""
-    picture = pictures(1, 3)
-    red, green, blue = (picture[..., k].double() for k in range(3))
-    y = 0.299 * red + 0.587 * green + 0.114 * blue
-    u, v = 0.436 * (blue - y) / (1 - 0.114), 0.615 * (red - y) / (1 - 0.299)
-    earlier = pictures(1, 4)[..., 0]
-    with torch.no_grad():
-        channels = PilotNet().channels(picture, earlier).double()
-    expected = torch.stack((y / 127.5 - 1, u / 127.5, v / 127.5, (y - earlier.double()) / 127.5), dim=1)
-    assert channels.shape == (1, 4, HEIGHT, WIDTH)
-    torch.testing.assert_close(channels, expected, atol=2e-5, rtol=0.0)
-    assert float((luma(picture).double() - y).abs().max()) < 1.0
 
 
 def test_a_row_does_not_depend_on_the_others(ego: VisionEgo) -> None:
@@ -153,26 +125,6 @@ def test_check_ego_finds_nothing_wrong_with_it() -> None:
 def test_another_observation_is_refused_with_the_right_one_named() -> None:
     with pytest.raises(ValueError, match="choose observation='camera\\+speed'"):
         rare_envs.DrivingProblem(CUT_IN, ego=load_ego("vision"), observation="features")
-
-
-def test_a_network_of_ones_own_is_kept_in_a_file(tmp_path: Path) -> None:
-    torch.manual_seed(0)
-    network = PilotNet()
-    provenance = Provenance(kind="dagger", command="train", data="none", data_licence="MIT", metrics={"kept": 1.0})
-    path = save_vision(network, provenance, tmp_path / "mine.safetensors")
-    loaded = load_ego(path)
-    assert isinstance(loaded, VisionEgo)
-    with torch.no_grad():
-        arguments = pictures(2), pictures(2)[..., 0], torch.tensor([3.0, 20.0])
-        torch.testing.assert_close(loaded.network(*arguments), network(*arguments), atol=1e-5, rtol=0.0)
-    assert read_vision_provenance(path) == provenance
-
-
-def test_files_of_another_kind_are_refused() -> None:
-    with pytest.raises(ValueError, match="no vision"):
-        load_vision(Path("agents/data/bc.safetensors"))
-    with pytest.raises(FileNotFoundError, match="No vision at"):
-        load_vision("nowhere.safetensors")
 
 
 def test_another_tick_is_refused():
