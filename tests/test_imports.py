@@ -76,6 +76,12 @@ MOST_MODULES = 13
 CARS_AND_TENSORS = {"gymnasium", "highway_env", "pettingzoo", "stable_baselines3", "torch"}
 
 
+EXAMPLES = sorted((ROOT / "examples").rglob("*.py"))
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PUBLIC_MODULES = {"samplers.testing"}
+"""Modules that users import as such: checks for methods of other packages, for the tests of these."""
+
+
 def modules(root: Path, packages: tuple[str, ...] = PACKAGES) -> dict[str, Path]:
     """Return dotted name to file of every module of the packages."""
     found = {}
@@ -216,7 +222,7 @@ def deep_imports(text: str, files: dict[str, Path]) -> list[str]:
     """Return import statements of Python code that reach into a module where a package should export the name."""
     wrong = []
     for node in ast.walk(ast.parse(text)):
-        if isinstance(node, ast.ImportFrom) and node.module in files:
+        if isinstance(node, ast.ImportFrom) and node.module in files and node.module not in PUBLIC_MODULES:
             path = files[node.module]
             names = [alias.name for alias in node.names]
             public = path.name == "__init__.py" and all(
@@ -358,3 +364,14 @@ def test_every_package_is_installed_by_name() -> None:
 @pytest.mark.parametrize("package", PACKAGES)
 def test_type_information_is_shipped(package: str) -> None:
     assert (ROOT / package / "py.typed").is_file()
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_examples_need_no_deep_path(path: Path) -> None:
+    assert deep_imports(path.read_text(encoding="utf-8"), modules(ROOT)) == []
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.stem)
+def test_pages_need_no_deep_path(path: Path) -> None:
+    blocks = re.findall(r"```python\n(.*?)```", path.read_text(encoding="utf-8"), re.DOTALL)
+    assert [line for block in blocks for line in deep_imports(block, modules(ROOT))] == []
