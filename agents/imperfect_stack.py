@@ -29,7 +29,7 @@ OWN_ERRORS, ERRORS_PER_VEHICLE = 3, 4
 """Numbers of errors: of the ego (across, heading, speed), of each other vehicle (along, across, speed, missed)."""
 OUT_OF_SIGHT = 400.0
 """Distance ahead at which a missed vehicle is placed [m]: beyond the range of every sensor."""
-FIXED_SEED = 54321
+FIXED_STACK_SEED = 54321
 """Seed of the one sequence of draws of `noise="fixed"`; any number would do."""
 
 
@@ -278,4 +278,4 @@ class NoisyDriver:
 
 def _fixed_draws(shape: tuple[int, int]) -> Tensor:
     """Return the one sequence of draws of `noise="fixed"`."""
-    return torch.randn(shape, generator=torch.Generator().manual_seed(FIXED_SEED), dtype=torch.float64)
+    return torch.randn(shape, generator=torch.Generator().manual_seed(FIXED_STACK_SEED), dtype=torch.float64)

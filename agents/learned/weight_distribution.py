@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from agents.learned.networks import HIDDEN_SIZES
-
-Array = NDArray[np.float64]
+from rare_envs.arrays import FloatArray
 
 RADIUS = 0.01
 """Largest shift of each mean in a search (O'Kelly et al. 2018, section 4)."""
@@ -48,9 +47,9 @@ class WeightDistribution:
         array([-1.2886])
     """
 
-    mean: Array
+    mean: FloatArray
     """Shape (d,)."""
-    precision: Array
+    precision: FloatArray
     """Inverse covariance, shape (d, d); mostly zeros when a graphical lasso made it."""
     radius: float = RADIUS
     """A search keeps |mu - mean|_inf within this."""
@@ -79,7 +78,7 @@ class WeightDistribution:
         return len(self.mean)
 
     @cached_property
-    def _whitening(self) -> Array:
+    def _whitening(self) -> FloatArray:
         """Lower triangular A with A' A = precision: the inverse of the covariance's Cholesky factor.
 
         It is the Cholesky factor of the precision with rows and columns in reverse order, transposed and reversed back,
@@ -92,21 +91,21 @@ class WeightDistribution:
         return np.ascontiguousarray(reversed_factor.T[::-1, ::-1])
 
     @cached_property
-    def cholesky(self) -> Array:
+    def cholesky(self) -> FloatArray:
         """Lower triangular L with L L' = covariance, shape (d, d)."""
         return np.asarray(solve_triangular(self._whitening, np.eye(self.dim), lower=True))
 
     @cached_property
-    def covariance(self) -> Array:
+    def covariance(self) -> FloatArray:
         """Shape (d, d)."""
         return np.asarray(self.cholesky @ self.cholesky.T)
 
     @property
-    def std(self) -> Array:
+    def std(self) -> FloatArray:
         """Standard deviation of each weight, shape (d,)."""
         return np.asarray(np.sqrt(np.square(self.cholesky).sum(axis=1)))
 
-    def sample(self, n: int, rng: np.random.Generator) -> Array:
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw n independent points, shape (n, d).
 
         Raises:
@@ -116,21 +115,21 @@ class WeightDistribution:
             raise TypeError(f"Expected rng as a numpy.random.Generator, got {rng!r}; see np.random.default_rng.")
         return self.from_standard_normal(rng.standard_normal((n, self.dim)))
 
-    def log_prob(self, x: Array, /) -> Array:
+    def log_prob(self, x: FloatArray, /) -> FloatArray:
         """Log density at x (n, d), shape (n,)."""
         u = self.to_standard_normal(x)
         log_det = float(np.log(np.diag(self._whitening)).sum())
         return np.asarray(log_det - 0.5 * (np.square(u).sum(axis=1) + self.dim * math.log(2.0 * math.pi)))
 
-    def to_standard_normal(self, x: Array, /) -> Array:
+    def to_standard_normal(self, x: FloatArray, /) -> FloatArray:
         """Return L^-1 (x - mean) of the rows of x (n, d)."""
         return np.asarray((self._rows(x) - self.mean) @ self._whitening.T)
 
-    def from_standard_normal(self, u: Array, /) -> Array:
+    def from_standard_normal(self, u: FloatArray, /) -> FloatArray:
         """Return mean + L u of the rows of u (n, d)."""
         return np.asarray(self.mean + self._rows(u) @ self.cholesky.T)
 
-    def _rows(self, x: Array) -> Array:
+    def _rows(self, x: FloatArray) -> FloatArray:
         x = np.asarray(x, dtype=np.float64)
         if x.ndim != 2 or x.shape[1] != self.dim:
             raise ValueError(f"Expected points of shape (n, {self.dim}), got {x.shape}.")

@@ -17,7 +17,7 @@ HEIGHT, WIDTH = 66, 200
 """Height and width of the pictures [pixels]."""
 OUTPUT_SIZE = 2
 """Acceleration and yaw rate."""
-HIDDEN_UNITS = 50
+PILOTNET_HIDDEN_UNITS = 50
 """Units of the layer that `PilotNet.hidden` gives."""
 ACCELERATION_UNIT, TURN_UNIT = 2.0, 0.1
 """Outputs are in these units [m/s^2, rad/s]."""
@@ -66,8 +66,8 @@ class PilotNet(nn.Module):
         sizes = ((4, 24, 5, 2), (24, 36, 5, 2), (36, 48, 5, 2), (48, 64, 3, 1), (64, 64, 3, 1))
         self.convolutions = nn.ModuleList(nn.Conv2d(a, b, kernel, stride) for a, b, kernel, stride in sizes)
         self.first = nn.Linear(64 * 18, 100)
-        self.second = nn.Linear(100 + 1, HIDDEN_UNITS)
-        self.last = nn.Linear(HIDDEN_UNITS, 10)
+        self.second = nn.Linear(100 + 1, PILOTNET_HIDDEN_UNITS)
+        self.last = nn.Linear(PILOTNET_HIDDEN_UNITS, 10)
         self.head = nn.Linear(10, OUTPUT_SIZE)
         for layer in (*self.convolutions, self.first, self.second, self.last):
             nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")

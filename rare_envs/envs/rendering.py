@@ -15,7 +15,7 @@ from rare_envs.traffic.overlap import pairwise_overlaps
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
 
-WIDTH, HEIGHT = 800, 160
+FRAME_WIDTH, FRAME_HEIGHT = 800, 160
 """Size of the picture of the road [pixels]; it is higher where the road asks for it."""
 TEXT_HEIGHT = 24
 """Height of the lines of text above and below [pixels]; all heights are multiples of 16, as video codecs want."""
@@ -79,11 +79,11 @@ class Renderer:
         self._world = world
         self._scenario: Scenario = world.scenario
         self._road: Road = world.scenario.road
-        height = max(HEIGHT, 16 * round((self._road.lanes * self._road.width + 2 * _MARGIN) * _SCALING / 16))
-        self._surface = WorldSurface((WIDTH, height), 0, pygame.Surface((WIDTH, height)))
+        height = max(FRAME_HEIGHT, 16 * round((self._road.lanes * self._road.width + 2 * _MARGIN) * _SCALING / 16))
+        self._surface = WorldSurface((FRAME_WIDTH, height), 0, pygame.Surface((FRAME_WIDTH, height)))
         self._surface.scaling = _SCALING
         self._surface.centering_position = [0.3, 0.5]
-        self._canvas = pygame.Surface((WIDTH, height + 2 * TEXT_HEIGHT))
+        self._canvas = pygame.Surface((FRAME_WIDTH, height + 2 * TEXT_HEIGHT))
         pygame.freetype.init()
         self._font = pygame.freetype.Font(None, 14)
         self._font.origin = True  # texts are placed by their base line
@@ -112,7 +112,7 @@ class Renderer:
             crashed: Indices of the vehicles that have crashed; None for the ego, if it has, and whom it touches.
 
         Returns:
-            The image, shape (H, WIDTH, 3).
+            The image, shape (H, FRAME_WIDTH, 3).
         """
         state = State(*(field[row : row + 1] for field in episode.state))
         if crashed is None:

@@ -28,12 +28,12 @@ def install_fast_observation(env: Any, blind: bool = False) -> None:
         if blind and isinstance(kind, KinematicObservation):
             kind.observe = partial(np.zeros, kind.space().shape, kind.space().dtype)
         elif type(kind) is KinematicObservation:
-            kind.observe = partial(observe_kinematics, kind)
+            kind.observe = partial(observe_without_pandas, kind)
 
     env.define_spaces = define_spaces_fast
 
 
-def observe_kinematics(kind: Any) -> NDArray[np.float32]:
+def observe_without_pandas(kind: Any) -> NDArray[np.float32]:
     """Return what `KinematicObservation.observe` returns.
 
     Args:

@@ -29,7 +29,7 @@ BACKGROUND_DRAWS = 2000
 """Ordinary scenarios drawn behind the failures."""
 MOMENTS, LAST_SECONDS = 4, 3.0
 """Bird's-eye views of a failure, spread over the seconds [s] up to its worst moment."""
-BEHIND, FAR_BEHIND, AHEAD = 12.0, 45.0, 48.0
+VIEW_BEHIND, VIEW_FAR_BEHIND, VIEW_AHEAD = 12.0, 45.0, 48.0
 """What a bird's-eye view shows of the road around the ego [m]; further behind where there is traffic."""
 ORDINARY_ROAD = 14.0
 """Width of a road [m] that a view has room for; on wider ones it is higher."""
@@ -39,7 +39,7 @@ NORMAL_QUANTILE, WIDEST_COV = 1.96, 3.0
 """Half-width of the band around estimates on the way, in standard errors; c.o.v. beyond which it is cut."""
 HEADROOM = 1.5
 """Upper ends of the curves' axes over their largest values: room for the legend."""
-LINE, HIT, GREY = "#3b6fb5", "#c0392b", "#b8b8b8"
+LINE_COLOUR, HIT_COLOUR, ORDINARY_COLOUR = "#3b6fb5", "#c0392b", "#b8b8b8"
 VEHICLE_COLOURS = ("#2a9d3a", "#3b6fb5", "#e08a1e", "#8e5aa8", "#3aa6a6", "#7a7a7a")
 """Colours of vehicles, the ego's first."""
 
@@ -106,18 +106,18 @@ def draw_convergence(axes: Axes, report: Report) -> None:
         spent = np.cumsum([level.n_sim for level in levels])
         values = np.array([level.estimate if level.estimate > 0 else np.nan for level in levels])
         seen += [value for value in values if value > 0]
-        axes.plot(spent, values, "o-", color=LINE, alpha=max(0.25, 1 / len(runs)), markersize=4)
+        axes.plot(spent, values, "o-", color=LINE_COLOUR, alpha=max(0.25, 1 / len(runs)), markersize=4)
         if len(runs) == 1 and by_levels:
             _label_thresholds(axes, spent, values, [level.gamma for level in levels])
         elif len(runs) == 1:
             spread = np.exp(NORMAL_QUANTILE * np.minimum([level.cov for level in levels], WIDEST_COV))
-            axes.fill_between(spent, values / spread, values * spread, color=LINE, alpha=0.15, linewidth=0)
+            axes.fill_between(spent, values / spread, values * spread, color=LINE_COLOUR, alpha=0.15, linewidth=0)
     low, high = estimate.interval
-    axes.axhspan(max(low, 1e-300), high, color=HIT, alpha=0.12, linewidth=0)
+    axes.axhspan(max(low, 1e-300), high, color=HIT_COLOUR, alpha=0.12, linewidth=0)
     label = f"{100 * estimate.confidence:g} % interval"
     if estimate.p > 0:
-        axes.axhline(estimate.p, color=HIT, linewidth=1, label="result")
-    axes.plot([], [], color=HIT, alpha=0.25, linewidth=8, label=label)
+        axes.axhline(estimate.p, color=HIT_COLOUR, linewidth=1, label="result")
+    axes.plot([], [], color=HIT_COLOUR, alpha=0.25, linewidth=8, label=label)
     axes.set_yscale("log")
     if by_levels or not seen:
         smallest = min([v for v in (low, estimate.p, high / 30) if v > 0], default=1e-9)
@@ -161,7 +161,7 @@ def draw_failures(axes: Axes, space: ScenarioSpace, failures: Failures) -> None:
     """Draw failures over ordinary traffic in the two parameters in which they differ most."""
     ordinary = space.sample(BACKGROUND_DRAWS, np.random.default_rng(0))
     a, b = rank_shifted_parameters(space, ordinary, failures.x)[:2] if len(failures) else (0, 1)
-    axes.scatter(ordinary[:, a], ordinary[:, b], s=6, color=GREY, label="ordinary traffic", linewidths=0)
+    axes.scatter(ordinary[:, a], ordinary[:, b], s=6, color=ORDINARY_COLOUR, label="ordinary traffic", linewidths=0)
     columns = list_columns(space)
     axes.set_xlabel(columns[a].label)
     axes.set_ylabel(columns[b].label)
@@ -203,7 +203,7 @@ def draw_moment(axes: Axes, drive: Drive, t: int) -> None:
             VEHICLE_LENGTH,
             VEHICLE_WIDTH,
             facecolor=vehicle_colour(j),
-            edgecolor=HIT if hit and j == 0 else "none",
+            edgecolor=HIT_COLOUR if hit and j == 0 else "none",
         )
         body.set_transform(Affine2D().rotate(heading).translate(x - origin, y) + axes.transData)
         axes.add_patch(body)
@@ -212,12 +212,12 @@ def draw_moment(axes: Axes, drive: Drive, t: int) -> None:
         edge = y in (left, right)
         axes.axhline(
             y,
-            color="black" if edge else GREY,
+            color="black" if edge else ORDINARY_COLOUR,
             linewidth=1,
             dashes=(None, None) if edge else (6, 6),
         )
     furthest = float(np.max(drive.position[:, :1, 0] - drive.position[..., 0])) + VEHICLE_LENGTH
-    axes.set_xlim(-min(max(BEHIND, furthest), FAR_BEHIND), AHEAD)
+    axes.set_xlim(-min(max(VIEW_BEHIND, furthest), VIEW_FAR_BEHIND), VIEW_AHEAD)
     # the lateral axis points right of the direction of travel, which is down when driving to the right
     axes.set_ylim(right + 0.1 * drive.road.width, left - 0.1 * drive.road.width)
     axes.set_aspect("equal")
@@ -228,7 +228,8 @@ def draw_moment(axes: Axes, drive: Drive, t: int) -> None:
     axes.set_ylabel(f"{drive.time[t]:.1f} s", rotation=0, ha="right", va="center")
     if t == drive.worst:
         lane = drive.position[t, 0, 1]
-        axes.text(AHEAD, lane, "collision" if hit else "closest", color=HIT, ha="right", va="center", fontweight="bold")
+        word = "collision" if hit else "closest"
+        axes.text(VIEW_AHEAD, lane, word, color=HIT_COLOUR, ha="right", va="center", fontweight="bold")
 
 
 def vehicle_colour(vehicle: int) -> str:

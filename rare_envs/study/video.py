@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from rare_envs import DrivingProblem
-from rare_envs.envs.rendering import WIDTH, Renderer
+from rare_envs.envs.rendering import FRAME_WIDTH, Renderer
 from rare_envs.study.columns import MAX_SHOWN, format_value
 from rare_envs.study.errors import BadInput
 from rare_envs.study.evaluate import Question, prepare
@@ -81,7 +81,7 @@ def draw_frames(drive: Drive) -> list[Image.Image]:
     shown = []
     for k, episode in enumerate(drive.episodes):
         road = renderer.draw(episode, drive.time[k])
-        picture = Image.new("RGB", (WIDTH, road.shape[0] + CURVES_HEIGHT))
+        picture = Image.new("RGB", (FRAME_WIDTH, road.shape[0] + CURVES_HEIGHT))
         picture.paste(Image.fromarray(road), (0, 0))
         picture.paste(curves, (0, road.shape[0]))
         column, top, bottom = place(drive.time[k])
@@ -97,7 +97,7 @@ def _draw_curves_strip(drive: Drive) -> tuple[Image.Image, Any]:
     world = drive.problem.world
     time = np.arange(len(drive.f_so_far)) * world.clock.dt
     name = world.measurement.measure if isinstance(world.measurement.measure, str) else "measure"
-    figure = Figure(figsize=(WIDTH / 100, CURVES_HEIGHT / 100), dpi=100)
+    figure = Figure(figsize=(FRAME_WIDTH / 100, CURVES_HEIGHT / 100), dpi=100)
     canvas: Any = FigureCanvasAgg(figure)
     axes = figure.add_axes((0.08, 0.3, 0.9, 0.62))
     axes.plot(time, drive.f_alone, color="tab:blue", linewidth=1, label="this moment")
@@ -159,7 +159,7 @@ def check_film_path(path: Path | str) -> None:
         raise BadInput(f"There is no folder {str(path.parent)!r}.")
 
 
-def write_film(path: Path | str, drive: Drive, width: int = WIDTH, every: int = 1) -> None:
+def write_film(path: Path | str, drive: Drive, width: int = FRAME_WIDTH, every: int = 1) -> None:
     """Write a drive as a moving picture (.gif), or its worst moment (.png).
 
     Args:
@@ -183,7 +183,7 @@ def write_film(path: Path | str, drive: Drive, width: int = WIDTH, every: int = 
     check_film_path(path)
     path = Path(path)
     shown = draw_frames(drive)
-    shown = [each.resize((width, round(each.height * width / WIDTH)), Image.Resampling.LANCZOS) for each in shown]
+    shown = [each.resize((width, round(each.height * width / FRAME_WIDTH)), Image.Resampling.LANCZOS) for each in shown]
     if path.suffix.lower() == ".png":
         shown[drive.worst].save(path)
         return

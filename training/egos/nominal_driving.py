@@ -43,12 +43,12 @@ from training.egos.nominal_traffic import CASES, FLOOR_GAP, FLOOR_HEADWAY, SECON
 
 VERDICT_NAMES = ("kept", "left its lane", "collided", "too close", "left behind", "hit by others")
 """Verdicts by number; a rollout gets the one that comes first in time, "left behind" at its end."""
-KEPT, LEFT_LANE, COLLIDED, TOO_CLOSE, LEFT_BEHIND, HIT = range(len(VERDICT_NAMES))
+KEPT, LEFT_LANE, COLLIDED, TOO_CLOSE, LEFT_BEHIND, HIT_BY_OTHER = range(len(VERDICT_NAMES))
 GRACE = 10.0
 """Time [s] in which an ego must open the gap to a lead that has cut in too close."""
 LEAST_WAY = 0.5
 """Share of its lead's distance that it must cover."""
-TILE, CAMERA_TILE = 256, 64
+DRIVE_BATCH, CAMERA_DRIVE_BATCH = 256, 64
 """Rollouts driven at once."""
 
 
@@ -144,7 +144,7 @@ def judge(
     if needs.lidar:
         world = world.with_lidar()
     x = draw_inputs(case, world, rollouts, needs.noise_columns(world), np.random.default_rng(seed))
-    tile = CAMERA_TILE if "camera" in kinds_of(observation) else TILE
+    tile = CAMERA_DRIVE_BATCH if "camera" in kinds_of(observation) else DRIVE_BATCH
     parts = [_judge_tile(world, driver, part) for part in torch.split(torch.from_numpy(x).float(), tile)]
     reason, time, headway, margin, speed = (np.concatenate(column) for column in zip(*parts, strict=True))
     return Verdicts(reason, time, headway, margin, speed, x)
@@ -214,11 +214,11 @@ def lane_margin(state: State, first: Episode) -> Tensor:
 
 
 def _blame(episode: Episode) -> Tensor:
-    """Return `COLLIDED` where the ego ran into a vehicle or the road's edge, `HIT` where a vehicle ran into it."""
+    """Return `COLLIDED` where the ego ran into something, `HIT_BY_OTHER` where a vehicle ran into it."""
     assert episode.statistics is not None
     crash = episode.statistics.own
     own = (crash.vehicles[:, 0] == 0) | (crash.kind == ROAD_EDGE)
-    return torch.where(crash.kind == NONE, KEPT, torch.where(own, COLLIDED, HIT))
+    return torch.where(crash.kind == NONE, KEPT, torch.where(own, COLLIDED, HIT_BY_OTHER))
 
 
 def _distances(first: State, last: State, lead: Tensor, seconds: float) -> tuple[Tensor, Tensor]:
@@ -238,7 +238,7 @@ def summarise_verdicts(found: Verdicts) -> Summary:
         {'too close': 1}
     """
     counts = Counter(VERDICT_NAMES[k] for k in found.reason.tolist())
-    kept, spoiled = counts.pop(VERDICT_NAMES[KEPT], 0), counts.pop(VERDICT_NAMES[HIT], 0)
+    kept, spoiled = counts.pop(VERDICT_NAMES[KEPT], 0), counts.pop(VERDICT_NAMES[HIT_BY_OTHER], 0)
     judged = len(found.reason) - spoiled
     return Summary(
         kept,

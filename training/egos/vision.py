@@ -30,7 +30,7 @@ from torch import nn
 from agents import Provenance
 from agents.vision.checkpoint import save_vision
 from agents.vision.ego import VisionEgo
-from agents.vision.pilotnet import HIDDEN_UNITS, PilotNet
+from agents.vision.pilotnet import PILOTNET_HIDDEN_UNITS, PilotNet
 from training.command_line import report_errors, run_command
 from training.egos.expert_driver import AUXILIARY_SIZE
 from training.egos.image_dataset import LabelledPictures, collect, concatenate, mirror
@@ -39,7 +39,7 @@ from training.imitation.fit import CHECKPOINT
 from training.imitation.run_folder import check_folder, write_settings
 
 FILE = "vision.safetensors"
-JUDGED = 2026
+JUDGE_SEED = 2026
 """Seed of the drives that evaluate the result, which no training uses."""
 
 
@@ -111,7 +111,7 @@ class Training:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
             self.network = PilotNet()
-            self.probe = nn.Linear(HIDDEN_UNITS, AUXILIARY_SIZE)
+            self.probe = nn.Linear(PILOTNET_HIDDEN_UNITS, AUXILIARY_SIZE)
         self.parameters = [*self.network.parameters(), *self.probe.parameters()]
         self.optimiser = torch.optim.Adam(self.parameters, config.rate)
         self.round = 0
@@ -261,7 +261,7 @@ def main(
     with report_errors("vision"):
         config = VisionConfig(seed=seed, rounds=rounds)
         network = train_vision_ego(config, out, progress=True)
-    metrics = judge_all_cases(VisionEgo(network), judged, JUDGED) if judged else {}
+    metrics = judge_all_cases(VisionEgo(network), judged, JUDGE_SEED) if judged else {}
     print(f"Wrote {save_vision(network, make_provenance(config, metrics), out / FILE)}.")
 
 

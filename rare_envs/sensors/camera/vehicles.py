@@ -14,7 +14,7 @@ from rare_envs.sensors.camera.light import AIR, RGB, Light
 from rare_envs.sensors.camera.pinhole import Camera, Pixels
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
 
-HEIGHT = 1.5
+BODY_HEIGHT = 1.5
 """Of every vehicle [m], a usual car's."""
 PAINT: tuple[RGB, ...] = (
     (0.62, 0.12, 0.10),
@@ -150,7 +150,7 @@ def cast_shadows(boxes: Boxes, light: Light, camera: Camera, seen: Pixels) -> Te
     """
     sun_forward, sun_right, sun_up = light.sun[:, :, None].unbind(1)
     forward, right = boxes.corners()
-    steep = (HEIGHT / sun_up)[..., None]
+    steep = (BODY_HEIGHT / sun_up)[..., None]
     moved = forward - sun_forward[..., None] * steep, right - sun_right[..., None] * steep
     forward, right = torch.cat((forward, moved[0]), -1), torch.cat((right, moved[1]), -1)
     at = find_candidates(camera, forward, right, torch.zeros_like(forward), seen.sky)
@@ -158,7 +158,7 @@ def cast_shadows(boxes: Boxes, light: Light, camera: Camera, seen: Pixels) -> Te
         return None
     origin = _to_box_frame(boxes.forward, boxes.right, boxes.cos, boxes.sin)
     sun = _to_box_frame(sun_forward, sun_right, boxes.cos, boxes.sin)
-    above = (HEIGHT / sun_up).expand_as(boxes.cos)
+    above = (BODY_HEIGHT / sun_up).expand_as(boxes.cos)
     x0, y0, cos, sin, inverse_x, inverse_y, leaves = _pick(
         at.box, *origin, boxes.cos, boxes.sin, 1.0 / sun[0], 1.0 / sun[1], above
     )
@@ -189,14 +189,14 @@ def draw_boxes(image: Tensor, boxes: Boxes, light: Light, camera: Camera, seen: 
     """
     forward, right = (torch.cat((part, part), -1) for part in boxes.corners())
     up = torch.zeros_like(forward)
-    up[..., 4:] = HEIGHT
+    up[..., 4:] = BODY_HEIGHT
     at = find_candidates(camera, forward, right, up)
     if not len(at.box):
         return
     origin = _to_box_frame(-boxes.forward, -boxes.right, boxes.cos, boxes.sin)
     ray_forward, ray_right, ray_up = seen.ray
-    middle = camera.mount_height - 0.5 * HEIGHT
-    near_z, far_z = _slab(torch.full_like(ray_up, middle), 1.0 / ray_up, HEIGHT)  # the same for all boxes
+    middle = camera.mount_height - 0.5 * BODY_HEIGHT
+    near_z, far_z = _slab(torch.full_like(ray_up, middle), 1.0 / ray_up, BODY_HEIGHT)  # the same for all boxes
     x0, y0, cos, sin = _pick(at.box, *origin, boxes.cos, boxes.sin)
     way_forward, way_right, near_z, far_z = _pick(at.pixel, ray_forward, ray_right, near_z, far_z)
     x, y = _to_box_frame(way_forward, way_right, cos, sin)

@@ -12,7 +12,7 @@ from samplers.proposals.shrinkage import shrink_towards_present
 
 EM_STEPS = 10
 """M-steps per step of cross-entropy, always all of them; each one raises the objective."""
-RESTARTS = 3
+KMEANS_RESTARTS = 3
 """Starts of k-means, of which the best is taken: one alone may put two centres into one region."""
 KMEANS_STEPS = 300
 """Steps of k-means at most."""
@@ -71,7 +71,7 @@ def fit_mixture_towards(
     """
     if len(present.components) == 1:
         rng = np.random.default_rng(0)  # fixed: equal points give equal mixtures
-        labels = k_means(x, weights, k, rng, RESTARTS, KMEANS_STEPS)
+        labels = k_means(x, weights, k, rng, KMEANS_RESTARTS, KMEANS_STEPS)
         k = int(labels.max()) + 1
         start = one_hot(labels, k)
         present = GaussianMixture(np.full(k, 1 / k), [present.components[0]] * k)

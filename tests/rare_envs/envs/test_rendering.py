@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import rare_envs
-from rare_envs.envs.rendering import AGENT, ROLE_COLOURS, TEXT_HEIGHT, WIDTH, Renderer, caption
+from rare_envs.envs.rendering import AGENT, FRAME_WIDTH, ROLE_COLOURS, TEXT_HEIGHT, Renderer, caption
 from rare_envs.make import set_up
 from rare_envs.scenarios.registry import SCENARIOS
 
@@ -31,7 +31,7 @@ def test_every_vehicle_has_the_colour_of_its_role(env_id):
     image = env.render()
     scenario = SCENARIOS[env_id]
     height = max(160, 16 * round((scenario.road.lanes * scenario.road.width + 8) / 2))
-    assert (image.shape, image.dtype) == ((height + 2 * TEXT_HEIGHT, WIDTH, 3), np.uint8)
+    assert (image.shape, image.dtype) == ((height + 2 * TEXT_HEIGHT, FRAME_WIDTH, 3), np.uint8)
     roles = {name if name in ROLE_COLOURS else "others" for name in scenario.vehicle_names}
     assert {ROLE_COLOURS[role] for role in roles} <= colours(road_of(image))
     assert colours(image[:TEXT_HEIGHT]) > {(255, 255, 255)}  # text

@@ -10,7 +10,7 @@ import torch
 
 from rare_envs.control.idm import IDM
 from rare_envs.distributions.space import Parameter
-from rare_envs.envs.rendering import TEXT_HEIGHT, WIDTH, Renderer
+from rare_envs.envs.rendering import FRAME_WIDTH, TEXT_HEIGHT, Renderer
 from rare_envs.scenarios.base import Others, Scenario, columns
 from rare_envs.scenarios.highway import HIGHWAY
 from rare_envs.simulation.rollout import drive
@@ -285,7 +285,7 @@ def test_a_curved_road_is_drawn_in_the_world() -> None:
     for x in (0.0, 400.0, 1500.0):
         state = pair(x, road.centre(1), x + 30.0, road.centre(4))
         image = renderer.draw(world.start_from(state, None))
-        assert image.shape == (240 + 2 * TEXT_HEIGHT, WIDTH, 3)
+        assert image.shape == (240 + 2 * TEXT_HEIGHT, FRAME_WIDTH, 3)
         image = image[TEXT_HEIGHT:-TEXT_HEIGHT]
         at = {}
         for name, ahead, y in [
@@ -297,7 +297,7 @@ def test_a_curved_road_is_drawn_in_the_world() -> None:
                 torch.stack(road.to_world(*torch.tensor([px, py, 0.0], dtype=F64))[:2])
                 for px, py in ((x + ahead, y), (x, road.middle))
             )
-            column, row = (8.0 * (point - camera) + torch.tensor([0.3 * WIDTH, 120.0])).round().long().tolist()
+            column, row = (8.0 * (point - camera) + torch.tensor([0.3 * FRAME_WIDTH, 120.0])).round().long().tolist()
             at[name] = image[row, column].tolist()
         assert at == {"ego": [50, 200, 0], "other": [100, 200, 255], "road": [100, 100, 100]}
         # white lines: the two edges whole, so that every column of the image crosses both

@@ -97,7 +97,7 @@ def test_who_runs_into_its_lead_is_to_blame() -> None:
 def test_the_judge_repeats_itself_and_tiles_do_not_matter(monkeypatch: pytest.MonkeyPatch) -> None:
     ego = agents.load_ego("noisy:idm")  # with noise of its own in x
     one = judge(ego, "i80", rollouts=6, seed=5, seconds=5.0)
-    monkeypatch.setattr("training.egos.nominal_driving.TILE", 4)
+    monkeypatch.setattr("training.egos.nominal_driving.DRIVE_BATCH", 4)
     other = judge(ego, "i80", rollouts=6, seed=5, seconds=5.0)
     assert (one.reason == other.reason).all()
     np.testing.assert_allclose(one.margin, other.margin, atol=1e-5)

@@ -181,8 +181,8 @@ def faces(x: float, y: float, heading: float):  # type: ignore[no-untyped-def]
     """Outward normal, centre and two half extents of the five faces of a body that can be seen."""
     along, up = np.array((math.cos(heading), math.sin(heading), 0.0)), np.array((0.0, 0.0, 1.0))
     across = np.array((-math.sin(heading), math.cos(heading), 0.0))
-    middle = np.array((x, y, b.HEIGHT / 2))
-    halves = ((along, VEHICLE_LENGTH / 2), (across, VEHICLE_WIDTH / 2), (up, b.HEIGHT / 2))
+    middle = np.array((x, y, b.BODY_HEIGHT / 2))
+    halves = ((along, VEHICLE_LENGTH / 2), (across, VEHICLE_WIDTH / 2), (up, b.BODY_HEIGHT / 2))
     for k, (direction, half) in enumerate(halves):
         for sign in (1.0, -1.0):
             yield sign * direction, middle + sign * half * direction, halves[:k] + halves[k + 1 :]
@@ -194,7 +194,7 @@ def shadow(x: float, y: float, heading: float, sun: Array) -> Array:
 
     cos, sin = math.cos(heading), math.sin(heading)
     points = []
-    for along, across, up in itertools.product((0.5, -0.5), (0.5, -0.5), (0.0, b.HEIGHT)):
+    for along, across, up in itertools.product((0.5, -0.5), (0.5, -0.5), (0.0, b.BODY_HEIGHT)):
         dx, dy = along * VEHICLE_LENGTH, across * VEHICLE_WIDTH
         corner = np.array((x + dx * cos - dy * sin, y + dx * sin + dy * cos))
         points.append(corner - sun[:2] / sun[2] * up)

@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull
 from rare_envs.sensors.camera import Camera, CameraContext, Weather, clear_day, find_camera, take_picture
 from rare_envs.sensors.camera.ground import ASPHALT, DASH, PERIOD, View, road_lines
 from rare_envs.sensors.camera.pinhole import pixels
-from rare_envs.sensors.camera.vehicles import HEIGHT
+from rare_envs.sensors.camera.vehicles import BODY_HEIGHT
 from rare_envs.traffic.reference_line import MAX_CURVATURE, ReferenceLine
 from rare_envs.traffic.road import Road, i80, straight
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
@@ -66,7 +66,7 @@ def test_a_body_is_where_its_projected_corners_are(x: float, y: float, heading: 
         forward = x + dx * math.cos(heading) - dy * math.sin(heading) - camera.mount_ahead
         right = y + dx * math.sin(heading) + dy * math.cos(heading) - camera.mount_right
         cos, sin = math.cos(camera.yaw), math.sin(camera.yaw)
-        corners.append(pinhole(camera, forward * cos + right * sin, right * cos - forward * sin, up * HEIGHT))
+        corners.append(pinhole(camera, forward * cos + right * sin, right * cos - forward * sin, up * BODY_HEIGHT))
     sides = ConvexHull(np.array(corners)).equations  # a point is inside where all sides @ (column, row, 1) < 0
     row, column = np.indices(seen.shape) + 0.5
     outside = (sides @ np.stack((column, row, np.ones_like(row))).reshape(3, -1)).max(axis=0).reshape(seen.shape)
