@@ -32,9 +32,9 @@ class WidenableMixture(Mixture):
 Fit = Callable[[FloatArray, FloatArray], WidenableDistribution]
 """Fits one component to points (n, d) with weights (n,) that add up to 1."""
 MAX_EM_STEPS = 50
-"""M-steps at most; most fits end after 5 to 15."""
+"""M-steps at most."""
 LEAST_EM_GAIN = 1e-3
-"""Expectation-maximisation ends where a step raises the mean log likelihood by less: it makes no visible weight."""
+"""Expectation-maximisation ends where a step raises the mean log likelihood by less."""
 LEAST_WEIGHT = 0.01
 """Components of less weight are dropped: with 1000 points they would rest on fewer than 10."""
 

@@ -1,4 +1,4 @@
-"""Subset simulation, whatever the kernel: from level to level, and what the levels say together.
+"""Levels of subset simulation with any kernel, and the estimate from all of them.
 
 References:
     Au and Beck, "Estimation of small failure probabilities in high dimensions by subset simulation",
@@ -30,10 +30,13 @@ from samplers.statistics.thresholds import next_level
 from samplers.trace import Level, Status
 
 ACCEPTANCE_RANGE = (0.15, 0.85)
+"""Acceptance without a warning: below it chains hardly move, above it their steps are short."""
 LONGEST_CHAIN = 50
 """More steps than this from a handful of seeds cost calls of f and add little."""
 FEW_CHAINS = 20
+"""Fewer seeds than this make a level coarse: its c.o.v. is 0.2 or more."""
 LARGE_COV = 0.5
+"""C.o.v. that is worth a warning; the interval then spans a factor of 2.5 to either side."""
 FEWEST_SEEDS = 10
 """A level is not made smaller for the sake of the budget than this many seeds allow."""
 USUAL_LEVELS = 4
@@ -41,7 +44,7 @@ USUAL_LEVELS = 4
 
 
 class LevelProduct(NamedTuple):
-    """What the levels passed so far say."""
+    """Probability of the last level reached, as a product over the levels."""
 
     p: float = 1.0
     """Probability of the last level reached."""

@@ -29,7 +29,7 @@ LEAST_SHAPE = 0.5
 LARGEST_SHAPE = 1e4
 """A radius with a c.o.v. of 0.5 %; points at one radius would give an infinite m."""
 LARGE_ORDER = 50.0
-"""Order of the Bessel function from which on its asymptotic expansion is exact to 1e-9 of its logarithm."""
+"""Order of the Bessel function from which on its asymptotic expansion is used; its logarithm is then exact to 2e-7."""
 
 
 @dataclass(frozen=True, eq=False)

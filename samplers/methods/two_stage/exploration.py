@@ -34,8 +34,8 @@ class ExplorationSettings:
     """Numbers of the exploration; those of draws hold for `usual_budget` simulations."""
 
     usual_budget: int = 6000
-    """Up to here sizes grow in proportion to the budget, above with its square root: regions that many draws miss
-    are found by more levels of subset simulation, not by more of the same draws."""
+    """Up to here sizes grow in proportion to the budget, above with its square root; the rest of the budget is
+    for refinement and estimate."""
     base: int = 500
     """Base draws; five levels of a tenth each reach 1e-5 from there."""
     wide: tuple[tuple[float, int], ...] = ((1.5, 120), (2.2, 120), (3.0, 80))
@@ -60,7 +60,7 @@ class ExplorationSettings:
     """The same for failures of subset simulation; they take the place of wide failures that are missing."""
     least_level_starts: int = 6
     bisections: int = 3
-    """Steps of a wide failure towards the origin: to an eighth of its distance from the edge of the region."""
+    """Steps of a wide failure towards the origin: the edge of the region is then known to an eighth of the way."""
     chain_cost: int = 25
     """Simulations that a chain needs at most before it is sorted: bisection, two walks, points half way."""
     descent_share: float = 0.45

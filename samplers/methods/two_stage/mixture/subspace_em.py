@@ -24,10 +24,10 @@ SIZES = (1, 2, 3, 4, 6, 8)
 """Numbers of components that are tried; MOST_WORSE of them without a better score end the search."""
 MOST_WORSE = 2
 MAX_EM_ITERATIONS = 25
-"""M-steps at most; most fits end after 5 to 10."""
+"""M-steps at most."""
 LEAST_RELATIVE_GAIN = 1e-3
 """Expectation-maximisation ends where a step raises the log likelihood by less than this share of it."""
-RESTARTS = 3
+EM_RESTARTS = 3
 """Starts for each number of components; k-means++ draws its centres."""
 LEAST_ESS = 2.0
 """Points that any component is taken to rest on: the formulae divide by their number."""
@@ -49,7 +49,7 @@ STANDARD_ERRORS = 2
 """By how many of them a variance under 1 is raised: too small a variance makes weights unbounded."""
 POINTS_PER_COMPONENT = 4
 """Effective points for each component at least."""
-TINY = 1e-300
+TINY_WEIGHT = 1e-300
 """Stands for 0 where a logarithm or a quotient is taken."""
 
 
@@ -124,7 +124,7 @@ def fit_subspace_mixture(points: GroupedPoints, most: int, rng: np.random.Genera
     for k in (size for size in SIZES if size <= most):
         if k > 1 and (k > points.n_groups or points.ess < POINTS_PER_COMPONENT * k):
             break
-        restarts = 1 if k == 1 else RESTARTS
+        restarts = 1 if k == 1 else EM_RESTARTS
         found = max(
             (_fit_from(points, _initial_responsibilities(points, k, rng)) for _ in range(restarts)),
             key=lambda mix: mix.score,
@@ -145,7 +145,7 @@ def _initial_responsibilities(points: GroupedPoints, k: int, rng: np.random.Gene
     mass = np.bincount(points.groups, weights=points.weights, minlength=n_groups).astype(np.float64)
     means = np.zeros((n_groups, points.u.shape[1]))
     np.add.at(means, points.groups, points.u * points.weights[:, None])
-    return one_hot(k_means(means / np.maximum(mass, TINY)[:, None], mass / mass.sum(), k, rng)[points.groups], k)
+    return one_hot(k_means(means / np.maximum(mass, TINY_WEIGHT)[:, None], mass / mass.sum(), k, rng)[points.groups], k)
 
 
 class _Fitted(NamedTuple):
@@ -206,7 +206,7 @@ def refit_components(
     log_mixing = np.zeros(len(components))
     for _ in range(REFIT_STEPS):
         shares = posterior(log_ratios(components, u) + log_mixing[:, None])
-        log_w = np.log(np.maximum(weights, TINY))
+        log_w = np.log(np.maximum(weights, TINY_WEIGHT))
         components = [_refit(one, u, share, log_w) for one, share in zip(components, shares, strict=True)]
         log_mixing = np.log(np.maximum((shares * weights).sum(axis=1), LEAST_MIXING))
     return components
@@ -221,7 +221,7 @@ def _refit(component: SubspaceGaussian, u: FloatArray, shares: FloatArray, log_w
     if count < LEAST_REFIT_POINTS:
         return component
     wanted = min(max(REFIT_ESS, REFIT_ESS_PER_DIM * u.shape[1]), count / 3)
-    log_shares = np.log(np.maximum(shares, TINY))
+    log_shares = np.log(np.maximum(shares, TINY_WEIGHT))
     for power in np.arange(1.0, 0.0, -0.1):
         w = normalise_weights(log_shares + power * log_weights)
         ess = 1 / float((w * w).sum())
