@@ -17,9 +17,12 @@ from agents.learned.coloured_noise import AutoregressiveNoise
 from agents.learned.networks import Policy
 from training.imitation.algorithms.actions import log_likelihood
 from training.imitation.algorithms.critic import critic_inputs, policy_cost
-from training.imitation.algorithms.learner import Learner, Log
+from training.imitation.algorithms.learner import MAX_GRADIENT_NORM, Learner, Log
 from training.imitation.algorithms.penalties import total_cost
 from training.imitation.algorithms.rollout import RolloutSteps
+
+LEAST_SPREAD = 1e-6
+"""Least standard deviation that advantages are divided by."""
 
 
 def advantages(reward: Tensor, value: Tensor, discount: float, gae: float) -> Tensor:
@@ -91,7 +94,7 @@ def update_gail(learner: Learner) -> Log:
             :kept
         ]
     gain = gain.flatten()
-    gain = (gain - gain.mean()) / gain.std().clamp(min=1e-6)
+    gain = (gain - gain.mean()) / gain.std().clamp(min=LEAST_SPREAD)
     for _ in range(config.ppo_epochs):
         for rows in torch.split(torch.randperm(kept, generator=learner.generator), config.ppo_batch):
             moments = conditional_action(policy, steps.features[rows], steps.noise[rows], config.colour)
@@ -100,7 +103,7 @@ def update_gail(learner: Learner) -> Log:
             loss = clone - clipped_surrogate(ratio, gain[rows], config.clip).mean()
             learner.policy_optimiser.zero_grad()
             torch.autograd.backward(loss)
-            torch.nn.utils.clip_grad_norm_(policy.parameters(), 1.0)
+            torch.nn.utils.clip_grad_norm_(policy.parameters(), MAX_GRADIENT_NORM)
             learner.policy_optimiser.step()
             error = (value(seen[rows])[:, 0] - target[rows]).square().mean()
             learner.value_optimiser.zero_grad()

@@ -25,6 +25,10 @@ from training.imitation.traffic.replayed_traffic import Traffic
 from training.imitation.traffic.scene_pool import ScenePool, draw_pool
 
 Log = dict[str, float]
+POLICY_BETAS, CRITIC_BETAS = (0.9, 0.99), (0.5, 0.9)
+"""Decay rates of Adam's two moments, for policy and critic."""
+MAX_GRADIENT_NORM = 1.0
+"""Norm to which the gradient of the policy is clipped."""
 _TRAINED_PARTS = ("policy", "critic", "value", "policy_optimiser", "critic_optimiser", "value_optimiser")
 """Attributes that have weights, or moments of an optimiser."""
 
@@ -49,8 +53,8 @@ class Learner:
     def __post_init__(self) -> None:
         """Make optimisers, pools and the critic's memory."""
         config = self.config
-        self.policy_optimiser = torch.optim.Adam(self.policy.parameters(), config.policy_rate, betas=(0.9, 0.99))
-        self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), config.critic_rate, betas=(0.5, 0.9))
+        self.policy_optimiser = torch.optim.Adam(self.policy.parameters(), config.policy_rate, betas=POLICY_BETAS)
+        self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), config.critic_rate, betas=CRITIC_BETAS)
         self.value = make_seeded(_make_value_network, self.generator)
         self.value_optimiser = torch.optim.Adam(self.value.parameters(), config.value_rate)
         self.learned: tuple[str, ...] = _TRAINED_PARTS

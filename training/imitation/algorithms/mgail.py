@@ -10,7 +10,7 @@ References:
 import torch
 
 from training.imitation.algorithms.critic import critic_inputs, policy_cost
-from training.imitation.algorithms.learner import Learner, Log
+from training.imitation.algorithms.learner import MAX_GRADIENT_NORM, Learner, Log
 from training.imitation.algorithms.penalties import Penalties, total_cost
 
 
@@ -24,7 +24,7 @@ def update_mgail(learner: Learner) -> Log:
     loss = total_cost(config, likeness, costs) + config.geometric_schedule(config.clone_weight, learner.update) * clone
     learner.policy_optimiser.zero_grad()
     torch.autograd.backward(loss)
-    norm = torch.nn.utils.clip_grad_norm_(learner.policy.parameters(), 1.0)
+    norm = torch.nn.utils.clip_grad_norm_(learner.policy.parameters(), MAX_GRADIENT_NORM)
     learner.policy_optimiser.step()
     critic, model = learner.learn_critic(steps), learner.learn_model(steps)
     return {

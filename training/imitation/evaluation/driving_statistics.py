@@ -25,6 +25,8 @@ BINS = MappingProxyType(
 )
 """Lowest and highest edge and number of bins of each quantity; values beyond count in the outermost bin. Units are m/s,
 m/s^2, m/s^3, rad/s, 1/s (closing speed over range of the beam ahead) and m (of that beam)."""
+LEAST_RANGE = 0.1
+"""Range of the beam ahead [m] to which shorter ones are raised before it divides the closing speed."""
 ERROR_NAMES = ("position", "speed", "lateral")
 """Errors against the record that are summed."""
 
@@ -51,7 +53,7 @@ def binned_quantities(behaviour: Behaviour) -> dict[str, tuple[Tensor, Tensor]]:
     meets = known & (behaviour.ahead < MAX_RANGE)
     scene = behaviour.scene.expand_as(known)
     jerk = (behaviour.acceleration[1:] - behaviour.acceleration[:-1]) / DT
-    inverse_ttc = -behaviour.rate / behaviour.ahead.clamp(min=0.1)
+    inverse_ttc = -behaviour.rate / behaviour.ahead.clamp(min=LEAST_RANGE)
     return {
         "speed": (behaviour.speed[known], scene[known]),
         "acceleration": (behaviour.acceleration[known], scene[known]),
