@@ -5,8 +5,13 @@ import pytest
 
 import samplers
 from samplers.errors import EvaluationError
-from samplers.execution.run import split_budget
+from samplers.execution.arguments import RunArguments
+from samplers.execution.combination import combine
+from samplers.execution.replicate import Replicate
+from samplers.execution.run import Run, split_budget
 from samplers.limit_states import half_space
+from samplers.method import Goal, Outcome
+from samplers.statistics.intervals import binomial_cov, clopper_pearson
 
 EASY = half_space(2, 2.0).problem
 
@@ -210,10 +215,200 @@ def test_a_method_without_an_outcome():
         run.tell([1.0])
 
 
-def test_shares_add_up():
+def test_the_budget_is_split_evenly():
     assert split_budget(None, 3) == [None] * 3
     for max_sim, replicates in ((1000, 3), (7, 7), (20, 6), (1, 1)):
         parts = split_budget(max_sim, replicates)
         assert sum(parts) == max_sim
         assert max(parts) - min(parts) <= 1
         assert len(parts) == replicates
+
+
+def test_replicates_are_independent_and_all_counted(recorder):
+    f = recorder(half_space().problem.f)
+    problem = samplers.FunctionProblem(f, 2)
+    result = samplers.estimate(problem, "adss", seed=1, replicates=4)
+    assert result.n_sim == f.rows
+    assert len(np.unique(f.points, axis=0)) == f.rows
+    assert {level.run for level in result.trace} == {0, 1, 2, 3}
+    ends = [level.estimate for level in result.trace if level.gamma == 0.0]
+    assert len(set(ends)) == 4
+    assert result.p == pytest.approx(np.mean(ends))
+
+
+def test_replicates_share_the_budget(recorder):
+    f = recorder(half_space().problem.f)
+    problem = samplers.FunctionProblem(f, 2)
+    result = samplers.estimate(problem, "mc", seed=1, replicates=3, max_sim=1000)
+    assert f.rows == result.n_sim == 1000
+    assert [level.n_sim for level in result.trace] == [333, 333, 334]
+
+
+def one_after_another(problem, method, seed, replicates, max_sim):
+    """The same runs without any interleaving."""
+    outcomes = []
+    for i in range(replicates):
+        share = None if max_sim is None else max_sim // replicates
+        goal = Goal(gamma=0.0, max_sim=share)
+        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(i,)))
+        run = Replicate(method.steps(problem, goal, rng), goal, problem.dim)
+        while run.running:
+            run.tell(problem.evaluate(run.requested))
+        outcomes.append(run.outcome)
+    return combine(outcomes, 0.95)
+
+
+@pytest.mark.parametrize("max_sim", [None, 6000])
+@pytest.mark.parametrize("method", sorted(samplers.METHODS))
+def test_side_by_side_is_one_after_another_in_fewer_calls(method, max_sim, recorder):
+    problem, chosen = half_space(3, 3.0).problem, samplers.get_method(method)
+    alone, together = (recorder(problem.f) for _ in range(2))
+    expected = one_after_another(samplers.FunctionProblem(alone, 3), chosen, 7, 3, max_sim)
+    result = samplers.estimate(samplers.FunctionProblem(together, 3), chosen, seed=7, replicates=3, max_sim=max_sim)
+    assert result.p == expected.p
+    assert result.interval == expected.interval
+    assert result.cov == expected.cov
+    assert result.trace == expected.trace
+    assert result.warnings == expected.warnings
+    np.testing.assert_array_equal(np.unique(together.points, axis=0), np.unique(alone.points, axis=0))
+    assert together.rows == alone.rows
+    assert len(together.batches) < 0.6 * len(alone.batches)
+
+
+def test_first_replicate_is_the_single_run():
+    single = samplers.estimate(half_space().problem, "adss", seed=1)
+    several = samplers.estimate(half_space().problem, "adss", seed=1, replicates=2)
+    assert several.trace[: len(single.trace)] == single.trace
+
+
+def test_target_cov_adds_runs_until_it_is_met():
+    result = samplers.estimate(half_space().problem, "adss", seed=1, target_cov=0.12)
+    assert result.cov <= 0.12
+    assert result.status == "converged"
+    assert max(level.run for level in result.trace) + 1 >= 5
+    enough = samplers.estimate(half_space().problem, "adss", seed=1, target_cov=0.5)
+    assert {level.run for level in enough.trace} == {0}
+
+
+def test_target_cov_keeps_to_the_budget_and_says_so(recorder):
+    f = recorder(half_space().problem.f)
+    problem = samplers.FunctionProblem(f, 2)
+    result = samplers.estimate(problem, "adss", seed=1, target_cov=0.05, max_sim=12_000)
+    assert f.rows == result.n_sim <= 12_000
+    assert result.status == "budget"
+    assert any("target c.o.v. 0.05 was not met" in text for text in result.warnings)
+
+
+def test_target_cov_of_pooled_runs_uses_all_of_max_sim():
+    """Three runs meet their share of the target early, all together they miss it at first."""
+    problem, method = half_space(2, 3.0).problem, samplers.MonteCarlo(batch=1000)
+    budget = (1 - half_space(2, 3.0).p) / half_space(2, 3.0).p / 0.05**2
+    missed = samplers.estimate(problem, method, seed=1, target_cov=0.05, replicates=3, max_sim=int(budget / 2) + 7)
+    assert missed.n_sim == int(budget / 2) + 7
+    assert missed.status == "budget"
+    met = samplers.estimate(problem, method, seed=1, target_cov=0.05, replicates=3, max_sim=2 * int(budget))
+    assert met.cov <= 0.05
+    assert met.status == "converged"
+    assert met.n_sim < 1.5 * budget
+
+
+class Fixed:
+    """Up to 400 plain draws, whatever the target; says that they pool, or not."""
+
+    name, stops_at_target = "fixed", False
+
+    def __init__(self, pools):
+        self.pools = pools
+
+    def steps(self, inputs, goal, rng):
+        n = min(400, goal.budget)
+        f = yield rng.standard_normal((n, 2))
+        hits = int(np.count_nonzero(f <= goal.gamma))
+        counts = (hits, n) if self.pools else None
+        p, status = hits / n, samplers.Status.CONVERGED
+        return Outcome(p=p, interval=(0.0, 1.0), cov=binomial_cov(p, n), status=status, counts=counts)
+
+
+@pytest.mark.parametrize(("pools", "n_sim"), [(True, 1000), (False, 800)])
+def test_a_rest_of_max_sim_is_used_where_runs_pool(pools, n_sim):
+    """A run of 200 draws beside two of 400 would spoil a mean, not a pooled share."""
+    problem = half_space(2, 1.0).problem
+    result = samplers.estimate(problem, Fixed(pools), seed=1, target_cov=0.01, replicates=2, max_sim=1000)
+    assert result.n_sim == n_sim
+
+
+def test_runs_that_pool_need_not_be_five():
+    """Hits are binomial: cov^2 = (1 - p) / (p n) is 0.066^2 with 1200 draws, 0.081^2 with 800."""
+    problem = half_space(2, 1.0).problem
+    pooled, mean = (
+        samplers.estimate(problem, Fixed(pools), seed=1, target_cov=0.073, replicates=2) for pools in (True, False)
+    )
+    assert pooled.n_sim == 1200
+    assert mean.n_sim >= 2000
+
+
+def test_one_run_at_the_limit_of_its_method_is_not_the_end():
+    method, target, share = samplers.MonteCarlo(n=1000), 0.12, 0.12 * math.sqrt(3)
+    gone_on = 0
+    for seed in range(20):
+        result = samplers.estimate(half_space(2, 2.0).problem, method, seed=seed, target_cov=target, replicates=3)
+        at_limit = sum(level.cov > share for level in result.trace)
+        assert (result.status == "converged") == (result.cov <= target)
+        assert result.cov <= target or at_limit == 3
+        gone_on += len(result.trace) > 3 and at_limit > 0
+    assert gone_on > 0
+
+
+@pytest.mark.parametrize("method", ["mc", "ce"])
+@pytest.mark.parametrize("replicates", [2, 3])
+def test_target_cov_with_replicates_is_met(method, replicates):
+    """The runs meet target_cov sqrt(R) each; their spread, or where they stopped, may still miss the target."""
+    target = {"mc": 0.2, "ce": 0.02}[method]
+    runs = []
+    for seed in range(12):
+        result = samplers.estimate(half_space().problem, method, seed=seed, target_cov=target, replicates=replicates)
+        assert result.cov <= target, seed
+        assert result.status == "converged"
+        runs.append(max(level.run for level in result.trace) + 1)
+    assert replicates in runs
+    assert max(runs) <= 20
+
+
+def test_a_target_out_of_reach_is_given_up_at_the_limit_of_the_method():
+    method = samplers.MonteCarlo(n=1000)
+    result = samplers.estimate(half_space().problem, method, seed=1, target_cov=0.01, replicates=3)
+    assert result.n_sim == 3000
+
+
+def test_target_cov_is_given_up_after_200_runs():
+    method = samplers.AdaptiveSubsetSimulation(n=10)
+    result = samplers.estimate(half_space(2, 2.0).problem, method, seed=1, target_cov=1e-3)
+    assert max(level.run for level in result.trace) + 1 == 200
+    assert result.status == "budget"
+
+
+def stopped_after(batches, method, **options):
+    """The result of a run that is stopped after so many batches, and the run."""
+    problem = half_space(2, 2.0).problem
+    run = Run(problem, method, RunArguments(seed=1, **options))
+    for _ in range(batches):
+        run.tell(problem.evaluate(run.ask()))
+    return run.result()
+
+
+def test_replicates_stopped_on_their_way():
+    result = stopped_after(2, samplers.MonteCarlo(batch=100), replicates=3, max_sim=5000)
+    assert (result.n_sim, result.status) == (600, "stopped")
+    assert result.p == result.failures.total / 600
+    assert result.interval == clopper_pearson(result.failures.total, 600, 0.95)
+    assert len(result.sample.f) == 600
+
+
+def test_stopped_while_further_runs_are_made_for_the_target():
+    """Two runs of 400 draws, then one more at a time: the third had not been told a thing, or is left out."""
+    first = stopped_after(1, Fixed(False), replicates=2, target_cov=0.01)
+    assert (first.n_sim, first.status) == (800, "stopped")
+    assert not any("left out" in text for text in first.warnings)
+    pooled = stopped_after(2, Fixed(True), replicates=2, target_cov=0.01)
+    assert pooled.n_sim == 1200
+    assert pooled.interval == clopper_pearson(pooled.failures.total, 1200, 0.95)
