@@ -14,6 +14,7 @@ import rare_envs
 import samplers
 import training
 from rare_envs.problem import POLICY_TILE
+from rare_envs.scenarios.registry import SCENARIOS
 
 
 class Constant:
@@ -187,3 +188,13 @@ def test_p_is_conditional_on_fixed_noise_and_says_so() -> None:
         problem = rare_envs.DrivingProblem("rare_envs/CutIn-v0", drivers=drivers, noise=noise, horizon=1.0)
         result = samplers.estimate(problem, "mc", gamma=2.0, seed=0, max_sim=50)
         assert ("given that the drivers' noise is one fixed sequence and" in str(result)) == given
+
+
+@pytest.mark.parametrize("env_id", [env_id for env_id in SCENARIOS if SCENARIOS[env_id].drivers is None])
+def test_a_row_does_not_depend_on_its_batch(env_id: str) -> None:
+    problem = rare_envs.DrivingProblem(env_id)
+    x = problem.base.sample(300, np.random.default_rng(2))
+    f = problem.evaluate(x)
+    for n in (1, 7, 33):
+        np.testing.assert_array_equal(problem.evaluate(x[:n]), f[:n])
+    np.testing.assert_array_equal(problem.evaluate(x[::-1])[::-1], f)

@@ -14,8 +14,6 @@ from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from stable_baselines3.common.vec_env import VecFrameStack
 
 import rare_envs
-from rare_envs.egos.wrappers import find_frame_stacking
-from rare_envs.envs.multi_agent_vector import AgentsVectorEnv
 from rare_envs.problem import CAMERA_TILE
 from rare_envs.sensors.camera import Camera
 from rare_envs.sensors.kinds import map_kinds, read_kinds
@@ -146,19 +144,6 @@ def test_stacked_frames_of_a_camera() -> None:
     assert infos[0]["measure"] == pytest.approx(f[0], abs=1e-5)
 
 
-def test_frames_of_spaces() -> None:
-    image, row = spaces.Box(0, 255, (*SMALL, 3), np.uint8), spaces.Box(-5.0, 5.0, (51,))
-    first = spaces.Box(0, 255, (6, *SMALL), np.uint8)
-    assert find_frame_stacking(image, image) == (1, False)
-    assert find_frame_stacking(image, first) == (2, False)
-    assert find_frame_stacking(row, spaces.Box(-5.0, 5.0, (102,))) == (2, False)
-    both = spaces.Dict({"camera": image, "lidar": row})
-    assert find_frame_stacking(both, both) == (1, False)
-    assert find_frame_stacking(both, spaces.Dict({"camera": first, "lidar": row})) is None  # not the same number
-    assert find_frame_stacking(both, spaces.Dict({"camera": image})) is None
-    assert find_frame_stacking(both, image) is None
-
-
 def test_a_camera_on_every_agent() -> None:
     env = rare_envs.parallel_env(CUT_IN, observation="camera", weather=True)
     pictures, infos = env.reset(seed=1, options={"sensor_noise": 0.0, "fog": 1e-4})
@@ -168,30 +153,6 @@ def test_a_camera_on_every_agent() -> None:
     red = {agent: (p[:, :, 0] > 2.5 * p[:, :, 1].astype(float)).sum() for agent, p in pictures.items()}
     assert red["ego"] > 20  # the cutter, vehicle 1, is red for everybody else
     assert red["cutter"] == red["lead"] == 0
-
-
-def test_a_batch_of_agents_that_see() -> None:
-    """Rows of agents that share a policy: what each sees in its place, also at the end of an episode."""
-    settings: dict[str, Any] = {"observation": "camera+features", "camera": SMALL, "horizon": 0.2}
-    batch, env = AgentsVectorEnv(CUT_IN, 2, **settings), rare_envs.parallel_env(CUT_IN, **settings)
-    x = batch.space.sample(2, np.random.default_rng(0))
-    seen, _ = batch.reset(options={"x": x})
-    assert batch.observation_space.contains(seen)
-    alone, _ = env.reset(options={"x": x[1]})
-    for number, agent in enumerate(env.agents):
-        map_kinds(np.testing.assert_array_equal, map_kinds(lambda part, row=3 + number: part[row], seen), alone[agent])
-    for _ in range(2):
-        seen, _, _, truncated, infos = batch.step(np.zeros((batch.num_envs, 2)))
-        alone, *_ = env.step(dict.fromkeys(env.agents, np.zeros(2)))
-    assert truncated.all()
-    for number, agent in enumerate(env.possible_agents):
-        map_kinds(np.testing.assert_array_equal, infos["final_obs"][3 + number], alone[agent])
-
-
-def test_a_network_that_does_not_transpose_is_not_taken_for_one_that_does() -> None:
-    image = spaces.Box(0, 255, (*SMALL, 3), np.uint8)
-    assert find_frame_stacking(image, spaces.Box(-np.inf, np.inf, (3, *SMALL))) is None  # an .onnx file's
-    assert find_frame_stacking(image, spaces.Box(-np.inf, np.inf, (*SMALL, 3))) == (1, False)
 
 
 def test_an_ego_for_other_pictures_is_refused() -> None:

@@ -6,14 +6,11 @@ from functools import partial
 import gymnasium as gym
 import numpy as np
 import pytest
-import torch
 from gymnasium.utils.env_checker import data_equivalence
 from pettingzoo.utils import parallel_to_aec
 
 import rare_envs
-from rare_envs.make import set_up
-from rare_envs.multi_agent.episode import start, step_traffic
-from rare_envs.multi_agent.rewards import adversary_reward, own_reward
+from rare_envs.multi_agent.rewards import own_reward
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # PettingZoo's test module imports what PettingZoo has deprecated
@@ -134,73 +131,6 @@ def test_a_vehicle_off_the_road_is_its_own_collision():
     assert infos["lead"]["collision_type"] == "road_edge"
     assert not infos["ego"]["collision"]
     assert env.agents == ["ego"]
-
-
-def test_rewards_are_those_of_an_ego_in_each_place():
-    """Car-following seen by the lead: nobody ahead, so no risk and no headway; its own speed and effort."""
-    env = rare_envs.parallel_env(FOLLOWING)
-    env.reset(options={"x": [20.0, 15.0, 14.5]})
-    _, rewards, *_, infos = env.step({"ego": np.array([0.5, 0.0]), "lead": np.array([-0.5, 0.0])})
-    terms = infos["lead"]["reward_terms"]
-    assert terms == pytest.approx(
-        {"progress": 14.75 / 21.72, "comfort": -0.025, "lane": 0, "risk": 0, "headway": 0, "collision": 0}, abs=1e-6
-    )
-    assert rewards["lead"] == pytest.approx(sum(terms.values()), abs=1e-6)
-    risk = -(1.0 - (14.0 / 5.5) / 4.0)  # closing at 20.25 - 14.75
-    assert infos["ego"]["reward_terms"]["risk"] == pytest.approx(risk, abs=1e-6)
-
-
-def test_the_adversarys_reward_by_hand():
-    env = rare_envs.parallel_env(FOLLOWING, agents=["lead"], rewards={"lead": adversary_reward})
-    env.reset(options={"x": [20.0, 15.0, 14.5]})
-    *_, infos = env.step({"lead": np.array([-1.0, 0.0])})
-    terms = infos["lead"]["reward_terms"]
-    speed = float(env.state()[0, 3])  # of the ego, which IDM brakes
-    assert terms["danger"] == pytest.approx(1.0 - 14.0 / (speed - 14.5) / 4.0, abs=1e-5)
-    assert terms["comfort"] == pytest.approx(-0.1)
-    assert (terms["collision"], terms["fault"]) == (0.0, 0.0)
-    env.reset(options={"x": [20.0, 15.0, 2.0]})
-    while env.agents:
-        *_, infos = env.step({"lead": np.array([-1.0, 0.0])})
-    assert (infos["lead"]["reward_terms"]["collision"], infos["lead"]["reward_terms"]["fault"]) == (30.0, 0.0)
-    env.reset(options={"x": [20.0, 20.0, 100.0]})
-    while env.agents:
-        *_, infos = env.step({"lead": np.array([0.0, 1.0])})
-    assert (infos["lead"]["reward_terms"]["collision"], infos["lead"]["reward_terms"]["fault"]) == (0.0, -30.0)
-
-
-def test_a_row_of_a_batch_is_the_episode_alone():
-    world, space = set_up(CUT_IN, horizon=5.0)
-    x = torch.from_numpy(space.sample(32, np.random.default_rng(0))).float()
-    rng = torch.Generator().manual_seed(0)
-    action = torch.rand(50, 32, 3, 2, generator=rng) * torch.tensor([8.0, 0.04]) - torch.tensor([4.0, 0.02])
-    commanded = torch.rand(50, 32, 3, generator=rng) < 0.5
-    together = start(world, x)
-    alone = [start(world, x[k : k + 1]) for k in range(4)]
-    for t in range(50):
-        together = step_traffic(world, together, action[t], commanded[t])
-        for k in range(4):
-            alone[k] = step_traffic(world, alone[k], action[t, k : k + 1], commanded[t, k : k + 1])
-            for view, own in zip(together.views, alone[k].views, strict=True):
-                assert torch.equal(view.f[k], own.f[0])
-                assert torch.equal(view.state.x[k], own.state.x[0])
-            assert torch.equal(together.disabled[k], alone[k].disabled[0])
-    assert together.disabled.any()
-    assert not together.disabled.all()
-
-
-def test_contacts_of_others_are_noted_and_change_nothing():
-    """A cutter much faster than the lead runs into it while the ego is far behind: as in the environment of one."""
-    world, _ = set_up(CUT_IN)
-    x = torch.tensor([[5.0, 40.0, 5.0, 60.0, 60.0, 2.2]])
-    crowd, episode = start(world, x), world.start(x)
-    nobody = torch.zeros(1, 3, dtype=torch.bool)
-    for _ in range(60):
-        crowd = step_traffic(world, crowd, torch.zeros(1, 3, 2), nobody)
-        episode = world.step(episode, torch.zeros(1, 2))
-    assert crowd.collided.tolist() == [[False, True, True]]
-    assert not crowd.disabled.any()
-    assert torch.equal(crowd.traffic.state.x, episode.state.x)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,6 @@ from rare_envs.distributions.product import NoiseDistribution, ProductDistributi
 from rare_envs.measures import TTC_MAX, Moment, lidar_ttc
 from rare_envs.scenarios.highway import START_LANES
 from rare_envs.sensors.perception import perceive_traffic
-from rare_envs.simulation.background import BackgroundState, fixed_draws, step_background
 from rare_envs.simulation.rollout import drive
 from rare_envs.traffic.road import i80
 
@@ -112,35 +111,6 @@ def test_noise_and_weights_matter_and_nothing_else_is_random():
         at = problem.space._slices[problem.space.names.index(name)]
         other[:, at] = draw(problem, 32, seed=1)[:, at]
         assert np.mean(problem.evaluate(other) != f) > 0.5
-
-
-def test_fixed_noise_is_one_sequence_and_no_noise_is_none():
-    drivers = agents.load_driver("mgail")
-    features = torch.randn(3, 5, 51)
-    draws = fixed_draws(7, 5)
-    torch.testing.assert_close(draws, fixed_draws(7, 5))
-    quiet = BackgroundState.start(drivers, torch.zeros(3, 0), torch.zeros(3, 0, 5, 2))
-    torch.testing.assert_close(step_background(drivers, quiet, features)[0], drivers.act(features)[0])
-    noisy = BackgroundState.start(drivers, torch.zeros(3, 0), draws.expand(3, -1, -1, -1).float())
-    action, after = step_background(drivers, noisy, features)
-    memory = drivers.begin(draws[:, :2].movedim(1, -1).expand(3, -1, -1, -1).float())
-    expected, _ = drivers.act(features, None, draws[:, 2].expand(3, -1, -1).float(), memory)
-    torch.testing.assert_close(action, expected)
-    assert isinstance(after, BackgroundState)
-    assert after.tick.tolist() == [1, 1, 1]
-
-
-def test_rows_of_a_batch_may_be_at_different_ticks():
-    """As after an episode of a vector environment was replaced."""
-    drivers = agents.load_driver("mgail")
-    draws = torch.randn(2, 6, 5, 2)
-    minds = BackgroundState.start(drivers, torch.zeros(2, 0), draws)
-    features = torch.randn(2, 5, 51)
-    _, later = step_background(drivers, minds, features)
-    mixed = BackgroundState(*(torch.stack((a[0], b[1])) for a, b in zip(minds, later, strict=True)))
-    action, _ = step_background(drivers, mixed, features)
-    torch.testing.assert_close(action[0], step_background(drivers, minds, features)[0][0], rtol=1e-5, atol=1e-5)
-    torch.testing.assert_close(action[1], step_background(drivers, later, features)[0][1], rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize("env_id", [env_id for env_id in rare_envs.ENV_IDS if env_id != HIGHWAY])

@@ -1,4 +1,4 @@
-"""Commands to vehicles around the ego, contacts of any two vehicles, and what any vehicle observes."""
+"""Vehicles around the ego that take actions, and what drives them afterwards."""
 
 import numpy as np
 import pytest
@@ -6,8 +6,6 @@ import torch
 
 import rare_envs
 from rare_envs.make import set_up
-from rare_envs.sensors.perception import perceive_traffic
-from rare_envs.simulation.observation import observe
 
 every = pytest.mark.parametrize("env_id", rare_envs.ENV_IDS)
 
@@ -88,22 +86,3 @@ def test_a_vehicle_that_is_commanded_no_longer_goes_on_from_where_it_is(env_id, 
         moved = torch.hypot(episode.state.x - before.x, episode.state.y - before.y)
         assert (moved <= before.speed * world.clock.dt * 1.05 + 1e-3).all()  # the I-80 is longer on its outer lanes
         assert ((episode.state.speed - before.speed).abs() <= 1.0).all()
-
-
-def test_what_the_cutter_observes_by_hand():
-    world, _ = start("rare_envs/CutIn-v0", n=1)
-    episode = world.start(torch.tensor([[20.0, 15.0, 18.0, 10.0, 30.0, 3.6]]))
-    ego, lead = [-20 / 50, 5 / 10, -3.6 / 4, 0.0], [30 / 50, 3 / 10, -3.6 / 4, 0.0]
-    seen = observe(episode, "features", vehicle=1)[0]
-    np.testing.assert_allclose(seen, [15 / 30, 3.6 / 4, 0.0, *ego, *lead], rtol=1e-6, atol=1e-7)
-
-
-@every
-def test_every_vehicle_observes_what_an_ego_in_its_place_would(env_id):
-    world, episode = start(env_id, observation="lidar", horizon=1.0)
-    for vehicle in range(world.scenario.vehicles):
-        state = episode.state.seen_by(vehicle)
-        looking = perceive_traffic(state, world.scenario.road)
-        as_ego = episode._replace(state=state, perception=looking)
-        for observation in ("features", "lidar"):
-            torch.testing.assert_close(observe(episode, observation, vehicle), observe(as_ego, observation))

@@ -1,0 +1,92 @@
+"""The environment of one: conformance with Gymnasium and Stable-Baselines3, and agreement with rollout."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from stable_baselines3.common.env_checker import check_env as sb3_check_env
+
+import rare_envs
+from rare_envs.control.idm import IDM
+from rare_envs.scenarios.registry import SCENARIOS
+
+ids = pytest.mark.parametrize("env_id", rare_envs.ENV_IDS)
+SCRIPTED_IDS = [env_id for env_id, scenario in SCENARIOS.items() if scenario.drivers is None]
+scripted = pytest.mark.parametrize("env_id", SCRIPTED_IDS)  # no network, so batch sizes change no bit
+
+
+@ids
+def test_gymnasium_checker(env_id: str) -> None:
+    check_env(gym.make(env_id).unwrapped, skip_render_check=True)
+
+
+@ids
+def test_stable_baselines3_checker(env_id: str) -> None:
+    sb3_check_env(gym.make(env_id))
+
+
+@scripted
+def test_env_and_rollout_agree_bit_for_bit_with_a_rule_based_ego(env_id: str) -> None:
+    problem = rare_envs.DrivingProblem(env_id)
+    x = problem.base.sample(2_000, np.random.default_rng(5))
+    f = problem.evaluate(x)
+    env = gym.make(env_id)
+    low = np.argsort(f)[[0, 1, 2, 5, 20, 100]]
+    for row in [*low, 0]:
+        env.reset(options={"x": x[row]})
+        done = False
+        while not done:
+            # the physical action, not its float32 image in [-1, 1], which rounds
+            episode = env.unwrapped._episode  # type: ignore[attr-defined]
+            action = IDM().act(episode, None)[0]
+            env.unwrapped._episode = env.unwrapped.world.step(episode, action)  # type: ignore[attr-defined]
+            env.unwrapped._tick += 1  # type: ignore[attr-defined]
+            done = bool(env.unwrapped._episode.collided) or env.unwrapped._tick == env.unwrapped.world.clock.ticks  # type: ignore[attr-defined]
+        assert float(env.unwrapped._episode.f) == f[row]  # type: ignore[attr-defined]
+
+
+@scripted
+def test_info_at_start_and_end(env_id: str) -> None:
+    env = gym.make(env_id)
+    _, info = env.reset(seed=3)
+    space = env.unwrapped.space  # type: ignore[attr-defined]
+    assert info["scenario"] == dict(zip(space.names, info["x"].tolist(), strict=True))
+    assert not {"measure", "collision_type"} & info.keys()
+    done = False
+    while not done:
+        _, reward, terminated, truncated, info = env.step(np.array([1.0, 0.0], np.float32))
+        assert reward == pytest.approx(sum(info["reward_terms"].values()), rel=1e-5)
+        done = terminated or truncated
+    assert {"scenario", "x", "min_ttc", "collision", "measure", "collision_type"} <= info.keys()
+    assert terminated  # full throttle runs into the lead
+    assert (info["measure"], info["min_ttc"]) == (-1.0, 0.0)
+    assert info["collision_type"] in ("rear_end", "side")
+
+
+@scripted
+def test_reset_options(env_id: str) -> None:
+    env = gym.make(env_id)
+    name = env.unwrapped.space.names[0]  # type: ignore[attr-defined]
+    _, free = env.reset(seed=11)
+    _, given = env.reset(seed=11, options={name: 12.5})
+    assert given["scenario"][name] == 12.5
+    assert np.array_equal(given["x"][1:], free["x"][1:])  # the others are drawn as without the option
+    _, again = env.reset(options={"x": free["x"]})
+    np.testing.assert_array_equal(again["x"], free["x"])
+    with pytest.raises(ValueError, match=rf"{name}.*range.*m/s"):
+        env.reset(options={name: -1.0})
+    with pytest.raises(ValueError, match=rf"did you mean '{name}'"):
+        env.reset(options={f"{name}_": 12.5})
+    with pytest.raises(ValueError, match=name):
+        env.reset(options={name: float("nan")})
+    with pytest.raises(ValueError, match="shape"):
+        env.reset(options={"x": [1.0, 2.0]})
+
+
+def test_wrong_actions_are_refused_and_the_episode_goes_on() -> None:
+    env = gym.make("rare_envs/CarFollowing-v0").unwrapped
+    env.reset(seed=0)
+    for action in (1, np.zeros(3), np.zeros((1, 2)), [np.nan, 0.0]):
+        with pytest.raises(ValueError, match=r"shape \(2,\)|NaN"):
+            env.step(action)
+    assert env.step([0.0, 0.0])[4]["x"].shape == (3,)

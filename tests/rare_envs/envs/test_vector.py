@@ -1,0 +1,135 @@
+"""The batched environment: agreement with the environment of one and with rollout, and its autoreset."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import rare_envs
+from rare_envs.envs.vector import DrivingVectorEnv
+from rare_envs.scenarios.registry import SCENARIOS
+
+ids = pytest.mark.parametrize("env_id", rare_envs.ENV_IDS)
+SCRIPTED_IDS = [env_id for env_id, scenario in SCENARIOS.items() if scenario.drivers is None]
+scripted = pytest.mark.parametrize("env_id", SCRIPTED_IDS)  # no network, so batch sizes change no bit
+
+
+class Scripted:
+    """An ego with SB3's `predict`: a fixed sequence of actions, then the last one for ever."""
+
+    def __init__(self, actions: NDArray[np.float64]) -> None:
+        self.actions = actions
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
+    ) -> Any:
+        tick = 0 if state is None else state[0]
+        action = self.actions[min(tick, len(self.actions) - 1)]
+        return np.repeat(action[None], len(observation), axis=0), (tick + 1,)
+
+
+def scripted_actions(seed: int = 0) -> NDArray[np.float64]:
+    rng = np.random.default_rng(seed)
+    return np.stack([rng.uniform(-0.7, 1.0, 100), rng.uniform(-0.05, 0.05, 100)], axis=1)
+
+
+@scripted
+def test_env_vector_env_and_rollout_agree_on_the_same_x_and_actions(env_id: str) -> None:
+    actions = scripted_actions()
+    problem = rare_envs.DrivingProblem(env_id, ego=Scripted(actions), horizon=5.0)
+    x = problem.base.sample(64, np.random.default_rng(1))
+    f = problem.evaluate(x)
+    assert (f == -1.0).any()
+    assert (f > 0.0).any()
+
+    batch = rare_envs.make_batch(env_id, len(x), horizon=5.0)
+    batch.reset(options={"x": x})
+    measured = np.full(len(x), np.nan)
+    observations = []
+    for action in actions:
+        observation, reward, terminated, truncated, infos = batch.step(np.repeat(action[None], len(x), axis=0))
+        observations.append((observation, reward, infos))
+        first = (terminated | truncated) & np.isnan(measured)
+        measured[first] = infos["final_info"]["measure"][first] if first.any() else np.nan
+    np.testing.assert_array_equal(measured, f)
+
+    env = gym.make(env_id, horizon=5.0)
+    for row in range(8):
+        env.reset(options={"x": x[row]})
+        for tick, action in enumerate(actions):
+            observation, reward, terminated, truncated, info = env.step(action)
+            if terminated or truncated:
+                assert info["measure"] == f[row]
+                assert info["collision"] == (f[row] == -1.0) == terminated
+                np.testing.assert_array_equal(observation, observations[tick][2]["final_obs"][row])
+                break
+            np.testing.assert_array_equal(observation, observations[tick][0][row])
+            assert reward == pytest.approx(observations[tick][1][row], rel=1e-6)
+            assert info["min_ttc"] == observations[tick][2]["min_ttc"][row]
+
+
+@ids
+def test_same_seed_same_episodes(env_id: str) -> None:
+    runs = []
+    for _ in range(2):
+        batch = rare_envs.make_batch(env_id, 16, horizon=3.0)
+        observation, _ = batch.reset(seed=4)
+        rows = [observation]
+        batch.action_space.seed(0)
+        for _ in range(50):
+            rows.append(batch.step(batch.action_space.sample())[0])
+        runs.append(np.array(rows))
+    np.testing.assert_array_equal(*runs)
+
+
+@ids
+def test_vector_env_replaces_ended_episodes_in_the_same_step(env_id: str) -> None:
+    batch = gym.make_vec(env_id, num_envs=32)  # the batched entry point is the default
+    assert isinstance(batch.unwrapped, DrivingVectorEnv)
+    assert batch.metadata["autoreset_mode"] == gym.vector.AutoresetMode.SAME_STEP
+    batch.reset(seed=0)
+    ended = 0
+    for _ in range(120):
+        x = batch.unwrapped._x.copy()
+        observation, _, terminated, truncated, infos = batch.step(np.tile(np.array([0.4, 0.0], np.float32), (32, 1)))
+        done = terminated | truncated
+        assert observation in batch.observation_space
+        np.testing.assert_array_equal((batch.unwrapped._x != x).any(axis=1), done)
+        if done.any():
+            np.testing.assert_array_equal(infos["_final_info"], done)
+            assert [row is not None for row in infos["final_obs"]] == done.tolist()
+            np.testing.assert_array_equal(infos["final_info"]["collision"][done], terminated[done])
+            np.testing.assert_array_equal(infos["final_info"]["x"][done], x[done])
+            ended += int(done.sum())
+    assert ended >= 32
+
+
+@scripted
+def test_episodes_after_a_replacement_are_those_of_the_single_env(env_id: str) -> None:
+    """Nothing of an ended episode, not its clock and not its least time to collision, is left in the next."""
+    batch, env = rare_envs.make_batch(env_id, 6, horizon=3.0), gym.make(env_id, horizon=3.0)
+    observation, infos = batch.reset(seed=5)
+    rng = np.random.default_rng(0)
+    x, given = infos["x"].copy(), [[] for _ in range(6)]  # type: ignore[var-annotated]
+    lives = np.zeros(6, dtype=int)
+    for _ in range(120):
+        actions = np.stack([rng.uniform(-0.2, 1.0, 6), rng.uniform(-0.2, 0.2, 6)], axis=1)
+        for row in range(6):
+            given[row].append(actions[row])
+        observation, reward, terminated, truncated, infos = batch.step(actions)
+        for row in np.flatnonzero(terminated | truncated):
+            env.reset(options={"x": x[row]})
+            for action in given[row]:
+                last = env.step(action)
+            final = infos["final_info"]
+            np.testing.assert_array_equal(last[0], infos["final_obs"][row])
+            assert last[1] == pytest.approx(reward[row], rel=1e-6)
+            assert last[2:4] == (terminated[row], truncated[row])
+            assert last[4]["measure"] == final["measure"][row]
+            assert last[4]["min_ttc"] == final["min_ttc"][row]
+            assert last[4]["collision_type"] == final["collision_type"][row]
+            x[row], given[row], lives[row] = infos["x"][row], [], lives[row] + 1
+            np.testing.assert_array_equal(env.reset(options={"x": x[row]})[0], observation[row])
+    assert lives.min() >= 3

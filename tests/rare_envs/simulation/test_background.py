@@ -1,0 +1,57 @@
+"""Background drivers: their noise, their clock, and how they are named."""
+
+import pytest
+import torch
+
+import agents
+from rare_envs.simulation.background import (
+    FIRST_DRAWS,
+    BackgroundState,
+    find_drivers,
+    fixed_draws,
+    noise_size,
+    step_background,
+)
+
+
+def test_fixed_noise_is_one_sequence_and_no_noise_is_none():
+    drivers = agents.load_driver("mgail")
+    features = torch.randn(3, 5, 51)
+    draws = fixed_draws(7, 5)
+    torch.testing.assert_close(draws, fixed_draws(7, 5))
+    quiet = BackgroundState.start(drivers, torch.zeros(3, 0), torch.zeros(3, 0, 5, 2))
+    torch.testing.assert_close(step_background(drivers, quiet, features)[0], drivers.act(features)[0])
+    noisy = BackgroundState.start(drivers, torch.zeros(3, 0), draws.expand(3, -1, -1, -1).float())
+    action, after = step_background(drivers, noisy, features)
+    memory = drivers.begin(draws[:, :2].movedim(1, -1).expand(3, -1, -1, -1).float())
+    expected, _ = drivers.act(features, None, draws[:, 2].expand(3, -1, -1).float(), memory)
+    torch.testing.assert_close(action, expected)
+    assert isinstance(after, BackgroundState)
+    assert after.tick.tolist() == [1, 1, 1]
+
+
+def test_rows_of_a_batch_may_be_at_different_ticks():
+    """As after an episode of a vector environment was replaced."""
+    drivers = agents.load_driver("mgail")
+    draws = torch.randn(2, 6, 5, 2)
+    first = BackgroundState.start(drivers, torch.zeros(2, 0), draws)
+    features = torch.randn(2, 5, 51)
+    _, later = step_background(drivers, first, features)
+    mixed = BackgroundState(*(torch.stack((a[0], b[1])) for a, b in zip(first, later, strict=True)))
+    action, _ = step_background(drivers, mixed, features)
+    torch.testing.assert_close(action[0], step_background(drivers, first, features)[0][0], rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(action[1], step_background(drivers, later, features)[0][1], rtol=1e-5, atol=1e-5)
+
+
+def test_draws_are_two_for_each_vehicle_and_tick_and_four_for_the_start():
+    assert noise_size(100, 5) == (2 + 100) * 5 * 2 == fixed_draws(100, 5).numel()
+    assert FIRST_DRAWS == 2
+
+
+def test_drivers_are_found_by_name_and_wrong_names_refused():
+    assert find_drivers(None) is None
+    driver = agents.load_driver("mgail")
+    assert find_drivers(driver) is driver
+    for wrong, message in (("mgial", "did you mean 'mgail'"), (3, "weights, begin and act")):
+        with pytest.raises(ValueError, match=message):
+            find_drivers(wrong)

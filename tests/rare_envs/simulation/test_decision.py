@@ -1,0 +1,47 @@
+"""A decision: one tick, or the ticks of a meta-action with the mean of their rewards."""
+
+import pytest
+import torch
+
+from rare_envs.control.actions import IDLE
+from rare_envs.scenarios.car_following import CAR_FOLLOWING
+from rare_envs.simulation.clock import Clock
+from rare_envs.simulation.decision import advance, hold_finished
+from rare_envs.simulation.reward import reward_terms
+from rare_envs.simulation.world import World
+
+
+def test_a_continuous_action_is_one_tick() -> None:
+    world = World(CAR_FOLLOWING)
+    episode = world.start(torch.tensor([[20.0, 15.0, 30.0]]))
+    action = torch.tensor([[1.0, 0.0]])
+    result, expected = advance(world, episode, action), world.step(episode, action)
+    assert torch.equal(result.episode.state.x, expected.state.x)
+    assert torch.equal(result.terms.total, reward_terms(expected, action).total)
+
+
+def test_the_reward_of_a_meta_action_is_the_mean_over_its_ticks() -> None:
+    """20 m/s is a target speed, so the ego coasts; ticks after a collision count as 0."""
+    world = World(CAR_FOLLOWING, clock=Clock(horizon=2.0, action="meta"))
+    episode = world.start(torch.tensor([[20.0, 10.0, 80.0], [20.0, 10.0, 3.5]]))
+    seen = []
+    result = advance(world, episode, torch.tensor([IDLE, IDLE]), watch=seen.append)
+    assert len(seen) == 10
+    assert float(result.terms.progress[0]) == pytest.approx(20.0 / 21.72)
+    # 3.5 m at 10 m/s: the bodies overlap after the fourth tick
+    assert result.episode.collided.tolist() == [False, True]
+    assert float(result.terms.progress[1]) == pytest.approx(0.4 * 20.0 / 21.72)
+    assert float(result.terms.collision[1]) == pytest.approx(-3.0)
+    assert torch.equal(result.episode.state.x[1], seen[3].state.x[1])  # it stays as it was then
+
+
+def test_finished_episodes_are_held() -> None:
+    world = World(CAR_FOLLOWING)
+    old = world.start(torch.tensor([[20.0, 15.0, 30.0], [20.0, 15.0, 30.0]]))
+    new = world.step(old, torch.zeros(2, 2))
+    held = hold_finished(torch.tensor([True, False]), old, new)
+    for before, after, kept in zip(old.state, new.state, held.state, strict=True):
+        assert torch.equal(kept[0], before[0])
+        assert torch.equal(kept[1], after[1])
+    assert float(held.lead.gap[0]) == 30.0
+    assert float(held.lead.gap[1]) == pytest.approx(29.5)
