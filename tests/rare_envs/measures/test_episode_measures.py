@@ -1,68 +1,22 @@
 """From moments to f: what is kept of an episode, wherever it is driven, and what is refused."""
 
-import math
 from collections.abc import Callable
-from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
-import rare_envs
 from rare_envs.measures import (
-    PET_MAX,
-    Measure,
-    Moment,
-    Trace,
-    TraceMeasure,
     minimum,
-    pet,
     stl,
-    ttc,
-    weighted,
     with_collision,
 )
-from rare_envs.measures.registry import MEASURES, find_measure
+from rare_envs.measures.registry import MEASURES
 from rare_envs.simulation.clock import Clock
 from rare_envs.simulation.measurement import Measurement
-from rare_envs.simulation.rollout import drive
 from rare_envs.simulation.world import World
-from rare_envs.traffic.lead import lead_of
-from rare_envs.traffic.road import straight
-from rare_envs.traffic.state import State
-from tests.rare_envs.traffic.slow_boxes import corners
-
-FOLLOWING, CUT_IN = "rare_envs/CarFollowing-v0", "rare_envs/CutIn-v0"
-F64 = torch.float64
-
-
-class Coasting:
-    """An ego that keeps its speed."""
-
-    def predict(self, observation: np.ndarray, **_: object) -> tuple[np.ndarray, None]:
-        return np.zeros((len(observation), 2), dtype=np.float32), None
-
-
-def problem(measure: object, env_id: str = FOLLOWING, **kwargs: object) -> rare_envs.DrivingProblem:
-    return rare_envs.DrivingProblem(env_id, ego=Coasting(), measure=measure, **kwargs)
-
-
-def f(measure: object, *x: float, **kwargs: object) -> float:
-    return float(problem(measure, **kwargs).evaluate(np.array([x]))[0])
-
-
-# 20 m/s behind 10 m/s at 100 m: no collision in 10 s (but at it); at 60 m after 6 s; 10 behind 20: never
-CLOSE, HIT, AWAY = (20.0, 10.0, 100.5), (20.0, 10.0, 60.5), (10.0, 20.0, 30.0)
-
-
-def test_time_exposed_and_integrated() -> None:
-    # at 0.1 k s the TTC is 10.05 - 0.1 k: below 3 s from k = 71 to k = 100
-    assert f("tet", *CLOSE) == pytest.approx(1.0 - 3.0, abs=1e-4)
-    assert f("tit", *CLOSE) == pytest.approx(1.0 - 0.1 * sum(3.0 - (10.05 - 0.1 * k) for k in range(71, 101)), abs=1e-3)
-    assert f("tet", *AWAY) == f("tit", *AWAY) == 1.0
-    assert f("tet", *HIT) == f("tit", *HIT) == -1000.0
+from tests.rare_envs.measures.moments import AWAY, CLOSE, CUT_IN, FOLLOWING, HIT, problem
 
 
 @pytest.mark.parametrize(
@@ -85,118 +39,6 @@ def test_margin_goes_on_past_contact() -> None:
     assert hits == pytest.approx([-5.0, -10.0, -20.0])
     near = problem("margin").evaluate(np.array([[20.0, 10.0, 100.2], [20.0, 10.0, 101.0]]))
     assert 0.0 < near[0] < near[1] < 0.2
-
-
-def trace(*paths: tuple[np.ndarray, np.ndarray, np.ndarray], dt: float = 0.1) -> Trace:
-    """One episode on a wide road: x, y and heading over time of each vehicle, the ego first."""
-    x, y, heading = (torch.from_numpy(np.stack(each, axis=1)[:, None]) for each in zip(*paths, strict=True))
-    state = State(x, y, heading, torch.zeros_like(x), torch.zeros(len(x), 1, 0, dtype=F64))
-    lead = lead_of(State(*(each[:, 0] for each in state)), straight(9))
-    valid = torch.ones(len(x), 1, dtype=torch.bool)
-    shaped = lead._replace(gap=lead.gap[:, None], closing_speed=lead.closing_speed[:, None])
-    return Trace(state, shaped, straight(9), None, valid, torch.zeros(1, dtype=torch.bool), dt)
-
-
-def line(x: float, y: float, heading: float, speed: float, dt: float = 0.1) -> tuple[np.ndarray, ...]:
-    time = np.arange(round(4.0 / dt) + 1) * dt
-    return x + speed * math.cos(heading) * time, y + speed * math.sin(heading) * time, np.full_like(time, heading)
-
-
-def test_post_encroachment_time_by_hand() -> None:
-    # in the lead's place gap / speed later, whatever the lead's speed
-    assert pet(trace(line(0.0, 0.0, 0.0, 20.0), line(17.3, 0.0, 0.0, 20.0))).item() == pytest.approx(12.3 / 20.0)
-    # the same with the ego in front, and another vehicle far away
-    behind, far = line(-17.3, 0.0, 0.0, 20.0), line(0.0, 100.0, 0.0, 20.0)
-    assert pet(trace(line(0.0, 0.0, 0.0, 20.0), behind, far)).item() == pytest.approx(12.3 / 20.0)
-    assert pet(trace(line(0.0, 0.0, 0.0, 20.0), far)).item() == PET_MAX
-    # at right angles: the other has left the ego's lane after (1 + 2.5) m / 10 m/s, the ego's front reaches it after
-    # (20 - 1 - 2.5) m / 10 m/s
-    across = line(20.0, 0.0, math.pi / 2, 10.0)
-    assert pet(trace(line(0.0, 0.0, 0.0, 10.0), across)).item() == pytest.approx(1.65 - 0.35, abs=1e-4)
-    assert pet(trace(across, line(0.0, 0.0, 0.0, 10.0))).item() == pytest.approx(1.65 - 0.35, abs=1e-4)
-
-
-def inside(points: np.ndarray, x: np.ndarray, y: np.ndarray, heading: np.ndarray) -> np.ndarray:
-    dx, dy = points[..., 0] - x, points[..., 1] - y
-    along, across = dx * np.cos(heading) + dy * np.sin(heading), dy * np.cos(heading) - dx * np.sin(heading)
-    return (np.abs(along) < 2.5) & (np.abs(across) < 1.0)
-
-
-def outline(x: float, y: float, heading: float) -> np.ndarray:
-    a = corners(x, y, heading)
-    share = np.linspace(0.0, 1.0, 15)[:, None]
-    return np.concatenate([p + share * (q - p) for p, q in zip(a, np.roll(a, -1, axis=0), strict=True)])
-
-
-def test_post_encroachment_time_is_the_least_delay_with_an_overlap() -> None:
-    """Against every pair of moments on a grid of 0.02 s, and points on the bodies' outlines."""
-    rng = np.random.default_rng(4)
-    for _ in range(8):
-        speeds, angle = rng.uniform(6.0, 12.0, 2), rng.uniform(0.3, 2.8)
-        start = (20.0 + rng.uniform(-8, 8), -15.0 * math.sin(angle) + rng.uniform(-3, 3))
-        fast = [line(0.0, 0.0, 0.0, speeds[0], 0.02), line(*start, angle, speeds[1], 0.02)]
-        bodies = [np.stack([outline(*pose) for pose in zip(*each, strict=True)]) for each in fast]
-        touch = np.zeros((len(fast[0][0]),) * 2, dtype=bool)
-        for k in range(len(touch)):
-            touch[k] = inside(bodies[1], *(each[k] for each in fast[0])).any(1)
-            touch[:, k] |= inside(bodies[0], *(each[k] for each in fast[1])).any(1)
-        ego, other = np.nonzero(touch)
-        slow = np.abs(ego - other).min() * 0.02 if len(ego) else PET_MAX
-        found = pet(trace(line(0.0, 0.0, 0.0, speeds[0]), line(*start, angle, speeds[1]))).item()
-        if slow > 0.02:
-            assert found == pytest.approx(slow, abs=0.04)
-
-
-def test_combinations() -> None:
-    x = np.array([HIT, CLOSE, AWAY, (15.0, 14.0, 13.0)])
-    of = {name: problem(name).evaluate(x) for name in ("ttc", "drac", "thw", "tet", "pet")}
-    both = problem(minimum("ttc", "drac", "pet")).evaluate(x)
-    np.testing.assert_array_equal(both, np.min([of["ttc"], of["drac"], of["pet"]], axis=0))
-    added = problem(weighted(("ttc", 0.5), ("thw", 2.0), ("tet", 1.0))).evaluate(x)
-    np.testing.assert_allclose(added, 0.5 * of["ttc"] + 2.0 * of["thw"] + of["tet"], rtol=1e-6)
-    on_top = problem(with_collision(weighted(("thw", 2.0)))).evaluate(x)
-    np.testing.assert_allclose(on_top, [-1.0, *(2.0 * of["thw"][1:])], rtol=1e-6)
-    nested = problem(minimum(weighted(("ttc", 1.0)), with_collision("drac", -7.0))).evaluate(x)
-    assert nested[0] == -7.0
-
-
-def test_functions_of_a_moment_and_of_an_episode() -> None:
-    def gap(moment: Moment) -> Tensor:
-        return moment.lead.gap
-
-    def mean_speed(trace: Trace) -> Tensor:
-        speed, valid = trace.state.speed[:, :, 0], trace.valid
-        return (speed * valid).sum(0) / valid.sum(0)
-
-    assert f(gap, *CLOSE) == pytest.approx(0.5, abs=1e-4)
-    assert f(gap, *HIT) == -1.0
-    assert f(Measure(gap, collision=None), *HIT) == pytest.approx(0.5, abs=1e-4)  # the last moment before
-    assert f(TraceMeasure(mean_speed), *CLOSE) == pytest.approx(20.0)
-    assert f(TraceMeasure(mean_speed, critical=30.0), *CLOSE) == pytest.approx(10.0)
-    assert f(TraceMeasure(mean_speed), *HIT) == -1.0
-
-
-def test_a_trace_has_the_moments_of_the_drive() -> None:
-    seen: list[Trace] = []
-
-    def keep(trace: Trace) -> Tensor:
-        seen.append(trace)
-        return trace.of(ttc).amin(0)
-
-    world = problem(TraceMeasure(keep, collision=None)).world
-    x = torch.tensor([HIT, CLOSE])
-    episodes = list(drive(world, problem("ttc").driver, x))
-    values = episodes[-1].f
-    last = seen[-1]
-    assert last.state.x.shape == (101, 2, 2)
-    assert last.valid.sum(0).tolist() == [62, 101]  # contact at 6.05 s
-    assert last.collided.tolist() == [True, False]
-    for k, episode in enumerate(episodes):
-        torch.testing.assert_close(last.state.x[k, 1], episode.state.x[1], rtol=0, atol=0)
-        torch.testing.assert_close(last.of(ttc)[k, 1], ttc(Moment(*episode[:2], episode.road, None))[1], rtol=0, atol=0)
-    assert (last.state.x[62:, 0] == last.state.x[61, 0]).all()  # what came after the collision is not shown
-    assert values[1] == pytest.approx(f("ttc", *CLOSE))
-    assert last.time[-1].item() == pytest.approx(10.0)
 
 
 SAMPLE: dict[str, Callable[[], object]] = {
@@ -245,135 +87,6 @@ def test_min_ttc_is_one_whatever_the_measure() -> None:
         found.append([env.step(np.zeros(2, dtype=np.float32))[4]["min_ttc"] for _ in range(20)])
     assert found[0] == found[1]
     assert found[0][-1] == pytest.approx(8.05, abs=1e-3)
-
-
-def test_robustness_by_hand() -> None:
-    pytest.importorskip("rtamt", reason="rtamt runs on Python 3.11 or older")
-    assert f(stl("always (gap > 2)"), *CLOSE) == pytest.approx(-1.5, abs=1e-3)
-    assert f(stl("always[0:5] (gap > 2)"), *CLOSE) == pytest.approx(48.5, abs=1e-3)  # 50.5 m at 5 s
-    assert f(stl("eventually[2:3] (ttc < 7.5)"), *CLOSE) == pytest.approx(7.5 - 7.05, abs=1e-3)
-    assert f(stl("always (speed_1 > 3 and x_0 < 150)"), *CLOSE) == pytest.approx(-50.0, abs=1e-3)
-    assert f(stl("(gap > 20) until (speed > 19)"), *CLOSE) == pytest.approx(1.0)
-    assert f(stl("always ((ttc < 3) implies (acceleration < -1))"), *CLOSE) == pytest.approx(-1.0, abs=1e-3)
-    assert f(stl("always (gap > 2)"), *HIT) < -1.5  # the moment of the collision is part of it
-    assert f(with_collision(stl("always (speed > 0)"), -5.0), *HIT) == -5.0
-
-
-def test_robustness_is_what_the_signals_say() -> None:
-    """ "always" is the least over time, "eventually" the greatest, bounds are in seconds."""
-    pytest.importorskip("rtamt", reason="rtamt runs on Python 3.11 or older")
-    kept: list[Trace] = []
-    recorder = TraceMeasure(lambda trace: kept.append(trace) or trace.of(ttc).amin(0), collision=None)
-    x = problem("ttc").base.sample(20, np.random.default_rng(3))
-    problem(recorder).evaluate(x)
-    gap, time = kept[-1].lead.gap.double().numpy(), kept[-1].of(ttc).double().numpy()
-    both = problem(stl("always (gap > 2 and ttc > 3)")).evaluate(x)
-    np.testing.assert_allclose(both, np.minimum(gap - 2.0, time - 3.0).min(0), rtol=1e-5)
-    late = problem(stl("eventually[1:2.5] (always[0:0.5] (gap > 10))")).evaluate(x)
-    windows = np.stack([gap[k : k + 6].min(0) - 10.0 for k in range(10, 26)])
-    np.testing.assert_allclose(late, windows.max(0), rtol=1e-5)
-
-
-@pytest.mark.parametrize(
-    ("formula", "words"),
-    [
-        ("always (gap >", ["does not parse"]),
-        ("always (gpa > 2)", ["'gpa'", "did you mean 'gap'", "ttc"]),
-        ("always (gap > 2) always (gap > 3)", ["one formula"]),
-        ("", ["does not parse"]),
-        (3, ["Expected a formula"]),
-    ],
-)
-def test_bad_formulas_are_refused_before_anything_is_driven(formula: str, words: list[str]) -> None:
-    pytest.importorskip("rtamt", reason="rtamt runs on Python 3.11 or older")
-    with pytest.raises(ValueError) as error:
-        stl(formula)
-    assert all(word in str(error.value) for word in words)
-
-
-def test_formulas_that_do_not_fit_the_world_are_refused() -> None:
-    pytest.importorskip("rtamt", reason="rtamt runs on Python 3.11 or older")
-    with pytest.raises(ValueError, match="vehicles are 0 to 1"):
-        problem(stl("always (speed_2 > 1)"))
-    with pytest.raises(ValueError, match="multiple of the sampling period"):
-        problem(stl("always[0:0.05] (gap > 1)"))
-
-
-def test_measures_by_what_a_user_types(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "measures_here.py").write_text(
-        "from rare_envs.measures import Measure, ttc\n"
-        "def gap(moment):\n    return moment.lead.gap\n"
-        "mine = Measure(ttc, collision=-7.0)\n"
-        "number = 3\n"
-    )
-    monkeypatch.chdir(tmp_path)
-    x = rare_envs.DrivingProblem(FOLLOWING).base.sample(20, np.random.default_rng(0))
-
-    def of(measure: object) -> np.ndarray:
-        return problem(measure, horizon=1.0).evaluate(x)
-
-    np.testing.assert_array_equal(of("measures_here:gap"), of(lambda moment: moment.lead.gap))
-    np.testing.assert_array_equal(of("measures_here:mine"), of(Measure(ttc, collision=-7.0)))
-    for wrong, words in (
-        ("measures_here:gpa", "nothing called 'gpa' .did you mean 'gap'"),
-        ("measures_here:number", "Unknown measure 3"),
-        ("no_such_module:gap", "Cannot import 'no_such_module'"),
-        (":gap", "Expected module:name for the measure ':gap'"),
-    ):
-        with pytest.raises(ValueError, match=words):
-            of(wrong)
-
-
-def test_a_formula_by_what_a_user_types() -> None:
-    pytest.importorskip("rtamt", reason="rtamt runs on Python 3.11 or older")
-    x = rare_envs.DrivingProblem(FOLLOWING).base.sample(5, np.random.default_rng(0))
-    found = [
-        rare_envs.DrivingProblem(FOLLOWING, measure=measure, horizon=1.0).evaluate(x)
-        for measure in ("stl: always (gap > 2)", stl("always (gap > 2)"))
-    ]
-    np.testing.assert_array_equal(*found)
-    with pytest.raises(ValueError, match="does not parse"):
-        rare_envs.DrivingProblem(FOLLOWING, measure="stl:always (gap >")
-
-
-def test_unknown_measures_are_refused() -> None:
-    for name, near in (("dracc", "drac"), ("rss_margins", "rss_margin"), ("ttc2d", "ttc_2d")):
-        with pytest.raises(ValueError, match=near) as error:
-            problem(name)
-        assert "docs/measures.md" in str(error.value)
-    for nonsense in (None, 3, ["ttc"], Measure):
-        with pytest.raises(ValueError, match="Unknown measure"):
-            find_measure(nonsense)
-    for build in (minimum, weighted, lambda: weighted("ttc"), lambda: weighted(("ttc", -1.0)), lambda: minimum("tcc")):
-        with pytest.raises(ValueError, match=r"Expected|Unknown"):
-            build()
-
-
-@pytest.mark.parametrize(
-    ("function", "words"),
-    [
-        (lambda moment: moment.state.speed, "shape"),
-        (lambda moment: moment.lead.gap.mean(), "shape"),
-        (lambda moment: 1.0, "got 1.0"),
-        (lambda moment: moment.lead.gap * math.nan, "finite"),
-        (lambda moment: moment.lead.headway, "headway"),
-        (TraceMeasure(lambda trace: trace.lead.gap), "shape"),
-        (TraceMeasure(lambda trace: 3.0, collision=None), "shape"),
-    ],
-)
-def test_broken_measures_are_refused_at_the_door(function: object, words: str) -> None:
-    with pytest.raises(ValueError, match=words):
-        problem(function)
-    with pytest.raises(ValueError, match=words):
-        gym.make(FOLLOWING, measure=function)
-
-
-def test_a_measure_that_breaks_later_names_the_scenario() -> None:
-    def sometimes(moment: Moment) -> Tensor:
-        return torch.where(moment.lead.gap > 90.0, math.nan, moment.lead.gap)
-
-    with pytest.raises(ValueError, match=r"NaN.*ego_speed"):
-        problem(sometimes).evaluate(np.array([AWAY, CLOSE]))
 
 
 def test_every_measure_serves_a_world() -> None:

@@ -2,11 +2,13 @@
 
 import math
 
+import numpy as np
 import pytest
 
-from rare_envs.measures import TTC_MAX, Moment, ttc
+from rare_envs.measures import TTC_MAX, Moment, mttc, ttc
 from rare_envs.traffic.lead import Lead
 from rare_envs.traffic.road import straight
+from tests.rare_envs.measures.moments import TIME, drives, following, path
 from tests.rare_envs.traffic_states import tensor, traffic
 
 
@@ -34,3 +36,10 @@ def test_ttc_of_two_cars() -> None:
 def test_ttc_of_the_edge_of_the_road(y: float, heading: float, lanes: int, expected: float) -> None:
     state, nobody = traffic((0.0, y, heading, 20.0)), Lead(tensor(math.inf), tensor(0.0))
     assert ttc(Moment(state, nobody, straight(lanes), None)).item() == pytest.approx(expected)
+
+
+def test_mttc_is_when_motion_with_these_accelerations_meets() -> None:
+    for gap, speed, lead_speed, own, its in drives(np.random.default_rng(1), 60):
+        apart = gap + path(lead_speed, its, False) - path(speed, own, False)
+        met = TIME[np.argmax(apart <= 0)] if (apart <= 0).any() else math.inf
+        assert mttc(following(gap, speed, lead_speed, own, its)).item() == pytest.approx(min(met, TTC_MAX), abs=5e-3)
