@@ -192,4 +192,4 @@ def _stop_warnings(status: Status, cov: float, target: float) -> list[str]:
     """Return the warning about draws that were used up before the target was met."""
     if status is not Status.BUDGET:
         return []
-    return [f"The draws were used up at a c.o.v. of {cov:.3g}, not {target:.3g}: the interval is wider than asked for."]
+    return [f"The draws were used up at a c.o.v. of {cov:.3g}, not {target:.3g}: the interval is wider than wanted."]

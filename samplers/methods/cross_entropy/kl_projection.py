@@ -30,7 +30,7 @@ HALVINGS = 40
 """Of a step at most; 2^-40 of a step is rounding."""
 ARMIJO = 1e-4
 """Share of the promised rise that a step must reach (Nocedal and Wright, "Numerical Optimization", section 3.1)."""
-ROUNDING = 1e-14
+RELATIVE_ROUNDING = 1e-14
 """Relative error of the likelihood, in which a rise near the top is lost."""
 
 
@@ -91,7 +91,7 @@ def _line_search(
     for _ in range(HALVINGS):
         trial = np.clip(theta + size[:, None] * step, low, high)
         promised = (gradient * (trial - theta)).sum(axis=1)
-        risen = likelihood(trial) - start >= ARMIJO * promised - ROUNDING * np.abs(start)
+        risen = likelihood(trial) - start >= ARMIJO * promised - RELATIVE_ROUNDING * np.abs(start)
         if risen.all():
             break
         size = np.where(risen, size, size / 2)

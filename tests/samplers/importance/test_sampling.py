@@ -6,26 +6,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from samplers.importance.draws import Draws
 from samplers.importance.sampling import count_final_draws, defensive_mixture, simulate_until
 from samplers.limit_states import half_space
 from samplers.method import Goal
 from samplers.problem import FunctionProblem
 from samplers.proposals.gaussian import Gaussian
-
-
-def weighing(*weights, n=1000):
-    """n draws of which those with these weights fail."""
-    return Draws(n, np.zeros(len(weights)), np.log(weights))
-
-
-def equal(k, weight=0.01):
-    return weighing(*[weight] * k)
-
-
-def log_normal(p, cov, quantile):
-    half = quantile * math.sqrt(math.log(1 + cov**2))
-    return p * math.exp(-half), p * math.exp(half)
 
 
 def test_final_draws_are_what_is_left_or_what_was_set():

@@ -31,11 +31,6 @@ def run(problem, seed=1, **settings):
     return samplers.estimate(problem, ADSS(**settings), seed=seed)
 
 
-def seeds_of(trace):
-    """Points that each level after the first took over from the one before."""
-    return [round(level.p * level.n_points) for level in trace[:-1]]
-
-
 def frozen(chains, steps):
     """One chain in ten below the threshold, all of its points."""
     f = np.where(np.arange(chains)[:, None] < chains // 10, -1.0, 1.0) * np.ones((chains, steps))

@@ -6,7 +6,6 @@ from scipy import stats
 
 import samplers
 from samplers.limit_states import half_space, plateau, shell
-from samplers.mcmc.chains import Chains
 from samplers.method import Goal
 from samplers.methods.subset_levels import (
     descent_cov,
@@ -57,13 +56,6 @@ def test_no_level_after_the_answer_is_known(recorder):
     assert result.interval == samplers.statistics.intervals.clopper_pearson(round(1000 * result.p), 1000, 0.95)
     result = run(half_space(2, -stats.norm.ppf(0.03)).problem)
     assert [level.gamma == 0.0 for level in result.trace] == [False, True]
-
-
-def frozen(chains, steps):
-    """One chain in ten below the threshold, all of its points."""
-    f = np.where(np.arange(chains)[:, None] < chains // 10, -1.0, 1.0) * np.ones((chains, steps))
-    u = np.zeros((chains, steps, 1))
-    return Chains(u, f, np.full(chains, steps), np.arange(chains), chains * (steps - 1), 0.4)
 
 
 def test_own_cov_matches_the_spread(study):
