@@ -20,11 +20,6 @@ from rare_envs.scenarios.registry import SCENARIOS
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
-OUTPUT_NOT_SHOWN = {
-    "egos.md",
-    "remote.md",
-}
-"""Pages whose output still has to be written down; their code runs, what it prints is not compared."""
 NUMBER = r"[-+]?(?:\d+\.\d*|\.\d+|\d+(?=[eE][-+]?\d))(?:[eE][-+]?\d+)?"
 
 
@@ -91,7 +86,7 @@ def test_code_of_a_page(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
         name = f"{page.name}, block {number}"
         with contextlib.redirect_stdout(io.StringIO()) as printed:
             exec(compile(block.code, name, "exec"), namespace)
-        if page.name not in OUTPUT_NOT_SHOWN and not same_text(block.output, printed.getvalue()):
+        if not same_text(block.output, printed.getvalue()):
             wrong.append(f"{name} prints\n{printed.getvalue()}where the page shows\n{block.output}")
     for env_id in set(rare_envs.ENV_IDS) - known:  # a page's own scenarios are not there for other tests
         SCENARIOS.remove(env_id)

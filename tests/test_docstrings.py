@@ -51,14 +51,10 @@ def has_example(value: object) -> bool:
 
 
 WITHOUT_EXAMPLE = {
-    "rare_envs.HighwayEnvProblem",
-    "rare_envs.HighwayEnvScenario",
-    "rare_envs.highway_env_problem",
-    "rare_envs.measures.stl",
-    "rare_envs.study.cli.main",
-    "samplers.TwoStage",
+    "rare_envs.measures.stl": "needs rtamt, which runs on Python 3.11 or older; docs/measures.md has an example",
+    "rare_envs.study.cli.main": "a program, which reads sys.argv and exits",
 }
-"""Public names that have no example yet."""
+"""Public names without an example, and the reason."""
 
 
 @pytest.mark.parametrize("name", [name for name in MODULES if ">>> " in source(name)])
@@ -71,7 +67,7 @@ def test_examples_of_a_module(name: str) -> None:
 
 def test_everything_public_has_an_example() -> None:
     without = {name for name, value in public_objects().items() if not has_example(value)}
-    assert without - WITHOUT_EXAMPLE == set()
+    assert without == set(WITHOUT_EXAMPLE)
 
 
 def test_an_example_is_told_from_none() -> None:

@@ -23,7 +23,7 @@ from rare_envs.study.ego_check.interface import (
 )
 from rare_envs.study.ego_check.probe import BATCH_ROWS, Probe, largest_difference
 
-ROUNDING = 1e-3
+ACTION_ROUNDING = 1e-3
 """Differences of actions above this are not rounding."""
 BATCH_SIZES = (1, 64, 1024)
 """Batch sizes at which latency is measured."""
@@ -73,7 +73,7 @@ def check_memory(probe: Probe) -> Iterator[Finding]:
     begun[: BATCH_ROWS // 2] = True
     again, _ = probe.query(probe.seen, state, begun)
     off = largest_difference(first[begun], again[begun])
-    if off > ROUNDING:
+    if off > ACTION_ROUNDING:
         yield report_warning(
             "memory",
             f"kept in its state, but rows that begin an episode are off by {off:.2g}",
@@ -92,7 +92,7 @@ def check_row_independence(probe: Probe) -> Iterator[Finding]:
     single = [probe.transform_seen(lambda part, row=row: part[row : row + 1]) for row in range(8)]  # type: ignore[misc]
     alone = largest_difference(np.concatenate([probe.query(row)[0] for row in single]), whole[:8])
     for name, off in (("order of the batch", shuffled), ("size of the batch", alone)):
-        if off > ROUNDING:
+        if off > ACTION_ROUNDING:
             yield report_failure(
                 name,
                 f"actions change with it, by up to {off:.2g}",
