@@ -58,7 +58,7 @@ def test_the_same_seed_gives_the_same_answer_and_another_seed_another(cli: Cli, 
 
 
 def test_the_result_names_the_statistics_that_were_applied(cli, tmp_path):
-    """A policy with somebody else's VecNormalize statistics drives like a stranger: say which file it was."""
+    """A policy with somebody else's VecNormalize statistics drives unlike its training data: say which file it was."""
     from stable_baselines3 import PPO
     from stable_baselines3.common.vec_env import VecNormalize
 
@@ -82,7 +82,7 @@ def test_noise_that_nobody_has_is_pointed_out(cli: Cli, risky: str) -> None:
 
 
 def test_what_actions_are_taken_for_is_pointed_out(cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A policy from HighwayEnv without its meta-actions runs all the same, and drives like a stranger."""
+    """A policy from HighwayEnv without its meta-actions runs all the same, and behaves arbitrarily."""
     (tmp_path / "idle_egos.py").write_text(DISCRETE)
     monkeypatch.chdir(tmp_path)
     words = ("estimate", FOLLOWING, "--ego", "idle_egos:Idle", "--method", "mc", "--max-sim", 50, "--json")
