@@ -177,7 +177,8 @@ def write_film(path: Path | str, drive: Drive, width: int = FRAME_WIDTH, every: 
         >>> drive = drive_again(DrivingProblem("rare_envs/CarFollowing-v0", horizon=1.0), np.array([20.0, 5.0, 10.0]))
         >>> with TemporaryDirectory() as folder:
         ...     write_film(Path(folder) / "worst.png", drive, width=300)
-        ...     Image.open(Path(folder) / "worst.png").size
+        ...     with Image.open(Path(folder) / "worst.png") as picture:
+        ...         picture.size
         (300, 132)
     """
     check_film_path(path)
