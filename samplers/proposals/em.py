@@ -82,14 +82,7 @@ def choose_centres(x: FloatArray, weights: FloatArray, k: int, rng: np.random.Ge
     return np.asarray(x[chosen])
 
 
-def k_means(
-    x: FloatArray,
-    weights: FloatArray,
-    k: int,
-    rng: np.random.Generator,
-    restarts: int = 1,
-    max_steps: int = LLOYD_STEPS,
-) -> NDArray[np.int64]:
+def k_means(x: FloatArray, weights: FloatArray, k: int, rng: np.random.Generator) -> NDArray[np.int64]:
     """Return clusters (n,) of weighted points x (n, d), numbered from 0: k-means++, then Lloyd's steps.
 
     Args:
@@ -97,24 +90,17 @@ def k_means(
         weights: Shape (n,).
         k: Clusters at most.
         rng: Source of randomness.
-        restarts: Runs; the one with the least weighted square distance to the centres is taken.
-        max_steps: Lloyd's steps at most; they end where no point changes its cluster.
     """
-    runs = [_lloyd(x, weights, choose_centres(x, weights, k, rng), max_steps) for _ in range(restarts)]
-    return min(runs, key=lambda run: run[1])[0]
-
-
-def _lloyd(x: FloatArray, weights: FloatArray, centres: FloatArray, max_steps: int) -> tuple[NDArray[np.int64], float]:
-    """Return the clusters (n,) that centres (k, d) lead to, and the weighted square distance to their centres."""
+    centres = choose_centres(x, weights, k, rng)
     near = np.full(len(x), -1)
-    for _ in range(max_steps):
+    for _ in range(LLOYD_STEPS):
         before, near = near, np.argmin(-2 * x @ centres.T + (centres**2).sum(axis=1), axis=1)
         if (near == before).all():
             break
         for j in range(len(centres)):
             if weights[near == j].sum() > 0:
                 centres[j] = np.average(x[near == j], axis=0, weights=weights[near == j])
-    return np.asarray(near, dtype=np.int64), float(weights @ ((x - centres[near]) ** 2).sum(axis=1))
+    return np.asarray(near, dtype=np.int64)
 
 
 def one_hot(labels: NDArray[np.int64], k: int) -> FloatArray:

@@ -104,6 +104,6 @@ def test_centres_are_far_apart_and_distinct(rng):
 
 def test_k_means_finds_the_groups(rng):
     x = np.repeat([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0]], 30, axis=0) + rng.standard_normal((90, 2))
-    labels = k_means(x, np.ones(90), 3, rng, restarts=3)
+    labels = k_means(x, np.ones(90), 3, rng)
     assert len({tuple(labels[30 * j : 30 * j + 30]) for j in range(3)}) == 3
     assert all(len(set(labels[30 * j : 30 * j + 30])) == 1 for j in range(3))
