@@ -11,6 +11,7 @@ from rare_envs.distributions.product import NoiseDistribution, join_independent
 from rare_envs.distributions.space import Distribution, Parameter, ScenarioSpace
 from rare_envs.measures.registry import load_measure
 from rare_envs.plugins import did_you_mean
+from rare_envs.scenarios.base import Scenario
 from rare_envs.scenarios.base_distributions import load_base
 from rare_envs.scenarios.registry import find_scenario
 from rare_envs.sensors.camera import find_camera
@@ -26,7 +27,7 @@ NO_NEEDS = EgoNeeds()
 
 
 def set_up(
-    env_id: str,
+    scenario: Scenario | str,
     needs: EgoNeeds = NO_NEEDS,
     /,
     *,
@@ -46,7 +47,7 @@ def set_up(
     """Return the world and the scenario space of an environment.
 
     Args:
-        env_id: For example "rare_envs/CutIn-v0".
+        scenario: The scenario or its environment's id, for example "rare_envs/CutIn-v0".
         needs: What the ego needs beside the keyword arguments.
         observation: "features", "lidar", "kinematics" (HighwayEnv's) or "camera"; several, such as "camera+lidar" or
             ("camera", "lidar"), make a `Dict`.
@@ -81,12 +82,12 @@ def set_up(
         TypeError: If there is no such argument; the message suggests the nearest and lists all.
         ValueError: If an argument is not one of those; the message says what is.
     """
-    scenario = find_scenario(env_id)
+    scenario = find_scenario(scenario) if isinstance(scenario, str) else scenario
     for name in unknown:
-        known = [word for word in inspect.signature(set_up).parameters if word not in ("env_id", "needs", "unknown")]
+        known = [word for word in inspect.signature(set_up).parameters if word not in ("scenario", "needs", "unknown")]
         of_reset = name in (parameter.name for parameter in scenario.parameters)
         hint = " (reset takes it as an option)" if of_reset else did_you_mean(name, known)
-        raise TypeError(f"{env_id} takes no keyword argument {name!r}{hint}; it takes {', '.join(known)}.")
+        raise TypeError(f"The scenario {scenario.name!r} takes no keyword argument {name!r}{hint}; it takes {', '.join(known)}.")
     kinds = read_kinds(observation)
     _check_one_of("action", action, ACTIONS)
     if not isinstance(weather, bool):

@@ -102,9 +102,9 @@ class DrivingProblem:
         with _ego_errors_as_value_errors(ego):
             self.needs = resolve(ego, scenario.vehicles)
         make_kwargs["observation"] = make_kwargs.get("observation") or self.needs.observation
-        self.world, self.space = set_up(env_id, self.needs, measure=measure, base=base, noise=noise, **make_kwargs)
+        self.world, self.space = set_up(scenario, self.needs, measure=measure, base=base, noise=noise, **make_kwargs)
         with _ego_errors_as_value_errors(ego):
-            self.driver = as_driver(ego, self.world)
+            self.driver = as_driver(ego, self.world, self.needs)
         self.varies = self.needs.varies
         for note in self.notes:
             warnings.warn(note, AmbiguousActions, stacklevel=2)

@@ -13,10 +13,11 @@ from torch import Tensor
 from rare_envs.control.actions import DISCRETE_ACTIONS, IDLE, META_ACTIONS
 from rare_envs.control.idm import IDM
 from rare_envs.egos.inference import PolicyQuery, query_policy
-from rare_envs.egos.needs import WrappedEgo, observation_for, resolve
+from rare_envs.egos.needs import WrappedEgo, resolve
 from rare_envs.egos.wrappers import find_frame_stacking, wrap_policy
 from rare_envs.sensors.kinds import map_kinds
 from rare_envs.simulation.background import Background
+from rare_envs.simulation.ego_needs import EgoNeeds
 from rare_envs.simulation.observation import observe
 from rare_envs.simulation.rollout import Driver
 from rare_envs.simulation.world import World
@@ -59,10 +60,10 @@ class PolicyDriver:
         seen = observe(episode, self.observation)
         observation = map_kinds(lambda part: _replace_rows(part, over).numpy(force=True), seen)
         start = np.full(batch, memory is None)
-        given, hidden = query_policy(
+        actions, hidden = query_policy(
             self.policy, self.action, PolicyQuery(observation, hidden, start, over), self.failed_rows
         )
-        return given.to(state.x) if given.is_floating_point() else given, (hidden, tick + 1)
+        return actions.to(state.x) if actions.is_floating_point() else actions, (hidden, tick + 1)
 
 
 def _replace_rows(observation: Tensor, rows: Tensor) -> Tensor:
@@ -73,12 +74,13 @@ def _replace_rows(observation: Tensor, rows: Tensor) -> Tensor:
     return torch.where(wide, observation[int((~rows).int().argmax())], observation)
 
 
-def as_driver(ego: Any, world: World) -> Driver:
+def as_driver(ego: Any, world: World, needs: EgoNeeds | None = None) -> Driver:
     """Return the Driver that an ego stands for in a world.
 
     Args:
         ego: "idm", a `Driver`, an object with `predict`, or a `rare_envs.egos.needs.WrappedEgo`.
         world: The world; what `resolve` says that the ego needs it has.
+        needs: The answer of `resolve`, if it is known already; None resolves the ego here.
 
     Example:
         >>> from rare_envs.scenarios.cut_in import CUT_IN
@@ -99,9 +101,9 @@ def as_driver(ego: Any, world: World) -> Driver:
         raise ValueError(f"Expected an ego, got the class {ego.__name__}; make or train one of it first.")
     if isinstance(ego, WrappedEgo):
         return ego.in_world(world)
-    needs = resolve(ego, world.scenario.vehicles)
+    needs = needs or resolve(ego, world.scenario.vehicles)
     if needs.queries_policy:
-        check_spaces(ego, world.observation_space, world.clock.action)
+        check_spaces(ego, world.observation_space, world.clock.action, needs.observation)
         if needs.dt is not None and needs.dt != world.clock.dt:
             raise ValueError(
                 f"Expected dt={needs.dt:g} s, which this ego remembers pictures by, got {world.clock.dt:g} s."
@@ -116,18 +118,25 @@ def as_driver(ego: Any, world: World) -> Driver:
     raise ValueError(f"Expected an ego with a method predict(observation, ...), got {type(ego).__name__}.")
 
 
-def check_spaces(ego: Any, expected: spaces.Space[Any], action: str = "continuous") -> None:
+def check_spaces(
+    ego: Any, expected: spaces.Space[Any], action: str = "continuous", declared: str = "features"
+) -> None:
     """Refuse an ego that was made for other observations or actions; one that declares none is accepted.
 
     Bounds may differ: HighwayEnv declares none for the observations that are clipped here as there.
+
+    Args:
+        ego: The ego.
+        expected: The environment's observations.
+        action: Kind of the environment's actions.
+        declared: Kind of observation that the ego's space tells, for the message.
 
     Raises:
         ValueError: If its `observation_space` or `action_space` does not fit.
     """
     observed = getattr(ego, "observation_space", None)  # a Stable-Baselines3 model, or anybody's object
     if observed is not None and find_frame_stacking(expected, observed) is None:
-        wanted = observation_for(ego)
-        which = "another observation" if wanted == "features" else f"observation={wanted!r}"
+        which = "another observation" if declared == "features" else f"observation={declared!r}"
         raise ValueError(
             f"The ego expects observations {observed}, the environment gives {expected}; "
             f"train it in this environment or choose {which}."

@@ -67,7 +67,8 @@ class AgentsVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]]
         """
         if not isinstance(scenarios, (int, np.integer)) or isinstance(scenarios, bool) or scenarios < 1:
             raise ValueError(f"Expected one or more scenarios, got {scenarios!r}.")
-        world, self.space = set_up(env_id, EgoNeeds(lidar=resolve(ego).lidar), **kwargs)
+        needs = resolve(ego)
+        world, self.space = set_up(env_id, EgoNeeds(lidar=needs.lidar), **kwargs)
         self.world = world.with_statistics()
         scenario = self.world.scenario
         self.agents = select_agents(scenario, agents)
@@ -76,7 +77,7 @@ class AgentsVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]]
         self._vehicles = [scenario.vehicle_names.index(agent) for agent in self.agents]
         by_name = select_rewards(self.agents, rewards)
         self._rewards = {vehicle: by_name[agent] for vehicle, agent in zip(self._vehicles, self.agents, strict=True)}
-        self._driver = as_driver(ego, self.world)
+        self._driver = as_driver(ego, self.world, needs)
         self.single_observation_space = self.world.observation_space
         self.single_action_space = self.world.action_space
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)

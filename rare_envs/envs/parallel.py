@@ -74,12 +74,13 @@ class DrivingParallelEnv(ParallelEnv[str, SingleObservation, NDArray[np.float32]
         Raises:
             ValueError: If an argument is invalid.
         """
-        world, self.space = set_up(env_id, EgoNeeds(lidar=resolve(ego).lidar), **kwargs)
+        needs = resolve(ego)
+        world, self.space = set_up(env_id, EgoNeeds(lidar=needs.lidar), **kwargs)
         self.world = world.with_statistics()
         scenario = self.world.scenario
         self.possible_agents = select_agents(scenario, agents)
         self.rewards = select_rewards(self.possible_agents, rewards)
-        self._driver = as_driver(ego, self.world)
+        self._driver = as_driver(ego, self.world, needs)
         self.metadata = {
             **self.metadata,
             "name": env_id,

@@ -140,7 +140,7 @@ def judge(
     needs = resolve(ego)
     observation = observation or needs.observation
     world = measured or make_world(case, seconds, observation)
-    driver = as_driver(ego, world)
+    driver = as_driver(ego, world, needs)
     if needs.lidar:
         world = world.with_lidar()
     x = draw_inputs(case, world, rollouts, needs.noise_columns(world), np.random.default_rng(seed))
