@@ -2,6 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
+from rare_envs.plugins import make_lazy_getattr
 from rare_envs.registration import make_batch, parallel_env, register_envs, register_scenario
 from rare_envs.scenarios.registry import SCENARIOS
 
@@ -45,13 +46,9 @@ _LAZY = {
     "highway_env_problem": "rare_envs.interop",
 }
 
+_import_lazily = make_lazy_getattr(__name__, _LAZY)
+
 
 def __getattr__(name: str) -> Any:
-    """Import torch only when a name that needs it is used."""
-    if name == "ENV_IDS":
-        return tuple(SCENARIOS)
-    if name in _LAZY:
-        from importlib import import_module
-
-        return getattr(import_module(_LAZY[name]), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    """Import torch only when a name that needs it is used; list the environments as they are now."""
+    return tuple(SCENARIOS) if name == "ENV_IDS" else _import_lazily(name)

@@ -87,7 +87,9 @@ def set_up(
         known = [word for word in inspect.signature(set_up).parameters if word not in ("scenario", "needs", "unknown")]
         of_reset = name in (parameter.name for parameter in scenario.parameters)
         hint = " (reset takes it as an option)" if of_reset else did_you_mean(name, known)
-        raise TypeError(f"The scenario {scenario.name!r} takes no keyword argument {name!r}{hint}; it takes {', '.join(known)}.")
+        raise TypeError(
+            f"The scenario {scenario.name!r} takes no keyword argument {name!r}{hint}; it takes {', '.join(known)}."
+        )
     kinds = read_kinds(observation)
     _check_one_of("action", action, ACTIONS)
     if not isinstance(weather, bool):

@@ -1,4 +1,4 @@
-"""Modules and objects of a user, imported by name, and the nearest valid name for one that is misspelt."""
+"""Imports by name: modules and objects of a user, names imported on first use, and the nearest valid name."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import difflib
 import importlib
 import os
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from types import ModuleType
 from typing import Any
 
@@ -59,6 +59,31 @@ def import_object(spec: str, purpose: str) -> Any:
     except AttributeError:
         hint = did_you_mean(name, [word for word in vars(module) if not word.startswith("__")])
         raise ValueError(f"{module_name!r} has nothing called {name!r}{hint}.") from None
+
+
+def make_lazy_getattr(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
+    """Return the `__getattr__` of a package that imports its names on first use.
+
+    Args:
+        package: Its dotted name.
+        modules: The module that defines each name.
+
+    Example:
+        >>> get = make_lazy_getattr("shapes", {"pi": "math"})
+        >>> round(get("pi"), 4)
+        3.1416
+        >>> get("tau")
+        Traceback (most recent call last):
+            ...
+        AttributeError: module 'shapes' has no attribute 'tau'
+    """
+
+    def get(name: str) -> Any:
+        if name not in modules:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        return getattr(importlib.import_module(modules[name]), name)  # of a module of ours
+
+    return get
 
 
 def did_you_mean(name: str, valid: Iterable[str]) -> str:

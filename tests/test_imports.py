@@ -93,7 +93,10 @@ def modules(root: Path, packages: tuple[str, ...] = PACKAGES) -> dict[str, Path]
 
 
 def imported(tree: ast.AST, module: str, is_package: bool, known: set[str]) -> Iterator[str]:
-    """Yield the dotted names that a tree imports; `from a import b` names `a.b` where that is a module."""
+    """Yield the dotted names that a tree imports; `from a import b` names `a.b` where that is a module.
+
+    The values of a table `_LAZY` are modules that a package imports on first use.
+    """
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -105,6 +108,8 @@ def imported(tree: ast.AST, module: str, is_package: bool, known: set[str]) -> I
             for alias in node.names:
                 inner = f"{source}.{alias.name}"
                 yield inner if inner in known else source
+        elif isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "_LAZY":
+            yield from ast.literal_eval(node.value).values()
 
 
 def import_graph(root: Path, packages: tuple[str, ...] = PACKAGES) -> dict[str, set[str]]:
@@ -327,7 +332,11 @@ def test_an_import_up_the_table_is_found(tmp_path: Path, file: str, line: str) -
 def test_a_circle_is_found_lazy_imports_counted(tmp_path: Path) -> None:
     tree_of(tmp_path, {"samplers/a.py": "from samplers import b", "samplers/b.py": ""})
     assert import_order(tmp_path) == ["samplers.b", "samplers.a"]
-    for hidden in ("def f():\n    import samplers.a", "if TYPE_CHECKING:\n    from samplers.a import x"):
+    for hidden in (
+        "def f():\n    import samplers.a",
+        "if TYPE_CHECKING:\n    from samplers.a import x",
+        "_LAZY = {'x': 'samplers.a'}",
+    ):
         tree_of(tmp_path, {"samplers/b.py": hidden})
         with pytest.raises(graphlib.CycleError):
             import_order(tmp_path)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from rare_envs.plugins import make_lazy_getattr
 from training.ego_training import train_ego
 
 if TYPE_CHECKING:
@@ -11,11 +12,7 @@ if TYPE_CHECKING:
 
 __all__ = ["sb3_agents_env", "sb3_vec_env", "train_ego"]
 
+_LAZY = {"sb3_agents_env": "training.vec_env", "sb3_vec_env": "training.vec_env"}
+"""Names that need Stable-Baselines3, which takes seconds to load."""
 
-def __getattr__(name: str) -> Any:
-    """Import what needs Stable-Baselines3 on first use: it takes seconds to load."""
-    if name not in ("sb3_agents_env", "sb3_vec_env"):
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from training import vec_env as sb3
-
-    return getattr(sb3, name)
+__getattr__ = make_lazy_getattr(__name__, _LAZY)

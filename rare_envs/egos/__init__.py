@@ -1,8 +1,9 @@
 """Egos: what they need, policies as drivers, their inference in batches, their wrappers and their faults."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rare_envs.egos.errors import EgoFault, EgoGone, NoAnswer
+from rare_envs.plugins import make_lazy_getattr
 
 if TYPE_CHECKING:
     from rare_envs.egos.faults import Fault, FaultTolerant
@@ -19,11 +20,5 @@ _LAZY = {
     "resolve": "rare_envs.egos.needs",
 }
 
-
-def __getattr__(name: str) -> Any:
-    """Import torch only when a name that needs it is used: a server of an ego needs the errors only."""
-    if name in _LAZY:
-        from importlib import import_module
-
-        return getattr(import_module(_LAZY[name]), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__ = make_lazy_getattr(__name__, _LAZY)
+"""Torch is imported only when a name needs it: a server of an ego needs the errors only."""

@@ -118,9 +118,7 @@ def as_driver(ego: Any, world: World, needs: EgoNeeds | None = None) -> Driver:
     raise ValueError(f"Expected an ego with a method predict(observation, ...), got {type(ego).__name__}.")
 
 
-def check_spaces(
-    ego: Any, expected: spaces.Space[Any], action: str = "continuous", declared: str = "features"
-) -> None:
+def check_spaces(ego: Any, expected: spaces.Space[Any], action: str = "continuous", declared: str = "features") -> None:
     """Refuse an ego that was made for other observations or actions; one that declares none is accepted.
 
     Bounds may differ: HighwayEnv declares none for the observations that are clipped here as there.

@@ -1,6 +1,8 @@
 """Environments: one scenario, batches, several agents, and their pictures."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from rare_envs.plugins import make_lazy_getattr
 
 if TYPE_CHECKING:
     from rare_envs.envs.multi_agent_vector import AgentsVectorEnv
@@ -19,11 +21,5 @@ _LAZY = {
     "Renderer": "rare_envs.envs.rendering",
 }
 
-
-def __getattr__(name: str) -> Any:
-    """Import an environment only when it is used: each needs a library of its own."""
-    if name in _LAZY:
-        from importlib import import_module
-
-        return getattr(import_module(_LAZY[name]), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__ = make_lazy_getattr(__name__, _LAZY)
+"""An environment is imported only when it is used: each needs a library of its own."""

@@ -1,8 +1,8 @@
 """Scenarios: what x means and how the vehicles around the ego move, and all that a file with one of your own needs."""
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from rare_envs.plugins import make_lazy_getattr
 from rare_envs.scenarios.registry import SCENARIOS, find_scenario, scenario_named
 
 if TYPE_CHECKING:
@@ -53,9 +53,4 @@ _LAZY = {
 }
 """Names that need torch, which `import rare_envs` must not import."""
 
-
-def __getattr__(name: str) -> Any:
-    """Import torch only when a name that needs it is used."""
-    if name in _LAZY:
-        return getattr(import_module(_LAZY[name]), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__ = make_lazy_getattr(__name__, _LAZY)

@@ -3,7 +3,9 @@
 The names are imported when they are used, so that the command line starts without torch.
 """
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from rare_envs.plugins import make_lazy_getattr
 
 if TYPE_CHECKING:
     from rare_envs.study.compare import EgoComparison, compare_egos
@@ -31,21 +33,22 @@ __all__ = [
     "write_run",
 ]
 
-_MODULES = {
-    "compare": ("EgoComparison", "compare_egos"),
-    "errors": ("BadInput",),
-    "evaluate": ("Question", "Report", "Study", "prepare", "run"),
-    "replay": ("Drive", "drive_again"),
-    "run_directory": ("read_failures", "resume", "run_into", "write_run"),
-    "video": ("write_film",),
+_LAZY = {
+    "BadInput": "rare_envs.study.errors",
+    "Drive": "rare_envs.study.replay",
+    "EgoComparison": "rare_envs.study.compare",
+    "Question": "rare_envs.study.evaluate",
+    "Report": "rare_envs.study.evaluate",
+    "Study": "rare_envs.study.evaluate",
+    "compare_egos": "rare_envs.study.compare",
+    "drive_again": "rare_envs.study.replay",
+    "prepare": "rare_envs.study.evaluate",
+    "read_failures": "rare_envs.study.run_directory",
+    "resume": "rare_envs.study.run_directory",
+    "run": "rare_envs.study.evaluate",
+    "run_into": "rare_envs.study.run_directory",
+    "write_film": "rare_envs.study.video",
+    "write_run": "rare_envs.study.run_directory",
 }
 
-
-def __getattr__(name: str) -> Any:
-    """Import a public name when it is first used."""
-    for module, names in _MODULES.items():
-        if name in names:
-            from importlib import import_module
-
-            return getattr(import_module(f"{__name__}.{module}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__getattr__ = make_lazy_getattr(__name__, _LAZY)

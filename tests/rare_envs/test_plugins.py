@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from rare_envs.plugins import did_you_mean, import_module, import_object, one_line
+from rare_envs.plugins import did_you_mean, import_module, import_object, make_lazy_getattr, one_line
 
 
 @pytest.fixture
@@ -59,3 +59,14 @@ def test_an_exception_is_cut_to_one_line() -> None:
     assert one_line(KeyError()) == "KeyError"
     assert one_line(ValueError(" a\n\tb. ")) == "ValueError: a b"
     assert one_line(ValueError("x" * 1000)) == "ValueError: " + "x" * 200
+
+
+def test_a_name_is_imported_from_its_module_when_it_is_used(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "late_module.py").write_text("answer = 42")
+    monkeypatch.syspath_prepend(tmp_path)
+    get = make_lazy_getattr("package", {"answer": "late_module"})
+    assert "late_module" not in sys.modules
+    assert get("answer") == 42
+    with pytest.raises(AttributeError, match="module 'package' has no attribute 'question'"):
+        get("question")
+    del sys.modules["late_module"]

@@ -5,8 +5,9 @@ The names are imported on first use: the modules are programs too, and need seco
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from rare_envs.plugins import make_lazy_getattr
 
 if TYPE_CHECKING:
     from training.egos.imitation import train_imitation_ego
@@ -22,19 +23,15 @@ __all__ = [
     "train_imitation_ego",
     "train_vision_ego",
 ]
+
 _LAZY = {
-    "Summary": "nominal_driving",
-    "Verdicts": "nominal_driving",
-    "VisionConfig": "vision",
-    "judge": "nominal_driving",
-    "summarise_verdicts": "nominal_driving",
-    "train_imitation_ego": "imitation",
-    "train_vision_ego": "vision",
+    "Summary": "training.egos.nominal_driving",
+    "Verdicts": "training.egos.nominal_driving",
+    "VisionConfig": "training.egos.vision",
+    "judge": "training.egos.nominal_driving",
+    "summarise_verdicts": "training.egos.nominal_driving",
+    "train_imitation_ego": "training.egos.imitation",
+    "train_vision_ego": "training.egos.vision",
 }
 
-
-def __getattr__(name: str) -> Any:
-    """Import a public name on first use."""
-    if name not in _LAZY:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_LAZY[name]}"), name)
+__getattr__ = make_lazy_getattr(__name__, _LAZY)

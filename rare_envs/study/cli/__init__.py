@@ -1,7 +1,8 @@
 """The command line `rare-envs`, and its printing of a report."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from rare_envs.plugins import make_lazy_getattr
 from rare_envs.study.cli.app import main
 
 if TYPE_CHECKING:
@@ -9,11 +10,7 @@ if TYPE_CHECKING:
 
 __all__ = ["main", "print_report"]
 
+_LAZY = {"print_report": "rare_envs.study.cli.printing"}
+"""Imported on first use, and torch with it."""
 
-def __getattr__(name: str) -> Any:
-    """Import `print_report`, and torch with it, when it is used."""
-    if name != "print_report":
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from rare_envs.study.cli.printing import print_report
-
-    return print_report
+__getattr__ = make_lazy_getattr(__name__, _LAZY)

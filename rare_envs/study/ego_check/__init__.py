@@ -1,6 +1,8 @@
 """Checks of an ego before a study: its interface, its protocol and its behaviour."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from rare_envs.plugins import make_lazy_getattr
 
 if TYPE_CHECKING:
     from rare_envs.study.ego_check.findings import Finding
@@ -8,12 +10,11 @@ if TYPE_CHECKING:
 
 __all__ = ["EgoCheckRequest", "Finding", "check_ego"]
 
+_LAZY = {
+    "EgoCheckRequest": "rare_envs.study.ego_check.subprocess_check",
+    "Finding": "rare_envs.study.ego_check.findings",
+    "check_ego": "rare_envs.study.ego_check.subprocess_check",
+}
+"""Imported on first use: `subprocess_check` is also a program, which must not be imported before."""
 
-def __getattr__(name: str) -> Any:
-    """Import a public name when it is used: `subprocess_check` is also a program, which must not be imported before."""
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from importlib import import_module
-
-    module = "findings" if name == "Finding" else "subprocess_check"
-    return getattr(import_module(f"{__name__}.{module}"), name)
+__getattr__ = make_lazy_getattr(__name__, _LAZY)
