@@ -94,13 +94,14 @@ def find_candidates(camera: Camera, forward: Tensor, right: Tensor, up: Tensor, 
     """
     right, down, depth = project_points(camera, forward, right, up)
     scale = camera.focal / depth.clamp(min=_NEAR)
-    near = torch.where((depth < _NEAR).any(-1), camera.focal / _NEAR, 0.0)
+    near, cut = camera.focal / _NEAR, (depth < _NEAR).any(-1)
     some = (depth > _NEAR).any(-1)  # else the rectangle is empty
 
     def limits(place: Tensor, first: int, last: int, size: int) -> tuple[Tensor, Tensor]:
         seen = place * scale
         low, high = seen.amin(-1), seen.amax(-1)
-        low, high = torch.minimum(low, place.amin(-1) * near), torch.maximum(high, place.amax(-1) * near)
+        low = torch.where(cut, torch.minimum(low, place.amin(-1) * near), low)
+        high = torch.where(cut, torch.maximum(high, place.amax(-1) * near), high)
         low, high = (low + 0.5 * size).floor().clamp(first, last), (high + 0.5 * size).ceil().clamp(first, last)
         return low.long().flatten(), torch.where(some, high, low).long().flatten()
 
