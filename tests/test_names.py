@@ -27,15 +27,7 @@ TESTED_ELSEWHERE: dict[str, str] = {
     "rare_envs/scenarios/base_distributions.py": "tests/rare_envs/distributions/test_truncated_mixture.py",
     "rare_envs/scenarios/registry.py": "tests/rare_envs/scenarios/test_own_scenario.py",
     "rare_envs/scenarios/validation.py": "tests/rare_envs/scenarios/test_own_scenario.py",
-    "rare_envs/sensors/camera/ground.py": "tests/rare_envs/sensors/camera/test_picture.py",
-    "rare_envs/sensors/camera/light.py": "tests/rare_envs/sensors/camera/test_picture.py",
-    "rare_envs/sensors/camera/sensor_noise.py": "tests/rare_envs/sensors/camera/test_weather.py",
-    "rare_envs/sensors/camera/vehicles.py": "tests/rare_envs/sensors/camera/test_picture.py",
-    "rare_envs/sensors/kinematics.py": "tests/rare_envs/control/test_meta_actions.py",
-    "rare_envs/sensors/perception.py": "tests/agents/learned/test_learned_ego.py",
     "rare_envs/study/cli/export_ego.py": "tests/agents/onnx/test_export.py",
-    "rare_envs/traffic/pairs.py": "tests/rare_envs/traffic/test_crash.py",
-    "rare_envs/traffic/state.py": "tests/rare_envs/traffic/test_road.py",
 }
 """Modules with logic that have no test module of their name, and where they are tested."""
 

@@ -2,9 +2,14 @@
 
 import torch
 
+from rare_envs.traffic.reference_line import ReferenceLine
+from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import State
 
 F64 = torch.float64
+RADIUS = 250.0
+ARC = Road((-2.0, 2.0, 6.0), ReferenceLine(50.0, (0.0, 1 / RADIUS, 1 / RADIUS, 0.0)))
+"""A road that turns to the right on a circle of this radius [m] from 50 to 100 m."""
 
 
 def tensor(*values: float) -> torch.Tensor:

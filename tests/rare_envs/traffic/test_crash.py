@@ -20,18 +20,11 @@ from rare_envs.traffic.crash import (
 )
 from rare_envs.traffic.overlap import others_overlap
 from rare_envs.traffic.road import straight
-from rare_envs.traffic.state import State
 from tests.rare_envs.traffic.slow_boxes import corners, nearest, overlap
+from tests.rare_envs.traffic_states import F64, traffic
 
-F64 = torch.float64
 CUT_IN = "rare_envs/CutIn-v0"
 Vehicle = tuple[float, float, float, float]
-
-
-def traffic(*vehicles: Vehicle) -> State:
-    """One scenario; x, y, heading, speed of each vehicle."""
-    x, y, heading, speed = (torch.tensor(column, dtype=F64)[None] for column in zip(*vehicles, strict=True))
-    return State(x, y, heading, speed, x[:, :0])
 
 
 def tick(*vehicles: Vehicle, lanes: int = 2) -> dict[str, object]:

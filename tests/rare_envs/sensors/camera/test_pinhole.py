@@ -35,7 +35,16 @@ def test_ground_is_where_rays_meet_it() -> None:
 
 
 @pytest.mark.parametrize(
-    "settings", [{"height": 0}, {"width": 2.5}, {"field_of_view": math.pi}, {"pitch": 2.0}, {"mount_height": 0.0}]
+    "settings",
+    [
+        {"height": 0},
+        {"width": 2.5},
+        {"field_of_view": math.pi},
+        {"pitch": 2.0},
+        {"mount_height": 0.0},
+        {"mount_height": math.nan},
+        {"yaw": 90.0},
+    ],
 )
 def test_cameras_out_of_range_are_refused(settings: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=next(iter(settings))):

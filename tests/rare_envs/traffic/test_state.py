@@ -1,0 +1,35 @@
+"""States: sizes of vehicles and lanes, and the same traffic seen from another vehicle."""
+
+import torch
+from highway_env.road.lane import AbstractLane
+from highway_env.vehicle.kinematics import Vehicle
+
+from rare_envs.traffic.state import LANE_WIDTH, VEHICLE_LENGTH, VEHICLE_WIDTH, State
+
+
+def numbered(vehicles: int) -> State:
+    """Two scenarios in which every number is another; those of vehicle j end with j."""
+    own = torch.arange(vehicles)
+    fields = [100 * field + torch.stack((own, 1000 + own)) for field in range(1, 5)]
+    return State(*fields, theta=torch.tensor([[7.0], [8.0]]))
+
+
+def test_sizes_are_highway_envs() -> None:
+    assert (VEHICLE_LENGTH, VEHICLE_WIDTH) == (Vehicle.LENGTH, Vehicle.WIDTH)
+    assert LANE_WIDTH == AbstractLane.DEFAULT_WIDTH
+
+
+def test_another_vehicle_takes_the_place_of_the_ego_and_the_rest_keep_their_order() -> None:
+    state = numbered(4)
+    for vehicle, order in enumerate(([0, 1, 2, 3], [1, 0, 2, 3], [2, 0, 1, 3], [3, 0, 1, 2])):
+        seen = state.seen_by(vehicle)
+        for field, before in zip(seen[:4], state[:4], strict=True):
+            assert (field % 100).tolist() == [order, order]
+            assert torch.equal(field - field % 100, before - before % 100)  # no mixture of fields or scenarios
+        assert seen.theta is state.theta
+
+
+def test_the_second_vehicle_and_the_ego_change_places_and_back() -> None:
+    state = numbered(3)
+    assert all(map(torch.equal, state.seen_by(1).seen_by(1), state))
+    assert state.seen_by(0) is state
