@@ -36,6 +36,10 @@ class EvaluationError(ValueError):
 def one_per_row(outcomes: ArrayLike, n: int) -> NDArray[np.float64]:
     """Return the outcomes as float64, shape (n,).
 
+    Called wherever outcomes of foreign code come in, each of which can be used without the others: a function
+    (`FunctionProblem.evaluate`), outcomes told by the user (`Run.tell`), and the halves of a batch that raises, whose
+    lengths must be right before they are joined (`isolate_failing_rows`).
+
     Raises:
         EvaluationError: If they are not n real numbers.
     """

@@ -6,9 +6,9 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from samplers.errors import OnError
-from samplers.execution.arguments import RunArguments, check_problem
+from samplers.execution.arguments import RunArguments, check_attributes
 from samplers.execution.fault_isolation import FaultIsolation
-from samplers.execution.progress import Listener, Progress, listening
+from samplers.execution.progress import Listener, Progress, open_listener
 from samplers.execution.run import Run
 from samplers.method import Stepping
 from samplers.methods.two_stage.method import TwoStage
@@ -82,14 +82,14 @@ def estimate(
         >>> [round(end, 6) for end in checked.interval]
         [9.9e-05, 0.000272]
     """
-    check_problem(problem, ("dim", "base", "evaluate"))
+    check_attributes(problem, ("dim", "base", "evaluate"))
     chosen = get_method(method) if isinstance(method, str) else method
     arguments = RunArguments(gamma, seed, max_sim, target_cov, confidence, replicates, on_error)
     conditions = _StopConditions(time_limit, stop)
     if not (callable(progress) or isinstance(progress, bool)):
         raise ValueError(f"Expected progress to be True, False or a function, got {progress!r}.")
     isolation = FaultIsolation(problem.evaluate, on_error)
-    with listening(progress, max_sim) as listener:
+    with open_listener(progress, max_sim) as listener:
         run = Run(problem, chosen, arguments, listener)
         while not run.done:
             run.tell(isolation.evaluate(run.ask()))

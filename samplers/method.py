@@ -1,4 +1,4 @@
-"""Contract of a method: `steps` takes a goal, requests points, receives their f and returns an outcome."""
+"""Contract of a method (`Stepping`) and its terms; the base class `Method` stands in `samplers.methods.base`."""
 
 import sys
 from collections.abc import Callable, Generator, Sequence

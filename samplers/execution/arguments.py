@@ -87,18 +87,23 @@ def check_arguments(problem: Inputs, method: Stepping) -> None:
 
 def check_problem(problem: Inputs, needed: tuple[str, ...]) -> None:
     """Raise a ValueError unless the problem has the attributes needed, a dimension and a base distribution."""
-    for name in needed:
-        if not hasattr(problem, name):  # a user's object: say which attribute it lacks
-            raise ValueError(
-                f"Expected a problem with {', '.join(needed[:-1])} and {needed[-1]}, got {type(problem).__name__} "
-                f"without {name}; FunctionProblem(f, dim) wraps a function."
-            )
+    check_attributes(problem, needed)
     check_whole("dim", problem.dim, 1)
     if not isinstance(problem.base, Distribution):
         raise ValueError(
             "Expected problem.base to have sample, log_prob, to_standard_normal and "
             f"from_standard_normal, got {type(problem.base).__name__}."
         )
+
+
+def check_attributes(problem: Inputs, needed: tuple[str, ...]) -> None:
+    """Raise a ValueError unless the problem has the attributes needed; `Run` checks what they are."""
+    for name in needed:
+        if not hasattr(problem, name):  # a user's object: say which attribute it lacks
+            raise ValueError(
+                f"Expected a problem with {', '.join(needed[:-1])} and {needed[-1]}, got {type(problem).__name__} "
+                f"without {name}; FunctionProblem(f, dim) wraps a function."
+            )
 
 
 def choose_seed(seed: int | None) -> int:

@@ -18,7 +18,7 @@ OWN_ERROR_FACTOR = 1.5
 MIN_SPREAD = 1 / 3
 """Least spread of runs, as a share of their own errors: they are closer together by chance, such as counts that tie."""
 UNINFORMATIVE_COV = 1.0
-"""From this c.o.v. on the p of a run tells no more than its interval."""
+"""From this c.o.v. on the p of a run adds nothing to its interval."""
 DISAGREEMENT_LEVEL = 1e-4
 """Probability that runs whose errors are right are said to disagree."""
 STATUS_PRIORITY = (Status.STOPPED, Status.STALLED, Status.BUDGET, Status.CONVERGED)

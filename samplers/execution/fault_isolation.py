@@ -89,7 +89,11 @@ def isolate_failing_rows(evaluate: Evaluate, x: FloatArray) -> tuple[FloatArray,
 
 
 def _raise_for_first_row(evaluate: Evaluate, x: FloatArray, error: Exception) -> NoReturn:
-    """Raise an EvaluationError for the first row that raises again, with the error of that row alone."""
+    """Raise an EvaluationError for the first row that raises again, with the error of that row alone.
+
+    One row is enough here: bisection finds it with log2(n) calls, half of those with which `isolate_failing_rows`
+    finds a row and the outcomes of all others.
+    """
     start, stop = 0, len(x)
     while stop - start > 1:
         middle = (start + stop) // 2

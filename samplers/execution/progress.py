@@ -67,8 +67,8 @@ class Monitor:
 
 
 @contextmanager
-def listening(progress: bool | Listener, max_sim: int | None) -> Iterator[Listener | None]:
-    """Yield the listener that `progress` stands for: None, one that shows a bar on standard error, or itself."""
+def open_listener(progress: bool | Listener, max_sim: int | None) -> Iterator[Listener | None]:
+    """Yield the listener that corresponds to `progress`: None, one that shows a bar on standard error, or itself."""
     if callable(progress):
         yield progress
     elif progress:

@@ -166,7 +166,7 @@ class ImportanceSampling(Method):
 
 
 def unreached_share(search: Search, theta: FloatArray, inputs: Inputs, gamma: float) -> float:
-    """Return the share of what the search saw that lies where the tilt theta (d,) does not lead.
+    """Return the share of the search's failing points that the tilt theta (d,) does not reach.
 
     The larger of two: of the base draws under the first level, those with theta' u < 0; of the mass of the
     failing draws of all rounds, that with theta' u < |theta|^2 / 2, where the tilted density is under the base one.

@@ -82,7 +82,11 @@ class SubsetLevels:
         return [f"max_sim leaves {budget} simulations: {n} points per level, not {self.n}."] if coarse else []
 
     def _run_levels(self, inputs: Inputs, goal: Goal, rng: np.random.Generator, kernel: Kernel) -> Steps:
-        """Run with n points per level, as far as the budget goes."""
+        """Run with n points per level, as far as the budget goes.
+
+        Every point below the threshold is a seed, with its root, as the estimate of the error needs. The exploration
+        of `TwoStage` takes a random part of them and records no levels: it shares `next_level` and `grow_chains`.
+        """
         chains = yield from draw_first_level(inputs, min(self.n, goal.budget), rng)
         left, stopped = goal.budget - chains.n_new, False
         passed, trace, levels = LevelProduct(), list[Level](), list[Chains]()

@@ -44,7 +44,7 @@ class SubsetSimulation(Method):
     Args:
         n: Points per level, N. (Tian et al. have 500.)
         p0: Wanted conditional probability of each level.
-        law: Distribution of a component's steps: "uniform" as Au and Beck, "normal" as Tian et al.
+        distribution: Distribution of a component's steps: "uniform" as Au and Beck, "normal" as Tian et al.
         spread: Half-width of the uniform, standard deviation of the normal distribution.
         max_levels: Levels after which the method gives up.
 
@@ -62,7 +62,7 @@ class SubsetSimulation(Method):
 
     n: int = 1000
     p0: float = 0.1
-    law: Literal["uniform", "normal"] = "uniform"
+    distribution: Literal["uniform", "normal"] = "uniform"
     spread: float = 1.0
     max_levels: int = 30
 
@@ -75,13 +75,15 @@ class SubsetSimulation(Method):
         check_count(who, "n", self.n, 10)
         check_count(who, "max_levels", self.max_levels, 1)
         check_setting(who, "p0", self.p0, 0.0, 0.5)
-        check_choice(who, "law", self.law, ("uniform", "normal"))
+        check_choice(who, "distribution", self.distribution, ("uniform", "normal"))
         check_setting(who, "spread", self.spread, 0.0, math.inf)
 
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Go from level to level until the share of failures among its points is p0 or more."""
         descent = SubsetLevels(n=self.n, p0=self.p0, max_levels=self.max_levels)
-        return (yield from descent.steps(inputs, goal, rng, FixedMetropolis(self.spread, distribution=self.law)))
+        return (
+            yield from descent.steps(inputs, goal, rng, FixedMetropolis(self.spread, distribution=self.distribution))
+        )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,7 +20,7 @@ from samplers.importance.search import (
 from samplers.method import Goal, Interrupted, Steps
 from samplers.methods.base import Method
 from samplers.methods.cross_entropy.blocks import GaussianBlock, MixtureBlock, NormalBlock, Product, announced_blocks
-from samplers.methods.cross_entropy.search import Iterate, best_iterate, iterate_of
+from samplers.methods.cross_entropy.search import Iterate, best_iterate, make_iterate
 from samplers.problem import FloatArray, Inputs
 from samplers.proposals.gaussian import Gaussian
 from samplers.proposals.mixture import ProposalDistribution
@@ -209,7 +209,7 @@ class CrossEntropy(Method):
             elite = u[f <= lowest]
             log_ratios = base.log_probs(elite) - proposal.log_probs(elite)
             rounds = [*rounds[:1], Round(base, proposal, u, f)]  # those that `pool_rounds` needs
-            iterates.append(iterate_of(rounds[-1], proposal, lowest, self.rho, log_ratios.sum(axis=0)))
+            iterates.append(make_iterate(rounds[-1], proposal, lowest, self.rho, log_ratios.sum(axis=0)))
             goal.on_level(iterates[-1].record)
             if level is None:
                 return ended(Status.STALLED)

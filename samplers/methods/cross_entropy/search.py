@@ -22,7 +22,7 @@ class Iterate(NamedTuple):
     record: Level
 
 
-def iterate_of(drawn: Round, proposal: Product, level: float, rho: float, log_weights: FloatArray) -> Iterate:
+def make_iterate(drawn: Round, proposal: Product, level: float, rho: float, log_weights: FloatArray) -> Iterate:
     """Return the iterate that one round of draws describes.
 
     Args:

@@ -109,12 +109,12 @@ def _fit_half_space_components(
         return []
     gaussians = state.gaussians + state.fresh_gaussians
     owner = log_ratios(gaussians, u).argmax(axis=0)
-    found: list[HalfSpaceNormal] = []
+    half_spaces: list[HalfSpaceNormal] = []
     for k, gaussian in enumerate(gaussians):
         own = owner == k
         if np.count_nonzero(own) >= settings.min_owned_failures:
-            found += fit_half_spaces(gaussian, u[own], np.exp(log_w[own] - log_w[own].max()))
-    return [ProposalComponent(half_space, "half-space") for half_space in found]
+            half_spaces += fit_half_spaces(gaussian, u[own], np.exp(log_w[own] - log_w[own].max()))
+    return [ProposalComponent(half_space, "half-space") for half_space in half_spaces]
 
 
 def _set_floors(

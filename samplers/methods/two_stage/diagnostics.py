@@ -48,7 +48,7 @@ def check_rounds(
 def check_efficiency(final: StratifiedSample, settings: DiagnosticSettings = DEFAULT_SETTINGS.diagnostics) -> list[str]:
     """Return a warning if the draws are worth so few failures that there may be weights heavier than any met."""
     draws = final.draws
-    if len(draws.f) == 0 or draws.ess >= settings.min_rate * draws.n:
+    if len(draws.f) == 0 or draws.ess >= settings.min_final_rate * draws.n:
         return []
     return [f"{draws.n:,} draws are worth {draws.ess:.0f} failures: there may be heavier weights than any met."]
 

@@ -22,54 +22,11 @@ from samplers.mcmc.chains import RootedPoints, grow_chains
 from samplers.mcmc.kernels import Kernel, ScaledKernel
 from samplers.method import Interrupted
 from samplers.methods.two_stage.regions import ExplorationResult, SubsetPoints, grow_regions
-from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, RegionSettings
+from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, ExplorationSettings, RegionSettings
 from samplers.methods.two_stage.simulator import ComponentDraws, Simulator
 from samplers.problem import FloatArray
 from samplers.proposals.components import IsotropicNormal, MixtureComponent, draw_components
 from samplers.statistics.thresholds import next_level
-
-
-@dataclass(frozen=True, kw_only=True)
-class ExplorationSettings:
-    """Numbers of the exploration; those of draws hold for `usual_budget` simulations."""
-
-    usual_budget: int = 6000
-    """Up to here sizes grow in proportion to the budget, above with its square root; the rest of the budget is
-    for refinement and estimate."""
-    base: int = 500
-    """Base draws; five levels of a tenth each reach 1e-5 from there."""
-    wide: tuple[tuple[float, int], ...] = ((1.5, 120), (2.2, 120), (3.0, 80))
-    """Wide draws: (s, number). At s = 3 a half-space at beta = 4.5 is hit by one draw in 15."""
-    level: int = 250
-    """Points of each level of subset simulation; `least_level` where the budget is small."""
-    least_level: int = 100
-    level_fraction: float = 0.1
-    """Conditional probability of a level (Au and Beck 2001)."""
-    points_per_seed: int = 3
-    """Points of a level for each of its seeds at least: chains take two steps or more."""
-    initial_scale: float = 0.6
-    """First step of the chains of subset simulation, as in `AdaptiveSubsetSimulation`."""
-    target_acceptance: float = 0.35
-    """Acceptance that it is adapted to; less than for long chains, as in `RegionSettings`."""
-    max_levels: int = 30
-    """Levels at most; the share of the budget ends the descent first unless f ties."""
-    starts: int = 60
-    """Chains from wide failures at most; `least_starts` where the budget is small."""
-    least_starts: int = 10
-    level_starts: int = 16
-    """The same for failures of subset simulation; they take the place of wide failures that are missing."""
-    least_level_starts: int = 6
-    bisections: int = 3
-    """Steps of a wide failure towards the origin: the edge of the region is then known to an eighth of the way."""
-    chain_cost: int = 25
-    """Simulations that a chain needs at most before it is sorted: bisection, two walks, points half way."""
-    descent_share: float = 0.45
-    """Share of the budget after which no further level is begun."""
-    share: float = 0.65
-    """Share of the budget for the whole exploration."""
-
-
-DEFAULT_EXPLORATION = ExplorationSettings()
 
 
 @dataclass(frozen=True)
@@ -92,7 +49,7 @@ class Sizes:
     """Simulations of the whole exploration."""
 
     @classmethod
-    def within(cls, budget: int, settings: ExplorationSettings = DEFAULT_EXPLORATION) -> "Sizes":
+    def within(cls, budget: int, settings: ExplorationSettings = DEFAULT_SETTINGS.exploration) -> "Sizes":
         """Return the sizes for a budget."""
         usual = settings.usual_budget
         scale = budget / usual if budget < usual else math.sqrt(budget / usual)
@@ -129,7 +86,7 @@ def find_regions(
     sizes: Sizes,
     rng: np.random.Generator,
     settings: RegionSettings = DEFAULT_SETTINGS.regions,
-    explore: ExplorationSettings = DEFAULT_EXPLORATION,
+    explore: ExplorationSettings = DEFAULT_SETTINGS.exploration,
 ) -> Generator[FloatArray, FloatArray, ExplorationResult]:
     """Find the regions of failure, starting from the first draws; none if nothing fails."""
     n_base = int(first.counts[0])
@@ -157,12 +114,14 @@ def _descend(
 ) -> Generator[FloatArray, FloatArray, SubsetPoints]:
     """Run subset simulation from base draws u (n, d), f (n,), until a tenth of a level fails or the budget is used.
 
-    Unlike `samplers.methods.subset_levels` it makes no estimate: seeds are a random third of a level at most, and all
-    candidates are kept, as the regressions around the regions use them.
+    It shares the threshold (`next_level`) and the growth of a level (`grow_chains`) with `SubsetLevels`, not the loop:
+    seeds are a random third of a level at most, in chains of equal length, drawn from `rng` in another order than the
+    chain lengths there. There is no estimate, so no level is recorded; all candidates are kept, for the regressions
+    around the regions.
     """
     dim = u.shape[1]
     kernel: Kernel = ScaledKernel(
-        "conditional", "unit", explore.initial_scale, explore.target_acceptance, deviations=np.ones(dim)
+        "conditional", "unit", explore.initial_scale, explore.level_acceptance, deviations=np.ones(dim)
     )
     points, outcomes, levels = [u[:0]], [f[:0]], 0
     for _ in range(explore.max_levels):

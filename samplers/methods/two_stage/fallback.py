@@ -1,4 +1,4 @@
-"""Fallback: adaptive subset simulation, which needs no proposal, where none describes the failures."""
+"""Fallback: adaptive subset simulation for failures that no proposal describes."""
 
 import math
 from dataclasses import replace
@@ -15,7 +15,7 @@ from samplers.problem import FloatArray, Inputs
 def describes_failures(
     last: Draws, expected: FloatArray, settings: FallbackSettings = DEFAULT_SETTINGS.fallback
 ) -> bool:
-    """Return whether a proposal describes the failures so well that the weights of its draws can be believed.
+    """Return whether a proposal describes the failures so well that the weights of its draws are reliable.
 
     Args:
         last: The draws of the last round.
@@ -31,25 +31,28 @@ def describes_failures(
 
 def meets_failures(last: Draws, settings: FallbackSettings = DEFAULT_SETTINGS.fallback) -> bool:
     """Return whether the draws of the last round meet failures often enough."""
-    return len(last.f) > 0 and last.ess >= settings.min_rate * last.n
+    return len(last.f) > 0 and last.ess >= settings.min_round_rate * last.n
 
 
-def reconcile(found: Outcome, before: Outcome) -> Outcome:
+def reconcile(subset_outcome: Outcome, earlier: Outcome) -> Outcome:
     """Return the outcome of subset simulation, or the earlier one where its interval lies above it.
 
     Subset simulation follows f downhill; wide draws also find regions that f does not announce. The interval of the
     earlier outcome then grows to hold both.
 
     Args:
-        found: By subset simulation.
-        before: From all draws of the exploration and the rounds.
+        subset_outcome: By subset simulation.
+        earlier: From all draws of the exploration and the rounds.
     """
-    if before.interval[0] <= found.p:
-        return found
-    interval = min(before.interval[0], found.interval[0]), max(before.interval[1], found.interval[1])
-    about = f"Subset simulation, with the rest, missed regions that were found before: its p is {found.p:.1e}."
-    warnings = (*before.warnings, *found.warnings, about)
-    return replace(before, interval=interval, status=found.status, warnings=warnings)
+    if earlier.interval[0] <= subset_outcome.p:
+        return subset_outcome
+    interval = (
+        min(earlier.interval[0], subset_outcome.interval[0]),
+        max(earlier.interval[1], subset_outcome.interval[1]),
+    )
+    about = f"Subset simulation, with the rest, missed regions that were found before: its p is {subset_outcome.p:.1e}."
+    warnings = (*earlier.warnings, *subset_outcome.warnings, about)
+    return replace(earlier, interval=interval, status=subset_outcome.status, warnings=warnings)
 
 
 def run_subset_simulation(

@@ -8,8 +8,6 @@ import numpy as np
 from samplers.method import Goal, Interrupted, Outcome, Steps
 from samplers.methods.base import Method
 from samplers.methods.two_stage import stages
-from samplers.methods.two_stage.candidates import build_proposal
-from samplers.methods.two_stage.refinement import start_refinement
 from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, TwoStageSettings
 from samplers.problem import Inputs
 from samplers.validation import check_count
@@ -40,8 +38,8 @@ class TwoStage(Method):
     yields 35 to 60 batches. Regression of f and subset simulation use its values, everything else only its sign.
 
     *Noise.* f may have noise of its own that is no part of x: p is then the marginal probability. No stored outcome
-    is simulated again. A noisy f is recognised by 30 points right beside failing ones. Regions are then not told
-    apart, and half of the draws come from tempered Gaussians, the best proposal where failure is a matter of chance.
+    is simulated again. A noisy f is recognised by 30 points right beside failing ones. Regions are then not
+    separated, and half of the draws come from tempered Gaussians: the best proposal where failure is by chance.
     Coordinates of x that the base distribution calls noise are not searched (`noise_coordinates.py`).
 
     *Interval.* Log-normal; with t quantiles where few draws carry the weight, and Bernstein's bound where very few do.
@@ -83,7 +81,7 @@ class TwoStage(Method):
 
     def __post_init__(self) -> None:
         """Check the settings."""
-        check_count("TwoStage", "n", self.n, DEFAULT_SETTINGS.min_budget)
+        check_count("TwoStage", "n", self.n, DEFAULT_SETTINGS.min_exploration_budget)
 
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Explore, refine, estimate."""
@@ -103,24 +101,23 @@ def run_two_stage(
         settings: Of all stages.
     """
     context, state = stages.start_run(inputs, goal, budget, settings, rng)
-    if budget < settings.min_budget:
-        least = settings.min_budget
+    if budget < settings.min_exploration_budget:
+        least = settings.min_exploration_budget
         about = f"max_sim leaves {budget} simulations, too few for an exploration ({least}): base draws only."
         return _warn_first(about, (yield from stages.run_monte_carlo(context, state)))
     try:
         state = yield from stages.draw_first(context, state)
         if state.base_share(goal.gamma) >= settings.common_share:
             return (yield from stages.run_monte_carlo(context, state, counted=False))
-        state, found = yield from stages.explore(context, state)
-        if not found.regions:
+        state, exploration = yield from stages.explore(context, state)
+        if not exploration.regions:
             return (yield from stages.run_monte_carlo(context, state))
-        refinement = start_refinement(found, goal.gamma, settings.refinement, rng)
-        proposal = build_proposal(refinement, state.history, settings.refinement, rng)
+        refinement, proposal = stages.begin_refinement(context, state, exploration)
         room = context.left
         for number in range(1, len(settings.refinement.round_shares) + 1):
             state, refinement, proposal = yield from stages.refine(context, state, refinement, number, room, proposal)
-        if not stages.serves(context, state, refinement, proposal):
-            return (yield from stages.fall_back(context, state, found.levels))
+        if not stages.accepts_proposal(context, state, refinement, proposal):
+            return (yield from stages.fall_back(context, state, exploration.levels))
     except Interrupted:
         return stages.estimate_early(context, state)
     outcome = yield from stages.estimate_afresh(context, state, refinement, proposal)

@@ -1,4 +1,4 @@
-"""Refinement: what rounds of draws tell of the failure regions that the exploration found.
+"""Refinement: update of the proposal components after each round of draws.
 
 `start_refinement` describes the regions by the chains inside them, `refine_once` takes in the draws of a round. The
 proposal for the next round follows from the state (`candidates.build_proposal`); all draws are kept by the caller
@@ -47,7 +47,7 @@ class NearDraws(NamedTuple):
 class RefinementState:
     """What is known of the regions after some rounds of draws."""
 
-    found: ExplorationResult
+    exploration: ExplorationResult
     """Regions of the exploration, at least one."""
     gamma: float
     """Threshold of failure."""
@@ -66,17 +66,17 @@ class RefinementState:
     @property
     def regions(self) -> list[Region]:
         """Regions of failure."""
-        return self.found.regions
+        return self.exploration.regions
 
     @property
     def noisy(self) -> bool:
         """Whether f has noise of its own."""
-        return self.found.noisy
+        return self.exploration.noisy
 
     @property
     def scattered(self) -> bool:
         """Whether the regions are no more than pieces of something like a shell."""
-        return self.found.scattered
+        return self.exploration.scattered
 
     @property
     def dim(self) -> int:
@@ -90,30 +90,35 @@ class RefinementState:
 
 
 def start_refinement(
-    found: ExplorationResult, gamma: float, settings: RefinementSettings, rng: np.random.Generator
+    exploration: ExplorationResult, gamma: float, settings: RefinementSettings, rng: np.random.Generator
 ) -> RefinementState:
-    """Return what the exploration alone tells of the regions.
+    """Return the initial state, from the exploration alone.
 
     Args:
-        found: Regions of the exploration, at least one.
+        exploration: Regions of the exploration, at least one.
         gamma: Threshold of failure.
         settings: Numbers of Gaussians.
         rng: Source of randomness of the fits.
     """
-    most = settings.max_gaussians if found.noisy else settings.gaussians_per_region
+    most = settings.max_gaussians if exploration.noisy else settings.gaussians_per_region
     explored = tuple(
         ProposalComponent(gaussian, "explored", k)
-        for k, region in enumerate(found.regions)
+        for k, region in enumerate(exploration.regions)
         for gaussian in _fit_chains(region, most, settings.points_per_chain, rng)
     )
     linear = tuple(
         ProposalComponent(component, "linear", k)
-        for k, region in enumerate(found.regions)
+        for k, region in enumerate(exploration.regions)
         for component in half_space_proposals(region.points, region.u, region.f, gamma)
     )
     gaussians = [candidate.component for candidate in explored if isinstance(candidate.component, SubspaceGaussian)]
     return RefinementState(
-        found=found, gamma=gamma, explored=explored, gaussians=gaussians, linear=linear, fresh_gaussians=[]
+        exploration=exploration,
+        gamma=gamma,
+        explored=explored,
+        gaussians=gaussians,
+        linear=linear,
+        fresh_gaussians=[],
     )
 
 
@@ -202,11 +207,11 @@ def _fit_linear(state: RefinementState, settings: RefinementSettings) -> tuple[P
     nearest = np.array([candidate.region for candidate in state.explored])[log_r.argmax(axis=0)]
     owner = np.where(log_r.max(axis=0) > settings.min_log_ratio, nearest, NO_REGION)
     fails = f <= state.gamma
-    found: list[ProposalComponent] = []
+    proposals: list[ProposalComponent] = []
     for k, region in enumerate(state.regions):
         own = owner == k
         failures = np.concatenate([region.points, u[own & fails]])
         around, outcomes = np.concatenate([region.u, u[own]]), np.concatenate([region.f, f[own]])
         components = half_space_proposals(failures, around, outcomes, state.gamma)
-        found += [ProposalComponent(component, "linear", k) for component in components]
-    return tuple(found)
+        proposals += [ProposalComponent(component, "linear", k) for component in components]
+    return tuple(proposals)

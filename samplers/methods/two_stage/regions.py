@@ -1,7 +1,7 @@
-"""Failure regions: chains grow inside them, and the points half way between failing points tell them apart.
+"""Failure regions: chains grow inside them, and the points half way between failing points separate them.
 
-A half way point uses f by its sign only: if it fails, the two points are of one region. Near convex regions are told
-apart by this in any dimension, however alike they look.
+A half way point uses f by its sign only: if it fails, the two points are of one region. Near convex regions are
+separated by this in any dimension, however alike they look.
 """
 
 import math
@@ -80,7 +80,7 @@ class ExplorationResult(NamedTuple):
 
     regions: list[Region]
     noisy: bool
-    """Whether f has noise of its own: then regions cannot be told apart, and all of it is one."""
+    """Whether f has noise of its own: then regions cannot be separated, and all of it is one."""
     scattered: bool = False
     """Whether the regions are no more than pieces of something like a shell."""
     levels: int = 0
@@ -191,7 +191,7 @@ def _pcn_chains(
         fails = f <= gamma
         u = np.where(fails[:, None], proposal, u)
         if directions is None:
-            change = settings.adaptation * (fails - settings.target_acceptance) / math.sqrt(step)
+            change = settings.adaptation * (fails - settings.chain_acceptance) / math.sqrt(step)
             sigma = np.clip(sigma * np.exp(change), settings.min_step, 1.0)
         else:
             across = np.clip(across * np.where(fails, *settings.across_factors), settings.min_across, 1.0)

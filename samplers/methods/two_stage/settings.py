@@ -2,8 +2,8 @@
 
 Users set `TwoStage.n` only. Where no other reason stands beside a number, it was chosen together with the others on the
 problems of `benchmarks/estimators/catalogue.py` at 6,000 simulations: some 30 configurations, up to 40 runs each, by
-which differences in gain of less than a factor of two cannot be told from chance. What belongs to one algorithm alone
-stands in its module (`mixture/`, the sizes in `exploration.py`).
+which differences in gain of less than a factor of two cannot be told from chance. Constants of the algorithms that fit
+and screen mixtures stand in their modules (`mixture/`).
 """
 
 from dataclasses import dataclass, field
@@ -25,8 +25,48 @@ def _initial_shares() -> dict[Kind, float]:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ExplorationSettings:
+    """Draws of the exploration (`exploration.py`); their numbers hold for `usual_budget` simulations."""
+
+    usual_budget: int = 6000
+    """Up to here sizes grow in proportion to the budget, above with its square root; the rest of the budget is
+    for refinement and estimate."""
+    base: int = 500
+    """Base draws; five levels of a tenth each reach 1e-5 from there."""
+    wide: tuple[tuple[float, int], ...] = ((1.5, 120), (2.2, 120), (3.0, 80))
+    """Wide draws: (s, number). At s = 3 a half-space at beta = 4.5 is hit by one draw in 15."""
+    level: int = 250
+    """Points of each level of subset simulation; `least_level` where the budget is small."""
+    least_level: int = 100
+    level_fraction: float = 0.1
+    """Conditional probability of a level (Au and Beck 2001)."""
+    points_per_seed: int = 3
+    """Points of a level for each of its seeds at least: chains take two steps or more."""
+    initial_scale: float = 0.6
+    """First step of the chains of subset simulation, as in `AdaptiveSubsetSimulation`."""
+    level_acceptance: float = 0.35
+    """Acceptance that it is adapted to; less than for long chains, as in `RegionSettings`."""
+    max_levels: int = 30
+    """Levels at most; the share of the budget ends the descent first unless f ties."""
+    starts: int = 60
+    """Chains from wide failures at most; `least_starts` where the budget is small."""
+    least_starts: int = 10
+    level_starts: int = 16
+    """The same for failures of subset simulation; they take the place of wide failures that are missing."""
+    least_level_starts: int = 6
+    bisections: int = 3
+    """Steps of a wide failure towards the origin: the edge of the region is then known to an eighth of the way."""
+    chain_cost: int = 25
+    """Simulations that a chain needs at most before it is sorted: bisection, two walks, points half way."""
+    descent_share: float = 0.45
+    """Share of the budget after which no further level is begun."""
+    share: float = 0.65
+    """Share of the budget for the whole exploration."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class RegionSettings:
-    """Chains inside the failure region, and how regions are told apart (`regions.py`)."""
+    """Chains inside the failure region, and how regions are separated (`regions.py`)."""
 
     initial_step: float = 0.5
     """pCN step before any adaptation."""
@@ -34,7 +74,7 @@ class RegionSettings:
     """Steps of the chains before and after they are sorted into regions."""
     steps_high_dim: tuple[int, int] = (8, 8)
     """The same above HIGH_DIM dimensions, where a wide failure has further to go."""
-    target_acceptance: float = 0.35
+    chain_acceptance: float = 0.35
     """Acceptance that the step is adapted to; Papaioannou, Betz, Zwirglmaier and Straub, 2015, adapt to 0.44."""
     adaptation: float = 0.7
     """Change of the log step per unit of acceptance in the first step; it falls with the root of their number."""
@@ -52,7 +92,7 @@ class RegionSettings:
     scattered_share: float = 0.25
     """Where this share of the points is in none of `many_regions` regions, it is."""
     max_regions: int = 16
-    """Regions that are told apart at most."""
+    """Regions that are separated at most."""
     chains_per_region: tuple[int, int] = (8, 24)
     """Chains of each region at least, in few dimensions and in many."""
     points_per_dim: float = 2.5
@@ -60,7 +100,7 @@ class RegionSettings:
     max_replicated: int = 60
     """Chains that are added to reach it at most, over all regions."""
     probes: int = 30
-    """Points beside failing ones that tell whether f is noisy."""
+    """Points beside failing ones that show whether f is noisy."""
     probe_distance: float = 1e-6
     """How far beside, in standard deviations: no f of a simulation changes over it, save at jumps or by noise."""
     noisy_share: float = 0.9
@@ -156,9 +196,9 @@ class RefinementSettings:
 class FallbackSettings:
     """When a proposal is given up for subset simulation (`fallback.py`)."""
 
-    min_budget: int = 300
+    min_fallback_budget: int = 300
     """Simulations under which subset simulation is not worth it."""
-    min_rate: float = 0.005
+    min_round_rate: float = 0.005
     """What the last round of draws must be worth, in independent failures for each draw. Proposals that describe the
     failures reach 0.01 to 0.9; with less, the spread of the weights is that of the failures met, not of all."""
     good_rate: float = 0.1
@@ -187,7 +227,7 @@ class DiagnosticSettings:
     """Standard errors between the rounds and the estimate; a normal distribution exceeds it once in 16,000 runs."""
     min_rounds_ess: float = 30.0
     """Independent failures that the rounds must be worth to be compared."""
-    min_rate: float = 0.025
+    min_final_rate: float = 0.025
     """Independent failures for each final draw; with less, there may be heavier weights than any met."""
     max_point_share: float = 0.05
     """Share of p that a single draw in a region may stand for."""
@@ -197,10 +237,10 @@ class DiagnosticSettings:
 class TwoStageSettings:
     """All settings of a run."""
 
-    min_budget: int = 400
+    min_exploration_budget: int = 400
     """With fewer simulations an exploration is not worth its draws."""
     sufficient_budget: int = 1500
-    """With fewer, one of two like regions is missed in 3 to 30 % of runs, and nothing tells."""
+    """With fewer, one of two like regions is missed in 3 to 30 % of runs, without any sign."""
     common_share: float = 0.1
     """Where this share of the base draws fails, plain Monte Carlo is as good as anything."""
     monte_carlo_batch: int = 10_000
@@ -211,6 +251,7 @@ class TwoStageSettings:
     """... but at least so many draws."""
     max_batches: int = 100
     """Batches after which a target c.o.v. is given up where max_sim does not say."""
+    exploration: ExplorationSettings = ExplorationSettings()
     regions: RegionSettings = RegionSettings()
     refinement: RefinementSettings = RefinementSettings()
     fallback: FallbackSettings = FallbackSettings()

@@ -1,4 +1,4 @@
-"""Stages of two-stage: what a run knows, as a frozen state, and the steps that lead from one state to the next.
+"""Stages of two-stage: the frozen state of a run, and the steps from one state to the next.
 
 A step that needs simulations is a generator: `state = yield from draw_first(context, state)`. Where `Interrupted`
 ends it, the caller goes on with the state before the step.
@@ -18,7 +18,7 @@ from samplers.methods.two_stage.exploration import Sizes, find_regions, first_dr
 from samplers.methods.two_stage.mixture.proposal import MixtureProposal
 from samplers.methods.two_stage.multiple_importance import MultipleImportanceSample
 from samplers.methods.two_stage.noise_coordinates import marginalise_noise
-from samplers.methods.two_stage.refinement import RefinementState, expected_weights, refine_once
+from samplers.methods.two_stage.refinement import RefinementState, expected_weights, refine_once, start_refinement
 from samplers.methods.two_stage.regions import ExplorationResult
 from samplers.methods.two_stage.settings import TwoStageSettings
 from samplers.methods.two_stage.simulator import ComponentDraws, SimulationSteps, Simulator
@@ -73,7 +73,7 @@ class RunContext:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RunState:
-    """What has been simulated so far, and its record."""
+    """State of a run: draws so far and their trace."""
 
     history: MultipleImportanceSample
     """All draws from known components."""
@@ -106,7 +106,7 @@ def start_run(
 
 def draw_first(context: RunContext, state: RunState) -> SimulationSteps[RunState]:
     """Make the base draws and the wide draws of the exploration."""
-    gamma, sizes = context.goal.gamma, Sizes.within(context.budget)
+    gamma, sizes = context.goal.gamma, Sizes.within(context.budget, context.settings.exploration)
     first = yield from first_draws(context.simulator, sizes, context.rng)
     state = replace(
         state,
@@ -121,13 +121,29 @@ def draw_first(context: RunContext, state: RunState) -> SimulationSteps[RunState
 
 def explore(context: RunContext, state: RunState) -> SimulationSteps[tuple[RunState, ExplorationResult]]:
     """Find the failure regions, starting from the first draws; there are none where nothing fails."""
-    gamma, sizes = context.goal.gamma, Sizes.within(context.budget)
-    found = yield from find_regions(
-        context.simulator, state.history.batches[0], gamma, sizes, context.rng, context.settings.regions
+    gamma, sizes = context.goal.gamma, Sizes.within(context.budget, context.settings.exploration)
+    settings = context.settings
+    exploration = yield from find_regions(
+        context.simulator,
+        state.history.batches[0],
+        gamma,
+        sizes,
+        context.rng,
+        settings.regions,
+        settings.exploration,
     )
-    n = sum(len(region.f) for region in found.regions)
-    fails = sum(int((region.f <= gamma).sum()) for region in found.regions)
-    return _record(context, state, fails / max(n, 1), state.base_share(gamma), n, math.inf), found
+    n = sum(len(region.f) for region in exploration.regions)
+    fails = sum(int((region.f <= gamma).sum()) for region in exploration.regions)
+    return _record(context, state, fails / max(n, 1), state.base_share(gamma), n, math.inf), exploration
+
+
+def begin_refinement(
+    context: RunContext, state: RunState, exploration: ExplorationResult
+) -> tuple[RefinementState, MixtureProposal]:
+    """Return what the exploration shows of its regions, at least one, and the proposal of the first round."""
+    settings, rng = context.settings.refinement, context.rng
+    refinement = start_refinement(exploration, context.goal.gamma, settings, rng)
+    return refinement, build_proposal(refinement, state.history, settings, rng)
 
 
 def draw_round(
@@ -168,10 +184,12 @@ def refine(
     return state, refinement, build_proposal(refinement, state.history, settings, context.rng, final=final)
 
 
-def serves(context: RunContext, state: RunState, refinement: RefinementState, proposal: MixtureProposal) -> bool:
+def accepts_proposal(
+    context: RunContext, state: RunState, refinement: RefinementState, proposal: MixtureProposal
+) -> bool:
     """Return whether to estimate with a proposal; where f is noisy by itself there is nothing better."""
     settings = context.settings.fallback
-    if context.left_at_all < settings.min_budget or not state.rounds:
+    if context.left_at_all < settings.min_fallback_budget or not state.rounds:
         return True
     if refinement.noisy:
         return not context.noise_marginalised or fallback.meets_failures(state.rounds[-1], settings)
@@ -315,6 +333,6 @@ def _record(
 
 
 def _close_trace(context: RunContext, state: RunState) -> RunState:
-    """Return the state with the simulations of a step that was interrupted as a level of their own."""
+    """Return the state with the simulations of an interrupted step recorded as a level."""
     loose = context.simulator.n_sim - sum(level.n_sim for level in state.trace)
     return _record(context, state, math.nan, math.nan, loose, math.inf) if loose else state

@@ -26,7 +26,7 @@ def seeds_of(trace):
     return [round(level.p * level.n_points) for level in trace[:-1]]
 
 
-BOTH = [SS(), ADSS(), ADSS(proposal="metropolis"), SS(law="normal")]
+BOTH = [SS(), ADSS(), ADSS(proposal="metropolis"), SS(distribution="normal")]
 IDS = ["ss", "adss", "adss metropolis", "ss normal"]
 
 
@@ -246,7 +246,9 @@ def test_a_candidate_that_did_not_move_is_not_simulated(recorder):
         assert level.n_sim < 0.9 * (1000 - seeds)
 
 
-@pytest.mark.parametrize("settings", [{"n": 5}, {"p0": 0.5}, {"spread": 0.0}, {"max_levels": 0}, {"law": "cauchy"}])
+@pytest.mark.parametrize(
+    "settings", [{"n": 5}, {"p0": 0.5}, {"spread": 0.0}, {"max_levels": 0}, {"distribution": "cauchy"}]
+)
 def test_settings_of_subset_simulation_out_of_range(settings):
     with pytest.raises(ValueError, match=f"SubsetSimulation: expected .*{next(iter(settings))}"):
         SS(**settings)

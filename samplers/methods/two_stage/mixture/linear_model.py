@@ -41,15 +41,15 @@ LARGEST_OUTCOME = 1e300
 EXACT = 0.999
 """R^2 from which f is linear."""
 LINEAR = 0.95
-"""R^2 from which the hyperplane also tells where failure begins."""
+"""R^2 from which the hyperplane locates the failure boundary."""
 LEAST_R2 = 0.3
-"""R^2 under which a hyperplane is no help; that of pure noise stays below (`test_noise_has_no_plane`)."""
+"""R^2 under which a hyperplane is no help; that of pure noise stays below (`test_noise_has_no_hyperplane`)."""
 AGREEING = 0.6
 """Share of the points that must agree with a hyperplane for it to be more than chance."""
 CROSSING_ERRORS = 2.0
 """Standard errors of a prediction by which a half-space begins before the hyperplane."""
 NEAREST = 0.03
-"""Share of the failures that may lie before the edge, where the hyperplane does not tell it."""
+"""Share of the failures that may lie before the edge, where the hyperplane does not locate it."""
 MIN_FAILURES = 8
 """Failures that half-space proposals need."""
 MIN_DISTANCE = 0.5
@@ -67,7 +67,7 @@ EDGE_EXCESSES = 2.0
 """Mean excesses over the quantile, divided by the number of failures, by which an edge is put back."""
 
 
-class Plane(NamedTuple):
+class Hyperplane(NamedTuple):
     """A hyperplane fitted to f: f = level - steepness (axis . u - at)."""
 
     axis: FloatArray
@@ -92,25 +92,25 @@ class Plane(NamedTuple):
 
     @property
     def clear(self) -> bool:
-        """Whether it also tells where failure begins."""
+        """Whether it also locates the failure boundary."""
         return self.r2 > LINEAR and self.share > AGREEING
 
     def crossing(self, gamma: float) -> float:
         """Return where along the axis f falls to gamma, less CROSSING_ERRORS standard errors of a prediction of that.
 
-        A plane that is turned by some degrees has failures before it all along its edge.
+        A hyperplane that is turned by some degrees has failures before it all along its edge.
         """
         error = math.sqrt(max(1 - self.r2, 0.0)) * self.spread
         return self.at + (self.level - gamma - CROSSING_ERRORS * error) / self.steepness
 
 
-def fit_plane(u: FloatArray, f: FloatArray) -> Plane:
+def fit_hyperplane(u: FloatArray, f: FloatArray) -> Hyperplane:
     """Return the hyperplane that f follows at points u (n, d), f (n,); axis 0 and R^2 0 where there is none.
 
     Infinite outcomes and the share TRIMMED at either end are left out.
     """
     dim = u.shape[1]
-    none = Plane(np.zeros(dim), 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+    none = Hyperplane(np.zeros(dim), 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
     finite = np.isfinite(f) & (np.abs(f) < LARGEST_OUTCOME)
     if finite.sum() < MIN_REGRESSION_POINTS:
         return none
@@ -126,7 +126,7 @@ def fit_plane(u: FloatArray, f: FloatArray) -> Plane:
         return none
     axis, x, y = -slope / norm, x[near], y[near]
     at, level, spread = float((x @ axis).mean()), size * float(y.mean()), size * float(y.std())
-    return Plane(axis, size * norm, at, level, r2, float(near.mean()), spread)
+    return Hyperplane(axis, size * norm, at, level, r2, float(near.mean()), spread)
 
 
 def descent_direction(u: FloatArray, f: FloatArray) -> tuple[FloatArray, float]:
@@ -135,11 +135,11 @@ def descent_direction(u: FloatArray, f: FloatArray) -> tuple[FloatArray, float]:
     That is R^2 (leave-one-out) times the share of the points that agree; direction 0 where there is none.
 
     Args:
-        u: GroupedPoints, shape (n, d).
+        u: Points, shape (n, d).
         f: Their outcomes, shape (n,); infinite ones and the share TRIMMED at either end are left out.
     """
-    plane = fit_plane(u, f)
-    return plane.axis, plane.explained
+    hyperplane = fit_hyperplane(u, f)
+    return hyperplane.axis, hyperplane.explained
 
 
 def half_space_proposals(
@@ -154,7 +154,7 @@ def half_space_proposals(
 
     Args:
         failures: Failing points, shape (m, d).
-        u: GroupedPoints around them, failing or not, shape (n, d).
+        u: Points around them, failing or not, shape (n, d).
         f: Outcomes of these, shape (n,).
         gamma: Threshold of failure.
 
@@ -166,23 +166,23 @@ def half_space_proposals(
         >>> gaussian.centre.round(2) + 0.0, half_space.axis.round(2) + 0.0, round(half_space.start, 2)
         (array([3.28, 0.  ]), array([1., 0.]), 2.98)
     """
-    plane = fit_plane(u, f)
-    if plane.explained < EXACT:  # outside the region, f may be that of another one
+    hyperplane = fit_hyperplane(u, f)
+    if hyperplane.explained < EXACT:  # outside the region, f may be that of another one
         inside = f <= gamma
-        alone = fit_plane(u[inside], f[inside])
-        plane = alone if alone.clear and alone.explained > plane.explained else plane
-    if plane.explained < LEAST_R2 or len(failures) < MIN_FAILURES:
+        alone = fit_hyperplane(u[inside], f[inside])
+        hyperplane = alone if alone.clear and alone.explained > hyperplane.explained else hyperplane
+    if hyperplane.explained < LEAST_R2 or len(failures) < MIN_FAILURES:
         return []
-    beta = _find_boundary(plane, failures @ plane.axis, gamma)
+    beta = _find_boundary(hyperplane, failures @ hyperplane.axis, gamma)
     if beta < MIN_DISTANCE:
         return []
     mean = math.exp(-0.5 * (beta * beta + LOG_TWO_PI) - float(log_ndtr(-beta)))
     variance = max(1 + beta * mean - mean * mean, MIN_GAUSSIAN_VARIANCE)
-    gaussian = SubspaceGaussian(plane.axis[:, None], np.array([mean]), np.array([WIDENING * variance]))
-    return [gaussian, HalfSpaceNormal(plane.axis, beta - EDGE_SLACK)]
+    gaussian = SubspaceGaussian(hyperplane.axis[:, None], np.array([mean]), np.array([WIDENING * variance]))
+    return [gaussian, HalfSpaceNormal(hyperplane.axis, beta - EDGE_SLACK)]
 
 
-def _find_boundary(plane: Plane, along: FloatArray, gamma: float) -> float:
+def _find_boundary(hyperplane: Hyperplane, along: FloatArray, gamma: float) -> float:
     """Return where along its axis a half-space of failures begins, given how far the failures are along it, (m,).
 
     0 where the failures are around the origin.
@@ -190,8 +190,8 @@ def _find_boundary(plane: Plane, along: FloatArray, gamma: float) -> float:
     middle = float(np.median(along))
     if middle < MIN_DISTANCE:
         return 0.0
-    if plane.clear:
-        return plane.crossing(gamma)
+    if hyperplane.clear:
+        return hyperplane.crossing(gamma)
     along = along[along > SAME_REGION * middle]
     return failure_edge(along, np.ones(len(along)), len(np.unique(along)), NEAREST)
 

@@ -23,7 +23,7 @@ from samplers.proposals.components import MixtureComponent
 MIN_ACCEPTANCES = (0.5, 0.25)
 """Values of a_min to choose from: no weight grows by more than 4."""
 MAX_VARIANCE_RATIO = 0.9
-"""A screen is used where it promises less than this share of the variance without it."""
+"""A screen is used where it is estimated to give less than this share of the variance without it."""
 MIN_CLASS_SIZE = 40
 """Failing, and other, points that a classifier needs."""
 SVM_PENALTY = 10.0
@@ -113,7 +113,7 @@ def train_screen(known: LabelledPoints, fresh: LabelledPoints, log_weights: Floa
 def _choose_screen(
     screens: list[FailureScreen], fresh: LabelledPoints, log_weights: FloatArray
 ) -> FailureScreen | None:
-    """Return the screen with the least variance per simulation, None where none promises enough.
+    """Return the screen with the least variance per simulation, None where none is estimated to give enough.
 
     Behind a screen a term y becomes y E[a] / a(u), drawn with density q a / E[a]: its second moment is E[y^2 / a] E[a].
     """

@@ -27,8 +27,8 @@ def half_spaces(dim, regions):
 def started(exact_region, rng, dim=3, regions=1, noisy=False, scattered=False):
     """Return the state before any round, an empty history and the problem."""
     problem = half_spaces(dim, regions)
-    found = ExplorationResult([exact_region(problem, k, BETA) for k in range(regions)], noisy, scattered)
-    return start_refinement(found, 0.0, SETTINGS, rng), MultipleImportanceSample.empty(dim), problem
+    exploration = ExplorationResult([exact_region(problem, k, BETA) for k in range(regions)], noisy, scattered)
+    return start_refinement(exploration, 0.0, SETTINGS, rng), MultipleImportanceSample.empty(dim), problem
 
 
 def after_round(exact_region, rng, n=800, **kwargs):

@@ -6,7 +6,6 @@ from scipy import stats
 
 from samplers.limit_states import four_branches, plateau, shell
 from samplers.methods.two_stage.exploration import (
-    DEFAULT_EXPLORATION,
     Sizes,
     _bisect_towards_origin,
     _descend,
@@ -14,7 +13,7 @@ from samplers.methods.two_stage.exploration import (
     find_regions,
     first_draws,
 )
-from samplers.methods.two_stage.settings import RegionSettings
+from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, RegionSettings
 from samplers.methods.two_stage.simulator import Simulator
 from samplers.problem import FunctionProblem
 
@@ -161,7 +160,9 @@ def test_descent_finds_what_plain_draws_cannot():
     for seed in range(6):
         rng, simulator = np.random.default_rng(seed), Simulator(problem)
         u = rng.standard_normal((sizes.base, 10))
-        descent = driven(_descend(simulator, u, problem.evaluate(u), 0.0, sizes, rng, DEFAULT_EXPLORATION), problem)
+        descent = driven(
+            _descend(simulator, u, problem.evaluate(u), 0.0, sizes, rng, DEFAULT_SETTINGS.exploration), problem
+        )
         assert simulator.n_sim == len(descent.u) == len(descent.f) <= sizes.most
         assert (problem.evaluate(descent.failing) <= 0).all()
         assert len(np.unique(descent.failing, axis=0)) == len(descent.failing)
@@ -174,12 +175,12 @@ def test_points_are_drawn_in_along_their_rays_and_still_fail(rng):
     problem = half_spaces(3, 3.0)
     u = rng.normal(0.0, 3.0, (200, 3))
     u[:, 0] = rng.uniform(3.0, 12.0, 200)
-    near = driven(_bisect_towards_origin(Simulator(problem), u, 0.0, DEFAULT_EXPLORATION.bisections), problem)
+    near = driven(_bisect_towards_origin(Simulator(problem), u, 0.0, DEFAULT_SETTINGS.exploration.bisections), problem)
     assert (near[:, 0] >= 3.0).all()
     ratio = near[:, 0] / u[:, 0]
     np.testing.assert_allclose(near, ratio[:, None] * u)
     assert (ratio <= 1).all()
-    assert (ratio - 3.0 / u[:, 0] <= 0.5**DEFAULT_EXPLORATION.bisections + 1e-12).all()
+    assert (ratio - 3.0 / u[:, 0] <= 0.5**DEFAULT_SETTINGS.exploration.bisections + 1e-12).all()
 
 
 def test_starts_are_half_the_least_wide_and_half_at_random(rng):

@@ -67,10 +67,10 @@ def test_where_f_is_noisy_one_region_may_have_many_gaussians(rng):
     centres = 6.0 * np.concatenate([np.eye(4), -np.eye(4)])
     chains = np.repeat(centres, 12, axis=0)[:, None] + 0.3 * rng.standard_normal((96, 5, 4))
     clusters = Region(chains, chains.reshape(-1, 4), rng.standard_normal(480))
-    found = ExplorationResult([clusters], noisy=True)
-    assert len(start_refinement(found, 0.0, SETTINGS, rng).explored) == SETTINGS.max_gaussians
-    found = found._replace(noisy=False)
-    assert len(start_refinement(found, 0.0, SETTINGS, rng).explored) == SETTINGS.gaussians_per_region
+    exploration = ExplorationResult([clusters], noisy=True)
+    assert len(start_refinement(exploration, 0.0, SETTINGS, rng).explored) == SETTINGS.max_gaussians
+    exploration = exploration._replace(noisy=False)
+    assert len(start_refinement(exploration, 0.0, SETTINGS, rng).explored) == SETTINGS.gaussians_per_region
 
 
 def test_a_round_moves_the_gaussians_and_leaves_the_state_before_as_it_was(exact_region, rng):
@@ -145,16 +145,18 @@ def test_expected_weight_of_a_region_leaves_out_its_heaviest_chain(rng):
     """Under N(0, I) itself all weights are 1; under a Gaussian far away the chain at the origin is the heaviest."""
     chains = np.zeros((4, 2, 2))
     chains[1:, :, 0] = 3.0
-    found = ExplorationResult([Region(chains, chains.reshape(-1, 2), -np.ones(8))], noisy=False)
-    state = RefinementState(found=found, gamma=0.0, explored=(), gaussians=[], linear=(), fresh_gaussians=[])
+    exploration = ExplorationResult([Region(chains, chains.reshape(-1, 2), -np.ones(8))], noisy=False)
+    state = RefinementState(
+        exploration=exploration, gamma=0.0, explored=(), gaussians=[], linear=(), fresh_gaussians=[]
+    )
     plain = MixtureProposal([ProposalComponent(IsotropicNormal(2), "base")], np.ones(1))
     np.testing.assert_allclose(expected_weights(state, plain), 1.0)
     far = SubspaceGaussian(np.eye(2), np.array([3.0, 0.0]), np.ones(2))
     proposal = MixtureProposal([ProposalComponent(far, "gaussian", 0)], np.ones(1))
     # phi / q = exp(9/2 - 3 u1): e^-4.5 at u1 = 3, e^4.5 at the origin
     np.testing.assert_allclose(expected_weights(state, proposal), np.exp(-4.5))
-    two = found._replace(regions=[Region(chains[:2], found.regions[0].u, found.regions[0].f)])
+    two = exploration._replace(regions=[Region(chains[:2], exploration.regions[0].u, exploration.regions[0].f)])
     both = expected_weights(
-        RefinementState(found=two, gamma=0.0, explored=(), gaussians=[], linear=(), fresh_gaussians=[]), proposal
+        RefinementState(exploration=two, gamma=0.0, explored=(), gaussians=[], linear=(), fresh_gaussians=[]), proposal
     )
     np.testing.assert_allclose(both, (np.exp(-4.5) + np.exp(4.5)) / 2)

@@ -35,8 +35,8 @@ def test_half_of_what_the_exploration_may_leave_is_for_the_estimate(budget):
 
 def test_settings_cannot_be_changed_but_replaced():
     with pytest.raises(FrozenInstanceError):
-        DEFAULT_SETTINGS.min_budget = 1  # type: ignore[misc]
-    assert replace(DEFAULT_SETTINGS, min_budget=1).min_budget == 1
+        DEFAULT_SETTINGS.min_exploration_budget = 1  # type: ignore[misc]
+    assert replace(DEFAULT_SETTINGS, min_exploration_budget=1).min_exploration_budget == 1
 
 
 def test_a_run_takes_its_numbers_from_the_settings_given(drive):
@@ -50,4 +50,4 @@ def test_a_run_takes_its_numbers_from_the_settings_given(drive):
     assert levels(DEFAULT_SETTINGS) == 6  # first draws, regions, three rounds, estimate
     two_rounds = replace(DEFAULT_SETTINGS, refinement=replace(REFINEMENT, round_shares=(0.1, 0.2)))
     assert levels(two_rounds) == 5
-    assert levels(replace(DEFAULT_SETTINGS, min_budget=2000)) == 1
+    assert levels(replace(DEFAULT_SETTINGS, min_exploration_budget=2000)) == 1

@@ -32,8 +32,8 @@ def explored(drive, **kwargs):
     """Return the run after the exploration."""
     context, state, levels = start(**kwargs)
     state = drive(stages.draw_first(context, state), PROBLEM).value
-    state, found = drive(stages.explore(context, state), PROBLEM).value
-    refinement = start_refinement(found, 0.0, context.settings.refinement, context.rng)
+    state, exploration = drive(stages.explore(context, state), PROBLEM).value
+    refinement = start_refinement(exploration, 0.0, context.settings.refinement, context.rng)
     proposal = build_proposal(refinement, state.history, context.settings.refinement, context.rng)
     return context, state, refinement, proposal, levels
 
@@ -108,7 +108,7 @@ def test_an_interrupted_step_leaves_the_state_and_its_simulations_are_counted(dr
 
 def test_the_estimate_rests_on_its_own_draws(drive):
     context, state, refinement, proposal, _ = refined(drive)
-    assert stages.serves(context, state, refinement, proposal)
+    assert stages.accepts_proposal(context, state, refinement, proposal)
     left = context.left
     outcome = drive(stages.estimate_afresh(context, state, refinement, proposal), PROBLEM).value
     assert context.simulator.n_sim == BUDGET == sum(level.n_sim for level in outcome.trace)
@@ -159,7 +159,7 @@ def test_plain_monte_carlo_goes_on_with_the_first_base_draws_or_without(drive, c
 def test_subset_simulation_takes_what_is_left_in_all_coordinates(drive):
     context, state, refinement, _, _ = explored(drive)
     left = context.left_at_all
-    outcome, f = drive(stages.fall_back(context, state, refinement.found.levels), PROBLEM)
+    outcome, f = drive(stages.fall_back(context, state, refinement.exploration.levels), PROBLEM)
     assert len(f) <= left
     assert outcome.warnings[0].startswith("No proposal describes the failures")
     assert outcome.trace[: len(state.trace)] == state.trace
@@ -169,4 +169,4 @@ def test_subset_simulation_takes_what_is_left_in_all_coordinates(drive):
 
 def test_without_rounds_or_budget_the_proposal_serves(drive):
     context, state, refinement, proposal, _ = explored(drive)
-    assert stages.serves(context, state, refinement, proposal)
+    assert stages.accepts_proposal(context, state, refinement, proposal)

@@ -10,7 +10,7 @@ from samplers.methods.two_stage.mixture.linear_model import (
     WIDENING,
     descent_direction,
     failure_edge,
-    fit_plane,
+    fit_hyperplane,
     half_space_proposals,
 )
 from samplers.proposals.components import HalfSpaceNormal, SubspaceGaussian
@@ -22,7 +22,7 @@ def unit(dim, seed=0):
 
 
 def around(axis, n, rng, mean=3.0):
-    """Points near a plane at this distance, as chains and their proposals are."""
+    """Points near a hyperplane at this distance, as chains and their proposals are."""
     u = rng.standard_normal((n, len(axis)))
     return u + (mean - u @ axis + 0.5 * rng.standard_normal(n))[:, None] * axis
 
@@ -64,7 +64,7 @@ def test_scale_and_shift_of_f_do_not_matter_much(rng):
 
 
 def with_outliers(axis, other, n, share, rng):
-    """f of another plane at a share of the points, which lie near that one."""
+    """f of another hyperplane at a share of the points, which lie near that one."""
     u = around(axis, n, rng)
     foreign = np.arange(n) < share * n
     u[foreign] = around(other, np.count_nonzero(foreign), rng)
@@ -116,7 +116,7 @@ def test_outcomes_of_any_size(scale, rng):
 @pytest.mark.parametrize(
     "f", [np.full(50, 2.0), np.full(50, np.inf), np.full(50, -np.inf), np.append(np.full(47, np.inf), [1.0, 2.0, 3.0])]
 )
-def test_without_outcomes_that_differ_there_is_no_plane(f, rng):
+def test_without_outcomes_that_differ_there_is_no_hyperplane(f, rng):
     found, r2 = descent_direction(rng.standard_normal((50, 3)), f)
     assert r2 == 0
     np.testing.assert_array_equal(found, 0.0)
@@ -144,7 +144,7 @@ def test_an_indicator_has_a_direction_but_a_small_r2(rng):
 
 
 @pytest.mark.parametrize(("dim", "n"), [(2, 100), (20, 100), (20, 400), (100, 80), (100, 400)])
-def test_noise_has_no_plane(dim, n):
+def test_noise_has_no_hyperplane(dim, n):
     """Left-out R^2: its mean is negative under noise, its spread about sqrt(2 d) / n."""
     for seed in range(10):
         rng = np.random.default_rng(seed)
@@ -183,19 +183,19 @@ def test_no_proposals_from_few_failures_or_a_plane_at_the_origin(rng):
     assert half_space_proposals(centred, centred, -(centred @ axis)) == []
 
 
-def beyond_plane(axis, beta, n, rng):
-    """Draws from N(0, I) beyond a plane."""
+def beyond_hyperplane(axis, beta, n, rng):
+    """Draws from N(0, I) beyond a hyperplane."""
     xi = rng.standard_normal((n, len(axis)))
     return xi + (stats.truncnorm(beta, np.inf).rvs(n, random_state=rng) - xi @ axis)[:, None] * axis
 
 
 @pytest.mark.parametrize("dim", [8, 100])
 def test_points_of_another_region_among_the_failures_change_nothing(dim):
-    """A tenth of the failures, and the points around them, lie beyond another plane."""
+    """A tenth of the failures, and the points around them, lie beyond another hyperplane."""
     for seed in range(5):
         rng = np.random.default_rng(seed)
         axis, other = np.eye(dim)[0], np.eye(dim)[1]
-        points = np.concatenate([beyond_plane(axis, 3.0, 180, rng), beyond_plane(other, 3.2, 20, rng)])
+        points = np.concatenate([beyond_hyperplane(axis, 3.0, 180, rng), beyond_hyperplane(other, 3.2, 20, rng)])
         u = np.concatenate([around(axis, 270, rng), around(other, 30, rng)])
         f = np.minimum(3.0 - u @ axis, 5.0 * (3.2 - u @ other))
         _, half_space = half_space_proposals(points, u, f)
@@ -204,11 +204,11 @@ def test_points_of_another_region_among_the_failures_change_nothing(dim):
 
 
 def test_a_region_whose_surroundings_fall_towards_another_one(rng):
-    """Outside the region f is that of a plane that falls more slowly: the failing points know better."""
+    """Outside the region f is that of a hyperplane that falls more slowly: the failing points know better."""
     axis, other = np.eye(6)[0], np.eye(6)[1]
     u = around(axis, 80, rng, mean=3.2)
     f = np.minimum(2.0 * (3.0 - u @ axis), 0.3 * (3.0 - u @ other))
-    _, half_space = half_space_proposals(beyond_plane(axis, 3.0, 40, rng), u, f)
+    _, half_space = half_space_proposals(beyond_hyperplane(axis, 3.0, 40, rng), u, f)
     assert angle(half_space.axis, axis) < 0.01
     assert half_space.start == pytest.approx(2.98, abs=0.02)
 
@@ -220,8 +220,8 @@ def test_hardly_any_failure_lies_before_the_start_of_a_plane_that_is_turned(n):
         rng = np.random.default_rng(seed)
         axis = unit(100)
         u = around(axis, n, rng, mean=3.2)
-        plane = fit_plane(u, 3.0 - u @ axis + 0.05 * rng.standard_normal(n))
-        before = beyond_plane(axis, 3.0, 10_000, rng) @ plane.axis < plane.crossing(0.0)
+        hyperplane = fit_hyperplane(u, 3.0 - u @ axis + 0.05 * rng.standard_normal(n))
+        before = beyond_hyperplane(axis, 3.0, 10_000, rng) @ hyperplane.axis < hyperplane.crossing(0.0)
         assert before.mean() < 0.03
 
 
