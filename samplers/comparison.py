@@ -212,7 +212,7 @@ def _summarise(found: Estimate, problem: EitherFails) -> Comparison:
     about = [f"{' and '.join(few)}: the ratio is coarse; estimate each separately."] if few else []
     return Comparison(
         ratio=_ratio(a.p, b.p),
-        interval=_interval(totals, factor, single, found),
+        interval=_ratio_interval(totals, factor, single, found),
         confidence=found.confidence,
         a=a,
         b=b,
@@ -239,7 +239,7 @@ def _side(totals: FloatArray, factor: float, single: bool, found: Estimate) -> S
     return Side(p=p, interval=interval_of_sum(p, cov, ess, single, found.confidence), cov=cov, ess=ess)
 
 
-def _interval(totals: FloatArray, factor: float, single: bool, found: Estimate) -> Interval:
+def _ratio_interval(totals: FloatArray, factor: float, single: bool, found: Estimate) -> Interval:
     """Return the interval of the ratio from the unit totals of A and B, shape (2, n_units)."""
     p_a, p_b = totals.sum(axis=1)
     if p_a == 0 and p_b == 0:

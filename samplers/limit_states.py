@@ -30,7 +30,7 @@ def half_space(dim: int = 2, beta: float = 3.5) -> Reference:
     def f(u: FloatArray) -> FloatArray:
         return np.asarray(beta - u.sum(axis=1) / math.sqrt(dim))
 
-    return _reference(f"half_space_d{dim}", f, dim, _phi(-beta))
+    return _reference(f"half_space_d{dim}", f, dim, normal_cdf(-beta))
 
 
 def two_modes(distance: float = 2.0) -> Reference:
@@ -43,7 +43,7 @@ def two_modes(distance: float = 2.0) -> Reference:
     def f(u: FloatArray) -> FloatArray:
         return np.asarray(distance - np.minimum(np.abs(u[:, 0]), u[:, 1]))
 
-    return _reference("two_modes", f, 2, 2 * _phi(-distance) ** 2)
+    return _reference("two_modes", f, 2, 2 * normal_cdf(-distance) ** 2)
 
 
 def parabola(beta: float = 3.3, curvature: float = 0.2) -> Reference:
@@ -52,7 +52,7 @@ def parabola(beta: float = 3.3, curvature: float = 0.2) -> Reference:
     def f(u: FloatArray) -> FloatArray:
         return np.asarray(beta + curvature * u[:, 0] ** 2 - u[:, 1])
 
-    return _reference("parabola", f, 2, _normal_mean(lambda s: _phi(-beta - curvature * s * s)))
+    return _reference("parabola", f, 2, _normal_mean(lambda s: normal_cdf(-beta - curvature * s * s)))
 
 
 def four_branches(k: float = 3.5) -> Reference:
@@ -63,8 +63,8 @@ def four_branches(k: float = 3.5) -> Reference:
         parabolas = k + 0.2 * s * s - np.abs(t)
         return np.asarray(np.minimum(parabolas, math.sqrt(2) * (k - np.abs(s))))
 
-    between = _normal_mean(lambda s: 2 * _phi(-k - 0.2 * s * s), -k, k)
-    return _reference("four_branches", f, 2, 2 * _phi(-k) + between)
+    between = _normal_mean(lambda s: 2 * normal_cdf(-k - 0.2 * s * s), -k, k)
+    return _reference("four_branches", f, 2, 2 * normal_cdf(-k) + between)
 
 
 def plateau(dim: int = 3, beta: float = 3.5, tied: float = 0.6) -> Reference:
@@ -76,7 +76,7 @@ def plateau(dim: int = 3, beta: float = 3.5, tied: float = 0.6) -> Reference:
         s = u @ direction
         return np.where(s >= beta, -1.0, np.minimum(0.5 + 3 * (beta - s), cap))
 
-    return _reference(f"plateau_d{dim}_{tied:g}", f, dim, _phi(-beta))
+    return _reference(f"plateau_d{dim}_{tied:g}", f, dim, normal_cdf(-beta))
 
 
 def shell(dim: int = 20, p: float = 1e-4) -> Reference:
@@ -102,7 +102,7 @@ def unannounced_region(announced: float = 4.0, hidden: float = 3.1) -> Reference
     def f(u: FloatArray) -> FloatArray:
         return np.where(u[:, 0] < -hidden, -1.0, announced - u[:, 0])
 
-    return _reference("unannounced", f, 2, _phi(-announced) + _phi(-hidden))
+    return _reference("unannounced", f, 2, normal_cdf(-announced) + normal_cdf(-hidden))
 
 
 def references() -> list[Reference]:
@@ -114,7 +114,8 @@ def _reference(name: str, f: Callable[[FloatArray], ArrayLike], dim: int, p: flo
     return Reference(name, FunctionProblem(f, dim), p)
 
 
-def _phi(x: float) -> float:
+def normal_cdf(x: float) -> float:
+    """Return Phi(x), the probability of the half-line below x under N(0, 1)."""
     return float(ndtr(x))
 
 

@@ -97,7 +97,7 @@ class Outcome:
             interval=clopper_pearson(hits, n, confidence),
             cov=binomial_cov(hits / n, n),
             status=Status.CONVERGED if hits else Status.NO_HITS,
-            warnings=_count_warnings(hits, n),
+            warnings=_hit_warnings(hits, n),
             trace=tuple(trace),
             no_outcome_share=no_outcome_share,
             counts=(hits, n),
@@ -168,7 +168,7 @@ MANY_FAILURES = 5
 """Fewer hits than this leave a c.o.v. above about 0.45 (half, in subset simulation): worth a warning."""
 
 
-def _count_warnings(hits: int, n: int) -> tuple[str, ...]:
+def _hit_warnings(hits: int, n: int) -> tuple[str, ...]:
     """Return the warning that few or none of n draws failed, if so."""
     if hits == 0:
         return (f"None of {n:,} simulations failed: p = 0 with a one-sided interval.",)

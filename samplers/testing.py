@@ -16,7 +16,7 @@ from samplers.estimation import estimate
 from samplers.execution.arguments import RunArguments
 from samplers.execution.replicate import NOT_KNOWN
 from samplers.execution.run import Run
-from samplers.limit_states import half_space, two_modes
+from samplers.limit_states import half_space, normal_cdf, two_modes
 from samplers.method import Stepping
 from samplers.problem import FloatArray, FunctionProblem
 from samplers.result import Estimate
@@ -114,13 +114,15 @@ def check_ties(method: Stepping) -> None:
     """Check that equality with gamma is failure, on an f with few distinct values."""
     for seed in range(5):
         problem = FunctionProblem(lambda x: np.floor(x[:, 0] + 4.5), 2)
-        _expect_near(method, estimate(problem, method, gamma=2.0, seed=seed, max_sim=5000), _phi(-1.5), "whole numbers")
+        _expect_near(
+            method, estimate(problem, method, gamma=2.0, seed=seed, max_sim=5000), normal_cdf(-1.5), "whole numbers"
+        )
 
 
 def check_infinite(method: Stepping) -> None:
     """Check that outcomes may be +inf and -inf."""
     problem = FunctionProblem(lambda x: np.where(x[:, 0] > 1.5, -np.inf, np.inf), 2)
-    _expect_near(method, estimate(problem, method, seed=1, max_sim=5000), _phi(-1.5), "infinite outcomes")
+    _expect_near(method, estimate(problem, method, seed=1, max_sim=5000), normal_cdf(-1.5), "infinite outcomes")
 
 
 def check_missing(method: Stepping) -> None:
@@ -130,17 +132,17 @@ def check_missing(method: Stepping) -> None:
         return np.where(x[:, 1] > 1.5, np.nan, 10.0 - x[:, 0])
 
     result = estimate(FunctionProblem(f, 2), method, seed=1, max_sim=5000, on_error="failure")
-    _expect_near(method, result, _phi(-1.5), "rows without an outcome")
+    _expect_near(method, result, normal_cdf(-1.5), "rows without an outcome")
 
 
 def check_dimensions(method: Stepping) -> None:
     """Check that one dimension is enough, and that with 1,500 the result is right or has a warning."""
     result = estimate(half_space(1, 2.0).problem, method, seed=1, max_sim=5000)
-    _expect_near(method, result, _phi(-2.0), "one dimension")
+    _expect_near(method, result, normal_cdf(-2.0), "one dimension")
     f = _Counting(half_space(1500, 2.0).problem.f)
     result = estimate(FunctionProblem(f, 1500), method, seed=1, max_sim=3000)
     _expect_sound(method, result, f.rows)
-    holds = result.interval[0] <= _phi(-2.0) <= result.interval[1]
+    holds = result.interval[0] <= normal_cdf(-2.0) <= result.interval[1]
     _expect(holds or len(result.warnings) > 0, method, f"1,500 dimensions: missed p without a warning\n{result}")
 
 
@@ -264,7 +266,3 @@ def _constant(value: float, dim: int) -> FunctionProblem:
 def _global_state() -> tuple[object, bytes]:
     state = np.random.get_state(legacy=False)  # noqa: NPY002  (to see that nobody uses it)
     return random.getstate(), repr(state).encode()
-
-
-def _phi(x: float) -> float:
-    return float(ndtr(x))

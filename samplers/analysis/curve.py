@@ -22,6 +22,8 @@ from samplers.statistics.cluster_sums import interval_of_count, interval_of_sum,
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+EIGENVALUE_ROUNDING = 1e-10
+"""Eigenvalues of a G x G correlation up to G times this are rounding: its trace is G."""
 BAND_DRAWS = 10_000
 """Draws of the largest deviation; its 95 % quantile is then good to about 1 %."""
 BAND_STREAM = 2**31
@@ -204,7 +206,7 @@ def simultaneous_level(correlation: NDArray[np.float64], confidence: float, rng:
         rng: Generator of the draws.
     """
     values, vectors = np.linalg.eigh(correlation)
-    some = values > 1e-10 * max(len(values), 1)
+    some = values > EIGENVALUE_ROUNDING * max(len(values), 1)
     if np.count_nonzero(some) <= 1:
         return confidence
     roots = vectors[:, some] * np.sqrt(values[some])

@@ -60,10 +60,10 @@ def combine(outcomes: Sequence[Outcome], confidence: float) -> Outcome:
     mean = float(p.mean())
     return Outcome(
         p=mean,
-        interval=_interval(used, p, confidence),
+        interval=_mean_interval(used, p, confidence),
         cov=combined_cov(used),
         status=_first_by_priority(used) if mean > 0 else Status.NO_HITS,
-        warnings=(*_count_warnings(used), *about, *_warn_of_disagreement(used)),
+        warnings=(*_collect_warnings(used), *about, *_warn_of_disagreement(used)),
         trace=trace,
         no_outcome_share=(float(np.average([o.no_outcome_share for o in used], weights=p)) if mean else 0.0),
         sample=merge_samples(used, [1 / len(used)] * len(used)),
@@ -147,7 +147,7 @@ def _own_error(outcomes: Sequence[Outcome]) -> float:
     return math.hypot(*errors) / math.sqrt(len(outcomes))
 
 
-def _interval(outcomes: Sequence[Outcome], p: np.ndarray, confidence: float) -> Interval:
+def _mean_interval(outcomes: Sequence[Outcome], p: np.ndarray, confidence: float) -> Interval:
     """Return the t interval of the mean of p (R,), see `combine`."""
     mean, runs = float(p.mean()), len(p)
     if np.ptp(p) == 0 or min(outcome.cov for outcome in outcomes) >= UNINFORMATIVE_COV:
@@ -165,7 +165,7 @@ def _first_by_priority(outcomes: Sequence[Outcome]) -> Status:
     return next((status for status in STATUS_PRIORITY if status in present), Status.BUDGET)
 
 
-def _count_warnings(outcomes: Sequence[Outcome]) -> tuple[str, ...]:
+def _collect_warnings(outcomes: Sequence[Outcome]) -> tuple[str, ...]:
     """Return the warnings of the runs, each once, with the number of runs that have it."""
     texts = Counter(text for outcome in outcomes for text in outcome.warnings)
     return tuple(f"In {count} of {len(outcomes)} runs: {text}" for text, count in texts.items())

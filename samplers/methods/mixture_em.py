@@ -37,6 +37,8 @@ LEAST_EM_GAIN = 1e-3
 """Expectation-maximisation ends where a step raises the mean log likelihood by less."""
 LEAST_WEIGHT = 0.01
 """Components of less weight are dropped: with 1000 points they would rest on fewer than 10."""
+LEAST_OF_EVEN_SHARE = 0.5
+"""Of more than 50 components, those with less than this share of 1 / k are: the heaviest one always stays."""
 
 
 def fit_proposal_mixture(
@@ -81,7 +83,7 @@ class _WeightedPoints:
         """Return the mixture of the components that have weight enough."""
         mass = self.weights * responsibilities
         totals = mass.sum(axis=1)
-        kept = totals > min(LEAST_WEIGHT, 0.5 / self.k)
+        kept = totals > min(LEAST_WEIGHT, LEAST_OF_EVEN_SHARE / self.k)
         components = [self.fit(self.u, part / part.sum()) for part in mass[kept]]
         return WidenableMixture(totals[kept] / totals[kept].sum(), components)
 

@@ -15,6 +15,8 @@ from samplers.proposals.gaussian import Gaussian, Moments, weighted_moments
 
 LEAST_VARIANCE = 1e-8
 """Added to the variance in every direction: points may coincide."""
+PRIOR_DIM = 10
+"""Above this many dimensions the present covariance counts as more than d + 1 points, in proportion to d."""
 
 
 def shrink_covariance(
@@ -58,14 +60,14 @@ def fit_shrunk_gaussian(u: FloatArray, weights: FloatArray) -> Gaussian:
 def shrink_towards_present(target: Moments, present: Gaussian, n: float) -> Gaussian:
     """Return the Gaussian with the target's mean and its covariance drawn towards the present one.
 
-    The present covariance counts as (d + 1) max(1, d / 10) points beside the n behind the target: in many dimensions
-    the noise of the d (d + 1) / 2 entries of a covariance ruins importance weights.
+    The present covariance counts as (d + 1) max(1, d / PRIOR_DIM) points beside the n behind the target: in many
+    dimensions the noise of the d (d + 1) / 2 entries of a covariance ruins importance weights.
 
     Args:
         target: Moments of weighted points.
         present: The Gaussian that the points are drawn from.
         n: Number of independent points that they are worth.
     """
-    prior = (present.dim + 1) * max(1.0, present.dim / 10)
+    prior = (present.dim + 1) * max(1.0, present.dim / PRIOR_DIM)
     share = prior / (prior + n)
     return Gaussian.from_covariance(target.first, (1 - share) * target.covariance + share * present.covariance)

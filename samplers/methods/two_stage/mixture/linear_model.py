@@ -24,8 +24,17 @@ RIDGES = (1.0, 1e-3)
 LAD_ITERATIONS = 12
 """Steps of iteratively reweighted least squares towards least absolute deviations."""
 LAD_RIDGE = 1e-3
+"""Ridge penalty of these steps, the smaller one of RIDGES: it keeps the matrix regular."""
 LAD_SMOOTHING = 1e-3
 """Share of the median deviation that is added to each before it divides: exact points have no infinite weight."""
+LAD_MIN_DEVIATION = 1e-12
+"""Added to each deviation as well: all of them are 0 where f is linear."""
+INLIER_ROUNDING = 1e-9
+"""Share of the range of f up to which a deviation is rounding."""
+MIN_LEFT_OUT = 1e-3
+"""Least 1 - leverage that a residual is divided by: a point that alone decides on a slope has leverage 1."""
+MIN_LEFT_OUT_LAD = 1e-2
+"""The same in the steps towards least absolute deviations, where one such point must not hold all the weight."""
 MAD_TO_SIGMA = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
 INLIER_SIGMAS = 3.0
@@ -45,13 +54,14 @@ LINEAR = 0.95
 LEAST_R2 = 0.3
 """R^2 under which a hyperplane is no help; that of pure noise stays below (`test_noise_has_no_hyperplane`)."""
 AGREEING = 0.6
-"""Share of the points that must agree with a hyperplane for it to be more than chance."""
+"""Share of the points that must agree with a hyperplane for it to be more than chance: over half, for two regions
+may have half each."""
 CROSSING_ERRORS = 2.0
 """Standard errors of a prediction by which a half-space begins before the hyperplane."""
 NEAREST = 0.03
-"""Share of the failures that may lie before the edge, where the hyperplane does not locate it."""
+"""Share of the failures that may lie before the edge, where the hyperplane does not locate it: none of 33 or fewer."""
 MIN_FAILURES = 8
-"""Failures that half-space proposals need."""
+"""Failures that half-space proposals need: `failure_edge` takes a quarter of the mean excess off the least of eight."""
 MIN_DISTANCE = 0.5
 """Nearer to the origin than this a half-space holds 31 % of N(0, I): base draws serve as well."""
 SAME_REGION = 0.5
@@ -249,7 +259,7 @@ def _solve_ridge(xc: FloatArray, yc: FloatArray, total: float, ridge: float) -> 
     else:
         inverse = np.linalg.inv(xc @ xc.T + ridge * np.eye(n))
         slope, leverage = xc.T @ (inverse @ yc), 1 - ridge * np.diag(inverse)
-    left_out = (yc - xc @ slope) / np.maximum(1 - leverage - 1 / n, 1e-3)
+    left_out = (yc - xc @ slope) / np.maximum(1 - leverage - 1 / n, MIN_LEFT_OUT)
     return slope, 1 - float(left_out @ left_out) / total
 
 
@@ -280,8 +290,8 @@ def _find_inliers(x: FloatArray, y: FloatArray) -> NDArray[np.bool_]:
         weighted = design * w[:, None]
         inverse = np.linalg.inv(weighted.T @ design + penalty)
         leverage = np.einsum("ij,ij->i", weighted @ inverse, design)
-        deviation = np.abs(y - design @ (inverse @ (weighted.T @ y))) / np.maximum(1 - leverage, 1e-2)
+        deviation = np.abs(y - design @ (inverse @ (weighted.T @ y))) / np.maximum(1 - leverage, MIN_LEFT_OUT_LAD)
         typical = float(np.median(deviation))
-        w = 1 / (deviation + LAD_SMOOTHING * typical + 1e-12)
+        w = 1 / (deviation + LAD_SMOOTHING * typical + LAD_MIN_DEVIATION)
         w *= n / w.sum()
-    return np.asarray(deviation <= INLIER_SIGMAS * MAD_TO_SIGMA * typical + 1e-9 * np.ptp(y))
+    return np.asarray(deviation <= INLIER_SIGMAS * MAD_TO_SIGMA * typical + INLIER_ROUNDING * np.ptp(y))

@@ -23,6 +23,7 @@ HIGH_DIM = 40
 SIZES = (1, 2, 3, 4, 6, 8)
 """Numbers of components that are tried; MOST_WORSE of them without a better score end the search."""
 MOST_WORSE = 2
+"""The score of a fit is uneven in their number: after one that is worse, a better one may follow."""
 MAX_EM_ITERATIONS = 25
 """M-steps at most."""
 LEAST_RELATIVE_GAIN = 1e-3
@@ -37,8 +38,12 @@ LEAST_REFIT_POINTS = 5
 """A component with fewer points stays where it is."""
 REFIT_ESS = 30.0
 REFIT_ESS_PER_DIM = 3.0
-"""Effective points that a component is fitted to, of at most a third of its own: as many as its mean needs, and its
-covariance with shrinkage. Where the weights are less even, they are raised to a power less than 1."""
+"""Effective points that a component is fitted to: as many as its mean needs, and its covariance with shrinkage. Where
+the weights are less even, they are raised to a power less than 1."""
+POINTS_PER_REFIT_ESS = 3
+"""Points of a component for each of them: no more is asked of it than a third of its points."""
+POWER_STEP = 0.1
+"""By how much the power falls from trial to trial; the effective number of points grows as it does."""
 LEAST_MIXING = 1e-6
 """Least weight of a component while others move; none is given up."""
 MOST_SPREAD = 4.0
@@ -47,6 +52,15 @@ LEAST_VARIANCE_OF_COMPONENT = 1e-6
 """Points may coincide."""
 STANDARD_ERRORS = 2
 """By how many of them a variance under 1 is raised: too small a variance makes weights unbounded."""
+MAX_MEAN_EXCESS = 0.5
+"""Share of a mean that is taken off as noise at most: of few points in hundreds of dimensions noise is all there is."""
+SHORT_MEAN = 1e-9
+"""A mean shorter than this has no direction; its length divides."""
+COVARIANCE_PARAMETERS_PER_DIM = 2
+"""Parameters of a covariance that BIC counts at most, per dimension: with all d (d + 1) / 2 of them some dozens
+of points would never have a second component."""
+MIN_BIC_ESS = 3.0
+"""Least number of points that BIC takes: log(n) would fall under 1 with fewer."""
 POINTS_PER_COMPONENT = 4
 """Effective points for each component at least."""
 TINY_WEIGHT = 1e-300
@@ -98,10 +112,10 @@ def fit_shrunk_subspace_gaussian(u: FloatArray, weights: FloatArray, ess: float)
     along = float(weights @ (u @ v - norm) ** 2)
     if dim > HIGH_DIM:
         # Noise makes the mean of few points too long, by (d - 1) / ess in the square, and turns it.
-        excess = min((dim - 1) / (ess * max(norm, 1e-9) ** 2), 0.5)
+        excess = min((dim - 1) / (ess * max(norm, SHORT_MEAN) ** 2), MAX_MEAN_EXCESS)
         variance = np.array([min(along * (1 - excess) + excess, MOST_SPREAD)])
         return SubspaceGaussian(v[:, None], np.array([norm * (1 - excess)]), inflate_variances(variance, ess)), 1.0
-    centred = (u - mean) * np.sqrt(weights)[:, None]
+    centred = (u - mean) * np.sqrt(weights)[:, None]  # `weighted_moments` would lose digits of small variances far out
     shrunk, share = shrink_covariance(centred.T @ centred, v, along, ess)
     values, axes = np.linalg.eigh(shrunk)
     return SubspaceGaussian(axes, axes.T @ mean, inflate_variances(values, ess)), share
@@ -188,9 +202,11 @@ def _fit_from(points: GroupedPoints, start: FloatArray) -> SubspaceMixture:
         _GroupedFamily(points), start, once_per_group, MAX_EM_ITERATIONS, lambda total: LEAST_RELATIVE_GAIN * abs(total)
     )
     dim = points.u.shape[1]
-    covariances = [min((1 - share) * dim * (dim + 1) / 2, 2 * dim) for share in fit.target_shares]
+    covariances = [
+        min((1 - share) * dim * (dim + 1) / 2, COVARIANCE_PARAMETERS_PER_DIM * dim) for share in fit.target_shares
+    ]
     parameters = len(fit.components) - 1 + sum(dim + 1 + size for size in covariances)
-    penalty = 0.5 * math.log(max(points.ess, 3.0)) * parameters
+    penalty = 0.5 * math.log(max(points.ess, MIN_BIC_ESS)) * parameters
     return SubspaceMixture(fit.components, fit.weights, log_likelihood - penalty)
 
 
@@ -220,9 +236,9 @@ def _refit(component: SubspaceGaussian, u: FloatArray, shares: FloatArray, log_w
     count = float(shares.sum())
     if count < LEAST_REFIT_POINTS:
         return component
-    wanted = min(max(REFIT_ESS, REFIT_ESS_PER_DIM * u.shape[1]), count / 3)
+    wanted = min(max(REFIT_ESS, REFIT_ESS_PER_DIM * u.shape[1]), count / POINTS_PER_REFIT_ESS)
     log_shares = np.log(np.maximum(shares, TINY_WEIGHT))
-    for power in np.arange(1.0, 0.0, -0.1):
+    for power in np.arange(1.0, 0.0, -POWER_STEP):
         w = normalise_weights(log_shares + power * log_weights)
         ess = 1 / float((w * w).sum())
         if ess >= wanted:
