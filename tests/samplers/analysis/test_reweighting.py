@@ -39,11 +39,11 @@ class Normal:
 
 
 class OnlyDensity:
-    def __init__(self, law):
-        self.law = law
+    def __init__(self, distribution):
+        self.distribution = distribution
 
     def log_prob(self, x):
-        return self.law.log_prob(x)
+        return self.distribution.log_prob(x)
 
 
 @functools.cache

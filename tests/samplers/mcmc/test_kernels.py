@@ -33,7 +33,7 @@ KERNELS = {
 
 
 @pytest.mark.parametrize("kernel", KERNELS.values(), ids=KERNELS)
-def test_every_kernel_leaves_the_conditioned_law_invariant(rng, kernel):
+def test_every_kernel_leaves_the_conditioned_distribution_invariant(rng, kernel):
     n = 20_000
     u = rng.standard_normal((n, 2))
     u[:, 0] = stats.norm.isf(rng.random(n) * stats.norm.sf(-LEVEL))
@@ -47,7 +47,7 @@ def test_every_kernel_leaves_the_conditioned_law_invariant(rng, kernel):
 
 
 def test_the_printed_ratio_is_wrong_for_the_conditional_proposal(rng):
-    """Why "metropolis" takes a symmetric step: with the AR-1 one the ratio makes the law N(0, 1/2)."""
+    """Why "metropolis" takes a symmetric step: with the AR-1 one the ratio makes the distribution N(0, 1/2)."""
     u = rng.standard_normal((20_000, 1))
     for _ in range(60):
         steps = conditional_proposal(u, np.full(1, 0.8), rng) - u
@@ -80,7 +80,7 @@ def conditional_step(evaluate, u, f, level, sigma, rng):
 
 
 def test_forgets_where_it_started(rng):
-    """A point mass at the boundary becomes the conditioned law."""
+    """A point mass at the boundary becomes the conditioned distribution."""
     n = 5000
     u, f = np.tile([1.0, 2.0], (n, 1)), np.full(n, -1.0)
     for _ in range(60):

@@ -16,7 +16,7 @@ from samplers.trace import Status
 IS = samplers.ImportanceSampling
 
 
-def test_a_tilt_of_the_standard_normal_law_is_a_shift(rng):
+def test_a_tilt_of_the_standard_normal_distribution_is_a_shift(rng):
     theta = np.array([1.5, -0.5])
     tilted, u = TiltedNormal(theta), rng.standard_normal((5, 2))
     ratio = tilted.log_prob(u) - StandardNormal(2).log_prob(u)

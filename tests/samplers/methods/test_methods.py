@@ -47,7 +47,7 @@ def test_failing_points_fail_and_are_all_counted(method, recorder):
 
 
 def test_works_through_any_base(method):
-    """An exponential law: P[x1 + x2 >= 14] has a closed form."""
+    """An exponential distribution: P[x1 + x2 >= 14] has a closed form."""
 
     class Exponential:
         def sample(self, n, rng):

@@ -30,8 +30,8 @@ def test_mixture_is_recovered(rng):
         np.testing.assert_allclose(found.components[k].covariance, component.covariance, atol=0.1)
 
 
-def test_weighted_points_stand_for_their_law(rng):
-    """Draws of a wide law under weights p / q."""
+def test_weighted_points_stand_for_their_distribution(rng):
+    """Draws of a wide distribution under weights p / q."""
     wide = Gaussian(np.zeros(2), 3 * np.eye(2))
     u = wide.sample(40_000, rng)
     weights = np.exp(TWO.log_prob(u) - wide.log_prob(u))
@@ -41,15 +41,15 @@ def test_weighted_points_stand_for_their_law(rng):
 
 
 def test_mixture_of_directions(rng):
-    laws = [VonMisesFisherNakagami(np.eye(8)[k], 40.0, 10.0, 16.0) for k in (0, 3)]
-    u = np.concatenate([law.sample(1000, rng) for law in laws])
+    distributions = [VonMisesFisherNakagami(np.eye(8)[k], 40.0, 10.0, 16.0) for k in (0, 3)]
+    u = np.concatenate([distribution.sample(1000, rng) for distribution in distributions])
     found = fit_proposal_mixture(VonMisesFisherNakagami.fit, u, equal(2000), 4, 10, rng)
     assert len(found.components) == 2
     assert sorted(int(np.argmax(c.mu)) for c in found.components) == [0, 3]
 
 
 @pytest.mark.parametrize("n", [1, 2, 3])
-def test_few_or_equal_points_give_a_proper_law(rng, n):
+def test_few_or_equal_points_give_a_proper_distribution(rng, n):
     for u in (rng.standard_normal((n, 4)), np.ones((n, 4))):
         for k in (1, 3):
             assert np.isfinite(fit_mixture_of_size(fit_shrunk_gaussian, u, equal(n), k, rng).log_prob(u)).all()

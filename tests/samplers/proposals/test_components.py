@@ -25,13 +25,13 @@ def rotation(dim, seed=0):
     return np.linalg.qr(np.random.default_rng(seed).standard_normal((dim, dim)))[0]
 
 
-def bump(dim, rank, seed=0):
+def subspace_gaussian(dim, rank, seed=0):
     """Along `rank` of the directions: means to 1.5, variances 0.7 to 1.5."""
     axes = rotation(dim, seed)[:, :rank]
     return SubspaceGaussian(axes, np.linspace(-0.5, 1.5, rank), np.linspace(0.7, 1.5, rank))
 
 
-def oblique_slice(start):
+def oblique_half_space(start):
     axes = rotation(3, 5)
     return HalfSpaceNormal(
         axes[:, 0], start, SubspaceGaussian(axes[:, 1:], np.array([0.6, -0.4]), np.array([0.8, 1.4]))
@@ -42,17 +42,17 @@ COMPONENTS = {
     "base": (IsotropicNormal(4), 4),
     "wide": (IsotropicNormal(2, 1.5), 2),
     "wide d=1": (IsotropicNormal(1, 3.0), 1),
-    "bump d=1": (bump(1, 1), 1),
-    "bump": (bump(2, 2), 2),
-    "one direction of 100": (bump(100, 1), 100),
-    "three directions of 6": (bump(6, 3), 6),
-    "tempered": (bump(6, 3).temper(0.5), 6),
-    "slice d=1": (HalfSpaceNormal(np.array([-1.0]), 1.5), 1),
-    "slice": (HalfSpaceNormal(rotation(3, 4)[:, 0], 2.0), 3),
-    "slice behind the origin": (HalfSpaceNormal(rotation(3, 4)[:, 0], -0.5), 3),
-    "slice with a bump across": (oblique_slice(1.0), 3),
-    "shell": (RadialLaw(3, 1.0, 1.5, 2.5), 3),
-    "shell d=20": (RadialLaw(20, 12.0, 2.0, 4.0), 20),
+    "gaussian d=1": (subspace_gaussian(1, 1), 1),
+    "gaussian": (subspace_gaussian(2, 2), 2),
+    "one direction of 100": (subspace_gaussian(100, 1), 100),
+    "three directions of 6": (subspace_gaussian(6, 3), 6),
+    "tempered": (subspace_gaussian(6, 3).temper(0.5), 6),
+    "half-space d=1": (HalfSpaceNormal(np.array([-1.0]), 1.5), 1),
+    "half-space": (HalfSpaceNormal(rotation(3, 4)[:, 0], 2.0), 3),
+    "half-space behind the origin": (HalfSpaceNormal(rotation(3, 4)[:, 0], -0.5), 3),
+    "half-space with a gaussian across": (oblique_half_space(1.0), 3),
+    "radial": (RadialLaw(3, 1.0, 1.5, 2.5), 3),
+    "radial d=20": (RadialLaw(20, 12.0, 2.0, 4.0), 20),
 }
 each = pytest.mark.parametrize(("component", "dim"), COMPONENTS.values(), ids=COMPONENTS)
 
@@ -89,12 +89,12 @@ def test_weights_of_draws_average_to_the_base_s_probability_of_the_support(compo
 def test_density_integrates_to_one(name):
     component, dim = COMPONENTS[name]
     u, mass = grid(dim)
-    edge = 1e-3 if isinstance(component, HalfSpaceNormal) else 0.0  # a cell that the edge of the slice cuts
+    edge = 1e-3 if isinstance(component, HalfSpaceNormal) else 0.0  # a cell that the edge of the half-space cuts
     assert (mass * np.exp(component.log_ratio(u))).sum() == pytest.approx(1.0, abs=1e-6 + edge)
 
 
 def test_ratio_is_that_of_the_densities():
-    component = bump(3, 3)
+    component = subspace_gaussian(3, 3)
     u = np.random.default_rng(0).normal(scale=2.0, size=(50, 3))
     covariance = component.axes * component.variance @ component.axes.T
     q = stats.multivariate_normal(component.centre, covariance).logpdf(u)
@@ -105,13 +105,17 @@ def test_ratio_is_that_of_the_densities():
     np.testing.assert_allclose(IsotropicNormal(3).log_ratio(u), 0.0, atol=1e-12)
 
 
-def agrees(x, law):
+def agrees(x, distribution):
     """Kolmogorov-Smirnov at a level of 1e-4: a dozen of these are made with fixed seeds."""
-    return stats.kstest(x, law.cdf).pvalue > 1e-4
+    return stats.kstest(x, distribution.cdf).pvalue > 1e-4
 
 
-@pytest.mark.parametrize("component", [bump(6, 3), bump(2, 2), bump(100, 1)], ids=["3 of 6", "2 of 2", "1 of 100"])
-def test_draws_of_a_bump_along_and_across_its_axes(component, rng):
+@pytest.mark.parametrize(
+    "component",
+    [subspace_gaussian(6, 3), subspace_gaussian(2, 2), subspace_gaussian(100, 1)],
+    ids=["3 of 6", "2 of 2", "1 of 100"],
+)
+def test_draws_of_a_gaussian_along_and_across_its_axes(component, rng):
     u = component.sample(N, rng)
     for axis, mean, variance in zip(component.axes.T, component.mean, component.variance, strict=True):
         assert agrees(u @ axis, stats.norm(mean, math.sqrt(variance)))
@@ -136,8 +140,8 @@ def test_draws_of_a_slice_along_and_across_its_axis(start, rng):
     np.testing.assert_allclose(component.log_ratio(u[along > start]), -stats.norm.logsf(start))
 
 
-def test_draws_of_a_slice_with_a_bump_across(rng):
-    component = oblique_slice(2.0)
+def test_draws_of_a_half_space_with_a_gaussian_across(rng):
+    component = oblique_half_space(2.0)
     u = component.sample(N, rng)
     assert agrees(stats.norm.sf(u @ component.axis) / stats.norm.sf(2.0), stats.uniform)
     for axis, mean, variance in zip(
@@ -198,7 +202,7 @@ def test_all_is_finite_in_1500_dimensions(rng):
 
 def test_mixture_is_the_sum_of_its_parts(rng):
     components, weights = (
-        [IsotropicNormal(3), bump(3, 2), oblique_slice(1.0), RadialLaw(3, 1.0, 1.5, 2.5)],
+        [IsotropicNormal(3), subspace_gaussian(3, 2), oblique_half_space(1.0), RadialLaw(3, 1.0, 1.5, 2.5)],
         np.array([0.1, 0.4, 0.5, 0]),
     )
     u = 2 * rng.standard_normal((500, 3))

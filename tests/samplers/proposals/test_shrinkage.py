@@ -6,7 +6,7 @@ import pytest
 from samplers.proposals.gaussian import Gaussian, Moments
 from samplers.proposals.shrinkage import fit_shrunk_gaussian, shrink_covariance, shrink_towards_present
 
-LAW = Gaussian(np.array([-1.0, 3.0]), np.array([[0.8, 0.0], [0.3, 0.4]]))
+DISTRIBUTION = Gaussian(np.array([-1.0, 3.0]), np.array([[0.8, 0.0], [0.3, 0.4]]))
 
 
 def equal(n):
@@ -46,8 +46,8 @@ def test_covariance_is_shrunk_where_points_are_few_for_the_dimensions(rng):
 
 
 def test_covariance_is_kept_where_points_are_many(rng):
-    found = fit_shrunk_gaussian(LAW.sample(50_000, rng), equal(50_000))
-    np.testing.assert_allclose(found.covariance, LAW.covariance, atol=0.02)
+    found = fit_shrunk_gaussian(DISTRIBUTION.sample(50_000, rng), equal(50_000))
+    np.testing.assert_allclose(found.covariance, DISTRIBUTION.covariance, atol=0.02)
 
 
 @pytest.mark.parametrize("n", [1, 2, 5])

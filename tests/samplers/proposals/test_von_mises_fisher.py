@@ -10,7 +10,7 @@ from samplers.proposals.von_mises_fisher import VonMisesFisherNakagami, concentr
 
 
 @pytest.mark.parametrize("dim", [1, 2, 3, 20, 100, 1500])
-def test_the_standard_normal_law_is_one(rng, dim):
+def test_the_standard_normal_distribution_is_one(rng, dim):
     u = rng.standard_normal((50, dim))
     np.testing.assert_allclose(
         VonMisesFisherNakagami.standard(dim).log_prob(u), StandardNormal(dim).log_prob(u), atol=2e-3
@@ -37,22 +37,22 @@ def vmfn(dim, kappa=8.0):
 
 @pytest.mark.parametrize("dim", [1, 2, 3, 6])
 def test_draws_have_the_density(rng, dim):
-    """Integral over another law: E_q[p / q] = 1 and the same moments either way."""
-    law = vmfn(dim, 2.0)
+    """Integral over another distribution: E_q[p / q] = 1 and the same moments either way."""
+    distribution = vmfn(dim, 2.0)
     u = 4 * rng.standard_normal((200_000, dim))
-    weights = np.exp(law.log_prob(u) - stats.norm(0, 4).logpdf(u).sum(axis=1))
+    weights = np.exp(distribution.log_prob(u) - stats.norm(0, 4).logpdf(u).sum(axis=1))
     assert weights.mean() == pytest.approx(1, abs=5 * weights.std() / math.sqrt(len(u)))
-    drawn = law.sample(200_000, rng)
+    drawn = distribution.sample(200_000, rng)
     error = 6 * (weights[:, None] * u).std(axis=0) / math.sqrt(len(u))
     assert (abs((weights[:, None] * u).mean(axis=0) - drawn.mean(axis=0)) < error).all()
     assert (drawn**2).sum(axis=1).mean() == pytest.approx(16, rel=0.02)
 
 
 @pytest.mark.parametrize("dim", [1, 2, 5, 50])
-def test_fit_recovers_the_law(rng, dim):
-    law = vmfn(dim, 1.0 if dim == 1 else 8.0)
-    found = VonMisesFisherNakagami.fit(law.sample(50_000, rng), np.full(50_000, 1 / 50_000))
-    assert found.mu @ law.mu > 0.995
+def test_fit_recovers_the_distribution(rng, dim):
+    distribution = vmfn(dim, 1.0 if dim == 1 else 8.0)
+    found = VonMisesFisherNakagami.fit(distribution.sample(50_000, rng), np.full(50_000, 1 / 50_000))
+    assert found.mu @ distribution.mu > 0.995
     assert found.m == pytest.approx(3.0, rel=0.05)
     assert found.omega == pytest.approx(16.0, rel=0.02)
     if dim > 2:  # Banerjee's formula is an approximation, poor on the line and fair in the plane
@@ -61,11 +61,11 @@ def test_fit_recovers_the_law(rng, dim):
 
 def test_weights_count(rng):
     """Points under weights p / q are points of p."""
-    law = vmfn(3)
+    distribution = vmfn(3)
     u = 4 * rng.standard_normal((200_000, 3))
-    log_weights = law.log_prob(u) - stats.norm(0, 4).logpdf(u).sum(axis=1)
+    log_weights = distribution.log_prob(u) - stats.norm(0, 4).logpdf(u).sum(axis=1)
     found = VonMisesFisherNakagami.fit(u, np.exp(log_weights))
-    assert found.mu @ law.mu > 0.999
+    assert found.mu @ distribution.mu > 0.999
     assert found.m == pytest.approx(3.0, rel=0.05)
 
 
@@ -82,15 +82,15 @@ def test_concentration_grows_with_the_resultant():
     assert 0 < kappas[0] < kappas[-1] < math.inf
 
 
-def test_few_points_give_a_finite_law():
+def test_few_points_give_a_finite_distribution():
     one = VonMisesFisherNakagami.fit(np.array([[1.0, 2.0]]), np.ones(1))
     assert np.isfinite(one.log_prob(np.array([[1.0, 2.0], [-3.0, 0.0], [0.0, 0.0]]))).all()
 
 
 def test_widened(rng):
-    law = vmfn(4, 30.0)
-    wide = law.widen(2.0)
-    tight, loose = law.sample(20_000, rng), wide.sample(20_000, rng)
+    distribution = vmfn(4, 30.0)
+    wide = distribution.widen(2.0)
+    tight, loose = distribution.sample(20_000, rng), wide.sample(20_000, rng)
     assert (loose**2).sum(axis=1).mean() == pytest.approx((tight**2).sum(axis=1).mean(), rel=0.05)
     assert loose.std(axis=0).mean() > 1.5 * tight.std(axis=0).mean()
 

@@ -20,10 +20,10 @@ def test_beta_density_against_scipy(rng):
     assert np.isneginf(BETA.log_prob(np.array([[79.0, 0.0], [100.0, 0.3]]))).all()
 
 
-def test_beta_draws_follow_their_law(rng):
+def test_beta_draws_follow_their_distribution(rng):
     x = BETA.sample(20_000, rng)
-    for column, law in zip(x.T, (stats.beta(2, 2, 80, 40), stats.beta(3, 1.5, -0.25, 0.5)), strict=True):
-        assert stats.kstest(column, law.cdf).pvalue > 1e-3
+    for column, distribution in zip(x.T, (stats.beta(2, 2, 80, 40), stats.beta(3, 1.5, -0.25, 0.5)), strict=True):
+        assert stats.kstest(column, distribution.cdf).pvalue > 1e-3
 
 
 def test_beta_map_reaches_far_tails():

@@ -83,15 +83,15 @@ def test_every_proposal_keeps_to_the_boxes(drive):
 def test_joint_ratio_is_the_projection_of_equation_2(rng):
     """Two Beta coordinates that fail together, from a proposal shifted in both.
 
-    Under Q, the base law given y_0 + y_1 <= 0.7, E[log y] is known by numerical integration. The joint ratio finds
-    it, the blockwise one does not.
+    Under Q, the base distribution given y_0 + y_1 <= 0.7, E[log y] is known by numerical integration. The joint ratio
+    finds it, the blockwise one does not.
     """
     base = Product(tuple(BetaBlock(alpha=2.0, beta=2.0, low=0.0, high=1.0) for _ in range(2)))
     shifted = Product(tuple(BetaBlock(alpha=1.5, beta=4.0, low=0.0, high=1.0) for _ in range(2)))
-    law = stats.beta(2, 2)
+    distribution = stats.beta(2, 2)
 
     def given(g):
-        return integrate.quad(lambda y: g(y) * law.pdf(y) * law.cdf(0.7 - y), 0, 0.7)[0]
+        return integrate.quad(lambda y: g(y) * distribution.pdf(y) * distribution.cdf(0.7 - y), 0, 0.7)[0]
 
     expected = [given(np.log) / given(np.ones_like), given(lambda y: np.log1p(-y)) / given(np.ones_like)]
     u = shifted.sample(400_000, rng)
@@ -115,7 +115,7 @@ def test_draws_stay_in_the_support(recorder):
     assert ((x >= problem.low) & (x <= problem.high)).all()
 
 
-def test_works_from_the_base_law_s_own_map_as_well():
+def test_works_from_the_base_distribution_s_own_map_as_well():
     """The same problem by a Gaussian in standard normal space: the same p."""
     problem = BlockProblem(3, 6, 4.0, radius=0.1)
     result = samplers.estimate(problem, CE(), seed=1)

@@ -30,12 +30,12 @@ def test_mixture_steps_raise_the_objective_of_equation_2(rng):
     other = elite * [1.0, 0.6]
     values = []
     draws = block.sample(20_000, rng)
-    for law in (block, block.project(other, uniform_weights(20_000), 0.7)):
-        values.append(0.7 * law.log_prob(other).mean() + 0.3 * law.log_prob(draws).mean())
+    for distribution in (block, block.project(other, uniform_weights(20_000), 0.7)):
+        values.append(0.7 * distribution.log_prob(other).mean() + 0.3 * distribution.log_prob(draws).mean())
     assert values[1] > values[0] + 0.01
 
 
-def test_mixture_keeps_the_share_1_minus_alpha_of_the_present_law():
+def test_mixture_keeps_the_share_1_minus_alpha_of_the_present_distribution():
     """All of Q in one point: with alpha = 0.8 the mean of the new mixture is 0.8 of the way there."""
     elite = np.tile([2.0, 1.0], (50, 1))
     block = MixtureBlock(Gaussian.standard(2), 3).project(elite, uniform_weights(50), 0.8)

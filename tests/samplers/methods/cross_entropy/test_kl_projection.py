@@ -35,17 +35,17 @@ def test_beta_statistics_against_scipy():
     np.testing.assert_allclose(beta_statistics(alpha, beta), expected, rtol=1e-6)
 
 
-def test_beta_projection_finds_the_law_itself(rng):
+def test_beta_projection_finds_the_distribution_itself(rng):
     alpha, beta = rng.uniform(1.5, 7.0, size=(2, 200))
     found = project_beta(beta_statistics(alpha, beta), *BOX)
     np.testing.assert_allclose(found, np.stack([alpha, beta], axis=1), rtol=1e-6)
 
 
 def test_beta_projection_against_a_generic_solver(rng):
-    """Statistics of laws in and far out of the box: optima inside, on the four edges, in the four corners."""
+    """Statistics of distributions in and far out of the box: optima inside, on the four edges, in the four corners."""
     alpha, beta = np.exp(rng.uniform(np.log(0.2), np.log(60), size=(2, 300)))
     statistics = beta_statistics(alpha, beta)
-    # a few points instead of a law: both statistics high, as no Beta in the box has them
+    # a few points instead of a distribution: both statistics high, as no Beta in the box has them
     few = rng.uniform(0.01, 0.99, size=(50, 3))
     statistics = np.concatenate([statistics, np.stack([np.log(few).mean(axis=1), np.log1p(-few).mean(axis=1)], 1)])
     found = project_beta(statistics, *BOX)

@@ -155,7 +155,7 @@ def test_noise_is_noticed_and_steps_are_not_noise():
 
 
 def test_descent_finds_what_plain_draws_cannot():
-    """p = 3e-7 in ten dimensions; the points it gives fail, are distinct, and their law is nearly that of failures."""
+    """p = 3e-7 in ten dimensions; its points fail, are distinct, and are distributed nearly as failures are."""
     problem, sizes, found = half_spaces(10, 5.0), Sizes.within(6000), 0
     for seed in range(6):
         rng, simulator = np.random.default_rng(seed), Simulator(problem)

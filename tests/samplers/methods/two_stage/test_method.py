@@ -317,7 +317,7 @@ def batches_of(name):
 @pytest.mark.parametrize("after", [1, 2, 5, 20, 40, 44, 100])
 @pytest.mark.parametrize("reference", STOPPED.values(), ids=STOPPED)
 def test_stopped_in_any_phase(reference, after):
-    """What draws from known laws say so far: an interval that holds p, give or take."""
+    """What draws from known distributions say so far: an interval that holds p, give or take."""
     run, rows = TS(n=4000).start(reference.problem, seed=3), 0
     for _ in range(min(after, batches_of(reference.name) - 1)):
         u = run.ask()

@@ -172,7 +172,7 @@ def passed(distribution):
     return distribution.sf(2.1) + 0.3 * distribution.cdf(2.1)
 
 
-def test_a_gate_thins_components_and_the_weights_account_for_it(rng):
+def test_a_screen_thins_components_and_the_weights_account_for_it(rng):
     """The shares that it lets through are estimated once, by drawing: their error is that of all runs together."""
     proposal = PROPOSAL.with_screen(screen, rng)
     for (_, distribution), acceptance, weight in zip(PARTS, proposal.acceptance, WEIGHTS, strict=True):
@@ -189,7 +189,7 @@ def test_a_gate_thins_components_and_the_weights_account_for_it(rng):
     assert 0 < proposal.acceptance_cov < 0.02
 
 
-def test_base_and_wide_draws_pass_every_gate(rng):
+def test_base_and_wide_draws_pass_every_screen(rng):
     candidates = [
         ProposalComponent(IsotropicNormal(1), "base"),
         ProposalComponent(IsotropicNormal(1, 1.5), "wide"),

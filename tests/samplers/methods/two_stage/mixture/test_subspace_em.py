@@ -20,9 +20,9 @@ from samplers.proposals.components import SubspaceGaussian, log_ratios
 N = 20_000
 
 
-def covariance_of(bump):
+def covariance_of(component):
     """In all directions: the identity outside the axes."""
-    return np.eye(len(bump.axes)) + (bump.axes * (bump.variance - 1)) @ bump.axes.T
+    return np.eye(len(component.axes)) + (component.axes * (component.variance - 1)) @ component.axes.T
 
 
 def equal(u, groups=None):
@@ -39,11 +39,11 @@ COVARIANCE = np.array([[1.5, 0.6, 0.0], [0.6, 1.2, 0.3], [0.0, 0.3, 2.0]])
 
 
 def test_a_known_gaussian_is_recovered(rng):
-    bump, share = fit_shrunk_subspace_gaussian(gaussian(N, MEAN, COVARIANCE, rng), np.full(N, 1 / N), N)
+    component, share = fit_shrunk_subspace_gaussian(gaussian(N, MEAN, COVARIANCE, rng), np.full(N, 1 / N), N)
     error = np.sqrt(np.outer(np.diag(COVARIANCE), np.diag(COVARIANCE)) * 2 / N)
-    np.testing.assert_allclose(bump.centre, MEAN, atol=4 * math.sqrt(2.0 / N))
+    np.testing.assert_allclose(component.centre, MEAN, atol=4 * math.sqrt(2.0 / N))
     # two standard errors of caution and the shrinkage, itself a standard error or so, on top of four
-    assert (np.abs(covariance_of(bump) - COVARIANCE) < 8 * error).all()
+    assert (np.abs(covariance_of(component) - COVARIANCE) < 8 * error).all()
     assert share < 0.01
 
 
@@ -54,9 +54,9 @@ def test_weighted_points_are_worth_what_they_stand_for(rng):
     w = np.exp(log_w - logsumexp(log_w))
     ess = 1 / float(w @ w)
     assert ess > 5000
-    bump, _ = fit_shrunk_subspace_gaussian(u, w, ess)
-    np.testing.assert_allclose(bump.centre, MEAN, atol=5 * math.sqrt(2.0 / ess))
-    np.testing.assert_allclose(covariance_of(bump), COVARIANCE, atol=8 * 2.0 * math.sqrt(2 / ess))
+    component, _ = fit_shrunk_subspace_gaussian(u, w, ess)
+    np.testing.assert_allclose(component.centre, MEAN, atol=5 * math.sqrt(2.0 / ess))
+    np.testing.assert_allclose(covariance_of(component), COVARIANCE, atol=8 * 2.0 * math.sqrt(2 / ess))
 
 
 def target_of(u):
@@ -70,16 +70,16 @@ def test_with_few_points_the_covariance_is_the_target(rng):
     shares, errors, plain_errors = [], [], []
     for n in (8, 40, 400):
         fits = [rng.standard_normal((n, 6)) + np.array([4.0, 0, 0, 0, 0, 0]) for _ in range(30)]
-        bumps = [fit_shrunk_subspace_gaussian(u, np.full(n, 1 / n), n) for u in fits]
-        shares.append(np.mean([share for _, share in bumps]))
-        errors.append(np.mean([((covariance_of(bump) - np.eye(6)) ** 2).sum() for bump, _ in bumps]))
+        components = [fit_shrunk_subspace_gaussian(u, np.full(n, 1 / n), n) for u in fits]
+        shares.append(np.mean([share for _, share in components]))
+        errors.append(np.mean([((covariance_of(component) - np.eye(6)) ** 2).sum() for component, _ in components]))
         plain_errors.append(np.mean([((np.cov(u.T) - np.eye(6)) ** 2).sum() for u in fits]))
     assert shares[0] > 0.9  # the truth is the target (nearly): most of it at any size
     assert (np.array(errors) < 0.6 * np.array(plain_errors)).all()
     u = rng.standard_normal((3, 6)) + 2.0
-    bump, share = fit_shrunk_subspace_gaussian(u, np.full(3, 1 / 3), 3)
+    component, share = fit_shrunk_subspace_gaussian(u, np.full(3, 1 / 3), 3)
     if share == 1.0:
-        across = np.linalg.eigvalsh(covariance_of(bump))
+        across = np.linalg.eigvalsh(covariance_of(component))
         assert np.count_nonzero(np.abs(across - 1) < 1e-9) >= 5
 
 
@@ -98,22 +98,24 @@ def test_shrinkage_goes_away_with_the_number_of_points(rng):
 @pytest.mark.parametrize("n", [1, 2, 5, 50])
 def test_axes_are_orthonormal_and_variances_positive_however_few_the_points(dim, n, rng):
     for u in (rng.standard_normal((n, dim)) + 1.0, np.ones((n, dim)), np.zeros((n, dim))):
-        bump, share = fit_shrunk_subspace_gaussian(u, np.full(n, 1 / n), max(n, 2))
-        np.testing.assert_allclose(bump.axes.T @ bump.axes, np.eye(bump.axes.shape[1]), atol=1e-9)
-        assert (bump.variance > 0).all()
+        component, share = fit_shrunk_subspace_gaussian(u, np.full(n, 1 / n), max(n, 2))
+        np.testing.assert_allclose(component.axes.T @ component.axes, np.eye(component.axes.shape[1]), atol=1e-9)
+        assert (component.variance > 0).all()
         assert 0 <= share <= 1
-        assert bump.axes.shape[1] == (dim if dim <= HIGH_DIM else 1)
+        assert component.axes.shape[1] == (dim if dim <= HIGH_DIM else 1)
 
 
 def test_in_many_dimensions_the_length_of_the_mean_is_corrected_for_noise():
     """The mean of 100 points of N(4 e1, I) in 200 dimensions is too long by 0.24, and turned: along its own direction
-    the law's mean is that much shorter than 4. Over 50 fits, each with a standard error of 0.1."""
+    the distribution's mean is that much shorter than 4. Over 50 fits, each with a standard error of 0.1."""
     rng = np.random.default_rng(0)
     first, even = 4.0 * np.eye(200)[0], np.full(100, 0.01)
-    bumps = [fit_shrunk_subspace_gaussian(rng.standard_normal((100, 200)) + first, even, 100)[0] for _ in range(50)]
-    excess = [bump.mean[0] - first @ bump.axes[:, 0] for bump in bumps]
+    components = [
+        fit_shrunk_subspace_gaussian(rng.standard_normal((100, 200)) + first, even, 100)[0] for _ in range(50)
+    ]
+    excess = [component.mean[0] - first @ component.axes[:, 0] for component in components]
     assert np.mean(excess) == pytest.approx(0.0, abs=4 * 0.1 / math.sqrt(50))
-    assert all(bump.variance[0] <= 4.0 for bump in bumps)
+    assert all(component.variance[0] <= 4.0 for component in components)
 
 
 variances = st.lists(st.floats(0, 100), min_size=1, max_size=8)
@@ -134,9 +136,9 @@ def test_caution_is_two_standard_errors():
     np.testing.assert_array_equal(inflate_variances(np.array([0.9]), 2.0), 1.0)
 
 
-def log_likelihood(bumps, mixing, u):
+def log_likelihood(components, mixing, u):
     """Mean log of the mixture's density over N(0, I)."""
-    return float(logsumexp(log_ratios(bumps, u), axis=0, b=np.asarray(mixing)[:, None]).mean())
+    return float(logsumexp(log_ratios(components, u), axis=0, b=np.asarray(mixing)[:, None]).mean())
 
 
 def two_clusters(rng, n=400, apart=6.0):
@@ -144,20 +146,20 @@ def two_clusters(rng, n=400, apart=6.0):
     return np.concatenate([rng.standard_normal((n, 2)) + centre, 0.6 * rng.standard_normal((n, 2)) + centre * [-1, 1]])
 
 
-def test_two_clusters_are_two_bumps():
+def test_two_clusters_are_two_components():
     for seed in range(10):
         rng = np.random.default_rng(seed)
         u = two_clusters(rng)
         mix = fit_subspace_mixture(equal(u), 8, rng)
         assert len(mix.components) == 2
-        first, second = sorted(mix.components, key=lambda bump: bump.centre[0])
+        first, second = sorted(mix.components, key=lambda component: component.centre[0])
         np.testing.assert_allclose(first.centre, [-3, 2], atol=4 * 0.6 / math.sqrt(400) + 0.02)
         np.testing.assert_allclose(second.centre, [3, 2], atol=4 / math.sqrt(400) + 0.02)
         np.testing.assert_allclose(first.variance, 0.36, atol=8 * 0.36 * math.sqrt(2 / 400))
         np.testing.assert_allclose(mix.weights, 0.5, atol=0.02)
 
 
-def test_one_gaussian_is_one_bump():
+def test_one_gaussian_is_one_component():
     """By BIC: a second one is not worth its parameters; a level of a per cent or so per fit."""
     numbers = []
     for seed in range(20):
@@ -167,7 +169,7 @@ def test_one_gaussian_is_one_bump():
     assert numbers.count(1) >= 18
 
 
-def test_no_more_bumps_than_asked_for_than_groups_or_than_points_carry(rng):
+def test_no_more_components_than_asked_for_than_groups_or_than_points_carry(rng):
     u = two_clusters(rng)
     assert len(fit_subspace_mixture(equal(u), 1, rng).components) == 1
     assert len(fit_subspace_mixture(equal(u, np.zeros(len(u), dtype=int)), 8, rng).components) == 1
@@ -184,7 +186,7 @@ def test_points_of_a_chain_stay_together(rng):
     assert len(fit_subspace_mixture(equal(u, across)._replace(ess=80.0), 3, rng).components) == 1
 
 
-def test_a_fit_is_nearly_as_likely_as_the_truth_and_more_than_one_bump(rng):
+def test_a_fit_is_nearly_as_likely_as_the_truth_and_more_than_one_component(rng):
     truth = [
         SubspaceGaussian(np.eye(2), np.array([3.0, 2.0]), np.ones(2)),
         SubspaceGaussian(np.eye(2), np.array([-3.0, 2.0]), np.full(2, 0.36)),
@@ -200,7 +202,7 @@ def test_a_fit_is_nearly_as_likely_as_the_truth_and_more_than_one_bump(rng):
 
 @pytest.mark.parametrize("seed", range(10))
 def test_refitting_raises_the_likelihood(seed):
-    """From bumps that are off by about a standard deviation, with many points."""
+    """From components that are off by about a standard deviation, with many points."""
     rng = np.random.default_rng(seed)
     u = two_clusters(rng, 500)
     start = [
@@ -214,7 +216,7 @@ def test_refitting_raises_the_likelihood(seed):
     assert log_likelihood(moved, [0.5, 0.5], u) > log_likelihood(start, [0.5, 0.5], u) + 0.1
 
 
-def test_refitting_leaves_a_bump_without_points_alone(rng):
+def test_refitting_leaves_a_component_without_points_alone(rng):
     near, far = (SubspaceGaussian(np.eye(3), np.full(3, m), np.full(3, v)) for m, v in ((0.5, 1.0), (-9.0, 0.7)))
     u = rng.standard_normal((300, 3)) + 1.0
     moved, left = refit_components([near, far], u, np.zeros(300))
@@ -222,7 +224,7 @@ def test_refitting_leaves_a_bump_without_points_alone(rng):
     np.testing.assert_allclose(moved.centre, 1.0, atol=4 / math.sqrt(300))
 
 
-def test_one_heavy_point_does_not_take_a_bump_with_it(rng):
+def test_one_heavy_point_does_not_take_a_component_with_it(rng):
     """Its weight is tempered until enough points carry the fit."""
     u = rng.standard_normal((300, 2)) + np.array([3.0, 0.0])
     u[0] = [1.0, 4.0]
