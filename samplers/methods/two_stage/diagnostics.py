@@ -22,7 +22,7 @@ def check_base_draws(
     if hits == 0 or stats.binom.sf(hits - 1, n, min(p, 1.0)) > settings.false_alarm:
         return []
     expected = n * p
-    return [f"{hits} of {n:,} base draws failed where p = {p:.2e} lets expect {expected:.2g}: p misses failures."]
+    return [f"{hits} of {n:,} base draws failed; with p = {p:.2e} {expected:.2g} are expected: p misses failures."]
 
 
 def check_rounds(
