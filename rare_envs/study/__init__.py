@@ -10,9 +10,11 @@ from rare_envs.plugins import make_lazy_getattr
 if TYPE_CHECKING:
     from rare_envs.study.compare import EgoComparison, compare_egos
     from rare_envs.study.errors import BadInput
-    from rare_envs.study.evaluate import Question, Report, Study, prepare, run
+    from rare_envs.study.evaluate import resume, run, run_into
+    from rare_envs.study.question import Question, Study, prepare
     from rare_envs.study.replay import Drive, drive_again
-    from rare_envs.study.run_directory import read_failures, resume, run_into, write_run
+    from rare_envs.study.report import Report
+    from rare_envs.study.run_directory import read_failures, write_run
     from rare_envs.study.video import write_film
 
 __all__ = [
@@ -37,16 +39,16 @@ _LAZY = {
     "BadInput": "rare_envs.study.errors",
     "Drive": "rare_envs.study.replay",
     "EgoComparison": "rare_envs.study.compare",
-    "Question": "rare_envs.study.evaluate",
-    "Report": "rare_envs.study.evaluate",
-    "Study": "rare_envs.study.evaluate",
+    "Question": "rare_envs.study.question",
+    "Report": "rare_envs.study.report",
+    "Study": "rare_envs.study.question",
     "compare_egos": "rare_envs.study.compare",
     "drive_again": "rare_envs.study.replay",
-    "prepare": "rare_envs.study.evaluate",
+    "prepare": "rare_envs.study.question",
     "read_failures": "rare_envs.study.run_directory",
-    "resume": "rare_envs.study.run_directory",
+    "resume": "rare_envs.study.evaluate",
     "run": "rare_envs.study.evaluate",
-    "run_into": "rare_envs.study.run_directory",
+    "run_into": "rare_envs.study.evaluate",
     "write_film": "rare_envs.study.video",
     "write_run": "rare_envs.study.run_directory",
 }

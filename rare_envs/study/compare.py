@@ -11,7 +11,7 @@ import rare_envs
 import samplers
 from rare_envs.egos.errors import EgoGone
 from rare_envs.study.errors import as_bad_input, output_folder
-from rare_envs.study.evaluate import Question, prepare
+from rare_envs.study.question import Question, prepare
 from rare_envs.study.run_directory import format_json, write_failures
 
 COMPARISON = "comparison.json"

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.egos.errors import EgoGone, reason_of
 from rare_envs.study.columns import list_columns
-from rare_envs.study.evaluate import Report
 from rare_envs.study.replay import Drive, drive_again
+from rare_envs.study.report import Report
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
 from samplers.problem import FloatArray

@@ -1,6 +1,6 @@
 """Folder of a run: result.json, failures.csv (and failures.npz), plot.png, faults.csv.
 
-Until the run is done, its finished simulations are there too, see `rare_envs.study.journal`.
+Until the run is done, its finished simulations are there too, see `rare_envs.study.journal`; `evaluate` runs it.
 """
 
 from __future__ import annotations
@@ -8,9 +8,6 @@ from __future__ import annotations
 import csv
 import json
 import re
-import sys
-from contextlib import closing
-from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import samplers
-from agents.loading import find_ego_kind
 from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.study.columns import MAX_SHOWN, list_columns
-from rare_envs.study.errors import BadInput, output_folder
-from rare_envs.study.evaluate import Question, Report, Study, prepare, run
-from rare_envs.study.journal import Journal
 from rare_envs.study.plots import save_plot
+from rare_envs.study.report import Report
 from rare_envs.traffic.crash import CRASH_KINDS, NONE
 
 RESULT, FAILURES, BLOCKS, PLOT = "result.json", "failures.csv", "failures.npz", "plot.png"
@@ -45,86 +39,8 @@ FAULTS, FAULT_BLOCKS = "faults.csv", "faults.npz"
 """The same for scenarios on which the ego failed."""
 
 
-def run_into(folder: Path, study: Study, progress: bool = False) -> Report:
-    """Answer a question and write the answer; finished simulations are kept if the run is interrupted.
-
-    Args:
-        folder: Is made, if need be; files of an earlier run in it are replaced.
-        study: From `rare_envs.study.evaluate.prepare`.
-        progress: Show a bar on standard error.
-
-    Returns:
-        The report.
-
-    Raises:
-        BadInput: See `rare_envs.study.evaluate.run`; or the folder cannot be used, or has an unfinished run.
-
-    Example:
-        >>> from tempfile import TemporaryDirectory
-        >>> question = Question(env_id="rare_envs/CarFollowing-v0", gamma=3.0, horizon=3.0, method="mc", max_sim=1000)
-        >>> with TemporaryDirectory() as folder:
-        ...     report = run_into(Path(folder), prepare(question))
-        ...     sorted(path.name for path in Path(folder).iterdir())
-        ['failures.csv', 'plot.png', 'result.json']
-    """
-    with output_folder(folder), closing(Journal(folder, asdict(study.question))) as journal:
-        return _run(folder, study, journal, progress)
-
-
-def resume(
-    folder: Path, ego: str | None = None, on_error: str | None = None, trust: bool = False, progress: bool = False
-) -> Report:
-    """Continue an interrupted run; the answer is that of an undisturbed one.
-
-    Args:
-        folder: Of the run.
-        ego: Address of an ego in another program, if it has changed.
-        on_error: What to count scenarios as on which the ego fails, if that has changed.
-        trust: Let the ego's file run code, as the run was allowed to.
-        progress: Show a bar on standard error.
-
-    Raises:
-        BadInput: There is no unfinished run, it cannot be continued, or it is interrupted again.
-
-    Example:
-        >>> resume(Path("runs/nowhere"))
-        Traceback (most recent call last):
-            ...
-        rare_envs.study.errors.BadInput: There is no unfinished run in 'runs/nowhere': it has no journal.npy.
-    """
-    with closing(Journal(folder)) as journal:
-        try:
-            question = Question(**{**journal.question, "trust": trust})
-        except TypeError as error:
-            raise BadInput(f"Cannot take up the run in {str(folder)!r}: {error}") from error
-        if ego is not None and {find_ego_kind(ego), find_ego_kind(question.ego)} != {"remote"}:
-            raise BadInput(f"Expected --ego for one whose address has changed only; the run has {question.ego!r}.")
-        question = replace(question, ego=ego or question.ego, on_error=on_error or question.on_error)
-        return _run(folder, prepare(question), journal, progress)
-
-
-def _run(folder: Path, study: Study, journal: Journal, progress: bool) -> Report:
-    try:
-        report = run(study, progress, journal)
-        write_run(folder, report)
-    except BadInput as error:
-        raise BadInput(f"{error}{_resume_hint(journal, folder)}") from error
-    except KeyboardInterrupt:
-        print(f"Stopped.{_resume_hint(journal, folder)}", file=sys.stderr)
-        raise
-    journal.remove()
-    return report
-
-
-def _resume_hint(journal: Journal, folder: Path) -> str:
-    """Return the number of simulations kept and the command that continues the run."""
-    if not journal.n:
-        return ""
-    return f" {journal.n:,} simulations are kept; go on with: rare-envs resume {folder}"
-
-
 def write_run(folder: Path, report: Report) -> None:
-    """Write a report; numbers first, so that they are safe whatever happens to the picture.
+    """Write a report, the numbers before the picture.
 
     Args:
         folder: An existing folder; files of an earlier run in it are replaced.
@@ -132,6 +48,7 @@ def write_run(folder: Path, report: Report) -> None:
 
     Example:
         >>> from tempfile import TemporaryDirectory
+        >>> from rare_envs.study import Question, prepare, run
         >>> report = run(prepare(Question(env_id="rare_envs/CarFollowing-v0", method="mc", max_sim=100, horizon=1.0)))
         >>> with TemporaryDirectory() as folder:
         ...     write_run(Path(folder), report)
@@ -167,6 +84,7 @@ def read_failures(folder: Path) -> dict[str, NDArray[Any]]:
 
     Example:
         >>> from tempfile import TemporaryDirectory
+        >>> from rare_envs.study import Question, prepare, run_into
         >>> question = Question(env_id="rare_envs/CarFollowing-v0", gamma=3.0, horizon=3.0, method="mc", max_sim=1000)
         >>> with TemporaryDirectory() as folder:
         ...     report = run_into(Path(folder), prepare(question))

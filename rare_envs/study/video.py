@@ -17,7 +17,7 @@ from rare_envs import DrivingProblem
 from rare_envs.envs.rendering import FRAME_WIDTH, Renderer
 from rare_envs.study.columns import MAX_SHOWN, format_value
 from rare_envs.study.errors import BadInput
-from rare_envs.study.evaluate import Question, prepare
+from rare_envs.study.question import Question, prepare
 from rare_envs.study.replay import Drive
 from rare_envs.study.run_directory import FAILURES, RESULT, read_failures
 

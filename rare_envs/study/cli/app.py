@@ -26,7 +26,7 @@ from rare_envs.study.cli.options import (
     WorldOptions,
     spread_options,
 )
-from rare_envs.study.cli.shell import OneLineErrors, print_json, use_one_thread
+from rare_envs.study.cli.shell import OneLineErrors, print_json, show_interruption, use_one_thread
 from rare_envs.study.errors import as_bad_input
 
 DOUBTFUL = 3
@@ -62,11 +62,14 @@ def estimate_command(
 ) -> None:
     """Estimate how often an ego fails, with an interval, and show its most likely failure."""
     use_one_thread()
-    from rare_envs.study.evaluate import Question, prepare, run
-    from rare_envs.study.run_directory import run_into
+    from rare_envs.study.evaluate import run, run_into
+    from rare_envs.study.question import Question, prepare
 
     question = Question(env_id=env, **options.arguments())
-    with contextlib.redirect_stdout(sys.stderr):  # an ego may print, and standard output is for the answer
+    with (
+        show_interruption(),
+        contextlib.redirect_stdout(sys.stderr),
+    ):  # an ego may print, and standard output is for the answer
         study = prepare(question)
         report = run(study, progress=True) if out is None else run_into(out, study, progress=True)
     _answer(report, out, as_json)
@@ -95,9 +98,9 @@ def resume_command(
 ) -> None:
     """Go on with a run whose ego has gone, or that was stopped; the answer is that of an undisturbed run."""
     use_one_thread()
-    from rare_envs.study.run_directory import resume
+    from rare_envs.study.evaluate import resume
 
-    with contextlib.redirect_stdout(sys.stderr):
+    with show_interruption(), contextlib.redirect_stdout(sys.stderr):
         report = resume(run, ego, on_error, trust, progress=True)
     _answer(report, run, as_json)
 
@@ -116,19 +119,19 @@ def compare_command(
     """Estimate how many times likelier ego A fails than ego B, with an interval, from the same scenarios."""
     use_one_thread()
     from rare_envs.study.compare import compare_egos
-    from rare_envs.study.evaluate import Question
+    from rare_envs.study.question import Question
 
     question = Question(env_id=env, ego=ego_a, max_sim=max_sim, **options.arguments())
     with contextlib.redirect_stdout(sys.stderr):
-        found = compare_egos(question, ego_b, progress=True, out=out)
+        comparison = compare_egos(question, ego_b, progress=True, out=out)
     if as_json:
-        print_json(found.answer)
+        print_json(comparison.answer)
     else:
-        notes = "".join(f"\n  note: {note}" for note in found.answer["notes"])
-        print(f"A = {ego_a}, B = {ego_b}, {env}\n{found.comparison}{notes}")
+        notes = "".join(f"\n  note: {note}" for note in comparison.answer["notes"])
+        print(f"A = {ego_a}, B = {ego_b}, {env}\n{comparison.comparison}{notes}")
         if out is not None:
             print(f"Wrote {out}.")
-    raise typer.Exit(DOUBTFUL if found.comparison.warnings else 0)
+    raise typer.Exit(DOUBTFUL if comparison.comparison.warnings else 0)
 
 
 @app.command("train-ego")

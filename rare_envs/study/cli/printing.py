@@ -13,7 +13,7 @@ from rich.table import Table
 import samplers
 from rare_envs.study.columns import MAX_SHOWN, format_value
 from rare_envs.study.crash_kinds import KIND_DESCRIPTIONS
-from rare_envs.study.evaluate import Report
+from rare_envs.study.report import Report
 from samplers.problem import FloatArray
 
 RANGE_DRAWS = 4000

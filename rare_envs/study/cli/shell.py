@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import sys
+from collections.abc import Iterator
 from typing import Any, NoReturn
 
 import typer
@@ -38,6 +40,17 @@ def _fail(message: str) -> NoReturn:
     """Print an error in one line, and exit."""
     print("rare-envs: " + " ".join(message.split()), file=sys.stderr)
     sys.exit(2)
+
+
+@contextlib.contextmanager
+def show_interruption() -> Iterator[None]:
+    """Print the message of a KeyboardInterrupt, which says how to continue the run; Typer would drop it."""
+    try:
+        yield
+    except KeyboardInterrupt as error:
+        if str(error):
+            print(error, file=sys.stderr)
+        raise
 
 
 def use_one_thread() -> None:

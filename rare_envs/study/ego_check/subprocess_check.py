@@ -11,15 +11,17 @@ import queue
 import subprocess
 import sys
 import threading
-import warnings
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rare_envs.study.ego_check.findings import Finding, report_failure, report_pass, report_warning
 from rare_envs.study.errors import BadInput
+
+if TYPE_CHECKING:
+    from rare_envs.study.question import Question
 
 START_TIMEOUT = 60.0
 """Duration that the process may take before its first check [s]."""
@@ -56,6 +58,14 @@ class EgoCheckRequest:
     base: str | None = None
     drivers: str | None = None
     horizon: float | None = None
+
+    @property
+    def question(self) -> Question:
+        """The question in whose problem the ego is checked."""
+        from rare_envs.study.question import Question
+
+        shared = {field.name for field in fields(Question)} & set(asdict(self))
+        return Question(**{name: value for name, value in asdict(self).items() if name in shared})
 
 
 def check_ego(request: EgoCheckRequest) -> list[Finding]:
@@ -147,12 +157,11 @@ def run_checks(request: EgoCheckRequest) -> Iterator[Finding | str]:
     """Load the ego and check it: yield findings, and before each check its name."""
     import agents
     from agents.loading import find_ego_kind
-    from rare_envs import DrivingProblem
     from rare_envs.egos.errors import EgoGone, reason_of
-    from rare_envs.problem import AmbiguousActions
     from rare_envs.study.ego_check.behaviour import EGO_CHECKS, check_driving
     from rare_envs.study.ego_check.probe import Probe
     from rare_envs.study.ego_check.protocol import check_protocol
+    from rare_envs.study.question import build_problem
 
     if find_ego_kind(request.ego) == "remote":
         yield "protocol"
@@ -164,17 +173,7 @@ def run_checks(request: EgoCheckRequest) -> Iterator[Finding | str]:
     try:
         ego = agents.load_ego(request.ego, algo=request.algo, trust=request.trust)
         yield report_pass("loading", f"{type(ego).__name__}" if not isinstance(ego, str) else ego)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", AmbiguousActions)
-            problem = DrivingProblem(
-                request.env_id,
-                ego=ego,
-                observation=request.observation,
-                action=request.action,
-                base=request.base,
-                drivers=request.drivers,
-                horizon=request.horizon,
-            )
+        problem = build_problem(request.question, ego)
         for note in problem.notes:
             yield report_warning("action space", note, "say --action meta if it was trained there")
         probe = Probe.of(ego, problem)

@@ -13,7 +13,8 @@ import rare_envs
 import samplers
 from rare_envs.control.idm import IDM
 from rare_envs.study.crash_kinds import classify_failures
-from rare_envs.study.evaluate import Question, Report, Study
+from rare_envs.study.question import Question, Study
+from rare_envs.study.report import Report
 from rare_envs.study.run_directory import CRASH, read_failures, write_run
 
 CUT_IN = "rare_envs/CutIn-v0"

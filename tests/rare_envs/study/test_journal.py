@@ -18,10 +18,10 @@ from typer.testing import Result
 
 import rare_envs
 from rare_envs.problem import DrivingProblem
-from rare_envs.study import run_directory as rundir
+from rare_envs.study import evaluate, run_directory
 from rare_envs.study.errors import BadInput
-from rare_envs.study.evaluate import Question, prepare
 from rare_envs.study.journal import JOURNAL, Journal
+from rare_envs.study.question import Question, prepare
 
 Cli = Callable[..., Result]
 FILES = ("result.json", "failures.csv")
@@ -60,7 +60,7 @@ def frail(here: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.syspath_prepend(str(here))
     monkeypatch.setenv("FRAIL", "gone")
     monkeypatch.setattr(DrivingProblem, "tile", 200)
-    monkeypatch.setattr(rundir, "save_plot", lambda path, report: None)
+    monkeypatch.setattr(run_directory, "save_plot", lambda path, report: None)
     return here
 
 
@@ -89,14 +89,14 @@ def question(base: str, method: str) -> Question:
 )
 def test_the_answer_is_that_of_an_undisturbed_run(method: str, after: int, again: int, frail: Path, risky: str) -> None:
     asked = question(risky, method)
-    rundir.run_into(frail / "whole", prepare(asked))
+    evaluate.run_into(frail / "whole", prepare(asked))
     whole = answer(frail / "whole")
     assert whole["n_faults"] > 0
     (frail / "left").write_text(str(after))
     with pytest.raises(
         BadInput, match=r"No ego at tcp://here\. [\d,]+ simulations are kept; go on with: rare-envs resume"
     ):
-        rundir.run_into(frail / "run", prepare(asked))
+        evaluate.run_into(frail / "run", prepare(asked))
     assert [path.name for path in (frail / "run").iterdir()] == [JOURNAL]
     kept = Journal(frail / "run")
     assert kept.question["method"] == method
@@ -105,8 +105,8 @@ def test_the_answer_is_that_of_an_undisturbed_run(method: str, after: int, again
         file.write(b"\x93NUMPY\x01\x00v")
     (frail / "left").write_text(str(again))  # it goes away again, a little later
     with pytest.raises(BadInput, match="are kept"):
-        rundir.resume(frail / "run")
-    rundir.resume(frail / "run")
+        evaluate.resume(frail / "run")
+    evaluate.resume(frail / "run")
     assert answer(frail / "run") == whole
     for name in ("failures.csv", "faults.csv"):
         assert (frail / "run" / name).read_bytes() == (frail / "whole" / name).read_bytes()
@@ -118,7 +118,7 @@ def test_what_is_in_the_journal_is_not_simulated_again(
 ) -> None:
     (frail / "left").write_text("150")
     with pytest.raises(BadInput, match="600 simulations are kept"):
-        rundir.run_into(frail / "run", prepare(question(risky, "mc")))
+        evaluate.run_into(frail / "run", prepare(question(risky, "mc")))
     simulated: list[int] = []
     attempt = DrivingProblem.attempt
 
@@ -127,7 +127,7 @@ def test_what_is_in_the_journal_is_not_simulated_again(
         return attempt(self, x)
 
     monkeypatch.setattr(DrivingProblem, "attempt", counted)
-    assert rundir.resume(frail / "run").estimate.n_sim == 1200
+    assert evaluate.resume(frail / "run").estimate.n_sim == 1200
     assert sum(size for size in simulated if size == 200) == 600
 
 
@@ -155,21 +155,21 @@ def test_on_the_command_line(cli: Cli, frail: Path, risky: str, monkeypatch: pyt
 def test_another_run_does_not_take_the_journal(frail: Path, risky: str) -> None:
     (frail / "left").write_text("150")
     with pytest.raises(BadInput, match="are kept"):
-        rundir.run_into(frail / "run", prepare(question(risky, "mc")))
+        evaluate.run_into(frail / "run", prepare(question(risky, "mc")))
     journal = frail / "run" / JOURNAL
     content = journal.read_bytes()
     journal.write_bytes(content.replace(b'"seed": 3', b'"seed": 4'))
     with pytest.raises(BadInput, match="asks for other scenarios"):
-        rundir.resume(frail / "run")
+        evaluate.resume(frail / "run")
     journal.write_bytes(content.replace(b'"version": "0', b'"version": "9'))
     with pytest.raises(BadInput, match="begun by version 9"):
-        rundir.resume(frail / "run")
+        evaluate.resume(frail / "run")
     journal.write_bytes(content)
     with pytest.raises(BadInput, match="whose address has changed only"):
-        rundir.resume(frail / "run", ego="tcp://127.0.0.1:5555")
+        evaluate.resume(frail / "run", ego="tcp://127.0.0.1:5555")
     journal.write_bytes(b"nothing")
     with pytest.raises(BadInput, match="Cannot take up"):
-        rundir.resume(frail / "run")
+        evaluate.resume(frail / "run")
 
 
 def killed_once_there_is(path: Path, process: subprocess.Popen[str]) -> None:
@@ -206,13 +206,13 @@ def test_a_remote_ego_that_is_killed_for_good_and_started_later(cli: Cli, frail:
     process, address = served("tcp://127.0.0.1:*")
     try:
         asked = replace(question(risky, "two-stage"), ego=f"{address}?patience=2")
-        rundir.run_into(frail / "whole", prepare(asked))
+        evaluate.run_into(frail / "whole", prepare(asked))
         threading.Thread(target=killed_once_there_is, args=(frail / "run" / JOURNAL, process)).start()
         with pytest.raises(BadInput, match=r"within 2 s.* simulations are kept; go on with: rare-envs resume"):
-            rundir.run_into(frail / "run", prepare(asked))
+            evaluate.run_into(frail / "run", prepare(asked))
         process.communicate()
         process, elsewhere = served("tcp://127.0.0.1:*")
-        rundir.resume(frail / "run", ego=f"{elsewhere}?patience=2")
+        evaluate.resume(frail / "run", ego=f"{elsewhere}?patience=2")
     finally:
         process.kill()
         process.communicate()

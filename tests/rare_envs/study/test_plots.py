@@ -10,8 +10,9 @@ from matplotlib.figure import Figure
 import rare_envs
 from rare_envs.scenarios.cut_in import CUT_IN
 from rare_envs.scenarios.highway import HIGHWAY
-from rare_envs.study.evaluate import Question, prepare, run
+from rare_envs.study.evaluate import run
 from rare_envs.study.plots import MOMENTS, draw_drive, rank_shifted_parameters, save_plot
+from rare_envs.study.question import Question, prepare
 from rare_envs.study.replay import drive_again
 
 FOLLOWING = "rare_envs/CarFollowing-v0"

@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from rare_envs.study.cli.options import EstimateOptions, NoiseChoice, ScenarioOptions, WorldOptions, spread_options
 from rare_envs.study.ego_check.subprocess_check import EgoCheckRequest
-from rare_envs.study.evaluate import Question
+from rare_envs.study.question import Question
 
 
 def test_defaults_are_those_of_a_question() -> None:

@@ -1,0 +1,194 @@
+"""Question: all inputs of an evaluation, checked and loaded before the first simulation."""
+
+from __future__ import annotations
+
+import itertools
+import warnings
+from dataclasses import dataclass, replace
+from typing import Any, cast
+
+import numpy as np
+import torch
+
+import agents
+import rare_envs
+import samplers
+from rare_envs.egos.errors import EgoGone
+from rare_envs.problem import AmbiguousActions
+from rare_envs.scenarios.registry import find_scenario
+from rare_envs.simulation.rollout import drive
+from rare_envs.study.errors import BadInput, as_bad_input
+from samplers.errors import OnError
+from samplers.execution.arguments import RunArguments
+
+
+@dataclass(frozen=True, kw_only=True)
+class Question:
+    """All inputs of an evaluation: the same question gives the same answer.
+
+    Attributes:
+        env_id: Environment, such as "rare_envs/CutIn-v0".
+        ego: "idm", a learned driver ("mgail", "gail", "bc" or its file), a path to a Stable-Baselines3 `.zip`, or
+            `module:function`.
+        algo: Algorithm of a `.zip`; recognised from the file when None.
+        trust: Let the ego's `.zip` run code when it is loaded, as `agents.load_ego` explains.
+        method: Name of a method in `samplers.METHODS`.
+        base: Name of a base distribution or path to a JSON file; the scenario's default when None.
+        measure: Safety measure f: a name, "module:name" or "stl:FORMULA".
+        gamma: Threshold; the answer is P[f(X) <= gamma].
+        seed: Seed of everything that is drawn.
+        max_sim: Largest number of simulations, or None.
+        target_cov: Stop when the coefficient of variation is this small, or None.
+        replicates: Number of independent runs, combined by their mean.
+        noise: Noise of the drivers, as in `DrivingProblem`: True, "fixed" or False.
+        drivers: Of the vehicles around the ego: the name of installed ones or a file; the scenario's default when None.
+        horizon: Length of an episode [s]; the scenario's when None.
+        observation: Observation of the ego: "features", "lidar", "kinematics", "camera" or "speed"; several joined by
+            "+"; None for the one that it declares, else "features".
+        action: Actions of a policy: "continuous" or "meta".
+        collisions: Which collisions count: those of the "ego", or "any", those between two other vehicles too.
+        weather: Whether weather and the camera's noise are parameters.
+        on_error: Treatment of scenarios on which the ego fails twice: "raise" ends the run, "failure" counts them as
+            failing, "bound" as failing in p and the upper end of the interval, but not in the lower end.
+
+    Example:
+        >>> question = Question(env_id="rare_envs/CarFollowing-v0", ego="idm", gamma=3.0, seed=1)
+        >>> question.run_arguments.gamma, question.method
+        (3.0, 'two-stage')
+    """
+
+    env_id: str
+    ego: str = "idm"
+    algo: str | None = None
+    trust: bool = False
+    method: str = "two-stage"
+    base: str | None = None
+    measure: str = "ttc"
+    gamma: float = RunArguments.gamma
+    seed: int = 0
+    max_sim: int | None = RunArguments.max_sim
+    target_cov: float | None = RunArguments.target_cov
+    replicates: int = RunArguments.replicates
+    noise: bool | str = True
+    drivers: str | None = None
+    horizon: float | None = None
+    observation: str | None = None
+    action: str = "continuous"
+    on_error: str = RunArguments.on_error
+    collisions: str = "ego"
+    weather: bool = False
+
+    @property
+    def run_arguments(self) -> RunArguments:
+        """The arguments of `samplers.estimate`.
+
+        Raises:
+            ValueError: If one of them is out of range.
+        """
+        return RunArguments(
+            gamma=self.gamma,
+            seed=self.seed,
+            max_sim=self.max_sim,
+            target_cov=self.target_cov,
+            replicates=self.replicates,
+            on_error=cast(OnError, self.on_error),
+        )
+
+    def check(self) -> samplers.Stepping:
+        """Return the method, after a check of all that is known before the ego is loaded, which takes seconds.
+
+        Raises:
+            ValueError: An argument of `samplers.estimate` is out of range, or there is no such method or environment.
+        """
+        _ = self.run_arguments
+        method = samplers.get_method(self.method)
+        find_scenario(self.env_id)
+        return method
+
+
+@dataclass(frozen=True)
+class Study:
+    """A question with everything that it names, loaded and checked.
+
+    Example:
+        >>> study = prepare(Question(env_id="rare_envs/CarFollowing-v0", method="mc"))
+        >>> study.problem.space.names, study.method.name
+        (('ego_speed', 'lead_speed', 'gap'), 'mc')
+    """
+
+    question: Question
+    problem: rare_envs.DrivingProblem
+    method: samplers.Stepping
+
+
+def prepare(question: Question) -> Study:
+    """Check a question and load what it names; nothing is simulated.
+
+    Args:
+        question: The question.
+
+    Returns:
+        The study, ready to run.
+
+    Raises:
+        BadInput: Something in the question cannot be used.
+
+    Example:
+        >>> prepare(Question(env_id="rare_envs/CutIn-v0", seed=-1))
+        Traceback (most recent call last):
+            ...
+        rare_envs.study.errors.BadInput: Expected seed to be a whole number of at least 0, got -1.
+    """
+    with as_bad_input(ValueError, OSError):
+        method = question.check()
+        ego = agents.load_ego(question.ego, algo=question.algo, trust=question.trust)
+        problem = build_problem(question, ego)
+    problem.varies = problem.varies or _answers_vary(problem)
+    return Study(replace(question, observation=problem.world.sensing.observation), problem, method)
+
+
+def build_problem(question: Question, ego: Any) -> rare_envs.DrivingProblem:
+    """Return the problem of a question; what it cannot check is among its notes, without a warning.
+
+    Args:
+        question: The question.
+        ego: The ego that it names, loaded.
+
+    Raises:
+        ValueError: An argument is invalid or the ego does not fit.
+        OSError: A file cannot be read.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", AmbiguousActions)
+        return rare_envs.DrivingProblem(
+            question.env_id,
+            ego=ego,
+            measure=question.measure,
+            base=question.base,
+            noise=question.noise,
+            drivers=question.drivers,
+            horizon=question.horizon,
+            collisions=question.collisions,
+            observation=question.observation,
+            weather=question.weather,
+            action=question.action,
+        )
+
+
+@torch.inference_mode()
+def _answers_vary(problem: rare_envs.DrivingProblem) -> bool:
+    """Return whether the ego answers differently when it is queried twice with ordinary traffic at time 0.
+
+    This finds a broken ego before the simulations, and one whose answers vary from run to run.
+
+    Raises:
+        BadInput: It raised, or its actions are not actions.
+    """
+    x = torch.from_numpy(problem.space.sample(2, np.random.default_rng(0))).float()
+    try:
+        first, again = (list(itertools.islice(drive(problem.world, problem.driver, x), 2))[1] for _ in range(2))
+    except (Exception, SystemExit, EgoGone) as error:  # the ego is the user's: anything may happen in it
+        words = "" if isinstance(error, SystemExit) else str(error)
+        raise BadInput(f"The ego fails on its first observation: {words or repr(error)}") from error
+    same = torch.equal(first.state.speed, again.state.speed) and torch.equal(first.state.heading, again.state.heading)
+    return not same

@@ -1,0 +1,108 @@
+"""Questions, checked before the first simulation."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import Result
+
+import agents
+import rare_envs
+from rare_envs.problem import AmbiguousActions
+from rare_envs.study.ego_check.findings import Finding
+from rare_envs.study.ego_check.subprocess_check import EgoCheckRequest, run_checks
+from rare_envs.study.errors import BadInput
+from rare_envs.study.question import Question, build_problem, prepare
+
+SMALL = ("estimate", "rare_envs/CarFollowing-v0", "--method", "mc", "--max-sim", 400)
+
+DISCRETE = """
+import gymnasium as gym
+import numpy as np
+
+class Idle:
+    action_space = gym.spaces.Discrete(5)
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        return np.ones(len(observation), int), None
+"""
+
+Cli = Callable[..., Result]
+
+FOLLOWING = "rare_envs/CarFollowing-v0"
+
+
+def test_a_question_is_checked_in_python_as_on_the_command_line() -> None:
+    with pytest.raises(BadInput, match="'adss'"):
+        prepare(Question(env_id=FOLLOWING, method="addss"))
+
+
+def test_what_actions_are_taken_for_is_pointed_out(cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A policy from HighwayEnv without its meta-actions runs all the same, and behaves arbitrarily."""
+    (tmp_path / "idle_egos.py").write_text(DISCRETE)
+    monkeypatch.chdir(tmp_path)
+    words = ("estimate", FOLLOWING, "--ego", "idle_egos:Idle", "--method", "mc", "--max-sim", 50, "--json")
+    (note,) = json.loads(cli(*words, "--observation", "kinematics").stdout)["notes"]
+    assert "--action meta" in note
+    for more in (("--observation", "kinematics", "--action", "meta"), ()):
+        assert json.loads(cli(*words, *more).stdout)["notes"] == []
+    both = (
+        *("compare", "idle_egos:Idle", "idm", FOLLOWING),
+        *("--method", "mc", "--max-sim", 20, "--observation", "kinematics"),
+    )
+    assert json.loads(cli(*both, "--json").stdout)["notes"] == [f"A: {note}"]
+    assert f"note: A: {note}" in cli(*both).stdout
+    asked = EgoCheckRequest("idle_egos:Idle", FOLLOWING, observation="kinematics")
+    (found,) = (each for each in run_checks(asked) if isinstance(each, Finding) and each.found == note)
+    assert (found.check, found.status) == ("action space", "warn")
+    with pytest.warns(AmbiguousActions, match="--action meta"):
+        rare_envs.DrivingProblem(FOLLOWING, ego=agents.load_ego("idle_egos:Idle"), observation="kinematics")
+
+
+def test_an_ego_that_answers_differently_each_time_is_noticed(cli: Cli, here: Path) -> None:
+    (here / "restless.py").write_text(
+        "import egos_here\n"
+        "import numpy as np\n"
+        "def make():\n"
+        "    ego = egos_here.Ego()\n"
+        "    ego.choose = lambda observation: np.random.uniform(-1, 1, (len(observation), 2))\n"
+        "    return ego\n"
+    )
+    words = (*SMALL[:-1], 50, "--json", "--gamma", 5, "--ego")
+    for ego in ("restless:make", "noisy:restless:make"):
+        found = json.loads(cli(*words, ego).stdout)
+        assert "failures may not replay" in found["given"]
+        assert found["n_failures"] > 0
+        assert found["kinds"] == {}
+        assert "cannot be seen again" in " ".join(found["notes"])
+    assert json.loads(cli(*words, "egos_here:coasting").stdout)["given"] == ""
+
+
+def test_an_unknown_word_is_refused(cli: Cli) -> None:
+    result = cli(*SMALL, "--on-error", "bonud")
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert "Did you mean 'bound'" in result.stderr
+
+
+def test_the_check_of_an_ego_and_a_question_build_the_same_problem() -> None:
+    request = EgoCheckRequest("idm", FOLLOWING, observation="lidar", base="highway", horizon=3.0)
+    question = request.question
+    assert question == Question(env_id=FOLLOWING, observation="lidar", base="highway", horizon=3.0)
+    world = build_problem(question, "idm").world
+    assert (world.sensing.observation, world.clock.horizon) == ("lidar", 3.0)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [({"seed": -1}, "seed"), ({"method": "addss"}, "'adss'"), ({"env_id": "rare_envs/CutIm-v0"}, "CutIn")],
+)
+def test_what_is_known_before_the_ego_is_loaded_is_checked_first(wrong: dict[str, Any], message: str) -> None:
+    question = Question(**{"env_id": FOLLOWING, "ego": "nobody.zip", **wrong})
+    with pytest.raises(ValueError, match=message):
+        question.check()
+    with pytest.raises(BadInput, match=message):
+        prepare(question)

@@ -1,0 +1,69 @@
+"""Reports: what they note, and the scenarios on which the ego fails."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import Result
+
+SMALL = ("estimate", "rare_envs/CarFollowing-v0", "--method", "mc", "--max-sim", 400)
+
+Cli = Callable[..., Result]
+
+FOLLOWING = "rare_envs/CarFollowing-v0"
+
+
+def test_the_result_names_the_statistics_that_were_applied(cli, tmp_path):
+    """A policy with somebody else's VecNormalize statistics drives unlike its training data: say which file it was."""
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    import training
+
+    env = VecNormalize(training.sb3_vec_env(FOLLOWING, 4))
+    PPO("MlpPolicy", env, n_steps=8, batch_size=32).save(tmp_path / "ego.zip")
+    words = ("estimate", FOLLOWING, "--ego", str(tmp_path / "ego.zip"), "--method", "mc", "--max-sim", "50", "--json")
+    assert json.loads(cli(*words).stdout)["vec_normalize"] is None
+    env.save(str(tmp_path / "vecnormalize.pkl"))
+    assert json.loads(cli(*words).stdout)["vec_normalize"] == str(tmp_path / "vecnormalize.pkl")
+    assert "normalised by" in cli(*words[:-1]).stdout
+
+
+def test_noise_that_nobody_has_is_pointed_out(cli: Cli, risky: str) -> None:
+    words = ("estimate", FOLLOWING, "--base", risky, "--method", "mc", "--max-sim", 500, "--noise", "fixed")
+    assert "note: --noise fixed changes nothing" in cli(*words).stdout
+    assert len(json.loads(cli(*words, "--json").stdout)["notes"]) == 1
+    for more in (("--drivers", "bc"), ("--noise", "on")):
+        assert json.loads(cli(*words, *more, "--json").stdout)["notes"] == []
+
+
+@pytest.mark.parametrize(
+    ("ego", "reason"), [("nan_when_close", "NaN or infinite"), ("exiting_when_close", "SystemExit(7)")]
+)
+def test_scenarios_on_which_the_ego_fails_are_listed(cli: Cli, here: Path, risky: str, ego: str, reason: str) -> None:
+    words = (*SMALL, "--base", risky, "--ego", f"egos_here:{ego}", "--out", here / "run")
+    found = {}
+    for on_error in ("bound", "failure"):
+        result = cli(*words, "--on-error", on_error)
+        assert result.exit_code == 3, result.output  # the number is doubtful
+        found[on_error] = json.loads((here / "run" / "result.json").read_text())
+        assert f"the ego failed twice on {found[on_error]['n_faults']} scenarios" in result.stdout
+    with (here / "run" / "faults.csv").open(newline="") as file:
+        header, *rows = csv.reader(file)
+    answer = found["failure"]
+    assert header == ["ego_speed", "lead_speed", "gap", "reason"]
+    assert len(rows) == answer["n_faults"] == answer["n_failures"] > 10  # this ego fails before it collides
+    assert all(reason in row[-1] for row in rows)
+    assert answer["n_retried"] >= len(rows)
+    assert answer["faults"][0]["parameters"]["gap"] == float(rows[0][2])
+    assert answer["p"] == pytest.approx(len(rows) / 400)
+    assert found["bound"]["interval"][0] == 0.0
+    assert found["bound"]["interval"][1] == answer["interval"][1]
+    assert np.isfinite(np.array([row[:-1] for row in rows], dtype=float)).all()
+    assert cli(*SMALL, "--ego", "idm", "--out", here / "run").exit_code in (0, 3)
+    assert not (here / "run" / "faults.csv").exists()
