@@ -157,7 +157,7 @@ def strip_prefixes(spec: str) -> str:
 
 
 def find_ego_kind(spec: str) -> EgoKind:
-    """Return the kind of ego that a name, file, address or function means; of a `.safetensors` the header tells.
+    """Return the kind of ego of a name, file, address or function; the header identifies a `.safetensors` file.
 
     Example:
         >>> [find_ego_kind(spec) for spec in ("idm", "bc", "tcp://host:5555", "noisy:idm", "ego.onnx", "file:make")]

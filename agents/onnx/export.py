@@ -157,7 +157,7 @@ def export_onnx(ego: SavedEgo, path: Path, seed: int = 0) -> ExportReport:
 
 
 def _trace(ego: SavedEgo, path: Path) -> None:
-    """Write the graph, traced on zeros; `compare_actions` finds what the tracer may get wrong."""
+    """Write the graph by tracing; `compare_actions` checks it."""
     graph, space = _Graph(ego).eval(), ego.observation_space
     memory = graph.memory(space, 2)
     names = [f"memory_{part}" for part in range(len(memory))]

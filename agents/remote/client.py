@@ -106,8 +106,8 @@ def parse_address(spec: str) -> tuple[str, dict[str, float]]:
     return address, settings
 
 
-class _Session:
-    """One batch of episodes on the server, and what it takes to begin it again there."""
+class _ClientSession:
+    """One batch of episodes on the server, with the history that restores it there."""
 
     def __init__(self, number: int, batch: int) -> None:
         self.number = number
@@ -163,7 +163,7 @@ class RemoteEgo:
         self._longest_answer = 0.0
         self._warm = False
         self._connected = False
-        self._reusable: dict[int, _Session] = {}
+        self._reusable: dict[int, _ClientSession] = {}
         self._ended: list[int] = []
         try:
             hello = self._connect()
@@ -205,7 +205,7 @@ class RemoteEgo:
         session.history.clear()
         return action, None
 
-    def _find_session(self, batch: int) -> _Session:
+    def _find_session(self, batch: int) -> _ClientSession:
         """Return a session without a memory, if there is one of this size, else a new one."""
         while self._ended and self._connected:  # batches with a memory that nobody refers to any more
             try:
@@ -214,11 +214,11 @@ class RemoteEgo:
                 self._connected = False
         if batch in self._reusable:
             return self._reusable[batch]
-        session = _Session(next(self._numbers), batch)
+        session = _ClientSession(next(self._numbers), batch)
         weakref.finalize(session, self._ended.append, session.number)
         return session
 
-    def _act(self, session: _Session, observation: Any, start: NDArray[np.bool_] | None) -> NDArray[Any]:
+    def _act(self, session: _ClientSession, observation: Any, start: NDArray[np.bool_] | None) -> NDArray[Any]:
         """Return the actions for one tick of a session; try again on a new connection where that may help."""
         reason = ""
         if session.batch >= self._smallest_unanswered:
@@ -248,7 +248,7 @@ class RemoteEgo:
             return action
         raise RemoteError(f"The ego at {self._link.address} failed twice on this batch: {reason}")
 
-    def _restore(self, session: _Session) -> None:
+    def _restore(self, session: _ClientSession) -> None:
         """Begin a session on the server if it does not know it, and bring it to the present tick."""
         if session.epoch == self._epoch:
             return
@@ -259,7 +259,9 @@ class RemoteEgo:
             self._send_act(session, step, observation, start)
         session.epoch = self._epoch
 
-    def _send_act(self, session: _Session, step: int, observation: Any, start: NDArray[np.bool_] | None) -> Message:
+    def _send_act(
+        self, session: _ClientSession, step: int, observation: Any, start: NDArray[np.bool_] | None
+    ) -> Message:
         """Return the answer for one tick of a session."""
         message: Message = {
             "type": "act",
@@ -313,7 +315,7 @@ class RemoteEgo:
         return reply
 
     def _connect(self) -> Message:
-        """Open the link and say hello, repeatedly while patience lasts; return the server's hello."""
+        """Connect and exchange hello messages, retrying for `patience` seconds; return the server's."""
         deadline, reason = time.monotonic() + self._patience, "no answer"
         greeting = {"type": "hello", "protocol": protocol.PROTOCOL, "client": "rare-envs"}
         while True:

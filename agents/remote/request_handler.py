@@ -32,7 +32,7 @@ class RequestRefused(Exception):
 
 
 @dataclass
-class _Session:
+class _ServerSession:
     """One batch of episodes."""
 
     batch: int
@@ -49,7 +49,7 @@ class _ClientState:
 
     last_id: int
     """Of the last request."""
-    sessions: OrderedDict[int, _Session] = field(default_factory=OrderedDict)
+    sessions: OrderedDict[int, _ServerSession] = field(default_factory=OrderedDict)
     """Open sessions by number, the least recently used first."""
 
 
@@ -151,7 +151,7 @@ class RequestHandler:
         if not protocol.is_count(batch, protocol.MAX_BATCH) or not batch or not protocol.is_count(number):
             raise MalformedMessage(f"reset has a session (a number) and a batch from 1 to {protocol.MAX_BATCH}")
         client.sessions.pop(number, None)
-        client.sessions[number] = _Session(batch)
+        client.sessions[number] = _ServerSession(batch)
         while len(client.sessions) > MAX_SESSIONS:
             client.sessions.popitem(last=False)
         return {"type": "ready"}

@@ -1,4 +1,4 @@
-"""A server that lends an ego to simulations elsewhere, over ZeroMQ."""
+"""A server that serves an ego to simulations elsewhere, over ZeroMQ."""
 
 from __future__ import annotations
 

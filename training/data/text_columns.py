@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -154,41 +154,64 @@ def check_tracks(
         row = int(np.argmax(bad))
         raise rows.error(row, f"speed is {speed[row]:.4g} m/s, expected 0 to {FASTEST_SPEED:g}; are the units right?")
     order = np.lexsort([frame, vehicle])
-    same = np.diff(vehicle[order]) == 0
-    step = np.diff(frame[order])
-    here, before = order[1:], order[:-1]
+    neighbours = _Neighbours(
+        order[1:], order[:-1], np.where(np.diff(vehicle[order]) == 0, np.diff(frame[order]), np.nan)
+    )
+    _check_frames(rows, neighbours, vehicle, frame, gaps)
+    _check_motion(rows, neighbours, vehicle, x, speed, dt)
 
-    def first(wrong: NDArray[np.bool_]) -> tuple[int, int] | None:
-        """Row at fault and the row before it in the track."""
+
+class _Neighbours(NamedTuple):
+    """Pairs of rows that follow each other in the file's order of vehicle and time."""
+
+    here: NDArray[np.intp]
+    """Later row of each pair, shape (rows - 1,)."""
+    before: NDArray[np.intp]
+    """Earlier row of each pair, shape (rows - 1,)."""
+    step: FloatArray
+    """Frames between the two, nan where they belong to two vehicles, shape (rows - 1,)."""
+
+    def first(self, wrong: NDArray[np.bool_]) -> tuple[int, int] | None:
+        """Return the first row of the file at fault and the row before it in its track, if any is."""
         if not wrong.any():
             return None
-        place = np.flatnonzero(wrong)[np.argmin(here[wrong])]
-        return int(here[place]), int(before[place])
+        place = np.flatnonzero(wrong)[np.argmin(self.here[wrong])]
+        return int(self.here[place]), int(self.before[place])
 
-    if found := first(same & (step == 0)):
-        row, other = found
+
+def _check_frames(rows: Rows, neighbours: _Neighbours, vehicle: FloatArray, frame: FloatArray, gaps: Gaps) -> None:
+    """Check that no row is given twice and, unless holes are cut, that no frame is missing."""
+    if pair := neighbours.first(neighbours.step == 0):
+        row, other = pair
         raise rows.error(
             row, f"vehicle {vehicle[row]:g} at frame {frame[row]:g} is given twice, first in line {rows.lines[other]}."
         )
-    if gaps == "error" and (found := first(same & (step > 1))):
-        row, other = found
+    if gaps == "error" and (pair := neighbours.first(neighbours.step > 1)):
+        row, other = pair
         missing = frame[row] - frame[other] - 1
         raise rows.error(
             row,
             f"vehicle {vehicle[row]:g} was missing for {missing:g} frames before; "
             "gaps='cut' goes on with a new track here.",
         )
-    moved, said = np.abs(np.diff(x[order])), 0.5 * (speed[order][1:] + speed[order][:-1]) * dt
-    next_frame = same & (step == 1)
-    if found := first(next_frame & (moved > FASTEST_JUMP * dt)):
-        row, other = found
+
+
+def _check_motion(
+    rows: Rows, neighbours: _Neighbours, vehicle: FloatArray, x: FloatArray, speed: FloatArray, dt: float
+) -> None:
+    """Check that no vehicle jumps, and that distances agree with the recorded speeds."""
+    here, before, step = neighbours
+    moved, expected = np.abs(x[here] - x[before]), 0.5 * (speed[here] + speed[before]) * dt
+    next_frame = step == 1
+    if pair := neighbours.first(next_frame & (moved > FASTEST_JUMP * dt)):
+        row, other = pair
         distance = abs(x[row] - x[other])
         raise rows.error(row, f"vehicle {vehicle[row]:g} moved {distance:.4g} m in {dt:g} s; are the units right?")
-    total = said[next_frame].sum()
+    total = expected[next_frame].sum()
     ratio = moved[next_frame].sum() / total if total > 0.0 else 1.0
     if not SPEED_RATIOS[0] <= ratio <= SPEED_RATIOS[1]:
-        found = first(next_frame & (np.abs(moved - ratio * said) <= 0.5 * ratio * said + 1e-9))
-        row = found[0] if found else 0
+        pair = neighbours.first(next_frame & (np.abs(moved - ratio * expected) <= 0.5 * ratio * expected + 1e-9))
+        row = pair[0] if pair else 0
         raise rows.error(
             row,
             f"positions move {ratio:.3g} times as fast as the recorded speeds say, here and in the whole file; "

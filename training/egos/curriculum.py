@@ -38,7 +38,7 @@ LARGEST_ROAD_CURVATURE = 1 / 400
 """Largest of curved roads [1/m]; the I-80 has about a third."""
 
 
-class Lesson(NamedTuple):
+class Situation(NamedTuple):
     """Traffic to train in."""
 
     scenario: Callable[[np.random.Generator], Scenario]
@@ -132,8 +132,8 @@ def _draw_highway(n: int, rng: np.random.Generator) -> Array:
     return load_base(scenario_named("highway")).sample(n, rng)
 
 
-def make_lessons() -> tuple[Lesson, ...]:
-    """Return all lessons, in the order in which they are taken; the common ones twice."""
+def make_situations() -> tuple[Situation, ...]:
+    """Return all situations, in the order in which they are taken; the common ones twice."""
 
     def somewhere(scenario: Scenario) -> Callable[[np.random.Generator], Scenario]:
         return lambda rng: replace(scenario, road=draw_road(rng))
@@ -145,16 +145,16 @@ def make_lessons() -> tuple[Lesson, ...]:
         inner = 1 if road.lanes == 3 else int(rng.integers(1, road.lanes - 1))
         return make_ordinary_traffic("traffic", road, inner)
 
-    following, highway = Lesson(somewhere(FOLLOWING), _draw_following), scenario_named("highway")
-    traffic = Lesson(in_traffic, draw_starts, OrdinaryDrivers())
+    following, highway = Situation(somewhere(FOLLOWING), _draw_following), scenario_named("highway")
+    traffic = Situation(in_traffic, draw_starts, OrdinaryDrivers())
     return (
         traffic,
         following,
-        Lesson(lambda rng: highway, _draw_highway, find_drivers(highway.drivers)),
-        Lesson(somewhere(scenario_named("cut_in")), _draw_cut_in),
+        Situation(lambda rng: highway, _draw_highway, find_drivers(highway.drivers)),
+        Situation(somewhere(scenario_named("cut_in")), _draw_cut_in),
         traffic,
         following,
-        Lesson(somewhere(scenario_named("hard_brake")), _draw_hard_brake),
+        Situation(somewhere(scenario_named("hard_brake")), _draw_hard_brake),
     )
 
 
@@ -170,11 +170,11 @@ def draw_road(rng: np.random.Generator, least: int = 1) -> Road:
     return Road(edges, ReferenceLine(80.0, (0.0, *(0.5 * curvature), 0.0)))
 
 
-def start_lesson(lesson: Lesson, rows: int, seconds: float, rng: np.random.Generator) -> tuple[World, Episode]:
-    """Start a lesson with egos in or beside their lanes.
+def start_situation(situation: Situation, rows: int, seconds: float, rng: np.random.Generator) -> tuple[World, Episode]:
+    """Start a situation with egos in or beside their lanes.
 
     Args:
-        lesson: Traffic to train in.
+        situation: Traffic to train in.
         rows: Number of scenarios B.
         seconds: Length of the episodes.
         rng: Source of roads, scenarios and places.
@@ -182,9 +182,9 @@ def start_lesson(lesson: Lesson, rows: int, seconds: float, rng: np.random.Gener
     Returns:
         The world and the episodes at time 0.
     """
-    scenario = lesson.scenario(rng)
-    world = World(scenario, Sensing(OBSERVATION, weather=True), lesson.drivers, clock=Clock(horizon=seconds))
-    own = lesson.sample(rows, rng)
+    scenario = situation.scenario(rng)
+    world = World(scenario, Sensing(OBSERVATION, weather=True), situation.drivers, clock=Clock(horizon=seconds))
+    own = situation.sample(rows, rng)
     parts = [own, _draw_weather(rows, rng)]
     if world.background is not None and world.background.weights is not None:
         parts.append(world.background.weights.sample(rows, rng))

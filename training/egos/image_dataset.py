@@ -10,14 +10,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from agents.vision.ego import LAG, to_actions, update_memory
+from agents.vision.ego import LAG, VisionEgo, to_actions, update_memory
 from agents.vision.pilotnet import PilotNet, luma
 from rare_envs.control.actions import to_physical
 from rare_envs.sensors.camera import Weather, take_picture
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.world import World
 from rare_envs.traffic.state import State
-from training.egos.curriculum import make_lessons, start_lesson
+from training.egos.curriculum import make_situations, start_situation
 from training.egos.expert_driver import auxiliary_targets, expert_outputs
 
 SWING_CORRELATION, SWING_SCALE = 0.8, 0.6
@@ -35,10 +35,10 @@ class LabelledPictures(NamedTuple):
     """Luma of the picture before it, uint8, shape (n, 66, 200)."""
     speed: Tensor
     """Own speed [m/s], shape (n,)."""
-    wanted: Tensor
-    """Outputs of the expert, as `training.egos.expert_driver.expert_outputs` has it, shape (n, 2)."""
+    expert: Tensor
+    """Outputs of the expert, as `training.egos.expert_driver.expert_outputs` returns them, shape (n, 2)."""
     truth: Tensor
-    """Auxiliary targets, as `training.egos.expert_driver.auxiliary_targets` has them, shape (n, 5)."""
+    """Auxiliary targets, as `training.egos.expert_driver.auxiliary_targets` returns them, shape (n, 5)."""
 
     def rows(self, rows: Any) -> LabelledPictures:
         """Return some of the moments."""
@@ -53,12 +53,12 @@ def concatenate(parts: list[LabelledPictures]) -> LabelledPictures:
 @torch.inference_mode()
 def collect(
     network: PilotNet | None,
-    trust: float,
+    network_share: float,
     *,
     drives: int,
     rows: int,
     ticks: int,
-    kept: float,
+    recorded_share: float,
     noise: float,
     rng: np.random.Generator,
 ) -> Iterator[LabelledPictures]:
@@ -66,54 +66,54 @@ def collect(
 
     Args:
         network: Drives together with the expert; with None the expert drives alone.
-        trust: Share of the ticks at which the network decides.
-        drives: Number of lessons, taken in turn.
-        rows: Scenarios of each.
-        ticks: Of each scenario.
-        kept: Share of the ticks that are recorded.
-        noise: Of the actions, in standard deviations of 0.5 m/s^2 and 0.05 rad/s that last for half a second, so that
-            places off the expert's path are seen.
+        network_share: Share of the ticks at which the network decides.
+        drives: Number of situations, taken in turn.
+        rows: Number of scenarios in each.
+        ticks: Length of each scenario in ticks of 0.1 s.
+        recorded_share: Share of the ticks that are recorded.
+        noise: Factor of the noise of the actions, `SWING_STD`, which lasts for half a second, so that places off the
+            expert's path are seen.
         rng: Source of everything that is random.
 
     Yields:
-        The moments of each lesson.
+        The moments of each situation.
     """
-    taught = make_lessons()
+    situations = make_situations()
     for number in range(drives):
-        world, episode = start_lesson(taught[number % len(taught)], rows, ticks * 0.1, rng)
-        yield concatenate(list(_drive(world, episode, network, trust, ticks, kept, noise, rng)))
+        world, episode = start_situation(situations[number % len(situations)], rows, ticks * VisionEgo.dt, rng)
+        yield concatenate(list(_drive(world, episode, network, network_share, ticks, recorded_share, noise, rng)))
 
 
 def _drive(
     world: World,
     episode: Episode,
     network: PilotNet | None,
-    trust: float,
+    network_share: float,
     ticks: int,
-    kept: float,
+    recorded_share: float,
     noise: float,
     rng: np.random.Generator,
 ) -> Iterator[LabelledPictures]:
-    """Yield the recorded moments of one lesson; arguments as in `collect`."""
+    """Yield the recorded moments of one situation; arguments as in `collect`."""
     state, swing, before = None, np.zeros((len(episode.collided), 2)), deque([episode], LAG)
     for _ in range(ticks):
-        speed, wanted = episode.state.speed[:, 0], expert_outputs(episode)
-        noted = ~episode.collided & bool(rng.random() < kept)
+        speed, expert = episode.state.speed[:, 0], expert_outputs(episode)
+        recorded = ~episode.collided & bool(rng.random() < recorded_share)
         swing = SWING_CORRELATION * swing + SWING_SCALE * rng.standard_normal(swing.shape)
-        done = wanted + noise * torch.from_numpy(swing * SWING_STD).float()
+        output = expert + noise * torch.from_numpy(swing * SWING_STD).float()
         if network is None:  # the expert needs no pictures: only recorded ones are taken
-            if bool(noted.any()):
-                seen = _take_pictures(episode, noted), luma(_take_pictures(before[0], noted)), speed[noted]
+            if bool(recorded.any()):
+                seen = _take_pictures(episode, recorded), luma(_take_pictures(before[0], recorded)), speed[recorded]
         else:
-            picture = _take_pictures(episode, torch.ones_like(noted))
+            picture = _take_pictures(episode, torch.ones_like(recorded))
             past, state = update_memory(picture, state)
-            trusted = torch.from_numpy(rng.random(len(speed)) < trust)[:, None]
-            done = torch.where(trusted, network(picture, torch.from_numpy(past), speed), done)
-            seen = picture[noted], torch.from_numpy(past)[noted.numpy()], speed[noted]
-        if bool(noted.any()):
-            yield LabelledPictures(*seen, wanted[noted], auxiliary_targets(episode)[noted])
+            decides = torch.from_numpy(rng.random(len(speed)) < network_share)[:, None]
+            output = torch.where(decides, network(picture, torch.from_numpy(past), speed), output)
+            seen = picture[recorded], torch.from_numpy(past)[recorded.numpy()], speed[recorded]
+        if bool(recorded.any()):
+            yield LabelledPictures(*seen, expert[recorded], auxiliary_targets(episode)[recorded])
         before.append(episode)
-        episode = world.step(episode, to_physical(to_actions(done, speed), len(speed), episode.collided))
+        episode = world.step(episode, to_physical(to_actions(output, speed), len(speed), episode.collided))
 
 
 def _take_pictures(episode: Episode, rows: Tensor) -> Tensor:
@@ -135,6 +135,6 @@ def mirror(pictures: LabelledPictures, rows: Tensor) -> LabelledPictures:
         picture,
         earlier,
         pictures.speed,
-        pictures.wanted * torch.cat((one, sign), dim=1),
+        pictures.expert * torch.cat((one, sign), dim=1),
         pictures.truth * torch.cat((sign, sign, sign, one, one), dim=1),
     )

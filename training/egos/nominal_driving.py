@@ -7,7 +7,7 @@ An ego keeps its lane if its body never crosses a line of the lane that it start
 into nobody and never follows its lead closer than 0.5 s or 1 m; after a lead cuts in closer than that it has 10 s.
 It must also advance: an ego that covers less than half of the distance of its lead (or, without a lead, of that at its
 first speed) is left behind. If another vehicle runs into it from behind or from the side, the rollout counts neither
-way, and is reported as spoiled.
+way, and is reported as excluded.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ from samplers.statistics.intervals import clopper_pearson
 from training.command_line import report_errors, run_command
 from training.egos.nominal_traffic import CASES, FLOOR_GAP, FLOOR_HEADWAY, SECONDS, Case
 
-VERDICT_NAMES = ("kept", "left its lane", "collided", "too close", "left behind", "hit by others")
+VERDICT_NAMES = ("passed", "left its lane", "collided", "too close", "left behind", "hit by others")
 """Verdicts by number; a rollout gets the one that comes first in time, "left behind" at its end."""
-KEPT, LEFT_LANE, COLLIDED, TOO_CLOSE, LEFT_BEHIND, HIT_BY_OTHER = range(len(VERDICT_NAMES))
+PASSED, LEFT_LANE, COLLIDED, TOO_CLOSE, LEFT_BEHIND, HIT_BY_OTHER = range(len(VERDICT_NAMES))
 GRACE = 10.0
 """Time [s] in which an ego must open the gap to a lead that has cut in too close."""
 LEAST_WAY = 0.5
@@ -58,7 +58,7 @@ class Verdicts(NamedTuple):
     Example:
         >>> verdicts = judge("idm", "straight", rollouts=3, seed=0, seconds=2.0)
         >>> [VERDICT_NAMES[number] for number in verdicts.reason]
-        ['kept', 'kept', 'kept']
+        ['passed', 'passed', 'passed']
     """
 
     reason: NDArray[np.int64]
@@ -81,17 +81,17 @@ class Summary:
 
     Example:
         >>> summary = summarise_verdicts(judge("idm", "straight", rollouts=3, seed=0, seconds=2.0))
-        >>> summary.kept, summary.judged, summary.share, round(summary.interval[0], 3)
+        >>> summary.passed, summary.judged, summary.share, round(summary.interval[0], 3)
         (3, 3, 1.0, 0.292)
     """
 
-    kept: int
+    passed: int
     judged: int
     """Rollouts that count."""
-    spoiled: int
+    excluded: int
     """Rollouts in which another vehicle ran into the ego."""
     interval: tuple[float, float]
-    """Of the share of kept ones, Clopper and Pearson, 95 %."""
+    """Interval of the share of passed rollouts, Clopper and Pearson, 95 %."""
     reasons: dict[str, int]
     """Number of the other verdicts, by name."""
     speed: float
@@ -103,8 +103,8 @@ class Summary:
 
     @property
     def share(self) -> float:
-        """Of kept rollouts among the judged ones."""
-        return self.kept / max(self.judged, 1)
+        """Share of passed rollouts among the judged ones."""
+        return self.passed / max(self.judged, 1)
 
 
 def judge(
@@ -119,13 +119,13 @@ def judge(
     """Return for each rollout in ordinary traffic whether an ego keeps its lane and its distance.
 
     Args:
-        ego: Whatever `rare_envs.DrivingProblem` takes, such as what `agents.load_ego` returns.
+        ego: An ego as `rare_envs.DrivingProblem` takes it, such as one from `agents.load_ego`.
         case: One of `CASES`, or a `Case`.
-        rollouts: How many.
-        seed: Of starts and of the others' noise.
-        seconds: Length of each [s].
-        observation: What an ego with `predict` observes; None for what it asks for itself.
-        measured: A world to be judged in instead of that of the case.
+        rollouts: Number of rollouts.
+        seed: Seed of the starts and of the others' noise.
+        seconds: Length of each rollout [s].
+        observation: Observation of an ego with `predict`; None for the one that it declares.
+        measured: World to drive in instead of that of the case.
 
     Raises:
         ValueError: If there is no such case, or the ego does not fit.
@@ -173,7 +173,7 @@ def draw_inputs(case: Case, world: World, n: int, own: int, rng: np.random.Gener
 @torch.inference_mode()
 def _judge_tile(world: World, driver: Driver, x: Tensor) -> tuple[NDArray[Any], ...]:
     """Return the columns of `Verdicts` without x, of one tile."""
-    reason = torch.full((len(x),), KEPT)
+    reason = torch.full((len(x),), PASSED)
     time = torch.full((len(x),), world.clock.seconds)
     least, room = torch.full_like(time, torch.inf), torch.full_like(time, torch.inf)
     lead, since, had = torch.zeros_like(reason), torch.zeros_like(time), torch.zeros(len(x), dtype=torch.bool)
@@ -181,7 +181,7 @@ def _judge_tile(world: World, driver: Driver, x: Tensor) -> tuple[NDArray[Any], 
     for tick, episode in enumerate(drive(world, driver, x)):
         first = first or episode
         state, now = episode.state, tick * world.clock.dt
-        running = reason == KEPT
+        running = reason == PASSED
         follows = lead_index(state, world.scenario.road)
         gap, speed = episode.lead.gap, state.speed[:, 0]
         headway = torch.where(gap < torch.inf, gap / speed.clamp(min=0.1), torch.inf)
@@ -189,18 +189,18 @@ def _judge_tile(world: World, driver: Driver, x: Tensor) -> tuple[NDArray[Any], 
         same = follows == lead
         since, had = torch.where(same, since + world.clock.dt, 0.0), (had & same) | far
         margin = lane_margin(state, first)
-        found = torch.full_like(reason, KEPT)
+        found = torch.full_like(reason, PASSED)
         found[~far & (had | (since >= GRACE))] = TOO_CLOSE
         found[margin < 0.0] = LEFT_LANE
         found = torch.where(episode.collided, _blame(episode), found)
         lead = follows
         least = torch.where(running, torch.minimum(least, headway), least)
         room = torch.where(running, torch.minimum(room, margin), room)
-        time = torch.where(running & (found != KEPT), now, time)
+        time = torch.where(running & (found != PASSED), now, time)
         reason = torch.where(running, found, reason)
     assert first is not None
     way, due = _distances(first.state, episode.state, lead_index(first.state, world.scenario.road), world.clock.seconds)
-    reason = torch.where((reason == KEPT) & (way < LEAST_WAY * due), LEFT_BEHIND, reason)
+    reason = torch.where((reason == PASSED) & (way < LEAST_WAY * due), LEFT_BEHIND, reason)
     return tuple(column.numpy() for column in (reason, time.double(), least, room, way / world.clock.seconds))
 
 
@@ -218,7 +218,7 @@ def _blame(episode: Episode) -> Tensor:
     assert episode.statistics is not None
     crash = episode.statistics.own
     own = (crash.vehicles[:, 0] == 0) | (crash.kind == ROAD_EDGE)
-    return torch.where(crash.kind == NONE, KEPT, torch.where(own, COLLIDED, HIT_BY_OTHER))
+    return torch.where(crash.kind == NONE, PASSED, torch.where(own, COLLIDED, HIT_BY_OTHER))
 
 
 def _distances(first: State, last: State, lead: Tensor, seconds: float) -> tuple[Tensor, Tensor]:
@@ -228,34 +228,36 @@ def _distances(first: State, last: State, lead: Tensor, seconds: float) -> tuple
     return ways[:, 0], torch.where(lead > 0, of_lead, first.speed[:, 0] * seconds)
 
 
-def summarise_verdicts(found: Verdicts) -> Summary:
-    """Return counts of verdicts, and the interval of the share of kept rollouts.
+def summarise_verdicts(verdicts: Verdicts) -> Summary:
+    """Return counts of verdicts, and the interval of the share of passed rollouts.
 
     Example:
         >>> columns = [np.array([1.0, 2.0])] * 4
-        >>> verdicts = Verdicts(np.array([KEPT, TOO_CLOSE]), *columns, x=np.zeros((2, 3)))
+        >>> verdicts = Verdicts(np.array([PASSED, TOO_CLOSE]), *columns, x=np.zeros((2, 3)))
         >>> summarise_verdicts(verdicts).reasons
         {'too close': 1}
     """
-    counts = Counter(VERDICT_NAMES[k] for k in found.reason.tolist())
-    kept, spoiled = counts.pop(VERDICT_NAMES[KEPT], 0), counts.pop(VERDICT_NAMES[HIT_BY_OTHER], 0)
-    judged = len(found.reason) - spoiled
+    counts = Counter(VERDICT_NAMES[k] for k in verdicts.reason.tolist())
+    passed, excluded = counts.pop(VERDICT_NAMES[PASSED], 0), counts.pop(VERDICT_NAMES[HIT_BY_OTHER], 0)
+    judged = len(verdicts.reason) - excluded
     return Summary(
-        kept,
+        passed,
         judged,
-        spoiled,
-        clopper_pearson(kept, judged, 0.95) if judged else (0.0, 1.0),
+        excluded,
+        clopper_pearson(passed, judged, 0.95) if judged else (0.0, 1.0),
         dict(counts),
-        float(found.speed.mean()),
-        float(np.median(found.headway)),
-        float(np.median(found.margin)),
+        float(verdicts.speed.mean()),
+        float(np.median(verdicts.headway)),
+        float(np.median(verdicts.margin)),
     )
 
 
 def judge_all_cases(ego: Any, rollouts: int, seed: int) -> dict[str, dict[str, float]]:
-    """Return rollouts kept, judged, and the interval's lower end for each case, for the header of an ego's file."""
+    """Return rollouts passed, judged, and the interval's lower end for each case, for the header of an ego's file."""
     found = {case: summarise_verdicts(judge(ego, case, rollouts, seed)) for case in CASES}
-    return {case: {"kept": one.kept, "judged": one.judged, "at least": one.interval[0]} for case, one in found.items()}
+    return {
+        case: {"passed": one.passed, "judged": one.judged, "at least": one.interval[0]} for case, one in found.items()
+    }
 
 
 def main(
@@ -264,7 +266,7 @@ def main(
     rollouts: Annotated[int, typer.Option(min=1)] = 400,
     seed: Annotated[int, typer.Option()] = 0,
     seconds: Annotated[float, typer.Option(help="Length of a rollout.")] = SECONDS,
-    observation: Annotated[str | None, typer.Option(help="What an ego with predict observes.")] = None,
+    observation: Annotated[str | None, typer.Option(help="Observation of an ego with predict.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object.")] = False,
 ) -> None:
     """Judge an ego in ordinary traffic."""
@@ -274,13 +276,13 @@ def main(
     if as_json:
         print(json.dumps({name: {"share": one.share, **vars(one)} for name, one in found.items()}, allow_nan=True))
         return
-    print("| case | kept | share (95 %) | why not | spoiled by others | mean speed | least headway | least margin |")
+    print("| case | passed | share (95 %) | why not | excluded | mean speed | least headway | least margin |")
     print("|---|---|---|---|---|---|---|---|")
     for name, one in found.items():
         why = ", ".join(f"{count} {reason}" for reason, count in one.reasons.items()) or "-"
         share = f"{one.share:.4f} ({one.interval[0]:.4f} to {one.interval[1]:.4f})"
         spread = f"{one.speed:.1f} m/s | {one.headway:.2f} s | {one.margin:.2f} m"
-        print(f"| {name} | {one.kept} of {one.judged} | {share} | {why} | {one.spoiled} | {spread} |")
+        print(f"| {name} | {one.passed} of {one.judged} | {share} | {why} | {one.excluded} | {spread} |")
 
 
 if __name__ == "__main__":

@@ -50,28 +50,28 @@ class VisionConfig:
     Example:
         >>> VisionConfig(rounds=2).all_visits
         80000
-        >>> VisionConfig(kept=1.5)
+        >>> VisionConfig(recorded_share=1.5)
         Traceback (most recent call last):
         ...
-        ValueError: Expected kept of at most 1, got 1.5.
+        ValueError: Expected recorded_share of at most 1, got 1.5.
     """
 
     seed: int = 0
     rounds: int = 5
     """Of DAgger, after the first imitation."""
     first_drives: int = 56
-    """Lessons in which the expert drives."""
+    """Situations in which the expert drives."""
     drives: int = 7
-    """Lessons of each later round."""
+    """Situations of each later round."""
     rows: int = 24
-    """Scenarios of a lesson."""
+    """Scenarios of a situation."""
     first_ticks: int = 100
     """Length of a scenario in which the expert drives."""
     ticks: int = 120
     """Length of the others."""
-    first_kept: float = 0.1
+    first_recorded_share: float = 0.1
     """Share of the moments that are recorded."""
-    kept: float = 0.2
+    recorded_share: float = 0.2
     """Likewise in later rounds."""
     noise: float = 1.0
     """See `training.egos.image_dataset.collect`."""
@@ -93,7 +93,7 @@ class VisionConfig:
             low = 0 if each.name in ("seed", "rounds", "noise", "mixing", "truth_weight") else None
             if not (value >= low if low is not None else value > 0) or not math.isfinite(value):
                 raise ValueError(f"Expected {each.name} {'of at least 0' if low == 0 else 'above 0'}, got {value!r}.")
-        for name in ("first_kept", "kept", "mixing"):
+        for name in ("first_recorded_share", "recorded_share", "mixing"):
             if getattr(self, name) > 1:
                 raise ValueError(f"Expected {name} of at most 1, got {getattr(self, name)!r}.")
 
@@ -167,7 +167,7 @@ class Training:
             drives=config.first_drives if first else config.drives,
             rows=config.rows,
             ticks=config.first_ticks if first else config.ticks,
-            kept=config.first_kept if first else config.kept,
+            recorded_share=config.first_recorded_share if first else config.recorded_share,
             noise=config.noise if first else 0.0,
             rng=rng,
         )
@@ -190,7 +190,7 @@ class Training:
 
     def _step(self, some: LabelledPictures) -> list[float]:
         hidden = self.network.hidden(some.picture, some.earlier, some.speed)
-        error = nn.functional.smooth_l1_loss(self.network.out(hidden), some.wanted, reduction="none", beta=0.5)
+        error = nn.functional.smooth_l1_loss(self.network.out(hidden), some.expert, reduction="none", beta=0.5)
         truth = nn.functional.smooth_l1_loss(self.probe(hidden), some.truth)
         loss = error.mean() + self.config.truth_weight * truth
         self.optimiser.zero_grad()
@@ -220,7 +220,7 @@ def train_vision_ego(config: VisionConfig, out: Path, progress: bool = False) ->
     Example:
         >>> import tempfile
         >>> config = VisionConfig(
-        ...     rounds=0, first_drives=1, rows=1, first_ticks=2, first_kept=1.0, first_visits=2, batch=2
+        ...     rounds=0, first_drives=1, rows=1, first_ticks=2, first_recorded_share=1.0, first_visits=2, batch=2
         ... )
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     type(train_vision_ego(config, Path(folder))).__name__

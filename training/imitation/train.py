@@ -1,4 +1,4 @@
-"""Train a driver from recorded traffic.
+"""Command line of imitation training.
 
     python -m training.imitation.train --data FOLDER --method mgail --seed 0 --out runs/mgail
     python -m training.imitation.train --highd FOLDER --recording 01 --out runs/highd

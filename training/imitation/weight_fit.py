@@ -82,18 +82,14 @@ def fit_weights(
         (20, (3,))
     """
     members = np.asarray(members, dtype=np.float64)
-    if members.ndim != 2 or members.shape[1] != len(names):
-        raise ValueError(f"Expected members of shape (K, {len(names)}), got {members.shape}.")
-    if folds < 2 or len(members) < 2 * folds:
-        raise ValueError(f"Expected at least 2 folds of 2 members each, got {len(members)} members in {folds} folds.")
-    if not 0.0 < shrinkage < 1.0 or list(penalties) != sorted(penalties, reverse=True) or not penalties:
-        raise ValueError(f"Expected shrinkage in (0, 1) and descending penalties, got {shrinkage} and {penalties}.")
+    _check_arguments(members, penalties, shrinkage, folds, names)
     everyone = _moments(members, shrinkage, names)
     held_out = np.array_split(np.arange(len(members)), folds)
     without = [_moments(np.delete(members, fold, axis=0), shrinkage, names) for fold in held_out]
 
     tried: list[dict[str, float]] = []
-    chosen, stopped = None, "no penalty left"
+    precisions: list[FloatArray] = []
+    stopped = "no penalty left"
     for penalty in penalties:
         try:
             precision = _lasso(everyone.correlation, penalty)
@@ -102,28 +98,35 @@ def fit_weights(
             stopped = f"penalty {penalty} failed: {' '.join(str(failure).split())[:120]}"
             break
         scores = np.concatenate([part.log_prob(members[fold]) for part, fold in zip(fitted, held_out, strict=True)])
-        row = {
-            "penalty": float(penalty),
-            "held_out_log_likelihood": float(scores.mean()),
-            **_describe_precision(precision),
-        }
-        if chosen is None or row["held_out_log_likelihood"] > max(r["held_out_log_likelihood"] for r in tried):
-            chosen = row, precision
-        tried.append(row)
-    if chosen is None:
+        likelihood = {"penalty": float(penalty), "held_out_log_likelihood": float(scores.mean())}
+        tried.append({**likelihood, **_describe_precision(precision)})
+        precisions.append(precision)
+    if not tried:
         raise ValueError(f"No distribution could be fitted: {stopped}. Start at a larger penalty or shrink more.")
-    row, precision = chosen
+    best = int(np.argmax([row["held_out_log_likelihood"] for row in tried]))
     metadata = {
         "members": len(members),
         "folds": folds,
         "shrinkage": shrinkage,
-        **{name: row[name] for name in ("penalty", "held_out_log_likelihood", "nonzeros", "condition")},
+        **{name: tried[best][name] for name in ("penalty", "held_out_log_likelihood", "nonzeros", "condition")},
         "spread_median": float(np.median(everyone.spread)),
         "spread_max": float(everyone.spread.max()),
         "stopped": stopped,
         "tried": tried,
     }
-    return WeightFit(_to_distribution(everyone, precision, radius), metadata)
+    return WeightFit(_to_distribution(everyone, precisions[best], radius), metadata)
+
+
+def _check_arguments(
+    members: FloatArray, penalties: Sequence[float], shrinkage: float, folds: int, names: Sequence[str]
+) -> None:
+    """Raise ValueError for arguments of `fit_weights` that do not fit together."""
+    if members.ndim != 2 or members.shape[1] != len(names):
+        raise ValueError(f"Expected members of shape (K, {len(names)}), got {members.shape}.")
+    if folds < 2 or len(members) < 2 * folds:
+        raise ValueError(f"Expected at least 2 folds of 2 members each, got {len(members)} members in {folds} folds.")
+    if not 0.0 < shrinkage < 1.0 or list(penalties) != sorted(penalties, reverse=True) or not penalties:
+        raise ValueError(f"Expected shrinkage in (0, 1) and descending penalties, got {shrinkage} and {penalties}.")
 
 
 class _Moments(NamedTuple):

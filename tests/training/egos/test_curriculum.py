@@ -1,4 +1,4 @@
-"""Lessons have roads with a lane for the ego."""
+"""Situations have roads with a lane for the ego."""
 
 import numpy as np
 import pytest

@@ -5,13 +5,13 @@ import torch
 
 from agents.vision.ego import to_actions
 from rare_envs.control.actions import to_physical
-from training.egos.curriculum import make_lessons, start_lesson
+from training.egos.curriculum import make_situations, start_situation
 from training.egos.expert_driver import auxiliary_targets, expert_outputs
 
 
-def test_the_expert_keeps_lane_and_distance_from_wherever_lessons_begin() -> None:
-    for number, lesson in enumerate(make_lessons()[:3]):
-        world, episode = start_lesson(lesson, 16, 15.0, np.random.default_rng(number))
+def test_the_expert_keeps_lane_and_distance_from_wherever_situations_begin() -> None:
+    for number, situation in enumerate(make_situations()[:3]):
+        world, episode = start_situation(situation, 16, 15.0, np.random.default_rng(number))
         with torch.inference_mode():
             for _ in range(world.clock.ticks):
                 speed = episode.state.speed[:, 0]
@@ -19,17 +19,17 @@ def test_the_expert_keeps_lane_and_distance_from_wherever_lessons_begin() -> Non
                 episode = world.step(episode, action)
             y = episode.state.y[:, 0]
             offset = (y - world.scenario.road.centre_of(y)).abs()
-        assert int(episode.collided.sum()) <= 1  # some lessons begin too fast and too close
+        assert int(episode.collided.sum()) <= 1  # some situations begin too fast and too close
         assert float(offset[~episode.collided].max()) < 0.1
 
 
 def test_on_a_curve_the_expert_does_not_run_wide() -> None:
     """Held to the curve of its lane, its yaw rate is speed times curvature: no offset remains."""
     rng = np.random.default_rng(0)
-    lesson = make_lessons()[1]
-    world, episode = start_lesson(lesson, 4, 8.0, rng)
+    situation = make_situations()[1]
+    world, episode = start_situation(situation, 4, 8.0, rng)
     while world.scenario.road.reference_line is None:
-        world, episode = start_lesson(lesson, 4, 8.0, rng)
+        world, episode = start_situation(situation, 4, 8.0, rng)
     with torch.inference_mode():
         for _ in range(world.clock.ticks):
             speed = episode.state.speed[:, 0]

@@ -9,11 +9,11 @@ from training.egos.image_dataset import collect, concatenate, mirror
 
 def test_pictures_are_noted_with_what_the_expert_would_do() -> None:
     rng = np.random.default_rng(2)
-    parts = list(collect(None, 0.0, drives=2, rows=3, ticks=3, kept=1.0, noise=1.0, rng=rng))
+    parts = list(collect(None, 0.0, drives=2, rows=3, ticks=3, recorded_share=1.0, noise=1.0, rng=rng))
     noted = concatenate(parts)
     assert noted.picture.shape == (18, 66, 200, 3)
     assert torch.equal(noted.earlier[:3], _luma(noted.picture[:3]))  # at time 0 there is no earlier one
-    assert noted.wanted.shape == (18, 2) and noted.truth.shape == (18, 5)
+    assert noted.expert.shape == (18, 2) and noted.truth.shape == (18, 5)
 
 
 def test_pictures_for_the_expert_and_for_a_network_are_the_same() -> None:
@@ -25,15 +25,15 @@ def test_pictures_for_the_expert_and_for_a_network_are_the_same() -> None:
     mixed = concatenate(list(collect(network, 0.0, rng=np.random.default_rng(3), **settings)))
     assert torch.equal(alone.picture[:4], mixed.picture[:4])
     assert torch.equal(alone.earlier, mixed.earlier)
-    torch.testing.assert_close(alone.wanted, mixed.wanted)
+    torch.testing.assert_close(alone.expert, mixed.expert)
 
 
 def test_mirrored_pictures_ask_for_mirrored_turns() -> None:
     rng = np.random.default_rng(4)
-    some = concatenate(list(collect(None, 0.0, drives=1, rows=4, ticks=1, kept=1.0, noise=0.0, rng=rng)))
+    some = concatenate(list(collect(None, 0.0, drives=1, rows=4, ticks=1, recorded_share=1.0, noise=0.0, rng=rng)))
     turned = mirror(some, torch.tensor([True, False, True, False]))
     assert torch.equal(turned.picture[0], some.picture[0].flip(1)) and torch.equal(turned.picture[1], some.picture[1])
-    assert torch.equal(turned.wanted[0], some.wanted[0] * torch.tensor([1.0, -1.0]))
+    assert torch.equal(turned.expert[0], some.expert[0] * torch.tensor([1.0, -1.0]))
     assert torch.equal(turned.truth[2], some.truth[2] * torch.tensor([-1.0, -1.0, -1.0, 1.0, 1.0]))
     assert all(torch.equal(a[1::2], b[1::2]) for a, b in zip(turned, some, strict=True))
 

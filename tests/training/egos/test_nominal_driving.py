@@ -42,7 +42,7 @@ def reasons(found: Any) -> set[str]:
 @pytest.mark.parametrize("case", ["straight", "i80", "bends"])
 def test_a_driver_by_rule_is_nominal(case: str) -> None:
     found = summarise_verdicts(judge("idm", case, rollouts=24, seed=3, seconds=30.0))
-    assert found.kept == found.judged == 24
+    assert found.passed == found.judged == 24
     assert found.headway > FLOOR_HEADWAY
     assert found.margin > 0.4
 

@@ -1,4 +1,4 @@
-"""How the ego that sees is taught: the expert drives, the lessons are as described, a stopped training goes on."""
+"""Training of the ego `vision`: the expert drives, a checkpoint resumes, the result is judged."""
 
 from pathlib import Path
 
@@ -16,8 +16,8 @@ TINY = VisionConfig(
     rows=3,
     first_ticks=4,
     ticks=4,
-    first_kept=1.0,
-    kept=1.0,
+    first_recorded_share=1.0,
+    recorded_share=1.0,
     first_visits=16,
     visits=16,
     batch=8,
@@ -54,7 +54,7 @@ def test_settings_out_of_range_are_refused() -> None:
 @pytest.mark.parametrize("case", ["straight", "bends"])
 def test_the_shipped_ego_keeps_lane_and_distance(case: str) -> None:
     found = summarise_verdicts(judge(load_ego("vision"), case, rollouts=6, seed=11, seconds=6.0))
-    assert found.kept == found.judged == 6
+    assert found.passed == found.judged == 6
     assert found.margin > 0.4
 
 
@@ -62,4 +62,4 @@ def test_the_shipped_ego_keeps_lane_and_distance(case: str) -> None:
 @pytest.mark.parametrize("case", ["straight", "i80", "bends"])
 def test_the_shipped_ego_keeps_lane_and_distance_for_a_minute(case: str) -> None:
     found = summarise_verdicts(judge(load_ego("vision"), case, rollouts=64, seed=12))
-    assert found.kept >= found.judged - 2
+    assert found.passed >= found.judged - 2

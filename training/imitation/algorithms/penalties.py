@@ -122,7 +122,7 @@ def compute_penalties(
 
 
 def _headway_cost(x: Tensor, speed: Tensor, along: Tensor, across: Tensor, m: int) -> Tensor:
-    """Return the cost of being close behind whoever reaches into the own path, or fast towards it, shape (B, M).
+    """Return the cost of a short headway to the vehicle ahead, or of closing on it, shape (B, M).
 
     Args:
         x: Position along the road [m], shape (B, V).

@@ -15,7 +15,14 @@ _PARKING_GAP = 300.0
 
 
 class Recording(NamedTuple):
-    """S scenes of at most T ticks, V vehicles and L lanes, single precision; units and frame as in `TrafficScene`."""
+    """S scenes of at most T ticks, V vehicles and L lanes, single precision; units and frame as in `TrafficScene`.
+
+    Example:
+        >>> from training.data import scenes_of, synthetic_traffic
+        >>> recording = stack_scenes(scenes_of(synthetic_traffic(seconds=5.0), seconds=5.0))
+        >>> tuple(recording.x.shape), tuple(recording.edges.shape), recording.ticks.tolist()
+        ((1, 49, 9), (1, 4), [49])
+    """
 
     x: Tensor
     """Shape (S, T, V), as the next five; 0 where absent."""
@@ -42,6 +49,12 @@ def stack_scenes(scenes: Sequence[TrafficScene]) -> Recording:
 
     Raises:
         ValueError: There is no scene.
+
+    Example:
+        >>> from training.data import scenes_of, synthetic_traffic
+        >>> scene = scenes_of(synthetic_traffic(seconds=5.0), seconds=5.0)[0]
+        >>> tuple(stack_scenes([scene, scene]).x.shape)
+        (2, 49, 9)
     """
     if not scenes:
         raise ValueError("Expected at least one scene.")
