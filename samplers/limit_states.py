@@ -3,6 +3,7 @@
 The probabilities are closed forms or one-dimensional integrals to about 1e-12.
 """
 
+import itertools
 import math
 from collections.abc import Callable
 from typing import NamedTuple
@@ -52,7 +53,7 @@ def parabola(beta: float = 3.3, curvature: float = 0.2) -> Reference:
     def f(u: FloatArray) -> FloatArray:
         return np.asarray(beta + curvature * u[:, 0] ** 2 - u[:, 1])
 
-    return _reference("parabola", f, 2, _normal_mean(lambda s: normal_cdf(-beta - curvature * s * s)))
+    return _reference("parabola", f, 2, normal_mean(lambda s: normal_cdf(-beta - curvature * s * s)))
 
 
 def four_branches(k: float = 3.5) -> Reference:
@@ -63,7 +64,7 @@ def four_branches(k: float = 3.5) -> Reference:
         parabolas = k + 0.2 * s * s - np.abs(t)
         return np.asarray(np.minimum(parabolas, math.sqrt(2) * (k - np.abs(s))))
 
-    between = _normal_mean(lambda s: 2 * normal_cdf(-k - 0.2 * s * s), -k, k)
+    between = normal_mean(lambda s: 2 * normal_cdf(-k - 0.2 * s * s), low=-k, high=k)
     return _reference("four_branches", f, 2, 2 * normal_cdf(-k) + between)
 
 
@@ -119,10 +120,13 @@ def normal_cdf(x: float) -> float:
     return float(ndtr(x))
 
 
-def _normal_mean(g: Callable[[float], float], low: float = -12.0, high: float = 12.0) -> float:
-    """Return the integral of g(s) phi(s) over [low, high]."""
+def normal_mean(g: Callable[[float], float], *breaks: float, low: float = -12.0, high: float = 12.0) -> float:
+    """Return the integral of g(s) phi(s) over [low, high], in pieces between the breaks."""
+    return integrate(lambda s: g(s) * math.exp(-0.5 * s * s) / math.sqrt(2 * math.pi), low, high, *breaks)
 
-    def integrand(s: float) -> float:
-        return g(s) * math.exp(-0.5 * s * s) / math.sqrt(2 * math.pi)
 
-    return float(quad(integrand, low, high, limit=500, epsabs=1e-18, epsrel=1e-12)[0])
+def integrate(g: Callable[[float], float], low: float, high: float, *breaks: float) -> float:
+    """Return the integral of g over [low, high] to about 1e-12, in pieces between the breaks, where g has kinks."""
+    edges = [low, *(b for b in breaks if low < b < high), high]
+    pieces = itertools.pairwise(edges)
+    return float(sum(quad(g, a, b, limit=500, epsabs=1e-18, epsrel=1e-12)[0] for a, b in pieces))

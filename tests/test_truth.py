@@ -7,10 +7,10 @@ from scipy import stats
 
 import rare_envs
 import samplers
-from benchmarks.estimators.against_truth import compare, side_by_side
-from benchmarks.estimators.truth import RESULT
+from benchmarks.estimators.against_truth import compare_with_truth, side_by_side
+from benchmarks.estimators.truth import TRUTH_RESULT
 
-TRUTH = json.loads(RESULT.read_text())["results"]
+TRUTH = json.loads(TRUTH_RESULT.read_text())["results"]
 
 
 def test_the_reference_is_long_and_complete() -> None:
@@ -47,7 +47,7 @@ def test_runs_side_by_side_are_the_runs_alone() -> None:
 
 @pytest.mark.parametrize("method", ["two-stage", "ce"])
 def test_a_few_seeds(method: str) -> None:
-    cell = compare(TRUTH[0], method, range(6))
+    cell = compare_with_truth(TRUTH[0], method, range(6))
     # a t distribution with 5 degrees of freedom is beyond 6.9 once in a thousand times
     assert abs(cell.z) < 6.9
     assert 0.5 < cell.mean / cell.truth < 2.0
@@ -58,7 +58,7 @@ def test_a_few_seeds(method: str) -> None:
 @pytest.mark.parametrize("method", list(samplers.METHODS))
 @pytest.mark.parametrize("row", TRUTH, ids=lambda row: f"{row['env_id']}-{row['base']}")
 def test_forty_seeds(row: dict[str, float], method: str) -> None:
-    cell = compare(row, method, range(1000, 1040))
+    cell = compare_with_truth(row, method, range(1000, 1040))
     assert abs(cell.z) <= 3.0
     precise = cell.own_cov < 2 * row["standard_error"] / row["p"]  # intervals as narrow as the reference is uncertain
     assert cell.coverage >= (0.6 if precise else 0.8)

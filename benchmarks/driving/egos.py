@@ -23,11 +23,11 @@ from rare_envs.scenarios.registry import SCENARIOS
 from rare_envs.study import Question, Report, drive_again, prepare, run, write_film
 from training import train_ego
 
-RESULT = RESULTS / "egos.json"
+EGOS_RESULT = RESULTS / "egos.json"
 STEPS = 400_000
 """Of the training of an ego, as in the demo."""
-EGOS = ("idm", "imitation", "vision", "noisy:idm", "ppo", "dqn")
-METHODS = ("two-stage", "adss")
+PAGE_EGOS = ("idm", "imitation", "vision", "noisy:idm", "ppo", "dqn")
+PAGE_METHODS = ("two-stage", "adss")
 MOST = {"vision": 1500}
 """Simulations of one run; the others get what the methods take by themselves."""
 NARROW = 400
@@ -65,7 +65,7 @@ P[f <= 0] = 4.04e-03
 
 
 @dataclass(frozen=True)
-class Cell:
+class EgoResult:
     """One ego in one scenario, by one method."""
 
     env_id: str
@@ -90,12 +90,12 @@ def train_cached(algo: str, env_id: str, folder: Path) -> Path:
     return path if path.exists() else train_ego(env_id, algo=algo, steps=STEPS, seed=0, out=path)
 
 
-def ask(env_id: str, ego: str, method: str, runs: Path, images: Path) -> Cell:
+def evaluate_ego(env_id: str, ego: str, method: str, runs: Path, images: Path) -> EgoResult:
     """Estimate, and draw the likeliest failure.
 
     Args:
         env_id: The scenario.
-        ego: One of `EGOS`.
+        ego: One of `PAGE_EGOS`.
         method: Name of the method.
         runs: Folder of the trained egos.
         images: Folder of the pictures.
@@ -106,8 +106,8 @@ def ask(env_id: str, ego: str, method: str, runs: Path, images: Path) -> Cell:
     spec = str(train_cached(ego, env_id, runs)) if ego in ("ppo", "dqn") else ego
     report = run(prepare(Question(env_id=env_id, ego=spec, method=method, max_sim=MOST.get(ego))), progress=True)
     estimate = report.estimate
-    picture, words = likeliest(report, images / f"ego_{SCENARIOS[env_id].name}_{ego.replace(':', '_')}.png")
-    return Cell(
+    picture, words = draw_likeliest(report, images / f"ego_{SCENARIOS[env_id].name}_{ego.replace(':', '_')}.png")
+    return EgoResult(
         env_id,
         ego,
         method,
@@ -121,7 +121,7 @@ def ask(env_id: str, ego: str, method: str, runs: Path, images: Path) -> Cell:
     )
 
 
-def likeliest(report: Report, path: Path) -> tuple[str, str]:
+def draw_likeliest(report: Report, path: Path) -> tuple[str, str]:
     """Draw the likeliest failure that a run has found; its file and what it is."""
     found = report.estimate.failures
     if len(found) == 0:
@@ -132,7 +132,7 @@ def likeliest(report: Report, path: Path) -> tuple[str, str]:
     return path.name, "no crash" if crash is None else f"{crash['kind']}, {crash['closing_speed']:.1f} m/s"
 
 
-def format_page(cells: Iterable[Cell]) -> str:
+def format_page(cells: Iterable[EgoResult]) -> str:
     """Return the page of all results."""
     cells = list(cells)
     horizon = max(scenario.horizon for scenario in SCENARIOS.values())
@@ -140,7 +140,7 @@ def format_page(cells: Iterable[Cell]) -> str:
     for env_id in SCENARIOS:
         own = [cell for cell in cells if cell.env_id == env_id]
         rows = [format_row(cell) for cell in own]
-        shown = [cell for cell in own if cell.method == METHODS[0] and cell.picture]
+        shown = [cell for cell in own if cell.method == PAGE_METHODS[0] and cell.picture]
         pictures = [
             f"**{cell.ego}**: {cell.words}\n\n![{cell.ego}: {cell.words}](images/{cell.picture})" for cell in shown
         ]
@@ -151,7 +151,7 @@ def format_page(cells: Iterable[Cell]) -> str:
     return "\n".join(parts)
 
 
-def format_row(cell: Cell) -> str:
+def format_row(cell: EgoResult) -> str:
     """Return a row of the table."""
     return (
         f"| `{cell.ego}` | `{cell.method}` | {cell.p:.2e} | {cell.low:.2e} to {cell.high:.2e} | {cell.n_sim:,} "
@@ -159,18 +159,18 @@ def format_row(cell: Cell) -> str:
     )
 
 
-def read_cells() -> dict[tuple[str, str, str], Cell]:
+def read_results() -> dict[tuple[str, str, str], EgoResult]:
     """Return what has been measured so far, by scenario, ego and method."""
-    cells = json.loads(RESULT.read_text())["cells"] if RESULT.exists() else []
-    found = [Cell(**{**cell, "warnings": tuple(cell["warnings"])}) for cell in cells]
+    cells = json.loads(EGOS_RESULT.read_text())["cells"] if EGOS_RESULT.exists() else []
+    found = [EgoResult(**{**cell, "warnings": tuple(cell["warnings"])}) for cell in cells]
     return {(cell.env_id, cell.ego, cell.method): cell for cell in found}
 
 
-def write(cells: dict[tuple[str, str, str], Cell]) -> None:
+def write_results(cells: dict[tuple[str, str, str], EgoResult]) -> None:
     """Write what has been measured."""
     versions = {"rare_envs": rare_envs.__version__, "torch": torch.__version__}
     about = {"command": "python -m benchmarks.driving.egos", "versions": versions}
-    RESULT.write_text(json.dumps({**about, "cells": [asdict(cell) for cell in cells.values()]}, indent=1) + "\n")
+    EGOS_RESULT.write_text(json.dumps({**about, "cells": [asdict(cell) for cell in cells.values()]}, indent=1) + "\n")
 
 
 def main(
@@ -182,15 +182,15 @@ def main(
     """Measure what is not measured yet and write the page."""
     torch.set_num_threads(1)
     chosen = only.split(",") if only else []
-    measured = {key for key, cell in read_cells().items() if cell.ego not in chosen or env not in cell.env_id}
-    for key in [(env_id, ego, method) for env_id in SCENARIOS for ego in EGOS for method in METHODS]:
+    measured = {key for key, cell in read_results().items() if cell.ego not in chosen or env not in cell.env_id}
+    for key in [(env_id, ego, method) for env_id in SCENARIOS for ego in PAGE_EGOS for method in PAGE_METHODS]:
         if key in measured or env not in key[0] or (chosen and key[1] not in chosen):
             continue
-        cell = ask(*key, runs=runs, images=docs / "images")
+        cell = evaluate_ego(*key, runs=runs, images=docs / "images")
         print(format_row(cell), flush=True)
-        write({**read_cells(), key: cell})  # read anew: another process may measure other egos
-    order = {ego: place for place, ego in enumerate(EGOS)}
-    in_order = sorted(read_cells().values(), key=lambda cell: (order[cell.ego], METHODS.index(cell.method)))
+        write_results({**read_results(), key: cell})  # read anew: another process may measure other egos
+    order = {ego: place for place, ego in enumerate(PAGE_EGOS)}
+    in_order = sorted(read_results().values(), key=lambda cell: (order[cell.ego], PAGE_METHODS.index(cell.method)))
     (docs / "shipped_egos.md").write_text(format_page(in_order), encoding="utf-8")
 
 

@@ -28,7 +28,7 @@ from training.imitation.traffic.scene_pool import draw_pool
 
 HORIZONS = (5, 15, 30)
 """Ticks."""
-COLUMNS = ("learned", "other noise", "no state", "length, learned / simulator")
+GRADIENT_COLUMNS = ("learned", "other noise", "no state", "length, learned / simulator")
 
 
 def train_forward_model(data: Path, run: Path, rounds: int) -> Learner:
@@ -60,8 +60,8 @@ def gradient(learner: Learner, horizon: int, start: int, noise: int, learned: bo
     return torch.cat([part.flatten() for part in torch.autograd.grad(cost, list(learner.policy.parameters()))])
 
 
-def compare(learner: Learner, horizon: int, starts: int) -> list[float]:
-    """Return means of `COLUMNS` over some starts."""
+def compare_gradients(learner: Learner, horizon: int, starts: int) -> list[float]:
+    """Return means of `GRADIENT_COLUMNS` over some starts."""
     rows = []
     for start in range(starts):
         credit = learner.config.credit
@@ -86,10 +86,11 @@ def main(
     """Compare the two gradients."""
     torch.set_num_threads(1)
     learner = train_forward_model(data, run, rounds)
-    print(f"| ticks | {' | '.join(COLUMNS)} |\n|{'---|' * (len(COLUMNS) + 1)}")
+    print(f"| ticks | {' | '.join(GRADIENT_COLUMNS)} |\n|{'---|' * (len(GRADIENT_COLUMNS) + 1)}")
     for horizon in HORIZONS:
         print(
-            f"| {horizon} | {' | '.join(f'{value:.2f}' for value in compare(learner, horizon, starts))} |", flush=True
+            f"| {horizon} | {' | '.join(f'{value:.2f}' for value in compare_gradients(learner, horizon, starts))} |",
+            flush=True,
         )
 
 

@@ -22,7 +22,7 @@ from training.scenario_fitting.event_filters import EVENT_RECIPES, filter_events
 from training.scenario_fitting.fit import fit_us101_base
 
 GAPS = {"car_following": ("gap",), "cut_in": ("gap_ego_cutin", "gap_cutin_lead")}
-ENV_IDS = {"car_following": "rare_envs/CarFollowing-v0", "cut_in": "rare_envs/CutIn-v0"}
+GAP_ENV_IDS = {"car_following": "rare_envs/CarFollowing-v0", "cut_in": "rare_envs/CutIn-v0"}
 
 
 def main(data: Path, rollouts: int = 1_000_000, seed: int = 0) -> None:
@@ -45,7 +45,7 @@ def main(data: Path, rollouts: int = 1_000_000, seed: int = 0) -> None:
             with tempfile.NamedTemporaryFile("w", suffix=".json") as file:
                 file.write(text)
                 file.flush()
-                problem = rare_envs.DrivingProblem(ENV_IDS[scenario], base=file.name)
+                problem = rare_envs.DrivingProblem(GAP_ENV_IDS[scenario], base=file.name)
             assert isinstance(problem.base, LogMixture) == bool(logarithmic)
             f = problem.evaluate(problem.base.sample(rollouts, np.random.default_rng(seed)))
             p = float((f <= 0.0).mean())

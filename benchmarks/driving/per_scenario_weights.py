@@ -21,7 +21,7 @@ from benchmarks.simulation.throughput import seconds
 FLOOR = 20.0
 
 
-def compare(batch: int, vehicles: int, rounds: int = 20) -> dict[str, float]:
+def compare_passes(batch: int, vehicles: int, rounds: int = 20) -> dict[str, float]:
     """Return times [ms] of one tick both ways, their ratio, and the largest difference of an action."""
     generator = torch.Generator().manual_seed(0)
     scaling = Scaling(
@@ -54,7 +54,7 @@ def main(
 ) -> None:
     """Print the comparison; exits with 1 if the batched pass is less than 20 times as fast, or another policy."""
     torch.set_num_threads(1)
-    result = compare(batch, vehicles)
+    result = compare_passes(batch, vehicles)
     print(f"{batch} scenarios of {vehicles} drivers: " + ", ".join(f"{name} {v:.3g}" for name, v in result.items()))
     raise typer.Exit(int(result["ratio"] < FLOOR or result["largest_difference"] > 1e-5))
 

@@ -36,7 +36,7 @@ def format_tables(found: Found) -> str:
     main = [row for row in found["realism"] if row["kind"] != "box"]
     boxed = [row for row in found["realism"] if row["kind"] == "box"]
     parts = ["## All vehicles driven", *(f"{s}:\n\n{_realism(main, s)}" for s in _times(main))]
-    parts += ["## One vehicle driven, the others replayed", _replayed(found["replayed"])]
+    parts += ["## One vehicle driven, the others replayed", _error_table(found["replayed"])]
     parts += ["## Six cars at 10 to 20 m/s", _highway(found["highway"])]
     if boxed:
         parts += [f"## Weights moved within a box, {_times(boxed)[0]}", _boxes(boxed)]
@@ -70,7 +70,7 @@ def _realism(rows: Sequence[Found], seconds: str) -> str:
     return _table(head, lines)
 
 
-def _replayed(errors: dict[str, Found]) -> str:
+def _error_table(errors: dict[str, Found]) -> str:
     times = list(dict.fromkeys(time for one in errors.values() for time in one))
     head = ["driver", *(f"{time} s" for time in times)]
     return _table(
@@ -125,14 +125,14 @@ def _boxes(rows: Sequence[Found]) -> str:
 def write_figures(found: Found, out: Path) -> None:
     """Write `rates.svg`, `distributions.svg`, `errors.svg` and, if weights have a distribution, `boxes.svg`."""
     with matplotlib.rc_context(STYLE):
-        figures = {"rates": _rates(found), "distributions": _distributions(found), "errors": _errors(found)}
+        figures = {"rates": _draw_rates(found), "distributions": _distributions(found), "errors": _errors(found)}
         if any(row["kind"] == "box" for row in found["realism"]):
             figures["boxes"] = _box_figure(found)
         for name, figure in figures.items():
             figure.savefig(out / f"{name}.svg", metadata={"Date": None})
 
 
-def _rates(found: Found) -> Figure:
+def _draw_rates(found: Found) -> Figure:
     """Draw rates of all rows but constant velocity, beside which the others could not be told apart."""
     rows = [row for row in found["realism"] if row["kind"] != "box" and row["name"] != "constant velocity"]
     figure = Figure(figsize=(12, 1.2 + 0.3 * len(rows)), layout="constrained")

@@ -15,7 +15,7 @@ from training.data.scenes import load_us101_scenes, split_by_clock
 from training.data.trajectories import DT
 
 CUTOFFS = ((5.0, 5.0), (1.0, 1.0), (0.5, 0.5), (0.4, 0.35), (0.35, 0.25), (0.25, 0.2))
-HARD_BRAKE = -3.0
+HARD_BRAKING = -3.0
 
 
 def main(data: Path) -> None:
@@ -30,7 +30,7 @@ def main(data: Path) -> None:
         ]
         a = np.concatenate([scene.acceleration[mask] for scene, mask in zip(scenes, chosen, strict=True)])
         yaw_rate = np.concatenate([scene.yaw_rate[mask] for scene, mask in zip(scenes, chosen, strict=True)])
-        share, jerk = (a <= HARD_BRAKE).mean(), np.concatenate(jerks).std()
+        share, jerk = (a <= HARD_BRAKING).mean(), np.concatenate(jerks).std()
         typer.echo(f"{along:g}/{across:g}  {a.std():.2f}  {share:.4f}  {jerk:.2f}  {yaw_rate.std():.3f}")
     for name, scenes in zip(("train", "test"), split_by_clock(load_us101_scenes(data)), strict=True):
         chosen = [scene.acted & ~scene.leads_lane() for scene in scenes]

@@ -34,7 +34,7 @@ from benchmarks.estimators.runs import about
 from samplers.serialization import to_json_value
 
 PAPER = samplers.CrossEntropy(family="blocks", rho=0.01, alpha=0.8, early_end=False, choice="quantile", wide_share=0)
-METHODS: dict[str, Any] = {
+SEARCH_METHODS: dict[str, Any] = {
     # 50 elites for the means of 404 weights, as in the paper: noise of the means, not failures, is what it follows
     "ce-50-elites": samplers.CrossEntropy(
         family="blocks", rho=0.05, alpha=0.8, n_iteration=1000, max_iterations=10, n_final=3000
@@ -51,9 +51,9 @@ METHODS: dict[str, Any] = {
     "adss": samplers.AdaptiveSubsetSimulation(),
     "two-stage": samplers.TwoStage(),
 }
-OWN_BUDGET = tuple(name for name, method in METHODS.items() if isinstance(method, samplers.CrossEntropy))
+OWN_BUDGET = tuple(name for name, method in SEARCH_METHODS.items() if isinstance(method, samplers.CrossEntropy))
 """Methods that spend what their settings say."""
-NOISES: dict[str, bool | str] = {"on": True, "fixed": "fixed", "off": False}
+NOISE_SETTINGS: dict[str, bool | str] = {"on": True, "fixed": "fixed", "off": False}
 ONCE = ("ce-paper", "ce-paper-short")
 """Methods of which one run is made, whatever is asked for: a run takes 20 minutes of a core, or five."""
 
@@ -113,13 +113,13 @@ def split_sizes(n: int, size: int) -> Iterator[int]:
         n -= size
 
 
-def compare(
+def repeat_method(
     name: str, problem: rare_envs.DrivingProblem, gamma: float, p: float, runs: int, max_sim: int
 ) -> tuple[Row, list[samplers.Estimate]]:
     """Run a method with several seeds."""
     start = time.process_time()
     limit = None if name in OWN_BUDGET else max_sim
-    found = [samplers.estimate(problem, METHODS[name], gamma=gamma, seed=s, max_sim=limit) for s in range(runs)]
+    found = [samplers.estimate(problem, SEARCH_METHODS[name], gamma=gamma, seed=s, max_sim=limit) for s in range(runs)]
     ratio = np.array([each.p for each in found]) / p
     n_sim = float(np.mean([each.n_sim for each in found]))
     row = Row(
@@ -157,8 +157,8 @@ def main(
     """Measure, print and write."""
     torch.set_num_threads(1)
     out = RESULTS / f"search_{ego}_{noise}.json" if out is None else out
-    chosen = [check_word(name, METHODS) for name in methods.split(",")]
-    how = NOISES[check_word(noise, NOISES)]
+    chosen = [check_word(name, SEARCH_METHODS) for name in methods.split(",")]
+    how = NOISE_SETTINGS[check_word(noise, NOISE_SETTINGS)]
     who: Any = "idm" if ego == "idm" else agents.LearnedEgo(agents.load_driver(ego))  # type: ignore[arg-type]
     problem = rare_envs.DrivingProblem(
         "rare_envs/Highway-v0",
@@ -175,10 +175,10 @@ def main(
     data: dict[str, Any] = {"about": about(command=command), "question": question, "reference": truth, "rows": []}
     found: list[samplers.Estimate] = []
     for name in chosen:
-        row, found = compare(name, problem, gamma, truth["p"], 1 if name in ONCE else runs, max_sim)
+        row, found = repeat_method(name, problem, gamma, truth["p"], 1 if name in ONCE else runs, max_sim)
         data["rows"].append(asdict(row))
         print(row, flush=True)
-        write(out, data)  # a run at the paper's setting takes half an hour: nothing that was measured is lost
+        write_result(out, data)  # a run at the paper's setting takes half an hour: nothing that was measured is lost
     rng = np.random.default_rng(seed)
     x, weights = failing_points(found)
     failing = describe_failures(problem, x, weights, rng)
@@ -188,10 +188,10 @@ def main(
     searched[:, at] = x[rng.choice(len(x), 2000, p=weights)][:, at]
     acts = {"base": measure_drivers(problem, base), "weights of failures": measure_drivers(problem, searched)}
     print(json.dumps({"failures": failing, "behaviour": acts}, indent=1))
-    write(out, {**data, "failures": failing, "behaviour": acts})
+    write_result(out, {**data, "failures": failing, "behaviour": acts})
 
 
-def write(path: Path, data: dict[str, Any]) -> None:
+def write_result(path: Path, data: dict[str, Any]) -> None:
     """Write what was measured."""
     path.write_text(json.dumps(to_json_value(data), indent=1) + "\n")
 

@@ -24,9 +24,9 @@ from rich.progress import track
 from threadpoolctl import threadpool_limits
 
 from benchmarks.estimators.catalogue import CASES
-from benchmarks.estimators.compare_methods import selected
-from benchmarks.estimators.report import table
-from benchmarks.estimators.runs import Job, Meter, Run, about, failed, limit_state, rotation_of, run_all
+from benchmarks.estimators.compare_methods import parse_names
+from benchmarks.estimators.report import format_cells
+from benchmarks.estimators.runs import Job, Meter, MethodRun, about, limit_state, record_failure, rotation_of, run_all
 from benchmarks.estimators.summary import Cell, cells_of
 from samplers.problem import FloatArray
 from samplers.serialization import to_json_value
@@ -41,7 +41,7 @@ BLOCK = 100
 """Points that OpenTURNS hands over at once: that many chains in subset sampling, 10 % of the points of a level."""
 
 
-def run_openturns(job: Job, points: int = 1000) -> Run:
+def run_openturns(job: Job, points: int = 1000) -> MethodRun:
     """Run one of their algorithms once.
 
     Args:
@@ -64,9 +64,9 @@ def run_openturns(job: Job, points: int = 1000) -> Run:
             cov = result.getCoefficientOfVariation()
         except Exception as error:  # an error of f arrives as a RuntimeError with the traceback as its text
             reason = RuntimeError(str(error).strip().splitlines()[-1])
-            return failed(job, meter, time.process_time() - start, reason)
+            return record_failure(job, meter, time.process_time() - start, reason)
         seconds = time.process_time() - start - meter.seconds
-    return Run(
+    return MethodRun(
         method=job.method,
         problem=job.problem,
         seed=job.seed,
@@ -114,10 +114,10 @@ def main(
 ) -> None:
     """Measure and print one row of theirs and one of ours for each algorithm and problem."""
     openturns.Log.Show(openturns.Log.NONE)
-    names = selected(problems, list(CASES), "problem")
+    names = parse_names(problems, list(CASES), "problem")
     console = Console(stderr=True)
     cells: list[Cell] = []
-    all_runs: list[Run] = []
+    all_runs: list[MethodRun] = []
     for algorithm in ALGORITHMS:
         jobs = [Job(algorithm, name, run, rotation=rotation) for name in names for run in range(runs)]
         made = run_all(jobs, workers, partial(run_openturns, points=points))
@@ -129,7 +129,7 @@ def main(
         pairs = zip(their_cells, cells_of(own), strict=True)
         cells += [cell for pair in pairs for cell in pair]
         all_runs += theirs + own
-    print(table(cells))
+    print(format_cells(cells))
     for text in sorted({f"{run.method} on {run.problem}: {run.error}" for run in all_runs if run.error}):
         print(f"raised: {text}")
     if out:

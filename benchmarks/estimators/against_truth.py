@@ -18,16 +18,16 @@ import typer
 import rare_envs
 import samplers
 from benchmarks import RESULTS
-from benchmarks.estimators.truth import RESULT as TRUTH
+from benchmarks.estimators.truth import TRUTH_RESULT
 from samplers.registry import get_method
 
-RESULT = RESULTS / "against_truth.json"
+COMPARISON_RESULT = RESULTS / "against_truth.json"
 MONTE_CARLO_BUDGET = 100_000
 """Plain Monte Carlo gets this many simulations, the others their defaults."""
 
 
 @dataclass(frozen=True)
-class Cell:
+class TruthComparison:
     """One method on one problem."""
 
     env_id: str
@@ -50,7 +50,7 @@ class Cell:
     """Share of results with a warning."""
 
 
-def compare(row: dict[str, Any], method: str, seeds: range) -> Cell:
+def compare_with_truth(row: dict[str, Any], method: str, seeds: range) -> TruthComparison:
     """Repeat one method.
 
     Args:
@@ -69,7 +69,7 @@ def compare(row: dict[str, Any], method: str, seeds: range) -> Cell:
     p, truth = np.array([run.p for run in runs]), row["p"]
     error = np.hypot(p.std(ddof=1) / len(p) ** 0.5, row["standard_error"])
     n_sim = float(np.mean([run.n_sim for run in runs]))
-    return Cell(
+    return TruthComparison(
         env_id=row["env_id"],
         base=row["base"],
         method=method,
@@ -111,14 +111,14 @@ def main(
     seeds: int = 40,
     first_seed: int = 0,
     env: Annotated[str, typer.Option(help="Only environments whose id contains this.")] = "",
-    out: Annotated[Path, typer.Option(help="Where the result goes.")] = RESULT,
+    out: Annotated[Path, typer.Option(help="Where the result goes.")] = COMPARISON_RESULT,
 ) -> None:
     """Compare every method with the truth and write the result."""
     torch.set_num_threads(1)
     cells = []
-    for row in json.loads(TRUTH.read_text())["results"]:
+    for row in json.loads(TRUTH_RESULT.read_text())["results"]:
         for method in samplers.METHODS if env in row["env_id"] else ():
-            cells.append(compare(row, method, range(first_seed, first_seed + seeds)))
+            cells.append(compare_with_truth(row, method, range(first_seed, first_seed + seeds)))
             cell = cells[-1]
             print(
                 f"{cell.env_id:25s} {cell.base:8s} {cell.method:9s} mean/p {cell.mean / cell.truth:.3f} "

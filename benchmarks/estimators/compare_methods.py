@@ -24,7 +24,7 @@ from rich.progress import track
 
 import samplers
 from benchmarks.estimators.catalogue import CASES
-from benchmarks.estimators.report import summary, table
+from benchmarks.estimators.report import format_cells, summary
 from benchmarks.estimators.runs import Job, about, run_all
 from benchmarks.estimators.summary import cells_of, power_of, verdicts
 from samplers.serialization import to_json_value
@@ -43,8 +43,8 @@ def main(
     out: Annotated[Path | None, typer.Option("--json", help="Write figures and runs here.")] = None,
 ) -> None:
     """Measure, print the tables and, if asked for, write the figures and all runs."""
-    chosen_methods = selected(methods, list(samplers.METHODS), "method")
-    chosen_problems = selected(problems, list(CASES), "problem")
+    chosen_methods = parse_names(methods, list(samplers.METHODS), "method")
+    chosen_problems = parse_names(problems, list(CASES), "problem")
     limit = None if own_settings else max_sim
     jobs = [
         Job(method, problem, seed + run, limit, replicates, rotation)
@@ -55,7 +55,7 @@ def main(
     console = Console(stderr=True)
     results = list(track(run_all(jobs, workers), total=len(jobs), console=console, description="runs"))
     cells = cells_of(results)
-    print(table(cells))
+    print(format_cells(cells))
     by_method = []
     for method in chosen_methods:
         own_cells = [cell for cell in cells if cell.method == method]
@@ -76,7 +76,7 @@ def main(
         out.write_text(json.dumps(to_json_value(data), indent=1, allow_nan=False) + "\n")
 
 
-def selected(names: str, known: list[str], kind: str) -> list[str]:
+def parse_names(names: str, known: list[str], kind: str) -> list[str]:
     """Return the names with commas between, all if there are none.
 
     Raises:

@@ -17,7 +17,7 @@ from sklearn.mixture import GaussianMixture
 from benchmarks.estimators.driving_models import car_following, cut_in
 from benchmarks.estimators.limit_states import Function, LimitState
 
-CHUNK = 50_000
+REFERENCE_CHUNK = 50_000
 BASE_SHARE = 0.3
 WIDE = 1.7
 """Standard deviation of the draws that the mixture is fitted to."""
@@ -26,7 +26,7 @@ WIDE = 1.7
 def reference(state: LimitState, draws: int, seed: int) -> tuple[float, float]:
     """Return p and its standard error from `draws` draws, and a fifth as many for the fit."""
     rng = np.random.default_rng(seed)
-    mixture = _fitted(state.f, state.dim, draws // 5, rng)
+    mixture = _fit_mixture(state.f, state.dim, draws // 5, rng)
     base = multivariate_normal(np.zeros(state.dim))
     weights = []
     for size in track(_chunks(draws), description=f"d = {state.dim}"):
@@ -38,7 +38,7 @@ def reference(state: LimitState, draws: int, seed: int) -> tuple[float, float]:
     return float(values.mean()), float(values.std(ddof=1) / np.sqrt(len(values)))
 
 
-def _fitted(f: Function, dim: int, draws: int, rng: np.random.Generator) -> GaussianMixture:
+def _fit_mixture(f: Function, dim: int, draws: int, rng: np.random.Generator) -> GaussianMixture:
     """Return a mixture fitted to U given failure, from wide draws that are drawn again by their weights."""
     found, weights = [], []
     for size in _chunks(draws):
@@ -47,13 +47,13 @@ def _fitted(f: Function, dim: int, draws: int, rng: np.random.Generator) -> Gaus
         found.append(failing)
         weights.append(np.exp(-0.5 * np.sum(failing**2, axis=1) * (1 - WIDE**-2)))
     points, weight = np.concatenate(found), np.concatenate(weights)
-    kept = points[rng.choice(len(points), 10_000, p=weight / weight.sum())]
+    resampled = points[rng.choice(len(points), 10_000, p=weight / weight.sum())]
     random_state = np.random.RandomState(rng.integers(2**31))  # with a plain seed all samples would be the same
-    return GaussianMixture(6, reg_covar=1e-3, random_state=random_state).fit(kept)
+    return GaussianMixture(6, reg_covar=1e-3, random_state=random_state).fit(resampled)
 
 
 def _chunks(total: int) -> list[int]:
-    return [min(CHUNK, total - first) for first in range(0, total, CHUNK)]
+    return [min(REFERENCE_CHUNK, total - first) for first in range(0, total, REFERENCE_CHUNK)]
 
 
 def main(draws: Annotated[float, typer.Option(help="Draws for each model.")] = 2e6, seed: int = 2026) -> None:

@@ -7,17 +7,15 @@ integrals.
 """
 
 import functools
-import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.integrate import quad
-from scipy.special import log_ndtr, ndtr
+from scipy.special import log_ndtr
 from scipy.stats import chi2, ncx2
 
-from samplers.limit_states import Reference
+from samplers.limit_states import Reference, integrate, normal_cdf, normal_mean
 from samplers.problem import FloatArray, FunctionProblem
 
 Function = Callable[[FloatArray], FloatArray]
@@ -55,7 +53,7 @@ def random_rotation(dim: int, seed: int) -> FloatArray:
     return rotation
 
 
-def known(reference: Reference) -> LimitState:
+def as_limit_state(reference: Reference) -> LimitState:
     """Return a problem of `samplers.limit_states` as a limit state."""
     return LimitState(reference.problem.evaluate, reference.problem.dim, reference.p)
 
@@ -73,7 +71,7 @@ def half_spaces(dim: int, betas: Sequence[float], slopes: Sequence[float] = (), 
 
     if not noise:
         return LimitState(f, dim, _any(betas))
-    p = _normal_mean(lambda z: _any([b + noise * z for b in betas]))
+    p = normal_mean(lambda z: _any([b + noise * z for b in betas]))
     return LimitState(f, dim, p, noise=noise)
 
 
@@ -87,10 +85,10 @@ def opposite(dim: int, ahead: float, behind: float, slopes: tuple[float, float] 
     def f(u: FloatArray) -> FloatArray:
         return np.minimum(slopes[0] * (ahead - u[:, 0]), slopes[1] * (behind + u[:, 0]))
 
-    return LimitState(f, dim, _phi(-ahead) + _phi(-behind))
+    return LimitState(f, dim, normal_cdf(-ahead) + normal_cdf(-behind))
 
 
-def stepped(smooth: LimitState, step: float = 0.5, cap: float = 3.0) -> LimitState:
+def round_to_steps(smooth: LimitState, step: float = 0.5, cap: float = 3.0) -> LimitState:
     """Round f up to whole steps and cap it, as a recorded time to collision may be: ties everywhere, the same p."""
 
     def f(u: FloatArray) -> FloatArray:
@@ -107,7 +105,7 @@ def bowl(dim: int, beta: float, curvature: float) -> LimitState:
 
     radius = chi2(dim - 1)
     low, high = radius.ppf(1e-15), radius.isf(1e-15)
-    return LimitState(f, dim, _integral(lambda q: radius.pdf(q) * _phi(-beta - curvature * q), low, high))
+    return LimitState(f, dim, integrate(lambda q: radius.pdf(q) * normal_cdf(-beta - curvature * q), low, high))
 
 
 def concave(beta: float = 5.0, curvature: float = 0.5, shift: float = 0.1) -> LimitState:
@@ -116,7 +114,7 @@ def concave(beta: float = 5.0, curvature: float = 0.5, shift: float = 0.1) -> Li
     def f(u: FloatArray) -> FloatArray:
         return np.asarray(beta - u[:, 1] - curvature * (u[:, 0] - shift) ** 2)
 
-    return LimitState(f, 2, _normal_mean(lambda s: _phi(-beta + curvature * (s - shift) ** 2), -3.2, 0.0, 3.2))
+    return LimitState(f, 2, normal_mean(lambda s: normal_cdf(-beta + curvature * (s - shift) ** 2), -3.2, 0.0, 3.2))
 
 
 def islands(centres: Sequence[Sequence[float]], radii: Sequence[float]) -> LimitState:
@@ -139,7 +137,7 @@ def corner(dim: int, betas: Sequence[float]) -> LimitState:
     def f(u: FloatArray) -> FloatArray:
         return np.asarray(np.max(beta - u[:, : len(beta)], axis=1))
 
-    return LimitState(f, dim, math.prod(_phi(-b) for b in betas))
+    return LimitState(f, dim, math.prod(normal_cdf(-b) for b in betas))
 
 
 def strip(dim: int = 4, beta: float = 2.8, centre: float = 1.0, half_width: float = 0.25) -> LimitState:
@@ -153,7 +151,7 @@ def strip(dim: int = 4, beta: float = 2.8, centre: float = 1.0, half_width: floa
         beyond = np.where(distance < 0, -0.02, np.maximum(distance, 0.02))
         return np.where(u[:, 0] > beta, beyond, 5.0 - u[:, 0])
 
-    return LimitState(f, dim, _phi(-beta) * (_phi(centre + half_width) - _phi(centre - half_width)))
+    return LimitState(f, dim, normal_cdf(-beta) * (normal_cdf(centre + half_width) - normal_cdf(centre - half_width)))
 
 
 def ring_part(dim: int = 10, p_radius: float = 2e-2, beta: float = 1.8) -> LimitState:
@@ -164,7 +162,7 @@ def ring_part(dim: int = 10, p_radius: float = 2e-2, beta: float = 1.8) -> Limit
     def f(u: FloatArray) -> FloatArray:
         return np.asarray(np.maximum(radius - np.linalg.norm(u, axis=1), beta - u[:, 0]))
 
-    p = _normal_mean(lambda s: float(chi2.sf(max(squared - s * s, 0.0), dim - 1)), radius, low=beta)
+    p = normal_mean(lambda s: float(chi2.sf(max(squared - s * s, 0.0), dim - 1)), radius, low=beta)
     return LimitState(f, dim, p)
 
 
@@ -178,8 +176,8 @@ def hidden_box(slope: float = 0.5, beta: float = 4.6) -> LimitState:
         box = (u[:, 1] > 2.2) & (u[:, 1] < 3.4) & (u[:, 2] > -2.6) & (u[:, 2] < -1.6)
         return np.where(box, -1.0, slope * (beta - u[:, 0]))
 
-    box = (_phi(-2.2) - _phi(-3.4)) * (_phi(-1.6) - _phi(-2.6))
-    return LimitState(f, 3, box + (1.0 - box) * _phi(-beta))
+    box = (normal_cdf(-2.2) - normal_cdf(-3.4)) * (normal_cdf(-1.6) - normal_cdf(-2.6))
+    return LimitState(f, 3, box + (1.0 - box) * normal_cdf(-beta))
 
 
 def never(dim: int = 4) -> LimitState:
@@ -196,21 +194,6 @@ def _noisy(f: Function, sd: float, seed: int) -> Function:
     return lambda u: f(u) + sd * rng.standard_normal(len(u))
 
 
-def _phi(x: float) -> float:
-    return float(ndtr(x))
-
-
 def _any(betas: Sequence[float]) -> float:
     """Return 1 - prod_k Phi(beta_k), without cancellation."""
     return -math.expm1(float(np.sum(log_ndtr(betas))))
-
-
-def _integral(g: Callable[[float], float], low: float, high: float, *breaks: float) -> float:
-    edges = [low, *(b for b in breaks if low < b < high), high]
-    pieces = itertools.pairwise(edges)
-    return float(sum(quad(g, a, b, limit=500, epsabs=1e-18, epsrel=1e-12)[0] for a, b in pieces))
-
-
-def _normal_mean(g: Callable[[float], float], *breaks: float, low: float = -12.0) -> float:
-    """Return the integral of g(s) phi(s) over s > low, in pieces between the breaks."""
-    return _integral(lambda s: g(s) * math.exp(-0.5 * s * s) / math.sqrt(2 * math.pi), low, 12.0, *breaks)

@@ -21,7 +21,7 @@ from rich.progress import track
 from threadpoolctl import threadpool_limits
 
 import samplers
-from benchmarks.estimators.compare_methods import selected
+from benchmarks.estimators.compare_methods import parse_names
 from benchmarks.estimators.runs import Meter, about
 from samplers.limit_states import half_space
 from samplers.problem import FunctionProblem
@@ -50,7 +50,7 @@ class Overhead:
     """Longest processor time of a run."""
 
 
-def measure(method: str, dim: int, runs: int, max_sim: int = 6000) -> Overhead:
+def measure_overhead(method: str, dim: int, runs: int, max_sim: int = 6000) -> Overhead:
     """Time `runs` runs of a method, after one that is not counted."""
     f = half_space(dim).problem.evaluate
     rows = []
@@ -75,7 +75,7 @@ def measure(method: str, dim: int, runs: int, max_sim: int = 6000) -> Overhead:
     )
 
 
-def table(rows: list[Overhead]) -> str:
+def format_overheads(rows: list[Overhead]) -> str:
     """Return the rows as Markdown."""
     lines = [
         "| method | d | simulations | calls of f | points per call | own time [s] | slowest [s] | wall time [s] |",
@@ -96,11 +96,14 @@ def main(
     out: Annotated[Path | None, typer.Option("--json", help="Write the figures here.")] = None,
 ) -> None:
     """Measure, print the table and whether the default method is fast enough."""
-    names = selected(methods, list(samplers.METHODS), "method")
+    names = parse_names(methods, list(samplers.METHODS), "method")
     pairs = [(name, dim) for name in names for dim in TARGETS]
     console = Console(stderr=True)
-    rows = [measure(name, dim, runs, max_sim) for name, dim in track(pairs, console=console, description="overhead")]
-    print(table(rows))
+    rows = [
+        measure_overhead(name, dim, runs, max_sim)
+        for name, dim in track(pairs, console=console, description="overhead")
+    ]
+    print(format_overheads(rows))
     for row in rows:
         if row.method == "two-stage":
             verdict = "met" if row.processor_seconds < TARGETS[row.dim] else "missed"

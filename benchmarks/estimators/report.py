@@ -5,16 +5,16 @@ from collections.abc import Sequence
 from benchmarks.estimators.catalogue import CASES
 from benchmarks.estimators.summary import Cell, Power, Verdict, pooled_coverage
 
-COLUMNS = (
+REPORT_COLUMNS = (
     "method | problem | p | mean/p | c.o.v. | own | own / real | gain | coverage % | warned % | worst error | n_sim "
     "| calls | own time [ms]"
 )
 
 
-def table(cells: Sequence[Cell]) -> str:
+def format_cells(cells: Sequence[Cell]) -> str:
     """Return one row for each cell; a last column says how many runs raised, where some did."""
     raised = any(cell.raised for cell in cells)
-    columns = COLUMNS + (" | raised" if raised else "")
+    columns = REPORT_COLUMNS + (" | raised" if raised else "")
     lines = [f"| {columns} |", "|---" * (columns.count("|") + 1) + "|"]
     for c in cells:
         values = [

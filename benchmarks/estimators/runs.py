@@ -34,7 +34,7 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Run:
+class MethodRun:
     """What came of it."""
 
     method: str
@@ -94,7 +94,7 @@ def rotation_of(job: Job) -> int | None:
     return CASES[job.problem].rotation if job.rotation is None else job.rotation
 
 
-def run_once(job: Job) -> Run:
+def run_once(job: Job) -> MethodRun:
     """Run one of our methods once. What it raises is recorded, so that a benchmark goes on."""
     state = limit_state(job.problem)
     meter = Meter(state.problem(rotation_of(job), noise_seed=job.seed).evaluate)
@@ -106,10 +106,10 @@ def run_once(job: Job) -> Run:
                 problem, job.method, seed=job.seed, max_sim=job.max_sim, replicates=job.replicates
             )
         except Exception as error:
-            return failed(job, meter, time.process_time() - start, error)
+            return record_failure(job, meter, time.process_time() - start, error)
         seconds = time.process_time() - start - meter.seconds
     assert result.n_sim == meter.points, f"{job}: {result.n_sim} simulations stated, {meter.points} made"
-    return Run(
+    return MethodRun(
         method=job.method,
         problem=job.problem,
         seed=job.seed,
@@ -125,10 +125,10 @@ def run_once(job: Job) -> Run:
     )
 
 
-def failed(job: Job, meter: Meter, seconds: float, error: Exception) -> Run:
+def record_failure(job: Job, meter: Meter, seconds: float, error: Exception) -> MethodRun:
     """Return the record of a run that raised."""
     nan = float("nan")
-    return Run(
+    return MethodRun(
         method=job.method,
         problem=job.problem,
         seed=job.seed,
@@ -144,7 +144,7 @@ def failed(job: Job, meter: Meter, seconds: float, error: Exception) -> Run:
     )
 
 
-def run_all(jobs: Iterable[Job], workers: int = 1, once: Callable[[Job], Run] = run_once) -> Iterator[Run]:
+def run_all(jobs: Iterable[Job], workers: int = 1, once: Callable[[Job], MethodRun] = run_once) -> Iterator[MethodRun]:
     """Make the runs in order, in this process or in several.
 
     Args:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from benchmarks.estimators.catalogue import CASES
-from benchmarks.estimators.runs import Run, limit_state
+from benchmarks.estimators.runs import MethodRun, limit_state
 from samplers.problem import FloatArray
 
 
@@ -45,15 +45,15 @@ class Cell:
     """Processor time of one run without f."""
 
 
-def cells_of(runs: Iterable[Run]) -> list[Cell]:
+def cells_of(runs: Iterable[MethodRun]) -> list[Cell]:
     """Return one cell for each method and problem, in the order of their first runs."""
-    groups: dict[tuple[str, str], list[Run]] = defaultdict(list)
+    groups: dict[tuple[str, str], list[MethodRun]] = defaultdict(list)
     for run in runs:
         groups[run.method, run.problem].append(run)
     return [cell_of(group, limit_state(group[0].problem).p) for group in groups.values()]
 
 
-def cell_of(runs: Sequence[Run], p: float) -> Cell:
+def cell_of(runs: Sequence[MethodRun], p: float) -> Cell:
     """Summarise the runs of one method on one problem with probability p."""
     ended = [run for run in runs if not run.error]
     estimates = np.array([run.p for run in ended])
@@ -85,12 +85,12 @@ def cell_of(runs: Sequence[Run], p: float) -> Cell:
     )
 
 
-def covers(run: Run, p: float) -> bool:
+def covers(run: MethodRun, p: float) -> bool:
     """Return whether the interval holds p."""
     return run.low <= p <= run.high
 
 
-def own_errors_off(run: Run, p: float) -> float:
+def own_errors_off(run: MethodRun, p: float) -> float:
     """Return by how many of its own standard errors the estimate is off.
 
     NaN where nothing can be said: p is 0, the run raised, or it gave 0 with an interval that holds p. An estimate of 0
@@ -117,7 +117,7 @@ class Power:
     """Runs with each warning (numbers as #): wrong, right, neither."""
 
 
-def power_of(runs: Iterable[Run]) -> Power:
+def power_of(runs: Iterable[MethodRun]) -> Power:
     """Return the power of the warnings over runs of one method."""
     counts: Counter[str] = Counter()
     texts: dict[str, Counter[str]] = defaultdict(Counter)

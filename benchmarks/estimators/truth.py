@@ -18,10 +18,10 @@ import rare_envs
 from benchmarks import RESULTS
 from rare_envs.scenarios.registry import SCENARIOS
 
-RESULT = RESULTS / "truth.json"
-CHUNK = 131_072
+TRUTH_RESULT = RESULTS / "truth.json"
+ROLLOUT_CHUNK = 131_072
 
-ENV_IDS = ("rare_envs/CarFollowing-v0", "rare_envs/CutIn-v0")
+TRUTH_ENV_IDS = ("rare_envs/CarFollowing-v0", "rare_envs/CutIn-v0")
 """Collisions elsewhere are too rare for plain Monte Carlo, and with learned drivers a rollout is too slow."""
 
 
@@ -39,7 +39,7 @@ def truth(env_id: str, base: str, rollouts: int, seed: int) -> dict[str, float |
     """
     problem = rare_envs.DrivingProblem(env_id, base=base)
     rng = np.random.default_rng(seed)
-    sizes = [min(CHUNK, rollouts - first) for first in range(0, rollouts, CHUNK)]
+    sizes = [min(ROLLOUT_CHUNK, rollouts - first) for first in range(0, rollouts, ROLLOUT_CHUNK)]
     collisions = 0
     for size in track(sizes, description=f"{env_id} {base}"):
         collisions += int((problem.evaluate(problem.base.sample(size, rng)) <= 0.0).sum())
@@ -60,12 +60,12 @@ def truth(env_id: str, base: str, rollouts: int, seed: int) -> dict[str, float |
 def main(
     rollouts: Annotated[float, typer.Option(help="Rollouts for each scenario and base.")] = 1e7,
     seed: int = 2026,
-    out: Path = RESULT,
+    out: Path = TRUTH_RESULT,
 ) -> None:
     """Measure both scenarios with both bases and write the result."""
     torch.set_num_threads(1)
     results = []
-    for env_id in ENV_IDS:
+    for env_id in TRUTH_ENV_IDS:
         for base in SCENARIOS[env_id].bases:
             results.append(truth(env_id, base, int(rollouts), seed))
             print(json.dumps(results[-1]))

@@ -75,7 +75,7 @@ def _road(lanes: int) -> Road:
     return Road(network, np_random=np.random.RandomState(0))
 
 
-def car_following(x: Array, ego: type[IDMVehicle] = TianVehicle, target_speed: float = 21.72) -> Road:
+def car_following_road(x: Array, ego: type[IDMVehicle] = TianVehicle, target_speed: float = 21.72) -> Road:
     """Road with ego and lead.
 
     Args:
@@ -92,7 +92,7 @@ def car_following(x: Array, ego: type[IDMVehicle] = TianVehicle, target_speed: f
     return road
 
 
-def cut_in(x: Array, ego: type[IDMVehicle] = TianVehicle, target_speed: float = 21.72) -> Road:
+def cut_in_road(x: Array, ego: type[IDMVehicle] = TianVehicle, target_speed: float = 21.72) -> Road:
     """Road with ego, cutter and lead.
 
     Args:
@@ -111,7 +111,7 @@ def cut_in(x: Array, ego: type[IDMVehicle] = TianVehicle, target_speed: float = 
     return road
 
 
-def highway(x: Array) -> Road:
+def highway_road(x: Array) -> Road:
     """Six of HighwayEnv's IDM vehicles on six straight lanes, started like ours; only their speed is comparable.
 
     Args:
@@ -126,7 +126,7 @@ def highway(x: Array) -> Road:
     return road
 
 
-def drive(road: Road, ticks: int, dt: float = 0.1) -> tuple[Array, bool]:
+def drive_road(road: Road, ticks: int, dt: float = 0.1) -> tuple[Array, bool]:
     """Run HighwayEnv's own loop.
 
     Args:

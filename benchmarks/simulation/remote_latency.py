@@ -35,7 +35,7 @@ def saved_policy(folder: Path) -> Path:
     return path
 
 
-def measure(batch: int, repeats: int) -> dict[str, Any]:
+def measure_latency(batch: int, repeats: int) -> dict[str, Any]:
     """Return rollouts per second of each way, medians over the repeats, and the ratio of in-process to remote."""
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as folder:
@@ -82,7 +82,7 @@ def main() -> None:
     parser.add_argument("--batch", type=int, default=1024)
     parser.add_argument("--repeats", type=int, default=7)
     arguments = parser.parse_args()
-    print(json.dumps(measure(arguments.batch, arguments.repeats), indent=2))
+    print(json.dumps(measure_latency(arguments.batch, arguments.repeats), indent=2))
 
 
 if __name__ == "__main__":

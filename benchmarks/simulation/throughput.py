@@ -27,7 +27,7 @@ CAR_FOLLOWING, CUT_IN, HIGHWAY = (f"rare_envs/{name}-v0" for name in ("CarFollow
 HORIZON = 20.0
 """Episodes of 200 ticks, as in the published baselines."""
 TICKS = 200
-ROADS = {CAR_FOLLOWING: reference.car_following, CUT_IN: reference.cut_in}
+ROADS = {CAR_FOLLOWING: reference.car_following_road, CUT_IN: reference.cut_in_road}
 FLOORS = {
     "car_following_idm": 800.0,
     "cut_in_idm": 700.0,
@@ -78,9 +78,9 @@ def rollout_ratio(env_id: str, rounds: int, reference_rollouts: int = 10) -> dic
         ours.append(len(x) / seconds(lambda: problem.evaluate(x)))
         some = x[:reference_rollouts]
         theirs.append(
-            len(some) / seconds(lambda some=some: [reference.drive(ROADS[env_id](row), TICKS) for row in some])
+            len(some) / seconds(lambda some=some: [reference.drive_road(ROADS[env_id](row), TICKS) for row in some])
         )
-    return _rates(ours, theirs)
+    return _compare_rates(ours, theirs)
 
 
 def policy_ratio(rounds: int) -> dict[str, float]:
@@ -92,14 +92,14 @@ def policy_ratio(rounds: int) -> dict[str, float]:
     for _ in range(rounds):
         ours.append(len(x) / seconds(lambda: problem.evaluate(x)))
         theirs.append(3 / seconds(lambda: [_drive_by_policy(model, row) for row in x[:3]]))
-    return _rates(ours, theirs)
+    return _compare_rates(ours, theirs)
 
 
 def _drive_by_policy(model: Any, x: np.ndarray[Any, Any]) -> None:
     """Drive HighwayEnv's vehicles, a plain one by the policy on the same observation."""
     from highway_env.vehicle.kinematics import Vehicle
 
-    road = reference.car_following(x)
+    road = reference.car_following_road(x)
     ego = Vehicle(road, [0.0, 0.0], 0.0, x[0])
     road.vehicles[0] = ego
     lead = road.vehicles[1]
@@ -139,7 +139,7 @@ def step_ratio(steps: int) -> dict[str, float]:
     pairs = [
         (steps / seconds(lambda: drive(ours, still)), steps / seconds(lambda: drive(theirs, still))) for _ in range(3)
     ]
-    return _rates([a for a, _ in pairs], [b for _, b in pairs])
+    return _compare_rates([a for a, _ in pairs], [b for _, b in pairs])
 
 
 def latency_ratio() -> dict[str, float]:
@@ -150,7 +150,9 @@ def latency_ratio() -> dict[str, float]:
     result = samplers.estimate(problem, samplers.AdaptiveSubsetSimulation(), seed=0)
     ours = time.process_time() - start
     x = problem.base.sample(20, np.random.default_rng(0))
-    theirs = seconds(lambda: [reference.drive(reference.cut_in(row), problem.world.clock.ticks) for row in x]) / len(x)
+    theirs = seconds(
+        lambda: [reference.drive_road(reference.cut_in_road(row), problem.world.clock.ticks) for row in x]
+    ) / len(x)
     return {
         "seconds": ours,
         "n_sim": result.n_sim,
@@ -159,7 +161,7 @@ def latency_ratio() -> dict[str, float]:
     }
 
 
-def highway(batch: int, rounds: int) -> dict[str, float]:
+def measure_highway(batch: int, rounds: int) -> dict[str, float]:
     """Compare Highway-v0, the IDM ego and five learned drivers, with HighwayEnv's six IDM vehicles and lidar."""
     problem = rare_envs.DrivingProblem(HIGHWAY, measure="lidar_ttc")
     seconds_of_traffic = problem.world.clock.seconds
@@ -169,11 +171,11 @@ def highway(batch: int, rounds: int) -> dict[str, float]:
     ours, theirs = [], []
     for _ in range(rounds):
         ours.append(batch * seconds_of_traffic / seconds(lambda: problem.evaluate(x), repeat))
-        road = reference.highway(x[0])
+        road = reference.highway_road(x[0])
         theirs.append(
             seconds_of_traffic / seconds(lambda road=road: reference.drive_looking(road, problem.world.clock.ticks))
         )
-    return {**_rates(ours, theirs), "batch": batch}
+    return {**_compare_rates(ours, theirs), "batch": batch}
 
 
 class Cruise:
@@ -184,7 +186,7 @@ class Cruise:
         return np.zeros((len(observation), 2)), state
 
 
-def camera(batch: int, rounds: int, weather: bool = False) -> dict[str, float]:
+def measure_camera(batch: int, rounds: int, weather: bool = False) -> dict[str, float]:
     """Compare a camera with lidar as the ego's sensor, in Highway-v0 with five learned drivers."""
     rates: dict[str, list[float]] = {}
     problems = {
@@ -227,7 +229,7 @@ def memory(rollouts: int = 1_000_000) -> dict[str, float]:
     return {"rollouts": rollouts, "seconds": elapsed, "peak_gib": _peak_gib()}
 
 
-def _rates(ours: list[float], theirs: list[float]) -> dict[str, float]:
+def _compare_rates(ours: list[float], theirs: list[float]) -> dict[str, float]:
     ratios = [a / b for a, b in zip(ours, theirs, strict=True)]
     return {
         "per_second": float(np.median(ours)),
@@ -250,8 +252,11 @@ def main(
     results: dict[str, dict[str, float]] = {}
     if not only_camera:
         results = {"highway_memory": highway_memory()}  # first: a peak stays
-        results |= {f"highway_{batch}": highway(batch, rounds) for batch in REAL_TIME}
-    results["camera_64"], results["camera_64_weather"] = camera(64, rounds), camera(64, rounds, weather=True)
+        results |= {f"highway_{batch}": measure_highway(batch, rounds) for batch in REAL_TIME}
+    results["camera_64"], results["camera_64_weather"] = (
+        measure_camera(64, rounds),
+        measure_camera(64, rounds, weather=True),
+    )
     if not (only_highway or only_camera):
         results["car_following_idm"] = rollout_ratio(CAR_FOLLOWING, rounds)
         results["cut_in_idm"] = rollout_ratio(CUT_IN, rounds)

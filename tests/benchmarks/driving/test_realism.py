@@ -9,7 +9,7 @@ import torch
 from agents import LearnedDriver, WeightDistribution
 from agents.learned.networks import head_weights
 from benchmarks.driving import realism_rows as imitation_rows
-from benchmarks.driving.forward_model import compare
+from benchmarks.driving.forward_model import compare_gradients
 from benchmarks.driving.realism import load_named, measure_all, round_numbers
 from benchmarks.driving.realism_figures import format_tables, write_figures
 from benchmarks.driving.realism_rows import Effort, highway_starts, move_weights
@@ -93,7 +93,7 @@ def test_numbers_are_rounded():
 
 def test_gradients_of_both_ways_are_compared(data):
     learner = make_learner(data, Config(learned_model=True, epochs=1, scenes=2))
-    learned, noise, blind, length = compare(learner, 3, starts=2)
+    learned, noise, blind, length = compare_gradients(learner, 3, starts=2)
     assert max(abs(learned), abs(noise), abs(blind)) <= 1 + 1e-5
     assert noise > 0
     assert length > 0

@@ -14,7 +14,7 @@ from samplers import CrossEntropy
 
 
 def test_the_paper_s_settings():
-    paper = study.METHODS["ce-paper"]
+    paper = study.SEARCH_METHODS["ce-paper"]
     assert isinstance(paper, CrossEntropy)
     assert (paper.max_iterations, paper.n_iteration, paper.rho, paper.alpha) == (100, 5000, 0.01, 0.8)
     assert (paper.family, paper.likelihood_ratio, paper.choice, paper.early_end) == (
@@ -23,7 +23,7 @@ def test_the_paper_s_settings():
         "quantile",
         False,
     )
-    assert set(study.OWN_BUDGET) | set(study.ONCE) <= set(study.METHODS)
+    assert set(study.OWN_BUDGET) | set(study.ONCE) <= set(study.SEARCH_METHODS)
 
 
 def test_failing_points_of_several_runs_are_weighted_together():

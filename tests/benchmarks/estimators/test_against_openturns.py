@@ -27,8 +27,8 @@ def test_openturns_is_stopped_where_it_has_no_bound(monkeypatch):
 
 
 def test_overhead_counts_calls_and_leaves_out_f():
-    row = overhead.measure("ss", 6, runs=1, max_sim=2000)
+    row = overhead.measure_overhead("ss", 6, runs=1, max_sim=2000)
     assert row.n_sim <= 2000
     assert row.points_per_call == pytest.approx(row.n_sim / row.calls)
     assert 0 < row.processor_seconds < 5
-    assert "| ss | 6 |" in overhead.table([row])
+    assert "| ss | 6 |" in overhead.format_overheads([row])

@@ -9,15 +9,15 @@ import pytest
 from typer.testing import CliRunner
 
 import benchmarks.estimators.compare_methods
-from benchmarks.estimators.report import summary, table
-from benchmarks.estimators.runs import Job, LimitReached, Meter, Run, run_all, run_once
+from benchmarks.estimators.report import format_cells, summary
+from benchmarks.estimators.runs import Job, LimitReached, Meter, MethodRun, run_all, run_once
 from benchmarks.estimators.summary import cell_of, cells_of, covers, own_errors_off, power_of, verdicts, without_numbers
 
 P = 1e-3
 
 
-def made(p=P, cov=0.1, low=0.8 * P, high=1.2 * P, **changes) -> Run:
-    run = Run("ce", "lin_d2", 0, p, low, high, cov, n_sim=1000, calls=4, seconds=0.01, status="converged")
+def made(p=P, cov=0.1, low=0.8 * P, high=1.2 * P, **changes) -> MethodRun:
+    run = MethodRun("ce", "lin_d2", 0, p, low, high, cov, n_sim=1000, calls=4, seconds=0.01, status="converged")
     return replace(run, **changes)
 
 
@@ -131,7 +131,7 @@ def test_tables():
     runs = list(run_all(jobs))
     cells = cells_of(runs)
     assert all(covers(run, 2.326e-4) for run in runs)
-    text = table(cells)
+    text = format_cells(cells)
     assert len({line.count("|") for line in text.splitlines()}) == 1
     assert "Pooled coverage 100.0 % of 3 runs" in summary(cells, power_of(runs), verdicts(cells, power_of(runs)))
 

@@ -14,7 +14,7 @@ from benchmarks.estimators.limit_states import (
     opposite,
     random_rotation,
     ring_part,
-    stepped,
+    round_to_steps,
     strip,
 )
 
@@ -23,7 +23,7 @@ NEAR = {
     "noise": half_spaces(2, (1.5,), noise=0.5),
     "noise, two regions": half_spaces(4, (1.6, 1.9), noise=0.6),
     "opposite": opposite(2, 1.2, 1.5, (0.5, 10.0)),
-    "stepped": stepped(half_spaces(3, (1.2, 1.6))),
+    "stepped": round_to_steps(half_spaces(3, (1.2, 1.6))),
     "bowl": bowl(5, 1.0, 0.2),
     "concave": concave(2.5),
     "islands": islands([(1.0, 1.0, 0.0), (-1.0, 0.0, -1.0)], [0.6, 0.8]),
@@ -94,7 +94,7 @@ def test_noise_is_fresh_at_every_call_and_the_same_for_the_same_seed():
 def test_steps_tie_and_fail_where_the_smooth_function_fails():
     smooth = half_spaces(3, (1.2, 1.6))
     u = np.random.default_rng(3).standard_normal((5000, 3))
-    f = stepped(smooth).f(u)
+    f = round_to_steps(smooth).f(u)
     np.testing.assert_array_equal(f <= 0, smooth.f(u) <= 0)
     assert len(np.unique(f)) < 20
     assert f.max() == 3.0

@@ -51,7 +51,7 @@ CUT_IN_X = np.concatenate(
 
 @pytest.mark.parametrize(
     ("scenario", "road", "x"),
-    [(CAR_FOLLOWING, reference.car_following, CAR_FOLLOWING_X), (CUT_IN, reference.cut_in, CUT_IN_X)],
+    [(CAR_FOLLOWING, reference.car_following_road, CAR_FOLLOWING_X), (CUT_IN, reference.cut_in_road, CUT_IN_X)],
     ids=["car_following", "cut_in"],
 )
 @pytest.mark.parametrize(
@@ -62,7 +62,7 @@ CUT_IN_X = np.concatenate(
 def test_closed_loop(scenario: Scenario, road: Callable[..., Road], x: Array, ego: type[IDMVehicle], idm: IDM) -> None:
     compared = collisions = 0
     for row, ours, collided in zip(x, *drive(scenario, idm, x), strict=True):
-        theirs, crashed = reference.drive(road(row, ego, 25.0), TICKS)
+        theirs, crashed = reference.drive_road(road(row, ego, 25.0), TICKS)
         before = len(theirs) if not collided.any() else min(len(theirs), int(collided.argmax()))
         standing = theirs[:before, 0, 3] <= 0.0
         before = int(standing.argmax()) if standing.any() else before  # from there HighwayEnv reverses
@@ -94,7 +94,7 @@ def test_open_loop_bicycle() -> None:
 
 def test_difference_vehicles_stop_where_highway_env_reverses() -> None:
     x = np.array([3.0, 0.0, 6.0])
-    theirs, _ = reference.drive(reference.car_following(x, IDMVehicle, 25.0), TICKS)
+    theirs, _ = reference.drive_road(reference.car_following_road(x, IDMVehicle, 25.0), TICKS)
     ours, _ = drive(CAR_FOLLOWING, IDM.highway_env(25.0), x[None])
     assert theirs[:, 0, 3].min() < 0.0
     assert ours[0, :, 0, 3].min() == 0.0
@@ -103,7 +103,7 @@ def test_difference_vehicles_stop_where_highway_env_reverses() -> None:
 def test_difference_collision_is_overlap_and_not_a_prediction() -> None:
     """HighwayEnv flags a hit that its swept test predicts; ours is counted when the bodies overlap."""
     x = np.array([30.0, 2.0, 11.0])
-    _, crashed = reference.drive(reference.car_following(x, IDMVehicle, 30.0), TICKS)
+    _, crashed = reference.drive_road(reference.car_following_road(x, IDMVehicle, 30.0), TICKS)
     ours, collided = drive(CAR_FOLLOWING, IDM.highway_env(30.0), x[None])
     assert crashed
     contact, gap = int(collided[0].argmax()), ours[0, :, 1, 0] - ours[0, :, 0, 0] - 5.0

@@ -18,7 +18,7 @@ def test_pictures_are_noted_with_what_the_expert_would_do() -> None:
 
 def test_pictures_for_the_expert_and_for_a_network_are_the_same() -> None:
     """Where nobody trusts the network, the expert alone drives, by pictures that are all taken."""
-    settings = {"drives": 1, "rows": 2, "ticks": 8, "kept": 1.0, "noise": 0.0}
+    settings = {"drives": 1, "rows": 2, "ticks": 8, "recorded_share": 1.0, "noise": 0.0}
     torch.manual_seed(0)
     network = PilotNet().eval()
     alone = concatenate(list(collect(None, 0.0, rng=np.random.default_rng(3), **settings)))

@@ -57,7 +57,7 @@ def test_a_driver_by_rule_is_nominal(case: str) -> None:
 )
 def test_a_flawed_driver_is_caught_and_the_reason_is_told(ego: Any, reason: str) -> None:
     found = judge(ego, "straight", rollouts=16, seed=1, seconds=30.0)
-    assert reasons(found) <= {reason, "kept"}
+    assert reasons(found) <= {reason, "passed"}
     assert (found.reason == 0).mean() < 0.5  # some leads only ever drive away
 
 
