@@ -22,12 +22,6 @@ FAMILIES = {
 """Public names that several modules define, each in the same role, and the role."""
 
 TESTED_ELSEWHERE: dict[str, str] = {
-    "rare_envs/distributions/truncated_normal.py": "tests/rare_envs/distributions/test_truncated_mixture.py",
-    "rare_envs/scenarios/base.py": "tests/rare_envs/scenarios/test_own_scenario.py",
-    "rare_envs/scenarios/base_distributions.py": "tests/rare_envs/distributions/test_truncated_mixture.py",
-    "rare_envs/scenarios/registry.py": "tests/rare_envs/scenarios/test_own_scenario.py",
-    "rare_envs/scenarios/validation.py": "tests/rare_envs/scenarios/test_own_scenario.py",
-    "rare_envs/study/cli/export_ego.py": "tests/agents/onnx/test_export.py",
 }
 """Modules with logic that have no test module of their name, and where they are tested."""
 

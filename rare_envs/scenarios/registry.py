@@ -26,6 +26,10 @@ class Registry(Mapping[str, "Scenario"]):
             entry = self._entries[env_id] = import_object(entry, f"the environment {env_id!r}")
         return entry
 
+    def __contains__(self, env_id: object) -> bool:
+        """Return whether there is a scenario of an id; it is not imported."""
+        return env_id in self._entries
+
     def __iter__(self) -> Iterator[str]:
         """Iterate over the ids in the order of their registration."""
         return iter(self._entries)
@@ -89,7 +93,7 @@ def find_scenario(env_id: str) -> Scenario:
     if isinstance(name, str) and name in SCENARIOS:
         return SCENARIOS[name]
     layouts = {kinematics_id(each): each for each in SCENARIOS}
-    if name in layouts:
+    if isinstance(name, str) and name in layouts:
         raise ValueError(
             f"{name!r} is for gym.make and gym.make_vec; here take {layouts[name]!r} with "
             f"observation 'kinematics' and action 'meta'."

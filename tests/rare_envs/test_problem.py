@@ -169,20 +169,6 @@ def test_classes_are_not_egos() -> None:
         rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego=PPO)
 
 
-def test_base_objects_have_to_stay_in_range() -> None:
-    class Wide:
-        def sample(self, n: int, rng: np.random.Generator) -> Any:
-            return rng.normal(20.0, 10.0, (n, 3))
-
-        def log_prob(self, x: Any) -> Any:
-            return np.zeros(len(x))
-
-        to_standard_normal = from_standard_normal = log_prob
-
-    with pytest.raises(ValueError, match=r"draws ego_speed outside \[0, 45\] m/s"):
-        rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", base=Wide())
-
-
 def test_p_is_conditional_on_fixed_noise_and_says_so() -> None:
     for noise, drivers, given in (("fixed", "mgail", True), ("fixed", None, False), (True, "mgail", False)):
         problem = rare_envs.DrivingProblem("rare_envs/CutIn-v0", drivers=drivers, noise=noise, horizon=1.0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,13 +13,11 @@ import stable_baselines3 as sb3
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
-from typer.testing import CliRunner
 
 import rare_envs
 from agents import load_ego
 from agents.onnx.export import ACTION_TOLERANCE, compare_actions, export_onnx
 from agents.sb3.saved_ego import load_saved_ego
-from rare_envs.study.cli.app import app
 
 onnx = pytest.importorskip("onnx", reason="the extra onnx is optional")
 pytest.importorskip("onnxruntime", reason="the extra onnx is optional")
@@ -131,24 +128,3 @@ def test_an_export_that_acts_otherwise_is_not_written(saved: Any, tmp_path: Path
     with pytest.raises(ValueError, match=r"acts differently, by up to .*; nothing was written"):
         export_onnx(saved("ppo"), tmp_path / "ego.onnx")
     assert list(tmp_path.glob("*onnx*")) == []
-
-
-def test_the_command_writes_and_says_what_it_compared(saved: Any, tmp_path: Path) -> None:
-    saved("normalised")
-    words = ["export-ego", str(tmp_path / "ego.zip"), str(tmp_path / "ego.onnx")]
-    done = CliRunner().invoke(app, [*words, "--json"])
-    assert done.exit_code == 0, done.output
-    answer = json.loads(done.stdout)
-    assert answer["largest_difference"] <= answer["tolerance"] == ACTION_TOLERANCE
-    assert answer["vec_normalize"] == str(tmp_path / "vecnormalize.pkl")
-    assert (tmp_path / "ego.onnx").stat().st_size > 1000
-    assert "random observations" in CliRunner().invoke(app, words).stdout
-    for bad in (
-        ["nowhere.zip", str(tmp_path / "b.onnx")],
-        [words[1], "b.zip"],
-        [words[1], "nowhere/b.onnx"],
-        ["idm", "b.onnx"],
-    ):
-        refused = CliRunner().invoke(app, ["export-ego", *bad])
-        assert (refused.exit_code, refused.stdout) == (2, "")
-        assert refused.stderr.count("\n") == 1

@@ -10,7 +10,6 @@ from scipy.special import ndtri_exp
 
 from rare_envs.distributions.log_mixture import LogMixture
 from rare_envs.distributions.truncated_mixture import CHUNK_ROWS, TruncatedGaussianMixture
-from rare_envs.distributions.truncated_normal import log_interval
 from rare_envs.scenarios.base_distributions import load_base
 from rare_envs.scenarios.registry import SCENARIOS, scenario_named
 
@@ -227,16 +226,6 @@ def test_tail_of_a_tail_agrees_with_survival_functions():
     total = np.log1p(-np.exp(log_sf[1] - log_sf[0]))
     upper = log_sf[2:] - log_sf[0] + np.log1p(-np.exp(log_sf[1] - log_sf[2:])) - total
     np.testing.assert_allclose(law.to_standard_normal(x)[:, 0], -ndtri_exp(upper), atol=1e-9)
-
-
-def test_interval_mass_is_accurate_for_narrow_intervals():
-    """Against the midpoint density, whose relative error is (a w)^2 / 24."""
-    for a in (-30.0, -3.0, -0.1, 0.0, 0.5, 4.0, 30.0):
-        for width in (1e-15, 1e-9, 1e-5, 1e-4):
-            w = np.array([width])
-            got = log_interval(np.array([a]), a + w, w)[0]
-            expected = np.log(width) + stats.norm.logpdf(a + 0.5 * width)
-            assert abs(got - expected) < 1e-11 + (1.0 + a * a) * width * width / 12.0
 
 
 def test_mirror_image():

@@ -5,64 +5,26 @@ import sys
 import warnings
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
-import torch
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 from typer.testing import CliRunner
 
 import rare_envs
 import samplers
-from rare_envs.distributions.space import Parameter
-from rare_envs.scenarios.base import Others, Scenario, columns
 from rare_envs.scenarios.registry import SCENARIOS, scenario_named
 from rare_envs.study.cli.app import app
 from rare_envs.study.cli.catalogue import list_names
-from rare_envs.traffic.road import straight
-from rare_envs.traffic.state import VEHICLE_LENGTH, State
+from tests.rare_envs.scenarios.standing import STANDING
 
 with warnings.catch_warnings():
     warnings.simplefilter("ignore")  # PettingZoo's test module imports what PettingZoo has deprecated
     from pettingzoo.test import parallel_api_test, parallel_seed_test
 
 ENV_ID = "tests/Standing-v0"
-
-
-def initial(x):
-    """speed, distance: an ego that comes upon a vehicle that stands."""
-    speed, distance = x.unbind(dim=1)
-    zero = torch.zeros_like(speed)
-    return State(
-        columns(zero, distance + VEHICLE_LENGTH),
-        columns(zero, zero),
-        columns(zero, zero),
-        columns(speed, zero),
-        theta=x[:, :0],
-    )
-
-
-def others(state, dt):
-    return Others(state.x[:, 1:], state.y[:, 1:], state.heading[:, 1:], state.speed[:, 1:])
-
-
-STANDING = Scenario(
-    name="standing",
-    road=straight(1),
-    vehicle_names=("ego", "stalled"),
-    horizon=6.0,
-    parameters=(
-        Parameter("speed", "m/s", 5.0, 30.0, "of the ego"),
-        Parameter("distance", "m", 10.0, 150.0, "bumper to bumper"),
-    ),
-    bases={"even": {"alpha": [1.0, 1.0], "beta": [1.0, 1.0]}},
-    initial=initial,
-    others=others,
-    driven=lambda state, action, dt: others(state, dt),
-)
 
 
 @pytest.fixture
@@ -114,28 +76,9 @@ def test_its_probability_is_the_one_on_paper(registered):
     assert samplers.estimate(problem, samplers.TwoStage(), gamma=0.0, seed=0).interval[0] < exact
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"vehicle_names": ("car", "stalled")}, '"ego" first'),
-        ({"vehicle_names": ("ego", "ego")}, "different names"),
-        ({"labels": ("the ego",)}, "as many labels as vehicles"),
-        ({"bases": {}}, "at least one base distribution"),
-        ({"horizon": 0.0}, "a horizon in s"),
-        ({"parameters": ()}, "parameters with different names"),
-        ({"parameters": (Parameter("x", "m", 0.0, 1.0, ""),)}, "none of them 'x'"),
-        ({"parameters": (Parameter("speed", "m/s", 1.0, 0.0, ""),)}, "low < high"),
-        ({"bases": {"even": {"alpha": [1.0], "beta": [1.0]}}}, "Base distribution even"),
-        ({"vehicle_names": ("ego", "stalled", "ghost"), "labels": ()}, r"expected x of shape \(B, 3\) from initial"),
-        ({"others": lambda state, dt: Others(*(field * torch.nan for field in others(state, dt)))}, "not finite"),
-        ({"driven": lambda state, action, dt: Others(*(state[:4]))}, r"shape \(B, 1\) from driven"),
-        ({"others": lambda state, dt: None}, r"expected others\(state, dt\) to give x, y, heading and speed"),
-        ({"initial": lambda x: None}, r"expected initial\(x\) to give a State"),
-    ],
-)
-def test_what_does_not_work_is_refused_when_it_is_made_or_registered(change, message):
-    with pytest.raises(ValueError, match=message):
-        rare_envs.register_scenario("tests/Broken-v0", replace(STANDING, **change))
+def test_what_does_not_work_is_not_registered():
+    with pytest.raises(ValueError, match=r"expected others\(state, dt\) to give x, y, heading and speed"):
+        rare_envs.register_scenario("tests/Broken-v0", replace(STANDING, others=lambda state, dt: None))
     assert "tests/Broken-v0" not in rare_envs.ENV_IDS
     assert "tests/Broken-v0" not in gym.registry
 
@@ -148,11 +91,9 @@ def test_an_id_is_taken_once():
 def test_a_command_imports_the_module_that_registers_it(tmp_path, monkeypatch):
     """Under the id that `gym.make` takes, from the working directory; a run of it replays."""
     (tmp_path / "crests.py").write_text(
-        f"import sys; sys.path.append({str(Path(__file__).parent)!r})\n"
-        "from test_own_scenario import STANDING; import rare_envs\n"
+        "from tests.rare_envs.scenarios.standing import STANDING; import rare_envs\n"
         "rare_envs.register_scenario('tests/Crest-v0', STANDING)\n"
     )
-    (tmp_path / "broken.py").write_text("1 / 0\n")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path])
     env_id = "crests:tests/Crest-v0"
@@ -163,11 +104,6 @@ def test_a_command_imports_the_module_that_registers_it(tmp_path, monkeypatch):
         assert ran.exit_code in (0, 3), ran.stderr
         assert json.loads(ran.stdout)["question"]["env_id"] == env_id
         assert rare_envs.DrivingProblem(env_id).space.names == ("speed", "distance")
-        with pytest.raises(ValueError, match="did you mean 'tests/Crest-v0'"):
-            rare_envs.DrivingProblem("crests:tests/Crests-v0")
     finally:
         SCENARIOS.remove("tests/Crest-v0")
         del gym.registry["tests/Crest-v0"]
-    for name in ("broken", "nowhere_at_all"):
-        with pytest.raises(ValueError, match=f"Cannot import '{name}' for the environment '{name}:tests/Crest-v0'"):
-            rare_envs.DrivingProblem(f"{name}:tests/Crest-v0")

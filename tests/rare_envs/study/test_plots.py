@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,8 +7,6 @@ import pytest
 from matplotlib.figure import Figure
 
 import rare_envs
-from rare_envs.scenarios.cut_in import CUT_IN
-from rare_envs.scenarios.highway import HIGHWAY
 from rare_envs.study.evaluate import run
 from rare_envs.study.plots import MOMENTS, draw_drive, rank_shifted_parameters, save_plot
 from rare_envs.study.question import Question, prepare
@@ -27,13 +24,6 @@ def test_the_legend_says_which_vehicle_is_which(env_id: str) -> None:
     assert legend is not None
     speeds = [f"speed of {label}" for label in problem.world.scenario.labels]
     assert [text.get_text() for text in legend.get_texts()] == [*speeds, "gap to the vehicle ahead"]
-
-
-def test_vehicles_without_names_are_numbered() -> None:
-    assert CUT_IN.labels == ("the ego", "the cutter", "the lead")
-    numbered = replace(CUT_IN, vehicle_names=("ego", "vehicle_1", "vehicle_2"), labels=())
-    assert numbered.labels == ("the ego", "vehicle 1", "vehicle 2")
-    assert HIGHWAY.labels == ("the ego", *(f"lane {number}'s car" for number in (1, 2, 4, 5, 6)))
 
 
 def test_the_most_shifted_parameters_come_first() -> None:

@@ -1,0 +1,192 @@
+"""Base distributions of scenarios: by name, from a file, as a dictionary or an object, and what does not fit."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from rare_envs.distributions.beta import BetaDistribution
+from rare_envs.distributions.log_mixture import LogMixture
+from rare_envs.distributions.space import Distribution, ScenarioSpace
+from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
+from rare_envs.scenarios.base import Scenario
+from rare_envs.scenarios.base_distributions import load_base
+from rare_envs.scenarios.registry import SCENARIOS, scenario_named
+from tests.rare_envs.scenarios.standing import STANDING
+
+FOLLOWING = scenario_named("car_following")
+CUT_IN = scenario_named("cut_in")
+
+
+def rng() -> np.random.Generator:
+    return np.random.default_rng(0)
+
+
+@pytest.mark.parametrize(("scenario", "base"), [(each, base) for each in SCENARIOS.values() for base in each.bases])
+def test_shipped_bases_fit_their_scenario(scenario: Scenario, base: str) -> None:
+    space = ScenarioSpace.of(scenario.parameters, load_base(scenario, base))
+    assert isinstance(space.base, Distribution)
+    x = space.sample(1000, rng())
+    assert x.shape == (1000, scenario.size)
+    assert (space.validate(x) == x).all()
+    assert np.isfinite(space.log_prob(x)).all()
+    back = space.from_standard_normal(space.to_standard_normal(x))
+    np.testing.assert_allclose(back, x, atol=1e-8)
+
+
+def test_the_default_is_the_first() -> None:
+    x = load_base(FOLLOWING).sample(10, rng())
+    assert (x == load_base(FOLLOWING, "us101").sample(10, rng())).all()
+    highway_first = replace(FOLLOWING, bases=dict(reversed(list(FOLLOWING.bases.items()))))
+    assert (load_base(highway_first).sample(10, rng()) == load_base(FOLLOWING, "highway").sample(10, rng())).all()
+
+
+# --- dictionaries -------------------------------------------------------------------------------
+
+GAUSSIAN = {"weights": [1.0], "means": [[15.0, 40.0]], "covariances": [[[4.0, 0.0], [0.0, 25.0]]]}
+WITH_LOGARITHM = {"weights": [1.0], "means": [[15.0, 3.5]], "covariances": [[[4.0, 0.0], [0.0, 0.0625]]]}
+
+
+@pytest.mark.parametrize(
+    ("content", "kind", "median"),
+    [
+        (GAUSSIAN, TruncatedGaussianMixture, [15.0, 40.0]),
+        ({**WITH_LOGARITHM, "logarithmic": [False, True]}, LogMixture, [15.0, np.exp(3.5)]),
+        ({"alpha": [2.0, 2.0], "beta": [2.0, 2.0]}, BetaDistribution, [17.5, 80.0]),
+    ],
+)
+def test_a_dictionary_has_the_names_and_the_box_of_its_scenario(
+    content: dict[str, Any], kind: type, median: list[float]
+) -> None:
+    """The box cuts the normals more than 4.7 standard deviations out, which moves the medians by less than 1e-4."""
+    base = load_base(replace(STANDING, bases={"mine": content}), "mine")
+    assert type(base) is kind
+    assert (base.low.tolist(), base.high.tolist()) == ([5.0, 10.0], [30.0, 150.0])
+    np.testing.assert_allclose(base.from_standard_normal(np.zeros((1, 2)))[0], median, atol=1e-4)
+
+
+def test_a_dictionary_may_have_a_narrower_box_but_no_wider_one() -> None:
+    even = {"alpha": [1.0, 1.0], "beta": [1.0, 1.0]}
+    narrow = replace(STANDING, bases={"mine": {**even, "high": [20.0, 150.0]}})
+    assert load_base(narrow).sample(1000, rng())[:, 0].max() <= 20.0
+    wide = replace(STANDING, bases={"mine": {**even, "low": [5.0, 1.0]}})
+    with pytest.raises(
+        ValueError, match=r"^Base distribution mine gives distance the range \[1, 150\] m; stand"
+    ) as caught:
+        load_base(wide)
+    assert str(caught.value).endswith("standing allows [10, 150].")
+
+
+# --- files --------------------------------------------------------------------------------------
+
+
+def shipped_dict(scenario: Scenario = FOLLOWING) -> dict[str, Any]:
+    base = load_base(scenario, "us101")
+    assert isinstance(base, TruncatedGaussianMixture | LogMixture)
+    return {"names": [p.name for p in scenario.parameters], **base.to_dict()}
+
+
+def write(path: Path, content: object) -> Path:
+    path.write_text(json.dumps(content), encoding="utf-8")
+    return path
+
+
+def test_a_users_json(tmp_path: Path) -> None:
+    path = write(tmp_path / "mine.json", shipped_dict())
+    shipped = load_base(FOLLOWING, "us101")
+    x = shipped.sample(10, rng())
+    for base in (path, str(path)):
+        assert (load_base(FOLLOWING, base).log_prob(x) == shipped.log_prob(x)).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"names": ["gap", "ego_speed", "lead_speed"]}, "does not fit car_following: expected names"),
+        ({"names": None}, "expected names .* got None"),
+        ({"low": [-5.0, 0.0, 1.0]}, r"gives ego_speed the range \[-5, 45\] m/s; .* allows \[0, 45\]"),
+        ({"weights": [1.0]}, "weights of shape"),
+        ({"means": "x"}, "means must be an array of numbers"),
+    ],
+)
+def test_json_that_does_not_fit(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+    path = write(tmp_path / "mine.json", {**shipped_dict(), **change})
+    with pytest.raises(ValueError, match=message) as caught:
+        load_base(FOLLOWING, path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_json_with_the_wrong_dimension(tmp_path: Path) -> None:
+    content = {**shipped_dict(CUT_IN), "names": shipped_dict()["names"]}
+    path = write(tmp_path / "mine.json", content)
+    with pytest.raises(ValueError, match="does not fit car_following: expected 3 columns, got 6"):
+        load_base(FOLLOWING, path)
+
+
+def test_files_that_are_no_base(tmp_path: Path) -> None:
+    broken = tmp_path / "broken.json"
+    broken.write_text("{", encoding="utf-8")
+    binary = tmp_path / "binary.json"
+    binary.write_bytes(b"\xff\xfe\x00")
+    for base, message in [
+        ("us11", r"'us11' for cut_in \(did you mean 'us101'\?\): neither one of us101, highway nor a"),
+        (tmp_path, "nor a file"),
+        (broken, "broken.json is not valid JSON"),
+        (binary, "Cannot read the base distribution"),
+        (write(tmp_path / "list.json", [1]), "expected a JSON object, got list"),
+    ]:
+        with pytest.raises(ValueError, match=message) as caught:
+            load_base(CUT_IN, base)
+        assert "\n" not in str(caught.value)
+
+
+# --- objects --------------------------------------------------------------------------------------
+
+
+def test_an_object_is_taken_as_it_is() -> None:
+    given = load_base(FOLLOWING, "highway")
+    assert load_base(FOLLOWING, given) is given
+    assert load_base(replace(FOLLOWING, bases={"mine": given})) is given
+
+
+class Draws:
+    """Draws of one's own."""
+
+    def __init__(self, draws: NDArray[np.float64]) -> None:
+        self.draws = draws
+
+    def sample(self, n: int, rng: np.random.Generator) -> NDArray[np.float64]:
+        return np.resize(self.draws, (n, self.draws.shape[1]))
+
+
+class Complete(Draws):
+    def log_prob(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.zeros(len(x))
+
+    to_standard_normal = from_standard_normal = log_prob
+
+
+@pytest.mark.parametrize(
+    ("base", "message"),
+    [
+        (3, "A base distribution must be one of us101, highway, a path .*; got int without sample, log_prob, to_stand"),
+        (Draws(np.zeros((1, 3))), r"; got Draws without log_prob, to_standard_normal, from_standard_normal\.$"),
+        (
+            Complete(np.zeros((1, 6))),
+            r"must have shape \(1000, 3\), one column for each of ego_speed, lead_speed, gap; got \(1000, 6\)\.$",
+        ),
+        (
+            Complete(np.array([[20.0, 10.0, 30.0], [20.0, 45.1, 30.0]])),
+            r"^Base distribution Complete does not fit car_following: it draws lead_speed outside \[0, 45\] m/s; trunc",
+        ),
+        (Complete(np.array([[20.0, 10.0, np.nan]])), r"it draws gap outside \[1, 150\] m; truncate it\.$"),
+    ],
+)
+def test_an_object_that_does_not_fit_is_refused(base: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        load_base(FOLLOWING, base)

@@ -1,0 +1,134 @@
+"""The registry: scenarios are imported when they are wanted, and unknown ids and names are told from the known ones."""
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from rare_envs.scenarios.registry import SCENARIOS, Registry, find_scenario, kinematics_id, scenario_named
+from tests.rare_envs.scenarios.standing import STANDING
+
+PLACE = "place_of_this_registry_test"
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    """A module of the working directory that has one object."""
+    (tmp_path / f"{PLACE}.py").write_text("SCENARIO = object()\n")
+    monkeypatch.chdir(tmp_path)
+    yield PLACE
+    sys.modules.pop(PLACE, None)
+
+
+def test_a_scenario_is_imported_when_it_is_first_asked_for_and_kept(place: str) -> None:
+    registry = Registry({"a/B-v0": f"{place}:SCENARIO", "a/C-v0": f"{place}:NOTHING"})
+    assert list(registry) == ["a/B-v0", "a/C-v0"]
+    assert len(registry) == 2
+    assert "a/B-v0" in registry
+    assert "a/D-v0" not in registry
+    assert place not in sys.modules
+    scenario = registry["a/B-v0"]
+    assert scenario is sys.modules.pop(place).SCENARIO
+    assert registry["a/B-v0"] is scenario
+    with pytest.raises(ValueError, match=r"^'place_of_this_registry_test' has nothing called 'NOTHING'"):
+        registry["a/C-v0"]
+    with pytest.raises(KeyError):
+        registry["a/D-v0"]
+
+
+def test_scenarios_are_added_replaced_and_removed_in_their_order() -> None:
+    registry = Registry({"a/B-v0": "nowhere:X"})
+    registry.add("a/C-v0", STANDING)
+    registry.add("a/B-v0", STANDING)
+    assert list(registry) == ["a/B-v0", "a/C-v0"]
+    assert registry["a/B-v0"] is STANDING
+    registry.remove("a/B-v0")
+    assert dict(registry) == {"a/C-v0": STANDING}
+
+
+def test_a_registry_leaves_the_mapping_that_it_was_made_of_alone() -> None:
+    entries = {"a/B-v0": "nowhere:X"}
+    Registry(entries).add("a/C-v0", STANDING)
+    assert entries == {"a/B-v0": "nowhere:X"}
+
+
+def test_scenarios_by_id_and_by_name_are_the_same() -> None:
+    for env_id, name in [
+        ("rare_envs/CarFollowing-v0", "car_following"),
+        ("rare_envs/CutIn-v0", "cut_in"),
+        ("rare_envs/Highway-v0", "highway"),
+        ("rare_envs/HardBrake-v0", "hard_brake"),
+    ]:
+        assert find_scenario(env_id) is scenario_named(name) is SCENARIOS[env_id]
+        assert scenario_named(name).name == name
+
+
+def test_unknown_scenario() -> None:
+    with pytest.raises(
+        ValueError, match=r"^Unknown scenario 'cutin'; there are car_following, cut_in, highway, hard_b"
+    ):
+        scenario_named("cutin")
+
+
+@pytest.mark.parametrize(
+    ("env_id", "message"),
+    [
+        (
+            "rare_envs/CutInn-v0",
+            r"^Unknown environment 'rare_envs/CutInn-v0' \(did you mean 'rare_envs/CutIn-v0'\?\); ",
+        ),
+        (
+            "highway",
+            r"^Unknown environment 'highway'.*; the environments are rare_envs/CarFollowing-v0, rare_envs/CutIn",
+        ),
+        ("my-highway-v0", "^Unknown environment 'my-highway-v0'"),
+        (None, "^Unknown environment None; the environments are rare_envs/CarFollowing-v0, "),
+        (["rare_envs/CutIn-v0"], r"^Unknown environment \['rare_envs/CutIn-v0'\]"),
+        (
+            "rare_envs/CutIn-kinematics-v0",
+            r"^'rare_envs/CutIn-kinematics-v0' is for gym.make and gym.make_vec; here take 'rare_envs/CutIn-v0' with "
+            r"observation 'kinematics' and action 'meta'\.$",
+        ),
+        *(
+            (name, rf"rare_envs.highway_env_problem\('{name}', ego=...\)\. The environments here are rare_envs/CarFoll")
+            for name in ("highway-v0", "highway-fast-v0", "merge-v0", "intersection-v1", "roundabout-v0")
+        ),
+    ],
+)
+def test_unknown_environment(env_id: object, message: str) -> None:
+    with pytest.raises(ValueError, match=message) as caught:
+        find_scenario(env_id)  # type: ignore[arg-type]
+    assert "\n" not in str(caught.value)
+
+
+def test_an_id_may_name_the_module_that_registers_it(place: str) -> None:
+    Path(f"{place}.py").write_text(
+        "from rare_envs.scenarios.registry import SCENARIOS\n"
+        "SCENARIOS.add('tests/Crest-v0', SCENARIOS['rare_envs/CutIn-v0'])\n"
+    )
+    try:
+        assert find_scenario(f"{place}:tests/Crest-v0") is scenario_named("cut_in")
+        with pytest.raises(ValueError, match="did you mean 'tests/Crest-v0'"):
+            find_scenario(f"{place}:tests/Crests-v0")
+    finally:
+        SCENARIOS.remove("tests/Crest-v0")
+
+
+def test_a_module_that_cannot_be_imported_is_named_with_the_id(place: str) -> None:
+    Path(f"{place}.py").write_text("1 / 0\n")
+    for name in (place, "nowhere_at_all"):
+        with pytest.raises(ValueError, match=f"Cannot import '{name}' for the environment '{name}:tests/Crest-v0'"):
+            find_scenario(f"{name}:tests/Crest-v0")
+
+
+@pytest.mark.parametrize(
+    ("env_id", "expected"),
+    [
+        ("rare_envs/CutIn-v0", "rare_envs/CutIn-kinematics-v0"),
+        ("mine/Thing-v12", "mine/Thing-kinematics-v12"),
+        ("mine/with-vans-v3", "mine/with-vans-kinematics-v3"),
+    ],
+)
+def test_the_id_of_highway_envs_layout_keeps_the_version_last(env_id: str, expected: str) -> None:
+    assert kinematics_id(env_id) == expected
