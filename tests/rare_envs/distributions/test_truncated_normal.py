@@ -54,6 +54,14 @@ def test_mass_of_a_far_tail_is_its_asymptotic_series() -> None:
     np.testing.assert_allclose(log_interval(-far, -a, far), expected, rtol=1e-13)
 
 
+def test_mass_of_an_interval_in_a_tail_is_that_of_its_mirror_image() -> None:
+    a, b = np.array([3.0, 8.0, 30.0]), np.array([4.0, 10.0, 31.0])
+    tails = stats.norm.logsf(a), stats.norm.logsf(b)
+    expected = tails[0] + np.log1p(-np.exp(tails[1] - tails[0]))
+    np.testing.assert_allclose(log_interval(a, b, b - a), expected, rtol=1e-13)
+    np.testing.assert_allclose(log_interval(-b, -a, b - a), expected, rtol=1e-13)
+
+
 def test_interval_mass_is_accurate_for_narrow_intervals() -> None:
     """Against the midpoint density, whose relative error is (a w)^2 / 24."""
     for a in (-30.0, -3.0, -0.1, 0.0, 0.5, 4.0, 30.0):

@@ -73,12 +73,10 @@ def test_a_dictionary_may_have_a_narrower_box_but_no_wider_one() -> None:
     even = {"alpha": [1.0, 1.0], "beta": [1.0, 1.0]}
     narrow = replace(STANDING, bases={"mine": {**even, "high": [20.0, 150.0]}})
     assert load_base(narrow).sample(1000, rng())[:, 0].max() <= 20.0
-    wide = replace(STANDING, bases={"mine": {**even, "low": [5.0, 1.0]}})
-    with pytest.raises(
-        ValueError, match=r"^Base distribution mine gives distance the range \[1, 150\] m; stand"
-    ) as caught:
-        load_base(wide)
-    assert str(caught.value).endswith("standing allows [10, 150].")
+    for box, words in [({"low": [5.0, 1.0]}, "[1, 150] m"), ({"high": [30.0, 151.0]}, "[10, 151] m")]:
+        with pytest.raises(ValueError, match=r"^Base distribution mine gives distance the range") as caught:
+            load_base(replace(STANDING, bases={"mine": {**even, **box}}))
+        assert str(caught.value).endswith(f" the range {words}; standing allows [10, 150].")
 
 
 # --- files --------------------------------------------------------------------------------------
