@@ -21,10 +21,6 @@ FAMILIES = {
 }
 """Public names that several modules define, each in the same role, and the role."""
 
-TESTED_ELSEWHERE: dict[str, str] = {
-}
-"""Modules with logic that have no test module of their name, and where they are tested."""
-
 QUESTION_WORDS = ("What", "How", "Where", "When", "Who", "Which", "Whether", "Why")
 
 
@@ -95,9 +91,7 @@ def test_every_module_with_logic_has_its_tests() -> None:
         for path, tree in sources().items()
         if not path.endswith(("__init__.py", "__main__.py")) and holds_logic(tree) and not test_module_of(path).exists()
     }
-    assert without - set(TESTED_ELSEWHERE) == set()
-    assert set(TESTED_ELSEWHERE) - without == set()
-    assert [place for place in TESTED_ELSEWHERE.values() if not (ROOT / place).exists()] == []
+    assert without == set()
 
 
 def test_names_and_logic_are_recognised() -> None:
