@@ -18,7 +18,7 @@ from rare_envs.sensors.camera import find_camera
 from rare_envs.sensors.kinds import read_kinds
 from rare_envs.simulation.background import find_drivers
 from rare_envs.simulation.clock import Clock
-from rare_envs.simulation.ego_needs import EgoNeeds
+from rare_envs.simulation.ego_interface import EgoNeeds
 from rare_envs.simulation.measurement import Measurement
 from rare_envs.simulation.sensing import Sensing
 from rare_envs.simulation.world import World
@@ -52,8 +52,8 @@ def set_up(
         observation: "features", "lidar", "kinematics" (HighwayEnv's) or "camera"; several, such as "camera+lidar" or
             ("camera", "lidar"), make a `Dict`.
         action: "continuous" or "meta" (HighwayEnv's, see `rare_envs.control.meta_actions`: a step is then one second).
-        measure: The safety measure: a name in `rare_envs.measures.registry.MEASURES`, "stl:FORMULA", "module:name", a
-            `Measure` or another of its kind, or a function; see `rare_envs.measures.registry.find_measure`.
+        measure: The safety measure: a name in `rare_envs.measures.MEASURES`, "stl:FORMULA", "module:name", a
+            `Measure` or another of its kind, or a function; see `rare_envs.measures.find_measure`.
         horizon: Length of an episode [s]; None takes the scenario's.
         dt: Tick [s].
         base: Distribution of the scenario's own parameters: the name of a shipped one, the path of a JSON file, or a

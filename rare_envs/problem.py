@@ -81,7 +81,7 @@ class DrivingProblem:
             env_id: For example "rare_envs/CutIn-v0".
             ego: "idm", a `Driver`, or an object with Stable-Baselines3's `predict`, called on whole batches.
             measure: The safety measure: a name, an object or a function, see
-                `rare_envs.measures.registry.find_measure`.
+                `rare_envs.measures.find_measure`.
             base: Base distribution of x; None takes the environment's default ("us101").
             noise: How the randomness of learned drivers is treated: True, it is part of x, standard normal columns
                 behind the others; "fixed", one sequence for all x, so that p is conditional on it; False, mean
@@ -116,7 +116,7 @@ class DrivingProblem:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What could not be checked and may be meant otherwise; an `AmbiguousActions` warning was given for each."""
+        """Ambiguities that cannot be checked; each was also given as an `AmbiguousActions` warning."""
         accelerations = self.world.clock.action == "continuous" and "kinematics" in self.world.sensing.kinds
         return (AMBIGUOUS,) if accelerations and isinstance(self.needs.action_space, spaces.Discrete) else ()
 
@@ -186,14 +186,14 @@ class DrivingProblem:
         """
         x = self.space.validate(np.atleast_2d(x))
         measurement = Measurement("ttc", self.world.measurement.collisions, statistics=True)
-        world, found = replace(self.world, measurement=measurement), list[Crash]()
+        world, parts = replace(self.world, measurement=measurement), list[Crash]()
         with torch.inference_mode():
             for first in range(0, len(x), self.tile):
                 rows = torch.from_numpy(x[first : first + self.tile]).float()
                 seen = rollout(world, self.driver, rows).statistics
                 assert seen is not None
-                found.append(seen.crash)
-        return Crash(*(torch.cat(parts) for parts in zip(*found, strict=True)))
+                parts.append(seen.crash)
+        return Crash(*(torch.cat(values) for values in zip(*parts, strict=True)))
 
     def crash_kinds(self, x: NDArray[np.float64]) -> list[str]:
         """Return words for the kinds of crash that scenarios x (n, d) end in, such as "rear_end"; see `crashes`."""
@@ -201,7 +201,7 @@ class DrivingProblem:
 
     @property
     def tile(self) -> int:
-        """Rollouts at once: `evaluate` simulates so many rows together, then the next."""
+        """Number of rollouts simulated at once."""
         if self.needs.queries_policy and "camera" in self.world.sensing.kinds:
             return CAMERA_TILE
         if self.world.uses_lidar or self.world.measurement.records:

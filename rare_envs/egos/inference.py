@@ -58,16 +58,16 @@ def query_policy(
             action, hidden = _predict(policy, query)
         return read_actions(kind, action, len(query.start), query.over), hidden
     try:
-        given, hidden, reasons = _query_with_reasons(policy, kind, query)
+        actions, hidden, reasons = _query_with_reasons(policy, kind, query)
     except EgoGone:
         raise
     except (Exception, SystemExit) as error:  # the policy is the user's: anything may happen in it
-        found = None if query.hidden is not None else _isolate_failing_rows(policy, kind, query, error)
-        if found is None:
+        parts = None if query.hidden is not None else _isolate_failing_rows(policy, kind, query, error)
+        if parts is None:
             raise
-        hidden, (given, reasons) = None, found
+        hidden, (actions, reasons) = None, parts
     failed_rows.update(reasons)
-    return given, hidden
+    return actions, hidden
 
 
 def _predict(policy: Any, query: PolicyQuery) -> tuple[Tensor, Any]:
@@ -108,10 +108,10 @@ def _isolate_failing_rows(
     """
 
     def attempt(rows: range) -> tuple[Tensor, dict[int, str]] | None:
-        given, hidden, reasons = _query_with_reasons(policy, kind, query.rows(slice(rows.start, rows.stop)))
+        actions, hidden, reasons = _query_with_reasons(policy, kind, query.rows(slice(rows.start, rows.stop)))
         if hidden is not None:
             return None
-        return given, {rows.start + row: reason for row, reason in reasons.items()}
+        return actions, {rows.start + row: reason for row, reason in reasons.items()}
 
     def give_up(row: int) -> Tensor:
         return _ignored_action(kind, query.over[row : row + 1])

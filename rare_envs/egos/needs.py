@@ -7,7 +7,7 @@ from typing import Any, Protocol, runtime_checkable
 from gymnasium import spaces
 
 from rare_envs.sensors.kinds import OBSERVATIONS, read_kinds
-from rare_envs.simulation.ego_needs import EgoNeeds
+from rare_envs.simulation.ego_interface import EgoNeeds
 from rare_envs.simulation.observation import observation_space
 from rare_envs.simulation.rollout import Driver
 from rare_envs.simulation.world import World
@@ -19,7 +19,7 @@ class PerceivingDriver(Driver, Protocol):
 
     @property
     def needs_lidar(self) -> bool:
-        """Whether it does."""
+        """Whether it reads lidar features."""
 
 
 @runtime_checkable

@@ -17,7 +17,7 @@ from rare_envs.egos.needs import WrappedEgo, resolve
 from rare_envs.egos.wrappers import find_frame_stacking, wrap_policy
 from rare_envs.sensors.kinds import map_kinds
 from rare_envs.simulation.background import Background
-from rare_envs.simulation.ego_needs import EgoNeeds
+from rare_envs.simulation.ego_interface import EgoNeeds
 from rare_envs.simulation.observation import observe
 from rare_envs.simulation.rollout import Driver
 from rare_envs.simulation.world import World
@@ -67,7 +67,7 @@ class PolicyDriver:
 
 
 def _replace_rows(observation: Tensor, rows: Tensor) -> Tensor:
-    """Return an observation with what the first other row sees in some rows; zeros if there is no other."""
+    """Return an observation in which some rows are replaced by the first other row, or by zeros if there is none."""
     wide = rows.view(-1, *[1] * (observation.ndim - 1))
     if bool(rows.all()):
         return observation.masked_fill(wide, 0)

@@ -20,7 +20,7 @@ from rare_envs.multi_agent.episode import MultiAgentEpisode, start
 from rare_envs.multi_agent.rewards import Reward, total_of
 from rare_envs.multi_agent.step import step_agents
 from rare_envs.sensors.kinds import map_kinds
-from rare_envs.simulation.ego_needs import EgoNeeds
+from rare_envs.simulation.ego_interface import EgoNeeds
 from rare_envs.simulation.observation import observe
 
 

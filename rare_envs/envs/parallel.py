@@ -24,7 +24,7 @@ from rare_envs.multi_agent.step import step_agents
 from rare_envs.plugins import did_you_mean
 from rare_envs.scenarios.base import Scenario
 from rare_envs.sensors.kinds import map_kinds
-from rare_envs.simulation.ego_needs import EgoNeeds
+from rare_envs.simulation.ego_interface import EgoNeeds
 from rare_envs.simulation.observation import observe
 
 Actions = Mapping[str, Any]

@@ -170,7 +170,7 @@ def _without_challenger(env: Any) -> None:
 
 
 def _arrange_intersection(env: Any, values: Values) -> None:
-    """Put ego and challenger; of HighwayEnv's other vehicles those too near to them go, by its own rule."""
+    """Place the ego and the challenger; remove vehicles too near to them, by HighwayEnv's rule."""
     road, ego = env.road, env.vehicle
     front = _APPROACH - HIGHWAY_ENV_LENGTH / 2
     move(ego, ("o0", "ir0", 0), front - values["ego_gap"], values["ego_speed"])

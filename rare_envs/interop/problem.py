@@ -46,7 +46,7 @@ class HighwayEnvProblem:
     """
 
     def __init__(self, task: DriveTask, ego: Any, workers: int) -> None:
-        """Make the environment once, here, so that what does not fit is known before the work.
+        """Build the environment once, so that errors show before the simulations.
 
         Args:
             task: Description of a drive.

@@ -41,7 +41,7 @@ def drac(moment: Moment) -> Tensor:
 
 
 def required_deceleration(moment: Moment) -> Tensor:
-    """Return the least constant deceleration with which the ego never touches its lead, which keeps its own.
+    """Return the least constant deceleration with which the ego never reaches a lead of constant acceleration.
 
     With b the deceleration of the lead over the last tick (b = 0 where it speeds up), v the ego's speed, w the lead's
     and dv = v - w, two cases. The speeds become equal while the lead still moves: b + dv^2 / (2 gap). The lead stops

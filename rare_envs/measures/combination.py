@@ -85,7 +85,7 @@ def minimum(*measures: Any) -> Combined:
 
 
 def weighted(*terms: tuple[Any, float]) -> Combined:
-    """Return a weighted sum of the f of several measures; a collision counts as the sum of what it is worth to each.
+    """Return the weighted sum of measures; after a collision, the sum of their collision values.
 
     Args:
         *terms: Pairs of a measure, whatever `find_measure` takes, and its weight, positive and finite.

@@ -168,7 +168,7 @@ class TraceMeasure:
     """It keeps whole episodes."""
 
     def gamma(self, value: float) -> float:
-        """Return the threshold of f that stands for a value in the measure's own unit and sign."""
+        """Return the threshold of f that corresponds to a value in the measure's own unit and sign."""
         return value if self.critical is None else self.critical - value
 
     def start(self, moment: Moment, ticks: int) -> Record:

@@ -65,7 +65,7 @@ def clearance(moment: Moment) -> Tensor:
 
 
 def margin(moment: Moment) -> Tensor:
-    """Return the time to contact without a cap: it tells vehicles apart that are far, level or on their way apart.
+    """Return the uncapped time to contact; it also orders vehicles that do not approach.
 
     Along each of the four axes on which two boxes can be apart, the time in which the gap g closes at the rate c:
     2 g / (c + sqrt(c^2 + 4 d^2)) with d = `DRIFT`, about g / c where it closes, g / d where it stays, g |c| / d^2 where

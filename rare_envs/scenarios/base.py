@@ -43,7 +43,7 @@ US 101 (at most 27 m/s in the events) and free-flow traffic reach."""
 
 @dataclass(frozen=True, kw_only=True)
 class Scenario:
-    """A scenario: all that the project knows of it in one object.
+    """A scenario: parameters, initial state, motion of the others, and defaults.
 
     The shipped ones are a file each and a line in `SCENARIOS`; `rare_envs.register_scenario` adds one of your own, and
     `docs/scenarios.md` shows how to write it.

@@ -26,7 +26,7 @@ class Measurement:
     """
 
     measure: Any = "ttc"
-    """What `rare_envs.measures.registry.find_measure` takes: a name, a `Measure`, a function of a `Moment`."""
+    """What `rare_envs.measures.find_measure` takes: a name, a `Measure`, a function of a `Moment`."""
     collisions: str = "ego"
     """Which collisions count: those of the "ego", or "any", those between other vehicles too."""
     statistics: bool = False

@@ -73,7 +73,7 @@ class ScenarioOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class WorldOptions(ScenarioOptions):
-    """With what is random in the world beside the scenario, for training and estimation."""
+    """Options of the world: noise and weather."""
 
     noise: Annotated[
         NoiseChoice, typer.Option("--noise", help="The drivers' noise: part of x, one fixed sequence, none.")
@@ -83,7 +83,7 @@ class WorldOptions(ScenarioOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class QuestionOptions(WorldOptions):
-    """With what is estimated, and how: for `estimate` and `compare`."""
+    """Options of a question: method, measure, threshold."""
 
     method: Annotated[str, typer.Option(help="Estimation method; see rare-envs list.")] = "two-stage"
     measure: Annotated[
@@ -97,7 +97,7 @@ class QuestionOptions(WorldOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class EstimateOptions(QuestionOptions):
-    """With what only `estimate` takes."""
+    """Options of `estimate` alone."""
 
     ego: Annotated[
         str, typer.Option(help="A name, a .zip or .onnx, module:function, tcp://..., noisy:EGO; see rare-envs list.")

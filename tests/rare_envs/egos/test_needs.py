@@ -9,7 +9,7 @@ from gymnasium import spaces
 import agents
 import rare_envs
 from rare_envs.egos.needs import PerceivingDriver, WrappedEgo, is_policy, resolve
-from rare_envs.simulation.ego_needs import EgoNeeds
+from rare_envs.simulation.ego_interface import EgoNeeds
 from rare_envs.simulation.observation import observation_space
 
 CUT_IN = "rare_envs/CutIn-v0"

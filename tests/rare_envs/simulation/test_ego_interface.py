@@ -1,7 +1,7 @@
 """Needs of an ego: noise columns are those of its source."""
 
 from rare_envs.scenarios.car_following import CAR_FOLLOWING
-from rare_envs.simulation.ego_needs import EgoNeeds
+from rare_envs.simulation.ego_interface import EgoNeeds
 from rare_envs.simulation.world import World
 
 
