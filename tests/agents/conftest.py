@@ -44,8 +44,8 @@ def features(generator: torch.Generator) -> Callable[[int, int], torch.Tensor]:
 
 
 @pytest.fixture
-def law(rng: np.random.Generator) -> WeightDistribution:
-    """A law of 404 weights with as sparse a precision as a graphical lasso gives."""
+def weight_distribution(rng: np.random.Generator) -> WeightDistribution:
+    """Distribution of 404 weights with as sparse a precision as a graphical lasso gives."""
     factor = np.diag(rng.uniform(100.0, 500.0, HEAD_SIZE))
     rows, columns = rng.integers(HEAD_SIZE, size=(2, 400))
     factor[rows, columns] += 50.0 * rng.standard_normal(400)

@@ -32,6 +32,10 @@ TRACK_NAMES = {
     "leader": ("precedingId",),
 }
 """Headers in the file of tracks, by name of column."""
+LARGEST_STEP = 1.5
+"""Frames between two rows of a vehicle from which on its track is cut: between 1 (no hole) and 2 (one is missing)."""
+ROUNDING = 1e-6
+"""Tolerance [ticks] within which the end of a track counts as a multiple of `DT`: more than times are rounded by."""
 SIDES = {1: "upper", 2: "lower"}
 """Names of the two carriageways by drivingDirection."""
 
@@ -163,11 +167,11 @@ def _resample(
 ) -> dict[str, FloatArray]:
     """Return tracks at multiples of `DT`, cut at their holes; `values` has the columns from "x" to "width"."""
     order = np.lexsort([time, vehicle])
-    cuts = 1 + np.flatnonzero((np.diff(vehicle[order]) != 0) | (np.diff(time[order]) > 1.5 * dt))
+    cuts = 1 + np.flatnonzero((np.diff(vehicle[order]) != 0) | (np.diff(time[order]) > LARGEST_STEP * dt))
     parts: list[FloatArray] = []
     for piece in np.split(order, cuts):
         t = time[piece]
-        frame = np.arange(np.ceil(t[0] / DT - 1e-6), np.floor(t[-1] / DT + 1e-6) + 1.0)
+        frame = np.arange(np.ceil(t[0] / DT - ROUNDING), np.floor(t[-1] / DT + ROUNDING) + 1.0)
         at = np.clip(frame * DT, t[0], t[-1])
         if not len(frame):
             continue

@@ -23,6 +23,8 @@ STEP = 100.0
 """Time between frames [ms]."""
 PAUSE = 60_000.0
 """Time [ms] after which a number that comes back belongs to another vehicle: each 15 minutes were numbered anew."""
+LANE_SPACINGS = (2.5, 5.0)
+"""Least and greatest distance [m] between the centres of neighbouring lanes: US freeways have lanes of 3.0 to 3.7 m."""
 RENUMBER_OFFSET = 1_000_000
 """Number added to that of such a vehicle, once for each time it comes back."""
 COLUMN_NAMES = {
@@ -160,7 +162,7 @@ def estimate_lane_edges(y: FloatArray, lane: NDArray[np.int64]) -> tuple[float, 
     centres: list[float] = []
     for number in range(1, int(lane.max()) + 1):
         centre = float(np.median(y[lane == number])) if (lane == number).any() else np.nan
-        if not np.isfinite(centre) or (centres and not 2.5 <= centre - centres[-1] <= 5.0):
+        if not np.isfinite(centre) or (centres and not LANE_SPACINGS[0] <= centre - centres[-1] <= LANE_SPACINGS[1]):
             break
         centres.append(centre)
     if len(centres) < 2:

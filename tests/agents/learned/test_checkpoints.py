@@ -26,8 +26,10 @@ PROVENANCE = Provenance(
 
 
 @pytest.fixture
-def driver(policy, law):
-    return LearnedDriver(policy, AutoregressiveNoise((0.95, 0.9)), (-7.0, 3.5), (-0.25, 0.3), law, "tester")
+def driver(policy, weight_distribution):
+    return LearnedDriver(
+        policy, AutoregressiveNoise((0.95, 0.9)), (-7.0, 3.5), (-0.25, 0.3), weight_distribution, "tester"
+    )
 
 
 @pytest.fixture

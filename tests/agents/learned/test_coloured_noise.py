@@ -1,4 +1,4 @@
-"""Coloured noise: its law in closed form and in samples."""
+"""Coloured noise: its distribution in closed form and in samples."""
 
 import math
 

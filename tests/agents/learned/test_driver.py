@@ -50,9 +50,9 @@ def test_own_weights_and_none_agree(driver, features):
     torch.testing.assert_close(driver.act(x, weights)[0], driver.act(x)[0], atol=1e-6, rtol=0.0)
 
 
-def test_weights_may_come_as_draws_of_a_law(driver, features, law, rng):
+def test_weights_may_come_as_draws_of_a_distribution(driver, features, weight_distribution, rng):
     x = features(4, 2)
-    weights = torch.from_numpy(law.sample(4, rng))
+    weights = torch.from_numpy(weight_distribution.sample(4, rng))
     action, _ = driver.act(x, weights)
     assert action.dtype == torch.float32
     torch.testing.assert_close(action, driver.act(x, weights.float())[0])

@@ -1,4 +1,4 @@
-"""The law of the last layer's weights: density, draws and maps against each other, arrays, and as a block."""
+"""Distribution of the last layer's weights: density, draws and maps against each other, arrays, and as a block."""
 
 from types import SimpleNamespace
 
@@ -32,13 +32,15 @@ def test_draws_have_mean_and_covariance(small, rng):
     np.testing.assert_allclose(small.std, np.sqrt(np.diag(covariance)), rtol=1e-12)
 
 
-def test_draws_and_maps_are_those_of_the_generator(law):
+def test_draws_and_maps_are_those_of_the_generator(weight_distribution):
     u = np.random.default_rng(5).standard_normal((4, 404))
-    np.testing.assert_array_equal(law.sample(4, np.random.default_rng(5)), law.from_standard_normal(u))
+    np.testing.assert_array_equal(
+        weight_distribution.sample(4, np.random.default_rng(5)), weight_distribution.from_standard_normal(u)
+    )
 
 
-def test_it_is_named_in_one_short_line(law):
-    assert repr(law) == "WeightDistribution(404 weights, radius=0.01)"
+def test_it_is_named_in_one_short_line(weight_distribution):
+    assert repr(weight_distribution) == "WeightDistribution(404 weights, radius=0.01)"
 
 
 def test_a_seed_is_no_generator(small):
@@ -46,44 +48,55 @@ def test_a_seed_is_no_generator(small):
         small.sample(3, 0)
 
 
-def test_maps_are_inverse_and_density_is_theirs(law, rng):
+def test_maps_are_inverse_and_density_is_theirs(weight_distribution, rng):
     """log p(x) = log phi(u) - log |dx / du| at u = the point in standard normal space."""
-    u = rng.standard_normal((20, law.dim))
-    x = law.from_standard_normal(u)
-    np.testing.assert_allclose(law.to_standard_normal(x), u, atol=1e-10)
-    _, log_det = np.linalg.slogdet(law.precision)
-    np.testing.assert_allclose(law.log_prob(x), stats.norm.logpdf(u).sum(axis=1) + 0.5 * log_det, rtol=1e-12)
-    np.testing.assert_allclose(law.covariance @ law.precision, np.eye(law.dim), atol=1e-8)
-    np.testing.assert_array_equal(law.cholesky, np.tril(law.cholesky))
+    u = rng.standard_normal((20, weight_distribution.dim))
+    x = weight_distribution.from_standard_normal(u)
+    np.testing.assert_allclose(weight_distribution.to_standard_normal(x), u, atol=1e-10)
+    _, log_det = np.linalg.slogdet(weight_distribution.precision)
+    np.testing.assert_allclose(
+        weight_distribution.log_prob(x), stats.norm.logpdf(u).sum(axis=1) + 0.5 * log_det, rtol=1e-12
+    )
+    np.testing.assert_allclose(
+        weight_distribution.covariance @ weight_distribution.precision, np.eye(weight_distribution.dim), atol=1e-8
+    )
+    np.testing.assert_array_equal(weight_distribution.cholesky, np.tril(weight_distribution.cholesky))
 
 
-def test_rows_stand_alone(law, rng):
-    x = law.sample(5, rng)
-    for call in (law.log_prob, law.to_standard_normal, law.from_standard_normal):
+def test_rows_stand_alone(weight_distribution, rng):
+    x = weight_distribution.sample(5, rng)
+    for call in (
+        weight_distribution.log_prob,
+        weight_distribution.to_standard_normal,
+        weight_distribution.from_standard_normal,
+    ):
         alone = np.concatenate([call(row[None]) for row in x])
         np.testing.assert_allclose(alone, call(x), rtol=1e-12, atol=1e-10)
 
 
-def test_arrays_bring_back_the_same_law(law):
-    arrays = law.to_arrays()
-    again = WeightDistribution.from_arrays(arrays, law.radius)
-    np.testing.assert_array_equal(again.mean, law.mean)
-    np.testing.assert_array_equal(again.precision, law.precision)
-    assert sum(array.nbytes for array in arrays.values()) < 0.1 * law.precision.nbytes
+def test_arrays_bring_back_the_same_distribution(weight_distribution):
+    arrays = weight_distribution.to_arrays()
+    again = WeightDistribution.from_arrays(arrays, weight_distribution.radius)
+    np.testing.assert_array_equal(again.mean, weight_distribution.mean)
+    np.testing.assert_array_equal(again.precision, weight_distribution.precision)
+    assert sum(array.nbytes for array in arrays.values()) < 0.1 * weight_distribution.precision.nbytes
 
 
-def test_it_is_a_block_whose_mean_stays_in_the_box(law, rng):
+def test_it_is_a_block_whose_mean_stays_in_the_box(weight_distribution, rng):
     base = SimpleNamespace(
-        blocks=(law, SimpleNamespace(alpha=np.full(2, 2.0), beta=np.full(2, 2.0), low=np.zeros(2), high=np.ones(2))),
-        log_prob=lambda x: law.log_prob(x[:, :404]) + stats.beta(2, 2).logpdf(x[:, 404:]).sum(axis=1),
+        blocks=(
+            weight_distribution,
+            SimpleNamespace(alpha=np.full(2, 2.0), beta=np.full(2, 2.0), low=np.zeros(2), high=np.ones(2)),
+        ),
+        log_prob=lambda x: weight_distribution.log_prob(x[:, :404]) + stats.beta(2, 2).logpdf(x[:, 404:]).sum(axis=1),
     )
     product = announced_blocks(SimpleNamespace(base=base, dim=406))
     x = product.sample(300, rng)
     wanted = np.full((2, 300), 1 / 300)
     x[:, :404] += 0.05  # asks for means far outside the box
     moved = product.project(x, wanted, 0.8)
-    shift = moved.sample(20_000, rng)[:, :404].mean(axis=0) - law.mean
-    assert np.abs(shift).max() < RADIUS + 5 * law.std.max() / np.sqrt(20_000)
+    shift = moved.sample(20_000, rng)[:, :404].mean(axis=0) - weight_distribution.mean
+    assert np.abs(shift).max() < RADIUS + 5 * weight_distribution.std.max() / np.sqrt(20_000)
     assert np.abs(shift).max() > 0.5 * RADIUS
 
 
