@@ -4,8 +4,28 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Annotated
 
 import typer
+
+RunFolderOption = Annotated[Path, typer.Option(help="Folder; a training that was stopped in it is taken up.")]
+DataOption = Annotated[Path | None, typer.Option(help="Folder with the files of US 101: compact tables, or events.")]
+NgsimOption = Annotated[Path | None, typer.Option(help="Or a raw NGSIM file, CSV or text.")]
+HighdOption = Annotated[Path | None, typer.Option(help="Or a folder with highD's files.")]
+LocationOption = Annotated[str | None, typer.Option(help="Location, where an NGSIM file has several.")]
+
+
+def find_recordings(data: Path | None, ngsim: Path | None, highd: Path | None) -> tuple[str, Path]:
+    """Return the one source of recordings among the options: "data", "ngsim" or "highd", and its path.
+
+    Raises:
+        ValueError: None is given, or several are.
+    """
+    named = [(kind, path) for kind, path in (("data", data), ("ngsim", ngsim), ("highd", highd)) if path is not None]
+    if len(named) != 1:
+        raise ValueError("Expected one of --data FOLDER, --ngsim FILE and --highd FOLDER.")
+    return named[0]
 
 
 @contextlib.contextmanager

@@ -1,9 +1,11 @@
 """Command lines of the trainings: options, exit codes, one line for an error."""
 
+from pathlib import Path
+
 import pytest
 import typer
 
-from training.command_line import report_errors, run_command
+from training.command_line import find_recordings, report_errors, run_command
 
 
 @pytest.mark.parametrize("error", [ValueError("no such kind"), FileNotFoundError("no such kind")])
@@ -28,3 +30,10 @@ def test_options_come_from_the_signature(monkeypatch, capsys):
         run_command(double)
     assert stop.value.code == 0
     assert capsys.readouterr().out == "12\n"
+
+
+def test_one_source_of_recordings_is_found():
+    assert find_recordings(None, Path("a.csv"), None) == ("ngsim", Path("a.csv"))
+    for wrong in ((None, None, None), (Path("a"), None, Path("b"))):
+        with pytest.raises(ValueError, match="one of --data FOLDER, --ngsim FILE and --highd FOLDER"):
+            find_recordings(*wrong)

@@ -23,7 +23,7 @@ import torch
 import typer
 
 from agents import LearnedEgo, Provenance, save_driver
-from training.command_line import report_errors, run_command
+from training.command_line import RunFolderOption, report_errors, run_command
 from training.data.scenes import TrafficScene
 from training.egos.encounters import EncounterSpec, make_scenes
 from training.egos.nominal_driving import judge_all_cases
@@ -138,7 +138,7 @@ def train_imitation_ego(
 
 
 def main(
-    out: Annotated[Path, typer.Option(help="Folder; a training that was stopped in it is taken up.")],
+    out: RunFolderOption,
     data: Annotated[Path, typer.Option(help="Folder with the compact tables of US 101.")],
     seed: Annotated[int, typer.Option(help="The same seed gives the same weights.")] = CONFIG.seed,
 ) -> None:

@@ -31,7 +31,7 @@ from agents import Provenance
 from agents.vision.checkpoint import save_vision
 from agents.vision.ego import VisionEgo
 from agents.vision.pilotnet import PILOTNET_HIDDEN_UNITS, PilotNet
-from training.command_line import report_errors, run_command
+from training.command_line import RunFolderOption, report_errors, run_command
 from training.egos.expert_driver import AUXILIARY_SIZE
 from training.egos.image_dataset import LabelledPictures, collect, concatenate, mirror
 from training.egos.nominal_driving import judge_all_cases
@@ -251,7 +251,7 @@ def make_provenance(config: VisionConfig, metrics: dict[str, Any]) -> Provenance
 
 
 def main(
-    out: Annotated[Path, typer.Option(help="Folder; a training that was stopped in it is taken up.")],
+    out: RunFolderOption,
     seed: Annotated[int, typer.Option(help="Of everything that is random.")] = VisionConfig.seed,
     rounds: Annotated[int, typer.Option(help="Of corrections.")] = VisionConfig.rounds,
     judged: Annotated[int, typer.Option(help="Minutes of driving in each kind of ordinary traffic to judge it.")] = 0,

@@ -17,7 +17,16 @@ from typing import Annotated, Any
 import torch
 import typer
 
-from training.command_line import report_errors, run_command
+from training.command_line import (
+    DataOption,
+    HighdOption,
+    LocationOption,
+    NgsimOption,
+    RunFolderOption,
+    find_recordings,
+    report_errors,
+    run_command,
+)
 from training.imitation.algorithms.config import Config
 from training.imitation.datasets import Source
 from training.imitation.run_folder import NOISES, train_driver
@@ -46,11 +55,11 @@ WeightRange = Annotated[tuple[float, float], typer.Option(help="First and last v
 
 
 def main(
-    out: Annotated[Path, typer.Option(help="Folder; a training that was stopped in it is taken up.")],
-    data: Annotated[Path | None, typer.Option(help="Folder with the compact tables of US 101.")] = None,
-    ngsim: Annotated[Path | None, typer.Option(help="Or a raw NGSIM file, CSV or text.")] = None,
-    highd: Annotated[Path | None, typer.Option(help="Or a folder with highD's files.")] = None,
-    location: Annotated[str | None, typer.Option(help="Of an NGSIM file that has several.")] = None,
+    out: RunFolderOption,
+    data: DataOption = None,
+    ngsim: NgsimOption = None,
+    highd: HighdOption = None,
+    location: LocationOption = None,
     recording: Annotated[list[str] | None, typer.Option(help="Of highD, such as 01; may be repeated.")] = None,
     seconds: Annotated[float, typer.Option(help="Length of the scenes of such files [s].")] = Source.seconds,
     log: Annotated[bool, typer.Option("--log", help="Write TensorBoard logs into the folder.")] = False,
@@ -121,10 +130,7 @@ def source_of(
     Raises:
         ValueError: None is given, or several are.
     """
-    named = [(kind, path) for kind, path in (("data", data), ("ngsim", ngsim), ("highd", highd)) if path is not None]
-    if len(named) != 1:
-        raise ValueError("Expected one of --data FOLDER, --ngsim FILE and --highd FOLDER.")
-    return Source(*named[0], location, tuple(recording or ()), seconds)
+    return Source(*find_recordings(data, ngsim, highd), location, tuple(recording or ()), seconds)
 
 
 if __name__ == "__main__":

@@ -26,7 +26,15 @@ import typer
 
 from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
 from rare_envs.scenarios.registry import scenario_named
-from training.command_line import report_errors, run_command
+from training.command_line import (
+    DataOption,
+    HighdOption,
+    LocationOption,
+    NgsimOption,
+    find_recordings,
+    report_errors,
+    run_command,
+)
 from training.data.events import EXTRACTORS, Events, concatenate_events, write_events
 from training.data.highd import highd_recordings, load_highd
 from training.data.ngsim import load_ngsim
@@ -209,10 +217,10 @@ def fit_own_bases(
 
 def main(
     out: Annotated[Path, typer.Option(help="Folder for the JSON files.")],
-    data: Annotated[Path | None, typer.Option(help="Folder with the US 101 events files.")] = None,
-    highd: Annotated[Path | None, typer.Option(help="Data folder of highD.")] = None,
-    ngsim: Annotated[Path | None, typer.Option(help="A raw NGSIM file.")] = None,
-    location: Annotated[str | None, typer.Option(help="Location, where an NGSIM file has several.")] = None,
+    data: DataOption = None,
+    highd: HighdOption = None,
+    ngsim: NgsimOption = None,
+    location: LocationOption = None,
     cut_gaps: Annotated[bool, typer.Option("--cut-gaps", help="Cut tracks where frames are missing.")] = False,
     scenario: Annotated[list[str] | None, typer.Option(help="Of your own recordings: which to fit.")] = None,
     name: Annotated[str, typer.Option(help="Name of the bases of your own recordings.")] = "own",
@@ -220,19 +228,18 @@ def main(
 ) -> None:
     """Write base distributions: us101 (fitted) and highway (assembled), or those of your own recordings."""
     with report_errors("fit"):
-        if sum(source is not None for source in (data, highd, ngsim)) != 1:
-            raise ValueError("Give one of --data, --highd and --ngsim.")
+        kind, path = find_recordings(data, ngsim, highd)
         chosen = tuple(scenario or EVENT_RECIPES)
         if unknown := sorted(set(chosen) - set(EVENT_RECIPES)):
             raise ValueError(f"Unknown scenario {unknown[0]}; known are {', '.join(EVENT_RECIPES)}.")
         gaps: Gaps = "cut" if cut_gaps else "error"
-        if highd is not None:
-            tables = (load_highd(highd, recording, gaps=gaps) for recording in highd_recordings(highd))
+        if kind == "highd":
+            tables = (load_highd(path, recording, gaps=gaps) for recording in highd_recordings(path))
             fit_own_bases(tables, chosen, out, name, seed)
-        elif ngsim is not None:
-            fit_own_bases([load_ngsim(ngsim, location=location, gaps=gaps)], chosen, out, name, seed)
-        elif data is not None:
-            _write_package_bases(data, out, seed)
+        elif kind == "ngsim":
+            fit_own_bases([load_ngsim(path, location=location, gaps=gaps)], chosen, out, name, seed)
+        else:
+            _write_package_bases(path, out, seed)
 
 
 def _write_package_bases(data: Path, out: Path, seed: int) -> None:

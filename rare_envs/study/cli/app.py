@@ -28,6 +28,7 @@ from rare_envs.study.cli.options import (
 )
 from rare_envs.study.cli.shell import OneLineErrors, print_json, show_interruption, use_one_thread
 from rare_envs.study.errors import as_bad_input
+from training.command_line import DataOption, HighdOption, NgsimOption, RunFolderOption
 
 DOUBTFUL = 3
 
@@ -169,10 +170,10 @@ def _estimate_options(world: dict[str, Any], noise: NoiseChoice) -> str:
 
 @app.command("train-drivers")
 def train_drivers_command(
-    out: Annotated[Path, typer.Option(help="Folder; a training that was stopped in it is taken up.")],
-    data: Annotated[Path | None, typer.Option(help="Folder with the compact tables of US 101.")] = None,
-    ngsim: Annotated[Path | None, typer.Option(help="Or a raw NGSIM file, CSV or text.")] = None,
-    highd: Annotated[Path | None, typer.Option(help="Or a folder with highD's files.")] = None,
+    out: RunFolderOption,
+    data: DataOption = None,
+    ngsim: NgsimOption = None,
+    highd: HighdOption = None,
     method: Annotated[str, typer.Option(help="bc, gail or mgail.")] = "mgail",
     updates: Annotated[int | None, typer.Option(help="Updates of the policy.")] = None,
     seed: SeedOption = 0,

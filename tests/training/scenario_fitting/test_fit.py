@@ -81,11 +81,11 @@ def test_bases_are_fitted_to_a_raw_ngsim_file(simulated, quick, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ((), "Give one of --data, --highd and --ngsim"),
+        ((), "Expected one of --data FOLDER, --ngsim FILE and --highd FOLDER"),
         (("--highd", "none"), "has no files XX_tracks.csv"),
         (("--ngsim", "none.csv"), "Cannot read none.csv"),
         (("--ngsim", "none.csv", "--scenario", "merge"), "Unknown scenario merge"),
-        (("--ngsim", "none.csv", "--data", "none"), "Give one of"),
+        (("--ngsim", "none.csv", "--data", "none"), "Expected one of"),
     ],
 )
 def test_bad_arguments_are_one_line_and_exit_code_2(arguments, message, tmp_path):
