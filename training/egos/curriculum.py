@@ -297,7 +297,8 @@ def start_situation(situation: Situation, rows: int, seconds: float, rng: np.ran
 
 def _draw_weather(n: int, rng: np.random.Generator) -> Array:
     """Draw weather: half of the days are clear; on the others the fog is thicker than in the base distribution."""
-    fog = np.exp(rng.uniform(*map(math.log, SETTINGS.fog), (n, 1)))
+    least, most = SETTINGS.fog
+    fog = np.exp(rng.uniform(math.log(least), math.log(most), (n, 1)))
     some = np.concatenate((fog, SUN_DISTRIBUTION.sample(n, rng), SENSOR_NOISE_DISTRIBUTION.sample(n, rng)), axis=1)
     clear = np.array([CLEAR[0], math.degrees(CLEAR[1]), math.degrees(CLEAR[2]), 0.0])
     return np.where(rng.random((n, 1)) < SETTINGS.clear_share, clear, some)
