@@ -41,13 +41,16 @@ def periodic(way: Tensor) -> Tensor:
     return (way + PERIOD / 2).remainder(PERIOD) - PERIOD / 2
 
 
-def footprints(s: float, t: float, length: float, width: float, turn: float = 0.0) -> Cover:
-    """What covers one pixel, so long in the camera's heading and so wide across, of a road with edges at -2, 2, 6."""
+def footprints(s: float, t: float, length: float, width: float, turn: float = 0.0, aside: float = 0.0) -> Cover:
+    """What covers one pixel, so long in the camera's heading and so wide across, of a road with edges at -2, 2, 6.
+
+    `aside` is how far to the right of it the pixel above lies.
+    """
     single, none = torch.ones(1, 1), torch.zeros(1, 1)
     place = [(torch.full((1, 1, 1), value), none[None], none[None]) for value in (s, t)]
     across = torch.full((1, 1, 1), math.cos(turn))
     lines = Lines(place[0], (place[1][0], across, none[None]), torch.full((1, 1, 1), math.sin(turn)))
-    seen = Pixels(none, none, 0, none, none, single, -length * single, none, width * single)
+    seen = Pixels(none, none, 0, none, none, single, -length * single, -aside * single, width * single)
     return cover_of(lines, straight(2), seen)
 
 
@@ -139,6 +142,16 @@ def test_a_camera_across_the_road_sees_lines_in_the_length_of_its_pixels() -> No
     assert turned.white.item() == pytest.approx(LINE_WIDTH / 0.6, abs=1e-4)  # all of the pixel's length is across
     strip = 1.0 * 0.5 + 0.4 * math.sqrt(0.75)
     assert footprints(0.0, -2.0, 1.0, 0.4, math.pi / 6).yellow.item() == pytest.approx(LINE_WIDTH / strip)
+
+
+def test_rows_that_slant_shorten_a_footprint_on_a_turned_road() -> None:
+    """1 m ahead and 0.5 m to the right, turned by 30 degrees: cos 30 - 0.5 sin 30 along the road, the rest across."""
+    cos, sin, beyond = math.sqrt(0.75), 0.5, 0.2
+    along, across = cos - 0.5 * sin, sin + 0.5 * cos
+    dash = (along / 2 - beyond) / along  # of a footprint with its middle 0.2 m beyond the end of a dash
+    line = LINE_WIDTH / (across + 0.1 * cos)
+    cover = footprints(DASH + beyond, 2.0, length=1.0, width=0.1, turn=math.pi / 6, aside=0.5)
+    assert cover.white.item() == pytest.approx(dash * line, abs=1e-5)
 
 
 def coloured(cover: tuple[float, float, float], light: Light, shade: bool = False, distance: float = 50.0) -> Tensor:
