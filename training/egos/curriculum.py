@@ -125,7 +125,7 @@ class CurriculumSettings:
     """Distances that these are moved back [m]."""
 
 
-SETTINGS = CurriculumSettings()
+CURRICULUM = CurriculumSettings()
 """Settings of the curriculum of the ego `vision`."""
 
 
@@ -189,7 +189,7 @@ FOLLOWING = Scenario(
 
 def _draw_speeds(n: int, rng: np.random.Generator) -> tuple[Array, Array]:
     """Draw speeds of the ego, some of them slow, and speeds near those [m/s]."""
-    c = SETTINGS
+    c = CURRICULUM
     slow = rng.random(n) < c.slow_share
     own = np.where(slow, rng.uniform(*c.slow_speeds, n), rng.uniform(c.least_speed, c.top_speed, n))
     return own, np.clip(own + rng.normal(0.0, c.speed_std, n), 0.0, c.top_speed + c.lead_excess)
@@ -197,7 +197,7 @@ def _draw_speeds(n: int, rng: np.random.Generator) -> tuple[Array, Array]:
 
 def _draw_following(n: int, rng: np.random.Generator) -> Array:
     """Draw columns of `FOLLOWING`, shape (n, 8)."""
-    c = SETTINGS
+    c = CURRICULUM
     own, lead = _draw_speeds(n, rng)
     far = rng.random(n) < c.far_share
     gap = np.where(far, c.far_gap, c.standstill + own * rng.uniform(*c.headways, n))
@@ -212,7 +212,7 @@ def _draw_following(n: int, rng: np.random.Generator) -> Array:
 
 def _draw_cut_in(n: int, rng: np.random.Generator) -> Array:
     """Draw columns of the cut-in, shape (n, 6)."""
-    c = SETTINGS
+    c = CURRICULUM
     own, lead = _draw_speeds(n, rng)
     cutter = np.clip(own + rng.normal(0.0, c.other_speed_std, n), 0.0, c.other_top_speed)
     gaps = rng.uniform(*c.cut_in_gaps, n), rng.uniform(*c.cut_in_lead_gaps, n)
@@ -221,7 +221,7 @@ def _draw_cut_in(n: int, rng: np.random.Generator) -> Array:
 
 def _draw_hard_brake(n: int, rng: np.random.Generator) -> Array:
     """Draw columns of the hard brake, shape (n, 3)."""
-    c = SETTINGS
+    c = CURRICULUM
     own = rng.uniform(c.brake_least_speed, c.top_speed, n)
     gap = c.brake_standstill + own * rng.uniform(*c.brake_headways, n)
     return np.column_stack((own, gap, rng.uniform(*c.brakings, n)))
@@ -239,7 +239,7 @@ def make_situations() -> tuple[Situation, ...]:
         return lambda rng: replace(scenario, road=draw_road(rng))
 
     def in_traffic(rng: np.random.Generator) -> Scenario:
-        if rng.random() < SETTINGS.i80_share:
+        if rng.random() < CURRICULUM.i80_share:
             return make_ordinary_traffic("traffic", i80(), int(rng.integers(1, 5)))
         road = draw_road(rng, least=3)
         inner = 1 if road.lanes == 3 else int(rng.integers(1, road.lanes - 1))
@@ -260,14 +260,14 @@ def make_situations() -> tuple[Situation, ...]:
 
 def draw_road(rng: np.random.Generator, least: int = 1) -> Road:
     """Draw a road of `least` to four lanes, one of them centred on y = 0; one in three is straight."""
-    lanes, width = int(rng.integers(least, SETTINGS.most_lanes + 1)), float(rng.choice(SETTINGS.lane_widths))
+    lanes, width = int(rng.integers(least, CURRICULUM.most_lanes + 1)), float(rng.choice(CURRICULUM.lane_widths))
     own = int(rng.integers(0, lanes))
     edges = tuple(width * (k - own - 0.5) for k in range(lanes + 1))
-    if rng.random() < SETTINGS.straight_share:
+    if rng.random() < CURRICULUM.straight_share:
         return Road(edges)
-    curvature = rng.uniform(-SETTINGS.largest_curvature, SETTINGS.largest_curvature, SETTINGS.curve_points)
+    curvature = rng.uniform(-CURRICULUM.largest_curvature, CURRICULUM.largest_curvature, CURRICULUM.curve_points)
     curvature -= curvature.mean()  # it returns to its first direction
-    return Road(edges, ReferenceLine(SETTINGS.curve_spacing, (0.0, *(0.5 * curvature), 0.0)))
+    return Road(edges, ReferenceLine(CURRICULUM.curve_spacing, (0.0, *(0.5 * curvature), 0.0)))
 
 
 def start_situation(situation: Situation, rows: int, seconds: float, rng: np.random.Generator) -> tuple[World, Episode]:
@@ -297,16 +297,16 @@ def start_situation(situation: Situation, rows: int, seconds: float, rng: np.ran
 
 def _draw_weather(n: int, rng: np.random.Generator) -> Array:
     """Draw weather: half of the days are clear; on the others the fog is thicker than in the base distribution."""
-    least, most = SETTINGS.fog
+    least, most = CURRICULUM.fog
     fog = np.exp(rng.uniform(math.log(least), math.log(most), (n, 1)))
     some = np.concatenate((fog, SUN_DISTRIBUTION.sample(n, rng), SENSOR_NOISE_DISTRIBUTION.sample(n, rng)), axis=1)
     clear = np.array([CLEAR[0], math.degrees(CLEAR[1]), math.degrees(CLEAR[2]), 0.0])
-    return np.where(rng.random((n, 1)) < SETTINGS.clear_share, clear, some)
+    return np.where(rng.random((n, 1)) < CURRICULUM.clear_share, clear, some)
 
 
 def _displace_ego(state: State, scenario: Scenario, rng: np.random.Generator) -> State:
     """Displace and turn the ego in its lane; on the highway also move it back and into any lane."""
-    n, c = len(state.x), SETTINGS
+    n, c = len(state.x), CURRICULUM
     offset = np.clip(rng.normal(0.0, c.offset_std, n), -c.largest_offset, c.largest_offset)
     x, y = state.x[:, 0].double().numpy(), state.y[:, 0].double().numpy() + offset
     heading = np.clip(rng.normal(0.0, c.heading_std, n), -c.largest_heading, c.largest_heading)

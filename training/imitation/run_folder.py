@@ -22,7 +22,7 @@ from training.imitation.evaluation.realism import header_metrics
 from training.imitation.fit import CHECKPOINT, make_learner, prepare_data, train_learner
 from training.imitation.progress import summary_writer
 
-DRIVER, SETTINGS = "driver.safetensors", "training.json"
+DRIVER, SETTINGS_FILE = "driver.safetensors", "training.json"
 """Names of the files in the folder of a training, beside the checkpoint."""
 NOISES = {"human": HUMAN_NOISE, "white": WHITE_NOISE}
 """Noises by their names on the command line."""
@@ -122,7 +122,7 @@ def check_folder(out: Path, settings: str) -> None:
     if out.exists() and not out.is_dir():
         raise ValueError(f"Expected a folder for the training, got the file {str(out)!r}.")
     begun = any((out / name).exists() for name in (CHECKPOINT, DRIVER))
-    noted = out / SETTINGS
+    noted = out / SETTINGS_FILE
     if begun and noted.exists() and json.loads(noted.read_text(encoding="utf-8")) != json.loads(settings):
         raise ValueError(f"{str(out)!r} holds a training with other settings; choose another folder or remove it.")
 
@@ -137,7 +137,7 @@ def write_settings(out: Path, settings: str) -> None:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ValueError(f"Cannot make the folder {str(out)!r}: {error}.") from None
-    (out / SETTINGS).write_text(settings + "\n", encoding="utf-8")
+    (out / SETTINGS_FILE).write_text(settings + "\n", encoding="utf-8")
 
 
 def read_training_settings(folder: Path) -> tuple[Source, Config]:
@@ -146,9 +146,9 @@ def read_training_settings(folder: Path) -> tuple[Source, Config]:
     Raises:
         ValueError: It holds none.
     """
-    path = folder / SETTINGS
+    path = folder / SETTINGS_FILE
     if not path.is_file():
-        raise ValueError(f"Expected a training in {str(folder)!r}, but there is no {SETTINGS}.")
+        raise ValueError(f"Expected a training in {str(folder)!r}, but there is no {SETTINGS_FILE}.")
     noted = json.loads(path.read_text(encoding="utf-8"))
     source, config = noted["source"], {name: _tuples(value) for name, value in noted["config"].items()}
     config["colour"] = AutoregressiveNoise(**{name: tuple(value) for name, value in noted["config"]["colour"].items()})

@@ -67,7 +67,7 @@ def test_a_wrapped_ego_needs_what_the_one_behind_it_needs_and_its_own_noise() ->
             return 7 * world.clock.ticks
 
         def in_world(self, world: Any) -> Any:
-            raise NotImplementedError
+            raise AssertionError("An ego is not driven to find its needs.")
 
     ego = Behind()
     assert isinstance(ego, WrappedEgo)
