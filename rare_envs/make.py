@@ -13,7 +13,7 @@ from rare_envs.measures.registry import load_measure
 from rare_envs.plugins import did_you_mean
 from rare_envs.scenarios.base import Scenario
 from rare_envs.scenarios.base_distributions import load_base
-from rare_envs.scenarios.registry import find_scenario
+from rare_envs.scenarios.registry import SCENARIOS, find_scenario
 from rare_envs.sensors.camera import find_camera
 from rare_envs.sensors.kinds import read_kinds
 from rare_envs.simulation.background import find_drivers
@@ -87,9 +87,8 @@ def set_up(
         known = [word for word in inspect.signature(set_up).parameters if word not in ("scenario", "needs", "unknown")]
         of_reset = name in (parameter.name for parameter in scenario.parameters)
         hint = " (reset takes it as an option)" if of_reset else did_you_mean(name, known)
-        raise TypeError(
-            f"The scenario {scenario.name!r} takes no keyword argument {name!r}{hint}; it takes {', '.join(known)}."
-        )
+        env_id = next((each for each, registered in SCENARIOS.items() if registered is scenario), scenario.name)
+        raise TypeError(f"{env_id} takes no keyword argument {name!r}{hint}; it takes {', '.join(known)}.")
     kinds = read_kinds(observation)
     _check_one_of("action", action, ACTIONS)
     if not isinstance(weather, bool):
