@@ -11,6 +11,7 @@ from rare_envs.control.meta_actions import initial_aim
 from rare_envs.egos.policy import PolicyDriver
 from rare_envs.multi_agent.episode import MultiAgentEpisode, start, step_traffic
 from rare_envs.multi_agent.rewards import Reward, Transition
+from rare_envs.simulation.decision import TickReward, run_ticks
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.rollout import Driver
 from rare_envs.simulation.world import World
@@ -27,6 +28,19 @@ class JointStepResult(NamedTuple):
     """Of the ego's driver."""
 
 
+class _Joint(NamedTuple):
+    """What goes on from tick to tick."""
+
+    episode: MultiAgentEpisode
+    memory: Any
+    """Of the ego's driver."""
+
+    @property
+    def collided(self) -> Tensor:
+        """Which vehicles have collided, boolean, shape (B, N)."""
+        return self.episode.collided
+
+
 def step_agents(
     world: World,
     episode: MultiAgentEpisode,
@@ -37,6 +51,8 @@ def step_agents(
     memory: Any = None,
 ) -> JointStepResult:
     """Carry out decisions, as `rare_envs.simulation.decision.advance` does for one agent.
+
+    Vehicles that have collided are held by `step_traffic`, because some may have before the decision.
 
     Args:
         world: The world.
@@ -50,24 +66,19 @@ def step_agents(
     Returns:
         The episodes at the time of the next decision, rewards and memory.
     """
-    sums: dict[int, Any] = {}
-    meta, stride = not action.is_floating_point(), world.clock.stride
-    for tick in range(stride):
-        chosen = torch.full_like(action, IDLE) if meta and tick else action
-        traffic, physical, memory = _combine_actions(world, episode, chosen, commanded, ego, memory)
-        before = episode
-        episode = step_traffic(world, episode._replace(traffic=traffic), physical, commanded)
-        for vehicle, reward in rewards.items():
-            terms = reward(Transition(before, episode, vehicle, physical[:, vehicle]))
-            if tick:
-                over = before.views[vehicle].collided
-                terms = _map_terms(lambda term, over=over: term.masked_fill(over, 0.0), terms)
-            sums[vehicle] = terms if tick == 0 else _map_terms(torch.add, sums[vehicle], terms)
-        if stride > 1 and bool(episode.collided.all()):
-            break
-    if stride > 1:
-        sums = {vehicle: _map_terms(lambda term: term / stride, terms) for vehicle, terms in sums.items()}
-    return JointStepResult(episode, sums, memory)
+
+    def tick(old: _Joint, chosen: Tensor, first: bool) -> tuple[_Joint, list[TickReward]]:
+        before = old.episode
+        traffic, physical, kept = _combine_actions(world, before, chosen, commanded, ego, old.memory)
+        after = step_traffic(world, before._replace(traffic=traffic), physical, commanded)
+        earned = [
+            TickReward(reward(Transition(before, after, j, physical[:, j])), before.views[j].collided)
+            for j, reward in rewards.items()
+        ]
+        return _Joint(after, kept), earned
+
+    end, means = run_ticks(world.clock, _Joint(episode, memory), action, tick)
+    return JointStepResult(end.episode, dict(zip(rewards, means, strict=True)), end.memory)
 
 
 def _combine_actions(
@@ -96,13 +107,6 @@ def _combine_actions(
         aim = (torch.where(first & by_driver[:, None], new, old) for new, old in zip(where, traffic.aim, strict=True))
         traffic = traffic._replace(aim=type(where)(*aim))
     return traffic, physical, memory
-
-
-def _map_terms(function: Any, *terms: Any) -> Any:
-    """Apply a function term by term."""
-    if isinstance(terms[0], Tensor):
-        return function(*terms)
-    return type(terms[0])(*(function(*each) for each in zip(*terms, strict=True)))
 
 
 def play(world: World, x: Tensor, policies: Mapping[int, Any], ego: Driver) -> MultiAgentEpisode:

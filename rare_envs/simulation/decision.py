@@ -1,17 +1,83 @@
-"""Step of an environment: one decision of the policy, and the ticks until the next."""
+"""A decision of one agent or of several: an action, the ticks until the next, and the mean of their rewards."""
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import torch
 from torch import Tensor
 
 from rare_envs.control.actions import IDLE
+from rare_envs.simulation.clock import Clock
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.reward import RewardTerms, reward_terms
 from rare_envs.simulation.world import World
 from rare_envs.traffic.lead import Lead
 from rare_envs.traffic.state import State
+
+
+class Episodes(Protocol):
+    """B episodes of one agent or of several."""
+
+    @property
+    def collided(self) -> Tensor:
+        """Which have collided, boolean, in any shape: of the episodes, or of each agent in each."""
+
+
+EpisodesT = TypeVar("EpisodesT", bound=Episodes)
+
+
+class TickReward(NamedTuple):
+    """Reward of one tick for one agent in B episodes."""
+
+    terms: Any
+    """A tensor of shape (B,), or a named tuple of such."""
+    over: Tensor
+    """Which had collided before the tick and earn nothing in it, boolean, shape (B,)."""
+
+
+Tick = Callable[[EpisodesT, Tensor, bool], tuple[EpisodesT, Sequence[TickReward]]]
+"""From episodes, an action and whether it was decided just now to the episodes a tick later and the agents' rewards."""
+
+
+def run_ticks(
+    clock: Clock, episodes: EpisodesT, action: Tensor, tick: Tick[EpisodesT]
+) -> tuple[EpisodesT, tuple[Any, ...]]:
+    """Carry out the ticks of a decision; no further ones once all have collided.
+
+    Args:
+        clock: Says how many they are.
+        episodes: B episodes at the decision.
+        action: What is decided. Meta-actions are given in the first tick, `IDLE` in those after it; a physical action
+            in all of them.
+        tick: Carries out one.
+
+    Returns:
+        The episodes at the time of the next decision, and the agents' rewards: the means over the ticks, where ticks
+        after a collision count as 0.
+    """
+    stride, sums = clock.stride, tuple[Any, ...]()
+    for index in range(stride):
+        if index == 1 and not action.is_floating_point():
+            action = torch.full_like(action, IDLE)
+        episodes, rewards = tick(episodes, action, index == 0)
+        sums = tuple(terms for terms, _ in rewards) if index == 0 else tuple(map(_add, sums, rewards))
+        if stride > 1 and bool(episodes.collided.all()):
+            break
+    if stride > 1:
+        sums = tuple(_map_terms(lambda term: term / stride, terms) for terms in sums)
+    return episodes, sums
+
+
+def _add(total: Any, reward: TickReward) -> Any:
+    """Add the reward of a later tick, which counts as 0 where the episode was over."""
+    return _map_terms(lambda old, new: old + new.masked_fill(reward.over, 0.0), total, reward.terms)
+
+
+def _map_terms(function: Callable[..., Tensor], *terms: Any) -> Any:
+    """Apply a function term by term."""
+    if isinstance(terms[0], Tensor):
+        return function(*terms)
+    return type(terms[0])(*(function(*each) for each in zip(*terms, strict=True)))
 
 
 class StepResult(NamedTuple):
@@ -24,11 +90,7 @@ class StepResult(NamedTuple):
 
 
 def advance(
-    world: World,
-    episode: Episode,
-    action: Tensor,
-    commanded: Tensor | None = None,
-    watch: Callable[[Episode], None] | None = None,
+    world: World, episode: Episode, action: Tensor, watch: Callable[[Episode], None] | None = None
 ) -> StepResult:
     """Carry out a decision.
 
@@ -38,33 +100,24 @@ def advance(
     Args:
         world: The world.
         episode: B episodes, none of which has collided.
-        action: As in `World.decode_meta_actions`.
-        commanded: As in `World.step`.
+        action: Of the ego, as in `World.decode_meta_actions`.
         watch: Called with the episodes after each tick.
 
     Returns:
         The episodes at the time of the next decision, and the reward.
     """
-    sums: RewardTerms | None = None
-    for tick in range(world.clock.stride):
-        chosen = action if tick == 0 else torch.full_like(action, IDLE)
-        ready, physical = world.decode_meta_actions(episode, chosen, commanded)
-        moved = world.step(ready, physical, commanded)
-        terms = reward_terms(moved, physical if commanded is None else physical[:, 0])
-        over = episode.collided
-        if tick:
-            moved = hold_finished(over, episode, moved)
-            terms = RewardTerms(*(term.masked_fill(over, 0.0) for term in terms))
-        sums = terms if sums is None else RewardTerms(*map(torch.add, sums, terms))
-        episode = moved
+
+    def tick(old: Episode, chosen: Tensor, first: bool) -> tuple[Episode, tuple[TickReward]]:
+        ready, physical = world.decode_meta_actions(old, chosen)
+        moved = world.step(ready, physical)
+        reward = TickReward(reward_terms(moved, physical), old.collided)
+        moved = moved if first else hold_finished(old.collided, old, moved)
         if watch is not None:
-            watch(episode)
-        if world.clock.stride > 1 and bool(episode.collided.all()):
-            break
-    assert sums is not None
-    if world.clock.stride > 1:
-        sums = RewardTerms(*(term / world.clock.stride for term in sums))
-    return StepResult(episode, sums)
+            watch(moved)
+        return moved, (reward,)
+
+    episode, (terms,) = run_ticks(world.clock, episode, action, tick)
+    return StepResult(episode, terms)
 
 
 def hold_finished(over: Tensor, old: Episode, new: Episode) -> Episode:

@@ -1,12 +1,15 @@
 """A decision: one tick, or the ticks of a meta-action with the mean of their rewards."""
 
+from typing import NamedTuple
+
 import pytest
 import torch
+from torch import Tensor
 
 from rare_envs.control.actions import IDLE
 from rare_envs.scenarios.car_following import CAR_FOLLOWING
 from rare_envs.simulation.clock import Clock
-from rare_envs.simulation.decision import advance, hold_finished
+from rare_envs.simulation.decision import TickReward, advance, hold_finished, run_ticks
 from rare_envs.simulation.reward import reward_terms
 from rare_envs.simulation.world import World
 
@@ -45,3 +48,53 @@ def test_finished_episodes_are_held() -> None:
         assert torch.equal(kept[1], after[1])
     assert float(held.lead.gap[0]) == 30.0
     assert float(held.lead.gap[1]) == pytest.approx(29.5)
+
+
+class Countdown(NamedTuple):
+    """Two episodes, each of which collides once its ticks are used up."""
+
+    left: Tensor
+
+    @property
+    def collided(self) -> Tensor:
+        return self.left <= 0
+
+
+def count_down(seen: list[tuple[list[int], bool]]):
+    """Return a tick with a reward of 1 and one of twice that, as terms, that notes what it was given."""
+
+    def tick(old: Countdown, action: Tensor, first: bool) -> tuple[Countdown, list[TickReward]]:
+        seen.append((action.tolist(), first))
+        ones = torch.ones(2)
+        return Countdown(old.left - 1), [TickReward(ones, old.collided), TickReward(Countdown(2 * ones), old.collided)]
+
+    return tick
+
+
+def test_a_decision_ends_when_all_have_collided() -> None:
+    """Of ten ticks, five are run: the first episode earns in two of them, the second in all five."""
+    seen: list[tuple[list[int], bool]] = []
+    clock = Clock(horizon=2.0, action="meta")
+    end, (plain, terms) = run_ticks(clock, Countdown(torch.tensor([2, 5])), torch.tensor([3, 4]), count_down(seen))
+    assert seen == [([3, 4], True)] + 4 * [([IDLE, IDLE], False)]
+    assert end.left.tolist() == [-3, 0]
+    torch.testing.assert_close(plain, torch.tensor([0.2, 0.5]))
+    torch.testing.assert_close(terms.left, torch.tensor([0.4, 1.0]))
+
+
+def test_a_physical_action_lasts_as_long_as_the_decision() -> None:
+    seen: list[tuple[list[float], bool]] = []
+    clock = Clock(dt=0.5, horizon=2.0, action="meta")
+    run_ticks(clock, Countdown(torch.tensor([9, 9])), torch.tensor([0.5, -0.5]), count_down(seen))
+    assert seen == [([0.5, -0.5], True), ([0.5, -0.5], False)]
+
+
+def test_without_agents_there_is_no_reward() -> None:
+    end, rewards = run_ticks(
+        Clock(horizon=2.0),
+        Countdown(torch.tensor([2])),
+        torch.zeros(1, 2),
+        lambda old, *_: (Countdown(old.left - 1), ()),
+    )
+    assert end.left.tolist() == [1]
+    assert rewards == ()
