@@ -1,8 +1,8 @@
 """Recorded traffic: trajectory tables, smoothing, scenes and events."""
 
 from training.data.events import car_following_events, cut_in_events
-from training.data.highd import highd_recordings, load_highd
-from training.data.ngsim import load_ngsim
+from training.data.formats.highd import highd_recordings, load_highd
+from training.data.formats.ngsim import load_ngsim
 from training.data.scenes import TrafficScene, load_us101_scenes, split_by_clock
 from training.data.synthetic import synthetic_traffic
 from training.data.trajectories import NOBODY, Trajectories, read_trajectories, tabulate, write_trajectories

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 
-from training.data.highd import highd_recordings, load_highd
-from training.data.ngsim import load_ngsim
+from training.data.formats.highd import highd_recordings, load_highd
+from training.data.formats.ngsim import load_ngsim
 from training.data.scenes import TrafficScene, load_us101_scenes, split_by_clock
 from training.data.windows import scenes_of
 

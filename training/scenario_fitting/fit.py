@@ -36,9 +36,9 @@ from training.command_line import (
     run_command,
 )
 from training.data.events import EXTRACTORS, Events, concatenate_events, write_events
-from training.data.highd import highd_recordings, load_highd
-from training.data.ngsim import load_ngsim
-from training.data.text_columns import Gaps
+from training.data.formats.highd import highd_recordings, load_highd
+from training.data.formats.ngsim import load_ngsim
+from training.data.formats.text_columns import Gaps
 from training.data.trajectories import Trajectories
 from training.scenario_fitting.event_filters import EVENT_RECIPES, EventRecipe, filter_events, read_events
 from training.scenario_fitting.mixture import (

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from training.data.ngsim import load_ngsim
+from training.data.formats.ngsim import load_ngsim
 from training.data.trajectories import COLUMNS, NOBODY, read_trajectories, tabulate, write_trajectories
 
 GOOD = {

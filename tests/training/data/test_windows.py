@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.training.data.recordings import cutting_in, simulate, write_ngsim
-from training.data.ngsim import load_ngsim
+from training.data.formats.ngsim import load_ngsim
 from training.data.trajectories import COLUMNS, tabulate
 from training.data.windows import scenes_of
 

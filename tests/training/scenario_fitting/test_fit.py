@@ -15,7 +15,7 @@ from tests.training.shared_data import DATA, needs_data
 from training.data.events import (
     cut_in_events,
 )
-from training.data.ngsim import load_ngsim
+from training.data.formats.ngsim import load_ngsim
 from training.data.windows import scenes_of
 from training.scenario_fitting import fit as fit_scenarios
 from training.scenario_fitting import mixture as mixture_fit

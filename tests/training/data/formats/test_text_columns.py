@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from training.data.text_columns import Rows, check_lengths, check_tracks, read_column_names, read_numbers
+from training.data.formats.text_columns import Rows, check_lengths, check_tracks, read_column_names, read_numbers
 
 
 def rows_of(n):

@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
-from samplers.problem import FloatArray
-from training.data.text_columns import Gaps, Rows, check_lengths, check_tracks, read_numbers
+from training.data.formats.lanes import lanes_of
+from training.data.formats.resampling import resample_tracks
+from training.data.formats.text_columns import Gaps, Rows, check_lengths, check_tracks, read_numbers
 from training.data.trajectories import DT, NOBODY, Trajectories, tabulate
 
 TRACK_NAMES = {
@@ -32,10 +32,6 @@ TRACK_NAMES = {
     "leader": ("precedingId",),
 }
 """Headers in the file of tracks, by name of column."""
-LARGEST_STEP = 1.5
-"""Frames between two rows of a vehicle from which on its track is cut: between 1 (no hole) and 2 (one is missing)."""
-ROUNDING = 1e-6
-"""Tolerance [ticks] within which the end of a track counts as a multiple of `DT`: more than times are rounded by."""
 SIDES = {1: "upper", 2: "lower"}
 """Names of the two carriageways by drivingDirection."""
 
@@ -90,32 +86,33 @@ def load_highd(folder: Path | str, recording: str, *, gaps: Gaps = "error") -> T
     if backwards.any():
         row = int(np.argmax(backwards))
         raise rows.error(row, f"vehicle {rows['vehicle'][row]:g} moves against its drivingDirection.")
-    values = np.column_stack(
-        [x, sign * (rows["y"] + 0.5 * rows["width"]), speed, sign * rows["acceleration"], rows["length"], rows["width"]]
+    time = rows["frame"] / rate
+    vehicle, frame, splined, linear, nearest = resample_tracks(
+        rows["vehicle"],
+        time,
+        1.0 / rate,
+        np.column_stack([x, sign * (rows["y"] + 0.5 * rows["width"])]),
+        np.column_stack([speed, sign * rows["acceleration"], rows["length"], rows["width"]]),
     )
-    resampled = _resample(rows["vehicle"], rows["frame"] / rate, 1.0 / rate, values, rows["leader"], direction)
-    side = resampled.pop("direction")
+    leader = rows["leader"][nearest]
+    side = direction[nearest]
+    resampled = {
+        "vehicle": vehicle,
+        "frame": frame,
+        **dict(zip(("x", "y"), splined.T, strict=True)),
+        **dict(zip(("speed", "acceleration", "length", "width"), linear.T, strict=True)),
+        "leader": np.where(leader > 0, leader, NOBODY),
+    }
     names = np.array([f"{recording}-{SIDES[number]}" for number in (1, 2)])
     edges = {str(names[0]): tuple(-y for y in reversed(markings[0])), str(names[1]): markings[1]}
     resampled["lane"] = np.zeros(len(side))
     for number, name in zip((1, 2), names, strict=True):
         mine = side == number
         resampled["lane"][mine] = lanes_of(resampled["y"][mine], edges[str(name)])
-    present = {str(name) for name in names[np.unique(side).astype(np.int64) - 1]}
-    recordings = names[side.astype(np.int64) - 1]
+    present = {str(name) for name in names[np.unique(side) - 1]}
+    recordings = names[side - 1]
     table = {"recording": recordings, **resampled}
     return tabulate(table, {name: edges[name] for name in sorted(present)})
-
-
-def lanes_of(y: FloatArray, edges: tuple[float, ...]) -> NDArray[np.int64]:
-    """Return the lane of each position, 1 the leftmost, 0 outside.
-
-    Args:
-        y: Position across the road [m], shape (n,).
-        edges: Lane boundaries from left to right [m].
-    """
-    lane = np.searchsorted(np.array(edges), y, side="right")
-    return np.where(lane < len(edges), lane, 0)
 
 
 def _recording_meta(path: Path) -> tuple[float, tuple[tuple[float, ...], tuple[float, ...]]]:
@@ -155,31 +152,3 @@ def _direction_of(rows: Rows, directions: dict[int, int]) -> NDArray[np.int64]:
         row = int(np.argmax(found == 0))
         raise rows.error(row, f"vehicle {rows['vehicle'][row]:g} is not in the file of tracksMeta.")
     return found
-
-
-def _resample(
-    vehicle: FloatArray,
-    time: FloatArray,
-    dt: float,
-    values: FloatArray,
-    leader: FloatArray,
-    direction: NDArray[np.int64],
-) -> dict[str, FloatArray]:
-    """Return tracks at multiples of `DT`, cut at their holes; `values` has the columns from "x" to "width"."""
-    order = np.lexsort([time, vehicle])
-    cuts = 1 + np.flatnonzero((np.diff(vehicle[order]) != 0) | (np.diff(time[order]) > LARGEST_STEP * dt))
-    parts: list[FloatArray] = []
-    for piece in np.split(order, cuts):
-        t = time[piece]
-        frame = np.arange(np.ceil(t[0] / DT - ROUNDING), np.floor(t[-1] / DT + ROUNDING) + 1.0)
-        at = np.clip(frame * DT, t[0], t[-1])
-        if not len(frame):
-            continue
-        spline = CubicSpline(t, values[piece, :2])(at) if len(t) > 3 else values[piece, :2][np.searchsorted(t, at)]
-        linear = np.column_stack([np.interp(at, t, column) for column in values[piece, 2:].T])
-        nearest = piece[np.minimum(np.rint((at - t[0]) / dt).astype(np.int64), len(t) - 1)]
-        ahead = np.where(leader[nearest] > 0, leader[nearest], NOBODY)
-        same = np.full(len(frame), vehicle[piece[0]])
-        parts.append(np.column_stack([same, frame, spline, linear, ahead, direction[nearest]]))
-    names = ("vehicle", "frame", "x", "y", "speed", "acceleration", "length", "width", "leader", "direction")
-    return dict(zip(names, np.concatenate(parts).T, strict=True))

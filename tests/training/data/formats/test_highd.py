@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.training.data.recordings import DT, LANE, ROAD, change, check_values, expected, write_csv
-from training.data.highd import highd_recordings, load_highd
+from training.data.formats.highd import highd_recordings, load_highd
 from training.data.trajectories import NOBODY
 
 

@@ -7,14 +7,13 @@ and `Local_X` across, to the right of the left edge of the section. Lane 1 is th
 
 from __future__ import annotations
 
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from samplers.problem import FloatArray
-from training.data.text_columns import Gaps, Rows, check_lengths, check_tracks, read_column_names, read_numbers
+from training.data.formats.lanes import estimate_lane_edges
+from training.data.formats.text_columns import Gaps, Rows, check_lengths, check_tracks, read_column_names, read_numbers
 from training.data.trajectories import NOBODY, Trajectories, tabulate
 
 FOOT = 0.3048
@@ -23,8 +22,6 @@ STEP = 100.0
 """Time between frames [ms]."""
 PAUSE = 60_000.0
 """Time [ms] after which a number that comes back belongs to another vehicle: each 15 minutes were numbered anew."""
-LANE_SPACINGS = (2.5, 5.0)
-"""Least and greatest distance [m] between the centres of neighbouring lanes: US freeways have lanes of 3.0 to 3.7 m."""
 RENUMBER_OFFSET = 1_000_000
 """Number added to that of such a vehicle, once for each time it comes back."""
 COLUMN_NAMES = {
@@ -144,30 +141,3 @@ def _renumber(vehicle: FloatArray, leader: FloatArray, frame: FloatArray) -> tup
     place = np.minimum(np.searchsorted(keys[order], wanted), len(keys) - 1)
     known = (keys[order][place] == wanted) & ~unled
     return number, np.where(known, number[order][place], NOBODY)
-
-
-def estimate_lane_edges(y: FloatArray, lane: NDArray[np.int64]) -> tuple[float, ...]:
-    """Return lane boundaries halfway between the median positions of neighbouring lanes; NGSIM records none.
-
-    The outer lanes get the width of the space to their neighbours. Lanes are counted from 1 as long as each lies 2.5 to
-    5 m to the right of the one before it; ramps, which lie beside each other, do not.
-
-    Args:
-        y: Position across the road [m], shape (rows,).
-        lane: Number of the lane, 1 the leftmost, shape (rows,).
-
-    Returns:
-        Boundaries [m], left to right; none if fewer than two lanes are found.
-    """
-    centres: list[float] = []
-    for number in range(1, int(lane.max()) + 1):
-        centre = float(np.median(y[lane == number])) if (lane == number).any() else np.nan
-        if not np.isfinite(centre) or (centres and not LANE_SPACINGS[0] <= centre - centres[-1] <= LANE_SPACINGS[1]):
-            break
-        centres.append(centre)
-    if len(centres) < 2:
-        return ()
-    middle = [0.5 * (left + right) for left, right in pairwise(centres)]
-    first = centres[0] - 0.5 * (centres[1] - centres[0])
-    last = centres[-1] + 0.5 * (centres[-1] - centres[-2])
-    return (first, *middle, last)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.training.data.recordings import FOOT, LANE, change, check_values, expected, write_csv
-from training.data.ngsim import estimate_lane_edges, load_ngsim
+from training.data.formats.ngsim import load_ngsim
 from training.data.trajectories import COLUMNS, NOBODY, find_leaders
 
 BROKEN = {
@@ -115,10 +115,3 @@ def test_files_without_trajectories_are_refused(text, message, tmp_path):
         load_ngsim(path)
     with pytest.raises(ValueError, match=r"none\.csv"):
         load_ngsim(tmp_path / "none.csv")
-
-
-def test_lane_boundaries_lie_halfway_and_ramps_do_not_count():
-    y = np.array([1.8, 5.4, 9.1, 12.0, 12.1])
-    np.testing.assert_allclose(estimate_lane_edges(y, np.arange(1, 6)), (0.0, 3.6, 7.25, 10.55, 13.45), atol=1e-12)
-    assert estimate_lane_edges(y[:1], np.array([1])) == ()
-    assert estimate_lane_edges(y[1:3], np.array([2, 3])) == ()
