@@ -37,6 +37,11 @@ class Chains(NamedTuple):
         chain, step = np.nonzero(self.used & mask)
         return RootedPoints(self.u[chain, step], self.f[chain, step], self.roots[chain])
 
+    def by_step(self) -> "RootedPoints":
+        """Return the used points step by step: the first of every chain, the second of every chain, and so on."""
+        step, chain = np.nonzero(self.used.T)
+        return RootedPoints(self.u[chain, step], self.f[chain, step], self.roots[chain])
+
 
 class RootedPoints(NamedTuple):
     """Points with the point of level 0 that each descends from; the seeds of a level, for example."""
@@ -47,6 +52,10 @@ class RootedPoints(NamedTuple):
     """Their stored outcomes, shape (n,)."""
     roots: NDArray[np.int64]
     """Index of that point, shape (n,)."""
+
+    def select(self, which: NDArray[np.int64]) -> "RootedPoints":
+        """Return the points with these indices."""
+        return RootedPoints(self.u[which], self.f[which], self.roots[which])
 
 
 class Growth(NamedTuple):
@@ -59,9 +68,14 @@ class Growth(NamedTuple):
     interrupted: bool
     """Whether the run was interrupted on the way."""
     candidates: FloatArray
-    """Points that were simulated, accepted or not, shape (m, d)."""
+    """Moves that were simulated, accepted or not, shape (m, d)."""
     f_candidates: FloatArray
     """Their outcomes, shape (m,)."""
+
+    @classmethod
+    def start(cls, chains: Chains, kernel: Kernel) -> "Growth":
+        """Return a level before any move, and the kernel of the first one."""
+        return cls(chains, kernel, False, chains.u[:0, 0], chains.f[:0, 0])
 
 
 def independent_chains(u: FloatArray, f: FloatArray) -> Chains:

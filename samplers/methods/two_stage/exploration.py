@@ -18,8 +18,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from samplers.mcmc.chains import RootedPoints, grow_chains
-from samplers.mcmc.kernels import Kernel, ScaledKernel
+from samplers.mcmc.chains import Chains, Growth, independent_chains
+from samplers.mcmc.descent import NextLevel, descend
+from samplers.mcmc.kernels import ScaledKernel
 from samplers.method import Interrupted
 from samplers.methods.two_stage.regions import ExplorationResult, SubsetPoints, grow_regions
 from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, ExplorationSettings, RegionSettings
@@ -27,6 +28,7 @@ from samplers.methods.two_stage.simulator import ComponentDraws, Simulator
 from samplers.problem import FloatArray
 from samplers.proposals.components import IsotropicNormal, MixtureComponent, draw_components
 from samplers.statistics.thresholds import next_level
+from samplers.trace import Status
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,33 @@ class Sizes:
             most=int(settings.descent_share * budget),
             limit=int(settings.share * budget),
         )
+
+
+@dataclass(frozen=True)
+class ExplorationPlanner:
+    """Levels whose seeds are a random part of the points below the threshold, in chains of equal length."""
+
+    gamma: float
+    """Threshold of failure."""
+    n: int
+    """Points per level, a few more where the chains do not divide them."""
+    budget: int
+    """Simulations for all levels."""
+    settings: ExplorationSettings
+
+    def plan_next(self, chains: Chains, depth: int, n_sim: int, rng: np.random.Generator) -> NextLevel | Status:
+        """Return the next level, or how the descent ends: converged once `level_fraction` of the points fail."""
+        points = chains.by_step()
+        threshold = next_level(points.f, self.settings.level_fraction, self.gamma)
+        if threshold == self.gamma:
+            return Status.CONVERGED
+        if threshold is None or depth >= self.settings.max_levels:
+            return Status.STALLED
+        seeds = rng.permutation(np.flatnonzero(points.f <= threshold))[: self.n // self.settings.points_per_seed]
+        steps = max(1, math.ceil(self.n / len(seeds)) - 1)
+        if n_sim + steps * len(seeds) > self.budget:
+            return Status.BUDGET
+        return NextLevel(threshold, points.select(seeds), np.full(len(seeds), steps + 1))
 
 
 def first_draws(
@@ -114,35 +143,22 @@ def _descend(
 ) -> Generator[FloatArray, FloatArray, SubsetPoints]:
     """Run subset simulation from base draws u (n, d), f (n,), until a tenth of a level fails or the budget is used.
 
-    It shares the threshold (`next_level`) and the growth of a level (`grow_chains`) with `SubsetLevels`, not the loop:
-    seeds are a random third of a level at most, in chains of equal length, drawn from `rng` in another order than the
-    chain lengths there. There is no estimate, so no level is recorded; all candidates are kept, for the regressions
-    around the regions.
+    All candidates are kept, for the regressions around the regions; there is no estimate, so no level is recorded.
     """
-    dim = u.shape[1]
-    kernel: Kernel = ScaledKernel(
-        "conditional", "unit", explore.initial_scale, explore.level_acceptance, deviations=np.ones(dim)
+    kernel = ScaledKernel(
+        "conditional", "unit", explore.initial_scale, explore.level_acceptance, deviations=np.ones(u.shape[1])
     )
-    points, outcomes, levels = [u[:0]], [f[:0]], 0
-    for _ in range(explore.max_levels):
-        level = next_level(f, explore.level_fraction, gamma)
-        if level is None or level == gamma:
-            break
-        seeds = rng.permutation(np.flatnonzero(f <= level))[: sizes.level // explore.points_per_seed]
-        steps = max(1, math.ceil(sizes.level / len(seeds)) - 1)
-        if simulator.n_sim + steps * len(seeds) > sizes.most:
-            break
-        lengths = np.full(len(seeds), steps + 1)
-        start = RootedPoints(u[seeds], f[seeds], seeds)
-        growth = yield from grow_chains(simulator.inputs, start, level, lengths, kernel, rng)
-        simulator.n_sim += growth.chains.n_new
-        if growth.interrupted:
-            raise Interrupted
-        kernel, levels = growth.kernel, levels + 1
-        points.append(growth.candidates)
-        outcomes.append(growth.f_candidates)
-        u, f = growth.chains.u.swapaxes(0, 1).reshape(-1, dim), growth.chains.f.T.ravel()  # in the order of simulation
-    return SubsetPoints(np.unique(u[f <= gamma], axis=0), np.concatenate(points), np.concatenate(outcomes), levels)
+    planner = ExplorationPlanner(gamma, sizes.level, sizes.most - simulator.n_sim, explore)
+    levels = list[Growth]()
+    start = Growth.start(independent_chains(u, f), kernel)
+    status = yield from descend(simulator.inputs, start, planner, lambda growth, _: levels.append(growth), rng)
+    outcomes = np.concatenate([level.f_candidates for level in levels])
+    simulator.n_sim += len(outcomes)
+    if status is Status.STOPPED:
+        raise Interrupted
+    last = levels[-1].chains
+    failing = np.unique(last.where(last.f <= gamma).u, axis=0)
+    return SubsetPoints(failing, np.concatenate([level.candidates for level in levels]), outcomes, len(levels) - 1)
 
 
 def _subsample(scale: NDArray[np.int64], n: int, rng: np.random.Generator) -> NDArray[np.int64]:

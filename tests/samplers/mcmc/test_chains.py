@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from samplers.mcmc.chains import RootedPoints, chain_lengths, draw_first_level, grow_chains, independent_chains
+from samplers.mcmc.chains import Chains, RootedPoints, chain_lengths, draw_first_level, grow_chains, independent_chains
 from samplers.mcmc.kernels import FixedMetropolis, ScaledKernel
 from samplers.method import Interrupted
 from samplers.problem import FunctionProblem
@@ -91,3 +91,15 @@ def test_independent_points_as_chains():
     chains = independent_chains(np.zeros((3, 2)), np.array([1.0, 2.0, 3.0]))
     points = chains.where(chains.f <= 2.0)
     np.testing.assert_array_equal(points.roots, [0, 1])
+
+
+def test_points_step_by_step():
+    """Two chains of three and two points, and a third of one: firsts, seconds, thirds."""
+    f = np.array([[1.0, 4.0, 6.0], [2.0, 5.0, -1.0], [3.0, -1.0, -1.0]])
+    chains = Chains(f[..., None], f, np.array([3, 2, 1]), np.array([7, 8, 9]), 3, None)
+    points = chains.by_step()
+    np.testing.assert_array_equal(points.f, [1, 2, 3, 4, 5, 6])
+    np.testing.assert_array_equal(points.u[:, 0], points.f)
+    np.testing.assert_array_equal(points.roots, [7, 8, 9, 7, 8, 7])
+    chosen = points.select(np.array([5, 0]))
+    assert (chosen.f.tolist(), chosen.u.tolist(), chosen.roots.tolist()) == ([6, 1], [[6], [1]], [7, 7])

@@ -1,103 +1,75 @@
-"""Levels of subset simulation: shares, c.o.v., budgets, warnings."""
-
-import math
-from dataclasses import replace
+"""Levels of subset simulation: seeds, lengths, budgets, how a run ends."""
 
 import numpy as np
 import pytest
-from scipy import stats
 
 import samplers
 from samplers.limit_states import half_space
-from samplers.mcmc.chains import Chains
-from samplers.method import Goal
-from samplers.methods.subset_levels import (
-    LevelProduct,
-    descent_cov,
-    effective_roots,
-    include_level,
-    level_record,
-    summarise,
-)
+from samplers.mcmc.chains import independent_chains
+from samplers.methods.subset_levels import SubsetPlanner
 from samplers.problem import FunctionProblem
-from samplers.statistics.intervals import log_normal_interval
 from samplers.trace import Status
 
 ADSS = samplers.AdaptiveSubsetSimulation
-SS = samplers.SubsetSimulation
 
 
 def run(problem, seed=1, **settings):
     return samplers.estimate(problem, ADSS(**settings), seed=seed)
 
 
-def frozen(chains, steps):
-    """One chain in ten below the threshold, all of its points."""
-    f = np.where(np.arange(chains)[:, None] < chains // 10, -1.0, 1.0) * np.ones((chains, steps))
-    u = np.zeros((chains, steps, 1))
-    return Chains(u, f, np.full(chains, steps), np.arange(chains), chains * (steps - 1), 0.4)
+def plan(f, rng, depth=0, n_sim=0, **settings):
+    """Return what follows on independent points with these outcomes."""
+    planner = SubsetPlanner(**{"n": 100, "p0": 0.1, "max_levels": 30, "gamma": 0.0, "budget": 10_000} | settings)
+    f = np.asarray(f, dtype=float)
+    return planner.plan_next(independent_chains(np.arange(len(f))[:, None], f), depth, n_sim, rng)
 
 
-def test_p_is_the_product_of_true_shares():
-    result = run(half_space().problem)
-    assert result.p == pytest.approx(math.prod(level.p for level in result.trace))
-    assert [level.gamma for level in result.trace] == sorted((level.gamma for level in result.trace), reverse=True)
-    assert result.trace[-1].gamma == 0.0
+def test_every_point_below_the_threshold_is_a_seed(rng):
+    level = plan(rng.permutation(100) + 1.0, rng)
+    assert level.threshold == 10.0
+    assert sorted(level.seeds.f) == list(range(1, 11))
+    np.testing.assert_array_equal(level.seeds.roots, level.seeds.u[:, 0])
+    np.testing.assert_array_equal(level.lengths, np.full(10, 10))
 
 
-def test_level_zero_is_part_of_the_cov():
-    result = run(half_space(2, -stats.norm.ppf(0.03)).problem)
-    zero, last = result.trace
-    assert zero.cov == pytest.approx(math.sqrt(0.9 / (0.1 * 1000)))
-    both = math.sqrt((1 + zero.cov**2) * (1 + last.cov**2) - 1)
-    assert result.cov >= both * (1 - 1e-12)
-    assert include_level(LevelProduct(), zero).cov == pytest.approx(zero.cov)
+def test_ten_percent_of_failures_end_the_run(rng):
+    assert plan(np.arange(100) - 9.0, rng) is Status.CONVERGED  # -9 ... 0 fail
+    assert plan(np.arange(100) - 8.0, rng).threshold == 1.0
 
 
-def test_chain_correlation_is_in_the_cov_of_a_level():
-    """Chains that never leave their side are worth one point each."""
-    level = level_record(frozen(100, 10), 0.0, LevelProduct())
-    assert level.p == 0.1
-    assert level.ess == pytest.approx(100)
-    assert level.cov == pytest.approx(math.sqrt(0.9 / (0.1 * 100)))
+@pytest.mark.parametrize(
+    ("settings", "status"),
+    [
+        ({"budget": 9}, Status.BUDGET),  # ten seeds
+        ({"budget": 500, "n_sim": 491}, Status.BUDGET),
+        ({"max_levels": 3, "depth": 2}, Status.STALLED),
+        ({"max_levels": 3, "depth": 2, "budget": 0}, Status.STALLED),
+        ({"n": 101, "budget": 0}, Status.BUDGET),  # level 0 is not whole
+    ],
+)
+def test_reasons_to_stop(settings, status, rng):
+    assert plan(np.arange(100) + 1.0, rng, **settings) is status
 
 
-def test_chains_are_kept_apart_end_to_end():
-    """Real chains are correlated: gamma is well above 0; it would vanish with mixed chains."""
-    ess = [level.ess for seed in range(20) for level in run(half_space().problem, seed).trace[1:]]
-    assert 200 < np.mean(ess) < 600
+def test_ties_leave_no_level_to_go_to(rng):
+    assert plan(np.full(100, 5.0), rng) is Status.STALLED
+    assert plan(np.full(50, 5.0), rng, budget=0) is Status.BUDGET  # 50 of 100 points do not tell
 
 
-def test_descent_cov():
-    """All descendants of one point: worth one point. One each: binomial."""
-    assert descent_cov(np.full(50, 7), 1000) == pytest.approx(math.sqrt(1 - 1 / 1000))
-    assert descent_cov(np.arange(100), 1000) == pytest.approx(math.sqrt(0.9 / (0.1 * 1000)))
-    assert math.isinf(descent_cov(np.empty(0, dtype=int), 1000))
-
-
-def test_effective_roots():
-    assert effective_roots(np.full(50, 7)) == 1
-    assert effective_roots(np.arange(100)) == 100
-    assert effective_roots(np.array([1, 1, 4, 9])) == pytest.approx(16 / 6)
-
-
-def test_cov_is_the_larger_of_chain_correlation_and_descent():
-    """100 chains that stay where they are; 10 fail. Either estimate can be the larger one."""
-    chains, goal = frozen(100, 10), Goal(gamma=0.0)
-
-    def outcome(roots, passed):
-        zero = replace(level_record(frozen(1000, 1), 0.0, LevelProduct()), n_points=1000)
-        last = level_record(chains._replace(roots=roots), 0.0, passed)
-        return summarise(chains._replace(roots=roots), goal, passed, [zero, last], Status.CONVERGED), last
-
-    one_root, passed = np.zeros(100, dtype=int), LevelProduct(0.1, 0.1)
-    by_descent, last = outcome(one_root, passed)
-    assert by_descent.cov == descent_cov(np.zeros(100, dtype=int), 1000) > 2 * include_level(passed, last).cov
-    assert by_descent.interval == log_normal_interval(by_descent.p, by_descent.cov, 0.95, df=1.0)
-
-    passed = LevelProduct(0.1, 2.0)
-    by_levels, last = outcome(np.arange(100), passed)
-    assert by_levels.cov == include_level(passed, last).cov > 2 * descent_cov(np.repeat(np.arange(10), 10), 1000)
+@pytest.mark.parametrize(
+    ("settings", "points"),
+    [
+        ({}, 100),
+        ({"budget": 34}, 44),  # ten seeds and 34 more
+        ({"budget": 500, "n_sim": 490}, 20),
+        ({"n": 700}, 500),  # 50 points a chain at most
+        ({"n": 5}, 10),  # one for each seed at least
+    ],
+)
+def test_points_of_the_next_level(settings, points, rng):
+    lengths = plan(np.arange(100) + 1.0, rng, **settings).lengths
+    assert lengths.sum() == points
+    assert lengths.max() - lengths.min() <= 1
 
 
 def test_stalls_honestly_where_everything_ties():
@@ -114,18 +86,6 @@ def test_gives_up_after_max_levels():
     assert result.p == 0
     # three levels passed, 1e-3 give or take, of which no hit in a dozen roots may be a quarter
     assert 1e-4 < result.interval[1] < 1e-3
-
-
-def test_no_failure_from_one_path_excludes_nothing():
-    """One point in 1,000 leads down, to where nothing fails: how likely that is, a single root cannot tell."""
-
-    def f(x):
-        return np.where(x[:, 0] > 3.0, 10 - x[:, 0], 20 - 0.01 * x[:, 1])
-
-    for seed in range(3):
-        result = samplers.estimate(FunctionProblem(f, 2), ADSS(max_levels=6), seed=seed)
-        assert result.p == 0
-        assert result.interval[1] > 0.01
 
 
 @pytest.mark.parametrize("max_sim", [1, 2, 5, 50, 99])
@@ -154,12 +114,6 @@ def test_points_per_level_fit_the_budget(max_sim, n):
     assert len(result.trace) == (1 if max_sim == 100 else 4)
     assert any(f"{n} points per level, not 1000" in text for text in result.warnings) == (n < 500)
     assert samplers.estimate(half_space().problem, ADSS(n=50), seed=1, max_sim=80).trace[0].n_points == 50
-
-
-def test_no_chains_no_acceptance():
-    trace = run(half_space().problem).trace
-    assert trace[0].acceptance is None
-    assert all(0 < level.acceptance < 1 for level in trace[1:])
 
 
 @pytest.mark.parametrize(

@@ -7,9 +7,7 @@ from scipy import stats
 import samplers
 from samplers.limit_states import half_space, plateau, shell
 from samplers.method import Goal
-from samplers.methods.subset_levels import (
-    descent_cov,
-)
+from samplers.methods.subset_estimate import descent_cov
 from samplers.problem import FunctionProblem
 from samplers.trace import Status
 

@@ -5,7 +5,11 @@ import pytest
 from scipy import stats
 
 from samplers.limit_states import four_branches, plateau, shell
+from samplers.mcmc.chains import independent_chains
+from samplers.mcmc.descent import NextLevel
+from samplers.method import Interrupted
 from samplers.methods.two_stage.exploration import (
+    ExplorationPlanner,
     Sizes,
     _bisect_towards_origin,
     _descend,
@@ -16,6 +20,7 @@ from samplers.methods.two_stage.exploration import (
 from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, RegionSettings
 from samplers.methods.two_stage.simulator import Simulator
 from samplers.problem import FunctionProblem
+from samplers.trace import Status
 
 
 def half_spaces(dim, *betas):
@@ -169,6 +174,52 @@ def test_descent_finds_what_plain_draws_cannot():
         np.testing.assert_array_equal(problem.evaluate(descent.u), descent.f)
         found += len(descent.failing) >= 20
     assert found >= 5
+
+
+def plan(f, rng, depth=0, n_sim=0, budget=10_000, n=250):
+    """Return what follows on independent points with these outcomes."""
+    f = np.asarray(f, dtype=float)
+    chains = independent_chains(np.arange(len(f))[:, None], f)
+    return ExplorationPlanner(0.0, n, budget, DEFAULT_SETTINGS.exploration).plan_next(chains, depth, n_sim, rng)
+
+
+def test_seeds_are_a_random_part_of_the_points_below_the_threshold(rng):
+    """Of 1000 points 100 are below; 250 points a level hold a third as many chains, 83, of four points each."""
+    level = plan(np.arange(1000) + 1.0, rng)
+    assert level.threshold == 100.0
+    assert len(set(level.seeds.f)) == len(level.seeds.f) == 83
+    assert (level.seeds.f <= 100.0).all()
+    np.testing.assert_array_equal(level.seeds.roots, level.seeds.f - 1)
+    np.testing.assert_array_equal(level.lengths, np.full(83, 4))
+    assert set(plan(np.arange(1000) + 1.0, rng).seeds.f) != set(level.seeds.f)
+
+
+def test_few_seeds_have_long_chains(rng):
+    level = plan(np.arange(100) + 1.0, rng)
+    np.testing.assert_array_equal(level.lengths, np.full(10, 25))
+
+
+def test_reasons_to_end_the_descent(rng):
+    f, most = np.arange(100) + 1.0, DEFAULT_SETTINGS.exploration.max_levels
+    assert plan(f - 10, rng) is Status.CONVERGED
+    assert plan(np.full(100, 5.0), rng) is Status.STALLED
+    assert plan(f, rng, depth=most) is Status.STALLED
+    assert isinstance(plan(f, rng, depth=most - 1), NextLevel)
+    assert plan(f, rng, n_sim=100, budget=339) is Status.BUDGET  # ten chains of 24 steps
+    assert isinstance(plan(f, rng, n_sim=100, budget=340), NextLevel)
+
+
+def test_an_interrupted_descent_counts_what_it_simulated(rng):
+    problem, sizes = half_spaces(10, 5.0), Sizes.within(6000)
+    simulator, u = Simulator(problem), rng.standard_normal((sizes.base, 10))
+    steps = _descend(simulator, u, problem.evaluate(u), 0.0, sizes, rng, DEFAULT_SETTINGS.exploration)
+    x, rows = next(steps), 0
+    for _ in range(7):
+        rows += len(x)
+        x = steps.send(problem.evaluate(x))
+    with pytest.raises(Interrupted):
+        steps.throw(Interrupted())
+    assert simulator.n_sim == rows > 0
 
 
 def test_points_are_drawn_in_along_their_rays_and_still_fail(rng):
