@@ -13,6 +13,7 @@ import sys
 
 from agents.remote.framing import add_length, read_message
 from agents.remote.request_handler import RequestHandler
+from rare_envs.threads import use_one_thread
 
 
 def serve_socket(link: socket.socket, handler: RequestHandler) -> None:
@@ -44,6 +45,23 @@ class FailedEgo:
         raise ValueError(self.reason)
 
 
+def load_or_explain(arguments: str) -> object:
+    """Return an ego, or a `FailedEgo` with the reason why there is none.
+
+    Args:
+        arguments: Of `agents.load_ego`, as JSON.
+    """
+    from agents.loading import Ego, load_ego
+
+    try:
+        ego = load_ego(**json.loads(arguments))
+        if not isinstance(ego, Ego):
+            raise ValueError(f"Expected an ego with predict for a process of its own, got {ego!r}.")
+    except (ValueError, OSError) as error:
+        return FailedEgo(str(error))
+    return ego
+
+
 def main(number: str, arguments: str) -> None:
     """Load an ego and answer for it.
 
@@ -51,20 +69,8 @@ def main(number: str, arguments: str) -> None:
         number: Of the inherited socket.
         arguments: Of `agents.load_ego`, as JSON.
     """
-    import torch
-
-    from agents.loading import Ego, load_ego
-
-    torch.set_num_threads(1)
-    ego: object
-    try:
-        ego = load_ego(**json.loads(arguments))
-        if not isinstance(ego, Ego):
-            raise ValueError(f"Expected an ego with predict for a process of its own, got {ego!r}.")
-    except (ValueError, OSError) as error:
-        ego = FailedEgo(str(error))
-    with socket.socket(fileno=int(number)) as link:
-        serve_socket(link, RequestHandler(ego))
+    with use_one_thread(), socket.socket(fileno=int(number)) as link:
+        serve_socket(link, RequestHandler(load_or_explain(arguments)))
 
 
 if __name__ == "__main__":

@@ -13,10 +13,10 @@ from typing import NamedTuple
 
 import gymnasium as gym
 import pytest
-import torch
 
 import rare_envs
 from rare_envs.scenarios.registry import SCENARIOS
+from rare_envs.threads import use_one_thread
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
@@ -72,11 +72,11 @@ def _without_padding(text: str) -> str:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@use_one_thread()
 def test_code_of_a_page(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     if page.name == "measures.md":
         pytest.importorskip("rtamt", reason="rtamt, for temporal logic, runs on Python 3.11 or older")
     monkeypatch.chdir(tmp_path)
-    torch.set_num_threads(1)
     code = blocks(page.read_text(encoding="utf-8"))
     assert code
     known = set(rare_envs.ENV_IDS)

@@ -8,7 +8,8 @@ import pkgutil
 from collections.abc import Iterator
 
 import pytest
-import torch
+
+from rare_envs.threads import use_one_thread
 
 PACKAGES = ("samplers", "rare_envs", "agents", "training")
 
@@ -58,8 +59,8 @@ WITHOUT_EXAMPLE = {
 
 
 @pytest.mark.parametrize("name", [name for name in MODULES if ">>> " in source(name)])
+@use_one_thread()
 def test_examples_of_a_module(name: str) -> None:
-    torch.set_num_threads(1)
     result = doctest.testmod(importlib.import_module(name), report=True)
     assert result.failed == 0
     assert result.attempted > 0

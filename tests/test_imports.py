@@ -40,7 +40,7 @@ FLOORS = {
         comparison testing
     """,
     "rare_envs": """
-        traffic plugins arrays
+        traffic plugins arrays threads
         distributions control sensors
         sensors.camera scenarios measures
         simulation

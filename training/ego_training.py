@@ -12,6 +12,7 @@ from types import MappingProxyType
 from typing import Any
 
 from rare_envs.plugins import did_you_mean
+from rare_envs.threads import use_one_thread
 
 RECENT = 500
 """Number of last episodes in the collision rate beside the progress bar."""
@@ -134,7 +135,7 @@ def train_ego(
 
     env = sb3_vec_env(env_id, num_envs, discrete=hyperparameters.discrete, **make_kwargs)
     try:
-        with _one_thread(), _progress_bar(steps, progress) as callback:
+        with use_one_thread(), _progress_bar(steps, progress) as callback:
             model = getattr(stable_baselines3, algo.upper())(
                 _policy_name(env.observation_space),
                 env,
@@ -201,19 +202,6 @@ def _prepare_target(out: Path) -> Path:
     if not os.access(existing, os.W_OK):
         raise ValueError(f"Cannot write {str(target)!r}: no permission.")
     return target
-
-
-@contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """Let torch use one thread: networks this small only lose time to more."""
-    import torch
-
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 Callback = Callable[[dict[str, Any], dict[str, Any]], bool]

@@ -21,6 +21,7 @@ import rare_envs
 from benchmarks import RESULTS
 from rare_envs.scenarios.registry import SCENARIOS
 from rare_envs.study import Question, Report, drive_again, prepare, run, write_film
+from rare_envs.threads import use_one_thread
 from training import train_ego
 
 EGOS_RESULT = RESULTS / "egos.json"
@@ -173,6 +174,7 @@ def write_results(cells: dict[tuple[str, str, str], EgoResult]) -> None:
     EGOS_RESULT.write_text(json.dumps({**about, "cells": [asdict(cell) for cell in cells.values()]}, indent=1) + "\n")
 
 
+@use_one_thread()
 def main(
     docs: Annotated[Path, typer.Option(help="Folder of the page.")] = Path("docs"),
     runs: Annotated[Path, typer.Option(help="Folder of the trained egos.")] = Path("runs/egos"),
@@ -180,7 +182,6 @@ def main(
     env: Annotated[str, typer.Option(help="Only environments whose id contains this.")] = "",
 ) -> None:
     """Measure what is not measured yet and write the page."""
-    torch.set_num_threads(1)
     chosen = only.split(",") if only else []
     measured = {key for key, cell in read_results().items() if cell.ego not in chosen or env not in cell.env_id}
     for key in [(env_id, ego, method) for env_id in SCENARIOS for ego in PAGE_EGOS for method in PAGE_METHODS]:

@@ -18,6 +18,7 @@ import typer
 from torch import Tensor
 
 from agents import read_driver
+from rare_envs.threads import use_one_thread
 from training.imitation.algorithms.critic import Critic, critic_inputs, policy_cost
 from training.imitation.algorithms.learner import Learner
 from training.imitation.algorithms.rollout import roll_out
@@ -77,6 +78,7 @@ def compare_gradients(learner: Learner, horizon: int, starts: int) -> list[float
     return torch.tensor(rows).mean(dim=0).tolist()
 
 
+@use_one_thread()
 def main(
     data: Annotated[Path, typer.Argument(help="Folder with the compact tables of US 101.")],
     run: Annotated[Path, typer.Argument(help="Folder of a training by MGAIL.")],
@@ -84,7 +86,6 @@ def main(
     starts: Annotated[int, typer.Option(help="Sets of scenes.")] = 8,
 ) -> None:
     """Compare the two gradients."""
-    torch.set_num_threads(1)
     learner = train_forward_model(data, run, rounds)
     print(f"| ticks | {' | '.join(GRADIENT_COLUMNS)} |\n|{'---|' * (len(GRADIENT_COLUMNS) + 1)}")
     for horizon in HORIZONS:

@@ -12,12 +12,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import torch
 import typer
 
 import rare_envs
 from rare_envs.distributions.log_mixture import LogMixture
 from rare_envs.scenarios.registry import scenario_named
+from rare_envs.threads import use_one_thread
 from training.scenario_fitting.event_filters import EVENT_RECIPES, filter_events, read_events
 from training.scenario_fitting.fit import fit_us101_base
 
@@ -25,9 +25,9 @@ GAPS = {"car_following": ("gap",), "cut_in": ("gap_ego_cutin", "gap_cutin_lead")
 GAP_ENV_IDS = {"car_following": "rare_envs/CarFollowing-v0", "cut_in": "rare_envs/CutIn-v0"}
 
 
+@use_one_thread()
 def main(data: Path, rollouts: int = 1_000_000, seed: int = 0) -> None:
     """Fit, compare, and simulate."""
-    torch.set_num_threads(1)
     for scenario, gaps in GAPS.items():
         for logarithmic in ((), gaps):
             recipe = replace(EVENT_RECIPES[scenario], logarithmic=logarithmic)

@@ -27,6 +27,7 @@ from benchmarks import RESULTS
 from benchmarks.driving.realism import load_named, round_numbers
 from benchmarks.estimators.runs import about
 from rare_envs.sensors.perception import FEATURES, HEADING_COLUMN, SPEED_COLUMN
+from rare_envs.threads import use_one_thread
 from training.data.trajectories import DT
 from training.imitation.algorithms.expert_pairs import Pairs, collect_pairs
 from training.imitation.datasets import Source, load_scenes
@@ -134,6 +135,7 @@ def measure_changes(recording: Recording, drivers: dict[str, LearnedDriver], noi
     }
 
 
+@use_one_thread()
 def main(
     data: Annotated[Path, typer.Argument(help="Folder with the compact tables of US 101.")],
     drivers: Annotated[list[str] | None, typer.Argument(help="Files or shipped names.")] = None,
@@ -141,7 +143,6 @@ def main(
     out: Annotated[Path, typer.Option("--json", help="File for the result.")] = RESULTS / "lane_changes.json",
 ) -> None:
     """Measure on all scenes, those that the drivers learned from included: changes are few."""
-    torch.set_num_threads(1)
     learn, test = load_scenes(Source("data", data))
     found = round_numbers(
         measure_changes(stack_scenes([*learn, *test]), load_named(drivers or ["mgail", "gail", "bc"]), noises)

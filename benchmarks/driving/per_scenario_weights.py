@@ -17,6 +17,7 @@ from agents.learned.coloured_noise import AutoregressiveNoise
 from agents.learned.driver import replace_head
 from agents.learned.networks import ACTION_SIZE, FEATURE_SIZE, HEAD_SIZE, Policy, Scaling, head_weights
 from benchmarks.simulation.throughput import seconds
+from rare_envs.threads import use_one_thread
 
 FLOOR = 20.0
 
@@ -48,12 +49,12 @@ def compare_passes(batch: int, vehicles: int, rounds: int = 20) -> dict[str, flo
     return {"batched_ms": fast, "loop_ms": slow, "ratio": slow / fast, "largest_difference": difference}
 
 
+@use_one_thread()
 def main(
     batch: Annotated[int, typer.Option(help="Scenarios.")] = 256,
     vehicles: Annotated[int, typer.Option(help="Learned drivers in each.")] = 5,
 ) -> None:
     """Print the comparison; exits with 1 if the batched pass is less than 20 times as fast, or another policy."""
-    torch.set_num_threads(1)
     result = compare_passes(batch, vehicles)
     print(f"{batch} scenarios of {vehicles} drivers: " + ", ".join(f"{name} {v:.3g}" for name, v in result.items()))
     raise typer.Exit(int(result["ratio"] < FLOOR or result["largest_difference"] > 1e-5))

@@ -41,6 +41,7 @@ from benchmarks.driving.realism_rows import (
     noisy_drivers,
 )
 from benchmarks.estimators.runs import about
+from rare_envs.threads import use_one_thread
 from training.imitation.algorithms.expert_pairs import collect_pairs
 from training.imitation.datasets import Source, load_scenes
 from training.imitation.evaluation.behaviour import Act
@@ -113,6 +114,7 @@ def load_named(words: Sequence[str]) -> dict[str, LearnedDriver]:
     return out
 
 
+@use_one_thread()
 def main(
     data: Annotated[Path, typer.Argument(help="Folder with the compact tables of US 101.")],
     drivers: Annotated[
@@ -125,7 +127,6 @@ def main(
     rollouts: Annotated[int, typer.Option(help="Of each segment among recorded others.")] = Effort.rollouts,
 ) -> None:
     """Measure how human drivers are, and draw it."""
-    torch.set_num_threads(1)
     begun = time.perf_counter()
     effort = replace(Effort(), noises=noises, draws=draws, rollouts=rollouts)
     train, test = (stack_scenes(scenes) for scenes in load_scenes(Source("data", data)))

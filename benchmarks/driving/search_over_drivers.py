@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import torch
 import typer
 
 import agents
@@ -31,6 +30,7 @@ import samplers
 from benchmarks import RESULTS
 from benchmarks.driving.failing_traffic import describe_failures, failing_points, measure_drivers
 from benchmarks.estimators.runs import about
+from rare_envs.threads import use_one_thread
 from samplers.serialization import to_json_value
 
 PAPER = samplers.CrossEntropy(family="blocks", rho=0.01, alpha=0.8, early_end=False, choice="quantile", wide_share=0)
@@ -139,6 +139,7 @@ def repeat_method(
     return row, found
 
 
+@use_one_thread()
 def main(
     ego: Annotated[str, typer.Option(help="idm, or mgail: a learned driver with lidar.")] = "idm",
     drivers: Annotated[str, typer.Option(help="Of the five others.")] = "mgail",
@@ -155,7 +156,6 @@ def main(
     ] = None,
 ) -> None:
     """Measure, print and write."""
-    torch.set_num_threads(1)
     out = RESULTS / f"search_{ego}_{noise}.json" if out is None else out
     chosen = [check_word(name, SEARCH_METHODS) for name in methods.split(",")]
     how = NOISE_SETTINGS[check_word(noise, NOISE_SETTINGS)]

@@ -12,13 +12,13 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import torch
 import typer
 
 import rare_envs
 import samplers
 from benchmarks import RESULTS
 from benchmarks.estimators.truth import TRUTH_RESULT
+from rare_envs.threads import use_one_thread
 from samplers.registry import get_method
 
 COMPARISON_RESULT = RESULTS / "against_truth.json"
@@ -107,6 +107,7 @@ def side_by_side(problem: samplers.Problem, runs: list[samplers.Run]) -> list[sa
     return [run.result() for run in runs]
 
 
+@use_one_thread()
 def main(
     seeds: int = 40,
     first_seed: int = 0,
@@ -114,7 +115,6 @@ def main(
     out: Annotated[Path, typer.Option(help="Where the result goes.")] = COMPARISON_RESULT,
 ) -> None:
     """Compare every method with the truth and write the result."""
-    torch.set_num_threads(1)
     cells = []
     for row in json.loads(TRUTH_RESULT.read_text())["results"]:
         for method in samplers.METHODS if env in row["env_id"] else ():

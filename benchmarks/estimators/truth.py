@@ -17,6 +17,7 @@ from rich.progress import track
 import rare_envs
 from benchmarks import RESULTS
 from rare_envs.scenarios.registry import SCENARIOS
+from rare_envs.threads import use_one_thread
 
 TRUTH_RESULT = RESULTS / "truth.json"
 ROLLOUT_CHUNK = 131_072
@@ -57,13 +58,13 @@ def truth(env_id: str, base: str, rollouts: int, seed: int) -> dict[str, float |
     }
 
 
+@use_one_thread()
 def main(
     rollouts: Annotated[float, typer.Option(help="Rollouts for each scenario and base.")] = 1e7,
     seed: int = 2026,
     out: Path = TRUTH_RESULT,
 ) -> None:
     """Measure both scenarios with both bases and write the result."""
-    torch.set_num_threads(1)
     results = []
     for env_id in TRUTH_ENV_IDS:
         for base in SCENARIOS[env_id].bases:

@@ -18,12 +18,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from stable_baselines3 import PPO
 
 import agents
 import rare_envs
 import training
+from rare_envs.threads import use_one_thread
 
 ENV = "rare_envs/CutIn-v0"
 
@@ -35,9 +35,9 @@ def saved_policy(folder: Path) -> Path:
     return path
 
 
+@use_one_thread()
 def measure_latency(batch: int, repeats: int) -> dict[str, Any]:
     """Return rollouts per second of each way, medians over the repeats, and the ratio of in-process to remote."""
-    torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as folder:
         path = saved_policy(Path(folder))
         words = [

@@ -22,6 +22,7 @@ import rare_envs
 import samplers
 from benchmarks.simulation import highway_env_reference as reference
 from rare_envs.simulation.rollout import rollout
+from rare_envs.threads import use_one_thread
 
 CAR_FOLLOWING, CUT_IN, HIGHWAY = (f"rare_envs/{name}-v0" for name in ("CarFollowing", "CutIn", "Highway"))
 HORIZON = 20.0
@@ -240,6 +241,7 @@ def _compare_rates(ours: list[float], theirs: list[float]) -> dict[str, float]:
     }
 
 
+@use_one_thread()
 def main(
     rounds: int = 5,
     out: Annotated[Path | None, typer.Option(help="Write the result here as JSON.")] = None,
@@ -248,7 +250,6 @@ def main(
     only_camera: Annotated[bool, typer.Option(help="The camera on the highway alone.")] = False,
 ) -> None:
     """Measure everything, print a table, and fail if a floor is missed."""
-    torch.set_num_threads(1)
     results: dict[str, dict[str, float]] = {}
     if not only_camera:
         results = {"highway_memory": highway_memory()}  # first: a peak stays

@@ -18,10 +18,10 @@ from rare_envs.interop.simulation import (
     DriveRunner,
     DriveTask,
     drive_in_worker,
-    one_thread,
     start_worker,
     strip_ego,
 )
+from rare_envs.threads import use_one_thread
 
 
 class HighwayEnvProblem:
@@ -100,7 +100,7 @@ class HighwayEnvProblem:
         x = self.space.validate(np.atleast_2d(x))
         if self.workers == 1 or len(x) == 1:
             self._driven = self._driven or self._task.build()
-            with one_thread():
+            with use_one_thread():
                 return np.array([self._driven.measure_drive(row) for row in x])
         chunk = max(1, min(8, len(x) // (4 * self.workers)))
         try:

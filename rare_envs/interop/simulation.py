@@ -1,9 +1,7 @@
 """Drives of an ego in a HighwayEnv scenario: from x to f, here or in a worker process."""
 
-import contextlib
-import sys
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -18,6 +16,7 @@ from rare_envs.interop.fast_observation import install_fast_observation
 from rare_envs.interop.parameters import restore_class_parameters, set_idm
 from rare_envs.interop.scenario import HighwayEnvScenario
 from rare_envs.plugins import did_you_mean
+from rare_envs.threads import use_one_thread
 
 MAX_SECONDS = 100.0
 """Longest drive [s] unless told otherwise: HighwayEnv's merge ends at a place, where not every ego arrives."""
@@ -184,20 +183,6 @@ def replace_ego_by_idm(env: HighwayEnvScenario) -> None:
     inner.define_spaces()
 
 
-@contextlib.contextmanager
-def one_thread() -> Iterator[None]:
-    """Let torch, if it is there, use one thread: sums round alike everywhere, and small networks run faster."""
-    torch = sys.modules.get("torch")
-    before = 1 if torch is None else torch.get_num_threads()
-    if torch is not None:
-        torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        if torch is not None:
-            torch.set_num_threads(before)
-
-
 _worker_runner: DriveRunner | None = None
 """The environment and ego of a worker process."""
 
@@ -213,5 +198,5 @@ def start_worker(blob: bytes) -> None:
 def drive_in_worker(x: NDArray[np.float64]) -> float:
     """Return f(x) of one drive in a worker process."""
     assert _worker_runner is not None
-    with one_thread():
+    with use_one_thread():
         return _worker_runner.measure_drive(x)

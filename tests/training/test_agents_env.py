@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import torch
 from stable_baselines3.common.vec_env import VecEnv
 
 import rare_envs
@@ -11,6 +10,7 @@ from examples import adversary, shared_policy
 from rare_envs.distributions.beta import BetaDistribution
 from rare_envs.envs.multi_agent_vector import AgentsVectorEnv
 from rare_envs.multi_agent.rewards import adversary_reward
+from rare_envs.threads import use_one_thread
 
 CUT_IN = "rare_envs/CutIn-v0"
 FOLLOWING = "rare_envs/CarFollowing-v0"
@@ -95,9 +95,9 @@ def test_bad_arguments():
         env.step(np.zeros((4, 2)))
 
 
+@use_one_thread()
 def test_an_adversary_raises_the_collision_rate():
     """Starts side by side, so that little training is enough; from ordinary starts docs/agents.md has the numbers."""
-    torch.set_num_threads(1)
     low, high = np.array([14.0, 14.0, 14.0, 1.0, 30.0, 3.0]), np.array([16.0, 16.0, 16.0, 4.0, 50.0, 4.0])
     near = {"base": BetaDistribution(np.full(6, 2.0), np.full(6, 2.0), low, high), "horizon": 5.0}
     n = 400
@@ -109,8 +109,8 @@ def test_an_adversary_raises_the_collision_rate():
     assert adversary.interval(attacked, n)[0] > adversary.interval(scripted, n)[1]
 
 
+@use_one_thread()
 def test_a_shared_policy_learns():
-    torch.set_num_threads(1)
     before, after = (
         shared_policy.mean_return(FOLLOWING, shared_policy.train(FOLLOWING, steps), 128, seed=1)
         for steps in (0, 25_600)

@@ -4,19 +4,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 import agents
 import rare_envs
 from examples.demo import ENV_ID, random_collision_rate
+from rare_envs.threads import use_one_thread
 from training import train_ego
 
 FACTOR = 20.0
 """After 100,000 steps; the demo's 400,000 reach several thousand."""
 
 
+@use_one_thread()
 def test_a_trained_ego_collides_far_less_than_a_random_policy(tmp_path: Path) -> None:
-    torch.set_num_threads(1)
     path = train_ego(ENV_ID, steps=100_000, seed=0, out=tmp_path / "ego.zip", progress=False)
     problem = rare_envs.DrivingProblem(ENV_ID, ego=agents.load_ego(str(path)))
     x = problem.base.sample(4_000, np.random.default_rng(1))

@@ -23,6 +23,7 @@ import torch
 import typer
 
 from agents import LearnedEgo, Provenance, save_driver
+from rare_envs.threads import use_one_thread
 from training.command_line import RunFolderOption, report_errors, run_command
 from training.data.scenes import TrafficScene
 from training.egos.encounters import EncounterSpec, make_scenes
@@ -137,13 +138,13 @@ def train_imitation_ego(
     return save_driver(driver, provenance, out / DRIVER)
 
 
+@use_one_thread()
 def main(
     out: RunFolderOption,
     data: Annotated[Path, typer.Option(help="Folder with the compact tables of US 101.")],
     seed: Annotated[int, typer.Option(help="The same seed gives the same weights.")] = CONFIG.seed,
 ) -> None:
     """Train the ego `imitation`."""
-    torch.set_num_threads(1)
     with report_errors("imitation"):
         path = train_imitation_ego(data, replace(CONFIG, seed=seed), out, progress=True)
     print(f"Saved {path}. Next: python -m training.egos.nominal_driving --ego {path}")

@@ -31,6 +31,7 @@ from agents import Provenance
 from agents.vision.checkpoint import save_vision
 from agents.vision.ego import VisionEgo
 from agents.vision.pilotnet import PILOTNET_HIDDEN_UNITS, PilotNet
+from rare_envs.threads import use_one_thread
 from training.command_line import RunFolderOption, report_errors, run_command
 from training.egos.expert_driver import AUXILIARY_SIZE
 from training.egos.image_dataset import LabelledPictures, collect, concatenate, mirror
@@ -250,6 +251,7 @@ def make_provenance(config: VisionConfig, metrics: dict[str, Any]) -> Provenance
     )
 
 
+@use_one_thread()
 def main(
     out: RunFolderOption,
     seed: Annotated[int, typer.Option(help="Of everything that is random.")] = VisionConfig.seed,
@@ -257,7 +259,6 @@ def main(
     judged: Annotated[int, typer.Option(help="Minutes of driving in each kind of ordinary traffic to judge it.")] = 0,
 ) -> None:
     """Train the ego `vision`, and write it to OUT/vision.safetensors."""
-    torch.set_num_threads(1)
     with report_errors("vision"):
         config = VisionConfig(seed=seed, rounds=rounds)
         network = train_vision_ego(config, out, progress=True)

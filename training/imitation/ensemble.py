@@ -28,6 +28,7 @@ from torch import Tensor
 
 from agents import LearnedDriver, read_driver, read_provenance, save_driver
 from agents.learned.networks import head_weights
+from rare_envs.threads import use_one_thread
 from samplers.problem import FloatArray
 from training.command_line import report_errors, run_command
 from training.imitation.algorithms.behaviour_cloning import clone_epochs
@@ -184,6 +185,7 @@ def make_ensemble(folder: Path, ensemble: Ensemble, out: Path, progress: bool = 
     return save_driver(replace(driver, weights=fit.distribution), replace(provenance, ensemble=about), out)
 
 
+@use_one_thread()
 def main(
     run: Annotated[Path, typer.Argument(help="Folder of a finished training.")],
     out: Annotated[Path, typer.Option(help="The driver with the distribution of its weights, .safetensors.")],
@@ -192,7 +194,6 @@ def main(
     seed: Annotated[int, typer.Option(help="The same seed gives the same distribution.")] = Ensemble.seed,
 ) -> None:
     """Train an ensemble around a driver and fit the distribution of its last layer's weights."""
-    torch.set_num_threads(1)
     with report_errors("ensemble"):
         path = make_ensemble(run, Ensemble(members, updates, seed), out, progress=True)
     print(f"Saved {path}.")

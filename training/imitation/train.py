@@ -14,9 +14,9 @@ from enum import Enum
 from pathlib import Path
 from typing import Annotated, Any
 
-import torch
 import typer
 
+from rare_envs.threads import use_one_thread
 from training.command_line import (
     DataOption,
     HighdOption,
@@ -54,6 +54,7 @@ TickRange = Annotated[tuple[int, int], typer.Option(help="First and last value."
 WeightRange = Annotated[tuple[float, float], typer.Option(help="First and last value.")]
 
 
+@use_one_thread()
 def main(
     out: RunFolderOption,
     data: DataOption = None,
@@ -109,7 +110,6 @@ def main(
     """Train a driver from recorded traffic. training/imitation/algorithms/config.py says what the settings mean."""
     words: dict[str, Any] = dict(locals())
     words |= {"method": method.value, "colour": NOISES[noise.value]}
-    torch.set_num_threads(1)  # at these sizes more threads cost more than they give
     with report_errors("train"):
         source = source_of(data, ngsim, highd, location, recording, seconds)
         config = Config(**{option.name: words[option.name] for option in fields(Config)})

@@ -26,8 +26,9 @@ from rare_envs.study.cli.options import (
     WorldOptions,
     spread_options,
 )
-from rare_envs.study.cli.shell import OneLineErrors, print_json, show_interruption, use_one_thread
+from rare_envs.study.cli.shell import OneLineErrors, print_json, show_interruption
 from rare_envs.study.errors import as_bad_input
+from rare_envs.threads import use_one_thread
 from training.command_line import DataOption, HighdOption, NgsimOption, RunFolderOption
 
 DOUBTFUL = 3
@@ -55,6 +56,7 @@ def list_command(as_json: JsonOption = False) -> None:
 
 @app.command("estimate")
 @spread_options
+@use_one_thread()
 def estimate_command(
     env: EnvArgument,
     options: EstimateOptions,
@@ -62,7 +64,6 @@ def estimate_command(
     as_json: JsonOption = False,
 ) -> None:
     """Estimate how often an ego fails, with an interval, and show its most likely failure."""
-    use_one_thread()
     from rare_envs.study.evaluate import run, run_into
     from rare_envs.study.question import Question, prepare
 
@@ -88,6 +89,7 @@ def _answer(report: Any, out: Path | None, as_json: bool) -> NoReturn:
 
 
 @app.command("resume")
+@use_one_thread()
 def resume_command(
     run: Annotated[
         Path, typer.Argument(metavar="RUN", help="Folder of an estimate --out that has not come to its end.")
@@ -98,7 +100,6 @@ def resume_command(
     as_json: JsonOption = False,
 ) -> None:
     """Go on with a run whose ego has gone, or that was stopped; the answer is that of an undisturbed run."""
-    use_one_thread()
     from rare_envs.study.evaluate import resume
 
     with show_interruption(), contextlib.redirect_stdout(sys.stderr):
@@ -108,6 +109,7 @@ def resume_command(
 
 @app.command("compare")
 @spread_options
+@use_one_thread()
 def compare_command(
     ego_a: Annotated[str, typer.Argument(metavar="EGO_A", help="An ego, as for estimate --ego.")],
     ego_b: Annotated[str, typer.Argument(metavar="EGO_B", help="The other ego.")],
@@ -118,7 +120,6 @@ def compare_command(
     as_json: JsonOption = False,
 ) -> None:
     """Estimate how many times likelier ego A fails than ego B, with an interval, from the same scenarios."""
-    use_one_thread()
     from rare_envs.study.compare import compare_egos
     from rare_envs.study.question import Question
 
@@ -137,6 +138,7 @@ def compare_command(
 
 @app.command("train-ego")
 @spread_options
+@use_one_thread()
 def train_ego_command(
     env: EnvArgument,
     options: WorldOptions,
@@ -148,7 +150,6 @@ def train_ego_command(
     as_json: JsonOption = False,
 ) -> None:
     """Train an ego on the batched simulation and save it for `rare-envs estimate --ego`."""
-    use_one_thread()
     from training import train_ego
 
     world = {**options.arguments(), "observation": options.observation or "features"}
@@ -169,6 +170,7 @@ def _estimate_options(world: dict[str, Any], noise: NoiseChoice) -> str:
 
 
 @app.command("train-drivers")
+@use_one_thread()
 def train_drivers_command(
     out: RunFolderOption,
     data: DataOption = None,
@@ -180,7 +182,6 @@ def train_drivers_command(
     as_json: JsonOption = False,
 ) -> None:
     """Train background drivers from recorded traffic; `python -m training.imitation.train` has every setting."""
-    use_one_thread()
     from training.imitation.algorithms.config import Config
     from training.imitation.run_folder import train_driver
     from training.imitation.train import source_of
@@ -218,6 +219,7 @@ def export_ego_command(
 
 
 @app.command("replay")
+@use_one_thread()
 def replay_command(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder that rare-envs estimate --out has written.")],
     failure: Annotated[int, typer.Option(help="Which failure; 0 is the most likely.")] = 0,
@@ -226,7 +228,6 @@ def replay_command(
     as_json: JsonOption = False,
 ) -> None:
     """Drive a failure that a run has found again, and show it with its measure over time."""
-    use_one_thread()
     from rare_envs.study.replay import drive_again
     from rare_envs.study.video import REPLAY_TOLERANCE, check_film_path, describe_drive, find_failure, write_film
 
@@ -289,6 +290,7 @@ def check_ego_command(
 
 
 @app.command("serve-ego")
+@use_one_thread()
 def serve_ego_command(
     ego: EgoArgument,
     bind: Annotated[
@@ -298,7 +300,6 @@ def serve_ego_command(
     trust: TrustOption = False,
 ) -> None:
     """Lend an ego to simulations in other processes or on other machines (estimate --ego tcp://...)."""
-    use_one_thread()
     from rare_envs.study.cli.serve_ego import serve_ego
 
     serve_ego(ego, bind, algo=algo, trust=trust)

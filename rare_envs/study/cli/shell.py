@@ -1,4 +1,4 @@
-"""Behaviour that all commands share: errors in one line, answers as JSON, one thread."""
+"""Behaviour that all commands share: errors in one line and answers as JSON."""
 
 from __future__ import annotations
 
@@ -51,13 +51,6 @@ def show_interruption() -> Iterator[None]:
         if str(error):
             print(error, file=sys.stderr)
         raise
-
-
-def use_one_thread() -> None:
-    """Keep torch to one thread: at these batch sizes more threads cost more than they give."""
-    import torch
-
-    torch.set_num_threads(1)
 
 
 def print_json(value: dict[str, Any]) -> None:

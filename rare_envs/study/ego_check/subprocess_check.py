@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from rare_envs.study.ego_check.findings import Finding, report_failure, report_pass, report_warning
 from rare_envs.study.errors import BadInput
+from rare_envs.threads import use_one_thread
 
 if TYPE_CHECKING:
     from rare_envs.study.question import Question
@@ -195,11 +196,9 @@ def run_checks(request: EgoCheckRequest) -> Iterator[Finding | str]:
 def _main(arguments: str) -> None:
     out = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)  # an ego may print
-    import torch
-
-    torch.set_num_threads(1)
-    for each in run_checks(EgoCheckRequest(**json.loads(arguments))):
-        out.write(json.dumps({"doing": each} if isinstance(each, str) else {"finding": asdict(each)}) + "\n")
+    with use_one_thread():
+        for each in run_checks(EgoCheckRequest(**json.loads(arguments))):
+            out.write(json.dumps({"doing": each} if isinstance(each, str) else {"finding": asdict(each)}) + "\n")
     out.write(json.dumps({"done": True}) + "\n")
 
 
