@@ -72,10 +72,10 @@ def descend(
         ...         median = float(np.median(chains.f))
         ...         seeds = chains.where(chains.f <= median)
         ...         return NextLevel(median, seeds, np.full(len(seeds.f), 2))
-        >>> problem, rng = FunctionProblem(lambda u: u[:, 0], dim=2), np.random.default_rng(0)
-        >>> u = rng.standard_normal((1000, 2))
+        >>> problem, rng = FunctionProblem(lambda u: 5.0 + u[:, 0], dim=2), np.random.default_rng(0)
+        >>> u = rng.standard_normal((10_000, 2))
         >>> start = Growth.start(independent_chains(u, problem.evaluate(u)), FixedMetropolis(1.0, "uniform"))
-        >>> medians = []  # of f given that f is below the one before: -0.67 = Phi^-1(1/4) follows on 0
+        >>> medians = []  # Phi^-1 of 1/2, 1/4, 1/8, 1/16 is 0, -0.67, -1.15, -1.53
         >>> steps = descend(problem, start, Halves(), lambda growth, _: medians.append(np.median(growth.chains.f)), rng)
         >>> x = next(steps)
         >>> try:
@@ -83,7 +83,7 @@ def descend(
         ...         x = steps.send(problem.evaluate(x))
         ... except StopIteration as end:
         ...     print(end.value, np.round(medians, 1))
-        converged [ 0.  -0.7 -1.1 -1.5]
+        converged [5.  4.3 3.8 3.5]
     """
     growth, depth, n_sim = start, 0, 0
     while True:
