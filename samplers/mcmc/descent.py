@@ -72,18 +72,21 @@ def descend(
         ...         median = float(np.median(chains.f))
         ...         seeds = chains.where(chains.f <= median)
         ...         return NextLevel(median, seeds, np.full(len(seeds.f), 2))
-        >>> problem, rng = FunctionProblem(lambda u: 5.0 + u[:, 0], dim=2), np.random.default_rng(0)
+        >>> problem, rng = FunctionProblem(lambda u: u[:, 0], dim=2), np.random.default_rng(0)
         >>> u = rng.standard_normal((10_000, 2))
         >>> start = Growth.start(independent_chains(u, problem.evaluate(u)), FixedMetropolis(1.0, "uniform"))
-        >>> medians = []  # Phi^-1 of 1/2, 1/4, 1/8, 1/16 is 0, -0.67, -1.15, -1.53
+        >>> medians = []
         >>> steps = descend(problem, start, Halves(), lambda growth, _: medians.append(np.median(growth.chains.f)), rng)
         >>> x = next(steps)
         >>> try:
         ...     while True:
         ...         x = steps.send(problem.evaluate(x))
         ... except StopIteration as end:
-        ...     print(end.value, np.round(medians, 1))
-        converged [5.  4.3 3.8 3.5]
+        ...     print(end.value)
+        converged
+        >>> exact = [0.0, -0.674, -1.150, -1.534]  # Phi^-1 of 1/2, 1/4, 1/8, 1/16
+        >>> bool(np.allclose(medians, exact, rtol=0, atol=0.1))
+        True
     """
     growth, depth, n_sim = start, 0, 0
     while True:
