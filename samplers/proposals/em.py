@@ -8,6 +8,7 @@ References:
     Lloyd, "Least squares quantization in PCM", IEEE Transactions on Information Theory 28, 1982.
 """
 
+import warnings
 from collections.abc import Callable
 from typing import Protocol, TypeVar
 
@@ -17,8 +18,8 @@ from scipy.special import logsumexp
 
 from samplers.problem import FloatArray
 
-LLOYD_STEPS = 5
-"""Steps of k-means; it only has to give expectation-maximisation a start."""
+LLOYD_STEPS = 4
+"""Times at most that k-means moves its centres; it only has to give expectation-maximisation a start."""
 
 MixtureT = TypeVar("MixtureT")
 
@@ -85,6 +86,8 @@ def choose_centres(x: FloatArray, weights: FloatArray, k: int, rng: np.random.Ge
 def k_means(x: FloatArray, weights: FloatArray, k: int, rng: np.random.Generator) -> NDArray[np.int64]:
     """Return clusters (n,) of weighted points x (n, d), numbered from 0: k-means++, then Lloyd's steps.
 
+    Two centres that differ by a rounding error may give one cluster, and one without points.
+
     Args:
         x: Points.
         weights: Shape (n,).
@@ -92,15 +95,15 @@ def k_means(x: FloatArray, weights: FloatArray, k: int, rng: np.random.Generator
         rng: Source of randomness.
     """
     centres = choose_centres(x, weights, k, rng)
-    near = np.full(len(x), -1)
-    for _ in range(LLOYD_STEPS):
-        before, near = near, np.argmin(-2 * x @ centres.T + (centres**2).sum(axis=1), axis=1)
-        if (near == before).all():
-            break
-        for j in range(len(centres)):
-            if weights[near == j].sum() > 0:
-                centres[j] = np.average(x[near == j], axis=0, weights=weights[near == j])
-    return np.asarray(near, dtype=np.int64)
+    if len(centres) == 1:
+        return np.zeros(len(x), dtype=np.int64)
+    from sklearn.cluster import KMeans  # slow to import
+    from sklearn.exceptions import ConvergenceWarning
+
+    lloyd = KMeans(len(centres), init=centres, n_init=1, max_iter=LLOYD_STEPS, tol=0.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)  # a cluster without points is no fault
+        return np.asarray(lloyd.fit(x, sample_weight=weights).labels_, dtype=np.int64)
 
 
 def one_hot(labels: NDArray[np.int64], k: int) -> FloatArray:

@@ -107,3 +107,21 @@ def test_k_means_finds_the_groups(rng):
     labels = k_means(x, np.ones(90), 3, rng)
     assert len({tuple(labels[30 * j : 30 * j + 30]) for j in range(3)}) == 3
     assert all(len(set(labels[30 * j : 30 * j + 30])) == 1 for j in range(3))
+
+
+def test_k_means_with_fewer_places_than_clusters(rng):
+    """Two places, with a rounding error in each: no warning, and no cluster has points of both."""
+    x = np.repeat([[1.0, 2.0], [-1.0, 0.5]], 20, axis=0) * (1 + 1e-16 * rng.integers(-3, 4, (40, 2)))
+    labels = k_means(x, np.full(40, 1 / 40), 5, rng)
+    assert labels.min() >= 0 and labels.max() < 5
+    assert not set(labels[:20]) & set(labels[20:])
+    np.testing.assert_array_equal(k_means(x, np.full(40, 1 / 40), 1, rng), np.zeros(40))
+
+
+def test_k_means_ends_where_each_point_is_nearest_to_the_mean_of_its_cluster(rng):
+    """Lloyd's fixed point with weights, on groups that four moves are enough for."""
+    x = np.repeat([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0]], 30, axis=0) + rng.standard_normal((90, 2))
+    weights = rng.random(90)
+    labels = k_means(x, weights, 3, rng)
+    means = np.array([np.average(x[labels == j], axis=0, weights=weights[labels == j]) for j in range(3)])
+    np.testing.assert_array_equal(((x[:, None] - means) ** 2).sum(axis=2).argmin(axis=1), labels)
