@@ -1,31 +1,73 @@
-"""Command lines of the trainings: options from a function's signature, one line for an error."""
+"""Command lines of the trainings: options from a function's signature, one line for an error.
+
+Typer reads the options of a command from its signature. A command here may take a whole group of options as one
+parameter, annotated with a dataclass; `spread_options` puts the fields of the class into the signature.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import functools
+import inspect
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields, is_dataclass
+from enum import Enum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, get_type_hints
 
 import typer
 
 RunFolderOption = Annotated[Path, typer.Option(help="Folder; a training that was stopped in it is taken up.")]
-DataOption = Annotated[Path | None, typer.Option(help="Folder with the files of US 101: compact tables, or events.")]
-NgsimOption = Annotated[Path | None, typer.Option(help="Or a raw NGSIM file, CSV or text.")]
-HighdOption = Annotated[Path | None, typer.Option(help="Or a folder with highD's files.")]
 LocationOption = Annotated[str | None, typer.Option(help="Location, where an NGSIM file has several.")]
 
 
-def find_recordings(data: Path | None, ngsim: Path | None, highd: Path | None) -> tuple[str, Path]:
-    """Return the one source of recordings among the options: "data", "ngsim" or "highd", and its path.
+@dataclass(frozen=True, kw_only=True)
+class RecordingOptions:
+    """Options that name recorded traffic, of which one is given.
 
-    Raises:
-        ValueError: None is given, or several are.
+    Example:
+        >>> RecordingOptions(ngsim=Path("us101.csv")).kind_and_path()[0]
+        'ngsim'
     """
-    named = [(kind, path) for kind, path in (("data", data), ("ngsim", ngsim), ("highd", highd)) if path is not None]
-    if len(named) != 1:
-        raise ValueError("Expected one of --data FOLDER, --ngsim FILE and --highd FOLDER.")
-    return named[0]
+
+    data: Annotated[Path | None, typer.Option(help="Folder with the files of US 101: compact tables, or events.")] = (
+        None
+    )
+    ngsim: Annotated[Path | None, typer.Option(help="Or a raw NGSIM file, CSV or text.")] = None
+    highd: Annotated[Path | None, typer.Option(help="Or a folder with highD's files.")] = None
+
+    def kind_and_path(self) -> tuple[str, Path]:
+        """Return the option that is given: "data", "ngsim" or "highd", and its path.
+
+        Raises:
+            ValueError: None is given, or several are.
+        """
+        kinds = {"data": self.data, "ngsim": self.ngsim, "highd": self.highd}
+        given = [(kind, path) for kind, path in kinds.items() if path is not None]
+        if len(given) != 1:
+            raise ValueError("Expected one of --data FOLDER, --ngsim FILE and --highd FOLDER.")
+        return given[0]
+
+
+class AlgorithmOption(str, Enum):
+    """Algorithms that train drivers of the traffic, as an option."""
+
+    BC = "bc"
+    GAIL = "gail"
+    MGAIL = "mgail"
+
+
+@dataclass(frozen=True, kw_only=True)
+class DriverTrainingOptions:
+    """Options of each command that trains drivers of the traffic.
+
+    The defaults are those of `training.imitation.algorithms.config.Config`, written out because importing that takes
+    seconds.
+    """
+
+    method: Annotated[AlgorithmOption, typer.Option(help="Algorithm.")] = AlgorithmOption.MGAIL
+    seed: Annotated[int, typer.Option(help="The same seed gives the same weights.")] = 0
+    updates: Annotated[int, typer.Option(min=1, help="Updates of the policy, after behaviour cloning.")] = 1500
 
 
 @contextlib.contextmanager
@@ -51,6 +93,43 @@ def run_command(command: Callable[..., None]) -> None:
     Args:
         command: Function whose parameters are the options; its docstring is the help.
     """
-    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
     app.command()(command)
     app()
+
+
+def spread_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Return the command with the fields of its option classes as options of its own.
+
+    Example:
+        >>> def command(name: str, options: RecordingOptions) -> None:
+        ...     print(name, options.highd)
+        >>> list(inspect.signature(spread_options(command)).parameters)
+        ['name', 'data', 'ngsim', 'highd']
+        >>> spread_options(command)(name="run", highd="highD/data")
+        run highD/data
+    """
+    groups: dict[str, type[Any]] = {}
+    parameters: list[inspect.Parameter] = []
+    for name, parameter in inspect.signature(command, eval_str=True).parameters.items():
+        group = parameter.annotation
+        if isinstance(group, type) and is_dataclass(group):
+            groups[name] = group
+            hints = get_type_hints(group, include_extras=True)  # each in the module of the class that has the field
+            options = inspect.signature(group).parameters.values()
+            parameters += [option.replace(annotation=hints[option.name]) for option in options]
+        else:
+            parameters.append(parameter)
+
+    @functools.wraps(command)
+    def spread(**values: Any) -> None:
+        for name, group in groups.items():
+            taken = {field.name: values.pop(field.name) for field in fields(group) if field.name in values}
+            values[name] = group(**taken)
+        command(**values)
+
+    keyword_only = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in parameters]
+    spread.__signature__ = inspect.Signature(keyword_only)  # type: ignore[attr-defined]
+    spread.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    del spread.__wrapped__
+    return spread

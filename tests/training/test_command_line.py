@@ -1,11 +1,22 @@
 """Command lines of the trainings: options, exit codes, one line for an error."""
 
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, get_args
 
 import pytest
 import typer
+from typer.testing import CliRunner
 
-from training.command_line import find_recordings, report_errors, run_command
+from training.command_line import (
+    AlgorithmOption,
+    DriverTrainingOptions,
+    RecordingOptions,
+    report_errors,
+    run_command,
+    spread_options,
+)
+from training.imitation.algorithms.config import Algorithm, Config
 
 
 @pytest.mark.parametrize("error", [ValueError("no such kind"), FileNotFoundError("no such kind")])
@@ -32,8 +43,35 @@ def test_options_come_from_the_signature(monkeypatch, capsys):
     assert capsys.readouterr().out == "12\n"
 
 
-def test_one_source_of_recordings_is_found():
-    assert find_recordings(None, Path("a.csv"), None) == ("ngsim", Path("a.csv"))
-    for wrong in ((None, None, None), (Path("a"), None, Path("b"))):
+def test_one_source_of_recordings_is_given():
+    assert RecordingOptions(ngsim=Path("a.csv")).kind_and_path() == ("ngsim", Path("a.csv"))
+    for wrong in (RecordingOptions(), RecordingOptions(data=Path("a"), highd=Path("b"))):
         with pytest.raises(ValueError, match="one of --data FOLDER, --ngsim FILE and --highd FOLDER"):
-            find_recordings(*wrong)
+            wrong.kind_and_path()
+
+
+def test_options_of_driver_trainings_have_the_defaults_of_the_settings():
+    options, config = DriverTrainingOptions(), Config()
+    assert (options.method.value, options.seed, options.updates) == (config.method, config.seed, config.updates)
+    assert [method.value for method in AlgorithmOption] == list(get_args(Algorithm))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Colours:
+    """Options of a group."""
+
+    paint: Annotated[str | None, typer.Option(help="Its colour.")] = None
+    glossy: Annotated[bool, typer.Option("--glossy")] = False
+
+
+def test_a_group_is_options_of_the_command():
+    app = typer.Typer()
+
+    @app.command()
+    @spread_options
+    def show(name: str, options: Colours, steps: int = 3) -> None:
+        print(name, options.paint, options.glossy, steps)
+
+    assert CliRunner().invoke(app, ["car", "--paint", "red", "--glossy", "--steps", "5"]).output == "car red True 5\n"
+    assert CliRunner().invoke(app, ["car"]).output == "car None False 3\n"
+    assert CliRunner().invoke(app, ["car", "--options", "x"]).exit_code == 2

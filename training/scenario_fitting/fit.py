@@ -26,15 +26,7 @@ import typer
 
 from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
 from rare_envs.scenarios.registry import scenario_named
-from training.command_line import (
-    DataOption,
-    HighdOption,
-    LocationOption,
-    NgsimOption,
-    find_recordings,
-    report_errors,
-    run_command,
-)
+from training.command_line import LocationOption, RecordingOptions, report_errors, run_command, spread_options
 from training.data.events import EXTRACTORS, Events, concatenate_events, write_events
 from training.data.formats.highd import highd_recordings, load_highd
 from training.data.formats.ngsim import load_ngsim
@@ -215,11 +207,10 @@ def fit_own_bases(
         typer.echo(base)
 
 
+@spread_options
 def main(
     out: Annotated[Path, typer.Option(help="Folder for the JSON files.")],
-    data: DataOption = None,
-    highd: HighdOption = None,
-    ngsim: NgsimOption = None,
+    recordings: RecordingOptions,
     location: LocationOption = None,
     cut_gaps: Annotated[bool, typer.Option("--cut-gaps", help="Cut tracks where frames are missing.")] = False,
     scenario: Annotated[list[str] | None, typer.Option(help="Of your own recordings: which to fit.")] = None,
@@ -228,7 +219,7 @@ def main(
 ) -> None:
     """Write base distributions: us101 (fitted) and highway (assembled), or those of your own recordings."""
     with report_errors("fit"):
-        kind, path = find_recordings(data, ngsim, highd)
+        kind, path = recordings.kind_and_path()
         chosen = tuple(scenario or EVENT_RECIPES)
         if unknown := sorted(set(chosen) - set(EVENT_RECIPES)):
             raise ValueError(f"Unknown scenario {unknown[0]}; known are {', '.join(EVENT_RECIPES)}.")

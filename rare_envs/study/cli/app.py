@@ -24,12 +24,11 @@ from rare_envs.study.cli.options import (
     SeedOption,
     TrustOption,
     WorldOptions,
-    spread_options,
 )
 from rare_envs.study.cli.shell import OneLineErrors, print_json, show_interruption
 from rare_envs.study.errors import as_bad_input
 from rare_envs.threads import use_one_thread
-from training.command_line import DataOption, HighdOption, NgsimOption, RunFolderOption
+from training.command_line import DriverTrainingOptions, RecordingOptions, RunFolderOption, spread_options
 
 DOUBTFUL = 3
 
@@ -170,28 +169,22 @@ def _estimate_options(world: dict[str, Any], noise: NoiseChoice) -> str:
 
 
 @app.command("train-drivers")
+@spread_options
 @use_one_thread()
 def train_drivers_command(
-    out: RunFolderOption,
-    data: DataOption = None,
-    ngsim: NgsimOption = None,
-    highd: HighdOption = None,
-    method: Annotated[str, typer.Option(help="bc, gail or mgail.")] = "mgail",
-    updates: Annotated[int | None, typer.Option(help="Updates of the policy.")] = None,
-    seed: SeedOption = 0,
-    as_json: JsonOption = False,
+    out: RunFolderOption, recordings: RecordingOptions, options: DriverTrainingOptions, as_json: JsonOption = False
 ) -> None:
     """Train background drivers from recorded traffic; `python -m training.imitation.train` has every setting."""
     from training.imitation.algorithms.config import Config
+    from training.imitation.datasets import Source
     from training.imitation.run_folder import train_driver
-    from training.imitation.train import source_of
 
-    chosen = {} if updates is None else {"updates": updates}
+    method = options.method.value
     with as_bad_input(ValueError):
-        config = Config(method=method, seed=seed, **chosen)  # type: ignore[arg-type]  # Config checks the method
-        path = train_driver(source_of(data, ngsim, highd), config, out, progress=True)
+        config = Config(method, options.seed, options.updates)  # type: ignore[arg-type]  # the options are its methods
+        path = train_driver(Source(*recordings.kind_and_path()), config, out, progress=True)
     if as_json:
-        print_json({"driver": str(path), "method": method, "seed": seed})
+        print_json({"driver": str(path), "method": method, "seed": options.seed})
     else:
         print(f"Saved {path}. Load it with agents.load_driver({str(path)!r}).")
 

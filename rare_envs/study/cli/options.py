@@ -1,16 +1,13 @@
-"""Options that several commands of the command line take, each written once, and their spreading into a command.
+"""Options that several commands of the command line take, each written once.
 
-Typer reads the options of a command from its signature. A command here may take a whole group of options as one
-parameter, annotated with a dataclass of this module; `spread_options` puts the fields of the class into the signature.
-The defaults are those of `rare_envs.study.Question`, written out because importing that takes seconds.
+A command takes a group of them as one parameter, annotated with a dataclass of this module and spread by
+`training.command_line.spread_options`. The defaults are those of `rare_envs.study.Question`, written out because
+importing that takes seconds.
 """
 
 from __future__ import annotations
 
-import functools
-import inspect
-from collections.abc import Callable
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields
 from enum import Enum
 from typing import Annotated, Any
 
@@ -107,38 +104,3 @@ class EstimateOptions(QuestionOptions):
     target_cov: Annotated[float | None, typer.Option(help="Stop at this coefficient of variation.")] = None
     replicates: Annotated[int, typer.Option(help="Independent runs, combined by their mean.")] = 1
     on_error: Annotated[str, typer.Option(help="Where the ego fails twice: raise, failure or bound.")] = "raise"
-
-
-def spread_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Return the command with the fields of its option classes as options of its own.
-
-    Example:
-        >>> def command(env: str, options: ScenarioOptions) -> None:
-        ...     print(env, options.base)
-        >>> list(inspect.signature(spread_options(command)).parameters)
-        ['env', 'base', 'drivers', 'observation', 'action', 'horizon']
-        >>> spread_options(command)(env="rare_envs/CutIn-v0", base="highway")
-        rare_envs/CutIn-v0 highway
-    """
-    groups: dict[str, type[Any]] = {}
-    parameters: list[inspect.Parameter] = []
-    for name, parameter in inspect.signature(command, eval_str=True).parameters.items():
-        group = parameter.annotation
-        if isinstance(group, type) and is_dataclass(group):
-            groups[name] = group
-            parameters += inspect.signature(group, eval_str=True).parameters.values()
-        else:
-            parameters.append(parameter)
-
-    @functools.wraps(command)
-    def spread(**values: Any) -> None:
-        for name, group in groups.items():
-            taken = {field.name: values.pop(field.name) for field in fields(group) if field.name in values}
-            values[name] = group(**taken)
-        command(**values)
-
-    keyword_only = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in parameters]
-    spread.__signature__ = inspect.Signature(keyword_only)  # type: ignore[attr-defined]
-    spread.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-    del spread.__wrapped__
-    return spread

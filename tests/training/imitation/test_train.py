@@ -3,6 +3,7 @@
 import dataclasses
 import inspect
 import json
+from pathlib import Path
 
 import pytest
 
@@ -47,7 +48,7 @@ def test_a_command_repeats_its_training(made_up, monkeypatch, tmp_path):
     result = CliRunner().invoke(app, [*words, "--out", str(tmp_path)])
     assert result.exit_code == 0, result.output
     assert found[0][1] == config
-    assert found[0][0] == Source("data", command_line.Path("tables"))
+    assert found[0][0] == Source("data", Path("tables"))
 
 
 @pytest.mark.parametrize(
