@@ -49,10 +49,10 @@ class Comparison:
     Example:
         >>> import samplers
         >>> a, b = (samplers.FunctionProblem(lambda x, at=at: at - x[:, 0], dim=2) for at in (3.0, 3.2))
-        >>> found = samplers.compare(a, b, seed=0, max_sim=8000)
-        >>> found.n_sim, found.interval[0] < 1.965 < found.interval[1]  # Phi(-3) / Phi(-3.2)
+        >>> comparison = samplers.compare(a, b, seed=0, max_sim=8000)
+        >>> comparison.n_sim, comparison.interval[0] < 1.965 < comparison.interval[1]  # Phi(-3) / Phi(-3.2)
         (8000, True)
-        >>> round(found.both / found.b.p, 2)  # B fails where A does
+        >>> round(comparison.both / comparison.b.p, 2)  # B fails where A does
         1.0
     """
 
@@ -182,8 +182,8 @@ def compare(
     _check_same_base(a, b)
     problem = EitherFails(a, b, gamma)
     limit = None if max_sim is None else max_sim // 2
-    found = estimate(problem, method, gamma, seed, limit, confidence=confidence, progress=progress)
-    return _summarise(found, problem)
+    either = estimate(problem, method, gamma, seed, limit, confidence=confidence, progress=progress)
+    return _summarise(either, problem)
 
 
 def _check_same_base(a: Problem, b: Problem) -> None:
@@ -195,31 +195,31 @@ def _check_same_base(a: Problem, b: Problem) -> None:
         raise ValueError("Expected two problems with the same base distribution; their densities differ.")
 
 
-def _summarise(found: Estimate, problem: EitherFails) -> Comparison:
+def _summarise(either: Estimate, problem: EitherFails) -> Comparison:
     """Return the comparison that the points of an estimate of P[A or B fails] give."""
-    sample = require_sample(found)
-    fails = sample.f <= found.gamma
+    sample = require_sample(either)
+    fails = sample.f <= either.gamma
     weights, units = sample.weights[fails], sample.units[fails]
     which = problem.failing_sides(sample.x)
     totals = np.array([np.bincount(units, weights=weights * hit, minlength=sample.n_units) for hit in which])
     own = float(np.bincount(units, weights=weights, minlength=sample.n_units).std()) * math.sqrt(sample.n_units)
-    factor = cov_inflation(found, own / found.p if found.p > 0 else math.inf)
+    factor = cov_inflation(either, own / either.p if either.p > 0 else math.inf)
     single = has_independent_points(sample)
-    a, b = (_side(total, factor, single, found) for total in totals)
+    a, b = (_side(total, factor, single, either) for total in totals)
     few = [
         f"{name} failed in only {s.ess:.0f} effective draws" for name, s in (("A", a), ("B", b)) if s.ess < MIN_SIDE_ESS
     ]
     about = [f"{' and '.join(few)}: the ratio is coarse; estimate each separately."] if few else []
     return Comparison(
         ratio=_ratio(a.p, b.p),
-        interval=_ratio_interval(totals, factor, single, found),
-        confidence=found.confidence,
+        interval=_ratio_interval(totals, factor, single, either),
+        confidence=either.confidence,
         a=a,
         b=b,
         both=float(weights[which.all(axis=0)].sum()),
         n_sim=problem.n_sim,
-        warnings=(*found.warnings, *about),
-        either=found,
+        warnings=(*either.warnings, *about),
+        either=either,
     )
 
 
@@ -230,16 +230,16 @@ def _ratio(a: float, b: float) -> float:
     return math.inf if a > 0 else math.nan
 
 
-def _side(totals: FloatArray, factor: float, single: bool, found: Estimate) -> Side:
+def _side(totals: FloatArray, factor: float, single: bool, either: Estimate) -> Side:
     """Return the probability that unit totals (n_units,) add up to."""
     p, ess = float(totals.sum()), effective_number(totals)
     if p == 0:
-        return Side(p=0.0, interval=(0.0, found.interval[1]), cov=math.inf, ess=0.0)
+        return Side(p=0.0, interval=(0.0, either.interval[1]), cov=math.inf, ess=0.0)
     cov = factor * _error(totals) / p
-    return Side(p=p, interval=interval_of_sum(p, cov, ess, single, found.confidence), cov=cov, ess=ess)
+    return Side(p=p, interval=interval_of_sum(p, cov, ess, single, either.confidence), cov=cov, ess=ess)
 
 
-def _ratio_interval(totals: FloatArray, factor: float, single: bool, found: Estimate) -> Interval:
+def _ratio_interval(totals: FloatArray, factor: float, single: bool, either: Estimate) -> Interval:
     """Return the interval of the ratio from the unit totals of A and B, shape (2, n_units)."""
     p_a, p_b = totals.sum(axis=1)
     if p_a == 0 and p_b == 0:
@@ -247,14 +247,14 @@ def _ratio_interval(totals: FloatArray, factor: float, single: bool, found: Esti
     apart = totals[0] != totals[1]  # units that tell the two from one another
     if p_a == 0 or p_b == 0 or not apart.any():
         # none of `ess` effective draws was of the kind that is missing: its share is at most
-        share = zero_hit_bound(max(round(effective_number(totals.max(axis=0))), 1), found.confidence)
+        share = zero_hit_bound(max(round(effective_number(totals.max(axis=0))), 1), either.confidence)
         if p_a == 0:
             return 0.0, share
         return (1 / share, math.inf) if p_b == 0 else (1 - share, 1 / (1 - share))
     z = totals[0] / p_a - totals[1] / p_b
     spread, ratio = factor * _error(z), float(p_a / p_b)
     ess = effective_number(np.where(apart, np.abs(z), 0.0))
-    quantile = float(stats.t.ppf(0.5 + found.confidence / 2, degrees_of_freedom(ess, single)))
+    quantile = float(stats.t.ppf(0.5 + either.confidence / 2, degrees_of_freedom(ess, single)))
     half = min(quantile * spread, MAX_LOG)
     return ratio * math.exp(-half), ratio * math.exp(half)
 

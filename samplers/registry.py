@@ -47,16 +47,16 @@ class Methods(Mapping[str, type[Stepping]]):
     @cached_property
     def _installed(self) -> dict[str, type[Stepping]]:
         """Methods of other packages by name."""
-        found: dict[str, type[Stepping]] = {}
+        loaded: dict[str, type[Stepping]] = {}
         for entry in sorted(entry_points(group=ENTRY_POINT_GROUP), key=lambda entry: entry.name):
             try:
-                if entry.name in self._own or entry.name in found:
+                if entry.name in self._own or entry.name in loaded:
                     raise ValueError("that name is taken")
-                found[entry.name] = _load_method(entry)
+                loaded[entry.name] = _load_method(entry)
             except Exception as error:  # an error of another package must not break this one
                 message = f"The method {_describe_entry(entry)} cannot be used: {type(error).__name__}: {error}"
                 warnings.warn(message, RuntimeWarning, stacklevel=2)
-        return found
+        return loaded
 
     def __getitem__(self, name: str) -> type[Stepping]:
         return self._own[name] if name in self._own else self._installed[name]

@@ -241,9 +241,9 @@ def _is_zip(path: Path) -> bool:
         return file.read(2) == b"PK"
 
 
-def require(found: Mapping[str, Any], names: Any, path: Path) -> None:
+def require(present: Mapping[str, Any], names: Any, path: Path) -> None:
     """Refuse a file that lacks one of the names."""
-    missing = [name for name in names if name not in found]
+    missing = [name for name in names if name not in present]
     if missing:
         raise ValueError(f"{str(path)!r} lacks {', '.join(missing)}.")
 
@@ -277,10 +277,10 @@ def _policy(tensors: Mapping[str, Tensor], path: Path) -> Policy:
         )
     expected = policy.state_dict()
     require(tensors, (_POLICY + name for name in expected), path)
-    found = {name: tensors[_POLICY + name] for name in expected}
-    for name, value in found.items():
+    state = {name: tensors[_POLICY + name] for name in expected}
+    for name, value in state.items():
         check_tensor(_POLICY + name, value, tuple(expected[name].shape), torch.float32, path)
-    policy.load_state_dict(found, assign=True)
+    policy.load_state_dict(state, assign=True)
     return policy.eval().requires_grad_(False)
 
 

@@ -99,10 +99,10 @@ class OnnxEgo:
         """Metadata that `agents.onnx.export` wrote into the file; empty for other files."""
         text = self._session.get_modelmeta().custom_metadata_map.get(METADATA_KEY, "{}")
         try:
-            found = json.loads(text)
+            metadata = json.loads(text)
         except json.JSONDecodeError:
             return {}
-        return found if isinstance(found, dict) else {}
+        return metadata if isinstance(metadata, dict) else {}
 
     @property
     def observation_space(self) -> spaces.Box:

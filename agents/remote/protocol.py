@@ -104,11 +104,11 @@ def unpack_observation(given: Any, batch: int) -> Any:
     parts = given["parts"] if named else {"": given}
     if not isinstance(parts, dict) or not parts or not all(isinstance(name, str) for name in parts):
         raise MalformedMessage("parts is a map from names to arrays")
-    found = {name: unpack_array(part) for name, part in parts.items()}
-    for part in found.values():
+    arrays = {name: unpack_array(part) for name, part in parts.items()}
+    for part in arrays.values():
         if part.ndim < 2 or len(part) != batch:
             raise MalformedMessage(f"expected observations of {batch} rows, got shape {part.shape}")
-    return found if named else found[""]
+    return arrays if named else arrays[""]
 
 
 def is_count(value: object, most: int = MAX_COUNT) -> TypeGuard[int]:

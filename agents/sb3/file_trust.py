@@ -44,13 +44,13 @@ def find_origin_risks(*files: Path | None) -> list[str]:
 
 def _find_risks(path: Path) -> list[str]:
     status = path.stat()
-    found = [f"{str(path)!r} is writable by everybody"] if status.st_mode & stat.S_IWOTH else []
+    risks = [f"{str(path)!r} is writable by everybody"] if status.st_mode & stat.S_IWOTH else []
     for folder in path.parents:
         mode = folder.stat().st_mode
         if not mode & stat.S_IWOTH:
             continue
         if not mode & stat.S_ISVTX:
-            found.append(f"the folder {str(folder)!r} is writable by everybody")
+            risks.append(f"the folder {str(folder)!r} is writable by everybody")
         elif folder == path.parent and status.st_uid not in (0, os.getuid()):
-            found.append(f"{str(path)!r} belongs to another user, in a folder to which everybody may add")
-    return found
+            risks.append(f"{str(path)!r} belongs to another user, in a folder to which everybody may add")
+    return risks

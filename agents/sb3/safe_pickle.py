@@ -65,17 +65,17 @@ class _RestrictedUnpickler(pickle.Unpickler):
                 return getattr(importlib.import_module(module), name)
             for package, bases in ALLOWED_BASES.items():
                 if module == package or module.startswith(f"{package}."):
-                    found = getattr(importlib.import_module(module), name, None)
-                    if isinstance(found, type) and issubclass(found, tuple(map(_import_class, bases))):
-                        return found
+                    named = getattr(importlib.import_module(module), name, None)
+                    if isinstance(named, type) and issubclass(named, tuple(map(_import_class, bases))):
+                        return named
         raise ForbiddenObject(f"it asks for {module}.{name}, which may run code")
 
 
 def _import_class(path: str) -> type:
     """Import `module.Class`."""
     module, _, name = path.rpartition(".")
-    found: type = getattr(importlib.import_module(module), name)
-    return found
+    imported: type = getattr(importlib.import_module(module), name)
+    return imported
 
 
 def open_pickle(content: bytes) -> Any:

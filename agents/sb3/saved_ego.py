@@ -116,15 +116,15 @@ def load_saved_ego(path: Path, algo: str | None, trust: bool = False) -> SavedEg
         raise FileNotFoundError(f"No ego at {str(path)!r}{_suggest_file(path)}.")
     if not path.is_file():
         raise ValueError(f"Expected a Stable-Baselines3 .zip, got the folder {str(path)!r}.")
-    found = find_statistics(path)
+    statistics_path = find_statistics(path)
     if not trust:
-        check_origin(path, found)
+        check_origin(path, statistics_path)
     header = read_header(path)
     name = algo.lower() if algo is not None else find_algorithm(header, path)
     algorithm = find_algorithm_class(name, path)
     model = _load_model(algorithm, name, header, path, trust)
-    statistics = None if found is None else _load_statistics(found, model.observation_space, trust)
-    return SavedEgo(model, name, path, statistics, found)
+    statistics = None if statistics_path is None else _load_statistics(statistics_path, model.observation_space, trust)
+    return SavedEgo(model, name, path, statistics, statistics_path)
 
 
 def _suggest_file(path: Path) -> str:
@@ -193,7 +193,7 @@ def _statistics_candidates(path: Path) -> Iterator[Path]:
 
 def find_statistics(path: Path) -> Path | None:
     """Return the file of the `VecNormalize` statistics of a model, or None."""
-    return next((found for found in _statistics_candidates(path) if found.is_file()), None)
+    return next((file for file in _statistics_candidates(path) if file.is_file()), None)
 
 
 def _load_statistics(path: Path, observation_space: Any, trust: bool) -> Any:

@@ -134,9 +134,9 @@ class FaultTolerant:
             f, reasons = self._attempt(x[rows.start : rows.stop].copy())
             return f, {rows.start + row: reason for row, reason in reasons.items()}
 
-        found = attempt_in_parts(attempt, lambda row: np.full(1, np.nan), range(len(x)))
-        assert found is not None
-        return np.concatenate(found[0]), found[1]
+        attempted = attempt_in_parts(attempt, lambda row: np.full(1, np.nan), range(len(x)))
+        assert attempted is not None
+        return np.concatenate(attempted[0]), attempted[1]
 
     def _attempt(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], dict[int, str]]:
         """Return f of a batch, and reasons where rows alone have failed, by the problem's `attempt` if it has one."""

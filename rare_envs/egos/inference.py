@@ -116,8 +116,8 @@ def _isolate_failing_rows(
     def give_up(row: int) -> Tensor:
         return _ignored_action(kind, query.over[row : row + 1])
 
-    found = attempt_in_parts(attempt, give_up, range(len(query.start)), error)
-    return None if found is None else (torch.cat(found[0]), found[1])
+    attempted = attempt_in_parts(attempt, give_up, range(len(query.start)), error)
+    return None if attempted is None else (torch.cat(attempted[0]), attempted[1])
 
 
 def _ignored_action(kind: str, over: Tensor) -> Tensor:

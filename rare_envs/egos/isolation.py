@@ -54,11 +54,11 @@ def attempt_in_parts(
     size = part_size(len(rows), error, whole)
     for first in range(rows.start, rows.stop, size):
         part = range(first, min(first + size, rows.stop))
-        found = attempt_in_parts(attempt, give_up, part, None, whole)
-        if found is None:
+        attempted = attempt_in_parts(attempt, give_up, part, None, whole)
+        if attempted is None:
             return None
-        values += found[0]
-        reasons |= found[1]
+        values += attempted[0]
+        reasons |= attempted[1]
     return values, reasons
 
 

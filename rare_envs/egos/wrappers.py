@@ -105,8 +105,8 @@ def find_frame_stacking(given: spaces.Space[Any], wanted: Any) -> tuple[int, boo
     if isinstance(given, spaces.Dict):
         if not isinstance(wanted, spaces.Dict) or set(given.spaces) != set(wanted.spaces):
             return None
-        found = {find_frame_stacking(space, wanted[name]) for name, space in given.spaces.items()}
-        return found.pop() if len(found) == 1 else None
+        stackings = {find_frame_stacking(space, wanted[name]) for name, space in given.spaces.items()}
+        return stackings.pop() if len(stackings) == 1 else None
     if given.shape is None or getattr(wanted, "shape", None) is None:  # declared by anybody
         return None
     shape = tuple(wanted.shape)

@@ -76,12 +76,12 @@ around HighwayEnv's value."""
 
 def idm_groups(layout: Layout) -> list[Group]:
     """Return one group for each parameter of IDM."""
-    found = []
+    groups = []
     for usual, (name, it) in zip(layout.idm, IDM_PARAMETERS.items(), strict=True):
         spread = min(it.spread, usual - it.low, it.high - usual)
         parameter = Parameter(name, it.unit, it.low, it.high, it.meaning)
-        found.append(Group((parameter,), make_beta(2.0, [usual - spread], [usual + spread]), usual))
-    return found
+        groups.append(Group((parameter,), make_beta(2.0, [usual - spread], [usual + spread]), usual))
+    return groups
 
 
 def set_idm(vehicles: list[Any], values: Values) -> None:

@@ -199,11 +199,11 @@ def _find_layout(env: gym.Env[Any, Any]) -> Layout:
     if plain is not inner:
         raise ValueError(f"Expected the environment as gym.make gives it, got {plain}; put wrappers around this one.")
     generic = isinstance(inner, MergeGenericEnv | RoundaboutGenericEnv)
-    found = [layout for kind, layout in LAYOUTS.items() if isinstance(inner, kind) and not generic]
-    if not found or len(inner.controlled_vehicles) != 1:
+    layouts = [layout for kind, layout in LAYOUTS.items() if isinstance(inner, kind) and not generic]
+    if not layouts or len(inner.controlled_vehicles) != 1:
         known = ", ".join(SUPPORTED)
         raise ValueError(f"No parameters are known for {type(inner).__name__}; expected {known}, with one ego.")
-    return found[0]
+    return layouts[0]
 
 
 def _find_measure(measure: str | Callable[[Any], float]) -> Callable[[Any], float]:

@@ -43,8 +43,8 @@ def pet(trace: Trace) -> Tensor:
         [1.55]
     """
     x, y, heading = trace.road.to_world(trace.state.x, trace.state.y, trace.state.heading)
-    found = torch.full_like(x[0, :, 0], PET_MAX)
-    rows = torch.arange(len(found), device=x.device)  # those without an overlap so far
+    pet = torch.full_like(x[0, :, 0], PET_MAX)
+    rows = torch.arange(len(pet), device=x.device)  # those without an overlap so far
     last = min(len(x) - 1, round(PET_MAX / trace.dt))
     nearer = None  # separations at one tick of delay less
     for delay in range(last + 1):
@@ -54,7 +54,7 @@ def pet(trace: Trace) -> Tensor:
             sooner = nearer[:, 1:]
             share = sooner / (sooner - apart).clamp(min=1e-12)
             time = torch.where((apart <= 0) & (sooner > 0), (delay - 1 + share) * trace.dt, PET_MAX).amin((0, 1, 3))
-            found = found.index_copy(0, rows, time.clamp(PET_MIN, PET_MAX))
+            pet = pet.index_copy(0, rows, time.clamp(PET_MIN, PET_MAX))
             open_ = time >= PET_MAX
             rows = rows[open_]
             if not len(rows):
@@ -62,7 +62,7 @@ def pet(trace: Trace) -> Tensor:
             x, y, heading, apart = x[:, open_], y[:, open_], heading[:, open_], apart[:, :, open_]
             trace = trace._replace(valid=trace.valid[:, open_])
         nearer = apart
-    return found
+    return pet
 
 
 def _apart(x: Tensor, y: Tensor, heading: Tensor, valid: Tensor, delay: int) -> Tensor:

@@ -74,5 +74,5 @@ def acceleration_of_lead(moment: Moment) -> Tensor:
     """Return the lead's acceleration along the ego's heading over the last tick [m/s^2], 0 without a lead, (B,)."""
     lead, heading = lead_index(moment.state, moment.road), moment.state.heading
     along = moment.acceleration * torch.cos(heading - heading[:, :1])
-    found = along.gather(1, lead[:, None])[:, 0]
-    return torch.where(lead > 0, found, 0.0)
+    of_lead = along.gather(1, lead[:, None])[:, 0]
+    return torch.where(lead > 0, of_lead, 0.0)

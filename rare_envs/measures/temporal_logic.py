@@ -91,10 +91,10 @@ class Robustness:
         monitor, names = _parse(self.formula, trace.dt)
         columns = {name: _signal(trace, name).T.tolist() for name in names}
         ticks = [trace.dt * k for k in range(len(trace.valid))]
-        found = []
+        robustness = []
         for row in range(trace.valid.shape[1]):
-            found.append(monitor.evaluate({"time": ticks, **{name: columns[name][row] for name in names}})[0][1])
-        values = torch.tensor(found, dtype=trace.state.x.dtype, device=trace.state.x.device)
+            robustness.append(monitor.evaluate({"time": ticks, **{name: columns[name][row] for name in names}})[0][1])
+        values = torch.tensor(robustness, dtype=trace.state.x.dtype, device=trace.state.x.device)
         return values.clamp(-ROBUSTNESS_MAX, ROBUSTNESS_MAX)
 
 

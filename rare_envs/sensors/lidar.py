@@ -178,8 +178,8 @@ def _first_met(bodies: Bodies, m: int) -> tuple[Tensor, Tensor]:
         slot = observer[:, None] * BEAMS + beam
         keys.scatter_reduce_(0, slot.flatten(), key.flatten(), "amin")
     keys = keys.view(batch, m, BEAMS)
-    found = (keys >> _VEHICLE_BITS).to(torch.int32).view(torch.float32)
-    return torch.where(keys == _NOTHING, -1, keys & (2**_VEHICLE_BITS - 1)), found
+    distance = (keys >> _VEHICLE_BITS).to(torch.int32).view(torch.float32)
+    return torch.where(keys == _NOTHING, -1, keys & (2**_VEHICLE_BITS - 1)), distance
 
 
 def _take(field: Tensor, numbers: Tensor) -> Tensor:

@@ -150,5 +150,5 @@ def find_drivers(drivers: Any) -> Background | None:
         raise ValueError(
             f"Unknown drivers {name!r}{did_you_mean(name, names)}; expected one of {listed}, or a .safetensors file."
         )
-    found: Background = known["file" if is_file else name].load()(name)
-    return found
+    background: Background = known["file" if is_file else name].load()(name)
+    return background

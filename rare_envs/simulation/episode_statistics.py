@@ -60,5 +60,5 @@ def _record_crashes(crash: Crash, where: Tensor, find: Callable[..., Crash], mom
     rows = where.nonzero()[:, 0]
     state = State(*(field[rows] for field in moment.state))
     before = None if moment.before is None else State(*(field[rows] for field in moment.before))
-    found = find(state, moment.road, before, moment.dt)
-    return Crash(*(old.index_put((rows,), new) for old, new in zip(crash, found, strict=True)))
+    latest = find(state, moment.road, before, moment.dt)
+    return Crash(*(old.index_put((rows,), new) for old, new in zip(crash, latest, strict=True)))

@@ -58,7 +58,7 @@ def compare_egos(question: Question, ego_b: str, progress: bool = False, out: Pa
     a, b = prepare(question), prepare(replace(question, ego=ego_b))
     with contextlib.nullcontext() if out is None else output_folder(out):
         with as_bad_input(ValueError, EgoGone):
-            found = samplers.compare(
+            comparison = samplers.compare(
                 a.problem,
                 b.problem,
                 a.method,
@@ -69,12 +69,12 @@ def compare_egos(question: Question, ego_b: str, progress: bool = False, out: Pa
             )
         inputs = {key: value for key, value in asdict(question).items() if key not in UNUSED_FIELDS}
         answer = {
-            **found.to_dict(),
+            **comparison.to_dict(),
             "question": {"ego_a": inputs.pop("ego"), "ego_b": ego_b, **inputs},
             "notes": [f"{name}: {note}" for name, study in (("A", a), ("B", b)) for note in study.problem.notes],
             "version": rare_envs.__version__,
         }
         if out is not None:
             (out / COMPARISON).write_text(format_json(answer) + "\n", encoding="utf-8")
-            write_failures(out, a.problem.space, found.either.failures)
-    return EgoComparison(found, answer)
+            write_failures(out, a.problem.space, comparison.either.failures)
+    return EgoComparison(comparison, answer)

@@ -144,8 +144,8 @@ class Journal:
 
     def _read_json(self) -> dict[str, Any]:
         assert self._file is not None
-        found: dict[str, Any] = json.loads(np.lib.format.read_array(self._file, allow_pickle=False).tobytes())
-        return found
+        notes: dict[str, Any] = json.loads(np.lib.format.read_array(self._file, allow_pickle=False).tobytes())
+        return notes
 
     def _write(self, *arrays: NDArray[Any]) -> None:
         assert self._file is not None

@@ -65,7 +65,7 @@ def format_json(value: dict[str, Any]) -> str:
     """Return JSON with one entry per line, but lists of numbers in one line."""
     text = json.dumps(value, indent=2, allow_nan=False)
     # a line that ends with a bracket is no part of a string, which would have no line breaks
-    return re.sub(r"\[\n([^\[\]{}\"]*)\n *\]", lambda found: f"[{' '.join(found[1].split())}]", text)
+    return re.sub(r"\[\n([^\[\]{}\"]*)\n *\]", lambda match: f"[{' '.join(match[1].split())}]", text)
 
 
 def read_failures(folder: Path) -> dict[str, NDArray[Any]]:
@@ -77,7 +77,7 @@ def read_failures(folder: Path) -> dict[str, NDArray[Any]]:
     Returns:
         Parameters by name, shape (n,), or (n, size) for blocks; then "f" and "log_p0", shape (n,), and what the
         failure ended in: "crash" (words) and the numbers of `CRASH`, NaN without a crash. The parameters of row k
-        replay by `env.reset(options={name: found[name][k] for name in env.unwrapped.space.names})`.
+        replay by `env.reset(options={name: failures[name][k] for name in env.unwrapped.space.names})`.
 
     Raises:
         FileNotFoundError: There is no such run.
@@ -100,11 +100,11 @@ def read_failures(folder: Path) -> dict[str, NDArray[Any]]:
         words = name == CRASH[0]
         values = np.array(cells, dtype=str) if words else np.array([float(cell or "nan") for cell in cells])
         columns.setdefault(name.partition("[")[0], []).append(values)
-    found = {name: parts[0] if len(parts) == 1 else np.stack(parts, axis=1) for name, parts in columns.items()}
+    failures = {name: parts[0] if len(parts) == 1 else np.stack(parts, axis=1) for name, parts in columns.items()}
     if (folder / BLOCKS).exists():
         with np.load(folder / BLOCKS) as blocks:
-            found |= {name: blocks[name].astype(np.float64) for name in blocks.files}
-    return found
+            failures |= {name: blocks[name].astype(np.float64) for name in blocks.files}
+    return failures
 
 
 def _write_failures(folder: Path, report: Report) -> None:

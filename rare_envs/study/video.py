@@ -118,14 +118,14 @@ def _draw_curves_strip(drive: Drive) -> tuple[Image.Image, Any]:
     return picture, place
 
 
-def describe_drive(found: RecordedFailure, drive: Drive, number: int) -> list[str]:
+def describe_drive(recorded: RecordedFailure, drive: Drive, number: int) -> list[str]:
     """Return the drive in words, line by line."""
-    space, labels = found.problem.space, found.problem.world.scenario.labels
+    space, labels = recorded.problem.space, recorded.problem.world.scenario.labels
     lines = [
-        f"Failure {number} of {found.n_failures} in {found.problem.env_id}: "
-        f"f = {drive.f:.4g}, log p0 = {found.log_p0:.2f}"
+        f"Failure {number} of {recorded.n_failures} in {recorded.problem.env_id}: "
+        f"f = {drive.f:.4g}, log p0 = {recorded.log_p0:.2f}"
     ]
-    for name, values in space.named(found.x).items():
+    for name, values in space.named(recorded.x).items():
         unit = space.units[space.names.index(name)]
         several = np.atleast_1d(values)
         shown = " ".join(map(format_value, several)) if len(several) <= MAX_SHOWN else f"{len(several)} values"
@@ -138,11 +138,11 @@ def describe_drive(found: RecordedFailure, drive: Drive, number: int) -> list[st
         who, whom = ("the edge of the road" if j < 0 else labels[j] for j in crash["vehicles"])
         how = f"{crash['kind']}, closing at {crash['closing_speed']:.1f} m/s"
         lines.append(f"Crash after {end:.1f} s: {who} into {whom} ({how}).")
-    if abs(drive.f - found.f) > REPLAY_TOLERANCE:
+    if abs(drive.f - recorded.f) > REPLAY_TOLERANCE:
         why = "ego, drivers or this program have changed since"
-        if found.problem.varies:
+        if recorded.problem.varies:
             why = "the ego answers differently from run to run, and what was recorded is what counts"
-        lines.append(f"warning: the run recorded f = {found.f:.4g}; {why}.")
+        lines.append(f"warning: the run recorded f = {recorded.f:.4g}; {why}.")
     return lines
 
 

@@ -115,15 +115,15 @@ def crash_of(state: State, road: Road, before: State | None = None, dt: float = 
         With the first vehicle that the ego touched, or with the edge of the road where it overlaps none and has left
         the road; else no crash.
     """
-    found = _pair_crash(state, road, before, dt, slice(0, state.x.shape[1] - 1))
-    off = (found.kind == NONE) & road.off_road(state.y[:, 0])
-    return found.replace_where(off, _edge_crash(state, before, dt))
+    crash = _pair_crash(state, road, before, dt, slice(0, state.x.shape[1] - 1))
+    off = (crash.kind == NONE) & road.off_road(state.y[:, 0])
+    return crash.replace_where(off, _edge_crash(state, before, dt))
 
 
 def crash_of_others(state: State, road: Road, before: State | None = None, dt: float = 0.1) -> Crash:
     """Return the crash of vehicles other than the ego, of kind "others"; arguments as of `crash_of`."""
-    found = _pair_crash(state, road, before, dt, slice(state.x.shape[1] - 1, None))
-    return found._replace(kind=torch.where(found.kind == NONE, NONE, OTHERS))
+    crash = _pair_crash(state, road, before, dt, slice(state.x.shape[1] - 1, None))
+    return crash._replace(kind=torch.where(crash.kind == NONE, NONE, OTHERS))
 
 
 def _pair_crash(state: State, road: Road, before: State | None, dt: float, which: slice) -> Crash:
@@ -218,8 +218,8 @@ def describe_crash(crash: Crash, row: int = 0) -> dict[str, Any] | None:
         >>> from rare_envs.traffic import State, straight
         >>> x = torch.tensor([[0.0, 4.9]])  # bodies of 5 m
         >>> state = State(x, 0 * x, 0 * x, torch.tensor([[20.0, 10.0]]), theta=x[:, :0])
-        >>> found = describe_crash(crash_of(state, straight(1)))
-        >>> found["kind"], found["vehicles"], found["delta_v"]
+        >>> described = describe_crash(crash_of(state, straight(1)))
+        >>> described["kind"], described["vehicles"], described["delta_v"]
         ('rear_end', [0, 1], [5.0, 5.0])
     """
     kind = CRASH_KINDS[int(crash.kind[row])]

@@ -63,5 +63,5 @@ def lead_index(state: State, road: Road) -> Tensor:
     ahead, reach = state.x - x, (road.width + VEHICLE_WIDTH) / 2
     relevant = (ahead >= 0) & ((state.y - road.centre_of(y)).abs() <= reach)
     way = torch.where(relevant, ahead, torch.inf)[:, 1:]
-    least, found = way.flip(1).min(1)  # of vehicles level with each other the last one, as in `lead_of`
-    return torch.where(least < torch.inf, way.shape[1] - found, 0)
+    least, from_last = way.flip(1).min(1)  # of vehicles level with each other the last one, as in `lead_of`
+    return torch.where(least < torch.inf, way.shape[1] - from_last, 0)

@@ -74,12 +74,12 @@ def split_by_kind(
     chosen = failing[rows]
     everything = sum_points(sample, chosen, estimate.gamma)
     grow = cov_inflation(estimate, float(everything.cov[0]))
-    found = {}
+    shares = {}
     for kind in dict.fromkeys(labels.tolist()):
         mine = labels == kind
         sums = sum_points(sample, chosen[mine], estimate.gamma)
-        found[kind] = make_share(estimate, sums, float(everything.p[0]), grow, int(mine.sum()))
-    return dict(sorted(found.items(), key=lambda each: -each[1].p))
+        shares[kind] = make_share(estimate, sums, float(everything.p[0]), grow, int(mine.sum()))
+    return dict(sorted(shares.items(), key=lambda each: -each[1].p))
 
 
 def label_failures(f: FloatArray, x: FloatArray, label: Callable[[FloatArray], Sequence[str]]) -> NDArray[np.object_]:

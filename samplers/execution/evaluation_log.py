@@ -60,6 +60,6 @@ class EvaluationLog:
     def _keep_failures(self, x: FloatArray, f: FloatArray, failing: NDArray[np.bool_]) -> None:
         """Merge the failing ones of the rows of x (n, d) into the failures kept."""
         if failing.any():
-            found = x[failing]
-            log_p0 = np.asarray(self._base.log_prob(found), dtype=np.float64)
-            self.failures = self.failures.merge(found, f[failing], log_p0, keep=self._keep)
+            failing_x = x[failing]
+            log_p0 = np.asarray(self._base.log_prob(failing_x), dtype=np.float64)
+            self.failures = self.failures.merge(failing_x, f[failing], log_p0, keep=self._keep)

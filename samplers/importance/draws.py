@@ -154,10 +154,10 @@ def weight_warnings(draws: Draws) -> list[str]:
     """Return warnings about the weights of the failing draws."""
     if len(draws.f) == 0:
         return [f"None of {draws.n:,} final draws failed: p = 0 with a one-sided interval."]
-    found = []
+    messages = []
     if draws.ess < LOW_ESS:
-        found.append(f"The failing draws are worth {draws.ess:.0f} independent ones: the estimate is coarse.")
+        messages.append(f"The failing draws are worth {draws.ess:.0f} independent ones: the estimate is coarse.")
     share = largest_weight_share(draws.log_weights)
     if share > LARGE_SHARE:
-        found.append(f"One draw carries {100 * share:.0f} % of p: failures lie where the proposal hardly reaches.")
-    return found
+        messages.append(f"One draw carries {100 * share:.0f} % of p: failures lie where the proposal hardly reaches.")
+    return messages

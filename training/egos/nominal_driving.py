@@ -189,15 +189,15 @@ def _judge_tile(world: World, driver: Driver, x: Tensor) -> tuple[NDArray[Any], 
         same = follows == lead
         since, had = torch.where(same, since + world.clock.dt, 0.0), (had & same) | far
         margin = lane_margin(state, first)
-        found = torch.full_like(reason, PASSED)
-        found[~far & (had | (since >= GRACE))] = TOO_CLOSE
-        found[margin < 0.0] = LEFT_LANE
-        found = torch.where(episode.collided, _blame(episode), found)
+        verdict = torch.full_like(reason, PASSED)
+        verdict[~far & (had | (since >= GRACE))] = TOO_CLOSE
+        verdict[margin < 0.0] = LEFT_LANE
+        verdict = torch.where(episode.collided, _blame(episode), verdict)
         lead = follows
         least = torch.where(running, torch.minimum(least, headway), least)
         room = torch.where(running, torch.minimum(room, margin), room)
-        time = torch.where(running & (found != PASSED), now, time)
-        reason = torch.where(running, found, reason)
+        time = torch.where(running & (verdict != PASSED), now, time)
+        reason = torch.where(running, verdict, reason)
     assert first is not None
     way, due = _distances(first.state, episode.state, lead_index(first.state, world.scenario.road), world.clock.seconds)
     reason = torch.where((reason == PASSED) & (way < LEAST_WAY * due), LEFT_BEHIND, reason)
@@ -254,9 +254,9 @@ def summarise_verdicts(verdicts: Verdicts) -> Summary:
 
 def judge_all_cases(ego: Any, rollouts: int, seed: int) -> dict[str, dict[str, float]]:
     """Return rollouts passed, judged, and the interval's lower end for each case, for the header of an ego's file."""
-    found = {case: summarise_verdicts(judge(ego, case, rollouts, seed)) for case in CASES}
+    results = {case: summarise_verdicts(judge(ego, case, rollouts, seed)) for case in CASES}
     return {
-        case: {"passed": one.passed, "judged": one.judged, "at least": one.interval[0]} for case, one in found.items()
+        case: {"passed": one.passed, "judged": one.judged, "at least": one.interval[0]} for case, one in results.items()
     }
 
 
@@ -272,13 +272,13 @@ def main(
     """Judge an ego in ordinary traffic."""
     with report_errors("nominal"):
         driver = load_ego(ego)
-        found = {name: summarise_verdicts(judge(driver, name, rollouts, seed, seconds, observation)) for name in case}
+        results = {name: summarise_verdicts(judge(driver, name, rollouts, seed, seconds, observation)) for name in case}
     if as_json:
-        print(json.dumps({name: {"share": one.share, **vars(one)} for name, one in found.items()}, allow_nan=True))
+        print(json.dumps({name: {"share": one.share, **vars(one)} for name, one in results.items()}, allow_nan=True))
         return
     print("| case | passed | share (95 %) | why not | excluded | mean speed | least headway | least margin |")
     print("|---|---|---|---|---|---|---|---|")
-    for name, one in found.items():
+    for name, one in results.items():
         why = ", ".join(f"{count} {reason}" for reason, count in one.reasons.items()) or "-"
         share = f"{one.share:.4f} ({one.interval[0]:.4f} to {one.interval[1]:.4f})"
         spread = f"{one.speed:.1f} m/s | {one.headway:.2f} s | {one.margin:.2f} m"

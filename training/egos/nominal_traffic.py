@@ -139,11 +139,11 @@ def draw_starts(n: int, rng: np.random.Generator) -> NDArray[np.float64]:
     Returns:
         Parameters, shape (n, 12).
     """
-    base, found = load_base(CAR_FOLLOWING), np.empty((0, 3))
-    while len(found) < n:
+    base, starts = load_base(CAR_FOLLOWING), np.empty((0, 3))
+    while len(starts) < n:
         drawn = base.sample(2 * n, rng)
-        found = np.concatenate((found, drawn[_is_nominal(drawn)]))
-    speed, lead_speed, gap = found[:n].T
+        starts = np.concatenate((starts, drawn[_is_nominal(drawn)]))
+    speed, lead_speed, gap = starts[:n].T
     uniform = partial(rng.uniform, size=n)
     others = [(speed + uniform(-2.0, 2.0)).clip(min=0.0) for _ in _NEIGHBOURS]
     return np.column_stack(

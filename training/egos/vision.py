@@ -125,11 +125,11 @@ class Training:
         path = self.out / CHECKPOINT
         if not path.is_file():
             return
-        found = torch.load(path, weights_only=True)
-        self.network.load_state_dict(found["network"])
-        self.probe.load_state_dict(found["probe"])
-        self.optimiser.load_state_dict(found["optimiser"])
-        self.round, self.visited = found["round"], found["visited"]
+        saved = torch.load(path, weights_only=True)
+        self.network.load_state_dict(saved["network"])
+        self.probe.load_state_dict(saved["probe"])
+        self.optimiser.load_state_dict(saved["optimiser"])
+        self.round, self.visited = saved["round"], saved["visited"]
         self.recorded = [
             LabelledPictures(*torch.load(self._recorded_path(k), weights_only=True)) for k in range(self.round)
         ]

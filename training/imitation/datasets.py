@@ -98,8 +98,8 @@ def split_end(
     learn: list[TrafficScene] = []
     test: list[TrafficScene] = []
     for _, group in groupby(scenes, key=lambda scene: scene.name.rsplit("-", 1)[0]):
-        found = list(group)
-        kept = len(found) - (max(round(TEST_SHARE * len(found)), 1) if len(found) > 1 else 0)
-        learn += found[:kept]
-        test += found[kept:]
+        of_recording = list(group)
+        kept = len(of_recording) - (max(round(TEST_SHARE * len(of_recording)), 1) if len(of_recording) > 1 else 0)
+        learn += of_recording[:kept]
+        test += of_recording[kept:]
     return tuple(learn), tuple(test)

@@ -138,10 +138,10 @@ def train_members(folder: Path, ensemble: Ensemble, progress: bool = False) -> l
             with partial.open("wb") as file:
                 np.savez(file, base=own, weights=member.weights, within=member.within)
             partial.replace(path)
-        with np.load(path) as found:
-            if not np.array_equal(found["base"], own):
+        with np.load(path) as saved:
+            if not np.array_equal(saved["base"], own):
                 raise ValueError(f"{str(path)!r} is a member around another driver; remove {str(kept)!r}.")
-            members.append(Member(found["weights"], found["within"]))
+            members.append(Member(saved["weights"], saved["within"]))
     return members
 
 

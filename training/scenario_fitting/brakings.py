@@ -53,12 +53,12 @@ def find_brakings(position: FloatArray, headway: FloatArray) -> FloatArray:
     braking[:END_TICKS] = braking[len(braking) - END_TICKS :] = False
     edges = np.flatnonzero(np.diff(braking.astype(np.int8)))
     spans = (edges + 1).reshape(-1, 2)
-    found = [
+    brakings = [
         (speed[first], gap[first], -acceleration[first:end].min())
         for first, end in spans
         if speed[first] - speed[end] >= MIN_SPEED_LOSS and gap[first] > 1.0
     ]
-    return np.array(found).reshape(-1, 3)
+    return np.array(brakings).reshape(-1, 3)
 
 
 def load_brakings(folder: Path) -> FloatArray:

@@ -227,18 +227,18 @@ def replay_command(
     if out is not None:
         check_film_path(out)
     with contextlib.redirect_stdout(sys.stderr):
-        found = find_failure(run, failure, trust)
-        drive = drive_again(found.problem, found.x)
+        recorded = find_failure(run, failure, trust)
+        drive = drive_again(recorded.problem, recorded.x)
         if out is not None:
             write_film(out, drive)
-    same = abs(drive.f - found.f) <= REPLAY_TOLERANCE
+    same = abs(drive.f - recorded.f) <= REPLAY_TOLERANCE
     answer = {
         "failure": failure,
-        "failures": found.n_failures,
+        "failures": recorded.n_failures,
         "f": drive.f,
-        "f_recorded": found.f,
+        "f_recorded": recorded.f,
         "same": same,
-        "log_p0": found.log_p0,
+        "log_p0": recorded.log_p0,
         "seconds": float(drive.time[-1]),
         "crash": drive.crash,
         "out": None if out is None else str(out),
@@ -246,7 +246,7 @@ def replay_command(
     if as_json:
         print_json(answer)
     else:
-        print("\n".join(describe_drive(found, drive, failure)))
+        print("\n".join(describe_drive(recorded, drive, failure)))
         if out is not None:
             print(f"Wrote {out}.")
     raise typer.Exit(0 if same else DOUBTFUL)

@@ -153,16 +153,16 @@ def _print_failure(console: Console, report: Report) -> None:
     if report.crashes[0] is not None:
         console.print(f"    {_summarise_crash(report.crashes[0])}")
     normal = space.columns(space.to_standard_normal(np.vstack((failures.x[:1], ordinary))))
-    found, usual = space.columns(failures.x[:1]), space.columns(ordinary)
+    likeliest, usual = space.columns(failures.x[:1]), space.columns(ordinary)
     for j, name in enumerate(space.names):
         if space.sizes[j] <= MAX_SHOWN:
             low, high = np.quantile(usual[name], (0.05, 0.95))
-            values = " ".join(f"{format_value(value):>8}" for value in found[name].flat)
+            values = " ".join(f"{format_value(value):>8}" for value in likeliest[name].flat)
             console.print(
                 f"    {name:<15} {values} {space.units[j]:<4} [{format_value(low, 1)} to {format_value(high, 1)}]"
             )
         else:
-            console.print(f"    {name:<15} {_summarise_block(name, found[name][0], usual[name], normal[name])}")
+            console.print(f"    {name:<15} {_summarise_block(name, likeliest[name][0], usual[name], normal[name])}")
 
 
 def _summarise_block(name: str, values: FloatArray, ordinary: FloatArray, normal: FloatArray) -> str:

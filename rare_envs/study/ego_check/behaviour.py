@@ -115,14 +115,17 @@ def check_latency(probe: Probe) -> Iterator[Finding]:
             probe.query(observation)
             durations.append(time.perf_counter() - begun)
         times[size] = float(np.median(durations))
-    found = ", ".join(f"{1e3 * seconds:.2g} ms for {size}" for size, seconds in times.items())
+    measured = ", ".join(f"{1e3 * seconds:.2g} ms for {size}" for size, seconds in times.items())
     needed = TYPICAL_SIMULATIONS / sizes[-1] * times[sizes[-1]] * probe.problem.world.clock.ticks
     if needed > SLOW_SECONDS:
         yield report_warning(
-            "latency", f"{found}: {needed / 3600:.1f} h for {TYPICAL_SIMULATIONS} simulations", "batch its work", False
+            "latency",
+            f"{measured}: {needed / 3600:.1f} h for {TYPICAL_SIMULATIONS} simulations",
+            "batch its work",
+            False,
         )
     else:
-        yield report_pass("latency", f"{found}: {needed:.0f} s for {TYPICAL_SIMULATIONS} simulations")
+        yield report_pass("latency", f"{measured}: {needed:.0f} s for {TYPICAL_SIMULATIONS} simulations")
 
 
 def check_memory_growth(probe: Probe) -> Iterator[Finding]:
@@ -158,11 +161,11 @@ def check_driving(probe: Probe) -> Iterator[Finding]:
         )
         return
     crashed = float((f == -1.0).mean())
-    found = f"collides in {crashed:.0%} of {BATCH_ROWS} ordinary scenarios"
+    result = f"collides in {crashed:.0%} of {BATCH_ROWS} ordinary scenarios"
     if crashed > MANY_COLLISIONS:
-        yield report_warning("driving", found, "does it see and act as in its training? is it trained?")
+        yield report_warning("driving", result, "does it see and act as in its training? is it trained?")
     else:
-        yield report_pass("driving", found)
+        yield report_pass("driving", result)
 
 
 EGO_CHECKS: tuple[Callable[[Probe], Iterator[Finding]], ...] = (

@@ -28,19 +28,19 @@ class Finding:
     """Whether, as a warning, it makes an estimate doubtful."""
 
 
-def report_pass(check: str, found: str) -> Finding:
+def report_pass(check: str, result: str) -> Finding:
     """Return a finding that needs no action."""
-    return Finding(check, "pass", found)
+    return Finding(check, "pass", result)
 
 
-def report_warning(check: str, found: str, advice: str, doubtful: bool = True) -> Finding:
+def report_warning(check: str, result: str, advice: str, doubtful: bool = True) -> Finding:
     """Return a warning; doubtful if an estimate for this ego may mislead."""
-    return Finding(check, "warn", found, advice, doubtful)
+    return Finding(check, "warn", result, advice, doubtful)
 
 
-def report_failure(check: str, found: str, advice: str) -> Finding:
+def report_failure(check: str, result: str, advice: str) -> Finding:
     """Return a finding that rules the ego out."""
-    return Finding(check, "fail", found, advice)
+    return Finding(check, "fail", result, advice)
 
 
 def exit_code(findings: list[Finding]) -> int:

@@ -88,15 +88,15 @@ def check_normalisation(probe: Probe) -> Iterator[Finding]:
         probe.seen if single else np.repeat(probe.seen, statistics.observation_space.shape[0] // probe.seen.shape[1], 1)
     )
     beyond = float((np.abs(statistics.normalize_obs(seen)) > OUTLYING).any(axis=1).mean())
-    found = (
+    result = (
         f"{probe.ego.statistics_path}: {beyond:.0%} of ordinary scenarios are over {OUTLYING:g} standard deviations off"
     )
     if beyond > MANY_OUTLYING:
         yield report_warning(
-            "normalisation", found, "are these the statistics of this policy, and of this environment?"
+            "normalisation", result, "are these the statistics of this policy, and of this environment?"
         )
     else:
-        yield report_pass("normalisation", found)
+        yield report_pass("normalisation", result)
 
 
 def check_actions(probe: Probe) -> Iterator[Finding]:

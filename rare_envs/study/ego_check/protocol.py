@@ -104,7 +104,7 @@ def _protocol_cases(hello: Any) -> dict[str, Callable[[str, Any], Iterator[Findi
 
 def _compare_reply(name: str, reply: Any, kind: str) -> Finding:
     """Return whether a reply is of the kind that the protocol demands."""
-    found = reply.get("type")
-    if found == kind:
+    reply_type = reply.get("type")
+    if reply_type == kind:
         return report_pass(name, f"{kind}: {reply['reason']}" if kind == "error" and "reason" in reply else kind)
-    return report_failure(name, f"got {found!r} ({reply.get('reason', '')}), expected {kind!r}", PROTOCOL_ADVICE)
+    return report_failure(name, f"got {reply_type!r} ({reply.get('reason', '')}), expected {kind!r}", PROTOCOL_ADVICE)

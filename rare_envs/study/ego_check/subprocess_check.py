@@ -166,9 +166,9 @@ def run_checks(request: EgoCheckRequest) -> Iterator[Finding | str]:
 
     if find_ego_kind(request.ego) == "remote":
         yield "protocol"
-        found = list(check_protocol(request.ego))
-        yield from found
-        if any(finding.status == "fail" for finding in found):
+        findings = list(check_protocol(request.ego))
+        yield from findings
+        if any(finding.status == "fail" for finding in findings):
             return
     yield "loading"
     try:

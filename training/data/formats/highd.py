@@ -47,10 +47,10 @@ def highd_recordings(folder: Path | str) -> tuple[str, ...]:
         Traceback (most recent call last):
         ValueError: no_such_folder has no files XX_tracks.csv; is it the data folder of highD?
     """
-    found = tuple(sorted(path.name.removesuffix("_tracks.csv") for path in Path(folder).glob("*_tracks.csv")))
-    if not found:
+    names = tuple(sorted(path.name.removesuffix("_tracks.csv") for path in Path(folder).glob("*_tracks.csv")))
+    if not names:
         raise ValueError(f"{folder} has no files XX_tracks.csv; is it the data folder of highD?")
-    return found
+    return names
 
 
 def load_highd(folder: Path | str, recording: str, *, gaps: Gaps = "error") -> Trajectories:
@@ -147,8 +147,8 @@ def _directions(path: Path) -> dict[int, int]:
 def _direction_of(rows: Rows, directions: dict[int, int]) -> NDArray[np.int64]:
     """Return the driving direction of each row, shape (rows,)."""
     vehicles, index = np.unique(rows["vehicle"], return_inverse=True)
-    found = np.array([directions.get(int(vehicle), 0) for vehicle in vehicles])[index.ravel()]
-    if (found == 0).any():
-        row = int(np.argmax(found == 0))
+    direction = np.array([directions.get(int(vehicle), 0) for vehicle in vehicles])[index.ravel()]
+    if (direction == 0).any():
+        row = int(np.argmax(direction == 0))
         raise rows.error(row, f"vehicle {rows['vehicle'][row]:g} is not in the file of tracksMeta.")
-    return found
+    return direction

@@ -83,11 +83,11 @@ def read_numbers(path: Path | str, names: Mapping[str, Sequence[str]], text: Seq
     path = Path(path)
     header = read_column_names(path)
     known = {name.lower(): i for i, name in enumerate(header)}
-    found = {name: next((known[a.lower()] for a in also if a.lower() in known), None) for name, also in names.items()}
-    missing = [names[name][0] for name, i in found.items() if i is None]
+    indices = {name: next((known[a.lower()] for a in also if a.lower() in known), None) for name, also in names.items()}
+    missing = [names[name][0] for name, i in indices.items() if i is None]
     if missing:
         raise ValueError(f"{path} lacks the columns {', '.join(missing)}; it has {', '.join(header)}.")
-    places = {name: f"c{i}" for name, i in found.items()}
+    places = {name: f"c{i}" for name, i in indices.items()}
     wanted = sorted(set(places.values()))
     numeric = {places[name] for name in names if name not in text}
     reading = csv.ReadOptions(column_names=[f"c{i}" for i in range(len(header))], skip_rows=1, use_threads=False)

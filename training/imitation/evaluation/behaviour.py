@@ -75,10 +75,10 @@ def sampling_driver(driver: LearnedDriver, generator: torch.Generator, weights: 
 def regular_starts(recording: Recording, seconds: float = 2.0) -> tuple[Tensor, Tensor]:
     """Return scenes and ticks of starts every few seconds from the start of every scene, shape (B,) each."""
     stride = round(seconds / DT)
-    found = [
+    starts = [
         (scene, tick) for scene, ticks in enumerate(recording.ticks.tolist()) for tick in range(0, ticks - 1, stride)
     ]
-    return torch.tensor([scene for scene, _ in found]), torch.tensor([tick for _, tick in found])
+    return torch.tensor([scene for scene, _ in starts]), torch.tensor([tick for _, tick in starts])
 
 
 class DrivingStep(NamedTuple):

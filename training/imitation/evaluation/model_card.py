@@ -38,9 +38,9 @@ def format_model_card(folder: Path) -> str:
     Raises:
         ValueError: The folder holds no driver, or a file is neither.
     """
-    found = sorted(folder.glob("*.safetensors"))
-    seeing = [path for path in found if holds_vision(path)]
-    paths = [path for path in found if path not in seeing]
+    files = sorted(folder.glob("*.safetensors"))
+    seeing = [path for path in files if holds_vision(path)]
+    paths = [path for path in files if path not in seeing]
     if not paths:
         raise ValueError(f"Expected drivers (*.safetensors) in {str(folder)!r}, found none.")
     drivers = {path.stem: (read_driver(path), read_provenance(path)) for path in paths}

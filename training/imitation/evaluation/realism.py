@@ -86,35 +86,35 @@ def jensen_shannon(p: FloatArray, q: FloatArray) -> float:
 
 
 def summarise_realism(
-    found: DrivingStatistics, recorded: DrivingStatistics, times: FloatArray | None = None
+    driven: DrivingStatistics, recorded: DrivingStatistics, times: FloatArray | None = None
 ) -> Realism:
     """Return rates, divergences and errors from the statistics of a driver.
 
     Args:
-        found: Statistics of the driver.
+        driven: Statistics of the driver.
         recorded: Statistics of the record that it is compared with.
         times: Number of times that each scene counts, shape (S,); None for once.
     """
-    times = np.ones_like(found.steps) if times is None else times
-    steps, vehicles = times @ found.steps, times @ found.vehicles
+    times = np.ones_like(driven.steps) if times is None else times
+    steps, vehicles = times @ driven.steps, times @ driven.vehicles
 
     def share(counts: FloatArray, of: FloatArray) -> FloatArray:
         total = of @ counts
         return np.asarray(total / max(total.sum(), 1.0))
 
     ones = np.ones_like(recorded.steps)
-    shares = {name: float(times @ found.sums[name] / steps) for name in _SHARES}
+    shares = {name: float(times @ driven.sums[name] / steps) for name in _SHARES}
     rmse = {}
-    if found.squared and (number := times @ found.squared["number"]) > 0:
-        rmse = {name: float(np.sqrt(times @ found.squared[name] / number)) for name in ERROR_NAMES}
+    if driven.squared and (number := times @ driven.squared["number"]) > 0:
+        rmse = {name: float(np.sqrt(times @ driven.squared[name] / number)) for name in ERROR_NAMES}
     return Realism(
         vehicles=int(vehicles),
         **shares,
-        ever=float(times @ found.sums["ever"] / vehicles),
-        lane_changes=float(times @ found.sums["lane_changes"] / steps * 10.0 / DT),
-        mean_speed=float(times @ found.sums["speed"] / steps),
+        ever=float(times @ driven.sums["ever"] / vehicles),
+        lane_changes=float(times @ driven.sums["lane_changes"] / steps * 10.0 / DT),
+        mean_speed=float(times @ driven.sums["speed"] / steps),
         divergence={
-            name: jensen_shannon(share(found.counts[name], times), share(recorded.counts[name], ones)) for name in BINS
+            name: jensen_shannon(share(driven.counts[name], times), share(recorded.counts[name], ones)) for name in BINS
         },
         rmse=rmse,
     )
@@ -164,8 +164,8 @@ def measure(
         >>> from training.imitation import prepare_data
         >>> recording = prepare_data(scenes_of(synthetic_traffic(), seconds=4.0)).recording
         >>> act = lambda features, memory: (torch.zeros(*features.shape[:2], 2), None)
-        >>> found = measure(recording, act, seconds=1.0)
-        >>> found.vehicles, found.collision
+        >>> realism = measure(recording, act, seconds=1.0)
+        >>> realism.vehicles, realism.collision
         (36, 0.0)
     """
     return summarise_realism(
@@ -179,12 +179,12 @@ def record_statistics(recording: Recording) -> DrivingStatistics:
 
 
 def bootstrap_errors(
-    found: DrivingStatistics, recorded: DrivingStatistics, rng: np.random.Generator, draws: int = 200
+    driven: DrivingStatistics, recorded: DrivingStatistics, rng: np.random.Generator, draws: int = 200
 ) -> Realism:
     """Return standard errors by bootstrap over scenes; scenes that share vehicles are taken as independent."""
-    scenes = len(found.steps)
+    scenes = len(driven.steps)
     drawn = [
-        asdict(summarise_realism(found, recorded, times))
+        asdict(summarise_realism(driven, recorded, times))
         for times in rng.multinomial(scenes, [1 / scenes] * scenes, draws)
     ]
 
@@ -198,6 +198,8 @@ def bootstrap_errors(
 
 def header_metrics(recording: Recording, driver: LearnedDriver, seed: int = 0) -> dict[str, dict[str, Any]]:
     """Return the metrics in the header of a driver's file: `Realism` over 10 s and 20 s, with one sequence of noise."""
-    found = collect_statistics(recording, sampling_driver(driver, torch.Generator().manual_seed(seed)), (10.0, 20.0))
+    statistics = collect_statistics(
+        recording, sampling_driver(driver, torch.Generator().manual_seed(seed)), (10.0, 20.0)
+    )
     recorded = record_statistics(recording)
-    return {f"{seconds:g} s": asdict(summarise_realism(one, recorded)) for seconds, one in found.items()}
+    return {f"{seconds:g} s": asdict(summarise_realism(one, recorded)) for seconds, one in statistics.items()}
