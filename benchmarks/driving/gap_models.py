@@ -15,7 +15,7 @@ import numpy as np
 import typer
 
 import rare_envs
-from rare_envs.distributions.log_mixture import LogMixture
+from rare_envs.distributions.coordinate_mixture import CoordinateMixture
 from rare_envs.scenarios.registry import scenario_named
 from rare_envs.threads import use_one_thread
 from training.scenario_fitting.event_filters import EVENT_RECIPES, filter_events, read_events
@@ -46,7 +46,7 @@ def main(data: Path, rollouts: int = 1_000_000, seed: int = 0) -> None:
                 file.write(text)
                 file.flush()
                 problem = rare_envs.DrivingProblem(GAP_ENV_IDS[scenario], base=file.name)
-            assert isinstance(problem.base, LogMixture) == bool(logarithmic)
+            assert isinstance(problem.base, CoordinateMixture) == bool(logarithmic)
             f = problem.evaluate(problem.base.sample(rollouts, np.random.default_rng(seed)))
             p = float((f <= 0.0).mean())
             print(

@@ -1,7 +1,8 @@
 """Distributions of scenario parameters, with exact maps to standard normal space, and the spaces they live on."""
 
 from rare_envs.distributions.beta import BetaDistribution
-from rare_envs.distributions.log_mixture import LogMixture
+from rare_envs.distributions.coordinate_mixture import CoordinateMixture
+from rare_envs.distributions.coordinates import ClosingSpeed, Coordinates
 from rare_envs.distributions.product import (
     BlockDistribution,
     NoiseDistribution,
@@ -14,8 +15,10 @@ from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
 __all__ = [
     "BetaDistribution",
     "BlockDistribution",
+    "ClosingSpeed",
+    "CoordinateMixture",
+    "Coordinates",
     "Distribution",
-    "LogMixture",
     "NoiseDistribution",
     "Parameter",
     "ProductDistribution",

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Protocol, cast, runtime_checkable
 import numpy as np
 
 from rare_envs.distributions.beta import BetaDistribution
-from rare_envs.distributions.log_mixture import LogMixture
+from rare_envs.distributions.coordinate_mixture import CoordinateMixture
 from rare_envs.distributions.space import Distribution
 from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
 from rare_envs.plugins import did_you_mean
@@ -19,7 +19,7 @@ from rare_envs.plugins import did_you_mean
 if TYPE_CHECKING:
     from rare_envs.scenarios.base import Scenario
 
-FileDistribution = TruncatedGaussianMixture | LogMixture | BetaDistribution
+FileDistribution = TruncatedGaussianMixture | CoordinateMixture | BetaDistribution
 _TRIAL_DRAWS = 1000
 """Draws by which a user's distribution is tried before it is used."""
 DISTRIBUTION_METHODS = ("sample", "log_prob", "to_standard_normal", "from_standard_normal")
@@ -37,8 +37,9 @@ def load_base(scenario: Scenario, base: str | PathLike[str] | Distribution | Non
     """Return the base distribution of a scenario.
 
     A JSON file holds what the shipped ones do: names, low, high, weights, means, covariances, and
-    if wanted units, provenance (see `TruncatedGaussianMixture`) and logarithmic (see `LogMixture`); or, for independent
-    Beta variables, names, low, high, alpha and beta, one for each column of x (see `BetaDistribution`).
+    if wanted units and provenance (see `TruncatedGaussianMixture`), coordinates and order (see `CoordinateMixture`;
+    logarithmic, true or false for each column, in older files); or, for independent Beta variables, names, low, high,
+    alpha and beta, one for each column of x (see `BetaDistribution`).
 
     Args:
         scenario: The scenario.
@@ -101,10 +102,7 @@ def _from_dict(scenario: Scenario, source: str, data: Mapping[str, Any]) -> File
             f"expected names {wanted} in this order, got {names}."
         )
     try:
-        kind = (
-            BetaDistribution if "alpha" in data else LogMixture if data.get("logarithmic") else TruncatedGaussianMixture
-        )
-        distribution: FileDistribution = kind.from_dict(data)
+        distribution = _read_distribution(data)
     except ValueError as error:
         raise ValueError(f"Base distribution {source}: {error}") from None
     columns = len(scenario.column_parameters)
@@ -115,6 +113,15 @@ def _from_dict(scenario: Scenario, source: str, data: Mapping[str, Any]) -> File
         )
     _check_box(scenario, source, distribution)
     return distribution
+
+
+def _read_distribution(data: Mapping[str, Any]) -> FileDistribution:
+    """Return the distribution of the kind that the keys of a file tell."""
+    if "alpha" in data:
+        return BetaDistribution.from_dict(data)
+    if "coordinates" in data or data.get("order") or data.get("logarithmic"):
+        return CoordinateMixture.from_dict(data)
+    return TruncatedGaussianMixture.from_dict(data)
 
 
 def _check_box(scenario: Scenario, source: str, distribution: FileDistribution) -> None:

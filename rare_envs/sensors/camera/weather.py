@@ -15,9 +15,8 @@ from torch import Tensor
 
 from rare_envs.arrays import FloatArray
 from rare_envs.distributions.beta import BetaDistribution
-from rare_envs.distributions.log_mixture import LogMixture
+from rare_envs.distributions.coordinate_mixture import CoordinateMixture
 from rare_envs.distributions.space import Distribution, Parameter
-from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
 from rare_envs.sensors.camera.pinhole import Camera
 
 
@@ -33,38 +32,33 @@ class LogNormalDistribution:
     dim: ClassVar[int] = 1
 
     @cached_property
-    def _log_mixture(self) -> LogMixture:
-        return LogMixture.from_dict(
+    def _log_normal(self) -> CoordinateMixture:
+        return CoordinateMixture.from_dict(
             {
                 "weights": [1.0],
                 "means": [[math.log(self.median)]],
                 "covariances": [[[self.spread**2]]],
                 "low": [self.low],
                 "high": [self.high],
-                "logarithmic": [True],
+                "coordinates": ["log"],
             }
         )
 
-    @property
-    def mixture(self) -> TruncatedGaussianMixture:
-        """Distribution of the logarithm."""
-        return self._log_mixture.mixture
-
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw independent points, shape (n, 1)."""
-        return self._log_mixture.sample(n, rng)
+        return self._log_normal.sample(n, rng)
 
     def log_prob(self, x: FloatArray) -> FloatArray:
         """Return the log density, (n, 1) -> (n,); -inf outside the range."""
-        return self._log_mixture.log_prob(x)
+        return self._log_normal.log_prob(x)
 
     def to_standard_normal(self, x: FloatArray) -> FloatArray:
         """Map to standard normal space, (n, 1) -> (n, 1)."""
-        return self._log_mixture.to_standard_normal(x)
+        return self._log_normal.to_standard_normal(x)
 
     def from_standard_normal(self, u: FloatArray) -> FloatArray:
         """Map from standard normal space, (n, 1) -> (n, 1)."""
-        return self._log_mixture.from_standard_normal(u)
+        return self._log_normal.from_standard_normal(u)
 
     def project(self, x: FloatArray, weights: FloatArray, alpha: float) -> "LogNormalDistribution":
         """Return it with the median moved towards that of weighted points, by alpha of the way in logarithms."""

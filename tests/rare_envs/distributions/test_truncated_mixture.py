@@ -8,8 +8,9 @@ import pytest
 from scipy import stats
 from scipy.special import ndtri_exp
 
-from rare_envs.distributions.log_mixture import LogMixture
-from rare_envs.distributions.truncated_mixture import CHUNK_ROWS, TruncatedGaussianMixture
+from rare_envs.distributions.coordinate_mixture import CoordinateMixture
+from rare_envs.distributions.mixture_conditionals import CHUNK_ROWS
+from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
 from rare_envs.scenarios.base_distributions import load_base
 from rare_envs.scenarios.registry import SCENARIOS, scenario_named
 
@@ -87,15 +88,14 @@ def test_density_integrates_to_one(case):
 @pytest.mark.parametrize(("scenario", "base"), SHIPPED)
 def test_shipped_density_integrates_to_one_by_importance_sampling(scenario, base):
     law = load_base(scenario_named(scenario), base)
-    mixture = getattr(law, "mixture", law)  # of logarithms, in a LogMixture
     rng = np.random.default_rng(11)
     n = 100_000
-    counts = rng.multinomial(n, mixture.weights)
-    parts = zip(mixture.means, mixture.covariances, counts, strict=True)
+    counts = rng.multinomial(n, law.weights)
+    parts = zip(law.means, law.covariances, counts, strict=True)
     z = np.concatenate([rng.multivariate_normal(m, c, k) for m, c, k in parts])
-    logarithmic = list(getattr(law, "logarithmic", [False] * law.dim))
+    logarithmic = [kind == "log" for kind in law.coordinates.kinds] if isinstance(law, CoordinateMixture) else False
     x = np.where(logarithmic, np.exp(z), z)
-    ratio = np.exp(law.log_prob(x)) * np.where(logarithmic, x, 1.0).prod(axis=1) / marginal(mixture, z)
+    ratio = np.exp(law.log_prob(x)) * np.where(logarithmic, x, 1.0).prod(axis=1) / marginal(law, z)
     error = ratio.std() / np.sqrt(n)
     assert error < 0.005
     assert abs(ratio.mean() - 1.0) < 4.0 * error
@@ -173,11 +173,19 @@ def test_round_trips_of_shipped_bases(scenario, base):
     assert np.abs(again - drawn).max() < 1e-8
 
 
+def of_coordinates(law):
+    """The mixture of the coordinates, plain or logarithms, in their box."""
+    if isinstance(law, TruncatedGaussianMixture):
+        return law
+    low, high = law.coordinates.to_coordinates(np.stack([law.low, law.high]))
+    return TruncatedGaussianMixture(law.weights, law.means, law.covariances, low, high)
+
+
 LAWS = [pytest.param(random_mixture(*case), id=f"random-{case[0]}") for case in CASES]
 SHIPPED_LAWS = [load_base(scenario_named(name), base) for name, base in SHIPPED]
 LAWS += [
-    # the floats of a LogMixture are those of its mixture of logarithms
-    pytest.param(law.mixture if isinstance(law, LogMixture) else law, id="-".join(pair))
+    # the floats of a mixture with logarithms are those of its logarithms
+    pytest.param(of_coordinates(law), id="-".join(pair))
     for law, pair in zip(SHIPPED_LAWS, SHIPPED, strict=True)
 ]
 
@@ -237,8 +245,9 @@ def test_mirror_image():
 
 def test_points_on_a_face_have_finite_images():
     law = random_mixture(*CUT)
+    for each in (law, random_mixture(*ONE_3D)):
+        assert np.isfinite(each.to_standard_normal(np.stack([each.low, each.high]))).all()
     u = law.to_standard_normal(np.stack([law.low, law.high]))
-    assert np.isfinite(u).all()
     assert (u[0] < -6.0).all()
     assert (u[1] > 6.0).all()
 

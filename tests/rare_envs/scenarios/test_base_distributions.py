@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from rare_envs.distributions.beta import BetaDistribution
-from rare_envs.distributions.log_mixture import LogMixture
+from rare_envs.distributions.coordinate_mixture import CoordinateMixture
 from rare_envs.distributions.space import Distribution, ScenarioSpace
 from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
 from rare_envs.scenarios.base import Scenario
@@ -55,7 +55,7 @@ WITH_LOGARITHM = {"weights": [1.0], "means": [[15.0, 3.5]], "covariances": [[[4.
     ("content", "kind", "median"),
     [
         (GAUSSIAN, TruncatedGaussianMixture, [15.0, 40.0]),
-        ({**WITH_LOGARITHM, "logarithmic": [False, True]}, LogMixture, [15.0, np.exp(3.5)]),
+        ({**WITH_LOGARITHM, "logarithmic": [False, True]}, CoordinateMixture, [15.0, np.exp(3.5)]),
         ({"alpha": [2.0, 2.0], "beta": [2.0, 2.0]}, BetaDistribution, [17.5, 80.0]),
     ],
 )
@@ -84,7 +84,7 @@ def test_a_dictionary_may_have_a_narrower_box_but_no_wider_one() -> None:
 
 def shipped_dict(scenario: Scenario = FOLLOWING) -> dict[str, Any]:
     base = load_base(scenario, "us101")
-    assert isinstance(base, TruncatedGaussianMixture | LogMixture)
+    assert isinstance(base, TruncatedGaussianMixture | CoordinateMixture)
     return {"names": [p.name for p in scenario.parameters], **base.to_dict()}
 
 
