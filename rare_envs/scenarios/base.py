@@ -87,6 +87,11 @@ class Scenario:
     """Drivers of the other vehicles unless told otherwise; None for the script."""
 
     def __post_init__(self) -> None:
+        if not all(isinstance(vehicle, str) and vehicle.strip() for vehicle in self.vehicle_names):
+            raise ValueError(
+                f"Expected vehicles with names, got {self.vehicle_names!r} in the scenario {self.name!r}; an empty one "
+                "has no label and calls no agent."
+            )
         names = tuple(p.name for p in self.parameters)
         labels = self.labels or tuple(_in_words(vehicle) for vehicle in self.vehicle_names)
         object.__setattr__(self, "labels", labels)
