@@ -13,6 +13,7 @@ import sys
 
 from agents.remote.framing import add_length, read_message
 from agents.remote.request_handler import RequestHandler
+from rare_envs.egos.validation import is_policy
 from rare_envs.threads import use_one_thread
 
 
@@ -51,11 +52,11 @@ def load_or_explain(arguments: str) -> object:
     Args:
         arguments: Of `agents.load_ego`, as JSON.
     """
-    from agents.loading import Ego, load_ego
+    from agents.loading import load_ego
 
     try:
         ego = load_ego(**json.loads(arguments))
-        if not isinstance(ego, Ego):
+        if not is_policy(ego):
             raise ValueError(f"Expected an ego with predict for a process of its own, got {ego!r}.")
     except (ValueError, OSError) as error:
         return FailedEgo(str(error))

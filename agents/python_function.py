@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from agents.names import RULE_BASED
+from rare_envs.egos.validation import is_policy, refuse_ego
 from rare_envs.plugins import import_object, one_line
 
 
@@ -25,6 +26,6 @@ def call_factory(spec: str) -> Any:
     except (Exception, SystemExit) as error:  # the function is the user's: anything may happen in it
         raise ValueError(f"{spec!r} failed to make an ego: {one_line(error)}.") from error
     rule_based = isinstance(ego, str) and ego == RULE_BASED  # an array, say, compares element by element
-    if not rule_based and not callable(getattr(ego, "predict", None)):
-        raise ValueError(f"Expected {spec!r} to return 'idm' or an object with predict, got {type(ego).__name__}.")
+    if not rule_based and not is_policy(ego):
+        refuse_ego(ego, f"from {spec!r}")
     return ego

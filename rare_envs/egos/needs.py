@@ -6,6 +6,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from gymnasium import spaces
 
+from rare_envs.egos.validation import is_policy
 from rare_envs.sensors.kinds import OBSERVATIONS, read_kinds
 from rare_envs.simulation.ego_interface import EgoNeeds
 from rare_envs.simulation.observation import observation_space
@@ -87,11 +88,6 @@ def resolve(ego: Any, vehicles: int = 1) -> EgoNeeds:
         queries_policy=is_policy(ego) and not lidar,
         varies=getattr(ego, "deterministic", None) is False,
     )
-
-
-def is_policy(ego: Any) -> bool:
-    """Return whether an object has Stable-Baselines3's `predict`."""
-    return callable(getattr(ego, "predict", None))  # anybody's object, which may pass attributes on
 
 
 def observation_for(ego: Any, vehicles: int = 1) -> str:

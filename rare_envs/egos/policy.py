@@ -14,6 +14,7 @@ from rare_envs.control.actions import DISCRETE_ACTIONS, IDLE, META_ACTIONS
 from rare_envs.control.idm import IDM
 from rare_envs.egos.inference import PolicyQuery, query_policy
 from rare_envs.egos.needs import WrappedEgo, resolve
+from rare_envs.egos.validation import refuse_ego
 from rare_envs.egos.wrappers import find_frame_stacking, wrap_policy
 from rare_envs.sensors.kinds import map_kinds
 from rare_envs.simulation.background import Background
@@ -90,15 +91,10 @@ def as_driver(ego: Any, world: World, needs: EgoNeeds | None = None) -> Driver:
     Raises:
         ValueError: If it is none of these, or its spaces do not fit.
     """
-    if isinstance(ego, str):
-        if ego == "idm":
-            return IDM()
-        raise ValueError(
-            f"Unknown ego {ego!r}; expected 'idm' or an object. Names and files become objects by "
-            f"agents.load_ego({ego!r})."
-        )
-    if isinstance(ego, type):
-        raise ValueError(f"Expected an ego, got the class {ego.__name__}; make or train one of it first.")
+    if isinstance(ego, str) and ego == "idm":
+        return IDM()
+    if isinstance(ego, str | type):  # a class has the attributes of its egos
+        refuse_ego(ego)
     if isinstance(ego, WrappedEgo):
         return ego.in_world(world)
     needs = needs or resolve(ego, world.scenario.vehicles)
@@ -115,7 +111,7 @@ def as_driver(ego: Any, world: World, needs: EgoNeeds | None = None) -> Driver:
     if callable(getattr(ego, "act", None)):  # anybody's object
         driver: Driver = ego
         return driver
-    raise ValueError(f"Expected an ego with a method predict(observation, ...), got {type(ego).__name__}.")
+    refuse_ego(ego)
 
 
 def check_spaces(ego: Any, expected: spaces.Space[Any], action: str = "continuous", declared: str = "features") -> None:
@@ -139,7 +135,7 @@ def check_spaces(ego: Any, expected: spaces.Space[Any], action: str = "continuou
             f"The ego expects observations {observed}, the environment gives {expected}; "
             f"train it in this environment or choose {which}."
         )
-    acted = getattr(ego, "action_space", None)
+    acted = getattr(ego, "action_space", None)  # likewise
     if acted is not None and action == "meta":
         if not (isinstance(acted, spaces.Discrete) and int(acted.n) == len(META_ACTIONS)):
             raise ValueError(
@@ -149,7 +145,8 @@ def check_spaces(ego: Any, expected: spaces.Space[Any], action: str = "continuou
         return
     discrete = isinstance(acted, spaces.Discrete) and int(acted.n) == len(DISCRETE_ACTIONS)
     several = isinstance(acted, spaces.MultiDiscrete | spaces.MultiBinary)
-    if acted is not None and not discrete and (several or getattr(acted, "shape", None) != (2,)):
+    shape = getattr(acted, "shape", None)  # whatever it declares
+    if acted is not None and not discrete and (several or shape != (2,)):
         raise ValueError(
             f"The ego acts in {acted}, the environment takes Box(-1, 1, (2,)) (acceleration, steering) "
             f"or Discrete({len(DISCRETE_ACTIONS)})."

@@ -11,6 +11,7 @@ import numpy as np
 from highway_env.vehicle.behavior import IDMVehicle
 from numpy.typing import NDArray
 
+from rare_envs.egos.validation import is_policy, refuse_ego
 from rare_envs.egos.wrappers import wrap_policy
 from rare_envs.interop.fast_observation import install_fast_observation
 from rare_envs.interop.parameters import restore_class_parameters, set_idm
@@ -45,9 +46,9 @@ class DriveTask:
         install_fast_observation(env.scene, blind=self.ego == "idm")
         if self.ego == "idm":
             return DriveRunner(env, None, self.seconds)
-        ego = self.ego if callable(getattr(self.ego, "predict", None)) else self.ego()
-        if not callable(getattr(ego, "predict", None)):
-            raise ValueError(f"Expected an ego with predict from {self.ego!r}, got {type(ego).__name__}.")
+        ego = self.ego if is_policy(self.ego) else self.ego()
+        if not is_policy(ego):
+            refuse_ego(ego, f"from {self.ego!r}")
         check_ego_spaces(ego, env)
         return DriveRunner(env, wrap_policy(ego, env.observation_space), self.seconds)
 
@@ -102,18 +103,21 @@ def make_highway_env(env_id: str, config: Mapping[str, Any] | None) -> gym.Env[A
 
 
 def strip_ego(ego: Any) -> Any:
-    """Return an ego without the objects of its training: of a Stable-Baselines3 model the policy and its statistics."""
-    if isinstance(ego, str):
-        if ego == "idm":
-            return ego
-        raise ValueError(f"Unknown ego {ego!r}; expected 'idm' or an object with predict (files: agents.load_ego).")
-    if isinstance(ego, type):
-        raise ValueError(f"Expected an ego, got the class {ego.__name__}; make or train one of it first.")
-    if not callable(getattr(ego, "predict", None)):
-        if callable(ego):
-            return ego
-        raise ValueError(f"Expected an ego with a method predict(observation, ...), got {type(ego).__name__}.")
-    statistics = getattr(ego, "get_vec_normalize_env", None)
+    """Return an ego without the objects of its training: of a Stable-Baselines3 model the policy and its statistics.
+
+    Args:
+        ego: "idm", an object with `predict`, or a function without arguments that makes one.
+
+    Raises:
+        ValueError: If it is none of these.
+    """
+    if isinstance(ego, str) and ego == "idm":
+        return ego
+    if not is_policy(ego):
+        if isinstance(ego, type) or not callable(ego):
+            refuse_ego(ego)
+        return ego
+    statistics = getattr(ego, "get_vec_normalize_env", None)  # a model has it; anybody's object need not
     return ego if statistics is None else BarePolicy(ego.policy, statistics())
 
 
@@ -123,7 +127,7 @@ def check_ego_spaces(ego: Any, env: gym.Env[Any, Any]) -> None:
     Raises:
         ValueError: If its spaces do not fit.
     """
-    for what in ("observation", "action"):
+    for what in ("observation", "action"):  # the ego and its spaces are anybody's objects
         given, expected = getattr(env, f"{what}_space"), getattr(ego, f"{what}_space", None)
         fits = type(expected) is type(given) and getattr(expected, "shape", None) == getattr(given, "shape", None)
         if expected is not None and not (fits and getattr(expected, "n", None) == getattr(given, "n", None)):

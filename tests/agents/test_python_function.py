@@ -53,10 +53,10 @@ def test_a_function_of_the_user_makes_the_ego(own_module: str) -> None:
     [
         ("mak", r"has nothing called 'mak' \(did you mean 'make'\?\)\."),
         ("zzz", r"has nothing called 'zzz'\."),
-        ("make_nothing", "an object with predict, got NoneType"),
+        ("make_nothing", r"predict\(observation, \.\.\.\), got NoneType from 'own_egos_for_test:make_nothing'"),
         ("make_trouble", "failed to make an ego: RuntimeError: no weights"),
         ("make_exit", "failed to make an ego: SystemExit: 7"),
-        ("make_array", "an object with predict, got ndarray"),
+        ("make_array", "got ndarray from"),
     ],
 )
 def test_a_function_that_does_not_serve_is_refused(function: str, message: str, own_module: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 
 import agents
+from rare_envs.egos.validation import is_policy
 from rare_envs.study.errors import BadInput
 
 
@@ -27,7 +28,7 @@ def serve_ego(spec: str, bind: str, algo: str | None = None, trust: bool = False
         raise BadInput("Serving needs pyzmq and msgpack: pip install 'rare-envs[remote]'.") from error
     try:
         ego = agents.load_ego(spec, algo=algo, trust=trust)
-        if not callable(getattr(ego, "predict", None)):  # an object of the user's
+        if not is_policy(ego):
             raise ValueError(f"Expected an ego with predict, got {spec!r}, which needs more than observations.")
         server = EgoServer(ego, bind, read_secret(), name=spec)
     except (ValueError, OSError) as error:

@@ -8,7 +8,7 @@ from gymnasium import spaces
 
 import agents
 import rare_envs
-from rare_envs.egos.needs import PerceivingDriver, WrappedEgo, is_policy, resolve
+from rare_envs.egos.needs import PerceivingDriver, WrappedEgo, resolve
 from rare_envs.simulation.ego_interface import EgoNeeds
 from rare_envs.simulation.observation import observation_space
 
@@ -81,13 +81,3 @@ def test_the_noise_of_a_stack_stands_behind_all_other_columns() -> None:
     assert problem.space.names[-1] == "ego_noise"
     assert problem.dim == 6 + problem.needs.noise_columns(problem.world)
     assert rare_envs.DrivingProblem(CUT_IN, ego=agents.load_ego("noisy:idm"), horizon=1.0, noise=False).dim == 6
-
-
-def test_who_has_predict_is_a_policy_also_by_delegation() -> None:
-    class Proxy:
-        def __getattr__(self, name: str) -> Any:
-            return getattr(Declared(), name)
-
-    assert is_policy(Proxy())
-    assert not is_policy("idm")
-    assert not is_policy(Declared(predict=7))

@@ -122,7 +122,7 @@ def test_bad_input_is_refused_at_the_door() -> None:
         (Always, {}, "got the class Always"),
         ("dqn.zip", {}, "agents.load_ego"),
         (3, {}, "got int"),
-        (lambda: 3, {}, "with predict from"),
+        (lambda: 3, {}, "got int from <function"),
         (IDLE, {"workers": 0}, "workers of at least 1"),
         (IDLE, {"horizon": -1.0}, "horizon in seconds"),
         (IDLE, {"measure": "ttcc"}, "did you mean 'ttc'"),

@@ -1,0 +1,46 @@
+"""Which objects are egos: policies by their `predict`, and the refusal of what is no ego."""
+
+from __future__ import annotations
+
+from typing import NoReturn
+
+
+def is_policy(ego: object) -> bool:
+    """Return whether an object, and not a class, has Stable-Baselines3's `predict`.
+
+    Example:
+        >>> class Coasting:
+        ...     def predict(self, observation, state=None, episode_start=None, deterministic=True): ...
+        >>> is_policy(Coasting()), is_policy(Coasting), is_policy("idm")
+        (True, False, False)
+    """
+    # not isinstance of a Protocol, which takes a predict that is no function, and misses one that is passed on
+    return not isinstance(ego, type) and callable(getattr(ego, "predict", None))
+
+
+def refuse_ego(ego: object, origin: str = "") -> NoReturn:
+    """Refuse what is no ego.
+
+    Args:
+        ego: A name, a class, or an object that is no ego.
+        origin: Where it came from, if not from the caller, such as "from make_ego()".
+
+    Raises:
+        ValueError: Always; it says what was expected.
+
+    Example:
+        >>> refuse_ego(3, "from make_ego()")
+        Traceback (most recent call last):
+        ValueError: Expected 'idm' or an object with a method predict(observation, ...), got int from make_ego().
+    """
+    origin = f" {origin}" if origin else ""
+    if isinstance(ego, str):
+        raise ValueError(
+            f"Unknown ego {ego!r}{origin}; expected 'idm' or an object. Names and files become objects by "
+            f"agents.load_ego({ego!r})."
+        )
+    if isinstance(ego, type):
+        raise ValueError(f"Expected an ego, got the class {ego.__name__}{origin}; make or train one of it first.")
+    raise ValueError(
+        f"Expected 'idm' or an object with a method predict(observation, ...), got {type(ego).__name__}{origin}."
+    )

@@ -1,0 +1,59 @@
+"""Which objects are egos, and what the refusal of others says."""
+
+import subprocess
+import sys
+from typing import Any
+
+import pytest
+
+from rare_envs.egos.validation import is_policy, refuse_ego
+
+
+class Still:
+    """A policy."""
+
+    def predict(self, observation: Any, **_: Any) -> Any:
+        return observation
+
+
+class Proxy:
+    """Passes all attributes of a policy on."""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(Still(), name)
+
+
+class Prophet:
+    """Its `predict` is no function."""
+
+    predict = 7
+
+
+def test_who_has_predict_is_a_policy_also_by_delegation() -> None:
+    assert is_policy(Still())
+    assert is_policy(Proxy())
+
+
+@pytest.mark.parametrize("ego", [Still, Prophet(), "idm", None])
+def test_what_cannot_be_asked_is_none(ego: object) -> None:
+    assert not is_policy(ego)
+
+
+@pytest.mark.parametrize(
+    ("ego", "origin", "message"),
+    [
+        ("imd", "", r"^Unknown ego 'imd'; expected 'idm' or an object\. .* agents\.load_ego\('imd'\)\.$"),
+        ("imd", "from f()", r"^Unknown ego 'imd' from f\(\); "),
+        (Still, "", r"^Expected an ego, got the class Still; make or train one"),
+        (None, "", r"^Expected 'idm' or an object with a method predict\(observation, \.\.\.\), got NoneType\.$"),
+        (3, "from f()", r"got int from f\(\)\.$"),
+    ],
+)
+def test_a_refusal_says_what_was_expected(ego: object, origin: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        refuse_ego(ego, origin)
+
+
+def test_the_module_needs_no_torch() -> None:
+    code = "import sys, rare_envs.egos.validation; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
