@@ -1,4 +1,4 @@
-"""Which objects are egos: policies by their `predict`, and the refusal of what is no ego."""
+"""Validation of egos: policies are known by their `predict`, and what is no ego is refused in the same words."""
 
 from __future__ import annotations
 
