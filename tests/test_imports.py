@@ -40,7 +40,7 @@ FLOORS = {
         comparison testing
     """,
     "rare_envs": """
-        traffic plugins arrays threads
+        traffic plugins arrays threads json_text
         distributions control sensors
         sensors.camera scenarios measures
         simulation

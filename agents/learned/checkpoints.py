@@ -26,6 +26,7 @@ from agents.learned.networks import ACTION_SIZE, FEATURE_CLIP, FEATURE_SIZE, HEA
 from agents.learned.rule_driver import RuleDriver
 from agents.learned.weight_distribution import WeightDistribution
 from agents.names import RULE_BASED, SHIPPED_DRIVERS, SHIPPED_EGOS
+from rare_envs.json_text import parse_json_object
 from rare_envs.plugins import did_you_mean
 from rare_envs.sensors.perception import FEATURES
 
@@ -227,13 +228,7 @@ def read_file(path: Path, entry: str = _HEADER) -> tuple[dict[str, Any], dict[st
         raise ValueError(f"{str(path)!r} is not a safetensors file, or is damaged: {error}.{pickled}") from None
     if text is None:
         raise ValueError(f"{str(path)!r} holds tensors but no {entry}: save drivers with agents.save_driver.")
-    try:
-        header = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise ValueError(f"{str(path)!r}: its header is not valid JSON: {error}.") from None
-    if not isinstance(header, dict):
-        raise ValueError(f"{str(path)!r}: expected a JSON object as header, got {type(header).__name__}.")
-    return header, tensors
+    return parse_json_object(text, f"The header of {str(path)!r}"), tensors
 
 
 def _is_zip(path: Path) -> bool:

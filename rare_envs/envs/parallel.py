@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium import spaces
@@ -15,8 +14,8 @@ from torch import Tensor
 from rare_envs.control.actions import IDLE, read_actions
 from rare_envs.egos.needs import resolve
 from rare_envs.egos.policy import as_driver
+from rare_envs.envs.display import RENDER_MODES, Display
 from rare_envs.envs.info import Info, SingleObservation, episode_info, step_info
-from rare_envs.envs.rendering import Renderer
 from rare_envs.make import set_up
 from rare_envs.multi_agent.episode import MultiAgentEpisode, start
 from rare_envs.multi_agent.rewards import Reward, own_reward, total_of
@@ -46,7 +45,7 @@ class DrivingParallelEnv(ParallelEnv[str, SingleObservation, NDArray[np.float32]
 
     metadata: dict[str, Any] = {  # noqa: RUF012  (PettingZoo's own form)
         "name": "rare_envs",
-        "render_modes": ["rgb_array", "human"],
+        "render_modes": list(RENDER_MODES),
         "is_parallelizable": True,
         "render_fps": 10,
     }
@@ -86,15 +85,13 @@ class DrivingParallelEnv(ParallelEnv[str, SingleObservation, NDArray[np.float32]
             "name": env_id,
             "render_fps": round(1.0 / (self.world.clock.dt * self.world.clock.stride)),
         }
-        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
-            raise ValueError(f"Expected render_mode None, 'rgb_array' or 'human', got {render_mode!r}.")
         self.render_mode = render_mode
+        self._display = Display(self.world, render_mode)
         self.agents: list[str] = []
         self.observation_spaces = {agent: self.world.observation_space for agent in self.possible_agents}
         self.action_spaces = {agent: self.world.action_space for agent in self.possible_agents}
         self._vehicles = {agent: scenario.vehicle_names.index(agent) for agent in self.possible_agents}
         self._np_random: np.random.Generator | None = None
-        self._renderer: Renderer | None = None
         self._x = np.full(self.space.dim, np.nan)
         self._episode: MultiAgentEpisode | None = None
         self._memory: Any = None
@@ -216,25 +213,18 @@ class DrivingParallelEnv(ParallelEnv[str, SingleObservation, NDArray[np.float32]
         return observation
 
     def _show(self) -> None:
-        if self.render_mode == "human":
+        if self._display.is_window:
             self.render()
 
     def render(self) -> NDArray[np.uint8] | None:
         """Draw the road with HighwayEnv's graphics: an (H, W, 3) image for "rgb_array", a window for "human"."""
-        if self.render_mode is None or self._episode is None:
-            gym.logger.warn("Nothing to render: pass render_mode='rgb_array' or 'human' and reset first.")
-            return None
-        if self._renderer is None:
-            window = self.render_mode == "human"
-            self._renderer = Renderer(self.world, window, self.metadata["render_fps"])
-        crashed = (self._episode.collided | self._episode.disabled)[0].nonzero().flatten().tolist()
-        image = self._renderer.draw(
-            self._episode.traffic,
+        episode = self._episode
+        return self._display.draw(
+            None if episode is None else episode.traffic,
             self._tick * self.world.clock.dt,
             agents=[self._vehicles[agent] for agent in self.possible_agents],
-            crashed=crashed,
+            crashed=[] if episode is None else (episode.collided | episode.disabled)[0].nonzero().flatten().tolist(),
         )
-        return None if self.render_mode == "human" else image
 
     def state(self) -> NDArray[np.float32]:
         """Return x, y [m], heading [rad] and speed [m/s] of all vehicles, for a central critic; shape (N, 4)."""
@@ -246,9 +236,7 @@ class DrivingParallelEnv(ParallelEnv[str, SingleObservation, NDArray[np.float32]
 
     def close(self) -> None:
         """Close the window."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
+        self._display.close()
 
 
 def select_agents(scenario: Scenario, agents: Sequence[str] | None) -> list[str]:

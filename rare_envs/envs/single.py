@@ -8,8 +8,8 @@ import torch
 from numpy.typing import NDArray
 
 from rare_envs.control.actions import read_actions
+from rare_envs.envs.display import RENDER_MODES, Display
 from rare_envs.envs.info import SingleObservation, episode_info, step_info
-from rare_envs.envs.rendering import Renderer
 from rare_envs.make import set_up
 from rare_envs.sensors.kinds import map_kinds
 from rare_envs.simulation.decision import advance
@@ -35,7 +35,7 @@ class DrivingEnv(gym.Env[SingleObservation, Any]):
         ((11,), 9.0, False)
     """
 
-    metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 10}  # noqa: RUF012  (Gymnasium's own form)
+    metadata = {"render_modes": list(RENDER_MODES), "render_fps": 10}  # noqa: RUF012  (Gymnasium's own form)
 
     def __init__(self, env_id: str, render_mode: str | None = None, **kwargs: Any) -> None:
         """Make the environment.
@@ -53,10 +53,8 @@ class DrivingEnv(gym.Env[SingleObservation, Any]):
         self.observation_space = self.world.observation_space
         self.action_space = self.world.action_space
         self.metadata = {**self.metadata, "render_fps": round(1.0 / (self.world.clock.dt * self.world.clock.stride))}
-        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
-            raise ValueError(f"Expected render_mode None, 'rgb_array' or 'human', got {render_mode!r}.")
         self.render_mode = render_mode
-        self._renderer: Renderer | None = None
+        self._display = Display(self.world, render_mode)
         self._x = np.full(self.space.dim, np.nan)
         self._episode: Episode | None = None
         self._tick = 0
@@ -113,7 +111,7 @@ class DrivingEnv(gym.Env[SingleObservation, Any]):
         with torch.inference_mode():
             given = read_actions(self.world.clock.action, torch.as_tensor(np.asarray(action))[None], 1)
             self._between = False
-            watched = self.world.clock.stride > 1 and (self._recorder or self.render_mode == "human")
+            watched = self.world.clock.stride > 1 and (self._recorder or self._display.is_window)
             episode, terms = advance(self.world, self._episode, given, watch=self._watch if watched else None)
             observation = map_kinds(lambda part: part[0].numpy(), observe(episode, self.world.sensing.observation))
             reward = float(terms.total)
@@ -126,29 +124,20 @@ class DrivingEnv(gym.Env[SingleObservation, Any]):
 
     def _watch(self, episode: Episode) -> None:
         """Render the ticks within a decision; its last one is rendered after it."""
-        if self._between and self.render_mode == "human":
+        if self._between and self._display.is_window:
             self.render()
         elif self._between:
             self._recorder._capture_frame()
         self._episode, self._between = episode, True
 
     def _show(self) -> None:
-        if self.render_mode == "human":
+        if self._display.is_window:
             self.render()
 
     def render(self) -> NDArray[np.uint8] | None:
         """Draw the road with HighwayEnv's graphics: an (H, W, 3) image for "rgb_array", a window for "human"."""
-        if self.render_mode is None or self._episode is None:
-            gym.logger.warn("Nothing to render: pass render_mode='rgb_array' or 'human' to gym.make and reset first.")
-            return None
-        if self._renderer is None:
-            window = self.render_mode == "human"
-            self._renderer = Renderer(self.world, window, self.metadata["render_fps"])
-        image = self._renderer.draw(self._episode, self._tick * self.world.clock.dt)
-        return None if self.render_mode == "human" else image
+        return self._display.draw(self._episode, self._tick * self.world.clock.dt)
 
     def close(self) -> None:
         """Close the window."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
+        self._display.close()

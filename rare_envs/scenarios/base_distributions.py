@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
@@ -14,6 +13,7 @@ from rare_envs.distributions.beta import BetaDistribution
 from rare_envs.distributions.coordinate_mixture import CoordinateMixture
 from rare_envs.distributions.space import Distribution
 from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
+from rare_envs.json_text import parse_json_object
 from rare_envs.plugins import did_you_mean
 
 if TYPE_CHECKING:
@@ -84,13 +84,7 @@ def load_base(scenario: Scenario, base: str | PathLike[str] | Distribution | Non
 
 
 def _from_json(scenario: Scenario, source: str, text: str) -> FileDistribution:
-    try:
-        data = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise ValueError(f"Base distribution {source} is not valid JSON: {error}.") from None
-    if not isinstance(data, dict):
-        raise ValueError(f"Base distribution {source}: expected a JSON object, got {type(data).__name__}.")
-    return _from_dict(scenario, source, data)
+    return _from_dict(scenario, source, parse_json_object(text, f"Base distribution {source}"))
 
 
 def _from_dict(scenario: Scenario, source: str, data: Mapping[str, Any]) -> FileDistribution:
