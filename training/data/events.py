@@ -27,6 +27,9 @@ LATERAL_SPAN = 5
 """Number of frames over which the lateral speed is measured: 0.5 s."""
 LATERAL_SPEED = 0.2
 """Lateral speed above which a lane change has begun [m/s]."""
+ASSUMED_START = 13
+"""Frames from the start of a lane change to its crossing where positions across were not recorded: mean of the 42
+recorded starts on US 101 (1.3 s, standard deviation 0.9 s)."""
 
 CAR_FOLLOWING_COLUMNS = ("recording", "frame", "lane", "ego", "lead", "v_ego", "v_lead", "gap", "a_ego", "a_lead", "n")
 CUT_IN_COLUMNS = (
@@ -106,7 +109,7 @@ def find_start(trajectories: Trajectories, crossing: int, first: int) -> tuple[i
 
     Going back from the crossing, that is the last row before the speed towards the new lane, over the `LATERAL_SPAN`
     frames up to it, fell to `LATERAL_SPEED` or less. If it never did, the first row of the track is returned, and
-    False.
+    False. Where y was not recorded, that is the row `ASSUMED_START` frames before the crossing, and False.
 
     Args:
         trajectories: The table.
@@ -114,6 +117,8 @@ def find_start(trajectories: Trajectories, crossing: int, first: int) -> tuple[i
         first: First row of the vehicle's track.
     """
     t = trajectories
+    if np.isnan(t.y[crossing]):
+        return max(crossing - ASSUMED_START, first), False
     side = np.sign(t.lane[crossing] - t.lane[crossing - 1])
     row = crossing
     while row - LATERAL_SPAN >= first:

@@ -39,7 +39,8 @@ COLUMN_NAMES = {
 """Published headers by name of column."""
 LOCATION = "Location"
 _TEXT_ORDER = (0, 3, 4, 5, 8, 9, 11, 12, 13, 14)  # of NAMES, in the 18 columns of the files without a header
-_TEXT_COLUMNS = 18
+TEXT_COLUMNS = 18
+"""Number of columns of the files without a header."""
 
 
 def load_ngsim(path: Path | str, *, location: str | None = None, gaps: Gaps = "error") -> Trajectories:
@@ -93,8 +94,8 @@ def _read(path: Path) -> Rows:
         values = np.loadtxt(path, ndmin=2, delimiter="," if len(header) > 1 else None)
     except ValueError as error:
         raise ValueError(f"Cannot read {path}: {error}") from None
-    if values.shape[1] != _TEXT_COLUMNS:
-        raise ValueError(f"{path} has no header and {values.shape[1]} columns; expected the {_TEXT_COLUMNS} of NGSIM.")
+    if values.shape[1] != TEXT_COLUMNS:
+        raise ValueError(f"{path} has no header and {values.shape[1]} columns; expected the {TEXT_COLUMNS} of NGSIM.")
     columns = {name: values[:, place] for name, place in zip(COLUMN_NAMES, _TEXT_ORDER, strict=True)}
     return Rows(path, columns, np.arange(1, 1 + len(values)))
 

@@ -31,12 +31,14 @@ SPEED_RATIOS = (0.8, 1.25)
 
 @dataclass(frozen=True)
 class Rows:
-    """Columns of a file, with the line that each row stands in."""
+    """Columns of a file, with the line, or other unit, that each row stands in."""
 
     path: Path
     columns: Mapping[str, NDArray[Any]]
     lines: NDArray[np.int64]
     """Line of each row, shape (rows,)."""
+    unit: str = "line"
+    """What `lines` counts, in errors."""
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         return self.columns[name]
@@ -46,11 +48,12 @@ class Rows:
 
     def select(self, chosen: NDArray[np.bool_]) -> Rows:
         """Return the chosen rows."""
-        return Rows(self.path, {name: values[chosen] for name, values in self.columns.items()}, self.lines[chosen])
+        columns = {name: values[chosen] for name, values in self.columns.items()}
+        return Rows(self.path, columns, self.lines[chosen], self.unit)
 
     def error(self, row: int, text: str) -> ValueError:
         """Return an error that names the file and the line of a row."""
-        return ValueError(f"{self.path}, line {self.lines[row]}: {text}")
+        return ValueError(f"{self.path}, {self.unit} {self.lines[row]}: {text}")
 
 
 def read_column_names(path: Path) -> list[str]:
@@ -69,13 +72,16 @@ def read_column_names(path: Path) -> list[str]:
     return header
 
 
-def read_numbers(path: Path | str, names: Mapping[str, Sequence[str]], text: Sequence[str] = ()) -> Rows:
+def read_numbers(
+    path: Path | str, names: Mapping[str, Sequence[str]], text: Sequence[str] = (), leave_out_empty: bool = False
+) -> Rows:
     """Return columns of a CSV file with a header, as float64.
 
     Args:
         path: The file.
         names: Accepted headers by name of column, in upper or lower case.
         text: Columns that are returned as strings instead.
+        leave_out_empty: Leave out rows in which a number is not given, in place of an error.
 
     Raises:
         ValueError: The file cannot be read, is empty, lacks a column, or holds something else than a number.
@@ -109,13 +115,28 @@ def read_numbers(path: Path | str, names: Mapping[str, Sequence[str]], text: Seq
         raise ValueError(f"{path} has a header and no rows.")
     columns = {name: _numbers(table[place], name in text) for name, place in places.items()}
     rows = Rows(path, columns, np.arange(2, 2 + table.num_rows))
+    given = np.ones(len(rows), dtype=bool)
     for name in (name for name in names if name not in text):
         bad = ~np.isfinite(rows[name])
+        if leave_out_empty:
+            empty = _empty_fields(table[places[name]])
+            given &= ~empty
+            bad &= ~empty
         if bad.any():
             row = int(np.argmax(bad))
             value = table[places[name]][row].as_py()
             raise rows.error(row, f"{names[name][0]} is {repr(value) if value else 'empty'}, a number was expected.")
-    return rows
+    if not given.any():
+        raise ValueError(f"{path} has no row in which every number is given.")
+    return rows if given.all() else rows.select(given)
+
+
+def _empty_fields(column: pa.ChunkedArray) -> NDArray[np.bool_]:
+    """Return which fields of a column hold nothing, shape (rows,)."""
+    if pa.types.is_string(column.type):
+        return np.array([not value for value in column.to_pylist()], dtype=bool)
+    empty: NDArray[np.bool_] = column.is_null().to_numpy()
+    return empty
 
 
 def _numbers(column: pa.ChunkedArray, text: bool) -> FloatArray:
@@ -183,9 +204,8 @@ def _check_frames(rows: Rows, neighbours: _Neighbours, vehicle: FloatArray, fram
     """Check that no row is given twice and, unless holes are cut, that no frame is missing."""
     if pair := neighbours.first(neighbours.step == 0):
         row, other = pair
-        raise rows.error(
-            row, f"vehicle {vehicle[row]:g} at frame {frame[row]:g} is given twice, first in line {rows.lines[other]}."
-        )
+        first = f"{rows.unit} {rows.lines[other]}"
+        raise rows.error(row, f"vehicle {vehicle[row]:g} at frame {frame[row]:g} is given twice, first in {first}.")
     if gaps == "error" and (pair := neighbours.first(neighbours.step > 1)):
         row, other = pair
         missing = frame[row] - frame[other] - 1
