@@ -1,0 +1,59 @@
+"""Axes of roads: straight, turned and curved ones are found, and distances along and across them are kept."""
+
+import numpy as np
+import pytest
+
+from tests.training.data.formats.published_files import bend
+from training.data.formats.road_axis import fit_road_axis
+
+LANES = np.array([1.8, 5.4, 9.0])
+
+
+def tracks(rng, length=1200.0, noise=0.3):
+    """Positions along and across, and lanes: lanes are used unevenly, and vehicles weave."""
+    lane = rng.choice(3, 6000, p=[0.6, 0.3, 0.1])
+    return rng.uniform(0.0, length, 6000), LANES[lane] + noise * rng.standard_normal(6000), lane
+
+
+@pytest.mark.parametrize("angle", [0.0, 1.0, 2.5, -1.7])
+@pytest.mark.parametrize("radius", [np.inf, 1000.0, -800.0])
+def test_distances_along_and_across_are_kept(angle, radius):
+    x, y, lane = tracks(np.random.default_rng(0))
+    there = {"radius": radius, "angle": angle, "shift": (300.0, 90.0)}
+    u, w = bend(x, y, **there)
+    heading = np.array([np.subtract(*bend(np.array([600.0, 590.0]), 0.0, **there)[k]) for k in (0, 1)])
+    along, across = fit_road_axis(u, w, lane, heading).project(u, w)
+    # the axis is parallel to the road at some distance, of which radians of the turn are lost along it
+    offset = np.median(across - y)
+    assert abs(offset) < 20.0
+    np.testing.assert_allclose(across - offset, y, atol=0.25)
+    scale = 1.0 + offset / radius
+    np.testing.assert_allclose(along - along.mean(), scale * (x - x.mean()), atol=0.3)
+
+
+def test_a_parallel_path_keeps_its_distance_and_a_lane_change_its_width():
+    x, y, lane = tracks(np.random.default_rng(1))
+    axis = fit_road_axis(*bend(x, y, radius=700.0), lane, np.array([1.0, 0.3]))
+    t = np.linspace(0.0, 1.0, 60)
+    along, across = axis.project(*bend(400.0 + 120.0 * t, 1.8 + 3.6 * t, radius=700.0))
+    np.testing.assert_allclose(np.diff(across), 3.6 / 59, atol=3e-3)
+    assert across[-1] - across[0] == pytest.approx(3.6, abs=0.05)
+    assert along[-1] - along[0] == pytest.approx(120.0, abs=2.0)
+
+
+def test_points_beyond_the_ends_lie_on_the_tangents():
+    x, y, lane = tracks(np.random.default_rng(2), noise=0.0)
+    along, across = fit_road_axis(x, y, lane, np.array([1.0, 0.0])).project(
+        np.array([0.0, 1200.0, 1250.0]), np.full(3, 5.4)
+    )
+    assert np.diff(along) == pytest.approx([1200.0, 50.0], abs=0.01)
+    assert np.ptp(across) < 0.01
+
+
+def test_a_short_road_of_one_lane_has_an_axis():
+    x = np.linspace(0.0, 8.0, 30)
+    along, across = fit_road_axis(x, 2.0 + 0.0 * x, np.zeros(30, dtype=np.int64), np.array([-1.0, 0.0])).project(
+        x, 2.0 + 0.0 * x
+    )
+    np.testing.assert_allclose(np.diff(along), -np.diff(x), atol=1e-6)
+    assert np.ptp(across) < 1e-6
