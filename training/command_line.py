@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, is_dataclass
 from enum import Enum
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any, ClassVar, get_type_hints
 
 import typer
 
@@ -35,17 +35,22 @@ class RecordingOptions:
     )
     ngsim: Annotated[Path | None, typer.Option(help="Or a raw NGSIM file, CSV or text.")] = None
     highd: Annotated[Path | None, typer.Option(help="Or a folder with highD's files.")] = None
+    tgsim: Annotated[Path | None, typer.Option(help="Or a file of TGSIM, or a folder with several.")] = None
+    i24: Annotated[Path | None, typer.Option(help="Or a JSON file of I-24 MOTION, unpacked.")] = None
+
+    KINDS: ClassVar[tuple[str, ...]] = ("data", "ngsim", "highd", "tgsim", "i24")
+    """Names of the options."""
 
     def kind_and_path(self) -> tuple[str, Path]:
-        """Return the option that is given: "data", "ngsim" or "highd", and its path.
+        """Return the option that is given, such as "highd", and its path.
 
         Raises:
             ValueError: None is given, or several are.
         """
-        kinds = {"data": self.data, "ngsim": self.ngsim, "highd": self.highd}
-        given = [(kind, path) for kind, path in kinds.items() if path is not None]
+        given = [(kind, getattr(self, kind)) for kind in self.KINDS if getattr(self, kind) is not None]
         if len(given) != 1:
-            raise ValueError("Expected one of --data FOLDER, --ngsim FILE and --highd FOLDER.")
+            options = [f"--{kind}" for kind in self.KINDS]
+            raise ValueError(f"Expected one of {', '.join(options[:-1])} and {options[-1]}, with a path.")
         return given[0]
 
 
@@ -105,7 +110,7 @@ def spread_options(command: Callable[..., None]) -> Callable[..., None]:
         >>> def command(name: str, options: RecordingOptions) -> None:
         ...     print(name, options.highd)
         >>> list(inspect.signature(spread_options(command)).parameters)
-        ['name', 'data', 'ngsim', 'highd']
+        ['name', 'data', 'ngsim', 'highd', 'tgsim', 'i24']
         >>> spread_options(command)(name="run", highd="highD/data")
         run highD/data
     """

@@ -46,7 +46,7 @@ def test_options_come_from_the_signature(monkeypatch, capsys):
 def test_one_source_of_recordings_is_given():
     assert RecordingOptions(ngsim=Path("a.csv")).kind_and_path() == ("ngsim", Path("a.csv"))
     for wrong in (RecordingOptions(), RecordingOptions(data=Path("a"), highd=Path("b"))):
-        with pytest.raises(ValueError, match="one of --data FOLDER, --ngsim FILE and --highd FOLDER"):
+        with pytest.raises(ValueError, match="one of --data, --ngsim, --highd, --tgsim and --i24, with a path"):
             wrong.kind_and_path()
 
 

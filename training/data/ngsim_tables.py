@@ -31,7 +31,7 @@ def read_columns(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
     if not path.is_file():
         raise ValueError(
             f"There is no {path.name} in the folder {str(path.parent)!r}. That is one of the compact tables, which are "
-            "no part of the package; recordings of your own are read as NGSIM or highD files."
+            "no part of the package; recordings of your own are read in the formats of docs/data.md."
         )
     try:
         table = pq.read_table(path)

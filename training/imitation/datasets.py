@@ -1,4 +1,4 @@
-"""Sources of recorded scenes: the tables of US 101, or a user's own NGSIM or highD files."""
+"""Sources of recorded scenes: the tables of US 101, or files of a user's own."""
 
 from __future__ import annotations
 
@@ -7,16 +7,19 @@ from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 
-from training.data.formats.highd import highd_recordings, load_highd
-from training.data.formats.ngsim import load_ngsim
+from training.data.formats.recordings import load_recordings
 from training.data.scenes import TrafficScene, load_us101_scenes, split_by_clock
 from training.data.windows import scenes_of
 
-SOURCE_KINDS = ("data", "ngsim", "highd")
+SOURCE_KINDS = ("data", "ngsim", "highd", "tgsim", "i24")
+"""Kinds of sources: those of recordings that have positions across the road."""
 TEST_SHARE = 0.2
 """Share at the end of a user's recording that is kept for tests."""
 _NGSIM = "CC BY-SA 3.0, as reported of the NGSIM record 8ect-6jqj"
+_TGSIM = "public, as reported of TGSIM's records at data.transportation.gov"
+_I24 = "the data use agreement of I-24 MOTION, which asks for a citation of Gloudemans et al., 2023"
 _HIGHD = "highD's: non-commercial, and neither the data nor what derives from it is passed on without leave"
+_FILES = {"tgsim": "TGSIM", "i24": "I-24 MOTION"}
 
 
 @dataclass(frozen=True)
@@ -33,7 +36,7 @@ class Source:
     """
 
     kind: str
-    """"data" for a folder with the compact tables of US 101, "ngsim" for a raw file, "highd" for a folder."""
+    """"data" for a folder with the compact tables of US 101, or the format of the files, one of `SOURCE_KINDS`."""
     path: Path
     location: str | None = None
     """Location to read from a raw NGSIM file that has several."""
@@ -53,12 +56,14 @@ class Source:
             return "NGSIM US 101, 15 June 2005, 07:49:51 to 07:52:53 without 64 to 88 s and 158 to 193 s of its clock"
         if self.kind == "ngsim":
             return f"NGSIM, {self.location or self.path.stem}, the first {1 - TEST_SHARE:.0%}"
+        if self.kind in _FILES:
+            return f"{_FILES[self.kind]}, {self.path.stem}, the first {1 - TEST_SHARE:.0%} of each recording"
         return f"highD, {', '.join(self.recordings) or 'all recordings'}, the first {1 - TEST_SHARE:.0%} of each"
 
     @property
     def licence(self) -> str:
         """Licence of the data."""
-        return _HIGHD if self.kind == "highd" else _NGSIM
+        return {"highd": _HIGHD, "tgsim": _TGSIM, "i24": _I24}.get(self.kind, _NGSIM)
 
     @property
     def options(self) -> str:
@@ -84,10 +89,9 @@ def load_scenes(source: Source) -> tuple[tuple[TrafficScene, ...], tuple[Traffic
     """
     if source.kind == "data":
         return split_by_clock(load_us101_scenes(source.path))
-    if source.kind == "ngsim":
-        return split_end(scenes_of(load_ngsim(source.path, location=source.location, gaps="cut"), source.seconds))
-    names = source.recordings or highd_recordings(source.path)
-    tables = [load_highd(source.path, name, gaps="cut") for name in names]
+    tables = load_recordings(
+        source.kind, source.path, location=source.location, recordings=source.recordings, gaps="cut"
+    )
     return split_end([scene for table in tables for scene in scenes_of(table, source.seconds)])
 
 

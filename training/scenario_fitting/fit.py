@@ -4,7 +4,7 @@
     python -m training.scenario_fitting.fit --highd DIR --out bases
 
 The first line makes the files of the package from events of US 101. The second first extracts the events of your own
-recordings: of highD, or with --ngsim of raw NGSIM.
+recordings: of highD, or with --ngsim, --tgsim, --i24 or --coifman of other formats (docs/data.md).
 
 Events (one per row of a CSV file) are filtered, standardised, and fitted with Gaussian mixtures with full
 covariances; the number of components is the one with the least Bayesian information criterion. Back in physical
@@ -16,10 +16,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import typer
@@ -28,8 +29,7 @@ from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
 from rare_envs.scenarios.registry import scenario_named
 from training.command_line import LocationOption, RecordingOptions, report_errors, run_command, spread_options
 from training.data.events import EXTRACTORS, Events, concatenate_events, write_events
-from training.data.formats.highd import highd_recordings, load_highd
-from training.data.formats.ngsim import load_ngsim
+from training.data.formats.recordings import load_recordings
 from training.data.formats.text_columns import Gaps
 from training.data.trajectories import Trajectories
 from training.scenario_fitting.event_filters import EVENT_RECIPES, EventRecipe, filter_events, read_events
@@ -47,7 +47,7 @@ from training.scenario_fitting.published_highway import build_highway_base
 
 US101_COMMAND = "python -m training.scenario_fitting.fit --data DIR --out rare_envs/data"
 """Command that writes the files of the package."""
-OWN_COMMAND = "python -m training.scenario_fitting.fit, with --highd or --ngsim"
+OWN_COMMAND = "python -m training.scenario_fitting.fit, with --highd or another option of recordings"
 """Command that writes bases of a user's own recordings."""
 US101_SOURCE = {
     "data": "Next Generation Simulation (NGSIM) Vehicle Trajectories and Supporting Data, US 101 "
@@ -207,11 +207,23 @@ def fit_own_bases(
         typer.echo(base)
 
 
+@dataclass(frozen=True, kw_only=True)
+class EventOptions(RecordingOptions):
+    """Options that name recordings of which events are extracted."""
+
+    coifman: Annotated[Path | None, typer.Option(help="Or the I-80 data of Coifman and Li, .mat or text.")] = None
+    location: LocationOption = None
+    between: Annotated[
+        tuple[float, float] | None, typer.Option(help="Of I-24 MOTION: first and last Unix time to read [s].")
+    ] = None
+
+    KINDS: ClassVar[tuple[str, ...]] = (*RecordingOptions.KINDS, "coifman")
+
+
 @spread_options
 def main(
     out: Annotated[Path, typer.Option(help="Folder for the JSON files.")],
-    recordings: RecordingOptions,
-    location: LocationOption = None,
+    recordings: EventOptions,
     cut_gaps: Annotated[bool, typer.Option("--cut-gaps", help="Cut tracks where frames are missing.")] = False,
     scenario: Annotated[list[str] | None, typer.Option(help="Of your own recordings: which to fit.")] = None,
     name: Annotated[str, typer.Option(help="Name of the bases of your own recordings.")] = "own",
@@ -224,13 +236,11 @@ def main(
         if unknown := sorted(set(chosen) - set(EVENT_RECIPES)):
             raise ValueError(f"Unknown scenario {unknown[0]}; known are {', '.join(EVENT_RECIPES)}.")
         gaps: Gaps = "cut" if cut_gaps else "error"
-        if kind == "highd":
-            tables = (load_highd(path, recording, gaps=gaps) for recording in highd_recordings(path))
-            fit_own_bases(tables, chosen, out, name, seed)
-        elif kind == "ngsim":
-            fit_own_bases([load_ngsim(path, location=location, gaps=gaps)], chosen, out, name, seed)
-        else:
+        if kind == "data":
             _write_package_bases(path, out, seed)
+        else:
+            tables = load_recordings(kind, path, location=recordings.location, between=recordings.between, gaps=gaps)
+            fit_own_bases(tables, chosen, out, name, seed)
 
 
 def _write_package_bases(data: Path, out: Path, seed: int) -> None:

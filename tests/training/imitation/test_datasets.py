@@ -1,12 +1,13 @@
 """Sources of scenes: kinds, and the part that is kept for tests."""
 
 import dataclasses
+from pathlib import Path
 
 import pytest
 
+from tests.training.data.formats.published_files import i24_documents, tgsim_rows, write_i24, write_tgsim
 from tests.training.data.recordings import simulate, write_highd
 from tests.training.imitation.synthetic_scenes import scenes
-from training.imitation import train as command_line
 from training.imitation.datasets import Source, load_scenes, split_end
 
 
@@ -27,7 +28,19 @@ def test_the_end_of_each_recording_is_kept_for_tests():
 
 def test_a_source_is_of_a_known_kind():
     with pytest.raises(ValueError, match="ngsim"):
-        Source("waymo", command_line.Path())
+        Source("waymo", Path("data"))
+
+
+def test_a_source_of_another_format_is_learned_from(tmp_path):
+    traffic = simulate(seed=2, per_lane=6, seconds=16.0)
+    write_tgsim(tmp_path / "I294.csv", tgsim_rows(traffic))
+    write_i24(tmp_path / "morning.json", i24_documents(traffic))
+    for kind, name in (("tgsim", "I294.csv"), ("i24", "morning.json")):
+        source = Source(kind, tmp_path / name, seconds=4.0)
+        learn, test = load_scenes(source)
+        assert len(learn) >= 2 and len(test) == 1
+        assert source.options == f"--{kind} {name} --seconds 4"
+        assert name.partition(".")[0] in source.description and source.licence
 
 
 def test_both_directions_are_learned_from_and_their_ends_kept_for_tests(highd):

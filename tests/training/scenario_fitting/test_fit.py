@@ -10,6 +10,15 @@ from typer.testing import CliRunner
 
 from rare_envs.scenarios.base_distributions import load_base
 from rare_envs.scenarios.registry import scenario_named
+from tests.training.data.formats.published_files import (
+    CLOCK,
+    coifman_matrix,
+    i24_documents,
+    tgsim_rows,
+    write_coifman,
+    write_i24,
+    write_tgsim,
+)
 from tests.training.data.recordings import simulate, write_highd, write_ngsim
 from tests.training.shared_data import DATA, needs_data
 from training.data.events import (
@@ -78,12 +87,53 @@ def test_bases_are_fitted_to_a_raw_ngsim_file(simulated, quick, tmp_path):
     assert states == len(table) - len(table.track_starts())  # the last position of a track has no speed
 
 
+def check_bases(folder, scenarios=tuple(EVENT_RECIPES)):
+    """Bases of simulated traffic, whose speeds are between 9 and 27 m/s."""
+    for scenario in scenarios:
+        base = load_base(scenario_named(scenario), folder / f"{scenario}_own.json")
+        points = base.sample(100, np.random.default_rng(0))
+        assert np.isfinite(points).all() and 12.0 < points[:, 0].mean() < 25.0
+
+
+def test_bases_are_fitted_to_a_folder_of_tgsim(simulated, quick, tmp_path):
+    folder = tmp_path / "tgsim"
+    folder.mkdir()
+    write_tgsim(folder / "I294_L1.csv", tgsim_rows(simulated, radius=900.0, angle=2.6))
+    (folder / "geometry.csv").write_text("x1,y1\n1,2\n", encoding="utf-8")
+    result = run_cli("--tgsim", folder, "--out", tmp_path / "bases")
+    assert result.exit_code == 0, result.output
+    check_bases(tmp_path / "bases")
+    provenance = json.loads((tmp_path / "bases" / "cut_in_own.json").read_text(encoding="utf-8"))["provenance"]
+    assert provenance["source"]["data"] == "recordings I294_L1-1-left"
+
+
+def test_bases_are_fitted_to_a_file_of_i24_motion(simulated, quick, tmp_path):
+    path = write_i24(tmp_path / "morning.json", i24_documents(simulated))
+    result = run_cli("--i24", path, "--out", tmp_path)
+    assert result.exit_code == 0, result.output
+    check_bases(tmp_path)
+    result = run_cli("--i24", path, "--out", tmp_path, "--between", CLOCK - 20.0, CLOCK - 10.0)
+    assert result.exit_code == 2 and "has no rows between the times" in result.stderr
+
+
+def test_a_car_following_base_is_fitted_to_the_data_of_coifman_and_li(simulated, quick, tmp_path):
+    path = write_coifman(tmp_path / "CoifmanAndLi2017.mat", coifman_matrix(simulated))
+    result = run_cli("--coifman", path, "--out", tmp_path, "--scenario", "car_following")
+    assert result.exit_code == 0, result.output
+    check_bases(tmp_path, ("car_following",))
+    result = run_cli("--coifman", path, "--out", tmp_path, "--scenario", "cut_in")  # no lateral offset
+    assert result.exit_code == 2 and len(result.stderr.splitlines()) == 1
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ((), "Expected one of --data FOLDER, --ngsim FILE and --highd FOLDER"),
+        ((), "Expected one of --data, --ngsim, --highd, --tgsim, --i24 and --coifman, with a path"),
         (("--highd", "none"), "has no files XX_tracks.csv"),
         (("--ngsim", "none.csv"), "Cannot read none.csv"),
+        (("--tgsim", "none"), "none has no CSV file with a column xloc_kf"),
+        (("--i24", "none.json"), "Cannot read none.json"),
+        (("--coifman", "none.mat"), "Cannot read none.mat"),
         (("--ngsim", "none.csv", "--scenario", "merge"), "Unknown scenario merge"),
         (("--ngsim", "none.csv", "--data", "none"), "Expected one of"),
     ],
