@@ -7,7 +7,12 @@ from samplers.methods.two_stage.mixture.boundary import fit_half_spaces, fit_rad
 from samplers.methods.two_stage.mixture.mixture_weights import Floor, minimise_second_moment, raise_to_floors
 from samplers.methods.two_stage.mixture.proposal import MixtureProposal, ProposalComponent
 from samplers.methods.two_stage.mixture.screening import FailureScreen, LabelledPoints, train_screen
-from samplers.methods.two_stage.mixture.subspace_em import HIGH_DIM
+from samplers.methods.two_stage.mixture.settings import (
+    DEFAULT_MIXTURE_SETTINGS,
+    EdgeSettings,
+    MixtureSettings,
+    ScreeningSettings,
+)
 from samplers.methods.two_stage.multiple_importance import MultipleImportanceSample
 from samplers.methods.two_stage.refinement import RefinementState
 from samplers.methods.two_stage.settings import RefinementSettings
@@ -20,6 +25,7 @@ def build_proposal(
     history: MultipleImportanceSample,
     settings: RefinementSettings,
     rng: np.random.Generator,
+    mixture: MixtureSettings = DEFAULT_MIXTURE_SETTINGS,
     *,
     final: bool = False,
 ) -> MixtureProposal:
@@ -33,9 +39,10 @@ def build_proposal(
         history: All draws so far.
         settings: Shares and lower limits.
         rng: Source of randomness: what a screen accepts is found by drawing.
+        mixture: Of edges, weights and screens.
         final: For the estimate: what is no use is dropped, and a classifier may screen the draws.
     """
-    candidates = list_candidates(state, history, settings)
+    candidates = list_candidates(state, history, settings, mixture.edges)
     kinds = np.array([candidate.kind for candidate in candidates])
     start = np.array([settings.initial_shares[c.kind] / np.count_nonzero(kinds == c.kind) for c in candidates])
     weights = start / start.sum()
@@ -44,7 +51,7 @@ def build_proposal(
     floors = _set_floors(state, candidates, settings, final=final)
     u, log_w = _smooth_indicators(history, state.gamma, settings) if state.noisy else (history.u, history.log_weights)
     log_r = log_ratios([candidate.component for candidate in candidates], u)
-    weights = minimise_second_moment(log_r, log_w, weights, floors)
+    weights = minimise_second_moment(log_r, log_w, weights, floors, mixture.weights)
     keeps = kinds == "base"
     if not final:
         explored = np.isin(kinds, ["explored", "linear"])
@@ -52,12 +59,17 @@ def build_proposal(
         keeps = keeps | explored
     weights = np.where((weights < settings.min_share) & ~keeps, 0.0, weights)
     proposal = MixtureProposal(candidates, raise_to_floors(weights / weights.sum(), floors))
-    screen = _train_screen(state) if final and not state.noisy and state.dim <= HIGH_DIM else None
-    return proposal if screen is None else proposal.with_screen(screen, rng)
+    if not final or state.noisy or state.dim > mixture.subspace.high_dim:
+        return proposal
+    screen = _train_screen(state, mixture.screening)
+    return proposal if screen is None else proposal.with_screen(screen, rng, mixture.screening)
 
 
 def list_candidates(
-    state: RefinementState, history: MultipleImportanceSample, settings: RefinementSettings
+    state: RefinementState,
+    history: MultipleImportanceSample,
+    settings: RefinementSettings,
+    edges: EdgeSettings = DEFAULT_MIXTURE_SETTINGS.edges,
 ) -> list[ProposalComponent]:
     """Return the components that the next proposal may have; the first is the base distribution."""
     gaussians = [
@@ -69,9 +81,9 @@ def list_candidates(
     return [
         ProposalComponent(IsotropicNormal(state.dim), "base"),
         ProposalComponent(IsotropicNormal(state.dim, settings.wide_scale), "wide"),
-        *_fit_radial_components(state, history, settings),
+        *_fit_radial_components(state, history, settings, edges),
         *regional,
-        *([] if state.noisy else _fit_half_space_components(state, history, settings)),
+        *([] if state.noisy else _fit_half_space_components(state, history, settings, edges)),
         *_temper_gaussians(regional, settings.noisy_tempering if state.noisy else settings.tempering),
     ]
 
@@ -87,20 +99,20 @@ def _temper_gaussians(components: list[ProposalComponent], powers: tuple[float, 
 
 
 def _fit_radial_components(
-    state: RefinementState, history: MultipleImportanceSample, settings: RefinementSettings
+    state: RefinementState, history: MultipleImportanceSample, settings: RefinementSettings, edges: EdgeSettings
 ) -> list[ProposalComponent]:
     """Return radial components around the chains' points and around the weighted failures; none in one dimension."""
     if state.dim < 2:
         return []
-    radial = [fit_radial(state.points, np.ones(len(state.points)))]
+    radial = [fit_radial(state.points, np.ones(len(state.points)), edges)]
     if len(history.u) >= settings.min_radial_failures:
         log_w = history.log_weights
-        radial.append(fit_radial(history.u, np.exp(log_w - log_w.max())))
+        radial.append(fit_radial(history.u, np.exp(log_w - log_w.max()), edges))
     return [ProposalComponent(component, "radial") for component in radial]
 
 
 def _fit_half_space_components(
-    state: RefinementState, history: MultipleImportanceSample, settings: RefinementSettings
+    state: RefinementState, history: MultipleImportanceSample, settings: RefinementSettings, edges: EdgeSettings
 ) -> list[ProposalComponent]:
     """Return half-spaces through the edge of the failures that each Gaussian describes."""
     u = history.u if state.rounds else state.points
@@ -113,7 +125,7 @@ def _fit_half_space_components(
     for k, gaussian in enumerate(gaussians):
         own = owner == k
         if np.count_nonzero(own) >= settings.min_owned_failures:
-            half_spaces += fit_half_spaces(gaussian, u[own], np.exp(log_w[own] - log_w[own].max()))
+            half_spaces += fit_half_spaces(gaussian, u[own], np.exp(log_w[own] - log_w[own].max()), edges)
     return [ProposalComponent(half_space, "half-space") for half_space in half_spaces]
 
 
@@ -153,10 +165,10 @@ def _smooth_indicators(
     return u, log_w + log_ndtr(odds)
 
 
-def _train_screen(state: RefinementState) -> FailureScreen | None:
+def _train_screen(state: RefinementState, settings: ScreeningSettings) -> FailureScreen | None:
     """Return a screen trained on the chains and the draws of all rounds, or None if none is worth it."""
     *earlier, last = state.rounds
     u = np.concatenate([region.u for region in state.regions] + [draws.u for draws in earlier])
     f = np.concatenate([region.f for region in state.regions] + [draws.f for draws in earlier])
     known, fresh = LabelledPoints(u, f <= state.gamma), LabelledPoints(last.u, last.f <= state.gamma)
-    return train_screen(known, fresh, last.log_weights)
+    return train_screen(known, fresh, last.log_weights, settings)

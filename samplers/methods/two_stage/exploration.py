@@ -22,6 +22,7 @@ from samplers.mcmc.chains import Chains, Growth, independent_chains
 from samplers.mcmc.descent import NextLevel, descend
 from samplers.mcmc.kernels import ScaledKernel
 from samplers.method import Interrupted
+from samplers.methods.two_stage.mixture.settings import DEFAULT_MIXTURE_SETTINGS, MixtureSettings
 from samplers.methods.two_stage.regions import ExplorationResult, SubsetPoints, grow_regions
 from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, ExplorationSettings, RegionSettings
 from samplers.methods.two_stage.simulator import ComponentDraws, Simulator
@@ -116,6 +117,7 @@ def find_regions(
     rng: np.random.Generator,
     settings: RegionSettings = DEFAULT_SETTINGS.regions,
     explore: ExplorationSettings = DEFAULT_SETTINGS.exploration,
+    mixture: MixtureSettings = DEFAULT_MIXTURE_SETTINGS,
 ) -> Generator[FloatArray, FloatArray, ExplorationResult]:
     """Find the regions of failure, starting from the first draws; none if nothing fails."""
     n_base = int(first.counts[0])
@@ -129,7 +131,7 @@ def find_regions(
     starts = np.concatenate([far, rng.permutation(descent.failing)[: min(others, most - len(far))]])
     if len(starts) == 0:
         return ExplorationResult([], noisy=False)
-    return (yield from grow_regions(simulator, starts, descent, gamma, sizes.limit, rng, settings))
+    return (yield from grow_regions(simulator, starts, descent, gamma, sizes.limit, rng, settings, mixture))
 
 
 def _descend(

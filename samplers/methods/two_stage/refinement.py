@@ -12,8 +12,8 @@ import numpy as np
 
 from samplers.methods.two_stage.mixture.linear_model import half_space_proposals
 from samplers.methods.two_stage.mixture.proposal import NO_REGION, MixtureProposal, ProposalComponent
+from samplers.methods.two_stage.mixture.settings import DEFAULT_MIXTURE_SETTINGS, MixtureSettings, SubspaceSettings
 from samplers.methods.two_stage.mixture.subspace_em import (
-    HIGH_DIM,
     GroupedPoints,
     fit_subspace_mixture,
     refit_components,
@@ -90,7 +90,11 @@ class RefinementState:
 
 
 def start_refinement(
-    exploration: ExplorationResult, gamma: float, settings: RefinementSettings, rng: np.random.Generator
+    exploration: ExplorationResult,
+    gamma: float,
+    settings: RefinementSettings,
+    rng: np.random.Generator,
+    mixture: MixtureSettings = DEFAULT_MIXTURE_SETTINGS,
 ) -> RefinementState:
     """Return the initial state, from the exploration alone.
 
@@ -99,17 +103,18 @@ def start_refinement(
         gamma: Threshold of failure.
         settings: Numbers of Gaussians.
         rng: Source of randomness of the fits.
+        mixture: Of the fits.
     """
     most = settings.max_gaussians if exploration.noisy else settings.gaussians_per_region
     explored = tuple(
         ProposalComponent(gaussian, "explored", k)
         for k, region in enumerate(exploration.regions)
-        for gaussian in _fit_chains(region, most, settings.points_per_chain, rng)
+        for gaussian in _fit_chains(region, most, settings.points_per_chain, rng, mixture.subspace)
     )
     linear = tuple(
         ProposalComponent(component, "linear", k)
         for k, region in enumerate(exploration.regions)
-        for component in half_space_proposals(region.points, region.u, region.f, gamma)
+        for component in half_space_proposals(region.points, region.u, region.f, gamma, mixture)
     )
     gaussians = [candidate.component for candidate in explored if isinstance(candidate.component, SubspaceGaussian)]
     return RefinementState(
@@ -129,6 +134,7 @@ def refine_once(
     batch: ComponentDraws,
     settings: RefinementSettings,
     rng: np.random.Generator,
+    mixture: MixtureSettings = DEFAULT_MIXTURE_SETTINGS,
     *,
     fresh: bool,
 ) -> RefinementState:
@@ -141,6 +147,7 @@ def refine_once(
         batch: Its draws.
         settings: How many failures a fit needs.
         rng: Source of randomness of the fits.
+        mixture: Of the fits.
         fresh: Whether a mixture is also fitted to all failures anew.
     """
     kinds = np.repeat([candidate.kind for candidate in proposal.candidates], batch.counts)
@@ -153,29 +160,31 @@ def refine_once(
     )
     if len(history.u) < settings.min_refit_failures:
         return state
-    high_dim = state.dim > HIGH_DIM
+    high_dim = state.dim > mixture.subspace.high_dim
     return replace(
         state,
-        gaussians=refit_components(state.gaussians, history.u, history.log_weights),
-        fresh_gaussians=_fit_failures(history, settings, rng) if fresh and not high_dim else [],
-        linear=_fit_linear(state, settings) if fresh or high_dim or len(state.regions) > 1 else state.linear,
+        gaussians=refit_components(state.gaussians, history.u, history.log_weights, mixture.subspace),
+        fresh_gaussians=_fit_failures(history, settings, rng, mixture.subspace) if fresh and not high_dim else [],
+        linear=_fit_linear(state, settings, mixture) if fresh or high_dim or len(state.regions) > 1 else state.linear,
     )
 
 
-def expected_weights(state: RefinementState, proposal: MixtureProposal) -> FloatArray:
+def expected_weights(state: RefinementState, proposal: MixtureProposal, min_trimmed_chains: int = 3) -> FloatArray:
     """Return the mean weight that the exploration's points in each region would have as draws of a proposal, (m,).
 
-    Without the heaviest of three chains or more: one may be where hardly any failure is.
+    Without the heaviest of `min_trimmed_chains` chains or more: one may be where hardly any failure is.
     """
     expected = []
     for region in state.regions:
         weights = np.exp(proposal.log_weights(region.points)).reshape(region.chains.shape[:2])
         chains = np.sort(weights.mean(axis=1))
-        expected.append(float(chains[:-1].mean() if len(chains) > 2 else chains.mean()))
+        expected.append(float(chains[:-1].mean() if len(chains) >= min_trimmed_chains else chains.mean()))
     return np.array(expected)
 
 
-def _fit_chains(region: Region, most: int, points_per_chain: float, rng: np.random.Generator) -> list[SubspaceGaussian]:
+def _fit_chains(
+    region: Region, most: int, points_per_chain: float, rng: np.random.Generator, subspace: SubspaceSettings
+) -> list[SubspaceGaussian]:
     """Return at most `most` Gaussians fitted to the chains of a region; a chain belongs to one of them."""
     chains, steps, dim = region.chains.shape
     n = chains * steps
@@ -185,11 +194,14 @@ def _fit_chains(region: Region, most: int, points_per_chain: float, rng: np.rand
         ess=points_per_chain * chains,
         groups=np.repeat(np.arange(chains), steps),
     )
-    return fit_subspace_mixture(points, most if dim <= HIGH_DIM else 1, rng).components
+    return fit_subspace_mixture(points, most if dim <= subspace.high_dim else 1, rng, subspace).components
 
 
 def _fit_failures(
-    history: MultipleImportanceSample, settings: RefinementSettings, rng: np.random.Generator
+    history: MultipleImportanceSample,
+    settings: RefinementSettings,
+    rng: np.random.Generator,
+    subspace: SubspaceSettings,
 ) -> list[SubspaceGaussian]:
     """Return a mixture fitted to all failures, [] where their weights are too uneven for one."""
     weights = truncate_weights(history.log_weights)
@@ -197,10 +209,12 @@ def _fit_failures(
     if ess < max(settings.min_fresh_ess, settings.min_fresh_ess_per_dim * dim):
         return []
     points = GroupedPoints(history.u, weights, ess, np.arange(len(weights)))
-    return fit_subspace_mixture(points, settings.max_gaussians, rng).components
+    return fit_subspace_mixture(points, settings.max_gaussians, rng, subspace).components
 
 
-def _fit_linear(state: RefinementState, settings: RefinementSettings) -> tuple[ProposalComponent, ...]:
+def _fit_linear(
+    state: RefinementState, settings: RefinementSettings, mixture: MixtureSettings
+) -> tuple[ProposalComponent, ...]:
     """Return half-space proposals from what was known of each region and the draws nearest to it."""
     u, f = np.concatenate([draws.u for draws in state.rounds]), np.concatenate([draws.f for draws in state.rounds])
     log_r = log_ratios([candidate.component for candidate in state.explored], u)
@@ -212,6 +226,6 @@ def _fit_linear(state: RefinementState, settings: RefinementSettings) -> tuple[P
         own = owner == k
         failures = np.concatenate([region.points, u[own & fails]])
         around, outcomes = np.concatenate([region.u, u[own]]), np.concatenate([region.f, f[own]])
-        components = half_space_proposals(failures, around, outcomes, state.gamma)
+        components = half_space_proposals(failures, around, outcomes, state.gamma, mixture)
         proposals += [ProposalComponent(component, "linear", k) for component in components]
     return tuple(proposals)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from samplers.methods.two_stage.mixture.linear_model import descent_direction
-from samplers.methods.two_stage.mixture.subspace_em import HIGH_DIM
+from samplers.methods.two_stage.mixture.settings import DEFAULT_MIXTURE_SETTINGS, LinearModelSettings, MixtureSettings
 from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, RegionSettings
 from samplers.methods.two_stage.simulator import SimulationSteps, Simulator
 from samplers.problem import FloatArray
@@ -95,6 +95,7 @@ def grow_regions(
     limit: int,
     rng: np.random.Generator,
     settings: RegionSettings = DEFAULT_SETTINGS.regions,
+    mixture: MixtureSettings = DEFAULT_MIXTURE_SETTINGS,
 ) -> SimulationSteps[ExplorationResult]:
     """Run chains from failing points, twice; sort them into regions after each time.
 
@@ -109,9 +110,11 @@ def grow_regions(
         limit: Simulations after which points are no longer compared.
         rng: Source of randomness.
         settings: Numbers and steps of chains.
+        mixture: From how many dimensions on these are others, and the regression that gives chains a direction.
     """
     dim = starts.shape[1]
-    steps = settings.steps if dim <= HIGH_DIM else settings.steps_high_dim
+    high_dim = dim > mixture.subspace.high_dim
+    steps = settings.steps_high_dim if high_dim else settings.steps
     sigma = np.full(len(starts), settings.initial_step)
     first = yield from _pcn_chains(simulator, starts, sigma, None, steps[0], gamma, rng, settings)
     if (yield from _is_noisy(simulator, first.ends, gamma, rng, settings)):
@@ -125,24 +128,23 @@ def grow_regions(
     wanted = min(max(few, math.ceil(settings.points_per_dim * dim / steps[1])), many)
     chosen = _replicate_seeds(labels, wanted, min(room, settings.max_replicated), rng)
     first, labels = first.select(chosen), labels[chosen]
-    directions = _estimate_directions(first, labels, descent, settings)
+    directions = _estimate_directions(first, labels, descent, settings, mixture.linear_model)
     last = yield from _pcn_chains(
         simulator, first.ends, first.sigma, directions[labels], steps[1], gamma, rng, settings
     )
     labels, scattered = yield from _label_regions(simulator, last.ends, gamma, limit, settings)
-    regions = _collect_regions(first, last, labels, settings)
+    regions = _collect_regions(first, last, labels, settings.late_steps_high_dim if high_dim else settings.late_steps)
     if len(regions) == 1:
         regions = [_add_subset_points(regions[0], descent, settings)]
     return ExplorationResult(regions, noisy=False, scattered=scattered, levels=descent.levels)
 
 
-def _collect_regions(first: ChainPaths, last: ChainPaths, labels: Labels, settings: RegionSettings) -> list[Region]:
+def _collect_regions(first: ChainPaths, last: ChainPaths, labels: Labels, late: int) -> list[Region]:
     """Return the regions: states of the last chains but their first, proposals to them and late ones to the first.
 
-    Early proposals to wide failures are far from where failures are likely.
+    Late are the last `late` steps: early proposals to wide failures are far from where failures are likely.
     """
     dim = last.states.shape[2]
-    late = settings.late_steps if dim <= HIGH_DIM else settings.late_steps_high_dim
     proposals = np.concatenate([first.proposals[:, -late:], last.proposals], axis=1)
     f = np.concatenate([first.f[:, -late:], last.f], axis=1)
     regions = []
@@ -259,23 +261,29 @@ def _replicate_seeds(labels: Labels, wanted: int, room: int, rng: np.random.Gene
 
 
 def _estimate_directions(
-    paths: ChainPaths, labels: Labels, descent: SubsetPoints, settings: RegionSettings
+    paths: ChainPaths,
+    labels: Labels,
+    descent: SubsetPoints,
+    settings: RegionSettings,
+    linear_model: LinearModelSettings,
 ) -> FloatArray:
     """Return the direction of each region, shape (m, d); the points of subset simulation belong to the only one."""
     n = labels.max() + 1
-    return np.array(
-        [_estimate_direction(paths.select(labels == k), descent if n == 1 else None, settings) for k in range(n)]
-    )
+    only = descent if n == 1 else None
+    return np.array([_estimate_direction(paths.select(labels == k), only, settings, linear_model) for k in range(n)])
 
 
 def _estimate_direction(
-    paths: ChainPaths, descent: SubsetPoints | None, settings: RegionSettings = DEFAULT_SETTINGS.regions
+    paths: ChainPaths,
+    descent: SubsetPoints | None,
+    settings: RegionSettings = DEFAULT_SETTINGS.regions,
+    linear_model: LinearModelSettings = DEFAULT_MIXTURE_SETTINGS.linear_model,
 ) -> FloatArray:
     """Return the direction in which a region lies, shape (d,): where f falls if it does so linearly, else its mean."""
     region = paths.to_region()
     if descent is not None:
         region = _add_subset_points(region, descent, settings)
-    axis, r2 = descent_direction(region.u, region.f)
+    axis, r2 = descent_direction(region.u, region.f, linear_model)
     if r2 > settings.direction_r2:
         return axis
     mean = paths.states[:, -settings.mean_steps :].mean(axis=(0, 1))

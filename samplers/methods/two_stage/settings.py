@@ -2,13 +2,14 @@
 
 Users set `TwoStage.n` only. Where no other reason stands beside a number, it was chosen together with the others on the
 problems of `benchmarks/estimators/catalogue.py` at 6,000 simulations: some 30 configurations, up to 40 runs each, by
-which differences in gain of less than a factor of two cannot be told from chance. Constants of the algorithms that fit
-and screen mixtures stand in their modules (`mixture/`).
+which differences in gain of less than a factor of two cannot be told from chance. Numbers of the
+algorithms that fit and screen mixtures stand in `mixture/settings.py`.
 """
 
 from dataclasses import dataclass, field
 
 from samplers.methods.two_stage.mixture.proposal import Kind
+from samplers.methods.two_stage.mixture.settings import DEFAULT_MIXTURE_SETTINGS, MixtureSettings
 
 
 def _initial_shares() -> dict[Kind, float]:
@@ -73,7 +74,7 @@ class RegionSettings:
     steps: tuple[int, int] = (5, 6)
     """Steps of the chains before and after they are sorted into regions."""
     steps_high_dim: tuple[int, int] = (8, 8)
-    """The same above HIGH_DIM dimensions, where a wide failure has further to go."""
+    """The same above `SubspaceSettings.high_dim` dimensions, where a wide failure has further to go."""
     chain_acceptance: float = 0.35
     """Acceptance that the step is adapted to; Papaioannou, Betz, Zwirglmaier and Straub, 2015, adapt to 0.44."""
     adaptation: float = 0.7
@@ -108,7 +109,7 @@ class RegionSettings:
     late_steps: int = 2
     """Of the steps before sorting, the last ones whose proposals describe f around a region."""
     late_steps_high_dim: int = 4
-    """The same above HIGH_DIM dimensions."""
+    """The same above `SubspaceSettings.high_dim` dimensions."""
     direction_r2: float = 0.5
     """From this R^2 on, chains follow the direction in which f falls, else that of their mean."""
     mean_steps: int = 3
@@ -181,6 +182,9 @@ class RefinementSettings:
     """Failures that a radial component needs."""
     min_log_ratio: float = 1.0
     """A draw belongs to the region whose Gaussian has the largest density there, if that is e times phi or more."""
+    min_trimmed_chains: int = 3
+    """From this many chains on the heaviest of a region is left out of its weight: it may be where hardly any failure
+    is, and of two nobody knows which."""
     probit_scale: float = 1.702
     """Log odds over the argument of Phi that is next to them: noise is near normal, and the logistic curve has far
     heavier tails (Camilli, "Origin of the scaling constant d = 1.7 in item response theory", 1994)."""
@@ -251,11 +255,15 @@ class TwoStageSettings:
     """... but at least so many draws."""
     max_batches: int = 100
     """Batches after which a target c.o.v. is given up where max_sim does not say."""
+    min_stratum_draws: int = 10
+    """Of components with fewer draws the second moment stands in for the variance: that of a handful is worth
+    nothing."""
     exploration: ExplorationSettings = ExplorationSettings()
     regions: RegionSettings = RegionSettings()
     refinement: RefinementSettings = RefinementSettings()
     fallback: FallbackSettings = FallbackSettings()
     diagnostics: DiagnosticSettings = DiagnosticSettings()
+    mixture: MixtureSettings = DEFAULT_MIXTURE_SETTINGS
 
 
 DEFAULT_SETTINGS = TwoStageSettings()

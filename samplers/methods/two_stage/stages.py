@@ -131,6 +131,7 @@ def explore(context: RunContext, state: RunState) -> SimulationSteps[tuple[RunSt
         context.rng,
         settings.regions,
         settings.exploration,
+        settings.mixture,
     )
     n = sum(len(region.f) for region in exploration.regions)
     fails = sum(int((region.f <= gamma).sum()) for region in exploration.regions)
@@ -141,9 +142,9 @@ def begin_refinement(
     context: RunContext, state: RunState, exploration: ExplorationResult
 ) -> tuple[RefinementState, MixtureProposal]:
     """Return what the exploration shows of its regions, at least one, and the proposal of the first round."""
-    settings, rng = context.settings.refinement, context.rng
-    refinement = start_refinement(exploration, context.goal.gamma, settings, rng)
-    return refinement, build_proposal(refinement, state.history, settings, rng)
+    settings, mixture, rng = context.settings.refinement, context.settings.mixture, context.rng
+    refinement = start_refinement(exploration, context.goal.gamma, settings, rng, mixture)
+    return refinement, build_proposal(refinement, state.history, settings, rng, mixture)
 
 
 def draw_round(
@@ -151,10 +152,12 @@ def draw_round(
 ) -> SimulationSteps[tuple[RunState, RefinementState]]:
     """Draw n points from a proposal and learn from them; `fresh`: also fit a mixture to all failures anew."""
     state, batch = yield from _draw(context, state, proposal, n)
-    gamma, settings = context.goal.gamma, context.settings.refinement
+    gamma, settings = context.goal.gamma, context.settings
     draws = Draws.from_outcomes(batch.f, proposal.log_weights(batch.u), batch.u, gamma)
     history = state.history.add(batch, gamma)
-    refinement = refine_once(refinement, history, proposal, batch, settings, context.rng, fresh=fresh)
+    refinement = refine_once(
+        refinement, history, proposal, batch, settings.refinement, context.rng, settings.mixture, fresh=fresh
+    )
     ess = effective_sample_size(history.log_weights)
     state = replace(state, history=history, rounds=(*state.rounds, draws))
     p = float(np.exp(history.log_weights).sum())
@@ -181,7 +184,8 @@ def refine(
         fresh = number > len(rounds) - settings.fresh_rounds
         state, refinement = yield from draw_round(context, state, refinement, proposal, n, fresh=fresh)
     final = number == len(rounds)
-    return state, refinement, build_proposal(refinement, state.history, settings, context.rng, final=final)
+    proposal = build_proposal(refinement, state.history, settings, context.rng, context.settings.mixture, final=final)
+    return state, refinement, proposal
 
 
 def accepts_proposal(
@@ -193,7 +197,8 @@ def accepts_proposal(
         return True
     if refinement.noisy:
         return not context.noise_marginalised or fallback.meets_failures(state.rounds[-1], settings)
-    return fallback.describes_failures(state.rounds[-1], expected_weights(refinement, proposal), settings)
+    expected = expected_weights(refinement, proposal, context.settings.refinement.min_trimmed_chains)
+    return fallback.describes_failures(state.rounds[-1], expected, settings)
 
 
 def fall_back(context: RunContext, state: RunState, levels: int) -> Steps:
@@ -213,7 +218,9 @@ def estimate_afresh(
 ) -> Steps:
     """Draw from the last proposal until the budget is used or the target is met; p rests on these draws alone."""
     goal, inputs, stopped = context.goal, context.simulator.inputs, False
-    sample = StratifiedSample.empty(len(proposal.weights), inputs.dim, expected_weights(refinement, proposal))
+    settings = context.settings
+    expected = expected_weights(refinement, proposal, settings.refinement.min_trimmed_chains)
+    sample = StratifiedSample.empty(len(proposal.weights), inputs.dim, expected, settings.min_stratum_draws)
     size = context.left if goal.target_cov is None else context.target_batch
     while context.left_at_all > 0:
         try:
@@ -228,7 +235,7 @@ def estimate_afresh(
     if sample.draws.n == 0:
         early = estimate_early(context, state)
         return early if stopped else replace(early, status=Status.BUDGET)
-    outcome = _outcome(context, state, sample.draws, sample.cov, 1 / context.settings.refinement.base_share)
+    outcome = _outcome(context, state, sample.draws, sample.cov, 1 / settings.refinement.base_share)
     return replace(
         outcome,
         warnings=(*outcome.warnings, *_check(context, state, refinement, sample)),
@@ -284,7 +291,7 @@ def _draw(
     context: RunContext, state: RunState, proposal: MixtureProposal, n: int
 ) -> SimulationSteps[tuple[RunState, ComponentDraws]]:
     """Make n draws of a proposal; those from its first component, the base distribution, are counted."""
-    u, counts = proposal.draw(n, context.rng)
+    u, counts = proposal.draw(n, context.rng, context.settings.mixture.screening)
     f = yield from context.simulator.evaluate(u)
     batch = ComponentDraws(proposal.components, counts, u, f)
     return replace(state, base_draws=state.base_draws + int(counts[0])), batch

@@ -11,12 +11,11 @@ import numpy as np
 
 from samplers.importance.draws import Draws
 from samplers.methods.two_stage.mixture.proposal import MixtureProposal
+from samplers.methods.two_stage.settings import DEFAULT_SETTINGS
 from samplers.methods.two_stage.simulator import ComponentDraws
 from samplers.problem import FloatArray, Inputs
 from samplers.sample import Sample
 
-MIN_STRATUM_DRAWS = 10
-"""Of components with fewer draws the second moment stands in for the variance: that of a handful is worth nothing."""
 MAX_LOG_WEIGHT = 700.0
 """exp(709) is the largest number; base draws bound all weights that matter far below."""
 
@@ -38,12 +37,16 @@ class StratifiedSample:
     """Weight of a typical point of each region, whether or not a draw has met one, shape (m,)."""
     u_safe: FloatArray
     """The draws that did not fail, in the order of `draws.f_safe`, shape (m, d)."""
+    min_stratum_draws: int = DEFAULT_SETTINGS.min_stratum_draws
+    """Draws of a component under which its second moment stands in for its variance."""
 
     @classmethod
-    def empty(cls, k: int, dim: int, expected: FloatArray) -> "StratifiedSample":
+    def empty(
+        cls, k: int, dim: int, expected: FloatArray, min_stratum_draws: int = DEFAULT_SETTINGS.min_stratum_draws
+    ) -> "StratifiedSample":
         """Return a sample without draws, of a proposal of k components in d dimensions."""
-        zero = np.zeros(k)
-        return cls(Draws(0, np.empty(0), np.empty(0)), zero, zero, zero, 0.0, expected, np.empty((0, dim)))
+        zero, none = np.zeros(k), Draws(0, np.empty(0), np.empty(0))
+        return cls(none, zero, zero, zero, 0.0, expected, np.empty((0, dim)), min_stratum_draws)
 
     def add(self, batch: ComponentDraws, proposal: MixtureProposal, inputs: Inputs, gamma: float) -> "StratifiedSample":
         """Return the sample with another batch from the same proposal."""
@@ -60,6 +63,7 @@ class StratifiedSample:
             proposal.acceptance_cov,
             self.expected,
             np.concatenate([self.u_safe, batch.u[~fails]]),
+            self.min_stratum_draws,
         )
 
     @property
@@ -76,7 +80,7 @@ class StratifiedSample:
         """
         if len(self.draws.f) == 0:
             return math.inf
-        many = self.counts >= MIN_STRATUM_DRAWS
+        many = self.counts >= self.min_stratum_draws
         n, s1, s2 = self.counts[many], self.sums[many], self.squares[many]
         within = float(((s2 - s1 * s1 / n) * n / (n - 1)).sum()) + float(self.squares[~many].sum())
         largest = max(math.exp(float(self.draws.log_weights.max())), float(self.expected.max(initial=0.0)))

@@ -6,36 +6,35 @@ and the rare heavy weight that it then has is what no estimate of the error know
 
 import numpy as np
 
-from samplers.methods.two_stage.mixture.linear_model import EDGE_SLACK, MIN_DISTANCE, failure_edge, weighted_quantile
+from samplers.methods.two_stage.mixture.linear_model import failure_edge, weighted_quantile
+from samplers.methods.two_stage.mixture.settings import DEFAULT_MIXTURE_SETTINGS, EdgeSettings
 from samplers.problem import FloatArray
 from samplers.proposals.components import HalfSpaceNormal, RadialLaw, SubspaceGaussian
 
-EDGE_SHARE = 0.02
-"""Share of the failures' weight that may lie before a half-space: what `failure_edge` then takes off covers them."""
-RADIUS_SHARE = 0.01
-"""Share of the failures' weight that may lie within the radius before it is shortened."""
-RADIUS_SLACK = 0.98
-"""|u|^2 at that quantile, times this, is where radial draws begin: the least of few lies beyond the edge of many."""
 MIN_NORM = 1e-6
 """A centre nearer to the origin than this has no direction."""
 MIN_VARIANCE = 1e-6
 """Smallest variance across a half-space, and of |u|^2: failures may coincide in a direction."""
-MIN_SHAPE = 0.3
-"""Least shape of the Gamma distribution of |u|^2: with less, nearly all draws are at its start."""
 MIN_SCALE = 1e-3
-"""Least scale of it."""
+"""Least scale of the Gamma distribution of |u|^2: it must be positive."""
 
 
-def fit_half_spaces(gaussian: SubspaceGaussian, u: FloatArray, weights: FloatArray) -> list[HalfSpaceNormal]:
+def fit_half_spaces(
+    gaussian: SubspaceGaussian,
+    u: FloatArray,
+    weights: FloatArray,
+    settings: EdgeSettings = DEFAULT_MIXTURE_SETTINGS.edges,
+) -> list[HalfSpaceNormal]:
     """Return half-spaces through the edge of a Gaussian's failures, orthogonal to the direction of its centre.
 
     N(0, I) beyond the edge, and, where the Gaussian has a full covariance, the same with that covariance within the
-    plane. None where the edge is nearer to the origin than MIN_DISTANCE.
+    plane. None where the edge is nearer to the origin than `min_distance`.
 
     Args:
         gaussian: Describes these failures.
         u: Failures, shape (n, d).
         weights: Their importance weights, of any scale, shape (n,).
+        settings: Where the edge is.
     """
     centre, dim = gaussian.centre, len(gaussian.axes)
     norm = float(np.linalg.norm(centre))
@@ -43,8 +42,8 @@ def fit_half_spaces(gaussian: SubspaceGaussian, u: FloatArray, weights: FloatArr
         return []
     axis = centre / norm
     ess = float(weights.sum()) ** 2 / float((weights**2).sum())
-    start = failure_edge(u @ axis, weights, ess, EDGE_SHARE) - EDGE_SLACK
-    if start < MIN_DISTANCE:
+    start = failure_edge(u @ axis, weights, ess, settings.share, settings) - settings.slack
+    if start < settings.min_distance:
         return []
     half_spaces = [HalfSpaceNormal(axis, start)]
     if gaussian.axes.shape[1] == dim > 1:
@@ -63,16 +62,19 @@ def _project(gaussian: SubspaceGaussian, axis: FloatArray) -> SubspaceGaussian:
     return SubspaceGaussian(axes, axes.T @ gaussian.centre, np.maximum(values[within], MIN_VARIANCE))
 
 
-def fit_radial(u: FloatArray, weights: FloatArray) -> RadialLaw:
+def fit_radial(
+    u: FloatArray, weights: FloatArray, settings: EdgeSettings = DEFAULT_MIXTURE_SETTINGS.edges
+) -> RadialLaw:
     """Return the radial distribution whose |u|^2 has the moments of failures u (n, d) with weights (n,).
 
     |u|^2 = start + Gamma(shape, scale) in every direction, with shape = mean^2 / variance and scale = variance / mean
     of what |u|^2 exceeds the start by.
     """
     square = np.einsum("ij,ij->i", u, u)
-    start = RADIUS_SLACK * weighted_quantile(square, weights, RADIUS_SHARE)
+    start = settings.radius_factor * weighted_quantile(square, weights, settings.radius_share)
     outside = square > start
     excess, w = square[outside] - start, weights[outside]
     mean = float(np.average(excess, weights=w))
     variance = max(float(np.average((excess - mean) ** 2, weights=w)), MIN_VARIANCE)
-    return RadialLaw(u.shape[1], start, max(mean * mean / variance, MIN_SHAPE), max(variance / mean, MIN_SCALE))
+    shape = max(mean * mean / variance, settings.min_radial_shape)
+    return RadialLaw(u.shape[1], start, shape, max(variance / mean, MIN_SCALE))

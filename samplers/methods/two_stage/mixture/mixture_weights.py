@@ -11,12 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from samplers.methods.two_stage.mixture.settings import DEFAULT_MIXTURE_SETTINGS, MixtureWeightSettings
 from samplers.problem import FloatArray
 
-WEIGHT_UPDATES = 60
-"""Multiplicative updates: they come within 2 % of the least second moment (`test_weights_are_nearly_the_best`)."""
-NEGLIGIBLE = 30.0
-"""Points whose weight is e^-30 of the largest one do not matter."""
 LEAST_DENSITY_RATIO = 1e-300
 """Least ratio of densities to divide by."""
 
@@ -32,7 +29,11 @@ class Floor:
 
 
 def minimise_second_moment(
-    log_r: FloatArray, log_weights: FloatArray, start: FloatArray, floors: Sequence[Floor]
+    log_r: FloatArray,
+    log_weights: FloatArray,
+    start: FloatArray,
+    floors: Sequence[Floor],
+    settings: MixtureWeightSettings = DEFAULT_MIXTURE_SETTINGS.weights,
 ) -> FloatArray:
     """Return weights a (k,) of a mixture q_a = sum_k a_k q_k that minimise the second moment of its estimate.
 
@@ -45,6 +46,7 @@ def minimise_second_moment(
         log_weights: Of the failing points, shape (n,).
         start: First weights, shape (k,).
         floors: Lower limits of disjoint groups, kept in every update.
+        settings: Number of updates.
 
     Example:
         Two components without overlap, 10 points of ratio 4 and 40 of ratio 1: weights are as the roots of 10 / 4 and
@@ -55,13 +57,13 @@ def minimise_second_moment(
         >>> minimise_second_moment(log_r, np.zeros(50), np.array([0.5, 0.5]), []).round(3)
         array([0.2, 0.8])
     """
-    matter = log_weights > log_weights.max() - NEGLIGIBLE
+    matter = log_weights > log_weights.max() - settings.negligible
     log_r, log_weights = log_r[:, matter], log_weights[matter]
     largest = log_r.max(axis=0)
     ratio = np.exp(log_r - largest)
     scaled = np.exp(log_weights - largest - (log_weights - largest).max())
     a = start
-    for _ in range(WEIGHT_UPDATES):
+    for _ in range(settings.updates):
         q = np.maximum(a @ ratio, LEAST_DENSITY_RATIO)
         a = a * np.sqrt((ratio * (scaled / (q * q))).sum(axis=1))
         a = raise_to_floors(a / a.sum(), floors)

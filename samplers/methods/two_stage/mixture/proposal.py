@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from samplers.methods.two_stage.mixture.screening import FailureScreen, draw_screened
+from samplers.methods.two_stage.mixture.settings import DEFAULT_MIXTURE_SETTINGS, ScreeningSettings
 from samplers.problem import FloatArray
 from samplers.proposals.components import MixtureComponent, draw_components, draw_counts, log_ratios, mixture_log_ratio
 
@@ -28,11 +29,6 @@ NO_REGION = -1
 """Region of a component that belongs to none in particular."""
 UNSCREENED = ("base", "wide")
 """Kinds that no screen thins: they guard against what the classifier does not know."""
-ACCEPTANCE_DRAWS = 15_000
-"""Draws, shared among the components by weight, that find what a screen accepts; they are not simulated. The c.o.v. of
-an acceptance of a half is then under 1 % of itself for a component of any weight that matters."""
-MIN_ACCEPTANCE_DRAWS = 500
-"""Such draws of a component at least."""
 
 
 class ProposalComponent(NamedTuple):
@@ -80,24 +76,34 @@ class MixtureProposal:
             log_r = log_r + np.where(self.screened[used, None], thinned, 0.0)
         return -mixture_log_ratio(log_r, self.weights[used])
 
-    def draw(self, n: int, rng: np.random.Generator) -> tuple[FloatArray, NDArray[np.int64]]:
+    def draw(
+        self,
+        n: int,
+        rng: np.random.Generator,
+        settings: ScreeningSettings = DEFAULT_MIXTURE_SETTINGS.screening,
+    ) -> tuple[FloatArray, NDArray[np.int64]]:
         """Draw n points (n, d), one component after the other; return them and how many are from which (k,)."""
         counts = draw_counts(self.weights, n, rng)
         if self.screen is None:
             return draw_components(self.components, counts, rng), counts
         parts = [
-            draw_screened(self.screen, component, int(k), rng) if screened else component.sample(int(k), rng)
+            draw_screened(self.screen, component, int(k), rng, settings) if screened else component.sample(int(k), rng)
             for component, k, screened in zip(self.components, counts, self.screened, strict=True)
             if k > 0
         ]
         return np.concatenate(parts), counts
 
-    def with_screen(self, screen: FailureScreen, rng: np.random.Generator) -> "MixtureProposal":
+    def with_screen(
+        self,
+        screen: FailureScreen,
+        rng: np.random.Generator,
+        settings: ScreeningSettings = DEFAULT_MIXTURE_SETTINGS.screening,
+    ) -> "MixtureProposal":
         """Return the mixture behind a screen; what it accepts of each component is found by draws, not simulations."""
         acceptance, error = np.ones(len(self.weights)), 0.0
         for k, component in enumerate(self.components):
             if self.screened[k] and self.weights[k] > 0:
-                n = max(int(self.weights[k] * ACCEPTANCE_DRAWS), MIN_ACCEPTANCE_DRAWS)
+                n = max(int(self.weights[k] * settings.acceptance_draws), settings.min_acceptance_draws)
                 accepted = screen(component.sample(n, rng))
                 acceptance[k] = accepted.mean()
                 error += (self.weights[k] / acceptance[k]) ** 2 * float(accepted.var()) / len(accepted)

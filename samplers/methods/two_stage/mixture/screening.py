@@ -17,23 +17,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from samplers.methods.two_stage.mixture.settings import DEFAULT_MIXTURE_SETTINGS, ScreeningSettings
 from samplers.problem import FloatArray
 from samplers.proposals.components import MixtureComponent
-
-MIN_ACCEPTANCES = (0.5, 0.25)
-"""Values of a_min to choose from: no weight grows by more than 4."""
-MAX_VARIANCE_RATIO = 0.9
-"""A screen is used where it is estimated to give less than this share of the variance without it."""
-MIN_CLASS_SIZE = 40
-"""Failing, and other, points that a classifier needs."""
-SVM_PENALTY = 10.0
-"""C of the support vector machine: points on the wrong side are few, for f has no noise where a screen is trained."""
-CALIBRATION_PENALTY = 100.0
-"""C of the logistic regression that calibrates it: two coefficients from dozens of points need hardly any penalty."""
-SPARE_FACTOR = 2
-"""Draws per missing one in each pass of the rejection, as an acceptance of a half asks for."""
-SPARE_DRAWS = 20
-"""Draws more than that: a pass for the last missing one is seldom the last without them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,17 +55,28 @@ class LabelledPoints(NamedTuple):
         return min(n_failing, len(self.fails) - n_failing)
 
 
-def draw_screened(screen: FailureScreen, component: MixtureComponent, n: int, rng: np.random.Generator) -> FloatArray:
+def draw_screened(
+    screen: FailureScreen,
+    component: MixtureComponent,
+    n: int,
+    rng: np.random.Generator,
+    settings: ScreeningSettings = DEFAULT_MIXTURE_SETTINGS.screening,
+) -> FloatArray:
     """Draw n points (n, d) of a component that the screen accepts, by rejection."""
     parts, missing = [component.sample(0, rng)], n
     while missing > 0:
-        u = component.sample(SPARE_FACTOR * missing + SPARE_DRAWS, rng)
+        u = component.sample(settings.spare_factor * missing + settings.spare_draws, rng)
         parts.append(u[rng.random(len(u)) < screen(u)][:missing])
         missing -= len(parts[-1])
     return np.concatenate(parts)
 
 
-def train_screen(known: LabelledPoints, fresh: LabelledPoints, log_weights: FloatArray) -> FailureScreen | None:
+def train_screen(
+    known: LabelledPoints,
+    fresh: LabelledPoints,
+    log_weights: FloatArray,
+    settings: ScreeningSettings = DEFAULT_MIXTURE_SETTINGS.screening,
+) -> FailureScreen | None:
     """Return the screen for the next draws, or None if none is worth it.
 
     A support vector machine is trained on the known points, calibrated and judged on fresh ones that it has not seen,
@@ -89,29 +86,30 @@ def train_screen(known: LabelledPoints, fresh: LabelledPoints, log_weights: Floa
         known: Points seen so far.
         fresh: Draws from the last proposal.
         log_weights: log(phi / q) of the fresh draws, shape (m,).
+        settings: Penalties, and when a screen is worth it.
     """
     from sklearn.linear_model import LogisticRegression  # slow to import
     from sklearn.svm import SVC
 
-    if min(known.min_class, fresh.min_class) < MIN_CLASS_SIZE:
+    if min(known.min_class, fresh.min_class) < settings.min_class_size:
         return None
-    classifier = SVC(C=SVM_PENALTY, random_state=0).fit(known.u, known.fails)
+    classifier = SVC(C=settings.svm_penalty, random_state=0).fit(known.u, known.fails)
     decision = classifier.decision_function(fresh.u)
-    line = LogisticRegression(C=CALIBRATION_PENALTY, random_state=0).fit(decision[:, None], fresh.fails)
+    line = LogisticRegression(C=settings.calibration_penalty, random_state=0).fit(decision[:, None], fresh.fails)
     intercept, slope = float(line.intercept_[0]), float(line.coef_[0, 0])
     if slope <= 0:
         return None
-    screens = [FailureScreen(classifier, intercept, slope, least) for least in MIN_ACCEPTANCES]
-    best = _choose_screen(screens, fresh, log_weights)
+    screens = [FailureScreen(classifier, intercept, slope, least) for least in settings.min_acceptances]
+    best = _choose_screen(screens, fresh, log_weights, settings.max_variance_ratio)
     if best is None:
         return None
     u, fails = (np.concatenate(parts) for parts in zip(known, fresh, strict=True))
-    both = SVC(C=SVM_PENALTY, random_state=0).fit(u, fails)
+    both = SVC(C=settings.svm_penalty, random_state=0).fit(u, fails)
     return FailureScreen(both, intercept, slope, best.min_acceptance)
 
 
 def _choose_screen(
-    screens: list[FailureScreen], fresh: LabelledPoints, log_weights: FloatArray
+    screens: list[FailureScreen], fresh: LabelledPoints, log_weights: FloatArray, max_variance_ratio: float
 ) -> FailureScreen | None:
     """Return the screen with the least variance per simulation, None where none is estimated to give enough.
 
@@ -119,7 +117,7 @@ def _choose_screen(
     """
     w = np.where(fresh.fails, np.exp(log_weights - log_weights[fresh.fails].max()), 0.0)
     mean, square = float(w.mean()), w * w
-    best, least = None, MAX_VARIANCE_RATIO * (float(square.mean()) - mean**2)
+    best, least = None, max_variance_ratio * (float(square.mean()) - mean**2)
     for screen in screens:
         accepted = screen(fresh.u)
         variance = float((square / accepted).mean()) * float(accepted.mean()) - mean**2

@@ -12,57 +12,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from samplers.methods.two_stage.mixture.settings import DEFAULT_MIXTURE_SETTINGS, SubspaceSettings
 from samplers.problem import FloatArray
 from samplers.proposals.components import SubspaceGaussian, log_ratios
 from samplers.proposals.em import expectation_maximisation, k_means, one_hot, posterior
 from samplers.proposals.shrinkage import shrink_covariance
 from samplers.statistics.weights import normalise_weights
 
-HIGH_DIM = 40
-"""Above this many dimensions a component has one direction of its own: some hundred points do not show more."""
-SIZES = (1, 2, 3, 4, 6, 8)
-"""Numbers of components that are tried; MOST_WORSE of them without a better score end the search."""
-MOST_WORSE = 2
-"""The score of a fit is uneven in their number: after one that is worse, a better one may follow."""
-MAX_EM_ITERATIONS = 25
-"""M-steps at most."""
-LEAST_RELATIVE_GAIN = 1e-3
-"""Expectation-maximisation ends where a step raises the log likelihood by less than this share of it."""
-EM_RESTARTS = 3
-"""Starts for each number of components; k-means++ draws its centres."""
-LEAST_ESS = 2.0
-"""Points that any component is taken to rest on: the formulae divide by their number."""
-REFIT_STEPS = 2
-"""M-steps between two rounds of draws; the rounds go on from there."""
-LEAST_REFIT_POINTS = 5
-"""A component with fewer points stays where it is."""
-REFIT_ESS = 30.0
-REFIT_ESS_PER_DIM = 3.0
-"""Effective points that a component is fitted to: as many as its mean needs, and its covariance with shrinkage. Where
-the weights are less even, they are raised to a power less than 1."""
-POINTS_PER_REFIT_ESS = 3
-"""Points of a component for each of them: no more is asked of it than a third of its points."""
-POWER_STEP = 0.1
-"""By how much the power falls from trial to trial; the effective number of points grows as it does."""
 LEAST_MIXING = 1e-6
 """Least weight of a component while others move; none is given up."""
-MOST_SPREAD = 4.0
-"""Largest variance along the one direction in high dimensions; a few points of another region give more."""
 LEAST_VARIANCE_OF_COMPONENT = 1e-6
 """Points may coincide."""
-STANDARD_ERRORS = 2
-"""By how many of them a variance under 1 is raised: too small a variance makes weights unbounded."""
-MAX_MEAN_EXCESS = 0.5
-"""Share of a mean that is taken off as noise at most: of few points in hundreds of dimensions noise is all there is."""
 SHORT_MEAN = 1e-9
 """A mean shorter than this has no direction; its length divides."""
-COVARIANCE_PARAMETERS_PER_DIM = 2
-"""Parameters of a covariance that BIC counts at most, per dimension: with all d (d + 1) / 2 of them some dozens
-of points would never have a second component."""
-MIN_BIC_ESS = 3.0
-"""Least number of points that BIC takes: log(n) would fall under 1 with fewer."""
-POINTS_PER_COMPONENT = 4
-"""Effective points for each component at least."""
 TINY_WEIGHT = 1e-300
 """Stands for 0 where a logarithm or a quotient is taken."""
 
@@ -94,60 +56,72 @@ class SubspaceMixture(NamedTuple):
     """Log likelihood, in independent points, less the BIC penalty."""
 
 
-def fit_shrunk_subspace_gaussian(u: FloatArray, weights: FloatArray, ess: float) -> tuple[SubspaceGaussian, float]:
+def fit_shrunk_subspace_gaussian(
+    u: FloatArray, weights: FloatArray, ess: float, settings: SubspaceSettings = DEFAULT_MIXTURE_SETTINGS.subspace
+) -> tuple[SubspaceGaussian, float]:
     """Return the component of weighted points, and the share of the shrinkage target in its covariance.
 
-    Its covariance is shrunk as by `shrink_covariance`. Above HIGH_DIM dimensions it is the target alone: one direction,
-    that of the mean, and N(0, 1) across it.
+    Its covariance is shrunk as by `shrink_covariance`. Above `high_dim` dimensions it is the target alone: one
+    direction, that of the mean, and N(0, 1) across it.
 
     Args:
         u: Points, shape (n, d).
         weights: Adding up to 1, shape (n,).
         ess: How many independent points they are worth.
+        settings: Limits of variances and of the mean's correction.
     """
     dim = u.shape[1]
     mean = weights @ u
     norm = float(np.linalg.norm(mean))
     v = mean / norm if norm > 0 else np.eye(dim)[0]
     along = float(weights @ (u @ v - norm) ** 2)
-    if dim > HIGH_DIM:
+    if dim > settings.high_dim:
         # Noise makes the mean of few points too long, by (d - 1) / ess in the square, and turns it.
-        excess = min((dim - 1) / (ess * max(norm, SHORT_MEAN) ** 2), MAX_MEAN_EXCESS)
-        variance = np.array([min(along * (1 - excess) + excess, MOST_SPREAD)])
-        return SubspaceGaussian(v[:, None], np.array([norm * (1 - excess)]), inflate_variances(variance, ess)), 1.0
+        excess = min((dim - 1) / (ess * max(norm, SHORT_MEAN) ** 2), settings.max_mean_excess)
+        variance = np.array([min(along * (1 - excess) + excess, settings.max_spread)])
+        raised = inflate_variances(variance, ess, settings)
+        return SubspaceGaussian(v[:, None], np.array([norm * (1 - excess)]), raised), 1.0
     centred = (u - mean) * np.sqrt(weights)[:, None]  # `weighted_moments` would lose digits of small variances far out
     shrunk, share = shrink_covariance(centred.T @ centred, v, along, ess)
     values, axes = np.linalg.eigh(shrunk)
-    return SubspaceGaussian(axes, axes.T @ mean, inflate_variances(values, ess)), share
+    return SubspaceGaussian(axes, axes.T @ mean, inflate_variances(values, ess, settings)), share
 
 
-def inflate_variances(variance: FloatArray, ess: float) -> FloatArray:
-    """Return variances (r,), those under 1 raised by two of their standard errors.
+def inflate_variances(
+    variance: FloatArray, ess: float, settings: SubspaceSettings = DEFAULT_MIXTURE_SETTINGS.subspace
+) -> FloatArray:
+    """Return variances (r,), those under 1 raised by some of their standard errors.
 
     Too small a variance makes weights unbounded, too large a one costs a few draws.
     """
     variance = np.maximum(variance, LEAST_VARIANCE_OF_COMPONENT)
-    raised = np.minimum(variance * (1 + STANDARD_ERRORS * math.sqrt(2 / max(ess, LEAST_ESS))), 1.0)
+    error = math.sqrt(2 / max(ess, settings.min_ess))
+    raised = np.minimum(variance * (1 + settings.standard_errors * error), 1.0)
     return np.where(variance < 1, raised, variance)
 
 
-def fit_subspace_mixture(points: GroupedPoints, most: int, rng: np.random.Generator) -> SubspaceMixture:
+def fit_subspace_mixture(
+    points: GroupedPoints,
+    most: int,
+    rng: np.random.Generator,
+    settings: SubspaceSettings = DEFAULT_MIXTURE_SETTINGS.subspace,
+) -> SubspaceMixture:
     """Return a mixture of at most `most` components, their number chosen by BIC."""
     best = None
     worse = 0
-    for k in (size for size in SIZES if size <= most):
-        if k > 1 and (k > points.n_groups or points.ess < POINTS_PER_COMPONENT * k):
+    for k in (size for size in settings.sizes if size <= most):
+        if k > 1 and (k > points.n_groups or points.ess < settings.points_per_component * k):
             break
-        restarts = 1 if k == 1 else EM_RESTARTS
+        restarts = 1 if k == 1 else settings.em_restarts
         found = max(
-            (_fit_from(points, _initial_responsibilities(points, k, rng)) for _ in range(restarts)),
+            (_fit_from(points, _initial_responsibilities(points, k, rng), settings) for _ in range(restarts)),
             key=lambda mix: mix.score,
         )
         if best is None or found.score > best.score:
             best, worse = found, 0
         else:
             worse += 1
-        if worse == MOST_WORSE:
+        if worse == settings.max_worse:
             break
     assert best is not None  # one component can always be fitted
     return best
@@ -175,6 +149,7 @@ class _GroupedFamily:
     """Mixtures in which all points of a group come from one component, see `samplers.proposals.em.Family`."""
 
     points: GroupedPoints
+    settings: SubspaceSettings
 
     def maximise(self, responsibilities: FloatArray) -> _Fitted:
         """Return the components that have at least one point, from responsibilities (k, n)."""
@@ -182,7 +157,9 @@ class _GroupedFamily:
         mass = (responsibilities * weights).sum(axis=1)
         shares, mass = responsibilities[mass * ess > 1], mass[mass * ess > 1]
         fits = [
-            fit_shrunk_subspace_gaussian(u, share * weights / m, max(float(m) * ess, LEAST_ESS))
+            fit_shrunk_subspace_gaussian(
+                u, share * weights / m, max(float(m) * ess, self.settings.min_ess), self.settings
+            )
             for share, m in zip(shares, mass, strict=True)
         ]
         return _Fitted([one for one, _ in fits], [share for _, share in fits], mass / mass.sum())
@@ -195,55 +172,64 @@ class _GroupedFamily:
         return np.asarray((per_group + np.log(mixture.weights)[:, None])[:, groups])
 
 
-def _fit_from(points: GroupedPoints, start: FloatArray) -> SubspaceMixture:
+def _fit_from(points: GroupedPoints, start: FloatArray, settings: SubspaceSettings) -> SubspaceMixture:
     """Return the mixture that expectation-maximisation reaches from responsibilities (k, n)."""
     once_per_group = 1 / np.bincount(points.groups)[points.groups]
     fit, log_likelihood = expectation_maximisation(
-        _GroupedFamily(points), start, once_per_group, MAX_EM_ITERATIONS, lambda total: LEAST_RELATIVE_GAIN * abs(total)
+        _GroupedFamily(points, settings),
+        start,
+        once_per_group,
+        settings.max_em_iterations,
+        lambda total: settings.min_relative_gain * abs(total),
     )
     dim = points.u.shape[1]
-    covariances = [
-        min((1 - share) * dim * (dim + 1) / 2, COVARIANCE_PARAMETERS_PER_DIM * dim) for share in fit.target_shares
-    ]
+    most = settings.covariance_parameters_per_dim * dim
+    covariances = [min((1 - share) * dim * (dim + 1) / 2, most) for share in fit.target_shares]
     parameters = len(fit.components) - 1 + sum(dim + 1 + size for size in covariances)
-    penalty = 0.5 * math.log(max(points.ess, MIN_BIC_ESS)) * parameters
+    penalty = 0.5 * math.log(max(points.ess, settings.min_bic_ess)) * parameters
     return SubspaceMixture(fit.components, fit.weights, log_likelihood - penalty)
 
 
 def refit_components(
-    components: list[SubspaceGaussian], u: FloatArray, log_weights: FloatArray
+    components: list[SubspaceGaussian],
+    u: FloatArray,
+    log_weights: FloatArray,
+    settings: SubspaceSettings = DEFAULT_MIXTURE_SETTINGS.subspace,
 ) -> list[SubspaceGaussian]:
     """Return components moved to weighted points u (n, d), each by those that are its own.
 
-    Two steps of expectation-maximisation from the present components; their number stays, so that one with few
+    Some steps of expectation-maximisation from the present components; their number stays, so that one with few
     points is not lost.
     """
     weights = truncate_weights(log_weights)
     log_mixing = np.zeros(len(components))
-    for _ in range(REFIT_STEPS):
+    for _ in range(settings.refit_steps):
         shares = posterior(log_ratios(components, u) + log_mixing[:, None])
         log_w = np.log(np.maximum(weights, TINY_WEIGHT))
-        components = [_refit(one, u, share, log_w) for one, share in zip(components, shares, strict=True)]
+        components = [_refit(one, u, share, log_w, settings) for one, share in zip(components, shares, strict=True)]
         log_mixing = np.log(np.maximum((shares * weights).sum(axis=1), LEAST_MIXING))
     return components
 
 
-def _refit(component: SubspaceGaussian, u: FloatArray, shares: FloatArray, log_weights: FloatArray) -> SubspaceGaussian:
+def _refit(
+    component: SubspaceGaussian, u: FloatArray, shares: FloatArray, log_weights: FloatArray, settings: SubspaceSettings
+) -> SubspaceGaussian:
     """Return a component fitted to its share (n,) of weighted points.
 
     Where the weights are too uneven to fit it, they are raised to powers less than 1 until they are not.
     """
     count = float(shares.sum())
-    if count < LEAST_REFIT_POINTS:
+    if count < settings.min_refit_points:
         return component
-    wanted = min(max(REFIT_ESS, REFIT_ESS_PER_DIM * u.shape[1]), count / POINTS_PER_REFIT_ESS)
+    wanted = max(settings.refit_ess, settings.refit_ess_per_dim * u.shape[1])
+    wanted = min(wanted, count / settings.points_per_refit_ess)
     log_shares = np.log(np.maximum(shares, TINY_WEIGHT))
-    for power in np.arange(1.0, 0.0, -POWER_STEP):
+    for power in np.arange(1.0, 0.0, -settings.power_step):
         w = normalise_weights(log_shares + power * log_weights)
         ess = 1 / float((w * w).sum())
         if ess >= wanted:
             break
-    return fit_shrunk_subspace_gaussian(u, w, max(ess, LEAST_ESS))[0]
+    return fit_shrunk_subspace_gaussian(u, w, max(ess, settings.min_ess), settings)[0]
 
 
 def truncate_weights(log_weights: FloatArray) -> FloatArray:

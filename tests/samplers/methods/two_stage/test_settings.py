@@ -1,12 +1,14 @@
 """Settings that must fit together."""
 
-from dataclasses import FrozenInstanceError, replace
+from copy import deepcopy
+from dataclasses import FrozenInstanceError, fields, is_dataclass, replace
 from typing import get_args
 
 import numpy as np
 import pytest
 
 import samplers
+from samplers.limit_states import half_space, parabola, shell
 from samplers.method import Goal
 from samplers.methods.two_stage.exploration import Sizes
 from samplers.methods.two_stage.method import run_two_stage
@@ -14,6 +16,61 @@ from samplers.methods.two_stage.mixture.proposal import Kind
 from samplers.methods.two_stage.settings import DEFAULT_SETTINGS
 
 REFINEMENT = DEFAULT_SETTINGS.refinement
+
+
+NOISE = np.random.default_rng(0)
+RUNS = {
+    "one region, screened": (parabola().problem, 6000, None),
+    "two regions": (samplers.FunctionProblem(lambda u: 3.0 - np.abs(u[:, 0]), 5), 2000, None),
+    "many dimensions": (half_space(60).problem, 2000, None),
+    "all around": (shell().problem, 6000, None),
+    "noise": (samplers.FunctionProblem(lambda u: 3.0 - u[:, 0] + NOISE.normal(size=len(u)), 2), 2000, None),
+    "subset simulation instead": (samplers.FunctionProblem(lambda u: 4.5 - np.abs(u).max(axis=1), 20), 6000, 0.9),
+    "Monte Carlo instead": (half_space(2, 0.5).problem, 1000, None),
+    "until a target is met": (half_space(2).problem, 2000, 0.1),
+}
+"""Problem, simulations to plan for and target c.o.v. of runs that, together, come to all parts of the method."""
+
+
+def groups(settings):
+    """Yield a group of settings and all groups in it."""
+    yield settings
+    for field in fields(settings):
+        if is_dataclass(value := getattr(settings, field.name)):
+            yield from groups(value)
+
+
+@pytest.fixture
+def reads(monkeypatch):
+    """Reads of numbers, as (id of the group, name of the field)."""
+    found = set()
+
+    def record(group, name):
+        found.add((id(group), name))
+        return object.__getattribute__(group, name)
+
+    for group in groups(DEFAULT_SETTINGS):
+        monkeypatch.setattr(type(group), "__getattribute__", record)
+    return found
+
+
+def test_runs_read_every_number_from_the_settings_given_and_none_elsewhere(drive, reads):
+    """Equal copies are given; whoever reads a default one was not handed its group."""
+    own = deepcopy(DEFAULT_SETTINGS)
+    numbers = {
+        (id(group), field.name): f"{type(group).__name__}.{field.name}"
+        for some in (own, DEFAULT_SETTINGS)
+        for group in groups(some)
+        for field in fields(group)
+    }
+    ids = {id(group) for group in groups(own)}
+    reads.clear()
+    for problem, n, target in RUNS.values():
+        goal = Goal(gamma=0.0, max_sim=n if target is None else None, target_cov=target)
+        drive(run_two_stage(problem, goal, n, np.random.default_rng(0), own), problem)
+    found = reads & numbers.keys()
+    assert {numbers[key] for key in found if key[0] not in ids} == set()
+    assert {name for key, name in numbers.items() if key[0] in ids and key not in found} == set()
 
 
 def test_every_kind_of_component_has_an_initial_share():

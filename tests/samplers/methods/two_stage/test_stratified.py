@@ -5,9 +5,10 @@ import pytest
 from scipy import stats
 from scipy.integrate import simpson
 
-from samplers.methods.two_stage.mixture.proposal import ACCEPTANCE_DRAWS, MixtureProposal, ProposalComponent
+from samplers.methods.two_stage.mixture.proposal import MixtureProposal, ProposalComponent
+from samplers.methods.two_stage.settings import DEFAULT_SETTINGS
 from samplers.methods.two_stage.simulator import ComponentDraws
-from samplers.methods.two_stage.stratified import MIN_STRATUM_DRAWS, StratifiedSample
+from samplers.methods.two_stage.stratified import StratifiedSample
 from samplers.problem import FunctionProblem
 from samplers.proposals.components import (
     HalfSpaceNormal,
@@ -17,6 +18,7 @@ from samplers.proposals.components import (
     draw_counts,
 )
 
+SCREENING = DEFAULT_SETTINGS.mixture.screening
 BETA = 2.0
 P = stats.norm.sf(BETA)
 PROBLEM = FunctionProblem(lambda u: BETA - u[:, 0], 1)
@@ -103,10 +105,10 @@ def test_its_variance_is_that_of_independent_draws_less_that_between_the_compone
 
 def test_components_with_few_draws_count_with_their_second_moment(rng):
     """Too large rather than too small: a variance of a handful of draws is worth nothing."""
-    counts = np.array([MIN_STRATUM_DRAWS - 1] * 4)
+    counts = np.array([DEFAULT_SETTINGS.min_stratum_draws - 1] * 4)
     own = [variance_within(strata(batch(counts, rng))) for _ in range(600)]
     n = counts.sum()
-    second = sum(moment(distribution, 2) for _, distribution in PARTS) * (MIN_STRATUM_DRAWS - 1) / n**2
+    second = sum(moment(distribution, 2) for _, distribution in PARTS) * (DEFAULT_SETTINGS.min_stratum_draws - 1) / n**2
     assert np.mean(own) == pytest.approx(second, abs=4 * np.std(own) / math.sqrt(600))
 
 
@@ -176,7 +178,7 @@ def test_a_screen_thins_components_and_the_weights_account_for_it(rng):
     """The shares that it lets through are estimated once, by drawing: their error is that of all runs together."""
     proposal = PROPOSAL.with_screen(screen, rng)
     for (_, distribution), acceptance, weight in zip(PARTS, proposal.acceptance, WEIGHTS, strict=True):
-        share, drawn = passed(distribution), max(ACCEPTANCE_DRAWS * weight, 500)
+        share, drawn = passed(distribution), max(SCREENING.acceptance_draws * weight, SCREENING.min_acceptance_draws)
         assert acceptance == pytest.approx(share, abs=4 * math.sqrt(0.25 / drawn))
     found = []
     for _ in range(300):

@@ -5,15 +5,15 @@ import pytest
 from scipy import stats
 
 from samplers.methods.two_stage.mixture.linear_model import (
-    EDGE_SLACK,
-    LEAST_R2,
-    WIDENING,
     descent_direction,
     failure_edge,
     fit_hyperplane,
     half_space_proposals,
 )
+from samplers.methods.two_stage.mixture.settings import DEFAULT_MIXTURE_SETTINGS
 from samplers.proposals.components import HalfSpaceNormal, SubspaceGaussian
+
+LINEAR = DEFAULT_MIXTURE_SETTINGS.linear_model
 
 
 def unit(dim, seed=0):
@@ -80,7 +80,7 @@ def test_a_tenth_of_the_points_from_another_plane_do_not_turn_it(dim, n):
         found, r2 = descent_direction(*with_outliers(axis, other, n, 0.1, rng))
         # in two dimensions it often fails to tell them apart, and is between both
         assert angle(found, axis) < (0.3 if dim == 2 else 0.01)
-        assert LEAST_R2 < r2 < 0.95  # it is multiplied by the share of the points that agree
+        assert LINEAR.min_r2 < r2 < 0.95  # it is multiplied by the share of the points that agree
 
 
 def test_infinite_outcomes_are_left_out(rng):
@@ -109,7 +109,7 @@ def test_outcomes_of_any_size(scale, rng):
     axis = unit(4)
     u = around(axis, 300, rng)
     found, r2 = descent_direction(u, scale * (3.0 - u @ axis))
-    assert LEAST_R2 < r2 <= 1
+    assert LINEAR.min_r2 < r2 <= 1
     assert angle(found, axis) < 0.05
 
 
@@ -150,7 +150,7 @@ def test_noise_has_no_hyperplane(dim, n):
         rng = np.random.default_rng(seed)
         u = rng.standard_normal((n, dim)) + 3 * unit(dim)
         r2 = descent_direction(u, rng.standard_normal(n))[1]
-        assert r2 < LEAST_R2
+        assert r2 < LINEAR.min_r2
         assert half_space_proposals(u, u, rng.standard_normal(n)) == []
 
 
@@ -166,9 +166,9 @@ def test_proposals_beyond_the_plane_of_a_half_space(dim, rng):
     assert isinstance(half_space, HalfSpaceNormal)
     low, high = (tail.ppf(share) for share in (0.005, 0.08))  # the 3 % quantile of 400 points, 4 standard errors
     assert low - 0.05 < half_space.start < high
-    beyond = stats.truncnorm(half_space.start + EDGE_SLACK, np.inf)
+    beyond = stats.truncnorm(half_space.start + DEFAULT_MIXTURE_SETTINGS.edges.slack, np.inf)
     assert gaussian.mean[0] == pytest.approx(beyond.mean(), rel=0.01)
-    assert gaussian.variance[0] == pytest.approx(WIDENING * beyond.var(), rel=0.02)
+    assert gaussian.variance[0] == pytest.approx(LINEAR.widening * beyond.var(), rel=0.02)
     assert angle(half_space.axis, axis) < 0.05
     weights = np.exp(-half_space.log_ratio(half_space.sample(100, rng)))
     np.testing.assert_allclose(weights, stats.norm.sf(half_space.start), rtol=1e-9)
@@ -221,7 +221,9 @@ def test_hardly_any_failure_lies_before_the_start_of_a_plane_that_is_turned(n):
         axis = unit(100)
         u = around(axis, n, rng, mean=3.2)
         hyperplane = fit_hyperplane(u, 3.0 - u @ axis + 0.05 * rng.standard_normal(n))
-        before = beyond_hyperplane(axis, 3.0, 10_000, rng) @ hyperplane.axis < hyperplane.crossing(0.0)
+        before = beyond_hyperplane(axis, 3.0, 10_000, rng) @ hyperplane.axis < hyperplane.crossing(
+            0.0, LINEAR.crossing_errors
+        )
         assert before.mean() < 0.03
 
 

@@ -4,15 +4,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from samplers.methods.two_stage.mixture.screening import (
-    MIN_ACCEPTANCES,
-    MIN_CLASS_SIZE,
-    FailureScreen,
-    LabelledPoints,
-    draw_screened,
-    train_screen,
-)
+from samplers.methods.two_stage.mixture.screening import FailureScreen, LabelledPoints, draw_screened, train_screen
+from samplers.methods.two_stage.mixture.settings import DEFAULT_MIXTURE_SETTINGS
 from samplers.proposals.components import IsotropicNormal
+
+SETTINGS = DEFAULT_MIXTURE_SETTINGS.screening
 
 
 class Coordinate:
@@ -72,7 +68,7 @@ def test_a_screen_that_separates_accepts_failures_and_rejects_the_others(rng):
     known, fresh = labelled(rng, 600, beyond), labelled(rng, 600, beyond)
     screen = train_screen(known, fresh, np.zeros(600))
     assert screen is not None
-    assert screen.min_acceptance in MIN_ACCEPTANCES
+    assert screen.min_acceptance in SETTINGS.min_acceptances
     u = rng.normal(0, 1.5, (4000, 2))
     accepted = screen(u)
     assert accepted[u[:, 0] > 1.5].mean() > 0.9
@@ -85,7 +81,7 @@ def test_a_screen_that_separates_accepts_failures_and_rejects_the_others(rng):
 
 def test_no_screen_without_points_of_both_classes(rng):
     good = labelled(rng, 600, beyond)
-    few = LabelledPoints(good.u, np.arange(600) < MIN_CLASS_SIZE - 1)
+    few = LabelledPoints(good.u, np.arange(600) < SETTINGS.min_class_size - 1)
     for known, fresh in ((few, good), (good, few), (good, LabelledPoints(good.u, np.ones(600, dtype=bool)))):
         assert train_screen(known, fresh, np.zeros(600)) is None
 

@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import logsumexp
 
+from samplers.methods.two_stage.mixture.settings import DEFAULT_MIXTURE_SETTINGS
 from samplers.methods.two_stage.mixture.subspace_em import (
-    HIGH_DIM,
     GroupedPoints,
     fit_shrunk_subspace_gaussian,
     fit_subspace_mixture,
@@ -18,6 +18,7 @@ from samplers.methods.two_stage.mixture.subspace_em import (
 from samplers.proposals.components import SubspaceGaussian, log_ratios
 
 N = 20_000
+HIGH_DIM = DEFAULT_MIXTURE_SETTINGS.subspace.high_dim
 
 
 def covariance_of(component):

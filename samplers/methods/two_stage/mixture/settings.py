@@ -1,0 +1,172 @@
+"""Settings of the mixtures of two-stage: regression, expectation-maximisation, edges, screens, weights."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, kw_only=True)
+class LinearModelSettings:
+    """Robust regression of f, and half-spaces beyond its hyperplane (`linear_model.py`)."""
+
+    ridges: tuple[float, float] = (1.0, 1e-3)
+    """Ridge penalties; the smaller one is tried where points are enough for ordinary regression."""
+    lad_iterations: int = 12
+    """Steps of iteratively reweighted least squares towards least absolute deviations."""
+    lad_ridge: float = 1e-3
+    """Ridge penalty of these steps, the smaller one of `ridges`: it keeps the matrix regular."""
+    lad_smoothing: float = 1e-3
+    """Share of the median deviation that is added to each before it divides: exact points have no infinite weight."""
+    min_left_out: float = 1e-3
+    """Least 1 - leverage that a residual is divided by: a point that alone decides on a slope has leverage 1."""
+    min_left_out_lad: float = 1e-2
+    """The same in the steps towards least absolute deviations, where one such point must not hold all the weight."""
+    inlier_sigmas: float = 3.0
+    """Deviation up to which a point agrees with a hyperplane, in standard deviations (Rousseeuw and Leroy use 2.5)."""
+    min_points: int = 5
+    """Points that a regression needs."""
+    min_points_per_dim: float = 1.2
+    """With `min_points` + this many points per dimension the small ridge and outliers can be judged."""
+    trimmed_share: float = 0.02
+    """Share of the outcomes left out at either end: f may be capped or wild there."""
+    exact_r2: float = 0.999
+    """R^2 from which f is linear."""
+    boundary_r2: float = 0.95
+    """R^2 from which the hyperplane locates the failure boundary."""
+    min_r2: float = 0.3
+    """R^2 under which a hyperplane is no help; that of pure noise stays below (`test_noise_has_no_hyperplane`)."""
+    agreeing_share: float = 0.6
+    """Share of the points that must agree with a hyperplane for it to be more than chance: over half, for two regions
+    may have half each."""
+    crossing_errors: float = 2.0
+    """Standard errors of a prediction by which a half-space begins before the hyperplane."""
+    nearest_share: float = 0.03
+    """Share of the failures that may lie before the edge, where the hyperplane does not locate it: none of 33 or
+    fewer."""
+    min_failures: int = 8
+    """Failures that half-space proposals need: `failure_edge` takes a quarter of the mean excess off the least of
+    eight."""
+    same_region_share: float = 0.5
+    """Failures nearer than this share of the median distance along the axis are another region's."""
+    widening: float = 1.3
+    """Variance of the Gaussian over that of N(0, 1) beyond the edge: too small a variance makes weights unbounded, too
+    large a one costs a few draws."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EdgeSettings:
+    """Where proposals with an edge begin (`boundary.py`, and the half-spaces of `linear_model.py`)."""
+
+    min_distance: float = 0.5
+    """Nearer to the origin than this a half-space holds 31 % of N(0, I): base draws serve as well."""
+    slack: float = 0.02
+    """By how much a half-space begins before the edge, in standard deviations of N(0, I)."""
+    mean_excesses: float = 2.0
+    """Mean excesses over the quantile, divided by the number of failures, by which an edge is put back."""
+    min_ess: float = 2.0
+    """Least number of failures that they are divided by."""
+    share: float = 0.02
+    """Share of the failures' weight that may lie before a half-space: what `failure_edge` then takes off covers
+    them."""
+    radius_share: float = 0.01
+    """Share of the failures' weight that may lie within the radius before it is shortened."""
+    radius_factor: float = 0.98
+    """|u|^2 at that quantile, times this, is where radial draws begin: the least of few lies beyond the edge of
+    many."""
+    min_radial_shape: float = 0.3
+    """Least shape of the Gamma distribution of |u|^2: with less, nearly all draws are at its start."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SubspaceSettings:
+    """Mixtures fitted to weighted points (`subspace_em.py`)."""
+
+    high_dim: int = 40
+    """Above this many dimensions a component has one direction of its own: some hundred points do not show more."""
+    sizes: tuple[int, ...] = (1, 2, 3, 4, 6, 8)
+    """Numbers of components that are tried; `max_worse` of them without a better score end the search."""
+    max_worse: int = 2
+    """The score of a fit is uneven in their number: after one that is worse, a better one may follow."""
+    max_em_iterations: int = 25
+    """M-steps at most."""
+    min_relative_gain: float = 1e-3
+    """Expectation-maximisation ends where a step raises the log likelihood by less than this share of it."""
+    em_restarts: int = 3
+    """Starts for each number of components; k-means++ draws its centres."""
+    min_ess: float = 2.0
+    """Points that any component is taken to rest on: the formulae divide by their number."""
+    refit_steps: int = 2
+    """M-steps between two rounds of draws; the rounds go on from there."""
+    min_refit_points: int = 5
+    """A component with fewer points stays where it is."""
+    refit_ess: float = 30.0
+    """Effective points that a component is fitted to, as its mean and a shrunk covariance need them ..."""
+    refit_ess_per_dim: float = 3.0
+    """... or this many per dimension. Where the weights are less even, they are raised to a power less than 1."""
+    points_per_refit_ess: float = 3.0
+    """Points of a component for each of them: no more is asked of it than a third of its points."""
+    power_step: float = 0.1
+    """By how much the power falls from trial to trial; the effective number of points grows as it does."""
+    max_spread: float = 4.0
+    """Largest variance along the one direction in high dimensions; a few points of another region give more."""
+    standard_errors: float = 2.0
+    """By how many of them a variance under 1 is raised: too small a variance makes weights unbounded."""
+    max_mean_excess: float = 0.5
+    """Share of a mean that is taken off as noise at most: of few points in hundreds of dimensions noise is all there
+    is."""
+    covariance_parameters_per_dim: float = 2.0
+    """Parameters of a covariance that BIC counts at most, per dimension: with all d (d + 1) / 2 of them some dozens of
+    points would never have a second component."""
+    min_bic_ess: float = 3.0
+    """Least number of points that BIC takes: log(n) would fall under 1 with fewer."""
+    points_per_component: float = 4.0
+    """Effective points for each component at least."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ScreeningSettings:
+    """When a classifier screens the last proposal, and how (`screening.py`, `proposal.py`)."""
+
+    min_acceptances: tuple[float, ...] = (0.5, 0.25)
+    """Values of a_min to choose from: no weight grows by more than 4."""
+    max_variance_ratio: float = 0.9
+    """A screen is used where it is estimated to give less than this share of the variance without it."""
+    min_class_size: int = 40
+    """Failing, and other, points that a classifier needs."""
+    svm_penalty: float = 10.0
+    """C of the support vector machine: points on the wrong side are few, for f has no noise where a screen is
+    trained."""
+    calibration_penalty: float = 100.0
+    """C of the logistic regression that calibrates it: two coefficients from dozens of points need hardly any
+    penalty."""
+    spare_factor: int = 2
+    """Draws per missing one in each pass of the rejection, as an acceptance of a half asks for."""
+    spare_draws: int = 20
+    """Draws more than that: a pass for the last missing one is seldom the last without them."""
+    acceptance_draws: int = 15_000
+    """Draws, shared among the components by weight, that find what a screen accepts; they are not simulated. The c.o.v.
+    of an acceptance of a half is then under 1 % of itself for a component of any weight that matters."""
+    min_acceptance_draws: int = 500
+    """Such draws of a component at least."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MixtureWeightSettings:
+    """Search for the best weights of a mixture (`mixture_weights.py`)."""
+
+    updates: int = 60
+    """Multiplicative updates: they come within 2 % of the least second moment (`test_weights_are_nearly_the_best`)."""
+    negligible: float = 30.0
+    """Points whose weight is e^-30 of the largest one do not matter."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MixtureSettings:
+    """All settings of the mixtures."""
+
+    linear_model: LinearModelSettings = LinearModelSettings()
+    edges: EdgeSettings = EdgeSettings()
+    subspace: SubspaceSettings = SubspaceSettings()
+    screening: ScreeningSettings = ScreeningSettings()
+    weights: MixtureWeightSettings = MixtureWeightSettings()
+
+
+DEFAULT_MIXTURE_SETTINGS = MixtureSettings()
