@@ -84,7 +84,7 @@ class Stack:
 
     def __post_init__(self) -> None:
         for each in fields(self):
-            value = getattr(self, each.name)
+            value = getattr(self, each.name)  # a field by its name
             if not (isinstance(value, int | float) and 0.0 <= value < math.inf):
                 raise ValueError(f"Expected {each.name} to be a number of at least 0, got {value!r}.")
         if not self.missed < 1.0 or not (self.jerk and self.steering_rate):
@@ -144,7 +144,7 @@ class NoisyEgo:
     @property
     def deterministic(self) -> bool | None:
         """Whether the ego behind the stack says that its answers repeat; the stack's own noise does, by x."""
-        return getattr(self.ego, "deterministic", None)
+        return getattr(self.ego, "deterministic", None)  # likewise
 
     def noise_columns(self, world: World) -> int:
         """Return how many standard normal columns of x are the stack's noise in a world."""

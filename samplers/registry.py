@@ -104,6 +104,7 @@ def _load_method(entry: EntryPoint) -> type[Stepping]:
     loaded: object = entry.load()
     if not isinstance(loaded, type):
         raise TypeError(f"expected a class, got {loaded!r}")
+    # another package's class: the message says which it lacks
     missing = [name for name in ("name", "stops_at_target", "steps") if not hasattr(loaded, name)]
     if missing:
         raise TypeError(f"the class {loaded.__name__} has no {', '.join(missing)}")

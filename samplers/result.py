@@ -304,4 +304,5 @@ class Estimate:
 
 def method_settings(method: Stepping) -> dict[str, Any]:
     """Return the settings of a method as plain values."""
+    # fields by name
     return {each.name: getattr(method, each.name) for each in fields(method)} if is_dataclass(method) else {}

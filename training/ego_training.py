@@ -136,7 +136,7 @@ def train_ego(
     env = sb3_vec_env(env_id, num_envs, discrete=hyperparameters.discrete, **make_kwargs)
     try:
         with use_one_thread(), _progress_bar(steps, progress) as callback:
-            model = getattr(stable_baselines3, algo.upper())(
+            model = getattr(stable_baselines3, algo.upper())(  # its classes are named so
                 _policy_name(env.observation_space),
                 env,
                 policy_kwargs={**hyperparameters.policy, "activation_fn": nn.ReLU},

@@ -202,6 +202,7 @@ class BatchedVecEnv(VecEnv):
 
     def _find(self, name: str) -> Any:
         """Return an attribute of the batch or of the environment inside its wrappers."""
+        # the name comes from Stable-Baselines3
         return getattr(self.env if hasattr(self.env, name) else self.env.unwrapped, name)
 
     def _refuse_part(self, indices: Indices, name: str) -> None:

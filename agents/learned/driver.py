@@ -62,12 +62,12 @@ class LearnedDriver:
 
     def __post_init__(self) -> None:
         for name in ("acceleration", "yaw_rate"):
-            pair = tuple(float(value) for value in getattr(self, name))
+            pair = tuple(float(value) for value in getattr(self, name))  # a field by its name
             if len(pair) != ACTION_SIZE:
                 raise ValueError(f"Expected {name} as two numbers, got {pair}.")
             object.__setattr__(self, name, pair)
         for name in ("acceleration", "yaw_rate"):
-            low, high = getattr(self, name)
+            low, high = getattr(self, name)  # a field by its name
             if not low < high:
                 raise ValueError(f"Expected limits of {name} in ascending order, got {(low, high)}.")
         if self.weights is not None and self.weights.dim != HEAD_SIZE:

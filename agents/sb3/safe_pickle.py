@@ -62,10 +62,10 @@ class _RestrictedUnpickler(pickle.Unpickler):
         if "." not in name:
             module = re.sub(r"^numpy\.core\.", "numpy._core.", module)  # what NumPy 1 called it
             if name in ALLOWED_NAMES.get(module, ()):
-                return getattr(importlib.import_module(module), name)
+                return getattr(importlib.import_module(module), name)  # pickles name what they need
             for package, bases in ALLOWED_BASES.items():
                 if module == package or module.startswith(f"{package}."):
-                    named = getattr(importlib.import_module(module), name, None)
+                    named = getattr(importlib.import_module(module), name, None)  # likewise
                     if isinstance(named, type) and issubclass(named, tuple(map(_import_class, bases))):
                         return named
         raise ForbiddenObject(f"it asks for {module}.{name}, which may run code")
@@ -74,7 +74,7 @@ class _RestrictedUnpickler(pickle.Unpickler):
 def _import_class(path: str) -> type:
     """Import `module.Class`."""
     module, _, name = path.rpartition(".")
-    imported: type = getattr(importlib.import_module(module), name)
+    imported: type = getattr(importlib.import_module(module), name)  # of ALLOWED_BASES, imported when needed
     return imported
 
 

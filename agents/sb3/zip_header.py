@@ -152,10 +152,10 @@ def find_algorithm_class(name: str, path: Path) -> Any:
         ValueError: The name is unknown, or its package is not installed.
     """
     if name in CORE_ALGORITHMS:
-        return getattr(importlib.import_module("stable_baselines3"), name.upper())
+        return getattr(importlib.import_module("stable_baselines3"), name.upper())  # a class by its name
     if name in CONTRIB_CLASSES:
         try:
-            return getattr(importlib.import_module("sb3_contrib"), CONTRIB_CLASSES[name])
+            return getattr(importlib.import_module("sb3_contrib"), CONTRIB_CLASSES[name])  # likewise
         except ImportError as error:
             raise ValueError(
                 f"{str(path)!r} holds {CONTRIB_CLASSES[name]}, which needs a package that is not "

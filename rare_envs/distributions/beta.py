@@ -42,10 +42,10 @@ class BetaDistribution:
 
     def __post_init__(self) -> None:
         for name in BETA_FIELDS:
-            values = np.atleast_1d(np.array(getattr(self, name), dtype=np.float64))
+            values = np.atleast_1d(np.array(getattr(self, name), dtype=np.float64))  # a field by its name
             values.setflags(write=False)
             object.__setattr__(self, name, values)
-        shapes = {getattr(self, name).shape for name in BETA_FIELDS}
+        shapes = {getattr(self, name).shape for name in BETA_FIELDS}  # a field by its name
         if len(shapes) != 1 or self.low.ndim != 1:
             raise ValueError(f"Expected alpha, beta, low and high of one shape (d,), got {sorted(shapes)}.")
         if not (np.isfinite(self.alpha + self.beta).all() and (self.alpha > 0).all() and (self.beta > 0).all()):

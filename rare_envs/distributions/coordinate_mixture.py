@@ -56,7 +56,7 @@ class CoordinateMixture:
         conditionals = MixtureConditionals(self.coordinates, self.weights, self.means, self.covariances)
         object.__setattr__(self, "_conditionals", conditionals)
         for name in COMPONENT_FIELDS:
-            object.__setattr__(self, name, getattr(conditionals, name))
+            object.__setattr__(self, name, getattr(conditionals, name))  # a field by its name
 
     @property
     def dim(self) -> int:
@@ -108,6 +108,7 @@ class CoordinateMixture:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain lists: the mixture's arrays in the order of the coordinates, and the entries of these."""
+        # fields by name
         return {**{name: getattr(self, name).tolist() for name in COMPONENT_FIELDS}, **self.coordinates.to_dict()}
 
     @classmethod

@@ -74,10 +74,10 @@ class Coordinates:
 
     def __post_init__(self) -> None:
         for name in ("low", "high"):
-            object.__setattr__(self, name, as_finite(name, getattr(self, name)))
-            getattr(self, name).setflags(write=False)
+            object.__setattr__(self, name, as_finite(name, getattr(self, name)))  # a field by its name
+            getattr(self, name).setflags(write=False)  # likewise
         for name in ("kinds", "names", "order"):
-            object.__setattr__(self, name, tuple(getattr(self, name)))
+            object.__setattr__(self, name, tuple(getattr(self, name)))  # likewise
         _check_ends(self.low, self.high, len(self.kinds))
         _check_names(self.names, self.order, len(self.kinds))
         for j, kind in enumerate(self.kinds):
@@ -163,6 +163,7 @@ class Coordinates:
     def to_dict(self) -> dict[str, Any]:
         """Return the entries of a base file: `low`, `high` and `coordinates`, and `names` and `order` where given."""
         box = {"low": self.low.tolist(), "high": self.high.tolist()}
+        # fields by name
         texts = {name: list(getattr(self, name)) for name in ("names", "order") if getattr(self, name)}
         return {**box, "coordinates": [_format_kind(kind) for kind in self.kinds], **texts}
 

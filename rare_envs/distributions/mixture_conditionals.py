@@ -51,13 +51,13 @@ class MixtureConditionals:
 
     def __post_init__(self) -> None:
         for name in COMPONENT_FIELDS:
-            object.__setattr__(self, name, as_finite(name, getattr(self, name)))
+            object.__setattr__(self, name, as_finite(name, getattr(self, name)))  # a field by its name
         _check_shapes(self.weights, self.means, self.covariances, self.coordinates.dim)
         _check_weights(self.weights)
         object.__setattr__(self, "_factors", _cholesky(self.covariances))
         object.__setattr__(self, "_regressions", _regressions(self.covariances))
         for name in COMPONENT_FIELDS:
-            getattr(self, name).setflags(write=False)
+            getattr(self, name).setflags(write=False)  # likewise
 
     @property
     def dim(self) -> int:

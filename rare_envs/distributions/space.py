@@ -97,7 +97,7 @@ class ScenarioSpace:
         object.__setattr__(self, "units", tuple(self.units))
         object.__setattr__(self, "sizes", tuple(self.sizes) or (1,) * len(self.names))
         for name in ("low", "high"):
-            bound = np.array(getattr(self, name), dtype=np.float64)
+            bound = np.array(getattr(self, name), dtype=np.float64)  # a field by its name
             bound.setflags(write=False)
             object.__setattr__(self, name, bound)
         fits = len(self.names) == len(self.units) == len(self.sizes)

@@ -77,6 +77,7 @@ class TruncatedGaussianMixture:
         conditionals = MixtureConditionals(plain, self.weights, self.means, self.covariances)
         object.__setattr__(self, "_conditionals", conditionals)
         for name in MIXTURE_FIELDS:
+            # a field by its name
             object.__setattr__(self, name, getattr(conditionals if name in COMPONENT_FIELDS else plain, name))
 
     @property
@@ -148,7 +149,7 @@ class TruncatedGaussianMixture:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain lists under the names of the constructor's arguments, ready for JSON."""
-        return {name: getattr(self, name).tolist() for name in MIXTURE_FIELDS}
+        return {name: getattr(self, name).tolist() for name in MIXTURE_FIELDS}  # fields by name
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> TruncatedGaussianMixture:

@@ -96,7 +96,10 @@ def set_idm(vehicles: list[Any], values: Values) -> None:
 def restore_class_parameters(kind: type) -> Iterator[None]:
     """Put the parameters of IDM of a class back afterwards: HighwayEnv's intersection changes them for good."""
     before = {
-        it.attribute: getattr(kind, it.attribute) for it in IDM_PARAMETERS.values() if hasattr(kind, it.attribute)
+        # attributes of HighwayEnv's classes, which have some of them each
+        it.attribute: getattr(kind, it.attribute)
+        for it in IDM_PARAMETERS.values()
+        if hasattr(kind, it.attribute)
     }
     try:
         yield

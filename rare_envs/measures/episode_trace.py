@@ -124,8 +124,8 @@ class Record:
         states, leads = [each.state for each in self.moments], [each.lead for each in self.moments]
         seen = [each.perception for each in self.moments if each.perception is not None]
         return Trace(
-            State(*(align([getattr(state, name) for state in states]) for name in State._fields)),
-            Lead(*(align([getattr(lead, name) for lead in leads]) for name in Lead._fields)),
+            State(*(align(list(values)) for values in zip(*states, strict=True))),
+            Lead(*(align(list(values)) for values in zip(*leads, strict=True))),
             self.moments[-1].road,
             align(seen) if seen else None,
             self.first + time <= self.last,

@@ -103,7 +103,7 @@ def _signal(trace: Trace, name: str) -> Tensor:
     if name in SIGNALS:
         return trace.of(SIGNALS[name])
     field, _, vehicle = name.rpartition("_")
-    values: Tensor = getattr(trace.state, field)
+    values: Tensor = getattr(trace.state, field)  # a field of State by its name, which the formula gives
     if int(vehicle) >= values.shape[2]:
         raise ValueError(f"The formula names {name!r}, but the vehicles are 0 to {values.shape[2] - 1}.")
     return values[:, :, int(vehicle)]

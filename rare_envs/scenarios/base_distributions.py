@@ -129,6 +129,7 @@ def _check_box(scenario: Scenario, source: str, distribution: FileDistribution) 
 
 
 def _check_object(scenario: Scenario, base: object) -> Distribution:
+    # an object of the user's: the message says which it lacks
     missing = [name for name in DISTRIBUTION_METHODS if not callable(getattr(base, name, None))]
     if missing:
         raise ValueError(

@@ -73,7 +73,7 @@ class Curve:
     def to_dict(self) -> dict[str, Any]:
         """Return plain lists and numbers for JSON; infinities become None."""
         arrays = ("gammas", "p", "low", "high", "cov", "ess")
-        data = {key: to_json_value(getattr(self, key).tolist()) for key in arrays}
+        data = {key: to_json_value(getattr(self, key).tolist()) for key in arrays}  # a field by its name
         return {**data, "confidence": self.confidence}
 
     def plot(self, ax: "Axes | None" = None) -> "Axes":

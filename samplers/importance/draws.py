@@ -54,6 +54,7 @@ class Draws:
         if self.n == 0:
             return other
         parts = ("f", "log_weights", "x", "f_safe", "log_weights_safe")
+        # fields by name
         return Draws(self.n + other.n, *(np.concatenate([getattr(self, p), getattr(other, p)]) for p in parts))
 
     @property

@@ -100,7 +100,7 @@ class Trajectories:
 
     def column(self, name: str) -> NDArray[Any]:
         """Return a column by its name."""
-        values: NDArray[Any] = getattr(self, name)
+        values: NDArray[Any] = getattr(self, name)  # a field by its name
         return values
 
     def select(self, chosen: NDArray[Any]) -> Trajectories:

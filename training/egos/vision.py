@@ -90,12 +90,12 @@ class VisionConfig:
 
     def __post_init__(self) -> None:
         for each in fields(self):
-            value = getattr(self, each.name)
+            value = getattr(self, each.name)  # a field by its name
             low = 0 if each.name in ("seed", "rounds", "noise", "mixing", "truth_weight") else None
             if not (value >= low if low is not None else value > 0) or not math.isfinite(value):
                 raise ValueError(f"Expected {each.name} {'of at least 0' if low == 0 else 'above 0'}, got {value!r}.")
         for name in ("first_recorded_share", "recorded_share", "mixing"):
-            if getattr(self, name) > 1:
+            if getattr(self, name) > 1:  # a field by its name
                 raise ValueError(f"Expected {name} of at most 1, got {getattr(self, name)!r}.")
 
     @property

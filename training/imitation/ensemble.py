@@ -73,6 +73,7 @@ class Member(NamedTuple):
 
 def member_config(base: Config, ensemble: Ensemble) -> Config:
     """Return the base's settings with all schedules at their ends."""
+    # fields by name
     last: dict[str, Any] = {name: (getattr(base, name)[1],) * 2 for name in ("horizon", "age", "drivers")}
     clone_weight = (base.clone_weight[1], base.clone_weight[1])
     return replace(base, updates=ensemble.updates, warm_up=0, clone_weight=clone_weight, **last)

@@ -91,7 +91,7 @@ def command_of(source: Source, config: Config) -> str:
     """Return the command that repeats a training, without its folders."""
     words = []
     for option in fields(Config):
-        value = getattr(config, option.name)
+        value = getattr(config, option.name)  # a field by its name
         if option.name in ("method", "seed") or value != option.default:
             words += _option(option.name, value)
     return f"python -m training.imitation.train {source.options} {shlex.join(words)}"

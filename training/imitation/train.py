@@ -111,6 +111,7 @@ class ConfigOptions(DriverTrainingOptions):
         Raises:
             ValueError: A setting is outside its range.
         """
+        # fields by name
         values = {each.name: getattr(self, each.name) for each in fields(self) if each.name != "noise"}
         return Config(**{**values, "method": self.method.value, "colour": NOISES[self.noise.value]})
 

@@ -116,7 +116,7 @@ def fit_base(
     """
     recipe, box = EVENT_RECIPES[scenario] if recipe is None else recipe, scenario_named(scenario).parameters
     (together, own), log = filter_events(read_events(path, recipe), recipe, box)
-    low, high = (np.array([getattr(p, end) for p in box]) for end in ("low", "high"))
+    low, high = np.array([p.low for p in box]), np.array([p.high for p in box])
     chosen = np.array([column in recipe.logarithmic for column in recipe.columns])
     joint = together.shape[1]
     together[:, chosen[:joint]] = np.log(together[:, chosen[:joint]])

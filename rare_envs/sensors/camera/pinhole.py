@@ -49,7 +49,7 @@ class Camera:
 
     def __post_init__(self) -> None:
         for name in ("height", "width"):
-            size: object = getattr(self, name)
+            size: object = getattr(self, name)  # a field by its name
             if not isinstance(size, int) or isinstance(size, bool) or not 1 <= size <= 4096:
                 raise ValueError(f"Expected the camera's {name} as a whole number of pixels, 1 to 4096, got {size!r}.")
         for name, low, high in (
@@ -60,7 +60,7 @@ class Camera:
             ("mount_right", -10.0, 10.0),
             ("yaw", -2 * math.pi, 2 * math.pi),
         ):
-            value: object = getattr(self, name)
+            value: object = getattr(self, name)  # a field by its name
             if not isinstance(value, int | float) or isinstance(value, bool) or not low < value < high:
                 raise ValueError(f"Expected the camera's {name} between {low:.4g} and {high:.4g}, got {value!r}.")
 

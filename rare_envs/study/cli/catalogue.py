@@ -9,6 +9,8 @@ import gymnasium as gym
 
 import samplers
 from agents.learned.networks import HEAD_SIZE
+from rare_envs.measures.base import Measure
+from rare_envs.measures.episode_trace import TraceMeasure
 from rare_envs.measures.registry import MEASURES
 from rare_envs.scenarios.registry import SCENARIOS, kinematics_id
 from rare_envs.sensors.camera.weather import CONDITIONS, SENSOR_NOISE
@@ -70,7 +72,10 @@ def list_names() -> dict[str, Any]:
         "methods": {name: _first_line(method) for name, method in samplers.METHODS.items()},
         "egos": EGOS,
         "drivers": DRIVERS,
-        "measures": {name: _first_line(getattr(measure, "of", measure)) for name, measure in MEASURES.items()},
+        "measures": {
+            name: _first_line(measure.of if isinstance(measure, Measure | TraceMeasure) else measure)
+            for name, measure in MEASURES.items()
+        },
     }
 
 

@@ -64,7 +64,7 @@ class ScenarioOptions:
 
     def arguments(self) -> dict[str, Any]:
         """Return the options as keyword arguments of `Question` and of `gym.make`."""
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        values = {field.name: getattr(self, field.name) for field in fields(self)}  # a field by its name
         return {name: value.argument if isinstance(value, NoiseChoice) else value for name, value in values.items()}
 
 

@@ -25,6 +25,7 @@ def check_declared_spaces(probe: Probe) -> Iterator[Finding]:
     """Compare declared spaces with the environment's; that they fit at all was found when the problem was made."""
     world = probe.problem.world
     ours = probe.space, world.action_space
+    # the ego is the user's: it need not declare anything
     observed, acted = (getattr(probe.ego, f"{name}_space", None) for name in ("observation", "action"))
     if observed is None or acted is None:
         missing = " and ".join(
@@ -102,7 +103,7 @@ def check_normalisation(probe: Probe) -> Iterator[Finding]:
 def check_actions(probe: Probe) -> Iterator[Finding]:
     """Check shape, type and range of actions on ordinary observations."""
     action, _ = probe.query(probe.seen)
-    declared = getattr(probe.ego, "action_space", None)
+    declared = getattr(probe.ego, "action_space", None)  # likewise
     whole = np.issubdtype(action.dtype, np.integer)
     expected = (BATCH_ROWS,) if whole else (BATCH_ROWS, 2)
     if action.shape != expected or action.dtype == object:

@@ -50,15 +50,17 @@ class BetaBlock:
     def __post_init__(self) -> None:
         """Bring the parameters to one shape and check them."""
         names = ("alpha", "beta", "low", "high")
+        # fields by name
         arrays = np.broadcast_arrays(*(np.atleast_1d(np.asarray(getattr(self, n), np.float64)) for n in names))
-        for name, array in zip(names, arrays, strict=True):
+        parameters = dict(zip(names, arrays, strict=True))
+        for name, array in parameters.items():
             object.__setattr__(self, name, array)
         least, most = self.box
         inside = all(((array >= least) & (array <= most)).all() for array in arrays[:2])
         if not (0 < least < most < math.inf and inside and (self.low < self.high).all() and self.low.ndim == 1):
             raise ValueError(
                 f"BetaBlock: expected alpha and beta in the box [{least}, {most}] with positive bounds and "
-                f"low < high, all of shape (b,), got {', '.join(f'{n} {getattr(self, n)}' for n in names)}."
+                f"low < high, all of shape (b,), got {', '.join(f'{n} {a}' for n, a in parameters.items())}."
             )
 
     @property

@@ -148,7 +148,7 @@ class Config:
             raise ValueError(f"Expected updates >= 1, got {self.updates}; a driver that is only cloned is method 'bc'.")
         for names, holds, expected in _VALID_RANGES:
             for name in names:
-                value = getattr(self, name)
+                value = getattr(self, name)  # a field by its name
                 if not all(holds(part) for part in (value if isinstance(value, tuple) else (value,))):
                     raise ValueError(f"Expected {name} {expected}, got {value}.")
 

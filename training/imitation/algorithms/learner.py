@@ -156,6 +156,7 @@ class Learner:
         state = {
             "update": self.update,
             "simulated": self.simulated,
+            # attributes that each algorithm names in `learned`
             **{name: getattr(self, name).state_dict() for name in self.learned},
             "generator": self.generator.get_state(),
             "rollouts": list(self.rollouts),
@@ -190,7 +191,7 @@ class Learner:
         if not state.keys() >= {"update", "pools", *self.learned}:
             raise ValueError(f"Expected a checkpoint of a training in {str(path)!r}.")
         for name in self.learned:
-            getattr(self, name).load_state_dict(state[name])
+            getattr(self, name).load_state_dict(state[name])  # likewise
         return state
 
 

@@ -88,7 +88,7 @@ def _penalties(traffic: Traffic, features: Tensor, action: Tensor, m: int) -> Pe
 def _scale_gradient(traffic: Traffic, credit: float) -> Traffic:
     """Return the same traffic, through which gradients are multiplied by `credit`."""
     moved = {
-        name: (value := getattr(traffic, name)) * credit + value.detach() * (1.0 - credit)
+        name: (value := getattr(traffic, name)) * credit + value.detach() * (1.0 - credit)  # a field by its name
         for name in ("x", "y", "heading", "speed")
     }
     return traffic._replace(**moved)

@@ -88,6 +88,7 @@ def sum_by_scene(behaviour: Behaviour, scenes: int, errors: Errors | None = None
         counts[name] = flat.reshape(scenes, bins).astype(np.float64)
     squared = {}
     if errors is not None:
+        # fields by name
         squared = {name: by_scene(errors.scene, getattr(errors, name).square()) for name in ERROR_NAMES}
         squared["number"] = by_scene(errors.scene, torch.ones_like(errors.position))
     return DrivingStatistics(
@@ -110,8 +111,9 @@ def add_statistics(tallies: list[DrivingStatistics]) -> DrivingStatistics:
     """Return the sum of several statistics of the same scenes."""
 
     def add(name: str) -> dict[str, FloatArray]:
-        parts = [getattr(one, name) for one in tallies]
+        parts = [getattr(one, name) for one in tallies]  # a field by its name
         return {key: np.sum([part[key] for part in parts], axis=0) for key in parts[0]}
 
+    # likewise
     steps, vehicles = (np.sum([getattr(one, name) for one in tallies], axis=0) for name in ("steps", "vehicles"))
     return DrivingStatistics(steps, vehicles, add("sums"), add("counts"), add("squared"))

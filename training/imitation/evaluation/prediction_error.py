@@ -43,8 +43,8 @@ def current_errors(recording: Recording, traffic: Traffic) -> Errors:
     known = recorded & traffic.driven & (traffic.tick == at)[:, None]
 
     def off(name: str) -> Tensor:
-        record: Tensor = getattr(recording, name)[traffic.scene, at].gather(1, traffic.vehicle)
-        made: Tensor = getattr(traffic, name)
+        record: Tensor = getattr(recording, name)[traffic.scene, at].gather(1, traffic.vehicle)  # a field by its name
+        made: Tensor = getattr(traffic, name)  # likewise
         return (made - record)[known]
 
     along, across = off("x"), off("y")

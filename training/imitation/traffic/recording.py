@@ -65,14 +65,15 @@ def stack_scenes(scenes: Sequence[TrafficScene]) -> Recording:
     def pad(name: str) -> Tensor:
         out = np.zeros((len(scenes), ticks, vehicles), dtype=np.float32)
         for row, scene in zip(out, scenes, strict=True):
-            values = getattr(scene, name)
+            values = getattr(scene, name)  # a field by its name
             row[: values.shape[0], : values.shape[1]] = np.nan_to_num(values)
         return torch.from_numpy(out)
 
     def sizes(name: str, fill: float) -> Tensor:
         out = np.full((len(scenes), vehicles), fill, dtype=np.float32)
         for row, scene in zip(out, scenes, strict=True):
-            row[: len(getattr(scene, name))] = getattr(scene, name)
+            values = getattr(scene, name)  # likewise
+            row[: len(values)] = values
         return torch.from_numpy(out)
 
     present = pad("present") > 0

@@ -157,7 +157,7 @@ def _replay(recording: Recording, traffic: Traffic, tick: Tensor, moved: dict[st
     at = tick.minimum(recording.ticks[scene] - 1)
     goes_on = recording.present[scene, at].gather(1, vehicle) & (tick == at)[:, None] & traffic.there & ~traffic.driven
     return {
-        name: torch.where(goes_on, getattr(recording, name)[scene, at].gather(1, vehicle), value)
+        name: torch.where(goes_on, getattr(recording, name)[scene, at].gather(1, vehicle), value)  # a field by its name
         for name, value in moved.items()
     }
 
