@@ -3,8 +3,11 @@
 from rare_envs.distributions.beta import BetaDistribution
 from rare_envs.distributions.coordinate_mixture import CoordinateMixture
 from rare_envs.distributions.coordinates import ClosingSpeed, Coordinates
+from rare_envs.distributions.fitted import EventCounts, FittedDistribution, PredictiveCheck
+from rare_envs.distributions.frequency import EventFrequency
 from rare_envs.distributions.product import (
     BlockDistribution,
+    FittedProduct,
     NoiseDistribution,
     ProductDistribution,
     join_independent,
@@ -19,8 +22,13 @@ __all__ = [
     "CoordinateMixture",
     "Coordinates",
     "Distribution",
+    "EventCounts",
+    "EventFrequency",
+    "FittedDistribution",
+    "FittedProduct",
     "NoiseDistribution",
     "Parameter",
+    "PredictiveCheck",
     "ProductDistribution",
     "ScenarioSpace",
     "TruncatedGaussianMixture",

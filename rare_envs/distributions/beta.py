@@ -65,6 +65,10 @@ class BetaDistribution:
             raise ValueError(f"Expected alpha, beta, low and high, got no {', '.join(missing)}.")
         return cls(*(np.asarray(data[name], dtype=np.float64) for name in BETA_FIELDS))
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain lists under the names of the constructor's arguments, ready for JSON."""
+        return {name: getattr(self, name).tolist() for name in BETA_FIELDS}
+
     @property
     def dim(self) -> int:
         """Number of variables d."""

@@ -7,12 +7,13 @@ Cross-entropy searches block by block (`samplers.CrossEntropy(family="blocks")`)
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, cast, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rare_envs.arrays import FloatArray
+from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.space import Distribution
 
 
@@ -125,14 +126,73 @@ class ProductDistribution:
         return np.split(np.asarray(points), self._ends, axis=1)
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FittedProduct(FittedDistribution):
+    """Independent blocks of which one is fitted to events: its refits, with the other blocks as they are.
+
+    `join_independent` makes it. Events, frequency, checks and record are those of the fitted block.
+    """
+
+    parts: tuple[Distribution, ...]
+    """The independent distributions, of which one is fitted."""
+
+    @property
+    def blocks(self) -> Sequence[Any]:
+        """Distributions with `dim`, in the order of the columns of x."""
+        return cast(BlockDistribution, self.distribution).blocks
+
+    @property
+    def noise(self) -> NDArray[np.bool_]:
+        """Which columns are noise, shape (d,): samplers may leave these as they are."""
+        return cast(BlockDistribution, self.distribution).noise
+
+    def ensemble(self) -> Distribution:
+        """Return the blocks with the ensemble of the fitted one in its place."""
+        fitted = next(each for each in self.parts if isinstance(each, FittedDistribution))
+        return _join_with(self.parts, fitted.ensemble())
+
+    def sibling(self, name: str) -> Distribution:
+        """Return the blocks with another base distribution in place of the fitted one."""
+        fitted = next(each for each in self.parts if isinstance(each, FittedDistribution))
+        return _join_with(self.parts, fitted.sibling(name))
+
+
 def join_independent(*distributions: Distribution) -> Distribution:
     """Return independent distributions side by side as one; their own blocks, if they have some, become its blocks.
+
+    If exactly one of them is fitted to events, so is the whole, see `FittedProduct`. With several fitted ones it is
+    not: their refits do not belong together.
 
     Example:
         >>> join_independent(NoiseDistribution(3), NoiseDistribution(2)).dim
         5
     """
+    fitted = [each for each in distributions if isinstance(each, FittedDistribution)]
+    if len(distributions) == 1:
+        return distributions[0]
+    if len(fitted) != 1:
+        return _join(distributions)
+    (own,) = fitted
+    return FittedProduct(
+        distribution=_join_with(distributions, own.distribution),
+        refits=tuple(_join_with(distributions, refit) for refit in own.refits),
+        events=own.events,
+        family=own.family,
+        frequency=own.frequency,
+        checks=own.checks,
+        record=own.record,
+        parts=distributions,
+    )
+
+
+def _join_with(distributions: Sequence[Distribution], replacement: Distribution) -> Distribution:
+    """Return distributions as one with another in place of the fitted one."""
+    return join_independent(*(replacement if isinstance(each, FittedDistribution) else each for each in distributions))
+
+
+def _join(distributions: Sequence[Distribution]) -> Distribution:
     blocks: list[Any] = []
     for each in distributions:
-        blocks += each.blocks if isinstance(each, BlockDistribution) else (each,)
-    return blocks[0] if len(blocks) == 1 else ProductDistribution(tuple(blocks))
+        plain = each.distribution if isinstance(each, FittedDistribution) else each
+        blocks += plain.blocks if isinstance(plain, BlockDistribution) else (plain,)
+    return ProductDistribution(tuple(blocks))

@@ -85,6 +85,11 @@ class TruncatedGaussianMixture:
         """Number of coordinates d."""
         return self._conditionals.dim
 
+    @property
+    def coordinates(self) -> Coordinates:
+        """Its coordinates: the columns of x, in their order, and the box."""
+        return self._conditionals.coordinates
+
     def log_prob(self, x: ArrayLike) -> FloatArray:
         """Return the log density, -inf outside the box.
 

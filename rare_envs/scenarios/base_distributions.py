@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, cast, runtime_checkable
 
 import numpy as np
 
-from rare_envs.distributions.beta import BetaDistribution
-from rare_envs.distributions.coordinate_mixture import CoordinateMixture
+from rare_envs.distributions.fitted import FITTED_KEYS, FittedDistribution
+from rare_envs.distributions.reading import FileDistribution, read_distribution
 from rare_envs.distributions.space import Distribution
-from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
 from rare_envs.json_text import parse_json_object
 from rare_envs.plugins import did_you_mean
 
 if TYPE_CHECKING:
     from rare_envs.scenarios.base import Scenario
 
-FileDistribution = TruncatedGaussianMixture | CoordinateMixture | BetaDistribution
 _TRIAL_DRAWS = 1000
 """Draws by which a user's distribution is tried before it is used."""
 DISTRIBUTION_METHODS = ("sample", "log_prob", "to_standard_normal", "from_standard_normal")
@@ -39,7 +38,8 @@ def load_base(scenario: Scenario, base: str | PathLike[str] | Distribution | Non
     A JSON file holds what the shipped ones do: names, low, high, weights, means, covariances, and
     if wanted units and provenance (see `TruncatedGaussianMixture`), coordinates and order (see `CoordinateMixture`;
     logarithmic, true or false for each column, in older files); or, for independent Beta variables, names, low, high,
-    alpha and beta, one for each column of x (see `BetaDistribution`).
+    alpha and beta, one for each column of x (see `BetaDistribution`). A file with refits, events, family, frequency or
+    checks gives a `FittedDistribution`, see its `from_dict`.
 
     Args:
         scenario: The scenario.
@@ -83,11 +83,11 @@ def load_base(scenario: Scenario, base: str | PathLike[str] | Distribution | Non
     return _from_json(scenario, str(path), text)
 
 
-def _from_json(scenario: Scenario, source: str, text: str) -> FileDistribution:
+def _from_json(scenario: Scenario, source: str, text: str) -> Distribution:
     return _from_dict(scenario, source, parse_json_object(text, f"Base distribution {source}"))
 
 
-def _from_dict(scenario: Scenario, source: str, data: Mapping[str, Any]) -> FileDistribution:
+def _from_dict(scenario: Scenario, source: str, data: Mapping[str, Any]) -> Distribution:
     wanted = [p.name for p in scenario.parameters]
     names = data.get("names")
     if names != wanted:
@@ -96,7 +96,7 @@ def _from_dict(scenario: Scenario, source: str, data: Mapping[str, Any]) -> File
             f"expected names {wanted} in this order, got {names}."
         )
     try:
-        distribution = _read_distribution(data)
+        distribution = _read(scenario, data)
     except ValueError as error:
         raise ValueError(f"Base distribution {source}: {error}") from None
     columns = len(scenario.column_parameters)
@@ -109,16 +109,14 @@ def _from_dict(scenario: Scenario, source: str, data: Mapping[str, Any]) -> File
     return distribution
 
 
-def _read_distribution(data: Mapping[str, Any]) -> FileDistribution:
-    """Return the distribution of the kind that the keys of a file tell."""
-    if "alpha" in data:
-        return BetaDistribution.from_dict(data)
-    if "coordinates" in data or data.get("order") or data.get("logarithmic"):
-        return CoordinateMixture.from_dict(data)
-    return TruncatedGaussianMixture.from_dict(data)
+def _read(scenario: Scenario, data: Mapping[str, Any]) -> FileDistribution | FittedDistribution:
+    """Return the distribution of a file, a fitted one if the file says what it was fitted to."""
+    if any(key in data for key in FITTED_KEYS):
+        return FittedDistribution.from_dict(data, siblings=partial(load_base, scenario))
+    return read_distribution(data)
 
 
-def _check_box(scenario: Scenario, source: str, distribution: FileDistribution) -> None:
+def _check_box(scenario: Scenario, source: str, distribution: FileDistribution | FittedDistribution) -> None:
     box = scenario.column_parameters
     for parameter, low, high in zip(box, distribution.low, distribution.high, strict=True):
         if low < parameter.low or high > parameter.high:

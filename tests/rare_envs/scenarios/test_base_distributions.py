@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+import rare_envs
 from rare_envs.distributions.beta import BetaDistribution
 from rare_envs.distributions.coordinate_mixture import CoordinateMixture
+from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.space import Distribution, ScenarioSpace
 from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
 from rare_envs.scenarios.base import Scenario
@@ -141,6 +143,66 @@ def test_files_that_are_no_base(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match=message) as caught:
             load_base(CUT_IN, base)
         assert "\n" not in str(caught.value)
+
+
+# --- fitted bases ---------------------------------------------------------------------------------
+
+
+def fitted_dict() -> dict[str, Any]:
+    shipped = shipped_dict()
+    components = {key: shipped[key] for key in ("weights", "means", "covariances")}
+    wider = {**components, "covariances": np.multiply(shipped["covariances"], 1.2).tolist()}
+    return {
+        **shipped,
+        "refits": [components, wider],
+        "events": {"used": [470], "clusters": 28},
+        "family": "3 components, plain",
+    }
+
+
+def test_a_fitted_file_has_refits_and_knows_the_other_bases(tmp_path: Path) -> None:
+    base = load_base(FOLLOWING, write(tmp_path / "mine.json", fitted_dict()))
+    assert isinstance(base, FittedDistribution)
+    assert base.fitted_to == "470 events of 28 scenes"
+    shipped = load_base(FOLLOWING, "us101")
+    x = shipped.sample(10, rng())
+    assert (base.log_prob(x) == shipped.log_prob(x)).all()
+    assert (base.refits[0].log_prob(x) == shipped.log_prob(x)).all()
+    assert (base.sibling("us101").log_prob(x) == shipped.log_prob(x)).all()
+    with pytest.raises(ValueError, match=r"No base distribution 'us11' for car_following \(did you mean 'us101'"):
+        base.sibling("us11")
+    written = {**fitted_dict(), **base.to_dict()}
+    again = load_base(FOLLOWING, write(tmp_path / "again.json", written))
+    assert isinstance(again, FittedDistribution)
+    assert again.to_dict() == base.to_dict()
+
+
+def test_a_problem_on_a_fitted_file_has_refits_of_all_its_columns(tmp_path: Path) -> None:
+    path = write(tmp_path / "mine.json", fitted_dict())
+    plain = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", base=str(path))
+    assert isinstance(plain.base, FittedDistribution)
+    with_weather = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", base=str(path), weather=True)
+    assert isinstance(with_weather.base, FittedDistribution)
+    x = with_weather.base.sample(5, rng())
+    for refit in with_weather.base.refits:
+        assert np.isfinite(refit.log_prob(x)).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"refits": [{}]}, r"refits\[0\] with weights, .* got no weights, means, covariances"),
+        ({"events": {"used": [470], "clusters": 500}}, "at most as many clusters as events, 470, got 500"),
+        ({"frequency": {"count": 3}}, "Expected frequency as an object with count, hours"),
+        ({"high": [45.0, 46.0, 150.0]}, r"gives lead_speed the range \[0, 46\] m/s"),
+    ],
+)
+def test_a_damaged_fitted_file_is_named(tmp_path: Path, change: dict[str, Any], message: str) -> None:
+    path = write(tmp_path / "mine.json", {**fitted_dict(), **change})
+    with pytest.raises(ValueError, match=message) as caught:
+        load_base(FOLLOWING, path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
 
 
 # --- objects --------------------------------------------------------------------------------------

@@ -1,0 +1,303 @@
+"""Distributions fitted to recorded events, with what says how far to trust them: refits, counts, checks, frequency."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any, cast
+
+import numpy as np
+
+from rare_envs.arrays import FloatArray
+from rare_envs.distributions.beta import BetaDistribution
+from rare_envs.distributions.coordinate_mixture import CoordinateMixture, pool_mixtures
+from rare_envs.distributions.frequency import EventFrequency
+from rare_envs.distributions.mixture_conditionals import COMPONENT_FIELDS
+from rare_envs.distributions.reading import (
+    FileDistribution,
+    read_distribution,
+    read_record,
+    require_count,
+    require_number,
+    require_text,
+)
+from rare_envs.distributions.space import Distribution
+from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
+
+FITTED_KEYS = ("refits", "events", "family", "frequency", "checks")
+"""Keys of a base file of which each makes it a fitted one; these then need `events` and `family`."""
+BETA_SHAPES = ("alpha", "beta")
+
+
+@dataclass(frozen=True, kw_only=True)
+class EventCounts:
+    """How many events a distribution was fitted to, and in how many independent clusters they come.
+
+    Raises:
+        ValueError: A number is not positive, or there are more clusters than events.
+
+    Example:
+        >>> EventCounts(used=(38, 15), clusters=17).describe()
+        '38 + 15 events of 17 scenes'
+    """
+
+    used: tuple[int, ...]
+    """Events of each part of the parameters that was fitted by itself."""
+    clusters: int
+    """Clusters of events, independent of each other; as many as events where each event is one."""
+    cluster: str = "scene"
+    """Kind of cluster, a singular noun."""
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.used, list | tuple) or not self.used:
+            raise ValueError(f"Expected used of the events as a list of whole numbers, got {self.used!r}.")
+        object.__setattr__(self, "used", tuple(self.used))
+        for count in self.used:
+            require_count("used of the events", count)
+        require_count("clusters of the events", self.clusters)
+        require_text("cluster of the events", self.cluster)
+        if self.clusters > sum(self.used):
+            raise ValueError(f"Expected at most as many clusters as events, {sum(self.used)}, got {self.clusters}.")
+
+    def describe(self) -> str:
+        """Return events and clusters in words."""
+        total, plural = " + ".join(map(str, self.used)), "" if self.clusters == 1 else "s"
+        events = f"{total} event{'' if self.used == (1,) else 's'}"
+        return events if self.cluster == "event" else f"{events} of {self.clusters} {self.cluster}{plural}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fields by name, ready for JSON."""
+        return {**asdict(self), "used": list(self.used)}
+
+
+@dataclass(frozen=True)
+class PredictiveCheck:
+    """A count of dangerous states among the recorded events, beside the count that the distribution expects.
+
+    Raises:
+        ValueError: The recorded count is negative or not whole, or the expected one is negative.
+
+    Example:
+        >>> PredictiveCheck("TTC < 5 s", recorded=7, expected=15.9).name
+        'TTC < 5 s'
+    """
+
+    name: str
+    """What is counted, in words."""
+    recorded: int
+    """Among the recorded events."""
+    expected: float
+    """Among as many events of the distribution, on average."""
+
+    def __post_init__(self) -> None:
+        require_text("name of a check", self.name)
+        require_count("recorded of a check", self.recorded, least=0)
+        if self.expected != 0:
+            require_number("expected of a check", self.expected)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FittedDistribution:
+    """A base distribution fitted to events, with refits to resampled events: how far the events determine it.
+
+    Density, sampling and maps are those of `distribution`.
+
+    Raises:
+        ValueError: A refit has no four methods, other dimensions or another box.
+
+    Example:
+        >>> fit, refit = (TruncatedGaussianMixture([1.0], [[m]], [[[1.0]]], [-9.0], [9.0]) for m in (0.0, 0.3))
+        >>> base = FittedDistribution(
+        ...     distribution=fit, refits=(fit, refit), events=EventCounts(used=(40,), clusters=12), family="1 component"
+        ... )
+        >>> base.fitted_to, base.ensemble().weights.tolist()
+        ('40 events of 12 scenes', [0.5, 0.5])
+    """
+
+    distribution: Distribution
+    """The fit."""
+    refits: tuple[Distribution, ...] = ()
+    """The same recipe applied to resampled events, of the same parameters and box; none if nobody made them."""
+    events: EventCounts
+    """What it was fitted to."""
+    family: str
+    """Family of distributions in words, such as "1 component, log gaps"."""
+    frequency: EventFrequency | None = None
+    """How often the events happen; None where nobody counted."""
+    checks: tuple[PredictiveCheck, ...] = ()
+    """Recorded against expected counts."""
+    record: Mapping[str, Any] = field(default_factory=dict)
+    """Provenance: sources, licence, site, date, coordinates, criteria of the selection; `provenance` of a file."""
+    siblings: Callable[[str], Distribution] | None = field(default=None, repr=False)
+    """Loader of other base distributions of the same scenario, by name or file."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "refits", tuple(self.refits))
+        object.__setattr__(self, "checks", tuple(self.checks))
+        require_text("family", self.family)
+        if not isinstance(self.record, Mapping):
+            raise ValueError(f"Expected provenance as an object, got {self.record!r}.")
+        for i, refit in enumerate(self.refits):
+            _check_refit(i, refit, self.distribution)
+
+    @property
+    def dim(self) -> int:
+        """Number of columns d."""
+        return int(cast(Any, self.distribution).dim)
+
+    @property
+    def low(self) -> FloatArray:
+        """Lower ends of the box, shape (d,)."""
+        return cast(FloatArray, cast(Any, self.distribution).low)
+
+    @property
+    def high(self) -> FloatArray:
+        """Upper ends of the box, shape (d,)."""
+        return cast(FloatArray, cast(Any, self.distribution).high)
+
+    @property
+    def clusters(self) -> int:
+        """Number of independent clusters of events."""
+        return self.events.clusters
+
+    @property
+    def fitted_to(self) -> str:
+        """The events in words, such as "38 + 15 events of 17 scenes"."""
+        return self.events.describe()
+
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw independent points, shape (n, d)."""
+        return self.distribution.sample(n, rng)
+
+    def log_prob(self, x: FloatArray) -> FloatArray:
+        """Return the log density, (n, d) -> (n,)."""
+        return self.distribution.log_prob(x)
+
+    def to_standard_normal(self, x: FloatArray) -> FloatArray:
+        """Map to standard normal space, (n, d) -> (n, d)."""
+        return self.distribution.to_standard_normal(x)
+
+    def from_standard_normal(self, u: FloatArray) -> FloatArray:
+        """Map from standard normal space, (n, d) -> (n, d)."""
+        return self.distribution.from_standard_normal(u)
+
+    def ensemble(self) -> Distribution:
+        """Return the refits as one mixture with equal weights: what they predict for the next event.
+
+        The mixture is cut to the box as a whole, see `pool_mixtures`.
+
+        Raises:
+            ValueError: There are no refits, or they are no mixtures of the same coordinates.
+        """
+        if not self.refits:
+            raise ValueError("There are no refits to make an ensemble of.")
+        mixtures = [each for each in self.refits if isinstance(each, TruncatedGaussianMixture | CoordinateMixture)]
+        if len(mixtures) < len(self.refits):
+            raise ValueError("An ensemble needs refits that are Gaussian mixtures.")
+        return pool_mixtures(mixtures)
+
+    def sibling(self, name: str) -> Distribution:
+        """Return another base distribution of the same scenario, by name or file.
+
+        Raises:
+            ValueError: There is no such one, or this distribution was made by hand and knows none.
+        """
+        if self.siblings is None:
+            raise ValueError(f"This base distribution was not loaded by name and knows no {name!r}; give an object.")
+        return self.siblings(name)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the entries of a base file, from which `from_dict` makes the same distribution.
+
+        Raises:
+            ValueError: The distribution or a refit is not of a kind that files hold, or a refit differs in coordinates.
+        """
+        own = _to_dict(self.distribution)
+        return {
+            **own,
+            "family": self.family,
+            "events": self.events.to_dict(),
+            "frequency": None if self.frequency is None else self.frequency.to_dict(),
+            "checks": [asdict(check) for check in self.checks],
+            "provenance": dict(self.record),
+            "refits": [_refit_entries(i, refit, own) for i, refit in enumerate(self.refits)],
+        }
+
+    @classmethod
+    def from_dict(
+        cls, data: Mapping[str, Any], siblings: Callable[[str], Distribution] | None = None
+    ) -> FittedDistribution:
+        """Return the distribution that `to_dict` describes; other keys are left alone.
+
+        Args:
+            data: Keys of the distribution (see `CoordinateMixture.from_dict`), and `events`, `family`, and if wanted
+                `refits`, `frequency`, `checks` and `provenance`. A refit is an object with the weights, means and
+                covariances of the same coordinates (alpha and beta, where the base has these).
+            siblings: Loader of other base distributions of the same scenario.
+
+        Raises:
+            ValueError: A key is missing or its value is not valid.
+        """
+        missing = [name for name in ("events", "family") if name not in data]
+        if missing:
+            raise ValueError(
+                f"A file with {', '.join(k for k in FITTED_KEYS if k in data)} lacks {', '.join(missing)}."
+            )
+        frequency = data.get("frequency")
+        return cls(
+            distribution=read_distribution(data),
+            refits=tuple(_read_refit(i, refit, data) for i, refit in enumerate(_read_list("refits", data))),
+            events=read_record(EventCounts, "events", data["events"]),
+            family=data["family"],
+            frequency=None if frequency is None else read_record(EventFrequency, "frequency", frequency),
+            checks=tuple(read_record(PredictiveCheck, "a check", each) for each in _read_list("checks", data)),
+            record=data.get("provenance", {}),
+            siblings=siblings,
+        )
+
+
+def _read_list(key: str, data: Mapping[str, Any]) -> Sequence[Any]:
+    values = data.get(key, ())
+    if not isinstance(values, list | tuple):
+        raise ValueError(f"Expected {key} as a list of objects, got {values!r}.")
+    return values
+
+
+def _read_refit(i: int, refit: object, data: Mapping[str, Any]) -> FileDistribution:
+    """Return a refit, whose entries replace those of the base."""
+    wanted = BETA_SHAPES if "alpha" in data else COMPONENT_FIELDS
+    if not isinstance(refit, Mapping):
+        raise ValueError(f"Expected refits[{i}] as an object with {', '.join(wanted)}, got {refit!r}.")
+    missing = [name for name in wanted if name not in refit]
+    others = [str(name) for name in refit if name not in wanted and refit[name] != data.get(name)]
+    if missing or others:
+        wrong = f"no {', '.join(missing)}" if missing else f"{', '.join(others)} of its own"
+        raise ValueError(f"Expected refits[{i}] with {', '.join(wanted)}, for the rest as its base, got {wrong}.")
+    try:
+        return read_distribution({**data, **refit})
+    except ValueError as error:
+        raise ValueError(f"refits[{i}]: {error}") from None
+
+
+def _check_refit(i: int, refit: object, distribution: Distribution) -> None:
+    if not isinstance(refit, Distribution):
+        raise ValueError(f"Expected refits[{i}] with the four methods of a distribution, got {type(refit).__name__}.")
+    for name in ("dim", "low", "high"):
+        own, expected = (getattr(each, name, None) for each in (refit, distribution))
+        if own is not None and expected is not None and not np.array_equal(own, expected):
+            raise ValueError(f"Expected refits[{i}] with {name} {expected} as its base, got {own}.")
+
+
+def _to_dict(distribution: Distribution) -> dict[str, Any]:
+    if not isinstance(distribution, TruncatedGaussianMixture | CoordinateMixture | BetaDistribution):
+        raise ValueError(f"A file holds mixtures and Beta variables, no {type(distribution).__name__}.")
+    return distribution.to_dict()
+
+
+def _refit_entries(i: int, refit: Distribution, base: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the entries of a refit that are its own."""
+    entries = _to_dict(refit)
+    wanted = BETA_SHAPES if "alpha" in base else COMPONENT_FIELDS
+    if {k: v for k, v in entries.items() if k not in wanted} != {k: v for k, v in base.items() if k not in wanted}:
+        raise ValueError(f"refits[{i}] has other coordinates than its base; a file holds one set for all.")
+    return {name: entries[name] for name in wanted}

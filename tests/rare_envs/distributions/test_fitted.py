@@ -1,0 +1,221 @@
+"""Fitted distributions: delegation, counts in words, refits and their mixture, files that come back or are damaged."""
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rare_envs.distributions.beta import BetaDistribution
+from rare_envs.distributions.coordinate_mixture import CoordinateMixture
+from rare_envs.distributions.fitted import EventCounts, FittedDistribution, PredictiveCheck
+from rare_envs.distributions.space import Distribution
+from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
+from tests.rare_envs.distributions.test_frequency import CUT_INS
+
+NAMES = ["speed", "lead_speed", "gap"]
+ORDER = ["speed", "gap", "lead_speed"]
+COORDINATES: list[Any] = ["plain", {"closing_behind": "speed", "gap": "gap"}, "log"]
+COUNTS = EventCounts(used=(38, 15), clusters=17)
+
+
+def components(seed: int, k: int) -> dict[str, Any]:
+    rng = np.random.default_rng(seed)
+    scale = np.array([3.0, 0.5, 0.3])
+    roots = 0.3 * rng.standard_normal((k, 3, 3)) + np.eye(3)
+    return {
+        "weights": rng.dirichlet(np.full(k, 5.0)).tolist(),
+        "means": (np.array([14.0, 2.7, 0.0]) + scale * rng.uniform(-1, 1, (k, 3))).tolist(),
+        "covariances": (roots @ roots.transpose(0, 2, 1) * np.outer(scale, scale)).tolist(),
+    }
+
+
+CONTENT: dict[str, Any] = {
+    **components(0, 2),
+    "names": NAMES,
+    "order": ORDER,
+    "coordinates": COORDINATES,
+    "low": [0.0, 0.0, 1.0],
+    "high": [45.0, 45.0, 150.0],
+    "family": "2 components, closing speed / sqrt(gap), log gap",
+    "events": {"used": [38, 15], "clusters": 17, "cluster": "scene"},
+    "frequency": CUT_INS.to_dict(),
+    "checks": [{"name": "TTC < 5 s", "recorded": 7, "expected": 15.9}],
+    "provenance": {"site": "US 101", "bic": 7852.8},
+    "refits": [components(seed, k) for seed, k in ((1, 1), (2, 2), (3, 3))],
+}
+BASE = FittedDistribution.from_dict(CONTENT)
+
+
+def test_the_methods_are_those_of_the_fit() -> None:
+    fit = CoordinateMixture.from_dict(CONTENT)
+    assert isinstance(BASE, Distribution)
+    assert (BASE.dim, BASE.low.tolist(), BASE.high.tolist()) == (3, CONTENT["low"], CONTENT["high"])
+    x = BASE.sample(100, np.random.default_rng(0))
+    assert (x == fit.sample(100, np.random.default_rng(0))).all()
+    assert (BASE.log_prob(x) == fit.log_prob(x)).all()
+    u = BASE.to_standard_normal(x)
+    assert (u == fit.to_standard_normal(x)).all()
+    assert (BASE.from_standard_normal(u) == fit.from_standard_normal(u)).all()
+
+
+def test_what_it_was_fitted_to() -> None:
+    assert (BASE.fitted_to, BASE.clusters) == ("38 + 15 events of 17 scenes", 17)
+    assert (BASE.frequency, BASE.checks) == (CUT_INS, (PredictiveCheck("TTC < 5 s", 7, 15.9),))
+    assert BASE.record["site"] == "US 101"
+
+
+@pytest.mark.parametrize(
+    ("counts", "words"),
+    [
+        (EventCounts(used=(470,), clusters=28), "470 events of 28 scenes"),
+        (EventCounts(used=(40,), clusters=1, cluster="drive"), "40 events of 1 drive"),
+        (EventCounts(used=(40,), clusters=40, cluster="event"), "40 events"),
+        (EventCounts(used=(1,), clusters=1, cluster="event"), "1 event"),
+        (EventCounts(used=(38, 15), clusters=53, cluster="event"), "38 + 15 events"),
+    ],
+)
+def test_counts_in_words(counts: EventCounts, words: str) -> None:
+    assert counts.describe() == words
+
+
+# --- refits -----------------------------------------------------------------------------------------
+
+
+def test_refits_are_distributions_of_the_same_coordinates_with_components_of_their_own() -> None:
+    assert [len(refit.weights) for refit in BASE.refits if isinstance(refit, CoordinateMixture)] == [1, 2, 3]
+    x = BASE.sample(50, np.random.default_rng(0))
+    alone = CoordinateMixture.from_dict({**CONTENT, **CONTENT["refits"][2]})
+    assert (BASE.refits[2].log_prob(x) == alone.log_prob(x)).all()
+
+
+def test_the_ensemble_is_the_mean_of_the_refits() -> None:
+    """Up to the mass outside the box, which is below 1e-3 for the typical points compared here."""
+    ensemble = BASE.ensemble()
+    assert isinstance(ensemble, CoordinateMixture)
+    assert len(ensemble.weights) == 6
+    np.testing.assert_allclose(ensemble.weights[:1], [1 / 3], rtol=1e-12)
+    x = ensemble.sample(2000, np.random.default_rng(0))
+    mean = np.mean([np.exp(refit.log_prob(x)) for refit in BASE.refits], axis=0)
+    assert np.median(np.abs(np.exp(ensemble.log_prob(x)) / mean - 1.0)) < 1e-3
+    u = np.random.default_rng(1).standard_normal((1000, 3))
+    assert np.abs(ensemble.to_standard_normal(ensemble.from_standard_normal(u)) - u).max() < 1e-8
+
+
+def test_an_ensemble_of_plain_mixtures_or_of_nothing() -> None:
+    fit, refit = (TruncatedGaussianMixture([1.0], [[m]], [[[1.0]]], [-9.0], [9.0]) for m in (0.0, 2.0))
+    base = FittedDistribution(distribution=fit, refits=(fit, refit), events=COUNTS, family="1 component")
+    x = np.linspace(-3.0, 5.0, 9)[:, None]
+    mean = 0.5 * (np.exp(fit.log_prob(x)) + np.exp(refit.log_prob(x)))
+    np.testing.assert_allclose(np.exp(base.ensemble().log_prob(x)), mean, rtol=1e-9)
+    with pytest.raises(ValueError, match="There are no refits"):
+        replace(base, refits=()).ensemble()
+    beta = BetaDistribution([2.0], [2.0], [-9.0], [9.0])
+    with pytest.raises(ValueError, match="needs refits that are Gaussian mixtures"):
+        replace(base, refits=(fit, beta)).ensemble()
+    logs = CoordinateMixture.from_dict({**fit.to_dict(), "low": [1.0], "high": [9.0], "coordinates": ["log"]})
+    with pytest.raises(ValueError, match="same coordinates and box, but mixtures 0 and 1 differ"):
+        replace(base, distribution=logs, refits=(logs, replace(fit, low=[1.0], high=[9.0]))).ensemble()
+
+
+@pytest.mark.parametrize(
+    ("refit", "message"),
+    [
+        (3, r"refits\[0\] with the four methods of a distribution, got int"),
+        (BetaDistribution([2.0], [2.0], [0.0], [1.0]), r"refits\[0\] with dim 3 as its base, got 1"),
+        (
+            BetaDistribution([2.0] * 3, [2.0] * 3, [0.0] * 3, [45.0, 45.0, 150.0]),
+            r"refits\[0\] with low \[0\. 0\. 1\.\] as its base",
+        ),
+    ],
+)
+def test_objects_that_are_no_refits(refit: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        replace(BASE, refits=(refit,))
+
+
+def test_siblings_are_found_by_name() -> None:
+    found = FittedDistribution.from_dict(CONTENT, siblings={"i80": BASE}.__getitem__)
+    assert found.sibling("i80") is BASE
+    with pytest.raises(ValueError, match="knows no 'i80'; give an object"):
+        BASE.sibling("i80")
+
+
+# --- files --------------------------------------------------------------------------------------------
+
+
+def test_a_file_comes_back() -> None:
+    assert BASE.to_dict() == CONTENT
+    again = FittedDistribution.from_dict(json.loads(json.dumps(BASE.to_dict())))
+    assert again.to_dict() == CONTENT
+    x = BASE.sample(20, np.random.default_rng(0))
+    for mine, read in zip(BASE.refits, again.refits, strict=True):
+        assert (mine.log_prob(x) == read.log_prob(x)).all()
+
+
+def test_beta_variables_may_have_refits() -> None:
+    shapes = [{"alpha": [a], "beta": [3.0]} for a in (1.9, 2.1)]
+    content = {"alpha": [2.0], "beta": [3.0], "low": [0.0], "high": [1.0], "refits": shapes}
+    base = FittedDistribution.from_dict({**content, "events": {"used": [9], "clusters": 9}, "family": "Beta"})
+    assert base.to_dict()["refits"] == shapes
+    assert isinstance(base.distribution, BetaDistribution)
+
+
+def test_few_entries_are_enough() -> None:
+    optional = ("refits", "frequency", "checks", "provenance")
+    base = FittedDistribution.from_dict({key: value for key, value in CONTENT.items() if key not in optional})
+    assert (base.refits, base.frequency, base.checks, dict(base.record)) == ((), None, (), {})
+
+
+def test_what_a_file_cannot_hold() -> None:
+    plain = TruncatedGaussianMixture(BASE.refits[0].weights, [[1.0] * 3], [np.eye(3)], BASE.low, BASE.high)
+    with pytest.raises(ValueError, match=r"refits\[0\] has other coordinates than its base"):
+        replace(BASE, refits=(plain,)).to_dict()
+    with pytest.raises(ValueError, match="A file holds mixtures and Beta variables, no FittedDistribution"):
+        replace(BASE, distribution=BASE).to_dict()
+
+
+REFIT = CONTENT["refits"][0]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"refits": "many"}, "Expected refits as a list of objects, got 'many'"),
+        ({"refits": None}, "Expected refits as a list of objects, got None"),
+        ({"refits": [3]}, r"Expected refits\[0\] as an object with weights, means, covariances, got 3"),
+        ({"refits": [REFIT, {"weights": [1.0]}]}, r"refits\[1\] with weights, .*, got no means, covariances"),
+        ({"refits": [{**REFIT, "names": ["a", "b", "c"]}]}, r"refits\[0\] .* got names of its own"),
+        ({"refits": [{**REFIT, "low": [0.0] * 3}]}, r"refits\[0\] .* got low of its own"),
+        ({"refits": [{**REFIT, "weights": [0.5]}]}, r"^refits\[0\]: weights must sum to 1"),
+        (
+            {"refits": [{"weights": [1.0], "means": [[1.0]], "covariances": [[[1.0]]]}]},
+            r"refits\[0\]: Expected means of shape \(1, 3\), one for each column, got \(1, 1\)",
+        ),
+        ({"events": [38]}, r"Expected events as an object with used, clusters, cluster, got \[38\]"),
+        ({"events": {"used": [38]}}, "got no clusters"),
+        ({"events": {"used": [38], "clusters": 5, "scenes": 5}}, "got unknown scenes"),
+        ({"events": {"used": 38, "clusters": 5}}, "used of the events as a list of whole numbers, got 38"),
+        ({"events": {"used": [], "clusters": 5}}, r"used of the events as a list of whole numbers, got \[\]"),
+        ({"events": {"used": [-38], "clusters": 5}}, "used of the events as a whole number, 1 or more, got -38"),
+        ({"events": {"used": [38], "clusters": 0}}, "clusters of the events as a whole number, 1 or more, got 0"),
+        ({"events": {"used": [38, 15], "clusters": 54}}, "at most as many clusters as events, 53, got 54"),
+        ({"family": ""}, "Expected family as a text, got ''"),
+        ({"frequency": 9.0}, r"Expected frequency as an object with count, .*, got 9\.0"),
+        ({"frequency": {**CUT_INS.to_dict(), "count": -3}}, "count of the frequency as a whole number"),
+        ({"checks": {"name": "gap"}}, "Expected checks as a list of objects"),
+        ({"checks": ["gap"]}, "Expected a check as an object with name, recorded, expected, got 'gap'"),
+        ({"provenance": "US 101"}, "Expected provenance as an object, got 'US 101'"),
+    ],
+)
+def test_damage_is_told_in_one_line(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message) as caught:
+        FittedDistribution.from_dict({**CONTENT, **change})
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("key", ["events", "family"])
+def test_a_missing_key_is_named(key: str) -> None:
+    with pytest.raises(ValueError, match=f"^A file with refits, .*, frequency, checks lacks {key}\\.$"):
+        FittedDistribution.from_dict({name: value for name, value in CONTENT.items() if name != key})
