@@ -122,7 +122,7 @@ class DrivingProblem:
 
     @property
     def given(self) -> str:
-        """What p is conditional on, in words for `samplers.Estimate.given`; empty if nothing is held fixed."""
+        """Condition of p, in words for `samplers.Estimate.given`; empty if nothing is held fixed."""
         fixed = ["the ego's own noise is not part of x, so that failures may not replay"] if self.varies else []
         if self.world.noise != "fixed":
             return ", ".join(fixed)

@@ -71,7 +71,7 @@ class Comparison:
     n_sim: int
     """Simulations of A and of B together."""
     warnings: tuple[str, ...]
-    """What makes the numbers doubtful."""
+    """Reasons for which the numbers are doubtful."""
     either: Estimate = field(repr=False)
     """P[A or B fails], from which all this comes."""
 

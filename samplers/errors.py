@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 OnError = Literal["raise", "failure", "bound"]
-"""Where f raises or gives NaN: stop, count the row as failing, or count it so in p and the upper end only."""
+"""Rows on which f raises or gives NaN: stop, count the row as failing, or count it so in p and the upper end only."""
 ON_ERROR: tuple[str, ...] = get_args(OnError)
 
 

@@ -64,9 +64,9 @@ class Outcome:
     cov: float
     """Estimated coefficient of variation of p; inf where p = 0."""
     status: Status
-    """How the run ended."""
+    """End of the run."""
     warnings: tuple[str, ...] = ()
-    """What makes the numbers doubtful, a sentence each."""
+    """Reasons for which the numbers are doubtful, a sentence each."""
     trace: tuple[Level, ...] = ()
     """One entry per level, iteration or batch."""
     no_outcome_share: float = 0.0

@@ -76,7 +76,7 @@ class HasNoise(Protocol):
 
     @property
     def noise(self) -> NDArray[np.bool_] | None:
-        """Which coordinates of x are noise, shape (d,); None for none."""
+        """Mask of the coordinates of x that are noise, shape (d,); None for none."""
 
 
 @runtime_checkable
@@ -109,7 +109,7 @@ class ConditionalProblem(Protocol):
 
     @property
     def given(self) -> str:
-        """What is fixed, in words; empty for nothing."""
+        """Condition, in words; empty without one."""
 
 
 def condition_of(problem: Inputs) -> str:

@@ -62,7 +62,7 @@ class Failures:
     log_p0: FloatArray
     """Log density under the base distribution, shape (m,), falling."""
     total: int
-    """How many failing points were simulated; m of them are kept here."""
+    """Number of failing points that were simulated; m of them are kept here."""
 
     @classmethod
     def empty(cls, dim: int) -> "Failures":
@@ -136,9 +136,9 @@ class Estimate:
     gain: float
     """Plain Monte Carlo runs for the same c.o.v., divided by n_sim; NaN where p is 0 or 1."""
     status: Status
-    """How the run ended."""
+    """End of the run."""
     warnings: tuple[str, ...]
-    """What makes the numbers doubtful; empty if nothing is known to."""
+    """Reasons for which the numbers are doubtful; empty if none is known."""
     trace: tuple[Level, ...]
     """One entry per level, iteration or batch."""
     failures: Failures
@@ -152,11 +152,11 @@ class Estimate:
     base: Distribution | None = field(default=None, compare=False, repr=False)
     """Distribution of X."""
     on_error: str = field(default="raise", repr=False)
-    """What was done where f raised or gave NaN."""
+    """Treatment of rows on which f raised or gave NaN."""
     base_draws: int = 0
     """Simulations that were independent draws from the base distribution."""
     given: str = ""
-    """What the problem holds fixed, so that p is conditional on it: its attribute `given`, if it has one."""
+    """Condition of p, which the problem holds fixed: its attribute `given`, if it has one."""
 
     @property
     def unseen(self) -> float:

@@ -7,7 +7,7 @@ from enum import Enum
 
 
 class Status(str, Enum):
-    """How a run ended; prints as its value.
+    """End of a run; prints as its value.
 
     Example:
         >>> import samplers
@@ -65,4 +65,4 @@ class Level:
     ess: float | None = None
     """Effective number of points behind `p` (chains) or of failing points (weights)."""
     run: int = 0
-    """Which replicate the level belongs to."""
+    """Number of the replicate that the level belongs to."""

@@ -182,12 +182,12 @@ class LearnedEgo:
 
     @property
     def observation_space(self) -> "spaces.Space[Any]":
-        """What `predict` takes: the observation "lidar"."""
+        """Space of the observations of `predict`: "lidar"."""
         return observation_space(1, "lidar")
 
     @property
     def action_space(self) -> "spaces.Box[np.float32]":
-        """What `predict` gives: acceleration and steering in [-1, 1]."""
+        """Space of the actions of `predict`: acceleration and steering in [-1, 1]."""
         return actions.action_space()
 
     def act(self, episode: "Episode", memory: Any) -> tuple[Tensor, Any]:

@@ -95,7 +95,7 @@ class OnnxEgo:
         return ", ".join(port.name for port in ports) or "none"
 
     @cached_property
-    def described(self) -> dict[str, Any]:
+    def export_metadata(self) -> dict[str, Any]:
         """Metadata that `agents.onnx.export` wrote into the file; empty for other files."""
         text = self._session.get_modelmeta().custom_metadata_map.get(METADATA_KEY, "{}")
         try:
@@ -112,7 +112,7 @@ class OnnxEgo:
     @property
     def action_space(self) -> spaces.Space[Any] | None:
         """Space of one action, None if the file does not tell."""
-        action = self.described.get("action", {})
+        action = self.export_metadata.get("action", {})
         if "n" in action:
             return spaces.Discrete(int(action["n"]))
         if "low" in action:

@@ -65,7 +65,7 @@ class Link(Protocol):
 
     @property
     def address(self) -> str:
-        """Where it leads, for messages."""
+        """Address of the server, for messages."""
 
     @property
     def load_timeout(self) -> float:

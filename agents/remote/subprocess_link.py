@@ -40,7 +40,7 @@ class SubprocessLink:
 
     @property
     def address(self) -> str:
-        """What runs there."""
+        """Ego that the process runs, as `process:EGO`."""
         return f"process:{self._spec}"
 
     def open(self) -> None:

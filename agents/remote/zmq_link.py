@@ -43,7 +43,7 @@ class ZmqLink:
 
     @property
     def address(self) -> str:
-        """Where it leads."""
+        """Address of the server."""
         return self._address
 
     def open(self) -> None:

@@ -31,7 +31,7 @@ _TAU_SPEED = 0.6
 _REACHABLE_LANES = 2.0
 """Lane widths up to which the middle of a target lane may be away: HighwayEnv's `is_reachable_from`."""
 _TAU_PURSUIT = 0.1
-"""How far ahead the steering controller looks at the road's heading [s]."""
+"""Time ahead at which the steering controller reads the road's heading [s]."""
 
 
 class Aim(NamedTuple):

@@ -71,7 +71,7 @@ class BlockDistribution(Distribution, Protocol):
 
     @property
     def noise(self) -> NDArray[np.bool_]:
-        """Which columns of x are noise, shape (d,): samplers may leave these as they are."""
+        """Mask of the columns of x that are noise, shape (d,): samplers may leave these as they are."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +98,7 @@ class ProductDistribution:
 
     @cached_property
     def noise(self) -> NDArray[np.bool_]:
-        """Which columns are noise, shape (d,): samplers may leave these as they are."""
+        """Mask of the columns that are noise, shape (d,): samplers may leave these as they are."""
         is_noise = [isinstance(block, NoiseDistribution) for block in self.blocks]
         return np.repeat(is_noise, [block.dim for block in self.blocks])
 

@@ -25,7 +25,7 @@ class Fault(NamedTuple):
     x: NDArray[np.float64]
     """Its parameters, shape (d,)."""
     reason: str
-    """What went wrong, in one line."""
+    """The error, in one line."""
 
 
 @runtime_checkable
@@ -42,7 +42,7 @@ class ConditionalProblem(Protocol):
 
     @property
     def given(self) -> str:
-        """What p is conditional on, in words; empty if on nothing."""
+        """Condition of p, in words; empty without one."""
 
 
 class FaultTolerant:
@@ -95,7 +95,7 @@ class FaultTolerant:
 
     @property
     def given(self) -> str:
-        """What p is conditional on, as the problem says."""
+        """Condition of p, as the problem states it."""
         return self.problem.given if isinstance(self.problem, ConditionalProblem) else ""
 
     def evaluate(self, x: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -39,7 +39,7 @@ class Trace(NamedTuple):
     perception: Tensor | None
     """Lidar features of the vehicles, shape (T, B, M, 51); None unless the measure needs them."""
     valid: Tensor
-    """Which moments were driven, up to a collision and with it, boolean, shape (T, B)."""
+    """Mask of the moments that were driven, up to a collision and with it, boolean, shape (T, B)."""
     collided: Tensor
     """Whether the ego has collided, boolean, shape (B,)."""
     dt: float

@@ -22,12 +22,12 @@ class MultiAgentEpisode(NamedTuple):
     """The episodes as each vehicle sees them, itself in the ego's place with a lead, a measure and collisions of its
     own; after its collision they stay as they were then."""
     disabled: Tensor
-    """Which vehicles' agents have crashed, or were hit by one that had, boolean, shape (B, N). A disabled vehicle
+    """Mask of vehicles that have crashed, or were hit by one that had, boolean, shape (B, N). A disabled vehicle
     takes no actions: it rolls out as HighwayEnv's crashed vehicles do."""
 
     @property
     def collided(self) -> Tensor:
-        """Which vehicles have touched another one or left the road by now, boolean, shape (B, N)."""
+        """Mask of vehicles that have touched another one or left the road by now, boolean, shape (B, N)."""
         return torch.stack([view.collided for view in self.views], dim=1)
 
 

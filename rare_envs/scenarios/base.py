@@ -72,7 +72,7 @@ class Scenario:
     horizon: float
     """Default length of an episode [s]."""
     parameters: tuple[Parameter, ...]
-    """What the columns of x are, in order."""
+    """Parameters in the columns of x, in order."""
     bases: Mapping[str, Any]
     """Base distributions by name, the default first: JSON files, contents of such a file (names and box may be left
     out there), or distribution objects."""

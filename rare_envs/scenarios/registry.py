@@ -108,7 +108,7 @@ def find_scenario(env_id: str) -> Scenario:
 
 
 HIGHWAY_ENV_LAYOUT = {"observation": "kinematics", "action": "meta"}
-"""What makes an environment look like one of HighwayEnv's."""
+"""Keyword arguments that give an environment the interface of HighwayEnv's."""
 
 
 def kinematics_id(env_id: str) -> str:

@@ -61,7 +61,7 @@ class Bodies(NamedTuple):
 
 
 class Readings(NamedTuple):
-    """What M observers in B scenes measure."""
+    """Measurements of M observers in B scenes."""
 
     range: Tensor
     """Distance to the nearest body along each beam [m], 0 to `MAX_RANGE`, shape (B, M, 20)."""

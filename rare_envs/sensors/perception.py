@@ -43,7 +43,7 @@ RATE_COLUMNS = slice(11 + BEAMS, 11 + 2 * BEAMS)
 
 
 class OnRoad(NamedTuple):
-    """Where vehicles are on their road; shapes (B, V)."""
+    """Positions of vehicles relative to their road; shapes (B, V)."""
 
     offset: Tensor
     """To the right of the middle of the nearest lane [m]."""

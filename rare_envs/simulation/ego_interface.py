@@ -17,7 +17,7 @@ class NoiseSource(Protocol):
 
 @dataclass(frozen=True)
 class EgoNeeds:
-    """What an ego needs, and what it says about itself; `rare_envs.egos.needs.resolve` finds it out.
+    """Needs of an ego, and its statements about itself; `rare_envs.egos.needs.resolve` finds it out.
 
     Example:
         >>> EgoNeeds().observation
@@ -37,7 +37,7 @@ class EgoNeeds:
     varies: bool = False
     """Whether it says that its answers differ from run to run, by randomness that is not part of x."""
     noise: NoiseSource | None = None
-    """What of it has noise that is part of x; None for nothing."""
+    """Its part that has noise in x; None without one."""
 
     def noise_columns(self, world: World) -> int:
         """Return how many columns of x are its own noise, the last ones."""

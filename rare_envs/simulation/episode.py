@@ -33,7 +33,7 @@ class Episode(NamedTuple):
     lead: Lead
     """The ego's lead in this state."""
     measure_state: Any
-    """What the measure keeps of the episode so far; see `f`."""
+    """State of the measure over the episode so far; see `f`."""
     collided: Tensor
     """Whether the ego has collided by now, boolean, shape (B,)."""
     road: Road
@@ -48,11 +48,11 @@ class Episode(NamedTuple):
     anyone but the ego has been."""
     measure: EpisodeMeasure = MEASURES["ttc"]
     aim: Aim | None = None
-    """What the controllers of vehicles with meta-actions aim for, (B, N) each; None in a world without such actions."""
+    """Aims of the controllers of vehicles with meta-actions, (B, N) each; None in a world without such actions."""
     statistics: EpisodeStatistics | None = None
     """Least time to collision and crashes so far; None unless the world keeps them."""
     camera_context: CameraContext | None = None
-    """What a camera's picture depends on beside the traffic; None in a world without a camera."""
+    """Inputs of a camera's picture beside the traffic; None in a world without a camera."""
 
     @property
     def f(self) -> Tensor:

@@ -10,12 +10,12 @@ from rare_envs.measures import EpisodeMeasure
 from rare_envs.measures.registry import find_measure
 
 COLLISIONS = ("ego", "any")
-"""Which collisions can count."""
+"""Choices of the collisions that count."""
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """What is measured of an episode.
+    """Measurement of an episode: its safety measure, and the collisions that count.
 
     Example:
         >>> Measurement("ttc").records, Measurement("pet").records
@@ -26,9 +26,9 @@ class Measurement:
     """
 
     measure: Any = "ttc"
-    """What `rare_envs.measures.find_measure` takes: a name, a `Measure`, a function of a `Moment`."""
+    """Argument of `rare_envs.measures.find_measure`: a name, a `Measure`, a function of a `Moment`."""
     collisions: str = "ego"
-    """Which collisions count: those of the "ego", or "any", those between other vehicles too."""
+    """Collisions that count: those of the "ego", or "any", those between other vehicles too."""
     statistics: bool = False
     """Whether to keep the least time to collision and who crashed with whom; see `Episode.statistics`."""
 

@@ -46,7 +46,7 @@ class StochasticDriver(Driver, Protocol):
 
     @property
     def noise_columns(self) -> int:
-        """How many columns of x are its noise, the last ones; 0 where its noise is fixed or off."""
+        """Number of columns of x that are its noise, the last ones; 0 where its noise is fixed or off."""
 
     def with_draws(self, draws: Tensor) -> Driver:
         """Return the driver of B episodes with standard normal draws, shape (B, `noise_columns`)."""

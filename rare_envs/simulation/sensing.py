@@ -20,7 +20,7 @@ WeatherDistributions = tuple[tuple[tuple[Parameter, ...], Distribution], ...]
 
 @dataclass(frozen=True)
 class Sensing:
-    """What the ego observes.
+    """Sensors of the ego.
 
     Example:
         >>> Sensing("camera+speed").kinds

@@ -30,7 +30,7 @@ BACKGROUND_DRAWS = 2000
 MOMENTS, LAST_SECONDS = 4, 3.0
 """Bird's-eye views of a failure, spread over the seconds [s] up to its worst moment."""
 VIEW_BEHIND, VIEW_FAR_BEHIND, VIEW_AHEAD = 12.0, 45.0, 48.0
-"""What a bird's-eye view shows of the road around the ego [m]; further behind where there is traffic."""
+"""Extent of a bird's-eye view of the road around the ego [m]; further behind where there is traffic."""
 ORDINARY_ROAD = 14.0
 """Width of a road [m] that a view has room for; on wider ones it is higher."""
 CURVES = 3.2

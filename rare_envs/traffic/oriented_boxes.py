@@ -38,7 +38,7 @@ class Axes(NamedTuple):
 
 
 class Crossing(NamedTuple):
-    """When two bodies overlap along each axis, shape (..., 4), if velocities and headings stay."""
+    """Times at which two bodies overlap along each axis, shape (..., 4), if velocities and headings stay."""
 
     enter: Tensor
     """From this time [s] on, ..."""

@@ -35,7 +35,7 @@ class State(NamedTuple):
     speed: Tensor
     """Speeds along the headings [m/s], never negative, shape (B, N)."""
     theta: Tensor
-    """What the scenario fixes for the whole episode, shape (B, P); the scenario says what the P columns are."""
+    """Parameters that the scenario fixes for the whole episode, shape (B, P); it defines the P columns."""
 
     def seen_by(self, vehicle: int) -> "State":
         """Return the same traffic with another vehicle in the ego's place; the others follow in their order.

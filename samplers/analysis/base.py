@@ -28,7 +28,7 @@ class HasTotal(Protocol):
 
     @property
     def total(self) -> int:
-        """How many failing points were simulated."""
+        """Number of failing points that were simulated."""
 
 
 class WeightedEstimate(Protocol):

@@ -42,7 +42,7 @@ class RunArguments:
     replicates: int = 1
     """Independent runs, side by side."""
     on_error: OnError = "raise"
-    """Where f raises or gives NaN: raise, count as failing, or count as failing in p and the upper end only."""
+    """Rows on which f raises or gives NaN: stop, count as failing, or count as failing in p and the upper end only."""
 
     def __post_init__(self) -> None:
         """Check the values."""

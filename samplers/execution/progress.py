@@ -10,7 +10,7 @@ from samplers.trace import Level
 
 @dataclass(frozen=True, kw_only=True)
 class Progress:
-    """How far a run has come.
+    """Progress of a run.
 
     Example:
         >>> import samplers

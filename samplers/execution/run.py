@@ -78,7 +78,7 @@ class Run:
 
     @property
     def progress(self) -> Progress:
-        """How far the run has come."""
+        """Progress of the run."""
         return self._monitor.progress
 
     def ask(self) -> FloatArray:

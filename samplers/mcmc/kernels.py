@@ -29,7 +29,7 @@ class Step(NamedTuple):
     f: FloatArray
     """Their outcomes, shape (n,): the stored ones where the chain stayed."""
     accepted: NDArray[np.bool_]
-    """Which chains moved, shape (n,)."""
+    """Mask of the chains that moved, shape (n,)."""
 
 
 class Kernel(Protocol):

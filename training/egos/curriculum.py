@@ -55,13 +55,13 @@ class CurriculumSettings:
     speed_std: float = 4.0
     """Standard deviation of the lead's speed about the ego's [m/s]."""
     lead_excess: float = 5.0
-    """How much faster than the fastest ego a lead may be [m/s]."""
+    """Speed by which a lead may exceed the fastest ego [m/s]."""
     far_share: float = 0.15
     """Share of leads that are out of sight."""
     far_gap: float = 200.0
     """Gap to these [m], the end of the parameter's range."""
     far_excess: float = 10.0
-    """How much faster than the fastest ego they drive [m/s], so that they stay out of sight."""
+    """Speed by which they exceed the fastest ego [m/s], so that they stay out of sight."""
     standstill: float = 2.0
     """Gap [m] at speed 0 behind a lead."""
     headways: tuple[float, float] = (0.3, 3.5)

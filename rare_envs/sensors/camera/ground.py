@@ -28,7 +28,7 @@ _OFF = 40.0
 
 
 class View(NamedTuple):
-    """Where T cameras are in the flat world, shapes (T,)."""
+    """Poses of T cameras in the flat world, shapes (T,)."""
 
     x: Tensor
     """[m]."""
@@ -86,7 +86,7 @@ def _quadratic(values: Tensor, middle: Tensor, reach: Tensor) -> tuple[Tensor, T
 
 
 class Cover(NamedTuple):
-    """Which part of each ground pixel is covered by what, from 0 to 1, shapes (T, R, W)."""
+    """Share of each ground pixel that each surface covers, from 0 to 1, shapes (T, R, W)."""
 
     road: Tensor
     """The road, lines included."""

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 GROUND_RANGE = 2000.0
-"""How far the ground is drawn [m]; beyond it there is sky."""
+"""Distance up to which the ground is drawn [m]; beyond it there is sky."""
 
 
 @dataclass(frozen=True)
@@ -106,11 +106,11 @@ class Pixels(NamedTuple):
     sky: int
     """Number of rows that see no ground, H - R."""
     forward: Tensor
-    """Where a row meets the ground, ahead of the camera [m], shape (R, 1)."""
+    """Distance ahead of the camera at which a row meets the ground [m], shape (R, 1)."""
     right: Tensor
-    """Where a pixel meets it, to the right [m], shape (R, W)."""
+    """Offset to the right at which a pixel meets it [m], shape (R, W)."""
     distance: Tensor
-    """How far that is from the camera [m], shape (R, W)."""
+    """Distance of that point from the camera [m], shape (R, W)."""
     forward_per_row: Tensor
     """Change of `forward` from a row to the next [m], negative, shape (R, 1)."""
     right_per_row: Tensor

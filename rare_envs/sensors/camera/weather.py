@@ -177,7 +177,7 @@ class CameraContext(NamedTuple):
     tick: Tensor
     """Ticks since the start of the episode, int64, shape (B,)."""
     viewer: int = 0
-    """Which vehicle carries the camera, 0 the ego."""
+    """Index of the vehicle that carries the camera, 0 the ego."""
 
     @classmethod
     def at_start(cls, camera: Camera, weather: Weather) -> "CameraContext":

@@ -15,7 +15,7 @@ from rare_envs.egos.errors import EgoGone
 from rare_envs.study.errors import BadInput
 
 _UsageError: type[Exception] = typer.BadParameter.__bases__[0]
-"""What Typer raises for a wrong option or a missing word; older versions of Typer take it from click."""
+"""Error that Typer raises for a wrong option or a missing word; older versions of Typer take it from click."""
 
 
 class OneLineErrors(TyperGroup):

@@ -115,17 +115,14 @@ def check_latency(probe: Probe) -> Iterator[Finding]:
             probe.query(observation)
             durations.append(time.perf_counter() - begun)
         times[size] = float(np.median(durations))
-    measured = ", ".join(f"{1e3 * seconds:.2g} ms for {size}" for size, seconds in times.items())
+    calls = ", ".join(f"{1e3 * seconds:.2g} ms for {size}" for size, seconds in times.items())
     needed = TYPICAL_SIMULATIONS / sizes[-1] * times[sizes[-1]] * probe.problem.world.clock.ticks
     if needed > SLOW_SECONDS:
         yield report_warning(
-            "latency",
-            f"{measured}: {needed / 3600:.1f} h for {TYPICAL_SIMULATIONS} simulations",
-            "batch its work",
-            False,
+            "latency", f"{calls}: {needed / 3600:.1f} h for {TYPICAL_SIMULATIONS} simulations", "batch its work", False
         )
     else:
-        yield report_pass("latency", f"{measured}: {needed:.0f} s for {TYPICAL_SIMULATIONS} simulations")
+        yield report_pass("latency", f"{calls}: {needed:.0f} s for {TYPICAL_SIMULATIONS} simulations")
 
 
 def check_memory_growth(probe: Probe) -> Iterator[Finding]:

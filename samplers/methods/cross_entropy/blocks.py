@@ -300,7 +300,7 @@ class Product:
 
     @cached_property
     def _ends(self) -> list[int]:
-        """Where each block but the last ends."""
+        """Column at which each block but the last ends."""
         return [int(end) for end in np.cumsum([block.dim for block in self.blocks])[:-1]]
 
     def _parts(self, x: FloatArray) -> list[FloatArray]:

@@ -1,4 +1,4 @@
-"""What an ego needs: read from what it declares, once."""
+"""Needs of an ego: read from what it declares, once."""
 
 from typing import Any, ClassVar
 

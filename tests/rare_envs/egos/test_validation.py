@@ -1,4 +1,4 @@
-"""Which objects are egos, and what the refusal of others says."""
+"""Objects that are egos, and the messages that refuse others."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""What is measured: wrong measures and collisions are refused, and a trace is known to be kept."""
+"""Measurement of an episode: wrong measures and collisions are refused, and a trace is known to be kept."""
 
 import pytest
 

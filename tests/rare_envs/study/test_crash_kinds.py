@@ -1,4 +1,4 @@
-"""What kinds of crash the failures of a run are: in result.json, in failures.csv and in print."""
+"""Kinds of crash among the failures of a run: in result.json, in failures.csv and in print."""
 
 from __future__ import annotations
 

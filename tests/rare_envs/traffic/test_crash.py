@@ -1,4 +1,4 @@
-"""Who ran into whom, where, how fast, and how bad that is."""
+"""Crashes: the vehicles, the place, the speeds and the injury risk."""
 
 import math
 from functools import partial

@@ -1,4 +1,4 @@
-"""Who overlaps whom: of the ego, of the others, of all pairs, on straight and curved roads."""
+"""Overlap of vehicles: of the ego, of the others, of all pairs, on straight and curved roads."""
 
 import numpy as np
 import torch

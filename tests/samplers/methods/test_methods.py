@@ -1,4 +1,4 @@
-"""What every method must do, whatever it is."""
+"""Properties that every method must have."""
 
 import dataclasses
 import functools

@@ -1,4 +1,4 @@
-"""When the draws of a proposal are believed, and how subset simulation takes over from them."""
+"""Conditions under which draws of a proposal are believed, and the change to subset simulation."""
 
 from dataclasses import replace
 
