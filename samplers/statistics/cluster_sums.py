@@ -46,7 +46,7 @@ class UnitSums:
 
     @property
     def is_count(self) -> NDArray[np.bool_]:
-        """Mask of thresholds where `p` is a share of n_units equal draws, one point each: T_c is 0 or 1 / n, shape (G,)."""
+        """Mask of those `p` that are shares of n_units equal draws, one point each: T_c is 0 or 1 / n, shape (G,)."""
         return np.isclose(np.diag(self.second) * self.n_units, self.p, rtol=1e-9, atol=0.0)
 
     @property
