@@ -20,7 +20,7 @@ from rare_envs.egos.policy import as_driver
 from rare_envs.plugins import did_you_mean
 from rare_envs.sensors.perception import perceive_traffic
 from rare_envs.simulation.episode import Episode
-from rare_envs.simulation.rollout import Driver
+from rare_envs.simulation.rollout import Driver, StochasticDriver
 from rare_envs.simulation.world import World
 from rare_envs.traffic.lead import lead_of
 from rare_envs.traffic.state import State
@@ -154,11 +154,14 @@ class NoisyEgo:
         """Return the driver that it is in a world.
 
         Raises:
-            ValueError: The ego does not fit the world, or decides meta-actions.
+            ValueError: The ego does not fit the world, decides meta-actions, or has noise of its own.
         """
         if world.clock.action != "continuous":
             raise ValueError(f'Expected action="continuous" for an ego behind a stack, got {world.clock.action!r}.')
-        return NoisyDriver(as_driver(self.ego, world), self.stack, world)
+        driver = as_driver(self.ego, world)
+        if isinstance(driver, StochasticDriver) and driver.noise_columns:
+            raise ValueError("Expected an ego without noise of its own behind a stack, whose noise is all that x has.")
+        return NoisyDriver(driver, self.stack, world)
 
 
 class _StackMemory(NamedTuple):

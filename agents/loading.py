@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from agents.learned.checkpoints import SUFFIX, load_driver
 from agents.learned.driver import LearnedDriver, LearnedEgo
-from agents.names import RULE_BASED, SHIPPED_DRIVERS, SHIPPED_EGOS, VISION
+from agents.names import HUMAN, RULE_BASED, SHIPPED_DRIVERS, SHIPPED_EGOS, VISION
 from agents.python_function import call_factory
 from agents.sb3.saved_ego import load_saved_ego
 from agents.vision.checkpoint import holds_vision, load_vision
@@ -18,7 +18,7 @@ from rare_envs.egos.errors import EgoGone
 from rare_envs.plugins import did_you_mean
 
 EXPECTED_EGO: Final = (
-    f"{', '.join(map(repr, (RULE_BASED, *SHIPPED_EGOS, VISION, *SHIPPED_DRIVERS)))}, a path to a {SUFFIX} or "
+    f"{', '.join(map(repr, (RULE_BASED, HUMAN, *SHIPPED_EGOS, VISION, *SHIPPED_DRIVERS)))}, a path to a {SUFFIX} or "
     "Stable-Baselines3 .zip, "
     "an .onnx file, module:function, tcp://host:port, or process:EGO for one of these in a process of its own, "
     "noisy:EGO for one behind the imperfections of a full stack"
@@ -61,13 +61,14 @@ class Ego(Protocol):
         ...
 
 
-def load_ego(spec: str | Path, algo: str | None = None, trust: bool = False) -> Ego | LearnedEgo | Literal["idm"]:
+def load_ego(spec: str | Path, algo: str | None = None, trust: bool = False) -> Ego | LearnedEgo | str:
     """Load an ego by its name, file, address or function.
 
     Args:
-        spec: "idm"; "imitation", the shipped ego with lidar; "vision", PilotNet on the front camera; "mgail", "gail" or
-            "bc", drivers of the traffic, which as egos act by their mean actions; a path to a `.safetensors` with one
-            of these kinds; a path to a `.zip` saved by Stable-Baselines3; a path to an `.onnx` file (see
+        spec: "idm"; "human", an attentive human driver; "imitation", the shipped ego with lidar; "vision", PilotNet on
+            the front camera; "mgail", "gail" or "bc", drivers of the traffic, which as egos act by their mean actions;
+            a path to a `.safetensors` with one of these kinds; a path to a `.zip` saved by Stable-Baselines3; a path to
+            an `.onnx` file (see
             `agents.onnx.ego.OnnxEgo` for its form); `module:function`, a function without arguments that returns an ego
             (modules in the working directory are found); `tcp://host:port` for an ego in another program
             (docs/remote.md); or `process:EGO`, any of these files and functions in a process of its own, which is ended
@@ -79,8 +80,8 @@ def load_ego(spec: str | Path, algo: str | None = None, trust: bool = False) -> 
             everybody may write.
 
     Returns:
-        "idm" as it stands, a `LearnedEgo`, else an object with `predict`. A `.zip` gives a `SavedEgo`, whose
-        `observation_space` and `action_space` are those of the policy. `VecNormalize` statistics
+        "idm" and "human" as they stand, a `LearnedEgo`, else an object with `predict`. A `.zip` gives a `SavedEgo`,
+        whose `observation_space` and `action_space` are those of the policy. `VecNormalize` statistics
         saved beside a `.zip` are applied to its observations: `<name>_vecnormalize.pkl`,
         `vecnormalize.pkl`, or where RL Zoo and Stable-Baselines3's checkpoints put them.
 
@@ -127,7 +128,7 @@ def load_ego(spec: str | Path, algo: str | None = None, trust: bool = False) -> 
         return load_vision(text)
     if kind == "learned":
         return LearnedEgo(cast(LearnedDriver, load_driver(text)))
-    return cast(Ego, call_factory(text)) if kind == "function" else "idm"
+    return cast(Ego, call_factory(text)) if kind == "function" else text
 
 
 def _load_elsewhere(kind: EgoKind, text: str, algo: str | None, trust: bool) -> Ego:
@@ -163,7 +164,7 @@ def find_ego_kind(spec: str) -> EgoKind:
         >>> [find_ego_kind(spec) for spec in ("idm", "bc", "tcp://host:5555", "noisy:idm", "ego.onnx", "file:make")]
         ['rule', 'learned', 'remote', 'noisy', 'onnx', 'function']
     """
-    if spec == RULE_BASED:
+    if spec in (RULE_BASED, HUMAN):
         return "rule"
     if spec == VISION or (spec.endswith(SUFFIX) and holds_vision(spec)):
         return "vision"
@@ -189,4 +190,4 @@ def _suggest_ego(text: str) -> str:
     saved = Path(f"{text}.zip")
     if saved.is_file():
         return f" (did you mean {str(saved)!r}?)"
-    return did_you_mean(text.lower(), [RULE_BASED, *SHIPPED_EGOS, VISION, *SHIPPED_DRIVERS])
+    return did_you_mean(text.lower(), [RULE_BASED, HUMAN, *SHIPPED_EGOS, VISION, *SHIPPED_DRIVERS])

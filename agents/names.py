@@ -2,6 +2,8 @@
 
 RULE_BASED = "idm"
 """The Intelligent Driver Model with lane keeping."""
+HUMAN = "human"
+"""An attentive human driver by a published model."""
 VISION = "vision"
 """The shipped ego with a camera."""
 SHIPPED_EGOS = ("imitation",)

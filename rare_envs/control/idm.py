@@ -41,8 +41,9 @@ class IDM:
     a = a_max [1 - (v/v0)^delta - (s*/gap)^2], at least -b_max, with
     s* = s0 + s1 sqrt(v/v0) + T v + v dv / (2 sqrt(a_max b)).
 
-    The defaults are Tian et al.'s (2024, Table I; as found in their group's public code). The last term of s* is not
-    cut off at 0: a lead that pulls away fast from a short gap is braked for, as in HighwayEnv and in their code.
+    The defaults are Tian et al.'s (2024, Table I; as found in their group's public code). Without `cut_off` the last
+    term of s* may be negative: a lead that pulls away fast from a short gap is braked for, as in HighwayEnv and in
+    their code.
 
     Example:
         >>> import math
@@ -69,6 +70,9 @@ class IDM:
     """b_max [m/s^2]: what the brakes can do."""
     added_length: float = 0.0
     """[m] added to the gap; HighwayEnv measures between centres, so its jam distance contains a vehicle length."""
+    cut_off: bool = False
+    """Whether T v + v dv / (2 sqrt(a_max b)) is cut off at 0, as Treiber and Kesting write it ("Traffic Flow Dynamics",
+    2013, chapter 11): a lead that pulls away fast is then not braked for."""
 
     @classmethod
     def highway_env(cls, desired_speed: float) -> IDM:
@@ -86,15 +90,29 @@ class IDM:
         Returns:
             Acceleration [m/s^2], shape (B,).
         """
-        v0 = self.desired_speed if desired_speed is None else desired_speed
-        ratio = speed / v0
+        ratio = speed / (self.desired_speed if desired_speed is None else desired_speed)
+        return self.combine(ratio, self.interaction(speed, ratio, lead))
+
+    def interaction(self, speed: Tensor, ratio: Tensor, lead: Lead) -> Tensor:
+        """Return (s*/gap)^2 for a lead.
+
+        Args:
+            speed: Speed of the follower [m/s], any shape; the others have one that broadcasts with it.
+            ratio: Its speed as a share of its desired speed.
+            lead: The lead.
+        """
         closing_gain = 0.5 / (self.max_acceleration * self.comfortable_deceleration) ** 0.5
-        desired_gap = self.jam_distance + speed * (self.time_headway + lead.closing_speed * closing_gain)
+        headway = self.time_headway + lead.closing_speed * closing_gain
+        desired_gap = self.jam_distance + speed * (headway.clamp(min=0.0) if self.cut_off else headway)
         if self.jam_distance_speed:
             desired_gap = desired_gap + self.jam_distance_speed * ratio.clamp(min=_MIN_RATIO).sqrt()
-        interaction = desired_gap / (lead.gap + self.added_length).clamp(min=NEAR_ZERO)
+        share: Tensor = desired_gap / (lead.gap + self.added_length).clamp(min=NEAR_ZERO)
+        return share.square()
+
+    def combine(self, ratio: Tensor, interaction: Tensor) -> Tensor:
+        """Return the acceleration [m/s^2] from speed / desired speed and (s*/gap)^2, of one shape."""
         free = ratio.square().square() if self.exponent == 4.0 else ratio.pow(self.exponent)
-        acceleration: Tensor = self.max_acceleration * (1.0 - free - interaction.square())
+        acceleration: Tensor = self.max_acceleration * (1.0 - free - interaction)
         return acceleration.clamp(min=-self.max_deceleration)
 
     def act(self, episode: EgoScene, memory: Any) -> tuple[Tensor, Any]:

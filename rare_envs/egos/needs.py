@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, Protocol, runtime_checkable
 
 from gymnasium import spaces
 
+from rare_envs.control.idm import IDM
+from rare_envs.egos.human import HumanEgo
 from rare_envs.egos.validation import is_policy
 from rare_envs.sensors.kinds import OBSERVATIONS, read_kinds
 from rare_envs.simulation.ego_interface import EgoNeeds
 from rare_envs.simulation.observation import observation_space
 from rare_envs.simulation.rollout import Driver
 from rare_envs.simulation.world import World
+
+RULE_BASED_EGOS: Mapping[str, Any] = MappingProxyType({"idm": IDM(), "human": HumanEgo()})
+"""Egos that are known by a name."""
 
 
 @runtime_checkable
@@ -24,7 +31,22 @@ class PerceivingDriver(Driver, Protocol):
 
 
 @runtime_checkable
-class WrappedEgo(Protocol):
+class WorldEgo(Protocol):
+    """An ego that becomes a driver only in a world, with noise of its own, such as a human driver."""
+
+    def noise_columns(self, world: World) -> int:
+        """Return how many standard normal columns of x are its noise in a world."""
+
+    def in_world(self, world: World) -> Driver:
+        """Return the driver that it is in a world.
+
+        Raises:
+            ValueError: The ego does not fit the world.
+        """
+
+
+@runtime_checkable
+class WrappedEgo(WorldEgo, Protocol):
     """An ego behind something that stands between it and its world, such as an imperfect stack.
 
     Example:
@@ -43,16 +65,6 @@ class WrappedEgo(Protocol):
     def ego(self) -> Any:
         """The ego behind it."""
 
-    def noise_columns(self, world: World) -> int:
-        """Return how many standard normal columns of x are its noise in a world."""
-
-    def in_world(self, world: World) -> Driver:
-        """Return the driver that it is in a world.
-
-        Raises:
-            ValueError: The ego does not fit the world.
-        """
-
 
 def resolve(ego: Any, vehicles: int = 1) -> EgoNeeds:
     """Return what an ego needs of its world.
@@ -60,7 +72,7 @@ def resolve(ego: Any, vehicles: int = 1) -> EgoNeeds:
     An ego that wraps another one needs what that one needs, and noise columns of its own.
 
     Args:
-        ego: "idm", a `Driver`, an object with `predict`, or a `WrappedEgo`.
+        ego: "idm", "human", a `Driver`, an object with `predict`, or a `WorldEgo`.
         vehicles: Of the scenario, which tell the features' space from that of the lidar.
 
     Example:
@@ -73,11 +85,14 @@ def resolve(ego: Any, vehicles: int = 1) -> EgoNeeds:
         >>> needs.observation, needs.varies, needs.queries_policy
         ('lidar', True, True)
     """
+    ego = find_rule_based(ego)
     if isinstance(ego, WrappedEgo):
         inner = resolve(ego.ego, vehicles)
         return EgoNeeds(
             inner.observation, inner.lidar, inner.dt, inner.action_space, inner.queries_policy, inner.varies, noise=ego
         )
+    if isinstance(ego, WorldEgo):
+        return EgoNeeds(noise=ego)
     # The ego may be anybody's object, such as a Stable-Baselines3 model: it may declare these or not.
     lidar = isinstance(ego, PerceivingDriver) and ego.needs_lidar
     return EgoNeeds(
@@ -88,6 +103,11 @@ def resolve(ego: Any, vehicles: int = 1) -> EgoNeeds:
         queries_policy=is_policy(ego) and not lidar,
         varies=getattr(ego, "deterministic", None) is False,
     )
+
+
+def find_rule_based(ego: Any) -> Any:
+    """Return the driver that "idm" or "human" names, and any other ego as it is."""
+    return RULE_BASED_EGOS.get(ego, ego) if isinstance(ego, str) else ego
 
 
 def observation_for(ego: Any, vehicles: int = 1) -> str:

@@ -11,9 +11,8 @@ from gymnasium import spaces
 from torch import Tensor
 
 from rare_envs.control.actions import DISCRETE_ACTIONS, IDLE, META_ACTIONS
-from rare_envs.control.idm import IDM
 from rare_envs.egos.inference import PolicyQuery, query_policy
-from rare_envs.egos.needs import WrappedEgo, resolve
+from rare_envs.egos.needs import RULE_BASED_EGOS, WorldEgo, find_rule_based, resolve
 from rare_envs.egos.validation import refuse_ego
 from rare_envs.egos.wrappers import find_frame_stacking, wrap_policy
 from rare_envs.sensors.kinds import map_kinds
@@ -79,7 +78,7 @@ def as_driver(ego: Any, world: World, needs: EgoNeeds | None = None) -> Driver:
     """Return the Driver that an ego stands for in a world.
 
     Args:
-        ego: "idm", a `Driver`, an object with `predict`, or a `rare_envs.egos.needs.WrappedEgo`.
+        ego: "idm", "human", a `Driver`, an object with `predict`, or a `rare_envs.egos.needs.WorldEgo`.
         world: The world; what `resolve` says that the ego needs it has.
         needs: The answer of `resolve`, if it is known already; None resolves the ego here.
 
@@ -91,11 +90,10 @@ def as_driver(ego: Any, world: World, needs: EgoNeeds | None = None) -> Driver:
     Raises:
         ValueError: If it is none of these, or its spaces do not fit.
     """
-    if isinstance(ego, str) and ego == "idm":
-        return IDM()
+    ego = find_rule_based(ego)
     if isinstance(ego, str | type):  # a class has the attributes of its egos
-        refuse_ego(ego)
-    if isinstance(ego, WrappedEgo):
+        refuse_ego(ego, known=tuple(RULE_BASED_EGOS))
+    if isinstance(ego, WorldEgo):
         return ego.in_world(world)
     needs = needs or resolve(ego, world.scenario.vehicles)
     if needs.queries_policy:
@@ -111,7 +109,7 @@ def as_driver(ego: Any, world: World, needs: EgoNeeds | None = None) -> Driver:
     if callable(getattr(ego, "act", None)):  # anybody's object
         driver: Driver = ego
         return driver
-    refuse_ego(ego)
+    refuse_ego(ego, known=tuple(RULE_BASED_EGOS))
 
 
 def check_spaces(ego: Any, expected: spaces.Space[Any], action: str = "continuous", declared: str = "features") -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NoReturn
 
 
@@ -18,12 +19,13 @@ def is_policy(ego: object) -> bool:
     return not isinstance(ego, type) and callable(getattr(ego, "predict", None))
 
 
-def refuse_ego(ego: object, origin: str = "") -> NoReturn:
+def refuse_ego(ego: object, origin: str = "", known: Sequence[str] = ("idm",)) -> NoReturn:
     """Refuse what is no ego.
 
     Args:
         ego: A name, a class, or an object that is no ego.
         origin: Where it came from, if not from the caller, such as "from make_ego()".
+        known: Names of egos that would have been taken.
 
     Raises:
         ValueError: Always; it says what was expected.
@@ -33,14 +35,14 @@ def refuse_ego(ego: object, origin: str = "") -> NoReturn:
         Traceback (most recent call last):
         ValueError: Expected 'idm' or an object with a method predict(observation, ...), got int from make_ego().
     """
-    origin = f" {origin}" if origin else ""
+    origin, names = f" {origin}" if origin else "", ", ".join(map(repr, known))
     if isinstance(ego, str):
         raise ValueError(
-            f"Unknown ego {ego!r}{origin}; expected 'idm' or an object. Names and files become objects by "
+            f"Unknown ego {ego!r}{origin}; expected {names} or an object. Names and files become objects by "
             f"agents.load_ego({ego!r})."
         )
     if isinstance(ego, type):
         raise ValueError(f"Expected an ego, got the class {ego.__name__}{origin}; make or train one of it first.")
     raise ValueError(
-        f"Expected 'idm' or an object with a method predict(observation, ...), got {type(ego).__name__}{origin}."
+        f"Expected {names} or an object with a method predict(observation, ...), got {type(ego).__name__}{origin}."
     )

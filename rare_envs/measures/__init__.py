@@ -1,7 +1,15 @@
 """Safety measures: how close an episode came to a collision; small is dangerous, always finite."""
 
 from rare_envs.measures.base import COLLISION, EpisodeMeasure, Measure
-from rare_envs.measures.braking import DECELERATION_MAX, MAX_BRAKING, btn, drac, required_deceleration, ttb
+from rare_envs.measures.braking import (
+    DECELERATION_MAX,
+    MAX_BRAKING,
+    btn,
+    drac,
+    evasive_manoeuvre,
+    required_deceleration,
+    ttb,
+)
 from rare_envs.measures.combination import Combined, minimum, weighted, with_collision
 from rare_envs.measures.encroachment import PET_MAX, pet
 from rare_envs.measures.episode_trace import Trace, TraceMeasure
@@ -35,6 +43,7 @@ __all__ = [
     "btn",
     "clearance",
     "drac",
+    "evasive_manoeuvre",
     "find_measure",
     "lidar_ttc",
     "margin",

@@ -9,6 +9,10 @@ from rare_envs.measures.time_to_collision import TTC_MAX
 
 MAX_BRAKING = MAX_ACCELERATION
 """The hardest braking that an action can ask for [m/s^2]."""
+STANDARD_GRAVITY = 9.80665
+"""g [m/s^2]."""
+RAPID_BRAKING, RAPID_LATERAL = 0.5 * STANDARD_GRAVITY, 0.4 * STANDARD_GRAVITY
+"""Braking and lateral acceleration above which a manoeuvre is rapid [m/s^2]; see `evasive_manoeuvre`."""
 DECELERATION_MAX = 100.0
 """Cap of decelerations [m/s^2], ten times what tyres can do: with a centimetre left they would be in the thousands."""
 
@@ -76,6 +80,43 @@ def required_deceleration(moment: Moment) -> Tensor:
     way = gap + lead_speed.square() / (2.0 * torch.where(stops_first, braking, 1.0))
     required = torch.where(stops_first, speed.square() / (2.0 * way), rolling)
     return required.clamp(max=DECELERATION_MAX)
+
+
+def evasive_manoeuvre(moment: Moment) -> Tensor:
+    """Return how rapid the ego's evasive manoeuvre is: 1 and more makes a near-crash in the 100-Car study.
+
+    The greater of its braking over 0.5 g and its lateral acceleration, beyond that of the road's curve, over 0.4 g.
+    In the words of the study a near-crash is "any circumstance that requires a rapid, evasive maneuver by the subject
+    vehicle, or any other vehicle, pedestrian, cyclist, or animal to avoid a crash"; "general guideline: subject vehicle
+    braking greater than 0.5 g or steering input that results in a lateral acceleration greater than 0.4 g to avoid a
+    crash constitutes a rapid maneuver". Here only the ego counts, and all its braking.
+
+    Critical value: 1.
+
+    Args:
+        moment: Of B scenarios.
+
+    Returns:
+        Without unit, in [0, DECELERATION_MAX / RAPID_BRAKING], shape (B,); 0 at the start.
+
+    References:
+        Virginia Tech Transportation Institute, "Researcher dictionary for video reduction data", version 1.3, 2012
+        (variable 5), of the 100-Car study: Dingus et al., DOT HS 810 593, 2006.
+
+    Example:
+        >>> from rare_envs.measures import Moment
+        >>> moment = Moment.of_two(gap=25.0, speed=20.0, lead_speed=20.0)
+        >>> before = moment.state._replace(speed=moment.state.speed + torch.tensor([0.6, 0.0]))
+        >>> round(evasive_manoeuvre(moment._replace(before=before)).item(), 2)  # braked by 6 m/s^2
+        1.22
+    """
+    braking = -moment.acceleration[:, 0]
+    turned = torch.zeros_like(braking)
+    if moment.before is not None:
+        turned = (moment.state.heading - moment.before.heading)[:, 0] / moment.dt
+    lateral = (moment.state.speed[:, 0] * turned).abs()
+    rapid = torch.maximum(braking / RAPID_BRAKING, lateral / RAPID_LATERAL)
+    return rapid.clamp(0.0, DECELERATION_MAX / RAPID_BRAKING)
 
 
 def btn(moment: Moment, brakes: float = MAX_BRAKING) -> Tensor:

@@ -8,7 +8,15 @@ from typing import Any
 from torch import Tensor
 
 from rare_envs.measures.base import EpisodeMeasure, Measure
-from rare_envs.measures.braking import DECELERATION_MAX, MAX_BRAKING, btn, drac, required_deceleration, ttb
+from rare_envs.measures.braking import (
+    DECELERATION_MAX,
+    MAX_BRAKING,
+    btn,
+    drac,
+    evasive_manoeuvre,
+    required_deceleration,
+    ttb,
+)
 from rare_envs.measures.encroachment import pet
 from rare_envs.measures.episode_trace import TraceMeasure
 from rare_envs.measures.exposure import EXPOSURE_MAX, Exposure, tet, tit
@@ -60,6 +68,7 @@ MEASURES: MappingProxyType[str, EpisodeMeasure] = MappingProxyType(
             required_deceleration, collision=-DECELERATION_MAX, critical=MAX_BRAKING, unit="m/s^2"
         ),
         "btn": Measure(btn, collision=-DECELERATION_MAX, critical=1.0, unit=""),
+        "near_crash": Measure(evasive_manoeuvre, collision=-DECELERATION_MAX, critical=1.0, unit=""),
         "ttb": Measure(ttb, collision=-TTC_MAX),
         "pet": TraceMeasure(pet, unit="s"),
         "rss_longitudinal": Measure(rss_longitudinal, collision=-MARGIN_MAX, unit="m"),

@@ -381,7 +381,10 @@ def test_learned_drivers_are_egos_by_name_and_by_file(tmp_path: Path, monkeypatc
 @pytest.mark.parametrize(
     ("spec", "message"),
     [
-        ("idn", r"Unknown ego 'idn' \(did you mean 'idm'\?\); expected 'idm', 'imitation', 'vision', 'mgail',"),
+        (
+            "idn",
+            r"Unknown ego 'idn' \(did you mean 'idm'\?\); expected 'idm', 'human', 'imitation', 'vision',",
+        ),
         ("", "Unknown ego ''"),
         ("runs/ego", "Unknown ego 'runs/ego'"),
         (":make", "Expected module:name"),

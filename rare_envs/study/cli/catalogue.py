@@ -20,6 +20,7 @@ TICK = 0.1
 """[s], the usual one."""
 EGOS = {
     "idm": "rule-based driver, Intelligent Driver Model (the default)",
+    "human": "attentive human driver by a published model with reaction time, errors and glances, docs/human_driver.md",
     "imitation": "shipped ego with lidar, learned from recorded traffic and from encounters",
     "mgail, gail, bc, FILE.safetensors": "learned driver with lidar, by its mean actions",
     "vision": "PilotNet on pictures of a front camera, which imitates a driver by rule; see docs/camera.md",

@@ -17,6 +17,7 @@ from rare_envs.measures import (
     btn,
     clearance,
     drac,
+    evasive_manoeuvre,
     mttc,
     required_deceleration,
     tet,
@@ -65,6 +66,9 @@ from tests.rare_envs.measures.moments import (
         (required_deceleration, following(15.0, 10.0, 10.0, 0.0, 5.0), 0.0),  # a lead that speeds up
         (required_deceleration, following(25.0, 20.0, 0.0), 8.0),  # stands
         (btn, following(25.0, 20.0, 10.0), 0.4),
+        (evasive_manoeuvre, following(25.0, 20.0, 10.0), 0.0),
+        (evasive_manoeuvre, following(25.0, 20.0, 20.0, 6.0, 0.0), 0.0),  # speeds up
+        (evasive_manoeuvre, following(25.0, 20.0, 20.0, -0.75 * 9.80665, 0.0), 1.5),
         (partial(btn, brakes=8.0), following(25.0, 20.0, 10.0), 0.25),
         (ttb, following(25.0, 20.0, 10.0), 1.5),  # 2.5 s less 10 / (2 x 5)
         (ttb, following(5.0, 20.0, 10.0), -0.5),  # half a second too late

@@ -1,10 +1,13 @@
 """Braking: the least that does not touch, and the last moment for it, against motion in small steps."""
 
 import numpy as np
+import pytest
+import torch
 
 from rare_envs.measures import (
     DECELERATION_MAX,
     TTC_MAX,
+    evasive_manoeuvre,
     required_deceleration,
     ttb,
 )
@@ -18,6 +21,14 @@ def test_required_deceleration_is_the_least_that_does_not_touch() -> None:
         if 1.0 < needed < DECELERATION_MAX:
             assert (gap + lead - path(speed, -1.001 * needed - 1e-3, True)).min() > 0
             assert (gap + lead - path(speed, -0.99 * needed, True)).min() < 0
+
+
+def test_a_swerve_is_as_rapid_as_its_lateral_acceleration() -> None:
+    """At 20 m/s a turn by 0.03 rad in a tick of 0.1 s is 6 m/s^2 across, 6 / (0.4 g) of what makes a near-crash."""
+    now = following(25.0, 20.0, 20.0, 0.0, 0.0)
+    assert now.before is not None
+    turned = now.state._replace(heading=now.state.heading + torch.tensor([0.03, 0.0]))
+    assert evasive_manoeuvre(now._replace(state=turned)).item() == pytest.approx(6.0 / (0.4 * 9.80665), rel=1e-6)
 
 
 def test_time_to_brake_is_the_last_moment_to_brake() -> None:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+import rare_envs
 from rare_envs.measures import (
     minimum,
     stl,
@@ -32,6 +33,14 @@ def test_a_collision_is_worse_than_anything_else(name: str, collision: float) ->
     assert values[0] == collision
     assert values[1] < values[2]
     assert values[0] < values[1]
+
+
+def test_near_crashes_count_collisions_apart() -> None:
+    """IDM brakes by 5 m/s^2 at most, which is more than 0.5 g; with a hit it is too late."""
+    around = rare_envs.DrivingProblem(FOLLOWING, measure="near_crash")
+    f = around.evaluate(np.array([(30.0, 10.0, 5.0), (30.0, 10.0, 60.0), (20.0, 20.0, 100.0)]))
+    assert f[0] == -100.0
+    assert f[1:] == pytest.approx([1.0 - 5.0 / (0.5 * 9.80665), 1.0], abs=1e-4)
 
 
 def test_margin_goes_on_past_contact() -> None:

@@ -1,0 +1,206 @@
+"""The human driver model of Treiber, Kesting and Helbing, with published limits of perception and braking.
+
+Reaction time, errors of estimation and anticipation around the Intelligent Driver Model. Everything here is a formula
+of what the driver has seen; `rare_envs.egos.human` adds the memory that makes an ego of it.
+
+References:
+    Treiber, Kesting and Helbing, "Delays, inaccuracies and anticipation in microscopic traffic models", Physica A 360,
+    2006; Treiber and Kesting, "Traffic Flow Dynamics", Springer, 2013, chapter 12.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, fields
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from rare_envs.control.idm import IDM
+from rare_envs.traffic.lead import Lead
+from rare_envs.traffic.road import Road
+from rare_envs.traffic.state import VEHICLE_LENGTH, State
+from rare_envs.traffic.vehicle_models import NEAR_ZERO
+
+MAX_HUMAN_BRAKING = 0.774 * 9.80665
+"""Hardest braking of a competent and careful human driver [m/s^2]: UN Regulation 157, its model of the driver."""
+
+
+def _attentive_idm() -> IDM:
+    """Return the IDM of motorways in Treiber and Kesting (2013, table 11.2)."""
+    return IDM(
+        desired_speed=120.0 / 3.6,
+        time_headway=1.0,
+        max_acceleration=1.0,
+        comfortable_deceleration=1.5,
+        jam_distance=2.0,
+        jam_distance_speed=0.0,
+        max_deceleration=MAX_HUMAN_BRAKING,
+        cut_off=True,
+    )
+
+
+class Percept(NamedTuple):
+    """What a driver knows of V other vehicles at a moment, in B scenarios; shape (B, V) each."""
+
+    distance: Tensor
+    """From centre to centre along the road [m], positive ahead."""
+    speed: Tensor
+    """Of the other vehicle along the driver's heading [m/s]."""
+    noticed: Tensor
+    """Whether the driver takes it for one that it follows, boolean."""
+
+
+@dataclass(frozen=True)
+class HumanDriverModel:
+    """Parameters of an attentive human driver; each is published, none is fitted.
+
+    Example:
+        >>> HumanDriverModel(reaction_time=1.0).reaction_time
+        1.0
+
+    Raises:
+        ValueError: If a number is negative.
+    """
+
+    idm: IDM = field(default_factory=_attentive_idm)
+    """How the driver wants to drive: Treiber and Kesting (2013), table 11.2, motorway."""
+    reaction_time: float = 0.6
+    """T' [s]: Treiber and Kesting (2013), table of the human driver model (page 216)."""
+    gap_error: float = 0.1
+    """V_s, standard deviation of the logarithm of the estimated gap: the same table."""
+    approach_error: float = 0.01
+    """sigma_r [1/s], standard deviation of the error of the speed difference over the gap: the same table."""
+    error_correlation: float = 20.0
+    """Persistence of the errors of estimation [s]: the same table."""
+    leaders: int = 5
+    """Largest number of vehicles ahead to which it responds: the same table."""
+    wandering: float = 0.375
+    """A vehicle of the next lane is noticed when its centre is off its lane's centre by more than this, towards the
+    driver [m]: UN Regulation 157, its model of a competent and careful human driver."""
+    noticing_time: float = 0.4
+    """... and for as long as this [s]: the same ("risk evaluation")."""
+    jerk: float = 12.65
+    """Fastest build-up of braking [m/s^3]: the same, 0.774 g within 0.6 s."""
+    glances: bool = True
+    """Whether it looks away from the road now and then, see `rare_envs.control.glances`."""
+
+    def __post_init__(self) -> None:
+        for each in fields(self):
+            value = getattr(self, each.name)
+            if isinstance(value, int | float) and not value >= 0:
+                raise ValueError(f"Expected {each.name} to be a number of at least 0, got {value!r}.")
+
+
+def in_wandering_zone(state: State, road: Road, wandering: float) -> Tensor:
+    """Return which vehicles are in the ego's lane, or off the centre of the next one towards it, boolean, (B, V).
+
+    The first is the case up to half a lane from the centre of the ego's lane; the second as far as a lane's width less
+    the zone in which a vehicle may wander about the centre of its lane.
+
+    Args:
+        state: Traffic of B scenarios with V vehicles beside the ego.
+        road: Their road.
+        wandering: Half the width of that zone [m].
+    """
+    lane_y = road.centre_of(state.y[:, :1])
+    return (state.y[:, 1:] - lane_y).abs() <= road.width - wandering
+
+
+def look(state: State, noticed: Tensor) -> Percept:
+    """Return what there is to see of the other vehicles.
+
+    Args:
+        state: Traffic of B scenarios with V vehicles beside the ego.
+        noticed: See `Percept`.
+    """
+    speed = state.speed[:, 1:] * torch.cos(state.heading[:, 1:] - state.heading[:, :1])
+    return Percept(state.x[:, 1:] - state.x[:, :1], speed, noticed)
+
+
+def inverse_tau(percept: Percept, speed: Tensor) -> Tensor:
+    """Return how fast the most urgent leader comes closer, as a share of its gap [1/s], shape (B,); 0 without one.
+
+    It is the inverse of the time to collision, which tau, the optical size over its rate of change, gives to the eye.
+
+    Args:
+        percept: What there is to see.
+        speed: Of the driver [m/s], shape (B,).
+    """
+    gap = (percept.distance - VEHICLE_LENGTH).clamp(min=NEAR_ZERO)
+    ahead = percept.noticed & (percept.distance >= 0.0)
+    closing = torch.where(ahead, speed[:, None] - percept.speed, 0.0)
+    return (closing / gap).amax(dim=1).clamp(min=0.0)
+
+
+def step_errors(errors: Tensor, fresh: Tensor, dt: float, correlation: float) -> Tensor:
+    """Return errors after a time: Ornstein-Uhlenbeck processes of variance 1, exactly.
+
+    dw = -w dt / tau + sqrt(2 / tau) dW, the "Wiener processes" of Treiber, Kesting and Helbing (2006).
+
+    Args:
+        errors: Before it, any shape.
+        fresh: Standard normal, same shape.
+        dt: The time [s].
+        correlation: tau [s].
+    """
+    kept = math.exp(-dt / correlation) if correlation else 0.0
+    return kept * errors + math.sqrt(1.0 - kept * kept) * fresh
+
+
+def estimate_leads(percept: Percept, speed: Tensor, errors: Tensor, model: HumanDriverModel) -> Lead:
+    """Return gaps and speed differences to V leaders as a driver estimates them, shape (B, V), with gap inf for others.
+
+    s_est = s exp(V_s w_s) and dv_est = dv + s sigma_r w_v. The gap to the second leader is the sum of both net gaps:
+    the bodies in between are not counted.
+
+    Args:
+        percept: Of the vehicles around.
+        speed: Of the driver [m/s], shape (B,).
+        errors: w_s and w_v, standard normal, shape (B, 2).
+        model: The driver.
+    """
+    ahead = percept.noticed & (percept.distance >= 0.0)
+    way = torch.where(ahead, percept.distance, torch.inf)
+    between = (way[:, None, :] < way[:, :, None]).sum(dim=2)
+    led = ahead & (between < max(model.leaders, 1))
+    gap = torch.where(led, percept.distance - VEHICLE_LENGTH * (between + 1), 0.0)
+    error = gap.abs() * model.approach_error * errors[:, 1:]
+    estimated = gap * torch.exp(model.gap_error * errors[:, :1])
+    closing = torch.where(led, speed[:, None] - percept.speed + error, 0.0)
+    return Lead(torch.where(led, estimated, torch.inf), closing)
+
+
+def anticipate(lead: Lead, speed: Tensor, acceleration: Tensor, delay: float) -> tuple[Lead, Tensor]:
+    """Return leads and own speed as a driver expects them after its reaction time.
+
+    s' = s - T' dv, dv' = dv, v' = v + T' a: other speeds, and the own acceleration, are taken for constant.
+
+    Args:
+        lead: As it was estimated, shape (B, V).
+        speed: Own speed at that time [m/s], shape (B,).
+        acceleration: Own acceleration at that time [m/s^2], shape (B,).
+        delay: T' [s].
+    """
+    expected = lead._replace(gap=lead.gap - delay * lead.closing_speed)
+    return expected, (speed + delay * acceleration).clamp(min=0.0)
+
+
+def respond(lead: Lead, speed: Tensor, model: HumanDriverModel) -> Tensor:
+    """Return the acceleration that a driver chooses [m/s^2], shape (B,).
+
+    The IDM with the interactions (s*/s_j)^2 of n leaders, weighted by 1 / sum_j j^-2 so that a queue in equilibrium
+    keeps the gaps of the IDM.
+
+    Args:
+        lead: Expected gaps and speed differences to V leaders, shape (B, V); gap inf for no leader.
+        speed: Expected own speed [m/s], shape (B,).
+        model: The driver.
+    """
+    ratio = speed / model.idm.desired_speed
+    each = model.idm.interaction(speed[:, None], ratio[:, None], lead)
+    seen = torch.isfinite(lead.gap).sum(dim=1)
+    weights = [1.0 / sum(j**-2 for j in range(1, n + 1)) if n else 1.0 for n in range(lead.gap.shape[1] + 1)]
+    weight = speed.new_tensor(weights)[seen]
+    return model.idm.combine(ratio, weight * each.sum(dim=1))

@@ -1,0 +1,106 @@
+"""The human driver model by pencil and paper."""
+
+import math
+
+import pytest
+import torch
+
+from rare_envs.control.human_driver import (
+    HumanDriverModel,
+    Percept,
+    anticipate,
+    estimate_leads,
+    in_wandering_zone,
+    inverse_tau,
+    respond,
+    step_errors,
+)
+from rare_envs.control.idm import IDM
+from rare_envs.traffic.lead import Lead
+from rare_envs.traffic.road import straight
+from tests.rare_envs.traffic_states import F64, tensor, traffic
+
+MODEL = HumanDriverModel()
+NO_ERRORS = torch.zeros(1, 2, dtype=F64)
+
+
+def percept(*vehicles: tuple[float, float, bool]) -> Percept:
+    """One scenario; distance of centres, speed, noticed."""
+    distance, speed, noticed = zip(*vehicles, strict=True)
+    return Percept(tensor(*distance)[None], tensor(*speed)[None], torch.tensor([noticed]))
+
+
+def test_errors_have_variance_one_and_the_published_correlation_time() -> None:
+    generator = torch.Generator().manual_seed(0)
+    n, dt, tau = 100_000, 0.5, 20.0
+    first = errors = torch.randn(n, generator=generator, dtype=F64)
+    for step in range(1, 41):
+        errors = step_errors(errors, torch.randn(n, generator=generator, dtype=F64), dt, tau)
+        if step in (1, 10, 40):
+            assert float(errors.std()) == pytest.approx(1.0, abs=5 / math.sqrt(2 * n))
+            kept = float((first * errors).mean())
+            assert kept == pytest.approx(math.exp(-step * dt / tau), abs=5 * math.sqrt(2 / n))
+    assert kept == pytest.approx(math.exp(-1.0), abs=0.02)  # after the correlation time
+
+
+def test_gap_and_speed_difference_are_misjudged_as_published() -> None:
+    lead = estimate_leads(percept((25.0, 12.0, True)), tensor(15.0), tensor(1.0, -2.0)[None], MODEL)
+    assert lead.gap.item() == pytest.approx(20.0 * math.exp(0.1))
+    assert lead.closing_speed.item() == pytest.approx(3.0 - 2.0 * 0.01 * 20.0)
+
+
+def test_gaps_to_several_leaders_leave_out_the_bodies_in_between() -> None:
+    others = percept((60.0, 10.0, True), (20.0, 12.0, True), (-20.0, 15.0, True), (30.0, 15.0, False))
+    lead = estimate_leads(others, tensor(15.0), NO_ERRORS, MODEL)
+    assert lead.gap.tolist() == [[50.0, 15.0, math.inf, math.inf]]
+    assert lead.closing_speed.tolist() == [[5.0, 3.0, 0.0, 0.0]]
+    nearest = estimate_leads(others, tensor(15.0), NO_ERRORS, HumanDriverModel(leaders=1))
+    assert nearest.gap.tolist() == [[math.inf, 15.0, math.inf, math.inf]]
+
+
+def test_anticipation_takes_speeds_and_the_own_acceleration_for_constant() -> None:
+    lead, speed = anticipate(Lead(tensor(20.0)[None], tensor(4.0)[None]), tensor(10.0), tensor(-2.0), 0.5)
+    assert (lead.gap.item(), lead.closing_speed.item(), speed.item()) == (18.0, 4.0, 9.0)
+    assert anticipate(lead, tensor(0.5), tensor(-2.0), 0.5)[1].item() == 0.0
+
+
+def test_one_leader_is_answered_as_by_the_idm() -> None:
+    lead = Lead(tensor(20.0, math.inf, 3.0), tensor(4.0, 0.0, 9.0))
+    expected = MODEL.idm.acceleration(tensor(15.0, 10.0, 15.0), lead)
+    alone = Lead(*(each[:, None] for each in lead))
+    assert respond(alone, tensor(15.0, 10.0, 15.0), MODEL).tolist() == expected.tolist()
+    assert expected[2].item() == pytest.approx(-0.774 * 9.80665)
+
+
+@pytest.mark.parametrize("leaders", [1, 2, 5])
+def test_a_queue_in_equilibrium_keeps_the_gap_of_the_idm(leaders: int) -> None:
+    """Equal speeds and gaps s: sum_j (s* / (j s))^2 / sum_j j^-2 = (s* / s)^2, so a = 0 where IDM's is."""
+    speed, v0 = 15.0, 120 / 3.6
+    gap = (2.0 + 1.0 * speed) / math.sqrt(1 - (speed / v0) ** 4)
+    queue = percept(*((j * (gap + 5.0), speed, True) for j in range(1, leaders + 1)))
+    lead = estimate_leads(queue, tensor(speed), NO_ERRORS, MODEL)
+    assert respond(lead, tensor(speed), MODEL).item() == pytest.approx(0.0, abs=1e-12)
+
+
+def test_the_cut_off_keeps_a_driver_from_braking_for_a_lead_that_pulls_away() -> None:
+    away = Lead(tensor(10.0), tensor(-20.0))
+    assert MODEL.idm.acceleration(tensor(20.0), away).item() == pytest.approx(1 - (20 * 3.6 / 120) ** 4 - 0.2**2)
+    assert IDM().acceleration(tensor(20.0), away).item() == -5.0
+
+
+def test_a_cutter_is_noticed_beyond_the_wandering_zone_of_its_lane() -> None:
+    """Lanes of 4 m: the next centre is at 4, and 0.375 m from it towards the driver is 3.625."""
+    vehicles = ((0.0, 0.0, 0.0, 20.0), *((30.0, y, 0.0, 20.0) for y in (0.5, 3.62, 3.63, 4.0, -3.62)))
+    zone = in_wandering_zone(traffic(*vehicles), straight(2), MODEL.wandering)
+    assert zone.tolist() == [[True, True, False, False, True]]
+
+
+def test_urgency_is_that_of_the_most_urgent_leader() -> None:
+    others = percept((25.0, 13.0, True), (45.0, 5.0, True), (15.0, 0.0, False), (-15.0, 0.0, True))
+    assert inverse_tau(others, tensor(15.0)).item() == pytest.approx(10.0 / 40.0)
+    assert inverse_tau(percept((25.0, 16.0, True)), tensor(15.0)).item() == 0.0
+
+
+def test_negative_parameters_are_refused() -> None:
+    with pytest.raises(ValueError, match="Expected reaction_time to be a number of at least 0, got -1"):
+        HumanDriverModel(reaction_time=-1.0)
