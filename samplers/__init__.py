@@ -3,8 +3,11 @@
 Knows NumPy and probability, nothing about driving. `estimate` is the front door.
 """
 
+from samplers.analysis.base_uncertainty import BaseUncertainty
 from samplers.analysis.curve import Curve
 from samplers.analysis.failure_modes import Share
+from samplers.analysis.ratio_uncertainty import RatioUncertainty, compute_ratio_uncertainty
+from samplers.analysis.refits import FittedBase
 from samplers.analysis.reweighting import Reweighted
 from samplers.comparison import Comparison, compare
 from samplers.errors import EvaluationError
@@ -31,6 +34,7 @@ from samplers.trace import Level, Status
 __all__ = [
     "METHODS",
     "AdaptiveSubsetSimulation",
+    "BaseUncertainty",
     "BetaBlock",
     "Comparison",
     "CrossEntropy",
@@ -40,6 +44,7 @@ __all__ = [
     "EvaluationError",
     "Failure",
     "Failures",
+    "FittedBase",
     "FunctionProblem",
     "GaussianBlock",
     "Goal",
@@ -56,6 +61,7 @@ __all__ = [
     "Problem",
     "Product",
     "Progress",
+    "RatioUncertainty",
     "Reweighted",
     "Run",
     "RunArguments",
@@ -68,6 +74,7 @@ __all__ = [
     "SubsetSimulation",
     "TwoStage",
     "compare",
+    "compute_ratio_uncertainty",
     "estimate",
     "get_method",
 ]

@@ -3,18 +3,20 @@
 import math
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
+from samplers.analysis.refits import HasEnsemble, needs_ensemble_run
 from samplers.errors import OnError
-from samplers.execution.arguments import RunArguments, check_attributes
+from samplers.execution.arguments import InputsOnly, RunArguments, check_attributes
 from samplers.execution.fault_isolation import FaultIsolation
 from samplers.execution.progress import Listener, Progress, open_listener
 from samplers.execution.run import Run
 from samplers.method import Stepping
 from samplers.methods.two_stage.method import TwoStage
-from samplers.problem import Problem
+from samplers.problem import Inputs, Problem
 from samplers.registry import get_method
 from samplers.result import Estimate
+from samplers.trace import Status
 from samplers.validation import check_number
 
 
@@ -32,8 +34,16 @@ def estimate(
     *,
     time_limit: float | None = None,
     stop: Callable[[Progress], bool] | None = None,
+    ensemble_run: bool = True,
 ) -> Estimate:
     """Estimate P[f(X) <= gamma], X ~ problem.base.
+
+    Where the base distribution was fitted and has refits (`FittedBase`), the failing points of the run also give p
+    under each refit and so the uncertainty of p that the events leave (`Estimate.base_uncertainty`). If they do not
+    reach the refits (more than a tenth of these rest on under 10 effective failing points, which is known without
+    simulations), one further run is made under the mixture of the refits, `base.ensemble()`. It has the same method
+    (`TwoStage`, if that one cannot search under a mixture), seed and rule for errors, no replicates and no target_cov.
+    p and its interval remain those of the first run.
 
     Args:
         problem: Has `dim`, `base` and `evaluate`; see `Problem`.
@@ -62,6 +72,9 @@ def estimate(
             that has begun is not cut short.
         stop: Function that gets `Progress` after every batch; the run is stopped when it returns
             True.
+        ensemble_run: Whether the further run may be made. Its simulations are not in `n_sim` but in
+            `base_uncertainty.n_sim`; max_sim limits them anew, time_limit and stop hold for both
+            runs. None is made after a run that was stopped.
 
     Returns:
         The probability, its interval, its cost and the failures. Of a run that was stopped (status
@@ -89,14 +102,46 @@ def estimate(
     if not (callable(progress) or isinstance(progress, bool)):
         raise ValueError(f"Expected progress to be True, False or a function, got {progress!r}.")
     isolation = FaultIsolation(problem.evaluate, on_error)
-    with open_listener(progress, max_sim) as listener:
-        run = Run(problem, chosen, arguments, listener)
-        while not run.done:
-            run.tell(isolation.evaluate(run.ask()))
-            why = conditions.reason(run.progress)
-            if why is not None:
-                run.stop(why)
-    return _add_retry_note(run.result(), isolation.n_retried)
+    simulation = _Simulation(isolation, conditions, progress)
+    result = simulation.run(problem, chosen, arguments)
+    if ensemble_run and result.status is not Status.STOPPED and needs_ensemble_run(result):
+        further = RunArguments(gamma, result.seed, max_sim, None, confidence, 1, on_error)
+        result = replace(result, ensemble_run=_run_under_ensemble(simulation, problem, chosen, further))
+    return _add_retry_note(result, isolation.n_retried)
+
+
+@dataclass(frozen=True)
+class _Simulation:
+    """What the runs of one estimation share: how f is called, when they end and who is told."""
+
+    isolation: FaultIsolation
+    conditions: "_StopConditions"
+    progress: bool | Listener
+
+    def run(self, inputs: Inputs, method: Stepping, arguments: RunArguments) -> Estimate:
+        """Run a method to its end, or to the first condition that stops it."""
+        with open_listener(self.progress, arguments.max_sim) as listener:
+            run = Run(inputs, method, arguments, listener)
+            while not run.done:
+                run.tell(self.isolation.evaluate(run.ask()))
+                why = self.conditions.reason(run.progress)
+                if why is not None:
+                    run.stop(why)
+        return run.result()
+
+
+def _run_under_ensemble(
+    simulation: _Simulation, problem: Problem, method: Stepping, arguments: RunArguments
+) -> Estimate | None:
+    """Return the run under the mixture of the refits; by `TwoStage` where the method cannot search under a mixture."""
+    if not isinstance(problem.base, HasEnsemble):
+        return None
+    inputs = InputsOnly(int(problem.dim), problem.base.ensemble())
+    try:
+        Run(inputs, method, arguments)
+    except ValueError:  # blocks of a product, which a mixture has none of
+        method = TwoStage()
+    return simulation.run(inputs, method, arguments)
 
 
 class _StopConditions:

@@ -4,14 +4,16 @@ import json
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from samplers.analysis.base_uncertainty import BaseUncertainty, compute_base_uncertainty
 from samplers.analysis.curve import Curve, compute_curve
 from samplers.analysis.failure_modes import Share, split_by_kind
-from samplers.analysis.reweighting import HasLogProb, Reweighted, reweight_estimate
+from samplers.analysis.reweighting import HasLogProb, Reweighted, find_sibling, reweight_estimate
 from samplers.method import Stepping
 from samplers.problem import Distribution, FloatArray
 from samplers.sample import Sample
@@ -157,6 +159,8 @@ class Estimate:
     """Simulations that were independent draws from the base distribution."""
     given: str = ""
     """Condition of p, which the problem holds fixed: its attribute `given`, if it has one."""
+    ensemble_run: "Estimate | None" = field(default=None, compare=False, repr=False)
+    """The further run under the mixture of the refits of the base, where `estimate` needed one."""
 
     @property
     def unseen(self) -> float:
@@ -225,6 +229,33 @@ class Estimate:
         """
         return reweight_estimate(self, new_base)
 
+    def under(self, base: HasLogProb | str) -> Reweighted:
+        """Return P[f(X) <= gamma] with X from another base distribution, which may be one that the base knows by name.
+
+        Args:
+            base: The other distribution, as for `reweight`, or a name for `sibling` of this run's base distribution.
+
+        Raises:
+            ValueError: As in `reweight`; or the base distribution knows no others by name, or not this one.
+
+        Example:
+            >>> import samplers
+            >>> result = samplers.estimate(samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2), seed=0)
+            >>> result.under("i80")
+            Traceback (most recent call last):
+                ...
+            ValueError: This base distribution knows no others by name: give a distribution in place of 'i80'.
+        """
+        return self.reweight(find_sibling(self.base, base) if isinstance(base, str) else base)
+
+    @cached_property
+    def base_uncertainty(self) -> BaseUncertainty | None:
+        """The interval of p that the events behind a fitted base distribution allow, from the same simulations.
+
+        None where the base has no refits; see `BaseUncertainty` and `samplers.FittedBase`.
+        """
+        return compute_base_uncertainty(self)
+
     def shares(self, label: Callable[[FloatArray], Sequence[str]], most: int | None = None) -> dict[str, Share]:
         """Return p by kind of failure, from the same simulations; the kinds' p add up to p.
 
@@ -264,6 +295,7 @@ class Estimate:
         lines = [
             f"P[f <= {self.gamma:g}] = {self.p:.3e}",
             f"  {100 * self.confidence:g} % interval [{low:.3e}, {high:.3e}], c.o.v. {cov}",
+            *indent_lines(self.base_uncertainty),
             f"  {self.n_sim:,} simulations{gain}; {self.method.name}, seed {self.seed}, "
             f"{self.status}; {self.failures.total:,} failing points",
             f"  given that {self.proviso}",
@@ -277,6 +309,7 @@ class Estimate:
             "interval": list(self.interval),
             "confidence": self.confidence,
             "cov": self.cov,
+            "base_uncertainty": None if self.base_uncertainty is None else self.base_uncertainty.to_dict(),
             "gamma": self.gamma,
             "n_sim": self.n_sim,
             "base_draws": self.base_draws,
@@ -300,6 +333,11 @@ class Estimate:
     def to_json(self) -> str:
         """Return `to_dict` as one line of JSON."""
         return json.dumps(self.to_dict(), allow_nan=False)
+
+
+def indent_lines(value: object | None) -> list[str]:
+    """Return the lines of a value as text, each indented by two spaces; none for None."""
+    return [] if value is None else [f"  {line}" for line in str(value).splitlines()]
 
 
 def method_settings(method: Stepping) -> dict[str, Any]:

@@ -37,6 +37,18 @@ class CanSample(Protocol):
         """Draw n independent points, shape (n, d)."""
 
 
+@runtime_checkable
+class HasSiblings(Protocol):
+    """A base distribution that knows others of the same X by name."""
+
+    def sibling(self, name: str) -> HasLogProb:
+        """Return the base distribution with this name.
+
+        Raises:
+            ValueError: If there is none.
+        """
+
+
 @dataclass(frozen=True, kw_only=True)
 class Reweighted:
     """P[f(X) <= gamma] with X from another base distribution.
@@ -130,14 +142,33 @@ def log_density_ratios(estimate: WeightedEstimate, new_base: HasLogProb, x: Floa
         ValueError: If the estimate has no base or no failing point, the new base does not fit, or a density is not
             finite.
     """
-    base = estimate.base
-    if base is None:
-        raise ValueError("The estimate does not know its base distribution (`Estimate.base`).")
+    base = require_base(estimate)
     if len(x) == 0:
         raise ValueError(f"No point failed (f <= {estimate.gamma:g}): there is nothing to reweight.")
     check_dimensions_fit(new_base, x.shape[1])
     check_support(base, new_base, x.shape[1], estimate.seed)
-    new, old = log_density(new_base, x), log_density(base, x)
+    return subtract_log_densities(new_base, log_density(base, x), x)
+
+
+def require_base(estimate: WeightedEstimate) -> Distribution:
+    """Return the base distribution of an estimate, or raise a ValueError that says it is not known."""
+    if estimate.base is None:
+        raise ValueError("The estimate does not know its base distribution (`Estimate.base`).")
+    return estimate.base
+
+
+def subtract_log_densities(new_base: HasLogProb, old: FloatArray, x: FloatArray) -> FloatArray:
+    """Return log p1(x) - log p0(x), shape (k,).
+
+    Args:
+        new_base: p1.
+        old: log p0 at x, shape (k,).
+        x: Points, shape (k, d).
+
+    Raises:
+        ValueError: If a density is not finite (p1 may be 0).
+    """
+    new = log_density(new_base, x)
     wrong = np.isnan(new) | np.isposinf(new) | ~np.isfinite(old)
     if wrong.any():
         row = int(np.argmax(wrong))
@@ -195,3 +226,14 @@ def check_enough(estimate: WeightedEstimate, ess: float, units: float) -> None:
         f"base; at least {MIN_POINTS:g} and {MIN_UNITS:g} are needed. Estimate again with the new base, or start "
         f"from a run with more failing points (it has {estimate.failures.total:,})."
     )
+
+
+def find_sibling(base: object, name: str) -> HasLogProb:
+    """Return another base distribution of the same X by its name.
+
+    Raises:
+        ValueError: If the base knows no others, or none of that name.
+    """
+    if not isinstance(base, HasSiblings):
+        raise ValueError(f"This base distribution knows no others by name: give a distribution in place of {name!r}.")
+    return base.sibling(name)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from samplers.analysis.refits import check_refits
 from samplers.errors import ON_ERROR, OnError
 from samplers.method import Goal, Stepping
 from samplers.problem import Distribution, Inputs
@@ -86,7 +87,10 @@ def check_arguments(problem: Inputs, method: Stepping) -> None:
 
 
 def check_problem(problem: Inputs, needed: tuple[str, ...]) -> None:
-    """Raise a ValueError unless the problem has the attributes needed, a dimension and a base distribution."""
+    """Raise a ValueError unless the problem has the attributes needed, a dimension and a base distribution.
+
+    Refits of the base must fit it, see `check_refits`.
+    """
     check_attributes(problem, needed)
     check_whole("dim", problem.dim, 1)
     if not isinstance(problem.base, Distribution):
@@ -94,6 +98,7 @@ def check_problem(problem: Inputs, needed: tuple[str, ...]) -> None:
             "Expected problem.base to have sample, log_prob, to_standard_normal and "
             f"from_standard_normal, got {type(problem.base).__name__}."
         )
+    check_refits(problem.base, int(problem.dim))
 
 
 def check_attributes(problem: Inputs, needed: tuple[str, ...]) -> None:

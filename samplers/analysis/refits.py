@@ -1,0 +1,230 @@
+"""Refits of a base distribution: p under each of them, from the failing points of one run.
+
+A base distribution that was fitted to events has an error of its own. Its refits are the same recipe applied to
+resampled events (whole clusters of them, where events come in clusters): the spread of p over the refits is the
+spread that p owes to the events.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from samplers.analysis.base import WeightedEstimate, require_sample
+from samplers.analysis.reweighting import (
+    CanSample,
+    HasLogProb,
+    check_dimensions_fit,
+    log_density,
+    require_base,
+    subtract_log_densities,
+)
+from samplers.problem import Distribution, FloatArray
+from samplers.statistics.weights import effective_number
+
+MIN_REFIT_ESS = 10.0
+"""Effective failing points from which p under a refit has an error of about 0.3 in its logarithm: little beside the
+usual spread of the refits, 0.7 to 1.5."""
+MAX_UNCOVERED_SHARE = 0.1
+"""Share of the refits that may rest on fewer points than that."""
+REFIT_CHECK_DRAWS = 100
+"""Draws on which a refit is compared with its base before the first simulation."""
+
+
+@runtime_checkable
+class FittedBase(Distribution, Protocol):
+    """A base distribution that was fitted to events, with its bootstrap refits; without refits it is like any other.
+
+    One that is also `HasEnsemble` lets `estimate` make a further run where the points of the first do not reach the
+    refits.
+    """
+
+    @property
+    def refits(self) -> Sequence[HasLogProb]:
+        """The same recipe applied to resampled events, R distributions on the same support."""
+
+    @property
+    def clusters(self) -> int:
+        """Number of independent clusters among the events; of events, where each is one."""
+
+    @property
+    def fitted_to(self) -> str:
+        """The events in words, such as "38 + 15 events of 17 scenes"."""
+
+    @property
+    def family(self) -> str:
+        """The family of distributions in words, such as "1 component, log gaps"."""
+
+
+@runtime_checkable
+class HasEnsemble(Protocol):
+    """A fitted base distribution that knows the mixture of its refits."""
+
+    def ensemble(self) -> Distribution:
+        """Return the mixture of the refits with equal weights: the predictive distribution of the next event."""
+
+
+class EnsembleEstimate(WeightedEstimate, Protocol):
+    """An estimate that may have a further run under the mixture of the refits."""
+
+    @property
+    def n_sim(self) -> int:
+        """Simulated points of the whole run."""
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What makes the numbers doubtful."""
+
+    @property
+    def ensemble_run(self) -> EnsembleEstimate | None:
+        """The further run."""
+
+
+class RefitSums(NamedTuple):
+    """Sums over the failing points under R refits, for m parts of p."""
+
+    log_p: FloatArray
+    """Logarithm of the probability, shape (m, R); -inf where a refit has no density at any failing point."""
+    ess: FloatArray
+    """Effective number of failing points behind it, shape (m, R); a path of a Markov chain counts as one."""
+
+
+def find_fitted_base(base: object) -> FittedBase | None:
+    """Return the base if it has refits; None for any other."""
+    return base if isinstance(base, FittedBase) and len(base.refits) > 0 else None
+
+
+def check_refits(base: Distribution, dim: int) -> None:
+    """Check the refits of a base distribution, if it has some.
+
+    Raises:
+        ValueError: If a refit has other dimensions or another support than the base, or no density.
+    """
+    fitted = find_fitted_base(base)
+    if fitted is None:
+        return
+    x = fitted.sample(REFIT_CHECK_DRAWS, np.random.default_rng(0))
+    for number, refit in enumerate(fitted.refits, start=1):
+        try:
+            check_dimensions_fit(refit, dim)
+            outside = _count_outside(refit, x)
+            if isinstance(refit, CanSample):
+                outside += _count_outside(fitted, np.asarray(refit.sample(REFIT_CHECK_DRAWS, np.random.default_rng(0))))
+        except ValueError as error:
+            raise ValueError(
+                f"Refit {number} of {len(fitted.refits)} does not fit its base distribution: {error}"
+            ) from error
+        if outside:
+            raise ValueError(
+                f"Refit {number} of {len(fitted.refits)} has another support than its base distribution: some draws "
+                "from the one have no finite density under the other."
+            )
+
+
+def _count_outside(distribution: HasLogProb, x: FloatArray) -> int:
+    """Return at how many of the points x (n, d) the density is 0 or not finite."""
+    return int(np.count_nonzero(~np.isfinite(log_density(distribution, x))))
+
+
+def reweight_to_refits(
+    estimate: WeightedEstimate, refits: Iterable[HasLogProb], parts: FloatArray | None = None
+) -> RefitSums:
+    """Return p under each refit, p_b = sum of w_i refit_b(x_i) / base(x_i) over the failing points.
+
+    As `Estimate.reweight`, without its refusal: refits on few points are counted by the caller, since leaving them out
+    would narrow the spread.
+
+    Args:
+        estimate: The run; its base may be any distribution that has density where the refits have.
+        refits: R distributions.
+        parts: Parts of p: what share of each failing point belongs to it, shape (m, k); None for p itself.
+
+    Raises:
+        ValueError: If there are no weighted points, none failed, or a density is not finite.
+    """
+    sample, base = require_sample(estimate), require_base(estimate)
+    failing = sample.f <= estimate.gamma
+    weights, x = sample.weights[failing], sample.x
+    if len(x) == 0 or estimate.p <= 0:
+        raise ValueError("nothing failed, so that p under the refits is not known.")
+    parts = np.ones((1, len(x))) if parts is None else parts
+    units = np.unique(sample.units[failing], return_inverse=True)[1]
+    old = log_density(base, x)
+    with np.errstate(divide="ignore"):  # weights and parts of 0
+        log_weights = np.log(parts * weights)
+    scale = np.log(estimate.p) - np.log(weights.sum())
+    sums = []
+    for refit in refits:
+        ratios = subtract_log_densities(refit, old, x)
+        sums.append([_sum_logarithms(row + ratios, units) for row in log_weights])
+    log_p, ess = np.asarray(sums, dtype=np.float64).transpose(2, 1, 0)
+    return RefitSums(np.minimum(log_p + scale, 0.0), ess)
+
+
+def reweight_runs_to_refits(
+    estimate: EnsembleEstimate,
+    refits: Sequence[HasLogProb],
+    split: Callable[[FloatArray], FloatArray] | None = None,
+) -> RefitSums:
+    """Return p under each refit from the run or its further run, whichever has more effective points under that refit.
+
+    The mixture of the refits has its failing points where the refits with the largest p have theirs: the others may
+    rest on fewer points than in the first run.
+
+    Args:
+        estimate: With weighted points.
+        refits: R distributions.
+        split: Returns parts of p (m, k) for points (k, d), see `reweight_to_refits`; None for p itself.
+
+    Raises:
+        ValueError: As in `reweight_to_refits`.
+    """
+    runs = [each for each in (estimate, estimate.ensemble_run) if each is not None and each.p > 0 and each.sample]
+    found = [
+        reweight_to_refits(run, refits, None if split is None else split(require_sample(run).x))
+        for run in runs or [estimate]
+    ]
+    best = np.argmax([sums.ess.min(axis=0) for sums in found], axis=0)
+    log_p, ess = (np.stack(values) for values in zip(*found, strict=True))
+    rows = np.arange(len(best))
+    return RefitSums(log_p[best, :, rows].T, ess[best, :, rows].T)
+
+
+def _sum_logarithms(log_terms: FloatArray, units: NDArray[np.intp]) -> tuple[float, float]:
+    """Return the logarithm of the sum of terms (k,) given as logarithms, and the effective number of units in it."""
+    highest = float(log_terms.max())
+    if not np.isfinite(highest):
+        return -np.inf, 0.0
+    totals = np.bincount(units, weights=np.exp(log_terms - highest)).astype(np.float64)
+    return highest + float(np.log(totals.sum())), effective_number(totals)
+
+
+def are_uncovered(sums: RefitSums) -> bool:
+    """Return whether the points do not reach the refits.
+
+    So it is where more than a tenth of the refits rest on under 10 effective failing points, or one of them on none.
+    """
+    ess = sums.ess.min(axis=0)
+    return count_uncovered(ess) > MAX_UNCOVERED_SHARE * len(ess) or not np.isfinite(sums.log_p).all()
+
+
+def count_uncovered(ess: Iterable[float]) -> int:
+    """Return how many refits rest on under 10 effective failing points."""
+    return sum(each < MIN_REFIT_ESS for each in ess)
+
+
+def needs_ensemble_run(estimate: WeightedEstimate) -> bool:
+    """Return whether a further run under the mixture of the refits would tell p under them; it needs no simulation.
+
+    False where the base has no refits or no `ensemble`, or nothing failed.
+    """
+    fitted = find_fitted_base(estimate.base)
+    if fitted is None or not isinstance(fitted, HasEnsemble):
+        return False
+    try:
+        return are_uncovered(reweight_to_refits(estimate, fitted.refits))
+    except ValueError:  # no points to reweight: the mixture of the refits would not mend that
+        return False

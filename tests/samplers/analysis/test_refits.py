@@ -1,0 +1,187 @@
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import samplers
+from samplers.analysis.refits import (
+    RefitSums,
+    are_uncovered,
+    check_refits,
+    find_fitted_base,
+    needs_ensemble_run,
+    reweight_to_refits,
+)
+from samplers.analysis.reweighting import find_sibling
+from tests.samplers.fitted_bases import BETA, FittedWithEnsemble, HalfSpace, fitted, normal, resampled, run
+
+
+def test_only_a_base_with_refits_is_fitted():
+    with_refits = fitted(resampled(400, 3))
+    assert find_fitted_base(with_refits) is with_refits
+    assert find_fitted_base(fitted()) is None
+    assert find_fitted_base(samplers.StandardNormal(2)) is None
+
+
+@pytest.mark.parametrize("method", ["mc", "two-stage", "ce", "adss"])
+def test_p_of_each_refit_is_the_exact_one(method):
+    """The error of log p_b is about 1 / sqrt(ess): four times that, and the error of the run itself."""
+    base = fitted(resampled(400, 10))
+    result = run(base, method, max_sim=40_000 if method == "mc" else None)
+    sums = reweight_to_refits(result, base.refits)
+    errors = np.abs(sums.log_p[0] - np.log([refit.p for refit in base.refits]))
+    assert (sums.ess > 10).all()
+    assert (errors < 4 * (1 / np.sqrt(sums.ess[0]) + result.cov)).all()
+    assert errors.mean() < 0.3
+
+
+def test_refits_equal_to_the_base_give_its_p():
+    base = fitted([normal()] * 3)
+    result = run(base)
+    assert np.exp(reweight_to_refits(result, base.refits).log_p) == pytest.approx(np.full((1, 3), result.p))
+
+
+def test_the_sum_by_hand_of_plain_draws():
+    """p_b = (1 / n) sum of ratios over the failing draws; effective number (sum r)^2 / sum r^2."""
+    refit = normal(0.3, 1.1)
+    result = run(fitted([refit, normal()]), "mc", max_sim=20_000)
+    x = result.sample.x
+    ratios = np.exp(refit.log_prob(x) - normal().log_prob(x))
+    sums = reweight_to_refits(result, [refit])
+    assert math.exp(sums.log_p[0, 0]) == pytest.approx(ratios.sum() / 20_000)
+    assert sums.ess[0, 0] == pytest.approx(ratios.sum() ** 2 / (ratios**2).sum())
+
+
+def test_parts_of_p_add_up():
+    refits = resampled(38, 4)
+    result = run(fitted(refits))
+    side = (result.sample.x[:, 1] > 0).astype(float)
+    parts = reweight_to_refits(result, refits, np.stack([side, 1 - side]))
+    whole = reweight_to_refits(result, refits)
+    assert np.exp(parts.log_p).sum(axis=0) == pytest.approx(np.exp(whole.log_p[0]))
+    nothing = reweight_to_refits(result, refits, np.zeros((1, len(side))))
+    assert np.isneginf(nothing.log_p).all()
+    assert (nothing.ess == 0).all()
+
+
+def test_a_path_of_a_chain_counts_once():
+    result = run(fitted([normal()]), "adss", max_sim=None)
+    failing = result.sample.f <= 0.0
+    ess = reweight_to_refits(result, [normal()]).ess[0, 0]
+    assert ess <= len(np.unique(result.sample.units[failing])) < failing.sum()
+
+
+def test_densities_far_below_the_smallest_float_keep_their_logarithm():
+    far = normal(-60.0, 1.0)
+    result = run(fitted([far]), "mc", max_sim=20_000)
+    log_p = reweight_to_refits(result, [far]).log_p[0, 0]
+    assert math.isfinite(log_p)
+    assert log_p < -1000 + 745  # no float would hold it by much more
+    x = result.sample.x
+    terms = far.log_prob(x) - normal().log_prob(x)
+    assert log_p == pytest.approx(terms.max() + np.log(np.exp(terms - terms.max()).sum()) - math.log(20_000))
+
+
+def test_points_reach_the_refits_or_not():
+    def sums(*ess, log_p=-5.0):
+        return RefitSums(np.full((1, len(ess)), log_p), np.array([ess], dtype=float))
+
+    assert not are_uncovered(sums(*[100] * 27, 9, 9, 9))
+    assert are_uncovered(sums(*[100] * 26, 9, 9, 9, 9))
+    assert not are_uncovered(sums(10, 10))
+    assert are_uncovered(sums(*[100] * 30, log_p=-np.inf))
+
+
+def test_the_decision_needs_points_and_an_ensemble():
+    covered, far = resampled(400), [normal(7.0, 0.3)] * 30
+    assert not needs_ensemble_run(run(fitted(covered, FittedWithEnsemble)))
+    result = run(fitted(far, FittedWithEnsemble), ensemble_run=False)
+    assert needs_ensemble_run(result)
+    assert not needs_ensemble_run(replace(result, sample=None))
+    assert not needs_ensemble_run(run(fitted(far)))  # no ensemble
+    assert not needs_ensemble_run(run(samplers.StandardNormal(2)))
+    nothing_failed = samplers.estimate(HalfSpace(fitted(far, FittedWithEnsemble), 9.0), "mc", seed=1, max_sim=100)
+    assert not needs_ensemble_run(nothing_failed)
+
+
+class Cut:
+    """N(0, 1) in both coordinates, x_1 cut to x_1 <= 1."""
+
+    def log_prob(self, x):
+        return np.where(x[:, 0] <= 1.0, normal().log_prob(x), -np.inf)
+
+
+class Wider(Cut):
+    """Density everywhere that the base has it, draws beyond."""
+
+    def log_prob(self, x):
+        return normal().log_prob(x)
+
+    def sample(self, n, rng):
+        return np.full((n, 2), np.nan)
+
+
+class Nowhere:
+    """NaN."""
+
+    def log_prob(self, x):
+        return np.full(len(x), np.nan)
+
+
+class Other:
+    """Three dimensions."""
+
+    dim = 3
+
+    def log_prob(self, x):
+        return stats.norm.logpdf(x).sum(axis=1)
+
+
+@pytest.mark.parametrize(
+    ("refit", "text"),
+    [
+        (Cut(), "Refit 2 of 2 has another support"),
+        (Wider(), "Refit 2 of 2 has another support"),
+        (Nowhere(), "Refit 2 of 2 has another support"),
+        (Other(), "Refit 2 of 2 does not fit its base distribution: Expected a distribution in 2 dimensions, got .* 3"),
+        ("us101", "Refit 2 of 2 does not fit .* log_prob, got 'us101'"),
+    ],
+)
+def test_a_refit_that_does_not_fit_is_refused_before_the_first_simulation(refit, text):
+    base = fitted([normal(), refit])
+    with pytest.raises(ValueError, match=text):
+        check_refits(base, 2)
+
+    class Never(HalfSpace):
+        def evaluate(self, x):
+            raise AssertionError("simulated")
+
+    with pytest.raises(ValueError, match=text):
+        samplers.estimate(Never(base), seed=0)
+    check_refits(fitted([normal(), normal()]), 2)
+
+
+def test_what_cannot_be_reweighted_says_so():
+    base = fitted(resampled(400, 3))
+    with pytest.raises(ValueError, match="nothing failed"):
+        reweight_to_refits(samplers.estimate(HalfSpace(base, 9.0), "mc", seed=1, max_sim=100), base.refits)
+    with pytest.raises(ValueError, match="gave no weighted points"):
+        reweight_to_refits(replace(run(base), sample=None), base.refits)
+    with pytest.raises(ValueError, match="does not know its base"):
+        reweight_to_refits(replace(run(base), base=None), base.refits)
+
+
+def test_siblings_by_name():
+    base = fitted(others={"i80": normal(0.1)})
+    assert find_sibling(base, "i80") is base.others["i80"]
+    with pytest.raises(ValueError, match="got 'i81'"):
+        find_sibling(base, "i81")
+    with pytest.raises(ValueError, match=r"knows no others by name.*'i80'"):
+        find_sibling(samplers.StandardNormal(2), "i80")
+    result = run(base)
+    assert result.under("i80").p == result.reweight(normal(0.1)).p == result.under(normal(0.1)).p
+    assert result.under("i80").p == pytest.approx(stats.norm.sf(BETA - 0.1), rel=0.1)
+    with pytest.raises(ValueError, match="Estimate again with the new base"):
+        result.under(normal(12.0, 0.2))
