@@ -9,6 +9,8 @@ import pytest
 
 import samplers
 from samplers.limit_states import half_space
+from samplers.proposals import Gaussian
+from tests.samplers.fitted_bases import FittedWithEnsemble, HalfSpace, fitted, normal
 
 PROBLEM = half_space().problem
 
@@ -291,3 +293,49 @@ def test_a_target_that_is_met_in_fact():
     method = samplers.MonteCarlo(batch=50)
     p = np.array([samplers.estimate(problem, method, seed=seed, target_cov=target).p for seed in range(runs)])
     assert p.std(ddof=1) / half_space(2, 1.5).p <= 1.3 * target
+
+
+FAR_REFITS = [normal(7.0, 0.2 + 0.01 * i) for i in range(30)]
+
+
+def test_a_stopped_run_is_not_followed_by_a_further_one():
+    problem = HalfSpace(fitted(FAR_REFITS, FittedWithEnsemble), 2.0)
+    once = samplers.estimate(
+        problem, samplers.MonteCarlo(batch=1000), seed=1, max_sim=2000, stop=lambda at: at.n_sim >= 1000
+    )
+    assert once.status is samplers.Status.STOPPED
+    assert once.ensemble_run is None
+    twice = samplers.estimate(problem, "mc", seed=1, max_sim=2000)
+    assert twice.ensemble_run.n_sim == 2000
+
+
+def test_the_condition_that_stops_holds_for_the_further_run_too():
+    problem, seen = HalfSpace(fitted(FAR_REFITS, FittedWithEnsemble), 2.0), []
+
+    def stop(progress):
+        seen.append(progress.n_sim)
+        return len(seen) == 3
+
+    result = samplers.estimate(problem, samplers.MonteCarlo(batch=1000), seed=1, max_sim=2000, stop=stop)
+    assert result.status is samplers.Status.CONVERGED
+    assert (result.ensemble_run.status, result.ensemble_run.n_sim) == (samplers.Status.STOPPED, 1000)
+    assert any("Stopped by the callback" in text for text in result.base_uncertainty.warnings)
+
+
+def test_the_further_run_repeats_with_the_seed_that_the_result_states():
+    problem = HalfSpace(fitted(FAR_REFITS, FittedWithEnsemble), 2.0)
+    first = samplers.estimate(problem, "mc", max_sim=2000)
+    again = samplers.estimate(problem, "mc", seed=first.seed, max_sim=2000)
+    assert again.base_uncertainty == first.base_uncertainty
+    assert (again.ensemble_run.seed, again.ensemble_run.p) == (first.seed, first.ensemble_run.p)
+
+
+def test_a_method_that_cannot_search_under_a_mixture_leaves_the_further_run_to_two_stage():
+    class WithBlocks(FittedWithEnsemble):
+        blocks = (samplers.NormalBlock(Gaussian.standard(1)), samplers.NormalBlock(Gaussian.standard(1)))
+
+    problem = HalfSpace(fitted(FAR_REFITS, WithBlocks), 2.0)
+    result = samplers.estimate(problem, samplers.CrossEntropy(family="blocks"), seed=1, max_sim=4000)
+    assert result.method.name == "ce"
+    assert result.ensemble_run.method.name == "two-stage"
+    assert len(result.base_uncertainty.p_refits) == 30

@@ -15,6 +15,7 @@ from rare_envs.study.columns import MAX_SHOWN, format_value
 from rare_envs.study.crash_kinds import KIND_DESCRIPTIONS
 from rare_envs.study.report import Report
 from samplers.problem import FloatArray
+from samplers.result import indent_lines
 
 RANGE_DRAWS = 4000
 """Scenarios drawn from the base distribution for the range of ordinary values."""
@@ -79,8 +80,10 @@ def print_report(report: Report, out: Path | None = None) -> None:
         f"{question.env_id}, ego {question.ego}",
         style="bold",
     )
+    console.print(f"  {f'{100 * estimate.confidence:g} % interval':<15} {low:.3e} to {high:.3e}")
+    for line in indent_lines(estimate.base_uncertainty):
+        console.print(line)
     rows = (
-        (f"{100 * estimate.confidence:g} % interval", f"{low:.3e} to {high:.3e}"),
         ("c.o.v.", "not known" if math.isinf(estimate.cov) else f"{estimate.cov:.3f}"),
         ("simulations", f"{estimate.n_sim:,} in {report.seconds:.1f} s"),
         ("given that", estimate.proviso),

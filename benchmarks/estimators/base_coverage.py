@@ -1,0 +1,254 @@
+"""Does the interval for the base distribution hold the true p? Simulated worlds with known p, events drawn anew.
+
+    python -m benchmarks.estimators.base_coverage --repetitions 200
+
+In each repetition events are drawn from a world, a Gaussian is fitted to them and 30 times to resampled clusters of
+them, p of a half-space under the fit is estimated and `Estimate.base_uncertainty` compared with p of the world: from
+the events to the printed interval. Beside it stand the sampling interval alone, and percentiles of the refits. Two
+worlds are Gaussian; two have the tails of Student's t with 6 degrees of freedom, which the fitted family does not.
+"""
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+from scipy import stats
+
+import samplers
+from benchmarks import RESULTS
+from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
+from samplers.problem import FloatArray
+
+COVERAGE_RESULT = RESULTS / "base_coverage.json"
+DIM = 3
+"""Coordinates of an event."""
+REFITS = 30
+MAX_SIM = 2000
+"""Simulations of an estimate: a half-space needs no more for a c.o.v. of 2 %."""
+VARIANCE_FLOOR = 0.01
+"""Added to variances of standardised events, as in `training.scenario_fitting.mixture`."""
+BOX = 30.0
+"""Half the width of the box of the fitted Gaussians; it cuts off nothing."""
+DIRECTION = np.full(DIM, DIM**-0.5)
+"""Unit vector towards the failures."""
+
+
+@dataclass(frozen=True)
+class World:
+    """Events X in clusters, each N(0, I) or Student's t; a system that fails where X in `DIRECTION` exceeds a limit."""
+
+    events: int
+    clusters: int
+    correlation: float
+    """Of two events of one cluster."""
+    p: float = 7e-4
+    freedom: float = math.inf
+    """Degrees of freedom of Student's t; inf for normal events."""
+
+    @property
+    def limit(self) -> float:
+        """The value in `DIRECTION` that is exceeded with probability p."""
+        return float(stats.t.isf(self.p, self.freedom))
+
+    @property
+    def cluster_of(self) -> NDArray[np.int64]:
+        """The cluster of each event, shape (events,), of sizes that differ by 1 at most."""
+        return np.arange(self.events) % self.clusters
+
+    def draw(self, rng: np.random.Generator) -> FloatArray:
+        """Return events, shape (events, DIM); those of one cluster share a part of their mean."""
+        shared = rng.standard_normal((self.clusters, DIM))[self.cluster_of]
+        own = rng.standard_normal((self.events, DIM))
+        x = math.sqrt(self.correlation) * shared + math.sqrt(1 - self.correlation) * own
+        if math.isinf(self.freedom):
+            return x
+        return x / np.sqrt(rng.chisquare(self.freedom, (self.events, 1)) / self.freedom)
+
+
+WORLDS = (
+    World(38, 17, 0.2),
+    World(400, 40, 0.1),
+    World(38, 17, 0.2, freedom=6.0),
+    World(400, 40, 0.1, freedom=6.0),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class FittedGaussian:
+    """A Gaussian fitted to events, with the fits to resampled clusters of them; see `samplers.FittedBase`."""
+
+    distribution: TruncatedGaussianMixture
+    refits: tuple[TruncatedGaussianMixture, ...]
+    clusters: int
+    fitted_to: str
+    family: str = "1 component"
+
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw n independent points, shape (n, d)."""
+        return self.distribution.sample(n, rng)
+
+    def log_prob(self, x: FloatArray) -> FloatArray:
+        """Return the log density at x (n, d), shape (n,)."""
+        return self.distribution.log_prob(x)
+
+    def to_standard_normal(self, x: FloatArray) -> FloatArray:
+        """Map to standard normal space, (n, d) -> (n, d)."""
+        return self.distribution.to_standard_normal(x)
+
+    def from_standard_normal(self, u: FloatArray) -> FloatArray:
+        """Map from standard normal space, (n, d) -> (n, d)."""
+        return self.distribution.from_standard_normal(u)
+
+    def ensemble(self) -> TruncatedGaussianMixture:
+        """Return the mixture of the refits with equal weights."""
+        return join_components(self.refits)
+
+
+def join_components(parts: Sequence[TruncatedGaussianMixture]) -> TruncatedGaussianMixture:
+    """Return the mixture of mixtures with equal weights; they have one box."""
+    return TruncatedGaussianMixture(
+        np.concatenate([part.weights for part in parts]) / len(parts),
+        np.concatenate([part.means for part in parts]),
+        np.concatenate([part.covariances for part in parts]),
+        parts[0].low,
+        parts[0].high,
+    )
+
+
+def fit_gaussian(x: FloatArray) -> TruncatedGaussianMixture:
+    """Return the Gaussian with the moments of events (n, d), a floor under its variances."""
+    covariance = np.cov(x, rowvar=False, bias=True) + VARIANCE_FLOOR * np.diag(x.var(axis=0))
+    box = np.full(x.shape[1], BOX)
+    return TruncatedGaussianMixture(np.ones(1), x.mean(axis=0)[None], covariance[None], -box, box)
+
+
+def resample_clusters(cluster_of: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.int64]:
+    """Return rows of events (n,) -> (about n,): all events of as many clusters as there are, drawn with replacement."""
+    names = np.unique(cluster_of)
+    picked = rng.choice(names, size=len(names))
+    return np.concatenate([np.flatnonzero(cluster_of == name) for name in picked])
+
+
+def fit_base(x: FloatArray, world: World, rng: np.random.Generator) -> FittedGaussian:
+    """Return the fit to the events of a world, and its refits."""
+    return FittedGaussian(
+        distribution=fit_gaussian(x),
+        refits=tuple(fit_gaussian(x[resample_clusters(world.cluster_of, rng)]) for _ in range(REFITS)),
+        clusters=world.clusters,
+        fitted_to=f"{world.events} events of {world.clusters} clusters",
+    )
+
+
+def exact_p(base: TruncatedGaussianMixture, limit: float) -> float:
+    """Return P[X in DIRECTION > limit] of a Gaussian."""
+    mean, variance = DIRECTION @ base.means[0], DIRECTION @ base.covariances[0] @ DIRECTION
+    return float(stats.norm.sf(limit, mean, math.sqrt(variance)))
+
+
+@dataclass(frozen=True, eq=False)
+class Exceedance:
+    """The problem of a fitted base: f = limit - X in `DIRECTION`."""
+
+    base: FittedGaussian
+    limit: float
+    dim: int = DIM
+
+    def evaluate(self, x: FloatArray) -> FloatArray:
+        """Return f, (n, d) -> (n,)."""
+        return np.asarray(self.limit - x @ DIRECTION)
+
+
+@dataclass(frozen=True)
+class Repetition:
+    """One draw of events, fitted, estimated and compared with the truth."""
+
+    covered: bool
+    """False too where nothing is said, because nothing failed under the fit."""
+    below: bool
+    """Whether the whole interval lies below the true p."""
+    undetermined: bool
+    """Whether a bound, which covers what lies below it, or nothing stands in place of the interval."""
+    sampling_covered: bool
+    percentiles_covered: bool
+    """Whether the 2.5 and 97.5 % points of p of the refits hold the true p."""
+    log_width: float
+    """Logarithm of upper over lower end; NaN without interval."""
+    spread: float
+    further_run: bool
+    log_errors: tuple[float, ...]
+    """Error of log p of each refit; empty where nothing is said."""
+    expected_ratio: float
+    """p expected for the next event over the true p; NaN without interval."""
+
+
+def repeat(world: World, seed: int) -> Repetition:
+    """Draw events from a world, fit, estimate and compare."""
+    rng = np.random.default_rng([seed, world.events, world.clusters])
+    base = fit_base(world.draw(rng), world, rng)
+    result = samplers.estimate(Exceedance(base, world.limit), seed=seed, max_sim=MAX_SIM)
+    found = result.base_uncertainty
+    assert found is not None
+    low, high = found.interval or (0.0, found.bound or math.nan)
+    known = not found.reason
+    percentiles = np.quantile(found.p_refits, (0.025, 0.975)) if known else (math.nan, math.nan)
+    exact = np.array([exact_p(refit, world.limit) for refit in base.refits])
+    return Repetition(
+        covered=low <= world.p <= high,
+        below=high < world.p,
+        undetermined=found.interval is None,
+        sampling_covered=result.interval[0] <= world.p <= result.interval[1],
+        percentiles_covered=bool(percentiles[0] <= world.p <= percentiles[1]),
+        log_width=math.log(high / low) if found.interval else math.nan,
+        spread=found.spread,
+        further_run=result.ensemble_run is not None,
+        log_errors=tuple(np.log(found.p_refits) - np.log(exact)) if known else (),
+        expected_ratio=math.nan if found.expected is None else found.expected / world.p,
+    )
+
+
+def summarise(world: World, repetitions: Sequence[Repetition]) -> dict[str, Any]:
+    """Return shares and medians over the repetitions of one world, ready for JSON."""
+
+    def share(name: str) -> float:
+        return float(np.mean([getattr(each, name) for each in repetitions]))
+
+    errors = np.concatenate([each.log_errors for each in repetitions])
+    return {
+        **{key: value if value != math.inf else None for key, value in asdict(world).items()},
+        "repetitions": len(repetitions),
+        "covered": share("covered"),
+        "below": share("below"),
+        "undetermined": share("undetermined"),
+        "sampling_covered": share("sampling_covered"),
+        "percentiles_covered": share("percentiles_covered"),
+        "median_width": math.exp(np.nanmedian([each.log_width for each in repetitions])),
+        "median_spread": float(np.nanmedian([each.spread for each in repetitions])),
+        "further_runs": share("further_run"),
+        "rms_log_error": float(np.sqrt((errors**2).mean())),
+        "expected_below_a_third": float(np.mean([each.expected_ratio < 1 / 3 for each in repetitions])),
+    }
+
+
+def main(
+    repetitions: Annotated[int, typer.Option(help="Draws of events for each world.")] = 200,
+    first_seed: Annotated[int, typer.Option(help="Of the first draw.")] = 0,
+    out: Annotated[Path, typer.Option(help="Where the result goes.")] = COVERAGE_RESULT,
+) -> None:
+    """Measure the coverage in every world and write the result."""
+    rows = []
+    for world in WORLDS:
+        seeds = range(first_seed, first_seed + repetitions)
+        rows.append(summarise(world, [repeat(world, seed) for seed in seeds]))
+        print(json.dumps(rows[-1]), flush=True)
+    command = f"python -m benchmarks.estimators.base_coverage --repetitions {repetitions} --first-seed {first_seed}"
+    out.write_text(json.dumps({"command": command, "worlds": rows}, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    typer.run(main)
