@@ -6,9 +6,15 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import pytest
 from typer.testing import Result
+
+from rare_envs import study
+from rare_envs.study.cli.printing import print_report
 
 Cli = Callable[..., Result]
 
@@ -45,3 +51,33 @@ def test_what_to_check_is_said_where_something_may_be_missed(cli: Cli, here: Pat
     words = ("estimate", FOLLOWING, "--method", "adss", "--max-sim", 2000, "--base")
     assert "check it" not in cli(*words, risky, "--ego", "egos_here:coasting").stdout  # base draws saw it often
     assert "check it: --method mc --max-sim 300000" in cli(*words, safe, "--ego", "careful:make").stdout
+
+
+class Fitted:
+    """A base distribution that was fitted, with refits that are all like it."""
+
+    clusters, fitted_to, family = 17, "38 + 15 events of 17 scenes", "1 component, log gaps"
+
+    def __init__(self, distribution: Any) -> None:
+        self.distribution, self.refits = distribution, (distribution,) * 30
+        self.sample, self.log_prob = distribution.sample, distribution.log_prob
+        self.to_standard_normal = distribution.to_standard_normal
+        self.from_standard_normal = distribution.from_standard_normal
+
+
+def test_the_base_distribution_stands_under_the_sampling_interval(
+    risky: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    report = study.run(study.prepare(study.Question(env_id=FOLLOWING, method="mc", max_sim=2000, base=risky)))
+    print_report(report)
+    plain = capsys.readouterr().out.splitlines()
+    assert not any("base distribution" in line for line in plain)
+    estimate = replace(report.estimate, base=Fitted(report.estimate.base))
+    print_report(replace(report, estimate=estimate))
+    lines = capsys.readouterr().out.splitlines()
+    found = estimate.base_uncertainty
+    assert found is not None
+    assert lines[:2] + lines[4:] == plain
+    assert lines[2:4] == [f"  {line}" for line in str(found).splitlines()]
+    assert lines[2].startswith("  base distribution 95 %  ")
+    assert json.loads(json.dumps(replace(report, estimate=estimate).to_dict()))["base_uncertainty"]["clusters"] == 17
