@@ -183,8 +183,6 @@ class Repetition:
     further_run: bool
     log_errors: tuple[float, ...]
     """Error of log p of each refit; empty where nothing is said."""
-    expected_ratio: float
-    """p expected for the next event over the true p; NaN without interval."""
 
 
 def repeat(world: World, seed: int) -> Repetition:
@@ -208,7 +206,6 @@ def repeat(world: World, seed: int) -> Repetition:
         spread=found.spread,
         further_run=result.ensemble_run is not None,
         log_errors=tuple(np.log(found.p_refits) - np.log(exact)) if known else (),
-        expected_ratio=math.nan if found.expected is None else found.expected / world.p,
     )
 
 
@@ -231,7 +228,6 @@ def summarise(world: World, repetitions: Sequence[Repetition]) -> dict[str, Any]
         "median_spread": float(np.nanmedian([each.spread for each in repetitions])),
         "further_runs": share("further_run"),
         "rms_log_error": float(np.sqrt((errors**2).mean())),
-        "expected_below_a_third": float(np.mean([each.expected_ratio < 1 / 3 for each in repetitions])),
     }
 
 

@@ -5,7 +5,7 @@ With p_b the probability under refit b, s the standard deviation of log p_b and 
     p exp(-t S) to p exp(t S),    S^2 = s^2 + cov^2 + 0.2^2.
 
 Percentiles of the p_b are not used: refits repeat the bias of the fit, and 30 of them do not reach the outer 2.5 %, so
-that percentiles cover 73 to 90 % and miss on the unsafe side. This interval covers 93 to 97 % where the family of
+that percentiles cover 73 to 90 % and miss on the unsafe side. This interval covers 92 to 97 % where the family of
 distributions is the true one (`benchmarks/estimators/base_coverage.py`). Another family is not covered by it.
 """
 
