@@ -133,10 +133,16 @@ class _Simulation:
 def _run_under_ensemble(
     simulation: _Simulation, problem: Problem, method: Stepping, arguments: RunArguments
 ) -> Estimate | None:
-    """Return the run under the mixture of the refits; by `TwoStage` where the method cannot search under a mixture."""
+    """Return the run under the mixture of the refits, or None where the base cannot make one of them.
+
+    `TwoStage` makes it where the method cannot search under a mixture.
+    """
     if not isinstance(problem.base, HasEnsemble):
         return None
-    inputs = InputsOnly(int(problem.dim), problem.base.ensemble())
+    try:
+        inputs = InputsOnly(int(problem.dim), problem.base.ensemble())
+    except ValueError:  # refits that are no mixtures; the first run stands, with a warning of `BaseUncertainty`
+        return None
     try:
         Run(inputs, method, arguments)
     except ValueError:  # blocks of a product, which a mixture has none of

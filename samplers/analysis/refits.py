@@ -64,7 +64,11 @@ class HasEnsemble(Protocol):
     """A fitted base distribution that knows the mixture of its refits."""
 
     def ensemble(self) -> Distribution:
-        """Return the mixture of the refits with equal weights: the predictive distribution of the next event."""
+        """Return the mixture of the refits with equal weights: the predictive distribution of the next event.
+
+        Raises:
+            ValueError: If they are of a kind that it cannot mix.
+        """
 
 
 class EnsembleEstimate(WeightedEstimate, Protocol):

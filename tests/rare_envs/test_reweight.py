@@ -5,8 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
+import agents
 import rare_envs
 import samplers
+from rare_envs.distributions.fitted import EventCounts, FittedDistribution
 
 
 def problem(base):
@@ -33,3 +35,59 @@ def test_the_two_shipped_bases_are_too_far_apart(old, new):
     result = samplers.estimate(problem(old), "ce", seed=1)
     with pytest.raises(ValueError, match="Estimate again with the new base"):
         result.reweight(problem(new).base)
+
+
+def fitted_us101(number=30):
+    """Return the base distribution of car-following with refits a few per cent wider and narrower."""
+    us101 = problem("us101").base
+    return FittedDistribution(
+        distribution=us101,
+        refits=tuple(wider(us101, factor) for factor in np.linspace(0.8, 1.2, number)),
+        events=EventCounts(used=(470,), clusters=28),
+        family="3 components, plain gaps",
+        siblings=lambda name: problem(name).base,
+    )
+
+
+def test_p_under_refits_against_simulating_them():
+    base = fitted_us101(4)
+    found = samplers.estimate(problem(base), seed=1, max_sim=3000).base_uncertainty
+    assert found.fitted_to == "470 events of 28 scenes"
+    for refit, p, ess in zip(base.refits, found.p_refits, found.ess_refits, strict=True):
+        direct = samplers.estimate(problem(refit), seed=2, max_sim=3000)
+        assert abs(np.log(p / direct.p)) < 4 * np.hypot(direct.cov, ess**-0.5)
+
+
+def test_a_safer_ego_is_safer_under_every_refit_and_the_ratio_is_known_better_than_p():
+    base = fitted_us101()
+    careful, usual = (
+        rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", ego=rare_envs.IDM(max_deceleration=limit), base=base)
+        for limit in (9.0, 7.0)
+    )
+    found = samplers.compare(usual, careful, seed=1, max_sim=8000)
+    assert min(found.base_uncertainty.ratio_refits) > 1
+    widths = [np.log(each[1] / each[0]) for each in (found.base_uncertainty.interval, _p_interval(found))]
+    assert widths[0] < widths[1]
+
+
+def _p_interval(found):
+    return found.either.base_uncertainty.interval
+
+
+def test_noise_beside_a_fitted_base_changes_nothing_of_the_refits():
+    env_id, base = "rare_envs/CarFollowing-v0", fitted_us101(4)
+    noisy = rare_envs.DrivingProblem(env_id, ego=agents.load_ego("noisy:idm"), base=base, horizon=2.0)
+    result = samplers.estimate(noisy, "mc", gamma=3.0, seed=1, max_sim=1000)
+    x = result.sample.x
+    found = result.base_uncertainty
+    assert x.shape[1] == noisy.dim > 3
+    own = base.distribution.log_prob(x[:, :3])
+    by_hand = [np.exp(refit.log_prob(x[:, :3]) - own).sum() / 1000 for refit in base.refits]
+    assert found.p_refits == pytest.approx(by_hand)
+
+
+def test_another_base_by_its_name():
+    result = samplers.estimate(problem(fitted_us101()), "ce", seed=1)
+    assert result.under("us101").ratio == pytest.approx(1.0)
+    with pytest.raises(ValueError, match="Estimate again with the new base"):
+        result.under("highway")

@@ -339,3 +339,14 @@ def test_a_method_that_cannot_search_under_a_mixture_leaves_the_further_run_to_t
     assert result.method.name == "ce"
     assert result.ensemble_run.method.name == "two-stage"
     assert len(result.base_uncertainty.p_refits) == 30
+
+
+def test_refits_that_cannot_be_mixed_leave_the_first_run_with_a_warning():
+    class Unmixed(FittedWithEnsemble):
+        def ensemble(self):
+            raise ValueError("An ensemble needs refits that are Gaussian mixtures.")
+
+    result = samplers.estimate(HalfSpace(fitted(FAR_REFITS, Unmixed), 2.0), "mc", seed=1, max_sim=2000)
+    assert result.ensemble_run is None
+    assert result.p > 0
+    assert "30 of 30 refits rest on under 10" in result.base_uncertainty.warnings[0]
