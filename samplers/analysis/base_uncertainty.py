@@ -6,7 +6,7 @@ With p_b the probability under refit b, s the standard deviation of log p_b and 
 
 Percentiles of the p_b are not used: refits repeat the bias of the fit, and 30 of them do not reach the outer 2.5 %, so
 that percentiles cover 73 to 90 % and miss on the unsafe side. This interval covers 92 to 97 % where the family of
-distributions is the true one (`benchmarks/estimators/base_coverage.py`). Another family is not covered by it.
+distributions is the true one (`benchmarks/uncertainty/base_coverage.py`). Another family is not covered by it.
 """
 
 from __future__ import annotations

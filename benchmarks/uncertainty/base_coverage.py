@@ -1,6 +1,6 @@
 """Does the interval for the base distribution hold the true p? Simulated worlds with known p, events drawn anew.
 
-    python -m benchmarks.estimators.base_coverage --repetitions 200
+    python -m benchmarks.uncertainty.base_coverage --repetitions 200
 
 In each repetition events are drawn from a world, a Gaussian is fitted to them and 30 times to resampled clusters of
 them, p of a half-space under the fit is estimated and `Estimate.base_uncertainty` compared with p of the world: from
@@ -242,7 +242,7 @@ def main(
         seeds = range(first_seed, first_seed + repetitions)
         rows.append(summarise(world, [repeat(world, seed) for seed in seeds]))
         print(json.dumps(rows[-1]), flush=True)
-    command = f"python -m benchmarks.estimators.base_coverage --repetitions {repetitions} --first-seed {first_seed}"
+    command = f"python -m benchmarks.uncertainty.base_coverage --repetitions {repetitions} --first-seed {first_seed}"
     out.write_text(json.dumps({"command": command, "worlds": rows}, indent=2) + "\n")
 
 

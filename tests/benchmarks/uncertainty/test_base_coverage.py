@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from benchmarks.estimators.base_coverage import (
+from benchmarks.uncertainty.base_coverage import (
     DIRECTION,
     WORLDS,
     World,

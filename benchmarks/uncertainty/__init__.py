@@ -1,0 +1,1 @@
+"""Benchmarks of intervals that account for the events behind a base distribution."""
