@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from rare_envs.plugins import make_lazy_getattr
 
 if TYPE_CHECKING:
+    from rare_envs.study.analysis.severity import Severity, severity_curve
     from rare_envs.study.compare import EgoComparison, compare_egos
     from rare_envs.study.errors import BadInput
     from rare_envs.study.evaluate import resume, run, run_into
@@ -23,6 +24,7 @@ __all__ = [
     "EgoComparison",
     "Question",
     "Report",
+    "Severity",
     "Study",
     "compare_egos",
     "drive_again",
@@ -31,6 +33,7 @@ __all__ = [
     "resume",
     "run",
     "run_into",
+    "severity_curve",
     "write_film",
     "write_run",
 ]
@@ -41,6 +44,7 @@ _LAZY = {
     "EgoComparison": "rare_envs.study.compare",
     "Question": "rare_envs.study.question",
     "Report": "rare_envs.study.report",
+    "Severity": "rare_envs.study.analysis.severity",
     "Study": "rare_envs.study.question",
     "compare_egos": "rare_envs.study.compare",
     "drive_again": "rare_envs.study.replay",
@@ -49,6 +53,7 @@ _LAZY = {
     "resume": "rare_envs.study.evaluate",
     "run": "rare_envs.study.evaluate",
     "run_into": "rare_envs.study.evaluate",
+    "severity_curve": "rare_envs.study.analysis.severity",
     "write_film": "rare_envs.study.video",
     "write_run": "rare_envs.study.run_directory",
 }

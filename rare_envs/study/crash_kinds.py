@@ -1,4 +1,4 @@
-"""Kinds of crash among the failures of a run, found by driving them once more."""
+"""Kinds of crash among the failures of a run and their severity, found by driving them once more."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ import numpy as np
 import samplers
 from rare_envs import DrivingProblem
 from rare_envs.egos.errors import EgoGone
-from rare_envs.traffic.crash import describe_crash
+from rare_envs.study.analysis.failure_replay import MAX_REPLAYED, replay_failures
+from rare_envs.study.analysis.severity import Severity, compute_severity
+from rare_envs.traffic.crash import CRASH_KINDS, describe_crash
 
-MAX_CLASSIFIED = 10_000
-"""Largest number of failing points that are driven again, evenly spaced among all."""
 KIND_DESCRIPTIONS = MappingProxyType(
     {
         "rear_end": "the ego runs into a vehicle ahead",
@@ -40,10 +40,12 @@ class CrashKinds:
     """The crash of each failure of the list, see `rare_envs.traffic.crash.describe_crash`; empty if it is not known."""
     unknown: str = ""
     """Reason why it is not known."""
+    severity: Severity | None = None
+    """How severe the collisions are; None if there are none, or it is not known."""
 
 
 def classify_failures(problem: DrivingProblem, estimate: samplers.Estimate) -> CrashKinds:
-    """Drive failures of a run once more: those of its list, and for the shares `MAX_CLASSIFIED` of all."""
+    """Drive failures of a run once more: those of its list, and for shares and severity `MAX_REPLAYED` of all."""
     known = np.isfinite(estimate.failures.f)
     if not known.any():
         return CrashKinds()
@@ -51,9 +53,21 @@ def classify_failures(problem: DrivingProblem, estimate: samplers.Estimate) -> C
         return CrashKinds(unknown="the ego's answers vary from run to run, so that its failures cannot be seen again")
     try:
         crashes = problem.crashes(estimate.failures.x[known])
-        shares = {} if estimate.sample is None else estimate.shares(problem.crash_kinds, MAX_CLASSIFIED)
+        shares, severity = _weigh_crashes(problem, estimate)
     except (Exception, SystemExit, EgoGone) as error:  # the ego is the user's, and need not do again what it did before
         return CrashKinds(unknown=f"{type(error).__name__}: {error}")
     row = np.cumsum(known) - 1
     listed = (describe_crash(crashes, int(at)) if one else None for at, one in zip(row, known, strict=True))
-    return CrashKinds(shares, tuple(listed))
+    return CrashKinds(shares, tuple(listed), severity=severity)
+
+
+def _weigh_crashes(
+    problem: DrivingProblem, estimate: samplers.Estimate
+) -> tuple[dict[str, samplers.Share], Severity | None]:
+    """Return p by kind of crash and the severity, from failing points that are driven again once for both."""
+    if estimate.sample is None:
+        return {}, None
+    replayed = replay_failures(problem, estimate)
+    words = [CRASH_KINDS[kind] for kind in replayed.crash.kind]
+    shares = estimate.shares(lambda _: words, MAX_REPLAYED)  # of the same points: `choose_failures` has picked both
+    return shares, compute_severity(problem, estimate, replayed)

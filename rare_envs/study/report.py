@@ -98,6 +98,7 @@ class Report:
             "seconds": self.seconds,
             "n_failures": failures.total,
             "kinds": {kind: share.to_dict() for kind, share in self.kinds.shares.items()},
+            "severity": None if self.kinds.severity is None else self.kinds.severity.to_dict(),
             "failures": ranked,
             "n_faults": len(self.faults),
             "n_retried": self.n_retried,

@@ -1,9 +1,28 @@
-"""Analyses of an estimate without new simulations: other thresholds, other base distributions, kinds of failure."""
+"""Analyses of an estimate without new simulations: thresholds, base distributions, kinds of failure, sensitivities."""
 
 from samplers.analysis.base_uncertainty import BaseUncertainty
 from samplers.analysis.curve import Curve
+from samplers.analysis.exceedance import Exceedance, compute_exceedance
 from samplers.analysis.failure_modes import Share
+from samplers.analysis.failure_weights import (
+    FailureExpectation,
+    WeightedFailures,
+    expect_over_failures,
+    weigh_failures,
+)
 from samplers.analysis.ratio_uncertainty import RatioUncertainty
 from samplers.analysis.reweighting import Reweighted
 
-__all__ = ["BaseUncertainty", "Curve", "RatioUncertainty", "Reweighted", "Share"]
+__all__ = [
+    "BaseUncertainty",
+    "Curve",
+    "Exceedance",
+    "FailureExpectation",
+    "RatioUncertainty",
+    "Reweighted",
+    "Share",
+    "WeightedFailures",
+    "compute_exceedance",
+    "expect_over_failures",
+    "weigh_failures",
+]

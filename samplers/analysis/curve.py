@@ -17,7 +17,7 @@ from samplers.analysis.base import MIN_UNITS, WeightedEstimate, cov_inflation, n
 from samplers.problem import FloatArray
 from samplers.sample import Sample
 from samplers.serialization import to_json_value
-from samplers.statistics.cluster_sums import interval_of_count, interval_of_sum, unit_sums
+from samplers.statistics.cluster_sums import UnitSums, interval_of_count, interval_of_sum, unit_sums
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -124,14 +124,7 @@ def compute_curve(estimate: WeightedEstimate, gammas: ArrayLike) -> Curve:
     use = np.unique(place[:-1])
     p = anchor_at_estimate(estimate, sums.p, at_gamma)
     cov = np.where(sums.is_count, 1.0, cov_inflation(estimate, float(sums.cov[at_gamma]))) * sums.cov
-    rng = np.random.default_rng(np.random.SeedSequence(estimate.seed, spawn_key=(BAND_STREAM,)))
-    level = simultaneous_level(sums.correlation[np.ix_(use, use)], estimate.confidence, rng)
-    low, high = np.zeros(len(grid)), np.ones(len(grid))
-    for i in use:
-        if sums.is_count[i]:
-            low[i], high[i] = interval_of_count(float(sums.p[i]), sums.n_units, level)
-        else:
-            low[i], high[i] = interval_of_sum(float(p[i]), float(cov[i]), float(sums.ess[i]), sums.independent, level)
+    low, high = simultaneous_intervals(estimate, sums, use, p, cov)
     low[use] = np.maximum.accumulate(low[use] * (1 - no_outcome_weight(estimate, sample) / sums.p[use]))
     high[use] = np.minimum.accumulate(high[use][::-1])[::-1]
     here = place[:-1]
@@ -144,6 +137,32 @@ def compute_curve(estimate: WeightedEstimate, gammas: ArrayLike) -> Curve:
         ess=sums.ess[here],
         confidence=estimate.confidence,
     )
+
+
+def simultaneous_intervals(
+    estimate: WeightedEstimate, sums: UnitSums, use: NDArray[np.intp], p: FloatArray, cov: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return pointwise intervals of p at one level, at which they should hold together; 0 to 1 where they are not used.
+
+    Args:
+        estimate: The run, for its confidence and its seed.
+        sums: Over units, at G thresholds.
+        use: Indices of the thresholds that count.
+        p: Probabilities, shape (G,).
+        cov: Their coefficients of variation, shape (G,).
+
+    Returns:
+        Lower and upper ends, shape (G,) each.
+    """
+    rng = np.random.default_rng(np.random.SeedSequence(estimate.seed, spawn_key=(BAND_STREAM,)))
+    level = simultaneous_level(sums.correlation[np.ix_(use, use)], estimate.confidence, rng)
+    low, high = np.zeros(len(p)), np.ones(len(p))
+    for i in use:
+        if sums.is_count[i]:
+            low[i], high[i] = interval_of_count(float(sums.p[i]), sums.n_units, level)
+        else:
+            low[i], high[i] = interval_of_sum(float(p[i]), float(cov[i]), float(sums.ess[i]), sums.independent, level)
+    return low, high
 
 
 def as_thresholds(gammas: ArrayLike) -> FloatArray:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from samplers.analysis.base import WeightedEstimate, cov_inflation, require_sample
+from samplers.analysis.failure_weights import choose_failures
 from samplers.problem import FloatArray
 from samplers.sample import Sample
 from samplers.serialization import to_json_value
@@ -67,9 +68,7 @@ def split_by_kind(
     """
     sample = require_sample(estimate)
     failing = np.flatnonzero(sample.f <= estimate.gamma)
-    rows = np.arange(len(failing))
-    if most is not None and len(rows) > most:
-        rows = rows[np.linspace(0, len(rows) - 1, most).round().astype(np.int64)]
+    rows = choose_failures(sample, estimate.gamma, most)
     labels = label_failures(sample.f[failing[rows]], sample.x[rows], label)
     chosen = failing[rows]
     everything = sum_points(sample, chosen, estimate.gamma)

@@ -113,12 +113,14 @@ def print_report(report: Report, out: Path | None = None) -> None:
 
 
 def _print_kinds(console: Console, report: Report) -> None:
-    """Print p by kind of crash, and how bad the listed ones are."""
+    """Print p by kind of crash, and how severe the collisions are."""
     for number, (kind, share) in enumerate(report.kinds.shares.items()):
         low, high = share.interval
         share_of_p = f"{share.p:.1e} [{low:.1e}, {high:.1e}], {100 * share.of_failures:.3g} %"
         text = f"{share_of_p}: {KIND_DESCRIPTIONS.get(kind, kind)}"
         console.print(f"  {'of which' if number == 0 else '':<15} {text}")
+    for number, line in enumerate(str(report.kinds.severity or "").splitlines()):
+        console.print(f"  {'severity' if number == 0 else '':<15} {line}")
 
 
 def _summarise_crash(crash: dict[str, Any]) -> str:

@@ -1,0 +1,1 @@
+"""Analyses of a finished evaluation: how severe its collisions are, and what p is sensitive to."""

@@ -1,0 +1,154 @@
+"""Severity of collisions: P[collision with delta-v > v] over v, and the expected number of serious injuries."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+import samplers
+from rare_envs import DrivingProblem
+from rare_envs.study.analysis.failure_replay import MAX_REPLAYED, ReplayedFailures, replay_failures
+from rare_envs.traffic.crash import NONE, OTHERS
+from samplers.analysis import Exceedance, FailureExpectation, compute_exceedance, expect_over_failures
+from samplers.problem import FloatArray
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+SHOWN_DELTA_V = (1.0, 2.0, 5.0, 10.0, 15.0)
+"""Delta-v [m/s] at which the curve is printed."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Severity:
+    """How severe the collisions among the failures of a run are.
+
+    Of the two vehicles of a collision the larger delta-v counts. Injuries are those of one occupant in each of the two,
+    MAIS 3 or more, see `rare_envs.traffic.crash.injury_risk`.
+    """
+
+    curve: Exceedance
+    """P[failure in a collision with delta-v > v] over v [m/s], with a simultaneous band. Where all collisions are
+    failures, as by default, it is P[collision with delta-v > v]."""
+    injuries: FailureExpectation
+    """Expected serious injuries per scenario, both vehicles together."""
+    n_replayed: int
+    """Failing scenarios that were simulated again for it; not in the run's n_sim."""
+    n_failures: int
+    """Failing scenarios that the run has."""
+    unknown: float
+    """Share of p from scenarios on which the ego failed: they have no delta-v and are left out."""
+
+    def __str__(self) -> str:
+        """Return a few lines for people."""
+        curve = self.curve
+        shown = [
+            f"> {v:g} m/s {p:.1e} [{low:.1e}, {high:.1e}]"
+            for v, p, low, high in zip(curve.thresholds, curve.p, curve.low, curve.high, strict=True)
+            if v in SHOWN_DELTA_V and low > 0
+        ]
+        shown = shown or ["too few collisions for a curve"]
+        low, high = self.injuries.interval
+        lines = [
+            f"collisions with delta-v {', '.join(shown)}",
+            f"serious injuries (MAIS 3+) {self.injuries.value:.1e} per scenario [{low:.1e}, {high:.1e}], "
+            f"{self.injuries.per_failure:.2g} per failure",
+            f"from {self.n_replayed:,} of {self.n_failures:,} failing scenarios, simulated again",
+        ]
+        if self.unknown:
+            lines[-1] += f"; {100 * self.unknown:.2g} % of p have no outcome and are left out"
+        return "\n".join(lines)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain lists and numbers for JSON."""
+        curve = self.curve.to_dict()
+        return {
+            "curve": {"delta_v": curve.pop("thresholds"), **curve},
+            "injuries": self.injuries.to_dict(),
+            "n_replayed": self.n_replayed,
+            "n_failures": self.n_failures,
+            "unknown": self.unknown,
+        }
+
+    def plot(self, ax: Axes | None = None) -> Axes:
+        """Draw P[collision with delta-v > v] and its band over v; needs matplotlib.
+
+        Args:
+            ax: Where to draw; None takes the current axes of pyplot.
+        """
+        ax = self.curve.plot(ax)
+        ax.set_xlabel("delta-v [m/s]")
+        ax.set_ylabel("P[collision with a larger delta-v]")
+        return ax
+
+
+def severity_curve(
+    problem: DrivingProblem,
+    estimate: samplers.Estimate,
+    thresholds: ArrayLike | None = None,
+    most: int | None = MAX_REPLAYED,
+) -> Severity:
+    """Return the severity of the collisions behind an estimate; its failing points are simulated once more.
+
+    Args:
+        problem: The problem that was estimated.
+        estimate: Its estimate.
+        thresholds: Delta-v [m/s] at which the curve is wanted; every 1 m/s up to the largest by default.
+        most: Drive at most so many failing points again, evenly spaced among all; None for all.
+
+    Raises:
+        ValueError: If no failure is a collision, the method gave no weighted points, nothing failed, or the ego's
+            answers vary from run to run.
+
+    Example:
+        >>> import rare_envs, samplers
+        >>> problem = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", base="us101")
+        >>> severity = severity_curve(problem, samplers.estimate(problem, seed=0, max_sim=2000), thresholds=[0.0, 2.5])
+        >>> bool(severity.curve.p[0] > severity.curve.p[1]), 0.0005 < severity.injuries.per_failure < 0.1
+        (True, True)
+    """
+    severity = compute_severity(problem, estimate, replay_failures(problem, estimate, most), thresholds)
+    if severity is None:
+        raise ValueError(f"No failure (f <= {estimate.gamma:g}) that was driven again is a collision.")
+    return severity
+
+
+def compute_severity(
+    problem: DrivingProblem,
+    estimate: samplers.Estimate,
+    replayed: ReplayedFailures,
+    thresholds: ArrayLike | None = None,
+) -> Severity | None:
+    """Return the severity of failures that were driven again; None where none of them is a collision.
+
+    Arguments as of `severity_curve`.
+    """
+    failures = replayed.failures
+    delta_v, injuries = _severities(replayed, problem.world.measurement.collisions == "any")
+    collided = np.isfinite(delta_v)
+    if not collided.any():
+        return None
+    if thresholds is None:
+        thresholds = np.arange(math.floor(delta_v[collided].max()) + 1.0)
+    return Severity(
+        curve=compute_exceedance(estimate, failures, delta_v, thresholds),
+        injuries=expect_over_failures(failures, injuries, estimate.confidence),
+        n_replayed=int(failures.has_outcome.sum()),
+        n_failures=failures.total,
+        unknown=float(failures.weights[~failures.has_outcome].sum() / failures.weights.sum()),
+    )
+
+
+def _severities(replayed: ReplayedFailures, any_vehicle: bool) -> tuple[FloatArray, FloatArray]:
+    """Return delta-v [m/s] (-inf without a collision) and expected injuries of each failing point, shape (k,) each."""
+    crash, known = replayed.crash, replayed.failures.has_outcome
+    kind = crash.kind.numpy()
+    counts = (kind != NONE) & (any_vehicle | (kind != OTHERS))
+    delta_v, injuries = np.full(len(known), -np.inf), np.zeros(len(known))
+    delta_v[known] = np.where(counts, crash.delta_v.double().amax(dim=1).numpy(), -np.inf)
+    injuries[known] = np.where(counts, crash.injury_risk.double().sum(dim=1).numpy(), 0.0)
+    return delta_v, injuries

@@ -1,0 +1,158 @@
+"""Severity of collisions against crash speeds by pencil and paper, Monte Carlo and the parts of p."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+import rare_envs
+import samplers
+from rare_envs.control.idm import IDM
+from rare_envs.study import severity_curve
+from rare_envs.study.analysis.failure_replay import replay_failures
+from rare_envs.study.analysis.severity import Severity, compute_severity
+from rare_envs.study.cli.printing import print_report
+from rare_envs.study.crash_kinds import classify_failures
+from rare_envs.study.question import Question, Study
+from rare_envs.study.report import Report
+from rare_envs.traffic.crash import injury_risk
+
+FOLLOWING, CUT_IN = "rare_envs/CarFollowing-v0", "rare_envs/CutIn-v0"
+
+
+@pytest.fixture(scope="module")
+def problem() -> rare_envs.DrivingProblem:
+    return rare_envs.DrivingProblem(CUT_IN, ego=IDM(max_deceleration=1.0))
+
+
+@pytest.fixture(scope="module")
+def plain(problem: rare_envs.DrivingProblem) -> samplers.Estimate:
+    return samplers.estimate(problem, "mc", max_sim=4000, seed=0)
+
+
+def estimate_of(x: np.ndarray, gamma: float = 0.0) -> samplers.Estimate:
+    """Return an estimate of plain draws of which these x are all that failed, 1 in 10."""
+    f = np.concatenate([np.full(len(x), -1.0), np.full(9 * len(x), 5.0)])
+    problem = samplers.FunctionProblem(lambda u: np.ones(len(u)), 3)
+    run = samplers.estimate(problem, "mc", max_sim=100, seed=0)
+    values = {**vars(run), "p": 0.1, "cov": (9 / len(f)) ** 0.5, "sample": samplers.Sample.of_equal_draws(f, x)}
+    return samplers.Estimate(**values)
+
+
+def test_a_coasting_ego_hits_at_half_the_closing_speed() -> None:
+    """An ego that only coasts runs into its lead at the closing speed that it began with; delta-v is half of that."""
+    problem = rare_envs.DrivingProblem(FOLLOWING, ego=IDM(max_deceleration=1e-3, max_acceleration=1e-3))
+    closing = np.array([4.0] * 10 + [12.0] * 10)
+    x = np.stack([20.0 + 0 * closing, 20.0 - closing, 10.0 + 0 * closing], axis=1)
+    severity = severity_curve(problem, estimate_of(x), thresholds=[0.0, 1.9, 2.1, 5.9, 6.1])
+    assert severity.curve.p.tolist() == pytest.approx([0.1, 0.1, 0.05, 0.05, 0.0])
+    one, six = (
+        sum(injury_risk(torch.tensor(v, dtype=torch.float64), mode).item() for mode in ("frontal", "rear"))
+        for v in (2.0, 6.0)
+    )
+    assert severity.injuries.per_failure == pytest.approx((one + six) / 2, rel=0.01)
+    assert severity.injuries.value == pytest.approx(0.1 * (one + six) / 2, rel=0.01)
+
+
+def test_of_plain_draws_the_curve_counts_crashes(problem: rare_envs.DrivingProblem, plain: samplers.Estimate) -> None:
+    severity = severity_curve(problem, plain, thresholds=[0.0, 1.0, 2.0])
+    crash = problem.crashes(plain.sample.x)  # type: ignore[union-attr]
+    worst = crash.delta_v.amax(dim=1)
+    counts = [int((worst > v).sum()) for v in (0.0, 1.0, 2.0)]
+    assert counts[0] > counts[2] > 0
+    assert severity.curve.p.tolist() == pytest.approx([count / 4000 for count in counts])
+    assert severity.injuries.value == pytest.approx(float(crash.injury_risk.sum()) / 4000)
+    assert severity.n_replayed == severity.n_failures == len(crash.kind)
+
+
+def test_two_stage_and_monte_carlo_agree(problem: rare_envs.DrivingProblem, plain: samplers.Estimate) -> None:
+    thresholds = [0.0, 1.0, 2.0]
+    one = severity_curve(problem, plain, thresholds)
+    other = severity_curve(problem, samplers.estimate(problem, seed=1, max_sim=3000), thresholds)
+    assert (one.curve.low <= other.curve.high).all()
+    assert (other.curve.low <= one.curve.high).all()
+    assert one.injuries.interval[0] <= other.injuries.interval[1]
+    assert other.injuries.interval[0] <= one.injuries.interval[1]
+
+
+def test_collisions_of_others_count_only_if_asked_for(problem: rare_envs.DrivingProblem) -> None:
+    estimate = samplers.estimate(problem, "mc", max_sim=2000, gamma=0.5, seed=0)
+    replayed = replay_failures(problem, estimate)
+    kind = replayed.crash.kind.clone()
+    first = int((kind != 0).nonzero()[0])
+    kind[first] = 5  # as if it had been one between others
+    changed = replayed._replace(crash=replayed.crash._replace(kind=kind))
+    every = rare_envs.DrivingProblem(CUT_IN, ego=IDM(max_deceleration=1.0), collisions="any")
+    own, any_vehicle = (compute_severity(each, estimate, changed, [-1.0]) for each in (problem, every))
+    assert own is not None and any_vehicle is not None
+    assert any_vehicle.curve.p[0] - own.curve.p[0] == pytest.approx(1 / 2000)
+
+
+def test_near_misses_are_no_collisions(problem: rare_envs.DrivingProblem) -> None:
+    estimate = samplers.estimate(problem, "mc", max_sim=2000, gamma=1.5, seed=0)
+    severity = severity_curve(problem, estimate, thresholds=[-1.0])
+    collisions = sum(kind not in ("none", "others") for kind in problem.crash_kinds(estimate.sample.x))  # type: ignore[union-attr]
+    assert severity.curve.p[0] == pytest.approx(collisions / 2000)
+    assert severity.curve.p[0] < estimate.p
+
+
+def test_scenarios_without_an_outcome_are_left_out_and_said(problem: rare_envs.DrivingProblem) -> None:
+    run = samplers.estimate(problem, "mc", max_sim=1000, seed=0)
+    sample = run.sample
+    assert sample is not None
+    failing = np.flatnonzero(sample.f <= 0)
+    f = sample.f.copy()
+    f[failing[:2]] = -np.inf
+    changed = samplers.Estimate(**{**vars(run), "sample": samplers.Sample.of_equal_draws(f, sample.x)})
+    severity = severity_curve(problem, changed, thresholds=[-1.0])
+    assert severity.unknown == pytest.approx(2 / len(failing))
+    assert severity.curve.p[0] == pytest.approx((len(failing) - 2) / 1000)
+    assert "of p have no outcome and are left out" in str(severity)
+
+
+def test_the_replay_is_shared_with_the_kinds_and_goes_to_print_and_json(
+    problem: rare_envs.DrivingProblem, plain: samplers.Estimate, capsys: pytest.CaptureFixture[str]
+) -> None:
+    study = Study(Question(env_id=CUT_IN, method="mc"), problem, samplers.get_method("mc"))
+    report = Report(study, plain, 1.0, kinds=classify_failures(problem, plain))
+    severity = report.kinds.severity
+    assert isinstance(severity, Severity)
+    saved = json.loads(json.dumps(report.to_dict()["severity"], allow_nan=False))
+    assert saved["injuries"]["value"] == severity.injuries.value
+    assert saved["curve"]["delta_v"][:2] == [0.0, 1.0]
+    print_report(report)
+    printed = capsys.readouterr().out
+    for line in str(severity).splitlines():
+        assert line in printed
+
+
+def test_most_limits_what_is_driven_again(problem: rare_envs.DrivingProblem, plain: samplers.Estimate) -> None:
+    severity = severity_curve(problem, plain, most=7)
+    assert severity.n_replayed == 7
+    assert f"from 7 of {plain.failures.total} failing scenarios" in str(severity)
+
+
+def test_a_picture(problem: rare_envs.DrivingProblem, plain: samplers.Estimate) -> None:
+    from matplotlib.figure import Figure
+
+    axes = severity_curve(problem, plain).plot(Figure().subplots())
+    assert axes.get_xlabel() == "delta-v [m/s]"
+
+
+def test_bad_input_is_refused(problem: rare_envs.DrivingProblem, plain: samplers.Estimate) -> None:
+    idm = rare_envs.DrivingProblem(FOLLOWING)
+    near = samplers.estimate(idm, "mc", max_sim=500, gamma=3.0, seed=0)
+    with pytest.raises(ValueError, match=r"^No failure \(f <= 3\) that was driven again is a collision\.$"):
+        severity_curve(idm, near)
+    with pytest.raises(ValueError, match=r"^No point failed"):
+        severity_curve(idm, samplers.estimate(idm, "mc", max_sim=100, seed=0))
+    without = samplers.Estimate(**{**vars(plain), "sample": None})
+    with pytest.raises(ValueError, match="gave no weighted points"):
+        severity_curve(problem, without)
+    problem_that_varies = rare_envs.DrivingProblem(CUT_IN, ego=IDM(max_deceleration=1.0))
+    problem_that_varies.varies = True
+    with pytest.raises(ValueError, match="vary from run to run"):
+        severity_curve(problem_that_varies, plain)
