@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 from rare_envs.plugins import make_lazy_getattr
 from rare_envs.registration import make_batch, parallel_env, register_envs, register_scenario
 from rare_envs.scenarios.registry import SCENARIOS
+from rare_envs.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from rare_envs.control.idm import IDM
@@ -13,6 +14,7 @@ if TYPE_CHECKING:
     from rare_envs.egos.faults import FaultTolerant
     from rare_envs.interop import HighwayEnvProblem, HighwayEnvScenario, highway_env_problem
     from rare_envs.problem import DrivingProblem
+    from rare_envs.study.rates.total_risk import risk
 
     ENV_IDS: tuple[str, ...]
     """Ids of all environments, your own included."""
@@ -30,9 +32,8 @@ __all__ = [
     "make_batch",
     "parallel_env",
     "register_scenario",
+    "risk",
 ]
-__version__ = "0.1.0"
-
 register_envs()
 
 _LAZY = {
@@ -44,6 +45,7 @@ _LAZY = {
     "ScenarioSpace": "rare_envs.distributions.space",
     "TruncatedGaussianMixture": "rare_envs.distributions.truncated_mixture",
     "highway_env_problem": "rare_envs.interop",
+    "risk": "rare_envs.study.rates.total_risk",
 }
 
 _import_lazily = make_lazy_getattr(__name__, _LAZY)

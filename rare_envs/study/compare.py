@@ -7,12 +7,12 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import rare_envs
 import samplers
 from rare_envs.egos.errors import EgoGone
 from rare_envs.study.errors import as_bad_input, output_folder
 from rare_envs.study.question import Question, prepare
 from rare_envs.study.run_directory import format_json, write_failures
+from rare_envs.version import __version__
 
 COMPARISON = "comparison.json"
 UNUSED_FIELDS = ("target_cov", "replicates", "on_error")
@@ -72,7 +72,7 @@ def compare_egos(question: Question, ego_b: str, progress: bool = False, out: Pa
             **comparison.to_dict(),
             "question": {"ego_a": inputs.pop("ego"), "ego_b": ego_b, **inputs},
             "notes": [f"{name}: {note}" for name, study in (("A", a), ("B", b)) for note in study.problem.notes],
-            "version": rare_envs.__version__,
+            "version": __version__,
         }
         if out is not None:
             (out / COMPARISON).write_text(format_json(answer) + "\n", encoding="utf-8")

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 import samplers
-from rare_envs import DrivingProblem
 from rare_envs.egos.errors import EgoGone
+from rare_envs.problem import DrivingProblem
 from rare_envs.study.analysis.failure_replay import MAX_REPLAYED, replay_failures
 from rare_envs.study.analysis.severity import Severity, compute_severity
 from rare_envs.traffic.crash import CRASH_KINDS, describe_crash

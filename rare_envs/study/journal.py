@@ -14,9 +14,9 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-import rare_envs
 from rare_envs.egos.faults import Fault, FaultTolerant
 from rare_envs.study.errors import BadInput
+from rare_envs.version import __version__
 from samplers.problem import FloatArray
 
 JOURNAL = "journal.npy"
@@ -82,8 +82,8 @@ class Journal:
 
     def _read_question(self) -> dict[str, Any]:
         head = self._read_json()
-        if head["version"] != rare_envs.__version__:
-            raise ValueError(f"it was begun by version {head['version']}, this is {rare_envs.__version__}.")
+        if head["version"] != __version__:
+            raise ValueError(f"it was begun by version {head['version']}, this is {__version__}.")
         return dict(head["question"])
 
     def read_next(self, x: FloatArray) -> JournalEntry | None:
@@ -110,7 +110,7 @@ class Journal:
         try:
             if self._file is None:
                 self._file = self._path.open("xb")
-                self._write(_json({"question": self.question, "version": rare_envs.__version__}))
+                self._write(_json({"question": self.question, "version": __version__}))
             notes = {"reasons": batch.reasons, "n_retried": batch.n_retried}
             self._write(batch.x, batch.f, _json(notes))
             self._file.flush()

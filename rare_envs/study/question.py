@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import itertools
 import warnings
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, cast
 
 import numpy as np
 import torch
 
 import agents
-import rare_envs
 import samplers
+from rare_envs.distributions.fitted import FittedDistribution
+from rare_envs.distributions.space import Distribution
 from rare_envs.egos.errors import EgoGone
-from rare_envs.problem import AmbiguousActions
+from rare_envs.problem import AmbiguousActions, DrivingProblem
+from rare_envs.scenarios.base_distributions import load_base
 from rare_envs.scenarios.registry import find_scenario
 from rare_envs.simulation.rollout import drive
 from rare_envs.study.errors import BadInput, as_bad_input
@@ -48,6 +52,9 @@ class Question:
         action: Actions of a policy: "continuous" or "meta".
         collisions: Which collisions count: those of the "ego", or "any", those between two other vehicles too.
         weather: Whether weather and the camera's noise are parameters.
+        ensemble: Whether the base distribution is the mixture of the refits of `base`: what these predict for the next
+            event.
+        also_under: Further base distributions, names or files joined by commas, under which p is stated too.
         on_error: Treatment of scenarios on which the ego fails twice: "raise" ends the run, "failure" counts them as
             failing, "bound" as failing in p and the upper end of the interval, but not in the lower end.
 
@@ -77,6 +84,8 @@ class Question:
     on_error: str = RunArguments.on_error
     collisions: str = "ego"
     weather: bool = False
+    ensemble: bool = False
+    also_under: str | None = None
 
     @property
     def run_arguments(self) -> RunArguments:
@@ -117,15 +126,28 @@ class Study:
     """
 
     question: Question
-    problem: rare_envs.DrivingProblem
+    problem: DrivingProblem
     method: samplers.Stepping
+    other_bases: Mapping[str, Distribution] = field(default_factory=dict)
+    """Distributions of x under the other base distributions that the question names."""
+
+    @cached_property
+    def base(self) -> Distribution:
+        """The base distribution that the question names, with what is known of its events."""
+        return load_base(find_scenario(self.question.env_id), self.question.base)
+
+    @property
+    def base_name(self) -> str:
+        """Its name or file."""
+        return self.question.base or next(iter(find_scenario(self.question.env_id).bases))
 
 
-def prepare(question: Question) -> Study:
+def prepare(question: Question, ego: Any = None) -> Study:
     """Check a question and load what it names; nothing is simulated.
 
     Args:
         question: The question.
+        ego: The ego, where it is an object of yours; None to load the one that the question names.
 
     Returns:
         The study, ready to run.
@@ -141,13 +163,16 @@ def prepare(question: Question) -> Study:
     """
     with as_bad_input(ValueError, OSError):
         method = question.check()
-        ego = agents.load_ego(question.ego, algo=question.algo, trust=question.trust)
+        if ego is None:
+            ego = agents.load_ego(question.ego, algo=question.algo, trust=question.trust)
         problem = build_problem(question, ego)
+        names = [name.strip() for name in (question.also_under or "").split(",") if name.strip()]
+        others = {name: build_problem(replace(question, base=name, ensemble=False), ego).base for name in names}
     problem.varies = problem.varies or _answers_vary(problem)
-    return Study(replace(question, observation=problem.world.sensing.observation), problem, method)
+    return Study(replace(question, observation=problem.world.sensing.observation), problem, method, others)
 
 
-def build_problem(question: Question, ego: Any) -> rare_envs.DrivingProblem:
+def build_problem(question: Question, ego: Any) -> DrivingProblem:
     """Return the problem of a question; what it cannot check is among its notes, without a warning.
 
     Args:
@@ -160,11 +185,11 @@ def build_problem(question: Question, ego: Any) -> rare_envs.DrivingProblem:
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", AmbiguousActions)
-        return rare_envs.DrivingProblem(
+        return DrivingProblem(
             question.env_id,
             ego=ego,
             measure=question.measure,
-            base=question.base,
+            base=_load_ensemble(question) if question.ensemble else question.base,
             noise=question.noise,
             drivers=question.drivers,
             horizon=question.horizon,
@@ -175,8 +200,21 @@ def build_problem(question: Question, ego: Any) -> rare_envs.DrivingProblem:
         )
 
 
+def _load_ensemble(question: Question) -> Distribution:
+    """Return the mixture of the refits of the base distribution.
+
+    Raises:
+        ValueError: It has none.
+    """
+    base = load_base(find_scenario(question.env_id), question.base)
+    if not isinstance(base, FittedDistribution) or not base.refits:
+        name = "the default" if question.base is None else repr(question.base)
+        raise ValueError(f"The base distribution ({name}) has no refits, so there is no ensemble of them.")
+    return base.ensemble()
+
+
 @torch.inference_mode()
-def _answers_vary(problem: rare_envs.DrivingProblem) -> bool:
+def _answers_vary(problem: DrivingProblem) -> bool:
     """Return whether the ego answers differently when it is queried twice with ordinary traffic at time 0.
 
     This finds a broken ego before the simulations, and one whose answers vary from run to run.

@@ -12,8 +12,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rare_envs import DrivingProblem
 from rare_envs.measures import Moment
+from rare_envs.problem import DrivingProblem
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.rollout import drive
 from rare_envs.traffic.crash import describe_crash

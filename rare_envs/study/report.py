@@ -5,17 +5,34 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-import rare_envs
 import samplers
 from agents.sb3.saved_ego import SavedEgo
+from rare_envs.distributions.space import Distribution
 from rare_envs.egos.faults import Fault
+from rare_envs.exposure import HUMAN_BENCHMARKS, CollisionRate
+from rare_envs.study.collision_rate import compute_rate, find_frequency
 from rare_envs.study.crash_kinds import CrashKinds
 from rare_envs.study.question import Study
+from rare_envs.version import __version__
+
+
+class BaseAnswer(NamedTuple):
+    """p under another base distribution, or why the simulations of this run do not give it."""
+
+    base: str
+    """Name or file of the base distribution."""
+    found: samplers.Reweighted | None
+    refused: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values for JSON."""
+        return {"base": self.base, "refused": self.refused, **(self.found.to_dict() if self.found else {})}
 
 
 @dataclass(frozen=True)
@@ -62,6 +79,25 @@ class Report:
         unknown = (f"kinds of crash are not known: {self.kinds.unknown}",) if self.kinds.unknown else ()
         return (*self._unused_options, *self.study.problem.notes, *unknown)
 
+    @cached_property
+    def rate(self) -> CollisionRate | None:
+        """Collisions per hour and per km; None where `no_rate` says why there are none."""
+        return compute_rate(self.study, self.estimate) if not self.no_rate else None
+
+    @cached_property
+    def no_rate(self) -> str:
+        """Why there is no rate; empty if there is one."""
+        try:
+            find_frequency(self.study)
+        except ValueError as error:
+            return str(error)
+        return ""
+
+    @cached_property
+    def other_bases(self) -> tuple[BaseAnswer, ...]:
+        """P under the other base distributions that the question names, from the same simulations."""
+        return tuple(_reweight(self.estimate, name, base) for name, base in self.study.other_bases.items())
+
     @property
     def _unused_options(self) -> tuple[str, ...]:
         world, noise = self.study.problem.world, self.study.question.noise
@@ -106,9 +142,25 @@ class Report:
                 {"parameters": self._parameters(fault.x), "reason": fault.reason} for fault in self.faults[:top]
             ],
             "units": dict(zip(space.names, space.units, strict=True)),
-            "version": rare_envs.__version__,
+            "rate": None if self.rate is None else {**self.rate.to_dict(), "people": _human_benchmarks()},
+            "no_rate": self.no_rate,
+            "other_bases": [each.to_dict() for each in self.other_bases],
+            "version": __version__,
         }
 
     def _parameters(self, x: NDArray[np.float64]) -> dict[str, Any]:
         named = self.study.problem.space.named(x)
         return {name: np.asarray(value).tolist() for name, value in named.items()}
+
+
+def _human_benchmarks() -> list[dict[str, Any]]:
+    """Return what people's rates are, to compare with, for JSON."""
+    return [benchmark.to_dict() for benchmark in HUMAN_BENCHMARKS]
+
+
+def _reweight(estimate: samplers.Estimate, name: str, base: Distribution) -> BaseAnswer:
+    """Return p under another base distribution, or the reason why not."""
+    try:
+        return BaseAnswer(name, estimate.reweight(base))
+    except ValueError as error:
+        return BaseAnswer(name, None, str(error))

@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from rare_envs import DrivingProblem
 from rare_envs.envs.rendering import FRAME_WIDTH, Renderer
+from rare_envs.problem import DrivingProblem
 from rare_envs.study.columns import MAX_SHOWN, format_value
 from rare_envs.study.errors import BadInput
 from rare_envs.study.question import Question, prepare

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import samplers
-from rare_envs import DrivingProblem
+from rare_envs.problem import DrivingProblem
 from rare_envs.traffic.crash import Crash
 from samplers.analysis import WeightedFailures, weigh_failures
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 import samplers
-from rare_envs import DrivingProblem
+from rare_envs.problem import DrivingProblem
 from rare_envs.study.analysis.failure_replay import MAX_REPLAYED, ReplayedFailures, replay_failures
 from rare_envs.traffic.crash import NONE, OTHERS
 from samplers.analysis import Exceedance, FailureExpectation, compute_exceedance, expect_over_failures

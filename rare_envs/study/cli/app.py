@@ -20,6 +20,7 @@ from rare_envs.study.cli.options import (
     JsonOption,
     NoiseChoice,
     QuestionOptions,
+    RiskOptions,
     ScenarioOptions,
     SeedOption,
     TrustOption,
@@ -85,6 +86,43 @@ def _answer(report: Any, out: Path | None, as_json: bool) -> NoReturn:
     else:
         print_report(report, out)
     raise typer.Exit(DOUBTFUL if report.doubtful else 0)
+
+
+@app.command("risk")
+@spread_options
+@use_one_thread()
+def risk_command(
+    ego: EgoArgument,
+    options: RiskOptions,
+    out: Annotated[Path | None, typer.Option(help="Folder for risk.json, risk.png and a run of each scenario.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Estimate collisions per million km, over scenarios that count nothing twice, with an honest interval."""
+    from rare_envs.study.rates.total_risk import risk
+
+    with show_interruption(), contextlib.redirect_stdout(sys.stderr), as_bad_input(ValueError):
+        found = risk(ego, out=out, progress=True, **options.arguments())
+    if as_json:
+        print_json(found.to_dict())
+    else:
+        print(found if out is None else f"{found}\nWrote {out}.")
+    raise typer.Exit(DOUBTFUL if found.warnings else 0)
+
+
+@app.command("bases")
+def bases_command(
+    scenario: Annotated[str, typer.Argument(metavar="SCENARIO", help="Environment, or its short name: cut_in.")],
+    as_json: JsonOption = False,
+) -> None:
+    """List the base distributions of a scenario: events, site, family, fit, frequency and predictive checks."""
+    from rare_envs.study.cli.base_table import list_bases, print_bases
+
+    with as_bad_input(ValueError):
+        found = list_bases(scenario)
+    if as_json:
+        print_json({"scenario": scenario, "bases": found})
+    else:
+        print_bases(found)
 
 
 @app.command("resume")

@@ -32,6 +32,23 @@ class NoiseChoice(str, Enum):
         return {"on": True, "off": False}.get(self.value, self.value)
 
 
+class LeaderChoice(str, Enum):
+    """Scenario in which the ego gets a new leader; each is run beside the hard brake, and they count nothing twice.
+
+    Example:
+        >>> LeaderChoice("car-following").scenarios
+        ('car_following', 'hard_brake')
+    """
+
+    CUT_IN = "cut-in"
+    CAR_FOLLOWING = "car-following"
+
+    @property
+    def scenarios(self) -> tuple[str, ...]:
+        """The set of scenarios, by name."""
+        return (self.value.replace("-", "_"), "hard_brake")
+
+
 EnvArgument = Annotated[str, typer.Argument(metavar="ENV", help="Environment, such as rare_envs/CutIn-v0.")]
 EgoArgument = Annotated[str, typer.Argument(metavar="EGO", help="An ego, as for estimate --ego.")]
 AlgoOption = Annotated[str | None, typer.Option(help="Algorithm of the .zip, if the file does not tell.")]
@@ -39,6 +56,16 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object 
 SeedOption = Annotated[int, typer.Option(help="Seed; the same seed gives the same answer.")]
 TrustOption = Annotated[
     bool, typer.Option("--trust", help="Let the ego's .zip run code; open it though others can write to it.")
+]
+ObservationOption = Annotated[
+    str | None,
+    typer.Option(
+        help="Observation of the ego: features, lidar, kinematics, camera, speed, or camera+lidar; by default the "
+        "one that the ego declares, else features.",
+    ),
+]
+ActionOption = Annotated[
+    str, typer.Option(help="Actions of the ego: continuous, each tick, or HighwayEnv's meta, each second.")
 ]
 
 
@@ -50,16 +77,8 @@ class ScenarioOptions:
     drivers: Annotated[
         str | None, typer.Option(help="Of the vehicles around the ego: mgail, gail, bc, idm or a file.")
     ] = None
-    observation: Annotated[
-        str | None,
-        typer.Option(
-            help="Observation of the ego: features, lidar, kinematics, camera, speed, or camera+lidar; by default the "
-            "one that the ego declares, else features.",
-        ),
-    ] = None
-    action: Annotated[
-        str, typer.Option(help="Actions of the ego: continuous, each tick, or HighwayEnv's meta, each second.")
-    ] = "continuous"
+    observation: ObservationOption = None
+    action: ActionOption = "continuous"
     horizon: Annotated[float | None, typer.Option(help="Length of an episode in seconds.")] = None
 
     def arguments(self) -> dict[str, Any]:
@@ -100,7 +119,55 @@ class EstimateOptions(QuestionOptions):
         str, typer.Option(help="A name, a .zip or .onnx, module:function, tcp://..., noisy:EGO; see rare-envs list.")
     ] = "idm"
     algo: AlgoOption = None
+    ensemble: Annotated[
+        bool, typer.Option("--ensemble", help="Take the mixture of the refits of the base: p for the next event.")
+    ] = False
+    also_under: Annotated[
+        str | None, typer.Option(help="State p under these bases too, by the same simulations: us101-gap,i80.")
+    ] = None
     max_sim: Annotated[int | None, typer.Option(help="Largest number of simulations.")] = None
     target_cov: Annotated[float | None, typer.Option(help="Stop at this coefficient of variation.")] = None
     replicates: Annotated[int, typer.Option(help="Independent runs, combined by their mean.")] = 1
     on_error: Annotated[str, typer.Option(help="Where the ego fails twice: raise, failure or bound.")] = "raise"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RiskOptions:
+    """Options of `risk`: which scenarios and sites, and how the ego is driven."""
+
+    leaders: Annotated[
+        LeaderChoice,
+        typer.Option("--with", help="Scenario of new leaders beside hard brake: cut-in or car-following."),
+    ] = LeaderChoice.CUT_IN
+    sites: Annotated[
+        str, typer.Option(help="Site of the bases; further ones, joined by commas, for the spread between sites.")
+    ] = "us101"
+    base: Annotated[
+        list[str] | None, typer.Option(help="SCENARIO=NAME or FILE, in place of the site's base; may be repeated.")
+    ] = None
+    method: Annotated[str, typer.Option(help="Estimation method; see rare-envs list.")] = "two-stage"
+    max_sim: Annotated[int | None, typer.Option(help="Largest number of simulations of each scenario.")] = None
+    seed: SeedOption = 0
+    algo: AlgoOption = None
+    trust: TrustOption = False
+    observation: ObservationOption = None
+    action: ActionOption = "continuous"
+
+    def arguments(self) -> dict[str, Any]:
+        """Return the options as keyword arguments of `rare_envs.risk`.
+
+        Raises:
+            ValueError: A base has another form.
+
+        Example:
+            >>> RiskOptions(sites="us101,i80", base=["cut_in=mine.json"]).arguments()["bases"]
+            {'cut_in': 'mine.json'}
+        """
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        pairs = [each.partition("=") for each in values.pop("base") or []]
+        for scenario, _, base in pairs:
+            if not scenario or not base:
+                raise ValueError(f"Expected --base SCENARIO=NAME, such as cut_in=i80, got {scenario!r} alone.")
+        scenarios = values.pop("leaders").scenarios
+        sites = [site.strip() for site in values.pop("sites").split(",") if site.strip()]
+        return {**values, "scenarios": scenarios, "sites": sites, "bases": {name: base for name, _, base in pairs}}

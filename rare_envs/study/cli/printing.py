@@ -11,8 +11,10 @@ from rich.console import Console
 from rich.table import Table
 
 import samplers
+from rare_envs.exposure import describe_human_contacts
 from rare_envs.study.columns import MAX_SHOWN, format_value
 from rare_envs.study.crash_kinds import KIND_DESCRIPTIONS
+from rare_envs.study.rates.text import describe_parts, format_interval, format_rate, name_events
 from rare_envs.study.report import Report
 from samplers.problem import FloatArray
 from samplers.result import indent_lines
@@ -83,6 +85,8 @@ def print_report(report: Report, out: Path | None = None) -> None:
     console.print(f"  {f'{100 * estimate.confidence:g} % interval':<15} {low:.3e} to {high:.3e}")
     for line in indent_lines(estimate.base_uncertainty):
         console.print(line)
+    _print_other_bases(console, report)
+    _print_rate(console, report)
     rows = (
         ("c.o.v.", "not known" if math.isinf(estimate.cov) else f"{estimate.cov:.3f}"),
         ("simulations", f"{estimate.n_sim:,} in {report.seconds:.1f} s"),
@@ -110,6 +114,35 @@ def print_report(report: Report, out: Path | None = None) -> None:
     if out is not None:
         names = ", ".join(path.name for path in sorted(out.iterdir()) if path.is_file())
         console.print(f"written to {out}: {names}")
+
+
+def _print_other_bases(console: Console, report: Report) -> None:
+    """Print p under the other bases that the question names, or why the simulations do not give it."""
+    for each in report.other_bases:
+        if each.found is None:
+            console.print(f"  {f'under {each.base}':<15} not known: {each.refused}")
+        else:
+            low, high = each.found.interval
+            console.print(
+                f"  {f'under {each.base}':<15} {each.found.p:.3e} ({low:.1e} to {high:.1e}), "
+                f"{each.found.ess:.0f} effective failing points"
+            )
+
+
+def _print_rate(console: Console, report: Report) -> None:
+    """Print collisions per million km and per hour beside those of people, or why they are not known."""
+    rate = report.rate
+    if rate is None:
+        console.print(f"  {'collisions':<15} {report.no_rate}")
+        return
+    console.print(
+        f"  {'collisions':<15} {format_rate(rate.per_million_km)} per million km "
+        f"({format_interval(rate.interval_per_million_km)}), {format_rate(rate.per_hour)} per hour "
+        f"({format_interval(rate.interval_per_hour)}); {describe_human_contacts()}"
+    )
+    events = f"{format_rate(rate.frequency.per_km)} {name_events(rate.scenario)} per km"
+    parts = describe_parts(rate)
+    console.print(f"  {'':<15} from {events}{f'; the uncertainty is {parts}' if parts else ''}")
 
 
 def _print_kinds(console: Console, report: Report) -> None:

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from gymnasium import spaces
 
-from rare_envs import DrivingProblem
 from rare_envs.arrays import AnyArray
 from rare_envs.egos.policy import PolicyDriver
+from rare_envs.problem import DrivingProblem
 from rare_envs.sensors.kinds import batch_size, map_kinds
 from rare_envs.simulation.observation import observe
 from rare_envs.simulation.rollout import drive

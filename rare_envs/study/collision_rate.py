@@ -1,0 +1,103 @@
+"""Rate of collisions of an evaluation: its probability times the frequency of the events of its base distribution."""
+
+from __future__ import annotations
+
+import math
+
+import samplers
+from rare_envs.distributions.fitted import FittedDistribution
+from rare_envs.distributions.frequency import EventFrequency
+from rare_envs.exposure.base_record import read_source
+from rare_envs.exposure.rate import CollisionProbability, CollisionRate
+from rare_envs.scenarios.registry import find_scenario
+from rare_envs.study.question import Question, Study
+from samplers.analysis.base_uncertainty import FIT_BIAS, half_width
+
+COLLISION_MEASURE = "ttc"
+"""Measure that is -1 after a collision and above 0 without one."""
+
+
+def find_frequency(study: Study) -> EventFrequency:
+    """Return the frequency of the events whose failures a question counts.
+
+    Raises:
+        ValueError: p is no probability of a collision per event, or nobody counted the events.
+    """
+    reason = _explain_no_collisions(study.question)
+    if reason:
+        raise ValueError(f"no rate per hour or km: {reason}")
+    frequency = study.base.frequency if isinstance(study.base, FittedDistribution) else None
+    if frequency is None:
+        scenario = find_scenario(study.question.env_id).name
+        raise ValueError(
+            f"no rate per hour or km: the base {study.base_name!r} of {scenario} has no event frequency, "
+            "nobody counted how often its events happen"
+        )
+    return frequency
+
+
+def compute_rate(study: Study, estimate: samplers.Estimate, site_log_sd: float = 0.0) -> CollisionRate:
+    """Return the rate of collisions of an estimate.
+
+    Args:
+        study: The question, loaded.
+        estimate: Its answer.
+        site_log_sd: Standard deviation of the logarithm of the rate between sites.
+
+    Raises:
+        ValueError: As in `find_frequency`.
+
+    Example:
+        >>> from rare_envs.study.question import prepare
+        >>> study = prepare(Question(env_id="rare_envs/CarFollowing-v0", base="highway", method="mc", max_sim=100))
+        >>> compute_rate(study, samplers.estimate(study.problem, "mc", max_sim=100, seed=0))
+        Traceback (most recent call last):
+            ...
+        ValueError: no rate per hour or km: the base 'highway' of car_following has no event frequency, nobody counted how often its events happen
+    """  # noqa: E501 (the example shows a whole message)
+    return CollisionRate(
+        scenario=study.problem.world.scenario.name,
+        probability=describe_probability(estimate),
+        frequency=find_frequency(study),
+        site_log_sd=site_log_sd,
+        confidence=estimate.confidence,
+        fitted_to=_identify_events(study),
+    )
+
+
+def describe_probability(estimate: samplers.Estimate) -> CollisionProbability:
+    """Return p of an estimate with its errors: that of sampling, and where refits are known, that of the base."""
+    upper = estimate.interval[1]
+    known = estimate.p > 0 and math.isfinite(estimate.cov)
+    base = estimate.base_uncertainty
+    if not known or base is None or not math.isfinite(base.spread):
+        return CollisionProbability(p=estimate.p, cov=estimate.cov, upper=upper, determined=known)
+    unit = math.sqrt(base.spread**2 + estimate.cov**2 + FIT_BIAS**2)
+    half = half_width(base.spread, estimate.cov, estimate.confidence, len(base.p_refits), base.clusters)
+    return CollisionProbability(
+        p=estimate.p,
+        cov=estimate.cov,
+        upper=upper if base.bound is None else base.bound,
+        spread=base.spread,
+        fit_bias=FIT_BIAS,
+        quantile=half / unit,
+        determined=base.bound is None,
+    )
+
+
+def _explain_no_collisions(question: Question) -> str:
+    """Return why p is no probability of a collision of the ego; empty if it is one."""
+    if question.measure != COLLISION_MEASURE:
+        return f"--measure {question.measure} counts other events than collisions (--measure {COLLISION_MEASURE} does)"
+    if not -1 <= question.gamma <= 0:
+        return f"--gamma {question.gamma:g} counts other events than collisions (--gamma 0 does)"
+    if question.collisions != "ego":
+        return f"--collisions {question.collisions} counts those between other vehicles too"
+    return ""
+
+
+def _identify_events(study: Study) -> str:
+    """Return words that two base distributions share if they were fitted to the same events; empty if not known."""
+    base = study.base
+    data = read_source(base.record)["data"] if isinstance(base, FittedDistribution) else ""
+    return f"{base.fitted_to}, {data}" if isinstance(base, FittedDistribution) and data else ""

@@ -1,0 +1,1 @@
+"""Rates of collisions over several scenarios: `rare_envs.risk`, its table and its picture."""

@@ -1,0 +1,82 @@
+"""Picture of a risk: rates with their intervals beside those of people, and what the uncertainty comes from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from rare_envs.exposure.human_benchmarks import CONTACTS_100CAR, REAR_END_CONTACTS_100CAR
+from rare_envs.exposure.rate import RateInterval
+from rare_envs.exposure.total_rate import TotalRate
+from rare_envs.study.plots import HIT_COLOUR, LINE_COLOUR, ORDINARY_COLOUR
+from rare_envs.study.rates.text import format_interval, format_rate, format_share, name_scenario, name_source
+
+DECADES_BELOW = 1e-3
+"""Left end of the axis over the smallest rate, where an interval reaches down to 0."""
+
+
+def save_risk_plot(path: Path, ego: str, total: TotalRate) -> None:
+    """Draw a total and the rates of which it is the sum, and save it.
+
+    Args:
+        path: `.png` to write.
+        ego: The ego, for the title.
+        total: The rates.
+    """
+    with matplotlib.rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
+        height = 1.6 + 0.45 * max(len(total.rates) + 1, len(total.shares))
+        figure = Figure(figsize=(12, height), layout="constrained")
+        left, right = figure.subplots(1, 2, width_ratios=(1.5, 1.0))
+        figure.suptitle(
+            f"ego {ego}: {format_rate(total.per_million_km)} collisions per million km "
+            f"({100 * total.confidence:g} %: {format_interval(total.interval_per_million_km)})",
+            fontsize=12,
+            fontweight="bold",
+        )
+        draw_rates(left, total)
+        draw_shares(right, total)
+        figure.savefig(path, dpi=120)
+
+
+def draw_rates(axes: Axes, total: TotalRate) -> None:
+    """Draw the rate of each scenario and their sum, with intervals, and lines for people."""
+    rows: list[tuple[str, float, RateInterval]] = [
+        (name_scenario(rate.scenario), rate.per_million_km, rate.interval_per_million_km) for rate in total.rates
+    ]
+    rows.append(("total", total.per_million_km, total.interval_per_million_km))
+    positive = [value for _, rate, ends in rows for value in (rate, *ends) if value > 0]
+    least = min(positive)
+    start = least * DECADES_BELOW if any(ends[0] == 0 for _, _, ends in rows) else least
+    for row, (name, rate, (low, high)) in enumerate(rows):
+        colour = HIT_COLOUR if name == "total" else LINE_COLOUR
+        axes.plot([max(low, start), high], [row, row], color=colour, linewidth=3, alpha=0.5, solid_capstyle="butt")
+        if rate > start:
+            axes.plot(rate, row, "o", color=colour)
+    for people, style in ((CONTACTS_100CAR, "--"), (REAR_END_CONTACTS_100CAR, ":")):
+        axes.axvline(people.per_million_km, color="black", linewidth=1, linestyle=style, label=people.kind)
+    axes.set_xscale("log")
+    axes.set_yticks(range(len(rows)), [name for name, _, _ in rows])
+    axes.set_ylim(len(rows) + 0.4, -0.6)  # room for the legend below
+    axes.set_xlabel("collisions per million km")
+    axes.legend(title="people (100-Car)", loc="lower left", fontsize=8, frameon=False)
+
+
+def draw_shares(axes: Axes, total: TotalRate) -> None:
+    """Draw the shares of the sources of the uncertainty as bars."""
+    shares = total.shares
+    axes.set_title("sources of the uncertainty, share of the variance", fontsize=10)
+    if not shares:
+        axes.set_axis_off()
+        axes.text(0.5, 0.5, "not known", ha="center", va="center", transform=axes.transAxes)
+        return
+    axes.barh(range(len(shares)), [100 * each.share for each in shares], color=LINE_COLOUR)
+    for row, each in enumerate(shares):
+        axes.text(100 * each.share + 1, row, format_share(each.share), va="center")
+    axes.set_yticks(range(len(shares)), [name_source(each) for each in shares])
+    axes.set_ylim(len(shares) - 0.4, -0.6)
+    axes.set_xlim(0, 115)
+    axes.set_xlabel("%")
+    axes.grid(axis="x", color=ORDINARY_COLOUR, alpha=0.4)

@@ -1,0 +1,54 @@
+"""List of the base distributions of a scenario."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from rare_envs.scenarios.hard_brake import HARD_BRAKE
+from rare_envs.scenarios.registry import SCENARIOS
+from rare_envs.study.cli.base_table import list_bases, print_bases
+from tests.rare_envs.study.fitted_files import fitted_entries
+from tests.rare_envs.study.refusals import Cli, assert_refused
+
+
+@pytest.fixture
+def fitted(monkeypatch: pytest.MonkeyPatch) -> None:
+    bases = {"us101": fitted_entries("hard_brake"), "plain": {**HARD_BRAKE.bases["us101"], "provenance": None}}
+    monkeypatch.setitem(SCENARIOS._entries, "rare_envs/HardBrake-v0", replace(HARD_BRAKE, bases=bases))
+
+
+def test_all_that_is_known_of_a_fitted_base_is_listed(fitted: None) -> None:
+    base = list_bases("hard_brake")["us101"]
+    assert base["fitted_to"] == "42 events of 40 scenes"
+    assert base["events"] == {"used": [42], "clusters": 40, "cluster": "scene"}
+    assert (base["refits"], base["family"], base["coordinates"]) == (30, "1 component", "plain")
+    assert (base["bic"], base["held_out_log_prob"]) == (1086.8, -14.6)
+    assert (base["site"], base["date"], base["licence"]) == ("site of hard_brake", "2005-06-15", "CC0")
+    assert base["frequency"]["per_hour"] == pytest.approx(42 / 5.64)
+    assert base["checks"] == [{"name": "TTC < 5 s", "recorded": 2, "expected": 7.5}]
+
+
+def test_the_table_for_people(fitted: None, capsys: pytest.CaptureFixture[str]) -> None:
+    print_bases(list_bases("rare_envs/HardBrake-v0"))
+    text = " ".join(capsys.readouterr().out.split())
+    assert "us101 (the default) fitted to 42 events of 40 scenes, 30 refits" in text
+    assert "site site of hard_brake, 2005-06-15" in text
+    assert "fit BIC 1,086.8, held-out log likelihood -14.60 per event" in text
+    assert "7.4 per hour, 0.19 per km: 42 in 5.64 h (events of a test)" in text
+    assert "recorded / expected TTC < 5 s 2 / 7.5" in text
+    assert "plain frequency not known: no rate per hour or km" in text
+
+
+@pytest.mark.parametrize("env_id", SCENARIOS)
+def test_every_shipped_base_can_be_listed(env_id: str) -> None:
+    assert list(list_bases(env_id)) == list(SCENARIOS[env_id].bases)
+
+
+def test_the_command(cli: Cli, fitted: None) -> None:
+    answer = json.loads(cli("bases", "hard_brake", "--json").stdout)
+    assert answer["bases"]["us101"]["fitted_to"] == "42 events of 40 scenes"
+    assert "42 events of 40 scenes" in cli("bases", "hard_brake").stdout
+    assert_refused(cli("bases", "merge"), "merge", "rare_envs/CutIn-v0")

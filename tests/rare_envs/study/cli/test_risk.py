@@ -1,0 +1,122 @@
+"""Risks and rates on the command line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.rare_envs.study.fitted_files import write_fitted
+from tests.rare_envs.study.refusals import Cli, assert_refused
+
+FEW = ("--method", "mc", "--max-sim", 300)
+BRAKE = ("estimate", "rare_envs/HardBrake-v0", *FEW)
+
+
+@pytest.fixture
+def bases(here: Path) -> list[str]:
+    """Options that name a fitted base for each scenario."""
+    names = ("cut_in", "hard_brake")
+    return [word for name in names for word in ("--base", f"{name}={write_fitted(here / f'{name}.json', name)}")]
+
+
+def test_the_table_and_the_folder(cli: Cli, bases: list[str], here: Path) -> None:
+    result = cli("risk", "idm", *bases, *FEW, "--out", here / "out")
+    assert result.exit_code == 0, result.output
+    assert result.stdout.startswith("collisions per million km  ")
+    assert "cut-in        0.26 per km x " in result.stdout
+    assert result.stdout.endswith(f"Wrote {here / 'out'}.\n")
+    assert (here / "out" / "risk.png").exists()
+
+
+def test_json_alone_on_standard_output(cli: Cli, bases: list[str]) -> None:
+    result = cli("risk", "idm", *bases, *FEW, "--seed", 3, "--json")
+    data = json.loads(result.stdout)
+    assert set(data["scenarios"]) == {"cut_in", "hard_brake"}
+    assert data["scenarios"]["cut_in"]["report"]["seed"] == 3
+    assert data["interval_per_million_km"][0] < data["per_million_km"] < data["interval_per_million_km"][1]
+
+
+def test_new_leaders_in_place_of_cut_ins(cli: Cli, here: Path) -> None:
+    words = [
+        word
+        for name in ("car_following", "hard_brake")
+        for word in ("--base", f"{name}={write_fitted(here / f'{name}.json', name)}")
+    ]
+    result = cli("risk", "idm", "--with", "car-following", *words, *FEW, "--json")
+    assert set(json.loads(result.stdout)["scenarios"]) == {"car_following", "hard_brake"}
+
+
+BAD = {
+    "misspelt ego": (["imd"], ["idm"]),
+    "missing ego": ([], ["EGO"]),
+    "unknown site": (["idm", "--sites", "us102"], ["us102", "us101"]),
+    "no site": (["idm", "--sites", ","], ["site"]),
+    "unknown leaders": (["idm", "--with", "merge"], ["merge"]),
+    "a base without its scenario": (["idm", "--base", "mine.json"], ["SCENARIO=NAME"]),
+    "a base of an unknown scenario": (["idm", "--base", "merge=mine.json"], ["merge"]),
+    "a base that is no file": (["idm", "--base", "cut_in=mine.json"], ["mine.json"]),
+    "a damaged base": (["idm", "--base", "cut_in=broken.json"], ["broken.json", "JSON"]),
+    "a base without frequency": (["idm", "--base", "cut_in=highway"], ["'highway'", "nobody counted"]),
+    "a misspelt method": (["idm", "--method", "addss"], ["adss"]),
+    "no budget": (["idm", "--max-sim", "0"], ["max_sim"]),
+}
+
+
+@pytest.mark.parametrize(("words", "said"), BAD.values(), ids=BAD.keys())
+def test_bad_input_is_one_line(cli: Cli, here: Path, bases: list[str], words: list[str], said: list[str]) -> None:
+    assert_refused(cli("risk", *words[:1], *bases, *words[1:]), *said)
+
+
+def test_out_in_a_file_is_refused(cli: Cli, here: Path, bases: list[str]) -> None:
+    assert_refused(cli("risk", "idm", *bases, *FEW, "--out", here / "a_file"), "a_file")
+
+
+def test_estimate_prints_the_rate_beside_people(cli: Cli, here: Path) -> None:
+    base = write_fitted(here / "fitted.json", "hard_brake")
+    text = " ".join(cli(*BRAKE, "--base", base).stdout.split())
+    assert "per million km (" in text
+    assert "people: 21 contacts of all kinds, 4.3 into a vehicle ahead (100-Car), 15 (SHRP 2)" in text
+    assert "from 0.19 brakings per km; the uncertainty is" in text
+    data = json.loads(cli(*BRAKE, "--base", base, "--json").stdout)
+    assert data["rate"]["per_hour"] == pytest.approx(42 / 5.64 * data["p"])
+
+
+def test_estimate_says_in_one_line_why_there_is_no_rate(cli: Cli, here: Path) -> None:
+    base = write_fitted(here / "fitted.json", "hard_brake")
+    for words, said in (
+        (("--base", base, "--gamma", "1"), "--gamma 1 counts other events"),
+        (("--base", base, "--measure", "drac"), "--measure drac counts other events"),
+        (("--base", write_fitted(here / "b.json", "hard_brake", frequency=None)), "nobody counted"),
+    ):
+        lines = [line for line in cli(*BRAKE, *words).stdout.splitlines() if "no rate" in line]
+        assert len(lines) == 1
+        assert said in lines[0]
+
+
+def test_the_mixture_of_the_refits_as_base(cli: Cli, here: Path) -> None:
+    base = write_fitted(here / "fitted.json", "hard_brake", spread=1.0)
+    data = json.loads(cli(*BRAKE, "--base", base, "--ensemble", "--json").stdout)
+    assert data["question"]["ensemble"] is True
+    assert data["base_uncertainty"] is None
+    without = write_fitted(here / "without.json", "hard_brake", refits=None)
+    assert_refused(cli(*BRAKE, "--base", without, "--ensemble"), "without.json", "no refits")
+
+
+def test_p_under_other_bases(cli: Cli, here: Path) -> None:
+    """A near one is answered, a far one refused with its reason; one that is not there before any simulation."""
+    base, near, far = (
+        write_fitted(here / f"{name}.json", "hard_brake", shift=shift)
+        for name, shift in (("own", 0.0), ("near", 0.2), ("far", 8.0))
+    )
+    words = (*BRAKE, "--base", base, "--also-under", f"{near}, {far}")
+    answers = {Path(each["base"]).stem: each for each in json.loads(cli(*words, "--json").stdout)["other_bases"]}
+    assert answers["near"]["refused"] == ""
+    low, high = answers["near"]["interval"]
+    assert low < answers["near"]["p"] < high
+    assert "effective" in answers["far"]["refused"] or "worth" in answers["far"]["refused"]
+    text = cli(*words).stdout
+    assert f"under {near} " in text
+    assert f"under {far} not known: " in " ".join(text.split())
+    assert_refused(cli(*BRAKE, "--base", base, "--also-under", "nowhere"), "nowhere")

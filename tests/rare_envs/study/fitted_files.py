@@ -1,0 +1,74 @@
+"""Files of fitted base distributions with refits and frequencies, under which crashes are common."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rare_envs.scenarios.registry import scenario_named
+
+MEANS = {
+    "cut_in": (20.0, 14.0, 20.0, 8.0, 30.0, 3.5),
+    "hard_brake": (15.0, 8.0, 7.0),
+    "car_following": (20.0, 10.0, 26.0),
+}
+SPREADS = {
+    "cut_in": (2.0, 2.0, 2.0, 2.0, 5.0, 0.2),
+    "hard_brake": (2.0, 2.0, 1.0),
+    "car_following": (2.0, 2.0, 5.0),
+}
+"""Of independent normal variables, so that between a tenth and a half of the scenarios end in a crash of the IDM."""
+FREQUENCIES = {
+    "cut_in": {"count": 1221, "hours": 112.0, "km": 3900.0, "share": 38 / 46, "share_events": 46},
+    "hard_brake": {"count": 42, "hours": 5.64, "km": 218.0},
+    "car_following": {"count": 153, "hours": 5.98, "km": 169.7},
+}
+EVENTS = {"cut_in": ([38, 15], 17), "hard_brake": ([42], 40), "car_following": ([470], 28)}
+
+
+def fitted_entries(scenario: str, spread: float = 0.3, shift: float = 0.0, **changes: Any) -> dict[str, Any]:
+    """Return the entries of a fitted base; a change to None leaves a key out.
+
+    Args:
+        scenario: Name of the scenario.
+        spread: Standard deviation by which the means of the 30 refits differ, in those of the base.
+        shift: By which the means of the base are moved, likewise.
+        changes: Keys of the file.
+    """
+    parameters = scenario_named(scenario).parameters
+    sd = np.array(SPREADS[scenario])
+    mean = np.array(MEANS[scenario]) + shift * sd
+    rng = np.random.default_rng(0)
+    used, clusters = EVENTS[scenario]
+    shape = {"weights": [1.0], "covariances": [np.diag(sd**2).tolist()]}
+    moved = mean + spread * sd * rng.standard_normal((30, len(sd)))
+    source = {"site": f"site of {scenario}", "date": "2005-06-15", "data": f"data of {scenario}", "licence": "CC0"}
+    entries = {
+        "names": [p.name for p in parameters],
+        "low": [p.low for p in parameters],
+        "high": [p.high for p in parameters],
+        **shape,
+        "means": [mean.tolist()],
+        "refits": [{**shape, "means": [each.tolist()]} for each in moved],
+        "events": {"used": used, "clusters": clusters, "cluster": "scene"},
+        "family": "1 component",
+        "frequency": {**FREQUENCIES[scenario], "definition": "events of a test", "source": "a test"},
+        "checks": [{"name": "TTC < 5 s", "recorded": 2, "expected": 7.5}],
+        "provenance": {
+            "source": source,
+            "bic": 1086.8,
+            "held_out_log_prob": -14.6,
+            "coordinates": "plain",
+        },
+        **changes,
+    }
+    return {name: value for name, value in entries.items() if value is not None}
+
+
+def write_fitted(path: Path, scenario: str, **changes: Any) -> str:
+    """Write `fitted_entries` and return the name of the file."""
+    path.write_text(json.dumps(fitted_entries(scenario, **changes)))
+    return str(path)

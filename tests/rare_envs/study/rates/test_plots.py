@@ -1,0 +1,45 @@
+"""Pictures of risks: what is drawn where."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+from matplotlib.figure import Figure
+
+from rare_envs.exposure import TotalRate
+from rare_envs.study.rates.plots import draw_rates, draw_shares, save_risk_plot
+from tests.rare_envs.exposure.test_rate import rate
+
+TOTAL = TotalRate((rate(spread=1.4), rate(1e-4, scenario="hard_brake", spread=1.0)))
+UNKNOWN = TotalRate((rate(0.0, math.inf, upper=1e-3),))
+
+
+def test_intervals_and_rates_stand_at_their_places() -> None:
+    axes = Figure().subplots()
+    draw_rates(axes, TOTAL)
+    bars = [line for line in axes.lines if line.get_linewidth() == 3]
+    assert [tuple(bar.get_xdata()) for bar in bars] == [
+        *(pytest.approx(each.interval_per_million_km) for each in TOTAL.rates),
+        pytest.approx(TOTAL.interval_per_million_km),
+    ]
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["cut-in", "hard brake", "total"]
+    people = sorted(float(line.get_xdata()[0]) for line in axes.lines if line.get_color() == "black")
+    assert people == pytest.approx([4.35, 21.1], rel=0.01)
+
+
+def test_bars_are_the_shares() -> None:
+    axes = Figure().subplots()
+    draw_shares(axes, TOTAL)
+    assert [patch.get_width() for patch in axes.patches] == pytest.approx([100 * each.share for each in TOTAL.shares])
+
+
+def test_an_interval_that_begins_at_zero_can_be_drawn(tmp_path: Path) -> None:
+    axes = Figure().subplots()
+    draw_rates(axes, UNKNOWN)
+    start, end = next(line for line in axes.lines if line.get_linewidth() == 3).get_xdata()
+    assert 0 < start < end == pytest.approx(UNKNOWN.interval_per_million_km[1])
+    draw_shares(Figure().subplots(), UNKNOWN)
+    save_risk_plot(tmp_path / "risk.png", "idm", UNKNOWN)
+    assert (tmp_path / "risk.png").read_bytes()[:4] == b"\x89PNG"

@@ -1,0 +1,68 @@
+"""Rates at other sites over that at one's own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import MappingProxyType
+
+import pytest
+
+from rare_envs.scenarios.hard_brake import HARD_BRAKE
+from rare_envs.scenarios.registry import SCENARIOS
+from rare_envs.study import Question, Report, prepare, run
+from rare_envs.study.rates.sites import choose_base, compare_sites
+from tests.rare_envs.study.fitted_files import fitted_entries
+
+OTHER_SITE = {"source": {"site": "another", "data": "more"}}
+
+
+@pytest.fixture
+def sites(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hard brake with three bases: a near one and a far one of other sites, and one of the same site."""
+    near = fitted_entries("hard_brake", shift=0.2, provenance=OTHER_SITE)
+    near["frequency"] = {**near["frequency"], "count": 84}
+    bases = {
+        "us101": fitted_entries("hard_brake"),
+        "near": near,
+        "far": fitted_entries("hard_brake", shift=6.0, provenance=OTHER_SITE),
+        "again": fitted_entries("hard_brake", shift=0.1),
+        "assembled": fitted_entries("hard_brake", refits=None, events=None, family=None, frequency=None, checks=None),
+    }
+    scenario = replace(HARD_BRAKE, bases=MappingProxyType(bases))
+    monkeypatch.setitem(SCENARIOS._entries, "rare_envs/HardBrake-v0", scenario)
+
+
+def report() -> Report:
+    return run(prepare(Question(env_id="rare_envs/HardBrake-v0", method="mc", max_sim=1000)))
+
+
+def test_other_sites_are_known_from_the_same_simulations(sites: None) -> None:
+    """The near site has twice the frequency."""
+    own = report()
+    factors = compare_sites(own, ())
+    assert list(factors) == ["near"]
+    p = run(prepare(Question(env_id="rare_envs/HardBrake-v0", base="near", method="mc", max_sim=4000))).estimate
+    assert factors["near"] == pytest.approx(2 * p.p / own.estimate.p, rel=0.15)
+
+
+def test_a_site_that_is_asked_for_is_simulated_if_need_be(sites: None) -> None:
+    own = report()
+    factors = compare_sites(own, ("far", "again", "nowhere"))  # the near one is of the same site as the far one
+    assert set(factors) == {"far", "again"}
+    p = run(prepare(Question(env_id="rare_envs/HardBrake-v0", base="far", method="mc", max_sim=1000))).estimate.p
+    assert factors["far"] == pytest.approx(p / own.estimate.p)
+
+
+def test_nothing_is_known_where_nothing_failed(tmp_path: Path) -> None:
+    own = run(prepare(Question(env_id="rare_envs/HardBrake-v0", method="mc", max_sim=20)))
+    assert own.estimate.p == 0
+    assert compare_sites(own, ("us101",)) == {}
+
+
+def test_the_base_of_a_scenario_at_a_site() -> None:
+    assert choose_base(HARD_BRAKE, None, "us101") == ("us101", ())
+    assert choose_base(HARD_BRAKE, Path("mine.json"), "us101") == ("mine.json", ())
+    base, notes = choose_base(HARD_BRAKE, None, "i80")
+    assert base == "us101"
+    assert "'i80'" in notes[0]

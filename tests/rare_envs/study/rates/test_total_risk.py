@@ -1,0 +1,154 @@
+"""Risks of the IDM under bases on which it often crashes."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import rare_envs
+from rare_envs.scenarios.registry import SCENARIOS
+from rare_envs.study import BadInput
+from tests.rare_envs.study.fitted_files import fitted_entries, write_fitted
+
+FEW = {"method": "mc", "max_sim": 400}
+
+
+@pytest.fixture
+def bases(tmp_path: Path) -> dict[str, str]:
+    return {name: write_fitted(tmp_path / f"{name}.json", name) for name in ("cut_in", "hard_brake")}
+
+
+class Coasting:
+    """An ego of the user's own, which does nothing."""
+
+    observation_space = action_space = None
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        return np.zeros((len(observation), 2), np.float32), state
+
+
+def test_the_total_is_the_sum_of_frequency_times_p(bases: dict[str, str]) -> None:
+    found = rare_envs.risk("idm", bases=bases, **FEW)
+    p = [each.report.estimate.p for each in found.scenarios]
+    expected = 1e6 * (1221 * 38 / 46 / 3900 * p[0] + 42 / 218 * p[1])
+    assert found.total.per_million_km == pytest.approx(expected)
+    low, high = found.total.interval_per_million_km
+    assert 0 < low < expected < high
+    assert sum(found.kinds.values()) == pytest.approx(expected)
+    assert found.recorded_events == {"cut_in": 38, "hard_brake": 42}
+    assert found.notes == ()
+    text = str(found)
+    assert text.startswith("collisions per million km  ")
+    assert "people: 21 contacts of all kinds" in text
+    assert "38 + 15 events of 17 scenes" in text
+    assert "the uncertainty is" in text
+
+
+def test_the_folder_has_numbers_a_picture_and_each_run(bases: dict[str, str], tmp_path: Path) -> None:
+    found = rare_envs.risk("idm", bases=bases, out=tmp_path / "out", **FEW)
+    names = sorted(path.name for path in (tmp_path / "out").iterdir())
+    assert names == ["cut_in", "hard_brake", "risk.json", "risk.png"]
+    data = json.loads((tmp_path / "out" / "risk.json").read_text())
+    assert data["per_million_km"] == found.total.per_million_km
+    assert data["scenarios"]["cut_in"]["report"]["p"] == found.scenarios[0].report.estimate.p
+    assert data["people"][0]["count"] == 68
+    assert sum(each["share"] for each in data["shares_of_variance"]) == pytest.approx(1.0)
+    assert (tmp_path / "out" / "cut_in" / "result.json").exists()
+
+
+def test_an_ego_that_is_an_object(bases: dict[str, str]) -> None:
+    found = rare_envs.risk(Coasting(), scenarios=("hard_brake",), bases={"hard_brake": bases["hard_brake"]}, **FEW)
+    assert found.ego == "Coasting"
+    assert found.scenarios[0].report.estimate.p > 0.2
+
+
+def test_a_base_without_refits_leaves_its_error_out_and_says_so(tmp_path: Path) -> None:
+    base = write_fitted(tmp_path / "b.json", "hard_brake", refits=None)
+    found = rare_envs.risk("idm", scenarios=("hard_brake",), bases={"hard_brake": base}, **FEW)
+    assert "no refits" in found.notes[0]
+    assert {each.source for each in found.total.shares} == {"counts", "sampling"}
+    assert found.to_dict()["further_events"] is None
+
+
+def test_nothing_failed_gives_an_upper_end(tmp_path: Path) -> None:
+    base = write_fitted(tmp_path / "safe.json", "hard_brake", means=[[5.0, 100.0, 1.0]])
+    found = rare_envs.risk("idm", scenarios=("hard_brake",), bases={"hard_brake": base}, **FEW)
+    assert found.total.per_million_km == 0.0
+    assert found.total.interval_per_million_km[0] == 0.0
+    assert "nothing failed" in " ".join(found.notes)
+    assert "below" in str(found)
+    json.dumps(found.to_dict(), allow_nan=False)
+
+
+def test_events_that_do_not_determine_p_count_in_the_upper_end(tmp_path: Path, bases: dict[str, str]) -> None:
+    wide = write_fitted(tmp_path / "wide.json", "hard_brake", spread=3.0, shift=3.0)
+    found = rare_envs.risk("idm", bases={**bases, "hard_brake": wide}, **{**FEW, "max_sim": 2000})
+    cut_in, brake = (each.rate for each in found.scenarios)
+    assert not brake.determined
+    high = found.total.interval_per_million_km[1]
+    both = cut_in.interval_per_million_km[1] + brake.interval_per_million_km[1]
+    assert high == pytest.approx(both, rel=0.05)  # that of the cut-ins is at p = 1, where draws end too
+    assert "do not determine" in " ".join(found.notes)
+
+
+def test_the_spread_between_sites_widens_the_interval(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two sites whose rates differ by a factor r: the sd of the logarithm is log(r) / sqrt(2)."""
+    brake = SCENARIOS["rare_envs/HardBrake-v0"]
+    other = fitted_entries("hard_brake", shift=-0.4, provenance={"source": {"site": "another"}})
+    scenario = replace(brake, bases={"us101": fitted_entries("hard_brake"), "i80": other})
+    monkeypatch.setitem(SCENARIOS._entries, "rare_envs/HardBrake-v0", scenario)
+    one = rare_envs.risk("idm", scenarios=("hard_brake",), **FEW)
+    two = rare_envs.risk("idm", scenarios=("hard_brake",), sites=["us101", "i80"], **FEW)
+    factor = two.scenarios[0].site_factors["i80"]
+    assert one.scenarios[0].site_factors == {"i80": factor}
+    assert one.total.rates[0].site_log_sd == 0.0
+    assert two.total.rates[0].site_log_sd == pytest.approx(abs(math.log(factor)) / math.sqrt(2))
+    assert two.total.interval_per_hour[1] > one.total.interval_per_hour[1]
+    assert "sites differ by a factor" in str(one)
+
+
+def test_a_scenario_without_a_base_of_the_site_uses_its_default_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    own = {
+        "hard_brake": ("rare_envs/HardBrake-v0", ["us101"]),
+        "cut_in": ("rare_envs/CutIn-v0", ["us101", "i80"]),
+    }
+    for name, (env_id, bases) in own.items():
+        scenario = replace(SCENARIOS[env_id], bases=dict.fromkeys(bases, fitted_entries(name)))
+        monkeypatch.setitem(SCENARIOS._entries, env_id, scenario)
+    found = rare_envs.risk("idm", sites=["i80"], **FEW)
+    assert [each.base_name for each in found.scenarios] == ["i80", "us101"]
+    assert any("no base 'i80'" in note for note in found.notes)
+
+
+REFUSED = {
+    "counted twice": ({"scenarios": ("cut_in", "car_following")}, "count twice"),
+    "no scenario": ({"scenarios": ()}, "one or more"),
+    "unknown scenario": ({"scenarios": ("merge",)}, "merge"),
+    "unknown site": ({"sites": ("us102",)}, "us102"),
+    "no site": ({"sites": ()}, "site"),
+    "base of another scenario": ({"bases": {"highway": "x.json"}}, "highway"),
+    "no such base": ({"bases": {"cut_in": "x.json"}}, "x.json"),
+    "no frequency": ({"bases": {"cut_in": "highway"}}, "nobody counted"),
+    "unknown option": ({"speed": 3}, "speed"),
+    "another measure": ({"measure": "drac"}, "drac"),
+    "unknown ego": ({"ego": "imd"}, "idm"),
+}
+
+
+@pytest.mark.parametrize(("changes", "said"), REFUSED.values(), ids=REFUSED.keys())
+def test_bad_input_is_one_line_before_any_simulation(
+    bases: dict[str, str], monkeypatch: pytest.MonkeyPatch, changes: dict[str, object], said: str
+) -> None:
+    def simulated(*_: object) -> None:
+        raise AssertionError("a simulation was started")
+
+    monkeypatch.setattr(rare_envs.DrivingProblem, "evaluate", simulated)
+    arguments = {"bases": bases, **FEW, **changes}
+    with pytest.raises(BadInput, match=said) as refused:
+        rare_envs.risk(arguments.pop("ego", "idm"), **arguments)
+    assert "\n" not in str(refused.value)

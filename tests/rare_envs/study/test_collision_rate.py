@@ -1,0 +1,118 @@
+"""Rates of evaluations against the formula by hand, and what has none."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from scipy import stats
+
+from rare_envs.study import Question, prepare, run
+from rare_envs.study.collision_rate import compute_rate, describe_probability, find_frequency
+from tests.rare_envs.study.fitted_files import write_fitted
+
+
+def question(base: str, **changes) -> Question:
+    return Question(env_id="rare_envs/HardBrake-v0", base=base, method="mc", **{"max_sim": 500, **changes})
+
+
+@pytest.fixture
+def fitted(tmp_path: Path) -> str:
+    return write_fitted(tmp_path / "fitted.json", "hard_brake")
+
+
+def test_the_rate_is_p_times_the_frequency_with_the_interval_by_hand(fitted: str) -> None:
+    """42 brakings in 5.64 h; 30 refits of 40 scenes: t with 29 degrees of freedom."""
+    report = run(prepare(question(fitted)))
+    estimate, rate = report.estimate, report.rate
+    uncertainty = estimate.base_uncertainty
+    assert rate is not None and uncertainty is not None
+    assert rate.per_hour == pytest.approx(42 / 5.64 * estimate.p)
+    t = stats.t.ppf(0.975, 29)
+    base = t * math.sqrt(uncertainty.spread**2 + estimate.cov**2 + 0.2**2)
+    half = math.hypot(base, stats.norm.ppf(0.975) / math.sqrt(42))
+    assert rate.interval_per_hour[0] == pytest.approx(rate.per_hour * math.exp(-half))
+    low, _ = uncertainty.interval or (0, 0)
+    assert math.log(estimate.p / low) == pytest.approx(base)
+    assert report.to_dict()["rate"]["per_hour"] == rate.per_hour
+    assert report.no_rate == ""
+
+
+def test_without_refits_the_error_of_the_base_is_left_out(tmp_path: Path) -> None:
+    report = run(prepare(question(write_fitted(tmp_path / "b.json", "hard_brake", refits=None))))
+    assert report.rate is not None
+    variance = report.rate.log_variance
+    assert variance.base == 0.0
+    assert variance == pytest.approx((1 / 42, report.estimate.cov**2, 0.0, 0.0))
+
+
+def test_events_that_do_not_determine_p_leave_an_upper_end(tmp_path: Path) -> None:
+    base = write_fitted(tmp_path / "wide.json", "hard_brake", spread=3.0, shift=3.0)
+    report = run(prepare(question(base, max_sim=2000, gamma=0.0)))
+    uncertainty = report.estimate.base_uncertainty
+    assert uncertainty is not None and uncertainty.bound is not None
+    found = describe_probability(report.estimate)
+    assert not found.determined
+    assert found.upper == uncertainty.bound
+    assert report.rate is not None and report.rate.interval_per_hour[0] == 0.0
+
+
+def test_nothing_failed(tmp_path: Path) -> None:
+    base = write_fitted(tmp_path / "safe.json", "hard_brake", means=[[5.0, 100.0, 1.0]])
+    report = run(prepare(question(base, max_sim=100)))
+    assert report.estimate.p == 0.0
+    assert report.rate is not None and report.rate.per_hour == 0.0
+    assert report.rate.interval_per_hour[1] >= 42 / 5.64 * report.estimate.interval[1]
+
+
+REFUSED = {
+    "another measure": ({"measure": "drac"}, "--measure drac"),
+    "another threshold": ({"gamma": 1.0}, "--gamma 1"),
+    "crashes of others": ({"collisions": "any"}, "--collisions any"),
+}
+
+
+@pytest.mark.parametrize(("changes", "said"), REFUSED.values(), ids=REFUSED.keys())
+def test_what_counts_no_collisions_has_no_rate(fitted: str, changes: dict[str, object], said: str) -> None:
+    study = prepare(question(fitted))
+    study = replace(study, question=replace(study.question, **changes))
+    with pytest.raises(ValueError, match=said):
+        find_frequency(study)
+
+
+@pytest.mark.parametrize("env", ["rare_envs/Highway-v0", "rare_envs/CutIn-v0"])
+def test_scenarios_and_bases_without_counted_events_have_no_rate(env: str) -> None:
+    base = "highway" if env == "rare_envs/CutIn-v0" else None
+    study = prepare(Question(env_id=env, base=base, drivers="idm" if base is None else None, method="mc"))
+    with pytest.raises(ValueError, match="nobody counted"):
+        find_frequency(study)
+
+
+def test_a_base_without_a_frequency_has_no_rate_and_the_report_says_so(tmp_path: Path) -> None:
+    report = run(prepare(question(write_fitted(tmp_path / "b.json", "hard_brake", frequency=None), max_sim=50)))
+    assert report.rate is None
+    assert "b.json" in report.no_rate
+    data = report.to_dict()
+    assert (data["rate"], data["no_rate"]) == (None, report.no_rate)
+
+
+def test_the_mixture_of_the_refits_keeps_the_frequency(fitted: str) -> None:
+    report = run(prepare(question(fitted, ensemble=True)))
+    assert report.estimate.base_uncertainty is None
+    assert report.rate is not None
+    assert report.rate.per_hour == pytest.approx(42 / 5.64 * report.estimate.p)
+
+
+def test_scenarios_fitted_to_the_same_events_are_told_by_their_data(tmp_path: Path) -> None:
+    names = [write_fitted(tmp_path / f"{number}.json", "hard_brake") for number in range(2)]
+    names.append(write_fitted(tmp_path / "other.json", "hard_brake", provenance={"source": {"data": "others"}}))
+    names.append(write_fitted(tmp_path / "unknown.json", "hard_brake", provenance={}))
+    keys = []
+    for name in names:
+        study = prepare(question(name, max_sim=50))
+        keys.append(compute_rate(study, run(study).estimate).fitted_to)
+    assert keys[0] == keys[1] != ""
+    assert keys[2] not in ("", keys[0])
+    assert keys[3] == ""
