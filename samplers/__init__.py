@@ -9,6 +9,7 @@ from samplers.analysis.failure_modes import Share
 from samplers.analysis.ratio_uncertainty import RatioUncertainty, compute_ratio_uncertainty
 from samplers.analysis.refits import FittedBase
 from samplers.analysis.reweighting import Reweighted
+from samplers.analysis.sensitivity import Sensitivity
 from samplers.comparison import Comparison, compare
 from samplers.errors import EvaluationError
 from samplers.estimation import estimate
@@ -66,6 +67,7 @@ __all__ = [
     "Run",
     "RunArguments",
     "Sample",
+    "Sensitivity",
     "Share",
     "StandardNormal",
     "Status",

@@ -14,6 +14,7 @@ from samplers.analysis.base_uncertainty import BaseUncertainty, compute_base_unc
 from samplers.analysis.curve import Curve, compute_curve
 from samplers.analysis.failure_modes import Share, split_by_kind
 from samplers.analysis.reweighting import HasLogProb, Reweighted, find_sibling, reweight_estimate
+from samplers.analysis.sensitivity import Sensitivity, compute_sensitivity
 from samplers.method import Stepping
 from samplers.problem import Distribution, FloatArray
 from samplers.sample import Sample
@@ -277,6 +278,23 @@ class Estimate:
             right 0.00135, 50% of p
         """
         return split_by_kind(self, label, most)
+
+    def sensitivity(self, names: Sequence[str] = (), sizes: Sequence[int] = ()) -> Sensitivity:
+        """Return what p is sensitive to: parameters of the base distribution, and columns of x; no new simulations.
+
+        Where the base offers its parameters (`parameters`, `with_parameters`), d log p / d theta is the score function
+        averaged over the failing points. Where it also has refits, the spread of log p over them is split among the
+        parameters to first order, which tells what recordings would narrow the interval most.
+
+        Args:
+            names: Of the parameters of x, for the tables; x1, x2, ... by default.
+            sizes: Columns of x that each takes; one by default.
+
+        Raises:
+            ValueError: If the method gave no weighted points, nothing failed, the base is not known, or names and
+                sizes do not fit.
+        """
+        return compute_sensitivity(self, names, sizes)
 
     @property
     def proviso(self) -> str:

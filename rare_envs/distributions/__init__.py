@@ -5,6 +5,7 @@ from rare_envs.distributions.coordinate_mixture import CoordinateMixture
 from rare_envs.distributions.coordinates import ClosingSpeed, Coordinates
 from rare_envs.distributions.fitted import EventCounts, FittedDistribution, PredictiveCheck
 from rare_envs.distributions.frequency import EventFrequency
+from rare_envs.distributions.parameters import DistributionParameter, HasParameters
 from rare_envs.distributions.product import (
     BlockDistribution,
     FittedProduct,
@@ -22,10 +23,12 @@ __all__ = [
     "CoordinateMixture",
     "Coordinates",
     "Distribution",
+    "DistributionParameter",
     "EventCounts",
     "EventFrequency",
     "FittedDistribution",
     "FittedProduct",
+    "HasParameters",
     "NoiseDistribution",
     "Parameter",
     "PredictiveCheck",

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import special
 
 from rare_envs.arrays import FloatArray
+from rare_envs.distributions.parameters import (
+    RELATIVE_CHANGE,
+    DistributionParameter,
+    check_values,
+    number_columns,
+)
 
 BETA_FIELDS = ("alpha", "beta", "low", "high")
 
@@ -68,6 +75,25 @@ class BetaDistribution:
     def to_dict(self) -> dict[str, Any]:
         """Return plain lists under the names of the constructor's arguments, ready for JSON."""
         return {name: getattr(self, name).tolist() for name in BETA_FIELDS}
+
+    def parameters(self, names: Sequence[str] = (), like: object = None) -> tuple[DistributionParameter, ...]:
+        """Return the shape parameters of each variable, alpha and beta; see `HasParameters`."""
+        columns = names or number_columns(self.dim)
+        return tuple(
+            DistributionParameter(f"{shape} of {name}", float(value), RELATIVE_CHANGE * float(value), "10 %", (j,))
+            for j, name in enumerate(columns)
+            for shape, value in (("alpha", self.alpha[j]), ("beta", self.beta[j]))
+        )
+
+    def with_parameters(self, values: ArrayLike) -> BetaDistribution:
+        """Return the distribution with other shape parameters on the same ranges.
+
+        Raises:
+            ValueError: There are not two positive values for each variable.
+        """
+        shapes = np.asarray(values, dtype=np.float64)
+        check_values(shapes, 2 * self.dim)
+        return BetaDistribution(shapes[0::2], shapes[1::2], self.low, self.high)
 
     @property
     def dim(self) -> int:

@@ -12,6 +12,13 @@ from numpy.typing import ArrayLike
 from rare_envs.arrays import FloatArray
 from rare_envs.distributions.coordinates import Coordinates
 from rare_envs.distributions.mixture_conditionals import COMPONENT_FIELDS, MixtureConditionals
+from rare_envs.distributions.parameters import (
+    DistributionParameter,
+    MixtureArrays,
+    arrays_of,
+    list_mixture_parameters,
+    set_mixture_parameters,
+)
 from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
 
 
@@ -106,6 +113,22 @@ class CoordinateMixture:
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw independent points, shape (n, d), by ancestral sampling; the first rows do not depend on n."""
         return self._conditionals.sample(n, rng)
+
+    def parameters(self, names: Sequence[str] = (), like: object = None) -> tuple[DistributionParameter, ...]:
+        """Return weights, means, standard deviations and correlations of the coordinates, see `HasParameters`."""
+        return list_mixture_parameters(self._arrays, self.coordinates, names, arrays_of(like))
+
+    def with_parameters(self, values: ArrayLike) -> CoordinateMixture:
+        """Return the mixture with other values of its parameters in the same box; weights are scaled to add up to 1.
+
+        Raises:
+            ValueError: There is not one value for each parameter, or there is no such mixture.
+        """
+        return CoordinateMixture(self.coordinates, *set_mixture_parameters(self._arrays, values))
+
+    @property
+    def _arrays(self) -> MixtureArrays:
+        return MixtureArrays(self.weights, self.means, self.covariances)
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain lists: the mixture's arrays in the order of the coordinates, and the entries of these."""

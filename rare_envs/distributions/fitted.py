@@ -7,12 +7,14 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, cast
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from rare_envs.arrays import FloatArray
 from rare_envs.distributions.beta import BetaDistribution
 from rare_envs.distributions.coordinate_mixture import CoordinateMixture, pool_mixtures
 from rare_envs.distributions.frequency import EventFrequency
 from rare_envs.distributions.mixture_conditionals import COMPONENT_FIELDS
+from rare_envs.distributions.parameters import DistributionParameter, HasParameters
 from rare_envs.distributions.reading import (
     FileDistribution,
     read_distribution,
@@ -180,6 +182,21 @@ class FittedDistribution:
     def from_standard_normal(self, u: FloatArray) -> FloatArray:
         """Map from standard normal space, (n, d) -> (n, d)."""
         return self.distribution.from_standard_normal(u)
+
+    def parameters(self, names: Sequence[str] = (), like: object = None) -> tuple[DistributionParameter, ...]:
+        """Return the parameters of `distribution`, none if it offers none; see `HasParameters`."""
+        like = like.distribution if isinstance(like, FittedDistribution) else like
+        return self.distribution.parameters(names, like) if isinstance(self.distribution, HasParameters) else ()
+
+    def with_parameters(self, values: ArrayLike) -> Distribution:
+        """Return `distribution` with other values of its parameters.
+
+        Raises:
+            ValueError: It has no parameters, or not so many.
+        """
+        if not isinstance(self.distribution, HasParameters):
+            raise ValueError(f"A {type(self.distribution).__name__} has no parameters.")
+        return self.distribution.with_parameters(values)
 
     def ensemble(self) -> Distribution:
         """Return the refits as one mixture with equal weights: what they predict for the next event.

@@ -10,10 +10,17 @@ from functools import cached_property
 from typing import Any, Protocol, cast, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from rare_envs.arrays import FloatArray
 from rare_envs.distributions.fitted import FittedDistribution
+from rare_envs.distributions.parameters import (
+    DistributionParameter,
+    HasParameters,
+    check_values,
+    list_block_parameters,
+    number_columns,
+)
 from rare_envs.distributions.space import Distribution
 
 
@@ -117,6 +124,23 @@ class ProductDistribution:
     def from_standard_normal(self, u: FloatArray) -> FloatArray:
         """Map from standard normal space block by block, (n, d) -> (n, d)."""
         return np.hstack([block.from_standard_normal(part) for block, part in self._with_parts(u)])
+
+    def parameters(self, names: Sequence[str] = (), like: object = None) -> tuple[DistributionParameter, ...]:
+        """Return the parameters of the blocks that have some, see `HasParameters`."""
+        return list_block_parameters(self.blocks, names or number_columns(self.dim), like)
+
+    def with_parameters(self, values: ArrayLike) -> "ProductDistribution":
+        """Return the blocks with other values of their parameters.
+
+        Raises:
+            ValueError: There is not one value for each parameter, or a block refuses its values.
+        """
+        counts = [len(block.parameters()) if isinstance(block, HasParameters) else 0 for block in self.blocks]
+        given = np.asarray(values, dtype=np.float64)
+        check_values(given, sum(counts))
+        parts = np.split(given, np.cumsum(counts)[:-1])
+        blocks = zip(self.blocks, parts, counts, strict=True)
+        return ProductDistribution(tuple(block.with_parameters(own) if n else block for block, own, n in blocks))
 
     def _with_parts(self, points: FloatArray) -> list[tuple[Any, FloatArray]]:
         """Return each block with its columns."""

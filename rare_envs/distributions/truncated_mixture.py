@@ -8,7 +8,7 @@ result does not depend, bit for bit, on the other rows of the call.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -18,6 +18,13 @@ from numpy.typing import ArrayLike
 from rare_envs.arrays import FloatArray
 from rare_envs.distributions.coordinates import CoordinateKind, Coordinates, as_finite
 from rare_envs.distributions.mixture_conditionals import COMPONENT_FIELDS, MixtureConditionals
+from rare_envs.distributions.parameters import (
+    DistributionParameter,
+    MixtureArrays,
+    arrays_of,
+    list_mixture_parameters,
+    set_mixture_parameters,
+)
 
 MIXTURE_FIELDS = (*COMPONENT_FIELDS, "low", "high")
 
@@ -151,6 +158,27 @@ class TruncatedGaussianMixture:
             Independent points, shape (n, d), strictly inside the box.
         """
         return self._conditionals.sample(n, rng)
+
+    def parameters(self, names: Sequence[str] = (), like: object = None) -> tuple[DistributionParameter, ...]:
+        """Return weights, means, standard deviations and correlations, see `HasParameters`."""
+        return list_mixture_parameters(self._arrays, self._conditionals.coordinates, names, arrays_of(like))
+
+    def with_parameters(self, values: ArrayLike) -> TruncatedGaussianMixture:
+        """Return the mixture with other values of its parameters in the same box; weights are scaled to add up to 1.
+
+        Example:
+            >>> normal = TruncatedGaussianMixture([1.0], [[0.0]], [[[4.0]]], [-9.0], [9.0])
+            >>> normal.with_parameters([1.0, 3.0]).covariances.tolist()  # mean and standard deviation
+            [[[9.0]]]
+
+        Raises:
+            ValueError: There is not one value for each parameter, or there is no such mixture.
+        """
+        return TruncatedGaussianMixture(*set_mixture_parameters(self._arrays, values), self.low, self.high)
+
+    @property
+    def _arrays(self) -> MixtureArrays:
+        return MixtureArrays(self.weights, self.means, self.covariances)
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain lists under the names of the constructor's arguments, ready for JSON."""

@@ -15,7 +15,7 @@ from rare_envs.study.run_directory import format_json, write_failures
 from rare_envs.version import __version__
 
 COMPARISON = "comparison.json"
-UNUSED_FIELDS = ("target_cov", "replicates", "on_error")
+UNUSED_FIELDS = ("target_cov", "replicates", "on_error", "sensitivity")
 """Fields of a question that a comparison does not use."""
 
 

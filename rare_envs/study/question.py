@@ -57,6 +57,7 @@ class Question:
         also_under: Further base distributions, names or files joined by commas, under which p is stated too.
         on_error: Treatment of scenarios on which the ego fails twice: "raise" ends the run, "failure" counts them as
             failing, "bound" as failing in p and the upper end of the interval, but not in the lower end.
+        sensitivity: Whether the report says what p is sensitive to; that takes no simulations.
 
     Example:
         >>> question = Question(env_id="rare_envs/CarFollowing-v0", ego="idm", gamma=3.0, seed=1)
@@ -86,6 +87,7 @@ class Question:
     weather: bool = False
     ensemble: bool = False
     also_under: str | None = None
+    sensitivity: bool = False
 
     @property
     def run_arguments(self) -> RunArguments:

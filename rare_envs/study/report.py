@@ -63,6 +63,17 @@ class Report:
     kinds: CrashKinds = field(default_factory=CrashKinds)
     n_retried: int = 0
 
+    @cached_property
+    def sensitivity(self) -> samplers.Sensitivity | str | None:
+        """What p is sensitive to, or the reason why that is not known; None if the question does not ask for it."""
+        if not self.study.question.sensitivity:
+            return None
+        space = self.study.problem.space
+        try:
+            return self.estimate.sensitivity(space.names, space.sizes)
+        except ValueError as error:
+            return str(error)
+
     @property
     def doubtful(self) -> bool:
         """Whether the method itself warns that the number may be wrong."""
@@ -76,7 +87,9 @@ class Report:
     @property
     def notes(self) -> tuple[str, ...]:
         """Options that make no difference here, notes of the problem, and what is not known."""
-        unknown = (f"kinds of crash are not known: {self.kinds.unknown}",) if self.kinds.unknown else ()
+        unknown = [f"kinds of crash are not known: {self.kinds.unknown}"] if self.kinds.unknown else []
+        if isinstance(self.sensitivity, str):
+            unknown.append(f"sensitivity is not known: {self.sensitivity}")
         return (*self._unused_options, *self.study.problem.notes, *unknown)
 
     @cached_property
@@ -135,6 +148,7 @@ class Report:
             "n_failures": failures.total,
             "kinds": {kind: share.to_dict() for kind, share in self.kinds.shares.items()},
             "severity": None if self.kinds.severity is None else self.kinds.severity.to_dict(),
+            "sensitivity": self.sensitivity.to_dict() if isinstance(self.sensitivity, samplers.Sensitivity) else None,
             "failures": ranked,
             "n_faults": len(self.faults),
             "n_retried": self.n_retried,

@@ -1,4 +1,4 @@
-"""Folder of a run: result.json, failures.csv (and failures.npz), plot.png, faults.csv.
+"""Folder of a run: result.json, failures.csv (and failures.npz), plot.png, faults.csv, sensitivity.png.
 
 Until the run is done, its finished simulations are there too, see `rare_envs.study.journal`; `evaluate` runs it.
 """
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 import samplers
 from rare_envs.distributions.space import ScenarioSpace
+from rare_envs.study.analysis.sensitivity_plot import save_sensitivity
 from rare_envs.study.columns import MAX_SHOWN, list_columns
 from rare_envs.study.plots import save_plot
 from rare_envs.study.report import Report
@@ -23,6 +24,8 @@ from rare_envs.traffic.crash import CRASH_KINDS, NONE
 
 RESULT, FAILURES, BLOCKS, PLOT = "result.json", "failures.csv", "failures.npz", "plot.png"
 """Blocks are what a table has no room for: of more than `columns.MAX_SHOWN` values, drivers' weights and noise."""
+SENSITIVITY = "sensitivity.png"
+"""Bars of what p is sensitive to, if the question asks for it."""
 CRASH = (
     "crash",
     "striking",
@@ -59,6 +62,9 @@ def write_run(folder: Path, report: Report) -> None:
     _write_failures(folder, report)
     _write_faults(folder, report)
     save_plot(folder / PLOT, report)
+    (folder / SENSITIVITY).unlink(missing_ok=True)
+    if isinstance(report.sensitivity, samplers.Sensitivity):
+        save_sensitivity(folder / SENSITIVITY, report.sensitivity)
 
 
 def format_json(value: dict[str, Any]) -> str:

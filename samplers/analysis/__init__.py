@@ -12,6 +12,7 @@ from samplers.analysis.failure_weights import (
 )
 from samplers.analysis.ratio_uncertainty import RatioUncertainty
 from samplers.analysis.reweighting import Reweighted
+from samplers.analysis.sensitivity import Sensitivity
 
 __all__ = [
     "BaseUncertainty",
@@ -20,6 +21,7 @@ __all__ = [
     "FailureExpectation",
     "RatioUncertainty",
     "Reweighted",
+    "Sensitivity",
     "Share",
     "WeightedFailures",
     "compute_exceedance",

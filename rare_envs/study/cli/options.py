@@ -129,6 +129,10 @@ class EstimateOptions(QuestionOptions):
     target_cov: Annotated[float | None, typer.Option(help="Stop at this coefficient of variation.")] = None
     replicates: Annotated[int, typer.Option(help="Independent runs, combined by their mean.")] = 1
     on_error: Annotated[str, typer.Option(help="Where the ego fails twice: raise, failure or bound.")] = "raise"
+    sensitivity: Annotated[
+        bool,
+        typer.Option("--sensitivity", help="Show what p is sensitive to: parameters of traffic and of its model."),
+    ] = False
 
 
 @dataclass(frozen=True, kw_only=True)

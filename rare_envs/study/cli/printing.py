@@ -104,6 +104,9 @@ def print_report(report: Report, out: Path | None = None) -> None:
         console.print(f"  {'faults':<15} the ego failed twice on {len(report.faults)} scenarios; the first: {first}")
         console.print(f"  {'':<15} {report.n_retried:,} more simulations were made to find them")
     _print_failure(console, report)
+    if isinstance(report.sensitivity, samplers.Sensitivity):
+        for line in indent_lines(report.sensitivity):
+            console.print(line)
     for warning in estimate.warnings:
         console.print(f"warning: {warning}", style="yellow")
     for note in report.notes:
