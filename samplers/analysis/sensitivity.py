@@ -55,7 +55,7 @@ class Sensitivity:
         >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
         >>> found = samplers.estimate(problem, seed=0, max_sim=4000).sensitivity()
         >>> [(each.name, round(each.importance, 1)) for each in found.columns]
-        [('x1', 0.8), ('x2', 0.0)]
+        [('x1', 0.9), ('x2', 0.0)]
         >>> found.reason  # why there are no derivatives
         'the base distribution (StandardNormal) offers no parameters'
     """
@@ -82,7 +82,8 @@ class Sensitivity:
         """Return tables for people."""
         head = "change of log p if a parameter of the base changes by"
         shown = self.parameters[:SHOWN_PARAMETERS]
-        width = max(len(head), *(len(each.name) + 2 for each in (*self.columns, *shown)))
+        names = [each.name for each in self.columns] + [each.name for each in shown]
+        width = max(len(head), *(len(name) + 2 for name in names))
         lines = ["importance of the parameters of x (share of -log p; mean of u given failure)"]
         lines += [
             f"{'  ' + each.name:<{width}} {each.importance:8.3f} +- {each.error:.3f} {each.direction:+7.2f} sd"
