@@ -8,6 +8,7 @@ from samplers.analysis.failure_weights import (
     FailureExpectation,
     WeightedFailures,
     expect_over_failures,
+    expect_under_refits,
     weigh_failures,
 )
 from samplers.analysis.ratio_uncertainty import RatioUncertainty
@@ -26,5 +27,6 @@ __all__ = [
     "WeightedFailures",
     "compute_exceedance",
     "expect_over_failures",
+    "expect_under_refits",
     "weigh_failures",
 ]

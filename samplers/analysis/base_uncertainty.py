@@ -12,6 +12,7 @@ distributions is the true one (`benchmarks/uncertainty/base_coverage.py`). Anoth
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -123,26 +124,80 @@ def compute_base_uncertainty(estimate: EnsembleEstimate) -> BaseUncertainty | No
     fitted = find_fitted_base(estimate.base)
     if fitted is None:
         return None
+    sums, low_factor, reason = RefitSums(np.empty((1, 0)), np.empty((1, 0))), 1.0, ""
     try:
         sums = reweight_runs_to_refits(estimate, fitted.refits)
         low_factor = _lower_factor(estimate)
     except ValueError as error:
-        return _without_interval(estimate, fitted, RefitSums(np.empty((1, 0)), np.empty((1, 0))), str(error))
-    log_p = sums.log_p[0]
-    reason = explain_missing_spread(log_p, fitted.clusters)
-    if reason:
-        return _without_interval(estimate, fitted, sums, reason)
-    spread = float(log_p.std(ddof=1))
-    half = half_width(spread, estimate.cov, estimate.confidence, len(log_p), fitted.clusters)
-    low, high = low_factor * scale_by_exp(estimate.p, -half), min(1.0, scale_by_exp(estimate.p, half))
-    determined = spread <= MAX_SPREAD
+        reason = str(error)
+    further = estimate.ensemble_run
+    doubts = [] if further is None else [f"in the further run: {text}" for text in further.warnings]
+    return summarise_refits(
+        estimate.p,
+        estimate.cov,
+        estimate.confidence,
+        fitted,
+        sums,
+        low_factor=low_factor,
+        n_sim=0 if further is None else further.n_sim,
+        doubts=doubts,
+        reason=reason,
+    )
+
+
+def summarise_refits(
+    value: float,
+    cov: float,
+    confidence: float,
+    fitted: FittedBase,
+    sums: RefitSums,
+    *,
+    low_factor: float = 1.0,
+    largest: float = 1.0,
+    n_sim: int = 0,
+    doubts: Sequence[str] = (),
+    reason: str = "",
+) -> BaseUncertainty:
+    """Return the uncertainty of a probability, or of another expectation over failures, from its values under refits.
+
+    Args:
+        value: Under the base distribution itself.
+        cov: Its coefficient of variation.
+        confidence: Nominal coverage of the interval.
+        fitted: The base.
+        sums: Values under each refit, one row; as shares of `largest`.
+        low_factor: Factor of the lower end.
+        largest: Largest value possible, 1 for a probability.
+        n_sim: Simulations of a further run.
+        doubts: Further warnings.
+        reason: Why the values are not known.
+    """
+    log_values, ess = sums.log_p[0] + math.log(largest), sums.ess[0]
+    reason = reason or explain_missing_spread(log_values, fitted.clusters)
+    interval, expected, spread, bound = None, None, math.nan, None
+    if not reason:
+        spread = float(log_values.std(ddof=1))
+        half = half_width(spread, cov, confidence, len(log_values), fitted.clusters)
+        low, high = low_factor * scale_by_exp(value, -half), min(largest, scale_by_exp(value, half))
+        if spread <= MAX_SPREAD:
+            interval, expected = (low, high), min(largest, scale_by_exp(value, spread**2 / 2))
+        else:
+            bound = high
     return BaseUncertainty(
-        p=estimate.p,
-        interval=(low, high) if determined else None,
-        expected=min(1.0, scale_by_exp(estimate.p, spread**2 / 2)) if determined else None,
+        p=value,
+        interval=interval,
+        expected=expected,
         spread=spread,
-        bound=None if determined else high,
-        **_describe(estimate, fitted, sums),
+        bound=bound,
+        reason=reason,
+        confidence=confidence,
+        p_refits=tuple(float(each) for each in np.exp(log_values)),
+        ess_refits=tuple(float(each) for each in ess),
+        clusters=fitted.clusters,
+        fitted_to=fitted.fitted_to,
+        family=fitted.family,
+        n_sim=n_sim,
+        warnings=(*describe_coverage(ess), *doubts),
     )
 
 
@@ -194,32 +249,3 @@ def _lower_factor(estimate: WeightedEstimate) -> float:
     """Return the share of p from points that have an outcome where the others only bound p; else 1."""
     sample = require_sample(estimate)
     return 1 - no_outcome_weight(estimate, sample) / float(sample.weights[sample.f <= estimate.gamma].sum())
-
-
-def _describe(estimate: EnsembleEstimate, fitted: FittedBase, sums: RefitSums) -> dict[str, Any]:
-    """Return the fields of the result that do not depend on whether there is an interval."""
-    further = estimate.ensemble_run
-    doubts = [] if further is None else [f"in the further run: {text}" for text in further.warnings]
-    return {
-        "confidence": estimate.confidence,
-        "p_refits": tuple(float(each) for each in np.exp(sums.log_p[0])),
-        "ess_refits": tuple(float(each) for each in sums.ess[0]),
-        "clusters": fitted.clusters,
-        "fitted_to": fitted.fitted_to,
-        "family": fitted.family,
-        "n_sim": 0 if further is None else further.n_sim,
-        "warnings": (*describe_coverage(sums.ess[0]), *doubts),
-    }
-
-
-def _without_interval(estimate: EnsembleEstimate, fitted: FittedBase, sums: RefitSums, reason: str) -> BaseUncertainty:
-    """Return the result where p under the refits or their spread is not known."""
-    return BaseUncertainty(
-        p=estimate.p,
-        interval=None,
-        expected=None,
-        spread=math.nan,
-        bound=None,
-        reason=reason,
-        **_describe(estimate, fitted, sums),
-    )

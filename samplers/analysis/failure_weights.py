@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from samplers.analysis.base import WeightedEstimate, cov_inflation, require_sample
+from samplers.analysis.base_uncertainty import BaseUncertainty, summarise_refits
+from samplers.analysis.refits import RefitSums, find_fitted_base, reweight_to_refits
 from samplers.problem import FloatArray
 from samplers.sample import Sample
 from samplers.serialization import to_json_value
@@ -151,6 +153,39 @@ def expect_over_failures(
         confidence=confidence,
         cov=cov,
         per_failure=value / float(failures.weights.sum()),
+    )
+
+
+def expect_under_refits(
+    estimate: WeightedEstimate, failures: WeightedFailures, values: FloatArray, expectation: FailureExpectation
+) -> BaseUncertainty | None:
+    """Return the uncertainty of E[h(X); failure] that the events behind a fitted base leave, as that of p.
+
+    It comes from the points of the first run alone, also where p has a further run under the mixture of the refits.
+
+    Args:
+        estimate: The run.
+        failures: Its weighted failing points.
+        values: h at these points, shape (k,).
+        expectation: E[h(X); failure] under the base itself.
+
+    Returns:
+        Its `p` is the expectation; None where the base has no refits.
+    """
+    fitted = find_fitted_base(estimate.base)
+    if fitted is None:
+        return None
+    sample, largest = require_sample(estimate), float(np.max(values))
+    weights = sample.weights[sample.f <= estimate.gamma]
+    parts = np.zeros((1, failures.total))
+    parts[0, failures.rows] = values / largest * (weights.sum() / weights[failures.rows].sum())
+    sums, reason = RefitSums(np.empty((1, 0)), np.empty((1, 0))), ""
+    try:
+        sums = reweight_to_refits(estimate, fitted.refits, parts)
+    except ValueError as error:
+        reason = str(error)
+    return summarise_refits(
+        expectation.value, expectation.cov, estimate.confidence, fitted, sums, largest=largest, reason=reason
     )
 
 

@@ -13,7 +13,14 @@ import samplers
 from rare_envs.problem import DrivingProblem
 from rare_envs.study.analysis.failure_replay import MAX_REPLAYED, ReplayedFailures, replay_failures
 from rare_envs.traffic.crash import NONE, OTHERS
-from samplers.analysis import Exceedance, FailureExpectation, compute_exceedance, expect_over_failures
+from samplers.analysis import (
+    BaseUncertainty,
+    Exceedance,
+    FailureExpectation,
+    compute_exceedance,
+    expect_over_failures,
+    expect_under_refits,
+)
 from samplers.problem import FloatArray
 
 if TYPE_CHECKING:
@@ -36,6 +43,8 @@ class Severity:
     failures, as by default, it is P[collision with delta-v > v]."""
     injuries: FailureExpectation
     """Expected serious injuries per scenario, both vehicles together."""
+    injuries_base: BaseUncertainty | None
+    """Interval of the same that the events behind a fitted base distribution allow; None where it has no refits."""
     n_replayed: int
     """Failing scenarios that were simulated again for it; not in the run's n_sim."""
     n_failures: int
@@ -57,6 +66,7 @@ class Severity:
             f"collisions with delta-v {', '.join(shown)}",
             f"serious injuries (MAIS 3+) {self.injuries.value:.1e} per scenario [{low:.1e}, {high:.1e}], "
             f"{self.injuries.per_failure:.2g} per failure",
+            *("" if self.injuries_base is None else f"their {self.injuries_base}").splitlines(),
             f"from {self.n_replayed:,} of {self.n_failures:,} failing scenarios, simulated again",
         ]
         if self.unknown:
@@ -69,6 +79,7 @@ class Severity:
         return {
             "curve": {"delta_v": curve.pop("thresholds"), **curve},
             "injuries": self.injuries.to_dict(),
+            "injuries_base": None if self.injuries_base is None else self.injuries_base.to_dict(),
             "n_replayed": self.n_replayed,
             "n_failures": self.n_failures,
             "unknown": self.unknown,
@@ -134,9 +145,11 @@ def compute_severity(
         return None
     if thresholds is None:
         thresholds = np.arange(math.floor(delta_v[collided].max()) + 1.0)
+    expected = expect_over_failures(failures, injuries, estimate.confidence)
     return Severity(
         curve=compute_exceedance(estimate, failures, delta_v, thresholds),
-        injuries=expect_over_failures(failures, injuries, estimate.confidence),
+        injuries=expected,
+        injuries_base=expect_under_refits(estimate, failures, injuries, expected),
         n_replayed=int(failures.has_outcome.sum()),
         n_failures=failures.total,
         unknown=float(failures.weights[~failures.has_outcome].sum() / failures.weights.sum()),

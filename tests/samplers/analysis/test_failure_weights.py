@@ -3,7 +3,14 @@ import pytest
 from scipy import stats
 
 import samplers
-from samplers.analysis.failure_weights import choose_failures, expect_over_failures, mean_over_failures, weigh_failures
+from samplers.analysis.failure_weights import (
+    choose_failures,
+    expect_over_failures,
+    expect_under_refits,
+    mean_over_failures,
+    weigh_failures,
+)
+from tests.samplers.analysis.parametric_normal import ALPHA, fitted, run
 
 BETA = 3.0
 P = float(stats.norm.sf(BETA))
@@ -109,3 +116,39 @@ def test_bad_input_is_refused():
             expect_over_failures(failures, values)
     with pytest.raises(ValueError, match="0 at every failing point"):
         expect_over_failures(failures, np.zeros(len(failures.x)))
+
+
+def test_the_uncertainty_of_one_under_refits_is_that_of_p():
+    result = run(fitted(), max_sim=6000)
+    failures = weigh_failures(result)
+    ones = np.ones(len(failures.x))
+    found = expect_under_refits(result, failures, 2 * ones, expect_over_failures(failures, 2 * ones))
+    whole = result.base_uncertainty
+    assert found.p_refits == pytest.approx([2 * p for p in whole.p_refits])
+    assert found.spread == pytest.approx(whole.spread)
+    assert found.interval == pytest.approx(tuple(2 * end for end in whole.interval), rel=0.01)
+    assert found.expected == pytest.approx(2 * whole.expected)
+
+
+def test_expectations_under_refits_are_those_of_the_tail():
+    """E[(Z - 3)^+] = phi(3) - 3 Phi(-3) of Z = alpha . u under each refit, by its mean and variance along alpha."""
+    base = fitted()
+    result = run(base, max_sim=6000)
+    failures = weigh_failures(result, most=1500)
+    beyond = -result.sample.f[result.sample.f <= 0][failures.rows]
+    found = expect_under_refits(result, failures, beyond, expect_over_failures(failures, beyond))
+    for refit, value in zip(base.refits, found.p_refits, strict=True):
+        mean = ALPHA @ ((refit.mean - base.mean) / base.sd)
+        sd = np.sqrt(ALPHA**2 @ (refit.sd / base.sd) ** 2)
+        z = (BETA - mean) / sd
+        assert value == pytest.approx(sd * (stats.norm.pdf(z) - z * stats.norm.sf(z)), rel=0.35)
+    assert found.interval[1] / found.interval[0] > np.exp(
+        2 * 2.04 * found.spread
+    )  # t is 2.09 with 19 degrees of freedom
+
+
+def test_without_refits_there_is_no_such_uncertainty():
+    result = half_space()
+    failures = weigh_failures(result)
+    ones = np.ones(len(failures.x))
+    assert expect_under_refits(result, failures, ones, expect_over_failures(failures, ones)) is None

@@ -1,6 +1,7 @@
 """Sensitivities as tables, JSON and pictures, and what is refused."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -41,9 +42,9 @@ def test_bad_input_is_refused_in_one_line(result):
     with pytest.raises(ValueError, match=r"^No point failed \(f <= 0\): there is nothing to analyse\.$"):
         safe.sensitivity()
     with pytest.raises(ValueError, match="gave no weighted points"):
-        samplers.Estimate(**{**vars(result), "sample": None}).sensitivity()
+        replace(result, sample=None).sensitivity()
     with pytest.raises(ValueError, match="does not know its base"):
-        samplers.Estimate(**{**vars(result), "base": None}).sensitivity()
+        replace(result, base=None).sensitivity()
     with pytest.raises(ValueError, match="Expected names and sizes of 3 columns, got 2 names"):
         result.sensitivity(["a", "b"])
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import torch
 import rare_envs
 import samplers
 from rare_envs.control.idm import IDM
+from rare_envs.distributions import EventCounts, FittedDistribution
 from rare_envs.study import severity_curve
 from rare_envs.study.analysis.failure_replay import replay_failures
 from rare_envs.study.analysis.severity import Severity, compute_severity
@@ -38,8 +40,7 @@ def estimate_of(x: np.ndarray, gamma: float = 0.0) -> samplers.Estimate:
     f = np.concatenate([np.full(len(x), -1.0), np.full(9 * len(x), 5.0)])
     problem = samplers.FunctionProblem(lambda u: np.ones(len(u)), 3)
     run = samplers.estimate(problem, "mc", max_sim=100, seed=0)
-    values = {**vars(run), "p": 0.1, "cov": (9 / len(f)) ** 0.5, "sample": samplers.Sample.of_equal_draws(f, x)}
-    return samplers.Estimate(**values)
+    return replace(run, p=0.1, cov=(9 / len(f)) ** 0.5, sample=samplers.Sample.of_equal_draws(f, x))
 
 
 def test_a_coasting_ego_hits_at_half_the_closing_speed() -> None:
@@ -106,7 +107,7 @@ def test_scenarios_without_an_outcome_are_left_out_and_said(problem: rare_envs.D
     failing = np.flatnonzero(sample.f <= 0)
     f = sample.f.copy()
     f[failing[:2]] = -np.inf
-    changed = samplers.Estimate(**{**vars(run), "sample": samplers.Sample.of_equal_draws(f, sample.x)})
+    changed = replace(run, sample=samplers.Sample.of_equal_draws(f, sample.x))
     severity = severity_curve(problem, changed, thresholds=[-1.0])
     assert severity.unknown == pytest.approx(2 / len(failing))
     assert severity.curve.p[0] == pytest.approx((len(failing) - 2) / 1000)
@@ -149,10 +150,37 @@ def test_bad_input_is_refused(problem: rare_envs.DrivingProblem, plain: samplers
         severity_curve(idm, near)
     with pytest.raises(ValueError, match=r"^No point failed"):
         severity_curve(idm, samplers.estimate(idm, "mc", max_sim=100, seed=0))
-    without = samplers.Estimate(**{**vars(plain), "sample": None})
+    without = replace(plain, sample=None)
     with pytest.raises(ValueError, match="gave no weighted points"):
         severity_curve(problem, without)
     problem_that_varies = rare_envs.DrivingProblem(CUT_IN, ego=IDM(max_deceleration=1.0))
     problem_that_varies.varies = True
     with pytest.raises(ValueError, match="vary from run to run"):
         severity_curve(problem_that_varies, plain)
+
+
+def test_injuries_have_the_interval_of_a_fitted_base() -> None:
+    """Moved by refits as p is: wider than that of the sampling, and printed."""
+    plain_base = rare_envs.DrivingProblem(FOLLOWING).base
+    means = [each.name.startswith("mean") for each in plain_base.parameters()]  # type: ignore[attr-defined]
+    rng = np.random.default_rng(0)
+    values, changes = (
+        np.array([getattr(each, name) for each in plain_base.parameters()])  # type: ignore[attr-defined]
+        for name in ("value", "change")
+    )
+    refits = tuple(
+        plain_base.with_parameters(values + 0.1 * rng.standard_normal(len(values)) * changes * means)  # type: ignore[attr-defined]
+        for _ in range(20)
+    )
+    base = FittedDistribution(
+        distribution=plain_base, refits=refits, events=EventCounts(used=(40,), clusters=12), family="3 components"
+    )
+    problem = rare_envs.DrivingProblem(FOLLOWING, base=base)
+    severity = severity_curve(problem, samplers.estimate(problem, seed=0, max_sim=2500))
+    wide = severity.injuries_base
+    assert wide is not None
+    assert wide.interval is not None
+    assert wide.p == severity.injuries.value
+    assert wide.interval[0] < severity.injuries.interval[0] < severity.injuries.interval[1] < wide.interval[1]
+    assert "their base distribution 95 %" in str(severity)
+    assert severity.to_dict()["injuries_base"]["spread"] == wide.spread
