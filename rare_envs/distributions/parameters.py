@@ -172,6 +172,8 @@ def check_values(values: FloatArray, n: int) -> None:
 def name_coordinates(coordinates: Coordinates, names: Sequence[str] = ()) -> list[str]:
     """Return the coordinates of a mixture in words, in their order.
 
+    "closing to lead_speed" is the coordinate `ClosingSpeed` of that column, (speed behind - lead_speed) / sqrt(gap).
+
     Example:
         >>> name_coordinates(Coordinates([1.0, 0.0], [9.0, 1.0], ("log", "plain")), ("gap", "speed"))
         ['log gap', 'speed']
@@ -181,8 +183,7 @@ def name_coordinates(coordinates: Coordinates, names: Sequence[str] = ()) -> lis
     for j in coordinates.columns:
         kind = coordinates.kinds[j]
         if isinstance(kind, ClosingSpeed):
-            behind, gap = (columns[coordinates.names.index(each)] for each in (kind.behind, kind.gap))
-            labels.append(f"({behind} - {columns[j]}) / sqrt({gap})")
+            labels.append(f"closing to {columns[j]}")
         else:
             labels.append(f"log {columns[j]}" if kind == "log" else columns[j])
     return labels

@@ -19,6 +19,8 @@ from samplers.serialization import to_json_value
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+MIN_CORRELATION = 0.8
+"""Correlation of log p to first order with log p over the refits below which no recording is recommended."""
 SHOWN_PARAMETERS = 12
 """Rows of the table for people, and bars of the picture."""
 
@@ -108,7 +110,9 @@ class Sensitivity:
             f"{self.first_order_spread:.2f} (correlation {self.correlation:.2f}), of which {parts}"
         ]
         name = next(iter(self.shares))
-        if name != JOINT_GROUP:
+        if not self.correlation or self.correlation < MIN_CORRELATION:
+            lines.append("first order describes the refits poorly: these shares are rough")
+        elif name != JOINT_GROUP:
             lines.append(f"more recordings of {name} would narrow the interval most")
         return lines
 

@@ -26,8 +26,11 @@ from samplers.problem import FloatArray
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-SHOWN_DELTA_V = (1.0, 2.0, 5.0, 10.0, 15.0)
-"""Delta-v [m/s] at which the curve is printed."""
+DELTA_V_STEP = 0.5
+"""Step of the curve by default [m/s]."""
+SHOWN_DELTA_V = (0.5, 1.0, 2.0, 5.0, 10.0, 15.0)
+"""Delta-v [m/s] at which the curve is printed, the largest `SHOWN_THRESHOLDS` that are known."""
+SHOWN_THRESHOLDS = 3
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -41,6 +44,8 @@ class Severity:
     curve: Exceedance
     """P[failure in a collision with delta-v > v] over v [m/s], with a simultaneous band. Where all collisions are
     failures, as by default, it is P[collision with delta-v > v]."""
+    largest_delta_v: float
+    """Largest delta-v among the failures that were simulated again [m/s]."""
     injuries: FailureExpectation
     """Expected serious injuries per scenario, both vehicles together."""
     injuries_base: BaseUncertainty | None
@@ -60,13 +65,13 @@ class Severity:
             for v, p, low, high in zip(curve.thresholds, curve.p, curve.low, curve.high, strict=True)
             if v in SHOWN_DELTA_V and low > 0
         ]
-        shown = shown or ["too few collisions for a curve"]
         low, high = self.injuries.interval
+        shown = [*shown[-SHOWN_THRESHOLDS:], f"at most {self.largest_delta_v:.2g} m/s"]
         lines = [
             f"collisions with delta-v {', '.join(shown)}",
             f"serious injuries (MAIS 3+) {self.injuries.value:.1e} per scenario [{low:.1e}, {high:.1e}], "
             f"{self.injuries.per_failure:.2g} per failure",
-            *("" if self.injuries_base is None else f"their {self.injuries_base}").splitlines(),
+            *("" if self.injuries_base is None else f"their {self.injuries_base}").splitlines()[:1],
             f"from {self.n_replayed:,} of {self.n_failures:,} failing scenarios, simulated again",
         ]
         if self.unknown:
@@ -78,6 +83,7 @@ class Severity:
         curve = self.curve.to_dict()
         return {
             "curve": {"delta_v": curve.pop("thresholds"), **curve},
+            "largest_delta_v": self.largest_delta_v,
             "injuries": self.injuries.to_dict(),
             "injuries_base": None if self.injuries_base is None else self.injuries_base.to_dict(),
             "n_replayed": self.n_replayed,
@@ -108,7 +114,7 @@ def severity_curve(
     Args:
         problem: The problem that was estimated.
         estimate: Its estimate.
-        thresholds: Delta-v [m/s] at which the curve is wanted; every 1 m/s up to the largest by default.
+        thresholds: Delta-v [m/s] at which the curve is wanted; every 0.5 m/s up to the largest by default.
         most: Drive at most so many failing points again, evenly spaced among all; None for all.
 
     Raises:
@@ -144,10 +150,11 @@ def compute_severity(
     if not collided.any():
         return None
     if thresholds is None:
-        thresholds = np.arange(math.floor(delta_v[collided].max()) + 1.0)
+        thresholds = DELTA_V_STEP * np.arange(math.ceil(delta_v[collided].max() / DELTA_V_STEP) or 1)
     expected = expect_over_failures(failures, injuries, estimate.confidence)
     return Severity(
         curve=compute_exceedance(estimate, failures, delta_v, thresholds),
+        largest_delta_v=float(delta_v[collided].max()),
         injuries=expected,
         injuries_base=expect_under_refits(estimate, failures, injuries, expected),
         n_replayed=int(failures.has_outcome.sum()),

@@ -74,13 +74,13 @@ def test_names_say_coordinate_and_component() -> None:
     assert names == [
         "mean of ego_speed",
         "mean of log gap",
-        "mean of (ego_speed - lead) / sqrt(gap)",
+        "mean of closing to lead",
         "sd of ego_speed",
         "sd of log gap",
-        "sd of (ego_speed - lead) / sqrt(gap)",
+        "sd of closing to lead",
         "correlation of ego_speed and log gap",
-        "correlation of ego_speed and (ego_speed - lead) / sqrt(gap)",
-        "correlation of log gap and (ego_speed - lead) / sqrt(gap)",
+        "correlation of ego_speed and closing to lead",
+        "correlation of log gap and closing to lead",
     ]
     assert [each.columns for each in CLOSING.parameters()][:3] == [(0,), (2,), (1,)]  # of x, not of the coordinates
     assert PLAIN.parameters()[0].name == "weight of component 1"

@@ -1,5 +1,7 @@
 """Shares of the spread over refits of which only two parameters vary."""
 
+from dataclasses import replace
+
 import pytest
 
 from tests.samplers.analysis.parametric_normal import BASE, BETA, HAZARD, ParametricNormal, fitted, run
@@ -23,6 +25,11 @@ def test_shares_of_the_spread_add_up_and_name_what_varies():
     assert found.correlation > 0.97
     assert found.first_order_spread == pytest.approx(found.spread, rel=0.15)
     assert "more recordings of speed would narrow the interval most" in str(found)
+
+
+def test_nothing_is_recommended_where_first_order_is_poor():
+    found = replace(run(fitted()).sensitivity(["speed", "gap", "offset"]), correlation=0.6)
+    assert str(found).splitlines()[-1] == "first order describes the refits poorly: these shares are rough"
 
 
 def test_shares_do_not_depend_on_the_units_of_parameters():

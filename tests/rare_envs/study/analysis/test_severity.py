@@ -54,6 +54,7 @@ def test_a_coasting_ego_hits_at_half_the_closing_speed() -> None:
         sum(injury_risk(torch.tensor(v, dtype=torch.float64), mode).item() for mode in ("frontal", "rear"))
         for v in (2.0, 6.0)
     )
+    assert severity.largest_delta_v == pytest.approx(6.0, rel=0.01)
     assert severity.injuries.per_failure == pytest.approx((one + six) / 2, rel=0.01)
     assert severity.injuries.value == pytest.approx(0.1 * (one + six) / 2, rel=0.01)
 
@@ -123,7 +124,7 @@ def test_the_replay_is_shared_with_the_kinds_and_goes_to_print_and_json(
     assert isinstance(severity, Severity)
     saved = json.loads(json.dumps(report.to_dict()["severity"], allow_nan=False))
     assert saved["injuries"]["value"] == severity.injuries.value
-    assert saved["curve"]["delta_v"][:2] == [0.0, 1.0]
+    assert saved["curve"]["delta_v"][:3] == [0.0, 0.5, 1.0]
     print_report(report)
     printed = capsys.readouterr().out
     for line in str(severity).splitlines():
