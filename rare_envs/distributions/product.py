@@ -155,6 +155,16 @@ class FittedProduct(FittedDistribution):
     """Independent blocks of which one is fitted to events: its refits, with the other blocks as they are.
 
     `join_independent` makes it. Events, frequency, checks and record are those of the fitted block.
+
+    Example:
+        >>> from rare_envs.distributions import EventCounts, TruncatedGaussianMixture
+        >>> fit, refit = (TruncatedGaussianMixture([1.0], [[m]], [[[1.0]]], [-9.0], [9.0]) for m in (0.0, 0.3))
+        >>> fitted = FittedDistribution(
+        ...     distribution=fit, refits=(fit, refit), events=EventCounts(used=(40,), clusters=12), family="1 component"
+        ... )
+        >>> joined = join_independent(fitted, NoiseDistribution(2))
+        >>> type(joined).__name__, joined.dim, [each.dim for each in joined.refits], joined.fitted_to
+        ('FittedProduct', 3, [3, 3], '40 events of 12 scenes')
     """
 
     parts: tuple[Distribution, ...]

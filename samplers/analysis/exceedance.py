@@ -90,6 +90,18 @@ def compute_exceedance(
 
     Raises:
         ValueError: If v is not one number per point, or a threshold is not finite.
+
+    Example:
+        v = x_1 where x_2 > 0, in plain draws from N(0, I): Phi(-1) / 2 = 0.079 and Phi(-2) / 2 = 0.011.
+
+        >>> import samplers
+        >>> from samplers.analysis import weigh_failures
+        >>> problem = samplers.FunctionProblem(lambda x: 1.0 - x[:, 0], dim=2)
+        >>> result = samplers.estimate(problem, "mc", seed=0, max_sim=10_000)
+        >>> failures = weigh_failures(result)
+        >>> v = np.where(failures.x[:, 1] > 0, failures.x[:, 0], -np.inf)
+        >>> compute_exceedance(result, failures, v, [1.0, 2.0]).p.round(2).tolist()
+        [0.08, 0.01]
     """
     v = np.asarray(values, dtype=np.float64)
     if v.shape != failures.weights.shape or np.isnan(v).any() or np.isposinf(v).any():

@@ -22,7 +22,17 @@ from samplers.statistics.weights import effective_number
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class WeightedFailures:
-    """Failing points of a run, all or evenly spaced among them, with weights that add up to p."""
+    """Failing points of a run, all or evenly spaced among them, with weights that add up to p.
+
+    Example:
+        4 failures among 400 plain draws: p = 0.01 with a c.o.v. of sqrt((1 - p) / (400 p)).
+
+        >>> failures = WeightedFailures(
+        ...     x=np.zeros((4, 2)), rows=np.arange(4), has_outcome=np.full(4, True), weights=np.full(4, 1 / 400),
+        ...     units=np.arange(4), n_units=400, independent=True, inflation=1.0, total=4)
+        >>> round(failures.cov_of_sum(failures.weights), 4), round(math.sqrt(0.99 / 4), 4)
+        (0.4975, 0.4975)
+    """
 
     x: FloatArray
     """The points, shape (k, d)."""
@@ -60,7 +70,15 @@ class WeightedFailures:
 
 @dataclass(frozen=True, kw_only=True)
 class FailureExpectation:
-    """E[h(X); failure], the expectation of a quantity h >= 0 that is 0 where nothing fails."""
+    """E[h(X); failure], the expectation of a quantity h >= 0 that is 0 where nothing fails.
+
+    Example:
+        With p = 0.01 and E[h(X) | failure] = 2:
+
+        >>> found = FailureExpectation(value=0.02, interval=(0.01, 0.04), confidence=0.95, cov=0.35, per_failure=2.0)
+        >>> found.value / found.per_failure, found.to_dict()["interval"]
+        (0.01, [0.01, 0.04])
+    """
 
     value: float
     """The expectation, over all X."""
@@ -101,6 +119,16 @@ def weigh_failures(estimate: WeightedEstimate, most: int | None = None) -> Weigh
 
     Raises:
         ValueError: If there are no weighted points, or none failed.
+
+    Example:
+        >>> import samplers
+        >>> problem = samplers.FunctionProblem(lambda x: 2.0 - x[:, 0], dim=1)
+        >>> result = samplers.estimate(problem, "mc", seed=0, max_sim=1000)
+        >>> failures = weigh_failures(result)
+        >>> failures.total == result.failures.total, bool((failures.x >= 2.0).all())
+        (True, True)
+        >>> bool(np.allclose(failures.weights, 1 / 1000))  # plain draws
+        True
     """
     sample = require_sample(estimate)
     failing = np.flatnonzero(sample.f <= estimate.gamma)
@@ -135,6 +163,16 @@ def expect_over_failures(
 
     Raises:
         ValueError: If h is not one finite number >= 0 per point, or 0 at all of them.
+
+    Example:
+        h = 1, 1, 3, 3 at 4 failures among 400 plain draws: (1 + 1 + 3 + 3) / 400.
+
+        >>> failures = WeightedFailures(
+        ...     x=np.zeros((4, 2)), rows=np.arange(4), has_outcome=np.full(4, True), weights=np.full(4, 1 / 400),
+        ...     units=np.arange(4), n_units=400, independent=True, inflation=1.0, total=4)
+        >>> found = expect_over_failures(failures, np.array([1.0, 1.0, 3.0, 3.0]))
+        >>> round(found.value, 6), round(found.per_failure, 6)
+        (0.02, 2.0)
     """
     h = np.asarray(values, dtype=np.float64)
     if h.shape != failures.weights.shape or not (np.isfinite(h).all() and (h >= 0).all()):
@@ -171,6 +209,24 @@ def expect_under_refits(
 
     Returns:
         Its `p` is the expectation; None where the base has no refits.
+
+    Example:
+        h = 2 at every failing point, P[x >= 1] under N(0, 1) and under its refits N(-0.2, 1), N(0, 1) and N(0.2, 1):
+        2 Phi(-1.2), 2 Phi(-1) and 2 Phi(-0.8).
+
+        >>> import samplers
+        >>> from types import SimpleNamespace
+        >>> from samplers.proposals import Gaussian
+        >>> class FittedNormal(samplers.StandardNormal):
+        ...     refits = [Gaussian(np.array([mean]), np.eye(1)) for mean in (-0.2, 0.0, 0.2)]
+        ...     clusters, fitted_to, family = 17, "40 events of 17 scenes", "normal"
+        >>> problem = SimpleNamespace(dim=1, base=FittedNormal(1), evaluate=lambda x: 1.0 - x[:, 0])
+        >>> result = samplers.estimate(problem, "mc", seed=0, max_sim=10_000)
+        >>> failures = weigh_failures(result)
+        >>> h = np.full(len(failures.x), 2.0)
+        >>> found = expect_under_refits(result, failures, h, expect_over_failures(failures, h))
+        >>> [round(value, 2) for value in found.p_refits]
+        [0.23, 0.32, 0.42]
     """
     fitted = find_fitted_base(estimate.base)
     if fitted is None:

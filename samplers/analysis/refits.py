@@ -40,6 +40,15 @@ class FittedBase(Distribution, Protocol):
 
     One that is also `HasEnsemble` lets `estimate` make a further run where the points of the first do not reach the
     refits.
+
+    Example:
+        >>> import samplers
+        >>> from samplers.proposals import Gaussian
+        >>> class FittedNormal(samplers.StandardNormal):
+        ...     refits = [Gaussian(np.array([mean]), np.eye(1)) for mean in (-0.2, 0.0, 0.2)]
+        ...     clusters, fitted_to, family = 17, "40 events of 17 scenes", "normal"
+        >>> [isinstance(base, samplers.FittedBase) for base in (FittedNormal(1), samplers.StandardNormal(1))]
+        [True, False]
     """
 
     @property

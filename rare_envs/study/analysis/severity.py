@@ -39,6 +39,19 @@ class Severity:
 
     Of the two vehicles of a collision the larger delta-v counts. Injuries are those of one occupant in each of the two,
     MAIS 3 or more, see `rare_envs.traffic.crash.injury_risk`.
+
+    Example:
+        >>> curve = Exceedance(
+        ...     thresholds=np.array([1.0, 2.0]), p=np.array([2e-3, 1e-3]), low=np.array([1e-3, 4e-4]),
+        ...     high=np.array([4e-3, 2.5e-3]), confidence=0.95)
+        >>> injuries = FailureExpectation(
+        ...     value=3e-5, interval=(2e-5, 5e-5), confidence=0.95, cov=0.2, per_failure=0.015)
+        >>> print(Severity(
+        ...     curve=curve, largest_delta_v=2.6, injuries=injuries, injuries_base=None,
+        ...     n_replayed=500, n_failures=1200, unknown=0.0))
+        collisions with delta-v > 1 m/s 2.0e-03 [1.0e-03, 4.0e-03], > 2 m/s 1.0e-03 [4.0e-04, 2.5e-03], at most 2.6 m/s
+        serious injuries (MAIS 3+) 3.0e-05 per scenario [2.0e-05, 5.0e-05], 0.015 per failure
+        from 500 of 1,200 failing scenarios, simulated again
     """
 
     curve: Exceedance
