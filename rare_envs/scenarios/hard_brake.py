@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from rare_envs.distributions.space import Parameter
-from rare_envs.scenarios.base import Others, Scenario, columns, keep_straight
+from rare_envs.scenarios.base import DATA, Others, Scenario, columns, keep_straight
 from rare_envs.traffic.road import straight
 from rare_envs.traffic.state import VEHICLE_LENGTH, State
 
@@ -19,7 +19,7 @@ US101 = {
     "weights": [1.0],
     "logarithmic": [False, True, True],
     "provenance": {
-        "kind": "moments of recorded events, by python -m training.scenario_fitting.brakings",
+        "kind": "moments of recorded events, by python -m training.scenario_fitting.shipped.brakings",
         "source": "NGSIM, US 101 (Los Angeles, southbound, 15 June 2005, congested), 370 vehicles over 640 m each",
         "events": "265 brakings by 3 m/s or more; speed at their beginning, gap of the braking vehicle to its own lead "
         "at that time (nobody's who follows is recorded), strongest deceleration of positions smoothed over 1 s",
@@ -63,7 +63,7 @@ HARD_BRAKE = Scenario(
         Parameter("gap", "m", 1.0, 150.0, "initial gap from ego to lead, bumper to bumper"),
         Parameter("deceleration", "m/s^2", 0.5, 10.0, "of the lead, until it stands"),
     ),
-    bases={"us101": US101},
+    bases={"us101": DATA / "hard_brake_us101.json", "us101-all-brakings": US101},
     initial=initial,
     others=others,
     driven=driven,

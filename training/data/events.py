@@ -31,7 +31,9 @@ ASSUMED_START = 13
 """Frames from the start of a lane change to its crossing where positions across were not recorded: mean of the 42
 recorded starts on US 101 (1.3 s, standard deviation 0.9 s)."""
 
-CAR_FOLLOWING_COLUMNS = ("recording", "frame", "lane", "ego", "lead", "v_ego", "v_lead", "gap", "a_ego", "a_lead", "n")
+CAR_FOLLOWING_COLUMNS = (
+    *("recording", "frame", "lane", "ego", "lead", "v_ego", "v_lead", "gap", "a_ego", "a_lead", "n", "at_entry"),
+)
 CUT_IN_COLUMNS = (
     *("recording", "frame", "phase", "vehicle", "from_lane", "to_lane", "start_seen", "v_cutin", "lateral_speed"),
     *("ego", "v_ego", "gap_ego_cutin", "lateral_offset", "lead", "v_lead", "gap_cutin_lead"),
@@ -43,7 +45,8 @@ def car_following_events(trajectories: Trajectories) -> Events:
 
     Returns:
         The columns `CAR_FOLLOWING_COLUMNS`, each of shape (events,): speeds [m/s], accelerations [m/s^2], `gap` from
-        bumper to bumper [m], `n` frames the pair was seen for. In the order of the table: by ego, then by time.
+        bumper to bumper [m], `n` frames the pair was seen for, `at_entry` whether the ego was seen first at that frame:
+        such a pair shows following under way, not its beginning. In the order of the table: by ego, then by time.
 
     Example:
         >>> from training.data import synthetic_traffic
@@ -74,6 +77,7 @@ def car_following_events(trajectories: Trajectories) -> Events:
         "a_ego": t.acceleration[ego],
         "a_lead": t.acceleration[lead],
         "n": n,
+        "at_entry": np.isin(ego, t.track_starts()),
     }
 
 

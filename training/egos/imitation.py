@@ -52,10 +52,10 @@ CONFIG = Config(
     speed_weight=8.0,
 )
 ENCOUNTERS = (
-    EncounterSpec("cut_in", "us101", 20, 4.0),
+    EncounterSpec("cut_in", "us101-15-offsets", 20, 4.0),
     EncounterSpec("cut_in", "highway", 10, 4.0),
-    EncounterSpec("hard_brake", "us101", 8, 8.0),
-    EncounterSpec("car_following", "us101", 2, 8.0),
+    EncounterSpec("hard_brake", "us101-all-brakings", 8, 8.0),
+    EncounterSpec("car_following", "us101-gap", 2, 8.0),
     EncounterSpec("car_following", "highway", 2, 8.0),
     EncounterSpec("straight", None, 10, 30.0),
     EncounterSpec("straight", None, 2, 30.0, {"gap": 140.0, "lead_speed": 25.0}),

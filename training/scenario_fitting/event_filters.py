@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pyarrow import ArrowInvalid, csv
 
+from rare_envs.distributions.fitted import EventCounts
 from rare_envs.distributions.space import Parameter
 from samplers.problem import FloatArray
 
@@ -31,22 +32,54 @@ class EventRecipe:
     """Last of the columns, if they are fitted separately: independent of the others, from events of their own."""
     required: tuple[str, ...] = ()
     """Columns of truth values that must hold for the columns fitted separately."""
-    logarithmic: tuple[str, ...] = ()
-    """Columns whose logarithms are fitted."""
     phase: str | None = None
     """Value of the column `phase` in the rows that are used; None where the file has no such column."""
+    cluster: tuple[str, ...] = ("recording", "frame")
+    """Columns whose values together name the cluster of an event; frames count in windows of `CLUSTER_FRAMES`."""
+
+    @property
+    def joint(self) -> tuple[str, ...]:
+        """The columns that are fitted together."""
+        return self.columns[: len(self.columns) - len(self.apart)]
 
 
+@dataclass(frozen=True)
+class EventSet:
+    """Usable events of a scenario, columns in the order of its parameters.
+
+    Example:
+        >>> pairs = EventSet(np.array([[15.0, 14.0, 20.0], [15.0, 16.0, 9.0]]), np.array([0, 0]), cluster="scene")
+        >>> pairs.counts.used, pairs.counts.clusters
+        ((2,), 1)
+    """
+
+    joint: FloatArray
+    """Columns that are fitted together, shape (n, d - a)."""
+    clusters: NDArray[np.int64]
+    """Number of the cluster of each event, shape (n,): events of one scene or window of time depend on each other."""
+    apart: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
+    """The last columns, independent of the others and from m events of their own, shape (m, a)."""
+    cluster: str = "30 s window"
+    """Word for a cluster."""
+    log: tuple[Mapping[str, Any], ...] = ()
+    """What each filter dropped, see `filter_events`."""
+
+    @property
+    def counts(self) -> EventCounts:
+        """Numbers of events and of clusters."""
+        used = (len(self.joint), len(self.apart)) if self.apart.shape[1] else (len(self.joint),)
+        return EventCounts(used=used, clusters=len(np.unique(self.clusters)), cluster=self.cluster)
+
+
+CLUSTER_FRAMES = 300
+"""Frames of a window of time whose events form a cluster: 30 s."""
 EVENT_RECIPES = {
-    "car_following": EventRecipe("us101_car_following_events.csv", ("v_ego", "v_lead", "gap")),
+    "car_following": EventRecipe("car_following_events.csv", ("v_ego", "v_lead", "gap")),
     "cut_in": EventRecipe(
-        "us101_cut_in_events.csv",
+        "cut_in_events.csv",
         ("v_ego", "v_cutin", "v_lead", "gap_ego_cutin", "gap_cutin_lead", "lateral_offset"),
         apart=("lateral_offset",),
         required=("start_seen",),
-        # So few events allow one component only, and a normal distribution is not skewed as gaps are: fitted to plain
-        # gaps it has a BIC 63 higher, a quarter of its mass outside the box, and gaps that were never recorded.
-        logarithmic=("gap_ego_cutin", "gap_cutin_lead"),
         phase="start",
     ),
 }
@@ -64,8 +97,8 @@ FILTER_REASONS = {
 """Reasons of filters, by kind of filter, unit of the parameter, or its name."""
 
 
-def read_events(path: Path, recipe: EventRecipe) -> dict[str, NDArray[Any]]:
-    """Return the columns of an events file, numbers as float64 with NaN where a value is missing.
+def read_csv_columns(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
+    """Return columns of a CSV file.
 
     Raises:
         ValueError: The file cannot be read or lacks a column.
@@ -74,18 +107,25 @@ def read_events(path: Path, recipe: EventRecipe) -> dict[str, NDArray[Any]]:
         table = csv.read_csv(path)
     except (OSError, ArrowInvalid) as error:
         raise ValueError(f"Cannot read events from {path}: {error}.") from None
-    wanted = (*recipe.columns, *recipe.required, *(("phase",) if recipe.phase else ()))
-    missing = [name for name in wanted if name not in table.column_names]
+    missing = [name for name in names if name not in table.column_names]
     if missing:
         raise ValueError(f"{path} lacks the columns {', '.join(missing)}.")
-    numbers = {name: table[name].cast("float64").to_numpy() for name in recipe.columns}
-    return numbers | {name: table[name].to_numpy() for name in wanted[len(recipe.columns) :]}
+    return {name: table[name].to_numpy() for name in names}
 
 
-def filter_events(
-    events: Mapping[str, NDArray[Any]], recipe: EventRecipe, box: Sequence[Parameter]
-) -> tuple[tuple[FloatArray, FloatArray], list[dict[str, Any]]]:
-    """Return the usable events, and a record of what each filter dropped.
+def read_events(path: Path, recipe: EventRecipe) -> dict[str, NDArray[Any]]:
+    """Return the columns of an events file, numbers as float64 with NaN where a value is missing.
+
+    Raises:
+        ValueError: The file cannot be read or lacks a column.
+    """
+    others = (*recipe.required, *(("phase",) if recipe.phase else ()), *recipe.cluster)
+    events = read_csv_columns(path, (*recipe.columns, *others))
+    return events | {name: np.asarray(events[name], dtype=np.float64) for name in recipe.columns}
+
+
+def filter_events(events: Mapping[str, NDArray[Any]], recipe: EventRecipe, box: Sequence[Parameter]) -> EventSet:
+    """Return the usable events, with a record of what each filter dropped.
 
     Args:
         events: Columns of an events file.
@@ -93,9 +133,8 @@ def filter_events(
         box: Parameters of the scenario with their ranges.
 
     Returns:
-        Events of the joint columns, shape (n, d - a), and of the a columns fitted separately, shape (m, a); and per
-        filter its rule, its reason and the number of events it dropped of those that passed the filters before. The
-        filters of the separate columns come last.
+        The events; `log` has per filter its rule, its reason and the number of events it dropped of those that passed
+        the filters before. The filters of the separate columns come last.
     """
     keep = np.ones(len(events[recipe.columns[0]]), dtype=bool)
     if recipe.phase is not None:
@@ -112,20 +151,34 @@ def filter_events(
         reason = FILTER_REASONS.get(p.name, FILTER_REASONS[p.unit])
         apply(f"{p.low:g} <= {column} <= {p.high:g} {p.unit}", reason, inside)
 
-    joint = recipe.columns[: len(recipe.columns) - len(recipe.apart)]
     for column in recipe.columns:
         apply(f"{column} is given", FILTER_REASONS["missing"], ~np.isnan(events[column]))
-    for column, p in zip(joint, box, strict=False):
+    for column, p in zip(recipe.joint, box, strict=False):
         apply_range(column, p)
-    log.append({"rule": "events used", "columns": list(joint), "events": int(keep.sum())})
-    together = np.column_stack([events[column][keep] for column in joint])
+    log.append({"rule": "events used", "columns": list(recipe.joint), "events": int(keep.sum())})
+    joint, clusters = (
+        np.column_stack([events[column][keep] for column in recipe.joint]),
+        number_clusters(events, recipe),
+    )
+    clusters = clusters[keep]
     for column in recipe.required:
         apply(column, FILTER_REASONS[column], events[column].astype(bool))
-    for column, p in zip(recipe.apart, box[len(joint) :], strict=True):
+    for column, p in zip(recipe.apart, box[len(recipe.joint) :], strict=False):
         apply_range(column, p)
     if recipe.apart:
         log.append({"rule": "events used", "columns": list(recipe.apart), "events": int(keep.sum())})
-    own = np.empty((int(keep.sum()), len(recipe.apart)))
+    apart = np.empty((int(keep.sum()), len(recipe.apart)))
     for j, column in enumerate(recipe.apart):
-        own[:, j] = events[column][keep]
-    return (together, own), log
+        apart[:, j] = events[column][keep]
+    word = "scene" if recipe.cluster == ("scene",) else "30 s window"
+    return EventSet(joint, clusters, apart, word, tuple(log))
+
+
+def number_clusters(events: Mapping[str, NDArray[Any]], recipe: EventRecipe) -> NDArray[np.int64]:
+    """Return the number of the cluster of each event, shape (n,)."""
+    labels = []
+    for column in recipe.cluster:
+        values = events[column] // CLUSTER_FRAMES if column == "frame" else events[column]
+        labels.append(np.unique(values, return_inverse=True)[1].ravel())
+    clusters: NDArray[np.int64] = np.unique(np.column_stack(labels), axis=0, return_inverse=True)[1].ravel()
+    return clusters

@@ -3,173 +3,71 @@
     python -m training.scenario_fitting.fit --data DIR --out rare_envs/data
     python -m training.scenario_fitting.fit --highd DIR --out bases
 
-The first line makes the files of the package from events of US 101. The second first extracts the events of your own
-recordings: of highD, or with --ngsim, --tgsim, --i24 or --coifman of other formats (docs/data.md).
+The first line makes the files of the package from events of US 101, I-80 and I-24. The second first extracts the events
+of your own recordings: of highD, or with --ngsim, --tgsim, --i24 or --coifman of other formats (docs/data.md).
 
-Events (one per row of a CSV file) are filtered, standardised, and fitted with Gaussian mixtures with full
-covariances; the number of components is the one with the least Bayesian information criterion. Back in physical
-units the mixture is truncated to the box of the scenario's parameters. The first line also writes the two `highway`
-files, which are assembled and not fitted (`training.scenario_fitting.published_highway`).
+Events are filtered and fitted with Gaussian mixtures with full covariances. The events choose the number of components
+(by the Bayesian information criterion) and the coordinates (by that and by the likelihood of events held out). The fit
+is repeated on events drawn anew, whole scenes at a time: these refits say what the events are worth. Expected counts of
+dangerous states are compared with the recorded ones, and the frequency of the events is counted. All of it is in the
+one file of a base.
 """
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
-from types import MappingProxyType
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
 import typer
 
-from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
 from rare_envs.scenarios.registry import scenario_named
 from training.command_line import LocationOption, RecordingOptions, report_errors, run_command, spread_options
 from training.data.events import EXTRACTORS, Events, concatenate_events, write_events
 from training.data.formats.recordings import load_recordings
 from training.data.formats.text_columns import Gaps
 from training.data.trajectories import Trajectories
-from training.scenario_fitting.event_filters import EVENT_RECIPES, EventRecipe, filter_events, read_events
-from training.scenario_fitting.mixture import (
-    COVARIANCE_FLOOR,
-    EM_STARTS,
-    EVENTS_PER_COMPONENT,
-    SMALLEST_COMPONENT,
-    MixtureFit,
-    append_independent,
-    mass_outside,
-    select_mixture,
-)
+from training.scenario_fitting.base_files import FitRequest, fit_base, format_base
+from training.scenario_fitting.event_filters import EVENT_RECIPES, filter_events, read_events
+from training.scenario_fitting.own_frequency import Exposure, count_events
 from training.scenario_fitting.published_highway import build_highway_base
+from training.scenario_fitting.shipped.bases import SHIPPED_BASES, ShippedBase
 
-US101_COMMAND = "python -m training.scenario_fitting.fit --data DIR --out rare_envs/data"
+PACKAGE_COMMAND = "python -m training.scenario_fitting.fit --data DIR --out rare_envs/data"
 """Command that writes the files of the package."""
 OWN_COMMAND = "python -m training.scenario_fitting.fit, with --highd or another option of recordings"
 """Command that writes bases of a user's own recordings."""
-US101_SOURCE = {
-    "data": "Next Generation Simulation (NGSIM) Vehicle Trajectories and Supporting Data, US 101 "
-    "(Los Angeles, southbound, 15 June 2005, 07:50 local time, congested)",
-    "publisher": "U.S. Department of Transportation, Federal Highway Administration (FHWA)",
-    "record": "8ect-6jqj",
-    "licence": "CC BY-SA 3.0 (as the data's public record was reported); these parameters are "
-    "derived from the data and are offered under the same licence",
-    "changes": "events extracted from the trajectories, filtered as listed, fitted with a mixture",
-}
-"""Provenance of the events of US 101."""
 
 
-def format_base(
-    scenario: str,
-    mixture: TruncatedGaussianMixture,
-    provenance: Mapping[str, Any],
-    replaced: Mapping[str, Any] = MappingProxyType({}),
-) -> str:
-    """Return the text of a base distribution file, which `rare_envs.scenarios.base_distributions.load_base` reads.
+def fit_shipped_base(base: ShippedBase, data: Path, seed: int = 0, n_refits: int | None = None) -> str:
+    """Return the text of the file of a base of the package.
 
     Args:
-        scenario: Name of the scenario, such as "cut_in".
-        mixture: The distribution, in logarithms of those coordinates that are fitted so.
-        provenance: Provenance of the distribution.
-        replaced: Entries that replace the mixture's own: the box of x, where some coordinates are logarithms.
-    """
-    content = {
-        "names": [p.name for p in scenario_named(scenario).parameters],
-        "units": [p.unit for p in scenario_named(scenario).parameters],
-        **mixture.to_dict(),
-        **replaced,
-        "provenance": {**provenance, "mass_outside_box": mass_outside(mixture)},
-    }
-    return json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
-
-
-def fit_us101_base(scenario: str, data: Path, seed: int = 0, recipe: EventRecipe | None = None) -> str:
-    """Return the text of the base file of a scenario fitted to the events of US 101.
-
-    Args:
-        scenario: Name of the scenario, such as "cut_in".
-        data: Folder with the events files.
+        base: One of `SHIPPED_BASES`.
+        data: Folder with the compact tables.
         seed: Seed of the fits.
-        recipe: Columns and filters of the events; those in `EVENT_RECIPES` if None.
-    """
-    recipe = EVENT_RECIPES[scenario] if recipe is None else recipe
-    return fit_base(scenario, data / recipe.file, US101_SOURCE, US101_COMMAND, seed, recipe)
-
-
-def fit_base(
-    scenario: str, path: Path, source: Mapping[str, str], command: str, seed: int = 0, recipe: EventRecipe | None = None
-) -> str:
-    """Return the text of the base file of a scenario fitted to a file of events.
-
-    Args:
-        scenario: Name of the scenario, such as "cut_in".
-        path: CSV file with the columns of the recipe.
-        source: Provenance and licence of the events.
-        command: Command that writes the file.
-        seed: Seed of the fits.
-        recipe: Columns and filters of the events; those in `EVENT_RECIPES` if None.
+        n_refits: Number of refits, see `refit`.
 
     Raises:
-        ValueError: The events cannot be read, or are too few.
+        ValueError: A table cannot be read.
     """
-    recipe, box = EVENT_RECIPES[scenario] if recipe is None else recipe, scenario_named(scenario).parameters
-    (together, own), log = filter_events(read_events(path, recipe), recipe, box)
-    low, high = np.array([p.low for p in box]), np.array([p.high for p in box])
-    chosen = np.array([column in recipe.logarithmic for column in recipe.columns])
-    joint = together.shape[1]
-    together[:, chosen[:joint]] = np.log(together[:, chosen[:joint]])
-    bottom, top = (np.where(chosen, np.log(np.where(chosen, end, 1.0)), end) for end in (low, high))
-    try:
-        fit = select_mixture(together, bottom[:joint], top[:joint], seed)
-        mixture = fit.mixture
-        if recipe.apart:
-            own_fit = select_mixture(own, bottom[joint:], top[joint:], seed, most=1)
-            mixture = append_independent(mixture, own_fit.mixture)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
-    box_of_x = {"low": low.tolist(), "high": high.tolist(), "logarithmic": chosen.tolist()} if chosen.any() else {}
-    origin = {"source": source, "file": path.name, "command": command}
-    return format_base(scenario, mixture, _provenance(recipe, log, fit, seed, origin), box_of_x)
-
-
-def _provenance(
-    recipe: EventRecipe, log: Sequence[Any], fit: MixtureFit, seed: int, origin: Mapping[str, Any]
-) -> dict[str, Any]:
-    """Return the record of a fit, for the header of its file."""
-    return {
-        "kind": "fitted to recorded events",
-        "source": origin["source"],
-        "file": origin["file"],
-        "columns": list(recipe.columns),
-        "moment": "start of the lane change" if recipe.phase else "first frame of the pair",
-        "events_read": log[0]["events"],
-        "events_used": {", ".join(e["columns"]): e["events"] for e in log if e["rule"] == "events used"},
-        "filters": [entry for entry in log if "dropped" in entry],
-        "selection": [
-            {
-                "components": candidate.components,
-                "bic": round(candidate.bic, 2),
-                "events_in_smallest": round(candidate.smallest, 1),
-                "accepted": candidate.accepted,
-            }
-            for candidate in fit.candidates
-        ],
-        "settings": {
-            "covariance_floor": COVARIANCE_FLOOR,
-            "restarts": EM_STARTS,
-            "events_per_component_and_dimension": EVENTS_PER_COMPONENT,
-            "smallest_component_per_dimension": SMALLEST_COMPONENT,
-            "seed": seed,
-        },
-        "command": origin["command"],
-        "libraries": {name: version(name) for name in ("numpy", "scipy", "scikit-learn")},
-    }
+    events, frequency = base.read(data)
+    source = {**base.source, "moment": base.moment}
+    request = FitRequest(
+        base.scenario, events, source, PACKAGE_COMMAND, frequency, base.system, n_refits=n_refits, seed=seed
+    )
+    return format_base(base.scenario, fit_base(request).to_dict())
 
 
 def fit_own_bases(
-    tables: Iterable[Trajectories], scenarios: Sequence[str], out: Path, name: str, seed: int = 0
+    tables: Iterable[Trajectories],
+    scenarios: Sequence[str],
+    out: Path,
+    name: str,
+    seed: int = 0,
+    n_refits: int | None = None,
 ) -> None:
     """Extract the events of recordings and fit scenarios to them.
 
@@ -181,6 +79,7 @@ def fit_own_bases(
         out: Folder of the files.
         name: Name of the bases.
         seed: Seed of the fits.
+        n_refits: Number of refits, see `refit`.
 
     Raises:
         ValueError: A recording is broken, or the events of a scenario are too few; the file of events is written
@@ -188,23 +87,34 @@ def fit_own_bases(
     """
     out.mkdir(parents=True, exist_ok=True)
     names: set[str] = set()
+    exposure = Exposure()
     parts: list[dict[str, Events]] = []
     for table in tables:
         names |= {str(recording) for recording in np.unique(table.recording)}
+        exposure = exposure.plus(table)
         parts.append({scenario: EXTRACTORS[scenario](table) for scenario in scenarios})
     source = {
+        "site": name,
         "data": f"recordings {', '.join(sorted(names))}",
         "licence": "that of the recordings; parameters derived from them may fall under it",
-        "changes": US101_SOURCE["changes"],
     }
+    pooled = {scenario: concatenate_events([events[scenario] for events in parts]) for scenario in scenarios}
     files = {scenario: out / f"{scenario}_events.csv" for scenario in scenarios}
     for scenario, path in files.items():
-        write_events(concatenate_events([events[scenario] for events in parts]), path)
+        write_events(pooled[scenario], path)
         typer.echo(path)
     for scenario, path in files.items():
-        base = out / f"{scenario}_{name}.json"
-        base.write_text(fit_base(scenario, path, source, OWN_COMMAND, seed), encoding="utf-8")
-        typer.echo(base)
+        recipe = EVENT_RECIPES[scenario]
+        events = filter_events(read_events(path, recipe), recipe, scenario_named(scenario).parameters)
+        frequency = count_events(scenario, pooled[scenario], len(events.joint), exposure)
+        request = FitRequest(scenario, events, source, OWN_COMMAND, frequency, n_refits=n_refits, seed=seed)
+        try:
+            base = fit_base(request)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
+        _write(out / f"{scenario}_{name}.json", format_base(scenario, base.to_dict()))
+        if not base.refits:
+            typer.echo(f"{base.fitted_to}: too few to say how far they determine {scenario}; no refits", err=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -225,34 +135,41 @@ def main(
     out: Annotated[Path, typer.Option(help="Folder for the JSON files.")],
     recordings: EventOptions,
     cut_gaps: Annotated[bool, typer.Option("--cut-gaps", help="Cut tracks where frames are missing.")] = False,
-    scenario: Annotated[list[str] | None, typer.Option(help="Of your own recordings: which to fit.")] = None,
+    scenario: Annotated[list[str] | None, typer.Option(help="Which to fit; all if none is named.")] = None,
     name: Annotated[str, typer.Option(help="Name of the bases of your own recordings.")] = "own",
+    refits: Annotated[int | None, typer.Option(help="Refits: 30, or 100 where their components differ.", min=2)] = None,
     seed: Annotated[int, typer.Option(help="Seed of the fits.", min=0)] = 0,
 ) -> None:
-    """Write base distributions: us101 (fitted) and highway (assembled), or those of your own recordings."""
+    """Write base distributions: those of the package, or those of your own recordings."""
     with report_errors("fit"):
         kind, path = recordings.kind_and_path()
-        chosen = tuple(scenario or EVENT_RECIPES)
-        if unknown := sorted(set(chosen) - set(EVENT_RECIPES)):
-            raise ValueError(f"Unknown scenario {unknown[0]}; known are {', '.join(EVENT_RECIPES)}.")
+        known = tuple(EVENT_RECIPES) if kind != "data" else tuple(dict.fromkeys(b.scenario for b in SHIPPED_BASES))
+        chosen = tuple(scenario or known)
+        if unknown := sorted(set(chosen) - set(known)):
+            raise ValueError(f"Unknown scenario {unknown[0]}; known are {', '.join(known)}.")
         gaps: Gaps = "cut" if cut_gaps else "error"
         if kind == "data":
-            _write_package_bases(path, out, seed)
+            _write_package_bases(path, chosen, out, seed, refits)
         else:
             tables = load_recordings(kind, path, location=recordings.location, between=recordings.between, gaps=gaps)
-            fit_own_bases(tables, chosen, out, name, seed)
+            fit_own_bases(tables, chosen, out, name, seed, refits)
 
 
-def _write_package_bases(data: Path, out: Path, seed: int) -> None:
-    """Write the bases of the package."""
-    texts = {}
-    for scenario in EVENT_RECIPES:
-        texts[f"{scenario}_us101.json"] = fit_us101_base(scenario, data, seed)
-        texts[f"{scenario}_highway.json"] = format_base(scenario, *build_highway_base(scenario))
-    out.mkdir(parents=True, exist_ok=True)
-    for name, text in texts.items():
-        (out / name).write_text(text, encoding="utf-8")
-        typer.echo(out / name)
+def _write_package_bases(data: Path, scenarios: Sequence[str], out: Path, seed: int, n_refits: int | None) -> None:
+    """Write the bases of the package, each as soon as it is fitted."""
+    for base in SHIPPED_BASES:
+        if base.scenario in scenarios:
+            text = fit_shipped_base(base, data, seed, n_refits)
+            _write(out / base.file, text)
+    for scenario in ("car_following", "cut_in"):
+        if scenario in scenarios:
+            _write(out / f"{scenario}_highway.json", format_base(scenario, build_highway_base(scenario)))
+
+
+def _write(path: Path, text: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="utf-8")
+    typer.echo(path)
 
 
 if __name__ == "__main__":

@@ -14,9 +14,12 @@ from typing import Any
 
 import numpy as np
 
+from rare_envs.distributions.coordinate_mixture import CoordinateMixture
+from rare_envs.distributions.coordinates import CoordinateKind, Coordinates
 from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
 from rare_envs.scenarios.registry import scenario_named
 from samplers.problem import FloatArray
+from training.scenario_fitting.base_files import mass_outside
 
 CAR_SPEED = 30.0
 """Speed of cars [m/s], published for highD."""
@@ -121,14 +124,20 @@ SITUATIONS: dict[str, tuple[TrafficSituation, ...]] = {
 """Situations of each scenario, the components of its mixture."""
 
 
-def build_highway_base(scenario: str) -> tuple[TruncatedGaussianMixture, dict[str, Any]]:
-    """Return the assembled mixture of a scenario and its provenance."""
+def build_highway_base(scenario: str) -> dict[str, Any]:
+    """Return the entries of the assembled base of a scenario, its provenance included."""
     components, box = SITUATIONS[scenario], scenario_named(scenario).parameters
-    mixture = TruncatedGaussianMixture(
+    low, high = np.array([p.low for p in box]), np.array([p.high for p in box])
+    arrays = (
         np.array([component.weight for component in components]),
         np.array([component.mean for component in components]),
         np.array([component.covariance() for component in components]),
-        np.array([p.low for p in box]),
-        np.array([p.high for p in box]),
     )
-    return mixture, {**PROVENANCE, "components": [component.meaning for component in components]}
+    kinds: list[CoordinateKind] = ["plain" for _ in box]
+    plain = Coordinates(low, high, tuple(kinds))
+    provenance = {
+        **PROVENANCE,
+        "components": [component.meaning for component in components],
+        "mass_outside_box": mass_outside(CoordinateMixture(plain, *arrays)),
+    }
+    return {**TruncatedGaussianMixture(*arrays, low, high).to_dict(), "provenance": provenance}

@@ -17,7 +17,7 @@ def make_space():
         units=tuple(p.unit for p in box),
         low=np.array([p.low for p in box for _ in range(p.size)]),
         high=np.array([p.high for p in box for _ in range(p.size)]),
-        base=load_base(scenario_named("cut_in"), "us101"),
+        base=load_base(scenario_named("cut_in"), "us101-15-offsets"),
         sizes=tuple(p.size for p in box),
     )
 
@@ -92,6 +92,6 @@ def test_bad_options_are_refused(options, message):
 
 
 def test_space_checks_its_own_lengths():
-    base = load_base(scenario_named("car_following"), "us101")
+    base = load_base(scenario_named("car_following"), "us101-gap")
     with pytest.raises(ValueError, match="2 names, 3 units"):
         ScenarioSpace(("a", "b"), ("m", "m", "m"), np.zeros(3), np.ones(3), base)

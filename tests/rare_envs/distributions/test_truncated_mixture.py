@@ -9,6 +9,7 @@ from scipy import stats
 from scipy.special import ndtri_exp
 
 from rare_envs.distributions.coordinate_mixture import CoordinateMixture
+from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.mixture_conditionals import CHUNK_ROWS
 from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
 from rare_envs.scenarios.base_distributions import load_base
@@ -175,6 +176,7 @@ def test_round_trips_of_shipped_bases(scenario, base):
 
 def of_coordinates(law):
     """The mixture of the coordinates, plain or logarithms, in their box."""
+    law = law.distribution if isinstance(law, FittedDistribution) else law
     if isinstance(law, TruncatedGaussianMixture):
         return law
     low, high = law.coordinates.to_coordinates(np.stack([law.low, law.high]))
@@ -187,6 +189,7 @@ LAWS += [
     # the floats of a mixture with logarithms are those of its logarithms
     pytest.param(of_coordinates(law), id="-".join(pair))
     for law, pair in zip(SHIPPED_LAWS, SHIPPED, strict=True)
+    if "closing_behind" not in str(law.to_dict())  # these have a range of their own in each row
 ]
 
 

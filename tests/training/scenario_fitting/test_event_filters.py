@@ -9,7 +9,7 @@ from training.scenario_fitting.event_filters import EVENT_RECIPES, filter_events
 
 
 def write_events(path, rows):
-    columns = ["phase", *EVENT_RECIPES["cut_in"].columns, "start_seen"]
+    columns = ["phase", *EVENT_RECIPES["cut_in"].columns, "start_seen", "recording", "frame"]
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(columns)
@@ -24,20 +24,24 @@ def test_filters_drop_and_count(tmp_path):
     write_events(
         path,
         [
-            ["start", *GOOD, True],
-            ["crossing", *GOOD, True],
-            ["start", *GOOD, False],
-            ["start", "", *GOOD[1:], True],  # no ego
-            ["start", *GOOD[:3], -2.0, *GOOD[4:], True],  # side by side
-            ["start", *GOOD[:5], 1.5, True],  # bodies overlap across
-            ["start", 16.0, *GOOD[1:], True],
+            ["start", *GOOD, True, "a", 299],
+            ["crossing", *GOOD, True, "a", 299],
+            ["start", *GOOD, False, "a", 300],
+            ["start", "", *GOOD[1:], True, "a", 1],  # no ego
+            ["start", *GOOD[:3], -2.0, *GOOD[4:], True, "a", 1],  # side by side
+            ["start", *GOOD[:5], 1.5, True, "b", 10],  # bodies overlap across
+            ["start", 16.0, *GOOD[1:], True, "a", 10],
         ],
     )
     recipe, box = EVENT_RECIPES["cut_in"], scenario_named("cut_in").parameters
-    (points, offsets), log = filter_events(read_events(path, recipe), recipe, box)
+    events = filter_events(read_events(path, recipe), recipe, box)
+    points, offsets, log = events.joint, events.apart, events.log
     # speeds and gaps count even where the offset at the start was not seen or is out of range
     assert points.tolist() == [GOOD[:5], GOOD[:5], GOOD[:5], [16.0, *GOOD[1:5]]]
     assert offsets.tolist() == [[3.0], [3.0]]
+    # 30 s windows: frame 299 of a, frame 300 of a, frame 10 of b, frame 10 of a
+    assert (events.clusters == events.clusters[[0, 3]][:, None]).tolist() == [[True, False, False, True]] * 2
+    assert (events.counts.used, events.counts.clusters, events.counts.cluster) == ((4, 2), 3, "30 s window")
     assert log[0]["events"] == 6
     assert [entry["events"] for entry in log if entry["rule"] == "events used"] == [4, 2]
     dropped = {entry["rule"]: entry["dropped"] for entry in log if entry.get("dropped")}

@@ -29,7 +29,8 @@ from training.data.windows import scenes_of
 from training.scenario_fitting import fit as fit_scenarios
 from training.scenario_fitting import mixture as mixture_fit
 from training.scenario_fitting.event_filters import EVENT_RECIPES
-from training.scenario_fitting.fit import fit_us101_base
+from training.scenario_fitting.fit import fit_shipped_base
+from training.scenario_fitting.shipped.bases import SHIPPED_BASES
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +46,7 @@ def quick(monkeypatch):
 def run_cli(*arguments):
     app = Typer()
     app.command()(fit_scenarios.main)
-    return CliRunner().invoke(app, [str(a) for a in arguments])
+    return CliRunner().invoke(app, [str(a) for a in (*arguments, "--refits", 2)])
 
 
 def shipped(name):
@@ -153,39 +154,45 @@ def test_bad_data_folder_is_one_line_and_exit_code_2(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("scenario", EVENT_RECIPES)
-def test_fitted_files_say_where_they_come_from(scenario):
-    provenance = shipped(f"{scenario}_us101.json")["provenance"]
-    assert provenance["source"]["record"] == "8ect-6jqj"
-    assert "CC BY-SA 3.0" in provenance["source"]["licence"]
-    dropped = sum(entry["dropped"] for entry in provenance["filters"])
-    assert provenance["events_read"] - dropped == min(provenance["events_used"].values())
-    best = min((c for c in provenance["selection"] if c["accepted"]), key=lambda c: c["bic"])
-    assert best["components"] == len(shipped(f"{scenario}_us101.json")["weights"])
+@pytest.mark.parametrize("base", SHIPPED_BASES, ids=lambda base: f"{base.scenario}-{base.name}")
+def test_shipped_files_say_what_they_are_worth(base):
+    file = shipped(base.file)
+    record = file["provenance"]
+    assert {"site", "data", "licence", "moment"} <= set(record["source"])
+    best = min((s for s in record["selection"]), key=lambda s: s["bic"])
+    own = next(s for s in record["selection"] if s["coordinates"] == record["coordinates"])
+    assert record["bic"] == own["bic"]
+    chosen = min((c for c in own["components"] if c["accepted"]), key=lambda c: c["bic"])
+    assert chosen["number"] == len(file["weights"])
+    assert (base.system or best["coordinates"]) == record["coordinates"]
+    fitted = load_base(scenario_named(base.scenario), base.name)
+    components = {len(refit.weights) for refit in fitted.refits}
+    assert len(fitted.refits) == (30 if len(components) == 1 else 100)
+    assert fitted.frequency.per_hour > 0.0
 
 
 def test_the_offset_of_a_cut_in_is_fitted_apart():
-    file = shipped("cut_in_us101.json")
-    assert list(file["provenance"]["events_used"].values()) == [38, 15]
-    assert file["logarithmic"] == [False, False, False, True, True, False]
-    covariance = np.array(file["covariances"][0])
+    base = load_base(scenario_named("cut_in"), "us101-15-offsets")
+    assert base.events.used == (38, 15)
+    covariance = np.array(base.distribution.covariances[0])
     assert (covariance[5, :5] == 0.0).all()
     assert (covariance[:5, :5] != 0.0).all()
 
 
-@needs_data(EVENT_RECIPES["cut_in"].file)
-@pytest.mark.parametrize("scenario", [pytest.param("car_following", marks=pytest.mark.slow), "cut_in"])
-def test_fit_of_the_recorded_events_is_the_shipped_file(scenario):
-    """Up to the last digits, which other library versions may round differently."""
-    written = json.loads(fit_us101_base(scenario, DATA))
-    expected = shipped(f"{scenario}_us101.json")
-    for key in ("weights", "means", "covariances"):
-        np.testing.assert_allclose(written.pop(key), expected.pop(key), rtol=1e-4, atol=1e-4)
+@needs_data("us101_cut_in_events.csv", "lane_change_profiles.parquet")
+@pytest.mark.parametrize(
+    "base",
+    [pytest.param(b, marks=pytest.mark.slow if b.scenario == "car_following" else ()) for b in SHIPPED_BASES],
+    ids=lambda base: f"{base.scenario}-{base.name}",
+)
+def test_fit_of_the_recorded_events_is_the_shipped_file(base):
+    """Up to the last digits, which other library versions may round differently; two of the refits."""
+    written, expected = json.loads(fit_shipped_base(base, DATA, n_refits=2)), shipped(base.file)
+    for one, other in [(written, expected), *zip(written.pop("refits"), expected.pop("refits")[:2], strict=True)]:
+        for key in ("weights", "means", "covariances"):
+            np.testing.assert_allclose(one.pop(key), other.pop(key), rtol=1e-4, atol=1e-4)
     new, old = written.pop("provenance"), expected.pop("provenance")
     assert written == expected
-    for key in ("source", "filters", "events_read", "events_used", "settings", "command"):
+    assert new["bic"] == pytest.approx(old["bic"], abs=0.1)
+    for key in ("source", "filters", "settings", "command", "coordinates"):
         assert new[key] == old[key]
-    # The best fits agree; those that were not chosen may have stopped at another local optimum.
-    assert [c["components"] for c in new["selection"]] == [c["components"] for c in old["selection"]]
-    best = [min(c["bic"] for c in p["selection"] if c["accepted"]) for p in (new, old)]
-    assert best[0] == pytest.approx(best[1], abs=0.1)

@@ -1,11 +1,17 @@
-"""Fitted mixtures: known truth, determinism, collapsed components, mass outside the box."""
+"""Fitted mixtures: known truth, determinism, collapsed components, the criterion in units of the points."""
 
 import numpy as np
 import pytest
 
 from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
 from training.scenario_fitting import mixture as mixture_fit
-from training.scenario_fitting.mixture import COVARIANCE_FLOOR, SMALLEST_COMPONENT, mass_outside, select_mixture
+from training.scenario_fitting.mixture import (
+    COVARIANCE_FLOOR,
+    SMALLEST_COMPONENT,
+    Components,
+    append_independent,
+    select_mixture,
+)
 
 TRUTH = TruncatedGaussianMixture(
     [0.65, 0.35],
@@ -24,13 +30,13 @@ def quick(monkeypatch):
 
 def fit_truth(n, seed=0):
     points = TRUTH.sample(n, np.random.default_rng(1))
-    return select_mixture(points, TRUTH.low, TRUTH.high, seed)
+    return select_mixture(points, seed)
 
 
 def test_fit_recovers_a_known_mixture(quick):
     n = 2000
     fit = fit_truth(n)
-    mixture = fit.mixture
+    mixture = fit.components
     assert len(mixture.weights) == 2
     assert abs(mixture.weights[0] - 0.65) < 4.0 * np.sqrt(0.65 * 0.35 / n)
     counts = n * TRUTH.weights
@@ -44,7 +50,8 @@ def test_fit_recovers_a_known_mixture(quick):
 
 
 def test_fit_is_deterministic(quick):
-    assert fit_truth(300).mixture.to_dict() == fit_truth(300).mixture.to_dict()
+    for one, other in zip(fit_truth(300).components, fit_truth(300).components, strict=True):
+        assert np.array_equal(one, other)
 
 
 def test_a_component_on_a_handful_of_events_is_rejected(quick):
@@ -52,27 +59,42 @@ def test_a_component_on_a_handful_of_events_is_rejected(quick):
     few = 2 * SMALLEST_COMPONENT - 4
     far = np.array([60.0, 60.0]) + 0.01 * rng.standard_normal((few, 2))
     points = np.concatenate([rng.standard_normal((200, 2)), far])
-    fit = select_mixture(points, np.full(2, -99.0), np.full(2, 99.0))
+    fit = select_mixture(points)
     second = fit.candidates[1]
     assert second.smallest == pytest.approx(few)
     assert second.bic < fit.candidates[0].bic
     assert not second.accepted
     chosen = min((c for c in fit.candidates if c.accepted), key=lambda c: c.bic)
-    assert len(fit.mixture.weights) == chosen.components
+    assert len(fit.components.weights) == chosen.components
 
 
 def test_few_events_get_one_component_and_too_few_an_error():
     points = np.random.default_rng(0).standard_normal((15, 6))
-    assert len(select_mixture(points, np.full(6, -9.0), np.full(6, 9.0)).candidates) == 1
+    assert len(select_mixture(points).candidates) == 1
     with pytest.raises(ValueError, match="6 events are too few to fit 6 parameters"):
-        select_mixture(points[:6], np.full(6, -9.0), np.full(6, 9.0))
+        select_mixture(points[:6])
     points[:, 2] = 1.0
     with pytest.raises(ValueError, match="Parameter 2 is the same in all 15 events"):
-        select_mixture(points, np.full(6, -9.0), np.full(6, 9.0))
+        select_mixture(points)
 
 
-def test_mass_outside_of_a_known_box():
-    mixture = TruncatedGaussianMixture([1.0], [[0.0, 0.0]], [np.eye(2)], [-1.0, -9.0], [9.0, 9.0])
-    mass = mass_outside(mixture)
-    assert abs(mass["any"] - 0.15865525) < 4.0 * mass["standard_error"]
-    assert mass["each"] == pytest.approx([0.15865525, 0.0], abs=1e-3)
+def test_the_criterion_is_in_units_of_the_points(quick):
+    """In units ten times as small, each of n densities in two dimensions is 100 times as small."""
+    points = TRUTH.sample(100, np.random.default_rng(2))
+    fine, coarse = select_mixture(points), select_mixture(10.0 * points)
+    assert coarse.bic - fine.bic == pytest.approx(2.0 * 100 * np.log(100.0))
+
+
+def test_one_component_has_the_criterion_of_its_own_likelihood(monkeypatch):
+    monkeypatch.setattr(mixture_fit, "COVARIANCE_FLOOR", 0.0)
+    points = np.random.default_rng(3).normal(5.0, 2.0, (40, 1))
+    log_likelihood = -0.5 * 40 * (np.log(2.0 * np.pi * points.var()) + 1.0)
+    assert select_mixture(points, most=1).bic == pytest.approx(-2.0 * log_likelihood + 2.0 * np.log(40))
+
+
+def test_independent_parts_stand_side_by_side():
+    joint = Components(np.array([0.6, 0.4]), np.array([[1.0], [2.0]]), np.array([[[4.0]], [[9.0]]]))
+    apart = Components(np.array([1.0]), np.array([[3.0]]), np.array([[[0.25]]]))
+    both = append_independent(joint, apart)
+    assert both.means.tolist() == [[1.0, 3.0], [2.0, 3.0]]
+    assert both.covariances.tolist() == [[[4.0, 0.0], [0.0, 0.25]], [[9.0, 0.0], [0.0, 0.25]]]

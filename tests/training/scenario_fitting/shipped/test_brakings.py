@@ -6,7 +6,12 @@ import pytest
 from rare_envs.scenarios.hard_brake import US101
 from tests.training.shared_data import DATA, needs_data
 from training.data.ngsim_tables import VEHICLES_FILE
-from training.scenario_fitting.brakings import find_brakings, load_brakings, log_moments
+from training.scenario_fitting.shipped.brakings import (
+    find_brakings,
+    find_standstill_brakings,
+    load_brakings,
+    log_moments,
+)
 
 
 def track(deceleration, seconds, speed=20.0, gap=30.0, before=5.0, after=5.0):
@@ -39,8 +44,25 @@ def test_moments_by_hand():
 
 @needs_data(VEHICLES_FILE)
 def test_the_shipped_moments_are_the_recorded_ones():
-    events = load_brakings(DATA)
+    events = load_brakings(DATA).events
     assert len(events) == 265
     mean, covariance = log_moments(events)
     np.testing.assert_allclose(mean, US101["means"][0], atol=1e-4)
     np.testing.assert_allclose(covariance, US101["covariances"][0], atol=1e-4)
+
+
+@pytest.mark.parametrize(("final", "expected"), [(0.5, 1), (5.0, 0)])
+def test_only_brakings_to_a_standstill(final, expected):
+    deceleration, speed = 2.5, 12.0
+    found = find_standstill_brakings(*track(deceleration, (speed - final) / deceleration, speed=speed, after=8.0))
+    assert len(found) == expected
+    if expected:
+        np.testing.assert_allclose(found[0], [speed, 30.0, deceleration], rtol=0.06)
+
+
+@needs_data(VEHICLES_FILE)
+def test_recorded_brakings_to_a_standstill():
+    brakings = load_brakings(DATA, find_standstill_brakings)
+    assert len(brakings.events) == len(brakings.vehicles) == 45
+    assert brakings.hours == pytest.approx(5.95, abs=0.01)
+    assert 200.0 < brakings.km < 250.0

@@ -1,6 +1,6 @@
 """Recorded brakings, and the moments from which the base distribution of the hard-brake scenario is made.
 
-    python -m training.scenario_fitting.brakings DATA
+    python -m training.scenario_fitting.shipped.brakings DATA
 
 DATA is the folder with the compact table of single vehicles on US 101 (docs/data.md). Prints the number of brakings,
 and means and covariances of speed, log gap and log deceleration.
@@ -8,16 +8,19 @@ and means and covariances of speed, log gap and log deceleration.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import typer
+from numpy.typing import NDArray
 
 from rare_envs.traffic.state import VEHICLE_LENGTH
 from samplers.problem import FloatArray
 from training.command_line import run_command
 from training.data.ngsim_tables import VEHICLES_FILE, read_columns
+from training.data.smoothing import CUTOFF_ALONG, smooth_positions
 from training.data.trajectories import DT
 
 POSITION_WINDOW = 11
@@ -28,8 +31,23 @@ BRAKING_ONSET = 0.5
 """Deceleration [m/s^2] above which a vehicle brakes."""
 MIN_SPEED_LOSS = 3.0
 """Least loss of speed [m/s] of a braking that counts."""
+STANDSTILL_SPEED = 1.0
+"""Speed at the end of a braking [m/s] below which it counts as one to a standstill."""
 END_TICKS = 10
 """Number of ticks at both ends of a track in which means are incomplete."""
+
+
+class Brakings(NamedTuple):
+    """Brakings of many vehicles, and for how long and how far these were recorded."""
+
+    events: FloatArray
+    """Speed and gap at the beginning [m/s, m], strongest deceleration [m/s^2], shape (n, 3)."""
+    vehicles: NDArray[np.int64]
+    """Vehicle of each, shape (n,)."""
+    hours: float
+    """Time [h]."""
+    km: float
+    """Distance [km]."""
 
 
 def find_brakings(position: FloatArray, headway: FloatArray) -> FloatArray:
@@ -49,6 +67,27 @@ def find_brakings(position: FloatArray, headway: FloatArray) -> FloatArray:
     speed = np.convolve(speed, np.ones(POSITION_WINDOW) / POSITION_WINDOW, "same")
     acceleration = np.convolve(np.gradient(speed, DT), np.ones(ACCELERATION_WINDOW) / ACCELERATION_WINDOW, "same")
     gap = headway[half:-half] - VEHICLE_LENGTH
+    return _describe_brakings(speed, acceleration, gap, np.inf)
+
+
+def find_standstill_brakings(position: FloatArray, headway: FloatArray) -> FloatArray:
+    """Return the brakings of one vehicle that end in a standstill, from positions smoothed as those of the drivers.
+
+    Args:
+        position: Position along the road at consecutive ticks [m], shape (T,).
+        headway: Distance from front to front to the vehicle's leader [m], NaN without one, shape (T,).
+
+    Returns:
+        Speed and gap at the beginning [m/s, m] and strongest deceleration [m/s^2], shape (n, 3).
+    """
+    if len(position) < 2 * END_TICKS + 2 * POSITION_WINDOW:
+        return np.empty((0, 3))
+    speed = np.gradient(smooth_positions(position, CUTOFF_ALONG, DT), DT)
+    return _describe_brakings(speed, np.gradient(speed, DT), headway - VEHICLE_LENGTH, STANDSTILL_SPEED)
+
+
+def _describe_brakings(speed: FloatArray, acceleration: FloatArray, gap: FloatArray, final: float) -> FloatArray:
+    """Return speed and gap at the beginning and strongest deceleration of brakings to a speed under `final` [m/s]."""
     braking = acceleration < -BRAKING_ONSET
     braking[:END_TICKS] = braking[len(braking) - END_TICKS :] = False
     edges = np.flatnonzero(np.diff(braking.astype(np.int8)))
@@ -56,28 +95,32 @@ def find_brakings(position: FloatArray, headway: FloatArray) -> FloatArray:
     brakings = [
         (speed[first], gap[first], -acceleration[first:end].min())
         for first, end in spans
-        if speed[first] - speed[end] >= MIN_SPEED_LOSS and gap[first] > 1.0
+        if speed[first] - speed[end] >= MIN_SPEED_LOSS and speed[end] < final and gap[first] > 1.0
     ]
     return np.array(brakings).reshape(-1, 3)
 
 
-def load_brakings(folder: Path) -> FloatArray:
-    """Return the brakings of all vehicles of the table, shape (n, 3).
+def load_brakings(folder: Path, find: Callable[[FloatArray, FloatArray], FloatArray] = find_brakings) -> Brakings:
+    """Return the brakings of all vehicles of the table.
 
     Args:
         folder: Folder with the compact table of single vehicles.
+        find: Finds those of one track, `find_brakings` or `find_standstill_brakings`.
 
     Raises:
         ValueError: The table is missing or cannot be read.
     """
     table = read_columns(folder / VEHICLES_FILE, ("vehicle", "frame", "y_along", "space_headway"))
-    parts = []
+    parts, vehicles, ticks, metres = [np.empty((0, 3))], [np.empty(0, dtype=np.int64)], 0, 0.0
     for vehicle in np.unique(table["vehicle"]):
         rows = np.flatnonzero(table["vehicle"] == vehicle)
         rows = rows[np.argsort(table["frame"][rows], kind="stable")]
         for track in np.split(rows, np.flatnonzero(np.diff(table["frame"][rows]) != 1) + 1):
-            parts.append(find_brakings(table["y_along"][track], table["space_headway"][track]))
-    return np.concatenate(parts)
+            position = table["y_along"][track]
+            parts.append(find(position, table["space_headway"][track]))
+            vehicles.append(np.full(len(parts[-1]), vehicle, dtype=np.int64))
+            ticks, metres = ticks + len(track), metres + float(position[-1] - position[0])
+    return Brakings(np.concatenate(parts), np.concatenate(vehicles), ticks * DT / 3600.0, metres / 1000.0)
 
 
 def log_moments(events: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -88,7 +131,7 @@ def log_moments(events: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def main(data: Annotated[Path, typer.Argument(help="Folder with ngsim_us101_vehicles.parquet.")]) -> None:
     """Print number and moments of the brakings."""
-    events = load_brakings(data)
+    events = load_brakings(data).events
     mean, covariance = log_moments(events)
     with np.printoptions(precision=4, suppress=True):
         print(f"{len(events)} brakings of speed, log gap and log deceleration\nmean {mean}\ncovariance\n{covariance}")

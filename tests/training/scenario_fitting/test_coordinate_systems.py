@@ -1,0 +1,95 @@
+"""Coordinate systems: criteria in common units, densities of held-out events, and which system events choose."""
+
+import numpy as np
+import pytest
+
+from rare_envs.distributions.coordinate_mixture import CoordinateMixture
+from rare_envs.scenarios.registry import scenario_named
+from training.scenario_fitting import mixture as mixture_fit
+from training.scenario_fitting.coordinate_systems import (
+    COORDINATE_SYSTEMS,
+    choose_system,
+    fit_system,
+    held_out_log_prob,
+)
+from training.scenario_fitting.event_filters import EventSet
+
+FOLLOWING = scenario_named("car_following").parameters
+CUT_IN = scenario_named("cut_in").parameters
+PLAIN, LOG_GAP, CLOSING = COORDINATE_SYSTEMS["car_following"]
+COMPONENT = ([1.0], [[15.0, 2.8, 0.0]], [np.diag([9.0, 0.16, 0.04])])
+"""Speed, log gap, closing speed over the root of the gap."""
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    monkeypatch.setattr(mixture_fit, "EM_STARTS", 1)
+
+
+def closing_events(n, seed=0):
+    x = CoordinateMixture(CLOSING.coordinates(FOLLOWING), *COMPONENT).sample(n, np.random.default_rng(seed))
+    return EventSet(x, np.arange(n) // 10)
+
+
+@pytest.mark.parametrize("scenario", COORDINATE_SYSTEMS)
+def test_every_system_fits_its_scenario(scenario):
+    parameters = scenario_named(scenario).parameters
+    for system in COORDINATE_SYSTEMS[scenario]:
+        assert system.coordinates(parameters).dim == len(parameters)
+        assert set(system.kinds) <= {p.name for p in parameters}
+
+
+def test_the_criterion_is_that_of_the_density_of_x(monkeypatch):
+    """BIC = -2 log L + (number of parameters) log n, with L the likelihood of x itself; nobody is outside the box."""
+    monkeypatch.setattr(mixture_fit, "COVARIANCE_FLOOR", 0.0)
+    events = closing_events(200)
+    for system in (LOG_GAP, CLOSING):
+        fit = fit_system(events, system, FOLLOWING, most=1)
+        log_likelihood = float(fit.distribution.log_prob(events.joint).sum())
+        # To what the ranges cut away (1e-4 of the mass), and six digits of the parameters.
+        assert fit.bic == pytest.approx(-2.0 * log_likelihood + 9 * np.log(200), abs=0.5)
+
+
+def test_events_choose_the_system_that_they_come_from(quick):
+    events = closing_events(400)
+    fits = [fit_system(events, system, FOLLOWING) for system in (PLAIN, LOG_GAP, CLOSING)]
+    held_out = [held_out_log_prob(events, system, FOLLOWING) for system in (PLAIN, LOG_GAP, CLOSING)]
+    assert choose_system([fit.bic for fit in fits], held_out, events.clusters) == 2
+    assert fits[2].family == "1 component, closing speed / sqrt(gap), log gap"
+    np.testing.assert_allclose(fits[2].distribution.means[0], COMPONENT[1][0], atol=4 * 3 / 20)
+
+
+def test_held_out_events_are_not_in_the_fit(quick):
+    """One cluster far from the others is predicted badly by them, though a fit to all events knows it."""
+    events = closing_events(100)
+    joint = events.joint.copy()
+    joint[:10, 0] = 40.0 + 0.1 * np.arange(10)
+    events = EventSet(joint, events.clusters)
+    scores = held_out_log_prob(events, LOG_GAP, FOLLOWING)
+    known = fit_system(events, LOG_GAP, FOLLOWING).distribution.log_prob(joint)
+    assert scores[:10].max() < scores[10:].min()
+    assert (known[:10] > scores[:10] + 2.0).all()
+
+
+def test_too_few_events_are_not_predicted():
+    events = EventSet(closing_events(8).joint, np.repeat([0, 1], 4))
+    assert np.isnan(held_out_log_prob(events, PLAIN, FOLLOWING)).all() or len(events.joint) - 4 > 3
+
+
+def test_columns_apart_are_independent(quick):
+    rng = np.random.default_rng(1)
+    joint = np.column_stack([rng.normal(15.0, 2.0, (60, 3)), rng.uniform(5.0, 40.0, (60, 2))])
+    offsets = rng.normal(3.0, 0.4, (25, 1))
+    fit = fit_system(EventSet(joint, np.arange(60), offsets), COORDINATE_SYSTEMS["cut_in"][2], CUT_IN)
+    covariance, mean = fit.distribution.covariances[0], fit.distribution.means[0]
+    assert (covariance[5, :5] == 0.0).all()
+    assert mean[5] == pytest.approx(offsets.mean(), rel=1e-5)
+
+
+def test_a_system_that_predicts_clearly_worse_is_not_chosen():
+    rng = np.random.default_rng(0)
+    good, noise = np.zeros(50), rng.standard_normal(50)
+    clusters = np.arange(50)
+    assert choose_system([10.0, 8.0], [good, good - 1.0 + 0.1 * noise], clusters) == 0
+    assert choose_system([10.0, 8.0], [good, good - 0.01 + noise - noise.mean()], clusters) == 1
+    assert choose_system([10.0, 8.0], [np.full(50, np.nan)] * 2, clusters) == 1

@@ -1,0 +1,50 @@
+"""Predictive checks: dangerous states by pencil and paper, and expected counts that agree with an exact share."""
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
+from training.scenario_fitting.predictive_checks import CHECK_DRAWS, DANGEROUS_STATES, check_predictions
+
+NAMES = ("ego_speed", "lead_speed", "gap")
+
+
+@pytest.mark.parametrize(
+    ("state", "ahead", "gap", "expected"),
+    [
+        ("TTC < 5 s", 10.0, 49.0, True),
+        ("TTC < 5 s", 10.0, 51.0, False),
+        ("TTC < 5 s", 21.0, 1.0, False),  # it opens
+        ("needed deceleration > 1 m/s^2", 10.0, 49.0, True),  # 100 / 98
+        ("needed deceleration > 1 m/s^2", 10.0, 51.0, False),
+        ("gap < 3 m", 30.0, 2.9, True),
+        ("gap < 3 m", 30.0, 3.1, False),
+    ],
+)
+def test_states_by_hand(state, ahead, gap, expected):
+    found = {each.name: each for each in DANGEROUS_STATES}[state]
+    assert found.occurs(np.array([20.0]), np.array([ahead]), np.array([gap])).tolist() == [expected]
+
+
+def test_expected_counts_are_shares_times_events():
+    """Gaps are N(10, 4^2) within [1, 150]: P[gap < 3] = (Phi(-7/4) - Phi(-9/4)) / (1 - Phi(-9/4))."""
+    base = TruncatedGaussianMixture(
+        [1.0], [[20.0, 20.0, 10.0]], [np.diag([4.0, 4.0, 16.0])], [0.0, 0.0, 1.0], [45.0, 45.0, 150.0]
+    )
+    events = base.sample(400, np.random.default_rng(1))
+    checks = {check.name: check for check in check_predictions("car_following", NAMES, events, base)}
+    share = (norm.cdf(-7 / 4) - norm.cdf(-9 / 4)) / norm.sf(-9 / 4)
+    check = checks["gap < 3 m"]
+    assert check.recorded == int((events[:, 2] < 3.0).sum())
+    assert check.expected == pytest.approx(
+        400 * share, abs=4 * 400 * np.sqrt(share / CHECK_DRAWS) + 0.005 * 400 * share
+    )
+
+
+def test_a_cut_in_has_two_pairs_and_hard_brake_none():
+    names = ("ego_speed", "cut_in_speed", "lead_speed", "cut_in_gap", "lead_gap", "lateral_offset")
+    d = len(names)
+    base = TruncatedGaussianMixture([1.0], [[20.0] * d], [np.eye(d)], [1.0] * d, [150.0] * d)
+    assert len(check_predictions("cut_in", names, np.full((3, 5), 20.0), base)) == 6
+    assert check_predictions("hard_brake", ("speed", "gap", "deceleration"), np.ones((3, 3)), base) == ()

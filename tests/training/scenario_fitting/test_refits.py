@@ -1,0 +1,74 @@
+"""Refits: clusters are drawn whole, everything is fitted again, and their spread is that of the fit."""
+
+import numpy as np
+import pytest
+
+from rare_envs.scenarios.registry import scenario_named
+from training.scenario_fitting import mixture as mixture_fit
+from training.scenario_fitting import refits as refits_module
+from training.scenario_fitting.coordinate_systems import COORDINATE_SYSTEMS
+from training.scenario_fitting.event_filters import EventSet
+from training.scenario_fitting.refits import draw_events, refit
+
+FOLLOWING = scenario_named("car_following").parameters
+LOG_GAP = COORDINATE_SYSTEMS["car_following"][1]
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    monkeypatch.setattr(mixture_fit, "EM_STARTS", 1)
+
+
+def events(n, seed=0, per_cluster=1):
+    rng = np.random.default_rng(seed)
+    x = np.column_stack([rng.normal(15.0, 3.0, (n, 2)), np.exp(rng.normal(3.0, 0.4, n))])
+    return EventSet(x, np.arange(n) // per_cluster)
+
+
+def test_clusters_are_drawn_whole():
+    drawn = draw_events(events(60, per_cluster=3), np.random.default_rng(1))
+    original = events(60, per_cluster=3).joint
+    assert len(drawn.joint) == 60
+    assert len(np.unique(drawn.clusters)) == 20  # one drawn twice counts as two
+    for label in np.unique(drawn.clusters):
+        rows = drawn.joint[drawn.clusters == label]
+        first = int(np.flatnonzero((original == rows[0]).all(axis=1))[0])
+        assert first % 3 == 0
+        assert (rows == original[first : first + 3]).all()
+
+
+def test_columns_apart_are_drawn_by_themselves():
+    base = events(20)
+    apart = np.arange(15.0)[:, None]
+    drawn = draw_events(EventSet(base.joint, base.clusters, apart), np.random.default_rng(0))
+    assert drawn.apart.shape == (15, 1)
+    assert len(np.unique(drawn.apart)) < 15
+
+
+def test_the_spread_is_the_standard_error_of_the_mean(quick):
+    """Of n independent events: sd / sqrt(n), here from 60 refits, so to 9 % (two standard errors 18 %)."""
+    n = 200
+    recorded = events(n)
+    fits = refit(recorded, LOG_GAP, FOLLOWING, n=60)
+    means = np.array([fit.weights @ fit.means[:, 0] for fit in fits])
+    assert means.std(ddof=1) == pytest.approx(recorded.joint[:, 0].std() / np.sqrt(n), rel=0.3)
+
+
+def test_more_refits_where_the_number_of_components_differs(quick, monkeypatch):
+    monkeypatch.setattr(refits_module, "N_REFITS", 4)
+    monkeypatch.setattr(refits_module, "MORE_REFITS", 7)
+    one = events(25)  # allows one component only
+    assert len(refit(one, LOG_GAP, FOLLOWING)) == 4
+    rng = np.random.default_rng(5)
+    two = np.concatenate([one.joint, one.joint * [2.0, 2.0, 1.0] + rng.normal(0.0, 1.0, (25, 3))])
+    fits = refit(EventSet(np.abs(two) + 1.0, np.arange(50)), LOG_GAP, FOLLOWING)
+    assert len(fits) == (7 if len({len(fit.weights) for fit in fits[:4]}) > 1 else 4)
+
+
+def test_same_seed_same_refits(quick):
+    one, other = (refit(events(30), LOG_GAP, FOLLOWING, seed=3, n=3) for _ in range(2))
+    assert [fit.to_dict() for fit in one] == [fit.to_dict() for fit in other]
+
+
+def test_few_clusters_have_no_refits(quick):
+    assert refit(events(40, per_cluster=10), LOG_GAP, FOLLOWING) == ()

@@ -1,0 +1,193 @@
+"""Base distributions fitted to events, with all that says what they are worth, as the text of a base file."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+
+from rare_envs.distributions.coordinate_mixture import CoordinateMixture
+from rare_envs.distributions.coordinates import ClosingSpeed
+from rare_envs.distributions.fitted import FittedDistribution
+from rare_envs.distributions.frequency import EventFrequency
+from rare_envs.distributions.space import Parameter
+from rare_envs.scenarios.registry import scenario_named
+from samplers.problem import FloatArray
+from training.scenario_fitting.coordinate_systems import (
+    COORDINATE_SYSTEMS,
+    FOLD_STARTS,
+    FOLDS,
+    CoordinateSystem,
+    SystemFit,
+    choose_system,
+    fit_system,
+    held_out_log_prob,
+)
+from training.scenario_fitting.event_filters import EventSet
+from training.scenario_fitting.mixture import COVARIANCE_FLOOR, EM_STARTS, EVENTS_PER_COMPONENT, SMALLEST_COMPONENT
+from training.scenario_fitting.predictive_checks import check_predictions
+from training.scenario_fitting.refits import refit
+
+MASS_SAMPLES = 1_000_000
+"""Draws from which the mass outside the box is estimated."""
+
+
+@dataclass(frozen=True)
+class FitRequest:
+    """What a base is fitted to, and how."""
+
+    scenario: str
+    events: EventSet
+    source: Mapping[str, Any]
+    """Site, data, publisher, licence and so on, for the file."""
+    command: str
+    """Command that writes the file."""
+    frequency: EventFrequency | None = None
+    """How often the events happen; None where nobody counted."""
+    system: str | None = None
+    """Name of the coordinate system; None for the one that the events support best."""
+    n_refits: int | None = None
+    """Number of refits, see `refit`."""
+    seed: int = 0
+    """Seed of the fits."""
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Parameters of the scenario, in the order of x."""
+        return tuple(scenario_named(self.scenario).parameters)
+
+    @property
+    def systems(self) -> tuple[CoordinateSystem, ...]:
+        """Coordinate systems that are tried."""
+        return COORDINATE_SYSTEMS[self.scenario]
+
+
+def fit_base(request: FitRequest) -> FittedDistribution:
+    """Return a base fitted to events: coordinates and components chosen, refits, predictive checks, and its record.
+
+    Raises:
+        ValueError: The events are too few, or there is no such coordinate system.
+    """
+    events, parameters, seed = request.events, request.parameters, request.seed
+    fits = [fit_system(events, system, parameters, seed) for system in request.systems]
+    held_out = [held_out_log_prob(events, system, parameters, seed) for system in request.systems]
+    chosen = _choose(request, fits, held_out)
+    names = [p.name for p in parameters]
+    return FittedDistribution(
+        distribution=chosen.distribution,
+        refits=refit(events, chosen.system, parameters, seed, request.n_refits),
+        events=events.counts,
+        family=chosen.family,
+        frequency=request.frequency,
+        checks=check_predictions(request.scenario, names, events.joint, chosen.distribution, seed),
+        record=_record(request, chosen, fits, held_out),
+    )
+
+
+def _choose(request: FitRequest, fits: Sequence[SystemFit], held_out: Sequence[FloatArray]) -> SystemFit:
+    """Return the fit in the coordinate system asked for, or in the best supported one."""
+    names = [fit.system.name for fit in fits]
+    if request.system is None:
+        return fits[choose_system([fit.bic for fit in fits], held_out, request.events.clusters)]
+    if request.system not in names:
+        raise ValueError(f"Unknown coordinate system {request.system!r}; known are {', '.join(names)}.")
+    return fits[names.index(request.system)]
+
+
+def _record(
+    request: FitRequest, chosen: SystemFit, fits: Sequence[SystemFit], held_out: Sequence[FloatArray]
+) -> dict[str, Any]:
+    """Return the record of a fit, for its file."""
+    selection = [_describe_fit(fit, scores) for fit, scores in zip(fits, held_out, strict=True)]
+    own = selection[fits.index(chosen)]
+    return {
+        "kind": "fitted to recorded events",
+        "coordinates": chosen.system.name,
+        "bic": own["bic"],
+        "held_out_log_prob": own["held_out_log_prob"],
+        "source": dict(request.source),
+        "filters": list(request.events.log),
+        "selection": selection,
+        "settings": {
+            "covariance_floor": COVARIANCE_FLOOR,
+            "restarts": EM_STARTS,
+            "restarts_of_refits": FOLD_STARTS,
+            "events_per_component_and_dimension": EVENTS_PER_COMPONENT,
+            "smallest_component_per_dimension": SMALLEST_COMPONENT,
+            "folds": FOLDS,
+            "seed": request.seed,
+        },
+        "mass_outside_box": mass_outside(chosen.distribution),
+        "command": request.command,
+        "libraries": {name: version(name) for name in ("numpy", "scipy", "scikit-learn")},
+    }
+
+
+def _describe_fit(fit: SystemFit, scores: FloatArray) -> dict[str, Any]:
+    """Return the criteria of one coordinate system; null where too few events were left to predict from."""
+    known = scores[np.isfinite(scores)]
+    return {
+        "coordinates": fit.system.name,
+        "bic": round(fit.bic, 2),
+        "held_out_log_prob": round(float(known.mean()), 4) if len(known) == len(scores) else None,
+        "components": [
+            {
+                "number": candidate.components,
+                "bic": round(candidate.bic - (fit.fit.bic - fit.bic), 2),
+                "events_in_smallest": round(candidate.smallest, 1),
+                "accepted": candidate.accepted,
+            }
+            for candidate in fit.fit.candidates
+        ],
+    }
+
+
+def format_base(scenario: str, content: Mapping[str, Any]) -> str:
+    """Return the text of a base file, which `rare_envs.scenarios.base_distributions.load_base` reads.
+
+    Args:
+        scenario: Name of the scenario, such as "cut_in".
+        content: Entries of the distribution, see its `to_dict`.
+    """
+    parameters = scenario_named(scenario).parameters
+    head = {"names": [p.name for p in parameters], "units": [p.unit for p in parameters]}
+    return json.dumps({**head, **content}, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def mass_outside(distribution: CoordinateMixture, seed: int = 0) -> dict[str, Any]:
+    """Return the probability that the box cuts away from the mixture without its box.
+
+    Returns:
+        `any`: probability that some column of x is outside, with its `standard_error`; `each`: the same per column.
+    """
+    coordinates = distribution.coordinates
+    y = _draw_unbounded(distribution, MASS_SAMPLES, np.random.default_rng(seed))
+    x = np.empty_like(y)
+    for position, j in enumerate(coordinates.columns):
+        kind, value = coordinates.kinds[j], y[:, position]
+        if isinstance(kind, ClosingSpeed):
+            behind, gap = (x[:, coordinates.names.index(name)] for name in (kind.behind, kind.gap))
+            x[:, j] = behind - value * np.sqrt(gap)
+        else:
+            x[:, j] = np.exp(value) if kind == "log" else value
+    outside = (x < coordinates.low) | (x > coordinates.high)
+    p = float(outside.any(axis=1).mean())
+    return {
+        "any": p,
+        "standard_error": float(f"{np.sqrt(p * (1.0 - p) / MASS_SAMPLES):.2g}"),
+        "each": [float(f"{value:.3g}") for value in outside.mean(axis=0)],
+    }
+
+
+def _draw_unbounded(distribution: CoordinateMixture, n: int, rng: np.random.Generator) -> FloatArray:
+    """Draw coordinates from the mixture without its box, shape (n, d)."""
+    counts = rng.multinomial(n, distribution.weights)
+    parts = [
+        mean + rng.standard_normal((count, distribution.dim)) @ np.linalg.cholesky(covariance).T
+        for count, mean, covariance in zip(counts, distribution.means, distribution.covariances, strict=True)
+    ]
+    return np.concatenate(parts)

@@ -1,0 +1,64 @@
+"""How often the events of a user's own recordings happen: counts, and the time and distance of all vehicles."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from rare_envs.distributions.frequency import EventFrequency
+from training.data.events import Events
+from training.data.trajectories import DT, Trajectories
+from training.scenario_fitting.shipped.frequencies import CUT_INS_US101
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """Time and distance of all vehicles of recordings.
+
+    Example:
+        >>> from training.data import synthetic_traffic
+        >>> exposure = Exposure().plus(synthetic_traffic(seconds=10.0, per_lane=1, speed=20.0))
+        >>> round(3600 * exposure.hours, 1)  # three lanes of one vehicle each
+        30.0
+    """
+
+    hours: float = 0.0
+    """Vehicle-hours."""
+    km: float = 0.0
+    """Vehicle-kilometres."""
+
+    def plus(self, table: Trajectories) -> Exposure:
+        """Return the exposure with one more recording."""
+        seconds, metres = len(table) * DT, float(table.speed.sum()) * DT
+        return Exposure(self.hours + seconds / 3600.0, self.km + metres / 1000.0)
+
+
+def count_events(scenario: str, events: Events, used: int, exposure: Exposure) -> EventFrequency | None:
+    """Return the frequency of the events of a user's own recordings; None where nothing was recorded to count.
+
+    Cut-ins: lane changes with a vehicle behind in the new lane, times the share of these that the filters keep.
+    Car-following: pairs that begin while the ego is in the picture already, all of which count.
+
+    Args:
+        scenario: "car_following" or "cut_in".
+        events: Columns of all its events, before the filters.
+        used: Events that the filters keep.
+        exposure: Of the recordings.
+    """
+    if scenario == "car_following":
+        count = int((~events["at_entry"]).sum())
+        words = "a vehicle gets a new leader, within the picture"
+        share, of = 1.0, None
+    else:
+        suffered = int(((events["phase"] == "start") & (events["ego"] >= 0)).sum())
+        count, words, share, of = suffered, CUT_INS_US101.definition, used / max(suffered, 1), suffered
+    if count == 0 or share == 0.0:
+        return None
+    return EventFrequency(
+        count=count,
+        hours=exposure.hours,
+        km=exposure.km,
+        share=share,
+        share_events=of,
+        definition=words,
+        source="counted in the recordings themselves",
+    )

@@ -1,0 +1,180 @@
+"""Events of the shipped bases: how they are read, where they come from, how often they happen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+
+from rare_envs.distributions.frequency import EventFrequency
+from rare_envs.distributions.space import Parameter
+from rare_envs.scenarios.registry import scenario_named
+from training.scenario_fitting.coordinate_systems import COORDINATE_SYSTEMS
+from training.scenario_fitting.event_filters import (
+    EVENT_RECIPES,
+    EventRecipe,
+    EventSet,
+    filter_events,
+    read_csv_columns,
+    read_events,
+)
+from training.scenario_fitting.shipped.brakings import find_standstill_brakings, load_brakings
+from training.scenario_fitting.shipped.frequencies import (
+    CUT_INS_I80,
+    CUT_INS_US101,
+    NEW_LEADERS_I24,
+    NEW_LEADERS_I80,
+    braking_frequency,
+)
+from training.scenario_fitting.shipped.lateral_offsets import lateral_offsets
+from training.scenario_fitting.shipped.new_leaders import load_new_leaders
+
+Reader = Callable[[Path], tuple[EventSet, EventFrequency]]
+
+PAIRS = ("v_ego", "v_lead", "gap")
+CUT_INS = ("v_ego", "v_cutin", "v_lead", "gap_ego_cutin", "gap_cutin_lead")
+NGSIM_LICENCE = (
+    "CC BY-SA 3.0 (as the data's public record was reported); these parameters are derived from the data and are "
+    "offered under the same licence"
+)
+US101 = MappingProxyType(
+    {
+        "site": "US 101, Los Angeles, 07:50, congested",
+        "data": "Next Generation Simulation (NGSIM) Vehicle Trajectories and Supporting Data, US 101 "
+        "(Los Angeles, southbound, 15 June 2005), record 8ect-6jqj",
+        "publisher": "U.S. Department of Transportation, Federal Highway Administration (FHWA)",
+        "licence": NGSIM_LICENCE,
+        "changes": "events extracted from the trajectories, filtered as listed, fitted with a mixture",
+    }
+)
+I80 = MappingProxyType(
+    {
+        "site": "I-80, Emeryville, 16:00, congested",
+        "data": "the data set from Coifman and Li (2017): A Critical Evaluation of the Next Generation Simulation "
+        "(NGSIM) Vehicle Trajectory Dataset, Transportation Research Part B 105, 2017, 362-377 (13 April 2005)",
+        "publisher": "B. Coifman, L. Li, Ohio State University",
+        "licence": "none stated; citation asked for. Parameters only",
+        "changes": US101["changes"],
+    }
+)
+I24 = MappingProxyType(
+    {
+        "site": "I-24, Nashville, rush hours, 27 m/s in the median",
+        "data": "CIRCLES, one instrumented car with radar, 26 drives of March and April 2021 "
+        "(doi 10.5281/zenodo.6366761)",
+        "publisher": "CIRCLES consortium",
+        "licence": "none seen; citation asked for. Parameters only",
+        "changes": US101["changes"],
+    }
+)
+
+
+@dataclass(frozen=True)
+class ShippedBase:
+    """A base of the package that is fitted to recorded events."""
+
+    scenario: str
+    name: str
+    read: Reader
+    """Reads its events from the folder of compact tables, and how often they happen."""
+    source: MappingProxyType[str, str]
+    """Site, data, publisher, licence and changes."""
+    moment: str
+    """Moment of an event at which x is taken."""
+    system: str | None = None
+    """Name of its coordinate system; None for the one that the events support best."""
+
+    @property
+    def file(self) -> str:
+        """Name of its file in the package."""
+        return f"{self.scenario}_{self.name.replace('-', '_')}.json"
+
+
+def _box(scenario: str) -> tuple[Parameter, ...]:
+    return tuple(scenario_named(scenario).parameters)
+
+
+def read_us101_pairs(folder: Path) -> tuple[EventSet, EventFrequency]:
+    """Return pairs of the scenes of US 101 at their first frame."""
+    recipe = EventRecipe("us101_car_following_events.csv", PAIRS, cluster=("scene",))
+    events = filter_events(read_events(folder / recipe.file, recipe), recipe, _box("car_following"))
+    return events, NEW_LEADERS_I80
+
+
+def read_i80_pairs(folder: Path) -> tuple[EventSet, EventFrequency]:
+    """Return pairs of the I-80 at their first frame; 93 % are the ego's entry into the picture."""
+    recipe = EventRecipe("i80_coifman_pairs.csv", PAIRS, cluster=("frame",))
+    events = filter_events(read_events(folder / recipe.file, recipe), recipe, _box("car_following"))
+    return events, NEW_LEADERS_I80
+
+
+def read_i24_pairs(folder: Path) -> tuple[EventSet, EventFrequency]:
+    """Return new leaders of the instrumented car on the I-24, within the box of the scenario."""
+    events, drives = load_new_leaders(folder)
+    inside = np.ones(len(events), dtype=bool)
+    for column, p in zip(events.T, _box("car_following"), strict=True):
+        inside &= (column >= p.low) & (column <= p.high)
+    return EventSet(events[inside], drives[inside], cluster="drive"), NEW_LEADERS_I24
+
+
+def read_us101_cut_ins(folder: Path) -> tuple[EventSet, EventFrequency]:
+    """Return cut-ins of the scenes of US 101 at the start of the lane change."""
+    recipe = EventRecipe("us101_cut_in_events.csv", CUT_INS, phase="start", cluster=("scene",))
+    events = filter_events(read_events(folder / recipe.file, recipe), recipe, _box("cut_in"))
+    return _with_offsets(events, folder, "us101"), CUT_INS_US101
+
+
+def read_us101_cut_ins_alone(folder: Path) -> tuple[EventSet, EventFrequency]:
+    """Return cut-ins of the scenes of US 101, with the lateral offsets of the 15 whose start was seen."""
+    recipe = replace(EVENT_RECIPES["cut_in"], file="us101_cut_in_events.csv", cluster=("scene",))
+    return filter_events(read_events(folder / recipe.file, recipe), recipe, _box("cut_in")), CUT_INS_US101
+
+
+def read_i80_cut_ins(folder: Path) -> tuple[EventSet, EventFrequency]:
+    """Return settled cut-ins of the I-80, 1.3 s before the crossing, the mean start of those on US 101."""
+    recipe = EventRecipe("i80_coifman_lane_changes.csv", CUT_INS, phase="start", cluster=("frame",))
+    rows = read_events(folder / recipe.file, recipe)
+    settled = read_csv_columns(folder / recipe.file, ("settled",))["settled"].astype(bool)
+    events = filter_events({name: values[settled] for name, values in rows.items()}, recipe, _box("cut_in"))
+    return _with_offsets(events, folder, "i80"), CUT_INS_I80
+
+
+def read_us101_brakings(folder: Path) -> tuple[EventSet, EventFrequency]:
+    """Return brakings to a standstill of single vehicles on US 101, at their beginning."""
+    brakings = load_brakings(folder, find_standstill_brakings)
+    inside = np.ones(len(brakings.events), dtype=bool)
+    for column, p in zip(brakings.events.T, _box("hard_brake"), strict=True):
+        inside &= (column >= p.low) & (column <= p.high)
+    events = EventSet(brakings.events[inside], brakings.vehicles[inside], cluster="vehicle")
+    return events, braking_frequency(len(events.joint), brakings.hours, brakings.km)
+
+
+def _with_offsets(events: EventSet, folder: Path, site: str) -> EventSet:
+    """Return events with lateral offsets from the profiles of lane changes of the site."""
+    offset = _box("cut_in")[-1]
+    return replace(events, apart=lateral_offsets(folder, site, offset.low, offset.high))
+
+
+CLOSING_GAPS = COORDINATE_SYSTEMS["cut_in"][2].name
+FIRST_FRAME, CHANGE_STARTS = "first frame of the pair", "start of the lane change"
+SHIPPED_BASES = (
+    ShippedBase("car_following", "us101", read_us101_pairs, US101, FIRST_FRAME),
+    ShippedBase("car_following", "us101-gap", read_us101_pairs, US101, FIRST_FRAME, system="plain"),
+    ShippedBase("car_following", "us101-log-gap", read_us101_pairs, US101, FIRST_FRAME, system="log gap"),
+    ShippedBase("car_following", "i80", read_i80_pairs, I80, FIRST_FRAME),
+    ShippedBase("car_following", "i24", read_i24_pairs, I24, "0.8 s after the gap began to jump"),
+    ShippedBase("cut_in", "us101", read_us101_cut_ins, US101, CHANGE_STARTS),
+    ShippedBase("cut_in", "us101-closing", read_us101_cut_ins, US101, CHANGE_STARTS, system=CLOSING_GAPS),
+    ShippedBase("cut_in", "us101-15-offsets", read_us101_cut_ins_alone, US101, CHANGE_STARTS, system="log gaps"),
+    ShippedBase("cut_in", "i80", read_i80_cut_ins, I80, "1.3 s before the crossing"),
+    ShippedBase("cut_in", "i80-closing", read_i80_cut_ins, I80, "1.3 s before the crossing", system=CLOSING_GAPS),
+    ShippedBase("hard_brake", "us101", read_us101_brakings, US101, "beginning of the braking"),
+)
+"""Bases of the package that are fitted to recorded events.
+
+Their names say the site, and behind a hyphen in what they differ from the one that the events support best: `us101-gap`
+(plain gaps) is a test distribution near the p of Tian et al., `us101-15-offsets` has lateral offsets from 15 events.
+"""

@@ -1,0 +1,66 @@
+"""How often the events of the shipped bases happen: counts in recordings, with exposure, definition and source.
+
+The rates of recordings that were picked for lane changes are never used: the shipped scenes of US 101 show 42 changes
+per vehicle-hour, the complete recording 11.
+"""
+
+from __future__ import annotations
+
+from rare_envs.distributions.frequency import EventFrequency
+
+LANE_CHANGE_COUNTS = (
+    "wein2004/lane-change-externality, outputs/tables/02_detection_summary.md: complete NGSIM recordings; lane changes "
+    "with a follower in the new lane, stable for 3 s"
+)
+COIFMAN = "Coifman and Li 2017, I-80, 16:00, every vehicle of one camera"
+CIRCLES = "CIRCLES, one instrumented car on I-24, 60 drives of 2021 (doi 10.5281/zenodo.6366761)"
+NEW_LEADERS_I80 = EventFrequency(
+    count=153,
+    hours=5.98,
+    km=169.7,
+    definition="a vehicle gets a new leader, within the picture",
+    source=COIFMAN,
+)
+"""US 101 has none of its own: its scenes are too short for pairs that begin inside them."""
+NEW_LEADERS_I24 = EventFrequency(
+    count=376,
+    hours=8.81,
+    km=777.1,
+    definition="the gap to the vehicle ahead jumps by 6 m or more within 0.3 s, either way",
+    source=CIRCLES,
+)
+CUT_INS_US101 = EventFrequency(
+    count=1221,
+    hours=112.0,
+    km=3900.0,
+    share=38 / 46,
+    share_events=46,
+    definition="a vehicle changes into the lane ahead of another, gaps within the ranges of the scenario",
+    source=f"{LANE_CHANGE_COUNTS}; the share with both gaps in range from 46 recorded changes with a follower",
+)
+CUT_INS_I80 = EventFrequency(
+    count=1693,
+    hours=122.5,
+    km=2860.0,
+    share=63 / 77,
+    share_events=77,
+    definition=CUT_INS_US101.definition,
+    source=f"{LANE_CHANGE_COUNTS}; the share with both gaps in range from 77 changes with a follower ({COIFMAN})",
+)
+
+
+def braking_frequency(count: int, hours: float, km: float) -> EventFrequency:
+    """Return the frequency of brakings to a standstill on US 101.
+
+    Args:
+        count: Brakings.
+        hours: Time of all vehicles [h].
+        km: Their distance [km].
+    """
+    return EventFrequency(
+        count=count,
+        hours=round(hours, 3),
+        km=round(km, 1),
+        definition="the vehicle ahead brakes by 3 m/s or more, to less than 1 m/s",
+        source="NGSIM, US 101, 370 vehicles over 640 m each, counted on the vehicles themselves",
+    )
