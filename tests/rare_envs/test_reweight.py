@@ -40,7 +40,7 @@ def test_the_two_shipped_bases_are_too_far_apart(old, new):
 
 def fitted_us101(number=30):
     """Return the base distribution of car-following with refits a few per cent wider and narrower."""
-    us101 = problem("us101").base
+    us101 = problem("us101-gap").base
     return FittedDistribution(
         distribution=us101,
         refits=tuple(wider(us101, factor) for factor in np.linspace(0.8, 1.2, number)),
@@ -89,6 +89,6 @@ def test_noise_beside_a_fitted_base_changes_nothing_of_the_refits():
 
 def test_another_base_by_its_name():
     result = samplers.estimate(problem(fitted_us101()), "ce", seed=1)
-    assert result.under("us101").ratio == pytest.approx(1.0)
+    assert result.under("us101-gap").ratio == pytest.approx(1.0)
     with pytest.raises(ValueError, match="Estimate again with the new base"):
         result.under("highway")
