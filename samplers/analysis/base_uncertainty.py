@@ -95,7 +95,8 @@ class BaseUncertainty:
             first = f"{100 * self.confidence:g} %  {low:.1e} to {high:.1e} {behind}"
             first += "" if self.expected is None else f"; expected for the next event {self.expected:.0e}"
         elif self.bound is not None:
-            first = f" the events do not determine p; below {self.bound:.1e} in this family {behind}"
+            below = f"below {self.bound:.1e} in this family" if self.bound < 1 else "nor an upper end in this family"
+            first = f" the events do not determine p; {below} {behind}"
         else:
             return f"base distribution  no interval: {self.reason}"
         lines = [
