@@ -28,6 +28,8 @@ from samplers.statistics.weights import effective_number
 MIN_REFIT_ESS = 10.0
 """Effective failing points from which p under a refit has an error of about 0.3 in its logarithm: little beside the
 usual spread of the refits, 0.7 to 1.5."""
+MIN_OWN_ESS = 30.0
+"""Effective failing points under the own base from which a lack of points is the refits' and not that of the budget."""
 MAX_UNCOVERED_SHARE = 0.1
 """Share of the refits that may rest on fewer points than that."""
 REFIT_CHECK_DRAWS = 100
@@ -232,12 +234,14 @@ def count_uncovered(ess: Iterable[float]) -> int:
 def needs_ensemble_run(estimate: WeightedEstimate) -> bool:
     """Return whether a further run under the mixture of the refits would tell p under them; it needs no simulation.
 
-    False where the base has no refits or no `ensemble`, or nothing failed.
+    False where the base has no refits or no `ensemble`, or where the run has few effective failing points under its own
+    base: another of that size would have as few.
     """
     fitted = find_fitted_base(estimate.base)
     if fitted is None or not isinstance(fitted, HasEnsemble):
         return False
     try:
-        return are_uncovered(reweight_to_refits(estimate, fitted.refits))
+        own = float(reweight_to_refits(estimate, [fitted]).ess[0, 0])
+        return own >= MIN_OWN_ESS and are_uncovered(reweight_to_refits(estimate, fitted.refits))
     except ValueError:  # no points to reweight: the mixture of the refits would not mend that
         return False

@@ -240,7 +240,7 @@ class Absent:
 def test_outcomes_of_an_ego_with_noise_of_its_own_stand_as_they_fell(method: Any) -> None:
     """p over its noise too is that of Monte Carlo; each scenario is simulated once, and its outcome never again."""
     ego, gamma = Absent(), 1.5
-    world = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", ego=ego, horizon=4.0)
+    world = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", ego=ego, horizon=4.0, base="us101-gap")
     assert world.varies
     plain = samplers.estimate(world, samplers.MonteCarlo(), gamma=gamma, max_sim=12_000, seed=1)
     assert len(ego.asked) == plain.n_sim

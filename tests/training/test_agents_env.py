@@ -112,7 +112,7 @@ def test_an_adversary_raises_the_collision_rate():
 @use_one_thread()
 def test_a_shared_policy_learns():
     before, after = (
-        shared_policy.mean_return(FOLLOWING, shared_policy.train(FOLLOWING, steps), 128, seed=1)
+        shared_policy.mean_return(FOLLOWING, shared_policy.train(FOLLOWING, steps), 512, seed=1)
         for steps in (0, 25_600)
     )
     error = (before[1] ** 2 + after[1] ** 2) ** 0.5

@@ -134,12 +134,12 @@ def make_ordinary_traffic(name: str, road: Road, lane: int) -> Scenario:
 
 
 def draw_starts(n: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Draw starts of `make_ordinary_traffic`: recorded car-following in which nobody is too close or comes too fast.
+    """Draw starts of `make_ordinary_traffic`: car-following near the recorded one (`us101-gap`) in which nobody is too close or comes too fast.
 
     Returns:
         Parameters, shape (n, 12).
     """
-    base, starts = load_base(CAR_FOLLOWING), np.empty((0, 3))
+    base, starts = load_base(CAR_FOLLOWING, "us101-gap"), np.empty((0, 3))
     while len(starts) < n:
         drawn = base.sample(2 * n, rng)
         starts = np.concatenate((starts, drawn[_is_nominal(drawn)]))

@@ -20,7 +20,7 @@ from samplers.problem import FloatArray
 from training.scenario_fitting.coordinate_systems import (
     COORDINATE_SYSTEMS,
     FOLD_STARTS,
-    FOLDS,
+    N_FOLDS,
     CoordinateSystem,
     SystemFit,
     choose_system,
@@ -118,7 +118,7 @@ def _record(
             "restarts_of_refits": FOLD_STARTS,
             "events_per_component_and_dimension": EVENTS_PER_COMPONENT,
             "smallest_component_per_dimension": SMALLEST_COMPONENT,
-            "folds": FOLDS,
+            "folds": N_FOLDS,
             "seed": request.seed,
         },
         "mass_outside_box": mass_outside(chosen.distribution),

@@ -20,7 +20,7 @@ from samplers.problem import FloatArray
 from training.scenario_fitting.event_filters import EventSet
 from training.scenario_fitting.mixture import MAX_COMPONENTS, MixtureFit, append_independent, select_mixture
 
-FOLDS = 5
+N_FOLDS = 5
 """Parts of the clusters; each is predicted from the others."""
 FOLD_STARTS = 5
 """Starts of expectation maximisation of the fits to folds and to resampled events.
@@ -147,7 +147,7 @@ def held_out_log_prob(
     names = np.random.default_rng(seed).permutation(np.unique(events.clusters))
     own = parameters[: events.joint.shape[1]]
     scores = np.full(len(events.joint), np.nan)
-    for fold in np.array_split(names, min(FOLDS, len(names))):
+    for fold in np.array_split(names, min(N_FOLDS, len(names))):
         test = np.isin(events.clusters, fold)
         try:
             fitted = fit_system(EventSet(events.joint[~test], events.clusters[~test]), system, own, seed, FOLD_STARTS)

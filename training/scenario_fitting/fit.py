@@ -31,7 +31,7 @@ from training.data.formats.text_columns import Gaps
 from training.data.trajectories import Trajectories
 from training.scenario_fitting.base_files import FitRequest, fit_base, format_base
 from training.scenario_fitting.event_filters import EVENT_RECIPES, filter_events, read_events
-from training.scenario_fitting.own_frequency import Exposure, count_events
+from training.scenario_fitting.own_frequency import ObservedTraffic, count_events
 from training.scenario_fitting.published_highway import build_highway_base
 from training.scenario_fitting.shipped.bases import SHIPPED_BASES, ShippedBase
 
@@ -87,11 +87,11 @@ def fit_own_bases(
     """
     out.mkdir(parents=True, exist_ok=True)
     names: set[str] = set()
-    exposure = Exposure()
+    traffic = ObservedTraffic()
     parts: list[dict[str, Events]] = []
     for table in tables:
         names |= {str(recording) for recording in np.unique(table.recording)}
-        exposure = exposure.plus(table)
+        traffic = traffic.plus(table)
         parts.append({scenario: EXTRACTORS[scenario](table) for scenario in scenarios})
     source = {
         "site": name,
@@ -106,7 +106,7 @@ def fit_own_bases(
     for scenario, path in files.items():
         recipe = EVENT_RECIPES[scenario]
         events = filter_events(read_events(path, recipe), recipe, scenario_named(scenario).parameters)
-        frequency = count_events(scenario, pooled[scenario], len(events.joint), exposure)
+        frequency = count_events(scenario, pooled[scenario], len(events.joint), traffic)
         request = FitRequest(scenario, events, source, OWN_COMMAND, frequency, n_refits=n_refits, seed=seed)
         try:
             base = fit_base(request)

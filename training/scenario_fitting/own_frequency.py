@@ -1,4 +1,4 @@
-"""How often the events of a user's own recordings happen: counts, and the time and distance of all vehicles."""
+"""Frequency of events in a user's own recordings: counts, and the time and distance of all vehicles."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from training.scenario_fitting.shipped.frequencies import CUT_INS_US101
 
 
 @dataclass(frozen=True)
-class Exposure:
+class ObservedTraffic:
     """Time and distance of all vehicles of recordings.
 
     Example:
         >>> from training.data import synthetic_traffic
-        >>> exposure = Exposure().plus(synthetic_traffic(seconds=10.0, per_lane=1, speed=20.0))
-        >>> round(3600 * exposure.hours, 1)  # three lanes of one vehicle each
+        >>> traffic = ObservedTraffic().plus(synthetic_traffic(seconds=10.0, per_lane=1))
+        >>> round(3600 * traffic.hours, 1)  # three lanes of one vehicle each
         30.0
     """
 
@@ -26,13 +26,13 @@ class Exposure:
     km: float = 0.0
     """Vehicle-kilometres."""
 
-    def plus(self, table: Trajectories) -> Exposure:
-        """Return the exposure with one more recording."""
+    def plus(self, table: Trajectories) -> ObservedTraffic:
+        """Return the traffic with one more recording."""
         seconds, metres = len(table) * DT, float(table.speed.sum()) * DT
-        return Exposure(self.hours + seconds / 3600.0, self.km + metres / 1000.0)
+        return ObservedTraffic(self.hours + seconds / 3600.0, self.km + metres / 1000.0)
 
 
-def count_events(scenario: str, events: Events, used: int, exposure: Exposure) -> EventFrequency | None:
+def count_events(scenario: str, events: Events, used: int, traffic: ObservedTraffic) -> EventFrequency | None:
     """Return the frequency of the events of a user's own recordings; None where nothing was recorded to count.
 
     Cut-ins: lane changes with a vehicle behind in the new lane, times the share of these that the filters keep.
@@ -42,7 +42,7 @@ def count_events(scenario: str, events: Events, used: int, exposure: Exposure) -
         scenario: "car_following" or "cut_in".
         events: Columns of all its events, before the filters.
         used: Events that the filters keep.
-        exposure: Of the recordings.
+        traffic: Of the recordings.
     """
     if scenario == "car_following":
         count = int((~events["at_entry"]).sum())
@@ -55,8 +55,8 @@ def count_events(scenario: str, events: Events, used: int, exposure: Exposure) -
         return None
     return EventFrequency(
         count=count,
-        hours=exposure.hours,
-        km=exposure.km,
+        hours=traffic.hours,
+        km=traffic.km,
         share=share,
         share_events=of,
         definition=words,

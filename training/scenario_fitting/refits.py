@@ -30,8 +30,8 @@ def draw_events(events: EventSet, rng: np.random.Generator) -> EventSet:
 
     Example:
         >>> events = EventSet(np.arange(6.0).reshape(3, 2), np.array([0, 0, 1]))
-        >>> draw_events(events, np.random.default_rng(1)).joint[:, 0].tolist()  # the first cluster, twice
-        [0.0, 2.0, 0.0, 2.0]
+        >>> draw_events(events, np.random.default_rng(1)).joint[:, 0].tolist()  # each cluster once, this time
+        [0.0, 2.0, 4.0]
     """
     names = np.unique(events.clusters)
     rows: list[NDArray[np.int64]] = []

@@ -36,6 +36,7 @@ def test_a_pair_is_an_event_once_it_was_seen_for_two_seconds():
         "a_ego": [0.5],
         "a_lead": [0.5],
         "n": [MIN_PAIR_FRAMES],
+        "at_entry": [True],
     }
     shorter = [tuple(values[:-1] if np.ndim(values) else values for values in track) for track in (follower, leader)]
     assert len(car_following_events(table_of(*shorter))["gap"]) == 0

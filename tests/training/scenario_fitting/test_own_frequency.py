@@ -5,12 +5,12 @@ import pytest
 
 from training.data.events import car_following_events, cut_in_events
 from training.data.synthetic import synthetic_traffic
-from training.scenario_fitting.own_frequency import Exposure, count_events
+from training.scenario_fitting.own_frequency import ObservedTraffic, count_events
 
 
 def test_exposure_is_time_and_distance_of_all_vehicles():
     table = synthetic_traffic(seconds=10.0, per_lane=2)
-    exposure = Exposure().plus(table).plus(table)
+    exposure = ObservedTraffic().plus(table).plus(table)
     assert exposure.hours == pytest.approx(2 * len(table) * 0.1 / 3600)
     assert exposure.km == pytest.approx(2 * table.speed.mean() * len(table) * 0.1 / 1000)
 
@@ -20,15 +20,15 @@ def test_pairs_at_the_entry_do_not_count():
     table = synthetic_traffic(seconds=4.0, per_lane=2)
     events = car_following_events(table)
     assert events["at_entry"].all()
-    assert count_events("car_following", events, len(events["ego"]), Exposure().plus(table)) is None
+    assert count_events("car_following", events, len(events["ego"]), ObservedTraffic().plus(table)) is None
 
 
 def test_cut_ins_count_with_the_share_that_is_used():
     events = {"phase": np.array(["start", "crossing"] * 4), "ego": np.array([1, 1, 2, 2, -1, -1, 3, 3])}
-    frequency = count_events("cut_in", events, 2, Exposure(hours=2.0, km=100.0))
+    frequency = count_events("cut_in", events, 2, ObservedTraffic(hours=2.0, km=100.0))
     assert frequency is not None
     assert frequency.count == 3
     assert frequency.per_hour == pytest.approx(3 / 2.0 * 2 / 3)
     assert frequency.per_km == pytest.approx(3 / 100.0 * 2 / 3)
     none = cut_in_events(synthetic_traffic(seconds=3.0, per_lane=2))
-    assert count_events("cut_in", none, 0, Exposure(2.0, 100.0)) is None
+    assert count_events("cut_in", none, 0, ObservedTraffic(2.0, 100.0)) is None

@@ -40,7 +40,7 @@ NGSIM_LICENCE = (
     "CC BY-SA 3.0 (as the data's public record was reported); these parameters are derived from the data and are "
     "offered under the same licence"
 )
-US101 = MappingProxyType(
+US101_SOURCE = MappingProxyType(
     {
         "site": "US 101, Los Angeles, 07:50, congested",
         "data": "Next Generation Simulation (NGSIM) Vehicle Trajectories and Supporting Data, US 101 "
@@ -50,24 +50,24 @@ US101 = MappingProxyType(
         "changes": "events extracted from the trajectories, filtered as listed, fitted with a mixture",
     }
 )
-I80 = MappingProxyType(
+I80_SOURCE = MappingProxyType(
     {
         "site": "I-80, Emeryville, 16:00, congested",
         "data": "the data set from Coifman and Li (2017): A Critical Evaluation of the Next Generation Simulation "
         "(NGSIM) Vehicle Trajectory Dataset, Transportation Research Part B 105, 2017, 362-377 (13 April 2005)",
         "publisher": "B. Coifman, L. Li, Ohio State University",
         "licence": "none stated; citation asked for. Parameters only",
-        "changes": US101["changes"],
+        "changes": US101_SOURCE["changes"],
     }
 )
-I24 = MappingProxyType(
+I24_SOURCE = MappingProxyType(
     {
         "site": "I-24, Nashville, rush hours, 27 m/s in the median",
         "data": "CIRCLES, one instrumented car with radar, 26 drives of March and April 2021 "
         "(doi 10.5281/zenodo.6366761)",
         "publisher": "CIRCLES consortium",
         "licence": "none seen; citation asked for. Parameters only",
-        "changes": US101["changes"],
+        "changes": US101_SOURCE["changes"],
     }
 )
 
@@ -161,17 +161,19 @@ def _with_offsets(events: EventSet, folder: Path, site: str) -> EventSet:
 CLOSING_GAPS = COORDINATE_SYSTEMS["cut_in"][2].name
 FIRST_FRAME, CHANGE_STARTS = "first frame of the pair", "start of the lane change"
 SHIPPED_BASES = (
-    ShippedBase("car_following", "us101", read_us101_pairs, US101, FIRST_FRAME),
-    ShippedBase("car_following", "us101-gap", read_us101_pairs, US101, FIRST_FRAME, system="plain"),
-    ShippedBase("car_following", "us101-log-gap", read_us101_pairs, US101, FIRST_FRAME, system="log gap"),
-    ShippedBase("car_following", "i80", read_i80_pairs, I80, FIRST_FRAME),
-    ShippedBase("car_following", "i24", read_i24_pairs, I24, "0.8 s after the gap began to jump"),
-    ShippedBase("cut_in", "us101", read_us101_cut_ins, US101, CHANGE_STARTS),
-    ShippedBase("cut_in", "us101-closing", read_us101_cut_ins, US101, CHANGE_STARTS, system=CLOSING_GAPS),
-    ShippedBase("cut_in", "us101-15-offsets", read_us101_cut_ins_alone, US101, CHANGE_STARTS, system="log gaps"),
-    ShippedBase("cut_in", "i80", read_i80_cut_ins, I80, "1.3 s before the crossing"),
-    ShippedBase("cut_in", "i80-closing", read_i80_cut_ins, I80, "1.3 s before the crossing", system=CLOSING_GAPS),
-    ShippedBase("hard_brake", "us101", read_us101_brakings, US101, "beginning of the braking"),
+    ShippedBase("car_following", "us101", read_us101_pairs, US101_SOURCE, FIRST_FRAME),
+    ShippedBase("car_following", "us101-gap", read_us101_pairs, US101_SOURCE, FIRST_FRAME, system="plain"),
+    ShippedBase("car_following", "us101-log-gap", read_us101_pairs, US101_SOURCE, FIRST_FRAME, system="log gap"),
+    ShippedBase("car_following", "i80", read_i80_pairs, I80_SOURCE, FIRST_FRAME),
+    ShippedBase("car_following", "i24", read_i24_pairs, I24_SOURCE, "0.8 s after the gap began to jump"),
+    ShippedBase("cut_in", "us101", read_us101_cut_ins, US101_SOURCE, CHANGE_STARTS),
+    ShippedBase("cut_in", "us101-closing", read_us101_cut_ins, US101_SOURCE, CHANGE_STARTS, system=CLOSING_GAPS),
+    ShippedBase("cut_in", "us101-15-offsets", read_us101_cut_ins_alone, US101_SOURCE, CHANGE_STARTS, system="log gaps"),
+    ShippedBase("cut_in", "i80", read_i80_cut_ins, I80_SOURCE, "1.3 s before the crossing"),
+    ShippedBase(
+        "cut_in", "i80-closing", read_i80_cut_ins, I80_SOURCE, "1.3 s before the crossing", system=CLOSING_GAPS
+    ),
+    ShippedBase("hard_brake", "us101", read_us101_brakings, US101_SOURCE, "beginning of the braking"),
 )
 """Bases of the package that are fitted to recorded events.
 

@@ -1,4 +1,4 @@
-"""How often the events of the shipped bases happen: counts in recordings, with exposure, definition and source.
+"""Frequencies of the events of the shipped bases: counts in recordings, with exposure, definition and source.
 
 The rates of recordings that were picked for lane changes are never used: the shipped scenes of US 101 show 42 changes
 per vehicle-hour, the complete recording 11.

@@ -162,7 +162,7 @@ def test_bad_input_is_refused(problem: rare_envs.DrivingProblem, plain: samplers
 
 def test_injuries_have_the_interval_of_a_fitted_base() -> None:
     """Moved by refits as p is: wider than that of the sampling, and printed."""
-    plain_base = rare_envs.DrivingProblem(FOLLOWING).base
+    plain_base = rare_envs.DrivingProblem(FOLLOWING, base="us101-gap").base.distribution  # type: ignore[attr-defined]
     means = [each.name.startswith("mean") for each in plain_base.parameters()]  # type: ignore[attr-defined]
     rng = np.random.default_rng(0)
     values, changes = (

@@ -16,7 +16,10 @@ from tests.rare_envs.study.refusals import Cli, assert_refused
 
 @pytest.fixture
 def fitted(monkeypatch: pytest.MonkeyPatch) -> None:
-    bases = {"us101": fitted_entries("hard_brake"), "plain": {**HARD_BRAKE.bases["us101"], "provenance": None}}
+    bases = {
+        "us101": fitted_entries("hard_brake"),
+        "plain": {**HARD_BRAKE.bases["us101-all-brakings"], "provenance": None},
+    }
     monkeypatch.setitem(SCENARIOS._entries, "rare_envs/HardBrake-v0", replace(HARD_BRAKE, bases=bases))
 
 
