@@ -134,7 +134,7 @@ def make_ordinary_traffic(name: str, road: Road, lane: int) -> Scenario:
 
 
 def draw_starts(n: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Draw starts of `make_ordinary_traffic`: car-following near the recorded one (`us101-gap`) in which nobody is too close or comes too fast.
+    """Draw starts of `make_ordinary_traffic`: `us101-gap` car-following in which nobody is too close or comes too fast.
 
     Returns:
         Parameters, shape (n, 12).

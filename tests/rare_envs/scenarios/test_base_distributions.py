@@ -237,7 +237,7 @@ class Complete(Draws):
     [
         (
             3,
-            "A base distribution must be one of us101, .*, highway, a path .*; got int without sample, log_prob, to_stand",
+            "A base distribution must be one of us101, .*, a path .*; got int without sample, log_prob, to_stand",
         ),
         (Draws(np.zeros((1, 3))), r"; got Draws without log_prob, to_standard_normal, from_standard_normal\.$"),
         (

@@ -159,7 +159,9 @@ def _with_offsets(events: EventSet, folder: Path, site: str) -> EventSet:
 
 
 CLOSING_GAPS = COORDINATE_SYSTEMS["cut_in"][2].name
-FIRST_FRAME, CHANGE_STARTS = "first frame of the pair", "start of the lane change"
+FIRST_FRAME = "first frame of the pair"
+CHANGE_STARTS = "start of the lane change"
+BEFORE_CROSSING = "1.3 s before the crossing"
 SHIPPED_BASES = (
     ShippedBase("car_following", "us101", read_us101_pairs, US101_SOURCE, FIRST_FRAME),
     ShippedBase("car_following", "us101-gap", read_us101_pairs, US101_SOURCE, FIRST_FRAME, system="plain"),
@@ -169,10 +171,8 @@ SHIPPED_BASES = (
     ShippedBase("cut_in", "us101", read_us101_cut_ins, US101_SOURCE, CHANGE_STARTS),
     ShippedBase("cut_in", "us101-closing", read_us101_cut_ins, US101_SOURCE, CHANGE_STARTS, system=CLOSING_GAPS),
     ShippedBase("cut_in", "us101-15-offsets", read_us101_cut_ins_alone, US101_SOURCE, CHANGE_STARTS, system="log gaps"),
-    ShippedBase("cut_in", "i80", read_i80_cut_ins, I80_SOURCE, "1.3 s before the crossing"),
-    ShippedBase(
-        "cut_in", "i80-closing", read_i80_cut_ins, I80_SOURCE, "1.3 s before the crossing", system=CLOSING_GAPS
-    ),
+    ShippedBase("cut_in", "i80", read_i80_cut_ins, I80_SOURCE, BEFORE_CROSSING),
+    ShippedBase("cut_in", "i80-closing", read_i80_cut_ins, I80_SOURCE, BEFORE_CROSSING, system=CLOSING_GAPS),
     ShippedBase("hard_brake", "us101", read_us101_brakings, US101_SOURCE, "beginning of the braking"),
 )
 """Bases of the package that are fitted to recorded events.
