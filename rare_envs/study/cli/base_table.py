@@ -99,7 +99,7 @@ def _summarise(base: Mapping[str, Any]) -> dict[str, str]:
         "site": site,
         "data": base["data"] or "",
         "licence": base["licence"] or "",
-        "family": ", ".join(text for text in (base["family"], base["coordinates"]) if text),
+        "family": _join_family(base["family"] or "", base["coordinates"] or ""),
         "fit": ", ".join(text for text in fit if text),
         "frequency": _describe_frequency(base["frequency"]),
         "recorded / expected": ", ".join(checks),
@@ -113,3 +113,8 @@ def _describe_frequency(frequency: Mapping[str, Any] | None) -> str:
         f"{format_rate(frequency['per_hour'])} per hour, {format_rate(frequency['per_km'])} per km: "
         f"{frequency['count']:,} in {frequency['hours']:g} h ({frequency['definition']})"
     )
+
+
+def _join_family(family: str, coordinates: str) -> str:
+    """Return the family in words with its coordinates, which it may name already."""
+    return family if coordinates in family else ", ".join(text for text in (family, coordinates) if text)

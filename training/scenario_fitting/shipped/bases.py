@@ -43,6 +43,7 @@ NGSIM_LICENCE = (
 US101_SOURCE = MappingProxyType(
     {
         "site": "US 101, Los Angeles, 07:50, congested",
+        "date": "15 June 2005",
         "data": "Next Generation Simulation (NGSIM) Vehicle Trajectories and Supporting Data, US 101 "
         "(Los Angeles, southbound, 15 June 2005), record 8ect-6jqj",
         "publisher": "U.S. Department of Transportation, Federal Highway Administration (FHWA)",
@@ -53,6 +54,7 @@ US101_SOURCE = MappingProxyType(
 I80_SOURCE = MappingProxyType(
     {
         "site": "I-80, Emeryville, 16:00, congested",
+        "date": "13 April 2005",
         "data": "the data set from Coifman and Li (2017): A Critical Evaluation of the Next Generation Simulation "
         "(NGSIM) Vehicle Trajectory Dataset, Transportation Research Part B 105, 2017, 362-377 (13 April 2005)",
         "publisher": "B. Coifman, L. Li, Ohio State University",
@@ -63,6 +65,7 @@ I80_SOURCE = MappingProxyType(
 I24_SOURCE = MappingProxyType(
     {
         "site": "I-24, Nashville, rush hours, 27 m/s in the median",
+        "date": "March and April 2021",
         "data": "CIRCLES, one instrumented car with radar, 26 drives of March and April 2021 "
         "(doi 10.5281/zenodo.6366761)",
         "publisher": "CIRCLES consortium",
