@@ -41,7 +41,9 @@ def run(
     Example:
         How often does the rule-based ego come within 3 s of a collision in the first 3 s?
 
-        >>> question = Question(env_id="rare_envs/CarFollowing-v0", gamma=3.0, horizon=3.0, method="mc", max_sim=1000)
+        >>> question = Question(
+        ...     env_id="rare_envs/CarFollowing-v0", base="us101-gap", gamma=3.0, horizon=3.0, method="mc", max_sim=1000
+        ... )
         >>> report = run(prepare(question))
         >>> report.estimate.p, report.estimate.n_sim
         (0.021, 1000)
@@ -83,7 +85,9 @@ def run_into(folder: Path, study: Study, progress: bool = False) -> Report:
 
     Example:
         >>> from tempfile import TemporaryDirectory
-        >>> question = Question(env_id="rare_envs/CarFollowing-v0", gamma=3.0, horizon=3.0, method="mc", max_sim=1000)
+        >>> question = Question(
+        ...     env_id="rare_envs/CarFollowing-v0", base="us101-gap", gamma=3.0, horizon=3.0, method="mc", max_sim=1000
+        ... )
         >>> with TemporaryDirectory() as folder:
         ...     report = run_into(Path(folder), prepare(question))
         ...     sorted(path.name for path in Path(folder).iterdir())

@@ -49,7 +49,9 @@ class Report:
 
     Example:
         >>> from rare_envs.study import Question, prepare, run
-        >>> question = Question(env_id="rare_envs/CarFollowing-v0", gamma=3.0, horizon=3.0, method="mc", max_sim=1000)
+        >>> question = Question(
+        ...     env_id="rare_envs/CarFollowing-v0", base="us101-gap", gamma=3.0, horizon=3.0, method="mc", max_sim=1000
+        ... )
         >>> report = run(prepare(question))
         >>> answer = report.to_dict()
         >>> answer["n_failures"], answer["doubtful"], answer["failures"][0]["crash"]

@@ -91,7 +91,9 @@ def read_failures(folder: Path) -> dict[str, NDArray[Any]]:
     Example:
         >>> from tempfile import TemporaryDirectory
         >>> from rare_envs.study import Question, prepare, run_into
-        >>> question = Question(env_id="rare_envs/CarFollowing-v0", gamma=3.0, horizon=3.0, method="mc", max_sim=1000)
+        >>> question = Question(
+        ...     env_id="rare_envs/CarFollowing-v0", base="us101-gap", gamma=3.0, horizon=3.0, method="mc", max_sim=1000
+        ... )
         >>> with TemporaryDirectory() as folder:
         ...     report = run_into(Path(folder), prepare(question))
         ...     failures = read_failures(Path(folder))

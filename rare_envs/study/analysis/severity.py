@@ -136,7 +136,7 @@ def severity_curve(
 
     Example:
         >>> import rare_envs, samplers
-        >>> problem = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", base="us101")
+        >>> problem = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", base="us101-gap")
         >>> severity = severity_curve(problem, samplers.estimate(problem, seed=0, max_sim=2000), thresholds=[0.0, 2.5])
         >>> bool(severity.curve.p[0] > severity.curve.p[1]), 0.0005 < severity.injuries.per_failure < 0.1
         (True, True)

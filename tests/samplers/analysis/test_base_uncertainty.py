@@ -71,8 +71,9 @@ def test_events_that_do_not_determine_p_give_a_bound_and_no_interval():
     assert found.interval is found.expected is None
     half = 2.119905 * math.sqrt(found.spread**2 + result.cov**2 + 0.04)
     assert found.bound == pytest.approx(min(1.0, result.p * math.exp(half)), rel=1e-6)
-    assert "the events do not determine p; below " in str(result)
+    assert "the events do not determine p; nor an upper end in this family" in str(result)
     assert "expected for the next event" not in str(result)
+    assert "do not determine p; below 1.0e-02 in this family" in str(replace(found, bound=0.01))
 
 
 def test_the_upper_end_stays_below_one():
