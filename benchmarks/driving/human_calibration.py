@@ -1,6 +1,6 @@
 """Does an attentive human driver collide as rarely as people do? Base distributions against the 100-Car study.
 
-    python -m benchmarks.driving.human_calibration [--base CutIn=us101] [--draws 50000]
+    python -m benchmarks.driving.human_calibration [--base CutIn=us101-15-offsets] [--draws 50000]
 
 drives draws of each base distribution with the human driver model, with parts of it taken away, with `idm`, and with
 one that brakes fully from the first moment on; counts contacts and near-crashes (`near_crash`); compares them with
@@ -60,6 +60,8 @@ class HumanEvents:
     """Events of a kind, and how often people come into contact or near it in one."""
 
     env_id: str
+    base: str
+    """Base distribution, unless another is named."""
     name: str
     per_km: float
     """Events as the base defines them, per vehicle-km."""
@@ -73,9 +75,17 @@ class HumanEvents:
 
 EVENTS = (
     # 1 contact and 136 near-crashes begun by another's lane change in 3.22 million km, .13 to .31 cut-ins per km
-    HumanEvents("rare_envs/CutIn-v0", "cut-in", 0.26, 1.0, (3e-8, 1.4e-5), (1.4e-4, 3.4e-4)),
+    HumanEvents("rare_envs/CutIn-v0", "us101-15-offsets", "cut-in", 0.26, 1.0, (3e-8, 1.4e-5), (1.4e-4, 3.4e-4)),
     # 14 contacts and 385 near-crashes with a lead, .155 to 1.23 brakings of the lead per km; 42 of 268 to a standstill
-    HumanEvents("rare_envs/HardBrake-v0", "braking of the lead", 1.23, 0.16, (3.5e-6, 2.8e-5), (9.7e-5, 7.7e-4)),
+    HumanEvents(
+        env_id="rare_envs/HardBrake-v0",
+        base="us101-all-brakings",
+        name="braking of the lead",
+        per_km=1.23,
+        share=0.16,
+        contacts=(3.5e-6, 2.8e-5),
+        near_crashes=(9.7e-5, 7.7e-4),
+    ),
 )
 PEOPLE_PER_KM = {"cut-in": (3.1e-7, 4.2e-5), "braking of the lead": (4.3e-6, 1.2e-4)}
 """Contacts and near-crashes of the 100-Car drivers per km, all roads: begun by another's lane change, and striking the
@@ -103,7 +113,7 @@ class CalibrationCell:
         return clopper_pearson(count, self.draws, CONFIDENCE)
 
 
-def count_outcomes(events: HumanEvents, driver: str, base: str | None, draws: int, seed: int = 0) -> CalibrationCell:
+def count_outcomes(events: HumanEvents, driver: str, base: str, draws: int, seed: int = 0) -> CalibrationCell:
     """Drive draws of a base distribution and count contacts and near-crashes."""
     f, flanks = {}, 0
     for measure in ("near_crash", "required_deceleration"):
@@ -118,7 +128,7 @@ def count_outcomes(events: HumanEvents, driver: str, base: str | None, draws: in
     near = (f["near_crash"] <= 0.0) & ~contact
     needed = near & (f["required_deceleration"] <= MAX_BRAKING - RAPID_BRAKING)
     counts = (int(each.sum()) for each in (contact, near, needed))
-    return CalibrationCell(events.name, driver, base or "default", draws, *counts, flanks)
+    return CalibrationCell(events.name, driver, base, draws, *counts, flanks)
 
 
 def split_draws(draws: int, most: int = 20_000) -> list[int]:
@@ -228,7 +238,9 @@ def write_page(measured: str) -> None:
 
 
 def main(
-    base: Annotated[list[str] | None, typer.Option(help="CutIn=NAME or HardBrake=NAME; else the default.")] = None,
+    base: Annotated[
+        list[str] | None, typer.Option(help="CutIn=NAME or HardBrake=NAME; else those of `EVENTS`.")
+    ] = None,
     draws: Annotated[int, typer.Option(help="Draws of each base distribution.")] = 50_000,
     seed: int = 0,
     page: Annotated[bool, typer.Option(help="Whether to write the JSON and the page.")] = True,
@@ -238,7 +250,7 @@ def main(
     chosen = dict(each.split("=", 1) for each in base or [])
     cells = []
     for events in EVENTS:
-        name = chosen.get(events.env_id.removeprefix("rare_envs/").removesuffix("-v0"))
+        name = chosen.get(events.env_id.removeprefix("rare_envs/").removesuffix("-v0"), events.base)
         for driver in DRIVERS:
             cells.append(count_outcomes(events, driver, name, draws, seed))
             print(cells[-1], flush=True)

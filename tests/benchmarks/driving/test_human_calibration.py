@@ -37,8 +37,8 @@ def cells_of(**counts: tuple[int, int, int]) -> dict[str, CalibrationCell]:
 
 
 def test_outcomes_are_those_of_the_problem() -> None:
-    cell = count_outcomes(CUT_IN, "human", None, 300, seed=3)
-    around = rare_envs.DrivingProblem(CUT_IN.env_id, ego="human", measure="near_crash")
+    cell = count_outcomes(CUT_IN, "human", CUT_IN.base, 300, seed=3)
+    around = rare_envs.DrivingProblem(CUT_IN.env_id, ego="human", measure="near_crash", base=CUT_IN.base)
     x = around.base.sample(300, np.random.default_rng(3))
     f = around.evaluate(x)
     ttc = rare_envs.DrivingProblem(CUT_IN.env_id, ego="human").evaluate(x)
@@ -92,7 +92,7 @@ def test_parts_and_page(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     page = tmp_path / "page.md"
     page.write_text("# Text\n\n## Measured\n\nold\n")
     monkeypatch.setattr(calibration, "PAGE", page)
-    cells = [CalibrationCell(e.name, d, "default", 100, 1, 2, 1, 0) for e in EVENTS for d in DRIVERS]
+    cells = [CalibrationCell(e.name, d, e.base, 100, 1, 2, 1, 0) for e in EVENTS for d in DRIVERS]
     calibration.write_page(format_measured(cells, "command"))
     text = page.read_text()
     assert text.startswith("# Text\n\n## Measured\n\n`command`; 100 draws each")
