@@ -42,11 +42,11 @@ NARROW = 400
 HEAD = """# The shipped egos, everywhere
 
 Every ego that comes with this project, and two that `rare-envs train-ego ENV --algo ppo --steps {steps}` trained in the
-scenario at hand (`dqn` likewise), in every scenario with its default drivers and the base distribution named with it: the
-probability of a collision within {horizon:g} s with its 95 % interval, by [two methods](estimates.md), simulations, wall time,
-number of warnings, and the likeliest failure that was found (`python -m benchmarks.driving.egos`). These bases are test
-distributions, under which collisions are frequent enough for a comparison of egos and methods, not those that the recorded
-events support best; for p and rates of your ego take the default ([rates](rates.md)).
+scenario at hand (`dqn` likewise), in every scenario with its default drivers and the base distribution named with it:
+the probability of a collision within {horizon:g} s with its 95 % interval, by [two methods](estimates.md), simulations,
+wall time, number of warnings, and the likeliest failure that was found (`python -m benchmarks.driving.egos`). These
+bases are test distributions, under which collisions are frequent enough for a comparison of egos and methods, not those
+that the recorded events support best; for p and rates of your ego take the default ([rates](rates.md)).
 
 `vision` has {most:,} simulations at most. Wall times are from a busy machine of two cores. `dqn` chooses among five
 accelerations and cannot steer: on the I-80's curves it leaves its lane, or the road. In the 1,448 dimensions of
