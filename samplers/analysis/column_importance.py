@@ -88,7 +88,8 @@ def rank_columns(
 def relative_entropies(failures: WeightedFailures, u: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return D_j of each column, its influence function at the points, and the mean of u_j given failure.
 
-    The estimate of D_j from n effective points is too large by (s^2 + 1) / (2 n) on average, which is taken off.
+    The estimate of D_j from n effective points is too large by 1 / n on average, which is taken off: the mean of u_j^2
+    has no bias, and that of -log(s^2) / 2 is 1 / n for normal u_j, whatever s^2.
 
     Args:
         failures: Weighted failing points, k of them.
@@ -102,7 +103,7 @@ def relative_entropies(failures: WeightedFailures, u: FloatArray) -> tuple[Float
     square = share @ u**2
     variance = np.maximum(square - mean**2, np.finfo(np.float64).tiny)
     points = effective_number(failures.unit_totals(failures.weights))
-    bias = (variance + 1) / (2 * points)
+    bias = 1 / points
     entropy = (square - 1 - np.log(variance)) / 2 - bias
     influence = (1 - 1 / variance) / 2 * (u**2 - square) + mean / variance * (u - mean)
     return entropy, influence, mean

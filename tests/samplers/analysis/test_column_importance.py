@@ -5,6 +5,8 @@ import pytest
 from scipy import stats
 
 import samplers
+from samplers.analysis.column_importance import relative_entropies
+from samplers.analysis.failure_weights import WeightedFailures
 from tests.samplers.analysis.parametric_normal import ALPHA, BASE, BETA, HAZARD, ParametricNormal, run
 
 
@@ -41,6 +43,20 @@ def test_columns_of_a_block_count_together(result):
     assert blocks["a"].importance == pytest.approx(alone["x1"].importance)
     assert blocks["rest"].importance == pytest.approx(joint, abs=0.003)
     assert blocks["rest"].direction > 0
+
+
+@pytest.mark.parametrize("variance", [0.05, 0.25, 1.0, 4.0])
+def test_relative_entropy_of_normal_points_has_no_bias(variance):
+    """20,000 columns of 50 points N(1.5, s^2): the bias of 1 / 50 is gone but for terms of order 1 / 50^2."""
+    points, columns = 50, 20_000
+    u = 1.5 + np.sqrt(variance) * np.random.default_rng(0).standard_normal((points, columns))
+    failures = WeightedFailures(
+        x=u, rows=np.arange(points), has_outcome=np.full(points, True), weights=np.full(points, 1e-4),
+        units=np.arange(points), n_units=10_000, independent=True, inflation=1.0, total=points,
+    )  # fmt: skip
+    entropy = relative_entropies(failures, u)[0]
+    exact = (1.5**2 + variance - 1 - np.log(variance)) / 2
+    assert entropy.mean() == pytest.approx(exact, abs=4 * entropy.std() / np.sqrt(columns) + 2 / points**2)
 
 
 def test_irrelevant_noise_has_no_importance():
