@@ -24,11 +24,12 @@ from rare_envs.traffic.state import VEHICLE_LENGTH, State
 from rare_envs.traffic.vehicle_models import NEAR_ZERO
 
 MAX_HUMAN_BRAKING = 0.774 * 9.80665
-"""Hardest braking of a competent and careful human driver [m/s^2]: UN Regulation 157, its model of the driver."""
+"""Hardest braking of a competent and careful human driver [m/s^2]: UN Regulation 157, as its reference implementation
+(esmini) has it, which all values of this regulation below are from."""
 
 
 def _attentive_idm() -> IDM:
-    """Return the IDM of motorways in Treiber and Kesting (2013, table 11.2)."""
+    """Return the IDM of motorways: Treiber and Kesting (2013), table 11.2, its values as commonly quoted."""
     return IDM(
         desired_speed=120.0 / 3.6,
         time_headway=1.0,
@@ -55,6 +56,8 @@ class Percept(NamedTuple):
 @dataclass(frozen=True)
 class HumanDriverModel:
     """Parameters of an attentive human driver; each is published, none is fitted.
+
+    Values of the book and of Regulation 157 are as quoted or implemented in public; neither text was consulted.
 
     Example:
         >>> HumanDriverModel(reaction_time=1.0).reaction_time
