@@ -129,10 +129,10 @@ def describe_human_contacts() -> str:
 
     Example:
         >>> describe_human_contacts()
-        'people: 21 contacts of all kinds, 4.3 into a vehicle ahead (100-Car), 15 (SHRP 2)'
+        'people: 21 contacts of all kinds, 4.3 into a vehicle ahead (100-Car), 15 crashes without tyre strikes (SHRP 2)'
     """
     return (
         f"people: {CONTACTS_100CAR.per_million_km:.2g} contacts of all kinds, "
         f"{REAR_END_CONTACTS_100CAR.per_million_km:.2g} into a vehicle ahead (100-Car), "
-        f"{CONTACTS_SHRP2.per_million_km:.2g} (SHRP 2)"
+        f"{CONTACTS_SHRP2.per_million_km:.2g} {CONTACTS_SHRP2.kind} (SHRP 2)"
     )

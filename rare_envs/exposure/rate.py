@@ -134,12 +134,12 @@ class CollisionRate:
 
     @property
     def interval_per_hour(self) -> RateInterval:
-        """RateInterval of `per_hour`; from 0 where p is not determined."""
+        """Interval of `per_hour`; from 0 where p is not determined."""
         return self._scale_interval(1.0 / self.frequency.hours)
 
     @property
     def interval_per_million_km(self) -> RateInterval:
-        """RateInterval of `per_million_km`; from 0 where p is not determined."""
+        """Interval of `per_million_km`; from 0 where p is not determined."""
         return self._scale_interval(MILLION_KM / self.frequency.km)
 
     @property

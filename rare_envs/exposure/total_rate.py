@@ -31,7 +31,7 @@ class VarianceShare(NamedTuple):
     scenario: str
     """The scenario; empty for those of all."""
     share: float
-    """Of the variance of the logarithm of the total."""
+    """Of the variance of the logarithm of the sum of the determined rates."""
 
 
 class FurtherEvents(NamedTuple):
@@ -88,14 +88,14 @@ class TotalRate:
 
     @cached_property
     def interval_per_hour(self) -> RateInterval:
-        """RateInterval of `per_hour`."""
+        """Interval of `per_hour`."""
         if len(self.rates) == 1:
             return self.rates[0].interval_per_hour
         return self._interval([rate.frequency.hours for rate in self.rates], [r.interval_per_hour for r in self.rates])
 
     @cached_property
     def interval_per_million_km(self) -> RateInterval:
-        """RateInterval of `per_million_km`."""
+        """Interval of `per_million_km`."""
         if len(self.rates) == 1:
             return self.rates[0].interval_per_million_km
         exposures = [rate.frequency.km / MILLION_KM for rate in self.rates]
@@ -108,11 +108,11 @@ class TotalRate:
 
     @cached_property
     def shares(self) -> tuple[VarianceShare, ...]:
-        """Sources of the variance of the logarithm of the total per km, the largest first; empty if it is not known.
+        """Sources of the variance of the logarithm of the sum of the determined rates, per km, the largest first.
 
-        To first order the variance of the total is the sum of R_i R_j c_ij over scenarios, c_ij the covariance of the
-        logarithms: the variance of log R_i where i = j, sqrt(b_i b_j) of the bases where both were fitted to the same
-        events, else 0.
+        Empty if none is determined. To first order the variance of this sum is the sum of R_i R_j c_ij over scenarios,
+        c_ij the covariance of the logarithms: the variance of log R_i where i = j, sqrt(b_i b_j) of the bases where
+        both were fitted to the same events, else 0.
         """
         parts = self._variance_parts()
         total = sum(parts.values())
@@ -129,8 +129,11 @@ class TotalRate:
             recorded: Events that each scenario's base was fitted to, by its name; those not known are left out.
 
         Returns:
-            The numbers for the scenario with the largest share; None where none has any.
+            The numbers for the scenario with the largest share; None where none has any, or where a rate that is not
+            determined adds its bound to the upper end, which further events of another scenario leave as it is.
         """
+        if len(self.determined) < len(self.rates):
+            return None
         first = next((each for each in self.shares if each.source == "base" and recorded.get(each.scenario)), None)
         if first is None:
             return None

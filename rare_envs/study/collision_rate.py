@@ -85,6 +85,29 @@ def describe_probability(estimate: samplers.Estimate) -> CollisionProbability:
     )
 
 
+def describe_left_out(study: Study, estimate: samplers.Estimate) -> tuple[str, ...]:
+    """Return which errors the interval of the rate leaves out, and why there is no lower end; empty if it holds all.
+
+    Args:
+        study: The question, loaded.
+        estimate: Its answer.
+    """
+    base, found = estimate.base_uncertainty, []
+    if study.question.ensemble:
+        mean = "ensemble: p is the mean over the refits, which stands for the error of the base distribution"
+        found.append(f"{mean}; no interval of that error is given, and that of the rate leaves it out")
+    if estimate.p == 0:
+        found.append("nothing failed: the upper end is that of the simulations, without the error of the distribution")
+    elif base is None:
+        if not found:  # the mixture of the refits has none of its own
+            found.append("the error of the base distribution is not known (no refits), and left out of the rate")
+    elif base.bound is not None:
+        found.append(f"the events do not determine p (spread {base.spread:.1f}): it counts in the upper end alone")
+    elif base.reason:
+        found.append(f"the error of the base distribution is left out of the rate: {base.reason}")
+    return tuple(found)
+
+
 def _explain_no_collisions(question: Question) -> str:
     """Return why p is no probability of a collision of the ego; empty if it is one."""
     if question.measure != COLLISION_MEASURE:

@@ -16,7 +16,7 @@ from agents.sb3.saved_ego import SavedEgo
 from rare_envs.distributions.space import Distribution
 from rare_envs.egos.faults import Fault
 from rare_envs.exposure import HUMAN_BENCHMARKS, CollisionRate
-from rare_envs.study.collision_rate import compute_rate, find_frequency
+from rare_envs.study.collision_rate import compute_rate, describe_left_out, find_frequency
 from rare_envs.study.crash_kinds import CrashKinds
 from rare_envs.study.question import Study
 from rare_envs.version import __version__
@@ -88,11 +88,12 @@ class Report:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Options that make no difference here, notes of the problem, and what is not known."""
+        """Options that make no difference here, notes of the problem, what is not known, what the rate leaves out."""
         unknown = [f"kinds of crash are not known: {self.kinds.unknown}"] if self.kinds.unknown else []
         if isinstance(self.sensitivity, str):
             unknown.append(f"sensitivity is not known: {self.sensitivity}")
-        return (*self._unused_options, *self.study.problem.notes, *unknown)
+        left_out = () if self.no_rate else describe_left_out(self.study, self.estimate)
+        return (*self._unused_options, *self.study.problem.notes, *unknown, *left_out)
 
     @cached_property
     def rate(self) -> CollisionRate | None:

@@ -67,7 +67,8 @@ def draw_rates(axes: Axes, total: TotalRate) -> None:
 def draw_shares(axes: Axes, total: TotalRate) -> None:
     """Draw the shares of the sources of the uncertainty as bars."""
     shares = total.shares
-    axes.set_title("sources of the uncertainty, share of the variance", fontsize=10)
+    of_what = "" if len(total.determined) == len(total.rates) else " of the determined part"
+    axes.set_title(f"sources of the uncertainty{of_what}, share of the variance", fontsize=10)
     if not shares:
         axes.set_axis_off()
         axes.text(0.5, 0.5, "not known", ha="center", va="center", transform=axes.transAxes)

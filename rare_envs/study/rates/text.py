@@ -92,13 +92,17 @@ def describe_further_events(needed: FurtherEvents) -> str:
 def describe_uncertainty(total: TotalRate, recorded: dict[str, int]) -> str:
     """Return what the uncertainty of a total comes from; empty if it is not known.
 
+    Where a rate is not determined, the shares are those of the sum of the others.
+
     Args:
         total: The total.
         recorded: Events behind the base of each scenario, by its name.
     """
     parts = []
     if total.shares:
-        parts.append(f"the uncertainty is {describe_sources(total.shares)}")
+        whole = len(total.determined) == len(total.rates)
+        of_what = "the uncertainty" if whole else "the uncertainty of the determined part"
+        parts.append(f"{of_what} is {describe_sources(total.shares)}")
         needed = total.further_events(recorded)
         parts += [] if needed is None else [f"{describe_further_events(needed)} (a spread falls with 1 / sqrt(events))"]
     for rate in (each for each in total.rates if not each.determined):

@@ -16,7 +16,6 @@ from rare_envs.study.evaluate import run, run_into
 from rare_envs.study.question import Question, Study, prepare
 from rare_envs.study.rates.result import Risk, ScenarioRisk
 from rare_envs.study.rates.sites import choose_base, compare_sites
-from rare_envs.study.report import Report
 from rare_envs.study.run_directory import format_json
 
 SCENARIO_SET = ("cut_in", "hard_brake")
@@ -132,17 +131,5 @@ def _evaluate(
         report=report,
         rate=compute_rate(study, report.estimate, spread),
         site_factors=factors,
-        notes=(*notes, *report.notes, *_describe_left_out(report)),
+        notes=(*notes, *report.notes),
     )
-
-
-def _describe_left_out(report: Report) -> tuple[str, ...]:
-    """Return which error the interval leaves out, or why there is no lower end."""
-    estimate, base = report.estimate, report.estimate.base_uncertainty
-    if estimate.p == 0:
-        return ("nothing failed: the upper end is that of the simulations, without the error of the distribution",)
-    if base is None:
-        return ("the error of the base distribution is not known (no refits), and left out",)
-    if base.bound is not None:
-        return (f"the events do not determine p (spread {base.spread:.1f}): it counts in the upper end alone",)
-    return (f"the error of the base distribution is left out: {base.reason}",) if base.reason else ()

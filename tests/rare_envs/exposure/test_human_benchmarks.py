@@ -36,6 +36,5 @@ def test_rates(benchmark) -> None:
 
 
 def test_the_line_beside_a_rate() -> None:
-    assert (
-        describe_human_contacts() == "people: 21 contacts of all kinds, 4.3 into a vehicle ahead (100-Car), 15 (SHRP 2)"
-    )
+    people = "people: 21 contacts of all kinds, 4.3 into a vehicle ahead (100-Car)"
+    assert describe_human_contacts() == f"{people}, 15 crashes without tyre strikes (SHRP 2)"

@@ -100,6 +100,12 @@ def test_further_events_halve_the_width() -> None:
     assert alone.further_events({}) is None
 
 
+def test_no_further_events_halve_a_width_that_a_bound_is_part_of() -> None:
+    known, unknown = rate(3e-4, 0.0, SURE, spread=1.4), rate(0.0, math.inf, SURE, upper=1e-3, scenario="b")
+    assert TotalRate((known,)).further_events({"cut_in": 38}) is not None
+    assert TotalRate((known, unknown)).further_events({"cut_in": 38, "b": 20}) is None
+
+
 def test_rates_of_different_confidence_do_not_add() -> None:
     with pytest.raises(ValueError, match="one confidence"):
         TotalRate(())

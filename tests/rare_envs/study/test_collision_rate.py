@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 
 from rare_envs.study import Question, prepare, run
-from rare_envs.study.collision_rate import compute_rate, describe_probability, find_frequency
+from rare_envs.study.collision_rate import compute_rate, describe_left_out, describe_probability, find_frequency
 from tests.rare_envs.study.fitted_files import write_fitted
 
 
@@ -57,6 +57,7 @@ def test_events_that_do_not_determine_p_leave_an_upper_end(tmp_path: Path) -> No
     assert not found.determined
     assert found.upper == uncertainty.bound
     assert report.rate is not None and report.rate.interval_per_hour[0] == 0.0
+    assert report.notes[-1].startswith(f"the events do not determine p (spread {uncertainty.spread:.1f})")
 
 
 def test_nothing_failed(tmp_path: Path) -> None:
@@ -65,6 +66,9 @@ def test_nothing_failed(tmp_path: Path) -> None:
     assert report.estimate.p == 0.0
     assert report.rate is not None and report.rate.per_hour == 0.0
     assert report.rate.interval_per_hour[1] >= 42 / 5.64 * report.estimate.interval[1]
+    left_out = describe_left_out(report.study, report.estimate)
+    assert len(left_out) == 1
+    assert left_out[0].startswith("nothing failed")
 
 
 REFUSED = {
@@ -103,6 +107,16 @@ def test_the_mixture_of_the_refits_keeps_the_frequency(fitted: str) -> None:
     assert report.estimate.base_uncertainty is None
     assert report.rate is not None
     assert report.rate.per_hour == pytest.approx(42 / 5.64 * report.estimate.p)
+    assert report.rate.log_variance.base == 0.0
+    (note,) = describe_left_out(report.study, report.estimate)
+    assert "stands for the error of the base distribution" in note
+
+
+def test_the_mixture_of_the_refits_where_nothing_failed_has_both_notes(tmp_path: Path) -> None:
+    base = write_fitted(tmp_path / "safe.json", "hard_brake", spread=0.0, means=[[5.0, 100.0, 1.0]])
+    safe = run(prepare(question(base, max_sim=100)))
+    study = replace(safe.study, question=replace(safe.study.question, ensemble=True))
+    assert [note.split(":")[0] for note in describe_left_out(study, safe.estimate)] == ["ensemble", "nothing failed"]
 
 
 def test_scenarios_fitted_to_the_same_events_are_told_by_their_data(tmp_path: Path) -> None:

@@ -45,7 +45,8 @@ def test_what_actions_are_taken_for_is_pointed_out(cli: Cli, tmp_path: Path, mon
     """A policy from HighwayEnv without its meta-actions runs all the same, and behaves arbitrarily."""
     (tmp_path / "idle_egos.py").write_text(DISCRETE)
     monkeypatch.chdir(tmp_path)
-    words = ("estimate", FOLLOWING, "--ego", "idle_egos:Idle", "--method", "mc", "--max-sim", 50, "--json")
+    few = ("--method", "mc", "--max-sim", 50, "--gamma", 1)  # TTC < 1 s has no rate, and so no notes on one
+    words = ("estimate", FOLLOWING, "--ego", "idle_egos:Idle", *few, "--json")
     (note,) = json.loads(cli(*words, "--observation", "kinematics").stdout)["notes"]
     assert "--action meta" in note
     for more in (("--observation", "kinematics", "--action", "meta"), ()):

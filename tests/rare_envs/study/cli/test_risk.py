@@ -77,10 +77,23 @@ def test_estimate_prints_the_rate_beside_people(cli: Cli, here: Path) -> None:
     base = write_fitted(here / "fitted.json", "hard_brake")
     text = " ".join(cli(*BRAKE, "--base", base).stdout.split())
     assert "per million km (" in text
-    assert "people: 21 contacts of all kinds, 4.3 into a vehicle ahead (100-Car), 15 (SHRP 2)" in text
+    assert (
+        "people: 21 contacts of all kinds, 4.3 into a vehicle ahead (100-Car), 15 crashes without tyre strikes (SHRP 2)"
+        in text
+    )
     assert "from 0.19 brakings per km; the uncertainty is" in text
     data = json.loads(cli(*BRAKE, "--base", base, "--json").stdout)
     assert data["rate"]["per_hour"] == pytest.approx(42 / 5.64 * data["p"])
+
+
+def test_estimate_says_which_error_the_rate_leaves_out(cli: Cli, here: Path) -> None:
+    whole = write_fitted(here / "whole.json", "hard_brake")
+    assert "note:" not in cli(*BRAKE, "--base", whole).stdout
+    without = write_fitted(here / "without.json", "hard_brake", refits=None)
+    assert "note: the error of the base distribution is not known (no refits)" in cli(*BRAKE, "--base", without).stdout
+    safe = write_fitted(here / "safe.json", "hard_brake", means=[[5.0, 100.0, 1.0]])
+    said = "note: nothing failed: the upper end is that of the simulations, without the error of the distribution"
+    assert said in cli(*BRAKE, "--base", safe).stdout
 
 
 def test_estimate_says_in_one_line_why_there_is_no_rate(cli: Cli, here: Path) -> None:
@@ -98,6 +111,11 @@ def test_estimate_says_in_one_line_why_there_is_no_rate(cli: Cli, here: Path) ->
 def test_the_mixture_of_the_refits_as_base(cli: Cli, here: Path) -> None:
     base = write_fitted(here / "fitted.json", "hard_brake", spread=1.0)
     data = json.loads(cli(*BRAKE, "--base", base, "--ensemble", "--json").stdout)
+    notes = [line for line in cli(*BRAKE, "--base", base, "--ensemble").stdout.splitlines() if line.startswith("note")]
+    assert len(notes) == 1
+    assert notes[0].startswith("note: ensemble: p is the mean over the refits")
+    assert "no interval of that error is given" in notes[0]
+    assert data["notes"] == [notes[0].removeprefix("note: ")]
     assert data["question"]["ensemble"] is True
     assert data["base_uncertainty"] is None
     without = write_fitted(here / "without.json", "hard_brake", refits=None)

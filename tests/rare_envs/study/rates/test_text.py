@@ -58,6 +58,14 @@ def test_the_line_of_a_total_names_the_largest_source_first() -> None:
     assert "further" not in describe_uncertainty(total, {})
 
 
+def test_shares_are_those_of_the_determined_part_where_a_rate_is_not_determined() -> None:
+    unknown = rate(0.0, upper=1e-3, scenario="hard_brake")
+    text = describe_uncertainty(TotalRate((rate(spread=1.4, counted=frequency(100)), unknown)), {"cut_in": 38})
+    assert text.startswith("the uncertainty of the determined part is 99 % the cut-in distribution, ")
+    assert "hard brake is not determined, and adds " in text
+    assert "halve" not in text
+
+
 def test_a_rate_that_is_not_determined_has_no_parts_but_raises_the_upper_end() -> None:
     unknown = rate(0.0, upper=1e-3)
     assert describe_parts(unknown) == ""
