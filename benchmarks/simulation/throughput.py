@@ -219,7 +219,12 @@ def highway_memory(rollouts: int = 1024) -> dict[str, float]:
 
 
 def _peak_gib() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    """Return the peak memory of this process [GiB]; `ru_maxrss` may be that of the process which started it."""
+    status = Path("/proc/self/status")
+    if not status.exists():  # not Linux
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    words = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM"))
+    return int(words.split()[1]) / 2**20
 
 
 def memory(rollouts: int = 1_000_000) -> dict[str, float]:

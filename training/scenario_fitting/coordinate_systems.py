@@ -1,7 +1,7 @@
 """Coordinate systems in which a Gaussian mixture is fitted to events, and the choice between them.
 
 Which coordinates one calls normal decides the tails, and with them the probability of a collision: for car-following
-p of the IDM is 1e-4 in plain gaps and 1e-13 in the closing speed over the root of the gap. BIC and the likelihood of
+p of the IDM is 1e-4 in plain gaps and 7e-11 in the closing speed over the root of the gap. BIC and the likelihood of
 events that the fit has not seen are what the events themselves have to say about it.
 """
 
@@ -28,6 +28,8 @@ FOLD_STARTS = 5
 Fewer than of the fit itself: another local optimum moves log p by .1 to .2, nothing beside the spread of .7 to 1.5 that
 other events cause.
 """
+BIC_TIE = 2.0
+"""Difference of BIC below which it says nothing (Kass and Raftery, "Bayes factors", 1995, section 3.2)."""
 CLEARLY_WORSE = 2.0
 """Paired standard errors of held-out log likelihood by which a coordinate system may be worse than the best."""
 
@@ -161,7 +163,8 @@ def choose_system(bic: Sequence[float], held_out: Sequence[FloatArray], clusters
     """Return which coordinate system is supported best.
 
     The one with the least BIC among those whose held-out log likelihood is not clearly worse than the best one's:
-    by no more than `CLEARLY_WORSE` paired standard errors, of sums over clusters.
+    by no more than `CLEARLY_WORSE` paired standard errors, of sums over clusters. Where others are within `BIC_TIE` of
+    it, the held-out log likelihood decides between these.
 
     Args:
         bic: Of each system.
@@ -185,4 +188,5 @@ def choose_system(bic: Sequence[float], held_out: Sequence[FloatArray], clusters
         error = float(np.sqrt(len(losses)) * losses.std(ddof=1)) if len(losses) > 1 else np.inf
         if losses.sum() <= CLEARLY_WORSE * error:
             eligible.append(i)
-    return min(eligible, key=lambda i: bic[i])
+    least = min(bic[i] for i in eligible)
+    return max((i for i in eligible if bic[i] <= least + BIC_TIE), key=lambda i: totals[i])

@@ -59,7 +59,7 @@ class EventSet:
     """Number of the cluster of each event, shape (n,): events of one scene or window of time depend on each other."""
     apart: FloatArray = field(default_factory=lambda: np.empty((0, 0)))
     """The last columns, independent of the others and from m events of their own, shape (m, a)."""
-    cluster: str = "30 s window"
+    cluster: str = "half-minute"
     """Word for a cluster."""
     log: tuple[Mapping[str, Any], ...] = ()
     """What each filter dropped, see `filter_events`."""
@@ -170,7 +170,7 @@ def filter_events(events: Mapping[str, NDArray[Any]], recipe: EventRecipe, box: 
     apart = np.empty((int(keep.sum()), len(recipe.apart)))
     for j, column in enumerate(recipe.apart):
         apart[:, j] = events[column][keep]
-    word = "scene" if recipe.cluster == ("scene",) else "30 s window"
+    word = "scene" if recipe.cluster == ("scene",) else "half-minute"
     return EventSet(joint, clusters, apart, word, tuple(log))
 
 

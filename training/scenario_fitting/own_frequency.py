@@ -36,7 +36,8 @@ def count_events(scenario: str, events: Events, used: int, traffic: ObservedTraf
     """Return the frequency of the events of a user's own recordings; None where nothing was recorded to count.
 
     Cut-ins: lane changes with a vehicle behind in the new lane, times the share of these that the filters keep.
-    Car-following: pairs that begin while the ego is in the picture already, all of which count.
+    Car-following: pairs that begin while the ego is in the picture already. The base is fitted to all pairs, those at
+    the entry into the picture included, and the definition says so.
 
     Args:
         scenario: "car_following" or "cut_in".
@@ -46,7 +47,7 @@ def count_events(scenario: str, events: Events, used: int, traffic: ObservedTraf
     """
     if scenario == "car_following":
         count = int((~events["at_entry"]).sum())
-        words = "a vehicle gets a new leader, within the picture"
+        words = f"a vehicle gets a new leader within the picture ({count} of the {len(events['ego'])} pairs fitted)"
         share, of = 1.0, None
     else:
         suffered = int(((events["phase"] == "start") & (events["ego"] >= 0)).sum())

@@ -91,5 +91,11 @@ def test_a_system_that_predicts_clearly_worse_is_not_chosen():
     good, noise = np.zeros(50), rng.standard_normal(50)
     clusters = np.arange(50)
     assert choose_system([10.0, 8.0], [good, good - 1.0 + 0.1 * noise], clusters) == 0
-    assert choose_system([10.0, 8.0], [good, good - 0.01 + noise - noise.mean()], clusters) == 1
+    assert choose_system([11.0, 8.0], [good, good - 0.01 + noise - noise.mean()], clusters) == 1
     assert choose_system([10.0, 8.0], [np.full(50, np.nan)] * 2, clusters) == 1
+
+
+def test_a_tie_of_the_criterion_is_decided_by_the_events_held_out():
+    good, noise = np.zeros(50), np.random.default_rng(0).standard_normal(50)
+    slightly_worse = good - 0.01 + noise - noise.mean()
+    assert choose_system([9.9, 8.0], [good, slightly_worse], np.arange(50)) == 0

@@ -41,7 +41,7 @@ def test_filters_drop_and_count(tmp_path):
     assert offsets.tolist() == [[3.0], [3.0]]
     # 30 s windows: frame 299 of a, frame 300 of a, frame 10 of b, frame 10 of a
     assert (events.clusters == events.clusters[[0, 3]][:, None]).tolist() == [[True, False, False, True]] * 2
-    assert (events.counts.used, events.counts.clusters, events.counts.cluster) == ((4, 2), 3, "30 s window")
+    assert (events.counts.used, events.counts.clusters, events.counts.cluster) == ((4, 2), 3, "half-minute")
     assert log[0]["events"] == 6
     assert [entry["events"] for entry in log if entry["rule"] == "events used"] == [4, 2]
     dropped = {entry["rule"]: entry["dropped"] for entry in log if entry.get("dropped")}

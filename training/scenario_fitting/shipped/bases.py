@@ -8,10 +8,12 @@ from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rare_envs.distributions.frequency import EventFrequency
 from rare_envs.distributions.space import Parameter
 from rare_envs.scenarios.registry import scenario_named
+from samplers.problem import FloatArray
 from training.scenario_fitting.coordinate_systems import COORDINATE_SYSTEMS
 from training.scenario_fitting.event_filters import (
     EVENT_RECIPES,
@@ -117,10 +119,7 @@ def read_i80_pairs(folder: Path) -> tuple[EventSet, EventFrequency]:
 def read_i24_pairs(folder: Path) -> tuple[EventSet, EventFrequency]:
     """Return new leaders of the instrumented car on the I-24, within the box of the scenario."""
     events, drives = load_new_leaders(folder)
-    inside = np.ones(len(events), dtype=bool)
-    for column, p in zip(events.T, _box("car_following"), strict=True):
-        inside &= (column >= p.low) & (column <= p.high)
-    return EventSet(events[inside], drives[inside], cluster="drive"), NEW_LEADERS_I24
+    return _within_box("car_following", events, drives, "drive"), NEW_LEADERS_I24
 
 
 def read_us101_cut_ins(folder: Path) -> tuple[EventSet, EventFrequency]:
@@ -148,19 +147,46 @@ def read_i80_cut_ins(folder: Path) -> tuple[EventSet, EventFrequency]:
 def read_us101_brakings(folder: Path) -> tuple[EventSet, EventFrequency]:
     """Return brakings to a standstill of single vehicles on US 101, at their beginning."""
     brakings = load_brakings(folder, find_standstill_brakings)
-    inside = np.ones(len(brakings.events), dtype=bool)
-    for column, p in zip(brakings.events.T, _box("hard_brake"), strict=True):
-        inside &= (column >= p.low) & (column <= p.high)
-    events = EventSet(brakings.events[inside], brakings.vehicles[inside], cluster="vehicle")
+    windows = (brakings.times // CLUSTER_SECONDS).astype(np.int64)  # stop waves brake one vehicle after the other
+    events = _within_box("hard_brake", brakings.events, windows, "half-minute")
     return events, braking_frequency(len(events.joint), brakings.hours, brakings.km)
+
+
+def _within_box(scenario: str, events: FloatArray, clusters: NDArray[np.int64], cluster: str) -> EventSet:
+    """Return the events within the ranges of the scenario, and the count of those that are not."""
+    inside = np.ones(len(events), dtype=bool)
+    for column, p in zip(events.T, _box(scenario), strict=True):
+        inside &= (column >= p.low) & (column <= p.high)
+    log = (
+        {"rule": "events read", "events": len(events)},
+        {
+            "rule": "within the ranges of the scenario",
+            "reason": "outside the physical range",
+            "dropped": int((~inside).sum()),
+        },
+        {"rule": "events used", "events": int(inside.sum())},
+    )
+    return EventSet(events[inside], clusters[inside], cluster=cluster, log=log)
 
 
 def _with_offsets(events: EventSet, folder: Path, site: str) -> EventSet:
     """Return events with lateral offsets from the profiles of lane changes of the site."""
     offset = _box("cut_in")[-1]
-    return replace(events, apart=lateral_offsets(folder, site, offset.low, offset.high))
+    apart = lateral_offsets(folder, site, offset.low, offset.high)
+    dropped = len(lateral_offsets(folder, site, 0.0, np.inf)) - len(apart)
+    rules = (
+        {
+            "rule": f"{offset.low:g} <= displacement <= {offset.high:g} m",
+            "reason": "bodies that overlap across, or more than one lane apart",
+            "dropped": dropped,
+        },
+        {"rule": "events used", "columns": ["lateral_offset"], "events": len(apart)},
+    )
+    return replace(events, apart=apart, log=(*events.log, *rules))
 
 
+CLUSTER_SECONDS = 30.0
+"""Window of time whose brakings form a cluster."""
 CLOSING_GAPS = COORDINATE_SYSTEMS["cut_in"][2].name
 FIRST_FRAME = "first frame of the pair"
 CHANGE_STARTS = "start of the lane change"

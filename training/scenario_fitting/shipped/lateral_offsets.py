@@ -1,7 +1,8 @@
 """Lateral displacement of recorded lane changes: the distribution of the lateral offset of a cut-in.
 
-Two tables: 281 changes on I-80 and US 101, smoothed and cut out by their author, and 302 changes of single vehicles on
-US 101 that stay 3 s or more in one lane on either side.
+One table for each site, since two of US 101 may hold the same changes: of I-80 the 165 changes that were smoothed and
+cut out by their author, of US 101 the 302 of single vehicles that stay 3 s or more in one lane on either side. The
+displacement is that of the changing vehicle; where the ego drives within its lane adds to it and is not recorded.
 """
 
 from __future__ import annotations
@@ -61,8 +62,5 @@ def lateral_offsets(folder: Path, site: str, low: float, high: float) -> FloatAr
     Raises:
         ValueError: A file is missing or lacks a column.
     """
-    parts = [profile_displacements(folder, site)]
-    if site == "us101":
-        parts.append(change_displacements(folder))
-    offsets = np.concatenate(parts)
+    offsets = change_displacements(folder) if site == "us101" else profile_displacements(folder, site)
     return offsets[(offsets >= low) & (offsets <= high)][:, None]

@@ -8,12 +8,12 @@ from training.scenario_fitting.shipped.bases import SHIPPED_BASES
 
 COUNTS = {
     ("car_following", "us101"): ((470,), 28, "scene"),
-    ("car_following", "i80"): ((2116,), 34, "30 s window"),
+    ("car_following", "i80"): ((2116,), 34, "half-minute"),
     ("car_following", "i24"): ((98,), 24, "drive"),
-    ("cut_in", "us101"): ((38, 355), 17, "scene"),
+    ("cut_in", "us101"): ((38, 265), 17, "scene"),
     ("cut_in", "us101-15-offsets"): ((38, 15), 17, "scene"),
-    ("cut_in", "i80"): ((50, 131), 25, "30 s window"),
-    ("hard_brake", "us101"): ((45,), 39, "vehicle"),
+    ("cut_in", "i80"): ((50, 131), 25, "half-minute"),
+    ("hard_brake", "us101"): ((44,), 23, "half-minute"),
 }
 
 

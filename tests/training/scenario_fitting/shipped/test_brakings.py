@@ -24,15 +24,16 @@ def track(deceleration, seconds, speed=20.0, gap=30.0, before=5.0, after=5.0):
 
 @pytest.mark.parametrize(("deceleration", "seconds"), [(2.0, 3.0), (4.0, 3.0), (1.0, 6.0)])
 def test_a_braking_is_found_with_its_size(deceleration, seconds):
-    found = find_brakings(*track(deceleration, seconds))
+    found, onsets = find_brakings(*track(deceleration, seconds))
     assert found.shape == (1, 3)
+    assert 36 <= onsets[0] <= 52  # 5 s, and half a window earlier
     np.testing.assert_allclose(found[0], [20.0, 30.0, deceleration], rtol=0.03)
 
 
 @pytest.mark.parametrize("case", [track(2.0, 1.0), track(0.4, 10.0), track(2.0, 3.0, gap=0.5), (np.arange(20.0),) * 2])
 def test_what_is_no_braking(case):
     """Less than 3 m/s, too gentle, too near to have been measured right, too short a track."""
-    assert find_brakings(*case).shape == (0, 3)
+    assert find_brakings(*case).events.shape == (0, 3)
 
 
 def test_moments_by_hand():
@@ -54,7 +55,7 @@ def test_the_shipped_moments_are_the_recorded_ones():
 @pytest.mark.parametrize(("final", "expected"), [(0.5, 1), (5.0, 0)])
 def test_only_brakings_to_a_standstill(final, expected):
     deceleration, speed = 2.5, 12.0
-    found = find_standstill_brakings(*track(deceleration, (speed - final) / deceleration, speed=speed, after=8.0))
+    found, _ = find_standstill_brakings(*track(deceleration, (speed - final) / deceleration, speed=speed, after=8.0))
     assert len(found) == expected
     if expected:
         np.testing.assert_allclose(found[0], [speed, 30.0, deceleration], rtol=0.06)
@@ -63,6 +64,17 @@ def test_only_brakings_to_a_standstill(final, expected):
 @needs_data(VEHICLES_FILE)
 def test_recorded_brakings_to_a_standstill():
     brakings = load_brakings(DATA, find_standstill_brakings)
-    assert len(brakings.events) == len(brakings.vehicles) == 45
-    assert brakings.hours == pytest.approx(5.95, abs=0.01)
+    assert len(brakings.events) == len(brakings.times) == 44
+    assert brakings.events[:, 2].max() < 4.0  # the one of 7.3 m/s^2 runs backwards
+    assert brakings.hours == pytest.approx(5.75, abs=0.01)
     assert 200.0 < brakings.km < 250.0
+
+
+def test_a_track_that_runs_backwards_is_left_out():
+    """A recorded position that freezes: the smoothed one overshoots and comes back."""
+    position, headway = track(2.5, 4.6, speed=12.0, after=8.0)
+    assert len(find_standstill_brakings(position, headway).events) == 1
+    stop = position[-1]
+    frozen = np.where(position > stop - 4.0, stop - 4.0, position)
+    frozen[np.argmax(position > stop - 4.0) :] -= 1.0
+    assert len(find_standstill_brakings(frozen, headway).events) == 0

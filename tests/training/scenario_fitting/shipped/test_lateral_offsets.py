@@ -43,7 +43,7 @@ def test_changes_count_when_they_are_settled(tmp_path):
 
 
 @needs_data(PROFILES_FILE, CHANGES_FILE)
-@pytest.mark.parametrize(("site", "n"), [("i80", 131), ("us101", 355)])
+@pytest.mark.parametrize(("site", "n"), [("i80", 131), ("us101", 265)])
 def test_recorded_offsets(site, n):
     offsets = lateral_offsets(DATA, site, 2.2, 5.0)
     assert offsets.shape == (n, 1)
