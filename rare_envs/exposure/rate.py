@@ -201,11 +201,12 @@ class CollisionRate:
             low, high = (float(end) for end in np.quantile(drawn, tail_levels(self.confidence)))
             return (low if self.determined else 0.0), high
         parts, events = self.log_variance, scale * counted.count * counted.share
-        rest = math.exp(z * math.sqrt(parts.counts + parts.site))
+        most = math.exp(z * math.sqrt(parts.counts))  # p is 1 at most, at any site
         if not self.determined:
-            return 0.0, events * self.probability.upper * rest
+            rest = math.exp(z * math.sqrt(parts.counts + parts.site))
+            return 0.0, events * min(self.probability.upper * rest, most)
         factor = math.exp(z * math.sqrt(parts.total))
-        return events * self.probability.p / factor, events * min(self.probability.p * factor, rest)
+        return events * self.probability.p / factor, events * min(self.probability.p * factor, most)
 
 
 def normal_quantile(confidence: float) -> float:

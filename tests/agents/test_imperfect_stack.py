@@ -21,7 +21,7 @@ PERFECT = Stack(**dict.fromkeys(Stack.__dataclass_fields__, 0.0) | {"jerk": 1e6,
 
 
 def problem(ego: Any, noise: Any = True, horizon: float = 4.0) -> rare_envs.DrivingProblem:
-    return rare_envs.DrivingProblem(ENV, ego=ego, noise=noise, horizon=horizon)
+    return rare_envs.DrivingProblem(ENV, ego=ego, noise=noise, horizon=horizon, base="us101-15-offsets")
 
 
 @pytest.mark.parametrize("noise", [True, "fixed", False])
@@ -84,7 +84,8 @@ def monte_carlo(around: rare_envs.DrivingProblem, gamma: float, n: int) -> tuple
 )
 def test_rare_failures_are_as_probable_with_noise_in_x_as_with_fresh_noise(env_id: str, method: Any) -> None:
     ego = load_ego("noisy:idm?position=1&speed=1&missed=0.05&latency=0.5")
-    around = rare_envs.DrivingProblem(env_id, ego=ego, horizon=5.0)
+    base = "us101-gap" if "CarFollowing" in env_id else "us101-15-offsets"
+    around = rare_envs.DrivingProblem(env_id, ego=ego, horizon=5.0, base=base)
     p, error = monte_carlo(around, 0.5, 40_000)
     assert 1e-3 < p < 3e-2
     found = samplers.estimate(around, method, gamma=0.5, seed=2, max_sim=8000)

@@ -102,6 +102,7 @@ def _summarise(base: Mapping[str, Any]) -> dict[str, str]:
         "family": _join_family(base["family"] or "", base["coordinates"] or ""),
         "fit": ", ".join(text for text in fit if text),
         "frequency": _describe_frequency(base["frequency"]),
+        "counted in": (base["frequency"] or {}).get("source", ""),
         "recorded / expected": ", ".join(checks),
     }
 

@@ -123,7 +123,7 @@ class EstimateOptions(QuestionOptions):
         bool, typer.Option("--ensemble", help="Take the mixture of the refits of the base: p for the next event.")
     ] = False
     also_under: Annotated[
-        str | None, typer.Option(help="State p under these bases too, by the same simulations: us101-gap,i80.")
+        str | None, typer.Option(help="State p under these bases too, by the same simulations: us101-closing,i80.")
     ] = None
     max_sim: Annotated[int | None, typer.Option(help="Largest number of simulations.")] = None
     target_cov: Annotated[float | None, typer.Option(help="Stop at this coefficient of variation.")] = None

@@ -29,7 +29,7 @@ def risk(
     ego: Any,
     *,
     scenarios: Sequence[str] = SCENARIO_SET,
-    sites: Sequence[str] = ("us101",),
+    sites: str | Sequence[str] = ("us101",),
     bases: Mapping[str, str | PathLike[str]] | None = None,
     out: str | PathLike[str] | None = None,
     progress: bool = False,
@@ -60,6 +60,7 @@ def risk(
             ...
         rare_envs.study.errors.BadInput: Expected one of cut_in, car_following: a cut-in is a new leader, and would count twice.
     """  # noqa: E501 (the example shows a whole message)
+    sites = (sites,) if isinstance(sites, str) else sites
     _check_scenarios(scenarios, sites, bases or {})
     prepared = []
     for name in scenarios:

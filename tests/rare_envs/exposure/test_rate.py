@@ -125,3 +125,12 @@ def test_json_has_the_rate_its_interval_and_its_parts() -> None:
     assert data["per_hour"] == pytest.approx(1221 / 112.0 * 7.83e-4)
     assert sum(data["shares_of_variance"].values()) == pytest.approx(1.0)
     assert data["frequency"]["count"] == 1221
+
+
+def test_no_rate_is_higher_than_that_of_its_events():
+    """Another site may have a p a thousand times as high, but not above 1; the count errs by 10 %: exp(1.96 x .1)."""
+    frequency = EventFrequency(count=100, hours=100.0, km=1000.0, definition="events", source="made up")
+    for spread, upper in ((0.5, 0.2), (5.0, 1.0)):
+        probability = CollisionProbability(p=0.1, cov=0.02, upper=upper, spread=spread)
+        rate = CollisionRate(scenario="cut_in", probability=probability, frequency=frequency, site_log_sd=5.0)
+        assert rate.interval_per_hour[1] == pytest.approx(math.exp(1.96 * 0.1), rel=1e-3)
