@@ -82,13 +82,17 @@ def test_a_budget_of_some_hundreds_is_used_up_and_not_exceeded(recorder, max_sim
 
 @pytest.mark.slow
 def test_no_budget_is_exceeded_whatever_the_regions(recorder):
+    """It is used up too, but where subset simulation takes over and reaches the failures before its end."""
     cube = FunctionProblem(lambda u: 3.3 - np.abs(u).max(axis=1), 10)
     corners = FunctionProblem(lambda u: 1.6 - np.abs(u[:, :3]).min(axis=1), 5)
     problems = [cube, corners, *(r.problem for r in (four_branches(), shell(2), shell(40), two_regions(60), noisy()))]
     for problem in problems:
         for max_sim in (400, 410, 450, 500, 600, 800, 1000, 1300, 2000, 3000):
             for seed in range(3):
-                assert counted(recorder, problem, seed=seed, max_sim=max_sim).n_sim == max_sim
+                result = counted(recorder, problem, seed=seed, max_sim=max_sim)
+                assert result.n_sim <= max_sim
+                taken_over = any("p is from adaptive subset simulation" in text for text in result.warnings)
+                assert result.n_sim == max_sim or taken_over
 
 
 def test_without_max_sim_it_makes_n():
