@@ -22,8 +22,11 @@ from scipy import stats
 
 import samplers
 from benchmarks import RESULTS
+from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
 from samplers.problem import FloatArray
+from training.scenario_fitting.event_filters import EventSet
+from training.scenario_fitting.refits import draw_events
 
 COVERAGE_RESULT = RESULTS / "base_coverage.json"
 DIM = 3
@@ -79,48 +82,6 @@ WORLDS = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class FittedGaussian:
-    """A Gaussian fitted to events, with the fits to resampled clusters of them; see `samplers.FittedBase`."""
-
-    distribution: TruncatedGaussianMixture
-    refits: tuple[TruncatedGaussianMixture, ...]
-    clusters: int
-    fitted_to: str
-    family: str = "1 component"
-
-    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
-        """Draw n independent points, shape (n, d)."""
-        return self.distribution.sample(n, rng)
-
-    def log_prob(self, x: FloatArray) -> FloatArray:
-        """Return the log density at x (n, d), shape (n,)."""
-        return self.distribution.log_prob(x)
-
-    def to_standard_normal(self, x: FloatArray) -> FloatArray:
-        """Map to standard normal space, (n, d) -> (n, d)."""
-        return self.distribution.to_standard_normal(x)
-
-    def from_standard_normal(self, u: FloatArray) -> FloatArray:
-        """Map from standard normal space, (n, d) -> (n, d)."""
-        return self.distribution.from_standard_normal(u)
-
-    def ensemble(self) -> TruncatedGaussianMixture:
-        """Return the mixture of the refits with equal weights."""
-        return join_components(self.refits)
-
-
-def join_components(parts: Sequence[TruncatedGaussianMixture]) -> TruncatedGaussianMixture:
-    """Return the mixture of mixtures with equal weights; they have one box."""
-    return TruncatedGaussianMixture(
-        np.concatenate([part.weights for part in parts]) / len(parts),
-        np.concatenate([part.means for part in parts]),
-        np.concatenate([part.covariances for part in parts]),
-        parts[0].low,
-        parts[0].high,
-    )
-
-
 def fit_gaussian(x: FloatArray) -> TruncatedGaussianMixture:
     """Return the Gaussian with the moments of events (n, d), a floor under its variances."""
     covariance = np.cov(x, rowvar=False, bias=True) + VARIANCE_FLOOR * np.diag(x.var(axis=0))
@@ -128,20 +89,14 @@ def fit_gaussian(x: FloatArray) -> TruncatedGaussianMixture:
     return TruncatedGaussianMixture(np.ones(1), x.mean(axis=0)[None], covariance[None], -box, box)
 
 
-def resample_clusters(cluster_of: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.int64]:
-    """Return rows of events (n,) -> (about n,): all events of as many clusters as there are, drawn with replacement."""
-    names = np.unique(cluster_of)
-    picked = rng.choice(names, size=len(names))
-    return np.concatenate([np.flatnonzero(cluster_of == name) for name in picked])
-
-
-def fit_base(x: FloatArray, world: World, rng: np.random.Generator) -> FittedGaussian:
+def fit_base(x: FloatArray, world: World, rng: np.random.Generator) -> FittedDistribution:
     """Return the fit to the events of a world, and its refits."""
-    return FittedGaussian(
+    events = EventSet(x, world.cluster_of, cluster="cluster")
+    return FittedDistribution(
         distribution=fit_gaussian(x),
-        refits=tuple(fit_gaussian(x[resample_clusters(world.cluster_of, rng)]) for _ in range(REFITS)),
-        clusters=world.clusters,
-        fitted_to=f"{world.events} events of {world.clusters} clusters",
+        refits=tuple(fit_gaussian(draw_events(events, rng).joint) for _ in range(REFITS)),
+        events=events.counts,
+        family="1 component",
     )
 
 
@@ -155,7 +110,7 @@ def exact_p(base: TruncatedGaussianMixture, limit: float) -> float:
 class Exceedance:
     """The problem of a fitted base: f = limit - X in `DIRECTION`."""
 
-    base: FittedGaussian
+    base: FittedDistribution
     limit: float
     dim: int = DIM
 

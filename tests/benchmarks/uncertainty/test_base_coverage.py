@@ -12,9 +12,7 @@ from benchmarks.uncertainty.base_coverage import (
     exact_p,
     fit_base,
     fit_gaussian,
-    join_components,
     repeat,
-    resample_clusters,
     summarise,
 )
 
@@ -33,16 +31,6 @@ def test_events_of_a_cluster_are_correlated():
     assert np.corrcoef(x[:20_000], x[20_000:])[0, 1] == pytest.approx(0.3, abs=4 / math.sqrt(20_000))
 
 
-def test_whole_clusters_are_resampled():
-    cluster_of = np.array([0, 1, 2, 0, 1, 2, 0])
-    rng = np.random.default_rng(0)
-    for _ in range(20):
-        rows = resample_clusters(cluster_of, rng)
-        counts = np.bincount(rows, minlength=7)
-        assert all(len(set(counts[cluster_of == name])) == 1 for name in range(3))
-        assert sum(counts[[0, 1, 2]]) == 3
-
-
 def test_the_fit_has_the_moments_of_the_events_and_p_of_its_draws():
     x = np.random.default_rng(1).standard_normal((400, 3))
     base = fit_gaussian(x)
@@ -58,7 +46,7 @@ def test_the_ensemble_is_the_mean_of_the_refits():
     base = fit_base(world.draw(rng), world, rng)
     x = rng.standard_normal((50, 3))
     mean = np.mean([np.exp(refit.log_prob(x)) for refit in base.refits], axis=0)
-    assert np.exp(join_components(base.refits).log_prob(x)) == pytest.approx(mean)
+    assert np.exp(base.ensemble().log_prob(x)) == pytest.approx(mean)
 
 
 def test_intervals_cover_in_a_few_repetitions():
