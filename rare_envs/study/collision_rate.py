@@ -102,7 +102,7 @@ def describe_left_out(study: Study, estimate: samplers.Estimate) -> tuple[str, .
         if not found:  # the mixture of the refits has none of its own
             found.append("the error of the base distribution is not known (no refits), and left out of the rate")
     elif base.bound is not None:
-        found.append(f"the events do not determine p (spread {base.spread:.1f}): it counts in the upper end alone")
+        found.append(f"the events do not determine p (spread {base.spread:.1f}): the rate has an upper end only")
     elif base.reason:
         found.append(f"the error of the base distribution is left out of the rate: {base.reason}")
     return tuple(found)

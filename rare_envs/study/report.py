@@ -78,8 +78,15 @@ class Report:
 
     @property
     def doubtful(self) -> bool:
-        """Whether the method itself warns that the number may be wrong."""
-        return bool(self.estimate.warnings)
+        """Whether there is a warning that p, or the error of its base distribution, may be wrong."""
+        return bool(self.warnings)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Doubts of the method about p, and about the error of the base distribution."""
+        base = self.estimate.base_uncertainty
+        doubts = () if base is None else tuple(f"base distribution: {text}" for text in base.warnings)
+        return (*self.estimate.warnings, *doubts)
 
     @property
     def crashes(self) -> tuple[dict[str, Any] | None, ...]:

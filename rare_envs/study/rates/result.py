@@ -112,10 +112,8 @@ class Risk:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Doubts of the methods, by scenario."""
-        return tuple(
-            f"{name_scenario(each.name)}: {text}" for each in self.scenarios for text in each.report.estimate.warnings
-        )
+        """Doubts about p and about the error of its base distribution, by scenario."""
+        return tuple(f"{name_scenario(each.name)}: {text}" for each in self.scenarios for text in each.report.warnings)
 
     @property
     def notes(self) -> tuple[str, ...]:

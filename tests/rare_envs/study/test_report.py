@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from typer.testing import Result
 
+from rare_envs.study import Question, prepare, run
+
 SMALL = ("estimate", "rare_envs/CarFollowing-v0", "--method", "mc", "--max-sim", 400)
 
 Cli = Callable[..., Result]
@@ -67,3 +69,13 @@ def test_scenarios_on_which_the_ego_fails_are_listed(cli: Cli, here: Path, risky
     assert np.isfinite(np.array([row[:-1] for row in rows], dtype=float)).all()
     assert cli(*SMALL, "--ego", "idm", "--out", here / "run").exit_code in (0, 3)
     assert not (here / "run" / "faults.csv").exists()
+
+
+def test_a_doubt_about_the_base_distribution_makes_a_report_doubtful() -> None:
+    """Some 20 failures tell p to a quarter, and are too few to tell it under each of 30 refits."""
+    study = prepare(Question(env_id="rare_envs/CutIn-v0", method="mc", max_sim=20_000, seed=1))
+    report = run(study)
+    assert not report.estimate.warnings
+    assert any("refits rest on under 10 effective failing points" in text for text in report.warnings)
+    assert report.doubtful
+    assert report.to_dict()["doubtful"]
