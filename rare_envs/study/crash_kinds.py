@@ -12,9 +12,10 @@ import numpy as np
 import samplers
 from rare_envs.egos.errors import EgoGone
 from rare_envs.problem import DrivingProblem
-from rare_envs.study.analysis.failure_replay import MAX_REPLAYED, replay_failures
+from rare_envs.study.analysis.failure_replay import replay_failures
 from rare_envs.study.analysis.severity import Severity, compute_severity
 from rare_envs.traffic.crash import CRASH_KINDS, describe_crash
+from samplers.analysis import NO_OUTCOME_LABEL, sum_by_label
 
 KIND_DESCRIPTIONS = MappingProxyType(
     {
@@ -68,6 +69,8 @@ def _weigh_crashes(
     if estimate.sample is None:
         return {}, None
     replayed = replay_failures(problem, estimate)
-    words = [CRASH_KINDS[kind] for kind in replayed.crash.kind]
-    shares = estimate.shares(lambda _: words, MAX_REPLAYED)  # of the same points: `choose_failures` has picked both
+    failures = replayed.failures
+    labels = np.full(len(failures.rows), NO_OUTCOME_LABEL, dtype=object)
+    labels[failures.has_outcome] = [CRASH_KINDS[kind] for kind in replayed.crash.kind]
+    shares = sum_by_label(estimate, failures.rows, labels)
     return shares, compute_severity(problem, estimate, replayed)

@@ -3,7 +3,7 @@
 from samplers.analysis.base_uncertainty import BaseUncertainty
 from samplers.analysis.curve import Curve
 from samplers.analysis.exceedance import Exceedance, compute_exceedance
-from samplers.analysis.failure_modes import Share
+from samplers.analysis.failure_modes import NO_OUTCOME_LABEL, Share, sum_by_label
 from samplers.analysis.failure_weights import (
     FailureExpectation,
     WeightedFailures,
@@ -16,6 +16,7 @@ from samplers.analysis.reweighting import Reweighted
 from samplers.analysis.sensitivity import Sensitivity
 
 __all__ = [
+    "NO_OUTCOME_LABEL",
     "BaseUncertainty",
     "Curve",
     "Exceedance",
@@ -28,5 +29,6 @@ __all__ = [
     "compute_exceedance",
     "expect_over_failures",
     "expect_under_refits",
+    "sum_by_label",
     "weigh_failures",
 ]

@@ -228,8 +228,12 @@ def half_width(spread: float, cov: float, confidence: float, n_refits: int, clus
         >>> round(half_width(spread=1.0, cov=0.0, confidence=0.95, n_refits=30, clusters=100) / (1 + 0.04) ** 0.5, 3)
         2.045
     """
-    quantile = float(stats.t.ppf(0.5 + confidence / 2, min(n_refits, clusters) - 1))
-    return quantile * math.sqrt(spread**2 + cov**2 + FIT_BIAS**2)
+    return refit_quantile(confidence, n_refits, clusters) * math.sqrt(spread**2 + cov**2 + FIT_BIAS**2)
+
+
+def refit_quantile(confidence: float, n_refits: int, clusters: int) -> float:
+    """Return t, the quantile of Student's t with as many degrees of freedom as refits or clusters, less 1."""
+    return float(stats.t.ppf(0.5 + confidence / 2, min(n_refits, clusters) - 1))
 
 
 def scale_by_exp(value: float, exponent: float) -> float:

@@ -69,8 +69,28 @@ def split_by_kind(
     sample = require_sample(estimate)
     failing = np.flatnonzero(sample.f <= estimate.gamma)
     rows = choose_failures(sample, estimate.gamma, most)
-    labels = label_failures(sample.f[failing[rows]], sample.x[rows], label)
-    chosen = failing[rows]
+    return sum_by_label(estimate, rows, label_failures(sample.f[failing[rows]], sample.x[rows], label))
+
+
+def sum_by_label(estimate: WeightedEstimate, rows: NDArray[np.int64], labels: NDArray[np.object_]) -> dict[str, Share]:
+    """Return p by label of failing points; see `split_by_kind`.
+
+    Args:
+        estimate: The run.
+        rows: Rows of the points among all failing ones, `Sample.x`, shape (k,).
+        labels: A word for each, shape (k,).
+
+    Example:
+        >>> import samplers
+        >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
+        >>> result = samplers.estimate(problem, "mc", seed=0, max_sim=10_000)
+        >>> rows = np.arange(result.failures.total)
+        >>> shares = sum_by_label(result, rows, np.where(rows % 2 == 0, "even", "odd").astype(object))
+        >>> {label: share.points for label, share in shares.items()}
+        {'even': 8, 'odd': 8}
+    """
+    sample = require_sample(estimate)
+    chosen = np.flatnonzero(sample.f <= estimate.gamma)[rows]
     everything = sum_points(sample, chosen, estimate.gamma)
     grow = cov_inflation(estimate, float(everything.cov[0]))
     shares = {}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -148,7 +148,7 @@ def weigh_failures(estimate: WeightedEstimate, most: int | None = None) -> Weigh
         inflation=1.0,
         total=len(failing),
     )
-    return WeightedFailures(**{**vars(raw), "inflation": cov_inflation(estimate, raw.cov_of_sum(raw.weights))})
+    return replace(raw, inflation=cov_inflation(estimate, raw.cov_of_sum(raw.weights)))
 
 
 def expect_over_failures(
