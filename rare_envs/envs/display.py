@@ -67,7 +67,7 @@ class Display:
             return None
         if self._renderer is None:
             clock = self._world.clock
-            self._renderer = Renderer(self._world, self.is_window, round(1.0 / (clock.dt * clock.stride)))
+            self._renderer = Renderer(self._world, self.is_window, clock.decisions_per_second)
         image = self._renderer.draw(episode, time, agents=agents, crashed=crashed)
         return None if self.is_window else image
 

@@ -83,7 +83,7 @@ class DrivingParallelEnv(ParallelEnv[str, SingleObservation, NDArray[np.float32]
         self.metadata = {
             **self.metadata,
             "name": env_id,
-            "render_fps": round(1.0 / (self.world.clock.dt * self.world.clock.stride)),
+            "render_fps": self.world.clock.decisions_per_second,
         }
         self.render_mode = render_mode
         self._display = Display(self.world, render_mode)

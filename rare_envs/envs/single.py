@@ -52,7 +52,7 @@ class DrivingEnv(gym.Env[SingleObservation, Any]):
         self.world = world.with_statistics()
         self.observation_space = self.world.observation_space
         self.action_space = self.world.action_space
-        self.metadata = {**self.metadata, "render_fps": round(1.0 / (self.world.clock.dt * self.world.clock.stride))}
+        self.metadata = {**self.metadata, "render_fps": self.world.clock.decisions_per_second}
         self.render_mode = render_mode
         self._display = Display(self.world, render_mode)
         self._x = np.full(self.space.dim, np.nan)

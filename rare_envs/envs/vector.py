@@ -60,7 +60,7 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
             raise ValueError(f"Expected render_mode None or 'rgb_array' for a batch, got {render_mode!r}.")
         world, self.space = set_up(env_id, **kwargs)
         self.world = world.with_statistics()
-        self.metadata = {**self.metadata, "render_fps": round(1.0 / (self.world.clock.dt * self.world.clock.stride))}
+        self.metadata = {**self.metadata, "render_fps": self.world.clock.decisions_per_second}
         self.num_envs = int(num_envs)
         self.render_mode = render_mode
         self.single_observation_space = self.world.observation_space

@@ -72,6 +72,11 @@ class Clock:
         """Ticks from one decision of a policy to the next."""
         return round(DECISION / self.dt) if self.action == "meta" else 1
 
+    @property
+    def decisions_per_second(self) -> int:
+        """Decisions of a policy each second, which is the frame rate of a picture at each."""
+        return round(1.0 / (self.dt * self.stride))
+
 
 def _is_number(value: object) -> bool:
     return isinstance(value, Real) and not isinstance(value, bool)
