@@ -11,7 +11,7 @@ from rare_envs.exposure.base_record import read_source
 from rare_envs.exposure.rate import CollisionProbability, CollisionRate
 from rare_envs.scenarios.registry import find_scenario
 from rare_envs.study.question import Question, Study
-from samplers.analysis.base_uncertainty import FIT_BIAS, half_width
+from samplers.analysis.base_uncertainty import FIT_BIAS, refit_quantile
 
 COLLISION_MEASURE = "ttc"
 """Measure that is -1 after a collision and above 0 without one."""
@@ -36,13 +36,12 @@ def find_frequency(study: Study) -> EventFrequency:
     return frequency
 
 
-def compute_rate(study: Study, estimate: samplers.Estimate, site_log_sd: float = 0.0) -> CollisionRate:
+def compute_rate(study: Study, estimate: samplers.Estimate) -> CollisionRate:
     """Return the rate of collisions of an estimate.
 
     Args:
         study: The question, loaded.
         estimate: Its answer.
-        site_log_sd: Standard deviation of the logarithm of the rate between sites.
 
     Raises:
         ValueError: As in `find_frequency`.
@@ -59,7 +58,6 @@ def compute_rate(study: Study, estimate: samplers.Estimate, site_log_sd: float =
         scenario=study.problem.world.scenario.name,
         probability=describe_probability(estimate),
         frequency=find_frequency(study),
-        site_log_sd=site_log_sd,
         confidence=estimate.confidence,
         fitted_to=_identify_events(study),
     )
@@ -72,15 +70,13 @@ def describe_probability(estimate: samplers.Estimate) -> CollisionProbability:
     base = estimate.base_uncertainty
     if not known or base is None or not math.isfinite(base.spread):
         return CollisionProbability(p=estimate.p, cov=estimate.cov, upper=upper, determined=known)
-    unit = math.sqrt(base.spread**2 + estimate.cov**2 + FIT_BIAS**2)
-    half = half_width(base.spread, estimate.cov, estimate.confidence, len(base.p_refits), base.clusters)
     return CollisionProbability(
         p=estimate.p,
         cov=estimate.cov,
         upper=upper if base.bound is None else base.bound,
         spread=base.spread,
         fit_bias=FIT_BIAS,
-        quantile=half / unit,
+        quantile=refit_quantile(estimate.confidence, len(base.p_refits), base.clusters),
         determined=base.bound is None,
     )
 

@@ -11,6 +11,7 @@ from typing import Any
 
 from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.exposure import HUMAN_BENCHMARKS, CollisionRate, TotalRate, describe_human_contacts
+from rare_envs.exposure.rate import MILLION_KM
 from rare_envs.study.rates.plots import save_risk_plot
 from rare_envs.study.rates.text import (
     describe_uncertainty,
@@ -54,16 +55,15 @@ class ScenarioRisk:
     @property
     def kinds(self) -> dict[str, float]:
         """Collisions per million km by kind of crash; empty where it is not known."""
-        scale = self.rate.frequency.per_km * 1e6
+        scale = self.rate.frequency.per_km * MILLION_KM
         return {kind: scale * share.p for kind, share in self.report.kinds.shares.items()}
 
     def describe(self) -> str:
         """Return the line of the table: frequency x p = rate, its interval, and the events behind it."""
         rate, base = self.rate, self.report.study.base
         behind = base.fitted_to if isinstance(base, FittedDistribution) else "events not known"
-        factors = [factor for factor in self.site_factors.values() if factor > 0]
-        widest = max([1.0, *(max(factor, 1 / factor) for factor in factors)])
-        sites = f", sites differ by a factor {widest:.2g}" if factors else ""
+        factors = {name: factor for name, factor in self.site_factors.items() if factor > 0}
+        sites = "".join(f", under {name} {factor:.2g} times as much" for name, factor in factors.items())
         return (
             f"{name_scenario(self.name):<13} {format_rate(rate.frequency.per_km)} per km x {rate.probability.p:.1e} = "
             f"{format_rate(rate.per_million_km)}  ({format_interval(rate.interval_per_million_km)})   "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from rare_envs.scenarios.registry import SCENARIOS, scenario_named
-from rare_envs.study.collision_rate import compute_rate, find_frequency
+from rare_envs.study.collision_rate import find_frequency
 from rare_envs.study.errors import BadInput, as_bad_input
 from rare_envs.study.evaluate import run, run_into
 from rare_envs.study.question import Question, Study, prepare
@@ -125,12 +126,13 @@ def _evaluate(
     """Run one scenario and return its rate, with the spread between sites if there are others."""
     name = study.problem.world.scenario.name
     report = run(study, progress) if folder is None else run_into(folder / name, study, progress)
+    assert report.rate is not None  # `risk` has looked for the frequency before
     factors = compare_sites(report, other_sites, progress)
     logs = [0.0, *(float(np.log(factors[site])) for site in other_sites if factors.get(site, 0) > 0)]
     spread = float(np.std(logs, ddof=1)) if len(logs) > 1 else 0.0
     return ScenarioRisk(
         report=report,
-        rate=compute_rate(study, report.estimate, spread),
+        rate=replace(report.rate, site_log_sd=spread),
         site_factors=factors,
         notes=(*notes, *report.notes),
     )

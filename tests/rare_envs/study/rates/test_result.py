@@ -26,7 +26,7 @@ def test_the_line_of_a_scenario(brake: ScenarioRisk) -> None:
     line = brake.describe()
     assert line.startswith(f"hard brake    0.19 per km x {p:.1e} = ")
     assert "42 events of 40 scenes" in line
-    assert line.endswith("sites differ by a factor 8")
+    assert line.endswith("under i80 0.12 times as much, under i24 2 times as much")
 
 
 def test_kinds_of_crash_add_up_to_the_rate(brake: ScenarioRisk) -> None:
