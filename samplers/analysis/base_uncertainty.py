@@ -5,8 +5,9 @@ With p_b the probability under refit b, s the standard deviation of log p_b and 
     p exp(-t S) to p exp(t S),    S^2 = s^2 + cov^2 + 0.2^2.
 
 Percentiles of the p_b are not used: refits repeat the bias of the fit, and 30 of them do not reach the outer 2.5 %, so
-that percentiles cover 73 to 90 % and miss on the unsafe side. This interval covers 92 to 97 % where the family of
-distributions is the true one (`benchmarks/uncertainty/base_coverage.py`). Another family is not covered by it.
+that percentiles cover 76 and 82 % (38 and 400 events) and miss on the unsafe side. This interval covers 93 and 92 %
+where the family of distributions is the true one (`benchmarks/uncertainty/base_coverage.py`). Another family is not
+covered by it.
 """
 
 from __future__ import annotations
@@ -34,8 +35,8 @@ from samplers.serialization import to_json_value
 from samplers.statistics.intervals import Interval
 
 FIT_BIAS = 0.2
-"""Bias of the fit itself in log p (floor of the covariances, local optima of the mixture), which refits repeat: without
-it the interval covers 80 % at 2,000 events. It is nothing beside the spread at 38 events."""
+"""Bias of the fit itself in log p (floor of the covariances, local optima of the mixture), which refits repeat: it
+keeps the interval of thousands of events from being too narrow, and is nothing beside the spread at 38."""
 MAX_SPREAD = 2.0
 """Standard deviation of log p_b above which the events do not determine p."""
 MIN_REFITS = 2

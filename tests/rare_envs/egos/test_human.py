@@ -102,6 +102,33 @@ def test_braking_builds_up_at_the_published_rate_to_the_published_maximum() -> N
     assert min(decided) == pytest.approx(-0.774 * 9.80665)
 
 
+def test_braking_that_follows_acceleration_builds_up_from_none() -> None:
+    """The foot leaves the accelerator at once: the first tick of braking is that of the jerk, whatever went before."""
+    world = problem("CarFollowing").world
+    decided = accelerations(HumanDriver(replace(SURE, idm=IDM()), world), world, [10.0, 2.0, 100.0])
+    first = next(tick for tick, a in enumerate(decided) if a < 0.0)
+    assert decided[first - 1] > 0.0
+    model = replace(SURE, idm=IDM(), jerk=math.inf)
+    wanted = accelerations(HumanDriver(model, world), world, [10.0, 2.0, 100.0])
+    assert decided[first] == pytest.approx(max(wanted[first], -SURE.jerk * 0.1), rel=1e-9)
+
+
+def test_what_was_there_at_the_start_does_not_move_before_it_was_seen() -> None:
+    """In the first reaction time the percept stays that of time 0, also with the eyes off the road."""
+    world = problem("CarFollowing").world
+    glance = Glances(torch.tensor([[0.0, 0.0]]), torch.tensor([[0.0, 3.0]]))
+    driver = HumanDriver(SURE, world, glances=glance)
+    episode, memory = world.start(torch.tensor([[20.0, 10.0, 80.0]], dtype=torch.float64)), None
+    known = []
+    for _ in range(driver.delay + 3):
+        action, memory = driver.act(episode, memory)
+        episode = world.step(episode, action)
+        known.append(float(memory.known.distance[0, 0]))
+    assert bool(memory.away)
+    assert known[: driver.delay + 1] == [known[0]] * (driver.delay + 1)
+    assert known[driver.delay + 1] == pytest.approx(known[0] - 0.1 * 10.0, rel=1e-6)
+
+
 def test_in_a_glance_the_lead_is_taken_to_keep_its_speed() -> None:
     world = problem("HardBrake").world
     glance = Glances(torch.tensor([[0.0, 0.5]]), torch.tensor([[0.0, 2.5]]))

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import special, stats
 
 from rare_envs.distributions.frequency import EventFrequency
 from rare_envs.exposure import CollisionProbability, CollisionRate
@@ -127,10 +127,36 @@ def test_json_has_the_rate_its_interval_and_its_parts() -> None:
     assert data["frequency"]["count"] == 1221
 
 
-def test_no_rate_is_higher_than_that_of_its_events():
+@pytest.mark.parametrize("known", [{"spread": 0.5}, {"upper": 0.2, "determined": False}])
+def test_no_rate_is_higher_than_that_of_its_events(known) -> None:
     """Another site may have a p a thousand times as high, but not above 1; the count errs by 10 %: exp(1.96 x .1)."""
-    frequency = EventFrequency(count=100, hours=100.0, km=1000.0, definition="events", source="made up")
-    for spread, upper in ((0.5, 0.2), (5.0, 1.0)):
-        probability = CollisionProbability(p=0.1, cov=0.02, upper=upper, spread=spread)
-        rate = CollisionRate(scenario="cut_in", probability=probability, frequency=frequency, site_log_sd=5.0)
-        assert rate.interval_per_hour[1] == pytest.approx(math.exp(1.96 * 0.1), rel=1e-3)
+    found = rate(0.1, counted=frequency(100, 100.0, 1000.0), site_log_sd=5.0, **known)
+    assert found.interval_per_hour[1] == pytest.approx(math.exp(1.96 * 0.1), rel=1e-3)
+    drawn = found.draw(100.0, np.zeros(10_000), np.random.default_rng(0))
+    assert drawn.max() < math.exp(5 * 0.1)
+
+
+def test_a_rate_that_is_not_determined_has_the_spread_between_sites_above_its_bound() -> None:
+    """No lower end; exp(1.96 sqrt(1 + 1 / 100)) above the bound. Drawn, the median is the bound itself."""
+    found = rate(1e-7, counted=frequency(100, 100.0, 1000.0), site_log_sd=1.0, upper=1e-6, determined=False)
+    assert found.interval_per_hour == (0.0, pytest.approx(1e-6 * math.exp(1.96 * math.sqrt(1.01)), rel=1e-3))
+    drawn = found.draw(100.0, np.zeros(100_000), np.random.default_rng(0))
+    assert np.median(drawn) == pytest.approx(1e-6, rel=0.02)
+    assert np.log(drawn).std() == pytest.approx(math.sqrt(1.01), rel=0.02)
+
+
+def test_few_events_of_which_a_share_counts() -> None:
+    """log of Gamma(3.5) has the variance trigamma(3.5), and the share of 2 of 4 adds (1 - .5) / (.5 x 4)."""
+    found = rate(0.1, cov=0.0, counted=frequency(3, 2.0, 40.0, share=0.5, share_events=4))
+    drawn = found.draw(2.0, np.zeros(200_000), np.random.default_rng(0))
+    assert np.log(drawn).var() == pytest.approx(float(special.polygamma(1, 3.5)) + 0.25, rel=0.02)
+    assert np.median(found.interval_per_hour) < found.interval_per_hour[1]
+
+
+@pytest.mark.parametrize(("count", "gamma"), [(9, True), (10, False)])
+def test_ten_events_are_no_longer_few(count, gamma) -> None:
+    found = rate(0.1, cov=0.0, counted=frequency(count, 2.0, 40.0))
+    by_gamma = stats.gamma.ppf(0.975, count + 0.5) * 0.1 / 2.0
+    by_logs = count * 0.1 / 2.0 * math.exp(1.96 / math.sqrt(count))
+    assert found.interval_per_hour[1] == pytest.approx(by_gamma if gamma else by_logs, rel=0.01)
+    assert abs(by_gamma / by_logs - 1) > 0.03

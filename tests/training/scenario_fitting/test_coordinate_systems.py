@@ -72,8 +72,9 @@ def test_held_out_events_are_not_in_the_fit(quick):
 
 
 def test_too_few_events_are_not_predicted():
-    events = EventSet(closing_events(8).joint, np.repeat([0, 1], 4))
-    assert np.isnan(held_out_log_prob(events, PLAIN, FOLLOWING)).all() or len(events.joint) - 4 > 3
+    """Three events are left to fit three parameters."""
+    events = EventSet(closing_events(6).joint, np.repeat([0, 1], 3))
+    assert np.isnan(held_out_log_prob(events, PLAIN, FOLLOWING)).all()
 
 
 def test_columns_apart_are_independent(quick):
@@ -86,13 +87,33 @@ def test_columns_apart_are_independent(quick):
     assert mean[5] == pytest.approx(offsets.mean(), rel=1e-5)
 
 
-def test_a_system_that_predicts_clearly_worse_is_not_chosen():
-    rng = np.random.default_rng(0)
-    good, noise = np.zeros(50), rng.standard_normal(50)
-    clusters = np.arange(50)
-    assert choose_system([10.0, 8.0], [good, good - 1.0 + 0.1 * noise], clusters) == 0
-    assert choose_system([11.0, 8.0], [good, good - 0.01 + noise - noise.mean()], clusters) == 1
-    assert choose_system([10.0, 8.0], [np.full(50, np.nan)] * 2, clusters) == 1
+ERROR_PATTERN = np.tile([1.0, -1.0], 25)
+"""Losses of 50 clusters with mean 0; their sum has the standard error sqrt(50) x 1.0102."""
+
+
+@pytest.mark.parametrize(("errors", "chosen"), [(1.5, 1), (2.5, 0)])
+def test_two_paired_standard_errors_are_clearly_worse(errors, chosen):
+    """The better one in prediction is second here and first there; the other has the smaller criterion by far."""
+    loss = ERROR_PATTERN + errors * np.sqrt(50) * ERROR_PATTERN.std(ddof=1) / 50
+    good = np.zeros(50)
+    assert choose_system([20.0, 8.0], [good, good - loss], np.arange(50)) == chosen
+    assert choose_system([8.0, 20.0], [good - loss, good], np.arange(50)) == 1 - chosen
+
+
+def test_events_of_a_cluster_err_together():
+    """Losses of 1 in three clusters of ten and -0.5 in two: clearly worse only if each event were by itself."""
+    clusters = np.repeat(np.arange(5), 10)
+    loss = np.where(clusters < 3, 1.0, -0.5)
+    assert loss.sum() / (np.sqrt(50) * loss.std(ddof=1)) > 2.0
+    assert choose_system([20.0, 8.0], [np.zeros(50), -loss], clusters) == 1
+    assert choose_system([20.0, 8.0], [np.zeros(50), -loss], np.arange(50)) == 0
+
+
+def test_events_count_that_every_system_predicts():
+    """The second one predicts half of them, and far worse."""
+    half = np.where(np.arange(50) < 25, np.nan, -10.0 + 0.01 * ERROR_PATTERN)
+    assert choose_system([20.0, 8.0], [np.zeros(50), half], np.arange(50)) == 0
+    assert choose_system([10.0, 8.0], [np.full(50, np.nan)] * 2, np.arange(50)) == 1
 
 
 def test_a_tie_of_the_criterion_is_decided_by_the_events_held_out():

@@ -27,7 +27,7 @@ def test_cut_ins_count_with_the_share_that_is_used():
     events = {"phase": np.array(["start", "crossing"] * 4), "ego": np.array([1, 1, 2, 2, -1, -1, 3, 3])}
     frequency = count_events("cut_in", events, 2, ObservedTraffic(hours=2.0, km=100.0))
     assert frequency is not None
-    assert frequency.count == 3
+    assert (frequency.count, frequency.share_events) == (3, 3)
     assert frequency.per_hour == pytest.approx(3 / 2.0 * 2 / 3)
     assert frequency.per_km == pytest.approx(3 / 100.0 * 2 / 3)
     none = cut_in_events(synthetic_traffic(seconds=3.0, per_lane=2))

@@ -46,5 +46,14 @@ def test_a_cut_in_has_two_pairs_and_hard_brake_none():
     names = ("ego_speed", "cut_in_speed", "lead_speed", "cut_in_gap", "lead_gap", "lateral_offset")
     d = len(names)
     base = TruncatedGaussianMixture([1.0], [[20.0] * d], [np.eye(d)], [1.0] * d, [150.0] * d)
-    assert len(check_predictions("cut_in", names, np.full((3, 5), 20.0), base)) == 6
+    events = np.array([[20.0, 20.0, 10.0, 50.0, 40.0], [20.0, 10.0, 20.0, 2.0, 40.0]])
+    checks = {check.name: check.recorded for check in check_predictions("cut_in", names, events, base)}
+    assert checks == {
+        "TTC < 5 s, cut_in_gap": 1,  # 10 m/s faster at 2 m
+        "needed deceleration > 1 m/s^2, cut_in_gap": 1,
+        "gap < 3 m, cut_in_gap": 1,
+        "TTC < 5 s, lead_gap": 1,  # the cutter, 10 m/s faster than its lead at 40 m
+        "needed deceleration > 1 m/s^2, lead_gap": 1,  # 100 / 80
+        "gap < 3 m, lead_gap": 0,
+    }
     assert check_predictions("hard_brake", ("speed", "gap", "deceleration"), np.ones((3, 3)), base) == ()

@@ -172,17 +172,17 @@ def _within_box(scenario: str, events: FloatArray, clusters: NDArray[np.int64], 
 def _with_offsets(events: EventSet, folder: Path, site: str) -> EventSet:
     """Return events with lateral offsets from the profiles of lane changes of the site."""
     offset = _box("cut_in")[-1]
-    apart = lateral_offsets(folder, site, offset.low, offset.high)
-    dropped = len(lateral_offsets(folder, site, 0.0, np.inf)) - len(apart)
+    displacements = lateral_offsets(folder, site)
+    apart = displacements[(displacements >= offset.low) & (displacements <= offset.high)]
     rules = (
         {
             "rule": f"{offset.low:g} <= displacement <= {offset.high:g} m",
             "reason": "bodies that overlap across, or more than one lane apart",
-            "dropped": dropped,
+            "dropped": len(displacements) - len(apart),
         },
         {"rule": "events used", "columns": ["lateral_offset"], "events": len(apart)},
     )
-    return replace(events, apart=apart, log=(*events.log, *rules))
+    return replace(events, apart=apart[:, None], log=(*events.log, *rules))
 
 
 CLUSTER_SECONDS = 30.0

@@ -48,7 +48,8 @@ CUT_INS_I80 = EventFrequency(
     share=63 / 77,
     share_events=77,
     definition=CUT_INS_US101.definition,
-    source=f"{LANE_CHANGE_COUNTS}; the share with both gaps in range from 77 changes with a follower ({COIFMAN})",
+    source=f"{LANE_CHANGE_COUNTS}; the share with both gaps in range from 77 changes with a follower, at the crossing: "
+    f"1.3 s before it fewer of them are within the picture ({COIFMAN})",
 )
 
 

@@ -17,8 +17,6 @@ from training.scenario_fitting.event_filters import read_csv_columns
 
 PROFILES_FILE = "lane_change_profiles.parquet"
 CHANGES_FILE = "us101_lane_changes.csv"
-MIN_DISPLACEMENT = 1.0
-"""Displacement to the side of the change [m] below which a profile shows no whole change (21 of 281)."""
 MIN_LANE_TIME = 3.0
 """Least time in one lane on either side of a change [s]."""
 
@@ -37,7 +35,7 @@ def profile_displacements(folder: Path, site: str) -> FloatArray:
     ends = [0, *breaks.tolist(), len(across)] if len(across) else []
     first, last = np.array(ends[:-1], dtype=np.int64), np.array(ends[1:], dtype=np.int64) - 1
     displacement: FloatArray = (across[last] - across[first]) * np.where(side[first] == "right", 1.0, -1.0)
-    return displacement[displacement >= MIN_DISPLACEMENT]
+    return displacement
 
 
 def change_displacements(folder: Path) -> FloatArray:
@@ -53,14 +51,13 @@ def change_displacements(folder: Path) -> FloatArray:
     settled = (rows["before_s"] >= MIN_LANE_TIME) & (rows["after_s"] >= MIN_LANE_TIME)
     wide, narrow = rows[ends[1]] - rows[ends[0]], rows[ends[3]] - rows[ends[2]]
     displacement: FloatArray = np.where(np.isnan(wide), narrow, wide)[settled]
-    return displacement[displacement >= MIN_DISPLACEMENT]  # NaN is dropped too
+    return displacement[~np.isnan(displacement)]
 
 
-def lateral_offsets(folder: Path, site: str, low: float, high: float) -> FloatArray:
-    """Return recorded displacements of a site within the range of the scenario's lateral offset [m], shape (n, 1).
+def lateral_offsets(folder: Path, site: str) -> FloatArray:
+    """Return the recorded displacements of a site ("i80" or "us101") [m], shape (n,).
 
     Raises:
         ValueError: A file is missing or lacks a column.
     """
-    offsets = change_displacements(folder) if site == "us101" else profile_displacements(folder, site)
-    return offsets[(offsets >= low) & (offsets <= high)][:, None]
+    return change_displacements(folder) if site == "us101" else profile_displacements(folder, site)

@@ -30,9 +30,9 @@ def write_profiles(folder):
 
 def test_displacements_to_the_side_of_the_change(tmp_path):
     write_profiles(tmp_path)
-    assert profile_displacements(tmp_path, "i80").tolist() == [3.5, 3.0]
+    assert profile_displacements(tmp_path, "i80").tolist() == [3.5, 3.0, 0.4]
     assert profile_displacements(tmp_path, "us101").shape == (0,)
-    assert lateral_offsets(tmp_path, "i80", 3.2, 5.0).tolist() == [[3.5]]
+    assert lateral_offsets(tmp_path, "i80").tolist() == [3.5, 3.0, 0.4]
 
 
 def test_changes_count_when_they_are_settled(tmp_path):
@@ -43,8 +43,10 @@ def test_changes_count_when_they_are_settled(tmp_path):
 
 
 @needs_data(PROFILES_FILE, CHANGES_FILE)
-@pytest.mark.parametrize(("site", "n"), [("i80", 131), ("us101", 265)])
-def test_recorded_offsets(site, n):
-    offsets = lateral_offsets(DATA, site, 2.2, 5.0)
-    assert offsets.shape == (n, 1)
-    assert 2.9 < offsets.mean() < 3.5  # a lane is 3.7 m wide
+@pytest.mark.parametrize(("site", "n", "inside"), [("i80", 165, 131), ("us101", 301, 265)])
+def test_recorded_offsets(site, n, inside):
+    offsets = lateral_offsets(DATA, site)
+    assert len(offsets) == n
+    within = offsets[(offsets >= 2.2) & (offsets <= 5.0)]
+    assert len(within) == inside
+    assert 2.9 < within.mean() < 3.5  # a lane is 3.7 m wide

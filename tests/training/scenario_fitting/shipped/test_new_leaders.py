@@ -7,6 +7,7 @@ from tests.training.shared_data import DATA, needs_data
 from training.scenario_fitting.shipped.new_leaders import (
     CIRCLES_FILE,
     SETTLING_TICKS,
+    STEADY_TICKS,
     find_new_leaders,
     load_new_leaders,
 )
@@ -41,6 +42,14 @@ def test_values_are_taken_once_the_radar_has_settled():
     speed = 20.0 + 0.01 * np.arange(len(speed))
     onset = 47  # the first tick whose gap 0.3 s later differs by more than 6 m
     assert find_new_leaders(speed, relative, gap)[0, 0] == pytest.approx(speed[onset + SETTLING_TICKS])
+
+
+def test_the_speed_ahead_is_a_mean_over_a_second():
+    speed, relative, gap = drive([(60.0, 50), (30.0, 50)])
+    relative = 0.1 * np.arange(len(gap))
+    first = 47 + SETTLING_TICKS
+    ahead = find_new_leaders(speed, relative, gap)[0, 1]
+    assert ahead == pytest.approx(25.0 + 0.1 * (first + (STEADY_TICKS - 1) / 2))
 
 
 def test_an_unknown_speed_ahead_is_no_event():
