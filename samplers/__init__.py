@@ -26,7 +26,16 @@ from samplers.methods.improved_cross_entropy import ImprovedCrossEntropy
 from samplers.methods.monte_carlo import MonteCarlo
 from samplers.methods.subset_simulation import AdaptiveSubsetSimulation, SubsetSimulation
 from samplers.methods.two_stage.method import TwoStage
-from samplers.problem import Distribution, FunctionProblem, Problem, StandardNormal
+from samplers.problem import (
+    Distribution,
+    FunctionProblem,
+    HasTermGradients,
+    HasTerms,
+    Problem,
+    StandardNormal,
+    TermGradients,
+    Terms,
+)
 from samplers.registry import METHODS, get_method
 from samplers.result import Estimate, Failure, Failures
 from samplers.sample import Layer, Sample
@@ -49,6 +58,8 @@ __all__ = [
     "FunctionProblem",
     "GaussianBlock",
     "Goal",
+    "HasTermGradients",
+    "HasTerms",
     "ImportanceSampling",
     "ImprovedCrossEntropy",
     "Interrupted",
@@ -74,6 +85,8 @@ __all__ = [
     "Stepping",
     "Steps",
     "SubsetSimulation",
+    "TermGradients",
+    "Terms",
     "TwoStage",
     "compare",
     "compute_ratio_uncertainty",

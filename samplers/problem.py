@@ -1,14 +1,15 @@
 """Problem: the probability P[f(X) <= gamma] of a function f and a base distribution of X; small f is dangerous."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, TypeGuard, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from samplers.errors import one_per_row
-from samplers.validation import check_whole
+from samplers.errors import EvaluationError, one_per_row
+from samplers.validation import check_number, check_whole
 
 FloatArray = NDArray[np.float64]
 LOG_TWO_PI = float(np.log(2 * np.pi))
@@ -112,6 +113,100 @@ class ConditionalProblem(Protocol):
         """Condition, in words; empty without one."""
 
 
+@dataclass(frozen=True, eq=False)
+class Terms:
+    """f of some points together with the terms that it is the least of: f fails where one of its terms does.
+
+    A term is a part of a series system: another car that may be hit, a pair of them, a beam of the lidar. For one
+    threshold gamma the failures are those of the terms, {f <= gamma} = {min_j values[:, j] <= threshold}. The terms
+    need not be f's own. Where failure is a collision, `values` may be clearances with threshold 0: they tell near from
+    far where f does not.
+
+    Example:
+        >>> import numpy as np
+        >>> terms = Terms(np.array([1.0, -2.0]), np.array([[1.0, 3.0], [0.5, -2.0]]), np.zeros((2, 2), dtype=int), 0.0)
+        >>> terms.least, terms.lowest
+        (array([0, 1]), array([ 1., -2.]))
+    """
+
+    f: FloatArray
+    """The problem's own f, shape (n,)."""
+    values: FloatArray
+    """Terms, in the order in which to search: small is dangerous; shape (n, J)."""
+    ticks: NDArray[np.int64]
+    """Index of the time at which each term is attained, 0 where time means nothing; shape (n, J)."""
+    threshold: float
+    """Terms fail at or below it."""
+    names: tuple[str, ...] = ()
+    """Names of the J terms for messages; numbers where there are none."""
+
+    @property
+    def least(self) -> NDArray[np.int64]:
+        """Number of the least term, shape (n,)."""
+        return np.asarray(self.values.argmin(axis=1), dtype=np.int64)
+
+    @property
+    def lowest(self) -> FloatArray:
+        """Value of the least term, shape (n,)."""
+        return np.asarray(self.values.min(axis=1))
+
+
+@dataclass(frozen=True, eq=False)
+class TermGradients:
+    """Gradients of one term of each point, and what they cost.
+
+    Example:
+        >>> import numpy as np
+        >>> TermGradients(np.zeros((2, 3)), cost=6.0).cost
+        6.0
+    """
+
+    values: FloatArray
+    """Gradient with respect to x of the term asked for, shape (n, d); NaN in rows that have none."""
+    cost: float
+    """Simulations that they took, all rows together."""
+
+
+@runtime_checkable
+class HasTerms(Protocol):
+    """A problem whose f is the least of several terms, and that can tell them apart.
+
+    Methods may ask for terms in place of f, at the price of one simulation a row. An attribute that is None counts as
+    not offered, so that a class can offer it for some of its objects only.
+    """
+
+    def terms(self, x: FloatArray, gamma: float = 0.0) -> Terms:
+        """Simulate the rows of x (n, d); return f and terms whose least decides whether f <= gamma."""
+
+
+@runtime_checkable
+class HasTermGradients(HasTerms, Protocol):
+    """A problem with terms that also has their gradients."""
+
+    @property
+    def gradient_cost(self) -> float:
+        """Simulations that a row of `gradient` takes at most, above 0; a budget is planned with it."""
+
+    def gradient(self, x: FloatArray, term: NDArray[np.int64], ticks: NDArray[np.int64]) -> TermGradients:
+        """Return the gradient with respect to x of one term for each row of x (n, d).
+
+        Args:
+            x: Points whose terms are known, shape (n, d).
+            term: Number of the term, shape (n,).
+            ticks: Index of the time at which `terms` found it attained, shape (n,).
+        """
+
+
+def offers_terms(problem: object) -> TypeGuard[HasTerms]:
+    """Return whether a problem has terms."""
+    return callable(getattr(problem, "terms", None))  # a user's object
+
+
+def offers_gradients(problem: object) -> TypeGuard[HasTermGradients]:
+    """Return whether a problem has terms and their gradients."""
+    return offers_terms(problem) and callable(getattr(problem, "gradient", None))
+
+
 def condition_of(problem: Inputs) -> str:
     """Return what a problem holds fixed, in words; empty for nothing."""
     return str(problem.given) if isinstance(problem, ConditionalProblem) else ""
@@ -160,27 +255,55 @@ class FunctionProblem:
     """Any vectorised function under N(0, I).
 
     Args:
-        f: Maps points of shape (n, d) to values of shape (n,); small is dangerous.
+        f: Maps points of shape (n, d) to values of shape (n,); small is dangerous. It may be left out where there are
+            `terms`: it is then their least.
         dim: Number of dimensions d.
+        terms: Maps points of shape (n, d) to terms of shape (n, J) whose least is f, for a series system that fails
+            where one of its parts does; None for none. The problem's own `terms` gives `Terms`.
+        gradient: Maps points of shape (n, d) and the numbers of their terms, shape (n,), to the gradients of these
+            terms, shape (n, d); None for none. The problem's own `gradient` gives `TermGradients`.
+        gradient_cost: Simulations that a row of `gradient` counts as.
 
     Raises:
-        ValueError: If f is not callable or dim is not a positive whole number.
+        ValueError: If f, terms or gradient is not callable, f and terms are missing both, or dim is not a positive
+            whole number.
 
     Example:
         >>> import numpy as np, samplers
         >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
         >>> problem.evaluate(np.array([[1.0, 0.0], [4.0, 0.0]]))
         array([ 2., -1.])
+
+        A series system, which fails where either coordinate exceeds 3:
+
+        >>> series = samplers.FunctionProblem(dim=2, terms=lambda x: 3.0 - x)
+        >>> series.evaluate(np.array([[1.0, 0.0], [4.0, 0.0]]))
+        array([ 2., -1.])
+        >>> series.terms(np.array([[4.0, 0.0]])).values
+        array([[-1.,  3.]])
     """
 
-    f: Callable[[FloatArray], ArrayLike]
-    dim: int
+    f: Callable[[FloatArray], ArrayLike] | None = None
+    dim: int = 0
+    terms: Any = None
+    gradient: Any = None
+    gradient_cost: float = 3.0
+    """A gradient by reverse-mode differentiation takes 2 to 4 evaluations (Griewank and Walther, "Evaluating
+    derivatives", 2008, section 4.6)."""
 
     def __post_init__(self) -> None:
-        """Check the two arguments."""
-        if not callable(self.f):
+        """Check the arguments; the functions of terms and gradients become those of the protocols."""
+        if not (callable(self.f) or (self.f is None and self.terms is not None)):
             raise ValueError(f"Expected f to be a function of an (n, d) array, got {self.f!r}.")
         check_whole("dim", self.dim, 1)
+        for name, wrap in (("terms", _FunctionTerms), ("gradient", _FunctionGradients)):
+            function = getattr(self, name)  # terms, gradient
+            if function is None or isinstance(function, wrap):
+                continue
+            if not callable(function):
+                raise ValueError(f"Expected {name} to be a function of an (n, d) array, got {function!r}.")
+            object.__setattr__(self, name, wrap(function, self.dim, self.gradient_cost))
+        check_number("gradient_cost", self.gradient_cost, 0.0, math.inf)
 
     @property
     def base(self) -> StandardNormal:
@@ -193,6 +316,42 @@ class FunctionProblem:
         Raises:
             ValueError: If x is not of shape (n, d), or f does not return one number per row.
         """
-        if np.ndim(x) != 2 or np.shape(x)[1] != self.dim:
-            raise ValueError(f"Expected x of shape (n, {self.dim}), got {np.shape(x)}.")
-        return one_per_row(self.f(x), len(x))
+        _check_points(x, self.dim)
+        return one_per_row(self.f(x), len(x)) if self.f is not None else np.asarray(self.terms(x).f)
+
+
+@dataclass(frozen=True)
+class _FunctionTerms:
+    """`HasTerms.terms` by a function from points (n, d) to terms (n, J)."""
+
+    function: Callable[[FloatArray], ArrayLike]
+    dim: int
+    gradient_cost: float
+
+    def __call__(self, x: FloatArray, gamma: float = 0.0) -> Terms:
+        """Return the terms at x (n, d); f is their least."""
+        _check_points(x, self.dim)
+        values = np.asarray(self.function(x), dtype=np.float64)
+        if values.ndim != 2 or len(values) != len(x) or values.shape[1] == 0:
+            raise EvaluationError(f"Expected terms of shape ({len(x)}, J), one row per row of x, got {values.shape}.")
+        return Terms(values.min(axis=1), values, np.zeros(values.shape, dtype=np.int64), gamma)
+
+
+@dataclass(frozen=True)
+class _FunctionGradients:
+    """`HasTermGradients.gradient` by a function from points (n, d) and terms (n,) to gradients (n, d)."""
+
+    function: Callable[[FloatArray, NDArray[np.int64]], ArrayLike]
+    dim: int
+    gradient_cost: float
+
+    def __call__(self, x: FloatArray, term: NDArray[np.int64], ticks: NDArray[np.int64]) -> TermGradients:
+        """Return the gradients; time means nothing to a function."""
+        _check_points(x, self.dim)
+        return TermGradients(np.asarray(self.function(x, term), dtype=np.float64), self.gradient_cost * len(x))
+
+
+def _check_points(x: FloatArray, dim: int) -> None:
+    """Raise a ValueError unless x is of shape (n, dim)."""
+    if np.ndim(x) != 2 or np.shape(x)[1] != dim:
+        raise ValueError(f"Expected x of shape (n, {dim}), got {np.shape(x)}.")

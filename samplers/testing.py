@@ -58,7 +58,7 @@ def check_form(method: Stepping) -> None:
 def check_counts(method: Stepping) -> None:
     """Check that every simulation is in n_sim and in one level of the trace, every failing point in the failures."""
     for max_sim in (None, 2500):
-        f = _Counting(half_space(2, 3.0).problem.f)
+        f = _Counting(half_space(2, 3.0).problem.evaluate)
         result = estimate(FunctionProblem(f, 2), method, seed=3, max_sim=max_sim)
         _expect_sound(method, result, f.rows)
         failing = result.failures.total
@@ -68,7 +68,7 @@ def check_counts(method: Stepping) -> None:
 def check_budget(method: Stepping) -> None:
     """Check that max_sim is never exceeded, however small, by one run or by replicates together."""
     for max_sim, replicates in [(1, 1), (2, 1), (7, 1), (7, 7), (50, 1), (500, 1), (1001, 3), (1950, 1), (3000, 1)]:
-        f = _Counting(half_space(2, 3.0).problem.f)
+        f = _Counting(half_space(2, 3.0).problem.evaluate)
         result = estimate(FunctionProblem(f, 2), method, seed=3, max_sim=max_sim, replicates=replicates)
         _expect_sound(method, result, f.rows)
         _expect(f.rows <= max_sim, method, f"max_sim={max_sim} was exceeded: {f.rows} simulations")
@@ -139,7 +139,7 @@ def check_dimensions(method: Stepping) -> None:
     """Check that one dimension is enough, and that with 1,500 the result is right or has a warning."""
     result = estimate(half_space(1, 2.0).problem, method, seed=1, max_sim=5000)
     _expect_near(method, result, normal_cdf(-2.0), "one dimension")
-    f = _Counting(half_space(1500, 2.0).problem.f)
+    f = _Counting(half_space(1500, 2.0).problem.evaluate)
     result = estimate(FunctionProblem(f, 1500), method, seed=1, max_sim=3000)
     _expect_sound(method, result, f.rows)
     holds = result.interval[0] <= normal_cdf(-2.0) <= result.interval[1]
@@ -153,7 +153,7 @@ def check_interruption(method: Stepping) -> None:
     whole = Run(reference.problem, method, arguments)
     batches = 0
     while not whole.done:
-        whole.tell(reference.problem.f(whole.ask()))
+        whole.tell(reference.problem.evaluate(whole.ask()))
         batches += 1
     for after in sorted({math.ceil(batches * i / 12) for i in range(1, 12)} & set(range(1, batches))):
         run = Run(reference.problem, method, arguments)
@@ -161,7 +161,7 @@ def check_interruption(method: Stepping) -> None:
         for _ in range(after):
             x = run.ask()
             rows += len(x)
-            run.tell(reference.problem.f(x))
+            run.tell(reference.problem.evaluate(x))
         result = run.result()
         known = not set(NOT_KNOWN.warnings) & set(result.warnings)
         _expect(known, method, f"Interrupted after batch {after}: expected an Outcome from what there is")

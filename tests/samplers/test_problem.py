@@ -1,8 +1,11 @@
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy import stats
 
 import samplers
+from samplers.problem import offers_gradients, offers_terms
 
 
 def test_standard_normal_density_and_map(rng):
@@ -55,3 +58,47 @@ def test_f_must_give_one_real_number_per_row(f, on_error):
     """Not an outcome that is missing, but an f that is none: no rule for errors covers it."""
     with pytest.raises(samplers.EvaluationError, match=r"Expected f to return shape \(50,\), one"):
         samplers.estimate(samplers.FunctionProblem(f, 2), "mc", seed=1, max_sim=50, on_error=on_error)
+
+
+def test_a_series_system_is_given_by_its_terms_alone():
+    problem = samplers.FunctionProblem(dim=2, terms=lambda x: 3.0 - x, gradient=lambda x, term: -np.eye(2)[term])
+    x = np.array([[1.0, 0.0], [4.0, 5.0]])
+    np.testing.assert_array_equal(problem.evaluate(x), [2.0, -2.0])
+    terms = problem.terms(x, gamma=1.0)
+    np.testing.assert_array_equal(terms.values, 3.0 - x)
+    np.testing.assert_array_equal(terms.f, terms.lowest)
+    np.testing.assert_array_equal(terms.least, [0, 1])
+    assert terms.threshold == 1.0
+    gradients = problem.gradient(x, terms.least, terms.ticks[[0, 1], terms.least])
+    np.testing.assert_array_equal(gradients.values, [[-1.0, 0.0], [0.0, -1.0]])
+    assert gradients.cost == 2 * problem.gradient_cost
+
+
+def test_what_is_none_is_not_offered():
+    plain = samplers.FunctionProblem(lambda x: x[:, 0], 2)
+    series = samplers.FunctionProblem(dim=2, terms=lambda x: x)
+    full = samplers.FunctionProblem(dim=2, terms=lambda x: x, gradient=lambda x, term: np.eye(2)[term])
+    assert [offers_terms(problem) for problem in (plain, series, full)] == [False, True, True]
+    assert [offers_gradients(problem) for problem in (plain, series, full)] == [False, False, True]
+
+
+def test_a_copy_of_a_problem_with_terms_has_the_same_terms():
+    problem = samplers.FunctionProblem(dim=2, terms=lambda x: 3.0 - x)
+    assert dataclasses.replace(problem) == problem
+    np.testing.assert_array_equal(dataclasses.replace(problem).terms(np.zeros((1, 2))).values, [[3.0, 3.0]])
+
+
+@pytest.mark.parametrize(
+    "arguments", [{"terms": 3.0}, {"terms": abs, "gradient": 3.0}, {"terms": abs, "gradient_cost": 0}]
+)
+def test_terms_and_gradients_must_be_functions_and_cost_something(arguments):
+    with pytest.raises(ValueError, match="Expected"):
+        samplers.FunctionProblem(dim=2, **arguments)
+
+
+@pytest.mark.parametrize(
+    "terms", [lambda x: x[:, 0], lambda x: x[1:], lambda x: x[:, :0]], ids=["flat", "short", "none"]
+)
+def test_terms_must_be_a_row_for_every_row(terms):
+    with pytest.raises(samplers.EvaluationError, match=r"Expected terms of shape \(3, J\)"):
+        samplers.FunctionProblem(dim=2, terms=terms).terms(np.zeros((3, 2)))
