@@ -173,6 +173,12 @@ class HasTerms(Protocol):
 
     Methods may ask for terms in place of f, at the price of one simulation a row. An attribute that is None counts as
     not offered, so that a class can offer it for some of its objects only.
+
+    Example:
+        >>> import samplers
+        >>> problem = samplers.FunctionProblem(dim=2, terms=lambda x: 3.0 - x)
+        >>> isinstance(problem, samplers.HasTerms), isinstance(problem, samplers.HasTermGradients)
+        (True, False)
     """
 
     def terms(self, x: FloatArray, gamma: float = 0.0) -> Terms:
@@ -181,7 +187,18 @@ class HasTerms(Protocol):
 
 @runtime_checkable
 class HasTermGradients(HasTerms, Protocol):
-    """A problem with terms that also has their gradients."""
+    """A problem with terms that also has their gradients.
+
+    Example:
+        >>> import numpy as np, samplers
+        >>> problem = samplers.FunctionProblem(
+        ...     dim=2, terms=lambda x: 3.0 - x, gradient=lambda x, term: -np.eye(2)[term]
+        ... )
+        >>> isinstance(problem, samplers.HasTermGradients)
+        True
+        >>> problem.gradient(np.zeros((1, 2)), term=np.array([1]), ticks=np.array([0])).values
+        array([[-0., -1.]])
+    """
 
     @property
     def gradient_cost(self) -> float:
