@@ -33,7 +33,7 @@ Reward: TypeAlias = Callable[[Transition], Any]
 
 
 @runtime_checkable
-class Terms(Protocol):
+class SummedTerms(Protocol):
     """A reward as a named tuple of terms."""
 
     @property
@@ -124,7 +124,7 @@ def total_of(reward: Any) -> Tensor:
     Raises:
         ValueError: If it is neither a tensor of shape (B,) nor terms with such a `total`.
     """
-    total = reward.total if isinstance(reward, Terms) else reward
+    total = reward.total if isinstance(reward, SummedTerms) else reward
     if not isinstance(total, Tensor) or total.ndim != 1:
         raise ValueError(f"Expected a reward of shape (B,) or terms with a `total`, got {reward!r}.")
     return total
@@ -132,4 +132,4 @@ def total_of(reward: Any) -> Tensor:
 
 def terms_of(reward: Any) -> dict[str, Tensor]:
     """Return the terms of a reward by name; one, "reward", if it has none."""
-    return dict(reward._asdict()) if isinstance(reward, Terms) else {"reward": reward}
+    return dict(reward._asdict()) if isinstance(reward, SummedTerms) else {"reward": reward}
