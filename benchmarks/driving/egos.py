@@ -29,12 +29,6 @@ STEPS = 400_000
 """Of the training of an ego, as in the demo."""
 PAGE_EGOS = ("idm", "imitation", "vision", "noisy:idm", "ppo", "dqn")
 PAGE_METHODS = ("two-stage", "adss")
-PAGE_BASES = {
-    "rare_envs/CarFollowing-v0": "us101-gap",
-    "rare_envs/CutIn-v0": "us101-15-offsets",
-    "rare_envs/HardBrake-v0": "us101-all-brakings",
-}
-"""Base distributions under which collisions are frequent enough to compare egos; elsewhere the default."""
 MOST = {"vision": 1500}
 """Simulations of one run; the others get what the methods take by themselves."""
 NARROW = 400
@@ -42,11 +36,11 @@ NARROW = 400
 HEAD = """# The shipped egos, everywhere
 
 Every ego that comes with this project, and two that `rare-envs train-ego ENV --algo ppo --steps {steps}` trained in the
-scenario at hand (`dqn` likewise), in every scenario with its default drivers and the base distribution named with it:
+scenario at hand (`dqn` likewise), in every scenario with its default drivers and its default base distribution:
 the probability of a collision within {horizon:g} s with its 95 % interval, by [two methods](estimates.md), simulations,
-wall time, number of warnings, and the likeliest failure that was found (`python -m benchmarks.driving.egos`). These
-bases are test distributions, under which collisions are frequent enough for a comparison of egos and methods, not those
-that the recorded events support best; for p and rates of your ego take the default ([rates](rates.md)).
+wall time, number of warnings, and the likeliest failure that was found (`python -m benchmarks.driving.egos`). The
+intervals are those of sampling; the events behind a base distribution leave p open by far more
+([the events behind it](estimates.md#the-events-behind-the-base-distribution)).
 
 `vision` has {most:,} simulations at most. Wall times are from a busy machine of two cores. `dqn` chooses among five
 accelerations and cannot steer: on the I-80's curves it leaves its lane, or the road. In the 1,448 dimensions of
@@ -98,7 +92,7 @@ class EgoResult:
 def train_cached(algo: str, env_id: str, folder: Path) -> Path:
     """Return the ego of `rare-envs train-ego ENV --algo ALGO --steps 400000`; one that was trained before is kept."""
     path = folder / f"{algo}_{SCENARIOS[env_id].name}.zip"
-    return path if path.exists() else train_ego(env_id, algo, STEPS, seed=0, out=path, base=PAGE_BASES.get(env_id))
+    return path if path.exists() else train_ego(env_id, algo, STEPS, seed=0, out=path)
 
 
 def evaluate_ego(env_id: str, ego: str, method: str, runs: Path, images: Path) -> EgoResult:
@@ -115,8 +109,7 @@ def evaluate_ego(env_id: str, ego: str, method: str, runs: Path, images: Path) -
         What came out.
     """
     spec = str(train_cached(ego, env_id, runs)) if ego in ("ppo", "dqn") else ego
-    base = PAGE_BASES.get(env_id)
-    question = Question(env_id=env_id, ego=spec, method=method, max_sim=MOST.get(ego), base=base)
+    question = Question(env_id=env_id, ego=spec, method=method, max_sim=MOST.get(ego), ensemble_run=False)
     report = run(prepare(question), progress=True)
     estimate = report.estimate
     picture, words = draw_likeliest(report, images / f"ego_{SCENARIOS[env_id].name}_{ego.replace(':', '_')}.png")
@@ -160,8 +153,13 @@ def format_page(cells: Iterable[EgoResult]) -> str:
         head = (
             "| ego | method | p | 95 % interval | simulations | wall time | warnings |\n|---|---|---|---|---|---|---|\n"
         )
-        base = f", `{PAGE_BASES[env_id]}`" if env_id in PAGE_BASES else ""
-        parts.append(f"## {env_id}{base}\n\n{head}" + "\n".join(rows) + "\n\n" + "\n\n".join(pictures) + "\n")
+        parts.append(
+            f"## {env_id}, `{next(iter(SCENARIOS[env_id].bases))}`\n\n{head}"
+            + "\n".join(rows)
+            + "\n\n"
+            + "\n\n".join(pictures)
+            + "\n"
+        )
     return "\n".join(parts)
 
 

@@ -66,6 +66,7 @@ def compare_egos(question: Question, ego_b: str, progress: bool = False, out: Pa
                 seed=question.seed,
                 max_sim=question.max_sim,
                 progress=progress,
+                ensemble_run=question.ensemble_run,
             )
         inputs = {key: value for key, value in asdict(question).items() if key not in UNUSED_FIELDS}
         answer = {

@@ -56,6 +56,7 @@ def run(
             study.method,
             **asdict(question.run_arguments),
             progress=progress,
+            ensemble_run=question.ensemble_run,
         )
     except EgoGone as error:
         raise BadInput(

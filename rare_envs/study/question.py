@@ -54,6 +54,8 @@ class Question:
         weather: Whether weather and the camera's noise are parameters.
         ensemble: Whether the base distribution is the mixture of the refits of `base`: what these predict for the next
             event.
+        ensemble_run: Whether a further run under that mixture may be made, of up to as many simulations again, where
+            the failures of the first do not tell p under the refits.
         also_under: Further base distributions, names or files joined by commas, under which p is stated too.
         on_error: Treatment of scenarios on which the ego fails twice: "raise" ends the run, "failure" counts them as
             failing, "bound" as failing in p and the upper end of the interval, but not in the lower end.
@@ -86,6 +88,7 @@ class Question:
     collisions: str = "ego"
     weather: bool = False
     ensemble: bool = False
+    ensemble_run: bool = True
     also_under: str | None = None
     sensitivity: bool = False
 

@@ -1,10 +1,12 @@
 """Arguments of gym.make: wrong ones are refused before anything is made."""
 
 import gymnasium as gym
+import numpy as np
 import pytest
 
 import rare_envs
 from rare_envs.envs.single import DrivingEnv
+from rare_envs.measures import minimum
 
 
 def test_bad_arguments_are_refused_at_the_door() -> None:
@@ -51,3 +53,12 @@ def test_an_unknown_keyword_is_named_with_the_nearest_known_one() -> None:
         gym.make("rare_envs/CutIn-v0", horizn=3.0)
     with pytest.raises(TypeError, match="reset takes it as an option"):
         gym.make("rare_envs/CutIn-v0", cut_in_gap=3.0)
+
+
+def test_a_measure_object_goes_with_an_ego_that_has_noise_of_its_own() -> None:
+    """The measure is tried on the scenario's columns; those of the ego's noise stand behind them."""
+    problem = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", ego="human", measure=minimum("ttc"), horizon=0.3)
+    named = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", ego="human", measure="ttc", horizon=0.3)
+    x = problem.base.sample(20, np.random.default_rng(0))
+    assert problem.dim > 3
+    assert problem.evaluate(x).tolist() == named.evaluate(x).tolist()

@@ -67,6 +67,13 @@ ObservationOption = Annotated[
 ActionOption = Annotated[
     str, typer.Option(help="Actions of the ego: continuous, each tick, or HighwayEnv's meta, each second.")
 ]
+EnsembleRunOption = Annotated[
+    bool,
+    typer.Option(
+        "--ensemble-run/--no-ensemble-run",
+        help="Where the failures found do not reach the refits of the base, simulate up to as much again under these.",
+    ),
+]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,6 +115,7 @@ class QuestionOptions(WorldOptions):
     gamma: Annotated[float, typer.Option(help="Threshold: P[f <= gamma]; 0 counts collisions.")] = 0.0
     seed: SeedOption = 0
     collisions: Annotated[str, typer.Option(help="Which count: ego, or any, between others too.")] = "ego"
+    ensemble_run: EnsembleRunOption = True
     trust: TrustOption = False
 
 
@@ -150,7 +158,11 @@ class RiskOptions:
         list[str] | None, typer.Option(help="SCENARIO=NAME or FILE, in place of the site's base; may be repeated.")
     ] = None
     method: Annotated[str, typer.Option(help="Estimation method; see rare-envs list.")] = "two-stage"
-    max_sim: Annotated[int | None, typer.Option(help="Largest number of simulations of each scenario.")] = None
+    max_sim: Annotated[
+        int | None,
+        typer.Option(help="Largest number of simulations of each scenario.", show_default="that of the method"),
+    ] = None
+    ensemble_run: EnsembleRunOption = True
     seed: SeedOption = 0
     algo: AlgoOption = None
     trust: TrustOption = False

@@ -1,20 +1,21 @@
 """The calibration against people: what is counted, and which part is called off, on made-up counts."""
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 import rare_envs
 from benchmarks.driving import human_calibration as calibration
 from benchmarks.driving.human_calibration import (
     DRIVERS,
     EVENTS,
-    PEOPLE_PER_KM,
     CalibrationCell,
     FullBraking,
+    classify_outcomes,
     count_outcomes,
+    count_per_event,
     format_measured,
     format_row,
     judge,
@@ -23,6 +24,8 @@ from benchmarks.driving.human_calibration import (
 from rare_envs.control.human_driver import MAX_HUMAN_BRAKING
 
 CUT_IN = EVENTS[0]
+CUT_INS = CUT_IN.find_frequency("us101")
+KM_100CAR = 2e6 * 1.609344
 
 
 def cells_of(**counts: tuple[int, int, int]) -> dict[str, CalibrationCell]:
@@ -36,16 +39,24 @@ def cells_of(**counts: tuple[int, int, int]) -> dict[str, CalibrationCell]:
     return found
 
 
-def test_outcomes_are_those_of_the_problem() -> None:
-    cell = count_outcomes(CUT_IN, "human", CUT_IN.base, 300, seed=3)
-    around = rare_envs.DrivingProblem(CUT_IN.env_id, ego="human", measure="near_crash", base=CUT_IN.base)
+def test_outcomes_are_those_of_the_measures_and_of_the_crashes() -> None:
+    cell = count_outcomes(CUT_IN, "human", "us101", 300, seed=3)
+    around = rare_envs.DrivingProblem(CUT_IN.env_id, ego="human", measure="near_crash", base="us101")
     x = around.base.sample(300, np.random.default_rng(3))
     f = around.evaluate(x)
-    ttc = rare_envs.DrivingProblem(CUT_IN.env_id, ego="human").evaluate(x)
+    ttc = rare_envs.DrivingProblem(CUT_IN.env_id, ego="human", base="us101").evaluate(x)
+    required = rare_envs.DrivingProblem(CUT_IN.env_id, ego="human", measure="required_deceleration", base="us101")
+    near = (f <= 0.0) & (ttc > 0.0)
     assert cell.contacts == int((ttc <= 0.0).sum()) > 0
-    assert cell.near_crashes == int((f <= 0.0).sum()) - cell.contacts > 0
-    assert 0 < cell.needed < cell.near_crashes
+    assert cell.near_crashes == int(near.sum()) > 0
+    assert cell.needed == int((near & (required.evaluate(x) <= 5.0 - 0.5 * 9.80665)).sum()) > 0
     assert cell.flanks == around.crash_kinds(x[ttc <= 0.0]).count("side") > 0
+
+
+def test_outcomes_are_told_apart() -> None:
+    """Nothing; braking beyond 0.5 g that was not needed, and that was; a contact."""
+    near, required = torch.tensor([0.1, 0.0, -0.5, -100.0]), torch.tensor([4.0, 4.0, 0.0, -100.0])
+    assert classify_outcomes(torch.stack([near, required])).tolist() == [0.0, 1.0, 2.0, 3.0]
 
 
 def test_full_braking_stops_in_the_way_of_physics() -> None:
@@ -66,25 +77,26 @@ def test_full_braking_stops_in_the_way_of_physics() -> None:
     ],
 )
 def test_the_part_that_is_off_is_named(human: Any, best: Any, said: str, unsaid: str) -> None:
-    told = " ".join(judge(CUT_IN, cells_of(human=human, best=best)))
+    told = " ".join(judge(CUT_IN, CUT_INS, cells_of(human=human, best=best)))
     assert said in told
     assert unsaid not in told
 
 
-def test_shares_are_told_of_the_events_that_people_are_counted_by() -> None:
+def test_a_row_has_shares_with_intervals() -> None:
     some = CalibrationCell("cut-in", "human", "x", 1000, 10, 0, 0, 0)
-    assert format_row(CUT_IN, some).startswith("| human | 1.0e-02 (4.8e-03 to 1.8e-02) | under 3.7e-03 |")
-    assert "2.0e-03" in format_row(replace(CUT_IN, share=0.2), some)
+    assert format_row(some).startswith("| human | 1.0e-02 (4.8e-03 to 1.8e-02) | under 3.7e-03 |")
 
 
-def test_rates_of_people_are_those_of_the_study() -> None:
-    """2 million miles; 1 and 136, 14 and 385 contacts and near-crashes."""
-    km = 2e6 * 1.609344
-    for name, counts in (("cut-in", (1, 136)), ("braking of the lead", (14, 385))):
-        assert PEOPLE_PER_KM[name] == pytest.approx([count / km for count in counts], rel=0.03)
-    brakings = EVENTS[1]
-    assert brakings.contacts == pytest.approx((14 / km / 1.23, 14 / km / 0.155), rel=0.03)
-    assert brakings.near_crashes == pytest.approx((385 / km / 1.23, 385 / km / 0.155), rel=0.03)
+def test_people_per_event_are_counts_over_events_in_as_many_km() -> None:
+    """1 contact (exact Poisson interval 0.0253 to 5.572) in 2 million miles, with 1221 x 38 / 46 cut-ins in 3900 km."""
+    per_km = 1221 * 38 / 46 / 3900
+    low, high = count_per_event(CUT_IN.contacts, CUT_INS)
+    assert (low, high) == pytest.approx((0.02532 / KM_100CAR / per_km, 5.572 / KM_100CAR / per_km), rel=1e-3)
+    for events, counts in zip(EVENTS, ((1, 136), (14, 385)), strict=True):
+        found = (events.contacts.per_million_km, events.near_crashes.per_million_km)
+        assert found == pytest.approx([1e6 * count / KM_100CAR for count in counts])
+    with pytest.raises(ValueError, match="no event frequency"):
+        CUT_IN.find_frequency("highway")
 
 
 def test_parts_and_page(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -92,9 +104,9 @@ def test_parts_and_page(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     page = tmp_path / "page.md"
     page.write_text("# Text\n\n## Measured\n\nold\n")
     monkeypatch.setattr(calibration, "PAGE", page)
-    cells = [CalibrationCell(e.name, d, e.base, 100, 1, 2, 1, 0) for e in EVENTS for d in DRIVERS]
+    cells = [CalibrationCell(e.name, d, "us101", 100, 1, 2, 1, 0) for e in EVENTS for d in DRIVERS]
     calibration.write_page(format_measured(cells, "command"))
     text = page.read_text()
     assert text.startswith("# Text\n\n## Measured\n\n`command`; 100 draws each")
     assert "old" not in text
-    assert "| cut-in | 0.26 | 2.6e-03 | 3.1e-07 |" in text
+    assert "| cut-in | 0.26 | 2,586 | 0.31 | 5,173 | 42 |" in text
