@@ -43,8 +43,8 @@ the probability of a collision within {horizon:g} s with its 95 % interval, by [
 wall time, number of warnings, and the likeliest failure that was found (`python -m benchmarks.driving.egos`). The
 intervals are those of sampling; the events behind a base distribution leave p open by far more
 ([the events behind it](estimates.md#the-events-behind-the-base-distribution)). The bases are the defaults but for
-car-following: under its default (`us101`) `idm` has 7.4e-11, which its 470 events do not determine, and in 6,000
-simulations of `imitation` nothing fails; `us101-gap` is a test distribution under which egos and methods can be compared.
+car-following: under its default, `us101`, `idm` has 7.4e-11 and in 6,000 simulations of `imitation` nothing fails;
+`us101-gap` is a test distribution under which egos and methods can be compared.
 
 `vision` has {most:,} simulations at most. Wall times are from a busy machine of two cores. `dqn` chooses among five
 accelerations and cannot steer: on the I-80's curves it leaves its lane, or the road. In the 1,448 dimensions of
