@@ -43,7 +43,7 @@ FLOORS = {
     """,
     "rare_envs": """
         version
-        traffic plugins arrays threads json_text
+        traffic plugins arrays threads json_text files
         distributions control sensors
         sensors.camera scenarios measures
         simulation

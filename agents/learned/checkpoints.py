@@ -26,6 +26,7 @@ from agents.learned.networks import ACTION_SIZE, FEATURE_CLIP, FEATURE_SIZE, HEA
 from agents.learned.rule_driver import RuleDriver
 from agents.learned.weight_distribution import WeightDistribution
 from agents.names import RULE_BASED, SHIPPED_DRIVERS, SHIPPED_EGOS
+from rare_envs.files import replace_file
 from rare_envs.json_text import parse_json_object
 from rare_envs.plugins import did_you_mean
 from rare_envs.sensors.perception import FEATURES
@@ -202,9 +203,8 @@ def write_file(path: Path, tensors: Mapping[str, Tensor], entry: str, header: Ma
         raise ValueError(f"Expected a path that ends with {SUFFIX}, got {str(path)!r}.")
     check_finite(tensors, path)
     content = safetensors.torch.save(dict(tensors), {entry: json.dumps(header, allow_nan=False)})
-    unfinished = path.with_name(f"{path.name}.part")
-    unfinished.write_bytes(content)
-    unfinished.replace(path)
+    with replace_file(path) as draft:
+        draft.write_bytes(content)
     return path
 
 

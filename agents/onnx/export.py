@@ -7,7 +7,6 @@ squashed or clipped action and a recurrent policy's memory are part of the graph
 from __future__ import annotations
 
 import json
-import os
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +19,7 @@ from torch import Tensor, nn
 
 from agents.onnx.ego import METADATA_KEY, OnnxEgo
 from agents.sb3.saved_ego import SavedEgo
+from rare_envs.files import replace_file
 
 ACTION_TOLERANCE = 1e-5
 """Largest difference between actions of the policy and of its export: single precision rounds by about 1e-7 in each of
@@ -141,8 +141,7 @@ def export_onnx(ego: SavedEgo, path: Path, seed: int = 0) -> ExportReport:
         "observation": list(space.shape),
         "action": _describe_space(ego.action_space),
     }
-    draft = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
+    with replace_file(path) as draft:
         _trace(ego, draft)
         model = onnx.load(str(draft))
         model.metadata_props.add(key=METADATA_KEY, value=json.dumps(description))
@@ -150,9 +149,6 @@ def export_onnx(ego: SavedEgo, path: Path, seed: int = 0) -> ExportReport:
         difference, count = compare_actions(ego, OnnxEgo(draft), np.random.default_rng(seed))
         if not difference <= ACTION_TOLERANCE:
             raise ValueError(f"The exported graph acts differently, by up to {difference:.2g}; nothing was written.")
-        draft.replace(path)
-    finally:
-        draft.unlink(missing_ok=True)
     return ExportReport(path, difference, count)
 
 

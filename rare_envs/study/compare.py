@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import samplers
 from rare_envs.egos.errors import EgoGone
+from rare_envs.files import replace_text
 from rare_envs.study.errors import as_bad_input, output_folder
 from rare_envs.study.question import Question, prepare
 from rare_envs.study.run_directory import format_json, write_failures
@@ -76,6 +77,6 @@ def compare_egos(question: Question, ego_b: str, progress: bool = False, out: Pa
             "version": __version__,
         }
         if out is not None:
-            (out / COMPARISON).write_text(format_json(answer) + "\n", encoding="utf-8")
+            replace_text(out / COMPARISON, format_json(answer) + "\n")
             write_failures(out, a.problem.space, comparison.either.failures)
     return EgoComparison(comparison, answer)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.egos.errors import EgoGone, reason_of
+from rare_envs.files import replace_file
 from rare_envs.study.columns import list_columns
 from rare_envs.study.replay import Drive, drive_again
 from rare_envs.study.report import Report
@@ -65,7 +66,8 @@ def save_plot(path: Path, report: Report) -> None:
             _write_message(right.subplots(), drive)
         else:
             draw_drive(list(right.subplots(MOMENTS + 1, height_ratios=[view] * MOMENTS + [CURVES])), drive)
-        figure.savefig(path, dpi=120)
+        with replace_file(path) as draft:
+            figure.savefig(draft, dpi=120)
 
 
 def _replay_likeliest_failure(report: Report) -> Drive | str:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 import samplers
 from rare_envs.distributions.space import ScenarioSpace
+from rare_envs.files import replace_file, replace_text
 from rare_envs.study.analysis.sensitivity_plot import save_sensitivity
 from rare_envs.study.columns import MAX_SHOWN, list_columns
 from rare_envs.study.plots import save_plot
@@ -58,7 +59,7 @@ def write_run(folder: Path, report: Report) -> None:
         ...     json.loads((Path(folder) / "result.json").read_text())["status"]
         'no_hits'
     """
-    (folder / RESULT).write_text(format_json(report.to_dict()) + "\n", encoding="utf-8")
+    replace_text(folder / RESULT, format_json(report.to_dict()) + "\n")
     _write_failures(folder, report)
     _write_faults(folder, report)
     save_plot(folder / PLOT, report)
@@ -163,7 +164,7 @@ def _write_table(
     """
     columns = list_columns(space)
     shown = [column.shown for column in columns]
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with replace_file(path) as draft, draft.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow([*(column.name for column in columns if column.shown), *names])
         writer.writerows([*row[shown].tolist(), *more] for row, more in zip(x, rest, strict=True))
@@ -172,4 +173,5 @@ def _write_table(
     blocks_path.unlink(missing_ok=True)
     if large:
         blocks = {name: part.astype(np.float32) for name, part in space.columns(x).items() if name in large}
-        np.savez_compressed(blocks_path, allow_pickle=False, **blocks)
+        with replace_file(blocks_path) as draft:
+            np.savez_compressed(draft, allow_pickle=False, **blocks)

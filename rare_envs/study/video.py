@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from rare_envs.envs.rendering import FRAME_WIDTH, Renderer
+from rare_envs.files import replace_file
 from rare_envs.problem import DrivingProblem
 from rare_envs.study.columns import MAX_SHOWN, format_value
 from rare_envs.study.errors import BadInput
@@ -186,10 +187,12 @@ def write_film(path: Path | str, drive: Drive, width: int = FRAME_WIDTH, every: 
     shown = draw_frames(drive)
     shown = [each.resize((width, round(each.height * width / FRAME_WIDTH)), Image.Resampling.LANCZOS) for each in shown]
     if path.suffix.lower() == ".png":
-        shown[drive.worst].save(path)
+        with replace_file(path) as draft:
+            shown[drive.worst].save(draft)
         return
     tick = round(1000 * drive.problem.world.clock.dt)
     kept = shown[:-1:every]
     frames = [each.quantize(GIF_COLOURS) for each in (*kept, shown[-1])]
     durations = [tick * every] * len(kept) + [tick * LAST_FRAME_TICKS]
-    frames[0].save(path, save_all=True, append_images=frames[1:], duration=durations, loop=0, optimize=True)
+    with replace_file(path) as draft:
+        frames[0].save(draft, save_all=True, append_images=frames[1:], duration=durations, loop=0, optimize=True)

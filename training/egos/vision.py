@@ -31,6 +31,7 @@ from agents import Provenance
 from agents.vision.checkpoint import save_vision
 from agents.vision.ego import VisionEgo
 from agents.vision.pilotnet import PILOTNET_HIDDEN_UNITS, PilotNet
+from rare_envs.files import replace_file
 from rare_envs.threads import use_one_thread
 from training.command_line import RunFolderOption, report_errors, run_command
 from training.egos.expert_driver import AUXILIARY_SIZE
@@ -142,7 +143,8 @@ class Training:
             parts.append(part)
             yield f"round {self.round}: {sum(len(each.speed) for each in parts)} pictures taken"
         self.recorded.append(concatenate(parts))
-        torch.save(tuple(self.recorded[-1]), self._recorded_path(self.round))
+        with replace_file(self._recorded_path(self.round)) as draft:
+            torch.save(tuple(self.recorded[-1]), draft)
         yield from self._learn(rng)
         self.round += 1
         state = {
@@ -152,9 +154,8 @@ class Training:
             "round": self.round,
             "visited": self.visited,
         }
-        unfinished = (self.out / CHECKPOINT).with_suffix(".part")
-        torch.save(state, unfinished)
-        unfinished.replace(self.out / CHECKPOINT)
+        with replace_file(self.out / CHECKPOINT) as draft:
+            torch.save(state, draft)
 
     def _recorded_path(self, number: int) -> Path:
         """Return the file of the pictures of a round."""

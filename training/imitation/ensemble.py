@@ -28,6 +28,7 @@ from torch import Tensor
 
 from agents import LearnedDriver, read_driver, read_provenance, save_driver
 from agents.learned.networks import head_weights
+from rare_envs.files import replace_file
 from rare_envs.threads import use_one_thread
 from samplers.problem import FloatArray
 from training.command_line import report_errors, run_command
@@ -135,10 +136,8 @@ def train_members(folder: Path, ensemble: Ensemble, progress: bool = False) -> l
         path = kept / f"{number:03}.npz"
         if not path.exists():
             member = train_member(data, driver, base, folder / CHECKPOINT, ensemble, number)
-            partial = path.with_suffix(".part")
-            with partial.open("wb") as file:
-                np.savez(file, base=own, weights=member.weights, within=member.within)
-            partial.replace(path)
+            with replace_file(path) as draft:
+                np.savez(draft, base=own, weights=member.weights, within=member.within)
         with np.load(path) as saved:
             if not np.array_equal(saved["base"], own):
                 raise ValueError(f"{str(path)!r} is a member around another driver; remove {str(kept)!r}.")

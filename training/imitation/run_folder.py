@@ -15,6 +15,7 @@ from typing import Any
 from agents import LearnedDriver, Provenance, save_driver
 from agents.learned.coloured_noise import WHITE_NOISE, AutoregressiveNoise
 from agents.learned.networks import Policy
+from rare_envs.files import replace_text
 from training.imitation.algorithms.actions import ACTION_HIGH, ACTION_LOW
 from training.imitation.algorithms.config import HUMAN_NOISE, Config
 from training.imitation.datasets import Source, load_scenes
@@ -137,7 +138,7 @@ def write_settings(out: Path, settings: str) -> None:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ValueError(f"Cannot make the folder {str(out)!r}: {error}.") from None
-    (out / SETTINGS_FILE).write_text(settings + "\n", encoding="utf-8")
+    replace_text(out / SETTINGS_FILE, settings + "\n")
 
 
 def read_training_settings(folder: Path) -> tuple[Source, Config]:

@@ -23,6 +23,7 @@ from typing import Annotated, ClassVar
 import numpy as np
 import typer
 
+from rare_envs.files import replace_text
 from rare_envs.scenarios.registry import scenario_named
 from training.command_line import LocationOption, RecordingOptions, report_errors, run_command, spread_options
 from training.data.events import EXTRACTORS, Events, concatenate_events, write_events
@@ -168,7 +169,7 @@ def _write_package_bases(data: Path, scenarios: Sequence[str], out: Path, seed: 
 
 def _write(path: Path, text: str) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text, encoding="utf-8")
+    replace_text(path, text)
     typer.echo(path)
 
 

@@ -19,6 +19,7 @@ import typer
 from pyarrow import ArrowInvalid, csv
 from scipy.optimize import least_squares
 
+from rare_envs.files import replace_text
 from rare_envs.traffic.reference_line import ReferenceLine
 from rare_envs.traffic.road import Road
 from samplers.problem import FloatArray
@@ -155,7 +156,7 @@ def main(
         "edges": road.edges,
         "curvature": curve.curvature,
     }
-    out.write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
+    replace_text(out, json.dumps(table, indent=1) + "\n")
     typer.echo(out)
 
 

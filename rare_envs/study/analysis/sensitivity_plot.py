@@ -8,6 +8,7 @@ import matplotlib
 from matplotlib.figure import Figure
 
 import samplers
+from rare_envs.files import replace_file
 
 
 def save_sensitivity(path: Path, sensitivity: samplers.Sensitivity) -> None:
@@ -21,4 +22,5 @@ def save_sensitivity(path: Path, sensitivity: samplers.Sensitivity) -> None:
         # a Figure of its own, without pyplot: no window, no global state, whatever backend the user has
         figure = Figure(figsize=(14, 4.5), layout="constrained")
         sensitivity.plot(list(figure.subplots(1, 2)))
-        figure.savefig(path, dpi=120)
+        with replace_file(path) as draft:
+            figure.savefig(draft, dpi=120)

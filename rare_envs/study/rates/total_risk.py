@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from rare_envs.files import replace_text
 from rare_envs.scenarios.registry import SCENARIOS, scenario_named
 from rare_envs.study.collision_rate import find_frequency
 from rare_envs.study.errors import BadInput, as_bad_input
@@ -82,7 +83,7 @@ def risk(
 
 def write_risk(folder: Path, found: Risk) -> None:
     """Write risk.json and risk.png into an existing folder."""
-    (folder / "risk.json").write_text(format_json(found.to_dict()) + "\n", encoding="utf-8")
+    replace_text(folder / "risk.json", format_json(found.to_dict()) + "\n")
     found.save_plot(folder / "risk.png")
 
 

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from agents.learned.networks import Policy
+from rare_envs.files import replace_file
 from training.imitation.algorithms.actions import log_likelihood, normalise_action
 from training.imitation.algorithms.behaviour_cloning import make_seeded
 from training.imitation.algorithms.config import Config
@@ -162,9 +163,8 @@ class Learner:
             "rollouts": list(self.rollouts),
             "pools": [{"traffic": pool.traffic._asdict(), "noise": pool.noise, "age": pool.age} for pool in self.pools],
         }
-        partial = path.with_suffix(".partial")
-        torch.save(state, partial)
-        partial.replace(path)
+        with replace_file(path) as draft:
+            torch.save(state, draft)
 
     def load(self, path: Path) -> None:
         """Resume a saved training.

@@ -13,6 +13,7 @@ import typer
 
 from agents import LearnedDriver, Provenance, read_driver, read_provenance
 from agents.vision.checkpoint import holds_vision, read_vision_provenance
+from rare_envs.files import replace_text
 from training.command_line import run_command
 
 ATTRIBUTION = (
@@ -119,7 +120,7 @@ def _cell(value: Any) -> str:
 
 def main(folder: Annotated[Path, typer.Argument(help="Folder with the drivers.")]) -> None:
     """Write the model card of a folder of drivers."""
-    (folder / "README.md").write_text(format_model_card(folder), encoding="utf-8")
+    replace_text(folder / "README.md", format_model_card(folder))
 
 
 if __name__ == "__main__":

@@ -1,0 +1,67 @@
+"""Files that are replaced whole: whoever is killed while writing, or runs out of space, leaves the earlier file."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+
+@contextlib.contextmanager
+def replace_file(path: str | Path) -> Iterator[Path]:
+    """Yield the path of a draft in the same folder; it takes the file's place when the block ends without an error.
+
+    The draft is on the disk before it takes the place, and the change of the folder after it: a power cut leaves the
+    earlier file or the new one. After an error the draft is removed. The draft keeps the ending of the name, which
+    libraries read the format from. A link stays one: the file that it leads to is replaced.
+
+    Args:
+        path: The file; its folder exists.
+
+    Raises:
+        OSError: The draft cannot be written.
+
+    Example:
+        >>> from tempfile import TemporaryDirectory
+        >>> with TemporaryDirectory() as folder:
+        ...     path = Path(folder) / "answer.txt"
+        ...     _ = path.write_text("the earlier one")
+        ...     with contextlib.suppress(RuntimeError), replace_file(path) as draft:
+        ...         _ = draft.write_text("half of the new o")
+        ...         raise RuntimeError
+        ...     path.read_text(), len(list(path.parent.iterdir()))
+        ('the earlier one', 1)
+    """
+    path = Path(os.path.realpath(path))
+    draft = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
+    try:
+        yield draft
+        _sync(draft)
+        with contextlib.suppress(FileNotFoundError):
+            draft.chmod(path.stat().st_mode & 0o7777)
+        draft.replace(path)
+    finally:
+        draft.unlink(missing_ok=True)
+    _sync(path.parent)
+
+
+def replace_text(path: str | Path, text: str) -> None:
+    """Write text in UTF-8 in place of what a file holds; see `replace_file`.
+
+    Raises:
+        OSError: It cannot be written; the file holds what it held.
+    """
+    with replace_file(path) as draft:
+        draft.write_text(text, encoding="utf-8")
+
+
+def _sync(path: Path) -> None:
+    """Bring a file, or the list of names of a folder, from the system's memory to the disk."""
+    if path.is_dir() and os.name != "posix":  # folders cannot be opened there
+        return
+    number = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(number)
+    finally:
+        os.close(number)

@@ -1,0 +1,122 @@
+"""A file is replaced whole or not at all, whatever stops the writing."""
+
+from __future__ import annotations
+
+import ast
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from rare_envs.files import replace_file, replace_text
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_text_takes_the_place_of_the_earlier_file(tmp_path: Path) -> None:
+    path = tmp_path / "answer.json"
+    replace_text(path, "first")
+    replace_text(path, "second, ä")
+    assert path.read_text(encoding="utf-8") == "second, ä"
+    assert names(tmp_path) == ["answer.json"]
+
+
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt, SystemExit])
+def test_an_error_leaves_the_earlier_file_and_no_draft(error: type[BaseException], tmp_path: Path) -> None:
+    path = tmp_path / "ego.zip"
+    path.write_bytes(b"earlier")
+    with pytest.raises(error), replace_file(path) as draft:
+        draft.write_bytes(b"half")
+        raise error
+    assert path.read_bytes() == b"earlier"
+    assert names(tmp_path) == ["ego.zip"]
+
+
+def test_the_draft_keeps_the_ending_and_the_file_its_rights(tmp_path: Path) -> None:
+    path = tmp_path / "plot.png"
+    path.write_bytes(b"earlier")
+    path.chmod(0o640)
+    with replace_file(path) as draft:
+        assert (draft.suffix, draft.parent) == (".png", tmp_path)
+        draft.write_bytes(b"new")
+    assert path.stat().st_mode & 0o777 == 0o640
+
+
+def test_a_link_stays_one(tmp_path: Path) -> None:
+    target, link = tmp_path / "target.txt", tmp_path / "link.txt"
+    target.write_text("earlier")
+    link.symlink_to(target)
+    replace_text(link, "new")
+    assert link.is_symlink()
+    assert target.read_text() == "new"
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
+def test_a_full_disk_leaves_the_earlier_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "result.json"
+    path.write_text("earlier")
+
+    def write_to_full_disk(self: Path, text: str, encoding: str) -> None:
+        self.touch()
+        with open("/dev/full", "w", encoding=encoding) as file:
+            file.write(text)
+
+    monkeypatch.setattr(Path, "write_text", write_to_full_disk)
+    with pytest.raises(OSError, match="No space left"):
+        replace_text(path, "new")
+    monkeypatch.undo()
+    assert path.read_text() == "earlier"
+    assert names(tmp_path) == ["result.json"]
+
+
+WRITERS = ("write_text", "write_bytes", "savefig", "savez", "savez_compressed")
+ROOT = Path(__file__).parents[2]
+
+
+def direct_writes() -> list[str]:
+    """Return calls in the packages that write into a file that is not a draft."""
+    found = []
+    for package in ("agents", "rare_envs", "training"):
+        for path in sorted((ROOT / package).rglob("*.py")):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in WRITERS:
+                    target = node.args[0] if "save" in node.func.attr else node.func.value
+                    if not (isinstance(target, ast.Name) and target.id == "draft"):
+                        found.append(f"{path.relative_to(ROOT)}:{node.lineno}")
+    return found
+
+
+def test_every_file_of_the_packages_is_replaced_whole() -> None:
+    assert not direct_writes()
+
+
+WRITER = """
+import sys
+from rare_envs.files import replace_text
+k = 0
+while True:
+    k += 1
+    replace_text(sys.argv[1], str(k) * 200_000)
+    print(flush=True)
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs SIGKILL")
+def test_a_killed_writer_leaves_a_whole_file(tmp_path: Path) -> None:
+    path = tmp_path / "result.json"
+    for delay in (0.0, 0.003, 0.011):
+        words = [sys.executable, "-c", WRITER, str(path)]
+        with subprocess.Popen(words, stdout=subprocess.PIPE) as process:
+            assert process.stdout is not None
+            process.stdout.readline()  # the first file is there
+            time.sleep(delay)
+            process.send_signal(signal.SIGKILL)
+        text = path.read_text()
+        number = text[: len(text) // 200_000]
+        assert text == number * 200_000
