@@ -1,0 +1,76 @@
+"""How often do the cases on the highway fail? Counts among rollouts from the base distribution, no sampler involved.
+
+    python -m benchmarks.estimators.highway.truth --rollouts 1e6
+
+adds to `benchmarks/results/highway_truth.json` after every chunk, and goes on where it was stopped.
+"""
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+import typer
+
+import rare_envs
+from benchmarks import RESULTS
+from benchmarks.estimators.highway.cases import CASES, WORLDS
+from rare_envs.simulation.rollout import rollout
+from rare_envs.threads import use_one_thread
+
+HIGHWAY_TRUTH = RESULTS / "highway_truth.json"
+CHUNK = 2048
+"""Rollouts between two writings; chunk k of a world has the draws of the seed (seed, k)."""
+
+
+def count_failures(world: str, seed: int, chunk: int) -> dict[str, int]:
+    """Count the failures of all cases of a world in one chunk of rollouts, by case.
+
+    Collisions are read off the rollouts themselves, where f of every measure is as it is without one.
+    """
+    problem = WORLDS[world].problem("lidar_ttc")
+    x = torch.from_numpy(problem.base.sample(CHUNK, np.random.default_rng((seed, chunk)))).float()
+    with torch.inference_mode():
+        ends = [rollout(problem.world, problem.driver, rows) for rows in x.split(problem.tile)]
+    collided, f = (torch.cat([getattr(end, name) for end in ends]) for name in ("collided", "f"))
+    failed = {
+        name: collided if case.measure == "clearance" else f <= case.gamma
+        for name, case in CASES.items()
+        if case.world == world
+    }
+    return {name: int(each.sum()) for name, each in failed.items()}
+
+
+def add_chunk(record: dict[str, Any], seed: int) -> None:
+    """Add one chunk to the world with the fewest, in place."""
+    world = min(WORLDS, key=lambda name: record["chunks"].get(name, 0))
+    chunk = record["chunks"].get(world, 0)
+    for name, failures in count_failures(world, seed, chunk).items():
+        counts = record["cases"].setdefault(name, {"rollouts": 0, "failures": 0})
+        counts["rollouts"] += CHUNK
+        counts["failures"] += failures
+    record["chunks"][world] = chunk + 1
+
+
+@use_one_thread()
+def main(
+    rollouts: Annotated[float, typer.Option(help="Rollouts of each world.")] = 1e6,
+    seed: int = 2026,
+    out: Path = HIGHWAY_TRUTH,
+) -> None:
+    """Count failures until every world has its rollouts."""
+    record: dict[str, Any] = json.loads(out.read_text()) if out.exists() else {"chunks": {}, "cases": {}}
+    record["command"] = f"python -m benchmarks.estimators.highway.truth --rollouts {rollouts:g} --seed {seed}"
+    if record.setdefault("seed", seed) != seed:
+        raise typer.BadParameter(f"{out} was counted with seed {record['seed']}.")
+    record["versions"] = {"rare_envs": rare_envs.__version__, "torch": torch.__version__, "numpy": np.__version__}
+    while min(record["chunks"].get(name, 0) for name in WORLDS) * CHUNK < rollouts:
+        add_chunk(record, seed)
+        written = out.with_suffix(".partial")
+        written.write_text(json.dumps(record, indent=2) + "\n")
+        written.replace(out)
+
+
+if __name__ == "__main__":
+    typer.run(main)
