@@ -4,6 +4,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,13 @@ from rare_envs.egos.needs import resolve
 from rare_envs.egos.policy import PolicyDriver, as_driver
 from rare_envs.make import set_up
 from rare_envs.scenarios.registry import find_scenario
+from rare_envs.search_terms import (
+    ROLLOUTS_PER_GRADIENT,
+    EpisodeTerms,
+    TermDifferentiator,
+    find_differentiator,
+    simulate_terms,
+)
 from rare_envs.simulation.measurement import Measurement
 from rare_envs.simulation.rollout import StochasticDriver, rollout
 from rare_envs.simulation.world import World
@@ -171,6 +179,42 @@ class DrivingProblem:
         f[list(failed_rows)] = np.nan
         return f, failed_rows
 
+    def terms(self, x: NDArray[np.float64], gamma: float = 0.0) -> EpisodeTerms:
+        """Simulate, and tell apart the terms of which f is the least, one of each vehicle say.
+
+        Where f <= gamma means a collision, they are distances to the vehicles, early and late in the episode, whatever
+        the measure; see `rare_envs.measures.terms.find_order`.
+
+        Args:
+            x: Scenario parameters, shape (n, d).
+            gamma: Threshold of f.
+
+        Raises:
+            ValueError: As `evaluate`.
+
+        Example:
+            >>> problem = DrivingProblem("rare_envs/CutIn-v0")
+            >>> terms = problem.terms([[20.0, 12.0, 12.0, 9.0, 40.0, 3.5]])
+            >>> terms.names[terms.least[0]], terms.lowest.round(1).tolist(), terms.f.round(1).tolist()  # [m] and [s]
+            ('cutter, 0 to 45 % of the time', [1.0], [1.0])
+        """
+        x = self.space.validate(np.atleast_2d(x))
+        terms = simulate_terms(self.world, self.driver, x, gamma, self.tile)
+        for row in np.flatnonzero(np.isnan(terms.f)):
+            raise self._nan_error(x[row], row)
+        return terms
+
+    @cached_property
+    def gradient(self) -> TermDifferentiator | None:
+        """Gradients of the terms: `gradient(x, term, ticks)`; None where measure or drivers have none."""
+        x = self.base.sample(1, np.random.default_rng(0))
+        return find_differentiator(self.world, self.driver, self.needs.queries_policy, x)
+
+    @property
+    def gradient_cost(self) -> float:
+        """Rollouts that a row of `gradient` takes as long as, at most."""
+        return ROLLOUTS_PER_GRADIENT
+
     def crashes(self, x: NDArray[np.float64]) -> Crash:
         """Simulate again and return the kind of crash that each scenario ends in.
 
@@ -223,12 +267,13 @@ class DrivingProblem:
                     failed_rows.update({first + row: reason for row, reason in mine.items()})
         for row in np.flatnonzero(np.isnan(f)):
             if failed_rows is None:
-                named = {name: value for name, value in self.space.named(x[row]).items() if np.size(value) == 1}
-                raise ValueError(
-                    f"The measure {self.world.measurement.measure!r} gave NaN, first at row {row}: {named}."
-                )
+                raise self._nan_error(x[row], row)
             failed_rows.setdefault(int(row), "the measure gave NaN")
         return f
+
+    def _nan_error(self, x_row: NDArray[np.float64], row: int | np.signedinteger[Any]) -> ValueError:
+        named = {name: value for name, value in self.space.named(x_row).items() if np.size(value) == 1}
+        return ValueError(f"The measure {self.world.measurement.measure!r} gave NaN, first at row {row}: {named}.")
 
 
 @contextmanager

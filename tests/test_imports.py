@@ -47,7 +47,7 @@ FLOORS = {
         distributions control sensors
         sensors.camera scenarios measures
         simulation
-        egos make
+        egos make search_terms
         multi_agent interop problem
         envs
         exposure

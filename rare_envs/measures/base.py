@@ -1,7 +1,7 @@
 """Safety measures: from the moments of an episode to its f, which is small where it is dangerous and always finite."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Protocol, TypeAlias, runtime_checkable
 
 import torch
@@ -96,6 +96,41 @@ def check_one_each(value: Any, like: Tensor) -> Tensor:
     )
 
 
+def _number_terms(vehicle_names: tuple[str, ...]) -> tuple[str, ...]:
+    """Return a name for each other vehicle: its own."""
+    return vehicle_names[1:]
+
+
+@dataclass(frozen=True)
+class MeasureTerms:
+    """Terms of a measure: K numbers of a moment, the most dangerous of which is the measure; one of each vehicle, say.
+
+    Samplers search among the failures of each term by itself, which are simpler than those of all together.
+
+    Example:
+        >>> import rare_envs
+        >>> def distances(moment):
+        ...     return (moment.state.x[:, 1:] - moment.state.x[:, :1]).abs()
+        >>> nearest = Measure(lambda moment: distances(moment).amin(1), terms=MeasureTerms(distances), unit="m")
+        >>> problem = rare_envs.DrivingProblem("rare_envs/CutIn-v0", measure=nearest)
+        >>> terms = problem.terms([[20.0, 20.0, 20.0, 30.0, 40.0, 3.5]])
+        >>> terms.names, terms.values.round(1).tolist(), terms.f.round(1).tolist()  # to the cutter and to the lead
+        (('cutter', 'lead'), [[33.5, 78.5]], [33.5])
+    """
+
+    of: Callable[[Moment], Tensor]
+    """A moment to the terms in the measure's own unit and sign, shape (B, K)."""
+    hit: Callable[[Moment], Tensor] | None = None
+    """The moment of a collision to the number of the term that the collision belongs to, int64, shape (B,); None for
+    the most dangerous one at that moment."""
+    names: Callable[[tuple[str, ...]], tuple[str, ...]] = _number_terms
+    """Names of the N vehicles, the ego's first, to those of the K terms."""
+    cuts: tuple[float, ...] = ()
+    """Shares of the horizon at which each term is cut into one before and one after, which count as different terms."""
+    unattained: float = 1e3
+    """f of a term that has no moment, such as one of the late moments of an episode that ended early."""
+
+
 @dataclass(frozen=True)
 class Measure:
     """A measure that is decided by the most dangerous moment of an episode: f is the least over its moments.
@@ -125,6 +160,10 @@ class Measure:
     """The critical value of a measure whose large values are dangerous; None where small ones are."""
     unit: str = "s"
     """Unit of f."""
+    terms: MeasureTerms | None = field(default=None, repr=False)
+    """Numbers of a moment of which `of` is the most dangerous; None for none but itself."""
+    collisions_only: bool = False
+    """Whether f is positive in episodes without a collision and only in those: then {f <= 0} is the collision."""
 
     @property
     def records(self) -> bool:
@@ -147,6 +186,13 @@ class Measure:
     def f(self, state: Tensor) -> Tensor:
         """Return the state, which is f."""
         return state
+
+    def term_values(self, moment: Moment) -> Tensor:
+        """Return f of each of the K terms of a moment, shape (B, K); their least is f of the moment."""
+        if self.terms is None:
+            return self._f_of_moment(moment)[:, None]
+        values = self.terms.of(moment)
+        return values if self.critical is None else self.critical - values
 
     def _f_of_moment(self, moment: Moment) -> Tensor:
         value = check_one_each(self.of(moment), moment.lead.gap)

@@ -4,10 +4,14 @@ import torch
 from torch import Tensor
 
 from rare_envs.measures.moment import GAP_MIN, STILL, Moment, acceleration_of_lead, gap_of
-from rare_envs.sensors.perception import RANGE_COLUMNS, RATE_COLUMNS
+from rare_envs.sensors.lidar import beam_angles
+from rare_envs.sensors.perception import RANGE_COLUMNS, RATE_COLUMNS, find_vehicles_met
+from rare_envs.traffic.lead import lead_index
 
 TTC_MAX = 10.0
 """Cap of the time to collision [s]; what is further away, or not closing, counts as this."""
+_SQUARE = 1e-6
+"""Cosines of angles of beams are taken as 0 within this, which is rounding."""
 
 
 def ttc(moment: Moment) -> Tensor:
@@ -34,9 +38,21 @@ def ttc(moment: Moment) -> Tensor:
         >>> ttc(Moment.of_two(gap=25.0, speed=20.0, lead_speed=10.0)).item()
         2.5
     """
+    return torch.minimum(_time_to_lead(moment), time_to_edge(moment)).clamp(max=TTC_MAX)
+
+
+def ttc_terms(moment: Moment) -> Tensor:
+    """Return `ttc` by vehicle, where it is the lead, and to the edge of the road [s], shape (B, N)."""
+    lead = lead_index(moment.state, moment.road)
+    others = torch.arange(1, moment.state.x.shape[1], device=lead.device)
+    to_lead = torch.where(lead[:, None] == others, _time_to_lead(moment)[:, None], TTC_MAX)
+    return torch.cat((to_lead, time_to_edge(moment)[:, None]), 1).clamp(max=TTC_MAX)
+
+
+def _time_to_lead(moment: Moment) -> Tensor:
+    """Return gap / closing speed [s], without a cap, shape (B,)."""
     lead = moment.lead
-    to_lead = lead.gap.clamp(min=GAP_MIN) / lead.closing_speed.clamp(min=STILL)
-    return torch.minimum(to_lead, time_to_edge(moment)).clamp(max=TTC_MAX)
+    return lead.gap.clamp(min=GAP_MIN) / lead.closing_speed.clamp(min=STILL)
 
 
 def time_to_edge(moment: Moment) -> Tensor:
@@ -77,11 +93,43 @@ def lidar_ttc(moment: Moment) -> Tensor:
         >>> lidar_ttc(moment._replace(perception=seen)).item()  # the beam starts 2.5 m behind the bumper
         2.75
     """
+    return _beam_times(moment).amin(dim=1).clamp(max=TTC_MAX)
+
+
+def lidar_ttc_terms(moment: Moment) -> Tensor:
+    """Return `lidar_ttc` by vehicle that a beam meets, and by whether that beam looks ahead or behind.
+
+    Beams square to the ego look ahead. A vehicle that no beam meets has `TTC_MAX`.
+
+    Args:
+        moment: Of B scenarios.
+
+    Returns:
+        Time to collision [s], shape (B, 2 (N - 1)): of each vehicle ahead, then behind.
+    """
+    times, vehicles = _beam_times(moment).clamp(max=TTC_MAX), moment.state.x.shape[1] - 1
+    met = (find_vehicles_met(moment.state, moment.road) - 1).clamp(min=0)  # what meets nobody has `TTC_MAX`
+    behind = torch.cos(beam_angles(times)) < -_SQUARE
+    nothing = times.new_full((len(times), 2 * vehicles), TTC_MAX)
+    return nothing.scatter_reduce(1, 2 * met + behind, times, "amin")
+
+
+def name_lidar_terms(vehicle_names: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the names of `lidar_ttc_terms`."""
+    return tuple(f"{vehicle}, {side}" for vehicle in vehicle_names[1:] for side in ("ahead", "behind"))
+
+
+def name_edge_terms(vehicle_names: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the names of terms of the other vehicles and of the edge of the road."""
+    return (*vehicle_names[1:], "edge of the road")
+
+
+def _beam_times(moment: Moment) -> Tensor:
+    """Return the time to collision along each beam of the ego [s], without a cap, shape (B, 20)."""
     assert moment.perception is not None
     ego = moment.perception[:, 0]
     closing = -ego[:, RATE_COLUMNS]
-    time = torch.where(closing > 0.0, ego[:, RANGE_COLUMNS] / closing.clamp(min=STILL), TTC_MAX)
-    return time.amin(dim=1).clamp(max=TTC_MAX)
+    return torch.where(closing > 0.0, ego[:, RANGE_COLUMNS] / closing.clamp(min=STILL), TTC_MAX)
 
 
 def mttc(moment: Moment) -> Tensor:

@@ -6,12 +6,16 @@ from torch import Tensor
 from rare_envs.measures.moment import GAP_MIN, Moment
 from rare_envs.measures.time_to_collision import TTC_MAX, time_to_edge
 from rare_envs.traffic.oriented_boxes import box_distance, time_to_contact
-from rare_envs.traffic.pairs import encounter, least
+from rare_envs.traffic.overlap import ego_overlaps, pairwise_overlaps
+from rare_envs.traffic.pairs import Encounter, encounter, encounters_of_all, least, pairs
 
 CLEARANCE_MAX = 1000.0
 """Cap of distances [m], where there is nobody."""
 DRIFT = 0.2
 """Speed [m/s] with which `margin` expects any gap to close at least."""
+EARLY_SHARE = 0.45
+"""Share of the horizon up to which a small distance is an early one. On the highway (100 ticks, IDM and imitation ego,
+23 + 20 failing walks) collisions come side by side at the start or by drifting after tick 60, from other directions."""
 TIME_MIN = 1e-3
 """Times to contact are floored here [s], so that only a collision comes to 0 or less."""
 
@@ -39,9 +43,7 @@ def ttc_2d(moment: Moment) -> Tensor:
         >>> ttc_2d(Moment.of_two(gap=25.0, speed=20.0, lead_speed=10.0)).item()
         2.5
     """
-    met = encounter(moment.state, moment.road)
-    times = least(time_to_contact(met.axes, met.rate).clamp(min=TIME_MIN), TTC_MAX)
-    return torch.minimum(times, time_to_edge(moment))
+    return torch.minimum(least(_contact_times(moment), TTC_MAX), time_to_edge(moment))
 
 
 def clearance(moment: Moment) -> Tensor:
@@ -60,8 +62,7 @@ def clearance(moment: Moment) -> Tensor:
         >>> clearance(Moment.of_two(gap=25.0, speed=20.0, lead_speed=10.0)).item()
         25.0
     """
-    met = encounter(moment.state, moment.road)
-    return least(box_distance(met.axes, met.turn).clamp(min=GAP_MIN), CLEARANCE_MAX)
+    return least(_distances(encounter(moment.state, moment.road)), CLEARANCE_MAX)
 
 
 def margin(moment: Moment) -> Tensor:
@@ -90,11 +91,75 @@ def margin(moment: Moment) -> Tensor:
         >>> round(margin(Moment.of_two(gap=25.0, speed=20.0, lead_speed=20.0)).item(), 2)  # not closing: 25 / 0.2
         125.0
     """
+    return torch.minimum(least(_margins(moment), torch.inf), time_to_edge(moment))
+
+
+def contact_time_terms(moment: Moment) -> Tensor:
+    """Return the time to contact with each other vehicle and with the edge of the road [s], shape (B, N)."""
+    times = _contact_times(moment).clamp(max=TTC_MAX)
+    return torch.cat((times, time_to_edge(moment)[:, None]), 1)
+
+
+def clearance_terms(moment: Moment) -> Tensor:
+    """Return the distance to each other vehicle [m], at most `CLEARANCE_MAX`, shape (B, N - 1)."""
+    return _distances(encounter(moment.state, moment.road)).clamp(max=CLEARANCE_MAX)
+
+
+def pair_clearance_terms(moment: Moment) -> Tensor:
+    """Return the distance of the vehicles of each pair [m], those with the ego first, shape (B, N (N - 1) / 2)."""
+    return _distances(encounters_of_all(moment.state, moment.road)).clamp(max=CLEARANCE_MAX)
+
+
+def pair_clearance(moment: Moment) -> Tensor:
+    """Return the distance of the two vehicles that are nearest to each other [m], the ego or not, shape (B,)."""
+    return pair_clearance_terms(moment).amin(1)
+
+
+def name_pairs(vehicle_names: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the names of `pair_clearance_terms`."""
+    first, second = pairs(len(vehicle_names))
+    return tuple(f"{vehicle_names[i]} and {vehicle_names[j]}" for i, j in zip(first, second, strict=True))
+
+
+def margin_terms(moment: Moment) -> Tensor:
+    """Return the margin to each other vehicle and to the edge of the road [s], shape (B, N)."""
+    return torch.cat((_margins(moment), time_to_edge(moment)[:, None]), 1)
+
+
+def find_vehicle_or_edge(moment: Moment) -> Tensor:
+    """Return the number of the vehicle, from 0, that is nearest to the ego, and N - 1 where it has left the road, (B,).
+
+    An ego that overlaps a vehicle has hit that vehicle, wherever it is.
+    """
+    apart = ~ego_overlaps(moment.state, moment.road).any(1)
+    off = apart & moment.road.off_road(moment.state.y[:, 0])
+    return torch.where(off, moment.state.x.shape[1] - 1, clearance_terms(moment).argmin(1))
+
+
+def find_nearest_pair(moment: Moment) -> Tensor:
+    """Return the number of the pair of vehicles that overlaps; where none does, of the nearest with the ego, (B,)."""
+    distances, own = pair_clearance_terms(moment), moment.state.x.shape[1] - 1
+    touching = pairwise_overlaps(moment.state, moment.road).flatten(1).any(1)
+    return torch.where(touching, distances.argmin(1), distances[:, :own].argmin(1))
+
+
+def _contact_times(moment: Moment) -> Tensor:
+    """Return the time to contact with each other vehicle [s], without a cap, shape (B, N - 1)."""
+    met = encounter(moment.state, moment.road)
+    return time_to_contact(met.axes, met.rate).clamp(min=TIME_MIN)
+
+
+def _distances(met: Encounter) -> Tensor:
+    """Return the distance of P pairs [m], shape (B, P)."""
+    return box_distance(met.axes, met.turn).clamp(min=GAP_MIN)
+
+
+def _margins(moment: Moment) -> Tensor:
+    """Return the margin to each other vehicle [s], shape (B, N - 1)."""
     met = encounter(moment.state, moment.road)
     gap, closing = met.axes.gap, -met.rate * torch.sign(met.axes.offset)
     root = (closing.square() + 4.0 * DRIFT**2).sqrt()
     # the same fraction twice: each form loses its digits where the other keeps them
     slow = (root - closing) / (2.0 * DRIFT**2)
     inverse = torch.where(closing > 0, 2.0 / (root + closing.clamp(min=0.0)), slow)
-    times = (gap.clamp(min=0.0) * inverse).amax(-1).clamp(min=TIME_MIN)
-    return torch.minimum(least(times, torch.inf), time_to_edge(moment))
+    return (gap.clamp(min=0.0) * inverse).amax(-1).clamp(min=TIME_MIN)

@@ -107,6 +107,12 @@ def sense(bodies: Bodies, observers: int | None = None) -> Readings:
     return Readings(torch.where(met, distance.clamp(0.0, MAX_RANGE), MAX_RANGE), rate)
 
 
+@torch.no_grad()
+def find_met(bodies: Bodies, observers: int) -> Tensor:
+    """Return the index of the body that each beam of the first M vehicles meets first, -1 for none, (B, M, 20)."""
+    return _first_met(Bodies(*(field.expand_as(bodies.x) for field in bodies)), observers)[0]
+
+
 def _crossing(
     dx: Tensor, dy: Tensor, heading: Tensor, turn: Tensor, length: Tensor, width: Tensor
 ) -> tuple[Tensor, Tensor]:

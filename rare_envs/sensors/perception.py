@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from rare_envs.sensors.lidar import AHEAD_BEAM, BEAM_SPACING, BEAMS, Bodies, sense
+from rare_envs.sensors.lidar import AHEAD_BEAM, BEAM_SPACING, BEAMS, Bodies, find_met, sense
 from rare_envs.traffic.road import Road, WorldPose
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
 
@@ -104,6 +104,24 @@ def perceive_traffic(state: State, road: Road, pose: WorldPose | None = None) ->
         (27.5, -10.0)
     """
     x, y, heading, curvature = pose or road.place(state.x, state.y, state.heading)
-    bodies = Bodies(x, y, heading, state.speed, x.new_tensor(VEHICLE_LENGTH), x.new_tensor(VEHICLE_WIDTH))
+    bodies = _bodies(state, x, y, heading)
     left, right = road.markers(state.y)
     return perceive(bodies, OnRoad(0.5 * (left - right), state.heading, curvature, left, right))
+
+
+def find_vehicles_met(state: State, road: Road) -> Tensor:
+    """Return the index of the vehicle that each of the ego's beams meets first, -1 for none, int64, shape (B, 20).
+
+    Example:
+        >>> from rare_envs.traffic import straight
+        >>> x = torch.tensor([[0.0, 30.0]])
+        >>> state = State(x, 0 * x, 0 * x, torch.tensor([[20.0, 10.0]]), theta=x[:, :0])
+        >>> find_vehicles_met(state, straight(1))[0, AHEAD_BEAM - 1 : AHEAD_BEAM + 2].tolist()
+        [-1, 1, -1]
+    """
+    return find_met(_bodies(state, *road.to_world(state.x, state.y, state.heading)), 1)[:, 0]
+
+
+def _bodies(state: State, x: Tensor, y: Tensor, heading: Tensor) -> Bodies:
+    """Return the vehicles' bodies at their places in the flat world, (B, N) each."""
+    return Bodies(x, y, heading, state.speed, x.new_tensor(VEHICLE_LENGTH), x.new_tensor(VEHICLE_WIDTH))

@@ -44,10 +44,21 @@ def encounter(state: State, road: Road) -> Encounter:
 
     They are compared in the world: where the road turns, ways along it are not distances.
     """
+    return _compare(state, road, slice(0, 1), slice(1, None))
+
+
+def encounters_of_all(state: State, road: Road) -> Encounter:
+    """Return every pair of vehicles, P = N (N - 1) / 2, in the order of `pairs`."""
+    first, second = map(list, pairs(state.x.shape[1]))
+    return _compare(state, road, first, second)
+
+
+def _compare(state: State, road: Road, first: list[int] | slice, second: list[int] | slice) -> Encounter:
+    """Return vehicles with others, by their indices; one may be compared with several."""
     x, y, heading = road.to_world(state.x, state.y, state.heading)
     along, across = velocities(state, heading)
-    ego, other = heading[:, :1].expand_as(heading[:, 1:]), heading[:, 1:]
-    axes = axes_of(x[:, 1:] - x[:, :1], y[:, 1:] - y[:, :1], ego, other)
-    return Encounter(
-        axes, project_on_axes(along[:, 1:] - along[:, :1], across[:, 1:] - across[:, :1], ego, other), other - ego
-    )
+    other = heading[:, second]
+    one = heading[:, first].expand_as(other)
+    axes = axes_of(x[:, second] - x[:, first], y[:, second] - y[:, first], one, other)
+    rate = project_on_axes(along[:, second] - along[:, first], across[:, second] - across[:, first], one, other)
+    return Encounter(axes, rate, other - one)
