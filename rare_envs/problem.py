@@ -18,16 +18,11 @@ from rare_envs.egos.needs import resolve
 from rare_envs.egos.policy import PolicyDriver, as_driver
 from rare_envs.make import set_up
 from rare_envs.scenarios.registry import find_scenario
-from rare_envs.search_terms import (
-    ROLLOUTS_PER_GRADIENT,
-    EpisodeTerms,
-    TermDifferentiator,
-    find_differentiator,
-    simulate_terms,
-)
+from rare_envs.search_terms import EpisodeTerms, simulate_terms
 from rare_envs.simulation.measurement import Measurement
 from rare_envs.simulation.rollout import StochasticDriver, rollout
 from rare_envs.simulation.world import World
+from rare_envs.term_gradients import ROLLOUTS_PER_GRADIENT, TermDifferentiator, find_differentiator
 from rare_envs.traffic.crash import CRASH_KINDS, Crash
 
 RULE_TILE = 16384

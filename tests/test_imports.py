@@ -47,7 +47,7 @@ FLOORS = {
         distributions control sensors
         sensors.camera scenarios measures
         simulation
-        egos make search_terms
+        egos make search_terms term_gradients
         multi_agent interop problem
         envs
         exposure

@@ -1,6 +1,6 @@
 """Safety measures: how close an episode came to a collision; small is dangerous, always finite."""
 
-from rare_envs.measures.base import COLLISION, EpisodeMeasure, Measure
+from rare_envs.measures.base import COLLISION, EpisodeMeasure, Measure, MeasureTerms
 from rare_envs.measures.braking import (
     DECELERATION_MAX,
     MAX_BRAKING,
@@ -37,6 +37,7 @@ __all__ = [
     "EpisodeMeasure",
     "Exposure",
     "Measure",
+    "MeasureTerms",
     "Moment",
     "Trace",
     "TraceMeasure",

@@ -72,16 +72,27 @@ def drive(world: World, driver: Driver, x: Tensor) -> Iterator[Episode]:
         >>> len(list(drive(World(CAR_FOLLOWING), IDM(), x)))  # time 0 and 100 ticks
         101
     """
+    episode, driver = begin_drive(world, driver, x)
+    memory = None
+    yield episode
+    for _ in range(world.clock.ticks):
+        episode, memory = drive_tick(world, driver, episode, memory)
+        yield episode
+
+
+def begin_drive(world: World, driver: Driver, x: Tensor) -> tuple[Episode, Driver]:
+    """Return the episodes at time 0, and the driver with its noise; arguments as of `drive`."""
     if isinstance(driver, StochasticDriver) and driver.noise_columns:
         own = driver.noise_columns
         x, driver = x[:, :-own], driver.with_draws(x[:, -own:])
-    episode, memory = world.start(x), None
-    yield episode
-    for _ in range(world.clock.ticks):
-        action, memory = driver.act(episode, memory)
-        episode, action = world.decode_meta_actions(episode, action)
-        episode = world.step(episode, action)
-        yield episode
+    return world.start(x), driver
+
+
+def drive_tick(world: World, driver: Driver, episode: Episode, memory: Any) -> tuple[Episode, Any]:
+    """Return the episodes one tick later, and the driver's memory."""
+    action, memory = driver.act(episode, memory)
+    episode, action = world.decode_meta_actions(episode, action)
+    return world.step(episode, action), memory
 
 
 def rollout(world: World, driver: Driver, x: Tensor) -> Episode:
