@@ -85,7 +85,7 @@ def test_central_differences_in_double_precision() -> None:
 
 @pytest.mark.parametrize("measure", ["clearance", "lidar_ttc"])
 def test_central_differences_among_learned_drivers(measure: str) -> None:
-    """Along the gradient, in single precision: at this scale f is rough in half of the rows, where beams or ticks change."""
+    """Along the gradient, in single precision: f is rough at this scale in half of the rows, by beams and ticks."""
     problem = rare_envs.DrivingProblem(HIGHWAY, measure=measure, noise="fixed")
     x = problem.base.sample(24, np.random.default_rng(4))
     terms = problem.terms(x)
