@@ -189,9 +189,9 @@ class DrivingProblem:
 
         Example:
             >>> problem = DrivingProblem("rare_envs/CutIn-v0")
-            >>> terms = problem.terms([[20.0, 12.0, 12.0, 9.0, 40.0, 3.5]])
+            >>> terms = problem.terms([[20.0, 12.0, 12.0, 20.0, 40.0, 3.5]])
             >>> terms.names[terms.least[0]], terms.lowest.round(1).tolist(), terms.f.round(1).tolist()  # [m] and [s]
-            ('cutter, 0 to 45 % of the time', [1.0], [1.0])
+            ('cutter, 0 to 45 % of the time', [6.6], [1.7])
         """
         x = self.space.validate(np.atleast_2d(x))
         terms = simulate_terms(self.world, self.driver, x, gamma, self.tile)

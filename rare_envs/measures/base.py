@@ -115,7 +115,7 @@ class MeasureTerms:
         >>> problem = rare_envs.DrivingProblem("rare_envs/CutIn-v0", measure=nearest)
         >>> terms = problem.terms([[20.0, 20.0, 20.0, 30.0, 40.0, 3.5]])
         >>> terms.names, terms.values.round(1).tolist(), terms.f.round(1).tolist()  # to the cutter and to the lead
-        (('cutter', 'lead'), [[33.5, 78.5]], [33.5])
+        (('cutter', 'lead'), [[34.0, 79.8]], [34.0])
     """
 
     of: Callable[[Moment], Tensor]
