@@ -145,44 +145,63 @@ def repeat(world: World, seed: int) -> Repetition:
     rng = np.random.default_rng([seed, world.events, world.clusters])
     base = fit_base(world.draw(rng), world, rng)
     result = samplers.estimate(Exceedance(base, world.limit), seed=seed, max_sim=MAX_SIM)
+    return compare_with_truth(result, world.p, np.array([exact_p(refit, world.limit) for refit in base.refits]))
+
+
+def compare_with_truth(result: samplers.Estimate, p: float, p_refits: FloatArray | None = None) -> Repetition:
+    """Return what the intervals of an estimate hold.
+
+    Args:
+        result: The estimate under a fitted base.
+        p: The true probability.
+        p_refits: The exact ones under the refits, shape (refits,), where they are known.
+    """
     found = result.base_uncertainty
     assert found is not None
     low, high = found.interval or (0.0, found.bound or math.nan)
     known = not found.reason
     percentiles = np.quantile(found.p_refits, (0.025, 0.975)) if known else (math.nan, math.nan)
-    exact = np.array([exact_p(refit, world.limit) for refit in base.refits])
     return Repetition(
-        covered=low <= world.p <= high,
-        below=high < world.p,
+        covered=low <= p <= high,
+        below=high < p,
         undetermined=found.interval is None,
-        sampling_covered=result.interval[0] <= world.p <= result.interval[1],
-        percentiles_covered=bool(percentiles[0] <= world.p <= percentiles[1]),
+        sampling_covered=result.interval[0] <= p <= result.interval[1],
+        percentiles_covered=bool(percentiles[0] <= p <= percentiles[1]),
         log_width=math.log(high / low) if found.interval else math.nan,
         spread=found.spread,
         further_run=result.ensemble_run is not None,
-        log_errors=tuple(np.log(found.p_refits) - np.log(exact)) if known else (),
+        log_errors=tuple(np.log(found.p_refits) - np.log(p_refits)) if known and p_refits is not None else (),
     )
 
 
 def summarise(world: World, repetitions: Sequence[Repetition]) -> dict[str, Any]:
     """Return shares and medians over the repetitions of one world, ready for JSON."""
+    errors = np.concatenate([each.log_errors for each in repetitions])
+    return {
+        **{key: value if value != math.inf else None for key, value in asdict(world).items()},
+        **summarise_repetitions(repetitions),
+        "rms_log_error": float(np.sqrt((errors**2).mean())),
+    }
+
+
+def summarise_repetitions(repetitions: Sequence[Repetition]) -> dict[str, Any]:
+    """Return shares and medians over repetitions; a median is None where no repetition has a value."""
 
     def share(name: str) -> float:
         return float(np.mean([getattr(each, name) for each in repetitions]))
 
-    errors = np.concatenate([each.log_errors for each in repetitions])
+    widths = [each.log_width for each in repetitions if math.isfinite(each.log_width)]
+    spreads = [each.spread for each in repetitions if math.isfinite(each.spread)]
     return {
-        **{key: value if value != math.inf else None for key, value in asdict(world).items()},
         "repetitions": len(repetitions),
         "covered": share("covered"),
         "below": share("below"),
         "undetermined": share("undetermined"),
         "sampling_covered": share("sampling_covered"),
         "percentiles_covered": share("percentiles_covered"),
-        "median_width": math.exp(np.nanmedian([each.log_width for each in repetitions])),
-        "median_spread": float(np.nanmedian([each.spread for each in repetitions])),
+        "median_width": math.exp(np.median(widths)) if widths else None,
+        "median_spread": float(np.median(spreads)) if spreads else None,
         "further_runs": share("further_run"),
-        "rms_log_error": float(np.sqrt((errors**2).mean())),
     }
 
 

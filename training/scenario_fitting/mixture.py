@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from sklearn.mixture import GaussianMixture
 
 from samplers.problem import FloatArray
+from training.scenario_fitting.expectation_maximisation import EmFit, fit_mixture
 
 MAX_COMPONENTS = 5
 """Most components that are tried."""
@@ -97,36 +97,25 @@ def select_mixture(
         raise ValueError(f"Parameter {int(np.argmin(scale))} is the same in all {n} events.")
     standard = (points - centre) / scale
     most = int(np.clip(n // (EVENTS_PER_COMPONENT * d), 1, most))
-    models = [_run_em(standard, k, seed, EM_STARTS if starts is None else starts) for k in range(1, most + 1)]
+    starts = EM_STARTS if starts is None else starts
+    models = [fit_mixture(standard, k, COVARIANCE_FLOOR, seed, starts) for k in range(1, most + 1)]
     # A density in units of the points is smaller by the product of the scales.
     units = 2.0 * n * float(np.log(scale).sum())
-    candidates = tuple(_assess(model, standard, units) for model in models)
+    candidates = tuple(_assess(model, n, units) for model in models)
     accepted = [i for i, candidate in enumerate(candidates) if candidate.accepted]
     best = models[min(accepted, key=lambda i: candidates[i].bic)]
-    covariances = best.covariances_ * np.outer(scale, scale)
-    return MixtureFit(_round_components(best.weights_, centre + best.means_ * scale, covariances), candidates)
+    covariances = best.covariances * np.outer(scale, scale)
+    return MixtureFit(_round_components(best.weights, centre + best.means * scale, covariances), candidates)
 
 
-def _run_em(standard: FloatArray, components: int, seed: int, starts: int) -> Any:
-    """Return the best model of several runs of expectation maximisation."""
-    model = GaussianMixture(
-        components,
-        covariance_type="full",
-        tol=1e-6,
-        reg_covar=COVARIANCE_FLOOR,
-        max_iter=5000,
-        n_init=starts,
-        random_state=seed,
-    )
-    return model.fit(standard)
-
-
-def _assess(model: Any, standard: FloatArray, units: float) -> MixtureCandidate:
-    """Return BIC and smallest component of a model."""
-    n, d = standard.shape
-    smallest = float(model.weights_.min() * n)
-    accepted = model.n_components == 1 or smallest >= SMALLEST_COMPONENT * d
-    return MixtureCandidate(model.n_components, float(model.bic(standard)) + units, smallest, accepted)
+def _assess(model: EmFit, n: int, units: float) -> MixtureCandidate:
+    """Return BIC and smallest component of a model of n points."""
+    k, d = model.means.shape
+    smallest = float(model.weights.min() * n)
+    accepted = k == 1 or smallest >= SMALLEST_COMPONENT * d
+    free = k - 1 + k * d + k * d * (d + 1) // 2
+    bic = -2.0 * model.log_likelihood + free * float(np.log(n))
+    return MixtureCandidate(k, bic + units, smallest, accepted)
 
 
 def _round_components(weights: FloatArray, means: FloatArray, covariances: FloatArray) -> Components:
