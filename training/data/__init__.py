@@ -1,5 +1,6 @@
 """Recorded traffic: trajectory tables, smoothing, scenes and events."""
 
+from training.data.brakings import hard_brake_events
 from training.data.events import car_following_events, cut_in_events
 from training.data.formats.coifman_li import load_coifman_li
 from training.data.formats.highd import highd_recordings, load_highd
@@ -18,6 +19,7 @@ __all__ = [
     "car_following_events",
     "cut_in_events",
     "find_tgsim_files",
+    "hard_brake_events",
     "highd_recordings",
     "load_coifman_li",
     "load_highd",

@@ -82,6 +82,7 @@ EVENT_RECIPES = {
         required=("start_seen",),
         phase="start",
     ),
+    "hard_brake": EventRecipe("hard_brake_events.csv", ("speed", "gap", "deceleration")),
 }
 """Recipes by scenario."""
 FILTER_REASONS = {
@@ -91,6 +92,7 @@ FILTER_REASONS = {
     "m/s": "outside the physical range of speeds",
     "m": "outside the physical range: gaps below it are side by side or errors of position and "
     "length, gaps above it no longer concern the ego",
+    "m/s^2": "outside the physical range of decelerations",
     "lateral_offset": "bodies that overlap across (errors of lane position, or an ego far from its "
     "lane's centre), or more than one lane apart",
 }

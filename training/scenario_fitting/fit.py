@@ -4,7 +4,8 @@
     python -m training.scenario_fitting.fit --highd DIR --out bases
 
 The first line makes the files of the package from events of US 101, I-80 and I-24. The second first extracts the events
-of your own recordings: of highD, or with --ngsim, --tgsim, --i24 or --coifman of other formats (docs/data.md).
+of your own recordings, for car-following, cut-in and hard brake: of highD, or with --ngsim, --tgsim, --i24 or --coifman
+of other formats (docs/data.md).
 
 Events are filtered and fitted with Gaussian mixtures with full covariances. The events choose the number of components
 (by the Bayesian information criterion) and the coordinates (by that and by the likelihood of events held out). The fit
@@ -26,7 +27,8 @@ import typer
 from rare_envs.files import replace_text
 from rare_envs.scenarios.registry import scenario_named
 from training.command_line import LocationOption, RecordingOptions, report_errors, run_command, spread_options
-from training.data.events import EXTRACTORS, Events, concatenate_events, write_events
+from training.data.event_tables import EXTRACTORS, concatenate_events, write_events
+from training.data.events import Events
 from training.data.formats.recordings import load_recordings
 from training.data.formats.text_columns import Gaps
 from training.data.trajectories import Trajectories
@@ -64,7 +66,7 @@ def fit_shipped_base(base: ShippedBase, data: Path, seed: int = 0, n_refits: int
 
 def fit_own_bases(
     tables: Iterable[Trajectories],
-    scenarios: Sequence[str],
+    scenarios: Sequence[str] | None,
     out: Path,
     name: str,
     seed: int = 0,
@@ -76,16 +78,17 @@ def fit_own_bases(
 
     Args:
         tables: The recordings.
-        scenarios: Names of the scenarios to fit.
+        scenarios: Names of the scenarios to fit; None for all that have enough events.
         out: Folder of the files.
         name: Name of the bases.
         seed: Seed of the fits.
         n_refits: Number of refits, see `refit`.
 
     Raises:
-        ValueError: A recording is broken, or the events of a scenario are too few; the file of events is written
-            nevertheless.
+        ValueError: A recording is broken, or the events of a scenario are too few, of each if none is named; the files
+            of events are written nevertheless.
     """
+    chosen = tuple(EVENT_RECIPES) if scenarios is None else tuple(scenarios)
     out.mkdir(parents=True, exist_ok=True)
     names: set[str] = set()
     traffic = ObservedTraffic()
@@ -93,17 +96,18 @@ def fit_own_bases(
     for table in tables:
         names |= {str(recording) for recording in np.unique(table.recording)}
         traffic = traffic.plus(table)
-        parts.append({scenario: EXTRACTORS[scenario](table) for scenario in scenarios})
+        parts.append({scenario: EXTRACTORS[scenario](table) for scenario in chosen})
     source = {
         "site": name,
         "data": f"recordings {', '.join(sorted(names))}",
         "licence": "that of the recordings; parameters derived from them may fall under it",
     }
-    pooled = {scenario: concatenate_events([events[scenario] for events in parts]) for scenario in scenarios}
-    files = {scenario: out / f"{scenario}_events.csv" for scenario in scenarios}
+    pooled = {scenario: concatenate_events([events[scenario] for events in parts]) for scenario in chosen}
+    files = {scenario: out / f"{scenario}_events.csv" for scenario in chosen}
     for scenario, path in files.items():
         write_events(pooled[scenario], path)
         typer.echo(path)
+    too_few = []
     for scenario, path in files.items():
         recipe = EVENT_RECIPES[scenario]
         events = filter_events(read_events(path, recipe), recipe, scenario_named(scenario).parameters)
@@ -112,7 +116,11 @@ def fit_own_bases(
         try:
             base = fit_base(request)
         except ValueError as error:
-            raise ValueError(f"{path}: {error}") from None
+            too_few.append(f"{path}: {error}")
+            if scenarios is not None or len(too_few) == len(chosen):
+                raise ValueError(too_few[0]) from None
+            typer.echo(f"{too_few[-1]} No base of {scenario} is written.", err=True)
+            continue
         _write(out / f"{scenario}_{name}.json", format_base(scenario, base.to_dict()))
         if not base.refits:
             typer.echo(f"{base.fitted_to}: too few to say how far they determine {scenario}; no refits", err=True)
@@ -136,7 +144,9 @@ def main(
     out: Annotated[Path, typer.Option(help="Folder for the JSON files.")],
     recordings: EventOptions,
     cut_gaps: Annotated[bool, typer.Option("--cut-gaps", help="Cut tracks where frames are missing.")] = False,
-    scenario: Annotated[list[str] | None, typer.Option(help="Which to fit; all if none is named.")] = None,
+    scenario: Annotated[
+        list[str] | None, typer.Option(help="Which to fit; all that have enough events if none is named.")
+    ] = None,
     name: Annotated[str, typer.Option(help="Name of the bases of your own recordings.")] = "own",
     refits: Annotated[int | None, typer.Option(help="Refits: 30, or 100 where their components differ.", min=2)] = None,
     seed: Annotated[int, typer.Option(help="Seed of the fits.", min=0)] = 0,
@@ -145,15 +155,14 @@ def main(
     with report_errors("fit"):
         kind, path = recordings.kind_and_path()
         known = tuple(EVENT_RECIPES) if kind != "data" else tuple(dict.fromkeys(b.scenario for b in SHIPPED_BASES))
-        chosen = tuple(scenario or known)
-        if unknown := sorted(set(chosen) - set(known)):
+        if unknown := sorted(set(scenario or ()) - set(known)):
             raise ValueError(f"Unknown scenario {unknown[0]}; known are {', '.join(known)}.")
         gaps: Gaps = "cut" if cut_gaps else "error"
         if kind == "data":
-            _write_package_bases(path, chosen, out, seed, refits)
+            _write_package_bases(path, scenario or known, out, seed, refits)
         else:
             tables = load_recordings(kind, path, location=recordings.location, between=recordings.between, gaps=gaps)
-            fit_own_bases(tables, chosen, out, name, seed, refits)
+            fit_own_bases(tables, scenario, out, name, seed, refits)
 
 
 def _write_package_bases(data: Path, scenarios: Sequence[str], out: Path, seed: int, n_refits: int | None) -> None:

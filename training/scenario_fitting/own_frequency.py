@@ -5,9 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from rare_envs.distributions.frequency import EventFrequency
+from training.data.brakings import braking_exposure
 from training.data.events import Events
 from training.data.trajectories import DT, Trajectories
-from training.scenario_fitting.shipped.frequencies import CUT_INS_US101
+from training.scenario_fitting.shipped.frequencies import CUT_INS_US101, braking_frequency
+
+OWN_SOURCE = "counted in the recordings themselves"
 
 
 @dataclass(frozen=True)
@@ -25,11 +28,21 @@ class ObservedTraffic:
     """Vehicle-hours."""
     km: float = 0.0
     """Vehicle-kilometres."""
+    braking_hours: float = 0.0
+    """Vehicle-hours in which a braking could begin and be seen."""
+    braking_km: float = 0.0
+    """Vehicle-kilometres in that time."""
 
     def plus(self, table: Trajectories) -> ObservedTraffic:
         """Return the traffic with one more recording."""
         seconds, metres = len(table) * DT, float(table.speed.sum()) * DT
-        return ObservedTraffic(self.hours + seconds / 3600.0, self.km + metres / 1000.0)
+        braking_seconds, braking_metres = braking_exposure(table)
+        return ObservedTraffic(
+            self.hours + seconds / 3600.0,
+            self.km + metres / 1000.0,
+            self.braking_hours + braking_seconds / 3600.0,
+            self.braking_km + braking_metres / 1000.0,
+        )
 
 
 def count_events(scenario: str, events: Events, used: int, traffic: ObservedTraffic) -> EventFrequency | None:
@@ -37,14 +50,16 @@ def count_events(scenario: str, events: Events, used: int, traffic: ObservedTraf
 
     Cut-ins: lane changes with a vehicle behind in the new lane, times the share of these that the filters keep.
     Car-following: pairs that begin while the ego is in the picture already. The base is fitted to all pairs, those at
-    the entry into the picture included, and the definition says so.
+    the entry into the picture included, and the definition says so. Brakings to a standstill: those that are fitted.
 
     Args:
-        scenario: "car_following" or "cut_in".
+        scenario: "car_following", "cut_in" or "hard_brake".
         events: Columns of all its events, before the filters.
         used: Events that the filters keep.
         traffic: Of the recordings.
     """
+    if scenario == "hard_brake":
+        return braking_frequency(used, traffic.braking_hours, traffic.braking_km, OWN_SOURCE) if used else None
     if scenario == "car_following":
         count = int((~events["at_entry"]).sum())
         words = f"a vehicle gets a new leader within the picture ({count} of the {len(events['ego'])} pairs fitted)"
@@ -61,5 +76,5 @@ def count_events(scenario: str, events: Events, used: int, traffic: ObservedTraf
         share=share,
         share_events=of,
         definition=words,
-        source="counted in the recordings themselves",
+        source=OWN_SOURCE,
     )

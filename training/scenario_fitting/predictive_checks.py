@@ -23,20 +23,15 @@ from samplers.problem import FloatArray
 
 CHECK_DRAWS = 200_000
 """Draws from which an expected count is computed; one in 2,000 events then has an error of 10 %."""
-FOLLOWING_COLUMNS: dict[str, tuple[tuple[str, str, str], ...]] = {
-    "car_following": (("ego_speed", "lead_speed", "gap"),),
-    "cut_in": (("ego_speed", "cut_in_speed", "cut_in_gap"), ("cut_in_speed", "lead_speed", "lead_gap")),
-}
-"""Speed behind, speed ahead and gap of each pair of vehicles, by scenario; none in hard brake: both are as fast."""
 
 
 @dataclass(frozen=True)
 class DangerousState:
-    """A condition on one vehicle behind another."""
+    """A condition on three parameters of a scenario."""
 
     name: str
     occurs: Callable[[FloatArray, FloatArray, FloatArray], NDArray[np.bool_]]
-    """Of speed behind, speed ahead [m/s] and gap [m], shape (n,) each."""
+    """Of the three columns that `CHECKED_COLUMNS` names, shape (n,) each."""
 
 
 DANGEROUS_STATES = (
@@ -44,7 +39,22 @@ DANGEROUS_STATES = (
     DangerousState("needed deceleration > 1 m/s^2", lambda v, ahead, gap: np.maximum(v - ahead, 0.0) ** 2 > 2.0 * gap),
     DangerousState("gap < 3 m", lambda v, ahead, gap: gap < 3.0),
 )
-"""The needed deceleration brings a vehicle to the speed ahead within the gap: (closing speed)^2 / (2 gap)."""
+"""Of speed behind, speed ahead [m/s] and gap [m].
+
+The needed deceleration brings a vehicle to the speed ahead within the gap: (closing speed)^2 / (2 gap).
+"""
+BRAKING_STATES = (
+    DangerousState("time headway < 0.5 s", lambda v, deceleration, gap: gap < 0.5 * v),
+    DangerousState("deceleration > 3 m/s^2", lambda v, deceleration, gap: deceleration > 3.0),
+    DangerousState("gap < 3 m", lambda v, deceleration, gap: gap < 3.0),
+)
+"""Of the speed of both [m/s], the deceleration ahead [m/s^2] and the gap [m]."""
+CHECKED_COLUMNS: dict[str, tuple[tuple[str, str, str], ...]] = {
+    "car_following": (("ego_speed", "lead_speed", "gap"),),
+    "cut_in": (("ego_speed", "cut_in_speed", "cut_in_gap"), ("cut_in_speed", "lead_speed", "lead_gap")),
+    "hard_brake": (("speed", "deceleration", "gap"),),
+}
+"""Parameters of each pair of vehicles, by scenario."""
 
 
 def check_predictions(
@@ -60,15 +70,16 @@ def check_predictions(
         seed: Seed of the draws.
 
     Returns:
-        One check for each state and pair of vehicles; none for a scenario without pairs of different speeds.
+        One check for each state and pair of vehicles; none for a scenario that is not in `CHECKED_COLUMNS`.
     """
-    pairs = FOLLOWING_COLUMNS.get(scenario, ())
-    drawn = np.asarray(distribution.sample(CHECK_DRAWS, np.random.default_rng(seed))) if pairs else np.empty((0, 0))
+    groups = CHECKED_COLUMNS.get(scenario, ())
+    states = BRAKING_STATES if scenario == "hard_brake" else DANGEROUS_STATES
+    drawn = np.asarray(distribution.sample(CHECK_DRAWS, np.random.default_rng(seed))) if groups else np.empty((0, 0))
     checks = []
-    for pair in pairs:
-        columns = [list(names).index(name) for name in pair]
-        words = "" if len(pairs) == 1 else f", {pair[2]}"
-        for state in DANGEROUS_STATES:
+    for group in groups:
+        columns = [list(names).index(name) for name in group]
+        words = "" if len(groups) == 1 else f", {group[2]}"
+        for state in states:
             recorded = int(state.occurs(*events[:, columns].T).sum())
             share = float(state.occurs(*drawn[:, columns].T).mean())
             checks.append(PredictiveCheck(f"{state.name}{words}", recorded, float(f"{share * len(events):.3g}")))

@@ -7,14 +7,13 @@ import pytest
 
 from tests.training.data.recordings import cutting_in, table_of
 from tests.training.shared_data import DATA, needs_data
+from training.data.event_tables import concatenate_events, write_events
 from training.data.events import (
     CAR_FOLLOWING_COLUMNS,
     CUT_IN_COLUMNS,
     MIN_PAIR_FRAMES,
     car_following_events,
-    concatenate_events,
     cut_in_events,
-    write_events,
 )
 from training.data.ngsim_tables import SCENES_FILE, load_us101_trajectories
 

@@ -20,7 +20,9 @@ from tests.training.data.formats.published_files import (
     write_tgsim,
 )
 from tests.training.data.recordings import simulate, write_highd, write_ngsim
+from tests.training.data.stopping_traffic import PAUSE, stopping_traffic
 from tests.training.shared_data import DATA, needs_data
+from training.data.brakings import braking_exposure
 from training.data.events import (
     cut_in_events,
 )
@@ -29,9 +31,11 @@ from training.data.windows import scenes_of
 from training.scenario_fitting import fit as fit_scenarios
 from training.scenario_fitting import mixture as mixture_fit
 from training.scenario_fitting.coordinate_systems import BIC_TIE
-from training.scenario_fitting.event_filters import EVENT_RECIPES
-from training.scenario_fitting.fit import fit_shipped_base
+from training.scenario_fitting.fit import fit_own_bases, fit_shipped_base
 from training.scenario_fitting.shipped.bases import SHIPPED_BASES
+
+MOVING = ("car_following", "cut_in")
+"""Scenarios of which `simulate` makes events: nobody stops in it."""
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +62,9 @@ def test_bases_are_fitted_to_a_highd_folder(simulated, quick, tmp_path):
     write_highd(tmp_path / "highD", simulated, simulate(1, lanes=2, per_lane=6, seconds=12.0))
     result = run_cli("--highd", tmp_path / "highD", "--out", tmp_path / "bases", "--name", "cologne")
     assert result.exit_code == 0, result.output
-    for scenario in EVENT_RECIPES:
+    assert "hard_brake_events.csv: 0 events are too few" in result.stderr  # nobody stops
+    assert not (tmp_path / "bases" / "hard_brake_cologne.json").exists()
+    for scenario in MOVING:
         path = tmp_path / "bases" / f"{scenario}_cologne.json"
         points = load_base(scenario_named(scenario), path).sample(100, np.random.default_rng(0))
         assert np.isfinite(points).all()
@@ -89,7 +95,7 @@ def test_bases_are_fitted_to_a_raw_ngsim_file(simulated, quick, tmp_path):
     assert states == len(table) - len(table.track_starts())  # the last position of a track has no speed
 
 
-def check_bases(folder, scenarios=tuple(EVENT_RECIPES)):
+def check_bases(folder, scenarios=MOVING):
     """Bases of simulated traffic, whose speeds are between 9 and 27 m/s."""
     for scenario in scenarios:
         base = load_base(scenario_named(scenario), folder / f"{scenario}_own.json")
@@ -125,6 +131,31 @@ def test_a_car_following_base_is_fitted_to_the_data_of_coifman_and_li(simulated,
     check_bases(tmp_path, ("car_following",))
     result = run_cli("--coifman", path, "--out", tmp_path, "--scenario", "cut_in")  # no lateral offset
     assert result.exit_code == 2 and len(result.stderr.splitlines()) == 1
+
+
+def test_a_hard_brake_base_is_fitted_to_brakings_to_a_standstill(quick, tmp_path):
+    """The recipe of the shipped base: filters, refits of half-minutes, checks and frequency in one file."""
+    rng = np.random.default_rng(4)
+    n = 40
+    speeds, decelerations = rng.uniform(8.0, 16.0, n), np.exp(rng.normal(np.log(2.0), 0.25, n))
+    table = stopping_traffic(speeds, np.exp(rng.normal(np.log(12.0), 0.4, n)), decelerations)
+    fit_own_bases([table], ["hard_brake"], tmp_path, "stops", n_refits=3)
+    base = load_base(scenario_named("hard_brake"), tmp_path / "hard_brake_stops.json")
+    assert base.events.used == (n,) and base.events.cluster == "half-minute"
+    assert base.events.clusters == len(np.unique((400 * np.arange(n) + PAUSE - 8) // 300))
+    assert len(base.refits) == 3
+    points = base.sample(2000, np.random.default_rng(0))
+    for column, recorded in ((0, speeds), (2, decelerations)):
+        assert points[:, column].mean() == pytest.approx(recorded.mean(), rel=0.12)
+    assert base.frequency.count == n
+    seconds, metres = braking_exposure(table)
+    assert base.frequency.per_hour == pytest.approx(3600 * n / seconds, rel=1e-3)
+    assert base.frequency.per_km == pytest.approx(1000 * n / metres, rel=1e-3)
+    assert [check.name for check in base.checks] == ["time headway < 0.5 s", "deceleration > 3 m/s^2", "gap < 3 m"]
+    selection = base.record["selection"]
+    assert [each["coordinates"] for each in selection] == ["plain", "log gap", "log gap, log deceleration"]
+    dropped = {rule["rule"]: rule["dropped"] for rule in base.record["filters"] if rule.get("dropped")}
+    assert dropped == {"gap is given": n}  # the leaders
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from tests.training.data.stopping_traffic import stopping_traffic
+from training.data.brakings import braking_exposure
 from training.data.events import car_following_events, cut_in_events
 from training.data.synthetic import synthetic_traffic
 from training.scenario_fitting.own_frequency import ObservedTraffic, count_events
@@ -32,3 +34,15 @@ def test_cut_ins_count_with_the_share_that_is_used():
     assert frequency.per_km == pytest.approx(3 / 100.0 * 2 / 3)
     none = cut_in_events(synthetic_traffic(seconds=3.0, per_lane=2))
     assert count_events("cut_in", none, 0, ObservedTraffic(2.0, 100.0)) is None
+
+
+def test_brakings_count_in_the_time_in_which_they_could_begin():
+    table = stopping_traffic((10.0, 14.0), (6.0, 15.0), (1.5, 2.5))
+    traffic = ObservedTraffic().plus(table).plus(table)
+    seconds, metres = braking_exposure(table)
+    frequency = count_events("hard_brake", {}, 4, traffic)
+    assert frequency is not None
+    assert (frequency.count, frequency.share) == (4, 1.0)
+    assert frequency.per_hour == pytest.approx(4 / (2 * seconds / 3600))
+    assert frequency.per_km == pytest.approx(4 / (2 * metres / 1000))
+    assert count_events("hard_brake", {}, 0, traffic) is None

@@ -42,7 +42,7 @@ def test_expected_counts_are_shares_times_events():
     )
 
 
-def test_a_cut_in_has_two_pairs_and_hard_brake_none():
+def test_a_cut_in_has_two_pairs_and_an_unknown_scenario_none():
     names = ("ego_speed", "cut_in_speed", "lead_speed", "cut_in_gap", "lead_gap", "lateral_offset")
     d = len(names)
     base = TruncatedGaussianMixture([1.0], [[20.0] * d], [np.eye(d)], [1.0] * d, [150.0] * d)
@@ -56,4 +56,23 @@ def test_a_cut_in_has_two_pairs_and_hard_brake_none():
         "needed deceleration > 1 m/s^2, lead_gap": 1,  # 100 / 80
         "gap < 3 m, lead_gap": 0,
     }
-    assert check_predictions("hard_brake", ("speed", "gap", "deceleration"), np.ones((3, 3)), base) == ()
+    assert check_predictions("merge", names, events, base) == ()
+
+
+def test_a_braking_has_one_speed_for_both():
+    base = TruncatedGaussianMixture(
+        [1.0], [[12.0, 20.0, 2.0]], [np.diag([4.0, 9.0, 0.25])], [1.0, 1.0, 0.5], [45.0, 150.0, 10.0]
+    )
+    events = np.array([[12.0, 5.9, 2.0], [12.0, 6.1, 3.1], [3.0, 2.9, 2.9]])  # speed, gap, deceleration
+    checks = {
+        each.name: each for each in check_predictions("hard_brake", ("speed", "gap", "deceleration"), events, base)
+    }
+    assert {name: check.recorded for name, check in checks.items()} == {
+        "time headway < 0.5 s": 1,
+        "deceleration > 3 m/s^2": 1,
+        "gap < 3 m": 1,
+    }
+    share = norm.sf(2.0)  # of N(2, 0.5^2) above 3; the box cuts off 0.1 %
+    assert checks["deceleration > 3 m/s^2"].expected == pytest.approx(
+        3 * share, abs=3 * (4 * np.sqrt(share / CHECK_DRAWS) + 0.003 * share) + 0.001
+    )

@@ -14,6 +14,7 @@ from rare_envs.distributions.frequency import EventFrequency
 from rare_envs.distributions.space import Parameter
 from rare_envs.scenarios.registry import scenario_named
 from samplers.problem import FloatArray
+from training.data.brakings import find_standstill_brakings
 from training.scenario_fitting.coordinate_systems import COORDINATE_SYSTEMS
 from training.scenario_fitting.event_filters import (
     EVENT_RECIPES,
@@ -23,7 +24,7 @@ from training.scenario_fitting.event_filters import (
     read_csv_columns,
     read_events,
 )
-from training.scenario_fitting.shipped.brakings import find_standstill_brakings, load_brakings
+from training.scenario_fitting.shipped.brakings import load_brakings
 from training.scenario_fitting.shipped.frequencies import (
     CUT_INS_I80,
     CUT_INS_US101,
@@ -147,9 +148,12 @@ def read_i80_cut_ins(folder: Path) -> tuple[EventSet, EventFrequency]:
 def read_us101_brakings(folder: Path) -> tuple[EventSet, EventFrequency]:
     """Return brakings to a standstill of single vehicles on US 101, at their beginning."""
     brakings = load_brakings(folder, find_standstill_brakings)
-    windows = (brakings.times // CLUSTER_SECONDS).astype(np.int64)  # stop waves brake one vehicle after the other
-    events = _within_box("hard_brake", brakings.events, windows, "half-minute")
-    return events, braking_frequency(len(events.joint), brakings.hours, brakings.km)
+    recipe = replace(EVENT_RECIPES["hard_brake"], cluster=("frame",))  # stop waves brake one vehicle after the other
+    rows = {"frame": brakings.frames, **dict(zip(recipe.columns, brakings.events.T, strict=True))}
+    # Without columns apart nothing is drawn for them, so that the refits stay those of the published file.
+    events = replace(filter_events(rows, recipe, _box("hard_brake")), apart=np.empty((0, 0)))
+    source = "NGSIM, US 101, 370 vehicles over 640 m each, counted on the vehicles themselves"
+    return events, braking_frequency(len(events.joint), round(brakings.hours, 3), round(brakings.km, 1), source)
 
 
 def _within_box(scenario: str, events: FloatArray, clusters: NDArray[np.int64], cluster: str) -> EventSet:
@@ -185,8 +189,6 @@ def _with_offsets(events: EventSet, folder: Path, site: str) -> EventSet:
     return replace(events, apart=apart[:, None], log=(*events.log, *rules))
 
 
-CLUSTER_SECONDS = 30.0
-"""Window of time whose brakings form a cluster."""
 CLOSING_GAPS = COORDINATE_SYSTEMS["cut_in"][2].name
 FIRST_FRAME = "first frame of the pair"
 CHANGE_STARTS = "start of the lane change"

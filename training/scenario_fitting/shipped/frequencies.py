@@ -53,18 +53,19 @@ CUT_INS_I80 = EventFrequency(
 )
 
 
-def braking_frequency(count: int, hours: float, km: float) -> EventFrequency:
-    """Return the frequency of brakings to a standstill on US 101.
+def braking_frequency(count: int, hours: float, km: float, source: str) -> EventFrequency:
+    """Return the frequency of brakings to a standstill.
 
     Args:
         count: Brakings.
-        hours: Time of all vehicles [h].
-        km: Their distance [km].
+        hours: Time of all vehicles in which one could begin [h].
+        km: Their distance in that time [km].
+        source: Where they were counted.
     """
     return EventFrequency(
         count=count,
-        hours=round(hours, 3),
-        km=round(km, 1),
+        hours=hours,
+        km=km,
         definition="the vehicle ahead brakes by 3 m/s or more, to less than 1 m/s",
-        source="NGSIM, US 101, 370 vehicles over 640 m each, counted on the vehicles themselves",
+        source=source,
     )

@@ -12,4 +12,4 @@ def test_rates_of_the_shipped_cut_ins():
 
 
 def test_brakings_to_a_standstill():
-    assert braking_frequency(42, 6.0, 230.0).per_hour == pytest.approx(7.0)
+    assert braking_frequency(42, 6.0, 230.0, "US 101").per_hour == pytest.approx(7.0)
