@@ -69,7 +69,7 @@ class RecipeWorld:
         return EventSet(self.truth().from_standard_normal(u), scene, cluster="scene")
 
 
-WORLDS = (
+RECIPE_WORLDS = (
     RecipeWorld("1 component, closing speed", "us101", 1, 0.3458, 40, 20, 0.2),
     RecipeWorld("3 components, closing speed", "us101", 3, 0.4451, 40, 20, 0.2),
     RecipeWorld("1 component, closing speed", "us101", 1, 0.3458, 400, 40, 0.1),
@@ -167,16 +167,16 @@ def main(
     known = [json.loads(line) for line in lines.read_text().splitlines()] if lines.is_file() else []
     done = {(each["world"], each["seed"]): read_repetition(each) for each in known}
     end = time.monotonic() + 60.0 * minutes
-    for seed, number in ((seed, number) for seed in range(repetitions) for number in range(len(WORLDS))):
+    for seed, number in ((seed, number) for seed in range(repetitions) for number in range(len(RECIPE_WORLDS))):
         if (number, seed) in done:
             continue
         if time.monotonic() > end:
             break
-        done[number, seed] = repeat_recipe(WORLDS[number], seed)
+        done[number, seed] = repeat_recipe(RECIPE_WORLDS[number], seed)
         with lines.open("a") as file:
             file.write(write_repetition(number, seed, done[number, seed]) + "\n")
-    by_world = [[done[key] for key in sorted(done) if key[0] == number] for number in range(len(WORLDS))]
-    rows = [summarise_recipe(world, found) for world, found in zip(WORLDS, by_world, strict=True) if found]
+    by_world = [[done[key] for key in sorted(done) if key[0] == number] for number in range(len(RECIPE_WORLDS))]
+    rows = [summarise_recipe(world, found) for world, found in zip(RECIPE_WORLDS, by_world, strict=True) if found]
     command = f"python -m benchmarks.uncertainty.recipe_coverage --repetitions {repetitions}"
     out.write_text(json.dumps({"command": command, "worlds": rows}, indent=2) + "\n")
 

@@ -20,7 +20,7 @@ from samplers.problem import FloatArray
 
 TOLERANCE = 1e-6
 """Change of the mean log likelihood below which a start has converged."""
-MAX_ITERATIONS = 5000
+EM_ITERATIONS = 5000
 LEAST_MASS = 10 * float(np.finfo(np.float64).eps)
 """Added to the number of points of a component, so that an empty one has a mean."""
 
@@ -49,7 +49,7 @@ class _Mixtures(NamedTuple):
         return _Mixtures(*(values[chosen] for values in self))
 
 
-def fit_mixture(points: FloatArray, components: int, floor: float, seed: int, starts: int) -> EmFit:
+def fit_mixture_of_starts(points: FloatArray, components: int, floor: float, seed: int, starts: int) -> EmFit:
     """Return the likeliest of the mixtures that several starts lead to.
 
     Each start is a k-means clustering of the points.
@@ -63,7 +63,7 @@ def fit_mixture(points: FloatArray, components: int, floor: float, seed: int, st
 
     Example:
         >>> points = np.array([[-1.1], [-1.0], [-0.9], [0.9], [1.0], [1.1]])
-        >>> fit = fit_mixture(points, 2, floor=0.01, seed=0, starts=3)
+        >>> fit = fit_mixture_of_starts(points, 2, floor=0.01, seed=0, starts=3)
         >>> fit.weights.round(2).tolist(), sorted(fit.means[:, 0].round(2).tolist())
         ([0.5, 0.5], [-1.0, 1.0])
     """
@@ -71,7 +71,7 @@ def fit_mixture(points: FloatArray, components: int, floor: float, seed: int, st
     mixtures = _maximise(_start(points, components, seed, starts if components > 1 else 1), monomials, floor)
     bounds = np.full(len(mixtures.weights), -np.inf)
     active = np.arange(len(bounds))
-    for _ in range(MAX_ITERATIONS):
+    for _ in range(EM_ITERATIONS):
         log_density, responsibilities = _expect(mixtures.select(active), monomials)
         for whole, part in zip(mixtures, _maximise(responsibilities, monomials, floor), strict=True):
             whole[active] = part

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from samplers.problem import FloatArray
-from training.scenario_fitting.expectation_maximisation import EmFit, fit_mixture
+from training.scenario_fitting.expectation_maximisation import EmFit, fit_mixture_of_starts
 
 MAX_COMPONENTS = 5
 """Most components that are tried."""
@@ -98,7 +98,7 @@ def select_mixture(
     standard = (points - centre) / scale
     most = int(np.clip(n // (EVENTS_PER_COMPONENT * d), 1, most))
     starts = EM_STARTS if starts is None else starts
-    models = [fit_mixture(standard, k, COVARIANCE_FLOOR, seed, starts) for k in range(1, most + 1)]
+    models = [fit_mixture_of_starts(standard, k, COVARIANCE_FLOOR, seed, starts) for k in range(1, most + 1)]
     # A density in units of the points is smaller by the product of the scales.
     units = 2.0 * n * float(np.log(scale).sum())
     candidates = tuple(_assess(model, n, units) for model in models)
