@@ -14,6 +14,7 @@ from samplers.comparison import Comparison, compare
 from samplers.errors import EvaluationError
 from samplers.estimation import estimate
 from samplers.execution.arguments import RunArguments
+from samplers.execution.interruption import EstimationInterrupted
 from samplers.execution.progress import Progress
 from samplers.execution.run import Run
 from samplers.method import Goal, Interrupted, Outcome, Stepping, Steps
@@ -51,6 +52,7 @@ __all__ = [
     "Curve",
     "Distribution",
     "Estimate",
+    "EstimationInterrupted",
     "EvaluationError",
     "Failure",
     "Failures",

@@ -4,16 +4,21 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from os import PathLike
+
+from numpy.typing import ArrayLike
 
 from samplers.analysis.refits import HasEnsemble, needs_ensemble_run
 from samplers.errors import OnError
 from samplers.execution.arguments import InputsOnly, RunArguments, check_attributes
 from samplers.execution.fault_isolation import FaultIsolation
+from samplers.execution.interruption import EstimationInterrupted, defer_signals
+from samplers.execution.journaled_evaluation import keep_simulations, open_journal
 from samplers.execution.progress import Listener, Progress, open_listener
 from samplers.execution.run import Run
 from samplers.method import Stepping
 from samplers.methods.two_stage.method import TwoStage
-from samplers.problem import Inputs, Problem
+from samplers.problem import FloatArray, Inputs, Problem
 from samplers.registry import get_method
 from samplers.result import Estimate
 from samplers.trace import Status
@@ -35,6 +40,7 @@ def estimate(
     time_limit: float | None = None,
     stop: Callable[[Progress], bool] | None = None,
     ensemble_run: bool = True,
+    journal: str | PathLike[str] | None = None,
 ) -> Estimate:
     """Estimate P[f(X) <= gamma], X ~ problem.base.
 
@@ -75,13 +81,22 @@ def estimate(
         ensemble_run: Whether the further run may be made. Its simulations are not in `n_sim` but in
             `base_uncertainty.n_sim`; max_sim limits them anew, time_limit and stop hold for both
             runs. None is made after a run that was stopped.
+        journal: File that keeps finished simulations, batch by batch. The same call continues a run that was
+            interrupted or killed from there, and comes to the result of an undisturbed run; the file stays when the
+            run is done, and the same call then takes no simulations. A power cut loses one second
+            (`samplers.execution.journal.SYNC_SECONDS`) and the batch. A file that is damaged, used by another process,
+            or was made for other points or another f is refused.
 
     Returns:
         The probability, its interval, its cost and the failures. Of a run that was stopped (status
         "stopped"), the estimate from the simulations made so far.
 
     Raises:
-        ValueError: If an argument is not as described, or f does not return one number per row.
+        ValueError: If an argument is not as described, f does not return one number per row, or the journal cannot be
+            used (`JournalError`).
+        OSError: If the journal cannot be written at the beginning.
+        EstimationInterrupted: If it is interrupted (a `KeyboardInterrupt`); it has the estimate from the simulations
+            made so far.
 
     Example:
         The half-space f = 3.5 - sum(x) / sqrt(10) in ten dimensions, P[f <= 0] = Phi(-3.5) = 2.326e-4:
@@ -102,11 +117,19 @@ def estimate(
     if not (callable(progress) or isinstance(progress, bool)):
         raise ValueError(f"Expected progress to be True, False or a function, got {progress!r}.")
     isolation = FaultIsolation(problem.evaluate, on_error)
-    simulation = _Simulation(isolation, conditions, progress)
-    result = simulation.run(problem, chosen, arguments)
-    if ensemble_run and result.status is not Status.STOPPED and needs_ensemble_run(result):
-        further = RunArguments(gamma, result.seed, max_sim, None, confidence, 1, on_error)
-        result = replace(result, ensemble_run=_run_under_ensemble(simulation, problem, chosen, further))
+    with open_journal(journal, problem, seed) as kept:
+        if kept is not None:
+            arguments = replace(arguments, seed=kept.head["seed"])
+        evaluate = isolation.evaluate if kept is None else keep_simulations(isolation, problem, on_error, kept)
+        simulation = _Simulation(evaluate, conditions, progress)
+        try:
+            result = simulation.run(problem, chosen, arguments)
+            if ensemble_run and result.status is not Status.STOPPED and needs_ensemble_run(result):
+                result = replace(
+                    result, ensemble_run=_run_under_ensemble(simulation, problem, chosen, arguments, result)
+                )
+        except EstimationInterrupted as stopped:
+            raise EstimationInterrupted(_add_retry_note(stopped.estimate, isolation.n_retried)) from None
     return _add_retry_note(result, isolation.n_retried)
 
 
@@ -114,40 +137,66 @@ def estimate(
 class _Simulation:
     """What the runs of one estimation share: how f is called, when they end and who is told."""
 
-    isolation: FaultIsolation
+    evaluate: Callable[[FloatArray], ArrayLike]
     conditions: "_StopConditions"
     progress: bool | Listener
 
     def run(self, inputs: Inputs, method: Stepping, arguments: RunArguments) -> Estimate:
-        """Run a method to its end, or to the first condition that stops it."""
+        """Run a method to its end, or to the first condition that stops it.
+
+        Raises:
+            EstimationInterrupted: If it is interrupted after the first batch.
+        """
         with open_listener(self.progress, arguments.max_sim) as listener:
             run = Run(inputs, method, arguments, listener)
-            while not run.done:
-                run.tell(self.isolation.evaluate(run.ask()))
-                why = self.conditions.reason(run.progress)
-                if why is not None:
-                    run.stop(why)
+            try:
+                self._simulate(run)
+            except KeyboardInterrupt:
+                if run.progress.n_sim == 0:
+                    raise
+                run.stop("Interrupted")
+                raise EstimationInterrupted(run.result()) from None
         return run.result()
+
+    def _simulate(self, run: Run) -> None:
+        while not run.done:
+            f = self.evaluate(run.ask())
+            with defer_signals():  # a method that is interrupted while it computes could not conclude
+                run.tell(f)
+            why = self.conditions.reason(run.progress)
+            if why is not None:
+                run.stop(why)
 
 
 def _run_under_ensemble(
-    simulation: _Simulation, problem: Problem, method: Stepping, arguments: RunArguments
+    simulation: _Simulation, problem: Problem, method: Stepping, arguments: RunArguments, first: Estimate
 ) -> Estimate | None:
     """Return the run under the mixture of the refits, or None where the base cannot make one of them.
 
     `TwoStage` makes it where the method cannot search under a mixture.
+
+    Args:
+        simulation: That of the first run.
+        problem: Its problem.
+        method: Its method.
+        arguments: Its arguments.
+        first: Its result, which is what is known if the further run is interrupted.
     """
     if not isinstance(problem.base, HasEnsemble):
         return None
+    further = replace(arguments, seed=first.seed, target_cov=None, replicates=1)
     try:
         inputs = InputsOnly(int(problem.dim), problem.base.ensemble())
     except ValueError:  # refits that are no mixtures; the first run stands, with a warning of `BaseUncertainty`
         return None
     try:
-        Run(inputs, method, arguments)
+        Run(inputs, method, further)
     except ValueError:  # blocks of a product, which a mixture has none of
         method = TwoStage()
-    return simulation.run(inputs, method, arguments)
+    try:
+        return simulation.run(inputs, method, further)
+    except KeyboardInterrupt:
+        raise EstimationInterrupted(first) from None
 
 
 class _StopConditions:

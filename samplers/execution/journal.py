@@ -1,0 +1,217 @@
+"""Journal: the finished simulations of a run in a file, so that one that was interrupted can be continued.
+
+Methods draw by their seed alone. A continued run therefore asks for the same points in the same order, takes their
+outcomes from the journal for as long as it has any, and comes to the result of an undisturbed run.
+
+The file is a `RecordFile`. Its first record is a JSON object that says what the run is. Each other one is a batch: a
+line of JSON, then f as float64. What was written is on the disk after `SYNC_SECONDS`, or after the batch if that takes
+longer.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import time
+import warnings
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from samplers.execution.record_file import JournalError, RecordFile
+from samplers.problem import FloatArray
+
+SYNC_SECONDS = 1.0
+"""Longest time for which finished simulations are not on the disk yet: what a power cut loses, beside the batch."""
+
+
+class Record(NamedTuple):
+    """A batch of finished simulations."""
+
+    points: str
+    """Digest of x, see `digest_points`."""
+    f: FloatArray
+    """Outcomes, shape (n,)."""
+    notes: dict[str, Any]
+    """What else is known of them, JSON-ready."""
+
+
+def digest_points(x: NDArray[Any]) -> str:
+    """Return the digest of points x (n, d), by which a record knows them again."""
+    return hashlib.blake2b(repr(x.shape).encode() + x.tobytes(), digest_size=16).hexdigest()
+
+
+class JournalFile:
+    """Finished simulations of a run, in their order; one process alone has the file open.
+
+    Attributes:
+        path: Of the file.
+        head: What the run is, JSON-ready.
+        n: Simulations that have been read or written so far.
+        n_dropped: Bytes at the end of the file that were dropped: a record that was cut while it was written.
+
+    Example:
+        >>> from tempfile import TemporaryDirectory
+        >>> with TemporaryDirectory() as folder:
+        ...     path = Path(folder) / "journal.bin"
+        ...     journal = JournalFile.create(path, {"seed": 1})
+        ...     journal.append(Record("of x", np.array([2.0, -1.0]), {}))
+        ...     journal.close()
+        ...     journal = JournalFile.open(path)
+        ...     print(journal.head, journal.read_next().f, journal.read_next())
+        ...     journal.close()
+        {'seed': 1} [ 2. -1.] None
+    """
+
+    def __init__(self, records: RecordFile, head: dict[str, Any], n_dropped: int = 0) -> None:
+        """Use an open file that stands behind its head; see `create` and `open`."""
+        self.path, self.head, self.n, self.n_dropped = records.path, head, 0, n_dropped
+        self._records = records
+        self._waiting: list[bytes] = []  # records that could not be written
+        self._synced = time.monotonic()
+        self._warned = False
+
+    @classmethod
+    def create(cls, path: Path, head: dict[str, Any], replace: bool = False) -> JournalFile:
+        """Begin a journal.
+
+        Args:
+            path: Of the file; one without any finished simulations is replaced.
+            head: What the run is, JSON-ready.
+            replace: Replace a journal with finished simulations too.
+
+        Raises:
+            JournalError: There is one already, or another process has it open.
+            OSError: It cannot be written.
+        """
+        records = RecordFile(path, new=True)
+        try:
+            if not replace and records.size and _has_simulations(records):
+                raise JournalError(f"There is a journal already: {str(path)!r}.")
+            records.clear()
+            records.write(_encode(head))
+            records.sync()
+            _sync_folder(path.parent)
+        except BaseException:
+            records.close()
+            raise
+        return cls(records, head)
+
+    @classmethod
+    def open(cls, path: Path, mend: bool = False) -> JournalFile:
+        """Continue a journal, all of whose checksums are verified; a record at its end that was cut is dropped.
+
+        Args:
+            path: Of the file.
+            mend: Of a damaged journal, keep what stands before the damage.
+
+        Raises:
+            JournalError: It is damaged, or another process has it open.
+            OSError: It cannot be read.
+        """
+        records = RecordFile(path)
+        try:
+            dropped = records.mend(drop=mend)
+            head = json.loads(records.read() or b"")
+            if not isinstance(head, dict):
+                raise ValueError("its head is no object")
+        except (ValueError, RecursionError) as error:
+            records.close()
+            words = str(error) if isinstance(error, JournalError) else f"{str(path)!r} is no journal: {error}."
+            raise JournalError(words) from error
+        except BaseException:
+            records.close()
+            raise
+        return cls(records, head, dropped)
+
+    def read_next(self) -> Record | None:
+        """Return the next batch; None at the end of the journal.
+
+        Raises:
+            JournalError: It is no batch.
+        """
+        payload = None if self._waiting else self._records.read()
+        if payload is None:
+            return None
+        try:
+            line, values = payload.split(b"\n", 1)
+            fields = json.loads(line)
+            record = Record(str(fields["points"]), np.frombuffer(values, "<f8").astype(np.float64), fields["notes"])
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            raise JournalError(f"{str(self.path)!r} is no journal of this version: {error}.") from error
+        self.n += len(record.f)
+        return record
+
+    def append(self, record: Record) -> None:
+        """Write finished simulations; those that cannot be written now are tried again with the next ones.
+
+        Warns:
+            UserWarning: They cannot be written; once.
+        """
+        line = {"points": record.points, "notes": record.notes}
+        self._waiting.append(_encode(line) + np.asarray(record.f, dtype="<f8").tobytes())
+        self.n += len(record.f)
+        try:
+            self._write_waiting()
+            if time.monotonic() - self._synced >= SYNC_SECONDS:
+                self._records.sync()
+                self._synced = time.monotonic()
+        except OSError as error:
+            self._warn(error)
+
+    def close(self) -> None:
+        """Leave the journal for later."""
+        try:
+            self._write_waiting()
+            self._records.sync()
+        except OSError as error:
+            self._warn(error)
+        except ValueError:  # closed before
+            return
+        self._records.close()
+
+    def remove(self) -> None:
+        """Remove the journal of a run that is done."""
+        self._waiting.clear()
+        self._records.remove()
+
+    def _write_waiting(self) -> None:
+        while self._waiting:
+            self._records.write(self._waiting[0])
+            del self._waiting[0]
+
+    def _warn(self, error: OSError) -> None:
+        """Warn once that simulations are not kept."""
+        if not self._warned:
+            self._warned = True
+            text = (
+                f"Cannot write {str(self.path)!r} ({error.strerror}): simulations from here on are lost if the run is"
+            )
+            warnings.warn(f"{text} interrupted.", stacklevel=4)
+
+
+def _has_simulations(records: RecordFile) -> bool:
+    """Return whether a file has batches, or is damaged or of another kind, so that somebody may want to keep it."""
+    try:
+        records.mend()
+    except JournalError:
+        return True
+    return records.read() is not None and records.read() is not None
+
+
+def _encode(fields: dict[str, Any]) -> bytes:
+    return json.dumps(fields).encode() + b"\n"
+
+
+def _sync_folder(folder: Path) -> None:
+    """Return when the name of a new file is on the disk, where the system can do that."""
+    if os.name != "posix":
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

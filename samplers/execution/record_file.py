@@ -1,0 +1,218 @@
+"""Record file: checksummed records, one behind the other, in a file that one process alone has open.
+
+The file is `MAGIC`, then records. A record is the length of its payload (8 bytes, little-endian), a CRC-32 of that
+length (4 bytes), the payload, and a BLAKE2b digest (16 bytes). Both checksums begin with the digest of the record
+before, so that a record that was changed, removed or moved does not match.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import struct
+import sys
+import zlib
+from pathlib import Path
+from typing import IO
+
+MAGIC = b"samplers records 1\n"
+_HEADER = struct.Struct("<QI")
+_DIGEST_SIZE = 16
+_BLOCK = 1 << 20
+
+
+class JournalError(ValueError):
+    """A journal cannot be used: it is damaged, in use, or of another run."""
+
+    final = True
+    """Simulating again would not help."""
+
+
+class RecordFile:
+    """Records of bytes, read and written in their order.
+
+    Attributes:
+        path: Of the file.
+
+    Example:
+        >>> from tempfile import TemporaryDirectory
+        >>> with TemporaryDirectory() as folder:
+        ...     records = RecordFile(Path(folder) / "records.bin", new=True)
+        ...     records.clear()
+        ...     records.write(b"first")
+        ...     records.close()
+        ...     records = RecordFile(Path(folder) / "records.bin")
+        ...     print(records.mend(), records.read(), records.read())
+        ...     records.close()
+        0 b'first' None
+    """
+
+    def __init__(self, path: Path, new: bool = False) -> None:
+        """Open and lock a file.
+
+        Args:
+            path: Of the file.
+            new: Make it where there is none; `clear` begins it.
+
+        Raises:
+            JournalError: Another process has it open.
+            OSError: It cannot be opened.
+        """
+        self.path = path
+        flags = os.O_RDWR | (os.O_CREAT if new else 0) | getattr(os, "O_BINARY", 0)
+        # unbuffered, so that nothing is left behind of a write that failed
+        self._file: IO[bytes] = open(os.open(path, flags, 0o666), "r+b", buffering=0)
+        self._digest, self._end = b"", len(MAGIC)  # of the records that have been read or written
+        if not lock_file(self._file) or not _still_there(self._file, path):
+            self._file.close()
+            raise JournalError(f"Another process is writing {str(path)!r}.")
+
+    @property
+    def size(self) -> int:
+        """Length of the file in bytes."""
+        return os.fstat(self._file.fileno()).st_size
+
+    def clear(self) -> None:
+        """Remove all records."""
+        self._file.truncate(0)
+        self._digest, self._end = b"", 0
+        self._write_at_end(MAGIC)
+
+    def rewind(self) -> None:
+        """Go back to the first record."""
+        self._digest, self._end = b"", len(MAGIC)
+
+    def read(self) -> bytes | None:
+        """Return the next record and step over it; None where there is no whole one."""
+        self._file.seek(self._end)
+        header = self._file.read(_HEADER.size)
+        if len(header) < _HEADER.size:
+            return None
+        length, checksum = _HEADER.unpack(header)
+        if checksum != self._checksum(length) or length > self.size:
+            return None
+        payload, digest = self._file.read(length), self._file.read(_DIGEST_SIZE)
+        if len(payload) < length or digest != self._digest_of(payload):
+            return None
+        self._end += _HEADER.size + length + _DIGEST_SIZE
+        self._digest = digest
+        return payload
+
+    def write(self, payload: bytes) -> None:
+        """Write a record behind the last one that was read or written; if that fails, nothing of it stays.
+
+        Raises:
+            OSError: It cannot be written.
+        """
+        digest = self._digest_of(payload)
+        self._write_at_end(_HEADER.pack(len(payload), self._checksum(len(payload))) + payload + digest)
+        self._digest = digest
+
+    def mend(self, drop: bool = False) -> int:
+        """Verify all records, drop one at the end that was cut while it was written, and go back to the first one.
+
+        A power cut leaves a record that ends too early, one whose last parts are missing, or zeros.
+
+        Args:
+            drop: Drop all records from the first damaged one on, whatever the damage.
+
+        Returns:
+            Number of bytes dropped.
+
+        Raises:
+            JournalError: A record is damaged otherwise, or the file is of another kind.
+        """
+        self._file.seek(0)
+        if self._file.read(len(MAGIC)) != MAGIC:
+            raise JournalError(f"{str(self.path)!r} is of another kind or version, or was cut at its beginning.")
+        self.rewind()
+        n = 0
+        while self.read() is not None:
+            n += 1
+        dropped = self.size - self._end
+        if dropped and not (drop or self._is_cut()):
+            raise JournalError(f"{str(self.path)!r} is damaged: record {n + 1} does not match its checksum.")
+        self._file.truncate(self._end)
+        self.rewind()
+        return dropped
+
+    def sync(self) -> None:
+        """Return when all that was written is on the disk."""
+        os.fsync(self._file.fileno())
+
+    def close(self) -> None:
+        """Leave the file to others."""
+        self._file.close()
+
+    def remove(self) -> None:
+        """Remove the file."""
+        if _still_there(self._file, self.path):
+            self.path.unlink()
+        self._file.close()
+
+    def _write_at_end(self, content: bytes) -> None:
+        rest = memoryview(content)
+        try:
+            self._file.seek(self._end)
+            while rest:  # a full disk takes a part
+                rest = rest[self._file.write(rest) :]
+        except OSError:
+            self._file.truncate(self._end)
+            raise
+        self._end += len(content)
+
+    def _is_cut(self) -> bool:
+        """Return whether what stands behind the last whole record is one record, or zeros alone."""
+        self._file.seek(self._end)
+        header = self._file.read(_HEADER.size)
+        if len(header) < _HEADER.size:
+            return True
+        length, checksum = _HEADER.unpack(header)
+        if checksum == self._checksum(length):
+            return bool(self._end + _HEADER.size + length + _DIGEST_SIZE >= self.size)
+        if header.strip(b"\0"):
+            return False
+        while block := self._file.read(_BLOCK):
+            if block.strip(b"\0"):
+                return False
+        return True
+
+    def _checksum(self, length: int) -> int:
+        return zlib.crc32(self._digest + length.to_bytes(8, "little"))
+
+    def _digest_of(self, payload: bytes) -> bytes:
+        return hashlib.blake2b(self._digest + payload, digest_size=_DIGEST_SIZE).digest()
+
+
+def lock_file(file: IO[bytes]) -> bool:
+    """Lock an open file for this process until it is closed; return False if another process has it.
+
+    The system lets go of the lock when the process ends, however. File systems that know no locks (some network
+    drives) grant every lock.
+    """
+    if sys.platform == "win32":
+        import msvcrt
+
+        file.seek(1 << 62)  # beyond the content, which others may then still read
+        try:
+            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+        except OSError:
+            return False
+        return True
+    import fcntl
+
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:  # no locks here
+        return True
+    return True
+
+
+def _still_there(file: IO[bytes], path: Path) -> bool:
+    """Return whether the path still names the open file."""
+    try:
+        return os.path.samestat(os.fstat(file.fileno()), path.stat())
+    except FileNotFoundError:
+        return False
