@@ -1,174 +1,154 @@
 """Journal: the finished simulations of a run, so that one that was interrupted can be continued.
 
-The journal lies in the run's folder until the run is done. Methods draw by their seed alone: a continued run draws the
-same scenarios in the same order, takes their outcomes from the journal for as long as it has any, and so ends with the
-estimate of an undisturbed run.
+The journal lies in the run's folder until the run is done; `samplers.execution.journal` has its form and its promises.
+Here it gets the question of the run, digests of the files that the question names, and what is known of faults.
 """
 
 from __future__ import annotations
 
-import json
+import hashlib
+import importlib.util
+from dataclasses import asdict
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from rare_envs.egos.faults import Fault, FaultTolerant
 from rare_envs.study.errors import BadInput
+from rare_envs.study.question import Question
 from rare_envs.version import __version__
+from samplers.execution.journal import JournalFile, Record, digest_points
+from samplers.execution.journaled_evaluation import JournaledEvaluation
+from samplers.execution.record_file import JournalError
 from samplers.problem import FloatArray
 
-JOURNAL = "journal.npy"
-"""Arrays one behind the other: the question, then for each batch x, f, and what is known of faults."""
+JOURNAL = "journal.bin"
+"""Name of the file in the folder of a run."""
 
 
-class JournalError(ValueError):
-    """The journal cannot be written, or belongs to another run."""
+def begin_journal(folder: Path, question: Question, force: bool = False) -> JournalFile:
+    """Return the journal of a new run.
 
-    final = True
-    """Simulating again would not help."""
+    Args:
+        folder: Of the run.
+        question: What it is about.
+        force: Replace the journal of an unfinished run.
 
-
-class JournalEntry(NamedTuple):
-    """Finished simulations."""
-
-    x: NDArray[np.float32]
-    """Scenarios, in the precision in which they are simulated, shape (n, d)."""
-    f: FloatArray
-    """Outcomes, shape (n,), NaN where the ego failed twice."""
-    reasons: list[str]
-    """Reasons of these failures, in their order."""
-    n_retried: int
-    """Simulations that were repeated to find them."""
-
-
-class Journal:
-    """Finished simulations of a run, in their order, in a file.
-
-    Attributes:
-        question: The question of the run.
-        n: Simulations that have been read or written so far.
+    Raises:
+        BadInput: There is an unfinished run, somebody else is writing it, or nothing can be written.
     """
-
-    def __init__(self, folder: Path, question: dict[str, Any] | None = None) -> None:
-        """Begin a journal, or continue one.
-
-        Args:
-            folder: Of the run.
-            question: Of a new run, JSON-ready; None continues an unfinished one.
-
-        Raises:
-            BadInput: There is a journal already, or none to continue, or one of another version of this program.
-        """
-        self._path, self.n = folder / JOURNAL, 0
-        self._file: IO[bytes] | None = None
-        if question is not None:
-            if self._path.exists():
-                raise BadInput(
-                    f"There is an unfinished run in {str(folder)!r}: go on with it by rare-envs resume {folder}, or "
-                    f"remove {str(self._path)!r}."
-                )
-            self.question = question
-            return
-        try:
-            self._file = self._path.open("r+b")
-            self.question = self._read_question()
-        except FileNotFoundError as error:
-            raise BadInput(f"There is no unfinished run in {str(folder)!r}: it has no {JOURNAL}.") from error
-        except (OSError, ValueError, EOFError, KeyError, TypeError) as error:
-            self.close()
-            raise BadInput(f"Cannot take up {str(self._path)!r}: {error}") from error
-
-    def _read_question(self) -> dict[str, Any]:
-        head = self._read_json()
-        if head["version"] != __version__:
-            raise ValueError(f"it was begun by version {head['version']}, this is {__version__}.")
-        return dict(head["question"])
-
-    def read_next(self, x: FloatArray) -> JournalEntry | None:
-        """Return the entry of the next batch; None at the end of the journal.
-
-        Raises:
-            JournalError: If the entry is of another batch.
-        """
-        batch = self._read()
-        if batch is not None and not np.array_equal(batch.x, x.astype(np.float32)):
-            raise JournalError(
-                f"After {self.n:,} simulations this run asks for other scenarios than {str(self._path)!r} has: ego, "
-                "drivers, libraries or this program have changed since it was begun. Remove the file and begin anew."
-            )
-        self.n += 0 if batch is None else len(batch.f)
-        return batch
-
-    def append(self, batch: JournalEntry) -> None:
-        """Write finished simulations.
-
-        Raises:
-            JournalError: They cannot be written.
-        """
-        try:
-            if self._file is None:
-                self._file = self._path.open("xb")
-                self._write(_json({"question": self.question, "version": __version__}))
-            notes = {"reasons": batch.reasons, "n_retried": batch.n_retried}
-            self._write(batch.x, batch.f, _json(notes))
-            self._file.flush()
-        except OSError as error:
-            raise JournalError(f"Cannot write {str(self._path)!r}: {error}") from error
-        self.n += len(batch.f)
-
-    def close(self) -> None:
-        """Leave the journal for later."""
-        if self._file is not None:
-            self._file.close()
-
-    def remove(self) -> None:
-        """Remove the journal of a run that is done."""
-        self.close()
-        self._path.unlink(missing_ok=True)
-
-    def _read(self) -> JournalEntry | None:
-        """Return the next entry; None at the end, where an incomplete entry is removed."""
-        if self._file is None:
-            return None
-        whole = self._file.tell()
-        try:
-            x, f = (np.lib.format.read_array(self._file, allow_pickle=False) for _ in range(2))
-            notes = self._read_json()
-            return JournalEntry(x, f, notes["reasons"], notes["n_retried"])
-        except (ValueError, EOFError):
-            self._file.seek(whole)
-            self._file.truncate()
-            return None
-
-    def _read_json(self) -> dict[str, Any]:
-        assert self._file is not None
-        notes: dict[str, Any] = json.loads(np.lib.format.read_array(self._file, allow_pickle=False).tobytes())
-        return notes
-
-    def _write(self, *arrays: NDArray[Any]) -> None:
-        assert self._file is not None
-        for array in arrays:
-            np.lib.format.write_array(self._file, np.ascontiguousarray(array), allow_pickle=False)
+    path = folder / JOURNAL
+    head = {"version": __version__, "question": asdict(question), "files": digest_files(question)}
+    try:
+        return JournalFile.create(path, head, replace=force)
+    except JournalError as error:
+        if "already" not in str(error):
+            raise BadInput(error) from error
+        raise BadInput(
+            f"There is an unfinished run in {str(folder)!r}: go on with it by rare-envs resume {folder}, or replace it "
+            "by --force."
+        ) from error
+    except OSError as error:
+        raise BadInput(f"Cannot write to the folder {str(folder)!r}: {error.strerror}.") from error
 
 
-def _json(value: dict[str, Any]) -> NDArray[np.uint8]:
-    return np.frombuffer(json.dumps(value).encode(), np.uint8)
+def continue_journal(folder: Path, mend: bool = False) -> tuple[JournalFile, Question]:
+    """Return the journal of an unfinished run, and its question.
+
+    Args:
+        folder: Of the run.
+        mend: Of a damaged journal, keep what stands before the damage.
+
+    Raises:
+        BadInput: There is none to continue, or one of another version of this program; it is damaged, or in use.
+    """
+    path = folder / JOURNAL
+    try:
+        journal = JournalFile.open(path, mend)
+    except FileNotFoundError as error:
+        raise BadInput(f"There is no unfinished run in {str(folder)!r}: it has no {JOURNAL}.") from error
+    except OSError as error:
+        raise BadInput(f"Cannot take up {str(path)!r}: {error.strerror}.") from error
+    except JournalError as error:
+        hint = f" What stands before the damage is kept by rare-envs resume {folder} --mend."
+        raise BadInput(f"{error}{hint if 'damaged' in str(error) else ''}") from error
+    try:
+        return journal, _read_question(journal)
+    except (BadInput, KeyError, TypeError, AttributeError) as error:
+        journal.close()
+        raise BadInput(f"Cannot take up {str(path)!r}: {error}") from error
+
+
+def _read_question(journal: JournalFile) -> Question:
+    version = journal.head.get("version")
+    if version != __version__:
+        raise BadInput(f"it was begun by version {version}, this is {__version__}.")
+    return Question(**journal.head["question"])
+
+
+def check_same_files(journal: JournalFile, question: Question) -> None:
+    """Raise a BadInput if a file that the question names has changed since the run was begun."""
+    before, now = journal.head.get("files") or {}, digest_files(question)
+    changed = sorted(name for name in before if name in now and now[name] != before[name])
+    if changed:
+        raise BadInput(
+            f"{', '.join(changed)} has changed since the run in {str(journal.path.parent)!r} was begun: its simulations "
+            "are of another ego or other traffic. Begin anew with --force."
+        )
+
+
+def digest_files(question: Question) -> dict[str, str]:
+    """Return the BLAKE2b digests of the files that a question names, by path; modules are found, not imported.
+
+    Example:
+        >>> digest_files(Question(env_id="rare_envs/CutIn-v0"))
+        {}
+    """
+    bases = [name.strip() for name in (question.also_under or "").split(",")]
+    names = [question.ego, question.base, question.drivers, question.measure, *bases]
+    paths = {path for name in names if name for path in _find_files(name)}
+    return {str(path): hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest() for path in sorted(paths)}
+
+
+def _find_files(name: str) -> list[Path]:
+    """Return the file that an option names, or that of its module: a.zip, noisy:a.zip, module:function."""
+    parts = [name, *name.split(":")]
+    try:
+        files = [Path(part) for part in parts if Path(part).is_file()]
+    except (OSError, ValueError):  # too long a name, or with a null byte
+        return []
+    if not files and len(parts) > 2:
+        files = [Path(found) for part in parts[1:] if (found := _find_module(part)) and Path(found).is_file()]
+    return files
+
+
+def _find_module(name: str) -> str | None:
+    """Return the file of a module at the top or one that is imported already; finding others would run code."""
+    if not name.isidentifier():
+        return None
+    try:
+        spec = importlib.util.find_spec(name)
+    except (ImportError, ValueError):
+        return None
+    return None if spec is None else spec.origin
 
 
 class JournaledProblem:
     """A problem whose finished simulations are kept; see `samplers.Problem`."""
 
-    def __init__(self, problem: FaultTolerant, journal: Journal, tile: int) -> None:
+    def __init__(self, problem: FaultTolerant, journal: JournalFile, tile: int, on_error: str) -> None:
         """Wrap a problem.
 
         Args:
             problem: The problem.
             journal: Keeps what has been simulated.
             tile: Simulations at once. Those of a tile are finished together.
+            on_error: The rule of the problem for scenarios on which the ego fails.
         """
-        self.problem, self.journal, self._tile = problem, journal, tile
+        self.problem, self._tile = problem, tile
+        again = FaultTolerant(problem.problem, on_error)
+        self._journaled = JournaledEvaluation(journal, self._simulate, self._restore, again.evaluate)
 
     @property
     def dim(self) -> int:
@@ -188,17 +168,18 @@ class JournaledProblem:
     def evaluate(self, x: FloatArray) -> FloatArray:
         """Return f from the journal, or simulate: (n, d) -> (n,)."""
         tiles = [x[first : first + self._tile] for first in range(0, max(len(x), 1), self._tile)]
-        return np.concatenate([self._evaluate_tile(tile) for tile in tiles])
+        # scenarios are simulated in single precision
+        return np.concatenate(
+            [self._journaled.evaluate(tile, digest_points(tile.astype(np.float32))) for tile in tiles]
+        )
 
-    def _evaluate_tile(self, x: FloatArray) -> FloatArray:
-        known, problem = self.journal.read_next(x), self.problem
-        if known is not None:
-            lost = x[np.isnan(known.f)]
-            problem.faults += [Fault(row.copy(), reason) for row, reason in zip(lost, known.reasons, strict=True)]
-            problem.n_retried += known.n_retried
-            return known.f
-        before, retried = len(problem.faults), problem.n_retried
-        f = problem.evaluate(x)
-        reasons = [fault.reason for fault in problem.faults[before:]]
-        self.journal.append(JournalEntry(x.astype(np.float32), f, reasons, problem.n_retried - retried))
-        return f
+    def _simulate(self, x: FloatArray) -> tuple[FloatArray, dict[str, Any]]:
+        before, retried = len(self.problem.faults), self.problem.n_retried
+        f = self.problem.evaluate(x)
+        reasons = [fault.reason for fault in self.problem.faults[before:]]
+        return f, {"reasons": reasons, "n_retried": self.problem.n_retried - retried}
+
+    def _restore(self, x: FloatArray, known: Record) -> None:
+        lost, reasons = x[np.isnan(known.f)], known.notes["reasons"]
+        self.problem.faults += [Fault(row.copy(), reason) for row, reason in zip(lost, reasons, strict=True)]
+        self.problem.n_retried += known.notes["n_retried"]
