@@ -12,7 +12,7 @@ from rare_envs.egos.errors import EgoGone
 from rare_envs.files import replace_text
 from rare_envs.study.errors import as_bad_input, output_folder
 from rare_envs.study.question import Question, prepare
-from rare_envs.study.run_directory import format_json, write_failures
+from rare_envs.study.run_directory import check_no_results, format_json, write_failures
 from rare_envs.version import __version__
 
 COMPARISON = "comparison.json"
@@ -35,7 +35,9 @@ class EgoComparison(NamedTuple):
     """The same with the question, JSON-ready."""
 
 
-def compare_egos(question: Question, ego_b: str, progress: bool = False, out: Path | None = None) -> EgoComparison:
+def compare_egos(
+    question: Question, ego_b: str, progress: bool = False, out: Path | None = None, force: bool = False
+) -> EgoComparison:
     """Estimate p_A / p_B, see `samplers.compare`.
 
     Args:
@@ -43,6 +45,7 @@ def compare_egos(question: Question, ego_b: str, progress: bool = False, out: Pa
         ego_b: The other ego.
         progress: Show a bar on standard error.
         out: Folder for `COMPARISON` and the scenarios on which one of them fails; is made, if need be.
+        force: Replace an earlier run or comparison in that folder.
 
     Returns:
         The estimate, and all of it with the question.
@@ -56,6 +59,8 @@ def compare_egos(question: Question, ego_b: str, progress: bool = False, out: Pa
         >>> comparison.ratio
         1.0
     """
+    if out is not None and not force:
+        check_no_results(out, COMPARISON)
     a, b = prepare(question), prepare(replace(question, ego=ego_b))
     with contextlib.nullcontext() if out is None else output_folder(out):
         with as_bad_input(ValueError, EgoGone):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -12,18 +12,37 @@ import samplers
 from agents.loading import find_ego_kind
 from rare_envs.egos.errors import EgoGone
 from rare_envs.egos.faults import FaultTolerant
-from rare_envs.study.crash_kinds import classify_failures
+from rare_envs.study.crash_kinds import CrashKinds, classify_failures
 from rare_envs.study.errors import BadInput, output_folder
-from rare_envs.study.journal import Journal, JournaledProblem
-from rare_envs.study.question import Question, Study, prepare
+from rare_envs.study.journal import JournaledProblem, begin_journal, check_same_files, continue_journal
+from rare_envs.study.question import Study, prepare
 from rare_envs.study.report import Report
-from rare_envs.study.run_directory import write_run
+from rare_envs.study.run_directory import check_no_results, remove_results, write_run
+from samplers.execution.journal import JournalFile
+
+
+class RunInterrupted(KeyboardInterrupt):
+    """A run was interrupted; the message says how to continue it."""
+
+    def __init__(self, message: str, report: Report | None = None) -> None:
+        super().__init__(message)
+        self.report = report
+        """The answer from the simulations made so far; None before the first ones."""
+
+
+class UnwrittenResults(BadInput):
+    """A run is done, but its results could not be written."""
+
+    def __init__(self, message: str, report: Report) -> None:
+        super().__init__(message)
+        self.report = report
+        """The answer."""
 
 
 def run(
     study: Study,
     progress: bool | Callable[[samplers.Progress], None] = False,
-    journal: Journal | None = None,
+    journal: JournalFile | None = None,
 ) -> Report:
     """Answer a question.
 
@@ -37,6 +56,7 @@ def run(
 
     Raises:
         BadInput: The ego failed on some x, or is gone.
+        RunInterrupted: It was interrupted; this has the answer from the simulations made so far.
 
     Example:
         How often does the rule-based ego come within 3 s of a collision in the first 3 s?
@@ -52,7 +72,7 @@ def run(
     problem = FaultTolerant(study.problem, question.on_error)
     try:
         estimate = samplers.estimate(
-            problem if journal is None else JournaledProblem(problem, journal, study.problem.tile),
+            problem if journal is None else JournaledProblem(problem, journal, study.problem.tile, question.on_error),
             study.method,
             **asdict(question.run_arguments),
             progress=progress,
@@ -64,25 +84,32 @@ def run(
         ) from error
     except ValueError as error:
         raise BadInput(error) from error
+    except samplers.EstimationInterrupted as stopped:
+        kinds = CrashKinds(unknown="the run was interrupted")
+        seconds = time.perf_counter() - start
+        report = Report(study, stopped.estimate, seconds, tuple(problem.faults), kinds, problem.n_retried)
+        raise RunInterrupted("Stopped.", report) from None
     seconds = time.perf_counter() - start
     kinds = classify_failures(study.problem, estimate)
     return Report(study, estimate, seconds, tuple(problem.faults), kinds, problem.n_retried)
 
 
-def run_into(folder: Path, study: Study, progress: bool = False) -> Report:
+def run_into(folder: Path, study: Study, progress: bool = False, force: bool = False) -> Report:
     """Answer a question and write the answer; finished simulations are kept if the run is interrupted.
 
     Args:
-        folder: Is made, if need be; files of an earlier run in it are replaced.
+        folder: Is made, if need be.
         study: From `rare_envs.study.prepare`.
         progress: Show a bar on standard error.
+        force: Replace a run that the folder has, finished or not.
 
     Returns:
         The report.
 
     Raises:
-        BadInput: See `run`; or the folder cannot be used, or has an unfinished run.
-        KeyboardInterrupt: It was stopped; the message says how to continue.
+        BadInput: See `run`; or the folder cannot be used, or has a run.
+        UnwrittenResults: The run is done, but its results cannot be written.
+        RunInterrupted: It was interrupted; the message says how to continue.
 
     Example:
         >>> from tempfile import TemporaryDirectory
@@ -94,12 +121,22 @@ def run_into(folder: Path, study: Study, progress: bool = False) -> Report:
         ...     sorted(path.name for path in Path(folder).iterdir())
         ['failures.csv', 'plot.png', 'result.json']
     """
-    with output_folder(folder), closing(Journal(folder, asdict(study.question))) as journal:
-        return _run(folder, study, journal, progress)
+    folder = folder.absolute()  # an ego may change the working directory
+    with output_folder(folder):
+        if not force:
+            check_no_results(folder)
+        with closing(begin_journal(folder, study.question, force)) as journal:
+            remove_results(folder)
+            return _run(folder, study, journal, progress)
 
 
 def resume(
-    folder: Path, ego: str | None = None, on_error: str | None = None, trust: bool = False, progress: bool = False
+    folder: Path,
+    ego: str | None = None,
+    on_error: str | None = None,
+    trust: bool = False,
+    progress: bool = False,
+    mend: bool = False,
 ) -> Report:
     """Continue an interrupted run; the answer is that of an undisturbed one.
 
@@ -109,9 +146,13 @@ def resume(
         on_error: What to count scenarios as on which the ego fails, if that has changed.
         trust: Let the ego's file run code, as the run was allowed to.
         progress: Show a bar on standard error.
+        mend: Of a damaged journal, keep the simulations before the damage.
 
     Raises:
-        BadInput: There is no unfinished run, it cannot be continued, or it is interrupted again.
+        BadInput: There is no unfinished run, or it cannot be continued: its journal is damaged or in use, or a file
+            that it names has changed.
+        UnwrittenResults: The run is done, but its results cannot be written.
+        RunInterrupted: It was interrupted again.
 
     Example:
         >>> resume(Path("runs/nowhere"))
@@ -119,31 +160,53 @@ def resume(
             ...
         rare_envs.study.errors.BadInput: There is no unfinished run in 'runs/nowhere': it has no journal.npy.
     """
-    with closing(Journal(folder)) as journal:
-        try:
-            question = Question(**{**journal.question, "trust": trust})
-        except TypeError as error:
-            raise BadInput(f"Cannot take up the run in {str(folder)!r}: {error}") from error
+    folder = folder.absolute()
+    journal, question = continue_journal(folder, mend)
+    with closing(journal):
         if ego is not None and {find_ego_kind(ego), find_ego_kind(question.ego)} != {"remote"}:
             raise BadInput(f"Expected --ego for one whose address has changed only; the run has {question.ego!r}.")
-        question = replace(question, ego=ego or question.ego, on_error=on_error or question.on_error)
+        question = replace(question, ego=ego or question.ego, on_error=on_error or question.on_error, trust=trust)
+        check_same_files(journal, question)
         return _run(folder, prepare(question), journal, progress)
 
 
-def _run(folder: Path, study: Study, journal: Journal, progress: bool) -> Report:
+def _run(folder: Path, study: Study, journal: JournalFile, progress: bool) -> Report:
     try:
         report = run(study, progress, journal)
-        write_run(folder, report)
+        _write(folder, report)
+    except UnwrittenResults as error:
+        raise UnwrittenResults(f"{error}{_resume_hint(journal, folder)}", error.report) from error
     except BadInput as error:
+        if not journal.n:
+            journal.remove()
         raise BadInput(f"{error}{_resume_hint(journal, folder)}") from error
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt(f"Stopped.{_resume_hint(journal, folder)}") from None
+    except KeyboardInterrupt as error:
+        report_so_far = error.report if isinstance(error, RunInterrupted) else None
+        raise RunInterrupted(f"Stopped.{_resume_hint(journal, folder)}", report_so_far) from None
     journal.remove()
     return report
 
 
-def _resume_hint(journal: Journal, folder: Path) -> str:
+def _write(folder: Path, report: Report) -> None:
+    """Write the results; a folder that somebody has removed is made again."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_run(folder, report)
+    except OSError as error:
+        raise UnwrittenResults(
+            f"Cannot write the results to {str(folder)!r}: {error.strerror or error}.", report
+        ) from error
+
+
+def _resume_hint(journal: JournalFile, folder: Path) -> str:
     """Return the number of simulations kept and the command that continues the run."""
-    if not journal.n:
+    if not journal.n or not journal.path.exists():
         return ""
-    return f" {journal.n:,} simulations are kept; go on with: rare-envs resume {folder}"
+    return f" {journal.n:,} simulations are kept; go on with: rare-envs resume {_shorten(folder)}"
+
+
+def _shorten(folder: Path) -> str:
+    """Return a path from the working directory, where the folder lies in it."""
+    with suppress(ValueError, OSError):
+        return str(folder.relative_to(Path.cwd()))
+    return str(folder)

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from agents.loading import strip_prefixes
 from rare_envs.egos.faults import Fault, FaultTolerant
 from rare_envs.study.errors import BadInput
 from rare_envs.study.question import Question
@@ -93,8 +94,8 @@ def check_same_files(journal: JournalFile, question: Question) -> None:
     changed = sorted(name for name in before if name in now and now[name] != before[name])
     if changed:
         raise BadInput(
-            f"{', '.join(changed)} has changed since the run in {str(journal.path.parent)!r} was begun: its simulations "
-            "are of another ego or other traffic. Begin anew with --force."
+            f"{', '.join(changed)} has changed since the run in {str(journal.path.parent)!r} was begun, and its "
+            "simulations are of what it was before. Begin anew with --force."
         )
 
 
@@ -106,25 +107,25 @@ def digest_files(question: Question) -> dict[str, str]:
         {}
     """
     bases = [name.strip() for name in (question.also_under or "").split(",")]
-    names = [question.ego, question.base, question.drivers, question.measure, *bases]
+    names = [strip_prefixes(question.ego), question.base, question.drivers, question.measure, *bases]
     paths = {path for name in names if name for path in _find_files(name)}
     return {str(path): hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest() for path in sorted(paths)}
 
 
 def _find_files(name: str) -> list[Path]:
     """Return the file that an option names, or that of its module: a.zip, noisy:a.zip, module:function."""
-    parts = [name, *name.split(":")]
+    parts = name.split(":")
+    modules = [Path(f"{part.replace('.', '/')}{end}") for part in parts[:-1] for end in (".py", "/__init__.py")]
     try:
-        files = [Path(part) for part in parts if Path(part).is_file()]
+        files = [path for path in (Path(name), *map(Path, parts), *modules) if path.is_file()]
     except (OSError, ValueError):  # too long a name, or with a null byte
         return []
-    if not files and len(parts) > 2:
-        files = [Path(found) for part in parts[1:] if (found := _find_module(part)) and Path(found).is_file()]
-    return files
+    found = [] if files else [origin for part in parts[:-1] if (origin := _find_module(part)) is not None]
+    return files or [path for path in map(Path, found) if path.is_file()]
 
 
 def _find_module(name: str) -> str | None:
-    """Return the file of a module at the top or one that is imported already; finding others would run code."""
+    """Return the file of a module; not of one in a package, since looking for it would import the package."""
     if not name.isidentifier():
         return None
     try:

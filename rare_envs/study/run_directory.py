@@ -19,6 +19,7 @@ from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.files import replace_file, replace_text
 from rare_envs.study.analysis.sensitivity_plot import save_sensitivity
 from rare_envs.study.columns import MAX_SHOWN, list_columns
+from rare_envs.study.errors import BadInput
 from rare_envs.study.plots import save_plot
 from rare_envs.study.report import Report
 from rare_envs.traffic.crash import CRASH_KINDS, NONE
@@ -41,6 +42,7 @@ CRASH = (
 """Columns of failures.csv that say what a failure ended in: `rare_envs.traffic.crash.Crash`."""
 FAULTS, FAULT_BLOCKS = "faults.csv", "faults.npz"
 """The same for scenarios on which the ego failed."""
+RESULT_FILES = (RESULT, FAILURES, BLOCKS, PLOT, SENSITIVITY, FAULTS, FAULT_BLOCKS)
 
 
 def write_run(folder: Path, report: Report) -> None:
@@ -66,6 +68,28 @@ def write_run(folder: Path, report: Report) -> None:
     (folder / SENSITIVITY).unlink(missing_ok=True)
     if isinstance(report.sensitivity, samplers.Sensitivity):
         save_sensitivity(folder / SENSITIVITY, report.sensitivity)
+
+
+def check_no_results(folder: Path, *names: str) -> None:
+    """Raise a BadInput if a folder has results of a finished run, or files of these names.
+
+    Args:
+        folder: It need not exist.
+        names: Names of further files.
+
+    Raises:
+        BadInput: It has one of them.
+    """
+    for name in (RESULT, FAILURES, *names):
+        if (folder / name).exists():
+            raise BadInput(f"There is a finished run in {str(folder)!r} ({name}): replace it by --force.")
+
+
+def remove_results(folder: Path) -> None:
+    """Remove the files of a finished run, and drafts that one left which was killed while it wrote."""
+    drafts = [path for name in RESULT_FILES for path in folder.glob(f".{Path(name).stem}.*.part{Path(name).suffix}")]
+    for path in (*(folder / name for name in RESULT_FILES), *drafts):
+        path.unlink(missing_ok=True)
 
 
 def format_json(value: dict[str, Any]) -> str:

@@ -5,7 +5,6 @@ Exit codes: 0 done, 2 bad input (one line on standard error), 3 done with warnin
 
 from __future__ import annotations
 
-import contextlib
 import sys
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
@@ -17,6 +16,7 @@ from rare_envs.study.cli.options import (
     EgoArgument,
     EnvArgument,
     EstimateOptions,
+    ForceOption,
     JsonOption,
     NoiseChoice,
     QuestionOptions,
@@ -26,7 +26,7 @@ from rare_envs.study.cli.options import (
     TrustOption,
     WorldOptions,
 )
-from rare_envs.study.cli.shell import OneLineErrors, print_json, show_interruption
+from rare_envs.study.cli.shell import OneLineErrors, keep_stdout_for_the_answer, print_json, show_what_is_known
 from rare_envs.study.errors import as_bad_input
 from rare_envs.threads import use_one_thread
 from training.command_line import DriverTrainingOptions, RecordingOptions, RunFolderOption, spread_options
@@ -61,6 +61,7 @@ def estimate_command(
     env: EnvArgument,
     options: EstimateOptions,
     out: Annotated[Path | None, typer.Option(help="Folder for result.json, failures.csv and plot.png.")] = None,
+    force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Estimate how often an ego fails, with an interval, and show its most likely failure."""
@@ -68,24 +69,26 @@ def estimate_command(
     from rare_envs.study.question import Question, prepare
 
     question = Question(env_id=env, **options.arguments())
-    with (
-        show_interruption(),
-        contextlib.redirect_stdout(sys.stderr),
-    ):  # an ego may print, and standard output is for the answer
+    with show_what_is_known(lambda known: _show(known, None, as_json)), keep_stdout_for_the_answer():
         study = prepare(question)
-        report = run(study, progress=True) if out is None else run_into(out, study, progress=True)
+        report = run(study, progress=True) if out is None else run_into(out, study, progress=True, force=force)
     _answer(report, out, as_json)
 
 
 def _answer(report: Any, out: Path | None, as_json: bool) -> NoReturn:
     """Print a report and exit."""
+    _show(report, out, as_json)
+    raise typer.Exit(DOUBTFUL if report.doubtful else 0)
+
+
+def _show(report: Any, out: Path | None, as_json: bool) -> None:
+    """Print a report."""
     from rare_envs.study.cli.printing import print_report
 
     if as_json:
         print_json(report.to_dict())
     else:
         print_report(report, out)
-    raise typer.Exit(DOUBTFUL if report.doubtful else 0)
 
 
 @app.command("risk")
@@ -95,13 +98,18 @@ def risk_command(
     ego: EgoArgument,
     options: RiskOptions,
     out: Annotated[Path | None, typer.Option(help="Folder for risk.json, risk.png and a run of each scenario.")] = None,
+    force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Estimate collisions per million km, over scenarios that count nothing twice, with an honest interval."""
     from rare_envs.study.rates.total_risk import risk
 
-    with show_interruption(), contextlib.redirect_stdout(sys.stderr), as_bad_input(ValueError):
-        found = risk(ego, out=out, progress=True, **options.arguments())
+    with (
+        show_what_is_known(lambda known: _show(known, None, as_json)),
+        keep_stdout_for_the_answer(),
+        as_bad_input(ValueError),
+    ):
+        found = risk(ego, out=out, progress=True, force=force, **options.arguments())
     if as_json:
         print_json(found.to_dict())
     else:
@@ -134,13 +142,16 @@ def resume_command(
     ego: Annotated[str | None, typer.Option(help="New address of an ego in another program, tcp://...")] = None,
     on_error: Annotated[str | None, typer.Option(help="Instead of what the run had: raise, failure or bound.")] = None,
     trust: TrustOption = False,
+    mend: Annotated[
+        bool, typer.Option("--mend", help="Of a damaged journal, keep the simulations before the damage.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Go on with a run whose ego has gone, or that was stopped; the answer is that of an undisturbed run."""
     from rare_envs.study.evaluate import resume
 
-    with show_interruption(), contextlib.redirect_stdout(sys.stderr):
-        report = resume(run, ego, on_error, trust, progress=True)
+    with show_what_is_known(lambda known: _show(known, None, as_json)), keep_stdout_for_the_answer():
+        report = resume(run, ego, on_error, trust, progress=True, mend=mend)
     _answer(report, run, as_json)
 
 
@@ -154,6 +165,7 @@ def compare_command(
     options: QuestionOptions,
     max_sim: Annotated[int, typer.Option(help="Largest number of simulations, of both egos together.")] = 12_000,
     out: Annotated[Path | None, typer.Option(help="Folder for comparison.json and failures.csv.")] = None,
+    force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Estimate how many times likelier ego A fails than ego B, with an interval, from the same scenarios."""
@@ -161,8 +173,8 @@ def compare_command(
     from rare_envs.study.question import Question
 
     question = Question(env_id=env, ego=ego_a, max_sim=max_sim, **options.arguments())
-    with contextlib.redirect_stdout(sys.stderr):
-        comparison = compare_egos(question, ego_b, progress=True, out=out)
+    with keep_stdout_for_the_answer():
+        comparison = compare_egos(question, ego_b, progress=True, out=out, force=force)
     if as_json:
         print_json(comparison.answer)
     else:
@@ -238,7 +250,7 @@ def export_ego_command(
     """Write a saved policy as ONNX, normalisation, memory and clipping included, and check that both act alike."""
     from rare_envs.study.cli.export_ego import export_ego
 
-    with contextlib.redirect_stdout(sys.stderr):
+    with keep_stdout_for_the_answer():
         done = export_ego(model, out, algo=algo, trust=trust)
     if as_json:
         print_json(done)
@@ -264,7 +276,7 @@ def replay_command(
 
     if out is not None:
         check_film_path(out)
-    with contextlib.redirect_stdout(sys.stderr):
+    with keep_stdout_for_the_answer():
         recorded = find_failure(run, failure, trust)
         drive = drive_again(recorded.problem, recorded.x)
         if out is not None:

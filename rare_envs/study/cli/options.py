@@ -51,6 +51,7 @@ class LeaderChoice(str, Enum):
 
 EnvArgument = Annotated[str, typer.Argument(metavar="ENV", help="Environment, such as rare_envs/CutIn-v0.")]
 EgoArgument = Annotated[str, typer.Argument(metavar="EGO", help="An ego, as for estimate --ego.")]
+ForceOption = Annotated[bool, typer.Option("--force", help="Replace what the folder of --out has of an earlier run.")]
 AlgoOption = Annotated[str | None, typer.Option(help="Algorithm of the .zip, if the file does not tell.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
 SeedOption = Annotated[int, typer.Option(help="Seed; the same seed gives the same answer.")]

@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import json
+import os
+import signal
 import sys
-from collections.abc import Iterator
+import threading
+import warnings
+from collections.abc import Callable, Iterator
+from types import FrameType
 from typing import Any, NoReturn
 
 import typer
@@ -18,39 +24,135 @@ _UsageError: type[Exception] = typer.BadParameter.__bases__[0]
 """Error that Typer raises for a wrong option or a missing word; older versions of Typer take it from click."""
 
 
+class Terminated(KeyboardInterrupt):
+    """The process was asked to end, by a signal other than that of Ctrl-C."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(f"ended by {signal.Signals(number).name}")
+        self.number = number
+
+
 class OneLineErrors(TyperGroup):
-    """Commands whose errors are one line on standard error and exit code 2."""
+    """Commands whose errors are one line on standard error and exit code 2.
+
+    SIGTERM and SIGHUP end a command as Ctrl-C does; the exit code is 128 and the number of the signal.
+    """
 
     def main(self, *args: Any, **extra: Any) -> NoReturn:
         """Run a command and exit."""
+        received: list[int] = []
         try:
-            code = super().main(*args, **{**extra, "standalone_mode": False})
+            with _signals_as_exceptions(received), _one_line_warnings():
+                code = super().main(*args, **{**extra, "standalone_mode": False})
         except _UsageError as error:
             words = getattr(error, "format_message")()  # noqa: B009  (its class differs by version)
             _fail(f"{words.rstrip('.')}{'' if words.endswith('?') else '.'} See rare-envs --help.")
         except (BadInput, EgoGone) as error:
             _fail(str(error))
+        except BrokenPipeError:  # whoever read the answer has enough of it
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # nothing more to say when Python flushes
+            sys.exit(128 + signal.SIGPIPE)
         except (KeyboardInterrupt, typer.Abort):
-            print("stopped", file=sys.stderr)
-            sys.exit(130)
+            _print_stderr(signal.Signals(received[0]).name + ": stopped" if received else "stopped")
+            sys.exit(128 + (received[0] if received else signal.SIGINT))
         sys.exit(code if isinstance(code, int) else 0)
+
+
+@contextlib.contextmanager
+def _signals_as_exceptions(received: list[int]) -> Iterator[None]:
+    """Raise `Terminated` on SIGTERM and SIGHUP, where they would end the process without a word."""
+
+    def end(number: int, frame: FrameType | None) -> None:
+        received.append(number)
+        raise Terminated(number)
+
+    before: dict[int, Any] = {}
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)):
+            if signal.getsignal(number) is signal.SIG_DFL:  # nohup has SIGHUP ignored
+                before[number] = signal.signal(number, end)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def _one_line_warnings() -> Iterator[None]:
+    """Print warnings in one line."""
+
+    def show(message: Warning | str, *_: Any, **__: Any) -> None:
+        _print_stderr("rare-envs: " + " ".join(str(message).split()))
+
+    before = warnings.showwarning
+    warnings.showwarning = show
+    try:
+        yield
+    finally:
+        warnings.showwarning = before
+
+
+def _print_stderr(line: str) -> None:
+    """Print a line on standard error, if there still is anybody to read it."""
+    with contextlib.suppress(OSError, ValueError):
+        print(line, file=sys.stderr, flush=True)
 
 
 def _fail(message: str) -> NoReturn:
     """Print an error in one line, and exit."""
-    print("rare-envs: " + " ".join(message.split()), file=sys.stderr)
+    _print_stderr("rare-envs: " + " ".join(message.split()))
     sys.exit(2)
 
 
 @contextlib.contextmanager
-def show_interruption() -> Iterator[None]:
-    """Print the message of a KeyboardInterrupt, which says how to continue the run; Typer would drop it."""
+def show_what_is_known(show: Callable[[Any], None]) -> Iterator[None]:
+    """Print what a run knows that was interrupted, or whose results could not be written.
+
+    The message of a KeyboardInterrupt, which says how to continue the run, is printed too; Typer would drop it.
+
+    Args:
+        show: Prints a report.
+    """
     try:
         yield
-    except KeyboardInterrupt as error:
-        if str(error):
-            print(error, file=sys.stderr)
+    except (KeyboardInterrupt, BadInput) as error:
+        report = getattr(error, "report", None)  # of `RunInterrupted` and `UnwrittenResults`, slow to import
+        if report is not None:
+            show(report)
+        if isinstance(error, KeyboardInterrupt) and str(error):
+            _print_stderr(str(error))
         raise
+
+
+@contextlib.contextmanager
+def keep_stdout_for_the_answer() -> Iterator[None]:
+    """Send what is printed to standard error, what libraries in C and child processes print included."""
+    with contextlib.redirect_stdout(sys.stderr), _redirect_descriptor():
+        yield
+
+
+@contextlib.contextmanager
+def _redirect_descriptor() -> Iterator[None]:
+    """Let file descriptor 1 be file descriptor 2, where both are open."""
+    try:
+        answer = os.dup(1)
+        os.dup2(2, 1)
+    except OSError:
+        yield
+        return
+    try:
+        yield
+    finally:
+        _flush_c()
+        os.dup2(answer, 1)
+        os.close(answer)
+
+
+def _flush_c() -> None:
+    """Write what C's standard library still has to write."""
+    with contextlib.suppress(OSError, AttributeError, TypeError):  # there is none by this name on Windows
+        ctypes.CDLL(None).fflush(None)
 
 
 def print_json(value: dict[str, Any]) -> None:

@@ -18,7 +18,7 @@ from rare_envs.study.evaluate import run, run_into
 from rare_envs.study.question import Question, Study, prepare
 from rare_envs.study.rates.result import Risk, ScenarioRisk
 from rare_envs.study.rates.sites import choose_base, compare_sites
-from rare_envs.study.run_directory import format_json
+from rare_envs.study.run_directory import check_no_results, format_json
 
 SCENARIO_SET = ("cut_in", "hard_brake")
 """Scenarios that count nothing twice."""
@@ -35,6 +35,7 @@ def risk(
     bases: Mapping[str, str | PathLike[str]] | None = None,
     out: str | PathLike[str] | None = None,
     progress: bool = False,
+    force: bool = False,
     **options: Any,
 ) -> Risk:
     """Estimate the collisions of an ego per million km, with an interval that holds what is not known of traffic.
@@ -51,6 +52,7 @@ def risk(
         bases: Base distributions, names or JSON files, by scenario, in place of those of the first site.
         out: Folder for the picture, the numbers and a folder of each scenario, see `rare-envs risk --out`.
         progress: Show a bar on standard error.
+        force: Replace runs that the folder has, finished or not.
         **options: Further fields of `rare_envs.study.Question`: seed, max_sim (of each scenario), method, and so on.
 
     Raises:
@@ -72,9 +74,12 @@ def risk(
             find_frequency(study)
         prepared.append((study, notes))
     folder = None if out is None else Path(out)
+    if folder is not None and not force:
+        for name in scenarios:  # all of them, before the first one is run
+            check_no_results(folder / name)
     found = Risk(
         ego=ego if isinstance(ego, str) else type(ego).__name__,
-        scenarios=tuple(_evaluate(study, notes, sites[1:], folder, progress) for study, notes in prepared),
+        scenarios=tuple(_evaluate(study, notes, sites[1:], folder, progress, force) for study, notes in prepared),
     )
     if folder is not None:
         write_risk(folder, found)
@@ -122,11 +127,11 @@ def _prepare(ego: Any, name: str, base: str, options: Mapping[str, Any]) -> Stud
 
 
 def _evaluate(
-    study: Study, notes: tuple[str, ...], other_sites: Sequence[str], folder: Path | None, progress: bool
+    study: Study, notes: tuple[str, ...], other_sites: Sequence[str], folder: Path | None, progress: bool, force: bool
 ) -> ScenarioRisk:
     """Run one scenario and return its rate, with the spread between sites if there are others."""
     name = study.problem.world.scenario.name
-    report = run(study, progress) if folder is None else run_into(folder / name, study, progress)
+    report = run(study, progress) if folder is None else run_into(folder / name, study, progress, force)
     assert report.rate is not None  # `risk` has looked for the frequency before
     factors = compare_sites(report, other_sites, progress)
     logs = [0.0, *(float(np.log(factors[site])) for site in other_sites if factors.get(site, 0) > 0)]
