@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from contextlib import closing, suppress
+from contextlib import closing
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from rare_envs.egos.errors import EgoGone
 from rare_envs.egos.faults import FaultTolerant
 from rare_envs.study.crash_kinds import CrashKinds, classify_failures
 from rare_envs.study.errors import BadInput, output_folder
-from rare_envs.study.journal import JournaledProblem, begin_journal, check_same_files, continue_journal
+from rare_envs.study.journal import JOURNAL, JournaledProblem, begin_journal, check_same_files, continue_journal
 from rare_envs.study.question import Study, prepare
 from rare_envs.study.report import Report
 from rare_envs.study.run_directory import check_no_results, remove_results, write_run
@@ -121,9 +121,8 @@ def run_into(folder: Path, study: Study, progress: bool = False, force: bool = F
         ...     sorted(path.name for path in Path(folder).iterdir())
         ['failures.csv', 'plot.png', 'result.json']
     """
-    folder = folder.absolute()  # an ego may change the working directory
     with output_folder(folder):
-        if not force:
+        if not force and not (folder / JOURNAL).exists():
             check_no_results(folder)
         with closing(begin_journal(folder, study.question, force)) as journal:
             remove_results(folder)
@@ -160,7 +159,6 @@ def resume(
             ...
         rare_envs.study.errors.BadInput: There is no unfinished run in 'runs/nowhere': it has no journal.npy.
     """
-    folder = folder.absolute()
     journal, question = continue_journal(folder, mend)
     with closing(journal):
         if ego is not None and {find_ego_kind(ego), find_ego_kind(question.ego)} != {"remote"}:
@@ -171,9 +169,10 @@ def resume(
 
 
 def _run(folder: Path, study: Study, journal: JournalFile, progress: bool) -> Report:
+    target = folder.absolute()  # an ego may change the working directory
     try:
         report = run(study, progress, journal)
-        _write(folder, report)
+        _write(target, report)
     except UnwrittenResults as error:
         raise UnwrittenResults(f"{error}{_resume_hint(journal, folder)}", error.report) from error
     except BadInput as error:
@@ -200,13 +199,6 @@ def _write(folder: Path, report: Report) -> None:
 
 def _resume_hint(journal: JournalFile, folder: Path) -> str:
     """Return the number of simulations kept and the command that continues the run."""
-    if not journal.n or not journal.path.exists():
+    if not journal.n or not journal.kept:
         return ""
-    return f" {journal.n:,} simulations are kept; go on with: rare-envs resume {_shorten(folder)}"
-
-
-def _shorten(folder: Path) -> str:
-    """Return a path from the working directory, where the folder lies in it."""
-    with suppress(ValueError, OSError):
-        return str(folder.relative_to(Path.cwd()))
-    return str(folder)
+    return f" {journal.n:,} simulations are kept; go on with: rare-envs resume {folder}"

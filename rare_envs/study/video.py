@@ -18,6 +18,7 @@ from rare_envs.files import replace_file
 from rare_envs.problem import DrivingProblem
 from rare_envs.study.columns import MAX_SHOWN, format_value
 from rare_envs.study.errors import BadInput
+from rare_envs.study.journal import JOURNAL
 from rare_envs.study.question import Question, prepare
 from rare_envs.study.replay import Drive
 from rare_envs.study.run_directory import FAILURES, RESULT, read_failures
@@ -55,6 +56,8 @@ def find_failure(folder: Path, number: int, trust: bool = False) -> RecordedFail
     Raises:
         BadInput: There is no such run or failure, or what it was about cannot be loaded any longer.
     """
+    if (folder / JOURNAL).exists():
+        raise BadInput(f"The run in {str(folder)!r} is not finished: rare-envs resume {folder} comes first.")
     try:
         recorded = json.loads((folder / RESULT).read_text(encoding="utf-8"))["question"]
         table = read_failures(folder)

@@ -74,6 +74,11 @@ class JournalFile:
         self._synced = time.monotonic()
         self._warned = False
 
+    @property
+    def kept(self) -> bool:
+        """Whether all simulations so far are in a file that is still there."""
+        return not self._waiting and self._records.exists
+
     @classmethod
     def create(cls, path: Path, head: dict[str, Any], replace: bool = False) -> JournalFile:
         """Begin a journal.
@@ -187,10 +192,11 @@ class JournalFile:
         """Warn once that simulations are not kept."""
         if not self._warned:
             self._warned = True
-            text = (
-                f"Cannot write {str(self.path)!r} ({error.strerror}): simulations from here on are lost if the run is"
+            warnings.warn(
+                f"Cannot write {str(self.path)!r}: {error.strerror}. The run goes on, but if it is interrupted now the "
+                "simulations from here on are lost.",
+                stacklevel=4,
             )
-            warnings.warn(f"{text} interrupted.", stacklevel=4)
 
 
 def _has_simulations(records: RecordFile) -> bool:

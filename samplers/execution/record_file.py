@@ -58,12 +58,12 @@ class RecordFile:
             JournalError: Another process has it open.
             OSError: It cannot be opened.
         """
-        self.path = path
+        self.path, self._absolute = path, path.absolute()  # the working directory may change
         flags = os.O_RDWR | (os.O_CREAT if new else 0) | getattr(os, "O_BINARY", 0)
         # unbuffered, so that nothing is left behind of a write that failed
         self._file: IO[bytes] = open(os.open(path, flags, 0o666), "r+b", buffering=0)
         self._digest, self._end = b"", len(MAGIC)  # of the records that have been read or written
-        if not lock_file(self._file) or not _still_there(self._file, path):
+        if not lock_file(self._file) or not self.exists:
             self._file.close()
             raise JournalError(f"Another process is writing {str(path)!r}.")
 
@@ -71,6 +71,14 @@ class RecordFile:
     def size(self) -> int:
         """Length of the file in bytes."""
         return os.fstat(self._file.fileno()).st_size
+
+    @property
+    def exists(self) -> bool:
+        """Whether the path still names this file."""
+        try:
+            return os.path.samestat(os.fstat(self._file.fileno()), self._absolute.stat())
+        except OSError:
+            return False
 
     def clear(self) -> None:
         """Remove all records."""
@@ -146,8 +154,8 @@ class RecordFile:
 
     def remove(self) -> None:
         """Remove the file."""
-        if _still_there(self._file, self.path):
-            self.path.unlink()
+        if self.exists:
+            self._absolute.unlink()
         self._file.close()
 
     def _write_at_end(self, content: bytes) -> None:
@@ -208,11 +216,3 @@ def lock_file(file: IO[bytes]) -> bool:
     except OSError:  # no locks here
         return True
     return True
-
-
-def _still_there(file: IO[bytes], path: Path) -> bool:
-    """Return whether the path still names the open file."""
-    try:
-        return os.path.samestat(os.fstat(file.fileno()), path.stat())
-    except FileNotFoundError:
-        return False

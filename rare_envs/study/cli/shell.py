@@ -53,8 +53,11 @@ class OneLineErrors(TyperGroup):
             os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # nothing more to say when Python flushes
             sys.exit(128 + signal.SIGPIPE)
         except (KeyboardInterrupt, typer.Abort):
-            _print_stderr(signal.Signals(received[0]).name + ": stopped" if received else "stopped")
-            sys.exit(128 + (received[0] if received else signal.SIGINT))
+            code = 128 + signal.SIGINT
+        if received or code == 128 + signal.SIGINT:
+            number = signal.Signals(received[0] if received else signal.SIGINT)
+            _print_stderr(f"rare-envs: stopped by {number.name}")
+            code = 128 + number
         sys.exit(code if isinstance(code, int) else 0)
 
 

@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +20,10 @@ import rare_envs
 from rare_envs.problem import DrivingProblem
 from rare_envs.study import evaluate, run_directory
 from rare_envs.study.errors import BadInput
-from rare_envs.study.journal import JOURNAL, Journal
+from rare_envs.study.journal import JOURNAL, continue_journal, digest_files
 from rare_envs.study.question import Question, prepare
+from samplers.execution.record_file import RecordFile
+from tests.rare_envs.study.refusals import assert_refused
 
 Cli = Callable[..., Result]
 FILES = ("result.json", "failures.csv")
@@ -98,11 +100,11 @@ def test_the_answer_is_that_of_an_undisturbed_run(method: str, after: int, again
     ):
         evaluate.run_into(frail / "run", prepare(asked))
     assert [path.name for path in (frail / "run").iterdir()] == [JOURNAL]
-    kept = Journal(frail / "run")
-    assert kept.question["method"] == method
+    kept, about = continue_journal(frail / "run")
+    assert about.method == method
     kept.close()
     with (frail / "run" / JOURNAL).open("ab") as file:  # as if it had been killed while it wrote
-        file.write(b"\x93NUMPY\x01\x00v")
+        file.write(b"\x07\x00\x00\x00\x00")
     (frail / "left").write_text(str(again))  # it goes away again, a little later
     with pytest.raises(BadInput, match="are kept"):
         evaluate.resume(frail / "run")
@@ -142,7 +144,7 @@ def test_on_the_command_line(cli: Cli, frail: Path, risky: str, monkeypatch: pyt
     assert (again.exit_code, again.stdout) == (2, "")
     assert "go on with it by rare-envs resume run" in again.stderr
     monkeypatch.setenv("FRAIL", "stop")
-    (frail / "left").write_text("30")
+    (frail / "left").write_text("60")
     stopped = cli("resume", "run")
     assert stopped.exit_code == 130
     assert "Stopped. 400 simulations are kept; go on with: rare-envs resume run" in stopped.stderr
@@ -152,24 +154,115 @@ def test_on_the_command_line(cli: Cli, frail: Path, risky: str, monkeypatch: pyt
     assert (cli("resume", "run").exit_code, cli("resume", "nowhere").exit_code) == (2, 2)
 
 
+def change_head(path: Path, **change: Any) -> None:
+    """Give a journal another head, with checksums that match."""
+    records = RecordFile(path)
+    records.mend()
+    head, *batches = iter(records.read, None)
+    records.clear()
+    records.write(json.dumps({**json.loads(head), **change}).encode())
+    for batch in batches:
+        records.write(batch)
+    records.close()
+
+
 def test_another_run_does_not_take_the_journal(frail: Path, risky: str) -> None:
     (frail / "left").write_text("150")
+    asked = question(risky, "mc")
     with pytest.raises(BadInput, match="are kept"):
-        evaluate.run_into(frail / "run", prepare(question(risky, "mc")))
+        evaluate.run_into(frail / "run", prepare(asked))
     journal = frail / "run" / JOURNAL
     content = journal.read_bytes()
-    journal.write_bytes(content.replace(b'"seed": 3', b'"seed": 4'))
-    with pytest.raises(BadInput, match="asks for other scenarios"):
+    change_head(journal, question=asdict(replace(asked, seed=4)))
+    with pytest.raises(BadInput, match="asks for other points"):
         evaluate.resume(frail / "run")
-    journal.write_bytes(content.replace(b'"version": "0', b'"version": "9'))
-    with pytest.raises(BadInput, match="begun by version 9"):
+    change_head(journal, question=asdict(asked), version="9.0")
+    with pytest.raises(BadInput, match=r"begun by version 9\.0"):
         evaluate.resume(frail / "run")
+    for head in ({"question": {"env": 1}}, {"question": None}, {"question": [1]}):
+        journal.write_bytes(content)
+        change_head(journal, **head)
+        with pytest.raises(BadInput, match="Cannot take up"):
+            evaluate.resume(frail / "run")
     journal.write_bytes(content)
     with pytest.raises(BadInput, match="whose address has changed only"):
         evaluate.resume(frail / "run", ego="tcp://127.0.0.1:5555")
     journal.write_bytes(b"nothing")
-    with pytest.raises(BadInput, match="Cannot take up"):
+    with pytest.raises(BadInput, match="is of another kind"):
         evaluate.resume(frail / "run")
+    journal.write_bytes(content)
+    assert evaluate.resume(frail / "run").estimate.n_sim == 1200
+
+
+def test_values_of_f_that_were_zeroed_are_refused_and_those_before_them_can_be_kept(
+    frail: Path, risky: str, cli: Cli
+) -> None:
+    asked = question(risky, "mc")
+    evaluate.run_into(frail / "whole", prepare(asked))
+    (frail / "left").write_text("150")
+    with pytest.raises(BadInput, match="600 simulations are kept"):
+        evaluate.run_into(frail / "run", prepare(asked))
+    journal = frail / "run" / JOURNAL
+    content = journal.read_bytes()
+    second = content.index(b"points", content.index(b"points") + 1)
+    journal.write_bytes(content[: second + 100] + bytes(1200) + content[second + 1300 :])
+    refused = cli("resume", "run")
+    assert_refused(refused, "damaged: record 3 does not match its checksum", "--mend")
+    done = cli("resume", "run", "--mend", "--json")
+    assert done.exit_code in (0, 3), done.stderr
+    assert answer(frail / "run") == answer(frail / "whole")
+
+
+def test_an_ego_that_has_changed_is_noticed(frail: Path, risky: str) -> None:
+    (frail / "left").write_text("150")
+    with pytest.raises(BadInput, match="are kept"):
+        evaluate.run_into(frail / "run", prepare(question(risky, "mc")))
+    before = (frail / "frail.py").read_text()
+    assert sorted(Path(name).name for name in digest_files(question(risky, "mc"))) == ["frail.py", "risky.json"]
+    (frail / "frail.py").write_text(before.replace("gap - 0.3", "gap - 0.2"))
+    with pytest.raises(BadInput, match=r"frail\.py has changed since the run"):
+        evaluate.resume(frail / "run")
+    change_head(frail / "run" / JOURNAL, files={})  # as if the part that has changed were not in that file
+    sys.modules.pop("frail")
+    with pytest.raises(BadInput, match=r"f is .* at a point where .*: it has changed"):
+        evaluate.resume(frail / "run")
+    (frail / "frail.py").write_text(before)
+    sys.modules.pop("frail")
+    assert evaluate.resume(frail / "run").estimate.n_sim == 1200
+
+
+def test_a_run_is_continued_by_one_process_alone(frail: Path, risky: str) -> None:
+    (frail / "left").write_text("150")
+    with pytest.raises(BadInput, match="are kept"):
+        evaluate.run_into(frail / "run", prepare(question(risky, "mc")))
+    journal, _ = continue_journal(frail / "run")
+    for attempt in (
+        lambda: evaluate.resume(frail / "run"),
+        lambda: evaluate.run_into(frail / "run", prepare(question(risky, "mc")), force=True),
+    ):
+        with pytest.raises(BadInput, match="Another process is writing"):
+            attempt()
+    journal.close()
+    evaluate.resume(frail / "run")
+
+
+def test_a_finished_run_is_replaced_by_force_alone_and_never_replayed_for_a_new_one(
+    frail: Path, risky: str, cli: Cli
+) -> None:
+    evaluate.run_into(frail / "run", prepare(question(risky, "mc")))
+    first = answer(frail / "run")
+    with pytest.raises(BadInput, match=r"There is a finished run in .* replace it by --force"):
+        evaluate.run_into(frail / "run", prepare(question(risky, "mc")))
+    assert answer(frail / "run") == first
+    (frail / "left").write_text("150")
+    new = replace(question(risky, "mc"), seed=8)
+    with pytest.raises(BadInput, match="are kept"):
+        evaluate.run_into(frail / "run", prepare(new), force=True)
+    assert [path.name for path in (frail / "run").iterdir()] == [JOURNAL]
+    assert_refused(cli("replay", "run"), "is not finished: rare-envs resume run comes first")
+    evaluate.resume(frail / "run")
+    evaluate.run_into(frail / "new", prepare(new))
+    assert answer(frail / "run") == answer(frail / "new") != first
 
 
 def killed_once_there_is(path: Path, process: subprocess.Popen[str]) -> None:

@@ -51,7 +51,7 @@ def test_scenarios_on_which_the_ego_fails_are_listed(cli: Cli, here: Path, risky
     words = (*SMALL, "--base", risky, "--ego", f"egos_here:{ego}", "--out", here / "run")
     found = {}
     for on_error in ("bound", "failure"):
-        result = cli(*words, "--on-error", on_error)
+        result = cli(*words, "--on-error", on_error, "--force")
         assert result.exit_code == 3, result.output  # the number is doubtful
         found[on_error] = json.loads((here / "run" / "result.json").read_text())
         assert f"the ego failed twice on {found[on_error]['n_faults']} scenarios" in result.stdout
@@ -67,7 +67,7 @@ def test_scenarios_on_which_the_ego_fails_are_listed(cli: Cli, here: Path, risky
     assert found["bound"]["interval"][0] == 0.0
     assert found["bound"]["interval"][1] == answer["interval"][1]
     assert np.isfinite(np.array([row[:-1] for row in rows], dtype=float)).all()
-    assert cli(*SMALL, "--ego", "idm", "--out", here / "run").exit_code in (0, 3)
+    assert cli(*SMALL, "--ego", "idm", "--out", here / "run", "--force").exit_code in (0, 3)
     assert not (here / "run" / "faults.csv").exists()
 
 

@@ -1,0 +1,247 @@
+"""A run that is killed, or cannot write, comes to the result of an undisturbed one; nobody else's journal is taken."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import samplers
+from samplers.execution import journal as journals
+from samplers.execution.journal import JournalFile, Record, digest_points
+from samplers.execution.record_file import JournalError, RecordFile
+from samplers.problem import FloatArray
+
+F = Callable[[FloatArray], FloatArray]
+
+
+def half_space(x: FloatArray) -> FloatArray:
+    return 3.0 - x.sum(axis=1) / x.shape[1] ** 0.5
+
+
+def raising(x: FloatArray) -> FloatArray:
+    if (x[:, 0] > 2.5).any():
+        raise ArithmeticError("off the map")
+    return half_space(x)
+
+
+def run(path: Path | None, f: F = half_space, method: str = "two-stage", **more: object) -> samplers.Estimate:
+    arguments = {"seed": 4, "max_sim": 3000, "on_error": "bound", "journal": path, **more}
+    return samplers.estimate(samplers.FunctionProblem(f, 4), method, **arguments)  # type: ignore[arg-type]
+
+
+class Counted:
+    def __init__(self, f: F = half_space, stop_at: int | None = None) -> None:
+        self.f, self.sizes, self.stop_at = f, [], stop_at  # type: ignore[var-annotated]
+
+    def __call__(self, x: FloatArray) -> FloatArray:
+        if len(self.sizes) == self.stop_at:
+            raise KeyboardInterrupt
+        self.sizes.append(len(x))
+        return self.f(x)
+
+
+@pytest.mark.parametrize("method", ["two-stage", "adss", "mc", "ce"])
+@pytest.mark.parametrize("f", [half_space, raising])
+def test_cut_anywhere_it_comes_to_the_same_result(method: str, f: F, tmp_path: Path) -> None:
+    path = tmp_path / "journal.bin"
+    whole = run(None, f, method)
+    assert run(path, f, method) == whole
+    content = path.read_bytes()
+    rng = np.random.default_rng(0)
+    for length in rng.integers(100, len(content), size=4):
+        path.write_bytes(content[:length])
+        assert run(path, f, method) == whole
+        assert path.read_bytes() == content
+
+
+def test_a_finished_run_takes_no_simulations_but_those_that_check_f(tmp_path: Path) -> None:
+    first = run(tmp_path / "j")
+    counted = Counted()
+    assert run(tmp_path / "j", counted) == first
+    assert counted.sizes == [8]
+
+
+def test_a_drawn_seed_is_that_of_the_journal(tmp_path: Path) -> None:
+    first = run(tmp_path / "j", method="mc", seed=None)
+    assert run(tmp_path / "j", method="mc", seed=None) == first
+    assert run(tmp_path / "j", method="mc", seed=first.seed) == first
+
+
+def test_replicates_and_a_longer_run_of_plain_monte_carlo_continue(tmp_path: Path) -> None:
+    short = samplers.MonteCarlo(batch=500)
+    problem = samplers.FunctionProblem(half_space, 4)
+    samplers.estimate(problem, short, seed=1, max_sim=2000, journal=tmp_path / "j")
+    counted = Counted()
+    longer = samplers.estimate(
+        samplers.FunctionProblem(counted, 4), short, seed=1, max_sim=3000, journal=tmp_path / "j"
+    )
+    assert longer == samplers.estimate(problem, short, seed=1, max_sim=3000)
+    assert counted.sizes == [8, 500, 500]
+
+
+def test_what_does_not_belong_to_the_journal_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "j"
+    run(path)
+    content = path.read_bytes()
+    cases: list[tuple[str, dict[str, object]]] = [
+        ("begun with seed 4, and this run has 5", {"seed": 5}),
+        ("asks for other points", {"method": "ce"}),
+        ("it has changed since", {"f": lambda x: half_space(x) + 0.1}),
+    ]
+    for words, change in cases:
+        with pytest.raises(JournalError, match=words):
+            run(path, **change)  # type: ignore[arg-type]
+    with pytest.raises(JournalError, match="begun with dim 4, and this run has 3"):
+        samplers.estimate(samplers.FunctionProblem(half_space, 3), seed=4, journal=path)
+    assert path.read_bytes() == content
+
+
+def test_an_f_that_is_random_can_be_continued(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+
+    def noisy(x: FloatArray) -> FloatArray:
+        return half_space(x) + 0.3 * rng.standard_normal(len(x))
+
+    first = run(tmp_path / "j", noisy, "mc")
+    assert run(tmp_path / "j", noisy, "mc") == first
+
+
+def test_no_journal_is_taken_for_one(tmp_path: Path) -> None:
+    (tmp_path / "j").write_bytes(b"x" * 500)
+    with pytest.raises(JournalError, match="of another kind"):
+        run(tmp_path / "j")
+    (tmp_path / "empty").touch()
+    assert run(tmp_path / "empty", method="mc").n_sim == 3000
+    for payload in (b"[1]", b"{", b"[" * 100_000, b"1" * 5000):
+        records = RecordFile(tmp_path / "k", new=True)
+        records.clear()
+        records.write(payload)
+        records.close()
+        with pytest.raises(JournalError, match="is no journal"):
+            JournalFile.open(tmp_path / "k")
+    for batch in (b"", b"{}\n", b'{"points": 1, "notes": {}}\n1234567', b"[1]\n" + bytes(8), b"{" * 10**5 + b"\n"):
+        journal = JournalFile.create(tmp_path / "m", {"dim": 4, "seed": 4})
+        journal.close()
+        records = RecordFile(tmp_path / "m")
+        records.mend()
+        records.read()
+        records.write(batch)
+        records.close()
+        with pytest.raises(JournalError, match="no journal of this version"):
+            run(tmp_path / "m")
+        (tmp_path / "m").unlink()
+
+
+def test_creating_replaces_an_empty_journal_alone(tmp_path: Path) -> None:
+    path = tmp_path / "j"
+    JournalFile.create(path, {"seed": 1}).close()
+    journal = JournalFile.create(path, {"seed": 2})
+    journal.append(Record("points", np.ones(3), {}))
+    with pytest.raises(JournalError, match="Another process"):
+        JournalFile.create(path, {"seed": 3}, replace=True)
+    journal.close()
+    with pytest.raises(JournalError, match="a journal already"):
+        JournalFile.create(path, {"seed": 3})
+    replaced = JournalFile.create(path, {"seed": 3}, replace=True)
+    assert replaced.read_next() is None
+    replaced.remove()
+    assert not path.exists()
+
+
+def test_a_full_disk_ends_nothing_and_what_waits_is_written_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    full = [False]
+    write = RecordFile.write
+
+    def limited(self: RecordFile, payload: bytes) -> None:
+        if full[0]:
+            raise OSError(28, "No space left on device")
+        write(self, payload)
+
+    monkeypatch.setattr(RecordFile, "write", limited)
+    calls: list[int] = []
+
+    def f(x: FloatArray) -> FloatArray:
+        calls.append(len(x))
+        full[0] = 2 <= len(calls) < 5
+        return half_space(x)
+
+    method = samplers.MonteCarlo(batch=300)
+    with pytest.warns(UserWarning, match=r"Cannot write .*: No space left on device\. .* are lost") as seen:
+        result = samplers.estimate(samplers.FunctionProblem(f, 4), method, seed=1, max_sim=3000, journal=tmp_path / "j")
+    assert len(seen) == 1
+    assert result == samplers.estimate(samplers.FunctionProblem(half_space, 4), method, seed=1, max_sim=3000)
+    calls.clear()
+    full[0] = False
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        again = samplers.estimate(samplers.FunctionProblem(f, 4), method, seed=1, max_sim=3000, journal=tmp_path / "j")
+    assert again == result
+    assert calls == [8]
+
+
+def test_what_was_written_is_on_the_disk_within_the_interval(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock, synced = [0.0], []
+    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(os, "fsync", lambda number: synced.append(clock[0]))
+    journal = JournalFile.create(tmp_path / "j", {})
+    assert len(synced) == 2  # the file and its name
+    for now in (0.4, 0.9, 1.1, 1.2, 2.2, 9.0):
+        clock[0] = now
+        journal.append(Record("points", np.ones(1), {}))
+    assert synced[2:] == [1.1, 2.2, 9.0]
+    journal.close()
+    assert len(synced) == 6
+    assert journals.SYNC_SECONDS == 1.0
+
+
+def test_points_are_known_by_value_and_shape() -> None:
+    x = np.arange(6.0).reshape(3, 2)
+    assert digest_points(x) == digest_points(x.copy())
+    assert len({digest_points(each) for each in (x, x.reshape(2, 3), x + 1e-15, x[::-1], x.astype("f4"))}) == 5
+
+
+CHILD = """
+import sys, time
+import samplers
+def f(x):
+    time.sleep(0.002)
+    return 3.0 - x.sum(axis=1) / x.shape[1] ** 0.5
+result = samplers.estimate(samplers.FunctionProblem(f, 4), sys.argv[2], seed=4, max_sim=3000, on_error="bound",
+                           journal=sys.argv[1])
+print(result.to_json())
+"""
+
+
+def kill_at_random_times(path: Path, method: str, kills: int, rng: np.random.Generator) -> str:
+    """Run, kill with SIGKILL once there is a journal and a random time after; return what the last run prints."""
+    words = [sys.executable, "-c", CHILD, str(path), method]
+    for _ in range(kills):
+        process = subprocess.Popen(words, stdout=subprocess.DEVNULL)
+        before = path.stat().st_size if path.exists() else 0
+        deadline = time.monotonic() + 60
+        while not path.exists() or path.stat().st_size <= before:
+            if process.poll() is not None or time.monotonic() > deadline:
+                break
+            time.sleep(0.001)
+        time.sleep(float(rng.uniform(0, 0.02)))
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    return subprocess.run(words, capture_output=True, text=True, check=True).stdout
+
+
+@pytest.mark.parametrize("kills", [2, pytest.param(21, marks=pytest.mark.slow)])
+def test_killed_at_random_times_it_comes_to_the_same_result(kills: int, tmp_path: Path) -> None:
+    method = "mc" if kills == 2 else "two-stage"
+    found = kill_at_random_times(tmp_path / "j", method, kills, np.random.default_rng(kills))
+    assert found == run(None, method=method).to_json() + "\n"
