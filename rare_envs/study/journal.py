@@ -19,7 +19,7 @@ from rare_envs.egos.faults import Fault, FaultTolerant
 from rare_envs.study.errors import BadInput
 from rare_envs.study.question import Question
 from rare_envs.version import __version__
-from samplers.execution.journal import JournalFile, Record, digest_points
+from samplers.execution.journal import JournalFile, JournalRecord, digest_points
 from samplers.execution.journaled_evaluation import JournaledEvaluation
 from samplers.execution.record_file import JournalError
 from samplers.problem import FloatArray
@@ -180,7 +180,7 @@ class JournaledProblem:
         reasons = [fault.reason for fault in self.problem.faults[before:]]
         return f, {"reasons": reasons, "n_retried": self.problem.n_retried - retried}
 
-    def _restore(self, x: FloatArray, known: Record) -> None:
+    def _restore(self, x: FloatArray, known: JournalRecord) -> None:
         lost, reasons = x[np.isnan(known.f)], known.notes["reasons"]
         self.problem.faults += [Fault(row.copy(), reason) for row, reason in zip(lost, reasons, strict=True)]
         self.problem.n_retried += known.notes["n_retried"]

@@ -11,7 +11,7 @@ from typing import Any
 
 from samplers.result import Estimate
 
-SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+DEFERRED_SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
 
 class EstimationInterrupted(KeyboardInterrupt):
@@ -66,7 +66,7 @@ def defer_signals() -> Iterator[None]:
             handlers[number](number, frame)
 
     if threading.current_thread() is threading.main_thread():
-        for number in SIGNALS:
+        for number in DEFERRED_SIGNALS:
             handler = signal.getsignal(number)
             if callable(handler):
                 handlers[number] = handler

@@ -28,7 +28,7 @@ SYNC_SECONDS = 1.0
 """Longest time for which finished simulations are not on the disk yet: what a power cut loses, beside the batch."""
 
 
-class Record(NamedTuple):
+class JournalRecord(NamedTuple):
     """A batch of finished simulations."""
 
     points: str
@@ -58,7 +58,7 @@ class JournalFile:
         >>> with TemporaryDirectory() as folder:
         ...     path = Path(folder) / "journal.bin"
         ...     journal = JournalFile.create(path, {"seed": 1})
-        ...     journal.append(Record("of x", np.array([2.0, -1.0]), {}))
+        ...     journal.append(JournalRecord("of x", np.array([2.0, -1.0]), {}))
         ...     journal.close()
         ...     journal = JournalFile.open(path)
         ...     print(journal.head, journal.read_next().f, journal.read_next())
@@ -132,7 +132,7 @@ class JournalFile:
             raise
         return cls(records, head, dropped)
 
-    def read_next(self) -> Record | None:
+    def read_next(self) -> JournalRecord | None:
         """Return the next batch; None at the end of the journal.
 
         Raises:
@@ -144,13 +144,15 @@ class JournalFile:
         try:
             line, values = payload.split(b"\n", 1)
             fields = json.loads(line)
-            record = Record(str(fields["points"]), np.frombuffer(values, "<f8").astype(np.float64), fields["notes"])
+            record = JournalRecord(
+                str(fields["points"]), np.frombuffer(values, "<f8").astype(np.float64), fields["notes"]
+            )
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise JournalError(f"{str(self.path)!r} is no journal of this version: {error}.") from error
         self.n += len(record.f)
         return record
 
-    def append(self, record: Record) -> None:
+    def append(self, record: JournalRecord) -> None:
         """Write finished simulations; those that cannot be written now are tried again with the next ones.
 
         Warns:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from samplers.errors import OnError, one_per_row
 from samplers.execution.arguments import choose_seed
 from samplers.execution.fault_isolation import FaultIsolation
-from samplers.execution.journal import JournalFile, Record, digest_points
+from samplers.execution.journal import JournalFile, JournalRecord, digest_points
 from samplers.execution.record_file import JournalError
 from samplers.problem import FloatArray, Inputs, Problem
 
@@ -42,7 +42,7 @@ class JournaledEvaluation:
         self,
         journal: JournalFile,
         simulate: Simulate,
-        restore: Callable[[FloatArray, Record], None],
+        restore: Callable[[FloatArray, JournalRecord], None],
         recheck: Callable[[FloatArray], ArrayLike],
     ) -> None:
         self._journal, self._simulate, self._restore, self._recheck = journal, simulate, restore, recheck
@@ -62,7 +62,7 @@ class JournaledEvaluation:
         known = self._journal.read_next()
         if known is None:
             f, notes = self._simulate(x)
-            self._journal.append(Record(points, f, notes))
+            self._journal.append(JournalRecord(points, f, notes))
             return f
         if known.points != points or len(known.f) != len(x):
             raise JournalError(
@@ -124,7 +124,7 @@ def keep_simulations(
         f = one_per_row(isolation.evaluate(x), len(x))
         return f, {"n_retried": isolation.n_retried - before}
 
-    def restore(x: FloatArray, known: Record) -> None:
+    def restore(x: FloatArray, known: JournalRecord) -> None:
         isolation.n_retried += int(known.notes.get("n_retried", 0))
 
     return JournaledEvaluation(journal, simulate, restore, FaultIsolation(problem.evaluate, on_error).evaluate).evaluate

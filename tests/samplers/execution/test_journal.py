@@ -16,7 +16,7 @@ import pytest
 
 import samplers
 from samplers.execution import journal as journals
-from samplers.execution.journal import JournalFile, Record, digest_points
+from samplers.execution.journal import JournalFile, JournalRecord, digest_points
 from samplers.execution.record_file import JournalError, RecordFile
 from samplers.problem import FloatArray
 
@@ -88,33 +88,6 @@ def test_replicates_and_a_longer_run_of_plain_monte_carlo_continue(tmp_path: Pat
     assert counted.sizes == [8, 500, 500]
 
 
-def test_what_does_not_belong_to_the_journal_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "j"
-    run(path)
-    content = path.read_bytes()
-    cases: list[tuple[str, dict[str, object]]] = [
-        ("begun with seed 4, and this run has 5", {"seed": 5}),
-        ("asks for other points", {"method": "ce"}),
-        ("it has changed since", {"f": lambda x: half_space(x) + 0.1}),
-    ]
-    for words, change in cases:
-        with pytest.raises(JournalError, match=words):
-            run(path, **change)  # type: ignore[arg-type]
-    with pytest.raises(JournalError, match="begun with dim 4, and this run has 3"):
-        samplers.estimate(samplers.FunctionProblem(half_space, 3), seed=4, journal=path)
-    assert path.read_bytes() == content
-
-
-def test_an_f_that_is_random_can_be_continued(tmp_path: Path) -> None:
-    rng = np.random.default_rng(1)
-
-    def noisy(x: FloatArray) -> FloatArray:
-        return half_space(x) + 0.3 * rng.standard_normal(len(x))
-
-    first = run(tmp_path / "j", noisy, "mc")
-    assert run(tmp_path / "j", noisy, "mc") == first
-
-
 def test_no_journal_is_taken_for_one(tmp_path: Path) -> None:
     (tmp_path / "j").write_bytes(b"x" * 500)
     with pytest.raises(JournalError, match="of another kind"):
@@ -145,7 +118,7 @@ def test_creating_replaces_an_empty_journal_alone(tmp_path: Path) -> None:
     path = tmp_path / "j"
     JournalFile.create(path, {"seed": 1}).close()
     journal = JournalFile.create(path, {"seed": 2})
-    journal.append(Record("points", np.ones(3), {}))
+    journal.append(JournalRecord("points", np.ones(3), {}))
     with pytest.raises(JournalError, match="Another process"):
         JournalFile.create(path, {"seed": 3}, replace=True)
     journal.close()
@@ -198,7 +171,7 @@ def test_what_was_written_is_on_the_disk_within_the_interval(tmp_path: Path, mon
     assert len(synced) == 2  # the file and its name
     for now in (0.4, 0.9, 1.1, 1.2, 2.2, 9.0):
         clock[0] = now
-        journal.append(Record("points", np.ones(1), {}))
+        journal.append(JournalRecord("points", np.ones(1), {}))
     assert synced[2:] == [1.1, 2.2, 9.0]
     journal.close()
     assert len(synced) == 6
