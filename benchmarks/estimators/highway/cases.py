@@ -14,12 +14,28 @@ class HighwayWorld:
     """An ego among learned drivers; several cases may be read off the same rollouts."""
 
     ego: str
-    noise: bool | str
+    noise: bool | str = True
+    collisions: str = "ego"
+    black_box: bool = False
+    """Whether the ego shows its `predict` only, so that nothing can be differentiated through it."""
 
     def problem(self, measure: str) -> rare_envs.DrivingProblem:
         """Return the problem with a measure."""
         ego: Any = self.ego if self.ego == "idm" else load_ego(self.ego)
-        return rare_envs.DrivingProblem(HIGHWAY_ID, ego=ego, noise=self.noise, measure=measure)
+        return rare_envs.DrivingProblem(
+            HIGHWAY_ID,
+            ego=_BlackBox(ego) if self.black_box else ego,
+            noise=self.noise,
+            measure=measure,
+            collisions=self.collisions,
+        )
+
+
+class _BlackBox:
+    """A policy of which nothing but its answers is known."""
+
+    def __init__(self, ego: Any) -> None:
+        self.observation_space, self.action_space, self.predict = ego.observation_space, ego.action_space, ego.predict
 
 
 @dataclass(frozen=True)
@@ -32,10 +48,15 @@ class HighwayCase:
     gamma: float
 
 
-WORLDS = {
-    "idm": HighwayWorld("idm", noise=True),
+COUNTED_WORLDS = {
+    "idm": HighwayWorld("idm"),
     "idm, noise fixed": HighwayWorld("idm", noise="fixed"),
-    "imitation": HighwayWorld("imitation", noise=True),
+    "imitation": HighwayWorld("imitation"),
+}
+"""Worlds in which failures are counted."""
+WORLDS = COUNTED_WORLDS | {
+    "idm, any": HighwayWorld("idm", collisions="any"),
+    "imitation, black box": HighwayWorld("imitation", black_box=True),
 }
 CASES = {
     "idm collisions": HighwayCase("idm", "clearance", 0.0),
@@ -43,4 +64,15 @@ CASES = {
     "idm lidar_ttc 0.56": HighwayCase("idm, noise fixed", "lidar_ttc", 0.56),
     "idm lidar_ttc 0.46": HighwayCase("idm, noise fixed", "lidar_ttc", 0.46),
     "imitation lidar_ttc 0.52": HighwayCase("imitation", "lidar_ttc", 0.52),
+    "idm any collisions": HighwayCase("idm, any", "clearance", 0.0),
+    "black box collisions": HighwayCase("imitation, black box", "clearance", 0.0),
 }
+EARLIER_COUNTS = {
+    "idm collisions": (44, 673_792),
+    "imitation collisions": (41, 365_568),
+    "idm lidar_ttc 0.56": (283, 412_000),
+    "idm lidar_ttc 0.46": (3, 307_200),
+    "imitation lidar_ttc 0.52": (290, 307_200),
+}
+"""Failures and rollouts of an earlier study, whose rollouts were those of this package transcribed to C++ (f equal to
+1e-5): cited, not counted here. Its draws are others than ours."""

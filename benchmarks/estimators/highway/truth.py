@@ -7,15 +7,17 @@ adds to `benchmarks/results/highway_truth.json` after every chunk, and goes on w
 
 import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import torch
 import typer
+from scipy.stats import beta
 
 import rare_envs
 from benchmarks import RESULTS
-from benchmarks.estimators.highway.cases import CASES, WORLDS
+from benchmarks.estimators.highway.cases import CASES, COUNTED_WORLDS, EARLIER_COUNTS
+from rare_envs.files import replace_text
 from rare_envs.simulation.rollout import rollout
 from rare_envs.threads import use_one_thread
 
@@ -29,10 +31,10 @@ def count_failures(world: str, seed: int, chunk: int) -> dict[str, int]:
 
     Collisions are read off the rollouts themselves, where f of every measure is as it is without one.
     """
-    problem = WORLDS[world].problem("lidar_ttc")
+    problem = COUNTED_WORLDS[world].problem("lidar_ttc")
     x = torch.from_numpy(problem.base.sample(CHUNK, np.random.default_rng((seed, chunk)))).float()
     with torch.inference_mode():
-        ends = [rollout(problem.world, problem.driver, rows) for rows in x.split(problem.tile)]
+        ends = [rollout(problem.world, problem.driver, rows) for rows in torch.split(x, problem.tile)]
     collided, f = (torch.cat([getattr(end, name) for end in ends]) for name in ("collided", "f"))
     failed = {
         name: collided if case.measure == "clearance" else f <= case.gamma
@@ -44,13 +46,41 @@ def count_failures(world: str, seed: int, chunk: int) -> dict[str, int]:
 
 def add_chunk(record: dict[str, Any], seed: int) -> None:
     """Add one chunk to the world with the fewest, in place."""
-    world = min(WORLDS, key=lambda name: record["chunks"].get(name, 0))
+    world = min(COUNTED_WORLDS, key=lambda name: record["chunks"].get(name, 0))
     chunk = record["chunks"].get(world, 0)
     for name, failures in count_failures(world, seed, chunk).items():
         counts = record["cases"].setdefault(name, {"rollouts": 0, "failures": 0})
         counts["rollouts"] += CHUNK
         counts["failures"] += failures
     record["chunks"][world] = chunk + 1
+
+
+class Proportion(NamedTuple):
+    """Failures among rollouts."""
+
+    failures: int
+    rollouts: int
+
+    @property
+    def p(self) -> float:
+        """Share of failures."""
+        return self.failures / self.rollouts
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Exact 95 % interval of the probability (Clopper and Pearson, 1934)."""
+        k, n = self.failures, self.rollouts
+        return float(beta.ppf(0.025, k, n - k + 1)), float(beta.ppf(0.975, k + 1, n - k))
+
+
+def read_truth(path: Path = HIGHWAY_TRUTH) -> dict[str, Proportion]:
+    """Return what was counted, in this study and the earlier one together, by case."""
+    counted = json.loads(path.read_text())["cases"] if path.exists() else {}
+    truth = {}
+    for name, (failures, rollouts) in EARLIER_COUNTS.items():
+        ours = counted.get(name, {"failures": 0, "rollouts": 0})
+        truth[name] = Proportion(failures + ours["failures"], rollouts + ours["rollouts"])
+    return truth
 
 
 @use_one_thread()
@@ -65,11 +95,9 @@ def main(
     if record.setdefault("seed", seed) != seed:
         raise typer.BadParameter(f"{out} was counted with seed {record['seed']}.")
     record["versions"] = {"rare_envs": rare_envs.__version__, "torch": torch.__version__, "numpy": np.__version__}
-    while min(record["chunks"].get(name, 0) for name in WORLDS) * CHUNK < rollouts:
+    while min(record["chunks"].get(name, 0) for name in COUNTED_WORLDS) * CHUNK < rollouts:
         add_chunk(record, seed)
-        written = out.with_suffix(".partial")
-        written.write_text(json.dumps(record, indent=2) + "\n")
-        written.replace(out)
+        replace_text(out, json.dumps(record, indent=2) + "\n")
 
 
 if __name__ == "__main__":
