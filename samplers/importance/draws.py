@@ -87,6 +87,17 @@ class Draws:
         """
         return weighted_cov(self.n, self.log_weights)
 
+    @property
+    def skewness(self) -> float:
+        """Skewness of a term, weight times indicator of failure; 0 where all are equal."""
+        if len(self.f) == 0:
+            return 0.0
+        w = np.exp(self.log_weights - self.log_weights.max())
+        mean = float(w.sum()) / self.n
+        variance = float((w * w).sum()) / self.n - mean**2
+        third = (float(((w - mean) ** 3).sum()) - (self.n - len(w)) * mean**3) / self.n
+        return third / variance**1.5 if variance > 0 else 0.0
+
 
 def weighted_cov(n: int, log_weights: FloatArray) -> float:
     """Return the c.o.v. of sum(w) / n over n draws whose nonzero terms have these log weights."""
@@ -98,11 +109,13 @@ def weighted_cov(n: int, log_weights: FloatArray) -> float:
     return math.sqrt(max(spread, 0.0) + 1.0 / (n * n)) / mean
 
 
-def weighted_interval(draws: Draws, confidence: float, largest_weight: float, cov: float | None = None) -> Interval:
+def weighted_interval(
+    draws: Draws, confidence: float, largest_weight: float, cov: float | None = None, ceiling: float = 1.0
+) -> Interval:
     """Return the interval of p: log-normal, with t quantiles where few draws carry it.
 
     With an effective number of failing draws under LOW_ESS its upper end is at least the one
-    that `bernstein_bound` guarantees.
+    that `bernstein_bound` guarantees, or `ceiling` where that is less.
 
     Without a failing draw p <= largest_weight P_q[failure] gives a one-sided interval. Where all
     weights are 1 the draws are plain Monte Carlo and the interval is Clopper-Pearson's.
@@ -112,6 +125,7 @@ def weighted_interval(draws: Draws, confidence: float, largest_weight: float, co
         confidence: Nominal coverage.
         largest_weight: Bound of the weights.
         cov: C.o.v. of p; None for that of independent draws.
+        ceiling: Upper end of p from elsewhere.
 
     Example:
         >>> import numpy as np
@@ -127,7 +141,7 @@ def weighted_interval(draws: Draws, confidence: float, largest_weight: float, co
     spread = draws.cov if cov is None else cov
     low, high = log_normal_interval(draws.p, spread, confidence, degrees_of_freedom(draws.ess, independent=True))
     if draws.ess < LOW_ESS:
-        high = max(high, bernstein_bound(draws, confidence, largest_weight))
+        high = max(high, min(bernstein_bound(draws, confidence, largest_weight), ceiling))
     return low, high
 
 

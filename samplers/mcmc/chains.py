@@ -84,11 +84,16 @@ def independent_chains(u: FloatArray, f: FloatArray) -> Chains:
     return Chains(u[:, None], f[:, None], np.ones(n, dtype=np.int64), np.arange(n), n, None)
 
 
-def draw_first_level(inputs: Inputs, n: int, rng: np.random.Generator) -> Generator[FloatArray, FloatArray, Chains]:
-    """Simulate the n independent points of level 0."""
-    u = rng.standard_normal((n, inputs.dim))
-    f = yield inputs.base.from_standard_normal(u)
-    return independent_chains(u, f)
+def draw_first_level(
+    inputs: Inputs, n: int, rng: np.random.Generator, known: RootedPoints | None = None
+) -> Generator[FloatArray, FloatArray, Chains]:
+    """Simulate the n independent points of level 0; those that are `known` are not simulated again."""
+    u, f = (known.u, known.f) if known is not None else (np.empty((0, inputs.dim)), np.empty(0))
+    new = rng.standard_normal((n - len(f), inputs.dim))
+    if len(new):
+        outcomes = yield inputs.base.from_standard_normal(new)
+        u, f = np.concatenate([u, new]), np.concatenate([f, outcomes])
+    return independent_chains(u, f)._replace(n_new=len(new))
 
 
 def chain_lengths(total: int, n: int, rng: np.random.Generator) -> NDArray[np.int64]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from samplers.mcmc.chains import Chains, Growth, chain_lengths, draw_first_level
+from samplers.mcmc.chains import Chains, Growth, RootedPoints, chain_lengths, draw_first_level
 from samplers.mcmc.descent import NextLevel, descend
 from samplers.mcmc.kernels import Kernel
 from samplers.method import Goal, Steps
@@ -77,9 +77,25 @@ class SubsetLevels:
     max_levels: int
     """Levels after which the method gives up."""
 
-    def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator, kernel: Kernel) -> Steps:
-        """Go from level to level until the share of failures among its points is p0 or more."""
-        n, gamma = self._points_per_level(goal.budget), goal.gamma
+    def steps(
+        self,
+        inputs: Inputs,
+        goal: Goal,
+        rng: np.random.Generator,
+        kernel: Kernel,
+        known: RootedPoints | None = None,
+    ) -> Steps:
+        """Go from level to level until the share of failures among its points is p0 or more.
+
+        Args:
+            inputs: Of the problem.
+            goal: Threshold and budget.
+            rng: Source of randomness.
+            kernel: Of the first chains.
+            known: Base draws whose outcomes are known, fewer than n: level 0 begins with them.
+        """
+        n_known = 0 if known is None else len(known.f)
+        n, gamma = self._points_per_level(goal.budget + n_known), goal.gamma
         levels, trace = list[Chains](), list[Level]()
 
         def record(growth: Growth, planned: NextLevel | Status) -> None:
@@ -88,14 +104,14 @@ class SubsetLevels:
             trace.append(level_record(growth.chains, threshold, multiply_levels(trace)))
             goal.on_level(trace[-1])
 
-        first = yield from draw_first_level(inputs, min(n, goal.budget), rng)
+        first = yield from draw_first_level(inputs, min(n, goal.budget + n_known), rng, known)
         left = goal.budget - first.n_new
         planner = SubsetPlanner(n=n, p0=self.p0, max_levels=self.max_levels, gamma=gamma, budget=left)
         status = yield from descend(inputs, Growth.start(first, kernel), planner, record, rng)
         outcome = summarise(levels[-1], goal, trace, status)
         return replace(
             outcome,
-            warnings=(*self._budget_warnings(n, goal.budget), *outcome.warnings),
+            warnings=(*self._budget_warnings(n, goal.budget + n_known), *outcome.warnings),
             sample=weighted_points(inputs, levels, trace, gamma),
         )
 

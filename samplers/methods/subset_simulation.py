@@ -6,6 +6,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
+from samplers.mcmc.chains import RootedPoints
 from samplers.mcmc.kernels import FixedMetropolis, ScaledKernel
 from samplers.method import Goal, Steps
 from samplers.methods.base import Method
@@ -181,10 +182,17 @@ class AdaptiveSubsetSimulation(Method):
         check_choice(who, "proposal", self.proposal, ("conditional", "metropolis"))
         check_choice(who, "sigma0", self.sigma0, ("unit", "seeds"))
 
-    def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
-        """Go from level to level until the share of failures among its points is p0 or more."""
+    def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator, known: RootedPoints | None = None) -> Steps:
+        """Go from level to level until the share of failures among its points is p0 or more.
+
+        Args:
+            inputs: Of the problem.
+            goal: Threshold and budget.
+            rng: Source of randomness.
+            known: Base draws whose outcomes are known, at most n: level 0 begins with them.
+        """
         kernel = ScaledKernel(
             self.proposal, self.sigma0, self.scale, self.target_acceptance, deviations=np.ones(inputs.dim)
         )
         descent = SubsetLevels(n=self.n, p0=self.p0, max_levels=self.max_levels)
-        return (yield from descent.steps(inputs, goal, rng, kernel))
+        return (yield from descent.steps(inputs, goal, rng, kernel, known))

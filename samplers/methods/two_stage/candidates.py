@@ -76,7 +76,6 @@ def list_candidates(
         ProposalComponent(gaussian, "gaussian", explored.region)
         for gaussian, explored in zip(state.gaussians, state.explored, strict=True)
     ]
-    gaussians += [ProposalComponent(gaussian, "gaussian") for gaussian in state.fresh_gaussians]
     regional = gaussians + ([] if state.noisy else list(state.linear)) + (list(state.explored) if state.rounds else [])
     return [
         ProposalComponent(IsotropicNormal(state.dim), "base"),
@@ -119,10 +118,9 @@ def _fit_half_space_components(
     log_w = history.log_weights if state.rounds else np.zeros(len(u))
     if len(u) == 0:
         return []
-    gaussians = state.gaussians + state.fresh_gaussians
-    owner = log_ratios(gaussians, u).argmax(axis=0)
+    owner = log_ratios(state.gaussians, u).argmax(axis=0)
     half_spaces: list[HalfSpaceNormal] = []
-    for k, gaussian in enumerate(gaussians):
+    for k, gaussian in enumerate(state.gaussians):
         own = owner == k
         if np.count_nonzero(own) >= settings.min_owned_failures:
             half_spaces += fit_half_spaces(gaussian, u[own], np.exp(log_w[own] - log_w[own].max()), edges)

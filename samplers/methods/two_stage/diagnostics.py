@@ -7,6 +7,7 @@ import numpy as np
 from scipy import stats
 
 from samplers.importance.draws import Draws
+from samplers.methods.two_stage.discovery.unseen import Discovery
 from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, DiagnosticSettings
 from samplers.methods.two_stage.stratified import StratifiedSample
 from samplers.statistics.weights import effective_sample_size
@@ -58,10 +59,23 @@ def check_regions(final: StratifiedSample, settings: DiagnosticSettings = DEFAUL
 
     The proposal does not describe such a region, and that the final draws met hardly any of that weight says nothing.
     """
-    share = final.expected / max(final.draws.n * final.p, 1e-300)
+    share = final.typical / max(final.draws.n * final.p, 1e-300)
     lost = int((share > settings.max_point_share).sum())
     if lost == 0 or len(final.draws.f) == 0:
         return []
     return [
         f"The draws hardly reach {lost} of {len(share)} regions found: a point there would be {share.max():.0%} of p."
+    ]
+
+
+def check_discovery(
+    p: float, discovery: Discovery, confidence: float, settings: DiagnosticSettings = DEFAULT_SETTINGS.diagnostics
+) -> list[str]:
+    """Return a warning if so few lineages reached failure that much of p may be in regions that were not found."""
+    share = discovery.unseen_share(confidence)
+    if share <= settings.max_unseen_share:
+        return []
+    return [
+        f"Only {discovery.lineages:.0f} independent searches reached failure: regions with "
+        f"{p * share / (1 - share):.1e} more, {share:.0%} of p, cannot be excluded."
     ]

@@ -12,24 +12,20 @@ plateaus, ties, jumps and misleading level sets do not matter to them:
 """
 
 import math
-from collections.abc import Generator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from samplers.mcmc.chains import Chains, Growth, independent_chains
-from samplers.mcmc.descent import NextLevel, descend
-from samplers.mcmc.kernels import ScaledKernel
-from samplers.method import Interrupted
-from samplers.methods.two_stage.mixture.settings import DEFAULT_MIXTURE_SETTINGS, MixtureSettings
-from samplers.methods.two_stage.regions import ExplorationResult, SubsetPoints, grow_regions
-from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, ExplorationSettings, RegionSettings
-from samplers.methods.two_stage.simulator import ComponentDraws, Simulator
+from samplers.method import Goal
+from samplers.methods.two_stage.discovery.levels import descend_levels
+from samplers.methods.two_stage.discovery.lines import LineEnds, choose_roots, count_lines, walk_lines
+from samplers.methods.two_stage.discovery.unseen import Discovery, count_lineages
+from samplers.methods.two_stage.discovery.wide import bisect_towards_origin, find_wide_failures
+from samplers.methods.two_stage.regions import ExplorationResult, grow_regions, label_regions
+from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, ExplorationSettings, TwoStageSettings
+from samplers.methods.two_stage.simulator import ComponentDraws, SimulationSteps, Simulator
 from samplers.problem import FloatArray
 from samplers.proposals.components import IsotropicNormal, MixtureComponent, draw_components
-from samplers.statistics.thresholds import next_level
-from samplers.trace import Status
 
 
 @dataclass(frozen=True)
@@ -67,36 +63,7 @@ class Sizes:
         )
 
 
-@dataclass(frozen=True)
-class ExplorationPlanner:
-    """Levels whose seeds are a random part of the points below the threshold, in chains of equal length."""
-
-    gamma: float
-    """Threshold of failure."""
-    n: int
-    """Points per level, a few more where the chains do not divide them."""
-    budget: int
-    """Simulations for all levels."""
-    settings: ExplorationSettings
-
-    def plan_next(self, chains: Chains, depth: int, n_sim: int, rng: np.random.Generator) -> NextLevel | Status:
-        """Return the next level, or how the descent ends: converged once `level_fraction` of the points fail."""
-        points = chains.by_step()
-        threshold = next_level(points.f, self.settings.level_fraction, self.gamma)
-        if threshold == self.gamma:
-            return Status.CONVERGED
-        if threshold is None or depth >= self.settings.max_levels:
-            return Status.STALLED
-        seeds = rng.permutation(np.flatnonzero(points.f <= threshold))[: self.n // self.settings.points_per_seed]
-        steps = max(1, math.ceil(self.n / len(seeds)) - 1)
-        if n_sim + steps * len(seeds) > self.budget:
-            return Status.BUDGET
-        return NextLevel(threshold, points.select(seeds), np.full(len(seeds), steps + 1))
-
-
-def first_draws(
-    simulator: Simulator, sizes: Sizes, rng: np.random.Generator
-) -> Generator[FloatArray, FloatArray, ComponentDraws]:
+def first_draws(simulator: Simulator, sizes: Sizes, rng: np.random.Generator) -> SimulationSteps[ComponentDraws]:
     """Simulate the base and the wide draws."""
     dim = simulator.inputs.dim
     components: list[MixtureComponent] = [
@@ -112,70 +79,61 @@ def first_draws(
 def find_regions(
     simulator: Simulator,
     first: ComponentDraws,
-    gamma: float,
+    goal: Goal,
     sizes: Sizes,
     rng: np.random.Generator,
-    settings: RegionSettings = DEFAULT_SETTINGS.regions,
-    explore: ExplorationSettings = DEFAULT_SETTINGS.exploration,
-    mixture: MixtureSettings = DEFAULT_MIXTURE_SETTINGS,
-) -> Generator[FloatArray, FloatArray, ExplorationResult]:
+    settings: TwoStageSettings = DEFAULT_SETTINGS,
+) -> SimulationSteps[ExplorationResult]:
     """Find the regions of failure, starting from the first draws; none if nothing fails."""
-    n_base = int(first.counts[0])
-    descent = yield from _descend(simulator, first.u[:n_base], first.f[:n_base], gamma, sizes, rng, explore)
-    wide = np.flatnonzero(first.f[n_base:] <= gamma) + n_base
-    scale = np.repeat(np.arange(len(first.counts)), first.counts)
+    n_base, gamma, explore = int(first.counts[0]), goal.gamma, settings.exploration
+    base_u, base_f = first.u[:n_base], first.f[:n_base]
+    drawn = ComponentDraws(first.components[1:], first.counts[1:], first.u[n_base:], first.f[n_base:])
+    descent = yield from descend_levels(simulator, base_u, base_f, goal, sizes.level, sizes.most, rng, explore)
+    wide = yield from find_wide_failures(simulator, drawn, goal, descent.levels, rng, explore)
+    lines = yield from _find_lines(simulator, base_u, base_f, gamma, descent.levels, rng, settings)
+    roots = len(np.union1d(descent.roots, lines.roots))
+    discovery = Discovery(count_lineages(roots, wide.log_weights), descent.ceiling)
     most = max(2, (sizes.limit - simulator.n_sim) // explore.chain_cost)
-    chosen = wide[_subsample(scale[wide], min(sizes.starts, most), rng)]
-    far = yield from _bisect_towards_origin(simulator, first.u[chosen], gamma, explore.bisections)
-    others = max(sizes.level_starts, sizes.starts + sizes.level_starts - len(far))
-    starts = np.concatenate([far, rng.permutation(descent.failing)[: min(others, most - len(far))]])
+    chosen = wide.choose(min(sizes.starts, most), rng)
+    far = yield from bisect_towards_origin(simulator, chosen, gamma, explore.bisections)
+    near = yield from _choose_lines(simulator, lines.u, gamma, sizes.limit, rng, settings)
+    others = min(max(sizes.level_starts, sizes.starts + sizes.level_starts - len(far)), most - len(far))
+    starts = np.concatenate([far, near, rng.permutation(descent.failing)[: max(others - len(near), 0)]])
     if len(starts) == 0:
-        return ExplorationResult([], noisy=False)
-    return (yield from grow_regions(simulator, starts, descent, gamma, sizes.limit, rng, settings, mixture))
+        return ExplorationResult([], noisy=False, discovery=discovery)
+    result = yield from grow_regions(
+        simulator, starts, descent, gamma, sizes.limit, rng, settings.regions, settings.mixture
+    )
+    return result._replace(discovery=discovery)
 
 
-def _descend(
+def _find_lines(
     simulator: Simulator,
     u: FloatArray,
     f: FloatArray,
     gamma: float,
-    sizes: Sizes,
+    levels: int,
     rng: np.random.Generator,
-    explore: ExplorationSettings,
-) -> Generator[FloatArray, FloatArray, SubsetPoints]:
-    """Run subset simulation from base draws u (n, d), f (n,), until a tenth of a level fails or the budget is used.
-
-    All candidates are kept, for the regressions around the regions; there is no estimate, so no level is recorded.
-    """
-    kernel = ScaledKernel(
-        "conditional", "unit", explore.initial_scale, explore.level_acceptance, deviations=np.ones(u.shape[1])
-    )
-    planner = ExplorationPlanner(gamma, sizes.level, sizes.most - simulator.n_sim, explore)
-    levels = list[Growth]()
-    start = Growth.start(independent_chains(u, f), kernel)
-    status = yield from descend(simulator.inputs, start, planner, lambda growth, _: levels.append(growth), rng)
-    outcomes = np.concatenate([level.f_candidates for level in levels])
-    simulator.n_sim += len(outcomes)
-    if status is Status.STOPPED:
-        raise Interrupted
-    last = levels[-1].chains
-    failing = np.unique(last.where(last.f <= gamma).u, axis=0)
-    return SubsetPoints(failing, np.concatenate([level.candidates for level in levels]), outcomes, len(levels) - 1)
+    settings: TwoStageSettings,
+) -> SimulationSteps[LineEnds]:
+    """Walk lines of descent from base draws u (n, d) with outcomes f (n,), and their ends towards the origin."""
+    roots = choose_roots(f, count_lines(levels, settings.lines), rng, settings.lines)
+    ends, failing = yield from walk_lines(simulator, u[roots], f[roots], gamma, rng, settings.lines)
+    near = yield from bisect_towards_origin(simulator, ends[failing], gamma, settings.exploration.bisections)
+    return LineEnds(near, roots[failing])
 
 
-def _subsample(scale: NDArray[np.int64], n: int, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Choose n of the wide failures: half of them the least wide ones, the rest at random."""
-    order = np.lexsort((rng.random(len(scale)), scale))
-    return np.concatenate([order[: n // 2], rng.permutation(order[n // 2 :])[: n - n // 2]])
-
-
-def _bisect_towards_origin(
-    simulator: Simulator, u: FloatArray, gamma: float, steps: int
-) -> Generator[FloatArray, FloatArray, FloatArray]:
-    """Move failing points (n, d) towards the origin along their rays, by bisection; they still fail."""
-    safe, failing = np.zeros(len(u)), np.ones(len(u))
-    for _ in range(steps):
-        middle = 0.5 * (safe + failing)
-        fails = (yield from simulator.evaluate(u * middle[:, None])) <= gamma
-        failing, safe = np.where(fails, middle, failing), np.where(fails, safe, middle)
-    return u * failing[:, None]
+def _choose_lines(
+    simulator: Simulator,
+    u: FloatArray,
+    gamma: float,
+    limit: int,
+    rng: np.random.Generator,
+    settings: TwoStageSettings,
+) -> SimulationSteps[FloatArray]:
+    """Return ends of lines (n, d) for chains to start from: a few of each region."""
+    if len(u) == 0:
+        return u
+    labels, _ = yield from label_regions(simulator, u, gamma, limit, settings.regions)
+    order = rng.permutation(len(u))
+    return np.concatenate([u[order[labels[order] == k][: settings.lines.starts]] for k in range(labels.max() + 1)])

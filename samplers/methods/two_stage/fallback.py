@@ -6,32 +6,25 @@ from dataclasses import replace
 import numpy as np
 
 from samplers.importance.draws import Draws
+from samplers.mcmc.chains import RootedPoints
 from samplers.method import Goal, Outcome, Steps
 from samplers.methods.subset_simulation import AdaptiveSubsetSimulation
 from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, FallbackSettings
-from samplers.problem import FloatArray, Inputs
+from samplers.problem import Inputs
 
 
-def describes_failures(
-    last: Draws, expected: FloatArray, settings: FallbackSettings = DEFAULT_SETTINGS.fallback
-) -> bool:
-    """Return whether a proposal describes the failures so well that the weights of its draws are reliable.
+def gives_up(draws: Draws, number: int, levels: int, settings: FallbackSettings = DEFAULT_SETTINGS.fallback) -> bool:
+    """Return whether a proposal describes the failures so badly that subset simulation does better with the rest.
 
     Args:
-        last: The draws of the last round.
-        expected: Mean weights of the exploration's points as draws of the proposal, by region, shape (m,).
-        settings: Limits of the rate and of these weights.
+        draws: Of the last round.
+        number: Of this round, from 1.
+        levels: Levels of subset simulation in the exploration.
+        settings: Failures that each draw must be worth.
     """
-    if not meets_failures(last, settings):
-        return False
-    good = last.ess >= settings.good_rate * last.n
-    limit = settings.max_weight if good else settings.max_region_weight
-    return bool(np.median(expected) <= limit * last.p)
-
-
-def meets_failures(last: Draws, settings: FallbackSettings = DEFAULT_SETTINGS.fallback) -> bool:
-    """Return whether the draws of the last round meet failures often enough."""
-    return len(last.f) > 0 and last.ess >= settings.min_round_rate * last.n
+    early = settings.early_rates
+    rate = early[number - 1] if number <= len(early) else settings.relative_rate / max(levels, settings.min_levels)
+    return draws.ess < rate * draws.n
 
 
 def reconcile(subset_outcome: Outcome, earlier: Outcome) -> Outcome:
@@ -60,6 +53,7 @@ def run_subset_simulation(
     goal: Goal,
     levels: int,
     budget: int,
+    known: RootedPoints,
     rng: np.random.Generator,
     settings: FallbackSettings = DEFAULT_SETTINGS.fallback,
 ) -> Steps:
@@ -70,17 +64,20 @@ def run_subset_simulation(
         goal: Threshold, confidence and target.
         levels: Levels that subset simulation passed in the exploration.
         budget: Simulations that are never exceeded.
+        known: Base draws of the exploration, from which it starts.
         rng: Source of randomness.
         settings: How points per level follow from the budget.
     """
     levels = max(levels, settings.min_levels)
-    n = int(budget / (1 + settings.level_share * levels))
+    n = int((budget + len(known.f)) / (1 + settings.level_share * (levels + 0.5)))
     if goal.target_cov is not None:
         n = min(n, math.ceil(settings.chain_points * (levels + 1) / goal.target_cov**2))
-    method = AdaptiveSubsetSimulation(n=max(n, settings.min_points))
-    outcome = yield from method.steps(inputs, replace(goal, max_sim=budget), rng)
+    n = max(n, settings.min_points)
+    known = known.select(np.arange(min(n, len(known.f))))
+    outcome = yield from AdaptiveSubsetSimulation(n=n).steps(inputs, replace(goal, max_sim=budget), rng, known)
     about = (
         "No proposal describes the failures: p is from adaptive subset simulation with what was left, "
         f"{budget:,} simulations; by itself (adss) it would have had all of them."
     )
+    outcome = replace(outcome, base_draws=outcome.base_draws - len(known.f))  # these were counted before
     return replace(outcome, warnings=(about, *outcome.warnings))

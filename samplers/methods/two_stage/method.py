@@ -116,8 +116,8 @@ def run_two_stage(
         room = context.left
         for number in range(1, len(settings.refinement.round_shares) + 1):
             state, refinement, proposal = yield from stages.refine(context, state, refinement, number, room, proposal)
-        if not stages.accepts_proposal(context, state, refinement, proposal):
-            return (yield from stages.fall_back(context, state, exploration.levels))
+            if stages.gives_up(context, state, exploration, number):
+                return (yield from stages.fall_back(context, state, exploration.levels))
     except Interrupted:
         return stages.estimate_early(context, state)
     outcome = yield from stages.estimate_afresh(context, state, refinement, proposal)

@@ -17,7 +17,6 @@ from samplers.methods.two_stage.mixture.subspace_em import (
     GroupedPoints,
     fit_subspace_mixture,
     refit_components,
-    truncate_weights,
 )
 from samplers.methods.two_stage.multiple_importance import MultipleImportanceSample
 from samplers.methods.two_stage.regions import ExplorationResult, Region
@@ -28,6 +27,8 @@ from samplers.proposals.components import SubspaceGaussian, log_ratios
 
 SHARP_KINDS = ("gaussian", "linear", "explored", "half-space", "radial")
 """Components that are meant to hold failures only."""
+TYPICAL_QUANTILE = 0.75
+"""Of the mean weights of chains: that of the heaviest may be where hardly any failure is."""
 DISTANT_KINDS = ("base", "wide", "radial")
 """Components whose draws are not near any region."""
 
@@ -57,8 +58,6 @@ class RefinementState:
     """The same, moved to the weighted failures: one for each of `explored`."""
     linear: tuple[ProposalComponent, ...]
     """Half-space proposals from linear regression of f around each region."""
-    fresh_gaussians: list[SubspaceGaussian]
-    """A mixture fitted to all failures anew."""
     rounds: tuple[NearDraws, ...] = ()
     hit_rate: float = 1.0
     """Share of the last round's draws from SHARP_KINDS that failed."""
@@ -105,7 +104,7 @@ def start_refinement(
         rng: Source of randomness of the fits.
         mixture: Of the fits.
     """
-    most = settings.max_gaussians if exploration.noisy else settings.gaussians_per_region
+    most = settings.noisy_gaussians if exploration.noisy else settings.gaussians_per_region
     explored = tuple(
         ProposalComponent(gaussian, "explored", k)
         for k, region in enumerate(exploration.regions)
@@ -117,14 +116,7 @@ def start_refinement(
         for component in half_space_proposals(region.points, region.u, region.f, gamma, mixture)
     )
     gaussians = [candidate.component for candidate in explored if isinstance(candidate.component, SubspaceGaussian)]
-    return RefinementState(
-        exploration=exploration,
-        gamma=gamma,
-        explored=explored,
-        gaussians=gaussians,
-        linear=linear,
-        fresh_gaussians=[],
-    )
+    return RefinementState(exploration=exploration, gamma=gamma, explored=explored, gaussians=gaussians, linear=linear)
 
 
 def refine_once(
@@ -133,10 +125,7 @@ def refine_once(
     proposal: MixtureProposal,
     batch: ComponentDraws,
     settings: RefinementSettings,
-    rng: np.random.Generator,
     mixture: MixtureSettings = DEFAULT_MIXTURE_SETTINGS,
-    *,
-    fresh: bool,
 ) -> RefinementState:
     """Return the state after a round of draws.
 
@@ -146,9 +135,7 @@ def refine_once(
         proposal: What the round drew from.
         batch: Its draws.
         settings: How many failures a fit needs.
-        rng: Source of randomness of the fits.
         mixture: Of the fits.
-        fresh: Whether a mixture is also fitted to all failures anew.
     """
     kinds = np.repeat([candidate.kind for candidate in proposal.candidates], batch.counts)
     sharp, near = np.isin(kinds, SHARP_KINDS), ~np.isin(kinds, DISTANT_KINDS)
@@ -160,26 +147,25 @@ def refine_once(
     )
     if len(history.u) < settings.min_refit_failures:
         return state
-    high_dim = state.dim > mixture.subspace.high_dim
     return replace(
         state,
         gaussians=refit_components(state.gaussians, history.u, history.log_weights, mixture.subspace),
-        fresh_gaussians=_fit_failures(history, settings, rng, mixture.subspace) if fresh and not high_dim else [],
-        linear=_fit_linear(state, settings, mixture) if fresh or high_dim or len(state.regions) > 1 else state.linear,
+        linear=_fit_linear(state, settings, mixture),
     )
 
 
-def expected_weights(state: RefinementState, proposal: MixtureProposal, min_trimmed_chains: int = 3) -> FloatArray:
-    """Return the mean weight that the exploration's points in each region would have as draws of a proposal, (m,).
+def typical_weights(state: RefinementState, proposal: MixtureProposal) -> FloatArray:
+    """Return the weight that a typical point of each region would have as a draw of a proposal, shape (m,).
 
-    Without the heaviest of `min_trimmed_chains` chains or more: one may be where hardly any failure is.
+    The upper quartile over the chains of the mean over the second half of their states: starts are far from where
+    failures are likely, and a few chains may still be.
     """
-    expected = []
+    typical = []
     for region in state.regions:
-        weights = np.exp(proposal.log_weights(region.points)).reshape(region.chains.shape[:2])
-        chains = np.sort(weights.mean(axis=1))
-        expected.append(float(chains[:-1].mean() if len(chains) >= min_trimmed_chains else chains.mean()))
-    return np.array(expected)
+        late = region.chains[:, region.chains.shape[1] // 2 :]
+        weights = np.exp(proposal.log_weights(late.reshape(-1, state.dim))).reshape(late.shape[:2])
+        typical.append(float(np.quantile(weights.mean(axis=1), TYPICAL_QUANTILE)))
+    return np.array(typical)
 
 
 def _fit_chains(
@@ -195,21 +181,6 @@ def _fit_chains(
         groups=np.repeat(np.arange(chains), steps),
     )
     return fit_subspace_mixture(points, most if dim <= subspace.high_dim else 1, rng, subspace).components
-
-
-def _fit_failures(
-    history: MultipleImportanceSample,
-    settings: RefinementSettings,
-    rng: np.random.Generator,
-    subspace: SubspaceSettings,
-) -> list[SubspaceGaussian]:
-    """Return a mixture fitted to all failures, [] where their weights are too uneven for one."""
-    weights = truncate_weights(history.log_weights)
-    ess, dim = 1 / float((weights**2).sum()), history.u.shape[1]
-    if ess < max(settings.min_fresh_ess, settings.min_fresh_ess_per_dim * dim):
-        return []
-    points = GroupedPoints(history.u, weights, ess, np.arange(len(weights)))
-    return fit_subspace_mixture(points, settings.max_gaussians, rng, subspace).components
 
 
 def _fit_linear(

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from samplers.methods.two_stage.discovery.unseen import Discovery
 from samplers.methods.two_stage.mixture.linear_model import descent_direction
 from samplers.methods.two_stage.mixture.settings import DEFAULT_MIXTURE_SETTINGS, LinearModelSettings, MixtureSettings
 from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, RegionSettings
@@ -73,6 +74,10 @@ class SubsetPoints(NamedTuple):
     """Outcomes of these, shape (n,)."""
     levels: int = 0
     """Levels passed."""
+    roots: NDArray[np.int64] = np.empty(0, dtype=np.int64)
+    """Base draws that the failing points descend from, shape (m,)."""
+    ceiling: float = 1.0
+    """Upper end of p."""
 
 
 class ExplorationResult(NamedTuple):
@@ -85,6 +90,8 @@ class ExplorationResult(NamedTuple):
     """Whether the regions are no more than pieces of something like a shell."""
     levels: int = 0
     """Levels that subset simulation passed."""
+    discovery: Discovery = Discovery(lineages=1.0)
+    """How thorough the search was."""
 
 
 def grow_regions(
@@ -122,7 +129,7 @@ def grow_regions(
         region = last.to_region()._replace(chains=last.states[:, 1:])
         return ExplorationResult([region], noisy=True, levels=descent.levels)
     reserve = len(starts) * (steps[1] + 1)  # for the second chains, and one look at where they end
-    labels, _ = yield from _label_regions(simulator, first.ends, gamma, limit - reserve, settings)
+    labels, _ = yield from label_regions(simulator, first.ends, gamma, limit - reserve, settings)
     room = max(limit - simulator.n_sim - reserve, 0) // (steps[1] + 1)
     few, many = settings.chains_per_region
     wanted = min(max(few, math.ceil(settings.points_per_dim * dim / steps[1])), many)
@@ -132,7 +139,7 @@ def grow_regions(
     last = yield from _pcn_chains(
         simulator, first.ends, first.sigma, directions[labels], steps[1], gamma, rng, settings
     )
-    labels, scattered = yield from _label_regions(simulator, last.ends, gamma, limit, settings)
+    labels, scattered = yield from label_regions(simulator, last.ends, gamma, limit, settings)
     regions = _collect_regions(first, last, labels, settings.late_steps_high_dim if high_dim else settings.late_steps)
     if len(regions) == 1:
         regions = [_add_subset_points(regions[0], descent, settings)]
@@ -217,7 +224,7 @@ def _is_noisy(
     return float((f <= gamma).mean()) < settings.noisy_share
 
 
-def _label_regions(
+def label_regions(
     simulator: Simulator, u: FloatArray, gamma: float, limit: int, settings: RegionSettings = DEFAULT_SETTINGS.regions
 ) -> SimulationSteps[tuple[Labels, bool]]:
     """Sort failing points (n, d) into regions, numbered from 0: those half way to whose first point fails.

@@ -36,6 +36,10 @@ class ExplorationSettings:
     """Base draws; five levels of a tenth each reach 1e-5 from there."""
     wide: tuple[tuple[float, int], ...] = ((1.5, 120), (2.2, 120), (3.0, 80))
     """Wide draws: (s, number). At s = 3 a half-space at beta = 4.5 is hit by one draw in 15."""
+    deep: tuple[float, int] = (3.3, 80)
+    """Where the levels went so far that wide draws should have a larger s than this: so many more, with that s."""
+    depth_ratio: float = 1.45
+    """Distance of the levels' end, beta, over s: one draw in 14 is beyond a half-space there."""
     level: int = 250
     """Points of each level of subset simulation; `least_level` where the budget is small."""
     least_level: int = 100
@@ -45,8 +49,8 @@ class ExplorationSettings:
     """Points of a level for each of its seeds at least: chains take two steps or more."""
     initial_scale: float = 0.6
     """First step of the chains of subset simulation, as in `AdaptiveSubsetSimulation`."""
-    level_acceptance: float = 0.35
-    """Acceptance that it is adapted to; less than for long chains, as in `RegionSettings`."""
+    level_acceptance: float = 0.44
+    """Acceptance that it is adapted to (Papaioannou, Betz, Zwirglmaier and Straub, 2015)."""
     max_levels: int = 30
     """Levels at most; the share of the budget ends the descent first unless f ties."""
     starts: int = 60
@@ -63,6 +67,36 @@ class ExplorationSettings:
     """Share of the budget after which no further level is begun."""
     share: float = 0.65
     """Share of the budget for the whole exploration."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LineSettings:
+    """Lines of descent (`discovery/lines.py`); numbers of simulations hold for `ExplorationSettings.usual_budget`."""
+
+    most: int = 50
+    """Lines at most."""
+    per_level: int = 60
+    """Lines times levels: a line costs 15 to 40 simulations where p is about 1e-4."""
+    root_share: float = 0.1
+    """Share of the base draws that lines start from: higher up they cost more and lead to the same regions."""
+    initial_step: float = 0.35
+    """First step."""
+    acceptance: float = 0.3
+    """Share of fresh steps that shall be taken ..."""
+    adaptation: float = 0.5
+    """... and change of the log step per unit of it."""
+    step_range: tuple[float, float] = (0.03, 1.0)
+    """Least and largest step."""
+    limit: int = 600
+    """Simulations after which all lines end."""
+    most_arrived: float = 0.6
+    """Share of the lines that has arrived when the others are given `patience` times the median time of arrival."""
+    patience: float = 2.0
+    first_look: int = 300
+    """Simulations after which lines are given up if less than `few_arrived` of them have arrived."""
+    few_arrived: float = 0.15
+    starts: int = 4
+    """Lines of each region from which chains start."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,10 +160,6 @@ class RefinementSettings:
 
     round_shares: tuple[float, ...] = (0.09, 0.12, 0.14)
     """Share of what the exploration leaves that each round draws; the rest is for the estimate."""
-    fresh_rounds: int = 2
-    """After so many of the last rounds a mixture is also fitted to all failures anew. It may not be worth it: on 13
-    problems of the catalogue, 20 seeds each, without it the stated variance is 0.95 times as large, and 248 of 260
-    intervals hold p in place of 246."""
     base_share: float = 0.05
     """Least share of base draws: no weight exceeds 20."""
     noisy_base_share: float = 0.1
@@ -166,25 +196,18 @@ class RefinementSettings:
     """The same where f is noisy."""
     gaussians_per_region: int = 3
     """Gaussians fitted to the chains of a region at most: it has some dozens of them."""
-    max_gaussians: int = 8
-    """Gaussians fitted to all failures at most, and to the chains where f is noisy: all of them are one region then."""
+    noisy_gaussians: int = 8
+    """The same where f is noisy: all of it is one region then."""
     points_per_chain: float = 2.0
     """Independent points that a chain is worth."""
     min_refit_failures: int = 6
     """Failures, all in all, from which on Gaussians and half-spaces are fitted again."""
-    min_fresh_ess: float = 60.0
-    """Independent failures that a mixture fitted anew needs ..."""
-    min_fresh_ess_per_dim: float = 6.0
-    """... and per dimension."""
     min_owned_failures: int = 10
     """Failures of a Gaussian that a half-space through their edge needs."""
     min_radial_failures: int = 20
     """Failures that a radial component needs."""
     min_log_ratio: float = 1.0
     """A draw belongs to the region whose Gaussian has the largest density there, if that is e times phi or more."""
-    min_trimmed_chains: int = 3
-    """From this many chains on the heaviest of a region is left out of its weight: it may be where hardly any failure
-    is, and of two nobody knows which."""
     probit_scale: float = 1.702
     """Log odds over the argument of Phi that is next to them: noise is near normal, and the logistic curve has far
     heavier tails (Camilli, "Origin of the scaling constant d = 1.7 in item response theory", 1994)."""
@@ -202,15 +225,12 @@ class FallbackSettings:
 
     min_fallback_budget: int = 300
     """Simulations under which subset simulation is not worth it."""
-    min_round_rate: float = 0.005
-    """What the last round of draws must be worth, in independent failures for each draw. Proposals that describe the
-    failures reach 0.01 to 0.9; with less, the spread of the weights is that of the failures met, not of all."""
-    good_rate: float = 0.1
-    """From this rate on, `max_region_weight` does not apply."""
-    max_region_weight: float = 30.0
-    """How many times p a point of the exploration may weigh as a draw: 1 to 3 is usual, 17 was seen to do."""
-    max_weight: float = 1e4
-    """How many times p, whatever the rate: all draws come from a place where hardly any failure is."""
+    early_rates: tuple[float, ...] = (0.005, 0.006)
+    """What each draw of the first rounds must be worth, in independent failures. Less cannot be told from chance; with
+    0.008 and more, proposals are given up that are several times better by the third round."""
+    relative_rate: float = 0.04
+    """The same for the last round, times the levels: subset simulation has an independent failure for each 100 levels
+    simulations, and the weights that were met are about four times flatter than all of them."""
     chain_points: float = 30.0
     """Points of a level at p0 = 0.1 for one that is independent: (1 - p0) / p0, and correlation along the chains."""
     level_share: float = 0.9
@@ -233,8 +253,10 @@ class DiagnosticSettings:
     """Independent failures that the rounds must be worth to be compared."""
     min_final_rate: float = 0.025
     """Independent failures for each final draw; with less, there may be heavier weights than any met."""
-    max_point_share: float = 0.05
-    """Share of p that a single draw in a region may stand for."""
+    max_point_share: float = 0.25
+    """Share of p that a typical point of a region may stand for as a draw."""
+    max_unseen_share: float = 0.3
+    """Share of p that may be in regions that were not found."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -259,6 +281,7 @@ class TwoStageSettings:
     """Of components with fewer draws the second moment stands in for the variance: that of a handful is worth
     nothing."""
     exploration: ExplorationSettings = ExplorationSettings()
+    lines: LineSettings = LineSettings()
     regions: RegionSettings = RegionSettings()
     refinement: RefinementSettings = RefinementSettings()
     fallback: FallbackSettings = FallbackSettings()

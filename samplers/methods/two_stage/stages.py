@@ -10,15 +10,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from samplers.importance.draws import Draws, weight_warnings, weighted_interval
+from samplers.mcmc.chains import RootedPoints
 from samplers.method import Goal, Interrupted, Outcome, Steps, no_outcome_share
 from samplers.methods.two_stage import fallback
 from samplers.methods.two_stage.candidates import build_proposal
-from samplers.methods.two_stage.diagnostics import check_base_draws, check_efficiency, check_regions, check_rounds
+from samplers.methods.two_stage.diagnostics import (
+    check_base_draws,
+    check_discovery,
+    check_efficiency,
+    check_regions,
+    check_rounds,
+)
+from samplers.methods.two_stage.discovery.unseen import discovery_interval
 from samplers.methods.two_stage.exploration import Sizes, find_regions, first_draws
 from samplers.methods.two_stage.mixture.proposal import MixtureProposal
 from samplers.methods.two_stage.multiple_importance import MultipleImportanceSample
 from samplers.methods.two_stage.noise_coordinates import marginalise_noise
-from samplers.methods.two_stage.refinement import RefinementState, expected_weights, refine_once, start_refinement
+from samplers.methods.two_stage.refinement import RefinementState, refine_once, start_refinement, typical_weights
 from samplers.methods.two_stage.regions import ExplorationResult
 from samplers.methods.two_stage.settings import TwoStageSettings
 from samplers.methods.two_stage.simulator import ComponentDraws, SimulationSteps, Simulator
@@ -122,16 +130,8 @@ def draw_first(context: RunContext, state: RunState) -> SimulationSteps[RunState
 def explore(context: RunContext, state: RunState) -> SimulationSteps[tuple[RunState, ExplorationResult]]:
     """Find the failure regions, starting from the first draws; there are none where nothing fails."""
     gamma, sizes = context.goal.gamma, Sizes.within(context.budget, context.settings.exploration)
-    settings = context.settings
     exploration = yield from find_regions(
-        context.simulator,
-        state.history.batches[0],
-        gamma,
-        sizes,
-        context.rng,
-        settings.regions,
-        settings.exploration,
-        settings.mixture,
+        context.simulator, state.history.batches[0], context.goal, sizes, context.rng, context.settings
     )
     n = sum(len(region.f) for region in exploration.regions)
     fails = sum(int((region.f <= gamma).sum()) for region in exploration.regions)
@@ -148,16 +148,14 @@ def begin_refinement(
 
 
 def draw_round(
-    context: RunContext, state: RunState, refinement: RefinementState, proposal: MixtureProposal, n: int, *, fresh: bool
+    context: RunContext, state: RunState, refinement: RefinementState, proposal: MixtureProposal, n: int
 ) -> SimulationSteps[tuple[RunState, RefinementState]]:
-    """Draw n points from a proposal and learn from them; `fresh`: also fit a mixture to all failures anew."""
+    """Draw n points from a proposal and learn from them."""
     state, batch = yield from _draw(context, state, proposal, n)
     gamma, settings = context.goal.gamma, context.settings
     draws = Draws.from_outcomes(batch.f, proposal.log_weights(batch.u), batch.u, gamma)
     history = state.history.add(batch, gamma)
-    refinement = refine_once(
-        refinement, history, proposal, batch, settings.refinement, context.rng, settings.mixture, fresh=fresh
-    )
+    refinement = refine_once(refinement, history, proposal, batch, settings.refinement, settings.mixture)
     ess = effective_sample_size(history.log_weights)
     state = replace(state, history=history, rounds=(*state.rounds, draws))
     p = float(np.exp(history.log_weights).sum())
@@ -181,33 +179,30 @@ def refine(
     rounds = settings.round_shares
     n = int(rounds[number - 1] * room)
     if n > 0:
-        fresh = number > len(rounds) - settings.fresh_rounds
-        state, refinement = yield from draw_round(context, state, refinement, proposal, n, fresh=fresh)
+        state, refinement = yield from draw_round(context, state, refinement, proposal, n)
     final = number == len(rounds)
     proposal = build_proposal(refinement, state.history, settings, context.rng, context.settings.mixture, final=final)
     return state, refinement, proposal
 
 
-def accepts_proposal(
-    context: RunContext, state: RunState, refinement: RefinementState, proposal: MixtureProposal
-) -> bool:
-    """Return whether to estimate with a proposal; where f is noisy by itself there is nothing better."""
+def gives_up(context: RunContext, state: RunState, exploration: ExplorationResult, number: int) -> bool:
+    """Return whether subset simulation does better with the rest, after a round of draws."""
     settings = context.settings.fallback
     if context.left_at_all < settings.min_fallback_budget or not state.rounds:
-        return True
-    if refinement.noisy:
-        return not context.noise_marginalised or fallback.meets_failures(state.rounds[-1], settings)
-    expected = expected_weights(refinement, proposal, context.settings.refinement.min_trimmed_chains)
-    return fallback.describes_failures(state.rounds[-1], expected, settings)
+        return False
+    return fallback.gives_up(state.rounds[-1], number, exploration.levels, settings)
 
 
 def fall_back(context: RunContext, state: RunState, levels: int) -> Steps:
     """Spend the rest on subset simulation in all coordinates, which needs no proposal."""
+    known = RootedPoints(state.base_u, state.base_f, np.arange(len(state.base_f)))
+    if context.noise_marginalised:  # the base draws lack the coordinates of noise
+        known = known.select(np.arange(0))
+    before = estimate_early(context, _close_trace(context, state))
     outcome = yield from fallback.run_subset_simulation(
-        context.inputs, context.goal, levels, context.left_at_all, context.rng, context.settings.fallback
+        context.inputs, context.goal, levels, context.left_at_all, known, context.rng, context.settings.fallback
     )
     state = _close_trace(context, state)
-    before = estimate_early(context, state)
     unfinished = outcome.status is Status.STOPPED and outcome.p == 0  # no estimate, then
     whole = before if unfinished else fallback.reconcile(outcome, before)
     return replace(whole, trace=state.trace + outcome.trace, base_draws=state.base_draws + outcome.base_draws)
@@ -219,8 +214,8 @@ def estimate_afresh(
     """Draw from the last proposal until the budget is used or the target is met; p rests on these draws alone."""
     goal, inputs, stopped = context.goal, context.simulator.inputs, False
     settings = context.settings
-    expected = expected_weights(refinement, proposal, settings.refinement.min_trimmed_chains)
-    sample = StratifiedSample.empty(len(proposal.weights), inputs.dim, expected, settings.min_stratum_draws)
+    typical = typical_weights(refinement, proposal)
+    sample = StratifiedSample.empty(len(proposal.weights), inputs.dim, typical, settings.min_stratum_draws)
     size = context.left if goal.target_cov is None else context.target_batch
     while context.left_at_all > 0:
         try:
@@ -236,8 +231,11 @@ def estimate_afresh(
         early = estimate_early(context, state)
         return early if stopped else replace(early, status=Status.BUDGET)
     outcome = _outcome(context, state, sample.draws, sample.cov, 1 / settings.refinement.base_share)
+    discovery = refinement.exploration.discovery
+    largest_weight = 1 / settings.refinement.base_share
     return replace(
         outcome,
+        interval=discovery_interval(sample.draws, sample.cov, goal.confidence, largest_weight, discovery),
         warnings=(*outcome.warnings, *_check(context, state, refinement, sample)),
         sample=sample.to_sample(proposal, state.base_f, state.base_u, goal.gamma),
         status=Status.STOPPED if stopped else outcome.status,
@@ -304,6 +302,7 @@ def _check(context: RunContext, state: RunState, refinement: RefinementState, sa
         *check_base_draws(sample.p, hits, len(state.base_f), settings),
         *check_rounds(sample, state.rounds, settings),
         *check_regions(sample, settings),
+        *check_discovery(sample.p, refinement.exploration.discovery, context.goal.confidence, settings),
         *([] if refinement.noisy else check_efficiency(sample, settings)),
     ]
 

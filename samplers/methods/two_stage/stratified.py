@@ -19,6 +19,9 @@ from samplers.sample import Sample
 MAX_LOG_WEIGHT = 700.0
 """exp(709) is the largest number; base draws bound all weights that matter far below."""
 
+MAX_TYPICAL_SHARE = 0.25
+"""More in one draw would be met often enough to be seen; a typical weight beyond is of a place without failures."""
+
 
 @dataclass(frozen=True, eq=False)
 class StratifiedSample:
@@ -33,7 +36,7 @@ class StratifiedSample:
     """Of y^2 in each component, shape (k,)."""
     acceptance_cov: float
     """Error that all draws have in common: see `MixtureProposal.acceptance_cov`."""
-    expected: FloatArray
+    typical: FloatArray
     """Weight of a typical point of each region, whether or not a draw has met one, shape (m,)."""
     u_safe: FloatArray
     """The draws that did not fail, in the order of `draws.f_safe`, shape (m, d)."""
@@ -42,11 +45,11 @@ class StratifiedSample:
 
     @classmethod
     def empty(
-        cls, k: int, dim: int, expected: FloatArray, min_stratum_draws: int = DEFAULT_SETTINGS.min_stratum_draws
+        cls, k: int, dim: int, typical: FloatArray, min_stratum_draws: int = DEFAULT_SETTINGS.min_stratum_draws
     ) -> "StratifiedSample":
         """Return a sample without draws, of a proposal of k components in d dimensions."""
         zero, none = np.zeros(k), Draws(0, np.empty(0), np.empty(0))
-        return cls(none, zero, zero, zero, 0.0, expected, np.empty((0, dim)), min_stratum_draws)
+        return cls(none, zero, zero, zero, 0.0, typical, np.empty((0, dim)), min_stratum_draws)
 
     def add(self, batch: ComponentDraws, proposal: MixtureProposal, inputs: Inputs, gamma: float) -> "StratifiedSample":
         """Return the sample with another batch from the same proposal."""
@@ -61,7 +64,7 @@ class StratifiedSample:
             self.sums + np.bincount(owner, weights=y, minlength=k),
             self.squares + np.bincount(owner, weights=y * y, minlength=k),
             proposal.acceptance_cov,
-            self.expected,
+            self.typical,
             np.concatenate([self.u_safe, batch.u[~fails]]),
             self.min_stratum_draws,
         )
@@ -75,15 +78,16 @@ class StratifiedSample:
     def cov(self) -> float:
         """Coefficient of variation of `p`; inf without a failing draw.
 
-        From the variance within the components. The square of the largest term, met or expected of a region, is added
-        for draws as heavy as that which have not been met.
+        From the variance within the components. The square of the largest term, met or typical of a region (at most
+        MAX_TYPICAL_SHARE of p), is added for draws as heavy as that which have not been met.
         """
         if len(self.draws.f) == 0:
             return math.inf
         many = self.counts >= self.min_stratum_draws
         n, s1, s2 = self.counts[many], self.sums[many], self.squares[many]
         within = float(((s2 - s1 * s1 / n) * n / (n - 1)).sum()) + float(self.squares[~many].sum())
-        largest = max(math.exp(float(self.draws.log_weights.max())), float(self.expected.max(initial=0.0)))
+        typical = min(float(self.typical.max(initial=0.0)), MAX_TYPICAL_SHARE * self.draws.n * self.p)
+        largest = max(math.exp(float(self.draws.log_weights.max())), typical)
         return math.hypot(
             math.sqrt(max(within, 0.0) + largest * largest) / (self.draws.n * self.p), self.acceptance_cov
         )

@@ -38,7 +38,7 @@ def after_round(exact_region, rng, n=800, **kwargs):
     u, counts = proposal.draw(n, rng)
     batch = ComponentDraws(proposal.components, counts, u, problem.evaluate(u))
     history = history.add(batch, 0.0)
-    return refine_once(state, history, proposal, batch, SETTINGS, rng, fresh=True), history, problem
+    return refine_once(state, history, proposal, batch, SETTINGS), history, problem
 
 
 def share(proposal, *kinds):
@@ -114,7 +114,7 @@ def test_no_region_is_lost(exact_region, rng, final, least):
     u, counts = proposal.draw(800, rng)
     batch = ComponentDraws(proposal.components, counts, u, BETA - u[:, 0])
     history = history.add(batch, 0.0)
-    state = refine_once(state, history, proposal, batch, SETTINGS, rng, fresh=True)
+    state = refine_once(state, history, proposal, batch, SETTINGS)
     shares = build_proposal(state, history, SETTINGS, rng, final=final)
     for k in range(2):
         own = [a for a, c in zip(shares.weights, shares.candidates, strict=True) if c.region == k]

@@ -37,13 +37,13 @@ def draws(proposal, n, problem, rng):
     return ComponentDraws(proposal.components, counts, u, problem.evaluate(u))
 
 
-def refined(exact_region, problem, regions, rng, fresh=True, n=600):
+def refined(exact_region, problem, regions, rng, n=600):
     """Return the state before and after a round, and the draws."""
     before = start_refinement(explored(exact_region, problem, regions), 0.0, SETTINGS, rng)
     proposal = build_proposal(before, MultipleImportanceSample.empty(problem.dim), SETTINGS, rng)
     batch = draws(proposal, n, problem, rng)
     history = MultipleImportanceSample.empty(problem.dim).add(batch, 0.0)
-    after = refine_once(before, history, proposal, batch, SETTINGS, rng, fresh=fresh)
+    after = refine_once(before, history, proposal, batch, SETTINGS)
     return before, after, history, batch
 
 
@@ -58,7 +58,7 @@ def test_the_exploration_gives_each_region_its_gaussians_and_its_half_space(exac
         assert isinstance(half_space, HalfSpaceNormal)
         assert half_space.axis[k] > 0.99
         assert half_space.start == pytest.approx(BETA, abs=0.1)
-    assert (state.dim, state.rounds, state.fresh_gaussians) == (4, (), [])
+    assert (state.dim, state.rounds) == (4, ())
     assert state.points.shape == (100 * regions, 4)
 
 
@@ -68,7 +68,7 @@ def test_where_f_is_noisy_one_region_may_have_many_gaussians(rng):
     chains = np.repeat(centres, 12, axis=0)[:, None] + 0.3 * rng.standard_normal((96, 5, 4))
     clusters = Region(chains, chains.reshape(-1, 4), rng.standard_normal(480))
     exploration = ExplorationResult([clusters], noisy=True)
-    assert len(start_refinement(exploration, 0.0, SETTINGS, rng).explored) == SETTINGS.max_gaussians
+    assert len(start_refinement(exploration, 0.0, SETTINGS, rng).explored) == SETTINGS.noisy_gaussians
     exploration = exploration._replace(noisy=False)
     assert len(start_refinement(exploration, 0.0, SETTINGS, rng).explored) == SETTINGS.gaussians_per_region
 
@@ -102,7 +102,7 @@ def test_hit_rate_is_that_of_the_sharp_components(exact_region, rng):
     f = np.concatenate([np.ones(100), np.where(np.arange(100) < 70, -1.0, 1.0)])
     batch = ComponentDraws(proposal.components, np.array([100, 100]), rng.standard_normal((200, 2)), f)
     history = MultipleImportanceSample.empty(2).add(batch, 0.0)
-    after = refine_once(state, history, proposal, batch, SETTINGS, rng, fresh=False)
+    after = refine_once(state, history, proposal, batch, SETTINGS)
     assert after.hit_rate == pytest.approx(0.7)
     np.testing.assert_array_equal(after.rounds[0].u, batch.u[100:])
     np.testing.assert_array_equal(after.rounds[0].log_weights, proposal.log_weights(batch.u[100:]))
@@ -115,7 +115,7 @@ def test_without_failures_a_round_changes_no_component(exact_region, rng):
     u = rng.standard_normal((100, 3))
     batch = ComponentDraws(proposal.components, np.array([100]), u, np.ones(100))
     history = MultipleImportanceSample.empty(3).add(batch, 0.0)
-    after = refine_once(state, history, proposal, batch, SETTINGS, rng, fresh=True)
+    after = refine_once(state, history, proposal, batch, SETTINGS)
     assert after.gaussians is state.gaussians
     assert after.linear is state.linear
     assert after.hit_rate == 0.0
@@ -146,9 +146,7 @@ def test_expected_weight_of_a_region_leaves_out_its_heaviest_chain(rng):
     chains = np.zeros((4, 2, 2))
     chains[1:, :, 0] = 3.0
     exploration = ExplorationResult([Region(chains, chains.reshape(-1, 2), -np.ones(8))], noisy=False)
-    state = RefinementState(
-        exploration=exploration, gamma=0.0, explored=(), gaussians=[], linear=(), fresh_gaussians=[]
-    )
+    state = RefinementState(exploration=exploration, gamma=0.0, explored=(), gaussians=[], linear=())
     plain = MixtureProposal([ProposalComponent(IsotropicNormal(2), "base")], np.ones(1))
     np.testing.assert_allclose(expected_weights(state, plain), 1.0)
     far = SubspaceGaussian(np.eye(2), np.array([3.0, 0.0]), np.ones(2))
@@ -156,7 +154,5 @@ def test_expected_weight_of_a_region_leaves_out_its_heaviest_chain(rng):
     # phi / q = exp(9/2 - 3 u1): e^-4.5 at u1 = 3, e^4.5 at the origin
     np.testing.assert_allclose(expected_weights(state, proposal), np.exp(-4.5))
     two = exploration._replace(regions=[Region(chains[:2], exploration.regions[0].u, exploration.regions[0].f)])
-    both = expected_weights(
-        RefinementState(exploration=two, gamma=0.0, explored=(), gaussians=[], linear=(), fresh_gaussians=[]), proposal
-    )
+    both = expected_weights(RefinementState(exploration=two, gamma=0.0, explored=(), gaussians=[], linear=()), proposal)
     np.testing.assert_allclose(both, (np.exp(-4.5) + np.exp(4.5)) / 2)

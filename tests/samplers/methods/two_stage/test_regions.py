@@ -11,10 +11,10 @@ from samplers.methods.two_stage.regions import (
     _add_subset_points,
     _estimate_direction,
     _is_noisy,
-    _label_regions,
     _pcn_chains,
     _replicate_seeds,
     grow_regions,
+    label_regions,
 )
 from samplers.methods.two_stage.settings import RegionSettings
 from samplers.methods.two_stage.simulator import Simulator
@@ -65,7 +65,7 @@ def test_chains_without_a_direction_come_from_a_wide_failure_to_likely_ones(driv
 def test_regions_are_told_apart_by_the_point_half_way(drive, rng):
     problem = half_spaces(4, 2.5, 2.5, 2.5)
     u = np.concatenate([rng.normal(0, 0.1, (20, 4)) + 3.0 * np.eye(4)[k] for k in range(3)])
-    labels, scattered = drive(_label_regions(Simulator(problem), u, 0.0, 10**6), problem).value
+    labels, scattered = drive(label_regions(Simulator(problem), u, 0.0, 10**6), problem).value
     assert not scattered
     assert labels.shape == (60,)
     assert all(len(set(labels[20 * k : 20 * (k + 1)])) == 1 for k in range(3))
@@ -77,7 +77,7 @@ def test_a_far_point_and_one_in_two_regions_join_no_regions(drive, rng):
     problem = half_spaces(2, 3.0, 3.0)
     u = np.array([[8.0, 0.0], [4.0, 4.0], [3.1, 0.0], [0.0, 3.2], [3.3, 0.5], [-0.5, 3.1]])
     for order in [rng.permutation(6) for _ in range(20)]:
-        labels, _ = drive(_label_regions(Simulator(problem), u[order], 0.0, 10**6), problem).value
+        labels, _ = drive(label_regions(Simulator(problem), u[order], 0.0, 10**6), problem).value
         found = labels[np.argsort(order)]
         assert found[2] == found[4] != found[3] == found[5]
 
@@ -89,7 +89,7 @@ def test_more_regions_than_a_shell_would_need_are_pieces_of_it(drive, dim):
     u = np.concatenate([s * 3.3 * np.eye(dim) for s in (1, -1)])
     per_face = np.repeat([6, 1], [8, 4]) if dim == 6 else np.full(20, 3)
     labels, scattered = drive(
-        _label_regions(Simulator(problem), np.repeat(u, per_face, axis=0), 0.0, 10**6), problem
+        label_regions(Simulator(problem), np.repeat(u, per_face, axis=0), 0.0, 10**6), problem
     ).value
     assert scattered == (dim == 10)
     assert set(labels) == set(range(12 if dim == 6 else SETTINGS.many_regions))
@@ -174,9 +174,9 @@ def test_the_limit_of_simulations_ends_the_comparison(drive, rng):
     problem = half_spaces(2, 3.0, 3.0)
     u = np.concatenate([rng.normal(0, 0.1, (20, 2)) + 3.4 * np.eye(2)[k] for k in range(2)])
     simulator = Simulator(problem)
-    labels, _ = drive(_label_regions(simulator, u, 0.0, 60), problem).value
+    labels, _ = drive(label_regions(simulator, u, 0.0, 60), problem).value
     assert simulator.n_sim == 39 + 19  # all others with the first point, those left over with the second
     assert set(labels[:20]) != set(labels[20:])
-    labels, _ = drive(_label_regions(simulator := Simulator(problem), u, 0.0, 40), problem).value
+    labels, _ = drive(label_regions(simulator := Simulator(problem), u, 0.0, 40), problem).value
     assert simulator.n_sim == 39
     assert set(labels[:20]) != set(labels[20:])
