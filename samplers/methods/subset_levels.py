@@ -104,7 +104,7 @@ class SubsetLevels:
             trace.append(level_record(growth.chains, threshold, multiply_levels(trace)))
             goal.on_level(trace[-1])
 
-        first = yield from draw_first_level(inputs, min(n, goal.budget + n_known), rng, known)
+        first = yield from draw_first_level(inputs, max(min(n, goal.budget + n_known), n_known), rng, known)
         left = goal.budget - first.n_new
         planner = SubsetPlanner(n=n, p0=self.p0, max_levels=self.max_levels, gamma=gamma, budget=left)
         status = yield from descend(inputs, Growth.start(first, kernel), planner, record, rng)

@@ -182,7 +182,7 @@ def describe_row(row: Row) -> str:
     )
 
 
-HEADER = """| problem | d | p | mean | c.o.v. (own) | gain | coverage | low : high | U/L | off, warned | right, warned | n |
+HEADER = """| problem | d | p | mean | c.o.v. (own) | gain | coverage | low : high | U/L | off, warned | right | n |
 |---|---|---|---|---|---|---|---|---|---|---|---|"""
 
 

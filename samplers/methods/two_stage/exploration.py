@@ -21,8 +21,8 @@ from samplers.methods.two_stage.discovery.levels import descend_levels
 from samplers.methods.two_stage.discovery.lines import LineEnds, choose_roots, count_lines, walk_lines
 from samplers.methods.two_stage.discovery.unseen import Discovery, count_lineages
 from samplers.methods.two_stage.discovery.wide import bisect_towards_origin, find_wide_failures
-from samplers.methods.two_stage.regions import ExplorationResult, grow_regions, label_regions
-from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, ExplorationSettings, TwoStageSettings
+from samplers.methods.two_stage.regions import ExplorationResult, Labels, Region, grow_regions, label_regions
+from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, ExplorationSettings, LineSettings, TwoStageSettings
 from samplers.methods.two_stage.simulator import ComponentDraws, SimulationSteps, Simulator
 from samplers.problem import FloatArray
 from samplers.proposals.components import IsotropicNormal, MixtureComponent, draw_components
@@ -32,6 +32,8 @@ from samplers.proposals.components import IsotropicNormal, MixtureComponent, dra
 class Sizes:
     """Simulations for each part of the exploration."""
 
+    scale: float
+    """By what the numbers of the settings are multiplied."""
     base: int
     """Base draws."""
     wide: tuple[tuple[float, int], ...]
@@ -53,6 +55,7 @@ class Sizes:
         usual = settings.usual_budget
         scale = budget / usual if budget < usual else math.sqrt(budget / usual)
         return cls(
+            scale=scale,
             base=round(settings.base * scale),
             wide=tuple((width, round(n * scale)) for width, n in settings.wide),
             level=max(settings.least_level, round(settings.level * scale)),
@@ -89,14 +92,20 @@ def find_regions(
     base_u, base_f = first.u[:n_base], first.f[:n_base]
     drawn = ComponentDraws(first.components[1:], first.counts[1:], first.u[n_base:], first.f[n_base:])
     descent = yield from descend_levels(simulator, base_u, base_f, goal, sizes.level, sizes.most, rng, explore)
-    wide = yield from find_wide_failures(simulator, drawn, goal, descent.levels, rng, explore)
-    lines = yield from _find_lines(simulator, base_u, base_f, gamma, descent.levels, rng, settings)
+    wide = yield from find_wide_failures(
+        simulator, drawn, gamma, descent.levels, round(explore.deep_draws * sizes.scale), rng, explore
+    )
+    lines = yield from _find_lines(simulator, base_u, base_f, gamma, descent.levels, sizes.scale, rng, settings)
     roots = len(np.union1d(descent.roots, lines.roots))
     discovery = Discovery(count_lineages(roots, wide.log_weights), descent.ceiling)
     most = max(2, (sizes.limit - simulator.n_sim) // explore.chain_cost)
     chosen = wide.choose(min(sizes.starts, most), rng)
     far = yield from bisect_towards_origin(simulator, chosen, gamma, explore.bisections)
-    near = yield from _choose_lines(simulator, lines.u, gamma, sizes.limit, rng, settings)
+    labels, _ = yield from label_regions(simulator, lines.u, gamma, sizes.limit, settings.regions)
+    if _is_scattered(labels, simulator.inputs.dim, settings):
+        region = Region(lines.u[:, None], descent.u, descent.f)
+        return ExplorationResult([region], noisy=False, scattered=True, levels=descent.levels, discovery=discovery)
+    near = _choose_lines(lines.u, labels, rng, settings.lines)
     others = min(max(sizes.level_starts, sizes.starts + sizes.level_starts - len(far)), most - len(far))
     starts = np.concatenate([far, near, rng.permutation(descent.failing)[: max(others - len(near), 0)]])
     if len(starts) == 0:
@@ -113,27 +122,25 @@ def _find_lines(
     f: FloatArray,
     gamma: float,
     levels: int,
+    scale: float,
     rng: np.random.Generator,
     settings: TwoStageSettings,
 ) -> SimulationSteps[LineEnds]:
     """Walk lines of descent from base draws u (n, d) with outcomes f (n,), and their ends towards the origin."""
-    roots = choose_roots(f, count_lines(levels, settings.lines), rng, settings.lines)
-    ends, failing = yield from walk_lines(simulator, u[roots], f[roots], gamma, rng, settings.lines)
+    roots = choose_roots(f, count_lines(levels, scale, settings.lines), rng, settings.lines)
+    ends, failing = yield from walk_lines(simulator, u[roots], f[roots], gamma, scale, rng, settings.lines)
     near = yield from bisect_towards_origin(simulator, ends[failing], gamma, settings.exploration.bisections)
     return LineEnds(near, roots[failing])
 
 
-def _choose_lines(
-    simulator: Simulator,
-    u: FloatArray,
-    gamma: float,
-    limit: int,
-    rng: np.random.Generator,
-    settings: TwoStageSettings,
-) -> SimulationSteps[FloatArray]:
+def _is_scattered(labels: Labels, dim: int, settings: TwoStageSettings) -> bool:
+    """Return whether lines of descent lie in so many regions, in many dimensions, that chains would not relax there."""
+    regions = int(labels.max(initial=-1)) + 1
+    return dim > settings.mixture.subspace.high_dim and regions >= settings.lines.many_regions
+
+
+def _choose_lines(u: FloatArray, labels: Labels, rng: np.random.Generator, settings: LineSettings) -> FloatArray:
     """Return ends of lines (n, d) for chains to start from: a few of each region."""
-    if len(u) == 0:
-        return u
-    labels, _ = yield from label_regions(simulator, u, gamma, limit, settings.regions)
     order = rng.permutation(len(u))
-    return np.concatenate([u[order[labels[order] == k][: settings.lines.starts]] for k in range(labels.max() + 1)])
+    chosen = [order[labels[order] == k][: settings.starts] for k in range(int(labels.max(initial=-1)) + 1)]
+    return u[np.concatenate([np.empty(0, dtype=np.int64), *chosen])]

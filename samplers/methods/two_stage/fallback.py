@@ -10,11 +10,13 @@ from samplers.mcmc.chains import RootedPoints
 from samplers.method import Goal, Outcome, Steps
 from samplers.methods.subset_simulation import AdaptiveSubsetSimulation
 from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, FallbackSettings
-from samplers.problem import Inputs
+from samplers.problem import FloatArray, Inputs
 
 
-def gives_up(draws: Draws, number: int, levels: int, settings: FallbackSettings = DEFAULT_SETTINGS.fallback) -> bool:
-    """Return whether a proposal describes the failures so badly that subset simulation does better with the rest.
+def meets_too_few(
+    draws: Draws, number: int, levels: int, settings: FallbackSettings = DEFAULT_SETTINGS.fallback
+) -> bool:
+    """Return whether the draws of a round meet so few failures that subset simulation does better with the rest.
 
     Args:
         draws: Of the last round.
@@ -25,6 +27,17 @@ def gives_up(draws: Draws, number: int, levels: int, settings: FallbackSettings 
     early = settings.early_rates
     rate = early[number - 1] if number <= len(early) else settings.relative_rate / max(levels, settings.min_levels)
     return draws.ess < rate * draws.n
+
+
+def misses_regions(draws: Draws, typical: FloatArray, settings: FallbackSettings = DEFAULT_SETTINGS.fallback) -> bool:
+    """Return whether a proposal is far from most of the regions found, and its draws are not so good that it may be.
+
+    Args:
+        draws: Of the last round.
+        typical: Weights of typical points of the regions as draws of the proposal, shape (m,).
+        settings: Limits.
+    """
+    return draws.ess < settings.good_rate * draws.n and float(np.median(typical)) > settings.max_typical * draws.p
 
 
 def reconcile(subset_outcome: Outcome, earlier: Outcome) -> Outcome:
@@ -53,7 +66,7 @@ def run_subset_simulation(
     goal: Goal,
     levels: int,
     budget: int,
-    known: RootedPoints,
+    known: RootedPoints | None,
     rng: np.random.Generator,
     settings: FallbackSettings = DEFAULT_SETTINGS.fallback,
 ) -> Steps:
@@ -64,20 +77,20 @@ def run_subset_simulation(
         goal: Threshold, confidence and target.
         levels: Levels that subset simulation passed in the exploration.
         budget: Simulations that are never exceeded.
-        known: Base draws of the exploration, from which it starts.
+        known: Base draws of the exploration, from which it starts, if these have all coordinates.
         rng: Source of randomness.
         settings: How points per level follow from the budget.
     """
     levels = max(levels, settings.min_levels)
-    n = int((budget + len(known.f)) / (1 + settings.level_share * (levels + 0.5)))
+    n = int((budget + (0 if known is None else len(known.f))) / (1 + settings.level_share * (levels + 0.5)))
     if goal.target_cov is not None:
         n = min(n, math.ceil(settings.chain_points * (levels + 1) / goal.target_cov**2))
     n = max(n, settings.min_points)
-    known = known.select(np.arange(min(n, len(known.f))))
+    known = known and known.select(np.arange(min(n, len(known.f))))
     outcome = yield from AdaptiveSubsetSimulation(n=n).steps(inputs, replace(goal, max_sim=budget), rng, known)
     about = (
         "No proposal describes the failures: p is from adaptive subset simulation with what was left, "
         f"{budget:,} simulations; by itself (adss) it would have had all of them."
     )
-    outcome = replace(outcome, base_draws=outcome.base_draws - len(known.f))  # these were counted before
-    return replace(outcome, warnings=(about, *outcome.warnings))
+    counted_before = 0 if known is None else len(known.f)
+    return replace(outcome, warnings=(about, *outcome.warnings), base_draws=outcome.base_draws - counted_before)

@@ -116,7 +116,7 @@ def run_two_stage(
         room = context.left
         for number in range(1, len(settings.refinement.round_shares) + 1):
             state, refinement, proposal = yield from stages.refine(context, state, refinement, number, room, proposal)
-            if stages.gives_up(context, state, exploration, number):
+            if stages.gives_up(context, state, refinement, proposal, number):
                 return (yield from stages.fall_back(context, state, exploration.levels))
     except Interrupted:
         return stages.estimate_early(context, state)

@@ -36,8 +36,10 @@ class ExplorationSettings:
     """Base draws; five levels of a tenth each reach 1e-5 from there."""
     wide: tuple[tuple[float, int], ...] = ((1.5, 120), (2.2, 120), (3.0, 80))
     """Wide draws: (s, number). At s = 3 a half-space at beta = 4.5 is hit by one draw in 15."""
-    deep: tuple[float, int] = (3.3, 80)
-    """Where the levels went so far that wide draws should have a larger s than this: so many more, with that s."""
+    deep_scale: float = 3.3
+    """Where the levels went so far that wide draws should have a larger s than this, there are ..."""
+    deep_draws: int = 80
+    """... so many more, with that s."""
     depth_ratio: float = 1.45
     """Distance of the levels' end, beta, over s: one draw in 14 is beyond a half-space there."""
     level: int = 250
@@ -53,10 +55,10 @@ class ExplorationSettings:
     """Acceptance that it is adapted to (Papaioannou, Betz, Zwirglmaier and Straub, 2015)."""
     max_levels: int = 30
     """Levels at most; the share of the budget ends the descent first unless f ties."""
-    starts: int = 60
+    starts: int = 24
     """Chains from wide failures at most; `least_starts` where the budget is small."""
     least_starts: int = 10
-    level_starts: int = 16
+    level_starts: int = 24
     """The same for failures of subset simulation; they take the place of wide failures that are missing."""
     least_level_starts: int = 6
     bisections: int = 3
@@ -97,6 +99,9 @@ class LineSettings:
     few_arrived: float = 0.15
     starts: int = 4
     """Lines of each region from which chains start."""
+    many_regions: int = 6
+    """In more than `SubspaceSettings.high_dim` dimensions lines in so many regions mean a shell or a ring: chains would
+    not relax there, and none are run."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -231,6 +236,10 @@ class FallbackSettings:
     relative_rate: float = 0.04
     """The same for the last round, times the levels: subset simulation has an independent failure for each 100 levels
     simulations, and the weights that were met are about four times flatter than all of them."""
+    good_rate: float = 0.1
+    """From this rate of the last round on, `max_typical` does not apply."""
+    max_typical: float = 30.0
+    """How many times p a typical point of most regions may weigh as a draw: 1 to 3 is usual, 17 was seen to do."""
     chain_points: float = 30.0
     """Points of a level at p0 = 0.1 for one that is independent: (1 - p0) / p0, and correlation along the chains."""
     level_share: float = 0.9

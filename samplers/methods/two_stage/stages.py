@@ -185,19 +185,25 @@ def refine(
     return state, refinement, proposal
 
 
-def gives_up(context: RunContext, state: RunState, exploration: ExplorationResult, number: int) -> bool:
+def gives_up(
+    context: RunContext, state: RunState, refinement: RefinementState, proposal: MixtureProposal, number: int
+) -> bool:
     """Return whether subset simulation does better with the rest, after a round of draws."""
-    settings = context.settings.fallback
+    settings, rounds = context.settings.fallback, context.settings.refinement.round_shares
     if context.left_at_all < settings.min_fallback_budget or not state.rounds:
         return False
-    return fallback.gives_up(state.rounds[-1], number, exploration.levels, settings)
+    last = state.rounds[-1]
+    if fallback.meets_too_few(last, number, refinement.exploration.levels, settings):
+        return True
+    final = number == len(rounds) and not refinement.noisy
+    return final and fallback.misses_regions(last, typical_weights(refinement, proposal), settings)
 
 
 def fall_back(context: RunContext, state: RunState, levels: int) -> Steps:
     """Spend the rest on subset simulation in all coordinates, which needs no proposal."""
-    known = RootedPoints(state.base_u, state.base_f, np.arange(len(state.base_f)))
+    known: RootedPoints | None = RootedPoints(state.base_u, state.base_f, np.arange(len(state.base_f)))
     if context.noise_marginalised:  # the base draws lack the coordinates of noise
-        known = known.select(np.arange(0))
+        known = None
     before = estimate_early(context, _close_trace(context, state))
     outcome = yield from fallback.run_subset_simulation(
         context.inputs, context.goal, levels, context.left_at_all, known, context.rng, context.settings.fallback

@@ -25,9 +25,9 @@ class LineEnds(NamedTuple):
     """Index of the base draw that each started from, shape (k,)."""
 
 
-def count_lines(levels: int, settings: LineSettings = DEFAULT_SETTINGS.lines) -> int:
-    """Return how many lines to walk: those that the simulations for them reach through so many levels."""
-    return min(settings.most, settings.per_level // max(levels, 1))
+def count_lines(levels: int, scale: float, settings: LineSettings = DEFAULT_SETTINGS.lines) -> int:
+    """Return how many lines to walk: those that the simulations for them suffice for, through so many levels."""
+    return max(1, round(scale * min(settings.most, settings.per_level / max(levels, 1))))
 
 
 def choose_roots(
@@ -43,6 +43,7 @@ def walk_lines(
     u: FloatArray,
     f: FloatArray,
     gamma: float,
+    scale: float,
     rng: np.random.Generator,
     settings: LineSettings = DEFAULT_SETTINGS.lines,
 ) -> SimulationSteps[tuple[FloatArray, NDArray[np.bool_]]]:
@@ -50,13 +51,13 @@ def walk_lines(
 
     A step is v = sqrt(1 - s^2) u + s xi with xi ~ N(0, I), or with the xi before if that was a gain; it is taken where
     f(v) <= f(u). All lines take a step in one batch. They end together: when all have arrived, at twice the median
-    time of arrival once most have, where hardly any arrives, or at the limit of simulations.
+    time of arrival once most have, where hardly any arrives, or at the limit of simulations (times `scale`).
     """
     u, f, n = u.copy(), f.copy(), len(f)
     s, xi, fresh = np.full(n, settings.initial_step), np.zeros_like(u), np.ones(n, dtype=bool)
     arrival = np.where(f <= gamma, 0.0, np.inf)
     used = time = 0
-    while np.isinf(arrival).any() and not _is_late(arrival, time, used, settings):
+    while np.isinf(arrival).any() and not _is_late(arrival, time, used / scale, settings):
         on = np.flatnonzero(np.isinf(arrival))
         drawn = on[fresh[on]]
         xi[drawn] = rng.standard_normal((len(drawn), u.shape[1]))
@@ -72,7 +73,7 @@ def walk_lines(
     return u, np.isfinite(arrival)
 
 
-def _is_late(arrival: FloatArray, time: int, used: int, settings: LineSettings) -> bool:
+def _is_late(arrival: FloatArray, time: int, used: float, settings: LineSettings) -> bool:
     """Return whether the lines that are still on their way are given up."""
     arrived = np.isfinite(arrival)
     share = float(arrived.mean())

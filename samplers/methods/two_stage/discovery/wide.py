@@ -5,7 +5,6 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtri
 
-from samplers.method import Goal
 from samplers.methods.two_stage.settings import ExplorationSettings
 from samplers.methods.two_stage.simulator import ComponentDraws, SimulationSteps, Simulator
 from samplers.problem import FloatArray
@@ -50,8 +49,9 @@ def draw_wide(
 def find_wide_failures(
     simulator: Simulator,
     first: ComponentDraws,
-    goal: Goal,
+    gamma: float,
     levels: int,
+    n: int,
     rng: np.random.Generator,
     settings: ExplorationSettings,
 ) -> SimulationSteps[WideFailures]:
@@ -60,22 +60,22 @@ def find_wide_failures(
     Args:
         simulator: Gives outcomes.
         first: The wide draws so far.
-        goal: Threshold of failure.
+        gamma: Threshold of failure.
         levels: Of subset simulation: it ended at a probability of about 10^-(levels + 1/2).
+        n: How many wider ones.
         rng: Source of randomness.
-        settings: Numbers and scales.
+        settings: Scales.
     """
-    usual, n = settings.deep
     scale = -float(ndtri(10 ** -(levels + 0.5))) / settings.depth_ratio
-    if scale > usual:
+    if scale > settings.deep_scale:
         deep = yield from draw_wide(simulator, ((scale, n),), rng)
         first = ComponentDraws(
-            first.components + deep.components,
+            [*first.components, *deep.components],
             np.concatenate([first.counts, deep.counts]),
             np.concatenate([first.u, deep.u]),
             np.concatenate([first.f, deep.f]),
         )
-    return WideFailures.among(first, goal.gamma)
+    return WideFailures.among(first, gamma)
 
 
 def bisect_towards_origin(simulator: Simulator, u: FloatArray, gamma: float, steps: int) -> SimulationSteps[FloatArray]:

@@ -7,7 +7,14 @@ import pytest
 from scipy import stats
 
 from samplers.importance.draws import Draws
-from samplers.methods.two_stage.diagnostics import check_base_draws, check_efficiency, check_regions, check_rounds
+from samplers.methods.two_stage.diagnostics import (
+    check_base_draws,
+    check_discovery,
+    check_efficiency,
+    check_regions,
+    check_rounds,
+)
+from samplers.methods.two_stage.discovery.unseen import Discovery
 from samplers.methods.two_stage.settings import DEFAULT_SETTINGS
 from samplers.methods.two_stage.stratified import StratifiedSample
 
@@ -75,12 +82,21 @@ def test_draws_that_are_worth_few_failures(failing, warns):
     assert bool(check_efficiency(final(failing=failing))) == warns
 
 
-@pytest.mark.parametrize(("share", "warns"), [(0.04, False), (0.06, True)])
+@pytest.mark.parametrize(("share", "warns"), [(0.24, False), (0.26, True)])
 def test_regions_that_the_draws_hardly_reach(share, warns):
-    """p rests on n p = 1: a point of weight 0.06 is 6 % of it."""
+    """p rests on n p = 1: a point of weight 0.26 is 26 % of it."""
     found = check_regions(final(expected=[0.0, share]))
     assert bool(found) == warns
     if warns:
         assert "1 of 2 regions" in found[0]
-        assert "6% of p" in found[0]
+        assert "26% of p" in found[0]
     assert check_regions(final(failing=0, expected=[1.0])) == []
+
+
+@pytest.mark.parametrize(("lineages", "warns"), [(4, True), (5, True), (6, False), (50, False)])
+def test_few_lineages(lineages, warns):
+    """The 97.5 % points of Beta(1/4, nu) are 0.38, 0.32 and 0.27 for nu = 4, 5 and 6."""
+    found = check_discovery(1e-3, Discovery(lineages), 0.95)
+    assert bool(found) == warns
+    if lineages == 4:
+        assert "6.0e-04 more, 38% of p" in found[0]

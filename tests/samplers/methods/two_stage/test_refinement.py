@@ -10,9 +10,9 @@ from samplers.methods.two_stage.multiple_importance import MultipleImportanceSam
 from samplers.methods.two_stage.refinement import (
     SHARP_KINDS,
     RefinementState,
-    expected_weights,
     refine_once,
     start_refinement,
+    typical_weights,
 )
 from samplers.methods.two_stage.regions import ExplorationResult, Region
 from samplers.methods.two_stage.settings import RefinementSettings
@@ -121,16 +121,6 @@ def test_without_failures_a_round_changes_no_component(exact_region, rng):
     assert after.hit_rate == 0.0
 
 
-def test_fresh_gaussians_are_fitted_where_they_are_asked_for(exact_region, rng):
-    problem = half_spaces(3, 1)
-    assert refined(exact_region, problem, 1, np.random.default_rng(1), fresh=False)[1].fresh_gaussians == []
-    fresh = refined(exact_region, problem, 1, np.random.default_rng(1))[1].fresh_gaussians
-    tail = stats.truncnorm(BETA, np.inf)
-    assert len(fresh) >= 1
-    mean = np.mean([gaussian.centre[0] for gaussian in fresh])
-    assert mean == pytest.approx(tail.mean(), abs=0.3)
-
-
 def test_linear_proposals_of_two_regions_are_learned_from_the_draws_nearest_to_each(exact_region, rng):
     after = refined(exact_region, half_spaces(4, 2), 2, rng)[1]
     for k in range(2):
@@ -141,18 +131,15 @@ def test_linear_proposals_of_two_regions_are_learned_from_the_draws_nearest_to_e
         assert half_space.start == pytest.approx(BETA, abs=0.06)
 
 
-def test_expected_weight_of_a_region_leaves_out_its_heaviest_chain(rng):
-    """Under N(0, I) itself all weights are 1; under a Gaussian far away the chain at the origin is the heaviest."""
-    chains = np.zeros((4, 2, 2))
-    chains[1:, :, 0] = 3.0
-    exploration = ExplorationResult([Region(chains, chains.reshape(-1, 2), -np.ones(8))], noisy=False)
+def test_typical_weight_of_a_region_is_that_of_later_states_without_the_heaviest_chains(rng):
+    """Chains from the origin to u_1 = 3, but for one that stays: under a Gaussian there it is the heaviest."""
+    chains = np.zeros((8, 2, 2))
+    chains[1:, 1, 0] = 3.0
+    exploration = ExplorationResult([Region(chains, chains.reshape(-1, 2), -np.ones(16))], noisy=False)
     state = RefinementState(exploration=exploration, gamma=0.0, explored=(), gaussians=[], linear=())
     plain = MixtureProposal([ProposalComponent(IsotropicNormal(2), "base")], np.ones(1))
-    np.testing.assert_allclose(expected_weights(state, plain), 1.0)
+    np.testing.assert_allclose(typical_weights(state, plain), 1.0)
     far = SubspaceGaussian(np.eye(2), np.array([3.0, 0.0]), np.ones(2))
     proposal = MixtureProposal([ProposalComponent(far, "gaussian", 0)], np.ones(1))
     # phi / q = exp(9/2 - 3 u1): e^-4.5 at u1 = 3, e^4.5 at the origin
-    np.testing.assert_allclose(expected_weights(state, proposal), np.exp(-4.5))
-    two = exploration._replace(regions=[Region(chains[:2], exploration.regions[0].u, exploration.regions[0].f)])
-    both = expected_weights(RefinementState(exploration=two, gamma=0.0, explored=(), gaussians=[], linear=()), proposal)
-    np.testing.assert_allclose(both, (np.exp(-4.5) + np.exp(4.5)) / 2)
+    np.testing.assert_allclose(typical_weights(state, proposal), np.exp(-4.5))

@@ -108,7 +108,7 @@ def test_an_interrupted_step_leaves_the_state_and_its_simulations_are_counted(dr
 
 def test_the_estimate_rests_on_its_own_draws(drive):
     context, state, refinement, proposal, _ = refined(drive)
-    assert stages.accepts_proposal(context, state, refinement, proposal)
+    assert not stages.gives_up(context, state, refinement, proposal, 3)
     left = context.left
     outcome = drive(stages.estimate_afresh(context, state, refinement, proposal), PROBLEM).value
     assert context.simulator.n_sim == BUDGET == sum(level.n_sim for level in outcome.trace)
@@ -169,4 +169,4 @@ def test_subset_simulation_takes_what_is_left_in_all_coordinates(drive):
 
 def test_without_rounds_or_budget_the_proposal_serves(drive):
     context, state, refinement, proposal, _ = explored(drive)
-    assert stages.accepts_proposal(context, state, refinement, proposal)
+    assert not stages.gives_up(context, state, refinement, proposal, 1)
