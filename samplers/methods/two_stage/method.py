@@ -17,9 +17,10 @@ from samplers.validation import check_count
 class TwoStage(Method):
     """Explore, then estimate from a fresh sample; few simulations for any number of failure regions.
 
-    1. *Exploration* (`exploration.py`, `regions.py`): base draws, wide draws from N(0, s^2 I), subset simulation from
-       the base draws, and chains inside the failure region from both. Two failing points are of one region if the
-       point half way between them fails.
+    1. *Exploration* (`exploration.py`, `discovery/`, `regions.py`): base draws; wide draws from N(0, s^2 I), with s as
+       large as the levels went deep; subset simulation from the base draws; lines of descent, points that walk
+       downhill each alone; chains inside the failure region from all of these. Two failing points are of one region
+       if the point half way between them fails.
     2. *Refinement* (`refinement.py`, `candidates.py`): each region is described by Gaussians, by a hyperplane from
        linear regression of f where f is linear, by half-spaces through the edge of its failures and by a radius.
        Three rounds of draws follow, each from a mixture of these. Its weights minimise the estimated variance
@@ -42,16 +43,27 @@ class TwoStage(Method):
     separated, and half of the draws come from tempered Gaussians: the best proposal where failure is by chance.
     Coordinates of x that the base distribution calls noise are not searched (`noise_coordinates.py`).
 
-    *Interval.* Log-normal; with t quantiles where few draws carry the weight, and Bernstein's bound where very few do.
+    *Interval* (`discovery/unseen.py`). Log-normal, with t quantiles where few draws carry the weight and Bernstein's
+    bound where very few do; p-hat exp(q s) with s^2 = log(1 + c.o.v.^2). The upper end is at least Hall's, which
+    knows the skewness of the weights, and holds the share M of p in regions that were not found:
+
+        upper end = 97.5 % point of  p-hat exp(s Z) / (1 - M),    Z ~ N(0, 1),   M ~ Beta(1/4, nu)
+        nu = distinct base draws whose line or path of levels failed + max(ESS, hits / 4) of the wide draws
+
+    nu independent lineages all led to known regions; a region of share M would be missed by one with probability
+    1 - M. The 97.5 % point of M is 0.38 for nu = 4, 0.067 for 25, 0.009 for 200. The c.o.v. is that of the sampling
+    alone.
 
     *Warnings* (`diagnostics.py`): uneven weights, base draws that fail more often than p allows, rounds that
-    contradict the estimate, and regions that the last draws hardly reach. A region that neither f announces nor any
-    draw has hit gives no warning; `Estimate.unseen` bounds its probability.
+    contradict the estimate, regions that the last draws hardly reach, and a search of so few lineages that M may
+    exceed 0.3; the message says what cannot be excluded in units of p. A region that neither f announces nor any draw
+    has hit gives no warning; `Estimate.unseen` bounds its probability.
 
     *Other methods take over* where a tenth of the base draws fails, or no failure is found (plain Monte Carlo for the
     rest), and where no mixture describes the failures: dozens of regions, hundreds of dimensions without a direction
-    that matters, failures that noise alone decides on. The rounds show that, and adaptive subset simulation in all
-    coordinates spends what is left (`fallback.py`), with a warning.
+    that matters, failures that noise alone decides on. That is decided after each round, by what its draws are
+    worth; adaptive subset simulation in all coordinates then goes on from the base draws (`fallback.py`), with a
+    warning.
 
     Args:
         n: Simulations where `max_sim` does not say how many; with a target c.o.v. final batches of a tenth of it
@@ -70,6 +82,7 @@ class TwoStage(Method):
         Owen and Zhou, "Safe and effective importance sampling", JASA 95, 2000 (defensive mixtures).
         Cappé, Douc, Guillin, Marin and Robert, "Adaptive importance sampling in general mixture classes",
         Statistics and Computing 18, 2008 (mixtures adapted in rounds).
+        Hall, "On the removal of skewness by transformation", Journal of the Royal Statistical Society B 54, 1992.
         Au and Beck, "Estimation of small failure probabilities in high dimensions by subset simulation",
         Probabilistic Engineering Mechanics 16, 2001.
     """

@@ -192,11 +192,13 @@ def gives_up(
     settings, rounds = context.settings.fallback, context.settings.refinement.round_shares
     if context.left_at_all < settings.min_fallback_budget or not state.rounds:
         return False
-    last = state.rounds[-1]
+    last, final = state.rounds[-1], number == len(rounds)
+    if refinement.noisy and not final:  # a tempered mixture meets few failures at first, but does not miss any
+        return False
     if fallback.meets_too_few(last, number, refinement.exploration.levels, settings):
         return True
-    final = number == len(rounds) and not refinement.noisy
-    return final and fallback.misses_regions(last, typical_weights(refinement, proposal), settings)
+    known = final and not refinement.noisy
+    return known and fallback.misses_regions(last, typical_weights(refinement, proposal), settings)
 
 
 def fall_back(context: RunContext, state: RunState, levels: int) -> Steps:
