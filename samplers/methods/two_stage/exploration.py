@@ -143,4 +143,4 @@ def _choose_lines(u: FloatArray, labels: Labels, rng: np.random.Generator, setti
     """Return ends of lines (n, d) for chains to start from: a few of each region."""
     order = rng.permutation(len(u))
     chosen = [order[labels[order] == k][: settings.starts] for k in range(int(labels.max(initial=-1)) + 1)]
-    return u[np.concatenate([np.empty(0, dtype=np.int64), *chosen])]
+    return np.take(u, np.concatenate([np.empty(0, dtype=np.int64), *chosen]), axis=0)

@@ -32,7 +32,7 @@ class WideFailures(NamedTuple):
     def choose(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Return at most n of them, shape (m, d): half of them the least wide ones, the rest at random."""
         order = np.lexsort((rng.random(len(self.scale)), self.scale))
-        return self.u[np.concatenate([order[: n // 2], rng.permutation(order[n // 2 :])[: n - n // 2]])]
+        return np.take(self.u, np.append(order[: n // 2], rng.permutation(order[n // 2 :])[: n - n // 2]), axis=0)
 
 
 def draw_wide(
