@@ -38,7 +38,7 @@ def sum_of(u):
 
 
 def problem(f):
-    return WithNoise(f, 303, 3)
+    return WithNoise(f, 303, first=3)
 
 
 PROBLEMS = {
