@@ -100,7 +100,7 @@ def test_inputs_without_noise_are_searched_as_they_are():
     plain, rng = FunctionProblem(sum_of, 303), np.random.default_rng(0)
     assert marginalise_noise(plain, rng) is plain
     assert not noise_mask(plain).any()
-    all_noise = WithNoise(sum_of, 303, 0)
+    all_noise = WithNoise(sum_of, 303, first=0)
     assert marginalise_noise(all_noise, rng) is all_noise
     assert rng.random() == np.random.default_rng(0).random()  # no number was drawn
 
