@@ -61,7 +61,9 @@ class Ego(Protocol):
         ...
 
 
-def load_ego(spec: str | Path, algo: str | None = None, trust: bool = False) -> Ego | LearnedEgo | str:
+def load_ego(
+    spec: str | Path, algo: str | None = None, trust: bool = False, stats: str | Path | None = None
+) -> Ego | LearnedEgo | str:
     """Load an ego by its name, file, address or function.
 
     Args:
@@ -78,18 +80,19 @@ def load_ego(spec: str | Path, algo: str | None = None, trust: bool = False) -> 
         trust: Open the pickles in a `.zip` as Stable-Baselines3 does, which runs whatever code is in them. Without it
             a file that needs code of its author's (a policy class of their own, say) is refused, and one to which
             everybody may write.
+        stats: File of the `VecNormalize` statistics of a `.zip`; None to look for one beside it.
 
     Returns:
         "idm" and "human" as they stand, a `LearnedEgo`, else an object with `predict`. A `.zip` gives a `SavedEgo`,
         whose `observation_space` and `action_space` are those of the policy. `VecNormalize` statistics
-        saved beside a `.zip` are applied to its observations: `<name>_vecnormalize.pkl`,
-        `vecnormalize.pkl`, or where RL Zoo and Stable-Baselines3's checkpoints put them.
+        saved beside a `.zip` are applied to its observations: `<name>_vecnormalize.pkl`, `vecnormalize.pkl`, the same
+        with `vec_normalize`, or where RL Zoo and Stable-Baselines3's checkpoints put them.
 
     Raises:
         FileNotFoundError: The file does not exist.
         ValueError: The spec is none of these, the file is not a model of Stable-Baselines3 or no driver or is
             damaged or not trusted, the function is missing, fails or returns something without `predict`, or
-            algo is given for something that is no `.zip`.
+            algo or stats is given for something that is no `.zip`.
 
     Example:
         >>> load_ego("idm")
@@ -109,17 +112,20 @@ def load_ego(spec: str | Path, algo: str | None = None, trust: bool = False) -> 
     if kind == "unknown":
         raise ValueError(f"Unknown ego {text!r}{_suggest_ego(text)}; expected {EXPECTED_EGO}.")
     if kind == "zip":
-        return load_saved_ego(Path(text), algo, trust)
-    if algo is not None and kind != "process":
-        raise ValueError(f"Expected algo for a Stable-Baselines3 .zip only, got {algo!r} for {text!r}; leave it out.")
+        return load_saved_ego(Path(text), algo, trust, stats)
     if kind == "noisy":
         from agents.imperfect_stack import NoisyEgo, Stack
 
         inner, mark, settings = text.removeprefix("noisy:").rpartition("?")
         stack = Stack.read(settings if mark else "")
-        return cast(Ego, NoisyEgo(load_ego(inner if mark else settings, algo, trust), stack))
+        return cast(Ego, NoisyEgo(load_ego(inner if mark else settings, algo, trust, stats), stack))
+    for name, value in (("algo", algo), ("stats", stats)):
+        if value is not None and kind != "process":
+            raise ValueError(
+                f"Expected {name} for a Stable-Baselines3 .zip only, got {str(value)!r} for {text!r}; leave it out."
+            )
     if kind in ("remote", "process"):
-        return _load_elsewhere(kind, text, algo, trust)
+        return _load_elsewhere(kind, text, algo, trust, stats)
     if kind == "onnx":
         from agents.onnx.ego import OnnxEgo
 
@@ -131,7 +137,7 @@ def load_ego(spec: str | Path, algo: str | None = None, trust: bool = False) -> 
     return cast(Ego, call_factory(text)) if kind == "function" else text
 
 
-def _load_elsewhere(kind: EgoKind, text: str, algo: str | None, trust: bool) -> Ego:
+def _load_elsewhere(kind: EgoKind, text: str, algo: str | None, trust: bool, stats: str | Path | None) -> Ego:
     """Connect to an ego in another process."""
     try:
         import msgpack  # noqa: F401
@@ -142,7 +148,7 @@ def _load_elsewhere(kind: EgoKind, text: str, algo: str | None, trust: bool) -> 
         if kind == "process":
             from agents.remote.subprocess_link import isolate
 
-            return isolate(text.removeprefix("process:"), algo, trust)
+            return isolate(text.removeprefix("process:"), algo, trust, stats)
         from agents.remote.zmq_link import connect
 
         return connect(text)

@@ -16,6 +16,7 @@ from rare_envs.distributions.space import Distribution, ScenarioSpace
 from rare_envs.egos.errors import reason_of
 from rare_envs.egos.needs import resolve
 from rare_envs.egos.policy import PolicyDriver, as_driver
+from rare_envs.egos.wrappers import find_action_bounds
 from rare_envs.make import set_up
 from rare_envs.scenarios.registry import find_scenario
 from rare_envs.search_terms import EpisodeTerms, simulate_terms
@@ -39,6 +40,13 @@ AMBIGUOUS = (
     "action='meta' (--action meta)"
 )
 """HighwayEnv's meta-actions and our discrete ones are both numbers from 0 to 4, and their spaces are equal."""
+
+
+RESCALED = (
+    "the ego's actions, between {low} and {high}, are mapped to [-1, 1] as RescaleAction does; if they are in units of "
+    "their own, put a function of yours around it"
+)
+"""A policy's bounds do not say whether they are those of a wrapper or units."""
 
 
 class AmbiguousActions(UserWarning):
@@ -120,8 +128,13 @@ class DrivingProblem:
     @property
     def notes(self) -> tuple[str, ...]:
         """Ambiguities that cannot be checked; each was also given as an `AmbiguousActions` warning."""
-        accelerations = self.world.clock.action == "continuous" and "kinematics" in self.world.sensing.kinds
-        return (AMBIGUOUS,) if accelerations and isinstance(self.needs.action_space, spaces.Discrete) else ()
+        continuous = self.world.clock.action == "continuous" and self.needs.queries_policy
+        indices = isinstance(self.needs.action_space, spaces.Discrete)
+        found = [AMBIGUOUS] if continuous and indices and "kinematics" in self.world.sensing.kinds else []
+        bounds = find_action_bounds(self.needs.action_space) if continuous else None
+        if bounds is not None:
+            found.append(RESCALED.format(low=bounds[0].tolist(), high=bounds[1].tolist()))
+        return tuple(found)
 
     @property
     def given(self) -> str:

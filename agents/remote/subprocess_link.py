@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 import time
+from pathlib import Path
 from typing import ClassVar
 
 from agents.remote.client import NoReply, RemoteEgo, parse_address
@@ -25,15 +26,19 @@ class SubprocessLink:
 
     load_timeout: ClassVar[float] = 60.0
 
-    def __init__(self, spec: str, algo: str | None = None, trust: bool = False) -> None:
+    def __init__(
+        self, spec: str, algo: str | None = None, trust: bool = False, stats: str | Path | None = None
+    ) -> None:
         """Make a link; `open` starts the process.
 
         Args:
             spec: What `agents.load_ego` is to load there.
             algo: Likewise.
             trust: Likewise.
+            stats: Likewise.
         """
-        self._arguments = json.dumps({"spec": spec, "algo": algo, "trust": trust})
+        stats = None if stats is None else str(stats)
+        self._arguments = json.dumps({"spec": spec, "algo": algo, "trust": trust, "stats": stats})
         self._spec = spec
         self._process: subprocess.Popen[bytes] | None = None
         self._socket: socket.socket | None = None
@@ -92,17 +97,18 @@ class SubprocessLink:
         self.close()
 
 
-def isolate(spec: str, algo: str | None = None, trust: bool = False) -> RemoteEgo:
+def isolate(spec: str, algo: str | None = None, trust: bool = False, stats: str | Path | None = None) -> RemoteEgo:
     """Load an ego in a process of its own.
 
     Args:
         spec: As for `agents.load_ego`; "?timeout=10" behind it sets how many seconds an answer may take.
         algo: Likewise.
         trust: Likewise.
+        stats: Likewise.
 
     Raises:
         ValueError: It cannot be loaded there.
         EgoGone: Its process does not stay alive.
     """
     address, settings = parse_address(spec)
-    return RemoteEgo(SubprocessLink(address, algo, trust), **settings)
+    return RemoteEgo(SubprocessLink(address, algo, trust, stats), **settings)

@@ -6,6 +6,8 @@ import os
 import stat
 from pathlib import Path
 
+TRUST = "if you trust where the file comes from, load it with trust=True (--trust)"
+"""Advice on a file that was not opened."""
 TRUST_CONSEQUENCE = "it is opened as Stable-Baselines3 does, and whatever code is in it runs"
 """Consequence of trust=True."""
 TRUST_ADVICE = (

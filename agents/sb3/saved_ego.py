@@ -6,13 +6,10 @@ that needs classes of its author's own is opened as Stable-Baselines3 does, and 
 
 from __future__ import annotations
 
-import base64
 import difflib
 import io
-import pickle
-import re
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -20,14 +17,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.sb3.file_trust import check_origin
-from agents.sb3.safe_pickle import ForbiddenObject, open_pickle
+from agents.sb3.file_trust import TRUST, check_origin
+from agents.sb3.model_building import build_model
+from agents.sb3.normalisation import (
+    describe_missing_statistics,
+    find_statistics,
+    load_statistics,
+    open_last_observation,
+)
+from agents.sb3.pickle_values import ForbiddenObject
 from agents.sb3.zip_header import find_algorithm, find_algorithm_class, make_training_stubs, read_header
 from rare_envs.egos.wrappers import FrameStackedPolicy, NormalisedPolicy, find_stacking
 from rare_envs.plugins import one_line
-
-TRUST = "if you trust where the file comes from, load it with trust=True (--trust)"
-"""Advice on a file that was not opened."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,8 @@ class SavedEgo:
     """Its `VecNormalize` statistics, or None; observations pass through them first."""
     statistics_path: Path | None = None
     """The file of the statistics, or None."""
+    header: Mapping[str, Any] = field(default_factory=dict, repr=False)
+    """Settings of the file, their pickles closed."""
 
     @property
     def observation_space(self) -> Any:
@@ -81,6 +84,17 @@ class SavedEgo:
         policy = self.model if self.frames is None else FrameStackedPolicy(self.model, *self.frames)
         return policy if self.statistics is None else NormalisedPolicy(policy, self.statistics.normalize_obs)
 
+    def find_missing_statistics(self, expected: Any) -> str:
+        """Return why it seems to have been trained on normalised observations, if it has no statistics; "" if not.
+
+        Args:
+            expected: Space of the environment's observations.
+        """
+        if self.statistics is not None:
+            return ""
+        last = open_last_observation(self.header)
+        return describe_missing_statistics(self.header, last, self.model.observation_space, expected)
+
     def predict(
         self,
         observation: Any,
@@ -93,16 +107,17 @@ class SavedEgo:
         return actions, state
 
 
-def load_saved_ego(path: Path, algo: str | None, trust: bool = False) -> SavedEgo:
+def load_saved_ego(path: Path, algo: str | None, trust: bool = False, stats: str | Path | None = None) -> SavedEgo:
     """Read a `.zip`: its header first, then its weights, then its statistics.
 
     Args:
         path: The file.
         algo: Its algorithm; found in the file if None.
         trust: Open its pickles as Stable-Baselines3 does, which runs whatever code is in them.
+        stats: The file of its `VecNormalize` statistics; None to look for one beside it.
 
     Raises:
-        FileNotFoundError: The file does not exist.
+        FileNotFoundError: The file, or that of the statistics, does not exist.
         ValueError: It is no model, is damaged, or needs trust: because of its content, or because other users may write
             to it or its statistics (`agents.sb3.file_trust`).
 
@@ -116,15 +131,17 @@ def load_saved_ego(path: Path, algo: str | None, trust: bool = False) -> SavedEg
         raise FileNotFoundError(f"No ego at {str(path)!r}{_suggest_file(path)}.")
     if not path.is_file():
         raise ValueError(f"Expected a Stable-Baselines3 .zip, got the folder {str(path)!r}.")
-    statistics_path = find_statistics(path)
+    statistics_path = find_statistics(path) if stats is None else Path(stats)
+    if statistics_path is not None and not statistics_path.is_file():
+        raise FileNotFoundError(f"No VecNormalize statistics at {str(statistics_path)!r}.")
     if not trust:
         check_origin(path, statistics_path)
     header = read_header(path)
     name = algo.lower() if algo is not None else find_algorithm(header, path)
     algorithm = find_algorithm_class(name, path)
     model = _load_model(algorithm, name, header, path, trust)
-    statistics = None if statistics_path is None else _load_statistics(statistics_path, model.observation_space, trust)
-    return SavedEgo(model, name, path, statistics, statistics_path)
+    statistics = None if statistics_path is None else load_statistics(statistics_path, model.observation_space, trust)
+    return SavedEgo(model, name, path, statistics, statistics_path, header)
 
 
 def _suggest_file(path: Path) -> str:
@@ -140,12 +157,11 @@ def _suggest_file(path: Path) -> str:
 
 def _load_model(algorithm: Any, name: str, header: Mapping[str, Any], path: Path, trust: bool) -> Any:
     """Build the algorithm and load the saved weights."""
-    given = make_training_stubs()
     try:
         content = path.read_bytes()  # once, so that what is loaded is what was looked at
         if not trust:
-            given = {**open_objects(read_header(io.BytesIO(content), str(path)), set(given)), **given}
-        return algorithm.load(io.BytesIO(content), device="cpu", custom_objects=given)
+            return build_model(algorithm, content, str(path))
+        return algorithm.load(io.BytesIO(content), device="cpu", custom_objects=make_training_stubs())
     except ForbiddenObject as error:
         raise ValueError(f"Will not load {str(path)!r}: {error}; {TRUST}.") from error
     except Exception as error:  # a damaged or foreign pickle can raise anything at all
@@ -155,71 +171,3 @@ def _load_model(algorithm: Any, name: str, header: Mapping[str, Any], path: Path
             f"{one_line(error)}. The file is damaged, needs a package that is not installed, or "
             "holds another algorithm (name it with algo)."
         ) from error
-
-
-def open_objects(header: Mapping[str, Any], without: set[str]) -> dict[str, Any]:
-    """Open the pickled entries of a model's settings safely.
-
-    Raises:
-        ForbiddenObject: One names a class or function that is not listed; the message names the entry.
-    """
-    opened = {}
-    for key, value in header.items():
-        if key in without or not isinstance(value, dict) or ":serialized:" not in value:
-            continue
-        try:
-            opened[key] = open_pickle(base64.b64decode(str(value[":serialized:"])))
-        except ForbiddenObject as error:
-            raise ForbiddenObject(f"in its {key!r} {error}") from error
-    return opened
-
-
-# --- statistics --------------------------------------------------------------------------------
-
-
-def _statistics_candidates(path: Path) -> Iterator[Path]:
-    """Yield the places where `VecNormalize` statistics of a model are kept, most specific first."""
-    folder, stem = path.parent, path.stem
-    yield folder / f"{stem}_vecnormalize.pkl"
-    checkpoint = re.fullmatch(r"(.+)_(\d+_steps)", stem)  # Stable-Baselines3's CheckpointCallback
-    if checkpoint:
-        yield folder / f"{checkpoint[1]}_vecnormalize_{checkpoint[2]}.pkl"
-    yield folder / stem / "vecnormalize.pkl"  # RL Zoo: Env-v0_1/Env-v0.zip, Env-v0_1/Env-v0/
-    run = re.fullmatch(r"(.+)_\d+", folder.resolve().name)  # RL Zoo: Env-v0_1/best_model.zip
-    if run:
-        yield folder / run[1] / "vecnormalize.pkl"
-    yield folder / "vecnormalize.pkl"
-
-
-def find_statistics(path: Path) -> Path | None:
-    """Return the file of the `VecNormalize` statistics of a model, or None."""
-    return next((file for file in _statistics_candidates(path) if file.is_file()), None)
-
-
-def _load_statistics(path: Path, observation_space: Any, trust: bool) -> Any:
-    """Read `VecNormalize` statistics and check that they fit the policy."""
-    from stable_baselines3.common.vec_env import VecNormalize
-
-    try:
-        content = path.read_bytes()
-        statistics = pickle.loads(content) if trust else open_pickle(content)
-    except ForbiddenObject as error:
-        raise ValueError(f"Will not read the VecNormalize statistics {str(path)!r}: {error}; {TRUST}.") from error
-    except Exception as error:  # a damaged pickle can raise anything at all
-        raise ValueError(
-            f"Cannot read the VecNormalize statistics {str(path)!r}: {one_line(error)}. "
-            "Save them again, or move the file away if it does not belong to this ego."
-        ) from error
-    if not isinstance(statistics, VecNormalize):
-        raise ValueError(
-            f"Expected VecNormalize statistics in {str(path)!r}, got {type(statistics).__name__}; "
-            "move the file away if it does not belong to this ego."
-        )
-    if find_stacking(statistics.observation_space.shape or (), observation_space.shape) is None:
-        raise ValueError(
-            f"VecNormalize statistics {str(path)!r} are for observations of shape "
-            f"{statistics.observation_space.shape}, the ego's have {observation_space.shape}; "
-            "move the file away if it does not belong to this ego."
-        )
-    statistics.training = False
-    return statistics

@@ -8,6 +8,7 @@ tell the algorithms apart.
 from __future__ import annotations
 
 import importlib
+import io
 import json
 import zipfile
 import zlib
@@ -59,8 +60,12 @@ MAX_UNPACKED, MAX_RATIO = 64 * 2**20, 20
 members uncompressed, so 20 refuses no policy."""
 
 
+MAX_VALUES = 1_000_000
+"""Values in the settings of a model."""
+
+
 class ArchiveTooLarge(ValueError):
-    """An archive that unpacks to far more than its own size."""
+    """An archive that would take far more memory than its own size."""
 
 
 def read_header(file: Path | BinaryIO, name: str | None = None) -> dict[str, Any]:
@@ -83,7 +88,7 @@ def read_header(file: Path | BinaryIO, name: str | None = None) -> dict[str, Any
         with zipfile.ZipFile(file) as archive:
             _check_size(archive, name)
             members = set(archive.namelist())
-            header = json.loads(archive.read("data")) if "data" in members else None
+            header = _parse_settings(archive.read("data"), name) if "data" in members else None
             version = _read_text(archive, members, "_stable_baselines3_version")
     except ArchiveTooLarge:
         raise
@@ -100,11 +105,23 @@ def read_header(file: Path | BinaryIO, name: str | None = None) -> dict[str, Any
 def _check_size(archive: zipfile.ZipFile, name: str) -> None:
     """Refuse an archive that would fill the memory."""
     unpacked = sum(member.file_size for member in archive.infolist())
-    packed = sum(member.compress_size for member in archive.infolist())
+    assert archive.fp is not None
+    packed = archive.fp.seek(0, io.SEEK_END)  # not the sum over members, which may share their bytes
     if unpacked > max(MAX_UNPACKED, MAX_RATIO * packed):
         raise ArchiveTooLarge(
             f"{name!r} would unpack from {packed / 1e6:.1f} to {unpacked / 1e6:,.0f} MB; no policy does that."
         )
+
+
+def _parse_settings(content: bytes, name: str) -> Any:
+    """Return the JSON of the settings.
+
+    Raises:
+        ArchiveTooLarge: It has more values than any policy: each takes some 50 times its two letters in memory.
+    """
+    if content.count(b",") + content.count(b"[") + content.count(b"{") > MAX_VALUES:
+        raise ArchiveTooLarge(f"{name!r} has more than {MAX_VALUES:,} values in its settings; no policy does that.")
+    return json.loads(content)
 
 
 def _read_text(archive: zipfile.ZipFile, members: set[str], name: str) -> str:

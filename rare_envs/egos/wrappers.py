@@ -75,6 +75,46 @@ class FrameStackedPolicy:
         return action, (seen, inner)
 
 
+@dataclass(frozen=True)
+class RescaledPolicy:
+    """A policy whose actions are mapped from their bounds to [-1, 1], as Gymnasium's `RescaleAction` maps them."""
+
+    policy: Any
+    low: NDArray[Any]
+    high: NDArray[Any]
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: NDArray[Any] | None = None, deterministic: bool = True
+    ) -> tuple[NDArray[Any], Any]:
+        """Stable-Baselines3's `predict` with actions in [-1, 1]."""
+        action, state = self.policy.predict(
+            observation, state=state, episode_start=episode_start, deterministic=deterministic
+        )
+        low, high = (bound.astype(np.float64) for bound in (self.low, self.high))
+        return ((2.0 * np.asarray(action) - low - high) / (high - low)).astype(np.float32), state
+
+
+def find_action_bounds(space: Any) -> tuple[NDArray[Any], NDArray[Any]] | None:
+    """Return the bounds of a policy's actions where they are not those of the environment; None where nothing differs.
+
+    Actions without bounds are clipped, as `Env.step` does.
+
+    Raises:
+        ValueError: A lower bound is not below the upper one.
+
+    Example:
+        >>> find_action_bounds(spaces.Box(-2.0, 2.0, (2,)))[1].tolist(), find_action_bounds(spaces.Box(-1.0, 1.0, (2,)))
+        ([2.0, 2.0], None)
+    """
+    if not isinstance(space, spaces.Box) or space.shape != (2,) or not np.isfinite([space.low, space.high]).all():
+        return None
+    if (space.low == -1.0).all() and (space.high == 1.0).all():
+        return None
+    if not (space.low < space.high).all():
+        raise ValueError(f"The ego acts in {space}, whose lower bounds are not below the upper ones.")
+    return space.low, space.high
+
+
 def find_stacking(given: Shape, wanted: Shape) -> tuple[int, bool] | None:
     """Find how many frames of shape `given` make an observation of shape `wanted`.
 
@@ -120,12 +160,14 @@ def wrap_policy(policy: Any, given: spaces.Space[Any]) -> Any:
     """Return the policy behind the wrappers that it was trained with, so that it takes the environment's observations.
 
     Args:
-        policy: Has `predict`; its `observation_space`, if it has one, tells how many frames it sees, and
+        policy: Has `predict`; its `action_space`, if it has one, tells the bounds of its actions, its
+            `observation_space` how many frames it sees, and
             `get_vec_normalize_env`, if it has one, SB3's `VecNormalize`, whose space tells whether observations are
             normalised before or after they are stacked.
         given: Space of the environment's observations.
     """
     # A Stable-Baselines3 model has both; anybody else's object need not.
+    bounds = find_action_bounds(getattr(policy, "action_space", None))
     wanted = getattr(policy, "observation_space", None)
     frames, new_axis = (find_frame_stacking(given, wanted) if wanted is not None else None) or (1, False)
     statistics: Any = getattr(policy, "get_vec_normalize_env", lambda: None)()
@@ -137,4 +179,4 @@ def wrap_policy(policy: Any, given: spaces.Space[Any]) -> Any:
         policy = FrameStackedPolicy(policy, frames, new_axis)
     if normalise is not None and not whole:
         policy = NormalisedPolicy(policy, normalise)
-    return policy
+    return policy if bounds is None else RescaledPolicy(policy, *bounds)

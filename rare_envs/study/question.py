@@ -35,6 +35,7 @@ class Question:
         ego: "idm", a learned driver ("mgail", "gail", "bc" or its file), a path to a Stable-Baselines3 `.zip`, or
             `module:function`.
         algo: Algorithm of a `.zip`; recognised from the file when None.
+        stats: File of the `VecNormalize` statistics of a `.zip`; None to look for one beside it.
         trust: Let the ego's `.zip` run code when it is loaded, as `agents.load_ego` explains.
         method: Name of a method in `samplers.METHODS`.
         base: Name of a base distribution or path to a JSON file; the scenario's default when None.
@@ -70,6 +71,7 @@ class Question:
     env_id: str
     ego: str = "idm"
     algo: str | None = None
+    stats: str | None = None
     trust: bool = False
     method: str = "two-stage"
     base: str | None = None
@@ -169,7 +171,7 @@ def prepare(question: Question, ego: Any = None) -> Study:
     with as_bad_input(ValueError, OSError):
         method = question.check()
         if ego is None:
-            ego = agents.load_ego(question.ego, algo=question.algo, trust=question.trust)
+            ego = agents.load_ego(question.ego, algo=question.algo, trust=question.trust, stats=question.stats)
         problem = build_problem(question, ego)
         names = [name.strip() for name in (question.also_under or "").split(",") if name.strip()]
         others = {name: build_problem(replace(question, base=name, ensemble=False), ego).base for name in names}

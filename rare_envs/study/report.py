@@ -83,10 +83,17 @@ class Report:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Doubts of the method about p, and about the error of the base distribution."""
+        """Doubts of the method about p, about the error of the base distribution, and about the ego's statistics."""
         base = self.estimate.base_uncertainty
         doubts = () if base is None else tuple(f"base distribution: {text}" for text in base.warnings)
-        return (*self.estimate.warnings, *doubts)
+        return (*self.estimate.warnings, *doubts, *self._missing_statistics)
+
+    @property
+    def _missing_statistics(self) -> tuple[str, ...]:
+        ego = self.study.problem.ego
+        problem = self.study.problem
+        missing = ego.find_missing_statistics(problem.world.observation_space) if isinstance(ego, SavedEgo) else ""
+        return (f"the ego has no VecNormalize statistics (--stats), but {missing}",) if missing else ()
 
     @property
     def crashes(self) -> tuple[dict[str, Any] | None, ...]:

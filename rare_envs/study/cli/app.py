@@ -23,6 +23,7 @@ from rare_envs.study.cli.options import (
     RiskOptions,
     ScenarioOptions,
     SeedOption,
+    StatsOption,
     TrustOption,
     WorldOptions,
 )
@@ -244,6 +245,7 @@ def export_ego_command(
     model: Annotated[Path, typer.Argument(metavar="MODEL", help="A .zip saved by Stable-Baselines3.")],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="The .onnx file to write.")],
     algo: AlgoOption = None,
+    stats: StatsOption = None,
     trust: TrustOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -251,7 +253,7 @@ def export_ego_command(
     from rare_envs.study.cli.export_ego import export_ego
 
     with keep_stdout_for_the_answer():
-        done = export_ego(model, out, algo=algo, trust=trust)
+        done = export_ego(model, out, algo=algo, trust=trust, stats=stats)
     if as_json:
         print_json(done)
     else:
@@ -309,6 +311,7 @@ def check_ego_command(
     env: EnvArgument,
     options: ScenarioOptions,
     algo: AlgoOption = None,
+    stats: StatsOption = None,
     trust: TrustOption = False,
     time_limit: Annotated[float, typer.Option(help="Seconds that one check may take.")] = 30.0,
     as_json: JsonOption = False,
@@ -320,7 +323,7 @@ def check_ego_command(
     from rare_envs.study.ego_check.subprocess_check import EgoCheckRequest, check_ego
     from rare_envs.study.ego_check.table import VERDICTS, print_findings
 
-    request = EgoCheckRequest(ego, env, algo, trust, time_limit=time_limit, **options.arguments())
+    request = EgoCheckRequest(ego, env, algo, trust, stats=stats, time_limit=time_limit, **options.arguments())
     findings = check_ego(request)
     code = exit_code(findings)
     if as_json:
@@ -340,12 +343,13 @@ def serve_ego_command(
         str, typer.Option(help="Address; beyond 127.0.0.1 it needs RARE_ENVS_SECRET.")
     ] = "tcp://127.0.0.1:5555",
     algo: AlgoOption = None,
+    stats: StatsOption = None,
     trust: TrustOption = False,
 ) -> None:
     """Lend an ego to simulations in other processes or on other machines (estimate --ego tcp://...)."""
     from rare_envs.study.cli.serve_ego import serve_ego
 
-    serve_ego(ego, bind, algo=algo, trust=trust)
+    serve_ego(ego, bind, algo=algo, trust=trust, stats=stats)
 
 
 def main() -> None:

@@ -10,7 +10,9 @@ from agents.sb3.saved_ego import SavedEgo, load_saved_ego
 from rare_envs.study.errors import BadInput
 
 
-def export_ego(model: Path, out: Path, algo: str | None = None, trust: bool = False) -> dict[str, Any]:
+def export_ego(
+    model: Path, out: Path, algo: str | None = None, trust: bool = False, stats: str | None = None
+) -> dict[str, Any]:
     """Write a Stable-Baselines3 `.zip` as ONNX and check that both act alike.
 
     Args:
@@ -18,6 +20,7 @@ def export_ego(model: Path, out: Path, algo: str | None = None, trust: bool = Fa
         out: The file to write, ending in `.onnx`.
         algo: Algorithm of the `.zip`, if the file does not tell.
         trust: As for `agents.load_ego`.
+        stats: Likewise.
 
     Returns:
         What was written, JSON-ready.
@@ -36,7 +39,7 @@ def export_ego(model: Path, out: Path, algo: str | None = None, trust: bool = Fa
     try:
         from agents.onnx.export import ACTION_TOLERANCE, export_onnx
 
-        ego: SavedEgo = load_saved_ego(model, algo, trust)
+        ego: SavedEgo = load_saved_ego(model, algo, trust, stats)
         exported = export_onnx(ego, out)
     except (ValueError, OSError) as error:
         raise BadInput(error) from error

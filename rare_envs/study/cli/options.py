@@ -53,6 +53,9 @@ EnvArgument = Annotated[str, typer.Argument(metavar="ENV", help="Environment, su
 EgoArgument = Annotated[str, typer.Argument(metavar="EGO", help="An ego, as for estimate --ego.")]
 ForceOption = Annotated[bool, typer.Option("--force", help="Replace what the folder of --out has of an earlier run.")]
 AlgoOption = Annotated[str | None, typer.Option(help="Algorithm of the .zip, if the file does not tell.")]
+StatsOption = Annotated[
+    str | None, typer.Option(help="File of the .zip's VecNormalize statistics; by default one is looked for beside it.")
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
 SeedOption = Annotated[int, typer.Option(help="Seed; the same seed gives the same answer.")]
 TrustOption = Annotated[
@@ -128,6 +131,7 @@ class EstimateOptions(QuestionOptions):
         str, typer.Option(help="A name, a .zip or .onnx, module:function, tcp://..., noisy:EGO; see rare-envs list.")
     ] = "idm"
     algo: AlgoOption = None
+    stats: StatsOption = None
     ensemble: Annotated[
         bool, typer.Option("--ensemble", help="Take the mixture of the refits of the base: p for the next event.")
     ] = False
@@ -166,6 +170,7 @@ class RiskOptions:
     ensemble_run: EnsembleRunOption = True
     seed: SeedOption = 0
     algo: AlgoOption = None
+    stats: StatsOption = None
     trust: TrustOption = False
     observation: ObservationOption = None
     action: ActionOption = "continuous"

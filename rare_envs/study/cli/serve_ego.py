@@ -9,7 +9,7 @@ from rare_envs.egos.validation import is_policy
 from rare_envs.study.errors import BadInput
 
 
-def serve_ego(spec: str, bind: str, algo: str | None = None, trust: bool = False) -> None:
+def serve_ego(spec: str, bind: str, algo: str | None = None, trust: bool = False, stats: str | None = None) -> None:
     """Answer requests for an ego until it is interrupted.
 
     Args:
@@ -17,6 +17,7 @@ def serve_ego(spec: str, bind: str, algo: str | None = None, trust: bool = False
         bind: Address to listen on, such as "tcp://127.0.0.1:5555".
         algo: Algorithm of a `.zip`, if the file does not tell.
         trust: As for `agents.load_ego`.
+        stats: Likewise.
 
     Raises:
         BadInput: The ego cannot be loaded or served, or the address cannot be used.
@@ -27,7 +28,7 @@ def serve_ego(spec: str, bind: str, algo: str | None = None, trust: bool = False
     except ImportError as error:
         raise BadInput("Serving needs pyzmq and msgpack: pip install 'rare-envs[remote]'.") from error
     try:
-        ego = agents.load_ego(spec, algo=algo, trust=trust)
+        ego = agents.load_ego(spec, algo=algo, trust=trust, stats=stats)
         if not is_policy(ego):
             raise ValueError(f"Expected an ego with predict, got {spec!r}, which needs more than observations.")
         server = EgoServer(ego, bind, read_secret(), name=spec)

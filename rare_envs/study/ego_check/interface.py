@@ -57,7 +57,7 @@ def check_declared_spaces(probe: Probe) -> Iterator[Finding]:
             yield report_warning(
                 "action space",
                 f"from {acted.low.tolist()} to {acted.high.tolist()}, the environment's from -1 to 1",
-                "they are clipped, not rescaled; if its units differ, put a function of yours around it",
+                "they are rescaled, as behind RescaleAction; if its units differ, put a function of yours around it",
             )
     elif acted is not None:
         yield report_pass("action space", str(acted))
@@ -67,12 +67,18 @@ def check_normalisation(probe: Probe) -> Iterator[Finding]:
     """Check whether the VecNormalize statistics of a saved ego suit the observations here."""
     if not isinstance(probe.ego, SavedEgo):
         return
+    missing = probe.ego.find_missing_statistics(probe.space)
+    if missing:
+        yield report_warning(
+            "normalisation", f"no VecNormalize statistics, but {missing}", "name their file with --stats"
+        )
+        return
     if probe.ego.statistics is None:
         yield Finding(
             "normalisation",
             "pass",
             "no VecNormalize statistics beside the file",
-            "if it was trained behind VecNormalize, put vecnormalize.pkl there",
+            "if it was trained behind VecNormalize, put vecnormalize.pkl there, or name it with --stats",
         )
         return
     statistics = probe.ego.statistics

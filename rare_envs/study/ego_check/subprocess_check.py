@@ -42,6 +42,7 @@ class EgoCheckRequest:
         time_limit: Duration that one check may take [s].
         base: Base distribution of the scenarios that it drives; the environment's default when None.
         drivers: Of the vehicles around it; the environment's default when None.
+        stats: File of the `VecNormalize` statistics of a `.zip`; None to look for one beside it.
         horizon: Length of an episode [s]; the environment's when None.
 
     Example:
@@ -59,6 +60,7 @@ class EgoCheckRequest:
     base: str | None = None
     drivers: str | None = None
     horizon: float | None = None
+    stats: str | None = None
 
     @property
     def question(self) -> Question:
@@ -88,7 +90,7 @@ def check_ego(request: EgoCheckRequest) -> list[Finding]:
     """
     from agents.loading import find_ego_kind, strip_prefixes
     from agents.sb3.file_trust import TRUST_ADVICE, TRUST_CONSEQUENCE, find_origin_risks
-    from agents.sb3.saved_ego import find_statistics
+    from agents.sb3.normalisation import find_statistics
     from rare_envs.scenarios.registry import find_scenario
 
     try:
@@ -172,7 +174,7 @@ def run_checks(request: EgoCheckRequest) -> Iterator[Finding | str]:
             return
     yield "loading"
     try:
-        ego = agents.load_ego(request.ego, algo=request.algo, trust=request.trust)
+        ego = agents.load_ego(request.ego, algo=request.algo, trust=request.trust, stats=request.stats)
         yield report_pass("loading", f"{type(ego).__name__}" if not isinstance(ego, str) else ego)
         problem = build_problem(request.question, ego)
         for note in problem.notes:

@@ -1,0 +1,188 @@
+"""Statistics of a saved policy: found under their names, refused where damaged, missed where they are missing."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import stable_baselines3 as sb3
+from gymnasium import spaces
+from gymnasium.wrappers import NormalizeObservation
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+import rare_envs
+from agents import SavedEgo, load_ego
+from agents.sb3.normalisation import describe_missing_statistics, find_statistics
+
+ENV = "rare_envs/CarFollowing-v0"
+SETTINGS: dict[str, Any] = {"n_steps": 8, "batch_size": 8, "seed": 0, "device": "cpu"}
+
+
+def load(path: Path, **options: Any) -> SavedEgo:
+    ego = load_ego(path, **options)
+    assert isinstance(ego, SavedEgo)
+    return ego
+
+
+@pytest.fixture(scope="module")
+def normalised(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A policy that was trained behind VecNormalize, and its statistics under a name that nobody looks for."""
+    folder = tmp_path_factory.mktemp("normalised")
+    env = VecNormalize(DummyVecEnv([lambda: gym.make(ENV, horizon=1.0)]))
+    sb3.PPO("MlpPolicy", env, **SETTINGS).learn(16).save(folder / "ego.zip")
+    env.save(str(folder / "mine.pkl"))
+    return folder / "ego.zip", folder / "mine.pkl"
+
+
+@pytest.mark.parametrize(
+    "name", ["vec_normalize.pkl", "ego_vec_normalize.pkl", "vecnormalize.pkl", "ego/vecnormalize.pkl"]
+)
+def test_statistics_are_found_under_their_usual_names(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).touch()
+    assert find_statistics(tmp_path / "ego.zip") == tmp_path / name
+
+
+def test_statistics_under_another_name_are_named(normalised: tuple[Path, Path]) -> None:
+    path, statistics = normalised
+    ego = load(path, stats=statistics)
+    assert ego.statistics_path == statistics
+    assert ego.find_missing_statistics(ego.observation_space) == ""
+    with pytest.raises(FileNotFoundError, match="No VecNormalize statistics at"):
+        load_ego(path, stats="no/such.pkl")
+    with pytest.raises(ValueError, match=r"Expected stats for a Stable-Baselines3 \.zip only"):
+        load_ego("idm", stats=statistics)
+
+
+def test_a_policy_without_its_statistics_is_noticed(normalised: tuple[Path, Path]) -> None:
+    ego = load(normalised[0])
+    assert "trained behind VecNormalize" in ego.find_missing_statistics(ego.observation_space)
+
+
+def test_gymnasiums_normalisation_is_noticed(tmp_path: Path) -> None:
+    sb3.PPO("MlpPolicy", NormalizeObservation(gym.make(ENV, horizon=1.0)), **SETTINGS).learn(16).save(
+        tmp_path / "ego.zip"
+    )
+    space = gym.make(ENV).observation_space
+    assert "NormalizeObservation" in load(tmp_path / "ego.zip").find_missing_statistics(space)
+
+
+def test_an_ordinary_policy_raises_no_doubt(tmp_path: Path) -> None:
+    env = rare_envs_training(64)
+    sb3.PPO("MlpPolicy", env, **{**SETTINGS, "n_steps": 4, "batch_size": 64}).learn(256).save(tmp_path / "ego.zip")
+    ego = load(tmp_path / "ego.zip")
+    assert ego.find_missing_statistics(ego.observation_space) == ""
+
+
+def rare_envs_training(num_envs: int) -> Any:
+    from training import sb3_vec_env
+
+    return sb3_vec_env("rare_envs/CutIn-v0", num_envs, seed=0)
+
+
+def test_the_scale_of_the_last_observations_tells() -> None:
+    box = spaces.Box(-5.0, 5.0, (4,))
+    rows = np.random.default_rng(0).normal(size=(256, 4)).astype(np.float32)
+    assert "mean 0 and spread 1" in describe_missing_statistics({}, rows, box, box)
+    assert describe_missing_statistics({}, rows * [1, 1, 1, 0.05], box, box) == ""  # one column as in the environment
+    assert "reach" in describe_missing_statistics({}, rows * 4, box, box)
+
+
+def change_moments(change: Callable[[Any], None]) -> Callable[[VecNormalize], Any]:
+    def changed(statistics: VecNormalize) -> VecNormalize:
+        change(statistics)
+        return statistics
+
+    return changed
+
+
+def remove(name: str) -> Callable[[VecNormalize], Any]:
+    return change_moments(lambda statistics: vars(statistics).pop(name))
+
+
+def put(name: str, value: Any) -> Callable[[VecNormalize], Any]:
+    return change_moments(lambda statistics: vars(statistics).update({name: value}))
+
+
+def put_moment(name: str, value: Any) -> Callable[[VecNormalize], Any]:
+    return change_moments(lambda statistics: vars(statistics.obs_rms).update({name: value}))
+
+
+DAMAGES: dict[str, Callable[[VecNormalize], Any]] = {
+    "no moments": remove("obs_rms"),
+    "no bound": remove("clip_obs"),
+    "no space": remove("observation_space"),
+    "no flag": remove("norm_obs"),
+    "text for moments": put("obs_rms", "text"),
+    "text for a bound": put("clip_obs", "ten"),
+    "text for epsilon": put("epsilon", None),
+    "text for a space": put("observation_space", "Box"),
+    "a list for a flag": put("norm_obs", [1]),
+    "another space": put("observation_space", spaces.Box(-1.0, 1.0, (3,))),
+    "a mapping of spaces": put("observation_space", spaces.Dict({"a": spaces.Box(-1.0, 1.0, (7,))})),
+    "mean of another shape": put_moment("mean", np.zeros(3)),
+    "no variance": put_moment("var", None),
+    "negative variance": put_moment("var", np.full(7, -1.0)),
+    "variance is NaN": put_moment("var", np.full(7, np.nan)),
+    "a number": lambda statistics: 3,
+    "a space": lambda statistics: statistics.observation_space,
+    "moments alone": lambda statistics: statistics.obs_rms,
+    "a list": lambda statistics: [statistics],
+    "a function": lambda statistics: print,
+    "a class": lambda statistics: VecNormalize,
+}
+
+
+@pytest.mark.parametrize("name", DAMAGES)
+def test_damaged_statistics_are_refused_in_one_line(name: str, normalised: tuple[Path, Path], tmp_path: Path) -> None:
+    path, statistics = normalised
+    with statistics.open("rb") as file:
+        loaded = pickle.load(file)
+    vars(loaded).update(class_attributes={}, returns=None)  # which it leaves out when it is pickled
+    value = DAMAGES[name](loaded)
+    (tmp_path / "bad.pkl").write_bytes(pickle.dumps(value))
+    with pytest.raises(ValueError, match=r"VecNormalize statistics .*bad\.pkl") as caught:
+        load_ego(path, stats=tmp_path / "bad.pkl")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("content", [b"", b"\x80\x04", b"cos\nsystem\n(S'true'\ntR.", b"noise" * 100])
+def test_what_are_no_statistics_is_refused_in_one_line(
+    content: bytes, normalised: tuple[Path, Path], tmp_path: Path
+) -> None:
+    (tmp_path / "bad.pkl").write_bytes(content)
+    with pytest.raises(ValueError, match=r"the VecNormalize statistics .*bad\.pkl") as caught:
+        load_ego(normalised[0], stats=tmp_path / "bad.pkl")
+    assert "\n" not in str(caught.value)
+
+
+class Rescaled:
+    """A policy that was trained behind `RescaleAction(env, -2, 2)`."""
+
+    def __init__(self, low: float, high: float) -> None:
+        self.action_space = spaces.Box(low, high, (2,))
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> Any:
+        speed = np.asarray(observation)[:, 0]
+        brake = self.action_space.low[0] + 0.4 * (self.action_space.high[0] - self.action_space.low[0])
+        middle = 0.5 * (self.action_space.low[1] + self.action_space.high[1])
+        return np.stack((np.full_like(speed, brake), np.full_like(speed, middle)), axis=1), None
+
+
+def test_actions_are_rescaled_from_their_bounds() -> None:
+    x = rare_envs.DrivingProblem(ENV).base.sample(64, np.random.default_rng(0))
+    expected = rare_envs.DrivingProblem(ENV, ego=Rescaled(-1.0, 1.0)).evaluate(x)
+    for low, high in ((-2.0, 2.0), (0.0, 1.0), (-0.1, 0.3)):
+        with pytest.warns(rare_envs.problem.AmbiguousActions, match=r"are mapped to \[-1, 1\] as RescaleAction does"):
+            problem = rare_envs.DrivingProblem(ENV, ego=Rescaled(low, high))
+        np.testing.assert_allclose(problem.evaluate(x), expected, rtol=1e-5)
+    assert len(np.unique(expected)) > 4
+    with pytest.raises(ValueError, match="lower bounds are not below"):
+        rare_envs.DrivingProblem(ENV, ego=Rescaled(1.0, 1.0))
