@@ -43,6 +43,7 @@ def test_missing_spaces_are_told() -> None:
     assert finding.found == "it has no observation_space and action_space"
 
 
+@pytest.mark.filterwarnings("ignore:.*are mapped to")
 @pytest.mark.parametrize(("high", "status"), [(1.0, "pass"), (3.0, "warn"), (np.inf, "pass")])
 def test_a_range_of_actions_that_is_not_the_environments_is_told(high: float, status: str) -> None:
     probe = probe_of(action_space=spaces.Box(-high, high, (2,)))
