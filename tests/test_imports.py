@@ -65,7 +65,7 @@ FLOORS = {
         ego_process
     """,
     "training": """
-        command_line data vec_env
+        command_line data vec_env ego_checkpoint
         scenario_fitting imitation.traffic ego_training
         imitation.algorithms imitation.evaluation
         imitation

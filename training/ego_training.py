@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -11,9 +12,13 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+from rare_envs.files import replace_file
 from rare_envs.plugins import did_you_mean
 from rare_envs.threads import use_one_thread
+from training.ego_checkpoint import load_checkpoint, restore_model, save_checkpoint
 
+CHECKPOINT_SUFFIX, CHECKPOINT_SECONDS = ".checkpoint", 30.0
+"""Ending of the file beside the ego, and the time between checkpoints [s]."""
 RECENT = 500
 """Number of last episodes in the collision rate beside the progress bar."""
 
@@ -88,11 +93,13 @@ def train_ego(
     num_envs: int = 256,
     out: str | Path = Path("ego.zip"),
     progress: bool = True,
+    resume: bool = False,
+    checkpoint_interval: float = CHECKPOINT_SECONDS,
     **make_kwargs: Any,
 ) -> Path:
     """Train an ego and save it.
 
-    Equal arguments give equal weights on the same machine.
+    Equal arguments give equal weights on the same machine, whether the training was interrupted and resumed or not.
 
     Args:
         env_id: Environment id, such as "rare_envs/CutIn-v0".
@@ -102,13 +109,17 @@ def train_ego(
         num_envs: Episodes that run side by side.
         out: The `.zip` to write; missing folders are made, a missing suffix is added.
         progress: Show a bar with the mean return and the collision rate on standard error.
+        resume: Go on with a training that was interrupted, from the checkpoint beside `out`.
+        checkpoint_interval: Time between checkpoints [s]; the last one is removed when the ego is saved.
         **make_kwargs: Keyword arguments of `gym.make` for this environment.
 
     Returns:
         Path of the `.zip`, which `agents.load_ego` and Stable-Baselines3 read.
 
     Raises:
-        ValueError: An argument is not usable; nothing has been simulated then.
+        ValueError: An argument is not usable, there is an unfinished training beside `out` and it is not to be
+            resumed, or there is none to resume; nothing has been simulated then.
+        OSError: The ego or a checkpoint cannot be written; what was in the file before stays.
 
     Example:
         >>> import tempfile
@@ -127,6 +138,10 @@ def train_ego(
 
     find_scenario(env_id)
     target = _prepare_target(Path(out))
+    arguments = {"env_id": env_id, "algo": algo, "steps": steps, "seed": seed, "num_envs": num_envs}
+    arguments |= {name: str(value) for name, value in make_kwargs.items() if value is not None}
+    checkpoint = target.with_suffix(CHECKPOINT_SUFFIX)
+    saved = _find_checkpoint(checkpoint, arguments, resume)
 
     import stable_baselines3
     from torch import nn
@@ -144,11 +159,52 @@ def train_ego(
                 device="cpu",
                 **_fit_to_run(hyperparameters, num_envs, steps),
             )
-            model.learn(steps, callback=callback)
-        model.save(target)
+            if saved is not None:
+                model.get_env().reset()
+                restore_model(model, saved)
+            keep = _make_checkpoints(checkpoint, arguments, checkpoint_interval)
+            callbacks = [keep] if callback is None else [keep, callback]
+            left = steps - model.num_timesteps
+            model.learn(left, callback=callbacks, reset_num_timesteps=saved is None)
+        with replace_file(target) as draft:
+            model.save(draft)
+        checkpoint.unlink(missing_ok=True)
     finally:
         env.close()
     return target
+
+
+def _find_checkpoint(path: Path, arguments: Mapping[str, Any], resume: bool) -> dict[str, Any] | None:
+    """Return the checkpoint to go on from; None to begin anew.
+
+    Raises:
+        ValueError: There is one and it is not to be resumed, or the other way round, or it does not fit.
+    """
+    if path.exists() and not resume:
+        raise ValueError(f"There is an unfinished training in {str(path)!r}: go on with --resume, or remove it.")
+    if not path.exists() and resume:
+        raise ValueError(f"There is no training to resume: no {str(path)!r}.")
+    return load_checkpoint(path, arguments) if resume else None
+
+
+def _make_checkpoints(path: Path, arguments: Mapping[str, Any], interval: float) -> Any:
+    """Return the callback that writes checkpoints."""
+    from stable_baselines3.common.callbacks import BaseCallback
+
+    class Checkpoints(BaseCallback):
+        """Writes a checkpoint where a rollout begins, when the last one is old enough."""
+
+        written = time.monotonic()
+
+        def _on_rollout_start(self) -> None:
+            if time.monotonic() - self.written >= interval:
+                save_checkpoint(path, arguments, self.model)
+                self.written = time.monotonic()
+
+        def _on_step(self) -> bool:
+            return True
+
+    return Checkpoints()
 
 
 def _policy_name(space: Any) -> str:

@@ -26,7 +26,7 @@ from agents.sb3.safe_pickle import open_pickle
 from agents.sb3.tensor_file import read_tensors
 from agents.sb3.zip_header import make_training_stubs, read_header
 
-MAX_ENTRIES = 2**22
+MAX_OBSERVED = 2**22
 """Most numbers of an observation, and most actions to choose from."""
 SPARE_NUMBERS, SPARE_TENSORS = 2**24, 10_000
 """Numbers and tensors that building may take beside a multiple of those in the file: buffers, initial values."""
@@ -145,12 +145,12 @@ def _check_space(space: Any, depth: int = 0) -> None:
             _check_space(part, 1)
         return
     if isinstance(space, spaces.Box):
-        good = space.low.shape == space.high.shape == space.shape and space.low.size <= MAX_ENTRIES
+        good = space.low.shape == space.high.shape == space.shape and space.low.size <= MAX_OBSERVED
     elif isinstance(space, spaces.Discrete):
-        good = 0 < int(space.n) <= MAX_ENTRIES
+        good = 0 < int(space.n) <= MAX_OBSERVED
     elif isinstance(space, spaces.MultiDiscrete):
-        good = 0 < int(space.nvec.sum()) <= MAX_ENTRIES
+        good = 0 < int(space.nvec.sum()) <= MAX_OBSERVED
     else:
-        good = isinstance(space, spaces.MultiBinary) and 0 < math.prod(space.shape) <= MAX_ENTRIES
+        good = isinstance(space, spaces.MultiBinary) and 0 < math.prod(space.shape) <= MAX_OBSERVED
     if not good:
         raise ForbiddenObject(f"its space is none that a policy could have ({type(space).__name__})")

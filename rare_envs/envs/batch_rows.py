@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any, TypeVar
 
 import numpy as np
@@ -40,6 +41,48 @@ def _merge(old: Any, rows: Tensor, new: Any) -> Any:
         parts = [_merge(a, rows, b) for a, b in zip(old, new, strict=True)]
         return tuple(parts) if type(old) is tuple else type(old)(*parts)  # a named tuple takes its fields one by one
     return old.replace_rows(rows, new) if isinstance(old, RowsReplaceable) else old
+
+
+def list_tensors(value: Any) -> list[Tensor]:
+    """Return the tensors in nested tuples, in their order; the rest, as the road, stays the same for a whole batch.
+
+    Raises:
+        ValueError: A part keeps its rows in a way of its own.
+
+    Example:
+        >>> import torch
+        >>> list_tensors((torch.zeros(1), ("road", torch.ones(1))))
+        [tensor([0.]), tensor([1.])]
+    """
+    if isinstance(value, Tensor):
+        return [value]
+    if isinstance(value, tuple):
+        return [tensor for part in value for tensor in list_tensors(part)]
+    if isinstance(value, RowsReplaceable):
+        raise ValueError(f"Expected tensors, to keep them in a file, got {type(value).__name__}.")
+    return []
+
+
+def put_tensors(value: _T, tensors: Iterator[Tensor]) -> _T:
+    """Return nested tuples with other tensors in the places of `list_tensors`.
+
+    Raises:
+        ValueError: A tensor has another shape or type, or there are too few.
+    """
+    result: _T = _put(value, tensors)
+    return result
+
+
+def _put(value: Any, tensors: Iterator[Tensor]) -> Any:
+    if isinstance(value, Tensor):
+        new = next(tensors, None)
+        if new is None or new.shape != value.shape or new.dtype != value.dtype:
+            raise ValueError(f"Expected a tensor of {value.dtype} and shape {tuple(value.shape)}.")
+        return new
+    if isinstance(value, tuple):
+        parts = [_put(part, tensors) for part in value]
+        return tuple(parts) if type(value) is tuple else type(value)(*parts)
+    return value
 
 
 def to_object_rows(observation: Any, mask: NDArray[np.bool_]) -> NDArray[Any]:

@@ -1,5 +1,6 @@
 """Environment of many scenarios at once: a `gymnasium.vector.VectorEnv` that is one batch, not many environments."""
 
+import json
 from typing import Any
 
 import gymnasium as gym
@@ -11,7 +12,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rare_envs.control.actions import read_actions
-from rare_envs.envs.batch_rows import merge_rows, put_masked, replace_rows, to_object_rows
+from rare_envs.envs.batch_rows import (
+    list_tensors,
+    merge_rows,
+    put_masked,
+    put_tensors,
+    replace_rows,
+    to_object_rows,
+)
 from rare_envs.envs.info import Info
 from rare_envs.envs.rendering import Renderer
 from rare_envs.make import set_up
@@ -172,6 +180,37 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
             put_masked(details, name, values if name == "kind" else values.numpy(), crashed)
         put_masked(infos, "crash", details, crashed)
         return infos
+
+    def export_state(self) -> dict[str, Any]:
+        """Return the episodes under way and the generator, to go on with them in another process: `restore_state`.
+
+        Returns:
+            Tensors and text only.
+
+        Raises:
+            RuntimeError: Before the first reset.
+        """
+        if self._episode is None:
+            raise RuntimeError("Expected reset() before export_state().")
+        return {
+            "x": torch.from_numpy(self._x.copy()),
+            "tick": torch.from_numpy(self._tick.copy()),
+            "episode": [tensor.clone() for tensor in list_tensors(self._episode)],
+            "generator": json.dumps(self.np_random.bit_generator.state),
+        }
+
+    def restore_state(self, state: dict[str, Any]) -> None:
+        """Go on with the episodes of `export_state` of an environment with the same arguments, after a reset.
+
+        Raises:
+            ValueError: They are of another environment.
+        """
+        tensors = iter(state["episode"])
+        self._episode = put_tensors(self._episode, tensors)
+        if next(tensors, None) is not None or state["x"].shape != self._x.shape:
+            raise ValueError("The episodes are of another environment.")
+        self._x, self._tick = state["x"].numpy().copy(), state["tick"].numpy().copy()
+        self.np_random.bit_generator.state = json.loads(state["generator"])
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """One (H, W, 3) image for each scenario."""

@@ -197,6 +197,7 @@ def train_ego_command(
     out: Annotated[Path, typer.Option(help="File to save the ego in.")] = Path("ego.zip"),
     seed: SeedOption = 0,
     num_envs: Annotated[int, typer.Option(help="Episodes that run side by side.")] = 256,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with a training that was interrupted.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Train an ego on the batched simulation and save it for `rare-envs estimate --ego`."""
@@ -204,7 +205,7 @@ def train_ego_command(
 
     world = {**options.arguments(), "observation": options.observation or "features"}
     with as_bad_input(ValueError, OSError):
-        path = train_ego(env, algo=algo, steps=steps, out=out, seed=seed, num_envs=num_envs, **world)
+        path = train_ego(env, algo=algo, steps=steps, out=out, seed=seed, num_envs=num_envs, resume=resume, **world)
     if as_json:
         print_json({"ego": str(path), "env_id": env, "algo": algo, "steps": steps, "seed": seed, **world})
     else:
