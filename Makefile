@@ -3,6 +3,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+LOWEST := .venv-lowest
 # Errors only; byte code is compiled when it is first used, which is less of it and later.
 PIP := $(BIN)/python -m pip --disable-pip-version-check -qq
 INSTALL := $(PIP) install --no-compile
@@ -21,7 +22,7 @@ PACKAGES := agents rare_envs samplers training
 SOURCES := $(PACKAGES) tests benchmarks examples
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow lint type format bench clean
+.PHONY: help demo test test-slow test-lowest lint type format bench clean
 
 help:  ## Show this list.
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1|\2/p' $(MAKEFILE_LIST) | column -t -s '|'
@@ -34,6 +35,10 @@ test: $(VENV)/.installed  ## Run the tests (some minutes; WORKERS=8 for more pro
 
 test-slow: $(VENV)/.installed  ## Run the repeated-seed studies too.
 	@$(TESTS) -m "not gpu"
+
+# Warnings of libraries that are older than those they rest on are none of ours.
+test-lowest: $(LOWEST)/.installed  ## Run the tests with the lowest versions that pyproject.toml allows.
+	@OMP_NUM_THREADS=1 $(LOWEST)/bin/python -m pytest -n $(WORKERS) --dist loadfile -o filterwarnings=default
 
 lint: $(VENV)/.developer  ## Check style and spelling.
 	@$(BIN)/ruff check $(SOURCES)
@@ -51,7 +56,7 @@ bench: $(VENV)/.installed  ## Measure speed against HighwayEnv.
 	@OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.simulation.throughput
 
 clean:  ## Remove the environment, caches and runs.
-	rm -rf $(VENV) runs build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) $(LOWEST) runs build *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	find $(SOURCES) -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(VENV)/.installed: pyproject.toml constraints.txt
@@ -64,4 +69,12 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 
 $(VENV)/.developer: $(VENV)/.installed
 	@$(INSTALL) -c constraints.txt -e ".[test,dev]"
+	@touch $@
+
+# "matplotlib>=3.9" of pyproject.toml becomes matplotlib==3.9 here.
+$(LOWEST)/.installed: pyproject.toml
+	@$(PYTHON) -m venv $(LOWEST)
+	@grep -oE '"[A-Za-z0-9_-]+>=[0-9.]+' pyproject.toml | tr -d '"' | grep -v setuptools | sed 's/>=/==/' > $(LOWEST)/lowest.txt
+	@$(LOWEST)/bin/python -m pip -qq install --no-compile $(TORCH_ARGS) "$$(grep '^torch==' $(LOWEST)/lowest.txt)"
+	@$(LOWEST)/bin/python -m pip -qq install --no-compile -c $(LOWEST)/lowest.txt -e ".[test]"
 	@touch $@
