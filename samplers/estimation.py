@@ -10,7 +10,8 @@ from numpy.typing import ArrayLike
 
 from samplers.analysis.refits import HasEnsemble, needs_ensemble_run
 from samplers.errors import OnError
-from samplers.execution.arguments import InputsOnly, RunArguments, check_attributes
+from samplers.execution.arguments import InputsOnly, RunArguments, check_attributes, check_problem
+from samplers.execution.base_check import find_base_fault
 from samplers.execution.fault_isolation import FaultIsolation
 from samplers.execution.interruption import EstimationInterrupted, defer_signals
 from samplers.execution.journaled_evaluation import keep_simulations, open_journal
@@ -18,7 +19,7 @@ from samplers.execution.progress import Listener, Progress, open_listener
 from samplers.execution.run import Run
 from samplers.method import Stepping
 from samplers.methods.two_stage.method import TwoStage
-from samplers.problem import FloatArray, Inputs, Problem
+from samplers.problem import FloatArray, Inputs, Problem, StandardNormal
 from samplers.registry import get_method
 from samplers.result import Estimate
 from samplers.trace import Status
@@ -116,6 +117,7 @@ def estimate(
     conditions = _StopConditions(time_limit, stop)
     if not (callable(progress) or isinstance(progress, bool)):
         raise ValueError(f"Expected progress to be True, False or a function, got {progress!r}.")
+    _check_base(problem)
     isolation = FaultIsolation(problem.evaluate, on_error)
     with open_journal(journal, problem, seed) as kept:
         if kept is not None:
@@ -131,6 +133,16 @@ def estimate(
         except EstimationInterrupted as stopped:
             raise EstimationInterrupted(_add_retry_note(stopped.estimate, isolation.n_retried)) from None
     return _add_retry_note(result, isolation.n_retried)
+
+
+def _check_base(problem: Problem) -> None:
+    """Raise a ValueError if the base distribution's map does not fit its draws: p would be wrong without a warning."""
+    check_problem(problem, ("dim", "base", "evaluate"))
+    if type(problem.base) is StandardNormal:
+        return
+    fault = find_base_fault(problem.base, int(problem.dim))
+    if fault is not None:
+        raise ValueError(f"The parts of problem.base ({type(problem.base).__name__}) do not fit together: {fault}.")
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Testing: checks that every method must pass, for a method of your own.
+"""Testing: checks that every method must pass, and every base distribution, for those of your own.
 
 A method that fails raises an AssertionError that says what was expected. The seeds are fixed, so
 the same method passes or fails every time. All runs together take a few 100,000 calls of cheap
@@ -14,11 +14,12 @@ from scipy.special import ndtr
 
 from samplers.estimation import estimate
 from samplers.execution.arguments import RunArguments
+from samplers.execution.base_check import find_base_fault
 from samplers.execution.replicate import NOT_KNOWN
 from samplers.execution.run import Run
 from samplers.limit_states import half_space, normal_cdf, two_modes
 from samplers.method import Stepping
-from samplers.problem import FloatArray, FunctionProblem
+from samplers.problem import Distribution, FloatArray, FunctionProblem
 from samplers.result import Estimate
 from samplers.trace import Status
 
@@ -45,6 +46,28 @@ def check_method(method: Stepping) -> None:
     """
     for check in METHOD_CHECKS:
         check(method)
+
+
+def check_base(base: Distribution, dim: int) -> None:
+    """Check that a base distribution's density and its map to standard normal space fit 200 of its draws.
+
+    `samplers.estimate` makes this check itself; see `samplers.execution.base_check.find_base_fault`.
+
+    Args:
+        base: The distribution.
+        dim: Its number of dimensions.
+
+    Raises:
+        AssertionError: If something does not fit; the text says what. Probability below 1e-6 if all fits.
+
+    Example:
+        >>> import samplers
+        >>> from samplers import testing
+        >>> testing.check_base(samplers.StandardNormal(3), 3)
+    """
+    fault = find_base_fault(base, dim)
+    if fault is not None:
+        raise AssertionError(f"{type(base).__name__}: {fault}.")
 
 
 def check_form(method: Stepping) -> None:

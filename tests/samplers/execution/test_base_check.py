@@ -1,0 +1,101 @@
+"""A base whose map does not fit its draws is refused at the door; one that fits practically never is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import samplers
+from samplers import testing
+from samplers.execution.base_check import FALSE_ALARM, N_DRAWS, _find_other_law, find_base_fault
+from samplers.problem import FloatArray, StandardNormal
+
+
+class Exponential:
+    """Independent exponential coordinates; the parts can be replaced by others that do not fit."""
+
+    def __init__(self, dim: int = 2, **parts: Callable[..., Any]) -> None:
+        self.dim, self.parts = dim, parts
+
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        return self._part("sample", lambda n, rng: rng.exponential(size=(n, self.dim)))(n, rng)
+
+    def log_prob(self, x: FloatArray) -> FloatArray:
+        return self._part("log_prob", lambda x: stats.expon.logpdf(x).sum(axis=1))(x)
+
+    def to_standard_normal(self, x: FloatArray) -> FloatArray:
+        return self._part("to_standard_normal", lambda x: stats.norm.isf(stats.expon.sf(x)))(x)
+
+    def from_standard_normal(self, u: FloatArray) -> FloatArray:
+        return self._part("from_standard_normal", lambda u: stats.expon.isf(stats.norm.sf(u)))(u)
+
+    def _part(self, name: str, usual: Callable[..., Any]) -> Callable[..., Any]:
+        return self.parts.get(name, usual)
+
+
+def correlated(n: int, rng: np.random.Generator) -> FloatArray:
+    first = rng.standard_normal(n)
+    both = np.column_stack([first, 0.8 * first + 0.6 * rng.standard_normal(n)])
+    return np.asarray(stats.expon.isf(stats.norm.sf(both)))
+
+
+WRONG: dict[str, tuple[dict[str, Callable[..., Any]], str]] = {
+    "another scale": ({"sample": lambda n, rng: 3.0 * rng.exponential(size=(n, 2))}, "mean|standard deviation"),
+    "another spread": (
+        {"sample": lambda n, rng: stats.expon.isf(stats.norm.sf(1.5 * rng.standard_normal((n, 2))))},
+        "standard deviation 1",
+    ),
+    "another shape": (
+        {"sample": lambda n, rng: stats.expon.isf(stats.norm.sf(np.sign(rng.standard_normal((n, 2)))))},
+        "is not normal",
+    ),
+    "correlated": ({"sample": correlated}, r"correlation 0\.[78]\d? between coordinates 0 and 1"),
+    "no inverse": ({"from_standard_normal": lambda u: stats.norm.cdf(u)}, "where x is"),
+    "NaN": ({"to_standard_normal": lambda x: np.log(x - 1)}, "NaN or infinity"),
+    "transposed": ({"sample": lambda n, rng: rng.exponential(size=(2, n))}, r"shape \(2, 200\)"),
+    "infinite draws": ({"sample": lambda n, rng: np.full((n, 2), np.inf)}, "sample.* gave NaN or infinity"),
+    "no density": ({"log_prob": lambda x: np.full(len(x), -np.inf)}, "200 finite numbers"),
+    "a column too few": ({"to_standard_normal": lambda x: x[:, :1]}, r"shapes \(200, 1\)"),
+}
+
+
+@pytest.mark.filterwarnings("ignore:invalid value")
+@pytest.mark.parametrize("name", WRONG)
+def test_what_does_not_fit_is_refused_by_estimate_and_by_the_check(name: str) -> None:
+    parts, words = WRONG[name]
+
+    class Problem:
+        dim, base = 2, Exponential(2, **parts)
+
+        def evaluate(self, x: FloatArray) -> FloatArray:
+            raise AssertionError("nothing is to be simulated")
+
+    with pytest.raises(ValueError, match=rf"problem\.base.*({words})"):
+        samplers.estimate(Problem(), seed=0, max_sim=1000)
+    with pytest.raises(AssertionError, match=words):
+        testing.check_base(Problem.base, 2)
+
+
+def test_what_fits_is_not_refused() -> None:
+    for dim in (1, 2, 40, 400):
+        testing.check_base(Exponential(dim), dim)
+        testing.check_base(StandardNormal(dim), dim)
+
+    def missing(x: FloatArray) -> FloatArray:
+        raise NotImplementedError
+
+    testing.check_base(Exponential(2, to_standard_normal=missing), 2)
+
+
+def test_statistics_of_standard_normal_draws_stay_within_the_level(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a level of 0.2 at most a fifth of 2,000 sets may be refused, and not none of them: 4 binomial deviations."""
+    monkeypatch.setattr("samplers.execution.base_check.FALSE_ALARM", 0.2)
+    rng = np.random.default_rng(3)
+    refused = sum(_find_other_law(rng.standard_normal((N_DRAWS, 3))) is not None for _ in range(2000))
+    assert 0.05 * 2000 < refused < 0.2 * 2000 + 4 * (2000 * 0.2 * 0.8) ** 0.5
+    assert FALSE_ALARM == 1e-6
+    assert find_base_fault(StandardNormal(3), 3) is None
