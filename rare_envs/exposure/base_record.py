@@ -34,3 +34,17 @@ def read_site(record: Mapping[str, Any]) -> str:
     """
     source = read_source(record)
     return source["site"] or source["data"]
+
+
+def explain_no_frequency(record: Mapping[str, Any]) -> str:
+    """Return why the events of a base distribution have no frequency.
+
+    Example:
+        >>> explain_no_frequency({})
+        'nobody counted how often its events happen'
+        >>> explain_no_frequency({"source": {"site": "US 101", "no_frequency": "its pairs were under way"}})
+        'its pairs were under way'
+    """
+    source = record.get("source", {})
+    reason = source.get("no_frequency") if isinstance(source, Mapping) else None
+    return str(reason or "nobody counted how often its events happen")

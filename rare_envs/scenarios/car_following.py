@@ -49,6 +49,7 @@ CAR_FOLLOWING = Scenario(
         "us101-gap": DATA / "car_following_us101_gap.json",
         "us101-log-gap": DATA / "car_following_us101_log_gap.json",
         "i80": DATA / "car_following_i80.json",
+        "i80-all-pairs": DATA / "car_following_i80_all_pairs.json",
         "i24": DATA / "car_following_i24.json",
         "highway": DATA / "car_following_highway.json",
     },

@@ -7,7 +7,7 @@ import math
 import samplers
 from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.frequency import EventFrequency
-from rare_envs.exposure.base_record import read_source
+from rare_envs.exposure.base_record import explain_no_frequency, read_source
 from rare_envs.exposure.rate import CollisionProbability, CollisionRate
 from rare_envs.scenarios.registry import find_scenario
 from rare_envs.study.question import Question, Study
@@ -29,9 +29,10 @@ def find_frequency(study: Study) -> EventFrequency:
     frequency = study.base.frequency if isinstance(study.base, FittedDistribution) else None
     if frequency is None:
         scenario = find_scenario(study.question.env_id).name
+        record = study.base.record if isinstance(study.base, FittedDistribution) else {}
         raise ValueError(
             f"no rate per hour or km: the base {study.base_name!r} of {scenario} has no event frequency, "
-            "nobody counted how often its events happen"
+            f"{explain_no_frequency(record)}"
         )
     return frequency
 

@@ -32,6 +32,8 @@ class EventRecipe:
     """Last of the columns, if they are fitted separately: independent of the others, from events of their own."""
     required: tuple[str, ...] = ()
     """Columns of truth values that must hold for the columns fitted separately."""
+    excluded: tuple[str, ...] = ()
+    """Columns of truth values that must not hold for any column."""
     phase: str | None = None
     """Value of the column `phase` in the rows that are used; None where the file has no such column."""
     cluster: tuple[str, ...] = ("recording", "frame")
@@ -74,7 +76,7 @@ class EventSet:
 CLUSTER_FRAMES = 300
 """Frames of a window of time whose events form a cluster: 30 s."""
 EVENT_RECIPES = {
-    "car_following": EventRecipe("car_following_events.csv", ("v_ego", "v_lead", "gap")),
+    "car_following": EventRecipe("car_following_events.csv", ("v_ego", "v_lead", "gap"), excluded=("at_entry",)),
     "cut_in": EventRecipe(
         "cut_in_events.csv",
         ("v_ego", "v_cutin", "v_lead", "gap_ego_cutin", "gap_cutin_lead", "lateral_offset"),
@@ -87,6 +89,7 @@ EVENT_RECIPES = {
 """Recipes by scenario."""
 FILTER_REASONS = {
     "missing": "no ego behind or no lead ahead was recorded, so the parameter has no value",
+    "not at_entry": "the pair was there when the ego came into the picture: following under way, no new leader",
     "start_seen": "the track began during the lane change: speeds and gaps are as good as any, but the vehicle had "
     "already moved across",
     "m/s": "outside the physical range of speeds",
@@ -121,7 +124,7 @@ def read_events(path: Path, recipe: EventRecipe) -> dict[str, NDArray[Any]]:
     Raises:
         ValueError: The file cannot be read or lacks a column.
     """
-    others = (*recipe.required, *(("phase",) if recipe.phase else ()), *recipe.cluster)
+    others = (*recipe.required, *recipe.excluded, *(("phase",) if recipe.phase else ()), *recipe.cluster)
     events = read_csv_columns(path, (*recipe.columns, *others))
     return events | {name: np.asarray(events[name], dtype=np.float64) for name in recipe.columns}
 
@@ -153,6 +156,8 @@ def filter_events(events: Mapping[str, NDArray[Any]], recipe: EventRecipe, box: 
         reason = FILTER_REASONS.get(p.name, FILTER_REASONS[p.unit])
         apply(f"{p.low:g} <= {column} <= {p.high:g} {p.unit}", reason, inside)
 
+    for column in recipe.excluded:
+        apply(f"not {column}", FILTER_REASONS[f"not {column}"], ~events[column].astype(bool))
     for column in recipe.columns:
         apply(f"{column} is given", FILTER_REASONS["missing"], ~np.isnan(events[column]))
     for column, p in zip(recipe.joint, box, strict=False):

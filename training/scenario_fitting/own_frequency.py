@@ -8,7 +8,7 @@ from rare_envs.distributions.frequency import EventFrequency
 from training.data.brakings import braking_exposure
 from training.data.events import Events
 from training.data.trajectories import DT, Trajectories
-from training.scenario_fitting.shipped.frequencies import CUT_INS_US101, braking_frequency
+from training.scenario_fitting.shipped.frequencies import CUT_INS_US101, NEW_LEADERS, braking_frequency
 
 OWN_SOURCE = "counted in the recordings themselves"
 
@@ -49,8 +49,8 @@ def count_events(scenario: str, events: Events, used: int, traffic: ObservedTraf
     """Return the frequency of the events of a user's own recordings; None where nothing was recorded to count.
 
     Cut-ins: lane changes with a vehicle behind in the new lane, times the share of these that the filters keep.
-    Car-following: pairs that begin while the ego is in the picture already. The base is fitted to all pairs, those at
-    the entry into the picture included, and the definition says so. Brakings to a standstill: those that are fitted.
+    Car-following: pairs that begin while the ego is in the picture already, times the share that the filters keep.
+    Brakings to a standstill: those that are fitted.
 
     Args:
         scenario: "car_following", "cut_in" or "hard_brake".
@@ -61,20 +61,17 @@ def count_events(scenario: str, events: Events, used: int, traffic: ObservedTraf
     if scenario == "hard_brake":
         return braking_frequency(used, traffic.braking_hours, traffic.braking_km, OWN_SOURCE) if used else None
     if scenario == "car_following":
-        count = int((~events["at_entry"]).sum())
-        words = f"a vehicle gets a new leader within the picture ({count} of the {len(events['ego'])} pairs fitted)"
-        share, of = 1.0, None
+        count, words = int((~events["at_entry"]).sum()), NEW_LEADERS
     else:
-        suffered = int(((events["phase"] == "start") & (events["ego"] >= 0)).sum())
-        count, words, share, of = suffered, CUT_INS_US101.definition, used / max(suffered, 1), suffered
-    if count == 0 or share == 0.0:
+        count, words = int(((events["phase"] == "start") & (events["ego"] >= 0)).sum()), CUT_INS_US101.definition
+    if count == 0 or used == 0:
         return None
     return EventFrequency(
         count=count,
         hours=traffic.hours,
         km=traffic.km,
-        share=share,
-        share_events=of,
+        share=used / count,
+        share_events=count,
         definition=words,
         source=OWN_SOURCE,
     )

@@ -9,7 +9,7 @@ from typing import Any
 from rich.console import Console
 
 from rare_envs.distributions.fitted import FittedDistribution
-from rare_envs.exposure.base_record import read_source
+from rare_envs.exposure.base_record import explain_no_frequency, read_source
 from rare_envs.scenarios.base import Scenario
 from rare_envs.scenarios.base_distributions import TextFile, load_base
 from rare_envs.scenarios.registry import SCENARIOS, find_scenario
@@ -57,6 +57,7 @@ def _describe_base(scenario: Scenario, name: str) -> dict[str, Any]:
         "family": None,
         "refits": 0,
         "frequency": None,
+        "no_frequency": explain_no_frequency(record),
         "checks": [],
     }
     if not isinstance(base, FittedDistribution):
@@ -64,6 +65,7 @@ def _describe_base(scenario: Scenario, name: str) -> dict[str, Any]:
     frequency = base.frequency
     return {
         **known,
+        "no_frequency": known["no_frequency"] if frequency is None else None,
         "fitted_to": base.fitted_to,
         "events": base.events.to_dict(),
         "family": base.family,
@@ -101,15 +103,15 @@ def _summarise(base: Mapping[str, Any]) -> dict[str, str]:
         "licence": base["licence"] or "",
         "family": _join_family(base["family"] or "", base["coordinates"] or ""),
         "fit": ", ".join(text for text in fit if text),
-        "frequency": _describe_frequency(base["frequency"]),
+        "frequency": _describe_frequency(base["frequency"], base["no_frequency"]),
         "counted in": (base["frequency"] or {}).get("source", ""),
         "recorded / expected": ", ".join(checks),
     }
 
 
-def _describe_frequency(frequency: Mapping[str, Any] | None) -> str:
+def _describe_frequency(frequency: Mapping[str, Any] | None, reason: str) -> str:
     if frequency is None:
-        return "not known: no rate per hour or km"
+        return f"not known, no rate per hour or km: {reason}"
     return (
         f"{format_rate(frequency['per_hour'])} per hour, {format_rate(frequency['per_km'])} per km: "
         f"{frequency['count']:,} in {frequency['hours']:g} h ({frequency['definition']})"

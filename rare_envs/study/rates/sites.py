@@ -21,6 +21,8 @@ from rare_envs.study.report import Report
 def choose_base(scenario: Scenario, given: str | PathLike[str] | None, site: str) -> tuple[str, tuple[str, ...]]:
     """Return the base distribution of a scenario at a site, and notes on it.
 
+    Where that of the site has no event frequency, it is the first one that has.
+
     Args:
         scenario: The scenario.
         given: Name or file that the user gave for it; None for the site's.
@@ -28,8 +30,19 @@ def choose_base(scenario: Scenario, given: str | PathLike[str] | None, site: str
     """
     if given is not None:
         return str(given), ()
-    default = next(iter(scenario.bases))
-    return (site, ()) if site in scenario.bases else (default, (f"it has no base {site!r}: {default!r} is used",))
+    own = site if site in scenario.bases else next(iter(scenario.bases))
+    found = (
+        own if _has_frequency(scenario, own) else next((n for n in scenario.bases if _has_frequency(scenario, n)), own)
+    )
+    if found == site:
+        return site, ()
+    lack = "no event frequency at" if site in scenario.bases else "no base"
+    return found, (f"it has {lack} {site!r}: {found!r} is used",)
+
+
+def _has_frequency(scenario: Scenario, name: str) -> bool:
+    base = load_base(scenario, name)
+    return isinstance(base, FittedDistribution) and base.frequency is not None
 
 
 def compare_sites(report: Report, sites: Sequence[str], progress: bool = False) -> dict[str, float]:

@@ -35,9 +35,10 @@ from training.scenario_fitting.shipped.frequencies import (
 from training.scenario_fitting.shipped.lateral_offsets import lateral_offsets
 from training.scenario_fitting.shipped.new_leaders import load_new_leaders
 
-Reader = Callable[[Path], tuple[EventSet, EventFrequency]]
+Reader = Callable[[Path], tuple[EventSet, EventFrequency | None]]
 
 PAIRS = ("v_ego", "v_lead", "gap")
+I80_PAIRS_FILE = "i80_coifman_pairs.csv"
 CUT_INS = ("v_ego", "v_cutin", "v_lead", "gap_ego_cutin", "gap_cutin_lead")
 NGSIM_LICENCE = (
     "CC BY-SA 3.0 (as the data's public record was reported); these parameters are derived from the data and are "
@@ -103,18 +104,23 @@ def _box(scenario: str) -> tuple[Parameter, ...]:
     return tuple(scenario_named(scenario).parameters)
 
 
-def read_us101_pairs(folder: Path) -> tuple[EventSet, EventFrequency]:
-    """Return pairs of the scenes of US 101 at their first frame."""
+def read_us101_pairs(folder: Path) -> tuple[EventSet, None]:
+    """Return pairs of the scenes of US 101 at their first frame; 76 % are the ego's entry into the picture."""
     recipe = EventRecipe("us101_car_following_events.csv", PAIRS, cluster=("scene",))
+    return filter_events(read_events(folder / recipe.file, recipe), recipe, _box("car_following")), None
+
+
+def read_i80_new_leaders(folder: Path) -> tuple[EventSet, EventFrequency]:
+    """Return pairs of the I-80 that begin in the picture, at their first frame."""
+    recipe = replace(EVENT_RECIPES["car_following"], file=I80_PAIRS_FILE, cluster=("frame",))
     events = filter_events(read_events(folder / recipe.file, recipe), recipe, _box("car_following"))
     return events, NEW_LEADERS_I80
 
 
-def read_i80_pairs(folder: Path) -> tuple[EventSet, EventFrequency]:
-    """Return pairs of the I-80 at their first frame; 93 % are the ego's entry into the picture."""
-    recipe = EventRecipe("i80_coifman_pairs.csv", PAIRS, cluster=("frame",))
-    events = filter_events(read_events(folder / recipe.file, recipe), recipe, _box("car_following"))
-    return events, NEW_LEADERS_I80
+def read_i80_pairs(folder: Path) -> tuple[EventSet, None]:
+    """Return all pairs of the I-80 at their first frame; 93 % are the ego's entry into the picture."""
+    recipe = EventRecipe(I80_PAIRS_FILE, PAIRS, cluster=("frame",))
+    return filter_events(read_events(folder / recipe.file, recipe), recipe, _box("car_following")), None
 
 
 def read_i24_pairs(folder: Path) -> tuple[EventSet, EventFrequency]:
@@ -191,13 +197,28 @@ def _with_offsets(events: EventSet, folder: Path, site: str) -> EventSet:
 
 CLOSING_GAPS = COORDINATE_SYSTEMS["cut_in"][2].name
 FIRST_FRAME = "first frame of the pair"
+US101_PAIRS = MappingProxyType(
+    {
+        **US101_SOURCE,
+        "no_frequency": "most of its pairs (76 %) were under way when the ego came into the picture and are no events of "
+        "traffic, and the scenes were picked for lane changes, so that the new leaders among them cannot be counted",
+    }
+)
+I80_PAIRS = MappingProxyType(
+    {
+        **I80_SOURCE,
+        "no_frequency": "most of its pairs (93 %) were under way when the ego came into the picture and are no events of "
+        "traffic; the base 'i80' has the new leaders among them",
+    }
+)
 CHANGE_STARTS = "start of the lane change"
 BEFORE_CROSSING = "1.3 s before the crossing"
 SHIPPED_BASES = (
-    ShippedBase("car_following", "us101", read_us101_pairs, US101_SOURCE, FIRST_FRAME),
-    ShippedBase("car_following", "us101-gap", read_us101_pairs, US101_SOURCE, FIRST_FRAME, system="plain"),
-    ShippedBase("car_following", "us101-log-gap", read_us101_pairs, US101_SOURCE, FIRST_FRAME, system="log gap"),
-    ShippedBase("car_following", "i80", read_i80_pairs, I80_SOURCE, FIRST_FRAME),
+    ShippedBase("car_following", "us101", read_us101_pairs, US101_PAIRS, FIRST_FRAME),
+    ShippedBase("car_following", "us101-gap", read_us101_pairs, US101_PAIRS, FIRST_FRAME, system="plain"),
+    ShippedBase("car_following", "us101-log-gap", read_us101_pairs, US101_PAIRS, FIRST_FRAME, system="log gap"),
+    ShippedBase("car_following", "i80", read_i80_new_leaders, I80_SOURCE, FIRST_FRAME),
+    ShippedBase("car_following", "i80-all-pairs", read_i80_pairs, I80_PAIRS, FIRST_FRAME),
     ShippedBase("car_following", "i24", read_i24_pairs, I24_SOURCE, "0.8 s after the gap began to jump"),
     ShippedBase("cut_in", "us101", read_us101_cut_ins, US101_SOURCE, CHANGE_STARTS),
     ShippedBase("cut_in", "us101-closing", read_us101_cut_ins, US101_SOURCE, CHANGE_STARTS, system=CLOSING_GAPS),
@@ -209,5 +230,6 @@ SHIPPED_BASES = (
 """Bases of the package that are fitted to recorded events.
 
 Their names say the site, and behind a hyphen in what they differ from the one that the events support best: `us101-gap`
-(plain gaps) is a test distribution near the p of Tian et al., `us101-15-offsets` has lateral offsets from 15 events.
+(plain gaps) is a test distribution near the p of Tian et al., `us101-15-offsets` has lateral offsets from 15 events,
+`i80-all-pairs` has pairs that were under way too.
 """

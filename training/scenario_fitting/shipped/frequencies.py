@@ -14,15 +14,16 @@ LANE_CHANGE_COUNTS = (
 )
 COIFMAN = "Coifman and Li 2017, I-80, 16:00, every vehicle of one camera"
 CIRCLES = "CIRCLES, one instrumented car on I-24, 60 drives of 2021 (doi 10.5281/zenodo.6366761)"
+NEW_LEADERS = "a vehicle in the picture gets a new leader, which it follows for 2 s or more"
 NEW_LEADERS_I80 = EventFrequency(
     count=153,
     hours=5.98,
     km=169.7,
-    definition="a vehicle gets a new leader within the picture; the fitted events are pairs at their first frame, most "
-    "of which (76 % on US 101, 93 % on I-80) had begun before",
-    source=f"{COIFMAN}; for US 101 too, whose scenes show no beginnings",
+    share=152 / 153,
+    share_events=153,
+    definition=NEW_LEADERS,
+    source=COIFMAN,
 )
-"""US 101 has none of its own: its scenes are too short for pairs that begin inside them."""
 NEW_LEADERS_I24 = EventFrequency(
     count=123,
     hours=3.87,
