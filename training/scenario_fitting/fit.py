@@ -37,6 +37,7 @@ from training.scenario_fitting.event_filters import EVENT_RECIPES, filter_events
 from training.scenario_fitting.own_frequency import ObservedTraffic, count_events
 from training.scenario_fitting.published_highway import build_highway_base
 from training.scenario_fitting.shipped.bases import SHIPPED_BASES, ShippedBase
+from training.scenario_fitting.shipped.following_states import check_against_following
 
 PACKAGE_COMMAND = "python -m training.scenario_fitting.fit --data DIR --out rare_envs/data"
 """Command that writes the files of the package."""
@@ -173,7 +174,10 @@ def _write_package_bases(data: Path, scenarios: Sequence[str], out: Path, seed: 
             _write(out / base.file, text)
     for scenario in ("car_following", "cut_in"):
         if scenario in scenarios:
-            _write(out / f"{scenario}_highway.json", format_base(scenario, build_highway_base(scenario)))
+            content = build_highway_base(scenario)
+            if scenario == "car_following":
+                content = check_against_following(content, data)
+            _write(out / f"{scenario}_highway.json", format_base(scenario, content))
 
 
 def _write(path: Path, text: str) -> None:

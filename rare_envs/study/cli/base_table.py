@@ -58,7 +58,8 @@ def _describe_base(scenario: Scenario, name: str) -> dict[str, Any]:
         "refits": 0,
         "frequency": None,
         "no_frequency": explain_no_frequency(record),
-        "checks": [],
+        "checks": record.get("checks", []),
+        "checked_against": record.get("checked_against"),
     }
     if not isinstance(base, FittedDistribution):
         return known
@@ -94,6 +95,7 @@ def _summarise(base: Mapping[str, Any]) -> dict[str, str]:
         if base["held_out_log_prob"] is not None
         else "",
     ]
+    against = f" ({base['checked_against']})" if base["checked_against"] else ""
     checks = [f"{each['name']} {each['recorded']} / {each['expected']:.3g}" for each in base["checks"]]
     return {
         "fitted to": f"{base['fitted_to']}, {base['refits'] or 'no'} refits" if base["fitted_to"] else "",
@@ -105,7 +107,7 @@ def _summarise(base: Mapping[str, Any]) -> dict[str, str]:
         "fit": ", ".join(text for text in fit if text),
         "frequency": _describe_frequency(base["frequency"], base["no_frequency"]),
         "counted in": (base["frequency"] or {}).get("source", ""),
-        "recorded / expected": ", ".join(checks),
+        "recorded / expected": ", ".join(checks) + against,
     }
 
 

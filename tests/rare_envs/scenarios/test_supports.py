@@ -8,7 +8,7 @@ import rare_envs
 import samplers
 from rare_envs.scenarios.registry import SCENARIOS
 
-FAR = [("rare_envs/CarFollowing-v0", base) for base in ("us101", "us101-log-gap", "i80", "i24")]
+FAR = [("rare_envs/CarFollowing-v0", base) for base in ("us101", "us101-log-gap", "i80-all-pairs", "i24")]
 """Bases of car-following with collisions so rare, 1e-5 to 1e-11, that 1,200 simulations may find none."""
 CASES = [(env_id, base) for env_id, each in SCENARIOS.items() if each.drivers is None for base in each.bases]
 

@@ -58,3 +58,14 @@ def test_missing_column_is_named(tmp_path):
     path.write_text("v_ego,v_lead\n1,2\n", encoding="utf-8")
     with pytest.raises(ValueError, match="lacks the columns gap"):
         read_events(path, EVENT_RECIPES["car_following"])
+
+
+def test_pairs_that_were_under_way_are_no_new_leaders(tmp_path):
+    path = tmp_path / "car_following_events.csv"
+    rows = ["v_ego,v_lead,gap,at_entry,recording,frame", "10,9,20,true,a,0", "11,9,20,false,a,5", "12,9,0.5,false,a,9"]
+    path.write_text("\n".join(rows) + "\n", encoding="utf-8")
+    recipe = EVENT_RECIPES["car_following"]
+    events = filter_events(read_events(path, recipe), recipe, scenario_named("car_following").parameters)
+    assert events.joint.tolist() == [[11.0, 9.0, 20.0]]
+    dropped = {entry["rule"]: entry["dropped"] for entry in events.log if entry.get("dropped")}
+    assert dropped == {"not at_entry": 1, "1 <= gap <= 150 m": 1}

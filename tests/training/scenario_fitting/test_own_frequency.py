@@ -25,6 +25,14 @@ def test_pairs_at_the_entry_do_not_count():
     assert count_events("car_following", events, len(events["ego"]), ObservedTraffic().plus(table)) is None
 
 
+def test_new_leaders_count_with_the_share_that_is_used():
+    events = {"at_entry": np.array([True, False, False, True, False, False]), "ego": np.arange(6)}
+    frequency = count_events("car_following", events, 3, ObservedTraffic(hours=2.0, km=100.0))
+    assert frequency is not None
+    assert (frequency.count, frequency.share_events) == (4, 4)
+    assert frequency.per_hour == pytest.approx(3 / 2.0)
+
+
 def test_cut_ins_count_with_the_share_that_is_used():
     events = {"phase": np.array(["start", "crossing"] * 4), "ego": np.array([1, 1, 2, 2, -1, -1, 3, 3])}
     frequency = count_events("cut_in", events, 2, ObservedTraffic(hours=2.0, km=100.0))

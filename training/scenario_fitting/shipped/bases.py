@@ -200,15 +200,15 @@ FIRST_FRAME = "first frame of the pair"
 US101_PAIRS = MappingProxyType(
     {
         **US101_SOURCE,
-        "no_frequency": "most of its pairs (76 %) were under way when the ego came into the picture and are no events of "
-        "traffic, and the scenes were picked for lane changes, so that the new leaders among them cannot be counted",
+        "no_frequency": "most of its pairs (76 %) were under way when the ego came into the picture and are no events "
+        "of traffic, and the scenes were picked for lane changes, so that the new leaders among them cannot be counted",
     }
 )
 I80_PAIRS = MappingProxyType(
     {
         **I80_SOURCE,
-        "no_frequency": "most of its pairs (93 %) were under way when the ego came into the picture and are no events of "
-        "traffic; the base 'i80' has the new leaders among them",
+        "no_frequency": "most of its pairs (93 %) were under way when the ego came into the picture and are no events "
+        "of traffic; the base 'i80' has the new leaders among them",
     }
 )
 CHANGE_STARTS = "start of the lane change"

@@ -42,7 +42,7 @@ def test_the_table_for_people(fitted: None, capsys: pytest.CaptureFixture[str]) 
     assert "fit BIC 1,086.8, held-out log likelihood -14.60 per event" in text
     assert "7.4 per hour, 0.19 per km: 42 in 5.64 h (events of a test)" in text
     assert "recorded / expected TTC < 5 s 2 / 7.5" in text
-    assert "plain frequency not known: no rate per hour or km" in text
+    assert "plain frequency not known, no rate per hour or km: nobody counted" in text
 
 
 @pytest.mark.parametrize("env_id", SCENARIOS)

@@ -9,7 +9,7 @@ from types import MappingProxyType
 import pytest
 
 from rare_envs.scenarios.hard_brake import HARD_BRAKE
-from rare_envs.scenarios.registry import SCENARIOS
+from rare_envs.scenarios.registry import SCENARIOS, scenario_named
 from rare_envs.study import Question, Report, prepare, run
 from rare_envs.study.rates.sites import choose_base, compare_sites
 from tests.rare_envs.study.fitted_files import fitted_entries
@@ -65,4 +65,14 @@ def test_the_base_of_a_scenario_at_a_site() -> None:
     assert choose_base(HARD_BRAKE, Path("mine.json"), "us101") == ("mine.json", ())
     base, notes = choose_base(HARD_BRAKE, None, "i80")
     assert base == "us101"
-    assert "'i80'" in notes[0]
+    assert notes == ("it has no base 'i80': 'us101' is used",)
+
+
+def test_a_base_whose_events_were_not_counted_gives_way_to_one_whose_were() -> None:
+    """Pairs of US 101 were under way, and cannot be counted; the new leaders of I-80 were."""
+    car_following = scenario_named("car_following")
+    base, notes = choose_base(car_following, None, "us101")
+    assert base == "i80"
+    assert notes == ("it has no event frequency at 'us101': 'i80' is used",)
+    assert choose_base(car_following, None, "i24") == ("i24", ())
+    assert choose_base(car_following, "us101", "us101") == ("us101", ())  # refused with its reason later
