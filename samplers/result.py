@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from samplers.analysis.base import RatioStore
 from samplers.analysis.base_uncertainty import BaseUncertainty, compute_base_uncertainty
 from samplers.analysis.curve import Curve, compute_curve
 from samplers.analysis.failure_modes import Share, split_by_kind
@@ -162,6 +163,8 @@ class Estimate:
     """Condition of p, which the problem holds fixed: its attribute `given`, if it has one."""
     ensemble_run: "Estimate | None" = field(default=None, compare=False, repr=False)
     """The further run under the mixture of the refits of the base, where `estimate` needed one."""
+    refit_ratios: RatioStore = field(default_factory=RatioStore, compare=False, repr=False)
+    """Density ratios of the refits at the failing points, kept by the analyses that need them."""
 
     @property
     def unseen(self) -> float:

@@ -1,8 +1,9 @@
-"""Rate of collisions of an evaluation: its probability times the frequency of the events of its base distribution."""
+"""Rates of collisions and injuries of an evaluation: per event, times the frequency of the events of its base."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import samplers
 from rare_envs.distributions.fitted import FittedDistribution
@@ -10,6 +11,7 @@ from rare_envs.distributions.frequency import EventFrequency
 from rare_envs.exposure.base_record import explain_no_frequency, read_source
 from rare_envs.exposure.rate import CollisionProbability, CollisionRate
 from rare_envs.scenarios.registry import find_scenario
+from rare_envs.study.analysis.severity import Severity
 from rare_envs.study.question import Question, Study
 from samplers.analysis.base_uncertainty import FIT_BIAS, refit_quantile
 
@@ -64,20 +66,41 @@ def compute_rate(study: Study, estimate: samplers.Estimate) -> CollisionRate:
     )
 
 
+def compute_injury_rate(study: Study, estimate: samplers.Estimate, severity: Severity) -> CollisionRate:
+    """Return the rate of serious injuries (MAIS 3 or more) of an estimate: injuries per event in place of p.
+
+    Args:
+        study: The question, loaded.
+        estimate: Its answer.
+        severity: Of the collisions.
+
+    Raises:
+        ValueError: As in `find_frequency`.
+    """
+    injuries = severity.injuries
+    probability = _describe_value(injuries.value, injuries.cov, injuries.interval[1], severity.injuries_base)
+    return replace(compute_rate(study, estimate), probability=probability)
+
+
 def describe_probability(estimate: samplers.Estimate) -> CollisionProbability:
     """Return p of an estimate with its errors: that of sampling, and where refits are known, that of the base."""
-    upper = estimate.interval[1]
-    known = estimate.p > 0 and math.isfinite(estimate.cov)
-    base = estimate.base_uncertainty
+    return _describe_value(estimate.p, estimate.cov, estimate.interval[1], estimate.base_uncertainty)
+
+
+def _describe_value(
+    value: float, cov: float, upper: float, base: samplers.BaseUncertainty | None
+) -> CollisionProbability:
+    """Return an expectation per event with its errors."""
+    known = value > 0 and math.isfinite(cov)
     if not known or base is None or not math.isfinite(base.spread):
-        return CollisionProbability(p=estimate.p, cov=estimate.cov, upper=upper, determined=known)
+        return CollisionProbability(p=value, cov=cov, upper=upper, determined=known)
     return CollisionProbability(
-        p=estimate.p,
-        cov=estimate.cov,
+        p=value,
+        cov=cov,
         upper=upper if base.bound is None else base.bound,
         spread=base.spread,
         fit_bias=FIT_BIAS,
-        quantile=refit_quantile(estimate.confidence, len(base.p_refits), base.clusters),
+        quantile=refit_quantile(base.confidence, len(base.p_refits), base.clusters),
         determined=base.bound is None,
     )
 

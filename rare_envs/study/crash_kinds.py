@@ -12,7 +12,7 @@ import numpy as np
 import samplers
 from rare_envs.egos.errors import EgoGone
 from rare_envs.problem import DrivingProblem
-from rare_envs.study.analysis.failure_replay import replay_failures
+from rare_envs.study.analysis.failure_replay import replay_failures, replay_further_failures
 from rare_envs.study.analysis.severity import Severity, compute_severity
 from rare_envs.traffic.crash import CRASH_KINDS, describe_crash
 from samplers.analysis import NO_OUTCOME_LABEL, sum_by_label
@@ -73,4 +73,5 @@ def _weigh_crashes(
     labels = np.full(len(failures.rows), NO_OUTCOME_LABEL, dtype=object)
     labels[failures.has_outcome] = [CRASH_KINDS[kind] for kind in replayed.crash.kind]
     shares = sum_by_label(estimate, failures.rows, labels)
-    return shares, compute_severity(problem, estimate, replayed)
+    further = replay_further_failures(problem, estimate)
+    return shares, compute_severity(problem, estimate, replayed, further=further)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import matplotlib
 import numpy as np
@@ -40,6 +40,9 @@ NORMAL_QUANTILE, WIDEST_COV = 1.96, 3.0
 """Half-width of the band around estimates on the way, in standard errors; c.o.v. beyond which it is cut."""
 HEADROOM = 1.5
 """Upper ends of the curves' axes over their largest values: room for the legend."""
+STYLE: Any = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}
+"""Settings of matplotlib for every picture. Each is a `Figure` of its own, without pyplot: no window, no global state,
+whatever backend the user has."""
 LINE_COLOUR, HIT_COLOUR, ORDINARY_COLOUR = "#3b6fb5", "#c0392b", "#b8b8b8"
 VEHICLE_COLOURS = ("#2a9d3a", "#3b6fb5", "#e08a1e", "#8e5aa8", "#3aa6a6", "#7a7a7a")
 """Colours of vehicles, the ego's first."""
@@ -52,8 +55,7 @@ def save_plot(path: Path, report: Report) -> None:
         path: `.png` to write.
         report: What to draw.
     """
-    # a Figure of its own, without pyplot: no window, no global state, whatever backend the user has
-    with matplotlib.rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
+    with matplotlib.rc_context(STYLE):
         view = _relative_view_height(report.study.problem.world.scenario.road)
         figure = Figure(figsize=(16, 5.4 * (MOMENTS * view + CURVES) / (MOMENTS + CURVES)), layout="constrained")
         columns = figure.subfigures(1, 3, squeeze=False, width_ratios=(1.0, 1.05, 1.25), wspace=0.03)

@@ -16,7 +16,7 @@ from agents.sb3.saved_ego import SavedEgo
 from rare_envs.distributions.space import Distribution
 from rare_envs.egos.faults import Fault
 from rare_envs.exposure import HUMAN_BENCHMARKS, CollisionRate
-from rare_envs.study.collision_rate import compute_rate, describe_left_out, find_frequency
+from rare_envs.study.collision_rate import compute_injury_rate, compute_rate, describe_left_out, find_frequency
 from rare_envs.study.crash_kinds import CrashKinds
 from rare_envs.study.question import Study
 from rare_envs.version import __version__
@@ -115,6 +115,12 @@ class Report:
         return compute_rate(self.study, self.estimate) if not self.no_rate else None
 
     @cached_property
+    def injury_rate(self) -> CollisionRate | None:
+        """Serious injuries (MAIS 3 or more) per hour and per km; None where there is no rate, or no collision."""
+        severity = self.kinds.severity
+        return None if self.no_rate or severity is None else compute_injury_rate(self.study, self.estimate, severity)
+
+    @cached_property
     def no_rate(self) -> str:
         """Why there is no rate; empty if there is one."""
         try:
@@ -174,6 +180,7 @@ class Report:
             ],
             "units": dict(zip(space.names, space.units, strict=True)),
             "rate": None if self.rate is None else {**self.rate.to_dict(), "people": _human_benchmarks()},
+            "injury_rate": None if self.injury_rate is None else self.injury_rate.to_dict(),
             "no_rate": self.no_rate,
             "other_bases": [each.to_dict() for each in self.other_bases],
             "version": __version__,

@@ -1,4 +1,4 @@
-"""Folder of a run: result.json, failures.csv (and failures.npz), plot.png, faults.csv, sensitivity.png.
+"""Folder of a run: result.json, failures.csv (and failures.npz), plot.png, severity.png, faults.csv, sensitivity.png.
 
 Until the run is done, its finished simulations are there too, see `rare_envs.study.journal`; `evaluate` runs it.
 """
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 import samplers
 from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.files import replace_file, replace_text
-from rare_envs.study.analysis.sensitivity_plot import save_sensitivity
+from rare_envs.study.analysis.pictures import save_sensitivity, save_severity
 from rare_envs.study.columns import MAX_SHOWN, list_columns
 from rare_envs.study.errors import BadInput
 from rare_envs.study.plots import save_plot
@@ -28,6 +28,8 @@ RESULT, FAILURES, BLOCKS, PLOT = "result.json", "failures.csv", "failures.npz", 
 """Blocks are what a table has no room for: of more than `columns.MAX_SHOWN` values, drivers' weights and noise."""
 SENSITIVITY = "sensitivity.png"
 """Bars of what p is sensitive to, if the question asks for it."""
+SEVERITY = "severity.png"
+"""P[collision with delta-v > v] over v, if there are collisions."""
 CRASH = (
     "crash",
     "striking",
@@ -65,9 +67,12 @@ def write_run(folder: Path, report: Report) -> None:
     _write_failures(folder, report)
     _write_faults(folder, report)
     save_plot(folder / PLOT, report)
-    (folder / SENSITIVITY).unlink(missing_ok=True)
+    for name in (SENSITIVITY, SEVERITY):
+        (folder / name).unlink(missing_ok=True)
     if isinstance(report.sensitivity, samplers.Sensitivity):
         save_sensitivity(folder / SENSITIVITY, report.sensitivity)
+    if report.kinds.severity is not None:
+        save_severity(folder / SEVERITY, report.kinds.severity)
 
 
 def check_no_results(folder: Path, *names: str) -> None:

@@ -2,15 +2,15 @@
 
 from samplers.analysis.base_uncertainty import BaseUncertainty
 from samplers.analysis.curve import Curve
-from samplers.analysis.exceedance import Exceedance, compute_exceedance
-from samplers.analysis.failure_modes import NO_OUTCOME_LABEL, Share, sum_by_label
-from samplers.analysis.failure_weights import (
+from samplers.analysis.exceedance import Exceedance, RefitBand, compute_exceedance
+from samplers.analysis.failure_expectation import (
     FailureExpectation,
-    WeightedFailures,
+    FurtherFailures,
     expect_over_failures,
     expect_under_refits,
-    weigh_failures,
 )
+from samplers.analysis.failure_modes import NO_OUTCOME_LABEL, Share, sum_by_label
+from samplers.analysis.failure_weights import WeightedFailures, weigh_failures
 from samplers.analysis.ratio_uncertainty import RatioUncertainty
 from samplers.analysis.reweighting import Reweighted
 from samplers.analysis.sensitivity import Sensitivity
@@ -21,7 +21,9 @@ __all__ = [
     "Curve",
     "Exceedance",
     "FailureExpectation",
+    "FurtherFailures",
     "RatioUncertainty",
+    "RefitBand",
     "Reweighted",
     "Sensitivity",
     "Share",

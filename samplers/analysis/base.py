@@ -3,16 +3,43 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
 
-from samplers.problem import Distribution
+from samplers.problem import Distribution, FloatArray
 from samplers.sample import Sample
 
 MIN_UNITS = 5.0
 """Effective number of independent units (draws; paths of chains) that a result must rest on: fewer give a useless t
 interval."""
+
+
+@dataclass(eq=False)
+class RatioStore:
+    """Logarithms of density ratios at the failing points of a run, kept once they were computed.
+
+    Example:
+        >>> store, of = RatioStore(), (object(), object())
+        >>> store.find(of) is None
+        True
+        >>> store.keep(of, np.zeros((2, 3)))
+        >>> store.find(of).shape
+        (2, 3)
+    """
+
+    _of: tuple[object, ...] = ()
+    _ratios: FloatArray = field(default_factory=lambda: np.empty((0, 0)), repr=False)
+
+    def find(self, of: tuple[object, ...]) -> FloatArray | None:
+        """Return what was kept for these very objects; None if it was for others."""
+        same = len(of) == len(self._of) > 0 and all(a is b for a, b in zip(of, self._of, strict=True))
+        return self._ratios if same else None
+
+    def keep(self, of: tuple[object, ...], ratios: FloatArray) -> None:
+        """Keep the ratios that belong to these objects, and forget those before."""
+        self._of, self._ratios = of, ratios
 
 
 class HasName(Protocol):
@@ -76,6 +103,10 @@ class WeightedEstimate(Protocol):
     @property
     def failures(self) -> HasTotal:
         """Failing points that were kept."""
+
+    @property
+    def refit_ratios(self) -> RatioStore:
+        """Density ratios of the refits of the base, once they were asked for."""
 
 
 def require_sample(estimate: WeightedEstimate) -> Sample:

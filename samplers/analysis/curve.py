@@ -1,37 +1,94 @@
-"""Curve: P[f(X) <= g] over thresholds g from one run, with a simultaneous band.
-
-References:
-    Montiel Olea and Plagborg-Moller, "Simultaneous confidence bands: theory, implementation, and an
-    application to SVARs", Journal of Applied Econometrics 34, 2019 (the sup-t band).
-"""
+"""Curve: P[f(X) <= g] over thresholds g from one run, with a simultaneous band."""
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from scipy import stats
+from numpy.typing import ArrayLike
 
 from samplers.analysis.base import MIN_UNITS, WeightedEstimate, cov_inflation, no_outcome_weight, require_sample
 from samplers.problem import FloatArray
 from samplers.sample import Sample
 from samplers.serialization import to_json_value
-from samplers.statistics.cluster_sums import UnitSums, interval_of_count, interval_of_sum, unit_sums
+from samplers.statistics.cluster_sums import unit_sums
+from samplers.statistics.simultaneous import simultaneous_intervals
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-EIGENVALUE_ROUNDING = 1e-10
-"""Eigenvalues of a G x G correlation up to G times this are rounding: its trace is G."""
-BAND_DRAWS = 10_000
-"""Draws of the largest deviation; its 95 % quantile is then good to about 1 %."""
-BAND_STREAM = 2**31
-"""Spawn key of the generator for these draws; the runs have 0, 1, 2, ..."""
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ProbabilityCurve:
+    """Probabilities over thresholds, with a band that should hold all of them at once; `Curve` and `Exceedance` are.
+
+    A subclass has the thresholds as a further field.
+    """
+
+    p: FloatArray
+    """Estimated probabilities, shape (k,)."""
+    low: FloatArray
+    """Lower end of the band, shape (k,)."""
+    high: FloatArray
+    """Upper end of the band, shape (k,)."""
+    cov: FloatArray
+    """Coefficient of variation of each `p`, shape (k,)."""
+    ess: FloatArray
+    """Effective number of independent units (draws, paths) behind each `p`, shape (k,)."""
+    confidence: float
+    """Nominal probability that the band holds the truth at all k thresholds together."""
+
+    axis: ClassVar[str]
+    """Name of the field that has the thresholds."""
+    symbol: ClassVar[str]
+    """What a threshold is called."""
+    event: ClassVar[str]
+    """What `p` is the probability of."""
+
+    @property
+    def _over(self) -> FloatArray:
+        """The thresholds, shape (k,)."""
+        return np.asarray(getattr(self, self.axis))  # a field by its name
+
+    def __len__(self) -> int:
+        """Return the number of thresholds."""
+        return len(self.p)
+
+    def __str__(self) -> str:
+        """Return a table for people."""
+        head = f"{self.symbol:>12} {f'P[{self.event}]':>10}   {100 * self.confidence:g} % band"
+        rows = zip(self._over, self.p, self.low, self.high, strict=True)
+        return "\n".join([head, *(f"{g:12.5g} {p:10.3e}   [{low:.3e}, {high:.3e}]" for g, p, low, high in rows)])
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain lists and numbers for JSON; infinities become None."""
+        arrays = (self.axis, "p", "low", "high", "cov", "ess")
+        data = {key: to_json_value(getattr(self, key).tolist()) for key in arrays}  # a field by its name
+        return {**data, "confidence": self.confidence}
+
+    def plot(self, ax: "Axes | None" = None) -> "Axes":
+        """Draw the curve and its band over the thresholds, p on a log scale; needs matplotlib.
+
+        Args:
+            ax: Where to draw; None takes the current axes of pyplot.
+        """
+        if ax is None:
+            from matplotlib import pyplot
+
+            ax = pyplot.gca()
+        order = np.argsort(self._over)
+        t, p, low, high = (each[order] for each in (self._over, self.p, self.low, self.high))
+        floor = p[p > 0].min(initial=1.0) / 10  # a lower end of 0 has no place on a log scale
+        ax.fill_between(t, np.maximum(low, floor), np.maximum(high, floor), alpha=0.25, linewidth=0)
+        ax.plot(t, np.where(p > 0, p, np.nan))
+        ax.set_yscale("log")
+        ax.set_xlabel(f"threshold {self.symbol}")
+        ax.set_ylabel(f"P[{self.event.replace('<=', '≤')}]")
+        return ax
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Curve:
+class Curve(ProbabilityCurve):
     """P[f(X) <= g] at several thresholds, with a band that should hold all of them at once.
 
     Example:
@@ -47,53 +104,10 @@ class Curve:
 
     gammas: FloatArray
     """Thresholds g, shape (k,), in the order asked for."""
-    p: FloatArray
-    """Estimated probabilities, shape (k,)."""
-    low: FloatArray
-    """Lower end of the band, shape (k,)."""
-    high: FloatArray
-    """Upper end of the band, shape (k,)."""
-    cov: FloatArray
-    """Coefficient of variation of each `p`, shape (k,)."""
-    ess: FloatArray
-    """Effective number of independent units (draws, paths) behind each `p`, shape (k,)."""
-    confidence: float
-    """Nominal probability that the band holds the truth at all k thresholds together."""
 
-    def __len__(self) -> int:
-        """Return the number of thresholds."""
-        return len(self.gammas)
-
-    def __str__(self) -> str:
-        """Return a table for people."""
-        head = f"{'g':>12} {'P[f <= g]':>10}   {100 * self.confidence:g} % band"
-        rows = zip(self.gammas, self.p, self.low, self.high, strict=True)
-        return "\n".join([head, *(f"{g:12.5g} {p:10.3e}   [{low:.3e}, {high:.3e}]" for g, p, low, high in rows)])
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain lists and numbers for JSON; infinities become None."""
-        arrays = ("gammas", "p", "low", "high", "cov", "ess")
-        data = {key: to_json_value(getattr(self, key).tolist()) for key in arrays}  # a field by its name
-        return {**data, "confidence": self.confidence}
-
-    def plot(self, ax: "Axes | None" = None) -> "Axes":
-        """Draw the curve and its band over the thresholds, p on a log scale; needs matplotlib.
-
-        Args:
-            ax: Where to draw; None takes the current axes of pyplot.
-        """
-        if ax is None:
-            from matplotlib import pyplot
-
-            ax = pyplot.gca()
-        order = np.argsort(self.gammas)
-        g = self.gammas[order]
-        ax.fill_between(g, self.low[order], self.high[order], alpha=0.25, linewidth=0)
-        ax.plot(g, self.p[order])
-        ax.set_yscale("log")
-        ax.set_xlabel("threshold g")
-        ax.set_ylabel("P[f ≤ g]")
-        return ax
+    axis = "gammas"
+    symbol = "g"
+    event = "f <= g"
 
 
 def compute_curve(estimate: WeightedEstimate, gammas: ArrayLike) -> Curve:
@@ -124,7 +138,7 @@ def compute_curve(estimate: WeightedEstimate, gammas: ArrayLike) -> Curve:
     use = np.unique(place[:-1])
     p = anchor_at_estimate(estimate, sums.p, at_gamma)
     cov = np.where(sums.is_count, 1.0, cov_inflation(estimate, float(sums.cov[at_gamma]))) * sums.cov
-    low, high = simultaneous_intervals(estimate, sums, use, p, cov)
+    low, high = simultaneous_intervals(sums, use, p, cov, estimate.confidence, estimate.seed)
     low[use] = np.maximum.accumulate(low[use] * (1 - no_outcome_weight(estimate, sample) / sums.p[use]))
     high[use] = np.minimum.accumulate(high[use][::-1])[::-1]
     here = place[:-1]
@@ -137,32 +151,6 @@ def compute_curve(estimate: WeightedEstimate, gammas: ArrayLike) -> Curve:
         ess=sums.ess[here],
         confidence=estimate.confidence,
     )
-
-
-def simultaneous_intervals(
-    estimate: WeightedEstimate, sums: UnitSums, use: NDArray[np.intp], p: FloatArray, cov: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return pointwise intervals of p at one level, at which they should hold together; 0 to 1 where they are not used.
-
-    Args:
-        estimate: The run, for its confidence and its seed.
-        sums: Over units, at G thresholds.
-        use: Indices of the thresholds that count.
-        p: Probabilities, shape (G,).
-        cov: Their coefficients of variation, shape (G,).
-
-    Returns:
-        Lower and upper ends, shape (G,) each.
-    """
-    rng = np.random.default_rng(np.random.SeedSequence(estimate.seed, spawn_key=(BAND_STREAM,)))
-    level = simultaneous_level(sums.correlation[np.ix_(use, use)], estimate.confidence, rng)
-    low, high = np.zeros(len(p)), np.ones(len(p))
-    for i in use:
-        if sums.is_count[i]:
-            low[i], high[i] = interval_of_count(float(sums.p[i]), sums.n_units, level)
-        else:
-            low[i], high[i] = interval_of_sum(float(p[i]), float(cov[i]), float(sums.ess[i]), sums.independent, level)
-    return low, high
 
 
 def as_thresholds(gammas: ArrayLike) -> FloatArray:
@@ -214,21 +202,3 @@ def anchor_at_estimate(estimate: WeightedEstimate, sums: FloatArray, at_gamma: i
         return np.minimum(sums, 1.0)
     moved = sums + (estimate.p / own - 1) * np.minimum(sums, own)
     return np.asarray(np.minimum(moved, 1.0))
-
-
-def simultaneous_level(correlation: NDArray[np.float64], confidence: float, rng: np.random.Generator) -> float:
-    """Return the level of pointwise intervals that together hold with probability `confidence`.
-
-    Args:
-        correlation: Of the estimates, shape (G, G); rows of zeros for those that do not vary.
-        confidence: Nominal coverage of all.
-        rng: Generator of the draws.
-    """
-    values, vectors = np.linalg.eigh(correlation)
-    some = values > EIGENVALUE_ROUNDING * max(len(values), 1)
-    if np.count_nonzero(some) <= 1:
-        return confidence
-    roots = vectors[:, some] * np.sqrt(values[some])
-    largest = np.abs(rng.standard_normal((BAND_DRAWS, roots.shape[1])) @ roots.T).max(axis=1)
-    level = 1 - 2 * float(stats.norm.sf(np.quantile(largest, confidence)))
-    return max(level, confidence)

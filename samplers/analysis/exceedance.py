@@ -1,20 +1,24 @@
-"""Exceedance curve: P[failure and v(X) > t] over thresholds t of a quantity v of the failing points, with a band."""
+"""Exceedance curve: P[failure and v(X) > t] over thresholds t of a quantity v of the failing points."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from samplers.analysis.base import MIN_UNITS, WeightedEstimate
-from samplers.analysis.curve import as_thresholds, simultaneous_intervals
+from samplers.analysis.base import MIN_UNITS
+from samplers.analysis.base_uncertainty import BaseUncertainty, summarise_refits
+from samplers.analysis.curve import ProbabilityCurve, as_thresholds
+from samplers.analysis.failure_expectation import FurtherFailures, sum_parts_under_refits
 from samplers.analysis.failure_weights import WeightedFailures
+from samplers.analysis.refits import EnsembleEstimate, RefitSums, find_fitted_base
 from samplers.problem import FloatArray
 from samplers.sample import Sample
 from samplers.serialization import to_json_value
 from samplers.statistics.cluster_sums import UnitSums, unit_sums
+from samplers.statistics.simultaneous import simultaneous_intervals
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,8 +28,40 @@ NOWHERE = 1e308
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Exceedance:
+class RefitBand:
+    """Intervals of an exceedance curve that the events behind a fitted base allow, each threshold by itself.
+
+    Each is that of `BaseUncertainty`; fields of shape (k,) belong to the thresholds of the curve.
+    """
+
+    low: FloatArray
+    """Lower ends, shape (k,); 0 where the events do not determine the probability, or too few units exceed the
+    threshold."""
+    high: FloatArray
+    """Upper ends, shape (k,); where too few units exceed the threshold, that of the next lower one."""
+    spread: FloatArray
+    """Standard deviation of log P over the refits, shape (k,); NaN where it is not known."""
+    confidence: float
+    """Nominal coverage of each interval."""
+    n_refits: int
+    """Number of refits."""
+    fitted_to: str
+    """The events in words."""
+    family: str
+    """The family of distributions in words."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain lists and numbers for JSON; NaN becomes None."""
+        values = asdict(self)
+        return {name: to_json_value(v.tolist() if isinstance(v, np.ndarray) else v) for name, v in values.items()}
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Exceedance(ProbabilityCurve):
     """P[failure and v(X) > t] at several thresholds t, with a band that should hold all of them at once.
+
+    `low` is 0 where fewer than 5 effective independent units exceed the threshold, and `high` there that of the next
+    lower threshold, which bounds it.
 
     Example:
         >>> import samplers
@@ -34,59 +70,60 @@ class Exceedance:
         >>> result = samplers.estimate(problem, seed=0, max_sim=4000)
         >>> failures = weigh_failures(result)
         >>> curve = compute_exceedance(result, failures, failures.x[:, 0], [3.0, 3.5])  # Phi(-3), Phi(-3.5)
-        >>> for t, low, high in zip(curve.thresholds, curve.low, curve.high):
-        ...     print(f"P[failure, v > {t}]: {low:.2e} to {high:.2e}")
-        P[failure, v > 3.0]: 1.32e-03 to 1.41e-03
-        P[failure, v > 3.5]: 1.96e-04 to 2.61e-04
+        >>> print(curve)
+                   t P[failure, v > t]   95 % band
+                   3  1.361e-03   [1.316e-03, 1.407e-03]
+                 3.5  2.264e-04   [1.962e-04, 2.612e-04]
     """
 
     thresholds: FloatArray
     """Thresholds t, shape (k,), in the order asked for."""
-    p: FloatArray
-    """Probabilities, shape (k,)."""
-    low: FloatArray
-    """Lower end of the band, shape (k,); 0 where fewer than 5 effective independent units exceed the threshold."""
-    high: FloatArray
-    """Upper end of the band, shape (k,); there, that of the next lower threshold, which bounds it."""
-    confidence: float
-    """Nominal probability that the band holds the truth at all k thresholds together."""
+    base: RefitBand | None = None
+    """Intervals that the events behind the base distribution allow; None where it has no refits."""
+
+    axis = "thresholds"
+    symbol = "t"
+    event = "failure, v > t"
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain lists and numbers for JSON."""
-        arrays = ("thresholds", "p", "low", "high")
-        return {**{key: to_json_value(getattr(self, key).tolist()) for key in arrays}, "confidence": self.confidence}
+        return {**super().to_dict(), "base": None if self.base is None else self.base.to_dict()}
 
     def plot(self, ax: Axes | None = None) -> Axes:
-        """Draw the curve and its band over the thresholds, p on a log scale; needs matplotlib.
+        """Draw the curve, its band and that of the base distribution, p on a log scale; needs matplotlib.
 
         Args:
             ax: Where to draw; None takes the current axes of pyplot.
         """
-        if ax is None:
-            from matplotlib import pyplot
-
-            ax = pyplot.gca()
-        order = np.argsort(self.thresholds)
-        t, p, low, high = (each[order] for each in (self.thresholds, self.p, self.low, self.high))
-        floor = p[p > 0].min(initial=1.0) / 10  # a lower end of 0 has no place on a log scale
-        ax.fill_between(t, np.maximum(low, floor), np.maximum(high, floor), alpha=0.25, linewidth=0)
-        ax.plot(t, np.where(p > 0, p, np.nan))
-        ax.set_yscale("log")
-        ax.set_xlabel("threshold t")
-        ax.set_ylabel("P[failure, v > t]")
+        ax = super().plot(ax)
+        ax.collections[-1].set_label(f"sampling, {100 * self.confidence:g} % of all together")
+        if self.base is not None:
+            positive = np.concatenate([self.p / 10, self.base.low])
+            order, floor = np.argsort(self.thresholds), positive[positive > 0].min(initial=1.0)
+            low, high = (np.maximum(each[order], floor) for each in (self.base.low, self.base.high))
+            label = f"base distribution, {100 * self.base.confidence:g} % each"
+            ax.fill_between(self.thresholds[order], low, high, color="C1", alpha=0.2, linewidth=0, label=label)
+        ax.legend(frameon=False)
         return ax
 
 
 def compute_exceedance(
-    estimate: WeightedEstimate, failures: WeightedFailures, values: FloatArray, thresholds: ArrayLike
+    estimate: EnsembleEstimate,
+    failures: WeightedFailures,
+    values: FloatArray,
+    thresholds: ArrayLike,
+    further: FurtherFailures | None = None,
 ) -> Exceedance:
     """Return P[failure and v > t] over thresholds t, with a simultaneous (sup-t) band as that of `Estimate.curve`.
+
+    Where the base has refits, each probability also has the interval that its events allow.
 
     Args:
         estimate: The run.
         failures: Its weighted failing points.
         values: v at these points, shape (k,); -inf where it exceeds no threshold.
         thresholds: Thresholds t, in any order.
+        further: Failing points of the run's `ensemble_run` with v, if it has one; they count for the refits alone.
 
     Raises:
         ValueError: If v is not one number per point, or a threshold is not finite.
@@ -112,11 +149,22 @@ def compute_exceedance(
     sums = _sum_by_threshold(failures, np.where(np.isneginf(v), NOWHERE, -v), grid)
     cov = np.where(sums.is_count, 1.0, failures.inflation) * sums.cov
     use = np.flatnonzero(sums.ess >= MIN_UNITS)
-    low, high = simultaneous_intervals(estimate, sums, use, sums.p, cov)
+    low, high = simultaneous_intervals(sums, use, sums.p, cov, estimate.confidence, estimate.seed)
     low = np.maximum.accumulate(low)
     high = np.minimum.accumulate(high[::-1])[::-1]
     here = place[:-1]
-    return Exceedance(thresholds=asked, p=sums.p[here], low=low[here], high=high[here], confidence=estimate.confidence)
+    return Exceedance(
+        thresholds=asked,
+        p=sums.p[here],
+        low=low[here],
+        high=high[here],
+        cov=cov[here],
+        ess=sums.ess[here],
+        confidence=estimate.confidence,
+        base=_band_under_refits(
+            estimate, (failures, v), further, asked, np.where(sums.ess >= MIN_UNITS, sums.p, 0.0)[here], cov[here]
+        ),
+    )
 
 
 def _sum_by_threshold(failures: WeightedFailures, f: FloatArray, grid: FloatArray) -> UnitSums:
@@ -124,3 +172,58 @@ def _sum_by_threshold(failures: WeightedFailures, f: FloatArray, grid: FloatArra
     sample = Sample(f=f, weights=failures.weights, units=failures.units, n_units=failures.n_units, x=failures.x)
     sums = unit_sums(sample, grid)
     return UnitSums(p=sums.p, second=sums.second, n_units=sums.n_units, independent=failures.independent)
+
+
+def _band_under_refits(
+    estimate: EnsembleEstimate,
+    own: tuple[WeightedFailures, FloatArray],
+    further: FurtherFailures | None,
+    thresholds: FloatArray,
+    p: FloatArray,
+    cov: FloatArray,
+) -> RefitBand | None:
+    """Return the intervals that refits allow for probabilities p (k,) at thresholds; None where there are none.
+
+    p is 0 where too few units exceed the threshold.
+    """
+    fitted = find_fitted_base(estimate.base)
+    if fitted is None:
+        return None
+    beyond = [
+        None if each is None else (each[0], (each[1] > thresholds[:, None]).astype(np.float64))
+        for each in (own, further)
+    ]
+    assert beyond[0] is not None
+    try:
+        sums = sum_parts_under_refits(estimate, fitted, beyond[0], beyond[1])
+    except ValueError:  # p itself is not known under the refits, as `BaseUncertainty` says
+        return None
+    found = [
+        summarise_refits(value, one, estimate.confidence, fitted, RefitSums(log_p[None], ess[None]))
+        if value > 0
+        else None
+        for value, one, log_p, ess in zip(p.tolist(), cov.tolist(), *sums, strict=True)
+    ]
+    low, high = _ends_by_threshold(found, np.argsort(thresholds))
+    return RefitBand(
+        low=low,
+        high=high,
+        spread=np.array([np.nan if each is None else each.spread for each in found]),
+        confidence=estimate.confidence,
+        n_refits=len(fitted.refits),
+        fitted_to=fitted.fitted_to,
+        family=fitted.family,
+    )
+
+
+def _ends_by_threshold(found: list[BaseUncertainty | None], rising: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
+    """Return lower and upper ends (k,); `rising` sorts the thresholds."""
+    low, high, last = np.zeros(len(found)), np.ones(len(found)), 1.0
+    for i in rising:
+        one = found[i]
+        if one is not None and one.interval is not None:
+            low[i], last = one.interval
+        elif one is not None and one.bound is not None:
+            last = one.bound
+        high[i] = last
+    return low, high

@@ -144,8 +144,29 @@ def _count_outside(distribution: HasLogProb, x: FloatArray) -> int:
     return int(np.count_nonzero(~np.isfinite(log_density(distribution, x))))
 
 
+def refit_log_ratios(estimate: WeightedEstimate, refits: Sequence[HasLogProb]) -> FloatArray:
+    """Return log(refit_b(x_i) / base(x_i)) at the failing points, shape (R, k); computed once for an estimate.
+
+    Args:
+        estimate: The run; its base may be any distribution that has density where the refits have.
+        refits: R distributions; the same sequence again gives what was computed before.
+
+    Raises:
+        ValueError: If there are no weighted points, or a density is not finite.
+    """
+    sample, base = require_sample(estimate), require_base(estimate)
+    of = (sample, base, refits)
+    known = estimate.refit_ratios.find(of)
+    if known is None:
+        old = log_density(base, sample.x)
+        rows = [subtract_log_densities(refit, old, sample.x) for refit in refits]
+        known = np.array(rows, dtype=np.float64).reshape(len(rows), len(sample.x))
+        estimate.refit_ratios.keep(of, known)
+    return known
+
+
 def reweight_to_refits(
-    estimate: WeightedEstimate, refits: Iterable[HasLogProb], parts: FloatArray | None = None
+    estimate: WeightedEstimate, refits: Sequence[HasLogProb], parts: FloatArray | None = None
 ) -> RefitSums:
     """Return p under each refit, p_b = sum of w_i refit_b(x_i) / base(x_i) over the failing points.
 
@@ -153,29 +174,31 @@ def reweight_to_refits(
     would narrow the spread.
 
     Args:
-        estimate: The run; its base may be any distribution that has density where the refits have.
+        estimate: The run.
         refits: R distributions.
         parts: Parts of p: what share of each failing point belongs to it, shape (m, k); None for p itself.
 
     Raises:
         ValueError: If there are no weighted points, none failed, or a density is not finite.
     """
-    sample, base = require_sample(estimate), require_base(estimate)
-    failing = sample.f <= estimate.gamma
-    weights, x = sample.weights[failing], sample.x
-    if len(x) == 0 or estimate.p <= 0:
+    sample = require_sample(estimate)
+    if len(sample.x) == 0 or estimate.p <= 0:
         raise ValueError("nothing failed, so that p under the refits is not known.")
-    parts = np.ones((1, len(x))) if parts is None else parts
+    return _sum_parts(estimate, refit_log_ratios(estimate, refits), parts)
+
+
+def _sum_parts(estimate: WeightedEstimate, log_ratios: FloatArray, parts: FloatArray | None) -> RefitSums:
+    """Return the sums over the failing points from the density ratios there, shape (R, k)."""
+    sample = require_sample(estimate)
+    failing = sample.f <= estimate.gamma
+    weights = sample.weights[failing]
+    parts = np.ones((1, len(weights))) if parts is None else parts
     units = np.unique(sample.units[failing], return_inverse=True)[1]
-    old = log_density(base, x)
     with np.errstate(divide="ignore"):  # weights and parts of 0
         log_weights = np.log(parts * weights)
     scale = np.log(estimate.p) - np.log(weights.sum())
-    sums = []
-    for refit in refits:
-        ratios = subtract_log_densities(refit, old, x)
-        sums.append([_sum_logarithms(row + ratios, units) for row in log_weights])
-    log_p, ess = np.asarray(sums, dtype=np.float64).transpose(2, 1, 0)
+    sums = [[_sum_logarithms(row + ratios, units) for row in log_weights] for ratios in log_ratios]
+    log_p, ess = np.asarray(sums, dtype=np.float64).reshape(len(log_ratios), len(log_weights), 2).transpose(2, 1, 0)
     return RefitSums(np.minimum(log_p + scale, 0.0), ess)
 
 
@@ -192,7 +215,8 @@ def reweight_runs_to_refits(
     Args:
         estimate: With weighted points.
         refits: R distributions.
-        split: Returns parts of p (m, k) for points (k, d), see `reweight_to_refits`; None for p itself.
+        split: Returns parts of p (m, k) for points (k, d), see `reweight_to_refits`; None for p itself. All parts
+            come from the same run.
 
     Raises:
         ValueError: As in `reweight_to_refits`.
@@ -202,10 +226,20 @@ def reweight_runs_to_refits(
         reweight_to_refits(run, refits, None if split is None else split(require_sample(run).x))
         for run in runs or [estimate]
     ]
-    best = np.argmax([sums.ess.min(axis=0) for sums in found], axis=0)
-    log_p, ess = (np.stack(values) for values in zip(*found, strict=True))
-    rows = np.arange(len(best))
-    return RefitSums(log_p[best, :, rows].T, ess[best, :, rows].T)
+    return choose_better_run(found, [sums.ess.min(axis=0, keepdims=True) for sums in found])
+
+
+def choose_better_run(found: Sequence[RefitSums], points: Sequence[FloatArray] | None = None) -> RefitSums:
+    """Return for each refit the sums of that run which has most effective points.
+
+    Args:
+        found: Sums of each run, of m parts and R refits.
+        points: Effective points to judge by, shape (m, R) or (1, R) each; None for those of each part.
+    """
+    ess = np.stack([sums.ess for sums in found])
+    best = np.broadcast_to(np.argmax(ess if points is None else np.stack(points), axis=0), ess.shape[1:])[None]
+    log_p = np.take_along_axis(np.stack([sums.log_p for sums in found]), best, axis=0)[0]
+    return RefitSums(log_p, np.take_along_axis(ess, best, axis=0)[0])
 
 
 def _sum_logarithms(log_terms: FloatArray, units: NDArray[np.intp]) -> tuple[float, float]:
@@ -240,8 +274,10 @@ def needs_ensemble_run(estimate: WeightedEstimate) -> bool:
     fitted = find_fitted_base(estimate.base)
     if fitted is None or not isinstance(fitted, HasEnsemble):
         return False
+    if estimate.sample is None or len(estimate.sample.x) == 0 or estimate.p <= 0:
+        return False
     try:
-        own = float(reweight_to_refits(estimate, [fitted]).ess[0, 0])
+        own = float(_sum_parts(estimate, np.zeros((1, len(estimate.sample.x))), None).ess[0, 0])
         return own >= MIN_OWN_ESS and are_uncovered(reweight_to_refits(estimate, fitted.refits))
     except ValueError:  # no points to reweight: the mixture of the refits would not mend that
         return False

@@ -11,6 +11,8 @@ from samplers.analysis import WeightedFailures, weigh_failures
 
 MAX_REPLAYED = 10_000
 """Largest number of failing points that are driven again, evenly spaced among all."""
+MAX_REPLAYED_FURTHER = 2_000
+"""The same of those of the run under the mixture of the refits, which count for the refits alone."""
 
 
 class ReplayedFailures(NamedTuple):
@@ -34,3 +36,16 @@ def replay_failures(
         raise ValueError("The ego's answers vary from run to run, so that its failures cannot be seen again.")
     failures = weigh_failures(estimate, most)
     return ReplayedFailures(failures, problem.crashes(failures.x[failures.has_outcome]))
+
+
+def replay_further_failures(
+    problem: DrivingProblem, estimate: samplers.Estimate, most: int | None = MAX_REPLAYED
+) -> ReplayedFailures | None:
+    """Drive failing points of the further run under the mixture of the refits once more; None where there is none.
+
+    Arguments as of `replay_failures`; at most `MAX_REPLAYED_FURTHER` are driven.
+    """
+    run = estimate.ensemble_run
+    if run is None or run.p <= 0 or run.sample is None:
+        return None
+    return replay_failures(problem, run, min(MAX_REPLAYED_FURTHER, MAX_REPLAYED if most is None else most))

@@ -11,12 +11,18 @@ from numpy.typing import ArrayLike
 
 import samplers
 from rare_envs.problem import DrivingProblem
-from rare_envs.study.analysis.failure_replay import MAX_REPLAYED, ReplayedFailures, replay_failures
+from rare_envs.study.analysis.failure_replay import (
+    MAX_REPLAYED,
+    ReplayedFailures,
+    replay_failures,
+    replay_further_failures,
+)
 from rare_envs.traffic.crash import NONE, OTHERS
 from samplers.analysis import (
     BaseUncertainty,
     Exceedance,
     FailureExpectation,
+    FurtherFailures,
     compute_exceedance,
     expect_over_failures,
     expect_under_refits,
@@ -26,8 +32,8 @@ from samplers.problem import FloatArray
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-DELTA_V_STEP = 0.5
-"""Step of the curve by default [m/s]."""
+DELTA_V_STEP, FINE_STEP, FINE_UP_TO = 0.5, 0.1, 2.5
+"""Step of the curve by default [m/s], and that of a curve that does not reach beyond 2.5 m/s."""
 SHOWN_DELTA_V = (0.5, 1.0, 2.0, 5.0, 10.0, 15.0)
 """Delta-v [m/s] at which the curve is printed, the largest `SHOWN_THRESHOLDS` that are known."""
 SHOWN_THRESHOLDS = 3
@@ -43,7 +49,7 @@ class Severity:
     Example:
         >>> curve = Exceedance(
         ...     thresholds=np.array([1.0, 2.0]), p=np.array([2e-3, 1e-3]), low=np.array([1e-3, 4e-4]),
-        ...     high=np.array([4e-3, 2.5e-3]), confidence=0.95)
+        ...     high=np.array([4e-3, 2.5e-3]), cov=np.array([0.2, 0.3]), ess=np.array([25.0, 11.0]), confidence=0.95)
         >>> injuries = FailureExpectation(
         ...     value=3e-5, interval=(2e-5, 5e-5), confidence=0.95, cov=0.2, per_failure=0.015)
         >>> print(Severity(
@@ -55,8 +61,9 @@ class Severity:
     """
 
     curve: Exceedance
-    """P[failure in a collision with delta-v > v] over v [m/s], with a simultaneous band. Where all collisions are
-    failures, as by default, it is P[collision with delta-v > v]."""
+    """P[failure in a collision with delta-v > v] over v [m/s], with a simultaneous band of the sampling, and where the
+    base has refits with the intervals that its events allow. Where all collisions are failures, as by default, it is
+    P[collision with delta-v > v]."""
     largest_delta_v: float
     """Largest delta-v among the failures that were simulated again [m/s]."""
     injuries: FailureExpectation
@@ -72,24 +79,39 @@ class Severity:
 
     def __str__(self) -> str:
         """Return a few lines for people."""
-        curve = self.curve
-        shown = [
-            f"> {v:g} m/s {p:.1e} [{low:.1e}, {high:.1e}]"
-            for v, p, low, high in zip(curve.thresholds, curve.p, curve.low, curve.high, strict=True)
-            if v in SHOWN_DELTA_V and low > 0
+        curve, shown = self.curve, self._shown_thresholds
+        parts = [
+            f"> {curve.thresholds[i]:g} m/s {curve.p[i]:.1e} [{curve.low[i]:.1e}, {curve.high[i]:.1e}]" for i in shown
         ]
         low, high = self.injuries.interval
-        shown = [*shown[-SHOWN_THRESHOLDS:], f"at most {self.largest_delta_v:.2g} m/s"]
         lines = [
-            f"collisions with delta-v {', '.join(shown)}",
+            f"collisions with delta-v {', '.join([*parts, f'at most {self.largest_delta_v:.2g} m/s'])}",
+            *self._describe_base(shown),
             f"serious injuries (MAIS 3+) {self.injuries.value:.1e} per scenario [{low:.1e}, {high:.1e}], "
             f"{self.injuries.per_failure:.2g} per failure",
-            *("" if self.injuries_base is None else f"their {self.injuries_base}").splitlines()[:1],
+            *("" if self.injuries_base is None else f"  {self.injuries_base}").splitlines()[:1],
             f"from {self.n_replayed:,} of {self.n_failures:,} failing scenarios, simulated again",
         ]
         if self.unknown:
             lines[-1] += f"; {100 * self.unknown:.2g} % of p have no outcome and are left out"
         return "\n".join(lines)
+
+    @property
+    def _shown_thresholds(self) -> list[int]:
+        """Indices of the thresholds that are printed."""
+        known = [i for i, v in enumerate(self.curve.thresholds) if v in SHOWN_DELTA_V and self.curve.low[i] > 0]
+        return known[-SHOWN_THRESHOLDS:]
+
+    def _describe_base(self, shown: list[int]) -> list[str]:
+        """Return what the events behind the base allow for the curve, in words."""
+        base = self.curve.base
+        if base is None or not shown:
+            return []
+        parts = [
+            f"> {self.curve.thresholds[i]:g} m/s {format_ends(float(base.low[i]), float(base.high[i]))}" for i in shown
+        ]
+        behind = f"({base.fitted_to}, {base.n_refits} refits)"
+        return [f"  base distribution {100 * base.confidence:g} %  {', '.join(parts)} {behind}"]
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain lists and numbers for JSON."""
@@ -105,7 +127,9 @@ class Severity:
         }
 
     def plot(self, ax: Axes | None = None) -> Axes:
-        """Draw P[collision with delta-v > v] and its band over v; needs matplotlib.
+        """Draw P[collision with delta-v > v] over v with the bands of sampling and base distribution.
+
+        Needs matplotlib.
 
         Args:
             ax: Where to draw; None takes the current axes of pyplot.
@@ -127,7 +151,8 @@ def severity_curve(
     Args:
         problem: The problem that was estimated.
         estimate: Its estimate.
-        thresholds: Delta-v [m/s] at which the curve is wanted; every 0.5 m/s up to the largest by default.
+        thresholds: Delta-v [m/s] at which the curve is wanted; every 0.5 m/s up to the largest by default,
+            or every 0.1 m/s if that is at most 2.5 m/s.
         most: Drive at most so many failing points again, evenly spaced among all; None for all.
 
     Raises:
@@ -141,7 +166,8 @@ def severity_curve(
         >>> bool(severity.curve.p[0] > severity.curve.p[1]), 0.0005 < severity.injuries.per_failure < 0.1
         (True, True)
     """
-    severity = compute_severity(problem, estimate, replay_failures(problem, estimate, most), thresholds)
+    replayed, further = replay_failures(problem, estimate, most), replay_further_failures(problem, estimate, most)
+    severity = compute_severity(problem, estimate, replayed, thresholds, further)
     if severity is None:
         raise ValueError(f"No failure (f <= {estimate.gamma:g}) that was driven again is a collision.")
     return severity
@@ -152,28 +178,53 @@ def compute_severity(
     estimate: samplers.Estimate,
     replayed: ReplayedFailures,
     thresholds: ArrayLike | None = None,
+    further: ReplayedFailures | None = None,
 ) -> Severity | None:
     """Return the severity of failures that were driven again; None where none of them is a collision.
 
-    Arguments as of `severity_curve`.
+    Arguments as of `severity_curve`; and `further`, failures of the run under the mixture of the refits, if there is
+    one: they tell the severity under refits that the failures of the first run do not reach.
     """
-    failures = replayed.failures
-    delta_v, injuries = _severities(replayed, problem.world.measurement.collisions == "any")
+    failures, any_vehicle = replayed.failures, problem.world.measurement.collisions == "any"
+    delta_v, injuries = _severities(replayed, any_vehicle)
+    more_delta_v, more_injuries = _further_severities(further, any_vehicle)
     collided = np.isfinite(delta_v)
     if not collided.any():
         return None
     if thresholds is None:
-        thresholds = DELTA_V_STEP * np.arange(math.ceil(delta_v[collided].max() / DELTA_V_STEP) or 1)
+        largest = float(delta_v[collided].max())
+        step = DELTA_V_STEP if largest > FINE_UP_TO else FINE_STEP
+        thresholds = step * np.arange(math.ceil(largest / step) or 1)
     expected = expect_over_failures(failures, injuries, estimate.confidence)
     return Severity(
-        curve=compute_exceedance(estimate, failures, delta_v, thresholds),
+        curve=compute_exceedance(estimate, failures, delta_v, thresholds, more_delta_v),
         largest_delta_v=float(delta_v[collided].max()),
         injuries=expected,
-        injuries_base=expect_under_refits(estimate, failures, injuries, expected),
+        injuries_base=expect_under_refits(estimate, failures, injuries, expected, more_injuries),
         n_replayed=int(failures.has_outcome.sum()),
         n_failures=failures.total,
         unknown=float(failures.weights[~failures.has_outcome].sum() / failures.weights.sum()),
     )
+
+
+def _further_severities(
+    further: ReplayedFailures | None, any_vehicle: bool
+) -> tuple[FurtherFailures | None, FurtherFailures | None]:
+    """Return delta-v and injuries at the failing points of the further run; None where there is none."""
+    if further is None:
+        return None, None
+    delta_v, injuries = _severities(further, any_vehicle)
+    return FurtherFailures(further.failures, delta_v), FurtherFailures(further.failures, injuries)
+
+
+def format_ends(low: float, high: float) -> str:
+    """Return an interval of a probability, or what it is below.
+
+    Example:
+        >>> format_ends(1e-4, 2e-3), format_ends(0.0, 2e-3)
+        ('1.0e-04 to 2.0e-03', 'below 2.0e-03')
+    """
+    return f"{low:.1e} to {high:.1e}" if low > 0 else f"below {high:.1e}"
 
 
 def _severities(replayed: ReplayedFailures, any_vehicle: bool) -> tuple[FloatArray, FloatArray]:

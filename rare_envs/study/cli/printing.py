@@ -14,7 +14,7 @@ import samplers
 from rare_envs.exposure import describe_human_contacts
 from rare_envs.study.columns import MAX_SHOWN, format_value
 from rare_envs.study.crash_kinds import KIND_DESCRIPTIONS
-from rare_envs.study.rates.text import describe_parts, format_interval, format_rate, name_events
+from rare_envs.study.rates.text import describe_injuries, describe_parts, format_interval, format_rate, name_events
 from rare_envs.study.report import Report
 from samplers.problem import FloatArray
 from samplers.result import indent_lines
@@ -146,6 +146,8 @@ def _print_rate(console: Console, report: Report) -> None:
     events = f"{format_rate(rate.frequency.per_km)} {name_events(rate.scenario)} per km"
     parts = describe_parts(rate)
     console.print(f"  {'':<15} from {events}{f'; the uncertainty is {parts}' if parts else ''}")
+    if report.injury_rate is not None:
+        console.print(f"  {'':<15} {describe_injuries(report.injury_rate)}")
 
 
 def _print_kinds(console: Console, report: Report) -> None:

@@ -12,7 +12,7 @@ from rare_envs.exposure.human_benchmarks import CONTACTS_100CAR, REAR_END_CONTAC
 from rare_envs.exposure.rate import RateInterval
 from rare_envs.exposure.total_rate import TotalRate
 from rare_envs.files import replace_file
-from rare_envs.study.plots import HIT_COLOUR, LINE_COLOUR, ORDINARY_COLOUR
+from rare_envs.study.plots import HIT_COLOUR, LINE_COLOUR, ORDINARY_COLOUR, STYLE
 from rare_envs.study.rates.text import format_interval, format_rate, format_share, name_scenario, name_source
 
 DECADES_BELOW = 1e-3
@@ -27,7 +27,7 @@ def save_risk_plot(path: Path, ego: str, total: TotalRate) -> None:
         ego: The ego, for the title.
         total: The rates.
     """
-    with matplotlib.rc_context({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False}):
+    with matplotlib.rc_context(STYLE):
         height = 1.6 + 0.45 * max(len(total.rates) + 1, len(total.shares))
         figure = Figure(figsize=(12, height), layout="constrained")
         left, right = figure.subplots(1, 2, width_ratios=(1.5, 1.0))

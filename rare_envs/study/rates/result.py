@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
@@ -14,6 +14,7 @@ from rare_envs.exposure import HUMAN_BENCHMARKS, CollisionRate, TotalRate, descr
 from rare_envs.exposure.rate import MILLION_KM
 from rare_envs.study.rates.plots import save_risk_plot
 from rare_envs.study.rates.text import (
+    describe_injuries,
     describe_uncertainty,
     format_interval,
     format_rate,
@@ -96,6 +97,16 @@ class Risk:
         """Sum over the scenarios."""
         return TotalRate(tuple(each.rate for each in self.scenarios))
 
+    @cached_property
+    def injuries(self) -> TotalRate | None:
+        """Serious injuries (MAIS 3 or more), summed over the scenarios with collisions; None where there are none."""
+        rates = tuple(
+            replace(each.report.injury_rate, site_log_sd=each.rate.site_log_sd)
+            for each in self.scenarios
+            if each.report.injury_rate is not None
+        )
+        return TotalRate(rates) if rates else None
+
     @property
     def kinds(self) -> dict[str, float]:
         """Collisions per million km by kind of crash, the most frequent first."""
@@ -131,6 +142,7 @@ class Risk:
             *(f"  {each.describe()}" for each in self.scenarios),
             f"  per hour      {format_rate(total.per_hour)}  ({level}: {per_hour})",
             *self._describe_kinds(),
+            *([] if self.injuries is None else [f"  {describe_injuries(self.injuries)}"]),
         ]
         uncertainty = describe_uncertainty(total, self.recorded_events)
         lines += [uncertainty] if uncertainty else []
@@ -145,6 +157,7 @@ class Risk:
             **self.total.to_dict(),
             "scenarios": {each.name: each.to_dict() for each in self.scenarios},
             "kinds_per_million_km": self.kinds,
+            "injuries": None if self.injuries is None else self.injuries.to_dict(),
             "further_events": None if needed is None else needed._asdict(),
             "people": [benchmark.to_dict() for benchmark in HUMAN_BENCHMARKS],
             "doubtful": bool(self.warnings),

@@ -66,6 +66,14 @@ def describe_parts(rate: CollisionRate) -> str:
     return ", ".join(f"{format_share(share)} {PART_NOUNS[name]}" for name, share in parts if share > 0)
 
 
+def describe_injuries(rate: CollisionRate | TotalRate) -> str:
+    """Return a rate of serious injuries with its interval, in words."""
+    return (
+        f"serious injuries (MAIS 3+) {format_rate(rate.per_million_km)} per million km "
+        f"({100 * rate.confidence:g} %: {format_interval(rate.interval_per_million_km)})"
+    )
+
+
 def describe_sources(shares: tuple[VarianceShare, ...]) -> str:
     """Return the sources of the uncertainty of a total, the largest first.
 

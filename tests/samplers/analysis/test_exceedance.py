@@ -5,8 +5,12 @@ import pytest
 from scipy import stats
 
 import samplers
+from samplers.analysis.base_uncertainty import half_width
 from samplers.analysis.exceedance import compute_exceedance
+from samplers.analysis.failure_expectation import FurtherFailures
 from samplers.analysis.failure_weights import weigh_failures
+from tests.samplers.fitted_bases import FittedWithEnsemble, fitted, normal, resampled
+from tests.samplers.fitted_bases import run as run_fitted
 
 BETA = 2.5
 
@@ -90,3 +94,54 @@ def test_bad_input_is_refused():
             compute_exceedance(result, failures, values, [1.0])
     with pytest.raises(ValueError, match="Expected finite thresholds"):
         compute_exceedance(result, failures, failures.x[:, 0], [np.inf])
+
+
+def test_each_threshold_has_the_interval_that_refits_allow():
+    """P[x_1 > t] under N(m, s) is known: its spread over the refits is the exact one, the interval p exp(-+ t S)."""
+    base = fitted(resampled(400, 20))
+    result = run_fitted(base)
+    curve = curve_of(result, [3.5, 3.0])
+    for i, t in enumerate(curve.thresholds):
+        exact = np.std([stats.norm.logsf(t, refit.means[0], refit.sds[0]) for refit in base.refits], ddof=1)
+        assert curve.base.spread[i] == pytest.approx(exact, rel=0.1)
+        half = half_width(curve.base.spread[i], curve.cov[i], 0.95, 20, base.clusters)
+        ends = curve.p[i] * np.exp([-half, half])
+        assert (curve.base.low[i], curve.base.high[i]) == pytest.approx(tuple(ends))
+    whole = result.base_uncertainty
+    assert curve.base.spread[1] == pytest.approx(whole.spread)
+    assert (curve.base.low[1], curve.base.high[1]) == pytest.approx(whole.interval, rel=0.02)
+    assert json.loads(json.dumps(curve.to_dict(), allow_nan=False))["base"]["n_refits"] == 20
+
+
+def test_what_refits_do_not_determine_has_an_upper_end_only():
+    base = fitted([normal(mean) for mean in (-1.5, -1.0, 0.0, 0.0, 1.0, 1.5)])
+    result = run_fitted(base)
+    curve = curve_of(result, [3.0, 50.0])
+    assert curve.base.spread[0] > 2.0
+    assert curve.base.low.tolist() == [0.0, 0.0]
+    assert curve.p[0] < curve.base.high[0] == pytest.approx(result.base_uncertainty.bound, rel=0.02)
+    assert curve.base.high[1] == curve.base.high[0]
+    assert np.isnan(curve.base.spread[1])
+    assert curve_of(run(), [3.0]).base is None
+
+
+def test_the_further_run_tells_of_refits_that_the_first_does_not_reach():
+    base = fitted([normal(0.0)] * 6 + [normal(7.0, 0.2 + 0.01 * i) for i in range(4)], kind=FittedWithEnsemble)
+    result = run_fitted(base)
+    failures, more = weigh_failures(result), weigh_failures(result.ensemble_run)
+    further = FurtherFailures(more, more.x[:, 0])
+    curve = compute_exceedance(result, failures, failures.x[:, 0], [3.5], further)
+    exact = np.std([stats.norm.logsf(3.5, refit.means[0], refit.sds[0]) for refit in base.refits], ddof=1)
+    assert curve.base.spread[0] == pytest.approx(exact, rel=0.1)
+
+
+def test_the_picture_has_both_bands():
+    from matplotlib.figure import Figure
+
+    curve = curve_of(run_fitted(fitted(resampled(400, 20))), [3.0, 3.25, 3.5])
+    axes = curve.plot(Figure().subplots())
+    labels = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert labels == ["sampling, 95 % of all together", "base distribution, 95 % each"]
+    band = axes.collections[1].get_paths()[0].vertices
+    assert band[:, 1].max() == pytest.approx(curve.base.high.max())
+    assert band[:, 1].min() == pytest.approx(curve.base.low.min())

@@ -12,6 +12,7 @@ from samplers.analysis.refits import (
     check_refits,
     find_fitted_base,
     needs_ensemble_run,
+    refit_log_ratios,
     reweight_to_refits,
 )
 from samplers.analysis.reweighting import find_sibling
@@ -185,3 +186,28 @@ def test_siblings_by_name():
     assert result.under("i80").p == pytest.approx(stats.norm.sf(BETA - 0.1), rel=0.1)
     with pytest.raises(ValueError, match="Estimate again with the new base"):
         result.under(normal(12.0, 0.2))
+
+
+class CountedRefit:
+    """A refit that counts how often its density is asked for."""
+
+    def __init__(self, mean):
+        self.distribution, self.calls = normal(mean), 0
+
+    def log_prob(self, x):
+        self.calls += 1
+        return self.distribution.log_prob(x)
+
+
+def test_density_ratios_are_computed_once_for_a_run():
+    base = fitted([CountedRefit(mean) for mean in (-0.1, 0.0, 0.1)])
+    result = samplers.estimate(HalfSpace(base), seed=1, max_sim=3000)
+    for refit in base.refits:
+        refit.calls = 0
+    first = refit_log_ratios(result, base.refits)
+    assert refit_log_ratios(replace(result, ensemble_run=None), base.refits) is first
+    _ = result.base_uncertainty, reweight_to_refits(result, base.refits, np.ones((3, first.shape[1])))
+    assert [refit.calls for refit in base.refits] == [1, 1, 1]
+    sample = replace(result.sample)
+    assert refit_log_ratios(replace(result, sample=sample), base.refits) is not first
+    assert [refit.calls for refit in base.refits] == [2, 2, 2]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -124,7 +125,7 @@ def test_the_replay_is_shared_with_the_kinds_and_goes_to_print_and_json(
     assert isinstance(severity, Severity)
     saved = json.loads(json.dumps(report.to_dict()["severity"], allow_nan=False))
     assert saved["injuries"]["value"] == severity.injuries.value
-    assert saved["curve"]["delta_v"][:3] == [0.0, 0.5, 1.0]
+    assert saved["curve"]["delta_v"][:3] == [0.0, 0.1, 0.2]  # fine steps up to 2.5 m/s
     print_report(report)
     printed = capsys.readouterr().out
     for line in str(severity).splitlines():
@@ -160,28 +161,59 @@ def test_bad_input_is_refused(problem: rare_envs.DrivingProblem, plain: samplers
         severity_curve(problem_that_varies, plain)
 
 
-def test_injuries_have_the_interval_of_a_fitted_base() -> None:
-    """Moved by refits as p is: wider than that of the sampling, and printed."""
+def moved_base(sd: float, number: int = 20) -> FittedDistribution:
+    """Return the car-following base with plain gaps and refits whose means are moved by as many standard errors."""
     plain_base = rare_envs.DrivingProblem(FOLLOWING, base="us101-gap").base.distribution  # type: ignore[attr-defined]
-    means = [each.name.startswith("mean") for each in plain_base.parameters()]  # type: ignore[attr-defined]
+    parameters = plain_base.parameters()  # type: ignore[attr-defined]
+    means = [each.name.startswith("mean") for each in parameters]
     rng = np.random.default_rng(0)
-    values, changes = (
-        np.array([getattr(each, name) for each in plain_base.parameters()])  # type: ignore[attr-defined]
-        for name in ("value", "change")
-    )
+    values, changes = (np.array([getattr(each, name) for each in parameters]) for name in ("value", "change"))
     refits = tuple(
-        plain_base.with_parameters(values + 0.1 * rng.standard_normal(len(values)) * changes * means)  # type: ignore[attr-defined]
-        for _ in range(20)
+        plain_base.with_parameters(values + sd * rng.standard_normal(len(values)) * changes * means)  # type: ignore[attr-defined]
+        for _ in range(number)
     )
-    base = FittedDistribution(
-        distribution=plain_base, refits=refits, events=EventCounts(used=(40,), clusters=12), family="3 components"
-    )
-    problem = rare_envs.DrivingProblem(FOLLOWING, base=base)
-    severity = severity_curve(problem, samplers.estimate(problem, seed=0, max_sim=2500))
+    events = EventCounts(used=(40,), clusters=12)
+    return FittedDistribution(distribution=plain_base, refits=refits, events=events, family="3 components")
+
+
+def test_curve_and_injuries_have_the_intervals_of_a_fitted_base() -> None:
+    """Moved by refits as p is: wider than those of the sampling, printed and saved."""
+    problem = rare_envs.DrivingProblem(FOLLOWING, base=moved_base(0.1))
+    estimate = samplers.estimate(problem, seed=0, max_sim=2500)
+    severity = severity_curve(problem, estimate, thresholds=[-1.0, 1.0])
     wide = severity.injuries_base
     assert wide is not None
     assert wide.interval is not None
     assert wide.p == severity.injuries.value
     assert wide.interval[0] < severity.injuries.interval[0] < severity.injuries.interval[1] < wide.interval[1]
-    assert "their base distribution 95 %" in str(severity)
-    assert severity.to_dict()["injuries_base"]["spread"] == wide.spread
+    curve, band = severity.curve, severity.curve.base
+    assert band is not None
+    assert (band.low < curve.low).all() and (curve.high < band.high).all()
+    whole = estimate.base_uncertainty
+    assert whole is not None and whole.interval is not None  # every failure is a collision
+    assert (band.low[0], band.high[0]) == pytest.approx(whole.interval, rel=0.02)
+    text = str(severity)
+    assert (
+        f"base distribution 95 %  > 1 m/s {band.low[1]:.1e} to {band.high[1]:.1e} (40 events of 12 scenes, 20 refits)"
+        in text
+    )
+    assert text.count("base distribution 95 %") == 2
+    saved = json.loads(json.dumps(severity.to_dict(), allow_nan=False))
+    assert saved["injuries_base"]["spread"] == wide.spread
+    assert saved["curve"]["base"]["low"] == band.low.tolist()
+
+
+def test_severity_under_a_refit_is_that_of_the_failures_reweighted_to_it() -> None:
+    """Spread of log P[delta-v > 1 m/s] over the refits, from `reweight` of an estimate in which only these fail."""
+    base = moved_base(0.1, number=6)
+    problem = rare_envs.DrivingProblem(FOLLOWING, base=base)
+    estimate = samplers.estimate(problem, seed=0, max_sim=2500)
+    severity = severity_curve(problem, estimate, thresholds=[1.0])
+    sample = estimate.sample
+    assert sample is not None and severity.curve.base is not None
+    worst = problem.crashes(sample.x).delta_v.amax(dim=1).numpy()
+    f = sample.f.copy()
+    f[np.flatnonzero(f <= 0)] = np.where(worst > 1.0, -1.0, 5.0)
+    harder = replace(estimate, p=float(severity.curve.p[0]), sample=replace(sample, f=f, x=sample.x[worst > 1.0]))
+    logs = [math.log(harder.reweight(refit).p) for refit in base.refits]
+    assert severity.curve.base.spread[0] == pytest.approx(np.std(logs, ddof=1), rel=1e-6)

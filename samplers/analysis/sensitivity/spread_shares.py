@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from samplers.analysis.base import WeightedEstimate
-from samplers.analysis.parameter_scores import ParametricBase, refit_displacements
 from samplers.analysis.refits import find_fitted_base, reweight_to_refits
+from samplers.analysis.sensitivity.parameter_scores import ParametricBase, refit_displacements
 from samplers.problem import FloatArray
 
 MIN_ALIGNED_REFITS = 10
@@ -60,7 +60,7 @@ def share_spread(
     if len(used) < MIN_ALIGNED_REFITS:
         reason = f"only {counts[0]} of {counts[1]} refits have the parameters of the base, so that no share is known"
         return SpreadShares(reason=reason, n_refits=counts)
-    log_p = reweight_to_refits(estimate, [fitted.refits[number] for number in used]).log_p[0]
+    log_p = reweight_to_refits(estimate, fitted.refits).log_p[0, used]
     parts = derivatives * (displacements - displacements.mean(axis=0))
     linear = parts.sum(axis=1)
     variance = float(linear @ linear)

@@ -1,4 +1,4 @@
-"""Sensitivities of a driving problem: on the command line, in JSON and as a picture."""
+"""Pictures of sensitivity and severity; sensitivities of a driving problem on the command line and in JSON."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from typer.testing import CliRunner
 
 import rare_envs
 import samplers
-from rare_envs.study.analysis.sensitivity_plot import save_sensitivity
+from rare_envs.study import run_into
+from rare_envs.study.analysis.pictures import save_sensitivity, save_severity
 from rare_envs.study.cli.app import app
 from rare_envs.study.question import Question, prepare
 from rare_envs.study.report import Report
@@ -23,6 +24,15 @@ def test_a_picture_is_written(tmp_path: Path) -> None:
     found = samplers.estimate(problem, seed=0, max_sim=2000).sensitivity(problem.space.names, problem.space.sizes)
     save_sensitivity(tmp_path / "bars.png", found)
     assert (tmp_path / "bars.png").read_bytes()[1:4] == b"PNG"
+
+
+def test_a_run_with_collisions_has_a_picture_of_their_severity(tmp_path: Path) -> None:
+    report = run_into(tmp_path / "run", prepare(Question(env_id=FOLLOWING, base="us101-gap", max_sim=1500)))
+    assert report.kinds.severity is not None
+    save_severity(tmp_path / "again.png", report.kinds.severity)
+    assert (tmp_path / "run" / "severity.png").read_bytes() == (tmp_path / "again.png").read_bytes()
+    run_into(tmp_path / "run", prepare(Question(env_id=FOLLOWING, method="mc", max_sim=50)))
+    assert not (tmp_path / "run" / "severity.png").exists()
 
 
 def test_the_command_shows_it_and_writes_it(tmp_path: Path) -> None:

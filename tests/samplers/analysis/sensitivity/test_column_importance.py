@@ -5,9 +5,9 @@ import pytest
 from scipy import stats
 
 import samplers
-from samplers.analysis.column_importance import relative_entropies
 from samplers.analysis.failure_weights import WeightedFailures
-from tests.samplers.analysis.parametric_normal import ALPHA, BASE, BETA, HAZARD, ParametricNormal, run
+from samplers.analysis.sensitivity.column_importance import relative_entropies
+from tests.samplers.analysis.sensitivity.parametric_normal import ALPHA, BASE, BETA, HAZARD, ParametricNormal, run
 
 
 @pytest.fixture(scope="module")

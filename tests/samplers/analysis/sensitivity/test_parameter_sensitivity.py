@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import samplers
-from tests.samplers.analysis.parametric_normal import BASE, ParametricNormal, fitted, run
+from tests.samplers.analysis.sensitivity.parametric_normal import BASE, ParametricNormal, fitted, run
 
 
 @pytest.fixture(scope="module")

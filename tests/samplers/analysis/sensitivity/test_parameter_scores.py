@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import samplers
-from samplers.analysis.parameter_scores import parameter_scores, refit_displacements
-from tests.samplers.analysis.parametric_normal import ALPHA, BASE, BETA, HAZARD, fitted, run
+from samplers.analysis.sensitivity.parameter_scores import parameter_scores, refit_displacements
+from tests.samplers.analysis.sensitivity.parametric_normal import ALPHA, BASE, BETA, HAZARD, fitted, run
 
 
 @pytest.fixture(scope="module")

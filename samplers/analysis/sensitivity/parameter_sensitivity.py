@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from samplers.analysis.base import WeightedEstimate
-from samplers.analysis.column_importance import ColumnImportance, rank_columns
 from samplers.analysis.failure_weights import mean_over_failures, weigh_failures
-from samplers.analysis.parameter_scores import ParametricBase, parameter_scores
 from samplers.analysis.reweighting import require_base
-from samplers.analysis.spread_shares import JOINT_GROUP, share_spread, sum_by_owner
+from samplers.analysis.sensitivity.column_importance import ColumnImportance, rank_columns
+from samplers.analysis.sensitivity.parameter_scores import ParametricBase, parameter_scores
+from samplers.analysis.sensitivity.spread_shares import JOINT_GROUP, share_spread, sum_by_owner
 from samplers.serialization import to_json_value
 
 if TYPE_CHECKING:

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from tests.samplers.analysis.parametric_normal import BASE, BETA, HAZARD, ParametricNormal, fitted, run
+from tests.samplers.analysis.sensitivity.parametric_normal import BASE, BETA, HAZARD, ParametricNormal, fitted, run
 
 
 @pytest.fixture(scope="module")
