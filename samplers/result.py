@@ -15,7 +15,7 @@ from samplers.analysis.base_uncertainty import BaseUncertainty, compute_base_unc
 from samplers.analysis.curve import Curve, compute_curve
 from samplers.analysis.failure_modes import Share, split_by_kind
 from samplers.analysis.reweighting import HasLogProb, Reweighted, find_sibling, reweight_estimate
-from samplers.analysis.sensitivity import Sensitivity, compute_sensitivity
+from samplers.analysis.sensitivity.parameter_sensitivity import Sensitivity, compute_sensitivity
 from samplers.method import Stepping
 from samplers.problem import Distribution, FloatArray
 from samplers.sample import Sample

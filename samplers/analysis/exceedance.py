@@ -32,6 +32,12 @@ class RefitBand:
     """Intervals of an exceedance curve that the events behind a fitted base allow, each threshold by itself.
 
     Each is that of `BaseUncertainty`; fields of shape (k,) belong to the thresholds of the curve.
+
+    Example:
+        >>> ends = {"low": np.array([1e-4, 0.0]), "high": np.array([4e-3, 4e-3]), "spread": np.array([0.9, np.nan])}
+        >>> band = RefitBand(**ends, confidence=0.95, n_refits=30, fitted_to="40 events", family="1 component")
+        >>> band.to_dict()["spread"]
+        [0.9, None]
     """
 
     low: FloatArray

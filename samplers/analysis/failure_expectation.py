@@ -97,7 +97,16 @@ def expect_over_failures(
 
 
 class FurtherFailures(NamedTuple):
-    """Failing points of the further run under the mixture of the refits, with a quantity at them."""
+    """Failing points of the further run under the mixture of the refits, with a quantity at them.
+
+    Example:
+        >>> import samplers
+        >>> from samplers.analysis.failure_weights import weigh_failures
+        >>> problem = samplers.FunctionProblem(lambda x: 1.0 - x[:, 0], dim=2)
+        >>> failures = weigh_failures(samplers.estimate(problem, "mc", seed=0, max_sim=1000))
+        >>> bool((FurtherFailures(failures, failures.x[:, 0]).values >= 1.0).all())
+        True
+    """
 
     failures: WeightedFailures
     values: FloatArray
