@@ -73,13 +73,13 @@ class Exceedance(ProbabilityCurve):
         >>> import samplers
         >>> from samplers.analysis import weigh_failures
         >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
-        >>> result = samplers.estimate(problem, seed=0, max_sim=4000)
+        >>> result = samplers.estimate(problem, "mc", seed=0, max_sim=100_000)
         >>> failures = weigh_failures(result)
         >>> curve = compute_exceedance(result, failures, failures.x[:, 0], [3.0, 3.5])  # Phi(-3), Phi(-3.5)
         >>> print(curve)
                    t P[failure, v > t]   95 % band
-                   3  1.361e-03   [1.316e-03, 1.407e-03]
-                 3.5  2.264e-04   [1.962e-04, 2.612e-04]
+                  3  1.410e-03   [1.162e-03, 1.695e-03]
+                3.5  2.700e-04   [1.686e-04, 4.090e-04]
     """
 
     thresholds: FloatArray
