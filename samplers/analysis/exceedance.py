@@ -78,8 +78,8 @@ class Exceedance(ProbabilityCurve):
         >>> curve = compute_exceedance(result, failures, failures.x[:, 0], [3.0, 3.5])  # Phi(-3), Phi(-3.5)
         >>> print(curve)
                    t P[failure, v > t]   95 % band
-                  3  1.410e-03   [1.162e-03, 1.695e-03]
-                3.5  2.700e-04   [1.686e-04, 4.090e-04]
+                   3  1.410e-03   [1.162e-03, 1.695e-03]
+                 3.5  2.700e-04   [1.686e-04, 4.090e-04]
     """
 
     thresholds: FloatArray
