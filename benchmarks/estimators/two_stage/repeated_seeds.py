@@ -228,7 +228,8 @@ def main(
     rows.append(summarise_runs("all", pooled))
     print(describe_row(rows[-1]))
     if json_path is not None:
-        command = " ".join(["python -m benchmarks.estimators.two_stage.repeated_seeds", *sys.argv[1:]])
+        names = [Path(word).name if word.endswith((".py", ".jsonl")) else word for word in sys.argv[1:]]
+        command = " ".join(["python -m benchmarks.estimators.two_stage.repeated_seeds", *names])
         content = {
             "about": about(command=command, method=method, max_sim=max_sim),
             "rows": [asdict(row) for row in rows],

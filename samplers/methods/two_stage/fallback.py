@@ -30,14 +30,14 @@ def meets_too_few(
 
 
 def misses_regions(draws: Draws, typical: FloatArray, settings: FallbackSettings = DEFAULT_SETTINGS.fallback) -> bool:
-    """Return whether a proposal is far from most of the regions found, and its draws are not so good that it may be.
+    """Return whether a proposal is far from most of the regions found.
 
     Args:
         draws: Of the last round.
         typical: Weights of typical points of the regions as draws of the proposal, shape (m,).
-        settings: Limits.
+        settings: The limit.
     """
-    return draws.ess < settings.good_rate * draws.n and float(np.median(typical)) > settings.max_typical * draws.p
+    return float(np.median(typical)) > settings.max_typical * draws.p
 
 
 def reconcile(subset_outcome: Outcome, earlier: Outcome) -> Outcome:

@@ -23,10 +23,10 @@ class TwoStage(Method):
        if the point half way between them fails.
     2. *Refinement* (`refinement.py`, `candidates.py`): each region is described by Gaussians, by a hyperplane from
        linear regression of f where f is linear, by half-spaces through the edge of its failures and by a radius.
-       Three rounds of draws follow, each from a mixture of these. Its weights minimise the estimated variance
-       (`mixture_weights.py`), with lower limits for the base distribution, for tempered Gaussians (which bound
-       weights where a Gaussian is a bad description) and for each region. In up to 40 dimensions a classifier then
-       screens the last mixture (`screening.py`).
+       Three rounds of draws follow, each from a mixture of these, and up to two more while a draw is worth less than
+       a tenth of a failure. The weights minimise the estimated variance (`mixture_weights.py`), with lower limits for
+       the base distribution, for tempered Gaussians (which bound weights where a Gaussian is a bad description) and
+       for each region. In up to 40 dimensions a classifier then screens the last mixture (`screening.py`).
     3. *Estimate* (`stratified.py`): fresh draws from the last mixture, stratified by component, and nothing else.
 
     Given the first two stages p-hat is unbiased, with two exceptions. Behind a screen, weights rest on its acceptance
@@ -47,11 +47,11 @@ class TwoStage(Method):
     bound where very few do; p-hat exp(q s) with s^2 = log(1 + c.o.v.^2). The upper end is at least Hall's, which
     knows the skewness of the weights, and holds the share M of p in regions that were not found:
 
-        upper end = 97.5 % point of  p-hat exp(s Z) / (1 - M),    Z ~ N(0, 1),   M ~ Beta(1/4, nu)
+        upper end = 97.5 % point of  p-hat exp(s Z) / (1 - M),    Z ~ N(0, 1),   M ~ Beta(1/10, nu)
         nu = distinct base draws whose line or path of levels failed + max(ESS, hits / 4) of the wide draws
 
     nu independent lineages all led to known regions; a region of share M would be missed by one with probability
-    1 - M. The 97.5 % point of M is 0.38 for nu = 4, 0.067 for 25, 0.009 for 200. The c.o.v. is that of the sampling
+    1 - M. The 97.5 % point of M is 0.24 for nu = 4, 0.04 for 25, 0.005 for 200. The c.o.v. is that of the sampling
     alone.
 
     *Warnings* (`diagnostics.py`): uneven weights, base draws that fail more often than p allows, rounds that
@@ -127,9 +127,12 @@ def run_two_stage(
             return (yield from stages.run_monte_carlo(context, state))
         refinement, proposal = stages.begin_refinement(context, state, exploration)
         room = context.left
-        for number in range(1, len(settings.refinement.round_shares) + 1):
-            state, refinement, proposal = yield from stages.refine(context, state, refinement, number, room, proposal)
-            if stages.gives_up(context, state, refinement, proposal, number):
+        number, final = 0, False
+        while not final:
+            number += 1
+            steps = stages.refine(context, state, refinement, number, room, proposal)
+            state, refinement, proposal, final = yield from steps
+            if stages.gives_up(context, state, refinement, proposal, number, final=final):
                 return (yield from stages.fall_back(context, state, exploration.levels))
     except Interrupted:
         return stages.estimate_early(context, state)

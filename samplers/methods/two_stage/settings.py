@@ -165,6 +165,10 @@ class RefinementSettings:
 
     round_shares: tuple[float, ...] = (0.09, 0.12, 0.14)
     """Share of what the exploration leaves that each round draws; the rest is for the estimate."""
+    further_shares: tuple[float, ...] = (0.14, 0.14)
+    """The same of further rounds, while the last one is worth less than `good_rate`."""
+    good_rate: float = 0.1
+    """Independent failures for each draw of a round with which its proposal describes the failures."""
     base_share: float = 0.05
     """Least share of base draws: no weight exceeds 20."""
     noisy_base_share: float = 0.1
@@ -236,10 +240,9 @@ class FallbackSettings:
     relative_rate: float = 0.04
     """The same for the last round, times the levels: subset simulation has an independent failure for each 100 levels
     simulations, and the weights that were met are about four times flatter than all of them."""
-    good_rate: float = 0.1
-    """From this rate of the last round on, `max_typical` does not apply."""
     max_typical: float = 30.0
-    """How many times p a typical point of most regions may weigh as a draw: 1 to 3 is usual, 17 was seen to do."""
+    """How many times p a typical point of most regions may weigh as a draw: 1 to 3 is usual, 17 was seen to do.
+    From `RefinementSettings.good_rate` on it does not apply."""
     chain_points: float = 30.0
     """Points of a level at p0 = 0.1 for one that is independent: (1 - p0) / p0, and correlation along the chains."""
     level_share: float = 0.9

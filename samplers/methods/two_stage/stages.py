@@ -164,8 +164,8 @@ def draw_round(
 
 def refine(
     context: RunContext, state: RunState, refinement: RefinementState, number: int, room: int, proposal: MixtureProposal
-) -> SimulationSteps[tuple[RunState, RefinementState, MixtureProposal]]:
-    """Run one round of refinement and build the proposal that follows from it.
+) -> SimulationSteps[tuple[RunState, RefinementState, MixtureProposal, bool]]:
+    """Run one round of refinement; return also the proposal that follows from it, and whether that is the last one.
 
     Args:
         context: What is fixed for the run.
@@ -176,29 +176,36 @@ def refine(
         proposal: What to draw from.
     """
     settings = context.settings.refinement
-    rounds = settings.round_shares
-    n = int(rounds[number - 1] * room)
+    shares = (*settings.round_shares, *settings.further_shares)
+    n = int(shares[number - 1] * room)
     if n > 0:
         state, refinement = yield from draw_round(context, state, refinement, proposal, n)
-    final = number == len(rounds)
+    enough = refinement.noisy or not state.rounds or state.rounds[-1].ess >= settings.good_rate * state.rounds[-1].n
+    final = number == len(shares) or (enough and number >= len(settings.round_shares))
     proposal = build_proposal(refinement, state.history, settings, context.rng, context.settings.mixture, final=final)
-    return state, refinement, proposal
+    return state, refinement, proposal, final
 
 
 def gives_up(
-    context: RunContext, state: RunState, refinement: RefinementState, proposal: MixtureProposal, number: int
+    context: RunContext,
+    state: RunState,
+    refinement: RefinementState,
+    proposal: MixtureProposal,
+    number: int,
+    *,
+    final: bool,
 ) -> bool:
-    """Return whether subset simulation does better with the rest, after a round of draws."""
-    settings, rounds = context.settings.fallback, context.settings.refinement.round_shares
+    """Return whether subset simulation does better with the rest, after a round of draws; `final`: after the last."""
+    settings = context.settings.fallback
     if context.left_at_all < settings.min_fallback_budget or not state.rounds:
         return False
-    last, final = state.rounds[-1], number == len(rounds)
-    if refinement.noisy and not final:  # a tempered mixture meets few failures at first, but does not miss any
-        return False
+    if refinement.noisy and not (final and context.noise_marginalised):
+        return False  # a tempered mixture meets few failures but does not miss any: nothing else is better
+    last = state.rounds[-1]
     if fallback.meets_too_few(last, number, refinement.exploration.levels, settings):
         return True
-    known = final and not refinement.noisy
-    return known and fallback.misses_regions(last, typical_weights(refinement, proposal), settings)
+    doubtful = final and not refinement.noisy and last.ess < context.settings.refinement.good_rate * last.n
+    return doubtful and fallback.misses_regions(last, typical_weights(refinement, proposal), settings)
 
 
 def fall_back(context: RunContext, state: RunState, levels: int) -> Steps:

@@ -37,9 +37,9 @@ def test_a_proposal_is_given_up_that_meets_failures_too_seldom(number, levels, e
     assert not meets_too_few(worth(enough), number, levels)
 
 
-@pytest.mark.parametrize(("failing", "typical", "misses"), [(99, 29.0, False), (99, 31.0, True), (100, 31.0, False)])
-def test_a_proposal_is_given_up_that_is_far_from_most_regions(failing, typical, misses):
-    draws = worth(failing)
+@pytest.mark.parametrize(("typical", "misses"), [(29.0, False), (31.0, True)])
+def test_a_proposal_is_given_up_that_is_far_from_most_regions(typical, misses):
+    draws = worth(99)
     assert misses_regions(draws, typical * draws.p * np.ones(1)) is misses
     assert misses_regions(draws, np.array([0.0, 1e9, typical * draws.p])) is misses  # the median counts
 

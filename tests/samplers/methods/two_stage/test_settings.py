@@ -23,7 +23,7 @@ RUNS = {
     "one region, screened": (parabola().problem, 6000, None),
     "two regions": (samplers.FunctionProblem(lambda u: 3.0 - np.abs(u[:, 0]), 5), 2000, None),
     "many dimensions": (half_space(60).problem, 2000, None),
-    "many faces": (samplers.FunctionProblem(lambda u: 3.4 - np.abs(u).max(axis=1), 6), 2000, None),
+    "many faces": (samplers.FunctionProblem(lambda u: 4.3 - np.abs(u).max(axis=1), 12), 6000, None),
     "all around": (shell().problem, 6000, None),
     "noise": (samplers.FunctionProblem(lambda u: 3.0 - u[:, 0] + NOISE.normal(size=len(u)), 2), 2000, None),
     "subset simulation instead": (samplers.FunctionProblem(lambda u: 4.5 - np.abs(u).max(axis=1), 20), 6000, 0.9),
@@ -89,6 +89,7 @@ def test_lower_limits_leave_room_for_what_is_best():
 def test_half_of_what_the_exploration_may_leave_is_for_the_estimate(budget):
     left = budget - Sizes.within(budget).limit
     assert 0.5 * left < left * (1 - sum(REFINEMENT.round_shares))
+    assert left / 3 < left * (1 - sum(REFINEMENT.round_shares) - sum(REFINEMENT.further_shares))
 
 
 def test_settings_cannot_be_changed_but_replaced():

@@ -1,11 +1,13 @@
 """Stages as functions from state to state, on a half-space in three dimensions."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy import stats
 
+from samplers.importance.draws import Draws
 from samplers.method import Goal, Interrupted
 from samplers.methods.two_stage import stages
 from samplers.methods.two_stage.candidates import build_proposal
@@ -42,9 +44,11 @@ def refined(drive, **kwargs):
     """Return the run after all rounds."""
     context, state, refinement, proposal, levels = explored(drive, **kwargs)
     room = context.left
-    for number in range(1, len(context.settings.refinement.round_shares) + 1):
+    number, final = 0, False
+    while not final:
+        number += 1
         steps = stages.refine(context, state, refinement, number, room, proposal)
-        state, refinement, proposal = drive(steps, PROBLEM).value
+        state, refinement, proposal, final = drive(steps, PROBLEM).value
     return context, state, refinement, proposal, levels
 
 
@@ -75,7 +79,9 @@ def test_an_open_end_only_where_nothing_but_a_target_is_given():
 def test_a_round_spends_its_share_of_what_the_exploration_left(drive):
     context, state, refinement, proposal, _ = explored(drive)
     room, spent = context.left, context.simulator.n_sim
-    after, learned, following = drive(stages.refine(context, state, refinement, 1, room, proposal), PROBLEM).value
+    steps = stages.refine(context, state, refinement, 1, room, proposal)
+    after, learned, following, final = drive(steps, PROBLEM).value
+    assert not final
     n = int(DEFAULT_SETTINGS.refinement.round_shares[0] * room)
     assert context.simulator.n_sim == spent + n == sum(level.n_sim for level in after.trace)
     assert after.history.n == state.history.n + n
@@ -106,9 +112,28 @@ def test_an_interrupted_step_leaves_the_state_and_its_simulations_are_counted(dr
     assert math.log(outcome.p / P) == pytest.approx(0, abs=4 * outcome.cov)
 
 
+@pytest.mark.parametrize(("rate", "noisy", "rounds"), [(0.05, False, 5), (0.2, False, 3), (0.05, True, 3)])
+def test_rounds_go_on_while_their_draws_are_worth_little(drive, rate, noisy, rounds):
+    """A third round whose draws are worth so many failures is followed by another, or not; a fifth is the last."""
+    context, state, refinement, proposal, _ = explored(drive)
+    refinement = replace(refinement, exploration=refinement.exploration._replace(noisy=noisy))
+    n = 1000
+    worth = Draws(n, np.zeros(int(rate * n)), np.zeros(int(rate * n)))
+    ends = []
+    for number in range(1, 6):
+        before = replace(state, rounds=(worth,) * (number - 1))
+        steps = stages.refine(context, before, refinement, number, 0, proposal)  # no draws: it looks at those before
+        with pytest.raises(StopIteration) as end:
+            next(steps)
+        ends.append(end.value.value[-1])
+    known = 1 + ends[1:].index(True) + 1
+    assert known == max(rounds, 3)
+    assert ends[4]
+
+
 def test_the_estimate_rests_on_its_own_draws(drive):
     context, state, refinement, proposal, _ = refined(drive)
-    assert not stages.gives_up(context, state, refinement, proposal, 3)
+    assert not stages.gives_up(context, state, refinement, proposal, 3, final=True)
     left = context.left
     outcome = drive(stages.estimate_afresh(context, state, refinement, proposal), PROBLEM).value
     assert context.simulator.n_sim == BUDGET == sum(level.n_sim for level in outcome.trace)
@@ -169,4 +194,4 @@ def test_subset_simulation_takes_what_is_left_in_all_coordinates(drive):
 
 def test_without_rounds_or_budget_the_proposal_serves(drive):
     context, state, refinement, proposal, _ = explored(drive)
-    assert not stages.gives_up(context, state, refinement, proposal, 1)
+    assert not stages.gives_up(context, state, refinement, proposal, 1, final=False)
