@@ -11,13 +11,12 @@ import math
 from dataclasses import dataclass, field, fields, replace
 from statistics import NormalDist
 from typing import Any, NamedTuple
-from urllib.parse import parse_qsl
 
 import torch
 from torch import Tensor
 
+from agents.settings import read_settings
 from rare_envs.egos.policy import as_driver
-from rare_envs.plugins import did_you_mean
 from rare_envs.sensors.perception import perceive_traffic
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.rollout import Driver, StochasticDriver
@@ -97,16 +96,7 @@ class Stack:
         Raises:
             ValueError: If a name is unknown or a value is no number.
         """
-        known = [each.name for each in fields(cls)]
-        given = {}
-        for name, value in parse_qsl(query, keep_blank_values=True):
-            if name not in known:
-                raise ValueError(f"Unknown setting {name!r}{did_you_mean(name, known)}; expected {', '.join(known)}.")
-            try:
-                given[name] = float(value)
-            except ValueError as error:
-                raise ValueError(f"Expected {name} to be a number, got {value!r}.") from error
-        return cls(**given)
+        return cls(**read_settings(cls, query))
 
 
 def ticks_per_plan(stack: Stack, world: World) -> int:

@@ -13,7 +13,9 @@ from agents.learned.driver import LearnedDriver, LearnedEgo
 from agents.names import HUMAN, RULE_BASED, SHIPPED_DRIVERS, SHIPPED_EGOS, VISION
 from agents.python_function import call_factory
 from agents.sb3.saved_ego import load_saved_ego
+from agents.settings import read_settings
 from agents.vision.checkpoint import holds_vision, load_vision
+from rare_envs.control.idm import IDM
 from rare_envs.egos.errors import EgoGone
 from rare_envs.plugins import did_you_mean
 
@@ -67,10 +69,11 @@ def load_ego(
     """Load an ego by its name, file, address or function.
 
     Args:
-        spec: "idm"; "human", an attentive human driver; "imitation", the shipped ego with lidar; "vision", PilotNet on
-            the front camera; "mgail", "gail" or "bc", drivers of the traffic, which as egos act by their mean actions;
-            a path to a `.safetensors` with one of these kinds; a path to a `.zip` saved by Stable-Baselines3; a path to
-            an `.onnx` file (see
+        spec: "idm"; "human", an attentive human driver; either with other parameters as "idm?time_headway=2&exponent=2"
+            (fields of `rare_envs.IDM` and `rare_envs.control.human_driver.HumanDriverModel`); "imitation", the shipped
+            ego with lidar; "vision", PilotNet on the front camera; "mgail", "gail" or "bc", drivers of the traffic,
+            which as egos act by their mean actions; a path to a `.safetensors` with one of these kinds; a path to a
+            `.zip` saved by Stable-Baselines3; a path to an `.onnx` file (see
             `agents.onnx.ego.OnnxEgo` for its form); `module:function`, a function without arguments that returns an ego
             (modules in the working directory are found); `tcp://host:port` for an ego in another program
             (docs/remote.md); or `process:EGO`, any of these files and functions in a process of its own, which is ended
@@ -83,10 +86,10 @@ def load_ego(
         stats: File of the `VecNormalize` statistics of a `.zip`; None to look for one beside it.
 
     Returns:
-        "idm" and "human" as they stand, a `LearnedEgo`, else an object with `predict`. A `.zip` gives a `SavedEgo`,
-        whose `observation_space` and `action_space` are those of the policy. `VecNormalize` statistics
-        saved beside a `.zip` are applied to its observations: `<name>_vecnormalize.pkl`, `vecnormalize.pkl`, the same
-        with `vec_normalize`, or where RL Zoo and Stable-Baselines3's checkpoints put them.
+        "idm" and "human" as they stand, with settings an `IDM` or a `HumanEgo`; a `LearnedEgo`, else an object with
+        `predict`. A `.zip` gives a `SavedEgo`, whose `observation_space` and `action_space` are those of the policy.
+        `VecNormalize` statistics saved beside a `.zip` are applied to its observations: `<name>_vecnormalize.pkl`,
+        `vecnormalize.pkl`, the same with `vec_normalize`, or where RL Zoo and Stable-Baselines3's checkpoints put them.
 
     Raises:
         FileNotFoundError: The file does not exist.
@@ -134,7 +137,23 @@ def load_ego(
         return load_vision(text)
     if kind == "learned":
         return LearnedEgo(cast(LearnedDriver, load_driver(text)))
-    return cast(Ego, call_factory(text)) if kind == "function" else text
+    return cast(Ego, call_factory(text)) if kind == "function" else _load_rule_based(text)
+
+
+def _load_rule_based(text: str) -> Any:
+    """Return a name as it stands; with settings behind it, the driver that has them."""
+    name, mark, query = text.partition("?")
+    if not mark:
+        return text
+    try:
+        if name == HUMAN:
+            from rare_envs.control.human_driver import HumanDriverModel
+            from rare_envs.egos.human import HumanEgo
+
+            return HumanEgo(HumanDriverModel(**read_settings(HumanDriverModel, query)))
+        return IDM(**read_settings(IDM, query))
+    except ValueError as error:
+        raise ValueError(f"The ego {text!r}: {error}") from None
 
 
 def _load_elsewhere(kind: EgoKind, text: str, algo: str | None, trust: bool, stats: str | Path | None) -> Ego:
@@ -170,7 +189,7 @@ def find_ego_kind(spec: str) -> EgoKind:
         >>> [find_ego_kind(spec) for spec in ("idm", "bc", "tcp://host:5555", "noisy:idm", "ego.onnx", "file:make")]
         ['rule', 'learned', 'remote', 'noisy', 'onnx', 'function']
     """
-    if spec in (RULE_BASED, HUMAN):
+    if spec.partition("?")[0] in (RULE_BASED, HUMAN):
         return "rule"
     if spec == VISION or (spec.endswith(SUFFIX) and holds_vision(spec)):
         return "vision"

@@ -282,7 +282,7 @@ class Estimate:
         """
         return split_by_kind(self, label, most)
 
-    def sensitivity(self, names: Sequence[str] = (), sizes: Sequence[int] = ()) -> Sensitivity:
+    def sensitivity(self, names: Sequence[str] = (), sizes: Sequence[int] = (), parameters: bool = True) -> Sensitivity:
         """Return what p is sensitive to: parameters of the base distribution, and columns of x; no new simulations.
 
         Where the base offers its parameters (`parameters`, `with_parameters`), d log p / d theta is the score function
@@ -292,12 +292,13 @@ class Estimate:
         Args:
             names: Of the parameters of x, for the tables; x1, x2, ... by default.
             sizes: Columns of x that each takes; one by default.
+            parameters: Whether derivatives by the parameters of the base are wanted too.
 
         Raises:
             ValueError: If the method gave no weighted points, nothing failed, the base is not known, or names and
                 sizes do not fit.
         """
-        return compute_sensitivity(self, names, sizes)
+        return compute_sensitivity(self, names, sizes, parameters)
 
     @property
     def proviso(self) -> str:

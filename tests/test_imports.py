@@ -57,7 +57,7 @@ FLOORS = {
         study.cli
     """,
     "agents": """
-        names
+        names settings
         python_function
         learned sb3 remote imperfect_stack
         vision onnx

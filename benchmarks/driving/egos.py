@@ -159,7 +159,7 @@ def format_page(cells: Iterable[EgoResult]) -> str:
             "| ego | method | p | 95 % interval | simulations | wall time | warnings |\n|---|---|---|---|---|---|---|\n"
         )
         parts.append(
-            f"## {env_id}, `{next(iter(SCENARIOS[env_id].bases))}`\n\n{head}"
+            f"## {env_id}, `{SCENARIOS[env_id].default_base}`\n\n{head}"
             + "\n".join(rows)
             + "\n\n"
             + "\n\n".join(pictures)

@@ -292,7 +292,7 @@ def main(
     cells, people = [], {}
     for events in EVENTS:
         short = events.env_id.removeprefix("rare_envs/").removesuffix("-v0")
-        name = chosen.get(short, next(iter(find_scenario(events.env_id).bases)))
+        name = chosen.get(short, find_scenario(events.env_id).default_base)
         people[events.name] = describe_people(events, events.find_frequency(name))
         for driver in DRIVERS:
             cells.append(count_outcomes(events, driver, name, draws, seed))

@@ -21,9 +21,9 @@ from rare_envs.control.idm import IDM
 from rare_envs.traffic.lead import Lead
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import VEHICLE_LENGTH, State
-from rare_envs.traffic.vehicle_models import NEAR_ZERO
+from rare_envs.traffic.vehicle_models import NEAR_ZERO, STANDARD_GRAVITY
 
-MAX_HUMAN_BRAKING = 0.774 * 9.80665
+MAX_HUMAN_BRAKING = 0.774 * STANDARD_GRAVITY
 """Hardest braking of a competent and careful human driver [m/s^2]: UN Regulation 157, as its reference implementation
 (esmini) has it, which all values of this regulation below are from."""
 

@@ -131,12 +131,14 @@ class Coordinates:
 
         Strictly inside the box, which rounding may leave by a float.
         """
+        return move_inside(self.unbounded_value(j, y, x), self.low[j], self.high[j])
+
+    def unbounded_value(self, j: int, y: FloatArray, x: FloatArray) -> FloatArray:
+        """Return the same wherever it is, inside the box or not."""
         if j in self._sources:
             behind, root = self._behind_and_root(j, x)
-            y = behind - y * root
-        elif self.kinds[j] == "log":
-            y = np.exp(y)
-        return move_inside(y, self.low[j], self.high[j])
+            return behind - y * root
+        return np.exp(y) if self.kinds[j] == "log" else y
 
     def log_jacobian(self, x: FloatArray) -> FloatArray:
         """Return log |det dy/dx| at rows x in the box, (n, d) -> (n,): -log x of a logarithm, -log(gap) / 2 of a speed.

@@ -6,11 +6,10 @@ from torch import Tensor
 from rare_envs.control.actions import MAX_ACCELERATION
 from rare_envs.measures.moment import STILL, Moment, acceleration_of_lead, gap_of
 from rare_envs.measures.time_to_collision import TTC_MAX
+from rare_envs.traffic.vehicle_models import STANDARD_GRAVITY
 
 MAX_BRAKING = MAX_ACCELERATION
 """The hardest braking that an action can ask for [m/s^2]."""
-STANDARD_GRAVITY = 9.80665
-"""g [m/s^2]."""
 RAPID_BRAKING, RAPID_LATERAL = 0.5 * STANDARD_GRAVITY, 0.4 * STANDARD_GRAVITY
 """Braking and lateral acceleration above which a manoeuvre is rapid [m/s^2]; see `evasive_manoeuvre`."""
 DECELERATION_MAX = 100.0

@@ -113,6 +113,11 @@ class Scenario:
         return len(self.vehicle_names)
 
     @property
+    def default_base(self) -> str:
+        """Name of the base distribution that is used unless another is named."""
+        return next(iter(self.bases))
+
+    @property
     def size(self) -> int:
         """Number of columns of x."""
         return sum(p.size for p in self.parameters)

@@ -54,7 +54,7 @@ def load_base(scenario: Scenario, base: str | PathLike[str] | Distribution | Non
         >>> load_base(scenario_named("hard_brake"), "us101").dim
         3
     """
-    base = next(iter(scenario.bases)) if base is None else base
+    base = scenario.default_base if base is None else base
     if not isinstance(base, str | PathLike):
         return _check_object(scenario, base)
     shipped = scenario.bases.get(str(base))

@@ -61,16 +61,36 @@ def scenario_named(name: str) -> Scenario:
     """Return the scenario of a short name, such as "cut_in".
 
     Raises:
-        ValueError: If there is none.
+        ValueError: If there is none; the message suggests the nearest name and lists all.
 
     Example:
         >>> scenario_named("cut_in").vehicle_names
         ('ego', 'cutter', 'lead')
     """
-    for scenario in SCENARIOS.values():
-        if scenario.name == name:
-            return scenario
-    raise ValueError(f"Unknown scenario {name!r}; there are {', '.join(each.name for each in SCENARIOS.values())}.")
+    return SCENARIOS[env_id_of(name)]
+
+
+def env_id_of(name: str) -> str:
+    """Return the environment id of a scenario's short name, or of an id itself.
+
+    Raises:
+        ValueError: If there is no such scenario; the message suggests the nearest name and lists all.
+
+    Example:
+        >>> env_id_of("cut_in"), env_id_of("rare_envs/CutIn-v0")
+        ('rare_envs/CutIn-v0', 'rare_envs/CutIn-v0')
+        >>> env_id_of("cutin")
+        Traceback (most recent call last):
+        ...
+        ValueError: Unknown scenario 'cutin' (did you mean 'cut_in'?); there are car_following, cut_in, highway, hard_brake.
+    """  # noqa: E501 (the example shows a whole message)
+    if name in SCENARIOS:
+        return name
+    ids = {scenario.name: env_id for env_id, scenario in SCENARIOS.items()}
+    if name not in ids:
+        hint = did_you_mean(name.rpartition("/")[2].lower(), ids)
+        raise ValueError(f"Unknown scenario {name!r}{hint}; there are {', '.join(ids)}.")
+    return ids[name]
 
 
 def find_scenario(env_id: str) -> Scenario:

@@ -95,7 +95,7 @@ def _format_title(report: Report) -> str:
     return (
         f"{question.env_id}, ego {question.ego}: P[f ≤ {estimate.gamma:g}] = {estimate.p:.2e}   "
         f"({100 * estimate.confidence:g} % interval {low:.1e} to {high:.1e}, "
-        f"{estimate.n_sim:,} simulations)"
+        f"{estimate.n_sim:,} simulations{report.average and f'; {report.average}'})"
     )
 
 

@@ -143,10 +143,20 @@ class Study:
         """The base distribution that the question names, with what is known of its events."""
         return load_base(find_scenario(self.question.env_id), self.question.base)
 
+    def under(self, base: str) -> Study:
+        """Return the same study with another base distribution, by name or file; the ego is the one that is loaded.
+
+        Raises:
+            ValueError: There is no such base, or it does not fit the scenario.
+            OSError: A file cannot be read.
+        """
+        question = replace(self.question, base=base, ensemble=False)
+        return replace(self, question=question, problem=build_problem(question, self.problem.ego))
+
     @property
     def base_name(self) -> str:
         """Its name or file."""
-        return self.question.base or next(iter(find_scenario(self.question.env_id).bases))
+        return self.question.base or find_scenario(self.question.env_id).default_base
 
 
 def prepare(question: Question, ego: Any = None) -> Study:
@@ -173,10 +183,11 @@ def prepare(question: Question, ego: Any = None) -> Study:
         if ego is None:
             ego = agents.load_ego(question.ego, algo=question.algo, trust=question.trust, stats=question.stats)
         problem = build_problem(question, ego)
+        study = Study(replace(question, observation=problem.world.sensing.observation), problem, method)
         names = [name.strip() for name in (question.also_under or "").split(",") if name.strip()]
-        others = {name: build_problem(replace(question, base=name, ensemble=False), ego).base for name in names}
+        others = {name: study.under(name).problem.base for name in names}
     problem.varies = problem.varies or _answers_vary(problem)
-    return Study(replace(question, observation=problem.world.sensing.observation), problem, method, others)
+    return replace(study, other_bases=others)
 
 
 def build_problem(question: Question, ego: Any) -> DrivingProblem:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 import samplers
 from agents.sb3.saved_ego import SavedEgo
+from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.space import Distribution
 from rare_envs.egos.faults import Fault
 from rare_envs.exposure import HUMAN_BENCHMARKS, CollisionRate
@@ -20,6 +21,11 @@ from rare_envs.study.collision_rate import compute_injury_rate, compute_rate, de
 from rare_envs.study.crash_kinds import CrashKinds
 from rare_envs.study.question import Study
 from rare_envs.version import __version__
+
+ENSEMBLE_REASON = (
+    "the parameters of an ensemble are those of all its refits; without --ensemble derivatives are by those of the base"
+)
+"""Why there are no derivatives of the mean over refits."""
 
 
 class BaseAnswer(NamedTuple):
@@ -70,11 +76,21 @@ class Report:
         """What p is sensitive to, or the reason why that is not known; None if the question does not ask for it."""
         if not self.study.question.sensitivity:
             return None
-        space = self.study.problem.space
+        space, ensemble = self.study.problem.space, self.study.question.ensemble
         try:
-            return self.estimate.sensitivity(space.names, space.sizes)
+            found = self.estimate.sensitivity(space.names, space.sizes, parameters=not ensemble)
+            return replace(found, reason=ENSEMBLE_REASON) if ensemble else found
         except ValueError as error:
             return str(error)
+
+    @property
+    def average(self) -> str:
+        """What p is a mean over, in words; empty where it is p under one distribution."""
+        if not self.study.question.ensemble:
+            return ""
+        base = self.study.base
+        number = len(base.refits) if isinstance(base, FittedDistribution) else 0
+        return f"mean over the {number} refits of {self.study.base_name}"
 
     @property
     def doubtful(self) -> bool:
@@ -164,6 +180,7 @@ class Report:
         return {
             **self.estimate.to_dict(),
             "question": asdict(self.study.question),
+            "average": self.average,
             "doubtful": self.doubtful,
             "notes": self.notes,
             "vec_normalize": self.vec_normalize,

@@ -16,6 +16,8 @@ STEERING_LIMIT = math.pi / 3
 _MAX_SLIP_SINE = math.sin(math.atan(0.5 * math.tan(STEERING_LIMIT)))
 """Sine of the slip angle at the largest steering angle. Near 1 single precision may give a slip beyond pi / 2, and its
 tangent the other sign."""
+STANDARD_GRAVITY = 9.80665
+"""g [m/s^2]."""
 NEAR_ZERO = 0.01
 """HighwayEnv's `not_zero`: distances [m] and speeds [m/s] in a denominator are kept at least this far from 0."""
 

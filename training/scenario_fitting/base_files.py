@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from rare_envs.distributions.coordinate_mixture import CoordinateMixture
-from rare_envs.distributions.coordinates import ClosingSpeed
 from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.frequency import EventFrequency
 from rare_envs.distributions.space import Parameter
@@ -168,12 +167,7 @@ def mass_outside(distribution: CoordinateMixture, seed: int = 0) -> dict[str, An
     y = _draw_unbounded(distribution, MASS_SAMPLES, np.random.default_rng(seed))
     x = np.empty_like(y)
     for position, j in enumerate(coordinates.columns):
-        kind, value = coordinates.kinds[j], y[:, position]
-        if isinstance(kind, ClosingSpeed):
-            behind, gap = (x[:, coordinates.names.index(name)] for name in (kind.behind, kind.gap))
-            x[:, j] = behind - value * np.sqrt(gap)
-        else:
-            x[:, j] = np.exp(value) if kind == "log" else value
+        x[:, j] = coordinates.unbounded_value(j, y[:, position], x)
     outside = (x < coordinates.low) | (x > coordinates.high)
     p = float(outside.any(axis=1).mean())
     return {

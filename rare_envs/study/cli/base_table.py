@@ -12,7 +12,7 @@ from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.exposure.base_record import explain_no_frequency, read_source
 from rare_envs.scenarios.base import Scenario
 from rare_envs.scenarios.base_distributions import TextFile, load_base
-from rare_envs.scenarios.registry import SCENARIOS, find_scenario
+from rare_envs.scenarios.registry import env_id_of, find_scenario
 from rare_envs.study.rates.text import format_rate
 
 
@@ -29,8 +29,7 @@ def list_bases(scenario: str) -> dict[str, dict[str, Any]]:
         >>> list_bases("highway")["okelly2018"]["frequency"] is None
         True
     """
-    short = {each.name: env_id for env_id, each in SCENARIOS.items()}
-    found = find_scenario(short.get(scenario, scenario))
+    found = find_scenario(scenario if ":" in scenario else env_id_of(scenario))
     return {name: _describe_base(found, name) for name in found.bases}
 
 

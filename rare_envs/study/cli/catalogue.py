@@ -19,7 +19,7 @@ from rare_envs.simulation.background import noise_size
 TICK = 0.1
 """[s], the usual one."""
 EGOS = {
-    "idm": "rule-based driver, Intelligent Driver Model (the default)",
+    "idm": "rule-based driver, Intelligent Driver Model (the default); with other parameters: idm?time_headway=2",
     "human": "attentive human driver by a published model with reaction time, errors and glances, docs/human_driver.md",
     "imitation": "shipped ego with lidar, learned from recorded traffic and from encounters",
     "mgail, gail, bc, FILE.safetensors": "learned driver with lidar, by its mean actions",

@@ -32,21 +32,9 @@ class NoiseChoice(str, Enum):
         return {"on": True, "off": False}.get(self.value, self.value)
 
 
-class LeaderChoice(str, Enum):
-    """Scenario in which the ego gets a new leader; each is run beside the hard brake, and they count nothing twice.
-
-    Example:
-        >>> LeaderChoice("car-following").scenarios
-        ('car_following', 'hard_brake')
-    """
-
-    CUT_IN = "cut-in"
-    CAR_FOLLOWING = "car-following"
-
-    @property
-    def scenarios(self) -> tuple[str, ...]:
-        """The set of scenarios, by name."""
-        return (self.value.replace("-", "_"), "hard_brake")
+DEFAULT_BUDGET = "that of the method, 6,000 for two-stage"
+LEADER_SCENARIOS = {"cut-in": "cut_in", "car-following": "car_following"}
+"""Scenarios in which the ego gets a new leader; each is run beside the hard brake, and they count nothing twice."""
 
 
 EnvArgument = Annotated[str, typer.Argument(metavar="ENV", help="Environment, such as rare_envs/CutIn-v0.")]
@@ -138,7 +126,9 @@ class EstimateOptions(QuestionOptions):
     also_under: Annotated[
         str | None, typer.Option(help="State p under these bases too, by the same simulations: us101-closing,i80.")
     ] = None
-    max_sim: Annotated[int | None, typer.Option(help="Largest number of simulations.")] = None
+    max_sim: Annotated[int | None, typer.Option(help="Largest number of simulations.", show_default=DEFAULT_BUDGET)] = (
+        None
+    )
     target_cov: Annotated[float | None, typer.Option(help="Stop at this coefficient of variation.")] = None
     replicates: Annotated[int, typer.Option(help="Independent runs, combined by their mean.")] = 1
     on_error: Annotated[str, typer.Option(help="Where the ego fails twice: raise, failure or bound.")] = "raise"
@@ -153,11 +143,12 @@ class RiskOptions:
     """Options of `risk`: which scenarios and sites, and how the ego is driven."""
 
     leaders: Annotated[
-        LeaderChoice,
+        str,
         typer.Option("--with", help="Scenario of new leaders beside hard brake: cut-in or car-following."),
-    ] = LeaderChoice.CUT_IN
+    ] = "cut-in"
     sites: Annotated[
-        str, typer.Option(help="Site of the bases; further ones, joined by commas, for the spread between sites.")
+        str,
+        typer.Option(help="Site of the bases, us101 or i80; both, joined by a comma, for the spread between sites."),
     ] = "us101"
     base: Annotated[
         list[str] | None, typer.Option(help="SCENARIO=NAME or FILE, in place of the site's base; may be repeated.")
@@ -165,7 +156,7 @@ class RiskOptions:
     method: Annotated[str, typer.Option(help="Estimation method; see rare-envs list.")] = "two-stage"
     max_sim: Annotated[
         int | None,
-        typer.Option(help="Largest number of simulations of each scenario.", show_default="that of the method"),
+        typer.Option(help="Largest number of simulations of each scenario.", show_default=DEFAULT_BUDGET),
     ] = None
     ensemble_run: EnsembleRunOption = True
     seed: SeedOption = 0
@@ -190,6 +181,12 @@ class RiskOptions:
         for scenario, _, base in pairs:
             if not scenario or not base:
                 raise ValueError(f"Expected --base SCENARIO=NAME, such as cut_in=i80, got {scenario!r} alone.")
-        scenarios = values.pop("leaders").scenarios
+        leaders = str(values.pop("leaders"))
+        if leaders not in LEADER_SCENARIOS:
+            raise ValueError(
+                f"Expected --with {' or --with '.join(LEADER_SCENARIOS)}, got {leaders!r}: the sum is that of the hard "
+                "brake and one scenario of new leaders, whose events were counted and are not in it twice."
+            )
+        scenarios = (LEADER_SCENARIOS[leaders], "hard_brake")
         sites = [site.strip() for site in values.pop("sites").split(",") if site.strip()]
         return {**values, "scenarios": scenarios, "sites": sites, "bases": {name: base for name, _, base in pairs}}

@@ -79,7 +79,7 @@ def print_report(report: Report, out: Path | None = None) -> None:
     low, high = estimate.interval
     console.print(
         f"P[f <= {estimate.gamma:g}] = {estimate.p:.3e}{_format_odds(estimate.p)}   "
-        f"{question.env_id}, ego {question.ego}",
+        f"{question.env_id}, ego {question.ego}{report.average and f', {report.average}'}",
         style="bold",
     )
     console.print(f"  {f'{100 * estimate.confidence:g} % interval':<15} {low:.3e} to {high:.3e}")
@@ -124,6 +124,9 @@ def _print_other_bases(console: Console, report: Report) -> None:
     for each in report.other_bases:
         if each.found is None:
             console.print(f"  {f'under {each.base}':<15} not known: {each.refused}")
+            console.print(
+                f"  {'':<15} --base {each.base} simulates there; a larger --max-sim gives more failing points"
+            )
         else:
             low, high = each.found.interval
             console.print(

@@ -15,8 +15,8 @@ from rare_envs.files import replace_file
 from rare_envs.study.plots import HIT_COLOUR, LINE_COLOUR, ORDINARY_COLOUR, STYLE
 from rare_envs.study.rates.text import format_interval, format_rate, format_share, name_scenario, name_source
 
-DECADES_BELOW = 1e-3
-"""Left end of the axis over the smallest rate, where an interval reaches down to 0."""
+FRACTION_BELOW = 0.1
+"""Left end of the axis over the smallest number on it, where an interval reaches down to 0."""
 
 
 def save_risk_plot(path: Path, ego: str, total: TotalRate) -> None:
@@ -49,17 +49,23 @@ def draw_rates(axes: Axes, total: TotalRate) -> None:
         (name_scenario(rate.scenario), rate.per_million_km, rate.interval_per_million_km) for rate in total.rates
     ]
     rows.append(("total", total.per_million_km, total.interval_per_million_km))
-    positive = [value for _, rate, ends in rows for value in (rate, *ends) if value > 0]
-    least = min(positive)
-    start = least * DECADES_BELOW if any(ends[0] == 0 for _, _, ends in rows) else least
+    people = (CONTACTS_100CAR, REAR_END_CONTACTS_100CAR)
+    shown = [end for _, _, ends in rows for end in ends if end > 0]
+    start = FRACTION_BELOW * min(*shown, people[1].per_million_km)
     for row, (name, rate, (low, high)) in enumerate(rows):
         colour = HIT_COLOUR if name == "total" else LINE_COLOUR
-        axes.plot([max(low, start), high], [row, row], color=colour, linewidth=3, alpha=0.5, solid_capstyle="butt")
-        if rate > start:
+        if low > 0:
+            axes.plot([low, high], [row, row], color=colour, linewidth=3, alpha=0.5, solid_capstyle="butt")
             axes.plot(rate, row, "o", color=colour)
-    for people, style in ((CONTACTS_100CAR, "--"), (REAR_END_CONTACTS_100CAR, ":")):
-        axes.axvline(people.per_million_km, color="black", linewidth=1, linestyle=style, label=people.kind)
+        else:  # an upper end alone: an arrow out of the axis, without a point
+            style = {"arrowstyle": "->", "color": colour, "linewidth": 2}
+            axes.annotate("", (start, row), (high, row), arrowprops=style)
+            axes.plot(high, row, "|", color=colour, markersize=12, markeredgewidth=2)
+            axes.annotate(f"below {format_rate(high)}", (high, row), (6, -3), textcoords="offset points", fontsize=8)
     axes.set_xscale("log")
+    axes.set_xlim(start, max(*shown, people[0].per_million_km) / FRACTION_BELOW)
+    for each, dashes in zip(people, ("--", ":"), strict=True):
+        axes.axvline(each.per_million_km, color="black", linewidth=1, linestyle=dashes, label=each.kind)
     axes.set_yticks(range(len(rows)), [name for name, _, _ in rows])
     axes.set_ylim(len(rows) + 0.4, -0.6)  # room for the legend below
     axes.set_xlabel("collisions per million km")
@@ -70,10 +76,10 @@ def draw_shares(axes: Axes, total: TotalRate) -> None:
     """Draw the shares of the sources of the uncertainty as bars."""
     shares = total.shares
     of_what = "" if len(total.determined) == len(total.rates) else " of the determined part"
-    axes.set_title(f"sources of the uncertainty{of_what}, share of the variance", fontsize=10)
+    axes.set_title(f"sources of the uncertainty{of_what}\n(shares of the variance)", fontsize=10)
     if not shares:
         axes.set_axis_off()
-        axes.text(0.5, 0.5, "not known", ha="center", va="center", transform=axes.transAxes)
+        axes.text(0.5, 0.5, "not known: no rate has a lower end", ha="center", va="center", transform=axes.transAxes)
         return
     axes.barh(range(len(shares)), [100 * each.share for each in shares], color=LINE_COLOUR)
     for row, each in enumerate(shares):

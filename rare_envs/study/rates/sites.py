@@ -4,18 +4,56 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from os import PathLike
 
 from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.frequency import EventFrequency
+from rare_envs.distributions.space import Distribution
 from rare_envs.exposure.base_record import read_site
 from rare_envs.exposure.rate import MILLION_KM
+from rare_envs.plugins import did_you_mean
 from rare_envs.scenarios.base import Scenario
 from rare_envs.scenarios.base_distributions import load_base
 from rare_envs.study.evaluate import run
-from rare_envs.study.question import Study, build_problem
+from rare_envs.study.question import Study
 from rare_envs.study.report import Report
+
+
+def list_sites(scenario: Scenario) -> dict[str, str]:
+    """Return the sites of a scenario: the name of the first base of each, and the site in words.
+
+    Further bases of a site are other families for the same events, no other site; an assembled base has none.
+
+    Example:
+        >>> from rare_envs.scenarios.registry import scenario_named
+        >>> list_sites(scenario_named("cut_in"))
+        {'us101': 'US 101, Los Angeles, 07:50, congested', 'i80': 'I-80, Emeryville, 16:00, congested'}
+    """
+    found: dict[str, str] = {}
+    for name in scenario.bases:
+        site = _read_site_of(load_base(scenario, name))
+        if site and site not in found.values():
+            found[name] = site
+    return found
+
+
+def check_sites(scenarios: Sequence[Scenario], sites: Sequence[str]) -> None:
+    """Raise a ValueError unless sites are different ones, each of a scenario at least."""
+    if not sites or len(set(sites)) < len(sites):
+        raise ValueError(f"Expected one site or more, such as us101, each once; got {', '.join(sites) or 'none'}.")
+    known = {name for scenario in scenarios for name in list_sites(scenario)}
+    for site in (each for each in sites if each not in known):
+        owner = next((scenario for scenario in scenarios if site in scenario.bases), None)
+        if owner is None:
+            names = ", ".join(scenario.name for scenario in scenarios)
+            hint = did_you_mean(site, known)
+            raise ValueError(f"No base of {names} is of a site {site!r}{hint}; there are {', '.join(sorted(known))}.")
+        place = _read_site_of(load_base(owner, site))
+        further = f"is a further base of the site {_name_of(owner, place)!r}" if place else "has no site"
+        raise ValueError(
+            f"{site!r} is no site: this base of {owner.name} {further}. The sites are {', '.join(sorted(known))}; "
+            f"--base {owner.name}={site} takes it as the base."
+        )
 
 
 def choose_base(scenario: Scenario, given: str | PathLike[str] | None, site: str) -> tuple[str, tuple[str, ...]]:
@@ -26,17 +64,18 @@ def choose_base(scenario: Scenario, given: str | PathLike[str] | None, site: str
     Args:
         scenario: The scenario.
         given: Name or file that the user gave for it; None for the site's.
-        site: Name of a base distribution.
+        site: Name of a site.
     """
     if given is not None:
         return str(given), ()
-    own = site if site in scenario.bases else next(iter(scenario.bases))
+    known = site in list_sites(scenario)
+    own = site if known else scenario.default_base
     found = (
         own if _has_frequency(scenario, own) else next((n for n in scenario.bases if _has_frequency(scenario, n)), own)
     )
     if found == site:
         return site, ()
-    lack = "no event frequency at" if site in scenario.bases else "no base"
+    lack = "no event frequency at" if known else "no base of the site"
     return found, (f"it has {lack} {site!r}: {found!r} is used",)
 
 
@@ -46,49 +85,53 @@ def _has_frequency(scenario: Scenario, name: str) -> bool:
 
 
 def compare_sites(report: Report, sites: Sequence[str], progress: bool = False) -> dict[str, float]:
-    """Return rates per km under the bases of other sites over that of a report, by name.
+    """Return rates per km at other sites over that of a report, by name.
 
     They come from the simulations of the report, reweighted. Where these do not suffice, sites that are asked for are
     simulated, and others left out; all are left out where nothing failed.
 
     Args:
         report: With a rate.
-        sites: Names of base distributions that are asked for; those that the scenario lacks are left out.
+        sites: Names of sites that are asked for; those that the scenario lacks are left out.
         progress: Show a bar on standard error.
     """
     study = report.study
     if report.estimate.p == 0 or report.rate is None:
         return {}
     factors = {}
-    for name, frequency in _other_frequencies(study, sites).items():
+    for name, frequency in _other_frequencies(study).items():
         p = _estimate_under(report, name, name in sites, progress)
         if p > 0:
             factors[name] = p * frequency.per_km / report.rate.per_million_km * MILLION_KM
     return factors
 
 
-def _other_frequencies(study: Study, sites: Sequence[str]) -> dict[str, EventFrequency]:
-    """Return the frequencies of the bases that are asked for, and of the first base of each further site."""
+def _other_frequencies(study: Study) -> dict[str, EventFrequency]:
+    """Return the frequencies of the events at each other site, by its name, as far as they were counted."""
     scenario = study.problem.world.scenario
-    own = read_site(study.base.record) if isinstance(study.base, FittedDistribution) else ""
-    seen, found = {own}, dict[str, EventFrequency]()
-    for name in sorted(scenario.bases, key=lambda name: name not in sites):
+    own = _read_site_of(study.base)
+    found = {}
+    for name, site in list_sites(scenario).items():
         base = load_base(scenario, name)
-        if name == study.base_name or not isinstance(base, FittedDistribution) or base.frequency is None:
-            continue
-        site = read_site(base.record)
-        if name in sites or site not in seen:
+        if site != own and isinstance(base, FittedDistribution) and base.frequency is not None:
             found[name] = base.frequency
-        seen.add(site)
     return found
+
+
+def _read_site_of(base: Distribution) -> str:
+    """Return the site of a base distribution in words; empty where it was not fitted to events of one."""
+    return read_site(base.record) if isinstance(base, FittedDistribution) else ""
+
+
+def _name_of(scenario: Scenario, place: str) -> str:
+    """Return the name of a site of a scenario."""
+    return next(name for name, site in list_sites(scenario).items() if site == place)
 
 
 def _estimate_under(report: Report, name: str, asked: bool, progress: bool) -> float:
     """Return p under another base; NaN where the simulations do not give it and it was not asked for."""
-    study = report.study
-    question = replace(study.question, base=name)
-    problem = build_problem(question, study.problem.ego)
+    other = report.study.under(name)
     try:
-        return report.estimate.reweight(problem.base).p
+        return report.estimate.reweight(other.problem.base).p
     except ValueError:
-        return run(replace(study, question=question, problem=problem), progress).estimate.p if asked else math.nan
+        return run(other, progress).estimate.p if asked else math.nan

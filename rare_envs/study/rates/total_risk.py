@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 
 from rare_envs.files import replace_text
-from rare_envs.scenarios.registry import SCENARIOS, scenario_named
+from rare_envs.scenarios.registry import env_id_of, scenario_named
 from rare_envs.study.collision_rate import find_frequency
 from rare_envs.study.errors import BadInput, as_bad_input
 from rare_envs.study.evaluate import run, run_into
 from rare_envs.study.question import Question, Study, prepare
 from rare_envs.study.rates.result import Risk, ScenarioRisk
-from rare_envs.study.rates.sites import choose_base, compare_sites
+from rare_envs.study.rates.sites import check_sites, choose_base, compare_sites
 from rare_envs.study.run_directory import check_no_results, format_json
 
 SCENARIO_SET = ("cut_in", "hard_brake")
@@ -47,8 +47,9 @@ def risk(
     Args:
         ego: Its name, file or address, as for `agents.load_ego`; or an object, as for `DrivingProblem`.
         scenarios: Names of scenarios that count nothing twice; car_following may stand in place of cut_in.
-        sites: Names of base distributions: those of the first are used, and the spread of the rate between these and
-            the others is part of the interval. A scenario without a base of a name uses its default.
+        sites: Names of sites, each that of the first base fitted to events of it, such as "us101": the bases of the
+            first are used, and the spread of the rate between it and the others is part of the interval. A scenario
+            without a base of a site uses its default.
         bases: Base distributions, names or JSON files, by scenario, in place of those of the first site.
         out: Folder for the picture, the numbers and a folder of each scenario, see `rare-envs risk --out`.
         progress: Show a bar on standard error.
@@ -102,10 +103,8 @@ def _check_scenarios(scenarios: Sequence[str], sites: Sequence[str], bases: Mapp
         raise BadInput(f"Expected one of {', '.join(TWICE)}: a cut-in is a new leader, and would count twice.")
     if not sites:
         raise BadInput("Expected one site or more, such as us101.")
-    for site in sites:
-        if not any(site in each.bases for each in known):
-            names = sorted({base for each in known for base in each.bases})
-            raise BadInput(f"No scenario of {', '.join(scenarios)} has a base {site!r}; they have {', '.join(names)}.")
+    with as_bad_input(ValueError):
+        check_sites(known, sites)
     for name in bases:
         if name not in scenarios:
             raise BadInput(f"A base is given for {name!r}, which is none of {', '.join(scenarios)}.")
@@ -117,10 +116,9 @@ def _prepare(ego: Any, name: str, base: str, options: Mapping[str, Any]) -> Stud
     Raises:
         BadInput: Something cannot be used.
     """
-    env_id = next(env_id for env_id in SCENARIOS if SCENARIOS[env_id].name == name)
     named = isinstance(ego, str)
     try:
-        question = Question(env_id=env_id, ego=ego if named else type(ego).__name__, base=base, **options)
+        question = Question(env_id=env_id_of(name), ego=ego if named else type(ego).__name__, base=base, **options)
     except TypeError as error:
         raise BadInput(f"Cannot use an option of risk: {error}") from error
     return prepare(question, None if named else ego)

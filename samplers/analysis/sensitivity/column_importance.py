@@ -43,7 +43,8 @@ class ColumnImportance:
     name: str
     """Name of the parameter."""
     importance: float
-    """D over -log p: the share of how rare failure is that the parameter has by itself, 0 to 1."""
+    """D over -log p: the share of how rare failure is that the parameter has by itself, 0 to 1; the estimate from few
+    points, which may be beyond, is cut to that range."""
     error: float
     """Standard error of `importance`."""
     direction: float
@@ -76,7 +77,7 @@ def rank_columns(
         part = slice(int(first), int(last))
         error = float(mean_over_failures(failures, influence[:, part].sum(axis=1, keepdims=True))[1][0])
         direction = float(mean[first]) if last - first == 1 else float(np.linalg.norm(mean[part]))
-        value = max(float(entropy[part].sum()), 0.0) / total if total > 0 else 0.0
+        value = min(max(float(entropy[part].sum()) / total, 0.0), 1.0) if total > 0 else 0.0
         found.append(
             ColumnImportance(
                 name=name, importance=value, error=error / total if total > 0 else math.nan, direction=direction
@@ -102,8 +103,12 @@ def relative_entropies(failures: WeightedFailures, u: FloatArray) -> tuple[Float
     mean = share @ u
     square = share @ u**2
     variance = np.maximum(square - mean**2, np.finfo(np.float64).tiny)
-    points = effective_number(failures.unit_totals(failures.weights))
-    bias = 1 / points
+    bias = 1 / count_effective_failures(failures)
     entropy = (square - 1 - np.log(variance)) / 2 - bias
     influence = (1 - 1 / variance) / 2 * (u**2 - square) + mean / variance * (u - mean)
     return entropy, influence, mean
+
+
+def count_effective_failures(failures: WeightedFailures) -> float:
+    """Return the effective number of independent units among the failing points."""
+    return effective_number(failures.unit_totals(failures.weights))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -11,7 +12,7 @@ import numpy as np
 from samplers.analysis.base import WeightedEstimate
 from samplers.analysis.failure_weights import mean_over_failures, weigh_failures
 from samplers.analysis.reweighting import require_base
-from samplers.analysis.sensitivity.column_importance import ColumnImportance, rank_columns
+from samplers.analysis.sensitivity.column_importance import ColumnImportance, count_effective_failures, rank_columns
 from samplers.analysis.sensitivity.parameter_scores import ParametricBase, parameter_scores
 from samplers.analysis.sensitivity.spread_shares import JOINT_GROUP, share_spread, sum_by_owner
 from samplers.serialization import to_json_value
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
 
 MIN_CORRELATION = 0.8
 """Correlation of log p to first order with log p over the refits below which no recording is recommended."""
+ENOUGH_POINTS = 30.0
+"""Effective failing points below which importance and derivatives are called not determined."""
 SHOWN_PARAMETERS = 12
 """Rows of the table for people, and bars of the picture."""
 
@@ -66,6 +69,8 @@ class Sensitivity:
     """By parameter of the base: those with the largest share of the spread first, or with the largest derivative."""
     columns: tuple[ColumnImportance, ...]
     """By parameter of x, the most important first."""
+    points: float = math.inf
+    """Effective number of failing points that all of it rests on."""
     shares: Mapping[str, float] = field(default_factory=dict)
     """Share of the spread of log p over the refits by parameter of x, the largest first; a correlation counts half for
     each of the two. Empty where the base has no refits."""
@@ -91,6 +96,10 @@ class Sensitivity:
             f"{'  ' + each.name:<{width}} {each.importance:8.3f} +- {each.error:.3f} {each.direction:+7.2f} sd"
             for each in self.columns[:SHOWN_PARAMETERS]
         ]
+        if self.points < ENOUGH_POINTS:
+            lines.append(
+                f"from only {self.points:.0f} effective failing points: importance and derivatives are not determined"
+            )
         if shown:
             lines.append(f"{head:<{width}} {'change':>8} {'d log p':>9}    error" + ("   share" if self.shares else ""))
         for each in shown:
@@ -109,6 +118,8 @@ class Sensitivity:
             f"spread of log p over {used} of {total} refits {self.spread:.2f}, to first order "
             f"{self.first_order_spread:.2f} (correlation {self.correlation:.2f}), of which {parts}"
         ]
+        if min(self.shares.values()) < 0:
+            lines.append("a negative share: in the refits it varies against others, and narrows the spread of p")
         name = next(iter(self.shares))
         if not self.correlation or self.correlation < MIN_CORRELATION:
             lines.append("first order describes the refits poorly: these shares are rough")
@@ -118,7 +129,7 @@ class Sensitivity:
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain lists and numbers for JSON."""
-        numbers = ("spread", "first_order_spread", "correlation")
+        numbers = ("points", "spread", "first_order_spread", "correlation")
         return {
             "columns": [each.to_dict() for each in self.columns],
             "parameters": [{k: to_json_value(v) for k, v in asdict(each).items()} for each in self.parameters],
@@ -155,7 +166,7 @@ class Sensitivity:
 
 
 def compute_sensitivity(
-    estimate: WeightedEstimate, names: Sequence[str] = (), sizes: Sequence[int] = ()
+    estimate: WeightedEstimate, names: Sequence[str] = (), sizes: Sequence[int] = (), by_parameters: bool = True
 ) -> Sensitivity:
     """Return the sensitivity of p; see `Estimate.sensitivity`.
 
@@ -165,16 +176,17 @@ def compute_sensitivity(
     base, failures = require_base(estimate), weigh_failures(estimate)
     dim = failures.x.shape[1]
     names, sizes = _check_names(names, sizes, dim)
-    columns = rank_columns(failures, base, names, sizes)
+    columns, points = rank_columns(failures, base, names, sizes), count_effective_failures(failures)
+    if not by_parameters:
+        return Sensitivity(parameters=(), columns=columns, points=points)
     labels = [
         name if size == 1 else f"{name}[{k}]" for name, size in zip(names, sizes, strict=True) for k in range(size)
     ]
     parameters = base.parameters(labels) if isinstance(base, ParametricBase) else ()
     if not isinstance(base, ParametricBase) or not parameters:
         kind = type(base).__name__
-        return Sensitivity(
-            parameters=(), columns=columns, reason=f"the base distribution ({kind}) offers no parameters"
-        )
+        reason = f"the base distribution ({kind}) offers no parameters"
+        return Sensitivity(parameters=(), columns=columns, points=points, reason=reason)
     derivatives, errors = mean_over_failures(failures, parameter_scores(base, failures.x))
     spread = share_spread(estimate, base, derivatives, labels)
     rows = [
@@ -195,6 +207,7 @@ def compute_sensitivity(
     return Sensitivity(
         parameters=tuple(rows),
         columns=columns,
+        points=points,
         shares=groups,
         spread=spread.spread,
         first_order_spread=spread.first_order,

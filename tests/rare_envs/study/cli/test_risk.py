@@ -54,6 +54,14 @@ BAD = {
     "unknown site": (["idm", "--sites", "us102"], ["us102", "us101"]),
     "no site": (["idm", "--sites", ","], ["site"]),
     "unknown leaders": (["idm", "--with", "merge"], ["merge"]),
+    "uncounted leaders": (
+        ["idm", "--with", "highway"],
+        ["cut-in or --with car-following", "'highway'"],
+    ),
+    "a base that is no site": (
+        ["idm", "--sites", "us101-closing"],
+        ["no site", "'us101'", "cut_in=us101-closing"],
+    ),
     "a base without its scenario": (["idm", "--base", "mine.json"], ["SCENARIO=NAME"]),
     "a base of an unknown scenario": (["idm", "--base", "merge=mine.json"], ["merge"]),
     "a base that is no file": (["idm", "--base", "cut_in=mine.json"], ["mine.json"]),

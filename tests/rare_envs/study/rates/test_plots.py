@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from rare_envs.exposure import TotalRate
 from rare_envs.study.rates.plots import draw_rates, draw_shares, save_risk_plot
+from rare_envs.study.rates.text import format_rate
 from tests.rare_envs.exposure.test_rate import rate
 
 TOTAL = TotalRate((rate(spread=1.4), rate(1e-4, scenario="hard_brake", spread=1.0)))
@@ -35,11 +36,26 @@ def test_bars_are_the_shares() -> None:
     assert [patch.get_width() for patch in axes.patches] == pytest.approx([100 * each.share for each in TOTAL.shares])
 
 
-def test_an_interval_that_begins_at_zero_can_be_drawn(tmp_path: Path) -> None:
+def test_a_rate_with_an_upper_end_alone_is_an_arrow_without_a_point(tmp_path: Path) -> None:
+    """The rates: one with an interval, one below its upper end, and their sum."""
+    axes = Figure().subplots()
+    total = TotalRate((rate(spread=1.4), rate(0.0, math.inf, upper=1e-3, scenario="hard_brake")))
+    draw_rates(axes, total)
+    dots = [float(line.get_ydata()[0]) for line in axes.lines if line.get_marker() == "o"]
+    assert dots == [0.0, 2.0]
+    arrows = [text for text in axes.texts if text.arrow_patch is not None]
+    assert len(arrows) == 1
+    high = total.rates[1].interval_per_million_km[1]
+    assert (arrows[0].xyann, arrows[0].xy) == ((pytest.approx(high), 1), (pytest.approx(axes.get_xlim()[0]), 1))
+    assert [text.get_text() for text in axes.texts if text.get_text()] == [f"below {format_rate(high)}"]
+
+
+def test_where_nothing_failed_the_picture_says_so(tmp_path: Path) -> None:
     axes = Figure().subplots()
     draw_rates(axes, UNKNOWN)
-    start, end = next(line for line in axes.lines if line.get_linewidth() == 3).get_xdata()
-    assert 0 < start < end == pytest.approx(UNKNOWN.interval_per_million_km[1])
-    draw_shares(Figure().subplots(), UNKNOWN)
+    assert axes.get_xlim()[0] < UNKNOWN.interval_per_million_km[1] < axes.get_xlim()[1]
+    shares = Figure().subplots()
+    draw_shares(shares, UNKNOWN)
+    assert [text.get_text() for text in shares.texts] == ["not known: no rate has a lower end"]
     save_risk_plot(tmp_path / "risk.png", "idm", UNKNOWN)
     assert (tmp_path / "risk.png").read_bytes()[:4] == b"\x89PNG"

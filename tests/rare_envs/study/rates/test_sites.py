@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -11,7 +12,7 @@ import pytest
 from rare_envs.scenarios.hard_brake import HARD_BRAKE
 from rare_envs.scenarios.registry import SCENARIOS, scenario_named
 from rare_envs.study import Question, Report, prepare, run
-from rare_envs.study.rates.sites import choose_base, compare_sites
+from rare_envs.study.rates.sites import check_sites, choose_base, compare_sites, list_sites
 from tests.rare_envs.study.fitted_files import fitted_entries
 
 OTHER_SITE = {"source": {"site": "another", "data": "more"}}
@@ -19,13 +20,14 @@ OTHER_SITE = {"source": {"site": "another", "data": "more"}}
 
 @pytest.fixture
 def sites(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Hard brake with three bases: a near one and a far one of other sites, and one of the same site."""
+    """Hard brake at three sites, with further bases of two of them, and an assembled one."""
     near = fitted_entries("hard_brake", shift=0.2, provenance=OTHER_SITE)
     near["frequency"] = {**near["frequency"], "count": 84}
     bases = {
         "us101": fitted_entries("hard_brake"),
         "near": near,
-        "far": fitted_entries("hard_brake", shift=6.0, provenance=OTHER_SITE),
+        "far": fitted_entries("hard_brake", shift=6.0, provenance={"source": {"site": "a third"}}),
+        "near-gap": fitted_entries("hard_brake", shift=0.3, provenance=OTHER_SITE),
         "again": fitted_entries("hard_brake", shift=0.1),
         "assembled": fitted_entries("hard_brake", refits=None, events=None, family=None, frequency=None, checks=None),
     }
@@ -48,10 +50,31 @@ def test_other_sites_are_known_from_the_same_simulations(sites: None) -> None:
 
 def test_a_site_that_is_asked_for_is_simulated_if_need_be(sites: None) -> None:
     own = report()
-    factors = compare_sites(own, ("far", "again", "nowhere"))  # the near one is of the same site as the far one
-    assert set(factors) == {"far", "again"}
+    factors = compare_sites(own, ("far", "nowhere"))
+    assert set(factors) == {"near", "far"}
     p = run(prepare(Question(env_id="rare_envs/HardBrake-v0", base="far", method="mc", max_sim=1000))).estimate.p
     assert factors["far"] == pytest.approx(p / own.estimate.p)
+
+
+def test_a_site_is_the_first_base_of_it(sites: None) -> None:
+    brake = scenario_named("hard_brake")
+    assert list_sites(brake) == {"us101": "site of hard_brake", "near": "another", "far": "a third"}
+    check_sites([brake], ["near", "us101"])
+    for given, said in (
+        (["near-gap"], "'near-gap' is no site: this base of hard_brake is a further base of the site 'near'"),
+        (["assembled"], "'assembled' is no site: this base of hard_brake has no site"),
+        (["us101", "naer"], "of a site 'naer' (did you mean 'near'?); there are far, near, us101"),
+        (["near", "near"], "each once; got near, near"),
+        ([], "got none"),
+    ):
+        with pytest.raises(ValueError, match=re.escape(said)):
+            check_sites([brake], given)
+
+
+def test_shipped_sites_are_two_for_cut_ins_and_one_for_brakings() -> None:
+    assert list(list_sites(scenario_named("cut_in"))) == ["us101", "i80"]
+    assert list(list_sites(scenario_named("hard_brake"))) == ["us101"]
+    assert list(list_sites(scenario_named("car_following"))) == ["us101", "i80", "i24"]
 
 
 def test_nothing_is_known_where_nothing_failed(tmp_path: Path) -> None:
@@ -65,7 +88,7 @@ def test_the_base_of_a_scenario_at_a_site() -> None:
     assert choose_base(HARD_BRAKE, Path("mine.json"), "us101") == ("mine.json", ())
     base, notes = choose_base(HARD_BRAKE, None, "i80")
     assert base == "us101"
-    assert notes == ("it has no base 'i80': 'us101' is used",)
+    assert notes == ("it has no base of the site 'i80': 'us101' is used",)
 
 
 def test_a_base_whose_events_were_not_counted_gives_way_to_one_whose_were() -> None:

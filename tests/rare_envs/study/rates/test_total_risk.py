@@ -118,11 +118,12 @@ def test_a_scenario_without_a_base_of_the_site_uses_its_default_and_says_so(monk
         "cut_in": ("rare_envs/CutIn-v0", ["us101", "i80"]),
     }
     for name, (env_id, bases) in own.items():
-        scenario = replace(SCENARIOS[env_id], bases=dict.fromkeys(bases, fitted_entries(name)))
+        entries = {base: fitted_entries(name, provenance={"source": {"site": base}}) for base in bases}
+        scenario = replace(SCENARIOS[env_id], bases=entries)
         monkeypatch.setitem(SCENARIOS._entries, env_id, scenario)
     found = rare_envs.risk("idm", sites=["i80"], **FEW)
     assert [each.base_name for each in found.scenarios] == ["i80", "us101"]
-    assert any("no base 'i80'" in note for note in found.notes)
+    assert any("no base of the site 'i80'" in note for note in found.notes)
 
 
 REFUSED = {
