@@ -66,7 +66,8 @@ def test_scenarios_by_id_and_by_name_are_the_same() -> None:
 
 def test_unknown_scenario() -> None:
     with pytest.raises(
-        ValueError, match=r"^Unknown scenario 'cutin'; there are car_following, cut_in, highway, hard_b"
+        ValueError,
+        match=r"^Unknown scenario 'cutin' \(did you mean 'cut_in'\?\); there are car_following, cut_in, highway",
     ):
         scenario_named("cutin")
 

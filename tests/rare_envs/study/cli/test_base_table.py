@@ -54,4 +54,5 @@ def test_the_command(cli: Cli, fitted: None) -> None:
     answer = json.loads(cli("bases", "hard_brake", "--json").stdout)
     assert answer["bases"]["us101"]["fitted_to"] == "42 events of 40 scenes"
     assert "42 events of 40 scenes" in cli("bases", "hard_brake").stdout
-    assert_refused(cli("bases", "merge"), "merge", "rare_envs/CutIn-v0")
+    assert_refused(cli("bases", "merge"), "merge", "cut_in")
+    assert_refused(cli("bases", "cutin"), "did you mean 'cut_in'?")

@@ -125,6 +125,11 @@ def test_the_mixture_of_the_refits_as_base(cli: Cli, here: Path) -> None:
     assert "no interval of that error is given" in notes[0]
     assert data["notes"] == [notes[0].removeprefix("note: ")]
     assert data["question"]["ensemble"] is True
+    assert data["average"] == f"mean over the 30 refits of {base}"
+    assert data["average"] in cli(*BRAKE, "--base", base, "--ensemble").stdout.splitlines()[0]
+    shown = cli(*BRAKE, "--base", base, "--ensemble", "--sensitivity").stdout
+    assert "without --ensemble derivatives are by those of the base" in shown
+    assert "component" not in shown.partition("importance of the parameters")[2]
     assert data["base_uncertainty"] is None
     without = write_fitted(here / "without.json", "hard_brake", refits=None)
     assert_refused(cli(*BRAKE, "--base", without, "--ensemble"), "without.json", "no refits")

@@ -37,6 +37,39 @@ def test_json_and_picture(tmp_path):
     figure.savefig(tmp_path / "bars.png")
 
 
+def test_without_parameters_only_the_importance_is_computed(result):
+    class Refusing(ParametricNormal):
+        def with_parameters(self, values):
+            raise AssertionError("a derivative was computed")
+
+    plain = run(Refusing(BASE.mean, BASE.sd), max_sim=6000).sensitivity(parameters=False)
+    assert plain.parameters == ()
+    assert [each.importance for each in plain.columns] == [each.importance for each in result.sensitivity().columns]
+
+
+def test_a_negative_share_is_explained():
+    one = run(fitted()).sensitivity()
+    sentence = "a negative share: in the refits it varies against others"
+    assert (min(one.shares.values()) < 0) == (sentence in str(one))
+    assert sentence in str(replace(one, shares={"a": 1.2, "b": -0.2}))
+    assert sentence not in str(replace(one, shares={"a": 0.8, "b": 0.2}))
+
+
+def test_few_failures_do_not_determine_the_importance():
+    """Five draws of 4,000 fail: no importance is above 1, and the table says that it is not determined."""
+    problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=3)
+    sparse = next(
+        result
+        for seed in range(50)
+        if (result := samplers.estimate(problem, "mc", seed=seed, max_sim=4000)).failures.total == 5
+    ).sensitivity()
+    assert sparse.points == pytest.approx(5.0)
+    assert all(0.0 <= each.importance <= 1.0 for each in sparse.columns)
+    assert "from only 5 effective failing points: importance and derivatives are not determined" in str(sparse)
+    enough = samplers.estimate(problem, seed=0, max_sim=4000).sensitivity()
+    assert "not determined" not in str(enough)
+
+
 def test_bad_input_is_refused_in_one_line(result):
     safe = samplers.estimate(samplers.FunctionProblem(lambda x: 9.0 - x[:, 0], 2), "mc", max_sim=100)
     with pytest.raises(ValueError, match=r"^No point failed \(f <= 0\): there is nothing to analyse\.$"):
