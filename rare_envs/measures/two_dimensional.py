@@ -15,8 +15,8 @@ DRIFT = 0.2
 """Speed [m/s] with which `margin` expects any gap to close at least."""
 EARLY_SHARE = 0.45
 """Share of the horizon up to which a small distance is an early one. On the highway 3 of 72 collisions among rollouts
-from the base distribution came after tick 60 of 100: late drifts, from other directions than those at the start, which a
-description of all together misses."""
+from the base distribution came after tick 60 of 100: late drifts, from other directions than those at the start, which
+a description of all together misses."""
 TIME_MIN = 1e-3
 """Times to contact are floored here [s], so that only a collision comes to 0 or less."""
 
