@@ -3,6 +3,9 @@
 import json
 from typing import Any
 
+_MAX_DIGITS = 300
+"""Digits of a whole number that is a float still, which ends at 1.8e308."""
+
 
 def parse_json_object(text: str, source: str) -> dict[str, Any]:
     """Return the JSON object that a text holds.
@@ -23,9 +26,22 @@ def parse_json_object(text: str, source: str) -> dict[str, Any]:
         ValueError: The header: expected a JSON object, got list.
     """
     try:
-        data = json.loads(text)
-    except json.JSONDecodeError as error:
+        data = json.loads(text, parse_int=_parse_int)
+    except RecursionError:
+        raise ValueError(f"{source} is not valid JSON for this program: nested too deeply.") from None
+    except ValueError as error:
         raise ValueError(f"{source} is not valid JSON: {error}.") from None
     if not isinstance(data, dict):
         raise ValueError(f"{source}: expected a JSON object, got {type(data).__name__}.")
     return data
+
+
+def _parse_int(digits: str) -> int:
+    """Return a whole number that a float can hold.
+
+    Raises:
+        ValueError: If it is larger.
+    """
+    if len(digits) > _MAX_DIGITS:
+        raise ValueError(f"a whole number of {len(digits)} digits")
+    return int(digits)

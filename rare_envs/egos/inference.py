@@ -71,9 +71,10 @@ def query_policy(
 
 
 def _predict(policy: Any, query: PolicyQuery) -> tuple[Tensor, Any]:
-    action, hidden = policy.predict(
-        query.observation, state=query.hidden, episode_start=query.start, deterministic=True
-    )
+    with np.errstate():  # a policy that sets NumPy's errors sets them for itself
+        action, hidden = policy.predict(
+            query.observation, state=query.hidden, episode_start=query.start, deterministic=True
+        )
     return torch.as_tensor(np.asarray(action)).to(query.over.device), hidden
 
 

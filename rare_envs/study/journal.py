@@ -17,7 +17,7 @@ import numpy as np
 from agents.loading import strip_prefixes
 from rare_envs.egos.faults import Fault, FaultTolerant
 from rare_envs.study.errors import BadInput
-from rare_envs.study.question import Question
+from rare_envs.study.question import Question, read_question
 from rare_envs.version import __version__
 from samplers.execution.journal import JournalFile, JournalRecord, digest_points
 from samplers.execution.journaled_evaluation import JournaledEvaluation
@@ -76,7 +76,7 @@ def continue_journal(folder: Path, mend: bool = False) -> tuple[JournalFile, Que
         raise BadInput(f"{error}{hint if 'damaged' in str(error) else ''}") from error
     try:
         return journal, _read_question(journal)
-    except (BadInput, KeyError, TypeError, AttributeError) as error:
+    except BadInput as error:
         journal.close()
         raise BadInput(f"Cannot take up {str(path)!r}: {error}") from error
 
@@ -85,7 +85,7 @@ def _read_question(journal: JournalFile) -> Question:
     version = journal.head.get("version")
     if version != __version__:
         raise BadInput(f"it was begun by version {version}, this is {__version__}.")
-    return Question(**journal.head["question"])
+    return read_question(journal.head.get("question"))
 
 
 def check_same_files(journal: JournalFile, question: Question) -> None:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import itertools
+import reprlib
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, cast
 
@@ -122,6 +123,42 @@ class Question:
         return method
 
 
+_JSON_TYPES: dict[str, tuple[type, ...]] = {
+    "str": (str,),
+    "int": (int,),
+    "float": (int, float),
+    "bool": (bool,),
+    "None": (type(None),),
+}
+"""Names in the annotations of `Question` to types in JSON."""
+
+
+def read_question(values: Any) -> Question:
+    """Return the question that a file has, without the fields that this version does not know.
+
+    Args:
+        values: From JSON, of any form.
+
+    Raises:
+        BadInput: It is no question.
+
+    Example:
+        >>> read_question({"env_id": "rare_envs/CutIn-v0", "gamma": "low"})
+        Traceback (most recent call last):
+            ...
+        rare_envs.study.errors.BadInput: Expected gamma of the recorded question to be float, got 'low'.
+    """
+    if not isinstance(values, dict) or "env_id" not in values:
+        raise BadInput(f"Expected a recorded question, an object with env_id, got {reprlib.repr(values)}.")
+    known = {each.name: str(each.type) for each in fields(Question) if each.name in values}
+    for name, annotation in known.items():
+        types = tuple(kind for word in annotation.split(" | ") for kind in _JSON_TYPES[word])
+        value = values[name]
+        if not isinstance(value, types) or (isinstance(value, bool) and bool not in types):
+            raise BadInput(f"Expected {name} of the recorded question to be {annotation}, got {reprlib.repr(value)}.")
+    return Question(**{name: values[name] for name in known})
+
+
 @dataclass(frozen=True)
 class Study:
     """A question with everything that it names, loaded and checked.
@@ -178,7 +215,7 @@ def prepare(question: Question, ego: Any = None) -> Study:
             ...
         rare_envs.study.errors.BadInput: Expected seed to be a whole number of at least 0, got -1.
     """
-    with as_bad_input(ValueError, OSError):
+    with as_bad_input(ValueError, OSError), np.errstate():  # what an ego does to NumPy's errors ends here
         method = question.check()
         if ego is None:
             ego = agents.load_ego(question.ego, algo=question.algo, trust=question.trust, stats=question.stats)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 import json
 import re
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 import samplers
 from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.files import replace_file, replace_text
+from rare_envs.plugins import one_line
 from rare_envs.study.analysis.pictures import save_sensitivity, save_severity
 from rare_envs.study.columns import MAX_SHOWN, list_columns
 from rare_envs.study.errors import BadInput
@@ -30,6 +32,8 @@ SENSITIVITY = "sensitivity.png"
 """Bars of what p is sensitive to, if the question asks for it."""
 SEVERITY = "severity.png"
 """P[collision with delta-v > v] over v, if there are collisions."""
+MAX_UNPACKED = 1 << 30
+"""Bytes of blocks that are unpacked at most: a thousand failures with a quarter of a million values each."""
 CRASH = (
     "crash",
     "striking",
@@ -117,6 +121,7 @@ def read_failures(folder: Path) -> dict[str, NDArray[Any]]:
 
     Raises:
         FileNotFoundError: There is no such run.
+        ValueError: One of its files is damaged.
 
     Example:
         >>> from tempfile import TemporaryDirectory
@@ -130,19 +135,54 @@ def read_failures(folder: Path) -> dict[str, NDArray[Any]]:
         >>> failures["gap"].shape, str(failures["crash"][0]), round(float(failures["f"][0]), 2)
         ((21,), 'none', 2.57)
     """
-    with (folder / FAILURES).open(newline="", encoding="utf-8") as file:
-        header, *rows = csv.reader(file)
+    try:
+        failures = _read_table(folder / FAILURES)
+    except (csv.Error, ValueError) as error:
+        raise ValueError(f"{str(folder / FAILURES)!r} is damaged: {error}.") from error
+    if (folder / BLOCKS).exists():
+        failures |= _read_blocks(folder / BLOCKS)
+    lengths = {name: len(values) for name, values in failures.items()}
+    if not {"f", "log_p0"} <= set(lengths) or len(set(lengths.values())) > 1:
+        raise ValueError(f"The files of failures in {str(folder)!r} are damaged: they do not have the same rows.")
+    return failures
+
+
+def _read_table(path: Path) -> dict[str, NDArray[Any]]:
+    """Return the columns of a table by name.
+
+    Raises:
+        ValueError: It is no table, or a cell is no number.
+    """
+    with path.open(newline="", encoding="utf-8") as file:
+        header, *rows = csv.reader(file) or [[]]
+    if any(len(row) != len(header) for row in rows):
+        raise ValueError("a row has more or fewer cells than the header")
     columns: dict[str, list[NDArray[Any]]] = {}
     for column, name in enumerate(header):
         cells = [row[column] for row in rows]
         words = name == CRASH[0]
         values = np.array(cells, dtype=str) if words else np.array([float(cell or "nan") for cell in cells])
         columns.setdefault(name.partition("[")[0], []).append(values)
-    failures = {name: parts[0] if len(parts) == 1 else np.stack(parts, axis=1) for name, parts in columns.items()}
-    if (folder / BLOCKS).exists():
-        with np.load(folder / BLOCKS) as blocks:
-            failures |= {name: blocks[name].astype(np.float64) for name in blocks.files}
-    return failures
+    return {name: parts[0] if len(parts) == 1 else np.stack(parts, axis=1) for name, parts in columns.items()}
+
+
+def _read_blocks(path: Path) -> dict[str, NDArray[Any]]:
+    """Return the large blocks by name, shape (n, size).
+
+    Raises:
+        ValueError: The file is damaged.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if sum(each.file_size for each in archive.infolist()) > MAX_UNPACKED:
+                raise ValueError(f"more than {MAX_UNPACKED:,} bytes unpacked")
+        with np.load(path, allow_pickle=False) as blocks:
+            found = {name: np.asarray(blocks[name]) for name in blocks.files}
+        if any(block.dtype.kind != "f" or block.ndim != 2 for block in found.values()):
+            raise ValueError("a block is no table of numbers")
+    except Exception as error:  # the zip, its compression and NumPy's headers have errors of their own
+        raise ValueError(f"{str(path)!r} is damaged: {one_line(error)}.") from error
+    return {name: block.astype(np.float64) for name, block in found.items()}
 
 
 def _write_failures(folder: Path, report: Report) -> None:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from dataclasses import fields
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,11 +14,12 @@ from PIL import Image, ImageDraw
 
 from rare_envs.envs.rendering import FRAME_WIDTH, Renderer
 from rare_envs.files import replace_file
+from rare_envs.json_text import parse_json_object
 from rare_envs.problem import DrivingProblem
 from rare_envs.study.columns import MAX_SHOWN, format_value
 from rare_envs.study.errors import BadInput
 from rare_envs.study.journal import JOURNAL
-from rare_envs.study.question import Question, prepare
+from rare_envs.study.question import prepare, read_question
 from rare_envs.study.replay import Drive
 from rare_envs.study.run_directory import FAILURES, RESULT, read_failures
 
@@ -59,23 +59,37 @@ def find_failure(folder: Path, number: int, trust: bool = False) -> RecordedFail
     if (folder / JOURNAL).exists():
         raise BadInput(f"The run in {str(folder)!r} is not finished: rare-envs resume {folder} comes first.")
     try:
-        recorded = json.loads((folder / RESULT).read_text(encoding="utf-8"))["question"]
+        recorded = parse_json_object((folder / RESULT).read_text(encoding="utf-8"), repr(str(folder / RESULT)))
         table = read_failures(folder)
-    except (OSError, ValueError, KeyError) as error:
+    except OSError as error:
         raise BadInput(
             f"No run in {str(folder)!r}: expected {RESULT} and {FAILURES}, as rare-envs estimate --out writes."
         ) from error
-    known = {field.name for field in fields(Question)}
-    problem = prepare(
-        Question(**{**{name: recorded[name] for name in recorded if name in known}, "trust": trust})
-    ).problem
+    except ValueError as error:
+        raise BadInput(error) from error
+    problem = prepare(replace(read_question(recorded.get("question")), trust=trust)).problem
     count = len(table["f"])
     if not 0 <= number < count:
         raise BadInput(
             f"Expected a failure from 0 to {count - 1}, got {number}." if count else "The run has no failure."
         )
-    x = np.concatenate([np.atleast_1d(table[name][number]) for name in problem.space.names])
+    x = _join_parameters(table, problem, number)
     return RecordedFailure(problem, x, float(table["f"][number]), float(table["log_p0"][number]), count)
+
+
+def _join_parameters(table: dict[str, NDArray[Any]], problem: DrivingProblem, number: int) -> NDArray[np.float64]:
+    """Return x (d,) of a row.
+
+    Raises:
+        BadInput: The columns are others than those of the problem, or x is no scenario of its traffic.
+    """
+    names = problem.space.names
+    if not set(names) <= set(table):
+        raise BadInput(f"Expected {FAILURES} with the columns {', '.join(names)}; the run is of another problem.")
+    x = np.concatenate([np.atleast_1d(table[name][number]) for name in names])
+    if x.shape != (problem.dim,) or not np.isfinite(x).all() or not np.isfinite(problem.base.log_prob(x[None])).all():
+        raise BadInput(f"Failure {number} in {FAILURES} is no scenario of {problem.env_id} and its base distribution.")
+    return x
 
 
 def draw_frames(drive: Drive) -> list[Image.Image]:

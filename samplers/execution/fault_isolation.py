@@ -39,7 +39,7 @@ class FaultIsolation:
 
     def __init__(self, evaluate: Evaluate, on_error: OnError = "raise") -> None:
         self.n_retried = 0
-        self._evaluate = evaluate
+        self._evaluate = _keep_error_settings(evaluate)
         self._on_error = on_error
 
     def evaluate(self, x: FloatArray) -> ArrayLike:
@@ -59,6 +59,16 @@ class FaultIsolation:
         f, n_retried = isolate_failing_rows(self._evaluate, x)
         self.n_retried += n_retried
         return f
+
+
+def _keep_error_settings(evaluate: Evaluate) -> Evaluate:
+    """Return f whose settings of NumPy's errors (`np.seterr`) are its own."""
+
+    def call(x: FloatArray) -> ArrayLike:
+        with np.errstate():
+            return evaluate(x)
+
+    return call
 
 
 def isolate_failing_rows(evaluate: Evaluate, x: FloatArray) -> tuple[FloatArray, int]:
