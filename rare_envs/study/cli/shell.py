@@ -42,7 +42,7 @@ class OneLineErrors(TyperGroup):
         """Run a command and exit."""
         received: list[int] = []
         try:
-            with _signals_as_exceptions(received), _one_line_warnings():
+            with signals_as_exceptions(received), one_line_warnings():
                 code = super().main(*args, **{**extra, "standalone_mode": False})
         except _UsageError as error:
             words = getattr(error, "format_message")()  # noqa: B009  (its class differs by version)
@@ -62,7 +62,7 @@ class OneLineErrors(TyperGroup):
 
 
 @contextlib.contextmanager
-def _signals_as_exceptions(received: list[int]) -> Iterator[None]:
+def signals_as_exceptions(received: list[int]) -> Iterator[None]:
     """Raise `Terminated` on SIGTERM and SIGHUP, where they would end the process without a word."""
 
     def end(number: int, frame: FrameType | None) -> None:
@@ -82,7 +82,7 @@ def _signals_as_exceptions(received: list[int]) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _one_line_warnings() -> Iterator[None]:
+def one_line_warnings() -> Iterator[None]:
     """Print warnings in one line."""
 
     def show(message: Warning | str, *_: Any, **__: Any) -> None:

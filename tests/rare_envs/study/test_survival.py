@@ -49,7 +49,7 @@ for name in ("replace", "unlink"):  # what the final writes end in
         setattr(Path, name, counted)
 cli.main()
 """
-WORDS = ["--method", "mc", "--max-sim", "1500", "--gamma", "1", "--horizon", "2", "--seed", "5"]
+WORDS = ["--method", "mc", "--max-sim", "6000", "--gamma", "1", "--horizon", "2", "--seed", "5"]
 
 
 @pytest.fixture
@@ -117,6 +117,7 @@ def test_killed_at_random_times_it_gives_the_same_files(tmp_path: Path, risky: s
         time.sleep(float(rng.uniform(0.0, 0.05)))
         process.send_signal(signal.SIGKILL)
         process.communicate()
+        assert process.returncode == -signal.SIGKILL
         if has_simulations(run):
             words = ["resume", "run"]
     finish(tmp_path, *words)

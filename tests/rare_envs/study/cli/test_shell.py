@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import pytest
 
+from rare_envs.study.cli.shell import Terminated, keep_stdout_for_the_answer, one_line_warnings, signals_as_exceptions
 from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli, assert_refused
 
 
@@ -53,3 +57,38 @@ def test_what_an_ego_prints_is_no_part_of_the_answer(cli: Cli, here: Path, risky
     assert json.loads(result.stdout)["n_sim"] == 2000
     for speaker in ("module", "function", "policy"):
         assert f"says the {speaker}" in result.stderr
+
+
+def test_what_is_written_to_the_descriptor_itself_is_no_part_of_the_answer(capfd: pytest.CaptureFixture[str]) -> None:
+    with keep_stdout_for_the_answer():
+        print("says Python")
+        os.write(1, b"says the descriptor\n")
+        subprocess.run([sys.executable, "-c", "print('says a child')"], check=True)
+    print("the answer")
+    os.write(1, b"and its end\n")
+    said = capfd.readouterr()
+    assert said.out == "the answer\nand its end\n"
+    for speaker in ("Python", "the descriptor", "a child"):
+        assert f"says {speaker}\n" in said.err
+
+
+def test_a_warning_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        with one_line_warnings():
+            warnings.warn("Cannot write\n  the journal.", stacklevel=1)
+    assert capsys.readouterr().err == "rare-envs: Cannot write the journal.\n"
+
+
+def test_a_signal_that_the_user_has_ignored_stays_so() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
+    received: list[int] = []
+    try:
+        with signals_as_exceptions(received):
+            os.kill(os.getpid(), signal.SIGHUP)
+            with pytest.raises(Terminated, match="ended by SIGTERM"):
+                os.kill(os.getpid(), signal.SIGTERM)
+        assert received == [signal.SIGTERM]
+        assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    finally:
+        signal.signal(signal.SIGHUP, before)
