@@ -32,7 +32,7 @@ SENSITIVITY = "sensitivity.png"
 """Bars of what p is sensitive to, if the question asks for it."""
 SEVERITY = "severity.png"
 """P[collision with delta-v > v] over v, if there are collisions."""
-MAX_UNPACKED = 1 << 30
+MAX_BLOCK_BYTES = 1 << 30
 """Bytes of blocks that are unpacked at most: a thousand failures with a quarter of a million values each."""
 CRASH = (
     "crash",
@@ -48,7 +48,7 @@ CRASH = (
 """Columns of failures.csv that say what a failure ended in: `rare_envs.traffic.crash.Crash`."""
 FAULTS, FAULT_BLOCKS = "faults.csv", "faults.npz"
 """The same for scenarios on which the ego failed."""
-RESULT_FILES = (RESULT, FAILURES, BLOCKS, PLOT, SENSITIVITY, FAULTS, FAULT_BLOCKS)
+RESULT_FILES = (RESULT, FAILURES, BLOCKS, PLOT, SENSITIVITY, SEVERITY, FAULTS, FAULT_BLOCKS)
 
 
 def write_run(folder: Path, report: Report) -> None:
@@ -174,8 +174,8 @@ def _read_blocks(path: Path) -> dict[str, NDArray[Any]]:
     """
     try:
         with zipfile.ZipFile(path) as archive:
-            if sum(each.file_size for each in archive.infolist()) > MAX_UNPACKED:
-                raise ValueError(f"more than {MAX_UNPACKED:,} bytes unpacked")
+            if sum(each.file_size for each in archive.infolist()) > MAX_BLOCK_BYTES:
+                raise ValueError(f"more than {MAX_BLOCK_BYTES:,} bytes unpacked")
         with np.load(path, allow_pickle=False) as blocks:
             found = {name: np.asarray(blocks[name]) for name in blocks.files}
         if any(block.dtype.kind != "f" or block.ndim != 2 for block in found.values()):

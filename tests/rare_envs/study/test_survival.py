@@ -131,7 +131,7 @@ def test_killed_at_random_times_it_gives_the_same_files(tmp_path: Path, risky: s
 def test_killed_in_the_final_writes_it_gives_the_same_files(kill_at: int, tmp_path: Path, risky: str) -> None:
     words = ["estimate", FOLLOWING, "--base", risky, *WORDS, "--out"]
     finish(tmp_path, *words, "whole")
-    process = start(tmp_path, *words, "run", KILL_AT=str(kill_at + 7))  # 7 files of an earlier run are removed first
+    process = start(tmp_path, *words, "run", KILL_AT=str(kill_at + len(run_directory.RESULT_FILES)))  # removed at first
     process.communicate()
     if process.returncode == -signal.SIGKILL:
         assert (tmp_path / "run" / JOURNAL).exists()
