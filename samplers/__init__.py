@@ -26,6 +26,7 @@ from samplers.methods.importance_sampling import ImportanceSampling
 from samplers.methods.improved_cross_entropy import ImprovedCrossEntropy
 from samplers.methods.monte_carlo import MonteCarlo
 from samplers.methods.subset_simulation import AdaptiveSubsetSimulation, SubsetSimulation
+from samplers.methods.surrogate.method import Surrogate
 from samplers.methods.two_stage.method import TwoStage
 from samplers.problem import (
     Distribution,
@@ -89,6 +90,7 @@ __all__ = [
     "SubsetSimulation",
     "TermGradients",
     "Terms",
+    "Surrogate",
     "TwoStage",
     "compare",
     "compute_ratio_uncertainty",

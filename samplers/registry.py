@@ -13,6 +13,7 @@ from samplers.methods.importance_sampling import ImportanceSampling
 from samplers.methods.improved_cross_entropy import ImprovedCrossEntropy
 from samplers.methods.monte_carlo import MonteCarlo
 from samplers.methods.subset_simulation import AdaptiveSubsetSimulation, SubsetSimulation
+from samplers.methods.surrogate.method import Surrogate
 from samplers.methods.two_stage.method import TwoStage
 from samplers.validation import check_name
 
@@ -70,6 +71,7 @@ class Methods(Mapping[str, type[Stepping]]):
 
 METHODS = Methods(
     TwoStage,
+    Surrogate,
     MonteCarlo,
     ImportanceSampling,
     CrossEntropy,

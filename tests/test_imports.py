@@ -37,6 +37,7 @@ FLOORS = {
         execution
         methods
         methods.cross_entropy methods.two_stage
+        methods.surrogate
         registry
         estimation
         comparison testing

@@ -1,0 +1,210 @@
+"""Kriging of f: a Gaussian process that gives every point a probability of failure.
+
+Made robust against what simulators return:
+
+- *Scale.* Outcomes y = f - gamma are compressed, z = arcsinh(y / c): what is far from gamma matters little.
+- *Caps.* Where many outcomes equal the largest (a capped time to collision) or the least one (-1 on collision), the
+  process need not pass through them. They are censored: known to be at least the cap, or at most 0, and replaced by
+  their leave-one-out predictions within these bounds.
+- *Noise and jumps* are a nugget whose size is found with the other covariance parameters.
+- *Overconfidence.* Standard deviations are inflated by the standardised residuals of leaving each point out.
+
+References:
+    Rasmussen and Williams, "Gaussian Processes for Machine Learning", MIT Press, 2006 (5.10 to 5.12: leave-one-out).
+"""
+
+import math
+import warnings
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_solve, solve_triangular
+from scipy.optimize import minimize
+from scipy.special import log_ndtr
+
+from samplers.methods.surrogate.settings import DEFAULT_SURROGATE_SETTINGS, KrigingSettings
+from samplers.problem import FloatArray
+
+LARGEST = 1e300
+"""Larger outcomes stand for infinite ones."""
+IMPUTED_SPREAD = 3.0
+"""Replaced outcomes lie at most so many standard deviations beyond their bound."""
+JUST_FAILED = 1e-3
+"""Least depth of a failing outcome that is replaced, in compressed units."""
+NEAR = 6.0
+"""Residuals count where the limit state is within so many standard deviations."""
+
+
+class Prediction(NamedTuple):
+    """Prediction of compressed outcomes minus that of gamma, at n points."""
+
+    mean: FloatArray
+    """Shape (n,)."""
+    sd: FloatArray
+    """Standard deviation, noise included, shape (n,)."""
+
+    @property
+    def log_fail(self) -> FloatArray:
+        """Logarithm of P[f <= gamma], shape (n,)."""
+        return np.asarray(log_ndtr(-self.mean / self.sd))
+
+    @property
+    def log_safe(self) -> FloatArray:
+        """Logarithm of P[f > gamma], shape (n,)."""
+        return np.asarray(log_ndtr(self.mean / self.sd))
+
+
+@dataclass(frozen=True, eq=False)
+class Kriging:
+    """A fitted process.
+
+    Example:
+        >>> import numpy as np
+        >>> u = np.random.default_rng(0).standard_normal((40, 2))
+        >>> kriging = fit_kriging(u, 2.0 - u[:, 0])
+        >>> np.exp(kriging.predict(np.array([[1.0, 0.0], [3.0, 0.0]])).log_fail).round(3)
+        array([0., 1.])
+    """
+
+    process: Any
+    """scikit-learn's `GaussianProcessRegressor`, fitted to standardised outcomes."""
+    limit: float
+    """The limit state in standardised outcomes."""
+    inflation: float
+    """Factor on standard deviations."""
+    scale: float
+    """c of the compression of outcomes, that of the first fit."""
+    n_searched: int
+    """Points when covariance parameters were last searched for."""
+
+    def predict(self, u: FloatArray) -> Prediction:
+        """Predict at u (n, d)."""
+        mean, sd = self.process.predict(u, return_std=True)
+        return Prediction(mean - self.limit, np.maximum(sd, 1e-9) * self.inflation)
+
+    def covariance(self, u: FloatArray) -> FloatArray:
+        """Return the posterior covariance of f without its noise at u (n, d), shape (n, n)."""
+        smooth = self.process.kernel_.k1
+        half = solve_triangular(self.process.L_, smooth(u, self.process.X_train_).T, lower=True)
+        return np.asarray(self.inflation**2 * (smooth(u) - half.T @ half))
+
+    @property
+    def noise(self) -> float:
+        """Variance of the nugget."""
+        return float(self.inflation**2 * self.process.kernel_.k2.noise_level)
+
+
+class _Outcomes(NamedTuple):
+    """Compressed outcomes, shape (n,), and which of them are only bounds."""
+
+    z: FloatArray
+    capped: NDArray[np.bool_]
+    floored: NDArray[np.bool_]
+
+
+def fit_kriging(
+    u: FloatArray,
+    y: FloatArray,
+    before: Kriging | None = None,
+    settings: KrigingSettings = DEFAULT_SURROGATE_SETTINGS.kriging,
+) -> Kriging:
+    """Fit a process to outcomes.
+
+    Args:
+        u: Points, shape (n, d).
+        y: f - gamma there, shape (n,); may be infinite.
+        before: Fitted to some of them: the search for covariance parameters begins there, or is left out.
+        settings: Numbers.
+    """
+    scale = outcome_scale(y, settings) if before is None else before.scale
+    outcomes = compress_outcomes(y, scale, settings)
+    search = before is None or len(y) >= settings.refit_growth * before.n_searched
+    kernel = _initial_kernel(u.shape[1], settings) if before is None else before.process.kernel_
+    z, censored = outcomes.z, bool(outcomes.capped.any() or outcomes.floored.any())
+    for turn in range(1 + settings.imputations * censored):
+        first_or_last = turn in (0, settings.imputations * censored)
+        standard, mean, sd = _standardise(z)
+        if search and first_or_last:
+            nearest = np.argsort(np.abs(z), kind="stable")[: settings.most_points]
+            kernel = _search_kernel(kernel, u[nearest], standard[nearest], settings)
+        process = _condition(kernel, u, standard)
+        left_out, left_out_sd = _leave_one_out(process, standard)
+        residuals = (standard - left_out) / left_out_sd
+        z = _impute(outcomes, mean + sd * left_out)
+    limit = -mean / sd
+    near = np.abs(left_out - limit) < NEAR * left_out_sd
+    inflation = math.sqrt(float((residuals[near] ** 2).mean())) if near.any() else 1.0
+    n_searched = len(y) if before is None or search else before.n_searched
+    return Kriging(process, limit, min(max(inflation, 1.0), settings.most_inflation), scale, n_searched)
+
+
+def outcome_scale(y: FloatArray, settings: KrigingSettings = DEFAULT_SURROGATE_SETTINGS.kriging) -> float:
+    """Return the scale c of outcomes y = f - gamma (n,)."""
+    sizes = np.abs(y[(np.abs(y) < LARGEST) & (y != 0)])
+    return settings.outcome_scale * (float(np.median(sizes)) if len(sizes) else 1.0)
+
+
+def compress_outcomes(
+    y: FloatArray, scale: float, settings: KrigingSettings = DEFAULT_SURROGATE_SETTINGS.kriging
+) -> _Outcomes:
+    """Return compressed outcomes of y = f - gamma (n,), and which of them stand at a cap or floor of f."""
+    y = np.clip(y, *_finite_range(y[np.abs(y) < LARGEST]))
+    ties = max(settings.least_ties, settings.tie_share * len(y))
+    capped, floored = (y == y.max()) & (y > 0), (y == y.min()) & (y <= 0)
+    return _Outcomes(np.arcsinh(y / scale), capped & (capped.sum() >= ties), floored & (floored.sum() >= ties))
+
+
+def _finite_range(y: FloatArray) -> tuple[float, float]:
+    """Return bounds that stand for -inf and +inf beside finite outcomes y (n,)."""
+    size = float(np.abs(y).max()) if len(y) else 1.0
+    return -(size or 1.0), size or 1.0
+
+
+def _impute(outcomes: _Outcomes, predicted: FloatArray) -> FloatArray:
+    """Return the outcomes with censored ones replaced by predictions within their bounds, shape (n,)."""
+    z, spread = outcomes.z, IMPUTED_SPREAD * float(outcomes.z.std())
+    z = np.where(outcomes.capped, np.clip(predicted, z, z + spread), z)
+    return np.where(outcomes.floored, np.clip(predicted, outcomes.z - spread, -JUST_FAILED), z)
+
+
+def _standardise(z: FloatArray) -> tuple[FloatArray, float, float]:
+    """Return z (n,) with mean 0 and standard deviation 1, and both before."""
+    mean, sd = float(z.mean()), max(float(z.std()), 1e-9)
+    return (z - mean) / sd, mean, sd
+
+
+def _initial_kernel(dim: int, settings: KrigingSettings) -> Any:
+    """Return a Matern covariance with a length for each coordinate, and a nugget."""
+    from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel  # slow to import
+
+    lengths = np.full(dim, 2.0 * math.sqrt(dim))  # about the distance between two draws
+    smooth = ConstantKernel(1.0, (1e-2, 1e3)) * Matern(lengths, (0.2, 100.0), nu=settings.smoothness)
+    return smooth + WhiteKernel(1e-4, (1e-8, 1.0))
+
+
+def _search_kernel(kernel: Any, u: FloatArray, z: FloatArray, settings: KrigingSettings) -> Any:
+    """Return the covariance whose parameters have the highest likelihood near those of `kernel`."""
+
+    def climb(loss: Any, start: Any, bounds: Any) -> tuple[FloatArray, float]:
+        options: Any = {"maxiter": settings.hyperparameter_steps}
+        found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+        return found.x, found.fun
+
+    return _condition(kernel, u, z, climb).kernel_
+
+
+def _condition(kernel: Any, u: FloatArray, z: FloatArray, optimiser: Any = None) -> Any:
+    """Return the process given outcomes z (n,) at u (n, d), its covariance parameters kept or searched."""
+    from sklearn.gaussian_process import GaussianProcessRegressor
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # parameters at their bounds are no concern
+        return GaussianProcessRegressor(kernel, optimizer=optimiser).fit(u, z)
+
+
+def _leave_one_out(process: Any, z: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return mean and standard deviation of each outcome z (n,) given all others."""
+    precision = np.diag(cho_solve((process.L_, True), np.eye(len(z))))
+    return z - process.alpha_.ravel() / precision, 1 / np.sqrt(precision)

@@ -1,0 +1,209 @@
+"""Run of the method `Surrogate`: learning, then draws for the estimate."""
+
+import math
+from collections.abc import Generator
+from dataclasses import replace
+
+import numpy as np
+
+from samplers.importance.draws import Draws, weight_warnings, weighted_interval
+from samplers.importance.sampling import count_final_draws, simulate_until
+from samplers.importance.search import FinalDraws
+from samplers.method import Goal, Interrupted, Outcome, Steps, no_outcome_share
+from samplers.methods.surrogate.kriging import Kriging, fit_kriging
+from samplers.methods.surrogate.learning import choose_batch, design_size, draw_design, learning_size
+from samplers.methods.surrogate.pool import PoolProposal, build_proposal, draw_pool, first_mixture, fit_mixture
+from samplers.methods.surrogate.settings import SurrogateSettings
+from samplers.methods.surrogate.unseen import count_discoveries, upper_end_with_unseen
+from samplers.problem import FloatArray, Inputs, StandardNormal
+from samplers.proposals.gaussian import TiltedNormal
+from samplers.statistics.intervals import Interval, degrees_of_freedom, log_normal_interval
+from samplers.trace import Level, Status
+
+
+class SurrogateRun:
+    """One run: what has been simulated so far.
+
+    Args:
+        inputs: Without coordinates that are noise.
+        goal: Threshold, confidence, target and budget.
+        budget: Simulations to plan for.
+        settings: Numbers.
+        rng: Source of randomness.
+    """
+
+    def __init__(
+        self, inputs: Inputs, goal: Goal, budget: int, settings: SurrogateSettings, rng: np.random.Generator
+    ) -> None:
+        self.inputs, self.goal, self.budget, self.settings, self.rng = inputs, goal, budget, settings, rng
+        self.u, self.f = np.empty((0, inputs.dim)), np.empty(0)
+        self.trace: list[Level] = []
+        self.n_design, self.failing_batches = 0, 0
+
+    def steps(self) -> Steps:
+        """Learn; then estimate, or leave it to plain Monte Carlo."""
+        learning, scales = self.settings.learning, self.settings.learning.scales
+        try:
+            self.n_design = design_size(self.budget, self.inputs.dim, learning)
+            yield from self._simulate(draw_design(self.n_design, self.inputs.dim, scales, self.rng))
+            if (self.f[: self.n_design // len(scales)] <= self.goal.gamma).mean() >= learning.common_share:
+                return (yield from self.draw_base())
+            kriging = yield from self._learn()
+        except Interrupted:
+            return self._estimate_early(Status.STOPPED)
+        if not (self.f <= self.goal.gamma).any():
+            about = f"None of {len(self.f):,} simulations for learning failed: base draws take the rest."
+            return warn_first(about, (yield from self.draw_base()))
+        return (yield from self._estimate(self._build_proposal(kriging)))
+
+    def draw_base(self) -> Steps:
+        """Spend the rest on base draws; those of the design do not count, for they may have decided it."""
+        base = TiltedNormal(np.zeros(self.inputs.dim))
+        limit, batch = self._count_draws(), max(self.budget - len(self.f), 1)
+        draws, trace, stopped = yield from simulate_until(self.inputs, base, self.goal, limit, batch, self.rng)
+        if draws.n == 0:
+            return self._estimate_early(Status.STOPPED if stopped else Status.BUDGET)
+        final = FinalDraws(draws, (*self.trace, *trace), 1.0, draws.n, stopped, from_search=False)
+        return final.outcome(self.goal, Status.CONVERGED, ())
+
+    def _simulate(self, u: FloatArray) -> Generator[FloatArray, FloatArray, None]:
+        """Simulate u (n, d) to learn from."""
+        f = yield self.inputs.base.from_standard_normal(u)
+        self.u, self.f = np.concatenate([self.u, u]), np.concatenate([self.f, f])
+        failing = float((f <= self.goal.gamma).mean())
+        self._record(
+            Level(gamma=self.goal.gamma, p=failing, estimate=math.nan, n_sim=len(f), n_points=len(f), cov=math.inf)
+        )
+
+    def _record(self, level: Level) -> None:
+        """Add a level to the trace."""
+        self.trace.append(level)
+        self.goal.on_level(level)
+
+    def _learn(self) -> Generator[FloatArray, FloatArray, Kriging]:
+        """Simulate batches where the surrogate is in doubt, until it is good enough or has its share of the budget."""
+        learning, scales = self.settings.learning, self.settings.learning.scales
+        most = learning_size(self.budget, learning)
+        size = max((most - self.n_design) // learning.batches, learning.least_batch)
+        kriging = fit_kriging(self.u, self.f - self.goal.gamma, None, self.settings.kriging)
+        mixture, good = first_mixture(self.inputs.dim, scales), 0
+        while len(self.f) < most and good < 2:
+            pool = draw_pool(kriging, mixture, self.settings.pool.learning_size, self.rng)
+            before = int((self.f <= self.goal.gamma).sum())
+            batch = choose_batch(kriging, pool, min(size, most - len(self.f)), learning, self.rng)
+            yield from self._simulate(batch)
+            failures = int((self.f <= self.goal.gamma).sum())
+            self.failing_batches += failures > before
+            forecast = pool.forecast_cov(self.budget - len(self.f))
+            good = good + 1 if failures and forecast < learning.forecast_cov else 0
+            mixture = fit_mixture(pool, scales, self.settings.pool, self.rng)
+            kriging = fit_kriging(self.u, self.f - self.goal.gamma, kriging, self.settings.kriging)
+        self._mixture = mixture
+        return kriging
+
+    def _build_proposal(self, kriging: Kriging) -> PoolProposal:
+        """Return the proposal for the estimate."""
+        scales, settings = self.settings.learning.scales, self.settings.pool
+        for _ in range(settings.final_rounds):
+            pool = draw_pool(kriging, self._mixture, settings.final_size // 4, self.rng)
+            self._mixture = fit_mixture(pool, scales, settings, self.rng)
+        pool = draw_pool(kriging, self._mixture, settings.final_size, self.rng)
+        return build_proposal(pool, scales, self.settings.base_share, self.settings.wide_share)
+
+    def _count_draws(self) -> int:
+        """Return the number of draws of the estimate at most."""
+        return count_final_draws(self.goal, len(self.f), self.budget - len(self.f))
+
+    def _estimate(self, proposal: PoolProposal) -> Steps:
+        """Draw from the proposal until the budget is used or the target is met; p rests on these draws alone."""
+        goal, stopped, cov = self.goal, False, math.inf
+        draws, wide_weights, kinds = Draws(0, np.empty(0), np.empty(0)), [self._design_log_weights()], np.zeros((2, 3))
+        left = self._count_draws()
+        size = left if goal.target_cov is None else max(int(self.settings.target_batch * self.budget), 1)
+        while left > 0 and not (goal.target_cov is not None and cov <= goal.target_cov):
+            new = proposal.draw(min(size, left), self.rng)
+            x = self.inputs.base.from_standard_normal(new.u)
+            try:
+                f = yield x
+            except Interrupted:
+                stopped = True
+                break
+            draws = draws.join(Draws.from_outcomes(f, new.log_weights, x, goal.gamma))
+            fails = f <= goal.gamma
+            kinds += np.array([np.bincount(new.part, minlength=3), np.bincount(new.part[fails], minlength=3)])
+            wide_weights.append(new.log_wide_weights[fails & (new.part == 2)])
+            cov = math.hypot(draws.cov, math.sqrt(proposal.pool_variance))
+            left -= len(f)
+            level = Level(
+                gamma=goal.gamma,
+                p=float(fails.mean()),
+                estimate=draws.p,
+                n_sim=len(f),
+                n_points=len(f),
+                cov=cov,
+                ess=draws.ess,
+            )
+            self._record(level)
+        if draws.n == 0:
+            return self._estimate_early(Status.STOPPED if stopped else Status.BUDGET)
+        discoveries = count_discoveries(self.failing_batches, np.concatenate(wide_weights))
+        outcome = self._outcome(draws, cov, proposal.largest_weight, Status.STOPPED if stopped else Status.CONVERGED)
+        high = upper_end_with_unseen(draws.p, outcome.interval[1], discoveries, goal.confidence)
+        return replace(
+            outcome,
+            interval=(outcome.interval[0], high),
+            warnings=(*outcome.warnings, *_skill_warnings(kinds, self.settings.least_skill)),
+            base_draws=int(kinds[0, 1]),
+        )
+
+    def _design_log_weights(self, *, failing: bool = True) -> FloatArray:
+        """Return log(phi / q) of the points of the design, q the equal mixture of its scales; of the failing ones."""
+        u, f = self.u[: self.n_design], self.f[: self.n_design]
+        u = u[f <= self.goal.gamma] if failing else u
+        design = first_mixture(self.inputs.dim, self.settings.learning.scales)
+        return StandardNormal(self.inputs.dim).log_prob(u) - design.log_prob(u)
+
+    def _estimate_early(self, status: Status) -> Outcome:
+        """Return what the first design says, for a run that ends before its estimate."""
+        n = self.n_design
+        x = self.inputs.base.from_standard_normal(self.u[:n])
+        draws = Draws.from_outcomes(self.f[:n], self._design_log_weights(failing=False), x, self.goal.gamma)
+        return self._outcome(draws, draws.cov, float(len(self.settings.learning.scales)), status)
+
+    def _interval(self, draws: Draws, cov: float, largest_weight: float) -> Interval:
+        """Return the interval of p from weighted draws, for the regions that they know of."""
+        if draws.ess < self.settings.least_ess:
+            return weighted_interval(draws, self.goal.confidence, largest_weight, cov)
+        return log_normal_interval(draws.p, cov, self.goal.confidence, degrees_of_freedom(draws.ess, independent=True))
+
+    def _outcome(self, draws: Draws, cov: float, largest_weight: float, status: Status) -> Outcome:
+        """Return what weighted draws say of p; no weight exceeds `largest_weight`."""
+        ended = Status.NO_HITS if status is Status.CONVERGED and len(draws.f) == 0 else status
+        return Outcome(
+            p=min(draws.p, 1.0),
+            interval=self._interval(draws, cov, largest_weight),
+            cov=cov,
+            status=ended,
+            warnings=tuple(weight_warnings(draws)),
+            trace=tuple(self.trace),
+            no_outcome_share=no_outcome_share(draws.f, draws.log_weights),
+            sample=draws.sample,
+        )
+
+
+def _skill_warnings(kinds: FloatArray, least: float) -> list[str]:
+    """Return the warning that the surrogate leads to few failures, if so.
+
+    Args:
+        kinds: Draws and failing draws of the surrogate, base and wide parts, shape (2, 3).
+        least: Share of the surrogate's draws that should fail.
+    """
+    n, failing = kinds[:, 0]
+    if failing >= least * n:
+        return []
+    return [f"Only {failing:.0f} of {n:.0f} draws that the surrogate proposed failed: it describes f poorly."]
+
+
+def warn_first(about: str, outcome: Outcome) -> Outcome:
+    """Return the outcome with a warning before its own."""
+    return replace(outcome, warnings=(about, *outcome.warnings))
