@@ -18,6 +18,7 @@ from samplers.execution.interruption import EstimationInterrupted
 from samplers.execution.progress import Progress
 from samplers.execution.run import Run
 from samplers.method import Goal, Interrupted, Outcome, Stepping, Steps
+from samplers.methods.auto import Auto
 from samplers.methods.base import Method
 from samplers.methods.cross_entropy.beta_block import BetaBlock
 from samplers.methods.cross_entropy.blocks import GaussianBlock, MixtureBlock, NormalBlock, Product
@@ -46,6 +47,7 @@ from samplers.trace import Level, Status
 __all__ = [
     "METHODS",
     "AdaptiveSubsetSimulation",
+    "Auto",
     "BaseUncertainty",
     "BetaBlock",
     "Comparison",

@@ -156,6 +156,14 @@ class Stepping(Protocol):
         """Estimate P[f(X) <= goal.gamma], X ~ inputs.base."""
 
 
+@runtime_checkable
+class Choosing(Protocol):
+    """A method that leaves the run to another one, chosen before any simulation."""
+
+    def choose(self, inputs: Inputs, goal: Goal) -> tuple[Stepping, str]:
+        """Return the method for one run, and the choice in words."""
+
+
 def no_outcome_share(f: FloatArray, log_weights: FloatArray | None = None) -> float:
     """Return the (weighted) share of points without an outcome, f = -inf, among f (k,)."""
     missing = np.isneginf(f)

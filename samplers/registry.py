@@ -8,6 +8,7 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Any, cast
 
 from samplers.method import Stepping
+from samplers.methods.auto import Auto
 from samplers.methods.cross_entropy.method import CrossEntropy
 from samplers.methods.importance_sampling import ImportanceSampling
 from samplers.methods.improved_cross_entropy import ImprovedCrossEntropy
@@ -70,6 +71,7 @@ class Methods(Mapping[str, type[Stepping]]):
 
 
 METHODS = Methods(
+    Auto,
     TwoStage,
     Surrogate,
     MonteCarlo,

@@ -161,6 +161,8 @@ class Estimate:
     """Simulations that were independent draws from the base distribution."""
     given: str = ""
     """Condition of p, which the problem holds fixed: its attribute `given`, if it has one."""
+    choice: str = field(default="", compare=False)
+    """Method that `Auto` chose and why; empty where the method was named."""
     ensemble_run: "Estimate | None" = field(default=None, compare=False, repr=False)
     """The further run under the mixture of the refits of the base, where `estimate` needed one."""
     refit_ratios: RatioStore = field(default_factory=RatioStore, compare=False, repr=False)
@@ -320,6 +322,7 @@ class Estimate:
             *indent_lines(self.base_uncertainty),
             f"  {self.n_sim:,} simulations{gain}; {self.method.name}, seed {self.seed}, "
             f"{self.status}; {self.failures.total:,} failing points",
+            *([f"  chosen {self.choice}"] if self.choice else []),
             f"  given that {self.proviso}",
         ]
         return "\n".join(lines + [f"  warning: {text}" for text in self.warnings])
@@ -348,6 +351,7 @@ class Estimate:
                 "total": self.failures.total,
             },
             "method": {"name": self.method.name, "settings": method_settings(self.method)},
+            "choice": self.choice,
             "seed": self.seed,
         }
         return {key: to_json_value(value) for key, value in data.items()}

@@ -38,6 +38,7 @@ FLOORS = {
         methods
         methods.cross_entropy methods.two_stage
         methods.surrogate
+        methods.auto
         registry
         estimation
         comparison testing

@@ -13,7 +13,7 @@ from samplers.execution.combination import combine, combined_cov, pool_counts
 from samplers.execution.evaluation_log import EvaluationLog
 from samplers.execution.progress import Listener, Monitor, Progress
 from samplers.execution.replicate import Replicate
-from samplers.method import Goal, Outcome, Stepping
+from samplers.method import Choosing, Goal, Outcome, Stepping
 from samplers.problem import FloatArray, Inputs, condition_of
 from samplers.result import Estimate
 from samplers.statistics.intervals import gain_over_monte_carlo
@@ -58,10 +58,10 @@ class Run:
         check_arguments(problem, method)
         self._inputs = InputsOnly(int(problem.dim), problem.base)
         self._given = condition_of(problem)
-        self._method = method
         self._goal, self._on_error = arguments.goal, arguments.on_error
         self._seed = choose_seed(arguments.seed)
         self._n_wanted = int(arguments.replicates)
+        self._method, self._choice = choose_method(method, self._inputs, self._goal, self._n_wanted)
         self._log = EvaluationLog(self._inputs.dim, self._inputs.base, self._goal.gamma, self._on_error)
         self._monitor = Monitor(listener, self._goal.max_sim)
         self._requested: FloatArray | None = None
@@ -157,6 +157,7 @@ class Run:
             on_error=self._on_error,
             base_draws=whole.base_draws,
             given=self._given,
+            choice=self._choice,
         )
 
     def _outcomes(self) -> list[Outcome]:
@@ -198,6 +199,13 @@ class Run:
         while self.done and needs_another(self._replicates, self._method, self._goal, self._n_wanted):
             max_sim = self._goal.max_sim
             self._start_replicate(None if max_sim is None else max_sim - self._log.n_sim)
+
+
+def choose_method(method: Stepping, inputs: Inputs, goal: Goal, replicates: int) -> tuple[Stepping, str]:
+    """Return the method that runs, and why where another one has chosen it: by the smallest share of the budget."""
+    if not isinstance(method, Choosing):
+        return method, ""
+    return method.choose(inputs, replace(goal, max_sim=split_budget(goal.max_sim, replicates)[0]))
 
 
 def split_budget(max_sim: int | None, replicates: int) -> list[int | None]:

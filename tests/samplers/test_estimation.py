@@ -51,7 +51,7 @@ PROBLEM = half_space().problem
         ({"seed": -1}, "seed to be a whole number of at least 0, got -1"),
         ({"seed": 1.5}, "seed"),
         ({"on_error": "ignore"}, "on_error 'ignore'.*Valid: raise, failure, bound"),
-        ({"method": "adds"}, "method 'adds'. Did you mean 'adss'.*Valid: two-stage, mc, .*adss"),
+        ({"method": "adds"}, "method 'adds'. Did you mean 'adss'.*Valid: auto, two-stage, surrogate, mc, .*adss"),
         ({"method": samplers.MonteCarlo}, "the class MonteCarlo; add brackets"),
         ({"method": 3}, "a method such as MonteCarlo"),
         ({"progress": 1}, "progress to be True, False or a function"),

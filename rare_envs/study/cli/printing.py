@@ -93,6 +93,7 @@ def print_report(report: Report, out: Path | None = None) -> None:
         ("given that", estimate.proviso),
         ("gain", _format_gain(estimate)),
         ("method", f"{estimate.method.name}, seed {estimate.seed}, {estimate.status}"),
+        *([("chosen", estimate.choice)] if estimate.choice else []),
     )
     for name, value in rows:
         console.print(f"  {name:<15} {value}")

@@ -4,8 +4,8 @@ Made robust against what simulators return:
 
 - *Scale.* Outcomes y = f - gamma are compressed, z = arcsinh(y / c): what is far from gamma matters little.
 - *Caps.* Where many outcomes equal the largest (a capped time to collision) or the least one (-1 on collision), the
-  process need not pass through them. They are censored: known to be at least the cap, or at most 0, and replaced by
-  their leave-one-out predictions within these bounds.
+  process need not pass through them. They are censored: known to be at least the cap, or at most 0, and replaced
+  within these bounds by what the others predict there, then by their leave-one-out predictions.
 - *Noise and jumps* are a nugget whose size is found with the other covariance parameters.
 - *Overconfidence.* Standard deviations are inflated by the standardised residuals of leaving each point out.
 
@@ -33,7 +33,7 @@ IMPUTED_SPREAD = 3.0
 """Replaced outcomes lie at most so many standard deviations beyond their bound."""
 JUST_FAILED = 1e-3
 """Least depth of a failing outcome that is replaced, in compressed units."""
-NEAR = 6.0
+NEAR_LIMIT = 6.0
 """Residuals count where the limit state is within so many standard deviations."""
 
 
@@ -75,7 +75,7 @@ class Kriging:
     inflation: float
     """Factor on standard deviations."""
     scale: float
-    """c of the compression of outcomes, that of the first fit."""
+    """c of the compression of outcomes, chosen when parameters are searched for."""
     n_searched: int
     """Points when covariance parameters were last searched for."""
 
@@ -115,18 +115,21 @@ def fit_kriging(
     Args:
         u: Points, shape (n, d).
         y: f - gamma there, shape (n,); may be infinite.
-        before: Fitted to some of them: the search for covariance parameters begins there, or is left out.
+        before: Fitted to some of them: its covariance parameters are kept unless there are many more points.
         settings: Numbers.
     """
-    scale = outcome_scale(y, settings) if before is None else before.scale
-    outcomes = compress_outcomes(y, scale, settings)
     search = before is None or len(y) >= settings.refit_growth * before.n_searched
-    kernel = _initial_kernel(u.shape[1], settings) if before is None else before.process.kernel_
-    z, censored = outcomes.z, bool(outcomes.capped.any() or outcomes.floored.any())
-    for turn in range(1 + settings.imputations * censored):
-        first_or_last = turn in (0, settings.imputations * censored)
+    scale = outcome_scale(y, settings) if before is None or search else before.scale
+    outcomes = compress_outcomes(y, scale, settings)
+    # a search begins afresh: from the last result it may stay where few points had led it
+    kernel = _initial_kernel(u.shape[1], settings) if before is None or search else before.process.kernel_
+    z, censored = outcomes.z, outcomes.capped | outcomes.floored
+    if censored.any() and (~censored).sum() >= settings.least_uncensored:
+        kernel, z = _impute_first(kernel, u, outcomes, settings, search=search)
+    turns = settings.imputations if censored.any() else 0
+    for turn in range(1 + turns):
         standard, mean, sd = _standardise(z)
-        if search and first_or_last:
+        if search and turn == turns:
             nearest = np.argsort(np.abs(z), kind="stable")[: settings.most_points]
             kernel = _search_kernel(kernel, u[nearest], standard[nearest], settings)
         process = _condition(kernel, u, standard)
@@ -134,7 +137,7 @@ def fit_kriging(
         residuals = (standard - left_out) / left_out_sd
         z = _impute(outcomes, mean + sd * left_out)
     limit = -mean / sd
-    near = np.abs(left_out - limit) < NEAR * left_out_sd
+    near = np.abs(left_out - limit) < NEAR_LIMIT * left_out_sd
     inflation = math.sqrt(float((residuals[near] ** 2).mean())) if near.any() else 1.0
     n_searched = len(y) if before is None or search else before.n_searched
     return Kriging(process, limit, min(max(inflation, 1.0), settings.most_inflation), scale, n_searched)
@@ -160,6 +163,19 @@ def _finite_range(y: FloatArray) -> tuple[float, float]:
     """Return bounds that stand for -inf and +inf beside finite outcomes y (n,)."""
     size = float(np.abs(y).max()) if len(y) else 1.0
     return -(size or 1.0), size or 1.0
+
+
+def _impute_first(
+    kernel: Any, u: FloatArray, outcomes: _Outcomes, settings: KrigingSettings, *, search: bool
+) -> tuple[Any, FloatArray]:
+    """Return covariance and outcomes (n,) where censored ones are predicted from all others."""
+    free = ~(outcomes.capped | outcomes.floored)
+    standard, mean, sd = _standardise(outcomes.z[free])
+    if search:
+        nearest = np.argsort(np.abs(outcomes.z[free]), kind="stable")[: settings.most_points]
+        kernel = _search_kernel(kernel, u[free][nearest], standard[nearest], settings)
+    predicted = _condition(kernel, u[free], standard).predict(u)
+    return kernel, _impute(outcomes, mean + sd * predicted)
 
 
 def _impute(outcomes: _Outcomes, predicted: FloatArray) -> FloatArray:

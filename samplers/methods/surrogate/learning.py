@@ -42,7 +42,7 @@ def choose_batch(
     n_candidates = min(settings.candidates * n, int(np.count_nonzero(weights)))
     among = np.unique(rng.choice(len(pool.u), n_candidates, p=weights))
     if len(among) < n:  # nearly all weight lies on few draws
-        among = np.argsort(pool.log_doubt)[-n_candidates:]
+        among = np.argsort(pool.log_doubt)[-settings.candidates * n :]
     u, mean = pool.u[among], pool.prediction.mean[among]
     covariance, noise = kriging.covariance(u), kriging.noise
     chosen = list[int]()

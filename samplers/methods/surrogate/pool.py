@@ -60,7 +60,7 @@ def first_mixture(dim: int, scales: tuple[float, ...]) -> Mixture:
     return Mixture(np.full(len(scales), 1 / len(scales)), isotropic_normals(dim, scales))
 
 
-def draw_pool(kriging: Kriging, mixture: Mixture, n: int, rng: np.random.Generator) -> Pool:
+def draw_mixture_pool(kriging: Kriging, mixture: Mixture, n: int, rng: np.random.Generator) -> Pool:
     """Draw n points of a mixture."""
     u = mixture.sample(n, rng)
     return Pool(u, StandardNormal(u.shape[1]).log_prob(u) - mixture.log_prob(u), kriging.predict(u))
@@ -122,7 +122,7 @@ class PoolProposal(NamedTuple):
         return PoolDraws(self.pool.u[chosen], log_weights, part, self.log_wide_weights[chosen])
 
 
-def build_proposal(pool: Pool, scales: tuple[float, ...], base_share: float, wide_share: float) -> PoolProposal:
+def build_pool_proposal(pool: Pool, scales: tuple[float, ...], base_share: float, wide_share: float) -> PoolProposal:
     """Return the proposal for the estimate."""
     wide = first_mixture(pool.u.shape[1], scales[1:])
     log_wide_weights = StandardNormal(pool.u.shape[1]).log_prob(pool.u) - wide.log_prob(pool.u)

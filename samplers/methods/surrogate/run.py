@@ -12,7 +12,13 @@ from samplers.importance.search import FinalDraws
 from samplers.method import Goal, Interrupted, Outcome, Steps, no_outcome_share
 from samplers.methods.surrogate.kriging import Kriging, fit_kriging
 from samplers.methods.surrogate.learning import choose_batch, design_size, draw_design, learning_size
-from samplers.methods.surrogate.pool import PoolProposal, build_proposal, draw_pool, first_mixture, fit_mixture
+from samplers.methods.surrogate.pool import (
+    PoolProposal,
+    build_pool_proposal,
+    draw_mixture_pool,
+    first_mixture,
+    fit_mixture,
+)
 from samplers.methods.surrogate.settings import SurrogateSettings
 from samplers.methods.surrogate.unseen import count_discoveries, upper_end_with_unseen
 from samplers.problem import FloatArray, Inputs, StandardNormal
@@ -88,7 +94,7 @@ class SurrogateRun:
         kriging = fit_kriging(self.u, self.f - self.goal.gamma, None, self.settings.kriging)
         mixture, good = first_mixture(self.inputs.dim, scales), 0
         while len(self.f) < most and good < 2:
-            pool = draw_pool(kriging, mixture, self.settings.pool.learning_size, self.rng)
+            pool = draw_mixture_pool(kriging, mixture, self.settings.pool.learning_size, self.rng)
             before = int((self.f <= self.goal.gamma).sum())
             batch = choose_batch(kriging, pool, min(size, most - len(self.f)), learning, self.rng)
             yield from self._simulate(batch)
@@ -105,10 +111,10 @@ class SurrogateRun:
         """Return the proposal for the estimate."""
         scales, settings = self.settings.learning.scales, self.settings.pool
         for _ in range(settings.final_rounds):
-            pool = draw_pool(kriging, self._mixture, settings.final_size // 4, self.rng)
+            pool = draw_mixture_pool(kriging, self._mixture, settings.final_size // 4, self.rng)
             self._mixture = fit_mixture(pool, scales, settings, self.rng)
-        pool = draw_pool(kriging, self._mixture, settings.final_size, self.rng)
-        return build_proposal(pool, scales, self.settings.base_share, self.settings.wide_share)
+        pool = draw_mixture_pool(kriging, self._mixture, settings.final_size, self.rng)
+        return build_pool_proposal(pool, scales, self.settings.base_share, self.settings.wide_share)
 
     def _count_draws(self) -> int:
         """Return the number of draws of the estimate at most."""

@@ -18,15 +18,17 @@ class KrigingSettings:
     tie_share: float = 0.05
     least_ties: int = 3
     """From these shares and numbers of equal largest (least) outcomes on, these are a cap (floor) of f."""
+    least_uncensored: int = 5
+    """With fewer other outcomes, those at a cap or floor are taken as they are at first."""
     imputations: int = 2
     """Times that outcomes at a cap are replaced by their leave-one-out predictions."""
     most_inflation: float = 3.0
     """Standard deviations are inflated by the root mean square of standardised residuals, but by no more."""
     hyperparameter_steps: int = 25
-    """Steps of L-BFGS in each search for covariance parameters; the next search begins at the last result."""
+    """Steps of L-BFGS in each search for covariance parameters."""
     refit_growth: float = 1.4
     """Covariance parameters are searched anew each time the number of points has grown by this factor."""
-    most_points: int = 300
+    most_points: int = 200
     """Points nearest to the limit state that covariance parameters are searched with; a step costs their cube."""
 
 
@@ -36,7 +38,7 @@ class LearningSettings:
 
     share: float = 2 / 3
     """Largest share of the budget; a third at least is left for the draws of the estimate."""
-    most: int = 500
+    most: int = 300
     """Simulations at most: the cost of kriging grows with their cube."""
     scales: tuple[float, ...] = (1.0, 1.5, 2.2, 3.0)
     """Standard deviations of the first design, a quarter each. At 3 a plane at beta = 4.5 is crossed by one in 15."""

@@ -1,0 +1,73 @@
+"""Auto: the choice of a method by budget, dimension and cost per simulation."""
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from samplers.method import Goal, Stepping, Steps
+from samplers.methods.base import Method
+from samplers.methods.surrogate.method import Surrogate
+from samplers.methods.surrogate.settings import DEFAULT_SURROGATE_SETTINGS
+from samplers.methods.two_stage.method import TwoStage
+from samplers.methods.two_stage.noise_coordinates import noise_mask
+from samplers.problem import Inputs
+from samplers.validation import check_setting
+
+MOST_FOR_SURROGATE = 1500
+"""From more simulations on `TwoStage` finds the regions by itself; kriging of more points takes minutes."""
+SLOW = 1.0
+"""Seconds of a simulation from which on 6,000 of them are taken as too many where max_sim does not say: 100 minutes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Auto(Method):
+    """Choice between the two methods for all problems, by a rule that looks at no outcome.
+
+    `Surrogate` where a run has 60 to 1,500 simulations and the search at most 20 dimensions (coordinates that the base
+    distribution calls noise are not searched); `TwoStage` otherwise. Without max_sim a run has the 6,000 simulations of
+    `TwoStage`, or, if one takes a second or more, the 1,000 of `Surrogate`; a target c.o.v. without max_sim goes to
+    `TwoStage`. The result is that of the method chosen, to the bit; `Estimate.choice` says which and why.
+
+    Args:
+        seconds_per_simulation: Time that one simulation takes; None where it is not known.
+
+    Example:
+        >>> import samplers
+        >>> problem = samplers.FunctionProblem(lambda u: 3.5 - u[:, 0], dim=2)
+        >>> for max_sim in (200, 3000):
+        ...     print(samplers.estimate(problem, seed=0, max_sim=max_sim).choice)
+        surrogate: 200 simulations for 2 dimensions
+        two-stage: 3,000 simulations for 2 dimensions
+    """
+
+    seconds_per_simulation: float | None = None
+
+    name: ClassVar[str] = "auto"
+    stops_at_target: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        """Check the settings."""
+        if self.seconds_per_simulation is not None:
+            check_setting("Auto", "seconds_per_simulation", self.seconds_per_simulation, 0.0, math.inf)
+
+    def choose(self, inputs: Inputs, goal: Goal) -> tuple[Stepping, str]:
+        """Return the method for one run, and the choice in words.
+
+        Args:
+            inputs: Dimension and base distribution.
+            goal: Budget and target of one replicate.
+        """
+        noise = noise_mask(inputs)
+        dim = inputs.dim - (0 if noise.all() else int(np.count_nonzero(noise)))
+        slow = (self.seconds_per_simulation or 0.0) >= SLOW and goal.target_cov is None
+        usual = Surrogate().n if slow else TwoStage().n
+        budget = usual if goal.max_sim is None else goal.max_sim
+        few = DEFAULT_SURROGATE_SETTINGS.least_budget <= budget <= MOST_FOR_SURROGATE
+        method = Surrogate() if few and dim <= DEFAULT_SURROGATE_SETTINGS.most_dims else TwoStage()
+        return method, f"{method.name}: {budget:,} simulations for {dim:,} dimension{'s' * (dim != 1)}"
+
+    def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
+        """Take the steps of the method chosen."""
+        return self.choose(inputs, goal)[0].steps(inputs, goal, rng)

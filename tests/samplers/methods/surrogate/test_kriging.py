@@ -1,0 +1,86 @@
+"""Kriging of f: its probabilities of failure, and what it makes of caps, floors, infinities and noise."""
+
+import numpy as np
+import pytest
+
+from samplers.methods.surrogate.kriging import compress_outcomes, fit_kriging, outcome_scale
+
+
+def points(n, dim, seed=0, scale=2.0):
+    return scale * np.random.default_rng(seed).standard_normal((n, dim))
+
+
+def misjudged(f, dim=2, n=80):
+    """Share of fresh points whose more likely side is not theirs, after n points."""
+    u, new = points(n, dim), points(2000, dim, seed=1)
+    prediction = fit_kriging(u, f(u)).predict(new)
+    return float(((prediction.mean <= 0) != (f(new) <= 0)).mean())
+
+
+def test_probabilities_add_up_to_one():
+    u = points(40, 2)
+    prediction = fit_kriging(u, 2.0 - u[:, 0]).predict(points(50, 2, seed=1))
+    np.testing.assert_allclose(np.exp(prediction.log_fail) + np.exp(prediction.log_safe), 1.0, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "f",
+    [
+        lambda u: 2.5 - u[:, 0],
+        lambda u: np.minimum(2.5 - u[:, 0], 1.0),  # a cap at most points
+        lambda u: np.where(u[:, 0] > 2.5, -1.0, 2.5 - u[:, 0]),  # a floor where it fails
+        lambda u: np.where(u[:, 0] > 2.5, -np.inf, np.minimum(2.5 - u[:, 0], 1.0)),
+        lambda u: 3.0 - np.abs(u[:, 0] + 0.2 * u[:, 1] ** 2),
+    ],
+    ids=["plane", "capped", "floored", "capped and minus infinity", "two bent regions"],
+)
+def test_few_points_are_misjudged(f):
+    assert misjudged(f) < 0.02
+
+
+def test_censoring_serves_where_f_has_a_cap():
+    """The cap is no outcome: a process through it bends the limit state."""
+    u = points(80, 2)
+    kriging = fit_kriging(u, np.minimum(2.5 - u[:, 0], 1.0))
+    slope = np.diff(kriging.predict(np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]])).mean)
+    assert (slope < -0.1).all()  # f itself is 1 at the first two of these
+
+
+def test_noise_is_taken_as_noise():
+    """With sd 0.5, P[fail] at a depth of one sd is Phi(1) = 0.84 however many points are there."""
+    rng, u = np.random.default_rng(3), points(250, 1)
+    kriging = fit_kriging(u, 2.0 - u[:, 0] + 0.5 * rng.standard_normal(250))
+    p = np.exp(kriging.predict(np.array([[2.5], [2.0], [1.5]])).log_fail)
+    np.testing.assert_allclose(p, [0.84, 0.5, 0.16], atol=0.12)
+
+
+def test_posterior_covariance_has_the_predicted_variance_on_its_diagonal():
+    u, new = points(40, 3), points(7, 3, seed=1)
+    kriging = fit_kriging(u, 2.0 - u[:, 0] * np.exp(0.3 * u[:, 1]))
+    variance = np.diag(kriging.covariance(new)) + kriging.noise
+    np.testing.assert_allclose(variance, kriging.predict(new).sd ** 2, rtol=1e-4, atol=1e-9)
+
+
+def test_parameters_are_searched_again_only_when_points_have_grown_in_number():
+    u = points(60, 2)
+    y = 2.5 - u[:, 0]
+    first = fit_kriging(u[:40], y[:40])
+    second = fit_kriging(u[:50], y[:50], first)
+    third = fit_kriging(u, y, second)
+    assert (first.n_searched, second.n_searched, third.n_searched) == (40, 40, 60)
+    assert second.process.kernel_ == first.process.kernel_ != third.process.kernel_
+
+
+def test_ties_are_a_cap_above_gamma_and_a_floor_below():
+    y = np.array([5.0] * 5 + [3.0, 2.0, 1.0] + [-1.0] * 4)
+    outcomes = compress_outcomes(y, outcome_scale(y))
+    assert outcomes.capped.tolist() == [True] * 5 + [False] * 7
+    assert outcomes.floored.tolist() == [False] * 8 + [True] * 4
+
+
+@pytest.mark.parametrize("y", [[np.inf] * 4, [-np.inf, np.inf], [0.0, 0.0, 0.0], [1e300, -3e300]])
+def test_any_outcomes_are_compressed_to_finite_numbers_of_their_sign(y):
+    y = np.array(y)
+    z = compress_outcomes(y, outcome_scale(y)).z
+    assert np.isfinite(z).all()
+    np.testing.assert_array_equal(np.sign(z), np.sign(y))
