@@ -20,7 +20,7 @@ from samplers.methods.surrogate.pool import (
     fit_mixture,
 )
 from samplers.methods.surrogate.settings import SurrogateSettings
-from samplers.methods.surrogate.unseen import count_discoveries, upper_end_with_unseen
+from samplers.methods.two_stage.discovery.unseen import add_unseen, count_lineages
 from samplers.problem import FloatArray, Inputs, StandardNormal
 from samplers.proposals.gaussian import TiltedNormal
 from samplers.statistics.intervals import Interval, degrees_of_freedom, log_normal_interval
@@ -152,9 +152,9 @@ class SurrogateRun:
             self._record(level)
         if draws.n == 0:
             return self._estimate_early(Status.STOPPED if stopped else Status.BUDGET)
-        discoveries = count_discoveries(self.failing_batches, np.concatenate(wide_weights))
+        discoveries = count_lineages(self.failing_batches, np.concatenate(wide_weights))
         outcome = self._outcome(draws, cov, proposal.largest_weight, Status.STOPPED if stopped else Status.CONVERGED)
-        high = upper_end_with_unseen(draws.p, outcome.interval[1], discoveries, goal.confidence)
+        high = add_unseen(draws.p, outcome.interval[1], max(discoveries, 1.0), goal.confidence)
         return replace(
             outcome,
             interval=(outcome.interval[0], high),
