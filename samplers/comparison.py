@@ -16,7 +16,7 @@ from samplers.estimation import estimate
 from samplers.execution.arguments import RunArguments, check_problem
 from samplers.execution.progress import Listener
 from samplers.method import Stepping
-from samplers.methods.auto import Auto
+from samplers.methods.two_stage.method import TwoStage
 from samplers.problem import FloatArray, Problem, condition_of
 from samplers.result import Estimate, indent_lines
 from samplers.serialization import to_json_value
@@ -144,7 +144,7 @@ class EitherFails:
 def compare(
     a: Problem,
     b: Problem,
-    method: Stepping | str = Auto(),  # noqa: B008  (frozen, so safe to share)
+    method: Stepping | str = TwoStage(),  # noqa: B008  (frozen, so safe to share)
     gamma: float = RunArguments.gamma,
     seed: int | None = RunArguments.seed,
     max_sim: int | None = RunArguments.max_sim,

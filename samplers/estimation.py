@@ -18,7 +18,6 @@ from samplers.execution.journaled_evaluation import keep_simulations, open_journ
 from samplers.execution.progress import Listener, Progress, open_listener
 from samplers.execution.run import Run
 from samplers.method import Stepping
-from samplers.methods.auto import Auto
 from samplers.methods.two_stage.method import TwoStage
 from samplers.problem import FloatArray, Inputs, Problem, StandardNormal
 from samplers.registry import get_method
@@ -29,7 +28,7 @@ from samplers.validation import check_number
 
 def estimate(
     problem: Problem,
-    method: Stepping | str = Auto(),  # noqa: B008  (frozen, so safe to share)
+    method: Stepping | str = TwoStage(),  # noqa: B008  (frozen, so safe to share)
     gamma: float = RunArguments.gamma,
     seed: int | None = RunArguments.seed,
     max_sim: int | None = RunArguments.max_sim,
@@ -55,8 +54,7 @@ def estimate(
 
     Args:
         problem: Has `dim`, `base` and `evaluate`; see `Problem`.
-        method: A method with its settings, or the name of one (`METHODS`). `Auto` chooses one by the budget and the
-            dimension, see `Estimate.choice`.
+        method: A method with its settings, or the name of one (`METHODS`).
         gamma: Threshold of failure.
         seed: Same seed, same answer. None draws one, which the result states.
         max_sim: Simulations that are never exceeded, over all replicates.

@@ -59,7 +59,7 @@ import rare_envs
 import samplers
 
 problem = rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego=agents.load_ego("imitation"), base="us101-15-offsets")
-print(samplers.estimate(problem, "two-stage", seed=0, max_sim=1500))
+print(samplers.estimate(problem, seed=0, max_sim=1500))
 ```
 
 ```text

@@ -66,7 +66,7 @@ class Question:
     Example:
         >>> question = Question(env_id="rare_envs/CarFollowing-v0", ego="idm", gamma=3.0, seed=1)
         >>> question.run_arguments.gamma, question.method
-        (3.0, 'auto')
+        (3.0, 'two-stage')
     """
 
     env_id: str
@@ -74,7 +74,7 @@ class Question:
     algo: str | None = None
     stats: str | None = None
     trust: bool = False
-    method: str = "auto"
+    method: str = "two-stage"
     base: str | None = None
     measure: str = "ttc"
     gamma: float = RunArguments.gamma

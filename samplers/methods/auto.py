@@ -37,7 +37,7 @@ class Auto(Method):
         >>> import samplers
         >>> problem = samplers.FunctionProblem(lambda u: 3.5 - u[:, 0], dim=2)
         >>> for max_sim in (200, 3000):
-        ...     print(samplers.estimate(problem, seed=0, max_sim=max_sim).choice)
+        ...     print(samplers.estimate(problem, "auto", seed=0, max_sim=max_sim).choice)
         surrogate: 200 simulations for 2 dimensions
         two-stage: 3,000 simulations for 2 dimensions
     """

@@ -100,7 +100,7 @@ class WorldOptions(ScenarioOptions):
 class QuestionOptions(WorldOptions):
     """Options of a question: method, measure, threshold."""
 
-    method: Annotated[str, typer.Option(help="Estimation method; see rare-envs list.")] = "auto"
+    method: Annotated[str, typer.Option(help="Estimation method; see rare-envs list.")] = "two-stage"
     measure: Annotated[
         str, typer.Option(help="Safety measure f, small is dangerous: a name, module:function or stl:FORMULA.")
     ] = "ttc"
@@ -153,7 +153,7 @@ class RiskOptions:
     base: Annotated[
         list[str] | None, typer.Option(help="SCENARIO=NAME or FILE, in place of the site's base; may be repeated.")
     ] = None
-    method: Annotated[str, typer.Option(help="Estimation method; see rare-envs list.")] = "auto"
+    method: Annotated[str, typer.Option(help="Estimation method; see rare-envs list.")] = "two-stage"
     max_sim: Annotated[
         int | None,
         typer.Option(help="Largest number of simulations of each scenario.", show_default=DEFAULT_BUDGET),

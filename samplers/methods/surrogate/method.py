@@ -27,8 +27,9 @@ class Surrogate(Method):
        to simulate. Given the learning p-hat is unbiased; its c.o.v. includes the error of the density's constant,
        which is a mean over a pool of 20,000 draws that are not simulated.
 
-    *Interval.* Log-normal with t quantiles, Bernstein's bound where under 30 effective draws failed; the upper end also
-    holds what no draw can have met (`two_stage/discovery/unseen.py`, a batch of learning with failures as a lineage). With a few hundred simulations that is a large part of it.
+    *Interval.* Log-normal with t quantiles, Bernstein's bound where under 10 effective draws failed. The upper end also
+    holds what no draw can have met (`two_stage/discovery/unseen.py`, a batch of learning with failures as a lineage).
+    With a few hundred simulations that is a large part of it.
 
     *Noise.* Coordinates that the base distribution calls noise are drawn, not learned; kriging takes what they do to f,
     and noise that is no part of x, as a nugget.

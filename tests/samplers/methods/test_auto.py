@@ -46,7 +46,7 @@ def test_noise_does_not_count_as_dimensions():
 @pytest.mark.parametrize(("max_sim", "name"), [(150, "surrogate"), (2000, "two-stage")])
 def test_the_result_is_that_of_the_method_chosen(max_sim, name):
     problem = half_space(2, 3.0).problem
-    result = samplers.estimate(problem, seed=4, max_sim=max_sim)
+    result = samplers.estimate(problem, "auto", seed=4, max_sim=max_sim)
     assert result == samplers.estimate(problem, name, seed=4, max_sim=max_sim)
     assert result.method.name == name
     assert result.choice.startswith(f"{name}: {max_sim:,} simulations")
@@ -56,7 +56,7 @@ def test_the_result_is_that_of_the_method_chosen(max_sim, name):
 
 
 def test_replicates_share_the_budget_before_the_choice():
-    result = samplers.estimate(half_space(2, 3.0).problem, seed=4, max_sim=3000, replicates=3)
+    result = samplers.estimate(half_space(2, 3.0).problem, "auto", seed=4, max_sim=3000, replicates=3)
     assert result.method.name == "surrogate"
 
 
