@@ -160,6 +160,7 @@ def write_repetition(world: int, seed: int, repetition: FittedRepetition) -> str
 def main(
     repetitions: Annotated[int, typer.Option(help="Draws of events for each world.")] = 200,
     minutes: Annotated[float, typer.Option(help="Time after which no repetition is begun.")] = 60.0,
+    world: Annotated[list[int] | None, typer.Option(help="Number of a world to go on with; all if none.")] = None,
     lines: Annotated[Path, typer.Option(help="Where a line for each repetition goes.")] = Path("recipe_coverage.jsonl"),
     out: Annotated[Path, typer.Option(help="Where the result goes.")] = RECIPE_RESULT,
 ) -> None:
@@ -167,7 +168,8 @@ def main(
     known = [json.loads(line) for line in lines.read_text().splitlines()] if lines.is_file() else []
     done = {(each["world"], each["seed"]): read_repetition(each) for each in known}
     end = time.monotonic() + 60.0 * minutes
-    for seed, number in ((seed, number) for seed in range(repetitions) for number in range(len(RECIPE_WORLDS))):
+    numbers = world or range(len(RECIPE_WORLDS))
+    for seed, number in ((seed, number) for seed in range(repetitions) for number in numbers):
         if (number, seed) in done:
             continue
         if time.monotonic() > end:
@@ -176,7 +178,7 @@ def main(
         with lines.open("a") as file:
             file.write(write_repetition(number, seed, done[number, seed]) + "\n")
     by_world = [[done[key] for key in sorted(done) if key[0] == number] for number in range(len(RECIPE_WORLDS))]
-    rows = [summarise_recipe(world, found) for world, found in zip(RECIPE_WORLDS, by_world, strict=True) if found]
+    rows = [summarise_recipe(each, found) for each, found in zip(RECIPE_WORLDS, by_world, strict=True) if found]
     command = f"python -m benchmarks.uncertainty.recipe_coverage --repetitions {repetitions}"
     out.write_text(json.dumps({"command": command, "worlds": rows}, indent=2) + "\n")
 
