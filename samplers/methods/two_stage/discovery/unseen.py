@@ -18,8 +18,8 @@ from samplers.statistics.intervals import Interval, skewed_upper_end
 from samplers.statistics.weights import effective_sample_size
 
 PRIOR_SHARE = 0.1
-"""First parameter of Beta. With 0.1, 0.25 and 0.5 the intervals of 360 runs on 18 limit states covered 97.4, 98.7 and
-99.4 %, upper over lower end being 1.21, 1.25 and 1.29."""
+"""First parameter of Beta. With 1/4, 5 of 880 intervals lay below p and 17 above (20 seeds on 44 limit states); with
+1/10, 15 and 17 of 1,160 (40 seeds on 29 of these)."""
 HITS_PER_LINEAGE = 4
 """Wide failures that count as one lineage at least: draws of N(0, s^2 I) are independent, but reach some regions more
 often than others."""
