@@ -6,8 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from os import PathLike
 
-from numpy.typing import ArrayLike
-
 from samplers.analysis.refits import HasEnsemble, needs_ensemble_run
 from samplers.errors import OnError
 from samplers.execution.arguments import InputsOnly, RunArguments, check_attributes, check_problem
@@ -16,10 +14,11 @@ from samplers.execution.fault_isolation import FaultIsolation
 from samplers.execution.interruption import EstimationInterrupted, defer_signals
 from samplers.execution.journaled_evaluation import keep_simulations, open_journal
 from samplers.execution.progress import Listener, Progress, open_listener
+from samplers.execution.responder import Responder
 from samplers.execution.run import Run
 from samplers.method import Stepping
 from samplers.methods.two_stage.method import TwoStage
-from samplers.problem import FloatArray, Inputs, Problem, StandardNormal
+from samplers.problem import Inputs, Problem, StandardNormal
 from samplers.registry import get_method
 from samplers.result import Estimate
 from samplers.trace import Status
@@ -123,7 +122,8 @@ def estimate(
         if kept is not None:
             arguments = replace(arguments, seed=kept.head["seed"])
         evaluate = isolation.evaluate if kept is None else keep_simulations(isolation, problem, on_error, kept)
-        simulation = _Simulation(evaluate, conditions, progress)
+        responder = Responder(problem, arguments.gamma, on_error, isolation, evaluate, kept)
+        simulation = _Simulation(responder, conditions, progress)
         try:
             result = simulation.run(problem, chosen, arguments)
             if ensemble_run and result.status is not Status.STOPPED and needs_ensemble_run(result):
@@ -149,7 +149,7 @@ def _check_base(problem: Problem) -> None:
 class _Simulation:
     """What the runs of one estimation share: how f is called, when they end and who is told."""
 
-    evaluate: Callable[[FloatArray], ArrayLike]
+    responder: Responder
     conditions: "_StopConditions"
     progress: bool | Listener
 
@@ -160,7 +160,7 @@ class _Simulation:
             EstimationInterrupted: If it is interrupted after the first batch.
         """
         with open_listener(self.progress, arguments.max_sim) as listener:
-            run = Run(inputs, method, arguments, listener)
+            run = Run(inputs, method, arguments, listener, self.responder.offer)
             try:
                 self._simulate(run)
             except KeyboardInterrupt:
@@ -172,9 +172,9 @@ class _Simulation:
 
     def _simulate(self, run: Run) -> None:
         while not run.done:
-            f = self.evaluate(run.ask())
+            answers = self.responder.respond(run.requests)
             with defer_signals():  # a method that is interrupted while it computes could not conclude
-                run.tell(f)
+                run.answer(answers)
             why = self.conditions.reason(run.progress)
             if why is not None:
                 run.stop(why)

@@ -1,13 +1,15 @@
 """Contract of a method (`Stepping`) and its terms; the base class `Method` stands in `samplers.methods.base`."""
 
+import math
 import sys
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Protocol, runtime_checkable
+from typing import ClassVar, Protocol, cast, runtime_checkable
 
 import numpy as np
+from numpy.typing import NDArray
 
-from samplers.problem import FloatArray, Inputs
+from samplers.problem import FloatArray, Inputs, TermGradients, Terms
 from samplers.sample import Sample
 from samplers.statistics.intervals import binomial_cov, clopper_pearson
 from samplers.statistics.weights import normalise_weights
@@ -130,7 +132,86 @@ class Interrupted(Exception):
 
 
 Steps = Generator[FloatArray, FloatArray, Outcome]
-"""Generator that yields points x (n, d) to be simulated, is sent their f (n,) and returns the outcome."""
+"""Generator that yields points x (n, d) to be simulated, is sent their f (n,) and returns the outcome.
+
+Where its inputs offer them (`offer_of`), it may also ask for terms and gradients, by `request_terms` and
+`request_gradients` alone."""
+
+
+@dataclass(frozen=True)
+class TermsOffer:
+    """What a run can answer beside f: the terms of points and, unless `gradient_cost` is None, their gradients."""
+
+    gradient_cost: float | None = None
+    """Simulations that a row of a gradient takes at most."""
+
+    def count_gradients(self, n: int) -> int:
+        """Return the simulations that n gradients take at most."""
+        assert self.gradient_cost is not None
+        return whole_simulations(self.gradient_cost * n)
+
+
+@runtime_checkable
+class OffersTerms(Protocol):
+    """Inputs that say whether the run answers requests for terms."""
+
+    @property
+    def offer(self) -> TermsOffer | None:
+        """What it answers; None for f alone."""
+
+
+def offer_of(inputs: Inputs) -> TermsOffer | None:
+    """Return what a run answers beside f; None where it has only f, as with simulations that the user makes."""
+    return inputs.offer if isinstance(inputs, OffersTerms) else None
+
+
+@dataclass(frozen=True, eq=False)
+class TermsRequest:
+    """Points to be simulated whose terms are wanted too; a row counts as one simulation."""
+
+    x: FloatArray
+    """Shape (n, d), n > 0."""
+
+
+@dataclass(frozen=True, eq=False)
+class GradientRequest:
+    """Points with one term each whose gradient is wanted."""
+
+    x: FloatArray
+    """Shape (n, d), n > 0."""
+    term: NDArray[np.int64]
+    """Number of the term, shape (n,)."""
+    ticks: NDArray[np.int64]
+    """Index of the time at which it was attained, shape (n,)."""
+
+
+Request = FloatArray | TermsRequest | GradientRequest
+"""What the steps of a method yield."""
+Answer = FloatArray | Terms | TermGradients
+"""What they are sent: f, terms (with f = -inf, and every term, where there is no outcome), or gradients."""
+
+
+def request_terms(x: FloatArray) -> Generator[FloatArray, FloatArray, Terms]:
+    """Ask for the terms of points x (n, d), n > 0, within a method's steps, by `yield from`."""
+    answer = yield cast(FloatArray, TermsRequest(x))  # steps are typed by points and f; see `Steps`
+    return cast(Terms, answer)
+
+
+def request_gradients(
+    x: FloatArray, term: NDArray[np.int64], ticks: NDArray[np.int64]
+) -> Generator[FloatArray, FloatArray, TermGradients]:
+    """Ask for the gradients of a term for each of the points x (n, d), n > 0; NaN in rows that have none."""
+    answer = yield cast(FloatArray, GradientRequest(x, term, ticks))
+    return cast(TermGradients, answer)
+
+
+def whole_simulations(cost: float) -> int:
+    """Return the whole number of simulations that the cost of a batch of gradients counts as."""
+    return math.ceil(cost - COST_ROUNDING)
+
+
+COST_ROUNDING = 1e-6
+"""Sums of costs may be off by a rounding error."""
 
 
 @runtime_checkable

@@ -204,13 +204,16 @@ class HasTermGradients(HasTerms, Protocol):
     def gradient_cost(self) -> float:
         """Simulations that a row of `gradient` takes at most, above 0; a budget is planned with it."""
 
-    def gradient(self, x: FloatArray, term: NDArray[np.int64], ticks: NDArray[np.int64]) -> TermGradients:
+    def gradient(
+        self, x: FloatArray, term: NDArray[np.int64], ticks: NDArray[np.int64], gamma: float = 0.0
+    ) -> TermGradients:
         """Return the gradient with respect to x of one term for each row of x (n, d).
 
         Args:
             x: Points whose terms are known, shape (n, d).
             term: Number of the term, shape (n,).
             ticks: Index of the time at which `terms` found it attained, shape (n,).
+            gamma: Threshold of f that `terms` was given.
         """
 
 
@@ -362,8 +365,10 @@ class _FunctionGradients:
     dim: int
     gradient_cost: float
 
-    def __call__(self, x: FloatArray, term: NDArray[np.int64], ticks: NDArray[np.int64]) -> TermGradients:
-        """Return the gradients; time means nothing to a function."""
+    def __call__(
+        self, x: FloatArray, term: NDArray[np.int64], ticks: NDArray[np.int64], gamma: float = 0.0
+    ) -> TermGradients:
+        """Return the gradients; time means nothing to a function, and its terms are the same for every gamma."""
         _check_points(x, self.dim)
         return TermGradients(np.asarray(self.function(x, term), dtype=np.float64), self.gradient_cost * len(x))
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from samplers.analysis.refits import check_refits
 from samplers.errors import ON_ERROR, OnError
-from samplers.method import Goal, Stepping
+from samplers.method import Goal, Stepping, TermsOffer
 from samplers.problem import Distribution, Inputs
 from samplers.validation import check_name, check_number, check_whole
 
@@ -75,6 +75,8 @@ class InputsOnly:
 
     dim: int
     base: Distribution
+    offer: TermsOffer | None = None
+    """What the run answers beside f."""
 
 
 def check_arguments(problem: Inputs, method: Stepping) -> None:

@@ -26,8 +26,8 @@ class EvaluationLog:
         keep: How many failing points are kept, the most likely ones.
 
     Attributes:
-        n_sim: Rows recorded.
-        n_errors: Those among them without an outcome.
+        n_sim: Rows recorded, and what gradients cost.
+        n_errors: Rows without an outcome.
         failures: The most likely failing points.
     """
 
@@ -56,6 +56,10 @@ class EvaluationLog:
         self.n_errors += int(missing.sum())
         self._keep_failures(x, f, missing | (f <= self._gamma))
         return np.where(missing, NO_OUTCOME, np.maximum(f, SMALLEST_F))
+
+    def add_cost(self, n: int) -> None:
+        """Count n simulations that gave gradients and no outcomes."""
+        self.n_sim += n
 
     def _keep_failures(self, x: FloatArray, f: FloatArray, failing: NDArray[np.bool_]) -> None:
         """Merge the failing ones of the rows of x (n, d) into the failures kept."""

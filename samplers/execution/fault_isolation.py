@@ -1,15 +1,20 @@
 """FaultIsolation: calls an f that may raise, and finds the rows of a batch on which it does."""
 
 from collections.abc import Callable
-from typing import NoReturn
+from typing import NoReturn, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from samplers.errors import EvaluationError, FinalError, OnError, describe_row, one_per_row
 from samplers.problem import FloatArray
 
+_T = TypeVar("_T")
 Evaluate = Callable[[FloatArray], ArrayLike]
+Rows = NDArray[np.int64]
+"""Numbers of rows of a batch."""
+RowwiseCall = Callable[[Rows], _T]
+"""A function of some rows of a batch."""
 
 
 class FaultIsolation:
@@ -42,23 +47,40 @@ class FaultIsolation:
         self._evaluate = _keep_error_settings(evaluate)
         self._on_error = on_error
 
-    def evaluate(self, x: FloatArray) -> ArrayLike:
+    def evaluate(self, x: FloatArray) -> FloatArray:
         """Simulate the rows of x (n, d); return what f returned, with NaN for rows on which it raised.
 
         Raises:
-            EvaluationError: If f raises and on_error is "raise". A `FinalError` whose `final` is True is passed on
-                unchanged, whatever on_error is.
+            EvaluationError: If f does not return one number per row, or raises and on_error is "raise". A `FinalError`
+                whose `final` is True is passed on unchanged, whatever on_error is.
         """
+        return _join(self.attempt(lambda rows: one_per_row(self._evaluate(x[rows]), len(rows)), x, "f"))
+
+    def attempt(self, call: RowwiseCall[_T], x: FloatArray, what: str) -> list[tuple[Rows, _T | None]]:
+        """Call a function of some rows of x (n, d) on all of them and, where it raises, on parts of them.
+
+        Args:
+            call: Gets numbers of rows; x[rows] is a copy.
+            x: Points, for messages.
+            what: Name of what raises, for messages.
+
+        Returns:
+            Its results with their rows; None for a row on which it raises alone.
+
+        Raises:
+            EvaluationError: See `evaluate`.
+        """
+        rows = np.arange(len(x))
         try:
-            return self._evaluate(x.copy())
+            return [(rows, call(rows))]
         except Exception as error:
             if _is_final(error):
                 raise
             if self._on_error == "raise":
-                _raise_for_first_row(self._evaluate, x, error)
-        f, n_retried = isolate_failing_rows(self._evaluate, x)
+                _raise_for_first_row(call, x, what, error)
+        parts, n_retried = call_on_parts(call, rows)
         self.n_retried += n_retried
-        return f
+        return parts
 
 
 def _keep_error_settings(evaluate: Evaluate) -> Evaluate:
@@ -74,50 +96,68 @@ def _keep_error_settings(evaluate: Evaluate) -> Evaluate:
 def isolate_failing_rows(evaluate: Evaluate, x: FloatArray) -> tuple[FloatArray, int]:
     """Return f (n,) of a batch x (n, d) on which `evaluate` raises, NaN for the rows that raise alone.
 
-    The batch is split in halves, and those that raise are split again, until the raising rows stand alone: at most
-    2 k ceil(log2(n)) calls for k of them.
-
     Returns:
-        f, and how many rows were simulated again.
+        f, and how many rows were simulated again, see `call_on_parts`.
 
     Raises:
         EvaluationError: If `evaluate` does not return one number per row.
     """
-    if len(x) == 1:
-        return np.array([np.nan]), 0
-    parts, n_retried = [], len(x)
-    for half in np.array_split(x, 2):
+    parts, n_retried = call_on_parts(lambda rows: one_per_row(evaluate(x[rows]), len(rows)), np.arange(len(x)))
+    return _join(parts), n_retried
+
+
+def call_on_parts(call: RowwiseCall[_T], rows: Rows) -> tuple[list[tuple[Rows, _T | None]], int]:
+    """Return the results of a function of rows that raises on all of them together.
+
+    The batch is split in halves, and those that raise are split again, until the raising rows stand alone: at most
+    2 k ceil(log2(n)) calls for k of them.
+
+    Returns:
+        Results with their rows, in order, None for a row on which it raises alone; and how many rows it was called
+        with again.
+    """
+    if len(rows) == 1:
+        return [(rows, None)], 0
+    parts, n_retried = list[tuple[Rows, _T | None]](), len(rows)
+    for half in np.array_split(rows, 2):
         try:
-            f, again = one_per_row(evaluate(half.copy()), len(half)), 0
+            parts.append((half, call(half)))
         except Exception as error:
             if _is_final(error):
                 raise
-            f, again = isolate_failing_rows(evaluate, half)
-        parts.append(f)
-        n_retried += again
-    return np.concatenate(parts), n_retried
+            found, again = call_on_parts(call, half)
+            parts += found
+            n_retried += again
+    return parts, n_retried
 
 
-def _raise_for_first_row(evaluate: Evaluate, x: FloatArray, error: Exception) -> NoReturn:
+def _join(parts: list[tuple[Rows, FloatArray | None]]) -> FloatArray:
+    """Return f (n,) of all rows, NaN where there is none."""
+    return np.concatenate([np.array([np.nan]) if f is None else f for _, f in parts])
+
+
+def _raise_for_first_row(call: RowwiseCall[_T], x: FloatArray, what: str, error: Exception) -> NoReturn:
     """Raise an EvaluationError for the first row that raises again, with the error of that row alone.
 
-    One row is enough here: bisection finds it with log2(n) calls, half of those with which `isolate_failing_rows`
-    finds a row and the outcomes of all others.
+    One row is enough here: bisection finds it with log2(n) calls, half of those with which `call_on_parts` finds a row
+    and the results of all others.
     """
     start, stop = 0, len(x)
     while stop - start > 1:
         middle = (start + stop) // 2
-        start, stop = (start, middle) if _exception_of(evaluate, x[start:middle]) else (middle, stop)
-    alone = _exception_of(evaluate, x[start:stop])  # the batch may have raised for another row
+        start, stop = (start, middle) if _exception_of(call, np.arange(start, middle)) else (middle, stop)
+    alone = _exception_of(call, np.arange(start, stop))  # the batch may have raised for another row
     if alone is None:
-        raise EvaluationError(f"f raised on a batch of {len(x)} rows, not repeatably; {_describe(error)}") from error
-    raise EvaluationError(f"f raised for {describe_row(x, start)}; {_describe(alone)}") from alone
+        raise EvaluationError(
+            f"{what} raised on a batch of {len(x)} rows, not repeatably; {_describe(error)}"
+        ) from error
+    raise EvaluationError(f"{what} raised for {describe_row(x, start)}; {_describe(alone)}") from alone
 
 
-def _exception_of(evaluate: Evaluate, x: FloatArray) -> Exception | None:
-    """Return what f raises for the rows of x, None if nothing."""
+def _exception_of(call: RowwiseCall[_T], rows: Rows) -> Exception | None:
+    """Return what a call with some rows raises, None if nothing."""
     try:
-        evaluate(x.copy())
+        call(rows)
     except Exception as error:
         return error
     return None

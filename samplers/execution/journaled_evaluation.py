@@ -1,4 +1,4 @@
-"""Journaled evaluation: f whose finished simulations are kept in a journal, and taken from it when a run continues."""
+"""Journaled evaluation: f, terms and gradients that are kept in a journal, and taken from it when a run continues."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from samplers.errors import OnError, one_per_row
 from samplers.execution.arguments import choose_seed
 from samplers.execution.fault_isolation import FaultIsolation
 from samplers.execution.journal import JournalFile, JournalRecord, digest_points
 from samplers.execution.record_file import JournalError
-from samplers.problem import FloatArray, Inputs, Problem
+from samplers.problem import FloatArray, Inputs, Problem, TermGradients, Terms
 
 N_CHECKED = 8
 """Points at which a continued journal calls f again, from the least f of its first batch to the largest."""
@@ -128,3 +128,66 @@ def keep_simulations(
         isolation.n_retried += int(known.notes.get("n_retried", 0))
 
     return JournaledEvaluation(journal, simulate, restore, FaultIsolation(problem.evaluate, on_error).evaluate).evaluate
+
+
+Packed = tuple[FloatArray, dict[str, Any]]
+"""An answer as numbers (k,) and notes, JSON-ready."""
+
+
+def keep_answer(journal: JournalFile | None, points: str, compute: Callable[[], Packed]) -> Packed:
+    """Return an answer from the journal, or compute and keep it; without a journal compute it.
+
+    Args:
+        journal: Of the run.
+        points: What was asked for, see `digest_request`.
+        compute: Computes the answer.
+
+    Raises:
+        JournalError: The journal has the answer to something else.
+    """
+    known = None if journal is None else journal.read_next()
+    if known is None:
+        numbers, notes = compute()
+        if journal is not None:
+            journal.append(JournalRecord(points, numbers, notes))
+        return numbers, notes
+    if known.points != points:
+        assert journal is not None
+        raise JournalError(
+            f"This run asks for other terms than {str(journal.path)!r} has: arguments, base distribution or libraries "
+            "have changed since it was begun. Remove the file to begin anew."
+        )
+    return known.f, known.notes
+
+
+def digest_request(kind: str, *arrays: NDArray[Any]) -> str:
+    """Return the digest of what is asked for: its kind, points and, of gradients, terms and ticks."""
+    return kind + " ".join(digest_points(array) for array in arrays)
+
+
+def pack_terms(terms: Terms, n_retried: int) -> Packed:
+    """Return terms, and the rows that were simulated again for them, as numbers and notes."""
+    numbers = np.concatenate([terms.f, terms.values.ravel(), terms.ticks.ravel()])
+    return numbers, {"threshold": terms.threshold, "names": list(terms.names), "n_retried": n_retried}
+
+
+def unpack_terms(numbers: FloatArray, notes: dict[str, Any], n: int) -> Terms:
+    """Return the terms of n points from numbers and notes."""
+    f, values, ticks = np.split(numbers, [n, n + (len(numbers) - n) // 2])
+    return Terms(
+        f,
+        values.reshape(n, -1),
+        ticks.reshape(n, -1).astype(np.int64),
+        float(notes["threshold"]),
+        tuple(notes["names"]),
+    )
+
+
+def pack_gradients(gradients: TermGradients, n_retried: int) -> Packed:
+    """Return gradients, and the rows that were computed again for them, as numbers and notes."""
+    return gradients.values.ravel(), {"cost": gradients.cost, "n_retried": n_retried}
+
+
+def unpack_gradients(numbers: FloatArray, notes: dict[str, Any], n: int) -> TermGradients:
+    """Return the gradients at n points from numbers and notes."""
+    return TermGradients(numbers.reshape(n, -1), float(notes["cost"]))

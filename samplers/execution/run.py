@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,9 +13,10 @@ from samplers.execution.arguments import InputsOnly, RunArguments, check_argumen
 from samplers.execution.combination import combine, combined_cov, pool_counts
 from samplers.execution.evaluation_log import EvaluationLog
 from samplers.execution.progress import Listener, Monitor, Progress
-from samplers.execution.replicate import Replicate
-from samplers.method import Choosing, Goal, Outcome, Stepping
-from samplers.problem import FloatArray, Inputs, condition_of
+from samplers.execution.replicate import Replicate, check_cost, count_simulations
+from samplers.execution.responder import hide_missing
+from samplers.method import Answer, Choosing, Goal, Outcome, Request, Stepping, TermsOffer
+from samplers.problem import FloatArray, Inputs, TermGradients, Terms, condition_of
 from samplers.result import Estimate
 from samplers.statistics.intervals import gain_over_monte_carlo
 from samplers.trace import Status
@@ -37,6 +39,7 @@ class Run:
         method: A method with its settings.
         arguments: Threshold, seed, budget and the rest; see `RunArguments`.
         listener: Given `Progress` after every batch and every level.
+        offer: What `answer` will be given beside f; None for f alone, as `tell` takes no more.
 
     Raises:
         ValueError: If the problem has no `dim` or `base`, or method is not a method.
@@ -53,10 +56,15 @@ class Run:
     """
 
     def __init__(
-        self, problem: Inputs, method: Stepping, arguments: RunArguments, listener: Listener | None = None
+        self,
+        problem: Inputs,
+        method: Stepping,
+        arguments: RunArguments,
+        listener: Listener | None = None,
+        offer: TermsOffer | None = None,
     ) -> None:
         check_arguments(problem, method)
-        self._inputs = InputsOnly(int(problem.dim), problem.base)
+        self._inputs = InputsOnly(int(problem.dim), problem.base, offer)
         self._given = condition_of(problem)
         self._goal, self._on_error = arguments.goal, arguments.on_error
         self._seed = choose_seed(arguments.seed)
@@ -64,7 +72,7 @@ class Run:
         self._method, self._choice = choose_method(method, self._inputs, self._goal, self._n_wanted)
         self._log = EvaluationLog(self._inputs.dim, self._inputs.base, self._goal.gamma, self._on_error)
         self._monitor = Monitor(listener, self._goal.max_sim)
-        self._requested: FloatArray | None = None
+        self._asked = False
         self._stopped: str | None = None
         self._replicates: list[Replicate] = []
         for max_sim in split_budget(self._goal.max_sim, self._n_wanted):
@@ -81,6 +89,11 @@ class Run:
         """Progress of the run."""
         return self._monitor.progress
 
+    @property
+    def requests(self) -> list[Request]:
+        """What the replicates that still run wait for, in their order."""
+        return [replicate.requested for replicate in self._running]
+
     def ask(self) -> FloatArray:
         """Return the points to simulate next, shape (n, d); the same ones until their outcomes are told.
 
@@ -89,9 +102,8 @@ class Run:
         """
         if self.done:
             raise RuntimeError("The run is done: nothing more to simulate; see result().")
-        if self._requested is None:
-            self._requested = np.concatenate([replicate.requested for replicate in self._replicates])
-        return self._requested.copy()
+        self._asked = True
+        return np.concatenate(self._points)
 
     def tell(self, f: ArrayLike) -> None:
         """Take the outcomes f, shape (n,), of the points that `ask` returned, in their order.
@@ -102,17 +114,57 @@ class Run:
             EvaluationError: If there is not one number per point, or one is NaN (on_error "raise").
             RuntimeError: If nothing has been asked for, or the method asks for more than max_sim.
         """
-        if self._requested is None:
+        if not self._asked:
             raise RuntimeError("Nothing has been asked for: call ask() for points, then tell() their outcomes.")
-        x = self._requested
-        seen = self._log.record(x, one_per_row(f, len(x)))
-        self._requested = None
+        ends = np.cumsum([len(points) for points in self._points])
+        self.answer(np.split(one_per_row(f, int(ends[-1])), ends[:-1]))
+
+    def answer(self, answers: Sequence[Answer]) -> None:
+        """Take the answers to `requests`, in their order: f, or terms and gradients where the run offers them.
+
+        Raises:
+            EvaluationError: If an f is NaN (on_error "raise"), or gradients cost more than they may.
+            RuntimeError: If the method asks for more than max_sim.
+        """
+        running = self._running
+        for answer in answers:
+            if isinstance(answer, TermGradients):
+                check_cost(answer, self._inputs.offer)
+        seen = self._record([replicate.requested for replicate in running], answers)
+        self._asked = False
         self._monitor.on_batch(self._log.n_sim)
-        running = [replicate for replicate in self._replicates if replicate.running]
-        ends = np.cumsum([len(replicate.requested) for replicate in running])
-        for replicate, part in zip(running, np.split(seen, ends[:-1]), strict=True):
-            replicate.tell(part)
+        for replicate, answer in zip(running, seen, strict=True):
+            replicate.tell(answer)
         self._start_more_for_target()
+
+    def _record(self, requests: Sequence[Request], answers: Sequence[Answer]) -> list[Answer]:
+        """Record what was simulated; return the answers as methods see them."""
+        pairs = [(request, one) for request, one in zip(requests, answers, strict=True)]
+        simulated = [(r if isinstance(r, np.ndarray) else r.x, a) for r, a in pairs if not isinstance(a, TermGradients)]
+        f = [answer.f if isinstance(answer, Terms) else answer for _, answer in simulated]
+        seen = iter(list[FloatArray]())
+        if simulated:
+            whole = self._log.record(np.concatenate([x for x, _ in simulated]), np.concatenate(f))
+            seen = iter(np.split(whole, np.cumsum([len(part) for part in f])[:-1]))
+        self._log.add_cost(sum(count_simulations(one) for one in answers if isinstance(one, TermGradients)))
+        return [
+            one
+            if isinstance(one, TermGradients)
+            else hide_missing(one, next(seen))
+            if isinstance(one, Terms)
+            else next(seen)
+            for one in answers
+        ]
+
+    @property
+    def _running(self) -> list[Replicate]:
+        """Replicates without an outcome."""
+        return [replicate for replicate in self._replicates if replicate.running]
+
+    @property
+    def _points(self) -> list[FloatArray]:
+        """Points that the replicates wait for, where they wait for nothing else."""
+        return [cast(FloatArray, request) for request in self.requests]
 
     def stop(self, why: str = "Stopped") -> None:
         """End the run here; the result is what has been told so far. Nothing happens to a run that is done.
@@ -123,7 +175,7 @@ class Run:
         if self.done:
             return
         self._stopped = f"{why} after {self._log.n_sim:,} simulations, before the method had come to its end."
-        self._requested = None
+        self._asked = False
         self._replicates = [replicate for replicate in self._replicates if replicate.n_sim] or self._replicates[:1]
         for replicate in self._replicates:
             if replicate.running:
@@ -192,7 +244,7 @@ class Run:
         )
         rng = np.random.default_rng(np.random.SeedSequence(self._seed, spawn_key=(number,)))
         steps = self._method.steps(self._inputs, goal, rng)
-        self._replicates.append(Replicate(steps, goal, self._inputs.dim))
+        self._replicates.append(Replicate(steps, goal, self._inputs.dim, self._inputs.offer))
 
     def _start_more_for_target(self) -> None:
         """Start one more run where all are done, the target is missed and the budget allows it."""

@@ -5,10 +5,11 @@ from typing import ClassVar
 
 import numpy as np
 
-from samplers.method import Goal, Interrupted, Outcome, Steps
+from samplers.method import Goal, Interrupted, Outcome, Steps, offer_of
 from samplers.methods.base import Method
 from samplers.methods.two_stage import stages
 from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, TwoStageSettings
+from samplers.methods.two_stage.terms.search import search_terms, suits_terms
 from samplers.problem import Inputs
 from samplers.validation import check_count
 
@@ -113,6 +114,9 @@ def run_two_stage(
         rng: Source of randomness.
         settings: Of all stages.
     """
+    offer = offer_of(inputs)
+    if offer is not None and suits_terms(inputs, offer, budget, settings.terms):
+        return (yield from search_terms(inputs, offer, goal, budget, rng, settings.terms))
     context, state = stages.start_run(inputs, goal, budget, settings, rng)
     if budget < settings.min_exploration_budget:
         least = settings.min_exploration_budget

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 
 from samplers.methods.two_stage.mixture.proposal import Kind
 from samplers.methods.two_stage.mixture.settings import DEFAULT_MIXTURE_SETTINGS, MixtureSettings
+from samplers.methods.two_stage.terms.settings import DEFAULT_TERM_SETTINGS, TermSettings
 
 
 def _initial_shares() -> dict[Kind, float]:
@@ -299,6 +300,7 @@ class TwoStageSettings:
     fallback: FallbackSettings = FallbackSettings()
     diagnostics: DiagnosticSettings = DiagnosticSettings()
     mixture: MixtureSettings = DEFAULT_MIXTURE_SETTINGS
+    terms: TermSettings = DEFAULT_TERM_SETTINGS
 
 
 DEFAULT_SETTINGS = TwoStageSettings()

@@ -9,9 +9,15 @@ import pytest
 
 import samplers
 from samplers.execution.journal import JournalFile
-from samplers.execution.journaled_evaluation import JournaledEvaluation
+from samplers.execution.journaled_evaluation import (
+    JournaledEvaluation,
+    pack_gradients,
+    pack_terms,
+    unpack_gradients,
+    unpack_terms,
+)
 from samplers.execution.record_file import JournalError
-from samplers.problem import FloatArray
+from samplers.problem import FloatArray, TermGradients, Terms
 from tests.samplers.execution.test_journal import half_space, run
 
 
@@ -64,3 +70,63 @@ def test_f_is_compared_from_its_least_value_to_its_largest_within_what_batches_r
         assert len(asked) == 1 + refused
         assert (asked[0][0], asked[0][-1], len(asked[0])) == (0.0, 99.0, 8)
         journal.close()
+
+
+class Series:
+    """Two half-spaces in 40 dimensions; it counts what it is asked for, and is interrupted at a certain request."""
+
+    dim, gradient_cost, base = 40, 3.0, samplers.StandardNormal(40)
+    normals = np.linalg.qr(np.random.default_rng(0).standard_normal((40, 2)))[0].T
+
+    def __init__(self, last=10**6):
+        self.requests, self.last = 0, last
+
+    def _count(self):
+        self.requests += 1
+        if self.requests > self.last:
+            raise KeyboardInterrupt
+
+    def evaluate(self, x):
+        return self.terms(x).f
+
+    def terms(self, x, gamma=0.0):
+        self._count()
+        values = 3.5 - x @ self.normals.T
+        return Terms(values.min(axis=1), values, np.zeros(values.shape, dtype=int), gamma, ("left", "right"))
+
+    def gradient(self, x, term, ticks, gamma=0.0):
+        self._count()
+        return TermGradients(-self.normals[term], 2.5 * len(x))
+
+
+@pytest.mark.parametrize("last", [1, 2, 5, 11])
+def test_a_search_by_terms_is_continued_from_its_journal(tmp_path, last):
+    """Interrupted at the walks, in a round or at the end; the rest alone is computed, and the result is the same."""
+    undisturbed = Series()
+    expected = samplers.estimate(undisturbed, seed=1, max_sim=2000)
+    assert undisturbed.requests > 11
+    with pytest.raises(KeyboardInterrupt):
+        samplers.estimate(Series(last), seed=1, max_sim=2000, journal=tmp_path / "journal")
+    rest = Series()
+    assert samplers.estimate(rest, seed=1, max_sim=2000, journal=tmp_path / "journal") == expected
+    assert rest.requests == undisturbed.requests - last
+
+
+def test_a_journal_of_other_terms_is_refused(tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        samplers.estimate(Series(5), seed=1, max_sim=2000, journal=tmp_path / "journal")
+    with pytest.raises(JournalError, match="asks for other terms"):
+        samplers.estimate(Series(), seed=1, max_sim=3000, journal=tmp_path / "journal")
+
+
+def test_answers_come_back_as_they_were(rng):
+    terms = Terms(rng.random(5), rng.random((5, 3)), rng.integers(0, 90, (5, 3)), 0.25, ("a", "b", "c"))
+    terms.f[2] = np.nan
+    again = unpack_terms(*pack_terms(terms, 4), 5)
+    for name in ("f", "values", "ticks", "threshold", "names"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(terms, name))
+    assert again.ticks.dtype == np.int64
+    gradients = TermGradients(rng.random((5, 7)), 12.5)
+    back = unpack_gradients(*pack_gradients(gradients, 0), 5)
+    np.testing.assert_array_equal(back.values, gradients.values)
+    assert back.cost == 12.5

@@ -1,0 +1,1 @@
+"""Search by terms: gradient walks, Gaussians in the gradients' subspaces, exact weights; see `search`."""

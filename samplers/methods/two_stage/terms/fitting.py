@@ -1,0 +1,125 @@
+"""Fitting of term proposals: subspaces of gradients, Gaussians around ends of walks and to weighted failures."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from samplers.methods.two_stage.mixture.subspace_em import GroupedPoints, fit_subspace_mixture
+from samplers.methods.two_stage.terms.history import TermHistory
+from samplers.methods.two_stage.terms.law import ComponentGroup, TermLaw
+from samplers.methods.two_stage.terms.settings import LawSettings, RoundSettings
+from samplers.problem import FloatArray
+from samplers.proposals.components import SubspaceGaussian
+from samplers.statistics.weights import effective_sample_size, normalise_weights
+
+LEAST_SINGULAR = 1e-6
+"""Singular vectors under this share of the first are rounding errors."""
+POWER_STEPS = 20
+"""Bisections for the power of the weights: to one millionth."""
+
+
+@dataclass(frozen=True, eq=False)
+class PursuedTerm:
+    """A term with a proposal of its own."""
+
+    number: int
+    directions: FloatArray
+    """Unit gradients, shape (k, d)."""
+    direction_weights: FloatArray
+    """Shape (k,)."""
+    ends: FloatArray
+    """Ends of walks, shape (m, d)."""
+    law: TermLaw
+    ready: bool = False
+    """Whether the law was fitted to failures."""
+
+
+def find_axes(directions: FloatArray, weights: FloatArray, rank: int) -> FloatArray:
+    """Return the first right singular vectors of weighted directions (k, d) as columns, shape (d, r)."""
+    _, values, right = np.linalg.svd(directions * weights[:, None], full_matrices=False)
+    kept = values[:rank] > LEAST_SINGULAR * values[0]
+    return np.asarray(right[:rank][kept].T)
+
+
+def first_law(axes: FloatArray, ends: FloatArray, settings: LawSettings) -> TermLaw:
+    """Return the proposal around ends of walks (m, d): one Gaussian, drawn towards variance 1, and its guards."""
+    z = ends @ axes
+    n, centred = len(z), z - z.mean(axis=0)
+    covariance = (centred.T @ centred + settings.prior_points * np.eye(z.shape[1])) / (n + settings.prior_points)
+    values, vectors = np.linalg.eigh(covariance)
+    bump = SubspaceGaussian(vectors, vectors.T @ z.mean(axis=0), values)
+    return build_law(axes, [bump], np.ones(1), z, settings)
+
+
+def fit_law(
+    axes: FloatArray,
+    u: FloatArray,
+    log_weights: FloatArray,
+    ends: FloatArray,
+    settings: LawSettings,
+    rng: np.random.Generator,
+) -> TermLaw:
+    """Return the proposal fitted to weighted points u (n, d), with guards around ends (m, d)."""
+    weights = temper_weights(log_weights, settings.fit_ess)
+    points = GroupedPoints(u @ axes, weights, 1 / float(weights @ weights), np.arange(len(u)))
+    fit = fit_subspace_mixture(points, settings.max_bumps, rng)
+    return build_law(axes, fit.components, fit.weights, ends @ axes, settings)
+
+
+def build_law(
+    axes: FloatArray, bumps: list[SubspaceGaussian], weights: FloatArray, ends: FloatArray, settings: LawSettings
+) -> TermLaw:
+    """Return bumps, the same tempered, and Gaussians around ends z (m, r), as one proposal."""
+    factor, plus = settings.tempered_variance
+    tempered = tuple(
+        SubspaceGaussian(b.axes, settings.tempered_mean * b.mean, factor * b.variance + plus) for b in bumps
+    )
+    groups = [
+        ComponentGroup(settings.bump_share * float(w / weights.sum()), (bump,), np.ones(1))
+        for bump, w in zip(bumps, weights, strict=True)
+    ]
+    groups.append(ComponentGroup(settings.tempered_share, tempered, weights / weights.sum()))
+    if len(ends):
+        identity, variance = np.eye(ends.shape[1]), np.full(ends.shape[1], settings.end_variance)
+        around = tuple(SubspaceGaussian(identity, settings.end_mean * end, variance) for end in ends)
+        groups.append(ComponentGroup(settings.end_share, around, np.full(len(ends), 1 / len(ends))))
+    total = sum(group.share for group in groups)
+    return TermLaw(axes, tuple(ComponentGroup(g.share / total, g.components, g.weights) for g in groups))
+
+
+def temper_weights(log_weights: FloatArray, wanted: float) -> FloatArray:
+    """Return weights to the largest power up to 1 with which they are worth `wanted` points, adding up to 1."""
+    wanted = min(wanted, 0.5 * len(log_weights))
+    low, high = 0.0, 1.0
+    if effective_sample_size(log_weights) >= wanted:
+        return normalise_weights(log_weights)
+    for _ in range(POWER_STEPS):
+        power = 0.5 * (low + high)
+        low, high = (power, high) if effective_sample_size(power * log_weights) >= wanted else (low, power)
+    return normalise_weights(low * log_weights)
+
+
+def near_points(
+    history: TermHistory, term: int, gamma: float, settings: RoundSettings
+) -> tuple[NDArray[np.int64], bool]:
+    """Return rows to fit a term to, and whether its failures among them are worth `ready_ess` points.
+
+    Failures that it is the least term of where there are `min_failures` of them, however uneven their weights: they
+    are nearer to the likely failures than any higher level is. Else the points under the lowest level of the term at
+    which they are worth `level_ess`.
+    """
+    values, log_weights = history.terms.values[:, term], history.log_weights
+    known = np.isfinite(history.terms.f)
+    mine = known & (history.terms.least == term)
+    failing = np.flatnonzero(mine & history.failing(gamma))
+    if len(failing) >= settings.min_failures:
+        return failing, effective_sample_size(log_weights[failing]) >= settings.ready_ess
+    rows = np.flatnonzero(known)
+    rows = rows[np.argsort(values[rows], kind="stable")]
+    w = np.exp(log_weights[rows] - log_weights[rows].max())
+    ess = np.cumsum(w) ** 2 / np.cumsum(w**2)
+    enough = np.flatnonzero(ess >= settings.level_ess)
+    count = int(enough[0]) + 1 if len(enough) else len(rows)
+    under = int((values[rows] <= history.terms.threshold).sum())
+    return rows[: max(count, under)], False

@@ -1,0 +1,134 @@
+"""Rounds of a search by terms: pursue terms from the ends of walks, refit their proposals to all draws so far."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from samplers.methods.two_stage.terms.fitting import PursuedTerm, find_axes, first_law, fit_law, near_points
+from samplers.methods.two_stage.terms.history import TermHistory
+from samplers.methods.two_stage.terms.law import TermProposal
+from samplers.methods.two_stage.terms.settings import LawSettings, RoundSettings, TermSettings
+from samplers.methods.two_stage.terms.space import TermSimulator, TermSteps
+from samplers.methods.two_stage.terms.walks import Walks
+from samplers.problem import FloatArray
+from samplers.statistics.weights import normalise_weights
+
+
+def pursue_walked(walks: Walks, history: TermHistory, settings: TermSettings) -> list[PursuedTerm]:
+    """Return the terms that walks came near, with proposals around their ends; those that hardly fail are left out."""
+    found, tails = list[PursuedTerm](), list[float]()
+    for term in np.unique(np.concatenate([walks.term, walks.failing_terms])):
+        directions, ends = walks.directions.of(term), _ends(walks, history, int(term), settings)
+        if len(ends) and len(directions):
+            found.append(start_term(int(term), directions, ends, settings.law))
+            arrived = walks.distance[(walks.term == term) & (walks.values <= history.terms.threshold)]
+            arrived = arrived[np.isfinite(arrived)]
+            tails.append(float(ndtr(-np.median(arrived))) if len(arrived) else math.nan)
+    least = settings.walks.negligible * max((tail for tail in tails if tail > 0), default=0.0)
+    return [one for one, tail in zip(found, tails, strict=True) if not tail < least]
+
+
+def start_term(number: int, directions: FloatArray, ends: FloatArray, settings: LawSettings) -> PursuedTerm:
+    """Return a term with a proposal around ends (m, d), from unit gradients (k, d)."""
+    weights = np.ones(len(directions))
+    law = first_law(find_axes(directions, weights, settings.rank), ends, settings)
+    return PursuedTerm(number, directions, weights, ends, law)
+
+
+def _ends(walks: Walks, history: TermHistory, term: int, settings: TermSettings) -> FloatArray:
+    """Return the ends of a term's walks: those that fail, else the lower half if one came half way."""
+    mine = (walks.term == term) & ~(walks.distance > settings.walks.max_distance)
+    failing = mine & (walks.values <= history.terms.threshold)
+    on_the_way = walks.failures[walks.failing_terms == term]
+    ends = np.concatenate([walks.u[failing], on_the_way])[: settings.law.max_ends]
+    if len(ends) or not mine.any():
+        return ends
+    values, threshold = walks.values[mine], history.terms.threshold
+    half_way = 0.5 * (float(np.median(history.terms.values[:, term])) + threshold)
+    lower = values <= np.median(values)
+    return walks.u[mine][lower] if values.min() <= half_way else ends
+
+
+def build_proposal(pursued: list[PursuedTerm], history: TermHistory, gamma: float, s: RoundSettings) -> TermProposal:
+    """Return the mixture over the terms.
+
+    With all of them at the threshold pi_j is proportional to sqrt(sum_j W^2), the sum over failures that the term is
+    the least of, at least `min_term_share`; until then those that are not come first.
+    """
+    k = len(pursued)
+    if all(one.ready for one in pursued):
+        w = np.where(history.failing(gamma), np.exp(history.log_weights), 0.0)
+        size = np.array([np.sqrt((w[history.terms.least == one.number] ** 2).sum()) for one in pursued])
+        shares = size / size.sum() if size.sum() > 0 else np.full(k, 1 / k)
+        shares = np.maximum(shares, min(s.min_term_share, 0.7 / k))
+    else:
+        shares = np.array([s.waiting_share if one.ready else 1.0 for one in pursued])
+    return TermProposal(history.u.shape[1], s.base_share, tuple(one.law for one in pursued), shares / shares.sum())
+
+
+def refit(
+    simulator: TermSimulator,
+    history: TermHistory,
+    pursued: list[PursuedTerm],
+    gamma: float,
+    limit: int,
+    rng: np.random.Generator,
+    settings: TermSettings,
+) -> TermSteps[list[PursuedTerm]]:
+    """Return the terms with proposals fitted to all draws, after a few more gradients of each at likely points.
+
+    Terms that failures showed and nobody pursued join them.
+    """
+    rounds = settings.rounds
+    known = {one.number for one in pursued}
+    new = [int(j) for j in np.unique(history.terms.least[history.failing(gamma)]) if j not in known]
+    numbers = [one.number for one in pursued] + new
+    near = [near_points(history, j, gamma, rounds) for j in numbers]
+    each = max(min(rounds.gradients, rounds.max_gradients // max(len(numbers), 1)), 1)
+    chosen = [_draw_rows(rows, history.log_weights, each, rng) for rows, _ in near]
+    while chosen and simulator.n_sim + simulator.offer.count_gradients(sum(map(len, chosen))) > limit:
+        chosen = [rows[: len(rows) // 2] for rows in chosen]  # count_gradients(0) is 0
+    rows, term = np.concatenate(chosen), np.repeat(numbers, [len(part) for part in chosen])
+    slopes = yield from simulator.gradients(history.u[rows], term, history.terms.ticks[rows, term])
+    norm = np.linalg.norm(slopes, axis=1)
+    good = np.isfinite(norm) & (norm > 0)
+    result = []
+    for number, (points, ready) in zip(numbers, near, strict=True):
+        mine = good & (term == number)
+        directions = slopes[mine] / norm[mine, None]
+        old = next((one for one in pursued if one.number == number), None)
+        if old is not None:
+            result.append(_refit_term(old, history, directions, points, ready, rng, settings))
+        elif len(directions):
+            result.append(start_term(number, directions, history.u[points[: settings.law.max_ends]], settings.law))
+    return result
+
+
+def _refit_term(
+    term: PursuedTerm,
+    history: TermHistory,
+    directions: FloatArray,
+    rows: NDArray[np.int64],
+    ready: bool,
+    rng: np.random.Generator,
+    settings: TermSettings,
+) -> PursuedTerm:
+    """Return a term with further unit gradients (k, d), fitted to some rows of the history."""
+    later = float(term.direction_weights.max()) * settings.rounds.later_weight
+    weights = np.concatenate([term.direction_weights, np.full(len(directions), later)])
+    directions = np.concatenate([term.directions, directions])
+    axes = find_axes(directions, weights, settings.law.rank)
+    law = fit_law(axes, history.u[rows], history.log_weights[rows], term.ends, settings.law, rng)
+    return replace(term, directions=directions, direction_weights=weights, law=law, ready=term.ready or ready)
+
+
+def _draw_rows(rows: NDArray[np.int64], log_weights: FloatArray, n: int, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Return at most n different ones of some rows, drawn by weight."""
+    if len(rows) <= n:
+        return rows
+    weights = normalise_weights(log_weights[rows])
+    possible = min(n, int(np.count_nonzero(weights)))
+    return np.asarray(rng.choice(rows, possible, replace=False, p=weights))

@@ -1,0 +1,309 @@
+"""Search by terms: failures of a least over terms, in tens to thousands of dimensions.
+
+f is a least over terms (which car is hit, ahead or behind, early or late), and each term's failures are nearly one
+half-space. In standard normal space:
+
+1. *Walks* (`walks.py`): from low base draws of every term that matters downhill along its gradient to its failures.
+2. *Rounds* (`rounds.py`, `fitting.py`, `law.py`): for each term Gaussians in the subspace of its gradients, N(0, I)
+   across it; fitted anew after every round to all draws so far, weighted by the balance heuristic.
+3. *Estimate* (`estimate.py`): three final rounds, each from a proposal fitted to what came before, with exact weights
+   and shares in p that were fixed beforehand: p = sum_r c_r mean(w_r 1{f <= gamma}) counts failures of any term.
+
+Each p_r is unbiased given the past: subspaces, terms and Gaussians may be wrong and p stays right; only its c.o.v.
+suffers. Where the rounds show that they are wrong, adaptive subset simulation takes over, on the order of the terms.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from samplers.importance.draws import Draws, weight_warnings, weighted_interval
+from samplers.method import Goal, Interrupted, Outcome, Steps, TermsOffer, no_outcome_share
+from samplers.methods.monte_carlo import MonteCarlo
+from samplers.methods.two_stage.fallback import run_subset_simulation
+from samplers.methods.two_stage.terms.estimate import CombinedRounds, FinalRound, doubt
+from samplers.methods.two_stage.terms.fitting import PursuedTerm
+from samplers.methods.two_stage.terms.history import TermHistory
+from samplers.methods.two_stage.terms.order import order_by_terms
+from samplers.methods.two_stage.terms.rounds import build_proposal, pursue_walked, refit
+from samplers.methods.two_stage.terms.settings import DEFAULT_TERM_SETTINGS, TermSettings
+from samplers.methods.two_stage.terms.space import TermSimulator, TermSteps
+from samplers.methods.two_stage.terms.walks import choose_starts, choose_terms, walk_downhill
+from samplers.problem import Inputs, Terms
+from samplers.statistics.intervals import binomial_cov
+from samplers.statistics.weights import effective_sample_size
+from samplers.trace import Level, Status
+
+
+def suits_terms(inputs: Inputs, offer: TermsOffer | None, budget: int, settings: TermSettings) -> bool:
+    """Return whether to search by terms: terms and gradients are offered, x is long and the budget holds a search."""
+    offered = offer is not None and offer.gradient_cost is not None
+    return offered and inputs.dim >= settings.min_dim and budget >= settings.min_budget
+
+
+@dataclass(frozen=True, eq=False)
+class TermSearch:
+    """What is fixed for a search, and the simulator that counts."""
+
+    simulator: TermSimulator
+    goal: Goal
+    budget: int
+    """Simulations to plan for."""
+    end: int
+    """Simulations that are never exceeded."""
+    rng: np.random.Generator
+    settings: TermSettings
+
+    @property
+    def left(self) -> int:
+        """Simulations left of the budget."""
+        return self.budget - self.simulator.n_sim
+
+
+@dataclass(frozen=True, eq=False)
+class SearchState:
+    """Draws so far, the terms that are pursued and the trace."""
+
+    history: TermHistory
+    pursued: tuple[PursuedTerm, ...] = ()
+    trace: tuple[Level, ...] = ()
+    finals: tuple[FinalRound, ...] = ()
+    base_draws: int = 0
+    last_rate: float = 0.0
+    """Effective failures for each draw of the last round."""
+
+
+def search_terms(
+    inputs: Inputs,
+    offer: TermsOffer,
+    goal: Goal,
+    budget: int,
+    rng: np.random.Generator,
+    settings: TermSettings = DEFAULT_TERM_SETTINGS,
+) -> Steps:
+    """Estimate P[f(X) <= goal.gamma] by terms and their gradients.
+
+    Args:
+        inputs: Dimension and base distribution.
+        offer: Terms and gradients, see `suits_terms`.
+        goal: Threshold, confidence, target and budget.
+        budget: Simulations to plan for.
+        rng: Source of randomness.
+        settings: Of all stages.
+    """
+    rounds = settings.rounds
+    open_ended = goal.max_sim is None and goal.target_cov is not None
+    end = budget + rounds.max_batches * rounds.target_batch if open_ended else budget
+    search = TermSearch(TermSimulator(inputs, offer), goal, budget, end, rng, settings)
+    state = yield from _draw_base(search)
+    try:
+        if float(state.history.failing(goal.gamma).mean()) >= rounds.common_share:
+            return (yield from _run_monte_carlo(search, state))
+        state = yield from _walk(search, state)
+        state = yield from _run_rounds(search, state)
+        if _gives_up(search, state):
+            return (yield from _fall_back(search, state))
+    except Interrupted:
+        return _estimate_early(search, state)
+    return (yield from _estimate(search, state))
+
+
+def _draw_base(search: TermSearch) -> TermSteps[SearchState]:
+    """Make the base draws."""
+    rounds = search.settings.rounds
+    n = min(max(int(rounds.base * search.budget), rounds.min_base), rounds.max_base)
+    u = search.rng.standard_normal((n, search.simulator.inputs.dim))
+    terms = yield from search.simulator.terms(u)
+    state = SearchState(TermHistory.of_base_draws(u, terms), base_draws=n)
+    share = float((terms.f <= search.goal.gamma).mean())
+    return _record(search, state, share, share, n, binomial_cov(share, n))
+
+
+def _walk(search: TermSearch, state: SearchState) -> TermSteps[SearchState]:
+    """Walk to the failures of main terms and of others; pursue those that are reached."""
+    walking, terms, simulator = search.settings.walks, state.history.terms, search.simulator
+    main, others = choose_terms(terms, walking)
+    walkers = walking.walkers * min(1.0, search.budget / walking.usual_budget)
+    each = int(np.clip(walkers / max(len(main), 1), walking.min_walkers, walking.max_walkers))
+    starts = [
+        (j, choose_starts(terms, j, n, walking)) for group, n in ((main, each), (others, walking.scouts)) for j in group
+    ]
+    rows = np.concatenate([part for _, part in starts] or [np.empty(0, dtype=np.int64)])
+    term = np.repeat([j for j, _ in starts], [len(part) for _, part in starts]).astype(np.int64)
+    chosen = Terms(terms.f[rows], terms.values[rows], terms.ticks[rows], terms.threshold)
+    limit = simulator.n_sim + int(walking.budget_share * search.budget)
+    walks = yield from walk_downhill(simulator, state.history.u[rows], chosen, term, search.goal.gamma, limit, walking)
+    state = replace(state, pursued=tuple(pursue_walked(walks, state.history, search.settings)))
+    reached = float((walks.values <= terms.threshold).mean()) if len(walks.values) else 0.0
+    return _record(search, state, reached, state.trace[-1].estimate, len(rows), math.inf)
+
+
+def _run_rounds(search: TermSearch, state: SearchState) -> TermSteps[SearchState]:
+    """Draw and refit until all terms have been at the threshold twice, or the rest is for the estimate."""
+    rounds, ready = search.settings.rounds, 0
+    size = int(rounds.size * search.budget)
+    while state.pursued and ready < rounds.ready_rounds and search.left - size >= rounds.final_share * search.budget:
+        state, _ = yield from _draw_round(search, state, size)
+        state = yield from _refit(search, state, int(rounds.final_share * search.budget))
+        ready = ready + 1 if all(term.ready for term in state.pursued) else 0
+    return state
+
+
+def _draw_round(search: TermSearch, state: SearchState, n: int) -> TermSteps[tuple[SearchState, FinalRound]]:
+    """Draw n points from the present proposal; they join the history."""
+    gamma, rounds = search.goal.gamma, search.settings.rounds
+    proposal = build_proposal(list(state.pursued), state.history, gamma, rounds)
+    u, strata = proposal.draw(n, search.rng)
+    terms = yield from search.simulator.terms(u)
+    x = search.simulator.inputs.base.from_standard_normal(u)
+    drawn = FinalRound(x, terms, -proposal.log_ratio(u), strata, factor=1.0)
+    fails = terms.f <= gamma
+    ess = effective_sample_size(drawn.log_weights[fails])
+    state = replace(
+        state,
+        history=state.history.add(u, terms, proposal),
+        base_draws=state.base_draws + int((strata == 0).sum()),
+        last_rate=ess / n,
+    )
+    p = float(drawn.y(gamma).mean())
+    return _record(search, state, float(fails.mean()), p, n, 1 / math.sqrt(ess) if ess else math.inf, ess), drawn
+
+
+def _refit(search: TermSearch, state: SearchState, reserve: int) -> TermSteps[SearchState]:
+    """Fit the proposals anew, leaving `reserve` simulations."""
+    pursued = yield from refit(
+        search.simulator,
+        state.history,
+        list(state.pursued),
+        search.goal.gamma,
+        search.budget - reserve,
+        search.rng,
+        search.settings,
+    )
+    return replace(state, pursued=tuple(pursued))
+
+
+def _gives_up(search: TermSearch, state: SearchState) -> bool:
+    """Return whether the proposals do not describe the failures, and enough is left for subset simulation."""
+    doubts = search.settings.doubts
+    return state.last_rate < doubts.fallback_rate and search.left >= doubts.min_fallback_budget
+
+
+def _estimate(search: TermSearch, state: SearchState) -> Steps:
+    """Make the final rounds; with a target c.o.v. end when it is met, or draw further batches until then."""
+    rounds, goal = search.settings.rounds, search.goal
+    room, stopped = search.left, False
+    plan = [(int(share * room), factor) for share, factor in zip(rounds.final_sizes, rounds.final_weights, strict=True)]
+    while not stopped:
+        number = len(state.finals)
+        if number and goal.target_cov is not None and _combine(search, state).cov(_between(search)) <= goal.target_cov:
+            break
+        size, factor = plan[number] if number < len(plan) else (rounds.target_batch, 1.0)
+        last = number == len(plan) - 1
+        if number >= len(plan) and (goal.target_cov is None or search.simulator.n_sim >= search.end):
+            break
+        try:
+            if 0 < number < len(plan):
+                state = yield from _refit(search, state, sum(n for n, _ in plan[number:]))
+            size = search.left if last else min(size, search.end - search.simulator.n_sim)
+            state, drawn = yield from _draw_round(search, state, size)
+            state = replace(state, finals=(*state.finals, replace(drawn, factor=factor)))
+        except Interrupted:
+            stopped = True
+    return _conclude(search, state, stopped) if state.finals else _estimate_early(search, state)
+
+
+def _between(search: TermSearch) -> float:
+    return search.settings.doubts.between_factor
+
+
+def _combine(search: TermSearch, state: SearchState) -> CombinedRounds:
+    return CombinedRounds(state.finals, search.goal.gamma)
+
+
+def _conclude(search: TermSearch, state: SearchState, stopped: bool) -> Outcome:
+    """Return the outcome of the final rounds."""
+    settings, goal, combined = search.settings, search.goal, _combine(search, state)
+    cov, draws = combined.cov(_between(search)), combined.draws()
+    state = _close_trace(search, state)
+    status = Status.CONVERGED if len(draws.f) else Status.NO_HITS
+    return Outcome(
+        p=combined.p,
+        interval=combined.interval(goal.confidence, settings.rounds.base_share, cov),
+        cov=cov,
+        status=Status.STOPPED if stopped else status,
+        warnings=tuple(doubt(combined, [one.number for one in state.pursued], settings.doubts)),
+        trace=state.trace,
+        no_outcome_share=no_outcome_share(draws.f, draws.log_weights),
+        sample=draws.sample,
+        base_draws=state.base_draws,
+    )
+
+
+def _estimate_early(search: TermSearch, state: SearchState) -> Outcome:
+    """Return what all draws from known proposals say, for a run that ends before its estimate."""
+    state, history = _close_trace(search, state), state.history
+    x = search.simulator.inputs.base.from_standard_normal(history.u)
+    n = len(history.u)
+    draws = Draws.from_outcomes(history.terms.f, history.log_weights + np.log(n), x, search.goal.gamma)
+    return Outcome(
+        p=draws.p,
+        interval=weighted_interval(draws, search.goal.confidence, n / history.n_base, draws.cov),
+        cov=draws.cov,
+        status=Status.STOPPED,
+        warnings=tuple(weight_warnings(draws)),
+        trace=state.trace,
+        no_outcome_share=no_outcome_share(draws.f, draws.log_weights),
+        sample=draws.sample,
+        base_draws=state.base_draws,
+    )
+
+
+def _run_monte_carlo(search: TermSearch, state: SearchState) -> Steps:
+    """Spend the rest on base draws; those made so far decided on this and do not count."""
+    left = search.end - search.simulator.n_sim
+    method = MonteCarlo(n=left, batch=min(left, 10_000))
+    outcome = yield from method.steps(search.simulator.inputs, replace(search.goal, max_sim=left), search.rng)
+    return _after(search, state, outcome)
+
+
+def _fall_back(search: TermSearch, state: SearchState) -> Steps:
+    """Spend the rest on subset simulation in the order of the terms."""
+    left, inputs = search.end - search.simulator.n_sim, search.simulator.inputs
+    levels = _expected_levels(state.history, search.goal.gamma)
+    steps = run_subset_simulation(inputs, replace(search.goal, max_sim=left), levels, left, None, search.rng)
+    outcome = yield from order_by_terms(steps, search.goal.gamma)
+    return _after(search, state, outcome)
+
+
+MOST_LEVELS = 6
+"""Levels of a tenth to plan for at most, and where nothing is known: with fewer than needed the last are short."""
+
+
+def _expected_levels(history: TermHistory, gamma: float) -> int:
+    """Return the levels of a tenth that the p of all draws so far takes."""
+    p = float(np.exp(history.log_weights[history.failing(gamma)]).sum())
+    return min(math.ceil(-math.log10(min(p, 1.0))), MOST_LEVELS) if p > 0 else MOST_LEVELS
+
+
+def _after(search: TermSearch, state: SearchState, outcome: Outcome) -> Outcome:
+    """Return the outcome of another method that used the rest."""
+    trace = (*_close_trace(search, state).trace, *outcome.trace)
+    return replace(outcome, trace=trace, base_draws=state.base_draws + outcome.base_draws, counts=None)
+
+
+def _record(
+    search: TermSearch, state: SearchState, p: float, estimate: float, n: int, cov: float, ess: float | None = None
+) -> SearchState:
+    """Return the state with one more level: of all simulations that no earlier level has."""
+    n_sim = search.simulator.n_sim - sum(level.n_sim for level in state.trace)
+    level = Level(gamma=search.goal.gamma, p=p, estimate=estimate, n_sim=n_sim, n_points=n, cov=cov, ess=ess)
+    search.goal.on_level(level)
+    return replace(state, trace=(*state.trace, level))
+
+
+def _close_trace(search: TermSearch, state: SearchState) -> SearchState:
+    """Return the state with the simulations of an interrupted step recorded as a level."""
+    loose = search.simulator.n_sim - sum(level.n_sim for level in state.trace)
+    return _record(search, state, math.nan, math.nan, loose, math.inf) if loose else state

@@ -1,0 +1,156 @@
+"""Settings of the search by terms, each with its reason.
+
+"Prototype" are runs on Highway-v0 (428 and 1,448 dimensions, 6,000 simulations, 7 to 20 replications of five cases).
+"""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, kw_only=True)
+class WalkSettings:
+    """Gradient walks to the failures of each term (`walks.py`)."""
+
+    candidate_quantile: float = 0.2
+    """A term is a main one where it is the least of some base draws under this quantile of the least term ..."""
+    candidate_share: float = 0.005
+    """... which are at least this share of all base draws: 3 of 600."""
+    walkers: int = 48
+    """Walks of all main terms together at `usual_budget`, in proportion with less; each has between `min_walkers` and
+    `max_walkers`."""
+    usual_budget: int = 6000
+    min_walkers: int = 6
+    max_walkers: int = 24
+    """More find nothing more on Highway-v0 (prototype); half of them start where the term is attained late."""
+    scouts: int = 2
+    """Walks of every other term: the least of 600 draws may hide a term that is far there and near along its
+    gradient."""
+    max_scouted: int = 12
+    """Other terms that are scouted, those with the lowest values; a hundred of them would eat the budget."""
+    start_quantile: float = 0.5
+    """Walks start at the lowest values of each half, early and late, of the draws under this quantile."""
+    steps: int = 8
+    """Steps at most: 6 reach beta = 4.5 (prototype), 8 reach 6."""
+    first_step: float = 1.3
+    """Length of the first step in standard deviations (prototype)."""
+    growth: float = 1.3
+    """Factor of the length after a step downhill, and ..."""
+    shrinkage: float = 0.4
+    """... after one uphill: roughness of f is shorter than that (prototype)."""
+    beyond: float = 0.03
+    """Standard deviations by which a step aims beyond the threshold along the gradient: rounding must not stop it."""
+    budget_share: float = 0.25
+    """Share of the budget that walks use at most, gradients at what they may cost."""
+    max_distance: float = 7.0
+    """Walks end where the half-space of their gradient is further than this from the origin: Phi(-7) = 1e-12."""
+    negligible: float = 0.002
+    """A term is left to base draws where Phi(-beta), beta the median of its failing walks, is this share of the largest
+    one: its failures are then reached by the 4 % of base draws, and counted."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LawSettings:
+    """Proposal of one term in the subspace of its gradients (`law.py`, `fitting.py`)."""
+
+    rank: int = 8
+    """Right singular vectors kept: failures of a term are nearly one half-space, 8 hold its curvature (prototype)."""
+    bump_share: float = 0.7
+    """Share of the fitted Gaussians."""
+    tempered_share: float = 0.15
+    """Share of them nearer to the origin and wider, which bounds weights where they are too narrow ..."""
+    tempered_mean: float = 0.85
+    tempered_variance: tuple[float, float] = (1.6, 0.2)
+    """... with mean times the one and variance times, plus, the others."""
+    end_share: float = 0.15
+    """Share of Gaussians around the ends of the walks: a mode that no draw has met yet stays in reach ..."""
+    end_mean: float = 0.9
+    end_variance: float = 0.7
+    """... with the end times the one as mean, and this variance."""
+    max_ends: int = 24
+    """Ends kept of a term."""
+    prior_points: float = 20.0
+    """Points that I counts as in the covariance of the ends."""
+    max_bumps: int = 3
+    """Gaussians of a term at most."""
+    fit_ess: float = 40.0
+    """Weights are raised to a power below 1 until they are worth this many points, for a fit to fewer is noise."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RoundSettings:
+    """Rounds of draws and the final ones (`rounds.py`, `estimate.py`); shares are of the budget."""
+
+    base: float = 0.1
+    """Base draws: 600 of 6,000; with more the budget goes to what hardly fails."""
+    max_base: int = 2000
+    min_base: int = 100
+    common_share: float = 0.1
+    """Where this share of the base draws fails, plain Monte Carlo is as good as anything."""
+    size: float = 0.1
+    """Draws of an adaptive round."""
+    base_share: float = 0.04
+    """Share of base draws in every proposal: no weight exceeds 25."""
+    min_term_share: float = 0.07
+    """Least share of a term, since its first weights may be uneven; less where there are more than ten."""
+    waiting_share: float = 0.35
+    """Weight of a term whose threshold is reached while another's is not (prototype)."""
+    ready_ess: float = 6.0
+    """Effective number of failures at which a term is fitted to failures and no longer to a higher level: waiting for
+    50 takes 7 to 9 rounds (prototype)."""
+    min_failures: int = 5
+    """Failures of a term that it is fitted to, with tempered weights, where they are worth fewer."""
+    level_ess: float = 15.0
+    """Effective number of points of such a level."""
+    gradients: int = 12
+    """Gradients of a term for each fit, at points drawn by weight; fewer where terms are many."""
+    max_gradients: int = 48
+    """Gradients of all terms for each fit."""
+    later_weight: float = 1.5
+    """Weight of gradients over those of the round before: later ones are at likelier failures."""
+    ready_rounds: int = 2
+    """Rounds in a row with all terms at the threshold after which the estimate begins."""
+    final_share: float = 0.52
+    """Adaptive rounds end where no more than this share of the budget is left."""
+    final_sizes: tuple[float, ...] = (0.22, 0.33, 0.45)
+    """Final rounds, as shares of what is left."""
+    final_weights: tuple[float, ...] = (0.4, 1.0, 1.0)
+    """Weight of a draw of each in p, fixed beforehand so that p stays unbiased: the first proposal is the roughest."""
+    target_batch: int = 500
+    """Draws of each further batch where a target c.o.v. is not yet met."""
+    max_batches: int = 100
+    """Such batches at most."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DoubtSettings:
+    """When an estimate is doubted, and when it is given up."""
+
+    between_factor: float = 1.5
+    """Factor of sum c_r^2 (p_r - p)^2, the variance that the rounds show: with 3 rounds it is 2 / 3 of it."""
+    min_ess: float = 20.0
+    """Effective number of failures of the last round under which its spread is not known."""
+    max_point_share: float = 0.25
+    """Share of p in one draw that says the same."""
+    max_other_share: float = 0.05
+    """Share of p in failures of terms that were not pursued from which on there is a warning."""
+    fallback_rate: float = 0.005
+    """Effective failures for each draw of the last adaptive round under which the mixture is given up, as in
+    `FallbackSettings.min_round_rate`."""
+    min_fallback_budget: int = 300
+    """Simulations under which subset simulation is not worth it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TermSettings:
+    """All settings of the search by terms."""
+
+    min_dim: int = 30
+    """Dimensions from which it replaces the exploration of two-stage."""
+    min_budget: int = 1000
+    """Simulations under which there is no room for walks, rounds and an estimate."""
+    walks: WalkSettings = WalkSettings()
+    law: LawSettings = LawSettings()
+    rounds: RoundSettings = RoundSettings()
+    doubts: DoubtSettings = DoubtSettings()
+
+
+DEFAULT_TERM_SETTINGS = TermSettings()

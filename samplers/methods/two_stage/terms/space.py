@@ -1,0 +1,112 @@
+"""Terms and their gradients in standard normal space, and the count of what they cost."""
+
+from collections.abc import Generator
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from samplers.method import TermsOffer, request_gradients, request_terms, whole_simulations
+from samplers.methods.two_stage.noise_coordinates import noise_mask
+from samplers.problem import FloatArray, Inputs, StandardNormal, Terms
+
+_T = TypeVar("_T")
+TermSteps = Generator[FloatArray, FloatArray, _T]
+"""A computation that makes requests (see `samplers.method.Steps`) and returns a result."""
+
+DIFFERENCE = 1e-4
+"""Standard deviations of a central difference: its error is 1e-8, that of rounding 1e-12."""
+PATTERN_POINTS = 3
+"""Points at which it is seen which coordinates of u a coordinate of x depends on."""
+
+
+class TermSimulator:
+    """The way from standard normal space to terms and gradients; it counts simulations and is changed in place.
+
+    Attributes:
+        inputs: All of x.
+        offer: What the run answers.
+        n_sim: Simulations made so far, gradients at their cost.
+    """
+
+    def __init__(self, inputs: Inputs, offer: TermsOffer) -> None:
+        self.inputs, self.offer = inputs, offer
+        self.n_sim = 0
+        self._slopes: TransformSlopes | None = None
+
+    def terms(self, u: FloatArray) -> TermSteps[Terms]:
+        """Return the terms at u (n, d), n > 0."""
+        terms = yield from request_terms(self.inputs.base.from_standard_normal(u))
+        self.n_sim += len(u)
+        return terms
+
+    def gradients(self, u: FloatArray, term: NDArray[np.int64], ticks: NDArray[np.int64]) -> TermSteps[FloatArray]:
+        """Return the gradients with respect to u of one term at each of the points u (n, d), shape (n, d).
+
+        Args:
+            u: Points; none give no request.
+            term: Number of the term, shape (n,).
+            ticks: When it is attained, shape (n,).
+        """
+        if len(u) == 0:
+            return np.empty_like(u)
+        answer = yield from request_gradients(self.inputs.base.from_standard_normal(u), term, ticks)
+        self.n_sim += whole_simulations(answer.cost)
+        if self._slopes is None:
+            self._slopes = TransformSlopes(self.inputs)
+        return self._slopes.pull_back(u, answer.values)
+
+
+class TransformSlopes:
+    """Derivatives of x = T(u), the map from standard normal space, by finite differences of it: no simulation.
+
+    Coordinates of noise are themselves. Others that no coordinate of x depends on together are moved at the same time,
+    as Curtis, Powell and Reid ("On the estimation of sparse Jacobian matrices", 1974) do: where each x depends on its
+    own u alone, one difference gives all of them.
+    """
+
+    def __init__(self, inputs: Inputs) -> None:
+        self._base = inputs.base
+        self._identity = isinstance(inputs.base, StandardNormal)
+        self._moved = np.flatnonzero(~noise_mask(inputs))
+        self._groups: list[NDArray[np.int64]] | None = None
+        self._pattern = np.zeros((0, inputs.dim), dtype=bool)
+
+    def pull_back(self, u: FloatArray, gradients: FloatArray) -> FloatArray:
+        """Return the gradients (n, d) with respect to x at T(u), u (n, d), as gradients with respect to u."""
+        if self._identity:
+            return gradients
+        if self._groups is None:
+            self._find_pattern(u[:PATTERN_POINTS])
+        return np.array([self._pull_back(point, g) for point, g in zip(u, gradients, strict=True)])
+
+    def _find_pattern(self, u: FloatArray) -> None:
+        """Find which coordinates of x each moved coordinate of u changes, and groups of them that do not meet."""
+        changed = [self._differences(point, list(self._moved[:, None])) != 0 for point in u]
+        self._pattern = np.logical_or.reduce(changed)
+        groups, taken = list[list[int]](), list[NDArray[np.bool_]]()
+        for number, row in enumerate(self._pattern):
+            k = next((k for k, seen in enumerate(taken) if not (seen & row).any()), len(groups))
+            if k == len(groups):
+                groups.append([])
+                taken.append(np.zeros_like(row))
+            groups[k].append(number)
+            taken[k] = taken[k] | row
+        self._groups = [np.array(group) for group in groups]
+
+    def _differences(self, u: FloatArray, groups: list[NDArray[np.int64]]) -> FloatArray:
+        """Return central differences of T at u (d,), with the coordinates of each group moved together, (k, d)."""
+        steps = np.zeros((len(groups), len(u)))
+        for row, group in zip(steps, groups, strict=True):
+            row[group] = DIFFERENCE
+        x = self._base.from_standard_normal(np.concatenate([u + steps, u - steps]))
+        return np.asarray((x[: len(groups)] - x[len(groups) :]) / (2 * DIFFERENCE))
+
+    def _pull_back(self, u: FloatArray, gradient: FloatArray) -> FloatArray:
+        """Return J' g at one point, with J = dx / du."""
+        assert self._groups is not None
+        result = gradient.copy()  # noise, where J = I
+        slopes = self._differences(u, [self._moved[group] for group in self._groups])
+        for group, slope in zip(self._groups, slopes, strict=True):
+            result[self._moved[group]] = (self._pattern[group] * slope) @ gradient
+        return result

@@ -1,0 +1,148 @@
+"""Gradient walks: from low base draws of a term downhill to its failures, each walk a lineage of its own."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from samplers.methods.two_stage.terms.settings import WalkSettings
+from samplers.methods.two_stage.terms.space import TermSimulator, TermSteps
+from samplers.problem import FloatArray, Terms
+
+
+class Directions(NamedTuple):
+    """Unit gradients of terms, where they exist."""
+
+    term: NDArray[np.int64]
+    """Shape (k,)."""
+    values: FloatArray
+    """Shape (k, d)."""
+
+    def of(self, term: int) -> FloatArray:
+        """Return those of one term, shape (m, d)."""
+        return np.asarray(self.values[self.term == term])
+
+
+@dataclass(frozen=True, eq=False)
+class Walks:
+    """Walks of several terms where they have come."""
+
+    term: NDArray[np.int64]
+    """Term that each walk follows, shape (m,)."""
+    u: FloatArray
+    """Points reached, shape (m, d)."""
+    values: FloatArray
+    """The term there, shape (m,)."""
+    ticks: NDArray[np.int64]
+    """When it is attained, shape (m,)."""
+    distance: FloatArray
+    """Of the origin from the half-space that the last gradient of each walk describes, beta; NaN for none; (m,)."""
+    directions: Directions
+    """At all points that the walks have passed."""
+    failures: FloatArray
+    """Points on the way at which f fails, of whatever term, shape (k, d)."""
+    failing_terms: NDArray[np.int64]
+    """Their least terms, shape (k,)."""
+
+
+def choose_terms(terms: Terms, settings: WalkSettings) -> tuple[list[int], list[int]]:
+    """Return main terms, which are often the least among low draws, and other terms to scout, most promising first."""
+    lowest, known = terms.lowest, np.isfinite(terms.values).all(axis=1)
+    if not known.any():
+        return [], []
+    low = known & (lowest <= np.quantile(lowest[known], settings.candidate_quantile))
+    n_terms = terms.values.shape[1]
+    counts = np.bincount(terms.least[low], minlength=n_terms)
+    ever = np.bincount(terms.least[known], minlength=n_terms) > 0
+    main = [j for j in range(n_terms) if counts[j] >= max(settings.candidate_share * len(lowest), 1)]
+    order = np.lexsort((terms.values[known].min(axis=0), ~ever))  # those that ever are the least come first
+    others = [int(j) for j in order if j not in main]
+    return main, others[: max(settings.max_scouted, int(ever.sum()) - len(main))]
+
+
+def choose_starts(terms: Terms, term: int, n: int, settings: WalkSettings) -> NDArray[np.int64]:
+    """Return the rows from which n walks of a term start: low values, half of them attained late."""
+    values, ticks = terms.values[:, term], terms.ticks[:, term]
+    order = np.argsort(values, kind="stable")
+    order = order[np.isfinite(values[order])]
+    lower = order[: max(int(settings.start_quantile * len(order)), n)]
+    late = ticks[lower] > np.median(ticks[lower])
+    chosen = [*lower[late][: n // 2], *lower[~late][: n - n // 2]]
+    chosen += [row for row in lower if row not in chosen][: n - len(chosen)]
+    return np.array(chosen[:n], dtype=np.int64)
+
+
+def walk_downhill(
+    simulator: TermSimulator,
+    u: FloatArray,
+    terms: Terms,
+    term: NDArray[np.int64],
+    gamma: float,
+    limit: int,
+    settings: WalkSettings,
+) -> TermSteps[Walks]:
+    """Walk from points u (m, d) with known terms down one term each, until it fails or the steps are used up.
+
+    A step goes along the gradient, as far as the term would fall to its threshold if it were linear, but no further
+    than its length. A step that does not fall is taken back, and its gradient kept.
+
+    Args:
+        simulator: Counts.
+        u: Starts.
+        terms: Terms there.
+        term: The term that each walk follows, shape (m,).
+        gamma: Threshold of f.
+        limit: Value of `simulator.n_sim` that is not exceeded.
+        settings: Of the steps.
+    """
+    rows = np.arange(len(u))
+    distance = np.full(len(u), np.nan)
+    u, values, ticks = u.copy(), terms.values[rows, term].copy(), terms.ticks[rows, term].copy()
+    slope, length, moved = np.full_like(u, np.nan), np.full(len(u), settings.first_step), np.ones(len(u), dtype=bool)
+    passed, failing = list[tuple[NDArray[np.int64], FloatArray]](), list[tuple[FloatArray, NDArray[np.int64]]]()
+    for step in range(settings.steps):
+        open_ = (values > terms.threshold) & ~(distance > settings.max_distance)
+        fresh = np.flatnonzero(moved & (open_ | (step == 0)))
+        cost = simulator.offer.count_gradients(len(fresh)) + int(open_.sum())
+        if not (len(fresh) or open_.any()) or simulator.n_sim + cost > limit:
+            break
+        slope[fresh] = yield from simulator.gradients(u[fresh], term[fresh], ticks[fresh])
+        norm = np.linalg.norm(slope, axis=1)
+        sloping = np.isfinite(norm) & (norm > 0)
+        good = fresh[sloping[fresh]]
+        passed.append((term[good], slope[good] / norm[good, None]))
+        ahead_of = (values - terms.threshold) / np.where(sloping, norm, np.nan)
+        distance[good] = ahead_of[good] - np.einsum("ij,ij->i", slope[good], u[good]) / norm[good]
+        walkers = np.flatnonzero(open_ & sloping & (distance <= settings.max_distance))
+        if len(walkers) == 0:
+            break
+        size = np.minimum(ahead_of[walkers] + settings.beyond, length[walkers])
+        ahead = u[walkers] - (size / norm[walkers])[:, None] * slope[walkers]
+        seen = yield from simulator.terms(ahead)
+        known = np.isfinite(seen.f)
+        fails = known & (seen.f <= gamma)
+        failing.append((ahead[fails], seen.least[fails]))
+        value = seen.values[np.arange(len(walkers)), term[walkers]]
+        fell = known & (value < values[walkers])
+        taken = walkers[fell]
+        u[taken], values[taken] = ahead[fell], value[fell]
+        ticks[taken] = seen.ticks[np.flatnonzero(fell), term[taken]]
+        length[walkers] *= np.where(fell, settings.growth, settings.shrinkage)
+        moved = np.zeros(len(u), dtype=bool)
+        moved[taken] = True
+    return Walks(
+        term,
+        u,
+        values,
+        ticks,
+        distance,
+        Directions(_join([t for t, _ in passed], np.empty(0, np.int64)), _join([g for _, g in passed], u[:0])),
+        _join([points for points, _ in failing], u[:0]),
+        _join([least for _, least in failing], np.empty(0, np.int64)),
+    )
+
+
+def _join(parts: list, empty: NDArray) -> NDArray:  # type: ignore[type-arg]
+    """Return arrays joined, or the empty one where there are none."""
+    return np.concatenate(parts) if parts else empty

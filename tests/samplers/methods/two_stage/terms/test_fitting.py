@@ -1,0 +1,72 @@
+import numpy as np
+import pytest
+
+from samplers.methods.two_stage.terms.fitting import find_axes, first_law, fit_law, near_points, temper_weights
+from samplers.methods.two_stage.terms.history import TermHistory
+from samplers.methods.two_stage.terms.settings import LawSettings, RoundSettings
+from samplers.statistics.weights import effective_number
+
+SETTINGS = LawSettings()
+
+
+def test_axes_span_the_directions_and_no_more(rng):
+    plane = np.linalg.qr(rng.standard_normal((30, 2)))[0]
+    directions = rng.standard_normal((9, 2)) @ plane.T
+    axes = find_axes(directions, np.ones(9), rank=8)
+    assert axes.shape == (30, 2)
+    np.testing.assert_allclose(axes.T @ axes, np.eye(2), atol=1e-12)
+    np.testing.assert_allclose(axes @ axes.T @ plane, plane, atol=1e-10)
+
+
+def test_heavier_directions_come_first():
+    axes = find_axes(np.eye(3), np.array([1.0, 3.0, 2.0]), rank=2)
+    np.testing.assert_allclose(np.abs(axes), np.eye(3)[:, [1, 2]], atol=1e-12)
+
+
+def test_the_first_law_lies_around_the_ends(rng):
+    """24 ends at distance 4 along one axis: mean 4 there; the covariance is (24 S + 20 I) / 44."""
+    ends = rng.standard_normal((24, 10))
+    ends[:, 0] = 4.0
+    law = first_law(np.eye(10)[:, :2], ends, SETTINGS)
+    bump = law.groups[0].components[0]
+    np.testing.assert_allclose(bump.centre, ends[:, :2].mean(axis=0))
+    s = ends[:, 1].var()
+    np.testing.assert_allclose(np.sort(bump.variance), np.sort([20 / 44, (24 * s + 20) / 44]))
+    assert sum(group.share for group in law.groups) == pytest.approx(1.0)
+
+
+def test_a_law_is_fitted_to_weighted_failures(rng):
+    """500 draws beyond a plane, half of them with weight 0: the mean is that of the others; 5 standard errors."""
+    z = 4.0 + 0.25 * rng.exponential(size=500)
+    u = rng.standard_normal((500, 20))
+    u[:, 0] = z
+    u[:250, 1] += 6.0
+    log_weights = np.where(np.arange(500) < 250, -60.0, 0.0)
+    law = fit_law(np.eye(20)[:, :2], u, log_weights, u[:0], SETTINGS, rng)
+    *bumps, tempered = law.groups  # without ends
+    share = sum(bump.share for bump in bumps)
+    centre = sum(bump.share * bump.components[0].centre for bump in bumps) / share
+    np.testing.assert_allclose(centre, [4.25, 0.0], atol=5 * 1.0 / np.sqrt(250))
+    assert (share, tempered.share) == pytest.approx((0.7 / 0.85, 0.15 / 0.85))
+
+
+@pytest.mark.parametrize("wanted", [5.0, 40.0])
+def test_weights_are_tempered_no_more_than_needed(rng, wanted):
+    log_weights = 4 * rng.standard_normal(200)
+    weights = temper_weights(log_weights, wanted)
+    assert weights.sum() == pytest.approx(1.0)
+    assert effective_number(weights) == pytest.approx(wanted, rel=1e-3)
+    assert (np.argsort(weights) == np.argsort(log_weights)).all()
+    np.testing.assert_allclose(temper_weights(np.zeros(200), wanted), 1 / 200)
+
+
+def test_points_to_fit_to_are_failures_or_a_level(half_spaces, rng):
+    """Of 600 base draws a term with p = 0.1 has 60 failures; one that nobody reaches has its 15 lowest values."""
+    problem, _, normals = half_spaces(20, 0.1, shares=(1.0, 1e-7))
+    u = rng.standard_normal((600, 20))
+    history = TermHistory.of_base_draws(u, problem.terms(u))
+    rows, ready = near_points(history, 0, 0.0, RoundSettings())
+    assert ready and len(rows) == int((problem.terms(u).values[:, 0] <= 0).sum())
+    rows, ready = near_points(history, 1, 0.0, RoundSettings())
+    assert not ready
+    assert set(rows) == set(np.argsort(-u @ normals[1])[:15])
