@@ -11,9 +11,9 @@ from samplers.problem import FloatArray
 
 _T = TypeVar("_T")
 Evaluate = Callable[[FloatArray], ArrayLike]
-Rows = NDArray[np.int64]
+RowNumbers = NDArray[np.int64]
 """Numbers of rows of a batch."""
-RowwiseCall = Callable[[Rows], _T]
+RowwiseCall = Callable[[RowNumbers], _T]
 """A function of some rows of a batch."""
 
 
@@ -28,7 +28,7 @@ class FaultIsolation:
         on_error: What to do where f raises.
 
     Attributes:
-        n_retried: Rows that were simulated again to find those that raise.
+        n_retried: RowNumbers that were simulated again to find those that raise.
 
     Example:
         >>> def f(x):
@@ -56,7 +56,7 @@ class FaultIsolation:
         """
         return _join(self.attempt(lambda rows: one_per_row(self._evaluate(x[rows]), len(rows)), x, "f"))
 
-    def attempt(self, call: RowwiseCall[_T], x: FloatArray, what: str) -> list[tuple[Rows, _T | None]]:
+    def attempt(self, call: RowwiseCall[_T], x: FloatArray, what: str) -> list[tuple[RowNumbers, _T | None]]:
         """Call a function of some rows of x (n, d) on all of them and, where it raises, on parts of them.
 
         Args:
@@ -106,7 +106,7 @@ def isolate_failing_rows(evaluate: Evaluate, x: FloatArray) -> tuple[FloatArray,
     return _join(parts), n_retried
 
 
-def call_on_parts(call: RowwiseCall[_T], rows: Rows) -> tuple[list[tuple[Rows, _T | None]], int]:
+def call_on_parts(call: RowwiseCall[_T], rows: RowNumbers) -> tuple[list[tuple[RowNumbers, _T | None]], int]:
     """Return the results of a function of rows that raises on all of them together.
 
     The batch is split in halves, and those that raise are split again, until the raising rows stand alone: at most
@@ -118,7 +118,7 @@ def call_on_parts(call: RowwiseCall[_T], rows: Rows) -> tuple[list[tuple[Rows, _
     """
     if len(rows) == 1:
         return [(rows, None)], 0
-    parts, n_retried = list[tuple[Rows, _T | None]](), len(rows)
+    parts, n_retried = list[tuple[RowNumbers, _T | None]](), len(rows)
     for half in np.array_split(rows, 2):
         try:
             parts.append((half, call(half)))
@@ -131,7 +131,7 @@ def call_on_parts(call: RowwiseCall[_T], rows: Rows) -> tuple[list[tuple[Rows, _
     return parts, n_retried
 
 
-def _join(parts: list[tuple[Rows, FloatArray | None]]) -> FloatArray:
+def _join(parts: list[tuple[RowNumbers, FloatArray | None]]) -> FloatArray:
     """Return f (n,) of all rows, NaN where there is none."""
     return np.concatenate([np.array([np.nan]) if f is None else f for _, f in parts])
 
@@ -154,7 +154,7 @@ def _raise_for_first_row(call: RowwiseCall[_T], x: FloatArray, what: str, error:
     raise EvaluationError(f"{what} raised for {describe_row(x, start)}; {_describe(alone)}") from alone
 
 
-def _exception_of(call: RowwiseCall[_T], rows: Rows) -> Exception | None:
+def _exception_of(call: RowwiseCall[_T], rows: RowNumbers) -> Exception | None:
     """Return what a call with some rows raises, None if nothing."""
     try:
         call(rows)

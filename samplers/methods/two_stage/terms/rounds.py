@@ -52,7 +52,7 @@ def _ends(walks: Walks, history: TermHistory, term: int, settings: TermSettings)
     return walks.u[mine][lower] if values.min() <= half_way else ends
 
 
-def build_proposal(pursued: list[PursuedTerm], history: TermHistory, gamma: float, s: RoundSettings) -> TermProposal:
+def mix_terms(pursued: list[PursuedTerm], history: TermHistory, gamma: float, s: RoundSettings) -> TermProposal:
     """Return the mixture over the terms.
 
     With all of them at the threshold pi_j is proportional to sqrt(sum_j W^2), the sum over failures that the term is
@@ -69,7 +69,7 @@ def build_proposal(pursued: list[PursuedTerm], history: TermHistory, gamma: floa
     return TermProposal(history.u.shape[1], s.base_share, tuple(one.law for one in pursued), shares / shares.sum())
 
 
-def refit(
+def refit_terms(
     simulator: TermSimulator,
     history: TermHistory,
     pursued: list[PursuedTerm],

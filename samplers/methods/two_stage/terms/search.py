@@ -26,7 +26,7 @@ from samplers.methods.two_stage.terms.estimate import CombinedRounds, FinalRound
 from samplers.methods.two_stage.terms.fitting import PursuedTerm
 from samplers.methods.two_stage.terms.history import TermHistory
 from samplers.methods.two_stage.terms.order import order_by_terms
-from samplers.methods.two_stage.terms.rounds import build_proposal, pursue_walked, refit
+from samplers.methods.two_stage.terms.rounds import mix_terms, pursue_walked, refit_terms
 from samplers.methods.two_stage.terms.settings import DEFAULT_TERM_SETTINGS, TermSettings
 from samplers.methods.two_stage.terms.space import TermSimulator, TermSteps
 from samplers.methods.two_stage.terms.walks import choose_starts, choose_terms, walk_downhill
@@ -153,7 +153,7 @@ def _run_rounds(search: TermSearch, state: SearchState) -> TermSteps[SearchState
 def _draw_round(search: TermSearch, state: SearchState, n: int) -> TermSteps[tuple[SearchState, FinalRound]]:
     """Draw n points from the present proposal; they join the history."""
     gamma, rounds = search.goal.gamma, search.settings.rounds
-    proposal = build_proposal(list(state.pursued), state.history, gamma, rounds)
+    proposal = mix_terms(list(state.pursued), state.history, gamma, rounds)
     u, strata = proposal.draw(n, search.rng)
     terms = yield from search.simulator.terms(u)
     x = search.simulator.inputs.base.from_standard_normal(u)
@@ -172,7 +172,7 @@ def _draw_round(search: TermSearch, state: SearchState, n: int) -> TermSteps[tup
 
 def _refit(search: TermSearch, state: SearchState, reserve: int) -> TermSteps[SearchState]:
     """Fit the proposals anew, leaving `reserve` simulations."""
-    pursued = yield from refit(
+    pursued = yield from refit_terms(
         search.simulator,
         state.history,
         list(state.pursued),

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from samplers.methods.two_stage.terms.history import TermHistory
-from samplers.methods.two_stage.terms.rounds import build_proposal, pursue_walked, refit
+from samplers.methods.two_stage.terms.rounds import mix_terms, pursue_walked, refit_terms
 from samplers.methods.two_stage.terms.settings import DEFAULT_TERM_SETTINGS, RoundSettings
 from samplers.methods.two_stage.terms.walks import Directions, Walks
 
@@ -45,13 +45,13 @@ def test_shares_of_ready_terms_follow_their_weights(half_spaces, rng, answer, si
     problem, _, normals = half_spaces(20, 0.3)
     history, start = base_history(problem, rng, 20_000), walked(normals, [1.0, 1.0, 1.0])
     pursued = pursue_walked(start, history, SETTINGS)
-    first = build_proposal(pursued, history, 0.0, RoundSettings())
+    first = mix_terms(pursued, history, 0.0, RoundSettings())
     np.testing.assert_allclose(first.shares, 1 / 3)  # none is ready: all alike
-    pursued = answer(refit(simulator_of(problem), history, pursued, 0.0, 10**6, rng, SETTINGS), problem)
+    pursued = answer(refit_terms(simulator_of(problem), history, pursued, 0.0, 10**6, rng, SETTINGS), problem)
     assert all(one.ready for one in pursued)
     failing = history.terms.f <= 0
     parts = np.sqrt([(failing & (history.terms.least == j)).sum() for j in range(3)])
-    shares = build_proposal(pursued, history, 0.0, RoundSettings()).shares
+    shares = mix_terms(pursued, history, 0.0, RoundSettings()).shares
     np.testing.assert_allclose(shares, parts / parts.sum(), rtol=1e-9)
 
 
@@ -61,12 +61,12 @@ def test_a_fit_makes_gradients_within_its_limit_and_takes_up_new_terms(half_spac
     history = base_history(problem, rng)
     pursued = [one for one in pursue_walked(walked(normals, [1.0, 1.0]), history, SETTINGS) if one.number == 0]
     simulator = simulator_of(problem)
-    result = answer(refit(simulator, history, pursued, 0.0, 10**6, rng, SETTINGS), problem)
+    result = answer(refit_terms(simulator, history, pursued, 0.0, 10**6, rng, SETTINGS), problem)
     assert [one.number for one in result] == [0, 1]
     assert simulator.n_sim == 2 * SETTINGS.rounds.gradients * problem.gradient_cost
     assert np.abs(result[1].law.axes.T @ normals[1]) == pytest.approx(1.0)
     tight = simulator_of(problem)
-    answer(refit(tight, history, pursued, 0.0, 20, rng, SETTINGS), problem)
+    answer(refit_terms(tight, history, pursued, 0.0, 20, rng, SETTINGS), problem)
     assert 0 < tight.n_sim <= 20
 
 
@@ -74,5 +74,5 @@ def test_later_gradients_weigh_more(half_spaces, rng, answer, simulator_of):
     problem, _, normals = half_spaces(20, 0.2, shares=(1.0,))
     history = base_history(problem, rng)
     pursued = pursue_walked(walked(normals, [1.0]), history, SETTINGS)
-    (once,) = answer(refit(simulator_of(problem), history, pursued, 0.0, 10**6, rng, SETTINGS), problem)
+    (once,) = answer(refit_terms(simulator_of(problem), history, pursued, 0.0, 10**6, rng, SETTINGS), problem)
     np.testing.assert_allclose(once.direction_weights, [1.0] * 3 + [1.5] * 12)
