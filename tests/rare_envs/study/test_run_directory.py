@@ -26,7 +26,7 @@ def test_the_run_folder_holds_numbers_failures_and_a_picture(cli: Cli, risky: st
     out = tmp_path / "runs" / "one"
     result = cli(*SMALL, "--base", risky, "--out", out, "--json")
     assert result.exit_code == 0
-    assert sorted(path.name for path in out.iterdir()) == ["failures.csv", "plot.png", "result.json"]
+    assert sorted(path.name for path in out.iterdir()) == ["failures.csv", "plot.png", "result.json", "severity.png"]
     assert json.loads((out / "result.json").read_text()) == json.loads(result.stdout)
 
     with (out / "failures.csv").open(newline="") as file:
