@@ -47,19 +47,22 @@ def _ends(walks: Walks, history: TermHistory, term: int, settings: TermSettings)
     if len(ends) or not mine.any():
         return ends
     values, threshold = walks.values[mine], history.terms.threshold
-    half_way = 0.5 * (float(np.median(history.terms.values[:, term])) + threshold)
+    half_way = 0.5 * (float(np.median(walks.start_values[mine])) + threshold)
     lower = values <= np.median(values)
     return walks.u[mine][lower] if values.min() <= half_way else ends
 
 
-def mix_terms(pursued: list[PursuedTerm], history: TermHistory, gamma: float, s: RoundSettings) -> TermProposal:
+def mix_terms(
+    pursued: list[PursuedTerm], history: TermHistory, gamma: float, s: RoundSettings, final: bool = False
+) -> TermProposal:
     """Return the mixture over the terms.
 
     With all of them at the threshold pi_j is proportional to sqrt(sum_j W^2), the sum over failures that the term is
-    the least of, at least `min_term_share`; until then those that are not come first.
+    the least of, at least `min_term_share`; until then those that are not come first. In the `final` rounds a term
+    that has not been reached waits no longer.
     """
     k = len(pursued)
-    if all(one.ready for one in pursued):
+    if final or all(one.ready for one in pursued):
         w = np.where(history.failing(gamma), np.exp(history.log_weights), 0.0)
         size = np.array([np.sqrt((w[history.terms.least == one.number] ** 2).sum()) for one in pursued])
         shares = size / size.sum() if size.sum() > 0 else np.full(k, 1 / k)

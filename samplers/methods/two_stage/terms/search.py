@@ -150,10 +150,12 @@ def _run_rounds(search: TermSearch, state: SearchState) -> TermSteps[SearchState
     return state
 
 
-def _draw_round(search: TermSearch, state: SearchState, n: int) -> TermSteps[tuple[SearchState, FinalRound]]:
+def _draw_round(
+    search: TermSearch, state: SearchState, n: int, final: bool = False
+) -> TermSteps[tuple[SearchState, FinalRound]]:
     """Draw n points from the present proposal; they join the history."""
     gamma, rounds = search.goal.gamma, search.settings.rounds
-    proposal = mix_terms(list(state.pursued), state.history, gamma, rounds)
+    proposal = mix_terms(list(state.pursued), state.history, gamma, rounds, final)
     u, strata = proposal.draw(n, search.rng)
     terms = yield from search.simulator.terms(u)
     x = search.simulator.inputs.base.from_standard_normal(u)
@@ -207,7 +209,7 @@ def _estimate(search: TermSearch, state: SearchState) -> Steps:
             if 0 < number < len(plan):
                 state = yield from _refit(search, state, sum(n for n, _ in plan[number:]))
             size = search.left if last else min(size, search.end - search.simulator.n_sim)
-            state, drawn = yield from _draw_round(search, state, size)
+            state, drawn = yield from _draw_round(search, state, size, final=True)
             state = replace(state, finals=(*state.finals, replace(drawn, factor=factor)))
         except Interrupted:
             stopped = True

@@ -34,6 +34,8 @@ class Walks:
     """Points reached, shape (m, d)."""
     values: FloatArray
     """The term there, shape (m,)."""
+    start_values: FloatArray
+    """The term where they began, shape (m,)."""
     ticks: NDArray[np.int64]
     """When it is attained, shape (m,)."""
     distance: FloatArray
@@ -98,6 +100,7 @@ def walk_downhill(
     """
     rows = np.arange(len(u))
     distance = np.full(len(u), np.nan)
+    start_values = terms.values[rows, term]
     u, values, ticks = u.copy(), terms.values[rows, term].copy(), terms.ticks[rows, term].copy()
     slope, length, moved = np.full_like(u, np.nan), np.full(len(u), settings.first_step), np.ones(len(u), dtype=bool)
     passed, failing = list[tuple[NDArray[np.int64], FloatArray]](), list[tuple[FloatArray, NDArray[np.int64]]]()
@@ -135,6 +138,7 @@ def walk_downhill(
         term,
         u,
         values,
+        start_values,
         ticks,
         distance,
         Directions(_join([t for t, _ in passed], np.empty(0, np.int64)), _join([g for _, g in passed], u[:0])),

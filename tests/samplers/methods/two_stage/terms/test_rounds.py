@@ -16,7 +16,7 @@ def walked(normals, distances):
     directions = Directions(term, -normals[term])
     none = np.empty(0, dtype=np.int64)
     beta = np.array(distances)[term]
-    return Walks(term, u, np.full(len(u), -0.03), np.zeros(len(u), int), beta, directions, u[:0], none)
+    return Walks(term, u, np.full(len(u), -0.03), np.ones(len(u)), np.zeros(len(u), int), beta, directions, u[:0], none)
 
 
 def base_history(problem, rng, n=600):
@@ -34,7 +34,7 @@ def test_a_term_that_hardly_fails_is_left_to_base_draws(half_spaces, rng):
 def test_a_walk_that_came_half_way_is_enough_and_one_that_did_not_is_not(half_spaces, rng):
     problem, _, normals = half_spaces(50, 1e-4, shares=(0.5, 0.5))
     history, walks = base_history(problem, rng), walked(normals, [3.0, 3.0])
-    walks.values[:] = [0.5, 1.0, 1.5, 3.0, 3.5, 4.0]  # their medians are 3.9
+    walks.values[:] = [0.5, 1.0, 1.5, 3.0, 3.5, 4.0]  # they began at 1
     (only,) = pursue_walked(walks, history, SETTINGS)
     assert only.number == 0
     np.testing.assert_array_equal(only.ends, walks.u[:2])  # the lower half
@@ -47,12 +47,14 @@ def test_shares_of_ready_terms_follow_their_weights(half_spaces, rng, answer, si
     pursued = pursue_walked(start, history, SETTINGS)
     first = mix_terms(pursued, history, 0.0, RoundSettings())
     np.testing.assert_allclose(first.shares, 1 / 3)  # none is ready: all alike
+    final = mix_terms(pursued, history, 0.0, RoundSettings(), final=True).shares
     pursued = answer(refit_terms(simulator_of(problem), history, pursued, 0.0, 10**6, rng, SETTINGS), problem)
     assert all(one.ready for one in pursued)
     failing = history.terms.f <= 0
     parts = np.sqrt([(failing & (history.terms.least == j)).sum() for j in range(3)])
     shares = mix_terms(pursued, history, 0.0, RoundSettings()).shares
     np.testing.assert_allclose(shares, parts / parts.sum(), rtol=1e-9)
+    np.testing.assert_allclose(final, shares)  # nobody waits for a term that was not reached
 
 
 def test_a_fit_makes_gradients_within_its_limit_and_takes_up_new_terms(half_spaces, rng, answer, simulator_of):
