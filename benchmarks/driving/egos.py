@@ -46,7 +46,8 @@ intervals are those of sampling; the events behind a base distribution leave p o
 car-following: under its default, `us101`, `idm` has 7.4e-11 and in 6,000 simulations of `imitation` nothing fails;
 `us101-gap` is a test distribution under which egos and methods can be compared.
 
-`vision` has {most:,} simulations at most, and was not measured in `HardBrake-v0`. Wall times are from a busy machine of two cores. `dqn` chooses among five
+`vision` has {most:,} simulations at most, and was not measured in `HardBrake-v0`.
+Wall times are from a busy machine of two cores. `dqn` chooses among five
 accelerations and cannot steer: on the I-80's curves it leaves its lane, or the road. In the 1,448 dimensions of
 `Highway-v0` no intermediate value of f predicts a collision, so all methods can do is count: intervals are wide
 there, and warnings say so.
