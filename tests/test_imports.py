@@ -45,7 +45,7 @@ FLOORS = {
     """,
     "rare_envs": """
         version
-        traffic plugins arrays threads json_text files
+        traffic plugins arrays threads json_text files code_trust
         distributions control sensors
         sensors.camera scenarios measures
         simulation

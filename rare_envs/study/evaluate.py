@@ -12,6 +12,8 @@ import samplers
 from agents.loading import find_ego_kind
 from rare_envs.egos.errors import EgoGone
 from rare_envs.egos.faults import FaultTolerant
+from rare_envs.study.analysis.recorded_question import note_question, open_question
+from rare_envs.study.analysis.repeatability import Repeatability, RowKeeper, check_repeatability
 from rare_envs.study.crash_kinds import CrashKinds, classify_failures
 from rare_envs.study.errors import BadInput, output_folder
 from rare_envs.study.journal import JOURNAL, JournaledProblem, begin_journal, check_same_files, continue_journal
@@ -70,9 +72,11 @@ def run(
     """
     question, start = study.question, time.perf_counter()
     problem = FaultTolerant(study.problem, question.on_error)
+    journaled = JournaledProblem(problem, journal, study.problem.tile, question.on_error) if journal else problem
+    keeper = RowKeeper(journaled, question.gamma)
     try:
         estimate = samplers.estimate(
-            problem if journal is None else JournaledProblem(problem, journal, study.problem.tile, question.on_error),
+            keeper,
             study.method,
             **asdict(question.run_arguments),
             progress=progress,
@@ -91,7 +95,18 @@ def run(
         raise RunInterrupted("Stopped.", report) from None
     seconds = time.perf_counter() - start
     kinds = classify_failures(study.problem, estimate)
-    return Report(study, estimate, seconds, tuple(problem.faults), kinds, problem.n_retried)
+    again = _check_repeatability(study, keeper)
+    return Report(study, estimate, seconds, tuple(problem.faults), kinds, problem.n_retried, again)
+
+
+def _check_repeatability(study: Study, keeper: RowKeeper) -> Repeatability | None:
+    """Simulate a sample again; None where the ego says that its answers vary, or is gone, which must cost no answer."""
+    if study.problem.needs.varies:
+        return None
+    try:
+        return check_repeatability(study.problem, keeper)
+    except (EgoGone, ValueError):
+        return None
 
 
 def run_into(folder: Path, study: Study, progress: bool = False, force: bool = False) -> Report:
@@ -126,6 +141,7 @@ def run_into(folder: Path, study: Study, progress: bool = False, force: bool = F
             check_no_results(folder)
         with closing(begin_journal(folder, study.question, force)) as journal:
             remove_results(folder)
+            note_question(study.question)
             return _run(folder, study, journal, progress)
 
 
@@ -143,7 +159,7 @@ def resume(
         folder: Of the run.
         ego: Address of an ego in another program, if it has changed.
         on_error: What to count scenarios as on which the ego fails, if that has changed.
-        trust: Let the ego's file run code, as the run was allowed to.
+        trust: Let the ego's file run code, as the run was allowed to, and code that a run from elsewhere names.
         progress: Show a bar on standard error.
         mend: Of a damaged journal, keep the simulations before the damage.
 
@@ -161,9 +177,10 @@ def resume(
     """
     journal, question = continue_journal(folder, mend)
     with closing(journal):
+        question = open_question(asdict(question), folder, trust)
         if ego is not None and {find_ego_kind(ego), find_ego_kind(question.ego)} != {"remote"}:
             raise BadInput(f"Expected --ego for one whose address has changed only; the run has {question.ego!r}.")
-        question = replace(question, ego=ego or question.ego, on_error=on_error or question.on_error, trust=trust)
+        question = replace(question, ego=ego or question.ego, on_error=on_error or question.on_error)
         check_same_files(journal, question)
         return _run(folder, prepare(question), journal, progress)
 

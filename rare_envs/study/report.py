@@ -17,6 +17,7 @@ from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.space import Distribution
 from rare_envs.egos.faults import Fault
 from rare_envs.exposure import HUMAN_BENCHMARKS, CollisionRate
+from rare_envs.study.analysis.repeatability import Repeatability
 from rare_envs.study.collision_rate import compute_injury_rate, compute_rate, describe_left_out, find_frequency
 from rare_envs.study.crash_kinds import CrashKinds
 from rare_envs.study.question import Study
@@ -52,6 +53,7 @@ class Report:
         faults: Scenarios on which the ego failed twice.
         n_retried: Simulations that were repeated to find them; not in n_sim.
         kinds: Crashes in which the failures ended.
+        repeatability: Simulations done again at the end, not in n_sim; None if that was not done.
 
     Example:
         >>> from rare_envs.study import Question, prepare, run
@@ -70,6 +72,7 @@ class Report:
     faults: tuple[Fault, ...] = ()
     kinds: CrashKinds = field(default_factory=CrashKinds)
     n_retried: int = 0
+    repeatability: Repeatability | None = None
 
     @cached_property
     def sensitivity(self) -> samplers.Sensitivity | str | None:
@@ -99,10 +102,11 @@ class Report:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Doubts of the method about p, about the error of the base distribution, and about the ego's statistics."""
+        """Doubts about p: of the method, about the base distribution, the ego's statistics, and f as a function."""
         base = self.estimate.base_uncertainty
         doubts = () if base is None else tuple(f"base distribution: {text}" for text in base.warnings)
-        return (*self.estimate.warnings, *doubts, *self._missing_statistics)
+        again = (self.repeatability.warning,) if self.repeatability and self.repeatability.warning else ()
+        return (*self.estimate.warnings, *doubts, *self._missing_statistics, *again)
 
     @property
     def _missing_statistics(self) -> tuple[str, ...]:
@@ -192,6 +196,7 @@ class Report:
             "failures": ranked,
             "n_faults": len(self.faults),
             "n_retried": self.n_retried,
+            "repeatability": None if self.repeatability is None else self.repeatability._asdict(),
             "faults": [
                 {"parameters": self._parameters(fault.x), "reason": fault.reason} for fault in self.faults[:top]
             ],

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,10 +15,11 @@ from rare_envs.envs.rendering import FRAME_WIDTH, Renderer
 from rare_envs.files import replace_file
 from rare_envs.json_text import parse_json_object
 from rare_envs.problem import DrivingProblem
+from rare_envs.study.analysis.recorded_question import open_question
 from rare_envs.study.columns import MAX_SHOWN, format_value
-from rare_envs.study.errors import BadInput
+from rare_envs.study.errors import BadInput, as_bad_input
 from rare_envs.study.journal import JOURNAL
-from rare_envs.study.question import prepare, read_question
+from rare_envs.study.question import prepare
 from rare_envs.study.replay import Drive
 from rare_envs.study.run_directory import FAILURES, RESULT, read_failures
 
@@ -51,7 +51,7 @@ def find_failure(folder: Path, number: int, trust: bool = False) -> RecordedFail
     Args:
         folder: Of `rare-envs estimate --out`.
         number: Which failure.
-        trust: Let the ego's file run code, as the run was allowed to.
+        trust: Let the ego's file run code, as the run was allowed to, and code that a run from elsewhere names.
 
     Raises:
         BadInput: There is no such run or failure, or what it was about cannot be loaded any longer.
@@ -67,7 +67,9 @@ def find_failure(folder: Path, number: int, trust: bool = False) -> RecordedFail
         ) from error
     except ValueError as error:
         raise BadInput(error) from error
-    problem = prepare(replace(read_question(recorded.get("question")), trust=trust)).problem
+    question = open_question(recorded.get("question"), folder, trust)
+    with as_bad_input(TypeError, OverflowError, RecursionError, MemoryError):
+        problem = prepare(question).problem
     count = len(table["f"])
     if not 0 <= number < count:
         raise BadInput(

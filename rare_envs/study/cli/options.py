@@ -47,7 +47,10 @@ StatsOption = Annotated[
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
 SeedOption = Annotated[int, typer.Option(help="Seed; the same seed gives the same answer.")]
 TrustOption = Annotated[
-    bool, typer.Option("--trust", help="Let the ego's .zip run code; open it though others can write to it.")
+    bool,
+    typer.Option(
+        "--trust", help="Let code run: of the ego's .zip, though others can write to it; of a run from elsewhere."
+    ),
 ]
 ObservationOption = Annotated[
     str | None,

@@ -1,0 +1,131 @@
+"""Trust in code that a folder of somebody else names: it is asked for once, and remembered by what it was given for.
+
+A run's question may name code: an ego or a measure `module:name`, an environment that a module registers. Whoever asks
+the question means that code. Whoever replays or resumes a folder that came from elsewhere does not, and modules are
+found in the working directory, where such a folder may bring its own. So each run that is made here is noted, and a
+folder whose question is not among these runs no code without trust.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+MAX_NOTES = 2**24
+"""Bytes of the notes that are read, the last ones: 250,000 runs."""
+
+
+def find_notes() -> Path:
+    """Return the file with the notes, in the user's folder for states of programs (XDG_STATE_HOME).
+
+    Example:
+        >>> find_notes().name
+        'runs'
+    """
+    state = os.environ.get("XDG_STATE_HOME") or str(Path.home() / ".local" / "state")
+    return Path(state) / "rare-envs" / "runs"
+
+
+def note_own_run(question: Mapping[str, Any], code: Sequence[str]) -> None:
+    """Note that a question was asked here; its code may change and is still the user's own.
+
+    Args:
+        question: JSON-ready.
+        code: Names `module:name` in it.
+    """
+    if code:
+        _append_note(_digest_own(question, code))
+
+
+def check_code_trust(question: Mapping[str, Any], code: Sequence[str], folder: Path, trust: bool) -> None:
+    """Refuse a question that names code, unless it was asked here, or trusted before with the same code.
+
+    Args:
+        question: JSON-ready, as recorded in a folder.
+        code: Names `module:name` in it.
+        folder: Where it was recorded, for the message.
+        trust: Trust it from now on, for as long as question and code stay what they are.
+
+    Raises:
+        ValueError: It is not trusted.
+
+    Example:
+        >>> check_code_trust({"ego": "mine:make"}, ["mine:make"], Path("run"), trust=False)
+        Traceback (most recent call last):
+            ...
+        ValueError: The run in 'run' was not made here, and its question runs code: 'mine:make'. Look at that code, then add --trust (trust=True) once; that is remembered until question or code change.
+    """  # noqa: E501 (the example shows a whole message)
+    if not code:
+        return
+    trusted = _digest_trusted(question, code)
+    if trust:
+        _append_note(trusted)
+        return
+    if not {trusted, _digest_own(question, code)} & _read_notes():
+        files = {name: find_module_file(name) for name in code}
+        named = ", ".join(f"{name!r}{f' ({path})' if path else ''}" for name, path in files.items())
+        raise ValueError(
+            f"The run in {str(folder)!r} was not made here, and its question runs code: {named}. Look at that code, "
+            "then add --trust (trust=True) once; that is remembered until question or code change."
+        )
+
+
+def find_module_file(name: str) -> Path | None:
+    """Return the file of the module in `module:name`, found without running anything; None if there is none.
+
+    Example:
+        >>> find_module_file("json.decoder:JSONDecoder").name
+        'decoder.py'
+    """
+    parts = name.partition(":")[0].split(".")
+    for folder in (os.getcwd(), *sys.path):
+        base = Path(folder, *parts)
+        for path in (base / "__init__.py", base.with_name(f"{base.name}.py")):
+            with contextlib.suppress(OSError, ValueError):
+                if path.is_file():
+                    return path.resolve()
+    return None
+
+
+def _digest_own(question: Mapping[str, Any], code: Sequence[str]) -> str:
+    """Return what identifies a question and the places of its code."""
+    return _digest("own", question, [[name, str(find_module_file(name))] for name in code])
+
+
+def _digest_trusted(question: Mapping[str, Any], code: Sequence[str]) -> str:
+    """Return what identifies a question and the content of its code."""
+    contents = []
+    for name in code:
+        path = find_module_file(name)
+        content = b""
+        with contextlib.suppress(OSError):
+            content = path.read_bytes() if path else b""
+        contents.append([name, hashlib.sha256(content).hexdigest()])
+    return _digest("trusted", question, contents)
+
+
+def _digest(kind: str, question: Mapping[str, Any], code: list[list[str]]) -> str:
+    return hashlib.sha256(json.dumps([kind, dict(question), code], sort_keys=True).encode()).hexdigest()
+
+
+def _read_notes() -> set[str]:
+    with contextlib.suppress(OSError), find_notes().open("rb") as file:
+        file.seek(max(0, os.fstat(file.fileno()).st_size - MAX_NOTES))
+        return set(file.read().decode("ascii", "replace").split())
+    return set()
+
+
+def _append_note(digest: str) -> None:
+    """Add a note, if there is not one; a folder that cannot be written to makes the next replay ask."""
+    if digest in _read_notes():
+        return
+    with contextlib.suppress(OSError):
+        find_notes().parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        with find_notes().open("a", encoding="ascii") as file:
+            file.write(f"{digest}\n")

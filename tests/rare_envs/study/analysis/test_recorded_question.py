@@ -1,0 +1,208 @@
+"""Folders of somebody else: nothing that they name is run without trust, and damaged ones are refused in one line."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rare_envs.study import Question, prepare, run_into
+from rare_envs.study.analysis.recorded_question import list_code, open_question
+from rare_envs.study.errors import BadInput
+from rare_envs.study.evaluate import resume
+from rare_envs.study.journal import begin_journal
+from rare_envs.study.run_directory import BLOCKS, FAILURES, RESULT
+from rare_envs.study.video import find_failure
+
+FOLLOWING = "rare_envs/CarFollowing-v0"
+EVIL = """
+from pathlib import Path
+
+Path("was_here").touch()
+
+import numpy as np
+
+
+class Coasting:
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        return np.zeros((len(observation), 2), np.float32), None
+
+
+def make():
+    return Coasting()
+
+
+def gap(moment):
+    return moment.lead.gap
+"""
+CODE = {
+    "ego": {"ego": "evil:make"},
+    "ego in a process": {"ego": "process:evil:make"},
+    "ego behind a stack": {"ego": "noisy:evil:make"},
+    "ego behind both": {"ego": "noisy:process:evil:make?timeout=5"},
+    "measure": {"measure": "evil:gap"},
+    "environment": {"env_id": f"evil:{FOLLOWING}"},
+}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("made") / "run"
+    question = Question(env_id=FOLLOWING, base="us101-gap", gamma=3.0, horizon=3.0, method="mc", max_sim=400)
+    run_into(folder, prepare(question))
+    return folder
+
+
+@pytest.fixture
+def received(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder from somebody else, with a module of theirs, in the working directory of one who made no runs."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    (tmp_path / "evil.py").write_text(EVIL)
+    return Path(shutil.copytree(run, tmp_path / "run"))
+
+
+def change_question(folder: Path, **changes: Any) -> dict[str, Any]:
+    result = json.loads((folder / RESULT).read_text())
+    result["question"] = {**result["question"], **changes}
+    (folder / RESULT).write_text(json.dumps(result))
+    return dict(result["question"])
+
+
+@pytest.mark.parametrize("name", CODE)
+def test_a_received_run_is_not_replayed_without_trust(name: str, received: Path) -> None:
+    change_question(received, **CODE[name])
+    with pytest.raises(BadInput, match=r"was not made here, and its question runs code: 'evil:.*add --trust"):
+        find_failure(received, 0)
+    assert not Path("was_here").exists()
+
+
+@pytest.mark.parametrize("name", CODE)
+def test_a_received_run_is_not_resumed_without_trust(name: str, received: Path, tmp_path: Path) -> None:
+    question = Question(**change_question(received, **CODE[name]))
+    (tmp_path / "begun").mkdir()
+    begin_journal(tmp_path / "begun", question).close()
+    with pytest.raises(BadInput, match=r"was not made here, and its question runs code: 'evil:.*add --trust"):
+        resume(tmp_path / "begun")
+    assert not Path("was_here").exists()
+
+
+def test_trust_is_asked_for_once(received: Path) -> None:
+    change_question(received, ego="evil:make")
+    assert find_failure(received, 0, trust=True).n_failures > 0
+    assert Path("was_here").exists()
+    assert find_failure(received, 0).n_failures > 0
+    with Path("evil.py").open("a") as file:
+        file.write("\nmore = 1\n")
+    with pytest.raises(BadInput, match="add --trust"):
+        find_failure(received, 0)
+
+
+def test_a_run_of_ones_own_needs_no_trust(received: Path, tmp_path: Path) -> None:
+    question = Question(env_id=FOLLOWING, ego="evil:make", base="us101-gap", method="mc", max_sim=200, gamma=5.0)
+    run_into(tmp_path / "mine", prepare(question))
+    with Path("evil.py").open("a") as file:
+        file.write("\nmended = True\n")
+    assert find_failure(tmp_path / "mine", 0).n_failures > 0
+
+
+QUESTIONS: dict[str, Any] = {
+    "a list": [1],
+    "text": "idm",
+    "nothing": None,
+    "no environment": {"ego": "idm"},
+    "ego is a number": {"ego": 3},
+    "ego is a list": {"ego": ["idm"]},
+    "ego is unknown": {"ego": "nobody"},
+    "ego is far away": {"ego": "https://example.org/ego.zip"},
+    "gamma is text": {"gamma": "3"},
+    "gamma is huge": {"gamma": 10**400},
+    "gamma is a flag": {"gamma": True},
+    "seed is a fraction": {"seed": 0.5},
+    "seed is huge": {"seed": 10**30},
+    "seed is negative": {"seed": -1},
+    "horizon is a list": {"horizon": [3.0]},
+    "horizon is negative": {"horizon": -3.0},
+    "horizon is not a number": {"horizon": float("nan")},
+    "base is a mapping": {"base": {"names": []}},
+    "base is a device": {"base": "/dev/null"},
+    "method is unknown": {"method": "guess"},
+    "measure is long": {"measure": "stl:" + "not " * 50_000},
+    "measure is nested": {"measure": "stl:" + "(" * 10_000},
+    "environment is unknown": {"env_id": "rare_envs/Nowhere-v0"},
+    "collisions are unknown": {"collisions": "all"},
+    "noise is unknown": {"noise": "loud"},
+}
+
+
+@pytest.mark.parametrize("name", QUESTIONS)
+def test_damaged_questions_are_refused_in_one_line(name: str, received: Path) -> None:
+    result = json.loads((received / RESULT).read_text())
+    change = QUESTIONS[name]
+    whole = isinstance(change, dict) and name != "no environment"
+    result["question"] = {**result["question"], **change} if whole else change
+    (received / RESULT).write_text(json.dumps(result))
+    with pytest.raises(BadInput) as caught:
+        find_failure(received, 0)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 2000
+
+
+def write(name: str, content: bytes) -> Callable[[Path], object]:
+    return lambda folder: (folder / name).write_bytes(content)
+
+
+def change_table(change: Callable[[list[str]], list[str]]) -> Callable[[Path], object]:
+    return lambda folder: (folder / FAILURES).write_text(
+        "\n".join(change((folder / FAILURES).read_text().splitlines()))
+    )
+
+
+FILES: dict[str, Callable[[Path], object]] = {
+    "no result": write(RESULT, b""),
+    "nested result": write(RESULT, b"[" * 100_000),
+    "result of large numbers": write(RESULT, b'{"question": ' + b"9" * 5000 + b"}"),
+    "result is no text": write(RESULT, b"\xff\xfe\x00"),
+    "result is a list": write(RESULT, b"[]"),
+    "result is a number": write(RESULT, b"1"),
+    "no table": lambda folder: (folder / FAILURES).unlink(),
+    "empty table": write(FAILURES, b""),
+    "table is no text": write(FAILURES, b"\xff\xfe\x00\x01"),
+    "table of null bytes": write(FAILURES, b"f,log_p0\n\0,\0\n"),
+    "no parameters": write(FAILURES, b"f,log_p0\n-1,-2\n"),
+    "no f": change_table(lambda lines: [line.replace("log_p0", "g").replace("f,", "h,") for line in lines]),
+    "rows are short": change_table(lambda lines: [lines[0], "1,2"]),
+    "words for numbers": change_table(lambda lines: [lines[0], ",".join("a" * (lines[0].count(",") + 1))]),
+    "far outside": change_table(lambda lines: [lines[0], ",".join(["1e300"] * (lines[0].count(",") + 1))]),
+    "not a number": change_table(lambda lines: [lines[0], ",".join(["nan"] * (lines[0].count(",") + 1))]),
+    "no rows": change_table(lambda lines: lines[:1]),
+    "long cell": change_table(lambda lines: [lines[0], "1" * 200_000]),
+    "blocks are no archive": write(BLOCKS, b"PK noise"),
+    "blocks of objects": lambda folder: np.savez(folder / BLOCKS, gap=np.array([print], dtype=object)),
+    "blocks of no rows": lambda folder: np.savez(folder / BLOCKS, gap=np.zeros(0)),
+}
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_damaged_folders_are_refused_in_one_line(name: str, received: Path) -> None:
+    FILES[name](received)
+    with pytest.raises(BadInput) as caught:
+        find_failure(received, 0)
+    assert "\n" not in str(caught.value)
+
+
+def test_values_of_every_field_are_taken_back(received: Path) -> None:
+    question = Question(env_id=FOLLOWING, gamma=1, max_sim=None, noise="fixed", horizon=3.0, trust=True)
+    recorded = json.loads(json.dumps(asdict(question)))
+    assert open_question({**recorded, "unknown": 1}, received, trust=True) == question
+
+
+def test_what_is_no_code_is_not_listed() -> None:
+    for ego in ("idm", "ego.zip", "noisy:bc", "tcp://127.0.0.1:5555", "process:imitation?timeout=3"):
+        assert list_code(Question(env_id=FOLLOWING, ego=ego)) == []
