@@ -100,8 +100,13 @@ def run(
 
 
 def _check_repeatability(study: Study, keeper: RowKeeper) -> Repeatability | None:
-    """Simulate a sample again; None where the ego says that its answers vary, or is gone, which must cost no answer."""
-    if study.problem.needs.varies:
+    """Simulate a sample again.
+
+    None where ego and measure are rules of this package, which keep nothing; where the ego says that its answers vary;
+    and where it is gone, which must not cost the answer.
+    """
+    rules = study.problem.ego in ("idm", "human") if isinstance(study.problem.ego, str) else False
+    if study.problem.needs.varies or (rules and ":" not in study.question.measure):
         return None
     try:
         return check_repeatability(study.problem, keeper)

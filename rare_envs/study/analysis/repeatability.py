@@ -14,7 +14,7 @@ import numpy as np
 from rare_envs.egos.faults import FaultTolerant
 from samplers.problem import FloatArray
 
-KEPT_ROWS, COMPANY, ROWS_ALONE = 64, 8, 4
+KEPT_ROWS, COMPANY, ROWS_ALONE = 64, 16, 2
 """Simulations that are done again, how many of them in one batch, and how many also each alone."""
 F_TOLERANCE = 1e-3
 """Largest difference of f that is rounding: products of networks round differently by batch size."""

@@ -54,7 +54,7 @@ def test_an_ego_without_an_f_is_noticed(ego: type[Braking]) -> None:
     assert report.to_dict()["repeatability"]["n_differing"] > 3
 
 
-@pytest.mark.parametrize("ego", [None, Braking(), "imitation"])
+@pytest.mark.parametrize("ego", [Braking(), "imitation"])
 def test_others_are_not_suspected(ego: Any) -> None:
     import agents
 
