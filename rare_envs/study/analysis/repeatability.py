@@ -16,7 +16,7 @@ from samplers.problem import FloatArray
 
 KEPT_ROWS, COMPANY, ROWS_ALONE = 64, 16, 2
 """Simulations that are done again, how many of them in one batch, and how many also each alone."""
-F_TOLERANCE = 1e-3
+ROUNDING_OF_F = 1e-3
 """Largest difference of f that is rounding: products of networks round differently by batch size."""
 MOST_DIFFERING = 0.05
 """Share of simulations that may differ by more: a choice between two actions may hang on rounding in a rare one."""
@@ -143,4 +143,4 @@ def check_repeatability(problem: Any, kept: RowKeeper) -> Repeatability:
         return Repeatability(0, 0, 0.0)
     again = np.concatenate([tolerant.evaluate(kept.x[rows]) for rows in batches])
     apart = np.nan_to_num(np.abs(again - kept.f[np.concatenate(batches)]), nan=np.inf)
-    return Repeatability(len(apart), int((apart > F_TOLERANCE).sum()), float(apart.max()))
+    return Repeatability(len(apart), int((apart > ROUNDING_OF_F).sum()), float(apart.max()))
