@@ -390,8 +390,8 @@ def test_subset_simulation_takes_as_many_points_as_the_target_asks_for(recorder)
 
 def test_subset_simulation_is_stopped():
     reference = case("slabs_d20")
-    run = TS().start(reference.problem, seed=0)
-    while not run.done and run.progress.n_sim < 5000:
+    run = TS().start(reference.problem, seed=2)  # given up after the first round
+    while not run.done and run.progress.n_sim < 4000:
         run.tell(reference.problem.f(run.ask()))
     run.stop()
     result = run.result()
