@@ -128,7 +128,7 @@ BIAS = {"two-stage": 0.005, "surrogate": 0.0, "mc": 0.0, "is": 0.01, "ce": 0.01,
 cross-entropy misses a little of the tail beyond its proposal in most runs."""
 
 
-RUNS = {"two-stage": 14, "surrogate": 8, "ice": 20, "is": 30}
+RUNS = {"two-stage": 14, "surrogate": 5, "ice": 20, "is": 30}
 """Runs per problem of the methods whose own work takes long; the others make 60."""
 MAX_SIM = {"two-stage": 3000, "surrogate": 250}
 """Simulations of each of these runs, where they are not the method's own number; with many seeds they are."""
