@@ -144,6 +144,7 @@ def train_ego(
     saved = _find_checkpoint(checkpoint, arguments, resume)
 
     import stable_baselines3
+    from stable_baselines3.common.callbacks import ConvertCallback
     from torch import nn
 
     from training.vec_env import sb3_vec_env
@@ -163,7 +164,7 @@ def train_ego(
                 model.get_env().reset()
                 restore_model(model, saved)
             keep = _make_checkpoints(checkpoint, arguments, checkpoint_interval)
-            callbacks = [keep] if callback is None else [keep, callback]
+            callbacks = [keep] if callback is None else [keep, ConvertCallback(callback)]
             left = steps - model.num_timesteps
             model.learn(left, callback=callbacks, reset_num_timesteps=saved is None)
         with replace_file(target) as draft:
