@@ -63,6 +63,7 @@ def run(
     Example:
         How often does the rule-based ego come within 3 s of a collision in the first 3 s?
 
+        >>> from rare_envs.study.question import Question
         >>> question = Question(
         ...     env_id="rare_envs/CarFollowing-v0", base="us101-gap", gamma=3.0, horizon=3.0, method="mc", max_sim=1000
         ... )
@@ -133,6 +134,7 @@ def run_into(folder: Path, study: Study, progress: bool = False, force: bool = F
 
     Example:
         >>> from tempfile import TemporaryDirectory
+        >>> from rare_envs.study.question import Question
         >>> question = Question(
         ...     env_id="rare_envs/CarFollowing-v0", base="us101-gap", gamma=3.0, horizon=3.0, method="mc", max_sim=1000
         ... )
@@ -178,7 +180,7 @@ def resume(
         >>> resume(Path("runs/nowhere"))
         Traceback (most recent call last):
             ...
-        rare_envs.study.errors.BadInput: There is no unfinished run in 'runs/nowhere': it has no journal.npy.
+        rare_envs.study.errors.BadInput: There is no unfinished run in 'runs/nowhere': it has no journal.bin.
     """
     journal, question = continue_journal(folder, mend)
     with closing(journal):

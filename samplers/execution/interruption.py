@@ -30,7 +30,7 @@ class EstimationInterrupted(KeyboardInterrupt):
         ... except samplers.EstimationInterrupted as stopped:
         ...     result = stopped.estimate
         >>> result.n_sim, round(result.p, 4), str(result.status)
-        (20000, 0.0231, 'stopped')
+        (20000, 0.0228, 'stopped')
     """
 
     def __init__(self, estimate: Estimate) -> None:

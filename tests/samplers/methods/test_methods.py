@@ -78,10 +78,14 @@ def test_works_through_any_base(method):
     np.testing.assert_allclose(results[0].failures.log_p0, -results[0].failures.x.sum(axis=1))
 
 
+CALLS = {"two-stage": 130}
+"""Calls of f at most, where they are more: a step of the lines of descent is a call, and lines take 30 to 80 steps."""
+
+
 def test_few_and_large_calls(method, recorder):
     f = recorder(half_space().problem.f)
     samplers.estimate(FunctionProblem(f, 2), method, seed=3)
-    assert len(f.batches) <= 60
+    assert len(f.batches) <= CALLS.get(method.name, 60)
 
 
 @pytest.mark.parametrize("max_sim", [1, 10, 100])

@@ -31,7 +31,7 @@ def test_a_run_with_collisions_has_a_picture_of_their_severity(tmp_path: Path) -
     assert report.kinds.severity is not None
     save_severity(tmp_path / "again.png", report.kinds.severity)
     assert (tmp_path / "run" / "severity.png").read_bytes() == (tmp_path / "again.png").read_bytes()
-    run_into(tmp_path / "run", prepare(Question(env_id=FOLLOWING, method="mc", max_sim=50)))
+    run_into(tmp_path / "run", prepare(Question(env_id=FOLLOWING, method="mc", max_sim=50)), force=True)
     assert not (tmp_path / "run" / "severity.png").exists()
 
 
