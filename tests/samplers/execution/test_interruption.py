@@ -5,12 +5,14 @@ from __future__ import annotations
 import os
 import signal
 import threading
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
 
 import samplers
 from samplers.execution.interruption import EstimationInterrupted, defer_signals
+from samplers.method import Answer
 from samplers.problem import FloatArray
 from samplers.trace import Status
 
@@ -46,13 +48,13 @@ def test_before_the_first_batch_there_is_nothing_to_know() -> None:
 
 
 def test_a_signal_while_the_method_computes_waits_until_it_can_conclude(monkeypatch: pytest.MonkeyPatch) -> None:
-    record = samplers.Run.tell
+    take = samplers.Run.answer
 
-    def tell(self: samplers.Run, f: FloatArray) -> None:
+    def answer(self: samplers.Run, answers: Sequence[Answer]) -> None:
         os.kill(os.getpid(), signal.SIGINT)
-        record(self, f)
+        take(self, answers)
 
-    monkeypatch.setattr(samplers.Run, "tell", tell)
+    monkeypatch.setattr(samplers.Run, "answer", answer)
     with pytest.raises(EstimationInterrupted) as caught:
         samplers.estimate(samplers.FunctionProblem(lambda x: 2.0 - x[:, 0], 2), "mc", seed=1, max_sim=20_000)
     assert caught.value.estimate.n_sim == 10_000
