@@ -6,6 +6,7 @@ Made robust against what simulators return:
 - *Caps.* Where many outcomes equal the largest (a capped time to collision) or the least one (-1 on collision), the
   process need not pass through them. They are censored: known to be at least the cap, or at most 0, and replaced
   within these bounds by what the others predict there, then by their leave-one-out predictions.
+- *A jump to failure* (0.5 s, then a collision) moves the limit to where points begin to fail.
 - *Noise and jumps* are a nugget whose size is found with the other covariance parameters.
 - *Overconfidence.* Standard deviations are inflated by the standardised residuals of leaving each point out.
 
@@ -21,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve, solve_triangular
-from scipy.optimize import minimize
+from scipy.optimize import minimize, minimize_scalar
 from scipy.special import log_ndtr
 
 from samplers.methods.surrogate.settings import DEFAULT_SURROGATE_SETTINGS, KrigingSettings
@@ -33,6 +34,8 @@ IMPUTED_SPREAD = 3.0
 """Replaced outcomes lie at most so many standard deviations beyond their bound."""
 JUST_FAILED = 1e-3
 """Least depth of a failing outcome that is replaced, in compressed units."""
+LARGEST_SHIFT = 3.0
+"""Failure begins at most so many standard deviations of all outcomes from the limit state."""
 NEAR_LIMIT = 6.0
 """Residuals count where the limit state is within so many standard deviations."""
 
@@ -140,7 +143,25 @@ def fit_kriging(
     near = np.abs(left_out - limit) < NEAR_LIMIT * left_out_sd
     inflation = math.sqrt(float((residuals[near] ** 2).mean())) if near.any() else 1.0
     n_searched = len(y) if before is None or search else before.n_searched
-    return Kriging(process, limit, min(max(inflation, 1.0), settings.most_inflation), scale, n_searched)
+    inflation = min(max(inflation, 1.0), settings.most_inflation)
+    if outcomes.floored.any():  # these do not tell where f would be 0
+        limit += _find_shift(left_out - limit, inflation * left_out_sd, y <= 0)
+    return Kriging(process, limit, inflation, scale, n_searched)
+
+
+def _find_shift(mean: FloatArray, sd: FloatArray, fails: NDArray[np.bool_]) -> float:
+    """Return where in standardised outcomes failure begins, given each point's prediction without it, shape (n,).
+
+    Where f jumps to failure (a time to collision of 0.5 s, then -1), points fail whose prediction is well above 0. The
+    shift has the highest posterior density with P[fail] = Phi((shift - mean) / sd) and
+    a standard normal prior.
+    """
+    sign = np.where(fails, 1.0, -1.0)
+
+    def loss(shift: float) -> float:
+        return 0.5 * shift**2 - float(log_ndtr(sign * (shift - mean) / np.maximum(sd, 1e-9)).sum())
+
+    return float(minimize_scalar(loss, bounds=(-LARGEST_SHIFT, LARGEST_SHIFT), method="bounded").x)
 
 
 def outcome_scale(y: FloatArray, settings: KrigingSettings = DEFAULT_SURROGATE_SETTINGS.kriging) -> float:

@@ -93,15 +93,20 @@ class SurrogateRun:
         size = max((most - self.n_design) // learning.batches, learning.least_batch)
         kriging = fit_kriging(self.u, self.f - self.goal.gamma, None, self.settings.kriging)
         mixture, good = first_mixture(self.inputs.dim, scales), 0
+        surprises = list[float]()
         while len(self.f) < most and good < 2:
             pool = draw_mixture_pool(kriging, mixture, self.settings.pool.learning_size, self.rng)
             before = int((self.f <= self.goal.gamma).sum())
             batch = choose_batch(kriging, pool, min(size, most - len(self.f)), learning, self.rng)
+            expected = np.exp(kriging.predict(batch).log_fail)
             yield from self._simulate(batch)
+            surprises.append(float((self.f[-len(batch) :] <= self.goal.gamma).sum() - expected.sum()))
+            allowed = learning.most_surprise * math.sqrt(2 * float((expected * (1 - expected)).sum()) + 1)
+            calibrated = abs(sum(surprises[-2:])) <= allowed
             failures = int((self.f <= self.goal.gamma).sum())
             self.failing_batches += failures > before
             forecast = pool.forecast_cov(self.budget - len(self.f))
-            good = good + 1 if failures and forecast < learning.forecast_cov else 0
+            good = good + 1 if failures and calibrated and forecast < learning.forecast_cov else 0
             mixture = fit_mixture(pool, scales, self.settings.pool, self.rng)
             kriging = fit_kriging(self.u, self.f - self.goal.gamma, kriging, self.settings.kriging)
         self._mixture = mixture

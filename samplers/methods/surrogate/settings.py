@@ -51,6 +51,9 @@ class LearningSettings:
     least_batch: int = 6
     candidates: int = 40
     """Candidates for each point of a batch."""
+    most_surprise: float = 1.5
+    """Standard errors by which the failures of two batches may differ from those predicted where learning ends early:
+    of a surrogate that is wrong at the limit state, all doubtful points fail, or none."""
     forecast_cov: float = 0.02
     """Learning ends where the draws that are left would give this c.o.v., in two batches one after the other."""
     common_share: float = 0.1

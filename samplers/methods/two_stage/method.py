@@ -37,7 +37,8 @@ class TwoStage(Method):
     some per cent and make intervals too short.)
 
     All stages work in standard normal space, so that wide draws stay within the support of the parameters. A run
-    yields 65 to 125 batches, most of them steps of the lines of descent. Regression of f and subset simulation use its values, everything else only its sign.
+    yields 65 to 125 batches, most of them steps of the lines of descent. Regression of f and subset simulation use its
+    values, everything else only its sign.
 
     *Noise.* f may have noise of its own that is no part of x: p is then the marginal probability. No stored outcome
     is simulated again. A noisy f is recognised by 30 points right beside failing ones. Regions are then not

@@ -84,3 +84,19 @@ def test_any_outcomes_are_compressed_to_finite_numbers_of_their_sign(y):
     z = compress_outcomes(y, outcome_scale(y)).z
     assert np.isfinite(z).all()
     np.testing.assert_array_equal(np.sign(z), np.sign(y))
+
+
+def test_failure_begins_where_points_fail_if_f_jumps_there() -> None:
+    """Beyond s = 2 f is -1, before it 0.5 + 3 (2 - s): extrapolated, that would be 0 at s = 2.17 only."""
+    s = np.linspace(0.0, 4.0, 81)[:, None]
+    kriging = fit_kriging(s, np.where(s[:, 0] >= 2.0, -1.0, 0.5 + 3 * (2.0 - s[:, 0])))
+    fail = np.exp(kriging.predict(np.array([[1.9], [2.1]])).log_fail)
+    assert fail[0] < 0.5 < fail[1]
+
+
+def test_where_f_is_continuous_failure_begins_at_the_limit_state() -> None:
+    s = np.linspace(0.0, 4.0, 81)[:, None]
+    kriging = fit_kriging(s, 2.0 - s[:, 0])
+    fail = np.exp(kriging.predict(np.array([[1.95], [2.05]])).log_fail)
+    assert fail[0] < 0.1
+    assert fail[1] > 0.9
