@@ -48,6 +48,7 @@ def defer_signals() -> Iterator[None]:
 
     Example:
         >>> import os, signal
+        >>> before = signal.signal(signal.SIGINT, signal.default_int_handler)
         >>> try:
         ...     with defer_signals():
         ...         os.kill(os.getpid(), signal.SIGINT)
@@ -56,6 +57,7 @@ def defer_signals() -> Iterator[None]:
         ...     print("interrupted")
         complete
         interrupted
+        >>> before = signal.signal(signal.SIGINT, before)
     """
     handlers: dict[int, Callable[[int, FrameType | None], Any]] = {}
     received: list[int] = []

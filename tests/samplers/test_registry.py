@@ -131,8 +131,11 @@ def command_line(*words):
 def test_the_command_line_knows_it(installed):
     installed(lattice="lattice_methods:Lattice", broken="lattice_methods:Lettuce")
     env = "rare_envs/CarFollowing-v0"
-    with pytest.warns(RuntimeWarning, match="'broken' of lattice-methods"):
-        answer = json.loads(command_line("estimate", env, "--method", "lattice", "--json").stdout)
+    with warnings.catch_warnings():
+        warnings.simplefilter("default")
+        run = command_line("estimate", env, "--method", "lattice", "--json")
+    assert "'broken' of lattice-methods" in run.stderr
+    answer = json.loads(run.stdout)
     assert (answer["method"]["name"], answer["n_sim"]) == ("lattice", 2000)
     assert "Plain draws under another name." in command_line("list").stdout
     refused = command_line("estimate", env, "--method", "lattic")

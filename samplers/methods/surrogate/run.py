@@ -130,7 +130,8 @@ class SurrogateRun:
         goal, stopped, cov = self.goal, False, math.inf
         draws, wide_weights, kinds = Draws(0, np.empty(0), np.empty(0)), [self._design_log_weights()], np.zeros((2, 3))
         left = self._count_draws()
-        size = left if goal.target_cov is None else max(int(self.settings.target_batch * self.budget), 1)
+        most = self.settings.largest_batch
+        size = most if goal.target_cov is None else max(int(self.settings.target_batch * self.budget), 1)
         while left > 0 and not (goal.target_cov is not None and cov <= goal.target_cov):
             new = proposal.draw(min(size, left), self.rng)
             x = self.inputs.base.from_standard_normal(new.u)

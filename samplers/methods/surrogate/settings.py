@@ -95,6 +95,8 @@ class SurrogateSettings:
     """Share of base draws in the estimate: no weight exceeds 1 / base_share, but for the error of the pool."""
     wide_share: float = 0.1
     """Share of draws from the wide distributions: they meet regions that the surrogate denies, with small weights."""
+    largest_batch: int = 1000
+    """Draws of a batch at most, so that a run can be stopped."""
     target_batch: float = 0.1
     """Draws of a batch as a share of n, where there is a target c.o.v."""
     least_ess: float = 10.0

@@ -93,7 +93,7 @@ def test_collisions_are_those_of_the_formula() -> None:
 def test_the_samplers_p_is_the_integral() -> None:
     p = truth()
     assert 0.005 < p < 0.03
-    result = samplers.estimate(truth_problem(), gamma=0.0, seed=0, max_sim=450)
+    result = samplers.estimate(truth_problem(), gamma=0.0, seed=0, max_sim=600)
     assert result.interval[0] <= p <= result.interval[1]
     assert result.p == pytest.approx(p, rel=4 * result.cov)
     assert result.cov < 0.2

@@ -175,23 +175,23 @@ def test_another_run_does_not_take_the_journal(frail: Path, risky: str) -> None:
     content = journal.read_bytes()
     change_head(journal, question=asdict(replace(asked, seed=4)))
     with pytest.raises(BadInput, match="asks for other points"):
-        evaluate.resume(frail / "run")
+        evaluate.resume(frail / "run", trust=True)
     change_head(journal, question=asdict(asked), version="9.0")
     with pytest.raises(BadInput, match=r"begun by version 9\.0"):
-        evaluate.resume(frail / "run")
+        evaluate.resume(frail / "run", trust=True)
     for head in ({"question": {"env": 1}}, {"question": None}, {"question": [1]}):
         journal.write_bytes(content)
         change_head(journal, **head)
         with pytest.raises(BadInput, match="Cannot take up"):
-            evaluate.resume(frail / "run")
+            evaluate.resume(frail / "run", trust=True)
     journal.write_bytes(content)
     with pytest.raises(BadInput, match="whose address has changed only"):
-        evaluate.resume(frail / "run", ego="tcp://127.0.0.1:5555")
+        evaluate.resume(frail / "run", ego="tcp://127.0.0.1:5555", trust=True)
     journal.write_bytes(b"nothing")
     with pytest.raises(BadInput, match="is of another kind"):
-        evaluate.resume(frail / "run")
+        evaluate.resume(frail / "run", trust=True)
     journal.write_bytes(content)
-    assert evaluate.resume(frail / "run").estimate.n_sim == 1200
+    assert evaluate.resume(frail / "run", trust=True).estimate.n_sim == 1200
 
 
 def test_values_of_f_that_were_zeroed_are_refused_and_those_before_them_can_be_kept(

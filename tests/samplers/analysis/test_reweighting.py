@@ -79,10 +79,12 @@ def test_the_same_base_gives_the_same_p(method):
     assert again.p == pytest.approx(result.p)
     assert again.ratio == pytest.approx(1)
     # Reweighting takes draws as independent; those of two-stage are stratified, and spread less.
-    most = 3.0 if method == "two-stage" else 1.4
+    most = 3.0 if method in ("two-stage", "auto") else 1.4
+    # The allowance for regions that were not found, large after some hundred simulations, is the estimate's alone.
+    allowed = 0.8 if method == "surrogate" else 0.95
     assert 0.99 * result.cov < again.cov < most * result.cov
     assert again.interval[0] < 1.05 * result.interval[0]
-    assert again.interval[1] > 0.95 * result.interval[1]
+    assert again.interval[1] > allowed * result.interval[1]
     assert again.ess >= again.units * 0.99
 
 

@@ -70,6 +70,8 @@ class SearchState:
     trace: tuple[Level, ...] = ()
     finals: tuple[FinalRound, ...] = ()
     base_draws: int = 0
+    base_rate: float = 0.0
+    """Share of the base draws that fail."""
     last_rate: float = 0.0
     """Effective failures for each draw of the last round."""
 
@@ -98,7 +100,8 @@ def search_terms(
     search = TermSearch(TermSimulator(inputs, offer), goal, budget, end, rng, settings)
     state = yield from _draw_base(search)
     try:
-        if float(state.history.failing(goal.gamma).mean()) >= rounds.common_share:
+        state = replace(state, base_rate=float(state.history.failing(goal.gamma).mean()))
+        if state.base_rate >= rounds.common_share:
             return (yield from _run_monte_carlo(search, state))
         state = yield from _walk(search, state)
         state = yield from _run_rounds(search, state)
@@ -187,9 +190,13 @@ def _refit(search: TermSearch, state: SearchState, reserve: int) -> TermSteps[Se
 
 
 def _gives_up(search: TermSearch, state: SearchState) -> bool:
-    """Return whether the proposals do not describe the failures, and enough is left for subset simulation."""
+    """Return whether the proposals do not describe the failures, and enough is left for subset simulation.
+
+    They do not where a draw is worth less than `fallback_rate` failures, or less than a base draw.
+    """
     doubts = search.settings.doubts
-    return state.last_rate < doubts.fallback_rate and search.left >= doubts.min_fallback_budget
+    worthless = state.last_rate < max(doubts.fallback_rate, state.base_rate)
+    return worthless and search.left >= doubts.min_fallback_budget
 
 
 def _estimate(search: TermSearch, state: SearchState) -> Steps:

@@ -1,11 +1,15 @@
 """The search by terms on series systems with exact p, and what it does where terms or gradients are wrong."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import chi2, norm
 
 import samplers
-from samplers.method import TermsOffer
+from samplers.execution.arguments import InputsOnly
+from samplers.method import Goal, TermsOffer
+from samplers.methods.two_stage.method import run_two_stage
 from samplers.methods.two_stage.settings import DEFAULT_SETTINGS
 from samplers.methods.two_stage.terms.search import suits_terms
 from samplers.problem import TermGradients, Terms
@@ -214,3 +218,18 @@ def test_simulations_made_by_the_user_are_searched_as_before(half_spaces, fracti
     assert run.result() == samplers.estimate(
         samplers.FunctionProblem(problem.evaluate, dim=40), seed=1, max_sim=int(3000 * fraction)
     )
+
+
+def test_a_search_takes_its_numbers_from_the_settings_given(half_spaces, answer):
+    """Other base draws are another first level; a smallest budget above that of the run is for the other search."""
+    problem, _, _ = half_spaces(40, 1e-3)
+    inputs = InputsOnly(problem.dim, problem.base, TermsOffer(problem.gradient_cost))
+
+    def first_level(terms):
+        settings = replace(DEFAULT_SETTINGS, terms=terms)
+        steps = run_two_stage(inputs, Goal(gamma=0.0, max_sim=2000), 2000, np.random.default_rng(0), settings)
+        return answer(steps, problem).trace[0].n_sim
+
+    assert first_level(SETTINGS) == 200
+    assert first_level(replace(SETTINGS, rounds=replace(SETTINGS.rounds, base=0.2))) == 400
+    assert first_level(replace(SETTINGS, min_budget=5000)) not in (200, 400)
