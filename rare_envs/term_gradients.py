@@ -144,7 +144,7 @@ class _Unmeasured:
         return None
 
     def f(self, state: None) -> Tensor:
-        raise NotImplementedError
+        raise AssertionError("Gradients are those of the terms: nobody reads f of their rollouts.")
 
 
 def _has_noise(driver: Driver) -> bool:

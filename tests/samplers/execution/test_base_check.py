@@ -86,7 +86,7 @@ def test_what_fits_is_not_refused() -> None:
         testing.check_base(StandardNormal(dim), dim)
 
     def missing(x: FloatArray) -> FloatArray:
-        raise NotImplementedError
+        raise NotImplementedError  # as a base says that it has no map, which plain Monte Carlo does not need
 
     testing.check_base(Exponential(2, to_standard_normal=missing), 2)
 

@@ -47,7 +47,7 @@ def test_draws_from_the_base_itself():
 
     class Base(samplers.StandardNormal):
         def from_standard_normal(self, u):
-            raise NotImplementedError
+            raise NotImplementedError  # as a base says that it has no map
 
     class Problem:
         dim, base = 2, Base(2)

@@ -18,12 +18,6 @@ class Chained:
     def sample(self, n, rng):
         return self.from_standard_normal(rng.standard_normal((n, 8)))
 
-    def log_prob(self, x):
-        raise NotImplementedError
-
-    def to_standard_normal(self, x):
-        raise NotImplementedError
-
     def from_standard_normal(self, u):
         self.calls += len(u)
         x = u.copy()
