@@ -45,7 +45,36 @@ class ConditionalProblem(Protocol):
         """Condition of p, in words; empty without one."""
 
 
-class FaultTolerant:
+class WrappedProblem:
+    """A problem around another one: its parameters and its condition; what it evaluates is for a class to say.
+
+    Example:
+        >>> import rare_envs
+        >>> WrappedProblem(rare_envs.DrivingProblem("rare_envs/CarFollowing-v0")).dim
+        3
+    """
+
+    def __init__(self, problem: Any) -> None:
+        """Wrap a problem that has `dim` and `base`."""
+        self.problem = problem
+
+    @property
+    def dim(self) -> int:
+        """Number of scenario parameters."""
+        return int(self.problem.dim)
+
+    @property
+    def base(self) -> Any:
+        """Distribution of x in ordinary traffic."""
+        return self.problem.base
+
+    @property
+    def given(self) -> str:
+        """Condition of p, as the problem states it."""
+        return self.problem.given if isinstance(self.problem, ConditionalProblem) else ""
+
+
+class FaultTolerant(WrappedProblem):
     """A problem around one whose ego may raise, hang (if remote), die, or give NaN or actions of a wrong shape.
 
     Rows on which it fails are found: at the tick at which they do if it has no memory, else by splitting the batch
@@ -78,25 +107,10 @@ class FaultTolerant:
         """
         if on_error not in ON_FAULT:
             raise ValueError(f"Expected on_error {', '.join(map(repr, ON_FAULT))}, got {on_error!r}.")
-        self.problem = problem
+        super().__init__(problem)
         self.faults: list[Fault] = []
         self.n_retried = 0
         self._on_error = on_error
-
-    @property
-    def dim(self) -> int:
-        """Number of scenario parameters."""
-        return int(self.problem.dim)
-
-    @property
-    def base(self) -> Any:
-        """Distribution of x in ordinary traffic."""
-        return self.problem.base
-
-    @property
-    def given(self) -> str:
-        """Condition of p, as the problem states it."""
-        return self.problem.given if isinstance(self.problem, ConditionalProblem) else ""
 
     def evaluate(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Simulate.

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from agents.loading import strip_prefixes
-from rare_envs.egos.faults import Fault, FaultTolerant
+from rare_envs.egos.faults import Fault, FaultTolerant, WrappedProblem
 from rare_envs.study.errors import BadInput
 from rare_envs.study.question import Question, read_question
 from rare_envs.version import __version__
@@ -135,7 +135,7 @@ def _find_module(name: str) -> str | None:
     return None if spec is None else spec.origin
 
 
-class JournaledProblem:
+class JournaledProblem(WrappedProblem):
     """A problem whose finished simulations are kept; see `samplers.Problem`."""
 
     def __init__(self, problem: FaultTolerant, journal: JournalFile, tile: int, on_error: str) -> None:
@@ -147,24 +147,10 @@ class JournaledProblem:
             tile: Simulations at once. Those of a tile are finished together.
             on_error: The rule of the problem for scenarios on which the ego fails.
         """
-        self.problem, self._tile = problem, tile
+        super().__init__(problem)
+        self._tile = tile
         again = FaultTolerant(problem.problem, on_error)
         self._journaled = JournaledEvaluation(journal, self._simulate, self._restore, again.evaluate)
-
-    @property
-    def dim(self) -> int:
-        """Number of scenario parameters."""
-        return self.problem.dim
-
-    @property
-    def base(self) -> Any:
-        """Distribution of x in ordinary traffic."""
-        return self.problem.base
-
-    @property
-    def given(self) -> str:
-        """Condition of p, from the problem."""
-        return self.problem.given
 
     def evaluate(self, x: FloatArray) -> FloatArray:
         """Return f from the journal, or simulate: (n, d) -> (n,)."""

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rare_envs.egos.faults import FaultTolerant
+from rare_envs.egos.faults import FaultTolerant, WrappedProblem
 from samplers.problem import FloatArray
 
 KEPT_ROWS, COMPANY, ROWS_ALONE = 64, 16, 2
@@ -51,7 +51,7 @@ class Repeatability(NamedTuple):
         )
 
 
-class RowKeeper:
+class RowKeeper(WrappedProblem):
     """A problem that keeps some scenarios that it evaluates, with their f; see `samplers.Problem`.
 
     Half of them are a uniform sample, half those with f nearest to the threshold, which decide p: in ordinary traffic
@@ -73,25 +73,11 @@ class RowKeeper:
             gamma: Threshold of f.
             size: Scenarios to keep.
         """
-        self.problem, self._gamma, self._size, self._seen = problem, gamma, size // 2, 0
+        super().__init__(problem)
+        self._gamma, self._size, self._seen = gamma, size // 2, 0
         self._sample = (np.empty((0, problem.dim)), np.empty(0))
         self._near = self._sample
         self._rng = np.random.default_rng(0)  # of its own, so that the run draws what it would draw without
-
-    @property
-    def dim(self) -> int:
-        """Number of scenario parameters."""
-        return int(self.problem.dim)
-
-    @property
-    def base(self) -> Any:
-        """Distribution of x in ordinary traffic."""
-        return self.problem.base
-
-    @property
-    def given(self) -> str:
-        """Condition of p, from the problem."""
-        return str(self.problem.given)
 
     @property
     def x(self) -> FloatArray:

@@ -1,13 +1,16 @@
 """Simulator: points of standard normal space become outcomes, and every simulation is counted."""
 
+import math
 from collections.abc import Generator
 from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from samplers.method import Goal
 from samplers.problem import FloatArray, Inputs
 from samplers.proposals.components import MixtureComponent
+from samplers.trace import Level
 
 _T = TypeVar("_T")
 SimulationSteps = Generator[FloatArray, FloatArray, _T]
@@ -48,3 +51,37 @@ class ComponentDraws(NamedTuple):
     """Shape (n, d)."""
     f: FloatArray
     """Shape (n,)."""
+
+
+def extend_trace(
+    trace: tuple[Level, ...],
+    goal: Goal,
+    n_sim: int,
+    p: float,
+    estimate: float,
+    n_points: int,
+    cov: float,
+    ess: float | None = None,
+) -> tuple[Level, ...]:
+    """Return the trace with one more level, which has all of `n_sim` simulations that no earlier one has.
+
+    Args:
+        trace: Levels so far.
+        goal: Has the threshold, and is told of the level.
+        n_sim: Simulations made so far.
+        p: Share of the level's points that fail.
+        estimate: Estimate so far.
+        n_points: Points behind p.
+        cov: C.o.v. of p.
+        ess: Effective number of failing points.
+    """
+    made = n_sim - sum(level.n_sim for level in trace)
+    level = Level(gamma=goal.gamma, p=p, estimate=estimate, n_sim=made, n_points=n_points, cov=cov, ess=ess)
+    goal.on_level(level)
+    return (*trace, level)
+
+
+def close_trace(trace: tuple[Level, ...], goal: Goal, n_sim: int) -> tuple[Level, ...]:
+    """Return the trace with the simulations of an interrupted step, if there are any, as a level of their own."""
+    loose = n_sim - sum(level.n_sim for level in trace)
+    return extend_trace(trace, goal, n_sim, math.nan, math.nan, loose, math.inf) if loose else trace

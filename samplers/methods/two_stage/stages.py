@@ -29,7 +29,13 @@ from samplers.methods.two_stage.noise_coordinates import marginalise_noise
 from samplers.methods.two_stage.refinement import RefinementState, refine_once, start_refinement, typical_weights
 from samplers.methods.two_stage.regions import ExplorationResult
 from samplers.methods.two_stage.settings import TwoStageSettings
-from samplers.methods.two_stage.simulator import ComponentDraws, SimulationSteps, Simulator
+from samplers.methods.two_stage.simulator import (
+    ComponentDraws,
+    SimulationSteps,
+    Simulator,
+    close_trace,
+    extend_trace,
+)
 from samplers.methods.two_stage.stratified import StratifiedSample
 from samplers.problem import FloatArray, Inputs
 from samplers.sample import Sample
@@ -213,11 +219,11 @@ def fall_back(context: RunContext, state: RunState, levels: int) -> Steps:
     known: RootedPoints | None = RootedPoints(state.base_u, state.base_f, np.arange(len(state.base_f)))
     if context.noise_marginalised:  # the base draws lack the coordinates of noise
         known = None
-    before = estimate_early(context, _close_trace(context, state))
+    state = _close_trace(context, state)
+    before = estimate_early(context, state)
     outcome = yield from fallback.run_subset_simulation(
         context.inputs, context.goal, levels, context.left_at_all, known, context.rng, context.settings.fallback
     )
-    state = _close_trace(context, state)
     unfinished = outcome.status is Status.STOPPED and outcome.p == 0  # no estimate, then
     whole = before if unfinished else fallback.reconcile(outcome, before)
     return replace(whole, trace=state.trace + outcome.trace, base_draws=state.base_draws + outcome.base_draws)
@@ -346,14 +352,11 @@ def _record_draws(
 def _record(
     context: RunContext, state: RunState, p: float, estimate: float, n: int, cov: float, ess: float | None = None
 ) -> RunState:
-    """Return the state with one more level: of all simulations that no earlier level of the trace has."""
-    n_sim = context.simulator.n_sim - sum(level.n_sim for level in state.trace)
-    level = Level(gamma=context.goal.gamma, p=p, estimate=estimate, n_sim=n_sim, n_points=n, cov=cov, ess=ess)
-    context.goal.on_level(level)
-    return replace(state, trace=(*state.trace, level))
+    """Return the state with one more level."""
+    trace = extend_trace(state.trace, context.goal, context.simulator.n_sim, p, estimate, n, cov, ess)
+    return replace(state, trace=trace)
 
 
 def _close_trace(context: RunContext, state: RunState) -> RunState:
-    """Return the state with the simulations of an interrupted step recorded as a level."""
-    loose = context.simulator.n_sim - sum(level.n_sim for level in state.trace)
-    return _record(context, state, math.nan, math.nan, loose, math.inf) if loose else state
+    """Return the state with the simulations of an interrupted step in its trace."""
+    return replace(state, trace=close_trace(state.trace, context.goal, context.simulator.n_sim))

@@ -2,28 +2,19 @@ import numpy as np
 import pytest
 from scipy import stats
 
-import samplers
 from samplers.analysis.failure_expectation import FurtherFailures, expect_over_failures, expect_under_refits
 from samplers.analysis.failure_weights import weigh_failures
+from tests.samplers.analysis.half_space_tail import BETA, METHODS, PHI, P, estimate_half_space
 from tests.samplers.analysis.sensitivity.parametric_normal import ALPHA, fitted, run
 from tests.samplers.fitted_bases import FittedWithEnsemble, normal
 from tests.samplers.fitted_bases import fitted as fitted_normal
 from tests.samplers.fitted_bases import run as run_normal
 
-BETA = 3.0
-P = float(stats.norm.sf(BETA))
-PHI = float(stats.norm.pdf(BETA))
-METHODS = sorted(samplers.METHODS)
-
-
-def half_space(method="two-stage", seed=0, **options):
-    return samplers.estimate(samplers.FunctionProblem(lambda x: BETA - x[:, 0], 2), method, seed=seed, **options)
-
 
 @pytest.mark.parametrize("method", METHODS)
 def test_the_expectation_of_one_is_p_with_its_cov(method):
     """With h = 1 the sum is p, and its c.o.v. at least that of the estimate."""
-    result = half_space(method, max_sim=8_000)
+    result = estimate_half_space(method, max_sim=8_000)
     failures = weigh_failures(result)
     found = expect_over_failures(failures, np.ones(len(failures.x)))
     assert found.value == pytest.approx(result.p, rel=1e-12)
@@ -34,7 +25,7 @@ def test_the_expectation_of_one_is_p_with_its_cov(method):
 
 def test_the_expectation_is_that_of_the_half_normal_tail():
     """E[(X - 3); X > 3] = phi(3) - 3 Phi(-3), within four standard errors, of which the interval has two."""
-    result = half_space(max_sim=6_000)
+    result = estimate_half_space(max_sim=6_000)
     failures = weigh_failures(result)
     found = expect_over_failures(failures, failures.x[:, 0] - BETA)
     assert found.value == pytest.approx(PHI - BETA * P, rel=4 * found.cov)
@@ -46,14 +37,14 @@ def test_intervals_of_expectations_hold():
     """At a nominal 95 %, 40 runs: fewer than 32 held has a probability under 1e-3."""
     held = 0
     for seed in range(40):
-        failures = weigh_failures(half_space("is", seed=seed, max_sim=1_500))
+        failures = weigh_failures(estimate_half_space("is", seed=seed, max_sim=1_500))
         low, high = expect_over_failures(failures, failures.x[:, 0] - BETA).interval
         held += low <= PHI - BETA * P <= high
     assert held >= 32
 
 
 def test_the_expectation_scales_with_the_quantity():
-    failures = weigh_failures(half_space())
+    failures = weigh_failures(estimate_half_space())
     h = failures.x[:, 0]
     one, thousand = (expect_over_failures(failures, scale * h) for scale in (1.0, 1000.0))
     assert thousand.value == pytest.approx(1000 * one.value)
@@ -91,14 +82,14 @@ def test_expectations_under_refits_are_those_of_the_tail():
 
 
 def test_without_refits_there_is_no_such_uncertainty():
-    result = half_space()
+    result = estimate_half_space()
     failures = weigh_failures(result)
     ones = np.ones(len(failures.x))
     assert expect_under_refits(result, failures, ones, expect_over_failures(failures, ones)) is None
 
 
 def test_bad_input_is_refused():
-    failures = weigh_failures(half_space())
+    failures = weigh_failures(estimate_half_space())
     for values in (-failures.x[:, 0], failures.x, np.full(len(failures.x), np.nan)):
         with pytest.raises(ValueError, match="finite value >= 0 for each"):
             expect_over_failures(failures, values)

@@ -1,6 +1,5 @@
 import numpy as np
 import pytest
-from scipy import stats
 
 import samplers
 from samplers.analysis.failure_weights import (
@@ -8,20 +7,12 @@ from samplers.analysis.failure_weights import (
     mean_over_failures,
     weigh_failures,
 )
-
-BETA = 3.0
-P = float(stats.norm.sf(BETA))
-PHI = float(stats.norm.pdf(BETA))
-METHODS = sorted(samplers.METHODS)
-
-
-def half_space(method="two-stage", seed=0, **options):
-    return samplers.estimate(samplers.FunctionProblem(lambda x: BETA - x[:, 0], 2), method, seed=seed, **options)
+from tests.samplers.analysis.half_space_tail import METHODS, PHI, P, estimate_half_space
 
 
 @pytest.mark.parametrize("method", METHODS)
 def test_weights_add_up_to_p(method):
-    result = half_space(method, max_sim=8_000)
+    result = estimate_half_space(method, max_sim=8_000)
     failures = weigh_failures(result)
     assert failures.weights.sum() == pytest.approx(result.p, rel=1e-12)
     assert failures.total == len(failures.x) == np.count_nonzero(result.sample.f <= 0.0)
@@ -32,7 +23,7 @@ def test_weights_add_up_to_p(method):
 
 
 def test_the_points_of_shares_are_those_of_the_weights():
-    result, seen = half_space(), []
+    result, seen = estimate_half_space(), []
     result.shares(lambda x: seen.append(x) or ["any"] * len(x), most=50)
     assert np.array_equal(seen[0], weigh_failures(result, most=50).x)
 
@@ -41,7 +32,7 @@ def test_the_mean_over_failures_is_that_of_the_truncated_normal():
     """E[X | X > 3] = phi(3) / Phi(-3) and E[X_2 | failure] = 0; errors are those of 30 seeds."""
     means, errors = [], []
     for seed in range(30):
-        failures = weigh_failures(half_space("is", seed=seed, max_sim=1_500))
+        failures = weigh_failures(estimate_half_space("is", seed=seed, max_sim=1_500))
         mean, error = mean_over_failures(failures, failures.x)
         means.append(mean)
         errors.append(error)
@@ -52,7 +43,7 @@ def test_the_mean_over_failures_is_that_of_the_truncated_normal():
 
 def test_errors_count_paths_of_chains_as_one():
     """Twice the points in the same units do not make a mean more certain."""
-    failures = weigh_failures(half_space("mc", max_sim=20_000))
+    failures = weigh_failures(estimate_half_space("mc", max_sim=20_000))
     double = {
         name: np.repeat(getattr(failures, name), 2, axis=0) for name in ("x", "rows", "has_outcome", "weights", "units")
     }
@@ -65,4 +56,4 @@ def test_bad_input_is_refused():
     with pytest.raises(ValueError, match=r"^No point failed \(f <= 0\): there is nothing to analyse\.$"):
         weigh_failures(samplers.estimate(samplers.FunctionProblem(lambda x: 9.0 - x[:, 0], 2), "mc", max_sim=100))
     with pytest.raises(ValueError, match="most of at least 1"):
-        choose_failures(half_space().sample, 0.0, 0)
+        choose_failures(estimate_half_space().sample, 0.0, 0)

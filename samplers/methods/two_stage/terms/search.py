@@ -22,6 +22,7 @@ from samplers.importance.draws import Draws, weight_warnings, weighted_interval
 from samplers.method import Goal, Interrupted, Outcome, Steps, TermsOffer, no_outcome_share
 from samplers.methods.monte_carlo import MonteCarlo
 from samplers.methods.two_stage.fallback import run_subset_simulation
+from samplers.methods.two_stage.simulator import close_trace, extend_trace
 from samplers.methods.two_stage.terms.estimate import CombinedRounds, FinalRound, doubt
 from samplers.methods.two_stage.terms.fitting import PursuedTerm
 from samplers.methods.two_stage.terms.history import TermHistory
@@ -305,14 +306,11 @@ def _after(search: TermSearch, state: SearchState, outcome: Outcome) -> Outcome:
 def _record(
     search: TermSearch, state: SearchState, p: float, estimate: float, n: int, cov: float, ess: float | None = None
 ) -> SearchState:
-    """Return the state with one more level: of all simulations that no earlier level has."""
-    n_sim = search.simulator.n_sim - sum(level.n_sim for level in state.trace)
-    level = Level(gamma=search.goal.gamma, p=p, estimate=estimate, n_sim=n_sim, n_points=n, cov=cov, ess=ess)
-    search.goal.on_level(level)
-    return replace(state, trace=(*state.trace, level))
+    """Return the state with one more level."""
+    trace = extend_trace(state.trace, search.goal, search.simulator.n_sim, p, estimate, n, cov, ess)
+    return replace(state, trace=trace)
 
 
 def _close_trace(search: TermSearch, state: SearchState) -> SearchState:
-    """Return the state with the simulations of an interrupted step recorded as a level."""
-    loose = search.simulator.n_sim - sum(level.n_sim for level in state.trace)
-    return _record(search, state, math.nan, math.nan, loose, math.inf) if loose else state
+    """Return the state with the simulations of an interrupted step in its trace."""
+    return replace(state, trace=close_trace(state.trace, search.goal, search.simulator.n_sim))

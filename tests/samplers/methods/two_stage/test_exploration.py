@@ -10,6 +10,7 @@ from samplers.methods.two_stage.exploration import Sizes, find_regions, first_dr
 from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, RegionSettings
 from samplers.methods.two_stage.simulator import Simulator
 from samplers.problem import FunctionProblem
+from tests.samplers.methods.two_stage.driven import driven
 
 
 def half_spaces(dim, *betas):
@@ -25,16 +26,6 @@ def rough(u):
 
 NOISY = FunctionProblem(lambda u: 3.5 - u.sum(axis=1) / math.sqrt(6) + 0.5 * rough(u), 6)
 INDICATOR = FunctionProblem(lambda u: np.where(u[:, 0] > 3.0, -1.0, 1.0), 5)
-
-
-def driven(steps, problem):
-    """Answer a generator that yields points with their outcomes; return what it returns."""
-    try:
-        u = next(steps)
-        while True:
-            u = steps.send(problem.evaluate(u))
-    except StopIteration as end:
-        return end.value
 
 
 def explored(problem, seed=0, budget=6000):

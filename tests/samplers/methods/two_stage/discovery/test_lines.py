@@ -5,18 +5,9 @@ from samplers.methods.two_stage.discovery.lines import choose_roots, count_lines
 from samplers.methods.two_stage.settings import DEFAULT_SETTINGS
 from samplers.methods.two_stage.simulator import Simulator
 from samplers.problem import FunctionProblem
+from tests.samplers.methods.two_stage.driven import driven
 
 LINES = DEFAULT_SETTINGS.lines
-
-
-def driven(steps, problem):
-    """Answer a generator that yields points with their outcomes, if it does; return what it returns."""
-    try:
-        u = next(steps)
-        while True:
-            u = steps.send(problem.evaluate(u))
-    except StopIteration as end:
-        return end.value
 
 
 def walk(problem, n, rng, gamma=0.0):
