@@ -65,7 +65,8 @@ def check_code_trust(question: Mapping[str, Any], code: Sequence[str], folder: P
         return
     trusted = _digest_trusted(question, code)
     if trust:
-        _append_note(trusted)
+        if trusted is not None:
+            _append_note(trusted)
         return
     if not {trusted, _digest_own(question, code)} & _read_notes():
         files = {name: find_module_file(name) for name in code}
@@ -98,14 +99,22 @@ def _digest_own(question: Mapping[str, Any], code: Sequence[str]) -> str:
     return _digest("own", question, [[name, str(find_module_file(name))] for name in code])
 
 
-def _digest_trusted(question: Mapping[str, Any], code: Sequence[str]) -> str:
-    """Return what identifies a question and the content of its code."""
+def _digest_trusted(question: Mapping[str, Any], code: Sequence[str]) -> str | None:
+    """Return what identifies a question and the content of its code; None where that content cannot be read.
+
+    Importing `a.b` runs `a/__init__.py` too. A compiled module has no content here: trust in it is asked for each time.
+    """
     contents = []
     for name in code:
         path = find_module_file(name)
-        content = b""
-        with contextlib.suppress(OSError):
-            content = path.read_bytes() if path else b""
+        if path is None:
+            return None
+        folders = path.parents[: name.partition(":")[0].count(".") + (path.name == "__init__.py")]
+        files = [path, *(folder / "__init__.py" for folder in folders)]
+        try:
+            content = b"".join(file.read_bytes() for file in files if file.exists())
+        except OSError:
+            return None
         contents.append([name, hashlib.sha256(content).hexdigest()])
     return _digest("trusted", question, contents)
 

@@ -110,7 +110,8 @@ class _Unfinished:
                     values.append(of_rows.gather(1, number[:, None])[:, 0])
             if tick < last:
                 self._go_on(moment, self.ticks > tick)
-        return torch.cat(values)
+        # where all have collided before the first moment, nothing depends on x
+        return torch.cat(values) if values else self.episode.state.x[:0, 0]
 
     def _moment(self) -> Moment:
         episode, before = self.episode, self.before
@@ -207,12 +208,19 @@ def find_differentiator(world: World, driver: Driver, black_box: bool, x: FloatA
     if order is None:
         return None
     coasting = _Coasting(driver.noise_columns if isinstance(driver, StochasticDriver) else 0)
+    if not _is_differentiable(world, coasting, order, x):
+        return None
+    return TermDifferentiator(world, driver, black_box or not _is_differentiable(world, driver, order, x))
+
+
+def _is_differentiable(world: World, driver: Driver, order: TermMeasure, x: FloatArray) -> bool:
+    """Return whether one tick of a rollout can be differentiated."""
     one = np.ones(1, dtype=np.int64)
     try:
-        differentiate_terms(world, coasting, order, x, 0 * one, one)
-    except RuntimeError:
-        return None
-    return TermDifferentiator(world, driver, black_box)
+        differentiate_terms(world, driver, order, x, 0 * one, one)
+    except Exception:  # whatever a user's measure, driver or world raises here: nobody needs gradients
+        return False
+    return True
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 import math
 import sys
 from collections.abc import Callable, Generator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, Protocol, cast, runtime_checkable
 
 import numpy as np
@@ -80,6 +80,10 @@ class Outcome:
     base_draws: int = 0
     """Independent draws from the base distribution that the run made, search included: `Estimate.unseen` follows from
     them. Of draws from a mixture, the expected number from its base component."""
+
+    def warn_first(self, about: str) -> "Outcome":
+        """Return the outcome with a warning before its own."""
+        return replace(self, warnings=(about, *self.warnings))
 
     @classmethod
     def of_counts(

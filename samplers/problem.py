@@ -222,11 +222,6 @@ def offers_terms(problem: object) -> TypeGuard[HasTerms]:
     return callable(getattr(problem, "terms", None))  # a user's object
 
 
-def offers_gradients(problem: object) -> TypeGuard[HasTermGradients]:
-    """Return whether a problem has terms and their gradients."""
-    return offers_terms(problem) and callable(getattr(problem, "gradient", None))
-
-
 def condition_of(problem: Inputs) -> str:
     """Return what a problem holds fixed, in words; empty for nothing."""
     return str(problem.given) if isinstance(problem, ConditionalProblem) else ""

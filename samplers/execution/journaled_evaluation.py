@@ -71,24 +71,37 @@ class JournaledEvaluation:
                 "begun. Remove the file to begin anew."
             )
         if not self._checked:
-            self._check_f(x, known.f)
+            self._checked = True
+            check_same_f(self._journal, self._recheck, x, known.f)
         self._restore(x, known)
         return known.f
 
-    def _check_f(self, x: FloatArray, f: FloatArray) -> None:
-        """Raise a JournalError if f has other values now at some of x (n, d), the same ones twice."""
-        self._checked = True
-        rows = np.argsort(f)[np.unique(np.linspace(0, len(f) - 1, N_CHECKED).astype(int))]
-        x, f = x[rows], f[rows]
-        again = np.asarray(self._recheck(x), dtype=np.float64)
-        room = F_TOLERANCE * float(np.abs(f[np.isfinite(f)]).max(initial=0.0))
-        same = np.isclose(again, f, rtol=0.0, atol=room, equal_nan=True)
-        if not same.all() and np.array_equal(again, np.asarray(self._recheck(x)), equal_nan=True):
-            row = int(np.argmin(same))
-            raise JournalError(
-                f"f is {again[row]:.6g} at a point where {str(self._journal.path)!r} has {f[row]:.6g}: it has changed "
-                "since the journal was begun. Remove the file to begin anew."
-            )
+
+def find_changed(again: FloatArray, f: FloatArray) -> NDArray[np.bool_]:
+    """Return where f, simulated again, is another, shape (n,): beyond `F_TOLERANCE` of the largest |f|.
+
+    Example:
+        >>> find_changed(np.array([1.0, 6.02, np.inf]), np.array([1.004, 6.0, np.inf]))
+        array([False,  True, False])
+    """
+    room = F_TOLERANCE * float(np.abs(f[np.isfinite(f)]).max(initial=0.0))
+    return ~np.isclose(again, f, rtol=0.0, atol=room, equal_nan=True)
+
+
+def check_same_f(
+    journal: JournalFile, recheck: Callable[[FloatArray], ArrayLike], x: FloatArray, f: FloatArray
+) -> None:
+    """Raise a JournalError if f has other values now at some of x (n, d), the same ones twice."""
+    rows = np.argsort(f)[np.unique(np.linspace(0, len(f) - 1, N_CHECKED).astype(int))]
+    x, f = x[rows], f[rows]
+    again = np.asarray(recheck(x), dtype=np.float64)
+    changed = find_changed(again, f)
+    if changed.any() and np.array_equal(again, np.asarray(recheck(x)), equal_nan=True):
+        row = int(np.argmax(changed))
+        raise JournalError(
+            f"f is {again[row]:.6g} at a point where {str(journal.path)!r} has {f[row]:.6g}: it has changed "
+            "since the journal was begun. Remove the file to begin anew."
+        )
 
 
 @contextlib.contextmanager

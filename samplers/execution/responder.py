@@ -10,6 +10,7 @@ from samplers.execution.fault_isolation import Evaluate, FaultIsolation
 from samplers.execution.journal import JournalFile
 from samplers.execution.journaled_evaluation import (
     Packed,
+    check_same_f,
     digest_request,
     keep_answer,
     pack_gradients,
@@ -56,7 +57,8 @@ class Responder:
         journal: JournalFile | None = None,
     ) -> None:
         self._problem: Any = problem
-        self._gamma, self._journal = gamma, journal
+        self._gamma, self._journal, self._on_error = gamma, journal, on_error
+        self._checked = False
         self._isolation = isolation or FaultIsolation(problem.evaluate, on_error)
         self._evaluate = evaluate or self._isolation.evaluate
         self._n_terms: int | None = None
@@ -90,9 +92,7 @@ class Responder:
         wanted = {i: one.x for i, one in enumerate(requests) if isinstance(one, TermsRequest)}
         if wanted:
             x = np.concatenate(list(wanted.values()))
-            digest = digest_request("terms", x)
-            numbers, notes = self._keep(digest, lambda: pack_terms(*self._count_retried(lambda: self._terms(x))))
-            terms = unpack_terms(numbers, notes, len(x))
+            terms = self._kept_terms(x)
             self._n_terms = terms.values.shape[1]
             rows = _split(np.arange(len(terms.f)), list(wanted.values()))
             answers.update((i, select_rows(terms, part)) for i, part in zip(wanted, rows, strict=True))
@@ -112,6 +112,22 @@ class Responder:
         """Return a result and how many rows were simulated again for it."""
         before = self.n_retried
         return compute(), self.n_retried - before
+
+    def _kept_terms(self, x: FloatArray) -> Terms:
+        computed = list[Terms]()
+
+        def compute() -> Packed:
+            terms, n_retried = self._count_retried(lambda: self._terms(x))
+            computed.append(terms)
+            return pack_terms(terms, n_retried)
+
+        numbers, notes = self._keep(digest_request("terms", x), compute)
+        terms = unpack_terms(numbers, notes, len(x))
+        if self._journal is not None and not computed and not self._checked:
+            self._checked = True
+            again = FaultIsolation(self._problem.evaluate, self._on_error)
+            check_same_f(self._journal, again.evaluate, x, terms.f)
+        return terms
 
     def _kept_gradients(self, request: GradientRequest) -> TermGradients:
         digest = digest_request("gradient", request.x, request.term, request.ticks)

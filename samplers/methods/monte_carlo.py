@@ -60,6 +60,8 @@ class MonteCarlo(Method):
             try:
                 f = yield x
             except Interrupted:
+                if n == 0:  # the caller, who has simulated before, has the outcome
+                    raise
                 stopped = True
                 break
             outcomes.append(f)

@@ -75,3 +75,22 @@ def test_modules_are_found_without_running_them(place: Path) -> None:
     assert find_module_file("pack.inner:make") == (place / "pack" / "inner" / "__init__.py").resolve()
     assert find_module_file("no_such_module:make") is None
     assert find_module_file("a\0b:make") is None
+
+
+def test_trust_holds_for_the_packages_on_the_way_too(place: Path) -> None:
+    (place / "outer").mkdir()
+    (place / "outer" / "__init__.py").write_text("")
+    (place / "outer" / "inner.py").write_text("first = 1")
+    question = {"ego": "outer.inner:make"}
+    check_code_trust(question, ["outer.inner:make"], FOLDER, trust=True)
+    check_code_trust(question, ["outer.inner:make"], FOLDER, trust=False)
+    (place / "outer" / "__init__.py").write_text("runs = 'on import'")
+    with pytest.raises(ValueError, match="add --trust"):
+        check_code_trust(question, ["outer.inner:make"], FOLDER, trust=False)
+
+
+def test_trust_in_a_module_that_cannot_be_read_is_not_remembered(place: Path) -> None:
+    question = {"ego": "compiled:make"}
+    check_code_trust(question, ["compiled:make"], FOLDER, trust=True)
+    with pytest.raises(ValueError, match="add --trust"):
+        check_code_trust(question, ["compiled:make"], FOLDER, trust=False)

@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 import samplers
-from samplers.problem import offers_gradients, offers_terms
+from samplers.problem import offers_terms
 
 
 def test_standard_normal_density_and_map(rng):
@@ -79,7 +79,7 @@ def test_what_is_none_is_not_offered():
     series = samplers.FunctionProblem(dim=2, terms=lambda x: x)
     full = samplers.FunctionProblem(dim=2, terms=lambda x: x, gradient=lambda x, term: np.eye(2)[term])
     assert [offers_terms(problem) for problem in (plain, series, full)] == [False, True, True]
-    assert [offers_gradients(problem) for problem in (plain, series, full)] == [False, False, True]
+    assert [problem.gradient is not None for problem in (plain, series, full)] == [False, False, True]
 
 
 def test_a_copy_of_a_problem_with_terms_has_the_same_terms():

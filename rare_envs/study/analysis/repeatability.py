@@ -12,12 +12,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rare_envs.egos.faults import FaultTolerant, WrappedProblem
+from samplers.execution.journaled_evaluation import find_changed
 from samplers.problem import FloatArray
 
 KEPT_ROWS, COMPANY, ROWS_ALONE = 64, 16, 2
 """Simulations that are done again, how many of them in one batch, and how many also each alone."""
-ROUNDING_OF_F = 1e-3
-"""Largest difference of f that is rounding: products of networks round differently by batch size."""
 MOST_DIFFERING = 0.05
 """Share of simulations that may differ by more: a choice between two actions may hang on rounding in a rare one."""
 
@@ -128,5 +127,7 @@ def check_repeatability(problem: Any, kept: RowKeeper) -> Repeatability:
     if not batches:
         return Repeatability(0, 0, 0.0)
     again = np.concatenate([tolerant.evaluate(kept.x[rows]) for rows in batches])
-    apart = np.nan_to_num(np.abs(again - kept.f[np.concatenate(batches)]), nan=np.inf)
-    return Repeatability(len(apart), int((apart > ROUNDING_OF_F).sum()), float(apart.max()))
+    before = kept.f[np.concatenate(batches)]
+    changed = find_changed(again, before)
+    apart = np.nan_to_num(np.abs(again[changed] - before[changed]), nan=np.inf)
+    return Repeatability(len(again), int(changed.sum()), float(apart.max(initial=0.0)))

@@ -125,7 +125,7 @@ def fit_kriging(
     scale = outcome_scale(y, settings) if before is None or search else before.scale
     outcomes = compress_outcomes(y, scale, settings)
     # a search begins afresh: from the last result it may stay where few points had led it
-    kernel = _initial_kernel(u.shape[1], settings) if before is None or search else before.process.kernel_
+    kernel = before.process.kernel_ if before is not None and not search else _initial_kernel(u.shape[1], settings)
     z, censored = outcomes.z, outcomes.capped | outcomes.floored
     if censored.any() and (~censored).sum() >= settings.least_uncensored:
         kernel, z = _impute_first(kernel, u, outcomes, settings, search=search)
@@ -138,7 +138,8 @@ def fit_kriging(
         process = _condition(kernel, u, standard)
         left_out, left_out_sd = _leave_one_out(process, standard)
         residuals = (standard - left_out) / left_out_sd
-        z = _impute(outcomes, mean + sd * left_out)
+        if turn < turns:
+            z = _impute(outcomes, mean + sd * left_out)
     limit = -mean / sd
     near = np.abs(left_out - limit) < NEAR_LIMIT * left_out_sd
     inflation = math.sqrt(float((residuals[near] ** 2).mean())) if near.any() else 1.0

@@ -7,9 +7,9 @@ import numpy as np
 
 from samplers.method import Goal, Steps
 from samplers.methods.base import Method
-from samplers.methods.surrogate.run import SurrogateRun, warn_first
+from samplers.methods.surrogate.run import SurrogateRun
 from samplers.methods.surrogate.settings import DEFAULT_SURROGATE_SETTINGS
-from samplers.methods.two_stage.method import TwoStage
+from samplers.methods.two_stage.method import run_two_stage
 from samplers.methods.two_stage.noise_coordinates import marginalise_noise
 from samplers.problem import Inputs
 from samplers.validation import check_count
@@ -75,9 +75,9 @@ class Surrogate(Method):
         searched = marginalise_noise(inputs, rng)
         if searched.dim > settings.most_dims:
             about = f"Kriging serves up to {settings.most_dims} dimensions, not {searched.dim:,}: two-stage takes over."
-            return warn_first(about, (yield from TwoStage(n=self.n).steps(inputs, goal, rng)))
+            return (yield from run_two_stage(inputs, goal, budget, rng)).warn_first(about)
         run = SurrogateRun(searched, goal, budget, settings, rng)
         if budget < settings.least_budget:
             about = f"max_sim leaves {budget} simulations, too few to learn from ({settings.least_budget}): "
-            return warn_first(about + "base draws only.", (yield from run.draw_base()))
+            return (yield from run.draw_base()).warn_first(about + "base draws only.")
         return (yield from run.steps())

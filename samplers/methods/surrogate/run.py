@@ -59,7 +59,7 @@ class SurrogateRun:
             return self._estimate_early(Status.STOPPED)
         if not (self.f <= self.goal.gamma).any():
             about = f"None of {len(self.f):,} simulations for learning failed: base draws take the rest."
-            return warn_first(about, (yield from self.draw_base()))
+            return (yield from self.draw_base()).warn_first(about)
         return (yield from self._estimate(self._build_proposal(kriging)))
 
     def draw_base(self) -> Steps:
@@ -214,8 +214,3 @@ def _skill_warnings(kinds: FloatArray, least: float) -> list[str]:
     if failing >= least * n:
         return []
     return [f"Only {failing:.0f} of {n:.0f} draws that the surrogate proposed failed: it describes f poorly."]
-
-
-def warn_first(about: str, outcome: Outcome) -> Outcome:
-    """Return the outcome with a warning before its own."""
-    return replace(outcome, warnings=(about, *outcome.warnings))

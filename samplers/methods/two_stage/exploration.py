@@ -1,14 +1,15 @@
 """Exploration: the search for every region of failure, the first stage of `TwoStage`.
 
-Four sources. Only subset simulation follows f downhill; the others use no more than whether a point fails, so that
-plateaus, ties, jumps and misleading level sets do not matter to them:
+Five sources. Subset simulation and lines of descent follow f downhill; the others use no more than whether a point
+fails, so that plateaus, ties, jumps and misleading level sets do not matter to them:
 
 1. Draws from the base distribution, and wide ones from N(0, s^2 I): a half-space at distance beta fails with
-   probability Phi(-beta / s), whatever the dimension.
-2. Subset simulation from the base draws, for regions too small to be hit by wide draws.
-3. Chains inside the region of failure (pCN), started from both, so that wide failures become likely ones
+   probability Phi(-beta / s), whatever the dimension (`discovery/wide.py`).
+2. Subset simulation from the base draws, for regions too small to be hit by wide draws (`discovery/levels.py`).
+3. Lines of descent from low base draws, each a trial of its own of which region is found (`discovery/lines.py`).
+4. Chains inside the region of failure (pCN), started from all of these, so that wide failures become likely ones
    (`regions.py`).
-4. The points half way between two failing points: if one fails, the two belong to one region (`regions.py`).
+5. The points half way between two failing points: if one fails, the two belong to one region (`regions.py`).
 """
 
 import math

@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from samplers.method import Goal, Interrupted, Outcome, Steps, offer_of
+from samplers.method import Goal, Interrupted, Steps, offer_of
 from samplers.methods.base import Method
 from samplers.methods.two_stage import stages
 from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, TwoStageSettings
@@ -37,8 +37,8 @@ class TwoStage(Method):
     some per cent and make intervals too short.)
 
     All stages work in standard normal space, so that wide draws stay within the support of the parameters. A run
-    yields 65 to 125 batches, most of them steps of the lines of descent. Regression of f and subset simulation use its
-    values, everything else only its sign.
+    yields 65 to 125 batches, most of them steps of the lines of descent. Regression of f, subset simulation and lines
+    of descent use its values, everything else only its sign.
 
     *Noise.* f may have noise of its own that is no part of x: p is then the marginal probability. No stored outcome
     is simulated again. A noisy f is recognised by 30 points right beside failing ones. Regions are then not
@@ -60,6 +60,9 @@ class TwoStage(Method):
     contradict the estimate, regions that the last draws hardly reach, and a search of so few lineages that M may
     exceed 0.3; the message says what cannot be excluded in units of p. A region that neither f announces nor any draw
     has hit gives no warning; `Estimate.unseen` bounds its probability.
+
+    *Terms.* Problems that offer terms and their gradients, in 30 dimensions or more and with 1,000 simulations or more,
+    are searched by another algorithm (`terms/search.py`).
 
     *Other methods take over* where a tenth of the base draws fails, or no failure is found (plain Monte Carlo for the
     rest), and where no mixture describes the failures: dozens of regions, hundreds of dimensions without a direction
@@ -122,7 +125,7 @@ def run_two_stage(
     if budget < settings.min_exploration_budget:
         least = settings.min_exploration_budget
         about = f"max_sim leaves {budget} simulations, too few for an exploration ({least}): base draws only."
-        return _warn_first(about, (yield from stages.run_monte_carlo(context, state)))
+        return (yield from stages.run_monte_carlo(context, state)).warn_first(about)
     try:
         state = yield from stages.draw_first(context, state)
         if state.base_share(goal.gamma) >= settings.common_share:
@@ -147,8 +150,3 @@ def run_two_stage(
     enough = settings.sufficient_budget
     about = f"An exploration within {budget:,} simulations may miss regions without notice ({enough:,} are enough)."
     return replace(outcome, warnings=(*outcome.warnings, about))
-
-
-def _warn_first(about: str, outcome: Outcome) -> Outcome:
-    """Return the outcome with a warning before its own."""
-    return replace(outcome, warnings=(about, *outcome.warnings))

@@ -39,7 +39,7 @@ from samplers.methods.two_stage.simulator import (
 from samplers.methods.two_stage.stratified import StratifiedSample
 from samplers.problem import FloatArray, Inputs
 from samplers.sample import Sample
-from samplers.statistics.intervals import binomial_cov
+from samplers.statistics.intervals import Interval, binomial_cov
 from samplers.statistics.weights import effective_sample_size
 from samplers.trace import Level, Status
 
@@ -251,12 +251,11 @@ def estimate_afresh(
     if sample.draws.n == 0:
         early = estimate_early(context, state)
         return early if stopped else replace(early, status=Status.BUDGET)
-    outcome = _outcome(context, state, sample.draws, sample.cov, 1 / settings.refinement.base_share)
-    discovery = refinement.exploration.discovery
-    largest_weight = 1 / settings.refinement.base_share
+    largest_weight, discovery = 1 / settings.refinement.base_share, refinement.exploration.discovery
+    interval = discovery_interval(sample.draws, sample.cov, goal.confidence, largest_weight, discovery)
+    outcome = _outcome(context, state, sample.draws, sample.cov, interval)
     return replace(
         outcome,
-        interval=discovery_interval(sample.draws, sample.cov, goal.confidence, largest_weight, discovery),
         warnings=(*outcome.warnings, *_check(context, state, refinement, sample)),
         sample=sample.to_sample(proposal, state.base_f, state.base_u, goal.gamma),
         status=Status.STOPPED if stopped else outcome.status,
@@ -266,7 +265,9 @@ def estimate_afresh(
 def estimate_early(context: RunContext, state: RunState) -> Outcome:
     """Return what all draws from known components say, for a run that ends before its estimate."""
     draws = state.history.to_draws(context.simulator.inputs, context.goal.gamma)
-    outcome = _outcome(context, state, draws, draws.cov, draws.n / max(len(state.base_f), 1))
+    largest_weight = draws.n / max(len(state.base_f), 1)
+    interval = weighted_interval(draws, context.goal.confidence, largest_weight, draws.cov)
+    outcome = _outcome(context, state, draws, draws.cov, interval)
     return replace(outcome, sample=draws.sample, status=Status.STOPPED)
 
 
@@ -328,11 +329,11 @@ def _check(context: RunContext, state: RunState, refinement: RefinementState, sa
     ]
 
 
-def _outcome(context: RunContext, state: RunState, draws: Draws, cov: float, largest_weight: float) -> Outcome:
-    """Return what weighted draws say of p; no weight exceeds `largest_weight`."""
+def _outcome(context: RunContext, state: RunState, draws: Draws, cov: float, interval: Interval) -> Outcome:
+    """Return what weighted draws say of p."""
     return Outcome(
         p=draws.p,
-        interval=weighted_interval(draws, context.goal.confidence, largest_weight, cov),
+        interval=interval,
         cov=cov,
         status=Status.CONVERGED if len(draws.f) else Status.NO_HITS,
         warnings=tuple(weight_warnings(draws)),

@@ -109,7 +109,19 @@ def test_a_search_by_terms_is_continued_from_its_journal(tmp_path, last):
         samplers.estimate(Series(last), seed=1, max_sim=2000, journal=tmp_path / "journal")
     rest = Series()
     assert samplers.estimate(rest, seed=1, max_sim=2000, journal=tmp_path / "journal") == expected
-    assert rest.requests == undisturbed.requests - last
+    assert rest.requests == undisturbed.requests - last + 1  # f is called once more, to see that it is the same
+
+
+def test_terms_that_have_changed_are_refused(tmp_path):
+    class Nearer(Series):
+        def terms(self, x, gamma=0.0):
+            seen = super().terms(x, gamma)
+            return Terms(seen.f - 1.0, seen.values - 1.0, seen.ticks, seen.threshold, seen.names)
+
+    with pytest.raises(KeyboardInterrupt):
+        samplers.estimate(Series(5), seed=1, max_sim=2000, journal=tmp_path / "journal")
+    with pytest.raises(JournalError, match="it has changed since"):
+        samplers.estimate(Nearer(), seed=1, max_sim=2000, journal=tmp_path / "journal")
 
 
 def test_a_journal_of_other_terms_is_refused(tmp_path):

@@ -33,7 +33,7 @@ class Discovery(NamedTuple):
     lineages: float
     """Independent lineages that reached failure."""
     ceiling: float = 1.0
-    """Upper end of p by the search's own subset simulation; 1 where it did not come to an end."""
+    """Upper end of p by the search's own subset simulation, or by as many of its levels as there were."""
 
     def unseen_share(self, confidence: float) -> float:
         """Return the upper end of the share of p in regions that were not found.

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,18 +50,18 @@ class CombinedRounds:
     rounds: tuple[FinalRound, ...]
     gamma: float
 
-    @property
+    @cached_property
     def shares(self) -> FloatArray:
         """c_r, adding up to 1."""
         size = np.array([one.factor * len(one.log_weights) for one in self.rounds])
         return np.asarray(size / size.sum())
 
-    @property
+    @cached_property
     def means(self) -> FloatArray:
         """p_r."""
         return np.array([one.y(self.gamma).mean() for one in self.rounds])
 
-    @property
+    @cached_property
     def p(self) -> float:
         """The estimate."""
         return float(self.shares @ self.means)
@@ -77,8 +78,9 @@ class CombinedRounds:
         between = between_factor * float(c**2 @ (self.means - p) ** 2)
         return math.sqrt(max(within, between)) / p
 
+    @cached_property
     def draws(self) -> Draws:
-        """Return all draws as those from one proposal, with the same p."""
+        """All draws as those from one proposal, with the same p."""
         n = sum(len(one.log_weights) for one in self.rounds)
         scaled = [
             one.log_weights + math.log(c * n / len(one.log_weights))
@@ -91,7 +93,7 @@ class CombinedRounds:
         """Return the log-normal interval; with t quantiles and Bernstein's bound where few draws carry p."""
         factors = self.shares / np.array([len(one.log_weights) for one in self.rounds])
         largest = float(factors.max() * sum(len(one.log_weights) for one in self.rounds)) / base_share
-        return weighted_interval(self.draws(), confidence, largest, cov)
+        return weighted_interval(self.draws, confidence, largest, cov)
 
     def share_of_others(self, pursued: list[int]) -> float:
         """Return the share of p in failures whose least term was not pursued, and in points without an outcome."""
@@ -105,7 +107,7 @@ class CombinedRounds:
 
 def doubt(combined: CombinedRounds, pursued: list[int], settings: DoubtSettings) -> list[str]:
     """Return the warnings about an estimate."""
-    warnings = list(weight_warnings(combined.draws()))
+    warnings = list(weight_warnings(combined.draws))
     last = combined.rounds[-1].y(combined.gamma)
     ess = effective_number(last)
     if 0 < ess < settings.min_ess:
@@ -114,7 +116,7 @@ def doubt(combined: CombinedRounds, pursued: list[int], settings: DoubtSettings)
         )
     failing = last[last > 0]
     if len(failing) and largest_weight_share(np.log(failing)) > settings.max_point_share:
-        warnings.append("One draw carries more than a quarter of the last round.")
+        warnings.append(f"One draw carries more than {100 * settings.max_point_share:.0f} % of the last round.")
     other = combined.share_of_others(pursued)
     if other > settings.max_other_share:
         warnings.append(f"{100 * other:.0f} % of p are failures of terms that no proposal was made for.")

@@ -7,11 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from samplers.methods.two_stage.simulator import SimulationSteps
 from samplers.methods.two_stage.terms.fitting import PursuedTerm, find_axes, first_law, fit_law, near_points
 from samplers.methods.two_stage.terms.history import TermHistory
 from samplers.methods.two_stage.terms.law import TermProposal
 from samplers.methods.two_stage.terms.settings import LawSettings, RoundSettings, TermSettings
-from samplers.methods.two_stage.terms.space import TermSimulator, TermSteps
+from samplers.methods.two_stage.terms.space import TermSimulator
 from samplers.methods.two_stage.terms.walks import Walks
 from samplers.problem import FloatArray
 from samplers.statistics.weights import normalise_weights
@@ -80,7 +81,7 @@ def refit_terms(
     limit: int,
     rng: np.random.Generator,
     settings: TermSettings,
-) -> TermSteps[list[PursuedTerm]]:
+) -> SimulationSteps[list[PursuedTerm]]:
     """Return the terms with proposals fitted to all draws, after a few more gradients of each at likely points.
 
     Terms that failures showed and nobody pursued join them.

@@ -22,16 +22,16 @@ from samplers.importance.draws import Draws, weight_warnings, weighted_interval
 from samplers.method import Goal, Interrupted, Outcome, Steps, TermsOffer, no_outcome_share
 from samplers.methods.monte_carlo import MonteCarlo
 from samplers.methods.two_stage.fallback import run_subset_simulation
-from samplers.methods.two_stage.simulator import close_trace, extend_trace
+from samplers.methods.two_stage.simulator import SimulationSteps, close_trace, extend_trace
 from samplers.methods.two_stage.terms.estimate import CombinedRounds, FinalRound, doubt
 from samplers.methods.two_stage.terms.fitting import PursuedTerm
 from samplers.methods.two_stage.terms.history import TermHistory
 from samplers.methods.two_stage.terms.order import order_by_terms
 from samplers.methods.two_stage.terms.rounds import mix_terms, pursue_walked, refit_terms
 from samplers.methods.two_stage.terms.settings import DEFAULT_TERM_SETTINGS, TermSettings
-from samplers.methods.two_stage.terms.space import TermSimulator, TermSteps
+from samplers.methods.two_stage.terms.space import TermSimulator
 from samplers.methods.two_stage.terms.walks import choose_starts, choose_terms, walk_downhill
-from samplers.problem import Inputs, Terms
+from samplers.problem import Inputs
 from samplers.statistics.intervals import binomial_cov
 from samplers.statistics.weights import effective_sample_size
 from samplers.trace import Level, Status
@@ -101,7 +101,6 @@ def search_terms(
     search = TermSearch(TermSimulator(inputs, offer), goal, budget, end, rng, settings)
     state = yield from _draw_base(search)
     try:
-        state = replace(state, base_rate=float(state.history.failing(goal.gamma).mean()))
         if state.base_rate >= rounds.common_share:
             return (yield from _run_monte_carlo(search, state))
         state = yield from _walk(search, state)
@@ -113,18 +112,18 @@ def search_terms(
     return (yield from _estimate(search, state))
 
 
-def _draw_base(search: TermSearch) -> TermSteps[SearchState]:
+def _draw_base(search: TermSearch) -> SimulationSteps[SearchState]:
     """Make the base draws."""
     rounds = search.settings.rounds
     n = min(max(int(rounds.base * search.budget), rounds.min_base), rounds.max_base)
     u = search.rng.standard_normal((n, search.simulator.inputs.dim))
     terms = yield from search.simulator.terms(u)
-    state = SearchState(TermHistory.of_base_draws(u, terms), base_draws=n)
     share = float((terms.f <= search.goal.gamma).mean())
+    state = SearchState(TermHistory.of_base_draws(u, terms), base_draws=n, base_rate=share)
     return _record(search, state, share, share, n, binomial_cov(share, n))
 
 
-def _walk(search: TermSearch, state: SearchState) -> TermSteps[SearchState]:
+def _walk(search: TermSearch, state: SearchState) -> SimulationSteps[SearchState]:
     """Walk to the failures of main terms and of others; pursue those that are reached."""
     walking, terms, simulator = search.settings.walks, state.history.terms, search.simulator
     main, others = choose_terms(terms, walking)
@@ -135,7 +134,7 @@ def _walk(search: TermSearch, state: SearchState) -> TermSteps[SearchState]:
     ]
     rows = np.concatenate([part for _, part in starts] or [np.empty(0, dtype=np.int64)])
     term = np.repeat([j for j, _ in starts], [len(part) for _, part in starts]).astype(np.int64)
-    chosen = Terms(terms.f[rows], terms.values[rows], terms.ticks[rows], terms.threshold)
+    chosen = replace(terms, f=terms.f[rows], values=terms.values[rows], ticks=terms.ticks[rows])
     limit = simulator.n_sim + int(walking.budget_share * search.budget)
     walks = yield from walk_downhill(simulator, state.history.u[rows], chosen, term, search.goal.gamma, limit, walking)
     state = replace(state, pursued=tuple(pursue_walked(walks, state.history, search.settings)))
@@ -143,7 +142,7 @@ def _walk(search: TermSearch, state: SearchState) -> TermSteps[SearchState]:
     return _record(search, state, reached, state.trace[-1].estimate, len(rows), math.inf)
 
 
-def _run_rounds(search: TermSearch, state: SearchState) -> TermSteps[SearchState]:
+def _run_rounds(search: TermSearch, state: SearchState) -> SimulationSteps[SearchState]:
     """Draw and refit until all terms have been at the threshold twice, or the rest is for the estimate."""
     rounds, ready = search.settings.rounds, 0
     size = int(rounds.size * search.budget)
@@ -156,7 +155,7 @@ def _run_rounds(search: TermSearch, state: SearchState) -> TermSteps[SearchState
 
 def _draw_round(
     search: TermSearch, state: SearchState, n: int, final: bool = False
-) -> TermSteps[tuple[SearchState, FinalRound]]:
+) -> SimulationSteps[tuple[SearchState, FinalRound]]:
     """Draw n points from the present proposal; they join the history."""
     gamma, rounds = search.goal.gamma, search.settings.rounds
     proposal = mix_terms(list(state.pursued), state.history, gamma, rounds, final)
@@ -176,7 +175,7 @@ def _draw_round(
     return _record(search, state, float(fails.mean()), p, n, 1 / math.sqrt(ess) if ess else math.inf, ess), drawn
 
 
-def _refit(search: TermSearch, state: SearchState, reserve: int) -> TermSteps[SearchState]:
+def _refit(search: TermSearch, state: SearchState, reserve: int) -> SimulationSteps[SearchState]:
     """Fit the proposals anew, leaving `reserve` simulations."""
     pursued = yield from refit_terms(
         search.simulator,
@@ -235,7 +234,7 @@ def _combine(search: TermSearch, state: SearchState) -> CombinedRounds:
 def _conclude(search: TermSearch, state: SearchState, stopped: bool) -> Outcome:
     """Return the outcome of the final rounds."""
     settings, goal, combined = search.settings, search.goal, _combine(search, state)
-    cov, draws = combined.cov(_between(search)), combined.draws()
+    cov, draws = combined.cov(_between(search)), combined.draws
     state = _close_trace(search, state)
     status = Status.CONVERGED if len(draws.f) else Status.NO_HITS
     return Outcome(
@@ -272,8 +271,9 @@ def _estimate_early(search: TermSearch, state: SearchState) -> Outcome:
 
 def _run_monte_carlo(search: TermSearch, state: SearchState) -> Steps:
     """Spend the rest on base draws; those made so far decided on this and do not count."""
-    left = search.end - search.simulator.n_sim
-    method = MonteCarlo(n=left, batch=min(left, 10_000))
+    left, rounds = search.end - search.simulator.n_sim, search.settings.rounds
+    batch = rounds.monte_carlo_batch if search.goal.target_cov is None else rounds.target_batch
+    method = MonteCarlo(n=left, batch=batch)
     outcome = yield from method.steps(search.simulator.inputs, replace(search.goal, max_sim=left), search.rng)
     return _after(search, state, outcome)
 

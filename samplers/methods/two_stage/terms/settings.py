@@ -1,6 +1,7 @@
 """Settings of the search by terms, each with its reason.
 
-"Prototype" are runs on Highway-v0 (428 and 1,448 dimensions, 6,000 simulations, 7 to 20 replications of five cases).
+"Prototype" are runs of another program on Highway-v0 (428 and 1,448 dimensions, 6,000 simulations, 7 to 20 replications
+of five cases), not repeated with this one: `python -m benchmarks.estimators.highway.gains` does that.
 """
 
 from dataclasses import dataclass
@@ -25,7 +26,8 @@ class WalkSettings:
     """Walks of every other term: the least of 600 draws may hide a term that is far there and near along its
     gradient."""
     max_scouted: int = 12
-    """Other terms that are scouted, those with the lowest values; a hundred of them would eat the budget."""
+    """Other terms that are scouted at most, those with the lowest values first; all that ever are the least are,
+    however many. A hundred more would eat the budget."""
     start_quantile: float = 0.5
     """Walks start at the lowest values of each half, early and late, of the draws under this quantile."""
     steps: int = 8
@@ -86,6 +88,8 @@ class RoundSettings:
     min_base: int = 100
     common_share: float = 0.1
     """Where this share of the base draws fails, plain Monte Carlo is as good as anything."""
+    monte_carlo_batch: int = 10_000
+    """Draws of a batch of plain Monte Carlo; with a target c.o.v. they are `target_batch`."""
     size: float = 0.1
     """Draws of an adaptive round."""
     base_share: float = 0.04

@@ -1,18 +1,12 @@
 """Terms and their gradients in standard normal space, and the count of what they cost."""
 
-from collections.abc import Generator
-from typing import TypeVar
-
 import numpy as np
 from numpy.typing import NDArray
 
 from samplers.method import TermsOffer, request_gradients, request_terms, whole_simulations
 from samplers.methods.two_stage.noise_coordinates import noise_mask
+from samplers.methods.two_stage.simulator import SimulationSteps
 from samplers.problem import FloatArray, Inputs, StandardNormal, Terms
-
-_T = TypeVar("_T")
-TermSteps = Generator[FloatArray, FloatArray, _T]
-"""A computation that makes requests (see `samplers.method.Steps`) and returns a result."""
 
 DIFFERENCE = 1e-4
 """Standard deviations of a central difference: its error is 1e-8, that of rounding 1e-12."""
@@ -34,13 +28,15 @@ class TermSimulator:
         self.n_sim = 0
         self._slopes: TransformSlopes | None = None
 
-    def terms(self, u: FloatArray) -> TermSteps[Terms]:
+    def terms(self, u: FloatArray) -> SimulationSteps[Terms]:
         """Return the terms at u (n, d), n > 0."""
         terms = yield from request_terms(self.inputs.base.from_standard_normal(u))
         self.n_sim += len(u)
         return terms
 
-    def gradients(self, u: FloatArray, term: NDArray[np.int64], ticks: NDArray[np.int64]) -> TermSteps[FloatArray]:
+    def gradients(
+        self, u: FloatArray, term: NDArray[np.int64], ticks: NDArray[np.int64]
+    ) -> SimulationSteps[FloatArray]:
         """Return the gradients with respect to u of one term at each of the points u (n, d), shape (n, d).
 
         Args:

@@ -6,8 +6,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from samplers.methods.two_stage.simulator import SimulationSteps
 from samplers.methods.two_stage.terms.settings import WalkSettings
-from samplers.methods.two_stage.terms.space import TermSimulator, TermSteps
+from samplers.methods.two_stage.terms.space import TermSimulator
 from samplers.problem import FloatArray, Terms
 
 
@@ -83,7 +84,7 @@ def walk_downhill(
     gamma: float,
     limit: int,
     settings: WalkSettings,
-) -> TermSteps[Walks]:
+) -> SimulationSteps[Walks]:
     """Walk from points u (m, d) with known terms down one term each, until it fails or the steps are used up.
 
     A step goes along the gradient, as far as the term would fall to its threshold if it were linear, but no further

@@ -14,6 +14,9 @@ def test_many_dimensions_are_left_to_two_stage():
     other = samplers.estimate(reference.problem, "two-stage", seed=0, max_sim=1500)
     assert "two-stage takes over" in result.warnings[0]
     assert (result.p, result.interval) == (other.p, other.interval)
+    few = samplers.estimate(reference.problem, samplers.Surrogate(n=100), seed=0)  # too few for an exploration
+    assert few.n_sim == 100
+    assert "two-stage takes over" in few.warnings[0]
 
 
 def test_noise_coordinates_are_not_searched():

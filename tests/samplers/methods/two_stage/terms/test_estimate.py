@@ -24,8 +24,8 @@ def test_rounds_are_combined_by_size_and_factor():
     np.testing.assert_allclose(combined.shares, [0.2, 0.8])
     np.testing.assert_allclose(combined.means, [0.5, 0.25])
     assert combined.p == pytest.approx(0.3)
-    assert combined.draws().p == pytest.approx(0.3)
-    assert combined.draws().sample.weights[:3].sum() == pytest.approx(0.3)
+    assert combined.draws.p == pytest.approx(0.3)
+    assert combined.draws.sample.weights[:3].sum() == pytest.approx(0.3)
 
 
 def test_the_variance_is_that_within_the_strata_and_of_one_more_heavy_draw():
@@ -65,4 +65,4 @@ def test_a_last_round_that_few_draws_carry_is_told():
     combined = CombinedRounds((final_round(np.ones(500)), final_round(y)), 0.0)
     warnings = doubt(combined, [0], DoubtSettings())
     assert any("last round are worth 2 independent" in text for text in warnings)
-    assert any("more than a quarter of the last round" in text for text in warnings)
+    assert any("more than 25 % of the last round" in text for text in warnings)

@@ -200,6 +200,17 @@ def test_a_run_that_is_stopped_anywhere_has_an_outcome(half_spaces):
         assert result.interval[0] <= exact <= result.interval[1]
 
 
+def test_common_failures_can_be_stopped_and_end_at_a_target(half_spaces):
+    problem, exact, _ = half_spaces(40, 0.3)
+    stopped = samplers.estimate(problem, samplers.TwoStage(n=1000), seed=1, stop=lambda seen: True)
+    assert stopped.status is Status.STOPPED
+    assert stopped.n_sim == 100
+    assert stopped.interval[0] <= exact <= stopped.interval[1]
+    met = samplers.estimate(problem, samplers.TwoStage(n=1000), seed=1, target_cov=0.1)
+    assert met.cov <= 0.1
+    assert met.n_sim == 100 + 500  # base draws that decided on it, and one batch
+
+
 def test_replicates_share_the_budget_and_equal_runs_with_their_seeds(half_spaces):
     problem, exact, _ = half_spaces(60, 1e-3)
     result = samplers.estimate(problem, seed=2, max_sim=6000, replicates=3)
