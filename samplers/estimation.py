@@ -245,4 +245,4 @@ def _add_retry_note(result: Estimate, n_retried: int) -> Estimate:
     if n_retried == 0:
         return result
     note = f"{n_retried} rows were simulated again to find those on which f raises."
-    return replace(result, warnings=(*result.warnings, note))
+    return replace(result, remarks=(*result.remarks, note))

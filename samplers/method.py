@@ -69,6 +69,8 @@ class Outcome:
     """End of the run."""
     warnings: tuple[str, ...] = ()
     """Reasons for which the numbers are doubtful, a sentence each."""
+    remarks: tuple[str, ...] = ()
+    """Facts about how the run went that cast no doubt on the numbers, a sentence each."""
     trace: tuple[Level, ...] = ()
     """One entry per level, iteration or batch."""
     no_outcome_share: float = 0.0
@@ -84,6 +86,10 @@ class Outcome:
     def warn_first(self, about: str) -> "Outcome":
         """Return the outcome with a warning before its own."""
         return replace(self, warnings=(about, *self.warnings))
+
+    def remark_first(self, about: str) -> "Outcome":
+        """Return the outcome with a remark before its own."""
+        return replace(self, remarks=(about, *self.remarks))
 
     @classmethod
     def of_counts(

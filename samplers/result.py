@@ -143,6 +143,8 @@ class Estimate:
     """End of the run."""
     warnings: tuple[str, ...]
     """Reasons for which the numbers are doubtful; empty if none is known."""
+    remarks: tuple[str, ...] = ()
+    """Facts about how the run went that cast no doubt on the numbers, such as a change of method."""
     trace: tuple[Level, ...]
     """One entry per level, iteration or batch."""
     failures: Failures
@@ -325,6 +327,7 @@ class Estimate:
             *([f"  chosen {self.choice}"] if self.choice else []),
             f"  given that {self.proviso}",
         ]
+        lines += [f"  remark: {text}" for text in self.remarks]
         return "\n".join(lines + [f"  warning: {text}" for text in self.warnings])
 
     def to_dict(self) -> dict[str, Any]:
@@ -343,6 +346,7 @@ class Estimate:
             "gain": self.gain,
             "status": str(self.status),
             "warnings": list(self.warnings),
+            "remarks": list(self.remarks),
             "trace": [asdict(level) for level in self.trace],
             "failures": {
                 "x": self.failures.x.tolist(),

@@ -50,7 +50,8 @@ def combine(outcomes: Sequence[Outcome], confidence: float) -> Outcome:
         hits, n = counts
         no_outcome = sum(o.no_outcome_share * o.counts[0] for o in outcomes if o.counts)
         whole = Outcome.of_counts(hits, n, confidence, trace, no_outcome / hits if hits else 0.0)
-        return replace(whole, sample=merge_samples(outcomes, [o.counts[1] / n for o in outcomes if o.counts]))
+        sample = merge_samples(outcomes, [o.counts[1] / n for o in outcomes if o.counts])
+        return replace(whole, sample=sample, remarks=_collect_texts([outcome.remarks for outcome in outcomes]))
     used = select_finished(outcomes)
     left_out = len(outcomes) - len(used)
     about = (f"{left_out} of {len(outcomes)} runs were stopped before their end and left out.",) if left_out else ()
@@ -63,7 +64,8 @@ def combine(outcomes: Sequence[Outcome], confidence: float) -> Outcome:
         interval=_mean_interval(used, p, confidence),
         cov=combined_cov(used),
         status=_first_by_priority(used) if mean > 0 else Status.NO_HITS,
-        warnings=(*_collect_warnings(used), *about, *_warn_of_disagreement(used)),
+        warnings=(*_collect_texts([outcome.warnings for outcome in used]), *about, *_warn_of_disagreement(used)),
+        remarks=_collect_texts([outcome.remarks for outcome in used]),
         trace=trace,
         no_outcome_share=(float(np.average([o.no_outcome_share for o in used], weights=p)) if mean else 0.0),
         sample=merge_samples(used, [1 / len(used)] * len(used)),
@@ -165,10 +167,10 @@ def _first_by_priority(outcomes: Sequence[Outcome]) -> Status:
     return next((status for status in STATUS_PRIORITY if status in present), Status.BUDGET)
 
 
-def _collect_warnings(outcomes: Sequence[Outcome]) -> tuple[str, ...]:
-    """Return the warnings of the runs, each once, with the number of runs that have it."""
-    texts = Counter(text for outcome in outcomes for text in outcome.warnings)
-    return tuple(f"In {count} of {len(outcomes)} runs: {text}" for text, count in texts.items())
+def _collect_texts(of_runs: Sequence[tuple[str, ...]]) -> tuple[str, ...]:
+    """Return the warnings or remarks of runs, each once, with the number of runs that have it."""
+    texts = Counter(text for run in of_runs for text in run)
+    return tuple(f"In {count} of {len(of_runs)} runs: {text}" for text, count in texts.items())
 
 
 def _number_levels(outcomes: Sequence[Outcome]) -> list[Level]:

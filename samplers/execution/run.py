@@ -200,6 +200,7 @@ class Run:
             gain=gain_over_monte_carlo(whole.p, whole.cov, self._log.n_sim),
             status=status,
             warnings=(*whole.warnings, *self._error_warnings(), *doubts),
+            remarks=whole.remarks,
             trace=whole.trace,
             failures=self._log.failures,
             method=self._method,

@@ -205,7 +205,7 @@ def test_f_that_raises_is_searched_for_the_row():
         samplers.estimate(problem, "mc", seed=1, max_sim=20_000)
     result = samplers.estimate(problem, "mc", seed=1, max_sim=5000, on_error="failure")
     assert result.n_sim == 5000
-    assert any("simulated again" in text for text in result.warnings)
+    assert any("simulated again" in text for text in result.remarks)
 
 
 def test_a_method_of_your_own(recorder):

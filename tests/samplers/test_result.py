@@ -31,6 +31,15 @@ def test_prints_warnings_and_no_gain_without_hits():
     assert "c.o.v. not known" in text
 
 
+def test_remarks_are_printed_and_are_no_warnings():
+    few = samplers.estimate(half_space(2, 1.0).problem, "two-stage", seed=1, max_sim=300)
+    text = "max_sim leaves 300 simulations, too few for an exploration (400): base draws only."
+    assert few.remarks == (text,)
+    assert few.warnings == ()
+    assert str(few).endswith(f"\n  remark: {text}")
+    assert few.to_dict()["remarks"] == [text]
+
+
 def test_to_dict_is_plain_json():
     estimate = result()
     data = json.loads(estimate.to_json())

@@ -110,6 +110,8 @@ def print_report(report: Report, out: Path | None = None) -> None:
             console.print(line)
     for warning in estimate.warnings:
         console.print(f"warning: {warning}", style="yellow")
+    for remark in estimate.remarks:
+        console.print(f"remark: {remark}")
     for note in report.notes:
         console.print(f"note: {note}")
     if question.method != "mc" and question.ego != "idm" and estimate.p < estimate.unseen:

@@ -58,7 +58,8 @@ def reconcile(subset_outcome: Outcome, earlier: Outcome) -> Outcome:
     )
     about = f"Subset simulation, with the rest, missed regions that were found before: its p is {subset_outcome.p:.1e}."
     warnings = (*earlier.warnings, *subset_outcome.warnings, about)
-    return replace(earlier, interval=interval, status=subset_outcome.status, warnings=warnings)
+    remarks = (*earlier.remarks, *subset_outcome.remarks)
+    return replace(earlier, interval=interval, status=subset_outcome.status, warnings=warnings, remarks=remarks)
 
 
 def run_subset_simulation(
@@ -93,4 +94,4 @@ def run_subset_simulation(
         f"{budget:,} simulations; by itself (adss) it would have had all of them."
     )
     counted_before = 0 if known is None else len(known.f)
-    return replace(outcome, warnings=(about, *outcome.warnings), base_draws=outcome.base_draws - counted_before)
+    return replace(outcome.remark_first(about), base_draws=outcome.base_draws - counted_before)

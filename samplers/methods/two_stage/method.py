@@ -67,8 +67,8 @@ class TwoStage(Method):
     *Other methods take over* where a tenth of the base draws fails, or no failure is found (plain Monte Carlo for the
     rest), and where no mixture describes the failures: dozens of regions, hundreds of dimensions without a direction
     that matters, failures that noise alone decides on. That is decided after each round, by what its draws are
-    worth; adaptive subset simulation in all coordinates then goes on from the base draws (`fallback.py`), with a
-    warning.
+    worth; adaptive subset simulation in all coordinates then goes on from the base draws (`fallback.py`), and a remark
+    says so.
 
     Args:
         n: Simulations where `max_sim` does not say how many; with a target c.o.v. final batches of a tenth of it
@@ -125,7 +125,7 @@ def run_two_stage(
     if budget < settings.min_exploration_budget:
         least = settings.min_exploration_budget
         about = f"max_sim leaves {budget} simulations, too few for an exploration ({least}): base draws only."
-        return (yield from stages.run_monte_carlo(context, state)).warn_first(about)
+        return (yield from stages.run_monte_carlo(context, state)).remark_first(about)
     try:
         state = yield from stages.draw_first(context, state)
         if state.base_share(goal.gamma) >= settings.common_share:

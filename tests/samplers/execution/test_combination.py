@@ -72,6 +72,12 @@ def test_warnings_are_counted_and_the_worst_status_kept():
     assert result.status is Status.BUDGET
 
 
+@pytest.mark.parametrize("counts", [None, (1, 10_000)])
+def test_remarks_are_counted_too_and_are_no_warnings(counts):
+    runs = [outcome(1e-4, cov=1.0, remarks=("base draws",), counts=counts), outcome(1e-4, cov=1.0, counts=counts)]
+    assert combine(runs, 0.95).remarks == ("In 1 of 2 runs: base draws",)
+
+
 def test_replicates_of_monte_carlo_are_one_longer_run():
     """Two runs with 252 hits in all: a t interval of two runs would be 20 times wider."""
     result = samplers.estimate(half_space(2, 2.8).problem, "mc", seed=1, replicates=2, max_sim=100_001)

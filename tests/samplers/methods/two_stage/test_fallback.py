@@ -99,5 +99,5 @@ def test_subset_simulation_keeps_to_its_budget_and_says_why_it_runs(drive):
     assert len(f) <= 3000
     assert outcome.p == pytest.approx(reference.p, rel=4 * outcome.cov)
     assert outcome.cov < 0.4
-    assert outcome.warnings[0].startswith("No proposal describes the failures")
-    assert "3,000 simulations" in outcome.warnings[0]
+    assert outcome.remarks[0].startswith("No proposal describes the failures")
+    assert "3,000 simulations" in outcome.remarks[0]

@@ -103,7 +103,7 @@ def test_without_max_sim_it_makes_n():
 def test_too_small_a_budget_is_plain_monte_carlo_and_says_so():
     result = samplers.estimate(half_space(2, 1.0).problem, TS(), seed=1, max_sim=300)
     assert result.p * 300 == pytest.approx(round(result.p * 300))
-    assert any("too few for an exploration" in warning for warning in result.warnings)
+    assert any("too few for an exploration" in text for text in result.remarks)
 
 
 @pytest.mark.parametrize("n", [0, 399, 2.5, True, "6000"])
@@ -366,7 +366,7 @@ def test_subset_simulation_takes_over(recorder, name):
     reference = case(name)
     for seed in range(3):
         result = counted(recorder, reference.problem, seed=seed, max_sim=6000)
-        assert result.warnings[0].startswith("No proposal describes the failures")
+        assert result.remarks[0].startswith("No proposal describes the failures")
         assert result.interval[0] < reference.p < result.interval[1]
         assert 0.15 < result.cov < 1
         assert result.n_sim <= 6000

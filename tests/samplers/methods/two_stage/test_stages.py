@@ -186,7 +186,7 @@ def test_subset_simulation_takes_what_is_left_in_all_coordinates(drive):
     left = context.left_at_all
     outcome, f = drive(stages.fall_back(context, state, refinement.exploration.levels), PROBLEM)
     assert len(f) <= left
-    assert outcome.warnings[0].startswith("No proposal describes the failures")
+    assert outcome.remarks[0].startswith("No proposal describes the failures")
     assert outcome.trace[: len(state.trace)] == state.trace
     assert outcome.base_draws > state.base_draws
     assert outcome.interval[0] <= P <= outcome.interval[1]

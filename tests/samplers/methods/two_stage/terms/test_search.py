@@ -125,7 +125,7 @@ def test_a_wrong_gradient_costs_accuracy_and_nothing_else(half_spaces):
     check(runs(half, range(3)), exact)
     noise = half_spaces(400, 1e-4, gradient=lambda x, t: rng.standard_normal(x.shape) / 20)[0]
     result = samplers.estimate(noise, seed=0, max_sim=6000)
-    assert any("subset simulation" in text for text in result.warnings)
+    assert any("subset simulation" in text for text in result.remarks)
     assert result.interval[0] <= exact <= result.interval[1]
     assert sum(level.n_sim for level in result.trace) == result.n_sim <= 6000
 
@@ -155,7 +155,7 @@ def test_points_without_an_outcome_fail_and_are_left_to_subset_simulation(half_s
     )
     result = samplers.estimate(problem, seed=1, max_sim=6000, on_error="failure")
     assert result.interval[0] <= exact + norm.sf(2.0) <= result.interval[1]
-    assert any("No proposal describes" in text for text in result.warnings)
+    assert any("No proposal describes" in text for text in result.remarks)
     assert any("gave no outcome" in text for text in result.warnings)
 
 
