@@ -11,6 +11,7 @@ from samplers.problem import Distribution, FloatArray
 from samplers.serialization import to_json_value
 from samplers.statistics.cluster_sums import has_independent_points, interval_of_sum
 from samplers.statistics.intervals import Interval
+from samplers.statistics.unseen_share import add_unseen
 from samplers.statistics.weights import effective_number
 
 MIN_POINTS = 30.0
@@ -99,7 +100,8 @@ def reweight_estimate(estimate: WeightedEstimate, new_base: HasLogProb) -> Rewei
     p1 = sum of w r over the failing points, r = p1(x) / p0(x). With T_c the sums over units, its
     variance is sum T_c^2 - p1^2 / n, to which the largest T_c^2 is added: where one term dominates, the
     sample variance is too small most of the time. The interval is log-normal with the t
-    quantile of the effective units.
+    quantile of the effective units. Where p rests on a search, the upper end holds the share that it may have missed,
+    as that of the estimate does; its lineages count for less as the effective units become fewer.
 
     Raises:
         ValueError: As described in `Estimate.reweight`.
@@ -116,11 +118,13 @@ def reweight_estimate(estimate: WeightedEstimate, new_base: HasLogProb) -> Rewei
     check_enough(estimate, ess, units)
     total = float(terms.sum())
     square = 1 / units - 1 / sample.n_units + (float(totals.max()) / total) ** 2
-    own = 1 / effective_number(np.bincount(owners, weights=old).astype(np.float64)) - 1 / sample.n_units
+    old_units = effective_number(np.bincount(owners, weights=old).astype(np.float64))
+    own = 1 / old_units - 1 / sample.n_units
     cov = math.sqrt(max(square, 0.0)) * cov_inflation(estimate, math.sqrt(max(own, 0.0)))
     ratio = total / float(old.sum()) * math.exp(min(max(largest, -MAX_LOG), MAX_LOG))
     p = min(1.0, estimate.p * ratio)
     low, high = interval_of_sum(p, cov, units, has_independent_points(sample), estimate.confidence)
+    high = add_unseen(p, high, sample.lineages * min(1.0, units / old_units), estimate.confidence)
     if estimate.on_error == "bound":
         low *= 1 - float(terms[np.isneginf(f)].sum()) / total
     return Reweighted(

@@ -115,6 +115,7 @@ def merge_samples(outcomes: Sequence[Outcome], shares: Sequence[float]) -> Sampl
         )
         if any(sample.layers for sample in samples)
         else (),
+        lineages=sum(sample.lineages for sample in samples),
     )
 
 

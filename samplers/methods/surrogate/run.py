@@ -20,10 +20,11 @@ from samplers.methods.surrogate.pool import (
     fit_mixture,
 )
 from samplers.methods.surrogate.settings import SurrogateSettings
-from samplers.methods.two_stage.discovery.unseen import add_unseen, count_lineages
+from samplers.methods.two_stage.discovery.unseen import count_lineages
 from samplers.problem import FloatArray, Inputs, StandardNormal
 from samplers.proposals.gaussian import TiltedNormal
 from samplers.statistics.intervals import Interval, degrees_of_freedom, log_normal_interval
+from samplers.statistics.unseen_share import add_unseen
 from samplers.trace import Level, Status
 
 
@@ -158,14 +159,15 @@ class SurrogateRun:
             self._record(level)
         if draws.n == 0:
             return self._estimate_early(Status.STOPPED if stopped else Status.BUDGET)
-        discoveries = count_lineages(self.failing_batches, np.concatenate(wide_weights))
+        lineages = max(count_lineages(self.failing_batches, np.concatenate(wide_weights)), 1.0)
         outcome = self._outcome(draws, cov, proposal.largest_weight, Status.STOPPED if stopped else Status.CONVERGED)
-        high = add_unseen(draws.p, outcome.interval[1], max(discoveries, 1.0), goal.confidence)
+        high = add_unseen(draws.p, outcome.interval[1], lineages, goal.confidence)
         return replace(
             outcome,
             interval=(outcome.interval[0], high),
             warnings=(*outcome.warnings, *_skill_warnings(kinds, self.settings.least_skill)),
             base_draws=int(kinds[0, 1]),
+            sample=replace(draws.sample, lineages=lineages),
         )
 
     def _design_log_weights(self, *, failing: bool = True) -> FloatArray:

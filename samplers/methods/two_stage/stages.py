@@ -257,7 +257,7 @@ def estimate_afresh(
     return replace(
         outcome,
         warnings=(*outcome.warnings, *_check(context, state, refinement, sample)),
-        sample=sample.to_sample(proposal, state.base_f, state.base_u, goal.gamma),
+        sample=replace(sample.to_sample(proposal, state.base_f, state.base_u, goal.gamma), lineages=discovery.lineages),
         status=Status.STOPPED if stopped else outcome.status,
     )
 

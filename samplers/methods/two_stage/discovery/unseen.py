@@ -1,30 +1,21 @@
 """The share of p that was not found, and the interval that holds it.
 
-Let nu independent lineages have reached failure, all of them in the regions that are known. The share M of p in other
-regions has then the distribution Beta(1/10, nu): each lineage is a trial that a region of share M is missed with
-probability 1 - M; the first parameter is small because most problems have no other region. With p-hat exp(s Z) the
-probability of the regions known, Z ~ N(0, 1), the upper end is the quantile of p-hat exp(s Z) / (1 - M).
+`samplers/statistics/unseen_share.py` has the equations; here lineages are counted.
 """
 
 from typing import NamedTuple
 
-import numpy as np
 from scipy import stats
-from scipy.special import ndtr
 
 from samplers.importance.draws import Draws, weighted_interval
 from samplers.problem import FloatArray
 from samplers.statistics.intervals import Interval, skewed_upper_end
+from samplers.statistics.unseen_share import PRIOR_SHARE, add_unseen
 from samplers.statistics.weights import effective_sample_size
 
-PRIOR_SHARE = 0.1
-"""First parameter of Beta. With 1/4, 5 of 880 intervals lay below p and 17 above (20 seeds on 44 limit states); with
-1/10, 15 and 17 of 1,160 (40 seeds on 29 of these)."""
 HITS_PER_LINEAGE = 4
 """Wide failures that count as one lineage at least: draws of N(0, s^2 I) are independent, but reach some regions more
 often than others."""
-QUANTILES = 400
-"""Points that stand for the distribution of M."""
 
 
 class Discovery(NamedTuple):
@@ -72,24 +63,3 @@ def discovery_interval(
         return low, high
     high = max(high, skewed_upper_end(draws.p, cov, draws.skewness / draws.n**0.5, confidence))
     return low, add_unseen(draws.p, high, discovery.lineages, confidence)
-
-
-def add_unseen(p: float, high: float, lineages: float, confidence: float) -> float:
-    """Return the upper end of p, `high` for the regions known, with the share that is unseen after some lineages.
-
-    Example:
-        >>> round(add_unseen(1e-4, 1.1e-4, lineages=25, confidence=0.95) * 1e4, 3)
-        1.11
-    """
-    if not 0 < p < high:
-        return high
-    tail = 0.5 + confidence / 2
-    sigma = np.log(high / p) / stats.norm.ppf(tail)
-    shares = stats.beta.ppf((np.arange(QUANTILES) + 0.5) / QUANTILES, PRIOR_SHARE, lineages)
-    shift = np.log1p(-np.minimum(shares, 1 - 1e-12))  # of log p, were it all of it
-    below, above = 0.0, np.log(high / p) - shift.min()
-    for _ in range(60):
-        middle = 0.5 * (below + above)
-        short = ndtr((middle + shift) / sigma).mean() < tail
-        below, above = (middle, above) if short else (below, middle)
-    return float(min(1.0, p * np.exp(above)))
