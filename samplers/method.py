@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from samplers.problem import FloatArray, Inputs, TermGradients, Terms
-from samplers.sample import Sample
+from samplers.sample import DrawWeights, Sample
 from samplers.statistics.intervals import binomial_cov, clopper_pearson
 from samplers.statistics.weights import normalise_weights
 from samplers.trace import Level, Status
@@ -82,6 +82,8 @@ class Outcome:
     base_draws: int = 0
     """Independent draws from the base distribution that the run made, search included: `Estimate.unseen` follows from
     them. Of draws from a mixture, the expected number from its base component."""
+    draw_weights: tuple[DrawWeights, ...] = ()
+    """Weights of single simulations in p; empty where p is no sum over simulations, as with chains."""
 
     def warn_first(self, about: str) -> "Outcome":
         """Return the outcome with a warning before its own."""

@@ -18,7 +18,7 @@ from samplers.analysis.reweighting import HasLogProb, Reweighted, find_sibling, 
 from samplers.analysis.sensitivity.parameter_sensitivity import Sensitivity, compute_sensitivity
 from samplers.method import Stepping
 from samplers.problem import Distribution, FloatArray
-from samplers.sample import Sample
+from samplers.sample import Sample, SimulationIndex
 from samplers.serialization import to_json_value
 from samplers.statistics.intervals import zero_hit_bound
 from samplers.trace import Level, Status
@@ -167,6 +167,8 @@ class Estimate:
     """Method that `Auto` chose and why; empty where the method was named."""
     ensemble_run: "Estimate | None" = field(default=None, compare=False, repr=False)
     """The further run under the mixture of the refits of the base, where `estimate` needed one."""
+    simulations: SimulationIndex | None = field(default=None, compare=False, repr=False)
+    """What each simulation was made for, and its weight in p; those of `ensemble_run` come after them."""
     refit_ratios: RatioStore = field(default_factory=RatioStore, compare=False, repr=False)
     """Density ratios of the refits at the failing points, kept by the analyses that need them."""
 

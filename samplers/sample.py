@@ -1,14 +1,16 @@
-"""Sample: the weighted points behind an estimate, and the layers of methods that work level by level."""
+"""Sample: the weighted points behind an estimate, layers of methods with levels, and what simulations were made for."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from samplers.problem import FloatArray
+from samplers.trace import Level
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -36,6 +38,32 @@ class Layer:
     """Least threshold of this layer; the next level has those below."""
     high: float = math.inf
     """Threshold of this level; the level before has those from here on."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DrawWeights:
+    """Weights of simulations that follow each other: p is the sum of those of the failing ones.
+
+    Example:
+        >>> import numpy as np
+        >>> weights = DrawWeights.of_equal_draws(200, first=0, n=3)
+        >>> np.exp(weights.log_weights).round(3).tolist()
+        [0.005, 0.005, 0.005]
+    """
+
+    first: int
+    """Number of the first of them in its run."""
+    log_weights: FloatArray
+    """log(p0 / q) - log(N) for N draws in all, in the order of the simulations, shape (n,)."""
+    run: int = 0
+    """Replicate that made them."""
+    log_share: float = 0.0
+    """Logarithm of the share that this replicate has in the result; to be added to the weights."""
+
+    @classmethod
+    def of_equal_draws(cls, total: int, first: int, n: int) -> DrawWeights:
+        """Return the weights of n of `total` plain draws."""
+        return cls(first=first, log_weights=np.broadcast_to(-math.log(total), n))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -92,3 +120,67 @@ class Sample:
         """
         n = len(f)
         return cls(f=f, weights=np.broadcast_to(1 / n, n), units=np.arange(n), n_units=n, x=x)
+
+
+class SimulationRows(NamedTuple):
+    """What is known of simulations that follow each other, from a `SimulationIndex`."""
+
+    run: NDArray[np.int64]
+    """Replicate that made each, shape (n,)."""
+    stage: NDArray[np.int64]
+    """Its level in the trace of that replicate, shape (n,); -1 for none."""
+    log_weight: FloatArray
+    """Logarithm of its weight in p, shape (n,); NaN where it has none."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SimulationIndex:
+    """Tells of each simulation of an estimate, numbered in the order of their making, what it was made for.
+
+    Example:
+        >>> import samplers
+        >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
+        >>> result = samplers.estimate(problem, "is", seed=0, max_sim=2000)
+        >>> rows = result.simulations.describe(0, result.n_sim)
+        >>> rows.stage[[0, -1]].tolist(), int(np.isnan(rows.log_weight).sum())  # those of the search have no weight
+        ([0, 4], 800)
+    """
+
+    spans: tuple[tuple[int, int], ...]
+    """Replicate and number of its simulations that follow each other, in order."""
+    trace: tuple[Level, ...]
+    """Levels of all replicates."""
+    weights: tuple[DrawWeights, ...]
+    """Weights of single simulations; empty where p is no sum over them."""
+
+    @property
+    def n(self) -> int:
+        """Number of simulations."""
+        return sum(n for _, n in self.spans)
+
+    def describe(self, first: int, n: int) -> SimulationRows:
+        """Return what simulations first, ..., first + n - 1 were made for."""
+        run, local = self._locate(first, n)
+        stage, log_weight = np.full(n, -1), np.full(n, np.nan)
+        for number in np.unique(run):
+            mine = run == number
+            ends = np.cumsum([level.n_sim for level in self.trace if level.run == number])
+            found = np.searchsorted(ends, local[mine], side="right")
+            stage[mine] = np.where(found < len(ends), found, -1)
+        for weights in self.weights:
+            row = local - weights.first
+            inside = (run == weights.run) & (row >= 0) & (row < len(weights.log_weights))
+            log_weight[inside] = weights.log_weights[row[inside]] + weights.log_share
+        return SimulationRows(run, stage, log_weight)
+
+    def _locate(self, first: int, n: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the replicate of each simulation and its number there, shape (n,) each."""
+        runs, sizes = (np.array(each, dtype=np.int64) for each in zip(*self.spans, strict=True))
+        before = np.zeros(len(runs), dtype=np.int64)
+        for number in np.unique(runs):
+            mine = runs == number
+            before[mine] = np.cumsum(sizes[mine]) - sizes[mine]
+        ends = np.cumsum(sizes)
+        rows = np.arange(first, first + n)
+        span = np.searchsorted(ends, rows, side="right")
+        return runs[span], before[span] + rows - (ends - sizes)[span]

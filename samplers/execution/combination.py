@@ -9,7 +9,7 @@ import numpy as np
 from scipy import stats
 
 from samplers.method import Outcome
-from samplers.sample import Sample
+from samplers.sample import DrawWeights, Sample
 from samplers.statistics.intervals import Interval, binomial_cov
 from samplers.trace import Level, Status
 
@@ -50,13 +50,19 @@ def combine(outcomes: Sequence[Outcome], confidence: float) -> Outcome:
         hits, n = counts
         no_outcome = sum(o.no_outcome_share * o.counts[0] for o in outcomes if o.counts)
         whole = Outcome.of_counts(hits, n, confidence, trace, no_outcome / hits if hits else 0.0)
-        sample = merge_samples(outcomes, [o.counts[1] / n for o in outcomes if o.counts])
-        return replace(whole, sample=sample, remarks=_collect_texts([outcome.remarks for outcome in outcomes]))
+        shares = [o.counts[1] / n for o in outcomes if o.counts]
+        return replace(
+            whole,
+            sample=merge_samples(outcomes, shares),
+            draw_weights=share_weights(outcomes, outcomes, shares),
+            remarks=_collect_texts([outcome.remarks for outcome in outcomes]),
+        )
     used = select_finished(outcomes)
     left_out = len(outcomes) - len(used)
     about = (f"{left_out} of {len(outcomes)} runs were stopped before their end and left out.",) if left_out else ()
     if len(used) == 1:
-        return replace(used[0], trace=trace, warnings=(*used[0].warnings, *about))
+        weights = share_weights(outcomes, used, [1.0])
+        return replace(used[0], trace=trace, warnings=(*used[0].warnings, *about), draw_weights=weights)
     p = np.array([outcome.p for outcome in used])
     mean = float(p.mean())
     return Outcome(
@@ -70,6 +76,7 @@ def combine(outcomes: Sequence[Outcome], confidence: float) -> Outcome:
         no_outcome_share=(float(np.average([o.no_outcome_share for o in used], weights=p)) if mean else 0.0),
         sample=merge_samples(used, [1 / len(used)] * len(used)),
         base_draws=sum(outcome.base_draws for outcome in used),
+        draw_weights=share_weights(outcomes, used, [1 / len(used)] * len(used)),
     )
 
 
@@ -116,6 +123,26 @@ def merge_samples(outcomes: Sequence[Outcome], shares: Sequence[float]) -> Sampl
         if any(sample.layers for sample in samples)
         else (),
         lineages=sum(sample.lineages for sample in samples),
+    )
+
+
+def share_weights(
+    outcomes: Sequence[Outcome], used: Sequence[Outcome], shares: Sequence[float]
+) -> tuple[DrawWeights, ...]:
+    """Return the weights of single simulations in a weighted mean of runs; none where a run does not give its own.
+
+    Args:
+        outcomes: All runs, in their order.
+        used: Those of them that are in the mean.
+        shares: The weight of each of these in it.
+    """
+    if not all(outcome.draw_weights for outcome in used):
+        return ()
+    number = {id(outcome): run for run, outcome in enumerate(outcomes)}
+    return tuple(
+        replace(weights, run=number[id(outcome)], log_share=math.log(share))
+        for outcome, share in zip(used, shares, strict=True)
+        for weights in outcome.draw_weights
     )
 
 

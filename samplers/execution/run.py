@@ -18,6 +18,7 @@ from samplers.execution.responder import hide_missing
 from samplers.method import Answer, Choosing, Goal, Outcome, Request, Stepping, TermsOffer
 from samplers.problem import FloatArray, Inputs, TermGradients, Terms, condition_of
 from samplers.result import Estimate
+from samplers.sample import SimulationIndex
 from samplers.statistics.intervals import gain_over_monte_carlo
 from samplers.trace import Status
 
@@ -75,6 +76,7 @@ class Run:
         self._asked = False
         self._stopped: str | None = None
         self._replicates: list[Replicate] = []
+        self._spans: list[tuple[Replicate, int]] = []
         for max_sim in split_budget(self._goal.max_sim, self._n_wanted):
             self._start_replicate(max_sim)
         self._start_more_for_target()
@@ -132,6 +134,7 @@ class Run:
                 check_cost(answer, self._inputs.offer)
         seen = self._record([replicate.requested for replicate in running], answers)
         self._asked = False
+        self._note_spans(running, answers)
         self._monitor.on_batch(self._log.n_sim)
         for replicate, answer in zip(running, seen, strict=True):
             replicate.tell(answer)
@@ -211,7 +214,24 @@ class Run:
             base_draws=whole.base_draws,
             given=self._given,
             choice=self._choice,
+            simulations=self._index_simulations(whole),
         )
+
+    def _note_spans(self, running: Sequence[Replicate], answers: Sequence[Answer]) -> None:
+        """Note which replicate made the simulations of some answers."""
+        for replicate, answer in zip(running, answers, strict=True):
+            if isinstance(answer, TermGradients):
+                continue
+            n = count_simulations(answer)
+            if self._spans and self._spans[-1][0] is replicate:
+                n += self._spans.pop()[1]
+            self._spans.append((replicate, n))
+
+    def _index_simulations(self, whole: Outcome) -> SimulationIndex:
+        """Return what the simulations were made for."""
+        number = {id(replicate): run for run, replicate in enumerate(self._replicates)}
+        spans = tuple((number[id(replicate)], n) for replicate, n in self._spans if id(replicate) in number)
+        return SimulationIndex(spans=spans, trace=whole.trace, weights=whole.draw_weights)
 
     def _outcomes(self) -> list[Outcome]:
         """Return the outcomes of the replicates that have one."""

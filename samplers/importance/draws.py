@@ -6,9 +6,10 @@ import math
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from samplers.problem import FloatArray
-from samplers.sample import Sample
+from samplers.sample import DrawWeights, Sample
 from samplers.statistics.intervals import Interval, clopper_pearson, degrees_of_freedom, log_normal_interval
 from samplers.statistics.weights import effective_sample_size, largest_weight_share
 
@@ -42,18 +43,20 @@ class Draws:
     """Outcomes of the others, shape (n - k,)."""
     log_weights_safe: FloatArray = field(default_factory=lambda: np.empty(0))
     """log(p0 / q) at the others, shape (n - k,)."""
+    fails: NDArray[np.bool_] = field(default_factory=lambda: np.empty(0, dtype=bool))
+    """Which draws fail, in the order in which they were simulated, shape (n,); empty where that is not known."""
 
     @classmethod
     def from_outcomes(cls, f: FloatArray, log_weights: FloatArray, x: FloatArray, gamma: float) -> Draws:
         """Return draws with outcomes f (n,), log(p0 / q) (n,) and points x (n, d) in physical space."""
         fails = f <= gamma
-        return cls(len(f), f[fails], log_weights[fails], x[fails], f[~fails], log_weights[~fails])
+        return cls(len(f), f[fails], log_weights[fails], x[fails], f[~fails], log_weights[~fails], fails)
 
     def join(self, other: Draws) -> Draws:
         """Return these draws and others from the same proposal."""
         if self.n == 0:
             return other
-        parts = ("f", "log_weights", "x", "f_safe", "log_weights_safe")
+        parts = ("f", "log_weights", "x", "f_safe", "log_weights_safe", "fails")
         # fields by name
         return Draws(self.n + other.n, *(np.concatenate([getattr(self, p), getattr(other, p)]) for p in parts))
 
@@ -67,6 +70,14 @@ class Draws:
             n_units=self.n,
             x=self.x,
         )
+
+    def weights_after(self, first: int) -> tuple[DrawWeights, ...]:
+        """Return the weight of each draw in p, in the order of their simulation, of which this many came before."""
+        if len(self.fails) != self.n:
+            return ()
+        in_order = np.empty(self.n)
+        in_order[self.fails], in_order[~self.fails] = self.log_weights, self.log_weights_safe
+        return (DrawWeights(first=first, log_weights=in_order - math.log(self.n)),)
 
     @property
     def ess(self) -> float:

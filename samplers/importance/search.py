@@ -111,6 +111,7 @@ class FinalDraws(NamedTuple):
             no_outcome_share=no_outcome_share(self.draws.f, self.draws.log_weights),
             sample=self.draws.sample,
             base_draws=self.base_draws,
+            draw_weights=self.draws.weights_after(sum(level.n_sim for level in self.trace) - self.draws.n),
         )
 
 

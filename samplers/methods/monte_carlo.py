@@ -5,10 +5,11 @@ from typing import ClassVar
 
 import numpy as np
 
-from samplers.method import Goal, Interrupted, Outcome, Steps, no_outcome_share
+from samplers.method import Goal, Interrupted, Outcome, Steps
 from samplers.methods.base import Method
-from samplers.problem import FloatArray, Inputs
-from samplers.sample import Sample
+from samplers.methods.kept_draws import KeptDraws
+from samplers.problem import Inputs
+from samplers.sample import DrawWeights
 from samplers.statistics.intervals import binomial_cov
 from samplers.trace import Level, Status
 from samplers.validation import check_count
@@ -22,7 +23,8 @@ class MonteCarlo(Method):
     batch, else when the simulations are used up. Tian et al. stop where the 95 % interval reaches
     20 % of p to either side: 1.96 c.o.v. = 0.2, that is target_cov = 0.102. Stopping at a c.o.v.
     makes the interval approximate.
-    Replicates are pooled: their draws are those of one longer run.
+    Replicates are pooled: their draws are those of one longer run. Memory does not grow with the draws: from a million
+    of them on, `Estimate.curve` and `Estimate.shares` rest on some of them, evenly spaced; p rests on all.
 
     Args:
         n: Simulations where `max_sim` does not say how many.
@@ -51,8 +53,7 @@ class MonteCarlo(Method):
         """Draw batches until the target or the end of the budget."""
         budget = self.n if goal.max_sim is None else goal.max_sim
         n, hits, met, stopped = 0, 0, False, False
-        outcomes: list[FloatArray] = []
-        failing: list[FloatArray] = []
+        draws = KeptDraws(goal.gamma, inputs.dim)
         trace: list[Level] = []
         while n < budget and not met:
             size = min(self.batch, budget - n)
@@ -64,15 +65,14 @@ class MonteCarlo(Method):
                     raise
                 stopped = True
                 break
-            outcomes.append(f)
-            failing.append(x[f <= goal.gamma])
-            n, hits = n + size, hits + len(failing[-1])
+            failing = draws.add(x, f)
+            n, hits = n + size, hits + failing
             cov = binomial_cov(hits / n, n)
             met = goal.target_cov is not None and hits > 0 and cov <= goal.target_cov
             trace.append(
                 Level(
                     gamma=goal.gamma,
-                    p=len(failing[-1]) / size,
+                    p=failing / size,
                     estimate=hits / n,
                     n_sim=size,
                     n_points=size,
@@ -80,7 +80,10 @@ class MonteCarlo(Method):
                 )
             )
             goal.on_level(trace[-1])
-        sample = Sample.of_equal_draws(np.concatenate(outcomes), np.concatenate(failing))
-        without = no_outcome_share(sample.f[sample.f <= goal.gamma])
-        outcome = Outcome.of_counts(hits, n, goal.confidence, trace, without)
-        return replace(outcome, sample=sample, status=Status.STOPPED if stopped else outcome.status)
+        outcome = Outcome.of_counts(hits, n, goal.confidence, trace, draws.no_outcome_share)
+        return replace(
+            outcome,
+            sample=draws.to_sample(),
+            status=Status.STOPPED if stopped else outcome.status,
+            draw_weights=(DrawWeights.of_equal_draws(n, 0, n),),
+        )

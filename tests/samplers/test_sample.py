@@ -1,7 +1,10 @@
 import math
 
 import numpy as np
+import pytest
 
+import samplers
+from samplers.problem import FloatArray
 from samplers.sample import Layer, Sample
 
 F = np.array([3.0, -1.0, 0.5, -2.0])
@@ -29,3 +32,56 @@ def test_layers_given_are_the_layers():
     first, second = (Layer(f=F, weights=np.full(4, 0.25), units=np.arange(4), low=low) for low in (1.0, -math.inf))
     sample = Sample(f=F, weights=np.full(4, 0.25), units=np.arange(4), n_units=4, x=X, layers=(first, second))
     assert sample.all_layers == (first, second)
+
+
+def of_simulations(method: str, replicates: int, gamma: float) -> tuple[samplers.Estimate, FloatArray]:
+    f: list[FloatArray] = []
+
+    def evaluate(x: FloatArray) -> FloatArray:
+        f.append(3.0 - np.abs(x[:, 0]))
+        return f[-1]
+
+    problem = samplers.FunctionProblem(evaluate, dim=4)
+    result = samplers.estimate(problem, method, gamma=gamma, seed=1, max_sim=3000, replicates=replicates)
+    return result, np.concatenate(f)
+
+
+@pytest.mark.parametrize("gamma", [0.0, 1.5])
+@pytest.mark.parametrize("replicates", [1, 2])
+@pytest.mark.parametrize("method", ["mc", "is", "ce", "ice", "two-stage"])
+def test_weights_of_single_simulations_add_up_to_p(method: str, replicates: int, gamma: float) -> None:
+    result, f = of_simulations(method, replicates, gamma)
+    index = result.simulations
+    assert index is not None and index.n == len(f) == result.n_sim
+    rows = index.describe(0, index.n)
+    known = ~np.isnan(rows.log_weight)
+    assert np.exp(rows.log_weight[known & (f <= gamma)]).sum() == pytest.approx(result.p, rel=1e-12)
+    # the weights of all draws from a proposal have mean 1, and here a c.o.v. of 10 at most: see their spread
+    weights = np.exp(rows.log_weight[known])
+    assert abs(weights.sum() - 1) <= 5 * weights.std() * len(weights) ** 0.5 + 1e-9
+    counts = [np.sum((rows.run == level.run) & (rows.stage >= 0)) for level in result.trace]
+    assert sum(level.n_sim for level in result.trace) == index.n and min(counts) > 0
+
+
+def test_stages_are_levels_and_parts_of_the_index_agree_with_the_whole() -> None:
+    result, f = of_simulations("ce", 2, 0.0)
+    assert result.simulations is not None
+    rows = result.simulations.describe(0, len(f))
+    parts = [result.simulations.describe(first, min(700, len(f) - first)) for first in range(0, len(f), 700)]
+    for name in ("run", "stage", "log_weight"):
+        joined = np.concatenate([getattr(part, name) for part in parts])
+        assert np.array_equal(joined, getattr(rows, name), equal_nan=True)
+    for run in (0, 1):
+        levels = [level for level in result.trace if level.run == run]
+        made = np.bincount(rows.stage[rows.run == run], minlength=len(levels))
+        assert made.tolist() == [level.n_sim for level in levels]
+        # a level's own count of points under its threshold is that of the simulations said to be its own
+        under = [(f[(rows.run == run) & (rows.stage == k)] <= level.gamma).sum() for k, level in enumerate(levels)]
+        assert under == [round(level.p * level.n_points) for level in levels]
+
+
+@pytest.mark.parametrize("method", ["ss", "adss"])
+def test_chains_give_no_weights_of_single_simulations(method: str) -> None:
+    result, f = of_simulations(method, 1, 0.0)
+    assert result.simulations is not None
+    assert np.isnan(result.simulations.describe(0, len(f)).log_weight).all()

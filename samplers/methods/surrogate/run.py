@@ -182,7 +182,8 @@ class SurrogateRun:
         n = self.n_design
         x = self.inputs.base.from_standard_normal(self.u[:n])
         draws = Draws.from_outcomes(self.f[:n], self._design_log_weights(failing=False), x, self.goal.gamma)
-        return self._outcome(draws, draws.cov, float(len(self.settings.learning.scales)), status)
+        outcome = self._outcome(draws, draws.cov, float(len(self.settings.learning.scales)), status)
+        return replace(outcome, draw_weights=draws.weights_after(0))
 
     def _interval(self, draws: Draws, cov: float, largest_weight: float) -> Interval:
         """Return the interval of p from weighted draws, for the regions that they know of."""
@@ -202,6 +203,7 @@ class SurrogateRun:
             trace=tuple(self.trace),
             no_outcome_share=no_outcome_share(draws.f, draws.log_weights),
             sample=draws.sample,
+            draw_weights=draws.weights_after(sum(level.n_sim for level in self.trace) - draws.n),
         )
 
 

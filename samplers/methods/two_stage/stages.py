@@ -38,7 +38,7 @@ from samplers.methods.two_stage.simulator import (
 )
 from samplers.methods.two_stage.stratified import StratifiedSample
 from samplers.problem import FloatArray, Inputs
-from samplers.sample import Sample
+from samplers.sample import DrawWeights, Sample
 from samplers.statistics.intervals import Interval, binomial_cov
 from samplers.statistics.weights import effective_sample_size
 from samplers.trace import Level, Status
@@ -258,6 +258,7 @@ def estimate_afresh(
         outcome,
         warnings=(*outcome.warnings, *_check(context, state, refinement, sample)),
         sample=replace(sample.to_sample(proposal, state.base_f, state.base_u, goal.gamma), lineages=discovery.lineages),
+        draw_weights=sample.draws.weights_after(context.simulator.n_sim - sample.draws.n),
         status=Status.STOPPED if stopped else outcome.status,
     )
 
@@ -280,7 +281,7 @@ def run_monte_carlo(context: RunContext, state: RunState, *, counted: bool = Tru
         counted: Whether the base draws made so far count. They must not where they have decided that plain Monte Carlo
             follows, for that would bias p; unless the run is stopped before it has any other.
     """
-    goal, inputs, stopped = context.goal, context.simulator.inputs, False
+    goal, inputs, stopped, first = context.goal, context.simulator.inputs, False, context.simulator.n_sim
     u, f = (state.base_u, state.base_f) if counted else (state.base_u[:0], state.base_f[:0])
     size = context.settings.monte_carlo_batch if goal.target_cov is None else context.target_batch
     while context.left_at_all > 0:
@@ -298,12 +299,16 @@ def run_monte_carlo(context: RunContext, state: RunState, *, counted: bool = Tru
             break
     if len(f) == 0:
         u, f = state.base_u, state.base_f
+    n_before = len(f) - (context.simulator.n_sim - first)  # base draws of the exploration, its first simulations
     fails = f <= goal.gamma
     trace = _close_trace(context, state).trace
     outcome = Outcome.of_counts(int(fails.sum()), len(fails), goal.confidence, trace, no_outcome_share(f[fails]))
     sample = Sample.of_equal_draws(f, inputs.base.from_standard_normal(u[fails]))
     # A share of draws, but only in runs that came to this: it must not be pooled with others.
-    outcome = replace(outcome, sample=sample, counts=None)
+    weights = tuple(
+        DrawWeights.of_equal_draws(len(f), start, n) for start, n in ((0, n_before), (first, len(f) - n_before)) if n
+    )
+    outcome = replace(outcome, sample=sample, counts=None, draw_weights=weights)
     return replace(outcome, status=Status.STOPPED) if stopped else outcome
 
 
