@@ -121,6 +121,41 @@ class ReferenceLine:
         return rows.unbind(-1), s - number * step
 
 
+class LineCell(NamedTuple):
+    """A cell of a reference line.
+
+    From its start it goes s + `cubic_u` s^3 along its heading, and `square_w` s^2 + `cubic_w` s^3 to the right of it.
+    """
+
+    length: float
+    """[m]."""
+    x: float
+    """Start, along the tangent at the start of the curve [m]."""
+    y: float
+    """Start, to the right of it [m]."""
+    heading: float
+    """At the start, relative to it [rad], positive to the right."""
+    cubic_u: float
+    square_w: float
+    cubic_w: float
+
+
+def list_cells(curve: ReferenceLine) -> list[LineCell]:
+    """Return the cells of a line between its first and its last knot, in order.
+
+    Example:
+        >>> cells = list_cells(ReferenceLine(spacing=50.0, curvature=(0.0, 0.002, 0.0)))
+        >>> len(cells), cells[1].length, round(cells[1].heading, 4)
+        (10, 10.0, 0.002)
+    """
+    table, step = _table(curve, torch.float64, torch.device("cpu"))
+    rows = table[1:-1].tolist()  # without the straights before and after the curve
+    return [
+        LineCell(step, x, y, h, cubic_u=-(k**2) / 6, square_w=k / 2, cubic_w=c / 6)
+        for x, _, _, _, y, _, _, _, h, k, c in rows
+    ]
+
+
 def _nodes(curve: ReferenceLine) -> tuple[float, NDArray[np.float64], NDArray[np.float64]]:
     """Return the length of a cell [m], curvatures and headings at the ends of the cells."""
     parts = math.ceil(curve.spacing / _CELL)

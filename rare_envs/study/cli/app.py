@@ -11,6 +11,7 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
+from rare_envs.study.cli.export_failure import export_command
 from rare_envs.study.cli.options import (
     AlgoOption,
     EgoArgument,
@@ -303,6 +304,9 @@ def replay_command(
         if out is not None:
             print(f"Wrote {out}.")
     raise typer.Exit(0 if same else DOUBTFUL)
+
+
+app.command("export")(export_command)
 
 
 @app.command("check-ego")

@@ -1,0 +1,201 @@
+"""Storyboard: a drive as ASAM OpenSCENARIO XML 1.2, or 1.0 for CARLA's scenario_runner.
+
+Every vehicle is put to its place with its speed and follows its trajectory, a polyline with times, by position. A
+vehicle's position in OpenSCENARIO is that of its rear axle, and its bounding box says where its centre is.
+
+scenario_runner reads 1.0 alone, spawns actors at their centres, knows its ego by the name "hero" and the property
+`type`, and takes whoever has no controller for its own: so the ego has "external_control" and no trajectory there.
+"""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rare_envs.files import replace_file
+from rare_envs.study.export.dependencies import import_scenariogeneration
+from rare_envs.study.export.trajectories import WorldTrajectories
+from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
+
+WHEELBASE = 2.8
+"""Distance of the axles [m]; a usual car of 5 m."""
+VEHICLE_HEIGHT = 1.5
+"""[m]."""
+_WHEEL = 0.65
+"""Diameter of a wheel [m]."""
+_MAX_SPEED, _MAX_ACCELERATION, _MAX_DECELERATION = 70.0, 10.0, 10.0
+"""Of a vehicle's description, which the standard demands [m/s, m/s^2]; its trajectory is followed whatever they are."""
+CARLA_MODEL = "vehicle.tesla.model3"
+"""Blueprint of CARLA; the nearest in length is 0.2 m shorter than ours."""
+
+
+@dataclass(frozen=True)
+class StoryOptions:
+    """Form of a storyboard."""
+
+    title: str
+    """For the header."""
+    properties: Mapping[str, str]
+    """For the header, by name."""
+    free_ego: bool = False
+    """Whether the ego is only put to its place."""
+    carla: bool = False
+    """Whether scenario_runner is to read it."""
+
+    @property
+    def minor_version(self) -> int:
+        """Minor version of OpenSCENARIO 1."""
+        return 0 if self.carla else 2
+
+    @property
+    def rear_axle(self) -> float:
+        """Distance from the point that positions name forward to the centre of the body [m]."""
+        return 0.0 if self.carla else WHEELBASE / 2
+
+    def name_of(self, vehicle: str) -> str:
+        """Return the name of an entity."""
+        return ("hero" if self.carla else "Ego") if vehicle == "ego" else vehicle
+
+
+def write_story(path: Path, trajectories: WorldTrajectories, road_file: str, options: StoryOptions) -> None:
+    """Write an OpenSCENARIO file.
+
+    Args:
+        path: The file, `.xosc`.
+        trajectories: Of the vehicles.
+        road_file: The OpenDRIVE file, relative to the folder of `path`.
+        options: Its form.
+
+    Raises:
+        ValueError: The library scenariogeneration is not installed.
+    """
+    xosc = import_scenariogeneration("xosc")
+    xosc.VersionBase().setVersion(minor=options.minor_version)
+    board = xosc.StoryBoard(_make_init(xosc, trajectories, options), _make_stop(xosc, trajectories, options))
+    board.add_act(_make_act(xosc, trajectories, options))
+    properties = xosc.Properties()
+    for name, value in options.properties.items():
+        properties.add_property(name, value)
+    scenario = xosc.Scenario(
+        options.title,
+        "rare-envs",
+        xosc.ParameterDeclarations(),
+        _make_entities(xosc, trajectories, options),
+        board,
+        xosc.RoadNetwork(road_file),
+        xosc.Catalog(),
+        osc_minor_version=options.minor_version,
+        creation_date=datetime.datetime.now().replace(microsecond=0),
+        header_properties=properties if options.properties and not options.carla else None,
+    )
+    with replace_file(path) as draft:
+        scenario.write_xml(str(draft))
+
+
+def _make_entities(xosc: Any, trajectories: WorldTrajectories, options: StoryOptions) -> Any:
+    entities = xosc.Entities()
+    for vehicle in trajectories.names:
+        entities.add_scenario_object(options.name_of(vehicle), _make_vehicle(xosc, vehicle, options))
+    return entities
+
+
+def _make_vehicle(xosc: Any, vehicle: str, options: StoryOptions) -> Any:
+    """Return the description of a vehicle; its axles are half a wheelbase before and behind the centre."""
+    centre = options.rear_axle
+    front, rear = centre + WHEELBASE / 2, centre - WHEELBASE / 2
+    made = xosc.Vehicle(
+        CARLA_MODEL if options.carla else "car",
+        xosc.VehicleCategory.car,
+        xosc.BoundingBox(VEHICLE_WIDTH, VEHICLE_LENGTH, VEHICLE_HEIGHT, centre, 0.0, VEHICLE_HEIGHT / 2),
+        xosc.Axle(np.pi / 3, _WHEEL, 0.8 * VEHICLE_WIDTH, front, _WHEEL / 2),
+        xosc.Axle(0.0, _WHEEL, 0.8 * VEHICLE_WIDTH, rear, _WHEEL / 2),
+        _MAX_SPEED,
+        _MAX_ACCELERATION,
+        _MAX_DECELERATION,
+    )
+    if options.carla:
+        made.add_property("type", "ego_vehicle" if vehicle == "ego" else "simulation")
+    return made
+
+
+def _position(xosc: Any, trajectories: WorldTrajectories, moment: int, vehicle: int, options: StoryOptions) -> Any:
+    heading = float(trajectories.heading[moment, vehicle])
+    back = options.rear_axle
+    x = float(trajectories.x[moment, vehicle]) - back * np.cos(heading)
+    y = float(trajectories.y[moment, vehicle]) - back * np.sin(heading)
+    return xosc.WorldPosition(float(x), float(y), 0.0, heading, 0.0, 0.0)
+
+
+def _make_init(xosc: Any, trajectories: WorldTrajectories, options: StoryOptions) -> Any:
+    init = xosc.Init()
+    step = xosc.TransitionDynamics(xosc.DynamicsShapes.step, xosc.DynamicsDimension.time, 0)
+    for j, vehicle in enumerate(trajectories.names):
+        name = options.name_of(vehicle)
+        init.add_init_action(name, xosc.TeleportAction(_position(xosc, trajectories, 0, j, options)))
+        init.add_init_action(name, xosc.AbsoluteSpeedAction(float(trajectories.speed[0, j]), step))
+        if options.carla:
+            init.add_init_action(name, _make_carla_controller(xosc, vehicle))
+    return init
+
+
+def _make_carla_controller(xosc: Any, vehicle: str) -> Any:
+    """Return the assignment of scenario_runner's controller: external for the ego, else one that sets velocities."""
+    module = xosc.Properties()
+    module.add_property("module", "external_control" if vehicle == "ego" else "simple_vehicle_control")
+    controller = xosc.Controller(f"{vehicle}_control", module)
+    assign = xosc.AssignControllerAction(controller)
+    override = xosc.OverrideControllerValueAction()
+    override.set_brake(False, 0)
+    override.set_clutch(False, 0)
+    override.set_gear(False, 0)
+    override.set_parkingbrake(False, 0)
+    override.set_steeringwheel(False, 0)
+    override.set_throttle(False, 0)
+    return xosc.ControllerAction(assign, override)
+
+
+def _make_act(xosc: Any, trajectories: WorldTrajectories, options: StoryOptions) -> Any:
+    act = xosc.Act("drive", _after(xosc, 0.0, "start", "start"))
+    priority = xosc.Priority.overwrite if options.carla else xosc.Priority.override  # its name since 1.1
+    for j, vehicle in enumerate(trajectories.names):
+        if vehicle == "ego" and options.free_ego:
+            continue
+        line = xosc.Trajectory(f"{vehicle}_trajectory", False)
+        moments = range(len(trajectories.time))
+        places = [_position(xosc, trajectories, moment, j, options) for moment in moments]
+        line.add_shape(xosc.Polyline(trajectories.time.tolist(), places))
+        follow = xosc.FollowTrajectoryAction(line, xosc.FollowingMode.position, xosc.ReferenceContext.absolute, 1, 0)
+        event = xosc.Event(f"{vehicle}_follows", priority)
+        event.add_trigger(_after(xosc, 0.0, f"{vehicle}_starts", "start"))
+        event.add_action(f"{vehicle}_follows_trajectory", follow)
+        maneuver = xosc.Maneuver(f"{vehicle}_maneuver")
+        maneuver.add_event(event)
+        group = xosc.ManeuverGroup(f"{vehicle}_group")
+        group.add_actor(options.name_of(vehicle))
+        group.add_maneuver(maneuver)
+        act.add_maneuver_group(group)
+    return act
+
+
+def _after(xosc: Any, time: float, name: str, point: str) -> Any:
+    """Return a trigger that is true once the simulation time is beyond `time` [s], or from its start at 0."""
+    condition = xosc.SimulationTimeCondition(time, xosc.Rule.greaterThan)
+    return xosc.ValueTrigger(name, 0, xosc.ConditionEdge.none, condition, point)
+
+
+def _make_stop(xosc: Any, trajectories: WorldTrajectories, options: StoryOptions) -> Any:
+    end = _after(xosc, float(trajectories.time[-1]), "end", "stop")
+    if not options.carla:
+        return end
+    # scenario_runner takes a condition of this name for a criterion, and reports whether the ego collided
+    collision = xosc.ParameterCondition("", "", xosc.Rule.lessThan)
+    group = xosc.ConditionGroup("stop")
+    criterion = xosc.ValueTrigger("criteria_CollisionTest", 0, xosc.ConditionEdge.rising, collision, "stop")
+    group.add_condition(end)
+    group.add_condition(criterion)
+    return group

@@ -1,0 +1,67 @@
+"""Trajectories of a drive in the frame of the exchange formats: flat, y to the left, headings counter-clockwise.
+
+Ours has y to the right and headings clockwise (`rare_envs.traffic.state`); x is the same. On a curved road, world
+coordinates are those of `rare_envs.traffic.road.Road.to_world`, mirrored.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from rare_envs.study.replay import Drive
+from rare_envs.traffic.road import Road
+from samplers.problem import FloatArray
+
+
+@dataclass(frozen=True)
+class WorldTrajectories:
+    """T + 1 moments of N vehicles, the ego first, in a right-handed flat world.
+
+    Example:
+        >>> from rare_envs import DrivingProblem
+        >>> from rare_envs.study import drive_again
+        >>> problem = DrivingProblem("rare_envs/CutIn-v0", horizon=1.0)
+        >>> drive = drive_again(problem, np.array([20.0, 15.0, 20.0, 30.0, 60.0, 3.5]))
+        >>> found = find_trajectories(drive)
+        >>> found.names, found.y[0].round(1).tolist()  # the cutter begins on the right of the ego
+        (('ego', 'cutter', 'lead'), [0.0, -3.5, 0.0])
+    """
+
+    names: tuple[str, ...]
+    """Of the vehicles, length N; the ego is "ego"."""
+    time: FloatArray
+    """[s], shape (T + 1,)."""
+    x: FloatArray
+    """Centres of the bodies [m], shape (T + 1, N)."""
+    y: FloatArray
+    """Centres, positive to the left [m], shape (T + 1, N)."""
+    heading: FloatArray
+    """From the x axis, counter-clockwise [rad], shape (T + 1, N)."""
+    speed: FloatArray
+    """Along the heading [m/s], shape (T + 1, N)."""
+
+
+def find_trajectories(drive: Drive) -> WorldTrajectories:
+    """Return the trajectories of a drive; one that ends at time 0 stands still for one tick."""
+    along, across = (torch.from_numpy(drive.position[..., axis].copy()) for axis in (0, 1))
+    x, y, heading = (part.numpy() for part in drive.road.to_world(along, across, torch.from_numpy(drive.heading)))
+    rows = np.arange(len(drive.time)) if len(drive.time) > 1 else np.zeros(2, dtype=int)
+    time = np.arange(len(rows)) * drive.problem.world.clock.dt
+    names = drive.problem.world.scenario.vehicle_names
+    return WorldTrajectories(names, time, x[rows], 0.0 - y[rows], 0.0 - heading[rows], drive.speed[rows])  # no -0.0
+
+
+def sample_line(road: Road, y: float, along: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return points of a line along the road in the right-handed world, x and y [m], shape (k,) each.
+
+    Args:
+        road: The road.
+        y: Across the road, positive to the right [m].
+        along: Along the road [m], shape (k,).
+    """
+    s = torch.from_numpy(along)
+    x, across, _ = road.to_world(s, torch.full_like(s, y), torch.zeros_like(s))
+    return x.numpy(), -across.numpy()
