@@ -49,7 +49,7 @@ def find_trajectories(drive: Drive) -> WorldTrajectories:
     along, across = (torch.from_numpy(drive.position[..., axis].copy()) for axis in (0, 1))
     x, y, heading = (part.numpy() for part in drive.road.to_world(along, across, torch.from_numpy(drive.heading)))
     rows = np.arange(len(drive.time)) if len(drive.time) > 1 else np.zeros(2, dtype=int)
-    time = np.arange(len(rows)) * drive.problem.world.clock.dt
+    time = np.arange(len(rows), dtype=np.float64) * drive.problem.world.clock.dt
     names = drive.problem.world.scenario.vehicle_names
     return WorldTrajectories(names, time, x[rows], 0.0 - y[rows], 0.0 - heading[rows], drive.speed[rows])  # no -0.0
 
