@@ -20,6 +20,7 @@ from rare_envs.egos.wrappers import find_action_bounds
 from rare_envs.make import set_up
 from rare_envs.scenarios.registry import find_scenario
 from rare_envs.search_terms import EpisodeTerms, simulate_terms
+from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.measurement import Measurement
 from rare_envs.simulation.rollout import StochasticDriver, rollout
 from rare_envs.simulation.world import World
@@ -206,11 +207,26 @@ class DrivingProblem:
             >>> terms.names[terms.least[0]], terms.lowest.round(1).tolist(), terms.f.round(1).tolist()  # [m] and [s]
             ('cutter, 0 to 45 % of the time', [6.6], [1.7])
         """
-        x = self.space.validate(np.atleast_2d(x))
-        terms = simulate_terms(self.world, self.driver, x, gamma, self.tile)
-        for row in np.flatnonzero(np.isnan(terms.f)):
-            raise self._nan_error(x[row], row)
-        return terms
+        return self._simulate_terms(x, gamma, None)
+
+    def attempt_terms(self, x: NDArray[np.float64], gamma: float = 0.0) -> tuple[EpisodeTerms, dict[int, str]]:
+        """Simulate as `terms` does, and go on with the other rows when the policy fails on some, as `attempt` does.
+
+        Args:
+            x: Scenario parameters, shape (n, d).
+            gamma: Threshold of f.
+
+        Returns:
+            f and terms, NaN in rows on which it fails, and the reasons by row.
+
+        Raises:
+            Exception: A policy with a memory has failed on the batch, which may be the fault of any row.
+        """
+        failed_rows: dict[int, str] = {}
+        terms = self._simulate_terms(x, gamma, failed_rows)
+        rows = list(failed_rows)
+        terms.f[rows], terms.values[rows] = np.nan, np.nan
+        return terms, failed_rows
 
     @cached_property
     def gradient(self) -> TermDifferentiator | None:
@@ -262,22 +278,45 @@ class DrivingProblem:
 
     def _simulate(self, x: NDArray[np.float64], failed_rows: dict[int, str] | None) -> NDArray[np.float64]:
         x = self.space.validate(np.atleast_2d(x))
-        tile = self.tile
         f = np.empty(len(x))
-        with torch.inference_mode():
-            for first in range(0, len(x), tile):
-                rows = torch.from_numpy(x[first : first + tile]).float()
-                driver, mine = self.driver, dict[int, str]()
-                if failed_rows is not None and isinstance(driver, PolicyDriver):
-                    driver = replace(driver, failed_rows=mine)
-                f[first : first + tile] = rollout(self.world, driver, rows).f.numpy()
-                if failed_rows is not None:
-                    failed_rows.update({first + row: reason for row, reason in mine.items()})
+        first = 0
+        for end in self._roll_out(self.world, x, failed_rows):
+            f[first : first + len(end.f)] = end.f.numpy()
+            first += len(end.f)
+        self._check_known(x, f, failed_rows)
+        return f
+
+    def _simulate_terms(self, x: NDArray[np.float64], gamma: float, failed_rows: dict[int, str] | None) -> EpisodeTerms:
+        x = self.space.validate(np.atleast_2d(x))
+        terms = simulate_terms(self.world, gamma, lambda world: self._roll_out(world, x, failed_rows))
+        self._check_known(x, terms.f, failed_rows)
+        return terms
+
+    def _roll_out(self, world: World, x: NDArray[np.float64], failed_rows: dict[int, str] | None) -> Iterator[Episode]:
+        """Yield the episodes of scenarios x (n, d) at the horizon, tile by tile.
+
+        Args:
+            world: The world, with what is to be measured.
+            x: Scenarios within the physical box.
+            failed_rows: Takes the rows on which a policy fails, with the reason; None if such a failure is raised.
+        """
+        for first in range(0, len(x), self.tile):
+            rows = torch.from_numpy(x[first : first + self.tile]).float()
+            driver, mine = self.driver, dict[int, str]()
+            if failed_rows is not None and isinstance(driver, PolicyDriver):
+                driver = replace(driver, failed_rows=mine)
+            with torch.inference_mode():
+                end = rollout(world, driver, rows)
+            if failed_rows is not None:
+                failed_rows.update({first + row: reason for row, reason in mine.items()})
+            yield end
+
+    def _check_known(self, x: NDArray[np.float64], f: NDArray[np.float64], failed_rows: dict[int, str] | None) -> None:
+        """Raise a ValueError where f is NaN, or add the row to those that failed."""
         for row in np.flatnonzero(np.isnan(f)):
             if failed_rows is None:
                 raise self._nan_error(x[row], row)
             failed_rows.setdefault(int(row), "the measure gave NaN")
-        return f
 
     def _nan_error(self, x_row: NDArray[np.float64], row: int | np.signedinteger[Any]) -> ValueError:
         named = {name: value for name, value in self.space.named(x_row).items() if np.size(value) == 1}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,8 +12,8 @@ from torch import Tensor
 
 from rare_envs.arrays import FloatArray
 from rare_envs.measures.terms import TermTracker, find_order
+from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.measurement import Measurement
-from rare_envs.simulation.rollout import Driver, rollout
 from rare_envs.simulation.world import World
 
 
@@ -42,15 +43,13 @@ class EpisodeTerms:
         return np.asarray(self.values.min(axis=1))
 
 
-def simulate_terms(world: World, driver: Driver, x: FloatArray, gamma: float, tile: int) -> EpisodeTerms:
-    """Drive scenarios from start to horizon.
+def simulate_terms(world: World, gamma: float, simulate: Callable[[World], Iterable[Episode]]) -> EpisodeTerms:
+    """Drive scenarios from start to horizon, and tell the terms of their measure apart.
 
     Args:
         world: The world, with its measure.
-        driver: The ego.
-        x: Scenarios within the physical box, shape (n, d).
         gamma: Threshold of f.
-        tile: Rollouts at once.
+        simulate: Drives the scenarios in a world and gives the episodes at the horizon, tile by tile.
 
     Returns:
         f and its terms. A measure that is no least over moments has one term, f itself, known at the horizon.
@@ -61,12 +60,10 @@ def simulate_terms(world: World, driver: Driver, x: FloatArray, gamma: float, ti
     if tracker is not None:
         world = replace(world, measurement=Measurement(tracker, collisions))
     f, values, ticks = [], [], []
-    with torch.inference_mode():
-        for first in range(0, len(x), tile):
-            end = rollout(world, driver, torch.from_numpy(x[first : first + tile]).float())
-            f.append(end.f)
-            values.append(end.f[:, None] if tracker is None else end.measure_state.values)
-            ticks.append(torch.full((len(end.f), 1), world.clock.ticks) if tracker is None else end.measure_state.ticks)
+    for end in simulate(world):
+        f.append(end.f)
+        values.append(end.f[:, None] if tracker is None else end.measure_state.values)
+        ticks.append(torch.full((len(end.f), 1), world.clock.ticks) if tracker is None else end.measure_state.ticks)
     names = ("f",) if tracker is None else tracker.names(world.scenario.vehicle_names)
     return EpisodeTerms(_join(f), _join(values), torch.cat(ticks).numpy(), threshold, names)
 

@@ -12,7 +12,7 @@ from samplers.execution.arguments import InputsOnly, RunArguments, check_attribu
 from samplers.execution.base_check import find_base_fault
 from samplers.execution.fault_isolation import FaultIsolation
 from samplers.execution.interruption import EstimationInterrupted, defer_signals
-from samplers.execution.journaled_evaluation import keep_simulations, open_journal
+from samplers.execution.journaled_evaluation import open_journal
 from samplers.execution.progress import Listener, Progress, open_listener
 from samplers.execution.responder import Responder
 from samplers.execution.run import Run
@@ -121,8 +121,7 @@ def estimate(
     with open_journal(journal, problem, seed) as kept:
         if kept is not None:
             arguments = replace(arguments, seed=kept.head["seed"])
-        evaluate = isolation.evaluate if kept is None else keep_simulations(isolation, problem, on_error, kept)
-        responder = Responder(problem, arguments.gamma, on_error, isolation, evaluate, kept)
+        responder = Responder(problem, arguments.gamma, on_error, isolation, kept)
         simulation = _Simulation(responder, conditions, progress)
         try:
             result = simulation.run(problem, chosen, arguments)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -9,6 +10,17 @@ from numpy.typing import NDArray
 
 from rare_envs.egos.errors import EgoFault
 from rare_envs.egos.isolation import attempt_in_parts
+from rare_envs.egos.term_rows import (
+    GradientRows,
+    Table,
+    TermRows,
+    join_tables,
+    read_terms,
+    replace_rows,
+    tabulate_terms,
+    widen_rows,
+)
+from rare_envs.egos.wrapped_problem import WrappedProblem
 
 ON_FAULT = ("raise", "failure", "bound")
 """Ways with a scenario on which the ego fails twice: an error, or NaN that counts as a failure or bounds p."""
@@ -37,41 +49,17 @@ class RowwiseProblem(Protocol):
 
 
 @runtime_checkable
-class ConditionalProblem(Protocol):
-    """A problem whose probability is conditional on something."""
+class RowwiseTerms(Protocol):
+    """A problem with terms that does the same for them."""
 
-    @property
-    def given(self) -> str:
-        """Condition of p, in words; empty without one."""
+    def attempt_terms(self, x: NDArray[np.float64], gamma: float = 0.0) -> tuple[Any, dict[int, str]]:
+        """Return the terms of x (n, d), NaN in rows that failed, and the reasons by row."""
 
 
-class WrappedProblem:
-    """A problem around another one: its parameters and its condition; what it evaluates is for a class to say.
-
-    Example:
-        >>> import rare_envs
-        >>> WrappedProblem(rare_envs.DrivingProblem("rare_envs/CarFollowing-v0")).dim
-        3
-    """
-
-    def __init__(self, problem: Any) -> None:
-        """Wrap a problem that has `dim` and `base`."""
-        self.problem = problem
-
-    @property
-    def dim(self) -> int:
-        """Number of scenario parameters."""
-        return int(self.problem.dim)
-
-    @property
-    def base(self) -> Any:
-        """Distribution of x in ordinary traffic."""
-        return self.problem.base
-
-    @property
-    def given(self) -> str:
-        """Condition of p, as the problem states it."""
-        return self.problem.given if isinstance(self.problem, ConditionalProblem) else ""
+Attempted = tuple[Table, dict[int, str]]
+"""A row of numbers for each scenario, shape (n, k), NaN in those that failed, and the reasons by row."""
+Attempt = Callable[[NDArray[np.int64]], Attempted]
+"""From rows of a batch to what they give; it may raise."""
 
 
 class FaultTolerant(WrappedProblem):
@@ -80,7 +68,8 @@ class FaultTolerant(WrappedProblem):
     Rows on which it fails are found: at the tick at which they do if it has no memory, else by splitting the batch
     (see `rare_envs.egos.isolation.part_size`) until they stand alone. They are simulated once more. If the ego fails
     on them again f is NaN, which `samplers.estimate(..., on_error="failure" or "bound")` counts, and what happened is
-    recorded. The simulations that this costs are not in `n_sim`; they are counted here.
+    recorded. The simulations that this costs are not in `n_sim`; they are counted here. Terms are simulated in the same
+    way. A scenario whose gradient fails twice has an outcome and no gradient: NaN, and no fault is recorded.
 
     Attributes:
         problem: The problem that is evaluated.
@@ -126,39 +115,112 @@ class FaultTolerant(WrappedProblem):
             EgoGone: If the ego cannot be queried any more.
         """
         x = np.atleast_2d(np.asarray(x, dtype=np.float64))
-        f, reasons = self._evaluate_isolated(x)
+        table, reasons = self._attempt_twice(lambda part: self._attempt(x[part]), x)
+        self._record(x, reasons)
+        return table[:, 0].copy()
+
+    def _terms(self, x: NDArray[np.float64], gamma: float = 0.0) -> TermRows:
+        """Simulate, with the terms of the problem.
+
+        Args:
+            x: Scenario parameters, shape (n, d).
+            gamma: Threshold of f.
+
+        Returns:
+            f and terms, NaN where the ego failed twice.
+
+        Raises:
+            EgoFault: As `evaluate`.
+            EgoGone: As `evaluate`.
+        """
+        x, seen = np.asarray(x, dtype=np.float64), list[Any]()
+
+        def attempt(part: NDArray[np.int64]) -> Attempted:
+            rows = x[part]
+            terms, reasons = (
+                self.problem.attempt_terms(rows, gamma)
+                if isinstance(self.problem, RowwiseTerms)
+                else (self.problem.terms(rows, gamma), {})
+            )
+            seen.append(terms)
+            return tabulate_terms(terms), _reasons_of_nan(terms.f) | reasons
+
+        table, reasons = self._attempt_twice(attempt, x)
+        self._record(x, reasons)
+        return read_terms(table, float(seen[0].threshold), seen[0].names) if seen else read_terms(table, gamma, ("f",))
+
+    def _gradient(
+        self, x: NDArray[np.float64], term: NDArray[np.int64], ticks: NDArray[np.int64], gamma: float = 0.0
+    ) -> GradientRows:
+        """Differentiate, as `rare_envs.DrivingProblem.gradient`; a row on which the ego fails costs the most there is.
+
+        Raises:
+            EgoFault: If it failed twice and on_error is "raise".
+            EgoGone: If the ego cannot be queried any more.
+        """
+        costs = np.full(len(x), self.gradient_cost)
+
+        def attempt(part: NDArray[np.int64]) -> Attempted:
+            found = self.problem.gradient(x[part], term[part], ticks[part], gamma)
+            costs[part] = found.cost / len(costs[part])
+            return np.asarray(found.values, dtype=np.float64), {}
+
+        table, reasons = self._attempt_twice(attempt, x)
+        if reasons and self._on_error == "raise":
+            self._record(x, reasons)
+        return GradientRows(widen_rows(table, x.shape[1]), float(costs.sum()))
+
+    def _attempt_twice(self, attempt: Attempt, x: NDArray[np.float64]) -> Attempted:
+        """Return what the rows of x (n, d) give at the second attempt at the latest, and reasons where both failed.
+
+        Args:
+            attempt: Gives a table and reasons of some rows.
+            x: Scenarios.
+        """
+        table, reasons = self._isolate(attempt, np.arange(len(x)))
         if not reasons:
-            return f
-        rows = sorted(reasons)
+            return table, {}
+        rows = np.array(sorted(reasons))
         self.n_retried += len(rows)
-        f[rows], again = self._evaluate_isolated(x[rows])
-        for number, reason in sorted(again.items()):
-            fault = Fault(x[rows[number]].copy(), reason)
-            if self._on_error == "raise":
-                raise EgoFault(f"The ego failed twice on x = {_format_x(fault.x)}: {fault.reason}")
-            self.faults.append(fault)
-        return f
+        other, again = self._isolate(attempt, rows)
+        return replace_rows(table, rows, other), {int(rows[number]): reason for number, reason in again.items()}
 
-    def _evaluate_isolated(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], dict[int, str]]:
-        """Return f of x (n, d), shape (n,), NaN where a row failed, and the reasons by row."""
+    def _isolate(self, attempt: Attempt, rows: NDArray[np.int64]) -> Attempted:
+        """Return what some rows give, in parts that become smaller until those that raise stand alone."""
 
-        def attempt(rows: range) -> tuple[NDArray[np.float64], dict[int, str]]:
-            if len(rows) < len(x):
-                self.n_retried += len(rows)
-            f, reasons = self._attempt(x[rows.start : rows.stop].copy())
-            return f, {rows.start + row: reason for row, reason in reasons.items()}
+        def attempt_part(part: range) -> Attempted:
+            if len(part) < len(rows):
+                self.n_retried += len(part)
+            table, reasons = attempt(rows[part.start : part.stop])
+            return table, {part.start + row: reason for row, reason in reasons.items()}
 
-        attempted = attempt_in_parts(attempt, lambda row: np.full(1, np.nan), range(len(x)))
+        attempted = attempt_in_parts(attempt_part, lambda row: np.full((1, 1), np.nan), range(len(rows)))
         assert attempted is not None
-        return np.concatenate(attempted[0]), attempted[1]
+        return join_tables(attempted[0]), attempted[1]
 
-    def _attempt(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], dict[int, str]]:
+    def _attempt(self, x: NDArray[np.float64]) -> Attempted:
         """Return f of a batch, and reasons where rows alone have failed, by the problem's `attempt` if it has one."""
         f, reasons = (
             self.problem.attempt(x) if isinstance(self.problem, RowwiseProblem) else (self.problem.evaluate(x), {})
         )
         f = np.array(f, dtype=np.float64)
-        return f, dict.fromkeys(np.flatnonzero(np.isnan(f)).tolist(), "f is NaN") | reasons
+        return f[:, None], _reasons_of_nan(f) | reasons
+
+    def _record(self, x: NDArray[np.float64], reasons: dict[int, str]) -> None:
+        """Record the scenarios that failed twice.
+
+        Raises:
+            EgoFault: If on_error is "raise".
+        """
+        for row, reason in sorted(reasons.items()):
+            fault = Fault(x[row].copy(), reason)
+            if self._on_error == "raise":
+                raise EgoFault(f"The ego failed twice on x = {_format_x(fault.x)}: {fault.reason}")
+            self.faults.append(fault)
+
+
+def _reasons_of_nan(f: NDArray[np.float64]) -> dict[int, str]:
+    return dict.fromkeys(np.flatnonzero(np.isnan(f)).tolist(), "f is NaN")
 
 
 def _format_x(x: NDArray[np.float64]) -> str:

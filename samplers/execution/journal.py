@@ -34,9 +34,14 @@ class JournalRecord(NamedTuple):
     points: str
     """Digest of x, see `digest_points`."""
     f: FloatArray
-    """Outcomes, shape (n,)."""
+    """Outcomes, shape (n,), or the numbers of another answer."""
     notes: dict[str, Any]
-    """What else is known of them, JSON-ready."""
+    """What else is known of them, JSON-ready; `n_sim` is their number where it is not that of f."""
+
+    @property
+    def n_sim(self) -> int:
+        """Number of simulations."""
+        return int(self.notes.get("n_sim", len(self.f)))
 
 
 def digest_points(x: NDArray[Any]) -> str:
@@ -149,7 +154,7 @@ class JournalFile:
             )
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise JournalError(f"{str(self.path)!r} is no journal of this version: {error}.") from error
-        self.n += len(record.f)
+        self.n += record.n_sim
         return record
 
     def append(self, record: JournalRecord) -> None:
@@ -160,7 +165,7 @@ class JournalFile:
         """
         line = {"points": record.points, "notes": record.notes}
         self._waiting.append(_encode(line) + np.asarray(record.f, dtype="<f8").tobytes())
-        self.n += len(record.f)
+        self.n += record.n_sim
         try:
             self._write_waiting()
             if time.monotonic() - self._synced >= SYNC_SECONDS:

@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from samplers.errors import OnError, one_per_row
+from samplers.errors import one_per_row
 from samplers.execution.arguments import choose_seed
 from samplers.execution.fault_isolation import FaultIsolation
 from samplers.execution.journal import JournalFile, JournalRecord, digest_points
 from samplers.execution.record_file import JournalError
-from samplers.problem import FloatArray, Inputs, Problem, TermGradients, Terms
+from samplers.method import whole_simulations
+from samplers.problem import FloatArray, Inputs, TermGradients, Terms
 
 N_CHECKED = 8
 """Points at which a continued journal calls f again, from the least f of its first batch to the largest."""
@@ -26,6 +27,29 @@ Simulate = Callable[[FloatArray], tuple[FloatArray, dict[str, Any]]]
 """From x (n, d) to f (n,) and notes on it, JSON-ready."""
 
 
+class FirstCheck:
+    """A check of the first outcomes taken from a journal: whether f is what it was.
+
+    Args:
+        journal: Has the outcomes.
+        recheck: f at points simulated before, at most `N_CHECKED`; called once, and once more if its values differ, to
+            tell an f that was changed from one that is random. These simulations are not counted.
+    """
+
+    def __init__(self, journal: JournalFile, recheck: Callable[[FloatArray], ArrayLike]) -> None:
+        self._journal, self._recheck, self._done = journal, recheck, False
+
+    def __call__(self, x: FloatArray, f: FloatArray) -> None:
+        """Check f (n,) at x (n, d); later calls do nothing.
+
+        Raises:
+            JournalError: f had other values at them than it has now.
+        """
+        if not self._done:
+            self._done = True
+            check_same_f(self._journal, self._recheck, x, f)
+
+
 class JournaledEvaluation:
     """f whose finished simulations are kept in a journal.
 
@@ -33,9 +57,7 @@ class JournaledEvaluation:
         journal: Keeps what has been simulated, and may have some from before.
         simulate: Makes simulations.
         restore: Takes x and the record of simulations from before.
-        recheck: f at points simulated before, at most `N_CHECKED`, to see that f is what it was; called once, and
-            once more if its values differ, to tell an f that was changed from one that is random. These simulations are
-            not counted.
+        check: Takes x and f of simulations from before.
     """
 
     def __init__(
@@ -43,10 +65,9 @@ class JournaledEvaluation:
         journal: JournalFile,
         simulate: Simulate,
         restore: Callable[[FloatArray, JournalRecord], None],
-        recheck: Callable[[FloatArray], ArrayLike],
+        check: FirstCheck,
     ) -> None:
-        self._journal, self._simulate, self._restore, self._recheck = journal, simulate, restore, recheck
-        self._checked = False
+        self._journal, self._simulate, self._restore, self._check = journal, simulate, restore, check
 
     def evaluate(self, x: FloatArray, points: str | None = None) -> FloatArray:
         """Return f (n,) of x (n, d) from the journal, or simulate.
@@ -58,23 +79,13 @@ class JournaledEvaluation:
         Raises:
             JournalError: The journal has other points, or f had other values at them than it has now.
         """
+
+        def restore(known: JournalRecord) -> None:
+            self._check(x, known.f)
+            self._restore(x, known)
+
         points = digest_points(x) if points is None else points
-        known = self._journal.read_next()
-        if known is None:
-            f, notes = self._simulate(x)
-            self._journal.append(JournalRecord(points, f, notes))
-            return f
-        if known.points != points or len(known.f) != len(x):
-            raise JournalError(
-                f"After {self._journal.n - len(known.f):,} simulations this run asks for other points than "
-                f"{str(self._journal.path)!r} has: arguments, base distribution or libraries have changed since it was "
-                "begun. Remove the file to begin anew."
-            )
-        if not self._checked:
-            self._checked = True
-            check_same_f(self._journal, self._recheck, x, known.f)
-        self._restore(x, known)
-        return known.f
+        return keep_answer(self._journal, points, lambda: self._simulate(x), restore)[0]
 
 
 def find_changed(again: FloatArray, f: FloatArray) -> NDArray[np.bool_]:
@@ -128,7 +139,7 @@ def open_journal(path: str | PathLike[str] | None, problem: Inputs, seed: int | 
 
 
 def keep_simulations(
-    isolation: FaultIsolation, problem: Problem, on_error: OnError, journal: JournalFile
+    isolation: FaultIsolation, journal: JournalFile, check: FirstCheck
 ) -> Callable[[FloatArray], FloatArray]:
     """Return f with isolated faults whose finished simulations are kept."""
 
@@ -140,36 +151,39 @@ def keep_simulations(
     def restore(x: FloatArray, known: JournalRecord) -> None:
         isolation.n_retried += int(known.notes.get("n_retried", 0))
 
-    return JournaledEvaluation(journal, simulate, restore, FaultIsolation(problem.evaluate, on_error).evaluate).evaluate
+    return JournaledEvaluation(journal, simulate, restore, check).evaluate
 
 
 Packed = tuple[FloatArray, dict[str, Any]]
 """An answer as numbers (k,) and notes, JSON-ready."""
 
 
-def keep_answer(journal: JournalFile | None, points: str, compute: Callable[[], Packed]) -> Packed:
-    """Return an answer from the journal, or compute and keep it; without a journal compute it.
+def keep_answer(
+    journal: JournalFile, points: str, compute: Callable[[], Packed], restore: Callable[[JournalRecord], None]
+) -> Packed:
+    """Return an answer from the journal, or compute and keep it.
 
     Args:
         journal: Of the run.
-        points: What was asked for, see `digest_request`.
+        points: What was asked for, see `digest_points` and `digest_request`.
         compute: Computes the answer.
+        restore: Takes the record of an answer from before.
 
     Raises:
         JournalError: The journal has the answer to something else.
     """
-    known = None if journal is None else journal.read_next()
+    known = journal.read_next()
     if known is None:
         numbers, notes = compute()
-        if journal is not None:
-            journal.append(JournalRecord(points, numbers, notes))
+        journal.append(JournalRecord(points, numbers, notes))
         return numbers, notes
     if known.points != points:
-        assert journal is not None
         raise JournalError(
-            f"This run asks for other terms than {str(journal.path)!r} has: arguments, base distribution or libraries "
-            "have changed since it was begun. Remove the file to begin anew."
+            f"After {journal.n - known.n_sim:,} simulations this run asks for other points than {str(journal.path)!r} "
+            "has: arguments, base distribution or libraries have changed since it was begun. Remove the file to begin "
+            "anew."
         )
+    restore(known)
     return known.f, known.notes
 
 
@@ -178,10 +192,11 @@ def digest_request(kind: str, *arrays: NDArray[Any]) -> str:
     return kind + " ".join(digest_points(array) for array in arrays)
 
 
-def pack_terms(terms: Terms, n_retried: int) -> Packed:
-    """Return terms, and the rows that were simulated again for them, as numbers and notes."""
-    numbers = np.concatenate([terms.f, terms.values.ravel(), terms.ticks.ravel()])
-    return numbers, {"threshold": terms.threshold, "names": list(terms.names), "n_retried": n_retried}
+def pack_terms(terms: Terms, notes: dict[str, Any]) -> Packed:
+    """Return terms as numbers, and further notes on them."""
+    numbers = np.concatenate([terms.f, np.ravel(terms.values), np.ravel(terms.ticks)])
+    own = {"threshold": float(terms.threshold), "names": list(terms.names), "n_sim": len(terms.f)}
+    return numbers, notes | own
 
 
 def unpack_terms(numbers: FloatArray, notes: dict[str, Any], n: int) -> Terms:
@@ -196,9 +211,10 @@ def unpack_terms(numbers: FloatArray, notes: dict[str, Any], n: int) -> Terms:
     )
 
 
-def pack_gradients(gradients: TermGradients, n_retried: int) -> Packed:
-    """Return gradients, and the rows that were computed again for them, as numbers and notes."""
-    return gradients.values.ravel(), {"cost": gradients.cost, "n_retried": n_retried}
+def pack_gradients(gradients: TermGradients, notes: dict[str, Any]) -> Packed:
+    """Return gradients as numbers, and further notes on them."""
+    cost = float(gradients.cost)
+    return np.ravel(gradients.values), notes | {"cost": cost, "n_sim": whole_simulations(cost)}
 
 
 def unpack_gradients(numbers: FloatArray, notes: dict[str, Any], n: int) -> TermGradients:

@@ -7,12 +7,13 @@ import numpy as np
 
 from samplers.errors import EvaluationError, OnError, one_per_row
 from samplers.execution.fault_isolation import Evaluate, FaultIsolation
-from samplers.execution.journal import JournalFile
+from samplers.execution.journal import JournalFile, JournalRecord
 from samplers.execution.journaled_evaluation import (
+    FirstCheck,
     Packed,
-    check_same_f,
     digest_request,
     keep_answer,
+    keep_simulations,
     pack_gradients,
     pack_terms,
     unpack_gradients,
@@ -37,8 +38,7 @@ class Responder:
         on_error: Rule for rows on which f, terms or a gradient raises. With "failure" and "bound" a row without terms
             has f = NaN, and one without a gradient has NaN there.
         isolation: Counts the rows that are simulated again; None for one of its own.
-        evaluate: f with isolated faults; None for that of the isolation.
-        journal: Keeps terms and gradients, and may have some from before; None keeps nothing.
+        journal: Keeps answers, and may have some from before; None keeps nothing.
 
     Raises:
         ValueError: If the problem has gradients and its gradient_cost is no positive number.
@@ -53,14 +53,15 @@ class Responder:
         gamma: float,
         on_error: OnError = "raise",
         isolation: FaultIsolation | None = None,
-        evaluate: Evaluate | None = None,
         journal: JournalFile | None = None,
     ) -> None:
         self._problem: Any = problem
-        self._gamma, self._journal, self._on_error = gamma, journal, on_error
-        self._checked = False
+        self._gamma, self._journal = gamma, journal
         self._isolation = isolation or FaultIsolation(problem.evaluate, on_error)
-        self._evaluate = evaluate or self._isolation.evaluate
+        self._evaluate: Evaluate = self._isolation.evaluate
+        if journal is not None:
+            self._check = FirstCheck(journal, FaultIsolation(problem.evaluate, on_error).evaluate)
+            self._evaluate = keep_simulations(self._isolation, journal, self._check)
         self._n_terms: int | None = None
         self._gradient: Any = None
         self.offer: TermsOffer | None = None
@@ -101,40 +102,38 @@ class Responder:
                 answers[i] = self._kept_gradients(one)
         return [answers[i] for i in range(len(requests))]
 
-    def _keep(self, points: str, compute: Callable[[], Packed]) -> Packed:
-        """Return an answer from the journal, with what it says of rows simulated again, or compute it."""
-        before = self.n_retried
-        numbers, notes = keep_answer(self._journal, points, compute)
-        self._isolation.n_retried = before + int(notes["n_retried"])
-        return numbers, notes
-
-    def _count_retried(self, compute: Callable[[], _T]) -> tuple[_T, int]:
-        """Return a result and how many rows were simulated again for it."""
-        before = self.n_retried
-        return compute(), self.n_retried - before
-
     def _kept_terms(self, x: FloatArray) -> Terms:
-        computed = list[Terms]()
+        """Return terms from the journal, or simulate."""
 
         def compute() -> Packed:
-            terms, n_retried = self._count_retried(lambda: self._terms(x))
-            computed.append(terms)
-            return pack_terms(terms, n_retried)
+            return pack_terms(*self._note(lambda: self._terms(x)))
 
-        numbers, notes = self._keep(digest_request("terms", x), compute)
-        terms = unpack_terms(numbers, notes, len(x))
-        if self._journal is not None and not computed and not self._checked:
-            self._checked = True
-            again = FaultIsolation(self._problem.evaluate, self._on_error)
-            check_same_f(self._journal, again.evaluate, x, terms.f)
-        return terms
+        def restore(known: JournalRecord) -> None:
+            self._check(x, unpack_terms(known.f, known.notes, len(x)).f)
+            self._isolation.n_retried += int(known.notes["n_retried"])
+
+        if self._journal is None:
+            return self._terms(x)
+        return unpack_terms(*keep_answer(self._journal, digest_request("terms", x), compute, restore), len(x))
 
     def _kept_gradients(self, request: GradientRequest) -> TermGradients:
-        digest = digest_request("gradient", request.x, request.term, request.ticks)
-        numbers, notes = self._keep(
-            digest, lambda: pack_gradients(*self._count_retried(lambda: self._gradients(request)))
-        )
-        return unpack_gradients(numbers, notes, len(request.x))
+        """Return gradients from the journal, or differentiate."""
+
+        def compute() -> Packed:
+            return pack_gradients(*self._note(lambda: self._gradients(request)))
+
+        def restore(known: JournalRecord) -> None:
+            self._isolation.n_retried += int(known.notes["n_retried"])
+
+        if self._journal is None:
+            return self._gradients(request)
+        asked = digest_request("gradient", request.x, request.term, request.ticks)
+        return unpack_gradients(*keep_answer(self._journal, asked, compute, restore), len(request.x))
+
+    def _note(self, compute: Callable[[], _T]) -> tuple[_T, dict[str, int]]:
+        """Return a result, and a note on how many rows were simulated again for it."""
+        before = self.n_retried
+        return compute(), {"n_retried": self.n_retried - before}
 
     def _terms(self, x: FloatArray) -> Terms:
         """Return the terms of points x (n, d), f = NaN in rows without an outcome."""
@@ -142,14 +141,16 @@ class Responder:
         def call(rows: Any) -> Terms:
             return _check_terms(self._problem.terms(x[rows], self._gamma), len(rows))
 
-        parts = self._isolation.attempt(call, x, "terms")
+        attempted = self._isolation.attempt(call, x, "terms")
+        # a problem that isolates failing rows itself may not know how many terms a batch has of which all rows failed
+        parts = [(rows, None if part is None or np.isnan(part.f).all() else part) for rows, part in attempted]
         known = [part for _, part in parts if part is not None]
         counts = {part.values.shape[1] for part in known} | ({self._n_terms} if self._n_terms else set())
         if len(counts) > 1:
             raise EvaluationError(f"Expected the same number of terms in every batch, got {sorted(counts)}.")
         self._n_terms = counts.pop() if counts else None
         missing = _without_outcome(self._n_terms or 1, known[0].threshold if known else self._gamma)
-        return join_terms([missing if part is None else part for _, part in parts])
+        return join_terms([select_rows(missing, 0 * rows) if part is None else part for rows, part in parts])
 
     def _gradients(self, request: GradientRequest) -> TermGradients:
         """Return gradients, NaN in rows on which they raise; such a row costs what a row costs at most."""

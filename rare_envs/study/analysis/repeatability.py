@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rare_envs.egos.faults import FaultTolerant, WrappedProblem
+from rare_envs.egos.faults import FaultTolerant
+from rare_envs.egos.wrapped_problem import WrappedProblem
 from samplers.execution.journaled_evaluation import find_changed
 from samplers.problem import FloatArray
 
@@ -91,12 +92,22 @@ class RowKeeper(WrappedProblem):
     def evaluate(self, x: FloatArray) -> FloatArray:
         """Return f of the problem: (n, d) -> (n,)."""
         f: FloatArray = self.problem.evaluate(x)
+        self._keep(x, f)
+        return f
+
+    def _terms(self, x: FloatArray, gamma: float = 0.0) -> Any:
+        """Return the terms of the problem at x (n, d)."""
+        terms = self.problem.terms(x, gamma)
+        self._keep(x, terms.f)
+        return terms
+
+    def _keep(self, x: FloatArray, f: FloatArray) -> None:
+        """Keep some of the scenarios x (n, d) with f (n,)."""
         good = ~np.isnan(f)
         self._keep_sample(x[good], f[good])
         xs, fs = np.vstack((self._near[0], x[good])), np.concatenate((self._near[1], f[good]))
         nearest = np.argsort(np.abs(fs - self._gamma), kind="stable")[: self._size]
         self._near = (xs[nearest], fs[nearest])
-        return f
 
     def _keep_sample(self, x: FloatArray, f: FloatArray) -> None:
         """Give each scenario so far the same chance to be in the sample (Vitter's algorithm R)."""

@@ -158,3 +158,61 @@ def test_an_ego_that_fails_on_one_scenario_in_fifty_is_estimated_all_the_same() 
     lost = len(tolerant.faults)
     assert abs(result.p - plain.p) <= lost / 200
     assert lost < 20
+
+
+@pytest.mark.parametrize("memory", [False, True])
+@pytest.mark.parametrize("how", FAILING)
+def test_terms_of_the_same_scenarios_are_lost_and_no_others(how: str, memory: bool, x: np.ndarray) -> None:
+    fail, reason = FAILING[how]
+    tolerant, bad = FaultTolerant(problem(Coasting(fail, memory))), x[:, 2] < GAP
+    assert tolerant.terms is not None
+    found, expected = tolerant.terms(x, 1.0), problem(Coasting()).terms(x, 1.0)
+    np.testing.assert_array_equal(found.f, np.where(bad, np.nan, expected.f))
+    np.testing.assert_array_equal(found.values, np.where(bad[:, None], np.nan, expected.values))
+    np.testing.assert_array_equal(found.ticks[~bad], expected.ticks[~bad])
+    assert (found.threshold, found.names) == (expected.threshold, expected.names)
+    np.testing.assert_array_equal([fault.x for fault in tolerant.faults], x[bad])
+    assert all(reason in fault.reason for fault in tolerant.faults)
+    assert 0 < tolerant.n_retried < (5 if memory else 2) * len(x)
+
+
+@pytest.mark.parametrize("memory", [False, True])
+def test_where_all_scenarios_fail_no_term_is_known(memory: bool, x: np.ndarray) -> None:
+    bad = x[x[:, 2] < GAP]
+    tolerant = FaultTolerant(problem(Coasting(raises, memory)), "bound")
+    assert tolerant.terms is not None
+    found = tolerant.terms(bad)
+    assert np.isnan(found.f).all() and np.isnan(found.values).all()
+    assert found.values.shape == found.ticks.shape == (len(bad), len(found.names))
+    assert len(tolerant.faults) == len(bad)
+
+
+@pytest.mark.parametrize("how", ["raises", "ends the program", "gives the wrong shape"])
+def test_scenarios_on_which_a_gradient_fails_have_none_and_the_others_theirs(how: str, x: np.ndarray) -> None:
+    good = problem(Coasting())
+    term = np.zeros(len(x), dtype=np.int64)
+    ticks = 1 + np.arange(len(x)) % 5  # at tick 0 nobody asks the ego
+    assert good.gradient is not None
+    expected, bad = good.gradient(x, term, ticks), x[:, 2] < GAP
+    tolerant = FaultTolerant(problem(Coasting(FAILING[how][0])))
+    assert tolerant.gradient is not None
+    found = tolerant.gradient(x, term, ticks)
+    np.testing.assert_allclose(found.values, np.where(bad[:, None], np.nan, expected.values), rtol=1e-6)
+    at_most = tolerant.gradient_cost * bad.sum()  # what a row costs at most, for those that gave nothing
+    assert at_most < found.cost <= at_most + expected.cost
+    assert not tolerant.faults  # they have an outcome
+    assert tolerant.n_retried > 0
+    strict = FaultTolerant(problem(Coasting(FAILING[how][0])), "raise")
+    assert strict.gradient is not None
+    with pytest.raises(EgoFault, match=r"failed twice on x = \[.*25\."):
+        strict.gradient(x, term, ticks)
+
+
+def test_a_gradient_is_not_asked_for_again_once_the_ego_is_gone(x: np.ndarray) -> None:
+    def gone(actions: Any, short: Any) -> Any:
+        raise EgoGone("not there")
+
+    tolerant = FaultTolerant(problem(Coasting(gone)), "bound")
+    assert tolerant.gradient is not None
+    with pytest.raises(EgoGone):
+        tolerant.gradient(x, np.zeros(len(x), dtype=np.int64), np.full(len(x), 3))

@@ -115,6 +115,35 @@ def test_the_answer_is_that_of_an_undisturbed_run(method: str, after: int, again
     assert not (frail / "run" / JOURNAL).exists()
 
 
+def test_a_search_by_terms_is_continued_like_any_other(frail: Path) -> None:
+    """The ego goes away among walks, in a round and among the final ones; 15 calls drive 1.5 s."""
+    asked = Question(
+        env_id="rare_envs/Highway-v0",
+        ego="frail:make",
+        measure="clearance",
+        gamma=0.2,
+        horizon=1.5,
+        max_sim=1200,
+        seed=3,
+        on_error="bound",
+    )
+    whole = evaluate.run_into(frail / "whole", prepare(asked))
+    assert len(whole.faults) > 0
+    assert whole.estimate.n_sim == 1200
+    (frail / "left").write_text("40")
+    with pytest.raises(BadInput, match=r"[\d,]+ simulations are kept"):
+        evaluate.run_into(frail / "run", prepare(asked))
+    for left in (75, 40):
+        (frail / "left").write_text(str(left))
+        with pytest.raises(BadInput, match="are kept") as ended:
+            evaluate.resume(frail / "run")
+        assert int(str(ended.value).split(" simulations")[0].split()[-1].replace(",", "")) < 1200
+    evaluate.resume(frail / "run")
+    assert answer(frail / "run") == answer(frail / "whole")
+    for name in ("failures.csv", "faults.csv"):
+        assert (frail / "run" / name).read_bytes() == (frail / "whole" / name).read_bytes()
+
+
 def test_what_is_in_the_journal_is_not_simulated_again(
     frail: Path, risky: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 import samplers
 from samplers.execution.journal import JournalFile
 from samplers.execution.journaled_evaluation import (
+    FirstCheck,
     JournaledEvaluation,
     pack_gradients,
     pack_terms,
@@ -48,10 +50,15 @@ def test_an_f_that_is_random_can_be_continued(tmp_path: Path) -> None:
     assert run(tmp_path / "j", noisy, "mc") == first
 
 
+def evaluation_of(journal: JournalFile, again: Callable[[FloatArray], FloatArray]) -> JournaledEvaluation:
+    """Return the journaled first coordinate, checked by `again`."""
+    return JournaledEvaluation(journal, lambda x: (x[:, 0], {}), lambda x, known: None, FirstCheck(journal, again))
+
+
 def test_f_is_compared_from_its_least_value_to_its_largest_within_what_batches_round(tmp_path: Path) -> None:
     x = np.arange(100.0)[:, None]
     journal = JournalFile.create(tmp_path / "j", {})
-    JournaledEvaluation(journal, lambda x: (x[:, 0], {}), lambda x, known: None, lambda x: x[:, 0]).evaluate(x)
+    evaluation_of(journal, lambda x: x[:, 0]).evaluate(x)
     journal.close()
     for shift, refused in ((0.0, False), (0.09, False), (0.11, True)):  # a thousandth of the largest |f| is 0.099
         asked: list[FloatArray] = []
@@ -61,7 +68,7 @@ def test_f_is_compared_from_its_least_value_to_its_largest_within_what_batches_r
             return np.asarray(points[:, 0] + shift * (points[:, 0] == 99.0))
 
         journal = JournalFile.open(tmp_path / "j")
-        evaluation = JournaledEvaluation(journal, lambda x: (x[:, 0], {}), lambda x, known: None, again)
+        evaluation = evaluation_of(journal, again)
         if refused:
             with pytest.raises(JournalError, match=r"f is 99\.11 at a point where .* has 99"):
                 evaluation.evaluate(x)
@@ -127,18 +134,28 @@ def test_terms_that_have_changed_are_refused(tmp_path):
 def test_a_journal_of_other_terms_is_refused(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         samplers.estimate(Series(5), seed=1, max_sim=2000, journal=tmp_path / "journal")
-    with pytest.raises(JournalError, match="asks for other terms"):
+    with pytest.raises(JournalError, match="asks for other points"):
         samplers.estimate(Series(), seed=1, max_sim=3000, journal=tmp_path / "journal")
 
 
 def test_answers_come_back_as_they_were(rng):
     terms = Terms(rng.random(5), rng.random((5, 3)), rng.integers(0, 90, (5, 3)), 0.25, ("a", "b", "c"))
     terms.f[2] = np.nan
-    again = unpack_terms(*pack_terms(terms, 4), 5)
+    again = unpack_terms(*pack_terms(terms, {"n_retried": 4}), 5)
     for name in ("f", "values", "ticks", "threshold", "names"):
         np.testing.assert_array_equal(getattr(again, name), getattr(terms, name))
     assert again.ticks.dtype == np.int64
     gradients = TermGradients(rng.random((5, 7)), 12.5)
-    back = unpack_gradients(*pack_gradients(gradients, 0), 5)
+    back = unpack_gradients(*pack_gradients(gradients, {}), 5)
     np.testing.assert_array_equal(back.values, gradients.values)
     assert back.cost == 12.5
+
+
+def test_a_journal_counts_simulations_not_numbers(tmp_path):
+    """Base draws are 200 simulations, of which the journal has 1 + 2 * 2 numbers each; 16 gradients of 2.5 are 40."""
+    with pytest.raises(KeyboardInterrupt):
+        samplers.estimate(Series(2), seed=1, max_sim=2000, journal=tmp_path / "journal")
+    journal = JournalFile.open(tmp_path / "journal")
+    assert [record.n_sim for record in iter(journal.read_next, None)] == [200, 40]
+    assert journal.n == 240
+    journal.close()

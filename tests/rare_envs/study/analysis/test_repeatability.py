@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import rare_envs
 from rare_envs.study import Question, prepare, run
 from rare_envs.study.analysis.repeatability import KEPT_ROWS, ROWS_ALONE, RowKeeper
 
@@ -92,3 +93,13 @@ def test_every_row_has_the_same_chance_to_be_kept() -> None:
     expected = 400 * 4 / 9
     assert counts[5] == 0
     assert np.abs(np.delete(counts, 5) - expected).max() < 5 * (expected * 5 / 9) ** 0.5
+
+
+def test_scenarios_whose_terms_were_simulated_are_kept_like_others() -> None:
+    problem = rare_envs.DrivingProblem("rare_envs/CutIn-v0", measure="clearance", horizon=1.0)
+    x = problem.base.sample(300, np.random.default_rng(0))
+    by_terms, by_f = RowKeeper(problem, gamma=5.0), RowKeeper(problem, gamma=5.0)
+    assert by_terms.terms is not None
+    np.testing.assert_array_equal(by_terms.terms(x, 5.0).f, by_f.evaluate(x))
+    np.testing.assert_array_equal(by_terms.x, by_f.x)
+    np.testing.assert_array_equal(by_terms.f, by_f.f)
