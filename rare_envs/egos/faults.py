@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rare_envs.egos.errors import EgoFault
-from rare_envs.egos.isolation import attempt_in_parts
+from rare_envs.egos.isolation import Attempt, attempt_in_parts
 from rare_envs.egos.term_rows import (
     GradientRows,
     Table,
     TermRows,
     join_tables,
+    overwrite_rows,
     read_terms,
-    replace_rows,
     tabulate_terms,
     widen_rows,
 )
@@ -56,9 +56,9 @@ class RowwiseTerms(Protocol):
         """Return the terms of x (n, d), NaN in rows that failed, and the reasons by row."""
 
 
-Attempted = tuple[Table, dict[int, str]]
+Attempted = Attempt[Table]
 """A row of numbers for each scenario, shape (n, k), NaN in those that failed, and the reasons by row."""
-Attempt = Callable[[NDArray[np.int64]], Attempted]
+AttemptRows = Callable[[NDArray[np.int64]], Attempted]
 """From rows of a batch to what they give; it may raise."""
 
 
@@ -170,7 +170,7 @@ class FaultTolerant(WrappedProblem):
             self._record(x, reasons)
         return GradientRows(widen_rows(table, x.shape[1]), float(costs.sum()))
 
-    def _attempt_twice(self, attempt: Attempt, x: NDArray[np.float64]) -> Attempted:
+    def _attempt_twice(self, attempt: AttemptRows, x: NDArray[np.float64]) -> Attempted:
         """Return what the rows of x (n, d) give at the second attempt at the latest, and reasons where both failed.
 
         Args:
@@ -183,9 +183,9 @@ class FaultTolerant(WrappedProblem):
         rows = np.array(sorted(reasons))
         self.n_retried += len(rows)
         other, again = self._isolate(attempt, rows)
-        return replace_rows(table, rows, other), {int(rows[number]): reason for number, reason in again.items()}
+        return overwrite_rows(table, rows, other), {int(rows[number]): reason for number, reason in again.items()}
 
-    def _isolate(self, attempt: Attempt, rows: NDArray[np.int64]) -> Attempted:
+    def _isolate(self, attempt: AttemptRows, rows: NDArray[np.int64]) -> Attempted:
         """Return what some rows give, in parts that become smaller until those that raise stand alone."""
 
         def attempt_part(part: range) -> Attempted:

@@ -67,7 +67,7 @@ def join_tables(parts: Sequence[Table]) -> Table:
     return np.concatenate([widen_rows(part, width) for part in parts])
 
 
-def replace_rows(table: Table, rows: NDArray[np.int64], other: Table) -> Table:
+def overwrite_rows(table: Table, rows: NDArray[np.int64], other: Table) -> Table:
     """Return a table with some of its rows replaced."""
     width = max(table.shape[1], other.shape[1])
     table = widen_rows(table, width)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from rare_envs.egos.term_rows import TermRows, join_tables, read_terms, replace_rows, tabulate_terms
+from rare_envs.egos.term_rows import TermRows, join_tables, overwrite_rows, read_terms, tabulate_terms
 
 RNG = np.random.default_rng(2)
 TERMS = TermRows(RNG.random(5), RNG.random((5, 3)), RNG.integers(0, 90, (5, 3)), 0.25, ("a", "b", "c"))
@@ -24,7 +24,7 @@ def test_lost_rows_stand_where_they_stood() -> None:
 
 def test_rows_are_replaced_by_wider_ones() -> None:
     table = tabulate_terms(TERMS)
-    found = replace_rows(join_tables([LOST, LOST]), np.array([1]), table[3:4])
+    found = overwrite_rows(join_tables([LOST, LOST]), np.array([1]), table[3:4])
     assert np.isnan(found[0]).all()
     np.testing.assert_array_equal(found[1], table[3])
 
