@@ -6,6 +6,7 @@ Knows NumPy and probability, nothing about driving. `estimate` is the front door
 from samplers.analysis.base_uncertainty import BaseUncertainty
 from samplers.analysis.curve import Curve
 from samplers.analysis.failure_modes import Share
+from samplers.analysis.gate import Verdict
 from samplers.analysis.ratio_uncertainty import RatioUncertainty, compute_ratio_uncertainty
 from samplers.analysis.refits import FittedBase
 from samplers.analysis.reweighting import Reweighted
@@ -94,6 +95,7 @@ __all__ = [
     "TermGradients",
     "Terms",
     "TwoStage",
+    "Verdict",
     "compare",
     "compute_ratio_uncertainty",
     "estimate",

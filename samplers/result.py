@@ -14,6 +14,7 @@ from samplers.analysis.base import RatioStore
 from samplers.analysis.base_uncertainty import BaseUncertainty, compute_base_uncertainty
 from samplers.analysis.curve import Curve, compute_curve
 from samplers.analysis.failure_modes import Share, split_by_kind
+from samplers.analysis.gate import Verdict, judge_estimate
 from samplers.analysis.reweighting import HasLogProb, Reweighted, find_sibling, reweight_estimate
 from samplers.analysis.sensitivity.parameter_sensitivity import Sensitivity, compute_sensitivity
 from samplers.method import Stepping
@@ -265,6 +266,21 @@ class Estimate:
         None where the base has no refits; see `BaseUncertainty` and `samplers.FittedBase`.
         """
         return compute_base_uncertainty(self)
+
+    def meets(self, max_p: float, given_base: bool = False) -> Verdict:
+        """Return whether p is below a limit: it passes, fails, or is undecided.
+
+        Both ends of the interval are one-sided limits at the confidence (1 + `confidence`) / 2: take `confidence=0.9`
+        for a test at 95 %. Where the base distribution was fitted, the ends hold the uncertainty that its events leave.
+
+        Args:
+            max_p: The limit.
+            given_base: Take the base distribution as given instead.
+
+        Raises:
+            ValueError: If the limit is not above 0 and below 1.
+        """
+        return judge_estimate(self, max_p, given_base)
 
     def shares(self, label: Callable[[FloatArray], Sequence[str]], most: int | None = None) -> dict[str, Share]:
         """Return p by kind of failure, from the same simulations; the kinds' p add up to p.

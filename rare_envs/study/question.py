@@ -62,6 +62,10 @@ class Question:
         on_error: Treatment of scenarios on which the ego fails twice: "raise" ends the run, "failure" counts them as
             failing, "bound" as failing in p and the upper end of the interval, but not in the lower end.
         sensitivity: Whether the report says what p is sensitive to; that takes no simulations.
+        max_p: Limit that p is compared with, or None. The intervals of the answer have then ends at the one-sided
+            `gate_confidence`, a coverage of twice that less 1.
+        gate_confidence: One-sided confidence of the comparison with `max_p`.
+        given_base: Whether the comparison takes the base distribution as given, without the uncertainty of its fit.
 
     Example:
         >>> question = Question(env_id="rare_envs/CarFollowing-v0", ego="idm", gamma=3.0, seed=1)
@@ -94,6 +98,9 @@ class Question:
     ensemble_run: bool = True
     also_under: str | None = None
     sensitivity: bool = False
+    max_p: float | None = None
+    gate_confidence: float = 0.95
+    given_base: bool = False
 
     @property
     def run_arguments(self) -> RunArguments:
@@ -109,7 +116,21 @@ class Question:
             target_cov=self.target_cov,
             replicates=self.replicates,
             on_error=cast(OnError, self.on_error),
+            confidence=RunArguments.confidence if self.max_p is None else self._two_sided_confidence,
         )
+
+    @property
+    def _two_sided_confidence(self) -> float:
+        """Coverage of an interval whose ends are at `gate_confidence` each.
+
+        Raises:
+            ValueError: The limit or the confidence is out of range.
+        """
+        if not 0.0 < cast(float, self.max_p) < 1.0:
+            raise ValueError(f"Expected max_p above 0 and below 1, got {self.max_p!r}.")
+        if not 0.5 < self.gate_confidence < 1.0:
+            raise ValueError(f"Expected a one-sided confidence above 0.5 and below 1, got {self.gate_confidence!r}.")
+        return 2.0 * self.gate_confidence - 1.0
 
     def check(self) -> samplers.Stepping:
         """Return the method, after a check of all that is known before the ego is loaded, which takes seconds.

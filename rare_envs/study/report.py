@@ -105,8 +105,13 @@ class Report:
         """Doubts about p: of the method, about the base distribution, the ego's statistics, and f as a function."""
         base = self.estimate.base_uncertainty
         doubts = () if base is None else tuple(f"base distribution: {text}" for text in base.warnings)
+        return (*self.estimate.warnings, *doubts, *self._doubts_of_f)
+
+    @property
+    def _doubts_of_f(self) -> tuple[str, ...]:
+        """Doubts about the ego's statistics, and f as a function."""
         again = (self.repeatability.warning,) if self.repeatability and self.repeatability.warning else ()
-        return (*self.estimate.warnings, *doubts, *self._missing_statistics, *again)
+        return (*self._missing_statistics, *again)
 
     @property
     def _missing_statistics(self) -> tuple[str, ...]:
@@ -128,6 +133,18 @@ class Report:
             unknown.append(f"sensitivity is not known: {self.sensitivity}")
         left_out = () if self.no_rate else describe_left_out(self.study, self.estimate)
         return (*self._unused_options, *self.study.problem.notes, *unknown, *left_out)
+
+    @cached_property
+    def verdict(self) -> samplers.Verdict | None:
+        """Whether p is below the limit of the question; None without a limit."""
+        question = self.study.question
+        if question.max_p is None:
+            return None
+        found = self.estimate.meets(question.max_p, question.given_base)
+        doubts = self._doubts_of_f  # the others are the estimate's own
+        if found.reason or not doubts:
+            return found
+        return replace(found, decision="undecided", reason=f"there is a warning: {doubts[0].rstrip('.')}")
 
     @cached_property
     def rate(self) -> CollisionRate | None:
@@ -185,6 +202,7 @@ class Report:
             **self.estimate.to_dict(),
             "question": asdict(self.study.question),
             "average": self.average,
+            "gate": None if self.verdict is None else self.verdict.to_dict(),
             "doubtful": self.doubtful,
             "notes": self.notes,
             "vec_normalize": self.vec_normalize,

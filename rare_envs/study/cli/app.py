@@ -1,6 +1,7 @@
 """Commands of the command line `rare-envs`: each reads its options, calls one function and prints.
 
-Exit codes: 0 done, 2 bad input (one line on standard error), 3 done with warnings that make the number doubtful.
+Exit codes: 0 done, 2 bad input (one line on standard error), 3 done with warnings that make the number doubtful; with
+--max-p 0 passes, 4 fails, 5 undecided.
 """
 
 from __future__ import annotations
@@ -34,6 +35,8 @@ from rare_envs.threads import use_one_thread
 from training.command_line import DriverTrainingOptions, RecordingOptions, RunFolderOption, spread_options
 
 DOUBTFUL = 3
+GATE_CODES = {"passes": 0, "fails": 4, "undecided": 5}
+"""Exit codes of a comparison of p with a limit."""
 
 app = typer.Typer(
     cls=OneLineErrors,
@@ -80,6 +83,8 @@ def estimate_command(
 def _answer(report: Any, out: Path | None, as_json: bool) -> NoReturn:
     """Print a report and exit."""
     _show(report, out, as_json)
+    if report.verdict is not None:
+        raise typer.Exit(GATE_CODES[report.verdict.decision])
     raise typer.Exit(DOUBTFUL if report.doubtful else 0)
 
 

@@ -139,6 +139,16 @@ class EstimateOptions(QuestionOptions):
         bool,
         typer.Option("--sensitivity", help="Show what p is sensitive to: parameters of traffic and of its model."),
     ] = False
+    max_p: Annotated[
+        float | None,
+        typer.Option(help="Limit of p: the exit code is 0 if it passes, 4 if it fails, 5 if that is undecided."),
+    ] = None
+    gate_confidence: Annotated[
+        float, typer.Option("--confidence", help="One-sided, of the comparison with --max-p.")
+    ] = 0.95
+    given_base: Annotated[
+        bool, typer.Option("--given-base", help="Compare with --max-p as if the base distribution were the true one.")
+    ] = False
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -83,6 +83,8 @@ def print_report(report: Report, out: Path | None = None) -> None:
         style="bold",
     )
     console.print(f"  {f'{100 * estimate.confidence:g} % interval':<15} {low:.3e} to {high:.3e}")
+    if report.verdict is not None:
+        console.print(f"  {'limit':<15} {report.verdict}", style="bold")
     for line in indent_lines(estimate.base_uncertainty):
         console.print(line)
     _print_other_bases(console, report)

@@ -1,0 +1,150 @@
+"""Gate: whether a probability is below a limit, at a one-sided confidence.
+
+An interval with nominal coverage c has each of its ends at the one-sided confidence (1 + c) / 2: the true p is above
+the upper end with probability (1 - c) / 2 at most, and below the lower end likewise. A test at confidence 0.95 takes
+the ends of a 90 % interval. Where nothing failed, the upper end is the bound that the draws from the base give by
+themselves, whatever the method.
+
+Where the base distribution was fitted, p is that of the true distribution, and the limits are those that the events
+behind the base leave (`samplers.analysis.base_uncertainty`), unless the base is taken as given.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any, Literal, Protocol
+
+from samplers.analysis.base_uncertainty import BaseUncertainty
+from samplers.serialization import to_json_value
+from samplers.statistics.intervals import Interval, zero_hit_bound
+from samplers.trace import Status
+
+Decision = Literal["passes", "fails", "undecided"]
+
+
+class HasLimits(Protocol):
+    """An estimate with an interval and what is known of its base distribution."""
+
+    @property
+    def interval(self) -> Interval:
+        """Interval of p."""
+
+    @property
+    def confidence(self) -> float:
+        """Nominal coverage of the interval."""
+
+    @property
+    def status(self) -> Status:
+        """End of the run."""
+
+    @property
+    def base_draws(self) -> int:
+        """Simulations that were independent draws from the base."""
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Doubts about p."""
+
+    @property
+    def base_uncertainty(self) -> BaseUncertainty | None:
+        """The uncertainty that the events leave."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Verdict:
+    """Whether P[f(X) <= gamma] is below a limit.
+
+    It passes if the upper end is below the limit, fails if the lower end is above it, and is undecided otherwise, or
+    where a warning makes the ends doubtful. It is true where it passes.
+
+    Example:
+        >>> import samplers
+        >>> problem = samplers.FunctionProblem(lambda x: 3.5 - x.sum(axis=1) / 10**0.5, dim=10)
+        >>> result = samplers.estimate(problem, seed=0, max_sim=6000, confidence=0.9)  # p = 2.3e-4
+        >>> print(result.meets(1e-3))
+        passes: p is below 0.001 with 95 % confidence (one-sided upper end 2.37e-04)
+        >>> bool(result.meets(1e-4)), result.meets(1e-4).decision
+        (False, 'fails')
+    """
+
+    decision: Decision
+    max_p: float
+    """Limit of p."""
+    confidence: float
+    """One-sided confidence of each end."""
+    low: float
+    """One-sided lower end of p; 0 where it is not known."""
+    high: float
+    """One-sided upper end of p; 1 where it is not known."""
+    includes_base: bool
+    """Whether the ends hold the uncertainty of the base distribution."""
+    reason: str = ""
+    """Why it is undecided, beside the ends."""
+
+    def __bool__(self) -> bool:
+        """Return whether it passes."""
+        return self.decision == "passes"
+
+    def __str__(self) -> str:
+        """Return one sentence."""
+        sure = f"{100 * self.confidence:.4g} % confidence"
+        base = ", the base distribution's uncertainty included" if self.includes_base else ""
+        if self.decision == "passes":
+            return f"passes: p is below {self.max_p:g} with {sure} (one-sided upper end {self.high:.2e}{base})"
+        if self.decision == "fails":
+            return f"fails: p is above {self.max_p:g} with {sure} (one-sided lower end {self.low:.2e}{base})"
+        if self.reason:
+            return f"undecided: whether p is below {self.max_p:g} cannot be said, as {self.reason}"
+        return (
+            f"undecided: {self.max_p:g} is between the one-sided ends of p, {self.low:.2e} and {self.high:.2e}, "
+            f"at {sure}{base}"
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain values for JSON."""
+        return {**{name: to_json_value(value) for name, value in asdict(self).items()}, "text": str(self)}
+
+
+def judge_estimate(estimate: HasLimits, max_p: float, given_base: bool = False) -> Verdict:
+    """Return whether p is below a limit.
+
+    Args:
+        estimate: The estimate.
+        max_p: The limit, above 0 and below 1.
+        given_base: Take the base distribution as given, without the uncertainty that its events leave.
+
+    Raises:
+        ValueError: The limit is no such number.
+    """
+    if not (isinstance(max_p, int | float) and 0.0 < max_p < 1.0):
+        raise ValueError(f"Expected max_p above 0 and below 1, got {max_p!r}.")
+    base = None if given_base else estimate.base_uncertainty
+    confidence = 0.5 + estimate.confidence / 2
+    none_failed = estimate.status is Status.NO_HITS
+    own = (0.0, zero_hit_bound(estimate.base_draws, confidence)) if none_failed else estimate.interval
+    (low, high), reason = (own, "") if base is None else _limits_of_base(base)
+    doubts = (*(() if none_failed else estimate.warnings), *(() if base is None else base.warnings))
+    if doubts:
+        reason = f"there is a warning: {doubts[0].rstrip('.')}"
+    decision: Decision = "undecided"
+    if not reason and not math.isnan(low + high):
+        decision = "passes" if high < max_p else "fails" if low > max_p else "undecided"
+    return Verdict(
+        decision=decision,
+        max_p=float(max_p),
+        confidence=confidence,
+        low=low,
+        high=high,
+        includes_base=base is not None,
+        reason=reason,
+    )
+
+
+def _limits_of_base(base: BaseUncertainty) -> tuple[Interval, str]:
+    """Return the ends of p under the uncertainty of the base, and why they are not known."""
+    if base.interval is not None:
+        return base.interval, ""
+    if base.bound is not None:
+        return (0.0, base.bound), ""
+    return (0.0, 1.0), f"p under the refits of the base distribution is not known: {base.reason.rstrip('.')}"

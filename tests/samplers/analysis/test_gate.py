@@ -1,0 +1,99 @@
+"""The gate: its three answers, and how often it is wrong at the limit."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import pytest
+from scipy import stats
+
+import samplers
+from samplers.analysis.base_uncertainty import BaseUncertainty
+from samplers.analysis.gate import judge_estimate
+
+BASE = BaseUncertainty(
+    p=1e-4,
+    interval=(1e-5, 1e-3),
+    expected=2e-4,
+    spread=1.0,
+    bound=None,
+    confidence=0.9,
+    p_refits=(1e-4, 2e-4),
+    ess_refits=(50.0, 50.0),
+    clusters=17,
+    fitted_to="38 events",
+    family="1 component",
+)
+
+
+class Known:
+    """An estimate that the gate looks at."""
+
+    def __init__(self, base: BaseUncertainty | None = None, warnings: tuple[str, ...] = ()) -> None:
+        self.interval, self.confidence, self.warnings, self.base_uncertainty = (8e-5, 1.2e-4), 0.9, warnings, base
+        self.status, self.base_draws = samplers.Status.CONVERGED, 500
+
+
+@pytest.mark.parametrize(
+    ("max_p", "base", "given", "decision"),
+    [
+        (2e-4, None, False, "passes"),
+        (1e-4, None, False, "undecided"),
+        (5e-5, None, False, "fails"),
+        (2e-4, BASE, False, "undecided"),
+        (2e-4, BASE, True, "passes"),
+        (2e-3, BASE, False, "passes"),
+        (5e-6, BASE, False, "fails"),
+        (2e-3, replace(BASE, interval=None, bound=1e-3), False, "passes"),
+        (5e-6, replace(BASE, interval=None, bound=1e-3), False, "undecided"),  # there is no lower end
+        (2e-3, replace(BASE, interval=None, reason="no spread."), False, "undecided"),
+    ],
+)
+def test_decisions(max_p: float, base: BaseUncertainty | None, given: bool, decision: str) -> None:
+    verdict = judge_estimate(Known(base), max_p, given)
+    assert verdict.decision == decision and bool(verdict) is (decision == "passes")
+    assert verdict.confidence == 0.95 and verdict.includes_base is (base is not None and not given)
+    assert str(verdict).startswith(decision) and "\n" not in str(verdict)
+    assert json.loads(json.dumps(verdict.to_dict()))["text"] == str(verdict)
+
+
+def test_a_warning_leaves_it_undecided() -> None:
+    verdict = judge_estimate(Known(warnings=("weights are uneven.",)), 2e-4)
+    assert verdict.decision == "undecided" and "weights are uneven" in str(verdict)
+    doubtful = replace(BASE, warnings=("the spread is coarse.",))
+    assert judge_estimate(Known(doubtful), 2e-3).decision == "undecided"
+    assert judge_estimate(Known(doubtful), 2e-4, given_base=True).decision == "passes"
+
+
+@pytest.mark.parametrize("max_p", [0.0, 1.0, -1.0, float("nan"), "low"])
+def test_a_limit_is_a_probability(max_p: float) -> None:
+    with pytest.raises(ValueError, match="max_p"):
+        judge_estimate(Known(), max_p)
+
+
+def test_it_is_as_often_wrong_as_it_says() -> None:
+    """Limits at p itself: at 95 % one-sided it passes in at most 1 of 20 runs, and fails in at most 1 of 20."""
+    p = stats.norm.cdf(-2.0)
+    problem = samplers.FunctionProblem(lambda x: x[:, 0] + 2.0, dim=1)
+    runs = [samplers.estimate(problem, "mc", seed=seed, max_sim=2000, confidence=0.9).meets(p) for seed in range(200)]
+    counts = [sum(run.decision == decision for run in runs) for decision in ("passes", "fails")]
+    allowed = stats.binom.ppf(0.999, 200, 0.05)  # Clopper-Pearson's ends are wrong in 5 % at most
+    assert max(counts) <= allowed
+    assert sum(counts) > 0  # and they are not idle: about 8 % of 200
+
+
+def test_no_failure_passes_where_the_sample_is_large_enough() -> None:
+    """0 of n passes a limit of 1 - 0.05^(1/n), 1.5e-3 for 2,000, and no less."""
+    problem = samplers.FunctionProblem(lambda x: x[:, 0] + 9.0, dim=1)
+    result = samplers.estimate(problem, "mc", seed=0, max_sim=2000, confidence=0.9)
+    limit = 1 - 0.05 ** (1 / 2000)
+    assert result.meets(1.001 * limit) and not result.meets(0.999 * limit)
+
+
+def test_no_failure_of_a_search_is_worth_its_base_draws_alone() -> None:
+    problem = samplers.FunctionProblem(lambda x: x[:, 0] + 50.0, dim=1)
+    result = samplers.estimate(problem, seed=0, max_sim=3000, confidence=0.9)
+    assert result.p == 0.0 and 0 < result.base_draws
+    limit = 1 - 0.05 ** (1 / result.base_draws)
+    assert result.meets(1.001 * limit) and not result.meets(0.999 * limit)
