@@ -19,7 +19,6 @@ from rare_envs.distributions.parameters import (
     list_mixture_parameters,
     set_mixture_parameters,
 )
-from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,32 +145,3 @@ class CoordinateMixture:
         if missing:
             raise ValueError(f"Missing {', '.join(missing)}; needed are {', '.join(COMPONENT_FIELDS)}.")
         return cls(Coordinates.from_dict(data), *(data[name] for name in COMPONENT_FIELDS))
-
-
-def pool_mixtures(mixtures: Sequence[TruncatedGaussianMixture | CoordinateMixture]) -> CoordinateMixture:
-    """Return one mixture with the components of all, each mixture with equal weight.
-
-    The conditionals of the whole are cut to the box, not each mixture's by itself, so its density is the mean of their
-    densities up to factors 1 / (1 - mass outside the box).
-
-    Args:
-        mixtures: Of the same coordinates and box; the numbers of components may differ.
-
-    Raises:
-        ValueError: The coordinates differ.
-
-    Example:
-        >>> narrow, wide = (TruncatedGaussianMixture([1.0], [[0.0]], [[[s * s]]], [-9.0], [9.0]) for s in (1.0, 2.0))
-        >>> np.exp(pool_mixtures([narrow, wide]).log_prob([[0.0]])).round(3).tolist()  # (0.399 + 0.199) / 2
-        [0.299]
-    """
-    described = [mixture.coordinates.to_dict() for mixture in mixtures]
-    different = [i for i, each in enumerate(described) if each != described[0]]
-    if different:
-        raise ValueError(
-            f"Expected mixtures of the same coordinates and box, but mixtures 0 and {different[0]} differ."
-        )
-    weights, means, covariances = (
-        np.concatenate([getattr(mixture, name) for mixture in mixtures]) for name in COMPONENT_FIELDS
-    )
-    return CoordinateMixture(mixtures[0].coordinates, weights / weights.sum(), means, covariances)

@@ -146,12 +146,17 @@ class Coordinates:
         A density of x is that of y plus this, in logarithms.
         """
         total = np.zeros(len(x))
-        for j, kind in enumerate(self.kinds):
-            if kind == "log":
-                total = total - self.coordinate(j, x)
-            elif j in self._sources:
-                total = total - 0.5 * np.log(np.ascontiguousarray(x[:, self._sources[j][1]]))
+        for j in range(self.dim):
+            total = total + self.log_slope(j, x)
         return total
+
+    def log_slope(self, j: int, x: FloatArray) -> FloatArray:
+        """Return log |dy/dx| of the coordinate of column j alone, (n, d) -> (n,); the other columns are held."""
+        if self.kinds[j] == "log":
+            return -self.coordinate(j, x)
+        if j in self._sources:
+            return np.asarray(-0.5 * np.log(np.ascontiguousarray(x[:, self._sources[j][1]])))
+        return np.zeros(len(x))
 
     def to_coordinates(self, x: ArrayLike) -> FloatArray:
         """Return the coordinates of points in the box, (n, d) -> (n, d), in their order."""

@@ -11,10 +11,11 @@ from numpy.typing import ArrayLike
 
 from rare_envs.arrays import FloatArray
 from rare_envs.distributions.beta import BetaDistribution
-from rare_envs.distributions.coordinate_mixture import CoordinateMixture, pool_mixtures
+from rare_envs.distributions.coordinate_mixture import CoordinateMixture
 from rare_envs.distributions.frequency import EventFrequency
 from rare_envs.distributions.mixture_conditionals import COMPONENT_FIELDS
 from rare_envs.distributions.parameters import DistributionParameter, HasParameters
+from rare_envs.distributions.pooled_mixture import pool_mixtures
 from rare_envs.distributions.reading import (
     FileDistribution,
     read_distribution,
@@ -29,6 +30,8 @@ from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
 FITTED_KEYS = ("refits", "events", "family", "frequency", "checks")
 """Keys of a base file of which each makes it a fitted one; these then need `events` and `family`."""
 BETA_SHAPES = ("alpha", "beta")
+COORDINATE_KEYS = ("coordinates", "order")
+"""Keys of a file that a refit may have of its own, where it has chosen other coordinates than its base."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,10 +204,10 @@ class FittedDistribution:
     def ensemble(self) -> Distribution:
         """Return the refits as one mixture with equal weights: what they predict for the next event.
 
-        The mixture is cut to the box as a whole, see `pool_mixtures`.
+        Mixtures of the same coordinates are cut to the box as a whole, see `pool_mixtures`.
 
         Raises:
-            ValueError: There are no refits, or they are no mixtures of the same coordinates.
+            ValueError: There are no refits, or they are no mixtures.
         """
         if not self.refits:
             raise ValueError("There are no refits to make an ensemble of.")
@@ -227,7 +230,7 @@ class FittedDistribution:
         """Return the entries of a base file, from which `from_dict` makes the same distribution.
 
         Raises:
-            ValueError: The distribution or a refit is not of a kind that files hold, or a refit differs in coordinates.
+            ValueError: The distribution or a refit is not of a kind that files hold, or a refit differs in its box.
         """
         own = _to_dict(self.distribution)
         return {
@@ -248,8 +251,9 @@ class FittedDistribution:
 
         Args:
             data: Keys of the distribution (see `CoordinateMixture.from_dict`), and `events`, `family`, and if wanted
-                `refits`, `frequency`, `checks` and `provenance`. A refit is an object with the weights, means and
-                covariances of the same coordinates (alpha and beta, where the base has these).
+                `refits`, `frequency`, `checks` and `provenance`. A refit is an object with weights, means and
+                covariances (alpha and beta, where the base has these), in the coordinates of the base or with
+                `coordinates` and `order` of its own.
             siblings: Loader of other base distributions of the same scenario.
 
         Raises:
@@ -283,15 +287,18 @@ def _read_list(key: str, data: Mapping[str, Any]) -> Sequence[Any]:
 def _read_refit(i: int, refit: object, data: Mapping[str, Any]) -> FileDistribution:
     """Return a refit, whose entries replace those of the base."""
     wanted = BETA_SHAPES if "alpha" in data else COMPONENT_FIELDS
+    own = () if "alpha" in data else COORDINATE_KEYS
     if not isinstance(refit, Mapping):
         raise ValueError(f"Expected refits[{i}] as an object with {', '.join(wanted)}, got {refit!r}.")
     missing = [name for name in wanted if name not in refit]
-    others = [str(name) for name in refit if name not in wanted and refit[name] != data.get(name)]
+    others = [str(name) for name in refit if name not in (*wanted, *own) and refit[name] != data.get(name)]
     if missing or others:
         wrong = f"no {', '.join(missing)}" if missing else f"{', '.join(others)} of its own"
         raise ValueError(f"Expected refits[{i}] with {', '.join(wanted)}, for the rest as its base, got {wrong}.")
+    # Coordinates of its own come with an order of their own, or that of x.
+    inherited = {k: v for k, v in data.items() if "coordinates" not in refit or k not in ("order", "logarithmic")}
     try:
-        return read_distribution({**data, **refit})
+        return read_distribution({**inherited, **refit})
     except ValueError as error:
         raise ValueError(f"refits[{i}]: {error}") from None
 
@@ -314,7 +321,16 @@ def _to_dict(distribution: Distribution) -> dict[str, Any]:
 def _refit_entries(i: int, refit: Distribution, base: Mapping[str, Any]) -> dict[str, Any]:
     """Return the entries of a refit that are its own."""
     entries = _to_dict(refit)
-    wanted = BETA_SHAPES if "alpha" in base else COMPONENT_FIELDS
-    if {k: v for k, v in entries.items() if k not in wanted} != {k: v for k, v in base.items() if k not in wanted}:
-        raise ValueError(f"refits[{i}] has other coordinates than its base; a file holds one set for all.")
-    return {name: entries[name] for name in wanted}
+    if ("alpha" in entries) != ("alpha" in base) or any(entries[k] != base[k] for k in ("low", "high")):
+        raise ValueError(f"refits[{i}] has another box than its base, or is of another kind; a file holds one for all.")
+    if "alpha" in base:
+        return {name: entries[name] for name in BETA_SHAPES}
+    own = {name: entries[name] for name in COMPONENT_FIELDS}
+    coordinates = _coordinates_of(entries)
+    return own if coordinates == _coordinates_of(base) else own | coordinates
+
+
+def _coordinates_of(entries: Mapping[str, Any]) -> dict[str, Any]:
+    """Return kinds and order of the coordinates in the entries of a mixture; plain ones are not written."""
+    kinds = entries.get("coordinates", ["plain"] * len(entries["low"]))
+    return {"coordinates": kinds, "order": entries.get("order", [])}

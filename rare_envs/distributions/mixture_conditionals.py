@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,6 +26,15 @@ from rare_envs.distributions.truncated_normal import (
 CHUNK_ROWS = 8192
 """Rows worked on together: the temporaries of one chunk stay in the cache."""
 COMPONENT_FIELDS = ("weights", "means", "covariances")
+
+
+class ConditioningState(NamedTuple):
+    """What the earlier coordinates of rows say about the next, of K components and n rows."""
+
+    log_weights: FloatArray
+    """Logarithms of the weights of the components times their densities of the earlier coordinates, shape (K, n)."""
+    residuals: tuple[FloatArray, ...] = ()
+    """Standardised residuals of the earlier coordinates, shape (K, n) each."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,11 +75,11 @@ class MixtureConditionals:
 
     def log_prob(self, x: FloatArray) -> FloatArray:
         """Return the log density of the coordinates of points in the box, (n, d) -> (n,)."""
-        return _by_chunks(self._log_prob, x, 1)[:, 0]
+        return apply_by_chunks(self._log_prob, x, 1)[:, 0]
 
     def to_standard_normal(self, x: FloatArray) -> FloatArray:
         """Map points in the box to standard normal space, (n, d) -> (n, d); u_j rises with column j of x."""
-        return _by_chunks(self._to_normal, x, self.dim)
+        return apply_by_chunks(self._to_normal, x, self.dim)
 
     def from_standard_normal(self, u: ArrayLike) -> FloatArray:
         """Map standard normal points to points strictly inside the box, (n, d) -> (n, d).
@@ -78,11 +87,7 @@ class MixtureConditionals:
         Raises:
             ValueError: Wrong shape, or u is not finite.
         """
-        points = self.rows("u", u)
-        if not np.isfinite(points).all():
-            i, j = np.argwhere(~np.isfinite(points))[0]
-            raise ValueError(f"u[{i}, {j}] = {points[i, j]} must be finite.")
-        return _by_chunks(self._from_normal, points, self.dim)
+        return apply_by_chunks(self._from_normal, self.finite_rows(u), self.dim)
 
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw by ancestral sampling: per coordinate a component, then its truncated normal.
@@ -96,7 +101,7 @@ class MixtureConditionals:
         Returns:
             Independent points, shape (n, d), strictly inside the box.
         """
-        return _by_chunks(self._ancestral, rng.random((n, 2 * self.dim)), self.dim)
+        return apply_by_chunks(self._ancestral, rng.random((n, 2 * self.dim)), self.dim)
 
     def rows(self, name: str, points: ArrayLike) -> FloatArray:
         """Return points as float64 of shape (n, d).
@@ -109,6 +114,18 @@ class MixtureConditionals:
             hint = "; add a batch axis" if array.shape == (self.dim,) else ""
             raise ValueError(f"Expected {name} of shape (n, {self.dim}), got {array.shape}{hint}.")
         return array
+
+    def finite_rows(self, u: ArrayLike) -> FloatArray:
+        """Return standard normal points as float64 of shape (n, d).
+
+        Raises:
+            ValueError: Wrong shape, or a value is not finite.
+        """
+        points = self.rows("u", u)
+        if not np.isfinite(points).all():
+            i, j = np.argwhere(~np.isfinite(points))[0]
+            raise ValueError(f"u[{i}, {j}] = {points[i, j]} must be finite.")
+        return points
 
     def rows_in_box(self, x: ArrayLike) -> FloatArray:
         """Return points as float64 of shape (n, d).
@@ -126,57 +143,54 @@ class MixtureConditionals:
             )
         return points
 
-    def _start(self, n: int) -> FloatArray:
-        return np.repeat(np.log(self.weights)[:, None], n, axis=1)
+    def start(self, n: int) -> ConditioningState:
+        """Return the state of n rows before the first coordinate."""
+        return ConditioningState(np.repeat(np.log(self.weights)[:, None], n, axis=1))
 
-    def _conditional(
-        self, i: int, log_weights: FloatArray, residuals: list[FloatArray], bounds: tuple[Any, Any]
-    ) -> TruncatedConditional:
-        """Return the distribution of coordinate i given the earlier ones, by their standardised residuals (K, n)."""
-        mean = np.repeat(self.means[:, i, None], log_weights.shape[1], axis=1)
-        for k, residual in enumerate(residuals):
+    def next_conditional(self, state: ConditioningState, bounds: tuple[Any, Any]) -> TruncatedConditional:
+        """Return the distribution of the next coordinate given the earlier ones, within bounds."""
+        i = len(state.residuals)
+        mean = np.repeat(self.means[:, i, None], state.log_weights.shape[1], axis=1)
+        for k, residual in enumerate(state.residuals):
             mean = mean + self._factors[:, i, k, None] * residual
-        return TruncatedConditional(log_weights, mean, self._factors[:, i, i, None], *bounds)
+        return TruncatedConditional(state.log_weights, mean, self._factors[:, i, i, None], *bounds)
+
+    def observe(self, conditional: TruncatedConditional, state: ConditioningState, y: FloatArray) -> ConditioningState:
+        """Return the state after the next coordinate y (n,), whose distribution is `conditional`."""
+        residual = (y - conditional.mean) / conditional.scale
+        log_weights = reweight(conditional.log_weights, residual, conditional.scale)
+        return ConditioningState(log_weights, (*state.residuals, residual))
 
     def _log_prob(self, x: FloatArray) -> FloatArray:
-        log_weights = self._start(len(x))
-        residuals: list[FloatArray] = []
-        total = np.zeros(len(x))
-        for i, j in enumerate(self.coordinates.columns):
-            conditional = self._conditional(i, log_weights, residuals, self.coordinates.bounds(j, x))
-            residual = (self.coordinates.coordinate(j, x) - conditional.mean) / conditional.scale
-            total = total - log_sum(log_weights + conditional.log_mass())
-            log_weights = reweight(log_weights, residual, conditional.scale)
-            total = total + log_sum(log_weights)
+        state, total = self.start(len(x)), np.zeros(len(x))
+        for j in self.coordinates.columns:
+            conditional = self.next_conditional(state, self.coordinates.bounds(j, x))
+            total = total - log_sum(state.log_weights + conditional.log_mass())
+            state = self.observe(conditional, state, self.coordinates.coordinate(j, x))
+            density = log_sum(state.log_weights)
+            total = total + density
             # Kept relative to the largest, so that far points do not run away.
-            log_weights = log_weights - log_sum(log_weights)
-            residuals.append(residual)
+            state = state._replace(log_weights=state.log_weights - density)
         return total[:, None]
 
     def _to_normal(self, x: FloatArray) -> FloatArray:
-        log_weights = self._start(len(x))
-        residuals: list[FloatArray] = []
-        u = np.empty_like(x)
-        for i, j in enumerate(self.coordinates.columns):
+        state, u = self.start(len(x)), np.empty_like(x)
+        for j in self.coordinates.columns:
             bounds = self.coordinates.bounds(j, x)
-            conditional = self._conditional(i, log_weights, residuals, bounds)
+            conditional = self.next_conditional(state, bounds)
             inner = move_inside(self.coordinates.coordinate(j, x), *bounds)
             u[:, j] = self.coordinates.sign(j) * conditional.to_normal(inner)
-            residuals.append((inner - conditional.mean) / conditional.scale)
-            log_weights = reweight(log_weights, residuals[-1], conditional.scale)
+            state = self.observe(conditional, state, inner)
         return u
 
     def _from_normal(self, u: FloatArray) -> FloatArray:
-        log_weights = self._start(len(u))
-        residuals: list[FloatArray] = []
-        x = np.empty_like(u)
-        for i, j in enumerate(self.coordinates.columns):
+        state, x = self.start(len(u)), np.empty_like(u)
+        for j in self.coordinates.columns:
             bounds = self.coordinates.bounds(j, x)
-            conditional = self._conditional(i, log_weights, residuals, bounds)
+            conditional = self.next_conditional(state, bounds)
             inner = move_inside(conditional.from_normal(self.coordinates.sign(j) * u[:, j]), *bounds)
             x[:, j] = self.coordinates.value(j, inner, x)
-            residuals.append((inner - conditional.mean) / conditional.scale)
-            log_weights = reweight(log_weights, residuals[-1], conditional.scale)
+            state = self.observe(conditional, state, inner)
         return x
 
     def _ancestral(self, uniforms: FloatArray) -> FloatArray:
@@ -187,7 +201,7 @@ class MixtureConditionals:
         """
         n = len(uniforms)
         rows = np.arange(n)
-        log_weights = self._start(n)
+        log_weights = self.start(n).log_weights
         x, y = np.empty((n, self.dim)), np.empty((n, self.dim))
         for i, j in enumerate(self.coordinates.columns):
             bounds = self.coordinates.bounds(j, x)
@@ -206,7 +220,8 @@ class MixtureConditionals:
         return x
 
 
-def _by_chunks(function: Callable[[FloatArray], FloatArray], points: FloatArray, columns: int) -> FloatArray:
+def apply_by_chunks(function: Callable[[FloatArray], FloatArray], points: FloatArray, columns: int) -> FloatArray:
+    """Return a function of rows, shape (n, columns), computed for `CHUNK_ROWS` rows at a time."""
     out = np.empty((len(points), columns))
     for start in range(0, len(points), CHUNK_ROWS):
         out[start : start + CHUNK_ROWS] = function(points[start : start + CHUNK_ROWS])

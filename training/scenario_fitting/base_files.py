@@ -29,7 +29,7 @@ from training.scenario_fitting.coordinate_systems import (
 from training.scenario_fitting.event_filters import EventSet
 from training.scenario_fitting.mixture import COVARIANCE_FLOOR, EM_STARTS, EVENTS_PER_COMPONENT, SMALLEST_COMPONENT
 from training.scenario_fitting.predictive_checks import check_predictions
-from training.scenario_fitting.refits import refit
+from training.scenario_fitting.refits import describe_family, refit
 
 MASS_SAMPLES = 1_000_000
 """Draws from which the mass outside the box is estimated."""
@@ -76,11 +76,13 @@ def fit_base(request: FitRequest) -> FittedDistribution:
     held_out = [held_out_log_prob(events, system, parameters, seed) for system in request.systems]
     chosen = _choose(request, fits, held_out)
     names = [p.name for p in parameters]
+    systems = request.systems if request.system is None else (chosen.system,)
+    refits = refit(events, systems, parameters, seed, request.n_refits)
     return FittedDistribution(
         distribution=chosen.distribution,
-        refits=refit(events, chosen.system, parameters, seed, request.n_refits),
+        refits=tuple(each.distribution for each in refits),
         events=events.counts,
-        family=chosen.family,
+        family=describe_family(chosen.family, refits),
         frequency=request.frequency,
         checks=check_predictions(request.scenario, names, events.joint, chosen.distribution, seed),
         record=_record(request, chosen, fits, held_out),

@@ -95,6 +95,8 @@ def _expand(points: FloatArray) -> FloatArray:
 
 def _start(points: FloatArray, components: int, seed: int, starts: int) -> FloatArray:
     """Return which cluster each point belongs to, 1 or 0, shape (starts, K, n)."""
+    if components == 1:
+        return np.ones((starts, 1, len(points)))
     random_state = check_random_state(seed)
     clusters = [
         KMeans(n_clusters=components, n_init=1, random_state=random_state).fit(points).labels_ for _ in range(starts)

@@ -2,27 +2,30 @@
 
 Whole clusters are drawn with replacement (the bootstrap of Efron and Tibshirani, "An Introduction to the Bootstrap",
 1993, chapter 8): events of one scene depend on each other, and resampling them one by one gives intervals that are too
-narrow. The number of components is selected anew in each refit; keeping it gives intervals that are too narrow too.
+narrow. Coordinates and number of components are selected anew in each refit (Breiman, "Bagging predictors", 1996;
+Efron, "Estimation and accuracy after model selection", 2014): keeping them gives intervals that are too narrow too.
+40 events do not settle the coordinates. In two worlds of car-following, refits in the coordinates of the fit gave
+intervals that held p in 87 and 75 % of 300 draws of events, refits that choose 94 and 92 %.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rare_envs.distributions.coordinate_mixture import CoordinateMixture
 from rare_envs.distributions.space import Parameter
-from training.scenario_fitting.coordinate_systems import FOLD_STARTS, CoordinateSystem, fit_system
+from training.scenario_fitting.coordinate_systems import FOLD_STARTS, CoordinateSystem, SystemFit, fit_system
 from training.scenario_fitting.event_filters import EventSet
 
 N_REFITS = 30
-"""Refits where all have the same number of components: the noise of log-spread is then .13."""
+"""Refits where all are of the same family: the noise of log-spread is then .13."""
 MIN_CLUSTERS = 5
 """Clusters below which there is nothing to draw anew: refits to so few would all be alike."""
 MORE_REFITS = 100
-"""Refits where the number of components differs: one refit alone may then carry the spread."""
+"""Refits where coordinates or number of components differ: one refit alone may then carry the spread."""
 
 
 def draw_events(events: EventSet, rng: np.random.Generator) -> EventSet:
@@ -46,16 +49,21 @@ def draw_events(events: EventSet, rng: np.random.Generator) -> EventSet:
 
 
 def refit(
-    events: EventSet, system: CoordinateSystem, parameters: Sequence[Parameter], seed: int = 0, n: int | None = None
-) -> tuple[CoordinateMixture, ...]:
-    """Return refits in one coordinate system.
+    events: EventSet,
+    systems: Sequence[CoordinateSystem],
+    parameters: Sequence[Parameter],
+    seed: int = 0,
+    n: int | None = None,
+) -> tuple[SystemFit, ...]:
+    """Return refits, each in the coordinate system that its events support best by the BIC.
 
     Args:
         events: The recorded events.
-        system: The coordinates, those of the base.
+        systems: The coordinate systems to choose from; those that were tried for the base.
         parameters: Parameters of the scenario, in the order of x.
         seed: Seed of the draws and the fits.
-        n: Number of refits; None for `N_REFITS`, or `MORE_REFITS` where the number of components differs among these.
+        n: Number of refits; None for `N_REFITS`, or `MORE_REFITS` where coordinates or the number of components
+            differ among these.
 
     Returns:
         The refits; none where there are fewer than `MIN_CLUSTERS` clusters.
@@ -66,11 +74,26 @@ def refit(
     if len(np.unique(events.clusters)) < MIN_CLUSTERS:
         return ()
     rng = np.random.default_rng(seed)
-    refits: list[CoordinateMixture] = []
+    refits: list[SystemFit] = []
     wanted = N_REFITS if n is None else n
     while len(refits) < wanted:
-        refits.append(fit_system(draw_events(events, rng), system, parameters, seed, FOLD_STARTS).distribution)
-        differs = len({len(each.weights) for each in refits}) > 1
-        if n is None and len(refits) == N_REFITS and differs:
+        drawn = draw_events(events, rng)
+        fits = [fit_system(drawn, system, parameters, seed, FOLD_STARTS) for system in systems]
+        refits.append(min(fits, key=lambda fit: fit.bic))
+        if n is None and len(refits) == N_REFITS and len({each.family for each in refits}) > 1:
             wanted = MORE_REFITS
     return tuple(refits)
+
+
+def describe_family(family: str, refits: Sequence[SystemFit]) -> str:
+    """Return the family of a fit in words, with the share of the refits in the same coordinates if others have others.
+
+    Args:
+        family: Components and coordinates of the fit, `SystemFit.family`.
+        refits: Its refits.
+    """
+    systems = Counter(each.system.name for each in refits)
+    if len(systems) < 2:
+        return family
+    counts = ", ".join(f"{number} in {name}" for name, number in systems.most_common())
+    return f"{family}; of the refits {counts}"

@@ -115,8 +115,23 @@ def test_an_ensemble_of_plain_mixtures_or_of_nothing() -> None:
     with pytest.raises(ValueError, match="needs refits that are Gaussian mixtures"):
         replace(base, refits=(fit, beta)).ensemble()
     logs = CoordinateMixture.from_dict({**fit.to_dict(), "low": [1.0], "high": [9.0], "coordinates": ["log"]})
-    with pytest.raises(ValueError, match="same coordinates and box, but mixtures 0 and 1 differ"):
-        replace(base, distribution=logs, refits=(logs, replace(fit, low=[1.0], high=[9.0]))).ensemble()
+    plain = replace(fit, low=[1.0], high=[9.0])
+    both = replace(base, distribution=logs, refits=(logs, plain)).ensemble()
+    x = np.linspace(1.5, 5.0, 9)[:, None]
+    mean = 0.5 * (np.exp(logs.log_prob(x)) + np.exp(plain.log_prob(x)))
+    np.testing.assert_allclose(np.exp(both.log_prob(x)), mean, rtol=1e-9)
+
+
+def test_a_refit_may_have_coordinates_of_its_own_also_in_a_file() -> None:
+    plain = {"coordinates": ["plain"] * 3, "order": []}
+    content = {**CONTENT, "refits": [CONTENT["refits"][0], CONTENT["refits"][0] | plain]}
+    base = FittedDistribution.from_dict(content)
+    own, other = base.refits
+    assert isinstance(own, CoordinateMixture)
+    assert isinstance(other, CoordinateMixture)
+    assert own.coordinates.kinds != other.coordinates.kinds == ("plain",) * 3
+    assert other.coordinates.order == ()
+    assert base.to_dict()["refits"] == content["refits"]
 
 
 @pytest.mark.parametrize(
@@ -169,9 +184,9 @@ def test_few_entries_are_enough() -> None:
 
 
 def test_what_a_file_cannot_hold() -> None:
-    plain = TruncatedGaussianMixture(BASE.refits[0].weights, [[1.0] * 3], [np.eye(3)], BASE.low, BASE.high)
-    with pytest.raises(ValueError, match=r"refits\[0\] has other coordinates than its base"):
-        replace(BASE, refits=(plain,)).to_dict()
+    beta = BetaDistribution([2.0] * 3, [2.0] * 3, BASE.low, BASE.high)
+    with pytest.raises(ValueError, match=r"refits\[0\] has another box than its base, or is of another kind"):
+        replace(BASE, refits=(beta,)).to_dict()
     with pytest.raises(ValueError, match="A file holds mixtures and Beta variables, no FittedDistribution"):
         replace(BASE, distribution=BASE).to_dict()
 

@@ -8,9 +8,9 @@ import pytest
 from rare_envs.scenarios.registry import scenario_named
 from training.scenario_fitting import mixture as mixture_fit
 from training.scenario_fitting import refits as refits_module
-from training.scenario_fitting.coordinate_systems import COORDINATE_SYSTEMS
+from training.scenario_fitting.coordinate_systems import COORDINATE_SYSTEMS, FOLD_STARTS, fit_system
 from training.scenario_fitting.event_filters import EventSet
-from training.scenario_fitting.refits import draw_events, refit
+from training.scenario_fitting.refits import describe_family, draw_events, refit
 
 FOLLOWING = scenario_named("car_following").parameters
 LOG_GAP = COORDINATE_SYSTEMS["car_following"][1]
@@ -51,7 +51,7 @@ def test_the_spread_is_the_standard_error_of_the_mean(quick):
     """Of n independent events: sd / sqrt(n), here from 60 refits, so to 9 % (two standard errors 18 %)."""
     n = 200
     recorded = events(n)
-    fits = refit(recorded, LOG_GAP, FOLLOWING, n=60)
+    fits = [each.distribution for each in refit(recorded, [LOG_GAP], FOLLOWING, n=60)]
     means = np.array([fit.weights @ fit.means[:, 0] for fit in fits])
     assert means.std(ddof=1) == pytest.approx(recorded.joint[:, 0].std() / np.sqrt(n), rel=0.3)
 
@@ -63,10 +63,11 @@ def test_more_refits_where_the_number_of_components_differs(monkeypatch):
         made = iter(numbers)
 
         def fit(*_, made=made):
-            return SimpleNamespace(distribution=SimpleNamespace(weights=np.ones(next(made))))
+            return SimpleNamespace(family=f"{next(made)} components", bic=0.0)
 
         monkeypatch.setattr(refits_module, "fit_system", fit)
-        assert [len(each.weights) for each in refit(events(25), LOG_GAP, FOLLOWING)] == numbers[:wanted]
+        families = [each.family for each in refit(events(25), [LOG_GAP], FOLLOWING)]
+        assert families == [f"{number} components" for number in numbers[:wanted]]
 
 
 def test_components_are_selected_anew_in_each_refit(quick):
@@ -74,13 +75,32 @@ def test_components_are_selected_anew_in_each_refit(quick):
     one = events(60)
     other = one.joint + np.array([20.0, 20.0, 0.0])
     both = EventSet(np.concatenate([one.joint, other]), np.arange(120))
-    assert {len(each.weights) for each in refit(both, LOG_GAP, FOLLOWING, n=3)} == {2}
+    assert {len(each.distribution.weights) for each in refit(both, [LOG_GAP], FOLLOWING, n=3)} == {2}
+
+
+def test_coordinates_are_chosen_anew_in_each_refit(quick):
+    """By the BIC of the events drawn; 400 events of logarithms of gaps leave no doubt."""
+    systems = COORDINATE_SYSTEMS["car_following"][:2]
+    few, many = (refit(events(n, seed=1), systems, FOLLOWING, n=12) for n in (25, 400))
+    assert {each.system.name for each in many} == {"log gap"}
+    drawn = draw_events(events(25, seed=1), np.random.default_rng(0))
+    criteria = [fit_system(drawn, system, FOLLOWING, 0, FOLD_STARTS).bic for system in systems]
+    assert few[0].bic == min(criteria)
+    assert few[0].system is systems[int(np.argmin(criteria))]
+
+
+def test_the_family_says_in_which_coordinates_refits_are():
+    log, plain = (SimpleNamespace(system=system) for system in COORDINATE_SYSTEMS["car_following"][1::-1])
+    assert describe_family("1 component, log gap", [log, log]) == "1 component, log gap"
+    assert describe_family("1 component, log gap", [plain, log, log]) == (
+        "1 component, log gap; of the refits 2 in log gap, 1 in plain"
+    )
 
 
 def test_same_seed_same_refits(quick):
-    one, other = (refit(events(30), LOG_GAP, FOLLOWING, seed=3, n=3) for _ in range(2))
-    assert [fit.to_dict() for fit in one] == [fit.to_dict() for fit in other]
+    one, other = (refit(events(30), [LOG_GAP], FOLLOWING, seed=3, n=3) for _ in range(2))
+    assert [fit.distribution.to_dict() for fit in one] == [fit.distribution.to_dict() for fit in other]
 
 
 def test_few_clusters_have_no_refits(quick):
-    assert refit(events(40, per_cluster=10), LOG_GAP, FOLLOWING) == ()
+    assert refit(events(40, per_cluster=10), [LOG_GAP], FOLLOWING) == ()

@@ -1,0 +1,294 @@
+"""Pools of Gaussian mixtures with equal weights, in the same coordinates or in different ones."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.special import log_ndtr, ndtri_exp
+
+from rare_envs.arrays import FloatArray
+from rare_envs.distributions.coordinate_mixture import CoordinateMixture
+from rare_envs.distributions.coordinates import Coordinates, move_inside
+from rare_envs.distributions.mixture_conditionals import (
+    COMPONENT_FIELDS,
+    ConditioningState,
+    MixtureConditionals,
+    apply_by_chunks,
+)
+from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
+from rare_envs.distributions.truncated_normal import ROOT_TOLERANCE, TruncatedConditional, log_sum
+
+SEARCH_STEPS = 200
+"""Most steps of the search for a quantile; bisections alone would need about 60."""
+Mixture = TruncatedGaussianMixture | CoordinateMixture
+
+
+def pool_mixtures(mixtures: Sequence[Mixture]) -> CoordinateMixture | PooledMixture:
+    """Return one distribution of all mixtures, each with equal weight.
+
+    Those of the same coordinates become one mixture with the components of all, whose conditionals are cut to the box
+    as a whole, not each mixture's by itself: its density is the mean of their densities up to factors
+    1 / (1 - mass outside the box). Where the coordinates differ, the columns are taken in an order that serves all.
+
+    Args:
+        mixtures: In the same box; coordinates and numbers of components may differ.
+
+    Raises:
+        ValueError: The boxes differ, or no order of the columns serves all coordinates.
+
+    Example:
+        >>> narrow, wide = (TruncatedGaussianMixture([1.0], [[0.0]], [[[s * s]]], [-9.0], [9.0]) for s in (1.0, 2.0))
+        >>> np.exp(pool_mixtures([narrow, wide]).log_prob([[0.0]])).round(3).tolist()  # (0.399 + 0.199) / 2
+        [0.299]
+    """
+    for i, each in enumerate(mixtures):
+        if not (np.array_equal(each.low, mixtures[0].low) and np.array_equal(each.high, mixtures[0].high)):
+            raise ValueError(f"Expected mixtures of the same box, but mixtures 0 and {i} differ.")
+    groups: dict[str, list[Mixture]] = {}
+    for each in mixtures:
+        groups.setdefault(json.dumps(_without_names(each.coordinates)), []).append(each)
+    pools = [_pool_alike(group) for group in groups.values()]
+    if len(pools) == 1:
+        return pools[0]
+    shares = np.array([len(group) for group in groups.values()]) / len(mixtures)
+    return PooledMixture(_align([pool.coordinates for pool in pools], pools), shares)
+
+
+def _without_names(coordinates: Coordinates) -> tuple[object, ...]:
+    """Return what tells coordinates apart: kinds and order of the columns."""
+    kinds = coordinates.to_dict()["coordinates"]
+    return (kinds, coordinates.columns)
+
+
+def _pool_alike(mixtures: Sequence[Mixture]) -> CoordinateMixture:
+    """Return the mixture with the components of mixtures in the same coordinates."""
+    weights, means, covariances = (
+        np.concatenate([getattr(mixture, name) for mixture in mixtures]) for name in COMPONENT_FIELDS
+    )
+    return CoordinateMixture(mixtures[0].coordinates, weights / weights.sum(), means, covariances)
+
+
+def _align(coordinates: Sequence[Coordinates], pools: Sequence[CoordinateMixture]) -> tuple[CoordinateMixture, ...]:
+    """Return mixtures with their coordinates in an order that serves all of them: the first of theirs that does."""
+    names = next((each.names for each in coordinates if each.names), ())
+    reasons = []
+    for columns in dict.fromkeys(each.columns for each in coordinates):
+        try:
+            return tuple(_reorder(pool, names, columns) for pool in pools)
+        except ValueError as error:
+            reasons.append(str(error))
+    raise ValueError(f"No order of the columns serves the coordinates of all mixtures: {reasons[0]}")
+
+
+def _reorder(mixture: CoordinateMixture, names: tuple[str, ...], columns: tuple[int, ...]) -> CoordinateMixture:
+    """Return a mixture with its coordinates in the order of these columns of x.
+
+    Raises:
+        ValueError: A coordinate depends on a column that comes later.
+    """
+    own = mixture.coordinates
+    if own.columns == columns:
+        return mixture
+    places = [own.columns.index(column) for column in columns]
+    order = tuple(names[column] for column in columns)
+    coordinates = Coordinates(own.low, own.high, own.kinds, own.names or names, order)
+    means, covariances = mixture.means[:, places], mixture.covariances[:, places][:, :, places]
+    return CoordinateMixture(coordinates, mixture.weights, means, covariances)
+
+
+class _Part(NamedTuple):
+    """One part of a pool while rows are gone through column by column."""
+
+    conditionals: MixtureConditionals
+    state: ConditioningState
+    log_weight: FloatArray
+    """Logarithm of its weight times its density of the earlier columns, shape (n,)."""
+
+    def next_conditional(self, j: int, x: FloatArray) -> TruncatedConditional:
+        """Return its distribution of the coordinate of column j."""
+        return self.conditionals.next_conditional(self.state, self.conditionals.coordinates.bounds(j, x))
+
+    def quantile_scale(self, j: int, x: FloatArray, conditional: TruncatedConditional) -> FloatArray:
+        """Return Phi^-1 of its distribution function of column j at x (n, d)."""
+        coordinates = self.conditionals.coordinates
+        y = move_inside(coordinates.coordinate(j, x), conditional.low, conditional.high)
+        return coordinates.sign(j) * conditional.to_normal(y)
+
+    def quantile(self, j: int, x: FloatArray, conditional: TruncatedConditional, u: FloatArray) -> FloatArray:
+        """Return its quantile of column j at Phi(u)."""
+        coordinates = self.conditionals.coordinates
+        y = move_inside(conditional.from_normal(coordinates.sign(j) * u), conditional.low, conditional.high)
+        return coordinates.value(j, y, x)
+
+    def observe(self, j: int, x: FloatArray, conditional: TruncatedConditional) -> _Part:
+        """Return the part after column j."""
+        coordinates = self.conditionals.coordinates
+        y = move_inside(coordinates.coordinate(j, x), conditional.low, conditional.high)
+        state = self.conditionals.observe(conditional, self.state, y)
+        mass = log_sum(self.state.log_weights + conditional.log_mass())
+        density = log_sum(state.log_weights) - mass + coordinates.log_slope(j, x)
+        return self._replace(state=state, log_weight=self.log_weight + density)
+
+
+@dataclass(frozen=True, eq=False)
+class PooledMixture:
+    """Mixtures in different coordinates of one box, pooled: the density is the weighted mean of theirs.
+
+    The map goes column by column, as that of `CoordinateMixture`: u_j = Phi^-1(P(X_j <= x_j | earlier columns)). That
+    distribution function is the mean of those of the parts, weighted by their densities of the earlier columns.
+
+    Args:
+        parts: Mixtures in the same box, with the columns in the same order.
+        weights: Shares of the parts, shape (G,), sum 1.
+
+    Raises:
+        ValueError: The columns differ in order, or there is not one weight for each part.
+
+    Example:
+        >>> plain, log = (Coordinates([1.0], [99.0], (kind,), ("gap",)) for kind in ("plain", "log"))
+        >>> wide, narrow = [[[9.0]]], [[[0.01]]]
+        >>> parts = CoordinateMixture(plain, [1.0], [[20.0]], wide), CoordinateMixture(log, [1.0], [[3.0]], narrow)
+        >>> pool = PooledMixture(parts, [0.5, 0.5])
+        >>> x = pool.from_standard_normal([[1.0], [3.0]])
+        >>> x.round(1).tolist(), pool.to_standard_normal(x).round(6).tolist()
+        ([[22.6], [28.4]], [[1.0], [3.0]])
+    """
+
+    parts: tuple[CoordinateMixture, ...]
+    weights: FloatArray
+    _conditionals: tuple[MixtureConditionals, ...] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "parts", tuple(self.parts))
+        object.__setattr__(self, "weights", np.asarray(self.weights, dtype=np.float64))
+        if len({part.coordinates.columns for part in self.parts}) != 1:
+            raise ValueError("Expected parts with the columns in the same order.")
+        if self.weights.shape != (len(self.parts),) or not np.isclose(self.weights.sum(), 1.0):
+            raise ValueError(f"Expected {len(self.parts)} weights with sum 1, got {self.weights.tolist()}.")
+        own = tuple(MixtureConditionals(p.coordinates, p.weights, p.means, p.covariances) for p in self.parts)
+        object.__setattr__(self, "_conditionals", own)
+
+    @property
+    def dim(self) -> int:
+        """Number of columns d."""
+        return self.parts[0].dim
+
+    @property
+    def low(self) -> FloatArray:
+        """Lower ends of the box, shape (d,)."""
+        return self.parts[0].low
+
+    @property
+    def high(self) -> FloatArray:
+        """Upper ends of the box, shape (d,)."""
+        return self.parts[0].high
+
+    def log_prob(self, x: ArrayLike) -> FloatArray:
+        """Return the log density, (n, d) -> (n,); -inf outside the box."""
+        return log_sum(np.stack([part.log_prob(x) for part in self.parts]) + np.log(self.weights)[:, None])
+
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw independent points, shape (n, d); the first rows do not depend on n."""
+        return self.from_standard_normal(rng.standard_normal((n, self.dim)))
+
+    def to_standard_normal(self, x: ArrayLike) -> FloatArray:
+        """Map points in the box to standard normal space, (n, d) -> (n, d).
+
+        Raises:
+            ValueError: Wrong shape, or a point outside the box.
+        """
+        points = self.parts[0].coordinates.interior(self._conditionals[0].rows_in_box(x))
+        return apply_by_chunks(self._to_normal, points, self.dim)
+
+    def from_standard_normal(self, u: ArrayLike) -> FloatArray:
+        """Map standard normal points to points strictly inside the box, (n, d) -> (n, d).
+
+        Raises:
+            ValueError: Wrong shape, or u is not finite.
+        """
+        return apply_by_chunks(self._from_normal, self._conditionals[0].finite_rows(u), self.dim)
+
+    def _start(self, n: int) -> list[_Part]:
+        logs = np.log(self.weights)
+        pairs = zip(self._conditionals, logs, strict=True)
+        return [_Part(own, own.start(n), np.full(n, log_weight)) for own, log_weight in pairs]
+
+    def _to_normal(self, x: FloatArray) -> FloatArray:
+        parts, u = self._start(len(x)), np.empty_like(x)
+        for j in self.parts[0].coordinates.columns:
+            conditionals = [part.next_conditional(j, x) for part in parts]
+            u[:, j] = _pooled_quantile_scale(j, x, parts, conditionals)
+            parts = [part.observe(j, x, each) for part, each in zip(parts, conditionals, strict=True)]
+        return u
+
+    def _from_normal(self, u: FloatArray) -> FloatArray:
+        parts, x = self._start(len(u)), np.empty_like(u)
+        for j in self.parts[0].coordinates.columns:
+            conditionals = [part.next_conditional(j, x) for part in parts]
+            x[:, j] = _find_quantile(j, x, u[:, j], parts, conditionals)
+            parts = [part.observe(j, x, each) for part, each in zip(parts, conditionals, strict=True)]
+        return x
+
+
+def _pooled_quantile_scale(
+    j: int, x: FloatArray, parts: Sequence[_Part], conditionals: Sequence[TruncatedConditional]
+) -> FloatArray:
+    """Return Phi^-1 of the pooled distribution function of column j at x (n, d), by the smaller tail."""
+    pairs = zip(parts, conditionals, strict=True)
+    scores = np.stack([part.quantile_scale(j, x, conditional) for part, conditional in pairs])
+    log_weights = np.stack([part.log_weight for part in parts])
+    lower, upper = log_sum(log_weights + log_ndtr(scores)), log_sum(log_weights + log_ndtr(-scores))
+    tail = np.minimum(lower, upper) - np.logaddexp(lower, upper)
+    return np.asarray(np.where(lower <= upper, 1.0, -1.0) * ndtri_exp(tail))
+
+
+def _find_quantile(
+    j: int, x: FloatArray, u: FloatArray, parts: Sequence[_Part], conditionals: Sequence[TruncatedConditional]
+) -> FloatArray:
+    """Return the value of column j at which the pooled distribution function is Phi(u), (n,).
+
+    It lies between the quantiles of the parts. Regula falsi on the quantile scale in the variant of Illinois (Dowell
+    and Jarratt, "A modified regula falsi method", 1971), with a bisection in every third step; each row stops by
+    itself.
+    """
+    pairs = zip(parts, conditionals, strict=True)
+    quantiles = np.stack([part.quantile(j, x, conditional, u) for part, conditional in pairs])
+    rows = x.copy()
+
+    def error_at(values: FloatArray) -> FloatArray:
+        rows[:, j] = values
+        return _pooled_quantile_scale(j, rows, parts, conditionals) - u
+
+    left, right = quantiles.min(axis=0), quantiles.max(axis=0)
+    error_left, error_right = np.minimum(error_at(left), 0.0), np.maximum(error_at(right), 0.0)
+    value = np.where(-error_left < error_right, left, right)
+    done = (np.minimum(-error_left, error_right) <= ROOT_TOLERANCE * (1.0 + np.abs(u))) | _is_narrow(left, right)
+    was_low = np.zeros(len(u), dtype=bool)
+    for step in range(SEARCH_STEPS):
+        if done.all():
+            break
+        with np.errstate(all="ignore"):  # rows that are done may have an empty bracket
+            secant = right - error_right * (right - left) / (error_right - error_left)
+        inside = np.isfinite(secant) & (secant > left) & (secant < right)
+        guess = np.where(inside & (step % 3 != 2), secant, left + 0.5 * (right - left))
+        value = np.where(done, value, guess)
+        error = error_at(value)
+        low_side = error <= 0
+        # Illinois: an end that stays a second time counts half, so that the next step passes the root.
+        again = low_side == was_low if step else np.zeros_like(low_side)
+        factor, was_low = np.where(again, 0.5, 1.0), low_side
+        error_right = np.where(low_side, factor * error_right, error)
+        error_left = np.where(low_side, error, factor * error_left)
+        left, right = np.where(low_side, value, left), np.where(low_side, right, value)
+        done |= (np.abs(error) <= ROOT_TOLERANCE * (1.0 + np.abs(u))) | _is_narrow(left, right)
+    return value
+
+
+def _is_narrow(left: FloatArray, right: FloatArray) -> FloatArray:
+    """Return whether no float is left between the ends of brackets, (n,)."""
+    return np.asarray(right - left <= 2.0 * np.spacing(np.abs(left)))
