@@ -23,8 +23,7 @@ STANDSTILL_SPEED = 1.0
 LEAST_SPEED = -0.2
 """Smoothed speed [m/s] below which the record of a braking is broken."""
 END_TICKS = 10
-"""Ticks at both ends of a track in which no braking begins or ends: accelerations are least certain there. One that is
-under way counts from then on (3 of the 44 on US 101)."""
+"""Ticks at both ends of a track in which no braking begins or ends: accelerations are least certain there."""
 SHORTEST_TRACK = 42
 """Ticks below which a track is too short to show a braking."""
 
@@ -50,7 +49,8 @@ def find_standstill_brakings(position: FloatArray, gap: FloatArray) -> TrackBrak
 
     Left out are those in which the smoothed vehicle runs backwards: there the recorded position is frozen or jumps, and
     the deceleration is that of the error. There is one such among 45 brakings on US 101; it alone, with 7.3 m/s^2
-    beside 3.8 of the next, would move p of the IDM from 1.7e-6 to 2.3e-5.
+    beside 3.8 of the next, would move p of the IDM from 1.7e-6 to 2.3e-5. Left out too are those that are under way
+    when the track begins (3 on US 101): speed and gap at their beginning are not known.
 
     Args:
         position: Position along the road at consecutive ticks [m], shape (T,).
@@ -72,7 +72,9 @@ def find_standstill_brakings(position: FloatArray, gap: FloatArray) -> TrackBrak
     spans = [
         (first, end)
         for first, end in braking_spans(acceleration)
-        if speed[end] < STANDSTILL_SPEED and speed[first : end + 1].min() > LEAST_SPEED
+        if speed[end] < STANDSTILL_SPEED
+        and speed[first : end + 1].min() > LEAST_SPEED
+        and not (first == END_TICKS and acceleration[first - 1] < -BRAKING_ONSET)  # under way before
     ]
     return describe_brakings(speed, acceleration, gap, spans)
 
