@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.special import log_ndtr, ndtri_exp
 
 from rare_envs.arrays import FloatArray
@@ -25,10 +25,10 @@ from rare_envs.distributions.truncated_normal import ROOT_TOLERANCE, TruncatedCo
 
 SEARCH_STEPS = 200
 """Most steps of the search for a quantile; bisections alone would need about 60."""
-Mixture = TruncatedGaussianMixture | CoordinateMixture
+BoxMixture = TruncatedGaussianMixture | CoordinateMixture
 
 
-def pool_mixtures(mixtures: Sequence[Mixture]) -> CoordinateMixture | PooledMixture:
+def pool_mixtures(mixtures: Sequence[BoxMixture]) -> CoordinateMixture | PooledMixture:
     """Return one distribution of all mixtures, each with equal weight.
 
     Those of the same coordinates become one mixture with the components of all, whose conditionals are cut to the box
@@ -49,7 +49,7 @@ def pool_mixtures(mixtures: Sequence[Mixture]) -> CoordinateMixture | PooledMixt
     for i, each in enumerate(mixtures):
         if not (np.array_equal(each.low, mixtures[0].low) and np.array_equal(each.high, mixtures[0].high)):
             raise ValueError(f"Expected mixtures of the same box, but mixtures 0 and {i} differ.")
-    groups: dict[str, list[Mixture]] = {}
+    groups: dict[str, list[BoxMixture]] = {}
     for each in mixtures:
         groups.setdefault(json.dumps(_without_names(each.coordinates)), []).append(each)
     pools = [_pool_alike(group) for group in groups.values()]
@@ -65,7 +65,7 @@ def _without_names(coordinates: Coordinates) -> tuple[object, ...]:
     return (kinds, coordinates.columns)
 
 
-def _pool_alike(mixtures: Sequence[Mixture]) -> CoordinateMixture:
+def _pool_alike(mixtures: Sequence[BoxMixture]) -> CoordinateMixture:
     """Return the mixture with the components of mixtures in the same coordinates."""
     weights, means, covariances = (
         np.concatenate([getattr(mixture, name) for mixture in mixtures]) for name in COMPONENT_FIELDS
@@ -286,9 +286,10 @@ def _find_quantile(
         error_left = np.where(low_side, error, factor * error_left)
         left, right = np.where(low_side, value, left), np.where(low_side, right, value)
         done |= (np.abs(error) <= ROOT_TOLERANCE * (1.0 + np.abs(u))) | _is_narrow(left, right)
-    return value
+    return np.asarray(value)
 
 
-def _is_narrow(left: FloatArray, right: FloatArray) -> FloatArray:
+def _is_narrow(left: FloatArray, right: FloatArray) -> NDArray[np.bool_]:
     """Return whether no float is left between the ends of brackets, (n,)."""
-    return np.asarray(right - left <= 2.0 * np.spacing(np.abs(left)))
+    narrow: NDArray[np.bool_] = right - left <= 2.0 * np.spacing(np.abs(left))
+    return narrow

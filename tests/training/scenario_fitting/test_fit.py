@@ -198,8 +198,11 @@ def test_shipped_files_say_what_they_are_worth(base):
     assert chosen["number"] == len(file["weights"])
     assert record["coordinates"] == base.system or own["bic"] <= least + BIC_TIE
     fitted = load_base(scenario_named(base.scenario), base.name)
-    components = {len(refit.weights) for refit in fitted.refits}
-    assert len(fitted.refits) == (30 if len(components) == 1 else 100)
+    families = {(len(refit.weights), refit.coordinates.kinds) for refit in fitted.refits}
+    assert len(fitted.refits) == (30 if len(families) == 1 else 100)
+    kinds = {kinds for _, kinds in families}
+    assert ("; of the refits" in file["family"]) == (len(kinds) > 1)
+    assert base.system is None or kinds == {fitted.distribution.coordinates.kinds}
     assert (fitted.frequency is None) == ("no_frequency" in record["source"])
 
 
@@ -224,6 +227,8 @@ def test_fit_of_the_recorded_events_is_the_shipped_file(base):
         for key in ("weights", "means", "covariances"):
             np.testing.assert_allclose(one.pop(key), other.pop(key), rtol=1e-4, atol=1e-4)
     new, old = written.pop("provenance"), expected.pop("provenance")
+    one, other = (each.pop("family").split(";")[0] for each in (written, expected))  # behind it are counts of refits
+    assert one == other
     assert written == expected
     assert new["bic"] == pytest.approx(old["bic"], abs=0.1)
     for key in ("source", "filters", "settings", "command", "coordinates"):

@@ -14,7 +14,7 @@ COUNTS = {
     ("cut_in", "us101"): ((38, 265), 17, "scene"),
     ("cut_in", "us101-15-offsets"): ((38, 15), 17, "scene"),
     ("cut_in", "i80"): ((50, 131), 25, "half-minute"),
-    ("hard_brake", "us101"): ((44,), 23, "half-minute"),
+    ("hard_brake", "us101"): ((41,), 22, "half-minute"),
 }
 
 

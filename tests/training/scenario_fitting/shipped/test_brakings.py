@@ -51,7 +51,7 @@ def test_the_shipped_moments_are_the_recorded_ones():
 @needs_data(VEHICLES_FILE)
 def test_recorded_brakings_to_a_standstill():
     brakings = load_brakings(DATA, find_standstill_brakings)
-    assert len(brakings.events) == len(brakings.frames) == 44
+    assert len(brakings.events) == len(brakings.frames) == 41
     assert brakings.events[:, 2].max() < 4.0  # the one of 7.3 m/s^2 runs backwards
     assert brakings.hours == pytest.approx(5.75, abs=0.01)
     assert 200.0 < brakings.km < 250.0
