@@ -138,8 +138,15 @@ def _draw_curves_strip(drive: Drive) -> tuple[Image.Image, Any]:
     return picture, place
 
 
-def describe_drive(recorded: RecordedFailure, drive: Drive, number: int) -> list[str]:
-    """Return the drive in words, line by line."""
+def describe_drive(recorded: RecordedFailure, drive: Drive, number: int, ego: str | None = None) -> list[str]:
+    """Return the drive in words, line by line.
+
+    Args:
+        recorded: The failure.
+        drive: Its drive.
+        number: Which failure of the run it is.
+        ego: Another ego, if one drove in the place of the run's.
+    """
     space, labels = recorded.problem.space, recorded.problem.world.scenario.labels
     lines = [
         f"Failure {number} of {recorded.n_failures} in {recorded.problem.env_id}: "
@@ -158,7 +165,9 @@ def describe_drive(recorded: RecordedFailure, drive: Drive, number: int) -> list
         who, whom = ("the edge of the road" if j < 0 else labels[j] for j in crash["vehicles"])
         how = f"{crash['kind']}, closing at {crash['closing_speed']:.1f} m/s"
         lines.append(f"Crash after {end:.1f} s: {who} into {whom} ({how}).")
-    if abs(drive.f - recorded.f) > REPLAY_TOLERANCE:
+    if ego is not None:
+        lines.append(f"The ego was {ego}; that of the run had f = {recorded.f:.4g}.")
+    elif abs(drive.f - recorded.f) > REPLAY_TOLERANCE:
         why = "ego, drivers or this program have changed since"
         if recorded.problem.varies:
             why = "the ego answers differently from run to run, and what was recorded is what counts"

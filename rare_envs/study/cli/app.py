@@ -12,6 +12,7 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
+from rare_envs.study.cli.corpus import corpus_app, replay_all
 from rare_envs.study.cli.export_failure import export_command
 from rare_envs.study.cli.options import (
     AlgoOption,
@@ -30,7 +31,7 @@ from rare_envs.study.cli.options import (
     WorldOptions,
 )
 from rare_envs.study.cli.shell import OneLineErrors, keep_stdout_for_the_answer, print_json, show_what_is_known
-from rare_envs.study.errors import as_bad_input
+from rare_envs.study.errors import BadInput, as_bad_input
 from rare_envs.threads import use_one_thread
 from training.command_line import DriverTrainingOptions, RecordingOptions, RunFolderOption, spread_options
 
@@ -276,17 +277,28 @@ def replay_command(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder that rare-envs estimate --out has written.")],
     failure: Annotated[int, typer.Option(help="Which failure; 0 is the most likely.")] = 0,
     out: Annotated[Path | None, typer.Option(help="A .gif of the drive, or a .png of its worst moment.")] = None,
+    ego: Annotated[
+        str | None, typer.Option(help="Another ego, as for estimate --ego, in the place of the run's.")
+    ] = None,
+    replay_each: Annotated[
+        bool, typer.Option("--all", help="Simulate all failures again and compare their f; without a film.")
+    ] = False,
     trust: TrustOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Drive a failure that a run has found again, and show it with its measure over time."""
+    from rare_envs.study.corpus.trial import find_for_ego
     from rare_envs.study.replay import drive_again
     from rare_envs.study.video import REPLAY_TOLERANCE, check_film_path, describe_drive, find_failure, write_film
 
+    if replay_each:
+        if out is not None:
+            raise BadInput("Expected --all without --out: a film shows one failure.")
+        replay_all(run, ego, trust, as_json)
     if out is not None:
         check_film_path(out)
     with keep_stdout_for_the_answer():
-        recorded = find_failure(run, failure, trust)
+        recorded = find_failure(run, failure, trust) if ego is None else find_for_ego(run, failure, ego, trust)
         drive = drive_again(recorded.problem, recorded.x)
         if out is not None:
             write_film(out, drive)
@@ -301,17 +313,19 @@ def replay_command(
         "seconds": float(drive.time[-1]),
         "crash": drive.crash,
         "out": None if out is None else str(out),
+        "ego": ego,
     }
     if as_json:
         print_json(answer)
     else:
-        print("\n".join(describe_drive(recorded, drive, failure)))
+        print("\n".join(describe_drive(recorded, drive, failure, ego)))
         if out is not None:
             print(f"Wrote {out}.")
-    raise typer.Exit(0 if same else DOUBTFUL)
+    raise typer.Exit(0 if same or ego is not None else DOUBTFUL)
 
 
 app.command("export")(export_command)
+app.add_typer(corpus_app, name="corpus")
 
 
 @app.command("check-ego")

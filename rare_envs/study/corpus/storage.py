@@ -1,0 +1,162 @@
+"""Storage of a corpus: a folder with a file for each failure, named by the content of the scenario."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rare_envs.files import replace_text
+from rare_envs.json_text import parse_json_object
+from rare_envs.study.analysis.recorded_question import note_question, open_question
+from rare_envs.study.corpus.stored_failure import StoredFailure, make_stored, read_stored
+from rare_envs.study.errors import BadInput, as_bad_input, output_folder
+from rare_envs.study.journal import JOURNAL
+from rare_envs.study.question import read_question
+from rare_envs.study.run_directory import CRASH, FAILURES, RESULT, read_failures
+
+MAX_CORPUS_FILES = 100_000
+"""Files of a corpus that are read at most."""
+
+
+def read_run(folder: Path, trust: bool = False) -> list[StoredFailure]:
+    """Return the failures of a run, the most likely first; nothing is simulated and no ego is loaded.
+
+    Args:
+        folder: Of `rare-envs estimate --out`.
+        trust: Trust the code that a run from elsewhere names.
+
+    Raises:
+        BadInput: There is no such run, it is not finished, its files are damaged, or it is not trusted.
+    """
+    question = open_question(read_recorded(folder).get("question"), folder, trust)
+    try:
+        table = read_failures(folder)
+    except OSError as error:
+        raise BadInput(_no_run(folder)) from error
+    except ValueError as error:
+        raise BadInput(error) from error
+    names = [name for name in table if name not in ("f", "log_p0", *CRASH)]
+    if not names or not all(np.isfinite(table[name]).all() for name in names):
+        raise BadInput(f"The files of failures in {str(folder)!r} are damaged: a parameter is no number.")
+    words = table.get(CRASH[0])
+    return [
+        make_stored(
+            question,
+            {name: table[name][k] for name in names},
+            float(table["f"][k]),
+            float(table["log_p0"][k]),
+            "" if words is None else str(words[k]),
+        )
+        for k in range(len(table["f"]))
+    ]
+
+
+def read_recorded(folder: Path) -> dict[str, Any]:
+    """Return what the file `RESULT` of a finished run has.
+
+    Raises:
+        BadInput: There is no such run, or it is not finished.
+    """
+    if (folder / JOURNAL).exists():
+        raise BadInput(f"The run in {str(folder)!r} is not finished: rare-envs resume {folder} comes first.")
+    try:
+        return parse_json_object((folder / RESULT).read_text(encoding="utf-8"), repr(str(folder / RESULT)))
+    except OSError as error:
+        raise BadInput(_no_run(folder)) from error
+    except ValueError as error:
+        raise BadInput(error) from error
+
+
+def _no_run(folder: Path) -> str:
+    return f"No run in {str(folder)!r}: expected {RESULT} and {FAILURES}, as rare-envs estimate --out writes."
+
+
+def choose_likely(failures: Sequence[StoredFailure], most: int) -> list[StoredFailure]:
+    """Return the `most` most likely failures, one of each kind of crash among them as far as there is room.
+
+    Example:
+        >>> kinds = ["rear_end"] * 3 + ["side"]
+        >>> failures = [StoredFailure("", {}, {}, -1.0, 0.0 - k, crash=kind) for k, kind in enumerate(kinds)]
+        >>> [(each.log_p0, each.crash) for each in choose_likely(failures, 2)]
+        [(0.0, 'rear_end'), (-3.0, 'side')]
+    """
+    first: dict[str, int] = {}
+    for number, failure in enumerate(failures):
+        first.setdefault(failure.crash, number)
+    order = [*first.values(), *(number for number in range(len(failures)) if number not in first.values())]
+    return [failures[number] for number in sorted(order[:most])]
+
+
+def add_run(run: Path, corpus: Path, most: int = 20, trust: bool = False) -> tuple[list[StoredFailure], int]:
+    """Add failures of a run to a corpus; those that it has already stay as they are.
+
+    Args:
+        run: Folder of `rare-envs estimate --out`.
+        corpus: Folder of the corpus; is made, if need be.
+        most: Number of failures, the most likely ones and one of each kind of crash.
+        trust: Trust the code that a run from elsewhere names.
+
+    Returns:
+        The failures, and how many of them are new.
+
+    Raises:
+        BadInput: There is no such run, or the corpus cannot be written.
+    """
+    if most < 1:
+        raise BadInput(f"Expected at least one failure to add, got {most}.")
+    chosen = choose_likely(read_run(run, trust), most)
+    if not chosen:
+        raise BadInput(f"The run in {str(run)!r} has no failure.")
+    new = 0
+    with output_folder(corpus), as_bad_input(OSError):
+        for failure in chosen:
+            path = corpus / f"{failure.key}.json"
+            if not path.exists():
+                replace_text(path, failure.to_json())
+                new += 1
+            note_question(read_question(failure.question_values()))
+    return chosen, new
+
+
+def read_corpus(folder: Path) -> list[StoredFailure]:
+    """Read a corpus, in the order of its files' names.
+
+    Raises:
+        BadInput: There is none, or one of its files is damaged.
+    """
+    paths = sorted(folder.glob("*.json"))
+    if not paths:
+        raise BadInput(f"There is no corpus in {str(folder)!r}: rare-envs corpus add RUN makes one.")
+    if len(paths) > MAX_CORPUS_FILES:
+        raise BadInput(f"The corpus in {str(folder)!r} has more than {MAX_CORPUS_FILES:,} files.")
+    with as_bad_input(ValueError, OSError):
+        return [read_stored(path) for path in paths]
+
+
+def join_x(failures: Sequence[StoredFailure], names: Sequence[str], sizes: Sequence[int]) -> NDArray[np.float64]:
+    """Return x (n, d) of failures for a problem with these parameters.
+
+    An ego's own noise, `ego_noise`, belongs to the ego that failed: another one has zeros, its mean actions.
+
+    Raises:
+        ValueError: A failure lacks a parameter, or has another size of it.
+    """
+    rows = []
+    for failure in failures:
+        parts: list[Any] = []
+        for name, size in zip(names, sizes, strict=True):
+            part = failure.x.get(name)
+            if name == "ego_noise" and (part is None or len(part) != size):
+                part = [0.0] * size
+            if part is None or len(part) != size:
+                raise ValueError(
+                    f"Stored failure {failure.key} has {0 if part is None else len(part)} values of {name}, its "
+                    f"scenario has {size}: {failure.env_id} or its drivers have changed since."
+                )
+            parts += part
+        rows.append(parts)
+    return np.array(rows, dtype=np.float64)

@@ -1,0 +1,78 @@
+"""The commands `corpus` and `replay --all`, `replay --ego`, on the folder of a small run."""
+
+from __future__ import annotations
+
+import json
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import pytest
+
+from rare_envs.study.cli.corpus import FAILS
+from tests.rare_envs.study.refusals import SMALL, Cli, assert_refused
+
+
+@pytest.fixture
+def run(cli: Cli, risky: str, here: Path) -> Path:
+    assert cli(*SMALL, "--base", risky, "--horizon", 4, "--out", "run").exit_code == 0
+    return here / "run"
+
+
+def test_from_a_run_to_a_regression_test(cli: Cli, run: Path) -> None:
+    assert cli("corpus", "add", "run").stdout.startswith("Added 20 of 20")
+    again = json.loads(cli("corpus", "add", "run", "--json").stdout)
+    assert again["added"] == 0 and len(again["failures"]) == 20
+    same = cli("corpus", "run", "--ego", "idm", "--junit", "out.xml", "--json")
+    assert same.exit_code == FAILS
+    answer = json.loads(same.stdout)
+    assert (answer["passed"], answer["failed"], answer["error"]) == (0, 20, 0)
+    suite = ET.parse("out.xml").getroot()[0]
+    assert suite.get("failures") == "20"
+    lines = cli("corpus", "run", "--ego", "egos_here:coasting").stdout.splitlines()
+    assert lines[0].startswith("egos_here:coasting fails in 20 of 20 scenarios") and len(lines) == 21
+
+
+def test_a_corpus_that_an_ego_passes(cli: Cli, run: Path) -> None:
+    """Thresholds below any f that there is: nobody fails, though all failed once."""
+    cli("corpus", "add", "run")
+    from dataclasses import replace
+
+    from rare_envs.study.corpus.storage import read_corpus
+
+    for stored in read_corpus(Path("corpus")):
+        strict = replace(stored, world={**stored.world, "gamma": -2.0})
+        Path("corpus", f"{stored.key}.json").unlink()
+        Path("corpus", f"{strict.key}.json").write_text(strict.to_json())
+    result = cli("corpus", "run", "--ego", "idm")
+    assert result.exit_code == 0 and result.stdout.startswith("idm fails in 0 of 20 scenarios")
+
+
+def test_all_failures_replay(cli: Cli, run: Path) -> None:
+    answer = json.loads(cli("replay", "run", "--all", "--json").stdout)
+    assert answer["same"] == len(answer["trials"]) > 20
+    other = cli("replay", "run", "--all", "--ego", "egos_here:coasting", "--json")
+    assert other.exit_code == FAILS and json.loads(other.stdout)["failed"] == len(answer["trials"])
+    table = (run / "failures.csv").read_text().splitlines()
+    names = table[0].split(",")
+    row = table[1].split(",")
+    row[names.index("f")] = "-0.5"
+    (run / "failures.csv").write_text("\n".join([table[0], ",".join(row), *table[2:]]) + "\n")
+    changed = cli("replay", "run", "--all")
+    assert changed.exit_code == 3 and changed.stdout.count("\n") == 2
+
+
+def test_one_failure_with_another_ego(cli: Cli, run: Path) -> None:
+    result = cli("replay", "run", "--ego", "egos_here:coasting")
+    assert result.exit_code == 0
+    assert result.stdout.splitlines()[-1] == "The ego was egos_here:coasting; that of the run had f = -1."
+
+
+def test_refusals_are_one_line(cli: Cli, run: Path) -> None:
+    assert_refused(cli("corpus", "run", "--ego", "idm"), "There is no corpus")
+    cli("corpus", "add", "run")
+    assert_refused(cli("corpus", "run", "--ego", "nowhere.zip"), "nowhere.zip")
+    assert_refused(cli("corpus", "run", "--ego", "idm", "--junit", "no/where.xml"), "no folder")
+    assert_refused(cli("replay", "run", "--all", "--out", "a.gif"), "--all without --out")
+    assert_refused(cli("replay", "run", "--ego", "idm", "--failure", "9999"), "from 0 to")
+    Path("corpus", "stray.json").write_text("{}")
+    assert_refused(cli("corpus", "run", "--ego", "idm"), "stray.json", "format")
