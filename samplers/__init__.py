@@ -15,6 +15,7 @@ from samplers.comparison import Comparison, compare
 from samplers.errors import EvaluationError
 from samplers.estimation import estimate
 from samplers.execution.arguments import RunArguments
+from samplers.execution.executors import Executor, ExecutorError, FuturesPool, InProcess, LocalProcesses, RayCluster
 from samplers.execution.interruption import EstimationInterrupted
 from samplers.execution.progress import Progress
 from samplers.execution.run import Run
@@ -58,19 +59,24 @@ __all__ = [
     "Estimate",
     "EstimationInterrupted",
     "EvaluationError",
+    "Executor",
+    "ExecutorError",
     "Failure",
     "Failures",
     "FittedBase",
     "FunctionProblem",
+    "FuturesPool",
     "GaussianBlock",
     "Goal",
     "HasTermGradients",
     "HasTerms",
     "ImportanceSampling",
     "ImprovedCrossEntropy",
+    "InProcess",
     "Interrupted",
     "Layer",
     "Level",
+    "LocalProcesses",
     "Method",
     "MixtureBlock",
     "MonteCarlo",
@@ -80,6 +86,7 @@ __all__ = [
     "Product",
     "Progress",
     "RatioUncertainty",
+    "RayCluster",
     "Reweighted",
     "Run",
     "RunArguments",

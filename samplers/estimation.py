@@ -2,18 +2,22 @@
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from os import PathLike
 
 from samplers.analysis.refits import HasEnsemble, needs_ensemble_run
 from samplers.errors import OnError
-from samplers.execution.arguments import InputsOnly, RunArguments, check_attributes, check_problem
+from samplers.execution.arguments import InputsOnly, RunArguments, check_attributes, check_problem, choose_seed
 from samplers.execution.base_check import find_base_fault
-from samplers.execution.fault_isolation import FaultIsolation
+from samplers.execution.executors.base import Executor, Pool
+from samplers.execution.executors.chunks import find_chunk_size
+from samplers.execution.executors.problem_work import ProblemWork
+from samplers.execution.executors.selection import AnyExecutor, find_executor
 from samplers.execution.interruption import EstimationInterrupted, defer_signals
-from samplers.execution.journaled_evaluation import open_journal
-from samplers.execution.progress import Listener, Progress, open_listener
+from samplers.execution.journaled_evaluation import JournaledEvaluation, open_journal
+from samplers.execution.progress import Listener, Pace, Progress, open_listener
 from samplers.execution.responder import Responder
 from samplers.execution.run import Run
 from samplers.method import Stepping
@@ -41,6 +45,8 @@ def estimate(
     stop: Callable[[Progress], bool] | None = None,
     ensemble_run: bool = True,
     journal: str | PathLike[str] | None = None,
+    workers: int | None = None,
+    executor: AnyExecutor | None = None,
 ) -> Estimate:
     """Estimate P[f(X) <= gamma], X ~ problem.base.
 
@@ -86,6 +92,13 @@ def estimate(
             run is done, and the same call then takes no simulations. A power cut loses one second
             (`samplers.execution.journal.SYNC_SECONDS`) and the batch. A file that is damaged, used by another process,
             or was made for other points or another f is refused.
+        workers: Processes of this machine that simulate, each with one thread; short for
+            `executor=LocalProcesses(workers)`. None simulates here, and gives f whole batches.
+        executor: Where simulations are made: `LocalProcesses`, `RayCluster` (or "ray"), `InProcess`, or any pool with
+            `submit`, see `FuturesPool`. Batches are split in chunks whose size the problem alone decides (its
+            `chunk_size`), so that the result has the same bits with any executor and any number of workers. A worker
+            that dies, or takes longer than the executor's time limit, costs nothing but time; a row that three workers
+            in a row do not survive is one on which f raises (`on_error`).
 
     Returns:
         The probability, its interval, its cost and the failures. Of a run that was stopped (status
@@ -95,6 +108,7 @@ def estimate(
         ValueError: If an argument is not as described, f does not return one number per row, or the journal cannot be
             used (`JournalError`).
         OSError: If the journal cannot be written at the beginning.
+        ExecutorError: If the executor cannot work at all.
         EstimationInterrupted: If it is interrupted (a `KeyboardInterrupt`); it has the estimate from the simulations
             made so far.
 
@@ -117,21 +131,35 @@ def estimate(
     if not (callable(progress) or isinstance(progress, bool)):
         raise ValueError(f"Expected progress to be True, False or a function, got {progress!r}.")
     _check_base(problem)
-    isolation = FaultIsolation(problem.evaluate, on_error)
+    places = find_executor(workers, executor)
+    work = ProblemWork(problem, arguments.gamma, on_error)
     with open_journal(journal, problem, seed) as kept:
-        if kept is not None:
-            arguments = replace(arguments, seed=kept.head["seed"])
-        responder = Responder(problem, arguments.gamma, on_error, isolation, kept)
-        simulation = _Simulation(responder, conditions, progress)
-        try:
-            result = simulation.run(problem, chosen, arguments)
-            if ensemble_run and result.status is not Status.STOPPED and needs_ensemble_run(result):
-                result = replace(
-                    result, ensemble_run=_run_under_ensemble(simulation, problem, chosen, arguments, result)
-                )
-        except EstimationInterrupted as stopped:
-            raise EstimationInterrupted(_add_retry_note(stopped.estimate, isolation.n_retried)) from None
-    return _add_retry_note(result, isolation.n_retried)
+        known = seed if kept is None else kept.head["seed"]
+        arguments = replace(arguments, seed=choose_seed(known))
+        with _open_pool(places, work, arguments) as pool:
+            size = None if pool is None else find_chunk_size(problem)
+            evaluation = JournaledEvaluation(work, kept, pool, size)
+            responder = Responder(problem, arguments.gamma, on_error, evaluation)
+            simulation = _Simulation(responder, evaluation, pool, conditions, progress)
+            try:
+                result = simulation.run(problem, chosen, arguments)
+                if ensemble_run and result.status is not Status.STOPPED and needs_ensemble_run(result):
+                    further = _run_under_ensemble(simulation, problem, chosen, arguments, result)
+                    result = replace(result, ensemble_run=further)
+            except EstimationInterrupted as stopped:
+                raise EstimationInterrupted(_add_remarks(stopped.estimate, responder)) from None
+    return _add_remarks(result, responder)
+
+
+@contextmanager
+def _open_pool(executor: Executor | None, work: ProblemWork, arguments: RunArguments) -> Iterator[Pool | None]:
+    """Yield the workers of a run; None without an executor."""
+    if executor is None:
+        yield None
+        return
+    assert arguments.seed is not None
+    with executor.open(work, arguments.seed) as pool:
+        yield pool
 
 
 def _check_base(problem: Problem) -> None:
@@ -149,6 +177,8 @@ class _Simulation:
     """What the runs of one estimation share: how f is called, when they end and who is told."""
 
     responder: Responder
+    evaluation: JournaledEvaluation
+    pool: Pool | None
     conditions: "_StopConditions"
     progress: bool | Listener
 
@@ -159,6 +189,9 @@ class _Simulation:
             EstimationInterrupted: If it is interrupted after the first batch.
         """
         with open_listener(self.progress, arguments.max_sim) as listener:
+            if self.pool is not None and listener is not None:
+                pace = Pace(listener, self.pool.workers, self.evaluation)
+                self.evaluation.on_chunk, listener = pace.on_chunk, pace.on_progress
             run = Run(inputs, method, arguments, listener, self.responder.offer)
             try:
                 self._simulate(run)
@@ -239,9 +272,11 @@ class _StopConditions:
         return None
 
 
-def _add_retry_note(result: Estimate, n_retried: int) -> Estimate:
-    """Return the result with a note on rows that were simulated again."""
-    if n_retried == 0:
-        return result
-    note = f"{n_retried} rows were simulated again to find those on which f raises."
-    return replace(result, remarks=(*result.remarks, note))
+def _add_remarks(result: Estimate, responder: Responder) -> Estimate:
+    """Return the result with remarks on rows that were simulated again, or lost with their workers."""
+    remarks = []
+    if responder.n_retried:
+        remarks.append(f"{responder.n_retried} rows were simulated again to find those on which f raises.")
+    if responder.lost:
+        remarks.append(f"No worker survived {len(responder.lost)} rows; of the first: {responder.lost[0]}.")
+    return replace(result, remarks=(*result.remarks, *remarks)) if remarks else result

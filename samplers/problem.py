@@ -271,13 +271,16 @@ class FunctionProblem:
 
     Args:
         f: Maps points of shape (n, d) to values of shape (n,); small is dangerous. It may be left out where there are
-            `terms`: it is then their least.
+            `terms`: it is then their least. See `vectorized` for an f of one point.
         dim: Number of dimensions d.
         terms: Maps points of shape (n, d) to terms of shape (n, J) whose least is f, for a series system that fails
             where one of its parts does; None for none. The problem's own `terms` gives `Terms`.
         gradient: Maps points of shape (n, d) and the numbers of their terms, shape (n,), to the gradients of these
             terms, shape (n, d); None for none. The problem's own `gradient` gives `TermGradients`.
         gradient_cost: Simulations that a row of `gradient` counts as.
+        vectorized: False where f maps one point of shape (d,) to a number, as a program does that simulates one drive.
+        chunk_size: Rows that workers get at once (`estimate(..., workers=2)`); None for 16, and for 1 of an f of one
+            point.
 
     Raises:
         ValueError: If f, terms or gradient is not callable, f and terms are missing both, or dim is not a positive
@@ -287,6 +290,12 @@ class FunctionProblem:
         >>> import numpy as np, samplers
         >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
         >>> problem.evaluate(np.array([[1.0, 0.0], [4.0, 0.0]]))
+        array([ 2., -1.])
+
+        An f of one point, such as a simulation of one drive:
+
+        >>> drive = samplers.FunctionProblem(lambda x: 3.0 - x[0], dim=2, vectorized=False)
+        >>> drive.evaluate(np.array([[1.0, 0.0], [4.0, 0.0]]))
         array([ 2., -1.])
 
         A series system, which fails where either coordinate exceeds 3:
@@ -305,6 +314,8 @@ class FunctionProblem:
     gradient_cost: float = 3.0
     """A gradient by reverse-mode differentiation takes 2 to 4 evaluations (Griewank and Walther, "Evaluating
     derivatives", 2008, section 4.6)."""
+    vectorized: bool = True
+    chunk_size: int | None = None
 
     def __post_init__(self) -> None:
         """Check the arguments; the functions of terms and gradients become those of the protocols."""
@@ -319,6 +330,8 @@ class FunctionProblem:
                 raise ValueError(f"Expected {name} to be a function of an (n, d) array, got {function!r}.")
             object.__setattr__(self, name, wrap(function, self.dim, self.gradient_cost))
         check_number("gradient_cost", self.gradient_cost, 0.0, math.inf)
+        if self.chunk_size is not None:
+            check_whole("chunk_size", self.chunk_size, 1)
 
     @property
     def base(self) -> StandardNormal:
@@ -332,7 +345,9 @@ class FunctionProblem:
             ValueError: If x is not of shape (n, d), or f does not return one number per row.
         """
         _check_points(x, self.dim)
-        return one_per_row(self.f(x), len(x)) if self.f is not None else np.asarray(self.terms(x).f)
+        if self.f is None:
+            return np.asarray(self.terms(x).f)
+        return one_per_row(self.f(x) if self.vectorized else [self.f(row) for row in x], len(x))
 
 
 @dataclass(frozen=True)

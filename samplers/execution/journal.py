@@ -49,6 +49,11 @@ def digest_points(x: NDArray[Any]) -> str:
     return hashlib.blake2b(repr(x.shape).encode() + x.tobytes(), digest_size=16).hexdigest()
 
 
+def digest_request(kind: str, *arrays: NDArray[Any]) -> str:
+    """Return the digest of what is asked for: its kind, points and, of gradients, terms and ticks."""
+    return kind + " ".join(digest_points(array) for array in arrays)
+
+
 class JournalFile:
     """Finished simulations of a run, in their order; one process alone has the file open.
 

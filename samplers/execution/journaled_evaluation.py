@@ -1,4 +1,4 @@
-"""Journaled evaluation: f, terms and gradients that are kept in a journal, and taken from it when a run continues."""
+"""Journaled evaluation: chunks that are kept in a journal, and taken from it when a run continues."""
 
 from __future__ import annotations
 
@@ -6,86 +6,132 @@ import contextlib
 from collections.abc import Callable, Iterator
 from os import PathLike
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from samplers.errors import one_per_row
 from samplers.execution.arguments import choose_seed
-from samplers.execution.fault_isolation import FaultIsolation
-from samplers.execution.journal import JournalFile, JournalRecord, digest_points
+from samplers.execution.executors.base import Pool, Work
+from samplers.execution.executors.chunks import Chunk, Packed
+from samplers.execution.executors.dispatch import Dispatcher
+from samplers.execution.journal import JournalFile, JournalRecord
 from samplers.execution.record_file import JournalError
-from samplers.method import whole_simulations
-from samplers.problem import FloatArray, Inputs, TermGradients, Terms
+from samplers.problem import FloatArray, Inputs
 
 N_CHECKED = 8
 """Points at which a continued journal calls f again, from the least f of its first batch to the largest."""
 F_TOLERANCE = 1e-3
 """Largest difference of f there, as a share of the largest |f|: products of networks round differently by batch."""
-Simulate = Callable[[FloatArray], tuple[FloatArray, dict[str, Any]]]
-"""From x (n, d) to f (n,) and notes on it, JSON-ready."""
-
-
-class FirstCheck:
-    """A check of the first outcomes taken from a journal: whether f is what it was.
-
-    Args:
-        journal: Has the outcomes.
-        recheck: f at points simulated before, at most `N_CHECKED`; called once, and once more if its values differ, to
-            tell an f that was changed from one that is random. These simulations are not counted.
-    """
-
-    def __init__(self, journal: JournalFile, recheck: Callable[[FloatArray], ArrayLike]) -> None:
-        self._journal, self._recheck, self._done = journal, recheck, False
-
-    def __call__(self, x: FloatArray, f: FloatArray) -> None:
-        """Check f (n,) at x (n, d); later calls do nothing.
-
-        Raises:
-            JournalError: f had other values at them than it has now.
-        """
-        if not self._done:
-            self._done = True
-            check_same_f(self._journal, self._recheck, x, f)
 
 
 class JournaledEvaluation:
-    """f whose finished simulations are kept in a journal.
+    """Requests that are split in chunks, whose results are taken from a journal, or computed and kept there.
+
+    A chunk is written as soon as it is done. Chunks of a request are done in any order, and requests in theirs, so that
+    a run that is continued finds the chunks of its first requests, and of the last one those that were done.
 
     Args:
-        journal: Keeps what has been simulated, and may have some from before.
-        simulate: Makes simulations.
-        restore: Takes x and the record of simulations from before.
-        check: Takes x and f of simulations from before.
+        work: Computes a chunk.
+        journal: Keeps what has been computed, and may have some from before; None keeps nothing.
+        pool: Computes chunks; None to compute them here.
+        size: Rows of a chunk; None to leave requests whole.
+
+    Attributes:
+        n_restored: Rows whose results were taken from the journal.
+        on_chunk: Called with the number of rows of the request that are done, after every chunk.
     """
 
     def __init__(
-        self,
-        journal: JournalFile,
-        simulate: Simulate,
-        restore: Callable[[FloatArray, JournalRecord], None],
-        check: FirstCheck,
+        self, work: Work, journal: JournalFile | None = None, pool: Pool | None = None, size: int | None = None
     ) -> None:
-        self._journal, self._simulate, self._restore, self._check = journal, simulate, restore, check
+        self._work, self._journal, self._size = work, journal, size
+        self._dispatcher = None if pool is None else Dispatcher(pool, work)
+        self._n_chunks = 0
+        self._checked = False
+        self.n_restored = 0
+        self.on_chunk: Callable[[int], None] | None = None
 
-    def evaluate(self, x: FloatArray, points: str | None = None) -> FloatArray:
-        """Return f (n,) of x (n, d) from the journal, or simulate.
+    @property
+    def n_retries(self) -> int:
+        """Chunks that were computed again because a worker was lost."""
+        return 0 if self._dispatcher is None else self._dispatcher.n_retries
 
-        Args:
-            x: Points, shape (n, d).
-            points: Their digest, if it is not that of x in double precision.
+    def evaluate(self, request: Chunk) -> list[tuple[Chunk, Packed]]:
+        """Return the chunks of a request with their results, in order.
 
         Raises:
             JournalError: The journal has other points, or f had other values at them than it has now.
         """
+        chunks = request.split(self._size)
+        first, self._n_chunks = self._n_chunks, self._n_chunks + len(chunks)
+        whole, known = self._restore(request, chunks)
+        if whole is not None:
+            return [(request, self._take(request, whole))]
+        results = {number: self._take(chunks[number], record) for number, record in known.items()}
+        n_done = sum(len(chunks[number]) for number in known)
 
-        def restore(known: JournalRecord) -> None:
-            self._check(x, known.f)
-            self._restore(x, known)
+        def done(number: int, packed: Packed) -> None:
+            nonlocal n_done
+            results[number - first] = packed
+            n_done += len(chunks[number - first])
+            if self._journal is not None:
+                digest = self._work.digest(chunks[number - first])
+                self._journal.append(JournalRecord(digest, packed[0], packed[1]))
+            changed()
 
-        points = digest_points(x) if points is None else points
-        return keep_answer(self._journal, points, lambda: self._simulate(x), restore)[0]
+        def changed() -> None:
+            if self.on_chunk is not None and request.kind != "gradient":  # whose rows count as what they cost
+                self.on_chunk(n_done)
+
+        left = [(first + number, chunk) for number, chunk in enumerate(chunks) if number not in results]
+        if self._dispatcher is not None:
+            self._dispatcher.run(left, done, changed)
+        else:
+            for number, chunk in left:
+                done(number, self._work(chunk))
+        return [(chunk, results[number]) for number, chunk in enumerate(chunks)]
+
+    def _restore(self, request: Chunk, chunks: list[Chunk]) -> tuple[JournalRecord | None, dict[int, JournalRecord]]:
+        """Return the record of the whole request, and those of chunks by their numbers.
+
+        There is one of the whole request where an executor continues what was begun without one.
+        """
+        known = dict[int, JournalRecord]()
+        if self._journal is None:
+            return None, known
+        waiting: dict[str, list[int]] = {}
+        for number, chunk in reversed(list(enumerate(chunks))):
+            waiting.setdefault(self._work.digest(chunk), []).append(number)
+        while len(known) < len(chunks) and (record := self._journal.read_next()) is not None:
+            numbers = waiting.get(record.points)
+            if not numbers and not known and len(chunks) > 1 and record.points == self._work.digest(request):
+                return record, {}
+            if not numbers or (request.kind == "f" and len(record.f) != len(chunks[numbers[-1]])):
+                raise JournalError(
+                    f"After {self._journal.n - record.n_sim:,} simulations this run asks for other points than "
+                    f"{str(self._journal.path)!r} has: arguments, base distribution or libraries have changed since it "
+                    "was begun. Remove the file to begin anew."
+                )
+            known[numbers.pop()] = record
+        return None, dict(sorted(known.items()))
+
+    def _take(self, chunk: Chunk, record: JournalRecord) -> Packed:
+        """Return the result in a record; f of the first one is compared with what it is now."""
+        if not self._checked and chunk.kind in ("f", "terms"):
+            self._checked = True
+            assert self._journal is not None
+            check_same_f(self._journal, self._compute_f, chunk.x, record.f[: len(chunk)])
+        self.n_restored += len(chunk)
+        return record.f, record.notes
+
+    def _compute_f(self, x: FloatArray) -> FloatArray:
+        """Return f of a few points, which are not kept."""
+        found: list[FloatArray] = []
+        chunk = Chunk("f", (x,))
+        if self._dispatcher is None:
+            return self._work(chunk)[0]
+        self._dispatcher.run([(0, chunk)], lambda number, packed: found.append(packed[0]), lambda: None)
+        return found[0]
 
 
 def find_changed(again: FloatArray, f: FloatArray) -> NDArray[np.bool_]:
@@ -136,87 +182,3 @@ def open_journal(path: str | PathLike[str] | None, problem: Inputs, seed: int | 
             if not isinstance(had, int) or wanted not in (None, had):
                 raise JournalError(f"{str(path)!r} was begun with {name} {had!r}, and this run has {wanted!r}.")
         yield journal
-
-
-def keep_simulations(
-    isolation: FaultIsolation, journal: JournalFile, check: FirstCheck
-) -> Callable[[FloatArray], FloatArray]:
-    """Return f with isolated faults whose finished simulations are kept."""
-
-    def simulate(x: FloatArray) -> tuple[FloatArray, dict[str, int]]:
-        before = isolation.n_retried
-        f = one_per_row(isolation.evaluate(x), len(x))
-        return f, {"n_retried": isolation.n_retried - before}
-
-    def restore(x: FloatArray, known: JournalRecord) -> None:
-        isolation.n_retried += int(known.notes.get("n_retried", 0))
-
-    return JournaledEvaluation(journal, simulate, restore, check).evaluate
-
-
-Packed = tuple[FloatArray, dict[str, Any]]
-"""An answer as numbers (k,) and notes, JSON-ready."""
-
-
-def keep_answer(
-    journal: JournalFile, points: str, compute: Callable[[], Packed], restore: Callable[[JournalRecord], None]
-) -> Packed:
-    """Return an answer from the journal, or compute and keep it.
-
-    Args:
-        journal: Of the run.
-        points: What was asked for, see `digest_points` and `digest_request`.
-        compute: Computes the answer.
-        restore: Takes the record of an answer from before.
-
-    Raises:
-        JournalError: The journal has the answer to something else.
-    """
-    known = journal.read_next()
-    if known is None:
-        numbers, notes = compute()
-        journal.append(JournalRecord(points, numbers, notes))
-        return numbers, notes
-    if known.points != points:
-        raise JournalError(
-            f"After {journal.n - known.n_sim:,} simulations this run asks for other points than {str(journal.path)!r} "
-            "has: arguments, base distribution or libraries have changed since it was begun. Remove the file to begin "
-            "anew."
-        )
-    restore(known)
-    return known.f, known.notes
-
-
-def digest_request(kind: str, *arrays: NDArray[Any]) -> str:
-    """Return the digest of what is asked for: its kind, points and, of gradients, terms and ticks."""
-    return kind + " ".join(digest_points(array) for array in arrays)
-
-
-def pack_terms(terms: Terms, notes: dict[str, Any]) -> Packed:
-    """Return terms as numbers, and further notes on them."""
-    numbers = np.concatenate([terms.f, np.ravel(terms.values), np.ravel(terms.ticks)])
-    own = {"threshold": float(terms.threshold), "names": list(terms.names), "n_sim": len(terms.f)}
-    return numbers, notes | own
-
-
-def unpack_terms(numbers: FloatArray, notes: dict[str, Any], n: int) -> Terms:
-    """Return the terms of n points from numbers and notes."""
-    f, values, ticks = np.split(numbers, [n, n + (len(numbers) - n) // 2])
-    return Terms(
-        f,
-        values.reshape(n, -1),
-        ticks.reshape(n, -1).astype(np.int64),
-        float(notes["threshold"]),
-        tuple(notes["names"]),
-    )
-
-
-def pack_gradients(gradients: TermGradients, notes: dict[str, Any]) -> Packed:
-    """Return gradients as numbers, and further notes on them."""
-    cost = float(gradients.cost)
-    return np.ravel(gradients.values), notes | {"cost": cost, "n_sim": whole_simulations(cost)}
-
-
-def unpack_gradients(numbers: FloatArray, notes: dict[str, Any], n: int) -> TermGradients:
-    """Return the gradients at n points from numbers and notes."""
-    return TermGradients(numbers.reshape(n, -1), float(notes["cost"]))

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import samplers
+from samplers.execution.executors.chunks import Chunk
+from samplers.execution.executors.packing import pack_gradients, pack_terms, unpack_gradients, unpack_terms
+from samplers.execution.executors.problem_work import ProblemWork
 from samplers.execution.journal import JournalFile
-from samplers.execution.journaled_evaluation import (
-    FirstCheck,
-    JournaledEvaluation,
-    pack_gradients,
-    pack_terms,
-    unpack_gradients,
-    unpack_terms,
-)
+from samplers.execution.journaled_evaluation import JournaledEvaluation
 from samplers.execution.record_file import JournalError
 from samplers.problem import FloatArray, TermGradients, Terms
 from tests.samplers.execution.test_journal import half_space, run
@@ -50,15 +45,11 @@ def test_an_f_that_is_random_can_be_continued(tmp_path: Path) -> None:
     assert run(tmp_path / "j", noisy, "mc") == first
 
 
-def evaluation_of(journal: JournalFile, again: Callable[[FloatArray], FloatArray]) -> JournaledEvaluation:
-    """Return the journaled first coordinate, checked by `again`."""
-    return JournaledEvaluation(journal, lambda x: (x[:, 0], {}), lambda x, known: None, FirstCheck(journal, again))
-
-
 def test_f_is_compared_from_its_least_value_to_its_largest_within_what_batches_round(tmp_path: Path) -> None:
-    x = np.arange(100.0)[:, None]
+    request = Chunk("f", (np.arange(100.0)[:, None],))
     journal = JournalFile.create(tmp_path / "j", {})
-    evaluation_of(journal, lambda x: x[:, 0]).evaluate(x)
+    whole = samplers.FunctionProblem(lambda x: x[:, 0], 1)
+    JournaledEvaluation(ProblemWork(whole, 0.0, "raise"), journal).evaluate(request)
     journal.close()
     for shift, refused in ((0.0, False), (0.09, False), (0.11, True)):  # a thousandth of the largest |f| is 0.099
         asked: list[FloatArray] = []
@@ -68,12 +59,13 @@ def test_f_is_compared_from_its_least_value_to_its_largest_within_what_batches_r
             return np.asarray(points[:, 0] + shift * (points[:, 0] == 99.0))
 
         journal = JournalFile.open(tmp_path / "j")
-        evaluation = evaluation_of(journal, again)
+        evaluation = JournaledEvaluation(ProblemWork(samplers.FunctionProblem(again, 1), 0.0, "raise"), journal)
         if refused:
             with pytest.raises(JournalError, match=r"f is 99\.11 at a point where .* has 99"):
-                evaluation.evaluate(x)
+                evaluation.evaluate(request)
         else:
-            assert np.array_equal(evaluation.evaluate(x), x[:, 0])
+            ((_, (f, _)),) = evaluation.evaluate(request)
+            assert np.array_equal(f, request.x[:, 0])
         assert len(asked) == 1 + refused
         assert (asked[0][0], asked[0][-1], len(asked[0])) == (0.0, 99.0, 8)
         journal.close()

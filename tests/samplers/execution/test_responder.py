@@ -5,8 +5,9 @@ import pytest
 
 import samplers
 from samplers.errors import EvaluationError
+from samplers.execution.executors.packing import join_terms, select_rows
 from samplers.execution.replicate import Replicate
-from samplers.execution.responder import Responder, hide_missing, join_terms, select_rows
+from samplers.execution.responder import Responder, hide_missing
 from samplers.execution.run import Run
 from samplers.method import (
     Goal,

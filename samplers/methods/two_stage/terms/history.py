@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from samplers.execution.responder import join_terms
+from samplers.execution.executors.packing import join_terms
 from samplers.methods.two_stage.terms.law import TermProposal
 from samplers.problem import FloatArray, Terms
 

@@ -1,0 +1,201 @@
+"""FuturesPool: chunks are computed by a pool of another library: concurrent.futures, loky, dask, mpi4py, submitit."""
+
+from __future__ import annotations
+
+import faulthandler
+import math
+import os
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Iterator
+from concurrent.futures import BrokenExecutor, CancelledError, Future
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from hashlib import blake2b
+from typing import Any
+
+from samplers.execution.executors.base import ExecutorError, Pool, Work, WorkerLost
+from samplers.execution.executors.chunks import Chunk, Index, Packed
+from samplers.execution.executors.seeding import SeededWork
+from samplers.execution.executors.transport import pack_work
+from samplers.execution.executors.worker import Reply, describe, make_portable
+from samplers.validation import check_number, check_whole
+
+POLL_SECONDS = 0.05
+"""Time between two looks at jobs that cannot tell when they are done, such as those of submitit."""
+MOST_RESTARTS = 1000
+"""Broken pools that are replaced in one run."""
+
+
+@dataclass(frozen=True)
+class FuturesPool:
+    """Computes chunks by any object whose `submit(function, *arguments)` returns a future or a job.
+
+    If a worker dies, most pools are of no use any more, and nobody knows whose chunk it was. Give a function that makes
+    a pool: a broken one is then replaced, and the chunks that were in flight are computed again, one at a time.
+
+    Raises:
+        ValueError: If an argument is not as described.
+
+    Example:
+        >>> from concurrent.futures import ThreadPoolExecutor
+        >>> import samplers
+        >>> problem = samplers.FunctionProblem(lambda x: 2.0 - x[:, 0], dim=2)
+        >>> with ThreadPoolExecutor(2) as threads:
+        ...     samplers.estimate(problem, "mc", seed=0, max_sim=1000, executor=threads).p
+        0.019
+    """
+
+    executor: Any
+    """The pool, or a function without arguments that makes one, which is then shut down at the end."""
+    workers: int | None = None
+    """Number of workers, where the pool does not tell."""
+    time_limit: float | None = None
+    """Longest time for a chunk [s]. The worker process ends itself then, which pools of threads do not allow."""
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if not (_has_submit(self.executor) or callable(self.executor)):
+            raise ValueError(f"Expected an object with submit, or a function that makes one, got {self.executor!r}.")
+        if self.workers is not None:
+            check_whole("workers", self.workers, 1)
+        if self.time_limit is not None:
+            check_number("time_limit", self.time_limit, 0.0, math.inf)
+
+    @contextmanager
+    def open(self, work: Work, seed: int) -> Iterator[Pool]:
+        """Yield the pool; one that was made here is shut down at the end of the block."""
+        pool = _ForeignPool(self, pack_work(SeededWork(work, seed)))
+        try:
+            yield pool
+        finally:
+            pool.close()
+
+
+class _ForeignPool:
+    """A pool of another library with the work to be done."""
+
+    blames = False
+
+    def __init__(self, settings: FuturesPool, packed: bytes) -> None:
+        self._settings, self._packed = settings, packed
+        self._key = blake2b(packed, digest_size=16).hexdigest()
+        self._made = not _has_submit(settings.executor)
+        self._pool: Any = settings.executor() if self._made else settings.executor
+        self._restarts = 0
+        self.workers = settings.workers or _count_workers(self._pool)
+        self.window = 2 * self.workers
+
+    def submit(self, index: Index, chunk: Chunk) -> Future[Packed]:
+        """Submit a chunk to the pool, to a new one if it is broken."""
+        future: Future[Packed] = Future()
+        arguments = (self._key, self._packed, os.getpid(), self._settings.time_limit, index, chunk)
+        try:
+            job = self._pool.submit(compute_in_worker, *arguments)
+        except (BrokenExecutor, RuntimeError) as error:
+            self._replace(error)
+            job = self._pool.submit(compute_in_worker, *arguments)
+        if hasattr(job, "add_done_callback"):
+            job.add_done_callback(lambda done: _pass_on(done, future))
+        else:
+            threading.Thread(target=_watch, args=(job, future), daemon=True).start()
+        return future
+
+    def close(self) -> None:
+        """Shut down a pool that was made here."""
+        if self._made:
+            with suppress(Exception):  # foreign, and perhaps broken
+                self._pool.shutdown(wait=False)
+
+    def _replace(self, error: Exception) -> None:
+        self._restarts += 1
+        if not self._made:
+            raise ExecutorError(
+                f"A worker of {type(self._pool).__name__} died, and with it the pool ({describe(error)}); give a "
+                "function that makes the pool (executor=lambda: ...), and a new one is made."
+            ) from error
+        if self._restarts > MOST_RESTARTS:
+            raise ExecutorError(f"{self._restarts} pools broke one after the other: {describe(error)}.") from error
+        self.close()
+        self._pool = self._settings.executor()
+
+
+def compute_in_worker(
+    key: str, packed: bytes, driver: int, time_limit: float | None, index: Index, chunk: Chunk
+) -> Reply:
+    """Compute a chunk in a worker of any kind, which keeps the last work that it was sent.
+
+    Args:
+        key: Digest of the work.
+        packed: The work.
+        driver: Number of the process that it must not end.
+        time_limit: Longest time [s], after which this process is ended.
+        index: Of the chunk.
+        chunk: The chunk.
+    """
+    if key not in _loaded:
+        import cloudpickle
+
+        try:
+            _loaded[key] = cloudpickle.loads(packed)
+        except BaseException as error:
+            return Reply(None, ExecutorError(f"A worker cannot load the problem ({describe(error)})."))
+        while len(_loaded) > 2:
+            _loaded.popitem(last=False)
+    limited = time_limit is not None and os.getpid() != driver
+    if limited:
+        assert time_limit is not None
+        faulthandler.dump_traceback_later(time_limit, exit=True)
+    try:
+        return Reply(_loaded[key](index, chunk))
+    except SystemExit as error:  # in a worker of somebody else's that is to live on
+        if os.getpid() == driver:
+            return Reply(None, RuntimeError(describe(error)))
+        os._exit(1)
+    except BaseException as error:
+        return Reply(None, make_portable(error))
+    finally:
+        if limited:
+            faulthandler.cancel_dump_traceback_later()
+
+
+_loaded: OrderedDict[str, Any] = OrderedDict()
+"""Work of this process by its digest."""
+
+
+def _pass_on(done: Any, future: Future[Packed]) -> None:
+    """Let a future have what a job has come to; what the pool itself raises means that a worker was lost."""
+    try:
+        reply: Reply = done.result()
+    except (Exception, CancelledError) as error:
+        future.set_exception(WorkerLost(describe(error).split("\n", 1)[0]))
+        return
+    if reply.error is not None:
+        future.set_exception(reply.error)
+    else:
+        assert reply.result is not None
+        future.set_result(reply.result)
+
+
+def _watch(job: Any, future: Future[Packed]) -> None:
+    while not job.done():
+        time.sleep(POLL_SECONDS)
+    _pass_on(job, future)
+
+
+def _has_submit(executor: Any) -> bool:
+    return callable(getattr(executor, "submit", None)) and not isinstance(executor, type)
+
+
+def _count_workers(pool: Any) -> int:
+    """Return the number of workers, as pools of several libraries tell it, or that of cores."""
+    for name in ("_max_workers", "num_workers"):
+        number = getattr(pool, name, None)
+        if isinstance(number, int) and number > 0:
+            return number
+    client = getattr(pool, "_client", None)  # of dask
+    if client is not None:
+        with suppress(Exception):
+            return max(1, sum(client.nthreads().values()))
+    return os.cpu_count() or 1

@@ -1,0 +1,139 @@
+"""Worker processes: the same bits with any number of them, however they die, and honest answers for bad rows."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import samplers
+from samplers.execution.executors.local_processes import LocalProcesses, describe_end
+from samplers.execution.progress import Progress
+from tests.samplers.execution.executors.egos import FAULTS, KillsItself, matrix, problem
+
+P = 0.15865525393145707
+
+
+def estimate(asked: samplers.FunctionProblem, executor: Any, n: int = 400, **more: Any) -> samplers.Estimate:
+    return samplers.estimate(asked, "mc", seed=3, max_sim=n, executor=executor, **{"on_error": "bound", **more})
+
+
+@pytest.mark.parametrize("method", ["mc", pytest.param("two-stage", marks=pytest.mark.slow)])
+def test_the_number_of_workers_changes_no_bit(method: str) -> None:
+    asked = samplers.FunctionProblem(matrix, dim=3)
+    whole = samplers.estimate(asked, method, seed=3, max_sim=400, executor=samplers.InProcess())
+    for workers in (1, 2) if method == "mc" else (2, 7):
+        assert samplers.estimate(asked, method, seed=3, max_sim=400, workers=workers) == whole
+
+
+def test_terms_and_gradients_come_from_workers_too() -> None:
+    normals = np.linalg.qr(np.random.default_rng(0).standard_normal((40, 2)))[0].T
+    asked = samplers.FunctionProblem(
+        dim=40, terms=lambda x: 3.5 - x @ normals.T, gradient=lambda x, term: -normals[term]
+    )
+    whole = samplers.estimate(asked, seed=1, max_sim=1500, executor=samplers.InProcess())
+    assert whole.p > 0
+    assert samplers.estimate(asked, seed=1, max_sim=1500, workers=2) == whole
+
+
+@pytest.mark.parametrize(
+    ("name", "n"),
+    [("crashing", 40), *(pytest.param(name, 150, marks=pytest.mark.slow) for name in sorted(FAULTS))],
+)
+def test_a_bad_row_has_no_outcome_and_p_is_bracketed(name: str, n: int) -> None:
+    """A row that fails counts as failing in the upper end alone, so that both truths lie between the ends."""
+    executor = LocalProcesses(2, time_limit=1.0, memory_limit=2.0**29)
+    result = estimate(problem(FAULTS[name]), executor, n)
+    x = np.random.default_rng(np.random.SeedSequence(3, spawn_key=(0,))).standard_normal((n, 3))
+    bad, failing = x[:, 1] > 2.0537, x[:, 0] >= 1.0
+    assert 1 <= bad.sum() <= 8
+    assert result.p == (bad | failing).mean()
+    assert result.n_sim == n
+    assert result.interval[0] < P < result.interval[1]
+    assert f"{bad.sum()} simulations gave no outcome" in " ".join(result.warnings)
+    words = {
+        "hanging": "no answer within 1 s",
+        "exiting": "ended with exit code",
+        "crashing": "ended by SIGSEGV",
+    }.get(name, "")
+    assert words in " ".join(result.remarks)
+
+
+def test_with_on_error_raise_a_bad_row_is_named() -> None:
+    with pytest.raises(samplers.EvaluationError, match=r"f has no outcome for row 0 .*ended by SIGSEGV"):
+        estimate(problem(FAULTS["crashing"]), LocalProcesses(2), on_error="raise")
+    with pytest.raises(samplers.EvaluationError, match=r"f raised for row 0 .*off the map"):
+        estimate(problem(FAULTS["raising"]), LocalProcesses(2), on_error="raise")
+
+
+def test_workers_that_are_killed_change_no_bit(tmp_path: Path) -> None:
+    seen: list[Progress] = []
+    result = estimate(problem(KillsItself(tmp_path, 20), chunk_size=2), LocalProcesses(2), 120, progress=seen.append)
+    assert result == estimate(problem(chunk_size=2), samplers.InProcess(), 120)
+    assert seen[-1].n_retries >= 3
+    assert seen[-1].workers == 2
+    assert [each.n_sim for each in seen] == sorted(each.n_sim for each in seen)
+
+
+def test_a_problem_that_cannot_be_sent_or_loaded_is_one_clear_line() -> None:
+    import threading
+
+    lock = threading.Lock()
+
+    def locked(x: Any) -> Any:
+        with lock:
+            return x[:, 0]
+
+    with pytest.raises(ValueError, match=r"^The problem cannot be sent to other processes \(TypeError"):
+        samplers.estimate(samplers.FunctionProblem(locked, 2), "mc", seed=1, max_sim=10, workers=1)
+
+    class Unloadable:
+        def __reduce__(self) -> Any:
+            return int, ("seven",)
+
+    broken = Unloadable()
+    asked = samplers.FunctionProblem(lambda x: x[:, 0] + len(str(broken)), 2)
+    with pytest.raises(samplers.ExecutorError, match="A worker process cannot load the problem"):
+        samplers.estimate(asked, "mc", seed=1, max_sim=10, workers=1)
+
+
+def test_workers_that_always_die_end_the_run() -> None:
+    def always(x: Any) -> Any:
+        import os
+
+        os._exit(7)
+
+    with pytest.raises(samplers.ExecutorError, match=r"No worker has computed anything: .* ended with exit code 7"):
+        samplers.estimate(
+            samplers.FunctionProblem(always, 2, vectorized=False), "mc", seed=1, max_sim=4, workers=2, on_error="bound"
+        )
+
+
+def test_nothing_is_left_running() -> None:
+    import subprocess
+
+    def children() -> int:
+        import os
+
+        listed = subprocess.run(["ps", "--ppid", str(os.getpid()), "-o", "args="], capture_output=True, text=True)
+        return sum("executors.worker" in line for line in listed.stdout.splitlines())
+
+    estimate(problem(), LocalProcesses(2), 20)
+    deadline = time.monotonic() + 20
+    while children() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert children() == 0
+
+
+def test_arguments() -> None:
+    for words, wrong in (
+        ("workers", {"workers": 0}),
+        ("time_limit", {"time_limit": 0}),
+        ("memory", {"memory_limit": -1}),
+    ):
+        with pytest.raises(ValueError, match=words):
+            LocalProcesses(**wrong)  # type: ignore[arg-type]
+    assert describe_end(-999) == "the process of the simulation was ended by signal 999"
