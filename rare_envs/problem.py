@@ -36,6 +36,11 @@ LIDAR_TILE = 512
 CAMERA_TILE = 128
 """Likewise with a policy that takes pictures: its layers' values for all of them have to fit into memory."""
 
+RULE_CHUNK = 4096
+"""Rollouts of a rule-based ego that a worker makes at once: enough for torch, and some for each of several workers."""
+POLICY_CHUNK = 256
+"""Likewise with a policy, which is slower."""
+
 AMBIGUOUS = (
     "the ego's actions 0 to 4 were taken as five accelerations; one that was trained in HighwayEnv needs "
     "action='meta' (--action meta)"
@@ -85,6 +90,7 @@ class DrivingProblem:
         measure: Any = "ttc",
         base: Any = None,
         noise: bool | str = True,
+        chunk_size: int | None = None,
         **make_kwargs: Any,
     ) -> None:
         """Check everything that can be checked before a simulation.
@@ -99,6 +105,9 @@ class DrivingProblem:
                 behind the others; "fixed", one sequence for all x, so that p is conditional on it; False, mean
                 actions. Scripts and most egos have none (policies act by their means), so there the three agree; the
                 noise of an ego behind a stack (`noisy:EGO`) goes with it.
+            chunk_size: Rollouts that a worker of `samplers.estimate(..., workers=2)` makes at once; None for 4096 with
+                rules and 256 with a policy, or what fits into memory. Few suit a slow ego. A network rounds differently
+                by batch, so another number gives other bits; another number of workers does not.
             **make_kwargs: Further keyword arguments of `gym.make` for this id. Without an `observation` the ego's
                 `observation_space` decides: a `Dict` names the kinds, the space of the lidar stands for "lidar", and
                 any other for "features".
@@ -108,6 +117,7 @@ class DrivingProblem:
         """
         self.env_id = env_id
         self.ego = ego
+        self._chunk_size = chunk_size
         self.world: World
         self.space: ScenarioSpace
         scenario = find_scenario(env_id)
@@ -275,6 +285,13 @@ class DrivingProblem:
         if self.world.uses_lidar or self.world.measurement.records:
             return LIDAR_TILE
         return POLICY_TILE if isinstance(self.driver, PolicyDriver) else RULE_TILE
+
+    @property
+    def chunk_size(self) -> int:
+        """Number of rollouts that a worker makes at once."""
+        if self._chunk_size is not None:
+            return self._chunk_size
+        return min(self.tile, POLICY_CHUNK if isinstance(self.driver, PolicyDriver) else RULE_CHUNK)
 
     def _simulate(self, x: NDArray[np.float64], failed_rows: dict[int, str] | None) -> NDArray[np.float64]:
         x = self.space.validate(np.atleast_2d(x))

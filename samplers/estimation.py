@@ -11,7 +11,7 @@ from samplers.analysis.refits import HasEnsemble, needs_ensemble_run
 from samplers.errors import OnError
 from samplers.execution.arguments import InputsOnly, RunArguments, check_attributes, check_problem, choose_seed
 from samplers.execution.base_check import find_base_fault
-from samplers.execution.executors.base import Executor, Pool
+from samplers.execution.executors.base import Executor, WorkerPool
 from samplers.execution.executors.chunks import find_chunk_size
 from samplers.execution.executors.problem_work import ProblemWork
 from samplers.execution.executors.selection import AnyExecutor, find_executor
@@ -152,7 +152,7 @@ def estimate(
 
 
 @contextmanager
-def _open_pool(executor: Executor | None, work: ProblemWork, arguments: RunArguments) -> Iterator[Pool | None]:
+def _open_pool(executor: Executor | None, work: ProblemWork, arguments: RunArguments) -> Iterator[WorkerPool | None]:
     """Yield the workers of a run; None without an executor."""
     if executor is None:
         yield None
@@ -178,7 +178,7 @@ class _Simulation:
 
     responder: Responder
     evaluation: JournaledEvaluation
-    pool: Pool | None
+    pool: WorkerPool | None
     conditions: "_StopConditions"
     progress: bool | Listener
 

@@ -347,7 +347,8 @@ class FunctionProblem:
         _check_points(x, self.dim)
         if self.f is None:
             return np.asarray(self.terms(x).f)
-        return one_per_row(self.f(x) if self.vectorized else [self.f(row) for row in x], len(x))
+        f: Any = self.f(x) if self.vectorized else [self.f(row) for row in x]
+        return one_per_row(f, len(x))
 
 
 @dataclass(frozen=True)

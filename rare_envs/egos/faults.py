@@ -215,7 +215,7 @@ class FaultTolerant(WrappedProblem):
         for row, reason in sorted(reasons.items()):
             fault = Fault(x[row].copy(), reason)
             if self._on_error == "raise":
-                raise EgoFault(f"The ego failed twice on x = {_format_x(fault.x)}: {fault.reason}")
+                raise EgoFault(f"The ego failed twice on x = {format_x(fault.x)}: {fault.reason}")
             self.faults.append(fault)
 
 
@@ -223,5 +223,11 @@ def _reasons_of_nan(f: NDArray[np.float64]) -> dict[int, str]:
     return dict.fromkeys(np.flatnonzero(np.isnan(f)).tolist(), "f is NaN")
 
 
-def _format_x(x: NDArray[np.float64]) -> str:
+def format_x(x: NDArray[np.float64]) -> str:
+    """Return scenario parameters x (d,) in one line.
+
+    Example:
+        >>> format_x(np.array([20.0, 15.0]))
+        '[20., 15.]'
+    """
     return np.array2string(x, precision=6, threshold=8, separator=", ", max_line_width=10**6)

@@ -23,6 +23,9 @@ from rare_envs.interop.simulation import (
 )
 from rare_envs.threads import use_one_thread
 
+DRIVES_AT_ONCE = 4
+"""Drives that a worker of `samplers.estimate(..., workers=2)` makes at once: each takes a good part of a second."""
+
 
 class HighwayEnvProblem:
     """P[f(X) <= gamma] for an ego in a HighwayEnv environment; fits `samplers.Problem`. See `highway_env_problem`.
@@ -36,6 +39,7 @@ class HighwayEnvProblem:
         workers: Number of processes.
         space: Names, units, bounds and base distribution of x.
         fixed: Parameters that are held, and their values.
+        chunk_size: Drives that a worker of an executor makes at once.
 
     Example:
         >>> problem = highway_env_problem("highway-fast-v0", config={"vehicles_count": 5}, fixed="highway_env")
@@ -58,7 +62,7 @@ class HighwayEnvProblem:
         """
         if isinstance(workers, bool) or not isinstance(workers, int) or workers < 1:
             raise ValueError(f"Expected workers of at least 1, got {workers!r}.")
-        self.env_id, self.ego, self.workers = task.env_id, ego, workers
+        self.env_id, self.ego, self.workers, self.chunk_size = task.env_id, ego, workers, DRIVES_AT_ONCE
         self._task = task
         if workers > 1:
             _pickle_task(task)

@@ -11,16 +11,18 @@ from pathlib import Path
 import samplers
 from agents.loading import find_ego_kind
 from rare_envs.egos.errors import EgoGone
-from rare_envs.egos.faults import FaultTolerant
 from rare_envs.study.analysis.recorded_question import note_question, open_question
 from rare_envs.study.analysis.repeatability import Repeatability, RowKeeper, check_repeatability
 from rare_envs.study.crash_kinds import CrashKinds, classify_failures
 from rare_envs.study.errors import BadInput, output_folder
-from rare_envs.study.journal import JOURNAL, JournaledProblem, begin_journal, check_same_files, continue_journal
+from rare_envs.study.execution.simulated_problem import SimulatedProblem, open_problem
+from rare_envs.study.journal import JOURNAL, begin_journal, check_same_files, continue_journal
 from rare_envs.study.question import Study, prepare
 from rare_envs.study.report import Report
 from rare_envs.study.run_directory import check_no_results, remove_results, write_run
+from samplers.execution.executors import Executor, ExecutorError
 from samplers.execution.journal import JournalFile
+from samplers.execution.progress import Pace, open_listener
 
 
 class RunInterrupted(KeyboardInterrupt):
@@ -45,6 +47,7 @@ def run(
     study: Study,
     progress: bool | Callable[[samplers.Progress], None] = False,
     journal: JournalFile | None = None,
+    executor: Executor | None = None,
 ) -> Report:
     """Answer a question.
 
@@ -52,12 +55,14 @@ def run(
         study: From `prepare`.
         progress: True for a bar on standard error, or a function, as in `samplers.estimate`.
         journal: Keeps finished simulations, and has those of an interrupted run.
+        executor: Where simulations are made, such as `samplers.LocalProcesses(2)`; None for here. The answer does not
+            depend on it, see `chunk` of `Question`.
 
     Returns:
         The report.
 
     Raises:
-        BadInput: The ego failed on some x, or is gone.
+        BadInput: The ego failed on some x, or is gone; or the executor cannot work.
         RunInterrupted: It was interrupted; this has the answer from the simulations made so far.
 
     Example:
@@ -71,23 +76,16 @@ def run(
         >>> report.estimate.p, report.estimate.n_sim
         (0.021, 1000)
     """
-    question, start = study.question, time.perf_counter()
-    problem = FaultTolerant(study.problem, question.on_error)
-    journaled = JournaledProblem(problem, journal, study.problem.tile, question.on_error) if journal else problem
-    keeper = RowKeeper(journaled, question.gamma)
+    start, study = time.perf_counter(), settle_chunk(study, executor)
     try:
-        estimate = samplers.estimate(
-            keeper,
-            study.method,
-            **asdict(question.run_arguments),
-            progress=progress,
-            ensemble_run=question.ensemble_run,
-        )
+        with open_problem(study, journal, executor) as problem:
+            keeper = RowKeeper(problem, study.question.gamma)
+            estimate = _estimate(study, keeper, problem, progress)
     except EgoGone as error:
         raise BadInput(
             f"{error}{'' if journal else ' With --out finished simulations would have been kept.'}"
         ) from error
-    except ValueError as error:
+    except (ValueError, ExecutorError) as error:
         raise BadInput(error) from error
     except samplers.EstimationInterrupted as stopped:
         kinds = CrashKinds(unknown="the run was interrupted")
@@ -98,6 +96,34 @@ def run(
     kinds = classify_failures(study.problem, estimate)
     again = _check_repeatability(study, keeper)
     return Report(study, estimate, seconds, tuple(problem.faults), kinds, problem.n_retried, again)
+
+
+def settle_chunk(study: Study, executor: Executor | None) -> Study:
+    """Return a study whose question says how many simulations workers make at once, if there are any."""
+    if executor is None or study.question.chunk is not None:
+        return study
+    return replace(study, question=replace(study.question, chunk=study.problem.chunk_size))
+
+
+def _estimate(
+    study: Study,
+    keeper: RowKeeper,
+    problem: SimulatedProblem,
+    progress: bool | Callable[[samplers.Progress], None],
+) -> samplers.Estimate:
+    """Run the method of a study; with workers progress is told chunk by chunk."""
+    question = study.question
+    with open_listener(progress, question.max_sim) as listener:
+        if problem.workers and listener is not None:
+            pace = Pace(listener, problem.workers, problem.evaluation)
+            problem.evaluation.on_chunk, listener = pace.on_chunk, pace.on_progress
+        return samplers.estimate(
+            keeper,
+            study.method,
+            **asdict(question.run_arguments),
+            progress=listener or False,
+            ensemble_run=question.ensemble_run,
+        )
 
 
 def _check_repeatability(study: Study, keeper: RowKeeper) -> Repeatability | None:
@@ -115,7 +141,9 @@ def _check_repeatability(study: Study, keeper: RowKeeper) -> Repeatability | Non
         return None
 
 
-def run_into(folder: Path, study: Study, progress: bool = False, force: bool = False) -> Report:
+def run_into(
+    folder: Path, study: Study, progress: bool = False, force: bool = False, executor: Executor | None = None
+) -> Report:
     """Answer a question and write the answer; finished simulations are kept if the run is interrupted.
 
     Args:
@@ -123,6 +151,7 @@ def run_into(folder: Path, study: Study, progress: bool = False, force: bool = F
         study: From `rare_envs.study.prepare`.
         progress: Show a bar on standard error.
         force: Replace a run that the folder has, finished or not.
+        executor: As in `run`.
 
     Returns:
         The report.
@@ -143,13 +172,14 @@ def run_into(folder: Path, study: Study, progress: bool = False, force: bool = F
         ...     sorted(path.name for path in Path(folder).iterdir())
         ['failures.csv', 'plot.png', 'result.json']
     """
+    study = settle_chunk(study, executor)
     with output_folder(folder):
         if not force and not (folder / JOURNAL).exists():
             check_no_results(folder)
         with closing(begin_journal(folder, study.question, force)) as journal:
             remove_results(folder)
             note_question(study.question)
-            return _run(folder, study, journal, progress)
+            return _run(folder, study, journal, progress, executor)
 
 
 def resume(
@@ -159,6 +189,7 @@ def resume(
     trust: bool = False,
     progress: bool = False,
     mend: bool = False,
+    executor: Executor | None = None,
 ) -> Report:
     """Continue an interrupted run; the answer is that of an undisturbed one.
 
@@ -169,6 +200,7 @@ def resume(
         trust: Let the ego's file run code, as the run was allowed to, and code that a run from elsewhere names.
         progress: Show a bar on standard error.
         mend: Of a damaged journal, keep the simulations before the damage.
+        executor: As in `run`; it need not be that with which the run was begun.
 
     Raises:
         BadInput: There is no unfinished run, or it cannot be continued: its journal is damaged or in use, or a file
@@ -189,13 +221,13 @@ def resume(
             raise BadInput(f"Expected --ego for one whose address has changed only; the run has {question.ego!r}.")
         question = replace(question, ego=ego or question.ego, on_error=on_error or question.on_error)
         check_same_files(journal, question)
-        return _run(folder, prepare(question), journal, progress)
+        return _run(folder, prepare(question), journal, progress, executor)
 
 
-def _run(folder: Path, study: Study, journal: JournalFile, progress: bool) -> Report:
+def _run(folder: Path, study: Study, journal: JournalFile, progress: bool, executor: Executor | None = None) -> Report:
     target = folder.absolute()  # an ego may change the working directory
     try:
-        report = run(study, progress, journal)
+        report = run(study, progress, journal, executor)
         _write(target, report)
     except UnwrittenResults as error:
         raise UnwrittenResults(f"{error}{_resume_hint(journal, folder)}", error.report) from error

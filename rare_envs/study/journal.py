@@ -8,37 +8,15 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
-from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, TypeVar
-
-import numpy as np
-from numpy.typing import NDArray
 
 from agents.loading import strip_prefixes
-from rare_envs.egos.faults import Fault, FaultTolerant
-from rare_envs.egos.wrapped_problem import WrappedProblem
 from rare_envs.study.errors import BadInput
 from rare_envs.study.question import Question, read_question
 from rare_envs.version import __version__
-from samplers.execution.journal import JournalFile, JournalRecord, digest_points
-from samplers.execution.journaled_evaluation import (
-    FirstCheck,
-    JournaledEvaluation,
-    Packed,
-    digest_request,
-    keep_answer,
-    pack_gradients,
-    pack_terms,
-    unpack_gradients,
-    unpack_terms,
-)
+from samplers.execution.journal import JournalFile
 from samplers.execution.record_file import JournalError
-from samplers.execution.responder import join_terms
-from samplers.problem import FloatArray, TermGradients, Terms
-
-_T = TypeVar("_T")
 
 JOURNAL = "journal.bin"
 """Name of the file in the folder of a run."""
@@ -149,82 +127,3 @@ def _find_module(name: str) -> str | None:
     except (ImportError, ValueError):
         return None
     return None if spec is None else spec.origin
-
-
-class JournaledProblem(WrappedProblem):
-    """A problem whose finished simulations are kept; see `samplers.Problem`."""
-
-    def __init__(self, problem: FaultTolerant, journal: JournalFile, tile: int, on_error: str) -> None:
-        """Wrap a problem.
-
-        Args:
-            problem: The problem.
-            journal: Keeps what has been simulated.
-            tile: Simulations at once. Those of a tile are finished together.
-            on_error: The rule of the problem for scenarios on which the ego fails.
-        """
-        super().__init__(problem)
-        self._journal, self._tile = journal, tile
-        again = FaultTolerant(problem.problem, on_error)
-        self._check = FirstCheck(journal, again.evaluate)
-        self._journaled = JournaledEvaluation(journal, self._simulate, self._restore, self._check)
-
-    def evaluate(self, x: FloatArray) -> FloatArray:
-        """Return f from the journal, or simulate: (n, d) -> (n,)."""
-        # scenarios are simulated in single precision
-        return np.concatenate(
-            [self._journaled.evaluate(tile, digest_points(tile.astype(np.float32))) for tile in self._split(x)]
-        )
-
-    def _split(self, x: FloatArray) -> list[FloatArray]:
-        return [x[first : first + self._tile] for first in range(0, max(len(x), 1), self._tile)]
-
-    def _terms(self, x: FloatArray, gamma: float = 0.0) -> Terms:
-        """Return the terms of scenarios x (n, d) from the journal, or simulate."""
-        return join_terms([self._kept_terms(tile, gamma) for tile in self._split(x)])
-
-    def _kept_terms(self, x: FloatArray, gamma: float) -> Terms:
-        def compute() -> Packed:
-            terms, notes = self._note(lambda: self.problem.terms(x, gamma))
-            return pack_terms(terms, notes)
-
-        def restore(known: JournalRecord) -> None:
-            f = unpack_terms(known.f, known.notes, len(x)).f
-            self._check(x, f)
-            self._restore_faults(x[np.isnan(f)], known.notes)
-
-        asked = digest_request("terms", x.astype(np.float32), np.array(gamma))
-        return unpack_terms(*keep_answer(self._journal, asked, compute, restore), len(x))
-
-    def _gradient(
-        self, x: FloatArray, term: NDArray[np.int64], ticks: NDArray[np.int64], gamma: float = 0.0
-    ) -> TermGradients:
-        """Return the gradients of one term of each of the scenarios x (n, d) from the journal, or differentiate."""
-
-        def compute() -> Packed:
-            gradients, notes = self._note(lambda: self.problem.gradient(x, term, ticks, gamma))
-            return pack_gradients(gradients, notes)
-
-        def restore(known: JournalRecord) -> None:
-            self._restore_faults(x[:0], known.notes)
-
-        asked = digest_request("gradient", x.astype(np.float32), term, ticks, np.array(gamma))
-        return unpack_gradients(*keep_answer(self._journal, asked, compute, restore), len(x))
-
-    def _simulate(self, x: FloatArray) -> tuple[FloatArray, dict[str, Any]]:
-        return self._note(lambda: self.problem.evaluate(x))
-
-    def _restore(self, x: FloatArray, known: JournalRecord) -> None:
-        self._restore_faults(x[np.isnan(known.f)], known.notes)
-
-    def _note(self, simulate: Callable[[], _T]) -> tuple[_T, dict[str, Any]]:
-        """Return what was simulated, and notes on the faults that were met."""
-        before, retried = len(self.problem.faults), self.problem.n_retried
-        found = simulate()
-        reasons = [fault.reason for fault in self.problem.faults[before:]]
-        return found, {"reasons": reasons, "n_retried": self.problem.n_retried - retried}
-
-    def _restore_faults(self, lost: FloatArray, notes: dict[str, Any]) -> None:
-        """Take up the faults on scenarios (k, d) without an outcome from notes."""
-        self.problem.faults += [Fault(row.copy(), reason) for row, reason in zip(lost, notes["reasons"], strict=True)]
-        self.problem.n_retried += notes["n_retried"]

@@ -25,6 +25,7 @@ from rare_envs.simulation.rollout import drive
 from rare_envs.study.errors import BadInput, as_bad_input
 from samplers.errors import OnError
 from samplers.execution.arguments import RunArguments
+from samplers.validation import check_whole
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,6 +62,8 @@ class Question:
         also_under: Further base distributions, names or files joined by commas, under which p is stated too.
         on_error: Treatment of scenarios on which the ego fails twice: "raise" ends the run, "failure" counts them as
             failing, "bound" as failing in p and the upper end of the interval, but not in the lower end.
+        chunk: Simulations at once; None for as many as suit one process. A network rounds differently by batch, so this
+            number, unlike that of workers, belongs to the question; with workers it is `DrivingProblem.chunk_size`.
         sensitivity: Whether the report says what p is sensitive to; that takes no simulations.
         max_p: Limit that p is compared with, or None. The intervals of the answer have then ends at the one-sided
             `gate_confidence`, a coverage of twice that less 1.
@@ -101,6 +104,7 @@ class Question:
     max_p: float | None = None
     gate_confidence: float = 0.95
     given_base: bool = False
+    chunk: int | None = None
 
     @property
     def run_arguments(self) -> RunArguments:
@@ -139,6 +143,8 @@ class Question:
             ValueError: An argument of `samplers.estimate` is out of range, or there is no such method or environment.
         """
         _ = self.run_arguments
+        if self.chunk is not None:
+            check_whole("chunk", self.chunk, 1)
         method = samplers.get_method(self.method)
         find_scenario(self.env_id)
         return method
@@ -195,6 +201,8 @@ class Study:
     method: samplers.Stepping
     other_bases: Mapping[str, Distribution] = field(default_factory=dict)
     """Distributions of x under the other base distributions that the question names."""
+    ego_was_given: bool = False
+    """Whether the ego is an object of the caller's, and not the one that the question names."""
 
     @cached_property
     def base(self) -> Distribution:
@@ -238,6 +246,7 @@ def prepare(question: Question, ego: Any = None) -> Study:
     """
     with as_bad_input(ValueError, OSError), np.errstate():  # what an ego does to NumPy's errors ends here
         method = question.check()
+        given = ego is not None
         if ego is None:
             ego = agents.load_ego(question.ego, algo=question.algo, trust=question.trust, stats=question.stats)
         problem = build_problem(question, ego)
@@ -245,7 +254,7 @@ def prepare(question: Question, ego: Any = None) -> Study:
         names = [name.strip() for name in (question.also_under or "").split(",") if name.strip()]
         others = {name: study.under(name).problem.base for name in names}
     problem.varies = problem.varies or _answers_vary(problem)
-    return replace(study, other_bases=others)
+    return replace(study, other_bases=others, ego_was_given=given)
 
 
 def build_problem(question: Question, ego: Any) -> DrivingProblem:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from samplers.execution.arguments import choose_seed
-from samplers.execution.executors.base import Pool, Work
+from samplers.execution.executors.base import Work, WorkerPool
 from samplers.execution.executors.chunks import Chunk, Packed
 from samplers.execution.executors.dispatch import Dispatcher
 from samplers.execution.journal import JournalFile, JournalRecord
@@ -42,7 +42,7 @@ class JournaledEvaluation:
     """
 
     def __init__(
-        self, work: Work, journal: JournalFile | None = None, pool: Pool | None = None, size: int | None = None
+        self, work: Work, journal: JournalFile | None = None, pool: WorkerPool | None = None, size: int | None = None
     ) -> None:
         self._work, self._journal, self._size = work, journal, size
         self._dispatcher = None if pool is None else Dispatcher(pool, work)

@@ -44,7 +44,7 @@ Compute = Callable[[Index, Chunk], Packed]
 """Work with the random generators of a chunk, see `samplers.execution.executors.seeding`."""
 
 
-class Pool(Protocol):
+class WorkerPool(Protocol):
     """Workers that are ready to compute chunks of one run."""
 
     @property
@@ -77,7 +77,7 @@ class Executor(Protocol):
         True
     """
 
-    def open(self, work: Work, seed: int) -> AbstractContextManager[Pool]:
+    def open(self, work: Work, seed: int) -> AbstractContextManager[WorkerPool]:
         """Return workers for a run, which are gone at the end of the block.
 
         Args:

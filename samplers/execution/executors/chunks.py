@@ -23,6 +23,7 @@ class Chunk:
     """Rows of a request.
 
     Example:
+        >>> import numpy as np
         >>> chunk = Chunk("f", (np.arange(5.0)[:, None],))
         >>> [len(part) for part in chunk.split(2)]
         [2, 2, 1]

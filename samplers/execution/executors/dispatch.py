@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass, field
 
-from samplers.execution.executors.base import ExecutorError, Pool, Work, WorkerLost
+from samplers.execution.executors.base import ExecutorError, Work, WorkerLost, WorkerPool
 from samplers.execution.executors.chunks import Chunk, Index, Packed
 
 ATTEMPTS = 3
@@ -40,7 +40,7 @@ class Dispatcher:
         n_lost: Rows that no worker survived.
     """
 
-    def __init__(self, pool: Pool, work: Work) -> None:
+    def __init__(self, pool: WorkerPool, work: Work) -> None:
         self._pool, self._work = pool, work
         self._proven = False  # a chunk has been computed
         self.n_retries = self.n_lost = 0

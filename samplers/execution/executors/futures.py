@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from hashlib import blake2b
 from typing import Any
 
-from samplers.execution.executors.base import ExecutorError, Pool, Work, WorkerLost
+from samplers.execution.executors.base import ExecutorError, Work, WorkerLost, WorkerPool
 from samplers.execution.executors.chunks import Chunk, Index, Packed
 from samplers.execution.executors.seeding import SeededWork
 from samplers.execution.executors.transport import pack_work
@@ -64,7 +64,7 @@ class FuturesPool:
             check_number("time_limit", self.time_limit, 0.0, math.inf)
 
     @contextmanager
-    def open(self, work: Work, seed: int) -> Iterator[Pool]:
+    def open(self, work: Work, seed: int) -> Iterator[WorkerPool]:
         """Yield the pool; one that was made here is shut down at the end of the block."""
         pool = _ForeignPool(self, pack_work(SeededWork(work, seed)))
         try:
@@ -151,7 +151,7 @@ def compute_in_worker(
         return Reply(_loaded[key](index, chunk))
     except SystemExit as error:  # in a worker of somebody else's that is to live on
         if os.getpid() == driver:
-            return Reply(None, RuntimeError(describe(error)))
+            return Reply(None, WorkerLost(describe(error)))
         os._exit(1)
     except BaseException as error:
         return Reply(None, make_portable(error))
@@ -197,5 +197,5 @@ def _count_workers(pool: Any) -> int:
     client = getattr(pool, "_client", None)  # of dask
     if client is not None:
         with suppress(Exception):
-            return max(1, sum(client.nthreads().values()))
+            return max(1, int(sum(client.nthreads().values())))
     return os.cpu_count() or 1

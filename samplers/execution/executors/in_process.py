@@ -7,7 +7,7 @@ from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from samplers.execution.executors.base import Compute, Pool, Work
+from samplers.execution.executors.base import Compute, Work, WorkerPool
 from samplers.execution.executors.chunks import Chunk, Index, Packed
 from samplers.execution.executors.seeding import SeededWork
 
@@ -24,7 +24,7 @@ class InProcess:
     """
 
     @contextmanager
-    def open(self, work: Work, seed: int) -> Iterator[Pool]:
+    def open(self, work: Work, seed: int) -> Iterator[WorkerPool]:
         """Yield this process as a pool of one."""
         yield SerialPool(SeededWork(work, seed))
 

@@ -16,14 +16,14 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import IO, Any
 
-from samplers.execution.executors.base import Pool, Work, WorkerLost
+from samplers.execution.executors.base import Work, WorkerLost, WorkerPool
 from samplers.execution.executors.chunks import Chunk, Index, Packed
 from samplers.execution.executors.seeding import SeededWork
 from samplers.execution.executors.transport import pack_work
 from samplers.execution.executors.worker import Reply
 from samplers.validation import check_number, check_whole
 
-START_SECONDS = 300.0
+LOAD_SECONDS = 300.0
 """Longest time that a worker may take to import and to load the problem."""
 END_SECONDS = 5.0
 """Longest time between the end of a worker's streams and its own."""
@@ -66,7 +66,7 @@ class LocalProcesses:
                 check_number(name, value, 0.0, math.inf)
 
     @contextmanager
-    def open(self, work: Work, seed: int) -> Iterator[Pool]:
+    def open(self, work: Work, seed: int) -> Iterator[WorkerPool]:
         """Yield the processes; each starts with its first chunk, and all are killed at the end of the block."""
         n = self.workers or os.cpu_count() or 1
         memory = None if self.memory_limit is None else int(self.memory_limit)
@@ -168,7 +168,7 @@ class _Process:
 
     def start(self, content: bytes) -> None:
         """Send the work and wait until it is loaded."""
-        self._exchange(content, START_SECONDS)
+        self._exchange(content, LOAD_SECONDS)
 
     def compute(self, index: Index, chunk: Chunk, time_limit: float | None) -> Packed:
         """Return the result of a chunk.

@@ -20,6 +20,7 @@ from samplers.execution.executors.packing import (
 )
 from samplers.execution.fault_isolation import FaultIsolation, RowNumbers
 from samplers.execution.journal import digest_points, digest_request
+from samplers.method import whole_simulations
 from samplers.problem import TermGradients, Terms
 
 
@@ -116,6 +117,8 @@ class ProblemWork:
 def join_parts(parts: list[tuple[Chunk, Packed]]) -> Packed:
     """Return the result of a chunk from those of its parts; numbers in their notes are added, lists joined."""
     kind, notes = parts[0][0].kind, join_notes([packed[1] for _, packed in parts])
+    if kind == "gradient":
+        notes["n_sim"] = whole_simulations(notes["cost"])
     if kind != "terms":
         return np.concatenate([packed[0] for _, packed in parts]), notes
     terms, n_known = unpack_all_terms([(len(part), packed) for part, packed in parts], None)

@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Any
 
-from samplers.execution.executors.base import Pool, Work, WorkerLost
+from samplers.execution.executors.base import Work, WorkerLost, WorkerPool
 from samplers.execution.executors.chunks import Chunk, Index, Packed
 from samplers.execution.executors.futures import compute_in_worker
 from samplers.execution.executors.seeding import SeededWork
@@ -58,7 +58,7 @@ class RayCluster:
             check_number("time_limit", self.time_limit, 0.0, math.inf)
 
     @contextmanager
-    def open(self, work: Work, seed: int) -> Iterator[Pool]:
+    def open(self, work: Work, seed: int) -> Iterator[WorkerPool]:
         """Yield the cluster; one that was started here ends with the block.
 
         Raises:

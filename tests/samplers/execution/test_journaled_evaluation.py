@@ -9,7 +9,6 @@ import pytest
 
 import samplers
 from samplers.execution.executors.chunks import Chunk
-from samplers.execution.executors.packing import pack_gradients, pack_terms, unpack_gradients, unpack_terms
 from samplers.execution.executors.problem_work import ProblemWork
 from samplers.execution.journal import JournalFile
 from samplers.execution.journaled_evaluation import JournaledEvaluation
@@ -128,19 +127,6 @@ def test_a_journal_of_other_terms_is_refused(tmp_path):
         samplers.estimate(Series(5), seed=1, max_sim=2000, journal=tmp_path / "journal")
     with pytest.raises(JournalError, match="asks for other points"):
         samplers.estimate(Series(), seed=1, max_sim=3000, journal=tmp_path / "journal")
-
-
-def test_answers_come_back_as_they_were(rng):
-    terms = Terms(rng.random(5), rng.random((5, 3)), rng.integers(0, 90, (5, 3)), 0.25, ("a", "b", "c"))
-    terms.f[2] = np.nan
-    again = unpack_terms(*pack_terms(terms, {"n_retried": 4}), 5)
-    for name in ("f", "values", "ticks", "threshold", "names"):
-        np.testing.assert_array_equal(getattr(again, name), getattr(terms, name))
-    assert again.ticks.dtype == np.int64
-    gradients = TermGradients(rng.random((5, 7)), 12.5)
-    back = unpack_gradients(*pack_gradients(gradients, {}), 5)
-    np.testing.assert_array_equal(back.values, gradients.values)
-    assert back.cost == 12.5
 
 
 def test_a_journal_counts_simulations_not_numbers(tmp_path):

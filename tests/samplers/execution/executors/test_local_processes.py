@@ -71,9 +71,9 @@ def test_with_on_error_raise_a_bad_row_is_named() -> None:
 
 def test_workers_that_are_killed_change_no_bit(tmp_path: Path) -> None:
     seen: list[Progress] = []
-    result = estimate(problem(KillsItself(tmp_path, 20), chunk_size=2), LocalProcesses(2), 120, progress=seen.append)
-    assert result == estimate(problem(chunk_size=2), samplers.InProcess(), 120)
-    assert seen[-1].n_retries >= 3
+    result = estimate(problem(KillsItself(tmp_path, 20), chunk_size=2), LocalProcesses(2), 70, progress=seen.append)
+    assert result == estimate(problem(chunk_size=2), samplers.InProcess(), 70)
+    assert seen[-1].n_retries >= 2
     assert seen[-1].workers == 2
     assert [each.n_sim for each in seen] == sorted(each.n_sim for each in seen)
 
@@ -108,7 +108,7 @@ def test_workers_that_always_die_end_the_run() -> None:
 
     with pytest.raises(samplers.ExecutorError, match=r"No worker has computed anything: .* ended with exit code 7"):
         samplers.estimate(
-            samplers.FunctionProblem(always, 2, vectorized=False), "mc", seed=1, max_sim=4, workers=2, on_error="bound"
+            samplers.FunctionProblem(always, 2, vectorized=False), "mc", seed=1, max_sim=1, workers=1, on_error="bound"
         )
 
 

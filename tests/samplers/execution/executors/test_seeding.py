@@ -1,0 +1,30 @@
+"""A simulation that draws by global generators draws the same for its chunk, and disturbs nobody else's."""
+
+import random
+
+import numpy as np
+import torch
+
+from samplers.execution.executors.seeding import seed_generators
+
+
+def draw():
+    return random.random(), np.random.random(), float(torch.rand(1))  # noqa: NPY002
+
+
+def test_the_seed_and_the_index_decide():
+    seen = []
+    for seed, index in ((1, (0,)), (1, (0,)), (1, (1,)), (2, (0,)), (1, (0, 3))):
+        with seed_generators(seed, index):
+            seen.append(draw())
+    assert seen[0] == seen[1]
+    assert len(set(seen)) == 4
+
+
+def test_the_generators_go_on_as_before():
+    random.seed(5), np.random.seed(5), torch.manual_seed(5)  # noqa: NPY002
+    expected = draw()
+    random.seed(5), np.random.seed(5), torch.manual_seed(5)  # noqa: NPY002
+    with seed_generators(1, (0,)):
+        draw()
+    assert draw() == expected

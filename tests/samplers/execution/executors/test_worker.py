@@ -1,0 +1,31 @@
+"""What a worker answers, and what it sends of errors that cannot be sent."""
+
+import pytest
+
+from samplers.errors import EvaluationError
+from samplers.execution.executors.worker import describe, make_portable, reply_to
+
+
+class Odd(Exception):
+    def __init__(self, first, second):
+        super().__init__(f"{first} and {second}")
+
+
+def test_errors_come_back_as_they_are_or_in_words():
+    portable = make_portable(EvaluationError("no number"))
+    assert type(portable) is EvaluationError
+    assert str(portable) == "no number"
+    odd = make_portable(Odd("a", "b"))  # pickled with one argument, it cannot be made again
+    assert type(odd) is RuntimeError
+    assert str(odd) == "Odd: a and b" == describe(Odd("a", "b"))
+
+
+def test_an_exit_is_one_and_other_errors_are_answers():
+    def compute(index, chunk):
+        raise chunk
+
+    assert str(reply_to(compute, (0,), ArithmeticError("off")).error) == "off"
+    assert isinstance(reply_to(compute, (0,), KeyboardInterrupt()).error, KeyboardInterrupt)
+    with pytest.raises(SystemExit):
+        reply_to(compute, (0,), SystemExit(3))
+    assert reply_to(lambda index, chunk: (index, chunk), (1,), "x").result == ((1,), "x")
