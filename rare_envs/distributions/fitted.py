@@ -15,7 +15,7 @@ from rare_envs.distributions.coordinate_mixture import CoordinateMixture
 from rare_envs.distributions.frequency import EventFrequency
 from rare_envs.distributions.mixture_conditionals import COMPONENT_FIELDS
 from rare_envs.distributions.parameters import DistributionParameter, HasParameters
-from rare_envs.distributions.pooled_mixture import pool_mixtures
+from rare_envs.distributions.pooled_mixture import number_coordinates, pool_mixtures
 from rare_envs.distributions.reading import (
     FileDistribution,
     read_distribution,
@@ -169,6 +169,11 @@ class FittedDistribution:
     def fitted_to(self) -> str:
         """The events in words, such as "38 + 15 events of 17 scenes"."""
         return self.events.describe()
+
+    @property
+    def refit_groups(self) -> tuple[int, ...]:
+        """Number of the coordinates of each refit; 0 are those of `distribution`."""
+        return number_coordinates([self.distribution, *self.refits])[1:]
 
     def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw independent points, shape (n, d)."""

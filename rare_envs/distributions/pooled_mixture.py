@@ -59,8 +59,19 @@ def pool_mixtures(mixtures: Sequence[BoxMixture]) -> CoordinateMixture | PooledM
     return PooledMixture(_align([pool.coordinates for pool in pools], pools), shares)
 
 
+def number_coordinates(distributions: Sequence[object]) -> tuple[int, ...]:
+    """Return a number for the coordinates of each distribution, 0 for those of the first; equal ones have the same.
+
+    The order in which columns are taken makes no other coordinates, and distributions that have none are all alike.
+    """
+    kinds = [getattr(each, "coordinates", None) for each in distributions]
+    names = [None if each is None else json.dumps(each.to_dict()["coordinates"]) for each in kinds]
+    numbers = {name: number for number, name in enumerate(dict.fromkeys(names))}
+    return tuple(numbers[name] for name in names)
+
+
 def _without_names(coordinates: Coordinates) -> tuple[object, ...]:
-    """Return what tells coordinates apart: kinds and order of the columns."""
+    """Return what tells coordinates apart for a pool: kinds and order of the columns."""
     kinds = coordinates.to_dict()["coordinates"]
     return (kinds, coordinates.columns)
 

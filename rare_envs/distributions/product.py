@@ -180,15 +180,23 @@ class FittedProduct(FittedDistribution):
         """Which columns are noise, shape (d,): samplers may leave these as they are."""
         return cast(BlockDistribution, self.distribution).noise
 
+    @property
+    def fitted_part(self) -> FittedDistribution:
+        """The one that is fitted."""
+        return next(each for each in self.parts if isinstance(each, FittedDistribution))
+
+    @property
+    def refit_groups(self) -> tuple[int, ...]:
+        """Number of the coordinates of each refit of the fitted one."""
+        return self.fitted_part.refit_groups
+
     def ensemble(self) -> Distribution:
         """Return the blocks with the ensemble of the fitted one in its place."""
-        fitted = next(each for each in self.parts if isinstance(each, FittedDistribution))
-        return _join_with(self.parts, fitted.ensemble())
+        return _join_with(self.parts, self.fitted_part.ensemble())
 
     def sibling(self, name: str) -> Distribution:
         """Return the blocks with another base distribution in place of the fitted one."""
-        fitted = next(each for each in self.parts if isinstance(each, FittedDistribution))
-        return _join_with(self.parts, fitted.sibling(name))
+        return _join_with(self.parts, self.fitted_part.sibling(name))
 
 
 def join_independent(*distributions: Distribution) -> Distribution:

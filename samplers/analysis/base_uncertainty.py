@@ -4,10 +4,11 @@ With p_b the probability under refit b, s the standard deviation of log p_b and 
 
     p exp(-t S) to p exp(t S),    S^2 = s^2 + cov^2 + 0.2^2.
 
-Percentiles of the p_b are not used: refits repeat the bias of the fit, and 30 of them do not reach the outer 2.5 %, so
-that percentiles cover 76 and 82 % (38 and 400 events) and miss on the unsafe side. This interval covers 93 and 92 %
-where the family of distributions is the true one (`benchmarks/uncertainty/base_coverage.py`). Another family is not
-covered by it.
+Where refits choose their family anew, each family has such an interval, and the whole reaches from the lowest end to
+the highest (`samplers.analysis.refit_groups`). Percentiles of the p_b are not used: refits repeat the bias of the fit,
+and 30 of them do not reach the outer 2.5 %, so that percentiles cover 76 and 82 % (38 and 400 events) and miss on the
+unsafe side. This interval covers 93 and 92 % where the family of distributions is the true one
+(`benchmarks/uncertainty/base_coverage.py`). Another family is not covered by it.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import numpy as np
 from scipy import stats
 
 from samplers.analysis.base import WeightedEstimate, no_outcome_weight, require_sample
+from samplers.analysis.refit_groups import find_log_ends, read_groups
 from samplers.analysis.refits import (
     MAX_UNCOVERED_SHARE,
     EnsembleEstimate,
@@ -179,8 +181,10 @@ def summarise_refits(
     interval, expected, spread, bound = None, None, math.nan, None
     if not reason:
         spread = float(log_values.std(ddof=1))
-        half = half_width(spread, cov, confidence, len(log_values), fitted.clusters)
-        low, high = low_factor * scale_by_exp(value, -half), min(largest, scale_by_exp(value, half))
+        quantile = refit_quantile(confidence, len(log_values), fitted.clusters)
+        groups = read_groups(fitted, len(log_values))
+        below, above = find_log_ends(math.log(value), log_values, groups, cov**2 + FIT_BIAS**2, quantile)
+        low, high = low_factor * scale_by_exp(1.0, below), min(largest, scale_by_exp(1.0, above))
         if spread <= MAX_SPREAD:
             interval, expected = (low, high), min(largest, scale_by_exp(value, spread**2 / 2))
         else:

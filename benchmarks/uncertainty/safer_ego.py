@@ -1,0 +1,131 @@
+"""An ego that is safer by construction, an IDM with a longer headway, under every fitted base and all of its refits.
+
+    python -m benchmarks.uncertainty.safer_ego --max-sim 4000
+
+Both egos are estimated under each base. Whatever the traffic, the longer headway should come out safer: under the base
+itself and under each refit. And as both p rise and fall together from refit to refit, the logarithm of their ratio
+should spread less than that of either.
+"""
+
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+import rare_envs
+import samplers
+from benchmarks import RESULTS
+from rare_envs.distributions.fitted import FittedDistribution
+from rare_envs.scenarios.base_distributions import load_base
+from rare_envs.scenarios.registry import env_id_of, scenario_named
+from samplers.analysis.refits import MIN_REFIT_ESS
+
+SAFER_RESULT = RESULTS / "safer_ego.json"
+HEADWAYS = (1.2, 1.8)
+"""Time headways of the two egos [s]; the minimum gap and the rest are those of the default IDM."""
+SCENARIOS = ("car_following", "cut_in", "hard_brake")
+
+
+@dataclass(frozen=True)
+class SaferRow:
+    """What came out under one base."""
+
+    scenario: str
+    base: str
+    fitted_to: str
+    refits: int
+    p: tuple[float, float]
+    """Of the shorter and the longer headway."""
+    ratio: float
+    """Shorter over longer."""
+    ratio_interval: tuple[float, float] | None
+    """95 % by the events; None where they do not determine it."""
+    spreads: tuple[float, float]
+    """Standard deviation over the refits of log p of each ego."""
+    ratio_spread: float
+    """The same of the logarithm of the ratio."""
+    covered_refits: int
+    """Refits under which both p rest on 10 effective failing points or more."""
+    safer_refits: int
+    """Of these, those under which the longer headway is safer."""
+
+
+def list_fitted_bases() -> Iterator[tuple[str, str]]:
+    """Yield scenario and name of each shipped base that has refits."""
+    for scenario in SCENARIOS:
+        for name in scenario_named(scenario).bases:
+            base = load_base(scenario_named(scenario), name)
+            if isinstance(base, FittedDistribution) and base.refits:
+                yield scenario, name
+
+
+def measure_base(scenario: str, base: str, max_sim: int, seed: int = 0) -> SaferRow | None:
+    """Return what comes out under one base, or None where one of the egos never fails.
+
+    Args:
+        scenario: Name of the scenario.
+        base: Name of the base.
+        max_sim: Simulations of each ego; the further run under the refits has as many again where it is needed.
+        seed: Of the estimates.
+    """
+    egos = [rare_envs.IDM(time_headway=headway) for headway in HEADWAYS]
+    problems = [rare_envs.DrivingProblem(env_id_of(scenario), ego=ego, base=base) for ego in egos]
+    shorter, longer = (samplers.estimate(problem, seed=seed, max_sim=max_sim) for problem in problems)
+    if shorter.p == 0 or longer.p == 0:
+        return None
+    found = samplers.compute_ratio_uncertainty(shorter, longer)
+    one, two = (each.base_uncertainty for each in (shorter, longer))
+    assert one is not None
+    assert two is not None
+    covered = np.array(found.ess_refits) >= MIN_REFIT_ESS
+    return SaferRow(
+        scenario=scenario,
+        base=base,
+        fitted_to=found.fitted_to,
+        refits=len(found.ratio_refits),
+        p=(shorter.p, longer.p),
+        ratio=found.ratio,
+        ratio_interval=found.interval,
+        spreads=(one.spread, two.spread),
+        ratio_spread=found.spread,
+        covered_refits=int(covered.sum()),
+        safer_refits=int((np.array(found.ratio_refits)[covered] > 1.0).sum()),
+    )
+
+
+def main(
+    max_sim: Annotated[int, typer.Option(help="Simulations of each ego under each base.")] = 4000,
+    seed: Annotated[int, typer.Option(help="Of the estimates.")] = 0,
+    out: Annotated[Path, typer.Option(help="Where the result goes.")] = SAFER_RESULT,
+) -> None:
+    """Measure all bases and write the result."""
+    rows, silent = [], []
+    for scenario, base in list_fitted_bases():
+        row = measure_base(scenario, base, max_sim, seed)
+        if row is None:
+            silent.append(f"{scenario} {base}")
+            continue
+        rows.append({name: _null_nan(value) for name, value in asdict(row).items()})
+        print(
+            f"{scenario} {base}: ratio {row.ratio:.2g} {row.ratio_interval}, safer in {row.safer_refits} of "
+            f"{row.covered_refits} ({row.refits}) refits; spreads {row.spreads[0]:.2f}, {row.spreads[1]:.2f}, "
+            f"of the ratio {row.ratio_spread:.2f}",
+            flush=True,
+        )
+    command = f"python -m benchmarks.uncertainty.safer_ego --max-sim {max_sim} --seed {seed}"
+    content = {"command": command, "headways": HEADWAYS, "rows": rows, "never_failed": silent}
+    out.write_text(json.dumps(content, indent=2) + "\n")
+
+
+def _null_nan(value: object) -> object:
+    """Return None for NaN, which JSON lacks, and anything else as it is."""
+    return None if isinstance(value, float) and math.isnan(value) else value
+
+
+if __name__ == "__main__":
+    typer.run(main)
