@@ -2,9 +2,9 @@
 
     python -m benchmarks.uncertainty.safer_ego --max-sim 4000
 
-Both egos are estimated under each base. Whatever the traffic, the longer headway should come out safer: under the base
-itself and under each refit. And as both p rise and fall together from refit to refit, the logarithm of their ratio
-should spread less than that of either.
+The two egos are compared under each base, from the same draws. Whatever the traffic, the longer headway should come out
+no less safe: under the base itself and under each refit. And as both p rise and fall together from refit to refit, the
+logarithm of their ratio should spread less than that of either.
 """
 
 import json
@@ -26,7 +26,7 @@ from rare_envs.scenarios.registry import env_id_of, scenario_named
 from samplers.analysis.refits import MIN_REFIT_ESS
 
 SAFER_RESULT = RESULTS / "safer_ego.json"
-HEADWAYS = (1.2, 1.8)
+HEADWAYS = (1.2, 1.4)
 """Time headways of the two egos [s]; the minimum gap and the rest are those of the default IDM."""
 SCENARIOS = ("car_following", "cut_in", "hard_brake")
 
@@ -45,14 +45,16 @@ class SaferRow:
     """Shorter over longer."""
     ratio_interval: tuple[float, float] | None
     """95 % by the events; None where they do not determine it."""
+    p_interval: tuple[float, float] | None
+    """The same of p of the shorter headway."""
     spreads: tuple[float, float]
     """Standard deviation over the refits of log p of each ego."""
     ratio_spread: float
     """The same of the logarithm of the ratio."""
     covered_refits: int
-    """Refits under which both p rest on 10 effective failing points or more."""
+    """Refits under which both p rest on 10 effective failing points or more; the spreads are those over these."""
     safer_refits: int
-    """Of these, those under which the longer headway is safer."""
+    """Of these, those under which the longer headway fails no more often."""
 
 
 def list_fitted_bases() -> Iterator[tuple[str, str]]:
@@ -70,37 +72,39 @@ def measure_base(scenario: str, base: str, max_sim: int, seed: int = 0) -> Safer
     Args:
         scenario: Name of the scenario.
         base: Name of the base.
-        max_sim: Simulations of each ego; the further run under the refits has as many again where it is needed.
-        seed: Of the estimates.
+        max_sim: Simulations of both egos together; the further run under the refits has as many again.
+        seed: Of the comparison.
     """
     egos = [rare_envs.IDM(time_headway=headway) for headway in HEADWAYS]
     problems = [rare_envs.DrivingProblem(env_id_of(scenario), ego=ego, base=base) for ego in egos]
-    shorter, longer = (samplers.estimate(problem, seed=seed, max_sim=max_sim) for problem in problems)
-    if shorter.p == 0 or longer.p == 0:
+    found = samplers.compare(*problems, seed=seed, max_sim=max_sim)
+    of_ratio, of_p = found.base_uncertainty, found.either.base_uncertainty
+    if of_ratio is None or of_p is None or found.a.p == 0 or found.b.p == 0:
         return None
-    found = samplers.compute_ratio_uncertainty(shorter, longer)
-    one, two = (each.base_uncertainty for each in (shorter, longer))
-    assert one is not None
-    assert two is not None
-    covered = np.array(found.ess_refits) >= MIN_REFIT_ESS
+    ratios, p_either = np.array(of_ratio.ratio_refits), np.array(of_p.p_refits)
+    # The longer headway hardly ever fails where the shorter does not, so that P[either fails] is that of the shorter.
+    covered = (np.array(of_ratio.ess_refits) >= MIN_REFIT_ESS) & (ratios > 0)
+    logs = np.log(p_either[covered]), np.log(p_either[covered] / ratios[covered]), np.log(ratios[covered])
+    first, second, both = (float(values.std(ddof=1)) for values in logs)
     return SaferRow(
         scenario=scenario,
         base=base,
-        fitted_to=found.fitted_to,
-        refits=len(found.ratio_refits),
-        p=(shorter.p, longer.p),
+        fitted_to=of_ratio.fitted_to,
+        refits=len(ratios),
+        p=(found.a.p, found.b.p),
         ratio=found.ratio,
-        ratio_interval=found.interval,
-        spreads=(one.spread, two.spread),
-        ratio_spread=found.spread,
+        ratio_interval=of_ratio.interval,
+        p_interval=of_p.interval,
+        spreads=(first, second),
+        ratio_spread=both,
         covered_refits=int(covered.sum()),
-        safer_refits=int((np.array(found.ratio_refits)[covered] > 1.0).sum()),
+        safer_refits=int((ratios[covered] >= 1.0).sum()),
     )
 
 
 def main(
-    max_sim: Annotated[int, typer.Option(help="Simulations of each ego under each base.")] = 4000,
-    seed: Annotated[int, typer.Option(help="Of the estimates.")] = 0,
+    max_sim: Annotated[int, typer.Option(help="Simulations of both egos together under each base.")] = 4000,
+    seed: Annotated[int, typer.Option(help="Of the comparisons.")] = 0,
     out: Annotated[Path, typer.Option(help="Where the result goes.")] = SAFER_RESULT,
 ) -> None:
     """Measure all bases and write the result."""
