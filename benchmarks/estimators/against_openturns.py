@@ -1,11 +1,13 @@
-"""OpenTURNS and our default method on the same problems in one run.
+"""OpenTURNS and our methods on the same problems in one run.
 
     python -m benchmarks.estimators.against_openturns --runs 100 --workers 2 --json against_openturns.json
 
 Subset sampling, cross-entropy in standard space and nonparametric adaptive importance sampling (NAIS) with their
-defaults and `--points` draws a level, each stopped at 300,000 evaluations (cross-entropy has no bound of its own; a run
-so stopped counts as raised). Their intervals are p -+ half their 95 % confidence length. Ours is run with as many
-simulations as theirs took on average. Columns as in `benchmarks.estimators.compare_methods`.
+defaults and `--points` draws a level, and importance sampling around the design point that FORM finds from the origin
+(`--points` draws; its gradients are finite differences, which count), each stopped at 300,000 evaluations
+(cross-entropy has no bound of its own; a run so stopped counts as raised). Their intervals are p -+ half their 95 %
+confidence length. Ours are run with as many simulations as theirs took on average, `surrogate` with 1,000 at most and
+in up to 20 dimensions. Columns as in `benchmarks.estimators.compare_methods`.
 """
 
 import json
@@ -28,10 +30,25 @@ from benchmarks.estimators.compare_methods import parse_names
 from benchmarks.estimators.report import format_cells
 from benchmarks.estimators.runs import Job, Meter, MethodRun, about, limit_state, record_failure, rotation_of, run_all
 from benchmarks.estimators.summary import Cell, cells_of
+from samplers.methods.surrogate.method import Surrogate
+from samplers.methods.surrogate.settings import DEFAULT_SURROGATE_SETTINGS
 from samplers.problem import FloatArray
 from samplers.serialization import to_json_value
 
+
+def _form_sampling(event: Any) -> Any:
+    """Return importance sampling around the design point that FORM finds from the origin."""
+    solver = openturns.AbdoRackwitz()
+    solver.setStartingPoint(openturns.Point(event.getFunction().getInputDimension()))
+    form = openturns.FORM(solver, event)
+    form.run()
+    sampling = openturns.PostAnalyticalImportanceSampling(form.getResult())
+    sampling.setMaximumCoefficientOfVariation(0.0)  # all draws are made
+    return sampling
+
+
 ALGORITHMS = {
+    "openturns-form": _form_sampling,
     "openturns-ss": openturns.SubsetSampling,
     "openturns-ce": openturns.StandardSpaceCrossEntropyImportanceSampling,
     "openturns-nais": openturns.NAIS,
@@ -93,18 +110,25 @@ def _event(f: Meter, dim: int) -> Any:
 
 
 def _ours(method: str, theirs: list[Cell], job: dict[str, Any], runs: int, most: int) -> list[Job]:
-    """Return runs of our method, each as costly as one of theirs, named after it."""
-    budgets = {(cell.method, cell.problem): min(round(cell.n_sim), most) for cell in theirs}
+    """Return runs of our method, each as costly as one of theirs."""
+    few = method == Surrogate.name
+    limit = min(most, Surrogate().n) if few else most
     return [
-        Job(method=method, problem=problem, seed=run, max_sim=budget, **job)
-        for (_, problem), budget in budgets.items()
+        Job(method=method, problem=cell.problem, seed=run, max_sim=min(round(cell.n_sim), limit), **job)
+        for cell in theirs
+        if not few or limit_state(cell.problem).dim <= DEFAULT_SURROGATE_SETTINGS.most_dims
         for run in range(runs)
     ]
 
 
+def _beside(theirs: list[Cell], ours: list[Cell]) -> list[Cell]:
+    """Return each cell of theirs with ours on the same problem behind it."""
+    return [cell for one in theirs for cell in (one, *(own for own in ours if own.problem == one.problem))]
+
+
 def main(
     runs: Annotated[int, typer.Option(min=2, help="Runs of each method on each problem.")] = 100,
-    ours: Annotated[str, typer.Option(help="Our method.")] = "two-stage",
+    ours: Annotated[str, typer.Option(help="Our methods, with commas.")] = "two-stage,surrogate",
     problems: Annotated[str, typer.Option(help="Names with commas between; all without it.")] = "",
     points: Annotated[int, typer.Option(min=1, help="Draws of OpenTURNS in each level.")] = 1000,
     most: Annotated[int, typer.Option(min=1, help="No run of ours takes more simulations.")] = 20_000,
@@ -118,16 +142,16 @@ def main(
     console = Console(stderr=True)
     cells: list[Cell] = []
     all_runs: list[MethodRun] = []
+    shared = {"rotation": rotation}
     for algorithm in ALGORITHMS:
         jobs = [Job(algorithm, name, run, rotation=rotation) for name in names for run in range(runs)]
         made = run_all(jobs, workers, partial(run_openturns, points=points))
         theirs = list(track(made, total=len(jobs), console=console, description=algorithm))
         their_cells = cells_of(theirs)
-        jobs = _ours(ours, their_cells, {"rotation": rotation}, runs, most)
+        jobs = [one for method in ours.split(",") for one in _ours(method, their_cells, shared, runs, most)]
         description = f"{ours} at the cost of {algorithm}"
         own = list(track(run_all(jobs, workers), total=len(jobs), console=console, description=description))
-        pairs = zip(their_cells, cells_of(own), strict=True)
-        cells += [cell for pair in pairs for cell in pair]
+        cells += _beside(their_cells, cells_of(own))
         all_runs += theirs + own
     print(format_cells(cells))
     for text in sorted({f"{run.method} on {run.problem}: {run.error}" for run in all_runs if run.error}):

@@ -36,6 +36,9 @@ JUST_FAILED = 1e-3
 """Least depth of a failing outcome that is replaced, in compressed units."""
 LARGEST_SHIFT = 3.0
 """Failure begins at most so many standard deviations of all outcomes from the limit state."""
+DOUBT = 4.0
+"""Factor on standard deviations of a surrogate that is not believed: points are left out at a learned limit state lie
+close together, so that their residuals say little of what is between them."""
 NEAR_LIMIT = 6.0
 """Residuals count where the limit state is within so many standard deviations."""
 
@@ -47,6 +50,11 @@ class Prediction(NamedTuple):
     """Shape (n,)."""
     sd: FloatArray
     """Standard deviation, noise included, shape (n,)."""
+
+    @property
+    def doubted(self) -> "Prediction":
+        """The prediction with standard deviations that are DOUBT times as large."""
+        return Prediction(self.mean, DOUBT * self.sd)
 
     @property
     def log_fail(self) -> FloatArray:

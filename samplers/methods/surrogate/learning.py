@@ -36,7 +36,8 @@ def choose_batch(
 
     Candidates are drawn from the pool in proportion to phi sqrt(P[fail] P[safe]). Of these, one after the other, the
     most doubtful one is taken (least |mean| / sd, the U of Echard, Gayton and Lemaire 2011), and the variances of all
-    are reduced by what its outcome will tell, which needs no outcome: the points of a batch lie apart.
+    are reduced by what its outcome will tell, which needs no outcome: the points of a batch lie apart. The others are
+    drawn at random, where a surrogate that is not believed leaves both open.
     """
     weights = normalise_weights(pool.log_doubt)
     n_candidates = min(settings.candidates * n, int(np.count_nonzero(weights)))
@@ -46,11 +47,14 @@ def choose_batch(
     u, mean = pool.u[among], pool.prediction.mean[among]
     covariance, noise = kriging.covariance(u), kriging.noise
     chosen = list[int]()
-    for _ in range(min(n, len(among))):
+    n_random = int(settings.random_share * n)
+    for _ in range(min(n - n_random, len(among))):
         doubt = -np.abs(mean) / np.sqrt(np.maximum(np.diag(covariance), 0.0) + noise + 1e-12)
         doubt[chosen] = -np.inf
         best = int(doubt.argmax())
         chosen.append(best)
         column = covariance[:, best]
         covariance = covariance - np.outer(column, column) / (column[best] + noise + 1e-12)
-    return u[chosen]
+    keys = pool.log_open + rng.gumbel(size=len(pool.u))  # the largest: draws without replacement
+    keys[among[chosen]] = -np.inf
+    return np.concatenate([u[chosen], pool.u[np.argsort(-keys, kind="stable")[:n_random]]])

@@ -14,7 +14,7 @@ from scipy.special import logsumexp
 
 from samplers.methods.mixture_em import fit_proposal_mixture
 from samplers.methods.surrogate.kriging import Kriging, Prediction
-from samplers.methods.surrogate.settings import PoolSettings
+from samplers.methods.surrogate.settings import PoolSettings, ProposalSettings
 from samplers.problem import FloatArray, StandardNormal
 from samplers.proposals.gaussian import Gaussian
 from samplers.proposals.mixture import Mixture
@@ -40,6 +40,16 @@ class Pool(NamedTuple):
     def log_doubt(self) -> FloatArray:
         """log(w sqrt(P[fail] P[safe])) but for a constant: which draws to learn from, shape (N,)."""
         return self.log_proposal + 0.5 * self.prediction.log_safe
+
+    @property
+    def log_doubted(self) -> FloatArray:
+        """log(w sqrt(P[fail])) of the surrogate not believed, but for a constant, shape (N,)."""
+        return self.log_weights + 0.5 * self.prediction.doubted.log_fail
+
+    @property
+    def log_open(self) -> FloatArray:
+        """log(w sqrt(P[fail] P[safe])) of the surrogate not believed, but for a constant, shape (N,)."""
+        return self.log_doubted + 0.5 * self.prediction.doubted.log_safe
 
     def forecast_cov(self, n: int) -> float:
         """Return the c.o.v. that n draws of the proposal would have if the surrogate's probabilities were true.
@@ -85,19 +95,19 @@ class PoolDraws(NamedTuple):
     log_weights: FloatArray
     """log(w / (N b)), shape (n,)."""
     part: NDArray[np.int64]
-    """What each was drawn from: 0 surrogate, 1 base, 2 wide, shape (n,)."""
+    """What each was drawn from: 0 surrogate, 1 base, 2 wide, 3 doubted, shape (n,)."""
     log_wide_weights: FloatArray
     """log(phi / wide), shape (n,): the weights as draws of the wide distribution."""
 
 
 class PoolProposal(NamedTuple):
-    """The probabilities with which draws of a pool are simulated: surrogate, base and wide parts."""
+    """The probabilities with which draws of a pool are simulated: surrogate, base, wide and doubted parts."""
 
     pool: Pool
     shares: FloatArray
-    """Of the three parts, shape (3,)."""
+    """Of the parts, shape (4,)."""
     parts: FloatArray
-    """Probabilities of each part, shape (3, N)."""
+    """Probabilities of each part, shape (4, N)."""
     log_wide_weights: FloatArray
     """log(phi / wide), shape (N,)."""
 
@@ -113,19 +123,20 @@ class PoolProposal(NamedTuple):
 
     def draw(self, n: int, rng: np.random.Generator) -> PoolDraws:
         """Draw n of the pool."""
-        part = rng.choice(3, n, p=self.shares)
+        part = rng.choice(len(self.shares), n, p=self.shares)
         chosen = np.empty(n, dtype=np.int64)
-        for k in range(3):
+        for k in range(len(self.shares)):
             chosen[part == k] = rng.choice(len(self.pool.u), int((part == k).sum()), p=self.parts[k])
         probability = self.shares @ self.parts[:, chosen]
         log_weights = self.pool.log_weights[chosen] - np.log(len(self.pool.u) * probability)
         return PoolDraws(self.pool.u[chosen], log_weights, part, self.log_wide_weights[chosen])
 
 
-def build_pool_proposal(pool: Pool, scales: tuple[float, ...], base_share: float, wide_share: float) -> PoolProposal:
+def build_pool_proposal(pool: Pool, scales: tuple[float, ...], settings: ProposalSettings) -> PoolProposal:
     """Return the proposal for the estimate."""
     wide = first_mixture(pool.u.shape[1], scales[1:])
     log_wide_weights = StandardNormal(pool.u.shape[1]).log_prob(pool.u) - wide.log_prob(pool.u)
-    logs = (pool.log_proposal, pool.log_weights, pool.log_weights - log_wide_weights)
-    shares = np.array([1 - base_share - wide_share, base_share, wide_share])
+    logs = (pool.log_proposal, pool.log_weights, pool.log_weights - log_wide_weights, pool.log_doubted)
+    others = (settings.base_share, settings.wide_share, settings.doubted_share)
+    shares = np.array([1 - sum(others), *others])
     return PoolProposal(pool, shares, np.array([normalise_weights(log) for log in logs]), log_wide_weights)

@@ -10,6 +10,7 @@ from samplers.importance.draws import Draws, weight_warnings, weighted_interval
 from samplers.importance.sampling import count_final_draws, simulate_until
 from samplers.importance.search import FinalDraws
 from samplers.method import Goal, Interrupted, Outcome, Steps, no_outcome_share
+from samplers.methods.surrogate.estimate import BASE, EstimateDraws
 from samplers.methods.surrogate.kriging import Kriging, fit_kriging
 from samplers.methods.surrogate.learning import choose_batch, design_size, draw_design, learning_size
 from samplers.methods.surrogate.pool import (
@@ -20,7 +21,6 @@ from samplers.methods.surrogate.pool import (
     fit_mixture,
 )
 from samplers.methods.surrogate.settings import SurrogateSettings
-from samplers.methods.two_stage.discovery.unseen import count_lineages
 from samplers.problem import FloatArray, Inputs, StandardNormal
 from samplers.proposals.gaussian import TiltedNormal
 from samplers.statistics.intervals import Interval, degrees_of_freedom, log_normal_interval
@@ -61,7 +61,7 @@ class SurrogateRun:
         if not (self.f <= self.goal.gamma).any():
             about = f"None of {len(self.f):,} simulations for learning failed: base draws take the rest."
             return (yield from self.draw_base()).warn_first(about)
-        return (yield from self._estimate(self._build_proposal(kriging)))
+        return (yield from self._estimate(kriging))
 
     def draw_base(self) -> Steps:
         """Spend the rest on base draws; those of the design do not count, for they may have decided it."""
@@ -120,20 +120,22 @@ class SurrogateRun:
             pool = draw_mixture_pool(kriging, self._mixture, settings.final_size // 4, self.rng)
             self._mixture = fit_mixture(pool, scales, settings, self.rng)
         pool = draw_mixture_pool(kriging, self._mixture, settings.final_size, self.rng)
-        return build_pool_proposal(pool, scales, self.settings.base_share, self.settings.wide_share)
+        return build_pool_proposal(pool, scales, self.settings.proposal)
 
     def _count_draws(self) -> int:
         """Return the number of draws of the estimate at most."""
         return count_final_draws(self.goal, len(self.f), self.budget - len(self.f))
 
-    def _estimate(self, proposal: PoolProposal) -> Steps:
-        """Draw from the proposal until the budget is used or the target is met; p rests on these draws alone."""
-        goal, stopped, cov = self.goal, False, math.inf
-        draws, wide_weights, kinds = Draws(0, np.empty(0), np.empty(0)), [self._design_log_weights()], np.zeros((2, 3))
-        left = self._count_draws()
-        most = self.settings.largest_batch
-        size = most if goal.target_cov is None else max(int(self.settings.target_batch * self.budget), 1)
-        while left > 0 and not (goal.target_cov is not None and cov <= goal.target_cov):
+    def _estimate(self, kriging: Kriging) -> Steps:
+        """Draw until the budget is used or the target is met; p rests on these draws alone.
+
+        The surrogate learns from each part before the next one is drawn. Given what was there before it, each part's
+        mean is unbiased, and so is that of all draws.
+        """
+        goal, stopped, made = self.goal, False, EstimateDraws.begin(self._design_log_weights())
+        left, proposal = self._count_draws(), self._build_proposal(kriging)
+        size = self._part_size(left)
+        while left > 0 and not (goal.target_cov is not None and made.draws.n and made.cov <= goal.target_cov):
             new = proposal.draw(min(size, left), self.rng)
             x = self.inputs.base.from_standard_normal(new.u)
             try:
@@ -141,33 +143,47 @@ class SurrogateRun:
             except Interrupted:
                 stopped = True
                 break
-            draws = draws.join(Draws.from_outcomes(f, new.log_weights, x, goal.gamma))
-            fails = f <= goal.gamma
-            kinds += np.array([np.bincount(new.part, minlength=3), np.bincount(new.part[fails], minlength=3)])
-            wide_weights.append(new.log_wide_weights[fails & (new.part == 2)])
-            cov = math.hypot(draws.cov, math.sqrt(proposal.pool_variance))
+            made = made.add(new, f, x, goal.gamma, proposal.pool_variance)
             left -= len(f)
-            level = Level(
-                gamma=goal.gamma,
-                p=float(fails.mean()),
-                estimate=draws.p,
-                n_sim=len(f),
-                n_points=len(f),
-                cov=cov,
-                ess=draws.ess,
-            )
-            self._record(level)
-        if draws.n == 0:
+            self._record_draws(f, made)
+            if left > 0 and made.draws.n < self.settings.most_learned:
+                self.u, self.f = np.concatenate([self.u, new.u]), np.concatenate([self.f, f])
+                kriging = fit_kriging(self.u, self.f - goal.gamma, kriging, self.settings.kriging)
+                proposal = self._build_proposal(kriging)
+        if made.draws.n == 0:
             return self._estimate_early(Status.STOPPED if stopped else Status.BUDGET)
-        lineages = max(count_lineages(self.failing_batches, np.concatenate(wide_weights)), 1.0)
-        outcome = self._outcome(draws, cov, proposal.largest_weight, Status.STOPPED if stopped else Status.CONVERGED)
-        high = add_unseen(draws.p, outcome.interval[1], lineages, goal.confidence)
+        return self._conclude(made, proposal.largest_weight, Status.STOPPED if stopped else Status.CONVERGED)
+
+    def _part_size(self, left: int) -> int:
+        """Return the number of draws of one part."""
+        if self.goal.target_cov is not None:
+            return max(int(self.settings.target_batch * self.budget), 1)
+        return min(self.settings.largest_batch, math.ceil(left / self.settings.parts))
+
+    def _record_draws(self, f: FloatArray, made: EstimateDraws) -> None:
+        """Add a part of the estimate, with outcomes f (n,), to the trace."""
+        level = Level(
+            gamma=self.goal.gamma,
+            p=float((f <= self.goal.gamma).mean()),
+            estimate=made.draws.p,
+            n_sim=len(f),
+            n_points=len(f),
+            cov=made.cov,
+            ess=made.draws.ess,
+        )
+        self._record(level)
+
+    def _conclude(self, made: EstimateDraws, largest_weight: float, status: Status) -> Outcome:
+        """Return what the draws of the estimate say, the upper end raised by what was not found."""
+        outcome = self._outcome(made.draws, made.cov, largest_weight, status)
+        lineages = made.count_lineages(self.failing_batches)
+        high = add_unseen(made.draws.p, outcome.interval[1], lineages, self.goal.confidence)
         return replace(
             outcome,
             interval=(outcome.interval[0], high),
-            warnings=(*outcome.warnings, *_skill_warnings(kinds, self.settings.least_skill)),
-            base_draws=int(kinds[0, 1]),
-            sample=replace(draws.sample, lineages=lineages),
+            warnings=(*outcome.warnings, *made.skill_warnings(self.settings.least_skill)),
+            base_draws=int(made.kinds[0, BASE]),
+            sample=replace(made.draws.sample, lineages=lineages),
         )
 
     def _design_log_weights(self, *, failing: bool = True) -> FloatArray:
@@ -205,16 +221,3 @@ class SurrogateRun:
             sample=draws.sample,
             draw_weights=draws.weights_after(sum(level.n_sim for level in self.trace) - draws.n),
         )
-
-
-def _skill_warnings(kinds: FloatArray, least: float) -> list[str]:
-    """Return the warning that the surrogate leads to few failures, if so.
-
-    Args:
-        kinds: Draws and failing draws of the surrogate, base and wide parts, shape (2, 3).
-        least: Share of the surrogate's draws that should fail.
-    """
-    n, failing = kinds[:, 0]
-    if failing >= least * n:
-        return []
-    return [f"Only {failing:.0f} of {n:.0f} draws that the surrogate proposed failed: it describes f poorly."]

@@ -49,6 +49,9 @@ class LearningSettings:
     batches: int = 16
     """Batches that the rest of the learning is cut into: simulators run the points of one side by side."""
     least_batch: int = 6
+    random_share: float = 0.3
+    """Share of a batch that is drawn at random where `Prediction.doubted` leaves both open: points far from where the
+    surrogate sees the limit state, which tell whether it is right there."""
     candidates: int = 40
     """Candidates for each point of a batch."""
     most_surprise: float = 1.5
@@ -81,22 +84,39 @@ class PoolSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ProposalSettings:
+    """What the draws of the estimate are drawn from (`pool.py`); the surrogate has the rest.
+
+    On the IDM cut-in, 300 simulations, 10 seeds: without doubted draws and random points 8 of 10 intervals held p and
+    the gain was 34; with doubted draws alone 10 and 76, with both 10 and 190.
+    """
+
+    base_share: float = 0.1
+    """Share of base draws: no weight exceeds 1 / base_share, but for the error of the pool."""
+    wide_share: float = 0.05
+    """Share of draws from the wide distributions: they meet regions that the surrogate denies, with small weights."""
+    doubted_share: float = 0.15
+    """Share of draws where the surrogate would see failures if it were doubted (`Prediction.doubted`)."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class SurrogateSettings:
     """All of them, and those of the estimate."""
 
     kriging: KrigingSettings = KrigingSettings()
     learning: LearningSettings = LearningSettings()
     pool: PoolSettings = PoolSettings()
+    proposal: ProposalSettings = ProposalSettings()
     least_budget: int = 60
     """With fewer simulations all are base draws."""
     most_dims: int = 20
     """In more dimensions `TwoStage` takes over: distances between points say little there."""
-    base_share: float = 0.1
-    """Share of base draws in the estimate: no weight exceeds 1 / base_share, but for the error of the pool."""
-    wide_share: float = 0.1
-    """Share of draws from the wide distributions: they meet regions that the surrogate denies, with small weights."""
     largest_batch: int = 1000
     """Draws of a batch at most, so that a run can be stopped."""
+    parts: int = 2
+    """Parts that the draws of the estimate come in; the surrogate learns from one before the next is drawn."""
+    most_learned: int = 1000
+    """Draws of the estimate that the surrogate learns from at most: its cost grows with the cube of their number."""
     target_batch: float = 0.1
     """Draws of a batch as a share of n, where there is a target c.o.v."""
     least_ess: float = 10.0

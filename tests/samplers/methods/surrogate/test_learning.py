@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from samplers.methods.surrogate.kriging import fit_kriging
+from samplers.methods.surrogate.kriging import Prediction, fit_kriging
 from samplers.methods.surrogate.learning import choose_batch, design_size, draw_design, learning_size
 from samplers.methods.surrogate.pool import draw_mixture_pool, first_mixture
 from samplers.methods.surrogate.settings import LearningSettings
@@ -44,3 +44,16 @@ def test_a_certain_surrogate_still_gives_a_whole_batch():
     kriging = fit_kriging(u, 2.5 - u[:, 0])
     pool = draw_mixture_pool(kriging, first_mixture(1, SETTINGS.scales), 200, rng)
     assert len(np.unique(choose_batch(kriging, pool, 8, SETTINGS, rng))) == 8
+
+
+def test_three_in_ten_points_lie_where_a_surrogate_that_is_not_believed_leaves_both_open():
+    """Of a certain one the doubtful points lie at its limit state, within 0.1; these reach to standard deviations."""
+    rng = np.random.default_rng(3)
+    u = draw_design(48, 2, SETTINGS.scales, rng)
+    kriging = fit_kriging(u, 2.5 - u[:, 0])
+    pool = draw_mixture_pool(kriging, first_mixture(2, SETTINGS.scales), 3000, rng)
+    unsure = pool._replace(prediction=Prediction(pool.u[:, 0] - 2.5, np.full(3000, 0.5)))
+    batch = choose_batch(kriging, unsure, 20, SETTINGS, rng)
+    distance = np.abs(batch[:, 0] - 2.5)
+    assert len(np.unique(batch, axis=0)) == 20
+    assert np.median(distance[14:]) > 2 * np.median(distance[:14])

@@ -6,7 +6,7 @@ from scipy.stats import norm
 
 from samplers.methods.surrogate.kriging import Prediction
 from samplers.methods.surrogate.pool import Pool, build_pool_proposal, first_mixture, fit_mixture
-from samplers.methods.surrogate.settings import PoolSettings
+from samplers.methods.surrogate.settings import PoolSettings, ProposalSettings
 from samplers.problem import StandardNormal
 
 SCALES = (1.0, 1.5, 2.2, 3.0)
@@ -26,7 +26,9 @@ def test_the_estimate_is_unbiased_whatever_the_surrogate_says(seen_as):
     rng, estimates = np.random.default_rng(1), []
     for seed in range(300):
         pool = pool_of(lambda u: seen_as - u[:, 0], n=1000, seed=seed)
-        draws = build_pool_proposal(pool, SCALES, 0.2, 0.2).draw(60, rng)
+        draws = build_pool_proposal(
+            pool, SCALES, ProposalSettings(base_share=0.2, wide_share=0.2, doubted_share=0.1)
+        ).draw(60, rng)
         estimates.append(np.exp(draws.log_weights)[draws.u[:, 0] > 2.0].sum() / 60)
     error = np.std(estimates, ddof=1) / np.sqrt(300)
     assert abs(np.mean(estimates) - norm.sf(2.0)) < 4 * error
@@ -34,11 +36,11 @@ def test_the_estimate_is_unbiased_whatever_the_surrogate_says(seen_as):
 
 
 def test_no_weight_exceeds_its_bound_and_the_parts_are_drawn_as_often_as_they_should():
-    proposal = build_pool_proposal(pool_of(lambda u: 2.0 - u[:, 0]), SCALES, 0.1, 0.2)
+    proposal = build_pool_proposal(pool_of(lambda u: 2.0 - u[:, 0]), SCALES, ProposalSettings())
     draws = proposal.draw(5000, np.random.default_rng(2))
     assert np.exp(draws.log_weights).max() <= proposal.largest_weight
     assert 9 < proposal.largest_weight < 11
-    np.testing.assert_allclose(np.bincount(draws.part) / 5000, [0.7, 0.1, 0.2], atol=4 * 0.5 / 5000**0.5)
+    np.testing.assert_allclose(np.bincount(draws.part) / 5000, [0.7, 0.1, 0.05, 0.15], atol=4 * 0.5 / 5000**0.5)
 
 
 def test_forecast_is_the_spread_that_draws_of_the_proposal_would_have():
@@ -47,7 +49,9 @@ def test_forecast_is_the_spread_that_draws_of_the_proposal_would_have():
     assert certain.forecast_cov(100) < 1e-3
     doubtful = pool_of(lambda u: 2.0 - u[:, 0], n=20_000)
     rng = np.random.default_rng(3)
-    proposal = build_pool_proposal(doubtful, SCALES, 1e-9, 1e-9)
+    proposal = build_pool_proposal(
+        doubtful, SCALES, ProposalSettings(base_share=1e-9, wide_share=1e-9, doubted_share=0.0)
+    )
     draws = proposal.draw(20_000, rng)
     fails = rng.random(20_000) < norm.cdf((draws.u[:, 0] - 2.0) / 0.3)  # the surrogate is right about its doubt
     terms = np.where(fails, np.exp(draws.log_weights), 0.0)
