@@ -77,7 +77,7 @@ def list_candidates(
         for gaussian, explored in zip(state.gaussians, state.explored, strict=True)
     ]
     regional = gaussians + ([] if state.noisy else list(state.linear)) + (list(state.explored) if state.rounds else [])
-    return [
+    candidates = [
         ProposalComponent(IsotropicNormal(state.dim), "base"),
         ProposalComponent(IsotropicNormal(state.dim, settings.wide_scale), "wide"),
         *_fit_radial_components(state, history, settings, edges),
@@ -85,6 +85,7 @@ def list_candidates(
         *([] if state.noisy else _fit_half_space_components(state, history, settings, edges)),
         *_temper_gaussians(regional, settings.noisy_tempering if state.noisy else settings.tempering),
     ]
+    return [candidate for candidate in candidates if candidate.kind in settings.initial_shares]
 
 
 def _temper_gaussians(components: list[ProposalComponent], powers: tuple[float, ...]) -> list[ProposalComponent]:
@@ -141,7 +142,8 @@ def _set_floors(
     elif n > 1:
         share = settings.final_region_share if final else settings.region_share
         floors += [Floor((regions == k) & (kinds != "tempered"), share / n) for k in range(n)]
-    return [*floors, Floor(kinds == "base", settings.noisy_base_share if state.noisy else settings.base_share)]
+    floors.append(Floor(kinds == "base", settings.noisy_base_share if state.noisy else settings.base_share))
+    return [floor for floor in floors if floor.members.any()]
 
 
 def _smooth_indicators(

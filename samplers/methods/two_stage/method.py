@@ -27,7 +27,9 @@ class TwoStage(Method):
        Three rounds of draws follow, each from a mixture of these, and up to two more while a draw is worth less than
        a tenth of a failure. The weights minimise the estimated variance (`mixture_weights.py`), with lower limits for
        the base distribution, for tempered Gaussians (which bound weights where a Gaussian is a bad description) and
-       for each region. In up to 40 dimensions a classifier then screens the last mixture (`screening.py`).
+       for each region. After each round but the last, chains grow from failures that the next proposal would hardly
+       reach (`discovery/uncovered.py`). In up to 40 dimensions a classifier then screens the last mixture
+       (`screening.py`).
     3. *Estimate* (`stratified.py`): fresh draws from the last mixture, stratified by component, and nothing else.
 
     Given the first two stages p-hat is unbiased, with two exceptions. Behind a screen, weights rest on its acceptance
@@ -142,6 +144,8 @@ def run_two_stage(
             state, refinement, proposal, final = yield from steps
             if stages.gives_up(context, state, refinement, proposal, number, final=final):
                 return (yield from stages.fall_back(context, state, exploration.levels))
+            if not final:
+                refinement, proposal = yield from stages.cover(context, state, refinement, proposal, room)
     except Interrupted:
         return stages.estimate_early(context, state)
     outcome = yield from stages.estimate_afresh(context, state, refinement, proposal)

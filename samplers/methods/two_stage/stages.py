@@ -21,6 +21,7 @@ from samplers.methods.two_stage.diagnostics import (
     check_regions,
     check_rounds,
 )
+from samplers.methods.two_stage.discovery.uncovered import cover_failures, find_uncovered
 from samplers.methods.two_stage.discovery.unseen import discovery_interval
 from samplers.methods.two_stage.exploration import Sizes, find_regions, first_draws
 from samplers.methods.two_stage.mixture.proposal import MixtureProposal
@@ -190,6 +191,30 @@ def refine(
     final = number == len(shares) or (enough and number >= len(settings.round_shares))
     proposal = build_proposal(refinement, state.history, settings, context.rng, context.settings.mixture, final=final)
     return state, refinement, proposal, final
+
+
+def cover(
+    context: RunContext, state: RunState, refinement: RefinementState, proposal: MixtureProposal, room: int
+) -> SimulationSteps[tuple[RefinementState, MixtureProposal]]:
+    """Give failures that the proposal of the next round hardly reaches components of their own.
+
+    Args:
+        context: What is fixed for the run.
+        state: Draws so far.
+        refinement: What is known of the regions.
+        proposal: For the next round.
+        room: Simulations that the exploration has left.
+    """
+    settings, rng = context.settings, context.rng
+    if refinement.noisy or refinement.scattered:
+        return refinement, proposal
+    last = int((1 - sum(settings.refinement.round_shares)) * room)
+    points = find_uncovered(refinement, state.history, proposal, last, settings.refinement)
+    within = int(settings.refinement.uncovered_budget * context.left)
+    covered = yield from cover_failures(context.simulator, refinement, points, within, rng, settings)
+    if covered is refinement:
+        return refinement, proposal
+    return covered, build_proposal(covered, state.history, settings.refinement, rng, settings.mixture)
 
 
 def gives_up(
