@@ -190,9 +190,9 @@ class RefinementSettings:
     explored_share: float = 0.01
     """Share that components from the exploration keep until the last round."""
     uncovered_share: float = 0.05
-    """Share of p that a failing point may stand for as one of the last draws; from more than that, chains grow. Without
-    them 5 of 36 intervals missed p on a series system in 25 dimensions and on a braking problem in 6, and 3 runs were off
-    by more than four of their own standard errors; with them, at the same seeds, none."""
+    """Share of p that a failing point may stand for as one of the last draws; from more than that, chains grow.
+    Without them 5 of 36 intervals missed p on a series system in 25 dimensions and on a braking problem in 6, and 3
+    runs were off by more than four of their own standard errors; with them, at the same seeds, none."""
     uncovered_budget: float = 0.1
     """Share of what is left for these chains, after each round but the last."""
     min_share: float = 0.004

@@ -63,7 +63,7 @@ def test_probability(name):
     for result in results:
         assert abs(np.log(result.p / p)) < 4 * result.cov
         assert result.n_sim <= 6000
-        assert bool(result.warnings) == (name == "noise alone")
+        assert bool(result.remarks) == (name == "noise alone")
     square = np.mean([(result.p / p - 1) ** 2 + result.cov**2 for result in results])
     assert 1 / (p * 6000 * square) > GAINS[name]
 
