@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 from gymnasium.vector import VectorEnv
 
-from rare_envs.scenarios.registry import HIGHWAY_ENV_LAYOUT, SCENARIOS, kinematics_id
+from rare_envs.scenarios.registry import HIGHWAY_ENV_LAYOUT, SCENARIOS, kinematics_id, split_version
 
 if TYPE_CHECKING:
     from rare_envs.envs.parallel import DrivingParallelEnv
@@ -25,6 +25,19 @@ def register_envs() -> None:
                     vector_entry_point="rare_envs.envs.vector:DrivingVectorEnv",
                     kwargs={"env_id": env_id, **layout},
                 )
+                _keep_earlier_versions(name)
+
+
+def _keep_earlier_versions(name: str) -> None:
+    """Let the earlier versions of an id stand beside it.
+
+    A version is a scenario of its own, with results of its own. Gymnasium would warn that the earlier ones are out of
+    date; it compares their numbers with the highest one of all entries, which are therefore counted as the first.
+    """
+    family, version = split_version(name)
+    versions = [split_version(each) for each in gym.registry]
+    if version is not None:
+        gym.registry[name].version = min(other for each, other in versions if each == family and other is not None)
 
 
 def register_scenario(env_id: str, scenario: Scenario) -> None:

@@ -51,6 +51,7 @@ SCENARIOS = Registry(
     {
         "rare_envs/CarFollowing-v0": "rare_envs.scenarios.car_following:CAR_FOLLOWING",
         "rare_envs/CutIn-v0": "rare_envs.scenarios.cut_in:CUT_IN",
+        "rare_envs/CutIn-v1": "rare_envs.scenarios.cut_in:TIMED_CUT_IN",
         "rare_envs/Highway-v0": "rare_envs.scenarios.highway:HIGHWAY",
         "rare_envs/HardBrake-v0": "rare_envs.scenarios.hard_brake:HARD_BRAKE",
     }
@@ -58,7 +59,7 @@ SCENARIOS = Registry(
 
 
 def scenario_named(name: str) -> Scenario:
-    """Return the scenario of a short name, such as "cut_in".
+    """Return the scenario of a short name, such as "cut_in", in its newest version, or of an id.
 
     Raises:
         ValueError: If there is none; the message suggests the nearest name and lists all.
@@ -71,14 +72,14 @@ def scenario_named(name: str) -> Scenario:
 
 
 def env_id_of(name: str) -> str:
-    """Return the environment id of a scenario's short name, or of an id itself.
+    """Return the environment id of a scenario's short name, in its newest version, or of an id itself.
 
     Raises:
         ValueError: If there is no such scenario; the message suggests the nearest name and lists all.
 
     Example:
         >>> env_id_of("cut_in"), env_id_of("rare_envs/CutIn-v0")
-        ('rare_envs/CutIn-v0', 'rare_envs/CutIn-v0')
+        ('rare_envs/CutIn-v1', 'rare_envs/CutIn-v0')
         >>> env_id_of("cutin")
         Traceback (most recent call last):
         ...
@@ -86,11 +87,33 @@ def env_id_of(name: str) -> str:
     """  # noqa: E501 (the example shows a whole message)
     if name in SCENARIOS:
         return name
-    ids = {scenario.name: env_id for env_id, scenario in SCENARIOS.items()}
+    ids = _newest_ids()
     if name not in ids:
         hint = did_you_mean(name.rpartition("/")[2].lower(), ids)
         raise ValueError(f"Unknown scenario {name!r}{hint}; there are {', '.join(ids)}.")
     return ids[name]
+
+
+def _newest_ids() -> dict[str, str]:
+    """Return the ids by the short names of their scenarios: of one name the first registered, in its newest version."""
+    ids: dict[str, str] = {}
+    for env_id, scenario in SCENARIOS.items():
+        family, version = split_version(env_id)
+        known, earlier = split_version(ids.setdefault(scenario.name, env_id))
+        if known == family and (earlier or 0) < (version or 0):
+            ids[scenario.name] = env_id
+    return ids
+
+
+def split_version(env_id: str) -> tuple[str, int | None]:
+    """Return an id without its version, and the version; None where it has none.
+
+    Example:
+        >>> split_version("rare_envs/CutIn-v1")
+        ('rare_envs/CutIn', 1)
+    """
+    found = re.fullmatch(r"(.*)-v(\d+)", env_id)
+    return (found[1], int(found[2])) if found else (env_id, None)
 
 
 def find_scenario(env_id: str) -> Scenario:

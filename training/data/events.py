@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from samplers.problem import FloatArray
+from training.data.lane_change_courses import LATERAL_SPAN, LATERAL_SPEED, course_durations, time_between_spans
 from training.data.trajectories import DT, Trajectories
 
 Events = dict[str, NDArray[Any]]
@@ -19,10 +20,6 @@ MIN_PAIR_FRAMES = 20
 """Least number of frames for which a pair of ego and leader is seen in one lane: 2 s."""
 MIN_LANE_FRAMES = 8
 """Least number of frames in one lane on either side of a lane change: 0.8 s."""
-LATERAL_SPAN = 5
-"""Number of frames over which the lateral speed is measured: 0.5 s."""
-LATERAL_SPEED = 0.2
-"""Lateral speed above which a lane change has begun [m/s]."""
 ASSUMED_START = 13
 """Frames from the start of a lane change to its crossing where positions across were not recorded: mean of the 42
 recorded starts on US 101 (1.3 s, standard deviation 0.9 s)."""
@@ -32,7 +29,7 @@ CAR_FOLLOWING_COLUMNS = (
 )
 CUT_IN_COLUMNS = (
     *("recording", "frame", "phase", "vehicle", "from_lane", "to_lane", "start_seen", "v_cutin", "lateral_speed"),
-    *("ego", "v_ego", "gap_ego_cutin", "lateral_offset", "lead", "v_lead", "gap_cutin_lead"),
+    *("ego", "v_ego", "gap_ego_cutin", "lateral_offset", "lead", "v_lead", "gap_cutin_lead", "duration"),
 )
 
 
@@ -128,13 +125,38 @@ def find_start(trajectories: Trajectories, crossing: int, first: int) -> tuple[i
     return row, False
 
 
+def find_duration(trajectories: Trajectories, crossing: int, first: int, last: int) -> float:
+    """Return the duration of the course of a lane change [s]; NaN where its start or its end was not recorded.
+
+    The end is found as the start is, see `find_start`: going on from the crossing, the first row from which the speed
+    over `LATERAL_SPAN` frames fell to `LATERAL_SPEED` or less. The displacement is that from the last slow span before
+    the change to the first one after it.
+
+    Args:
+        trajectories: The table.
+        crossing: First row in the new lane.
+        first: First row of the vehicle's track.
+        last: Its last row.
+    """
+    t = trajectories
+    start, seen = find_start(t, crossing, first)
+    side = np.sign(t.lane[crossing] - t.lane[crossing - 1])
+    for end in range(crossing, last - LATERAL_SPAN + 1) if seen else ():
+        if side * (t.y[end + LATERAL_SPAN] - t.y[end]) <= LATERAL_SPEED * LATERAL_SPAN * DT:
+            above = time_between_spans(np.array([start]), np.array([end]), DT)
+            moved = side * (t.y[end + LATERAL_SPAN] - t.y[start - LATERAL_SPAN])
+            return float(course_durations(above, np.array([moved]))[0])
+    return float("nan")
+
+
 def cut_in_events(trajectories: Trajectories) -> Events:
     """Return lane changes, each at its start and at its crossing, with the vehicles behind and ahead in the new lane.
 
     Returns:
         The columns `CUT_IN_COLUMNS`, each of shape (2 changes,): ego is the nearest vehicle behind in the new lane,
         lead the nearest ahead in it, -1 and NaN where there is none; gaps bumper to bumper (negative: side by side) and
-        the lateral offset from ego [m]; `lateral_speed` towards the new lane over 0.8 s around the crossing [m/s].
+        the lateral offset from ego [m]; `lateral_speed` towards the new lane over 0.8 s around the crossing [m/s];
+        `duration` of the cubic course that moves across for as long [s], NaN where start or end was not recorded.
 
     Example:
         >>> from dataclasses import replace
@@ -149,10 +171,13 @@ def cut_in_events(trajectories: Trajectories) -> Events:
     t = trajectories
     breaks = t.track_starts()
     crossings = find_lane_changes(t)
-    firsts = breaks[np.searchsorted(breaks, crossings, side="right") - 1]
+    track = np.searchsorted(breaks, crossings, side="right") - 1
+    firsts, lasts = breaks[track], np.append(breaks[1:], len(t))[track] - 1
     starts = [find_start(t, int(c), int(first)) for c, first in zip(crossings, firsts, strict=True)]
     rows = np.column_stack([crossings, [row for row, _ in starts]]).ravel().astype(np.int64)
     change = np.repeat(crossings, 2)
+    spans = zip(crossings.tolist(), firsts.tolist(), lasts.tolist(), strict=True)
+    durations = np.array([find_duration(t, *span) for span in spans], dtype=float)
     ego, lead = _find_neighbours(t, rows, t.lane[change])
     side = np.sign(t.lane[change] - t.lane[change - 1])
     reach = MIN_LANE_FRAMES // 2
@@ -175,6 +200,7 @@ def cut_in_events(trajectories: Trajectories) -> Events:
         "lead": np.where(lead >= 0, t.vehicle[lead], -1),
         "v_lead": np.where(lead >= 0, t.speed[lead], np.nan),
         "gap_cutin_lead": bumper_gaps(t, rows, lead),
+        "duration": np.repeat(durations, 2),
     }
 
 

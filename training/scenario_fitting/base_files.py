@@ -20,6 +20,7 @@ from training.scenario_fitting.coordinate_systems import (
     COORDINATE_SYSTEMS,
     FOLD_STARTS,
     N_FOLDS,
+    SYSTEMS_APART,
     CoordinateSystem,
     SystemFit,
     choose_system,
@@ -40,6 +41,7 @@ class FitRequest:
     """What a base is fitted to, and how."""
 
     scenario: str
+    """Short name or environment id."""
     events: EventSet
     source: Mapping[str, Any]
     """Site, data, publisher, licence and so on, for the file."""
@@ -48,7 +50,7 @@ class FitRequest:
     frequency: EventFrequency | None = None
     """How often the events happen; None where nobody counted."""
     system: str | None = None
-    """Name of the coordinate system; None for the one that the events support best."""
+    """Name of the coordinate system, columns apart left out; None for the one that the events support best."""
     n_refits: int | None = None
     """Number of refits, see `refit`."""
     seed: int = 0
@@ -62,7 +64,7 @@ class FitRequest:
     @property
     def systems(self) -> tuple[CoordinateSystem, ...]:
         """Coordinate systems that are tried."""
-        return COORDINATE_SYSTEMS[self.scenario]
+        return COORDINATE_SYSTEMS[scenario_named(self.scenario).name]
 
 
 def fit_base(request: FitRequest) -> FittedDistribution:
@@ -72,8 +74,10 @@ def fit_base(request: FitRequest) -> FittedDistribution:
         ValueError: The events are too few, or there is no such coordinate system.
     """
     events, parameters, seed = request.events, request.parameters, request.seed
-    fits = [fit_system(events, system, parameters, seed) for system in request.systems]
-    held_out = [held_out_log_prob(events, system, parameters, seed) for system in request.systems]
+    apart = compare_apart(request)
+    systems = [system.combine(apart.chosen.system) if apart else system for system in request.systems]
+    fits = [fit_system(events, system, parameters, seed) for system in systems]
+    held_out = [held_out_log_prob(events, system, parameters, seed) for system in systems]
     chosen = _choose(request, fits, held_out)
     names = [p.name for p in parameters]
     systems = request.systems if request.system is None else (chosen.system,)
@@ -84,14 +88,52 @@ def fit_base(request: FitRequest) -> FittedDistribution:
         events=events.counts,
         family=describe_family(chosen.family, refits),
         frequency=request.frequency,
-        checks=check_predictions(request.scenario, names, events.joint, chosen.distribution, seed),
-        record=_record(request, chosen, fits, held_out),
+        checks=check_predictions(scenario_named(request.scenario).name, names, events.joint, chosen.distribution, seed),
+        record=_record(request, chosen, fits, held_out, apart),
+    )
+
+
+@dataclass(frozen=True)
+class ApartComparison:
+    """Fits of the columns apart in several coordinate systems."""
+
+    fits: tuple[SystemFit, ...]
+    held_out: tuple[FloatArray, ...]
+    """Log density of each event under a fit to the others, see `held_out_log_prob`."""
+
+    @property
+    def chosen(self) -> SystemFit:
+        """The fit that the events support best."""
+        events = np.arange(len(self.held_out[0]))
+        return self.fits[choose_system([fit.bic for fit in self.fits], self.held_out, events)]
+
+    @property
+    def selection(self) -> list[dict[str, Any]]:
+        """The criteria of each, for the file."""
+        return [_describe_fit(fit, scores) for fit, scores in zip(self.fits, self.held_out, strict=True)]
+
+
+def compare_apart(request: FitRequest) -> ApartComparison | None:
+    """Return fits of the columns apart, one component each; None where there is only one coordinate system for them.
+
+    Raises:
+        ValueError: The events are too few.
+    """
+    columns, seed = request.events.joint.shape[1], request.seed
+    own = request.parameters[columns:]
+    systems = [system for p in own for system in SYSTEMS_APART.get(p.name, ())]
+    if not systems:
+        return None
+    events = EventSet(request.events.apart, np.arange(len(request.events.apart)))
+    return ApartComparison(
+        tuple(fit_system(events, system, own, seed, most=1) for system in systems),
+        tuple(held_out_log_prob(events, system, own, seed, most=1) for system in systems),
     )
 
 
 def _choose(request: FitRequest, fits: Sequence[SystemFit], held_out: Sequence[FloatArray]) -> SystemFit:
     """Return the fit in the coordinate system asked for, or in the best supported one."""
-    names = [fit.system.name for fit in fits]
+    names = [system.name for system in request.systems]
     if request.system is None:
         return fits[choose_system([fit.bic for fit in fits], held_out, request.events.clusters)]
     if request.system not in names:
@@ -100,7 +142,11 @@ def _choose(request: FitRequest, fits: Sequence[SystemFit], held_out: Sequence[F
 
 
 def _record(
-    request: FitRequest, chosen: SystemFit, fits: Sequence[SystemFit], held_out: Sequence[FloatArray]
+    request: FitRequest,
+    chosen: SystemFit,
+    fits: Sequence[SystemFit],
+    held_out: Sequence[FloatArray],
+    apart: ApartComparison | None,
 ) -> dict[str, Any]:
     """Return the record of a fit, for its file."""
     selection = [_describe_fit(fit, scores) for fit, scores in zip(fits, held_out, strict=True)]
@@ -113,6 +159,7 @@ def _record(
         "source": dict(request.source),
         "filters": list(request.events.log),
         "selection": selection,
+        **({"selection_apart": apart.selection} if apart else {}),
         "settings": {
             "covariance_floor": COVARIANCE_FLOOR,
             "restarts": EM_STARTS,

@@ -8,7 +8,7 @@ events that the fit has not seen are what the events themselves have to say abou
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,6 +56,10 @@ class CoordinateSystem:
             order=tuple(name for name in self.order if name in names),
         )
 
+    def combine(self, apart: CoordinateSystem) -> CoordinateSystem:
+        """Return the system with the coordinates of another for the columns fitted apart."""
+        return replace(self, name=f"{self.name}, {apart.name}", kinds={**self.kinds, **apart.kinds})
+
 
 COORDINATE_SYSTEMS: dict[str, tuple[CoordinateSystem, ...]] = {
     "car_following": (
@@ -78,7 +82,7 @@ COORDINATE_SYSTEMS: dict[str, tuple[CoordinateSystem, ...]] = {
                 "cut_in_gap": "log",
                 "lead_gap": "log",
             },
-            ("ego_speed", "cut_in_gap", "cut_in_speed", "lead_gap", "lead_speed", "lateral_offset"),
+            ("ego_speed", "cut_in_gap", "cut_in_speed", "lead_gap", "lead_speed", "lateral_offset", "duration"),
         ),
     ),
     "hard_brake": (
@@ -88,6 +92,10 @@ COORDINATE_SYSTEMS: dict[str, tuple[CoordinateSystem, ...]] = {
     ),
 }
 """Coordinate systems that are tried, by scenario."""
+SYSTEMS_APART: dict[str, tuple[CoordinateSystem, ...]] = {
+    "duration": (CoordinateSystem("plain duration"), CoordinateSystem("log duration", {"duration": "log"})),
+}
+"""Those for the columns fitted apart, by a parameter among these."""
 
 
 @dataclass(frozen=True)
@@ -121,7 +129,7 @@ def fit_system(
 
     Args:
         events: The events.
-        system: The coordinates.
+        system: The coordinates, those of the columns apart included.
         parameters: Parameters of the scenario, in the order of x.
         seed: Seed of the fits.
         starts: Starts of each fit, see `select_mixture`.
@@ -134,13 +142,18 @@ def fit_system(
     fit = select_mixture(joint.to_coordinates(events.joint), seed, most, starts)
     components = fit.components
     if events.apart.shape[1]:
-        components = append_independent(components, select_mixture(events.apart, seed, most=1).components)
+        apart = system.coordinates(parameters[events.joint.shape[1] :]).to_coordinates(events.apart)
+        components = append_independent(components, select_mixture(apart, seed, most=1).components)
     bic = fit.bic - 2.0 * float(joint.log_jacobian(joint.interior(events.joint)).sum())
     return SystemFit(system, CoordinateMixture(system.coordinates(parameters), *components), fit, bic)
 
 
 def held_out_log_prob(
-    events: EventSet, system: CoordinateSystem, parameters: Sequence[Parameter], seed: int = 0
+    events: EventSet,
+    system: CoordinateSystem,
+    parameters: Sequence[Parameter],
+    seed: int = 0,
+    most: int = MAX_COMPONENTS,
 ) -> FloatArray:
     """Return the log density of each event under a fit to the other folds, shape (n,), columns apart left out.
 
@@ -152,7 +165,8 @@ def held_out_log_prob(
     for fold in np.array_split(names, min(N_FOLDS, len(names))):
         test = np.isin(events.clusters, fold)
         try:
-            fitted = fit_system(EventSet(events.joint[~test], events.clusters[~test]), system, own, seed, FOLD_STARTS)
+            rest = EventSet(events.joint[~test], events.clusters[~test])
+            fitted = fit_system(rest, system, own, seed, FOLD_STARTS, most)
         except ValueError:
             continue
         scores[test] = fitted.distribution.log_prob(events.joint[test])

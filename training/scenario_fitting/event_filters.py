@@ -79,8 +79,8 @@ EVENT_RECIPES = {
     "car_following": EventRecipe("car_following_events.csv", ("v_ego", "v_lead", "gap"), excluded=("at_entry",)),
     "cut_in": EventRecipe(
         "cut_in_events.csv",
-        ("v_ego", "v_cutin", "v_lead", "gap_ego_cutin", "gap_cutin_lead", "lateral_offset"),
-        apart=("lateral_offset",),
+        ("v_ego", "v_cutin", "v_lead", "gap_ego_cutin", "gap_cutin_lead", "lateral_offset", "duration"),
+        apart=("lateral_offset", "duration"),
         required=("start_seen",),
         phase="start",
     ),
@@ -96,6 +96,8 @@ FILTER_REASONS = {
     "m": "outside the physical range: gaps below it are side by side or errors of position and "
     "length, gaps above it no longer concern the ego",
     "m/s^2": "outside the physical range of decelerations",
+    "duration is given": "start or end of the lane change was not recorded",
+    "duration": "shorter than tyres allow, or so long that the vehicle drifted rather than changed",
     "lateral_offset": "bodies that overlap across (errors of lane position, or an ego far from its "
     "lane's centre), or more than one lane apart",
 }
@@ -151,15 +153,19 @@ def filter_events(events: Mapping[str, NDArray[Any]], recipe: EventRecipe, box: 
         log.append({"rule": rule, "reason": reason, "dropped": dropped})
         np.logical_and(keep, passes, out=keep)
 
+    def apply_given(column: str) -> None:
+        rule = f"{column} is given"
+        apply(rule, FILTER_REASONS.get(rule, FILTER_REASONS["missing"]), ~np.isnan(events[column]))
+
     def apply_range(column: str, p: Parameter) -> None:
         inside = (events[column] >= p.low) & (events[column] <= p.high)
-        reason = FILTER_REASONS.get(p.name, FILTER_REASONS[p.unit])
+        reason = FILTER_REASONS[p.name if p.name in FILTER_REASONS else p.unit]
         apply(f"{p.low:g} <= {column} <= {p.high:g} {p.unit}", reason, inside)
 
     for column in recipe.excluded:
         apply(f"not {column}", FILTER_REASONS[f"not {column}"], ~events[column].astype(bool))
-    for column in recipe.columns:
-        apply(f"{column} is given", FILTER_REASONS["missing"], ~np.isnan(events[column]))
+    for column in recipe.joint:
+        apply_given(column)
     for column, p in zip(recipe.joint, box, strict=False):
         apply_range(column, p)
     log.append({"rule": "events used", "columns": list(recipe.joint), "events": int(keep.sum())})
@@ -170,6 +176,8 @@ def filter_events(events: Mapping[str, NDArray[Any]], recipe: EventRecipe, box: 
     clusters = clusters[keep]
     for column in recipe.required:
         apply(column, FILTER_REASONS[column], events[column].astype(bool))
+    for column in recipe.apart:
+        apply_given(column)
     for column, p in zip(recipe.apart, box[len(recipe.joint) :], strict=False):
         apply_range(column, p)
     if recipe.apart:

@@ -36,7 +36,8 @@ from training.scenario_fitting.base_files import FitRequest, fit_base, format_ba
 from training.scenario_fitting.event_filters import EVENT_RECIPES, filter_events, read_events
 from training.scenario_fitting.own_frequency import ObservedTraffic, count_events
 from training.scenario_fitting.published_highway import build_highway_base
-from training.scenario_fitting.shipped.bases import SHIPPED_BASES, ShippedBase
+from training.scenario_fitting.shipped.bases import SHIPPED_BASES, ShippedBase, name_file
+from training.scenario_fitting.shipped.cut_ins import CUT_IN_V0, CUT_IN_V1
 from training.scenario_fitting.shipped.following_states import check_against_following
 
 PACKAGE_COMMAND = "python -m training.scenario_fitting.fit --data DIR --out rare_envs/data"
@@ -155,7 +156,7 @@ def main(
     """Write base distributions: those of the package, or those of your own recordings."""
     with report_errors("fit"):
         kind, path = recordings.kind_and_path()
-        known = tuple(EVENT_RECIPES) if kind != "data" else tuple(dict.fromkeys(b.scenario for b in SHIPPED_BASES))
+        known = tuple(EVENT_RECIPES)
         if unknown := sorted(set(scenario or ()) - set(known)):
             raise ValueError(f"Unknown scenario {unknown[0]}; known are {', '.join(known)}.")
         gaps: Gaps = "cut" if cut_gaps else "error"
@@ -169,15 +170,15 @@ def main(
 def _write_package_bases(data: Path, scenarios: Sequence[str], out: Path, seed: int, n_refits: int | None) -> None:
     """Write the bases of the package, each as soon as it is fitted."""
     for base in SHIPPED_BASES:
-        if base.scenario in scenarios:
+        if scenario_named(base.scenario).name in scenarios:
             text = fit_shipped_base(base, data, seed, n_refits)
             _write(out / base.file, text)
-    for scenario in ("car_following", "cut_in"):
-        if scenario in scenarios:
+    for scenario in ("car_following", CUT_IN_V0, CUT_IN_V1):
+        if scenario_named(scenario).name in scenarios:
             content = build_highway_base(scenario)
             if scenario == "car_following":
                 content = check_against_following(content, data)
-            _write(out / f"{scenario}_highway.json", format_base(scenario, content))
+            _write(out / name_file(scenario, "highway"), format_base(scenario, content))
 
 
 def _write(path: Path, text: str) -> None:

@@ -25,6 +25,13 @@ CAR_SPEED = 30.0
 """Speed of cars [m/s], published for highD."""
 TRUCK_SPEED = 24.0
 """Speed of trucks [m/s], published for highD."""
+CHANGE_DURATION = 6.28
+"""Mean duration of a lane change [s], published for 16 commuters."""
+PUBLISHED_DURATION = {
+    "a lane change takes 6.28 s in the mean": "7,192 single lane changes of 16 commuters "
+    "(Lee, Olsen, Wierwille, DOT HS 809 702, 2004)",
+}
+"""Provenance of the duration of a cut-in."""
 PROVENANCE: dict[str, Any] = {
     "kind": "assembled from published statistics and stated choices, NOT fitted to data",
     "published": {
@@ -102,21 +109,21 @@ SITUATIONS: dict[str, tuple[TrafficSituation, ...]] = {
             _following_correlation(0.5),
         ),
     ),
-    # ego_speed, cut_in_speed, lead_speed, cut_in_gap, lead_gap, lateral_offset: 30 m at 30 m/s is
-    # a headway of 1 s, 45 m one of 1.5 s: the ends of the published mode.
+    # ego_speed, cut_in_speed, lead_speed, cut_in_gap, lead_gap, lateral_offset, duration: 30 m at 30 m/s is
+    # a headway of 1 s, 45 m one of 1.5 s: the ends of the published mode. CutIn-v0 has no duration.
     "cut_in": (
         TrafficSituation(
             "car changes lane between cars",
             0.6,
-            (CAR_SPEED, CAR_SPEED, 31.0, 30.0, 40.0, 3.75),
-            (3.0, 3.0, 3.0, 12.0, 18.0, 0.3),
+            (CAR_SPEED, CAR_SPEED, 31.0, 30.0, 40.0, 3.75, CHANGE_DURATION),
+            (3.0, 3.0, 3.0, 12.0, 18.0, 0.3, 2.0),
             _cut_in_correlation(0.6),
         ),
         TrafficSituation(
             "slower car pulls out to overtake",
             0.4,
-            (CAR_SPEED, 26.0, 28.0, 45.0, 45.0, 3.75),
-            (3.0, 2.5, 2.5, 16.0, 18.0, 0.3),
+            (CAR_SPEED, 26.0, 28.0, 45.0, 45.0, 3.75, CHANGE_DURATION),
+            (3.0, 2.5, 2.5, 16.0, 18.0, 0.3, 2.0),
             _cut_in_correlation(0.6),
         ),
     ),
@@ -125,18 +132,21 @@ SITUATIONS: dict[str, tuple[TrafficSituation, ...]] = {
 
 
 def build_highway_base(scenario: str) -> dict[str, Any]:
-    """Return the entries of the assembled base of a scenario, its provenance included."""
-    components, box = SITUATIONS[scenario], scenario_named(scenario).parameters
+    """Return the entries of the assembled base of a scenario, by short name or id, its provenance included."""
+    components, box = SITUATIONS[scenario_named(scenario).name], scenario_named(scenario).parameters
+    d = len(box)
     low, high = np.array([p.low for p in box]), np.array([p.high for p in box])
     arrays = (
         np.array([component.weight for component in components]),
-        np.array([component.mean for component in components]),
-        np.array([component.covariance() for component in components]),
+        np.array([component.mean[:d] for component in components]),
+        np.array([component.covariance()[:d, :d] for component in components]),
     )
     kinds: list[CoordinateKind] = ["plain" for _ in box]
     plain = Coordinates(low, high, tuple(kinds))
+    published = {**PROVENANCE["published"], **(PUBLISHED_DURATION if box[-1].name == "duration" else {})}
     provenance = {
         **PROVENANCE,
+        "published": published,
         "components": [component.meaning for component in components],
         "mass_outside_box": mass_outside(CoordinateMixture(plain, *arrays)),
     }

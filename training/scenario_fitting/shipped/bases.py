@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from rare_envs.distributions.frequency import EventFrequency
 from rare_envs.distributions.space import Parameter
-from rare_envs.scenarios.registry import scenario_named
+from rare_envs.scenarios.registry import env_id_of, scenario_named, split_version
 from samplers.problem import FloatArray
 from training.data.brakings import find_standstill_brakings
 from training.scenario_fitting.coordinate_systems import COORDINATE_SYSTEMS
@@ -21,25 +21,25 @@ from training.scenario_fitting.event_filters import (
     EventRecipe,
     EventSet,
     filter_events,
-    read_csv_columns,
     read_events,
 )
 from training.scenario_fitting.shipped.brakings import load_brakings
-from training.scenario_fitting.shipped.frequencies import (
-    CUT_INS_I80,
-    CUT_INS_US101,
-    NEW_LEADERS_I24,
-    NEW_LEADERS_I80,
-    braking_frequency,
+from training.scenario_fitting.shipped.cut_ins import (
+    CUT_IN_V0,
+    CUT_IN_V1,
+    read_i80_cut_ins,
+    read_i80_timed_cut_ins,
+    read_us101_cut_ins,
+    read_us101_cut_ins_alone,
+    read_us101_timed_cut_ins,
 )
-from training.scenario_fitting.shipped.lateral_offsets import lateral_offsets
+from training.scenario_fitting.shipped.frequencies import NEW_LEADERS_I24, NEW_LEADERS_I80, braking_frequency
 from training.scenario_fitting.shipped.new_leaders import load_new_leaders
 
 Reader = Callable[[Path], tuple[EventSet, EventFrequency | None]]
 
 PAIRS = ("v_ego", "v_lead", "gap")
 I80_PAIRS_FILE = "i80_coifman_pairs.csv"
-CUT_INS = ("v_ego", "v_cutin", "v_lead", "gap_ego_cutin", "gap_cutin_lead")
 NGSIM_LICENCE = (
     "CC BY-SA 3.0 (as the data's public record was reported); these parameters are derived from the data and are "
     "offered under the same licence"
@@ -84,6 +84,7 @@ class ShippedBase:
     """A base of the package that is fitted to recorded events."""
 
     scenario: str
+    """Short name, or environment id where its scenario has several versions."""
     name: str
     read: Reader
     """Reads its events from the folder of compact tables, and how often they happen."""
@@ -97,7 +98,19 @@ class ShippedBase:
     @property
     def file(self) -> str:
         """Name of its file in the package."""
-        return f"{self.scenario}_{self.name.replace('-', '_')}.json"
+        return name_file(self.scenario, self.name)
+
+
+def name_file(scenario: str, base: str) -> str:
+    """Return the name of the file of a base in the package, with the version of its scenario if that is not the first.
+
+    Example:
+        >>> name_file("rare_envs/CutIn-v0", "us101"), name_file("rare_envs/CutIn-v1", "i80-closing")
+        ('cut_in_us101.json', 'cut_in_v1_i80_closing.json')
+    """
+    version = split_version(env_id_of(scenario))[1]
+    parts = (scenario_named(scenario).name, *([f"v{version}"] if version else []), base.replace("-", "_"))
+    return "_".join(parts) + ".json"
 
 
 def _box(scenario: str) -> tuple[Parameter, ...]:
@@ -129,28 +142,6 @@ def read_i24_pairs(folder: Path) -> tuple[EventSet, EventFrequency]:
     return _within_box("car_following", events, drives, "drive"), NEW_LEADERS_I24
 
 
-def read_us101_cut_ins(folder: Path) -> tuple[EventSet, EventFrequency]:
-    """Return cut-ins of the scenes of US 101 at the start of the lane change."""
-    recipe = EventRecipe("us101_cut_in_events.csv", CUT_INS, phase="start", cluster=("scene",))
-    events = filter_events(read_events(folder / recipe.file, recipe), recipe, _box("cut_in"))
-    return _with_offsets(events, folder, "us101"), CUT_INS_US101
-
-
-def read_us101_cut_ins_alone(folder: Path) -> tuple[EventSet, EventFrequency]:
-    """Return cut-ins of the scenes of US 101, with the lateral offsets of the 15 whose start was seen."""
-    recipe = replace(EVENT_RECIPES["cut_in"], file="us101_cut_in_events.csv", cluster=("scene",))
-    return filter_events(read_events(folder / recipe.file, recipe), recipe, _box("cut_in")), CUT_INS_US101
-
-
-def read_i80_cut_ins(folder: Path) -> tuple[EventSet, EventFrequency]:
-    """Return settled cut-ins of the I-80, 1.3 s before the crossing, the mean start of those on US 101."""
-    recipe = EventRecipe("i80_coifman_lane_changes.csv", CUT_INS, phase="start", cluster=("frame",))
-    rows = read_events(folder / recipe.file, recipe)
-    settled = read_csv_columns(folder / recipe.file, ("settled",))["settled"].astype(bool)
-    events = filter_events({name: values[settled] for name, values in rows.items()}, recipe, _box("cut_in"))
-    return _with_offsets(events, folder, "i80"), CUT_INS_I80
-
-
 def read_us101_brakings(folder: Path) -> tuple[EventSet, EventFrequency]:
     """Return brakings to a standstill of single vehicles on US 101, at their beginning."""
     brakings = load_brakings(folder, find_standstill_brakings)
@@ -179,22 +170,6 @@ def _within_box(scenario: str, events: FloatArray, clusters: NDArray[np.int64], 
     return EventSet(events[inside], clusters[inside], cluster=cluster, log=log)
 
 
-def _with_offsets(events: EventSet, folder: Path, site: str) -> EventSet:
-    """Return events with lateral offsets from the profiles of lane changes of the site."""
-    offset = _box("cut_in")[-1]
-    displacements = lateral_offsets(folder, site)
-    apart = displacements[(displacements >= offset.low) & (displacements <= offset.high)]
-    rules = (
-        {
-            "rule": f"{offset.low:g} <= displacement <= {offset.high:g} m",
-            "reason": "bodies that overlap across, or more than one lane apart",
-            "dropped": len(displacements) - len(apart),
-        },
-        {"rule": "events used", "columns": ["lateral_offset"], "events": len(apart)},
-    )
-    return replace(events, apart=apart[:, None], log=(*events.log, *rules))
-
-
 CLOSING_GAPS = COORDINATE_SYSTEMS["cut_in"][2].name
 FIRST_FRAME = "first frame of the pair"
 US101_PAIRS = MappingProxyType(
@@ -220,11 +195,17 @@ SHIPPED_BASES = (
     ShippedBase("car_following", "i80", read_i80_new_leaders, I80_SOURCE, FIRST_FRAME),
     ShippedBase("car_following", "i80-all-pairs", read_i80_pairs, I80_PAIRS, FIRST_FRAME),
     ShippedBase("car_following", "i24", read_i24_pairs, I24_SOURCE, "0.8 s after the gap began to jump"),
-    ShippedBase("cut_in", "us101", read_us101_cut_ins, US101_SOURCE, CHANGE_STARTS),
-    ShippedBase("cut_in", "us101-closing", read_us101_cut_ins, US101_SOURCE, CHANGE_STARTS, system=CLOSING_GAPS),
-    ShippedBase("cut_in", "us101-15-offsets", read_us101_cut_ins_alone, US101_SOURCE, CHANGE_STARTS, system="log gaps"),
-    ShippedBase("cut_in", "i80", read_i80_cut_ins, I80_SOURCE, BEFORE_CROSSING),
-    ShippedBase("cut_in", "i80-closing", read_i80_cut_ins, I80_SOURCE, BEFORE_CROSSING, system=CLOSING_GAPS),
+    ShippedBase(CUT_IN_V1, "us101", read_us101_timed_cut_ins, US101_SOURCE, CHANGE_STARTS),
+    ShippedBase(CUT_IN_V1, "us101-closing", read_us101_timed_cut_ins, US101_SOURCE, CHANGE_STARTS, system=CLOSING_GAPS),
+    ShippedBase(CUT_IN_V1, "i80", read_i80_timed_cut_ins, I80_SOURCE, BEFORE_CROSSING),
+    ShippedBase(CUT_IN_V1, "i80-closing", read_i80_timed_cut_ins, I80_SOURCE, BEFORE_CROSSING, system=CLOSING_GAPS),
+    ShippedBase(CUT_IN_V0, "us101", read_us101_cut_ins, US101_SOURCE, CHANGE_STARTS),
+    ShippedBase(CUT_IN_V0, "us101-closing", read_us101_cut_ins, US101_SOURCE, CHANGE_STARTS, system=CLOSING_GAPS),
+    ShippedBase(
+        CUT_IN_V0, "us101-15-offsets", read_us101_cut_ins_alone, US101_SOURCE, CHANGE_STARTS, system="log gaps"
+    ),
+    ShippedBase(CUT_IN_V0, "i80", read_i80_cut_ins, I80_SOURCE, BEFORE_CROSSING),
+    ShippedBase(CUT_IN_V0, "i80-closing", read_i80_cut_ins, I80_SOURCE, BEFORE_CROSSING, system=CLOSING_GAPS),
     ShippedBase("hard_brake", "us101", read_us101_brakings, US101_SOURCE, "beginning of the braking"),
 )
 """Bases of the package that are fitted to recorded events.

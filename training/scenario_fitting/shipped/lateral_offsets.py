@@ -7,9 +7,12 @@ displacement is that of the changing vehicle; where the ego drives within its la
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from samplers.problem import FloatArray
 from training.data.ngsim_tables import read_columns
@@ -21,6 +24,21 @@ MIN_LANE_TIME = 3.0
 """Least time in one lane on either side of a change [s]."""
 
 
+def split_profiles(rows: Mapping[str, NDArray[Any]], site: str) -> Iterator[tuple[NDArray[np.int64], float]]:
+    """Yield the rows of each profile of a site in the order of time, and 1 for a change to the right, -1 to the left.
+
+    Args:
+        rows: Columns site, side, change and t of the profiles.
+        site: "i80" or "us101".
+    """
+    chosen = np.flatnonzero(rows["site"] == site)
+    chosen = chosen[np.lexsort([rows[name][chosen] for name in ("t", "change", "side")])]
+    side, change = rows["side"][chosen], rows["change"][chosen]
+    breaks = np.flatnonzero((side[1:] != side[:-1]) | (change[1:] != change[:-1])) + 1
+    for profile in np.split(chosen, breaks) if len(chosen) else ():
+        yield profile, 1.0 if rows["side"][profile[0]] == "right" else -1.0
+
+
 def profile_displacements(folder: Path, site: str) -> FloatArray:
     """Return the displacements of the profiles of a site ("i80" or "us101") to the side of the change [m], shape (n,).
 
@@ -28,30 +46,27 @@ def profile_displacements(folder: Path, site: str) -> FloatArray:
         ValueError: The file is missing or lacks a column.
     """
     rows = read_columns(folder / PROFILES_FILE, ("site", "side", "change", "t", "across"))
-    rows = {name: values[rows["site"] == site] for name, values in rows.items()}
-    order = np.lexsort([rows["t"], rows["change"], rows["side"]])
-    side, change, across = (rows[name][order] for name in ("side", "change", "across"))
-    breaks = np.flatnonzero((side[1:] != side[:-1]) | (change[1:] != change[:-1])) + 1
-    ends = [0, *breaks.tolist(), len(across)] if len(across) else []
-    first, last = np.array(ends[:-1], dtype=np.int64), np.array(ends[1:], dtype=np.int64) - 1
-    displacement: FloatArray = (across[last] - across[first]) * np.where(side[first] == "right", 1.0, -1.0)
-    return displacement
+    across = rows["across"]
+    return np.array([side * (across[each[-1]] - across[each[0]]) for each, side in split_profiles(rows, site)])
+
+
+def settled_changes(rows: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
+    """Return which changes of single vehicles on US 101 have `MIN_LANE_TIME` in one lane on either side, shape (n,)."""
+    return np.asarray((rows["before_s"] >= MIN_LANE_TIME) & (rows["after_s"] >= MIN_LANE_TIME))
 
 
 def change_displacements(folder: Path) -> FloatArray:
-    """Return the displacements of the changes of single vehicles on US 101 [m], shape (n,).
+    """Return the displacements of the settled changes of single vehicles on US 101 [m], shape (n,).
 
-    Between 4 s before and 4 s after the crossing, 3 s where the track is shorter.
+    Between 4 s before and 4 s after the crossing, 3 s where the track is shorter; NaN where that is not known either.
 
     Raises:
         ValueError: The file is missing or lacks a column.
     """
     ends = ("across_-4s", "across_+4s", "across_-3s", "across_+3s")
     rows = read_csv_columns(folder / CHANGES_FILE, ("before_s", "after_s", *ends))
-    settled = (rows["before_s"] >= MIN_LANE_TIME) & (rows["after_s"] >= MIN_LANE_TIME)
     wide, narrow = rows[ends[1]] - rows[ends[0]], rows[ends[3]] - rows[ends[2]]
-    displacement: FloatArray = np.where(np.isnan(wide), narrow, wide)[settled]
-    return displacement[~np.isnan(displacement)]
+    return np.asarray(np.where(np.isnan(wide), narrow, wide)[settled_changes(rows)])
 
 
 def lateral_offsets(folder: Path, site: str) -> FloatArray:
@@ -60,4 +75,5 @@ def lateral_offsets(folder: Path, site: str) -> FloatArray:
     Raises:
         ValueError: A file is missing or lacks a column.
     """
-    return change_displacements(folder) if site == "us101" else profile_displacements(folder, site)
+    found = change_displacements(folder) if site == "us101" else profile_displacements(folder, site)
+    return found[~np.isnan(found)]
