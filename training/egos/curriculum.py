@@ -251,7 +251,7 @@ def make_situations() -> tuple[Situation, ...]:
         traffic,
         following,
         Situation(lambda rng: highway, _draw_highway, find_drivers(highway.drivers)),
-        Situation(somewhere(scenario_named("cut_in")), _draw_cut_in),
+        Situation(somewhere(scenario_named("rare_envs/CutIn-v0")), _draw_cut_in),
         traffic,
         following,
         Situation(somewhere(scenario_named("hard_brake")), _draw_hard_brake),

@@ -36,7 +36,7 @@ class EncounterSpec:
     """Settings of encounters of one kind."""
 
     scenario: str
-    """Short name of a scenario, or one of `training.egos.nominal_traffic.CASES` on a straight road."""
+    """Short name or id of a scenario, or one of `training.egos.nominal_traffic.CASES` on a straight road."""
     base: str | None = None
     """Base distribution of the scenario."""
     scenes: int = 1

@@ -7,17 +7,17 @@ from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.scenarios.base_distributions import load_base
 from rare_envs.scenarios.registry import scenario_named
 
-NAMES = [p.name for p in scenario_named("cut_in").parameters]
+NAMES = [p.name for p in scenario_named("rare_envs/CutIn-v0").parameters]
 
 
 def make_space():
-    box = scenario_named("cut_in").parameters
+    box = scenario_named("rare_envs/CutIn-v0").parameters
     return ScenarioSpace(
         names=tuple(p.name for p in box),
         units=tuple(p.unit for p in box),
         low=np.array([p.low for p in box for _ in range(p.size)]),
         high=np.array([p.high for p in box for _ in range(p.size)]),
-        base=load_base(scenario_named("cut_in"), "us101-15-offsets"),
+        base=load_base(scenario_named("rare_envs/CutIn-v0"), "us101-15-offsets"),
         sizes=tuple(p.size for p in box),
     )
 

@@ -125,7 +125,7 @@ def test_json_that_does_not_fit(tmp_path: Path, change: dict[str, Any], message:
 def test_json_with_the_wrong_dimension(tmp_path: Path) -> None:
     content = {**shipped_dict(CUT_IN), "names": shipped_dict()["names"]}
     path = write(tmp_path / "mine.json", content)
-    with pytest.raises(ValueError, match="does not fit car_following: expected 3 columns, got 6"):
+    with pytest.raises(ValueError, match="does not fit car_following: expected 3 columns, got 7"):
         load_base(FOLLOWING, path)
 
 

@@ -117,7 +117,7 @@ def test_noise_and_weights_matter_and_nothing_else_is_random():
 def test_learned_drivers_in_the_scripted_scenarios(env_id):
     problem = rare_envs.DrivingProblem(env_id, drivers="mgail", **SHORT)
     vehicles = problem.world.scenario.vehicles - 1
-    own = 3 if vehicles == 1 else 6
+    own = problem.world.scenario.size
     assert problem.dim == own + 404 + 22 * vehicles * 2
     x = draw(problem, 64)
     f = problem.evaluate(x)

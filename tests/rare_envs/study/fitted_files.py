@@ -11,12 +11,12 @@ import numpy as np
 from rare_envs.scenarios.registry import scenario_named
 
 MEANS = {
-    "cut_in": (20.0, 14.0, 20.0, 8.0, 30.0, 3.5),
+    "cut_in": (20.0, 14.0, 20.0, 8.0, 30.0, 3.5, 4.0),
     "hard_brake": (15.0, 8.0, 7.0),
     "car_following": (20.0, 10.0, 26.0),
 }
 SPREADS = {
-    "cut_in": (2.0, 2.0, 2.0, 2.0, 5.0, 0.2),
+    "cut_in": (2.0, 2.0, 2.0, 2.0, 5.0, 0.2, 0.5),
     "hard_brake": (2.0, 2.0, 1.0),
     "car_following": (2.0, 2.0, 5.0),
 }

@@ -57,6 +57,7 @@ def simulate(seed=0, lanes=3, per_lane=16, seconds=24.0, changers=0.4):
     n, steps = lanes * per_lane, round(seconds / DT)
     length, width = rng.uniform(3.8, 5.4, n), rng.uniform(1.7, 2.0, n)
     lane = np.repeat(np.arange(lanes), per_lane)
+    took = np.random.default_rng((seed, 1)).uniform(3.5, 4.5, n)  # seconds from centre to centre
     x = np.concatenate([200.0 - np.cumsum(rng.uniform(18.0, 45.0, per_lane)) for _ in range(lanes)])
     y = LANE * (lane + 0.5)
     v, desired = rng.uniform(17.0, 23.0, n), rng.uniform(17.0, 27.0, n)
@@ -80,7 +81,7 @@ def simulate(seed=0, lanes=3, per_lane=16, seconds=24.0, changers=0.4):
         for name, values in zip(record, (x, y, v, a), strict=True):
             record[name][k] = values
         moving = changed >= 0
-        phase = np.clip((k + 1 - changed) * DT / 4.0, 0.0, 1.0)  # four seconds from centre to centre
+        phase = np.clip((k + 1 - changed) * DT / took, 0.0, 1.0)
         came = np.where(moving, record["y"][np.maximum(changed, 0), np.arange(n)], y)
         y = np.where(moving, came + (LANE * (target + 0.5) - came) * phase**3 * (10 - 15 * phase + 6 * phase**2), y)
         lane = np.clip(y // LANE, 0, lanes - 1).astype(int)

@@ -16,7 +16,9 @@ from training.imitation.traffic.replayed_traffic import start_replay, step_repla
 
 def test_an_encounter_is_the_scenario_with_its_ego_free() -> None:
     """Others move as in the scenario whatever the ego does; only egos are driven; every other scene is mirrored."""
-    plain, mirrored = make_scenes([EncounterSpec("cut_in", "us101", scenes=2, seconds=4.0)], np.random.default_rng(3))
+    plain, mirrored = make_scenes(
+        [EncounterSpec("rare_envs/CutIn-v0", "us101", scenes=2, seconds=4.0)], np.random.default_rng(3)
+    )
     world = World(CUT_IN, clock=Clock(horizon=4.0))
     x = rare_envs.DrivingProblem("rare_envs/CutIn-v0").base.sample(26, np.random.default_rng(3))
     with torch.inference_mode():

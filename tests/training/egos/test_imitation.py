@@ -28,7 +28,10 @@ def tiny() -> tuple[Config, list[EncounterSpec]]:
     config = Config(
         updates=2, pools=1, scenes=3, horizon=(4, 4), epochs=1, warm_up=1, headway_weight=8.0, lane_weight=8.0
     )
-    return config, [EncounterSpec("cut_in", "us101", seconds=2.0), EncounterSpec("hard_brake", None, seconds=2.0)]
+    return config, [
+        EncounterSpec("rare_envs/CutIn-v0", "us101", seconds=2.0),
+        EncounterSpec("hard_brake", None, seconds=2.0),
+    ]
 
 
 def test_training_repeats_and_learns_from_people_only(tiny: tuple[Config, list[EncounterSpec]]) -> None:

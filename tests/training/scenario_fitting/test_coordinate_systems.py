@@ -8,6 +8,7 @@ from rare_envs.scenarios.registry import scenario_named
 from training.scenario_fitting import mixture as mixture_fit
 from training.scenario_fitting.coordinate_systems import (
     COORDINATE_SYSTEMS,
+    SYSTEMS_APART,
     choose_system,
     fit_system,
     held_out_log_prob,
@@ -80,11 +81,16 @@ def test_too_few_events_are_not_predicted():
 def test_columns_apart_are_independent(quick):
     rng = np.random.default_rng(1)
     joint = np.column_stack([rng.normal(15.0, 2.0, (60, 3)), rng.uniform(5.0, 40.0, (60, 2))])
-    offsets = rng.normal(3.0, 0.4, (25, 1))
-    fit = fit_system(EventSet(joint, np.arange(60), offsets), COORDINATE_SYSTEMS["cut_in"][2], CUT_IN)
+    offsets = rng.normal(3.0, 0.4, 25)
+    apart = np.column_stack([offsets, np.exp(1.5 + 0.3 * (offsets - 3.0) + rng.normal(0.0, 0.1, 25))])
+    system = COORDINATE_SYSTEMS["cut_in"][2].combine(SYSTEMS_APART["duration"][1])
+    fit = fit_system(EventSet(joint, np.arange(60), apart), system, CUT_IN)
     covariance, mean = fit.distribution.covariances[0], fit.distribution.means[0]
-    assert (covariance[5, :5] == 0.0).all()
-    assert mean[5] == pytest.approx(offsets.mean(), rel=1e-5)
+    assert (covariance[5:, :5] == 0.0).all()
+    logs = np.column_stack([offsets, np.log(apart[:, 1])])
+    np.testing.assert_allclose(mean[5:], logs.mean(axis=0), rtol=1e-5)
+    # Up to the floor under variances, 1 % of each.
+    np.testing.assert_allclose(covariance[5:, 5:], np.cov(logs.T, bias=True), rtol=0.011)
 
 
 ERROR_PATTERN = np.tile([1.0, -1.0], 25)

@@ -16,7 +16,7 @@ def write_events(path, rows):
         writer.writerows(rows)
 
 
-GOOD = [15.0, 14.0, 16.0, 12.0, 20.0, 3.0]
+GOOD = [15.0, 14.0, 16.0, 12.0, 20.0, 3.0, 4.5]
 
 
 def test_filters_drop_and_count(tmp_path):
@@ -29,27 +29,33 @@ def test_filters_drop_and_count(tmp_path):
             ["start", *GOOD, False, "a", 300],
             ["start", "", *GOOD[1:], True, "a", 1],  # no ego
             ["start", *GOOD[:3], -2.0, *GOOD[4:], True, "a", 1],  # side by side
-            ["start", *GOOD[:5], 1.5, True, "b", 10],  # bodies overlap across
+            ["start", *GOOD[:5], 1.5, 4.5, True, "b", 10],  # bodies overlap across
             ["start", 16.0, *GOOD[1:], True, "a", 10],
+            ["start", *GOOD[:6], "", True, "a", 11],  # the end was not recorded
+            ["start", *GOOD[:6], 1.2, True, "a", 12],  # faster than tyres allow
         ],
     )
     recipe, box = EVENT_RECIPES["cut_in"], scenario_named("cut_in").parameters
     events = filter_events(read_events(path, recipe), recipe, box)
-    points, offsets, log = events.joint, events.apart, events.log
-    # speeds and gaps count even where the offset at the start was not seen or is out of range
-    assert points.tolist() == [GOOD[:5], GOOD[:5], GOOD[:5], [16.0, *GOOD[1:5]]]
-    assert offsets.tolist() == [[3.0], [3.0]]
+    points, shapes, log = events.joint, events.apart, events.log
+    # speeds and gaps count even where the offset at the start was not seen or is out of range, or the duration
+    assert points.tolist() == [GOOD[:5], GOOD[:5], GOOD[:5], [16.0, *GOOD[1:5]], GOOD[:5], GOOD[:5]]
+    assert shapes.tolist() == [[3.0, 4.5], [3.0, 4.5]]
     # 30 s windows: frame 299 of a, frame 300 of a, frame 10 of b, frame 10 of a
-    assert (events.clusters == events.clusters[[0, 3]][:, None]).tolist() == [[True, False, False, True]] * 2
-    assert (events.counts.used, events.counts.clusters, events.counts.cluster) == ((4, 2), 3, "half-minute")
-    assert log[0]["events"] == 6
-    assert [entry["events"] for entry in log if entry["rule"] == "events used"] == [4, 2]
+    assert (events.clusters == events.clusters[[0, 3]][:, None]).tolist() == [
+        [True, False, False, True, True, True]
+    ] * 2
+    assert (events.counts.used, events.counts.clusters, events.counts.cluster) == ((6, 2), 3, "half-minute")
+    assert log[0]["events"] == 8
+    assert [entry["events"] for entry in log if entry["rule"] == "events used"] == [6, 2]
     dropped = {entry["rule"]: entry["dropped"] for entry in log if entry.get("dropped")}
     assert dropped == {
         "v_ego is given": 1,
         "start_seen": 1,
         "1 <= gap_ego_cutin <= 120 m": 1,
         "2.2 <= lateral_offset <= 5 m": 1,
+        "duration is given": 1,
+        "1.5 <= duration <= 12 s": 1,
     }
 
 

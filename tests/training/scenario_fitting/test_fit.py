@@ -196,7 +196,7 @@ def test_shipped_files_say_what_they_are_worth(base):
     assert record["bic"] == own["bic"]
     chosen = min((c for c in own["components"] if c["accepted"]), key=lambda c: c["bic"])
     assert chosen["number"] == len(file["weights"])
-    assert record["coordinates"] == base.system or own["bic"] <= least + BIC_TIE
+    assert record["coordinates"].startswith(base.system or " ") or own["bic"] <= least + BIC_TIE
     fitted = load_base(scenario_named(base.scenario), base.name)
     families = {(len(refit.weights), refit.coordinates.kinds) for refit in fitted.refits}
     assert len(fitted.refits) == (30 if len(families) == 1 else 100)
@@ -207,7 +207,7 @@ def test_shipped_files_say_what_they_are_worth(base):
 
 
 def test_the_offset_of_a_cut_in_is_fitted_apart():
-    base = load_base(scenario_named("cut_in"), "us101-15-offsets")
+    base = load_base(scenario_named("rare_envs/CutIn-v0"), "us101-15-offsets")
     assert base.events.used == (38, 15)
     covariance = np.array(base.distribution.covariances[0])
     assert (covariance[5, :5] == 0.0).all()

@@ -20,8 +20,8 @@ from training.scenario_fitting.event_filters import read_csv_columns
 from training.scenario_fitting.shipped.lateral_offsets import (
     CHANGES_FILE,
     PROFILES_FILE,
-    change_displacements,
     settled_changes,
+    settled_displacements,
     split_profiles,
 )
 
@@ -58,7 +58,7 @@ def change_shapes(folder: Path) -> FloatArray:
     start, end, first, last = (rows[name][settled] for name in ("start_s", "end_s", "start_seen", "end_seen"))
     above = time_between_spans(np.round(start / DT), np.round(end / DT), DT)
     above = np.where(first.astype(bool) & last.astype(bool), above, np.nan)
-    displacement = change_displacements(folder)
+    displacement = settled_displacements(folder)
     return np.column_stack([displacement, course_durations(above, displacement)])
 
 

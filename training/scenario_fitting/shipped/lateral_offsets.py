@@ -55,7 +55,7 @@ def settled_changes(rows: Mapping[str, NDArray[Any]]) -> NDArray[np.bool_]:
     return np.asarray((rows["before_s"] >= MIN_LANE_TIME) & (rows["after_s"] >= MIN_LANE_TIME))
 
 
-def change_displacements(folder: Path) -> FloatArray:
+def settled_displacements(folder: Path) -> FloatArray:
     """Return the displacements of the settled changes of single vehicles on US 101 [m], shape (n,).
 
     Between 4 s before and 4 s after the crossing, 3 s where the track is shorter; NaN where that is not known either.
@@ -69,11 +69,20 @@ def change_displacements(folder: Path) -> FloatArray:
     return np.asarray(np.where(np.isnan(wide), narrow, wide)[settled_changes(rows)])
 
 
+def change_displacements(folder: Path) -> FloatArray:
+    """Return the displacements that `settled_displacements` knows [m], shape (n,).
+
+    Raises:
+        ValueError: The file is missing or lacks a column.
+    """
+    found = settled_displacements(folder)
+    return found[~np.isnan(found)]
+
+
 def lateral_offsets(folder: Path, site: str) -> FloatArray:
     """Return the recorded displacements of a site ("i80" or "us101") [m], shape (n,).
 
     Raises:
         ValueError: A file is missing or lacks a column.
     """
-    found = change_displacements(folder) if site == "us101" else profile_displacements(folder, site)
-    return found[~np.isnan(found)]
+    return change_displacements(folder) if site == "us101" else profile_displacements(folder, site)

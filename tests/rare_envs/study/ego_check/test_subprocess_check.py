@@ -317,7 +317,7 @@ def test_a_remote_file_is_refused(cli: Cli) -> None:
 
 
 def test_an_unknown_environment_is_one_line(cli: Cli) -> None:
-    refused = cli("check-ego", "idm", "rare_envs/CutIn-v1")
+    refused = cli("check-ego", "idm", "rare_envs/CutIn-v9")
     assert (refused.exit_code, refused.stdout) == (2, "")
     assert "rare_envs/CutIn-v0" in refused.stderr
 

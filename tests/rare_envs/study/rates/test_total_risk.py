@@ -115,7 +115,7 @@ def test_the_spread_between_sites_widens_the_interval(monkeypatch: pytest.Monkey
 def test_a_scenario_without_a_base_of_the_site_uses_its_default_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     own = {
         "hard_brake": ("rare_envs/HardBrake-v0", ["us101"]),
-        "cut_in": ("rare_envs/CutIn-v0", ["us101", "i80"]),
+        "cut_in": ("rare_envs/CutIn-v1", ["us101", "i80"]),
     }
     for name, (env_id, bases) in own.items():
         entries = {base: fitted_entries(name, provenance={"source": {"site": base}}) for base in bases}
