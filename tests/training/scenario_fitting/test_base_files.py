@@ -85,6 +85,24 @@ def test_the_file_gives_the_same_distribution(quick, tmp_path):
         assert np.array_equal(one.log_prob(x), other.log_prob(x))
 
 
+@pytest.mark.parametrize("logarithmic", [True, False])
+def test_the_coordinate_of_the_duration_is_chosen_by_the_changes(quick, logarithmic):
+    """Durations of 200 changes, normal or log-normal with the same mean and a coefficient of variation of 0.4."""
+    rng = np.random.default_rng(3)
+    joint = np.column_stack([rng.normal(15.0, 2.0, (40, 3)), rng.uniform(5.0, 40.0, (40, 2))])
+    normal = rng.standard_normal(200)
+    duration = np.exp(np.log(5.0) - 0.08 + 0.39 * normal) if logarithmic else 5.0 + 1.2 * normal
+    events = EventSet(joint, np.arange(40), np.column_stack([rng.normal(3.2, 0.2, 200), np.clip(duration, 1.6, 11.9)]))
+    base = fit_base(FitRequest("cut_in", events, {}, "a test", n_refits=2))
+    word = "log duration" if logarithmic else "plain duration"
+    assert base.family.endswith(f", {word}") and base.record["coordinates"].endswith(f", {word}")
+    selection = base.record["selection_apart"]
+    assert [each["coordinates"] for each in selection] == ["plain duration", "log duration"]
+    assert min(selection, key=lambda each: each["bic"])["coordinates"] == word
+    assert base.events.used == (40, 200)
+    assert {refit.coordinates.kinds[6] for refit in base.refits} == {"log" if logarithmic else "plain"}
+
+
 def test_a_coordinate_system_by_name(quick):
     assert fit_base(request(system="plain")).family.endswith("plain")
     with pytest.raises(ValueError, match="Unknown coordinate system 'polar'; known are plain, log gap, closing"):
