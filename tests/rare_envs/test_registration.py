@@ -3,12 +3,13 @@
 import gymnasium as gym
 
 from rare_envs import ENV_IDS
-from rare_envs.scenarios.registry import SCENARIOS, kinematics_id
+from rare_envs.scenarios.registry import SCENARIOS, kinematics_id, split_version
 
 
 def test_registered_ids_are_the_scenarios() -> None:
     assert tuple(SCENARIOS) == ENV_IDS
-    assert len({scenario.name for scenario in SCENARIOS.values()}) == len(SCENARIOS)
+    names = {(scenario.name, split_version(env_id)[1]) for env_id, scenario in SCENARIOS.items()}
+    assert len(names) == len(SCENARIOS)
     assert set(SCENARIOS) <= set(gym.registry)
 
 
