@@ -8,8 +8,6 @@ from scipy import stats
 
 from tests.training.shared_data import DATA, needs_data
 from training.scenario_fitting.event_filters import read_csv_columns
-from training.scenario_fitting.mixture import select_mixture
-from training.scenario_fitting.shipped.cut_ins import read_i80_timed_cut_ins, read_us101_timed_cut_ins
 from training.scenario_fitting.shipped.lane_change_shapes import change_shapes, lane_change_shapes, profile_shapes
 from training.scenario_fitting.shipped.lateral_offsets import CHANGES_FILE, PROFILES_FILE, settled_changes
 
@@ -47,24 +45,6 @@ def test_changes_have_a_duration_where_start_and_end_were_seen(tmp_path):
     assert found[0, 1] == pytest.approx(4.07, abs=0.01)
     assert found[1, 0] == pytest.approx(3.1) and np.isnan(found[1, 1])
     assert len(found) == 2
-
-
-@needs_data(PROFILES_FILE, CHANGES_FILE)
-@pytest.mark.parametrize(
-    ("read", "n", "median", "correlation"),
-    [(read_us101_timed_cut_ins, 259, 4.65, 0.36), (read_i80_timed_cut_ins, 131, 5.55, 0.42)],
-    ids=["us101", "i80"],
-)
-def test_recorded_changes_that_go_farther_take_longer(read, n, median, correlation):
-    events, _ = read(DATA)
-    offset, duration = events.apart.T
-    assert len(offset) == n
-    assert np.median(duration) == pytest.approx(median, abs=0.05)
-    assert np.corrcoef(offset, np.log(duration))[0, 1] == pytest.approx(correlation, abs=0.005)
-    assert stats.spearmanr(offset, duration).pvalue < 1e-4
-    together = select_mixture(np.column_stack([offset, np.log(duration)]))
-    by_themselves = sum(select_mixture(y[:, None], most=1).bic for y in (offset, np.log(duration)))
-    assert len(together.components.weights) == 1 and together.bic < by_themselves - 15.0
 
 
 @needs_data(CHANGES_FILE)
