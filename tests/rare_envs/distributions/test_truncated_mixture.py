@@ -16,8 +16,8 @@ from rare_envs.scenarios.base_distributions import load_base
 from rare_envs.scenarios.registry import SCENARIOS, scenario_named
 
 SHIPPED = [
-    (each.name, base)
-    for each in SCENARIOS.values()
+    (env_id, base)
+    for env_id, each in SCENARIOS.items()
     if each.drivers is None
     for base in each.bases
     if "closing_behind" not in str(load_base(each, base).to_dict())  # these have a range of their own in each row
