@@ -80,8 +80,7 @@ def fit_base(request: FitRequest) -> FittedDistribution:
     held_out = [held_out_log_prob(events, system, parameters, seed) for system in systems]
     chosen = _choose(request, fits, held_out)
     names = [p.name for p in parameters]
-    systems = request.systems if request.system is None else (chosen.system,)
-    refits = refit(events, systems, parameters, seed, request.n_refits)
+    refits = refit(events, _systems_of_refits(request, apart), parameters, seed, request.n_refits)
     return FittedDistribution(
         distribution=chosen.distribution,
         refits=tuple(each.distribution for each in refits),
@@ -129,6 +128,12 @@ def compare_apart(request: FitRequest) -> ApartComparison | None:
         tuple(fit_system(events, system, own, seed, most=1) for system in systems),
         tuple(held_out_log_prob(events, system, own, seed, most=1) for system in systems),
     )
+
+
+def _systems_of_refits(request: FitRequest, apart: ApartComparison | None) -> list[CoordinateSystem]:
+    """Return the coordinate systems that refits choose from: all, or that asked for with all of the columns apart."""
+    systems = [each for each in request.systems if request.system in (None, each.name)]
+    return [each.combine(fit.system) for each in systems for fit in apart.fits] if apart else systems
 
 
 def _choose(request: FitRequest, fits: Sequence[SystemFit], held_out: Sequence[FloatArray]) -> SystemFit:

@@ -109,6 +109,8 @@ class SystemFit:
     """Of the columns that are fitted together."""
     bic: float
     """Bayesian information criterion of these, in units of x: comparable between systems."""
+    bic_apart: float = 0.0
+    """The same of the columns fitted apart."""
 
     @property
     def family(self) -> str:
@@ -140,12 +142,19 @@ def fit_system(
     """
     joint = system.coordinates(parameters[: events.joint.shape[1]])
     fit = select_mixture(joint.to_coordinates(events.joint), seed, most, starts)
-    components = fit.components
+    components, bic_apart = fit.components, 0.0
     if events.apart.shape[1]:
-        apart = system.coordinates(parameters[events.joint.shape[1] :]).to_coordinates(events.apart)
-        components = append_independent(components, select_mixture(apart, seed, most=1).components)
-    bic = fit.bic - 2.0 * float(joint.log_jacobian(joint.interior(events.joint)).sum())
-    return SystemFit(system, CoordinateMixture(system.coordinates(parameters), *components), fit, bic)
+        own = system.coordinates(parameters[events.joint.shape[1] :])
+        apart = select_mixture(own.to_coordinates(events.apart), seed, most=1)
+        components = append_independent(components, apart.components)
+        bic_apart = apart.bic - _log_jacobian(own, events.apart)
+    bic = fit.bic - _log_jacobian(joint, events.joint)
+    return SystemFit(system, CoordinateMixture(system.coordinates(parameters), *components), fit, bic, bic_apart)
+
+
+def _log_jacobian(coordinates: Coordinates, points: FloatArray) -> float:
+    """Return twice the sum of log |det dy/dx| over points, by which a BIC of y exceeds that of x."""
+    return 2.0 * float(coordinates.log_jacobian(coordinates.interior(points)).sum())
 
 
 def held_out_log_prob(

@@ -79,7 +79,7 @@ def refit(
     while len(refits) < wanted:
         drawn = draw_events(events, rng)
         fits = [fit_system(drawn, system, parameters, seed, FOLD_STARTS) for system in systems]
-        refits.append(min(fits, key=lambda fit: fit.bic))
+        refits.append(min(fits, key=lambda fit: fit.bic + fit.bic_apart))
         if n is None and len(refits) == N_REFITS and len({each.family for each in refits}) > 1:
             wanted = MORE_REFITS
     return tuple(refits)

@@ -1,5 +1,6 @@
 """Refits: clusters are drawn whole, everything is fitted again, and their spread is that of the fit."""
 
+from collections import Counter
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from rare_envs.scenarios.registry import scenario_named
 from training.scenario_fitting import mixture as mixture_fit
 from training.scenario_fitting import refits as refits_module
-from training.scenario_fitting.coordinate_systems import COORDINATE_SYSTEMS, FOLD_STARTS, fit_system
+from training.scenario_fitting.coordinate_systems import COORDINATE_SYSTEMS, FOLD_STARTS, SYSTEMS_APART, fit_system
 from training.scenario_fitting.event_filters import EventSet
 from training.scenario_fitting.refits import describe_family, draw_events, refit
 
@@ -63,7 +64,7 @@ def test_more_refits_where_the_number_of_components_differs(monkeypatch):
         made = iter(numbers)
 
         def fit(*_, made=made):
-            return SimpleNamespace(family=f"{next(made)} components", bic=0.0)
+            return SimpleNamespace(family=f"{next(made)} components", bic=0.0, bic_apart=0.0)
 
         monkeypatch.setattr(refits_module, "fit_system", fit)
         families = [each.family for each in refit(events(25), [LOG_GAP], FOLLOWING)]
@@ -87,6 +88,20 @@ def test_coordinates_are_chosen_anew_in_each_refit(quick):
     criteria = [fit_system(drawn, system, FOLLOWING, 0, FOLD_STARTS).bic for system in systems]
     assert few[0].bic == min(criteria)
     assert few[0].system is systems[int(np.argmin(criteria))]
+
+
+def test_coordinates_of_the_columns_apart_are_chosen_anew_in_each_refit(quick):
+    """Log-normal durations of 20 changes leave it open in which coordinate they are normal, those of 300 do not."""
+    cut_in, rng = scenario_named("cut_in").parameters, np.random.default_rng(0)
+    joint = np.column_stack([rng.normal(15.0, 2.0, (40, 3)), rng.uniform(5.0, 40.0, (40, 2))])
+    apart = np.column_stack([rng.normal(3.2, 0.2, 300), np.exp(rng.normal(1.6, 0.25, 300))])
+    systems = [COORDINATE_SYSTEMS["cut_in"][1].combine(each) for each in SYSTEMS_APART["duration"]]
+    few, many = (
+        Counter(fit.system.name for fit in refit(EventSet(joint, np.arange(40), apart[:n]), systems, cut_in, n=12))
+        for n in (20, 300)
+    )
+    assert many == {"log gaps, log duration": 12}
+    assert set(few) == {"log gaps, plain duration", "log gaps, log duration"}
 
 
 def test_the_family_says_in_which_coordinates_refits_are():
