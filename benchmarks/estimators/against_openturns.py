@@ -110,12 +110,13 @@ def _event(f: Meter, dim: int) -> Any:
 
 
 def _ours(method: str, theirs: list[Cell], job: dict[str, Any], runs: int, most: int) -> list[Job]:
-    """Return runs of our method, each as costly as one of theirs."""
+    """Return runs of our method, each as costly as one of theirs; none where all of theirs raised."""
     few = method == Surrogate.name
     limit = min(most, Surrogate().n) if few else most
     return [
         Job(method=method, problem=cell.problem, seed=run, max_sim=min(round(cell.n_sim), limit), **job)
         for cell in theirs
+        if cell.raised < cell.runs
         if not few or limit_state(cell.problem).dim <= DEFAULT_SURROGATE_SETTINGS.most_dims
         for run in range(runs)
     ]

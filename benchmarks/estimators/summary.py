@@ -59,7 +59,7 @@ def cell_of(runs: Sequence[MethodRun], p: float) -> Cell:
     estimates = np.array([run.p for run in ended])
     ratio = estimates / p if p > 0 else np.full(len(ended), math.nan)
     own_cov = _mean([run.cov for run in ended if math.isfinite(run.cov)])
-    cov = _spread(ratio) / _mean(ratio)
+    cov = _spread(ratio) / _mean(ratio) if _mean(ratio) > 0 else math.nan
     error = (ratio - 1.0) ** 2
     n_sim = _mean([run.n_sim for run in runs])
     gain = (1.0 - p) / p / (n_sim * _mean(error)) if p > 0 and _mean(error) > 0 else math.nan
