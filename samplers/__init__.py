@@ -4,6 +4,7 @@ Knows NumPy and probability, nothing about driving. `estimate` is the front door
 """
 
 from samplers.analysis.base_uncertainty import BaseUncertainty
+from samplers.analysis.budget import Pilot, PlannedRun, plan_runs
 from samplers.analysis.curve import Curve
 from samplers.analysis.failure_modes import Share
 from samplers.analysis.gate import Verdict
@@ -82,6 +83,8 @@ __all__ = [
     "MonteCarlo",
     "NormalBlock",
     "Outcome",
+    "Pilot",
+    "PlannedRun",
     "Problem",
     "Product",
     "Progress",
@@ -107,4 +110,5 @@ __all__ = [
     "compute_ratio_uncertainty",
     "estimate",
     "get_method",
+    "plan_runs",
 ]

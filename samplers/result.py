@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from samplers.analysis.base import RatioStore
 from samplers.analysis.base_uncertainty import BaseUncertainty, compute_base_uncertainty
+from samplers.analysis.budget import Pilot
 from samplers.analysis.curve import Curve, compute_curve
 from samplers.analysis.failure_modes import Share, split_by_kind
 from samplers.analysis.gate import Verdict, judge_estimate
@@ -282,6 +283,28 @@ class Estimate:
         """
         return judge_estimate(self, max_p, given_base)
 
+    def pilot(self, seconds: float | None = None) -> Pilot:
+        """Return this run as one that others are planned from, by `samplers.plan_runs`.
+
+        Args:
+            seconds: Its wall time [s].
+
+        Raises:
+            ValueError: If nothing failed, or the c.o.v. is above 0.5.
+
+        Example:
+            >>> import samplers
+            >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
+            >>> result = samplers.estimate(problem, "mc", seed=0, max_sim=10_000)  # 16 hits
+            >>> [run.n_sim for run in samplers.plan_runs(result.pilot(), target_cov=0.1)]
+            [62400]
+        """
+        again = self.method.stops_at_target and self.sample is not None
+        draws = self.sample.n_units if again and self.sample is not None else None
+        return Pilot(
+            method=self.method.name, p=self.p, cov=self.cov, n_sim=self.n_sim, final_draws=draws, seconds=seconds
+        )
+
     def shares(self, label: Callable[[FloatArray], Sequence[str]], most: int | None = None) -> dict[str, Share]:
         """Return p by kind of failure, from the same simulations; the kinds' p add up to p.
 
@@ -359,6 +382,7 @@ class Estimate:
             "gamma": self.gamma,
             "n_sim": self.n_sim,
             "base_draws": self.base_draws,
+            "final_draws": None if self.sample is None else self.sample.n_units,
             "unseen": self.unseen,
             "given": self.given,
             "gain": self.gain,

@@ -30,6 +30,7 @@ from rare_envs.study.cli.options import (
     TrustOption,
     WorldOptions,
 )
+from rare_envs.study.cli.plan import plan_command
 from rare_envs.study.cli.shell import OneLineErrors, keep_stdout_for_the_answer, print_json, show_what_is_known
 from rare_envs.study.errors import BadInput, as_bad_input
 from rare_envs.threads import use_one_thread
@@ -326,6 +327,7 @@ def replay_command(
 
 app.command("export")(export_command)
 app.add_typer(corpus_app, name="corpus")
+app.command("plan")(plan_command)
 
 
 @app.command("check-ego")

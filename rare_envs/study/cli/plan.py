@@ -1,0 +1,60 @@
+"""Command `plan`: what an estimate of a wished precision costs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rare_envs.study.cli.options import AlgoOption, JsonOption, QuestionOptions, StatsOption
+from rare_envs.study.cli.shell import keep_stdout_for_the_answer, print_json
+from rare_envs.threads import use_one_thread
+from training.command_line import spread_options
+
+if TYPE_CHECKING:
+    from samplers import PlannedRun
+
+
+@spread_options
+@use_one_thread()
+def plan_command(
+    target: Annotated[
+        str, typer.Argument(metavar="ENV|RUN", help="Environment, of which pilots are run; or the folder of a run.")
+    ],
+    options: QuestionOptions,
+    cov: Annotated[float, typer.Option(help="Coefficient of variation that is wished for.")] = 0.1,
+    ego: Annotated[str, typer.Option(help="An ego, as for estimate --ego.")] = "idm",
+    pilot: Annotated[
+        int | None, typer.Option(help="Simulations of each pilot.", show_default="the method's own budget")
+    ] = None,
+    algo: AlgoOption = None,
+    stats: StatsOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Plan simulations and wall time for a c.o.v. by each of --method (joined by commas) and by plain Monte Carlo."""
+    from rare_envs.study.analysis.plan import plan_by_pilots, plan_from_result
+    from rare_envs.study.corpus.storage import read_recorded
+    from rare_envs.study.question import Question
+
+    with keep_stdout_for_the_answer():
+        if Path(target).is_dir():
+            found = plan_from_result(read_recorded(Path(target)), cov)
+        else:
+            arguments = options.arguments()
+            methods = [name.strip() for name in str(arguments.pop("method")).split(",")]
+            question = Question(env_id=target, ego=ego, algo=algo, stats=stats, max_sim=pilot, **arguments)
+            found = plan_by_pilots(question, methods, cov, progress=True)
+    if as_json:
+        print_json({"target_cov": cov, "runs": [each.to_dict() for each in found]})
+    else:
+        _print_plan(found, cov)
+
+
+def _print_plan(found: tuple[PlannedRun, ...], cov: float) -> None:
+    from rare_envs.study.analysis.plan import format_seconds
+
+    print(f"For a c.o.v. of {cov:g} (--target-cov {cov:g}):")
+    for each in found:
+        time = "" if each.seconds is None else f", about {format_seconds(each.seconds)} as fast as the pilot"
+        print(f"  {each.method:<12} {each.n_sim:>15,} simulations{time}")

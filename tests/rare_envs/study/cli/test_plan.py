@@ -1,0 +1,23 @@
+"""The command `plan`, on an environment and on the folder of a run."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli, assert_refused
+
+
+def test_a_plan_from_pilots_and_one_from_a_folder(cli: Cli, risky: str, safe: str, tmp_path: Path) -> None:
+    options = ("--base", risky, "--method", "mc", "--horizon", 4)
+    answer = json.loads(cli("plan", FOLLOWING, *options, "--pilot", 2000, "--cov", 0.05, "--json").stdout)
+    (planned,) = answer["runs"]
+    assert planned["method"] == "mc" and planned["n_sim"] > 2000 and planned["seconds"] > 0.0
+    assert cli(*SMALL, "--base", risky, "--horizon", 4, "--out", tmp_path / "run").exit_code == 0
+    text = cli("plan", tmp_path / "run", "--cov", 0.05).stdout
+    assert f"{planned['n_sim']:,} simulations" in text and "--target-cov 0.05" in text  # the same seed, the same pilot
+    none = cli("plan", FOLLOWING, "--base", safe, "--method", "mc", "--pilot", 200)
+    assert none.exit_code == 2 and none.stdout == ""
+    assert "found no failure" in none.stderr.splitlines()[-1]  # behind the bar
+    assert_refused(cli("plan", tmp_path), "No run in")
+    assert_refused(cli("plan", "rare_envs/Nowhere-v0"), "Nowhere")
