@@ -13,6 +13,7 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from rare_envs.study.cli.corpus import corpus_app, replay_all
+from rare_envs.study.cli.executor_options import ExecutorOptions
 from rare_envs.study.cli.export_failure import export_command
 from rare_envs.study.cli.options import (
     AlgoOption,
@@ -67,6 +68,7 @@ def list_command(as_json: JsonOption = False) -> None:
 def estimate_command(
     env: EnvArgument,
     options: EstimateOptions,
+    places: ExecutorOptions,
     out: Annotated[Path | None, typer.Option(help="Folder for result.json, failures.csv and plot.png.")] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
@@ -77,8 +79,14 @@ def estimate_command(
 
     question = Question(env_id=env, **options.arguments())
     with show_what_is_known(lambda known: _show(known, None, as_json)), keep_stdout_for_the_answer():
+        with as_bad_input(ValueError):
+            executor = places.make()
         study = prepare(question)
-        report = run(study, progress=True) if out is None else run_into(out, study, progress=True, force=force)
+        report = (
+            run(study, progress=True, executor=executor)
+            if out is None
+            else run_into(out, study, progress=True, force=force, executor=executor)
+        )
     _answer(report, out, as_json)
 
 
@@ -143,11 +151,13 @@ def bases_command(
 
 
 @app.command("resume")
+@spread_options
 @use_one_thread()
 def resume_command(
     run: Annotated[
         Path, typer.Argument(metavar="RUN", help="Folder of an estimate --out that has not come to its end.")
     ],
+    places: ExecutorOptions,
     ego: Annotated[str | None, typer.Option(help="New address of an ego in another program, tcp://...")] = None,
     on_error: Annotated[str | None, typer.Option(help="Instead of what the run had: raise, failure or bound.")] = None,
     trust: TrustOption = False,
@@ -160,7 +170,9 @@ def resume_command(
     from rare_envs.study.evaluate import resume
 
     with show_what_is_known(lambda known: _show(known, None, as_json)), keep_stdout_for_the_answer():
-        report = resume(run, ego, on_error, trust, progress=True, mend=mend)
+        with as_bad_input(ValueError):
+            executor = places.make()
+        report = resume(run, ego, on_error, trust, progress=True, mend=mend, executor=executor)
     _answer(report, run, as_json)
 
 

@@ -135,6 +135,10 @@ class EstimateOptions(QuestionOptions):
     target_cov: Annotated[float | None, typer.Option(help="Stop at this coefficient of variation.")] = None
     replicates: Annotated[int, typer.Option(help="Independent runs, combined by their mean.")] = 1
     on_error: Annotated[str, typer.Option(help="Where the ego fails twice: raise, failure or bound.")] = "raise"
+    chunk: Annotated[
+        int | None,
+        typer.Option(help="Simulations at once, few for a slow ego; with --workers 256, and 4,096 of rules."),
+    ] = None
     sensitivity: Annotated[
         bool,
         typer.Option("--sensitivity", help="Show what p is sensitive to: parameters of traffic and of its model."),

@@ -1,0 +1,70 @@
+"""Options of the commands that simulate: where that is done."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from samplers import Executor
+
+GIB = 2.0**30
+
+
+class ExecutorKind(str, Enum):
+    """Names of executors."""
+
+    LOCAL = "local"
+    RAY = "ray"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ExecutorOptions:
+    """Where simulations are made; none of these options changes the answer.
+
+    Example:
+        >>> ExecutorOptions(workers=2, time_limit=60.0).make()
+        LocalProcesses(workers=2, time_limit=60.0, memory_limit=None)
+        >>> ExecutorOptions().make()
+    """
+
+    workers: Annotated[
+        int | None, typer.Option(help="Processes that simulate; by default this one, or all cores of --executor.")
+    ] = None
+    executor: Annotated[
+        ExecutorKind | None, typer.Option(help="Where they are: local processes, or the machines of a Ray cluster.")
+    ] = None
+    address: Annotated[
+        str | None, typer.Option(help="Of the Ray cluster, or auto; by default one is started on this machine.")
+    ] = None
+    time_limit: Annotated[
+        float | None, typer.Option(help="Seconds for a chunk of simulations, after which its worker counts as hung.")
+    ] = None
+    memory_limit: Annotated[
+        float | None, typer.Option(help="GiB that the simulations of a local worker may take (Linux).")
+    ] = None
+
+    def make(self) -> Executor | None:
+        """Return the executor; None for this process.
+
+        Raises:
+            ValueError: If an option is out of range, or does not go with the executor.
+        """
+        import samplers
+
+        settings = {"--address": self.address, "--time-limit": self.time_limit, "--memory-limit": self.memory_limit}
+        given = [name for name, value in settings.items() if value is not None]
+        if self.executor is None and self.workers is None:
+            if given:
+                raise ValueError(f"Expected {given[0]} together with --workers or --executor.")
+            return None
+        refused = "--memory-limit" if self.executor is ExecutorKind.RAY else "--address"
+        if refused in given:
+            raise ValueError(f"{refused} does not go with --executor {(self.executor or ExecutorKind.LOCAL).value}.")
+        if self.executor is ExecutorKind.RAY:
+            return samplers.RayCluster(self.address, self.workers, self.time_limit)
+        memory = None if self.memory_limit is None else self.memory_limit * GIB
+        return samplers.LocalProcesses(self.workers, self.time_limit, memory)
