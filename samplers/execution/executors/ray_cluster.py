@@ -20,8 +20,9 @@ from samplers.execution.executors.transport import pack_work
 from samplers.execution.executors.worker import Reply, describe
 from samplers.validation import check_number, check_whole
 
-START_SECONDS = 30.0
-"""Time in which a worker process may start and load the problem; a chunk has it beside its time limit."""
+START_SECONDS = 300.0
+"""Time in which a worker process may start and load the problem; a task that takes it and its time limit is cancelled
+by force, whatever it waits for."""
 _WAIT_SECONDS = 0.2
 
 
@@ -46,7 +47,7 @@ class RayCluster:
     workers: int | None = None
     """Tasks in flight; None for as many as the cluster has cores for."""
     time_limit: float | None = None
-    """Longest time for a chunk [s]; None waits for ever."""
+    """Longest time for a chunk [s], after which its process ends itself, or is ended; None waits for ever."""
     options: Mapping[str, Any] = field(default_factory=dict)
     """What a task needs, as for `ray.remote`: num_cpus, num_gpus, memory, runtime_env."""
 
@@ -105,7 +106,7 @@ class _RayPool:
     def submit(self, index: Index, chunk: Chunk) -> Future[Packed]:
         """Submit a task."""
         future: Future[Packed] = Future()
-        reference = self._task.remote(self._key, self._packed, 0, None, index, chunk)
+        reference = self._task.remote(self._key, self._packed, 0, self._time_limit, index, chunk)
         self._new.put((reference, future))
         return future
 
@@ -142,7 +143,8 @@ class _RayPool:
         try:
             reply: Reply = self._ray.get(reference)
         except Exception as error:  # of Ray: the work's own are in the reply
-            future.set_exception(WorkerLost(describe(error).split("\n", 1)[0]))
+            limit = "" if self._time_limit is None else f" (its time limit was {self._time_limit:g} s)"
+            future.set_exception(WorkerLost(describe(error).split("\n", 1)[0] + limit))
             return
         if reply.error is not None:
             future.set_exception(reply.error)
