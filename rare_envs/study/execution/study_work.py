@@ -28,7 +28,9 @@ class StudyWork:
         gamma: Threshold of f.
 
     Example:
-        >>> from rare_envs.study.question import prepare
+        >>> import numpy as np
+        >>> from rare_envs.study.question import Question, prepare
+        >>> from samplers.execution.executors.chunks import Chunk
         >>> work = StudyWork(prepare(Question(env_id="rare_envs/CarFollowing-v0")))
         >>> f, notes = work(Chunk("f", (np.array([[20.0, 15.0, 30.0]]),)))
         >>> f.round(2), notes

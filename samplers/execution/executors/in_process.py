@@ -20,7 +20,7 @@ class InProcess:
         >>> import samplers
         >>> problem = samplers.FunctionProblem(lambda x: 2.0 - x[:, 0], dim=2)
         >>> samplers.estimate(problem, "mc", seed=0, max_sim=1000, executor=samplers.InProcess()).p
-        0.019
+        0.017
     """
 
     @contextmanager

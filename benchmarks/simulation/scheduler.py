@@ -1,0 +1,140 @@
+"""Utilisation of up to 1,000 workers, from the batches that two-stage asks for and measured task times, simulated.
+
+A method asks for a batch, waits for all of it and asks for the next one. With W workers a batch of n chunks takes at
+least as long as its longest chunk, and W - n workers are idle. This script records the batches of a run, draws the
+time of each chunk from times that were measured for an ego, and schedules the chunks in their order on W workers, the
+next one to whichever is free first, as the executors do.
+
+    python -m benchmarks.simulation.scheduler --out benchmarks/results/scheduler.json --figure docs/images/scheduler.svg
+"""
+
+from __future__ import annotations
+
+import argparse
+import heapq
+import json
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import rare_envs
+import samplers
+
+WORKERS = (1, 10, 30, 100, 300, 1000)
+BUDGETS = (1000, 6000, 30_000)
+N_TIMED = 60
+
+
+def record_batches(budget: int, seed: int = 0) -> list[int]:
+    """Return the rows of each batch that two-stage asks for in car-following."""
+    problem = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", base="us101-gap")
+    sizes: list[int] = []
+
+    class Counted:
+        dim, base = problem.dim, problem.base
+
+        def evaluate(self, x: np.ndarray) -> np.ndarray:
+            sizes.append(len(x))
+            return problem.evaluate(x)
+
+    samplers.estimate(Counted(), "two-stage", seed=seed, max_sim=budget, ensemble_run=False)
+    return sizes
+
+
+def measure_times(n: int = N_TIMED, seed: int = 0) -> list[float]:
+    """Return the seconds of single drives of HighwayEnv's own environment with its rule-based driver."""
+    problem = rare_envs.highway_env_problem("highway-fast-v0", config={"vehicles_count": 10, "duration": 10})
+    x = problem.base.sample(n + 1, np.random.default_rng(seed))
+    problem.evaluate(x[:1])
+    seconds = []
+    for row in x[1:]:
+        begun = time.process_time()  # processor time: others may be using this machine
+        problem.evaluate(row[None])
+        seconds.append(time.process_time() - begun)
+    return seconds
+
+
+def simulate_schedule(batches: Sequence[Sequence[float]], workers: int) -> tuple[float, list[float]]:
+    """Return the wall time of batches of chunks, one after the other, and the utilisation in each.
+
+    Args:
+        batches: Seconds of each chunk of each batch.
+        workers: Number of workers.
+
+    Example:
+        >>> simulate_schedule([[1.0, 1.0, 1.0, 1.0], [2.0]], workers=2)
+        (4.0, [1.0, 0.5])
+    """
+    total, utilisation = 0.0, []
+    for seconds in batches:
+        free = [0.0] * min(workers, len(seconds))
+        for each in seconds:
+            heapq.heappush(free, heapq.heappop(free) + each)
+        wall = max(free)
+        utilisation.append(sum(seconds) / (wall * workers))
+        total += wall
+    return total, utilisation
+
+
+def measure(seed: int = 0) -> dict[str, Any]:
+    """Return the utilisation by budget and number of workers, and by batch with 1,000 workers."""
+    times, rng = measure_times(), np.random.default_rng(seed)
+    found: dict[str, Any] = {"seconds_of_a_drive": times, "workers": WORKERS, "budgets": {}}
+    for budget in BUDGETS:
+        sizes = record_batches(budget)
+        drawn = [rng.choice(times, size).tolist() for size in sizes]  # a chunk is one drive
+        busy = sum(map(sum, drawn))
+        walls = [simulate_schedule(drawn, workers)[0] for workers in WORKERS]
+        found["budgets"][str(budget)] = {
+            "batches": sizes,
+            "utilisation": [busy / (wall * workers) for wall, workers in zip(walls, WORKERS, strict=True)],
+            "speedup": [walls[0] / wall for wall in walls],
+            "by_batch": simulate_schedule(drawn, WORKERS[-1])[1],
+        }
+    return found
+
+
+def draw_figure(found: dict[str, Any], path: Path) -> None:
+    """Draw utilisation against workers, and by batch with the most workers."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9.0, 3.4), layout="constrained")
+    for budget, result in found["budgets"].items():
+        left.plot(found["workers"], result["utilisation"], "o-", label=f"{int(budget):,} simulations")
+        ends = np.cumsum(result["batches"]) / sum(result["batches"])
+        right.step(ends, result["by_batch"], where="pre", label=f"{int(budget):,}")
+    left.set(xscale="log", xlabel="workers", ylabel="share of their time that workers simulate", ylim=(0, 1.05))
+    right.set(
+        xlabel="share of the simulations", ylabel=f"the same, batch by batch, {WORKERS[-1]:,} workers", ylim=(0, 1)
+    )
+    left.legend(frameon=False)
+    figure.savefig(path, metadata={"Date": None} if path.suffix == ".svg" else None)
+    plt.close(figure)
+
+
+def main() -> None:
+    """Measure, write and draw."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--figure", type=Path)
+    given = parser.parse_args()
+    found = measure()
+    found["command"] = "python -m benchmarks.simulation.scheduler"
+    given.out.write_text(json.dumps(found, indent=1) + "\n")
+    if given.figure is not None:
+        draw_figure(found, given.figure)
+    for budget, result in found["budgets"].items():
+        shares = ", ".join(
+            f"{n}: {share:.2f}" for n, share in zip(found["workers"], result["utilisation"], strict=True)
+        )
+        print(f"{int(budget):,} simulations in {len(result['batches'])} batches; utilisation {shares}")
+
+
+if __name__ == "__main__":
+    main()
