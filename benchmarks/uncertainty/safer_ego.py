@@ -28,7 +28,7 @@ from samplers.analysis.refits import MIN_REFIT_ESS
 SAFER_RESULT = RESULTS / "safer_ego.json"
 HEADWAYS = (1.2, 1.4)
 """Time headways of the two egos [s]; the minimum gap and the rest are those of the default IDM."""
-SCENARIOS = ("car_following", "cut_in", "hard_brake")
+SCENARIOS = ("cut_in", "hard_brake", "car_following")
 
 
 @dataclass(frozen=True)
@@ -109,6 +109,7 @@ def main(
 ) -> None:
     """Measure all bases and write the result."""
     rows, silent = [], []
+    command = f"python -m benchmarks.uncertainty.safer_ego --max-sim {max_sim} --seed {seed}"
     for scenario, base in list_fitted_bases():
         row = measure_base(scenario, base, max_sim, seed)
         if row is None:
@@ -121,9 +122,8 @@ def main(
             f"of the ratio {row.ratio_spread:.2f}",
             flush=True,
         )
-    command = f"python -m benchmarks.uncertainty.safer_ego --max-sim {max_sim} --seed {seed}"
-    content = {"command": command, "headways": HEADWAYS, "rows": rows, "never_failed": silent}
-    out.write_text(json.dumps(content, indent=2) + "\n")
+        content = {"command": command, "headways": HEADWAYS, "rows": rows, "never_failed": silent}
+        out.write_text(json.dumps(content, indent=2) + "\n")
 
 
 def _null_nan(value: object) -> object:

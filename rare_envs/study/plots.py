@@ -77,11 +77,23 @@ def _replay_likeliest_failure(report: Report) -> Drive | str:
     failures = report.estimate.failures
     driven = np.flatnonzero(~np.isnan(failures.f))  # not those on which the ego failed
     if not len(driven):
-        return "no failure found that can be shown"
+        return explain_no_failure(report) if report.estimate.p == 0 else "no failure found that can be shown"
     try:
         return drive_again(report.study.problem, failures.x[driven[0]])
     except (Exception, SystemExit, EgoGone) as error:  # the ego is the user's, and need not do again what it did before
         return f"the failure cannot be shown: {reason_of(error)}"
+
+
+def explain_no_failure(report: Report) -> str:
+    """Return what a run without a failure says."""
+    estimate = report.estimate
+    return (
+        f"None of {estimate.n_sim:,} simulations failed.\n\n"
+        f"P[f ≤ {estimate.gamma:g}] is below {estimate.interval[1]:.1e} ({100 * estimate.confidence:g} %):\n"
+        f"less than one failure in {1 / estimate.interval[1]:,.0f} scenarios.\n\n"
+        "Ten times as many simulations would lower this bound to a tenth;\n"
+        "methods that search for failures go further."
+    )
 
 
 def _relative_view_height(road: Road) -> float:
@@ -118,6 +130,10 @@ def draw_convergence(axes: Axes, report: Report) -> None:
             axes.fill_between(spent, values / spread, values * spread, color=LINE_COLOUR, alpha=0.15, linewidth=0)
     low, high = estimate.interval
     axes.axhspan(max(low, 1e-300), high, color=HIT_COLOUR, alpha=0.12, linewidth=0)
+    if estimate.p == 0:
+        spent = np.geomspace(1.0, max(estimate.n_sim, 2), 100)
+        bound = np.minimum(high * estimate.n_sim / spent, 1.0)
+        axes.plot(spent, bound, color=HIT_COLOUR, linewidth=1, label="upper end without a failure: as 1 / simulations")
     label = f"{100 * estimate.confidence:g} % interval"
     if estimate.p > 0:
         axes.axhline(estimate.p, color=HIT_COLOUR, linewidth=1, label="result")

@@ -44,7 +44,7 @@ def test_intervals_cover_in_a_few_repetitions():
     """Coverage of 92 % leaves 3 of 6 or fewer with probability 1e-2, 2 or fewer with 5e-4."""
     found = [repeat_recipe(RECIPE_WORLDS[0], seed) for seed in range(6)]
     assert sum(each.found.covered for each in found) > stats.binom.ppf(1e-4, 6, 0.92)
-    assert {each.refits for each in found} == {30}
+    assert {each.refits for each in found} <= {30, 100}
     assert {each.components for each in found} == {1}  # 40 events allow no second one
     row = summarise_recipe(RECIPE_WORLDS[0], found)
     assert row["repetitions"] == 6 and sum(row["chosen"].values()) == 6

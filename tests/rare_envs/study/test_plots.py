@@ -8,7 +8,14 @@ from matplotlib.figure import Figure
 
 import rare_envs
 from rare_envs.study.evaluate import run
-from rare_envs.study.plots import MOMENTS, draw_drive, rank_shifted_parameters, save_plot
+from rare_envs.study.plots import (
+    MOMENTS,
+    draw_convergence,
+    draw_drive,
+    explain_no_failure,
+    rank_shifted_parameters,
+    save_plot,
+)
 from rare_envs.study.question import Question, prepare
 from rare_envs.study.replay import drive_again
 
@@ -49,5 +56,21 @@ def test_weights_and_noise_are_never_the_most_shifted() -> None:
 def test_replicates_and_policies_are_drawn_too(here: Path, risky: str, tmp_path: Path) -> None:
     question = Question(env_id=FOLLOWING, base=risky, ego="egos_here:coasting", replicates=3, max_sim=3000, method="mc")
     report = run(prepare(question))
+    save_plot(tmp_path / "plot.png", report)
+    assert (tmp_path / "plot.png").stat().st_size > 20_000
+
+
+def test_a_run_without_a_failure_shows_how_its_bound_falls(tmp_path: Path) -> None:
+    report = run(prepare(Question(env_id=FOLLOWING, base="i24", ego="idm", max_sim=200, method="mc")))
+    high = report.estimate.interval[1]
+    assert (report.estimate.p, report.estimate.n_sim) == (0.0, 200)
+    axes = Figure().subplots()
+    draw_convergence(axes, report)
+    spent, bound = next(line for line in axes.get_lines() if "without a failure" in str(line.get_label())).get_data()
+    np.testing.assert_allclose([spent[0], bound[0], spent[-1], bound[-1]], [1.0, 1.0, 200.0, high], rtol=1e-6)
+    np.testing.assert_allclose(bound[bound < 1.0] * spent[bound < 1.0], 200.0 * high, rtol=1e-6)
+    words = explain_no_failure(report)
+    assert "None of 200 simulations failed." in words
+    assert f"below {high:.1e} (95 %)" in words
     save_plot(tmp_path / "plot.png", report)
     assert (tmp_path / "plot.png").stat().st_size > 20_000
