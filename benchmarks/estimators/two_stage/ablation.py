@@ -38,28 +38,30 @@ HEADER = """| without | stated variance | largest | squared error | largest | co
 |---|---|---|---|---|---|---|---|"""
 
 
-def _without_kind(kind: str) -> dict[str, Any]:
-    """Return the setting that leaves out a kind of component."""
+def _without_kinds(*kinds: str) -> dict[str, Any]:
+    """Return the setting that leaves out kinds of components."""
     shares = DEFAULT_SETTINGS.refinement.initial_shares
-    return {"refinement.initial_shares": {name: share for name, share in shares.items() if name != kind}}
+    return {"refinement.initial_shares": {name: share for name, share in shares.items() if name not in kinds}}
 
 
 ABLATIONS: dict[str, Mapping[str, Any]] = {
-    "wide draws": {"exploration.wide": ((1.5, 2),), "exploration.deep_draws": 0},
-    "wide draws as deep as the levels": {"exploration.deep_draws": 0},
-    "subset simulation": {"exploration.descent_share": 0.0},
-    "lines of descent": {"lines.most": 1},
-    "chains along a direction": {"regions.direction_r2": 1.1},
-    "wide component": _without_kind("wide"),
-    "radial components": _without_kind("radial"),
-    "Gaussians": _without_kind("gaussian"),
-    "half-spaces of the regression": _without_kind("linear"),
-    "components of the exploration": _without_kind("explored"),
-    "tempered Gaussians": _without_kind("tempered"),
-    "half-spaces through edges": _without_kind("half-space"),
-    "floors of the regions": {"refinement.region_share": 0.0, "refinement.final_region_share": 0.0},
-    "further rounds": {"refinement.further_shares": ()},
+    "all half-spaces": _without_kinds("linear", "half-space"),
+    "wide component": _without_kinds("wide"),
+    "half-spaces through edges": _without_kinds("half-space"),
+    "half-spaces of the regression": _without_kinds("linear"),
+    "radial components": _without_kinds("radial"),
+    "components of the exploration": _without_kinds("explored"),
+    "tempered Gaussians": _without_kinds("tempered"),
     "screen": {"mixture.screening.min_class_size": 10**9},
+    "further rounds": {"refinement.further_shares": ()},
+    "lines of descent": {"lines.most": 1},
+    "wide draws": {"exploration.wide": ((1.5, 2),), "exploration.deep_draws": 0},
+    "subset simulation": {"exploration.descent_share": 0.0},
+    "chains from uncovered failures": {"refinement.uncovered_budget": 0.0},
+    "chains along a direction": {"regions.direction_r2": 1.1},
+    "floors of the regions": {"refinement.region_share": 0.0, "refinement.final_region_share": 0.0},
+    "Gaussians": _without_kinds("gaussian"),
+    "wide draws as deep as the levels": {"exploration.deep_draws": 0},
 }
 """Settings without a component, by its name."""
 
@@ -86,10 +88,10 @@ class AblationRow:
     variance_ratio: float
     variance_ratio_se: float
     """Standard error of its logarithm."""
-    largest_variance_ratio: tuple[str, float]
-    """The problem where the component matters most, and the ratio there."""
+    variance_ratios: dict[str, float]
+    """On each problem."""
     error_ratio: float
-    largest_error_ratio: tuple[str, float]
+    error_ratios: dict[str, float]
     coverage: float
     low: int
     high: int
@@ -128,9 +130,9 @@ def compare(name: str, problems: Sequence[str], varied: list[AblationRun], defau
         runs=len(varied),
         variance_ratio=float(np.exp(logs.mean())),
         variance_ratio_se=float(logs.std()) / math.sqrt(len(logs)),
-        largest_variance_ratio=(problems[int(stated.argmax())], float(stated.max())),
+        variance_ratios=dict(zip(problems, stated.tolist(), strict=True)),
         error_ratio=float(np.exp(np.log(errors).mean())),
-        largest_error_ratio=(problems[int(errors.argmax())], float(errors.max())),
+        error_ratios=dict(zip(problems, errors.tolist(), strict=True)),
         coverage=float(np.mean([not (run.low or run.high) for run in varied])),
         low=sum(run.low for run in varied),
         high=sum(run.high for run in varied),
@@ -141,11 +143,17 @@ def compare(name: str, problems: Sequence[str], varied: list[AblationRun], defau
 def format_row(row: AblationRow) -> str:
     """Return a row as Markdown, in the columns of HEADER."""
     stated = f"{row.variance_ratio:.2f} ± {row.variance_ratio * row.variance_ratio_se:.2f}"
-    (one, largest), (other, error) = row.largest_variance_ratio, row.largest_error_ratio
+    largest, error = _largest(row.variance_ratios), _largest(row.error_ratios)
     return (
-        f"| {row.without} | {stated} | {largest:.3g} ({one}) | {row.error_ratio:.2f} | {error:.3g} ({other}) | "
+        f"| {row.without} | {stated} | {largest} | {row.error_ratio:.2f} | {error} | "
         f"{row.coverage:.1%} | {row.low} : {row.high} | {row.n_sim:,.0f} |"
     )
+
+
+def _largest(ratios: Mapping[str, float]) -> str:
+    """Return the largest ratio and its problem."""
+    problem = max(ratios, key=lambda name: ratios[name])
+    return f"{ratios[problem]:.3g} ({problem})"
 
 
 def main(

@@ -18,7 +18,8 @@ def test_a_row_has_ratios_of_variances_and_of_squared_errors():
     row = compare("it", ("a", "b"), varied, default)
     assert row.variance_ratio == pytest.approx(4)
     assert row.error_ratio == pytest.approx(4)
-    assert (row.largest_error_ratio[0], row.coverage, row.low, row.high, row.n_sim) == ("a", 0.75, 1, 0, 200)
+    assert row.error_ratios == pytest.approx({"a": 4, "b": 4})
+    assert (row.without, row.coverage, row.low, row.high, row.n_sim) == ("it", 0.75, 1, 0, 200)
 
 
 @pytest.mark.parametrize("name", ABLATIONS)
