@@ -17,6 +17,7 @@ from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.measurement import Measurement
 from rare_envs.simulation.rollout import Driver, StochasticDriver, begin_drive, drive_tick
 from rare_envs.simulation.world import World
+from rare_envs.traffic.tensor_trees import map_tensors
 
 GRADIENT_TILE = 256
 """Rollouts that are differentiated at once, at most."""
@@ -153,12 +154,8 @@ def _has_noise(driver: Driver) -> bool:
 
 
 def _select(tree: Any, rows: Tensor) -> Any:
-    """Return some of the episodes of a named tuple of tensors, whose other fields are those of all."""
-    if isinstance(tree, Tensor):
-        return tree[rows]
-    if isinstance(tree, tuple) and hasattr(tree, "_fields"):
-        return type(tree)(*(_select(each, rows) for each in tree))
-    return tree
+    """Return some of the episodes of a tree of tensors."""
+    return map_tensors(lambda part: part[rows], tree)
 
 
 @dataclass(frozen=True)
@@ -266,14 +263,5 @@ class ActionsAsGiven:
     def act(self, episode: Episode, memory: Any) -> tuple[Tensor, Any]:
         """Return what the ego does in these episodes, as if they were constants."""
         with torch.no_grad():
-            action, memory = self.driver.act(_detach(episode), memory)
+            action, memory = self.driver.act(map_tensors(Tensor.detach, episode), memory)
         return action.detach(), memory
-
-
-def _detach(tree: Any) -> Any:
-    """Return a tensor, or a tuple of tensors, without its graph."""
-    if isinstance(tree, Tensor):
-        return tree.detach()
-    if isinstance(tree, tuple) and hasattr(tree, "_fields"):  # a named tuple, of which `Episode` is made
-        return type(tree)(*map(_detach, tree))
-    return tree

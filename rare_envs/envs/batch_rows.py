@@ -11,6 +11,7 @@ from torch import Tensor
 
 from rare_envs.measures.base import RowsReplaceable
 from rare_envs.sensors.kinds import map_kinds
+from rare_envs.traffic.tensor_trees import map_leaves, map_tensors
 
 _T = TypeVar("_T")
 
@@ -28,19 +29,16 @@ def merge_rows(old: _T, rows: Tensor, new: _T) -> _T:
         >>> merge_rows((torch.zeros(3), "road"), torch.tensor([1]), (torch.ones(1), "road"))
         (tensor([0., 1., 0.]), 'road')
     """
-    result: _T = _merge(old, rows, new)
-    return result
 
-
-def _merge(old: Any, rows: Tensor, new: Any) -> Any:
-    if isinstance(old, Tensor):
+    def merge(old: Any, new: Any) -> Any:
+        if not isinstance(old, Tensor):
+            return old.replace_rows(rows, new) if isinstance(old, RowsReplaceable) else old
         old = old.clone()
         old[rows] = new
         return old
-    if isinstance(old, tuple):
-        parts = [_merge(a, rows, b) for a, b in zip(old, new, strict=True)]
-        return tuple(parts) if type(old) is tuple else type(old)(*parts)  # a named tuple takes its fields one by one
-    return old.replace_rows(rows, new) if isinstance(old, RowsReplaceable) else old
+
+    result: _T = map_leaves(merge, old, new)
+    return result
 
 
 def list_tensors(value: Any) -> list[Tensor]:
@@ -54,13 +52,16 @@ def list_tensors(value: Any) -> list[Tensor]:
         >>> list_tensors((torch.zeros(1), ("road", torch.ones(1))))
         [tensor([0.]), tensor([1.])]
     """
-    if isinstance(value, Tensor):
-        return [value]
-    if isinstance(value, tuple):
-        return [tensor for part in value for tensor in list_tensors(part)]
-    if isinstance(value, RowsReplaceable):
-        raise ValueError(f"Expected tensors, to keep them in a file, got {type(value).__name__}.")
-    return []
+    found = list[Tensor]()
+
+    def collect(leaf: Any) -> None:
+        if isinstance(leaf, RowsReplaceable):
+            raise ValueError(f"Expected tensors, to keep them in a file, got {type(leaf).__name__}.")
+        if isinstance(leaf, Tensor):
+            found.append(leaf)
+
+    map_leaves(collect, value)
+    return found
 
 
 def put_tensors(value: _T, tensors: Iterator[Tensor]) -> _T:
@@ -69,20 +70,15 @@ def put_tensors(value: _T, tensors: Iterator[Tensor]) -> _T:
     Raises:
         ValueError: A tensor has another shape or type, or there are too few.
     """
-    result: _T = _put(value, tensors)
-    return result
 
-
-def _put(value: Any, tensors: Iterator[Tensor]) -> Any:
-    if isinstance(value, Tensor):
+    def put(old: Tensor) -> Tensor:
         new = next(tensors, None)
-        if new is None or new.shape != value.shape or new.dtype != value.dtype:
-            raise ValueError(f"Expected a tensor of {value.dtype} and shape {tuple(value.shape)}.")
+        if new is None or new.shape != old.shape or new.dtype != old.dtype:
+            raise ValueError(f"Expected a tensor of {old.dtype} and shape {tuple(old.shape)}.")
         return new
-    if isinstance(value, tuple):
-        parts = [_put(part, tensors) for part in value]
-        return tuple(parts) if type(value) is tuple else type(value)(*parts)
-    return value
+
+    result: _T = map_tensors(put, value)
+    return result
 
 
 def to_object_rows(observation: Any, mask: NDArray[np.bool_]) -> NDArray[Any]:

@@ -146,9 +146,10 @@ def _run_rounds(search: TermSearch, state: SearchState) -> SimulationSteps[Searc
     """Draw and refit until all terms have been at the threshold twice, or the rest is for the estimate."""
     rounds, ready = search.settings.rounds, 0
     size = int(rounds.size * search.budget)
+    reserve = int((rounds.final_share - rounds.refit_share) * search.budget)
     while state.pursued and ready < rounds.ready_rounds and search.left - size >= rounds.final_share * search.budget:
         state, _ = yield from _draw_round(search, state, size)
-        state = yield from _refit(search, state, int(rounds.final_share * search.budget))
+        state = yield from _refit(search, state, reserve)
         ready = ready + 1 if all(term.ready for term in state.pursued) else 0
     return state
 
@@ -202,7 +203,7 @@ def _gives_up(search: TermSearch, state: SearchState) -> bool:
 def _estimate(search: TermSearch, state: SearchState) -> Steps:
     """Make the final rounds; with a target c.o.v. end when it is met, or draw further batches until then."""
     rounds, goal = search.settings.rounds, search.goal
-    room, stopped = search.left, False
+    room, stopped = search.left - int((len(rounds.final_sizes) - 1) * rounds.refit_share * search.budget), False
     plan = [(int(share * room), factor) for share, factor in zip(rounds.final_sizes, rounds.final_weights, strict=True)]
     while not stopped:
         number = len(state.finals)

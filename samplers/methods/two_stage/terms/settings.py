@@ -115,6 +115,8 @@ class RoundSettings:
     """Rounds in a row with all terms at the threshold after which the estimate begins."""
     final_share: float = 0.52
     """Adaptive rounds end where no more than this share of the budget is left."""
+    refit_share: float = 0.03
+    """Share kept for the gradients of each fit between the final rounds; what they leave goes to the last round."""
     final_sizes: tuple[float, ...] = (0.22, 0.33, 0.45)
     """Final rounds, as shares of what is left."""
     final_weights: tuple[float, ...] = (0.4, 1.0, 1.0)
