@@ -60,11 +60,13 @@ def fit_law(
     settings: LawSettings,
     rng: np.random.Generator,
 ) -> TermLaw:
-    """Return the proposal fitted to weighted points u (n, d), with guards around ends (m, d)."""
+    """Return the proposal fitted to weighted points u (n, d), with guards around the heaviest and ends (m, d)."""
     weights = temper_weights(log_weights, settings.fit_ess)
+    heaviest = np.argsort(-log_weights, kind="stable")[: settings.max_heavy]
     points = GroupedPoints(u @ axes, weights, 1 / float(weights @ weights), np.arange(len(u)))
     fit = fit_subspace_mixture(points, settings.max_bumps, rng)
-    return build_law(axes, fit.components, fit.weights, ends @ axes, settings)
+    around = np.concatenate([u[heaviest], ends])[: settings.max_ends]
+    return build_law(axes, fit.components, fit.weights, around @ axes, settings)
 
 
 def build_law(

@@ -70,6 +70,9 @@ class LawSettings:
     """... with the end times the one as mean, and this variance."""
     max_ends: int = 24
     """Ends kept of a term."""
+    max_heavy: int = 12
+    """Of these the points of largest weight, once there are points from proposals: a mode of which one draw is known is
+    not left to the mixture fitted to all."""
     prior_points: float = 20.0
     """Points that I counts as in the covariance of the ends."""
     max_bumps: int = 3

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from samplers.methods.two_stage.terms.fitting import find_axes, first_law, fit_law, near_points, temper_weights
 from samplers.methods.two_stage.terms.history import TermHistory
@@ -70,3 +71,18 @@ def test_points_to_fit_to_are_failures_or_a_level(half_spaces, rng):
     rows, ready = near_points(history, 1, 0.0, RoundSettings())
     assert not ready
     assert set(rows) == set(np.argsort(-u @ normals[1])[:15])
+
+
+def test_the_heaviest_points_and_ends_are_guarded(rng):
+    """One point of weight 50 stands apart from 60 others: it gets a Gaussian, and the first ends the places left."""
+    u, ends = rng.standard_normal((61, 5)) + 3.0, np.full((40, 5), 2.0)
+    u[7] = -4.0
+    log_weights = np.zeros(61)
+    log_weights[7] = np.log(50.0)
+    law = fit_law(np.eye(5), u, log_weights, ends, SETTINGS, rng)
+    means = np.array([component.mean for component in law.groups[-1].components])
+    np.testing.assert_allclose(means[0], SETTINGS.end_mean * u[7])
+    np.testing.assert_allclose(means[SETTINGS.max_heavy :], SETTINGS.end_mean * ends[0] * np.ones((12, 5)))
+    assert len(means) == SETTINGS.max_ends
+    own = SETTINGS.end_share / SETTINGS.max_ends * norm.pdf(0.1 * u[7], scale=SETTINGS.end_variance**0.5).prod()
+    assert law.log_ratio(u[7:8])[0] >= np.log(own / norm.pdf(u[7]).prod())
