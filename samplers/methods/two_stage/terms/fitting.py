@@ -9,6 +9,7 @@ from samplers.methods.two_stage.mixture.subspace_em import GroupedPoints, fit_su
 from samplers.methods.two_stage.terms.history import TermHistory
 from samplers.methods.two_stage.terms.law import ComponentGroup, TermLaw
 from samplers.methods.two_stage.terms.settings import LawSettings, RoundSettings
+from samplers.methods.two_stage.terms.walks import Directions
 from samplers.problem import FloatArray
 from samplers.proposals.components import SubspaceGaussian
 from samplers.statistics.weights import effective_sample_size, normalise_weights
@@ -24,8 +25,8 @@ class PursuedTerm:
     """A term with a proposal of its own."""
 
     number: int
-    directions: FloatArray
-    """Unit gradients, shape (k, d)."""
+    directions: Directions
+    """k gradients."""
     direction_weights: FloatArray
     """Shape (k,)."""
     ends: FloatArray
@@ -42,14 +43,26 @@ def find_axes(directions: FloatArray, weights: FloatArray, rank: int) -> FloatAr
     return np.asarray(right[:rank][kept].T)
 
 
-def first_law(axes: FloatArray, ends: FloatArray, settings: LawSettings) -> TermLaw:
+def choose_guards(directions: Directions, settings: LawSettings) -> FloatArray:
+    """Return design points (m, d) that are apart from each other, those nearest to the origin first."""
+    points = directions.design_points
+    distance = np.linalg.norm(points, axis=1)
+    order = [row for row in np.argsort(distance, kind="stable") if np.isfinite(distance[row])]
+    chosen = list[int]()
+    for row in order:
+        if all(np.linalg.norm(points[row] - points[other]) >= settings.guard_spacing for other in chosen):
+            chosen.append(int(row))
+    return np.asarray(points[chosen[: settings.max_guards]])
+
+
+def first_law(axes: FloatArray, ends: FloatArray, guards: FloatArray, settings: LawSettings) -> TermLaw:
     """Return the proposal around ends of walks (m, d): one Gaussian, drawn towards variance 1, and its guards."""
     z = ends @ axes
     n, centred = len(z), z - z.mean(axis=0)
     covariance = (centred.T @ centred + settings.prior_points * np.eye(z.shape[1])) / (n + settings.prior_points)
     values, vectors = np.linalg.eigh(covariance)
     bump = SubspaceGaussian(vectors, vectors.T @ z.mean(axis=0), values)
-    return build_law(axes, [bump], np.ones(1), z, settings)
+    return build_law(axes, [bump], np.ones(1), z, guards @ axes, settings)
 
 
 def fit_law(
@@ -57,22 +70,28 @@ def fit_law(
     u: FloatArray,
     log_weights: FloatArray,
     ends: FloatArray,
+    guards: FloatArray,
     settings: LawSettings,
     rng: np.random.Generator,
 ) -> TermLaw:
-    """Return the proposal fitted to weighted points u (n, d), with guards around the heaviest and ends (m, d)."""
+    """Return the proposal fitted to weighted points u (n, d), with guards around the heaviest of them too."""
     weights = temper_weights(log_weights, settings.fit_ess)
     heaviest = np.argsort(-log_weights, kind="stable")[: settings.max_heavy]
     points = GroupedPoints(u @ axes, weights, 1 / float(weights @ weights), np.arange(len(u)))
     fit = fit_subspace_mixture(points, settings.max_bumps, rng)
     around = np.concatenate([u[heaviest], ends])[: settings.max_ends]
-    return build_law(axes, fit.components, fit.weights, around @ axes, settings)
+    return build_law(axes, fit.components, fit.weights, around @ axes, guards @ axes, settings)
 
 
 def build_law(
-    axes: FloatArray, bumps: list[SubspaceGaussian], weights: FloatArray, ends: FloatArray, settings: LawSettings
+    axes: FloatArray,
+    bumps: list[SubspaceGaussian],
+    weights: FloatArray,
+    ends: FloatArray,
+    guards: FloatArray,
+    settings: LawSettings,
 ) -> TermLaw:
-    """Return bumps, the same tempered, and Gaussians around ends z (m, r), as one proposal."""
+    """Return bumps, the same tempered, and Gaussians around ends and design points z (m, r), as one proposal."""
     factor, plus = settings.tempered_variance
     tempered = tuple(
         SubspaceGaussian(b.axes, settings.tempered_mean * b.mean, factor * b.variance + plus) for b in bumps
@@ -86,6 +105,10 @@ def build_law(
         identity, variance = np.eye(ends.shape[1]), np.full(ends.shape[1], settings.end_variance)
         around = tuple(SubspaceGaussian(identity, settings.end_mean * end, variance) for end in ends)
         groups.append(ComponentGroup(settings.end_share, around, np.full(len(ends), 1 / len(ends))))
+    if len(guards):
+        identity = np.eye(guards.shape[1])
+        half_spaces = tuple(SubspaceGaussian(identity, guard, np.ones(len(guard))) for guard in guards)
+        groups.append(ComponentGroup(settings.guard_share, half_spaces, np.full(len(guards), 1 / len(guards))))
     total = sum(group.share for group in groups)
     return TermLaw(axes, tuple(ComponentGroup(g.share / total, g.components, g.weights) for g in groups))
 

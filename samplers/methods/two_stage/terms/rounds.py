@@ -8,12 +8,19 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from samplers.methods.two_stage.simulator import SimulationSteps
-from samplers.methods.two_stage.terms.fitting import PursuedTerm, find_axes, first_law, fit_law, near_points
+from samplers.methods.two_stage.terms.fitting import (
+    PursuedTerm,
+    choose_guards,
+    find_axes,
+    first_law,
+    fit_law,
+    near_points,
+)
 from samplers.methods.two_stage.terms.history import TermHistory
 from samplers.methods.two_stage.terms.law import TermProposal
 from samplers.methods.two_stage.terms.settings import LawSettings, RoundSettings, TermSettings
 from samplers.methods.two_stage.terms.space import TermSimulator
-from samplers.methods.two_stage.terms.walks import Walks
+from samplers.methods.two_stage.terms.walks import Directions, Walks, describe_half_spaces
 from samplers.problem import FloatArray
 from samplers.statistics.weights import normalise_weights
 
@@ -23,7 +30,7 @@ def pursue_walked(walks: Walks, history: TermHistory, settings: TermSettings) ->
     found, tails = list[PursuedTerm](), list[float]()
     for term in np.unique(np.concatenate([walks.term, walks.failing_terms])):
         directions, ends = walks.directions.of(term), _ends(walks, history, int(term), settings)
-        if len(ends) and len(directions):
+        if len(ends) and len(directions.term):
             found.append(start_term(int(term), directions, ends, settings.law))
             arrived = walks.distance[(walks.term == term) & (walks.values <= history.terms.threshold)]
             arrived = arrived[np.isfinite(arrived)]
@@ -32,10 +39,12 @@ def pursue_walked(walks: Walks, history: TermHistory, settings: TermSettings) ->
     return [one for one, tail in zip(found, tails, strict=True) if not tail < least]
 
 
-def start_term(number: int, directions: FloatArray, ends: FloatArray, settings: LawSettings) -> PursuedTerm:
-    """Return a term with a proposal around ends (m, d), from unit gradients (k, d)."""
-    weights = np.ones(len(directions))
-    law = first_law(find_axes(directions, weights, settings.rank), ends, settings)
+def start_term(number: int, directions: Directions, ends: FloatArray, settings: LawSettings) -> PursuedTerm:
+    """Return a term with a proposal around ends (m, d), from its gradients."""
+    weights = np.ones(len(directions.term))
+    law = first_law(
+        find_axes(directions.values, weights, settings.rank), ends, choose_guards(directions, settings), settings
+    )
     return PursuedTerm(number, directions, weights, ends, law)
 
 
@@ -97,16 +106,15 @@ def refit_terms(
         chosen = [rows[: len(rows) // 2] for rows in chosen]  # count_gradients(0) is 0
     rows, term = np.concatenate(chosen), np.repeat(numbers, [len(part) for part in chosen])
     slopes = yield from simulator.gradients(history.u[rows], term, history.terms.ticks[rows, term])
-    norm = np.linalg.norm(slopes, axis=1)
-    good = np.isfinite(norm) & (norm > 0)
+    excess = history.terms.values[rows, term] - history.terms.threshold
+    found = describe_half_spaces(term, history.u[rows], slopes, excess)
     result = []
     for number, (points, ready) in zip(numbers, near, strict=True):
-        mine = good & (term == number)
-        directions = slopes[mine] / norm[mine, None]
+        directions = found.of(number)
         old = next((one for one in pursued if one.number == number), None)
         if old is not None:
             result.append(_refit_term(old, history, directions, points, ready, rng, settings))
-        elif len(directions):
+        elif len(directions.term):
             result.append(start_term(number, directions, history.u[points[: settings.law.max_ends]], settings.law))
     return result
 
@@ -114,18 +122,19 @@ def refit_terms(
 def _refit_term(
     term: PursuedTerm,
     history: TermHistory,
-    directions: FloatArray,
+    directions: Directions,
     rows: NDArray[np.int64],
     ready: bool,
     rng: np.random.Generator,
     settings: TermSettings,
 ) -> PursuedTerm:
-    """Return a term with further unit gradients (k, d), fitted to some rows of the history."""
+    """Return a term with further gradients, fitted to some rows of the history."""
     later = float(term.direction_weights.max()) * settings.rounds.later_weight
-    weights = np.concatenate([term.direction_weights, np.full(len(directions), later)])
-    directions = np.concatenate([term.directions, directions])
-    axes = find_axes(directions, weights, settings.law.rank)
-    law = fit_law(axes, history.u[rows], history.log_weights[rows], term.ends, settings.law, rng)
+    weights = np.concatenate([term.direction_weights, np.full(len(directions.term), later)])
+    directions = term.directions.join(directions)
+    axes = find_axes(directions.values, weights, settings.law.rank)
+    guards = choose_guards(directions, settings.law)
+    law = fit_law(axes, history.u[rows], history.log_weights[rows], term.ends, guards, settings.law, rng)
     return replace(term, directions=directions, direction_weights=weights, law=law, ready=term.ready or ready)
 
 

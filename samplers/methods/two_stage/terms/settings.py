@@ -52,7 +52,7 @@ class WalkSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class LawSettings:
-    """Proposal of one term in the subspace of its gradients (`law.py`, `fitting.py`)."""
+    """Proposal of one term in the subspace of its gradients (`law.py`, `fitting.py`); shares are relative."""
 
     rank: int = 8
     """Right singular vectors kept: failures of a term are nearly one half-space, 8 hold its curvature (prototype)."""
@@ -68,6 +68,13 @@ class LawSettings:
     end_mean: float = 0.9
     end_variance: float = 0.7
     """... with the end times the one as mean, and this variance."""
+    guard_share: float = 0.1
+    """Share of N(design point, I) for half-spaces of gradients near failures: modes of a term in other directions than
+    the one fitted to; where a mode is that half-space, no weight in it exceeds exp(-beta^2 / 2) over its share."""
+    max_guards: int = 12
+    """Such half-spaces at most, the nearest first."""
+    guard_spacing: float = 1.5
+    """Least distance between their design points; Gaussians nearer than that are one."""
     max_ends: int = 24
     """Ends kept of a term."""
     max_heavy: int = 12

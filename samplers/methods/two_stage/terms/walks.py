@@ -19,10 +19,39 @@ class Directions(NamedTuple):
     """Shape (k,)."""
     values: FloatArray
     """Shape (k, d)."""
+    design_points: FloatArray
+    """Points nearest to the origin of the half-spaces that the gradients describe, shape (k, d); NaN where the term is
+    not near its threshold."""
 
-    def of(self, term: int) -> FloatArray:
-        """Return those of one term, shape (m, d)."""
-        return np.asarray(self.values[self.term == term])
+    def of(self, term: int) -> "Directions":
+        """Return those of one term."""
+        mine = self.term == term
+        return Directions(self.term[mine], self.values[mine], self.design_points[mine])
+
+    def join(self, later: "Directions") -> "Directions":
+        """Return these and later ones."""
+        return Directions(*(np.concatenate(pair) for pair in zip(self, later, strict=True)))
+
+
+NEAR = 1.5
+"""Standard deviations along the gradient to the threshold within which a gradient is taken for that of the failures."""
+
+
+def describe_half_spaces(term: NDArray[np.int64], u: FloatArray, slopes: FloatArray, excess: FloatArray) -> Directions:
+    """Return unit gradients where they exist, and the half-spaces {excess + slope (v - u) <= 0} of those near them.
+
+    Args:
+        term: Number of the term of each gradient, shape (k,).
+        u: Points, shape (k, d).
+        slopes: Gradients there, shape (k, d).
+        excess: Values of the terms there less their threshold, shape (k,).
+    """
+    norm = np.linalg.norm(slopes, axis=1)
+    good = np.isfinite(norm) & (norm > 0)
+    unit, ahead = slopes[good] / norm[good, None], excess[good] / norm[good]
+    distance = ahead - np.einsum("ij,ij->i", unit, u[good])
+    near = (np.abs(ahead) <= NEAR) & (distance > 0)
+    return Directions(term[good], unit, np.where(near, -distance, np.nan)[:, None] * unit)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +133,8 @@ def walk_downhill(
     start_values = terms.values[rows, term]
     u, values, ticks = u.copy(), terms.values[rows, term].copy(), terms.ticks[rows, term].copy()
     slope, length, moved = np.full_like(u, np.nan), np.full(len(u), settings.first_step), np.ones(len(u), dtype=bool)
-    passed, failing = list[tuple[NDArray[np.int64], FloatArray]](), list[tuple[FloatArray, NDArray[np.int64]]]()
+    passed = describe_half_spaces(term[:0], u[:0], u[:0], values[:0])
+    failing = list[tuple[FloatArray, NDArray[np.int64]]]()
     for step in range(settings.steps):
         open_ = (values > terms.threshold) & ~(distance > settings.max_distance)
         fresh = np.flatnonzero(moved & (open_ | (step == 0)))
@@ -115,8 +145,9 @@ def walk_downhill(
         norm = np.linalg.norm(slope, axis=1)
         sloping = np.isfinite(norm) & (norm > 0)
         good = fresh[sloping[fresh]]
-        passed.append((term[good], slope[good] / norm[good, None]))
-        ahead_of = (values - terms.threshold) / np.where(sloping, norm, np.nan)
+        excess = values - terms.threshold
+        passed = passed.join(describe_half_spaces(term[fresh], u[fresh], slope[fresh], excess[fresh]))
+        ahead_of = excess / np.where(sloping, norm, np.nan)
         distance[good] = ahead_of[good] - np.einsum("ij,ij->i", slope[good], u[good]) / norm[good]
         walkers = np.flatnonzero(open_ & sloping & (distance <= settings.max_distance))
         if len(walkers) == 0:
@@ -142,7 +173,7 @@ def walk_downhill(
         start_values,
         ticks,
         distance,
-        Directions(_join([t for t, _ in passed], np.empty(0, np.int64)), _join([g for _, g in passed], u[:0])),
+        passed,
         _join([points for points, _ in failing], u[:0]),
         _join([least for _, least in failing], np.empty(0, np.int64)),
     )

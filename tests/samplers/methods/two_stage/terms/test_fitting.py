@@ -1,10 +1,20 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import norm
 
-from samplers.methods.two_stage.terms.fitting import find_axes, first_law, fit_law, near_points, temper_weights
+from samplers.methods.two_stage.terms.fitting import (
+    choose_guards,
+    find_axes,
+    first_law,
+    fit_law,
+    near_points,
+    temper_weights,
+)
 from samplers.methods.two_stage.terms.history import TermHistory
 from samplers.methods.two_stage.terms.settings import LawSettings, RoundSettings
+from samplers.methods.two_stage.terms.walks import Directions
 from samplers.statistics.weights import effective_number
 
 SETTINGS = LawSettings()
@@ -28,7 +38,7 @@ def test_the_first_law_lies_around_the_ends(rng):
     """24 ends at distance 4 along one axis: mean 4 there; the covariance is (24 S + 20 I) / 44."""
     ends = rng.standard_normal((24, 10))
     ends[:, 0] = 4.0
-    law = first_law(np.eye(10)[:, :2], ends, SETTINGS)
+    law = first_law(np.eye(10)[:, :2], ends, ends[:0], SETTINGS)
     bump = law.groups[0].components[0]
     np.testing.assert_allclose(bump.centre, ends[:, :2].mean(axis=0))
     s = ends[:, 1].var()
@@ -43,12 +53,12 @@ def test_a_law_is_fitted_to_weighted_failures(rng):
     u[:, 0] = z
     u[:250, 1] += 6.0
     log_weights = np.where(np.arange(500) < 250, -60.0, 0.0)
-    law = fit_law(np.eye(20)[:, :2], u, log_weights, u[:0], SETTINGS, rng)
-    *bumps, tempered = law.groups  # without ends
+    law = fit_law(np.eye(20)[:, :2], u, log_weights, u[:0], u[:0], SETTINGS, rng)
+    *bumps, tempered, _ = law.groups  # the last is around the heaviest
     share = sum(bump.share for bump in bumps)
     centre = sum(bump.share * bump.components[0].centre for bump in bumps) / share
     np.testing.assert_allclose(centre, [4.25, 0.0], atol=5 * 1.0 / np.sqrt(250))
-    assert (share, tempered.share) == pytest.approx((0.7 / 0.85, 0.15 / 0.85))
+    assert (share, tempered.share) == pytest.approx((SETTINGS.bump_share, SETTINGS.tempered_share))
 
 
 @pytest.mark.parametrize("wanted", [5.0, 40.0])
@@ -79,10 +89,25 @@ def test_the_heaviest_points_and_ends_are_guarded(rng):
     u[7] = -4.0
     log_weights = np.zeros(61)
     log_weights[7] = np.log(50.0)
-    law = fit_law(np.eye(5), u, log_weights, ends, SETTINGS, rng)
+    law = fit_law(np.eye(5), u, log_weights, ends, u[:0], SETTINGS, rng)
     means = np.array([component.mean for component in law.groups[-1].components])
     np.testing.assert_allclose(means[0], SETTINGS.end_mean * u[7])
     np.testing.assert_allclose(means[SETTINGS.max_heavy :], SETTINGS.end_mean * ends[0] * np.ones((12, 5)))
     assert len(means) == SETTINGS.max_ends
     own = SETTINGS.end_share / SETTINGS.max_ends * norm.pdf(0.1 * u[7], scale=SETTINGS.end_variance**0.5).prod()
     assert law.log_ratio(u[7:8])[0] >= np.log(own / norm.pdf(u[7]).prod())
+
+
+def test_half_spaces_apart_from_each_other_are_guarded(rng):
+    """Planes at 3, 4 and 5 along three axes, one of them known twice, and one gradient far from any failure."""
+    distance = np.array([4.0, 3.0, 5.0, 4.1, np.nan])
+    unit = -np.eye(6)[[0, 1, 2, 0, 3]]
+    directions = Directions(np.zeros(5, dtype=int), unit, -distance[:, None] * unit)
+    guards = choose_guards(directions, SETTINGS)
+    np.testing.assert_allclose(guards, np.diag([4.0, 3.0, 5.0, 0, 0, 0])[[1, 0, 2]])
+    law = first_law(np.eye(6)[:, :3], rng.standard_normal((9, 6)), guards, SETTINGS)
+    beyond = np.array([[0.0, 0.0, 5.5, 1.0, -1.0, 2.0]])
+    ratio = law.groups[-1].share / 3 * np.exp(5.0 * 5.5 - 5.0**2 / 2)  # N(m, I) / N(0, I)
+    assert law.groups[-1].share == pytest.approx(0.1 / 1.1)
+    assert law.log_ratio(beyond)[0] >= np.log(ratio)
+    assert len(choose_guards(directions, replace(SETTINGS, max_guards=1))) == 1

@@ -13,7 +13,7 @@ def walked(normals, distances):
     """Return walks that ended in failures at these distances along the normals, three for each term."""
     term = np.repeat(np.arange(len(normals)), 3)
     u = np.array(distances)[term, None] * normals[term]
-    directions = Directions(term, -normals[term])
+    directions = Directions(term, -normals[term], u)
     none = np.empty(0, dtype=np.int64)
     beta = np.array(distances)[term]
     return Walks(term, u, np.full(len(u), -0.03), np.ones(len(u)), np.zeros(len(u), int), beta, directions, u[:0], none)

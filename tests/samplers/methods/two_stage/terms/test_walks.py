@@ -3,7 +3,13 @@ from scipy.stats import norm
 
 import samplers
 from samplers.methods.two_stage.terms.settings import WalkSettings
-from samplers.methods.two_stage.terms.walks import Directions, choose_starts, choose_terms, walk_downhill
+from samplers.methods.two_stage.terms.walks import (
+    Directions,
+    choose_starts,
+    choose_terms,
+    describe_half_spaces,
+    walk_downhill,
+)
 from samplers.problem import Terms
 
 SETTINGS = WalkSettings()
@@ -51,7 +57,7 @@ def test_walks_end_just_beyond_the_plane_of_their_own_term(half_spaces, simulato
     np.testing.assert_allclose(walks.values, -0.03, atol=1e-9)
     moved = walks.u - u
     np.testing.assert_allclose(moved, (moved @ normals.T) @ normals, atol=1e-9)
-    np.testing.assert_allclose(np.abs(walks.directions.of(1) @ normals.T), [[0.0, 1.0]] * 9, atol=1e-9)
+    np.testing.assert_allclose(np.abs(walks.directions.of(1).values @ normals.T), [[0.0, 1.0]] * 9, atol=1e-9)
     np.testing.assert_array_equal(walks.failing_terms, term)
     assert simulator.n_sim == 6 * 3 + 6 * 3 * problem.gradient_cost
     np.testing.assert_allclose(walks.distance, -norm.ppf(0.5e-4))
@@ -91,8 +97,24 @@ def test_walks_without_a_gradient_stay(half_spaces, simulator_of, answer):
 
 
 def test_directions_are_found_by_term():
-    directions = Directions(np.array([0, 1, 0]), np.eye(3))
-    np.testing.assert_array_equal(directions.of(0), np.eye(3)[[0, 2]])
+    directions = Directions(np.array([0, 1, 0]), np.eye(3), 2 * np.eye(3))
+    mine = directions.of(0)
+    np.testing.assert_array_equal(mine.values, np.eye(3)[[0, 2]])
+    np.testing.assert_array_equal(mine.design_points, 2 * np.eye(3)[[0, 2]])
+    np.testing.assert_array_equal(directions.join(mine).term, [0, 1, 0, 0, 0])
+
+
+def test_design_points_are_those_of_the_half_spaces_near_which_gradients_were_taken(rng):
+    """f = 3 (4 - n.u): the nearest point is 4 n wherever f was differentiated; from 3 away it is not believed."""
+    n = np.array([0.6, 0.8, 0.0])
+    across = rng.standard_normal((5, 3))
+    u = across - np.outer(across @ n, n) + np.outer([4.5, 3.0, 1.0, 4.0, 4.0], n)
+    slopes = np.tile(-3.0 * n, (5, 1))
+    slopes[3], slopes[4] = np.nan, 0.0
+    found = describe_half_spaces(np.arange(5), u, slopes, 3.0 * (4.0 - u @ n))
+    np.testing.assert_array_equal(found.term, [0, 1, 2])
+    np.testing.assert_allclose(found.values, np.tile(-n, (3, 1)))
+    np.testing.assert_allclose(found.design_points, [4 * n, 4 * n, np.full(3, np.nan)])
 
 
 def test_walks_do_not_go_where_nothing_ever_happens(half_spaces, simulator_of, answer):
