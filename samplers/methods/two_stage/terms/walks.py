@@ -33,7 +33,7 @@ class Directions(NamedTuple):
         return Directions(*(np.concatenate(pair) for pair in zip(self, later, strict=True)))
 
 
-NEAR = 1.5
+NEAR_FAILURES = 1.5
 """Standard deviations along the gradient to the threshold within which a gradient is taken for that of the failures."""
 
 
@@ -50,7 +50,7 @@ def describe_half_spaces(term: NDArray[np.int64], u: FloatArray, slopes: FloatAr
     good = np.isfinite(norm) & (norm > 0)
     unit, ahead = slopes[good] / norm[good, None], excess[good] / norm[good]
     distance = ahead - np.einsum("ij,ij->i", unit, u[good])
-    near = (np.abs(ahead) <= NEAR) & (distance > 0)
+    near = (np.abs(ahead) <= NEAR_FAILURES) & (distance > 0)
     return Directions(term[good], unit, np.where(near, -distance, np.nan)[:, None] * unit)
 
 
