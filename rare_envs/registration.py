@@ -29,15 +29,18 @@ def register_envs() -> None:
 
 
 def _keep_earlier_versions(name: str) -> None:
-    """Let the earlier versions of an id stand beside it.
+    """Let all versions of an id stand beside each other.
 
     A version is a scenario of its own, with results of its own. Gymnasium would warn that the earlier ones are out of
-    date; it compares their numbers with the highest one of all entries, which are therefore counted as the first.
+    date; it compares their numbers with the highest one of all entries, which are therefore all counted as the first.
     """
     family, version = split_version(name)
-    versions = [split_version(each) for each in gym.registry]
-    if version is not None:
-        gym.registry[name].version = min(other for each, other in versions if each == family and other is not None)
+    if version is None:
+        return
+    versions = {each: number for each in gym.registry for other, number in [split_version(each)] if other == family}
+    for each, number in versions.items():
+        if number is not None:
+            gym.registry[each].version = min(other for other in versions.values() if other is not None)
 
 
 def register_scenario(env_id: str, scenario: Scenario) -> None:

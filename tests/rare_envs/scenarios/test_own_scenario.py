@@ -45,6 +45,26 @@ def test_it_is_known_everywhere(registered):
         rare_envs.make_batch("tests/Standin-v0", 2)
 
 
+@pytest.mark.parametrize(
+    "later", [("tests/Standing-v2", "tests/Standing-v10"), ("tests/Standing-v10", "tests/Standing-v2")]
+)
+def test_versions_stand_beside_each_other(registered, later):
+    """The short name means the newest; Gymnasium's warning of versions that are out of date would be an error here."""
+    try:
+        for env_id in later:
+            rare_envs.register_scenario(env_id, replace(STANDING, horizon=float(env_id.partition("-v")[2])))
+        for env_id in (registered, *later):
+            assert gym.make(env_id).spec.id == env_id
+        assert scenario_named("standing").horizon == 10.0
+        assert scenario_named(registered) is STANDING
+        rare_envs.register_scenario("tests/Other-v11", STANDING)
+        assert scenario_named("standing").horizon == 10.0  # a name stays with the ids that had it first
+    finally:
+        for env_id in (*later, "tests/Other-v11"):
+            SCENARIOS.remove(env_id)
+            del gym.registry[env_id]
+
+
 def test_it_passes_the_suites(registered):
     check_env(gym.make(registered).unwrapped, skip_render_check=True)
     sb3_check_env(gym.make(registered))
