@@ -34,7 +34,13 @@ class Pilot:
 
     Raises:
         ValueError: It found no failure, or knows p too badly.
-    """
+
+    Example:
+        >>> Pilot(method="mc", p=1e-3, cov=0.9, n_sim=1200, final_draws=1200)
+        Traceback (most recent call last):
+            ...
+        ValueError: The pilot of 1,200 simulations has a c.o.v. of 0.9: above 0.5 it tells too little; a plan needs a larger one.
+    """  # noqa: E501 (the example shows a whole message)
 
     method: str
     """Name of its method."""
@@ -62,7 +68,12 @@ class Pilot:
 
 @dataclass(frozen=True, kw_only=True)
 class PlannedRun:
-    """Simulations that a method needs for a coefficient of variation."""
+    """Simulations that a method needs for a coefficient of variation.
+
+    Example:
+        >>> PlannedRun(method="mc", target_cov=0.1, n_sim=99_900).to_dict()
+        {'method': 'mc', 'target_cov': 0.1, 'n_sim': 99900, 'seconds': None}
+    """
 
     method: str
     """Name of the method."""

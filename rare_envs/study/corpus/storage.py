@@ -31,7 +31,13 @@ def read_run(folder: Path, trust: bool = False) -> list[StoredFailure]:
 
     Raises:
         BadInput: There is no such run, it is not finished, its files are damaged, or it is not trusted.
-    """
+
+    Example:
+        >>> read_run(Path("runs/nowhere"))
+        Traceback (most recent call last):
+            ...
+        rare_envs.study.errors.BadInput: No run in 'runs/nowhere': expected result.json and failures.csv, as rare-envs estimate --out writes.
+    """  # noqa: E501 (the example shows a whole message)
     question = open_question(read_recorded(folder).get("question"), folder, trust)
     try:
         table = read_failures(folder)
@@ -105,6 +111,18 @@ def add_run(run: Path, corpus: Path, most: int = 20, trust: bool = False) -> tup
 
     Raises:
         BadInput: There is no such run, or the corpus cannot be written.
+
+    Example:
+        >>> from tempfile import TemporaryDirectory
+        >>> from rare_envs.study import Question, prepare, run_into
+        >>> question = Question(
+        ...     env_id="rare_envs/CarFollowing-v0", base="us101-gap", gamma=3.0, horizon=3.0, method="mc", max_sim=1000
+        ... )
+        >>> with TemporaryDirectory() as folder:
+        ...     report = run_into(Path(folder) / "run", prepare(question))
+        ...     chosen, new = add_run(Path(folder) / "run", Path(folder) / "corpus", most=5)
+        ...     len(chosen), new, len(read_corpus(Path(folder) / "corpus"))
+        (5, 5, 5)
     """
     if most < 1:
         raise BadInput(f"Expected at least one failure to add, got {most}.")
@@ -127,6 +145,12 @@ def read_corpus(folder: Path) -> list[StoredFailure]:
 
     Raises:
         BadInput: There is none, or one of its files is damaged.
+
+    Example:
+        >>> read_corpus(Path("nowhere"))
+        Traceback (most recent call last):
+            ...
+        rare_envs.study.errors.BadInput: There is no corpus in 'nowhere': rare-envs corpus add RUN makes one.
     """
     paths = sorted(folder.glob("*.json"))
     if not paths:

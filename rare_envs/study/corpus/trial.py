@@ -28,7 +28,12 @@ TrialOutcome = Literal["passed", "failed", "error"]
 
 @dataclass(frozen=True, kw_only=True)
 class EgoChoice:
-    """An ego as options name it, and its interface."""
+    """An ego as options name it, and its interface.
+
+    Example:
+        >>> EgoChoice(ego="ppo.zip", observation="lidar").action
+        'continuous'
+    """
 
     ego: str
     algo: str | None = None
@@ -47,6 +52,12 @@ class Trial:
         f: Its measure; NaN after an error.
         crash: Kind of its crash, where it failed.
         reason: The error.
+
+    Example:
+        >>> stored = StoredFailure("rare_envs/CutIn-v0", {"gamma": 0.0}, {"x": [1.0]}, f=-1.0, log_p0=-9.0)
+        >>> trial = Trial(stored, "passed", f=1.5)
+        >>> trial.same, trial.to_dict()["outcome"]
+        (False, 'passed')
     """
 
     failure: StoredFailure
@@ -92,6 +103,15 @@ def try_ego(
 
     Raises:
         BadInput: The ego cannot be used, or a scenario is not one of its world any longer.
+
+    Example:
+        >>> from rare_envs.study.corpus.stored_failure import WORLD_FIELDS
+        >>> world = {name: getattr(Question(env_id=""), name) for name in WORLD_FIELDS}
+        >>> x = {"ego_speed": [20.0], "lead_speed": [5.0], "gap": [10.0]}
+        >>> stored = StoredFailure("rare_envs/CarFollowing-v0", world, x, f=-1.0, log_p0=-9.0)
+        >>> (trial,), _ = try_ego([stored], EgoChoice(ego="idm"), Path("corpus"))
+        >>> trial.outcome, trial.f, trial.crash
+        ('failed', -1.0, 'rear_end')
     """
     worlds: dict[str, list[int]] = {}
     for number, failure in enumerate(failures):

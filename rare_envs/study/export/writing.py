@@ -92,6 +92,15 @@ def export_drive(
     Raises:
         ValueError: An argument is not as described, or the library scenariogeneration is missing.
         OSError: A file cannot be written.
+
+    Example:
+        >>> from tempfile import TemporaryDirectory
+        >>> problem = DrivingProblem("rare_envs/CarFollowing-v0", horizon=1.0)
+        >>> drive = drive_again(problem, np.array([20.0, 15.0, 30.0]))
+        >>> with TemporaryDirectory() as folder:
+        ...     (file,) = export_drive(drive, Path(folder) / "drive.xml", "commonroad", ego="free")
+        ...     file.read_text().count("<dynamicObstacle")
+        1
     """
     path = Path(path)
     free = check_export(path, format, ego)
