@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from rare_envs.interop import HighwayEnvProblem, HighwayEnvScenario, highway_env_problem
     from rare_envs.problem import DrivingProblem
     from rare_envs.study.rates.total_risk import risk
+    from rare_envs.study.storage.loaded_study import load_study
 
     ENV_IDS: tuple[str, ...]
     """Ids of all environments, your own included."""
@@ -29,6 +30,7 @@ __all__ = [
     "ScenarioSpace",
     "TruncatedGaussianMixture",
     "highway_env_problem",
+    "load_study",
     "make_batch",
     "parallel_env",
     "register_scenario",
@@ -45,6 +47,7 @@ _LAZY = {
     "ScenarioSpace": "rare_envs.distributions.space",
     "TruncatedGaussianMixture": "rare_envs.distributions.truncated_mixture",
     "highway_env_problem": "rare_envs.interop",
+    "load_study": "rare_envs.study.storage.loaded_study",
     "risk": "rare_envs.study.rates.total_risk",
 }
 

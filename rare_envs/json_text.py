@@ -1,6 +1,7 @@
-"""JSON text of files: an object, or one line that says what is wrong."""
+"""JSON text of files: an object, or one line that says what is wrong, and text that people can read."""
 
 import json
+import re
 from typing import Any
 
 _MAX_DIGITS = 300
@@ -34,6 +35,21 @@ def parse_json_object(text: str, source: str) -> dict[str, Any]:
     if not isinstance(data, dict):
         raise ValueError(f"{source}: expected a JSON object, got {type(data).__name__}.")
     return data
+
+
+def format_json(value: dict[str, Any]) -> str:
+    """Return JSON with one entry per line, but lists of numbers in one line.
+
+    Example:
+        >>> print(format_json({"p": 0.5, "interval": [0.25, 0.75]}))
+        {
+          "p": 0.5,
+          "interval": [0.25, 0.75]
+        }
+    """
+    text = json.dumps(value, indent=2, allow_nan=False)
+    # a line that ends with a bracket is no part of a string, which would have no line breaks
+    return re.sub(r"\[\n([^\[\]{}\"]*)\n *\]", lambda match: f"[{' '.join(match[1].split())}]", text)
 
 
 def _parse_int(digits: str) -> int:

@@ -52,7 +52,7 @@ class DrawWeights:
     """
 
     first: int
-    """Number of the first of them in its run."""
+    """Simulations that its run had spent before the first of them."""
     log_weights: FloatArray
     """log(p0 / q) - log(N) for N draws in all, in the order of the simulations, shape (n,)."""
     run: int = 0
@@ -146,8 +146,9 @@ class SimulationIndex:
         ([0, 4], 800)
     """
 
-    spans: tuple[tuple[int, int], ...]
-    """Replicate and number of its simulations that follow each other, in order."""
+    spans: tuple[tuple[int, int, int], ...]
+    """Replicate, number of its simulations that follow each other, and what they cost: more than their number where
+    gradients follow them, which cost simulations and give none; in order."""
     trace: tuple[Level, ...]
     """Levels of all replicates."""
     weights: tuple[DrawWeights, ...]
@@ -156,7 +157,7 @@ class SimulationIndex:
     @property
     def n(self) -> int:
         """Number of simulations."""
-        return sum(n for _, n in self.spans)
+        return sum(n for _, n, _ in self.spans)
 
     def describe(self, first: int, n: int) -> SimulationRows:
         """Return what simulations first, ..., first + n - 1 were made for."""
@@ -174,12 +175,12 @@ class SimulationIndex:
         return SimulationRows(run, stage, log_weight)
 
     def _locate(self, first: int, n: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the replicate of each simulation and its number there, shape (n,) each."""
-        runs, sizes = (np.array(each, dtype=np.int64) for each in zip(*self.spans, strict=True))
+        """Return the replicate of each simulation and what was spent there before it, shape (n,) each."""
+        runs, sizes, costs = (np.array(each, dtype=np.int64) for each in zip(*self.spans, strict=True))
         before = np.zeros(len(runs), dtype=np.int64)
         for number in np.unique(runs):
             mine = runs == number
-            before[mine] = np.cumsum(sizes[mine]) - sizes[mine]
+            before[mine] = np.cumsum(costs[mine]) - costs[mine]
         ends = np.cumsum(sizes)
         rows = np.arange(first, first + n)
         span = np.searchsorted(ends, rows, side="right")

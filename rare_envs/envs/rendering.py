@@ -12,6 +12,7 @@ from rare_envs.scenarios.base import Scenario
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.world import World
 from rare_envs.traffic.overlap import pairwise_overlaps
+from rare_envs.traffic.palette import CRASH_COLOUR, ROLE_COLOURS, as_rgb
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
 
@@ -29,14 +30,6 @@ _AHEAD, _BEHIND = 4, 2
 """Pieces drawn ahead of the ego's and behind it."""
 
 Colour = tuple[int, int, int]
-ROLE_COLOURS: dict[str, Colour] = {
-    "ego": (50, 200, 0),
-    "lead": (100, 200, 255),
-    "cutter": (200, 200, 0),
-    "others": (190, 190, 205),
-    "crashed": (255, 100, 100),
-}
-"""Colours of vehicles by what they are called, HighwayEnv's green, blue, yellow and red; "others" for other names."""
 AGENT: Colour = (200, 0, 150)
 """Outline of vehicles other than the ego that an agent drives, HighwayEnv's purple."""
 _PAPER: Colour = (255, 255, 255)
@@ -47,7 +40,9 @@ class Roles(NamedTuple):
     """Roles of the vehicles of a picture."""
 
     names: tuple[str, ...]
-    """A key of `ROLE_COLOURS` for each vehicle."""
+    """A key of `palette.ROLE_COLOURS` for each vehicle."""
+    crashed: frozenset[int]
+    """Vehicles that have crashed; they are outlined."""
     agents: frozenset[int]
     """Vehicles other than the ego that agents drive."""
 
@@ -132,9 +127,8 @@ class Renderer:
         return image
 
     def _assign_roles(self, agents: Collection[int], crashed: Collection[int]) -> Roles:
-        names = (name if name in ROLE_COLOURS else "others" for name in self._scenario.vehicle_names)
-        drawn = tuple("crashed" if j in crashed else name for j, name in enumerate(names))
-        return Roles(drawn, frozenset(agents) - {0})
+        names = tuple(name if name in ROLE_COLOURS else "others" for name in self._scenario.vehicle_names)
+        return Roles(names, frozenset(crashed), frozenset(agents) - {0})
 
     def _draw_road(self, state: State, roles: Roles) -> None:
         from highway_env.road.graphics import RoadGraphics
@@ -146,25 +140,30 @@ class Renderer:
         places = torch.stack(self._road.to_world(state.x[0], state.y[0], state.heading[0]), dim=1).tolist()
         for j, (x, y, heading) in enumerate(places):
             vehicle = Vehicle(traffic, [x, y], heading, float(state.speed[0, j]))
-            vehicle.color = ROLE_COLOURS[roles.names[j]]
+            vehicle.color = as_rgb(ROLE_COLOURS[roles.names[j]])
             traffic.vehicles.append(vehicle)
         self._surface.move_display_window_to(_point(self._road, ego_x, self._road.middle))
         RoadGraphics.display(traffic, self._surface)
         RoadGraphics.display_traffic(traffic, self._surface, offscreen=True)
-        for j in roles.agents:
+        outlines = [(j, AGENT) for j in roles.agents] + [(j, as_rgb(CRASH_COLOUR)) for j in sorted(roles.crashed)]
+        for j, colour in outlines:
             corners = [self._surface.pos2pix(x, y) for x, y in _corners(*places[j])]
-            self._pygame.draw.polygon(self._surface, AGENT, corners, width=3)
+            self._pygame.draw.polygon(self._surface, colour, corners, width=3)
 
     def _draw_legend(self, roles: Roles) -> None:
         """Draw colours and what they mean, in a line below the road."""
         x, y = 8, self._canvas.get_height() - TEXT_HEIGHT + 6
         for role in ROLE_COLOURS:
             if role in roles.names:
-                self._pygame.draw.rect(self._canvas, ROLE_COLOURS[role], (x, y, 20, 11))
+                self._pygame.draw.rect(self._canvas, as_rgb(ROLE_COLOURS[role]), (x, y, 20, 11))
                 x += 26 + self._write(x + 26, y + 10, role) + 18
-        if roles.agents:
-            self._pygame.draw.rect(self._canvas, AGENT, (x, y, 20, 11), width=3)
-            self._write(x + 26, y + 10, "driven by an agent")
+        for shown, colour, text in (
+            (roles.agents, AGENT, "driven by an agent"),
+            (roles.crashed, as_rgb(CRASH_COLOUR), "crashed"),
+        ):
+            if shown:
+                self._pygame.draw.rect(self._canvas, colour, (x, y, 20, 11), width=3)
+                x += 26 + self._write(x + 26, y + 10, text) + 18
 
     def _write(self, x: int, y: int, text: str) -> int:
         """Write a line, and return how long it is."""

@@ -15,19 +15,23 @@ if TYPE_CHECKING:
     from rare_envs.study.question import Question, Study, prepare
     from rare_envs.study.replay import Drive, drive_again
     from rare_envs.study.report import Report
-    from rare_envs.study.run_directory import read_failures, write_run
+    from rare_envs.study.run_directory import write_run
+    from rare_envs.study.storage.failure_table import read_failures
+    from rare_envs.study.storage.loaded_study import LoadedStudy, load_study
     from rare_envs.study.video import write_film
 
 __all__ = [
     "BadInput",
     "Drive",
     "EgoComparison",
+    "LoadedStudy",
     "Question",
     "Report",
     "Severity",
     "Study",
     "compare_egos",
     "drive_again",
+    "load_study",
     "prepare",
     "read_failures",
     "resume",
@@ -42,14 +46,16 @@ _LAZY = {
     "BadInput": "rare_envs.study.errors",
     "Drive": "rare_envs.study.replay",
     "EgoComparison": "rare_envs.study.compare",
+    "LoadedStudy": "rare_envs.study.storage.loaded_study",
     "Question": "rare_envs.study.question",
     "Report": "rare_envs.study.report",
     "Severity": "rare_envs.study.analysis.severity",
     "Study": "rare_envs.study.question",
     "compare_egos": "rare_envs.study.compare",
     "drive_again": "rare_envs.study.replay",
+    "load_study": "rare_envs.study.storage.loaded_study",
     "prepare": "rare_envs.study.question",
-    "read_failures": "rare_envs.study.run_directory",
+    "read_failures": "rare_envs.study.storage.failure_table",
     "resume": "rare_envs.study.evaluate",
     "run": "rare_envs.study.evaluate",
     "run_into": "rare_envs.study.evaluate",

@@ -10,9 +10,10 @@ from typing import Any, NamedTuple
 import samplers
 from rare_envs.egos.errors import EgoGone
 from rare_envs.files import replace_text
+from rare_envs.json_text import format_json
 from rare_envs.study.errors import as_bad_input, output_folder
 from rare_envs.study.question import Question, prepare
-from rare_envs.study.run_directory import check_no_results, format_json, write_failures
+from rare_envs.study.run_directory import check_no_results, write_failures
 from rare_envs.version import __version__
 
 COMPARISON = "comparison.json"

@@ -14,8 +14,10 @@ from rare_envs.egos.errors import EgoGone
 from rare_envs.problem import DrivingProblem
 from rare_envs.study.analysis.failure_replay import replay_failures, replay_further_failures
 from rare_envs.study.analysis.severity import Severity, compute_severity
-from rare_envs.traffic.crash import CRASH_KINDS, describe_crash
+from rare_envs.study.storage.episode_file import digest_scenario
+from rare_envs.traffic.crash import CRASH_KINDS, Crash, describe_crash
 from samplers.analysis import NO_OUTCOME_LABEL, sum_by_label
+from samplers.problem import FloatArray
 
 KIND_DESCRIPTIONS = MappingProxyType(
     {
@@ -41,6 +43,8 @@ class CrashKinds:
     """The crash of each failure of the list, see `rare_envs.traffic.crash.describe_crash`; empty if it is not known."""
     unknown: str = ""
     """Reason why it is not known."""
+    by_scenario: Mapping[str, str] = field(default_factory=dict, repr=False)
+    """Kind of each failure that was driven again, by `digest_scenario`."""
     severity: Severity | None = None
     """How severe the collisions are; None if there are none, or it is not known."""
 
@@ -54,24 +58,34 @@ def classify_failures(problem: DrivingProblem, estimate: samplers.Estimate) -> C
         return CrashKinds(unknown="the ego's answers vary from run to run, so that its failures cannot be seen again")
     try:
         crashes = problem.crashes(estimate.failures.x[known])
-        shares, severity = _weigh_crashes(problem, estimate)
+        by_scenario = _label_scenarios(estimate.failures.x[known], crashes)
+        shares, severity = _weigh_crashes(problem, estimate, by_scenario)
     except (Exception, SystemExit, EgoGone) as error:  # the ego is the user's, and need not do again what it did before
         return CrashKinds(unknown=f"{type(error).__name__}: {error}")
     row = np.cumsum(known) - 1
     listed = (describe_crash(crashes, int(at)) if one else None for at, one in zip(row, known, strict=True))
-    return CrashKinds(shares, tuple(listed), severity=severity)
+    return CrashKinds(shares, tuple(listed), by_scenario=by_scenario, severity=severity)
 
 
 def _weigh_crashes(
-    problem: DrivingProblem, estimate: samplers.Estimate
+    problem: DrivingProblem, estimate: samplers.Estimate, by_scenario: dict[str, str]
 ) -> tuple[dict[str, samplers.Share], Severity | None]:
-    """Return p by kind of crash and the severity, from failing points that are driven again once for both."""
+    """Return p by kind of crash and the severity, from failing points that are driven again once for both.
+
+    The kind of each is added to `by_scenario`.
+    """
     if estimate.sample is None:
         return {}, None
     replayed = replay_failures(problem, estimate)
     failures = replayed.failures
     labels = np.full(len(failures.rows), NO_OUTCOME_LABEL, dtype=object)
+    by_scenario |= _label_scenarios(failures.x[failures.has_outcome], replayed.crash)
     labels[failures.has_outcome] = [CRASH_KINDS[kind] for kind in replayed.crash.kind]
     shares = sum_by_label(estimate, failures.rows, labels)
     further = replay_further_failures(problem, estimate)
     return shares, compute_severity(problem, estimate, replayed, further=further)
+
+
+def _label_scenarios(x: FloatArray, crash: Crash) -> dict[str, str]:
+    """Return the kinds of crash of scenarios x (k, d), by their digest."""
+    return {digest_scenario(row): CRASH_KINDS[int(kind)] for row, kind in zip(x, crash.kind, strict=True)}

@@ -20,6 +20,9 @@ from rare_envs.study.journal import JOURNAL, begin_journal, check_same_files, co
 from rare_envs.study.question import Study, prepare
 from rare_envs.study.report import Report
 from rare_envs.study.run_directory import check_no_results, remove_results, write_run
+from rare_envs.study.storage.episode_recorder import EpisodeRecorder
+from rare_envs.study.storage.names import STUDY
+from rare_envs.study.storage.study_file import begin_study_file, finish_study_file
 from samplers.execution.executors import Executor, ExecutorError
 from samplers.execution.journal import JournalFile
 from samplers.execution.progress import Pace, open_listener
@@ -48,6 +51,7 @@ def run(
     progress: bool | Callable[[samplers.Progress], None] = False,
     journal: JournalFile | None = None,
     executor: Executor | None = None,
+    folder: Path | None = None,
 ) -> Report:
     """Answer a question.
 
@@ -57,6 +61,7 @@ def run(
         journal: Keeps finished simulations, and has those of an interrupted run.
         executor: Where simulations are made, such as `samplers.LocalProcesses(2)`; None for here. The answer does not
             depend on it, see `chunk` of `Question`.
+        folder: Gets the table of all simulations; None for no table.
 
     Returns:
         The report.
@@ -77,9 +82,11 @@ def run(
         (0.021, 1000)
     """
     start, study = time.perf_counter(), settle_chunk(study, executor)
+    recorder: EpisodeRecorder | None = None
     try:
         with open_problem(study, journal, executor) as problem:
-            keeper = RowKeeper(problem, study.question.gamma)
+            recorder = None if folder is None else EpisodeRecorder(problem, folder, study.problem.space)
+            keeper = RowKeeper(recorder or problem, study.question.gamma)
             estimate = _estimate(study, keeper, problem, progress)
     except EgoGone as error:
         raise BadInput(
@@ -92,10 +99,17 @@ def run(
         seconds = time.perf_counter() - start
         report = Report(study, stopped.estimate, seconds, tuple(problem.faults), kinds, problem.n_retried)
         raise RunInterrupted("Stopped.", report) from None
-    seconds = time.perf_counter() - start
-    kinds = classify_failures(study.problem, estimate)
+    else:
+        seconds = time.perf_counter() - start
+        kinds = classify_failures(study.problem, estimate)
+        if recorder is not None:
+            recorder.write(estimate, kinds.by_scenario)
+    finally:
+        if recorder is not None:
+            recorder.close()
     again = _check_repeatability(study, keeper)
-    return Report(study, estimate, seconds, tuple(problem.faults), kinds, problem.n_retried, again)
+    lost = "" if recorder is None else recorder.lost
+    return Report(study, estimate, seconds, tuple(problem.faults), kinds, problem.n_retried, again, lost)
 
 
 def settle_chunk(study: Study, executor: Executor | None) -> Study:
@@ -170,7 +184,7 @@ def run_into(
         >>> with TemporaryDirectory() as folder:
         ...     report = run_into(Path(folder), prepare(question))
         ...     sorted(path.name for path in Path(folder).iterdir())
-        ['failures.csv', 'plot.png', 'result.json']
+        ['episodes.parquet', 'failures.csv', 'plot.png', 'result.json', 'study.json']
     """
     study = settle_chunk(study, executor)
     with output_folder(folder):
@@ -178,6 +192,7 @@ def run_into(
             check_no_results(folder)
         with closing(begin_journal(folder, study.question, force)) as journal:
             remove_results(folder)
+            begin_study_file(folder, study)
             note_question(study.question)
             return _run(folder, study, journal, progress, executor)
 
@@ -227,13 +242,14 @@ def resume(
 def _run(folder: Path, study: Study, journal: JournalFile, progress: bool, executor: Executor | None = None) -> Report:
     target = folder.absolute()  # an ego may change the working directory
     try:
-        report = run(study, progress, journal, executor)
+        report = run(study, progress, journal, executor, target)
         _write(target, report)
     except UnwrittenResults as error:
         raise UnwrittenResults(f"{error}{_resume_hint(journal, folder)}", error.report) from error
     except BadInput as error:
         if not journal.n:
             journal.remove()
+            (target / STUDY).unlink(missing_ok=True)
         raise BadInput(f"{error}{_resume_hint(journal, folder)}") from error
     except KeyboardInterrupt as error:
         report_so_far = error.report if isinstance(error, RunInterrupted) else None
@@ -247,6 +263,7 @@ def _write(folder: Path, report: Report) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         write_run(folder, report)
+        finish_study_file(folder, report.study, report.seconds)
     except OSError as error:
         raise UnwrittenResults(
             f"Cannot write the results to {str(folder)!r}: {error.strerror or error}.", report

@@ -102,11 +102,11 @@ def digest_files(question: Question) -> dict[str, str]:
     """
     bases = [name.strip() for name in (question.also_under or "").split(",")]
     names = [strip_prefixes(question.ego), question.base, question.drivers, question.measure, *bases]
-    paths = {path for name in names if name for path in _find_files(name)}
+    paths = {path for name in names if name for path in find_named_files(name)}
     return {str(path): hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest() for path in sorted(paths)}
 
 
-def _find_files(name: str) -> list[Path]:
+def find_named_files(name: str) -> list[Path]:
     """Return the file that an option names, or that of its module: a.zip, noisy:a.zip, module:function."""
     parts = name.split(":")
     modules = [Path(f"{part.replace('.', '/')}{end}") for part in parts[:-1] for end in (".py", "/__init__.py")]

@@ -19,6 +19,7 @@ from rare_envs.files import replace_file
 from rare_envs.study.columns import list_columns
 from rare_envs.study.replay import Drive, drive_again
 from rare_envs.study.report import Report
+from rare_envs.traffic.palette import CRASH_COLOUR, vehicle_colour
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
 from samplers.problem import FloatArray
@@ -44,8 +45,6 @@ STYLE: Any = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": Fal
 """Settings of matplotlib for every picture. Each is a `Figure` of its own, without pyplot: no window, no global state,
 whatever backend the user has."""
 LINE_COLOUR, HIT_COLOUR, ORDINARY_COLOUR = "#3b6fb5", "#c0392b", "#b8b8b8"
-VEHICLE_COLOURS = ("#2a9d3a", "#3b6fb5", "#e08a1e", "#8e5aa8", "#3aa6a6", "#7a7a7a")
-"""Colours of vehicles, the ego's first."""
 
 
 def save_plot(path: Path, report: Report) -> None:
@@ -210,20 +209,20 @@ def draw_drive(axes: list[Axes], drive: Drive) -> None:
     for view, t in zip(axes[:MOMENTS], np.linspace(first, drive.worst, MOMENTS).round(), strict=True):
         draw_moment(view, drive, int(t))
     axes[0].set_title("The most likely failure from above, and its speeds and gap", fontsize=10)
-    _draw_curves(axes[-1], drive)
+    draw_speeds(axes[-1], drive)
 
 
 def draw_moment(axes: Axes, drive: Drive, t: int) -> None:
     """Draw the vehicles at moment t (an index of `drive.time`) from above, the ego at 0 m; bends are straightened."""
     origin = drive.position[t, 0, 0]
-    hit = drive.collided and t == drive.worst
+    hit, names = drive.collided and t == drive.worst, drive.problem.world.scenario.vehicle_names
     for j, ((x, y), heading) in enumerate(zip(drive.position[t], drive.heading[t], strict=True)):
         body = Rectangle(
             (-VEHICLE_LENGTH / 2, -VEHICLE_WIDTH / 2),
             VEHICLE_LENGTH,
             VEHICLE_WIDTH,
-            facecolor=vehicle_colour(j),
-            edgecolor=HIT_COLOUR if hit and j == 0 else "none",
+            facecolor=vehicle_colour(names[j], j),
+            edgecolor=CRASH_COLOUR if hit and j == 0 else "none",
         )
         body.set_transform(Affine2D().rotate(heading).translate(x - origin, y) + axes.transData)
         axes.add_patch(body)
@@ -252,15 +251,10 @@ def draw_moment(axes: Axes, drive: Drive, t: int) -> None:
         axes.text(VIEW_AHEAD, lane, word, color=HIT_COLOUR, ha="right", va="center", fontweight="bold")
 
 
-def vehicle_colour(vehicle: int) -> str:
-    """Return the colour of a vehicle; 0 is the ego."""
-    return VEHICLE_COLOURS[0] if vehicle == 0 else VEHICLE_COLOURS[1 + (vehicle - 1) % (len(VEHICLE_COLOURS) - 1)]
-
-
-def _draw_curves(axes: Axes, drive: Drive) -> None:
+def draw_speeds(axes: Axes, drive: Drive) -> None:
     """Draw speeds (left axis) and the gap to the vehicle ahead (right axis) over time."""
-    for j, name in enumerate(drive.names):
-        axes.plot(drive.time, drive.speed[:, j], color=vehicle_colour(j), label=f"speed of {name}")
+    for j, (name, role) in enumerate(zip(drive.names, drive.problem.world.scenario.vehicle_names, strict=True)):
+        axes.plot(drive.time, drive.speed[:, j], color=vehicle_colour(role, j), label=f"speed of {name}")
     axes.set_xlabel("time [s]")
     axes.set_ylabel("speed [m/s]")
     axes.set_ylim(0, HEADROOM * max(1.0, float(drive.speed.max())))

@@ -17,7 +17,9 @@ from rare_envs.distributions.fitted import FittedDistribution
 from rare_envs.distributions.space import Distribution
 from rare_envs.egos.faults import Fault
 from rare_envs.exposure import HUMAN_BENCHMARKS, CollisionRate
+from rare_envs.study.analysis.modes import FailureMode, find_modes
 from rare_envs.study.analysis.repeatability import Repeatability
+from rare_envs.study.analysis.threshold_curve import compute_threshold_curve
 from rare_envs.study.collision_rate import compute_injury_rate, compute_rate, describe_left_out, find_frequency
 from rare_envs.study.crash_kinds import CrashKinds
 from rare_envs.study.question import Study
@@ -54,6 +56,7 @@ class Report:
         n_retried: Simulations that were repeated to find them; not in n_sim.
         kinds: Crashes in which the failures ended.
         repeatability: Simulations done again at the end, not in n_sim; None if that was not done.
+        lost: What of the folder could not be written, though the run went on; "" if nothing.
 
     Example:
         >>> from rare_envs.study import Question, prepare, run
@@ -73,6 +76,7 @@ class Report:
     kinds: CrashKinds = field(default_factory=CrashKinds)
     n_retried: int = 0
     repeatability: Repeatability | None = None
+    lost: str = ""
 
     @cached_property
     def sensitivity(self) -> samplers.Sensitivity | str | None:
@@ -131,6 +135,7 @@ class Report:
         unknown = [f"kinds of crash are not known: {self.kinds.unknown}"] if self.kinds.unknown else []
         if isinstance(self.sensitivity, str):
             unknown.append(f"sensitivity is not known: {self.sensitivity}")
+        unknown += [self.lost] if self.lost else []
         left_out = () if self.no_rate else describe_left_out(self.study, self.estimate)
         return (*self._unused_options, *self.study.problem.notes, *unknown, *left_out)
 
@@ -145,6 +150,18 @@ class Report:
         if found.reason or not doubts:
             return found
         return replace(found, decision="undecided", reason=f"there is a warning: {doubts[0].rstrip('.')}")
+
+    @cached_property
+    def modes(self) -> tuple[FailureMode, ...]:
+        """Modes of failure, the largest first; empty where they are not known."""
+        if self.kinds.unknown:
+            return ()
+        return find_modes(self.study.problem.space, self.estimate, self.kinds.by_scenario)
+
+    @cached_property
+    def curve(self) -> samplers.Curve | None:
+        """Probability over the threshold, from the same simulations; None where the run does not tell it."""
+        return compute_threshold_curve(self.estimate)
 
     @cached_property
     def rate(self) -> CollisionRate | None:
@@ -209,6 +226,8 @@ class Report:
             "seconds": self.seconds,
             "n_failures": failures.total,
             "kinds": {kind: share.to_dict() for kind, share in self.kinds.shares.items()},
+            "modes": [mode.to_dict() for mode in self.modes],
+            "curve": None if self.curve is None else self.curve.to_dict(),
             "severity": None if self.kinds.severity is None else self.kinds.severity.to_dict(),
             "sensitivity": self.sensitivity.to_dict() if isinstance(self.sensitivity, samplers.Sensitivity) else None,
             "failures": ranked,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from rare_envs.envs.rendering import FRAME_WIDTH, Renderer
+from rare_envs.envs.rendering import AGENT, FRAME_WIDTH, Colour, Renderer
 from rare_envs.files import replace_file
 from rare_envs.json_text import parse_json_object
 from rare_envs.problem import DrivingProblem
@@ -21,7 +21,9 @@ from rare_envs.study.errors import BadInput, as_bad_input
 from rare_envs.study.journal import JOURNAL
 from rare_envs.study.question import prepare
 from rare_envs.study.replay import Drive
-from rare_envs.study.run_directory import FAILURES, RESULT, read_failures
+from rare_envs.study.storage.failure_table import read_failures
+from rare_envs.study.storage.names import FAILURES, RESULT
+from rare_envs.traffic.palette import CRASH_COLOUR, OTHER_COLOURS, ROLE_COLOURS, as_rgb
 
 CURVES_HEIGHT = 144
 """Height of the curves below the road [pixels]."""
@@ -29,8 +31,8 @@ REPLAY_TOLERANCE = 1e-3
 """Largest difference of f to the recorded one: products of networks round differently by batch size."""
 LAST_FRAME_TICKS = 10
 """Ticks for which the last picture stays."""
-GIF_COLOURS = 64
-"""Colours of a picture in a GIF."""
+MARKER: Colour = (200, 0, 150)
+"""Line at the present moment in the curves."""
 
 
 class RecordedFailure(NamedTuple):
@@ -75,11 +77,11 @@ def find_failure(folder: Path, number: int, trust: bool = False) -> RecordedFail
         raise BadInput(
             f"Expected a failure from 0 to {count - 1}, got {number}." if count else "The run has no failure."
         )
-    x = _join_parameters(table, problem, number)
+    x = join_parameters(table, problem, number)
     return RecordedFailure(problem, x, float(table["f"][number]), float(table["log_p0"][number]), count)
 
 
-def _join_parameters(table: dict[str, NDArray[Any]], problem: DrivingProblem, number: int) -> NDArray[np.float64]:
+def join_parameters(table: dict[str, NDArray[Any]], problem: DrivingProblem, number: int) -> NDArray[np.float64]:
     """Return x (d,) of a row.
 
     Raises:
@@ -106,7 +108,7 @@ def draw_frames(drive: Drive) -> list[Image.Image]:
         picture.paste(curves, (0, road.shape[0]))
         column, top, bottom = place(drive.time[k])
         ImageDraw.Draw(picture).line(
-            [(column, road.shape[0] + top), (column, road.shape[0] + bottom)], fill=(200, 0, 150), width=2
+            [(column, road.shape[0] + top), (column, road.shape[0] + bottom)], fill=MARKER, width=2
         )
         shown.append(picture)
     return shown
@@ -120,7 +122,7 @@ def _draw_curves_strip(drive: Drive) -> tuple[Image.Image, Any]:
     figure = Figure(figsize=(FRAME_WIDTH / 100, CURVES_HEIGHT / 100), dpi=100)
     canvas: Any = FigureCanvasAgg(figure)
     axes = figure.add_axes((0.08, 0.3, 0.9, 0.62))
-    axes.plot(time, drive.f_alone, color="tab:blue", linewidth=1, label="this moment")
+    axes.plot(time, drive.f_alone, color="#777777", linewidth=1, label="this moment")
     axes.step(time, drive.f_so_far, where="post", color="black", linewidth=1.5, label="f so far")
     axes.set_xlim(0.0, max(world.clock.dt, float(time[-1])))
     axes.set_xlabel("time [s]", fontsize=8)
@@ -218,9 +220,39 @@ def write_film(path: Path | str, drive: Drive, width: int = FRAME_WIDTH, every: 
         with replace_file(path) as draft:
             shown[drive.worst].save(draft)
         return
-    tick = round(1000 * drive.problem.world.clock.dt)
-    kept = shown[:-1:every]
-    frames = [each.quantize(GIF_COLOURS) for each in (*kept, shown[-1])]
+    with replace_file(path) as draft, draft.open("wb") as file:
+        save_gif(file, shown, drive.problem.world.clock.dt, every)
+
+
+def _make_gif_palette() -> Image.Image:
+    """Return a picture with the colours of a GIF: greys, and those of vehicles as they are, in shade and in light.
+
+    A palette found from a picture has mostly greys of the road, and gives two vehicles one colour.
+    """
+    colours = [*(as_rgb(each) for each in (*ROLE_COLOURS.values(), *OTHER_COLOURS, CRASH_COLOUR)), MARKER, AGENT]
+    mixed = [
+        tuple(round((1 - share) * own + share * other) for own, other in zip(colour, beside, strict=True))
+        for colour in colours
+        for beside, share in (((100, 100, 100), 0.5), ((255, 255, 255), 0.5), ((0, 0, 0), 0.4))
+    ]
+    greys = [(level, level, level) for level in range(0, 256, 5)]
+    picture = Image.new("P", (1, 1))
+    picture.putpalette([value for colour in (*colours, *mixed, *greys) for value in colour])
+    return picture
+
+
+def save_gif(file: IO[bytes], shown: list[Image.Image], dt: float, every: int = 1) -> None:
+    """Write pictures as a moving one.
+
+    Args:
+        file: To write to.
+        shown: A picture for each tick; the last one stays for a while.
+        dt: Length of a tick [s].
+        every: Show one tick out of so many.
+    """
+    tick, kept = round(1000 * dt), shown[:-1:every]
+    palette = _make_gif_palette()
+    frames = [each.quantize(palette=palette, dither=Image.Dither.NONE) for each in (*kept, shown[-1])]
     durations = [tick * every] * len(kept) + [tick * LAST_FRAME_TICKS]
-    with replace_file(path) as draft:
-        frames[0].save(draft, save_all=True, append_images=frames[1:], duration=durations, loop=0, optimize=True)
+    more: dict[str, Any] = {"append_images": frames[1:], "duration": durations, "loop": 0, "optimize": True}
+    frames[0].save(file, format="GIF", save_all=True, **more)

@@ -76,7 +76,7 @@ class Run:
         self._asked = False
         self._stopped: str | None = None
         self._replicates: list[Replicate] = []
-        self._spans: list[tuple[Replicate, int]] = []
+        self._spans: list[tuple[Replicate, int, int]] = []
         for max_sim in split_budget(self._goal.max_sim, self._n_wanted):
             self._start_replicate(max_sim)
         self._start_more_for_target()
@@ -218,19 +218,20 @@ class Run:
         )
 
     def _note_spans(self, running: Sequence[Replicate], answers: Sequence[Answer]) -> None:
-        """Note which replicate made the simulations of some answers."""
-        for replicate, answer in zip(running, answers, strict=True):
-            if isinstance(answer, TermGradients):
-                continue
-            n = count_simulations(answer)
-            if self._spans and self._spans[-1][0] is replicate:
-                n += self._spans.pop()[1]
-            self._spans.append((replicate, n))
+        """Note which replicate made the simulations of some answers: points first, then terms, then gradients."""
+        order = sorted(range(len(answers)), key=lambda i: isinstance(answers[i], Terms | TermGradients))
+        for i in order:
+            replicate, cost = running[i], count_simulations(answers[i])
+            n = 0 if isinstance(answers[i], TermGradients) else cost
+            if self._spans and self._spans[-1][0] is replicate and self._spans[-1][1] == self._spans[-1][2]:
+                _, n_before, cost_before = self._spans.pop()
+                n, cost = n + n_before, cost + cost_before
+            self._spans.append((replicate, n, cost))
 
     def _index_simulations(self, whole: Outcome) -> SimulationIndex:
         """Return what the simulations were made for."""
         number = {id(replicate): run for run, replicate in enumerate(self._replicates)}
-        spans = tuple((number[id(replicate)], n) for replicate, n in self._spans if id(replicate) in number)
+        spans = tuple((number[id(replicate)], n, cost) for replicate, n, cost in self._spans if id(replicate) in number)
         return SimulationIndex(spans=spans, trace=whole.trace, weights=whole.draw_weights)
 
     def _outcomes(self) -> list[Outcome]:

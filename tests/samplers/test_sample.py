@@ -85,3 +85,24 @@ def test_chains_give_no_weights_of_single_simulations(method: str) -> None:
     result, f = of_simulations(method, 1, 0.0)
     assert result.simulations is not None
     assert np.isnan(result.simulations.describe(0, len(f)).log_weight).all()
+
+
+def test_gradients_cost_simulations_that_have_no_row() -> None:
+    calls: list[int] = []
+
+    def terms(x: FloatArray) -> FloatArray:
+        calls.append(len(x))
+        return np.stack([4.5 - x.sum(axis=1) / 40**0.5, 6.0 - x[:, 0]], axis=1)
+
+    def gradient(x: FloatArray, term: np.ndarray) -> FloatArray:
+        slope = np.zeros_like(x)
+        slope[term == 0], slope[term == 1, 0] = -1 / 40**0.5, -1.0
+        return slope
+
+    problem = samplers.FunctionProblem(dim=40, terms=terms, gradient=gradient)
+    result = samplers.estimate(problem, "two-stage", seed=0, max_sim=4000)
+    index = result.simulations
+    assert index is not None and index.n == sum(calls) < result.n_sim
+    rows = index.describe(0, index.n)
+    assert sum(cost for _, _, cost in index.spans) == result.n_sim
+    assert (rows.stage >= 0).all() and (np.diff(rows.stage) >= 0).all() and rows.stage[-1] == len(result.trace) - 1

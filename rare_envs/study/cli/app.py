@@ -32,7 +32,14 @@ from rare_envs.study.cli.options import (
     WorldOptions,
 )
 from rare_envs.study.cli.plan import plan_command
-from rare_envs.study.cli.shell import OneLineErrors, keep_stdout_for_the_answer, print_json, show_what_is_known
+from rare_envs.study.cli.report import report_command
+from rare_envs.study.cli.shell import (
+    OneLineErrors,
+    is_typed,
+    keep_stdout_for_the_answer,
+    print_json,
+    show_what_is_known,
+)
 from rare_envs.study.errors import BadInput, as_bad_input
 from rare_envs.threads import use_one_thread
 from training.command_line import DriverTrainingOptions, RecordingOptions, RunFolderOption, spread_options
@@ -66,18 +73,26 @@ def list_command(as_json: JsonOption = False) -> None:
 @spread_options
 @use_one_thread()
 def estimate_command(
-    env: EnvArgument,
+    context: typer.Context,
     options: EstimateOptions,
     places: ExecutorOptions,
-    out: Annotated[Path | None, typer.Option(help="Folder for result.json, failures.csv and plot.png.")] = None,
+    env: Annotated[
+        str | None, typer.Argument(metavar="ENV", help="Environment, such as rare_envs/CutIn-v0; or in --config.")
+    ] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="YAML file with ENV (env: ...) and options; those given here come first.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder of the run: result.json, episodes.parquet and more.")] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Estimate how often an ego fails, with an interval, and show its most likely failure."""
+    from rare_envs.study.cli.question_file import join_question, read_question_file
     from rare_envs.study.evaluate import run, run_into
-    from rare_envs.study.question import Question, prepare
+    from rare_envs.study.question import prepare
 
-    question = Question(env_id=env, **options.arguments())
+    typed = {name for name in context.params if is_typed(context, name)}
+    question = join_question({} if config is None else read_question_file(config), env, options.arguments(), typed)
     with show_what_is_known(lambda known: _show(known, None, as_json)), keep_stdout_for_the_answer():
         with as_bad_input(ValueError):
             executor = places.make()
@@ -340,6 +355,7 @@ def replay_command(
 app.command("export")(export_command)
 app.add_typer(corpus_app, name="corpus")
 app.command("plan")(plan_command)
+app.command("report")(report_command)
 
 
 @app.command("check-ego")

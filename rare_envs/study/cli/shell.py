@@ -61,6 +61,12 @@ class OneLineErrors(TyperGroup):
         sys.exit(code if isinstance(code, int) else 0)
 
 
+def is_typed(context: typer.Context, name: str) -> bool:
+    """Return whether an option of a command was typed, not left at its default."""
+    source = context.get_parameter_source(name)
+    return source is not None and source.name == "COMMANDLINE"
+
+
 @contextlib.contextmanager
 def signals_as_exceptions(received: list[int]) -> Iterator[None]:
     """Raise `Terminated` on SIGTERM and SIGHUP, where they would end the process without a word."""

@@ -16,7 +16,8 @@ from rare_envs.study.corpus.stored_failure import StoredFailure, make_stored, re
 from rare_envs.study.errors import BadInput, as_bad_input, output_folder
 from rare_envs.study.journal import JOURNAL
 from rare_envs.study.question import read_question
-from rare_envs.study.run_directory import CRASH, FAILURES, RESULT, read_failures
+from rare_envs.study.storage.failure_table import CRASH, read_failures
+from rare_envs.study.storage.names import FAILURES, RESULT
 
 MAX_CORPUS_FILES = 100_000
 """Files of a corpus that are read at most."""

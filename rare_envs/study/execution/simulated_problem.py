@@ -28,6 +28,7 @@ class SimulatedProblem(WrappedProblem):
         n_retried: Rows simulated again to find them.
         evaluation: Keeps and computes chunks.
         workers: Number of workers; 0 without an executor.
+        row_seconds: Wall time of each simulation of the last batch [s], that of its chunk shared equally, shape (n,).
     """
 
     def __init__(self, study: Study, journal: JournalFile | None = None, pool: WorkerPool | None = None) -> None:
@@ -46,10 +47,12 @@ class SimulatedProblem(WrappedProblem):
         self.workers = 0 if pool is None else pool.workers
         self.faults: list[Fault] = []
         self.n_retried = 0
+        self.row_seconds = np.empty(0)
 
     def evaluate(self, x: FloatArray) -> FloatArray:
         """Return f of scenarios x (n, d), shape (n,); NaN where the ego failed twice."""
         parts = self._evaluate(Chunk("f", (np.asarray(x, dtype=np.float64),)))
+        self.row_seconds = _share_seconds(parts)
         for chunk, (f, notes) in parts:
             self._record_faults(chunk, f, notes["reasons"])
         return np.concatenate([f for _, (f, _) in parts])
@@ -62,6 +65,7 @@ class SimulatedProblem(WrappedProblem):
         """
         self._check_gamma(gamma)
         parts = self._evaluate(Chunk("terms", (np.asarray(x, dtype=np.float64),)))
+        self.row_seconds = _share_seconds(parts)
         for chunk, (numbers, notes) in parts:
             self._record_faults(chunk, numbers[: len(chunk)], notes["reasons"])
         terms, self._n_terms = unpack_all_terms([(len(chunk), packed) for chunk, packed in parts], self._n_terms)
@@ -93,6 +97,13 @@ class SimulatedProblem(WrappedProblem):
     def _check_gamma(self, gamma: float) -> None:
         if gamma != self._work.gamma:
             raise ValueError(f"Expected the threshold of the study, {self._work.gamma:g}, got {gamma:g}.")
+
+
+def _share_seconds(parts: list[tuple[Chunk, Packed]]) -> FloatArray:
+    """Return the wall time of each row of some chunks; NaN where it is not known."""
+    return np.concatenate(
+        [np.full(len(chunk), notes.get("seconds", np.nan) / max(len(chunk), 1)) for chunk, (_, notes) in parts]
+    )
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import numpy as np
@@ -33,8 +34,8 @@ class StudyWork:
         >>> from samplers.execution.executors.chunks import Chunk
         >>> work = StudyWork(prepare(Question(env_id="rare_envs/CarFollowing-v0")))
         >>> f, notes = work(Chunk("f", (np.array([[20.0, 15.0, 30.0]]),)))
-        >>> f.round(2), notes
-        (array([6.]), {'reasons': [], 'n_retried': 0})
+        >>> f.round(2), notes["reasons"], notes["n_retried"]
+        (array([6.]), [], 0)
     """
 
     def __init__(self, study: Study) -> None:
@@ -51,15 +52,15 @@ class StudyWork:
             EgoFault: If the ego failed twice on a row and on_error is "raise".
             EgoGone: If the ego cannot be queried any more.
         """
-        tolerant = FaultTolerant(self.problem, self._on_error)
+        tolerant, start = FaultTolerant(self.problem, self._on_error), time.perf_counter()
         if chunk.kind == "f":
-            return tolerant.evaluate(chunk.x), _note(tolerant)
+            return tolerant.evaluate(chunk.x), _note(tolerant, start)
         if chunk.kind == "terms":
             assert tolerant.terms is not None
-            return pack_terms(tolerant.terms(chunk.x, self.gamma), _note(tolerant))
+            return pack_terms(tolerant.terms(chunk.x, self.gamma), _note(tolerant, start))
         assert tolerant.gradient is not None
         gradients = tolerant.gradient(*chunk.arrays, self.gamma)
-        return pack_gradients(gradients, _note(tolerant))
+        return pack_gradients(gradients, _note(tolerant, start))
 
     def digest(self, chunk: Chunk) -> str:
         """Return the name of a chunk in the journal; scenarios are simulated in single precision."""
@@ -106,6 +107,7 @@ class StudyWork:
         self.problem = build_problem(question, ego)
 
 
-def _note(tolerant: FaultTolerant) -> dict[str, Any]:
-    """Return notes on the faults that were met."""
-    return {"reasons": [fault.reason for fault in tolerant.faults], "n_retried": tolerant.n_retried}
+def _note(tolerant: FaultTolerant, start: float) -> dict[str, Any]:
+    """Return notes on the faults that were met, and on the time since the start."""
+    reasons = [fault.reason for fault in tolerant.faults]
+    return {"reasons": reasons, "n_retried": tolerant.n_retried, "seconds": time.perf_counter() - start}

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from rare_envs.files import replace_text
+from rare_envs.json_text import format_json
 from rare_envs.scenarios.registry import env_id_of, scenario_named
 from rare_envs.study.collision_rate import find_frequency
 from rare_envs.study.errors import BadInput, as_bad_input
@@ -18,7 +19,7 @@ from rare_envs.study.evaluate import run, run_into
 from rare_envs.study.question import Question, Study, prepare
 from rare_envs.study.rates.result import Risk, ScenarioRisk
 from rare_envs.study.rates.sites import check_sites, choose_base, compare_sites
-from rare_envs.study.run_directory import check_no_results, format_json
+from rare_envs.study.run_directory import check_no_results
 
 SCENARIO_SET = ("cut_in", "hard_brake")
 """Scenarios that count nothing twice."""

@@ -8,9 +8,10 @@ import pytest
 import torch
 
 import rare_envs
-from rare_envs.envs.rendering import AGENT, FRAME_WIDTH, ROLE_COLOURS, TEXT_HEIGHT, Renderer, caption
+from rare_envs.envs.rendering import AGENT, FRAME_WIDTH, TEXT_HEIGHT, Renderer, caption
 from rare_envs.make import set_up
 from rare_envs.scenarios.registry import SCENARIOS
+from rare_envs.traffic.palette import CRASH_COLOUR, ROLE_COLOURS, as_rgb
 
 every = pytest.mark.parametrize("env_id", rare_envs.ENV_IDS)
 CUT_IN = "rare_envs/CutIn-v0"
@@ -33,7 +34,7 @@ def test_every_vehicle_has_the_colour_of_its_role(env_id):
     height = max(160, 16 * round((scenario.road.lanes * scenario.road.width + 8) / 2))
     assert (image.shape, image.dtype) == ((height + 2 * TEXT_HEIGHT, FRAME_WIDTH, 3), np.uint8)
     roles = {name if name in ROLE_COLOURS else "others" for name in scenario.vehicle_names}
-    assert {ROLE_COLOURS[role] for role in roles} <= colours(road_of(image))
+    assert {as_rgb(ROLE_COLOURS[role]) for role in roles} <= colours(road_of(image))
     assert colours(image[:TEXT_HEIGHT]) > {(255, 255, 255)}  # text
     env.close()
 
@@ -50,12 +51,10 @@ def test_the_picture_shows_where_vehicles_are_and_who_has_crashed():
     for j, role in enumerate(("ego", "cutter", "lead")):
         ahead = float(episode.state.x[0, j] - episode.state.x[0, 0])
         across = float(episode.state.y[0, j]) - world.scenario.road.middle
-        assert tuple(image[round(80 + 8 * across), round(240 + 8 * ahead)]) == ROLE_COLOURS[role]
+        assert tuple(image[round(80 + 8 * across), round(240 + 8 * ahead)]) == as_rgb(ROLE_COLOURS[role])
     crashed = colours(road_of(renderer.draw(episode, row=1)))
-    assert ROLE_COLOURS["crashed"] in crashed
-    assert ROLE_COLOURS["ego"] not in crashed
-    assert ROLE_COLOURS["cutter"] not in crashed  # which it ran into
-    assert ROLE_COLOURS["lead"] in crashed
+    assert as_rgb(CRASH_COLOUR) in crashed and as_rgb(CRASH_COLOUR) not in colours(image)
+    assert {as_rgb(ROLE_COLOURS[role]) for role in ("ego", "lead")} <= crashed  # each is still who it is
 
 
 def test_agents_are_outlined():

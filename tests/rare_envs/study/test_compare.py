@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from rare_envs.study.run_directory import read_failures
+from rare_envs.study.storage.failure_table import read_failures
 
 FOLLOWING = "rare_envs/CarFollowing-v0"
 

@@ -15,7 +15,8 @@ from rare_envs.control.idm import IDM
 from rare_envs.study.crash_kinds import classify_failures
 from rare_envs.study.question import Question, Study
 from rare_envs.study.report import Report
-from rare_envs.study.run_directory import CRASH, read_failures, write_run
+from rare_envs.study.run_directory import write_run
+from rare_envs.study.storage.failure_table import CRASH, read_failures
 
 CUT_IN = "rare_envs/CutIn-v0"
 

@@ -99,7 +99,7 @@ def test_the_answer_is_that_of_an_undisturbed_run(method: str, after: int, again
         BadInput, match=r"No ego at tcp://here\. [\d,]+ simulations are kept; go on with: rare-envs resume"
     ):
         evaluate.run_into(frail / "run", prepare(asked))
-    assert [path.name for path in (frail / "run").iterdir()] == [JOURNAL]
+    assert sorted(path.name for path in (frail / "run").iterdir()) == [JOURNAL, "study.json"]
     kept, about = continue_journal(frail / "run")
     assert about.method == method
     kept.close()
@@ -288,7 +288,7 @@ def test_a_finished_run_is_replaced_by_force_alone_and_never_replayed_for_a_new_
     new = replace(question(risky, "mc"), seed=8)
     with pytest.raises(BadInput, match="are kept"):
         evaluate.run_into(frail / "run", prepare(new), force=True)
-    assert [path.name for path in (frail / "run").iterdir()] == [JOURNAL]
+    assert sorted(path.name for path in (frail / "run").iterdir()) == [JOURNAL, "study.json"]
     assert_refused(cli("replay", "run"), "is not finished: rare-envs resume run comes first")
     evaluate.resume(frail / "run")
     evaluate.run_into(frail / "new", prepare(new))

@@ -8,12 +8,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import pytest
 from matplotlib.image import imread
 from typer.testing import Result
 
 import rare_envs
-from rare_envs.study.run_directory import CRASH, read_failures
 
 Cli = Callable[..., Result]
 
@@ -26,7 +24,14 @@ def test_the_run_folder_holds_numbers_failures_and_a_picture(cli: Cli, risky: st
     out = tmp_path / "runs" / "one"
     result = cli(*SMALL, "--base", risky, "--out", out, "--json")
     assert result.exit_code == 0
-    assert sorted(path.name for path in out.iterdir()) == ["failures.csv", "plot.png", "result.json", "severity.png"]
+    assert sorted(path.name for path in out.iterdir()) == [
+        "episodes.parquet",
+        "failures.csv",
+        "plot.png",
+        "result.json",
+        "severity.png",
+        "study.json",
+    ]
     assert json.loads((out / "result.json").read_text()) == json.loads(result.stdout)
 
     with (out / "failures.csv").open(newline="") as file:
@@ -43,16 +48,3 @@ def test_the_run_folder_holds_numbers_failures_and_a_picture(cli: Cli, risky: st
     for part in np.array_split(picture, 3, axis=1):  # each of the three drawings has ink and colour
         assert 0.01 < np.mean(part.min(axis=2) < 0.9) < 0.6
         assert np.mean(np.ptp(part, axis=2) > 0.2) > 0.001
-
-
-def test_a_short_table_needs_no_second_file(cli: Cli, risky: str, tmp_path: Path) -> None:
-    (tmp_path / "failures.npz").write_bytes(b"of an earlier run in this folder")
-    cli("estimate", FOLLOWING, "--base", risky, "--method", "mc", "--max-sim", 2000, "--out", tmp_path)
-    assert not (tmp_path / "failures.npz").exists()
-    found = read_failures(tmp_path)
-    assert list(found) == ["ego_speed", "lead_speed", "gap", "f", "log_p0", *CRASH]
-    problem = rare_envs.DrivingProblem(FOLLOWING, base=risky)
-    x = np.column_stack([found[name] for name in problem.space.names])
-    np.testing.assert_array_equal(problem.evaluate(x), found["f"])
-    with pytest.raises(FileNotFoundError):
-        read_failures(tmp_path / "nowhere")

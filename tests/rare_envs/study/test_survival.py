@@ -18,11 +18,13 @@ import numpy as np
 import pytest
 from typer.testing import Result
 
+import rare_envs
 from rare_envs.problem import DrivingProblem
 from rare_envs.study import evaluate, run_directory
 from rare_envs.study.errors import BadInput
 from rare_envs.study.journal import JOURNAL, continue_journal
 from rare_envs.study.question import Question, prepare
+from rare_envs.study.storage.names import RESULT_FILES
 from samplers.execution.record_file import RecordFile
 from tests.rare_envs.study.refusals import FOLLOWING, SMALL, assert_refused
 
@@ -67,6 +69,11 @@ def answer(folder: Path) -> dict[str, Any]:
 def tables_of(folder: Path) -> list[str]:
     """Return the names of the files of a folder that are no pictures."""
     return sorted(path.name for path in folder.iterdir() if path.suffix != ".png")
+
+
+def episodes_of(folder: Path) -> Any:
+    """Return the table of all simulations but for their times."""
+    return rare_envs.load_study(folder).episodes().drop(["seconds"])
 
 
 def start(folder: Path, *words: str, **environment: str) -> subprocess.Popen[str]:
@@ -126,25 +133,27 @@ def test_killed_at_random_times_it_gives_the_same_files(tmp_path: Path, risky: s
         if has_simulations(run):
             words = ["resume", "run"]
     finish(tmp_path, *words)
-    assert tables_of(run) == ["failures.csv", "result.json"]
+    assert tables_of(run) == ["episodes.parquet", "failures.csv", "result.json", "study.json"]
     assert answer(run) == answer(tmp_path / "whole")
     assert (run / "failures.csv").read_bytes() == (tmp_path / "whole" / "failures.csv").read_bytes()
+    assert episodes_of(run).equals(episodes_of(tmp_path / "whole"))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kill_at", [1, 2, 3, 4, 5, 6])
+@pytest.mark.parametrize("kill_at", [1, 2, 3, 4, 5, 6, 8, 10, 12])
 def test_killed_in_the_final_writes_it_gives_the_same_files(kill_at: int, tmp_path: Path, risky: str) -> None:
     words = ["estimate", FOLLOWING, "--base", risky, *WORDS, "--out"]
     finish(tmp_path, *words, "whole")
-    process = start(tmp_path, *words, "run", KILL_AT=str(kill_at + len(run_directory.RESULT_FILES)))  # removed at first
+    process = start(tmp_path, *words, "run", KILL_AT=str(kill_at + len(RESULT_FILES) + 2))  # study.json
     process.communicate()
     if process.returncode == -signal.SIGKILL:
         assert (tmp_path / "run" / JOURNAL).exists()
         finish(tmp_path, "resume", "run")
     run = tmp_path / "run"
-    assert tables_of(run) == ["failures.csv", "result.json"]
+    assert tables_of(run) == ["episodes.parquet", "failures.csv", "result.json", "study.json"]
     assert answer(run) == answer(tmp_path / "whole")
     assert (run / "failures.csv").read_bytes() == (tmp_path / "whole" / "failures.csv").read_bytes()
+    assert episodes_of(run).equals(episodes_of(tmp_path / "whole"))
 
 
 @pytest.mark.parametrize(
@@ -165,7 +174,7 @@ def test_a_signal_is_one_line_and_what_is_known(name: str, tmp_path: Path, risky
     assert "Traceback" not in said
     assert said.splitlines()[-1] == f"rare-envs: stopped by {name}"
     assert "simulations are kept; go on with: rare-envs resume run" in said
-    assert [path.name for path in (tmp_path / "run").iterdir()] == [JOURNAL]
+    assert sorted(path.name for path in (tmp_path / "run").iterdir()) == [JOURNAL, "study.json"]
 
 
 def test_without_out_an_interrupted_run_prints_what_it_knows(
@@ -259,5 +268,5 @@ def test_an_ego_that_changes_the_working_directory(here: Path, risky: str, no_pi
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(DrivingProblem, "attempt", moving)
         evaluate.run_into(Path("run"), study)
-    assert tables_of(here / "run") == ["failures.csv", "result.json"]
+    assert tables_of(here / "run") == ["episodes.parquet", "failures.csv", "result.json", "study.json"]
     assert not list((here / "elsewhere").iterdir())

@@ -9,7 +9,7 @@ from PIL import Image
 import rare_envs
 from rare_envs.study.errors import BadInput
 from rare_envs.study.replay import drive_again
-from rare_envs.study.run_directory import read_failures
+from rare_envs.study.storage.failure_table import read_failures
 from rare_envs.study.video import (
     CURVES_HEIGHT,
     LAST_FRAME_TICKS,

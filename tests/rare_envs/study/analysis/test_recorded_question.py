@@ -17,7 +17,7 @@ from rare_envs.study.analysis.recorded_question import list_code, open_question
 from rare_envs.study.errors import BadInput
 from rare_envs.study.evaluate import resume
 from rare_envs.study.journal import begin_journal
-from rare_envs.study.run_directory import BLOCKS, FAILURES, RESULT
+from rare_envs.study.storage.names import BLOCKS, FAILURES, RESULT
 from rare_envs.study.video import find_failure
 
 FOLLOWING = "rare_envs/CarFollowing-v0"

@@ -42,7 +42,7 @@ def test_sent_it_does_what_it_did(kind: str, faulty: Path) -> None:
     numbers, notes = work(chunk)
     again, further = pickle.loads(pickle.dumps(work))(chunk)
     np.testing.assert_array_equal(again, numbers)
-    assert further == notes
+    assert {**further, "seconds": 0.0} == {**notes, "seconds": 0.0}
     lost = int(np.isnan(numbers[: len(chunk)]).sum())
     assert len(notes["reasons"]) == lost > 0
 

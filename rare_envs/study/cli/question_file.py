@@ -1,0 +1,102 @@
+"""Question of `rare-envs estimate` as a YAML file: one key for each option, by its name."""
+
+from __future__ import annotations
+
+import reprlib
+from collections.abc import Mapping
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from rare_envs.plugins import did_you_mean
+from rare_envs.study.errors import BadInput
+from rare_envs.study.question import Question, read_question
+
+MAX_QUESTION_BYTES = 2**20
+ENV_KEY = "env"
+"""Key of the environment; the others are the options of `rare-envs estimate`, with - or _ between words."""
+NOT_IN_FILES = ("trust",)
+"""Whoever asks decides whether code runs, not a file."""
+
+
+def read_question_file(path: Path) -> dict[str, Any]:
+    r"""Return the fields of `Question` that a file gives.
+
+    Args:
+        path: Of a YAML file, which may be JSON.
+
+    Raises:
+        BadInput: It cannot be read, or has unknown keys or values of a wrong type.
+
+    Example:
+        >>> from tempfile import TemporaryDirectory
+        >>> with TemporaryDirectory() as folder:
+        ...     path = Path(folder) / "study.yaml"
+        ...     _ = path.write_text("env: rare_envs/CutIn-v0\nmax-sim: 3000\nnoise: off\n")
+        ...     read_question_file(path)
+        {'env_id': 'rare_envs/CutIn-v0', 'max_sim': 3000, 'noise': False}
+    """
+    given = _load_mapping(path)
+    named = {"env_id" if key == ENV_KEY else key.replace("-", "_"): value for key, value in given.items()}
+    known = [field.name for field in fields(Question) if field.name not in NOT_IN_FILES]
+    for key in given:
+        name = "env_id" if key == ENV_KEY else key.replace("-", "_")
+        if name in NOT_IN_FILES:
+            raise BadInput(f"{str(path)!r} cannot say {key}: give --{key} on the command line.")
+        if name not in known:
+            names = [ENV_KEY if each == "env_id" else each for each in known]
+            hint = did_you_mean(key.replace("-", "_"), names)
+            raise BadInput(f"{str(path)!r} has an unknown key {key!r}{hint}. It may have: {', '.join(names)}.")
+    if len(named) < len(given):
+        raise BadInput(f"{str(path)!r} gives the same option twice.")
+    try:
+        read_question({"env_id": "", **named})
+    except BadInput as error:
+        raise BadInput(f"{str(path)!r}: {str(error).replace(' of the recorded question', '')}") from error
+    return named
+
+
+def join_question(given: Mapping[str, Any], env: str | None, options: Mapping[str, Any], typed: set[str]) -> Question:
+    """Return the question of a file and a command line.
+
+    Args:
+        given: Fields that the file gives.
+        env: Environment on the command line, if there is one.
+        options: All options, with their defaults.
+        typed: Names of those that were typed; they come before the file.
+
+    Raises:
+        BadInput: Neither names an environment.
+
+    Example:
+        >>> question = join_question({"env_id": "a", "seed": 5, "gamma": 1.0}, None, {"seed": 7, "gamma": 0}, {"seed"})
+        >>> question.env_id, question.seed, question.gamma
+        ('a', 7, 1.0)
+    """
+    named = {**options, **given, **{name: value for name, value in options.items() if name in typed}}
+    if env is not None:
+        named["env_id"] = env
+    if "env_id" not in named:
+        raise BadInput(f"Expected an environment: rare-envs estimate ENV, or {ENV_KEY}: ENV in the file of --config.")
+    return Question(**named)
+
+
+def _load_mapping(path: Path) -> dict[str, Any]:
+    """Return what a YAML file holds, with words as keys.
+
+    Raises:
+        BadInput: It cannot be read, or is no mapping.
+    """
+    try:
+        if path.stat().st_size > MAX_QUESTION_BYTES:
+            raise BadInput(f"{str(path)!r} has more than {MAX_QUESTION_BYTES:,} bytes.")
+        given = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise BadInput(f"Cannot read {str(path)!r}: {error.strerror}.") from error
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise BadInput(f"{str(path)!r} is no YAML: {error}") from error
+    if not isinstance(given, dict) or not all(isinstance(key, str) for key in given):
+        raise BadInput(f"Expected {str(path)!r} to have lines like gamma: 0.0, got {reprlib.repr(given)}.")
+    return given

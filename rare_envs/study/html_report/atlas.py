@@ -1,0 +1,185 @@
+"""Failure atlas: each mode of failure with its most likely failure driven again, from above and over time."""
+
+from __future__ import annotations
+
+import base64
+import io
+import shlex
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from PIL import Image
+
+from rare_envs.egos.errors import EgoGone, reason_of
+from rare_envs.envs.rendering import FRAME_WIDTH
+from rare_envs.problem import DrivingProblem
+from rare_envs.study.columns import format_value, list_columns
+from rare_envs.study.html_report.recorded_events import NearestEvent, find_nearest_event
+from rare_envs.study.html_report.svg import FigureOfPage
+from rare_envs.study.html_report.wording import describe_kind, format_probability, name_measure
+from rare_envs.study.plots import HIT_COLOUR, LAST_SECONDS, MOMENTS, draw_moment, draw_speeds
+from rare_envs.study.replay import Drive, drive_again
+from rare_envs.study.video import draw_frames, join_parameters, save_gif
+from samplers.problem import FloatArray
+
+MOST_MODES = 8
+"""Modes that are shown with pictures; the others have a row in the table."""
+CLIP_WIDTH, CLIP_EVERY = 560, 2
+"""Width of a clip [pixels], and of how many ticks it shows one."""
+CLIP_SECONDS = 5.0
+"""Seconds of a clip, the last ones up to the end of the drive."""
+
+
+@dataclass(frozen=True)
+class AtlasEntry:
+    """A mode of failure as the page shows it."""
+
+    number: int
+    title: str
+    share: str
+    facts: list[tuple[str, str]]
+    """Names and values."""
+    parameters: list[tuple[str, str, str, str]]
+    """Name, value at the failure, where nine of ten ordinary scenarios lie, and value of the nearest event."""
+    clip: str
+    """Moving picture as a data URI; "" if there is none."""
+    figures: list[FigureOfPage]
+    missing: str
+    """Why there are no pictures; "" if there are."""
+
+
+@dataclass(frozen=True)
+class AtlasSource:
+    """What the atlas of a run is made from."""
+
+    folder: Path
+    problem: DrivingProblem
+    failures: Mapping[str, Any]
+    """Of failures.csv."""
+    ordinary: FloatArray
+    """Draws of the base distribution, shape (n, d)."""
+    events: FloatArray | None
+    """Recorded events, columns of x that are shown, shape (m, k); None without recordings."""
+
+
+def build_atlas(source: AtlasSource, modes: list[dict[str, Any]]) -> list[AtlasEntry]:
+    """Return the entries of the largest modes."""
+    return [_build_entry(source, number, mode) for number, mode in enumerate(modes[:MOST_MODES], 1)]
+
+
+def _build_entry(source: AtlasSource, number: int, mode: Mapping[str, Any]) -> AtlasEntry:
+    crash, failure = str(mode.get("crash", "")), mode.get("failure")
+    low, high = mode["interval"]
+    share = (
+        f"{100 * float(mode['of_failures']):.3g} % of p: {format_probability(mode['p'])} "
+        f"({format_probability(low, mode['p'])} to {format_probability(high, mode['p'])})"
+    )
+    title = f"Mode {number}: {describe_kind(crash)}"
+    if failure is None:
+        return AtlasEntry(number, title, share, [], [], "", [], "none of its failures is in failures.csv")
+    x = join_parameters(dict(source.failures), source.problem, int(failure))
+    nearest = _find_nearest(source, x)
+    parameters = _list_parameters(source, x, nearest)
+    facts = _list_facts(source, int(failure), nearest)
+    try:
+        drive = drive_again(source.problem, x)
+        figures, clip = _draw_drive(drive, number), encode_clip(drive)
+    except (Exception, SystemExit, EgoGone) as error:  # the ego is the user's, and need not do again what it did before
+        return AtlasEntry(number, title, share, facts, parameters, "", [], f"it cannot be shown: {reason_of(error)}")
+    return AtlasEntry(number, title, share, _describe_crash(drive) + facts, parameters, clip, figures, "")
+
+
+def _list_facts(source: AtlasSource, failure: int, nearest: NearestEvent | None) -> list[tuple[str, str]]:
+    facts = [
+        ("f", f"{float(source.failures['f'][failure]):.4g}"),
+        (
+            "replay",
+            f"rare-envs replay {shlex.quote(str(source.folder))} --failure {failure} --out failure_{failure}.gif",
+        ),
+    ]
+    if nearest is not None:
+        text = f"{nearest.distance:.2g} standard deviations per parameter away"
+        facts.insert(
+            1, ("nearest recorded", f"{text}; {100 * nearest.rarer:.2g} % of ordinary scenarios are as far from theirs")
+        )
+    return facts
+
+
+def _describe_crash(drive: Drive) -> list[tuple[str, str]]:
+    """Return who ran into whom, how fast, and what it did."""
+    crash = drive.crash
+    if crash is None:
+        return [("end", f"no crash; the worst moment is at {drive.time[drive.worst]:.1f} s")]
+    who, whom = ("the edge of the road" if j < 0 else drive.names[j] for j in crash["vehicles"])
+    return [
+        ("crash", f"{who} into {whom} after {drive.time[-1]:.1f} s, closing at {crash['closing_speed']:.1f} m/s"),
+        ("delta-v", f"{max(crash['delta_v']):.2g} m/s"),
+        ("serious injury (MAIS 3+)", f"{100 * max(crash['injury_risk']):.2g} %"),
+    ]
+
+
+def _list_parameters(
+    source: AtlasSource, x: FloatArray, nearest: NearestEvent | None
+) -> list[tuple[str, str, str, str]]:
+    low, high = np.quantile(source.ordinary, (0.05, 0.95), axis=0)
+    rows, shown = [], 0
+    for j, column in enumerate(list_columns(source.problem.space)):
+        if column.shown:
+            event = "" if nearest is None else format_value(nearest.values[shown])
+            shown += 1
+            usual = f"{format_value(low[j])} to {format_value(high[j])}"
+            rows.append((column.label, format_value(x[j]), usual, event))
+    return rows
+
+
+def _find_nearest(source: AtlasSource, x: FloatArray) -> NearestEvent | None:
+    if source.events is None:
+        return None
+    shown = [column.shown for column in list_columns(source.problem.space)]
+    return find_nearest_event(x[shown], source.events, source.ordinary[:, shown])
+
+
+def _draw_drive(drive: Drive, number: int) -> list[FigureOfPage]:
+    """Return the figures of a drive: from above, the measure, and speeds."""
+    first = int(np.argmin(np.abs(drive.time - (drive.time[drive.worst] - LAST_SECONDS))))
+    moments = np.linspace(first, drive.worst, MOMENTS).round().astype(int)
+
+    def draw_views(figure: Figure) -> None:
+        for axes, t in zip(figure.subplots(MOMENTS, 1), moments, strict=True):
+            draw_moment(axes, drive, int(t))
+
+    road = drive.road
+    height = 0.25 + MOMENTS * max(0.6, 0.045 * road.lanes * road.width)
+    return [
+        FigureOfPage(f"mode{number}-views", "From above; the ego is green", draw_views, (6.4, height)),
+        FigureOfPage(f"mode{number}-measure", "The measure over time", lambda f: _draw_measure(f, drive), (6.4, 2.2)),
+        FigureOfPage(
+            f"mode{number}-speeds", "Speeds and gap over time", lambda f: draw_speeds(f.subplots(), drive), (6.4, 2.8)
+        ),
+    ]
+
+
+def _draw_measure(figure: Figure, drive: Drive) -> None:
+    axes = figure.subplots()
+    measure = drive.problem.world.measurement.measure
+    axes.plot(drive.time, drive.f_alone, color="#777777", linewidth=1, label="this moment")
+    axes.step(drive.time, drive.f_so_far, where="post", color="black", linewidth=1.5, label="f so far")
+    axes.axvline(drive.time[drive.worst], color=HIT_COLOUR, linewidth=1, label="worst moment")
+    axes.set_xlabel("time [s]")
+    axes.set_ylabel(name_measure(measure if isinstance(measure, str) else ""))
+    axes.legend(frameon=False, fontsize=8)
+
+
+def encode_clip(drive: Drive) -> str:
+    """Return the last seconds of a drive as a data URI."""
+    frames = draw_frames(drive)
+    dt = drive.problem.world.clock.dt
+    frames = frames[-max(round(CLIP_SECONDS / dt), 2) :]
+    size = (CLIP_WIDTH, round(frames[0].height * CLIP_WIDTH / FRAME_WIDTH))
+    buffer = io.BytesIO()
+    save_gif(buffer, [frame.resize(size, Image.Resampling.LANCZOS) for frame in frames], dt, CLIP_EVERY)
+    return f"data:image/gif;base64,{base64.b64encode(buffer.getvalue()).decode()}"

@@ -1,0 +1,189 @@
+"""Figures of the report that come from the files of a run alone."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from rare_envs.study.html_report.svg import FigureOfPage
+from rare_envs.study.html_report.wording import Result
+from rare_envs.study.plots import HIT_COLOUR, LINE_COLOUR, ORDINARY_COLOUR
+from samplers.problem import FloatArray
+
+TWO_PANELS_SIZE, PANEL_SIZE = (7.2, 3.2), (5.4, 3.2)
+"""Sizes of figures [inch]."""
+MAX_HISTOGRAMS = 12
+"""Parameters that are shown, those that failures shift most."""
+
+
+def draw_estimate_over_simulations(figure: Figure, result: Result) -> None:
+    """Draw the estimate over the simulations spent, each replicate by itself, and the result with its interval."""
+    axes = figure.subplots()
+    trace = result.get("trace") or []
+    for run in sorted({level["run"] for level in trace}):
+        levels = [level for level in trace if level["run"] == run]
+        spent = np.cumsum([level["n_sim"] for level in levels])
+        values = [_positive(level["estimate"]) for level in levels]
+        axes.plot(spent, values, "o-", color=LINE_COLOUR, markersize=4, label="on the way" if run == 0 else None)
+    low, high = result["interval"]
+    axes.axhspan(max(low, 1e-300), high, color=HIT_COLOUR, alpha=0.15, linewidth=0, label="interval of the sampling")
+    if result["p"] > 0:
+        axes.axhline(result["p"], color=HIT_COLOUR, linewidth=1.2, label="result")
+    seen = [level["estimate"] for level in trace if level["estimate"]]
+    _log_scale(axes, [value for value in (low, high, result["p"], *seen) if value > 0])
+    axes.set_xlim(left=0)
+    axes.set_xlabel("simulations")
+    axes.set_ylabel("P[f ≤ threshold of the level]")
+    axes.legend(frameon=False, fontsize=8)
+
+
+def draw_levels(figure: Figure, result: Result) -> None:
+    """Draw the share of each level's points below its threshold, and the threshold, where that changes."""
+    panels = figure.subplots(1, 2 if _passes_levels(result) else 1, squeeze=False)[0]
+    shares = panels[0]
+    trace = [level for level in result.get("trace") or [] if level["run"] == 0]
+    numbers = range(len(trace))
+    shares.bar(numbers, [level["p"] or 0.0 for level in trace], color=LINE_COLOUR)
+    shares.set_ylabel("share of the level's points with f ≤ threshold")
+    shares.set_ylim(0, 1)
+    for thresholds in panels[1:]:
+        gammas = [np.nan if level["gamma"] is None else level["gamma"] for level in trace]
+        thresholds.plot(numbers, gammas, "o-", color=LINE_COLOUR, markersize=4)
+        thresholds.axhline(float(result["gamma"]), color=HIT_COLOUR, linewidth=1, label="gamma")
+        thresholds.set_ylabel("threshold of f")
+        thresholds.legend(frameon=False, fontsize=8)
+    for axes in panels:
+        axes.set_xlabel("level, iteration or batch")
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+
+
+def draw_weights(figure: Figure, log_weights: FloatArray, p: float) -> None:
+    """Draw how much of p each failing simulation carries: a histogram, and p by the heaviest of them.
+
+    Args:
+        figure: To draw into.
+        log_weights: Of the failing simulations, shape (k,).
+        p: Their sum.
+    """
+    histogram, share = figure.subplots(1, 2)
+    parts = np.sort(np.exp(log_weights) / p)[::-1]
+    shown = np.log10(parts[parts > 0])
+    histogram.hist(shown, bins=min(40, max(5, len(shown) // 5)) if np.ptp(shown) > 0 else 1, color=LINE_COLOUR)
+    histogram.set_xlabel("share of p in one simulation, log10")
+    histogram.set_ylabel("failing simulations")
+    share.plot(np.arange(1, len(parts) + 1), 100 * np.cumsum(parts), color=LINE_COLOUR)
+    share.set_xlabel("heaviest failing simulations")
+    share.set_ylabel("share of p [%]")
+    share.set_ylim(0, 103)
+    share.set_xlim(left=0)
+
+
+def draw_curve(figure: Figure, curve: Mapping[str, Any], gamma: float, measure: str) -> None:
+    """Draw p over the threshold with its simultaneous band."""
+    axes = figure.subplots()
+    g, p, low, high = (np.array(curve[name], dtype=float) for name in ("gammas", "p", "low", "high"))
+    floor = p[p > 0].min(initial=1.0) / 10
+    percent = 100 * float(curve["confidence"])
+    band = f"{percent:g} % band, for all thresholds together"
+    axes.fill_between(g, np.maximum(low, floor), high, color=LINE_COLOUR, alpha=0.2, linewidth=0, label=band)
+    axes.plot(g, p, color=LINE_COLOUR, label="P[f ≤ threshold]")
+    axes.axvline(gamma, color=HIT_COLOUR, linewidth=1, label="gamma")
+    axes.set_yscale("log")
+    axes.set_xlabel(f"threshold of f{f', {measure}' if measure else ''}")
+    axes.set_ylabel("P[f ≤ threshold]")
+    axes.legend(frameon=False, fontsize=8)
+
+
+def draw_parameters(
+    figure: Figure, ordinary: FloatArray, failing: FloatArray, weights: FloatArray, labels: list[str]
+) -> None:
+    """Draw each parameter in ordinary traffic and among failures.
+
+    Args:
+        figure: To draw into.
+        ordinary: Draws of the base distribution, shape (n, k).
+        failing: Failures, shape (m, k).
+        weights: Of the failures, shape (m,).
+        labels: Name and unit of each, length k.
+    """
+    rows = math.ceil(len(labels) / 3)
+    panels = np.atleast_1d(figure.subplots(rows, min(3, len(labels)), squeeze=False)).ravel()
+    for j, axes in enumerate(panels):
+        if j >= len(labels):
+            axes.set_axis_off()
+            continue
+        both = np.concatenate([ordinary[:, j], failing[:, j]])
+        low, high = (float(end) for end in np.quantile(both, [0.002, 0.998]))
+        bins = np.linspace(low, high, 30) if high > low else np.array([low - 0.5, low + 0.5])
+        usual: dict[str, Any] = {"color": ORDINARY_COLOUR, "label": "ordinary traffic"}
+        failures: dict[str, Any] = {"color": HIT_COLOUR, "label": "failures", "histtype": "step", "linewidth": 1.5}
+        axes.hist(ordinary[:, j], bins=bins, density=True, **usual)
+        axes.hist(failing[:, j], bins=bins, density=True, weights=weights, **failures)
+        axes.set_xlabel(labels[j])
+        axes.set_yticks([])
+        axes.set_ylabel("density")
+    panels[0].legend(frameon=False, fontsize=8)
+
+
+def draw_severity(figure: Figure, severity: Mapping[str, Any]) -> None:
+    """Draw P[collision with a larger delta-v] with its band."""
+    curve = severity["curve"]
+    v, p, low, high = (np.array(curve[name], dtype=float) for name in ("delta_v", "p", "low", "high"))
+    axes = figure.subplots()
+    floor = p[p > 0].min(initial=1.0) / 10
+    axes.fill_between(v, np.maximum(low, floor), np.maximum(high, floor), color=LINE_COLOUR, alpha=0.2, linewidth=0)
+    axes.plot(v, np.where(p > 0, p, np.nan), color=LINE_COLOUR)
+    axes.set_yscale("log")
+    axes.set_xlabel("delta-v [m/s]")
+    axes.set_ylabel("P[collision with a larger delta-v]")
+
+
+def figures_of_result(result: Result, log_weights: FloatArray, measure: str) -> dict[str, FigureOfPage]:
+    """Return the figures that the numbers of a run allow, by name.
+
+    Args:
+        result: Of the run.
+        log_weights: Of its failing simulations, shape (k,); empty where they have none.
+        measure: What f is, with its unit.
+    """
+    way, levels = "The estimate on the way, and the result", "Levels of the run: shares and thresholds"
+    room = TWO_PANELS_SIZE if _passes_levels(result) else PANEL_SIZE
+    made = [
+        FigureOfPage("convergence", way, lambda f: draw_estimate_over_simulations(f, result), PANEL_SIZE),
+        FigureOfPage("levels", levels, lambda f: draw_levels(f, result), room),
+    ]
+    if len(log_weights):
+        p = float(np.exp(log_weights).sum())
+        caption = "Weights of the failing simulations"
+        made.append(FigureOfPage("weights", caption, lambda f: draw_weights(f, log_weights, p), TWO_PANELS_SIZE))
+    curve, severity = result.get("curve"), result.get("severity")
+    if isinstance(curve, dict):
+        gamma = float(result["gamma"])
+        caption = "Probability over the threshold, with its band"
+        made.append(FigureOfPage("curve", caption, lambda f: draw_curve(f, curve, gamma, measure), PANEL_SIZE))
+    if isinstance(severity, dict):
+        caption = "Severity of the collisions"
+        made.append(FigureOfPage("severity", caption, lambda f: draw_severity(f, severity), PANEL_SIZE))
+    return {figure.name: figure for figure in made}
+
+
+def _passes_levels(result: Result) -> bool:
+    """Return whether the run has thresholds other than gamma."""
+    return any(level["gamma"] != result["gamma"] for level in result.get("trace") or [])
+
+
+def _positive(value: float | None) -> float:
+    return value if value is not None and value > 0 else math.nan
+
+
+def _log_scale(axes: Axes, values: list[float]) -> None:
+    """Set a log scale, where there is anything to show on it."""
+    if values:
+        axes.set_yscale("log")
+        axes.set_ylim(min(values) / 1.6, max(values) * 1.6)

@@ -1,0 +1,172 @@
+"""Page: the report of a run, from its folder to one HTML file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import numpy as np
+
+from rare_envs.files import replace_text
+from rare_envs.study.analysis.recorded_question import open_question
+from rare_envs.study.analysis.repeatability import Repeatability
+from rare_envs.study.columns import list_columns
+from rare_envs.study.errors import BadInput, as_bad_input, output_folder
+from rare_envs.study.html_report.atlas import AtlasEntry, AtlasSource, build_atlas
+from rare_envs.study.html_report.figures import MAX_HISTOGRAMS, draw_parameters, figures_of_result
+from rare_envs.study.html_report.recorded_events import read_recorded_events
+from rare_envs.study.html_report.svg import FORMATS, FigureOfPage
+from rare_envs.study.html_report.wording import (
+    describe_intervals,
+    describe_kind,
+    describe_rate,
+    format_probability,
+    name_measure,
+    summarise_answer,
+)
+from rare_envs.study.journal import JOURNAL
+from rare_envs.study.plots import BACKGROUND_DRAWS
+from rare_envs.study.question import prepare
+from rare_envs.study.storage.loaded_study import LoadedStudy, load_study
+from rare_envs.study.storage.names import EPISODES, REPORT
+from rare_envs.traffic.palette import CRASH_COLOUR, ROLE_COLOURS
+from samplers.problem import FloatArray
+
+SECTIONS = ("warnings", "answer", "convergence", "levels", "weights", "curve", "parameters", "kinds", "atlas", "made")
+"""Ids of the sections of the page, in their order."""
+
+
+def write_html_report(
+    folder: Path, trust: bool = False, events: Path | None = None, out: Path | None = None, figures: str | None = None
+) -> list[Path]:
+    """Write the report of a finished run.
+
+    Args:
+        folder: Of the run.
+        trust: Let the ego's file run code, and code that a run from elsewhere names: failures are driven again.
+        events: CSV file of recorded events with a column for each parameter; None without.
+        out: The file; report.html in the folder by default.
+        figures: "svg", "pdf" or "png" for the figures as files too, in a folder `figures` beside the page.
+
+    Returns:
+        The files that were written, the page first.
+
+    Raises:
+        BadInput: There is no finished run, what it was about cannot be loaded any longer, or nothing can be written.
+    """
+    if figures is not None and figures not in FORMATS:
+        raise BadInput(f"Expected --figures {', '.join(FORMATS)}, got {figures!r}.")
+    if (folder / JOURNAL).exists():
+        raise BadInput(f"The run in {str(folder)!r} is not finished: rare-envs resume {folder} comes first.")
+    study = load_study(folder)
+    with as_bad_input(ValueError):
+        failures = study.failures
+    problem = prepare(open_question(study.question, folder, trust)).problem
+    columns = [column for column in list_columns(problem.space) if column.shown]
+    known = None if events is None else read_recorded_events(events, [column.name for column in columns])
+    ordinary = problem.space.sample(BACKGROUND_DRAWS, np.random.default_rng(0))
+    source = AtlasSource(folder, problem, failures, ordinary, known)
+    page = out or folder / REPORT
+    with as_bad_input(KeyError, TypeError, IndexError):  # a result.json of somebody else's making
+        atlas = build_atlas(source, list(study.result.get("modes") or []))
+        drawn = _make_figures(study, source)
+        text = render_page(study, drawn, atlas)
+    with as_bad_input(OSError):
+        replace_text(page, text)
+        saved = [] if figures is None else _save_figures(page.parent / "figures", figures, drawn, atlas)
+    return [page, *saved]
+
+
+def render_page(study: LoadedStudy, figures: Mapping[str, FigureOfPage], atlas: Sequence[AtlasEntry]) -> str:
+    """Return the page as text; everything that files say is escaped."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("rare_envs.study.html_report"),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    result = study.result
+    return environment.get_template("report.html.j2").render(
+        result=result,
+        about=study.about,
+        folder=str(study.folder),
+        summary=summarise_answer(result, str((study.about.get("base") or {}).get("name") or "its default base")),
+        doubts=list_doubts(result),
+        remarks=[*(result.get("remarks") or []), *(result.get("notes") or [])],
+        intervals=describe_intervals(result),
+        rate=describe_rate(result),
+        figures={name: figure.to_svg() for name, figure in figures.items()},
+        captions={name: figure.caption for name, figure in figures.items()},
+        atlas=atlas,
+        svgs={figure.name: figure.to_svg() for entry in atlas for figure in entry.figures},
+        kinds=[(describe_kind(kind), share) for kind, share in (result.get("kinds") or {}).items()],
+        probability=format_probability,
+        roles={**ROLE_COLOURS, "outline: crashed": CRASH_COLOUR},
+    )
+
+
+def list_doubts(result: Mapping[str, Any]) -> list[str]:
+    """Return all warnings of a run: of the method, of its base distribution, and of f as a function."""
+    doubts = [str(text) for text in result.get("warnings") or []]
+    base = result.get("base_uncertainty")
+    if isinstance(base, dict):
+        doubts += [f"base distribution: {text}" for text in base.get("warnings") or []]
+    again = result.get("repeatability")
+    if isinstance(again, dict):
+        warning = Repeatability(**again).warning
+        doubts += [warning] if warning else []
+    if result.get("doubtful") and not doubts:
+        doubts.append("the run had warnings that its result.json does not hold: see what the command printed")
+    return doubts
+
+
+def _make_figures(study: LoadedStudy, source: AtlasSource) -> dict[str, FigureOfPage]:
+    """Return the figures of the run by name."""
+    space = source.problem.space
+    shown = [j for j, column in enumerate(list_columns(space)) if column.shown]
+    columns = [list_columns(space)[j] for j in shown]
+    failing, log_weights = _read_failing(study, [column.name for column in columns])
+    known = log_weights[~np.isnan(log_weights)]
+    figures = figures_of_result(study.result, known, name_measure(str(study.question.get("measure", ""))))
+    ordinary = source.ordinary[:, shown]
+    if len(failing) and columns:
+        weighted = ~np.isnan(log_weights) if len(known) else np.ones(len(failing), dtype=bool)
+        weights = np.exp(log_weights[weighted]) if len(known) else np.ones(len(failing))
+        order = _rank_shifts(ordinary, failing[weighted], weights)[:MAX_HISTOGRAMS]
+        labels = [columns[j].label for j in order]
+        rows = -(-len(order) // 3)
+        figures["parameters"] = FigureOfPage(
+            "parameters",
+            "Parameters in ordinary traffic and among failures, the most shifted first",
+            lambda f: draw_parameters(f, ordinary[:, order], failing[weighted][:, order], weights, labels),
+            (8.0, 0.4 + 1.9 * rows),
+        )
+    return figures
+
+
+def _read_failing(study: LoadedStudy, names: list[str]) -> tuple[FloatArray, FloatArray]:
+    """Return the failing simulations, the columns asked for (k, m) and log weights (k,), NaN where there is none."""
+    if not (study.folder / EPISODES).exists():
+        table = [np.asarray(study.failures[name], dtype=float) for name in names if name in study.failures]
+        x = np.column_stack(table) if len(table) == len(names) else np.empty((0, len(names)))
+        return x, np.full(len(x), np.nan)
+    with as_bad_input(ValueError):
+        found = study.episodes([*names, "log_weight"], failed=True)
+    x = np.column_stack([found[name].to_numpy() for name in names]) if names else np.empty((found.num_rows, 0))
+    return x, found["log_weight"].to_numpy().astype(float)
+
+
+def _rank_shifts(ordinary: FloatArray, failing: FloatArray, weights: FloatArray) -> list[int]:
+    """Return the columns in which failures differ most from ordinary traffic, by |mean shift| / deviation."""
+    shift = np.average(failing, axis=0, weights=weights) - ordinary.mean(axis=0)
+    return [int(j) for j in np.argsort(-np.abs(shift) / np.maximum(ordinary.std(axis=0), 1e-12), kind="stable")]
+
+
+def _save_figures(
+    folder: Path, kind: str, figures: Mapping[str, FigureOfPage], atlas: Sequence[AtlasEntry]
+) -> list[Path]:
+    with output_folder(folder):
+        every = [*figures.values(), *(figure for entry in atlas for figure in entry.figures)]
+        return [figure.save(folder, kind) for figure in every]

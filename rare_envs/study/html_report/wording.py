@@ -1,0 +1,156 @@
+"""Numbers of a report in plain words."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from rare_envs.exposure import describe_human_contacts
+from rare_envs.measures import MEASURES
+from rare_envs.study.crash_kinds import KIND_DESCRIPTIONS
+from rare_envs.study.rates.text import format_interval, format_rate
+
+Result = Mapping[str, Any]
+
+
+def format_probability(p: float | None, like: float | None = None) -> str:
+    """Return a probability for people: as a percentage, or in powers of ten where it is small.
+
+    Args:
+        p: The probability.
+        like: Another one that stands beside it and decides on the form; itself by default.
+
+    Example:
+        >>> format_probability(0.0242), format_probability(3.1e-5), format_probability(0.0), format_probability(None)
+        ('2.4 %', '3.1 × 10⁻⁵', '0', 'not known')
+        >>> format_probability(0.00085, like=0.0012)
+        '0.085 %'
+    """
+    if p is None or not math.isfinite(p):
+        return "not known"
+    if p <= 0:
+        return "0"
+    if (p if like is None else like) >= 0.001:
+        return f"{100 * p:.2g} %"
+    mantissa, _, exponent = f"{p:.1e}".partition("e")
+    return f"{mantissa} × 10{str(int(exponent)).translate(str.maketrans('-0123456789', '⁻⁰¹²³⁴⁵⁶⁷⁸⁹'))}"
+
+
+def format_odds(p: float) -> str:
+    """Return a probability as one in so many.
+
+    Example:
+        >>> format_odds(0.0242), format_odds(0.3), format_odds(0.0)
+        ('about 1 in 41', 'about 30 in 100', 'none')
+    """
+    if p <= 0:
+        return "none"
+    if p > 0.1:
+        return f"about {100 * p:.0f} in 100"
+    n = 1 / p
+    return f"about 1 in {float(f'{n:.2g}'):,.0f}"
+
+
+def describe_event(result: Result) -> str:
+    """Return what is counted, in words.
+
+    Example:
+        >>> describe_event({"gamma": 0.0, "question": {"measure": "ttc"}})
+        'ends in a collision'
+        >>> describe_event({"gamma": 1.5, "question": {"measure": "ttc"}})
+        'comes to f ≤ 1.5, f being the least ttc'
+    """
+    question = result.get("question") or {}
+    measure, gamma = str(question.get("measure", "")), float(result.get("gamma", 0.0))
+    if measure == "ttc" and gamma == 0.0:
+        return "ends in a collision"
+    what = "the measure" if ":" in measure or not measure else f"the least {measure}"
+    return f"comes to f ≤ {gamma:g}, f being {what}"
+
+
+def summarise_answer(result: Result, base: str) -> str:
+    """Return the answer in a sentence, or two.
+
+    Example:
+        >>> question = {"env_id": "rare_envs/CutIn-v0", "ego": "idm", "measure": "ttc"}
+        >>> summarise_answer({"p": 0.0242, "gamma": 0.0, "question": question, "n_sim": 3000}, "us101")
+        'About 1 in 41 scenarios ends in a collision. Scenarios: rare_envs/CutIn-v0 with traffic as in us101.'
+    """
+    p = float(result["p"])
+    where = f"Scenarios: {(result.get('question') or {}).get('env_id')} with traffic as in {base}."
+    if p > 0:
+        return f"{format_odds(p).capitalize()} scenarios {describe_event(result)}. {where}"
+    percent, rare = f"{100 * float(result['confidence']):g} %", 1 / float(result["interval"][1])
+    n = int(result.get("n_sim", 0))
+    seen = (
+        f"None of {n:,} simulations {describe_event(result)}; with {percent} confidence fewer than 1 in {rare:,.0f} do."
+    )
+    return f"{seen} {where}"
+
+
+def describe_intervals(result: Result) -> list[tuple[str, str, str]]:
+    """Return the intervals of p: name, ends, and what each holds."""
+    percent, p = f"{100 * float(result['confidence']):g} %", float(result["p"])
+    low, high = (float(end) for end in result["interval"])
+    rows = [
+        (
+            f"{percent}, sampling",
+            f"{format_probability(low, p)} to {format_probability(high, p)}",
+            "error of a finite number of simulations; the model of traffic taken as true",
+        )
+    ]
+    base = result.get("base_uncertainty")
+    if isinstance(base, dict):
+        ends = base.get("interval") or [None, None]
+        text = (
+            f"{format_probability(ends[0], p)} to {format_probability(ends[1], p)}"
+            if ends[0] is not None
+            else "not determined"
+        )
+        rows.append(
+            (
+                f"{100 * float(base.get('confidence') or 0.95):g} %, base distribution",
+                text,
+                f"what the recorded events allow ({base.get('fitted_to', '')}); expected for the next event "
+                f"{format_probability(base.get('expected'), p)}",
+            )
+        )
+    return rows
+
+
+def describe_rate(result: Result) -> list[str]:
+    """Return collisions per distance and time, or why they are not known."""
+    rate = result.get("rate")
+    if not isinstance(rate, dict):
+        return [str(result.get("no_rate") or "no rate is known")]
+    lines = [
+        f"{format_rate(rate['per_million_km'])} collisions per million km "
+        f"({format_interval(tuple(rate['interval_per_million_km']))}), {format_rate(rate['per_hour'])} per hour "
+        f"({format_interval(tuple(rate['interval_per_hour']))})",
+        describe_human_contacts(),
+    ]
+    return lines
+
+
+def describe_kind(kind: str) -> str:
+    """Return a kind of crash in words.
+
+    Example:
+        >>> describe_kind("side"), describe_kind("")
+        ('flank against flank', 'kind of crash not known')
+    """
+    return KIND_DESCRIPTIONS.get(kind, kind or "kind of crash not known")
+
+
+def name_measure(name: str) -> str:
+    """Return a measure with the unit of f, for an axis.
+
+    Example:
+        >>> name_measure("ttc"), name_measure("mine:measure"), name_measure("stl:always (ttc > 2)")
+        ('ttc [s]', 'measure f', 'measure f')
+    """
+    measure = MEASURES.get(name)
+    if measure is None:
+        return "measure f"
+    return f"{name} [{measure.unit}]" if measure.unit else name

@@ -1,0 +1,158 @@
+"""LoadedStudy: the folder of a run, read without simulating: numbers, failures, and the table of simulations."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from numpy.typing import NDArray
+
+from rare_envs.json_text import parse_json_object
+from rare_envs.study.errors import BadInput
+from rare_envs.study.storage.failure_table import read_failures
+from rare_envs.study.storage.names import EPISODES, FAILURES, RESULT, STUDY
+
+if TYPE_CHECKING:
+    import pyarrow
+
+
+@dataclass(frozen=True)
+class LoadedStudy:
+    """A finished run; nothing of the ego or of its question is run, whoever wrote the folder.
+
+    Example:
+        >>> from tempfile import TemporaryDirectory
+        >>> from rare_envs.study import Question, prepare, run_into
+        >>> question = Question(
+        ...     env_id="rare_envs/CarFollowing-v0", base="us101-gap", gamma=3.0, horizon=3.0, method="mc", max_sim=1000
+        ... )
+        >>> with TemporaryDirectory() as folder:
+        ...     _ = run_into(Path(folder), prepare(question))
+        ...     study = load_study(folder)
+        ...     episodes = study.episodes(columns=["gap", "failed"])
+        >>> study.p, study.question["method"], episodes.shape, sum(episodes["failed"].to_pylist())
+        (0.021, 'mc', (1000, 2), 21)
+    """
+
+    folder: Path
+    about: dict[str, Any]
+    """What study.json holds: command, versions, ego, base, parameters; empty for runs of earlier versions."""
+    result: dict[str, Any]
+    """What result.json holds."""
+
+    @property
+    def question(self) -> dict[str, Any]:
+        """The question as it was asked."""
+        return dict(self.result.get("question") or {})
+
+    @property
+    def p(self) -> float:
+        """Estimated probability."""
+        return float(self.result["p"])
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Its interval, of the sampling error alone."""
+        low, high = self.result["interval"]
+        return float(low), float(high)
+
+    @cached_property
+    def failures(self) -> dict[str, NDArray[Any]]:
+        """The most likely failures, see `read_failures`."""
+        return read_failures(self.folder)
+
+    @property
+    def episodes_path(self) -> Path:
+        """File of all simulations, for programs that read Parquet by themselves."""
+        return self.folder / EPISODES
+
+    def episodes(self, columns: list[str] | None = None, failed: bool | None = None) -> pyarrow.Table:
+        """Return the table of all simulations, a row each; docs/run_folder.md has its columns.
+
+        Args:
+            columns: Those wanted; None for all.
+            failed: Only failing simulations, or only the others; None for all.
+
+        Raises:
+            FileNotFoundError: The folder has no such table.
+            ValueError: The file is damaged, or has no such columns.
+        """
+        import pyarrow.parquet as pq
+
+        where = None if failed is None else [("failed", "=", failed)]
+        if not self.episodes_path.is_file():
+            raise FileNotFoundError(f"There is no {EPISODES} in {str(self.folder)!r}.")
+        missing = sorted(set(columns or []) - set(self.column_names))
+        if missing:
+            raise ValueError(f"{EPISODES} has no column {', '.join(missing)}; it has {', '.join(self.column_names)}.")
+        with _damage_as_value_error(self.episodes_path):
+            return pq.read_table(self.episodes_path, columns=columns, filters=where)
+
+    @property
+    def column_names(self) -> list[str]:
+        """Columns of the table of all simulations."""
+        import pyarrow.parquet as pq
+
+        with _damage_as_value_error(self.episodes_path):
+            return list(pq.read_schema(self.episodes_path).names)
+
+
+@contextlib.contextmanager
+def _damage_as_value_error(path: Path) -> Iterator[None]:
+    """Raise errors of Arrow, which differ by the kind of damage, as a ValueError in one line."""
+    try:
+        yield
+    except (OSError, ValueError) as error:
+        raise ValueError(f"Cannot read {str(path)!r}: {' '.join(str(error).split())}") from error
+
+
+def load_study(folder: str | Path) -> LoadedStudy:
+    """Read the folder of a finished run.
+
+    Args:
+        folder: Of `rare-envs estimate --out`.
+
+    Returns:
+        Its numbers; failures and simulations are read when they are asked for.
+
+    Raises:
+        BadInput: There is no finished run, or a file of it is damaged.
+
+    Example:
+        >>> load_study("runs/nowhere")
+        Traceback (most recent call last):
+            ...
+        rare_envs.study.errors.BadInput: No finished run in 'runs/nowhere': expected result.json and failures.csv, as rare-envs estimate --out writes.
+    """  # noqa: E501 (the example shows a whole message)
+    path = Path(folder)
+    if not all((path / name).is_file() for name in (RESULT, FAILURES)):
+        raise BadInput(
+            f"No finished run in {str(folder)!r}: expected {RESULT} and {FAILURES}, as rare-envs estimate --out writes."
+        )
+    about = _read_object(path / STUDY) if (path / STUDY).exists() else {}
+    return LoadedStudy(path, about, _check_result(_read_object(path / RESULT), path))
+
+
+def _read_object(path: Path) -> dict[str, Any]:
+    """Return the object of a JSON file.
+
+    Raises:
+        BadInput: It holds none.
+    """
+    try:
+        return parse_json_object(path.read_text(encoding="utf-8"), repr(str(path)))
+    except (OSError, ValueError) as error:
+        raise BadInput(error) from error
+
+
+def _check_result(result: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Return a result; raise a BadInput unless it has p and an interval."""
+    p, interval = result.get("p"), result.get("interval")
+    numbers = [p, *(interval if isinstance(interval, list) and len(interval) == 2 else [None])]
+    if any(isinstance(value, bool) or not isinstance(value, int | float) for value in numbers):
+        raise BadInput(f"Expected p and its interval as numbers in {str(folder / RESULT)!r}.")
+    return result

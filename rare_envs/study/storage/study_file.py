@@ -1,0 +1,127 @@
+"""study.json: what a run asks, of which ego, by what command, and with which versions of what it rests on."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+import shlex
+import sys
+from collections.abc import Mapping
+from dataclasses import asdict
+from datetime import datetime, timezone
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from agents.loading import find_ego_kind, strip_prefixes
+from rare_envs.distributions.fitted import FittedDistribution
+from rare_envs.files import replace_text
+from rare_envs.json_text import format_json, parse_json_object
+from rare_envs.study.journal import digest_files, find_named_files
+from rare_envs.study.question import Question, Study
+from rare_envs.study.storage.names import STUDY
+from rare_envs.version import __version__
+from samplers.result import method_settings
+
+STUDY_FORMAT = 1
+"""Version of the fields; see docs/run_folder.md."""
+LIBRARIES = ("gymnasium", "numpy", "onnxruntime", "scipy", "stable-baselines3", "torch")
+"""Distributions whose versions may change a number."""
+
+
+def describe_study(study: Study) -> dict[str, Any]:
+    """Return what study.json holds at the beginning of a run.
+
+    Example:
+        >>> from rare_envs.study import prepare
+        >>> about = describe_study(prepare(Question(env_id="rare_envs/CarFollowing-v0", seed=5)))
+        >>> about["seed"], about["ego"]["kind"], about["base"]["name"], about["parameters"][2]
+        (5, 'idm', 'us101', {'name': 'gap', 'unit': 'm', 'size': 1})
+    """
+    question, space = study.question, study.problem.space
+    rows = zip(space.names, space.units, space.sizes, strict=True)
+    return {
+        "format": STUDY_FORMAT,
+        "command": _describe_command(sys.argv),
+        "begun": _now(),
+        "finished": None,
+        "seconds": None,
+        "seed": question.seed,
+        "gamma": question.gamma,
+        "ego": _describe_ego(question),
+        "base": _describe_base(study),
+        "method": {"name": study.method.name, "settings": method_settings(study.method)},
+        "parameters": [{"name": name, "unit": unit, "size": int(size)} for name, unit, size in rows],
+        "question": asdict(question),
+        "files": digest_files(question),
+        "versions": find_versions(),
+        "platform": platform.platform(),
+    }
+
+
+def begin_study_file(folder: Path, study: Study) -> None:
+    """Write study.json of a run that begins.
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    replace_text(folder / STUDY, format_json(describe_study(study)) + "\n")
+
+
+def finish_study_file(folder: Path, study: Study, seconds: float) -> None:
+    """Note in study.json that the run is done; what it held of the beginning stays.
+
+    Args:
+        folder: Of the run.
+        study: What was asked.
+        seconds: Wall time [s].
+
+    Raises:
+        OSError: It cannot be written.
+    """
+    try:
+        begun = parse_json_object((folder / STUDY).read_text(encoding="utf-8"), STUDY)
+    except (OSError, ValueError):  # of an earlier version, or somebody has removed it
+        begun = describe_study(study)
+    replace_text(folder / STUDY, format_json({**begun, "finished": _now(), "seconds": seconds}) + "\n")
+
+
+def find_versions() -> dict[str, str]:
+    """Return the versions of this program, Python and the libraries that are installed."""
+    found = {"rare-envs": __version__, "python": platform.python_version()}
+    for name in LIBRARIES:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def _describe_ego(question: Question) -> dict[str, Any]:
+    """Return name, kind and fingerprint of the ego: of its files, or of this version where it comes with it."""
+    paths = find_named_files(strip_prefixes(question.ego))
+    files = {str(path): hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest() for path in paths}
+    rests_on = "".join(sorted(files.values())) or f"{question.ego} of rare-envs {__version__}"
+    return {
+        "name": question.ego,
+        "kind": find_ego_kind(strip_prefixes(question.ego)),
+        "files": files,
+        "fingerprint": hashlib.blake2b(rests_on.encode(), digest_size=16).hexdigest(),
+    }
+
+
+def _describe_base(study: Study) -> Mapping[str, Any]:
+    base = study.base
+    fit = {"fitted_to": base.fitted_to, "family": base.family} if isinstance(base, FittedDistribution) else {}
+    return {"name": study.base_name, "fitted_to": "", "family": "", **fit}
+
+
+def _describe_command(words: list[str]) -> str:
+    """Return the command line that was typed; empty where another program runs."""
+    program = Path(words[0]) if words else Path()
+    ours = program.stem == "rare-envs" or program.parts[-2:] == ("rare_envs", "__main__.py")
+    return shlex.join(["rare-envs", *words[1:]]) if ours else ""
+
+
+def _now() -> str:
+    return datetime.now(timezone.utc).isoformat(timespec="seconds")

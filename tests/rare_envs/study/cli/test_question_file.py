@@ -1,0 +1,68 @@
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+from typer.testing import Result
+
+from rare_envs.study import BadInput, Question
+from rare_envs.study.cli.options import EstimateOptions
+from rare_envs.study.cli.question_file import NOT_IN_FILES, read_question_file
+
+Cli = Callable[..., Result]
+
+
+def test_the_same_question_as_a_file_gives_the_same_answer(cli: Cli, risky: str, tmp_path: Path) -> None:
+    file = tmp_path / "study.yaml"
+    file.write_text(f"env: rare_envs/CarFollowing-v0\nbase: {risky}\nmethod: mc\nmax-sim: 200\nseed: 3\nnoise: off\n")
+    words = ("--base", risky, "--method", "mc", "--max-sim", 200, "--seed", 3, "--noise", "off", "--json")
+    typed = json.loads(cli("estimate", "rare_envs/CarFollowing-v0", *words).stdout)
+    filed = json.loads(cli("estimate", "--config", file, "--json").stdout)
+    assert {**filed, "seconds": 0} == {**typed, "seconds": 0}
+    assert filed["question"]["max_sim"] == 200 and filed["p"] > 0
+
+
+def test_what_is_typed_comes_before_the_file(cli: Cli, risky: str, tmp_path: Path) -> None:
+    file = tmp_path / "study.yaml"
+    file.write_text(f"env: rare_envs/Nowhere-v0\nbase: {risky}\nmethod: mc\nmax_sim: 200\nseed: 3\n")
+    words = ("rare_envs/CarFollowing-v0", "--config", file, "--seed", 0, "--json")
+    question = json.loads(cli("estimate", *words).stdout)["question"]
+    assert (question["env_id"], question["seed"], question["max_sim"]) == ("rare_envs/CarFollowing-v0", 0, 200)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("env: rare_envs/CutIn-v0\nmax_sims: 3\n", r"unknown key 'max_sims' \(did you mean 'max_sim'\?\)"),
+        ("env: rare_envs/CutIn-v0\ntrust: true\n", "cannot say trust: give --trust on the command line"),
+        ("env: rare_envs/CutIn-v0\ngamma: low\n", "Expected gamma to be float, got 'low'"),
+        ("env: rare_envs/CutIn-v0\nseed: 1.5\n", "Expected seed to be int"),
+        ("max-sim: 3\nmax_sim: 4\n", "same option twice"),
+        ("- 1\n- 2\n", "lines like gamma"),
+        ("", "lines like gamma"),
+        ("env: [unclosed\n", "is no YAML"),
+        ("env: !!python/object/apply:os.system ['true']\n", "is no YAML"),
+        ("1: 2\n", "lines like gamma"),
+        ("seed: 2000-99-99\n", "is no YAML|Expected seed"),
+    ],
+)
+def test_a_file_that_cannot_be_used_is_refused_in_one_line(cli: Cli, tmp_path: Path, text: str, message: str) -> None:
+    file = tmp_path / "study.yaml"
+    file.write_text(text)
+    with pytest.raises(BadInput, match=message):
+        read_question_file(file)
+    result = cli("estimate", "--config", file)
+    assert result.exit_code == 2 and result.stderr.count("\n") == 1 and "Traceback" not in result.stderr
+
+
+def test_no_environment_and_no_file_are_refused(cli: Cli, tmp_path: Path) -> None:
+    assert "Expected an environment" in cli("estimate").stderr
+    assert "Cannot read" in cli("estimate", "--config", tmp_path / "none.yaml").stderr
+
+
+def test_every_option_can_be_in_a_file(tmp_path: Path) -> None:
+    names = {field.name for field in fields(EstimateOptions)}
+    assert names - set(NOT_IN_FILES) == {field.name for field in fields(Question)} - {"env_id", "chunk", *NOT_IN_FILES}

@@ -1,0 +1,53 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import rare_envs
+from rare_envs.study import replay
+from rare_envs.study.html_report.atlas import AtlasSource, build_atlas
+
+MODE = {"crash": "rear_end", "p": 0.01, "interval": [0.005, 0.02], "of_failures": 0.75, "failure": 0}
+
+
+@pytest.fixture
+def source() -> AtlasSource:
+    problem = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", horizon=3.0)
+    failures = {"ego_speed": [20.0], "lead_speed": [5.0], "gap": [10.0], "f": [-1.0], "log_p0": [-9.0]}
+    arrays = {name: np.array(values) for name, values in failures.items()}
+    ordinary = problem.space.sample(200, np.random.default_rng(0))
+    return AtlasSource(Path("runs/one"), problem, arrays, ordinary, ordinary[:5])
+
+
+def test_an_entry_says_what_happened_and_how_to_see_it_again(source: AtlasSource) -> None:
+    (entry,) = build_atlas(source, [MODE])
+    facts = dict(entry.facts)
+    assert entry.title == "Mode 1: the ego runs into a vehicle ahead" and entry.share.startswith("75 % of p: 1 %")
+    assert facts["crash"].startswith("the ego into the lead after 0.8 s") and facts["f"] == "-1"
+    assert facts["replay"].startswith("rare-envs replay runs/one --failure 0")
+    assert "standard deviations per parameter" in facts["nearest recorded"]
+    assert [row[:2] for row in entry.parameters] == [
+        ("ego_speed [m/s]", "20.00"),
+        ("lead_speed [m/s]", "5.00"),
+        ("gap [m]", "10.00"),
+    ]
+    assert [figure.name for figure in entry.figures] == ["mode1-views", "mode1-measure", "mode1-speeds"]
+
+
+def test_an_ego_that_cannot_be_driven_again_costs_the_pictures_alone(
+    source: AtlasSource, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise RuntimeError("gone")
+
+    monkeypatch.setattr("rare_envs.study.html_report.atlas.drive_again", fail)
+    assert replay.drive_again is not fail
+    (entry,) = build_atlas(source, [MODE])
+    assert entry.clip == "" and entry.figures == [] and "gone" in entry.missing and entry.parameters
+
+
+def test_a_mode_without_a_listed_failure_has_its_share(source: AtlasSource) -> None:
+    (entry,) = build_atlas(source, [{**MODE, "failure": None}])
+    assert entry.parameters == [] and "none of its failures" in entry.missing and entry.share.startswith("75 % of p")

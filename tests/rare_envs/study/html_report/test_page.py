@@ -1,0 +1,179 @@
+"""The report of a run: one file with everything in it."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import os
+import re
+import shutil
+from collections import Counter
+from collections.abc import Callable
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from typer.testing import Result
+
+from rare_envs.study import BadInput, Question, prepare, run_into
+from rare_envs.study.html_report.page import SECTIONS, list_doubts, write_html_report
+from rare_envs.traffic.palette import ROLE_COLOURS, as_rgb
+
+VOID = {"meta", "br", "img", "link", "path", "use", "rect", "circle", "line", "polygon"}
+
+
+class Page(HTMLParser):
+    """What a page refers to, its ids, and whether its elements end in the order in which they began."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.links: list[str] = []
+        self.ids: list[str] = []
+        self.open: list[str] = []
+        self.tags: Counter[str] = Counter()
+        self.wrong: list[str] = []
+        self.feed(text)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self._note(tag, attrs)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self._note(tag, attrs)
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        if not self.open or self.open.pop() != tag:
+            self.wrong.append(tag)
+
+    def _note(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags[tag] += 1
+        for name, value in attrs:
+            if name in ("src", "href", "xlink:href", "action", "data", "poster", "srcset"):
+                self.links.append(value or "")
+            if name == "id":
+                self.ids.append(value or "")
+
+
+def test_the_page_is_whole_and_needs_nothing_else(folder: Path) -> None:
+    text = (folder / "report.html").read_text(encoding="utf-8")
+    page = Page(text)
+    assert page.wrong == [] and page.open == []
+    assert all(link.startswith(("data:image/gif;base64,", "#")) for link in page.links) and page.links
+    outside = set(re.findall(r"""(?:https?:)?//[^\s"'<>)]+""", re.sub(r"base64,[A-Za-z0-9+/=]+", "", text)))
+    assert all(url.startswith("http://www.w3.org/") for url in outside), outside  # names of namespaces
+    assert "@import" not in text and page.tags["script"] == page.tags["iframe"] == page.tags["link"] == 0
+    assert [name for name, n in Counter(page.ids).items() if n > 1] == []
+    assert [name for name in page.ids if name in SECTIONS] == list(SECTIONS)
+    targets = re.findall(r"(?:href=\"#|url\(#)([^\")]+)", text)
+    assert set(targets) <= set(page.ids) and targets
+    assert 'name="viewport"' in text and "@media print" in text and text.startswith("<!DOCTYPE html>")
+
+
+def test_the_page_says_what_the_files_say(folder: Path) -> None:
+    text = (folder / "report.html").read_text(encoding="utf-8")
+    result = json.loads((folder / "result.json").read_text())
+    assert f"p = {100 * result['p']:.2g} %" in text
+    assert "ends in a collision" in text and "the ego runs into a vehicle ahead" in text
+    for name in ("ego_speed [m/s]", "lead_speed [m/s]", "gap [m]"):
+        assert name in text
+    assert f"rare-envs replay {folder} --failure {result['modes'][0]['failure']}" in text
+    for label in ("simulations", "delta-v [m/s]", "time [s]", "ttc [s]", "share of p [%]"):
+        assert label in text, label  # axes with units, as text
+    figures = re.findall(r"<svg[^>]*aria-label=\"([^\"]+)\"", text)
+    assert len(figures) >= 8
+
+
+def test_in_the_clip_every_vehicle_has_its_colour(folder: Path) -> None:
+    text = (folder / "report.html").read_text(encoding="utf-8")
+    clip = re.search(r"data:image/gif;base64,([A-Za-z0-9+/=]+)", text)
+    assert clip is not None
+    picture = Image.open(io.BytesIO(base64.b64decode(clip[1])))
+    assert 10 <= getattr(picture, "n_frames", 1) <= 60
+    for frame in (0, picture.n_frames - 1):  # type: ignore[attr-defined]
+        picture.seek(frame)
+        colours = {tuple(each) for each in np.asarray(picture.convert("RGB")).reshape(-1, 3).tolist()}
+        assert {as_rgb(ROLE_COLOURS["ego"]), as_rgb(ROLE_COLOURS["lead"])} <= colours
+
+
+def test_warnings_come_first_and_text_of_files_is_escaped(folder: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(folder, run)
+    result = json.loads((run / "result.json").read_text())
+    result |= {"warnings": ["<script>alert(1)</script> the estimate is coarse"], "notes": ["<b>a note</b>"]}
+    result["repeatability"] = {"n": 68, "n_differing": 40, "largest": 3.5}
+    (run / "result.json").write_text(json.dumps(result))
+    text = write_html_report(run)[0].read_text(encoding="utf-8")
+    assert "<script>" not in text and "&lt;script&gt;alert(1)&lt;/script&gt; the estimate is coarse" in text
+    assert text.index("the estimate is coarse") < text.index("The answer") and "gave another f" in text
+    assert "&lt;b&gt;a note" in text
+
+
+def test_doubts_are_those_of_method_base_and_f() -> None:
+    base = {"warnings": ["few events"]}
+    found = list_doubts({"warnings": ["coarse"], "base_uncertainty": base, "doubtful": True})
+    assert found == ["coarse", "base distribution: few events"]
+    assert list_doubts({"doubtful": False}) == [] and len(list_doubts({"doubtful": True})) == 1
+
+
+def test_recorded_events_and_figures_as_files(folder: Path, tmp_path: Path, cli: Callable[..., Result]) -> None:
+    events = tmp_path / "events.csv"
+    events.write_text("gap,ego_speed,lead_speed,site\n20,21,10,a\n60,20,20,b\n,1,2,c\n")
+    out = tmp_path / "page.html"
+    done = cli("report", folder, "--events", events, "--out", out, "--figures", "svg")
+    assert done.exit_code == 0, done.stderr
+    text = out.read_text(encoding="utf-8")
+    assert "nearest recorded" in text and "standard deviations per parameter away" in text
+    names = {path.name for path in (tmp_path / "figures").iterdir()}
+    assert names >= {"convergence.svg", "weights.svg", "curve.svg", "parameters.svg", "mode1-views.svg"}
+    assert all((tmp_path / "figures" / name).read_text().lstrip().startswith("<?xml") for name in names)
+
+
+def test_a_run_without_failures_has_a_page(tmp_path: Path, safe: str) -> None:
+    question = Question(env_id="rare_envs/CarFollowing-v0", base=safe, method="mc", max_sim=50, horizon=1.0)
+    run_into(tmp_path / "run", prepare(question))
+    text = write_html_report(tmp_path / "run")[0].read_text(encoding="utf-8")
+    page = Page(text)
+    assert page.wrong == [] and [name for name in page.ids if name in SECTIONS] == list(SECTIONS)
+    assert "None of 50 simulations ends in a collision" in text and "No failure was found." in text
+
+
+def find_chromium() -> str | None:
+    """Return a browser to look with: RARE_ENVS_CHROMIUM, or one that is installed."""
+    names = ("chromium", "chromium-browser", "google-chrome", "chrome")
+    return os.environ.get("RARE_ENVS_CHROMIUM") or next(filter(None, map(shutil.which, names)), None)
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+def test_a_browser_shows_the_page_without_a_network_and_without_sideways_scrolling(folder: Path, width: int) -> None:
+    playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright")
+    chromium = find_chromium()
+    if chromium is None:
+        pytest.skip("needs a Chromium: set RARE_ENVS_CHROMIUM")
+    with playwright.sync_playwright() as started:
+        browser = started.chromium.launch(
+            executable_path=chromium, args=["--no-sandbox", "--single-process", "--no-zygote"]
+        )
+        tab = browser.new_context(viewport={"width": width, "height": 900}, offline=True).new_page()
+        said: list[str] = []
+        tab.on("console", lambda message: said.append(message.text))
+        tab.on("request", lambda request: said.append(request.url) if request.url.startswith("http") else None)
+        tab.goto(f"file://{folder / 'report.html'}")
+        assert tab.evaluate("document.documentElement.scrollWidth") == width
+        assert said == []
+        assert len(tab.pdf(format="A4")) > 20_000
+        browser.close()
+
+
+def test_what_has_no_report_is_refused(folder: Path, tmp_path: Path, cli: Callable[..., Result]) -> None:
+    with pytest.raises(BadInput, match="No finished run"):
+        write_html_report(tmp_path)
+    with pytest.raises(BadInput, match="Expected --figures svg, pdf, png"):
+        write_html_report(folder, figures="bmp")
+    shutil.copytree(folder, tmp_path / "run")
+    (tmp_path / "run" / "journal.bin").touch()
+    refused = cli("report", tmp_path / "run")
+    assert refused.exit_code == 2 and "is not finished" in refused.stderr

@@ -1,0 +1,108 @@
+"""The table of all simulations: what it says adds up to the answer."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+import rare_envs
+from rare_envs.study import Question, prepare, resume, run_into
+from rare_envs.study.storage import episode_file
+from rare_envs.study.storage.episode_file import EpisodeBatch, EpisodeDraft, digest_scenario, name_columns
+
+FOLLOWING = "rare_envs/CarFollowing-v0"
+
+
+def ask(risky: str, method: str, **more: object) -> Question:
+    return Question(**{"env_id": FOLLOWING, "base": risky, "method": method, "max_sim": 900, "horizon": 4.0, **more})
+
+
+@pytest.mark.parametrize(("method", "replicates"), [("mc", 1), ("mc", 2), ("is", 1), ("two-stage", 1)])
+def test_p_is_the_sum_of_the_weights_of_the_failures(risky: str, tmp_path: Path, method: str, replicates: int) -> None:
+    report = run_into(tmp_path / "run", prepare(ask(risky, method, replicates=replicates)))
+    study = rare_envs.load_study(tmp_path / "run")
+    table = study.episodes().to_pydict()
+    assert study.p == report.estimate.p > 0
+    assert len(table["f"]) == study.result["n_sim"]
+    weights = [w for w, failed in zip(table["log_weight"], table["failed"], strict=True) if failed and w is not None]
+    assert np.exp(weights).sum() == pytest.approx(study.result["p"], rel=1e-12)
+    assert table["simulation"] == list(range(len(table["f"])))
+    levels = [level["n_sim"] for level in study.result["trace"]]
+    places = [(level["run"], k) for run in range(replicates) for k, level in enumerate(study.result["trace"])]
+    counts = {(run, stage): 0 for run, stage in zip(table["run"], table["stage"], strict=True)}
+    for run, stage in zip(table["run"], table["stage"], strict=True):
+        counts[run, stage] += 1
+    assert sum(counts.values()) == sum(levels) and len(counts) <= len(places)
+
+
+def test_a_row_has_the_scenario_its_f_and_its_crash(risky: str, tmp_path: Path) -> None:
+    report = run_into(tmp_path / "run", prepare(ask(risky, "mc", max_sim=400)))
+    study = rare_envs.load_study(tmp_path / "run")
+    table = study.episodes()
+    problem = report.study.problem
+    x = np.column_stack([table[name].to_numpy() for name in problem.space.names])
+    f = table["f"].to_numpy()
+    np.testing.assert_array_equal(problem.evaluate(x), f)
+    np.testing.assert_array_equal(table["failed"].to_numpy(), f <= 0)
+    failing = study.episodes(failed=True)
+    assert set(failing["crash"].to_pylist()) == {"rear_end"} and failing.num_rows == report.estimate.failures.total
+    assert study.episodes(["crash"], failed=False)["crash"].null_count == 400 - failing.num_rows
+    assert (table["seconds"].to_numpy() > 0).all() and table["error"].null_count == 400
+    listed = {tuple(row) for row in np.column_stack([study.failures[name] for name in problem.space.names])}
+    assert listed <= {tuple(row) for row in x}
+
+
+def test_a_resumed_run_has_the_same_table_but_for_times(
+    risky: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    question = ask(risky, "is")
+    run_into(tmp_path / "whole", prepare(question))
+
+    def interrupt(self: object, *_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("rare_envs.study.storage.episode_recorder.EpisodeRecorder.write", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            run_into(tmp_path / "cut", prepare(question))
+    assert sorted(path.name for path in (tmp_path / "cut").iterdir()) == ["journal.bin", "study.json"]
+    begun = json.loads((tmp_path / "cut" / "study.json").read_text())
+    assert begun["finished"] is None and begun["seed"] == 0
+    resume(tmp_path / "cut")
+    whole, cut = (rare_envs.load_study(tmp_path / name) for name in ("whole", "cut"))
+    assert cut.episodes().drop(["seconds"]).equals(whole.episodes().drop(["seconds"]))
+    assert (cut.episodes()["seconds"].to_numpy() > 0).all()
+    assert cut.about["begun"] == begun["begun"] and cut.about["finished"] is not None
+
+
+def test_large_blocks_are_lists_in_single_precision(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(episode_file, "ROWS_AT_ONCE", 8)
+    space = rare_envs.DrivingProblem("rare_envs/Highway-v0", noise=False).space
+    kinds = name_columns(space)
+    assert kinds["weights"].list_size == 404 and str(kinds["speed[5]"]) == "double"
+    x = space.sample(20, np.random.default_rng(0))
+    draft = EpisodeDraft(tmp_path, space)
+    for part in np.split(x, 4):
+        draft.add(EpisodeBatch(part, np.zeros(5), [None] * 5, np.ones(5)))
+    batches = list(draft.read())
+    draft.close()
+    assert [batch.num_rows for batch in batches] == [8, 2, 8, 2]
+    values = np.concatenate([batch.column("weights").flatten().to_numpy().reshape(-1, 404) for batch in batches])
+    np.testing.assert_array_equal(values, space.columns(x)["weights"].astype(np.float32))
+    rows = [episode_file._as_table(batch.column(name)) for batch in batches[:1] for name in draft.columns]
+    assert [digest_scenario(row) for row in np.hstack(rows)] == [digest_scenario(row) for row in x[:8]]
+
+
+def test_row_groups_are_bounded_and_the_schema_says_its_version(
+    risky: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(episode_file, "ROWS_AT_ONCE", 128)
+    run_into(tmp_path / "run", prepare(ask(risky, "mc", max_sim=500)))
+    file = pq.ParquetFile(tmp_path / "run" / "episodes.parquet")
+    sizes = [file.metadata.row_group(k).num_rows for k in range(file.num_row_groups)]
+    assert sum(sizes) == 500 and max(sizes) <= 128
+    assert file.schema_arrow.metadata[b"rare_envs.format"] == b"1"

@@ -1,0 +1,83 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import rare_envs
+from rare_envs.study import BadInput, Question, prepare, run_into
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("runs") / "run"
+    run_into(
+        path, prepare(Question(env_id="rare_envs/CarFollowing-v0", gamma=3.0, horizon=2.0, method="mc", max_sim=300))
+    )
+    return path
+
+
+def test_what_is_loaded_is_what_the_files_hold(folder: Path) -> None:
+    study = rare_envs.load_study(folder)
+    assert study.about["ego"]["name"] == study.question["ego"] == "idm"
+    assert study.about["versions"]["rare-envs"] == rare_envs.__version__
+    assert [each["name"] for each in study.about["parameters"]] == ["ego_speed", "lead_speed", "gap"]
+    low, high = study.interval
+    assert low <= study.p <= high
+    assert set(study.column_names) >= {"gap", "f", "failed", "log_weight", "crash", "error", "seconds"}
+
+
+def test_other_libraries_read_the_table(folder: Path) -> None:
+    study = rare_envs.load_study(folder)
+    p = np.exp(study.episodes(failed=True)["log_weight"].to_numpy()).sum()
+    frame = pytest.importorskip("pandas").read_parquet(study.episodes_path)
+    assert np.exp(frame.log_weight[frame.failed]).sum() == pytest.approx(p) == pytest.approx(study.p)
+
+
+def test_polars_reads_the_table(folder: Path) -> None:
+    frame = pytest.importorskip("polars").read_parquet(rare_envs.load_study(folder).episodes_path)
+    assert frame.height == 300
+
+
+def test_duckdb_reads_the_table(folder: Path) -> None:
+    duckdb = pytest.importorskip("duckdb")
+    study = rare_envs.load_study(folder)
+    found = duckdb.sql(f"SELECT sum(exp(log_weight)) FROM '{study.episodes_path}' WHERE failed").fetchone()
+    assert found[0] == pytest.approx(study.p)
+
+
+def test_loading_takes_neither_torch_nor_the_simulation(folder: Path) -> None:
+    code = (
+        "import sys, rare_envs; study = rare_envs.load_study(sys.argv[1]); study.episodes(); study.failures\n"
+        "assert 'torch' not in sys.modules and 'matplotlib' not in sys.modules, 'slow to import'"
+    )
+    subprocess.run([sys.executable, "-c", code, str(folder)], check=True)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{", "[1]", '{"p": "low", "interval": [0, 1]}', '{"p": 0.1, "interval": [0]}', '{"p": true}']
+)
+def test_a_damaged_result_is_refused_in_one_line(folder: Path, tmp_path: Path, text: str) -> None:
+    (tmp_path / "failures.csv").write_text("f,log_p0\n")
+    (tmp_path / "result.json").write_text(text)
+    with pytest.raises(BadInput, match=r"result\.json"):
+        rare_envs.load_study(tmp_path)
+
+
+def test_a_damaged_table_and_unknown_columns_are_refused(folder: Path, tmp_path: Path) -> None:
+    study = rare_envs.load_study(folder)
+    with pytest.raises(ValueError, match="has no column gab"):
+        study.episodes(["gab"])
+    for name in ("result.json", "failures.csv"):
+        (tmp_path / name).write_bytes((folder / name).read_bytes())
+    (tmp_path / "episodes.parquet").write_bytes(study.episodes_path.read_bytes()[:-40])
+    with pytest.raises(ValueError, match=r"episodes\.parquet"):
+        rare_envs.load_study(tmp_path).episodes()
+
+
+def test_a_folder_without_a_finished_run_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match="No finished run"):
+        rare_envs.load_study(tmp_path)
