@@ -87,9 +87,9 @@ def estimate_command(
     as_json: JsonOption = False,
 ) -> None:
     """Estimate how often an ego fails, with an interval, and show its most likely failure."""
-    from rare_envs.study.cli.question_file import join_question, read_question_file
     from rare_envs.study.evaluate import run, run_into
     from rare_envs.study.question import prepare
+    from rare_envs.study.storage.question_file import join_question, read_question_file
 
     typed = {name for name in context.params if is_typed(context, name)}
     question = join_question({} if config is None else read_question_file(config), env, options.arguments(), typed)

@@ -10,7 +10,7 @@ from typer.testing import Result
 
 from rare_envs.study import BadInput, Question
 from rare_envs.study.cli.options import EstimateOptions
-from rare_envs.study.cli.question_file import NOT_IN_FILES, read_question_file
+from rare_envs.study.storage.question_file import NOT_IN_FILES, read_question_file
 
 Cli = Callable[..., Result]
 
@@ -65,4 +65,4 @@ def test_no_environment_and_no_file_are_refused(cli: Cli, tmp_path: Path) -> Non
 
 def test_every_option_can_be_in_a_file(tmp_path: Path) -> None:
     names = {field.name for field in fields(EstimateOptions)}
-    assert names - set(NOT_IN_FILES) == {field.name for field in fields(Question)} - {"env_id", "chunk", *NOT_IN_FILES}
+    assert names - set(NOT_IN_FILES) == {field.name for field in fields(Question)} - {"env_id", *NOT_IN_FILES}
