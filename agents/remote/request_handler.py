@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -16,6 +17,9 @@ from rare_envs.egos.errors import EgoGone, reason_of
 
 MAX_CLIENTS, MAX_SESSIONS = 64, 64
 """Connections, and sessions of each, that are remembered; the least recently used makes room."""
+
+MAX_MEMORY = 2**28
+"""Bytes of the memory of the ego that are kept for all sessions; the least recently used ones make room."""
 
 
 class RequestRefused(Exception):
@@ -41,6 +45,10 @@ class _ServerSession:
     """Next tick."""
     memory: Any = None
     """State of the ego after the last tick."""
+    size: int = 0
+    """Bytes of the memory."""
+    used: int = 0
+    """Number of the request that used it last."""
 
 
 @dataclass
@@ -79,6 +87,7 @@ class RequestHandler:
         self.ego = ego
         self._name = name
         self._clients: OrderedDict[bytes, _ClientState] = OrderedDict()
+        self._n_acts = 0
         self._actions: dict[str, Callable[[_ClientState, Message], Message]] = {
             "reset": self._reset,
             "act": self._act,
@@ -182,8 +191,22 @@ class RequestHandler:
         except (Exception, SystemExit, EgoGone) as error:  # the ego is the user's: anything may happen in it
             client.sessions.pop(number, None)
             raise RequestRefused("ego", reason_of(error)) from error
-        session.memory, session.step = memory, session.step + 1
+        session.memory, session.step, session.size = memory, session.step + 1, measure_bytes(memory)
+        self._n_acts += 1
+        session.used = self._n_acts
+        self._forget_memories(session)
         return {"type": "action", "action": packed, "memory": memory is not None}
+
+    def _forget_memories(self, current: _ServerSession) -> None:
+        """Forget sessions until what is kept of memories is small enough; their clients send them again."""
+        kept = [
+            (each.used, number, client) for client in self._clients.values() for number, each in client.sessions.items()
+        ]
+        total = sum(client.sessions[number].size for _, number, client in kept)
+        for _, number, client in sorted(kept, key=lambda each: each[0]):
+            if total <= MAX_MEMORY or client.sessions[number] is current:
+                return
+            total -= client.sessions.pop(number).size
 
     def _end(self, client: _ClientState, message: Message) -> Message:
         """Forget a session."""
@@ -191,3 +214,19 @@ class RequestHandler:
         if protocol.is_count(number):
             client.sessions.pop(number, None)
         return {"type": "ended"}
+
+
+def measure_bytes(memory: Any) -> int:
+    """Return the bytes of the arrays in what an ego remembers, and about those of other objects.
+
+    Example:
+        >>> measure_bytes((np.zeros((4, 10)), [np.zeros(3, np.float32)])) > 4 * 10 * 8 + 3 * 4
+        True
+    """
+    own = sys.getsizeof(memory)
+    if isinstance(memory, dict):
+        return own + sum(measure_bytes(value) for value in memory.values())
+    if isinstance(memory, tuple | list):
+        return own + sum(map(measure_bytes, memory))
+    n_bytes = getattr(memory, "nbytes", 0)  # of NumPy and torch; the memory is the ego's
+    return max(own, n_bytes) if isinstance(n_bytes, int) else own

@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import ipaddress
+import os
+import shutil
+import tempfile
 import threading
+from pathlib import Path
 from typing import Any
 
 import zmq
 
 from agents.remote.curve import SECRET_VARIABLE, secure_server
 from agents.remote.protocol import MAX_BYTES
+from agents.remote.relay import BoundedRelay
 from agents.remote.request_handler import RequestHandler
 
+QUEUED_MESSAGES = 4
+"""Messages of a connection that ZeroMQ keeps in each direction; a client has one request under way."""
 POLL_INTERVAL = 100
 """Time after which the server looks whether it is to stop [ms]."""
 
@@ -60,18 +67,40 @@ class EgoServer:
         self._socket = self._context.socket(zmq.ROUTER)
         self._socket.setsockopt(zmq.MAXMSGSIZE, MAX_BYTES)
         self._socket.setsockopt(zmq.LINGER, 0)
+        self._socket.setsockopt(zmq.RCVHWM, QUEUED_MESSAGES)
+        self._socket.setsockopt(zmq.SNDHWM, QUEUED_MESSAGES)
+        self._folder: str | None = None
+        self._relay: BoundedRelay | None = None
         try:
             if secret:
                 secure_server(self._socket, secret)
-            self._socket.bind(bind)
-        except zmq.ZMQError as error:
+            self.address = self._listen(bind)
+        except (zmq.ZMQError, OSError, OverflowError) as error:
             self.close()
             hint = "" if bind.startswith("tcp://") else "; expected tcp://host:port"
-            raise ValueError(f"Cannot listen on {bind!r}: {error}{hint}.") from error
+            number = error.errno if isinstance(error, OSError) else None  # that of a failed look-up is negative
+            reason = os.strerror(number) if number and number > 0 else error
+            raise ValueError(f"Cannot listen on {bind!r}: {reason}{hint}.") from error
         except ValueError:
             self.close()
             raise
-        self.address = self._socket.getsockopt_string(zmq.LAST_ENDPOINT)
+
+    def _listen(self, bind: str) -> str:
+        """Return where the server listens: TCP by a relay that bounds what clients send, where there are Unix sockets.
+
+        Raises:
+            zmq.ZMQError: The address is malformed.
+            OSError: It cannot be used.
+        """
+        place = parse_tcp(bind)
+        if place is None or os.name != "posix":
+            self._socket.bind(bind)
+            return str(self._socket.getsockopt_string(zmq.LAST_ENDPOINT))
+        self._folder = tempfile.mkdtemp(prefix="rare-envs-")  # which others cannot enter
+        path = str(Path(self._folder) / "ego")
+        self._socket.bind(f"ipc://{path}")
+        self._relay = BoundedRelay(*place, path)
+        return self._relay.address
 
     def run(self) -> None:
         """Answer until `stop` is called."""
@@ -93,7 +122,12 @@ class EgoServer:
 
     def close(self) -> None:
         """Stop listening."""
+        if self._relay is not None:
+            self._relay.close()
         self._context.destroy(0)
+        if self._folder is not None:
+            shutil.rmtree(self._folder, ignore_errors=True)
+        self._relay = self._folder = None
 
     def __enter__(self) -> EgoServer:
         """Return the server."""
@@ -102,6 +136,20 @@ class EgoServer:
     def __exit__(self, *_: object) -> None:
         """Stop listening."""
         self.close()
+
+
+def parse_tcp(address: str) -> tuple[str, int] | None:
+    """Return host and port of an address; None if it is none of TCP, which ZeroMQ may know.
+
+    Example:
+        >>> parse_tcp("tcp://*:5555"), parse_tcp("tcp://[::1]:*"), parse_tcp("ipc:///tmp/ego")
+        (('0.0.0.0', 5555), ('::1', 0), None)
+    """
+    host, _, port = address.removeprefix("tcp://").rpartition(":")
+    if not address.startswith("tcp://") or not (port == "*" or (port.isascii() and port.isdigit())):
+        return None
+    host = {"*": "0.0.0.0", "localhost": "127.0.0.1"}.get(host, host.strip("[]"))
+    return (host, 0 if port == "*" else int(port)) if host else None
 
 
 def is_loopback(address: str) -> bool:

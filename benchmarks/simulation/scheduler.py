@@ -24,8 +24,8 @@ import rare_envs
 import samplers
 
 WORKERS = (1, 10, 30, 100, 300, 1000)
-BUDGETS = (1000, 6000, 30_000)
-N_TIMED = 60
+BUDGETS = (1000, 6000, 20_000)
+N_TIMED = 40
 
 
 def record_batches(budget: int, seed: int = 0) -> list[int]:

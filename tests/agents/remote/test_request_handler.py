@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from agents.remote import protocol
+from agents.remote import protocol, request_handler
 from agents.remote.request_handler import MAX_CLIENTS, MAX_SESSIONS, RequestHandler
 from tests.agents.remote.egos import Averaging, Braking, good_messages
 
@@ -198,3 +198,31 @@ def test_an_ego_that_fails_ends_its_session_only() -> None:
         reply = ask(handler, id=10 * number + 3, **act)
         assert (reply["code"], reply["reason"]) == ("ego", reason)
         assert ask(handler, id=10 * number + 4, **act)["code"] == "session"
+
+
+def test_memories_are_kept_up_to_a_size_the_least_used_make_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A client whose session was forgotten is told so, and sends its observations again."""
+
+    class Remembering:
+        def predict(
+            self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
+        ) -> Any:
+            return np.zeros((len(observation), 2), np.float32), np.zeros(1000)  # 8,000 bytes
+
+    monkeypatch.setattr(request_handler, "MAX_MEMORY", 30_000)
+    handler, number = RequestHandler(Remembering()), 0
+
+    def ask(connection: bytes, **message: Any) -> Any:
+        nonlocal number
+        number += 1
+        return protocol.unpack(handler.handle(connection, protocol.pack({**message, "id": number})))
+
+    seen = protocol.pack_observation(np.ones((1, 7), np.float32))
+    sessions = [(client, session) for client in (b"a", b"b") for session in range(3)]
+    for client in (b"a", b"b"):
+        ask(client, type="hello", protocol=1)
+    for client, session in sessions:
+        ask(client, type="reset", session=session, batch=1)
+        assert ask(client, type="act", session=session, step=0, observation=seen)["type"] == "action"
+    kept = [ask(client, type="act", session=session, step=1, observation=seen)["type"] for client, session in sessions]
+    assert kept == ["error"] * 3 + ["action"] * 3
