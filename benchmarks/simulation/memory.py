@@ -26,9 +26,9 @@ n, table = int(sys.argv[1]), sys.argv[2] == "table"
 space = None
 if table:
     from pathlib import Path
-    from rare_envs.scenarios.registry import find_scenario
+    import rare_envs
     from rare_envs.study.storage.episode_file import EpisodeBatch, EpisodeDraft, write_episodes
-    space = find_scenario("rare_envs/CarFollowing-v0").space()
+    space = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0").space
     draft = EpisodeDraft(Path(sys.argv[3]), space)
 
 def f(x):

@@ -43,6 +43,7 @@ def write_run(folder: Path, report: Report) -> None:
         report: What to write.
 
     Example:
+        >>> import json
         >>> from tempfile import TemporaryDirectory
         >>> from rare_envs.study import Question, prepare, run
         >>> report = run(prepare(Question(env_id="rare_envs/CarFollowing-v0", method="mc", max_sim=100, horizon=1.0)))

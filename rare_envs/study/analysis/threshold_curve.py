@@ -18,7 +18,7 @@ def compute_threshold_curve(estimate: samplers.Estimate) -> samplers.Curve | Non
     Example:
         >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
         >>> curve = compute_threshold_curve(samplers.estimate(problem, "ce", seed=0, max_sim=4000))
-        >>> float(curve.gammas[0]), 0.3 < curve.p[-1] < 0.7
+        >>> float(curve.gammas[0]), 0.3 < float(curve.p[-1]) < 0.7
         (0.0, True)
     """
     if estimate.sample is None or estimate.p <= 0:

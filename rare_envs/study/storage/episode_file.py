@@ -55,9 +55,10 @@ def name_columns(space: ScenarioSpace) -> dict[str, pa.DataType]:
     """Return the columns of x and their types: numbers by name, and blocks of many values as lists.
 
     Example:
-        >>> from rare_envs.scenarios.registry import find_scenario
-        >>> [str(kind) for kind in name_columns(find_scenario("rare_envs/CarFollowing-v0").space()).values()]
-        ['double', 'double', 'double']
+        >>> import rare_envs
+        >>> space = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0").space
+        >>> {name: str(kind) for name, kind in name_columns(space).items()}
+        {'ego_speed': 'double', 'lead_speed': 'double', 'gap': 'double'}
     """
     types: dict[str, pa.DataType] = {}
     for name, size in zip(space.names, space.sizes, strict=True):

@@ -36,7 +36,7 @@ def describe_study(study: Study) -> dict[str, Any]:
         >>> from rare_envs.study import prepare
         >>> about = describe_study(prepare(Question(env_id="rare_envs/CarFollowing-v0", seed=5)))
         >>> about["seed"], about["ego"]["kind"], about["base"]["name"], about["parameters"][2]
-        (5, 'idm', 'us101', {'name': 'gap', 'unit': 'm', 'size': 1})
+        (5, 'rule', 'us101', {'name': 'gap', 'unit': 'm', 'size': 1})
     """
     question, space = study.question, study.problem.space
     rows = zip(space.names, space.units, space.sizes, strict=True)
