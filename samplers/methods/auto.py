@@ -9,14 +9,15 @@ import numpy as np
 from samplers.method import Goal, Stepping, Steps
 from samplers.methods.base import Method
 from samplers.methods.surrogate.method import Surrogate
-from samplers.methods.surrogate.settings import DEFAULT_SURROGATE_SETTINGS
 from samplers.methods.two_stage.method import TwoStage
 from samplers.methods.two_stage.noise_coordinates import noise_mask
 from samplers.problem import Inputs
 from samplers.validation import check_setting
 
-MOST_FOR_SURROGATE = 1500
-"""From more simulations on `TwoStage` finds the regions by itself; kriging of more points takes minutes."""
+FEW = (100, 1000)
+"""Simulations of a run, from and to, for `Surrogate`; with more `TwoStage` finds the regions by itself."""
+MOST_DIMS = 6
+"""Dimensions up to which `Surrogate` was measured (`benchmarks/estimators/few_simulations`)."""
 SLOW = 1.0
 """Seconds of a simulation from which on 6,000 of them are taken as too many where max_sim does not say: 100 minutes."""
 
@@ -25,10 +26,11 @@ SLOW = 1.0
 class Auto(Method):
     """Choice between the two methods for all problems, by a rule that looks at no outcome.
 
-    `Surrogate` where a run has 60 to 1,500 simulations and the search at most 20 dimensions (coordinates that the base
-    distribution calls noise are not searched); `TwoStage` otherwise. Without max_sim a run has the 6,000 simulations of
-    `TwoStage`, or, if one takes a second or more, the 1,000 of `Surrogate`; a target c.o.v. without max_sim goes to
-    `TwoStage`. The result is that of the method chosen, to the bit; `Estimate.choice` says which and why.
+    `Surrogate` where a run has 100 to 1,000 simulations and the search at most 6 dimensions, as it was measured in
+    (coordinates that the base distribution calls noise are not searched); `TwoStage` otherwise. Without max_sim a run
+    has the 6,000 simulations of `TwoStage`, or, if one takes a second or more, the 1,000 of `Surrogate`; a target
+    c.o.v. without max_sim goes to `TwoStage`. The result is that of the method chosen, to the bit; `Estimate.choice`
+    says which and why.
 
     Args:
         seconds_per_simulation: Time that one simulation takes; None where it is not known.
@@ -64,8 +66,8 @@ class Auto(Method):
         slow = (self.seconds_per_simulation or 0.0) >= SLOW and goal.target_cov is None
         usual = Surrogate().n if slow else TwoStage().n
         budget = usual if goal.max_sim is None else goal.max_sim
-        few = DEFAULT_SURROGATE_SETTINGS.least_budget <= budget <= MOST_FOR_SURROGATE
-        method = Surrogate() if few and dim <= DEFAULT_SURROGATE_SETTINGS.most_dims else TwoStage()
+        few = FEW[0] <= budget <= FEW[1]
+        method = Surrogate() if few and dim <= MOST_DIMS else TwoStage()
         return method, f"{method.name}: {budget:,} simulations for {dim:,} dimension{'s' * (dim != 1)}"
 
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
