@@ -26,11 +26,11 @@ SLOW = 1.0
 class Auto(Method):
     """Choice between the two methods for all problems, by a rule that looks at no outcome.
 
-    `Surrogate` where a run has 100 to 1,000 simulations and the search at most 6 dimensions, as it was measured in
-    (coordinates that the base distribution calls noise are not searched); `TwoStage` otherwise. Without max_sim a run
-    has the 6,000 simulations of `TwoStage`, or, if one takes a second or more, the 1,000 of `Surrogate`; a target
-    c.o.v. without max_sim goes to `TwoStage`. The result is that of the method chosen, to the bit; `Estimate.choice`
-    says which and why.
+    `Surrogate` where a run has 100 to 1,000 simulations and the search at most 6 dimensions (coordinates that the base
+    distribution calls noise are not searched), `TwoStage` otherwise; it was measured with 300, in 2 to 6 dimensions.
+    Without max_sim a run has the 6,000 simulations of `TwoStage`, or, if one takes a second or more, the 1,000 of
+    `Surrogate`; a target c.o.v. without max_sim goes to `TwoStage`. The result is that of the method chosen, to the
+    bit; `Estimate.choice` says which and why.
 
     Args:
         seconds_per_simulation: Time that one simulation takes; None where it is not known.

@@ -56,6 +56,11 @@ class RunFile:
             run = SeededRun(**{**row, "warnings": tuple(row["warnings"])})
             self._runs[run.problem, method, max_sim, run.seed] = run
 
+    def find(self, cell: Cell, seeds: int) -> list[SeededRun]:
+        """Return those of the first runs that are there."""
+        keys = [(cell.state.name, cell.method, cell.max_sim, seed) for seed in range(seeds)]
+        return [self._runs[key] for key in keys if key in self._runs]
+
     def get(self, cell: Cell, seed: int) -> SeededRun:
         """Return a run, made now if it is not there."""
         key = (cell.state.name, cell.method, cell.max_sim, seed)
@@ -75,11 +80,22 @@ def find_states(sets: Iterable[Path], wanted: Iterable[str]) -> list[NamedState]
     return [state for path in files for state in load_set(path) if not named or state.name in named]
 
 
-def summarise_cells(cells: Iterable[Cell], seeds: dict[int, int], runs: RunFile) -> Iterator[tuple[Cell, Row]]:
-    """Yield each cell with its row, as soon as its runs are there."""
+def summarise_cells(
+    cells: Iterable[Cell], seeds: dict[int, int], runs: RunFile, *, made: bool
+) -> Iterator[tuple[Cell, Row]]:
+    """Yield each cell with its row, as soon as its runs are there; those without a run are left out.
+
+    Args:
+        cells: All of them.
+        seeds: Runs of a cell by the simulations of a run.
+        runs: What is there.
+        made: Whether only runs count that are there.
+    """
     for cell in cells:
-        made = [runs.get(cell, seed) for seed in range(seeds[cell.max_sim])]
-        yield cell, summarise_runs(cell.state.name, made)
+        n = seeds[cell.max_sim]
+        found = runs.find(cell, n) if made else [runs.get(cell, seed) for seed in range(n)]
+        if found:
+            yield cell, summarise_runs(cell.state.name, found)
 
 
 def main(
@@ -89,6 +105,7 @@ def main(
     seeds: Annotated[str, typer.Option(help="Runs of each problem, one number for each budget.")] = "20,20,20",
     methods: Annotated[str, typer.Option(help="Names of methods, with commas.")] = "surrogate",
     runs: Annotated[Path | None, typer.Option(help="File of all runs, one line each.")] = None,
+    made: Annotated[bool, typer.Option(help="Make no run; summarise those that are in the file.")] = False,
     json_path: Annotated[Path | None, typer.Option("--json", help="File of the table.")] = None,
 ) -> None:
     """Run with many seeds and print gain, coverage and warnings."""
@@ -97,7 +114,7 @@ def main(
     states, kept, rows = find_states(sets or [], problems.split(",")), RunFile(runs), []
     cells = [Cell(state, method, size) for size in sizes for method in methods.split(",") for state in states]
     print(HEADER)
-    for cell, row in summarise_cells(cells, repeats, kept):
+    for cell, row in summarise_cells(cells, repeats, kept, made=made):
         print(describe_row(row), cell.method, flush=True)
         rows.append({"method": cell.method, "max_sim": cell.max_sim, **asdict(row)})
         if json_path is not None:

@@ -30,6 +30,10 @@ def test_runs_are_kept_by_budget_and_method_and_not_made_again(tmp_path, capsys)
         ("ss", 100, 3),
     ]
     assert capsys.readouterr().out.count("| half | 2 |") == 5
+    before = runs.read_text()
+    main(budgets="50,100", seeds="9,9", methods="mc", made=True, **{**arguments, "problems": ""})
+    assert runs.read_text() == before
+    assert [(row["max_sim"], row["runs"]) for row in json.loads(table.read_text())["rows"]] == [(50, 1), (100, 3)]
 
 
 def test_a_budget_without_its_number_of_seeds_is_an_error():
