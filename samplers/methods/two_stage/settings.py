@@ -191,8 +191,8 @@ class RefinementSettings:
     """Share that components from the exploration keep until the last round."""
     uncovered_share: float = 0.05
     """Share of p that a failing point may stand for as one of the last draws; from more than that, chains grow.
-    Without them 5 of 36 intervals missed p on a series system in 25 dimensions and on a braking problem in 6, and 3
-    runs were off by more than four of their own standard errors; with them, at the same seeds, none."""
+    Without them 3 of 48 intervals missed p on the four problems where they come most often, with them 1
+    (`benchmarks/results/two_stage_seeds_uncovered.json`)."""
     uncovered_budget: float = 0.1
     """Share of what is left for these chains, after each round but the last."""
     min_share: float = 0.004
