@@ -1,6 +1,6 @@
 """An ego that is safer by construction, an IDM with a longer headway, under every fitted base and all of its refits.
 
-    python -m benchmarks.uncertainty.safer_ego --max-sim 4000
+    python -m benchmarks.uncertainty.safer_ego
 
 The two egos are compared under each base, from the same draws. Whatever the traffic, the longer headway should come out
 no less safe: under the base itself and under each refit. And as both p rise and fall together from refit to refit, the
@@ -103,27 +103,30 @@ def measure_base(scenario: str, base: str, max_sim: int, seed: int = 0) -> Safer
 
 
 def main(
-    max_sim: Annotated[int, typer.Option(help="Simulations of both egos together under each base.")] = 4000,
+    max_sim: Annotated[int, typer.Option(help="Simulations of both egos together under each base.")] = 8000,
     seed: Annotated[int, typer.Option(help="Of the comparisons.")] = 0,
+    scenario: Annotated[list[str] | None, typer.Option(help="Which to measure; the rows of others are kept.")] = None,
     out: Annotated[Path, typer.Option(help="Where the result goes.")] = SAFER_RESULT,
 ) -> None:
-    """Measure all bases and write the result."""
-    rows, silent = [], []
-    command = f"python -m benchmarks.uncertainty.safer_ego --max-sim {max_sim} --seed {seed}"
-    for scenario, base in list_fitted_bases():
-        row = measure_base(scenario, base, max_sim, seed)
-        if row is None:
-            silent.append(f"{scenario} {base}")
+    """Measure bases and write the result."""
+    rows = {(row["scenario"], row["base"]): row for row in json.loads(out.read_text())["rows"]} if out.is_file() else {}
+    for name, base in list_fitted_bases():
+        if scenario and name not in scenario:
             continue
-        rows.append({name: _null_nan(value) for name, value in asdict(row).items()})
+        row = measure_base(name, base, max_sim, seed)
+        if row is None:
+            print(f"{name} {base}: one of the two never fails")
+            continue
+        values = {key: _null_nan(value) for key, value in asdict(row).items()}
+        rows[name, base] = {**values, "max_sim": max_sim, "seed": seed}
         print(
-            f"{scenario} {base}: ratio {row.ratio:.2g} {row.ratio_interval}, safer in {row.safer_refits} of "
+            f"{name} {base}: ratio {row.ratio:.2g} {row.ratio_interval}, safer in {row.safer_refits} of "
             f"{row.covered_refits} ({row.refits}) refits; spreads {row.spreads[0]:.2f}, {row.spreads[1]:.2f}, "
             f"of the ratio {row.ratio_spread:.2f}",
             flush=True,
         )
-        content = {"command": command, "headways": HEADWAYS, "rows": rows, "never_failed": silent}
-        out.write_text(json.dumps(content, indent=2) + "\n")
+        about = {"command": "python -m benchmarks.uncertainty.safer_ego", "headways": HEADWAYS}
+        out.write_text(json.dumps({**about, "rows": list(rows.values())}, indent=2) + "\n")
 
 
 def _null_nan(value: object) -> object:
