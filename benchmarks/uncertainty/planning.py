@@ -4,7 +4,7 @@
 
 For each ego and scenario a pilot of the method's own budget (seed 0) plans the simulations for a c.o.v. of 0.8 and of
 half its own; runs with other seeds and that target say how many it took. Limit states with known p take the same test.
-No ego and no limit state was used to choose anything in `samplers.analysis.budget`, which has nothing to choose.
+`samplers.analysis.budget` has no constant that was fitted to any of them.
 """
 
 from __future__ import annotations
