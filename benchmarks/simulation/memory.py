@@ -3,7 +3,7 @@
 Each number of simulations has a process of its own, whose largest resident set is read at its end. f is that of a half
 space, so that nothing but the bookkeeping counts: 2 dimensions, P = Phi(-3).
 
-    python -m benchmarks.simulation.memory --out benchmarks/results/memory.json
+    python -m benchmarks.simulation.memory --out benchmarks/results/run_memory.json
 """
 
 from __future__ import annotations
