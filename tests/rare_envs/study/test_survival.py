@@ -140,6 +140,28 @@ def test_killed_at_random_times_it_gives_the_same_files(tmp_path: Path, risky: s
 
 
 @pytest.mark.slow
+def test_killed_under_workers_and_resumed_anywhere_it_gives_the_same_files(tmp_path: Path, risky: str) -> None:
+    """The driver is killed seven times, and goes on in turn here and with two worker processes."""
+    words = ["estimate", FOLLOWING, "--base", risky, *WORDS, "--chunk", "50", "--out"]
+    finish(tmp_path, *words, "whole")
+    rng, run = np.random.default_rng(22), tmp_path / "run"
+    words = [*words, "run"]
+    for number in range(7):
+        process = start(tmp_path, *words, *(() if number % 2 else ("--workers", "2")))
+        wait_for_more(run / JOURNAL, process)
+        time.sleep(float(rng.uniform(0.0, 0.05)))
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+        assert process.returncode == -signal.SIGKILL
+        if has_simulations(run):
+            words = ["resume", "run"]
+    finish(tmp_path, *words, "--workers", "2")
+    assert tables_of(run) == ["failures.csv", "result.json"]
+    assert answer(run) == answer(tmp_path / "whole")
+    assert (run / "failures.csv").read_bytes() == (tmp_path / "whole" / "failures.csv").read_bytes()
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("kill_at", [1, 2, 3, 4, 5, 6, 8, 10, 12])
 def test_killed_in_the_final_writes_it_gives_the_same_files(kill_at: int, tmp_path: Path, risky: str) -> None:
     words = ["estimate", FOLLOWING, "--base", risky, *WORDS, "--out"]
