@@ -125,7 +125,7 @@ def main() -> None:
     parser.add_argument("--figure", type=Path)
     given = parser.parse_args()
     found = measure()
-    found["command"] = "python -m benchmarks.simulation.scheduler"
+    found["command"] = f"python -m benchmarks.simulation.scheduler --out {given.out} --figure {given.figure}"
     given.out.write_text(json.dumps(found, indent=1) + "\n")
     if given.figure is not None:
         draw_figure(found, given.figure)
