@@ -12,7 +12,7 @@ import rare_envs
 from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli, assert_refused
 
 BAD_ESTIMATES = {
-    "unknown environment": (["rare_envs/CutIn-v1"], ["rare_envs/CutIn-v0"]),
+    "unknown environment": (["rare_envs/CutIn-v7"], ["rare_envs/CutIn-v"]),
     "environment without its namespace": (["CutIn"], ["rare_envs/CutIn-v0"]),
     "the id with HighwayEnv's layout": (
         ["rare_envs/CutIn-kinematics-v0"],
@@ -81,7 +81,7 @@ def test_an_ego_that_fails_on_the_way_is_one_line(cli: Cli, here: Path, risky: s
 
 
 BAD_TRAININGS = {
-    "unknown environment": (["rare_envs/CutIn-v1"], ["rare_envs/CutIn-v0"]),
+    "unknown environment": (["rare_envs/CutIn-v7"], ["rare_envs/CutIn-v"]),
     "misspelt algorithm": ([FOLLOWING, "--algo", "poo"], ["'ppo'"]),
     "no steps": ([FOLLOWING, "--steps", "0"], ["steps", "0"]),
     "no environments": ([FOLLOWING, "--num-envs", "0"], ["num_envs", "0"]),
