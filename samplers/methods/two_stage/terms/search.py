@@ -30,7 +30,7 @@ from samplers.methods.two_stage.terms.order import order_by_terms
 from samplers.methods.two_stage.terms.rounds import mix_terms, pursue_walked, refit_terms
 from samplers.methods.two_stage.terms.settings import DEFAULT_TERM_SETTINGS, TermSettings
 from samplers.methods.two_stage.terms.space import TermSimulator
-from samplers.methods.two_stage.terms.walks import choose_starts, choose_terms, walk_downhill
+from samplers.methods.two_stage.terms.walks import choose_starts, choose_terms, count_walks, walk_downhill
 from samplers.problem import Inputs
 from samplers.statistics.intervals import binomial_cov
 from samplers.statistics.weights import effective_sample_size
@@ -127,11 +127,10 @@ def _walk(search: TermSearch, state: SearchState) -> SimulationSteps[SearchState
     """Walk to the failures of main terms and of others; pursue those that are reached."""
     walking, terms, simulator = search.settings.walks, state.history.terms, search.simulator
     main, others = choose_terms(terms, walking)
-    walkers = walking.walkers * min(1.0, search.budget / walking.usual_budget)
-    each = int(np.clip(walkers / max(len(main), 1), walking.min_walkers, walking.max_walkers))
-    starts = [
-        (j, choose_starts(terms, j, n, walking)) for group, n in ((main, each), (others, walking.scouts)) for j in group
-    ]
+    step = simulator.offer.count_gradients(1) + 1
+    each, scouted = count_walks(len(main), len(others), search.budget, step, walking)
+    planned = ((main, each), (others[:scouted], walking.scouts))
+    starts = [(j, choose_starts(terms, j, n, walking)) for group, n in planned for j in group]
     rows = np.concatenate([part for _, part in starts] or [np.empty(0, dtype=np.int64)])
     term = np.repeat([j for j, _ in starts], [len(part) for _, part in starts]).astype(np.int64)
     chosen = replace(terms, f=terms.f[rows], values=terms.values[rows], ticks=terms.ticks[rows])

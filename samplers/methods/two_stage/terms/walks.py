@@ -33,6 +33,8 @@ class Directions(NamedTuple):
         return Directions(*(np.concatenate(pair) for pair in zip(self, later, strict=True)))
 
 
+MIN_STEPS = 2
+"""Steps that there must be room for before another walk is begun."""
 NEAR_FAILURES = 1.5
 """Standard deviations along the gradient to the threshold within which a gradient is taken for that of the failures."""
 
@@ -91,6 +93,23 @@ def choose_terms(terms: Terms, settings: WalkSettings) -> tuple[list[int], list[
     order = np.lexsort((terms.values[known].min(axis=0), ~ever))  # those that ever are the least come first
     others = [int(j) for j in order if j not in main]
     return main, others[: max(settings.max_scouted, int(ever.sum()) - len(main))]
+
+
+def count_walks(n_main: int, n_others: int, budget: int, step: float, settings: WalkSettings) -> tuple[int, int]:
+    """Return the walks of each main term, and how many other terms are scouted, so that all can make two steps.
+
+    Args:
+        n_main: Main terms.
+        n_others: Other terms.
+        budget: Simulations of the run.
+        step: Simulations that a step takes at most, its gradient included.
+        settings: Of the walks.
+    """
+    affordable = int(settings.budget_share * budget / (MIN_STEPS * step))
+    walkers = settings.walkers * min(1.0, budget / settings.usual_budget)
+    wanted = int(np.clip(walkers / max(n_main, 1), settings.min_walkers, settings.max_walkers))
+    each = min(wanted, max(affordable // max(n_main, 1), 2))
+    return each, min(n_others, max(affordable - each * n_main, 0) // settings.scouts)
 
 
 def choose_starts(terms: Terms, term: int, n: int, settings: WalkSettings) -> NDArray[np.int64]:

@@ -1,4 +1,5 @@
 import numpy as np
+import pytest
 from scipy.stats import norm
 
 import samplers
@@ -7,6 +8,7 @@ from samplers.methods.two_stage.terms.walks import (
     Directions,
     choose_starts,
     choose_terms,
+    count_walks,
     describe_half_spaces,
     walk_downhill,
 )
@@ -94,6 +96,15 @@ def test_walks_without_a_gradient_stay(half_spaces, simulator_of, answer):
     )
     np.testing.assert_array_equal(walks.u, u)
     assert len(walks.directions.values) == 0
+
+
+@pytest.mark.parametrize(
+    ("budget", "step", "expected"),
+    [(6000, 7.5, (12, 8)), (2000, 7.5, (6, 4)), (1000, 7.5, (4, 0)), (1000, 4.0, (6, 3))],
+)
+def test_walks_are_as_many_as_can_make_two_steps(budget, step, expected):
+    """With 4 main terms and 8 others; a quarter of the budget is for walks: at 1,000 and 7.5 a step 250 / 15 = 16."""
+    assert count_walks(4, 8, budget, step, WalkSettings()) == expected
 
 
 def test_directions_are_found_by_term():
