@@ -33,7 +33,7 @@ class Directions(NamedTuple):
         return Directions(*(np.concatenate(pair) for pair in zip(self, later, strict=True)))
 
 
-MIN_STEPS = 2
+MIN_WALK_STEPS = 2
 """Steps that there must be room for before another walk is begun."""
 NEAR_FAILURES = 1.5
 """Standard deviations along the gradient to the threshold within which a gradient is taken for that of the failures."""
@@ -105,7 +105,7 @@ def count_walks(n_main: int, n_others: int, budget: int, step: float, settings: 
         step: Simulations that a step takes at most, its gradient included.
         settings: Of the walks.
     """
-    affordable = int(settings.budget_share * budget / (MIN_STEPS * step))
+    affordable = int(settings.budget_share * budget / (MIN_WALK_STEPS * step))
     walkers = settings.walkers * min(1.0, budget / settings.usual_budget)
     wanted = int(np.clip(walkers / max(n_main, 1), settings.min_walkers, settings.max_walkers))
     each = min(wanted, max(affordable // max(n_main, 1), 2))
