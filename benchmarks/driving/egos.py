@@ -46,7 +46,8 @@ intervals are those of sampling; the events behind a base distribution leave p o
 car-following: under its default, `us101`, `idm` has 7.4e-11 and in 6,000 simulations of `imitation` nothing fails;
 `us101-gap` is a test distribution under which egos and methods can be compared.
 
-`vision` has {most:,} simulations at most, and was not measured in `HardBrake-v0`. There `ppo` and `dqn` were measured
+`vision` has {most:,} simulations at most, and was not measured in `HardBrake-v0`.
+There `imitation`, `ppo` and `dqn` were measured
 before three brakings that were under way when their record began were left out of the base (`idm` then had 1.7e-06).
 `CutIn-v1` has `idm` and `imitation` alone.
 Wall times are from a busy machine of two cores. `dqn` chooses among five
