@@ -59,24 +59,28 @@ def check_sites(scenarios: Sequence[Scenario], sites: Sequence[str]) -> None:
 def choose_base(scenario: Scenario, given: str | PathLike[str] | None, site: str) -> tuple[str, tuple[str, ...]]:
     """Return the base distribution of a scenario at a site, and notes on it.
 
-    Where that of the site has no event frequency, it is the first one that has.
+    Where that of the site has no event frequency, it is the first one that has, as the notes say.
 
     Args:
         scenario: The scenario.
         given: Name or file that the user gave for it; None for the site's.
         site: Name of a site.
+
+    Raises:
+        ValueError: The scenario has no base of the site. A sum of rates at different sites is that of no road.
     """
     if given is not None:
         return str(given), ()
-    known = site in list_sites(scenario)
-    own = site if known else scenario.default_base
-    found = (
-        own if _has_frequency(scenario, own) else next((n for n in scenario.bases if _has_frequency(scenario, n)), own)
-    )
-    if found == site:
+    sites = list_sites(scenario)
+    if site not in sites:
+        raise ValueError(
+            f"{scenario.name} has no base of the site {site!r} (it has {', '.join(sites) or 'none'}): "
+            f"--base {scenario.name}={scenario.default_base} takes another one."
+        )
+    if _has_frequency(scenario, site):
         return site, ()
-    lack = "no event frequency at" if known else "no base of the site"
-    return found, (f"it has {lack} {site!r}: {found!r} is used",)
+    found = next((name for name in scenario.bases if _has_frequency(scenario, name)), site)
+    return found, () if found == site else (f"it has no event frequency at {site!r}: {found!r} is used",)
 
 
 def _has_frequency(scenario: Scenario, name: str) -> bool:

@@ -49,8 +49,8 @@ def risk(
         ego: Its name, file or address, as for `agents.load_ego`; or an object, as for `DrivingProblem`.
         scenarios: Names of scenarios that count nothing twice; car_following may stand in place of cut_in.
         sites: Names of sites, each that of the first base fitted to events of it, such as "us101": the bases of the
-            first are used, and the spread of the rate between it and the others is part of the interval. A scenario
-            without a base of a site uses its default.
+            first are used, and the spread of the rate between it and the others is part of the interval. Each
+            scenario must have a base of the first site, or one in `bases`.
         bases: Base distributions, names or JSON files, by scenario, in place of those of the first site.
         out: Folder for the picture, the numbers and a folder of each scenario, see `rare-envs risk --out`.
         progress: Show a bar on standard error.
@@ -68,9 +68,11 @@ def risk(
     """  # noqa: E501 (the example shows a whole message)
     sites = (sites,) if isinstance(sites, str) else sites
     _check_scenarios(scenarios, sites, bases or {})
+    with as_bad_input(ValueError):
+        chosen = {name: choose_base(scenario_named(name), (bases or {}).get(name), sites[0]) for name in scenarios}
     prepared = []
     for name in scenarios:
-        base, notes = choose_base(scenario_named(name), (bases or {}).get(name), sites[0])
+        base, notes = chosen[name]
         study = _prepare(ego, name, base, options)
         with as_bad_input(ValueError):
             find_frequency(study)

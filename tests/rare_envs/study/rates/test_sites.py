@@ -86,9 +86,9 @@ def test_nothing_is_known_where_nothing_failed(tmp_path: Path) -> None:
 def test_the_base_of_a_scenario_at_a_site() -> None:
     assert choose_base(HARD_BRAKE, None, "us101") == ("us101", ())
     assert choose_base(HARD_BRAKE, Path("mine.json"), "us101") == ("mine.json", ())
-    base, notes = choose_base(HARD_BRAKE, None, "i80")
-    assert base == "us101"
-    assert notes == ("it has no base of the site 'i80': 'us101' is used",)
+    assert choose_base(HARD_BRAKE, "us101", "i80") == ("us101", ())
+    with pytest.raises(ValueError, match=r"hard_brake has no base of the site 'i80' \(it has us101\): --base hard_br"):
+        choose_base(HARD_BRAKE, None, "i80")
 
 
 def test_a_base_whose_events_were_not_counted_gives_way_to_one_whose_were() -> None:

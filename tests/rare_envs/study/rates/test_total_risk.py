@@ -112,18 +112,13 @@ def test_the_spread_between_sites_widens_the_interval(monkeypatch: pytest.Monkey
     assert ", under i80 " in str(one)
 
 
-def test_a_scenario_without_a_base_of_the_site_uses_its_default_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    own = {
-        "hard_brake": ("rare_envs/HardBrake-v0", ["us101"]),
-        "cut_in": ("rare_envs/CutIn-v1", ["us101", "i80"]),
-    }
-    for name, (env_id, bases) in own.items():
-        entries = {base: fitted_entries(name, provenance={"source": {"site": base}}) for base in bases}
-        scenario = replace(SCENARIOS[env_id], bases=entries)
-        monkeypatch.setitem(SCENARIOS._entries, env_id, scenario)
-    found = rare_envs.risk("idm", sites=["i80"], **FEW)
-    assert [each.base_name for each in found.scenarios] == ["i80", "us101"]
-    assert any("no base of the site 'i80'" in note for note in found.notes)
+def test_another_site_needs_a_base_for_each_scenario(monkeypatch: pytest.MonkeyPatch, bases: dict[str, str]) -> None:
+    """Cut-ins of I-80 and brakings of US 101 are those of no road: whoever adds them says so."""
+    entries = {name: fitted_entries("cut_in", provenance={"source": {"site": name}}) for name in ("us101", "i80")}
+    cut_in = replace(SCENARIOS["rare_envs/CutIn-v1"], bases=entries)
+    monkeypatch.setitem(SCENARIOS._entries, "rare_envs/CutIn-v1", cut_in)
+    found = rare_envs.risk("idm", sites=["i80"], bases={"hard_brake": bases["hard_brake"]}, **FEW)
+    assert [each.base_name for each in found.scenarios] == ["i80", bases["hard_brake"]]
 
 
 REFUSED = {
@@ -132,6 +127,7 @@ REFUSED = {
     "unknown scenario": ({"scenarios": ("merge",)}, "merge"),
     "unknown site": ({"sites": ("us102",)}, "us102"),
     "no site": ({"sites": ()}, "site"),
+    "site of one scenario alone": ({"sites": ("i80",), "bases": {}}, "hard_brake has no base of the site 'i80'"),
     "base of another scenario": ({"bases": {"highway": "x.json"}}, "highway"),
     "no such base": ({"bases": {"cut_in": "x.json"}}, "x.json"),
     "no frequency": ({"bases": {"cut_in": "highway"}}, "nobody counted"),
