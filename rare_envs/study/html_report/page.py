@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import contextlib
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ import jinja2
 import numpy as np
 
 from rare_envs.files import replace_text
+from rare_envs.plugins import one_line
 from rare_envs.study.analysis.recorded_question import open_question
 from rare_envs.study.analysis.repeatability import Repeatability
 from rare_envs.study.columns import list_columns
@@ -30,7 +32,7 @@ from rare_envs.study.journal import JOURNAL
 from rare_envs.study.plots import BACKGROUND_DRAWS
 from rare_envs.study.question import prepare
 from rare_envs.study.storage.loaded_study import LoadedStudy, load_study
-from rare_envs.study.storage.names import EPISODES, REPORT
+from rare_envs.study.storage.names import EPISODES, REPORT, RESULT, STUDY
 from rare_envs.traffic.palette import CRASH_COLOUR, ROLE_COLOURS
 from samplers.problem import FloatArray
 
@@ -69,7 +71,7 @@ def write_html_report(
     ordinary = problem.space.sample(BACKGROUND_DRAWS, np.random.default_rng(0))
     source = AtlasSource(folder, problem, failures, ordinary, known)
     page = out or folder / REPORT
-    with as_bad_input(KeyError, TypeError, IndexError):  # a result.json of somebody else's making
+    with _damage_as_bad_input(folder):
         atlas = build_atlas(source, list(study.result.get("modes") or []))
         drawn = _make_figures(study, source)
         text = render_page(study, drawn, atlas)
@@ -105,6 +107,15 @@ def render_page(study: LoadedStudy, figures: Mapping[str, FigureOfPage], atlas: 
         probability=format_probability,
         roles={**ROLE_COLOURS, "outline: crashed": CRASH_COLOUR},
     )
+
+
+@contextlib.contextmanager
+def _damage_as_bad_input(folder: Path) -> Iterator[None]:
+    """Raise what a result.json or study.json of somebody else's making leads to as a BadInput."""
+    try:
+        yield
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, jinja2.TemplateError) as error:
+        raise BadInput(f"{RESULT} or {STUDY} in {str(folder)!r} is damaged: {one_line(error)}.") from error
 
 
 def list_doubts(result: Mapping[str, Any]) -> list[str]:

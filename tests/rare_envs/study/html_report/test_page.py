@@ -10,6 +10,7 @@ import re
 import shutil
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -19,7 +20,9 @@ from PIL import Image
 from typer.testing import Result
 
 from rare_envs.study import BadInput, Question, prepare, run_into
-from rare_envs.study.html_report.page import SECTIONS, list_doubts, write_html_report
+from rare_envs.study.html_report.page import SECTIONS, list_doubts, render_page, write_html_report
+from rare_envs.study.html_report.svg import FigureOfPage
+from rare_envs.study.storage.loaded_study import load_study
 from rare_envs.traffic.palette import ROLE_COLOURS, as_rgb
 
 VOID = {"meta", "br", "img", "link", "path", "use", "rect", "circle", "line", "polygon"}
@@ -110,6 +113,33 @@ def test_warnings_come_first_and_text_of_files_is_escaped(folder: Path, tmp_path
     assert "<script>" not in text and "&lt;script&gt;alert(1)&lt;/script&gt; the estimate is coarse" in text
     assert text.index("the estimate is coarse") < text.index("The answer") and "gave another f" in text
     assert "&lt;b&gt;a note" in text
+
+
+def test_names_of_egos_and_bases_are_escaped(folder: Path) -> None:
+    study, script = load_study(folder), "<script>alert(1)</script>"
+    result = {**study.result, "question": {**study.question, "ego": script, "env_id": f'"{script}'}}
+    about = {**study.about, "ego": {**study.about["ego"], "name": script}, "base": {"name": script}, "command": script}
+    text = render_page(replace(study, result=result, about=about), {}, [])
+    assert "<script" not in text and text.count("&lt;script&gt;alert(1)") >= 6
+
+
+DAMAGED = {
+    "result.json": [{"kinds": [1]}, {"modes": ["x"]}, {"method": "x"}, {"confidence": "x"}, {"n_sim": "x"}],
+    "study.json": [{"versions": [1]}, {"base": [1]}],
+}
+
+
+@pytest.mark.parametrize(("name", "change"), [(name, each) for name, all_ in DAMAGED.items() for each in all_])
+def test_a_damaged_file_is_one_line(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, change: dict[str, object]
+) -> None:
+    monkeypatch.setattr(FigureOfPage, "to_svg", lambda _: "")
+    run = tmp_path / "run"
+    shutil.copytree(folder, run)
+    (run / name).write_text(json.dumps(json.loads((run / name).read_text()) | {"modes": []} | change))
+    with pytest.raises(BadInput, match=r"result\.json or study\.json in .* is damaged"):
+        write_html_report(run, out=tmp_path / "page.html")
+    assert not (tmp_path / "page.html").exists()
 
 
 def test_doubts_are_those_of_method_base_and_f() -> None:
