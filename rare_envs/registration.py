@@ -33,6 +33,7 @@ def _keep_earlier_versions(name: str) -> None:
 
     A version is a scenario of its own, with results of its own. Gymnasium would warn that the earlier ones are out of
     date; it compares their numbers with the highest one of all entries, which are therefore all counted as the first.
+    So `spec.version` is that of the first, and an id without a version means the first; `spec.id` is right.
     """
     family, version = split_version(name)
     if version is None:
