@@ -12,7 +12,7 @@ from samplers.execution.executors.chunks import Chunk, Index, Packed
 
 ATTEMPTS = 3
 """Times that a chunk is computed before it is taken apart, and a row before it counts as lost: where 1 worker in 20 is
-killed by chance, a good row is lost once in 20^6 = 6e7."""
+killed by chance, a good row of a chunk of several is lost once in 20^6 = 6e7, and a chunk of one row once in 8,000."""
 
 
 @dataclass

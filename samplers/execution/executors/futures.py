@@ -96,6 +96,7 @@ class _ForeignPool:
         except (BrokenExecutor, RuntimeError) as error:
             self._replace(error)
             job = self._pool.submit(compute_in_worker, *arguments)
+        future.add_done_callback(lambda given_up: given_up.cancelled() and _cancel(job))
         if hasattr(job, "add_done_callback"):
             job.add_done_callback(lambda done: _pass_on(done, future))
         else:
@@ -166,6 +167,8 @@ _loaded: OrderedDict[str, Any] = OrderedDict()
 
 def _pass_on(done: Any, future: Future[Packed]) -> None:
     """Let a future have what a job has come to; what the pool itself raises means that a worker was lost."""
+    if not future.set_running_or_notify_cancel():  # nobody waits for it any more
+        return
     try:
         reply: Reply = done.result()
     except (Exception, CancelledError) as error:
@@ -182,6 +185,12 @@ def _watch(job: Any, future: Future[Packed]) -> None:
     while not job.done():
         time.sleep(POLL_SECONDS)
     _pass_on(job, future)
+
+
+def _cancel(job: Any) -> None:
+    """Cancel a job that has not begun, where its pool can do that."""
+    with suppress(Exception):  # foreign: some have no `cancel`, some raise where it is too late
+        job.cancel()
 
 
 def _has_submit(executor: Any) -> bool:

@@ -157,14 +157,18 @@ class _Process:
 
     def __init__(self) -> None:
         path = os.pathsep.join(os.path.abspath(place) for place in sys.path)
+        # A group of its own, so that what a simulation has started ends with its process.
         environment = {**os.environ, **dict.fromkeys(_ONE_THREAD, "1"), "PYTHONPATH": path}
         self._child = subprocess.Popen(
-            [sys.executable, "-c", _MAIN], stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment
+            [sys.executable, "-c", _MAIN],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env=environment,
+            start_new_session=True,
         )
         assert self._child.stdin is not None and self._child.stdout is not None
         self._to: IO[bytes] = self._child.stdin
         self._from: IO[bytes] = self._child.stdout
-        self._late = False
 
     def start(self, content: bytes) -> None:
         """Send the work and wait until it is loaded."""
@@ -182,9 +186,14 @@ class _Process:
         return result
 
     def kill(self) -> None:
-        """End the process at once."""
+        """End the process at once, and what it has started, where the system has groups of processes."""
         with suppress(OSError):
-            self._child.kill()
+            if self._child.returncode is not None:  # its number may be that of another process by now
+                return
+            if hasattr(os, "killpg"):
+                os.killpg(self._child.pid, signal.SIGKILL)
+            else:
+                self._child.kill()
 
     def end(self) -> None:
         """End the process and close its streams."""
@@ -195,9 +204,10 @@ class _Process:
                 stream.close()
 
     def _exchange(self, content: bytes, time_limit: float | None) -> Packed | None:
+        late = threading.Event()
         timer = None
         if time_limit is not None:
-            timer = threading.Timer(time_limit, self._end_late)
+            timer = threading.Timer(time_limit, self._end_late, (late,))
             timer.daemon = True
             timer.start()
         try:
@@ -205,7 +215,7 @@ class _Process:
             self._to.flush()
             reply: Reply = pickle.load(self._from)
         except (EOFError, OSError, pickle.UnpicklingError, ValueError) as error:
-            raise WorkerLost(f"no answer within {time_limit:g} s" if self._late else self._describe_end()) from error
+            raise WorkerLost(f"no answer within {time_limit:g} s" if late.is_set() else self._describe_end()) from error
         finally:
             if timer is not None:
                 timer.cancel()
@@ -219,8 +229,8 @@ class _Process:
         self.kill()
         return describe_end(self._child.wait())
 
-    def _end_late(self) -> None:
-        self._late = True
+    def _end_late(self, late: threading.Event) -> None:
+        late.set()
         self.kill()
 
 

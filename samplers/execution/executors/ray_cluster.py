@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Any
 
-from samplers.execution.executors.base import Work, WorkerLost, WorkerPool
+from samplers.execution.executors.base import ExecutorError, Work, WorkerLost, WorkerPool
 from samplers.execution.executors.chunks import Chunk, Index, Packed
 from samplers.execution.executors.futures import compute_in_worker
 from samplers.execution.executors.seeding import SeededWork
@@ -116,8 +116,22 @@ class _RayPool:
         self._thread.join()
 
     def _wait(self) -> None:
-        """Wait for tasks, and cancel those that take too long."""
+        """Wait for tasks until the pool is closed; where Ray itself fails, no task has a result any more."""
         running: dict[Any, tuple[Future[Packed], float]] = {}
+        try:
+            self._watch(running)
+        except Exception as error:  # of Ray: the cluster is gone
+            lost = ExecutorError(f"Ray does not answer any more ({describe(error)}).")
+            waiting = [future for future, _ in running.values()]
+            while waiting or (task := self._new.get()) is not None:
+                future = waiting.pop() if waiting else task[1]
+                if future.set_running_or_notify_cancel():
+                    future.set_exception(lost)
+        for reference in running:
+            self._cancel(reference)
+
+    def _watch(self, running: dict[Any, tuple[Future[Packed], float]]) -> None:
+        """Pass on what tasks have come to, and cancel those that take too long."""
         closed = False
         while not closed:
             closed = self._take_new(running)
@@ -127,8 +141,6 @@ class _RayPool:
             for reference in done:
                 self._pass_on(reference, running.pop(reference)[0])
             self._cancel_late(running)
-        for reference in running:
-            self._cancel(reference)
 
     def _take_new(self, running: dict[Any, tuple[Future[Packed], float]]) -> bool:
         """Take over what was submitted, and wait for it if nothing is running; return whether the pool was closed."""
@@ -140,6 +152,8 @@ class _RayPool:
         return False
 
     def _pass_on(self, reference: Any, future: Future[Packed]) -> None:
+        if not future.set_running_or_notify_cancel():  # nobody waits for it any more
+            return
         try:
             reply: Reply = self._ray.get(reference)
         except Exception as error:  # of Ray: the work's own are in the reply
@@ -159,7 +173,8 @@ class _RayPool:
         for reference in [each for each, (_, begun) in running.items() if begun < latest]:
             future, _ = running.pop(reference)
             self._cancel(reference)
-            future.set_exception(WorkerLost(f"no answer within {self._time_limit:g} s"))
+            if future.set_running_or_notify_cancel():
+                future.set_exception(WorkerLost(f"no answer within {self._time_limit:g} s"))
 
     def _cancel(self, reference: Any) -> None:
         with suppress(Exception):  # it may have ended in the meantime

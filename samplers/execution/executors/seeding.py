@@ -1,7 +1,8 @@
 """Seeding: the global random generators of a chunk, by the seed of the run and the index of the chunk.
 
 A simulation is to draw nothing itself. One that does (a policy that samples its actions) draws the same again when its
-chunk is computed again, on whichever worker, as long as it uses the generators of `random`, `numpy.random` or torch.
+chunk is computed again, on whichever worker, as long as it uses the generators of `random`, `numpy.random` or, on the
+CPU, torch.
 """
 
 from __future__ import annotations

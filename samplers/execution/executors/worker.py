@@ -10,6 +10,7 @@ import os
 import pickle
 import queue
 import signal
+import sys
 import threading
 from typing import IO, Any, NamedTuple
 
@@ -89,9 +90,13 @@ def limit_memory(n_bytes: int | None) -> None:
         import resource
     except ImportError:  # Windows
         return
+    if not os.path.exists("/proc/self/statm"):  # macOS
+        return
     with open("/proc/self/statm", encoding="ascii") as file:
         data = int(file.read().split()[5]) * resource.getpagesize()
-    resource.setrlimit(resource.RLIMIT_DATA, (data + n_bytes, resource.RLIM_INFINITY))
+    hard = resource.getrlimit(resource.RLIMIT_DATA)[1]  # which only root may raise
+    soft = data + n_bytes if hard == resource.RLIM_INFINITY else min(data + n_bytes, hard)
+    resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
 
 
 def _take_streams() -> tuple[IO[bytes], IO[bytes]]:
@@ -110,6 +115,9 @@ def _read(inbox: IO[bytes], requests: queue.SimpleQueue[tuple[Index, Chunk]]) ->
             requests.put(pickle.load(inbox))
     except (EOFError, OSError, pickle.UnpicklingError):
         os._exit(0)
+    except BaseException as error:  # such as no memory: without this thread the process would wait for ever
+        print(f"A request cannot be read: {describe(error)}", file=sys.stderr, flush=True)
+        os._exit(1)
 
 
 def _send(outbox: IO[bytes], reply: Reply) -> None:

@@ -5,13 +5,17 @@ from __future__ import annotations
 import importlib.util
 import multiprocessing
 import threading
-from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from typing import Any
 
+import numpy as np
 import pytest
 
 import samplers
+from samplers.execution.executors.base import WorkerLost
+from samplers.execution.executors.chunks import Chunk
 from samplers.execution.executors.futures import FuturesPool
+from samplers.execution.executors.problem_work import ProblemWork
 from tests.samplers.execution.executors.egos import FAULTS, matrix, problem
 from tests.samplers.execution.executors.test_local_processes import estimate
 
@@ -109,6 +113,28 @@ def test_a_pool_of_threads_survives_an_exit() -> None:
     with ThreadPoolExecutor(1) as threads:
         result = estimate(problem(FAULTS["exiting"]), FuturesPool(threads, time_limit=1e-9), 60)
     assert "1 simulations gave no outcome" in " ".join(result.warnings)
+
+
+class Waiting:
+    """A pool in which nothing begins."""
+
+    def __init__(self) -> None:
+        self.jobs: list[Future[Any]] = []
+
+    def submit(self, function: Any, *arguments: Any) -> Future[Any]:
+        self.jobs.append(Future())
+        return self.jobs[-1]
+
+
+def test_a_chunk_that_nobody_waits_for_is_cancelled_in_the_pool_of_the_caller() -> None:
+    waiting, chunk = Waiting(), Chunk("f", (np.zeros((1, 2)),))
+    work = ProblemWork(samplers.FunctionProblem(matrix, 2), 0.0, "raise")
+    with FuturesPool(waiting, workers=1).open(work, 1) as pool:
+        given_up, wanted = pool.submit((0,), chunk), pool.submit((1,), chunk)
+        assert given_up.cancel()
+    assert [job.cancelled() for job in waiting.jobs] == [True, False]
+    waiting.jobs[1].set_exception(ArithmeticError("gone"))
+    assert isinstance(wanted.exception(), WorkerLost)
 
 
 def test_arguments() -> None:

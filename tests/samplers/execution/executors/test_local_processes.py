@@ -10,7 +10,10 @@ import numpy as np
 import pytest
 
 import samplers
+from samplers.execution.executors.base import WorkerLost
+from samplers.execution.executors.chunks import Chunk
 from samplers.execution.executors.local_processes import LocalProcesses, describe_end
+from samplers.execution.executors.problem_work import ProblemWork
 from samplers.execution.progress import Progress
 from tests.samplers.execution.executors.egos import FAULTS, KillsItself, matrix, problem
 
@@ -126,6 +129,36 @@ def test_nothing_is_left_running() -> None:
     while children() and time.monotonic() < deadline:
         time.sleep(0.05)
     assert children() == 0
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="processes are looked up in /proc")
+def test_what_a_simulation_has_started_ends_with_its_process(tmp_path: Path) -> None:
+    """Such as an external simulator, which the time limit would otherwise leave behind."""
+
+    def start_and_hang(x: Any) -> Any:
+        import subprocess
+
+        child = subprocess.Popen(["sleep", "600"])
+        (tmp_path / "child").write_text(str(child.pid))
+        child.wait()
+
+    work = ProblemWork(samplers.FunctionProblem(start_and_hang, 2), 0.0, "bound")
+    with LocalProcesses(1, time_limit=5.0).open(work, seed=1) as pool:
+        error = pool.submit((0,), Chunk("f", (np.zeros((1, 2)),))).exception()
+    assert isinstance(error, WorkerLost)
+    status = Path(f"/proc/{(tmp_path / 'child').read_text()}/stat")
+    deadline = time.monotonic() + 20
+    while is_running(status) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not is_running(status)
+
+
+def is_running(status: Path) -> bool:
+    """Return whether a process runs, by its file in /proc; a zombie, which waits for its parent, does not."""
+    try:
+        return status.read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False
 
 
 def test_arguments() -> None:

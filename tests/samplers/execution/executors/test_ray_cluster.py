@@ -103,6 +103,15 @@ def test_a_task_that_does_not_end_is_cancelled_by_force(monkeypatch: pytest.Monk
     assert len(FakeCluster.fake.cancelled) == 3
 
 
+def test_a_cluster_that_is_gone_ends_the_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    def gone(self: Any, tasks: Any, num_returns: int, timeout: float) -> Any:
+        raise ConnectionError("the head does not answer")
+
+    monkeypatch.setattr(FakeRay, "wait", gone)
+    with pytest.raises(samplers.ExecutorError, match=r"Ray does not answer any more \(ConnectionError: the head"):
+        estimate(problem(), FakeCluster(), 60)
+
+
 @pytest.mark.parametrize("workers", [pytest.param(each, marks=slow) for each in (1, 2)])
 def test_the_number_of_workers_changes_no_bit(workers: int) -> None:
     asked = samplers.FunctionProblem(matrix, dim=3)

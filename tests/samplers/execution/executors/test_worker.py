@@ -1,5 +1,9 @@
 """What a worker answers, and what it sends of errors that cannot be sent."""
 
+import os
+import subprocess
+import sys
+
 import pytest
 
 from samplers.errors import EvaluationError
@@ -29,3 +33,19 @@ def test_an_exit_is_one_and_other_errors_are_answers():
     with pytest.raises(SystemExit):
         reply_to(compute, (0,), SystemExit(3))
     assert reply_to(lambda index, chunk: (index, chunk), (1,), "x").result == ((1,), "x")
+
+
+@pytest.mark.skipif(not os.path.exists("/proc/self/statm"), reason="the limit needs /proc")
+def test_a_limit_of_memory_stays_below_one_that_is_set_already():
+    code = """
+import resource
+from samplers.execution.executors.worker import limit_memory
+hard = 2**33
+resource.setrlimit(resource.RLIMIT_DATA, (hard, hard))
+limit_memory(2**40)
+print(resource.getrlimit(resource.RLIMIT_DATA) == (hard, hard))
+limit_memory(2**20)
+print(resource.getrlimit(resource.RLIMIT_DATA)[0] < 2**32)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["True", "True"]
