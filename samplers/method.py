@@ -85,10 +85,6 @@ class Outcome:
     draw_weights: tuple[DrawWeights, ...] = ()
     """Weights of single simulations in p; empty where p is no sum over simulations, as with chains."""
 
-    def warn_first(self, about: str) -> "Outcome":
-        """Return the outcome with a warning before its own."""
-        return replace(self, warnings=(about, *self.warnings))
-
     def remark_first(self, about: str) -> "Outcome":
         """Return the outcome with a remark before its own."""
         return replace(self, remarks=(about, *self.remarks))

@@ -180,10 +180,19 @@ def weight_warnings(draws: Draws) -> list[str]:
     """Return warnings about the weights of the failing draws."""
     if len(draws.f) == 0:
         return [f"None of {draws.n:,} final draws failed: p = 0 with a one-sided interval."]
-    messages = []
-    if draws.ess < LOW_ESS:
-        messages.append(f"The failing draws are worth {draws.ess:.0f} independent ones: the estimate is coarse.")
+    return [*describe_low_ess(draws), *heavy_draw_warnings(draws)]
+
+
+def describe_low_ess(draws: Draws) -> list[str]:
+    """Return a sentence where the failing draws, one or more, are worth few independent ones."""
+    if draws.ess >= LOW_ESS:
+        return []
+    return [f"The failing draws are worth {draws.ess:.0f} independent ones: the estimate is coarse."]
+
+
+def heavy_draw_warnings(draws: Draws) -> list[str]:
+    """Return a warning where one of the failing draws, one or more, carries a large share of p."""
     share = largest_weight_share(draws.log_weights)
-    if share > LARGE_SHARE:
-        messages.append(f"One draw carries {100 * share:.0f} % of p: failures lie where the proposal hardly reaches.")
-    return messages
+    if share <= LARGE_SHARE:
+        return []
+    return [f"One draw carries {100 * share:.0f} % of p: failures lie where the proposal hardly reaches."]

@@ -36,7 +36,7 @@ class Surrogate(Method):
     *Noise.* Coordinates that the base distribution calls noise are drawn, not learned; kriging takes what they do to f,
     and noise that is no part of x, as a nugget.
 
-    *Other methods take over*, with a warning: in more than 20 dimensions `TwoStage`, where learning meets no failure
+    *Other methods take over*, with a remark: in more than 20 dimensions `TwoStage`, where learning meets no failure
     and below 60 simulations plain Monte Carlo; without one where a tenth of the first base draws fails.
 
     Where Dubourg, Sudret and Deheeger and this implementation differ: they draw from P[fail] phi by Markov chains, we
@@ -77,9 +77,9 @@ class Surrogate(Method):
         searched = marginalise_noise(inputs, rng)
         if searched.dim > settings.most_dims:
             about = f"Kriging serves up to {settings.most_dims} dimensions, not {searched.dim:,}: two-stage takes over."
-            return (yield from run_two_stage(inputs, goal, budget, rng)).warn_first(about)
+            return (yield from run_two_stage(inputs, goal, budget, rng)).remark_first(about)
         run = SurrogateRun(searched, goal, budget, settings, rng)
         if budget < settings.least_budget:
             about = f"max_sim leaves {budget} simulations, too few to learn from ({settings.least_budget}): "
-            return (yield from run.draw_base()).warn_first(about + "base draws only.")
+            return (yield from run.draw_base()).remark_first(about + "base draws only.")
         return (yield from run.steps())

@@ -12,11 +12,11 @@ def test_many_dimensions_are_left_to_two_stage():
     reference = half_space(30, 2.5)
     result = samplers.estimate(reference.problem, "surrogate", seed=0, max_sim=1500)
     other = samplers.estimate(reference.problem, "two-stage", seed=0, max_sim=1500)
-    assert "two-stage takes over" in result.warnings[0]
+    assert "two-stage takes over" in result.remarks[0]
     assert (result.p, result.interval) == (other.p, other.interval)
     few = samplers.estimate(reference.problem, samplers.Surrogate(n=100), seed=0)  # too few for an exploration
     assert few.n_sim == 100
-    assert "two-stage takes over" in few.warnings[0]
+    assert "two-stage takes over" in few.remarks[0]
 
 
 def test_noise_coordinates_are_not_searched():
@@ -33,7 +33,7 @@ def test_noise_coordinates_are_not_searched():
 
     result = samplers.estimate(Noisy(), "surrogate", seed=2, max_sim=300)
     p = ndtr(-3.0 / np.hypot(1.0, 0.3))
-    assert not any("takes over" in text for text in result.warnings)
+    assert not any("takes over" in text for text in result.remarks)
     assert result.interval[0] <= p <= result.interval[1]
     assert result.cov < 0.5
 

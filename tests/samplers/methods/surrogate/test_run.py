@@ -54,7 +54,7 @@ def test_no_failure_is_left_to_plain_monte_carlo():
     result = run(lambda u: 20.0 - u[:, 0], 2)
     assert result.p == 0
     assert result.status is samplers.Status.NO_HITS
-    assert any("for learning failed" in text for text in result.warnings)
+    assert any("for learning failed" in text for text in result.remarks)
 
 
 def test_common_failure_is_left_to_plain_monte_carlo():
