@@ -96,7 +96,7 @@ class _ForeignPool:
         except (BrokenExecutor, RuntimeError) as error:
             self._replace(error)
             job = self._pool.submit(compute_in_worker, *arguments)
-        future.add_done_callback(lambda given_up: given_up.cancelled() and _cancel(job))
+        future.add_done_callback(lambda given_up: _cancel(job) if given_up.cancelled() else None)
         if hasattr(job, "add_done_callback"):
             job.add_done_callback(lambda done: _pass_on(done, future))
         else:

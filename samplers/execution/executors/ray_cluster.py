@@ -122,11 +122,10 @@ class _RayPool:
             self._watch(running)
         except Exception as error:  # of Ray: the cluster is gone
             lost = ExecutorError(f"Ray does not answer any more ({describe(error)}).")
-            waiting = [future for future, _ in running.values()]
-            while waiting or (task := self._new.get()) is not None:
-                future = waiting.pop() if waiting else task[1]
-                if future.set_running_or_notify_cancel():
-                    future.set_exception(lost)
+            for future, _ in running.values():
+                _fail(future, lost)
+            while (task := self._new.get()) is not None:
+                _fail(task[1], lost)
         for reference in running:
             self._cancel(reference)
 
@@ -173,12 +172,17 @@ class _RayPool:
         for reference in [each for each, (_, begun) in running.items() if begun < latest]:
             future, _ = running.pop(reference)
             self._cancel(reference)
-            if future.set_running_or_notify_cancel():
-                future.set_exception(WorkerLost(f"no answer within {self._time_limit:g} s"))
+            _fail(future, WorkerLost(f"no answer within {self._time_limit:g} s"))
 
     def _cancel(self, reference: Any) -> None:
         with suppress(Exception):  # it may have ended in the meantime
             self._ray.cancel(reference, force=True)
+
+
+def _fail(future: Future[Packed], error: Exception) -> None:
+    """Let a future have an error, unless nobody waits for it any more."""
+    if future.set_running_or_notify_cancel():
+        future.set_exception(error)
 
 
 def _count_places(ray: Any, options: Mapping[str, Any]) -> int:
