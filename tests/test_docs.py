@@ -32,7 +32,7 @@ class Block(NamedTuple):
 
 def blocks(page: str) -> list[Block]:
     fences = re.findall(r"^```(\w*)\n(.*?)^```$", page, flags=re.MULTILINE | re.DOTALL)
-    following = [*fences[1:], ("", "")]
+    following = [*fences[1:], ("", "")][: len(fences)]
     return [
         Block(code, after if kind == "text" else "")
         for (language, code), (kind, after) in zip(fences, following, strict=True)

@@ -13,6 +13,7 @@ from samplers.sample import Sample
 from samplers.serialization import to_json_value
 from samplers.statistics.cluster_sums import unit_sums
 from samplers.statistics.simultaneous import simultaneous_intervals
+from samplers.statistics.unseen_share import add_unseen
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -122,6 +123,7 @@ def compute_curve(estimate: WeightedEstimate, gammas: ArrayLike) -> Curve:
     of plain draws, else log-normal with the t quantile of the effective units. At that level normal
     deviations with the correlation of the curve stay inside all intervals with probability
     `confidence` (sup-t); it is found from 10,000 draws, whose generator comes from the seed.
+    Where p rests on a search, the upper ends hold the share that it may have missed, as that of the estimate does.
     The truth rises with g, so the ends of the band are made to rise too, which only narrows it.
 
     The units of replicates are taken together: with 2 or 3 runs the band can be narrower at gamma
@@ -140,6 +142,9 @@ def compute_curve(estimate: WeightedEstimate, gammas: ArrayLike) -> Curve:
     cov = np.where(sums.is_count, 1.0, cov_inflation(estimate, float(sums.cov[at_gamma]))) * sums.cov
     low, high = simultaneous_intervals(sums, use, p, cov, estimate.confidence, estimate.seed)
     low[use] = np.maximum.accumulate(low[use] * (1 - no_outcome_weight(estimate, sample) / sums.p[use]))
+    high[use] = [
+        add_unseen(*ends, sample.lineages, estimate.confidence) for ends in zip(p[use], high[use], strict=True)
+    ]
     high[use] = np.minimum.accumulate(high[use][::-1])[::-1]
     here = place[:-1]
     return Curve(

@@ -26,6 +26,6 @@ def test_a_trained_ego_collides_far_less_than_a_random_policy(tmp_path: Path) ->
 
 
 def test_an_unknown_environment_leaves_no_folder_behind(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="did you mean 'rare_envs/CutIn-v0'"):
+    with pytest.raises(ValueError, match="did you mean 'rare_envs/CutIn-v1'"):
         train_ego("CutIn", steps=1, out=tmp_path / "new" / "ego.zip")
     assert not (tmp_path / "new").exists()

@@ -11,11 +11,30 @@ from samplers.execution.executors.chunks import Chunk, Index, Packed
 
 
 class WorkerLost(Exception):
-    """A worker ended, or did not answer in time: perhaps because of a row of its chunk, perhaps not."""
+    """A worker ended, or did not answer in time: perhaps because of a row of its chunk, perhaps not.
+
+    Example:
+        The future of an executor of your own has it for a chunk that is to be computed again.
+
+        >>> from concurrent.futures import Future
+        >>> from samplers.execution.executors import WorkerLost
+        >>> future = Future()
+        >>> future.set_exception(WorkerLost("the node has gone"))
+        >>> future.exception()
+        WorkerLost('the node has gone')
+    """
 
 
 class ExecutorError(RuntimeError):
-    """An executor cannot work at all; calling it again would not help."""
+    """An executor cannot work at all; calling it again would not help.
+
+    Example:
+        An executor of your own raises it where waiting and trying again are of no use.
+
+        >>> from samplers import ExecutorError
+        >>> ExecutorError("The queue of the cluster is closed.").final
+        True
+    """
 
     final = True
 

@@ -40,6 +40,8 @@ class RayCluster:
     Example:
         >>> import samplers
         >>> cluster = samplers.RayCluster(address="ray://head:10001", options={"num_gpus": 0.25})
+        >>> cluster.workers is None, cluster.options
+        (True, {'num_gpus': 0.25})
     """
 
     address: str | None = None

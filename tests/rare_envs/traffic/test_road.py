@@ -15,6 +15,7 @@ from rare_envs.scenarios.base import Others, Scenario, columns
 from rare_envs.scenarios.highway import HIGHWAY
 from rare_envs.simulation.rollout import drive
 from rare_envs.simulation.world import World
+from rare_envs.traffic.palette import as_rgb, vehicle_colour
 from rare_envs.traffic.reference_line import ReferenceLine
 from rare_envs.traffic.road import Road, i80, straight
 from rare_envs.traffic.state import State
@@ -252,7 +253,8 @@ def test_a_curved_road_is_drawn_in_the_world() -> None:
             )
             column, row = (8.0 * (point - camera) + torch.tensor([0.3 * FRAME_WIDTH, 120.0])).round().long().tolist()
             at[name] = image[row, column].tolist()
-        assert at == {"ego": [50, 200, 0], "other": [100, 200, 255], "road": [100, 100, 100]}
+        colours = {"ego": list(as_rgb(vehicle_colour("ego"))), "other": list(as_rgb(vehicle_colour("lead")))}
+        assert at == {**colours, "road": [100, 100, 100]}
         # white lines: the two edges whole, so that every column of the image crosses both
         assert ((image == 255).all(axis=-1).sum(axis=0) >= 2 * 2).all()
     renderer.close()

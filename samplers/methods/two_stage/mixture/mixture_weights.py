@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from samplers.methods.two_stage.mixture.settings import DEFAULT_MIXTURE_SETTINGS, MixtureWeightSettings
 from samplers.problem import FloatArray
 
-LEAST_DENSITY_RATIO = 1e-300
+LEAST_DENSITY_RATIO = 1e-150
 """Least ratio of densities to divide by."""
 
 
