@@ -57,6 +57,15 @@ def write_html_report(
 
     Raises:
         BadInput: There is no finished run, what it was about cannot be loaded any longer, or nothing can be written.
+
+    Example:
+        >>> import tempfile
+        >>> from rare_envs.study import Question, prepare, run_into
+        >>> question = Question(env_id="rare_envs/CarFollowing-v0", gamma=3.0, method="mc", max_sim=200)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     report = run_into(Path(folder), prepare(question))
+        ...     [page.name for page in write_html_report(Path(folder))]
+        ['report.html']
     """
     if figures is not None and figures not in FORMATS:
         raise BadInput(f"Expected --figures {', '.join(FORMATS)}, got {figures!r}.")
