@@ -65,6 +65,9 @@ def plan_by_pilots(
         BadInput: The question cannot be answered, or a pilot is none: nothing failed, or its c.o.v. is above 0.5.
     """
     found: dict[str, samplers.PlannedRun] = {}
+    with as_bad_input(ValueError):
+        for name in methods:  # all of them before the first pilot, which may take hours
+            samplers.get_method(name)
     study = prepare(replace(question, method=methods[0], ensemble_run=False))
     for name in methods:
         with as_bad_input(ValueError):

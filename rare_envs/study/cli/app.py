@@ -93,6 +93,8 @@ def estimate_command(
 
     typed = {name for name in context.params if is_typed(context, name)}
     question = join_question({} if config is None else read_question_file(config), env, options.arguments(), typed)
+    if question.max_p is None:
+        _refuse_options_of_a_limit(typed)
     with show_what_is_known(lambda known: _show(known, None, as_json)), keep_stdout_for_the_answer():
         with as_bad_input(ValueError):
             executor = places.make()
@@ -103,6 +105,17 @@ def estimate_command(
             else run_into(out, study, progress=True, force=force, executor=executor)
         )
     _answer(report, out, as_json)
+
+
+def _refuse_options_of_a_limit(typed: set[str]) -> None:
+    """Refuse options that a question without --max-p would ignore.
+
+    Raises:
+        BadInput: One was typed. A folder of an older run may have them, so that the question itself allows them.
+    """
+    for name, option in (("given_base", "--given-base"), ("gate_confidence", "--confidence")):
+        if name in typed:
+            raise BadInput(f"Expected {option} together with --max-p, the limit of p.")
 
 
 def _answer(report: Any, out: Path | None, as_json: bool) -> NoReturn:
@@ -302,6 +315,7 @@ def export_ego_command(
 @app.command("replay")
 @use_one_thread()
 def replay_command(
+    context: typer.Context,
     run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder that rare-envs estimate --out has written.")],
     failure: Annotated[int, typer.Option(help="Which failure; 0 is the most likely.")] = 0,
     out: Annotated[Path | None, typer.Option(help="A .gif of the drive, or a .png of its worst moment.")] = None,
@@ -322,6 +336,8 @@ def replay_command(
     if replay_each:
         if out is not None:
             raise BadInput("Expected --all without --out: a film shows one failure.")
+        if is_typed(context, "failure"):
+            raise BadInput("Expected --all without --failure: it simulates all of them.")
         replay_all(run, ego, trust, as_json)
     if out is not None:
         check_film_path(out)

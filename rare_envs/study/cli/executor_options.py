@@ -66,5 +66,7 @@ class ExecutorOptions:
             raise ValueError(f"{refused} does not go with --executor {(self.executor or ExecutorKind.LOCAL).value}.")
         if self.executor is ExecutorKind.RAY:
             return samplers.RayCluster(self.address, self.workers, self.time_limit)
+        if self.memory_limit is not None and not 0.0 < self.memory_limit < float("inf"):
+            raise ValueError(f"Expected --memory-limit to be a number of GiB above 0, got {self.memory_limit}.")
         memory = None if self.memory_limit is None else self.memory_limit * GIB
         return samplers.LocalProcesses(self.workers, self.time_limit, memory)

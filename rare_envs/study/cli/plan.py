@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rare_envs.study.cli.options import AlgoOption, JsonOption, QuestionOptions, StatsOption
-from rare_envs.study.cli.shell import keep_stdout_for_the_answer, print_json
+from rare_envs.study.cli.shell import is_typed, keep_stdout_for_the_answer, print_json
+from rare_envs.study.errors import BadInput
 from rare_envs.threads import use_one_thread
 from training.command_line import spread_options
 
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 @spread_options
 @use_one_thread()
 def plan_command(
+    context: typer.Context,
     target: Annotated[
         str, typer.Argument(metavar="ENV|RUN", help="Environment, of which pilots are run; or the folder of a run.")
     ],
@@ -39,6 +41,7 @@ def plan_command(
 
     with keep_stdout_for_the_answer():
         if Path(target).is_dir():
+            _refuse_options_of_pilots(context)
             found = plan_from_result(read_recorded(Path(target)), cov)
         else:
             arguments = options.arguments()
@@ -49,6 +52,18 @@ def plan_command(
         print_json({"target_cov": cov, "runs": [each.to_dict() for each in found]})
     else:
         _print_plan(found, cov)
+
+
+def _refuse_options_of_pilots(context: typer.Context) -> None:
+    """Refuse what was typed beside the folder of a run, which has a question of its own.
+
+    Raises:
+        BadInput: There is such an option.
+    """
+    typed = sorted(name for name in context.params if is_typed(context, name))
+    refused = [name for name in typed if name not in ("target", "cov", "as_json")]
+    if refused:
+        raise BadInput(f"Expected the folder of a run without --{refused[0].replace('_', '-')}: nothing is simulated.")
 
 
 def _print_plan(found: tuple[PlannedRun, ...], cov: float) -> None:

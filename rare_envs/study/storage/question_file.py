@@ -92,7 +92,9 @@ def _load_mapping(path: Path) -> dict[str, Any]:
     try:
         if path.stat().st_size > MAX_QUESTION_BYTES:
             raise BadInput(f"{str(path)!r} has more than {MAX_QUESTION_BYTES:,} bytes.")
-        given = yaml.safe_load(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
+        given = yaml.safe_load(text)
+        _refuse_repeated_keys(path, text)
     except OSError as error:
         raise BadInput(f"Cannot read {str(path)!r}: {error.strerror}.") from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:
@@ -100,3 +102,16 @@ def _load_mapping(path: Path) -> dict[str, Any]:
     if not isinstance(given, dict) or not all(isinstance(key, str) for key in given):
         raise BadInput(f"Expected {str(path)!r} to have lines like gamma: 0.0, got {reprlib.repr(given)}.")
     return given
+
+
+def _refuse_repeated_keys(path: Path, text: str) -> None:
+    """Refuse a key that stands twice, of which PyYAML takes the last one without a word.
+
+    Raises:
+        BadInput: There is one.
+    """
+    node = yaml.compose(text, Loader=yaml.SafeLoader)
+    keys = [key.value for key, _ in node.value] if isinstance(node, yaml.MappingNode) else []
+    for key in keys:
+        if keys.count(key) > 1:
+            raise BadInput(f"{str(path)!r} has the key {key!r} more than once.")

@@ -73,6 +73,7 @@ def test_refusals_are_one_line(cli: Cli, run: Path) -> None:
     assert_refused(cli("corpus", "run", "--ego", "nowhere.zip"), "nowhere.zip")
     assert_refused(cli("corpus", "run", "--ego", "idm", "--junit", "no/where.xml"), "no folder")
     assert_refused(cli("replay", "run", "--all", "--out", "a.gif"), "--all without --out")
+    assert_refused(cli("replay", "run", "--all", "--failure", 0), "--all without --failure")
     assert_refused(cli("replay", "run", "--ego", "idm", "--failure", "9999"), "from 0 to")
     Path("corpus", "stray.json").write_text("{}")
     assert_refused(cli("corpus", "run", "--ego", "idm"), "stray.json", "format")

@@ -31,6 +31,8 @@ def test_options_name_an_executor() -> None:
         (("--workers", 2, "--address", "auto"), "--address does not go with --executor local"),
         (("--executor", "ray", "--memory-limit", 2), "--memory-limit does not go with --executor ray"),
         (("--workers", 0), "workers"),
+        (("--workers", 2, "--memory-limit", -1), "a number of GiB above 0, got -1.0"),
+        (("--workers", 2, "--memory-limit", "nan"), "a number of GiB above 0, got nan"),
         (("--workers", 1, "--chunk", 0), "chunk"),
     ],
 )

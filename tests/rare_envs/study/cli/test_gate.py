@@ -41,7 +41,13 @@ def test_without_a_limit_nothing_changes(cli: Cli, risky: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "word"), [(("--max-p", 2), "max_p"), (("--max-p", 0.1, "--confidence", 0.4), "0.4")]
+    ("options", "word"),
+    [
+        (("--max-p", 2), "max_p"),
+        (("--max-p", 0.1, "--confidence", 0.4), "0.4"),
+        (("--confidence", 0.9), "--confidence together with --max-p"),
+        (("--given-base",), "--given-base together with --max-p"),
+    ],
 )
 def test_refusals(cli: Cli, options: tuple[object, ...], word: str) -> None:
     assert_refused(cli(*SMALL, *options), word)

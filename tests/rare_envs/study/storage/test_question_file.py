@@ -37,6 +37,7 @@ def test_what_is_typed_comes_before_the_file(cli: Cli, risky: str, tmp_path: Pat
     ("text", "message"),
     [
         ("env: rare_envs/CutIn-v0\nmax_sims: 3\n", r"unknown key 'max_sims' \(did you mean 'max_sim'\?\)"),
+        ("env: rare_envs/CutIn-v0\nseed: 1\nseed: 2\n", "has the key 'seed' more than once"),
         ("env: rare_envs/CutIn-v0\ntrust: true\n", "cannot say trust: give --trust on the command line"),
         ("env: rare_envs/CutIn-v0\ngamma: low\n", "Expected gamma to be float, got 'low'"),
         ("env: rare_envs/CutIn-v0\nseed: 1.5\n", "Expected seed to be int"),
