@@ -7,9 +7,9 @@ only: whoever changes the method by them needs another set.
 
 import numpy as np
 from scipy.special import log_ndtr, ndtr
-from scipy.stats import beta, chi2, norm
+from scipy.stats import norm
 
-from benchmarks.estimators.two_stage.blind_states import Make, any_of, integrate, rotate
+from benchmarks.estimators.two_stage.blind_states import Make, any_of, cone_beyond, integrate, rotate
 from samplers.problem import FloatArray
 
 
@@ -29,13 +29,7 @@ def other_branches() -> Make:
 
 def narrow_cone() -> Make:
     """Return a cone of half angle arccos(0.8) beyond a radius, in 4 dimensions."""
-    q = rotate(4, 22)[:, 0]
-
-    def f(u: FloatArray) -> FloatArray:
-        r = np.linalg.norm(u, axis=1)
-        return np.asarray(np.maximum(3.3 - r, 5.0 * (0.8 - u @ q / r)))
-
-    return f, 4, float(chi2.sf(3.3**2, 4) * 0.5 * beta.sf(0.8**2, 0.5, 1.5))
+    return cone_beyond(3.3, cosine=0.8, steepness=5.0, axis=rotate(4, 22)[:, 0])
 
 
 def four_planes() -> Make:

@@ -42,13 +42,18 @@ def three_steepnesses() -> Make:
 
 def cone() -> Make:
     """Return a cone of half angle arccos(0.75) beyond a radius, in 8 dimensions."""
-    q = rotate(8, 2)[:, 0]
+    return cone_beyond(4.2, cosine=0.75, steepness=4.0, axis=rotate(8, 2)[:, 0])
+
+
+def cone_beyond(radius: float, cosine: float, steepness: float, axis: FloatArray) -> Make:
+    """Return a cone about an axis, a unit vector (d,), beyond a radius, and its exact probability."""
+    d = len(axis)
 
     def f(u: FloatArray) -> FloatArray:
         r = np.linalg.norm(u, axis=1)
-        return np.asarray(np.maximum(4.2 - r, 4.0 * (0.75 - u @ q / r)))
+        return np.asarray(np.maximum(radius - r, steepness * (cosine - u @ axis / r)))
 
-    return f, 8, float(chi2.sf(4.2**2, 8) * 0.5 * beta.sf(0.75**2, 0.5, 3.5))
+    return f, d, float(chi2.sf(radius**2, d) * 0.5 * beta.sf(cosine**2, 0.5, (d - 1) / 2))
 
 
 def one_large_jump() -> Make:

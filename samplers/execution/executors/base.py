@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import AbstractContextManager
 from typing import Protocol, runtime_checkable
 
 from samplers.execution.executors.chunks import Chunk, Index, Packed
+from samplers.validation import check_number, check_whole
 
 
 class WorkerLost(Exception):
@@ -106,3 +108,12 @@ class Executor(Protocol):
         Raises:
             ValueError: The work cannot be sent to workers.
         """
+
+
+def check_limits(workers: int | None, **limits: float | None) -> None:
+    """Raise a ValueError unless there is at least one worker and each limit is above 0; None is no limit."""
+    if workers is not None:
+        check_whole("workers", workers, 1)
+    for name, limit in limits.items():
+        if limit is not None:
+            check_number(name, limit, 0.0, math.inf)

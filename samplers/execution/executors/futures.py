@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import faulthandler
-import math
 import os
 import threading
 import time
@@ -15,12 +14,11 @@ from dataclasses import dataclass
 from hashlib import blake2b
 from typing import Any
 
-from samplers.execution.executors.base import ExecutorError, Work, WorkerLost, WorkerPool
+from samplers.execution.executors.base import ExecutorError, Work, WorkerLost, WorkerPool, check_limits
 from samplers.execution.executors.chunks import Chunk, Index, Packed
 from samplers.execution.executors.seeding import SeededWork
 from samplers.execution.executors.transport import pack_work
 from samplers.execution.executors.worker import Reply, describe, make_portable
-from samplers.validation import check_number, check_whole
 
 POLL_SECONDS = 0.05
 """Time between two looks at jobs that cannot tell when they are done, such as those of submitit."""
@@ -58,10 +56,7 @@ class FuturesPool:
         """Check the values."""
         if not (_has_submit(self.executor) or callable(self.executor)):
             raise ValueError(f"Expected an object with submit, or a function that makes one, got {self.executor!r}.")
-        if self.workers is not None:
-            check_whole("workers", self.workers, 1)
-        if self.time_limit is not None:
-            check_number("time_limit", self.time_limit, 0.0, math.inf)
+        check_limits(self.workers, time_limit=self.time_limit)
 
     @contextmanager
     def open(self, work: Work, seed: int) -> Iterator[WorkerPool]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import pickle
 import queue
@@ -16,12 +15,11 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import IO, Any
 
-from samplers.execution.executors.base import Work, WorkerLost, WorkerPool
+from samplers.execution.executors.base import Work, WorkerLost, WorkerPool, check_limits
 from samplers.execution.executors.chunks import Chunk, Index, Packed
 from samplers.execution.executors.seeding import SeededWork
 from samplers.execution.executors.transport import pack_work
 from samplers.execution.executors.worker import Reply
-from samplers.validation import check_number, check_whole
 
 LOAD_SECONDS = 300.0
 """Longest time that a worker may take to import and to load the problem."""
@@ -59,11 +57,7 @@ class LocalProcesses:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        if self.workers is not None:
-            check_whole("workers", self.workers, 1)
-        for name, value in (("time_limit", self.time_limit), ("memory_limit", self.memory_limit)):
-            if value is not None:
-                check_number(name, value, 0.0, math.inf)
+        check_limits(self.workers, time_limit=self.time_limit, memory_limit=self.memory_limit)
 
     @contextmanager
     def open(self, work: Work, seed: int) -> Iterator[WorkerPool]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import queue
 import threading
 import time
@@ -12,13 +11,12 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Any
 
-from samplers.execution.executors.base import ExecutorError, Work, WorkerLost, WorkerPool
+from samplers.execution.executors.base import ExecutorError, Work, WorkerLost, WorkerPool, check_limits
 from samplers.execution.executors.chunks import Chunk, Index, Packed
 from samplers.execution.executors.futures import compute_in_worker
 from samplers.execution.executors.seeding import SeededWork
 from samplers.execution.executors.transport import pack_work
 from samplers.execution.executors.worker import Reply, describe
-from samplers.validation import check_number, check_whole
 
 START_SECONDS = 300.0
 """Time in which a worker process may start and load the problem; a task that takes it and its time limit is cancelled
@@ -55,10 +53,7 @@ class RayCluster:
 
     def __post_init__(self) -> None:
         """Check the values."""
-        if self.workers is not None:
-            check_whole("workers", self.workers, 1)
-        if self.time_limit is not None:
-            check_number("time_limit", self.time_limit, 0.0, math.inf)
+        check_limits(self.workers, time_limit=self.time_limit)
 
     @contextmanager
     def open(self, work: Work, seed: int) -> Iterator[WorkerPool]:
