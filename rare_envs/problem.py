@@ -20,6 +20,7 @@ from rare_envs.egos.wrappers import find_action_bounds
 from rare_envs.make import set_up
 from rare_envs.scenarios.registry import find_scenario
 from rare_envs.search_terms import EpisodeTerms, simulate_terms
+from rare_envs.simulation.compiled.selection import CompiledRollout, CompilerFails, NotCompiled, find_compiled_rollout
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.measurement import Measurement
 from rare_envs.simulation.rollout import StochasticDriver, rollout
@@ -41,6 +42,8 @@ RULE_CHUNK = 4096
 POLICY_CHUNK = 256
 """Likewise with a policy, which is slower."""
 
+CORES = ("auto", "torch", "numba")
+"""Choices of what simulates."""
 AMBIGUOUS = (
     "the ego's actions 0 to 4 were taken as five accelerations; one that was trained in HighwayEnv needs "
     "action='meta' (--action meta)"
@@ -91,6 +94,7 @@ class DrivingProblem:
         base: Any = None,
         noise: bool | str = True,
         chunk_size: int | None = None,
+        core: str = "auto",
         **make_kwargs: Any,
     ) -> None:
         """Check everything that can be checked before a simulation.
@@ -108,6 +112,9 @@ class DrivingProblem:
             chunk_size: Rollouts that a worker of `samplers.estimate(..., workers=2)` makes at once; None for 4096 with
                 rules and 256 with a policy, or what fits into memory. Few suit a slow ego. A network rounds differently
                 by batch, so another number gives other bits; another number of workers does not.
+            core: What simulates: "torch", the reference, for everything; "numba", compiled rollouts, for the scripted
+                scenarios with the IDM as ego and the measure `ttc`; "auto" for the compiled ones where they can be had.
+                They differ by rounding; an estimate says which it used (`DrivingProblem.core`).
             **make_kwargs: Further keyword arguments of `gym.make` for this id. Without an `observation` the ego's
                 `observation_space` decides: a `Dict` names the kinds, the space of the lidar stands for "lidar", and
                 any other for "features".
@@ -128,8 +135,38 @@ class DrivingProblem:
         with _ego_errors_as_value_errors(ego):
             self.driver = as_driver(ego, self.world, self.needs)
         self.varies = self.needs.varies
+        self._core = core
+        self._compiled = self._find_compiled()
         for note in self.notes:
             warnings.warn(note, AmbiguousActions, stacklevel=2)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Set an attribute; another world or driver has another compiled rollout, or none, and other gradients."""
+        super().__setattr__(name, value)
+        if name in ("world", "driver") and "_compiled" in vars(self):
+            self._compiled = self._find_compiled()
+            vars(self).pop("gradient", None)
+
+    def _find_compiled(self) -> CompiledRollout | None:
+        """Return the compiled rollout, if the core that was asked for is one and there is one."""
+        core = self._core
+        if core not in CORES:
+            raise ValueError(f"Expected core to be one of {', '.join(map(repr, CORES))}, got {core!r}.")
+        if core == "torch":
+            return None
+        try:
+            return find_compiled_rollout(self.world, self.driver)
+        except NotCompiled as reason:
+            if core == "numba":
+                raise ValueError(f"core='numba' cannot simulate this: {reason}.") from reason
+            if isinstance(reason, CompilerFails):
+                warnings.warn(f"{reason}; torch simulates, which is slower.", stacklevel=3)
+            return None
+
+    @property
+    def core(self) -> str:
+        """What simulates `evaluate`: "torch" or "numba"."""
+        return "torch" if self._compiled is None else "numba"
 
     @property
     def dim(self) -> int:
@@ -295,11 +332,14 @@ class DrivingProblem:
 
     def _simulate(self, x: NDArray[np.float64], failed_rows: dict[int, str] | None) -> NDArray[np.float64]:
         x = self.space.validate(np.atleast_2d(x))
-        f = np.empty(len(x))
-        first = 0
-        for end in self._roll_out(self.world, x, failed_rows):
-            f[first : first + len(end.f)] = end.f.numpy()
-            first += len(end.f)
+        if self._compiled is not None:
+            f = self._compiled(x).astype(np.float64)
+        else:
+            f = np.empty(len(x))
+            first = 0
+            for end in self._roll_out(self.world, x, failed_rows):
+                f[first : first + len(end.f)] = end.f.numpy()
+                first += len(end.f)
         self._check_known(x, f, failed_rows)
         return f
 

@@ -21,6 +21,9 @@ FAMILIES = {
 }
 """Public names that several modules define, each in the same role, and the role."""
 
+TWINS = ("rare_envs/simulation/compiled/equations.py", "rare_envs/simulation/compiled/rollouts.py")
+"""Modules whose functions are compiled twins of torch functions, and have their names."""
+
 QUESTION_WORDS = ("What", "How", "Where", "When", "Who", "Which", "Whether", "Why")
 
 
@@ -50,7 +53,8 @@ def defined_twice(trees: dict[str, ast.Module]) -> dict[str, list[str]]:
     """Return public names that more than one module defines, and these modules."""
     places = defaultdict(list)
     for path, tree in trees.items():
-        for name in set(public_names(tree)):
+        functions = {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
+        for name in set(public_names(tree)) - (functions if path in TWINS else set()):
             places[name].append(path)
     return {name: paths for name, paths in sorted(places.items()) if len(paths) > 1}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -14,7 +15,7 @@ from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import VEHICLE_LENGTH, State
 from rare_envs.traffic.vehicle_models import NEAR_ZERO
 
-_MIN_RATIO = 1e-24
+MIN_RATIO = 1e-24
 """Floor of speed / desired speed under the root: its slope stays finite at standstill, in single precision too."""
 
 
@@ -74,6 +75,11 @@ class IDM:
     """Whether T v + v dv / (2 sqrt(a_max b)) is cut off at 0, as Treiber and Kesting write it ("Traffic Flow Dynamics",
     2013, chapter 11): a lead that pulls away fast is then not braked for."""
 
+    @property
+    def closing_gain(self) -> float:
+        """1 / (2 sqrt(a_max b)) [s^2/m], the factor of v dv in s*."""
+        return 0.5 / math.sqrt(self.max_acceleration * self.comfortable_deceleration)
+
     @classmethod
     def highway_env(cls, desired_speed: float) -> IDM:
         """Return HighwayEnv's `IDMVehicle`: distances of centres, jam distance 10 m, accelerations within 6 m/s^2."""
@@ -101,11 +107,10 @@ class IDM:
             ratio: Its speed as a share of its desired speed.
             lead: The lead.
         """
-        closing_gain = 0.5 / (self.max_acceleration * self.comfortable_deceleration) ** 0.5
-        headway = self.time_headway + lead.closing_speed * closing_gain
+        headway = self.time_headway + lead.closing_speed * self.closing_gain
         desired_gap = self.jam_distance + speed * (headway.clamp(min=0.0) if self.cut_off else headway)
         if self.jam_distance_speed:
-            desired_gap = desired_gap + self.jam_distance_speed * ratio.clamp(min=_MIN_RATIO).sqrt()
+            desired_gap = desired_gap + self.jam_distance_speed * ratio.clamp(min=MIN_RATIO).sqrt()
         share: Tensor = desired_gap / (lead.gap + self.added_length).clamp(min=NEAR_ZERO)
         return share.square()
 

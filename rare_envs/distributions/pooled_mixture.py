@@ -269,26 +269,26 @@ def _find_quantile(
     """
     pairs = zip(parts, conditionals, strict=True)
     quantiles = np.stack([part.quantile(j, x, conditional, u) for part, conditional in pairs])
-    rows = x.copy()
-
-    def error_at(values: FloatArray) -> FloatArray:
-        rows[:, j] = values
-        return _pooled_quantile_scale(j, rows, parts, conditionals) - u
-
+    errors = _Errors(j, x.copy(), u, list(parts), list(conditionals))
     left, right = quantiles.min(axis=0), quantiles.max(axis=0)
-    error_left, error_right = np.minimum(error_at(left), 0.0), np.maximum(error_at(right), 0.0)
-    value = np.where(-error_left < error_right, left, right)
-    done = (np.minimum(-error_left, error_right) <= ROOT_TOLERANCE * (1.0 + np.abs(u))) | _is_narrow(left, right)
-    was_low = np.zeros(len(u), dtype=bool)
+    error_left, error_right = np.minimum(errors.at(left), 0.0), np.maximum(errors.at(right), 0.0)
+    found = np.where(-error_left < error_right, left, right)
+    done = errors.are_small(np.minimum(-error_left, error_right)) | _is_narrow(left, right)
+    was_low, running = np.zeros(len(u), dtype=bool), np.arange(len(u))
     for step in range(SEARCH_STEPS):
-        if done.all():
+        if done.any():  # what is done is left out: most rows need half of the steps of the last one
+            keep = np.flatnonzero(~done)
+            running, errors = running[keep], errors.take(keep)
+            left, right, error_left, error_right = (each[keep] for each in (left, right, error_left, error_right))
+            was_low = was_low[keep]
+        if not running.size:
             break
-        with np.errstate(all="ignore"):  # rows that are done may have an empty bracket
+        with np.errstate(all="ignore"):
             secant = right - error_right * (right - left) / (error_right - error_left)
         inside = np.isfinite(secant) & (secant > left) & (secant < right)
-        guess = np.where(inside & (step % 3 != 2), secant, left + 0.5 * (right - left))
-        value = np.where(done, value, guess)
-        error = error_at(value)
+        value = np.where(inside & (step % 3 != 2), secant, left + 0.5 * (right - left))
+        error = errors.at(value)
+        found[running] = value
         low_side = error <= 0
         # Illinois: an end that stays a second time counts half, so that the next step passes the root.
         again = low_side == was_low if step else np.zeros_like(low_side)
@@ -296,8 +296,35 @@ def _find_quantile(
         error_right = np.where(low_side, factor * error_right, error)
         error_left = np.where(low_side, error, factor * error_left)
         left, right = np.where(low_side, value, left), np.where(low_side, right, value)
-        done |= (np.abs(error) <= ROOT_TOLERANCE * (1.0 + np.abs(u))) | _is_narrow(left, right)
-    return np.asarray(value)
+        done = errors.are_small(np.abs(error)) | _is_narrow(left, right)
+    return np.asarray(found)
+
+
+class _Errors(NamedTuple):
+    """Errors of guesses of the value of column j, on the quantile scale; row by row."""
+
+    j: int
+    x: FloatArray
+    """With the columns before j, shape (n, d); column j is written over."""
+    u: FloatArray
+    """What is wanted on the quantile scale, shape (n,)."""
+    parts: list[_Part]
+    conditionals: list[TruncatedConditional]
+
+    def at(self, values: FloatArray) -> FloatArray:
+        """Return the errors of values (n,)."""
+        self.x[:, self.j] = values
+        return _pooled_quantile_scale(self.j, self.x, self.parts, self.conditionals) - self.u
+
+    def are_small(self, error: FloatArray) -> NDArray[np.bool_]:
+        """Return whether errors (n,) of either sign are within the tolerance."""
+        small: NDArray[np.bool_] = error <= ROOT_TOLERANCE * (1.0 + np.abs(self.u))
+        return small
+
+    def take(self, rows: NDArray[np.intp]) -> _Errors:
+        """Return those of some rows."""
+        parts = [part._replace(log_weight=part.log_weight[rows]) for part in self.parts]
+        return _Errors(self.j, self.x[rows], self.u[rows], parts, [each.take(rows) for each in self.conditionals])
 
 
 def _is_narrow(left: FloatArray, right: FloatArray) -> NDArray[np.bool_]:

@@ -41,6 +41,12 @@ class TruncatedConditional(NamedTuple):
     low: Any
     high: Any
 
+    def take(self, rows: NDArray[np.intp]) -> TruncatedConditional:
+        """Return the distributions of some rows."""
+        n = self.mean.shape[1]
+        low, high = (np.broadcast_to(end, n)[rows] for end in (self.low, self.high))
+        return TruncatedConditional(self.log_weights[:, rows], self.mean[:, rows], self.scale, low, high)
+
     def log_mass(self) -> FloatArray:
         """Return the log mass of each component in [low, high], (K, n)."""
         a = (self.low - self.mean) / self.scale
@@ -119,10 +125,8 @@ class _Search(NamedTuple):
 
     def take(self, keep: NDArray[np.intp]) -> _Search:
         """Return the search of some rows."""
-        log_weights, mean, scale, low, high = self.conditional
-        part = TruncatedConditional(log_weights[:, keep], mean[:, keep], scale, low[keep], high[keep])
         columns = (self.log_cdf_low[:, keep], self.log_sf_low[:, keep])
-        return _Search(part, *columns, *(array[keep] for array in self[3:]))
+        return _Search(self.conditional.take(keep), *columns, *(array[keep] for array in self[3:]))
 
     def log_cdf_and_density(self) -> tuple[FloatArray, FloatArray]:
         """Return the log mass of [low, x] and log density at x under the unnormalised weights, (n,)."""

@@ -13,7 +13,7 @@ from rare_envs.traffic.state import VEHICLE_LENGTH
 
 STEERING_LIMIT = math.pi / 3
 """Largest steering angle [rad], HighwayEnv's."""
-_MAX_SLIP_SINE = math.sin(math.atan(0.5 * math.tan(STEERING_LIMIT)))
+MAX_SLIP_SINE = math.sin(math.atan(0.5 * math.tan(STEERING_LIMIT)))
 """Sine of the slip angle at the largest steering angle. Near 1 single precision may give a slip beyond pi / 2, and its
 tangent the other sign."""
 STANDARD_GRAVITY = 9.80665
@@ -87,7 +87,7 @@ def steering_for(yaw_rate: Tensor, speed: Tensor) -> Tensor:
         Steering angle [rad], shape (B,).
     """
     sine = VEHICLE_LENGTH / 2 / speed.clamp(min=NEAR_ZERO) * yaw_rate
-    slip = torch.asin(sine.clamp(-_MAX_SLIP_SINE, _MAX_SLIP_SINE))
+    slip = torch.asin(sine.clamp(-MAX_SLIP_SINE, MAX_SLIP_SINE))
     return torch.atan(2.0 * torch.tan(slip)).clamp(-STEERING_LIMIT, STEERING_LIMIT)
 
 

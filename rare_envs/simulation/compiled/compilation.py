@@ -1,0 +1,82 @@
+"""Compilation by numba, with machine code that is kept for the next process."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import numba
+import numpy as np
+
+Function = TypeVar("Function", bound=Callable[..., object])
+PACKAGE = Path(__file__).parents[2]
+_CONFIG: Any = numba.config
+
+
+def compiled(function: Function) -> Function:
+    """Compile a function when it is first called; division by zero gives inf, as in torch.
+
+    numba looks at a function's own file alone to tell whether its kept code is out of date, not at those of the
+    functions and constants that it uses. So the folder is named after the sources of the whole package.
+
+    Raises:
+        ImportError: numba is switched off, and would leave the function to Python.
+    """
+    if _CONFIG.DISABLE_JIT:
+        raise ImportError("NUMBA_DISABLE_JIT is set")
+    dispatcher = numba.njit(error_model="numpy")(function)
+    with _kept_in(find_cache_folder()) as can_be_kept:
+        if can_be_kept:
+            dispatcher.enable_caching()
+    return cast(Function, dispatcher)
+
+
+def single(*values: float) -> tuple[float, ...]:
+    """Return constants in single precision. To the type checker they are floats; numba infers types by itself."""
+    return tuple(cast(float, np.float32(value)) for value in values)
+
+
+@cache
+def find_cache_folder() -> Path | None:
+    """Return the folder of the machine code of these sources, made if need be; None where none can be written.
+
+    It is below numba's `NUMBA_CACHE_DIR` if that is set, else beside this file, else in the home folder.
+    """
+    asked = os.environ.get("NUMBA_CACHE_DIR")
+    places = (
+        [Path(asked)] if asked else [Path(__file__).parent / "__pycache__", Path("~/.cache/rare-envs").expanduser()]
+    )
+    for place in places:
+        folder = place / f"compiled-{digest_sources()}"
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError:
+            continue
+        if os.access(folder, os.W_OK):
+            return folder
+    return None
+
+
+@cache
+def digest_sources() -> str:
+    """Return a digest of the sources of the package."""
+    digest = hashlib.blake2b(digest_size=8)
+    for path in sorted(PACKAGE.rglob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+@contextmanager
+def _kept_in(folder: Path | None) -> Iterator[bool]:
+    """Let numba keep code in a folder, which its configuration alone can say; yield whether it can."""
+    before = _CONFIG.CACHE_DIR
+    _CONFIG.CACHE_DIR = "" if folder is None else str(folder)
+    try:
+        yield folder is not None
+    finally:
+        _CONFIG.CACHE_DIR = before

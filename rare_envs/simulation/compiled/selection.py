@@ -1,0 +1,133 @@
+"""Selection: which worlds have a compiled rollout, and its numbers."""
+
+from __future__ import annotations
+
+import importlib.util
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rare_envs.control.idm import IDM
+from rare_envs.measures.registry import MEASURES
+from rare_envs.scenarios import car_following, cut_in, hard_brake
+
+if TYPE_CHECKING:
+    from rare_envs.scenarios.base import Scenario
+    from rare_envs.simulation.rollout import Driver
+    from rare_envs.simulation.world import World
+    from rare_envs.traffic.road import Road
+
+COMPILED_SCRIPTS = {
+    "car_following": (car_following.initial, car_following.others),
+    "cut_in": (cut_in.initial, cut_in.others),
+    "hard_brake": (hard_brake.initial, hard_brake.others),
+}
+"""Names of compiled scripts to the initial state and the motion of the other vehicles that they have."""
+
+
+class NotCompiled(ValueError):
+    """There is no compiled rollout; the message says why."""
+
+
+class CompilerFails(NotCompiled):
+    """numba is installed, but does not work here."""
+
+
+@dataclass(frozen=True)
+class CompiledRollout:
+    """The rollouts of a world with the IDM as ego, compiled: called with x (B, d), it returns f (B,).
+
+    It keeps no compiled code, so that it can be sent to other processes.
+
+    Example:
+        >>> from rare_envs.scenarios.car_following import CAR_FOLLOWING
+        >>> from rare_envs.simulation import World
+        >>> rollout = find_compiled_rollout(World(CAR_FOLLOWING), IDM())
+        >>> rollout(np.array([[20.0, 15.0, 30.0], [30.0, 5.0, 20.0]])).tolist()  # 30 m / (5 m/s), and a collision
+        [6.0, -1.0]
+    """
+
+    script: str
+    """One of `COMPILED_SCRIPTS`."""
+    ego: IDM
+    road: Road
+    dt: float
+    """Tick [s]."""
+    ticks: int
+
+    def __call__(self, x: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Return f of scenarios x (B, d) within the physical box."""
+        try:
+            from rare_envs.simulation.compiled import rollouts
+        except ImportError as error:
+            raise NotCompiled(
+                f"The problem was made with core='numba', which fails in this process: {error}; install "
+                "'rare-envs[fast]' wherever it is simulated, or make it with core='torch'."
+            ) from error
+        return rollouts.drive(self.script, x, self.ego, self.road, self.dt, self.ticks)
+
+
+def find_compiled_rollout(world: World, driver: Driver) -> CompiledRollout:
+    """Return the compiled rollout of a world and its ego.
+
+    Raises:
+        NotCompiled: There is none, or numba is missing.
+        CompilerFails: numba cannot be used here.
+
+    Example:
+        >>> from rare_envs.scenarios.highway import HIGHWAY
+        >>> from rare_envs.simulation import World
+        >>> find_compiled_rollout(World(HIGHWAY), IDM())
+        Traceback (most recent call last):
+            ...
+        rare_envs.simulation.compiled.selection.NotCompiled: the script of the scenario 'highway' is not compiled
+    """
+    obstacle = _find_obstacle(world, driver)
+    if obstacle:
+        raise NotCompiled(obstacle)
+    _import_compiler()
+    assert isinstance(driver, IDM)
+    scenario = world.scenario
+    return CompiledRollout(_find_script(scenario), driver, scenario.road, world.clock.dt, world.clock.ticks)
+
+
+def _find_obstacle(world: World, driver: Driver) -> str:
+    """Return why the torch simulation is needed; empty if it is not."""
+    scenario, measurement = world.scenario, world.measurement
+    obstacles = {
+        f"the ego, a {type(driver).__name__}, is not compiled": type(driver) is not IDM,
+        f"the script of the scenario {scenario.name!r} is not compiled": world.background is not None
+        or not _find_script(scenario),
+        "curved roads and lanes of different widths are not compiled": scenario.road.reference_line is not None
+        or not scenario.road.equal,
+        f"the measure {measurement.measure!r} is not compiled": measurement.episode_measure is not MEASURES["ttc"],
+        "statistics of episodes are not compiled": measurement.statistics,
+        "collisions of other vehicles are not compiled": measurement.collisions != "ego",
+        "parameters of the weather are not compiled": sum(world.columns) != scenario.size,
+    }
+    return next((words for words, found in obstacles.items() if found), "")
+
+
+def _find_script(scenario: Scenario) -> str:
+    """Return the name of the compiled script of a scenario; empty if it has none."""
+    for name, (initial, others) in COMPILED_SCRIPTS.items():
+        if scenario.initial is initial and scenario.others is others:
+            return name
+    return ""
+
+
+def _import_compiler() -> None:
+    """Import what needs numba.
+
+    Raises:
+        NotCompiled: It is not installed.
+        CompilerFails: It is, but fails: with this NumPy, or since it can write its cache nowhere.
+    """
+    if importlib.util.find_spec("numba") is None:
+        raise NotCompiled("numba is not installed: pip install 'rare-envs[fast]'")
+    try:
+        from rare_envs.simulation.compiled import rollouts  # noqa: F401
+    except (ImportError, OSError, RuntimeError) as error:
+        raise CompilerFails(f"numba is installed, but fails here: {error}") from error
