@@ -27,24 +27,25 @@ def simulate(x: Any) -> float:
     return float(2.0 - x[0])
 
 
-def measure_seconds(executor: Any, chunk_size: int, n: int) -> float:
-    """Return the wall time of a run of plain Monte Carlo [s], without that in which workers start."""
+def run_seconds(executor: Any, chunk_size: int, n: int) -> float:
+    """Return the wall time of a run of plain Monte Carlo of n simulations [s]."""
     problem = samplers.FunctionProblem(simulate, dim=2, vectorized=False, chunk_size=chunk_size)
-    begun: list[float] = []
+    begun = time.perf_counter()
+    samplers.estimate(problem, "mc", seed=0, max_sim=n, executor=executor)
+    return time.perf_counter() - begun
 
-    def watch(progress: samplers.Progress) -> None:
-        if not begun and progress.n_sim >= n_warm:
-            begun.append(time.perf_counter())
 
-    n_warm = 4 * chunk_size  # every worker has then started
-    samplers.estimate(problem, "mc", seed=0, max_sim=n + n_warm, executor=executor, progress=watch)
-    return time.perf_counter() - begun[0]
+def measure_seconds(workers: int, chunk_size: int, n: int) -> float:
+    """Return the wall time of n simulations [s]: how much longer a run takes than one with n fewer."""
+    short = 4 * chunk_size
+    first, second = (run_seconds(samplers.LocalProcesses(workers), chunk_size, size) for size in (short, short + n))
+    return second - first
 
 
 def measure() -> dict[str, Any]:
     """Return the overhead of one worker at chunks of 1 s, and the speed-up of two at chunks of 4 rows."""
-    one = measure_seconds(samplers.LocalProcesses(1), chunk_size=20, n=600)
-    serial, two = (measure_seconds(samplers.LocalProcesses(workers), chunk_size=4, n=600) for workers in (1, 2))
+    one = measure_seconds(1, chunk_size=20, n=600)
+    serial, two = (measure_seconds(workers, chunk_size=4, n=600) for workers in (1, 2))
     return {
         "cores": os.cpu_count(),
         "overhead_at_chunks_of_1_s": one / (600 * EGO_SECONDS) - 1.0,

@@ -24,12 +24,13 @@ import rare_envs
 import samplers
 
 WORKERS = (1, 10, 30, 100, 300, 1000)
-BUDGETS = (1000, 6000, 20_000)
+RUNS = ((1000, 1), (6000, 1), (20_000, 1), (60_000, 1), (60_000, 10))
+"""Simulations, and replicates that share them."""
 N_TIMED = 40
 
 
-def record_batches(budget: int, seed: int = 0) -> list[int]:
-    """Return the rows of each batch that two-stage asks for in car-following."""
+def record_batches(budget: int, replicates: int = 1, seed: int = 0) -> tuple[list[int], float]:
+    """Return the rows of each batch that two-stage asks for in car-following, and the c.o.v. of the answer."""
     problem = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", base="us101-gap")
     sizes: list[int] = []
 
@@ -40,8 +41,10 @@ def record_batches(budget: int, seed: int = 0) -> list[int]:
             sizes.append(len(x))
             return problem.evaluate(x)
 
-    samplers.estimate(Counted(), "two-stage", seed=seed, max_sim=budget, ensemble_run=False)
-    return sizes
+    found = samplers.estimate(
+        Counted(), "two-stage", seed=seed, max_sim=budget, replicates=replicates, ensemble_run=False
+    )
+    return sizes, found.cov
 
 
 def measure_times(n: int = N_TIMED, seed: int = 0) -> list[float]:
@@ -80,20 +83,24 @@ def simulate_schedule(batches: Sequence[Sequence[float]], workers: int) -> tuple
 
 
 def measure(seed: int = 0) -> dict[str, Any]:
-    """Return the utilisation by budget and number of workers, and by batch with 1,000 workers."""
+    """Return the utilisation of each run by number of workers, and by batch with 1,000 workers."""
     times, rng = measure_times(), np.random.default_rng(seed)
-    found: dict[str, Any] = {"seconds_of_a_drive": times, "workers": WORKERS, "budgets": {}}
-    for budget in BUDGETS:
-        sizes = record_batches(budget)
+    found: dict[str, Any] = {"seconds_of_a_drive": times, "workers": WORKERS, "runs": []}
+    for budget, replicates in RUNS:
+        sizes, cov = record_batches(budget, replicates)
         drawn = [rng.choice(times, size).tolist() for size in sizes]  # a chunk is one drive
         busy = sum(map(sum, drawn))
         walls = [simulate_schedule(drawn, workers)[0] for workers in WORKERS]
-        found["budgets"][str(budget)] = {
-            "batches": sizes,
-            "utilisation": [busy / (wall * workers) for wall, workers in zip(walls, WORKERS, strict=True)],
-            "speedup": [walls[0] / wall for wall in walls],
-            "by_batch": simulate_schedule(drawn, WORKERS[-1])[1],
-        }
+        found["runs"].append(
+            {
+                "name": f"{budget:,} simulations" + (f", {replicates} replicates" if replicates > 1 else ""),
+                "cov": cov,
+                "batches": sizes,
+                "utilisation": [busy / (wall * workers) for wall, workers in zip(walls, WORKERS, strict=True)],
+                "speedup": [walls[0] / wall for wall in walls],
+                "by_batch": simulate_schedule(drawn, WORKERS[-1])[1],
+            }
+        )
     return found
 
 
@@ -105,10 +112,10 @@ def draw_figure(found: dict[str, Any], path: Path) -> None:
     import matplotlib.pyplot as plt
 
     figure, (left, right) = plt.subplots(1, 2, figsize=(9.0, 3.4), layout="constrained")
-    for budget, result in found["budgets"].items():
-        left.plot(found["workers"], result["utilisation"], "o-", label=f"{int(budget):,} simulations")
+    for result in found["runs"]:
+        left.plot(found["workers"], result["utilisation"], "o-", label=result["name"])
         ends = np.cumsum(result["batches"]) / sum(result["batches"])
-        right.step(ends, result["by_batch"], where="pre", label=f"{int(budget):,}")
+        right.step(ends, result["by_batch"], where="pre")
     left.set(xscale="log", xlabel="workers", ylabel="share of their time that workers simulate", ylim=(0, 1.05))
     right.set(
         xlabel="share of the simulations", ylabel=f"the same, batch by batch, {WORKERS[-1]:,} workers", ylim=(0, 1)
@@ -129,11 +136,11 @@ def main() -> None:
     given.out.write_text(json.dumps(found, indent=1) + "\n")
     if given.figure is not None:
         draw_figure(found, given.figure)
-    for budget, result in found["budgets"].items():
+    for result in found["runs"]:
         shares = ", ".join(
             f"{n}: {share:.2f}" for n, share in zip(found["workers"], result["utilisation"], strict=True)
         )
-        print(f"{int(budget):,} simulations in {len(result['batches'])} batches; utilisation {shares}")
+        print(f"{result['name']} in {len(result['batches'])} batches, c.o.v. {result['cov']:.3f}; utilisation {shares}")
 
 
 if __name__ == "__main__":

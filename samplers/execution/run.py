@@ -15,7 +15,7 @@ from samplers.execution.evaluation_log import EvaluationLog
 from samplers.execution.progress import Listener, Monitor, Progress
 from samplers.execution.replicate import Replicate, check_cost, count_simulations
 from samplers.execution.responder import hide_missing
-from samplers.method import Answer, Choosing, Goal, Outcome, Request, Stepping, TermsOffer
+from samplers.method import Answer, Choice, Choosing, Goal, Outcome, Request, Stepping, TermsOffer
 from samplers.problem import FloatArray, Inputs, TermGradients, Terms, condition_of
 from samplers.result import Estimate
 from samplers.sample import SimulationIndex
@@ -70,7 +70,8 @@ class Run:
         self._goal, self._on_error = arguments.goal, arguments.on_error
         self._seed = choose_seed(arguments.seed)
         self._n_wanted = int(arguments.replicates)
-        self._method, self._choice = choose_method(method, self._inputs, self._goal, self._n_wanted)
+        self._choice = choose_method(method, self._inputs, self._goal, self._n_wanted)
+        self._method = self._choice.method
         self._log = EvaluationLog(self._inputs.dim, self._inputs.base, self._goal.gamma, self._on_error)
         self._monitor = Monitor(listener, self._goal.max_sim)
         self._asked = False
@@ -213,7 +214,8 @@ class Run:
             on_error=self._on_error,
             base_draws=whole.base_draws,
             given=self._given,
-            choice=self._choice,
+            choice=self._choice.why,
+            chose_another=self._choice.unusual,
             simulations=self._index_simulations(whole),
         )
 
@@ -275,10 +277,10 @@ class Run:
             self._start_replicate(None if max_sim is None else max_sim - self._log.n_sim)
 
 
-def choose_method(method: Stepping, inputs: Inputs, goal: Goal, replicates: int) -> tuple[Stepping, str]:
+def choose_method(method: Stepping, inputs: Inputs, goal: Goal, replicates: int) -> Choice:
     """Return the method that runs, and why where another one has chosen it: by the smallest share of the budget."""
     if not isinstance(method, Choosing):
-        return method, ""
+        return Choice(method)
     return method.choose(inputs, replace(goal, max_sim=split_budget(goal.max_sim, replicates)[0]))
 
 

@@ -44,7 +44,7 @@ class ExecutorOptions:
         float | None, typer.Option(help="Seconds for a chunk of simulations, after which its worker counts as hung.")
     ] = None
     memory_limit: Annotated[
-        float | None, typer.Option(help="GiB that the simulations of a local worker may take (Linux).")
+        float | None, typer.Option(help="GiB that the simulations of a worker process may take (Linux).")
     ] = None
 
     def make(self) -> Executor | None:
@@ -61,12 +61,11 @@ class ExecutorOptions:
             if given:
                 raise ValueError(f"Expected {given[0]} together with --workers or --executor.")
             return None
-        refused = "--memory-limit" if self.executor is ExecutorKind.RAY else "--address"
-        if refused in given:
-            raise ValueError(f"{refused} does not go with --executor {(self.executor or ExecutorKind.LOCAL).value}.")
-        if self.executor is ExecutorKind.RAY:
-            return samplers.RayCluster(self.address, self.workers, self.time_limit)
+        if self.address is not None and self.executor is not ExecutorKind.RAY:
+            raise ValueError("--address does not go with --executor local.")
         if self.memory_limit is not None and not 0.0 < self.memory_limit < float("inf"):
             raise ValueError(f"Expected --memory-limit to be a number of GiB above 0, got {self.memory_limit}.")
         memory = None if self.memory_limit is None else self.memory_limit * GIB
+        if self.executor is ExecutorKind.RAY:
+            return samplers.RayCluster(self.address, self.workers, self.time_limit, memory_limit=memory)
         return samplers.LocalProcesses(self.workers, self.time_limit, memory)

@@ -3,27 +3,60 @@
 from __future__ import annotations
 
 import faulthandler
+import itertools
 import os
 import threading
 import time
+import weakref
 from collections import OrderedDict
 from collections.abc import Iterator
 from concurrent.futures import BrokenExecutor, CancelledError, Future
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from hashlib import blake2b
-from typing import Any
+from typing import Any, NamedTuple
+from uuid import uuid4
 
 from samplers.execution.executors.base import ExecutorError, Work, WorkerLost, WorkerPool, check_limits
 from samplers.execution.executors.chunks import Chunk, Index, Packed
 from samplers.execution.executors.seeding import SeededWork
 from samplers.execution.executors.transport import pack_work
-from samplers.execution.executors.worker import Reply, describe, make_portable
+from samplers.execution.executors.worker import Reply, describe, limit_memory, make_portable
 
 POLL_SECONDS = 0.05
 """Time between two looks at jobs that cannot tell when they are done, such as those of submitit."""
+PARENT_SECONDS = 1.0
+"""Time between two looks of a worker whether its driver is still there."""
 MOST_RESTARTS = 1000
 """Broken pools that are replaced in one run."""
+
+
+class ProcessName(NamedTuple):
+    """A process among those of all machines: numbers of processes repeat from one machine to the next."""
+
+    program: str
+    """Drawn when this module is imported; a forked process has that of its parent."""
+    number: int
+    """Of the process on its machine."""
+
+
+NO_PROCESS = ProcessName("", 0)
+"""Name that no process has."""
+_PROGRAM = uuid4().hex
+
+
+def name_process() -> ProcessName:
+    """Return the name of this process."""
+    return ProcessName(_PROGRAM, os.getpid())
+
+
+class Limits(NamedTuple):
+    """What a chunk may take of a worker process."""
+
+    seconds: float | None = None
+    """Longest time [s], after which the process ends itself."""
+    n_bytes: float | None = None
+    """Memory of the simulations of the process."""
 
 
 @dataclass(frozen=True)
@@ -51,12 +84,14 @@ class FuturesPool:
     """Number of workers, where the pool does not tell."""
     time_limit: float | None = None
     """Longest time for a chunk [s]. The worker process ends itself then, which pools of threads do not allow."""
+    memory_limit: float | None = None
+    """Bytes that the simulations may take in each worker process, where the system can limit that (Linux)."""
 
     def __post_init__(self) -> None:
         """Check the values."""
         if not (_has_submit(self.executor) or callable(self.executor)):
             raise ValueError(f"Expected an object with submit, or a function that makes one, got {self.executor!r}.")
-        check_limits(self.workers, time_limit=self.time_limit)
+        check_limits(self.workers, time_limit=self.time_limit, memory_limit=self.memory_limit)
 
     @contextmanager
     def open(self, work: Work, seed: int) -> Iterator[WorkerPool]:
@@ -78,20 +113,22 @@ class _ForeignPool:
         self._key = blake2b(packed, digest_size=16).hexdigest()
         self._made = not _has_submit(settings.executor)
         self._pool: Any = settings.executor() if self._made else settings.executor
-        self._restarts = 0
+        self._restarts, self._calls = 0, itertools.count()
         self.workers = settings.workers or _count_workers(self._pool)
         self.window = 2 * self.workers
 
     def submit(self, index: Index, chunk: Chunk) -> Future[Packed]:
         """Submit a chunk to the pool, to a new one if it is broken."""
         future: Future[Packed] = Future()
-        arguments = (self._key, self._packed, os.getpid(), self._settings.time_limit, index, chunk)
+        limits = Limits(self._settings.time_limit, self._settings.memory_limit)
+        arguments = (self._key, self._packed, name_process(), limits, index, chunk, next(self._calls))
         try:
             job = self._pool.submit(compute_in_worker, *arguments)
         except (BrokenExecutor, RuntimeError) as error:
             self._replace(error)
             job = self._pool.submit(compute_in_worker, *arguments)
-        future.add_done_callback(lambda given_up: _cancel(job) if given_up.cancelled() else None)
+        kept = weakref.ref(job)  # a job that is done is let go: some pools compute it again where its worker dies
+        future.add_done_callback(lambda given_up: _cancel(kept()) if given_up.cancelled() else None)
         if hasattr(job, "add_done_callback"):
             job.add_done_callback(lambda done: _pass_on(done, future))
         else:
@@ -118,18 +155,21 @@ class _ForeignPool:
 
 
 def compute_in_worker(
-    key: str, packed: bytes, driver: int, time_limit: float | None, index: Index, chunk: Chunk
+    key: str, packed: bytes, driver: ProcessName, limits: Limits, index: Index, chunk: Chunk, call: int
 ) -> Reply:
     """Compute a chunk in a worker of any kind, which keeps the last work that it was sent.
 
     Args:
         key: Digest of the work.
         packed: The work.
-        driver: Number of the process that it must not end.
-        time_limit: Longest time [s], after which this process is ended.
+        driver: The process that is neither ended nor limited.
+        limits: Of another process.
         index: Of the chunk.
         chunk: The chunk.
+        call: Number of this call. Dask takes a call with the arguments of an earlier one for that one, and would answer
+            that its worker died.
     """
+    in_driver = name_process() == driver
     if key not in _loaded:
         import cloudpickle
 
@@ -139,23 +179,41 @@ def compute_in_worker(
             return Reply(None, ExecutorError(f"A worker cannot load the problem ({describe(error)})."))
         while len(_loaded) > 2:
             _loaded.popitem(last=False)
-    limited = time_limit is not None and os.getpid() != driver
-    if limited:
-        assert time_limit is not None
-        faulthandler.dump_traceback_later(time_limit, exit=True)
+        if not in_driver:
+            _end_with(driver.number)
+            limit_memory(None if limits.n_bytes is None else int(limits.n_bytes))
+    seconds = None if in_driver else limits.seconds
+    if seconds is not None:
+        faulthandler.dump_traceback_later(seconds, exit=True)
     try:
         return Reply(_loaded[key](index, chunk))
     except SystemExit as error:  # in a worker of somebody else's that is to live on
-        if os.getpid() == driver:
+        if in_driver:
             return Reply(None, WorkerLost(describe(error)))
         os._exit(1)
     except BaseException as error:
         return Reply(None, make_portable(error))
     finally:
-        if limited:
+        if seconds is not None:
             faulthandler.cancel_dump_traceback_later()
 
 
+def _end_with(driver: int) -> None:
+    """Let this process end with the driver that is its parent: the workers of most pools would wait for it for ever.
+
+    The parent of a worker that somebody else has started, a shell perhaps, may end before it.
+    """
+    if os.getppid() == driver and not any(thread.name == _WATCH for thread in threading.enumerate()):
+        threading.Thread(target=_watch_parent, args=(driver,), name=_WATCH, daemon=True).start()
+
+
+def _watch_parent(number: int) -> None:
+    while os.getppid() == number:
+        time.sleep(PARENT_SECONDS)
+    os._exit(1)
+
+
+_WATCH = "watches the driver"
 _loaded: OrderedDict[str, Any] = OrderedDict()
 """Work of this process by its digest."""
 

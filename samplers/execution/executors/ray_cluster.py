@@ -13,7 +13,7 @@ from typing import Any
 
 from samplers.execution.executors.base import ExecutorError, Work, WorkerLost, WorkerPool, check_limits
 from samplers.execution.executors.chunks import Chunk, Index, Packed
-from samplers.execution.executors.futures import compute_in_worker
+from samplers.execution.executors.futures import NO_PROCESS, Limits, compute_in_worker
 from samplers.execution.executors.seeding import SeededWork
 from samplers.execution.executors.transport import pack_work
 from samplers.execution.executors.worker import Reply, describe
@@ -50,10 +50,12 @@ class RayCluster:
     """Longest time for a chunk [s], after which its process ends itself, or is ended; None waits for ever."""
     options: Mapping[str, Any] = field(default_factory=dict)
     """What a task needs, as for `ray.remote`: num_cpus, num_gpus, memory, runtime_env."""
+    memory_limit: float | None = None
+    """Bytes that the simulations may take in each worker process, where the system can limit that (Linux)."""
 
     def __post_init__(self) -> None:
         """Check the values."""
-        check_limits(self.workers, time_limit=self.time_limit)
+        check_limits(self.workers, time_limit=self.time_limit, memory_limit=self.memory_limit)
 
     @contextmanager
     def open(self, work: Work, seed: int) -> Iterator[WorkerPool]:
@@ -90,6 +92,7 @@ class _RayPool:
 
     def __init__(self, ray: Any, settings: RayCluster, packed: bytes) -> None:
         self._ray, self._time_limit = ray, settings.time_limit
+        self._limits = Limits(settings.time_limit, settings.memory_limit)
         options = {"num_cpus": 1, "max_retries": 0, **settings.options}
         self._task = ray.remote(**options)(compute_in_worker)
         self._packed = ray.put(packed)
@@ -103,7 +106,7 @@ class _RayPool:
     def submit(self, index: Index, chunk: Chunk) -> Future[Packed]:
         """Submit a task."""
         future: Future[Packed] = Future()
-        reference = self._task.remote(self._key, self._packed, 0, self._time_limit, index, chunk)
+        reference = self._task.remote(self._key, self._packed, NO_PROCESS, self._limits, index, chunk, 0)
         self._new.put((reference, future))
         return future
 

@@ -33,9 +33,26 @@ class SeededWork:
     seed: int
 
     def __call__(self, index: Index, chunk: Chunk) -> Packed:
-        """Compute a chunk; the generators are then as before."""
+        """Compute a chunk; the generators are then as before.
+
+        A chunk that imports torch, and draws by its generator before that could be seeded, is computed once more.
+        """
+        torch_is_new = "torch" not in sys.modules
+        with seed_generators(self.seed, index):
+            result = self.work(chunk)
+        if not (torch_is_new and _torch_has_drawn()):
+            return result
         with seed_generators(self.seed, index):
             return self.work(chunk)
+
+
+def _torch_has_drawn() -> bool:
+    """Return whether torch's generator, which begins in each process with a seed of its own, has left its beginning."""
+    torch: Any = sys.modules.get("torch")
+    if torch is None:
+        return False
+    fresh = torch.Generator().manual_seed(torch.initial_seed())
+    return not torch.equal(fresh.get_state(), torch.random.get_rng_state())
 
 
 @contextmanager

@@ -6,8 +6,6 @@ import json
 import os
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from contextlib import closing
@@ -26,32 +24,19 @@ from rare_envs.study.journal import JOURNAL, continue_journal
 from rare_envs.study.question import Question, prepare
 from rare_envs.study.storage.names import RESULT_FILES
 from samplers.execution.record_file import RecordFile
+from tests.rare_envs.study.conftest import write_base
+from tests.rare_envs.study.forked_command import TILE, ForkedCommand
 from tests.rare_envs.study.refusals import FOLLOWING, SMALL, assert_refused
 
 Cli = Callable[..., Result]
 NO_SPACE = OSError(28, "No space left on device")
 
-CHILD = """
-import os, signal, sys
-from pathlib import Path
-from rare_envs.problem import DrivingProblem
-from rare_envs.study import cli, run_directory
-
-DrivingProblem.tile = 50
-run_directory.save_plot = lambda path, report: None
-kill_at = int(os.environ.get("KILL_AT", "-1"))
-left = [kill_at]
-for name in ("replace", "unlink"):  # what the final writes end in
-    def counted(self, *words, act=getattr(Path, name), **options):
-        left[0] -= 1
-        if left[0] == 0:
-            os.kill(os.getpid(), signal.SIGKILL)
-        return act(self, *words, **options)
-    if kill_at > 0:
-        setattr(Path, name, counted)
-cli.main()
-"""
 WORDS = ["--method", "mc", "--max-sim", "6000", "--gamma", "1", "--horizon", "2", "--seed", "5"]
+TABLES = ("episodes.parquet", "failures.csv", "result.json", "study.json")
+PAUSE = 0.03
+"""Seconds after a chunk: 21 kills within 0.05 s of a chunk, or 0.3 s of the start, leave most of the 120 chunks."""
+KILLS = (1, 2, 3, 4, 5, 6, 8, 10, 12)
+"""Changes of files in the final writes before which a run is killed."""
 
 
 @pytest.fixture
@@ -76,33 +61,32 @@ def episodes_of(folder: Path) -> Any:
     return rare_envs.load_study(folder).episodes().drop(["seconds"])
 
 
-def start(folder: Path, *words: str, **environment: str) -> subprocess.Popen[str]:
-    (folder / "child.py").write_text(CHILD)
-    return subprocess.Popen(
-        [sys.executable, "child.py", *words],
-        cwd=folder,
-        env={**os.environ, **environment},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-
-
-def wait_for_more(path: Path, process: subprocess.Popen[str]) -> None:
-    """Wait until a file has grown, or the process has ended."""
-    before = path.stat().st_size if path.exists() else 0
-    deadline = time.monotonic() + 120
-    while process.poll() is None and time.monotonic() < deadline:
-        if path.exists() and path.stat().st_size > before + 200:
-            return
-        time.sleep(0.001)
-
-
 def finish(folder: Path, *words: str) -> None:
     """Run a command to its end, which must be a good one."""
-    process = start(folder, *words)
-    said = process.communicate(timeout=300)
-    assert process.returncode in (0, 3), said
+    ended = ForkedCommand(folder, *words).end()
+    assert ended.code in (0, 3), ended
+
+
+def assert_same_files(run: Path, whole: Path, *names: str) -> None:
+    """The files of a run that was killed are those of one that was not, but for their times."""
+    assert tables_of(run) == list(names)
+    assert answer(run) == answer(whole)
+    assert (run / "failures.csv").read_bytes() == (whole / "failures.csv").read_bytes()
+    assert episodes_of(run).equals(episodes_of(whole))
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """As `risky`, for all tests of this module."""
+    return str(write_base(tmp_path_factory.mktemp("base") / "risky.json", gap=30.0))
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory, base: str) -> Path:
+    """The folder of an undisturbed run."""
+    folder = tmp_path_factory.mktemp("whole")
+    finish(folder, "estimate", FOLLOWING, "--base", base, *WORDS, "--out", "run")
+    return folder / "run"
 
 
 def has_simulations(folder: Path) -> bool:
@@ -117,65 +101,67 @@ def has_simulations(folder: Path) -> bool:
         return journal.read_next() is not None
 
 
-@pytest.mark.slow
-def test_killed_at_random_times_it_gives_the_same_files(tmp_path: Path, risky: str) -> None:
-    words = ["estimate", FOLLOWING, "--base", risky, *WORDS, "--out"]
-    finish(tmp_path, *words, "whole")
-    rng, run = np.random.default_rng(21), tmp_path / "run"
-    words = [*words, "run"]
-    for _ in range(21):
-        process = start(tmp_path, *words)
-        wait_for_more(run / JOURNAL, process)
-        time.sleep(float(rng.uniform(0.0, 0.05)))
-        process.send_signal(signal.SIGKILL)
-        process.communicate()
-        assert process.returncode == -signal.SIGKILL
-        if has_simulations(run):
-            words = ["resume", "run"]
-    finish(tmp_path, *words)
-    assert tables_of(run) == ["episodes.parquet", "failures.csv", "result.json", "study.json"]
-    assert answer(run) == answer(tmp_path / "whole")
-    assert (run / "failures.csv").read_bytes() == (tmp_path / "whole" / "failures.csv").read_bytes()
-    assert episodes_of(run).equals(episodes_of(tmp_path / "whole"))
+def kill_and_resume(
+    folder: Path, base: str, rng: np.random.Generator, kills: int, options: Callable[[int], tuple[str, ...]]
+) -> None:
+    """Kill a run many times, at its beginning and while it simulates; then let it come to its end.
+
+    Args:
+        folder: Gets the run, as `run`.
+        base: Of the run.
+        rng: Draws the times.
+        kills: Number of kills.
+        options: Further options of the command, by its number.
+    """
+    words: tuple[str, ...] = ("estimate", FOLLOWING, "--base", base, *WORDS, "--out", "run")
+    for number in range(kills):
+        command = ForkedCommand(folder, *words, *options(number), pause=PAUSE)
+        if number % 4:  # else while it reads what there is, or begins
+            command.wait_for_more(folder / "run" / JOURNAL)
+        time.sleep(float(rng.uniform(0.0, 0.05 if number % 4 else 0.3)))
+        command.kill()
+        if has_simulations(folder / "run"):
+            words = ("resume", "run")
+    finish(folder, *words, *options(kills))
+
+
+@pytest.mark.parametrize("kills", [3, pytest.param(21, marks=pytest.mark.slow)])
+def test_killed_at_random_times_it_gives_the_same_files(kills: int, tmp_path: Path, base: str, whole: Path) -> None:
+    kill_and_resume(tmp_path, base, np.random.default_rng(21), kills, lambda number: ())
+    assert_same_files(tmp_path / "run", whole, *TABLES)
 
 
 @pytest.mark.slow
-def test_killed_under_workers_and_resumed_anywhere_it_gives_the_same_files(tmp_path: Path, risky: str) -> None:
+def test_killed_under_workers_and_resumed_anywhere_it_gives_the_same_files(
+    tmp_path: Path, base: str, whole: Path
+) -> None:
     """The driver is killed seven times, and goes on in turn here and with two worker processes."""
-    words = ["estimate", FOLLOWING, "--base", risky, *WORDS, "--chunk", "50", "--out"]
-    finish(tmp_path, *words, "whole")
-    rng, run = np.random.default_rng(22), tmp_path / "run"
-    words = [*words, "run"]
-    for number in range(7):
-        process = start(tmp_path, *words, *(() if number % 2 else ("--workers", "2")))
-        wait_for_more(run / JOURNAL, process)
-        time.sleep(float(rng.uniform(0.0, 0.05)))
-        process.send_signal(signal.SIGKILL)
-        process.communicate()
-        assert process.returncode == -signal.SIGKILL
-        if has_simulations(run):
-            words = ["resume", "run"]
-    finish(tmp_path, *words, "--workers", "2")
-    assert tables_of(run) == ["failures.csv", "result.json"]
-    assert answer(run) == answer(tmp_path / "whole")
-    assert (run / "failures.csv").read_bytes() == (tmp_path / "whole" / "failures.csv").read_bytes()
+    rng, chunk = np.random.default_rng(22), ("--chunk", str(TILE))
+    words = ("estimate", FOLLOWING, "--base", base, *WORDS, *chunk, "--out", "whole")
+    finish(tmp_path, *words)
+
+    def options(number: int) -> tuple[str, ...]:
+        workers = () if number % 2 else ("--workers", "2")
+        return (
+            workers
+            if (tmp_path / "run" / JOURNAL).exists() and has_simulations(tmp_path / "run")
+            else (*chunk, *workers)
+        )
+
+    kill_and_resume(tmp_path, base, rng, 7, options)
+    assert_same_files(tmp_path / "run", tmp_path / "whole", *TABLES)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kill_at", [1, 2, 3, 4, 5, 6, 8, 10, 12])
-def test_killed_in_the_final_writes_it_gives_the_same_files(kill_at: int, tmp_path: Path, risky: str) -> None:
-    words = ["estimate", FOLLOWING, "--base", risky, *WORDS, "--out"]
-    finish(tmp_path, *words, "whole")
-    process = start(tmp_path, *words, "run", KILL_AT=str(kill_at + len(RESULT_FILES) + 2))  # study.json
-    process.communicate()
-    if process.returncode == -signal.SIGKILL:
+@pytest.mark.parametrize("kill_at", [pytest.param(k, marks=[] if k == 3 else pytest.mark.slow) for k in KILLS])
+def test_killed_in_the_final_writes_it_gives_the_same_files(
+    kill_at: int, tmp_path: Path, base: str, whole: Path
+) -> None:
+    words = ("estimate", FOLLOWING, "--base", base, *WORDS, "--out", "run")
+    ended = ForkedCommand(tmp_path, *words, kill_at=kill_at + len(RESULT_FILES) + 2).end()  # study.json
+    if ended.code == -signal.SIGKILL:
         assert (tmp_path / "run" / JOURNAL).exists()
         finish(tmp_path, "resume", "run")
-    run = tmp_path / "run"
-    assert tables_of(run) == ["episodes.parquet", "failures.csv", "result.json", "study.json"]
-    assert answer(run) == answer(tmp_path / "whole")
-    assert (run / "failures.csv").read_bytes() == (tmp_path / "whole" / "failures.csv").read_bytes()
-    assert episodes_of(run).equals(episodes_of(tmp_path / "whole"))
+    assert_same_files(tmp_path / "run", whole, *TABLES)
 
 
 @pytest.mark.parametrize(
@@ -184,12 +170,12 @@ def test_killed_in_the_final_writes_it_gives_the_same_files(kill_at: int, tmp_pa
 def test_a_signal_is_one_line_and_what_is_known(name: str, tmp_path: Path, risky: str) -> None:
     number = getattr(signal, name)
     words = ["estimate", FOLLOWING, "--base", risky, "--gamma", "1", "--method", "ce", "--max-sim", "100000"]
-    process = start(tmp_path, *words, "--target-cov", "0.001", "--json", "--out", "run")
+    command = ForkedCommand(tmp_path, *words, "--target-cov", "0.001", "--json", "--out", "run")
     for _ in range(40):  # over several batches
-        wait_for_more(tmp_path / "run" / JOURNAL, process)
-    process.send_signal(number)
-    printed, said = process.communicate(timeout=120)
-    assert process.returncode == 128 + number, said
+        command.wait_for_more(tmp_path / "run" / JOURNAL)
+    command.signal(number)
+    code, printed, said = command.end()
+    assert code == 128 + number, said
     found = json.loads(printed)
     assert found["status"] == "stopped"
     assert found["n_sim"] > 0

@@ -22,6 +22,8 @@ def test_options_name_an_executor() -> None:
     assert ExecutorOptions(executor=ExecutorKind.LOCAL).make() == samplers.LocalProcesses()
     ray = ExecutorOptions(executor=ExecutorKind.RAY, address="auto", time_limit=9.0)
     assert ray.make() == samplers.RayCluster("auto", None, 9.0)
+    ray = ExecutorOptions(executor=ExecutorKind.RAY, memory_limit=1.0)
+    assert ray.make() == samplers.RayCluster(memory_limit=2.0**30)
 
 
 @pytest.mark.parametrize(
@@ -29,7 +31,6 @@ def test_options_name_an_executor() -> None:
     [
         (("--time-limit", 5), "Expected --time-limit together with --workers"),
         (("--workers", 2, "--address", "auto"), "--address does not go with --executor local"),
-        (("--executor", "ray", "--memory-limit", 2), "--memory-limit does not go with --executor ray"),
         (("--workers", 0), "workers"),
         (("--workers", 2, "--memory-limit", -1), "a number of GiB above 0, got -1.0"),
         (("--workers", 2, "--memory-limit", "nan"), "a number of GiB above 0, got nan"),

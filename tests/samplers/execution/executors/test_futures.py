@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import multiprocessing
 import threading
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
@@ -14,8 +13,10 @@ import pytest
 import samplers
 from samplers.execution.executors.base import WorkerLost
 from samplers.execution.executors.chunks import Chunk
-from samplers.execution.executors.futures import FuturesPool
+from samplers.execution.executors.futures import FuturesPool, Limits, ProcessName, compute_in_worker, name_process
 from samplers.execution.executors.problem_work import ProblemWork
+from samplers.execution.executors.seeding import SeededWork
+from samplers.execution.executors.transport import pack_work
 from tests.samplers.execution.executors.egos import FAULTS, matrix, problem
 from tests.samplers.execution.executors.test_local_processes import estimate
 
@@ -40,19 +41,6 @@ def test_threads_and_processes_give_the_bits_of_one_process() -> None:
         assert by(threads) == expected
         assert threads.submit(int, 7).result() == 7  # it is the caller's, and goes on
     assert by(make_processes) == expected
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("library", ["loky", "dask"])
-def test_other_libraries_give_the_bits_of_one_process(library: str) -> None:
-    if library == "loky":
-        loky = pytest.importorskip("loky", reason="loky is not installed")
-        assert by(lambda: loky.ProcessPoolExecutor(2)) == whole()
-        return
-    distributed = pytest.importorskip("distributed", reason="dask.distributed is not installed")
-    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
-        with distributed.Client(cluster) as client:
-            assert by(client.get_executor()) == whole()
 
 
 class Job:
@@ -87,28 +75,6 @@ def test_a_broken_pool_of_the_callers_ends_the_run_with_advice() -> None:
             estimate(problem(FAULTS["crashing"]), processes, 60)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("library", ["concurrent.futures", "loky"])
-@pytest.mark.parametrize("name", ["crashing", "exiting", "hanging", "raising"])
-def test_a_broken_pool_is_replaced_and_bad_rows_are_found(library: str, name: str) -> None:
-    """The rows in flight beside a bad one are not taken for bad."""
-    if library == "loky" and importlib.util.find_spec("loky") is None:
-        pytest.skip("loky is not installed")
-
-    def make() -> Any:
-        if library == "loky":
-            import loky
-
-            return loky.ProcessPoolExecutor(2)
-        return make_processes()
-
-    n = 60
-    expected = estimate(problem(FAULTS["nan"]), samplers.InProcess(), n)
-    result = estimate(problem(FAULTS[name]), FuturesPool(make, workers=2, time_limit=5.0), n)
-    assert result.p == expected.p
-    assert "1 simulations gave no outcome" in " ".join(result.warnings)
-
-
 def test_a_pool_of_threads_survives_an_exit() -> None:
     with ThreadPoolExecutor(1) as threads:
         result = estimate(problem(FAULTS["exiting"]), FuturesPool(threads, time_limit=1e-9), 60)
@@ -120,8 +86,10 @@ class Waiting:
 
     def __init__(self) -> None:
         self.jobs: list[Future[Any]] = []
+        self.calls: list[Any] = []
 
     def submit(self, function: Any, *arguments: Any) -> Future[Any]:
+        self.calls.append((function, arguments))
         self.jobs.append(Future())
         return self.jobs[-1]
 
@@ -135,6 +103,36 @@ def test_a_chunk_that_nobody_waits_for_is_cancelled_in_the_pool_of_the_caller() 
     assert [job.cancelled() for job in waiting.jobs] == [True, False]
     waiting.jobs[1].set_exception(ArithmeticError("gone"))
     assert isinstance(wanted.exception(), WorkerLost)
+
+
+def test_no_two_calls_are_alike(rng: np.random.Generator) -> None:
+    """Dask answers a call with the arguments of an earlier one by the answer to that, which may be a worker's death."""
+    waiting, chunk = Waiting(), Chunk("f", (rng.standard_normal((1, 2)),))
+    work = ProblemWork(samplers.FunctionProblem(matrix, 2), 0.0, "raise")
+    with FuturesPool(waiting, workers=1).open(work, 1) as pool:
+        pool.submit((0,), chunk), pool.submit((0,), chunk)
+    (*first, call), (*again, other) = (arguments for _, arguments in waiting.calls)
+    assert first == again
+    assert call != other
+
+
+def test_a_process_of_another_machine_with_the_same_number_is_another_one() -> None:
+    """A worker there ends itself at the time limit; the driver, and threads in it, must not."""
+    here = name_process()
+    assert here == name_process()
+    work = pack_work(SeededWork(ProblemWork(samplers.FunctionProblem(leave, 1), 0.0, "bound"), 1))
+    chunk = Chunk("f", (np.zeros((1, 1)),))
+    reply = compute_in_worker("leave", work, here, Limits(), (0,), chunk, 0)
+    assert isinstance(reply.error, WorkerLost)
+    ended: list[int] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("os._exit", ended.append)
+        compute_in_worker("leave", work, ProcessName("of another machine", here.number), Limits(), (0,), chunk, 0)
+    assert ended == [1]
+
+
+def leave(x: Any) -> Any:
+    raise SystemExit(3)
 
 
 def test_arguments() -> None:

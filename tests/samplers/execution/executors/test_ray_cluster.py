@@ -8,7 +8,6 @@ import threading
 import time
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import contextmanager
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -18,7 +17,7 @@ import samplers
 from samplers.execution.executors import ray_cluster
 from samplers.execution.executors.seeding import SeededWork
 from samplers.execution.executors.transport import pack_work
-from tests.samplers.execution.executors.egos import FAULTS, KillsItself, matrix, problem
+from tests.samplers.execution.executors.egos import FAULTS, matrix, problem
 from tests.samplers.execution.executors.test_local_processes import estimate
 
 needs_ray = pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed")
@@ -110,31 +109,6 @@ def test_a_cluster_that_is_gone_ends_the_run(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(FakeRay, "wait", gone)
     with pytest.raises(samplers.ExecutorError, match=r"Ray does not answer any more \(ConnectionError: the head"):
         estimate(problem(), FakeCluster(), 60)
-
-
-@pytest.mark.parametrize("workers", [pytest.param(each, marks=slow) for each in (1, 2)])
-def test_the_number_of_workers_changes_no_bit(workers: int) -> None:
-    asked = samplers.FunctionProblem(matrix, dim=3)
-    whole = samplers.estimate(asked, "mc", seed=3, max_sim=200, executor=samplers.InProcess())
-    found = samplers.estimate(asked, "mc", seed=3, max_sim=200, executor=samplers.RayCluster(workers=workers))
-    assert found == whole
-
-
-@pytest.mark.parametrize("name", [pytest.param(each, marks=slow) for each in sorted(set(FAULTS) - {"hungry"})])
-def test_a_bad_row_has_no_outcome(name: str) -> None:
-    n = 60
-    expected = estimate(problem(FAULTS["nan"]), samplers.InProcess(), n)
-    result = estimate(problem(FAULTS[name]), samplers.RayCluster(workers=2, time_limit=2.0), n)
-    assert result.p == expected.p
-    assert "1 simulations gave no outcome" in " ".join(result.warnings)
-    if name == "hanging":
-        assert "its time limit was 2 s" in " ".join(result.remarks)
-
-
-@pytest.mark.parametrize("chance", [pytest.param(20, marks=slow)])
-def test_workers_that_are_killed_change_no_bit(chance: int, tmp_path: Path) -> None:
-    result = estimate(problem(KillsItself(tmp_path, chance), chunk_size=2), samplers.RayCluster(workers=2), 80)
-    assert result == estimate(problem(chunk_size=2), samplers.InProcess(), 80)
 
 
 @pytest.mark.parametrize("nodes", [pytest.param(2, marks=slow)])

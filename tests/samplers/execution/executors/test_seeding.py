@@ -1,6 +1,8 @@
 """A simulation that draws by global generators draws the same for its chunk, and disturbs nobody else's."""
 
 import random
+import subprocess
+import sys
 
 import numpy as np
 import torch
@@ -28,3 +30,24 @@ def test_the_generators_go_on_as_before():
     with seed_generators(1, (0,)):
         draw()
     assert draw() == expected
+
+
+FIRST_IMPORT = """
+import sys
+from samplers.execution.executors.seeding import SeededWork
+n_calls = 0
+def work(chunk):
+    import torch
+    global n_calls
+    n_calls += 1
+    return float(torch.rand(1))
+assert "torch" not in sys.modules
+seeded = SeededWork(work, 7)
+print(seeded((0,), None) == seeded((0,), None), n_calls)
+"""
+
+
+def test_torch_that_a_chunk_imports_first_is_seeded_all_the_same():
+    """Such a chunk is computed once more."""
+    done = subprocess.run([sys.executable, "-c", FIRST_IMPORT], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["True", "3"]

@@ -1,0 +1,121 @@
+"""Commands of `rare-envs` in processes that begin with everything imported, so that a test can kill many of them.
+
+Most of the time of a short command is that of its imports. A server makes them once, and each command is a fork of it.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+CONTEXT = multiprocessing.get_context("forkserver")
+CONTEXT.set_forkserver_preload(["tests.rare_envs.study.forked_command_imports"])
+TILE = 50
+"""Simulations of a chunk without workers."""
+END_SECONDS = 300.0
+
+
+class Ended(NamedTuple):
+    """A command that has ended."""
+
+    code: int
+    """Exit code; less than 0 for a signal."""
+    printed: str
+    """On standard output."""
+    said: str
+    """On standard error."""
+
+
+class ForkedCommand:
+    """A command that runs in a folder, in a process of its own."""
+
+    def __init__(self, folder: Path, *words: str, kill_at: int = 0, pause: float = 0.0) -> None:
+        """Start it.
+
+        Args:
+            folder: Where it runs.
+            words: Of the command line.
+            kill_at: Number of the change of a file's name at which it kills itself, from 1 on; 0 for never.
+            pause: Seconds after each chunk in the journal, so that it takes as long as a test needs.
+        """
+        self._outputs = [folder / "printed.txt", folder / "said.txt"]
+        for path in self._outputs:
+            path.write_text("")
+        self._process = CONTEXT.Process(target=run_command, args=(folder, words, self._outputs, kill_at, pause))
+        self._process.start()
+
+    @property
+    def running(self) -> bool:
+        return self._process.is_alive()
+
+    def wait_for_more(self, path: Path, n_bytes: int = 200) -> None:
+        """Wait until a file has grown, or the process has ended."""
+        before = path.stat().st_size if path.exists() else 0
+        deadline = time.monotonic() + END_SECONDS
+        while self.running and time.monotonic() < deadline:
+            if path.exists() and path.stat().st_size > before + n_bytes:
+                return
+            time.sleep(0.001)
+
+    def signal(self, number: int) -> None:
+        """Send it a signal."""
+        assert self._process.pid is not None
+        os.kill(self._process.pid, number)
+
+    def kill(self) -> None:
+        """Kill it, which it must not have come to its end before."""
+        self._process.kill()
+        ended = self.end()
+        assert ended.code == -signal.SIGKILL, ended
+
+    def end(self) -> Ended:
+        """Wait for its end."""
+        self._process.join(END_SECONDS)
+        code = self._process.exitcode
+        printed, said = (path.read_text() for path in self._outputs)
+        if code is None:
+            self._process.kill()
+            raise AssertionError(f"The command does not end: {said}")
+        return Ended(code, printed, said)
+
+
+def run_command(folder: Path, words: tuple[str, ...], outputs: list[Path], kill_at: int, pause: float) -> None:
+    """Run a command, without pictures, and exit with its code."""
+    from rare_envs.problem import DrivingProblem
+    from rare_envs.study import cli, run_directory
+    from samplers.execution.journal import JournalFile
+
+    os.chdir(folder)
+    for number, path in enumerate(outputs, 1):
+        os.dup2(os.open(path, os.O_WRONLY), number)
+    sys.argv = ["rare-envs", *words]
+    DrivingProblem.tile = TILE
+    run_directory.save_plot = lambda path, report: None
+    append = JournalFile.append
+    JournalFile.append = lambda *words: (append(*words), time.sleep(pause))[0]  # type: ignore[method-assign]
+    if kill_at:
+        _kill_at_change(kill_at)
+    cli.main()
+
+
+def _kill_at_change(kill_at: int) -> None:
+    """Kill this process before it replaces or removes a file for the n-th time, as the final writes do."""
+    left = [kill_at]
+    for name in ("replace", "unlink"):
+        setattr(Path, name, _counted(getattr(Path, name), left))
+
+
+def _counted(act: Callable[..., Any], left: list[int]) -> Callable[..., Any]:
+    def count(*words: Any, **options: Any) -> Any:
+        left[0] -= 1
+        if left[0] == 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return act(*words, **options)
+
+    return count

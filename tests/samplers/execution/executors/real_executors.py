@@ -1,0 +1,56 @@
+"""Executors with the real libraries, by name, for tests that all of them are to pass."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from typing import Any
+
+import samplers
+
+LIBRARIES = {"futures": "concurrent.futures", "loky": "loky", "dask": "distributed", "ray": "ray"}
+"""What an executor needs; `local` needs nothing."""
+
+
+@contextmanager
+def open_executor(name: str, workers: int = 2, **limits: Any) -> Iterator[Any]:
+    """Yield an executor whose workers are processes of this machine.
+
+    Args:
+        name: "here", "local" or one of `LIBRARIES`.
+        workers: Number of processes.
+        limits: time_limit [s], memory_limit [bytes].
+    """
+    if name == "here":
+        yield samplers.InProcess()
+    elif name == "local":
+        yield samplers.LocalProcesses(workers, **limits)
+    elif name == "futures":
+        spawn = multiprocessing.get_context("spawn")
+        yield samplers.FuturesPool(lambda: ProcessPoolExecutor(workers, mp_context=spawn), workers, **limits)
+    elif name == "loky":
+        import loky
+
+        yield samplers.FuturesPool(lambda: loky.ProcessPoolExecutor(workers), workers, **limits)
+    elif name == "dask":
+        with open_dask(workers) as pool:
+            yield samplers.FuturesPool(pool, **limits)
+    else:
+        os.environ.setdefault("RAY_worker_niceness", "0")  # it is 15, so that on a busy machine they hardly begin
+        yield samplers.RayCluster(workers=workers, **limits)
+
+
+@contextmanager
+def open_dask(workers: int) -> Iterator[Any]:
+    """Yield the executor of a cluster of dask whose tasks fail with their worker, and which waits for a new one."""
+    import dask
+    from distributed import Client, LocalCluster
+
+    settings = {"distributed.scheduler.allowed-failures": 0, "distributed.deploy.lost-worker-timeout": "1 h"}
+    with dask.config.set(settings):
+        with LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None) as cluster:
+            with Client(cluster) as client:
+                yield client.get_executor()
