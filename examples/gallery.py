@@ -27,10 +27,10 @@ NARROW = 480
 HEAD = """# Gallery
 
 What failures look like; every picture on this page was drawn by `python -m examples.gallery`. Green is the ego, blue
-the lead, yellow the cutter, grey other vehicles, red who has crashed; vehicles with a purple outline are driven by an
-agent. Above the road are time, speed, gap and time to collision, below it the measure over time: of the moment (blue)
-and of the episode so far (black). `rare-envs replay RUN --failure 0 --out clip.gif` draws the same for what your run
-has found.
+the lead, orange the cutter, grey other vehicles; who has crashed has a red outline, a vehicle that an agent drives a
+purple one. Above the road are time, speed, gap and time to collision, below it the measure over time: of the moment
+(grey) and of the episode so far (black). `rare-envs replay RUN --failure 0 --out clip.gif` draws the same for what
+your run has found.
 
 ```python
 import numpy as np

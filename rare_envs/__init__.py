@@ -3,7 +3,13 @@
 from typing import TYPE_CHECKING, Any
 
 from rare_envs.plugins import make_lazy_getattr
-from rare_envs.registration import make_batch, parallel_env, register_envs, register_scenario
+from rare_envs.registration import (
+    ignore_version_warnings,
+    make_batch,
+    parallel_env,
+    register_envs,
+    register_scenario,
+)
 from rare_envs.scenarios.registry import SCENARIOS
 from rare_envs.version import __version__ as __version__
 
@@ -37,6 +43,7 @@ __all__ = [
     "risk",
 ]
 register_envs()
+ignore_version_warnings()
 
 _LAZY = {
     "DrivingProblem": "rare_envs.problem",

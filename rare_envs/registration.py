@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 from gymnasium.vector import VectorEnv
 
-from rare_envs.scenarios.registry import HIGHWAY_ENV_LAYOUT, SCENARIOS, kinematics_id, split_version
+from rare_envs.scenarios.registry import HIGHWAY_ENV_LAYOUT, SCENARIOS, kinematics_id
 
 if TYPE_CHECKING:
     from rare_envs.envs.parallel import DrivingParallelEnv
@@ -25,23 +26,17 @@ def register_envs() -> None:
                     vector_entry_point="rare_envs.envs.vector:DrivingVectorEnv",
                     kwargs={"env_id": env_id, **layout},
                 )
-                _keep_earlier_versions(name)
 
 
-def _keep_earlier_versions(name: str) -> None:
-    """Let all versions of an id stand beside each other.
+def ignore_version_warnings() -> None:
+    """Turn off Gymnasium's warning that an earlier version of an id of this package is out of date.
 
-    A version is a scenario of its own, with results of its own. Gymnasium would warn that the earlier ones are out of
-    date; it compares their numbers with the highest one of all entries, which are therefore all counted as the first.
-    So `spec.version` is that of the first, and an id without a version means the first; `spec.id` is right.
+    A version is a scenario of its own, with results of its own; the earlier ones are kept as they are. Warnings of
+    other packages, and of versions that are registered under other namespaces, stay.
     """
-    family, version = split_version(name)
-    if version is None:
-        return
-    versions = {each: number for each in gym.registry for other, number in [split_version(each)] if other == family}
-    for each, number in versions.items():
-        if number is not None:
-            gym.registry[each].version = min(other for other in versions.values() if other is not None)
+    warnings.filterwarnings(
+        "ignore", message=r".*The environment rare_envs/\S+ is out of date", category=DeprecationWarning
+    )
 
 
 def register_scenario(env_id: str, scenario: Scenario) -> None:

@@ -16,13 +16,14 @@ from samplers.estimation import estimate
 from samplers.execution.arguments import RunArguments, check_problem
 from samplers.execution.progress import Listener
 from samplers.method import Stepping
-from samplers.methods.two_stage.method import TwoStage
+from samplers.methods.auto import Auto
 from samplers.problem import FloatArray, Problem, condition_of
 from samplers.result import Estimate, indent_lines
 from samplers.serialization import to_json_value
 from samplers.statistics.cluster_sums import has_independent_points, interval_of_sum
 from samplers.statistics.intervals import Interval, degrees_of_freedom, zero_hit_bound
 from samplers.statistics.weights import effective_number
+from samplers.validation import check_whole
 
 MIN_SIDE_ESS = 30.0
 """Effective failing units below which a probability is called coarse: its c.o.v. is then about 0.2 or more."""
@@ -133,6 +134,10 @@ class EitherFails:
             self._known[x[row].tobytes()] = (bool(f[0, row] <= self._gamma), bool(f[1, row] <= self._gamma))
         return least
 
+    def failing_parts(self, x: FloatArray) -> FloatArray:
+        """Return 1 where A and where B fails at points x (k, d) that were simulated, 0 elsewhere, shape (2, k)."""
+        return self.failing_sides(x).astype(np.float64)
+
     def failing_sides(self, x: FloatArray) -> NDArray[np.bool_]:
         """Return whether A and whether B fails at points x (k, d) that were simulated, shape (2, k)."""
         unknown = np.array([row.tobytes() not in self._known for row in x], dtype=bool)
@@ -144,7 +149,7 @@ class EitherFails:
 def compare(
     a: Problem,
     b: Problem,
-    method: Stepping | str = TwoStage(),  # noqa: B008  (frozen, so safe to share)
+    method: Stepping | str = Auto(),  # noqa: B008  (frozen, so safe to share)
     gamma: float = RunArguments.gamma,
     seed: int | None = RunArguments.seed,
     max_sim: int | None = RunArguments.max_sim,
@@ -178,7 +183,8 @@ def compare(
         max_sim: Simulations of A and B together that are never exceeded.
         confidence: Nominal coverage of the intervals.
         progress: As in `estimate`.
-        ensemble_run: As in `estimate`; the further run is one of both.
+        ensemble_run: As in `estimate`; the further run is one of both, and is made too where the failing points of A
+            alone or of B alone do not reach the refits.
 
     Raises:
         ValueError: If an argument is not as described in `estimate`, or the base distributions differ.
@@ -190,6 +196,8 @@ def compare(
         >>> print(f"{samplers.compare(a, b, seed=0, max_sim=8000).ratio:.1f}")  # Phi(-3) / Phi(-3.2) = 1.96
         2.0
     """
+    if max_sim is not None:
+        check_whole("max_sim (of A and B together)", max_sim, 2)
     for problem in (a, b):
         check_problem(problem, ("dim", "base", "evaluate"))
     _check_same_base(a, b)
@@ -217,7 +225,8 @@ def _summarise(either: Estimate, problem: EitherFails) -> Comparison:
     weights, units = sample.weights[fails], sample.units[fails]
     which = problem.failing_sides(sample.x)
     totals = np.array([np.bincount(units, weights=weights * hit, minlength=sample.n_units) for hit in which])
-    own = float(np.bincount(units, weights=weights, minlength=sample.n_units).std()) * math.sqrt(sample.n_units)
+    # the error of the units as `_error` has it for A and B: for A = either, A has the c.o.v. of either
+    own = _error(np.bincount(units, weights=weights, minlength=sample.n_units).astype(np.float64))
     factor = cov_inflation(either, own / either.p if either.p > 0 else math.inf)
     single = has_independent_points(sample)
     a, b = (_side(total, factor, single, either) for total in totals)
@@ -225,10 +234,11 @@ def _summarise(either: Estimate, problem: EitherFails) -> Comparison:
         f"{name} failed in only {s.ess:.0f} effective draws" for name, s in (("A", a), ("B", b)) if s.ess < MIN_SIDE_ESS
     ]
     about = [f"{' and '.join(few)}: the ratio is coarse; estimate each separately."] if few else []
+    interval = _ratio_interval(totals, factor, single, either)
     n_sim = problem.n_sim - (0 if either.ensemble_run is None else 2 * either.ensemble_run.n_sim)
     return Comparison(
         ratio=_ratio(a.p, b.p),
-        interval=_ratio_interval(totals, factor, single, either),
+        interval=interval,
         confidence=either.confidence,
         a=a,
         b=b,
@@ -236,24 +246,27 @@ def _summarise(either: Estimate, problem: EitherFails) -> Comparison:
         n_sim=n_sim,
         warnings=(*either.warnings, *about),
         either=either,
-        base_uncertainty=_base_uncertainty(totals, factor, either, problem),
+        base_uncertainty=_base_uncertainty(totals, factor, either, problem, interval),
     )
 
 
 def _base_uncertainty(
-    totals: FloatArray, factor: float, either: Estimate, problem: EitherFails
+    totals: FloatArray, factor: float, either: Estimate, problem: EitherFails, sampling: Interval
 ) -> RatioUncertainty | None:
-    """Return the uncertainty that the events leave from the unit totals of A and B, shape (2, n_units)."""
+    """Return the uncertainty that the events leave from the unit totals of A and B, shape (2, n_units).
+
+    It holds the interval of the sampling, which of few draws is wider than their errors say.
+    """
     fitted = find_fitted_base(either.base)
     if fitted is None:
         return None
     p_a, p_b = (float(p) for p in totals.sum(axis=1))
     if p_a == 0 or p_b == 0:
         return summarise_ratio(_ratio(p_a, p_b), math.inf, None, fitted, either.confidence)
-    sums = reweight_runs_to_refits(either, fitted.refits, lambda x: problem.failing_sides(x).astype(np.float64))
+    sums = reweight_runs_to_refits(either, fitted.refits, problem.failing_parts)
     cov = factor * _error(totals[0] / p_a - totals[1] / p_b)
     n_sim = 0 if either.ensemble_run is None else 2 * either.ensemble_run.n_sim
-    return summarise_ratio(p_a / p_b, cov, sums, fitted, either.confidence, n_sim)
+    return summarise_ratio(p_a / p_b, cov, sums, fitted, either.confidence, n_sim, sampling)
 
 
 def _ratio(a: float, b: float) -> float:

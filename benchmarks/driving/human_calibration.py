@@ -94,7 +94,7 @@ class HumanEvents:
 
 
 EVENTS = (
-    HumanEvents("rare_envs/CutIn-v0", "cut-in", CUT_IN_CONTACTS_100CAR, CUT_IN_NEAR_CRASHES_100CAR),
+    HumanEvents("rare_envs/CutIn-v1", "cut-in", CUT_IN_CONTACTS_100CAR, CUT_IN_NEAR_CRASHES_100CAR),
     # all of people's rear-end contacts are taken to begin with brakings of the base's kind, those to a standstill
     HumanEvents(
         "rare_envs/HardBrake-v0", "braking of the lead", REAR_END_CONTACTS_100CAR, REAR_END_NEAR_CRASHES_100CAR
@@ -291,7 +291,7 @@ def main(
     chosen = dict(each.split("=", 1) for each in base or [])
     cells, people = [], {}
     for events in EVENTS:
-        short = events.env_id.removeprefix("rare_envs/").removesuffix("-v0")
+        short = events.env_id.removeprefix("rare_envs/").rpartition("-v")[0]
         name = chosen.get(short, find_scenario(events.env_id).default_base)
         people[events.name] = describe_people(events, events.find_frequency(name))
         for driver in DRIVERS:

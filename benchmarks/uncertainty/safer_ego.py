@@ -106,21 +106,22 @@ def main(
     max_sim: Annotated[int, typer.Option(help="Simulations of both egos together under each base.")] = 8000,
     seed: Annotated[int, typer.Option(help="Of the comparisons.")] = 0,
     scenario: Annotated[list[str] | None, typer.Option(help="Which to measure; the rows of others are kept.")] = None,
+    base: Annotated[list[str] | None, typer.Option(help="Which bases of these; the rows of others are kept.")] = None,
     out: Annotated[Path, typer.Option(help="Where the result goes.")] = SAFER_RESULT,
 ) -> None:
     """Measure bases and write the result."""
     rows = {(row["scenario"], row["base"]): row for row in json.loads(out.read_text())["rows"]} if out.is_file() else {}
-    for name, base in list_fitted_bases():
-        if scenario and name not in scenario:
+    for name, fitted in list_fitted_bases():
+        if (scenario and name not in scenario) or (base and fitted not in base):
             continue
-        row = measure_base(name, base, max_sim, seed)
+        row = measure_base(name, fitted, max_sim, seed)
         if row is None:
-            print(f"{name} {base}: one of the two never fails")
+            print(f"{name} {fitted}: one of the two never fails", flush=True)
             continue
         values = {key: _null_nan(value) for key, value in asdict(row).items()}
-        rows[name, base] = {**values, "max_sim": max_sim, "seed": seed}
+        rows[name, fitted] = {**values, "max_sim": max_sim, "seed": seed}
         print(
-            f"{name} {base}: ratio {row.ratio:.2g} {row.ratio_interval}, safer in {row.safer_refits} of "
+            f"{name} {fitted}: ratio {row.ratio:.2g} {row.ratio_interval}, safer in {row.safer_refits} of "
             f"{row.covered_refits} ({row.refits}) refits; spreads {row.spreads[0]:.2f}, {row.spreads[1]:.2f}, "
             f"of the ratio {row.ratio_spread:.2f}",
             flush=True,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,8 +12,10 @@ import samplers
 from rare_envs.egos.errors import EgoGone
 from rare_envs.files import replace_text
 from rare_envs.json_text import format_json
+from rare_envs.study.analysis.repeatability import RowKeeper
 from rare_envs.study.errors import as_bad_input, output_folder
-from rare_envs.study.question import Question, prepare
+from rare_envs.study.evaluate import recheck
+from rare_envs.study.question import Question, Study, prepare
 from rare_envs.study.run_directory import check_no_results, write_failures
 from rare_envs.version import __version__
 
@@ -37,9 +40,15 @@ class EgoComparison(NamedTuple):
 
 
 def compare_egos(
-    question: Question, ego_b: str, progress: bool = False, out: Path | None = None, force: bool = False
+    question: Question,
+    ego_b: str,
+    progress: bool = False,
+    out: Path | None = None,
+    force: bool = False,
+    algo_b: str | None = None,
+    stats_b: str | None = None,
 ) -> EgoComparison:
-    """Estimate p_A / p_B, see `samplers.compare`.
+    """Estimate p_A / p_B, see `samplers.compare`; some simulations of each are done again at the end.
 
     Args:
         question: The question about ego A, without its `UNUSED_FIELDS`.
@@ -47,6 +56,8 @@ def compare_egos(
         progress: Show a bar on standard error.
         out: Folder for `COMPARISON` and the scenarios on which one of them fails; is made, if need be.
         force: Replace an earlier run or comparison in that folder.
+        algo_b: Algorithm of the other ego's `.zip`; recognised from the file when None.
+        stats_b: File of its `VecNormalize` statistics; None to look for one beside it.
 
     Returns:
         The estimate, and all of it with the question.
@@ -62,12 +73,13 @@ def compare_egos(
     """
     if out is not None and not force:
         check_no_results(out, COMPARISON)
-    a, b = prepare(question), prepare(replace(question, ego=ego_b))
+    a, b = prepare(question), prepare(replace(question, ego=ego_b, algo=algo_b, stats=stats_b))
+    kept = {name: RowKeeper(study.problem, question.gamma) for name, study in (("A", a), ("B", b))}
     with contextlib.nullcontext() if out is None else output_folder(out):
         with as_bad_input(ValueError, EgoGone):
             comparison = samplers.compare(
-                a.problem,
-                b.problem,
+                kept["A"],
+                kept["B"],
                 a.method,
                 gamma=question.gamma,
                 seed=question.seed,
@@ -75,10 +87,12 @@ def compare_egos(
                 progress=progress,
                 ensemble_run=question.ensemble_run,
             )
+        doubts = _find_doubts({"A": a, "B": b}, kept)
+        comparison = replace(comparison, warnings=(*comparison.warnings, *doubts))
         inputs = {key: value for key, value in asdict(question).items() if key not in UNUSED_FIELDS}
         answer = {
             **comparison.to_dict(),
-            "question": {"ego_a": inputs.pop("ego"), "ego_b": ego_b, **inputs},
+            "question": {"ego_a": inputs.pop("ego"), "ego_b": ego_b, **inputs, "algo_b": algo_b, "stats_b": stats_b},
             "notes": [f"{name}: {note}" for name, study in (("A", a), ("B", b)) for note in study.problem.notes],
             "version": __version__,
         }
@@ -86,3 +100,9 @@ def compare_egos(
             replace_text(out / COMPARISON, format_json(answer) + "\n")
             write_failures(out, a.problem.space, comparison.either.failures)
     return EgoComparison(comparison, answer)
+
+
+def _find_doubts(studies: Mapping[str, Study], kept: Mapping[str, RowKeeper]) -> list[str]:
+    """Return which egos, by name, gave other f when some simulations were done again."""
+    checks = {name: recheck(study, kept[name]) for name, study in studies.items()}
+    return [f"{name}: {check.warning}" for name, check in checks.items() if check is not None and check.warning]

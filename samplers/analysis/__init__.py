@@ -2,7 +2,7 @@
 
 from samplers.analysis.base_uncertainty import BaseUncertainty
 from samplers.analysis.curve import Curve
-from samplers.analysis.exceedance import Exceedance, RefitBand, compute_exceedance
+from samplers.analysis.exceedance import Exceedance, compute_exceedance
 from samplers.analysis.failure_expectation import (
     FailureExpectation,
     FurtherFailures,
@@ -12,6 +12,7 @@ from samplers.analysis.failure_expectation import (
 from samplers.analysis.failure_modes import NO_OUTCOME_LABEL, Share, sum_by_label
 from samplers.analysis.failure_weights import WeightedFailures, weigh_failures
 from samplers.analysis.ratio_uncertainty import RatioUncertainty
+from samplers.analysis.refit_band import RefitBand
 from samplers.analysis.reweighting import Reweighted
 from samplers.analysis.sensitivity import Sensitivity
 

@@ -2,13 +2,18 @@
 
 With p_b the probability under refit b, s the standard deviation of log p_b and t a quantile of Student's t,
 
-    p exp(-t S) to p exp(t S),    S^2 = s^2 + cov^2 + 0.2^2.
+    p exp(-t S) to p exp(t S),    S^2 = s^2 + cov^2 + 0.2^2,
+
+the upper end raised by the share of p that a search may have missed, as that of the sampling interval is
+(`samplers.statistics.unseen_share`): S does not hold it, since the refits miss what the run misses. It is nowhere
+narrower than the sampling interval, which of few draws is wider than their c.o.v. says.
 
 Where refits choose their family anew, each family has such an interval, and the whole reaches from the lowest end to
-the highest (`samplers.analysis.refit_groups`). Percentiles of the p_b are not used: refits repeat the bias of the fit,
-and 30 of them do not reach the outer 2.5 %, so that percentiles cover 76 and 82 % (38 and 400 events) and miss on the
-unsafe side. This interval covers 93 and 92 % where the family of distributions is the true one
-(`benchmarks/uncertainty/base_coverage.py`). Another family is not covered by it.
+the highest; what is expected for the next event is a sum over the families (`samplers.statistics.refit_groups`).
+Percentiles of the p_b are not used: refits repeat the bias of the fit, and 30 of them do not reach the outer 2.5 %, so
+that percentiles cover 76 and 82 % (38 and 400 events) and miss on the unsafe side. This interval covers 93 and 92 %
+where the family of distributions is the true one (`benchmarks/uncertainty/base_coverage.py`). Another family is not
+covered by it.
 """
 
 from __future__ import annotations
@@ -19,10 +24,8 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
 from samplers.analysis.base import WeightedEstimate, no_outcome_weight, require_sample
-from samplers.analysis.refit_groups import find_log_ends, read_groups
 from samplers.analysis.refits import (
     MAX_UNCOVERED_SHARE,
     EnsembleEstimate,
@@ -35,6 +38,13 @@ from samplers.analysis.refits import (
 from samplers.problem import FloatArray
 from samplers.serialization import to_json_value
 from samplers.statistics.intervals import Interval
+from samplers.statistics.refit_groups import (
+    expect_over_families,
+    find_log_ends,
+    read_groups,
+    refit_quantile,
+    split_families,
+)
 
 FIT_BIAS = 0.2
 """Bias of the fit itself in log p (floor of the covariances, local optima of the mixture), which refits repeat: it
@@ -66,7 +76,8 @@ class BaseUncertainty:
     """Interval that should hold the p of the true distribution with probability `confidence`, if that is of the fitted
     family; None where the events do not determine p, or p under the refits is not known."""
     expected: float | None
-    """Probability that the next event fails, the error of the fit averaged: p exp(spread^2 / 2)."""
+    """Probability that the next event fails, the error of the fit averaged: p exp(s^2 / 2) with s the standard
+    deviation of log p over the refits; over several families of refits the sum of such means, by their shares."""
     spread: float
     """Standard deviation of log p over the refits; NaN where it is not known."""
     bound: float | None
@@ -142,6 +153,8 @@ def compute_base_uncertainty(estimate: EnsembleEstimate) -> BaseUncertainty | No
         estimate.confidence,
         fitted,
         sums,
+        sampling=estimate.interval,
+        lineages=read_lineages(estimate),
         low_factor=low_factor,
         n_sim=0 if further is None else further.n_sim,
         doubts=doubts,
@@ -156,6 +169,8 @@ def summarise_refits(
     fitted: FittedBase,
     sums: RefitSums,
     *,
+    sampling: Interval | None = None,
+    lineages: float = math.inf,
     low_factor: float = 1.0,
     largest: float = 1.0,
     n_sim: int = 0,
@@ -170,6 +185,8 @@ def summarise_refits(
         confidence: Nominal coverage of the interval.
         fitted: The base.
         sums: Values under each refit, one row; as shares of `largest`.
+        sampling: Interval of the sampling alone, which the interval is to hold; None where it need not.
+        lineages: Independent searches behind the value, see `Sample.lineages`; inf without a search.
         low_factor: Factor of the lower end.
         largest: Largest value possible, 1 for a probability.
         n_sim: Simulations of a further run.
@@ -181,12 +198,12 @@ def summarise_refits(
     interval, expected, spread, bound = None, None, math.nan, None
     if not reason:
         spread = float(log_values.std(ddof=1))
-        quantile = refit_quantile(confidence, len(log_values), fitted.clusters)
-        groups = read_groups(fitted, len(log_values))
-        below, above = find_log_ends(math.log(value), log_values, groups, cov**2 + FIT_BIAS**2, quantile)
+        families = split_families(math.log(value), log_values, read_groups(fitted, len(log_values)))
+        below, above = find_log_ends(families, cov**2 + FIT_BIAS**2, confidence, fitted.clusters, lineages)
         low, high = low_factor * scale_by_exp(1.0, below), min(largest, scale_by_exp(1.0, above))
+        low, high = (low, high) if sampling is None else (min(low, sampling[0]), max(high, sampling[1]))
         if spread <= MAX_SPREAD:
-            interval, expected = (low, high), min(largest, scale_by_exp(value, spread**2 / 2))
+            interval, expected = (low, high), expect_over_families(families, largest)
         else:
             bound = high
     return BaseUncertainty(
@@ -233,12 +250,7 @@ def half_width(spread: float, cov: float, confidence: float, n_refits: int, clus
         >>> round(half_width(spread=1.0, cov=0.0, confidence=0.95, n_refits=30, clusters=100) / (1 + 0.04) ** 0.5, 3)
         2.045
     """
-    return refit_quantile(confidence, n_refits, clusters) * math.sqrt(spread**2 + cov**2 + FIT_BIAS**2)
-
-
-def refit_quantile(confidence: float, n_refits: int, clusters: int) -> float:
-    """Return t, the quantile of Student's t with as many degrees of freedom as refits or clusters, less 1."""
-    return float(stats.t.ppf(0.5 + confidence / 2, min(n_refits, clusters) - 1))
+    return refit_quantile(confidence, n_refits - 1, clusters) * math.sqrt(spread**2 + cov**2 + FIT_BIAS**2)
 
 
 def scale_by_exp(value: float, exponent: float) -> float:
@@ -253,6 +265,11 @@ def describe_coverage(ess: FloatArray) -> tuple[str, ...]:
     if few <= MAX_UNCOVERED_SHARE * len(ess):
         return ()
     return (f"{few} of {len(ess)} refits rest on under 10 effective failing points: the spread is coarse.",)
+
+
+def read_lineages(estimate: WeightedEstimate) -> float:
+    """Return the independent searches that reached failure behind an estimate; inf without a search or points."""
+    return math.inf if estimate.sample is None else estimate.sample.lineages
 
 
 def _lower_factor(estimate: WeightedEstimate) -> float:

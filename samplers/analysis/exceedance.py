@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from samplers.analysis.base import MIN_UNITS
-from samplers.analysis.base_uncertainty import BaseUncertainty, summarise_refits
+from samplers.analysis.base_uncertainty import read_lineages
 from samplers.analysis.curve import ProbabilityCurve, as_thresholds
 from samplers.analysis.failure_expectation import FurtherFailures, sum_parts_under_refits
 from samplers.analysis.failure_weights import WeightedFailures
-from samplers.analysis.refits import EnsembleEstimate, RefitSums, find_fitted_base
+from samplers.analysis.refit_band import RefitBand, compute_refit_band
+from samplers.analysis.refits import EnsembleEstimate, find_fitted_base
 from samplers.problem import FloatArray
 from samplers.sample import Sample
-from samplers.serialization import to_json_value
 from samplers.statistics.cluster_sums import UnitSums, unit_sums
 from samplers.statistics.simultaneous import simultaneous_intervals
 
@@ -25,41 +25,6 @@ if TYPE_CHECKING:
 
 NOWHERE = 1e308
 """Stands for the f of points that exceed no threshold: above all thresholds, and finite."""
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class RefitBand:
-    """Intervals of an exceedance curve that the events behind a fitted base allow, each threshold by itself.
-
-    Each is that of `BaseUncertainty`; fields of shape (k,) belong to the thresholds of the curve.
-
-    Example:
-        >>> ends = {"low": np.array([1e-4, 0.0]), "high": np.array([4e-3, 4e-3]), "spread": np.array([0.9, np.nan])}
-        >>> band = RefitBand(**ends, confidence=0.95, n_refits=30, fitted_to="40 events", family="1 component")
-        >>> band.to_dict()["spread"]
-        [0.9, None]
-    """
-
-    low: FloatArray
-    """Lower ends, shape (k,); 0 where the events do not determine the probability, or too few units exceed the
-    threshold."""
-    high: FloatArray
-    """Upper ends, shape (k,); where too few units exceed the threshold, that of the next lower one."""
-    spread: FloatArray
-    """Standard deviation of log P over the refits, shape (k,); NaN where it is not known."""
-    confidence: float
-    """Nominal coverage of each interval."""
-    n_refits: int
-    """Number of refits."""
-    fitted_to: str
-    """The events in words."""
-    family: str
-    """The family of distributions in words."""
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain lists and numbers for JSON; NaN becomes None."""
-        values = asdict(self)
-        return {name: to_json_value(v.tolist() if isinstance(v, np.ndarray) else v) for name, v in values.items()}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -85,7 +50,8 @@ class Exceedance(ProbabilityCurve):
     thresholds: FloatArray
     """Thresholds t, shape (k,), in the order asked for."""
     base: RefitBand | None = None
-    """Intervals that the events behind the base distribution allow; None where it has no refits."""
+    """Band that the events behind the base distribution allow; None where it has no refits, or these tell
+    nothing of any threshold."""
 
     axis = "thresholds"
     symbol = "t"
@@ -107,7 +73,7 @@ class Exceedance(ProbabilityCurve):
             positive = np.concatenate([self.p / 10, self.base.low])
             order, floor = np.argsort(self.thresholds), positive[positive > 0].min(initial=1.0)
             low, high = (np.maximum(each[order], floor) for each in (self.base.low, self.base.high))
-            label = f"base distribution, {100 * self.base.confidence:g} % each"
+            label = f"base distribution, {100 * self.base.confidence:g} % of all together"
             ax.fill_between(self.thresholds[order], low, high, color="C1", alpha=0.2, linewidth=0, label=label)
         ax.legend(frameon=False)
         return ax
@@ -122,7 +88,7 @@ def compute_exceedance(
 ) -> Exceedance:
     """Return P[failure and v > t] over thresholds t, with a simultaneous (sup-t) band as that of `Estimate.curve`.
 
-    Where the base has refits, each probability also has the interval that its events allow.
+    Where the base has refits, the curve also has the band that its events allow.
 
     Args:
         estimate: The run.
@@ -159,6 +125,8 @@ def compute_exceedance(
     low = np.maximum.accumulate(low)
     high = np.minimum.accumulate(high[::-1])[::-1]
     here = place[:-1]
+    enough = np.where(sums.ess >= MIN_UNITS, sums.p, 0.0)
+    sampling = enough[here], cov[here], sums.correlation[np.ix_(here, here)]
     return Exceedance(
         thresholds=asked,
         p=sums.p[here],
@@ -167,9 +135,7 @@ def compute_exceedance(
         cov=cov[here],
         ess=sums.ess[here],
         confidence=estimate.confidence,
-        base=_band_under_refits(
-            estimate, (failures, v), further, asked, np.where(sums.ess >= MIN_UNITS, sums.p, 0.0)[here], cov[here]
-        ),
+        base=_band_under_refits(estimate, (failures, v), further, asked, sampling),
     )
 
 
@@ -185,12 +151,12 @@ def _band_under_refits(
     own: tuple[WeightedFailures, FloatArray],
     further: FurtherFailures | None,
     thresholds: FloatArray,
-    p: FloatArray,
-    cov: FloatArray,
+    sampling: tuple[FloatArray, FloatArray, FloatArray],
 ) -> RefitBand | None:
-    """Return the intervals that refits allow for probabilities p (k,) at thresholds; None where there are none.
+    """Return the band that refits allow for probabilities at k thresholds; None where these tell nothing of any.
 
-    p is 0 where too few units exceed the threshold.
+    `sampling` has the probabilities (k,), 0 where too few units exceed the threshold, their c.o.v. (k,) and the
+    correlation of their errors (k, k).
     """
     fitted = find_fitted_base(estimate.base)
     if fitted is None:
@@ -204,32 +170,13 @@ def _band_under_refits(
         sums = sum_parts_under_refits(estimate, fitted, beyond[0], beyond[1])
     except ValueError:  # p itself is not known under the refits, as `BaseUncertainty` says
         return None
-    found = [
-        summarise_refits(value, one, estimate.confidence, fitted, RefitSums(log_p[None], ess[None]))
-        if value > 0
-        else None
-        for value, one, log_p, ess in zip(p.tolist(), cov.tolist(), *sums, strict=True)
-    ]
-    low, high = _ends_by_threshold(found, np.argsort(thresholds))
-    return RefitBand(
-        low=low,
-        high=high,
-        spread=np.array([np.nan if each is None else each.spread for each in found]),
+    band = compute_refit_band(
+        thresholds,
+        *sampling,
+        sums,
+        fitted,
         confidence=estimate.confidence,
-        n_refits=len(fitted.refits),
-        fitted_to=fitted.fitted_to,
-        family=fitted.family,
+        seed=estimate.seed,
+        lineages=read_lineages(estimate),
     )
-
-
-def _ends_by_threshold(found: list[BaseUncertainty | None], rising: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
-    """Return lower and upper ends (k,); `rising` sorts the thresholds."""
-    low, high, last = np.zeros(len(found)), np.ones(len(found)), 1.0
-    for i in rising:
-        one = found[i]
-        if one is not None and one.interval is not None:
-            low[i], last = one.interval
-        elif one is not None and one.bound is not None:
-            last = one.bound
-        high[i] = last
-    return low, high
+    return band if np.isfinite(band.spread).any() else None

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from samplers.analysis.base import WeightedEstimate, require_sample
-from samplers.analysis.base_uncertainty import BaseUncertainty, summarise_refits
+from samplers.analysis.base_uncertainty import BaseUncertainty, read_lineages, summarise_refits
 from samplers.analysis.failure_weights import WeightedFailures
 from samplers.analysis.refits import (
     EnsembleEstimate,
@@ -167,6 +167,8 @@ def expect_under_refits(
         estimate.confidence,
         fitted,
         sums,
+        sampling=expectation.interval,
+        lineages=read_lineages(estimate),
         largest=largest,
         n_sim=0 if further is None or estimate.ensemble_run is None else estimate.ensemble_run.n_sim,
         reason=reason,

@@ -133,7 +133,13 @@ def compute_ratio_uncertainty(first: EnsembleEstimate, second: EnsembleEstimate)
 
 
 def summarise_ratio(
-    ratio: float, cov: float, sums: RefitSums | None, fitted: FittedBase, confidence: float, n_sim: int = 0
+    ratio: float,
+    cov: float,
+    sums: RefitSums | None,
+    fitted: FittedBase,
+    confidence: float,
+    n_sim: int = 0,
+    sampling: Interval | None = None,
 ) -> RatioUncertainty:
     """Return the uncertainty of a ratio.
 
@@ -144,6 +150,7 @@ def summarise_ratio(
         fitted: The base distribution.
         confidence: Nominal coverage.
         n_sim: Simulations of further runs.
+        sampling: Interval of the sampling alone, which the interval is to hold; None where it need not.
     """
     log_ratios, ess, reason = np.empty(0), np.empty(0), "one of the two never failed."
     if sums is not None:
@@ -157,7 +164,8 @@ def summarise_ratio(
         reason = f"the events do not determine the ratio: the spread of its logarithm is {spread:.1f}."
     elif not reason:
         half = half_width(spread, cov, confidence, len(log_ratios), fitted.clusters)
-        interval = (scale_by_exp(ratio, -half), scale_by_exp(ratio, half))
+        low, high = scale_by_exp(ratio, -half), scale_by_exp(ratio, half)
+        interval = (low, high) if sampling is None else (min(low, sampling[0]), max(high, sampling[1]))
     return RatioUncertainty(
         ratio=ratio,
         interval=interval,

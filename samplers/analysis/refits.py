@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple, Protocol, runtime_checkable
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,8 +83,20 @@ class HasEnsemble(Protocol):
         """
 
 
+@runtime_checkable
+class HasParts(Protocol):
+    """A problem whose failures have parts, each with a probability of its own that is wanted under the refits."""
+
+    def failing_parts(self, x: FloatArray) -> FloatArray:
+        """Return what share of failing points x (k, d) belongs to each of m parts, shape (m, k)."""
+
+
 class EnsembleEstimate(WeightedEstimate, Protocol):
     """An estimate that may have a further run under the mixture of the refits."""
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Interval of p, of the sampling alone."""
 
     @property
     def n_sim(self) -> int:
@@ -112,14 +125,21 @@ def find_fitted_base(base: object) -> FittedBase | None:
     return base if isinstance(base, FittedBase) and len(base.refits) > 0 else None
 
 
+_checked: WeakKeyDictionary[object, tuple[object, ...]] = WeakKeyDictionary()
+"""Bases to the refits and the dimension that were found to fit them; a check takes as long as a thousand rollouts."""
+
+
 def check_refits(base: Distribution, dim: int) -> None:
-    """Check the refits of a base distribution, if it has some.
+    """Check the refits of a base distribution, if it has some; once for each base.
 
     Raises:
         ValueError: If a refit has other dimensions or another support than the base, or no density.
     """
     fitted = find_fitted_base(base)
     if fitted is None:
+        return
+    known = (dim, *map(id, fitted.refits))
+    if _can_be_remembered(fitted) and _checked.get(fitted) == known:
         return
     x = fitted.sample(REFIT_CHECK_DRAWS, np.random.default_rng(0))
     for number, refit in enumerate(fitted.refits, start=1):
@@ -137,6 +157,13 @@ def check_refits(base: Distribution, dim: int) -> None:
                 f"Refit {number} of {len(fitted.refits)} has another support than its base distribution: some draws "
                 "from the one have no finite density under the other."
             )
+    if _can_be_remembered(fitted):
+        _checked[fitted] = known
+
+
+def _can_be_remembered(base: object) -> bool:
+    """Return whether a base can be a key by its identity."""
+    return type(base).__hash__ is object.__hash__ and getattr(type(base), "__weakrefoffset__", 0) != 0
 
 
 def _count_outside(distribution: HasLogProb, x: FloatArray) -> int:
@@ -265,11 +292,15 @@ def count_uncovered(ess: Iterable[float]) -> int:
     return sum(each < MIN_REFIT_ESS for each in ess)
 
 
-def needs_ensemble_run(estimate: WeightedEstimate) -> bool:
-    """Return whether a further run under the mixture of the refits would tell p under them; it needs no simulation.
+def needs_ensemble_run(estimate: WeightedEstimate, split: Callable[[FloatArray], FloatArray] | None = None) -> bool:
+    """Return whether a further run under the mixture of the refits would tell p, or a part of it, under them.
 
-    False where the base has no refits or no `ensemble`, or where the run has few effective failing points under its own
-    base: another of that size would have as few.
+    False where the base has no refits or no `ensemble`, or where the run, or a part of it, has few effective failing
+    points under its own base: another of that size would have as few.
+
+    Args:
+        estimate: The run.
+        split: Returns parts of p (m, k) for points (k, d), see `reweight_to_refits`; None for p itself.
     """
     fitted = find_fitted_base(estimate.base)
     if fitted is None or not isinstance(fitted, HasEnsemble):
@@ -277,7 +308,8 @@ def needs_ensemble_run(estimate: WeightedEstimate) -> bool:
     if estimate.sample is None or len(estimate.sample.x) == 0 or estimate.p <= 0:
         return False
     try:
-        own = float(_sum_parts(estimate, np.zeros((1, len(estimate.sample.x))), None).ess[0, 0])
-        return own >= MIN_OWN_ESS and are_uncovered(reweight_to_refits(estimate, fitted.refits))
+        parts = None if split is None else split(estimate.sample.x)
+        own = float(_sum_parts(estimate, np.zeros((1, len(estimate.sample.x))), parts).ess.min())
+        return own >= MIN_OWN_ESS and are_uncovered(reweight_to_refits(estimate, fitted.refits, parts))
     except ValueError:  # no points to reweight: the mixture of the refits would not mend that
         return False

@@ -36,8 +36,7 @@ def simultaneous_intervals(
     Returns:
         Lower and upper ends, shape (G,) each.
     """
-    rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(BAND_STREAM,)))
-    level = simultaneous_level(sums.correlation[np.ix_(use, use)], confidence, rng)
+    level = simultaneous_level(sums.correlation[np.ix_(use, use)], confidence, band_generator(seed))
     low, high = np.zeros(len(p)), np.ones(len(p))
     for i in use:
         if sums.is_count[i]:
@@ -45,6 +44,11 @@ def simultaneous_intervals(
         else:
             low[i], high[i] = interval_of_sum(float(p[i]), float(cov[i]), float(sums.ess[i]), sums.independent, level)
     return low, high
+
+
+def band_generator(seed: int) -> np.random.Generator:
+    """Return the generator of the draws for a band of a run with this seed."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(BAND_STREAM,)))
 
 
 def simultaneous_level(correlation: NDArray[np.float64], confidence: float, rng: np.random.Generator) -> float:

@@ -32,13 +32,32 @@ def add_unseen(p: float, high: float, lineages: float, confidence: float) -> flo
     """
     if not 0 < p < high or np.isinf(lineages):
         return high
+    return float(min(1.0, p * np.exp(raise_log_end(float(np.log(high / p)), lineages, confidence))))
+
+
+def raise_log_end(half: float, lineages: float, confidence: float) -> float:
+    """Return how far the upper end of log p lies above its estimate, `half` without the share that is unseen.
+
+    Args:
+        half: Above 0.
+        lineages: As for `add_unseen`.
+        confidence: Nominal coverage of the interval.
+
+    Example:
+        Beside half a width of 2, a share of some per cent is next to nothing; beside 0.1 it is not.
+
+        >>> [round(raise_log_end(half, 25, 0.95), 3) for half in (0.1, 2.0)]
+        [0.108, 2.004]
+    """
+    if np.isinf(lineages):
+        return half
     tail = 0.5 + confidence / 2
-    sigma = np.log(high / p) / stats.norm.ppf(tail)
+    sigma = half / stats.norm.ppf(tail)
     shares = stats.beta.ppf((np.arange(QUANTILES) + 0.5) / QUANTILES, PRIOR_SHARE, lineages)
     shift = np.log1p(-np.minimum(shares, 1 - 1e-12))  # of log p, were it all of it
-    below, above = 0.0, np.log(high / p) - shift.min()
+    below, above = 0.0, half - shift.min()
     for _ in range(60):
         middle = 0.5 * (below + above)
         short = ndtr((middle + shift) / sigma).mean() < tail
         below, above = (middle, above) if short else (below, middle)
-    return float(min(1.0, p * np.exp(above)))
+    return float(above)

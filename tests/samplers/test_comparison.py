@@ -56,6 +56,13 @@ def test_other_methods(method, max_sim):
     assert found.interval[1] < 3 * found.interval[0]
 
 
+def test_where_b_never_fails_alone_the_error_of_a_is_that_of_either():
+    """Subset simulation: its c.o.v. holds the correlation of the chains, which that of the units lacks."""
+    found = samplers.compare(*NESTED[:2], "adss", seed=2, max_sim=8000)
+    assert found.a.p == pytest.approx(found.either.p)
+    assert found.a.cov == pytest.approx(found.either.cov)
+
+
 def test_monte_carlo_with_hand_counted_hits():
     """Four failing draws of A, two of B, one of both."""
     order = np.array([1, 1, 1, 1, 0, 0, 0, 0, 0, 0])
@@ -122,3 +129,9 @@ def test_intervals_hold_the_ratio(a, b, ratio):
     assert held >= stats.binom.ppf(1e-3, 60, 0.9)
     logs = np.log([each.ratio / ratio for each in found])
     assert abs(logs.mean()) < 4 * logs.std(ddof=1) / math.sqrt(60) + 0.01
+
+
+@pytest.mark.parametrize("max_sim", [1, 0, 2.5])
+def test_a_budget_is_for_both(max_sim):
+    with pytest.raises(ValueError, match=rf"max_sim \(of A and B together\) .* at least 2, got {max_sim}"):
+        samplers.compare(*NESTED[:2], seed=0, max_sim=max_sim)

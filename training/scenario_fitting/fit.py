@@ -159,6 +159,8 @@ def main(
         known = tuple(EVENT_RECIPES)
         if unknown := sorted(set(scenario or ()) - set(known)):
             raise ValueError(f"Unknown scenario {unknown[0]}; known are {', '.join(known)}.")
+        if not name or Path(name).name != name:
+            raise ValueError(f"Expected --name as a part of file names, such as cologne, got {name!r}.")
         gaps: Gaps = "cut" if cut_gaps else "error"
         if kind == "data":
             _write_package_bases(path, scenario or known, out, seed, refits)

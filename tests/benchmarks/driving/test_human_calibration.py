@@ -40,9 +40,9 @@ def cells_of(**counts: tuple[int, int, int]) -> dict[str, CalibrationCell]:
 
 
 def test_outcomes_are_those_of_the_measures_and_of_the_crashes() -> None:
-    cell = count_outcomes(CUT_IN, "human", "us101", 300, seed=3)
+    cell = count_outcomes(CUT_IN, "human", "us101", 1000, seed=3)
     around = rare_envs.DrivingProblem(CUT_IN.env_id, ego="human", measure="near_crash", base="us101")
-    x = around.base.sample(300, np.random.default_rng(3))
+    x = around.base.sample(1000, np.random.default_rng(3))
     f = around.evaluate(x)
     ttc = rare_envs.DrivingProblem(CUT_IN.env_id, ego="human", base="us101").evaluate(x)
     required = rare_envs.DrivingProblem(CUT_IN.env_id, ego="human", measure="required_deceleration", base="us101")

@@ -7,6 +7,22 @@ import pytest
 from rare_envs.study.storage.failure_table import read_failures
 
 FOLLOWING = "rare_envs/CarFollowing-v0"
+RANDOM_LATER = """
+import numpy as np
+
+
+class Ego:
+    calls = 0
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        self.calls += 1
+        share = np.random.default_rng(self.calls if self.calls > 4 else 0).random((len(observation), 1))
+        return np.hstack((-share, 0.0 * share)), None
+
+
+make = Ego
+"""
+"""Two answers of it are alike, as the check before a run wants, and later ones are random."""
 
 
 def test_the_ratio_of_an_ego_that_brakes_and_one_that_does_not(cli, risky, here):
@@ -50,3 +66,20 @@ def test_a_missing_ego_is_named(cli):
     assert result.exit_code == 2
     assert "nowhere.zip" in result.stderr
     assert result.stdout == ""
+
+
+def test_an_ego_that_answers_at_random_is_named(cli, risky, here):
+    (here / "random_later.py").write_text(RANDOM_LATER)
+    words = ("compare", "idm", "random_later:make", FOLLOWING, "--base", risky, "--method", "mc", "--max-sim", 400)
+    result = cli(*words, "--gamma", 2, "--json")
+    assert result.exit_code == 3, result.output
+    found = json.loads(result.stdout)["warnings"]
+    assert [text for text in found if text.startswith("B: of ") and "gave another f" in text]
+    assert not [text for text in found if text.startswith("A: ")]
+
+
+def test_each_ego_has_its_own_statistics(cli, here):
+    for option in ("--stats", "--stats-b"):
+        refused = cli("compare", "idm", "idm", FOLLOWING, option, "nowhere.pkl", "--max-sim", 100)
+        assert refused.exit_code == 2, option
+        assert refused.stderr.count("\n") == 1

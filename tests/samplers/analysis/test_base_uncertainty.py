@@ -13,7 +13,16 @@ from samplers.analysis.base_uncertainty import (
     scale_by_exp,
 )
 from samplers.analysis.refits import reweight_runs_to_refits
-from tests.samplers.fitted_bases import FittedWithEnsemble, HalfSpace, fitted, normal, resampled, run
+from tests.samplers.fitted_bases import (
+    BETA,
+    FittedNormal,
+    FittedWithEnsemble,
+    HalfSpace,
+    fitted,
+    normal,
+    resampled,
+    run,
+)
 
 WIDE = [normal(mean, sd) for mean in np.linspace(-2.0, 2.0, 6) for sd in (0.5, 0.75, 1.0, 1.5, 2.0)]
 """30 refits so far apart that the events determine nothing."""
@@ -24,9 +33,14 @@ FAR = [*SHIFTED[:26], *[normal(7.0, 0.2 + 0.01 * i) for i in range(4)]]
 BASE, FAR_BASE = fitted(SHIFTED), fitted(FAR, FittedWithEnsemble)
 
 
+def after(result, lineages):
+    """Return a result as if so many independent searches had found its failures; inf for plain draws."""
+    return replace(result, sample=replace(result.sample, lineages=lineages))
+
+
 def test_the_interval_by_hand():
-    """30 refits of 17 scenes: 16 degrees of freedom; t = 2.120."""
-    result = run(BASE)
+    """30 refits of 17 scenes: 16 degrees of freedom; t = 2.120. Plain draws miss no region."""
+    result = after(run(BASE), math.inf)
     found = result.base_uncertainty
     spread = np.std(np.log(found.p_refits), ddof=1)
     half = 2.119905 * math.sqrt(spread**2 + result.cov**2 + 0.04)
@@ -37,6 +51,17 @@ def test_the_interval_by_hand():
     exact = np.log([refit.p for refit in SHIFTED])
     assert found.spread == pytest.approx(exact.std(ddof=1), rel=0.05)
     assert np.log(found.p_refits) == pytest.approx(exact, abs=0.3)
+
+
+def test_the_upper_end_holds_what_a_search_may_have_missed():
+    """97.5 % point of p exp(S T) / (1 - M), M ~ Beta(1/10, lineages); the other numbers do not change."""
+    without, found = (after(run(BASE), lineages).base_uncertainty for lineages in (math.inf, 3.0))
+    assert (found.interval[0], found.spread, found.expected) == (without.interval[0], without.spread, without.expected)
+    rng = np.random.default_rng(0)
+    sigma = math.log(without.interval[1] / without.p) / stats.norm.ppf(0.975)
+    drawn = sigma * rng.standard_normal(10**6) - np.log1p(-rng.beta(0.1, 3.0, 10**6))
+    assert np.quantile(drawn, 0.975) > math.log(without.interval[1] / without.p) + 0.03
+    assert math.log(found.interval[1] / found.p) == pytest.approx(np.quantile(drawn, 0.975), abs=0.02)
 
 
 @pytest.mark.parametrize(
@@ -50,7 +75,7 @@ def test_quantiles_of_t_from_a_table(refits, clusters, confidence, quantile):
 
 
 def test_refits_without_a_spread_leave_the_bias_of_the_fit():
-    result = run(fitted([normal()] * 30, clusters=500))
+    result = after(run(fitted([normal()] * 30, clusters=500)), math.inf)
     low, high = result.base_uncertainty.interval
     half = 2.045230 * math.hypot(0.2, result.cov)
     assert (math.log(result.p / low), math.log(high / result.p)) == pytest.approx((half, half), rel=1e-6)
@@ -139,6 +164,49 @@ def test_where_the_spread_is_not_known_one_sentence_says_why(change, text):
     assert text in found.reason
     assert f"base distribution  no interval: {found.reason}" in str(result)
     assert json.loads(result.to_json())["base_uncertainty"]["spread"] is None
+
+
+class EachOfItsOwnFamily(FittedNormal):
+    """Refits of which no two are of one family."""
+
+    @property
+    def refit_groups(self):
+        return tuple(range(len(self.refits)))
+
+
+def test_refits_of_which_each_is_of_a_family_of_its_own_have_the_spread_of_all():
+    one, apart = run(BASE), run(fitted(SHIFTED, EachOfItsOwnFamily))
+    assert apart.base_uncertainty == one.base_uncertainty
+    (line,) = (each for each in str(apart).splitlines() if "base distribution" in each)
+    assert " to " in line and "(38 + 15 events of 17 scenes, 30 refits); expected for the next event" in line
+
+
+@pytest.mark.parametrize("max_sim", [1, 2, 20])
+@pytest.mark.parametrize("method", ["two-stage", "mc", "adss", "ce", "surrogate"])
+@pytest.mark.parametrize("beta", [0.0, 3.0])
+def test_after_hardly_any_simulations_one_line_says_what_is_known(method, max_sim, beta):
+    result = samplers.estimate(HalfSpace(BASE, beta), method, seed=1, max_sim=max_sim)
+    found = result.base_uncertainty
+    (line,) = (each.strip() for each in str(result).splitlines() if "base distribution" in each)
+    if found.interval is not None:
+        assert 0.0 <= found.interval[0] <= result.p <= found.interval[1] <= 1.0
+        assert line.startswith("base distribution 95 %")
+    else:
+        assert line.startswith(("base distribution  no interval: ", "base distribution  the events do not determine p"))
+        assert "nothing failed" in line or result.p > 0
+    assert "nan" not in line and "inf " not in line
+    json.loads(result.to_json())
+
+
+def test_of_a_run_that_was_stopped_the_interval_holds_that_of_the_sampling():
+    """Of the first batch of a search, 16 failures with a c.o.v. of 0.56: few draws are worth a wider quantile."""
+    started = samplers.TwoStage().start(HalfSpace(fitted([normal()] * 30)), seed=1, max_sim=3000)
+    started.tell(BETA - started.ask()[:, 0])
+    result = started.result()
+    low, high = result.base_uncertainty.interval
+    assert result.n_sim < 3000 and result.cov > 0.5
+    assert low <= result.interval[0] < result.interval[1] <= high
+    assert str(result).count("base distribution 95 %") == 1
 
 
 class Impossible:

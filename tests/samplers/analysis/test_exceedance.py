@@ -9,6 +9,7 @@ from samplers.analysis.base_uncertainty import half_width
 from samplers.analysis.exceedance import compute_exceedance
 from samplers.analysis.failure_expectation import FurtherFailures
 from samplers.analysis.failure_weights import weigh_failures
+from samplers.statistics.unseen_share import raise_log_end
 from tests.samplers.fitted_bases import FittedWithEnsemble, fitted, normal, resampled
 from tests.samplers.fitted_bases import run as run_fitted
 
@@ -96,20 +97,22 @@ def test_bad_input_is_refused():
         compute_exceedance(result, failures, failures.x[:, 0], [np.inf])
 
 
-def test_each_threshold_has_the_interval_that_refits_allow():
+def test_one_threshold_has_the_interval_that_refits_allow_and_several_have_a_wider_band():
     """P[x_1 > t] under N(m, s) is known: its spread over the refits is the exact one, the interval p exp(-+ t S)."""
     base = fitted(resampled(400, 20))
     result = run_fitted(base)
-    curve = curve_of(result, [3.5, 3.0])
-    for i, t in enumerate(curve.thresholds):
+    for t in (3.5, 3.0):
+        curve = curve_of(result, [t])
         exact = np.std([stats.norm.logsf(t, refit.means[0], refit.sds[0]) for refit in base.refits], ddof=1)
-        assert curve.base.spread[i] == pytest.approx(exact, rel=0.1)
-        half = half_width(curve.base.spread[i], curve.cov[i], 0.95, 20, base.clusters)
-        ends = curve.p[i] * np.exp([-half, half])
-        assert (curve.base.low[i], curve.base.high[i]) == pytest.approx(tuple(ends))
+        assert curve.base.spread[0] == pytest.approx(exact, rel=0.1)
+        half = half_width(curve.base.spread[0], curve.cov[0], 0.95, 20, base.clusters)
+        ends = curve.p[0] * np.exp([-half, raise_log_end(half, result.sample.lineages, 0.95)])
+        assert (curve.base.low[0], curve.base.high[0]) == pytest.approx(tuple(ends))
     whole = result.base_uncertainty
-    assert curve.base.spread[1] == pytest.approx(whole.spread)
-    assert (curve.base.low[1], curve.base.high[1]) == pytest.approx(whole.interval, rel=0.02)
+    assert curve.base.spread[0] == pytest.approx(whole.spread)
+    assert (curve.base.low[0], curve.base.high[0]) == pytest.approx(whole.interval, rel=0.02)
+    both = curve_of(result, [3.5, 3.0])
+    assert both.base.low[1] < curve.base.low[0] < curve.base.high[0] < both.base.high[1]
     assert json.loads(json.dumps(curve.to_dict(), allow_nan=False))["base"]["n_refits"] == 20
 
 
@@ -123,6 +126,8 @@ def test_what_refits_do_not_determine_has_an_upper_end_only():
     assert curve.base.high[1] == curve.base.high[0]
     assert np.isnan(curve.base.spread[1])
     assert curve_of(run(), [3.0]).base is None
+    for few in (fitted(base.refits[:1]), fitted(base.refits, clusters=1)):
+        assert curve_of(run_fitted(few), [3.0]).base is None
 
 
 def test_the_further_run_tells_of_refits_that_the_first_does_not_reach():
@@ -141,7 +146,7 @@ def test_the_picture_has_both_bands():
     curve = curve_of(run_fitted(fitted(resampled(400, 20))), [3.0, 3.25, 3.5])
     axes = curve.plot(Figure().subplots())
     labels = [text.get_text() for text in axes.get_legend().get_texts()]
-    assert labels == ["sampling, 95 % of all together", "base distribution, 95 % each"]
+    assert labels == ["sampling, 95 % of all together", "base distribution, 95 % of all together"]
     band = axes.collections[1].get_paths()[0].vertices
     assert band[:, 1].max() == pytest.approx(curve.base.high.max())
     assert band[:, 1].min() == pytest.approx(curve.base.low.min())

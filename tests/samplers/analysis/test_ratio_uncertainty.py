@@ -99,11 +99,38 @@ def test_the_further_run_of_a_comparison_simulates_both():
     assert "rest on under 10" in forbidden.base_uncertainty.warnings[0]
 
 
+def test_the_further_run_of_a_comparison_is_made_for_the_side_that_lacks_points():
+    """B fails where A does and x_2 >= 1, so p_A / p_B = 1 / Phi(-1) = 6.30 under each refit."""
+
+    class Corner(HalfSpace):
+        def evaluate(self, x):
+            return np.maximum(super().evaluate(x), 1.0 - x[:, 1])
+
+    base = fitted([normal(3.0, 0.5)] * 30, FittedWithEnsemble)
+    a, b = HalfSpace(base, 2.0), Corner(base, 2.0)
+    without = samplers.compare(a, b, "mc", seed=1, max_sim=20_000, ensemble_run=False).base_uncertainty
+    found = samplers.compare(a, b, "mc", seed=1, max_sim=20_000)
+    assert max(without.ess_refits) < 10.0 < min(found.either.base_uncertainty.ess_refits)
+    assert min(found.base_uncertainty.ess_refits) > 1000.0
+    assert found.base_uncertainty.n_sim == 20_000
+    assert np.array(found.base_uncertainty.ratio_refits) == pytest.approx(1 / stats.norm.sf(1.0), rel=0.1)
+    alone = samplers.estimate(a, "mc", seed=1, max_sim=10_000)
+    assert alone.ensemble_run is None  # A by itself needs none
+
+
 def test_two_runs_with_further_runs():
     first, second = estimates(FAR_BASE)
     found = samplers.compute_ratio_uncertainty(first, second)
     assert found.n_sim == first.ensemble_run.n_sim + second.ensemble_run.n_sim
     assert np.log(found.ratio_refits) == pytest.approx(np.log(exact_ratios(FAR)), abs=0.25)
+
+
+def test_the_interval_of_a_comparison_holds_that_of_its_sampling():
+    """Where a few draws fail on both sides, their errors cancel, and the interval of counts alone says how few."""
+    found = samplers.compare(*(HalfSpace(BASE, beta) for beta in (2.5, 2.5)), "mc", seed=1, max_sim=800)
+    assert found.interval is not None and 0 < found.a.p == found.b.p
+    low, high = found.base_uncertainty.interval
+    assert low <= found.interval[0] < 0.5 and high >= found.interval[1] > 2.0
 
 
 def test_one_that_never_fails_leaves_no_interval():

@@ -107,6 +107,20 @@ def test_the_decision_needs_points_and_an_ensemble():
     assert not needs_ensemble_run(nothing_failed)
 
 
+def test_a_part_that_the_points_do_not_reach_asks_for_a_further_run():
+    """Refits at 3: plain draws of N(0, 1) beyond 2 are worth a tenth of their number there."""
+    base = fitted([normal(3.0, 0.5)] * 30, FittedWithEnsemble)
+    result = samplers.estimate(HalfSpace(base, 2.0), "mc", seed=1, max_sim=10_000, ensemble_run=False)
+
+    def shares(*above):
+        return lambda x: np.array([x[:, 1] > each for each in above], dtype=float)
+
+    assert not needs_ensemble_run(result)
+    assert not needs_ensemble_run(result, shares(-9.0, -9.0))
+    assert needs_ensemble_run(result, shares(-9.0, 1.0))
+    assert not needs_ensemble_run(result, shares(-9.0, 9.0))  # another run would have as few in the second part
+
+
 class Cut:
     """N(0, 1) in both coordinates, x_1 cut to x_1 <= 1."""
 
@@ -162,6 +176,20 @@ def test_a_refit_that_does_not_fit_is_refused_before_the_first_simulation(refit,
     with pytest.raises(ValueError, match=text):
         samplers.estimate(Never(base), seed=0)
     check_refits(fitted([normal(), normal()]), 2)
+
+
+def test_refits_of_a_base_are_checked_once_and_other_refits_again(monkeypatch):
+    base, draws = fitted([normal(), normal()]), []
+    sample = type(base).sample
+    monkeypatch.setattr(type(base), "sample", lambda self, n, rng: draws.append(n) or sample(self, n, rng))
+    check_refits(base, 2)
+    assert len(draws) > 0
+    seen = len(draws)
+    check_refits(base, 2)
+    assert len(draws) == seen
+    object.__setattr__(base, "refits", (normal(), Cut()))
+    with pytest.raises(ValueError, match="Refit 2 of 2 has another support"):
+        check_refits(base, 2)
 
 
 def test_what_cannot_be_reweighted_says_so():

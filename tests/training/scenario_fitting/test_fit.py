@@ -169,6 +169,7 @@ def test_a_hard_brake_base_is_fitted_to_brakings_to_a_standstill(quick, tmp_path
         (("--coifman", "none.mat"), "Cannot read none.mat"),
         (("--ngsim", "none.csv", "--scenario", "merge"), "Unknown scenario merge"),
         (("--ngsim", "none.csv", "--data", "none"), "Expected one of"),
+        (("--ngsim", "none.csv", "--name", "a/b"), "part of file names, such as cologne, got 'a/b'"),
     ],
 )
 def test_bad_arguments_are_one_line_and_exit_code_2(arguments, message, tmp_path):
