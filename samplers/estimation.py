@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from os import PathLike
 
-from samplers.analysis.refits import HasEnsemble, needs_ensemble_run
+from samplers.analysis.refits import HasEnsemble, HasParts, needs_ensemble_run
 from samplers.errors import OnError
 from samplers.execution.arguments import InputsOnly, RunArguments, check_attributes, check_problem, choose_seed
 from samplers.execution.base_check import find_base_fault
@@ -21,6 +21,7 @@ from samplers.execution.progress import Listener, Pace, Progress, open_listener
 from samplers.execution.responder import Responder
 from samplers.execution.run import Run
 from samplers.method import Stepping
+from samplers.methods.auto import Auto
 from samplers.methods.two_stage.method import TwoStage
 from samplers.problem import Inputs, Problem, StandardNormal
 from samplers.registry import get_method
@@ -31,7 +32,7 @@ from samplers.validation import check_number
 
 def estimate(
     problem: Problem,
-    method: Stepping | str = TwoStage(),  # noqa: B008  (frozen, so safe to share)
+    method: Stepping | str = Auto(),  # noqa: B008  (frozen, so safe to share)
     gamma: float = RunArguments.gamma,
     seed: int | None = RunArguments.seed,
     max_sim: int | None = RunArguments.max_sim,
@@ -59,7 +60,7 @@ def estimate(
 
     Args:
         problem: Has `dim`, `base` and `evaluate`; see `Problem`.
-        method: A method with its settings, or the name of one (`METHODS`).
+        method: A method with its settings, or the name of one (`METHODS`); by default `Auto` chooses one.
         gamma: Threshold of failure.
         seed: Same seed, same answer. None draws one, which the result states.
         max_sim: Simulations that are never exceeded, over all replicates.
@@ -143,7 +144,8 @@ def estimate(
             simulation = _Simulation(responder, evaluation, pool, conditions, progress)
             try:
                 result = simulation.run(problem, chosen, arguments)
-                if ensemble_run and result.status is not Status.STOPPED and needs_ensemble_run(result):
+                split = problem.failing_parts if isinstance(problem, HasParts) else None
+                if ensemble_run and result.status is not Status.STOPPED and needs_ensemble_run(result, split):
                     further = _run_under_ensemble(simulation, problem, chosen, arguments, result)
                     result = replace(result, ensemble_run=further)
             except EstimationInterrupted as stopped:

@@ -4,7 +4,7 @@ import math
 import sys
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, Protocol, cast, runtime_checkable
+from typing import ClassVar, NamedTuple, Protocol, cast, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -249,8 +249,18 @@ class Stepping(Protocol):
 class Choosing(Protocol):
     """A method that leaves the run to another one, chosen before any simulation."""
 
-    def choose(self, inputs: Inputs, goal: Goal) -> tuple[Stepping, str]:
-        """Return the method for one run, and the choice in words."""
+    def choose(self, inputs: Inputs, goal: Goal) -> "Choice":
+        """Return the method for one run."""
+
+
+class Choice(NamedTuple):
+    """A method for one run, and why it was chosen."""
+
+    method: Stepping
+    why: str = ""
+    """In words, the name of the method first; empty where it was named and nothing was chosen."""
+    unusual: bool = False
+    """Whether it is another one than most runs have, so that the text of the result says it."""
 
 
 def no_outcome_share(f: FloatArray, log_weights: FloatArray | None = None) -> float:

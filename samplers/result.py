@@ -167,6 +167,8 @@ class Estimate:
     """Condition of p, which the problem holds fixed: its attribute `given`, if it has one."""
     choice: str = field(default="", compare=False)
     """Method that `Auto` chose and why; empty where the method was named."""
+    chose_another: bool = field(default=False, compare=False, repr=False)
+    """Whether that is another method than the usual one, which the text says; `to_dict` has every choice."""
     ensemble_run: "Estimate | None" = field(default=None, compare=False, repr=False)
     """The further run under the mixture of the refits of the base, where `estimate` needed one."""
     simulations: SimulationIndex | None = field(default=None, compare=False, repr=False)
@@ -365,7 +367,7 @@ class Estimate:
             *indent_lines(self.base_uncertainty),
             f"  {self.n_sim:,} simulations{gain}; {self.method.name}, seed {self.seed}, "
             f"{self.status}; {self.failures.total:,} failing points",
-            *([f"  chosen {self.choice}"] if self.choice else []),
+            *([f"  chosen {self.choice}"] if self.chose_another else []),
             f"  given that {self.proviso}",
         ]
         lines += [f"  remark: {text}" for text in self.remarks]

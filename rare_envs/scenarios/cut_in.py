@@ -19,7 +19,8 @@ CUT_IN_DURATION = 4.0
 """Duration of the lane change where x has no column for it [s]."""
 CUT_IN_MIN_LENGTH = 15.0
 """Least length of the path along the road [m], for slow vehicles, which cannot move sideways."""
-_CUTTER_IDM = IDM()
+CUTTER_IDM = IDM()
+"""How the cutter follows the lead; its desired speed is its own initial speed."""
 
 
 def initial(x: Tensor) -> State:
@@ -84,7 +85,7 @@ def others(state: State, dt: float) -> Others:
     speed, lead_speed = state.speed[:, 1], state.speed[:, 2]
     distance = state.x[:, 2] - state.x[:, 1]
     lead = Lead(distance - VEHICLE_LENGTH, speed - lead_speed * torch.cos(state.heading[:, 1]))
-    acceleration = _CUTTER_IDM.acceleration(speed, lead, desired_speed)
+    acceleration = CUTTER_IDM.acceleration(speed, lead, desired_speed)
     return _advance(state, (speed + acceleration * dt).clamp(min=0.0), lead_speed, dt)
 
 

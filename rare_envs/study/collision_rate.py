@@ -13,7 +13,8 @@ from rare_envs.exposure.rate import CollisionProbability, CollisionRate
 from rare_envs.scenarios.registry import find_scenario
 from rare_envs.study.analysis.severity import Severity
 from rare_envs.study.question import Question, Study
-from samplers.analysis.base_uncertainty import FIT_BIAS, refit_quantile
+from samplers.analysis.base_uncertainty import FIT_BIAS
+from samplers.statistics.refit_groups import refit_quantile
 
 COLLISION_MEASURE = "ttc"
 """Measure that is -1 after a collision and above 0 without one."""
@@ -100,7 +101,7 @@ def _describe_value(
         upper=upper if base.bound is None else base.bound,
         spread=base.spread,
         fit_bias=FIT_BIAS,
-        quantile=refit_quantile(base.confidence, len(base.p_refits), base.clusters),
+        quantile=refit_quantile(base.confidence, len(base.p_refits) - 1, base.clusters),
         determined=base.bound is None,
     )
 

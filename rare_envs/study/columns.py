@@ -4,10 +4,15 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
 from rare_envs.distributions.space import ScenarioSpace
+from samplers.problem import FloatArray
 
 MAX_SHOWN = 12
 """Blocks of more values than this, drivers' weights and noise, are summarised instead of shown."""
+ORDINARY_DRAWS = 4000
+"""Scenarios drawn from the base distribution to show what is ordinary."""
 
 
 class Column(NamedTuple):
@@ -32,6 +37,23 @@ def list_columns(space: ScenarioSpace) -> list[Column]:
         for name, unit, size in zip(space.names, space.units, space.sizes, strict=True)
         for k in range(size)
     ]
+
+
+def draw_ordinary(space: ScenarioSpace) -> FloatArray:
+    """Return ordinary scenarios (n, d), the same on the console, in pictures and in the report."""
+    return space.sample(ORDINARY_DRAWS, np.random.default_rng(0))
+
+
+def find_ordinary_range(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the ends between which nine of ten ordinary values lie, of each column of (n, k).
+
+    Example:
+        >>> low, high = find_ordinary_range(np.arange(101.0)[:, None])
+        >>> float(low[0]), float(high[0])
+        (5.0, 95.0)
+    """
+    low, high = np.quantile(values, (0.05, 0.95), axis=0)
+    return low, high
 
 
 def format_value(value: float, places: int = 2) -> str:

@@ -62,6 +62,22 @@ def output_folder(path: Path) -> Iterator[None]:
         raise
 
 
+@contextlib.contextmanager
+def output_file(path: Path) -> Iterator[None]:
+    """Make the folder of a file before the work, as `output_folder` does.
+
+    Args:
+        path: The file; it may exist.
+
+    Raises:
+        BadInput: It is a folder, or its folder cannot be made or written to.
+    """
+    if path.is_dir():
+        raise BadInput(f"Expected a file to write, got the folder {str(path)!r}.")
+    with output_folder(path.parent):
+        yield
+
+
 def _writable_folder(path: Path) -> None:
     try:
         path.mkdir(parents=True, exist_ok=True)

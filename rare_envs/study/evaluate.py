@@ -19,7 +19,7 @@ from rare_envs.study.execution.simulated_problem import SimulatedProblem, open_p
 from rare_envs.study.journal import JOURNAL, begin_journal, check_same_files, continue_journal
 from rare_envs.study.question import Study, prepare
 from rare_envs.study.report import Report
-from rare_envs.study.run_directory import check_no_results, remove_results, write_run
+from rare_envs.study.run_directory import check_no_results, remove_drafts, remove_results, write_run
 from rare_envs.study.storage.episode_recorder import EpisodeRecorder
 from rare_envs.study.storage.names import STUDY
 from rare_envs.study.storage.study_file import begin_study_file, finish_study_file
@@ -107,7 +107,7 @@ def run(
     finally:
         if recorder is not None:
             recorder.close()
-    again = _check_repeatability(study, keeper)
+    again = recheck(study, keeper)
     lost = "" if recorder is None else recorder.lost
     return Report(study, estimate, seconds, tuple(problem.faults), kinds, problem.n_retried, again, lost)
 
@@ -140,7 +140,7 @@ def _estimate(
         )
 
 
-def _check_repeatability(study: Study, keeper: RowKeeper) -> Repeatability | None:
+def recheck(study: Study, keeper: RowKeeper) -> Repeatability | None:
     """Simulate a sample again.
 
     None where ego and measure are rules of this package, which keep nothing; where the ego says that its answers vary;
@@ -231,11 +231,12 @@ def resume(
     """
     journal, question = continue_journal(folder, mend)
     with closing(journal):
-        question = open_question(asdict(question), folder, trust)
+        question = replace(open_question(asdict(question), folder, trust), core=question.core)
         if ego is not None and {find_ego_kind(ego), find_ego_kind(question.ego)} != {"remote"}:
             raise BadInput(f"Expected --ego for one whose address has changed only; the run has {question.ego!r}.")
         question = replace(question, ego=ego or question.ego, on_error=on_error or question.on_error)
         check_same_files(journal, question)
+        remove_drafts(folder)
         return _run(folder, prepare(question), journal, progress, executor)
 
 

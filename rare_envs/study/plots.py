@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.egos.errors import EgoGone, reason_of
 from rare_envs.files import replace_file
-from rare_envs.study.columns import list_columns
+from rare_envs.study.columns import draw_ordinary, list_columns
 from rare_envs.study.replay import Drive, drive_again
 from rare_envs.study.report import Report
 from rare_envs.traffic.palette import CRASH_COLOUR, vehicle_colour
@@ -178,7 +178,7 @@ def rank_shifted_parameters(space: ScenarioSpace, ordinary: FloatArray, failures
 
 def draw_failures(axes: Axes, space: ScenarioSpace, failures: Failures) -> None:
     """Draw failures over ordinary traffic in the two parameters in which they differ most."""
-    ordinary = space.sample(BACKGROUND_DRAWS, np.random.default_rng(0))
+    ordinary = draw_ordinary(space)[:BACKGROUND_DRAWS]
     a, b = rank_shifted_parameters(space, ordinary, failures.x)[:2] if len(failures) else (0, 1)
     axes.scatter(ordinary[:, a], ordinary[:, b], s=6, color=ORDINARY_COLOUR, label="ordinary traffic", linewidths=0)
     columns = list_columns(space)

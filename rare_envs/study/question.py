@@ -64,6 +64,8 @@ class Question:
             failing, "bound" as failing in p and the upper end of the interval, but not in the lower end.
         chunk: Simulations at once; None for as many as suit one process. A network rounds differently by batch, so this
             number, unlike that of workers, belongs to the question; with workers it is `DrivingProblem.chunk_size`.
+        core: What simulates, as in `DrivingProblem`: "torch", "numba" or "auto". A
+            run goes on with what it began with.
         sensitivity: Whether the report says what p is sensitive to; that takes no simulations.
         max_p: Limit that p is compared with, or None. The intervals of the answer have then ends at the one-sided
             `gate_confidence`, a coverage of twice that less 1.
@@ -73,7 +75,7 @@ class Question:
     Example:
         >>> question = Question(env_id="rare_envs/CarFollowing-v0", ego="idm", gamma=3.0, seed=1)
         >>> question.run_arguments.gamma, question.method
-        (3.0, 'two-stage')
+        (3.0, 'auto')
     """
 
     env_id: str
@@ -81,7 +83,7 @@ class Question:
     algo: str | None = None
     stats: str | None = None
     trust: bool = False
-    method: str = "two-stage"
+    method: str = "auto"
     base: str | None = None
     measure: str = "ttc"
     gamma: float = RunArguments.gamma
@@ -105,6 +107,7 @@ class Question:
     gate_confidence: float = 0.95
     given_base: bool = False
     chunk: int | None = None
+    core: str = "auto"
 
     @property
     def run_arguments(self) -> RunArguments:
@@ -250,8 +253,14 @@ def prepare(question: Question, ego: Any = None) -> Study:
         if ego is None:
             ego = agents.load_ego(question.ego, algo=question.algo, trust=question.trust, stats=question.stats)
         problem = build_problem(question, ego)
-        study = Study(replace(question, observation=problem.world.sensing.observation), problem, method)
+        study = Study(
+            replace(question, observation=problem.world.sensing.observation, core=problem.core), problem, method
+        )
         names = [name.strip() for name in (question.also_under or "").split(",") if name.strip()]
+        if question.also_under is not None and (not names or len(set(names)) < len(names)):
+            raise ValueError(
+                f"Expected --also-under with one base or more, each once, such as i80; got {question.also_under!r}."
+            )
         others = {name: study.under(name).problem.base for name in names}
     problem.varies = problem.varies or _answers_vary(problem)
     return replace(study, other_bases=others, ego_was_given=given)
@@ -282,6 +291,7 @@ def build_problem(question: Question, ego: Any) -> DrivingProblem:
             observation=question.observation,
             weather=question.weather,
             action=question.action,
+            core=question.core,
         )
 
 

@@ -80,10 +80,17 @@ def check_no_results(folder: Path, *names: str) -> None:
 
 
 def remove_results(folder: Path) -> None:
-    """Remove the files of a finished run, and drafts that one left which was killed while it wrote."""
-    drafts = [path for name in RESULT_FILES for path in folder.glob(f".{Path(name).stem}.*.part{Path(name).suffix}")]
-    for path in (*(folder / name for name in RESULT_FILES), *drafts):
-        path.unlink(missing_ok=True)
+    """Remove the files of a finished run, and drafts of them."""
+    for name in RESULT_FILES:
+        (folder / name).unlink(missing_ok=True)
+    remove_drafts(folder)
+
+
+def remove_drafts(folder: Path) -> None:
+    """Remove the drafts of a run that was killed while it wrote, see `rare_envs.files.replace_file`."""
+    for name in map(Path, RESULT_FILES):
+        for draft in folder.glob(f".{name.stem}.*.part{name.suffix}"):
+            draft.unlink(missing_ok=True)
 
 
 def _write_failures(folder: Path, report: Report) -> None:

@@ -1,4 +1,4 @@
-"""Auto: the choice of a method by budget, dimension and cost per simulation."""
+"""Auto: the choice of a method by budget, dimension, terms and cost per simulation; the default."""
 
 import math
 from dataclasses import dataclass
@@ -6,16 +6,19 @@ from typing import ClassVar
 
 import numpy as np
 
-from samplers.method import Goal, Stepping, Steps
+from samplers.method import Choice, Goal, Steps, offer_of
 from samplers.methods.base import Method
 from samplers.methods.surrogate.method import Surrogate
 from samplers.methods.two_stage.method import TwoStage
 from samplers.methods.two_stage.noise_coordinates import noise_mask
+from samplers.methods.two_stage.terms.search import suits_terms
+from samplers.methods.two_stage.terms.settings import DEFAULT_TERM_SETTINGS
 from samplers.problem import Inputs
 from samplers.validation import check_setting
 
-FEW = (100, 1000)
-"""Simulations of a run, from and to, for `Surrogate`; with more `TwoStage` finds the regions by itself."""
+FEW = (300, 1000)
+"""Simulations of a run, from and to, for `Surrogate`. It was measured from 300 on, where its c.o.v. is a third of that
+of `TwoStage` with 1,000 (`benchmarks/results/few_simulations.json`); with more `TwoStage` knows the regions better."""
 MOST_DIMS = 6
 """Dimensions up to which `Surrogate` was measured (`benchmarks/estimators/few_simulations`)."""
 SLOW = 1.0
@@ -24,13 +27,17 @@ SLOW = 1.0
 
 @dataclass(frozen=True, kw_only=True)
 class Auto(Method):
-    """Choice between the two methods for all problems, by a rule that looks at no outcome.
+    """Choice between the two methods for all problems, by a rule that looks at no outcome; the default of `estimate`.
 
-    `Surrogate` where a run has 100 to 1,000 simulations and the search at most 6 dimensions (coordinates that the base
-    distribution calls noise are not searched), `TwoStage` otherwise; it was measured with 300, in 2 to 6 dimensions.
-    Without max_sim a run has the 6,000 simulations of `TwoStage`, or, if one takes a second or more, the 1,000 of
-    `Surrogate`; a target c.o.v. without max_sim goes to `TwoStage`. The result is that of the method chosen, to the
-    bit; `Estimate.choice` says which and why.
+    1. *Budget and dimension.* `Surrogate` where a run has 300 to 1,000 simulations and the search at most 6 dimensions
+       (coordinates that the base distribution calls noise are not searched), `TwoStage` otherwise.
+    2. *Terms.* `TwoStage` too where it searches by terms: 30 coordinates or more, 1,000 simulations or more, and a
+       problem that offers terms and their gradients.
+    3. *Cost.* Without max_sim a run has the 6,000 simulations of `TwoStage`, or, if one takes a second or more, the
+       1,000 of `Surrogate`; a target c.o.v. without max_sim goes to `TwoStage`.
+
+    The budget is that of one replicate. The result is that of the method chosen, to the bit, and names it;
+    `Estimate.choice` says which and why, and so does the result's text where it is not `TwoStage`.
 
     Args:
         seconds_per_simulation: Time that one simulation takes; None where it is not known.
@@ -38,9 +45,9 @@ class Auto(Method):
     Example:
         >>> import samplers
         >>> problem = samplers.FunctionProblem(lambda u: 3.5 - u[:, 0], dim=2)
-        >>> for max_sim in (200, 3000):
+        >>> for max_sim in (300, 3000):
         ...     print(samplers.estimate(problem, "auto", seed=0, max_sim=max_sim).choice)
-        surrogate: 200 simulations for 2 dimensions
+        surrogate: 300 simulations for 2 dimensions
         two-stage: 3,000 simulations for 2 dimensions
     """
 
@@ -54,11 +61,11 @@ class Auto(Method):
         if self.seconds_per_simulation is not None:
             check_setting("Auto", "seconds_per_simulation", self.seconds_per_simulation, 0.0, math.inf)
 
-    def choose(self, inputs: Inputs, goal: Goal) -> tuple[Stepping, str]:
-        """Return the method for one run, and the choice in words.
+    def choose(self, inputs: Inputs, goal: Goal) -> Choice:
+        """Return the method for one run.
 
         Args:
-            inputs: Dimension and base distribution.
+            inputs: Dimension, base distribution, and whether terms are offered.
             goal: Budget and target of one replicate.
         """
         noise = noise_mask(inputs)
@@ -66,10 +73,12 @@ class Auto(Method):
         slow = (self.seconds_per_simulation or 0.0) >= SLOW and goal.target_cov is None
         usual = Surrogate().n if slow else TwoStage().n
         budget = usual if goal.max_sim is None else goal.max_sim
-        few = FEW[0] <= budget <= FEW[1]
-        method = Surrogate() if few and dim <= MOST_DIMS else TwoStage()
-        return method, f"{method.name}: {budget:,} simulations for {dim:,} dimension{'s' * (dim != 1)}"
+        by_terms = suits_terms(inputs, offer_of(inputs), budget, DEFAULT_TERM_SETTINGS)
+        few = FEW[0] <= budget <= FEW[1] and dim <= MOST_DIMS and not by_terms
+        method = Surrogate() if few else TwoStage()
+        how = method.name + " by terms" * by_terms
+        return Choice(method, f"{how}: {budget:,} simulations for {dim:,} dimension{'s' * (dim != 1)}", unusual=few)
 
     def steps(self, inputs: Inputs, goal: Goal, rng: np.random.Generator) -> Steps:
         """Take the steps of the method chosen."""
-        return self.choose(inputs, goal)[0].steps(inputs, goal, rng)
+        return self.choose(inputs, goal).method.steps(inputs, goal, rng)

@@ -28,7 +28,7 @@ def make(case: str, **more: Any) -> tuple[rare_envs.DrivingProblem, np.ndarray]:
     options = {**options, **more}
     if options.get("ego") == "imitation":
         options["ego"] = load_ego("imitation")
-    problem = rare_envs.DrivingProblem(env_id, **options)
+    problem = rare_envs.DrivingProblem(env_id, core="torch", **options)  # terms are of the reference
     spread = 4.0 if case.startswith("highway") else 2.0
     u = spread * np.random.default_rng(5).standard_normal((count, problem.dim))
     return problem, problem.base.from_standard_normal(u)

@@ -13,12 +13,14 @@ from rare_envs.study.question import Question, read_question
 
 MAX_TEXT = 2**16
 """Letters of a name or formula in a question."""
-_CHANGEABLE = ("trust", "on_error")
-"""Fields that a resumed run may change."""
+_CHANGEABLE = ("trust", "on_error", "core")
+"""Fields that a resumed run may change, or that follow from what is installed."""
 
 
 def open_question(recorded: object, folder: Path, trust: bool) -> Question:
     """Return the question of a folder, if its values are of the right types and what code it names may run.
+
+    What simulates it (`core`) is chosen anew.
 
     Args:
         recorded: Of the file.
@@ -32,7 +34,7 @@ def open_question(recorded: object, folder: Path, trust: bool) -> Question:
         >>> open_question({"env_id": "rare_envs/CutIn-v0", "gamma": 2.0}, Path("run"), trust=False).gamma
         2.0
     """
-    question = replace(read_question(recorded), trust=trust)
+    question = replace(read_question(recorded), trust=trust, core="auto")
     if any(isinstance(value, str) and len(value) > MAX_TEXT for value in asdict(question).values()):
         raise BadInput(f"The question of the run in {str(folder)!r} has a name of more than {MAX_TEXT} letters.")
     with as_bad_input(ValueError):

@@ -62,7 +62,7 @@ class Severity:
 
     curve: Exceedance
     """P[failure in a collision with delta-v > v] over v [m/s], with a simultaneous band of the sampling, and where the
-    base has refits with the intervals that its events allow. Where all collisions are failures, as by default, it is
+    base has refits with the band that its events allow. Where all collisions are failures, as by default, it is
     P[collision with delta-v > v]."""
     largest_delta_v: float
     """Largest delta-v among the failures that were simulated again [m/s]."""
@@ -221,10 +221,12 @@ def format_ends(low: float, high: float) -> str:
     """Return an interval of a probability, or what it is below.
 
     Example:
-        >>> format_ends(1e-4, 2e-3), format_ends(0.0, 2e-3)
-        ('1.0e-04 to 2.0e-03', 'below 2.0e-03')
+        >>> format_ends(1e-4, 2e-3), format_ends(0.0, 2e-3), format_ends(0.0, 1.0)
+        ('1.0e-04 to 2.0e-03', 'below 2.0e-03', 'not bounded')
     """
-    return f"{low:.1e} to {high:.1e}" if low > 0 else f"below {high:.1e}"
+    if low > 0:
+        return f"{low:.1e} to {high:.1e}"
+    return f"below {high:.1e}" if high < 1 else "not bounded"
 
 
 def _severities(replayed: ReplayedFailures, any_vehicle: bool) -> tuple[FloatArray, FloatArray]:

@@ -168,14 +168,14 @@ def bases_command(
     as_json: JsonOption = False,
 ) -> None:
     """List the base distributions of a scenario: events, site, family, fit, frequency and predictive checks."""
-    from rare_envs.study.cli.base_table import list_bases, print_bases
+    from rare_envs.study.cli.base_table import list_bases, print_bases, resolve_scenario
 
     with as_bad_input(ValueError):
         found = list_bases(scenario)
     if as_json:
-        print_json({"scenario": scenario, "bases": found})
+        print_json({"scenario": scenario, "env_id": resolve_scenario(scenario), "bases": found})
     else:
-        print_bases(found)
+        print_bases(resolve_scenario(scenario), found)
 
 
 @app.command("resume")
@@ -213,6 +213,10 @@ def compare_command(
     env: EnvArgument,
     options: QuestionOptions,
     max_sim: Annotated[int, typer.Option(help="Largest number of simulations, of both egos together.")] = 12_000,
+    algo: AlgoOption = None,
+    stats: StatsOption = None,
+    algo_b: Annotated[str | None, typer.Option(help="As --algo, for the .zip of EGO_B.")] = None,
+    stats_b: Annotated[str | None, typer.Option(help="As --stats, for the .zip of EGO_B.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for comparison.json and failures.csv.")] = None,
     force: ForceOption = False,
     as_json: JsonOption = False,
@@ -221,9 +225,9 @@ def compare_command(
     from rare_envs.study.compare import compare_egos
     from rare_envs.study.question import Question
 
-    question = Question(env_id=env, ego=ego_a, max_sim=max_sim, **options.arguments())
+    question = Question(env_id=env, ego=ego_a, max_sim=max_sim, algo=algo, stats=stats, **options.arguments())
     with keep_stdout_for_the_answer():
-        comparison = compare_egos(question, ego_b, progress=True, out=out, force=force)
+        comparison = compare_egos(question, ego_b, progress=True, out=out, force=force, algo_b=algo_b, stats_b=stats_b)
     if as_json:
         print_json(comparison.answer)
     else:

@@ -29,13 +29,19 @@ def list_bases(scenario: str) -> dict[str, dict[str, Any]]:
         >>> list_bases("highway")["okelly2018"]["frequency"] is None
         True
     """
-    found = find_scenario(scenario if ":" in scenario else env_id_of(scenario))
+    found = find_scenario(resolve_scenario(scenario))
     return {name: _describe_base(found, name) for name in found.bases}
 
 
-def print_bases(bases: Mapping[str, Mapping[str, Any]]) -> None:
-    """Print what `list_bases` returns, a few lines each."""
+def resolve_scenario(scenario: str) -> str:
+    """Return the environment id that an id or a short name means; versions have bases of the same names."""
+    return scenario if ":" in scenario else env_id_of(scenario)
+
+
+def print_bases(env_id: str, bases: Mapping[str, Mapping[str, Any]]) -> None:
+    """Print what `list_bases` returns for an environment, a few lines each."""
     console = Console(highlight=False, soft_wrap=True, markup=False)
+    console.print(f"base distributions of {env_id}")
     for number, (name, base) in enumerate(bases.items()):
         console.print(f"{name}{'   (the default)' if number == 0 else ''}", style="bold")
         for title, text in _summarise(base).items():

@@ -103,7 +103,7 @@ class WorldOptions(ScenarioOptions):
 class QuestionOptions(WorldOptions):
     """Options of a question: method, measure, threshold."""
 
-    method: Annotated[str, typer.Option(help="Estimation method; see rare-envs list.")] = "two-stage"
+    method: Annotated[str, typer.Option(help="Estimation method; see rare-envs list.")] = "auto"
     measure: Annotated[
         str, typer.Option(help="Safety measure f, small is dangerous: a name, module:function or stl:FORMULA.")
     ] = "ttc"
@@ -139,6 +139,9 @@ class EstimateOptions(QuestionOptions):
         int | None,
         typer.Option(help="Simulations at once, few for a slow ego; with --workers 256, and 4,096 of rules."),
     ] = None
+    core: Annotated[
+        str, typer.Option(help="What simulates: torch, numba (compiled; the IDM in scripted scenarios), or auto.")
+    ] = "auto"
     sensitivity: Annotated[
         bool,
         typer.Option("--sensitivity", help="Show what p is sensitive to: parameters of traffic and of its model."),
@@ -170,7 +173,7 @@ class RiskOptions:
     base: Annotated[
         list[str] | None, typer.Option(help="SCENARIO=NAME or FILE, in place of the site's base; may be repeated.")
     ] = None
-    method: Annotated[str, typer.Option(help="Estimation method; see rare-envs list.")] = "two-stage"
+    method: Annotated[str, typer.Option(help="Estimation method; see rare-envs list.")] = "auto"
     max_sim: Annotated[
         int | None,
         typer.Option(help="Largest number of simulations of each scenario.", show_default=DEFAULT_BUDGET),
@@ -198,6 +201,12 @@ class RiskOptions:
         for scenario, _, base in pairs:
             if not scenario or not base:
                 raise ValueError(f"Expected --base SCENARIO=NAME, such as cut_in=i80, got {scenario!r} alone.")
+        names = [scenario for scenario, _, _ in pairs]
+        for scenario in names:
+            if names.count(scenario) > 1:
+                raise ValueError(
+                    f"Expected one --base for each scenario, got {names.count(scenario)} for {scenario!r}."
+                )
         leaders = str(values.pop("leaders"))
         if leaders not in LEADER_SCENARIOS:
             raise ValueError(

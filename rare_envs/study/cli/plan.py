@@ -46,12 +46,23 @@ def plan_command(
         else:
             arguments = options.arguments()
             methods = [name.strip() for name in str(arguments.pop("method")).split(",")]
+            _check_environment(target)
             question = Question(env_id=target, ego=ego, algo=algo, stats=stats, max_sim=pilot, **arguments)
             found = plan_by_pilots(question, methods, cov, progress=True)
     if as_json:
         print_json({"target_cov": cov, "runs": [each.to_dict() for each in found]})
     else:
         _print_plan(found, cov)
+
+
+def _check_environment(target: str) -> None:
+    """Raise a BadInput unless a target, which is no folder, is the name of an environment."""
+    from rare_envs.scenarios.registry import find_scenario
+
+    try:
+        find_scenario(target)
+    except ValueError as error:
+        raise BadInput(f"There is no folder {target!r} of a run. {error}") from error
 
 
 def _refuse_options_of_pilots(context: typer.Context) -> None:

@@ -12,15 +12,13 @@ from rich.table import Table
 
 import samplers
 from rare_envs.exposure import describe_human_contacts
-from rare_envs.study.columns import MAX_SHOWN, format_value
+from rare_envs.study.columns import MAX_SHOWN, draw_ordinary, find_ordinary_range, format_value
 from rare_envs.study.crash_kinds import KIND_DESCRIPTIONS
 from rare_envs.study.rates.text import describe_injuries, describe_parts, format_interval, format_rate, name_events
 from rare_envs.study.report import Report
 from samplers.problem import FloatArray
 from samplers.result import indent_lines
 
-RANGE_DRAWS = 4000
-"""Scenarios drawn from the base distribution for the range of ordinary values."""
 ENOUGH, MANY = 3.0, 300_000
 """Simulations over p that show with 95 % a region of failure as probable as all that was found; what they may cost."""
 
@@ -91,11 +89,11 @@ def print_report(report: Report, out: Path | None = None) -> None:
     _print_rate(console, report)
     rows = (
         ("c.o.v.", "not known" if math.isinf(estimate.cov) else f"{estimate.cov:.3f}"),
-        ("simulations", f"{estimate.n_sim:,} in {report.seconds:.1f} s"),
+        ("simulations", f"{estimate.n_sim:,} in {report.seconds:.1f} s by {question.core}"),
         ("given that", estimate.proviso),
         ("gain", _format_gain(estimate)),
         ("method", f"{estimate.method.name}, seed {estimate.seed}, {estimate.status}"),
-        *([("chosen", estimate.choice)] if estimate.choice else []),
+        *([("chosen", estimate.choice)] if estimate.chose_another else []),
     )
     for name, value in rows:
         console.print(f"  {name:<15} {value}")
@@ -196,7 +194,7 @@ def _print_failure(console: Console, report: Report) -> None:
     if not len(failures):
         console.print("  no failure found")
         return
-    ordinary = space.sample(RANGE_DRAWS, np.random.default_rng(0))
+    ordinary = draw_ordinary(space)
     console.print(
         f"  most likely of {failures.total:,} failures found (f = {failures.f[0]:.3g}; "
         "in brackets where nine of ten ordinary scenarios lie):"
@@ -207,7 +205,7 @@ def _print_failure(console: Console, report: Report) -> None:
     likeliest, usual = space.columns(failures.x[:1]), space.columns(ordinary)
     for j, name in enumerate(space.names):
         if space.sizes[j] <= MAX_SHOWN:
-            low, high = np.quantile(usual[name], (0.05, 0.95))
+            (low,), (high,) = find_ordinary_range(usual[name].reshape(-1, 1))  # of all values of a block
             values = " ".join(f"{format_value(value):>8}" for value in likeliest[name].flat)
             console.print(
                 f"    {name:<15} {values} {space.units[j]:<4} [{format_value(low, 1)} to {format_value(high, 1)}]"

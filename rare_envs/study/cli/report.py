@@ -17,7 +17,8 @@ def report_command(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder that rare-envs estimate --out has written.")],
     out: Annotated[Path | None, typer.Option(help="The .html file; report.html in RUN by default.")] = None,
     events: Annotated[
-        Path | None, typer.Option(help="CSV of recorded events, a column for each parameter: how near they come.")
+        Path | None,
+        typer.Option(help="CSV of recorded events, with columns named as the parameters: how near they come."),
     ] = None,
     figures: Annotated[str | None, typer.Option(help="Figures as files too, beside the page: svg, pdf or png.")] = None,
     trust: TrustOption = False,

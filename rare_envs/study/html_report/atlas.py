@@ -17,7 +17,7 @@ from PIL import Image
 from rare_envs.egos.errors import EgoGone, reason_of
 from rare_envs.envs.rendering import FRAME_WIDTH
 from rare_envs.problem import DrivingProblem
-from rare_envs.study.columns import format_value, list_columns
+from rare_envs.study.columns import find_ordinary_range, format_value, list_columns
 from rare_envs.study.html_report.recorded_events import NearestEvent, find_nearest_event
 from rare_envs.study.html_report.svg import FigureOfPage
 from rare_envs.study.html_report.wording import describe_kind, format_probability, name_measure
@@ -125,7 +125,7 @@ def _describe_crash(drive: Drive) -> list[tuple[str, str]]:
 def _list_parameters(
     source: AtlasSource, x: FloatArray, nearest: NearestEvent | None
 ) -> list[tuple[str, str, str, str]]:
-    low, high = np.quantile(source.ordinary, (0.05, 0.95), axis=0)
+    low, high = find_ordinary_range(source.ordinary)
     rows, shown = [], 0
     for j, column in enumerate(list_columns(source.problem.space)):
         if column.shown:

@@ -14,8 +14,8 @@ from rare_envs.files import replace_text
 from rare_envs.plugins import one_line
 from rare_envs.study.analysis.recorded_question import open_question
 from rare_envs.study.analysis.repeatability import Repeatability
-from rare_envs.study.columns import list_columns
-from rare_envs.study.errors import BadInput, as_bad_input, output_folder
+from rare_envs.study.columns import draw_ordinary, list_columns
+from rare_envs.study.errors import BadInput, as_bad_input, output_file, output_folder
 from rare_envs.study.html_report.atlas import AtlasEntry, AtlasSource, build_atlas
 from rare_envs.study.html_report.figures import MAX_HISTOGRAMS, draw_parameters, figures_of_result
 from rare_envs.study.html_report.recorded_events import read_recorded_events
@@ -23,13 +23,13 @@ from rare_envs.study.html_report.svg import FORMATS, FigureOfPage
 from rare_envs.study.html_report.wording import (
     describe_intervals,
     describe_kind,
+    describe_method,
     describe_rate,
     format_probability,
     name_measure,
     summarise_answer,
 )
 from rare_envs.study.journal import JOURNAL
-from rare_envs.study.plots import BACKGROUND_DRAWS
 from rare_envs.study.question import prepare
 from rare_envs.study.storage.loaded_study import LoadedStudy, load_study
 from rare_envs.study.storage.names import EPISODES, REPORT, RESULT, STUDY
@@ -71,22 +71,28 @@ def write_html_report(
         raise BadInput(f"Expected --figures {', '.join(FORMATS)}, got {figures!r}.")
     if (folder / JOURNAL).exists():
         raise BadInput(f"The run in {str(folder)!r} is not finished: rare-envs resume {folder} comes first.")
-    study = load_study(folder)
+    study, page = load_study(folder), out or folder / REPORT
+    with output_file(page):
+        return _write(study, page, trust, events, figures)
+
+
+def _write(study: LoadedStudy, page: Path, trust: bool, events: Path | None, kind: str | None) -> list[Path]:
+    """Write the page of a run, and its figures where their kind is given; return the files."""
+    folder = study.folder
     with as_bad_input(ValueError):
         failures = study.failures
     problem = prepare(open_question(study.question, folder, trust)).problem
     columns = [column for column in list_columns(problem.space) if column.shown]
     known = None if events is None else read_recorded_events(events, [column.name for column in columns])
-    ordinary = problem.space.sample(BACKGROUND_DRAWS, np.random.default_rng(0))
+    ordinary = draw_ordinary(problem.space)
     source = AtlasSource(folder, problem, failures, ordinary, known)
-    page = out or folder / REPORT
     with _damage_as_bad_input(folder):
         atlas = build_atlas(source, list(study.result.get("modes") or []))
         drawn = _make_figures(study, source)
         text = render_page(study, drawn, atlas)
     with as_bad_input(OSError):
         replace_text(page, text)
-        saved = [] if figures is None else _save_figures(page.parent / "figures", figures, drawn, atlas)
+        saved = [] if kind is None else _save_figures(page.parent / "figures", kind, drawn, atlas)
     return [page, *saved]
 
 
@@ -108,6 +114,7 @@ def render_page(study: LoadedStudy, figures: Mapping[str, FigureOfPage], atlas: 
         remarks=[*(result.get("remarks") or []), *(result.get("notes") or [])],
         intervals=describe_intervals(result),
         rate=describe_rate(result),
+        method=describe_method(result),
         figures={name: figure.to_svg() for name, figure in figures.items()},
         captions={name: figure.caption for name, figure in figures.items()},
         atlas=atlas,

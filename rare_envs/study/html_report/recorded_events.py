@@ -41,7 +41,10 @@ def read_recorded_events(path: Path, names: list[str]) -> FloatArray:
             rows = list(csv.DictReader(file))
         missing = [name for name in names if rows and name not in rows[0]]
         if missing or not rows:
-            raise BadInput(f"Expected events in {str(path)!r} with the columns {', '.join(names)}.")
+            has = f"it has {', '.join(rows[0])}" if rows else "it has no rows"
+            raise BadInput(
+                f"Expected events in {str(path)!r} with columns named as the parameters, {', '.join(names)}; {has}."
+            )
         values = np.array([[float(row[name] or "nan") for name in names] for row in rows])
     except OSError as error:
         raise BadInput(f"Cannot read {str(path)!r}: {error.strerror}.") from error

@@ -12,6 +12,8 @@ from rare_envs.study.crash_kinds import KIND_DESCRIPTIONS
 from rare_envs.study.rates.text import format_interval, format_rate
 
 Result = Mapping[str, Any]
+SIZED_BY_BUDGET = ("mc", "is", "two-stage", "surrogate")
+"""Methods whose setting n is their budget where max_sim does not say; the n of others is that of a level."""
 
 
 def format_probability(p: float | None, like: float | None = None) -> str:
@@ -131,6 +133,23 @@ def describe_rate(result: Result) -> list[str]:
         describe_human_contacts(),
     ]
     return lines
+
+
+def describe_method(result: Result) -> str:
+    """Return the method with the settings that it used.
+
+    Example:
+        >>> result = {"method": {"name": "two-stage", "settings": {"n": 6000}}, "question": {"max_sim": 1000}}
+        >>> describe_method(result), describe_method({**result, "question": {"max_sim": None}})
+        ('two-stage max_sim = 1000', 'two-stage n = 6000')
+    """
+    name, settings = str(result["method"]["name"]), dict(result["method"]["settings"])
+    max_sim = (result.get("question") or {}).get("max_sim")
+    if max_sim is not None:
+        settings = {"max_sim": max_sim, **settings}
+        if name in SIZED_BY_BUDGET:
+            settings.pop("n", None)
+    return f"{name} {', '.join(f'{key} = {value}' for key, value in settings.items())}".rstrip()
 
 
 def describe_kind(kind: str) -> str:

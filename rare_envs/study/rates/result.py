@@ -63,12 +63,13 @@ class ScenarioRisk:
         """Return the line of the table: frequency x p = rate, its interval, and the events behind it."""
         rate, base = self.rate, self.report.study.base
         behind = base.fitted_to if isinstance(base, FittedDistribution) else "events not known"
+        version = self.report.study.question.env_id.rpartition("/")[2]  # whose bases may have the same names
         factors = {name: factor for name, factor in self.site_factors.items() if factor > 0}
         sites = "".join(f", under {name} {factor:.2g} times as much" for name, factor in factors.items())
         return (
             f"{name_scenario(self.name):<13} {format_rate(rate.frequency.per_km)} per km x {rate.probability.p:.1e} = "
             f"{format_rate(rate.per_million_km)}  ({format_interval(rate.interval_per_million_km)})   "
-            f"{behind} ({self.base_name}){sites}"
+            f"{behind} ({self.base_name} of {version}){sites}"
         )
 
     def to_dict(self) -> dict[str, Any]:

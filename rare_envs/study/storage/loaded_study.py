@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import reprlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,10 +15,14 @@ from numpy.typing import NDArray
 from rare_envs.json_text import parse_json_object
 from rare_envs.study.errors import BadInput
 from rare_envs.study.storage.failure_table import read_failures
-from rare_envs.study.storage.names import EPISODES, FAILURES, RESULT, STUDY
+from rare_envs.study.storage.names import EPISODES, FAILURES, RESULT, STUDY, STUDY_FORMAT
 
 if TYPE_CHECKING:
     import pyarrow
+
+
+MAX_TABLE_BYTES = 2**32
+"""Largest table that is read at once [bytes]: 40 million simulations with twelve numbers each."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +84,7 @@ class LoadedStudy:
 
         Raises:
             FileNotFoundError: The folder has no such table.
-            ValueError: The file is damaged, or has no such columns.
+            ValueError: The file is damaged, has no such columns, or these take more than `MAX_TABLE_BYTES`.
         """
         import pyarrow.parquet as pq
 
@@ -89,6 +94,7 @@ class LoadedStudy:
         missing = sorted(set(columns or []) - set(self.column_names))
         if missing:
             raise ValueError(f"{EPISODES} has no column {', '.join(missing)}; it has {', '.join(self.column_names)}.")
+        _check_size(self.episodes_path, columns)
         with _damage_as_value_error(self.episodes_path):
             return pq.read_table(self.episodes_path, columns=columns, filters=where)
 
@@ -99,6 +105,39 @@ class LoadedStudy:
 
         with _damage_as_value_error(self.episodes_path):
             return list(pq.read_schema(self.episodes_path).names)
+
+
+def _check_size(path: Path, columns: list[str] | None) -> None:
+    """Raise a ValueError if some columns of a table, all for None, would take more than `MAX_TABLE_BYTES`.
+
+    A file of a few kilobytes can hold billions of rows that are alike, so the size of the file says nothing.
+    """
+    import pyarrow.parquet as pq
+
+    with _damage_as_value_error(path):
+        with pq.ParquetFile(path) as file:
+            about, schema = file.metadata, file.schema_arrow
+    n_rows = sum(about.row_group(i).num_rows for i in range(about.num_row_groups))
+    wanted = [field for field in schema if columns is None or field.name in columns]
+    n_bytes = n_rows * sum(_count_bytes(field.type) for field in wanted)
+    if n_bytes > MAX_TABLE_BYTES:
+        raise ValueError(
+            f"{len(wanted)} columns of {EPISODES} take {n_bytes / 2**30:,.1f} GiB, more than the "
+            f"{MAX_TABLE_BYTES / 2**30:g} GiB that are read at once: ask for fewer columns, or read {str(path)!r} in "
+            "parts by a program of your own."
+        )
+
+
+def _count_bytes(kind: pyarrow.DataType) -> float:
+    """Return the bytes of a value; of a text, which most rows have not, those of its place."""
+    import pyarrow as pa
+
+    if pa.types.is_fixed_size_list(kind):
+        return int(kind.list_size) * _count_bytes(kind.value_type)
+    try:
+        return float(kind.bit_width) / 8
+    except ValueError:  # of no fixed size
+        return 4.0
 
 
 @contextlib.contextmanager
@@ -133,7 +172,7 @@ def load_study(folder: str | Path) -> LoadedStudy:
         raise BadInput(
             f"No finished run in {str(folder)!r}: expected {RESULT} and {FAILURES}, as rare-envs estimate --out writes."
         )
-    about = _read_object(path / STUDY) if (path / STUDY).exists() else {}
+    about = _check_about(_read_object(path / STUDY), path) if (path / STUDY).exists() else {}
     return LoadedStudy(path, about, _check_result(_read_object(path / RESULT), path))
 
 
@@ -147,6 +186,16 @@ def _read_object(path: Path) -> dict[str, Any]:
         return parse_json_object(path.read_text(encoding="utf-8"), repr(str(path)))
     except (OSError, ValueError) as error:
         raise BadInput(error) from error
+
+
+def _check_about(about: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Return what study.json holds; raise a BadInput unless it is of the format that this version knows."""
+    if about.get("format") != STUDY_FORMAT:
+        raise BadInput(
+            f"Expected format {STUDY_FORMAT} in {str(folder / STUDY)!r}, got {reprlib.repr(about.get('format'))}: "
+            "the file is damaged, or of a newer version of rare-envs. Without it the run can be read."
+        )
+    return about
 
 
 def _check_result(result: dict[str, Any], folder: Path) -> dict[str, Any]:

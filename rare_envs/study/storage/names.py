@@ -2,6 +2,8 @@
 
 STUDY = "study.json"
 """What was asked, by what command and with which versions."""
+STUDY_FORMAT = 1
+"""Version of the fields of study.json; see docs/run_folder.md."""
 RESULT, FAILURES, BLOCKS, PLOT = "result.json", "failures.csv", "failures.npz", "plot.png"
 """Blocks are what a table has no room for: of more than `columns.MAX_SHOWN` values, drivers' weights and noise."""
 EPISODES = "episodes.parquet"

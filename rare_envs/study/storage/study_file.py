@@ -19,12 +19,10 @@ from rare_envs.files import replace_text
 from rare_envs.json_text import format_json, parse_json_object
 from rare_envs.study.journal import digest_files, find_named_files
 from rare_envs.study.question import Question, Study
-from rare_envs.study.storage.names import STUDY
+from rare_envs.study.storage.names import STUDY, STUDY_FORMAT
 from rare_envs.version import __version__
 from samplers.result import method_settings
 
-STUDY_FORMAT = 1
-"""Version of the fields; see docs/run_folder.md."""
 LIBRARIES = ("gymnasium", "numpy", "onnxruntime", "scipy", "stable-baselines3", "torch")
 """Distributions whose versions may change a number."""
 

@@ -87,11 +87,11 @@ def test_four_seconds_are_the_first_version_to_the_bit() -> None:
 
 
 def test_both_versions_stand_beside_each_other() -> None:
-    """Gymnasium warns of versions that are out of date, which is an error here."""
+    """An id without a version is that of the newest."""
     for env_id in ("rare_envs/CutIn-v0", "rare_envs/CutIn-v1", "rare_envs/CutIn-kinematics-v0"):
         assert gym.make(env_id).spec.id == env_id  # type: ignore[union-attr]
-    with pytest.warns(UserWarning, match="Using the latest versioned environment `rare_envs/CutIn-v0`"):
-        assert gym.make("rare_envs/CutIn").spec.id == "rare_envs/CutIn-v0"  # type: ignore[union-attr]
+    with pytest.warns(UserWarning, match="Using the latest versioned environment `rare_envs/CutIn-v1`"):
+        assert gym.make("rare_envs/CutIn").spec.id == "rare_envs/CutIn-v1"  # type: ignore[union-attr]
     _, info = gym.make("rare_envs/CutIn-v1").reset(seed=0, options={"duration": 7.0})
     assert info["scenario"]["duration"] == 7.0
     with pytest.raises(ValueError, match=r"duration = 13.* is outside its range \[1.5, 12\] s"):

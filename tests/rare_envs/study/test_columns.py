@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import rare_envs
-from rare_envs.study.columns import format_value, list_columns
+from rare_envs.study.columns import ORDINARY_DRAWS, draw_ordinary, format_value, list_columns
 
 FOLLOWING = "rare_envs/CarFollowing-v0"
 
@@ -29,3 +29,10 @@ def test_thin_air_is_not_shown_as_none() -> None:
         "-0.001",
     ]
     assert [format_value(value, 1) for value in (0.002, 21.04)] == ["0.002", "21.0"]
+
+
+def test_ordinary_scenarios_are_the_same_each_time() -> None:
+    space = rare_envs.DrivingProblem(FOLLOWING).space
+    first, again = draw_ordinary(space), draw_ordinary(space)
+    assert first.shape == (ORDINARY_DRAWS, 3)
+    assert (first == again).all()

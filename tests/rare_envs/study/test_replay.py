@@ -16,11 +16,18 @@ FOLLOWING = "rare_envs/CarFollowing-v0"
 
 @pytest.mark.parametrize("env_id", rare_envs.ENV_IDS)
 def test_a_replay_gives_the_same_f_bit_for_bit(env_id: str) -> None:
-    problem = rare_envs.DrivingProblem(env_id)
+    problem = rare_envs.DrivingProblem(env_id, core="torch")
     learned = problem.world.background is not None  # whose products round differently by batch size
     x = problem.base.sample(3 if learned else 20, np.random.default_rng(0))
     tolerance = 1e-3 if learned else 0.0
     assert [drive_again(problem, row).f for row in x] == pytest.approx(problem.evaluate(x).tolist(), abs=tolerance)
+
+
+@pytest.mark.parametrize("env_id", ["rare_envs/CutIn-v0", "rare_envs/HardBrake-v0"])
+def test_a_replay_gives_the_f_of_a_compiled_rollout_to_rounding(env_id: str) -> None:
+    problem = rare_envs.DrivingProblem(env_id, core="numba")
+    x = problem.base.sample(20, np.random.default_rng(0))
+    assert [drive_again(problem, row).f for row in x] == pytest.approx(problem.evaluate(x).tolist(), abs=1e-5)
 
 
 def test_a_replay_ends_at_the_collision(risky: str) -> None:

@@ -1,16 +1,21 @@
 """The choice of a method."""
 
+import inspect
+
 import numpy as np
 import pytest
 
 import samplers
+from rare_envs.study import Question
+from rare_envs.study.cli.options import EstimateOptions
+from samplers.execution.arguments import InputsOnly
 from samplers.limit_states import half_space
-from samplers.method import Goal
+from samplers.method import Goal, TermsOffer
 
 
 def choice(dim=2, seconds=None, **goal):
     inputs = half_space(dim, 3.0).problem
-    return samplers.Auto(seconds_per_simulation=seconds).choose(inputs, Goal(gamma=0.0, **goal))[0].name
+    return samplers.Auto(seconds_per_simulation=seconds).choose(inputs, Goal(gamma=0.0, **goal)).method.name
 
 
 @pytest.mark.parametrize(
@@ -18,13 +23,13 @@ def choice(dim=2, seconds=None, **goal):
     [
         ("two-stage", {}),
         ("two-stage", {"max_sim": 6000}),
-        ("two-stage", {"max_sim": 99}),
+        ("two-stage", {"max_sim": 299}),
         ("two-stage", {"max_sim": 1001}),
         ("two-stage", {"max_sim": 300, "dim": 7}),
         ("two-stage", {"seconds": 5.0, "dim": 7}),
         ("two-stage", {"seconds": 5.0, "target_cov": 0.1}),
         ("two-stage", {"seconds": 0.9}),
-        ("surrogate", {"max_sim": 100}),
+        ("surrogate", {"max_sim": 300}),
         ("surrogate", {"max_sim": 1000, "dim": 6}),
         ("surrogate", {"seconds": 1.0}),
     ],
@@ -40,18 +45,18 @@ def test_noise_does_not_count_as_dimensions():
     class Noisy:
         dim, base = 102, Base(102)
 
-    method, why = samplers.Auto().choose(Noisy(), Goal(gamma=0.0, max_sim=300))
-    assert (method.name, why) == ("surrogate", "surrogate: 300 simulations for 2 dimensions")
+    choice = samplers.Auto().choose(Noisy(), Goal(gamma=0.0, max_sim=300))
+    assert (choice.method.name, choice.why) == ("surrogate", "surrogate: 300 simulations for 2 dimensions")
 
 
-@pytest.mark.parametrize(("max_sim", "name"), [(150, "surrogate"), (2000, "two-stage")])
+@pytest.mark.parametrize(("max_sim", "name"), [(300, "surrogate"), (2000, "two-stage")])
 def test_the_result_is_that_of_the_method_chosen(max_sim, name):
     problem = half_space(2, 3.0).problem
     result = samplers.estimate(problem, "auto", seed=4, max_sim=max_sim)
     assert result == samplers.estimate(problem, name, seed=4, max_sim=max_sim)
     assert result.method.name == name
     assert result.choice.startswith(f"{name}: {max_sim:,} simulations")
-    assert f"chosen {result.choice}" in str(result)
+    assert (f"chosen {result.choice}" in str(result)) == (name == "surrogate")  # the usual one is not announced
     assert result.to_dict()["choice"] == result.choice
     assert samplers.estimate(problem, name, seed=4, max_sim=max_sim).choice == ""
 
@@ -64,9 +69,41 @@ def test_replicates_share_the_budget_before_the_choice():
 def test_steps_are_those_of_the_method_chosen():
     """For callers that drive a method by themselves."""
     problem = half_space(2, 3.0).problem
-    goal = Goal(gamma=0.0, max_sim=100)
+    goal = Goal(gamma=0.0, max_sim=300)
     first = [next(m.steps(problem, goal, np.random.default_rng(1))) for m in (samplers.Auto(), samplers.Surrogate())]
     np.testing.assert_array_equal(*first)
+
+
+def test_a_search_by_terms_comes_before_the_surrogate():
+    """Two coordinates are searched and 100 are noise: with terms and 1,000 simulations that is a search by terms."""
+
+    class Base(samplers.StandardNormal):
+        noise = np.arange(102) >= 2
+
+    for offer, expected in ((None, "surrogate"), (TermsOffer(gradient_cost=5.0), "two-stage by terms")):
+        inputs = InputsOnly(102, Base(102), offer)
+        assert samplers.Auto().choose(inputs, Goal(gamma=0.0, max_sim=1000)).why.startswith(f"{expected}: 1,000")
+
+
+def test_it_is_the_default_of_whatever_takes_a_method():
+    for function in (samplers.estimate, samplers.compare):
+        assert inspect.signature(function).parameters["method"].default == samplers.Auto()
+    assert Question(env_id="rare_envs/CutIn-v0").method == EstimateOptions().method == "auto"
+
+
+def test_a_run_goes_on_from_its_journal_in_chunks_and_by_ask_and_tell(tmp_path, recorder):
+    f = recorder(half_space(2, 3.0).problem.evaluate)
+    problem = samplers.FunctionProblem(f, dim=2)
+    first = samplers.estimate(problem, seed=4, max_sim=300, journal=tmp_path / "journal")
+    assert (first.method.name, f.rows) == ("surrogate", 300)
+    again = samplers.estimate(problem, seed=4, max_sim=300, journal=tmp_path / "journal", executor=samplers.InProcess())
+    assert again == first and again.choice == first.choice != ""
+    assert f.rows < 330  # the journal compares a few rows with f
+    run = samplers.Auto().start(problem, seed=4, max_sim=300)
+    while not run.done:
+        run.tell(problem.evaluate(run.ask()))
+    assert run.result() == first
+    assert samplers.plan_runs(first.pilot(), target_cov=first.cov / 2)[0].method == "surrogate"
 
 
 def test_settings_are_checked():

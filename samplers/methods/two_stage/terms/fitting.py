@@ -14,8 +14,6 @@ from samplers.problem import FloatArray
 from samplers.proposals.components import SubspaceGaussian
 from samplers.statistics.weights import effective_sample_size, normalise_weights
 
-LEAST_SINGULAR = 1e-6
-"""Singular vectors under this share of the first are rounding errors."""
 POWER_STEPS = 20
 """Bisections for the power of the weights: to one millionth."""
 
@@ -36,11 +34,11 @@ class PursuedTerm:
     """Whether the law was fitted to failures."""
 
 
-def find_axes(directions: FloatArray, weights: FloatArray, rank: int) -> FloatArray:
-    """Return the first right singular vectors of weighted directions (k, d) as columns, shape (d, r)."""
+def find_axes(directions: FloatArray, weights: FloatArray, settings: LawSettings) -> FloatArray:
+    """Return the right singular vectors of weighted directions (k, d) that matter as columns, shape (d, r)."""
     _, values, right = np.linalg.svd(directions * weights[:, None], full_matrices=False)
-    kept = values[:rank] > LEAST_SINGULAR * values[0]
-    return np.asarray(right[:rank][kept].T)
+    kept = values[: settings.rank] > settings.least_singular * values[0]
+    return np.asarray(right[: settings.rank][kept].T)
 
 
 def choose_guards(directions: Directions, settings: LawSettings) -> FloatArray:

@@ -43,7 +43,7 @@ def start_term(number: int, directions: Directions, ends: FloatArray, settings: 
     """Return a term with a proposal around ends (m, d), from its gradients."""
     weights = np.ones(len(directions.term))
     law = first_law(
-        find_axes(directions.values, weights, settings.rank), ends, choose_guards(directions, settings), settings
+        find_axes(directions.values, weights, settings), ends, choose_guards(directions, settings), settings
     )
     return PursuedTerm(number, directions, weights, ends, law)
 
@@ -132,7 +132,7 @@ def _refit_term(
     later = float(term.direction_weights.max()) * settings.rounds.later_weight
     weights = np.concatenate([term.direction_weights, np.full(len(directions.term), later)])
     directions = term.directions.join(directions)
-    axes = find_axes(directions.values, weights, settings.law.rank)
+    axes = find_axes(directions.values, weights, settings.law)
     guards = choose_guards(directions, settings.law)
     law = fit_law(axes, history.u[rows], history.log_weights[rows], term.ends, guards, settings.law, rng)
     return replace(term, directions=directions, direction_weights=weights, law=law, ready=term.ready or ready)

@@ -56,6 +56,10 @@ class LawSettings:
 
     rank: int = 8
     """Right singular vectors kept: failures of a term are nearly one half-space, 8 hold its curvature (prototype)."""
+    least_singular: float = 0.1
+    """Singular vectors under this share of the first are left out: there the term hardly changes, its failures are
+    N(0, 1), and what is fitted instead makes heavy weights. Of proposals fitted again within four stored runs on
+    Highway-v0, E[w^2] of the failures is 0.77 of what it was, 0.57 for lidar_ttc; 0.08 to 0.15 are as good."""
     bump_share: float = 0.7
     """Share of the fitted Gaussians."""
     tempered_share: float = 0.15
@@ -104,8 +108,9 @@ class RoundSettings:
     """Draws of an adaptive round."""
     base_share: float = 0.04
     """Share of base draws in every proposal: no weight exceeds 25."""
-    min_term_share: float = 0.07
-    """Least share of a term, since its first weights may be uneven; less where there are more than ten."""
+    min_term_share: float = 0.17
+    """Least share of a term, since one heavy draw of another would leave it next to nothing; less where there are more
+    than four. In those four runs E[w^2] is 0.88 of that with 0.07."""
     waiting_share: float = 0.35
     """Weight of a term whose threshold is reached while another's is not (prototype)."""
     ready_ess: float = 6.0

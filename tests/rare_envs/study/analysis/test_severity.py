@@ -191,7 +191,10 @@ def test_curve_and_injuries_have_the_intervals_of_a_fitted_base() -> None:
     assert (band.low < curve.low).all() and (curve.high < band.high).all()
     whole = estimate.base_uncertainty
     assert whole is not None and whole.interval is not None  # every failure is a collision
-    assert (band.low[0], band.high[0]) == pytest.approx(whole.interval, rel=0.02)
+    alone = severity_curve(problem, estimate, thresholds=[-1.0]).curve.base
+    assert alone is not None
+    assert (alone.low[0], alone.high[0]) == pytest.approx(whole.interval, rel=0.02)
+    assert band.low[0] < alone.low[0] < alone.high[0] < band.high[0]
     text = str(severity)
     assert (
         f"base distribution 95 %  > 1 m/s {band.low[1]:.1e} to {band.high[1]:.1e} (40 events of 12 scenes, 20 refits)"

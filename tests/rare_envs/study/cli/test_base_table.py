@@ -35,7 +35,7 @@ def test_all_that_is_known_of_a_fitted_base_is_listed(fitted: None) -> None:
 
 
 def test_the_table_for_people(fitted: None, capsys: pytest.CaptureFixture[str]) -> None:
-    print_bases(list_bases("rare_envs/HardBrake-v0"))
+    print_bases("rare_envs/HardBrake-v0", list_bases("rare_envs/HardBrake-v0"))
     text = " ".join(capsys.readouterr().out.split())
     assert "us101 (the default) fitted to 42 events of 40 scenes, 30 refits" in text
     assert "site site of hard_brake, 2005-06-15" in text
@@ -53,6 +53,16 @@ def test_every_shipped_base_can_be_listed(env_id: str) -> None:
 def test_the_command(cli: Cli, fitted: None) -> None:
     answer = json.loads(cli("bases", "hard_brake", "--json").stdout)
     assert answer["bases"]["us101"]["fitted_to"] == "42 events of 40 scenes"
+    assert answer["env_id"] == "rare_envs/HardBrake-v0"
     assert "42 events of 40 scenes" in cli("bases", "hard_brake").stdout
+
+
+def test_the_version_of_the_scenario_is_said_as_both_have_a_us101(cli: Cli) -> None:
+    newest, first = (cli("bases", name).stdout for name in ("cut_in", "rare_envs/CutIn-v0"))
+    assert newest.startswith("base distributions of rare_envs/CutIn-v1\nus101 ") and "38 + 259 events" in newest
+    assert first.startswith("base distributions of rare_envs/CutIn-v0\nus101 ") and "38 + 265 events" in first
+
+
+def test_unknown_scenarios_are_refused(cli: Cli) -> None:
     assert_refused(cli("bases", "merge"), "merge", "cut_in")
     assert_refused(cli("bases", "cutin"), "did you mean 'cut_in'?")

@@ -24,3 +24,4 @@ def test_a_plan_from_pilots_and_one_from_a_folder(cli: Cli, risky: str, safe: st
         assert_refused(cli("plan", tmp_path / "run", *options), f"without {options[0]}")
     assert_refused(cli("plan", FOLLOWING, "--base", risky, "--method", "mc,nope", "--pilot", 100), "'nope'")
     assert_refused(cli("plan", "rare_envs/Nowhere-v0"), "Nowhere")
+    assert_refused(cli("plan", tmp_path / "nowhere"), "There is no folder", "nowhere' of a run. Unknown environment")

@@ -54,6 +54,10 @@ BAD = {
     "unknown site": (["idm", "--sites", "us102"], ["us102", "us101"]),
     "no site": (["idm", "--sites", ","], ["site"]),
     "unknown leaders": (["idm", "--with", "merge"], ["merge"]),
+    "two bases for one scenario": (
+        ["idm", "--base", "hard_brake=us101", "--base", "hard_brake=mine.json"],
+        ["one --base for each scenario", "2 for 'hard_brake'"],
+    ),
     "uncounted leaders": (
         ["idm", "--with", "highway"],
         ["cut-in or --with car-following", "'highway'"],
@@ -74,7 +78,8 @@ BAD = {
 
 @pytest.mark.parametrize(("words", "said"), BAD.values(), ids=BAD.keys())
 def test_bad_input_is_one_line(cli: Cli, here: Path, bases: list[str], words: list[str], said: list[str]) -> None:
-    assert_refused(cli("risk", *words[:1], *bases, *words[1:]), *said)
+    given = [] if "--base" in words else bases
+    assert_refused(cli("risk", *words[:1], *given, *words[1:]), *said)
 
 
 def test_out_in_a_file_is_refused(cli: Cli, here: Path, bases: list[str]) -> None:
@@ -151,3 +156,5 @@ def test_p_under_other_bases(cli: Cli, here: Path) -> None:
     assert f"under {near} " in text
     assert f"under {far} not known: " in " ".join(text.split())
     assert_refused(cli(*BRAKE, "--base", base, "--also-under", "nowhere"), "nowhere")
+    assert_refused(cli(*BRAKE, "--base", base, "--also-under", ","), "one base or more")
+    assert_refused(cli(*BRAKE, "--base", base, "--also-under", f"{near},{near}"), "each once")

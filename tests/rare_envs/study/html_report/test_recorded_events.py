@@ -20,8 +20,8 @@ def test_the_nearest_event_is_the_nearest_in_deviations() -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "Expected events"),
-        ("gap\n1\n", "with the columns a, gap"),
+        ("", "columns named as the parameters, a, gap; it has no rows"),
+        ("gap\n1\n", "columns named as the parameters, a, gap; it has gap"),
         ("a,gap\nx,1\n", "no table"),
         ("a,gap\n,1\n", "no event"),
     ],

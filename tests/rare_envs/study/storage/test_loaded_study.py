@@ -9,6 +9,7 @@ import pytest
 
 import rare_envs
 from rare_envs.study import BadInput, Question, prepare, run_into
+from rare_envs.study.storage import loaded_study
 
 
 @pytest.fixture(scope="module")
@@ -76,6 +77,27 @@ def test_a_damaged_table_and_unknown_columns_are_refused(folder: Path, tmp_path:
     (tmp_path / "episodes.parquet").write_bytes(study.episodes_path.read_bytes()[:-40])
     with pytest.raises(ValueError, match=r"episodes\.parquet"):
         rare_envs.load_study(tmp_path).episodes()
+
+
+@pytest.mark.parametrize("text", ["{}", '{"format": 2}', '{"format": null}', '{"format": [[[]]]}'])
+def test_an_unknown_format_of_the_study_is_refused_in_one_line(folder: Path, tmp_path: Path, text: str) -> None:
+    for name in ("result.json", "failures.csv"):
+        (tmp_path / name).write_bytes((folder / name).read_bytes())
+    assert rare_envs.load_study(tmp_path).about == {}  # a run of an earlier version
+    (tmp_path / "study.json").write_text(text)
+    with pytest.raises(BadInput, match=r"^Expected format 1 in '.*study\.json', got .*: the file is damaged"):
+        rare_envs.load_study(tmp_path)
+
+
+def test_a_table_that_is_too_large_for_memory_is_refused(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A file of a few kilobytes can hold billions of rows that are alike."""
+    study = rare_envs.load_study(folder)
+    monkeypatch.setattr(loaded_study, "MAX_TABLE_BYTES", 300 * 8)
+    with pytest.raises(ValueError, match=r"2 columns of episodes\.parquet take .* GiB, more than the .* ask for fewer"):
+        study.episodes(["f", "gap"])
+    with pytest.raises(ValueError, match="ask for fewer"):
+        study.episodes()
+    assert study.episodes(["f"]).num_rows == 300
 
 
 def test_a_folder_without_a_finished_run_is_refused(tmp_path: Path) -> None:

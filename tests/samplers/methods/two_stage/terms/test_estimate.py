@@ -57,6 +57,8 @@ def test_failures_of_terms_that_nobody_pursued_are_told():
     assert combined.share_of_others([0]) == pytest.approx(0.1)
     assert any("no proposal was made for" in text for text in doubt(combined, [0], DoubtSettings()))
     assert doubt(combined, [0, 1], DoubtSettings()) == []
+    few = CombinedRounds((final_round(np.ones(100), least=np.repeat([0, 1], [96, 4])),), 0.0)
+    assert doubt(few, [0], DoubtSettings()) == []  # up to 5 % of p are no reason
 
 
 def test_a_last_round_that_few_draws_carry_is_told():

@@ -23,15 +23,20 @@ SETTINGS = LawSettings()
 def test_axes_span_the_directions_and_no_more(rng):
     plane = np.linalg.qr(rng.standard_normal((30, 2)))[0]
     directions = rng.standard_normal((9, 2)) @ plane.T
-    axes = find_axes(directions, np.ones(9), rank=8)
+    axes = find_axes(directions, np.ones(9), SETTINGS)
     assert axes.shape == (30, 2)
     np.testing.assert_allclose(axes.T @ axes, np.eye(2), atol=1e-12)
     np.testing.assert_allclose(axes @ axes.T @ plane, plane, atol=1e-10)
 
 
 def test_heavier_directions_come_first():
-    axes = find_axes(np.eye(3), np.array([1.0, 3.0, 2.0]), rank=2)
+    axes = find_axes(np.eye(3), np.array([1.0, 3.0, 2.0]), replace(SETTINGS, rank=2))
     np.testing.assert_allclose(np.abs(axes), np.eye(3)[:, [1, 2]], atol=1e-12)
+
+
+def test_directions_in_which_a_term_hardly_changes_are_left_out():
+    axes = find_axes(np.eye(3), np.array([1.0, 0.11, 0.09]), SETTINGS)
+    np.testing.assert_allclose(np.abs(axes), np.eye(3)[:, :2], atol=1e-12)
 
 
 def test_the_first_law_lies_around_the_ends(rng):

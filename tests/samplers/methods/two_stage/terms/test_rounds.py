@@ -41,7 +41,10 @@ def test_a_walk_that_came_half_way_is_enough_and_one_that_did_not_is_not(half_sp
 
 
 def test_shares_of_ready_terms_follow_their_weights(half_spaces, rng, answer, simulator_of):
-    """Terms with 80, 15 and 5 % of p = 0.3: of base draws sqrt(sum W^2) goes with sqrt(p_j), 0.53 : 0.24 : 0.14."""
+    """Terms with 80, 15 and 5 % of p = 0.3: of base draws sqrt(sum W^2) goes with sqrt(p_j), 0.59 : 0.26 : 0.15.
+
+    The least share, 0.17, is that of the last.
+    """
     problem, _, normals = half_spaces(20, 0.3)
     history, start = base_history(problem, rng, 20_000), walked(normals, [1.0, 1.0, 1.0])
     pursued = pursue_walked(start, history, SETTINGS)
@@ -53,7 +56,8 @@ def test_shares_of_ready_terms_follow_their_weights(half_spaces, rng, answer, si
     failing = history.terms.f <= 0
     parts = np.sqrt([(failing & (history.terms.least == j)).sum() for j in range(3)])
     shares = mix_terms(pursued, history, 0.0, RoundSettings()).shares
-    np.testing.assert_allclose(shares, parts / parts.sum(), rtol=1e-9)
+    wanted = np.maximum(parts / parts.sum(), RoundSettings().min_term_share)
+    np.testing.assert_allclose(shares, wanted / wanted.sum(), rtol=1e-9)
     np.testing.assert_allclose(final, shares)  # nobody waits for a term that was not reached
 
 

@@ -127,7 +127,7 @@ def lobes(dim=300, cosine=0.3):
     beta = np.array([3.6, 3.9, 4.2])[:, None] + 0.35 * rng.standard_normal((3, 3))
 
     def values(x):
-        return beta - np.einsum("nd,jkd->njk", x, normals)
+        return beta - np.einsum("id,jkd->ijk", x, normals)
 
     def gradient(x, term):
         return -normals[term, values(x)[np.arange(len(x)), term].argmin(axis=1)]
@@ -153,6 +153,19 @@ def test_a_wrong_gradient_costs_accuracy_and_nothing_else(half_spaces):
     assert any("subset simulation" in text for text in result.remarks)
     assert result.interval[0] <= exact <= result.interval[1]
     assert sum(level.n_sim for level in result.trace) == result.n_sim <= 6000
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_failures_of_a_term_that_nobody_pursued_are_told(half_spaces, known):
+    """A term with 30 % of p has no gradient, so that nothing but base draws meets its failures; or it has one."""
+    _, exact, normals = half_spaces(40, 0.03, shares=(0.7, 0.3))
+
+    def gradient(x, term):
+        return -normals[term] if known else np.where(term[:, None] == 0, -normals[term], np.nan)
+
+    result = runs(half_spaces(40, 0.03, shares=(0.7, 0.3), gradient=gradient)[0], [3], max_sim=20_000)[0]
+    assert any("terms that no proposal was made for" in text for text in result.warnings) != known
+    check([result], exact)
 
 
 def test_gradients_that_raise_cost_accuracy_and_nothing_else(half_spaces):
