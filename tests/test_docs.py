@@ -95,6 +95,13 @@ def test_code_of_a_page(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_training_on_a_page_is_seeded(page: Path) -> None:
+    for block in blocks(page.read_text(encoding="utf-8")):
+        for model in re.findall(r"= (?:PPO|DQN|SAC)\((.*?)\.learn\(", block.code, flags=re.DOTALL):
+            assert "seed=" in model, f"two runs of the page train two policies: {model}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_links_of_a_page(page: Path) -> None:
     for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text(encoding="utf-8")):
         if not target.startswith("http"):
