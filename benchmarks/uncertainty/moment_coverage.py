@@ -20,7 +20,7 @@ from scipy.special import ndtr
 from benchmarks import RESULTS
 from benchmarks.uncertainty.recipe_coverage import RECIPE_WORLDS, RecipeWorld
 from samplers.analysis.base_uncertainty import FIT_BIAS
-from samplers.statistics.refit_groups import refit_quantile
+from samplers.statistics.refit_families import refit_quantile
 
 MOMENT_RESULT = RESULTS / "moment_coverage.json"
 NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(60)

@@ -171,7 +171,7 @@ class FittedDistribution:
         return self.events.describe()
 
     @property
-    def refit_groups(self) -> tuple[int, ...]:
+    def refit_families(self) -> tuple[int, ...]:
         """Number of the coordinates of each refit; 0 are those of `distribution`."""
         return number_coordinates([self.distribution, *self.refits])[1:]
 

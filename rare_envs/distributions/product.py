@@ -186,9 +186,9 @@ class FittedProduct(FittedDistribution):
         return next(each for each in self.parts if isinstance(each, FittedDistribution))
 
     @property
-    def refit_groups(self) -> tuple[int, ...]:
+    def refit_families(self) -> tuple[int, ...]:
         """Number of the coordinates of each refit of the fitted one."""
-        return self.fitted_part.refit_groups
+        return self.fitted_part.refit_families
 
     def ensemble(self) -> Distribution:
         """Return the blocks with the ensemble of the fitted one in its place."""

@@ -8,6 +8,14 @@ R = lambda p. Both factors are wide, so that errors add up in logarithms:
 for n counted events of which a share q, known from k others, is as the scenario describes; cov of the estimate; s the
 spread of log p over the refits of the base distribution, with the bias of a fit; s_site the spread between sites.
 Where refits are known, cov and s count (t / z)^2 fold: t is the quantile of Student's t for as few clusters of events.
+
+Where p has an interval of its own, with other distances below and above log p (families of refits, the share that a
+search may have missed), each side adds up by itself (Zou, Donner, "Construction of confidence limits about effect
+measures: a general approach", Statistics in Medicine 27, 2008):
+
+    log R_low = log R - sqrt((log p - log p_low)^2 + z^2 (1 / n + (1 - q) / (q k) + s_site^2)),
+
+and in the same way upwards. For an interval p exp(-+ t S) that is the formula above.
 """
 
 from __future__ import annotations
@@ -73,6 +81,9 @@ class CollisionProbability:
     """Bias of the fit itself in log p, which counts beside the spread."""
     quantile: float | None = None
     """Quantile of Student's t for the number of clusters of events; None for that of a normal distribution."""
+    interval: RateInterval | None = None
+    """Interval of p with all these errors, of the confidence of the rate; None for that which they give alike below and
+    above log p."""
     determined: bool = True
     """Whether the events behind the base determine p; if not, `upper` alone is known."""
 
@@ -121,7 +132,7 @@ class CollisionRate:
 
     @property
     def log_variance(self) -> LogVariance:
-        """Parts of the variance of log R, by which the interval is made."""
+        """Parts of the variance of log R; of them the interval is made where p has none of its own."""
         one = self.probability
         factor = 1.0 if one.quantile is None else (one.quantile / normal_quantile(self.confidence)) ** 2
         spread = 0.0 if one.spread is None else one.spread**2 + one.fit_bias**2
@@ -155,6 +166,7 @@ class CollisionRate:
         return {
             "scenario": self.scenario,
             "p": self.probability.p,
+            "p_interval": None if self.probability.interval is None else list(self.probability.interval),
             "per_hour": self.per_hour,
             "interval_per_hour": list(self.interval_per_hour),
             "per_million_km": self.per_million_km,
@@ -186,8 +198,11 @@ class CollisionRate:
         log_events = math.log(counted.share) + np.log(events) + math.sqrt(counts) * rng.standard_normal(n)
         other = math.sqrt(parts.site) * rng.standard_normal(n)
         if self.determined:
-            sampling = math.sqrt(parts.sampling) * rng.standard_normal(n)
-            log_p = math.log(self.probability.p) + sampling + math.sqrt(parts.base) * base_normal + other
+            (below, above), z = self._log_distances(), normal_quantile(self.confidence)
+            own = parts.sampling + parts.base
+            of_base = parts.base / own if own > 0 else 0.0
+            error = math.sqrt(of_base) * base_normal + math.sqrt(1.0 - of_base) * rng.standard_normal(n)
+            log_p = math.log(self.probability.p) + np.where(error < 0, below, above) / z * error + other
         else:
             log_p = math.log(self.probability.upper) + other
         return np.exp(log_events + np.minimum(log_p, 0.0)) / exposure  # a probability is 1 at most
@@ -202,11 +217,20 @@ class CollisionRate:
             return (low if self.determined else 0.0), high
         parts, events = self.log_variance, scale * counted.count * counted.share
         most = math.exp(z * math.sqrt(parts.counts))  # p is 1 at most, at any site
+        rest = z * math.sqrt(parts.counts + parts.site)
         if not self.determined:
-            rest = math.exp(z * math.sqrt(parts.counts + parts.site))
-            return 0.0, events * min(self.probability.upper * rest, most)
-        factor = math.exp(z * math.sqrt(parts.total))
-        return events * self.probability.p / factor, events * min(self.probability.p * factor, most)
+            return 0.0, events * min(self.probability.upper * math.exp(rest), most)
+        below, above = (math.exp(math.hypot(distance, rest)) for distance in self._log_distances())
+        return events * self.probability.p / below, events * min(self.probability.p * above, most)
+
+    def _log_distances(self) -> RateInterval:
+        """Return how far the ends of the interval of p are below and above log p > -inf."""
+        one, parts = self.probability, self.log_variance
+        if one.interval is None:
+            half = normal_quantile(self.confidence) * math.sqrt(parts.sampling + parts.base)
+            return half, half
+        low, high = one.interval
+        return math.log(one.p / low) if low > 0 else math.inf, math.log(high / one.p)
 
 
 def normal_quantile(confidence: float) -> float:

@@ -14,7 +14,8 @@ from rare_envs.scenarios.registry import find_scenario
 from rare_envs.study.analysis.severity import Severity
 from rare_envs.study.question import Question, Study
 from samplers.analysis.base_uncertainty import FIT_BIAS
-from samplers.statistics.refit_groups import refit_quantile
+from samplers.statistics.intervals import Interval
+from samplers.statistics.refit_families import refit_quantile
 
 COLLISION_MEASURE = "ttc"
 """Measure that is -1 after a collision and above 0 without one."""
@@ -79,26 +80,28 @@ def compute_injury_rate(study: Study, estimate: samplers.Estimate, severity: Sev
         ValueError: As in `find_frequency`.
     """
     injuries = severity.injuries
-    probability = _describe_value(injuries.value, injuries.cov, injuries.interval[1], severity.injuries_base)
+    probability = _describe_value(injuries.value, injuries.cov, injuries.interval, severity.injuries_base)
     return replace(compute_rate(study, estimate), probability=probability)
 
 
 def describe_probability(estimate: samplers.Estimate) -> CollisionProbability:
     """Return p of an estimate with its errors: that of sampling, and where refits are known, that of the base."""
-    return _describe_value(estimate.p, estimate.cov, estimate.interval[1], estimate.base_uncertainty)
+    return _describe_value(estimate.p, estimate.cov, estimate.interval, estimate.base_uncertainty)
 
 
 def _describe_value(
-    value: float, cov: float, upper: float, base: samplers.BaseUncertainty | None
+    value: float, cov: float, sampling: Interval, base: samplers.BaseUncertainty | None
 ) -> CollisionProbability:
-    """Return an expectation per event with its errors."""
+    """Return an expectation per event with its errors; its interval is that of the base where there is one."""
     known = value > 0 and math.isfinite(cov)
     if not known or base is None or not math.isfinite(base.spread):
-        return CollisionProbability(p=value, cov=cov, upper=upper, determined=known)
+        interval = sampling if known else None
+        return CollisionProbability(p=value, cov=cov, upper=sampling[1], determined=known, interval=interval)
     return CollisionProbability(
         p=value,
         cov=cov,
-        upper=upper if base.bound is None else base.bound,
+        upper=sampling[1] if base.bound is None else base.bound,
+        interval=base.interval,
         spread=base.spread,
         fit_bias=FIT_BIAS,
         quantile=refit_quantile(base.confidence, len(base.p_refits) - 1, base.clusters),

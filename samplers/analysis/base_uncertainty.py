@@ -9,7 +9,7 @@ the upper end raised by the share of p that a search may have missed, as that of
 narrower than the sampling interval, which of few draws is wider than their c.o.v. says.
 
 Where refits choose their family anew, each family has such an interval, and the whole reaches from the lowest end to
-the highest; what is expected for the next event is a sum over the families (`samplers.statistics.refit_groups`).
+the highest; what is expected for the next event is a sum over the families (`samplers.statistics.refit_families`).
 Percentiles of the p_b are not used: refits repeat the bias of the fit, and 30 of them do not reach the outer 2.5 %, so
 that percentiles cover 76 and 82 % (38 and 400 events) and miss on the unsafe side. This interval covers 93 and 92 %
 where the family of distributions is the true one (`benchmarks/uncertainty/base_coverage.py`). Another family is not
@@ -38,11 +38,10 @@ from samplers.analysis.refits import (
 from samplers.problem import FloatArray
 from samplers.serialization import to_json_value
 from samplers.statistics.intervals import Interval
-from samplers.statistics.refit_groups import (
+from samplers.statistics.refit_families import (
     expect_over_families,
     find_log_ends,
-    read_groups,
-    refit_quantile,
+    read_refit_families,
     split_families,
 )
 
@@ -198,7 +197,7 @@ def summarise_refits(
     interval, expected, spread, bound = None, None, math.nan, None
     if not reason:
         spread = float(log_values.std(ddof=1))
-        families = split_families(math.log(value), log_values, read_groups(fitted, len(log_values)))
+        families = split_families(math.log(value), log_values, read_refit_families(fitted, len(log_values)))
         below, above = find_log_ends(families, cov**2 + FIT_BIAS**2, confidence, fitted.clusters, lineages)
         low, high = low_factor * scale_by_exp(1.0, below), min(largest, scale_by_exp(1.0, above))
         low, high = (low, high) if sampling is None else (min(low, sampling[0]), max(high, sampling[1]))
@@ -232,25 +231,6 @@ def explain_missing_spread(log_values: FloatArray, clusters: int) -> str:
     if missing:
         return f"{missing} of {len(log_values)} refits have no density at any failing point, so that p is not known."
     return ""
-
-
-def half_width(spread: float, cov: float, confidence: float, n_refits: int, clusters: int) -> float:
-    """Return t S, half the width of the interval of log p.
-
-    Args:
-        spread: Standard deviation over the refits, of the logarithm.
-        cov: Coefficient of variation of the estimate itself.
-        confidence: Nominal coverage.
-        n_refits: Number of refits.
-        clusters: Independent clusters of events; the fewer of the two, less 1, are the degrees of freedom.
-
-    Example:
-        30 refits: the t quantile with 29 degrees of freedom is 2.045.
-
-        >>> round(half_width(spread=1.0, cov=0.0, confidence=0.95, n_refits=30, clusters=100) / (1 + 0.04) ** 0.5, 3)
-        2.045
-    """
-    return refit_quantile(confidence, n_refits - 1, clusters) * math.sqrt(spread**2 + cov**2 + FIT_BIAS**2)
 
 
 def scale_by_exp(value: float, exponent: float) -> float:

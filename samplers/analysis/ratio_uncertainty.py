@@ -1,9 +1,9 @@
 """Uncertainty of a ratio of two probabilities under the same refits of one base distribution.
 
 Both probabilities rise and fall together from refit to refit, so that their ratio is known far better than either:
-with s the standard deviation of log(p_1b / p_2b) over refits b the interval is ratio exp(-+ t S), as in
-`base_uncertainty`. Being a ratio protects against few events, not against a wrong family of distributions: in a world
-with Student t tails it covers 2 to 42 % at 400 events.
+with s the standard deviation of log(p_1b / p_2b) over refits b the interval is ratio exp(-+ t S), one for each family
+of refits as in `base_uncertainty`. Being a ratio protects against few events, not against a wrong family of
+distributions: in a world with Student t tails it covers 2 to 42 % at 400 events.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 
 from samplers.analysis.base_uncertainty import (
+    FIT_BIAS,
     MAX_SPREAD,
     describe_coverage,
     explain_missing_spread,
-    half_width,
     scale_by_exp,
 )
 from samplers.analysis.refits import (
@@ -30,6 +30,7 @@ from samplers.analysis.refits import (
 )
 from samplers.serialization import to_json_value
 from samplers.statistics.intervals import Interval
+from samplers.statistics.refit_families import find_log_ends, read_refit_families, split_families
 
 RATIO_CHECK_DRAWS = 16
 """Draws at which the refits of two estimates are compared."""
@@ -163,8 +164,9 @@ def summarise_ratio(
     if spread > MAX_SPREAD:
         reason = f"the events do not determine the ratio: the spread of its logarithm is {spread:.1f}."
     elif not reason:
-        half = half_width(spread, cov, confidence, len(log_ratios), fitted.clusters)
-        low, high = scale_by_exp(ratio, -half), scale_by_exp(ratio, half)
+        families = split_families(math.log(ratio), log_ratios, read_refit_families(fitted, len(log_ratios)))
+        ends = find_log_ends(families, cov**2 + FIT_BIAS**2, confidence, fitted.clusters)
+        low, high = (scale_by_exp(1.0, end) for end in ends)
         interval = (low, high) if sampling is None else (min(low, sampling[0]), max(high, sampling[1]))
     return RatioUncertainty(
         ratio=ratio,

@@ -19,7 +19,7 @@ from samplers.analysis.base_uncertainty import FIT_BIAS, explain_missing_spread,
 from samplers.analysis.refits import FittedBase, RefitSums
 from samplers.problem import FloatArray
 from samplers.serialization import to_json_value
-from samplers.statistics.refit_groups import deviate_within_families, read_groups
+from samplers.statistics.refit_families import deviate_within_families, read_refit_families
 from samplers.statistics.simultaneous import band_generator, simultaneous_level
 
 
@@ -109,7 +109,7 @@ def compute_refit_band(
 
 def _correlate_errors(cov: FloatArray, correlation: FloatArray, log_p: FloatArray, fitted: FittedBase) -> FloatArray:
     """Return the correlation of the errors of log p at k thresholds, shape (k, k); log_p of R refits is (k, R)."""
-    deviations, freedom = deviate_within_families(log_p, read_groups(fitted, log_p.shape[1]))
+    deviations, freedom = deviate_within_families(log_p, read_refit_families(fitted, log_p.shape[1]))
     covariance = deviations @ deviations.T / freedom + np.outer(cov, cov) * correlation + FIT_BIAS**2
     scale = 1 / np.sqrt(np.diag(covariance))
     return np.asarray(covariance * np.outer(scale, scale))

@@ -131,7 +131,7 @@ def test_a_refit_may_have_coordinates_of_its_own_also_in_a_file() -> None:
     assert isinstance(other, CoordinateMixture)
     assert own.coordinates.kinds != other.coordinates.kinds == ("plain",) * 3
     assert other.coordinates.order == ()
-    assert base.refit_groups == (0, 1)
+    assert base.refit_families == (0, 1)
     assert base.to_dict()["refits"] == content["refits"]
 
 

@@ -9,7 +9,6 @@ from scipy import stats
 import samplers
 from samplers.analysis.base_uncertainty import (
     explain_missing_spread,
-    half_width,
     scale_by_exp,
 )
 from samplers.analysis.refits import reweight_runs_to_refits
@@ -62,16 +61,6 @@ def test_the_upper_end_holds_what_a_search_may_have_missed():
     drawn = sigma * rng.standard_normal(10**6) - np.log1p(-rng.beta(0.1, 3.0, 10**6))
     assert np.quantile(drawn, 0.975) > math.log(without.interval[1] / without.p) + 0.03
     assert math.log(found.interval[1] / found.p) == pytest.approx(np.quantile(drawn, 0.975), abs=0.02)
-
-
-@pytest.mark.parametrize(
-    ("refits", "clusters", "confidence", "quantile"),
-    [(30, 100, 0.95, 2.045230), (30, 17, 0.95, 2.119905), (100, 17, 0.9, 1.745884), (2, 28, 0.95, 12.706205)],
-)
-def test_quantiles_of_t_from_a_table(refits, clusters, confidence, quantile):
-    half = half_width(0.0, 0.0, confidence, refits, clusters)
-    assert half == pytest.approx(0.2 * quantile, rel=1e-6)
-    assert half_width(1.2, 0.9, confidence, refits, clusters) == pytest.approx(quantile * math.sqrt(2.29), rel=1e-6)
 
 
 def test_refits_without_a_spread_leave_the_bias_of_the_fit():
@@ -170,7 +159,7 @@ class EachOfItsOwnFamily(FittedNormal):
     """Refits of which no two are of one family."""
 
     @property
-    def refit_groups(self):
+    def refit_families(self):
         return tuple(range(len(self.refits)))
 
 

@@ -1,11 +1,11 @@
 import json
+import math
 
 import numpy as np
 import pytest
 from scipy import stats
 
 import samplers
-from samplers.analysis.base_uncertainty import half_width
 from samplers.analysis.exceedance import compute_exceedance
 from samplers.analysis.failure_expectation import FurtherFailures
 from samplers.analysis.failure_weights import weigh_failures
@@ -105,7 +105,7 @@ def test_one_threshold_has_the_interval_that_refits_allow_and_several_have_a_wid
         curve = curve_of(result, [t])
         exact = np.std([stats.norm.logsf(t, refit.means[0], refit.sds[0]) for refit in base.refits], ddof=1)
         assert curve.base.spread[0] == pytest.approx(exact, rel=0.1)
-        half = half_width(curve.base.spread[0], curve.cov[0], 0.95, 20, base.clusters)
+        half = stats.t.ppf(0.975, base.clusters - 1) * math.sqrt(curve.base.spread[0] ** 2 + curve.cov[0] ** 2 + 0.2**2)
         ends = curve.p[0] * np.exp([-half, raise_log_end(half, result.sample.lineages, 0.95)])
         assert (curve.base.low[0], curve.base.high[0]) == pytest.approx(tuple(ends))
     whole = result.base_uncertainty

@@ -17,6 +17,14 @@ FAR = [*SHIFTED[:26], *[normal(7.0, 0.2 + 0.01 * i) for i in range(4)]]
 BASE, FAR_BASE = fitted(SHIFTED), fitted(FAR, FittedWithEnsemble)
 
 
+class TwoFamilies(FittedNormal):
+    """Of 50 refits the last 20 are of a family of their own."""
+
+    @property
+    def refit_families(self):
+        return [0] * 30 + [1] * 20
+
+
 @functools.cache
 def estimates(base=None, betas=(3.0, 3.3), **options):
     base = BASE if base is None else base
@@ -43,6 +51,19 @@ def test_the_interval_by_hand():
     ratio = first.p / second.p
     assert found.interval == pytest.approx((ratio * math.exp(-half), ratio * math.exp(half)), rel=1e-6)
     assert found.spread == pytest.approx(spread)
+
+
+def test_another_family_of_refits_moves_the_end_on_its_side_alone():
+    """20 refits in which both egos fail alike, of a family of their own, around a ratio of 1 for 4 of the fit itself.
+
+    One spread over all would raise the upper end as well. t is 2.045 for 30 refits and 2.093 for 20.
+    """
+    own, other = math.log(4.0) + np.linspace(-0.3, 0.3, 30), np.linspace(-0.1, 0.1, 20)
+    base = fitted(SHIFTED + SHIFTED[:20], TwoFamilies, clusters=500)
+    sums = RefitSums(np.stack([np.concatenate([own, other]) - 9.0, np.full(50, -9.0)]), np.full((2, 50), 100.0))
+    low, high = summarise_ratio(4.0, 0.1, sums, base, 0.95).interval
+    assert low == pytest.approx(math.exp(-2.093024 * math.sqrt(other.var(ddof=1) + 0.05)))
+    assert high == pytest.approx(4.0 * math.exp(2.045230 * math.sqrt(own.var(ddof=1) + 0.05)))
 
 
 def test_the_ratio_is_known_better_than_either():

@@ -15,13 +15,13 @@ THRESHOLDS = np.array([0.0, 1.0, 2.0, 3.0])
 N_EVENTS, N_REFITS = 40, 30
 
 
-def band_of(log_p, log_p_refits, thresholds=THRESHOLDS, groups=None, correlation=None, cov=0.0, **options):
+def band_of(log_p, log_p_refits, thresholds=THRESHOLDS, family_of=None, correlation=None, cov=0.0, **options):
     """Return the band of known probabilities (k,) and those of refits (k, R)."""
     log_p_refits = np.asarray(log_p_refits, dtype=float)
     k, n = log_p_refits.shape
     fitted = SimpleNamespace(refits=[None] * n, clusters=1000, fitted_to="40 events", family="normal")
-    if groups is not None:
-        fitted.refit_groups = groups
+    if family_of is not None:
+        fitted.refit_families = family_of
     sums = RefitSums(log_p_refits, np.full((k, n), 100.0))
     correlation = np.eye(k) if correlation is None else correlation
     options = {"confidence": 0.95, "seed": 0, **options}
@@ -86,9 +86,9 @@ def test_errors_of_two_thresholds_that_are_independent_have_the_level_of_both():
 def test_the_distance_between_families_does_not_correlate_thresholds():
     """Both thresholds have families 9 apart, and independent errors within them."""
     first, second = np.tile(np.repeat([-1.0, 1.0], 8), 2), np.tile([-1.0, 1.0], 16)
-    shift, groups = np.repeat([0.0, -9.0], 16), np.repeat([0, 1], 16)
+    shift, family_of = np.repeat([0.0, -9.0], 16), np.repeat([0, 1], 16)
     log_p = np.array([-5.0, -7.0])
-    apart = band_of(log_p, [first + shift - 5.0, second + shift - 7.0], np.array([1.0, 2.0]), groups)
+    apart = band_of(log_p, [first + shift - 5.0, second + shift - 7.0], np.array([1.0, 2.0]), family_of)
     alone = band_of(log_p, [first[:16] - 5.0, second[:16] - 7.0], np.array([1.0, 2.0]))
     assert apart.high == pytest.approx(alone.high, rel=0.01)
 

@@ -5,11 +5,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from samplers.statistics.refit_groups import (
+from samplers.statistics.refit_families import (
     RefitFamily,
     expect_over_families,
     find_log_ends,
-    read_groups,
+    read_refit_families,
+    refit_quantile,
     split_families,
 )
 
@@ -21,8 +22,8 @@ T = {4: 2.776445, 11: 2.200985, 59: 2.000995, 64: 1.997730}
 """97.5 % points of Student's t from a table."""
 
 
-def ends_of(log_p, values, groups, other_variance=0.0, clusters=1000):
-    return find_log_ends(split_families(log_p, values, groups), other_variance, 0.95, clusters)
+def ends_of(log_p, values, family_of, other_variance=0.0, clusters=1000):
+    return find_log_ends(split_families(log_p, values, family_of), other_variance, 0.95, clusters)
 
 
 def test_one_family_has_the_interval_around_p_itself():
@@ -41,18 +42,18 @@ def test_another_family_moves_the_end_on_its_side_alone(shift, end):
 
 def test_a_family_of_few_refits_takes_the_pooled_spread_and_one_of_hardly_any_none():
     values = np.concatenate([OWN, 5.0 + OWN[:6], [90.0]])
-    groups = np.repeat([0, 1, 2], [60, 6, 1])
+    family_of = np.repeat([0, 1, 2], [60, 6, 1])
     pooled = (40 + 4) / (67 - 3)
-    low, high = ends_of(0.0, values, groups)
+    low, high = ends_of(0.0, values, family_of)
     assert low == pytest.approx(-T[59] * np.sqrt(40 / 59))
     assert high == pytest.approx(5.0 + T[64] * np.sqrt(pooled))
 
 
 def test_p_itself_counts_where_no_refit_is_of_its_family():
-    values, groups = OWN - 9.0, np.ones(60, dtype=int)
+    values, family_of = OWN - 9.0, np.ones(60, dtype=int)
     half = T[59] * np.sqrt(40 / 59)
-    assert ends_of(0.0, values, groups) == pytest.approx((-9.0 - half, half))
-    assert [each.share for each in split_families(0.0, values, groups)] == [0.0, 1.0]
+    assert ends_of(0.0, values, family_of) == pytest.approx((-9.0 - half, half))
+    assert [each.share for each in split_families(0.0, values, family_of)] == [0.0, 1.0]
 
 
 def test_families_of_one_refit_each_are_taken_for_one():
@@ -60,9 +61,20 @@ def test_families_of_one_refit_each_are_taken_for_one():
     assert family == (0.0, pytest.approx(2.0), 1, 1.0)
 
 
+@pytest.mark.parametrize(
+    ("freedom", "clusters", "confidence", "quantile"),
+    [(29, 100, 0.95, 2.045230), (29, 17, 0.95, 2.119905), (99, 17, 0.9, 1.745884), (1, 28, 0.95, 12.706205)],
+)
+def test_quantiles_of_t_from_a_table(freedom, clusters, confidence, quantile):
+    assert refit_quantile(confidence, freedom, clusters) == pytest.approx(quantile, rel=1e-6)
+    family = RefitFamily(0.0, 1.2**2, freedom, 1.0)
+    half = quantile * np.sqrt(2.25)
+    assert find_log_ends((family,), 0.81, confidence, clusters) == pytest.approx((-half, half), rel=1e-6)
+
+
 def test_clusters_of_events_limit_the_degrees_of_freedom_of_each_family():
-    values, groups = np.concatenate([OWN, OWN[:12] - 8.0]), np.repeat([0, 1], [60, 12])
-    low, high = ends_of(0.0, values, groups, clusters=5)
+    values, family_of = np.concatenate([OWN, OWN[:12] - 8.0]), np.repeat([0, 1], [60, 12])
+    low, high = ends_of(0.0, values, family_of, clusters=5)
     assert (low, high) == pytest.approx((-8.0 - T[4] * np.sqrt(8 / 11), T[4] * np.sqrt(40 / 59)))
 
 
@@ -85,8 +97,8 @@ def test_no_family_expects_more_than_the_largest_value_possible():
     assert expect_over_families(families, largest=50.0) == pytest.approx(0.25 * 0.5 * np.exp(4.0) + 0.75e-6)
 
 
-def test_a_base_may_know_no_groups_and_must_know_all():
-    assert read_groups(object(), 3).tolist() == [0, 0, 0]
-    assert read_groups(SimpleNamespace(refit_groups=(0, 1, 1)), 3).tolist() == [0, 1, 1]
-    with pytest.raises(ValueError, match="one group for each of 3 refits"):
-        read_groups(SimpleNamespace(refit_groups=(0, 1)), 3)
+def test_a_base_may_know_no_families_and_must_know_all():
+    assert read_refit_families(object(), 3).tolist() == [0, 0, 0]
+    assert read_refit_families(SimpleNamespace(refit_families=(0, 1, 1)), 3).tolist() == [0, 1, 1]
+    with pytest.raises(ValueError, match="one family for each of 3 refits"):
+        read_refit_families(SimpleNamespace(refit_families=(0, 1)), 3)

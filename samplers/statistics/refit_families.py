@@ -19,18 +19,18 @@ from scipy import stats
 from samplers.problem import FloatArray
 from samplers.statistics.unseen_share import raise_log_end
 
-MIN_GROUP_SHARE = 0.05
+MIN_FAMILY_SHARE = 0.05
 """Share of the refits from which a family has an interval of its own: one that fewer choose is not plausible."""
-MIN_GROUP = 10
-"""Refits from which a group has a spread of its own; smaller groups take the pooled one."""
+MIN_FAMILY = 10
+"""Refits from which a family has a spread of its own; smaller families take the pooled one."""
 
 
 @runtime_checkable
-class HasRefitGroups(Protocol):
+class HasRefitFamilies(Protocol):
     """A fitted base distribution whose refits may be of other families."""
 
     @property
-    def refit_groups(self) -> Sequence[int]:
+    def refit_families(self) -> Sequence[int]:
         """Number of the family of each refit; 0 is that of the base distribution itself."""
 
 
@@ -52,23 +52,25 @@ class RefitFamily(NamedTuple):
     """Of the refits that are of this family; 0 for that of the base where no refit chose it."""
 
 
-def read_groups(fitted: object, n_refits: int) -> NDArray[np.int64]:
-    """Return the group of each refit, shape (n_refits,); all 0 where the base knows no groups."""
-    groups = np.array(fitted.refit_groups if isinstance(fitted, HasRefitGroups) else [0] * n_refits, dtype=np.int64)
-    if groups.shape != (n_refits,):
-        raise ValueError(f"Expected one group for each of {n_refits} refits, got {groups.shape}.")
-    return groups
+def read_refit_families(fitted: object, n_refits: int) -> NDArray[np.int64]:
+    """Return the family of each refit, shape (n_refits,); all 0 where the base knows no families."""
+    family_of = np.array(
+        fitted.refit_families if isinstance(fitted, HasRefitFamilies) else [0] * n_refits, dtype=np.int64
+    )
+    if family_of.shape != (n_refits,):
+        raise ValueError(f"Expected one family for each of {n_refits} refits, got {family_of.shape}.")
+    return family_of
 
 
-def split_families(log_p: float, log_values: FloatArray, groups: NDArray[np.int64]) -> tuple[RefitFamily, ...]:
+def split_families(log_p: float, log_values: FloatArray, family_of: NDArray[np.int64]) -> tuple[RefitFamily, ...]:
     """Return the families of the refits, that of the base distribution first.
 
-    All refits are one family where each group has one member: nothing tells then a spread within from one between.
+    All refits are one family where each has one member: nothing tells then a spread within from one between.
 
     Args:
         log_p: Of the base itself.
         log_values: Of each refit, shape (R,), with R > 1.
-        groups: Of each refit, shape (R,).
+        family_of: Of each refit, shape (R,).
 
     Example:
         >>> values = np.array([-1.0, 0.0, 1.0] * 10 + [-11.0, -10.0, -9.0] * 10)
@@ -76,35 +78,35 @@ def split_families(log_p: float, log_values: FloatArray, groups: NDArray[np.int6
         >>> own.centre, other.centre, own.share, round(own.variance, 3)
         (0.2, -10.0, 0.5, 0.69)
     """
-    groups = _merge_single_members(groups)
-    deviations, free = deviate_within_families(log_values[None], groups)
+    family_of = _merge_single_members(family_of)
+    deviations, free = deviate_within_families(log_values[None], family_of)
     pooled = float((deviations**2).sum() / free)
     families = []
-    for name in sorted({0, *groups.tolist()}):
-        own = log_values[groups == name]
+    for name in sorted({0, *family_of.tolist()}):
+        own = log_values[family_of == name]
         centre = log_p if name == 0 else float(own.mean())
-        variance, freedom = (float(own.var(ddof=1)), len(own) - 1) if len(own) >= MIN_GROUP else (pooled, free)
+        variance, freedom = (float(own.var(ddof=1)), len(own) - 1) if len(own) >= MIN_FAMILY else (pooled, free)
         families.append(RefitFamily(centre, variance, freedom, len(own) / len(log_values)))
     return tuple(families)
 
 
-def deviate_within_families(log_values: FloatArray, groups: NDArray[np.int64]) -> tuple[FloatArray, int]:
+def deviate_within_families(log_values: FloatArray, family_of: NDArray[np.int64]) -> tuple[FloatArray, int]:
     """Return deviations of values (k, R) from the mean of their family, shape (k, R), and their degrees of freedom.
 
     Example:
-        >>> values, groups = np.array([[1.0, 3.0, 7.0, 8.0, 9.0]]), np.repeat([0, 1], [2, 3])
-        >>> deviations, freedom = deviate_within_families(values, groups)
+        >>> values, family_of = np.array([[1.0, 3.0, 7.0, 8.0, 9.0]]), np.repeat([0, 1], [2, 3])
+        >>> deviations, freedom = deviate_within_families(values, family_of)
         >>> deviations.tolist(), freedom
         ([[-1.0, 1.0, -1.0, 0.0, 1.0]], 3)
     """
-    names, index = np.unique(_merge_single_members(groups), return_inverse=True)
+    names, index = np.unique(_merge_single_members(family_of), return_inverse=True)
     means = np.stack([log_values[:, index == i].mean(axis=1) for i in range(len(names))], axis=1)
-    return log_values - means[:, index], len(groups) - len(names)
+    return log_values - means[:, index], len(family_of) - len(names)
 
 
-def _merge_single_members(groups: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the groups, shape (R,); one for all where each has one member."""
-    return np.zeros_like(groups) if len(np.unique(groups)) == len(groups) else groups
+def _merge_single_members(family_of: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the families, shape (R,); one for all where each has one member."""
+    return np.zeros_like(family_of) if len(np.unique(family_of)) == len(family_of) else family_of
 
 
 def find_log_ends(
@@ -137,7 +139,7 @@ def find_log_ends(
     """
     ends = []
     for number, family in enumerate(families):
-        if number == 0 or family.share >= MIN_GROUP_SHARE:
+        if number == 0 or family.share >= MIN_FAMILY_SHARE:
             quantile = refit_quantile(confidence, family.freedom, clusters)
             half = quantile * math.sqrt(family.variance + other_variance)
             ends.append((family.centre - half, family.centre + raise_log_end(half, lineages, confidence)))
