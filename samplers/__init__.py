@@ -43,8 +43,8 @@ from samplers.problem import (
     Terms,
 )
 from samplers.registry import METHODS, get_method
-from samplers.result import Estimate, Failure, Failures
-from samplers.sample import Layer, Sample
+from samplers.result import Estimate
+from samplers.sample import Failure, Failures, Layer, Sample, SimulatedPoints
 from samplers.trace import Level, Status
 
 __all__ = [
@@ -96,6 +96,7 @@ __all__ = [
     "Sample",
     "Sensitivity",
     "Share",
+    "SimulatedPoints",
     "StandardNormal",
     "Status",
     "Stepping",

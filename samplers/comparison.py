@@ -1,8 +1,10 @@
 """Comparison: the ratio of two probabilities of failure, from the same draws for both."""
 
 import math
-from dataclasses import asdict, dataclass, field
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
+from os import PathLike
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,13 +19,20 @@ from samplers.execution.arguments import RunArguments, check_problem
 from samplers.execution.progress import Listener
 from samplers.method import Stepping
 from samplers.methods.auto import Auto
+from samplers.presentation.notebook_html import html_table
+from samplers.presentation.object_file import read_object, register_stored, write_object
 from samplers.problem import FloatArray, Problem, condition_of
-from samplers.result import Estimate, indent_lines
+from samplers.result import Estimate, indent_lines, without_base
 from samplers.serialization import to_json_value
 from samplers.statistics.cluster_sums import has_independent_points, interval_of_sum
 from samplers.statistics.intervals import Interval, degrees_of_freedom, zero_hit_bound
 from samplers.statistics.weights import effective_number
 from samplers.validation import check_whole
+
+if TYPE_CHECKING:
+    import pandas
+    import pyarrow
+    from matplotlib.axes import Axes
 
 MIN_SIDE_ESS = 30.0
 """Effective failing units below which a probability is called coarse: its c.o.v. is then about 0.2 or more."""
@@ -80,10 +89,120 @@ class Comparison:
     base_uncertainty: RatioUncertainty | None = None
     """The interval of the ratio that the events behind a fitted base allow; None for a base without refits."""
 
+    def plot(self, ax: "Axes | None" = None) -> "Axes":
+        """Draw p of A, of B and of both with their intervals, p on a log scale; needs matplotlib.
+
+        Args:
+            ax: Where to draw; None takes the current axes of pyplot.
+
+        Raises:
+            ValueError: If neither failed.
+        """
+        if self.a.p == 0 and self.b.p == 0:
+            raise ValueError("There is nothing to draw: neither A nor B failed; give more simulations.")
+        if ax is None:
+            from matplotlib import pyplot
+
+            ax = pyplot.gca()
+        ends = [end for side in (self.a, self.b) for end in (side.p, *side.interval) if end > 0]
+        floor = min(ends) / 10  # an end of 0 has no place on a log scale
+        for place, side in enumerate((self.a, self.b)):
+            p, low, high = (max(value, floor) for value in (side.p, *side.interval))
+            ax.errorbar([place], [p], yerr=[[p - low], [high - p]], fmt="o" if side.p > 0 else "v", capsize=4)
+        ax.set_yscale("log")
+        ax.set_xticks([0, 1], ["A", "B"])
+        ax.set_xlim(-0.5, 1.5)
+        ax.set_ylabel(f"P[f ≤ {self.either.gamma:g}]")
+        ax.set_title(self._ratio_text)
+        return ax
+
+    def to_arrow(self, names: Sequence[str] = ()) -> "pyarrow.Table":
+        """Return the simulated points behind both probabilities, as `Estimate.to_arrow` of `either` does.
+
+        f is the smaller outcome of the two.
+
+        Args:
+            names: Names of the coordinates of x; x1, x2, ... by default.
+
+        Raises:
+            ValueError: If names do not fit.
+        """
+        return self.either.to_arrow(names)
+
+    def to_pandas(self, names: Sequence[str] = ()) -> "pandas.DataFrame":
+        """Return `to_arrow` as a pandas table; needs pandas."""
+        return self.to_arrow(names).to_pandas()
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write the comparison to a file that `Comparison.load` reads, as `Estimate.save` does.
+
+        Args:
+            path: Of the file.
+
+        Raises:
+            OSError: If it cannot be written.
+        """
+        write_object(path, replace(self, either=without_base(self.either)))
+
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> "Comparison":
+        """Return the comparison that `save` has written.
+
+        Args:
+            path: Of the file.
+
+        Raises:
+            FileNotFoundError: If there is no such file.
+            ValueError: If the file is damaged, or of something else.
+        """
+        return read_object(path, cls)
+
+    @property
+    def _has_ratio(self) -> bool:
+        """Whether both failed, so that there is more than a bound."""
+        return math.isfinite(self.ratio) and self.ratio > 0
+
+    @property
+    def _ratio_text(self) -> str:
+        """The ratio, or its bound where one of the two did not fail."""
+        low, high = self.interval
+        if math.isinf(self.ratio):
+            return f"p_A / p_B above {low:.3g} ({100 * self.confidence:g} % one-sided bound; B did not fail)"
+        if math.isnan(self.ratio):
+            return "p_A / p_B not known (neither failed)"
+        if self.ratio == 0:
+            return f"p_A / p_B below {high:.3g} ({100 * self.confidence:g} % one-sided bound; A did not fail)"
+        return f"p_A / p_B = {self.ratio:.3g}"
+
+    def __repr__(self) -> str:
+        """Return one line; `str` has all of it."""
+        low, high = self.interval
+        ends = f" [{low:.3g}, {high:.3g}]" if self._has_ratio else ""
+        return f"<Comparison {self._ratio_text}{ends}, {self.n_sim:,} simulations>"
+
+    def _repr_html_(self) -> str:
+        """Return a table for notebooks."""
+        level = f"{100 * self.confidence:g} % interval"
+        rows = [
+            ("p_A / p_B", f"{self.ratio:.3g}", "{:.3g} to {:.3g}".format(*self.interval))
+            if self._has_ratio
+            else ("p_A / p_B", self._ratio_text.removeprefix("p_A / p_B "), ""),
+            *(
+                (name, f"{side.p:.3e}", "{:.3e} to {:.3e}".format(*side.interval))
+                for name, side in (("p_A", self.a), ("p_B", self.b))
+            ),
+            ("both fail", f"{self.both:.3e}", ""),
+            ("simulations", f"{self.n_sim:,}", ""),
+        ]
+        notes = [] if self.base_uncertainty is None else [str(self.base_uncertainty)]
+        return html_table("", rows, ("", "estimate", level), [*notes, *(f"warning: {text}" for text in self.warnings)])
+
     def __str__(self) -> str:
         """Return a few lines for people."""
-        low, high = self.interval
-        lines = [f"p_A / p_B = {self.ratio:.3g}", f"  {100 * self.confidence:g} % interval [{low:.3g}, {high:.3g}]"]
+        lines = [self._ratio_text]
+        if self._has_ratio:
+            low, high = self.interval
+            lines.append(f"  {100 * self.confidence:g} % interval [{low:.3g}, {high:.3g}]")
         lines += indent_lines(self.base_uncertainty)
         for name, side in (("A", self.a), ("B", self.b)):
             lines.append(f"  p_{name} = {side.p:.3e} [{side.interval[0]:.3e}, {side.interval[1]:.3e}]")
@@ -104,6 +223,9 @@ class Comparison:
             "base_uncertainty": None if self.base_uncertainty is None else self.base_uncertainty.to_dict(),
         }
         return {**{key: to_json_value(value) for key, value in data.items()}, **sides}
+
+
+register_stored(Comparison, Side, RatioUncertainty)
 
 
 class EitherFails:
@@ -231,7 +353,9 @@ def _summarise(either: Estimate, problem: EitherFails) -> Comparison:
     single = has_independent_points(sample)
     a, b = (_side(total, factor, single, either) for total in totals)
     few = [
-        f"{name} failed in only {s.ess:.0f} effective draws" for name, s in (("A", a), ("B", b)) if s.ess < MIN_SIDE_ESS
+        f"{name} failed in no draw" if s.ess == 0 else f"{name} failed in only {s.ess:.0f} effective draws"
+        for name, s in (("A", a), ("B", b))
+        if s.ess < MIN_SIDE_ESS
     ]
     about = [f"{' and '.join(few)}: the ratio is coarse; estimate each separately."] if few else []
     interval = _ratio_interval(totals, factor, single, either)

@@ -48,6 +48,7 @@ def estimate(
     journal: str | PathLike[str] | None = None,
     workers: int | None = None,
     executor: AnyExecutor | None = None,
+    keep_points: bool = False,
 ) -> Estimate:
     """Estimate P[f(X) <= gamma], X ~ problem.base.
 
@@ -100,6 +101,9 @@ def estimate(
             `chunk_size`), so that the result has the same bits with any executor and any number of workers. A worker
             that dies, or takes longer than the executor's time limit, costs nothing but time; a row that three workers
             in a row do not survive is one on which f raises (`on_error`).
+        keep_points: Whether the result shall hold every simulated point (`Estimate.points`, `Estimate.to_pandas`);
+            otherwise it holds the weights of the draws behind p, and x of the failing ones. They take 8 (d + 1) bytes
+            a simulation.
 
     Returns:
         The probability, its interval, its cost and the failures. Of a run that was stopped (status
@@ -141,7 +145,7 @@ def estimate(
             size = None if pool is None else find_chunk_size(problem)
             evaluation = JournaledEvaluation(work, kept, pool, size)
             responder = Responder(problem, arguments.gamma, on_error, evaluation)
-            simulation = _Simulation(responder, evaluation, pool, conditions, progress)
+            simulation = _Simulation(responder, evaluation, pool, conditions, progress, keep_points)
             try:
                 result = simulation.run(problem, chosen, arguments)
                 split = problem.failing_parts if isinstance(problem, HasParts) else None
@@ -183,6 +187,7 @@ class _Simulation:
     pool: WorkerPool | None
     conditions: "_StopConditions"
     progress: bool | Listener
+    keep_points: bool
 
     def run(self, inputs: Inputs, method: Stepping, arguments: RunArguments) -> Estimate:
         """Run a method to its end, or to the first condition that stops it.
@@ -194,7 +199,7 @@ class _Simulation:
             if self.pool is not None and listener is not None:
                 pace = Pace(listener, self.pool.workers, self.evaluation)
                 self.evaluation.on_chunk, listener = pace.on_chunk, pace.on_progress
-            run = Run(inputs, method, arguments, listener, self.responder.offer)
+            run = Run(inputs, method, arguments, listener, self.responder.offer, self.keep_points)
             try:
                 self._simulate(run)
             except KeyboardInterrupt:

@@ -16,6 +16,7 @@ from samplers.methods.monte_carlo import MonteCarlo
 from samplers.methods.subset_simulation import AdaptiveSubsetSimulation, SubsetSimulation
 from samplers.methods.surrogate.method import Surrogate
 from samplers.methods.two_stage.method import TwoStage
+from samplers.presentation.object_file import register_stored
 from samplers.validation import check_name
 
 ENTRY_POINT_GROUP = "rare_envs.samplers"
@@ -81,6 +82,7 @@ METHODS = Methods(
     SubsetSimulation,
     AdaptiveSubsetSimulation,
 )
+register_stored(*(METHODS[name] for name in METHODS.own))
 
 
 def get_method(name: str, **settings: Any) -> Stepping:

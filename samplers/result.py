@@ -1,115 +1,42 @@
-"""Result: the estimate that `estimate` returns, and the failing points that it lists."""
+"""Result: the estimate that `estimate` returns."""
 
 import json
 import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from os import PathLike
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from samplers.analysis.base import RatioStore
+from samplers.analysis.base import RatioStore, require_sample
 from samplers.analysis.base_uncertainty import BaseUncertainty, compute_base_uncertainty
 from samplers.analysis.budget import Pilot
-from samplers.analysis.curve import Curve, compute_curve
+from samplers.analysis.curve import Curve, compute_curve, lowest_known_threshold
 from samplers.analysis.failure_modes import Share, split_by_kind
 from samplers.analysis.gate import Verdict, judge_estimate
 from samplers.analysis.reweighting import HasLogProb, Reweighted, find_sibling, reweight_estimate
 from samplers.analysis.sensitivity.parameter_sensitivity import Sensitivity, compute_sensitivity
 from samplers.method import Stepping
+from samplers.presentation.notebook_html import html_table
+from samplers.presentation.object_file import is_stored, read_object, register_stored, write_object
+from samplers.presentation.point_table import arrow_table, columns_of_sample, columns_of_simulations
+from samplers.presentation.stored_method import StoredMethod
 from samplers.problem import Distribution, FloatArray
-from samplers.sample import Sample, SimulationIndex
+from samplers.sample import DrawWeights, Failures, Layer, Sample, SimulatedPoints, SimulationIndex
 from samplers.serialization import to_json_value
 from samplers.statistics.intervals import zero_hit_bound
 from samplers.trace import Level, Status
 
+if TYPE_CHECKING:
+    import pandas
+    import pyarrow
+    from matplotlib.axes import Axes
 
-class Failure(NamedTuple):
-    """One failing point.
-
-    Example:
-        >>> import samplers
-        >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
-        >>> failure = samplers.estimate(problem, seed=0, max_sim=2000).failures[0]
-        >>> failure.x.shape, bool(failure.f <= 0.0), round(failure.log_p0, 2)
-        ((2,), True, -6.35)
-    """
-
-    x: FloatArray
-    """The point, shape (d,)."""
-    f: float
-    """Its outcome; NaN where f raised or gave NaN and was counted as failing."""
-    log_p0: float
-    """Log density under the base distribution."""
-
-
-@dataclass(frozen=True, eq=False)
-class Failures:
-    """Failing points, the most likely under the base distribution first.
-
-    Iterating or indexing gives `Failure(x, f, log_p0)`.
-
-    Example:
-        >>> import samplers
-        >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
-        >>> failures = samplers.estimate(problem, "mc", seed=0, max_sim=10_000).failures
-        >>> len(failures), failures.total
-        (16, 16)
-        >>> failures.x[0].round(2)  # the most likely one
-        array([3.03, 0.28])
-    """
-
-    x: FloatArray
-    """Points, shape (m, d)."""
-    f: FloatArray
-    """Outcomes, shape (m,); NaN where f raised or gave NaN and was counted as failing."""
-    log_p0: FloatArray
-    """Log density under the base distribution, shape (m,), falling."""
-    total: int
-    """Number of failing points that were simulated; m of them are kept here."""
-
-    @classmethod
-    def empty(cls, dim: int) -> "Failures":
-        """Return no failures, of a problem with `dim` dimensions."""
-        return cls(x=np.empty((0, dim)), f=np.empty(0), log_p0=np.empty(0), total=0)
-
-    def merge(self, x: FloatArray, f: FloatArray, log_p0: FloatArray, *, keep: int) -> "Failures":
-        """Return these failures and points x (k, d), f (k,), log_p0 (k,), the `keep` most likely of all."""
-        all_log_p0 = np.concatenate([self.log_p0, log_p0])
-        best = np.argsort(-all_log_p0, kind="stable")[:keep]
-        return Failures(
-            x=np.concatenate([self.x, x])[best],
-            f=np.concatenate([self.f, f])[best],
-            log_p0=all_log_p0[best],
-            total=self.total + len(f),
-        )
-
-    def __len__(self) -> int:
-        """Return how many points are kept."""
-        return len(self.f)
-
-    def __getitem__(self, index: int) -> Failure:
-        """Return the failure at one rank, 0 being the most likely."""
-        return Failure(self.x[index], float(self.f[index]), float(self.log_p0[index]))
-
-    def __iter__(self) -> Iterator[Failure]:
-        """Go through the failures, most likely first."""
-        return (self[index] for index in range(len(self)))
-
-    def __eq__(self, other: object) -> bool:
-        """Compare values; NaN equals NaN."""
-        if not isinstance(other, Failures):
-            return NotImplemented
-        return (
-            self.total == other.total
-            and np.array_equal(self.x, other.x)
-            and np.array_equal(self.f, other.f, equal_nan=True)
-            and np.array_equal(self.log_p0, other.log_p0)
-        )
-
-    __hash__ = None  # type: ignore[assignment]  # arrays have no hash
+PLOTTED_THRESHOLDS = 60
+"""Thresholds of the curve that `Estimate.plot` draws."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,6 +100,8 @@ class Estimate:
     """The further run under the mixture of the refits of the base, where `estimate` needed one."""
     simulations: SimulationIndex | None = field(default=None, compare=False, repr=False)
     """What each simulation was made for, and its weight in p; those of `ensemble_run` come after them."""
+    points: SimulatedPoints | None = field(default=None, compare=False, repr=False)
+    """All simulations, where `estimate` was told to keep them (`keep_points=True`)."""
     refit_ratios: RatioStore = field(default_factory=RatioStore, compare=False, repr=False)
     """Density ratios of the refits at the failing points, kept by the analyses that need them."""
 
@@ -356,6 +285,135 @@ class Estimate:
         missed = f"no region of more than {self.unseen:.1e} was missed ({self.base_draws:,} base draws saw none other)"
         return fixed + missed
 
+    def to_arrow(self, names: Sequence[str] = ()) -> "pyarrow.Table":
+        """Return simulated points with their weights as an Arrow table, a row each.
+
+        With `estimate(..., keep_points=True)` these are all simulations in their order: `f`, `weight` (its share in p
+        where it fails; null for those of a search, and for Markov chains, whose points stand for each other), `run`
+        (replicate), `stage` (level in its trace), `failed` and the coordinates of x. Otherwise they are the points
+        behind p (`Estimate.sample`): `f`, `weight`, `unit` and `failed` of all, and x of the failing ones, null
+        elsewhere. The folder of a run of `rare-envs estimate --out` has the first table as `episodes.parquet`
+        (`rare_envs.load_study(folder).episodes()`); a journal keeps outcomes only.
+
+        Args:
+            names: Names of the coordinates; x1, x2, ... by default.
+
+        Raises:
+            ValueError: If the method gave no weighted points, or names do not fit.
+
+        Example:
+            >>> import samplers
+            >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
+            >>> result = samplers.estimate(problem, "mc", seed=0, max_sim=10_000, keep_points=True)
+            >>> table = result.to_arrow()
+            >>> table.column_names, table.num_rows
+            (['f', 'weight', 'run', 'stage', 'failed', 'x1', 'x2'], 10000)
+            >>> round(sum(table.filter(table["failed"])["weight"].to_pylist()), 6), result.p
+            (0.0016, 0.0016)
+        """
+        if self.points is None or self.simulations is None:
+            columns = columns_of_sample(require_sample(self), self.gamma)
+        else:
+            columns = columns_of_simulations(self.points, self.simulations, self.gamma)
+        return arrow_table(columns, names)
+
+    def to_pandas(self, names: Sequence[str] = ()) -> "pandas.DataFrame":
+        """Return `to_arrow` as a pandas table; needs pandas."""
+        return self.to_arrow(names).to_pandas()
+
+    def plot(self, ax: "Axes | None" = None) -> "Axes":
+        """Draw P[f <= g] over thresholds g with its band, and p with its interval at gamma; needs matplotlib.
+
+        Args:
+            ax: Where to draw; None takes the current axes of pyplot.
+
+        Raises:
+            ValueError: If the method gave no weighted points, or too few of them to draw a curve.
+        """
+        sample = require_sample(self)
+        finite = sample.f[np.isfinite(sample.f)]
+        low = max(lowest_known_threshold(sample, self.gamma), finite.min(initial=math.inf))
+        if not math.isfinite(low):
+            raise ValueError("There is nothing to draw: too few simulations came near failure; give more of them.")
+        order = np.argsort(finite)
+        reached = np.cumsum(sample.weights[np.isfinite(sample.f)][order])
+        high = float(finite[order][min(np.searchsorted(reached, reached[-1] / 2), len(order) - 1)])
+        grid = np.unique([*np.linspace(low, max(low, high, self.gamma), PLOTTED_THRESHOLDS), max(low, self.gamma)])
+        axes = self.curve(grid).plot(ax)
+        axes.axvline(self.gamma, linestyle=":", color="0.4")
+        if self.p > 0:
+            below, above = self.p - self.interval[0], self.interval[1] - self.p
+            axes.errorbar([self.gamma], [self.p], yerr=[[below], [above]], fmt="o", capsize=4, color="0.2")
+        axes.set_title(f"P[f ≤ {self.gamma:g}] = {self.p:.2e}")
+        return axes
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write the estimate to a file that `Estimate.load` reads: all but the base distribution, which is code.
+
+        The file is of the format safetensors, with JSON in its metadata; no code is run when it is read.
+
+        Args:
+            path: Of the file.
+
+        Raises:
+            OSError: If it cannot be written.
+
+        Example:
+            >>> import samplers
+            >>> from tempfile import TemporaryDirectory
+            >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
+            >>> result = samplers.estimate(problem, seed=0, max_sim=2000)
+            >>> with TemporaryDirectory() as folder:
+            ...     result.save(f"{folder}/result.safetensors")
+            ...     samplers.Estimate.load(f"{folder}/result.safetensors") == result
+            True
+        """
+        write_object(path, StoredEstimate(without_base(self), self.base_uncertainty))
+
+    @classmethod
+    def load(cls, path: str | PathLike[str], base: Distribution | None = None) -> "Estimate":
+        """Return the estimate that `save` has written.
+
+        Args:
+            path: Of the file.
+            base: The base distribution (`problem.base`), which `reweight` and `sensitivity` need; `base_uncertainty`
+                is kept without it. A method of another package comes back as its name and settings.
+
+        Raises:
+            FileNotFoundError: If there is no such file.
+            ValueError: If the file is damaged, or of something else.
+        """
+        stored = read_object(path, StoredEstimate)
+        if base is not None:
+            return replace(stored.estimate, base=base)
+        vars(stored.estimate)["base_uncertainty"] = stored.base_uncertainty  # its place once it is computed
+        return stored.estimate
+
+    def __repr__(self) -> str:
+        """Return one line; `str` has all of it."""
+        low, high = self.interval
+        doubts = f", {len(self.warnings)} warning{'s' * (len(self.warnings) != 1)}" if self.warnings else ""
+        return (
+            f"<Estimate P[f <= {self.gamma:g}] = {self.p:.3e} [{low:.3e}, {high:.3e}], {self.n_sim:,} simulations, "
+            f"{self.method.name}, {self.status}{doubts}>"
+        )
+
+    def _repr_html_(self) -> str:
+        """Return a table for notebooks."""
+        low, high = self.interval
+        rows = [
+            (f"{100 * self.confidence:g} % interval", f"{low:.3e} to {high:.3e}"),
+            ("c.o.v.", "not known" if math.isinf(self.cov) else f"{self.cov:.3g}"),
+            *([("base distribution", str(self.base_uncertainty))] if self.base_uncertainty is not None else []),
+            ("simulations", f"{self.n_sim:,}"),
+            *([] if math.isnan(self.gain) else [("gain over Monte Carlo", f"{self.gain:.3g}")]),
+            ("failing points", f"{self.failures.total:,}"),
+            ("method", f"{self.method.name}, seed {self.seed}, {self.status}"),
+            ("given that", self.proviso),
+        ]
+        notes = [*(f"remark: {text}" for text in self.remarks), *(f"warning: {text}" for text in self.warnings)]
+        return html_table(f"P[f <= {self.gamma:g}] = {self.p:.3e}", rows, notes=notes)
+
     def __str__(self) -> str:
         """Return a few lines for people."""
         low, high = self.interval
@@ -418,3 +476,30 @@ def method_settings(method: Stepping) -> dict[str, Any]:
     """Return the settings of a method as plain values."""
     # fields by name
     return {each.name: getattr(method, each.name) for each in fields(method)} if is_dataclass(method) else {}
+
+
+@dataclass(frozen=True)
+class StoredEstimate:
+    """An estimate as a file has it."""
+
+    estimate: Estimate
+    base_uncertainty: BaseUncertainty | None
+
+
+def without_base(estimate: Estimate) -> Estimate:
+    """Return an estimate without what a file cannot hold."""
+    method, further = estimate.method, estimate.ensemble_run
+    if not is_stored(method):
+        settings = {name: repr(value) for name, value in method_settings(method).items()}
+        method = cast(Stepping, StoredMethod(method.name, method.stops_at_target, settings))
+    return replace(
+        estimate,
+        base=None,
+        method=method,
+        ensemble_run=None if further is None else without_base(further),
+        refit_ratios=RatioStore(),
+    )
+
+
+register_stored(StoredEstimate, Estimate, BaseUncertainty, Failures, Level, Status, StoredMethod, RatioStore)
+register_stored(Sample, Layer, DrawWeights, SimulationIndex, SimulatedPoints)

@@ -1,8 +1,9 @@
-"""Sample: the weighted points behind an estimate, layers of methods with levels, and what simulations were made for."""
+"""Sample: the weighted points behind an estimate, layers of methods with levels, simulations and failing points."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -185,3 +186,107 @@ class SimulationIndex:
         rows = np.arange(first, first + n)
         span = np.searchsorted(ends, rows, side="right")
         return runs[span], before[span] + rows - (ends - sizes)[span]
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedPoints:
+    """All simulations of a run in the order of their making, as `SimulationIndex` numbers them.
+
+    Example:
+        >>> import samplers
+        >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
+        >>> result = samplers.estimate(problem, "ss", seed=0, keep_points=True)
+        >>> len(result.points.f) == result.n_sim, result.points.x.shape[1]
+        (True, 2)
+    """
+
+    x: FloatArray
+    """Points, shape (n, d), in physical space."""
+    f: FloatArray
+    """Outcomes, shape (n,); NaN where f raised or gave NaN."""
+
+
+class Failure(NamedTuple):
+    """One failing point.
+
+    Example:
+        >>> import samplers
+        >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
+        >>> failure = samplers.estimate(problem, seed=0, max_sim=2000).failures[0]
+        >>> failure.x.shape, bool(failure.f <= 0.0), round(failure.log_p0, 2)
+        ((2,), True, -6.35)
+    """
+
+    x: FloatArray
+    """The point, shape (d,)."""
+    f: float
+    """Its outcome; NaN where f raised or gave NaN and was counted as failing."""
+    log_p0: float
+    """Log density under the base distribution."""
+
+
+@dataclass(frozen=True, eq=False)
+class Failures:
+    """Failing points, the most likely under the base distribution first.
+
+    Iterating or indexing gives `Failure(x, f, log_p0)`.
+
+    Example:
+        >>> import samplers
+        >>> problem = samplers.FunctionProblem(lambda x: 3.0 - x[:, 0], dim=2)
+        >>> failures = samplers.estimate(problem, "mc", seed=0, max_sim=10_000).failures
+        >>> len(failures), failures.total
+        (16, 16)
+        >>> failures.x[0].round(2)  # the most likely one
+        array([3.03, 0.28])
+    """
+
+    x: FloatArray
+    """Points, shape (m, d)."""
+    f: FloatArray
+    """Outcomes, shape (m,); NaN where f raised or gave NaN and was counted as failing."""
+    log_p0: FloatArray
+    """Log density under the base distribution, shape (m,), falling."""
+    total: int
+    """Number of failing points that were simulated; m of them are kept here."""
+
+    @classmethod
+    def empty(cls, dim: int) -> Failures:
+        """Return no failures, of a problem with `dim` dimensions."""
+        return cls(x=np.empty((0, dim)), f=np.empty(0), log_p0=np.empty(0), total=0)
+
+    def merge(self, x: FloatArray, f: FloatArray, log_p0: FloatArray, *, keep: int) -> Failures:
+        """Return these failures and points x (k, d), f (k,), log_p0 (k,), the `keep` most likely of all."""
+        all_log_p0 = np.concatenate([self.log_p0, log_p0])
+        best = np.argsort(-all_log_p0, kind="stable")[:keep]
+        return Failures(
+            x=np.concatenate([self.x, x])[best],
+            f=np.concatenate([self.f, f])[best],
+            log_p0=all_log_p0[best],
+            total=self.total + len(f),
+        )
+
+    def __len__(self) -> int:
+        """Return how many points are kept."""
+        return len(self.f)
+
+    def __getitem__(self, index: int) -> Failure:
+        """Return the failure at one rank, 0 being the most likely."""
+        return Failure(self.x[index], float(self.f[index]), float(self.log_p0[index]))
+
+    def __iter__(self) -> Iterator[Failure]:
+        """Go through the failures, most likely first."""
+        return (self[index] for index in range(len(self)))
+
+    def __eq__(self, other: object) -> bool:
+        """Compare values; NaN equals NaN."""
+        if not isinstance(other, Failures):
+            return NotImplemented
+        return (
+            self.total == other.total
+            and np.array_equal(self.x, other.x)
+            and np.array_equal(self.f, other.f, equal_nan=True)
+            and np.array_equal(self.log_p0, other.log_p0)
+        )
+
+    __hash__ = None  # type: ignore[assignment]  # arrays have no hash

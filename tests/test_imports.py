@@ -31,6 +31,7 @@ FLOORS = {
         errors trace validation serialization
         problem
         sample proposals limit_states
+        presentation
         statistics
         analysis method
         result importance mcmc methods.two_stage.mixture

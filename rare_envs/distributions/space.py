@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from html import escape
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -60,7 +61,11 @@ class Parameter:
     """Columns of x that it takes: 1 for a scalar, more for a block of like values, one for each vehicle, say."""
 
 
-@dataclass(frozen=True, eq=False)
+MOST_SHOWN = 8
+"""Parameters that `repr` names."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
 class ScenarioSpace:
     """The parameters of a scenario in the order of x, and their base distribution.
 
@@ -166,6 +171,29 @@ class ScenarioSpace:
     def describe(self) -> str:
         """Return all valid names with their ranges, in the order of x."""
         return ", ".join(f"{self._title(j)} {self._range(j)}" for j in range(len(self.names)))
+
+    def __repr__(self) -> str:
+        """Return one line; `describe` has the ranges."""
+        n = len(self.names)
+        names = ", ".join(self.names[:MOST_SHOWN]) + (", ..." if n > MOST_SHOWN else "")
+        return f"<ScenarioSpace of {n} parameters in {self.dim} dimensions: {names}>"
+
+    def _repr_html_(self) -> str:
+        """Return a table of the parameters for notebooks."""
+        rows = "".join(
+            f"<tr><th>{escape(name)}</th><td>{low:g} to {high:g}</td><td>{escape(unit)}</td><td>{size}</td></tr>"
+            for name, unit, size, low, high in zip(
+                self.names, self.units, self.sizes, *self._parameter_bounds, strict=True
+            )
+        )
+        header = "<tr><th>parameter</th><th>range</th><th>unit</th><th>values</th></tr>"
+        return f"<table>{header}{rows}</table>"
+
+    @property
+    def _parameter_bounds(self) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper ends, one for each parameter."""
+        first = [at.start for at in self._slices]
+        return self.low[first], self.high[first]
 
     def _title(self, j: int) -> str:
         return self.names[j] if self.sizes[j] == 1 else f"{self.names[j]} ({self.sizes[j]} values)"

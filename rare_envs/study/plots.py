@@ -25,7 +25,7 @@ from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH
 from samplers.problem import FloatArray
 
 if TYPE_CHECKING:
-    from samplers.result import Failures
+    from samplers.sample import Failures
 
 BACKGROUND_DRAWS = 2000
 """Ordinary scenarios drawn behind the failures."""

@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from samplers.analysis.base import MIN_UNITS, WeightedEstimate, cov_inflation, no_outcome_weight, require_sample
+from samplers.presentation.curve_display import CurveDisplay
+from samplers.presentation.object_file import register_stored
 from samplers.problem import FloatArray
 from samplers.sample import Sample
 from samplers.serialization import to_json_value
@@ -19,8 +21,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class ProbabilityCurve:
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
+class ProbabilityCurve(CurveDisplay):
     """Probabilities over thresholds, with a band that should hold all of them at once; `Curve` and `Exceedance` are.
 
     A subclass has the thresholds as a further field.
@@ -88,7 +90,7 @@ class ProbabilityCurve:
         return ax
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Curve(ProbabilityCurve):
     """P[f(X) <= g] at several thresholds, with a band that should hold all of them at once.
 
@@ -109,6 +111,9 @@ class Curve(ProbabilityCurve):
     axis = "gammas"
     symbol = "g"
     event = "f <= g"
+
+
+register_stored(Curve)
 
 
 def compute_curve(estimate: WeightedEstimate, gammas: ArrayLike) -> Curve:

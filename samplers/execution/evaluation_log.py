@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from samplers.errors import EvaluationError, OnError, describe_row
 from samplers.problem import Distribution, FloatArray
-from samplers.result import Failures
+from samplers.sample import Failures
 
 NO_OUTCOME = -np.inf
 """f as methods see it for a row without an outcome (counted as failing, on_error not "raise")."""

@@ -18,7 +18,7 @@ from samplers.execution.responder import hide_missing
 from samplers.method import Answer, Choice, Choosing, Goal, Outcome, Request, Stepping, TermsOffer
 from samplers.problem import FloatArray, Inputs, TermGradients, Terms, condition_of
 from samplers.result import Estimate
-from samplers.sample import SimulationIndex
+from samplers.sample import SimulatedPoints, SimulationIndex
 from samplers.statistics.intervals import gain_over_monte_carlo
 from samplers.trace import Status
 
@@ -41,6 +41,7 @@ class Run:
         arguments: Threshold, seed, budget and the rest; see `RunArguments`.
         listener: Given `Progress` after every batch and every level.
         offer: What `answer` will be given beside f; None for f alone, as `tell` takes no more.
+        keep_points: Whether the result shall hold all simulations (`Estimate.points`).
 
     Raises:
         ValueError: If the problem has no `dim` or `base`, or method is not a method.
@@ -63,6 +64,7 @@ class Run:
         arguments: RunArguments,
         listener: Listener | None = None,
         offer: TermsOffer | None = None,
+        keep_points: bool = False,
     ) -> None:
         check_arguments(problem, method)
         self._inputs = InputsOnly(int(problem.dim), problem.base, offer)
@@ -78,6 +80,7 @@ class Run:
         self._stopped: str | None = None
         self._replicates: list[Replicate] = []
         self._spans: list[tuple[Replicate, int, int]] = []
+        self._kept_points: list[SimulatedPoints] | None = [] if keep_points else None
         for max_sim in split_budget(self._goal.max_sim, self._n_wanted):
             self._start_replicate(max_sim)
         self._start_more_for_target()
@@ -217,6 +220,7 @@ class Run:
             choice=self._choice.why,
             chose_another=self._choice.unusual,
             simulations=self._index_simulations(whole),
+            points=self._join_points(),
         )
 
     def _note_spans(self, running: Sequence[Replicate], answers: Sequence[Answer]) -> None:
@@ -225,10 +229,25 @@ class Run:
         for i in order:
             replicate, cost = running[i], count_simulations(answers[i])
             n = 0 if isinstance(answers[i], TermGradients) else cost
+            self._keep_points(replicate.requested, answers[i])
             if self._spans and self._spans[-1][0] is replicate and self._spans[-1][1] == self._spans[-1][2]:
                 _, n_before, cost_before = self._spans.pop()
                 n, cost = n + n_before, cost + cost_before
             self._spans.append((replicate, n, cost))
+
+    def _keep_points(self, request: Request, answer: Answer) -> None:
+        """Keep the simulations of an answer, where they are wanted; gradients have no outcomes."""
+        if self._kept_points is None or isinstance(answer, TermGradients):
+            return
+        x = request if isinstance(request, np.ndarray) else request.x
+        self._kept_points.append(SimulatedPoints(x, answer.f if isinstance(answer, Terms) else answer))
+
+    def _join_points(self) -> SimulatedPoints | None:
+        """Return all simulations in the order of the spans; None where they were not kept."""
+        if self._kept_points is None:
+            return None
+        x = [np.empty((0, self._inputs.dim)), *(part.x for part in self._kept_points)]
+        return SimulatedPoints(np.concatenate(x), np.concatenate([np.empty(0), *(p.f for p in self._kept_points)]))
 
     def _index_simulations(self, whole: Outcome) -> SimulationIndex:
         """Return what the simulations were made for."""

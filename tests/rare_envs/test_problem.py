@@ -184,3 +184,9 @@ def test_a_row_does_not_depend_on_its_batch(env_id: str) -> None:
     for n in (1, 7, 33):
         np.testing.assert_array_equal(problem.evaluate(x[:n]), f[:n])
     np.testing.assert_array_equal(problem.evaluate(x[::-1])[::-1], f)
+
+
+def test_repr_is_one_line_and_html_has_the_parameters() -> None:
+    problem = rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego=Constant([0.0, 0.0]))
+    assert repr(problem) == "<DrivingProblem rare_envs/CutIn-v0, ego Constant, measure ttc, 6 dimensions>"
+    assert problem.space._repr_html_() in problem._repr_html_()

@@ -135,3 +135,36 @@ def test_intervals_hold_the_ratio(a, b, ratio):
 def test_a_budget_is_for_both(max_sim):
     with pytest.raises(ValueError, match=rf"max_sim \(of A and B together\) .* at least 2, got {max_sim}"):
         samplers.compare(*NESTED[:2], seed=0, max_sim=max_sim)
+
+
+def test_without_failures_of_one_the_text_has_a_bound():
+    a, never = half_space(2.0, [1.0, 0]), half_space(30.0, [1.0, 0])
+    above, below = samplers.compare(a, never, seed=0, max_sim=4000), samplers.compare(never, a, seed=0, max_sim=4000)
+    assert str(above).startswith(f"p_A / p_B above {above.interval[0]:.3g} (95 % one-sided bound; B did not fail)")
+    assert str(below).startswith(f"p_A / p_B below {below.interval[1]:.3g} (95 % one-sided bound; A did not fail)")
+    neither = samplers.compare(never, never, "mc", seed=0, max_sim=200)
+    assert str(neither).startswith("p_A / p_B not known (neither failed)")
+    for found in (above, below, neither):
+        assert "inf" not in str(found) + repr(found) + found._repr_html_()
+        assert "nan" not in str(found) + repr(found) + found._repr_html_()
+
+
+def test_a_comparison_comes_back_from_its_file(tmp_path):
+    found = samplers.compare(NESTED[0], NESTED[1], seed=0, max_sim=3000)
+    found.save(tmp_path / "comparison")
+    assert samplers.Comparison.load(tmp_path / "comparison") == found
+    assert "\n" not in repr(found)
+    assert len(found.to_pandas()) == len(found.either.sample.f)
+
+
+def test_the_plot_shows_both_probabilities():
+    pyplot = pytest.importorskip("matplotlib.pyplot")
+    figure, axes = pyplot.subplots()
+    found = samplers.compare(NESTED[0], NESTED[1], seed=0, max_sim=3000)
+    found.plot(axes)
+    shown = [float(line.get_ydata()[0]) for line in axes.lines if line.get_marker() == "o"]
+    assert shown == [found.a.p, found.b.p]
+    never = half_space(30.0, [1.0, 0])
+    with pytest.raises(ValueError, match="neither A nor B failed"):
+        samplers.compare(never, never, "mc", seed=0, max_sim=200).plot(axes)
+    pyplot.close(figure)

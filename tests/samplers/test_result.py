@@ -8,8 +8,9 @@ import pytest
 
 import samplers
 from samplers.limit_states import half_space
-from samplers.result import Failures
+from samplers.sample import Failures
 from samplers.serialization import to_json_value
+from tests.samplers.fitted_bases import fitted, resampled, run
 
 
 def result(**options):
@@ -178,3 +179,48 @@ def test_failures_kept_do_not_grow_without_end():
 def test_status_prints_as_its_value():
     assert f"{samplers.Status.NO_HITS}" == str(samplers.Status.NO_HITS) == "no_hits"
     assert math.isfinite(result().cov)
+
+
+def test_repr_is_one_short_line():
+    assert "\n" not in repr(result())
+    assert len(repr(result())) <= 160
+    assert f"{result().p:.3e}" in repr(result())
+
+
+def test_an_estimate_comes_back_from_its_file(tmp_path):
+    found = result(replicates=2)
+    found.save(tmp_path / "result")
+    loaded = samplers.Estimate.load(tmp_path / "result")
+    assert loaded == found
+    assert loaded.to_json() == found.to_json()
+    assert loaded.base is None
+    again = samplers.estimate(half_space().problem, loaded.method, seed=loaded.seed, replicates=2)
+    assert again == found
+    np.testing.assert_array_equal(loaded.curve([0.0, 1.0]).high, found.curve([0.0, 1.0]).high)
+
+
+def test_the_uncertainty_of_the_base_is_kept_and_computed_anew_with_the_base(tmp_path):
+    base = fitted(resampled(200))
+    found = run(base, "ce", max_sim=6000)
+    assert found.base_uncertainty is not None
+    found.save(tmp_path / "result")
+    assert str(samplers.Estimate.load(tmp_path / "result")) == str(found)
+    with_base = samplers.Estimate.load(tmp_path / "result", base=base)
+    assert "base_uncertainty" not in vars(with_base)
+    assert with_base.base_uncertainty == found.base_uncertainty
+
+
+def test_the_plot_shows_p_at_gamma():
+    pyplot = pytest.importorskip("matplotlib.pyplot")
+    figure, axes = pyplot.subplots()
+    found = samplers.estimate(half_space(2, 2.0).problem, "mc", seed=0, max_sim=5000)
+    found.plot(axes)
+    line = next(line for line in axes.lines if len(line.get_xdata()) > 10)
+    assert np.interp(0.0, line.get_xdata(), line.get_ydata()) == pytest.approx(found.p)
+    pyplot.close(figure)
+
+
+def test_there_is_nothing_to_plot_where_no_threshold_is_known():
+    never = samplers.FunctionProblem(lambda x: np.full(len(x), np.inf), 1)
+    with pytest.raises(ValueError, match="nothing to draw"):
+        samplers.estimate(never, "mc", seed=1, max_sim=100).plot()

@@ -1,8 +1,11 @@
 """Scenario parameters as reset options."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
+import rare_envs
 from rare_envs.distributions.space import ScenarioSpace
 from rare_envs.scenarios.base_distributions import load_base
 from rare_envs.scenarios.registry import scenario_named
@@ -95,3 +98,22 @@ def test_space_checks_its_own_lengths():
     base = load_base(scenario_named("car_following"), "us101-gap")
     with pytest.raises(ValueError, match="2 names, 3 units"):
         ScenarioSpace(("a", "b"), ("m", "m", "m"), np.zeros(3), np.ones(3), base)
+
+
+def test_repr_is_one_line_and_html_has_every_parameter():
+    space = make_space()
+    assert "\n" not in repr(space)
+    assert repr(space) == f"<ScenarioSpace of 6 parameters in 6 dimensions: {', '.join(NAMES)}>"
+    html = space._repr_html_()
+    assert all(f"<th>{name}</th>" in html for name in NAMES)
+
+
+def test_names_are_escaped_in_html():
+    space = dataclasses.replace(make_space(), names=("<b>", *NAMES[1:]))
+    assert "<b>" not in space._repr_html_()
+    assert "&lt;b&gt;" in space._repr_html_()
+
+
+def test_html_of_a_block_has_one_row():
+    space = rare_envs.DrivingProblem("rare_envs/Highway-v0").space
+    assert space._repr_html_().count("<tr>") == 1 + len(space.names)

@@ -1,0 +1,150 @@
+"""Results in files: safetensors for arrays, JSON for the rest; reading a file runs no code of it.
+
+A file holds one object of the classes that `register_stored` names, with objects of these classes inside. A value is
+written as JSON writes it; numbers that JSON has not, arrays, tuples and objects are written as {kind: content} with one
+of the kinds below.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Mapping
+from enum import Enum
+from os import PathLike
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+FILE_FORMAT = "samplers 1"
+"""First word of the metadata; another one is of another version."""
+_KEY = "samplers"
+
+_Stored = TypeVar("_Stored")
+_CLASSES: dict[str, type] = {}
+
+
+def register_stored(*classes: type) -> None:
+    """Name dataclasses and enumerations that files may hold; they are known by their name.
+
+    Raises:
+        ValueError: If another class has the name.
+    """
+    for cls in classes:
+        if _CLASSES.setdefault(cls.__name__, cls) is not cls:
+            raise ValueError(f"Another class named {cls.__name__} is stored in files already.")
+
+
+def is_stored(value: object) -> bool:
+    """Return whether the class of a value is one that files may hold."""
+    return _CLASSES.get(type(value).__name__) is type(value)
+
+
+def write_object(path: str | PathLike[str], value: object) -> None:
+    """Write an object of a registered class to a file.
+
+    Args:
+        path: Of the file; any name will do.
+        value: The object.
+
+    Raises:
+        TypeError: If it holds something of a class that is not registered.
+        OSError: If the file cannot be written.
+    """
+    from safetensors.numpy import save_file
+
+    arrays: dict[str, NDArray[Any]] = {}
+    text = json.dumps(_encode(value, arrays), allow_nan=False)
+    save_file(arrays, str(path), metadata={"format": FILE_FORMAT, _KEY: text})
+
+
+def read_object(path: str | PathLike[str], cls: type[_Stored]) -> _Stored:
+    """Return the object that a file holds.
+
+    Args:
+        path: Of the file.
+        cls: Class that the object must have.
+
+    Raises:
+        FileNotFoundError: If there is no such file.
+        ValueError: If the file is damaged, is no such file, or holds an object of another class; one line.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    where = repr(str(path))
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"There is no file {where}.")
+    try:
+        with safe_open(str(path), framework="np") as file:
+            about = file.metadata() or {}
+            arrays = {name: file.get_tensor(name) for name in file.keys()}  # not a mapping
+        if about.get("format") != FILE_FORMAT:
+            raise ValueError(f"expected the format {FILE_FORMAT!r}, got {about.get('format')!r}")
+        value = _decode(json.loads(about[_KEY]), arrays)
+    except OSError as error:
+        raise ValueError(f"Cannot read {where}: {error.strerror or error}.") from error
+    except (SafetensorError, ValueError, KeyError, TypeError, IndexError, AttributeError, RecursionError) as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise ValueError(f"Cannot read {where}, it is damaged or no file of a result: {reason}.") from error
+    if not isinstance(value, cls):
+        raise ValueError(f"Expected {cls.__name__} in {where}, got {type(value).__name__}.")
+    return value
+
+
+def _encode(value: Any, arrays: dict[str, NDArray[Any]]) -> Any:
+    """Return value as JSON has it; its arrays are added to `arrays`."""
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, Enum):
+        return {"enum": [_name_of(value), value.value]}
+    if value is None or isinstance(value, bool | int | str):
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else {"float": repr(value)}
+    if isinstance(value, np.ndarray):
+        name = f"array{len(arrays)}"
+        arrays[name] = np.ascontiguousarray(value)  # safetensors writes the memory as it lies
+        return {"array": name}
+    if isinstance(value, list | tuple):
+        return {"tuple" if isinstance(value, tuple) else "list": [_encode(item, arrays) for item in value]}
+    if isinstance(value, Mapping):
+        return {"dict": [[_encode(key, arrays), _encode(item, arrays)] for key, item in value.items()]}
+    if not dataclasses.is_dataclass(value):
+        raise TypeError(f"A value of class {type(value).__name__} cannot be written to a file.")
+    fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if f.init}  # fields by name
+    return {"object": [_name_of(value), {name: _encode(item, arrays) for name, item in fields.items()}]}
+
+
+def _name_of(value: object) -> str:
+    """Return the name of a value's class, which must be registered."""
+    if not is_stored(value):
+        raise TypeError(f"An object of class {type(value).__name__} cannot be written to a file.")
+    return type(value).__name__
+
+
+def _decode(data: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
+    """Return the value that `_encode` has written."""
+    if not isinstance(data, dict):
+        return data
+    ((kind, content),) = data.items()
+    if kind == "float":
+        return float(content)
+    if kind == "array":
+        return arrays[content]
+    if kind == "list":
+        return [_decode(item, arrays) for item in content]
+    if kind == "tuple":
+        return tuple(_decode(item, arrays) for item in content)
+    if kind == "dict":
+        return {_decode(key, arrays): _decode(item, arrays) for key, item in content}
+    if kind not in ("enum", "object"):
+        raise ValueError(f"unknown kind of value {kind!r}")
+    name, inside = content
+    if name not in _CLASSES:
+        raise ValueError(f"unknown class {name!r}")
+    if kind == "enum":
+        return _CLASSES[name](inside)
+    return _CLASSES[name](**{key: _decode(item, arrays) for key, item in inside.items()})
