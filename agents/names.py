@@ -2,6 +2,8 @@
 
 RULE_BASED = "idm"
 """The Intelligent Driver Model with lane keeping."""
+LANE_CHANGING = "idm+mobil"
+"""The same with lane changes by MOBIL; a driver of the traffic."""
 HUMAN = "human"
 """An attentive human driver by a published model."""
 VISION = "vision"

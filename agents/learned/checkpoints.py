@@ -25,7 +25,8 @@ from agents.learned.driver import LearnedDriver
 from agents.learned.networks import ACTION_SIZE, FEATURE_CLIP, FEATURE_SIZE, HEAD_SIZE, Policy, Scaling
 from agents.learned.rule_driver import RuleDriver
 from agents.learned.weight_distribution import WeightDistribution
-from agents.names import RULE_BASED, SHIPPED_DRIVERS, SHIPPED_EGOS
+from agents.names import LANE_CHANGING, RULE_BASED, SHIPPED_DRIVERS, SHIPPED_EGOS
+from rare_envs.control.lane_changing import LaneChangingDriver
 from rare_envs.files import replace_file
 from rare_envs.json_text import parse_json_object
 from rare_envs.plugins import did_you_mean
@@ -62,15 +63,15 @@ class Provenance:
     """Settings of the fit of the distribution of its weights."""
 
 
-def load_driver(name: str | PathLike[str]) -> LearnedDriver | RuleDriver:
+def load_driver(name: str | PathLike[str]) -> LearnedDriver | RuleDriver | LaneChangingDriver:
     """Load a driver by its name or from its file.
 
     Args:
         name: "mgail", "gail" or "bc", which are shipped, and "imitation", which was trained to be an ego; "idm", the
-            rule-based driver; or the path of a file that `save_driver` wrote.
+            rule-based driver, and "idm+mobil", which changes lanes too; or the path of a file that `save_driver` wrote.
 
     Returns:
-        A `LearnedDriver`, or a `RuleDriver` with its default parameters.
+        A `LearnedDriver`, or a `RuleDriver` or `LaneChangingDriver` with its default parameters.
 
     Raises:
         FileNotFoundError: The file does not exist.
@@ -85,12 +86,14 @@ def load_driver(name: str | PathLike[str]) -> LearnedDriver | RuleDriver:
     text = str(name)
     if text == RULE_BASED:
         return RuleDriver()
+    if text == LANE_CHANGING:
+        return LaneChangingDriver()
     if text in (*SHIPPED_DRIVERS, *SHIPPED_EGOS):
         with resources.as_file(resources.files("agents") / "data" / f"{text}{SUFFIX}") as path:
             return read_driver(path)
     if text.endswith(SUFFIX) or Path(text).is_file():
         return read_driver(text)
-    names = (*SHIPPED_DRIVERS, *SHIPPED_EGOS, RULE_BASED)
+    names = (*SHIPPED_DRIVERS, *SHIPPED_EGOS, RULE_BASED, LANE_CHANGING)
     hint = did_you_mean(text.lower(), names)
     if Path(f"{text}{SUFFIX}").is_file():
         hint = f" (did you mean {text + SUFFIX!r}?)"

@@ -56,8 +56,11 @@ def steering_control(offset: Tensor, heading: Tensor, speed: Tensor) -> Tensor:
     Returns:
         Steering angle [rad].
     """
-    speed = speed.clamp(min=NEAR_ZERO)
-    heading_command = torch.asin((offset / (-TAU_LATERAL * speed)).clamp(-1.0, 1.0))
+    return steering_for(yaw_rate_towards(offset, heading, speed), speed.clamp(min=NEAR_ZERO))
+
+
+def yaw_rate_towards(offset: Tensor, heading: Tensor, speed: Tensor) -> Tensor:
+    """Return the yaw rate that `steering_control` asks for [rad/s]; arguments as there."""
+    heading_command = torch.asin((offset / (-TAU_LATERAL * speed.clamp(min=NEAR_ZERO))).clamp(-1.0, 1.0))
     heading_command = heading_command.clamp(-MAX_HEADING_COMMAND, MAX_HEADING_COMMAND)
-    yaw_rate = (1.0 / TAU_HEADING) * (heading_command - heading)
-    return steering_for(yaw_rate, speed)
+    return (1.0 / TAU_HEADING) * (heading_command - heading)

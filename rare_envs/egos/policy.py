@@ -16,7 +16,7 @@ from rare_envs.egos.needs import RULE_BASED_EGOS, WorldEgo, find_rule_based, res
 from rare_envs.egos.validation import refuse_ego
 from rare_envs.egos.wrappers import find_frame_stacking, wrap_policy
 from rare_envs.sensors.kinds import map_kinds
-from rare_envs.simulation.background import Background
+from rare_envs.simulation.background import Background, TrafficBackground
 from rare_envs.simulation.ego_interface import EgoNeeds
 from rare_envs.simulation.observation import observe
 from rare_envs.simulation.rollout import Driver
@@ -104,7 +104,7 @@ def as_driver(ego: Any, world: World, needs: EgoNeeds | None = None) -> Driver:
             )
         policy = wrap_policy(ego, world.observation_space)
         return PolicyDriver(policy, world.sensing.observation, world.clock.action, world.clock.stride)
-    if isinstance(ego, Background):
+    if isinstance(ego, Background | TrafficBackground):
         raise ValueError("These drivers drive the traffic around an ego; as an ego take agents.LearnedEgo(driver).")
     if callable(getattr(ego, "act", None)):  # anybody's object
         driver: Driver = ego

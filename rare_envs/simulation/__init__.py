@@ -1,6 +1,6 @@
 """Simulation: the world, its episodes, the time loop, observations and rewards."""
 
-from rare_envs.simulation.background import Background
+from rare_envs.simulation.background import Background, TrafficBackground
 from rare_envs.simulation.clock import Clock
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.measurement import Measurement
@@ -18,6 +18,7 @@ __all__ = [
     "Measurement",
     "RewardTerms",
     "Sensing",
+    "TrafficBackground",
     "World",
     "drive",
     "observe",

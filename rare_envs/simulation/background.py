@@ -11,6 +11,9 @@ from torch import Tensor
 
 from rare_envs.distributions.space import Distribution
 from rare_envs.plugins import did_you_mean
+from rare_envs.traffic.neighbours import LaneTraffic
+from rare_envs.traffic.road import Road
+from rare_envs.traffic.state import State
 
 DRIVERS_GROUP = "rare_envs.drivers"
 """Entry points by which packages offer drivers: name to a function that takes the name and returns a `Background`."""
@@ -70,6 +73,41 @@ class Background(Protocol):
         """
 
 
+@runtime_checkable
+class TrafficBackground(Protocol):
+    """Drivers that act by where everybody is, not by what a lidar shows. Nothing in it is random.
+
+    Example:
+        >>> from rare_envs.control.lane_changing import LaneChangingDriver
+        >>> isinstance(LaneChangingDriver(), TrafficBackground)
+        True
+    """
+
+    @property
+    def weights(self) -> DriverWeights | None:
+        """As of `Background`."""
+
+    @property
+    def noisy(self) -> bool:
+        """As of `Background`."""
+
+    def begin(self, draws: Tensor) -> Tensor:
+        """As of `Background`."""
+
+    def decide(self, traffic: LaneTraffic, who: slice, memory: Tensor, dt: float) -> tuple[Tensor, Tensor]:
+        """Decide for one tick of dt [s].
+
+        Args:
+            traffic: All V vehicles of B scenarios.
+            who: The M that are driven.
+            memory: As the last call returned it, at the start `begin`.
+            dt: Tick [s].
+
+        Returns:
+            As `Background.act`.
+        """
+
+
 class BackgroundState(NamedTuple):
     """State of the drivers of M vehicles in B scenarios."""
 
@@ -83,7 +121,7 @@ class BackgroundState(NamedTuple):
     """Ticks driven so far, shape (B,)."""
 
     @classmethod
-    def start(cls, drivers: Background, weights: Tensor, draws: Tensor) -> BackgroundState:
+    def start(cls, drivers: Background | TrafficBackground, weights: Tensor, draws: Tensor) -> BackgroundState:
         """Return the state at the start of an episode; shapes as of the fields."""
         batch, ticks, vehicles, _ = draws.shape
         first = draws[:, :FIRST_DRAWS] if ticks else draws.new_zeros(batch, FIRST_DRAWS, vehicles, 2)
@@ -114,6 +152,40 @@ def step_background(drivers: Background, state: BackgroundState, features: Tenso
     return action, state._replace(memory=memory, tick=state.tick + 1)
 
 
+def needs_lidar(drivers: Background | TrafficBackground | None) -> bool:
+    """Return whether drivers act by lidar features."""
+    return drivers is not None and not isinstance(drivers, TrafficBackground)
+
+
+def query_background(
+    drivers: Background | TrafficBackground,
+    background_state: BackgroundState,
+    state: State,
+    road: Road,
+    perception: Tensor | None,
+    dt: float,
+) -> tuple[Tensor, BackgroundState]:
+    """Query the drivers of all vehicles but the ego for one tick, by lidar or by where everybody is.
+
+    Args:
+        drivers: Of the N - 1 vehicles.
+        background_state: Theirs.
+        state: Traffic of B scenarios.
+        road: Their road.
+        perception: Lidar features, shape (B, N, 51); None for drivers that do not need them.
+        dt: Tick [s].
+
+    Returns:
+        Accelerations [m/s^2] and yaw rates [rad/s], shape (B, N - 1, 2), and the drivers' state one tick later.
+    """
+    others = slice(1, None)
+    if isinstance(drivers, TrafficBackground):
+        action, memory = drivers.decide(LaneTraffic.of(state, road), others, background_state.memory, dt)
+        return action, background_state._replace(memory=memory, tick=background_state.tick + 1)
+    assert perception is not None
+    return step_background(drivers, background_state, perception[:, others])
+
+
 def noise_size(ticks: int, vehicles: int) -> int:
     """Return the number of standard normal draws of an episode."""
     return (FIRST_DRAWS + ticks) * vehicles * 2
@@ -125,12 +197,13 @@ def fixed_draws(ticks: int, vehicles: int) -> Tensor:
     return torch.randn(1, FIRST_DRAWS + ticks, vehicles, 2, generator=generator, dtype=torch.float64)
 
 
-def find_drivers(drivers: Any) -> Background | None:
+def find_drivers(drivers: Any) -> Background | TrafficBackground | None:
     """Return the drivers that a keyword argument `drivers` names.
 
     Args:
-        drivers: None for the scenario's script, a `Background`, the name of an installed one ("mgail"), or
-            the path of a file that the package `agents` wrote.
+        drivers: None for the scenario's script, a `Background` or `TrafficBackground`, the name of an installed one
+            ("mgail"; "idm+mobil" is looked up as "idm", whose loader gets the whole name), or the path of a file that
+            the package `agents` wrote.
 
     Raises:
         ValueError: If it is none of these.
@@ -138,17 +211,20 @@ def find_drivers(drivers: Any) -> Background | None:
     if drivers is None:
         return None
     if not isinstance(drivers, str | Path):
-        if isinstance(drivers, Background):
+        if isinstance(drivers, Background | TrafficBackground):
             return drivers
-        raise ValueError(f"Expected drivers by name, or an object with weights, begin and act, got {drivers!r}.")
+        raise ValueError(
+            f"Expected drivers by name, or an object with weights, begin and act (or decide), got {drivers!r}."
+        )
     known = {entry.name: entry for entry in entry_points(group=DRIVERS_GROUP)}
     name = str(drivers)
     is_file = name.endswith(".safetensors")
-    if name not in known and not (is_file and "file" in known):
+    offered = "file" if is_file else name.partition("+")[0]
+    if offered not in known:
         names = sorted(set(known) - {"file"})
         listed = ", ".join(map(repr, names)) or "none is installed: pip install rare-envs"
         raise ValueError(
             f"Unknown drivers {name!r}{did_you_mean(name, names)}; expected one of {listed}, or a .safetensors file."
         )
-    background: Background = known["file" if is_file else name].load()(name)
+    background: Background | TrafficBackground = known[offered].load()(name)
     return background

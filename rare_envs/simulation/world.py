@@ -16,7 +16,15 @@ from rare_envs.measures import Moment
 from rare_envs.scenarios.base import Scenario
 from rare_envs.sensors.camera import CameraContext
 from rare_envs.sensors.perception import perceive_traffic
-from rare_envs.simulation.background import Background, BackgroundState, fixed_draws, noise_size, step_background
+from rare_envs.simulation.background import (
+    Background,
+    BackgroundState,
+    TrafficBackground,
+    fixed_draws,
+    needs_lidar,
+    noise_size,
+    query_background,
+)
 from rare_envs.simulation.clock import LEARNED_TICK, Clock
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.episode_statistics import EpisodeStatistics
@@ -63,7 +71,7 @@ class World:
 
     scenario: Scenario
     sensing: Sensing = field(default_factory=Sensing)
-    background: Background | None = None
+    background: Background | TrafficBackground | None = None
     """Drivers of the vehicles around the ego; None for the scenario's script."""
     measurement: Measurement = field(default_factory=Measurement)
     clock: Clock = field(default_factory=Clock)
@@ -84,7 +92,7 @@ class World:
     @cached_property
     def uses_lidar(self) -> bool:
         """Whether the lidar features of all vehicles are computed at every moment."""
-        return self.sensing.uses_lidar or self.background is not None or self.measurement.episode_measure.sees
+        return self.sensing.uses_lidar or needs_lidar(self.background) or self.measurement.episode_measure.sees
 
     @property
     def weather_distributions(self) -> WeatherDistributions:
@@ -260,11 +268,12 @@ class World:
         curvature = None if road.reference_line is None else road.curvature(old.x[:, 0])
         moved = bicycle(*ego, steered[:, 0], steered[:, 1], dt, curvature)
         driver_actions = None
-        if self.background is None or background_state is None or episode.perception is None:
+        if self.background is None or background_state is None:
             others = self.scenario.others(old, dt)
         else:
-            features = episode.perception[:, 1:]
-            driver_actions, background_state = step_background(self.background, background_state, features)
+            driver_actions, background_state = query_background(
+                self.background, background_state, old, road, episode.perception, dt
+            )
             others = self.scenario.driven(old, driver_actions, dt)
         overridden = episode.overridden
         if commanded is not None or overridden is not None:

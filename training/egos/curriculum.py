@@ -19,7 +19,7 @@ from rare_envs.scenarios.base_distributions import load_base
 from rare_envs.scenarios.registry import scenario_named
 from rare_envs.sensors.camera.weather import CLEAR, SENSOR_NOISE_DISTRIBUTION, SUN_DISTRIBUTION
 from rare_envs.sensors.perception import perceive_traffic
-from rare_envs.simulation.background import Background, find_drivers
+from rare_envs.simulation.background import Background, TrafficBackground, find_drivers
 from rare_envs.simulation.clock import Clock
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.sensing import Sensing
@@ -136,7 +136,7 @@ class Situation(NamedTuple):
     """Draws a scenario, with another road each time."""
     sample: Callable[[int, np.random.Generator], Array]
     """Draws the scenario's own columns of x, shape (n, d)."""
-    drivers: Background | None = None
+    drivers: Background | TrafficBackground | None = None
     """Drivers of the other vehicles; None for those of the scenario."""
 
 

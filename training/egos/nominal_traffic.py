@@ -26,7 +26,7 @@ from rare_envs.scenarios.base_distributions import load_base
 from rare_envs.scenarios.car_following import CAR_FOLLOWING
 from rare_envs.scenarios.highway import HIGHWAY
 from rare_envs.sensors.perception import SPEED_COLUMN
-from rare_envs.simulation.background import Background, DriverWeights
+from rare_envs.simulation.background import Background, DriverWeights, TrafficBackground
 from rare_envs.traffic.reference_line import ReferenceLine
 from rare_envs.traffic.road import Road, i80, straight
 from rare_envs.traffic.state import LANE_WIDTH, VEHICLE_LENGTH, State
@@ -168,7 +168,7 @@ class Case:
     """A kind of traffic that an ego is judged in."""
 
     scenario: Scenario
-    drivers: Callable[[], Background]
+    drivers: Callable[[], Background | TrafficBackground]
     starts: Callable[[int, np.random.Generator], NDArray[np.float64]]
     """Of the scenario's own parameters, shape (n, d)."""
 

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 import agents
+from rare_envs.control.lane_changing import LaneChangingDriver
 from rare_envs.simulation.background import (
     FIRST_DRAWS,
     BackgroundState,
@@ -50,8 +51,13 @@ def test_draws_are_two_for_each_vehicle_and_tick_and_four_for_the_start():
 
 def test_drivers_are_found_by_name_and_wrong_names_refused():
     assert find_drivers(None) is None
-    driver = agents.load_driver("mgail")
-    assert find_drivers(driver) is driver
-    for wrong, message in (("mgial", "did you mean 'mgail'"), (3, "weights, begin and act")):
+    for driver in (agents.load_driver("mgail"), agents.load_driver("idm+mobil")):
+        assert find_drivers(driver) is driver
+    assert find_drivers("idm+mobil") == LaneChangingDriver()  # by the loader of "idm"
+    for wrong, message in (
+        ("mgial", "did you mean 'mgail'"),
+        (3, "weights, begin and act"),
+        ("idm+x", "'idm\\+mobil'"),
+    ):
         with pytest.raises(ValueError, match=message):
             find_drivers(wrong)
