@@ -13,6 +13,7 @@ from samplers.analysis.refits import FittedBase
 from samplers.analysis.reweighting import Reweighted
 from samplers.analysis.sensitivity import Sensitivity
 from samplers.comparison import Comparison, compare
+from samplers.distributions import as_distribution
 from samplers.errors import EvaluationError
 from samplers.estimation import estimate
 from samplers.execution.arguments import RunArguments
@@ -24,7 +25,8 @@ from samplers.method import Goal, Interrupted, Outcome, Stepping, Steps
 from samplers.methods.auto import Auto
 from samplers.methods.base import Method
 from samplers.methods.cross_entropy.beta_block import BetaBlock
-from samplers.methods.cross_entropy.blocks import GaussianBlock, MixtureBlock, NormalBlock, Product
+from samplers.methods.cross_entropy.blocks import Product
+from samplers.methods.cross_entropy.gaussian_blocks import GaussianBlock, MappedBlock, MixtureBlock, NormalBlock
 from samplers.methods.cross_entropy.method import CrossEntropy
 from samplers.methods.importance_sampling import ImportanceSampling
 from samplers.methods.improved_cross_entropy import ImprovedCrossEntropy
@@ -78,6 +80,7 @@ __all__ = [
     "Layer",
     "Level",
     "LocalProcesses",
+    "MappedBlock",
     "Method",
     "MixtureBlock",
     "MonteCarlo",
@@ -107,6 +110,7 @@ __all__ = [
     "Terms",
     "TwoStage",
     "Verdict",
+    "as_distribution",
     "compare",
     "compute_ratio_uncertainty",
     "estimate",

@@ -27,8 +27,8 @@ class EvaluationError(ValueError):
         >>> samplers.estimate(problem, "mc", seed=0, max_sim=100)
         Traceback (most recent call last):
             ...
-        samplers.errors.EvaluationError: Expected f to return shape (100,), one value per row of x, got (100, 2).
-    """
+        samplers.errors.EvaluationError: Expected f to return shape (100,), one value per row of x, got (100, 2). f gets a batch of points of shape (n, 2); pass vectorized=False for an f of one point.
+    """  # noqa: E501 (the example shows a whole message)
 
     final = True
 

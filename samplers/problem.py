@@ -3,11 +3,13 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from html import escape
 from typing import Any, Protocol, TypeGuard, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from samplers.distributions.conversion import as_distribution
 from samplers.errors import EvaluationError, one_per_row
 from samplers.validation import check_number, check_whole
 
@@ -265,14 +267,14 @@ class StandardNormal:
         return u
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class FunctionProblem:
-    """Any vectorised function under N(0, I).
+    """Any vectorised function, under N(0, I) or another base distribution.
 
     Args:
         f: Maps points of shape (n, d) to values of shape (n,); small is dangerous. It may be left out where there are
             `terms`: it is then their least. See `vectorized` for an f of one point.
-        dim: Number of dimensions d.
+        dim: Number of dimensions d; may be left out where the base has one.
         terms: Maps points of shape (n, d) to terms of shape (n, J) whose least is f, for a series system that fails
             where one of its parts does; None for none. The problem's own `terms` gives `Terms`.
         gradient: Maps points of shape (n, d) and the numbers of their terms, shape (n,), to the gradients of these
@@ -281,10 +283,12 @@ class FunctionProblem:
         vectorized: False where f maps one point of shape (d,) to a number, as a program does that simulates one drive.
         chunk_size: Rows that workers get at once (`estimate(..., workers=2)`); None for 16, and for 1 of an f of one
             point.
+        base: Distribution of X: N(0, I) by default, a `Distribution`, or what `as_distribution` takes: a frozen
+            distribution of SciPy (of one coordinate: all `dim` have it), one of OpenTURNS, or a list of them.
 
     Raises:
-        ValueError: If f, terms or gradient is not callable, f and terms are missing both, or dim is not a positive
-            whole number.
+        ValueError: If f, terms or gradient is not callable, f and terms are missing both, dim is not a positive
+            whole number, or base does not fit.
 
     Example:
         >>> import numpy as np, samplers
@@ -297,6 +301,13 @@ class FunctionProblem:
         >>> drive = samplers.FunctionProblem(lambda x: 3.0 - x[0], dim=2, vectorized=False)
         >>> drive.evaluate(np.array([[1.0, 0.0], [4.0, 0.0]]))
         array([ 2., -1.])
+
+        Other distributions, here of SciPy:
+
+        >>> from scipy import stats
+        >>> strength, load = stats.lognorm(0.1, scale=9.0), stats.gumbel_r(3.0)
+        >>> samplers.FunctionProblem(lambda x: x[:, 0] - x[:, 1], base=[strength, load])
+        <FunctionProblem of <lambda>, 2 dimensions, base IndependentDistributions>
 
         A series system, which fails where either coordinate exceeds 3:
 
@@ -316,12 +327,13 @@ class FunctionProblem:
     derivatives", 2008, section 4.6)."""
     vectorized: bool = True
     chunk_size: int | None = None
+    base: Any = None
 
     def __post_init__(self) -> None:
         """Check the arguments; the functions of terms and gradients become those of the protocols."""
         if not (callable(self.f) or (self.f is None and self.terms is not None)):
             raise ValueError(f"Expected f to be a function of an (n, d) array, got {self.f!r}.")
-        check_whole("dim", self.dim, 1)
+        self._set_base()
         for name, wrap in (("terms", _FunctionTerms), ("gradient", _FunctionGradients)):
             function = getattr(self, name)  # terms, gradient
             if function is None or isinstance(function, wrap):
@@ -333,10 +345,27 @@ class FunctionProblem:
         if self.chunk_size is not None:
             check_whole("chunk_size", self.chunk_size, 1)
 
-    @property
-    def base(self) -> StandardNormal:
-        """N(0, I)."""
-        return StandardNormal(self.dim)
+    def _set_base(self) -> None:
+        """Set the base distribution and the dimension, each of which may follow from the other."""
+        if self.base is None:
+            check_whole("dim", self.dim, 1)
+            object.__setattr__(self, "base", StandardNormal(self.dim))
+            return
+        base = as_distribution(self.base, self.dim or None)
+        object.__setattr__(self, "base", base)
+        if self.dim == 0 and hasattr(base, "dim"):  # a user's distribution need not have it
+            object.__setattr__(self, "dim", int(base.dim))
+        check_whole("dim", self.dim, 1)
+
+    def __repr__(self) -> str:
+        """Return one line."""
+        what = "terms" if self.f is None else getattr(self.f, "__name__", type(self.f).__name__)  # a user's function
+        base = "" if isinstance(self.base, StandardNormal) else f", base {type(self.base).__name__}"
+        return f"<FunctionProblem of {what}, {self.dim} dimension{'s' * (self.dim != 1)}{base}>"
+
+    def _repr_html_(self) -> str:
+        """Return the problem and its base distribution for notebooks."""
+        return f"<p>{escape(repr(self)[1:-1])}</p><p>base: {escape(repr(self.base))}</p>"
 
     def evaluate(self, x: FloatArray) -> FloatArray:
         """Call f on the rows of x (n, d); return its values as float64.
@@ -347,8 +376,33 @@ class FunctionProblem:
         _check_points(x, self.dim)
         if self.f is None:
             return np.asarray(self.terms(x).f)
-        f: Any = self.f(x) if self.vectorized else [self.f(row) for row in x]
-        return one_per_row(f, len(x))
+        if not self.vectorized:
+            values: Any = [self.f(row) for row in x]
+            return one_per_row(values, len(x))
+        hint = f"f gets a batch of points of shape (n, {self.dim}); pass vectorized=False for an f of one point."
+        try:
+            f = self.f(x)
+        except Exception as error:  # the function is the user's
+            if _takes_one_point(self.f, x):
+                raise EvaluationError(f"f raised {type(error).__name__} ({error}): {hint}") from error
+            raise
+        try:
+            return one_per_row(f, len(x))
+        except EvaluationError as error:
+            raise EvaluationError(f"{error} {hint}") from error
+
+
+def _takes_one_point(f: Callable[[FloatArray], Any], x: FloatArray) -> bool:
+    """Return whether f gives a number for the first point of x (n, d), and raises for it as a batch of one."""
+    try:
+        f(x[:1].copy())
+        return False
+    except Exception:  # of the user's function, whatever it is
+        pass
+    try:
+        return np.ndim(f(x[0].copy())) == 0
+    except Exception:
+        return False
 
 
 @dataclass(frozen=True)

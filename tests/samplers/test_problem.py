@@ -102,3 +102,44 @@ def test_terms_and_gradients_must_be_functions_and_cost_something(arguments):
 def test_terms_must_be_a_row_for_every_row(terms):
     with pytest.raises(samplers.EvaluationError, match=r"Expected terms of shape \(3, J\)"):
         samplers.FunctionProblem(dim=2, terms=terms).terms(np.zeros((3, 2)))
+
+
+@pytest.mark.parametrize(
+    "f",
+    [
+        lambda x: 3.0 - x[0],
+        lambda x: 3.0 - max(x),
+        lambda x: 3.0 - float(x[0]),
+        lambda x: 1.0 if x[0] > x[1] else 2.0,
+        lambda x: 3.0,
+    ],
+    ids=["row", "max", "float", "branch", "constant"],
+)
+def test_an_f_of_one_point_gets_a_hint(f):
+    problem = samplers.FunctionProblem(f, dim=2)
+    with pytest.raises(
+        samplers.EvaluationError, match=r"batch of points of shape \(n, 2\); pass vectorized=False"
+    ) as error:
+        samplers.estimate(problem, "mc", seed=0, max_sim=100)
+    assert "\n" not in str(error.value)
+    assert (
+        samplers.estimate(samplers.FunctionProblem(f, dim=2, vectorized=False), "mc", seed=0, max_sim=100).n_sim == 100
+    )
+
+
+def test_an_f_of_batches_that_raises_gets_none():
+    def f(x):
+        if (x[..., 0] > 1.0).any():
+            raise ValueError("off the map")
+        return x.sum(axis=-1)
+
+    problem = samplers.FunctionProblem(f, dim=2)
+    with pytest.raises(samplers.EvaluationError, match="off the map") as error:
+        samplers.estimate(problem, "mc", seed=0, max_sim=100)
+    assert "vectorized" not in str(error.value)
+    assert samplers.estimate(problem, "mc", seed=0, max_sim=100, on_error="failure").p > 0.1
+
+
+def test_repr_is_one_line():
+    assert repr(samplers.FunctionProblem(np.sin, dim=1)) == "<FunctionProblem of sin, 1 dimension>"
+    assert "<p>FunctionProblem of &lt;lambda&gt;" in samplers.FunctionProblem(lambda x: x, dim=2)._repr_html_()

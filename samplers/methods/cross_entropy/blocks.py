@@ -11,19 +11,17 @@ References:
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from samplers.distributions.conversion import as_distribution, can_convert
 from samplers.methods.cross_entropy.beta_block import PAPERS_BOX, BetaBlock
-from samplers.methods.cross_entropy.gaussian_mixture_em import fit_mixture_towards
-from samplers.methods.cross_entropy.kl_projection import project_mean
+from samplers.methods.cross_entropy.gaussian_blocks import MappedBlock, NormalBlock
 from samplers.problem import FloatArray, Inputs
-from samplers.proposals.gaussian import Gaussian, weighted_moments
-from samplers.proposals.mixture import GaussianMixture
-from samplers.proposals.shrinkage import shrink_towards_present
+from samplers.proposals.gaussian import Gaussian
 
 
 @runtime_checkable
@@ -97,136 +95,6 @@ class HasRadius(Protocol):
     radius: float
 
 
-BlockT = TypeVar("BlockT", bound="_FromGaussian")
-
-
-@dataclass(frozen=True, eq=False)
-class _FromGaussian:
-    """Common part of the blocks that are Gaussian in the base distribution."""
-
-    gaussian: Gaussian
-    """N(mean, L L')."""
-
-    @property
-    def dim(self) -> int:
-        """Number of coordinates b."""
-        return self.gaussian.dim
-
-    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
-        """Draw n independent points, shape (n, b)."""
-        return self.gaussian.sample(n, rng)
-
-    def log_prob(self, x: FloatArray, /) -> FloatArray:
-        """Log density at x (n, b), shape (n,)."""
-        return self.gaussian.log_prob(x)
-
-    def to_standard_normal(self, x: FloatArray, /) -> FloatArray:
-        """Return L^-1 (x - mean)."""
-        return self.gaussian.to_standard_normal(x)
-
-    def from_standard_normal(self, u: FloatArray, /) -> FloatArray:
-        """Return mean + L u."""
-        return self.gaussian.from_standard_normal(u)
-
-    def widen(self: BlockT, factor: float) -> BlockT:
-        """Return the block with `factor` times the standard deviations."""
-        return replace(self, gaussian=self.gaussian.widen(factor))
-
-
-@dataclass(frozen=True, eq=False)
-class NormalBlock(_FromGaussian):
-    """A Normal with fixed covariance whose mean may move in a box |mean - centre|_inf <= radius.
-
-    Args:
-        gaussian: The present Gaussian; in the base distribution the one to start from.
-        radius: In the units of x (0.01 in the paper); inf for no box, 0 for a block that stays.
-        centre: Centre of the box; None takes the mean of `gaussian`.
-
-    Example:
-        >>> import numpy as np
-        >>> from samplers.proposals import Gaussian
-        >>> block = NormalBlock(Gaussian.standard(2), radius=0.5)
-        >>> elite = np.array([[3.0, 0.1], [1.0, 0.1]])
-        >>> block.project(elite, np.array([0.5, 0.5]), alpha=1.0).gaussian.mean
-        array([0.5, 0.1])
-    """
-
-    radius: float = math.inf
-    centre: FloatArray | None = None
-
-    def project(self, x: FloatArray, weights: FloatArray, alpha: float) -> "NormalBlock":
-        """Return the projection of alpha Q + (1 - alpha) P in the box, see `project_mean`."""
-        centre = self.gaussian.mean if self.centre is None else self.centre
-        target = alpha * (weights @ x) + (1 - alpha) * self.gaussian.mean
-        mean = project_mean(target, centre, self.gaussian.cholesky, self.radius)
-        return replace(self, gaussian=Gaussian(mean, self.gaussian.cholesky), centre=centre)
-
-
-@dataclass(frozen=True, eq=False)
-class GaussianBlock(_FromGaussian):
-    """A Gaussian whose mean and covariance may move: E[x] and E[x x'] are matched.
-
-    The covariance is drawn towards the present one, see `shrink_towards_present`.
-
-    Example:
-        Ten points in one place have no covariance; the present one counts as three points.
-
-        >>> import numpy as np
-        >>> from samplers.proposals import Gaussian
-        >>> elite = np.tile([2.0, 1.0], (10, 1))
-        >>> block = GaussianBlock(Gaussian.standard(2)).project(elite, np.full(10, 0.1), alpha=1.0)
-        >>> block.gaussian.mean, block.gaussian.covariance.diagonal().round(3)
-        (array([2., 1.]), array([0.231, 0.231]))
-    """
-
-    def project(self, x: FloatArray, weights: FloatArray, alpha: float) -> "GaussianBlock":
-        """Return the projection of alpha Q + (1 - alpha) P, its covariance pulled back."""
-        target = weighted_moments(x, weights).mix_with(self.gaussian.moments, alpha)
-        return GaussianBlock(shrink_towards_present(target, self.gaussian, 1 / float(weights @ weights)))
-
-
-@dataclass(frozen=True, eq=False)
-class MixtureBlock(_FromGaussian):
-    """A mixture of k Gaussians, moved by expectation-maximisation, see `fit_mixture_towards`.
-
-    Args:
-        gaussian: The Gaussian of the base distribution.
-        k: Number of components at most.
-        mixture: The present mixture; None stands for `gaussian`.
-
-    Example:
-        >>> import numpy as np
-        >>> from samplers.proposals import Gaussian
-        >>> elite = np.repeat([[4.0, 0.0], [-4.0, 0.0]], 100, axis=0)
-        >>> block = MixtureBlock(Gaussian.standard(2), k=2).project(elite, np.full(200, 1 / 200), alpha=1.0)
-        >>> sorted(float(component.mean[0].round(2)) for component in block.mixture.components)
-        [-4.0, 4.0]
-    """
-
-    k: int
-    mixture: GaussianMixture | None = None
-
-    @property
-    def _mixture(self) -> GaussianMixture:
-        return GaussianMixture(np.ones(1), (self.gaussian,)) if self.mixture is None else self.mixture
-
-    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
-        """Draw n independent points, shape (n, b)."""
-        return self._mixture.sample(n, rng)
-
-    def log_prob(self, x: FloatArray, /) -> FloatArray:
-        """Log density at x (n, b), shape (n,)."""
-        return self._mixture.log_prob(x)
-
-    def project(self, x: FloatArray, weights: FloatArray, alpha: float) -> "MixtureBlock":
-        """Return a mixture nearer to alpha Q + (1 - alpha) P."""
-        return replace(self, mixture=fit_mixture_towards(self._mixture, self.k, x, weights, alpha))
-
-    def widen(self, factor: float) -> "MixtureBlock":
-        """Return the block with `factor` times the standard deviations of every component."""
-        return replace(self, mixture=self._mixture.widen(factor))
-
-
 @dataclass(frozen=True, eq=False)
 class Product:
     """Independent blocks of consecutive coordinates: a base distribution, or a proposal of the search.
@@ -234,10 +102,11 @@ class Product:
     As a base distribution it announces its blocks to `CrossEntropy(family="blocks")`.
 
     Args:
-        blocks: In the order of the coordinates.
+        blocks: In the order of the coordinates; a distribution of SciPy or OpenTURNS (`as_distribution`) becomes a
+            `MappedBlock`.
 
     Raises:
-        ValueError: If there is no block.
+        ValueError: If there is no block, or one is not as described.
 
     Example:
         >>> import numpy as np
@@ -254,7 +123,8 @@ class Product:
 
     def __post_init__(self) -> None:
         """Make a tuple of the blocks."""
-        object.__setattr__(self, "blocks", tuple(self.blocks))
+        blocks = (MappedBlock(as_distribution(b)) if can_convert(b) else b for b in self.blocks)
+        object.__setattr__(self, "blocks", tuple(blocks))
         if not self.blocks:
             raise ValueError("Product: expected at least one block.")
 

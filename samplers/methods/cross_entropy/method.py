@@ -19,7 +19,8 @@ from samplers.importance.search import (
 )
 from samplers.method import Goal, Interrupted, Steps
 from samplers.methods.base import Method
-from samplers.methods.cross_entropy.blocks import GaussianBlock, MixtureBlock, NormalBlock, Product, announced_blocks
+from samplers.methods.cross_entropy.blocks import Product, announced_blocks
+from samplers.methods.cross_entropy.gaussian_blocks import GaussianBlock, MixtureBlock, NormalBlock
 from samplers.methods.cross_entropy.search import Iterate, best_iterate, make_iterate
 from samplers.problem import FloatArray, Inputs
 from samplers.proposals.gaussian import Gaussian

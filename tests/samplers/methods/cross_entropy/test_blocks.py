@@ -6,7 +6,8 @@ from scipy import stats
 
 from samplers import Distribution
 from samplers.methods.cross_entropy.beta_block import BetaBlock
-from samplers.methods.cross_entropy.blocks import GaussianBlock, NormalBlock, Product, announced_blocks
+from samplers.methods.cross_entropy.blocks import Product, announced_blocks
+from samplers.methods.cross_entropy.gaussian_blocks import GaussianBlock, NormalBlock
 from samplers.proposals.gaussian import Gaussian
 
 MEAN, COVARIANCE = np.array([0.3, -0.2, 0.1]), np.array([[0.5, 0.2, 0.0], [0.2, 0.4, 0.1], [0.0, 0.1, 0.3]])

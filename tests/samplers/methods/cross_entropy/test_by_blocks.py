@@ -10,7 +10,8 @@ from scipy import integrate, stats
 import samplers
 from samplers.method import Goal
 from samplers.methods.cross_entropy.beta_block import BetaBlock
-from samplers.methods.cross_entropy.blocks import NormalBlock, Product
+from samplers.methods.cross_entropy.blocks import Product
+from samplers.methods.cross_entropy.gaussian_blocks import NormalBlock
 from samplers.proposals.gaussian import Gaussian
 
 CE = samplers.CrossEntropy

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from samplers.methods.cross_entropy.blocks import MixtureBlock
+from samplers.methods.cross_entropy.gaussian_blocks import MixtureBlock
 from samplers.methods.cross_entropy.gaussian_mixture_em import fit_mixture_towards
 from samplers.proposals.gaussian import Gaussian
 from samplers.proposals.mixture import GaussianMixture

@@ -9,7 +9,8 @@ import samplers
 from samplers.importance.draws import Draws, bernstein_bound, weight_warnings, weighted_cov, weighted_interval
 from samplers.importance.sampling import defensive_mixture, simulate_draws
 from samplers.limit_states import four_branches, half_space, parabola, plateau, two_modes
-from samplers.methods.cross_entropy.blocks import GaussianBlock, NormalBlock, Product
+from samplers.methods.cross_entropy.blocks import Product
+from samplers.methods.cross_entropy.gaussian_blocks import GaussianBlock, NormalBlock
 from samplers.methods.cross_entropy.method import value_at
 from samplers.problem import FunctionProblem
 from samplers.proposals.gaussian import Gaussian

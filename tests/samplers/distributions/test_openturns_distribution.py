@@ -1,0 +1,107 @@
+import pickle
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import samplers
+from samplers.distributions import OpenTurnsDistribution
+from samplers.execution.base_check import find_base_fault
+
+ot = pytest.importorskip("openturns")
+
+
+def correlated(rho=0.5):
+    matrix = ot.CorrelationMatrix(2)
+    matrix[0, 1] = rho
+    return matrix
+
+
+BASES = {
+    "normal": lambda: ot.Normal([1.0, 2.0], [1.0, 2.0], correlated()),
+    "nataf": lambda: ot.JointDistribution([ot.LogNormal(0, 0.5), ot.Gumbel(1, 2)], ot.NormalCopula(correlated())),
+    "rosenblatt": lambda: ot.JointDistribution([ot.Exponential(1.0), ot.Uniform(0, 1)], ot.ClaytonCopula(2.0)),
+    "copula": lambda: ot.GumbelCopula(2.0),
+    "normal copula": lambda: ot.NormalCopula(correlated()),
+    "independent": lambda: ot.JointDistribution([ot.WeibullMin(1, 2), ot.Student(4.0)]),
+    "mixture": lambda: ot.Mixture([ot.Normal(2), ot.Normal([3.0, 3.0], [1.0, 1.0])]),
+    "kernel": lambda: ot.KernelSmoothing().build(ot.Sample([[0.0], [1.0], [3.0], [3.5], [4.0]])),
+    "student": lambda: ot.Student(4.0),
+    "interface": lambda: ot.Distribution(ot.Gamma(2.0, 1.0)),
+}
+
+
+@pytest.fixture(params=BASES, scope="module")
+def base(request):
+    return OpenTurnsDistribution(BASES[request.param]())
+
+
+def test_it_is_the_transformation_of_openturns(base):
+    if type(base.distribution).__name__ == "Student":
+        pytest.skip("OpenTURNS maps it to Student's distribution, not to the normal")
+    u = np.random.default_rng(0).standard_normal((50, base.dim))
+    x = base.from_standard_normal(u)
+    forward = base.distribution.getIsoProbabilisticTransformation()
+    for row, point in zip(u, x, strict=True):  # point by point, as it is called there
+        np.testing.assert_allclose(np.array(forward(point)), row, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(base.to_standard_normal(x), u, rtol=0, atol=1e-8)
+
+
+def test_draws_have_its_density_and_are_mapped_to_the_standard_normal(base):
+    assert find_base_fault(base, base.dim) is None
+    x = base.sample(20, np.random.default_rng(1))
+    wanted = [base.distribution.computeLogPDF(point) for point in x]
+    np.testing.assert_allclose(base.log_prob(x), wanted, rtol=1e-12)
+
+
+def test_points_far_out_are_finite(base):
+    for u in (-12.0, 12.0):
+        assert np.isfinite(base.from_standard_normal(np.full((1, base.dim), u))).all()
+
+
+def test_draws_come_from_the_generator_that_is_given(base):
+    ot.RandomGenerator.SetSeed(1)
+    first = base.sample(3, np.random.default_rng(5))
+    ot.RandomGenerator.SetSeed(2)
+    np.testing.assert_array_equal(first, base.sample(3, np.random.default_rng(5)))
+
+
+def test_it_travels_to_workers(base):
+    copy = pickle.loads(pickle.dumps(base))
+    u = np.full((2, base.dim), 0.7)
+    np.testing.assert_allclose(copy.from_standard_normal(u), base.from_standard_normal(u))
+
+
+def test_student_in_one_dimension_is_that_of_scipy():
+    base, u = OpenTurnsDistribution(ot.Student(4.0)), np.array([[-5.0], [0.3], [7.0]])
+    np.testing.assert_allclose(base.from_standard_normal(u), stats.t(4).isf(stats.norm.sf(u)), rtol=1e-6)
+    back = base.to_standard_normal(base.from_standard_normal(u))
+    np.testing.assert_allclose(stats.norm.sf(back), stats.norm.sf(u), rtol=1e-4)  # digits of its complementary CDF
+
+
+def test_outside_the_support_the_density_is_zero():
+    assert OpenTurnsDistribution(ot.Exponential(1.0)).log_prob(np.array([[-1.0], [1.0]])).tolist() == [-np.inf, -1.0]
+
+
+def test_what_has_no_map_is_refused():
+    with pytest.raises(ValueError, match="Poisson of OpenTURNS, which is not"):
+        OpenTurnsDistribution(ot.Poisson(3.0))
+    with pytest.raises(ValueError, match=r"leads to Student, not to N\(0, I\)"):
+        OpenTurnsDistribution(ot.Student(4.0, [0.0, 0.0], [1.0, 1.0], correlated()))
+
+
+def test_p_with_correlated_normals_is_exact():
+    """X ~ N(0, R), correlation 0.5: P[x1 + x2 >= 6] = Phi(-6 / sqrt(3)) = 2.7e-4."""
+    base = ot.JointDistribution([ot.Normal(), ot.Normal()], ot.NormalCopula(correlated()))
+    problem = samplers.FunctionProblem(lambda x: 6.0 - x.sum(axis=1), base=base)
+    result = samplers.estimate(problem, "two-stage", seed=0, max_sim=3000)
+    assert problem.dim == 2
+    assert abs(result.p / stats.norm.cdf(-6 / 3**0.5) - 1) < 4 * result.cov < 0.5
+
+
+def test_p_under_a_clayton_copula_is_its_lower_tail():
+    """C(v, v) = (2 v^-2 - 1)^(-1/2) for theta = 2: at v = 1e-3 it is 7.07e-4."""
+    problem = samplers.FunctionProblem(lambda x: np.log(x.max(axis=1) / 1e-3), base=ot.ClaytonCopula(2.0))
+    result = samplers.estimate(problem, "two-stage", seed=0, max_sim=3000)
+    exact = (2 * 1e-3**-2.0 - 1) ** -0.5
+    assert abs(result.p / exact - 1) < 4 * result.cov < 0.5
