@@ -32,6 +32,12 @@ def register_stored(*classes: type) -> None:
 
     Raises:
         ValueError: If another class has the name.
+
+    Example:
+        >>> register_stored(type("Level", (), {}))
+        Traceback (most recent call last):
+            ...
+        ValueError: Another class named Level is stored in files already.
     """
     for cls in classes:
         if _CLASSES.setdefault(cls.__name__, cls) is not cls:
@@ -53,6 +59,12 @@ def write_object(path: str | PathLike[str], value: object) -> None:
     Raises:
         TypeError: If it holds something of a class that is not registered.
         OSError: If the file cannot be written.
+
+    Example:
+        >>> write_object("nowhere", object())
+        Traceback (most recent call last):
+            ...
+        TypeError: A value of class object cannot be written to a file.
     """
     from safetensors.numpy import save_file
 
@@ -71,6 +83,14 @@ def read_object(path: str | PathLike[str], cls: type[_Stored]) -> _Stored:
     Raises:
         FileNotFoundError: If there is no such file.
         ValueError: If the file is damaged, is no such file, or holds an object of another class; one line.
+
+    Example:
+        >>> from tempfile import TemporaryDirectory
+        >>> import samplers
+        >>> with TemporaryDirectory() as folder:
+        ...     write_object(f"{folder}/status", samplers.Status.BUDGET)
+        ...     print(read_object(f"{folder}/status", samplers.Status))
+        budget
     """
     from safetensors import SafetensorError, safe_open
 

@@ -48,6 +48,11 @@ def arrow_table(points: PointColumns, names: Sequence[str]) -> pyarrow.Table:
 
     Raises:
         ValueError: If names are not d different ones, or one is that of another column.
+
+    Example:
+        >>> points = PointColumns(x=np.ones((1, 1)), rows=np.array([0]), columns={"f": np.zeros(1)}, missing={})
+        >>> arrow_table(points, ["gap"]).to_pylist()
+        [{'f': 0.0, 'gap': 1.0}]
     """
     import pyarrow as pa
 
