@@ -8,26 +8,30 @@ import samplers
 from samplers.distributions import OpenTurnsDistribution
 from samplers.execution.base_check import find_base_fault
 
-ot = pytest.importorskip("openturns")
+openturns = pytest.importorskip("openturns")
 
 
 def correlated(rho=0.5):
-    matrix = ot.CorrelationMatrix(2)
+    matrix = openturns.CorrelationMatrix(2)
     matrix[0, 1] = rho
     return matrix
 
 
 BASES = {
-    "normal": lambda: ot.Normal([1.0, 2.0], [1.0, 2.0], correlated()),
-    "nataf": lambda: ot.JointDistribution([ot.LogNormal(0, 0.5), ot.Gumbel(1, 2)], ot.NormalCopula(correlated())),
-    "rosenblatt": lambda: ot.JointDistribution([ot.Exponential(1.0), ot.Uniform(0, 1)], ot.ClaytonCopula(2.0)),
-    "copula": lambda: ot.GumbelCopula(2.0),
-    "normal copula": lambda: ot.NormalCopula(correlated()),
-    "independent": lambda: ot.JointDistribution([ot.WeibullMin(1, 2), ot.Student(4.0)]),
-    "mixture": lambda: ot.Mixture([ot.Normal(2), ot.Normal([3.0, 3.0], [1.0, 1.0])]),
-    "kernel": lambda: ot.KernelSmoothing().build(ot.Sample([[0.0], [1.0], [3.0], [3.5], [4.0]])),
-    "student": lambda: ot.Student(4.0),
-    "interface": lambda: ot.Distribution(ot.Gamma(2.0, 1.0)),
+    "normal": lambda: openturns.Normal([1.0, 2.0], [1.0, 2.0], correlated()),
+    "nataf": lambda: openturns.JointDistribution(
+        [openturns.LogNormal(0, 0.5), openturns.Gumbel(1, 2)], openturns.NormalCopula(correlated())
+    ),
+    "rosenblatt": lambda: openturns.JointDistribution(
+        [openturns.Exponential(1.0), openturns.Uniform(0, 1)], openturns.ClaytonCopula(2.0)
+    ),
+    "copula": lambda: openturns.GumbelCopula(2.0),
+    "normal copula": lambda: openturns.NormalCopula(correlated()),
+    "independent": lambda: openturns.JointDistribution([openturns.WeibullMin(1, 2), openturns.Student(4.0)]),
+    "mixture": lambda: openturns.Mixture([openturns.Normal(2), openturns.Normal([3.0, 3.0], [1.0, 1.0])]),
+    "kernel": lambda: openturns.KernelSmoothing().build(openturns.Sample([[0.0], [1.0], [3.0], [3.5], [4.0]])),
+    "student": lambda: openturns.Student(4.0),
+    "interface": lambda: openturns.Distribution(openturns.Gamma(2.0, 1.0)),
 }
 
 
@@ -60,9 +64,9 @@ def test_points_far_out_are_finite(base):
 
 
 def test_draws_come_from_the_generator_that_is_given(base):
-    ot.RandomGenerator.SetSeed(1)
+    openturns.RandomGenerator.SetSeed(1)
     first = base.sample(3, np.random.default_rng(5))
-    ot.RandomGenerator.SetSeed(2)
+    openturns.RandomGenerator.SetSeed(2)
     np.testing.assert_array_equal(first, base.sample(3, np.random.default_rng(5)))
 
 
@@ -73,26 +77,29 @@ def test_it_travels_to_workers(base):
 
 
 def test_student_in_one_dimension_is_that_of_scipy():
-    base, u = OpenTurnsDistribution(ot.Student(4.0)), np.array([[-5.0], [0.3], [7.0]])
+    base, u = OpenTurnsDistribution(openturns.Student(4.0)), np.array([[-5.0], [0.3], [7.0]])
     np.testing.assert_allclose(base.from_standard_normal(u), stats.t(4).isf(stats.norm.sf(u)), rtol=1e-6)
     back = base.to_standard_normal(base.from_standard_normal(u))
     np.testing.assert_allclose(stats.norm.sf(back), stats.norm.sf(u), rtol=1e-4)  # digits of its complementary CDF
 
 
 def test_outside_the_support_the_density_is_zero():
-    assert OpenTurnsDistribution(ot.Exponential(1.0)).log_prob(np.array([[-1.0], [1.0]])).tolist() == [-np.inf, -1.0]
+    assert OpenTurnsDistribution(openturns.Exponential(1.0)).log_prob(np.array([[-1.0], [1.0]])).tolist() == [
+        -np.inf,
+        -1.0,
+    ]
 
 
 def test_what_has_no_map_is_refused():
     with pytest.raises(ValueError, match="Poisson of OpenTURNS, which is not"):
-        OpenTurnsDistribution(ot.Poisson(3.0))
+        OpenTurnsDistribution(openturns.Poisson(3.0))
     with pytest.raises(ValueError, match=r"leads to Student, not to N\(0, I\)"):
-        OpenTurnsDistribution(ot.Student(4.0, [0.0, 0.0], [1.0, 1.0], correlated()))
+        OpenTurnsDistribution(openturns.Student(4.0, [0.0, 0.0], [1.0, 1.0], correlated()))
 
 
 def test_p_with_correlated_normals_is_exact():
     """X ~ N(0, R), correlation 0.5: P[x1 + x2 >= 6] = Phi(-6 / sqrt(3)) = 2.7e-4."""
-    base = ot.JointDistribution([ot.Normal(), ot.Normal()], ot.NormalCopula(correlated()))
+    base = openturns.JointDistribution([openturns.Normal(), openturns.Normal()], openturns.NormalCopula(correlated()))
     problem = samplers.FunctionProblem(lambda x: 6.0 - x.sum(axis=1), base=base)
     result = samplers.estimate(problem, "two-stage", seed=0, max_sim=3000)
     assert problem.dim == 2
@@ -101,7 +108,7 @@ def test_p_with_correlated_normals_is_exact():
 
 def test_p_under_a_clayton_copula_is_its_lower_tail():
     """C(v, v) = (2 v^-2 - 1)^(-1/2) for theta = 2: at v = 1e-3 it is 7.07e-4."""
-    problem = samplers.FunctionProblem(lambda x: np.log(x.max(axis=1) / 1e-3), base=ot.ClaytonCopula(2.0))
+    problem = samplers.FunctionProblem(lambda x: np.log(x.max(axis=1) / 1e-3), base=openturns.ClaytonCopula(2.0))
     result = samplers.estimate(problem, "two-stage", seed=0, max_sim=3000)
     exact = (2 * 1e-3**-2.0 - 1) ** -0.5
     assert abs(result.p / exact - 1) < 4 * result.cov < 0.5

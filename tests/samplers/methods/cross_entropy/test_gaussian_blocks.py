@@ -37,9 +37,9 @@ def test_outside_the_support_the_density_is_zero(moved):
 
 
 def test_a_product_takes_distributions_of_scipy_and_openturns():
-    ot = pytest.importorskip("openturns")
+    openturns = pytest.importorskip("openturns")
     base = samplers.Product(
-        [stats.lognorm(0.5), samplers.BetaBlock(alpha=2.0, beta=2.0, low=0.0, high=1.0), ot.ClaytonCopula(2.0)]
+        [stats.lognorm(0.5), samplers.BetaBlock(alpha=2.0, beta=2.0, low=0.0, high=1.0), openturns.ClaytonCopula(2.0)]
     )
     assert base.dim == 4
     assert isinstance(base.blocks[0], MappedBlock)
