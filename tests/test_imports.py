@@ -42,7 +42,7 @@ FLOORS = {
         methods.auto
         registry
         estimation
-        comparison testing
+        comparison testing benchmark
     """,
     "rare_envs": """
         version
@@ -86,8 +86,8 @@ CARS_AND_TENSORS = {"gymnasium", "highway_env", "pettingzoo", "stable_baselines3
 
 EXAMPLES = sorted((ROOT / "examples").rglob("*.py"))
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-PUBLIC_MODULES = {"samplers.testing"}
-"""Modules that users import as such: checks for methods of other packages, for the tests of these."""
+PUBLIC_MODULES = {"samplers.testing", "samplers.benchmark"}
+"""Modules that users import as such: checks and a benchmark for methods of other packages."""
 
 
 def modules(root: Path, packages: tuple[str, ...] = PACKAGES) -> dict[str, Path]:

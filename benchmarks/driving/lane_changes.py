@@ -25,9 +25,9 @@ from torch import Tensor
 from agents import LearnedDriver
 from benchmarks import RESULTS
 from benchmarks.driving.realism import load_named, round_numbers
-from benchmarks.estimators.runs import about
 from rare_envs.sensors.perception import FEATURES, HEADING_COLUMN, SPEED_COLUMN
 from rare_envs.threads import use_one_thread
+from samplers.benchmark.runs import about
 from training.data.trajectories import DT
 from training.imitation.algorithms.expert_pairs import Pairs, collect_pairs
 from training.imitation.datasets import Source, load_scenes

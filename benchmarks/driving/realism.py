@@ -40,8 +40,8 @@ from benchmarks.driving.realism_rows import (
     measure_people,
     noisy_drivers,
 )
-from benchmarks.estimators.runs import about
 from rare_envs.threads import use_one_thread
+from samplers.benchmark.runs import about
 from training.imitation.algorithms.expert_pairs import collect_pairs
 from training.imitation.datasets import Source, load_scenes
 from training.imitation.evaluation.behaviour import Act

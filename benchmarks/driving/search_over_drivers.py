@@ -29,8 +29,8 @@ import rare_envs
 import samplers
 from benchmarks import RESULTS
 from benchmarks.driving.failing_traffic import describe_failures, failing_points, measure_drivers
-from benchmarks.estimators.runs import about
 from rare_envs.threads import use_one_thread
+from samplers.benchmark.runs import about
 from samplers.serialization import to_json_value
 
 PAPER = samplers.CrossEntropy(family="blocks", rho=0.01, alpha=0.8, early_end=False, choice="quantile", wide_share=0)

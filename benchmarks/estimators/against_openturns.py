@@ -18,44 +18,33 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import openturns
 import typer
 from rich.console import Console
 from rich.progress import track
-from threadpoolctl import threadpool_limits
 
-from benchmarks.estimators.catalogue import CASES
 from benchmarks.estimators.compare_methods import parse_names
 from benchmarks.estimators.report import format_cells
-from benchmarks.estimators.runs import Job, Meter, MethodRun, about, limit_state, record_failure, rotation_of, run_all
-from benchmarks.estimators.summary import Cell, cells_of
+from benchmarks.estimators.targets import TARGET_PROBLEMS
+from samplers.benchmark.openturns_methods import ALGORITHMS, run_algorithm
+from samplers.benchmark.runs import (
+    Job,
+    Meter,
+    MethodRun,
+    about,
+    limit_state,
+    read_answer,
+    record_failure,
+    rotation_of,
+    run_all,
+    use_one_core,
+)
+from samplers.benchmark.summary import Cell, cells_of
 from samplers.methods.surrogate.method import Surrogate
 from samplers.methods.surrogate.settings import DEFAULT_SURROGATE_SETTINGS
-from samplers.problem import FloatArray
 from samplers.serialization import to_json_value
 
-
-def _form_sampling(event: Any) -> Any:
-    """Return importance sampling around the design point that FORM finds from the origin."""
-    solver = openturns.AbdoRackwitz()
-    solver.setStartingPoint(openturns.Point(event.getFunction().getInputDimension()))
-    form = openturns.FORM(solver, event)
-    form.run()
-    sampling = openturns.PostAnalyticalImportanceSampling(form.getResult())
-    sampling.setMaximumCoefficientOfVariation(0.0)  # all draws are made
-    return sampling
-
-
-ALGORITHMS = {
-    "openturns-form": _form_sampling,
-    "openturns-ss": openturns.SubsetSampling,
-    "openturns-ce": openturns.StandardSpaceCrossEntropyImportanceSampling,
-    "openturns-nais": openturns.NAIS,
-}
 GUARD = 300_000
-BLOCK = 100
-"""Points that OpenTURNS hands over at once: that many chains in subset sampling, 10 % of the points of a level."""
 
 
 def run_openturns(job: Job, points: int = 1000) -> MethodRun:
@@ -67,46 +56,13 @@ def run_openturns(job: Job, points: int = 1000) -> MethodRun:
     """
     state = limit_state(job.problem)
     meter = Meter(state.problem(rotation_of(job), noise_seed=job.seed).evaluate, limit=GUARD)
-    openturns.TBB.Disable()  # one thread, as ours
-    openturns.RandomGenerator.SetSeed(job.seed)
-    with threadpool_limits(limits=1):
+    with use_one_core():
         start = time.process_time()
         try:
-            algorithm = ALGORITHMS[job.method](_event(meter, state.dim))
-            algorithm.setMaximumOuterSampling(max(points // BLOCK, 1))
-            algorithm.setBlockSize(min(points, BLOCK))
-            algorithm.run()
-            result = algorithm.getResult()
-            p, half = result.getProbabilityEstimate(), 0.5 * result.getConfidenceLength(0.95)
-            cov = result.getCoefficientOfVariation()
-        except Exception as error:  # an error of f arrives as a RuntimeError with the traceback as its text
-            reason = RuntimeError(str(error).strip().splitlines()[-1])
-            return record_failure(job, meter, time.process_time() - start, reason)
-        seconds = time.process_time() - start - meter.seconds
-    return MethodRun(
-        method=job.method,
-        problem=job.problem,
-        seed=job.seed,
-        p=p,
-        low=p - half,
-        high=p + half,
-        cov=cov if p > 0 and cov >= 0 else float("inf"),
-        n_sim=meter.points,
-        calls=meter.calls,
-        seconds=seconds,
-        status="ended",
-    )
-
-
-def _event(f: Meter, dim: int) -> Any:
-    """Return the event {f(U) <= 0}, U ~ N(0, I)."""
-
-    def column(u: Any) -> FloatArray:
-        return f(np.asarray(u))[:, None]
-
-    function = openturns.PythonFunction(dim, 1, func_sample=column)
-    response = openturns.CompositeRandomVector(function, openturns.RandomVector(openturns.Normal(dim)))
-    return openturns.ThresholdEvent(response, openturns.LessOrEqual(), 0.0)
+            answer = run_algorithm(ALGORITHMS[job.method], meter, state.dim, job.seed, points)
+        except RuntimeError as error:
+            return record_failure(job, meter, time.process_time() - start, error)
+        return read_answer(job, meter, time.process_time() - start, answer)
 
 
 def _ours(method: str, theirs: list[Cell], job: dict[str, Any], runs: int, most: int) -> list[Job]:
@@ -139,7 +95,7 @@ def main(
 ) -> None:
     """Measure and print one row of theirs and one of ours for each algorithm and problem."""
     openturns.Log.Show(openturns.Log.NONE)
-    names = parse_names(problems, list(CASES), "problem")
+    names = parse_names(problems, list(TARGET_PROBLEMS), "problem")
     console = Console(stderr=True)
     cells: list[Cell] = []
     all_runs: list[MethodRun] = []

@@ -2,7 +2,7 @@
 
     python -m benchmarks.estimators.compare_methods --runs 200 --max-sim 6000 --workers 2
 
-Runs every method many times on every problem of `benchmarks.estimators.catalogue` and prints, for each: mean / p, the
+Runs every method many times on every problem of `samplers.benchmark.catalogue` and prints, for each: mean / p, the
 spread of the estimates (c.o.v.) beside the mean c.o.v. that the runs state, gain over plain Monte Carlo at equal error,
 how often the 95 % interval holds p, the share of runs with a warning, the worst error, simulations, calls of f, and the
 method's own processor time; then, for each method, coverage over all problems, the power of the warnings, the targets
@@ -23,10 +23,10 @@ from rich.console import Console
 from rich.progress import track
 
 import samplers
-from benchmarks.estimators.catalogue import CASES
 from benchmarks.estimators.report import format_cells, summary
-from benchmarks.estimators.runs import Job, about, run_all
-from benchmarks.estimators.summary import cells_of, power_of, verdicts
+from benchmarks.estimators.targets import TARGET_PROBLEMS, verdicts
+from samplers.benchmark.runs import Job, about, run_all
+from samplers.benchmark.summary import cells_of, power_of
 from samplers.serialization import to_json_value
 
 
@@ -44,7 +44,7 @@ def main(
 ) -> None:
     """Measure, print the tables and, if asked for, write the figures and all runs."""
     chosen_methods = parse_names(methods, list(samplers.METHODS), "method")
-    chosen_problems = parse_names(problems, list(CASES), "problem")
+    chosen_problems = parse_names(problems, list(TARGET_PROBLEMS), "problem")
     limit = None if own_settings else max_sim
     jobs = [
         Job(method, problem, seed + run, limit, replicates, rotation)

@@ -1,4 +1,4 @@
-"""Reference probabilities of collision in `benchmarks.estimators.driving_models`, by importance sampling of their own.
+"""Reference probabilities of collision in `samplers.benchmark.driving_models`, by importance sampling of their own.
 
     python -m benchmarks.estimators.driving_references --draws 2e6
 
@@ -14,8 +14,8 @@ from rich.progress import track
 from scipy.stats import multivariate_normal
 from sklearn.mixture import GaussianMixture
 
-from benchmarks.estimators.driving_models import car_following, cut_in
-from benchmarks.estimators.limit_states import Function, LimitState
+from samplers.benchmark.analytic_states import LimitState, PointFunction
+from samplers.benchmark.driving_models import car_following, cut_in
 
 REFERENCE_CHUNK = 50_000
 BASE_SHARE = 0.3
@@ -38,7 +38,7 @@ def reference(state: LimitState, draws: int, seed: int) -> tuple[float, float]:
     return float(values.mean()), float(values.std(ddof=1) / np.sqrt(len(values)))
 
 
-def _fit_mixture(f: Function, dim: int, draws: int, rng: np.random.Generator) -> GaussianMixture:
+def _fit_mixture(f: PointFunction, dim: int, draws: int, rng: np.random.Generator) -> GaussianMixture:
     """Return a mixture fitted to U given failure, from wide draws that are drawn again by their weights."""
     found, weights = [], []
     for size in _chunks(draws):

@@ -22,7 +22,7 @@ from threadpoolctl import threadpool_limits
 
 import samplers
 from benchmarks.estimators.compare_methods import parse_names
-from benchmarks.estimators.runs import Meter, about
+from samplers.benchmark.runs import Meter, about
 from samplers.limit_states import half_space
 from samplers.problem import FunctionProblem
 from samplers.serialization import to_json_value

@@ -2,8 +2,9 @@
 
 from collections.abc import Sequence
 
-from benchmarks.estimators.catalogue import CASES
-from benchmarks.estimators.summary import Cell, Power, Verdict, pooled_coverage
+from benchmarks.estimators.targets import Verdict, pooled_coverage
+from samplers.benchmark.catalogue import PROBLEMS
+from samplers.benchmark.summary import Cell, Power
 
 REPORT_COLUMNS = (
     "method | problem | p | mean/p | c.o.v. | own | own / real | gain | coverage % | warned % | worst error | n_sim "
@@ -33,9 +34,9 @@ def summary(cells: Sequence[Cell], power: Power, verdicts: Sequence[Verdict]) ->
     low = [
         f"{cell.problem} {100 * cell.coverage:.0f}"
         for cell in cells
-        if cell.p > 0 and cell.coverage < 0.88 and CASES[cell.problem].min_coverage is not None
+        if cell.p > 0 and cell.coverage < 0.88 and PROBLEMS[cell.problem].knowable
     ]
-    left_out = [cell.problem for cell in cells if cell.p == 0 or CASES[cell.problem].min_coverage is None]
+    left_out = [cell.problem for cell in cells if cell.p == 0 or not PROBLEMS[cell.problem].knowable]
     note = f" (without {', '.join(left_out)})" if left_out else ""
     lines = [
         f"## {cells[0].method}",

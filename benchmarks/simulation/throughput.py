@@ -20,10 +20,10 @@ import typer
 
 import rare_envs
 import samplers
-from benchmarks.estimators.runs import about
 from benchmarks.simulation import highway_env_reference as reference
 from rare_envs.simulation.rollout import rollout
 from rare_envs.threads import use_one_thread
+from samplers.benchmark.runs import about
 
 CAR_FOLLOWING, CUT_IN, HIGHWAY = (f"rare_envs/{name}-v0" for name in ("CarFollowing", "CutIn", "Highway"))
 HORIZON = 20.0

@@ -18,7 +18,6 @@ from typing import Annotated, NamedTuple
 import typer
 
 from benchmarks.estimators.few_simulations import driving_states, held_out_states
-from benchmarks.estimators.runs import about
 from benchmarks.estimators.two_stage.repeated_seeds import (
     HEADER,
     NamedState,
@@ -29,6 +28,7 @@ from benchmarks.estimators.two_stage.repeated_seeds import (
     run_seed,
     summarise_runs,
 )
+from samplers.benchmark.runs import about
 from samplers.serialization import to_json_value
 
 

@@ -22,8 +22,9 @@ import typer
 from threadpoolctl import threadpool_limits
 
 import samplers
-from benchmarks.estimators.catalogue import CASES
-from benchmarks.estimators.runs import about
+from benchmarks.estimators.targets import TARGET_PROBLEMS
+from samplers.benchmark.catalogue import PROBLEMS
+from samplers.benchmark.runs import about
 from samplers.problem import FloatArray, FunctionProblem
 from samplers.serialization import to_json_value
 
@@ -119,7 +120,8 @@ def load_set(path: Path) -> Iterator[NamedState]:
 
 def load_catalogue() -> Iterator[NamedState]:
     """Yield the problems of the benchmark's catalogue."""
-    for name, case in CASES.items():
+    for name in TARGET_PROBLEMS:
+        case = PROBLEMS[name]
         state = case.make()
         problem = state.problem(case.rotation, noise_seed=0)
         yield NamedState(name, problem.evaluate, state.dim, state.p)

@@ -23,10 +23,10 @@ from rich.progress import track
 from threadpoolctl import threadpool_limits
 
 import samplers
-from benchmarks.estimators.catalogue import CASES
 from benchmarks.estimators.compare_methods import parse_names
-from benchmarks.estimators.runs import about, limit_state
 from benchmarks.estimators.two_stage.variations import VARIATIONS
+from samplers.benchmark.catalogue import PROBLEMS
+from samplers.benchmark.runs import about, limit_state
 from samplers.method import Goal, Steps
 from samplers.methods.two_stage.method import run_two_stage
 from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, TwoStageSettings
@@ -100,7 +100,7 @@ def run_settings(problem: str, seed: int, settings: TwoStageSettings) -> RunResu
     state = limit_state(problem)
     method = VariedTwoStage(settings=settings)
     with threadpool_limits(limits=1):
-        result = samplers.estimate(state.problem(CASES[problem].rotation, noise_seed=seed), method, seed=seed)
+        result = samplers.estimate(state.problem(PROBLEMS[problem].rotation, noise_seed=seed), method, seed=seed)
     return RunResult(result.cov, result.p / state.p - 1, result.interval[0] <= state.p <= result.interval[1])
 
 

@@ -12,9 +12,12 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from rare_envs.study.cli.corpus import corpus_app, replay_all
+from rare_envs.study.cli.commands.bench import bench_app
+from rare_envs.study.cli.commands.corpus import corpus_app, replay_all
+from rare_envs.study.cli.commands.export_failure import export_command
+from rare_envs.study.cli.commands.plan import plan_command
+from rare_envs.study.cli.commands.report import report_command
 from rare_envs.study.cli.executor_options import ExecutorOptions
-from rare_envs.study.cli.export_failure import export_command
 from rare_envs.study.cli.options import (
     AlgoOption,
     EgoArgument,
@@ -31,8 +34,6 @@ from rare_envs.study.cli.options import (
     TrustOption,
     WorldOptions,
 )
-from rare_envs.study.cli.plan import plan_command
-from rare_envs.study.cli.report import report_command
 from rare_envs.study.cli.shell import (
     OneLineErrors,
     is_typed,
@@ -303,7 +304,7 @@ def export_ego_command(
     as_json: JsonOption = False,
 ) -> None:
     """Write a saved policy as ONNX, normalisation, memory and clipping included, and check that both act alike."""
-    from rare_envs.study.cli.export_ego import export_ego
+    from rare_envs.study.cli.commands.export_ego import export_ego
 
     with keep_stdout_for_the_answer():
         done = export_ego(model, out, algo=algo, trust=trust, stats=stats)
@@ -374,6 +375,7 @@ def replay_command(
 
 app.command("export")(export_command)
 app.add_typer(corpus_app, name="corpus")
+app.add_typer(bench_app, name="bench")
 app.command("plan")(plan_command)
 app.command("report")(report_command)
 
@@ -421,7 +423,7 @@ def serve_ego_command(
     trust: TrustOption = False,
 ) -> None:
     """Lend an ego to simulations in other processes or on other machines (estimate --ego tcp://...)."""
-    from rare_envs.study.cli.serve_ego import serve_ego
+    from rare_envs.study.cli.commands.serve_ego import serve_ego
 
     serve_ego(ego, bind, algo=algo, trust=trust, stats=stats)
 

@@ -6,7 +6,7 @@ import pytest
 
 from benchmarks.estimators import against_openturns, overhead
 from benchmarks.estimators.against_openturns import ALGORITHMS, run_openturns
-from benchmarks.estimators.runs import Job, limit_state
+from samplers.benchmark.runs import Job, limit_state
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)

@@ -6,7 +6,7 @@ import pytest
 from scipy import stats
 
 import samplers
-from benchmarks.estimators.catalogue import CASES
+from samplers.benchmark.catalogue import PROBLEMS
 from samplers.limit_states import Reference, four_branches, half_space, plateau, shell
 from samplers.problem import FunctionProblem
 
@@ -357,7 +357,7 @@ def test_stopped_in_the_estimate():
 
 def case(name):
     """A problem of the benchmark for which no proposal is to be found."""
-    state = CASES[name].make()
+    state = PROBLEMS[name].make()
     return Reference(name, state.problem(), state.p)
 
 

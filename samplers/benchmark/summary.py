@@ -7,9 +7,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import stats
 
-from benchmarks.estimators.catalogue import CASES
-from benchmarks.estimators.runs import MethodRun, limit_state
+from samplers.benchmark.runs import OWN_CATALOGUE, MethodRun, limit_state
 from samplers.problem import FloatArray
 
 
@@ -36,6 +36,9 @@ class Cell:
     gain_se: float
     """Standard error of the gain, that of the mean square error only."""
     coverage: float
+    """Share of the intervals that hold p."""
+    below: float
+    """Share of the intervals that are wholly below p: the unsafe side."""
     warned: float
     worst: float
     """Largest |estimate / p - 1|."""
@@ -43,18 +46,32 @@ class Cell:
     calls: float
     seconds: float
     """Processor time of one run without f."""
+    max_sim: int | None = None
+    """The budget; None for no limit."""
+    hidden: float = 0.0
+    """Share of the runs that state another number of simulations than were made."""
+    reference_error: float = 0.0
+    """Standard error of p itself, over p."""
+
+    @property
+    def coverage_interval(self) -> tuple[float, float]:
+        """Return the 95 % interval of the coverage, of so many runs (Clopper and Pearson 1934)."""
+        held = round(self.coverage * self.runs)
+        found = stats.binomtest(held, self.runs).proportion_ci(0.95, method="exact")
+        return float(found.low), float(found.high)
 
 
-def cells_of(runs: Iterable[MethodRun]) -> list[Cell]:
-    """Return one cell for each method and problem, in the order of their first runs."""
-    groups: dict[tuple[str, str], list[MethodRun]] = defaultdict(list)
+def cells_of(runs: Iterable[MethodRun], catalogue: str = OWN_CATALOGUE) -> list[Cell]:
+    """Return one cell for each method, problem and budget, in the order of their first runs."""
+    groups: dict[tuple[str, str, int | None], list[MethodRun]] = defaultdict(list)
     for run in runs:
-        groups[run.method, run.problem].append(run)
-    return [cell_of(group, limit_state(group[0].problem).p) for group in groups.values()]
+        groups[run.method, run.problem, run.max_sim].append(run)
+    states = [limit_state(group[0].problem, catalogue) for group in groups.values()]
+    return [cell_of(group, state.p, state.standard_error) for group, state in zip(groups.values(), states, strict=True)]
 
 
-def cell_of(runs: Sequence[MethodRun], p: float) -> Cell:
-    """Summarise the runs of one method on one problem with probability p."""
+def cell_of(runs: Sequence[MethodRun], p: float, standard_error: float = 0.0) -> Cell:
+    """Summarise the runs of one method on one problem with probability p, known to a standard error."""
     ended = [run for run in runs if not run.error]
     estimates = np.array([run.p for run in ended])
     ratio = estimates / p if p > 0 else np.full(len(ended), math.nan)
@@ -77,12 +94,21 @@ def cell_of(runs: Sequence[MethodRun], p: float) -> Cell:
         gain=gain,
         gain_se=gain * _spread(error) / (_mean(error) * math.sqrt(len(runs))) if _mean(error) > 0 else math.nan,
         coverage=sum(covers(run, p) for run in ended) / len(runs),
+        below=sum(run.high < p for run in ended) / len(runs),
         warned=_mean([bool(run.warnings) for run in ended]),
         worst=float(np.max(np.abs(ratio - 1.0))) if len(ended) else math.nan,
         n_sim=n_sim,
         calls=_mean([run.calls for run in runs]),
         seconds=_mean([run.seconds for run in runs]),
+        max_sim=runs[0].max_sim,
+        hidden=sum(hides_simulations(run) for run in runs) / len(runs),
+        reference_error=standard_error / p if p > 0 else 0.0,
     )
+
+
+def hides_simulations(run: MethodRun) -> bool:
+    """Return whether a run states another number of simulations than it made."""
+    return run.stated is not None and run.stated != run.n_sim
 
 
 def covers(run: MethodRun, p: float) -> bool:
@@ -117,12 +143,12 @@ class Power:
     """Runs with each warning (numbers as #): wrong, right, neither."""
 
 
-def power_of(runs: Iterable[MethodRun]) -> Power:
+def power_of(runs: Iterable[MethodRun], catalogue: str = OWN_CATALOGUE) -> Power:
     """Return the power of the warnings over runs of one method."""
     counts: Counter[str] = Counter()
     texts: dict[str, Counter[str]] = defaultdict(Counter)
     for run in runs:
-        off = own_errors_off(run, limit_state(run.problem).p)
+        off = own_errors_off(run, limit_state(run.problem, catalogue).p)
         kind = "wrong" if off > 4 else "right" if off <= 2 else "neither"
         counts[kind] += 1
         counts[f"{kind} warned"] += bool(run.warnings)
@@ -143,59 +169,6 @@ def power_of(runs: Iterable[MethodRun]) -> Power:
 def without_numbers(text: str) -> str:
     """Replace the numbers in a text by #."""
     return re.sub(r"[-+]?\d(?:[\d,]*\d)?(?:\.\d+)?(?:e[-+]?\d+)?", "#", text)
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """A target and what was measured."""
-
-    target: str
-    measured: float
-    met: bool
-
-
-def pooled_coverage(cells: Sequence[Cell]) -> tuple[float, int]:
-    """Return coverage over all runs and their number, but for p = 0 and regions that cannot be known of."""
-    counted = [cell for cell in cells if cell.p > 0 and CASES[cell.problem].min_coverage is not None]
-    runs = sum(cell.runs for cell in counted)
-    return (sum(cell.coverage * cell.runs for cell in counted) / runs if runs else math.nan), runs
-
-
-def verdicts(cells: Sequence[Cell], power: Power, replicates: int = 1) -> list[Verdict]:
-    """Compare the cells of one method with what it should reach.
-
-    The default method has targets for gain, bias, intervals and warnings; the others for coverage only.
-    """
-    if cells[0].method != "two-stage":
-        needed = 0.93 if replicates >= 10 else 0.88
-        pooled, _ = pooled_coverage(cells)
-        return [Verdict(f"pooled coverage >= {needed:.0%}", pooled, pooled >= needed)]
-    out = []
-    for cell in cells:
-        case = CASES[cell.problem]
-        if case.min_gain is not None:
-            out.append(Verdict(f"{cell.problem}: gain >= {case.min_gain:,g}", cell.gain, cell.gain >= case.min_gain))
-        if cell.p == 0 or case.min_coverage is None:
-            continue
-        ratio = cell.own_over_cov
-        coverage = f"{cell.problem}: coverage >= {case.min_coverage:.0%}"
-        out += [
-            Verdict(coverage, cell.coverage, cell.coverage >= case.min_coverage),
-            Verdict(f"{cell.problem}: mean/p within 3 %", cell.mean_over_p, abs(cell.mean_over_p - 1) <= 0.03),
-            Verdict(f"{cell.problem}: own c.o.v. 0.8 to 1.3 of the real one", ratio, 0.8 <= ratio <= 1.3),
-        ]
-    pooled, _ = pooled_coverage(cells)
-    wrong, right = _share(power.wrong_warned, power.wrong), _share(power.right_warned, power.right)
-    return [
-        *out,
-        Verdict("pooled coverage >= 93%", pooled, pooled >= 0.93),
-        Verdict("wrong runs warned >= 80 %", wrong, power.wrong == 0 or wrong >= 0.80),
-        Verdict("right runs warned <= 5 %", right, power.right == 0 or right <= 0.05),
-    ]
-
-
-def _share(part: int, whole: int) -> float:
-    return part / whole if whole else math.nan
 
 
 def _mean(values: Sequence[float] | FloatArray) -> float:

@@ -1,9 +1,7 @@
 import numpy as np
 import pytest
 
-from benchmarks.estimators.catalogue import CASES
-from benchmarks.estimators.high_dimensional import network, slabs, squares
-from benchmarks.estimators.limit_states import (
+from samplers.benchmark.analytic_states import (
     bowl,
     concave,
     corner,
@@ -31,9 +29,6 @@ NEAR = {
     "strip": strip(4, beta=1.0),
     "ring": ring_part(5, p_radius=0.3, beta=0.8),
     "box": hidden_box(beta=1.5),
-    "slabs": slabs(20, 2.5),
-    "squares": squares(50, 1.0, 8.0),
-    "squares, flatter": squares(20, 0.5, 13.0),
 }
 
 
@@ -45,29 +40,6 @@ def test_probability_against_monte_carlo(state, rotation):
     u = np.random.default_rng(1).standard_normal((n, state.dim))
     share = np.mean(state.problem(rotation).evaluate(u) <= 0)
     assert share == pytest.approx(state.p, abs=4 * np.sqrt(state.p / n))
-
-
-@pytest.mark.parametrize("name", CASES)
-def test_catalogue(name):
-    state = CASES[name].make()
-    assert name.endswith(f"_d{state.dim}")
-    assert 0 < state.p < 0.05 or name == "never_d4"
-    rotated = state.problem(rotation=7)
-    u = 2 * np.random.default_rng(2).standard_normal((200, state.dim))
-    f = rotated.evaluate(u)
-    assert f.shape == (200,)
-    assert np.isfinite(f).all()
-    if not state.noise:
-        np.testing.assert_allclose(f, state.problem().evaluate(u @ random_rotation(state.dim, 7)))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("dim", [30, 400])
-def test_probability_of_networks(dim):
-    """Drawn input by input, where the reference draws what reaches the layer."""
-    state, n, rng = network(dim), 1_000_000, np.random.default_rng(5)
-    hits = sum(np.count_nonzero(state.f(rng.standard_normal((n // 100, dim))) <= 0) for _ in range(100))
-    assert hits / n == pytest.approx(state.p, abs=4 * np.sqrt(state.p / n))
 
 
 def test_never_is_zero():

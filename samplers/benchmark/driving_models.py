@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from benchmarks.estimators.limit_states import LimitState
+from samplers.benchmark.analytic_states import LimitState
 from samplers.problem import FloatArray
 
 TTC_CAP = 10.0
-STEP = 0.1
+TIME_STEP = 0.1
 """Time step [s]."""
 
 
@@ -65,16 +65,16 @@ def follow(x: FloatArray, reaction: float = 0.6, max_braking: float = 6.0, horiz
     lead, speed, gap = x.T.copy()
     least = np.full(len(x), TTC_CAP)
     active = speed > lead
-    for step in range(round(horizon / STEP)):
+    for step in range(round(horizon / TIME_STEP)):
         closing = speed - lead
         least = np.where(active, np.minimum(least, _ttc(gap, closing)), least)
         braking = np.clip(driver(speed, gap, closing), -max_braking, driver.acceleration)
-        next_speed = np.maximum(speed + STEP * (braking if step >= round(reaction / STEP) else 0.0), 0.0)
-        gap = gap + STEP * (lead - 0.5 * (speed + next_speed))
+        next_speed = np.maximum(speed + TIME_STEP * (braking if step >= round(reaction / TIME_STEP) else 0.0), 0.0)
+        gap = gap + TIME_STEP * (lead - 0.5 * (speed + next_speed))
         speed = next_speed
         least[active & (gap <= 0)] = -1.0
         active &= gap > 0
-        if step > round(reaction / STEP):
+        if step > round(reaction / TIME_STEP):
             active &= speed > lead
             if not active.any():
                 break
@@ -105,8 +105,8 @@ def cut_in_front(x: FloatArray, reaction: float = 0.5, max_braking: float = 6.5,
     least = np.full(len(x), TTC_CAP)
     collided = np.zeros(len(x), dtype=bool)
     noticed = np.full(len(x), np.inf)
-    for step in range(round(horizon / STEP)):
-        time = step * STEP
+    for step in range(round(horizon / TIME_STEP)):
+        time = step * TIME_STEP
         done = min(time / duration, 1.0)
         lateral = offset * (1 - 3 * done**2 + 2 * done**3)
         noticed = np.where((lateral < notice) & np.isinf(noticed), time, noticed)
@@ -116,11 +116,11 @@ def cut_in_front(x: FloatArray, reaction: float = 0.5, max_braking: float = 6.5,
         least = np.where(collided, -1.0, np.minimum(least, ttc))
         follows = (time >= noticed + reaction) & (gap > -length)
         wish = np.minimum(driver(ego, to_leader, ego - leader), np.where(follows, driver(ego, gap, closing), np.inf))
-        next_ego = np.maximum(ego + STEP * np.clip(wish, -max_braking, driver.acceleration), 0.0)
-        next_other = np.maximum(other + STEP * _settling(other, leader, to_leader - length - gap), 0.0)
-        travelled = 0.5 * STEP * (ego + next_ego)
-        gap = gap + 0.5 * STEP * (other + next_other) - travelled
-        to_leader = to_leader + STEP * leader - travelled
+        next_ego = np.maximum(ego + TIME_STEP * np.clip(wish, -max_braking, driver.acceleration), 0.0)
+        next_other = np.maximum(other + TIME_STEP * _settling(other, leader, to_leader - length - gap), 0.0)
+        travelled = 0.5 * TIME_STEP * (ego + next_ego)
+        gap = gap + 0.5 * TIME_STEP * (other + next_other) - travelled
+        to_leader = to_leader + TIME_STEP * leader - travelled
         ego, other = next_ego, next_other
     return least
 

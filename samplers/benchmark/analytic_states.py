@@ -2,7 +2,7 @@
 
 More than `samplers.limit_states`, which it builds on: several regions in many dimensions, noise, jumps, ties, islands,
 intersections. All are written along the axes; N(0, I) is the same in every direction, so any rotation of them has the
-same p. `benchmarks.estimators.catalogue` has the parameters; the probabilities are closed forms or one-dimensional
+same p. `samplers.benchmark.catalogue` has the parameters; the probabilities are closed forms or one-dimensional
 integrals.
 """
 
@@ -18,14 +18,14 @@ from scipy.stats import chi2, ncx2
 from samplers.limit_states import Reference, integrate, normal_cdf, normal_mean
 from samplers.problem import FloatArray, FunctionProblem
 
-Function = Callable[[FloatArray], FloatArray]
+PointFunction = Callable[[FloatArray], FloatArray]
 
 
 @dataclass(frozen=True)
 class LimitState:
     """f, failing where f <= 0, and how likely that is."""
 
-    f: Function
+    f: PointFunction
     """Maps points of N(0, I), shape (n, d), to (n,)."""
     dim: int
     p: float
@@ -185,11 +185,11 @@ def never(dim: int = 4) -> LimitState:
     return LimitState(lambda u: np.asarray(50.0 - u[:, 0]), dim, 0.0)
 
 
-def _rotated(f: Function, rotation: FloatArray) -> Function:
+def _rotated(f: PointFunction, rotation: FloatArray) -> PointFunction:
     return lambda u: f(u @ rotation)
 
 
-def _noisy(f: Function, sd: float, seed: int) -> Function:
+def _noisy(f: PointFunction, sd: float, seed: int) -> PointFunction:
     rng = np.random.default_rng([seed, 777])
     return lambda u: f(u) + sd * rng.standard_normal(len(u))
 

@@ -1,25 +1,21 @@
 """Limit states that no mixture of a few thousand points describes: dozens of regions, or no direction that matters.
 
-    python -m benchmarks.estimators.high_dimensional --draws 4e7
-
-computes the probabilities of the random networks, which have no closed form, by plain Monte Carlo.
+The random networks have no closed form: `benchmarks.estimators.network_references` counts 4e7 plain draws of each.
 """
 
 import math
-from typing import Annotated
 
 import numpy as np
-import typer
 from scipy.integrate import quad
 from scipy.special import ndtr
 
-from benchmarks.estimators.limit_states import LimitState
+from samplers.benchmark.analytic_states import LimitState
 from samplers.problem import FloatArray
 
 HIDDEN, OUTPUTS = 50, 10
 """Units of a random network's layer, and its outputs."""
 NETWORKS = {30: (3.5, 3.0200e-4, 2.7e-6), 400: (3.3, 2.5473e-4, 2.5e-6)}
-"""Inputs to limit, p and its standard error (this module's command)."""
+"""Inputs to limit, p and its standard error (`benchmarks.estimators.network_references`)."""
 
 
 def slabs(dim: int, beta: float) -> LimitState:
@@ -42,33 +38,13 @@ def squares(dim: int, power: float, limit: float) -> LimitState:
 
 def network(dim: int) -> LimitState:
     """A random network of one layer: f = limit - max |tanh(2 u W) V|, W and V Gaussian of variance 1 / inputs."""
-    first, second = _weights(dim)
+    first, second = network_weights(dim)
     limit, p, error = NETWORKS[dim]
     return LimitState(lambda u: limit - np.abs(np.tanh(2.0 * u @ first) @ second).max(axis=1), dim, p, error)
 
 
-def _weights(dim: int) -> tuple[FloatArray, FloatArray]:
+def network_weights(dim: int) -> tuple[FloatArray, FloatArray]:
+    """Return the weights of a random network's two layers, (dim, units) and (units, outputs)."""
     rng = np.random.default_rng(3)
     first = rng.standard_normal((dim, HIDDEN)) / math.sqrt(dim)
     return first, rng.standard_normal((HIDDEN, OUTPUTS)) / math.sqrt(HIDDEN)
-
-
-def main(
-    draws: Annotated[float, typer.Option(help="Plain draws for each network.")] = 4e7,
-    seed: Annotated[int, typer.Option(help="Of the draws.")] = 0,
-) -> None:
-    """Print P[f <= 0] of the random networks; u W is N(0, W'W), so a draw has one coordinate for each unit."""
-    rng, batch = np.random.default_rng(seed), 100_000
-    for dim, (limit, *_) in NETWORKS.items():
-        first, second = _weights(dim)
-        root = np.linalg.qr(first, mode="r")  # W'W = R'R
-        hits = sum(
-            int(np.count_nonzero(np.abs(np.tanh(2.0 * z @ root) @ second).max(axis=1) >= limit))
-            for z in (rng.standard_normal((batch, len(root))) for _ in range(math.ceil(draws / batch)))
-        )
-        n = batch * math.ceil(draws / batch)
-        print(f"{dim} inputs: p = {hits / n:.5e}, standard error {math.sqrt(hits) / n:.1e}")
-
-
-if __name__ == "__main__":
-    typer.run(main)

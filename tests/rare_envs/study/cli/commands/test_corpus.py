@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from rare_envs.study.cli.corpus import FAILS
+from rare_envs.study.cli.commands.corpus import FAILS
 from tests.rare_envs.study.refusals import SMALL, Cli, assert_refused
 
 

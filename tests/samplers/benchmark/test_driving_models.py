@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from benchmarks.estimators.driving_models import (
+from benchmarks.estimators.driving_references import reference
+from samplers.benchmark.driving_models import (
     car_following,
     cut_in,
     cut_in_front,
@@ -10,7 +11,6 @@ from benchmarks.estimators.driving_models import (
     follow,
     traffic_states,
 )
-from benchmarks.estimators.driving_references import reference
 
 
 @pytest.mark.parametrize(("model", "sd"), [(car_following, 1.7), (cut_in, 1.4)])

@@ -1,0 +1,104 @@
+"""Page of a benchmark: one table for each method and budget, its worst problems first.
+
+Methods are in the order of their names and in no ranking: no single number says which is best.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+PAGE_COLUMNS = (
+    "problem | p | mean / p | gain | coverage % (95 %) | below p % | above p % | own / real c.o.v. | warned % "
+    "| simulations | own time [ms] | faults"
+)
+EXPLANATION = """\
+- *mean / p*: mean of the estimates over the known probability, with its standard error.
+- *gain*: variance of plain Monte Carlo at as many simulations, over the mean square error.
+- *coverage*: runs whose 95 % interval holds p, with the interval that so many runs allow (Clopper and Pearson).
+- *below p*, *above p*: runs whose interval is wholly below p, the unsafe side, and wholly above.
+- *own / real c.o.v.*: what the runs state over the spread of their estimates.
+- *simulations*: all that were made, counted by the benchmark, search and fit included.
+- *own time*: processor time of a run without f.
+- *faults*: what the number of runs cannot explain (`samplers.benchmark.find_faults`).
+"""
+
+
+def format_leaderboard(result: Mapping[str, Any]) -> str:
+    """Return the page of a benchmark as Markdown.
+
+    Args:
+        result: What `rare_envs.study.sampler_benchmark.study.summarise_study` returns.
+    """
+    about = result["about"]
+    plan = about["plan"]
+    lines = [
+        "# Samplers on problems with known probabilities",
+        "",
+        f"{plan['runs']} runs of each method on {len(plan['problems'])} problems, budgets of "
+        f"{_join(f'{each:,}' for each in plan['budgets'])} simulations, seeds from {plan['seed']}. "
+        f"rare_envs {about['rare_envs']}, NumPy {about['numpy']}, SciPy {about['scipy']}, Python {about['python']}, "
+        f"{about['processor']}.",
+        "",
+        EXPLANATION,
+    ]
+    for method in sorted(plan["methods"]):
+        lines += [f"## {method}", "", _describe_warnings(result["warnings"][method]), ""]
+        for budget in plan["budgets"]:
+            cells = [cell for cell in result["cells"] if (cell["method"], cell["max_sim"]) == (method, budget)]
+            lines += [f"### {budget:,} simulations", "", *_format_table(cells), ""]
+    lines += ["## Problems", "", "| problem | set | dimensions | p | standard error | how it is known |"]
+    lines += ["|---|---|---|---|---|---|"]
+    for name, problem in result["problems"].items():
+        error = f"{problem['standard_error']:.1e}" if problem["standard_error"] else "0"
+        known = problem["reference"] + ("" if problem["knowable"] else "; no method can know of its main region")
+        lines.append(f"| {name} | {problem['group']} | {problem['dim']} | {problem['p']:.5g} | {error} | {known} |")
+    return "\n".join(lines) + "\n"
+
+
+def sort_worst_first(cells: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """Return the cells of a method: those with most faults first, then by coverage and gain, the least first."""
+    return sorted(
+        cells,
+        key=lambda cell: (-len(cell["faults"]), cell["coverage"], math.inf if cell["gain"] is None else cell["gain"]),
+    )
+
+
+def _format_table(cells: Sequence[Mapping[str, Any]]) -> list[str]:
+    rows = [f"| {PAGE_COLUMNS} |", "|---" * (PAGE_COLUMNS.count("|") + 1) + "|"]
+    return rows + [_format_row(cell) for cell in sort_worst_first(cells)]
+
+
+def _format_row(cell: Mapping[str, Any]) -> str:
+    low, high = cell["coverage_interval"]
+    above = max(0.0, 1.0 - cell["coverage"] - cell["below"] - cell["raised"] / cell["runs"])
+    values = [
+        cell["problem"],
+        f"{cell['p']:.3g}",
+        f"{_number(cell['mean_over_p'], '.3f')} ± {_number(cell['mean_se'], '.3f')}",
+        _number(cell["gain"], ",.3g"),
+        f"{100 * cell['coverage']:.0f} ({100 * low:.0f} to {100 * high:.0f})",
+        f"{100 * cell['below']:.0f}",
+        f"{100 * above:.0f}",
+        _number(cell["own_over_cov"], ".2f"),
+        _number(cell["warned"], ".0%").rstrip("%"),
+        f"{cell['n_sim']:,.0f}",
+        f"{1e3 * cell['seconds']:,.0f}",
+        "; ".join(cell["faults"]),
+    ]
+    return f"| {' | '.join(values)} |"
+
+
+def _describe_warnings(power: Mapping[str, Any]) -> str:
+    """Return how often the warnings of a method come with the runs that are wrong, and with those that are right."""
+    wrong = f"{power['wrong_warned']} of {power['wrong']} runs that are off by more than 4 of their own standard errors"
+    return f"Warned: {wrong}; {power['right_warned']} of {power['right']} within 2."
+
+
+def _number(value: float | None, spec: str) -> str:
+    return "-" if value is None else format(value, spec)
+
+
+def _join(words: Any) -> str:
+    return ", ".join(words)

@@ -1,0 +1,52 @@
+"""Problems of the benchmark: those of `samplers.benchmark`, and scenarios whose collisions were counted."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+from rare_envs.problem import DrivingProblem
+from samplers.benchmark import PROBLEMS, BenchmarkProblem, LimitState
+
+
+class CountedCollisions(NamedTuple):
+    """Collisions of the IDM ego in plain draws from a base distribution.
+
+    Example:
+        >>> counted = COUNTED_COLLISIONS["cut_in_us101_d6"]
+        >>> f"{counted.collisions / counted.rollouts:.2e}"
+        '7.83e-04'
+    """
+
+    env_id: str
+    base: str
+    collisions: int
+    rollouts: int
+
+
+COUNTED_COLLISIONS = {
+    "following_us101_d3": CountedCollisions("rare_envs/CarFollowing-v0", "us101-gap", 2459, 20_000_000),
+    "following_highway_d3": CountedCollisions("rare_envs/CarFollowing-v0", "highway", 5045, 20_000_000),
+    "cut_in_us101_d6": CountedCollisions("rare_envs/CutIn-v0", "us101-15-offsets", 15_667, 20_000_000),
+    "cut_in_highway_d6": CountedCollisions("rare_envs/CutIn-v0", "highway", 6062, 20_000_000),
+}
+"""As `python -m benchmarks.estimators.truth --rollouts 2e7` has counted them."""
+
+
+def make_driving_state(counted: CountedCollisions) -> LimitState:
+    """Return a scenario as a limit state in standard normal space."""
+    problem = DrivingProblem(counted.env_id, base=counted.base)
+    p = counted.collisions / counted.rollouts
+    error = (p * (1 - p) / counted.rollouts) ** 0.5
+    return LimitState(lambda u: problem.evaluate(problem.base.from_standard_normal(u)), problem.dim, p, error)
+
+
+ALL_PROBLEMS: dict[str, BenchmarkProblem] = {
+    **PROBLEMS,
+    **{
+        name: BenchmarkProblem(partial(make_driving_state, counted), "driving", f"{counted.rollouts:,} plain rollouts")
+        for name, counted in COUNTED_COLLISIONS.items()
+    },
+}
+GROUPS = tuple(dict.fromkeys(problem.group for problem in ALL_PROBLEMS.values()))
+"""Names of the sets of problems."""

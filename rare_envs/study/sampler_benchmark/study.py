@@ -1,0 +1,189 @@
+"""A benchmark of samplers in a folder: each run is a line of a file, so that it goes on where it has ended."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import rare_envs
+from rare_envs.files import replace_text
+from rare_envs.json_text import format_json
+from rare_envs.study.errors import BadInput
+from rare_envs.study.sampler_benchmark.leaderboard import format_leaderboard
+from rare_envs.study.sampler_benchmark.problems import ALL_PROBLEMS, GROUPS
+from samplers.benchmark import Job, MethodRun, cells_of, find_faults, power_of, run_all, run_once
+from samplers.benchmark.runs import about, find_method
+from samplers.serialization import to_json_value
+
+RUNS_FILE, RESULT_FILE, PAGE_FILE = "runs.jsonl", "benchmark.json", "leaderboard.md"
+CATALOGUE = "rare_envs.study.sampler_benchmark.problems:ALL_PROBLEMS"
+
+
+@dataclass(frozen=True)
+class BenchmarkPlan:
+    """What is to be run.
+
+    Example:
+        >>> plan = BenchmarkPlan(("mc",), ("lin_d2", "rp75_d2"), (1000,), runs=3)
+        >>> len(plan.jobs()), plan.jobs()[0].problem
+        (6, 'lin_d2')
+    """
+
+    methods: tuple[str, ...]
+    problems: tuple[str, ...]
+    budgets: tuple[int, ...]
+    runs: int = 20
+    seed: int = 0
+    """Of the first run; the runs have successive seeds."""
+
+    def __post_init__(self) -> None:
+        if not (self.methods and self.problems and self.budgets):
+            raise ValueError("Expected methods, problems and budgets, at least one of each.")
+        if self.runs < 2 or min(self.budgets) < 1:
+            raise ValueError(f"Expected 2 runs and budgets of 1 at least, got {self.runs} and {min(self.budgets)}.")
+        unknown = [name for name in self.problems if name not in ALL_PROBLEMS]
+        if unknown:
+            raise ValueError(f"Unknown problem {unknown[0]!r}; known: {', '.join(ALL_PROBLEMS)}.")
+        for name in self.methods:
+            find_method(name)
+
+    def jobs(self) -> list[Job]:
+        """Return the runs, those of one seed for all problems and methods before those of the next."""
+        return [
+            Job(method, problem, self.seed + run, budget, catalogue=CATALOGUE)
+            for run in range(self.runs)
+            for budget in self.budgets
+            for problem in self.problems
+            for method in self.methods
+        ]
+
+
+def choose_problems(groups: Sequence[str], names: Sequence[str] = ()) -> tuple[str, ...]:
+    """Return the problems of some sets, or those that are named.
+
+    Raises:
+        ValueError: A set is not known.
+    """
+    if names:
+        return tuple(names)
+    unknown = [group for group in groups if group not in GROUPS]
+    if unknown:
+        raise ValueError(f"Unknown set {unknown[0]!r}; known: {', '.join(GROUPS)}.")
+    return tuple(name for name, problem in ALL_PROBLEMS.items() if problem.group in groups)
+
+
+def run_study(
+    plan: BenchmarkPlan, out: Path, workers: int = 1, executor: Executor | None = None, progress: bool = False
+) -> dict[str, Any]:
+    """Make the runs of a plan that a folder does not have yet, and write figures and page.
+
+    Args:
+        plan: What is to be run.
+        out: Folder of the files.
+        workers: Processes.
+        executor: Where runs are made instead, any `concurrent.futures.Executor`.
+        progress: Whether to show a bar.
+
+    Returns:
+        What `benchmark.json` has: machine and versions, cells, faults, power of the warnings, runs.
+
+    Raises:
+        BadInput: The folder has runs of another version of the package, or damaged ones.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    file = out / RUNS_FILE
+    done = {_key(run): run for run in read_runs(file)}
+    wanted = plan.jobs()
+    missing = [job for job in wanted if _key(job) not in done]
+    made = run_all(missing, workers, run_once, executor)
+    with file.open("a", encoding="utf-8") as lines:
+        if not done:
+            lines.write(json.dumps({"rare_envs": rare_envs.__version__}) + "\n")
+        for run in _show_progress(made, len(missing)) if progress else made:
+            done[_key(run)] = run
+            lines.write(json.dumps(to_json_value(asdict(run))) + "\n")
+            lines.flush()
+    result = summarise_study(plan, [done[_key(job)] for job in wanted])
+    replace_text(out / RESULT_FILE, format_json(result))
+    replace_text(out / PAGE_FILE, format_leaderboard(result))
+    return result
+
+
+def summarise_study(plan: BenchmarkPlan, runs: Sequence[MethodRun]) -> dict[str, Any]:
+    """Return the figures of runs as plain values for JSON."""
+    cells = cells_of(runs, CATALOGUE)
+    return to_json_value(  # type: ignore[no-any-return]  # a dict in, a dict out
+        {
+            "about": about(rare_envs=rare_envs.__version__, plan=asdict(plan)),
+            "problems": {name: _describe_problem(name) for name in plan.problems},
+            "cells": [
+                {
+                    **asdict(cell),
+                    "coverage_interval": cell.coverage_interval,
+                    "faults": find_faults(cell, ALL_PROBLEMS[cell.problem].knowable),
+                }
+                for cell in cells
+            ],
+            "warnings": {
+                name: asdict(power_of([run for run in runs if run.method == name], CATALOGUE)) for name in plan.methods
+            },
+            "runs": [asdict(run) for run in runs],
+        }
+    )
+
+
+def read_runs(file: Path) -> list[MethodRun]:
+    """Return the runs of a file, none if there is no such file.
+
+    Raises:
+        BadInput: It is damaged, or of another version of the package.
+    """
+    if not file.is_file():
+        return []
+    runs = []
+    for number, line in enumerate(file.read_text(encoding="utf-8").splitlines(), 1):
+        try:
+            content = json.loads(line)
+            if number == 1:
+                version = content["rare_envs"]
+                continue
+            numbers = {name: math.nan if content[name] is None else content[name] for name in ("p", "low", "high")}
+            cov = math.inf if content["cov"] is None else content["cov"]
+            runs.append(MethodRun(**{**content, **numbers, "cov": cov, "warnings": tuple(content["warnings"])}))
+        except (ValueError, KeyError, TypeError) as error:
+            raise BadInput(f"{file}, line {number} is no run of a benchmark; take the line out. {error}") from None
+    if runs and version != rare_envs.__version__:
+        raise BadInput(
+            f"{file} has runs of rare_envs {version}, this is {rare_envs.__version__}: choose another --out."
+        )
+    return runs
+
+
+def _describe_problem(name: str) -> dict[str, Any]:
+    """Return what is known of a problem."""
+    problem = ALL_PROBLEMS[name]
+    state = problem.make()
+    return {
+        "group": problem.group,
+        "dim": state.dim,
+        "p": state.p,
+        "standard_error": state.standard_error,
+        "reference": problem.reference,
+        "knowable": problem.knowable,
+    }
+
+
+def _key(run: Job | MethodRun) -> tuple[str, str, int, int | None]:
+    return run.method, run.problem, run.seed, run.max_sim
+
+
+def _show_progress(runs: Iterator[MethodRun], total: int) -> Iterator[MethodRun]:
+    from rich.console import Console
+    from rich.progress import track
+
+    yield from track(runs, total=total, console=Console(stderr=True), description="runs")

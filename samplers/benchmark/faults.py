@@ -1,0 +1,62 @@
+"""Faults of a method on a problem, each beyond what the number of runs can explain."""
+
+from __future__ import annotations
+
+import math
+
+from scipy import stats
+
+from samplers.benchmark.summary import Cell
+
+BIAS_ERRORS = 4.0
+"""Standard errors that a mean may be off: by chance 1 of 16,000 unbiased means is further off."""
+NOTICED_BIAS = 0.02
+"""Bias below which nobody would mind, over p."""
+NOMINAL_COVERAGE = 0.95
+CHANCE = 1e-3
+"""Probability that a method of nominal coverage is called one that covers too little."""
+BUDGET_EXCESS = 0.01
+"""Share of the budget by which it may be exceeded."""
+
+
+def find_faults(cell: Cell, knowable: bool = True) -> tuple[str, ...]:
+    """Return the faults of a method on a problem in words; none where it does what it claims.
+
+    Args:
+        cell: Its runs.
+        knowable: False where no method can know of a region of failure: bias and coverage are not judged there.
+
+    Example:
+        An unbiased method with intervals that hold p in 14 of 20 runs:
+
+        >>> cell = Cell(
+        ...     method="own", problem="lin_d2", p=2.3e-4, runs=20, raised=0, mean_over_p=1.01, mean_se=0.01, cov=0.05,
+        ...     own_cov=0.02, own_over_cov=0.4, gain=290.0, gain_se=90.0, coverage=0.7, below=0.15, warned=0.0,
+        ...     worst=0.1, n_sim=6000.0, calls=50.0, seconds=0.1)
+        >>> find_faults(cell)
+        ('intervals hold p in 70 % of 20 runs (46 to 88 %)',)
+    """
+    found = []
+    if cell.raised:
+        found.append(f"raised in {cell.raised} of {cell.runs} runs")
+    if cell.hidden:
+        found.append(f"states fewer simulations than it made in {100 * cell.hidden:.0f} % of the runs")
+    if cell.max_sim is not None and cell.n_sim > (1 + BUDGET_EXCESS) * cell.max_sim:
+        found.append(f"makes {cell.n_sim / cell.max_sim:.2g} times the simulations of its budget")
+    if not knowable:
+        return tuple(found)
+    bias = cell.mean_over_p - 1.0
+    error = math.hypot(cell.mean_se, cell.reference_error)
+    if abs(bias) > max(BIAS_ERRORS * error, NOTICED_BIAS):
+        found.append(f"biased: mean / p {cell.mean_over_p:.3g} +- {error:.2g}")
+    if _is_too_low(cell):
+        low, high = cell.coverage_interval
+        held = f"intervals hold p in {100 * cell.coverage:.0f} % of {cell.runs} runs"
+        found.append(f"{held} ({100 * low:.0f} to {100 * high:.0f} %)")
+    return tuple(found)
+
+
+def _is_too_low(cell: Cell) -> bool:
+    """Return whether a method that covers as it claims would hardly ever cover so little."""
+    held = round(cell.coverage * cell.runs)
+    return float(stats.binom.cdf(held, cell.runs, NOMINAL_COVERAGE)) < CHANCE

@@ -1,0 +1,310 @@
+"""Runs of methods on problems with known p; whatever a method raises or hides is recorded."""
+
+from __future__ import annotations
+
+import importlib
+import math
+import platform
+import time
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from functools import cache
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy
+
+from samplers.benchmark.analytic_states import LimitState
+from samplers.benchmark.catalogue import BenchmarkProblem
+from samplers.benchmark.openturns_methods import OPENTURNS
+from samplers.estimation import estimate
+from samplers.method import Stepping
+from samplers.problem import FloatArray, FunctionProblem
+from samplers.registry import METHODS
+from samplers.result import Estimate
+
+OWN_CATALOGUE = "samplers.benchmark.catalogue:PROBLEMS"
+GUARD_FACTOR = 50
+"""Times its budget that a method of somebody else may simulate before it is stopped."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run to be made.
+
+    Example:
+        >>> run = run_once(Job("mc", "lin_d2", seed=1, max_sim=1000))
+        >>> run.n_sim, run.stated, run.p, run.error
+        (1000, 1000, 0.0, '')
+    """
+
+    method: str
+    """A name of `samplers.METHODS`, or `module:attribute`; see `find_method`."""
+    problem: str
+    seed: int
+    max_sim: int | None = None
+    replicates: int = 1
+    rotation: int | None = None
+    """Seed of the rotation of the input space; None for the catalogue's own."""
+    catalogue: str = OWN_CATALOGUE
+    """Module and attribute of the problems by name."""
+
+
+@dataclass(frozen=True)
+class MethodRun:
+    """What came of it."""
+
+    method: str
+    problem: str
+    seed: int
+    p: float
+    low: float
+    high: float
+    cov: float
+    n_sim: int
+    """Points at which f was evaluated."""
+    calls: int
+    """How often f was called."""
+    seconds: float
+    """Processor time without f."""
+    status: str
+    warnings: tuple[str, ...] = ()
+    error: str = ""
+    """What the method raised, if it did; the estimate is then NaN."""
+    max_sim: int | None = None
+    """The budget; None for no limit."""
+    stated: int | None = None
+    """Simulations that the method states, None if it does not say; fewer than `n_sim` are hidden ones."""
+
+
+Solver = Callable[..., Any]
+"""Called as solver(problem, seed=..., max_sim=...); returns p, low and high, with the c.o.v. if it knows it, or an
+object with `p`, `interval` and perhaps `cov`."""
+
+
+class Meter:
+    """Counts calls and points of f and the processor time spent in it.
+
+    Args:
+        f: Maps points (n, d) to (n,).
+        limit: Points after which the next call raises `LimitReached`; None for no limit.
+    """
+
+    def __init__(self, f: Callable[[FloatArray], FloatArray], limit: int | None = None) -> None:
+        self.calls, self.points, self.seconds = 0, 0, 0.0
+        self._f, self._limit = f, limit
+
+    def __call__(self, x: FloatArray) -> FloatArray:
+        """Call f."""
+        if self._limit is not None and self.points + len(x) > self._limit:
+            raise LimitReached(f"more than {self._limit:,} evaluations")
+        self.calls += 1
+        self.points += len(x)
+        start = time.process_time()
+        values = self._f(x)
+        self.seconds += time.process_time() - start
+        return values
+
+
+class LimitReached(RuntimeError):
+    """f was asked for more than it may be."""
+
+
+@cache
+def find_problem(name: str, catalogue: str = OWN_CATALOGUE) -> BenchmarkProblem:
+    """Return a problem of a catalogue.
+
+    Raises:
+        ValueError: It has no such problem.
+    """
+    module, _, attribute = catalogue.partition(":")
+    problems = getattr(importlib.import_module(module), attribute)
+    if name not in problems:
+        raise ValueError(f"Unknown problem {name!r} of {catalogue}; known: {', '.join(problems)}.")
+    found: BenchmarkProblem = problems[name]
+    return found
+
+
+@cache
+def limit_state(name: str, catalogue: str = OWN_CATALOGUE) -> LimitState:
+    """Return the limit state of a problem; its p is computed once."""
+    return find_problem(name, catalogue).make()
+
+
+def find_method(name: str) -> Stepping | Solver:
+    """Return a method by its name, or by where it stands.
+
+    Args:
+        name: A name of `samplers.METHODS` or `OPENTURNS`; or `module:attribute`, the attribute a class with the
+            protocol of our methods (`samplers.testing.check_method` checks it) or a `Solver`.
+
+    Raises:
+        ValueError: There is no such method.
+
+    Example:
+        >>> find_method("mc").name
+        'mc'
+    """
+    if name in OPENTURNS:
+        return OPENTURNS[name]
+    if ":" not in name:
+        if name not in METHODS:
+            known = ", ".join([*METHODS, *OPENTURNS])
+            raise ValueError(f"Unknown method {name!r}; known: {known}, or module:attribute.")
+        return METHODS[name]()
+    module, _, attribute = name.partition(":")
+    try:
+        found = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(f"Cannot load the method {name}: {error}") from None
+    if isinstance(found, type):
+        found = found()
+    if isinstance(found, Stepping):
+        return found
+    if not callable(found):
+        raise ValueError(f"Expected {name} to be a method or a function, got {type(found).__name__}.")
+    solver: Solver = found
+    return solver
+
+
+def rotation_of(job: Job) -> int | None:
+    """Return the seed of the rotation that the run is made under."""
+    return find_problem(job.problem, job.catalogue).rotation if job.rotation is None else job.rotation
+
+
+def run_once(job: Job, method: Stepping | Solver | None = None) -> MethodRun:
+    """Make one run. What the method raises is recorded, so that a benchmark goes on.
+
+    Args:
+        job: The run; its method is found by name.
+        method: The method itself instead, of which the job has a name of your choice.
+    """
+    state = limit_state(job.problem, job.catalogue)
+    method = find_method(job.method) if method is None else method
+    own = isinstance(method, Stepping)
+    limit = None if own or job.max_sim is None else GUARD_FACTOR * job.max_sim
+    meter = Meter(state.problem(rotation_of(job), noise_seed=job.seed).evaluate, limit)
+    problem = FunctionProblem(meter, state.dim)
+    with use_one_core():
+        start = time.process_time()
+        try:
+            if isinstance(method, Stepping):
+                answer: Any = estimate(problem, method, seed=job.seed, max_sim=job.max_sim, replicates=job.replicates)
+            else:
+                answer = method(problem, seed=job.seed, max_sim=job.max_sim)
+            return read_answer(job, meter, time.process_time() - start, answer)
+        except Exception as error:
+            return record_failure(job, meter, time.process_time() - start, error)
+
+
+def read_answer(job: Job, meter: Meter, seconds: float, answer: Any) -> MethodRun:
+    """Return the record of a run from what the method returned.
+
+    Raises:
+        TypeError: It is neither a result nor three or four numbers.
+    """
+    if isinstance(answer, Estimate):
+        p, (low, high), cov, stated = answer.p, answer.interval, answer.cov, answer.n_sim
+        status, warnings = str(answer.status), answer.warnings
+    else:
+        if hasattr(answer, "interval"):
+            answer = (answer.p, *answer.interval, getattr(answer, "cov", math.nan))
+        numbers = [float(value) for value in answer]
+        if len(numbers) not in (3, 4):
+            raise TypeError(f"expected p, low, high and perhaps c.o.v., got {len(numbers)} numbers")
+        p, low, high, cov = (*numbers, math.nan)[:4]
+        stated, status, warnings = None, "ended", ()
+    return MethodRun(
+        method=job.method,
+        problem=job.problem,
+        seed=job.seed,
+        p=p,
+        low=low,
+        high=high,
+        cov=cov,
+        n_sim=meter.points,
+        calls=meter.calls,
+        seconds=seconds - meter.seconds,
+        status=status,
+        warnings=tuple(warnings),
+        max_sim=job.max_sim,
+        stated=stated,
+    )
+
+
+def record_failure(job: Job, meter: Meter, seconds: float, error: Exception) -> MethodRun:
+    """Return the record of a run that raised."""
+    nan = float("nan")
+    return MethodRun(
+        method=job.method,
+        problem=job.problem,
+        seed=job.seed,
+        p=nan,
+        low=nan,
+        high=nan,
+        cov=nan,
+        n_sim=meter.points,
+        calls=meter.calls,
+        seconds=seconds - meter.seconds,
+        status="raised",
+        error=f"{type(error).__name__}: {error}",
+        max_sim=job.max_sim,
+    )
+
+
+def run_all(
+    jobs: Iterable[Job],
+    workers: int = 1,
+    once: Callable[[Job], MethodRun] = run_once,
+    executor: Executor | None = None,
+) -> Iterator[MethodRun]:
+    """Make the runs in order, in this process or in several.
+
+    Args:
+        jobs: Runs to be made.
+        workers: Processes; with 1 the runs are made in this one.
+        once: Makes one of them.
+        executor: Where the runs are made instead, for example a dask client's.
+    """
+    if executor is not None:
+        yield from executor.map(once, jobs)
+    elif workers == 1:
+        yield from map(once, jobs)
+    else:
+        # spawned, not forked: a progress bar runs in a thread of its own
+        with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+            yield from pool.map(once, jobs)
+
+
+def use_one_core() -> AbstractContextManager[object]:
+    """Return a context in which linear algebra uses one thread, where threadpoolctl is installed."""
+    try:
+        from threadpoolctl import threadpool_limits
+    except ImportError:
+        return nullcontext()
+    limits: AbstractContextManager[object] = threadpool_limits(limits=1)
+    return limits
+
+
+def about(**settings: Any) -> dict[str, Any]:
+    """Return the machine, the versions and the settings that figures were measured with."""
+    return {
+        "processor": _processor(),
+        "system": platform.platform(),
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "scipy": scipy.__version__,
+        **settings,
+    }
+
+
+def _processor() -> str:
+    """Return the processor's name where the system tells it."""
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()

@@ -1,0 +1,84 @@
+"""Runs in a folder: resumed, refused where they do not fit, the same in any number of processes."""
+
+from __future__ import annotations
+
+import json
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from rare_envs.study.errors import BadInput
+from rare_envs.study.sampler_benchmark.study import BenchmarkPlan, choose_problems, read_runs, run_study
+
+PLAN = BenchmarkPlan(("mc", "adss"), ("common_d4", "never_d4"), (500,), runs=2)
+
+
+def without_times(result):
+    return [{**run, "seconds": 0} for run in result["runs"]]
+
+
+def test_a_study_goes_on_where_it_has_ended(tmp_path: Path) -> None:
+    whole = run_study(PLAN, tmp_path / "whole")
+    part = tmp_path / "part"
+    part.mkdir()
+    lines = (tmp_path / "whole" / "runs.jsonl").read_text().splitlines()
+    (part / "runs.jsonl").write_text("\n".join(lines[:4]) + "\n")
+    assert without_times(run_study(PLAN, part)) == without_times(whole)
+    assert len((part / "runs.jsonl").read_text().splitlines()) == len(lines) == 9
+    assert json.loads((part / "benchmark.json").read_text())["about"]["plan"]["runs"] == 2
+    assert (part / "leaderboard.md").read_text().startswith("# Samplers on problems")
+
+
+def test_an_executor_gives_the_runs_of_this_process(tmp_path: Path) -> None:
+    with ThreadPoolExecutor(1) as pool:
+        other = run_study(PLAN, tmp_path / "pool", executor=pool)
+    assert without_times(other) == without_times(run_study(PLAN, tmp_path / "own"))
+
+
+def test_runs_read_back_are_those_that_were_made(tmp_path: Path) -> None:
+    """No failure: a c.o.v. of inf, which JSON has not."""
+    run_study(PLAN, tmp_path)
+    found = [run for run in read_runs(tmp_path / "runs.jsonl") if run.problem == "never_d4"]
+    assert [run.cov for run in found] == [float("inf")] * 4
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [("{}\n", "line 1 is no run"), ('{"rare_envs": "0.0"}\nx\n', "line 2 is no run"), ("[]\n", "line 1 is no run")],
+)
+def test_damaged_files_are_refused_in_one_line(tmp_path: Path, text: str, said: str) -> None:
+    (tmp_path / "runs.jsonl").write_text(text)
+    with pytest.raises(BadInput, match=said) as caught:
+        run_study(PLAN, tmp_path)
+    assert "\n" not in str(caught.value)
+
+
+def test_runs_of_another_version_are_refused(tmp_path: Path) -> None:
+    run_study(PLAN, tmp_path)
+    file = tmp_path / "runs.jsonl"
+    file.write_text(file.read_text().replace(file.read_text().splitlines()[0], '{"rare_envs": "0.0.0"}', 1))
+    with pytest.raises(BadInput, match=r"runs of rare_envs 0\.0\.0"):
+        run_study(PLAN, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"methods": ("nothing",)}, "Unknown method"),
+        ({"problems": ("nothing",)}, "Unknown problem"),
+        ({"methods": ()}, "at least one of each"),
+        ({"runs": 1}, "2 runs"),
+        ({"budgets": (0,)}, "budgets of 1"),
+    ],
+)
+def test_plans_that_cannot_be_run_are_refused(changes, said) -> None:
+    with pytest.raises(ValueError, match=said):
+        BenchmarkPlan(**{"methods": ("mc",), "problems": ("lin_d2",), "budgets": (100,), **changes})
+
+
+def test_sets_and_names() -> None:
+    assert "lin_d500" in choose_problems(["highdim"])
+    assert choose_problems(["highdim"], ["lin_d2"]) == ("lin_d2",)
+    with pytest.raises(ValueError, match="Unknown set 'cars'; known: analytic, highdim, driving, public"):
+        choose_problems(["cars"])

@@ -1,0 +1,44 @@
+"""Samplers that are wrong on purpose are found out, and right ones are not accused."""
+
+from dataclasses import replace
+
+import pytest
+
+from samplers.benchmark import Job, cells_of, find_faults, run_once
+from tests.samplers.benchmark.test_summary import P, made
+
+WRONG = "tests.samplers.benchmark.wrong_samplers"
+
+
+def faults_of(method: str, problem: str = "lin_d2", runs: int = 30, max_sim: int = 3000) -> str:
+    jobs = [Job(method, problem, seed, max_sim) for seed in range(runs)]
+    (cell,) = cells_of([run_once(job) for job in jobs])
+    return "; ".join(find_faults(cell))
+
+
+def test_a_bias_of_a_fifth_is_found() -> None:
+    assert "biased: mean / p 1.2" in faults_of(f"{WRONG}:biased")
+
+
+def test_intervals_of_half_the_width_are_found() -> None:
+    """They hold p in 67 %: of 60 runs more than 50 do with a probability of 0.2 %, and 51 of 60 are accused."""
+    assert "intervals hold p in" in faults_of(f"{WRONG}:narrow", runs=60)
+
+
+def test_hidden_simulations_are_found() -> None:
+    assert "states fewer simulations than it made in 100 % of the runs" in faults_of(f"{WRONG}:hidden", runs=3)
+
+
+def test_more_simulations_than_the_budget_are_found() -> None:
+    assert "makes 2 times the simulations of its budget" in faults_of(f"{WRONG}:spendthrift", runs=3)
+
+
+@pytest.mark.parametrize("method", ["two-stage", "adss", f"{WRONG}:plain"])
+def test_right_methods_have_no_faults(method: str) -> None:
+    assert faults_of(method, "common_d4") == ""
+
+
+def test_a_region_that_nobody_can_know_of_is_no_fault() -> None:
+    (cell,) = cells_of([replace(made(0.1 * P, 0.1, 0.08 * P, 0.12 * P), seed=seed) for seed in range(20)])
+    assert len(find_faults(cell)) == 2
+    assert find_faults(cell, knowable=False) == ()

@@ -1,0 +1,27 @@
+"""OpenTURNS as rows of the benchmark."""
+
+import pytest
+
+pytest.importorskip("openturns")
+
+from samplers.benchmark import Job, run_once
+from samplers.benchmark.openturns_methods import OPENTURNS
+
+
+@pytest.mark.parametrize("name", OPENTURNS)
+def test_their_methods_on_a_half_space(name) -> None:
+    run = run_once(Job(name, "lin_d2", seed=3, max_sim=5000))
+    assert run.error == ""
+    assert run.p == pytest.approx(2.326e-4, rel=6 * run.cov)
+    assert run.low < run.p < run.high
+    assert 1000 <= run.n_sim <= 15_000
+
+
+def test_an_error_of_f_is_one_line() -> None:
+    def f(u):
+        raise ValueError("singular")
+
+    from samplers import FunctionProblem
+
+    with pytest.raises(RuntimeError, match="singular"):
+        OPENTURNS["openturns-ss"](FunctionProblem(f, 2), seed=0, max_sim=1000)

@@ -1,0 +1,74 @@
+"""One run, and what it records."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from samplers.benchmark.runs import Job, LimitReached, Meter, find_method, find_problem, run_all, run_once
+
+WRONG = "tests.samplers.benchmark.wrong_samplers"
+
+
+def test_meter_counts_and_stops():
+    meter = Meter(lambda x: x[:, 0], limit=10)
+    meter(np.zeros((4, 2)))
+    meter(np.zeros((6, 2)))
+    assert (meter.calls, meter.points) == (2, 10)
+    with pytest.raises(LimitReached, match="more than 10"):
+        meter(np.zeros((1, 2)))
+
+
+def test_what_a_method_raises_is_recorded(monkeypatch):
+    def estimate(*args, **kwargs):
+        raise ArithmeticError("singular")
+
+    monkeypatch.setattr("samplers.benchmark.runs.estimate", estimate)
+    run = run_once(Job("ce", "lin_d2", 0))
+    assert run.error == "ArithmeticError: singular"
+    assert math.isnan(run.p)
+
+
+@pytest.mark.slow
+def test_two_processes_give_the_runs_of_one():
+    jobs = [Job("ss", problem, seed, 1500) for problem in ("noisy_d6", "six_d8") for seed in range(3)]
+    one, two = list(run_all(jobs)), list(run_all(jobs, workers=2))
+    assert [replace(run, seconds=0) for run in one] == [replace(run, seconds=0) for run in two]
+
+
+def test_noise_differs_between_runs_and_comes_back_with_the_seed():
+    first, again, other = (run_once(Job("adss", "noise2_d4", seed, 2000)) for seed in (1, 1, 2))
+    assert replace(first, seconds=0) == replace(again, seconds=0)
+    assert first.p != other.p
+
+
+def test_a_function_of_a_third_party_is_counted_and_read():
+    run = run_once(Job(f"{WRONG}:plain", "common_d4", seed=1, max_sim=2000))
+    assert (run.n_sim, run.calls, run.stated, run.error) == (2000, 1, None, "")
+    assert run.low < run.p < run.high
+    assert math.isnan(run.cov)
+
+
+def test_a_method_that_never_ends_is_stopped_at_fifty_times_its_budget():
+    run = run_once(Job(f"{WRONG}:endless", "lin_d2", seed=1, max_sim=1000))
+    assert run.error == "LimitReached: more than 50,000 evaluations"
+    assert run.n_sim == 50_000
+
+
+def test_an_answer_of_two_numbers_is_recorded_as_an_error():
+    assert "expected p, low, high and perhaps c.o.v., got 2" in run_once(Job(f"{WRONG}:wordy", "lin_d2", 0, 100)).error
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [("nothing", "Unknown method 'nothing'"), ("no.such:thing", "Cannot load the method"), ("math:pi", "got float")],
+)
+def test_what_is_no_method_is_refused(name, said):
+    with pytest.raises(ValueError, match=said):
+        find_method(name)
+
+
+def test_an_unknown_problem_is_refused():
+    with pytest.raises(ValueError, match=r"Unknown problem 'nothing' of samplers\.benchmark\.catalogue:PROBLEMS"):
+        find_problem("nothing")
