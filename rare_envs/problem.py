@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from rare_envs.distributions.space import Distribution, ScenarioSpace
 from rare_envs.egos.errors import reason_of
+from rare_envs.egos.loading import load_named_ego
 from rare_envs.egos.needs import resolve
 from rare_envs.egos.policy import PolicyDriver, as_driver
 from rare_envs.egos.wrappers import find_action_bounds
@@ -102,7 +103,9 @@ class DrivingProblem:
 
         Args:
             env_id: For example "rare_envs/CutIn-v0".
-            ego: "idm", a `Driver`, or an object with Stable-Baselines3's `predict`, called on whole batches.
+            ego: "idm", a `Driver`, an object with Stable-Baselines3's `predict`, called on whole batches, a function or
+                torch module from observations (B, F) to actions (B, 2), or a name or file that `agents.load_ego`
+                knows, such as "ppo.zip" (its further arguments: `ego=agents.load_ego("ppo.zip", stats=...)`).
             measure: The safety measure: a name, an object or a function, see
                 `rare_envs.measures.find_measure`.
             base: Base distribution of x; None takes the environment's default ("us101").
@@ -121,10 +124,12 @@ class DrivingProblem:
                 any other for "features".
 
         Raises:
+            FileNotFoundError: If the ego is a file that does not exist.
             ValueError: If an argument is invalid or the ego's spaces are not the environment's.
         """
         self.env_id = env_id
         self.ego = ego
+        ego = load_named_ego(ego)
         self._chunk_size = chunk_size
         self.world: World
         self.space: ScenarioSpace

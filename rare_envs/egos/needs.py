@@ -10,6 +10,7 @@ from gymnasium import spaces
 
 from rare_envs.control.idm import IDM
 from rare_envs.egos.human import HumanEgo
+from rare_envs.egos.plain_callables import wrap_callable
 from rare_envs.egos.validation import is_policy
 from rare_envs.sensors.kinds import OBSERVATIONS, read_kinds
 from rare_envs.simulation.ego_interface import EgoNeeds
@@ -72,7 +73,8 @@ def resolve(ego: Any, vehicles: int = 1) -> EgoNeeds:
     An ego that wraps another one needs what that one needs, and noise columns of its own.
 
     Args:
-        ego: "idm", "human", a `Driver`, an object with `predict`, or a `WorldEgo`.
+        ego: "idm", "human", a `Driver`, an object with `predict`, a `WorldEgo`, or a function or torch module from
+            observations to actions.
         vehicles: Of the scenario, which tell the features' space from that of the lidar.
 
     Example:
@@ -106,8 +108,8 @@ def resolve(ego: Any, vehicles: int = 1) -> EgoNeeds:
 
 
 def find_rule_based(ego: Any) -> Any:
-    """Return the driver that "idm" or "human" names, and any other ego as it is."""
-    return RULE_BASED_EGOS.get(ego, ego) if isinstance(ego, str) else ego
+    """Return the driver that "idm" or "human" names, a policy for a plain function, and any other ego as it is."""
+    return RULE_BASED_EGOS.get(ego, ego) if isinstance(ego, str) else wrap_callable(ego)
 
 
 def observation_for(ego: Any, vehicles: int = 1) -> str:

@@ -78,7 +78,8 @@ def as_driver(ego: Any, world: World, needs: EgoNeeds | None = None) -> Driver:
     """Return the Driver that an ego stands for in a world.
 
     Args:
-        ego: "idm", "human", a `Driver`, an object with `predict`, or a `rare_envs.egos.needs.WorldEgo`.
+        ego: "idm", "human", a `Driver`, an object with `predict`, a `rare_envs.egos.needs.WorldEgo`, or a function or
+            torch module from observations to actions.
         world: The world; what `resolve` says that the ego needs it has.
         needs: The answer of `resolve`, if it is known already; None resolves the ego here.
 

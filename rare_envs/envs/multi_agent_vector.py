@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rare_envs.control.actions import IDLE, read_actions
+from rare_envs.egos.loading import load_named_ego
 from rare_envs.egos.needs import resolve
 from rare_envs.egos.policy import as_driver
 from rare_envs.envs.batch_rows import merge_rows, put_masked, to_object_rows
@@ -67,6 +68,7 @@ class AgentsVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]]
         """
         if not isinstance(scenarios, (int, np.integer)) or isinstance(scenarios, bool) or scenarios < 1:
             raise ValueError(f"Expected one or more scenarios, got {scenarios!r}.")
+        ego = load_named_ego(ego)
         needs = resolve(ego)
         world, self.space = set_up(env_id, EgoNeeds(lidar=needs.lidar), **kwargs)
         self.world = world.with_statistics()

@@ -12,6 +12,7 @@ from pettingzoo import ParallelEnv
 from torch import Tensor
 
 from rare_envs.control.actions import IDLE, read_actions
+from rare_envs.egos.loading import load_named_ego
 from rare_envs.egos.needs import resolve
 from rare_envs.egos.policy import as_driver
 from rare_envs.envs.display import RENDER_MODES, Display
@@ -73,6 +74,7 @@ class DrivingParallelEnv(ParallelEnv[str, SingleObservation, NDArray[np.float32]
         Raises:
             ValueError: If an argument is invalid.
         """
+        ego = load_named_ego(ego)
         needs = resolve(ego)
         world, self.space = set_up(env_id, EgoNeeds(lidar=needs.lidar), **kwargs)
         self.world = world.with_statistics()
