@@ -1,6 +1,6 @@
-"""Is a command faster at one commit than at another? Both in turn, in work trees of their own.
+r"""Is a command faster at one commit than at another? Both in turn, in work trees of their own.
 
-    python -m benchmarks.simulation.compare_commits main~5 main --runs 7 -- python -m rare_envs estimate \\
+    python -m benchmarks.simulation.compare_commits main~5 main --runs 7 -- python -m rare_envs estimate \
         rare_envs/CutIn-v0 --max-sim 6000 --json
 
 The runs alternate and the order within a pair changes from pair to pair, so that a machine that slows down or speeds up

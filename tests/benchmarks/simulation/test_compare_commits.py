@@ -30,7 +30,7 @@ def test_more_work_takes_more_processor_time(tmp_path: Path) -> None:
 
 
 def test_a_command_that_fails_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="ended with 1 in .*: ZeroDivisionError"):
+    with pytest.raises(ValueError, match=r"ended with 1 in .*: ZeroDivisionError"):
         measure_command([sys.executable, "-c", "1 / 0"], tmp_path)
 
 
