@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import stdtrit
 
 from samplers.analysis.base import cov_inflation, require_sample
 from samplers.analysis.ratio_uncertainty import RatioUncertainty, summarise_ratio
@@ -424,7 +424,7 @@ def _ratio_interval(totals: FloatArray, factor: float, single: bool, either: Est
     z = totals[0] / p_a - totals[1] / p_b
     spread, ratio = factor * _error(z), float(p_a / p_b)
     ess = effective_number(np.where(apart, np.abs(z), 0.0))
-    quantile = float(stats.t.ppf(0.5 + either.confidence / 2, degrees_of_freedom(ess, single)))
+    quantile = float(stdtrit(degrees_of_freedom(ess, single), 0.5 + either.confidence / 2))
     half = min(quantile * spread, MAX_LOG)
     return ratio * math.exp(-half), ratio * math.exp(half)
 

@@ -11,8 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.integrate import quad
-from scipy.special import ndtr, ndtri
-from scipy.stats import chi2
+from scipy.special import chdtri, ndtr, ndtri
 
 from samplers.problem import FloatArray, FunctionProblem
 
@@ -82,7 +81,7 @@ def plateau(dim: int = 3, beta: float = 3.5, tied: float = 0.6) -> Reference:
 
 def shell(dim: int = 20, p: float = 1e-4) -> Reference:
     """Return failure in every direction, beyond a radius: f = r - |u|."""
-    radius = math.sqrt(float(chi2.isf(p, dim)))
+    radius = math.sqrt(float(chdtri(dim, p)))
 
     def f(u: FloatArray) -> FloatArray:
         return np.asarray(radius - np.linalg.norm(u, axis=1))

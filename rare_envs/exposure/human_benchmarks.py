@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from scipy import stats
+from scipy.special import chdtri, gammaincinv
 
 KM_PER_MILE = 1.609344
 CONFIDENCE = 0.95
@@ -52,8 +52,8 @@ class HumanBenchmark:
         """Exact Poisson interval of `per_million_km`, 95 %; the distance is taken as exact."""
         tail = 0.5 - CONFIDENCE / 2
         scale = 1e6 / (self.miles * KM_PER_MILE)
-        low = float(stats.chi2.ppf(tail, 2 * self.count)) / 2 if self.count else 0.0
-        return scale * low, scale * float(stats.chi2.isf(tail, 2 * self.count + 2)) / 2
+        low = float(gammaincinv(self.count, tail)) if self.count else 0.0
+        return scale * low, scale * float(chdtri(2 * self.count + 2, tail)) / 2
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""

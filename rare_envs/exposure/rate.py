@@ -25,7 +25,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import stats
+from scipy.special import ndtri
 
 from rare_envs.arrays import FloatArray
 from rare_envs.distributions.frequency import EventFrequency
@@ -235,7 +235,7 @@ class CollisionRate:
 
 def normal_quantile(confidence: float) -> float:
     """Return z: a normal variable is within z standard deviations with this probability."""
-    return float(stats.norm.ppf(0.5 + confidence / 2))
+    return float(ndtri(0.5 + confidence / 2))
 
 
 def tail_levels(confidence: float) -> RateInterval:

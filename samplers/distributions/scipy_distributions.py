@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.special import ndtr, ndtri
-from scipy.stats import rv_continuous
 
 FloatArray = NDArray[np.float64]
 
@@ -52,6 +51,8 @@ class ScipyDistribution:
 
     def __post_init__(self) -> None:
         """Check the distribution."""
+        from scipy.stats import rv_continuous  # takes a second to import, and whoever has a frozen one has done so
+
         if not isinstance(self.frozen.dist, rv_continuous):
             raise ValueError(f"Expected a continuous distribution, got the discrete {self._name} of scipy.stats.")
         if np.ndim(self._median) > 1 or not np.isfinite(self._median).all():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtri, gammaincinv, ndtr, ndtri, stdtrit
 
 from samplers.problem import Distribution, FloatArray
 
@@ -75,12 +75,12 @@ def _find_other_law(u: FloatArray) -> str | None:
     n, dim = u.shape
     level = FALSE_ALARM / 4 / dim
     name = f"to_standard_normal(sample({n}))"
-    mean, room = u.mean(axis=0), float(stats.norm.isf(level / 2)) / n**0.5
+    mean, room = u.mean(axis=0), -float(ndtri(level / 2)) / n**0.5
     column = int(np.abs(mean).argmax())
     if abs(mean[column]) > room:
         return f"{name} has mean {mean[column]:.3g} in coordinate {column}, where 0 +- {room:.2g} fits"
     squares = (u**2).sum(axis=0)
-    low, high = float(stats.chi2.ppf(level / 2, n)), float(stats.chi2.isf(level / 2, n))
+    low, high = 2 * float(gammaincinv(n / 2, level / 2)), float(chdtri(n, level / 2))
     for column in (int(squares.argmin()), int(squares.argmax())):
         if not low <= squares[column] <= high:
             spread = (squares[column] / n) ** 0.5
@@ -98,7 +98,7 @@ def _find_other_law(u: FloatArray) -> str | None:
 def _kolmogorov_distances(u: FloatArray) -> FloatArray:
     """Return the Kolmogorov distance of each column of u (n, d) to the standard normal distribution, shape (d,)."""
     n = len(u)
-    reached = stats.norm.cdf(np.sort(u, axis=0))
+    reached = ndtr(np.sort(u, axis=0))
     steps = np.arange(n + 1)[:, None] / n
     return np.asarray(np.maximum(steps[1:] - reached, reached - steps[:-1]).max(axis=0))
 
@@ -116,7 +116,7 @@ def _find_correlation(u: FloatArray, name: str) -> str | None:
     else:
         first, second = np.arange(dim - 1), np.arange(1, dim)
         correlation = np.einsum("ij,ij->j", centred[:, :-1], centred[:, 1:])
-    t = float(stats.t.isf(FALSE_ALARM / 8 / len(first), n - 2))
+    t = -float(stdtrit(n - 2, FALSE_ALARM / 8 / len(first)))
     room = t / (n - 2 + t**2) ** 0.5
     pair = int(np.abs(correlation).argmax())
     if abs(correlation[pair]) <= room:

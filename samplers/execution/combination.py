@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtrc, stdtrit
 
 from samplers.method import Outcome
 from samplers.sample import DrawWeights, Sample
@@ -88,7 +88,7 @@ def _warn_of_disagreement(outcomes: Sequence[Outcome]) -> list[str]:
         return []
     with np.errstate(over="ignore"):  # inf is far enough apart
         apart = float((((p - p.mean()) / error) ** 2).sum())
-    if stats.chi2.sf(apart, len(p) - 1) > DISAGREEMENT_LEVEL:
+    if chdtrc(len(p) - 1, apart) > DISAGREEMENT_LEVEL:
         return []
     return [f"The runs disagree ({p.min():.2e} to {p.max():.2e}): some of them may have missed a region of failure."]
 
@@ -185,7 +185,7 @@ def _mean_interval(outcomes: Sequence[Outcome], p: np.ndarray, confidence: float
         return min(o.interval[0] for o in outcomes), max(o.interval[1] for o in outcomes)
     spread = float(np.log(p).std(ddof=1)) if p.all() else float((p / mean).std(ddof=1))
     spread = max(spread, MIN_SPREAD * _own_error(outcomes))
-    half = float(stats.t.ppf(0.5 + confidence / 2, runs - 1)) * spread / math.sqrt(runs)
+    half = float(stdtrit(runs - 1, 0.5 + confidence / 2)) * spread / math.sqrt(runs)
     return mean * math.exp(-half), min(1.0, mean * math.exp(half))
 
 

@@ -15,7 +15,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
 from scipy.special import gammaln, ive
 
 from samplers.problem import LOG_TWO_PI, FloatArray
@@ -132,5 +131,7 @@ def directions(mu: FloatArray, kappa: float, n: int, rng: np.random.Generator) -
     if len(mu) == 1:  # two directions
         with_mu = rng.random(n) < 1 / (1 + math.exp(-2 * kappa))
         return np.asarray(np.where(with_mu, mu[0], -mu[0])[:, None])
+    from scipy import stats  # takes a second to import
+
     distribution = stats.vonmises_fisher(mu, kappa)  # type: ignore[arg-type]  # the stubs ask for a whole kappa
     return np.asarray(distribution.rvs(n, random_state=rng)).reshape(n, len(mu))

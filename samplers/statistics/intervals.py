@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import betaincinv, ndtri, stdtrit
 
 Interval = tuple[float, float]
 MAX_SKEWNESS = 0.4
@@ -38,8 +38,8 @@ def clopper_pearson(hits: int, n: int, confidence: float) -> Interval:
         0.0048 0.0183
     """
     tail = (1 - confidence) / 2
-    low = 0.0 if hits == 0 else float(stats.beta.ppf(tail, hits, n - hits + 1))
-    high = 1.0 if hits == n else float(stats.beta.ppf(1 - tail, hits + 1, n - hits))
+    low = 0.0 if hits == 0 else float(betaincinv(hits, n - hits + 1, tail))
+    high = 1.0 if hits == n else float(betaincinv(hits + 1, n - hits, 1 - tail))
     return low, high
 
 
@@ -65,7 +65,7 @@ def log_normal_interval(p: float, cov: float, confidence: float, df: float = mat
         >>> print(f"{low:.2e} {high:.2e}")
         6.78e-05 1.47e-04
     """
-    quantile = float(stats.t.ppf(0.5 + confidence / 2, df))
+    quantile = float(stdtrit(df, 0.5 + confidence / 2))
     half = quantile * math.sqrt(math.log1p(cov * cov))
     return p * math.exp(-half), min(1.0, p * math.exp(half))
 
@@ -86,7 +86,7 @@ def skewed_upper_end(p: float, cov: float, skewness: float, confidence: float) -
         >>> [f"{skewed_upper_end(1e-4, 0.1, skewness, confidence=0.95):.3e}" for skewness in (0.0, 0.2, 0.4)]
         ['1.196e-04', '1.234e-04', '1.319e-04']
     """
-    z, g = float(stats.norm.ppf(0.5 + confidence / 2)), min(skewness, MAX_SKEWNESS)
+    z, g = float(ndtri(0.5 + confidence / 2)), min(skewness, MAX_SKEWNESS)
     if g < MIN_SKEWNESS:
         return min(1.0, p * (1 + z * cov))
     return min(1.0, p * (1 + 3 * cov / g * (1 - float(np.cbrt(1 - g * (z + g / 6))))))

@@ -14,7 +14,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import stdtrit
 
 from samplers.problem import FloatArray
 from samplers.statistics.unseen_share import raise_log_end
@@ -154,7 +154,7 @@ def refit_quantile(confidence: float, freedom: int, clusters: int) -> float:
         freedom: Degrees of freedom of the variance, refits less 1.
         clusters: Independent clusters of events, which leave no more than these less 1.
     """
-    return float(stats.t.ppf(0.5 + confidence / 2, min(freedom, clusters - 1)))
+    return float(stdtrit(min(freedom, clusters - 1), 0.5 + confidence / 2))
 
 
 def expect_over_families(families: Sequence[RefitFamily], largest: float = 1.0) -> float:

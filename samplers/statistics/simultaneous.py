@@ -7,7 +7,7 @@ References:
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy.special import ndtr
 
 from samplers.problem import FloatArray
 from samplers.statistics.cluster_sums import UnitSums, interval_of_count, interval_of_sum
@@ -65,5 +65,5 @@ def simultaneous_level(correlation: NDArray[np.float64], confidence: float, rng:
         return confidence
     roots = vectors[:, some] * np.sqrt(values[some])
     largest = np.abs(rng.standard_normal((BAND_DRAWS, roots.shape[1])) @ roots.T).max(axis=1)
-    level = 1 - 2 * float(stats.norm.sf(np.quantile(largest, confidence)))
+    level = 1 - 2 * float(ndtr(-np.quantile(largest, confidence)))
     return max(level, confidence)

@@ -7,8 +7,7 @@ probability of the regions known, Z ~ N(0, 1), the upper end is the quantile of 
 """
 
 import numpy as np
-from scipy import stats
-from scipy.special import ndtr
+from scipy.special import betaincinv, ndtr, ndtri
 
 PRIOR_SHARE = 0.1
 """First parameter of Beta. With 1/4, 5 of 880 intervals lay below p and 17 above (20 seeds on 44 limit states); with
@@ -52,8 +51,8 @@ def raise_log_end(half: float, lineages: float, confidence: float) -> float:
     if np.isinf(lineages):
         return half
     tail = 0.5 + confidence / 2
-    sigma = half / stats.norm.ppf(tail)
-    shares = stats.beta.ppf((np.arange(QUANTILES) + 0.5) / QUANTILES, PRIOR_SHARE, lineages)
+    sigma = half / ndtri(tail)
+    shares = betaincinv(PRIOR_SHARE, lineages, (np.arange(QUANTILES) + 0.5) / QUANTILES)
     shift = np.log1p(-np.minimum(shares, 1 - 1e-12))  # of log p, were it all of it
     below, above = 0.0, half - shift.min()
     for _ in range(60):

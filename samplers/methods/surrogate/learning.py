@@ -2,7 +2,6 @@
 
 import numpy as np
 from scipy.special import ndtri
-from scipy.stats import qmc
 
 from samplers.methods.surrogate.kriging import Kriging
 from samplers.methods.surrogate.pool import Pool
@@ -25,6 +24,8 @@ def learning_size(budget: int, settings: LearningSettings) -> int:
 def draw_design(n: int, dim: int, scales: tuple[float, ...], rng: np.random.Generator) -> FloatArray:
     """Return n points, an equal number of each N(0, s^2 I), as Latin hypercubes, in the order of the scales s."""
     each = n // len(scales)
+    from scipy.stats import qmc  # takes a second to import
+
     cubes = [ndtri(qmc.LatinHypercube(dim, rng=rng).random(each)) for _ in scales]
     return np.concatenate([scale * cube for scale, cube in zip(scales, cubes, strict=True)])
 

@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from scipy import stats
+from scipy.special import bdtrc
 
 from samplers.importance.draws import Draws
 from samplers.methods.two_stage.discovery.unseen import Discovery
@@ -20,7 +20,7 @@ def check_base_draws(
 
     Base draws do not depend on the proposal: they hit a missed region as often as any other of its probability.
     """
-    if hits == 0 or stats.binom.sf(hits - 1, n, min(p, 1.0)) > settings.false_alarm:
+    if hits == 0 or bdtrc(hits - 1, n, min(p, 1.0)) > settings.false_alarm:
         return []
     expected = n * p
     return [f"{hits} of {n:,} base draws failed; with p = {p:.2e} {expected:.2g} are expected: p misses failures."]

@@ -5,7 +5,7 @@
 
 from typing import NamedTuple
 
-from scipy import stats
+from scipy.special import betaincinv
 
 from samplers.importance.draws import Draws, weighted_interval
 from samplers.problem import FloatArray
@@ -33,7 +33,7 @@ class Discovery(NamedTuple):
             >>> [round(Discovery(n).unseen_share(0.95), 3) for n in (4, 25, 200)]
             [0.24, 0.039, 0.005]
         """
-        return float(stats.beta.ppf(0.5 + confidence / 2, PRIOR_SHARE, self.lineages))
+        return float(betaincinv(PRIOR_SHARE, self.lineages, 0.5 + confidence / 2))
 
 
 def count_lineages(roots: int, wide_log_weights: FloatArray) -> float:
