@@ -4,7 +4,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from html import escape
 from typing import Any
 
@@ -13,16 +13,24 @@ import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from rare_envs.control.idm import IDM
 from rare_envs.distributions.space import Distribution, ScenarioSpace
 from rare_envs.egos.errors import reason_of
 from rare_envs.egos.loading import load_named_ego
 from rare_envs.egos.needs import resolve
 from rare_envs.egos.policy import PolicyDriver, as_driver
+from rare_envs.egos.sb3.dense_networks import read_dense_policy
 from rare_envs.egos.wrappers import find_action_bounds
 from rare_envs.make import set_up
 from rare_envs.scenarios.registry import find_scenario
 from rare_envs.search_terms import EpisodeTerms, simulate_terms
-from rare_envs.simulation.compiled.selection import CompiledRollout, CompilerFails, NotCompiled, find_compiled_rollout
+from rare_envs.simulation.compiled.selection import (
+    CompiledEgo,
+    CompiledRollout,
+    CompilerFails,
+    NotCompiled,
+    find_compiled_rollout,
+)
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.measurement import Measurement
 from rare_envs.simulation.rollout import StochasticDriver, rollout
@@ -117,8 +125,9 @@ class DrivingProblem:
                 rules and 256 with a policy, or what fits into memory. Few suit a slow ego. A network rounds differently
                 by batch, so another number gives other bits; another number of workers does not.
             core: What simulates: "torch", the reference, for everything; "numba", compiled rollouts, for the scripted
-                scenarios with the IDM as ego and the measure `ttc`; "auto" for the compiled ones where they can be had.
-                They differ by rounding; an estimate says which it used (`DrivingProblem.core`).
+                scenarios with the IDM or a policy of dense layers as ego and the measure `ttc`; "auto" for the compiled
+                ones where they can be had. They differ by rounding; an estimate says which it used
+                (`DrivingProblem.core`).
             **make_kwargs: Further keyword arguments of `gym.make` for this id. Without an `observation` the ego's
                 `observation_space` decides: a `Dict` names the kinds, the space of the lidar stands for "lidar", and
                 any other for "features".
@@ -161,7 +170,7 @@ class DrivingProblem:
         if core == "torch":
             return None
         try:
-            return find_compiled_rollout(self.world, self.driver)
+            return find_compiled_rollout(self.world, self._compiled_ego)
         except NotCompiled as reason:
             if core == "numba":
                 raise ValueError(f"core='numba' cannot simulate this: {reason}.") from reason
@@ -181,9 +190,33 @@ class DrivingProblem:
         return f"<p>{escape(repr(self)[1:-1])}</p>{self.space._repr_html_()}"
 
     @property
+    def _compiled_ego(self) -> CompiledEgo:
+        """The ego as compiled rollouts take it; NotCompiled if they do not."""
+        driver = self.driver
+        if type(driver) is PolicyDriver:
+            return partial(read_dense_policy, driver.policy)
+        if type(driver) is not IDM:
+            raise NotCompiled(f"the ego, a {type(driver).__name__}, is not compiled")
+        return driver
+
+    def _run_compiled(self, x: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """Return f of scenarios x (n, d), NaN where it is not known; None where torch has to simulate."""
+        if self._compiled is None:
+            return None
+        try:
+            return self._compiled(x).astype(np.float64)
+        except NotCompiled as reason:
+            if self._core == "numba":
+                raise ValueError(f"core='numba' cannot simulate this: {reason}.") from reason
+            self._compiled = None
+            warnings.warn(f"{reason}; torch simulates, which is slower.", stacklevel=5)
+            return None
+
+    @property
     def core(self) -> str:
-        """What simulates `evaluate`: "torch" or "numba"."""
-        return "torch" if self._compiled is None else "numba"
+        """What simulates `evaluate`: "torch" or "numba", which compiles now what it has not yet."""
+        nothing = np.empty((0, self.world.scenario.size))
+        return "torch" if self._run_compiled(nothing) is None else "numba"
 
     @property
     def dim(self) -> int:
@@ -349,16 +382,20 @@ class DrivingProblem:
 
     def _simulate(self, x: NDArray[np.float64], failed_rows: dict[int, str] | None) -> NDArray[np.float64]:
         x = self.space.validate(np.atleast_2d(x))
-        if self._compiled is not None:
-            f = self._compiled(x).astype(np.float64)
-        else:
-            f = np.empty(len(x))
-            first = 0
-            for end in self._roll_out(self.world, x, failed_rows):
-                f[first : first + len(end.f)] = end.f.numpy()
-                first += len(end.f)
+        f = self._run_compiled(x)
+        if f is None:
+            f = self._simulate_by_torch(x, failed_rows)
+        elif self.needs.queries_policy and np.isnan(f).any():  # torch tells what fails there, and how
+            rows, failed = np.flatnonzero(np.isnan(f)), None if failed_rows is None else dict[int, str]()
+            f[rows] = self._simulate_by_torch(x[rows], failed)
+            if failed_rows is not None and failed is not None:
+                failed_rows.update({int(rows[row]): reason for row, reason in failed.items()})
         self._check_known(x, f, failed_rows)
         return f
+
+    def _simulate_by_torch(self, x: NDArray[np.float64], failed_rows: dict[int, str] | None) -> NDArray[np.float64]:
+        parts = [end.f.numpy() for end in self._roll_out(self.world, x, failed_rows)]
+        return np.concatenate([np.empty(0), *parts])
 
     def _simulate_terms(self, x: NDArray[np.float64], gamma: float, failed_rows: dict[int, str] | None) -> EpisodeTerms:
         x = self.space.validate(np.atleast_2d(x))

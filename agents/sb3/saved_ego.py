@@ -84,6 +84,11 @@ class SavedEgo:
         policy = self.model if self.frames is None else FrameStackedPolicy(self.model, *self.frames)
         return policy if self.statistics is None else NormalisedPolicy(policy, self.statistics.normalize_obs)
 
+    @property
+    def same_as(self) -> Any:
+        """A policy that acts as it does; compiled rollouts read its network."""
+        return self.policy
+
     def find_missing_statistics(self, expected: Any) -> str:
         """Return why it seems to have been trained on normalised observations, if it has no statistics; "" if not.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any, Protocol
 
 import torch
@@ -15,6 +16,8 @@ from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import VEHICLE_LENGTH, State
 from rare_envs.traffic.vehicle_models import NEAR_ZERO
 
+_POSITIVE = ("desired_speed", "max_acceleration", "comfortable_deceleration", "exponent", "max_deceleration")
+_NOT_NEGATIVE = ("time_headway", "jam_distance", "jam_distance_speed", "added_length")
 MIN_RATIO = 1e-24
 """Floor of speed / desired speed under the root: its slope stays finite at standstill, in single precision too."""
 
@@ -46,6 +49,9 @@ class IDM:
     term of s* may be negative: a lead that pulls away fast from a short gap is braked for, as in HighwayEnv and in
     their code.
 
+    Raises:
+        ValueError: A parameter is not finite, is negative, or is 0 where it divides or scales.
+
     Example:
         >>> import math
         >>> nobody_ahead = Lead(gap=torch.tensor([math.inf]), closing_speed=torch.tensor([0.0]))
@@ -74,6 +80,14 @@ class IDM:
     cut_off: bool = False
     """Whether T v + v dv / (2 sqrt(a_max b)) is cut off at 0, as Treiber and Kesting write it ("Traffic Flow Dynamics",
     2013, chapter 11): a lead that pulls away fast is then not braked for."""
+
+    def __post_init__(self) -> None:
+        for name in _POSITIVE + _NOT_NEGATIVE:
+            value = getattr(self, name)  # a field by its name
+            known = isinstance(value, Real) and math.isfinite(value)
+            if not known or value < 0.0 or (name in _POSITIVE and value == 0.0):
+                least = "above 0" if name in _POSITIVE else "of at least 0"
+                raise ValueError(f"Expected {name} of the IDM to be a number {least}, got {value!r}.")
 
     @property
     def closing_gain(self) -> float:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import os
+import shutil
+import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -15,6 +17,8 @@ import numpy as np
 
 Function = TypeVar("Function", bound=Callable[..., object])
 PACKAGE = Path(__file__).parents[2]
+UNUSED = 7 * 24 * 3600.0
+"""Machine code of older sources that no process has loaded for so long [s] is removed."""
 _CONFIG: Any = numba.config
 
 
@@ -27,9 +31,18 @@ def compiled(function: Function) -> Function:
     Raises:
         ImportError: numba is switched off, and would leave the function to Python.
     """
+    return _compile(function)
+
+
+def compiled_fused(function: Function) -> Function:
+    """Compile as `compiled` does; products that are added are not rounded before, where the processor can do so."""
+    return _compile(function, fastmath={"contract"})
+
+
+def _compile(function: Function, **options: Any) -> Function:
     if _CONFIG.DISABLE_JIT:
         raise ImportError("NUMBA_DISABLE_JIT is set")
-    dispatcher = numba.njit(error_model="numpy")(function)
+    dispatcher = numba.njit(error_model="numpy", **options)(function)
     with _kept_in(find_cache_folder()) as can_be_kept:
         if can_be_kept:
             dispatcher.enable_caching()
@@ -58,8 +71,24 @@ def find_cache_folder() -> Path | None:
         except OSError:
             continue
         if os.access(folder, os.W_OK):
+            remove_old_code(place, folder)
             return folder
     return None
+
+
+def remove_old_code(place: Path, kept: Path) -> None:
+    """Remove the folders of older sources, but those that were used within a week: another process may use them.
+
+    Args:
+        place: Where the folders are.
+        kept: That of these sources; it is marked as used now.
+    """
+    with suppress(OSError):
+        os.utime(kept)
+    for folder in place.glob("compiled-*"):
+        with suppress(OSError):  # another process may remove it, too
+            if folder != kept and time.time() - folder.stat().st_mtime > UNUSED:
+                shutil.rmtree(folder)
 
 
 @cache

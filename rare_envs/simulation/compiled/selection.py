@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -11,11 +12,13 @@ from numpy.typing import NDArray
 
 from rare_envs.control.idm import IDM
 from rare_envs.measures.registry import MEASURES
+from rare_envs.plugins import one_line
 from rare_envs.scenarios import car_following, cut_in, hard_brake
+from rare_envs.simulation.compiled.dense_policy import DensePolicy
+from rare_envs.simulation.observation import EGO_FEATURES, OTHER_FEATURES
 
 if TYPE_CHECKING:
     from rare_envs.scenarios.base import Scenario
-    from rare_envs.simulation.rollout import Driver
     from rare_envs.simulation.world import World
     from rare_envs.traffic.road import Road
 
@@ -35,9 +38,13 @@ class CompilerFails(NotCompiled):
     """numba is installed, but does not work here."""
 
 
+CompiledEgo = IDM | Callable[[], DensePolicy]
+"""An ego that compiled rollouts carry out: the IDM, or what reads the network of a policy, with its present weights."""
+
+
 @dataclass(frozen=True)
 class CompiledRollout:
-    """The rollouts of a world with the IDM as ego, compiled: called with x (B, d), it returns f (B,).
+    """The rollouts of a world and its ego, compiled: called with x (B, d), it returns f (B,).
 
     It keeps no compiled code, so that it can be sent to other processes.
 
@@ -51,26 +58,42 @@ class CompiledRollout:
 
     script: str
     """One of `COMPILED_SCRIPTS`."""
-    ego: IDM
+    ego: CompiledEgo
     road: Road
     dt: float
     """Tick [s]."""
     ticks: int
 
     def __call__(self, x: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Return f of scenarios x (B, d) within the physical box."""
+        """Return f of scenarios x (B, d) within the physical box; NaN where a policy's outputs are not finite.
+
+        Raises:
+            NotCompiled: The policy has been changed, and is no longer one that is compiled.
+            CompilerFails: numba does not work in this process.
+        """
+        ego = self.ego if isinstance(self.ego, IDM) else self.ego()
+        arguments = (self.road, self.dt, self.ticks)
         try:
-            from rare_envs.simulation.compiled import rollouts
+            from rare_envs.simulation.compiled import policy_rollouts, rollouts
+
+            if isinstance(ego, IDM):
+                return rollouts.drive(self.script, x, ego, *arguments)
+            return policy_rollouts.drive_by_policy(self.script, x, ego, *arguments)
         except ImportError as error:
-            raise NotCompiled(
-                f"The problem was made with core='numba', which fails in this process: {error}; install "
-                "'rare-envs[fast]' wherever it is simulated, or make it with core='torch'."
+            raise CompilerFails(
+                f"the compiled rollouts fail in this process: {error}; install 'rare-envs[fast]' wherever it is "
+                "simulated, or make it with core='torch'"
             ) from error
-        return rollouts.drive(self.script, x, self.ego, self.road, self.dt, self.ticks)
+        except Exception as error:  # numba compiles at the first call, and anything may be raised
+            raise CompilerFails(f"numba is installed, but fails here: {one_line(error)}") from error
 
 
-def find_compiled_rollout(world: World, driver: Driver) -> CompiledRollout:
+def find_compiled_rollout(world: World, ego: CompiledEgo) -> CompiledRollout:
     """Return the compiled rollout of a world and its ego.
+
+    Args:
+        world: The world.
+        ego: The ego; a policy is read, and refused by an error of its own.
 
     Raises:
         NotCompiled: There is none, or numba is missing.
@@ -84,20 +107,32 @@ def find_compiled_rollout(world: World, driver: Driver) -> CompiledRollout:
             ...
         rare_envs.simulation.compiled.selection.NotCompiled: the script of the scenario 'highway' is not compiled
     """
-    obstacle = _find_obstacle(world, driver)
+    obstacle = _find_obstacle(world)
     if obstacle:
         raise NotCompiled(obstacle)
+    scenario, clock = world.scenario, world.clock
+    if not isinstance(ego, IDM):
+        obstacle = _find_policy_obstacle(world, ego())
+        if obstacle:
+            raise NotCompiled(obstacle)
     _import_compiler()
-    assert isinstance(driver, IDM)
-    scenario = world.scenario
-    return CompiledRollout(_find_script(scenario), driver, scenario.road, world.clock.dt, world.clock.ticks)
+    return CompiledRollout(_find_script(scenario), ego, scenario.road, clock.dt, clock.ticks)
 
 
-def _find_obstacle(world: World, driver: Driver) -> str:
-    """Return why the torch simulation is needed; empty if it is not."""
+def _find_policy_obstacle(world: World, policy: DensePolicy) -> str:
+    """Return why the torch simulation is needed with a policy as ego; empty if it is not."""
+    if world.sensing.observation != "features":
+        return f"the observation {world.sensing.observation!r} is not compiled"
+    if world.clock.action != "continuous":
+        return f"the action {world.clock.action!r} is not compiled"
+    obstacle = policy.describe_obstacle(len(EGO_FEATURES) + len(OTHER_FEATURES) * (world.scenario.vehicles - 1))
+    return f"{obstacle} is not compiled" if obstacle else ""
+
+
+def _find_obstacle(world: World) -> str:
+    """Return why the torch simulation is needed, whatever the ego; empty if it is not."""
     scenario, measurement = world.scenario, world.measurement
     obstacles = {
-        f"the ego, a {type(driver).__name__}, is not compiled": type(driver) is not IDM,
         f"the script of the scenario {scenario.name!r} is not compiled": world.background is not None
         or not _find_script(scenario),
         "curved roads and lanes of different widths are not compiled": scenario.road.reference_line is not None
@@ -128,6 +163,6 @@ def _import_compiler() -> None:
     if importlib.util.find_spec("numba") is None:
         raise NotCompiled("numba is not installed: pip install 'rare-envs[fast]'")
     try:
-        from rare_envs.simulation.compiled import rollouts  # noqa: F401
+        from rare_envs.simulation.compiled import policy_rollouts, rollouts  # noqa: F401
     except (ImportError, OSError, RuntimeError) as error:
-        raise CompilerFails(f"numba is installed, but fails here: {error}") from error
+        raise CompilerFails(f"numba is installed, but fails here: {one_line(error)}") from error

@@ -50,3 +50,22 @@ def test_each_follower_may_have_a_desired_speed_of_its_own() -> None:
     lead = Lead(tensor(math.inf, math.inf), tensor(0.0, 0.0))
     acceleration = IDM().acceleration(tensor(10.0, 10.0), lead, tensor(10.0, 20.0))
     assert acceleration.tolist() == pytest.approx([0.0, 2.22 * (1 - 0.5**4)])
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("max_acceleration", 0.0),
+        ("desired_speed", -1.0),
+        ("exponent", math.nan),
+        ("jam_distance", -0.1),
+        ("time_headway", math.inf),
+    ],
+)
+def test_parameters_without_meaning_are_refused(name: str, value: float) -> None:
+    with pytest.raises(ValueError, match=f"^Expected {name} of the IDM to be a number .*, got {value!r}\\.$"):
+        IDM(**{name: value})  # type: ignore[arg-type]
+
+
+def test_an_idm_without_headway_or_distance_is_one() -> None:
+    assert IDM(time_headway=0.0, jam_distance=0.0, jam_distance_speed=0.0).jam_distance == 0.0

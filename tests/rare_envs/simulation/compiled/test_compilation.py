@@ -1,6 +1,7 @@
 """Compiled code is kept where it can be written, under a name that follows the sources."""
 
 import os
+import time
 
 import numba
 import pytest
@@ -47,3 +48,15 @@ def test_numba_that_is_switched_off_is_named(monkeypatch):
     monkeypatch.setattr(numba.config, "DISABLE_JIT", 1)
     with pytest.raises(ImportError, match="NUMBA_DISABLE_JIT is set"):
         compilation.compiled(double)
+
+
+def test_code_of_older_sources_is_removed_unless_it_was_used_within_a_week(tmp_path):
+    now, names = time.time(), ("compiled-old", "compiled-recent", "compiled-kept", "other")
+    for name in names:
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "code.nbc").write_bytes(b"0")
+    for name, days in (("compiled-old", 8), ("compiled-recent", 6), ("compiled-kept", 30), ("other", 30)):
+        os.utime(tmp_path / name, (now - days * 86_400,) * 2)
+    compilation.remove_old_code(tmp_path, tmp_path / "compiled-kept")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["compiled-kept", "compiled-recent", "other"]
+    assert (tmp_path / "compiled-kept").stat().st_mtime > now - 60

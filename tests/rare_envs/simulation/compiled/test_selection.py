@@ -6,6 +6,7 @@ import sys
 import warnings
 from dataclasses import dataclass, replace
 
+import numba
 import numpy as np
 import pytest
 
@@ -18,6 +19,7 @@ from rare_envs.simulation.compiled import selection
 from rare_envs.simulation.measurement import Measurement
 
 CAR_FOLLOWING = "rare_envs/CarFollowing-v0"
+X = np.array([[20.0, 15.0, 30.0]])
 
 
 @pytest.mark.parametrize(
@@ -81,6 +83,24 @@ def test_where_numba_fails_torch_simulates_and_one_line_says_so(monkeypatch):
         problem = rare_envs.DrivingProblem(CAR_FOLLOWING)
     assert problem.core == "torch"
     assert problem.evaluate(np.array([[20.0, 15.0, 30.0]])) == pytest.approx(6.0)
+
+
+@pytest.mark.parametrize("ask", [lambda problem: problem.core, lambda problem: problem.evaluate(X)])
+def test_where_the_first_call_cannot_be_compiled_torch_simulates_and_one_line_says_so(monkeypatch, ask):
+    def fail(*_):
+        raise numba.core.errors.TypingError("No implementation of\nfunction")
+
+    monkeypatch.setattr("rare_envs.simulation.compiled.rollouts.drive", fail)
+    problem, strict = (rare_envs.DrivingProblem(CAR_FOLLOWING, core=core) for core in ("auto", "numba"))
+    line = "numba is installed, but fails here: TypingError: No implementation of function"
+    with pytest.warns(UserWarning, match=f"^{line}; torch simulates, which is slower\\.$"):
+        ask(problem)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert problem.core == "torch"
+        assert problem.evaluate(X) == pytest.approx(6.0)
+    with pytest.raises(ValueError, match=f"core='numba' cannot simulate this: {line}"):
+        ask(strict)
 
 
 def test_a_problem_is_sent_to_other_processes_with_its_core():

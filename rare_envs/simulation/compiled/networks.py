@@ -1,0 +1,137 @@
+"""Dense networks for a block of rows, compiled by numba.
+
+`LANES` rows go through a layer side by side, so that the compiler vectorises over them. Every row has the same
+operations in the same order whatever the others are, so its outputs are the same bits in any block.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rare_envs.simulation.compiled.compilation import compiled, compiled_fused, single
+from rare_envs.simulation.compiled.dense_policy import DensePolicy
+from rare_envs.simulation.compiled.rollouts import SingleArray
+
+LANES = 64
+"""Rows side by side, a number that the compiler knows: four of the widest registers, whose additions overlap in time.
+Half as many cost half as much again by row."""
+UNITS_AT_ONCE = 4
+"""Units are padded with zeros to multiples of this: so many inputs and outputs are taken at once."""
+_ZERO, _LIMIT = single(0.0, 7.905311)
+"""Beyond 7.9 the hyperbolic tangent is 1 in single precision."""
+_P1, _P3, _P5, _P7, _P9, _P11, _P13 = single(
+    4.89352455891786e-03,
+    6.37261928875436e-04,
+    1.48572235717979e-05,
+    5.12229709037114e-08,
+    -8.60467152213735e-11,
+    2.00018790482477e-13,
+    -2.76076847742355e-16,
+)
+_Q0, _Q2, _Q4, _Q6 = single(4.89352518554385e-03, 2.26843463243900e-03, 1.18534705686654e-04, 1.19825839466702e-06)
+
+
+class NetworkNumbers(NamedTuple):
+    """The layers of a `DensePolicy`, padded and one behind the other, in single precision."""
+
+    weights: SingleArray
+    """Of all layers, each of shape (outputs, inputs), flat."""
+    biases: SingleArray
+    """Of all layers, flat."""
+    widths: NDArray[np.int64]
+    """Units: the padded inputs of the first layer, then the padded outputs of each."""
+    bounded: bool
+    """Whether the activation is the hyperbolic tangent; else the larger of 0 and the value."""
+
+    @classmethod
+    def of(cls, policy: DensePolicy) -> "NetworkNumbers":
+        """Return the layers of a policy."""
+        weights, biases, widths = [], [], [_pad(policy.layers[0][0].shape[1])]
+        for weight, bias in policy.layers:
+            padded = np.zeros((_pad(len(bias)), widths[-1]), dtype=np.float32)
+            padded[: weight.shape[0], : weight.shape[1]] = weight
+            weights.append(padded.ravel())
+            biases.append(np.pad(bias.astype(np.float32), (0, len(padded) - len(bias))))
+            widths.append(len(padded))
+        return cls(np.concatenate(weights), np.concatenate(biases), np.array(widths), policy.activation == "tanh")
+
+
+def _pad(width: int) -> int:
+    """Return the next multiple of `UNITS_AT_ONCE`."""
+    return -(-width // UNITS_AT_ONCE) * UNITS_AT_ONCE
+
+
+@compiled_fused
+def tanh(values: SingleArray) -> None:
+    """Write the hyperbolic tangents of values (n,) over them, to 3e-7 of their size.
+
+    The rational function of Eigen (`generic_fast_tanh_float`, Mozilla Public License 2.0), which is vectorised.
+    """
+    for i in range(len(values)):
+        x = min(max(values[i], -_LIMIT), _LIMIT) if values[i] == values[i] else values[i]
+        s = x * x
+        p = s * (s * (s * (s * (s * (s * _P13 + _P11) + _P9) + _P7) + _P5) + _P3) + _P1
+        q = s * (s * (s * _Q6 + _Q4) + _Q2) + _Q0
+        values[i] = x * p / q
+
+
+@compiled
+def relu(values: SingleArray) -> None:
+    """Write the larger of 0 and the value over values (n,); NaN stays."""
+    for i in range(len(values)):
+        values[i] = _ZERO if values[i] < _ZERO else values[i]
+
+
+@compiled_fused
+def apply_layer(weight: SingleArray, bias: SingleArray, before: SingleArray, after: SingleArray) -> None:
+    """Write a layer's outputs.
+
+    Args:
+        weight: Shape (outputs, inputs), multiples of `UNITS_AT_ONCE`.
+        bias: Shape (outputs,).
+        before: Inputs, shape (at least inputs, `LANES`).
+        after: Outputs, shape (at least outputs, `LANES`), written to.
+    """
+    outputs, inputs = weight.shape
+    for j in range(0, outputs, 4):
+        after0, after1, after2, after3 = after[j], after[j + 1], after[j + 2], after[j + 3]
+        for lane in range(LANES):
+            after0[lane], after1[lane], after2[lane], after3[lane] = bias[j], bias[j + 1], bias[j + 2], bias[j + 3]
+        for k in range(0, inputs, 4):
+            a0, a1, a2, a3 = weight[j, k], weight[j, k + 1], weight[j, k + 2], weight[j, k + 3]
+            b0, b1, b2, b3 = weight[j + 1, k], weight[j + 1, k + 1], weight[j + 1, k + 2], weight[j + 1, k + 3]
+            c0, c1, c2, c3 = weight[j + 2, k], weight[j + 2, k + 1], weight[j + 2, k + 2], weight[j + 2, k + 3]
+            d0, d1, d2, d3 = weight[j + 3, k], weight[j + 3, k + 1], weight[j + 3, k + 2], weight[j + 3, k + 3]
+            before0, before1, before2, before3 = before[k], before[k + 1], before[k + 2], before[k + 3]
+            for lane in range(LANES):
+                x0, x1, x2, x3 = before0[lane], before1[lane], before2[lane], before3[lane]
+                after0[lane] = after0[lane] + a0 * x0 + a1 * x1 + a2 * x2 + a3 * x3
+                after1[lane] = after1[lane] + b0 * x0 + b1 * x1 + b2 * x2 + b3 * x3
+                after2[lane] = after2[lane] + c0 * x0 + c1 * x1 + c2 * x2 + c3 * x3
+                after3[lane] = after3[lane] + d0 * x0 + d1 * x1 + d2 * x2 + d3 * x3
+
+
+@compiled
+def apply_network(network: NetworkNumbers, values: SingleArray, spare: SingleArray) -> SingleArray:
+    """Return the array that the outputs of a block were written to, `values` or `spare`.
+
+    Args:
+        network: The network.
+        values: Observations in the first rows, zeros in those that pad them, shape (widest layer, `LANES`); written
+            over.
+        spare: Of the same shape; written over.
+    """
+    before, after, last = values, spare, len(network.widths) - 2
+    weight_start, bias_start = 0, 0
+    for layer in range(last + 1):
+        inputs, outputs = network.widths[layer], network.widths[layer + 1]
+        weight = network.weights[weight_start : weight_start + inputs * outputs].reshape((outputs, inputs))
+        apply_layer(weight, network.biases[bias_start : bias_start + outputs], before, after)
+        weight_start, bias_start = weight_start + inputs * outputs, bias_start + outputs
+        if layer < last and network.bounded:
+            tanh(after[:outputs].reshape(outputs * LANES))
+        elif layer < last:
+            relu(after[:outputs].reshape(outputs * LANES))
+        before, after = after, before
+    return before
