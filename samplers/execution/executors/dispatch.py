@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections import deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import FIRST_COMPLETED, Future, wait
@@ -13,6 +14,9 @@ from samplers.execution.executors.chunks import Chunk, Index, Packed
 ATTEMPTS = 3
 """Times that a chunk is computed before it is taken apart, and a row before it counts as lost: where 1 worker in 20 is
 killed by chance, a good row of a chunk of several is lost once in 20^6 = 6e7, and a chunk of one row once in 8,000."""
+
+QUIET_SECONDS = 180.0
+"""Time [s] without a result after which a warning says so: a chunk is meant to take seconds."""
 
 
 @dataclass
@@ -43,6 +47,7 @@ class Dispatcher:
     def __init__(self, pool: WorkerPool, work: Work) -> None:
         self._pool, self._work = pool, work
         self._proven = False  # a chunk has been computed
+        self._warned = False
         self.n_retries = self.n_lost = 0
 
     def run(
@@ -64,7 +69,7 @@ class Dispatcher:
         try:
             while waiting or running:
                 self._submit(waiting, running)
-                for future in wait(running, return_when=FIRST_COMPLETED).done:
+                for future in self._wait(running):
                     task = running.pop(future)
                     try:
                         self._finish(task, future.result(), done)
@@ -74,6 +79,20 @@ class Dispatcher:
         finally:
             for future in running:
                 future.cancel()
+
+    def _wait(self, running: dict[Future[Packed], _Task]) -> set[Future[Packed]]:
+        """Return chunks that are done; warn once if none is for long."""
+        done = wait(running, QUIET_SECONDS, FIRST_COMPLETED).done
+        if done:
+            return done
+        if not self._warned:
+            self._warned = True
+            message = (
+                f"None of {len(running)} chunks has come back in {QUIET_SECONDS:g} s, and the run waits: a pool "
+                "without workers (dask, Ray) never answers, nor does a hung ego without a time limit (time_limit=)."
+            )
+            warnings.warn(message, RuntimeWarning, stacklevel=2)
+        return wait(running, return_when=FIRST_COMPLETED).done
 
     def _submit(self, waiting: deque[_Task], running: dict[Future[Packed], _Task]) -> None:
         """Submit what the window has room for; a suspect goes alone where its neighbours would share its fate."""

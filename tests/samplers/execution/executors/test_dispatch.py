@@ -1,10 +1,13 @@
 """Dispatch: every chunk is done once, in any order of completion, and only rows that are guilty are lost."""
 
+import threading
+from concurrent import futures
 from concurrent.futures import Future
 
 import numpy as np
 import pytest
 
+from samplers.execution.executors import dispatch
 from samplers.execution.executors.base import ExecutorError, WorkerLost
 from samplers.execution.executors.chunks import Chunk
 from samplers.execution.executors.dispatch import ATTEMPTS, Dispatcher
@@ -62,7 +65,7 @@ class LazyFuture(Future):
 
 @pytest.fixture(autouse=True)
 def without_threads(monkeypatch):
-    def wait(running, return_when):
+    def wait(running, timeout=None, return_when=None):
         next(iter(running)).pool.finish_one()
         done = {future for future in running if future.done()}
         return type("Done", (), {"done": done})
@@ -135,3 +138,24 @@ def test_what_the_work_raises_ends_the_run():
 
     with pytest.raises(ArithmeticError, match="off the map"):
         run(Raising(np.random.default_rng(0)))
+
+
+def test_a_pool_without_workers_is_spoken_of_once(monkeypatch):
+    """The two chunks come back after some ten times the time after which a warning is due."""
+    monkeypatch.setattr(dispatch, "QUIET_SECONDS", 0.02)
+    monkeypatch.setattr(dispatch, "wait", futures.wait)
+
+    class Idle:
+        workers, window, blames = 1, 8, True
+
+        def submit(self, index, chunk):
+            future = Future()
+            threading.Timer(0.2 * (1 + index[0]), lambda: future.set_result(WORK(chunk))).start()
+            return future
+
+    results = {}
+    chunks = [(number, Chunk("f", (np.full((1, 1), float(number)),))) for number in range(2)]
+    with pytest.warns(RuntimeWarning, match="None of 2 chunks has come back in 0.02 s") as caught:
+        Dispatcher(Idle(), WORK).run(chunks, results.__setitem__, lambda: None)
+    assert len(caught) == 1
+    assert sorted(results) == [0, 1]
