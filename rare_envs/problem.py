@@ -22,7 +22,7 @@ from rare_envs.egos.policy import PolicyDriver, as_driver
 from rare_envs.egos.sb3.dense_networks import read_dense_policy
 from rare_envs.egos.wrappers import find_action_bounds
 from rare_envs.make import set_up
-from rare_envs.scenarios.registry import find_scenario
+from rare_envs.scenarios.registry import find_scenario, split_layout
 from rare_envs.search_terms import EpisodeTerms, simulate_terms
 from rare_envs.simulation.compiled.selection import (
     CompiledEgo,
@@ -110,7 +110,8 @@ class DrivingProblem:
         """Check everything that can be checked before a simulation.
 
         Args:
-            env_id: For example "rare_envs/CutIn-v0".
+            env_id: For example "rare_envs/CutIn-v0"; an id with HighwayEnv's layout, such as
+                "rare_envs/CutIn-kinematics-v0", stands for observation="kinematics" and action="meta".
             ego: "idm", a `Driver`, an object with Stable-Baselines3's `predict`, called on whole batches, a function or
                 torch module from observations (B, F) to actions (B, 2), or a name or file that `agents.load_ego`
                 knows, such as "ppo.zip" (its further arguments: `ego=agents.load_ego("ppo.zip", stats=...)`).
@@ -136,6 +137,8 @@ class DrivingProblem:
             FileNotFoundError: If the ego is a file that does not exist.
             ValueError: If an argument is invalid or the ego's spaces are not the environment's.
         """
+        env_id, layout = split_layout(env_id)
+        make_kwargs = {**layout, **make_kwargs}
         self.env_id = env_id
         self.ego = ego
         ego = load_named_ego(ego)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 from gymnasium.vector import VectorEnv
 
-from rare_envs.scenarios.registry import HIGHWAY_ENV_LAYOUT, SCENARIOS, kinematics_id
+from rare_envs.scenarios.registry import HIGHWAY_ENV_LAYOUT, SCENARIOS, kinematics_id, split_layout
 
 if TYPE_CHECKING:
     from rare_envs.envs.parallel import DrivingParallelEnv
@@ -84,7 +84,8 @@ def parallel_env(env_id: str, **kwargs: Any) -> DrivingParallelEnv:
     """
     from rare_envs.envs.parallel import DrivingParallelEnv
 
-    return DrivingParallelEnv(env_id, **kwargs)
+    env_id, layout = split_layout(env_id)
+    return DrivingParallelEnv(env_id, **{**layout, **kwargs})
 
 
 def make_batch(env_id: str, num_envs: int, **kwargs: Any) -> VectorEnv[Any, Any, Any]:
@@ -108,7 +109,7 @@ def make_batch(env_id: str, num_envs: int, **kwargs: Any) -> VectorEnv[Any, Any,
     """
     from rare_envs.scenarios.registry import find_scenario
 
-    find_scenario(env_id)
+    find_scenario(split_layout(env_id)[0])
     if not isinstance(num_envs, int) or num_envs < 1:
         raise ValueError(f"Expected num_envs of at least 1, got {num_envs!r}.")
     return gym.make_vec(env_id, num_envs=num_envs, vectorization_mode="vector_entry_point", **kwargs)

@@ -7,7 +7,7 @@ import torch
 from gymnasium import spaces
 from torch import Tensor
 
-ACTIONS = ("continuous", "meta")
+ACTIONS = ("continuous", "discrete", "meta")
 """Kinds of actions."""
 
 MAX_ACCELERATION = 5.0
@@ -35,8 +35,10 @@ def action_space() -> "spaces.Box[np.float32]":
 
 
 def space_of_actions(kind: str) -> spaces.Space[Any]:
-    """Return the space of a kind of action: `action_space`, or for "meta" the indices of `META_ACTIONS`."""
-    return spaces.Discrete(len(META_ACTIONS)) if kind == "meta" else action_space()
+    """Return the space of a kind of action: `action_space`, or the indices of `DISCRETE_ACTIONS` or `META_ACTIONS`."""
+    if kind == "continuous":
+        return action_space()
+    return spaces.Discrete(len(META_ACTIONS) if kind == "meta" else len(DISCRETE_ACTIONS))
 
 
 def read_actions(kind: str, actions: Tensor, batch: int, ignored: Tensor | None = None) -> Tensor:

@@ -17,7 +17,7 @@ SingleObservation = NDArray[np.float32]
 
 
 def episode_info(space: ScenarioSpace, x: NDArray[Any], episode: Episode) -> Info:
-    """Return the info of one episode at any moment: `scenario`, `x`, `min_ttc` [s] and `collision`.
+    """Return the info of one episode: `scenario`, `x`, `min_ttc` [s], `collision`, `crashed` (the same), `speed` [m/s].
 
     Args:
         space: Of its parameters.
@@ -31,6 +31,8 @@ def episode_info(space: ScenarioSpace, x: NDArray[Any], episode: Episode) -> Inf
         "x": x.copy(),
         "min_ttc": 0.0 if collided else float(episode.statistics.least_ttc),
         "collision": collided,
+        "crashed": collided,
+        "speed": float(episode.state.speed[0, 0]),
     }
 
 

@@ -24,8 +24,8 @@ class DrivingEnv(gym.Env[SingleObservation, Any]):
     `rare_envs.control.actions`, for one tick; with `action="meta"` one of HighwayEnv's meta-actions, see
     `rare_envs.control.meta_actions`, for one second. Reward: see `rare_envs.simulation.reward`. The episode terminates
     with a collision and is truncated at the horizon. `info` carries `scenario`, `x`, `min_ttc` [s], `collision`,
-    `reward_terms`, and at the end `measure` (f(x)), `collision_type` and `crash`, which say who ran into whom and how
-    hard (`rare_envs.traffic.crash`), or None.
+    `crashed` (the same), `speed` [m/s] and `reward_terms`, and at the end `measure` (f(x)), `collision_type` and
+    `crash`, which say who ran into whom and how hard (`rare_envs.traffic.crash`), or None.
 
     Example:
         >>> import gymnasium

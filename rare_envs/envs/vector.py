@@ -163,6 +163,8 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         put_masked(infos, "x", self._x.copy(), mask)
         put_masked(infos, "min_ttc", np.where(collided, 0.0, episode.statistics.least_ttc.double().numpy()), mask)
         put_masked(infos, "collision", collided.copy(), mask)
+        put_masked(infos, "crashed", collided.copy(), mask)  # HighwayEnv's name of it
+        put_masked(infos, "speed", episode.state.speed[:, 0].double().numpy(), mask)
         return infos
 
     def _final_info(self, episode: Episode, terms: RewardTerms, done: NDArray[np.bool_]) -> Info:

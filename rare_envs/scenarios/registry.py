@@ -165,3 +165,17 @@ def kinematics_id(env_id: str) -> str:
     """
     name, _, version = env_id.rpartition("-v")
     return f"{name}-kinematics-v{version}"
+
+
+def split_layout(env_id: str) -> tuple[str, dict[str, str]]:
+    """Return the id of the scenario itself for an id with HighwayEnv's layout, and the keyword arguments it stands for.
+
+    Example:
+        >>> split_layout("rare_envs/CutIn-kinematics-v0")
+        ('rare_envs/CutIn-v0', {'observation': 'kinematics', 'action': 'meta'})
+        >>> split_layout("rare_envs/CutIn-v0")
+        ('rare_envs/CutIn-v0', {})
+    """
+    layouts = {kinematics_id(each): each for each in SCENARIOS}
+    known = isinstance(env_id, str) and env_id in layouts  # what is no id is refused where the scenario is looked for
+    return (layouts[env_id], dict(HIGHWAY_ENV_LAYOUT)) if known else (env_id, {})

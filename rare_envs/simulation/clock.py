@@ -38,7 +38,7 @@ class Clock:
     horizon: float | None = None
     """Length of an episode [s]; None for the scenario's, which a `World` fills in."""
     action: str = "continuous"
-    """Kind of a policy's actions: "continuous" ones, each tick, or "meta"-actions, each second."""
+    """Kind of a policy's actions: "continuous" or "discrete" ones, each tick, or "meta"-actions, each second."""
 
     def __post_init__(self) -> None:
         if not (_is_number(self.dt) and 0.0 < self.dt <= LONGEST_TICK):

@@ -20,7 +20,7 @@ from rare_envs.distributions.space import Distribution
 from rare_envs.egos.errors import EgoGone
 from rare_envs.problem import AmbiguousActions, DrivingProblem
 from rare_envs.scenarios.base_distributions import load_base
-from rare_envs.scenarios.registry import find_scenario
+from rare_envs.scenarios.registry import find_scenario, split_layout
 from rare_envs.simulation.rollout import drive
 from rare_envs.study.errors import BadInput, as_bad_input
 from samplers.errors import OnError
@@ -108,6 +108,14 @@ class Question:
     given_base: bool = False
     chunk: int | None = None
     core: str = "auto"
+
+    def __post_init__(self) -> None:
+        """Take an id with HighwayEnv's layout as that of the scenario, with the observation and actions it means."""
+        env_id, layout = split_layout(self.env_id)
+        if layout:
+            object.__setattr__(self, "env_id", env_id)
+            object.__setattr__(self, "observation", self.observation or layout["observation"])
+            object.__setattr__(self, "action", layout["action"])
 
     @property
     def run_arguments(self) -> RunArguments:

@@ -60,7 +60,7 @@ ObservationOption = Annotated[
     ),
 ]
 ActionOption = Annotated[
-    str, typer.Option(help="Actions of the ego: continuous, each tick, or HighwayEnv's meta, each second.")
+    str, typer.Option(help="Actions of the ego: continuous or discrete, each tick, or HighwayEnv's meta, each second.")
 ]
 EnsembleRunOption = Annotated[
     bool,

@@ -2,10 +2,13 @@
 
 import math
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from stable_baselines3 import DQN
 
+import rare_envs
 from rare_envs.control.actions import (
     DISCRETE_ACTIONS,
     IDLE,
@@ -69,3 +72,31 @@ def test_spaces_hold_the_actions() -> None:
     assert space_of_actions("continuous") == action_space()
     assert all(action_space().contains(row) for row in DISCRETE_ACTIONS)
     assert space_of_actions("meta").n == len(META_ACTIONS)  # type: ignore[attr-defined]
+
+
+def test_discrete_actions_are_rows_of_the_table() -> None:
+    """One step of each index is that of its continuous action, alone and in a batch; DQN trains."""
+    discrete, continuous = gym.make("rare_envs/CutIn-v0", action="discrete"), gym.make("rare_envs/CutIn-v0")
+    assert discrete.action_space == gym.spaces.Discrete(len(DISCRETE_ACTIONS))
+    for index, action in enumerate(DISCRETE_ACTIONS):
+        discrete.reset(seed=1)
+        continuous.reset(seed=1)
+        found, wanted = discrete.step(index), continuous.step(action)
+        np.testing.assert_array_equal(found[0], wanted[0])
+        assert found[1:4] == wanted[1:4]
+    batch = gym.make_vec("rare_envs/CutIn-v0", num_envs=5, action="discrete")
+    same = gym.make_vec("rare_envs/CutIn-v0", num_envs=5)
+    batch.reset(seed=2)
+    same.reset(seed=2)
+    np.testing.assert_array_equal(batch.step(np.arange(5))[0], same.step(DISCRETE_ACTIONS)[0])
+    model = DQN("MlpPolicy", discrete, buffer_size=50, learning_starts=4, batch_size=4, device="cpu", seed=0).learn(12)
+    assert rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego=model, horizon=1.0).notes == ()
+
+
+def test_agents_of_a_parallel_environment_act_by_index_too() -> None:
+    many = rare_envs.parallel_env("rare_envs/CutIn-v0", action="discrete", agents=["ego"])
+    alone = rare_envs.parallel_env("rare_envs/CutIn-v0", agents=["ego"])
+    many.reset(seed=1)
+    alone.reset(seed=1)
+    found, wanted = many.step({"ego": 1})[0], alone.step({"ego": DISCRETE_ACTIONS[1]})[0]
+    np.testing.assert_array_equal(found["ego"], wanted["ego"])

@@ -18,6 +18,7 @@ from rare_envs.control.actions import FASTER, IDLE, LANE_LEFT, LANE_RIGHT, SLOWE
 from rare_envs.control.meta_actions import TARGET_SPEEDS, follow_meta_actions, initial_aim
 from rare_envs.make import set_up
 from rare_envs.sensors.kinematics import observe_kinematics
+from rare_envs.study import Question
 from rare_envs.traffic.road import i80, straight
 from rare_envs.traffic.state import State
 from rare_envs.traffic.vehicle_models import bicycle
@@ -319,6 +320,26 @@ def test_an_id_with_highway_envs_layout() -> None:
     for action in (3, 1):
         np.testing.assert_array_equal(env.step(action)[0], same.step(action)[0])
     assert gym.make_vec("rare_envs/HardBrake-kinematics-v0", num_envs=2).reset()[0].shape == (2, 5, 5)
+
+
+def test_the_id_used_in_training_is_taken_everywhere() -> None:
+    class Idle:
+        def predict(
+            self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
+        ) -> Any:
+            assert observation.shape[1:] == (5, 5)
+            return np.full(len(observation), IDLE), state
+
+    x = rare_envs.DrivingProblem("rare_envs/CutIn-v0").base.sample(4, np.random.default_rng(0))
+    short = rare_envs.DrivingProblem("rare_envs/CutIn-kinematics-v0", ego=Idle())
+    whole = rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego=Idle(), observation="kinematics", action="meta")
+    np.testing.assert_array_equal(short.evaluate(x), whole.evaluate(x))
+    assert short.env_id == "rare_envs/CutIn-v0"
+    many = rare_envs.parallel_env("rare_envs/CutIn-kinematics-v0")
+    assert many.action_space("ego") == gym.spaces.Discrete(5)
+    assert rare_envs.make_batch("rare_envs/CutIn-kinematics-v0", num_envs=2).single_observation_space.shape == (5, 5)
+    asked = Question(env_id="rare_envs/CutIn-kinematics-v0")
+    assert asked == Question(env_id="rare_envs/CutIn-v0", observation="kinematics", action="meta")
 
 
 def test_stable_baselines3_takes_our_environment_for_a_policy_from_highway_env(tmp_path: Path) -> None:

@@ -1,8 +1,11 @@
 """Info of one episode, and whose crash it tells."""
 
+import gymnasium as gym
+import numpy as np
 import pytest
 import torch
 
+import rare_envs  # noqa: F401  (registers its ids)
 from rare_envs.envs.info import episode_info, step_info
 from rare_envs.make import set_up
 from rare_envs.multi_agent.episode import start
@@ -38,3 +41,23 @@ def test_vehicles_of_a_crash_are_numbered_as_in_the_scenario_whoever_sees_it() -
         numbers.append(sorted(info["crash"]["vehicles"]))
         assert info["reward_terms"] == {"reward": 0.0}
     assert numbers == [[0, 1], [0, 1]]
+
+
+def test_info_has_the_names_of_highway_env() -> None:
+    alone, batch = gym.make("rare_envs/CutIn-v0"), gym.make_vec("rare_envs/CutIn-v0", num_envs=2)
+    x = {"ego_speed": 20.0, "cut_in_speed": 20.0, "cut_in_gap": 50.0}
+    one, many = alone.reset(seed=0, options=x)[1], batch.reset(seed=0, options=x)[1]
+    assert (one["speed"], one["crashed"]) == (20.0, False)
+    assert many["speed"].tolist() == [20.0, 20.0]
+    brake = np.array([-1.0, 0.0], np.float32)  # 5 m/s^2 for a tick of 0.1 s
+    assert alone.step(brake)[4]["speed"] == pytest.approx(19.5)
+    np.testing.assert_allclose(batch.step(np.stack([brake, brake]))[4]["speed"], 19.5, rtol=1e-6)
+
+
+def test_crashed_says_what_collision_does() -> None:
+    alone = gym.make("rare_envs/CarFollowing-v0")
+    alone.reset(seed=0, options={"ego_speed": 30.0, "lead_speed": 0.0, "gap": 5.0})
+    over = False
+    while not over:
+        _, _, over, _, info = alone.step(np.array([1.0, 0.0], np.float32))
+    assert info["crashed"] is info["collision"] is True

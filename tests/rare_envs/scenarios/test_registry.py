@@ -6,7 +6,15 @@ from pathlib import Path
 
 import pytest
 
-from rare_envs.scenarios.registry import SCENARIOS, Registry, find_scenario, kinematics_id, scenario_named
+from rare_envs.scenarios.registry import (
+    HIGHWAY_ENV_LAYOUT,
+    SCENARIOS,
+    Registry,
+    find_scenario,
+    kinematics_id,
+    scenario_named,
+    split_layout,
+)
 from tests.rare_envs.scenarios.standing import STANDING
 
 PLACE = "place_of_this_registry_test"
@@ -134,3 +142,9 @@ def test_a_module_that_cannot_be_imported_is_named_with_the_id(place: str) -> No
 )
 def test_the_id_of_highway_envs_layout_keeps_the_version_last(env_id: str, expected: str) -> None:
     assert kinematics_id(env_id) == expected
+
+
+def test_an_id_with_highway_envs_layout_stands_for_its_arguments() -> None:
+    assert split_layout("rare_envs/HardBrake-kinematics-v0") == ("rare_envs/HardBrake-v0", HIGHWAY_ENV_LAYOUT)
+    for other in ("rare_envs/CutIn-v0", "highway-fast-v0", 3, ["rare_envs/CutIn-v0"]):
+        assert split_layout(other) == (other, {})  # type: ignore[arg-type]

@@ -14,10 +14,6 @@ from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli, assert_refused
 BAD_ESTIMATES = {
     "unknown environment": (["rare_envs/CutIn-v7"], ["rare_envs/CutIn-v"]),
     "environment without its namespace": (["CutIn"], ["rare_envs/CutIn-v0"]),
-    "the id with HighwayEnv's layout": (
-        ["rare_envs/CutIn-kinematics-v0"],
-        ["rare_envs/CutIn-v0", "'kinematics'", "'meta'"],
-    ),
     "HighwayEnv's environment": (["highway-fast-v0"], ["rare_envs.highway_env_problem('highway-fast-v0'"]),
     "missing environment": ([], ["ENV"]),
     "missing .zip": ([FOLLOWING, "--ego", "nowhere.zip"], ["nowhere.zip"]),
