@@ -33,6 +33,7 @@ from rare_envs.study.cli.options import (
     StatsOption,
     TrustOption,
     WorldOptions,
+    read_count,
 )
 from rare_envs.study.cli.shell import (
     OneLineErrors,
@@ -43,6 +44,7 @@ from rare_envs.study.cli.shell import (
 )
 from rare_envs.study.errors import BadInput, as_bad_input
 from rare_envs.threads import use_one_thread
+from rare_envs.version import __version__
 from training.command_line import DriverTrainingOptions, RecordingOptions, RunFolderOption, spread_options
 
 DOUBTFUL = 3
@@ -56,6 +58,22 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
+
+
+def _print_version(wanted: bool) -> None:
+    """Print the version and exit, where it is wanted."""
+    if wanted:
+        print(f"rare-envs {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def common_options(
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version and exit.", callback=_print_version, is_eager=True)
+    ] = False,
+) -> None:
+    """How often does a driving policy crash? Train one, estimate its rare failures, see the most likely."""
 
 
 @app.command("list")
@@ -213,7 +231,12 @@ def compare_command(
     ego_b: Annotated[str, typer.Argument(metavar="EGO_B", help="The other ego.")],
     env: EnvArgument,
     options: QuestionOptions,
-    max_sim: Annotated[int, typer.Option(help="Largest number of simulations, of both egos together.")] = 12_000,
+    max_sim: Annotated[
+        int,
+        typer.Option(
+            help="Largest number of simulations, of both egos together.", parser=read_count, metavar="INTEGER"
+        ),
+    ] = 12_000,
     algo: AlgoOption = None,
     stats: StatsOption = None,
     algo_b: Annotated[str | None, typer.Option(help="As --algo, for the .zip of EGO_B.")] = None,

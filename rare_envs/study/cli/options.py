@@ -7,6 +7,7 @@ importing that takes seconds.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 from enum import Enum
 from typing import Annotated, Any
@@ -30,6 +31,29 @@ class NoiseChoice(str, Enum):
     def argument(self) -> bool | str:
         """The argument that the name stands for."""
         return {"on": True, "off": False}.get(self.value, self.value)
+
+
+def read_count(text: str) -> int:
+    """Return the whole number that a text stands for, such as "10000" or "1e4".
+
+    Example:
+        >>> read_count("1e4"), read_count("-5")
+        (10000, -5)
+
+    Raises:
+        typer.BadParameter: If it is no whole number.
+    """
+    try:
+        return int(text)
+    except ValueError:
+        pass
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not number.is_integer():
+        raise typer.BadParameter(f"expected a whole number, such as 10000 or 1e4, got {text!r}.")
+    return int(number)
 
 
 DEFAULT_BUDGET = "that of the method, 6,000 for two-stage"
@@ -129,9 +153,12 @@ class EstimateOptions(QuestionOptions):
     also_under: Annotated[
         str | None, typer.Option(help="State p under these bases too, by the same simulations: us101-closing,i80.")
     ] = None
-    max_sim: Annotated[int | None, typer.Option(help="Largest number of simulations.", show_default=DEFAULT_BUDGET)] = (
-        None
-    )
+    max_sim: Annotated[
+        int | None,
+        typer.Option(
+            help="Largest number of simulations.", parser=read_count, metavar="INTEGER", show_default=DEFAULT_BUDGET
+        ),
+    ] = None
     target_cov: Annotated[float | None, typer.Option(help="Stop at this coefficient of variation.")] = None
     replicates: Annotated[int, typer.Option(help="Independent runs, combined by their mean.")] = 1
     on_error: Annotated[str, typer.Option(help="Where the ego fails twice: raise, failure or bound.")] = "raise"
@@ -176,7 +203,12 @@ class RiskOptions:
     method: Annotated[str, typer.Option(help="Estimation method; see rare-envs list.")] = "auto"
     max_sim: Annotated[
         int | None,
-        typer.Option(help="Largest number of simulations of each scenario.", show_default=DEFAULT_BUDGET),
+        typer.Option(
+            help="Largest number of simulations of each scenario.",
+            parser=read_count,
+            metavar="INTEGER",
+            show_default=DEFAULT_BUDGET,
+        ),
     ] = None
     ensemble_run: EnsembleRunOption = True
     seed: SeedOption = 0
