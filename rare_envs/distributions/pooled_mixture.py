@@ -21,7 +21,7 @@ from rare_envs.distributions.mixture_conditionals import (
     apply_by_chunks,
 )
 from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
-from rare_envs.distributions.truncated_normal import ROOT_TOLERANCE, TruncatedConditional, log_sum
+from rare_envs.distributions.truncated_normal import ROOT_TOLERANCE, TailSearch, TruncatedConditional, log_sum
 
 SEARCH_STEPS = 200
 """Most steps of the search for a quantile; bisections alone would need about 60."""
@@ -269,7 +269,7 @@ def _find_quantile(
     """
     pairs = zip(parts, conditionals, strict=True)
     quantiles = np.stack([part.quantile(j, x, conditional, u) for part, conditional in pairs])
-    errors = _Errors(j, x.copy(), u, list(parts), list(conditionals))
+    errors = _Errors.start(j, x, u, parts, conditionals)
     left, right = quantiles.min(axis=0), quantiles.max(axis=0)
     error_left, error_right = np.minimum(errors.at(left), 0.0), np.maximum(errors.at(right), 0.0)
     found = np.where(-error_left < error_right, left, right)
@@ -300,6 +300,48 @@ def _find_quantile(
     return np.asarray(found)
 
 
+class _Tail(NamedTuple):
+    """The distribution function of column j of one part, read from the tail in which the root is; row by row."""
+
+    coordinates: Coordinates
+    log_weight: FloatArray
+    """Logarithm of the part's weight given the earlier columns, (n,)."""
+    mirrored: NDArray[np.bool_]
+    """Rows whose tail is the upper one of the coordinate, (n,)."""
+    low: FloatArray
+    high: FloatArray
+    """Range of the coordinate, (n,)."""
+    search: TailSearch
+
+    @classmethod
+    def of(cls, part: _Part, conditional: TruncatedConditional, j: int, u: FloatArray, log_total: FloatArray) -> _Tail:
+        """Return the tail of a part; what does not depend on the value of column j is computed once."""
+        coordinates = part.conditionals.coordinates
+        mirrored = coordinates.sign(j) * u > 0
+        mirror = conditional.mirror(mirrored)
+        mass = log_sum(mirror.log_weights + mirror.log_mass())
+        search = TailSearch.start(mirror, mass, u, u)
+        low, high = (np.broadcast_to(end, len(u)) for end in (conditional.low, conditional.high))
+        return cls(coordinates, part.log_weight - log_total, mirrored, low, high, search)
+
+    def log_share(self, j: int, x: FloatArray) -> FloatArray:
+        """Return the logarithm of the part's weight times its mass in the tail up to column j of x (n, d), (n,)."""
+        y = move_inside(self.coordinates.coordinate(j, x), self.low, self.high)
+        log_cdf = self.search.log_cdf(np.where(self.mirrored, -y, y))
+        return self.log_weight + np.minimum(log_cdf - self.search.mass, 0.0)
+
+    def take(self, rows: NDArray[np.intp]) -> _Tail:
+        """Return those of some rows."""
+        return _Tail(
+            self.coordinates,
+            self.log_weight[rows],
+            self.mirrored[rows],
+            self.low[rows],
+            self.high[rows],
+            self.search.take(rows),
+        )
+
+
 class _Errors(NamedTuple):
     """Errors of guesses of the value of column j, on the quantile scale; row by row."""
 
@@ -308,13 +350,22 @@ class _Errors(NamedTuple):
     """With the columns before j, shape (n, d); column j is written over."""
     u: FloatArray
     """What is wanted on the quantile scale, shape (n,)."""
-    parts: list[_Part]
-    conditionals: list[TruncatedConditional]
+    tails: list[_Tail]
+
+    @classmethod
+    def start(
+        cls, j: int, x: FloatArray, u: FloatArray, parts: Sequence[_Part], conditionals: Sequence[TruncatedConditional]
+    ) -> _Errors:
+        """Return the errors of all rows."""
+        log_total = log_sum(np.stack([part.log_weight for part in parts]))
+        pairs = zip(parts, conditionals, strict=True)
+        return cls(j, x.copy(), u, [_Tail.of(part, conditional, j, u, log_total) for part, conditional in pairs])
 
     def at(self, values: FloatArray) -> FloatArray:
         """Return the errors of values (n,)."""
         self.x[:, self.j] = values
-        return _pooled_quantile_scale(self.j, self.x, self.parts, self.conditionals) - self.u
+        tail = log_sum(np.stack([each.log_share(self.j, self.x) for each in self.tails]))
+        return np.where(self.u > 0, -1.0, 1.0) * ndtri_exp(np.minimum(tail, 0.0)) - self.u
 
     def are_small(self, error: FloatArray) -> NDArray[np.bool_]:
         """Return whether errors (n,) of either sign are within the tolerance."""
@@ -323,8 +374,7 @@ class _Errors(NamedTuple):
 
     def take(self, rows: NDArray[np.intp]) -> _Errors:
         """Return those of some rows."""
-        parts = [part._replace(log_weight=part.log_weight[rows]) for part in self.parts]
-        return _Errors(self.j, self.x[rows], self.u[rows], parts, [each.take(rows) for each in self.conditionals])
+        return _Errors(self.j, self.x[rows], self.u[rows], [each.take(rows) for each in self.tails])
 
 
 def _is_narrow(left: FloatArray, right: FloatArray) -> NDArray[np.bool_]:

@@ -66,10 +66,12 @@ class TruncatedConditional(NamedTuple):
     def from_normal(self, u: FloatArray) -> FloatArray:
         """Invert `to_normal`, (n,) -> (n,); positive u are solved in the mirror image."""
         sign = np.where(u > 0, -1.0, 1.0)
-        low = np.where(u > 0, -self.high, self.low)
-        high = np.where(u > 0, -self.low, self.high)
-        mirrored = TruncatedConditional(self.log_weights, sign * self.mean, self.scale, low, high)
-        return sign * _solve_lower_tail(mirrored, sign * u)
+        return sign * _solve_lower_tail(self.mirror(u > 0), sign * u)
+
+    def mirror(self, rows: NDArray[np.bool_]) -> TruncatedConditional:
+        """Return the distributions of -x in some rows, boolean (n,), and of x in the others."""
+        low, high = np.where(rows, -self.high, self.low), np.where(rows, -self.low, self.high)
+        return TruncatedConditional(self.log_weights, np.where(rows, -1.0, 1.0) * self.mean, self.scale, low, high)
 
 
 def _solve_lower_tail(conditional: TruncatedConditional, u: FloatArray) -> FloatArray:
@@ -78,10 +80,11 @@ def _solve_lower_tail(conditional: TruncatedConditional, u: FloatArray) -> Float
     Newton's method on the quantile scale (exact for one component far from the box), else on the
     mass scale (exact where the box cuts a flat density), else bisection; each row stops by itself.
     """
-    mass = log_sum(conditional.log_weights + conditional.log_mass())
-    root = _first_guess(conditional, u)
+    score = conditional.log_weights + conditional.log_mass()
+    mass = log_sum(score)
+    root = _first_guess(conditional, u, score)
     rows = np.arange(len(u))
-    search = _Search.start(conditional, mass, u, root)
+    search = TailSearch.start(conditional, mass, u, root)
     for _ in range(MAX_ITERATIONS):
         search, done = search.advance()
         root[rows] = search.x
@@ -93,9 +96,14 @@ def _solve_lower_tail(conditional: TruncatedConditional, u: FloatArray) -> Float
     return root
 
 
-def _first_guess(conditional: TruncatedConditional, u: FloatArray) -> FloatArray:
-    """Return the quantile of the truncated normal with the moments of the mixture; exact for K = 1."""
-    score = conditional.log_weights + conditional.log_mass()
+def _first_guess(conditional: TruncatedConditional, u: FloatArray, score: FloatArray) -> FloatArray:
+    """Return the quantile of the truncated normal with the moments of the mixture; exact for K = 1.
+
+    Args:
+        conditional: The mixture.
+        u: What is wanted on the quantile scale, (n,).
+        score: Logarithms of the masses of the components in the interval times their weights, (K, n).
+    """
     weights = np.exp(score - log_sum(score))
     mean = sum_components(weights * conditional.mean)
     scale = np.sqrt(sum_components(weights * (conditional.scale**2 + (conditional.mean - mean) ** 2)))
@@ -104,8 +112,8 @@ def _first_guess(conditional: TruncatedConditional, u: FloatArray) -> FloatArray
     return np.clip(guess, conditional.low, conditional.high)
 
 
-class _Search(NamedTuple):
-    """State of the root search, one column per row still running."""
+class TailSearch(NamedTuple):
+    """State of the search for a root in the lower tail, one column per row still running."""
 
     conditional: TruncatedConditional
     log_cdf_low: FloatArray  # (K, n) log Phi at the lower end, and of its mirror image
@@ -118,18 +126,28 @@ class _Search(NamedTuple):
     step: FloatArray  # (n,) size of the last step
 
     @classmethod
-    def start(cls, conditional: TruncatedConditional, mass: FloatArray, u: FloatArray, x: FloatArray) -> _Search:
+    def start(cls, conditional: TruncatedConditional, mass: FloatArray, u: FloatArray, x: FloatArray) -> TailSearch:
+        """Return the search from x (n,); mass is the log mass of the box under the unnormalised weights, (n,)."""
         a = (conditional.low - conditional.mean) / conditional.scale
         width = conditional.high - conditional.low
         return cls(conditional, log_ndtr(a), log_ndtr(-a), mass, u, x, conditional.low, conditional.high, width)
 
-    def take(self, keep: NDArray[np.intp]) -> _Search:
+    def take(self, keep: NDArray[np.intp]) -> TailSearch:
         """Return the search of some rows."""
         columns = (self.log_cdf_low[:, keep], self.log_sf_low[:, keep])
-        return _Search(self.conditional.take(keep), *columns, *(array[keep] for array in self[3:]))
+        return TailSearch(self.conditional.take(keep), *columns, *(array[keep] for array in self[3:]))
+
+    def log_cdf(self, x: FloatArray) -> FloatArray:
+        """Return the log mass of [low, x] under the unnormalised weights, (n,)."""
+        return self._replace(x=x)._log_cdf_and_ends()[0]
 
     def log_cdf_and_density(self) -> tuple[FloatArray, FloatArray]:
         """Return the log mass of [low, x] and log density at x under the unnormalised weights, (n,)."""
+        log_cdf, b = self._log_cdf_and_ends()
+        return log_cdf, log_sum(reweight(self.conditional.log_weights, b, self.conditional.scale))
+
+    def _log_cdf_and_ends(self) -> tuple[FloatArray, FloatArray]:
+        """Return the log mass of [low, x] (n,), and x in units of each component (K, n)."""
         conditional = self.conditional
         a, b = (conditional.low - conditional.mean) / conditional.scale, (self.x - conditional.mean) / conditional.scale
         width = (self.x - conditional.low) / conditional.scale
@@ -137,10 +155,9 @@ class _Search(NamedTuple):
         end = log_ndtr(np.where(flip, -b, b))
         lower = np.where(flip, end, self.log_cdf_low)
         upper = np.where(flip, self.log_sf_low, end)
-        log_cdf = log_sum(conditional.log_weights + log_difference(lower, upper, a, width))
-        return log_cdf, log_sum(reweight(conditional.log_weights, b, conditional.scale))
+        return log_sum(conditional.log_weights + log_difference(lower, upper, a, width)), b
 
-    def advance(self) -> tuple[_Search, NDArray[np.bool_]]:
+    def advance(self) -> tuple[TailSearch, NDArray[np.bool_]]:
         """Return the search after one step of every row, and which rows have converged."""
         log_cdf, log_density = self.log_cdf_and_density()
         tail = np.minimum(log_cdf - self.mass, 0.0)

@@ -43,9 +43,9 @@ def read_dense_policy(policy: Any) -> DensePolicy:
         NotCompiled: It is none of these; the message says what it is.
 
     Example:
-        >>> import rare_envs
+        >>> import gymnasium, rare_envs
         >>> from stable_baselines3 import PPO
-        >>> model = PPO("MlpPolicy", rare_envs.make_vec("rare_envs/CarFollowing-v0"), n_steps=8, device="cpu")
+        >>> model = PPO("MlpPolicy", gymnasium.make("rare_envs/CarFollowing-v0"), device="cpu")
         >>> [weight.shape for weight, _ in read_dense_policy(model).layers]
         [(64, 7), (64, 64), (2, 64)]
     """
