@@ -222,6 +222,11 @@ class DrivingProblem:
         return "torch" if self._run_compiled(nothing) is None else "numba"
 
     @property
+    def terms_with_f(self) -> bool:
+        """Whether terms come with the rollout that gives f: compiled rollouts have none, torch then simulates them."""
+        return self._compiled is None
+
+    @property
     def dim(self) -> int:
         """Number of scenario parameters."""
         return self.space.dim

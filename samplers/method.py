@@ -152,6 +152,8 @@ class TermsOffer:
 
     gradient_cost: float | None = None
     """Simulations that a row of a gradient takes at most."""
+    with_f: bool = True
+    """Whether terms come with the rollout that gives f; see `samplers.problem.HasTerms`."""
 
     def count_gradients(self, n: int) -> int:
         """Return the simulations that n gradients take at most."""

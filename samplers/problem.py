@@ -174,7 +174,8 @@ class HasTerms(Protocol):
     """A problem whose f is the least of several terms, and that can tell them apart.
 
     Methods may ask for terms in place of f, at the price of one simulation a row. An attribute that is None counts as
-    not offered, so that a class can offer it for some of its objects only.
+    not offered, so that a class can offer it for some of its objects only. Where terms take another simulation than f,
+    a slower one that rounds otherwise, an attribute `terms_with_f` of the problem that is False says so.
 
     Example:
         >>> import samplers

@@ -55,6 +55,11 @@ class WrappedProblem:
         return self._terms if callable(getattr(self.problem, "terms", None)) else None  # anybody's problem
 
     @property
+    def terms_with_f(self) -> bool:
+        """Whether terms come with the rollout that gives f."""
+        return bool(getattr(self.problem, "terms_with_f", True))  # anybody's problem
+
+    @property
     def gradient(self) -> Callable[..., Any] | None:
         """Gradients of the terms as of `rare_envs.DrivingProblem.gradient`; None where the problem has none."""
         return self._gradient if callable(getattr(self.problem, "gradient", None)) else None  # likewise

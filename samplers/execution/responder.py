@@ -54,7 +54,7 @@ class Responder:
             cost = _read_cost(problem) if callable(gradient) else None
             if cost is not None:
                 check_number("gradient_cost", cost, 0.0, np.inf)
-            self.offer = TermsOffer(cost)
+            self.offer = TermsOffer(cost, bool(getattr(problem, "terms_with_f", True)))
 
     def respond(self, requests: Sequence[Request]) -> list[Answer]:
         """Return the answers to some requests, in their order; f may still be NaN.

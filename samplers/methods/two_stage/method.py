@@ -8,6 +8,7 @@ import numpy as np
 from samplers.method import Goal, Interrupted, Steps, offer_of
 from samplers.methods.base import Method
 from samplers.methods.two_stage import stages
+from samplers.methods.two_stage.discovery.unexplored_terms import TermRecord, explore_terms
 from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, TwoStageSettings
 from samplers.methods.two_stage.terms.search import search_terms, suits_terms
 from samplers.problem import Inputs
@@ -123,16 +124,29 @@ def run_two_stage(
     offer = offer_of(inputs)
     if offer is not None and suits_terms(inputs, offer, budget, settings.terms):
         return (yield from search_terms(inputs, offer, goal, budget, rng, settings.terms))
+    record = TermRecord(offered=offer is not None and offer.with_f)
+    outcome = yield from _explore_and_estimate(inputs, goal, budget, rng, settings, record)
+    return replace(outcome, remarks=(*outcome.remarks, *record.unreached.describe(outcome.p)))
+
+
+def _explore_and_estimate(
+    inputs: Inputs, goal: Goal, budget: int, rng: np.random.Generator, settings: TwoStageSettings, record: TermRecord
+) -> Steps:
+    """Run all stages; `record` takes the terms of what the exploration simulates."""
     context, state = stages.start_run(inputs, goal, budget, settings, rng)
     if budget < settings.min_exploration_budget:
         least = settings.min_exploration_budget
         about = f"max_sim leaves {budget} simulations, too few for an exploration ({least}): base draws only."
         return (yield from stages.run_monte_carlo(context, state)).remark_first(about)
     try:
-        state = yield from stages.draw_first(context, state)
+        state = yield from record.watch(stages.draw_first(context, state))
         if state.base_share(goal.gamma) >= settings.common_share:
             return (yield from stages.run_monte_carlo(context, state, counted=False))
-        state, exploration = yield from stages.explore(context, state)
+        state, exploration = yield from record.watch(stages.explore(context, state))
+        room, first = context.left, state.history.batches[0]
+        exploration = yield from explore_terms(
+            context.simulator, exploration, record, first, goal.gamma, room, rng, settings
+        )
         if not exploration.regions:
             return (yield from stages.run_monte_carlo(context, state))
         refinement, proposal = stages.begin_refinement(context, state, exploration)

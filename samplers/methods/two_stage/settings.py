@@ -106,6 +106,24 @@ class LineSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
+class TermsAloneSettings:
+    """Searches on single terms of f (`discovery/unexplored_terms.py`)."""
+
+    lines: int = 4
+    """Lines of descent, and starts of chains, of each term, as of each region."""
+    line_share: float = 0.15
+    """Share of what the exploration leaves for lines on terms that were the least somewhere, and failed nowhere."""
+    scout_share: float = 0.1
+    """The same for terms that were the least nowhere."""
+    usual_cost: int = 180
+    """Simulations for the lines of a term; of more terms than that allows, some are left out."""
+    chain_share: float = 0.15
+    """Share of what the exploration leaves for the chains from the ends of the lines."""
+    least_density: float = 1e-5
+    """Failures that are less likely than the likeliest ones by this factor start no chains: they matter too little."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class RegionSettings:
     """Chains inside the failure region, and how regions are separated (`regions.py`)."""
 
@@ -301,6 +319,7 @@ class TwoStageSettings:
     nothing."""
     exploration: ExplorationSettings = ExplorationSettings()
     lines: LineSettings = LineSettings()
+    terms_alone: TermsAloneSettings = TermsAloneSettings()
     regions: RegionSettings = RegionSettings()
     refinement: RefinementSettings = RefinementSettings()
     fallback: FallbackSettings = FallbackSettings()

@@ -1,13 +1,15 @@
 """Order of the terms: any method follows the least term in place of f where it asks for f."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import replace
-from typing import cast
+from typing import TypeVar, cast
 
 import numpy as np
 
 from samplers.method import Outcome, Steps, request_terms
 from samplers.problem import FloatArray, Terms
+
+_T = TypeVar("_T")
 
 
 def ordering_values(terms: Terms, gamma: float) -> FloatArray:
@@ -21,18 +23,21 @@ def ordering_values(terms: Terms, gamma: float) -> FloatArray:
     return np.where(np.isneginf(terms.f), -np.inf, values)
 
 
-def order_by_terms(steps: Steps, gamma: float) -> Steps:
-    """Run steps with the least term in place of f; the outcome's points have f again.
+def answer_by_terms(
+    steps: Generator[FloatArray, FloatArray, _T], read: Callable[[FloatArray, Terms], FloatArray]
+) -> Generator[FloatArray, FloatArray, _T]:
+    """Run steps that ask for f, with terms requested in its place; return what they return.
 
-    Their layers are left out: they are thresholds of the order, not of f.
+    Args:
+        steps: Yields points x (n, d), is sent numbers (n,).
+        read: Gives these numbers from points and their terms.
     """
-    f_of: dict[float, float] = {}
     answer: FloatArray | None = None
     while True:
         try:
             x = next(steps) if answer is None else steps.send(answer)
         except StopIteration as end:
-            return _with_f(cast(Outcome, end.value), f_of)
+            return cast(_T, end.value)
         if len(x) == 0:
             answer = np.empty(0)
             continue
@@ -42,10 +47,24 @@ def order_by_terms(steps: Steps, gamma: float) -> Steps:
             try:
                 steps.throw(error)
             except StopIteration as end:
-                return _with_f(cast(Outcome, end.value), f_of)
+                return cast(_T, end.value)
             raise
+        answer = read(x, terms)
+
+
+def order_by_terms(steps: Steps, gamma: float) -> Steps:
+    """Run steps with the least term in place of f; the outcome's points have f again.
+
+    Their layers are left out: they are thresholds of the order, not of f.
+    """
+    f_of: dict[float, float] = {}
+
+    def read(_: FloatArray, terms: Terms) -> FloatArray:
         answer = ordering_values(terms, gamma)
         f_of.update(zip(answer.tolist(), terms.f.tolist(), strict=True))
+        return answer
+
+    return _with_f((yield from answer_by_terms(steps, read)), f_of)
 
 
 def _with_f(outcome: Outcome, f_of: dict[float, float]) -> Outcome:
