@@ -65,7 +65,9 @@ class TwoStage(Method):
     has hit gives no warning; `Estimate.unseen` bounds its probability.
 
     *Terms.* Problems that offer terms and their gradients, in 30 dimensions or more and with 1,000 simulations or more,
-    are searched by another algorithm (`terms/search.py`).
+    are searched by another algorithm (`terms/search.py`). Where terms are offered otherwise, all points of the
+    exploration are simulated with them, and a term of which no state of the chains fails is searched alone
+    (`discovery/unexplored_terms.py`); a remark names those that were the least somewhere and did not reach failure.
 
     *Other methods take over* where a tenth of the base draws fails, or no failure is found (plain Monte Carlo for the
     rest), and where no mixture describes the failures: dozens of regions, hundreds of dimensions without a direction

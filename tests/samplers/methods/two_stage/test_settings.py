@@ -13,7 +13,7 @@ from samplers.method import Goal
 from samplers.methods.two_stage.exploration import Sizes
 from samplers.methods.two_stage.method import run_two_stage
 from samplers.methods.two_stage.mixture.proposal import Kind
-from samplers.methods.two_stage.settings import DEFAULT_SETTINGS
+from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, TermsAloneSettings
 from samplers.methods.two_stage.terms.settings import TermSettings
 
 REFINEMENT = DEFAULT_SETTINGS.refinement
@@ -35,10 +35,12 @@ RUNS = {
 
 
 def groups(settings):
-    """Yield a group of settings and all groups in it, save those of the search by terms, which has its own test."""
+    """Yield a group of settings and all groups in it, save those of searches by terms, which have their own tests."""
     yield settings
     for field in fields(settings):
-        if is_dataclass(value := getattr(settings, field.name)) and not isinstance(value, TermSettings):
+        if is_dataclass(value := getattr(settings, field.name)) and not isinstance(
+            value, TermSettings | TermsAloneSettings
+        ):
             yield from groups(value)
 
 
@@ -64,7 +66,7 @@ def test_runs_read_every_number_from_the_settings_given_and_none_elsewhere(drive
         for some in (own, DEFAULT_SETTINGS)
         for group in groups(some)
         for field in fields(group)
-        if field.name != "terms"
+        if field.name not in ("terms", "terms_alone")
     }
     ids = {id(group) for group in groups(own)}
     reads.clear()

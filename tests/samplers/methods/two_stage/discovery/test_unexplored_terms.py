@@ -1,5 +1,8 @@
 """Series systems with exact p, one of whose terms the search for f alone loses."""
 
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import fields
+
 import numpy as np
 import pytest
 from scipy import optimize, stats
@@ -7,6 +10,7 @@ from scipy import optimize, stats
 import samplers
 from samplers.method import Interrupted, TermsOffer
 from samplers.methods.two_stage.discovery.unexplored_terms import TermRecord, UnreachedTerms, hit_limit
+from samplers.methods.two_stage.settings import TermsAloneSettings
 from samplers.methods.two_stage.simulator import ComponentDraws
 from samplers.proposals.components import IsotropicNormal
 
@@ -37,7 +41,11 @@ def estimates(problem, seeds, **options):
     return [samplers.estimate(problem, samplers.TwoStage(), seed=seed, **options) for seed in range(seeds)]
 
 
-CASES = [(2, 0.4, 10.0), (4, 0.25, 10.0), (6, 0.1, 10.0)]
+CASES = [
+    pytest.param(2, 0.4, 10.0, marks=pytest.mark.slow),
+    (4, 0.25, 10.0),
+    pytest.param(6, 0.1, 10.0, marks=pytest.mark.slow),
+]
 
 
 @pytest.mark.parametrize(("dim", "share", "steepness"), CASES)
@@ -53,7 +61,7 @@ def test_no_term_is_lost_in_any_seed(dim, share, steepness):
     assert abs(ratios.mean() - 1) < 4 * ratios.std(ddof=1) / np.sqrt(20) + 0.01
     covered = sum(result.interval[0] <= P <= result.interval[1] for result in results)
     assert covered >= 16
-    assert all(result.n_sim == 6000 for result in results)
+    assert all(result.n_sim <= 6000 for result in results)
 
 
 def test_without_terms_it_is_lost_in_some_seeds():
@@ -100,25 +108,30 @@ def test_no_budget_is_exceeded(max_sim):
         assert result.n_sim == max_sim == sum(level.n_sim for level in result.trace)
 
 
-def test_same_seed_same_answer_by_workers_journal_and_replicates(tmp_path):
-    problem = half_space_and_ball(4, 0.25, 10.0)
-    options = {"seed": 3, "max_sim": 4000, "replicates": 2}
-    alone = samplers.estimate(problem, samplers.TwoStage(), **options)
-    path = tmp_path / "journal"
-    written = samplers.estimate(problem, samplers.TwoStage(), journal=path, **options)
-    assert written.p == alone.p
+def test_same_seed_same_answer_by_journal_workers_and_replicates(tmp_path):
+    problem, rows = half_space_and_ball(4, 0.25, 10.0), list[int]()
 
-    class Forbidden:
+    class Counted:
         dim, base = problem.dim, problem.base
 
         def evaluate(self, x):
-            raise AssertionError("is in the journal")
+            rows.append(len(x))
+            return problem.evaluate(x)
 
         def terms(self, x, gamma=0.0):
-            raise AssertionError("is in the journal")
+            rows.append(len(x))
+            return problem.terms(x, gamma)
 
-    resumed = samplers.estimate(Forbidden(), samplers.TwoStage(), journal=path, **options)
-    assert (resumed.p, resumed.interval) == (alone.p, alone.interval)
+    options = {"seed": 3, "max_sim": 4000, "replicates": 2}
+    alone = samplers.estimate(problem, samplers.TwoStage(), **options)
+    with ThreadPoolExecutor(2) as pool:
+        pooled = samplers.estimate(problem, samplers.TwoStage(), executor=pool, **options)
+    written, resumed = (
+        samplers.estimate(Counted(), samplers.TwoStage(), journal=tmp_path / "journal", **options) for _ in range(2)
+    )
+    for other in (pooled, written, resumed):
+        assert (other.p, other.interval) == (alone.p, alone.interval)
+    assert 4000 <= sum(rows) < 4100  # the journal has all that the second run needs, but for rows of its check
 
 
 def test_a_stop_on_the_way_gives_what_is_known():
@@ -169,6 +182,18 @@ def test_limit_is_hit_with_the_confidence_asked_for(rng):
         not ((rng.standard_normal(500) > beta).any() or (3 * rng.standard_normal(80) > beta).any()) for _ in range(4000)
     ]
     assert np.mean(missed) == pytest.approx(0.05, abs=4 * np.sqrt(0.05 * 0.95 / 4000))
+
+
+def test_every_setting_is_read(monkeypatch):
+    found = set()
+
+    def record(group, name):
+        found.add(name)
+        return object.__getattribute__(group, name)
+
+    monkeypatch.setattr(TermsAloneSettings, "__getattribute__", record)
+    samplers.estimate(half_space_and_ball(4, 0.25, 10.0), samplers.TwoStage(), seed=0, max_sim=3000)
+    assert {field.name for field in fields(TermsAloneSettings)} <= found
 
 
 def test_remarks_list_names_and_their_number():
