@@ -14,8 +14,6 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
-from scipy.spatial import cKDTree
 from scipy.special import ndtr
 
 from samplers.method import request_terms
@@ -155,6 +153,8 @@ def _rank_missing(
     reliability index of first order, mean above the threshold over standard deviation, among the n base draws come
     first (Cornell, "A probability-based structural code", 1969).
     """
+    from scipy.spatial import cKDTree  # slow to import, and seldom needed
+
     held: NDArray[np.bool_] = np.zeros(terms.values.shape[1], dtype=bool)
     if exploration.regions:
         states = np.concatenate([region.points for region in exploration.regions])
@@ -257,6 +257,8 @@ def hit_limit(first: ComponentDraws, confidence: float = 0.95) -> float:
     One at distance beta is hit by a draw with probability Phi(-beta / s), and by none of them with about
     exp(-sum_s n_s Phi(-beta / s)).
     """
+    from scipy.optimize import brentq  # slow to import, and seldom needed
+
     scales = np.array([one.scale if isinstance(one, IsotropicNormal) else 1.0 for one in first.components])
     wanted = -float(np.log1p(-confidence))
     beta = brentq(lambda b: float(first.counts @ ndtr(-b / scales)) - wanted, 0.0, 40.0 * scales.max())
