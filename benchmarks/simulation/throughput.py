@@ -36,6 +36,7 @@ FLOORS = {
     "cut_in_idm": 1000.0,
     "cut_in_idm_compiled": 3500.0,
     "car_following_ppo": 300.0,
+    "car_following_ppo_compiled": 700.0,
     "env_step": 5.0,
     "adss_latency": 10.0,
     "highway_1": 1.0,
@@ -116,11 +117,12 @@ def measure_answer(env_id: str, rounds: int) -> dict[str, float]:
     }
 
 
-def policy_ratio(rounds: int) -> dict[str, float]:
+def policy_ratio(core: str, rounds: int) -> dict[str, float]:
     """Compare car following with an SB3 PPO ego, 4096 rollouts at a time, with `predict` in HighwayEnv's loop."""
     model = ppo(CAR_FOLLOWING)
-    problem = rare_envs.DrivingProblem(CAR_FOLLOWING, ego=model, horizon=HORIZON)
+    problem = rare_envs.DrivingProblem(CAR_FOLLOWING, ego=model, horizon=HORIZON, core=core)
     x = problem.base.sample(4_096, np.random.default_rng(0))
+    problem.evaluate(x[:1])  # compiles
     ours, theirs = [], []
     for _ in range(rounds):
         ours.append(len(x) / seconds(lambda: problem.evaluate(x)))
@@ -298,7 +300,8 @@ def main(
             results[f"{name}_idm"] = rollout_ratio(env_id, "torch", rounds)
             results[f"{name}_idm_compiled"] = rollout_ratio(env_id, "numba", rounds)
             results[f"answer_{name}"] = measure_answer(env_id, rounds)
-        results["car_following_ppo"] = policy_ratio(rounds)
+        results["car_following_ppo"] = policy_ratio("torch", rounds)
+        results["car_following_ppo_compiled"] = policy_ratio("numba", rounds)
         results["env_step"] = step_ratio(500)
         results["adss_latency"] = latency_ratio()
         if with_memory:
