@@ -16,7 +16,6 @@ References:
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -28,6 +27,8 @@ from rare_envs.traffic.lead import Lead
 from rare_envs.traffic.neighbours import LEFT, OWN, RIGHT, LaneTraffic, Neighbours, find_neighbours
 
 _SIDES = (LEFT, RIGHT)
+_NO_LIMIT = 1e12
+"""A deceleration [m/s^2] that no gap asks for."""
 
 
 class LaneChoice(NamedTuple):
@@ -106,7 +107,7 @@ class Mobil:
 
     def judge(self, traffic: LaneTraffic, who: slice, idm: IDM, around: Neighbours) -> LaneChoice:
         """Return the same for known neighbours."""
-        unlimited = replace(idm, max_deceleration=math.inf)
+        unlimited = replace(idm, max_deceleration=_NO_LIMIT)
         batch, m, _ = around.lead.shape
         own = torch.arange(traffic.x.shape[1], device=traffic.x.device)[who].view(1, m, 1).expand(batch, m, 2)
         lead, follower = around.lead[..., _SIDES], around.follower[..., _SIDES]

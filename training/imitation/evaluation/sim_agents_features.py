@@ -1,0 +1,218 @@
+"""Features of motion that the Waymo Open Sim Agents Challenge scores: kinematic, interactive and of the road.
+
+All follow from poses and sizes, as in the challenge: speeds and accelerations are central differences of positions and
+headings, distances are those of rectangles. The road is straight, between two edges.
+
+References:
+    Montali et al., "The Waymo Open Sim Agents Challenge", 2023; the definitions that the text leaves open are those of
+    the released evaluation (github.com/waymo-research/waymo-open-dataset, `sim_agents_metrics`, 2024).
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from training.data.trajectories import DT
+
+POSE = 3
+"""Numbers in a pose: x along the road [m], y across it and positive to the right [m], heading [rad]."""
+AT_ONCE = 2
+"""Rollouts whose pairs of agents are looked at together."""
+MAX_TIME_TO_COLLISION = 5.0
+"""[s]; longer ones, and those of vehicles that follow nobody, are this."""
+FOLLOWING_TURN = math.radians(75.0)
+"""Largest difference of headings [rad] of a vehicle and the one that it follows."""
+FOLLOWING_TURN_GRAZING = math.radians(10.0)
+"""The same where they overlap by less than `GRAZING` across."""
+FAR = 1e4
+"""Distance to the nearest object of an agent that is alone [m]."""
+GRAZING = 0.5
+"""[m]."""
+KINEMATIC = ("linear_speed", "linear_acceleration", "angular_speed", "angular_acceleration")
+INTERACTIVE = ("distance_to_nearest_object", "collision_indication", "time_to_collision")
+MAP_BASED = ("distance_to_road_edge", "offroad_indication")
+FEATURE_NAMES = (*KINEMATIC, *INTERACTIVE, *MAP_BASED)
+
+
+def motion_features(
+    states: Tensor, valid: Tensor, sizes: Tensor, edges: tuple[float, float], scored: Tensor | None = None
+) -> dict[str, Tensor]:
+    """Return the features of every agent at every step.
+
+    Args:
+        states: Poses, shape (..., n_agents, T, 3); leading axes may be rollouts.
+        valid: Where an agent is recorded, boolean, shape (n_agents, T). Elsewhere nobody sees it.
+        sizes: Lengths and widths [m], shape (n_agents, 2).
+        edges: y of the left and the right edge of the road [m].
+        scored: Agents whose features are wanted, boolean, shape (n_agents,); None for all. The others are seen.
+
+    Returns:
+        `FEATURE_NAMES` to values of shape (..., scored agents, T) in SI units, NaN where a feature does not exist;
+        those of collision and off-road are 0 or 1 by step.
+
+    Raises:
+        ValueError: If shapes do not fit together.
+
+    Example:
+        >>> states = torch.zeros(2, 5, 3)  # two agents that drive straight on, one 10 m behind the other
+        >>> states[..., 0] = torch.tensor([[0.0], [10.0]]) + torch.arange(5.0)
+        >>> valid, sizes = torch.ones(2, 5, dtype=bool), torch.tensor([[4.0, 2.0], [4.0, 2.0]])
+        >>> features = motion_features(states, valid, sizes, edges=(-2.0, 2.0))
+        >>> features["linear_speed"][0].tolist()  # 1 m in 0.1 s
+        [nan, 10.0, 10.0, 10.0, nan]
+        >>> features["distance_to_nearest_object"][0, 0].item(), features["distance_to_road_edge"][0, 0].item()
+        (6.0, -1.0)
+    """
+    _check(states, valid, sizes)
+    if states.ndim > 3 and len(states) > AT_ONCE:  # small parts stay in the processor's cache
+        parts = [motion_features(part, valid, sizes, edges, scored) for part in torch.split(states, AT_ONCE)]
+        return {name: torch.cat([part[name] for part in parts]) for name in FEATURE_NAMES}
+    chosen = torch.ones(len(valid), dtype=torch.bool) if scored is None else scored
+    own = chosen.nonzero()[:, 0]
+    speed, *changes = kinematic_features(states)
+    once = _both(valid) & valid
+    distance, time = _interactive(states, speed, (valid, once), sizes, own)
+    across = _outermost(states[..., own, :, :], sizes[own], edges)
+    there = valid[own]
+    values = [*(change[..., own, :] for change in (speed, *changes)), distance, (distance < 0).to(distance), time]
+    values += [across, (across > 0).to(across)]
+    twice = _both(once) & once
+    kept = [once[own], twice[own], once[own], twice[own], there, there, once[own], there, there]
+    return {
+        name: torch.where(mask, value, torch.nan) for name, value, mask in zip(FEATURE_NAMES, values, kept, strict=True)
+    }
+
+
+def _check(states: Tensor, valid: Tensor, sizes: Tensor) -> None:
+    if states.ndim < 3 or states.shape[-1] != POSE:
+        raise ValueError(f"Expected poses of shape (..., n_agents, T, {POSE}), got {tuple(states.shape)}.")
+    agents, steps = states.shape[-3:-1]
+    if valid.shape != (agents, steps) or sizes.shape != (agents, 2):
+        raise ValueError(
+            f"Expected a mask of shape {(agents, steps)} and sizes of shape {(agents, 2)} for these poses, got "
+            f"{tuple(valid.shape)} and {tuple(sizes.shape)}."
+        )
+
+
+def kinematic_features(states: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return linear speed and acceleration, angular speed and acceleration of poses: (..., T, 3) -> (..., T) each.
+
+    Central differences; NaN at the first and last step, of accelerations at the first and last two.
+    """
+    change = central_difference(states.movedim(-1, 0))
+    speed, turn = torch.hypot(change[0], change[1]), _wrap(2.0 * change[2] * DT) / (2.0 * DT)
+    return speed, central_difference(speed), turn, central_difference(turn)
+
+
+def central_difference(values: Tensor) -> Tensor:
+    """Return the derivative along the last axis [1/s], (x[t + 1] - x[t - 1]) / 2 dt, NaN at both ends."""
+    inner = (values[..., 2:] - values[..., :-2]) / (2.0 * DT)
+    return torch.nn.functional.pad(inner, (1, 1), value=torch.nan)
+
+
+def _wrap(angle: Tensor) -> Tensor:
+    return torch.remainder(angle + torch.pi, 2 * torch.pi) - torch.pi
+
+
+def _both(valid: Tensor) -> Tensor:
+    """Return whether a central difference is of two valid steps."""
+    return torch.nn.functional.pad(valid[..., 2:] & valid[..., :-2], (1, 1), value=False)
+
+
+def _interactive(
+    states: Tensor, speed: Tensor, valid: tuple[Tensor, Tensor], sizes: Tensor, own: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return the distance to the nearest other agent and the time to collision, (..., m, T) each.
+
+    `valid` says where poses and where speeds are known; an agent without a speed is not one to follow.
+    """
+    x, y, heading = states.movedim(-1, 0)
+    agents = len(sizes)
+
+    def pair(field: Tensor) -> tuple[Tensor, Tensor]:
+        return field[..., own, None, :], field[..., None, :, :]
+
+    (own_x, x), (own_y, y), (own_heading, heading) = pair(x), pair(y), pair(heading)
+    size, other_size = ((part[:, None, None] for part in sizes[own].T), (part[None, :, None] for part in sizes.T))
+    (length, width), (other_length, other_width) = size, other_size
+    turn = heading - own_heading
+    cos, sin = torch.cos(own_heading), torch.sin(own_heading)
+    dx, dy = x - own_x, y - own_y
+    along, across = dx * cos + dy * sin, dy * cos - dx * sin
+    others = ~torch.eye(agents, dtype=torch.bool)[own]
+    seen, known = (others[..., None] & each[None] for each in valid)
+    distance = box_distance_of_sizes(along, across, turn, (length, width), (other_length, other_width))
+    nearest = torch.where(seen, distance, FAR).amin(dim=-2)
+    cos, sin = torch.cos(turn).abs(), torch.sin(turn).abs()
+    ahead = along - 0.5 * length - 0.5 * (other_length * cos + other_width * sin)
+    aside = across.abs() - 0.5 * width - 0.5 * (other_length * sin + other_width * cos)
+    follows = (ahead > 0) & (aside < 0) & (turn.abs() <= FOLLOWING_TURN) & known
+    follows = follows & ((aside < -GRAZING) | (turn.abs() <= FOLLOWING_TURN_GRAZING))
+    lead = torch.where(follows, ahead, torch.inf).min(dim=-2)
+    lead_speed = speed[..., None, :, :].expand_as(ahead).gather(-2, lead.indices[..., None, :])[..., 0, :]
+    closing = speed[..., own, :] - lead_speed
+    time = torch.where(closing > 0, lead.values / closing, torch.inf).clamp(max=MAX_TIME_TO_COLLISION)
+    return nearest, time
+
+
+def box_distance_of_sizes(
+    along: Tensor,
+    across: Tensor,
+    turn: Tensor,
+    size: tuple[Tensor, Tensor],
+    other_size: tuple[Tensor, Tensor],
+) -> Tensor:
+    """Return the distance between rectangles [m], the negative depth of their overlap if they do.
+
+    Args:
+        along: Centre of the other from the centre of the first, along the first [m], shape (...).
+        across: The same across the first [m].
+        turn: Heading of the other less that of the first [rad].
+        size: Length and width of the first [m].
+        other_size: Of the other [m].
+
+    Example:
+        >>> at, size = torch.tensor([7.0, 3.0]), (torch.tensor(4.0), torch.tensor(2.0))
+        >>> box_distance_of_sizes(at, 0 * at, 0 * at, size, size).tolist()  # 3 m apart, and 1 m into each other
+        [3.0, -1.0]
+    """
+    cos, sin = torch.cos(turn), torch.sin(turn)
+    other_along, other_across = along * cos + across * sin, across * cos - along * sin
+    half, other_half = (tuple(0.5 * part for part in each) for each in (size, other_size))
+    steep, flat = cos.abs(), sin.abs()
+    gaps = (
+        along.abs() - half[0] - other_half[0] * steep - other_half[1] * flat,
+        across.abs() - half[1] - other_half[0] * flat - other_half[1] * steep,
+        other_along.abs() - other_half[0] - half[0] * steep - half[1] * flat,
+        other_across.abs() - other_half[1] - half[0] * flat - half[1] * steep,
+    )
+    depth = torch.maximum(torch.maximum(gaps[0], gaps[1]), torch.maximum(gaps[2], gaps[3]))
+    corners = _nearest_corner(along, across, cos, sin, half, other_half)
+    own_corners = _nearest_corner(-other_along, -other_across, cos, -sin, other_half, half)
+    return torch.where(depth < 0, depth, torch.minimum(corners, own_corners).sqrt())
+
+
+def _nearest_corner(
+    along: Tensor, across: Tensor, cos: Tensor, sin: Tensor, half: tuple[Tensor, ...], other_half: tuple[Tensor, ...]
+) -> Tensor:
+    """Return the least squared distance of a corner of the other rectangle from the first [m^2]."""
+    least = None
+    for ahead, right in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+        u, v = ahead * other_half[0], right * other_half[1]
+        out = (along + u * cos - v * sin).abs() - half[0]
+        aside = (across + u * sin + v * cos).abs() - half[1]
+        square = out.clamp(min=0.0).square() + aside.clamp(min=0.0).square()
+        least = square if least is None else torch.minimum(least, square)
+    assert least is not None
+    return least
+
+
+def _outermost(states: Tensor, sizes: Tensor, edges: tuple[float, float]) -> Tensor:
+    """Return how far the outermost corner is beyond the nearer edge of the road [m], negative on the road."""
+    y, heading = states[..., 1], states[..., 2]
+    length, width = sizes[:, :1], sizes[:, 1:]
+    reach = 0.5 * (length * torch.sin(heading).abs() + width * torch.cos(heading).abs())
+    return torch.maximum(edges[0] - (y - reach), (y + reach) - edges[1])
