@@ -54,7 +54,7 @@ ABLATIONS: dict[str, Mapping[str, Any]] = {
     "tempered Gaussians": _without_kinds("tempered"),
     "screen": {"mixture.screening.min_class_size": 10**9},
     "further rounds": {"refinement.further_shares": ()},
-    "lines of descent": {"lines.most": 1},
+    "lines of descent": {"lines.n": 1},
     "wide draws": {"exploration.wide": ((1.5, 2),), "exploration.deep_draws": 0},
     "subset simulation": {"exploration.descent_share": 0.0},
     "chains from uncovered failures": {"refinement.uncovered_budget": 0.0},
@@ -102,7 +102,7 @@ def replace_nested(settings: Any, path: str, value: object) -> Any:
     """Return settings with one of them replaced, by its path.
 
     Example:
-        >>> replace_nested(DEFAULT_SETTINGS, "lines.most", 1).lines.most
+        >>> replace_nested(DEFAULT_SETTINGS, "lines.n", 1).lines.n
         1
     """
     name, _, rest = path.partition(".")

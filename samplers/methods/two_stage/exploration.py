@@ -6,7 +6,8 @@ fails, so that plateaus, ties, jumps and misleading level sets do not matter to 
 1. Draws from the base distribution, and wide ones from N(0, s^2 I): a half-space at distance beta fails with
    probability Phi(-beta / s), whatever the dimension (`discovery/wide.py`).
 2. Subset simulation from the base draws, for regions too small to be hit by wide draws (`discovery/levels.py`).
-3. Lines of descent from low base draws, each a trial of its own of which region is found (`discovery/lines.py`).
+3. Lines of descent from low base draws, each a trial of its own of which region is found (`discovery/lines.py`). They
+   use nothing of the subset simulation, and are walked in the same batches (`discovery/joint_batches.py`).
 4. Chains inside the region of failure (pCN), started from all of these, so that wide failures become likely ones
    (`regions.py`).
 5. The points half way between two failing points: if one fails, the two belong to one region (`regions.py`).
@@ -18,11 +19,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from samplers.method import Goal
+from samplers.methods.two_stage.discovery.joint_batches import join_batches
 from samplers.methods.two_stage.discovery.levels import descend_levels
-from samplers.methods.two_stage.discovery.lines import LineEnds, choose_roots, count_lines, walk_lines
+from samplers.methods.two_stage.discovery.lines import LineEnds, choose_roots, walk_lines
 from samplers.methods.two_stage.discovery.unseen import Discovery, count_lineages
-from samplers.methods.two_stage.discovery.wide import bisect_towards_origin, find_wide_failures
-from samplers.methods.two_stage.regions import ExplorationResult, Labels, Region, grow_regions, label_regions
+from samplers.methods.two_stage.discovery.wide import WideFailures, bisect_towards_origin, find_wide_failures
+from samplers.methods.two_stage.regions import (
+    ExplorationResult,
+    Labels,
+    Region,
+    SubsetPoints,
+    grow_regions,
+    label_regions,
+)
 from samplers.methods.two_stage.settings import DEFAULT_SETTINGS, ExplorationSettings, LineSettings, TwoStageSettings
 from samplers.methods.two_stage.simulator import ComponentDraws, SimulationSteps, Simulator
 from samplers.problem import FloatArray
@@ -92,17 +101,18 @@ def find_regions(
     n_base, gamma, explore = int(first.counts[0]), goal.gamma, settings.exploration
     base_u, base_f = first.u[:n_base], first.f[:n_base]
     drawn = ComponentDraws(first.components[1:], first.counts[1:], first.u[n_base:], first.f[n_base:])
-    descent = yield from descend_levels(simulator, base_u, base_f, goal, sizes.level, sizes.most, rng, explore)
-    wide = yield from find_wide_failures(
-        simulator, drawn, gamma, descent.levels, round(explore.deep_draws * sizes.scale), rng, explore
+    for_levels, for_lines = rng.spawn(2)
+    (descent, wide), lines = yield from join_batches(
+        _pass_levels(simulator, base_u, base_f, drawn, goal, sizes, for_levels, explore),
+        _find_lines(simulator, base_u, base_f, gamma, sizes.scale, for_lines, settings),
     )
-    lines = yield from _find_lines(simulator, base_u, base_f, gamma, descent.levels, sizes.scale, rng, settings)
     roots = len(np.union1d(descent.roots, lines.roots))
     discovery = Discovery(count_lineages(roots, wide.log_weights), descent.ceiling)
     most = max(2, (sizes.limit - simulator.n_sim) // explore.chain_cost)
-    chosen = wide.choose(min(sizes.starts, most), rng)
-    far = yield from bisect_towards_origin(simulator, chosen, gamma, explore.bisections)
-    labels, _ = yield from label_regions(simulator, lines.u, gamma, sizes.limit, settings.regions)
+    far, (labels, _) = yield from join_batches(
+        bisect_towards_origin(simulator, wide.choose(min(sizes.starts, most), rng), gamma, explore.bisections),
+        label_regions(simulator, lines.u, gamma, sizes.limit, settings.regions),
+    )
     if _is_scattered(labels, simulator.inputs.dim, settings):
         region = Region(lines.u[:, None], descent.u, descent.f)
         return ExplorationResult([region], noisy=False, scattered=True, levels=descent.levels, discovery=discovery)
@@ -117,18 +127,34 @@ def find_regions(
     return result._replace(discovery=discovery)
 
 
+def _pass_levels(
+    simulator: Simulator,
+    u: FloatArray,
+    f: FloatArray,
+    drawn: ComponentDraws,
+    goal: Goal,
+    sizes: Sizes,
+    rng: np.random.Generator,
+    explore: ExplorationSettings,
+) -> SimulationSteps[tuple[SubsetPoints, WideFailures]]:
+    """Run subset simulation from base draws u (n, d), f (n,), and make the wide draws as wide as it went deep."""
+    descent = yield from descend_levels(simulator, u, f, goal, sizes.level, sizes.most, rng, explore)
+    more = round(explore.deep_draws * sizes.scale)
+    wide = yield from find_wide_failures(simulator, drawn, goal.gamma, descent.levels, more, rng, explore)
+    return descent, wide
+
+
 def _find_lines(
     simulator: Simulator,
     u: FloatArray,
     f: FloatArray,
     gamma: float,
-    levels: int,
     scale: float,
     rng: np.random.Generator,
     settings: TwoStageSettings,
 ) -> SimulationSteps[LineEnds]:
     """Walk lines of descent from base draws u (n, d) with outcomes f (n,), and their ends towards the origin."""
-    roots = choose_roots(f, count_lines(levels, scale, settings.lines), rng, settings.lines)
+    roots = choose_roots(f, max(1, round(scale * settings.lines.n)), rng, settings.lines)
     ends, failing = yield from walk_lines(simulator, u[roots], f[roots], gamma, scale, rng, settings.lines)
     near = yield from bisect_towards_origin(simulator, ends[failing], gamma, settings.exploration.bisections)
     return LineEnds(near, roots[failing])

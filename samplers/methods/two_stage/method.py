@@ -20,9 +20,9 @@ class TwoStage(Method):
     """Explore, then estimate from a fresh sample; few simulations for any number of failure regions.
 
     1. *Exploration* (`exploration.py`, `discovery/`, `regions.py`): base draws; wide draws from N(0, s^2 I), with s as
-       large as the levels went deep; subset simulation from the base draws; lines of descent, points that walk
-       downhill each alone; chains inside the failure region from all of these. Two failing points are of one region
-       if the point half way between them fails.
+       large as the levels went deep; subset simulation from the base draws and, in the same batches, lines of descent,
+       points that walk downhill each alone; chains inside the failure region from all of these. Two failing points are
+       of one region if the point half way between them fails.
     2. *Refinement* (`refinement.py`, `candidates.py`): each region is described by Gaussians, by a hyperplane from
        linear regression of f where f is linear, by half-spaces through the edge of its failures and by a radius.
        Three rounds of draws follow, each from a mixture of these, and up to two more while a draw is worth less than
@@ -40,8 +40,8 @@ class TwoStage(Method):
     some per cent and make intervals too short.)
 
     All stages work in standard normal space, so that wide draws stay within the support of the parameters. A run
-    yields 65 to 125 batches, most of them steps of the lines of descent. Regression of f, subset simulation and lines
-    of descent use its values, everything else only its sign.
+    yields 45 to 90 batches, half of them steps of the levels and the lines of descent. Regression of f, subset
+    simulation and lines of descent use its values, everything else only its sign.
 
     *Noise.* f may have noise of its own that is no part of x: p is then the marginal probability. No stored outcome
     is simulated again. A noisy f is recognised by 30 points right beside failing ones. Regions are then not
@@ -86,7 +86,7 @@ class TwoStage(Method):
         >>> from samplers.limit_states import half_space
         >>> result = samplers.estimate(half_space(100).problem, samplers.TwoStage(n=2000), seed=0)
         >>> result.n_sim, f"{result.p:.1e}", result.cov < 0.05
-        (2000, '2.4e-04', True)
+        (2000, '2.3e-04', True)
 
     References:
         Owen and Zhou, "Safe and effective importance sampling", JASA 95, 2000 (defensive mixtures).

@@ -238,6 +238,7 @@ def label_regions(
     """
     labels = np.full(len(u), -1)
     scattered = False
+    joined, all_compared = np.zeros((len(u), len(u)), dtype=bool), False
     for k in range(settings.max_regions):
         free = np.flatnonzero(labels < 0)
         scattered = k >= settings.many_regions and len(free) > settings.scattered_share * len(u)
@@ -246,16 +247,25 @@ def label_regions(
         first = free[np.argmin((u[free] ** 2).sum(axis=1))]
         labels[first] = k
         others = free[free != first]
-        if simulator.n_sim + len(others) > limit:
-            break
-        fails = (yield from simulator.evaluate(0.5 * (u[others] + u[first]))) <= gamma
-        labels[others[fails]] = k
+        if not all_compared:
+            all_compared = len(free) <= settings.few_points
+            left, right = free[_all_pairs(len(free))] if all_compared else (np.full_like(others, first), others)
+            if simulator.n_sim + len(left) > limit:
+                break
+            joined[left, right] = (yield from simulator.evaluate(0.5 * (u[left] + u[right]))) <= gamma
+            joined |= joined.T
+        labels[others[joined[first, others]]] = k
     free = np.flatnonzero(labels < 0)
     if len(free):
         means = np.array([u[labels == k].mean(axis=0) for k in range(labels.max() + 1)])
         # |u - m|^2 is least where u . m - |m|^2 / 2 is largest.
         labels[free] = np.argmax(u[free] @ means.T - 0.5 * (means**2).sum(axis=1), axis=1)
     return labels, scattered
+
+
+def _all_pairs(n: int) -> NDArray[np.int64]:
+    """Return the pairs of n indices, shape (2, n (n - 1) / 2)."""
+    return np.stack(np.triu_indices(n, 1))
 
 
 def _replicate_seeds(labels: Labels, wanted: int, room: int, rng: np.random.Generator) -> NDArray[np.int64]:

@@ -76,10 +76,9 @@ class ExplorationSettings:
 class LineSettings:
     """Lines of descent (`discovery/lines.py`); numbers of simulations hold for `ExplorationSettings.usual_budget`."""
 
-    most: int = 50
-    """Lines at most."""
-    per_level: int = 60
-    """Lines times levels: a line costs 15 to 40 simulations where p is about 1e-4."""
+    n: int = 24
+    """Lines. Half of them arrive, as a rule. With 30 the exploration costs 60 to 110 simulations more, and the c.o.v.
+    was no smaller on four problems (20 seeds each)."""
     root_share: float = 0.1
     """Share of the base draws that lines start from: higher up they cost more and lead to the same regions."""
     initial_step: float = 0.35
@@ -90,12 +89,17 @@ class LineSettings:
     """... and change of the log step per unit of it."""
     step_range: tuple[float, float] = (0.03, 1.0)
     """Least and largest step."""
+    most_tries: int = 3
+    """Tries at once of each line where others have arrived, so that the batches do not become small."""
+    steps: int = 300
+    """Lines that go on, times steps taken, at most: where failures are far off, few lines that arrive are better than
+    many that do not."""
     limit: int = 600
     """Simulations after which all lines end."""
     most_arrived: float = 0.6
     """Share of the lines that has arrived when the others are given `patience` times the median time of arrival."""
     patience: float = 2.0
-    first_look: int = 300
+    first_look: int = 450
     """Simulations after which lines are given up if less than `few_arrived` of them have arrived."""
     few_arrived: float = 0.15
     starts: int = 4
@@ -150,6 +154,8 @@ class RegionSettings:
     """Number of regions from which failure may be something like a shell."""
     scattered_share: float = 0.25
     """Where this share of the points is in none of `many_regions` regions, it is."""
+    few_points: int = 8
+    """So many points or fewer are all compared with each other at once, not region by region."""
     max_regions: int = 16
     """Regions that are separated at most."""
     chains_per_region: tuple[int, int] = (8, 24)

@@ -25,11 +25,6 @@ class LineEnds(NamedTuple):
     """Index of the base draw that each started from, shape (k,)."""
 
 
-def count_lines(levels: int, scale: float, settings: LineSettings = DEFAULT_SETTINGS.lines) -> int:
-    """Return how many lines to walk: those that the simulations for them suffice for, through so many levels."""
-    return max(1, round(scale * min(settings.most, settings.per_level / max(levels, 1))))
-
-
 def choose_roots(
     f: FloatArray, n: int, rng: np.random.Generator, settings: LineSettings = DEFAULT_SETTINGS.lines
 ) -> NDArray[np.int64]:
@@ -49,28 +44,49 @@ def walk_lines(
 ) -> SimulationSteps[tuple[FloatArray, NDArray[np.bool_]]]:
     """Walk downhill from points u (n, d) with outcomes f (n,); return where the lines end, and which of them fail.
 
-    A step is v = sqrt(1 - s^2) u + s xi with xi ~ N(0, I), or with the xi before if that was a gain; it is taken where
-    f(v) <= f(u). All lines take a step in one batch. They end together: when all have arrived, at twice the median
-    time of arrival once most have, where hardly any arrives, or at the limit of simulations (times `scale`).
+    A step has one try or more, v = sqrt(1 - s^2) u + s xi with xi ~ N(0, I); in the first of them xi is that of the
+    step before if that was a gain. The line goes to the first try with f(v) < f(u), else to the first with f(v) = f(u).
+    All lines take a step in one batch: where half of them have arrived, the others have two tries each. The longer it
+    takes, the fewer lines go on. They end together: when all have arrived, at twice the median time of arrival once
+    most have, where hardly any arrives, or at the limit of simulations (times `scale`).
     """
     u, f, n = u.copy(), f.copy(), len(f)
-    s, xi, fresh = np.full(n, settings.initial_step), np.zeros_like(u), np.ones(n, dtype=bool)
+    s, kept, gained = np.full(n, settings.initial_step), np.zeros_like(u), np.zeros(n, dtype=bool)
     arrival = np.where(f <= gamma, 0.0, np.inf)
     used = time = 0
     while np.isinf(arrival).any() and not _is_late(arrival, time, used / scale, settings):
         on = np.flatnonzero(np.isinf(arrival))
-        drawn = on[fresh[on]]
-        xi[drawn] = rng.standard_normal((len(drawn), u.shape[1]))
-        v = np.sqrt(1 - s[on] ** 2)[:, None] * u[on] + s[on, None] * xi[on]
-        new = yield from simulator.evaluate(v)
-        used, time = used + len(on), time + 1
-        taken, gained = new <= f[on], new < f[on]
-        change = settings.adaptation * (taken - settings.acceptance) * fresh[on]
+        on = on[on < max(1, scale * settings.steps / max(time, 1))]
+        if len(on) == 0:
+            break
+        tries = min(n // len(on), settings.most_tries)
+        xi = rng.standard_normal((len(on), tries, u.shape[1]))
+        xi[gained[on], 0] = kept[on[gained[on]]]
+        v = np.sqrt(1 - s[on, None, None] ** 2) * u[on, None] + s[on, None, None] * xi
+        new = (yield from simulator.evaluate(v.reshape(-1, u.shape[1]))).reshape(xi.shape[:2])
+        used, time = used + new.size, time + 1
+        fresh = np.ones(new.shape, dtype=bool)
+        fresh[:, 0] = ~gained[on]
+        change = settings.adaptation * (((new <= f[on, None]) - settings.acceptance) * fresh).sum(axis=1)
         s[on] = np.clip(s[on] * np.exp(change), *settings.step_range)
-        u[on[taken]], f[on[taken]] = v[taken], new[taken]
-        fresh[on] = ~gained
-        arrival[on[new <= gamma]] = time
+        best = np.arange(len(on)), _choose_tries(f[on], new)
+        kept[on], gained[on], moves = xi[best], new[best] < f[on], new[best] <= f[on]
+        u[on[moves]], f[on[moves]] = v[best][moves], new[best][moves]
+        arrival[on[f[on] <= gamma]] = time
     return u, np.isfinite(arrival)
+
+
+def _choose_tries(f: FloatArray, new: FloatArray) -> NDArray[np.int64]:
+    """Return the number of the try (n,) that each line goes to from f (n,), if any: the first gain, else the first tie.
+
+    Not the best one, which would be more often where f falls steeply, whichever region that is.
+
+    Args:
+        f: Outcomes where the lines are, shape (n,).
+        new: Outcomes of their tries, shape (n, tries).
+    """
+    gain, tie = new < f[:, None], new == f[:, None]
+    return np.asarray(np.where(gain.any(axis=1), gain.argmax(axis=1), tie.argmax(axis=1)))
 
 
 def _is_late(arrival: FloatArray, time: int, used: float, settings: LineSettings) -> bool:

@@ -180,3 +180,15 @@ def test_the_limit_of_simulations_ends_the_comparison(drive, rng):
     labels, _ = drive(label_regions(simulator := Simulator(problem), u, 0.0, 40), problem).value
     assert simulator.n_sim == 39
     assert set(labels[:20]) != set(labels[20:])
+
+
+def test_few_points_are_compared_all_at_once(drive):
+    """Three regions: of twelve points those of the first are found one after the other, the rest in one batch."""
+    problem = half_spaces(3, 3.0, 3.0, 3.0)
+    u = np.repeat(3.1 * np.eye(3), [6, 4, 2], axis=0) * np.linspace(1.0, 1.1, 12)[:, None]
+    sizes = []
+    steps = label_regions(Simulator(problem), u, 0.0, 10**6)
+    counted = FunctionProblem(lambda x: sizes.append(len(x)) or problem.evaluate(x), 3)
+    labels, _ = drive(steps, counted).value
+    assert sizes == [11, 6 * 5 // 2]
+    np.testing.assert_array_equal(labels, np.repeat([0, 1, 2], [6, 4, 2]))

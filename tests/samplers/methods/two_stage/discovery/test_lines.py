@@ -1,7 +1,9 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from samplers.methods.two_stage.discovery.lines import choose_roots, count_lines, walk_lines
+from samplers.methods.two_stage.discovery.lines import _choose_tries, choose_roots, walk_lines
 from samplers.methods.two_stage.settings import DEFAULT_SETTINGS
 from samplers.methods.two_stage.simulator import Simulator
 from samplers.problem import FunctionProblem
@@ -31,11 +33,11 @@ def test_lines_come_to_a_half_space_within_their_budget(dim, rng):
 def test_no_line_ends_because_another_is_lower(rng):
     """Two regions of a share of a half; where f is ten times as steep, subset simulation hardly ever comes."""
     problem = FunctionProblem(lambda u: np.minimum(10 * (3.5 - u[:, 0]), 3.5 - u[:, 1]), 5)
-    ends = [walk(problem, 20, np.random.default_rng(seed))[1:3] for seed in range(4)]
+    ends = [walk(problem, LINES.n, np.random.default_rng(seed))[1:3] for seed in range(8)]
     steep = sum(int((u[failing, 0] >= 3.5).sum()) for u, failing in ends)
     flat = sum(int((u[failing, 1] >= 3.5).sum()) for u, failing in ends)
-    assert steep >= 8
-    assert flat >= 8
+    assert steep >= 12  # 23 on average
+    assert flat >= 12
 
 
 def test_each_line_moves_downhill_only(rng):
@@ -64,6 +66,24 @@ def test_lines_that_fail_at_once_need_no_simulation(rng):
     np.testing.assert_array_equal(start, ends)
 
 
-def test_fewer_lines_where_they_have_far_to_go():
-    assert [count_lines(levels, 1.0) for levels in (0, 1, 3, 6, 100)] == [50, 50, 20, 10, 1]
-    assert count_lines(3, 0.25) == 5
+def test_of_several_tries_the_first_gain_counts_else_the_first_tie():
+    new = np.array([[5.0, 3.0, 1.0], [5.0, 4.0, 4.0], [6.0, 7.0, 8.0], [4.0, 5.0, 3.0]])
+    assert _choose_tries(np.full(4, 4.0), new)[[0, 1, 3]].tolist() == [1, 1, 2]  # no matter which in the third line
+
+
+def test_the_longer_it_takes_the_fewer_lines_go_on(rng):
+    """Towards a half-space 40 standard deviations away: 24 lines at first, one once 300 steps are taken."""
+    problem, sizes = FunctionProblem(lambda u: 40.0 - u[:, 0], 3), []
+
+    def f(u):
+        sizes.append(len(u))
+        return problem.evaluate(u)
+
+    patient, u = replace(LINES, limit=20_000, first_look=20_000), rng.standard_normal((24, 3))
+    steps = walk_lines(Simulator(problem), u, problem.evaluate(u), 0.0, 1.0, rng, patient)
+    driven(steps, FunctionProblem(f, 3))
+    assert sizes[:13] == [24] * 13
+    assert sizes[20] == 15  # 300 / 20 lines
+    assert sizes[25] == 12 * 2  # lines, tries
+    assert len(sizes) > 310
+    assert set(sizes[310:]) == {1 * 3}
