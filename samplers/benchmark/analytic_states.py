@@ -23,7 +23,13 @@ PointFunction = Callable[[FloatArray], FloatArray]
 
 @dataclass(frozen=True)
 class LimitState:
-    """f, failing where f <= 0, and how likely that is."""
+    """f, failing where f <= 0, and how likely that is.
+
+    Example:
+        >>> state = LimitState(lambda u: 3.0 - u[:, 0], dim=2, p=1.3499e-3)
+        >>> state.problem().evaluate(np.array([[3.5, 0.0]])).tolist()
+        [-0.5]
+    """
 
     f: PointFunction
     """Maps points of N(0, I), shape (n, d), to (n,)."""

@@ -56,7 +56,13 @@ class Job:
 
 @dataclass(frozen=True)
 class MethodRun:
-    """What came of it."""
+    """What came of a run.
+
+    Example:
+        >>> run = run_once(Job("mc", "common_d4", seed=0, max_sim=1000))
+        >>> run.low < run.p < run.high, run.calls
+        (True, 1)
+    """
 
     method: str
     problem: str
@@ -182,6 +188,12 @@ def run_once(job: Job, method: Stepping | Solver | None = None) -> MethodRun:
     Args:
         job: The run; its method is found by name.
         method: The method itself instead, of which the job has a name of your choice.
+
+    Example:
+        >>> def certain(problem, seed, max_sim):
+        ...     return 1e-3, 0.9e-3, 1.1e-3
+        >>> run_once(Job("certain", "lin_d2", seed=0), certain).n_sim  # whatever it claims
+        0
     """
     state = limit_state(job.problem, job.catalogue)
     method = find_method(job.method) if method is None else method
@@ -269,6 +281,10 @@ def run_all(
         workers: Processes; with 1 the runs are made in this one.
         once: Makes one of them.
         executor: Where the runs are made instead, for example a dask client's.
+
+    Example:
+        >>> [run.n_sim for run in run_all(Job("mc", "lin_d2", seed, max_sim=100) for seed in range(3))]
+        [100, 100, 100]
     """
     if executor is not None:
         yield from executor.map(once, jobs)

@@ -15,7 +15,14 @@ from samplers.problem import FloatArray
 
 @dataclass(frozen=True)
 class Cell:
-    """One method on one problem. NaN where a figure has no meaning, as ratios where p = 0."""
+    """One method on one problem. NaN where a figure has no meaning, as ratios where p = 0.
+
+    Example:
+        >>> from samplers.benchmark import Job, run_all
+        >>> (cell,) = cells_of(run_all(Job("mc", "common_d4", seed, max_sim=1000) for seed in range(10)))
+        >>> cell.runs, cell.n_sim, cell.coverage
+        (10, 1000.0, 1.0)
+    """
 
     method: str
     problem: str
@@ -62,7 +69,14 @@ class Cell:
 
 
 def cells_of(runs: Iterable[MethodRun], catalogue: str = OWN_CATALOGUE) -> list[Cell]:
-    """Return one cell for each method, problem and budget, in the order of their first runs."""
+    """Return one cell for each method, problem and budget, in the order of their first runs.
+
+    Example:
+        >>> from samplers.benchmark import Job, run_all
+        >>> jobs = [Job("mc", "common_d4", seed, budget) for seed in range(2) for budget in (500, 1000)]
+        >>> [(cell.max_sim, cell.runs) for cell in cells_of(run_all(jobs))]
+        [(500, 2), (1000, 2)]
+    """
     groups: dict[tuple[str, str, int | None], list[MethodRun]] = defaultdict(list)
     for run in runs:
         groups[run.method, run.problem, run.max_sim].append(run)
@@ -144,7 +158,14 @@ class Power:
 
 
 def power_of(runs: Iterable[MethodRun], catalogue: str = OWN_CATALOGUE) -> Power:
-    """Return the power of the warnings over runs of one method."""
+    """Return the power of the warnings over runs of one method.
+
+    Example:
+        >>> from samplers.benchmark import Job, run_all
+        >>> power = power_of(run_all(Job("mc", "common_d4", seed, 1000) for seed in range(10)))
+        >>> power.wrong, power.right
+        (0, 8)
+    """
     counts: Counter[str] = Counter()
     texts: dict[str, Counter[str]] = defaultdict(Counter)
     for run in runs:

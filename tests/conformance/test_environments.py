@@ -76,7 +76,7 @@ def test_batches_behind_every_vector_wrapper(env_id, observation, action):
         seen, _ = batch.reset(seed=0)
         assert seen in batch.observation_space, name
         ended = 0
-        for _ in range(12 if action == "continuous" else 2):  # a second of ticks, or one decision
+        for _ in range(2 if action == "meta" else 12):  # one decision, or a second of ticks
             seen, reward, terminated, truncated, _ = batch.step(batch.action_space.sample())
             assert seen in batch.observation_space, name
             assert np.isfinite(reward).all(), name

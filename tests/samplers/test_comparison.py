@@ -40,11 +40,12 @@ def test_equal_functions_are_known_to_be_so():
 
 def test_functions_that_are_nearly_alike_are_told_apart_better_than_by_runs_of_their_own():
     a, b = half_space(3.5, [1.0, 0]), half_space(3.51, [1.0, 0])
-    found = samplers.compare(a, b, seed=0, max_sim=6000)
+    runs = [samplers.compare(a, b, seed=seed, max_sim=6000) for seed in range(5)]
     alone = [samplers.estimate(problem, seed=0, max_sim=3000).cov for problem in (a, b)]
     ratio = PHI(-3.5) / PHI(-3.51)
-    assert found.interval[0] < ratio < found.interval[1]
-    half = 0.5 * math.log(found.interval[1] / found.interval[0])
+    held = sum(found.interval[0] < ratio < found.interval[1] for found in runs)
+    assert held >= 3  # fewer of 5 at 95 % in 1 of 900
+    half = np.median([0.5 * math.log(found.interval[1] / found.interval[0]) for found in runs])
     assert half < 0.7 * 1.96 * math.hypot(*alone)
 
 

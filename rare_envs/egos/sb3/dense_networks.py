@@ -25,7 +25,13 @@ SB3 = "stable_baselines3"
 
 @runtime_checkable
 class RenamedPolicy(Protocol):
-    """An ego whose `predict` is that of another policy."""
+    """An ego whose `predict` is that of another policy.
+
+    Example:
+        >>> from types import SimpleNamespace
+        >>> isinstance(SimpleNamespace(same_as=None), RenamedPolicy), isinstance(object(), RenamedPolicy)
+        (True, False)
+    """
 
     @property
     def same_as(self) -> Any:

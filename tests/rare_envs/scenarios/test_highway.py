@@ -219,11 +219,6 @@ def test_unknown_arguments_are_named_with_the_environment(name, message):
             make(HIGHWAY, **{name: 1})
 
 
-def test_an_ego_by_name_is_told_where_names_become_egos():
-    with pytest.raises(ValueError, match=r"agents\.load_ego\('mgail'\)"):
-        rare_envs.DrivingProblem(HIGHWAY, ego="mgail")
-
-
 def test_beta_law_against_scipy():
     law = BetaDistribution([2.0, 5.0], [2.0, 1.5], [80.0, -1.0], [120.0, 1.0])
     x = law.sample(2000, np.random.default_rng(0))

@@ -21,8 +21,8 @@ def test_a_bias_of_a_fifth_is_found() -> None:
 
 
 def test_intervals_of_half_the_width_are_found() -> None:
-    """They hold p in 67 %: of 60 runs more than 50 do with a probability of 0.2 %, and 51 of 60 are accused."""
-    assert "intervals hold p in" in faults_of(f"{WRONG}:narrow", runs=60)
+    """They hold p in 67 %: of 60 runs more than 50 do with a probability of 0.2 %, and 50 of 60 are accused."""
+    assert "intervals hold p in" in faults_of(f"{WRONG}:narrow", "common_d4", runs=60)
 
 
 def test_hidden_simulations_are_found() -> None:

@@ -14,13 +14,6 @@ def biased(problem, seed, max_sim):
     return replace(found, p=1.2 * found.p, interval=(1.2 * low, 1.2 * high))
 
 
-def narrow(problem, seed, max_sim):
-    """Intervals of half the width."""
-    found = samplers.estimate(problem, "two-stage", seed=seed, max_sim=max_sim)
-    low, high = found.interval
-    return replace(found, interval=(found.p - (found.p - low) / 2, found.p + (high - found.p) / 2))
-
-
 def hidden(problem, seed, max_sim):
     """The same estimate twice, of which one is stated."""
     samplers.estimate(problem, "two-stage", seed=seed + 1000, max_sim=max_sim // 2)
@@ -39,6 +32,12 @@ def plain(problem, seed, max_sim):
     p = (f <= 0).mean()
     error = 1.96 * (p * (1 - p) / max_sim) ** 0.5
     return p, p - error, p + error
+
+
+def narrow(problem, seed, max_sim):
+    """Intervals of half the width."""
+    p, low, high = plain(problem, seed, max_sim)
+    return p, (p + low) / 2, (p + high) / 2
 
 
 def endless(problem, seed, max_sim):

@@ -23,13 +23,8 @@ class PartlyNoise(StandardNormal):
         return np.arange(self.dim) >= self.first
 
 
-@dataclasses.dataclass(frozen=True)
-class WithNoise(FunctionProblem):
-    first: int = 1
-
-    @property
-    def base(self):
-        return PartlyNoise(self.dim, self.first)
+def problem_with_noise(f, dim, first=1):
+    return FunctionProblem(f, dim, base=PartlyNoise(dim, first))
 
 
 def sum_of(u):
@@ -38,7 +33,7 @@ def sum_of(u):
 
 
 def problem(f):
-    return WithNoise(f, 303, first=3)
+    return problem_with_noise(f, 303, first=3)
 
 
 PROBLEMS = {
@@ -100,7 +95,7 @@ def test_inputs_without_noise_are_searched_as_they_are():
     plain, rng = FunctionProblem(sum_of, 303), np.random.default_rng(0)
     assert marginalise_noise(plain, rng) is plain
     assert not noise_mask(plain).any()
-    all_noise = WithNoise(sum_of, 303, first=0)
+    all_noise = problem_with_noise(sum_of, 303, first=0)
     assert marginalise_noise(all_noise, rng) is all_noise
     assert rng.random() == np.random.default_rng(0).random()  # no number was drawn
 
