@@ -30,7 +30,7 @@ def import_module(name: str, purpose: str) -> ModuleType:
         3.1416
     """
     try:
-        with _working_directory_first():
+        with working_directory_first():
             return importlib.import_module(name)
     except (Exception, SystemExit) as error:  # the module is the user's: anything may happen in it
         raise ValueError(f"Cannot import {name!r} for {purpose}: {one_line(error)}.") from error
@@ -112,8 +112,14 @@ def one_line(error: BaseException) -> str:
 
 
 @contextlib.contextmanager
-def _working_directory_first() -> Iterator[None]:
-    """Search modules in the working directory first, as `python -m` does and console scripts do not."""
+def working_directory_first() -> Iterator[None]:
+    """Search modules in the working directory first, as `python -m` does and console scripts do not.
+
+    Example:
+        >>> with working_directory_first():
+        ...     sys.path[0] == os.getcwd()
+        True
+    """
     here = os.getcwd()
     sys.path.insert(0, here)
     try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from scipy import stats
+from scipy.special import ndtr
 
 from samplers.benchmark.summary import Cell
 
@@ -47,13 +48,27 @@ def find_faults(cell: Cell, knowable: bool = True) -> tuple[str, ...]:
         return tuple(found)
     bias = cell.mean_over_p - 1.0
     error = math.hypot(cell.mean_se, cell.reference_error)
-    if abs(bias) > max(BIAS_ERRORS * error, NOTICED_BIAS):
+    if abs(bias) > max(BIAS_ERRORS * error, NOTICED_BIAS) and not _is_bad_luck(cell):
         found.append(f"biased: mean / p {cell.mean_over_p:.3g} +- {error:.2g}")
     if _is_too_low(cell):
         low, high = cell.coverage_interval
         held = f"intervals hold p in {100 * cell.coverage:.0f} % of {cell.runs} runs"
         found.append(f"{held} ({100 * low:.0f} to {100 * high:.0f} %)")
     return tuple(found)
+
+
+def _is_bad_luck(cell: Cell) -> bool:
+    """Return whether a mean below p may come from few hits or none, which show too small a spread.
+
+    The variance of a mean of hits is as its expectation, so that around p it is what was seen, over mean / p. Where
+    no run saw a failure, plain Monte Carlo of all simulations sees none with probability exp(-n p).
+    """
+    if cell.mean_over_p == 0:
+        return math.exp(-cell.p * cell.n_sim * cell.runs) > 2 * float(ndtr(-BIAS_ERRORS))
+    if not 0 < cell.mean_over_p < 1:
+        return False
+    error = math.hypot(cell.mean_se / math.sqrt(cell.mean_over_p), cell.reference_error)
+    return 1 - cell.mean_over_p <= BIAS_ERRORS * error
 
 
 def _is_too_low(cell: Cell) -> bool:

@@ -56,7 +56,7 @@ class Cell:
     max_sim: int | None = None
     """The budget; None for no limit."""
     hidden: float = 0.0
-    """Share of the runs that state another number of simulations than were made."""
+    """Share of the runs that state fewer simulations than were made."""
     reference_error: float = 0.0
     """Standard error of p itself, over p."""
 
@@ -93,7 +93,7 @@ def cell_of(runs: Sequence[MethodRun], p: float, standard_error: float = 0.0) ->
     cov = _spread(ratio) / _mean(ratio) if _mean(ratio) > 0 else math.nan
     error = (ratio - 1.0) ** 2
     n_sim = _mean([run.n_sim for run in runs])
-    gain = (1.0 - p) / p / (n_sim * _mean(error)) if p > 0 and _mean(error) > 0 else math.nan
+    gain = (1.0 - p) / p / (n_sim * _mean(error)) if p > 0 and n_sim > 0 and _mean(error) > 0 else math.nan
     return Cell(
         method=runs[0].method,
         problem=runs[0].problem,
@@ -101,12 +101,12 @@ def cell_of(runs: Sequence[MethodRun], p: float, standard_error: float = 0.0) ->
         runs=len(runs),
         raised=len(runs) - len(ended),
         mean_over_p=_mean(ratio),
-        mean_se=_spread(ratio) / math.sqrt(len(runs)),
+        mean_se=_spread(ratio) / math.sqrt(max(len(ended), 1)),
         cov=cov,
         own_cov=own_cov,
         own_over_cov=own_cov / cov if cov > 0 else math.nan,
         gain=gain,
-        gain_se=gain * _spread(error) / (_mean(error) * math.sqrt(len(runs))) if _mean(error) > 0 else math.nan,
+        gain_se=gain * _spread(error) / (_mean(error) * math.sqrt(len(ended))) if _mean(error) > 0 else math.nan,
         coverage=sum(covers(run, p) for run in ended) / len(runs),
         below=sum(run.high < p for run in ended) / len(runs),
         warned=_mean([bool(run.warnings) for run in ended]),
@@ -121,8 +121,8 @@ def cell_of(runs: Sequence[MethodRun], p: float, standard_error: float = 0.0) ->
 
 
 def hides_simulations(run: MethodRun) -> bool:
-    """Return whether a run states another number of simulations than it made."""
-    return run.stated is not None and run.stated != run.n_sim
+    """Return whether a run states fewer simulations than it made."""
+    return run.stated is not None and run.stated < run.n_sim
 
 
 def covers(run: MethodRun, p: float) -> bool:
@@ -133,13 +133,15 @@ def covers(run: MethodRun, p: float) -> bool:
 def own_errors_off(run: MethodRun, p: float) -> float:
     """Return by how many of its own standard errors the estimate is off.
 
-    NaN where nothing can be said: p is 0, the run raised, or it gave 0 with an interval that holds p. An estimate of 0
-    with one that does not is off by infinitely many.
+    NaN where nothing can be said: p is 0, the run raised, states no finite c.o.v., or gave 0 with an interval that
+    holds p. An estimate of 0 with one that does not is off by infinitely many.
     """
     if run.error or p == 0:
         return math.nan
     if run.p == 0:
         return math.nan if covers(run, p) else math.inf
+    if not math.isfinite(run.cov):
+        return math.nan
     return abs(run.p - p) / (run.cov * run.p) if run.cov > 0 else (0.0 if run.p == p else math.inf)
 
 

@@ -21,6 +21,8 @@ from samplers.benchmark.runs import about, find_method
 from samplers.serialization import to_json_value
 
 RUNS_FILE, RESULT_FILE, PAGE_FILE = "runs.jsonl", "benchmark.json", "leaderboard.md"
+_MAY_BE_INFINITE = ("p", "low", "high", "cov")
+"""Fields of a run that may be NaN or infinite."""
 CATALOGUE = "rare_envs.study.sampler_benchmark.problems:ALL_PROBLEMS"
 
 
@@ -42,6 +44,8 @@ class BenchmarkPlan:
     """Of the first run; the runs have successive seeds."""
 
     def __post_init__(self) -> None:
+        for name in ("methods", "problems", "budgets"):  # fields by name; what is named twice is run once
+            object.__setattr__(self, name, tuple(dict.fromkeys(getattr(self, name))))
         if not (self.methods and self.problems and self.budgets):
             raise ValueError("Expected methods, problems and budgets, at least one of each.")
         if self.runs < 2 or min(self.budgets) < 1:
@@ -97,16 +101,16 @@ def run_study(
     """
     out.mkdir(parents=True, exist_ok=True)
     file = out / RUNS_FILE
-    done = {_key(run): run for run in read_runs(file)}
+    begun, done = file.is_file() and file.stat().st_size > 0, {_key(run): run for run in read_runs(file)}
     wanted = plan.jobs()
     missing = [job for job in wanted if _key(job) not in done]
     made = run_all(missing, workers, run_once, executor)
     with file.open("a", encoding="utf-8") as lines:
-        if not done:
+        if not begun:
             lines.write(json.dumps({"rare_envs": rare_envs.__version__}) + "\n")
         for run in _show_progress(made, len(missing)) if progress else made:
             done[_key(run)] = run
-            lines.write(json.dumps(to_json_value(asdict(run))) + "\n")
+            lines.write(json.dumps(_encode_run(run)) + "\n")
             lines.flush()
     result = summarise_study(plan, [done[_key(job)] for job in wanted])
     replace_text(out / RESULT_FILE, format_json(result))
@@ -145,23 +149,28 @@ def read_runs(file: Path) -> list[MethodRun]:
     """
     if not file.is_file():
         return []
-    runs = []
+    runs, version = [], rare_envs.__version__
     for number, line in enumerate(file.read_text(encoding="utf-8").splitlines(), 1):
         try:
             content = json.loads(line)
             if number == 1:
                 version = content["rare_envs"]
                 continue
-            numbers = {name: math.nan if content[name] is None else content[name] for name in ("p", "low", "high")}
-            cov = math.inf if content["cov"] is None else content["cov"]
-            runs.append(MethodRun(**{**content, **numbers, "cov": cov, "warnings": tuple(content["warnings"])}))
+            numbers = {name: float(content[name]) for name in _MAY_BE_INFINITE}
+            runs.append(MethodRun(**{**content, **numbers, "warnings": tuple(content["warnings"])}))
         except (ValueError, KeyError, TypeError) as error:
             raise BadInput(f"{file}, line {number} is no run of a benchmark; take the line out. {error}") from None
-    if runs and version != rare_envs.__version__:
+    if version != rare_envs.__version__:
         raise BadInput(
             f"{file} has runs of rare_envs {version}, this is {rare_envs.__version__}: choose another --out."
         )
     return runs
+
+
+def _encode_run(run: MethodRun) -> dict[str, Any]:
+    """Return a run as a line of the file has it: NaN and infinities, which JSON has not, as texts."""
+    content = asdict(run)
+    return {**content, **{name: repr(content[name]) for name in _MAY_BE_INFINITE if not math.isfinite(content[name])}}
 
 
 def _describe_problem(name: str) -> dict[str, Any]:

@@ -38,6 +38,26 @@ def test_right_methods_have_no_faults(method: str) -> None:
     assert faults_of(method, "common_d4") == ""
 
 
+def test_plain_draws_that_hit_seldom_or_never_are_not_called_biased() -> None:
+    """20 runs of n draws, of which k hit: a Poisson number with mean 20 n p.
+
+    Of a mean of 5 no hit comes with probability 0.7 %, of a mean of 10 three or fewer with 1 %; of a mean of 20 no hit
+    comes with 2e-9, and two or fewer with 5e-7: these are faults.
+    """
+    for mean, hits, biased in ((5, 0, False), (10, 3, False), (20, 0, True), (20, 2, True)):
+        n = round(mean / (20 * P))
+        runs = [made(1 / n if seed < hits else 0.0, 1.0, 0.0, 1.0, seed=seed, n_sim=n) for seed in range(20)]
+        (cell,) = cells_of(runs)
+        assert any("biased" in fault for fault in find_faults(cell)) == biased
+
+
+def test_a_region_that_is_lost_in_every_run_is_found() -> None:
+    """Half of p, with errors of 1 % of it."""
+    runs = [replace(made((0.49 + 0.02 * (seed % 2)) * P), seed=seed) for seed in range(20)]
+    (cell,) = cells_of(runs)
+    assert "biased: mean / p 0.5" in "; ".join(find_faults(cell))
+
+
 def test_a_region_that_nobody_can_know_of_is_no_fault() -> None:
     (cell,) = cells_of([replace(made(0.1 * P, 0.1, 0.08 * P, 0.12 * P), seed=seed) for seed in range(20)])
     assert len(find_faults(cell)) == 2

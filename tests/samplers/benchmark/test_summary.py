@@ -37,6 +37,25 @@ def test_runs_that_raised_do_not_cover_and_count_nowhere_else():
     assert math.isnan(cell_of([lost, lost], P).gain)
 
 
+def test_standard_errors_are_of_the_runs_that_ended():
+    """Two of four: |ratio - 1| of 0.1 and 0.3 around a mean of 1.1, spread 0.2 sqrt(2), over sqrt(2)."""
+    lost = made(math.nan, math.nan, math.nan, math.nan, error="ValueError: no", status="raised")
+    ended = [made(1.3 * P), made(0.9 * P)]
+    assert cell_of([*ended, lost, lost], P).mean_se == pytest.approx(0.2)
+    assert cell_of([*ended, lost, lost], P).gain_se == pytest.approx(cell_of(ended, P).gain_se)
+
+
+def test_a_method_that_simulates_nothing_has_no_gain():
+    cell = cell_of([made(1.1 * P, n_sim=0), made(0.9 * P, n_sim=0)], P)
+    assert math.isnan(cell.gain)
+    assert cell.mean_over_p == pytest.approx(1.0)
+
+
+def test_more_stated_simulations_than_made_ones_are_not_hidden():
+    runs = [made(n_sim=1000, stated=stated) for stated in (999, 1000, 1001, None)]
+    assert cell_of(runs, P).hidden == 0.25
+
+
 def test_impossible_failure_has_coverage_only():
     cell = cell_of([made(0.0, math.inf, 0.0, 1e-3)] * 3, 0.0)
     assert cell.coverage == 1.0
@@ -51,6 +70,8 @@ def test_impossible_failure_has_coverage_only():
         (made(0.0, math.inf, 0.0, 2 * P), math.nan),
         (made(0.0, math.inf, 0.0, 0.5 * P), math.inf),
         (made(error="ValueError"), math.nan),
+        (made(1.2 * P, math.nan), math.nan),
+        (made(1.2 * P, math.inf), math.nan),
     ],
 )
 def test_own_errors_off(run, off):

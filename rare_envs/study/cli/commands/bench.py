@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from rare_envs.plugins import working_directory_first
 from rare_envs.study.cli.options import JsonOption
 from rare_envs.study.cli.shell import keep_stdout_for_the_answer, print_json
 from rare_envs.study.errors import as_bad_input
@@ -40,7 +41,7 @@ def bench_samplers_command(
     """Run methods many times on problems with known p; write bias, coverage, gain and faults of each."""
     from rare_envs.study.sampler_benchmark.study import BenchmarkPlan, choose_problems, run_study
 
-    with keep_stdout_for_the_answer(), as_bad_input(ValueError):
+    with keep_stdout_for_the_answer(), as_bad_input(ValueError), working_directory_first():
         plan = BenchmarkPlan(
             methods=_split(method),
             problems=choose_problems(_split(groups), _split(problems)),

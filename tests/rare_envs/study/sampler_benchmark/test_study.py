@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -41,6 +42,46 @@ def test_runs_read_back_are_those_that_were_made(tmp_path: Path) -> None:
     run_study(PLAN, tmp_path)
     found = [run for run in read_runs(tmp_path / "runs.jsonl") if run.problem == "never_d4"]
     assert [run.cov for run in found] == [float("inf")] * 4
+
+
+def test_a_study_that_ended_before_its_first_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("rare_envs.study.sampler_benchmark.study.run_all", lambda *_: iter(interrupt, None))
+        with pytest.raises(KeyboardInterrupt):
+            run_study(PLAN, tmp_path)
+    assert len((tmp_path / "runs.jsonl").read_text().splitlines()) == 1
+    first = run_study(PLAN, tmp_path)
+    assert without_times(run_study(PLAN, tmp_path)) == without_times(first)
+    assert len(read_runs(tmp_path / "runs.jsonl")) == 8
+
+
+def test_ends_and_errors_that_json_has_not_come_back(tmp_path: Path) -> None:
+    """Infinite ends of an interval hold p when the study goes on, too; an unknown c.o.v. stays unknown."""
+    plan = BenchmarkPlan((f"{__name__}:everything",), ("lin_d2",), (100,), runs=2)
+    first = run_study(plan, tmp_path)
+    assert [cell["coverage"] for cell in first["cells"]] == [1.0]
+    assert without_times(run_study(plan, tmp_path)) == without_times(first)
+    assert [cell["coverage"] for cell in run_study(plan, tmp_path)["cells"]] == [1.0]
+    for run in read_runs(tmp_path / "runs.jsonl"):
+        assert (run.low, run.high) == (-math.inf, math.inf)
+        assert math.isnan(run.cov)
+    text = (tmp_path / "runs.jsonl").read_text()
+    assert "NaN" not in text
+    assert "Infinity" not in text
+
+
+def everything(problem, seed, max_sim):
+    """An interval that says nothing."""
+    return 0.5, -math.inf, math.inf
+
+
+def test_what_is_named_twice_is_run_once() -> None:
+    plan = BenchmarkPlan(("mc", "mc"), ("lin_d2", "lin_d2"), (100, 100), runs=2)
+    assert (plan.methods, plan.problems, plan.budgets) == (("mc",), ("lin_d2",), (100,))
+    assert len(plan.jobs()) == 2
 
 
 @pytest.mark.parametrize(

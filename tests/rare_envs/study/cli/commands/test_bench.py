@@ -1,8 +1,10 @@
 """The command `bench samplers`."""
 
 import json
+import sys
 from pathlib import Path
 
+import pytest
 from typer.testing import CliRunner
 
 from rare_envs.study.cli.app import app
@@ -25,6 +27,17 @@ def test_faults_are_printed(tmp_path: Path) -> None:
     assert done.exit_code == 0, done.output
     assert "makes 2 times the simulations of its budget" in done.stdout
     assert "1 of 1 cells have faults" in done.stdout
+
+
+def test_a_method_in_the_working_directory_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A console script does not have it in the path of its modules."""
+    (tmp_path / "method_of_this_test.py").write_text("def guess(problem, seed, max_sim):\n    return 1e-3, 0.0, 1.0\n")
+    monkeypatch.chdir(tmp_path)
+    before = list(sys.path)
+    method = ["--method", "method_of_this_test:guess", "--budget", "300", "--out", str(tmp_path / "b")]
+    done = CliRunner().invoke(app, [*SMALL, *method])
+    assert done.exit_code == 0, done.output
+    assert sys.path == before
 
 
 def test_bad_input_is_one_line(tmp_path: Path) -> None:
