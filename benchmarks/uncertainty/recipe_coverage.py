@@ -31,6 +31,8 @@ from training.scenario_fitting.base_files import FitRequest, fit_base
 from training.scenario_fitting.event_filters import EventSet
 
 RECIPE_RESULT = RESULTS / "recipe_coverage.json"
+RECIPE_LINES = RESULTS / "recipe_coverage.jsonl"
+"""Lines of the draws, but for the first of each world, of which the result has the summary alone."""
 MAX_SIM = 2000
 """Simulations of an estimate."""
 SCENARIO = "car_following"
@@ -161,7 +163,7 @@ def main(
     repetitions: Annotated[int, typer.Option(help="Draws of events for each world.")] = 200,
     minutes: Annotated[float, typer.Option(help="Time after which no repetition is begun.")] = 60.0,
     world: Annotated[list[int] | None, typer.Option(help="Number of a world to go on with; all if none.")] = None,
-    lines: Annotated[Path, typer.Option(help="Where a line for each repetition goes.")] = Path("recipe_coverage.jsonl"),
+    lines: Annotated[Path, typer.Option(help="Where a line for each repetition goes.")] = RECIPE_LINES,
     out: Annotated[Path, typer.Option(help="Where the result goes.")] = RECIPE_RESULT,
 ) -> None:
     """Measure the coverage in every world, as far as the time allows, and write the result."""
