@@ -220,7 +220,7 @@ class CollisionRate:
         rest = z * math.sqrt(parts.counts + parts.site)
         if not self.determined:
             return 0.0, events * min(self.probability.upper * math.exp(rest), most)
-        below, above = (math.exp(math.hypot(distance, rest)) for distance in self._log_distances())
+        below, above = (float(np.exp(np.hypot(distance, rest))) for distance in self._log_distances())
         return events * self.probability.p / below, events * min(self.probability.p * above, most)
 
     def _log_distances(self) -> RateInterval:

@@ -101,6 +101,7 @@ def run_study(
     """
     out.mkdir(parents=True, exist_ok=True)
     file = out / RUNS_FILE
+    _drop_torn_line(file)
     begun, done = file.is_file() and file.stat().st_size > 0, {_key(run): run for run in read_runs(file)}
     wanted = plan.jobs()
     missing = [job for job in wanted if _key(job) not in done]
@@ -165,6 +166,14 @@ def read_runs(file: Path) -> list[MethodRun]:
             f"{file} has runs of rare_envs {version}, this is {rare_envs.__version__}: choose another --out."
         )
     return runs
+
+
+def _drop_torn_line(file: Path) -> None:
+    """Take out a last line that a stop has cut off; its run is made again."""
+    if file.is_file():
+        text = file.read_text(encoding="utf-8")
+        if text and not text.endswith("\n"):
+            replace_text(file, text[: text.rfind("\n") + 1])
 
 
 def _encode_run(run: MethodRun) -> dict[str, Any]:

@@ -31,6 +31,13 @@ def test_a_study_goes_on_where_it_has_ended(tmp_path: Path) -> None:
     assert (part / "leaderboard.md").read_text().startswith("# Samplers on problems")
 
 
+def test_a_line_that_a_stop_has_cut_off_is_made_again(tmp_path: Path) -> None:
+    whole = run_study(PLAN, tmp_path)
+    file = tmp_path / "runs.jsonl"
+    file.write_text(file.read_text()[:-20])
+    assert without_times(run_study(PLAN, tmp_path)) == without_times(whole)
+
+
 def test_an_executor_gives_the_runs_of_this_process(tmp_path: Path) -> None:
     with ThreadPoolExecutor(1) as pool:
         other = run_study(PLAN, tmp_path / "pool", executor=pool)
