@@ -218,6 +218,7 @@ def read_answer(job: Job, meter: Meter, seconds: float, answer: Any) -> MethodRu
 
     Raises:
         TypeError: It is neither a result nor three or four numbers.
+        ValueError: One of them is NaN.
     """
     if isinstance(answer, Estimate):
         p, (low, high), cov, stated = answer.p, answer.interval, answer.cov, answer.n_sim
@@ -230,6 +231,8 @@ def read_answer(job: Job, meter: Meter, seconds: float, answer: Any) -> MethodRu
             raise TypeError(f"expected p, low, high and perhaps c.o.v., got {len(numbers)} numbers")
         p, low, high, cov = (*numbers, math.nan)[:4]
         stated, status, warnings = None, "ended", ()
+    if math.isnan(p) or math.isnan(low) or math.isnan(high):
+        raise ValueError(f"expected p and an interval, got {p:g} and {low:g} to {high:g}")
     return MethodRun(
         method=job.method,
         problem=job.problem,

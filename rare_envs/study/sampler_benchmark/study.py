@@ -48,8 +48,10 @@ class BenchmarkPlan:
             object.__setattr__(self, name, tuple(dict.fromkeys(getattr(self, name))))
         if not (self.methods and self.problems and self.budgets):
             raise ValueError("Expected methods, problems and budgets, at least one of each.")
-        if self.runs < 2 or min(self.budgets) < 1:
-            raise ValueError(f"Expected 2 runs and budgets of 1 at least, got {self.runs} and {min(self.budgets)}.")
+        if self.runs < 2:
+            raise ValueError(f"Expected 2 runs at least, got {self.runs}.")
+        if min(self.budgets) < 1:
+            raise ValueError(f"Expected budgets of 1 simulation at least, got {min(self.budgets)}.")
         unknown = [name for name in self.problems if name not in ALL_PROBLEMS]
         if unknown:
             raise ValueError(f"Unknown problem {unknown[0]!r}; known: {', '.join(ALL_PROBLEMS)}.")

@@ -60,6 +60,11 @@ def test_an_answer_of_two_numbers_is_recorded_as_an_error():
     assert "expected p, low, high and perhaps c.o.v., got 2" in run_once(Job(f"{WRONG}:wordy", "lin_d2", 0, 100)).error
 
 
+def test_an_answer_that_is_no_number_is_recorded_as_an_error():
+    run = run_once(Job("nan", "lin_d2", 0, 100), lambda problem, seed, max_sim: (math.nan, 0.0, 1.0))
+    assert run.error == "ValueError: expected p and an interval, got nan and 0 to 1"
+
+
 @pytest.mark.parametrize(
     ("name", "said"),
     [("nothing", "Unknown method 'nothing'"), ("no.such:thing", "Cannot load the method"), ("math:pi", "got float")],

@@ -117,7 +117,7 @@ def test_runs_of_another_version_are_refused(tmp_path: Path) -> None:
         ({"problems": ("nothing",)}, "Unknown problem"),
         ({"methods": ()}, "at least one of each"),
         ({"runs": 1}, "2 runs"),
-        ({"budgets": (0,)}, "budgets of 1"),
+        ({"budgets": (0,)}, "budgets of 1 simulation"),
     ],
 )
 def test_plans_that_cannot_be_run_are_refused(changes, said) -> None:
