@@ -45,7 +45,7 @@ def bench_samplers_command(
         plan = BenchmarkPlan(
             methods=_split(method),
             problems=choose_problems(_split(groups), _split(problems)),
-            budgets=tuple(int(float(each)) for each in _split(budget)),
+            budgets=tuple(_read_budget(each) for each in _split(budget)),
             runs=runs,
             seed=seed,
         )
@@ -57,6 +57,18 @@ def bench_samplers_command(
     for cell in faulty:
         print(f"{cell['method']} on {cell['problem']}, {cell['max_sim']:,} simulations: {'; '.join(cell['faults'])}")
     print(f"{len(faulty)} of {len(result['cells'])} cells have faults. Wrote {out / 'leaderboard.md'}.")
+
+
+def _read_budget(text: str) -> int:
+    """Return a number of simulations, written as 6000 or 6e3.
+
+    Raises:
+        ValueError: It is no number.
+    """
+    try:
+        return int(float(text))
+    except (ValueError, OverflowError):
+        raise ValueError(f"Expected --budget as numbers of simulations, such as 300,1500, got {text!r}.") from None
 
 
 def _split(names: str) -> tuple[str, ...]:

@@ -40,6 +40,9 @@ def test_a_method_in_the_working_directory_is_found(tmp_path: Path, monkeypatch:
     assert sys.path == before
 
 
-def test_bad_input_is_one_line(tmp_path: Path) -> None:
-    done = CliRunner().invoke(app, [*SMALL, "--method", "nothing", "--out", str(tmp_path)])
+@pytest.mark.parametrize("changes", [["--method", "nothing"], ["--budget", "abc"], ["--budget", "inf"], ["--set", "x"]])
+def test_bad_input_is_one_line(tmp_path: Path, changes: list[str]) -> None:
+    known = SMALL if "--set" not in changes else SMALL[:2]
+    done = CliRunner().invoke(app, [*known, *changes, "--out", str(tmp_path)])
     assert done.exit_code == 2
+    assert len(done.stderr.strip().splitlines()) == 1
