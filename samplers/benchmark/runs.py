@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from multiprocessing import get_context
 from pathlib import Path
@@ -233,6 +233,21 @@ def read_answer(job: Job, meter: Meter, seconds: float, answer: Any) -> MethodRu
         stated, status, warnings = None, "ended", ()
     if math.isnan(p) or math.isnan(low) or math.isnan(high):
         raise ValueError(f"expected p and an interval, got {p:g} and {low:g} to {high:g}")
+    run = _record(job, meter, seconds, (p, low, high, cov), status)
+    return replace(run, warnings=tuple(warnings), stated=stated)
+
+
+def record_failure(job: Job, meter: Meter, seconds: float, error: Exception) -> MethodRun:
+    """Return the record of a run that raised."""
+    run = _record(job, meter, seconds, (math.nan,) * 4, "raised")
+    return replace(run, error=f"{type(error).__name__}: {error}")
+
+
+def _record(
+    job: Job, meter: Meter, seconds: float, numbers: tuple[float, float, float, float], status: str
+) -> MethodRun:
+    """Return the record of a run with p, low, high and c.o.v., and what its meter counted."""
+    p, low, high, cov = numbers
     return MethodRun(
         method=job.method,
         problem=job.problem,
@@ -245,28 +260,6 @@ def read_answer(job: Job, meter: Meter, seconds: float, answer: Any) -> MethodRu
         calls=meter.calls,
         seconds=seconds - meter.seconds,
         status=status,
-        warnings=tuple(warnings),
-        max_sim=job.max_sim,
-        stated=stated,
-    )
-
-
-def record_failure(job: Job, meter: Meter, seconds: float, error: Exception) -> MethodRun:
-    """Return the record of a run that raised."""
-    nan = float("nan")
-    return MethodRun(
-        method=job.method,
-        problem=job.problem,
-        seed=job.seed,
-        p=nan,
-        low=nan,
-        high=nan,
-        cov=nan,
-        n_sim=meter.points,
-        calls=meter.calls,
-        seconds=seconds - meter.seconds,
-        status="raised",
-        error=f"{type(error).__name__}: {error}",
         max_sim=job.max_sim,
     )
 
