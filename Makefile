@@ -22,7 +22,7 @@ PACKAGES := agents rare_envs samplers training
 SOURCES := $(PACKAGES) tests benchmarks examples
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow test-lowest lint type format bench clean
+.PHONY: help demo test test-slow test-lowest docs lint type format bench clean
 
 help:  ## Show this list.
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1|\2/p' $(MAKEFILE_LIST) | column -t -s '|'
@@ -41,16 +41,20 @@ test-lowest: $(LOWEST)/.installed  ## Run the tests with the lowest versions tha
 	@OMP_NUM_THREADS=1 $(LOWEST)/bin/python -m pytest -n $(WORKERS) --dist loadfile -o filterwarnings=default
 
 lint: $(VENV)/.developer  ## Check style and spelling.
-	@$(BIN)/ruff check $(SOURCES)
-	@$(BIN)/ruff format --check $(SOURCES)
-	@$(BIN)/codespell $(SOURCES) *.md
+	@$(BIN)/ruff check $(SOURCES) docs
+	@$(BIN)/ruff format --check $(SOURCES) docs
+	@$(BIN)/codespell $(SOURCES) docs *.md
 
 type: $(VENV)/.developer  ## Check the types of the four packages.
 	@$(BIN)/mypy
 
 format: $(VENV)/.developer  ## Format the code and sort the imports.
-	@$(BIN)/ruff check --fix $(SOURCES)
-	@$(BIN)/ruff format $(SOURCES)
+	@$(BIN)/ruff check --fix $(SOURCES) docs
+	@$(BIN)/ruff format $(SOURCES) docs
+
+docs: $(VENV)/.docs  ## Build the documentation site in build/site (Python 3.11 or later).
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict
+	@echo "Open build/site/index.html, or run: $(BIN)/python -m mkdocs serve"
 
 bench: $(VENV)/.installed  ## Measure speed against HighwayEnv.
 	@OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.simulation.throughput
@@ -69,6 +73,10 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 
 $(VENV)/.developer: $(VENV)/.installed
 	@$(INSTALL) -c constraints.txt -e ".[test,dev]"
+	@touch $@
+
+$(VENV)/.docs: $(VENV)/.installed
+	@$(INSTALL) -c constraints.txt -e ".[docs]"
 	@touch $@
 
 # "matplotlib>=3.9" of pyproject.toml becomes matplotlib==3.9 here.
