@@ -20,6 +20,9 @@ from typer.core import TyperGroup
 from rare_envs.egos.errors import EgoGone
 from rare_envs.study.errors import BadInput
 
+DOUBTFUL = 3
+"""Exit code of a command that is done, with warnings that make its number doubtful."""
+
 _UsageError: type[Exception] = typer.BadParameter.__bases__[0]
 """Error that Typer raises for a wrong option or a missing word; older versions of Typer take it from click."""
 

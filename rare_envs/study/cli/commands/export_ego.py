@@ -1,13 +1,36 @@
-"""Export of a saved policy as an ONNX file (`rare-envs export-ego`)."""
+"""Command `export-ego`: a saved policy as an ONNX file."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from agents.sb3.saved_ego import SavedEgo, load_saved_ego
+import typer
+
+from rare_envs.study.cli.options import AlgoOption, JsonOption, StatsOption, TrustOption
+from rare_envs.study.cli.shell import keep_stdout_for_the_answer, print_json
 from rare_envs.study.errors import BadInput
+
+
+def export_ego_command(
+    model: Annotated[Path, typer.Argument(metavar="MODEL", help="A .zip saved by Stable-Baselines3.")],
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="The .onnx file to write.")],
+    algo: AlgoOption = None,
+    stats: StatsOption = None,
+    trust: TrustOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Write a saved policy as ONNX, normalisation, memory and clipping included, and check that both act alike."""
+    with keep_stdout_for_the_answer():
+        done = export_ego(model, out, algo=algo, trust=trust, stats=stats)
+    if as_json:
+        print_json(done)
+    else:
+        print(
+            f"Wrote {out}: its actions differ by {done['largest_difference']:.1e} at most "
+            f"on {done['observations_tried']:,} random observations."
+        )
 
 
 def export_ego(
@@ -38,8 +61,9 @@ def export_ego(
         raise BadInput(f"Cannot write to the folder {str(out.parent)!r}.")
     try:
         from agents.onnx.export import ACTION_TOLERANCE, export_onnx
+        from agents.sb3.saved_ego import load_saved_ego
 
-        ego: SavedEgo = load_saved_ego(model, algo, trust, stats)
+        ego = load_saved_ego(model, algo, trust, stats)
         exported = export_onnx(ego, out)
     except (ValueError, OSError) as error:
         raise BadInput(error) from error

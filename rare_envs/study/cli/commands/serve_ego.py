@@ -1,12 +1,29 @@
-"""Server of an ego for simulations in other processes or on other machines (`rare-envs serve-ego`)."""
+"""Command `serve-ego`: an ego served to simulations in other processes or on other machines."""
 
 from __future__ import annotations
 
 import sys
+from typing import Annotated
 
-import agents
-from rare_envs.egos.validation import is_policy
+import typer
+
+from rare_envs.study.cli.options import AlgoOption, EgoArgument, StatsOption, TrustOption
 from rare_envs.study.errors import BadInput
+from rare_envs.threads import use_one_thread
+
+
+@use_one_thread()
+def serve_ego_command(
+    ego: EgoArgument,
+    bind: Annotated[
+        str, typer.Option(help="Address; beyond 127.0.0.1 it needs RARE_ENVS_SECRET.")
+    ] = "tcp://127.0.0.1:5555",
+    algo: AlgoOption = None,
+    stats: StatsOption = None,
+    trust: TrustOption = False,
+) -> None:
+    """Lend an ego to simulations in other processes or on other machines (estimate --ego tcp://...)."""
+    serve_ego(ego, bind, algo=algo, trust=trust, stats=stats)
 
 
 def serve_ego(spec: str, bind: str, algo: str | None = None, trust: bool = False, stats: str | None = None) -> None:
@@ -22,6 +39,9 @@ def serve_ego(spec: str, bind: str, algo: str | None = None, trust: bool = False
     Raises:
         BadInput: The ego cannot be loaded or served, or the address cannot be used.
     """
+    import agents
+    from rare_envs.egos.validation import is_policy
+
     try:
         from agents.remote.server import EgoServer
         from agents.remote.zmq_link import read_secret

@@ -308,25 +308,3 @@ def test_where_everybody_may_add_files_ones_own_are_safe(saved: Path, monkeypatc
     assert "belongs to another user" in find_origin_risks(saved)[0]
     saved.parent.chmod(0o755)  # a colleague's: nobody else can have put it there
     assert find_origin_risks(saved) == []
-
-
-def test_a_remote_file_is_refused(cli: Cli) -> None:
-    refused = cli("check-ego", "https://example.org/ego.zip", ENV)
-    assert refused.exit_code == 2
-    assert "remote place" in refused.stdout
-
-
-def test_an_unknown_environment_is_one_line(cli: Cli) -> None:
-    refused = cli("check-ego", "idm", "rare_envs/CutIn-v9")
-    assert (refused.exit_code, refused.stdout) == (2, "")
-    assert "rare_envs/CutIn-v0" in refused.stderr
-
-
-# --- servers -----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("option", "word"), [("--base", "nowhere"), ("--drivers", "nobody")])
-def test_it_is_tried_in_the_traffic_that_is_asked_for(cli: Cli, option: str, word: str) -> None:
-    findings = json.loads(cli("check-ego", "idm", ENV, option, word, "--json").stdout)["findings"]
-    assert findings[-1]["status"] == "fail"
-    assert word in findings[-1]["found"]

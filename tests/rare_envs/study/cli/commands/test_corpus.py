@@ -1,4 +1,4 @@
-"""The commands `corpus` and `replay --all`, `replay --ego`, on the folder of a small run."""
+"""The commands of `corpus`, on the folder of a small run."""
 
 from __future__ import annotations
 
@@ -47,33 +47,10 @@ def test_a_corpus_that_an_ego_passes(cli: Cli, run: Path) -> None:
     assert result.exit_code == 0 and result.stdout.startswith("idm fails in 0 of 20 scenarios")
 
 
-def test_all_failures_replay(cli: Cli, run: Path) -> None:
-    answer = json.loads(cli("replay", "run", "--all", "--json").stdout)
-    assert answer["same"] == len(answer["trials"]) > 20
-    other = cli("replay", "run", "--all", "--ego", "egos_here:coasting", "--json")
-    assert other.exit_code == FAILS and json.loads(other.stdout)["failed"] == len(answer["trials"])
-    table = (run / "failures.csv").read_text().splitlines()
-    names = table[0].split(",")
-    row = table[1].split(",")
-    row[names.index("f")] = "-0.5"
-    (run / "failures.csv").write_text("\n".join([table[0], ",".join(row), *table[2:]]) + "\n")
-    changed = cli("replay", "run", "--all")
-    assert changed.exit_code == 3 and changed.stdout.count("\n") == 2
-
-
-def test_one_failure_with_another_ego(cli: Cli, run: Path) -> None:
-    result = cli("replay", "run", "--ego", "egos_here:coasting")
-    assert result.exit_code == 0
-    assert result.stdout.splitlines()[-1] == "The ego was egos_here:coasting; that of the run had f = -1."
-
-
 def test_refusals_are_one_line(cli: Cli, run: Path) -> None:
     assert_refused(cli("corpus", "run", "--ego", "idm"), "There is no corpus")
     cli("corpus", "add", "run")
     assert_refused(cli("corpus", "run", "--ego", "nowhere.zip"), "nowhere.zip")
     assert_refused(cli("corpus", "run", "--ego", "idm", "--junit", "no/where.xml"), "no folder")
-    assert_refused(cli("replay", "run", "--all", "--out", "a.gif"), "--all without --out")
-    assert_refused(cli("replay", "run", "--all", "--failure", 0), "--all without --failure")
-    assert_refused(cli("replay", "run", "--ego", "idm", "--failure", "9999"), "from 0 to")
     Path("corpus", "stray.json").write_text("{}")
     assert_refused(cli("corpus", "run", "--ego", "idm"), "stray.json", "format")

@@ -1,0 +1,115 @@
+"""Commands `estimate` and `resume`: one evaluation, and the rest of one that was stopped."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, NoReturn
+
+import typer
+
+from rare_envs.study.cli.executor_options import ExecutorOptions
+from rare_envs.study.cli.options import EstimateOptions, ForceOption, JsonOption, TrustOption
+from rare_envs.study.cli.shell import (
+    DOUBTFUL,
+    is_typed,
+    keep_stdout_for_the_answer,
+    print_json,
+    show_what_is_known,
+)
+from rare_envs.study.errors import BadInput, as_bad_input
+from rare_envs.threads import use_one_thread
+from training.command_line import spread_options
+
+GATE_CODES = {"passes": 0, "fails": 4, "undecided": 5}
+"""Exit codes of a comparison of p with a limit."""
+
+
+@spread_options
+@use_one_thread()
+def estimate_command(
+    context: typer.Context,
+    options: EstimateOptions,
+    places: ExecutorOptions,
+    env: Annotated[
+        str | None, typer.Argument(metavar="ENV", help="Environment, such as rare_envs/CutIn-v0; or in --config.")
+    ] = None,
+    config: Annotated[
+        Path | None, typer.Option(help="YAML file with ENV (env: ...) and options; those given here come first.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder of the run: result.json, episodes.parquet and more.")] = None,
+    force: ForceOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Estimate how often an ego fails, with an interval, and show its most likely failure."""
+    from rare_envs.study.evaluate import run, run_into
+    from rare_envs.study.question import prepare
+    from rare_envs.study.storage.question_file import join_question, read_question_file
+
+    typed = {name for name in context.params if is_typed(context, name)}
+    question = join_question({} if config is None else read_question_file(config), env, options.arguments(), typed)
+    if question.max_p is None:
+        _refuse_options_of_a_limit(typed)
+    with show_what_is_known(lambda known: show_report(known, None, as_json)), keep_stdout_for_the_answer():
+        with as_bad_input(ValueError):
+            executor = places.make()
+        study = prepare(question)
+        report = (
+            run(study, progress=True, executor=executor)
+            if out is None
+            else run_into(out, study, progress=True, force=force, executor=executor)
+        )
+    _answer(report, out, as_json)
+
+
+def _refuse_options_of_a_limit(typed: set[str]) -> None:
+    """Refuse options that a question without --max-p would ignore.
+
+    Raises:
+        BadInput: One was typed. A folder of an older run may have them, so that the question itself allows them.
+    """
+    for name, option in (("given_base", "--given-base"), ("gate_confidence", "--confidence")):
+        if name in typed:
+            raise BadInput(f"Expected {option} together with --max-p, the limit of p.")
+
+
+def _answer(report: Any, out: Path | None, as_json: bool) -> NoReturn:
+    """Print a report and exit."""
+    show_report(report, out, as_json)
+    if report.verdict is not None:
+        raise typer.Exit(GATE_CODES[report.verdict.decision])
+    raise typer.Exit(DOUBTFUL if report.doubtful else 0)
+
+
+def show_report(report: Any, out: Path | None, as_json: bool) -> None:
+    """Print a report."""
+    from rare_envs.study.cli.printing import print_report
+
+    if as_json:
+        print_json(report.to_dict())
+    else:
+        print_report(report, out)
+
+
+@spread_options
+@use_one_thread()
+def resume_command(
+    run: Annotated[
+        Path, typer.Argument(metavar="RUN", help="Folder of an estimate --out that has not come to its end.")
+    ],
+    places: ExecutorOptions,
+    ego: Annotated[str | None, typer.Option(help="New address of an ego in another program, tcp://...")] = None,
+    on_error: Annotated[str | None, typer.Option(help="Instead of what the run had: raise, failure or bound.")] = None,
+    trust: TrustOption = False,
+    mend: Annotated[
+        bool, typer.Option("--mend", help="Of a damaged journal, keep the simulations before the damage.")
+    ] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Go on with a run whose ego has gone, or that was stopped; the answer is that of an undisturbed run."""
+    from rare_envs.study.evaluate import resume
+
+    with show_what_is_known(lambda known: show_report(known, None, as_json)), keep_stdout_for_the_answer():
+        with as_bad_input(ValueError):
+            executor = places.make()
+        report = resume(run, ego, on_error, trust, progress=True, mend=mend, executor=executor)
+    _answer(report, run, as_json)
