@@ -58,6 +58,7 @@ FLOORS = {
         study
         study.ego_check study.rates
         study.html_report
+        study.reproduction
         study.cli
     """,
     "agents": """

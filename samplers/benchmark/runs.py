@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import scipy
@@ -26,6 +26,9 @@ from samplers.method import Stepping
 from samplers.problem import FloatArray, FunctionProblem
 from samplers.registry import METHODS
 from samplers.result import Estimate
+
+_Job = TypeVar("_Job")
+_Run = TypeVar("_Run")
 
 OWN_CATALOGUE = "samplers.benchmark.catalogue:PROBLEMS"
 GUARD_FACTOR = 50
@@ -281,6 +284,18 @@ def run_all(
     Example:
         >>> [run.n_sim for run in run_all(Job("mc", "lin_d2", seed, max_sim=100) for seed in range(3))]
         [100, 100, 100]
+    """
+    yield from map_jobs(once, jobs, workers, executor)
+
+
+def map_jobs(
+    once: Callable[[_Job], _Run], jobs: Iterable[_Job], workers: int = 1, executor: Executor | None = None
+) -> Iterator[_Run]:
+    """Return what a function gives for jobs of any kind, in order; see `run_all`.
+
+    Example:
+        >>> list(map_jobs(abs, [-1, 2]))
+        [1, 2]
     """
     if executor is not None:
         yield from executor.map(once, jobs)

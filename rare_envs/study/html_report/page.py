@@ -20,6 +20,7 @@ from rare_envs.study.html_report.atlas import AtlasEntry, AtlasSource, build_atl
 from rare_envs.study.html_report.figures import MAX_HISTOGRAMS, draw_parameters, figures_of_result
 from rare_envs.study.html_report.recorded_events import read_recorded_events
 from rare_envs.study.html_report.svg import FORMATS, FigureOfPage
+from rare_envs.study.html_report.templating import render_template
 from rare_envs.study.html_report.wording import (
     describe_intervals,
     describe_kind,
@@ -98,14 +99,9 @@ def _write(study: LoadedStudy, page: Path, trust: bool, events: Path | None, kin
 
 def render_page(study: LoadedStudy, figures: Mapping[str, FigureOfPage], atlas: Sequence[AtlasEntry]) -> str:
     """Return the page as text; everything that files say is escaped."""
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("rare_envs.study.html_report"),
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     result = study.result
-    return environment.get_template("report.html.j2").render(
+    return render_template(
+        "report.html.j2",
         result=result,
         about=study.about,
         folder=str(study.folder),

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
-import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -13,7 +11,7 @@ from typing import Any
 import rare_envs
 from rare_envs.files import replace_text
 from rare_envs.json_text import format_json
-from rare_envs.study.errors import BadInput
+from rare_envs.study.execution.run_lines import RunLines
 from rare_envs.study.sampler_benchmark.leaderboard import format_leaderboard
 from rare_envs.study.sampler_benchmark.problems import ALL_PROBLEMS, GROUPS
 from samplers.benchmark import Job, MethodRun, cells_of, find_faults, power_of, run_all, run_once
@@ -102,20 +100,9 @@ def run_study(
         BadInput: The folder has runs of another version of the package, or damaged ones.
     """
     out.mkdir(parents=True, exist_ok=True)
-    file = out / RUNS_FILE
-    _drop_torn_line(file)
-    begun, done = file.is_file() and file.stat().st_size > 0, {_key(run): run for run in read_runs(file)}
-    wanted = plan.jobs()
-    missing = [job for job in wanted if _key(job) not in done]
-    made = run_all(missing, workers, run_once, executor)
-    with file.open("a", encoding="utf-8") as lines:
-        if not begun:
-            lines.write(json.dumps({"rare_envs": rare_envs.__version__}) + "\n")
-        for run in _show_progress(made, len(missing)) if progress else made:
-            done[_key(run)] = run
-            lines.write(json.dumps(_encode_run(run)) + "\n")
-            lines.flush()
-    result = summarise_study(plan, [done[_key(job)] for job in wanted])
+    lines = _open_runs(out / RUNS_FILE)
+    runs = lines.complete(plan.jobs(), lambda missing: run_all(missing, workers, run_once, executor), progress)
+    result = summarise_study(plan, runs)
     replace_text(out / RESULT_FILE, format_json(result))
     replace_text(out / PAGE_FILE, format_leaderboard(result))
     return result
@@ -150,38 +137,17 @@ def read_runs(file: Path) -> list[MethodRun]:
     Raises:
         BadInput: It is damaged, or of another version of the package.
     """
-    if not file.is_file():
-        return []
-    runs, version = [], rare_envs.__version__
-    for number, line in enumerate(file.read_text(encoding="utf-8").splitlines(), 1):
-        try:
-            content = json.loads(line)
-            if number == 1:
-                version = content["rare_envs"]
-                continue
-            numbers = {name: float(content[name]) for name in _MAY_BE_INFINITE}
-            runs.append(MethodRun(**{**content, **numbers, "warnings": tuple(content["warnings"])}))
-        except (ValueError, KeyError, TypeError) as error:
-            raise BadInput(f"{file}, line {number} is no run of a benchmark; take the line out. {error}") from None
-    if version != rare_envs.__version__:
-        raise BadInput(
-            f"{file} has runs of rare_envs {version}, this is {rare_envs.__version__}: choose another --out."
-        )
-    return runs
+    return _open_runs(file).read()
 
 
-def _drop_torn_line(file: Path) -> None:
-    """Take out a last line that a stop has cut off; its run is made again."""
-    if file.is_file():
-        text = file.read_text(encoding="utf-8")
-        if text and not text.endswith("\n"):
-            replace_text(file, text[: text.rfind("\n") + 1])
+def _open_runs(file: Path) -> RunLines[Job, MethodRun]:
+    """Return the runs of a file, and how they are read and written."""
+    return RunLines(file, {"rare_envs": rare_envs.__version__}, _parse_run, asdict, _key, _key)
 
 
-def _encode_run(run: MethodRun) -> dict[str, Any]:
-    """Return a run as a line of the file has it: NaN and infinities, which JSON has not, as texts."""
-    content = asdict(run)
-    return {**content, **{name: repr(content[name]) for name in _MAY_BE_INFINITE if not math.isfinite(content[name])}}
+def _parse_run(content: dict[str, Any]) -> MethodRun:
+    numbers = {name: float(content[name]) for name in _MAY_BE_INFINITE}
+    return MethodRun(**{**content, **numbers, "warnings": tuple(content["warnings"])})
 
 
 def _describe_problem(name: str) -> dict[str, Any]:
@@ -200,10 +166,3 @@ def _describe_problem(name: str) -> dict[str, Any]:
 
 def _key(run: Job | MethodRun) -> tuple[str, str, int, int | None]:
     return run.method, run.problem, run.seed, run.max_sim
-
-
-def _show_progress(runs: Iterator[MethodRun], total: int) -> Iterator[MethodRun]:
-    from rich.console import Console
-    from rich.progress import track
-
-    yield from track(runs, total=total, console=Console(stderr=True), description="runs")

@@ -1,0 +1,125 @@
+"""Comparison of what a paper prints with what this package finds, as plain values of a record."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+
+@dataclass(frozen=True, kw_only=True)
+class ComparedValue:
+    """One number of a paper's table beside ours.
+
+    Example:
+        >>> value = ComparedValue(labels=("SS", "IDM"), quantity="mean of p", paper=8.0e-4, ours=8.4e-4)
+        >>> f"{value.difference:+.0%}"
+        '+5%'
+    """
+
+    labels: tuple[str, ...]
+    """Row of the table: the method, the system under test and so on."""
+    quantity: str
+    paper: float | None = None
+    """As printed; None where the paper has none."""
+    ours: float | None = None
+    interval: tuple[float, float] | None = None
+    """95 % interval of ours."""
+    released: str = ""
+    """What the released code does or gives, in words."""
+    reasons: tuple[str, ...] = ()
+    """Why the two differ: names of explanations of the table."""
+
+    @property
+    def difference(self) -> float | None:
+        """Ours over the paper's, less 1; None where one of them is not known."""
+        return None if self.ours is None or not self.paper else self.ours / self.paper - 1.0
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the value and the difference as a record has them."""
+        return {**asdict(self), "difference": self.difference}
+
+
+@dataclass(frozen=True, kw_only=True)
+class ComparisonTable:
+    """A table of a paper beside ours."""
+
+    name: str
+    """A word, unique in the record: `table2`."""
+    title: str
+    keys: tuple[str, ...]
+    """Heads of the columns of the labels."""
+    values: tuple[ComparedValue, ...]
+    explanations: Mapping[str, str] = field(default_factory=dict)
+    """Sentences by the names that the values have as reasons."""
+
+    def __post_init__(self) -> None:
+        for value in self.values:
+            if len(value.labels) != len(self.keys):
+                raise ValueError(f"Expected {len(self.keys)} labels ({', '.join(self.keys)}), got {value.labels}.")
+            unknown = [reason for reason in value.reasons if reason not in self.explanations]
+            if unknown:
+                raise ValueError(f"No explanation {unknown[0]!r} in the table; known: {', '.join(self.explanations)}.")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the table as a record has it."""
+        return {
+            "name": self.name,
+            "title": self.title,
+            "keys": list(self.keys),
+            "values": [value.to_dict() for value in self.values],
+            "explanations": dict(self.explanations),
+        }
+
+
+@dataclass(frozen=True, kw_only=True)
+class TestedClaim:
+    """A statement of a paper, and the test statistic that says whether it is so here.
+
+    Example:
+        >>> finding = TestedClaim(claim="A needs fewer runs than B", statistic="runs of B / runs of A",
+        ...                   value=2.1, interval=(1.8, 2.4), verdict="holds")
+        >>> finding.to_dict()["verdict"]
+        'holds'
+    """
+
+    claim: str
+    statistic: str
+    """What is computed, in words."""
+    value: float | None
+    interval: tuple[float, float] | None
+    """95 % interval of the statistic."""
+    verdict: str
+    """In a few words: holds, does not hold here, cannot be told."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the finding as a record has it."""
+        return asdict(self)
+
+
+def format_compared(value: float | None) -> str:
+    """Return a number of a table, whatever its size; an en dash for None.
+
+    Example:
+        >>> [format_compared(value) for value in (2.392e-4, 0.0862, 406_400.0, 20, None)]
+        ['2.39e-04', '0.0862', '406,400', '20', '–']
+    """
+    if value is None:
+        return "–"
+    if abs(value) >= 1000:
+        return f"{value:,.0f}"
+    return f"{value:.3g}"
+
+
+def format_difference(value: float | None) -> str:
+    """Return a relative difference in percent, or as a factor where it is large.
+
+    Example:
+        >>> [format_difference(value) for value in (0.05, -0.2, 20.4, -0.99, None)]
+        ['+5 %', '-20 %', '× 21.4', '× 0.01', '–']
+    """
+    if value is None:
+        return "–"
+    if value > 2.0 or value < -0.9:
+        return f"× {1.0 + value:.3g}"
+    return f"{100 * value:+.0f} %"

@@ -1,0 +1,45 @@
+"""The page has the record's numbers in their columns, and escapes what they say."""
+
+from __future__ import annotations
+
+import re
+
+from rare_envs.study.reproduction.page import group_rows, render_reproduction
+from tests.rare_envs.study.reproduction.records import record_by_hand
+
+
+def rows_of(page: str) -> list[list[str]]:
+    rows = re.findall(r"<tr>(.*?)</tr>", page, flags=re.DOTALL)
+    return [re.findall(r"<t[dh][^>]*>(.*?)</t[dh]>", row, flags=re.DOTALL) for row in rows]
+
+
+def test_paper_ours_and_difference_stand_side_by_side() -> None:
+    rows = rows_of(render_reproduction(record_by_hand(), []))
+    assert rows[0][2:] == [
+        "quantity",
+        "paper",
+        "ours",
+        "95 % interval",
+        "difference",
+        "released code",
+        "why they differ",
+    ]
+    assert rows[1] == ["SS", "IDM", "mean of p", "0.0008", "0.0006", "–", "-25 %", "–", "traffic"]
+    assert rows[2] == ["simulations", "–", "4,980", "4,900 to 5,100", "–", "–", "–"]
+    assert rows[3][-2] == "does &lt;not&gt; run"
+
+
+def test_the_page_needs_nothing_else_and_has_all_sections() -> None:
+    page = render_reproduction(record_by_hand(), [])
+    assert not re.search(r"(src|href)=", page)
+    assert [f'id="{name}"' in page for name in ("notes", "table9", "findings", "figure9", "made")] == [True] * 5
+    assert "rare-envs reproduce paper" in page
+
+
+def test_equal_labels_apart_are_two_groups() -> None:
+    values = [{"labels": [name]} for name in ("a", "a", "b", "a")]
+    assert [(labels, len(rows)) for labels, rows in group_rows({"values": values})] == [
+        (["a"], 2),
+        (["b"], 1),
+        (["a"], 1),
+    ]
