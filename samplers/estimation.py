@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from os import PathLike
 
-from samplers.analysis.refits import HasEnsemble, HasParts, needs_ensemble_run
+from samplers.analysis.refits import HasEnsemble, HasParts, needs_ensemble_run, pool_refits
 from samplers.errors import OnError
 from samplers.execution.arguments import InputsOnly, RunArguments, check_attributes, check_problem, choose_seed
 from samplers.execution.base_check import find_base_fault
@@ -55,9 +55,9 @@ def estimate(
     Where the base distribution was fitted and has refits (`FittedBase`), the failing points of the run also give p
     under each refit and so the uncertainty of p that the events leave (`Estimate.base_uncertainty`). If they do not
     reach the refits (more than a tenth of these rest on under 10 effective failing points, which is known without
-    simulations), one further run is made under the mixture of the refits, `base.ensemble()`. It has the same method
-    (`TwoStage`, if that one cannot search under a mixture), seed and rule for errors, no replicates and no target_cov.
-    p and its interval remain those of the first run.
+    simulations), one further run is made under the mixture of the refits, `base.covering_ensemble()` where there is
+    one and else `base.ensemble()`. It has the same method (`TwoStage`, if that one cannot search under a mixture), seed
+    and rule for errors, no replicates and no target_cov. p and its interval remain those of the first run.
 
     Args:
         problem: Has `dim`, `base` and `evaluate`; see `Problem`.
@@ -237,7 +237,7 @@ def _run_under_ensemble(
         return None
     further = replace(arguments, seed=first.seed, target_cov=None, replicates=1)
     try:
-        inputs = InputsOnly(int(problem.dim), problem.base.ensemble())
+        inputs = InputsOnly(int(problem.dim), pool_refits(problem.base))
     except ValueError:  # refits that are no mixtures; the first run stands, with a warning of `BaseUncertainty`
         return None
     try:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, cast
 
 import numpy as np
@@ -30,6 +30,8 @@ from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
 FITTED_KEYS = ("refits", "events", "family", "frequency", "checks")
 """Keys of a base file of which each makes it a fitted one; these then need `events` and `family`."""
 BETA_SHAPES = ("alpha", "beta")
+MAX_COVERING_REFITS = 30
+"""Refits whose mixture reaches where failures under any of them lie: of 100, more take longer and reach no further."""
 COORDINATE_KEYS = ("coordinates", "order")
 """Keys of a file that a refit may have of its own, where it has chosen other coordinates than its base."""
 
@@ -220,6 +222,18 @@ class FittedDistribution:
         if len(mixtures) < len(self.refits):
             raise ValueError("An ensemble needs refits that are Gaussian mixtures.")
         return pool_mixtures(mixtures)
+
+    def covering_ensemble(self) -> Distribution:
+        """Return the mixture of at most 30 of the refits, evenly chosen: to simulate failures under any of them.
+
+        Its map takes a third of the time of that of a hundred refits, and its failures are worth as much under these.
+
+        Raises:
+            ValueError: As `ensemble`.
+        """
+        last = len(self.refits) - 1
+        chosen = np.linspace(0, last, min(MAX_COVERING_REFITS, last + 1)).round().astype(int)
+        return replace(self, refits=tuple(self.refits[i] for i in chosen)).ensemble()
 
     def sibling(self, name: str) -> Distribution:
         """Return another base distribution of the same scenario, by name or file.

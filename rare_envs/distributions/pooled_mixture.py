@@ -21,10 +21,16 @@ from rare_envs.distributions.mixture_conditionals import (
     apply_by_chunks,
 )
 from rare_envs.distributions.truncated_mixture import TruncatedGaussianMixture
-from rare_envs.distributions.truncated_normal import ROOT_TOLERANCE, TailSearch, TruncatedConditional, log_sum
+from rare_envs.distributions.truncated_normal import (
+    MAX_ITERATIONS,
+    RootBracket,
+    TailSearch,
+    TruncatedConditional,
+    guess_quantile,
+    log_sum,
+    sum_components,
+)
 
-SEARCH_STEPS = 200
-"""Most steps of the search for a quantile; bisections alone would need about 60."""
 BoxMixture = TruncatedGaussianMixture | CoordinateMixture
 
 
@@ -130,11 +136,10 @@ class _Part(NamedTuple):
         y = move_inside(coordinates.coordinate(j, x), conditional.low, conditional.high)
         return coordinates.sign(j) * conditional.to_normal(y)
 
-    def quantile(self, j: int, x: FloatArray, conditional: TruncatedConditional, u: FloatArray) -> FloatArray:
-        """Return its quantile of column j at Phi(u)."""
+    def ends(self, j: int) -> tuple[float, float]:
+        """Return the range of column j."""
         coordinates = self.conditionals.coordinates
-        y = move_inside(conditional.from_normal(coordinates.sign(j) * u), conditional.low, conditional.high)
-        return coordinates.value(j, y, x)
+        return float(coordinates.low[j]), float(coordinates.high[j])
 
     def observe(self, j: int, x: FloatArray, conditional: TruncatedConditional) -> _Part:
         """Return the part after column j."""
@@ -261,42 +266,24 @@ def _pooled_quantile_scale(
 def _find_quantile(
     j: int, x: FloatArray, u: FloatArray, parts: Sequence[_Part], conditionals: Sequence[TruncatedConditional]
 ) -> FloatArray:
-    """Return the value of column j at which the pooled distribution function is Phi(u), (n,).
+    """Return the value of column j at which the pooled distribution function is Phi(u), (n,); each row stops by itself.
 
-    It lies between the quantiles of the parts. Regula falsi on the quantile scale in the variant of Illinois (Dowell
-    and Jarratt, "A modified regula falsi method", 1971), with a bisection in every third step; each row stops by
-    itself.
+    Positive u are solved in the mirror image, as those of one mixture are (`RootBracket`).
     """
-    pairs = zip(parts, conditionals, strict=True)
-    quantiles = np.stack([part.quantile(j, x, conditional, u) for part, conditional in pairs])
-    errors = _Errors.start(j, x, u, parts, conditionals)
-    left, right = quantiles.min(axis=0), quantiles.max(axis=0)
-    error_left, error_right = np.minimum(errors.at(left), 0.0), np.maximum(errors.at(right), 0.0)
-    found = np.where(-error_left < error_right, left, right)
-    done = errors.are_small(np.minimum(-error_left, error_right)) | _is_narrow(left, right)
-    was_low, running = np.zeros(len(u), dtype=bool), np.arange(len(u))
-    for step in range(SEARCH_STEPS):
-        if done.any():  # what is done is left out: most rows need half of the steps of the last one
-            keep = np.flatnonzero(~done)
-            running, errors = running[keep], errors.take(keep)
-            left, right, error_left, error_right = (each[keep] for each in (left, right, error_left, error_right))
-            was_low = was_low[keep]
-        if not running.size:
+    sign = np.where(u > 0, -1.0, 1.0)
+    pool = _PooledTail.of(j, x, u, parts, conditionals)
+    low, high = parts[0].ends(j)
+    left, right = np.where(u > 0, -high, low), np.where(u > 0, -low, high)
+    search = RootBracket(-np.abs(u), np.clip(sign * pool.guess(), left, right), left, right, right - left)
+    found, rows = sign * search.x, np.arange(len(u))
+    for _ in range(MAX_ITERATIONS):
+        search, done = search.advance(*pool.log_cdf_and_density(sign[rows] * search.x))
+        found[rows] = sign[rows] * search.x
+        keep = np.flatnonzero(~done)
+        if keep.size == 0:
             break
-        with np.errstate(all="ignore"):
-            secant = right - error_right * (right - left) / (error_right - error_left)
-        inside = np.isfinite(secant) & (secant > left) & (secant < right)
-        value = np.where(inside & (step % 3 != 2), secant, left + 0.5 * (right - left))
-        error = errors.at(value)
-        found[running] = value
-        low_side = error <= 0
-        # Illinois: an end that stays a second time counts half, so that the next step passes the root.
-        again = low_side == was_low if step else np.zeros_like(low_side)
-        factor, was_low = np.where(again, 0.5, 1.0), low_side
-        error_right = np.where(low_side, factor * error_right, error)
-        error_left = np.where(low_side, error, factor * error_left)
-        left, right = np.where(low_side, value, left), np.where(low_side, right, value)
-        done = errors.are_small(np.abs(error)) | _is_narrow(left, right)
+        if keep.size < len(rows):
+            rows, search, pool = rows[keep], search.take(keep), pool.take(keep)
     return np.asarray(found)
 
 
@@ -315,20 +302,28 @@ class _Tail(NamedTuple):
 
     @classmethod
     def of(cls, part: _Part, conditional: TruncatedConditional, j: int, u: FloatArray, log_total: FloatArray) -> _Tail:
-        """Return the tail of a part; what does not depend on the value of column j is computed once."""
+        """Return the tail of a part with a first guess; what does not depend on column j is computed once."""
         coordinates = part.conditionals.coordinates
         mirrored = coordinates.sign(j) * u > 0
         mirror = conditional.mirror(mirrored)
-        mass = log_sum(mirror.log_weights + mirror.log_mass())
-        search = TailSearch.start(mirror, mass, u, u)
+        score = mirror.log_weights + mirror.log_mass()
+        below = -np.abs(u)
+        search = TailSearch.start(mirror, log_sum(score), below, guess_quantile(mirror, below, score))
         low, high = (np.broadcast_to(end, len(u)) for end in (conditional.low, conditional.high))
         return cls(coordinates, part.log_weight - log_total, mirrored, low, high, search)
 
-    def log_share(self, j: int, x: FloatArray) -> FloatArray:
-        """Return the logarithm of the part's weight times its mass in the tail up to column j of x (n, d), (n,)."""
+    def guess(self, j: int, x: FloatArray) -> FloatArray:
+        """Return the part's own guess of column j for rows x (n, d), (n,)."""
+        y = np.where(self.mirrored, -self.search.x, self.search.x)
+        return self.coordinates.value(j, move_inside(y, self.low, self.high), x)
+
+    def log_cdf_and_density(self, j: int, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return logarithms at column j of x (n, d): the part's weight times its mass in the tail, and its density."""
         y = move_inside(self.coordinates.coordinate(j, x), self.low, self.high)
-        log_cdf = self.search.log_cdf(np.where(self.mirrored, -y, y))
-        return self.log_weight + np.minimum(log_cdf - self.search.mass, 0.0)
+        log_cdf, log_density = self.search._replace(x=np.where(self.mirrored, -y, y)).log_cdf_and_density()
+        tail = np.minimum(log_cdf - self.search.mass, 0.0)
+        slope = self.coordinates.log_slope(j, x)
+        return self.log_weight + tail, self.log_weight + log_density - self.search.mass + slope
 
     def take(self, rows: NDArray[np.intp]) -> _Tail:
         """Return those of some rows."""
@@ -342,42 +337,34 @@ class _Tail(NamedTuple):
         )
 
 
-class _Errors(NamedTuple):
-    """Errors of guesses of the value of column j, on the quantile scale; row by row."""
+class _PooledTail(NamedTuple):
+    """The distribution function of column j of the pool, read from the tail in which the root is; row by row."""
 
     j: int
     x: FloatArray
     """With the columns before j, shape (n, d); column j is written over."""
-    u: FloatArray
-    """What is wanted on the quantile scale, shape (n,)."""
     tails: list[_Tail]
 
     @classmethod
-    def start(
+    def of(
         cls, j: int, x: FloatArray, u: FloatArray, parts: Sequence[_Part], conditionals: Sequence[TruncatedConditional]
-    ) -> _Errors:
-        """Return the errors of all rows."""
+    ) -> _PooledTail:
+        """Return the tails of all parts, for all rows."""
         log_total = log_sum(np.stack([part.log_weight for part in parts]))
         pairs = zip(parts, conditionals, strict=True)
-        return cls(j, x.copy(), u, [_Tail.of(part, conditional, j, u, log_total) for part, conditional in pairs])
+        return cls(j, x.copy(), [_Tail.of(part, conditional, j, u, log_total) for part, conditional in pairs])
 
-    def at(self, values: FloatArray) -> FloatArray:
-        """Return the errors of values (n,)."""
+    def guess(self) -> FloatArray:
+        """Return the mean of the parts' guesses of the root by their weights, (n,)."""
+        return sum_components(np.stack([np.exp(each.log_weight) * each.guess(self.j, self.x) for each in self.tails]))
+
+    def log_cdf_and_density(self, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the logarithms of the mass in the tail up to values (n,), and of the density there."""
         self.x[:, self.j] = values
-        tail = log_sum(np.stack([each.log_share(self.j, self.x) for each in self.tails]))
-        return np.where(self.u > 0, -1.0, 1.0) * ndtri_exp(np.minimum(tail, 0.0)) - self.u
+        pairs = [each.log_cdf_and_density(self.j, self.x) for each in self.tails]
+        log_cdf, log_density = (log_sum(np.stack(each)) for each in zip(*pairs, strict=True))
+        return np.minimum(log_cdf, 0.0), log_density
 
-    def are_small(self, error: FloatArray) -> NDArray[np.bool_]:
-        """Return whether errors (n,) of either sign are within the tolerance."""
-        small: NDArray[np.bool_] = error <= ROOT_TOLERANCE * (1.0 + np.abs(self.u))
-        return small
-
-    def take(self, rows: NDArray[np.intp]) -> _Errors:
+    def take(self, rows: NDArray[np.intp]) -> _PooledTail:
         """Return those of some rows."""
-        return _Errors(self.j, self.x[rows], self.u[rows], [each.take(rows) for each in self.tails])
-
-
-def _is_narrow(left: FloatArray, right: FloatArray) -> NDArray[np.bool_]:
-    """Return whether no float is left between the ends of brackets, (n,)."""
-    narrow: NDArray[np.bool_] = right - left <= 2.0 * np.spacing(np.abs(left))
-    return narrow
+        return _PooledTail(self.j, self.x[rows], [each.take(rows) for each in self.tails])

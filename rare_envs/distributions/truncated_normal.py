@@ -82,7 +82,7 @@ def _solve_lower_tail(conditional: TruncatedConditional, u: FloatArray) -> Float
     """
     score = conditional.log_weights + conditional.log_mass()
     mass = log_sum(score)
-    root = _first_guess(conditional, u, score)
+    root = guess_quantile(conditional, u, score)
     rows = np.arange(len(u))
     search = TailSearch.start(conditional, mass, u, root)
     for _ in range(MAX_ITERATIONS):
@@ -96,7 +96,7 @@ def _solve_lower_tail(conditional: TruncatedConditional, u: FloatArray) -> Float
     return root
 
 
-def _first_guess(conditional: TruncatedConditional, u: FloatArray, score: FloatArray) -> FloatArray:
+def guess_quantile(conditional: TruncatedConditional, u: FloatArray, score: FloatArray) -> FloatArray:
     """Return the quantile of the truncated normal with the moments of the mixture; exact for K = 1.
 
     Args:
@@ -160,13 +160,36 @@ class TailSearch(NamedTuple):
     def advance(self) -> tuple[TailSearch, NDArray[np.bool_]]:
         """Return the search after one step of every row, and which rows have converged."""
         log_cdf, log_density = self.log_cdf_and_density()
-        tail = np.minimum(log_cdf - self.mass, 0.0)
+        bracket = RootBracket(self.u, self.x, self.left, self.right, self.step)
+        bracket, done = bracket.advance(np.minimum(log_cdf - self.mass, 0.0), log_density - self.mass)
+        return self._replace(x=bracket.x, left=bracket.left, right=bracket.right, step=bracket.step), done
+
+
+class RootBracket(NamedTuple):
+    """Guesses of quantiles with the brackets that they lie in; row by row, (n,) each."""
+
+    u: FloatArray
+    """What is wanted on the quantile scale."""
+    x: FloatArray
+    left: FloatArray
+    right: FloatArray
+    step: FloatArray
+    """Size of the last step."""
+
+    def advance(self, tail: FloatArray, log_density: FloatArray) -> tuple[RootBracket, NDArray[np.bool_]]:
+        """Return the search after one step of every row, and which rows have converged.
+
+        Newton's method on the quantile scale, else on the mass scale, else bisection.
+
+        Args:
+            tail: Logarithm of the distribution function at x, (n,).
+            log_density: At x, (n,).
+        """
         with np.errstate(all="ignore"):  # the ends of the box give inf and nan: bisected below
             quantile = ndtri_exp(tail)
             error = quantile - self.u
-            log_slope = log_density - self.mass + 0.5 * quantile**2 + LOG_SQRT_2PI
-            newton = -error * np.exp(-log_slope)
-            by_mass = np.expm1(log_ndtr(self.u) - tail) * np.exp(log_cdf - log_density)
+            newton = -error * np.exp(-(log_density + 0.5 * quantile**2 + LOG_SQRT_2PI))
+            by_mass = np.expm1(log_ndtr(self.u) - tail) * np.exp(tail - log_density)
         left = np.where(error <= 0, self.x, self.left)
         right = np.where(error > 0, self.x, self.right)
         fits = self._fits(newton, left, right)
@@ -176,7 +199,11 @@ class TailSearch(NamedTuple):
         x = np.where(fits, self.x + move, middle)
         done = fits & (np.abs(error) <= ROOT_TOLERANCE * (1.0 + np.abs(self.u)))
         done |= (right - left <= 2.0 * np.spacing(np.abs(self.x))) | (x == self.x)
-        return self._replace(x=x, left=left, right=right, step=np.abs(x - self.x)), done
+        return RootBracket(self.u, x, left, right, np.abs(x - self.x)), done
+
+    def take(self, rows: NDArray[np.intp]) -> RootBracket:
+        """Return those of some rows."""
+        return RootBracket(*(array[rows] for array in self))
 
     def _fits(self, move: FloatArray, left: FloatArray, right: FloatArray) -> NDArray[np.bool_]:
         """Return whether a step stays in the bracket and shrinks; where not, bisection is faster."""

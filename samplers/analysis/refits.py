@@ -84,6 +84,14 @@ class HasEnsemble(Protocol):
 
 
 @runtime_checkable
+class HasCoveringEnsemble(HasEnsemble, Protocol):
+    """A fitted base distribution of many refits, of which a few reach where failures under any of them lie."""
+
+    def covering_ensemble(self) -> Distribution:
+        """Return the mixture of these few, to simulate under; the rest as of `ensemble`."""
+
+
+@runtime_checkable
 class HasParts(Protocol):
     """A problem whose failures have parts, each with a probability of its own that is wanted under the refits."""
 
@@ -290,6 +298,15 @@ def are_uncovered(sums: RefitSums) -> bool:
 def count_uncovered(ess: Iterable[float]) -> int:
     """Return how many refits rest on under 10 effective failing points."""
     return sum(each < MIN_REFIT_ESS for each in ess)
+
+
+def pool_refits(base: HasEnsemble) -> Distribution:
+    """Return the mixture of refits that a further run simulates under.
+
+    Raises:
+        ValueError: The refits are of a kind that the base cannot mix.
+    """
+    return base.covering_ensemble() if isinstance(base, HasCoveringEnsemble) else base.ensemble()
 
 
 def needs_ensemble_run(estimate: WeightedEstimate, split: Callable[[FloatArray], FloatArray] | None = None) -> bool:

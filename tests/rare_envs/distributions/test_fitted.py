@@ -103,6 +103,19 @@ def test_the_ensemble_is_the_mean_of_the_refits() -> None:
     assert np.abs(ensemble.to_standard_normal(ensemble.from_standard_normal(u)) - u).max() < 1e-8
 
 
+def test_a_covering_ensemble_has_at_most_30_refits_the_first_and_the_last_among_them() -> None:
+    means = np.linspace(-1.0, 1.0, 100)
+    refits = tuple(TruncatedGaussianMixture([1.0], [[m]], [[[1.0]]], [-9.0], [9.0]) for m in means)
+    base = FittedDistribution(distribution=refits[0], refits=refits, events=COUNTS, family="1 component")
+    pool = base.covering_ensemble()
+    assert isinstance(pool, CoordinateMixture)
+    assert len(pool.weights) == 30
+    assert (pool.means.min(), pool.means.max()) == (-1.0, 1.0)
+    few = replace(base, refits=refits[:3])
+    x = few.sample(5, np.random.default_rng(0))
+    assert (few.covering_ensemble().log_prob(x) == few.ensemble().log_prob(x)).all()
+
+
 def test_an_ensemble_of_plain_mixtures_or_of_nothing() -> None:
     fit, refit = (TruncatedGaussianMixture([1.0], [[m]], [[[1.0]]], [-9.0], [9.0]) for m in (0.0, 2.0))
     base = FittedDistribution(distribution=fit, refits=(fit, refit), events=COUNTS, family="1 component")

@@ -7,6 +7,7 @@ from scipy import special, stats
 
 from rare_envs.distributions.truncated_normal import (
     NARROW,
+    RootBracket,
     TruncatedConditional,
     choose,
     log_interval,
@@ -229,3 +230,16 @@ def test_a_sum_over_components_does_not_depend_on_how_many_columns_there_are() -
     whole = sum_components(values)
     np.testing.assert_allclose(whole, values.sum(axis=0), atol=1e-12)
     assert all(sum_components(values[:, j : j + 1])[0] == whole[j] for j in range(300))
+
+
+def test_a_quantile_is_found_from_anywhere_in_its_bracket() -> None:
+    """Of the exponential distribution: the mass scale helps where the quantile scale leads out of the bracket."""
+    u = np.array([-6.0, -1.0, 0.0, 1.5])
+    start = np.array([19.0, 1e-3, 10.0, 1e-6])
+    search = RootBracket(u, start, np.zeros(4), np.full(4, 20.0), np.full(4, 20.0))
+    for _ in range(60):
+        search, done = search.advance(np.log(-np.expm1(-search.x)), -search.x)
+        if done.all():
+            break
+    np.testing.assert_allclose(search.x, stats.expon.ppf(stats.norm.cdf(u)), rtol=1e-8)
+    assert (search.take(np.array([2])).x == search.x[2]).all()

@@ -12,6 +12,7 @@ from samplers.analysis.refits import (
     check_refits,
     find_fitted_base,
     needs_ensemble_run,
+    pool_refits,
     refit_log_ratios,
     reweight_to_refits,
 )
@@ -105,6 +106,15 @@ def test_the_decision_needs_points_and_an_ensemble():
     assert not needs_ensemble_run(run(samplers.StandardNormal(2)))
     nothing_failed = samplers.estimate(HalfSpace(fitted(far, FittedWithEnsemble), 9.0), "mc", seed=1, max_sim=100)
     assert not needs_ensemble_run(nothing_failed)
+
+
+def test_a_further_run_takes_the_mixture_that_a_base_of_many_refits_has_for_it():
+    class FewOfMany(FittedWithEnsemble):
+        def covering_ensemble(self):
+            return replace(self, refits=self.refits[:2]).ensemble()
+
+    few, all_of_them = (fitted(resampled(40, 5), kind) for kind in (FewOfMany, FittedWithEnsemble))
+    assert [len(pool_refits(base).means) for base in (few, all_of_them)] == [2, 5]
 
 
 def test_a_part_that_the_points_do_not_reach_asks_for_a_further_run():
