@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from gymnasium import spaces
 from numpy.typing import NDArray
 
 from rare_envs.control.idm import IDM
@@ -20,10 +19,12 @@ from rare_envs.egos.loading import load_named_ego
 from rare_envs.egos.needs import resolve
 from rare_envs.egos.policy import PolicyDriver, as_driver
 from rare_envs.egos.sb3.dense_networks import read_dense_policy
+from rare_envs.egos.spaces.choice import choose_action, choose_observation, takes_indices
 from rare_envs.egos.wrappers import find_action_bounds
 from rare_envs.make import set_up
 from rare_envs.scenarios.registry import find_scenario, split_layout
 from rare_envs.search_terms import EpisodeTerms, simulate_terms
+from rare_envs.sensors.kinds import read_kinds
 from rare_envs.simulation.compiled.selection import (
     CompiledEgo,
     CompiledRollout,
@@ -59,7 +60,11 @@ AMBIGUOUS = (
     "action='meta' (--action meta)"
 )
 """HighwayEnv's meta-actions and our discrete ones are both numbers from 0 to 4, and their spaces are equal."""
-
+TAKEN_AS_ACCELERATIONS = (
+    "the ego's actions 0 to 4 were taken as five accelerations; --action discrete says so without this note, and one "
+    "that was trained with action='meta' needs --action meta"
+)
+"""Likewise for policies without HighwayEnv's observation, which rarely have its actions."""
 
 RESCALED = (
     "the ego's actions, between {low} and {high}, are mapped to [-1, 1] as RescaleAction does; if they are in units of "
@@ -138,7 +143,8 @@ class DrivingProblem:
             ValueError: If an argument is invalid or the ego's spaces are not the environment's.
         """
         env_id, layout = split_layout(env_id)
-        make_kwargs = {**layout, **make_kwargs}
+        named = {name: value for name, value in make_kwargs.items() if value is not None or name not in layout}
+        make_kwargs = {**layout, **named}
         self.env_id = env_id
         self.ego = ego
         ego = load_named_ego(ego)
@@ -148,7 +154,10 @@ class DrivingProblem:
         scenario = find_scenario(env_id)
         with _ego_errors_as_value_errors(ego):
             self.needs = resolve(ego, scenario.vehicles)
-        make_kwargs["observation"] = make_kwargs.get("observation") or self.needs.observation
+        make_kwargs["observation"] = make_kwargs.get("observation") or choose_observation(self.needs, scenario.vehicles)
+        make_kwargs["action"] = make_kwargs.get("action") or choose_action(
+            self.needs.action_space, read_kinds(make_kwargs["observation"])
+        )
         self.world, self.space = set_up(scenario, self.needs, measure=measure, base=base, noise=noise, **make_kwargs)
         with _ego_errors_as_value_errors(ego):
             self.driver = as_driver(ego, self.world, self.needs)
@@ -156,7 +165,8 @@ class DrivingProblem:
         self._core = core
         self._compiled = self._find_compiled()
         for note in self.notes:
-            warnings.warn(note, AmbiguousActions, stacklevel=2)
+            if note != TAKEN_AS_ACCELERATIONS:
+                warnings.warn(note, AmbiguousActions, stacklevel=2)
 
     def __setattr__(self, name: str, value: Any) -> None:
         """Set an attribute; another world or driver has another compiled rollout, or none, and other gradients."""
@@ -233,10 +243,11 @@ class DrivingProblem:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Ambiguities that cannot be checked; each was also given as an `AmbiguousActions` warning."""
+        """Ambiguities that cannot be checked; the grave ones were also given as an `AmbiguousActions` warning."""
         continuous = self.world.clock.action == "continuous" and self.needs.queries_policy
-        indices = isinstance(self.needs.action_space, spaces.Discrete)
-        found = [AMBIGUOUS] if continuous and indices and "kinematics" in self.world.sensing.kinds else []
+        found = []
+        if continuous and takes_indices(self.needs.action_space):
+            found.append(AMBIGUOUS if "kinematics" in self.world.sensing.kinds else TAKEN_AS_ACCELERATIONS)
         bounds = find_action_bounds(self.needs.action_space) if continuous else None
         if bounds is not None:
             found.append(RESCALED.format(low=bounds[0].tolist(), high=bounds[1].tolist()))

@@ -6,15 +6,12 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, Protocol, runtime_checkable
 
-from gymnasium import spaces
-
 from rare_envs.control.idm import IDM
 from rare_envs.egos.human import HumanEgo
 from rare_envs.egos.plain_callables import wrap_callable
+from rare_envs.egos.spaces.choice import find_fitting_kinds
 from rare_envs.egos.validation import is_policy
-from rare_envs.sensors.kinds import OBSERVATIONS, read_kinds
 from rare_envs.simulation.ego_interface import EgoNeeds
-from rare_envs.simulation.observation import observation_space
 from rare_envs.simulation.rollout import Driver
 from rare_envs.simulation.world import World
 
@@ -75,10 +72,10 @@ def resolve(ego: Any, vehicles: int = 1) -> EgoNeeds:
     Args:
         ego: "idm", "human", a `Driver`, an object with `predict`, a `WorldEgo`, or a function or torch module from
             observations to actions.
-        vehicles: Of the scenario, which tell the features' space from that of the lidar.
+        vehicles: Of the scenario, whose features have a space for each number of them.
 
     Example:
-        >>> from gymnasium import spaces
+        >>> from rare_envs.simulation.observation import observation_space
         >>> class Policy:
         ...     observation_space = observation_space(1, "lidar")
         ...     deterministic = False
@@ -91,36 +88,31 @@ def resolve(ego: Any, vehicles: int = 1) -> EgoNeeds:
     if isinstance(ego, WrappedEgo):
         inner = resolve(ego.ego, vehicles)
         return EgoNeeds(
-            inner.observation, inner.lidar, inner.dt, inner.action_space, inner.queries_policy, inner.varies, noise=ego
+            inner.observations,
+            inner.lidar,
+            inner.dt,
+            inner.action_space,
+            inner.queries_policy,
+            inner.varies,
+            ego,
+            inner.observation_space,
         )
     if isinstance(ego, WorldEgo):
         return EgoNeeds(noise=ego)
     # The ego may be anybody's object, such as a Stable-Baselines3 model: it may declare these or not.
     lidar = isinstance(ego, PerceivingDriver) and ego.needs_lidar
+    observed = getattr(ego, "observation_space", None)
     return EgoNeeds(
-        observation=observation_for(ego, vehicles),
+        observations=EgoNeeds.observations if observed is None else find_fitting_kinds(observed, vehicles),
         lidar=lidar,
         dt=getattr(ego, "dt", None),
         action_space=getattr(ego, "action_space", None),
         queries_policy=is_policy(ego) and not lidar,
         varies=getattr(ego, "deterministic", None) is False,
+        observation_space=observed,
     )
 
 
 def find_rule_based(ego: Any) -> Any:
     """Return the driver that "idm" or "human" names, a policy for a plain function, and any other ego as it is."""
     return RULE_BASED_EGOS.get(ego, ego) if isinstance(ego, str) else wrap_callable(ego)
-
-
-def observation_for(ego: Any, vehicles: int = 1) -> str:
-    """Return what to show an ego where nobody says: what its space tells, else "features".
-
-    Args:
-        ego: A `Dict` names the kinds, such as "camera+speed"; the space of "lidar" is known by its shape.
-        vehicles: Of the scenario, whose features may have that shape too.
-    """
-    space = getattr(ego, "observation_space", None)  # anybody's object
-    if space == observation_space(vehicles, "lidar") != observation_space(vehicles, "features"):
-        return "lidar"
-    names = set(space.spaces) if isinstance(space, spaces.Dict) else set[str]()
-    return read_kinds(sorted(names)) if names and names <= set(OBSERVATIONS) else "features"

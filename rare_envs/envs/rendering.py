@@ -1,17 +1,15 @@
 """Pictures of episodes: roads and vehicles by HighwayEnv's own graphics, numbers above, a legend below."""
 
 from collections.abc import Collection
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
+from rare_envs.envs.highway_env_objects import find_crashed, make_traffic, world_places, world_point
 from rare_envs.scenarios.base import Scenario
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.world import World
-from rare_envs.traffic.overlap import pairwise_overlaps
 from rare_envs.traffic.palette import CRASH_COLOUR, ROLE_COLOURS, as_rgb
 from rare_envs.traffic.road import Road
 from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
@@ -24,10 +22,6 @@ _SCALING = 8.0
 """Pixels per metre."""
 _MARGIN = 4.0
 """Shown beside the road [m] at least."""
-_SEGMENT = 6 * 4.33
-"""A curve is drawn as straight pieces this long [m]: six stripes of HighwayEnv's."""
-_AHEAD, _BEHIND = 4, 2
-"""Pieces drawn ahead of the ego's and behind it."""
 
 Colour = tuple[int, int, int]
 AGENT: Colour = (200, 0, 150)
@@ -111,7 +105,7 @@ class Renderer:
         """
         state = State(*(field[row : row + 1] for field in episode.state))
         if crashed is None:
-            crashed = _find_crashed(state, self._road) if bool(episode.collided[row]) else ()
+            crashed = find_crashed(state, self._road) if bool(episode.collided[row]) else ()
         roles = self._assign_roles(agents, crashed)
         self._draw_road(state, roles)
         self._canvas.fill(_PAPER)
@@ -132,17 +126,11 @@ class Renderer:
 
     def _draw_road(self, state: State, roles: Roles) -> None:
         from highway_env.road.graphics import RoadGraphics
-        from highway_env.road.road import Road as Traffic
-        from highway_env.vehicle.kinematics import Vehicle
 
-        ego_x = float(state.x[0, 0])
-        traffic = Traffic(_network(self._road, ego_x))
-        places = torch.stack(self._road.to_world(state.x[0], state.y[0], state.heading[0]), dim=1).tolist()
-        for j, (x, y, heading) in enumerate(places):
-            vehicle = Vehicle(traffic, [x, y], heading, float(state.speed[0, j]))
-            vehicle.color = as_rgb(ROLE_COLOURS[roles.names[j]])
-            traffic.vehicles.append(vehicle)
-        self._surface.move_display_window_to(_point(self._road, ego_x, self._road.middle))
+        traffic, places = make_traffic(state, self._road), world_places(state, self._road)
+        for vehicle, name in zip(traffic.vehicles, roles.names, strict=True):
+            vehicle.color = as_rgb(ROLE_COLOURS[name])
+        self._surface.move_display_window_to(world_point(self._road, float(state.x[0, 0]), self._road.middle))
         RoadGraphics.display(traffic, self._surface)
         RoadGraphics.display_traffic(traffic, self._surface, offscreen=True)
         outlines = [(j, AGENT) for j in roles.agents] + [(j, as_rgb(CRASH_COLOUR)) for j in sorted(roles.crashed)]
@@ -190,39 +178,9 @@ def caption(world: World, episode: Episode, time: float | None, row: int = 0) ->
     return "    ".join(parts)
 
 
-def _find_crashed(state: State, road: Road) -> set[int]:
-    """Return the ego and the vehicles that it touches."""
-    return {0, *pairwise_overlaps(state, road)[0, 0].nonzero().flatten().tolist()}
-
-
 def _corners(x: float, y: float, heading: float) -> list[tuple[float, float]]:
     """Return the corners of a vehicle in the world [m]."""
     along, across = VEHICLE_LENGTH / 2, VEHICLE_WIDTH / 2
     cos, sin = np.cos(heading), np.sin(heading)
     box = ((along, across), (along, -across), (-along, -across), (-along, across))
     return [(x + a * cos - b * sin, y + a * sin + b * cos) for a, b in box]
-
-
-def _network(road: Road, x: float) -> Any:
-    """Return HighwayEnv's road network of the lanes around x [m]."""
-    from highway_env.road.lane import LineType, StraightLane
-    from highway_env.road.road import RoadNetwork
-
-    here = x // _SEGMENT
-    cuts = [-1e3, 9e3] if road.reference_line is None else [_SEGMENT * (here + k) for k in range(-_BEHIND, _AHEAD + 2)]
-    network = RoadNetwork()
-    for lane in range(road.lanes):
-        y, width = road.centre(lane), road.edges[lane + 1] - road.edges[lane]
-        left = LineType.CONTINUOUS_LINE if lane == 0 else LineType.STRIPED
-        right = LineType.CONTINUOUS_LINE if lane == road.lanes - 1 else LineType.NONE
-        for start, end in pairwise(cuts):
-            piece = StraightLane(_point(road, start, y), _point(road, end, y), width, [left, right])
-            network.add_lane("0", "1", piece)
-    return network
-
-
-def _point(road: Road, x: float, y: float) -> NDArray[np.float64]:
-    """Return world coordinates [m], shape (2,), of a point of the road."""
-    zero = torch.zeros((), dtype=torch.float64)
-    world_x, world_y, _ = road.to_world(zero + x, zero + y, zero)
-    return np.array([float(world_x), float(world_y)])

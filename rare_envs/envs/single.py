@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from rare_envs.control.actions import read_actions
 from rare_envs.envs.display import RENDER_MODES, Display
+from rare_envs.envs.highway_env_interface import HighwayEnvInterface
 from rare_envs.envs.info import SingleObservation, episode_info, step_info
 from rare_envs.make import set_up
 from rare_envs.sensors.kinds import map_kinds
@@ -17,7 +18,7 @@ from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.observation import observe
 
 
-class DrivingEnv(gym.Env[SingleObservation, Any]):
+class DrivingEnv(HighwayEnvInterface, gym.Env[SingleObservation, Any]):
     """Environment of the ego; everything else follows the scenario.
 
     Observation: `features`, see `rare_envs.simulation.observation`. Action: acceleration and steering in [-1, 1], see
@@ -25,7 +26,8 @@ class DrivingEnv(gym.Env[SingleObservation, Any]):
     `rare_envs.control.meta_actions`, for one second. Reward: see `rare_envs.simulation.reward`. The episode terminates
     with a collision and is truncated at the horizon. `info` carries `scenario`, `x`, `min_ttc` [s], `collision`,
     `crashed` (the same), `speed` [m/s] and `reward_terms`, and at the end `measure` (f(x)), `collision_type` and
-    `crash`, which say who ran into whom and how hard (`rare_envs.traffic.crash`), or None.
+    `crash`, which say who ran into whom and how hard (`rare_envs.traffic.crash`), or None. Code for HighwayEnv reads
+    `config`, `road`, `vehicle` and `action_type`, see `rare_envs.envs.highway_env_interface`.
 
     Example:
         >>> import gymnasium
@@ -78,7 +80,8 @@ class DrivingEnv(gym.Env[SingleObservation, Any]):
         Args:
             seed: Seeds the draw of the scenario.
             options: Scenario parameters by name, or {"x": vector} for all of them. What is not given is drawn: a
-                whole x comes from the base distribution, then the given parameters replace theirs.
+                whole x comes from the base distribution, then the given parameters replace theirs. "config" is taken
+                as `configure` takes it.
 
         Returns:
             Observation and info.
@@ -87,6 +90,9 @@ class DrivingEnv(gym.Env[SingleObservation, Any]):
             ValueError: If an option is unknown, of the wrong shape, NaN or outside its range.
         """
         super().reset(seed=seed)
+        if options and "config" in options:
+            self.configure(options["config"])
+            options = {name: value for name, value in options.items() if name != "config"}
         self._x = self.space.scenario_x(options, 1, self.np_random)[0]
         self._tick = 0
         with torch.inference_mode():

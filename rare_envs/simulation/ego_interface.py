@@ -24,8 +24,9 @@ class EgoNeeds:
         'features'
     """
 
-    observation: str = "features"
-    """Kinds of observation that it takes, as `rare_envs.sensors.kinds.read_kinds` writes them."""
+    observations: tuple[str, ...] = ("features",)
+    """Kinds of observation that its space fits, each as `rare_envs.sensors.kinds.read_kinds` writes it; one where it
+    declares none."""
     lidar: bool = False
     """Whether it reads `Episode.perception` by itself, whatever is observed."""
     dt: float | None = None
@@ -38,6 +39,13 @@ class EgoNeeds:
     """Whether it says that its answers differ from run to run, by randomness that is not part of x."""
     noise: NoiseSource | None = None
     """Its part that has noise in x; None without one."""
+    observation_space: Any = None
+    """The space of its observations, as it declares it; None if it does not."""
+
+    @property
+    def observation(self) -> str:
+        """The first kind of observation that fits, "features" if none does."""
+        return self.observations[0] if self.observations else "features"
 
     def noise_columns(self, world: World) -> int:
         """Return how many columns of x are its own noise, the last ones."""

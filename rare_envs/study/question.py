@@ -51,8 +51,8 @@ class Question:
         drivers: Of the vehicles around the ego: the name of installed ones or a file; the scenario's default when None.
         horizon: Length of an episode [s]; the scenario's when None.
         observation: Observation of the ego: "features", "lidar", "kinematics", "camera" or "speed"; several joined by
-            "+"; None for the one that it declares, else "features".
-        action: Actions of a policy: "continuous" or "meta".
+            "+"; None for the one that its space fits, "features" where it declares none.
+        action: Actions of a policy: "continuous", "discrete" or "meta"; None for those that its space fits.
         collisions: Which collisions count: those of the "ego", or "any", those between two other vehicles too.
         weather: Whether weather and the camera's noise are parameters.
         ensemble: Whether the base distribution is the mixture of the refits of `base`: what these predict for the next
@@ -95,7 +95,7 @@ class Question:
     drivers: str | None = None
     horizon: float | None = None
     observation: str | None = None
-    action: str = "continuous"
+    action: str | None = None
     on_error: str = RunArguments.on_error
     collisions: str = "ego"
     weather: bool = False
@@ -115,7 +115,7 @@ class Question:
         if layout:
             object.__setattr__(self, "env_id", env_id)
             object.__setattr__(self, "observation", self.observation or layout["observation"])
-            object.__setattr__(self, "action", layout["action"])
+            object.__setattr__(self, "action", self.action or layout["action"])
 
     @property
     def run_arguments(self) -> RunArguments:
@@ -261,9 +261,8 @@ def prepare(question: Question, ego: Any = None) -> Study:
         if ego is None:
             ego = agents.load_ego(question.ego, algo=question.algo, trust=question.trust, stats=question.stats)
         problem = build_problem(question, ego)
-        study = Study(
-            replace(question, observation=problem.world.sensing.observation, core=problem.core), problem, method
-        )
+        observation, action = problem.world.sensing.observation, problem.world.clock.action
+        study = Study(replace(question, observation=observation, action=action, core=problem.core), problem, method)
         names = [name.strip() for name in (question.also_under or "").split(",") if name.strip()]
         if question.also_under is not None and (not names or len(set(names)) < len(names)):
             raise ValueError(

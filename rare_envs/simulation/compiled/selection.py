@@ -123,7 +123,7 @@ def _find_policy_obstacle(world: World, policy: DensePolicy) -> str:
     """Return why the torch simulation is needed with a policy as ego; empty if it is not."""
     if world.sensing.observation != "features":
         return f"the observation {world.sensing.observation!r} is not compiled"
-    if world.clock.action != "continuous":
+    if world.clock.action == "meta":
         return f"the action {world.clock.action!r} is not compiled"
     obstacle = policy.describe_obstacle(len(EGO_FEATURES) + len(OTHER_FEATURES) * (world.scenario.vehicles - 1))
     return f"{obstacle} is not compiled" if obstacle else ""

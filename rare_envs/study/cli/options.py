@@ -80,11 +80,15 @@ ObservationOption = Annotated[
     str | None,
     typer.Option(
         help="Observation of the ego: features, lidar, kinematics, camera, speed, or camera+lidar; by default the "
-        "one that the ego declares, else features.",
+        "one that the ego's space fits.",
     ),
 ]
 ActionOption = Annotated[
-    str, typer.Option(help="Actions of the ego: continuous or discrete, each tick, or HighwayEnv's meta, each second.")
+    str | None,
+    typer.Option(
+        help="Actions of the ego: continuous or discrete, each tick, or HighwayEnv's meta, each second; by default "
+        "those that its space fits."
+    ),
 ]
 EnsembleRunOption = Annotated[
     bool,
@@ -104,7 +108,7 @@ class ScenarioOptions:
         str | None, typer.Option(help="Of the vehicles around the ego: mgail, gail, bc, idm, idm+mobil or a file.")
     ] = None
     observation: ObservationOption = None
-    action: ActionOption = "continuous"
+    action: ActionOption = None
     horizon: Annotated[float | None, typer.Option(help="Length of an episode in seconds.")] = None
 
     def arguments(self) -> dict[str, Any]:
@@ -216,7 +220,7 @@ class RiskOptions:
     stats: StatsOption = None
     trust: TrustOption = False
     observation: ObservationOption = None
-    action: ActionOption = "continuous"
+    action: ActionOption = None
 
     def arguments(self) -> dict[str, Any]:
         """Return the options as keyword arguments of `rare_envs.risk`.

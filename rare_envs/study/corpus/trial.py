@@ -31,15 +31,15 @@ class EgoChoice:
     """An ego as options name it, and its interface.
 
     Example:
-        >>> EgoChoice(ego="ppo.zip", observation="lidar").action
-        'continuous'
+        >>> EgoChoice(ego="ppo.zip", observation="lidar")
+        EgoChoice(ego='ppo.zip', algo=None, stats=None, observation='lidar', action=None)
     """
 
     ego: str
     algo: str | None = None
     stats: str | None = None
     observation: str | None = None
-    action: str = "continuous"
+    action: str | None = None
 
 
 @dataclass(frozen=True)

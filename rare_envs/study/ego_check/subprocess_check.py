@@ -38,7 +38,7 @@ class EgoCheckRequest:
         algo: Algorithm of a `.zip`, if the file does not tell.
         trust: As for `agents.load_ego`.
         observation: Observation of the ego; None for the one that it declares.
-        action: Kind of its actions.
+        action: Kind of its actions; None for the one that it fits.
         time_limit: Duration that one check may take [s].
         base: Base distribution of the scenarios that it drives; the environment's default when None.
         drivers: Of the vehicles around it; the environment's default when None.
@@ -55,7 +55,7 @@ class EgoCheckRequest:
     algo: str | None = None
     trust: bool = False
     observation: str | None = None
-    action: str = "continuous"
+    action: str | None = None
     time_limit: float = 30.0
     base: str | None = None
     drivers: str | None = None
@@ -161,6 +161,7 @@ def run_checks(request: EgoCheckRequest) -> Iterator[Finding | str]:
     import agents
     from agents.loading import find_ego_kind
     from rare_envs.egos.errors import EgoGone, reason_of
+    from rare_envs.problem import TAKEN_AS_ACCELERATIONS
     from rare_envs.study.ego_check.behaviour import EGO_CHECKS, check_driving
     from rare_envs.study.ego_check.probe import Probe
     from rare_envs.study.ego_check.protocol import check_protocol
@@ -178,7 +179,8 @@ def run_checks(request: EgoCheckRequest) -> Iterator[Finding | str]:
         yield report_pass("loading", f"{type(ego).__name__}" if not isinstance(ego, str) else ego)
         problem = build_problem(request.question, ego)
         for note in problem.notes:
-            yield report_warning("action space", note, "say --action meta if it was trained there")
+            usual = note == TAKEN_AS_ACCELERATIONS
+            yield report_warning("action space", note, "say which by --action", not usual)
         probe = Probe.of(ego, problem)
     except (Exception, SystemExit, EgoGone) as error:  # the ego is the user's: anything may happen in it
         yield report_failure("loading", reason_of(error), "see docs/egos.md for what an ego is")

@@ -17,6 +17,7 @@ from rare_envs.study.ego_check.findings import Finding
 from rare_envs.study.ego_check.subprocess_check import EgoCheckRequest, run_checks
 from rare_envs.study.errors import BadInput
 from rare_envs.study.question import Question, build_problem, prepare
+from tests.rare_envs.study.refusals import assert_refused
 
 SMALL = ("estimate", "rare_envs/CarFollowing-v0", "--method", "mc", "--max-sim", 400)
 
@@ -47,21 +48,27 @@ def test_what_actions_are_taken_for_is_pointed_out(cli: Cli, tmp_path: Path, mon
     monkeypatch.chdir(tmp_path)
     few = ("--method", "mc", "--max-sim", 50, "--gamma", 1)  # TTC < 1 s has no rate, and so no notes on one
     words = ("estimate", FOLLOWING, "--ego", "idle_egos:Idle", *few, "--json")
-    (note,) = json.loads(cli(*words, "--observation", "kinematics").stdout)["notes"]
+    kinematics = ("--observation", "kinematics")
+    (note,) = json.loads(cli(*words, *kinematics, "--action", "continuous").stdout)["notes"]
     assert "--action meta" in note
-    for more in (("--observation", "kinematics", "--action", "meta"), ()):
+    for more in ((*kinematics, "--action", "meta"), ("--action", "discrete")):
         assert json.loads(cli(*words, *more).stdout)["notes"] == []
+    assert_refused(cli(*words, *kinematics), "fit two kinds", "--action meta", "--action discrete")
+    accelerating = json.loads(cli(*words).stdout)
+    assert ["--action discrete" in line for line in accelerating["notes"]] == [True]
+    assert accelerating["question"]["action"] == "continuous"
     both = (
         *("compare", "idle_egos:Idle", "idm", FOLLOWING),
-        *("--method", "mc", "--max-sim", 20, "--observation", "kinematics"),
+        *("--method", "mc", "--max-sim", 20, *kinematics, "--action", "continuous"),
     )
     assert json.loads(cli(*both, "--json").stdout)["notes"] == [f"A: {note}"]
     assert f"note: A: {note}" in cli(*both).stdout
-    asked = EgoCheckRequest("idle_egos:Idle", FOLLOWING, observation="kinematics")
+    asked = EgoCheckRequest("idle_egos:Idle", FOLLOWING, observation="kinematics", action="continuous")
     (found,) = (each for each in run_checks(asked) if isinstance(each, Finding) and each.found == note)
     assert (found.check, found.status) == ("action space", "warn")
     with pytest.warns(AmbiguousActions, match="--action meta"):
-        rare_envs.DrivingProblem(FOLLOWING, ego=agents.load_ego("idle_egos:Idle"), observation="kinematics")
+        ego = agents.load_ego("idle_egos:Idle")
+        rare_envs.DrivingProblem(FOLLOWING, ego=ego, observation="kinematics", action="continuous")
 
 
 def test_an_ego_that_answers_differently_each_time_is_noticed(cli: Cli, here: Path) -> None:

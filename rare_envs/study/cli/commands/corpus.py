@@ -58,7 +58,7 @@ def corpus_run_command(
     algo: AlgoOption = None,
     stats: StatsOption = None,
     observation: ObservationOption = None,
-    action: ActionOption = "continuous",
+    action: ActionOption = None,
     trust: TrustOption = False,
     as_json: JsonOption = False,
 ) -> None:

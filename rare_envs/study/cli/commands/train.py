@@ -29,13 +29,17 @@ def train_ego_command(
 ) -> None:
     """Train an ego on the batched simulation and save it for `rare-envs estimate --ego`."""
     from training import train_ego
+    from training.ego_training import HYPERPARAMETERS
 
-    world = {**options.arguments(), "observation": options.observation or "features"}
+    asked = {"observation": options.observation or "features", "action": options.action or "continuous"}
+    world = {**options.arguments(), **asked}
     with as_bad_input(ValueError, OSError):
         path = train_ego(env, algo=algo, steps=steps, out=out, seed=seed, num_envs=num_envs, resume=resume, **world)
     if as_json:
         print_json({"ego": str(path), "env_id": env, "algo": algo, "steps": steps, "seed": seed, **world})
     else:
+        if HYPERPARAMETERS[algo].discrete and options.action is None:
+            world["action"] = "discrete"  # which is what the algorithm made of it
         print(f"Saved {path}. Next: rare-envs estimate {env} --ego {path}{_estimate_options(world, options.noise)}")
 
 

@@ -1,0 +1,118 @@
+"""Attributes that code for HighwayEnv reads from `env.unwrapped`: configuration, road, vehicle and actions."""
+
+import warnings
+from collections.abc import Mapping
+from functools import cached_property
+from typing import Any
+
+from rare_envs.control.actions import MAX_ACCELERATION, MAX_STEERING
+from rare_envs.envs.highway_env_objects import make_scene
+from rare_envs.simulation.episode import Episode
+from rare_envs.simulation.reward import COLLISION_COST
+from rare_envs.simulation.world import World
+
+PICTURE_KEYS = frozenset(
+    {
+        "screen_width",
+        "screen_height",
+        "centering_position",
+        "scaling",
+        "show_trajectories",
+        "render_agent",
+        "offscreen_rendering",
+        "manual_control",
+        "real_time_rendering",
+    }
+)
+"""Keys of HighwayEnv's configuration that change neither traffic nor spaces; they are kept, and the picture is ours."""
+
+
+class HighwayEnvInterface:
+    """Attributes of HighwayEnv's environments, for code that reads them: they tell, and do not steer.
+
+    Example:
+        >>> import gymnasium
+        >>> env = gymnasium.make("rare_envs/CutIn-kinematics-v0").unwrapped
+        >>> _ = env.reset(seed=0, options={"ego_speed": 20.0, "cut_in_gap": 30.0})
+        >>> env.vehicle.speed, env.vehicle.crashed, len(env.road.vehicles)
+        (20.0, False, 3)
+        >>> env.action_type.actions_indexes["FASTER"], env.config["policy_frequency"]
+        (3, 1)
+    """
+
+    world: World
+    render_mode: str | None
+    _episode: Episode | None
+    _scene: tuple[Episode, Any] | None = None
+
+    @cached_property
+    def config(self) -> dict[str, Any]:
+        """The configuration under HighwayEnv's names: frequencies [Hz], duration [s], vehicles beside the ego."""
+        clock, scenario = self.world.clock, self.world.scenario
+        kinds = {"meta": "DiscreteMetaAction", "discrete": "DiscreteAction", "continuous": "ContinuousAction"}
+        observation = self.world.sensing.observation
+        return {
+            "observation": {"type": "Kinematics" if observation == "kinematics" else observation},
+            "action": {"type": kinds[clock.action]},
+            "simulation_frequency": round(1.0 / clock.dt),
+            "policy_frequency": clock.decisions_per_second,
+            "duration": clock.seconds,
+            "lanes_count": scenario.road.lanes,
+            "vehicles_count": scenario.vehicles - 1,
+            "controlled_vehicles": 1,
+            "collision_reward": -COLLISION_COST,
+            "normalize_reward": False,
+            "offroad_terminal": True,
+            "offscreen_rendering": self.render_mode != "human",
+            "manual_control": False,
+            "real_time_rendering": False,
+        }
+
+    def configure(self, config: Mapping[str, Any] | None) -> None:
+        """Take a change of the configuration as HighwayEnv's method does, as far as it concerns the picture.
+
+        Args:
+            config: Keys and values. What defines scenario, spaces and time is fixed when the environment is made; such
+                a change is left out, with a warning that names it.
+        """
+        stay = []
+        for name, value in (config or {}).items():
+            if name in PICTURE_KEYS:
+                self.config[name] = value
+            elif name not in self.config or self.config[name] != value:
+                stay.append(name)
+        if stay:
+            warnings.warn(
+                f"configure() leaves {', '.join(stay)} as they are: the scenario and its time are fixed when the "
+                "environment is made; gym.make takes dt, horizon, observation, action and base.",
+                stacklevel=2,
+            )
+
+    @property
+    def road(self) -> Any:
+        """The road with all vehicles, the ego first, a `highway_env.road.road.Road`; None before the first reset."""
+        if self._episode is None:
+            return None
+        if self._scene is None or self._scene[0] is not self._episode:
+            self._scene = (self._episode, make_scene(self._episode))
+        return self._scene[1]
+
+    @property
+    def controlled_vehicles(self) -> list[Any]:
+        """The ego, in a list; empty before the first reset."""
+        return [] if self.road is None else self.road.vehicles[:1]
+
+    @property
+    def vehicle(self) -> Any:
+        """The ego, a `highway_env.vehicle.kinematics.Vehicle` at this moment; None before the first reset."""
+        return self.controlled_vehicles[0] if self.controlled_vehicles else None
+
+    @property
+    def action_type(self) -> Any:
+        """HighwayEnv's description of the actions: with meta-actions a `DiscreteMetaAction`, with `actions_indexes`."""
+        from highway_env.envs.common.action import ContinuousAction, DiscreteMetaAction
+
+        if self.world.clock.action == "meta":
+            return DiscreteMetaAction(self)
+        ranges = {"acceleration_range": (-MAX_ACCELERATION, MAX_ACCELERATION)}
+        return ContinuousAction(self, steering_range=(-MAX_STEERING, MAX_STEERING), **ranges)
