@@ -1,0 +1,94 @@
+"""Reproduction of O'Kelly et al. 2018: rollouts made, record and page written."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import samplers
+from rare_envs.study.reproduction.okelly2018.figures import describe_figures, make_figures
+from rare_envs.study.reproduction.okelly2018.printed import describe_printed
+from rare_envs.study.reproduction.okelly2018.scales import EGOS, STUDY_SCALES
+from rare_envs.study.reproduction.okelly2018.study import HighwayStudy, measure
+from rare_envs.study.reproduction.okelly2018.summary import summarise
+from rare_envs.study.reproduction.okelly2018.tables import make_tables
+from rare_envs.study.reproduction.record import make_record, write_record
+
+SOURCE = (
+    "O'Kelly, Sinha, Namkoong, Duchi and Tedrake, Scalable end-to-end autonomous vehicle testing via rare-event "
+    "simulation, NeurIPS 2018: Tables 1 and 2, Figures 2 and 3, section 4."
+)
+
+
+def reproduce_okelly2018(
+    study: HighwayStudy,
+    out: Path,
+    command: str,
+    executor: samplers.Executor | None = None,
+    limit: int | None = None,
+    progress: bool = False,
+) -> dict[str, Any]:
+    """Make the rollouts that a folder does not have yet, and write record and page of what there is.
+
+    Args:
+        study: Ego, scale and seed.
+        out: Folder of rollouts, record and page.
+        command: As typed.
+        executor: Where rollouts are made; None for this process.
+        limit: Rollouts to make now at most; the page says what is not run.
+        progress: Whether to show bars.
+
+    Raises:
+        BadInput: The folder has rollouts of something else, or damaged ones.
+    """
+    problem = study.make_problem()
+    measured = measure(study, out, problem, executor, limit, progress)
+    record = describe_study(study, command, summarise(study, problem, measured))
+    write_record(out, record, make_figures(record))
+    return record
+
+
+def describe_study(study: HighwayStudy, command: str, found: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the record of a study.
+
+    Args:
+        study: What was measured.
+        command: As typed.
+        found: As `rare_envs.study.reproduction.okelly2018.summary.summarise` returns it.
+    """
+    details = {name: value for name, value in found.items() if name != "findings"}
+    return make_record(
+        title=f"O'Kelly et al. 2018 with the {study.ego} ego, {study.scale} scale",
+        source=SOURCE,
+        command=command,
+        settings={"ego": study.ego, "scale": study.scale, "seed": study.seed, "rollouts": asdict(study.settings)},
+        tables=make_tables(study.ego, study.gammas, found),
+        figures=describe_figures(study.ego, found),
+        findings=found["findings"],
+        notes=write_notes(study, found),
+        runs=[{"printed": describe_printed(study.ego), **details}],
+    )
+
+
+def write_notes(study: HighwayStudy, found: Mapping[str, Any]) -> list[str]:
+    """Return what holds for all of it, in sentences: the question, what was run, and what the rest would take."""
+    ours = study.settings
+    notes = [
+        f"P[lidar_ttc <= gamma] on rare_envs/Highway-v0 with the ego `{EGOS[study.ego]}`: 428 dimensions, the drivers' "
+        "noise one fixed sequence as in the released code, 10 s an episode. Every row is one run with one seed.",
+        f"Made: {found['rollouts']:,} of {ours.rollouts - 4 * ours.own:,} rollouts of naive Monte Carlo and the "
+        f"searches, and {len(found['own'])} of {4 if ours.own else 0} estimates by our default method.",
+    ]
+    full, speed = STUDY_SCALES[study.ego, "full"], found["rollouts_per_second"]
+    if study.scale == "full" or speed is None:
+        return notes
+    hours, search = (count / speed / 3600.0 for count in (full.rollouts, full.per_search))
+    return [
+        *notes,
+        f"The full scale was not run: {full.naive:,} naive rollouts and four searches of {full.per_search:,}, "
+        f"{full.rollouts:,} with our own method. At the {speed:,.0f} rollouts a second of the fastest chunk of this "
+        f"run (one core) that is {hours:,.1f} hours of a core, {search:,.1f} for each search; `--scale full` goes on "
+        "where it was stopped.",
+    ]

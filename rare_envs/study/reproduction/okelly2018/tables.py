@@ -1,0 +1,188 @@
+"""Tables of the paper beside ours, from the figures of a study."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from rare_envs.study.reproduction.comparison import ComparedValue, ComparisonTable
+from rare_envs.study.reproduction.okelly2018.printed import PRINTED_TABLES, PrintedTable
+from rare_envs.study.reproduction.okelly2018.scales import PRINTED_SEARCH, WHY_OTHER_THRESHOLDS
+
+Z_95 = 1.96
+KEYS = ("sample", "gamma, theirs / ours [s]")
+_ERROR = "standard error"
+
+
+def make_tables(ego: str, gammas: tuple[float, ...], found: Mapping[str, Any]) -> tuple[ComparisonTable, ...]:
+    """Return the table of estimates and that of ratios.
+
+    Args:
+        ego: "lidar" or "vision".
+        gammas: Our thresholds.
+        found: As `rare_envs.study.reproduction.okelly2018.study.summarise` returns it.
+    """
+    printed = PRINTED_TABLES[ego]
+    reasons = explain_differences(found)
+    heads = [f"{theirs} / {ours}" for theirs, ours in zip(printed.thresholds, gammas, strict=True)]
+    estimates = _list_estimates(printed, heads, found)
+    ratios = _list_ratios(printed, heads, found)
+    return (
+        ComparisonTable(
+            name=printed.name.lower().replace(" ", ""),
+            title=f"{printed.name}: probabilities with the {ego} ego",
+            keys=KEYS,
+            values=tuple(estimates),
+            explanations=reasons,
+        ),
+        ComparisonTable(
+            name=f"{printed.name.lower().replace(' ', '')}_ratios",
+            title=f"What cross-entropy gains over naive Monte Carlo with the {ego} ego",
+            keys=KEYS,
+            values=tuple(ratios),
+            explanations=reasons,
+        ),
+    )
+
+
+def explain_differences(found: Mapping[str, Any]) -> dict[str, str]:
+    """Return sentences by the names that values have as reasons."""
+    printed = found["searches"][PRINTED_SEARCH]
+    texts = {
+        "thresholds": WHY_OTHER_THRESHOLDS,
+        "scale": "One run, with fewer rollouts than theirs unless the scale is full; the rows say how many.",
+        "search": "Their tables leave out the rollouts of the search; here they are counted.",
+        "not run": "These rollouts were not made.",
+        "no event": "Too rare for as many rollouts: nothing to compare with.",
+        "extra": "Not in the paper.",
+    }
+    if "sampler" not in printed:
+        return texts
+    sampler = printed["sampler"]
+    texts["weights"] = (
+        "The 404 weights of our drivers have standard deviations of 0.001 to 0.004, so that the paper's box of 0.01 is "
+        f"some of them wide; the mean moved by {sampler['shift']:.3g} of them (Mahalanobis). The likelihood ratio of "
+        f"equation 3 then hardly ever is of any size: its mean over the final draws is {printed['mean_ratio']:.2g}, "
+        "where it should be 1, so p is too small, and its standard error says nothing. The paper's covariance was not "
+        "released; their mean ratio must have been near 1. `starts alone` leaves the weights as they are."
+    )
+    return texts
+
+
+def _list_estimates(printed: PrintedTable, heads: list[str], found: Mapping[str, Any]) -> list[ComparedValue]:
+    searches = found["searches"]
+    rows: list[tuple[str, str | None, list[dict[str, Any]], tuple[str, ...]]] = [
+        ("naive", "naive", found["naive"], ("thresholds", "scale")),
+        ("naive, equal draws", "naive, equal draws", found["naive_equal"], ("thresholds", "scale")),
+        *(
+            (
+                f"cross-entropy, {name}",
+                "cross-entropy" if name == PRINTED_SEARCH else None,
+                each["estimates"],
+                ("thresholds", "weights", "scale") if each["weights_move"] else ("extra",),
+            )
+            for name, each in searches.items()
+        ),
+    ]
+    values: list[ComparedValue] = []
+    for label, row, estimates, reasons in rows:
+        for j, head in enumerate(heads):
+            paper = printed.rows[row][j] if row in printed.rows else (None, None)
+            values += _pair(label, head, paper, estimates[j] if estimates else None, reasons)
+    for own in found["own"]:
+        head = next(each for each in heads if each.endswith(f" {own['gamma']}"))
+        labels = (f"our default method, {own['n_sim']:,} simulations all in", head)
+        values += [
+            ComparedValue(
+                labels=labels, quantity="p", ours=own["p"], interval=(own["low"], own["high"]), reasons=("extra",)
+            ),
+            ComparedValue(labels=labels, quantity=_ERROR, ours=own["p"] * own["cov"], reasons=("extra",)),
+        ]
+    return values
+
+
+def _pair(
+    label: str,
+    head: str,
+    paper: tuple[float | None, float | None],
+    ours: Mapping[str, Any] | None,
+    reasons: tuple[str, ...],
+) -> list[ComparedValue]:
+    """Return an estimate and its standard error."""
+    if ours is None:
+        labels = (f"{label}: not run", head)
+        return [
+            ComparedValue(labels=labels, quantity=quantity, paper=value, reasons=("not run",))
+            for quantity, value in zip(("p", _ERROR), paper, strict=True)
+        ]
+    p, error = ours["p"], ours["standard_error"]
+    interval = ours["interval"] or (max(0.0, p - Z_95 * error), p + Z_95 * error)
+    labels = (f"{label}, {ours['n']:,} rollouts", head)
+    return [
+        ComparedValue(
+            labels=labels,
+            quantity=f"p ({ours['events']:,} events)",
+            paper=paper[0],
+            ours=p,
+            interval=tuple(interval),
+            reasons=reasons,
+        ),
+        ComparedValue(labels=labels, quantity=_ERROR, paper=paper[1], ours=error, reasons=reasons),
+    ]
+
+
+def _list_ratios(printed: PrintedTable, heads: list[str], found: Mapping[str, Any]) -> list[ComparedValue]:
+    values: list[ComparedValue] = []
+    for name, each in found["searches"].items():
+        of_paper = name == PRINTED_SEARCH
+        for j, head in enumerate(heads):
+            ratio = printed.variance_ratio(j) if of_paper else None
+            draws = printed.draws["cross-entropy"]
+            all_in = None if ratio is None else ratio * draws / (draws + printed.search)
+            known = each["comparisons"][j] if each["comparisons"] else None
+            values += _ratios_of(f"cross-entropy, {name}", head, ratio, all_in, known, each)
+    for own in found["own"]:
+        head = next(each for each in heads if each.endswith(f" {own['gamma']}"))
+        values.append(
+            ComparedValue(
+                labels=(f"our default method, {own['n_sim']:,} simulations all in", head),
+                quantity="variance, naive / method, search counted",
+                ours=own["gain"],
+                reasons=("extra",) if own["gain"] is not None else ("no event",),
+            )
+        )
+    return values
+
+
+def _ratios_of(
+    label: str,
+    head: str,
+    ratio: float | None,
+    all_in: float | None,
+    known: Mapping[str, Any] | None,
+    search: Mapping[str, Any],
+) -> list[ComparedValue]:
+    """Return the ratios of one search at one threshold."""
+    if known is None:
+        labels, missing = (f"{label}: {search['iterations']} of {search['of']} iterations run", head), ("not run",)
+        known = {name: None for name in ("events_ratio", "events_interval", "variance_ratio", "all_in", "error_ratio")}
+    else:
+        labels, missing = (label, head), ("no event",)
+    why = ("thresholds", "weights", "scale") if search["weights_move"] and "sampler" in search else ("thresholds",)
+    rows = (
+        ("rare events, sampler / naive, equal draws", None, known["events_ratio"], known["events_interval"], why),
+        ("variance, naive / sampler, equal draws", ratio, known["variance_ratio"], None, why),
+        ("the same, search counted", all_in, known["all_in"], None, ("search", *why)),
+        ("by distance from the naive p instead, search counted", None, known["error_ratio"], None, ("search", *why)),
+    )
+    return [
+        ComparedValue(
+            labels=labels,
+            quantity=quantity,
+            paper=paper,
+            ours=ours,
+            interval=interval,
+            reasons=reasons if ours is not None else missing,
+        )
+        for quantity, paper, ours, interval, reasons in rows
+    ]

@@ -1,0 +1,43 @@
+"""Figures of the study from runs whose answers are known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rare_envs.study.reproduction.okelly2018.behaviour import RunBehaviour
+from rare_envs.study.reproduction.okelly2018 import summary
+from rare_envs.study.reproduction.okelly2018.study import HighwayStudy, measure
+from rare_envs.study.reproduction.okelly2018.summary import summarise
+
+
+@pytest.fixture(autouse=True)
+def still(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Take the drives of the findings away: they are tested with `behaviour`."""
+    monkeypatch.setattr(summary, "measure_behaviour", lambda problem, x: RunBehaviour(*np.ones((4, len(x)))))
+
+
+def test_starts_alone_are_weighted_right(tiny: HighwayStudy, cheap: Any, out: Path) -> None:
+    found = summarise(tiny, cheap, measure(tiny, out, cheap))
+    search = found["searches"]["starts alone, rho 0.1"]
+    assert search["mean_ratio"] == pytest.approx(1.0, abs=0.5)
+    assert abs(search["comparisons"][-1]["errors_off"]) < 4
+    assert search["search"] == 600
+    assert found["rollouts"] == 2000 + 4 * 800
+    assert [each["events"] for each in found["naive"]] == sorted(each["events"] for each in found["naive"])
+
+
+def test_what_fails_is_seen_in_the_starts(tiny: HighwayStudy, cheap: Any, out: Path) -> None:
+    found = {each.claim: each for each in summarise(tiny, cheap, measure(tiny, out, cheap))["findings"][:4]}
+    assert found["vehicles box in the ego: neighbours are nearer"].verdict == "holds"
+
+
+def test_what_is_not_run_is_left_out(tiny: HighwayStudy, cheap: Any, out: Path) -> None:
+    found = summarise(tiny, cheap, measure(tiny, out, cheap, limit=500))
+    assert len(found["naive"]) == 4
+    assert all(not each["estimates"] for each in found["searches"].values())
+    none = summarise(tiny, cheap, measure(tiny, out / "other", cheap, limit=0))
+    assert (none["naive"], none["findings"], none["rollouts"]) == ([], [], 0)
