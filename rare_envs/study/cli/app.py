@@ -21,6 +21,7 @@ from rare_envs.study.cli.commands.export_failure import export_command
 from rare_envs.study.cli.commands.plan import plan_command
 from rare_envs.study.cli.commands.replay import replay_command
 from rare_envs.study.cli.commands.report import report_command
+from rare_envs.study.cli.commands.reproduce import reproduce_app
 from rare_envs.study.cli.commands.serve_ego import serve_ego_command
 from rare_envs.study.cli.commands.train import train_drivers_command, train_ego_command
 from rare_envs.study.cli.options import (
@@ -177,6 +178,7 @@ app.command("replay")(replay_command)
 app.command("export")(export_command)
 app.add_typer(corpus_app, name="corpus")
 app.add_typer(bench_app, name="bench")
+app.add_typer(reproduce_app, name="reproduce")
 app.command("plan")(plan_command)
 app.command("report")(report_command)
 app.command("check-ego")(check_ego_command)

@@ -14,7 +14,7 @@ from rare_envs.sensors.lidar import beam_angles
 from rare_envs.sensors.perception import RANGE_COLUMNS, RATE_COLUMNS
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.rollout import drive
-from rare_envs.study.reproduction.comparison import Finding
+from rare_envs.study.reproduction.comparison import TestedClaim
 from rare_envs.study.reproduction.okelly2018.findings import PaperClaim, compare_means
 from samplers.problem import FloatArray
 
@@ -86,7 +86,7 @@ MORE_SIDESWIPES = PaperClaim("dangerous events include frequent sideswipes", abo
 
 def compare_behaviour(
     failing: RunBehaviour, ordinary: RunBehaviour, with_their_weights: RunBehaviour, all_failing: int
-) -> list[Finding]:
+) -> list[TestedClaim]:
     """Test what the paper says of behaviour.
 
     Args:

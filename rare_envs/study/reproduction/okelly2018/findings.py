@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from rare_envs.study.reproduction.comparison import Finding
+from rare_envs.study.reproduction.comparison import TestedClaim
 from samplers.problem import FloatArray
 from samplers.statistics.intervals import Interval
 
@@ -59,7 +59,7 @@ def speed_behind(columns: Columns) -> FloatArray:
     behind = columns["s"][:, 1:] < columns["s"][:, :1]
     count = behind.sum(axis=1)
     total = np.where(behind, columns["speed"][:, 1:], 0.0).sum(axis=1)
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+    return np.asarray(np.where(count > 0, total / np.maximum(count, 1), np.nan))
 
 
 def distance_beside(columns: Columns) -> FloatArray:
@@ -71,7 +71,7 @@ def distance_beside(columns: Columns) -> FloatArray:
 def is_boxed_in(columns: Columns) -> FloatArray:
     """Return 1 where both vehicles in the lanes beside start within `BESIDE` of the ego, else 0, shape (n,)."""
     along = np.abs(columns["s"][:, 1:] - columns["s"][:, :1])[:, [j - 1 for j in NEXT_LANES]]
-    return (along <= BESIDE).all(axis=1).astype(np.float64)
+    return np.asarray((along <= BESIDE).all(axis=1), dtype=np.float64)
 
 
 def spread_of_starts(columns: Columns, base: Columns) -> FloatArray:
@@ -96,7 +96,7 @@ def _unbias(values: FloatArray) -> float:
 
 def compare_means(
     claim: PaperClaim, quantity: str, failing: FloatArray, ordinary: FloatArray, groups: str = "failing / ordinary"
-) -> Finding:
+) -> TestedClaim:
     """Test a claim on the ratio of two means, a value of each run: Welch's t, and a bootstrap interval of the ratio.
 
     Args:
@@ -117,7 +117,7 @@ def compare_means(
     sizes = f"{len(failing):,} and {len(ordinary):,} runs"
     if len(failing) < 2 or len(ordinary) < 2 or ordinary.mean() == 0.0:
         known = [f"{values.mean():.3g}" if len(values) else "none" for values in (failing, ordinary)]
-        return Finding(
+        return TestedClaim(
             claim=claim.text,
             statistic=f"{quantity}, {groups}: {' and '.join(known)}, {sizes}",
             value=None,
@@ -132,7 +132,7 @@ def compare_means(
         found = stats.ttest_ind(failing, ordinary, equal_var=False)
         test = f"Welch's t = {float(found.statistic):.1f}, p = {float(found.pvalue):.1g}"
     means = f"{failing.mean():.3g} / {ordinary.mean():.3g}"
-    return Finding(
+    return TestedClaim(
         claim=claim.text,
         statistic=f"{quantity}, {groups}: {means}; {test}; {sizes}",
         value=float(failing.mean() / ordinary.mean()),
@@ -165,7 +165,7 @@ _OF_STARTS: tuple[tuple[PaperClaim, str, Callable[[Columns], FloatArray]], ...] 
 )
 
 
-def compare_starts(failing: Columns, ordinary: Columns, groups: str) -> list[Finding]:
+def compare_starts(failing: Columns, ordinary: Columns, groups: str) -> list[TestedClaim]:
     """Test what the paper says of initial conditions.
 
     Args:

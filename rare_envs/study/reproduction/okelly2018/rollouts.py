@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 import samplers
-from rare_envs.study.execution.run_lines import RunLines
+from rare_envs.study.execution.run_lines import RunLines, drop_torn_line
 from rare_envs.study.reproduction.okelly2018.search import draw_chunk
 from samplers.execution.executors.chunks import Chunk, Packed
 from samplers.execution.executors.dispatch import Dispatcher
@@ -100,6 +100,7 @@ class RolloutFolder:
         limit: int | None = None,
         progress: bool = False,
     ) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
         self.made = 0
         self._folder, self._header, self._seed, self._limit, self._progress = folder, header, seed, limit, progress
         self._work = ProblemWork(problem, 0.0, "raise")
@@ -127,6 +128,7 @@ class RolloutFolder:
             Outcomes of the first chunks, all of them unless the limit was reached.
         """
         lines = self._lines(jobs[0].key.partition("/")[0])
+        drop_torn_line(lines.file)
         known = {run.key for run in lines.read()}
         wanted: list[ChunkJob] = []
         for job in jobs:

@@ -10,7 +10,7 @@ import numpy as np
 
 import rare_envs
 import samplers
-from rare_envs.study.execution.run_lines import RunLines
+from rare_envs.study.execution.run_lines import RunLines, drop_torn_line
 from rare_envs.study.reproduction.okelly2018.rollouts import (
     ChunkJob,
     ChunkOutcomes,
@@ -132,7 +132,6 @@ def measure(
     Raises:
         BadInput: The folder has rollouts of something else, or damaged ones.
     """
-    out.mkdir(parents=True, exist_ok=True)
     scale = study.settings
     with RolloutFolder(out, problem, study.header, study.seed, executor, limit, progress) as rollouts:
         base = make_base(problem, SEARCHES[PRINTED_SEARCH])
@@ -200,6 +199,7 @@ def _run_own(
     lines = RunLines[float, dict[str, Any]](
         out / "own.jsonl", study.header, dict, dict, key_of_job=lambda gamma: gamma, key_of_run=lambda run: run["gamma"]
     )
+    drop_torn_line(lines.file)
     known = {run["gamma"] for run in lines.read()}
     wanted = [gamma for gamma in study.gammas if gamma in known or rollouts.spend(budget)]
     return lines.complete(wanted, make, progress, "our default method")

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rare_envs.study.reproduction.comparison import Finding
+from rare_envs.study.reproduction.comparison import TestedClaim
 from rare_envs.study.reproduction.okelly2018.behaviour import compare_behaviour, measure_behaviour
 from rare_envs.study.reproduction.okelly2018.estimates import (
     ThresholdEstimate,
@@ -120,12 +120,12 @@ def _compare_own(own: dict[str, Any], references: Sequence[ThresholdEstimate]) -
     return {**own, "gain": gain}
 
 
-def _find(study: HighwayStudy, problem: Any, measured: MeasuredHighway, f: FloatArray) -> list[Finding]:
+def _find(study: HighwayStudy, problem: Any, measured: MeasuredHighway, f: FloatArray) -> list[TestedClaim]:
     """Test what the paper says on the naive runs, and on the sampler of the search as printed."""
     fails = f <= study.gammas[-1]
     failing = _draw_rows(study, measured.naive_jobs, np.flatnonzero(fails))
     ordinary = _draw_rows(study, measured.naive_jobs, np.flatnonzero(~fails)[:ORDINARY_COMPARED])
-    found: list[Finding] = []
+    found: list[TestedClaim] = []
     if len(failing) > 1:
         columns, usual = problem.space.columns(failing), problem.space.columns(ordinary)
         found += compare_starts(columns, usual, "failing / ordinary")
@@ -140,8 +140,12 @@ def _find(study: HighwayStudy, problem: Any, measured: MeasuredHighway, f: Float
         mixed = usual_x.copy()
         weights = slice(problem.space.dim - WEIGHT_COUNT, problem.space.dim)
         mixed[:, weights] = again[np.arange(len(mixed)) % len(again)][:, weights]
-        behaviours = [measure_behaviour(problem, x) for x in (again, usual_x, mixed)]
-        found += compare_behaviour(*behaviours, all_failing=len(failing))
+        found += compare_behaviour(
+            measure_behaviour(problem, again),
+            measure_behaviour(problem, usual_x),
+            measure_behaviour(problem, mixed),
+            all_failing=len(failing),
+        )
     return found
 
 

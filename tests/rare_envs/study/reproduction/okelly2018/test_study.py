@@ -38,7 +38,7 @@ def test_all_stages_are_made_once(tiny: HighwayStudy, cheap: Any, out: Path) -> 
 
 def test_a_run_that_is_stopped_in_a_search_goes_on(tiny: HighwayStudy, cheap: Any, out: Path, tmp_path: Path) -> None:
     whole = measure(tiny, out, cheap)
-    part = measure(tiny, tmp_path / "other", cheap, limit=tiny.settings.naive + 300)
+    part = measure(tiny, tmp_path / "other", cheap, limit=tiny.settings.naive + 400)
     first = next(iter(part.searches.values()))
     assert (len(first.steps), len(first.final)) == (1, 0)
     rest = measure(tiny, tmp_path / "other", cheap)
@@ -46,10 +46,9 @@ def test_a_run_that_is_stopped_in_a_search_goes_on(tiny: HighwayStudy, cheap: An
         assert all((a.f == b.f).all() for a, b in zip(rest.searches[name].final, run.final, strict=True))
 
 
-def test_the_search_makes_failures_more_frequent(tiny: HighwayStudy, cheap: Any, out: Path) -> None:
+def test_the_search_goes_to_small_outcomes(tiny: HighwayStudy, cheap: Any, out: Path) -> None:
     measured = measure(tiny, out, cheap)
     naive = np.concatenate([each.f for each in measured.naive])
-    gamma = tiny.gammas[-1]
-    for run in measured.searches.values():
+    for run in (run for name, run in measured.searches.items() if name.endswith("0.1")):
         found = np.concatenate([each.f for each in run.final])
-        assert (found <= gamma).mean() > 2 * (naive <= gamma).mean()
+        assert np.quantile(found, 0.1) < np.quantile(naive, 0.1) - 0.1

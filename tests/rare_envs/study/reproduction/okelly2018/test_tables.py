@@ -1,0 +1,75 @@
+"""Tables of the paper beside made-up figures of ours."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from rare_envs.study.reproduction.okelly2018.scales import PRINTED_SEARCH, THRESHOLDS
+from rare_envs.study.reproduction.okelly2018.tables import explain_differences, make_tables
+
+GAMMAS = THRESHOLDS["lidar"]
+NOT_RUN = {"iterations": 2, "of": 20, "weights_move": True, "estimates": [], "comparisons": []}
+ESTIMATE = {"n": 1000, "events": 10, "p": 0.01, "standard_error": 0.003, "interval": None}
+COMPARISON = {
+    "events_ratio": 5.0,
+    "events_interval": (3.0, 8.0),
+    "variance_ratio": 7.2,
+    "all_in": 1.2,
+    "error_ratio": None,
+}
+RUN = {
+    **NOT_RUN,
+    "iterations": 20,
+    "sampler": {"shift": 5.0},
+    "mean_ratio": 1e-9,
+    "estimates": [ESTIMATE] * 4,
+    "comparisons": [COMPARISON] * 4,
+}
+
+
+def found_of(search: dict[str, Any], own: tuple[dict[str, Any], ...] = ()) -> dict[str, Any]:
+    return {"naive": [ESTIMATE] * 4, "naive_equal": [], "searches": {PRINTED_SEARCH: search}, "own": own}
+
+
+def test_ours_stand_beside_theirs() -> None:
+    values = make_tables("lidar", GAMMAS, found_of(RUN))[0].to_dict()["values"]
+    first = next(value for value in values if value["labels"][0].startswith("naive, 1,000 rollouts"))
+    assert (first["paper"], first["ours"], first["quantity"]) == (12.4e-6, 0.01, "p (10 events)")
+    assert first["labels"][1] == f"0.14 / {GAMMAS[0]}"
+    assert first["interval"] == pytest.approx((0.00412, 0.01588))
+    searched = [value["paper"] for value in values if PRINTED_SEARCH in value["labels"][0]]
+    assert searched[:2] == [19.8e-6, 8.88e-6]
+
+
+def test_the_search_counts_for_the_paper_too() -> None:
+    values = make_tables("lidar", GAMMAS, found_of(RUN))[1].values
+    ratio, all_in = (value for value in values[:4] if value.paper is not None)
+    assert ratio.paper == pytest.approx(1.57, abs=0.01)
+    assert all_in.paper == pytest.approx(1.57 / 6, abs=0.01)
+    assert (ratio.ours, all_in.ours) == (7.2, 1.2)
+    assert values[3].reasons == ("no event",)
+
+
+def test_what_was_not_run_has_no_number() -> None:
+    for table in make_tables("lidar", GAMMAS, found_of(NOT_RUN)):
+        rows = [value for value in table.values if PRINTED_SEARCH in value.labels[0]]
+        assert rows
+        assert all(value.ours is None and value.reasons == ("not run",) for value in rows)
+    assert "2 of 20 iterations" in rows[0].labels[0]
+    assert "weights" not in explain_differences(found_of(NOT_RUN))
+
+
+def test_our_own_method_stands_at_its_threshold() -> None:
+    own = {"gamma": GAMMAS[2], "n_sim": 3000, "p": 1e-3, "low": 8e-4, "high": 1.2e-3, "cov": 0.1, "gain": 30.0}
+    estimates, ratios = make_tables("lidar", GAMMAS, found_of(RUN, (own,)))
+    assert estimates.values[-2].labels[1] == f"0.19 / {GAMMAS[2]}"
+    assert estimates.values[-1].ours == pytest.approx(1e-4)
+    assert ratios.values[-1].ours == 30.0
+
+
+@pytest.mark.parametrize("ego", ["lidar", "vision"])
+def test_every_reason_is_explained(ego: str) -> None:
+    make_tables(ego, THRESHOLDS[ego], found_of(RUN))  # it would be refused
+    assert "1e-09" in explain_differences(found_of(RUN))["weights"]
