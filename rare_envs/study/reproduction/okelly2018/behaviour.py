@@ -1,4 +1,4 @@
-"""How the vehicles behave in some runs: hard brakes, lane changes, and on which side danger was."""
+"""Behaviour of the vehicles in some runs: hard brakes, lane changes, and on which side danger was."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from rare_envs.study.reproduction.comparison import TestedClaim
 from rare_envs.study.reproduction.okelly2018.findings import PaperClaim, compare_means
 from samplers.problem import FloatArray
 
-HARD_BRAKE = -3.0
+HARD_BRAKE_LIMIT = -3.0
 """Acceleration that counts as a hard brake [m/s^2]."""
-SIDE = (math.radians(45.0), math.radians(135.0))
+SIDEWAYS_ANGLES = (math.radians(45.0), math.radians(135.0))
 """Angles to the heading between which a beam looks sideways."""
 
 
@@ -57,7 +57,7 @@ def _measure_tile(problem: Any, x: FloatArray) -> RunBehaviour:
         brakes, changes = torch.zeros(len(x)), torch.zeros(len(x))
         for episode in episodes:
             slowing = (episode.state.speed - before.state.speed)[:, 1:] / clock.dt
-            brakes += (slowing <= HARD_BRAKE).float().mean(dim=1)
+            brakes += (slowing <= HARD_BRAKE_LIMIT).float().mean(dim=1)
             lane, lane_before = (each.road.lane_of(each.state.y[:, 1:]) for each in (episode, before))
             changes += (lane != lane_before).float().mean(dim=1)
             now, here = find_least_time(episode)
@@ -76,7 +76,7 @@ def find_least_time(episode: Episode) -> tuple[Tensor, Tensor]:
     times = torch.where(closing > 0.0, ego[:, RANGE_COLUMNS] / closing.clamp(min=1e-4), TTC_MAX)
     least, beam = times.min(dim=1)
     angle = beam_angles(times).abs()[beam]
-    return least, (angle >= SIDE[0]) & (angle <= SIDE[1])
+    return least, (angle >= SIDEWAYS_ANGLES[0]) & (angle <= SIDEWAYS_ANGLES[1])
 
 
 MORE_LANE_CHANGES = PaperClaim("perturbed weights make lane changes more frequent", above=True)

@@ -34,7 +34,7 @@ def describe_figures(ego: str, found: Mapping[str, Any]) -> dict[str, dict[str, 
 
     Args:
         ego: "lidar" or "vision".
-        found: As `rare_envs.study.reproduction.okelly2018.study.summarise` returns it.
+        found: As `rare_envs.study.reproduction.okelly2018.study.summarise_highway` returns it.
     """
     printed = PRINTED_TABLES[ego]
     word = printed.figure.lower().replace(" ", "")

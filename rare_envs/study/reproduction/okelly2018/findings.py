@@ -1,4 +1,4 @@
-"""What the paper says of the failures, tested: failing runs against ordinary ones, run by run."""
+"""Statements of the paper about failures, tested: failing runs against ordinary ones, run by run."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ BESIDE = 10.0
 """Distance along the road within which a neighbour closes the way to its lane [m]."""
 STARTS = ("s", "t", "heading", "speed")
 RESAMPLES = 999
-Columns = Mapping[str, FloatArray]
+StartColumns = Mapping[str, FloatArray]
 """Scenario parameters by name, (n, 6) each, the ego first."""
 
 
@@ -54,7 +54,7 @@ class PaperClaim:
         return f"holds, but {'less' if less else 'more'}: {self.printed:g} in the paper"
 
 
-def speed_behind(columns: Columns) -> FloatArray:
+def speed_behind(columns: StartColumns) -> FloatArray:
     """Return the mean speed of the vehicles that start behind the ego [m/s], NaN where there is none, shape (n,)."""
     behind = columns["s"][:, 1:] < columns["s"][:, :1]
     count = behind.sum(axis=1)
@@ -62,19 +62,19 @@ def speed_behind(columns: Columns) -> FloatArray:
     return np.asarray(np.where(count > 0, total / np.maximum(count, 1), np.nan))
 
 
-def distance_beside(columns: Columns) -> FloatArray:
+def distance_beside(columns: StartColumns) -> FloatArray:
     """Return the mean distance along the road to the vehicles in the lanes beside [m], shape (n,)."""
     along = np.abs(columns["s"][:, 1:] - columns["s"][:, :1])
     return np.asarray(along[:, [j - 1 for j in NEXT_LANES]].mean(axis=1))
 
 
-def is_boxed_in(columns: Columns) -> FloatArray:
+def is_boxed_in(columns: StartColumns) -> FloatArray:
     """Return 1 where both vehicles in the lanes beside start within `BESIDE` of the ego, else 0, shape (n,)."""
     along = np.abs(columns["s"][:, 1:] - columns["s"][:, :1])[:, [j - 1 for j in NEXT_LANES]]
     return np.asarray((along <= BESIDE).all(axis=1), dtype=np.float64)
 
 
-def spread_of_starts(columns: Columns, base: Columns) -> FloatArray:
+def spread_of_starts(columns: StartColumns, base: StartColumns) -> FloatArray:
     """Return the squared distance of the starts from their own mean, in variances of a base sample, shape (n,).
 
     Its mean is the ratio of variances to those of the base, averaged over all 24 variables.
@@ -155,17 +155,17 @@ def bootstrap_ratio(failing: FloatArray, ordinary: FloatArray) -> Interval:
 
 
 BOXED_IN = PaperClaim("vehicles box in the ego", above=True)
-NEAR = PaperClaim("vehicles box in the ego: neighbours are nearer", above=False)
+NEARER_NEIGHBOURS = PaperClaim("vehicles box in the ego: neighbours are nearer", above=False)
 FASTER_BEHIND = PaperClaim("vehicles behind the ego are 20 % faster", above=True, printed=1.2)
 LESS_VARIANCE = PaperClaim("variances of the initial conditions are 50 % smaller", above=False, printed=0.5)
-_OF_STARTS: tuple[tuple[PaperClaim, str, Callable[[Columns], FloatArray]], ...] = (
+_OF_STARTS: tuple[tuple[PaperClaim, str, Callable[[StartColumns], FloatArray]], ...] = (
     (BOXED_IN, f"share of starts with a vehicle within {BESIDE:g} m in both lanes beside", is_boxed_in),
-    (NEAR, "distance to the vehicles in the lanes beside at the start [m]", distance_beside),
+    (NEARER_NEIGHBOURS, "distance to the vehicles in the lanes beside at the start [m]", distance_beside),
     (FASTER_BEHIND, "initial speed of the vehicles that start behind [m/s]", speed_behind),
 )
 
 
-def compare_starts(failing: Columns, ordinary: Columns, groups: str) -> list[TestedClaim]:
+def compare_starts(failing: StartColumns, ordinary: StartColumns, groups: str) -> list[TestedClaim]:
     """Test what the paper says of initial conditions.
 
     Args:

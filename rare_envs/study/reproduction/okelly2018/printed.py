@@ -1,4 +1,4 @@
-"""What O'Kelly et al. print: their tables, the ranges of their figures and their settings.
+"""Printed numbers of O'Kelly et al.: their tables, the ranges of their figures and their settings.
 
 References:
     O'Kelly, Sinha, Namkoong, Duchi and Tedrake, "Scalable end-to-end autonomous vehicle testing via rare-event

@@ -10,9 +10,9 @@ from typing import Any
 import samplers
 from rare_envs.study.reproduction.okelly2018.figures import describe_figures, make_figures
 from rare_envs.study.reproduction.okelly2018.printed import describe_printed
-from rare_envs.study.reproduction.okelly2018.scales import EGOS, STUDY_SCALES
-from rare_envs.study.reproduction.okelly2018.study import HighwayStudy, measure
-from rare_envs.study.reproduction.okelly2018.summary import summarise
+from rare_envs.study.reproduction.okelly2018.scales import EGO_NAMES, STUDY_SCALES
+from rare_envs.study.reproduction.okelly2018.study import HighwayStudy, measure_highway
+from rare_envs.study.reproduction.okelly2018.summary import summarise_highway
 from rare_envs.study.reproduction.okelly2018.tables import make_tables
 from rare_envs.study.reproduction.record import make_record, write_record
 
@@ -44,19 +44,19 @@ def reproduce_okelly2018(
         BadInput: The folder has rollouts of something else, or damaged ones.
     """
     problem = study.make_problem()
-    measured = measure(study, out, problem, executor, limit, progress)
-    record = describe_study(study, command, summarise(study, problem, measured))
+    measured = measure_highway(study, out, problem, executor, limit, progress)
+    record = make_okelly_record(study, command, summarise_highway(study, problem, measured))
     write_record(out, record, make_figures(record))
     return record
 
 
-def describe_study(study: HighwayStudy, command: str, found: Mapping[str, Any]) -> dict[str, Any]:
+def make_okelly_record(study: HighwayStudy, command: str, found: Mapping[str, Any]) -> dict[str, Any]:
     """Return the record of a study.
 
     Args:
         study: What was measured.
         command: As typed.
-        found: As `rare_envs.study.reproduction.okelly2018.summary.summarise` returns it.
+        found: As `rare_envs.study.reproduction.okelly2018.summary.summarise_highway` returns it.
     """
     details = {name: value for name, value in found.items() if name != "findings"}
     return make_record(
@@ -76,8 +76,8 @@ def write_notes(study: HighwayStudy, found: Mapping[str, Any]) -> list[str]:
     """Return what holds for all of it, in sentences: the question, what was run, and what the rest would take."""
     ours = study.settings
     notes = [
-        f"P[lidar_ttc <= gamma] on rare_envs/Highway-v0 with the ego `{EGOS[study.ego]}`: 428 dimensions, the drivers' "
-        "noise one fixed sequence as in the released code, 10 s an episode. Every row is one run with one seed.",
+        f"P[lidar_ttc <= gamma] on rare_envs/Highway-v0 with the ego `{EGO_NAMES[study.ego]}`: 428 dimensions, the "
+        "drivers' noise one fixed sequence as in the released code, 10 s an episode. Every row is one run with one seed.",
         f"Made: {found['rollouts']:,} of {ours.rollouts - 4 * ours.own:,} rollouts of naive Monte Carlo and the "
         f"searches, and {len(found['own'])} of {4 if ours.own else 0} estimates by our default method.",
     ]

@@ -1,4 +1,4 @@
-"""How much of the study is made: rollouts and searches of each ego at two scales, and our thresholds."""
+"""Scales of the study: rollouts and searches of each ego at two scales, and our thresholds."""
 
 from __future__ import annotations
 
@@ -78,5 +78,5 @@ WHY_OTHER_THRESHOLDS = (
     "rollouts. Our thresholds were chosen from 22,528 rollouts, which are not in the tables, for probabilities "
     "of the order of theirs; columns are compared by how rare the event is."
 )
-EGOS = {"lidar": "imitation", "vision": "vision"}
+EGO_NAMES = {"lidar": "imitation", "vision": "vision"}
 """The egos by their names in `agents.load_ego`."""

@@ -18,7 +18,7 @@ from rare_envs.study.reproduction.okelly2018.rollouts import (
     split_jobs,
 )
 from rare_envs.study.reproduction.okelly2018.scales import (
-    EGOS,
+    EGO_NAMES,
     PRINTED_SEARCH,
     SEARCHES,
     STUDY_SCALES,
@@ -35,7 +35,7 @@ from rare_envs.study.reproduction.okelly2018.search import (
 )
 from samplers.methods.cross_entropy import Product
 
-HIGHWAY = "rare_envs/Highway-v0"
+HIGHWAY_ENV_ID = "rare_envs/Highway-v0"
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class HighwayStudy:
 
     def make_problem(self) -> rare_envs.DrivingProblem:
         """Return the highway with the ego; noise is one sequence, as in the released code: 428 dimensions."""
-        return rare_envs.DrivingProblem(HIGHWAY, ego=EGOS[self.ego], measure="lidar_ttc", noise="fixed")
+        return rare_envs.DrivingProblem(HIGHWAY_ENV_ID, ego=EGO_NAMES[self.ego], measure="lidar_ttc", noise="fixed")
 
     @property
     def header(self) -> dict[str, Any]:
@@ -111,7 +111,7 @@ class MeasuredHighway:
     own: list[dict[str, Any]]
 
 
-def measure(
+def measure_highway(
     study: HighwayStudy,
     out: Path,
     problem: Any,

@@ -35,7 +35,7 @@ FAILING_DRIVEN, ORDINARY_DRIVEN, ORDINARY_COMPARED = 256, 512, 4000
 WEIGHT_COUNT = 404
 
 
-def summarise(study: HighwayStudy, problem: Any, measured: MeasuredHighway) -> dict[str, Any]:
+def summarise_highway(study: HighwayStudy, problem: Any, measured: MeasuredHighway) -> dict[str, Any]:
     """Return the figures of what was measured, as plain values but for the findings.
 
     Returns:

@@ -20,7 +20,7 @@ def make_tables(ego: str, gammas: tuple[float, ...], found: Mapping[str, Any]) -
     Args:
         ego: "lidar" or "vision".
         gammas: Our thresholds.
-        found: As `rare_envs.study.reproduction.okelly2018.study.summarise` returns it.
+        found: As `rare_envs.study.reproduction.okelly2018.study.summarise_highway` returns it.
     """
     printed = PRINTED_TABLES[ego]
     reasons = explain_differences(found)

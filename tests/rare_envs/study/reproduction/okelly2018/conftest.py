@@ -12,7 +12,7 @@ from rare_envs.study.reproduction.okelly2018 import study as study_module
 from rare_envs.study.reproduction.okelly2018.scales import StudyScale
 from rare_envs.study.reproduction.okelly2018.study import HighwayStudy
 
-TINY = StudyScale(naive=1000, iterations=3, draws=300, final=300, own=0, chunk=100)
+TINY = StudyScale(naive=1000, iterations=2, draws=300, final=300, own=0, chunk=100)
 
 
 class CheapHighway:

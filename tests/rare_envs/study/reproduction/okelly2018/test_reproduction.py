@@ -24,6 +24,6 @@ def test_record_and_page_are_written(
     assert json.loads((out / "reproduction.json").read_text()) == record
     page = (out / "reproduction.html").read_text()
     assert page.count("<svg") == 2
-    assert "Made: 5,800 of 5,800 rollouts" in page
+    assert "Made: 4,600 of 4,600 rollouts" in page
     assert "The full scale was not run" in page
     assert len(record["findings"]) == 11

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rare_envs.study.reproduction.okelly2018.scales import SEARCHES
-from rare_envs.study.reproduction.okelly2018.study import HighwayStudy, measure
+from rare_envs.study.reproduction.okelly2018.study import HighwayStudy, measure_highway
 
 
 @pytest.mark.parametrize(
@@ -26,28 +26,28 @@ def test_bad_settings_are_refused(arguments: dict[str, Any], words: str) -> None
 
 
 def test_all_stages_are_made_once(tiny: HighwayStudy, cheap: Any, out: Path) -> None:
-    measured = measure(tiny, out, cheap)
+    measured = measure_highway(tiny, out, cheap)
     scale = tiny.settings
     assert cheap.evaluated == scale.naive + len(SEARCHES) * scale.per_search
-    assert [len(run.steps) for run in measured.searches.values()] == [3] * len(SEARCHES)
-    again = measure(tiny, out, cheap)
+    assert [len(run.steps) for run in measured.searches.values()] == [2] * len(SEARCHES)
+    again = measure_highway(tiny, out, cheap)
     assert cheap.evaluated == scale.naive + len(SEARCHES) * scale.per_search
     for name, run in measured.searches.items():
         assert [step.quantile for step in again.searches[name].steps] == [step.quantile for step in run.steps]
 
 
 def test_a_run_that_is_stopped_in_a_search_goes_on(tiny: HighwayStudy, cheap: Any, out: Path, tmp_path: Path) -> None:
-    whole = measure(tiny, out, cheap)
-    part = measure(tiny, tmp_path / "other", cheap, limit=tiny.settings.naive + 400)
+    whole = measure_highway(tiny, out, cheap)
+    part = measure_highway(tiny, tmp_path / "other", cheap, limit=tiny.settings.naive + 400)
     first = next(iter(part.searches.values()))
     assert (len(first.steps), len(first.final)) == (1, 0)
-    rest = measure(tiny, tmp_path / "other", cheap)
+    rest = measure_highway(tiny, tmp_path / "other", cheap)
     for name, run in whole.searches.items():
         assert all((a.f == b.f).all() for a, b in zip(rest.searches[name].final, run.final, strict=True))
 
 
 def test_the_search_goes_to_small_outcomes(tiny: HighwayStudy, cheap: Any, out: Path) -> None:
-    measured = measure(tiny, out, cheap)
+    measured = measure_highway(tiny, out, cheap)
     naive = np.concatenate([each.f for each in measured.naive])
     for run in (run for name, run in measured.searches.items() if name.endswith("0.1")):
         found = np.concatenate([each.f for each in run.final])

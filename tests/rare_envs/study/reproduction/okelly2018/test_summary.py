@@ -10,8 +10,8 @@ import pytest
 
 from rare_envs.study.reproduction.okelly2018 import summary
 from rare_envs.study.reproduction.okelly2018.behaviour import RunBehaviour
-from rare_envs.study.reproduction.okelly2018.study import HighwayStudy, measure
-from rare_envs.study.reproduction.okelly2018.summary import summarise
+from rare_envs.study.reproduction.okelly2018.study import HighwayStudy, measure_highway
+from rare_envs.study.reproduction.okelly2018.summary import summarise_highway
 
 
 @pytest.fixture(autouse=True)
@@ -21,23 +21,25 @@ def still(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_starts_alone_are_weighted_right(tiny: HighwayStudy, cheap: Any, out: Path) -> None:
-    found = summarise(tiny, cheap, measure(tiny, out, cheap))
+    found = summarise_highway(tiny, cheap, measure_highway(tiny, out, cheap))
     search = found["searches"]["starts alone, rho 0.1"]
     assert 0.3 < search["mean_ratio"] < 3.0
     assert abs(search["comparisons"][-1]["errors_off"]) < 4
-    assert search["search"] == 900
-    assert found["rollouts"] == 1000 + 4 * 1200
+    assert search["search"] == 600
+    assert found["rollouts"] == 1000 + 4 * 900
     assert [each["events"] for each in found["naive"]] == sorted(each["events"] for each in found["naive"])
 
 
 def test_what_fails_is_seen_in_the_starts(tiny: HighwayStudy, cheap: Any, out: Path) -> None:
-    found = {each.claim: each for each in summarise(tiny, cheap, measure(tiny, out, cheap))["findings"][:4]}
+    found = {
+        each.claim: each for each in summarise_highway(tiny, cheap, measure_highway(tiny, out, cheap))["findings"][:4]
+    }
     assert found["vehicles box in the ego: neighbours are nearer"].verdict == "holds"
 
 
 def test_what_is_not_run_is_left_out(tiny: HighwayStudy, cheap: Any, out: Path) -> None:
-    found = summarise(tiny, cheap, measure(tiny, out, cheap, limit=500))
+    found = summarise_highway(tiny, cheap, measure_highway(tiny, out, cheap, limit=500))
     assert len(found["naive"]) == 4
     assert all(not each["estimates"] for each in found["searches"].values())
-    none = summarise(tiny, cheap, measure(tiny, out / "other", cheap, limit=0))
+    none = summarise_highway(tiny, cheap, measure_highway(tiny, out / "other", cheap, limit=0))
     assert (none["naive"], none["findings"], none["rollouts"]) == ([], [], 0)
