@@ -77,7 +77,8 @@ def write_notes(study: HighwayStudy, found: Mapping[str, Any]) -> list[str]:
     ours = study.settings
     notes = [
         f"P[lidar_ttc <= gamma] on rare_envs/Highway-v0 with the ego `{EGO_NAMES[study.ego]}`: 428 dimensions, the "
-        "drivers' noise one fixed sequence as in the released code, 10 s an episode. Every row is one run with one seed.",
+        "drivers' noise one fixed sequence as in the released code, 10 s an episode. Every row is one run with "
+        "one seed.",
         f"Made: {found['rollouts']:,} of {ours.rollouts - 4 * ours.own:,} rollouts of naive Monte Carlo and the "
         f"searches, and {len(found['own'])} of {4 if ours.own else 0} estimates by our default method.",
     ]
