@@ -167,11 +167,13 @@ class Comparison:
         """The ratio, or its bound where one of the two did not fail."""
         low, high = self.interval
         if math.isinf(self.ratio):
-            return f"p_A / p_B above {low:.3g} ({100 * self.confidence:g} % one-sided bound; B did not fail)"
+            return f"p_A / p_B above {low:.3g} ({100 * self.confidence:g} % one-sided bound; no failure of B was found)"
         if math.isnan(self.ratio):
-            return "p_A / p_B not known (neither failed)"
+            return "p_A / p_B not known (no failure of A or B was found)"
         if self.ratio == 0:
-            return f"p_A / p_B below {high:.3g} ({100 * self.confidence:g} % one-sided bound; A did not fail)"
+            return (
+                f"p_A / p_B below {high:.3g} ({100 * self.confidence:g} % one-sided bound; no failure of A was found)"
+            )
         return f"p_A / p_B = {self.ratio:.3g}"
 
     def __repr__(self) -> str:

@@ -278,12 +278,14 @@ class Estimate:
 
     @property
     def proviso(self) -> str:
-        """Conditions under which p and its interval hold, in words."""
-        fixed = f"{self.given} and " if self.given else ""
+        """Conditions under which p and its interval are valid, in words that follow "valid"."""
+        fixed = f"given that {self.given}, " if self.given else ""
         if self.base_draws == 0:
-            return f"{fixed}no region of failure was missed (no base draws bound its size)"
-        missed = f"no region of more than {self.unseen:.1e} was missed ({self.base_draws:,} base draws saw none other)"
-        return fixed + missed
+            return f"{fixed}unless a failure region was missed (no base draws bound its probability)"
+        return (
+            f"{fixed}unless a failure region with probability above {self.unseen:.1e} was missed "
+            f"({self.base_draws:,} base draws found no other)"
+        )
 
     def to_arrow(self, names: Sequence[str] = ()) -> "pyarrow.Table":
         """Return simulated points with their weights as an Arrow table, a row each.
@@ -409,7 +411,7 @@ class Estimate:
             *([] if math.isnan(self.gain) else [("gain over Monte Carlo", f"{self.gain:.3g}")]),
             ("failing points", f"{self.failures.total:,}"),
             ("method", f"{self.method.name}, seed {self.seed}, {self.status}"),
-            ("given that", self.proviso),
+            ("valid", self.proviso),
         ]
         notes = [*(f"remark: {text}" for text in self.remarks), *(f"warning: {text}" for text in self.warnings)]
         return html_table(f"P[f <= {self.gamma:g}] = {self.p:.3e}", rows, notes=notes)
@@ -426,7 +428,7 @@ class Estimate:
             f"  {self.n_sim:,} simulations{gain}; {self.method.name}, seed {self.seed}, "
             f"{self.status}; {self.failures.total:,} failing points",
             *([f"  chosen {self.choice}"] if self.chose_another else []),
-            f"  given that {self.proviso}",
+            f"  valid {self.proviso}",
         ]
         lines += [f"  remark: {text}" for text in self.remarks]
         return "\n".join(lines + [f"  warning: {text}" for text in self.warnings])

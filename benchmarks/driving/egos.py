@@ -72,10 +72,10 @@ print(samplers.estimate(problem, seed=0, max_sim=1500))
 ```text
 P[f <= 0] = 4.39e-03
   95 % interval [3.32e-03, 6.45e-03], c.o.v. 0.135
-  base distribution 95 %  5.2e-04 to 3.7e-02 (38 + 15 events of 17 scenes, 30 refits); expected for the next event 7e-03
-    if the truth is of the fitted family (1 component, log gaps); another family is not covered
+  base distribution 95 %  5.2e-04 to 3.7e-02 (38 + 15 events of 17 scenes, 30 refits); ... 7e-03
+    assumes that the fitted family is correct (1 component, log gaps); errors of the family are not included
   1,500 simulations, gain over Monte Carlo 8.33; two-stage, seed 0, converged; 707 failing points
-  given that no region of more than 1.8e-02 was missed (166 base draws saw none other)
+  valid unless a failure region with probability above 1.8e-02 was missed (166 base draws found no other)
 ```
 """
 

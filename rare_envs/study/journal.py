@@ -41,7 +41,7 @@ def begin_journal(folder: Path, question: Question, force: bool = False) -> Jour
         if "already" not in str(error):
             raise BadInput(error) from error
         raise BadInput(
-            f"There is an unfinished run in {str(folder)!r}: go on with it by rare-envs resume {folder}, or replace it "
+            f"There is an unfinished run in {str(folder)!r}: continue it with rare-envs resume {folder}, or replace it "
             "by --force."
         ) from error
     except OSError as error:

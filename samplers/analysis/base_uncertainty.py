@@ -66,7 +66,7 @@ class BaseUncertainty:
         >>> print(found)  # doctest: +NORMALIZE_WHITESPACE
         base distribution 95 %  3.2e-05 to 1.9e-02 (38 + 15 events of 17 scenes, 3 refits); expected for the next
         event 2e-03
-          if the truth is of the fitted family (1 component, log gaps); another family is not covered
+          assumes that the fitted family is correct (1 component, log gaps); errors of the family are not included
     """
 
     p: float
@@ -106,7 +106,7 @@ class BaseUncertainty:
         if self.interval is not None:
             low, high = self.interval
             first = f"{100 * self.confidence:g} %  {low:.1e} to {high:.1e} {behind}"
-            first += "" if self.expected is None else f"; expected for the next event {self.expected:.0e}"
+            first += "" if self.expected is None else f"; predictive probability for a new event {self.expected:.0e}"
         elif self.bound is not None:
             below = f"below {self.bound:.1e} in this family" if self.bound < 1 else "nor an upper end in this family"
             first = f" the events do not determine p; {below} {behind}"
@@ -114,7 +114,7 @@ class BaseUncertainty:
             return f"base distribution  no interval: {self.reason}"
         lines = [
             f"base distribution {first}",
-            f"  if the truth is of the fitted family ({self.family}); another family is not covered",
+            f"  assumes that the fitted family is correct ({self.family}); errors of the family are not included",
         ]
         if self.n_sim:
             lines.append(f"  p of the refits from a further {self.n_sim:,} simulations under their mixture")

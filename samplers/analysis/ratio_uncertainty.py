@@ -47,7 +47,7 @@ class RatioUncertainty:
         ...     family="1 component, log gaps")
         >>> print(found)
         base distribution 95 %  1.1 to 2.9 (38 + 15 events of 17 scenes, 3 refits)
-          if the truth is of the fitted family (1 component, log gaps); another family is not covered
+          assumes that the fitted family is correct (1 component, log gaps); errors of the family are not included
     """
 
     ratio: float
@@ -84,7 +84,7 @@ class RatioUncertainty:
         lines = [
             f"base distribution {100 * self.confidence:g} %  {low:.2g} to {high:.2g} "
             f"({self.fitted_to}, {len(self.ratio_refits)} refits)",
-            f"  if the truth is of the fitted family ({self.family}); another family is not covered",
+            f"  assumes that the fitted family is correct ({self.family}); errors of the family are not included",
         ]
         if self.n_sim:
             lines.append(f"  under the refits from a further {self.n_sim:,} simulations under their mixture")

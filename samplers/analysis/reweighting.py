@@ -86,7 +86,7 @@ class Reweighted:
         return (
             f"P[f <= {self.gamma:g}] = {self.p:.3e} under the new base, {self.ratio:.3g} times that under the old\n"
             f"  {100 * self.confidence:g} % interval [{low:.3e}, {high:.3e}], c.o.v. {self.cov:.3g}; "
-            f"effectively {self.ess:.0f} failing points from {self.units:.0f} independent units"
+            f"effective sample size {self.ess:.0f} failing points, {self.units:.0f} independent units"
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -226,9 +226,9 @@ def check_enough(estimate: WeightedEstimate, ess: float, units: float) -> None:
     if ess >= MIN_POINTS and units >= MIN_UNITS:
         return
     raise ValueError(
-        f"The failing points of this run are worth {ess:.1f} points from {units:.1f} independent units under the new "
-        f"base; at least {MIN_POINTS:g} and {MIN_UNITS:g} are needed. Estimate again with the new base, or start "
-        f"from a run with more failing points (it has {estimate.failures.total:,})."
+        f"Under the new base the failing points have an effective sample size of {ess:.1f}, from {units:.1f} "
+        f"independent units; at least {MIN_POINTS:g} and {MIN_UNITS:g} are needed. Estimate again with the new base, "
+        f"or start from a run with more failing points (it has {estimate.failures.total:,})."
     )
 
 

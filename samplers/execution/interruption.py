@@ -36,7 +36,7 @@ class EstimationInterrupted(KeyboardInterrupt):
     def __init__(self, estimate: Estimate) -> None:
         self.estimate = estimate
         """The estimate from the simulations made so far."""
-        super().__init__(f"Interrupted after {estimate.n_sim:,} simulations, which say (`estimate` of this error):")
+        super().__init__(f"Interrupted after {estimate.n_sim:,} simulations; the estimate so far (`.estimate`):")
         self.args = (f"{self.args[0]}\n{estimate}",)
 
 

@@ -181,7 +181,7 @@ class Run:
         """
         if self.done:
             return
-        self._stopped = f"{why} after {self._log.n_sim:,} simulations, before the method had come to its end."
+        self._stopped = f"{why} after {self._log.n_sim:,} simulations, before the method had finished."
         self._asked = False
         self._replicates = [replicate for replicate in self._replicates if replicate.n_sim] or self._replicates[:1]
         for replicate in self._replicates:

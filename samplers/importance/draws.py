@@ -187,7 +187,7 @@ def describe_low_ess(draws: Draws) -> list[str]:
     """Return a sentence where the failing draws, one or more, are worth few independent ones."""
     if draws.ess >= LOW_ESS:
         return []
-    return [f"The failing draws are worth {draws.ess:.0f} independent ones: the estimate is coarse."]
+    return [f"Effective sample size of the failing draws: {draws.ess:.0f}; the estimate is coarse."]
 
 
 def heavy_draw_warnings(draws: Draws) -> list[str]:
@@ -195,4 +195,4 @@ def heavy_draw_warnings(draws: Draws) -> list[str]:
     share = largest_weight_share(draws.log_weights)
     if share <= LARGE_SHARE:
         return []
-    return [f"One draw carries {100 * share:.0f} % of p: failures lie where the proposal hardly reaches."]
+    return [f"One draw carries {100 * share:.0f} % of p: the proposal barely covers some failures."]

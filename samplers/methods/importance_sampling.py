@@ -183,8 +183,8 @@ def unreached_share(search: Search, theta: FloatArray, inputs: Inputs, gamma: fl
 def _tilt_warnings(search: Search, gamma: float, missed: float) -> list[str]:
     """Return the warning about a search that did not end well."""
     if missed > MOST_UNREACHED:
-        where = f"{100 * missed:.0f} % of the points found lie where the tilt does not lead"
-        return [f"{where}: base draws take its place."]
+        where = f"{100 * missed:.0f} % of the failing points found lie outside the tilted distribution"
+        return [f"{where}: draws from the base distribution replace it."]
     return search_warnings(search, gamma)
 
 
@@ -192,4 +192,4 @@ def _stop_warnings(status: Status, cov: float, target: float) -> list[str]:
     """Return the warning about draws that were used up before the target was met."""
     if status is not Status.BUDGET:
         return []
-    return [f"The draws were used up at a c.o.v. of {cov:.3g}, not {target:.3g}: the interval is wider than wanted."]
+    return [f"All draws were used at a c.o.v. of {cov:.3g}, above the target {target:.3g}."]

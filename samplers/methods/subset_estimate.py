@@ -173,7 +173,7 @@ def _end_warnings(depth: int, status: Status, hits: int, cov: float) -> list[str
     """Return what the end of the run at level `depth` and its failures leave doubtful."""
     found = []
     if status is Status.STALLED:
-        found.append(f"No progress beyond level {depth}: f ties there or the number of levels is used up.")
+        found.append(f"No progress beyond level {depth}: f is constant there, or the limit on levels was reached.")
     if status is Status.BUDGET:
         found.append(f"max_sim was used up at level {depth}; p rests on {hits} failing points.")
     if status is Status.STOPPED:

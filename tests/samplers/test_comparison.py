@@ -141,10 +141,14 @@ def test_a_budget_is_for_both(max_sim):
 def test_without_failures_of_one_the_text_has_a_bound():
     a, never = half_space(2.0, [1.0, 0]), half_space(30.0, [1.0, 0])
     above, below = samplers.compare(a, never, seed=0, max_sim=4000), samplers.compare(never, a, seed=0, max_sim=4000)
-    assert str(above).startswith(f"p_A / p_B above {above.interval[0]:.3g} (95 % one-sided bound; B did not fail)")
-    assert str(below).startswith(f"p_A / p_B below {below.interval[1]:.3g} (95 % one-sided bound; A did not fail)")
+    assert str(above).startswith(
+        f"p_A / p_B above {above.interval[0]:.3g} (95 % one-sided bound; no failure of B was found)"
+    )
+    assert str(below).startswith(
+        f"p_A / p_B below {below.interval[1]:.3g} (95 % one-sided bound; no failure of A was found)"
+    )
     neither = samplers.compare(never, never, "mc", seed=0, max_sim=200)
-    assert str(neither).startswith("p_A / p_B not known (neither failed)")
+    assert str(neither).startswith("p_A / p_B not known (no failure of A or B was found)")
     for found in (above, below, neither):
         assert "inf" not in str(found) + repr(found) + found._repr_html_()
         assert "nan" not in str(found) + repr(found) + found._repr_html_()

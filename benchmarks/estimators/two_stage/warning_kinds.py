@@ -40,8 +40,8 @@ def name_kind(text: str) -> str:
     """Return the first words of a warning, numbers replaced by n.
 
     Example:
-        >>> name_kind("2,197 draws are worth 31 failures: there may be heavier weights than any met.")
-        'n draws are worth n failures'
+        >>> name_kind("Effective sample size of 2,197 draws: 31 failures; larger weights may be missing.")
+        'Effective sample size of n draws'
     """
     return " ".join(re.sub(r"[\d,.e-]*\d[\d,.e+-]*", "n", text).split()[:WORDS]).rstrip(":")
 

@@ -90,7 +90,7 @@ def print_report(report: Report, out: Path | None = None) -> None:
     rows = (
         ("c.o.v.", "not known" if math.isinf(estimate.cov) else f"{estimate.cov:.3f}"),
         ("simulations", f"{estimate.n_sim:,} in {report.seconds:.1f} s by {question.core}"),
-        ("given that", estimate.proviso),
+        ("valid", estimate.proviso),
         ("gain", _format_gain(estimate)),
         ("method", f"{estimate.method.name}, seed {estimate.seed}, {estimate.status}"),
         *([("chosen", estimate.choice)] if estimate.chose_another else []),
@@ -116,7 +116,7 @@ def print_report(report: Report, out: Path | None = None) -> None:
         console.print(f"note: {note}")
     if question.method != "mc" and question.ego != "idm" and estimate.p < estimate.unseen:
         n = float(f"{ENOUGH / estimate.p:.1g}") if estimate.p > ENOUGH / MANY else MANY
-        console.print(f"check it: --method mc --max-sim {n:.0f} finds ways to crash that f does not announce")
+        console.print(f"check: --method mc --max-sim {n:.0f} does not rely on a search")
     if out is not None:
         names = ", ".join(path.name for path in sorted(out.iterdir()) if path.is_file())
         console.print(f"written to {out}: {names}")
@@ -197,7 +197,7 @@ def _print_failure(console: Console, report: Report) -> None:
     ordinary = draw_ordinary(space)
     console.print(
         f"  most likely of {failures.total:,} failures found (f = {failures.f[0]:.3g}; "
-        "in brackets where nine of ten ordinary scenarios lie):"
+        "in brackets the central 90 % of ordinary scenarios):"
     )
     if report.crashes[0] is not None:
         console.print(f"    {_summarise_crash(report.crashes[0])}")

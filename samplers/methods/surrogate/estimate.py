@@ -69,4 +69,4 @@ class EstimateDraws:
         n, failing = self.kinds[:, SURROGATE]
         if failing >= least * n:
             return []
-        return [f"Only {failing:.0f} of {n:.0f} draws that the surrogate proposed failed: it describes f poorly."]
+        return [f"Only {failing:.0f} of {n:.0f} draws proposed by the surrogate failed: it fits f poorly."]

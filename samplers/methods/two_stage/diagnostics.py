@@ -23,7 +23,7 @@ def check_base_draws(
     if hits == 0 or bdtrc(hits - 1, n, min(p, 1.0)) > settings.false_alarm:
         return []
     expected = n * p
-    return [f"{hits} of {n:,} base draws failed; with p = {p:.2e} {expected:.2g} are expected: p misses failures."]
+    return [f"{hits} of {n:,} base draws failed, but p = {p:.2e} predicts {expected:.2g}: a failure region was missed."]
 
 
 def check_rounds(
@@ -43,7 +43,7 @@ def check_rounds(
     apart = abs(before - final.p) / math.hypot(error, final.cov * final.p)
     if apart < settings.max_deviation:
         return []
-    return [f"The rounds before the estimate say {before:.2e}, {apart:.1f} standard errors from it."]
+    return [f"The search rounds give p = {before:.2e}, {apart:.1f} standard errors from the final estimate."]
 
 
 def check_efficiency(final: StratifiedSample, settings: DiagnosticSettings = DEFAULT_SETTINGS.diagnostics) -> list[str]:
@@ -51,7 +51,7 @@ def check_efficiency(final: StratifiedSample, settings: DiagnosticSettings = DEF
     draws = final.draws
     if len(draws.f) == 0 or draws.ess >= settings.min_final_rate * draws.n:
         return []
-    return [f"{draws.n:,} draws are worth {draws.ess:.0f} failures: there may be heavier weights than any met."]
+    return [f"Effective sample size of {draws.n:,} draws: {draws.ess:.0f} failures; larger weights may be missing."]
 
 
 def check_regions(final: StratifiedSample, settings: DiagnosticSettings = DEFAULT_SETTINGS.diagnostics) -> list[str]:
@@ -64,7 +64,7 @@ def check_regions(final: StratifiedSample, settings: DiagnosticSettings = DEFAUL
     if lost == 0 or len(final.draws.f) == 0:
         return []
     return [
-        f"The draws hardly reach {lost} of {len(share)} regions found: a point there would be {share.max():.0%} of p."
+        f"The proposal barely covers {lost} of {len(share)} regions found: one draw there adds {share.max():.0%} of p."
     ]
 
 
@@ -76,6 +76,6 @@ def check_discovery(
     if share <= settings.max_unseen_share:
         return []
     return [
-        f"Only {discovery.lineages:.0f} independent searches reached failure: regions with "
-        f"{p * share / (1 - share):.1e} more, {share:.0%} of p, cannot be excluded."
+        f"Only {discovery.lineages:.0f} independent searches reached failure: further failure regions with probability "
+        f"up to {p * share / (1 - share):.1e} ({share:.0%} of p) cannot be excluded."
     ]

@@ -56,7 +56,7 @@ def reconcile(subset_outcome: Outcome, earlier: Outcome) -> Outcome:
         min(earlier.interval[0], subset_outcome.interval[0]),
         max(earlier.interval[1], subset_outcome.interval[1]),
     )
-    about = f"Subset simulation, with the rest, missed regions that were found before: its p is {subset_outcome.p:.1e}."
+    about = f"Subset simulation, which took over, missed failure regions found before; it gives {subset_outcome.p:.1e}."
     warnings = (*earlier.warnings, *subset_outcome.warnings, about)
     remarks = (*earlier.remarks, *subset_outcome.remarks)
     return replace(earlier, interval=interval, status=subset_outcome.status, warnings=warnings, remarks=remarks)
@@ -90,8 +90,8 @@ def run_subset_simulation(
     known = known and known.select(np.arange(min(n, len(known.f))))
     outcome = yield from AdaptiveSubsetSimulation(n=n).steps(inputs, replace(goal, max_sim=budget), rng, known)
     about = (
-        "No proposal describes the failures: p is from adaptive subset simulation with what was left, "
-        f"{budget:,} simulations; by itself (adss) it would have had all of them."
+        "No proposal describes the failures: p is from adaptive subset simulation with the remaining "
+        f"{budget:,} simulations; run by itself (--method adss) it uses all of them."
     )
     counted_before = 0 if known is None else len(known.f)
     return replace(outcome.remark_first(about), base_draws=outcome.base_draws - counted_before)

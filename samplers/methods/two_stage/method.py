@@ -168,5 +168,5 @@ def _explore_and_estimate(
     if budget >= settings.sufficient_budget:
         return outcome
     enough = settings.sufficient_budget
-    about = f"An exploration within {budget:,} simulations may miss regions without notice ({enough:,} are enough)."
+    about = f"A search of only {budget:,} simulations may miss failure regions ({enough:,} are recommended)."
     return replace(outcome, warnings=(*outcome.warnings, about))

@@ -171,7 +171,7 @@ def test_on_the_command_line(cli: Cli, frail: Path, risky: str, monkeypatch: pyt
     assert "simulations are kept; go on with: rare-envs resume run" in ended.stderr
     again = cli(*words)
     assert (again.exit_code, again.stdout) == (2, "")
-    assert "go on with it by rare-envs resume run" in again.stderr
+    assert "continue it with rare-envs resume run" in again.stderr
     monkeypatch.setenv("FRAIL", "stop")
     (frail / "left").write_text("60")
     stopped = cli("resume", "run")

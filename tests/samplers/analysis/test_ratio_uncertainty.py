@@ -89,7 +89,7 @@ def test_two_sides_of_one_run():
     assert math.log(ratio.interval[1] / ratio.interval[0]) < 0.5 * math.log(whole.interval[1] / whole.interval[0])
     text = str(found)
     assert f"  base distribution 95 %  {ratio.interval[0]:.2g} to {ratio.interval[1]:.2g} (38 + 15 events" in text
-    assert "another family is not covered" in text
+    assert "errors of the family are not included" in text
     assert json.loads(json.dumps(found.to_dict()))["base_uncertainty"]["ratio_refits"] == list(ratio.ratio_refits)
 
 

@@ -140,12 +140,12 @@ def test_subset_simulation_counts_paths_not_points():
 
 @pytest.mark.parametrize("method", ["mc", "ce", "adss"])
 def test_a_base_too_far_away_is_refused(method):
-    with pytest.raises(ValueError, match=r"worth .* points from .* at least 30 and 5 .* Estimate again"):
+    with pytest.raises(ValueError, match=r"effective sample size of .*, from .* at least 30 and 5 .* Estimate again"):
         run(method).reweight(Normal(7.0, sd=0.3))
 
 
 def test_a_base_without_mass_among_the_failures_is_refused():
-    with pytest.raises(ValueError, match=r"worth 0\.0 points"):
+    with pytest.raises(ValueError, match=r"effective sample size of 0\.0,"):
         run().reweight(OnlyDensity(Uniform(-0.5, 0.5)))
 
 
@@ -255,5 +255,5 @@ def test_points_without_an_outcome_are_not_in_the_lower_end_where_they_only_boun
 def test_what_it_says_of_itself():
     found = run().reweight(Normal(0.5))
     assert json.loads(json.dumps(found.to_dict(), allow_nan=False))["p"] == found.p
-    for part in ("P[f <= 0] =", "under the new base", "95 % interval", "effectively"):
+    for part in ("P[f <= 0] =", "under the new base", "95 % interval", "effective sample size"):
         assert part in str(found)

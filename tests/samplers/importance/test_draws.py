@@ -86,7 +86,7 @@ def test_bernstein_bound_is_that_of_the_theorem():
 
 
 def test_doubts_are_of_few_and_of_heavy_draws():
-    assert "worth 29" in weight_warnings(equal(29))[0]
+    assert "draws: 29;" in weight_warnings(equal(29))[0]
     assert weight_warnings(equal(31)) == []
     others = [1.0] * 100
     assert weight_warnings(weighing(*others, 17.5)) == []  # 14.9 %

@@ -41,11 +41,14 @@ class UnreachedTerms(NamedTuple):
 
     def describe(self, p: float) -> tuple[str, ...]:
         """Return remarks on them, for an estimate p."""
-        share = f", {self.limit / p:.0e} of p," if p > 0 else ""
-        bound = f"a half-space of more than {self.limit:.0e}{share} would have been hit by the first draws"
-        parts = (("no search on one alone reached failure", self.searched), ("not searched alone", self.unsearched))
+        share = f" ({self.limit / p:.0e} of p)" if p > 0 else ""
+        bound = f"the first draws rule out a half-space with probability above {self.limit:.0e}{share}"
+        parts = (
+            ("searched one by one without reaching failure", self.searched),
+            ("not searched one by one", self.unsearched),
+        )
         return tuple(
-            f"Terms that were the least somewhere, no failure known ({how}): {_list_names(names)}; {bound}."
+            f"Terms that were smallest at some points but have no known failure ({how}): {_list_names(names)}; {bound}."
             for how, names in parts
             if names
         )

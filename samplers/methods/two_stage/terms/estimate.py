@@ -112,12 +112,12 @@ def doubt(combined: CombinedRounds, pursued: list[int], settings: DoubtSettings)
     ess = effective_number(last)
     if 0 < ess < settings.min_ess:
         warnings.append(
-            f"The failing draws of the last round are worth {ess:.0f} independent ones: it knows no spread."
+            f"Effective sample size of the last round's failing draws: {ess:.0f}; its standard error is unreliable."
         )
     failing = last[last > 0]
     if len(failing) and largest_weight_share(np.log(failing)) > settings.max_point_share:
         warnings.append(f"One draw carries more than {100 * settings.max_point_share:.0f} % of the last round.")
     other = combined.share_of_others(pursued)
     if other > settings.max_other_share:
-        warnings.append(f"{100 * other:.0f} % of p are failures of terms that no proposal was made for.")
+        warnings.append(f"{100 * other:.0f} % of p comes from terms without a proposal of their own.")
     return warnings

@@ -50,7 +50,7 @@ def test_what_to_check_is_said_where_something_may_be_missed(cli: Cli, here: Pat
     (here / "careful.py").write_text("def make():\n    return 'idm'\n")
     words = ("estimate", FOLLOWING, "--method", "adss", "--max-sim", 2000, "--base")
     assert "check it" not in cli(*words, risky, "--ego", "egos_here:coasting").stdout  # base draws saw it often
-    assert "check it: --method mc --max-sim 300000" in cli(*words, safe, "--ego", "careful:make").stdout
+    assert "check: --method mc --max-sim 300000" in cli(*words, safe, "--ego", "careful:make").stdout
 
 
 class Fitted:

@@ -46,7 +46,7 @@ def test_a_surrogate_without_skill_says_so():
     """Every point fails by chance of its own: nothing can be learned."""
     rng = np.random.default_rng(5)
     result = run(lambda u: np.where(rng.random(len(u)) < 0.01, -1.0, 1.0), 4)
-    assert any("describes f poorly" in text for text in result.warnings)
+    assert any("fits f poorly" in text for text in result.warnings)
     assert result.interval[0] <= 0.01 <= result.interval[1]
 
 

@@ -99,4 +99,4 @@ def test_few_lineages(lineages, warns):
     found = check_discovery(1e-3, Discovery(lineages), 0.95)
     assert bool(found) == warns
     if lineages == 2:
-        assert "8.4e-04 more, 46% of p" in found[0]
+        assert "up to 8.4e-04 (46% of p)" in found[0]

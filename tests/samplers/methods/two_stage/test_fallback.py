@@ -54,7 +54,7 @@ def test_what_subset_simulation_found_gives_way_to_more_that_was_known():
     assert kept.interval == (5e-6, 9e-5)
     assert kept.status is samplers.Status.CONVERGED
     assert kept.warnings[:2] == ("old", "new")
-    assert "missed regions" in kept.warnings[2]
+    assert "missed failure regions" in kept.warnings[2]
     assert "1.0e-05" in kept.warnings[2]
     wide = reconcile(replace(found, interval=(1e-6, 1e-3)), known)
     assert wide.interval == (1e-6, 1e-3)

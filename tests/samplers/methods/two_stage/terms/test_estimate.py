@@ -55,7 +55,7 @@ def test_failures_of_terms_that_nobody_pursued_are_told():
     round_ = final_round(np.ones(100), least=np.repeat([0, 1], [90, 10]))
     combined = CombinedRounds((round_,), 0.0)
     assert combined.share_of_others([0]) == pytest.approx(0.1)
-    assert any("no proposal was made for" in text for text in doubt(combined, [0], DoubtSettings()))
+    assert any("without a proposal of their own" in text for text in doubt(combined, [0], DoubtSettings()))
     assert doubt(combined, [0, 1], DoubtSettings()) == []
     few = CombinedRounds((final_round(np.ones(100), least=np.repeat([0, 1], [96, 4])),), 0.0)
     assert doubt(few, [0], DoubtSettings()) == []  # up to 5 % of p are no reason
@@ -66,5 +66,5 @@ def test_a_last_round_that_few_draws_carry_is_told():
     y[:4] = [10.0, 1.0, 1.0, 1.0]
     combined = CombinedRounds((final_round(np.ones(500)), final_round(y)), 0.0)
     warnings = doubt(combined, [0], DoubtSettings())
-    assert any("last round are worth 2 independent" in text for text in warnings)
+    assert any("last round's failing draws: 2;" in text for text in warnings)
     assert any("more than 25 % of the last round" in text for text in warnings)

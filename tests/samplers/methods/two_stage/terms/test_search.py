@@ -164,7 +164,7 @@ def test_failures_of_a_term_that_nobody_pursued_are_told(half_spaces, known):
         return -normals[term] if known else np.where(term[:, None] == 0, -normals[term], np.nan)
 
     result = runs(half_spaces(40, 0.03, shares=(0.7, 0.3), gradient=gradient)[0], [3], max_sim=20_000)[0]
-    assert any("terms that no proposal was made for" in text for text in result.warnings) != known
+    assert any("terms without a proposal of their own" in text for text in result.warnings) != known
     check([result], exact)
 
 
