@@ -45,8 +45,8 @@ distribution named with it: the probability of a collision within {horizon:g} s 
 [two methods](estimates.md), simulations, wall time, number of warnings, and the likeliest failure that `two-stage`
 found (`python -m benchmarks.driving.egos`). The
 intervals are those of sampling; the events behind a base distribution leave p open by far more
-([the events behind it](estimates.md#the-events-behind-the-base-distribution)). The bases are the defaults but for
-car-following: under its default, `us101`, `idm` has 7.4e-11 and in 6,000 simulations of `imitation` nothing fails;
+([the events behind it](base_uncertainty.md#the-events-behind-the-base-distribution)). The bases are the defaults but
+for car-following: under its default, `us101`, `idm` has 7.4e-11 and in 6,000 simulations of `imitation` nothing fails;
 `us101-gap` is a test distribution under which egos and methods can be compared.
 
 `vision` has {most:,} simulations at most, which take a quarter of an hour. {missing}
@@ -72,7 +72,7 @@ print(samplers.estimate(problem, seed=0, max_sim=1500))
 ```text
 P[f <= 0] = 4.39e-03
   95 % interval [3.32e-03, 6.45e-03], c.o.v. 0.135
-  base distribution 95 %  5.2e-04 to 3.7e-02 (38 + 15 events of 17 scenes, 30 refits); ... 7e-03
+  base distribution 95 %  5.2e-04 to 3.7e-02 (38 + 15 events of 17 scenes, 30 refits); predictive mean 7e-03
     assumes that the fitted family is correct (1 component, log gaps); errors of the family are not included
   1,500 simulations, gain over Monte Carlo 8.33; two-stage, seed 0, converged; 707 failing points
   valid unless a failure region with probability above 1.8e-02 was missed (166 base draws found no other)

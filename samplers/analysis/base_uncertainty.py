@@ -106,7 +106,7 @@ class BaseUncertainty:
         if self.interval is not None:
             low, high = self.interval
             first = f"{100 * self.confidence:g} %  {low:.1e} to {high:.1e} {behind}"
-            first += "" if self.expected is None else f"; predictive probability for a new event {self.expected:.0e}"
+            first += "" if self.expected is None else f"; predictive mean {self.expected:.0e}"
         elif self.bound is not None:
             below = f"below {self.bound:.1e} in this family" if self.bound < 1 else "nor an upper end in this family"
             first = f" the events do not determine p; {below} {behind}"

@@ -97,7 +97,7 @@ def risk_command(
     force: ForceOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Estimate collisions per million km, over scenarios that count nothing twice, with an honest interval."""
+    """Estimate collisions per million km, summed over scenarios, with an interval."""
     from rare_envs.study.rates.total_risk import risk
 
     with (

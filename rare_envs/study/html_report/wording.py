@@ -114,7 +114,7 @@ def describe_intervals(result: Result) -> list[tuple[str, str, str]]:
             (
                 f"{100 * float(base.get('confidence') or 0.95):g} %, base distribution",
                 text,
-                f"what the recorded events allow ({base.get('fitted_to', '')}); predictive probability for a new event "
+                f"what the recorded events allow ({base.get('fitted_to', '')}); predictive mean "
                 f"{format_probability(base.get('expected'), p)}",
             )
         )

@@ -86,7 +86,7 @@ def test_events_that_do_not_determine_p_give_a_bound_and_no_interval():
     half = 2.119905 * math.sqrt(found.spread**2 + result.cov**2 + 0.04)
     assert found.bound == pytest.approx(min(1.0, result.p * math.exp(half)), rel=1e-6)
     assert "the events do not determine p; nor an upper end in this family" in str(result)
-    assert "predictive probability for a new event" not in str(result)
+    assert "predictive mean" not in str(result)
     assert "do not determine p; below 1.0e-02 in this family" in str(replace(found, bound=0.01))
 
 
@@ -114,7 +114,7 @@ def test_the_lines_stand_under_the_sampling_interval():
     assert lines[1].startswith("  95 % interval [")
     assert lines[2] == (
         f"  base distribution 95 %  {low:.1e} to {high:.1e} (38 + 15 events of 17 scenes, 30 refits); "
-        f"predictive probability for a new event {found.expected:.0e}"
+        f"predictive mean {found.expected:.0e}"
     )
     assert lines[3] == (
         "    assumes that the fitted family is correct (1 component, log gaps); errors of the family are not included"
@@ -167,7 +167,7 @@ def test_refits_of_which_each_is_of_a_family_of_its_own_have_the_spread_of_all()
     one, apart = run(BASE), run(fitted(SHIFTED, EachOfItsOwnFamily))
     assert apart.base_uncertainty == one.base_uncertainty
     (line,) = (each for each in str(apart).splitlines() if "base distribution" in each)
-    assert " to " in line and "(38 + 15 events of 17 scenes, 30 refits); predictive probability for a new event" in line
+    assert " to " in line and "(38 + 15 events of 17 scenes, 30 refits); predictive mean" in line
 
 
 @pytest.mark.parametrize("max_sim", [1, 2, 20])

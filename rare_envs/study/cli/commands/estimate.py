@@ -105,7 +105,7 @@ def resume_command(
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Go on with a run whose ego has gone, or that was stopped; the answer is that of an undisturbed run."""
+    """Continue an interrupted run; the result is the same as without the interruption."""
     from rare_envs.study.evaluate import resume
 
     with show_what_is_known(lambda known: show_report(known, None, as_json)), keep_stdout_for_the_answer():

@@ -29,7 +29,7 @@ def replay_command(
     trust: TrustOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Drive a failure that a run has found again, and show it with its measure over time."""
+    """Replay a failure that a run has found, and show it with its measure over time."""
     from rare_envs.study.corpus.trial import find_for_ego
     from rare_envs.study.replay import drive_again
     from rare_envs.study.video import REPLAY_TOLERANCE, check_film_path, describe_drive, find_failure, write_film

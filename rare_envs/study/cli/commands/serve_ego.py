@@ -22,7 +22,7 @@ def serve_ego_command(
     stats: StatsOption = None,
     trust: TrustOption = False,
 ) -> None:
-    """Lend an ego to simulations in other processes or on other machines (estimate --ego tcp://...)."""
+    """Serve an ego to simulations in other processes or on other machines (estimate --ego tcp://...)."""
     serve_ego(ego, bind, algo=algo, trust=trust, stats=stats)
 
 
