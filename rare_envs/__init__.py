@@ -4,9 +4,11 @@ from typing import TYPE_CHECKING, Any
 
 from rare_envs.plugins import make_lazy_getattr
 from rare_envs.registration import (
+    env,
     ignore_version_warnings,
     make_batch,
     parallel_env,
+    raw_env,
     register_envs,
     register_scenario,
 )
@@ -35,10 +37,12 @@ __all__ = [
     "HighwayEnvScenario",
     "ScenarioSpace",
     "TruncatedGaussianMixture",
+    "env",
     "highway_env_problem",
     "load_study",
     "make_batch",
     "parallel_env",
+    "raw_env",
     "register_scenario",
     "risk",
 ]

@@ -11,6 +11,8 @@ from gymnasium.vector import VectorEnv
 from rare_envs.scenarios.registry import HIGHWAY_ENV_LAYOUT, SCENARIOS, kinematics_id, split_layout
 
 if TYPE_CHECKING:
+    from pettingzoo import AECEnv
+
     from rare_envs.envs.parallel import DrivingParallelEnv
     from rare_envs.scenarios.base import Scenario
 
@@ -88,16 +90,57 @@ def parallel_env(env_id: str, **kwargs: Any) -> DrivingParallelEnv:
     return DrivingParallelEnv(env_id, **{**layout, **kwargs})
 
 
+def raw_env(env_id: str, **kwargs: Any) -> AECEnv[str, Any, Any]:
+    """Return PettingZoo's AEC environment of an id: `parallel_env` with one agent acting after the other.
+
+    Args:
+        env_id: For example "rare_envs/CutIn-v0".
+        **kwargs: As for `parallel_env`.
+
+    Example:
+        >>> raw_env("rare_envs/CutIn-v0").possible_agents
+        ['ego', 'cutter', 'lead']
+
+    Raises:
+        ValueError: If the id or an argument is unknown.
+    """
+    from pettingzoo.utils.conversions import parallel_to_aec_wrapper
+
+    return parallel_to_aec_wrapper(parallel_env(env_id, **kwargs))
+
+
+def env(env_id: str, **kwargs: Any) -> AECEnv[str, Any, Any]:
+    """Return `raw_env` behind PettingZoo's usual wrapper, which refuses calls in a wrong order.
+
+    Args:
+        env_id: For example "rare_envs/CutIn-v0".
+        **kwargs: As for `parallel_env`.
+
+    Example:
+        >>> game = env("rare_envs/CutIn-v0")
+        >>> game.reset(seed=0)
+        >>> game.agent_selection, game.state_space.shape
+        ('ego', (3, 4))
+
+    Raises:
+        ValueError: If the id or an argument is unknown.
+    """
+    from pettingzoo.utils import OrderEnforcingWrapper
+
+    return OrderEnforcingWrapper(raw_env(env_id, **kwargs))
+
+
 def make_batch(env_id: str, num_envs: int, **kwargs: Any) -> VectorEnv[Any, Any, Any]:
     """Return the batched VectorEnv of an id: `gym.make_vec` with its vector entry point.
 
     Args:
         env_id: For example "rare_envs/CutIn-v0".
         num_envs: Number of scenarios.
-        **kwargs: Keyword arguments of `gym.make` for the id.
+        **kwargs: `autoreset_mode`, see `rare_envs.envs.vector.DrivingVectorEnv`, and keyword arguments of `gym.make`
+            for the id.
 
     Returns:
-        The environment, autoreset mode SAME_STEP.
+        The environment, autoreset mode SAME_STEP unless another one is named.
 
     Example:
         >>> batch = make_batch("rare_envs/CutIn-v0", num_envs=8)

@@ -107,6 +107,14 @@ class DrivingParallelEnv(ParallelEnv[str, SingleObservation, NDArray[np.float32]
         """Return the space of an agent's actions."""
         return self.action_spaces[agent]
 
+    @property
+    def state_space(self) -> "spaces.Box[np.float32]":
+        """Space of `state`: any finite numbers, shape (N, 4), speeds not negative."""
+        most = float(np.finfo(np.float32).max)
+        low = np.full((self.world.scenario.vehicles, 4), -most, dtype=np.float32)
+        low[:, 3] = 0.0
+        return spaces.Box(low, most, dtype=np.float32)
+
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, SingleObservation], dict[str, Info]]:

@@ -32,10 +32,12 @@ from rare_envs.traffic.crash import CRASH_KINDS, NONE
 
 
 class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]]):
-    """`DrivingEnv` for a whole batch, with Gymnasium's SAME_STEP autoreset.
+    """`DrivingEnv` for a whole batch, with Gymnasium's autoreset modes, SAME_STEP unless another one is asked for.
 
-    An episode that ends is replaced within the step by one drawn from the base distribution; its last observation
-    and info are in `infos["final_obs"]` and `infos["final_info"]`. One generator draws for the whole batch.
+    With SAME_STEP an episode that ends is replaced within the step by one drawn from the base distribution; its last
+    observation and info are in `infos["final_obs"]` and `infos["final_info"]`. With NEXT_STEP the next step replaces
+    it, whose action does not count and whose reward is 0. With DISABLED a `reset` with options={"reset_mask": rows}
+    does. One generator draws for the whole batch.
 
     Example:
         >>> env = DrivingVectorEnv("rare_envs/CutIn-v0", num_envs=3)
@@ -50,13 +52,21 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         "autoreset_mode": AutoresetMode.SAME_STEP,
     }
 
-    def __init__(self, env_id: str, num_envs: int = 1, render_mode: str | None = None, **kwargs: Any) -> None:
+    def __init__(
+        self,
+        env_id: str,
+        num_envs: int = 1,
+        render_mode: str | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+        **kwargs: Any,
+    ) -> None:
         """Make the batch.
 
         Args:
             env_id: The scenario's registered id.
             num_envs: Number of scenarios.
             render_mode: None or "rgb_array" (one image for each scenario).
+            autoreset_mode: Gymnasium's, or its value: "SameStep", "NextStep" or "Disabled".
             **kwargs: See `rare_envs.make.set_up`.
 
         Raises:
@@ -66,9 +76,11 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
             raise ValueError(f"Expected num_envs of at least 1, got {num_envs!r}.")
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"Expected render_mode None or 'rgb_array' for a batch, got {render_mode!r}.")
+        self._mode = read_autoreset_mode(autoreset_mode)
         world, self.space = set_up(env_id, **kwargs)
         self.world = world.with_statistics()
-        self.metadata = {**self.metadata, "render_fps": self.world.clock.decisions_per_second}
+        frames = self.world.clock.decisions_per_second
+        self.metadata = {**self.metadata, "render_fps": frames, "autoreset_mode": self._mode}
         self.num_envs = int(num_envs)
         self.render_mode = render_mode
         self.single_observation_space = self.world.observation_space
@@ -77,6 +89,8 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._x = np.full((num_envs, self.space.dim), np.nan)
         self._tick = np.zeros(num_envs, dtype=np.int64)
+        self._ended = np.zeros(num_envs, dtype=bool)
+        """Episodes that are over and were not replaced yet."""
         self._episode: Episode | None = None
         self._renderer: Renderer | None = None
 
@@ -88,7 +102,8 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         Args:
             seed: Seeds the one generator of the batch; a list is taken as one seed.
             options: Scenario parameters by name, scalars or arrays of shape (num_envs,), or {"x": (d,) or
-                (num_envs, d)}; what is not given is drawn as in `DrivingEnv.reset`.
+                (num_envs, d)}; what is not given is drawn as in `DrivingEnv.reset`. "reset_mask", boolean of shape
+                (num_envs,), names the R episodes to start, with arrays of as many values; the others go on.
 
         Returns:
             Observations, shape (num_envs, F), and infos.
@@ -100,57 +115,107 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
             self._np_random = np.random.default_rng([s for s in seed if s is not None] or None)
         else:
             super().reset(seed=seed)
-        self._x = self.space.scenario_x(options, self.num_envs, self.np_random)
-        self._tick[:] = 0
-        with torch.inference_mode():
-            self._episode = self._start(self._x)
-            observation = map_kinds(Tensor.numpy, observe(self._episode, self.world.sensing.observation))
-        return observation, self._info(self._episode, np.ones(self.num_envs, dtype=bool))
+        mask, options = self._read_mask(options)
+        if mask.all():
+            self._x = self.space.scenario_x(options, self.num_envs, self.np_random)
+            self._tick[:] = 0
+            with torch.inference_mode():
+                self._episode = self._start(self._x)
+        else:
+            self._replace(np.flatnonzero(mask), options)
+        self._ended[mask] = False
+        assert self._episode is not None
+        return self._observe(self._episode), self._info(self._episode, mask)
+
+    def _read_mask(self, options: dict[str, Any] | None) -> tuple[NDArray[np.bool_], dict[str, Any] | None]:
+        """Return which episodes `reset` is to start, and its other options."""
+        if options is None or "reset_mask" not in options:
+            return np.ones(self.num_envs, dtype=bool), options
+        mask = np.asarray(options["reset_mask"])
+        if mask.dtype != np.bool_ or mask.shape != (self.num_envs,) or not mask.any():
+            raise ValueError(
+                f"Expected reset_mask boolean of shape ({self.num_envs},) with at least one True, got {mask!r}."
+            )
+        if self._episode is None and not mask.all():
+            raise RuntimeError("Expected reset() of all episodes before one with reset_mask.")
+        return mask, {name: value for name, value in options.items() if name != "reset_mask"} or None
 
     def step(
         self, actions: NDArray[Any]
     ) -> tuple[NDArray[np.float32], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_], Info]:
-        """Carry out one decision each and replace the episodes that ended.
+        """Carry out one decision each; replace episodes that ended as the autoreset mode says.
 
         Raises:
             ValueError: If the actions have the wrong shape or are NaN.
+            RuntimeError: Before `reset`; with autoreset disabled, where an episode has ended and was not reset.
         """
         if self._episode is None:
             raise RuntimeError("Expected reset() before step().")
+        fresh = self._ended.copy()
+        if self._mode == AutoresetMode.DISABLED and fresh.any():
+            raise RuntimeError(
+                "Expected reset(options={'reset_mask': ...}) before step(): episodes "
+                f"{np.flatnonzero(fresh).tolist()} have ended and autoreset is disabled."
+            )
+        started = self._replace(np.flatnonzero(fresh)) if fresh.any() else None
         with torch.inference_mode():
-            given = read_actions(self.world.clock.action, torch.as_tensor(np.asarray(actions)), self.num_envs)
+            ignored = torch.from_numpy(fresh) if fresh.any() else None
+            given = read_actions(self.world.clock.action, torch.as_tensor(np.asarray(actions)), self.num_envs, ignored)
             episode, terms = advance(self.world, self._episode, given)
-            observation = map_kinds(Tensor.numpy, observe(episode, self.world.sensing.observation))
+            if started is not None:  # which do not move in the step that starts them
+                episode = merge_rows(episode, torch.from_numpy(np.flatnonzero(fresh)), started)
             reward = terms.total.double().numpy()
+        reward[fresh] = 0.0
         self._episode = episode
-        self._tick += self.world.clock.stride
-        terminated = episode.collided.numpy()
-        truncated = (self._tick >= self.world.clock.ticks) & ~terminated
-        done = terminated | truncated
-        infos: Info = {}
+        self._tick += np.where(fresh, 0, self.world.clock.stride)
+        terminated = episode.collided.numpy() & ~fresh
+        truncated = (self._tick >= self.world.clock.ticks) & ~terminated & ~fresh
+        observation, infos = self._finish(terms, terminated | truncated, fresh)
+        return observation, reward, terminated.copy(), truncated, infos
+
+    def _finish(
+        self, terms: RewardTerms, done: NDArray[np.bool_], fresh: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.float32], Info]:
+        """Return observations and infos after a step, and replace what ended if that is to be in the same step."""
+        assert self._episode is not None
+        episode, infos, everyone = self._episode, Info(), np.ones(self.num_envs, dtype=bool)
+        observation = self._observe(episode)
+        if self._mode != AutoresetMode.SAME_STEP:
+            self._ended = done.copy()
+            infos.update(self._info(episode, everyone))
+            put_masked(infos, "reward_terms", _terms(terms, ~fresh), ~fresh)
+            if done.any():
+                infos.update(self._end_info(episode, done))
+            return observation, infos
         if done.any():
             infos["final_obs"], infos["_final_obs"] = to_object_rows(observation, done), done.copy()
-            infos["final_info"], infos["_final_info"] = self._final_info(episode, terms, done), done.copy()
-            observation = self._replace(observation, done)
-        infos.update(self._info(self._episode, np.ones(self.num_envs, dtype=bool)))
+            infos["final_info"], infos["_final_info"] = self._info(episode, done), done.copy()
+            put_masked(infos["final_info"], "reward_terms", _terms(terms, done), done)
+            infos["final_info"].update(self._end_info(episode, done))
+            rows = np.flatnonzero(done)
+            observation = replace_rows(observation, rows, self._observe(self._replace(rows)))
+        infos.update(self._info(self._episode, everyone))
         put_masked(infos, "reward_terms", _terms(terms, ~done), ~done)
-        return observation, reward, terminated.copy(), truncated, infos
+        return observation, infos
+
+    def _observe(self, episode: Episode) -> Any:
+        with torch.inference_mode():
+            return map_kinds(Tensor.numpy, observe(episode, self.world.sensing.observation))
 
     def _start(self, x: NDArray[np.float64]) -> Episode:
         return self.world.start(torch.from_numpy(x).float())
 
-    def _replace(self, observation: Any, done: NDArray[np.bool_]) -> Any:
-        rows = np.flatnonzero(done)
+    def _replace(self, rows: NDArray[np.intp], options: dict[str, Any] | None = None) -> Episode:
+        """Start the episodes of some rows anew, and return them, a batch of R."""
         assert self._episode is not None
-        x = self.space.scenario_x(None, len(rows), self.np_random)
+        x = self.space.scenario_x(options, len(rows), self.np_random)
         self._x = self._x.copy()
         self._x[rows] = x
         self._tick[rows] = 0
         with torch.inference_mode():
-            fresh = self._start(x)
-            self._episode = merge_rows(self._episode, torch.from_numpy(rows), fresh)
-            seen = map_kinds(Tensor.numpy, observe(fresh, self.world.sensing.observation))
-        return replace_rows(observation, rows, seen)
+            started = self._start(x)
+            self._episode = merge_rows(self._episode, torch.from_numpy(rows), started)
+        return started
 
     def _info(self, episode: Episode, mask: NDArray[np.bool_]) -> Info:
         assert episode.statistics is not None
@@ -167,14 +232,14 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         put_masked(infos, "speed", episode.state.speed[:, 0].double().numpy(), mask)
         return infos
 
-    def _final_info(self, episode: Episode, terms: RewardTerms, done: NDArray[np.bool_]) -> Info:
-        infos = self._info(episode, done)
+    def _end_info(self, episode: Episode, done: NDArray[np.bool_]) -> Info:
+        """Return what is known at the end of episodes: `measure`, `collision_type` and `crash`."""
+        infos: Info = {}
         assert episode.statistics is not None
         crash = episode.statistics.crash
         crashed = done & (crash.kind != NONE).numpy()
         kinds = np.array(CRASH_KINDS, dtype=object)[crash.kind.numpy()]
         kinds[~crashed] = None
-        put_masked(infos, "reward_terms", _terms(terms, done), done)
         put_masked(infos, "measure", episode.f.double().numpy(), done)
         put_masked(infos, "collision_type", kinds, crashed)
         details: Info = {}
@@ -197,6 +262,7 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         return {
             "x": torch.from_numpy(self._x.copy()),
             "tick": torch.from_numpy(self._tick.copy()),
+            "ended": torch.from_numpy(self._ended.copy()),
             "episode": [tensor.clone() for tensor in list_tensors(self._episode)],
             "generator": json.dumps(self.np_random.bit_generator.state),
         }
@@ -212,6 +278,7 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         if next(tensors, None) is not None or state["x"].shape != self._x.shape:
             raise ValueError("The episodes are of another environment.")
         self._x, self._tick = state["x"].numpy().copy(), state["tick"].numpy().copy()
+        self._ended = state["ended"].numpy().copy() if "ended" in state else np.zeros(self.num_envs, dtype=bool)
         self.np_random.bit_generator.state = json.loads(state["generator"])
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
@@ -223,6 +290,23 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
             self._renderer = Renderer(self.world, False, self.metadata["render_fps"])
         episode, draw, dt = self._episode, self._renderer.draw, self.world.clock.dt
         return tuple(draw(episode, self._tick[row] * dt, row).copy() for row in range(self.num_envs))
+
+
+def read_autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
+    """Return Gymnasium's autoreset mode of a value, such as "NextStep".
+
+    Raises:
+        ValueError: There is no such mode.
+
+    Example:
+        >>> read_autoreset_mode("NextStep")
+        <AutoresetMode.NEXT_STEP: 'NextStep'>
+    """
+    try:
+        return AutoresetMode(mode)
+    except ValueError:
+        known = ", ".join(repr(each.value) for each in AutoresetMode)
+        raise ValueError(f"Unknown autoreset_mode {mode!r}; expected one of {known}.") from None
 
 
 def _terms(terms: RewardTerms, mask: NDArray[np.bool_]) -> Info:

@@ -134,3 +134,72 @@ def test_episodes_after_a_replacement_are_those_of_the_single_env(env_id: str) -
             x[row], given[row], lives[row] = infos["x"][row], [], lives[row] + 1
             np.testing.assert_array_equal(env.reset(options={"x": x[row]})[0], observation[row])
     assert lives.min() >= 3
+
+
+@scripted
+def test_episodes_replaced_in_the_next_step_are_those_of_the_single_env(env_id: str) -> None:
+    """The step after an end starts an episode: its action does not count, its reward is 0, and nothing moves."""
+    batch = rare_envs.make_batch(env_id, 3, horizon=0.8, autoreset_mode="NextStep")
+    env = gym.make(env_id, horizon=0.8)
+    observation, infos = batch.reset(seed=5)
+    rng = np.random.default_rng(0)
+    over, ends = np.zeros(3, dtype=bool), 0
+    for row in range(3):
+        np.testing.assert_array_equal(env.reset(options={"x": infos["x"][row]})[0], observation[row])
+    x, given = infos["x"].copy(), [[] for _ in range(3)]  # type: ignore[var-annotated]
+    for _ in range(24):
+        actions = np.stack([rng.uniform(-0.2, 1.0, 3), rng.uniform(-0.2, 0.2, 3)], axis=1)
+        actions[over] = np.nan  # which does not count
+        observation, reward, terminated, truncated, infos = batch.step(actions)
+        assert "final_obs" not in infos
+        np.testing.assert_array_equal(infos["_reward_terms"], ~over)
+        for row in range(3):
+            if over[row]:
+                assert (reward[row], terminated[row], truncated[row]) == (0.0, False, False)
+                x[row], given[row] = infos["x"][row], []
+            else:
+                given[row].append(actions[row])
+            last = env.reset(options={"x": x[row]})[0], 0.0, False, False, {}
+            for action in given[row]:
+                last = env.step(action)
+            np.testing.assert_array_equal(last[0], observation[row])
+            assert last[1] == pytest.approx(reward[row], rel=1e-6)
+            assert last[2:4] == (terminated[row], truncated[row])
+            if last[2] or last[3]:
+                assert infos["_measure"][row] and infos["measure"][row] == last[4]["measure"]
+                ends += 1
+        over = terminated | truncated
+    assert ends >= 6
+
+
+def test_without_autoreset_the_caller_resets_the_rows_that_ended() -> None:
+    batch = rare_envs.make_batch("rare_envs/CutIn-v0", 3, horizon=0.2, autoreset_mode=gym.vector.AutoresetMode.DISABLED)
+    with pytest.raises(RuntimeError, match="of all episodes before one with reset_mask"):
+        batch.reset(options={"reset_mask": np.array([True, False, False])})
+    _, infos = batch.reset(seed=0)
+    still = np.zeros((3, 2), np.float32)
+    batch.step(still)
+    *_, truncated, _ = batch.step(still)
+    assert truncated.all()
+    with pytest.raises(RuntimeError, match=r"episodes \[0, 1, 2\] have ended"):
+        batch.step(still)
+    mask = np.array([True, False, True])
+    _, after = batch.reset(options={"reset_mask": mask, "cut_in_gap": [9.0, 12.0]})
+    assert after["scenario"]["cut_in_gap"][mask].tolist() == [9.0, 12.0]
+    np.testing.assert_array_equal(after["_x"], mask)
+    np.testing.assert_array_equal(after["x"][1], infos["x"][1])
+    with pytest.raises(RuntimeError, match=r"episodes \[1\] have ended"):
+        batch.step(still)
+    batch.reset(options={"reset_mask": ~mask})
+    *_, truncated, _ = batch.step(still)
+    assert not truncated.any()
+
+
+@pytest.mark.parametrize("mask", [np.zeros(2, bool), np.ones(3, bool), np.array([1, 0])])
+def test_a_wrong_mask_or_mode_is_refused(mask: np.ndarray) -> None:
+    batch = rare_envs.make_batch("rare_envs/CutIn-v0", 2)
+    batch.reset(seed=0)
+    with pytest.raises(ValueError, match=r"reset_mask boolean of shape \(2,\)"):
+        batch.reset(options={"reset_mask": mask})
+    with pytest.raises(ValueError, match=r"autoreset_mode 'later'; expected one of 'NextStep', 'SameStep', 'Disabled'"):
+        rare_envs.make_batch("rare_envs/CutIn-v0", 2, autoreset_mode="later")
