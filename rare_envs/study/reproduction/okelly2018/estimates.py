@@ -10,7 +10,7 @@ from scipy.stats.contingency import relative_risk
 
 from samplers.problem import FloatArray
 from samplers.statistics.intervals import Interval, clopper_pearson
-from samplers.statistics.weights import effective_number
+from samplers.statistics.weights import effective_sample_size
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,9 @@ def estimate_weighted(f: FloatArray, log_ratios: FloatArray, gamma: float) -> Th
     n, fails = len(f), f <= gamma
     terms = np.where(fails, np.exp(log_ratios), 0.0)
     error = float(terms.std()) / math.sqrt(n)
-    return ThresholdEstimate(gamma, n, int(fails.sum()), float(terms.mean()), error, ess=effective_number(terms[fails]))
+    return ThresholdEstimate(
+        gamma, n, int(fails.sum()), float(terms.mean()), error, ess=effective_sample_size(log_ratios[fails])
+    )
 
 
 def mean_ratio(log_ratios: FloatArray) -> float:

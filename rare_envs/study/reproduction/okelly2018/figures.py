@@ -73,9 +73,9 @@ def draw_ratios(figure: Figure, data: Mapping[str, Any]) -> None:
     axes = figure.subplots()
     for name, curve in data["curves"].items():
         known = [(g, r) for g, r in zip(curve["gamma"], curve["ratio"], strict=True) if r]
-        if known:
-            gammas, ratios = zip(*known, strict=True)
-            axes.plot(gammas, np.clip(ratios, *_SHOWN_RATIOS), marker="o", markersize=3, label=name)
+        gammas, ratios = [g for g, _ in known], [r for _, r in known]
+        label = name if known else f"{name}: none can be computed"
+        axes.plot(gammas, np.clip(ratios, *_SHOWN_RATIOS), marker="o", markersize=3, label=label)
     axes.axhline(1.0, color="0.6", linewidth=0.8)
     axes.set_yscale("log")
     axes.set_xlabel("threshold gamma [s]")

@@ -137,7 +137,8 @@ class RolloutFolder:
                     break
                 self.made += job.n
             wanted.append(job)
-        return lines.complete(wanted, self._make, self._progress, description)
+        progress = self._progress and any(job.key not in known for job in wanted)
+        return lines.complete(wanted, self._make, progress, description)
 
     def spend(self, n: int) -> bool:
         """Return whether n more rollouts may be made now, by somebody else; they are counted then."""

@@ -202,4 +202,4 @@ def _run_own(
     drop_torn_line(lines.file)
     known = {run["gamma"] for run in lines.read()}
     wanted = [gamma for gamma in study.gammas if gamma in known or rollouts.spend(budget)]
-    return lines.complete(wanted, make, progress, "our default method")
+    return lines.complete(wanted, make, progress and not known.issuperset(wanted), "our default method")

@@ -33,6 +33,8 @@ from samplers.problem import FloatArray
 FAILING_DRIVEN, ORDINARY_DRIVEN, ORDINARY_COMPARED = 256, 512, 4000
 """Failing and ordinary runs that are driven again for their behaviour, and starts that are compared."""
 WEIGHT_COUNT = 404
+FIRST = 8
+"""Outcomes that a record has, so that others can see whether they get the same."""
 
 
 def summarise_highway(study: HighwayStudy, problem: Any, measured: MeasuredHighway) -> dict[str, Any]:
@@ -43,6 +45,7 @@ def summarise_highway(study: HighwayStudy, problem: Any, measured: MeasuredHighw
         searches: By name: settings, iterations made, sampler, estimates and comparisons with naive Monte Carlo.
         own: Estimates of our default method.
         findings: Tested statements.
+        first: Outcomes of the first naive rollouts.
         rollouts: All of them but those of our own method.
         rollouts_per_second: Of the fastest chunk of naive Monte Carlo, wall time; None if there is none.
     """
@@ -57,6 +60,7 @@ def summarise_highway(study: HighwayStudy, problem: Any, measured: MeasuredHighw
         "own": [_compare_own(each, references) for each in measured.own],
         "findings": _find(study, problem, measured, f) if len(f) else [],
         "rollouts": len(f) + sum(each["search"] + each["final"] for each in searches.values()),
+        "first": f[:FIRST].tolist(),
         "rollouts_per_second": _find_speed(measured.naive),
     }
 

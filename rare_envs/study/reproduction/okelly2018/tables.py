@@ -23,7 +23,7 @@ def make_tables(ego: str, gammas: tuple[float, ...], found: Mapping[str, Any]) -
         found: As `rare_envs.study.reproduction.okelly2018.study.summarise_highway` returns it.
     """
     printed = PRINTED_TABLES[ego]
-    reasons = explain_differences(found)
+    reasons = explain_differences(ego, found)
     heads = [f"{theirs} / {ours}" for theirs, ours in zip(printed.thresholds, gammas, strict=True)]
     estimates = _list_estimates(printed, heads, found)
     ratios = _list_ratios(printed, heads, found)
@@ -45,15 +45,16 @@ def make_tables(ego: str, gammas: tuple[float, ...], found: Mapping[str, Any]) -
     )
 
 
-def explain_differences(found: Mapping[str, Any]) -> dict[str, str]:
+def explain_differences(ego: str, found: Mapping[str, Any]) -> dict[str, str]:
     """Return sentences by the names that values have as reasons."""
     printed = found["searches"][PRINTED_SEARCH]
     texts = {
-        "thresholds": WHY_OTHER_THRESHOLDS,
+        "thresholds": WHY_OTHER_THRESHOLDS[ego],
         "scale": "One run, with fewer rollouts than theirs unless the scale is full; the rows say how many.",
         "search": "Their tables leave out the rollouts of the search; here they are counted.",
         "not run": "These rollouts were not made.",
         "no event": "Too rare for as many rollouts: nothing to compare with.",
+        "underflow": "The standard error is below the smallest number of the machine, for the reason `weights`.",
         "extra": "Not in the paper.",
     }
     if "sampler" not in printed:
@@ -166,8 +167,8 @@ def _ratios_of(
     if known is None:
         labels, missing = (f"{label}: {search['iterations']} of {search['of']} iterations run", head), ("not run",)
         known = {name: None for name in ("events_ratio", "events_interval", "variance_ratio", "all_in", "error_ratio")}
-    else:
-        labels, missing = (label, head), ("no event",)
+    else:  # a standard error of 0 is one below the smallest number
+        labels, missing = (label, head), ("no event",) if known["events_ratio"] is None else ("underflow",)
     why = ("thresholds", "weights", "scale") if search["weights_move"] and "sampler" in search else ("thresholds",)
     rows = (
         ("rare events, sampler / naive, equal draws", None, known["events_ratio"], known["events_interval"], why),

@@ -49,7 +49,7 @@ def test_the_search_counts_for_the_paper_too() -> None:
     assert ratio.paper == pytest.approx(1.57, abs=0.01)
     assert all_in.paper == pytest.approx(1.57 / 6, abs=0.01)
     assert (ratio.ours, all_in.ours) == (7.2, 1.2)
-    assert values[3].reasons == ("no event",)
+    assert values[3].reasons == ("underflow",)
 
 
 def test_what_was_not_run_has_no_number() -> None:
@@ -58,7 +58,7 @@ def test_what_was_not_run_has_no_number() -> None:
         assert rows
         assert all(value.ours is None and value.reasons == ("not run",) for value in rows)
     assert "2 of 20 iterations" in rows[0].labels[0]
-    assert "weights" not in explain_differences(found_of(NOT_RUN))
+    assert "weights" not in explain_differences("lidar", found_of(NOT_RUN))
 
 
 def test_our_own_method_stands_at_its_threshold() -> None:
@@ -72,4 +72,10 @@ def test_our_own_method_stands_at_its_threshold() -> None:
 @pytest.mark.parametrize("ego", ["lidar", "vision"])
 def test_every_reason_is_explained(ego: str) -> None:
     make_tables(ego, THRESHOLDS[ego], found_of(RUN))  # it would be refused
-    assert "1e-09" in explain_differences(found_of(RUN))["weights"]
+    assert "1e-09" in explain_differences("lidar", found_of(RUN))["weights"]
+
+
+def test_a_standard_error_that_underflows_is_no_gain() -> None:
+    run = {**RUN, "comparisons": [{**COMPARISON, "variance_ratio": None, "all_in": None}] * 4}
+    values = make_tables("lidar", GAMMAS, found_of(run))[1].values
+    assert [value.reasons for value in values[1:3]] == [("underflow",)] * 2
