@@ -7,6 +7,7 @@ References:
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -48,6 +49,15 @@ class PrintedTable:
         p = self.rows["naive"][j][0]
         error = self.rows["cross-entropy"][j][1]
         return p * (1.0 - p) / self.draws["cross-entropy"] / error**2
+
+    def errors_off(self, j: int) -> float:
+        """Return the distance of cross-entropy from the longest naive row, in their joint standard error.
+
+        Args:
+            j: Number of the threshold.
+        """
+        (p, error), (found, own) = self.rows["naive"][j], self.rows["cross-entropy"][j]
+        return (found - p) / math.hypot(error, own)
 
 
 PRINTED_TABLES = {

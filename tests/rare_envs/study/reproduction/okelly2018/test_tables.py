@@ -18,6 +18,7 @@ COMPARISON = {
     "variance_ratio": 7.2,
     "all_in": 1.2,
     "error_ratio": None,
+    "errors_off": -5.0,
 }
 RUN = {
     **NOT_RUN,
@@ -45,7 +46,7 @@ def test_ours_stand_beside_theirs() -> None:
 
 def test_the_search_counts_for_the_paper_too() -> None:
     values = make_tables("lidar", GAMMAS, found_of(RUN))[1].values
-    ratio, all_in = (value for value in values[:4] if value.paper is not None)
+    ratio, all_in = (value for value in values[:3] if value.paper is not None)
     assert ratio.paper == pytest.approx(1.57, abs=0.01)
     assert all_in.paper == pytest.approx(1.57 / 6, abs=0.01)
     assert (ratio.ours, all_in.ours) == (7.2, 1.2)
@@ -79,3 +80,10 @@ def test_a_standard_error_that_underflows_is_no_gain() -> None:
     run = {**RUN, "comparisons": [{**COMPARISON, "variance_ratio": None, "all_in": None}] * 4}
     values = make_tables("lidar", GAMMAS, found_of(run))[1].values
     assert [value.reasons for value in values[1:3]] == [("underflow",)] * 2
+
+
+def test_missed_failures_are_said_to_be_missed() -> None:
+    alone = {**RUN, "weights_move": False}
+    values = make_tables("lidar", GAMMAS, found_of(alone))[1].values
+    assert all("missed" in value.reasons for value in values[:3])
+    assert (values[4].ours, values[4].paper) == (-5.0, pytest.approx(0.79, abs=0.01))  # (19.8 - 12.4) / 9.4
