@@ -141,13 +141,23 @@ def find_scenario(env_id: str) -> Scenario:
             f"{name!r} is for gym.make and gym.make_vec; here take {layouts[name]!r} with "
             f"observation 'kinematics' and action 'meta'."
         )
-    if re.match(r"(highway(-fast)?|merge|intersection|roundabout)-v\d", str(name)):
+    if is_highway_env_id(name):
         raise ValueError(
             f"{name!r} is an environment of HighwayEnv, not of the batched simulation: its drives become a problem by "
             f"rare_envs.highway_env_problem({name!r}, ego=...). The environments here are {', '.join(SCENARIOS)}."
         )
     hint = did_you_mean(str(name), SCENARIOS)
     raise ValueError(f"Unknown environment {env_id!r}{hint}; the environments are {', '.join(SCENARIOS)}.")
+
+
+def is_highway_env_id(env_id: object) -> bool:
+    """Return whether an id is that of an environment of HighwayEnv that `rare_envs.highway_env_problem` takes.
+
+    Example:
+        >>> is_highway_env_id("highway-fast-v0"), is_highway_env_id("rare_envs/Highway-v0")
+        (True, False)
+    """
+    return re.match(r"(highway(-fast)?|merge|intersection|roundabout)-v\d", str(env_id)) is not None
 
 
 HIGHWAY_ENV_LAYOUT = {"observation": "kinematics", "action": "meta"}

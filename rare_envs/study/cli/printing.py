@@ -36,7 +36,8 @@ def print_catalogue(entries: dict[str, Any]) -> None:
         console.print(f"  learned drivers add: {added}")
         console.print(f"  with HighwayEnv's observations and actions: {environment['kinematics_id']}\n")
     console.print(
-        f"HighwayEnv's own, by rare_envs.highway_env_problem in Python: {', '.join(entries['highway_env'])}\n"
+        "HighwayEnv's own, for estimate, and with its settings for rare_envs.highway_env_problem in Python: "
+        f"{', '.join(entries['highway_env'])}\n"
     )
     console.print(_make_parameter_table("Weather, which --weather adds for egos with a camera", entries["weather"]))
     titles = {

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
+from rare_envs.scenarios.registry import is_highway_env_id
 from rare_envs.study.cli.executor_options import ExecutorOptions
 from rare_envs.study.cli.options import EstimateOptions, ForceOption, JsonOption, TrustOption
 from rare_envs.study.cli.shell import (
@@ -19,6 +20,9 @@ from rare_envs.study.cli.shell import (
 from rare_envs.study.errors import BadInput, as_bad_input
 from rare_envs.threads import use_one_thread
 from training.command_line import spread_options
+
+if TYPE_CHECKING:
+    from rare_envs.study.question import Question
 
 GATE_CODES = {"passes": 0, "fails": 4, "undecided": 5}
 """Exit codes of a comparison of p with a limit."""
@@ -49,6 +53,8 @@ def estimate_command(
     question = join_question({} if config is None else read_question_file(config), env, options.arguments(), typed)
     if question.max_p is None:
         _refuse_options_of_a_limit(typed)
+    if is_highway_env_id(question.env_id):
+        _estimate_highway_env(question, typed, out, force, as_json, places)
     with show_what_is_known(lambda known: show_report(known, None, as_json)), keep_stdout_for_the_answer():
         with as_bad_input(ValueError):
             executor = places.make()
@@ -59,6 +65,22 @@ def estimate_command(
             else run_into(out, study, progress=True, force=force, executor=executor)
         )
     _answer(report, out, as_json)
+
+
+def _estimate_highway_env(
+    question: Question, typed: set[str], out: Path | None, force: bool, as_json: bool, places: ExecutorOptions
+) -> NoReturn:
+    """Estimate in an environment of HighwayEnv, print the answer and exit."""
+    from rare_envs.study.cli.highway_env import estimate_highway_env
+
+    with keep_stdout_for_the_answer(), as_bad_input(ValueError):
+        answer = estimate_highway_env(question, typed, out, force, places.make())
+    text = answer.pop("text")
+    if as_json:
+        print_json(answer)
+    else:
+        print(text if out is None else f"{text}\nWrote {out}.")
+    raise typer.Exit(DOUBTFUL if answer["warnings"] else 0)
 
 
 def _refuse_options_of_a_limit(typed: set[str]) -> None:

@@ -14,7 +14,10 @@ from tests.rare_envs.study.refusals import FOLLOWING, SMALL, Cli, assert_refused
 BAD_ESTIMATES = {
     "unknown environment": (["rare_envs/CutIn-v7"], ["rare_envs/CutIn-v"]),
     "environment without its namespace": (["CutIn"], ["rare_envs/CutIn-v0"]),
-    "HighwayEnv's environment": (["highway-fast-v0"], ["rare_envs.highway_env_problem('highway-fast-v0'"]),
+    "option that HighwayEnv's do not have": (
+        ["merge-v0", "--base", "us101"],
+        ["has no --base", "CutIn-v0"],
+    ),
     "missing environment": ([], ["ENV"]),
     "missing .zip": ([FOLLOWING, "--ego", "nowhere.zip"], ["nowhere.zip"]),
     "corrupt .zip": ([FOLLOWING, "--ego", "corrupt.zip"], ["corrupt.zip"]),
