@@ -41,6 +41,15 @@ class ComparedValue:
 
 
 @dataclass(frozen=True, kw_only=True)
+class MeasuredRow:
+    """Numbers of ours in a row of their own, where the paper has nothing to stand beside them."""
+
+    labels: tuple[str, ...]
+    values: Mapping[str, float | None]
+    """By quantity; the same quantities in every row of a table."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class ComparisonTable:
     """A table of a paper beside ours."""
 
@@ -52,11 +61,15 @@ class ComparisonTable:
     values: tuple[ComparedValue, ...]
     explanations: Mapping[str, str] = field(default_factory=dict)
     """Sentences by the names that the values have as reasons."""
+    measured: tuple[MeasuredRow, ...] = ()
+    """Further rows of ours, shown below."""
+    measured_title: str = ""
 
     def __post_init__(self) -> None:
-        for value in self.values:
+        for value in (*self.values, *self.measured):
             if len(value.labels) != len(self.keys):
                 raise ValueError(f"Expected {len(self.keys)} labels ({', '.join(self.keys)}), got {value.labels}.")
+        for value in self.values:
             unknown = [reason for reason in value.reasons if reason not in self.explanations]
             if unknown:
                 raise ValueError(f"No explanation {unknown[0]!r} in the table; known: {', '.join(self.explanations)}.")
@@ -69,6 +82,8 @@ class ComparisonTable:
             "keys": list(self.keys),
             "values": [value.to_dict() for value in self.values],
             "explanations": dict(self.explanations),
+            "measured_title": self.measured_title,
+            "measured": [{"labels": row.labels, "values": dict(row.values)} for row in self.measured],
         }
 
 
@@ -108,7 +123,7 @@ def format_compared(value: float | None) -> str:
         return "–"
     if abs(value) >= 1000:
         return f"{value:,.0f}"
-    return f"{value:.3g}"
+    return f"{value:.2e}" if 0 < abs(value) < 1e-3 else f"{value:.3g}"
 
 
 def format_difference(value: float | None) -> str:

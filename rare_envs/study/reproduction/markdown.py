@@ -21,6 +21,8 @@ def format_reproduction(record: Mapping[str, Any]) -> str:
     lines += [f"- {note}" for note in record["notes"]]
     for table in record["tables"]:
         lines += ["", f"### {table['title']}", "", *_format_table(table), ""]
+        if table["measured"]:
+            lines += [f"{table['measured_title']}:", "", *_format_measured(table), ""]
         lines += [f"- *{name}*: {text}" for name, text in table["explanations"].items()]
     if record["findings"]:
         lines += [
@@ -56,6 +58,12 @@ def _format_table(table: Mapping[str, Any]) -> list[str]:
             shown = labels if first == 0 else [""] * len(labels)
             lines.append(_format_row([*shown, *_describe_value(value)]))
     return lines
+
+
+def _format_measured(table: Mapping[str, Any]) -> list[str]:
+    heads = [*table["keys"], *table["measured"][0]["values"]]
+    rows = [[*row["labels"], *map(format_compared, row["values"].values())] for row in table["measured"]]
+    return [_format_row(heads), "|---" * len(heads) + "|", *map(_format_row, rows)]
 
 
 def _describe_value(value: Mapping[str, Any]) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from enum import Enum
 from pathlib import Path
 from typing import Annotated
 
@@ -15,6 +16,25 @@ from rare_envs.threads import use_one_thread
 from training.command_line import spread_options
 
 reproduce_app = typer.Typer(help="Make the tables and figures of a published paper anew.")
+
+
+class ScaleChoice(str, Enum):
+    """Size of a reproduction."""
+
+    SMALL = "small"
+    FULL = "full"
+
+
+ReproductionFolder = Annotated[Path, typer.Option("--out", help="Folder of runs, JSON and page.")]
+ScaleOption = Annotated[ScaleChoice, typer.Option(help="small: minutes; full: as many runs as the paper has.")]
+ReplicationsOption = Annotated[
+    int | None, typer.Option("--replications", min=2, help="Replications of every method, instead of the scale's.")
+]
+ResumeOption = Annotated[
+    bool, typer.Option("--resume/--afresh", help="Go on with the runs in the folder, or make all of them anew.")
+]
+WorkersOption = Annotated[int, typer.Option(min=1, help="Processes.")]
+FirstSeedOption = Annotated[int, typer.Option("--seed", min=0, help="Seed of the first replication.")]
 
 
 @reproduce_app.callback()
@@ -56,3 +76,32 @@ def reproduce_okelly2018_command(
     for found in record["findings"]:
         print(f"{found['claim']}: {found['verdict']}. {found['statistic']}.")
     print(f"Wrote {out / 'reproduction.html'}.")
+
+
+@reproduce_app.command("tian2024")
+@use_one_thread()
+def reproduce_tian2024_command(
+    out: ReproductionFolder = Path("tian2024"),
+    scale: ScaleOption = ScaleChoice.FULL,
+    replications: ReplicationsOption = None,
+    seed: FirstSeedOption = 0,
+    workers: WorkersOption = 1,
+    resume: ResumeOption = True,
+    as_json: JsonOption = False,
+) -> None:
+    """Tian et al. 2024: Tables II and III, Figures 6 to 8. Writes reproduction.html and reproduction.json."""
+    from rare_envs.study.reproduction.tian2024.study import REPLICATIONS_FILE, SCALES, TianPlan, reproduce_tian2024
+
+    number = SCALES[scale.value] if replications is None else replications
+    command = f"rare-envs reproduce tian2024 --replications {number} --seed {seed}"
+    with keep_stdout_for_the_answer(), as_bad_input(ValueError, OSError):
+        plan = TianPlan(replications=number, seed=seed)
+        if not resume:
+            (out / REPLICATIONS_FILE).unlink(missing_ok=True)
+        record = reproduce_tian2024(plan, out, command, workers, progress=True)
+    if as_json:
+        print_json(record)
+        return
+    for finding in record["findings"]:
+        print(f"{finding['claim']}: {finding['verdict']}")
+    print(f"Wrote {out / 'reproduction.html'} and {out / 'reproduction.json'}.")

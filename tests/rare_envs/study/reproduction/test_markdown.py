@@ -9,7 +9,7 @@ from tests.rare_envs.study.reproduction.records import record_by_hand
 def test_the_markdown_has_tables_findings_and_figures() -> None:
     lines = format_reproduction(record_by_hand()).splitlines()
     assert lines[0] == "## A paper"
-    assert "| SS | IDM | mean of p | 0.0008 | 0.0006 | – | -25 % | – | traffic |" in lines
+    assert "| SS | IDM | mean of p | 8.00e-04 | 6.00e-04 | – | -25 % | – | traffic |" in lines
     assert "|  |  | simulations | – | 4,980 | 4,900 to 5,100 | – | – | – |" in lines
     assert "| A < B | A / B | 0.5 | 0.4 to 0.6 | holds |" in lines
     assert "- *traffic*: Other roads." in lines

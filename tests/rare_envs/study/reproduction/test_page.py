@@ -24,7 +24,7 @@ def test_paper_ours_and_difference_stand_side_by_side() -> None:
         "released code",
         "why they differ",
     ]
-    assert rows[1] == ["SS", "IDM", "mean of p", "0.0008", "0.0006", "–", "-25 %", "–", "traffic"]
+    assert rows[1] == ["SS", "IDM", "mean of p", "8.00e-04", "6.00e-04", "–", "-25 %", "–", "traffic"]
     assert rows[2] == ["simulations", "–", "4,980", "4,900 to 5,100", "–", "–", "–"]
     assert rows[3][-2] == "does &lt;not&gt; run"
 
