@@ -66,9 +66,9 @@ class ComparisonTable:
     measured_title: str = ""
 
     def __post_init__(self) -> None:
-        for value in (*self.values, *self.measured):
-            if len(value.labels) != len(self.keys):
-                raise ValueError(f"Expected {len(self.keys)} labels ({', '.join(self.keys)}), got {value.labels}.")
+        for labels in (*(value.labels for value in self.values), *(row.labels for row in self.measured)):
+            if len(labels) != len(self.keys):
+                raise ValueError(f"Expected {len(self.keys)} labels ({', '.join(self.keys)}), got {labels}.")
         for value in self.values:
             unknown = [reason for reason in value.reasons if reason not in self.explanations]
             if unknown:
@@ -136,5 +136,5 @@ def format_difference(value: float | None) -> str:
     if value is None:
         return "–"
     if value > 2.0 or value < -0.9:
-        return f"× {1.0 + value:.3g}"
+        return f"× {format_compared(1.0 + value)}"
     return f"{100 * value:+.0f} %"

@@ -10,7 +10,7 @@ from scipy import stats
 from rare_envs.study.reproduction.comparison import TestedClaim
 from rare_envs.study.reproduction.tian2024.replications import FIGURE7_METHOD, ReplicationRun
 from rare_envs.study.reproduction.tian2024.summary import (
-    CONFIDENCE,
+    INTERVAL_CONFIDENCE,
     Ends,
     ReplicationSummary,
     ratio_of_work,
@@ -38,7 +38,7 @@ def _efficiency(found: dict[tuple[str, str, str], ReplicationSummary]) -> Iterat
             ratio, ends = ratio_of_work(found[scenario, system, other], found[scenario, system, "ADSS"])
             yield TestedClaim(
                 claim=f"{claim} ({scenario}, {system})",
-                statistic=f"N c.o.v.² of {other} over that of ADSS, all simulations counted",
+                statistic=f"all simulations times mean square error of {other} over that of ADSS",
                 value=ratio,
                 interval=ends,
                 verdict=_judge(ends, 1.0),
@@ -50,9 +50,9 @@ def _accuracy(found: dict[tuple[str, str, str], ReplicationSummary]) -> Iterator
         if method != "IS" or (scenario, system, "MC") not in found:
             continue
         truth = found[scenario, system, "MC"]
-        ratio = ours.mean / truth.mean
+        ratio = 1.0 + ours.error
         error = ratio * (ours.cov**2 / ours.replications + truth.cov**2 / truth.replications) ** 0.5
-        half = float(stats.norm.ppf(0.5 + CONFIDENCE / 2)) * error
+        half = float(stats.t.ppf(0.5 + INTERVAL_CONFIDENCE / 2, ours.replications - 1)) * error
         ends = ratio - half, ratio + half
         yield TestedClaim(
             claim=f"IS is off by 2 to 17 % ({scenario}, {system})",
@@ -77,7 +77,11 @@ def _moves(runs: Sequence[ReplicationRun]) -> Iterator[TestedClaim]:
             (_GAP, -1.0, "the gap dis1x to it decreases from subset to subset"),
         ):
             moved = np.array([levels[-1][column] - levels[0][column] for levels in means])
-            half = float(stats.t.ppf(0.5 + CONFIDENCE / 2, len(moved) - 1)) * moved.std(ddof=1) / len(moved) ** 0.5
+            half = (
+                float(stats.t.ppf(0.5 + INTERVAL_CONFIDENCE / 2, len(moved) - 1))
+                * moved.std(ddof=1)
+                / len(moved) ** 0.5
+            )
             ends = float(moved.mean() - half), float(moved.mean() + half)
             yield TestedClaim(
                 claim=f"{claim} (cut-in, {system})",

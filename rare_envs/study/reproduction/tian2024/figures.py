@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from rare_envs.study.html_report.svg import FigureOfPage
 from rare_envs.study.plots import HIT_COLOUR, LINE_COLOUR, ORDINARY_COLOUR
-from rare_envs.study.reproduction.tian2024.catalogue import SCENARIOS, SYSTEMS
+from rare_envs.study.reproduction.tian2024.catalogue import SCENARIO_ROWS, SYSTEMS
 from rare_envs.study.reproduction.tian2024.replications import FIGURE7_METHOD, ReplicationRun
 
 _ROMAN = ("I", "II", "III", "IV", "V", "VI", "VII", "VIII")
@@ -99,8 +99,8 @@ def _subsets_shown(runs: Sequence[ReplicationRun], seed: int) -> list[list[list[
 
 
 def _draw_rates(figure: Figure, data: Mapping[str, Any]) -> None:
-    panels = figure.subplots(1, len(SCENARIOS), squeeze=False)[0]
-    for axes, scenario in zip(panels, SCENARIOS, strict=True):
+    panels = figure.subplots(1, len(SCENARIO_ROWS), squeeze=False)[0]
+    for axes, scenario in zip(panels, SCENARIO_ROWS, strict=True):
         for system, colour in zip(SYSTEMS, _COLOURS, strict=False):
             for line in data["lines"]:
                 if (line["scenario"], line["system"]) != (scenario, system):
@@ -121,7 +121,7 @@ def _draw_subsets(figure: Figure, data: Mapping[str, Any]) -> None:
     levels = data["levels"]
     rows = -(-len(levels) // 3)
     everything = [row for level in levels for row in level]
-    limits = [(min(column), max(column)) for column in zip(*everything, strict=True)]
+    limits = [_pad(min(column), max(column)) for column in zip(*everything, strict=True)]
     for number, level in enumerate(levels):
         axes: Any = figure.add_subplot(rows, 3, number + 1, projection="3d")
         v1, v2, dis1y = zip(*level, strict=True) if level else ((), (), ())
@@ -133,6 +133,11 @@ def _draw_subsets(figure: Figure, data: Mapping[str, Any]) -> None:
         axes.set_xlabel("v1 [m/s]", fontsize=7)
         axes.set_ylabel("v2 [m/s]", fontsize=7)
         axes.set_zlabel("dis1y [m]", fontsize=7)
+
+
+def _pad(low: float, high: float) -> tuple[float, float]:
+    margin = 0.02 * (high - low) or 0.5
+    return low - margin, high + margin
 
 
 def _draw_comparison(figure: Figure, data: Mapping[str, Any]) -> None:

@@ -20,6 +20,8 @@ class PrintedRow:
     n_sim: float | None = None
     error: float | None = None
     """Relative error of the mean against Monte Carlo."""
+    mcs: float | None = None
+    """p by Monte Carlo."""
 
     @property
     def cov(self) -> float | None:
@@ -28,14 +30,16 @@ class PrintedRow:
 
     @property
     def gain(self) -> float | None:
-        """Plain Monte Carlo runs for the same c.o.v. over those printed."""
-        if self.p is None or self.squared_cov is None or self.n_sim is None:
+        """Variance of plain Monte Carlo with as many simulations over the mean square error; see `mcs`."""
+        if self.p is None or self.squared_cov is None or self.n_sim is None or self.mcs is None:
             return None
-        return (1.0 - self.p) / (self.p * self.squared_cov * self.n_sim)
+        ratio = self.p / self.mcs
+        square_error = self.squared_cov * ratio**2 + (ratio - 1.0) ** 2
+        return (1.0 - self.mcs) / (self.mcs * self.n_sim * square_error)
 
 
 def _table2(p: float, squared_cov: float, n_sim: float, mcs: float) -> PrintedRow:
-    return PrintedRow(p, squared_cov, n_sim, None if p == mcs else abs(p / mcs - 1.0))
+    return PrintedRow(p, squared_cov, n_sim, None if p == mcs else abs(p / mcs - 1.0), mcs)
 
 
 PRINTED = {
@@ -62,7 +66,7 @@ that ADSS is 112 times faster than IS, from which its n_sim is derived.
 RELEASED = {
     "MCS": "stops where the 95 % interval is p (1 ± 0.2): N = 96 (1 - p) / p",
     "IS": "does not run as released; adds weighted draws of the tilt and unweighted base draws in one mean",
-    "SS": "does not run as released; 5,000 points a level where the text says 500; maps to normal space by the marginals",
+    "SS": "does not run as released; 5,000 points a level (text: 500); maps to normal space by marginals",
     "ADSS": "AR-1 proposals without a Metropolis ratio, first step 1 in every level; simulates the seeds again",
 }
 """What the code does that the paper names as its source, by method."""
@@ -109,6 +113,6 @@ EXPLANATIONS = {
         "The mean of 20 replications with a c.o.v. of 0.3 to 0.5 has a standard error of 7 to 11 %: printed errors of "
         "2 or 3 % are smaller than chance explains, and ours differ from them by chance as well."
     ),
-    "text": "Table III itself is not in the text at hand: single runs and figures that the text repeats, see the notes.",
+    "text": "Table III itself is not in the text at hand: single runs and figures that the text repeats, see above.",
 }
 """Why numbers differ, by the words in the table."""

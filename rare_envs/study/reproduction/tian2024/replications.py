@@ -11,7 +11,13 @@ from numpy.typing import NDArray
 
 from rare_envs.egos.wrapped_problem import WrappedProblem
 from rare_envs.problem import DrivingProblem
-from rare_envs.study.reproduction.tian2024.catalogue import BASE, HORIZON, METHOD_ROWS, SCENARIOS, SYSTEMS
+from rare_envs.study.reproduction.tian2024.catalogue import (
+    EPISODE_SECONDS,
+    METHOD_ROWS,
+    SCENARIO_ROWS,
+    SYSTEMS,
+    TRAFFIC_BASE,
+)
 from samplers.benchmark.runs import use_one_core
 from samplers.estimation import estimate
 from samplers.method import whole_simulations
@@ -118,7 +124,9 @@ class CountedSimulations(WrappedProblem):
 @cache
 def driving_problem(scenario: str, system: str) -> DrivingProblem:
     """Return the problem of a scenario and a system under test; gamma = 0 is a collision."""
-    return DrivingProblem(SCENARIOS[scenario].env_id, ego=SYSTEMS[system], base=BASE, horizon=HORIZON)
+    return DrivingProblem(
+        SCENARIO_ROWS[scenario].env_id, ego=SYSTEMS[system], base=TRAFFIC_BASE, horizon=EPISODE_SECONDS
+    )
 
 
 def run_replication(job: ReplicationJob) -> ReplicationRun:
@@ -128,7 +136,7 @@ def run_replication(job: ReplicationJob) -> ReplicationRun:
     with use_one_core():
         result = estimate(
             problem,
-            row.method,
+            row.find_method(job.system),
             seed=job.seed,
             max_sim=row.max_sim,
             target_cov=row.target_cov,

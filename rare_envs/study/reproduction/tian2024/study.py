@@ -13,12 +13,12 @@ from rare_envs.study.execution.run_lines import RunLines
 from rare_envs.study.reproduction.record import make_record, write_record
 from rare_envs.study.reproduction.tian2024.catalogue import (
     ADSS_SIMULATIONS,
-    BASE,
-    HORIZON,
+    EPISODE_SECONDS,
     METHOD_ROWS,
     POINTS_OF_A_LEVEL,
-    SCENARIOS,
+    SCENARIO_ROWS,
     SYSTEMS,
+    TRAFFIC_BASE,
 )
 from rare_envs.study.reproduction.tian2024.claims import assess_claims
 from rare_envs.study.reproduction.tian2024.figures import collect_figures, draw_figures
@@ -50,7 +50,7 @@ class TianPlan:
     replications: int = SCALES["full"]
     seed: int = 0
     """Of the first replication; the others have the seeds that follow."""
-    scenarios: tuple[str, ...] = tuple(SCENARIOS)
+    scenarios: tuple[str, ...] = tuple(SCENARIO_ROWS)
     systems: tuple[str, ...] = tuple(SYSTEMS)
     methods: tuple[str, ...] = tuple(METHOD_ROWS)
 
@@ -60,7 +60,7 @@ class TianPlan:
         if self.seed < 0:
             raise ValueError(f"Expected a seed of at least 0, got {self.seed}.")
         for name, chosen, known in (
-            ("scenario", self.scenarios, SCENARIOS),
+            ("scenario", self.scenarios, SCENARIO_ROWS),
             ("system", self.systems, SYSTEMS),
             ("method", self.methods, METHOD_ROWS),
         ):
@@ -134,8 +134,8 @@ def record_replications(plan: TianPlan, runs: Sequence[ReplicationRun], command:
         settings={
             "replications": plan.replications,
             "seeds": f"{plan.seed} to {plan.seed + plan.replications - 1}",
-            "base": BASE,
-            "horizon": HORIZON,
+            "base": TRAFFIC_BASE,
+            "horizon": EPISODE_SECONDS,
         },
         notes=_describe_setting(plan),
         tables=make_tables(runs),
@@ -151,13 +151,13 @@ def _describe_setting(plan: TianPlan) -> list[str]:
         "distribution, of a c.o.v. by the chi-square distribution.",
         "Failure is a collision of the ego within 5 s. Systems under test: the IDM with the paper's parameters, and "
         "`noisy:idm`, an imperfect stack around it, where the paper has Apollo.",
-        f"SS and ADSS have {POINTS_OF_A_LEVEL} points a level; Monte Carlo and IS stop at 20 % relative half-width; our "
-        f"methods get {ADSS_SIMULATIONS:,} simulations, what the paper prints for ADSS with Apollo.",
+        f"SS and ADSS have {POINTS_OF_A_LEVEL} points a level; Monte Carlo and IS stop at 20 % relative half-width; "
+        f"our methods get {ADSS_SIMULATIONS:,} simulations, what the paper prints for ADSS with Apollo.",
         "Of Table III the paper's text at hand has only: Monte Carlo 2.58e-4, SS 2.49e-4 with about 5,000 simulations "
         "and IS 2.86e-4 with 237,000 (single runs, Apollo); errors of IS of 17.1 % (Apollo) and 3.8 % (IDM) and of SS "
         "of 2.6 % over 20 replications; ADSS 112 times faster than IS.",
-        "The gain is (1 - p) / (p N c.o.v.²): plain Monte Carlo has 1, whatever p is, so it can be compared across "
-        "papers.",
+        "The gain is the variance of plain Monte Carlo with as many simulations over the mean square error about p by "
+        "Monte Carlo. Plain Monte Carlo has 1 whatever p is, so that it can be compared across papers.",
     ]
 
 

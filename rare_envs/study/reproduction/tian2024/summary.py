@@ -1,4 +1,4 @@
-"""Figures over the replications of a method: mean, c.o.v., its square, simulations and gain, with intervals."""
+"""Figures over the replications of a method: mean, c.o.v., its square, error, simulations and gain, with intervals."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scipy import stats
 
 from rare_envs.study.reproduction.tian2024.replications import ReplicationRun
 
-CONFIDENCE = 0.95
+INTERVAL_CONFIDENCE = 0.95
 Ends = tuple[float, float]
 
 
@@ -35,21 +35,28 @@ class ReplicationSummary:
     """Mean number of simulations as the paper counts them: without the search of importance sampling."""
     all_simulations: float
     """Mean number of all simulations, counted outside the method."""
+    truth: float
+    """p by Monte Carlo; its own error is left out."""
 
     @classmethod
-    def of_runs(cls, runs: Sequence[ReplicationRun]) -> ReplicationSummary:
+    def of_runs(cls, runs: Sequence[ReplicationRun], truth: float | None = None) -> ReplicationSummary:
         """Return the summary of runs of one method on one system in one scenario."""
         return cls.of_estimates(
             [run.p for run in runs],
             float(np.mean([run.final for run in runs])),
             float(np.mean([run.simulated for run in runs])),
+            truth,
         )
 
     @classmethod
     def of_estimates(
-        cls, p: Sequence[float], simulations: float, all_simulations: float | None = None
+        cls,
+        p: Sequence[float],
+        simulations: float,
+        all_simulations: float | None = None,
+        truth: float | None = None,
     ) -> ReplicationSummary:
-        """Return the summary of two estimates or more.
+        """Return the summary of two estimates or more; p is their mean where no truth is given.
 
         Raises:
             ValueError: There are fewer.
@@ -58,7 +65,8 @@ class ReplicationSummary:
             raise ValueError(f"Expected 2 replications at least, got {len(p)}.")
         mean, spread = float(np.mean(p)), float(np.std(p, ddof=1))
         all_simulations = simulations if all_simulations is None else all_simulations
-        return cls(len(p), mean, spread / mean if mean > 0 else math.nan, simulations, all_simulations)
+        cov = spread / mean if mean > 0 else math.nan
+        return cls(len(p), mean, cov, simulations, all_simulations, mean if truth is None else truth)
 
     @property
     def squared_cov(self) -> float:
@@ -68,7 +76,7 @@ class ReplicationSummary:
     @property
     def mean_interval(self) -> Ends:
         """Interval of the mean by Student's distribution."""
-        half = float(stats.t.ppf(0.5 + CONFIDENCE / 2, self.replications - 1)) * self.cov * self.mean
+        half = float(stats.t.ppf(0.5 + INTERVAL_CONFIDENCE / 2, self.replications - 1)) * self.cov * self.mean
         half /= self.replications**0.5
         return max(self.mean - half, 0.0), self.mean + half
 
@@ -76,7 +84,7 @@ class ReplicationSummary:
     def cov_interval(self) -> Ends:
         """Interval of the c.o.v. by the chi-square distribution of the variance of normal estimates."""
         df = self.replications - 1
-        low, high = (float(stats.chi2.ppf(0.5 + side * CONFIDENCE / 2, df)) for side in (1, -1))
+        low, high = (float(stats.chi2.ppf(0.5 + side * INTERVAL_CONFIDENCE / 2, df)) for side in (1, -1))
         return self.cov * (df / low) ** 0.5, self.cov * (df / high) ** 0.5
 
     @property
@@ -86,24 +94,36 @@ class ReplicationSummary:
         return low**2, high**2
 
     @property
+    def error(self) -> float:
+        """Mean of the estimates over p by Monte Carlo, less 1."""
+        return self.mean / self.truth - 1.0
+
+    @property
+    def square_error(self) -> float:
+        """Mean square error of the estimates over p², p by Monte Carlo."""
+        spread = 0.0 if self.mean == 0.0 else (self.cov * self.mean / self.truth) ** 2
+        return spread + self.error**2
+
+    @property
     def gain(self) -> float:
-        """Plain Monte Carlo runs for the same c.o.v. over all simulations; with p the mean of the estimates."""
-        return self._gain(self.cov)
+        """Variance of plain Monte Carlo with as many simulations, search included, over the mean square error.
+
+        The c.o.v. alone would praise a method that misses most of p in all of its runs.
+        """
+        work = self.truth * self.work
+        return (1.0 - self.truth) / work if work > 0 else math.nan
 
     @property
     def gain_interval(self) -> Ends:
-        """Interval of the gain from that of the c.o.v."""
-        low, high = self.cov_interval
-        return self._gain(high), self._gain(low)
-
-    def _gain(self, cov: float) -> float:
-        work = self.mean * cov**2 * self.all_simulations
-        return (1.0 - self.mean) / work if work > 0 else math.nan
+        """Interval of the gain by the chi-square distribution of the mean square error of normal estimates."""
+        df = self.replications - 1
+        low, high = (float(stats.chi2.ppf(0.5 + side * INTERVAL_CONFIDENCE / 2, df)) for side in (-1, 1))
+        return self.gain * low / df, self.gain * high / df
 
     @property
     def work(self) -> float:
-        """All simulations times the squared c.o.v.: simulations for a c.o.v. of 1; less is better."""
-        return self.all_simulations * self.squared_cov
+        """All simulations times the mean square error over p²; less is better."""
+        return self.all_simulations * self.square_error
 
 
 def summarise_runs(runs: Iterable[ReplicationRun]) -> dict[tuple[str, str, str], ReplicationSummary]:
@@ -111,20 +131,25 @@ def summarise_runs(runs: Iterable[ReplicationRun]) -> dict[tuple[str, str, str],
     groups: Mapping[tuple[str, str, str], list[ReplicationRun]] = defaultdict(list)
     for run in runs:
         groups[run.scenario, run.system, run.method].append(run)
-    return {key: ReplicationSummary.of_runs(group) for key, group in groups.items()}
+    truths = {
+        (scenario, system): ReplicationSummary.of_runs(group).mean
+        for (scenario, system, method), group in groups.items()
+        if method == "MC"
+    }
+    return {key: ReplicationSummary.of_runs(group, truths.get(key[:2])) for key, group in groups.items()}
 
 
 def ratio_of_work(one: ReplicationSummary, other: ReplicationSummary) -> tuple[float, Ends]:
     """Return the work of one method over that of another, and its interval by the F distribution of two variances.
 
     Example:
-        >>> noisy = ReplicationSummary(20, 1e-4, 0.4, 2000.0, 2000.0)
-        >>> exact = ReplicationSummary(20, 1e-4, 0.2, 1000.0, 1000.0)
+        >>> noisy = ReplicationSummary(20, 1e-4, 0.4, 2000.0, 2000.0, truth=1e-4)
+        >>> exact = ReplicationSummary(20, 1e-4, 0.2, 1000.0, 1000.0, truth=1e-4)
         >>> ratio, (low, high) = ratio_of_work(noisy, exact)
         >>> round(ratio, 3), round(low, 2), round(high, 1)
         (8.0, 3.17, 20.2)
     """
     ratio = one.work / other.work
     df = one.replications - 1, other.replications - 1
-    low, high = (float(stats.f.ppf(0.5 + side * CONFIDENCE / 2, *df)) for side in (1, -1))
+    low, high = (float(stats.f.ppf(0.5 + side * INTERVAL_CONFIDENCE / 2, *df)) for side in (1, -1))
     return ratio, (ratio / low, ratio / high)

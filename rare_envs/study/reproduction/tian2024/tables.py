@@ -10,7 +10,7 @@ from rare_envs.study.reproduction.tian2024.catalogue import (
     ADSS_SIMULATIONS,
     METHOD_ROWS,
     POINTS_OF_A_LEVEL,
-    SCENARIOS,
+    SCENARIO_ROWS,
     SYSTEMS,
 )
 from rare_envs.study.reproduction.tian2024.printed import (
@@ -36,7 +36,9 @@ def make_tables(runs: Sequence[ReplicationRun]) -> list[ComparisonTable]:
     """
     found = summarise_runs(runs)
     levels = _mean_levels(runs)
-    return [_make_table(scenario, found, levels) for scenario in SCENARIOS if any(key[0] == scenario for key in found)]
+    return [
+        _make_table(scenario, found, levels) for scenario in SCENARIO_ROWS if any(key[0] == scenario for key in found)
+    ]
 
 
 def _make_table(scenario: str, found: Summaries, levels: Mapping[tuple[str, str, str], float]) -> ComparisonTable:
@@ -47,15 +49,14 @@ def _make_table(scenario: str, found: Summaries, levels: Mapping[tuple[str, str,
             key = (scenario, system, method)
             if key not in found:
                 continue
-            truth = found[scenario, system, "MC"].mean
             if row.paper:
-                values += _compare(key, row.paper, found[key], truth, levels[key])
+                values += _compare(key, row.paper, found[key], levels[key])
             else:
-                measured.append(_measure(key, found[key], truth))
+                measured.append(_measure(key, found[key]))
     used = {reason for value in values for reason in value.reasons}
     return ComparisonTable(
-        name=SCENARIOS[scenario].table,
-        title=SCENARIOS[scenario].title,
+        name=SCENARIO_ROWS[scenario].table,
+        title=SCENARIO_ROWS[scenario].title,
         keys=("method", "system under test"),
         values=tuple(values),
         explanations={name: text for name, text in EXPLANATIONS.items() if name in used},
@@ -64,9 +65,7 @@ def _make_table(scenario: str, found: Summaries, levels: Mapping[tuple[str, str,
     )
 
 
-def _compare(
-    key: tuple[str, str, str], paper: str, ours: ReplicationSummary, truth: float, levels: float
-) -> Iterator[ComparedValue]:
+def _compare(key: tuple[str, str, str], paper: str, ours: ReplicationSummary, levels: float) -> Iterator[ComparedValue]:
     """Yield the numbers of a method that the paper has beside ours."""
     scenario, system, _ = key
     printed = PRINTED.get((scenario, system, paper), PrintedRow())
@@ -98,7 +97,7 @@ def _compare(
     yield value("mean of p", printed.p, ours.mean, ("traffic", *stacked), ours.mean_interval, RELEASED[paper])
     if paper != "MCS":
         reasons = ("chance",) if level_methods else ("weights", "chance")
-        yield value("error of the mean against Monte Carlo", printed.error, abs(ours.mean / truth - 1.0), reasons)
+        yield value("error of the mean against Monte Carlo", printed.error, abs(ours.error), reasons)
     yield value("c.o.v. of p", printed.cov, ours.cov, spread, ours.cov_interval)
     yield value(
         'square of the c.o.v. (printed as "COV")', printed.squared_cov, ours.squared_cov, spread,
@@ -122,10 +121,10 @@ def _released_cost(paper: str, p: float | None, ours: ReplicationSummary, levels
     return ""
 
 
-def _measure(key: tuple[str, str, str], ours: ReplicationSummary, truth: float) -> MeasuredRow:
+def _measure(key: tuple[str, str, str], ours: ReplicationSummary) -> MeasuredRow:
     values = {
         "mean of p": ours.mean,
-        "error of the mean": abs(ours.mean / truth - 1.0),
+        "error of the mean": abs(ours.error),
         "c.o.v.": ours.cov,
         "square of the c.o.v.": ours.squared_cov,
         "simulations of the estimate": ours.simulations,

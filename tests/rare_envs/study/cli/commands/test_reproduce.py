@@ -1,4 +1,10 @@
+<<<<<<< HEAD
 """The commands `reproduce`."""
+=======
+"""The commands `reproduce PAPER`."""
+
+from __future__ import annotations
+>>>>>>> f65d01d (Reproduction of Tian et al. 2024: gain by the mean square error about Monte Carlo, tests, changelog)
 
 import json
 from pathlib import Path
@@ -7,6 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from rare_envs.study.cli.app import app
+<<<<<<< HEAD
 
 OKELLY = ["reproduce", "okelly2018"]
 
@@ -38,3 +45,63 @@ def test_nothing_run_is_said_to_be_so(tmp_path: Path) -> None:
     assert all(value["ours"] is None for table in record["tables"] for value in table["values"])
     assert "Made: 0 of" in record["notes"][1]
     assert "not run" in (tmp_path / "reproduction.html").read_text()
+=======
+from rare_envs.study.reproduction.tian2024 import study
+from tests.rare_envs.study.reproduction.tian2024.made_runs import made_run
+
+TIAN = ["reproduce", "tian2024"]
+
+
+@pytest.fixture
+def made(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    seeds: list[int] = []
+    monkeypatch.setattr(study, "run_replication", lambda job: (seeds.append(job.seed), made_run(job))[1])
+    return seeds
+
+
+def test_the_small_scale_writes_page_and_json(made: list[int], tmp_path: Path) -> None:
+    out = tmp_path / "t"
+    done = CliRunner().invoke(app, [*TIAN, "--out", str(out), "--scale", "small", "--json"])
+    assert done.exit_code == 0, done.output
+    record = json.loads(done.stdout)
+    assert record["about"]["replications"] == 5
+    assert record["command"] == "rare-envs reproduce tian2024 --replications 5 --seed 0"
+    assert sorted(path.name for path in out.iterdir()) == ["reproduction.html", "reproduction.json", "runs.jsonl"]
+
+
+def test_it_goes_on_unless_told_otherwise(made: list[int], tmp_path: Path) -> None:
+    few = [*TIAN, "--out", str(tmp_path), "--replications", "2"]
+    done = CliRunner().invoke(app, few)
+    assert done.exit_code == 0, done.output
+    assert "Wrote" in done.stdout
+    assert "IS is off by 2 to 17 %" in done.stdout
+    first = len(made)
+    CliRunner().invoke(app, few)
+    assert len(made) == first
+    CliRunner().invoke(app, [*few, "--afresh"])
+    assert len(made) == 2 * first
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [["--replications", "1"], ["--scale", "huge"], ["--seed", "-1"], ["--workers", "0"], ["--replications", "x"]],
+)
+def test_bad_options_are_one_line(tmp_path: Path, changes: list[str]) -> None:
+    done = CliRunner().invoke(app, [*TIAN, "--out", str(tmp_path), *changes])
+    assert done.exit_code == 2
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_cannot_be_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    done = CliRunner().invoke(app, [*TIAN, "--out", str(tmp_path / "file"), "--replications", "2"])
+    assert done.exit_code == 2
+    assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_an_unknown_paper_is_one_line() -> None:
+    done = CliRunner().invoke(app, ["reproduce", "nobody1999"])
+    assert done.exit_code == 2
+    assert len(done.stderr.strip().splitlines()) == 1
+>>>>>>> f65d01d (Reproduction of Tian et al. 2024: gain by the mean square error about Monte Carlo, tests, changelog)

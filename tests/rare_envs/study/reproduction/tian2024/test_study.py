@@ -1,0 +1,82 @@
+"""The reproduction in a folder: resumed, refused where it does not fit, recorded with what made it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from rare_envs.study.errors import BadInput
+from rare_envs.study.reproduction.tian2024 import study
+from rare_envs.study.reproduction.tian2024.study import TianPlan, reproduce_tian2024
+from tests.rare_envs.study.reproduction.tian2024.made_runs import made_run
+
+PLAN = TianPlan(replications=2)
+COMMAND = "rare-envs reproduce tian2024 --replications 2 --seed 0"
+
+
+@pytest.fixture
+def made(monkeypatch: pytest.MonkeyPatch) -> list[tuple]:
+    """Replications made by hand; those that were asked for are listed."""
+    asked: list[tuple] = []
+
+    def make(job):
+        asked.append((job.scenario, job.system, job.method, job.seed))
+        return made_run(job)
+
+    monkeypatch.setattr(study, "run_replication", make)
+    return asked
+
+
+def test_a_folder_has_lines_record_and_page(made, tmp_path: Path) -> None:
+    record = reproduce_tian2024(PLAN, tmp_path, COMMAND)
+    assert len(made) == len((tmp_path / "runs.jsonl").read_text().splitlines()) - 1 == 72
+    assert json.loads((tmp_path / "reproduction.json").read_text()) == record
+    assert (record["about"]["seeds"], record["command"]) == ("0 to 1", COMMAND)
+    assert [table["name"] for table in record["tables"]] == ["table2", "table3"]
+    assert "trace" not in record["runs"][0]
+    page = (tmp_path / "reproduction.html").read_text()
+    assert all(f'id="{name}"' in page for name in ("table2", "table3", "findings", "figure6", "figure7", "figure8"))
+
+
+def test_a_torn_line_alone_is_made_again(made, tmp_path: Path) -> None:
+    whole = reproduce_tian2024(PLAN, tmp_path, COMMAND)
+    file = tmp_path / "runs.jsonl"
+    text = file.read_text()
+    file.write_text(text[:-30])
+    made.clear()
+    assert reproduce_tian2024(PLAN, tmp_path, COMMAND) == whole
+    assert made == [("cut-in", "stack", "improved cross-entropy", 1)]
+    assert file.read_text() == text
+
+
+def test_more_replications_go_on_with_those_there(made, tmp_path: Path) -> None:
+    reproduce_tian2024(PLAN, tmp_path, COMMAND)
+    made.clear()
+    reproduce_tian2024(TianPlan(replications=3), tmp_path, COMMAND)
+    assert {seed for *_, seed in made} == {2}
+
+
+def test_runs_of_another_paper_are_refused(made, tmp_path: Path) -> None:
+    reproduce_tian2024(PLAN, tmp_path, COMMAND)
+    file = tmp_path / "runs.jsonl"
+    file.write_text(file.read_text().replace("tian2024", "okelly2018", 1))
+    with pytest.raises(BadInput, match="has runs of paper okelly2018, this is tian2024"):
+        reproduce_tian2024(PLAN, tmp_path, COMMAND)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"replications": 1}, "2 replications at least"),
+        ({"seed": -1}, "a seed of at least 0"),
+        ({"scenarios": ("parking",)}, "a scenario of car-following, cut-in, got 'parking'"),
+        ({"systems": ()}, "a system of IDM, stack, got none"),
+        ({"methods": ("MC", "magic")}, "got 'magic'"),
+        ({"methods": ("IS",)}, "MC among the methods"),
+    ],
+)
+def test_plans_that_cannot_be_run_are_refused(changes, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        TianPlan(**changes)
