@@ -21,7 +21,7 @@ def format_reproduction(record: Mapping[str, Any]) -> str:
     lines += [f"- {note}" for note in record["notes"]]
     for table in record["tables"]:
         lines += ["", f"### {table['title']}", "", *_format_table(table), ""]
-        if table["measured"]:
+        if table.get("measured"):
             lines += [f"{table['measured_title']}:", "", *_format_measured(table), ""]
         lines += [f"- *{name}*: {text}" for name, text in table["explanations"].items()]
     if record["findings"]:

@@ -1,10 +1,4 @@
-<<<<<<< HEAD
 """The commands `reproduce`."""
-=======
-"""The commands `reproduce PAPER`."""
-
-from __future__ import annotations
->>>>>>> f65d01d (Reproduction of Tian et al. 2024: gain by the mean square error about Monte Carlo, tests, changelog)
 
 import json
 from pathlib import Path
@@ -13,9 +7,11 @@ import pytest
 from typer.testing import CliRunner
 
 from rare_envs.study.cli.app import app
-<<<<<<< HEAD
+from rare_envs.study.reproduction.tian2024 import study
+from tests.rare_envs.study.reproduction.tian2024.made_runs import made_run
 
 OKELLY = ["reproduce", "okelly2018"]
+TIAN = ["reproduce", "tian2024"]
 
 
 @pytest.mark.parametrize(
@@ -45,11 +41,6 @@ def test_nothing_run_is_said_to_be_so(tmp_path: Path) -> None:
     assert all(value["ours"] is None for table in record["tables"] for value in table["values"])
     assert "Made: 0 of" in record["notes"][1]
     assert "not run" in (tmp_path / "reproduction.html").read_text()
-=======
-from rare_envs.study.reproduction.tian2024 import study
-from tests.rare_envs.study.reproduction.tian2024.made_runs import made_run
-
-TIAN = ["reproduce", "tian2024"]
 
 
 @pytest.fixture
@@ -86,7 +77,7 @@ def test_it_goes_on_unless_told_otherwise(made: list[int], tmp_path: Path) -> No
     "changes",
     [["--replications", "1"], ["--scale", "huge"], ["--seed", "-1"], ["--workers", "0"], ["--replications", "x"]],
 )
-def test_bad_options_are_one_line(tmp_path: Path, changes: list[str]) -> None:
+def test_bad_options_of_tian_are_one_line(tmp_path: Path, changes: list[str]) -> None:
     done = CliRunner().invoke(app, [*TIAN, "--out", str(tmp_path), *changes])
     assert done.exit_code == 2
     assert len(done.stderr.strip().splitlines()) == 1
@@ -104,4 +95,3 @@ def test_an_unknown_paper_is_one_line() -> None:
     done = CliRunner().invoke(app, ["reproduce", "nobody1999"])
     assert done.exit_code == 2
     assert len(done.stderr.strip().splitlines()) == 1
->>>>>>> f65d01d (Reproduction of Tian et al. 2024: gain by the mean square error about Monte Carlo, tests, changelog)
