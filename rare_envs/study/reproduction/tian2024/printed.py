@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-SOURCE = (
+TIAN_SOURCE = (
     "Tian, Fu, Zhang, Tang, Sun: Accelerated verification of autonomous driving systems based on adaptive subset "
     "simulation. IEEE Transactions on Intelligent Vehicles, 2024, doi:10.1109/TIV.2024.3449947."
 )

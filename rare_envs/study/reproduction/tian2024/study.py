@@ -22,14 +22,14 @@ from rare_envs.study.reproduction.tian2024.catalogue import (
 )
 from rare_envs.study.reproduction.tian2024.claims import assess_claims
 from rare_envs.study.reproduction.tian2024.figures import collect_figures, draw_figures
-from rare_envs.study.reproduction.tian2024.printed import SOURCE
+from rare_envs.study.reproduction.tian2024.printed import TIAN_SOURCE
 from rare_envs.study.reproduction.tian2024.replications import (
     FIGURE7_METHOD,
     ReplicationJob,
     ReplicationRun,
     run_replication,
 )
-from rare_envs.study.reproduction.tian2024.tables import make_tables
+from rare_envs.study.reproduction.tian2024.tables import make_method_tables
 from samplers.benchmark.runs import map_jobs
 
 REPLICATIONS_FILE = "runs.jsonl"
@@ -129,7 +129,7 @@ def record_replications(plan: TianPlan, runs: Sequence[ReplicationRun], command:
     """Return the record of some replications."""
     return make_record(
         title="Tian et al. 2024: adaptive subset simulation",
-        source=SOURCE,
+        source=TIAN_SOURCE,
         command=command,
         settings={
             "replications": plan.replications,
@@ -138,7 +138,7 @@ def record_replications(plan: TianPlan, runs: Sequence[ReplicationRun], command:
             "horizon": EPISODE_SECONDS,
         },
         notes=_describe_setting(plan),
-        tables=make_tables(runs),
+        tables=make_method_tables(runs),
         figures=collect_figures(runs),
         findings=assess_claims(runs),
         runs=[_short(run) for run in runs],

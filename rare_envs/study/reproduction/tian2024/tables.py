@@ -28,7 +28,7 @@ METHOD_LABELS = {"MCS": "Monte Carlo", "IS": "IS", "SS": "SS", "ADSS": "ADSS"}
 Summaries = Mapping[tuple[str, str, str], ReplicationSummary]
 
 
-def make_tables(runs: Sequence[ReplicationRun]) -> list[ComparisonTable]:
+def make_method_tables(runs: Sequence[ReplicationRun]) -> list[ComparisonTable]:
     """Return Tables II and III, as far as there are runs.
 
     Args:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from rare_envs.study.reproduction.tian2024.replications import ReplicationJob
-from rare_envs.study.reproduction.tian2024.tables import make_tables
+from rare_envs.study.reproduction.tian2024.tables import make_method_tables
 from tests.rare_envs.study.reproduction.tian2024.made_runs import made_run
 
 
@@ -17,7 +17,7 @@ def tables_of(*methods: str, scenarios=("car-following", "cut-in")):
         for method in methods
         for seed in (0, 1)
     ]
-    return make_tables([made_run(job) for job in jobs])
+    return make_method_tables([made_run(job) for job in jobs])
 
 
 def find(table, method: str, system: str, quantity: str):
