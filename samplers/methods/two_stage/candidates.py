@@ -48,7 +48,7 @@ def build_proposal(
     weights = start / start.sum()
     if not state.rounds or len(history.u) == 0:
         return MixtureProposal(candidates, weights)
-    floors = _set_floors(state, candidates, settings, final=final)
+    floors = _set_floors(state, candidates, settings, radial=state.dim <= mixture.subspace.high_dim, final=final)
     u, log_w = _smooth_indicators(history, state.gamma, settings) if state.noisy else (history.u, history.log_weights)
     log_r = log_ratios([candidate.component for candidate in candidates], u)
     weights = minimise_second_moment(log_r, log_w, weights, floors, mixture.weights)
@@ -129,17 +129,30 @@ def _fit_half_space_components(
 
 
 def _set_floors(
-    state: RefinementState, candidates: list[ProposalComponent], settings: RefinementSettings, *, final: bool
+    state: RefinementState,
+    candidates: list[ProposalComponent],
+    settings: RefinementSettings,
+    *,
+    radial: bool,
+    final: bool,
 ) -> list[Floor]:
-    """Return the least shares: of tempered Gaussians, of each region (or of radial components), of base draws."""
+    """Return the least shares: of tempered Gaussians, radial components, each region and base draws.
+
+    Args:
+        state: What is known of the regions.
+        candidates: All components.
+        settings: The shares.
+        radial: Whether there are few enough dimensions for radial components to reach a place off the regions.
+        final: For the estimate.
+    """
     kinds = np.array([candidate.kind for candidate in candidates])
     regions = np.array([candidate.region for candidate in candidates])
     tempered = settings.tempered_share + settings.extra_tempered_share * (1 - state.hit_rate)
     floors = [Floor(kinds == "tempered", settings.noisy_tempered_share if state.noisy else tempered)]
     n = len(state.regions)
-    if state.scattered:
+    if state.scattered or (radial and not state.noisy):
         floors.append(Floor(kinds == "radial", settings.radial_share))
-    elif n > 1:
+    if n > 1 and not state.scattered:
         share = settings.final_region_share if final else settings.region_share
         floors += [Floor((regions == k) & (kinds != "tempered"), share / n) for k in range(n)]
     floors.append(Floor(kinds == "base", settings.noisy_base_share if state.noisy else settings.base_share))

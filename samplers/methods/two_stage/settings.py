@@ -209,8 +209,10 @@ class RefinementSettings:
     be so uneven that it seems to have no mass: it must not be lost by that."""
     final_region_share: float = 0.2
     """The same for the estimate."""
-    radial_share: float = 0.1
-    """Least share of radial components where the regions are no more than pieces of a shell."""
+    radial_share: float = 0.05
+    """Least share of radial components in up to `SubspaceSettings.high_dim` dimensions, and wherever the regions are no
+    more than pieces of a shell: they reach failures beside the regions, of which one draw would outweigh all others. In
+    160 runs of a cut-in 0, 2, 5 and 10 % had gains of 135, 219, 320 and 242."""
     explored_share: float = 0.01
     """Share that components from the exploration keep until the last round."""
     uncovered_share: float = 0.05
