@@ -121,6 +121,15 @@ def test_no_region_is_lost(exact_region, rng, final, least):
         assert sum(own) >= least - 1e-9
 
 
+@pytest.mark.parametrize(
+    ("dim", "noisy", "least"), [(3, False, SETTINGS.radial_share), (41, False, 0.0), (3, True, 0.0)]
+)
+def test_radial_draws_reach_failures_beside_the_regions_in_few_dimensions(exact_region, rng, dim, noisy, least):
+    state, history, _ = after_round(exact_region, rng, dim=dim, noisy=noisy)
+    final = build_proposal(state, history, SETTINGS, rng, final=True)
+    assert share(final, "radial") == pytest.approx(least, abs=1e-9)
+
+
 def test_pieces_of_a_shell_share_one_limit(exact_region, rng):
     state, history, _ = after_round(exact_region, rng, regions=2, scattered=True)
     proposal = build_proposal(state, history, SETTINGS, rng)
