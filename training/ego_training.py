@@ -16,6 +16,7 @@ from rare_envs.files import replace_file
 from rare_envs.plugins import did_you_mean
 from rare_envs.threads import use_one_thread
 from training.ego_checkpoint import load_checkpoint, restore_model, save_checkpoint
+from training.ego_retraining import Retraining, check_retrainable, continue_settings, restore_parameters
 
 CHECKPOINT_SUFFIX, CHECKPOINT_SECONDS = ".checkpoint", 30.0
 """Ending of the file beside the ego, and the time between checkpoints [s]."""
@@ -95,6 +96,7 @@ def train_ego(
     progress: bool = True,
     resume: bool = False,
     checkpoint_interval: float = CHECKPOINT_SECONDS,
+    retraining: Retraining | None = None,
     **make_kwargs: Any,
 ) -> Path:
     """Train an ego and save it.
@@ -111,6 +113,7 @@ def train_ego(
         progress: Show a bar with the mean return and the collision rate on standard error.
         resume: Go on with a training that was interrupted, from the checkpoint beside `out`.
         checkpoint_interval: Time between checkpoints [s]; the last one is removed when the ego is saved.
+        retraining: An ego to go on from, in place of a new one, and failures that are mixed into the scenarios.
         **make_kwargs: Keyword arguments of `gym.make` for this environment.
 
     Returns:
@@ -140,26 +143,22 @@ def train_ego(
     target = _prepare_target(Path(out))
     arguments = {"env_id": env_id, "algo": algo, "steps": steps, "seed": seed, "num_envs": num_envs}
     arguments |= {name: str(value) for name, value in make_kwargs.items() if value is not None}
+    arguments |= {} if retraining is None else retraining.arguments()
     checkpoint = target.with_suffix(CHECKPOINT_SUFFIX)
     saved = _find_checkpoint(checkpoint, arguments, resume)
 
-    import stable_baselines3
     from stable_baselines3.common.callbacks import ConvertCallback
-    from torch import nn
 
     from training.vec_env import sb3_vec_env
 
     env = sb3_vec_env(env_id, num_envs, discrete=hyperparameters.discrete, **make_kwargs)
     try:
         with use_one_thread(), _progress_bar(steps, progress) as callback:
-            model = getattr(stable_baselines3, algo.upper())(  # its classes are named so
-                _policy_name(env.observation_space),
-                env,
-                policy_kwargs={**hyperparameters.policy, "activation_fn": nn.ReLU},
-                seed=seed,
-                device="cpu",
-                **_fit_to_run(hyperparameters, num_envs, steps),
-            )
+            settings = _fit_to_run(hyperparameters, num_envs, steps)
+            if retraining is None:
+                model = _make_model(algo, env, seed, settings, hyperparameters.policy)
+            else:
+                model = _continue_model(retraining, algo, env, seed, settings)
             if saved is not None:
                 model.get_env().reset()
                 restore_model(model, saved)
@@ -173,6 +172,34 @@ def train_ego(
     finally:
         env.close()
     return target
+
+
+def _make_model(algo: str, env: Any, seed: int, settings: Mapping[str, Any], policy: Mapping[str, Any]) -> Any:
+    """Return a new model; ReLU is the activation of its networks unless `policy` names another."""
+    import stable_baselines3
+    from torch import nn
+
+    algorithm = getattr(stable_baselines3, algo.upper())  # its classes are named so
+    policy = {"activation_fn": nn.ReLU, **policy}
+    name = _policy_name(env.observation_space)
+    return algorithm(name, env, policy_kwargs=policy, seed=seed, device="cpu", **settings)
+
+
+def _continue_model(retraining: Retraining, algo: str, env: Any, seed: int, settings: Mapping[str, Any]) -> Any:
+    """Return the model of an ego to train on, in an environment that draws its failures too.
+
+    Raises:
+        ValueError: The ego cannot be trained on here, or the failures are not of this environment.
+        OSError: The ego's file cannot be read.
+    """
+    from agents.sb3.saved_ego import load_saved_ego
+
+    saved = load_saved_ego(retraining.ego, None)
+    check_retrainable(saved, algo, env)
+    env.set_attr("space", retraining.mix(env.get_attr("space")[0]))
+    model = _make_model(algo, env, seed, continue_settings(settings), saved.model.policy_kwargs)
+    restore_parameters(model, saved)
+    return model
 
 
 def _find_checkpoint(path: Path, arguments: Mapping[str, Any], resume: bool) -> dict[str, Any] | None:
