@@ -70,7 +70,7 @@ FLOORS = {
         ego_process
     """,
     "training": """
-        command_line data vec_env ego_checkpoint
+        command_line data vec_env ego_checkpoint ego_retraining
         scenario_fitting imitation.traffic ego_training
         imitation.algorithms imitation.evaluation
         imitation

@@ -118,7 +118,7 @@ def check_retrainable(saved: Any, algo: str, env: Any) -> None:
     if saved.algorithm != algo:
         raise ValueError(f"Expected an ego trained by {algo}, got {name}, trained by {saved.algorithm}.")
     if saved.statistics is not None:
-        raise ValueError(f"Cannot train {name} on: it was trained behind VecNormalize, which train-ego has not.")
+        raise ValueError(f"Cannot train {name} on: it was trained behind VecNormalize, train-ego has none.")
     for what in ("observation_space", "action_space"):
         own, given = getattr(saved.model, what), getattr(env, what)  # both have these two
         if own != given:

@@ -41,6 +41,7 @@ from rare_envs.simulation.world import World
 from rare_envs.threads import use_one_thread
 from training.command_line import report_errors, run_command
 from training.egos.correction_labels import Labelled, record_drive
+from training.egos.imitation import JUDGED, JUDGED_SEED
 from training.egos.nominal_driving import draw_inputs, judge_all_cases, make_world
 from training.egos.nominal_traffic import CASES
 from training.imitation.datasets import Source, load_scenes
@@ -62,8 +63,6 @@ DRAWN = (
 )
 """Scenarios and bases that are driven by draws."""
 ROUNDS_FILE = "rounds.json"
-JUDGED, JUDGED_SEED = 400, 1000
-"""Rollouts of each case of ordinary traffic in the header of the file, and their seed."""
 
 
 @dataclass(frozen=True)

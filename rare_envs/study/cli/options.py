@@ -32,6 +32,11 @@ class NoiseChoice(str, Enum):
         """The argument that the name stands for."""
         return {"on": True, "off": False}.get(self.value, self.value)
 
+    @classmethod
+    def of(cls, argument: bool | str) -> NoiseChoice:
+        """Return the name of an argument."""
+        return next(choice for choice in cls if choice.argument == argument)
+
 
 def read_count(text: str) -> int:
     """Return the whole number that a text stands for, such as "10000" or "1e4".

@@ -3,49 +3,118 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from rare_envs.study.cli.options import EnvArgument, JsonOption, NoiseChoice, SeedOption, WorldOptions
-from rare_envs.study.cli.shell import print_json
-from rare_envs.study.errors import as_bad_input
+from rare_envs.study.cli.options import JsonOption, NoiseChoice, SeedOption, TrustOption, WorldOptions
+from rare_envs.study.cli.shell import keep_stdout_for_the_answer, print_json
+from rare_envs.study.errors import BadInput, as_bad_input
 from rare_envs.threads import use_one_thread
 from training.command_line import DriverTrainingOptions, RecordingOptions, RunFolderOption, spread_options
+
+if TYPE_CHECKING:
+    from rare_envs.study.corpus.retraining import RetrainingPlan
+    from training import Retraining
 
 
 @spread_options
 @use_one_thread()
 def train_ego_command(
-    env: EnvArgument,
     options: WorldOptions,
-    algo: Annotated[str, typer.Option(help="Stable-Baselines3 algorithm.")] = "ppo",
+    env: Annotated[
+        str | None,
+        typer.Argument(metavar="[ENV]", help="Environment, such as rare_envs/CutIn-v0; --from-failures tells it."),
+    ] = None,
+    algo: Annotated[
+        str | None, typer.Option(help="Stable-Baselines3 algorithm; --from-failures tells it.", show_default="ppo")
+    ] = None,
     steps: Annotated[int, typer.Option(help="Environment steps to train for.")] = 200_000,
     out: Annotated[Path, typer.Option(help="File to save the ego in.")] = Path("ego.zip"),
     seed: SeedOption = 0,
     num_envs: Annotated[int, typer.Option(help="Episodes that run side by side.")] = 256,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with a training that was interrupted.")] = False,
+    from_failures: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="RUN",
+            help="Train the ego of this run of rare-envs estimate on, with its failures among ordinary scenarios; "
+            "repeated, the ego of the last run with the failures of all.",
+        ),
+    ] = None,
+    failure_share: Annotated[
+        float, typer.Option(help="Share of episodes that begin in a failure, with --from-failures.")
+    ] = 0.25,
+    trust: TrustOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Train an ego on the batched simulation and save it for `rare-envs estimate --ego`."""
+    """Train an ego on the batched simulation and save it for `rare-envs estimate --ego`.
+
+    A new one in ENV, or by --from-failures the ego of a run, in the world of that run.
+    """
     from training import train_ego
     from training.ego_training import HYPERPARAMETERS
 
-    asked = {"observation": options.observation or "features", "action": options.action or "continuous"}
-    world = {**options.arguments(), **asked}
-    with as_bad_input(ValueError, OSError):
-        path = train_ego(env, algo=algo, steps=steps, out=out, seed=seed, num_envs=num_envs, resume=resume, **world)
-    if as_json:
-        print_json({"ego": str(path), "env_id": env, "algo": algo, "steps": steps, "seed": seed, **world})
+    if from_failures:
+        plan = _read_plan(from_failures, failure_share, trust, env, algo, options)
+        env, algo, world, retraining = plan.env_id, plan.algo, dict(plan.world), plan.retraining
+        noise, next_seed = NoiseChoice.of(world["noise"]), plan.next_seed
+    elif env is None:
+        raise BadInput("Expected an environment, such as rare_envs/CutIn-v0, or --from-failures RUN; rare-envs list.")
     else:
-        if HYPERPARAMETERS[algo].discrete and options.action is None:
-            world["action"] = "discrete"  # which is what the algorithm made of it
-        print(f"Saved {path}. Next: rare-envs estimate {env} --ego {path}{_estimate_options(world, options.noise)}")
+        algo, noise, retraining, next_seed = algo or "ppo", options.noise, None, None
+        asked = {"observation": options.observation or "features", "action": options.action or "continuous"}
+        world = {**options.arguments(), **asked}
+    with as_bad_input(ValueError, OSError):
+        path = train_ego(
+            env,
+            algo=algo,
+            steps=steps,
+            out=out,
+            seed=seed,
+            num_envs=num_envs,
+            resume=resume,
+            retraining=retraining,
+            **world,
+        )
+    if as_json:
+        answer = {"ego": str(path), "env_id": env, "algo": algo, "steps": steps, "seed": seed, **world}
+        print_json(answer | ({} if retraining is None else _describe_retraining(retraining)))
+        return
+    if HYPERPARAMETERS[algo].discrete and options.action is None:
+        world["action"] = "discrete"  # which is what the algorithm made of it
+    seed_words = "" if next_seed is None else f" --seed {next_seed}"
+    print(f"Saved {path}. Next: rare-envs estimate {env} --ego {path}{_estimate_options(world, noise)}{seed_words}")
+
+
+def _read_plan(
+    runs: list[Path], share: float, trust: bool, env: str | None, algo: str | None, options: WorldOptions
+) -> RetrainingPlan:
+    """Return how to train on with the failures of runs.
+
+    Raises:
+        BadInput: The runs cannot be used, or an option says otherwise than they do.
+    """
+    from rare_envs.study.corpus.retraining import plan_retraining
+
+    if options != WorldOptions():
+        raise BadInput("The world of --from-failures is that of the run: leave --base, --drivers and the like out.")
+    with keep_stdout_for_the_answer():
+        plan = plan_retraining(runs, share, trust)
+    for name, given, own in (("ENV", env, plan.env_id), ("--algo", algo, plan.algo)):
+        if given not in (None, own):
+            raise BadInput(f"Expected {name} {own}, that of the run in {str(runs[-1])!r}, got {given!r}; leave it out.")
+    return plan
+
+
+def _describe_retraining(retraining: Retraining) -> dict[str, Any]:
+    failures, share = len(retraining.failures), retraining.share
+    return {"retrained": str(retraining.ego), "failures": failures, "failure_share": share}
 
 
 def _estimate_options(world: dict[str, Any], noise: NoiseChoice) -> str:
     """Return the options with which `estimate` makes the world that an ego was trained in."""
-    usual = {"noise": NoiseChoice.ON.value, "observation": "features", "action": "continuous"}
+    usual = {"noise": NoiseChoice.ON.value, "observation": "features", "action": "continuous", "collisions": "ego"}
     values = {**world, "noise": noise.value, "weather": None}
     words = [f" --{name} {value}" for name, value in values.items() if value not in (None, usual.get(name))]
     return "".join(words) + (" --weather" if world["weather"] else "")

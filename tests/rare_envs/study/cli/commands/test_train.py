@@ -14,6 +14,9 @@ BAD_TRAININGS = {
     "misspelt algorithm": ([FOLLOWING, "--algo", "poo"], ["'ppo'"]),
     "no steps": ([FOLLOWING, "--steps", "0"], ["steps", "0"]),
     "no environments": ([FOLLOWING, "--num-envs", "0"], ["num_envs", "0"]),
+    "no environment": ([], ["--from-failures"]),
+    "no run": (["--from-failures", "nowhere"], ["No run in 'nowhere'"]),
+    "the run tells the world": (["--from-failures", "nowhere", "--base", "us101"], ["leave --base"]),
     "out is a folder": ([FOLLOWING, "--out", "."], ["folder"]),
 }
 
@@ -35,3 +38,30 @@ def test_an_ego_is_trained_and_then_estimated(cli: Cli, risky: str, tmp_path: Pa
     assert result.exit_code in (0, 3)
     assert json.loads(result.stdout)["question"]["ego"] == str(ego)
     assert_refused(cli("estimate", "rare_envs/CutIn-v0", "--ego", ego), "(7,)", "(11,)")
+
+
+def test_an_ego_is_trained_on_with_the_failures_of_its_runs(cli: Cli, risky: str, tmp_path: Path) -> None:
+    words = ("--steps", 40, "--num-envs", 8, "--json")
+    ego, on, runs = tmp_path / "ego.zip", tmp_path / "on.zip", [tmp_path / "first", tmp_path / "second"]
+    assert cli("train-ego", FOLLOWING, "--algo", "a2c", "--out", ego, *words).exit_code == 0
+    for seed, run in enumerate(runs):
+        estimated = cli(*SMALL, "--base", risky, "--ego", ego, "--seed", 7 + seed, "--out", run)
+        assert estimated.exit_code in (0, 3), estimated.output
+    found = [len((run / "failures.csv").read_text().splitlines()) - 1 for run in runs]
+    both = [part for run in runs for part in ("--from-failures", run)]
+    trained = cli("train-ego", *both, "--failure-share", 0.5, "--out", on, *words)
+    assert trained.exit_code == 0, trained.output
+    answer = json.loads(trained.stdout)
+    assert (answer["env_id"], answer["algo"], answer["base"], answer["retrained"]) == (
+        FOLLOWING,
+        "a2c",
+        risky,
+        str(ego),
+    )
+    assert (answer["failures"], answer["failure_share"]) == (sum(found), 0.5)
+    printed = cli("train-ego", "--from-failures", runs[0], "--out", on, *words[:-1]).stdout.replace("\n", " ")
+    assert f"--base {risky} --seed 8" in printed.replace("  ", " ")
+    one = ("train-ego", "--from-failures", runs[0], "--out", on)
+    assert_refused(cli(*one, "--algo", "ppo"), "Expected --algo a2c", "'ppo'")
+    assert_refused(cli("train-ego", "rare_envs/CutIn-v0", *one[1:]), f"Expected ENV {FOLLOWING}")
+    assert_refused(cli(*one, "--failure-share", 1), "share of failures above 0 and below 1")

@@ -1,0 +1,1 @@
+"""Benchmarks of trainings of egos."""
