@@ -127,7 +127,7 @@ def test_no_region_is_lost(exact_region, rng, final, least):
 def test_radial_draws_reach_failures_beside_the_regions_in_few_dimensions(exact_region, rng, dim, noisy, least):
     state, history, _ = after_round(exact_region, rng, dim=dim, noisy=noisy)
     final = build_proposal(state, history, SETTINGS, rng, final=True)
-    assert share(final, "radial") == pytest.approx(least, abs=1e-9)
+    assert least - 1e-9 <= share(final, "radial") <= 1.1 * least
 
 
 def test_pieces_of_a_shell_share_one_limit(exact_region, rng):
