@@ -14,8 +14,6 @@ import sys
 import threading
 from typing import IO, Any, NamedTuple
 
-import cloudpickle
-
 from samplers.execution.executors.base import ExecutorError
 from samplers.execution.executors.chunks import Chunk, Index, Packed
 
@@ -32,6 +30,8 @@ class Reply(NamedTuple):
 def main() -> None:
     """Compute chunks until standard input is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the driver decides
+    import cloudpickle  # only workers need it
+
     inbox, outbox = _take_streams()
     packed, memory = pickle.load(inbox)
     try:

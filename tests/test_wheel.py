@@ -1,0 +1,71 @@
+"""The wheel installs alone: built here, installed into a fresh environment, used outside the checkout."""
+
+from __future__ import annotations
+
+import ast
+import json
+import os
+import re
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("agents", "rare_envs", "samplers", "training")
+
+
+def run(*words: str | Path, cwd: Path) -> str:
+    """Return what a command prints, run in a folder without this checkout on its path."""
+    environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
+    done = subprocess.run(
+        [str(word) for word in words], cwd=cwd, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode in (0, 3), f"{words} ended with {done.returncode}:\n{done.stdout}\n{done.stderr}"
+    return done.stdout
+
+
+def shipped_files() -> set[str]:
+    """Return the files that `[tool.setuptools.package-data]` names and the modules of the packages."""
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    section = text[text.index("[tool.setuptools.package-data]") :].partition("\n\n")[0]
+    patterns = {
+        name: ast.literal_eval(found) for name, found in re.findall(r"^(\w+) = (\[.*\])$", section, re.MULTILINE)
+    }
+    assert set(patterns) == set(PACKAGES)
+    data = {path for name in PACKAGES for pattern in patterns[name] for path in (ROOT / name).glob(pattern)}
+    modules = {path for name in PACKAGES for path in (ROOT / name).rglob("*.py")}
+    return {path.relative_to(ROOT).as_posix() for path in data | modules}
+
+
+def test_data_files_are_named() -> None:
+    files = shipped_files()
+    assert "agents/data/imitation.safetensors" in files
+    assert {f"{name}/py.typed" for name in PACKAGES} <= files
+    unnamed = {
+        path.relative_to(ROOT).as_posix()
+        for name in PACKAGES
+        for path in (ROOT / name).rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    }
+    assert unnamed - files == set()
+
+
+@pytest.mark.slow
+def test_an_estimate_from_the_wheel_outside_the_checkout(tmp_path: Path) -> None:
+    run(sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", tmp_path, ROOT, cwd=tmp_path)
+    (wheel,) = tmp_path.glob("*.whl")
+    inside = set(zipfile.ZipFile(wheel).namelist())
+    assert shipped_files() <= inside
+    run(sys.executable, "-m", "venv", tmp_path / "venv", cwd=tmp_path)
+    scripts = tmp_path / "venv" / ("Scripts" if os.name == "nt" else "bin")
+    pinned = ("-c", ROOT / "constraints.txt")
+    run(scripts / "python", "-m", "pip", "install", "--quiet", *pinned, wheel, cwd=tmp_path)
+    where = run(scripts / "python", "-c", "import rare_envs; print(rare_envs.__file__)", cwd=tmp_path)
+    assert Path(where.strip()).is_relative_to(tmp_path / "venv")
+    words = ("estimate", "rare_envs/CutIn-v0", "--ego", "idm", "--seed", "0", "--max-sim", "3000", "--json")
+    answer = json.loads(run(scripts / "rare-envs", *words, "--out", "runs/cutin", cwd=tmp_path))
+    assert answer["interval"][0] < 1.2e-3 < answer["interval"][1]
+    assert (tmp_path / "runs/cutin/episodes.parquet").is_file()
