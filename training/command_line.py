@@ -54,6 +54,24 @@ class RecordingOptions:
         return given[0]
 
 
+@dataclass(frozen=True, kw_only=True)
+class EventOptions(RecordingOptions):
+    """Options that name recordings of which events are extracted.
+
+    Example:
+        >>> EventOptions(coifman=Path("i80.mat")).kind_and_path()[0]
+        'coifman'
+    """
+
+    coifman: Annotated[Path | None, typer.Option(help="Or the I-80 data of Coifman and Li, .mat or text.")] = None
+    location: LocationOption = None
+    between: Annotated[
+        tuple[float, float] | None, typer.Option(help="Of I-24 MOTION: first and last Unix time to read [s].")
+    ] = None
+
+    KINDS: ClassVar[tuple[str, ...]] = (*RecordingOptions.KINDS, "coifman")
+
+
 class AlgorithmOption(str, Enum):
     """Algorithms that train drivers of the traffic, as an option."""
 

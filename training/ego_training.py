@@ -15,6 +15,7 @@ from typing import Any
 from rare_envs.files import replace_file
 from rare_envs.plugins import did_you_mean
 from rare_envs.threads import use_one_thread
+from samplers.execution.progress import NARROW_TERMINAL
 from training.ego_checkpoint import load_checkpoint, restore_model, save_checkpoint
 from training.ego_retraining import Retraining, check_retrainable, continue_settings, restore_parameters
 
@@ -300,15 +301,18 @@ def _progress_bar(steps: int, show: bool) -> Iterator[Callback | None]:
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+    console = Console(stderr=True)
+    time_left = TimeRemainingColumn(elapsed_when_finished=True)
+    narrow = (BarColumn(bar_width=10), TextColumn("{task.completed:,.0f} steps"), time_left)
     columns = (
         TextColumn("training"),
         BarColumn(),
         TextColumn("{task.completed:,.0f}/{task.total:,.0f} steps"),
-        TimeRemainingColumn(elapsed_when_finished=True),
+        time_left,
         TextColumn("{task.description}"),
     )
     crashes: deque[bool] = deque(maxlen=RECENT)
-    with Progress(*columns, console=Console(stderr=True)) as bar:
+    with Progress(*(columns if console.width >= NARROW_TERMINAL else narrow), console=console) as bar:
         task = bar.add_task("", total=steps)
 
         def on_step(local: dict[str, Any], _: dict[str, Any]) -> bool:

@@ -41,6 +41,9 @@ class Progress:
     """Time that the rest of max_sim takes at the pace so far [s]; None where that is not known."""
 
 
+NARROW_TERMINAL = 72
+"""Columns of a terminal below which a bar keeps itself, the count and the time only."""
+
 Listener = Callable[[Progress], None]
 
 
@@ -159,6 +162,7 @@ def _rich_bar(max_sim: int | None) -> Iterator[Listener]:
     from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Bar
 
+    console = Console(stderr=True)
     columns = (
         TextColumn("[bold]{task.description}"),
         BarColumn(bar_width=20),
@@ -166,7 +170,8 @@ def _rich_bar(max_sim: int | None) -> Iterator[Listener]:
         TextColumn("{task.fields[state]}", markup=False),
         TimeElapsedColumn(),
     )
-    bar = Bar(*columns, console=Console(stderr=True))
+    narrow = (BarColumn(bar_width=10), TextColumn("{task.completed:,.0f} done"), TimeElapsedColumn())
+    bar = Bar(*(columns if console.width >= NARROW_TERMINAL else narrow), console=console)
     task = bar.add_task("estimate", total=max_sim, state="")
 
     def show(progress: Progress) -> None:

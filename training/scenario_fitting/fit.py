@@ -1,7 +1,7 @@
 """Fit of base distributions to recorded traffic, written as JSON.
 
-    python -m training.scenario_fitting.fit --data DIR --out rare_envs/data
-    python -m training.scenario_fitting.fit --highd DIR --out bases
+    rare-envs fit --data DIR --out rare_envs/data
+    rare-envs fit --highd DIR --out bases
 
 The first line makes the files of the package from events of US 101, I-80 and I-24. The second first extracts the events
 of your own recordings, for car-following, cut-in and hard brake: of highD, or with --ngsim, --tgsim, --i24 or --coifman
@@ -17,16 +17,15 @@ one file of a base.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import numpy as np
 import typer
 
 from rare_envs.files import replace_text
 from rare_envs.scenarios.registry import scenario_named
-from training.command_line import LocationOption, RecordingOptions, report_errors, run_command, spread_options
+from training.command_line import EventOptions, report_errors, run_command, spread_options
 from training.data.event_tables import EXTRACTORS, concatenate_events, write_events
 from training.data.events import Events
 from training.data.formats.recordings import load_recordings
@@ -73,7 +72,7 @@ def fit_own_bases(
     name: str,
     seed: int = 0,
     n_refits: int | None = None,
-) -> None:
+) -> list[Path]:
     """Extract the events of recordings and fit scenarios to them.
 
     Writes `<scenario>_events.csv` and `<scenario>_<name>.json` into a folder; `load_base` reads the latter.
@@ -86,9 +85,12 @@ def fit_own_bases(
         seed: Seed of the fits.
         n_refits: Number of refits, see `refit`.
 
+    Returns:
+        The files of the bases.
+
     Raises:
-        ValueError: A recording is broken, or the events of a scenario are too few, of each if none is named; the files
-            of events are written nevertheless.
+        ValueError: A recording is broken, or the events of all scenarios are too few; the files of events are written
+            nevertheless.
     """
     chosen = tuple(EVENT_RECIPES) if scenarios is None else tuple(scenarios)
     out.mkdir(parents=True, exist_ok=True)
@@ -109,7 +111,7 @@ def fit_own_bases(
     for scenario, path in files.items():
         write_events(pooled[scenario], path)
         typer.echo(path)
-    too_few = []
+    too_few, written = [], []
     for scenario, path in files.items():
         recipe = EVENT_RECIPES[scenario]
         events = filter_events(read_events(path, recipe), recipe, scenario_named(scenario).parameters)
@@ -119,26 +121,14 @@ def fit_own_bases(
             base = fit_base(request)
         except ValueError as error:
             too_few.append(f"{path}: {error}")
-            if scenarios is not None or len(too_few) == len(chosen):
+            if len(too_few) == len(chosen):
                 raise ValueError(too_few[0]) from None
             typer.echo(f"{too_few[-1]} No base of {scenario} is written.", err=True)
             continue
-        _write(out / f"{scenario}_{name}.json", format_base(scenario, base.to_dict()))
+        written.append(_write(out / f"{scenario}_{name}.json", format_base(scenario, base.to_dict())))
         if not base.refits:
             typer.echo(f"{base.fitted_to}: too few to say how far they determine {scenario}; no refits", err=True)
-
-
-@dataclass(frozen=True, kw_only=True)
-class EventOptions(RecordingOptions):
-    """Options that name recordings of which events are extracted."""
-
-    coifman: Annotated[Path | None, typer.Option(help="Or the I-80 data of Coifman and Li, .mat or text.")] = None
-    location: LocationOption = None
-    between: Annotated[
-        tuple[float, float] | None, typer.Option(help="Of I-24 MOTION: first and last Unix time to read [s].")
-    ] = None
-
-    KINDS: ClassVar[tuple[str, ...]] = (*RecordingOptions.KINDS, "coifman")
+    return written
 
 
 @spread_options
@@ -155,38 +145,75 @@ def main(
 ) -> None:
     """Write base distributions: those of the package, or those of your own recordings."""
     with report_errors("fit"):
-        kind, path = recordings.kind_and_path()
-        known = tuple(EVENT_RECIPES)
-        if unknown := sorted(set(scenario or ()) - set(known)):
-            raise ValueError(f"Unknown scenario {unknown[0]}; known are {', '.join(known)}.")
-        if not name or Path(name).name != name:
-            raise ValueError(f"Expected --name as a part of file names, such as cologne, got {name!r}.")
-        gaps: Gaps = "cut" if cut_gaps else "error"
-        if kind == "data":
-            _write_package_bases(path, scenario or known, out, seed, refits)
-        else:
-            tables = load_recordings(kind, path, location=recordings.location, between=recordings.between, gaps=gaps)
-            fit_own_bases(tables, scenario, out, name, seed, refits)
+        fit_bases(recordings, out, cut_gaps=cut_gaps, scenarios=scenario, name=name, n_refits=refits, seed=seed)
 
 
-def _write_package_bases(data: Path, scenarios: Sequence[str], out: Path, seed: int, n_refits: int | None) -> None:
-    """Write the bases of the package, each as soon as it is fitted."""
+def fit_bases(
+    recordings: EventOptions,
+    out: Path,
+    *,
+    cut_gaps: bool = False,
+    scenarios: Sequence[str] | None = None,
+    name: str = "own",
+    n_refits: int | None = None,
+    seed: int = 0,
+) -> list[Path]:
+    """Fit base distributions to recordings, or those of the package to its events.
+
+    A scenario with too few events is left out with a line on standard error, unless there is no other.
+
+    Args:
+        recordings: Where they are, and of which format.
+        out: Folder of the files.
+        cut_gaps: Cut tracks where frames are missing.
+        scenarios: Names of the scenarios to fit; None for all that have enough events.
+        name: Name of the bases.
+        n_refits: Number of refits, see `refit`.
+        seed: Seed of the fits.
+
+    Returns:
+        The files of the bases.
+
+    Raises:
+        ValueError: An argument is invalid, a recording is broken, or the events of all scenarios are too few.
+        OSError: A file cannot be read or written.
+    """
+    kind, path = recordings.kind_and_path()
+    known = tuple(EVENT_RECIPES)
+    if unknown := sorted(set(scenarios or ()) - set(known)):
+        raise ValueError(f"Unknown scenario {unknown[0]}; known are {', '.join(known)}.")
+    if not name or Path(name).name != name:
+        raise ValueError(f"Expected --name as a part of file names, such as cologne, got {name!r}.")
+    if kind == "data":
+        return _write_package_bases(path, scenarios or known, out, seed, n_refits)
+    gaps: Gaps = "cut" if cut_gaps else "error"
+    tables = load_recordings(kind, path, location=recordings.location, between=recordings.between, gaps=gaps)
+    return fit_own_bases(tables, scenarios, out, name, seed, n_refits)
+
+
+def _write_package_bases(
+    data: Path, scenarios: Sequence[str], out: Path, seed: int, n_refits: int | None
+) -> list[Path]:
+    """Write the bases of the package, each as soon as it is fitted, and return their files."""
+    files = []
     for base in SHIPPED_BASES:
         if scenario_named(base.scenario).name in scenarios:
             text = fit_shipped_base(base, data, seed, n_refits)
-            _write(out / base.file, text)
+            files.append(_write(out / base.file, text))
     for scenario in ("car_following", CUT_IN_V0, CUT_IN_V1):
         if scenario_named(scenario).name in scenarios:
             content = build_highway_base(scenario)
             if scenario == "car_following":
                 content = check_against_following(content, data)
-            _write(out / name_file(scenario, "highway"), format_base(scenario, content))
+            files.append(_write(out / name_file(scenario, "highway"), format_base(scenario, content)))
+    return files
 
 
-def _write(path: Path, text: str) -> None:
+def _write(path: Path, text: str) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     replace_text(path, text)
     typer.echo(path)
+    return path
 
 
 if __name__ == "__main__":

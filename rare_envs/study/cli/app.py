@@ -18,12 +18,14 @@ from rare_envs.study.cli.commands.corpus import corpus_app
 from rare_envs.study.cli.commands.estimate import estimate_command, resume_command, show_report
 from rare_envs.study.cli.commands.export_ego import export_ego_command
 from rare_envs.study.cli.commands.export_failure import export_command
+from rare_envs.study.cli.commands.fit import fit_command
 from rare_envs.study.cli.commands.plan import plan_command
 from rare_envs.study.cli.commands.replay import replay_command
 from rare_envs.study.cli.commands.report import report_command
 from rare_envs.study.cli.commands.reproduce import reproduce_app
 from rare_envs.study.cli.commands.serve_ego import serve_ego_command
 from rare_envs.study.cli.commands.train import train_drivers_command, train_ego_command
+from rare_envs.study.cli.examples import add_examples, format_examples
 from rare_envs.study.cli.options import (
     AlgoOption,
     EgoArgument,
@@ -38,6 +40,7 @@ from rare_envs.study.cli.options import (
 from rare_envs.study.cli.shell import (
     DOUBTFUL,
     OneLineErrors,
+    SummarisedCommands,
     keep_stdout_for_the_answer,
     print_json,
     show_what_is_known,
@@ -50,7 +53,6 @@ from training.command_line import spread_options
 app = typer.Typer(
     cls=OneLineErrors,
     help="How often does a driving policy crash? Train one, estimate its rare failures, see the most likely.",
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
@@ -171,18 +173,23 @@ def compare_command(
     raise typer.Exit(DOUBTFUL if comparison.comparison.warnings else 0)
 
 
+app.command("fit")(fit_command)
 app.command("train-ego")(train_ego_command)
 app.command("train-drivers")(train_drivers_command)
 app.command("export-ego")(export_ego_command)
 app.command("replay")(replay_command)
 app.command("export")(export_command)
-app.add_typer(corpus_app, name="corpus")
-app.add_typer(bench_app, name="bench")
-app.add_typer(reproduce_app, name="reproduce")
+app.add_typer(corpus_app, name="corpus", cls=SummarisedCommands)
+app.add_typer(bench_app, name="bench", cls=SummarisedCommands)
+app.add_typer(reproduce_app, name="reproduce", cls=SummarisedCommands)
 app.command("plan")(plan_command)
 app.command("report")(report_command)
 app.command("check-ego")(check_ego_command)
 app.command("serve-ego")(serve_ego_command)
+
+
+add_examples(app)
+app.info.epilog = format_examples("")
 
 
 def main() -> None:

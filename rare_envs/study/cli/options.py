@@ -66,7 +66,34 @@ LEADER_SCENARIOS = {"cut-in": "cut_in", "car-following": "car_following"}
 """Scenarios in which the ego gets a new leader; each is run beside the hard brake, and they count nothing twice."""
 
 
-EnvArgument = Annotated[str, typer.Argument(metavar="ENV", help="Environment, such as rare_envs/CutIn-v0.")]
+def complete_environment(incomplete: str) -> list[str]:
+    """Return the ids that begin so, for completion in a shell.
+
+    Example:
+        >>> complete_environment("rare_envs/Car")
+        ['rare_envs/CarFollowing-v0']
+    """
+    from rare_envs.scenarios.registry import SCENARIOS
+
+    return [env_id for env_id in SCENARIOS if env_id.startswith(incomplete)]
+
+
+def complete_method(incomplete: str) -> list[str]:
+    """Return the estimation methods whose names begin so.
+
+    Example:
+        >>> complete_method("a")
+        ['adss', 'auto']
+    """
+    import samplers
+
+    return sorted(name for name in samplers.METHODS if name.startswith(incomplete))
+
+
+EnvArgument = Annotated[
+    str,
+    typer.Argument(metavar="ENV", help="Environment, such as rare_envs/CutIn-v0.", autocompletion=complete_environment),
+]
 EgoArgument = Annotated[str, typer.Argument(metavar="EGO", help="An ego, as for estimate --ego.")]
 ForceOption = Annotated[bool, typer.Option("--force", help="Replace what the folder of --out has of an earlier run.")]
 AlgoOption = Annotated[str | None, typer.Option(help="Algorithm of the .zip, if the file does not tell.")]
@@ -136,7 +163,9 @@ class WorldOptions(ScenarioOptions):
 class QuestionOptions(WorldOptions):
     """Options of a question: method, measure, threshold."""
 
-    method: Annotated[str, typer.Option(help="Estimation method; see rare-envs list.")] = "auto"
+    method: Annotated[
+        str, typer.Option(help="Estimation method; see rare-envs list.", autocompletion=complete_method)
+    ] = "auto"
     measure: Annotated[
         str, typer.Option(help="Safety measure f, small is dangerous: a name, module:function or stl:FORMULA.")
     ] = "ttc"

@@ -23,6 +23,9 @@ from rare_envs.study.errors import BadInput
 DOUBTFUL = 3
 """Exit code of a command that is done, with warnings that make its number doubtful."""
 
+WHOLE = 1_000
+"""Characters of a summary in a list of commands: more than any has."""
+
 _UsageError: type[Exception] = typer.BadParameter.__bases__[0]
 """Error that Typer raises for a wrong option or a missing word; older versions of Typer take it from click."""
 
@@ -35,7 +38,18 @@ class Terminated(KeyboardInterrupt):
         self.number = number
 
 
-class OneLineErrors(TyperGroup):
+class SummarisedCommands(TyperGroup):
+    """Commands whose summaries are not cut in the list of them."""
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write the commands, each with the whole first sentence of its help, in several lines where it is long."""
+        commands = [(name, self.get_command(ctx, name)) for name in self.list_commands(ctx)]
+        rows = [(name, found.get_short_help_str(limit=WHOLE)) for name, found in commands if found is not None]
+        with formatter.section("Commands"):
+            formatter.write_dl(rows)
+
+
+class OneLineErrors(SummarisedCommands):
     """Commands whose errors are one line on standard error and exit code 2.
 
     SIGTERM and SIGHUP end a command as Ctrl-C does; the exit code is 128 and the number of the signal.

@@ -36,6 +36,16 @@ def test_bar_goes_to_standard_error(capsys):
     assert f"P[f <= 0] = {result.p:.2e}" in err
 
 
+def test_a_narrow_terminal_keeps_bar_count_and_time(capsys, monkeypatch):
+    for columns, words in ((40, False), (120, True)):
+        monkeypatch.setenv("COLUMNS", str(columns))
+        result = samplers.estimate(half_space().problem, "mc", seed=1, max_sim=2000, progress=True)
+        last = capsys.readouterr().err.strip("\n").splitlines()[-1]
+        assert len(last) <= columns
+        assert "\u2501" in last and re.search(r"\d:\d\d:\d\d", last) and f"{result.n_sim:,}" in last
+        assert ("P[f <= 0]" in last) == words
+
+
 def failing_in_mid_run(x):
     if (x[:, 0] > 3.0).any():
         raise ArithmeticError("ego left the map")

@@ -9,7 +9,7 @@ import typer
 
 from rare_envs.scenarios.registry import is_highway_env_id
 from rare_envs.study.cli.executor_options import ExecutorOptions
-from rare_envs.study.cli.options import EstimateOptions, ForceOption, JsonOption, TrustOption
+from rare_envs.study.cli.options import EstimateOptions, ForceOption, JsonOption, TrustOption, complete_environment
 from rare_envs.study.cli.shell import (
     DOUBTFUL,
     is_typed,
@@ -35,7 +35,12 @@ def estimate_command(
     options: EstimateOptions,
     places: ExecutorOptions,
     env: Annotated[
-        str | None, typer.Argument(metavar="ENV", help="Environment, such as rare_envs/CutIn-v0; or in --config.")
+        str | None,
+        typer.Argument(
+            metavar="ENV",
+            help="Environment, such as rare_envs/CutIn-v0; or in --config.",
+            autocompletion=complete_environment,
+        ),
     ] = None,
     config: Annotated[
         Path | None, typer.Option(help="YAML file with ENV (env: ...) and options; those given here come first.")

@@ -34,7 +34,7 @@ def plan_command(
     stats: StatsOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Plan simulations and wall time for a c.o.v. by each of --method (joined by commas) and by plain Monte Carlo."""
+    """Plan simulations and wall time for a precision, by each of --method (joined by commas) and plain Monte Carlo."""
     from rare_envs.study.analysis.plan import plan_by_pilots, plan_from_result
     from rare_envs.study.corpus.storage import read_recorded
     from rare_envs.study.question import Question
