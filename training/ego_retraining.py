@@ -29,7 +29,7 @@ class ScenariosWithFailures:
         >>> mixed = ScenariosWithFailures(NoiseDistribution(2), np.full((1, 2), 9.0), share=0.5)
         >>> x = mixed.sample(1000, np.random.default_rng(0))
         >>> x.shape, int((x == 9.0).all(axis=1).sum())
-        ((1000, 2), 495)
+        ((1000, 2), 519)
     """
 
     base: Distribution

@@ -64,8 +64,8 @@ class BaseUncertainty:
         ...     p_refits=(2e-4, 1e-3, 3e-3), ess_refits=(150.0, 200.0, 90.0), clusters=17,
         ...     fitted_to="38 + 15 events of 17 scenes", family="1 component, log gaps")
         >>> print(found)  # doctest: +NORMALIZE_WHITESPACE
-        base distribution 95 %  3.2e-05 to 1.9e-02 (38 + 15 events of 17 scenes, 3 refits); expected for the next
-        event 2e-03
+        base distribution 95 %  3.2e-05 to 1.9e-02 (38 + 15 events of 17 scenes, 3 refits); predictive mean
+        2e-03
           assumes that the fitted family is correct (1 component, log gaps); errors of the family are not included
     """
 
