@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
-from rare_envs.plugins import make_lazy_getattr
+from rare_envs.plugins import make_lazy_getattr, warn_of_namesakes
 from rare_envs.registration import (
     env,
     ignore_version_warnings,
@@ -46,6 +46,7 @@ __all__ = [
     "register_scenario",
     "risk",
 ]
+warn_of_namesakes()
 register_envs()
 ignore_version_warnings()
 

@@ -5,14 +5,37 @@ from __future__ import annotations
 import contextlib
 import difflib
 import importlib
+import importlib.util
 import os
 import sys
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 _MAX_WORDS = 200
 """Characters of an exception's message that `one_line` keeps: a line of a terminal or two."""
+SIBLINGS = {"agents": "agents.loading", "samplers": "samplers.estimation", "training": "training.ego_training"}
+"""Packages that are installed with this one, and a module that the `__init__` of each imports."""
+
+
+def warn_of_namesakes() -> None:
+    """Warn, in one line each, of packages named as one of SIBLINGS that Python finds in place of ours.
+
+    Nothing is imported: the file that Python would import is read.
+    """
+    for name, part in SIBLINGS.items():
+        with contextlib.suppress(ImportError, ValueError, OSError):  # not there, or made by hand
+            found = importlib.util.find_spec(name)
+            origin = found.origin if found else None
+            if origin and part not in Path(origin).read_text(encoding="utf-8", errors="replace"):
+                warnings.warn(
+                    f"Expected {name!r} of Rare Envs, found another package of that name, {origin}; rename or "
+                    "uninstall it, or use an environment of its own (docs/names.md).",
+                    RuntimeWarning,
+                    stacklevel=3,
+                )
 
 
 def import_module(name: str, purpose: str) -> ModuleType:

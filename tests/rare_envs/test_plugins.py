@@ -1,11 +1,21 @@
 """Modules of a user by name: found in the working directory, and every way to fail is one line."""
 
+import importlib.util
 import sys
+import warnings
 from pathlib import Path
 
 import pytest
 
-from rare_envs.plugins import did_you_mean, import_module, import_object, make_lazy_getattr, one_line
+from rare_envs.plugins import (
+    SIBLINGS,
+    did_you_mean,
+    import_module,
+    import_object,
+    make_lazy_getattr,
+    one_line,
+    warn_of_namesakes,
+)
 
 
 @pytest.fixture
@@ -70,3 +80,29 @@ def test_a_name_is_imported_from_its_module_when_it_is_used(monkeypatch: pytest.
     with pytest.raises(AttributeError, match="module 'package' has no attribute 'question'"):
         get("question")
     del sys.modules["late_module"]
+
+
+def test_our_own_packages_are_known_as_such() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn_of_namesakes()
+    for name, part in SIBLINGS.items():
+        assert importlib.util.find_spec(part) is not None, name
+
+
+@pytest.mark.parametrize("name", SIBLINGS)
+def test_a_package_of_the_same_name_is_noticed(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / name).mkdir()
+    (tmp_path / name / "__init__.py").write_text("raise RuntimeError('imported')")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, name, raising=False)
+    with pytest.warns(RuntimeWarning, match=f"Expected '{name}' of Rare Envs, found another package") as caught:
+        warn_of_namesakes()
+    assert len(caught) == 1
+    assert str(tmp_path) in str(caught[0].message)
+    assert "\n" not in str(caught[0].message)
+
+
+def test_a_package_that_is_not_there_or_made_by_hand_is_passed_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "training", type(sys)("training"))  # without a spec
+    warn_of_namesakes()

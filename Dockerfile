@@ -1,0 +1,19 @@
+# rare-envs in a container: docker build -t rare-envs . && docker run --rm -v "$PWD/runs:/work/runs" rare-envs estimate rare_envs/CutIn-v0
+FROM python:3.11-slim AS build
+WORKDIR /source
+COPY . .
+RUN pip wheel --no-cache-dir --no-deps --wheel-dir /wheels .
+
+FROM python:3.11-slim
+COPY constraints.txt /tmp/constraints.txt
+COPY --from=build /wheels /wheels
+# The CPU build of torch is a tenth of the size of the CUDA build; give another index for a GPU.
+ARG TORCH_INDEX=https://download.pytorch.org/whl/cpu
+RUN pip install --no-cache-dir --index-url "$TORCH_INDEX" "$(grep '^torch==' /tmp/constraints.txt)" \
+    && pip install --no-cache-dir -c /tmp/constraints.txt "$(ls /wheels/*.whl)[fast]" \
+    && rm -r /wheels /tmp/constraints.txt
+RUN useradd --create-home user
+USER user
+WORKDIR /work
+ENTRYPOINT ["rare-envs"]
+CMD ["--help"]
