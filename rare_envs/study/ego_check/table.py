@@ -8,6 +8,8 @@ from rich.text import Text
 
 from rare_envs.study.ego_check.findings import Finding, exit_code
 
+MEASUREMENTS = ("driving", "latency")
+"""Checks whose result is of interest though it passed."""
 STYLES = {"pass": "green", "warn": "yellow", "fail": "bold red"}
 VERDICTS = {
     0: "The ego can be used.",
@@ -16,12 +18,24 @@ VERDICTS = {
 }
 
 
-def print_findings(findings: list[Finding], title: str) -> None:
-    """Print findings with their remedies, and the verdict."""
+def print_findings(findings: list[Finding], title: str, everything: bool = False) -> None:
+    """Print findings with their remedies, and the verdict.
+
+    Args:
+        findings: Of all checks.
+        title: Above them.
+        everything: A row for each that passed too; else they are named in one row, so that all fits a screen.
+    """
     console = Console(highlight=False)
     table = Table("check", "", "found", "what to do", title=Text(title), title_justify="left", title_style="bold")
-    for each in findings:
+    shown = [
+        each for each in findings if everything or each.status != "pass" or each.advice or each.check in MEASUREMENTS
+    ]
+    for each in shown:
         status = Text(each.status, style=STYLES[each.status])
         table.add_row(Text(each.check), status, Text(each.found), Text(each.advice))
+    passed = [each.check for each in findings if each not in shown]
+    if passed:
+        table.add_row(Text(f"{len(passed)} others"), Text("pass", style=STYLES["pass"]), Text(", ".join(passed)), "")
     console.print(table)
     console.print(VERDICTS[exit_code(findings)], markup=False)

@@ -29,6 +29,7 @@ def check_ego_command(
     stats: StatsOption = None,
     trust: TrustOption = False,
     time_limit: Annotated[float, typer.Option(help="Seconds that one check may take.")] = 30.0,
+    show_all: Annotated[bool, typer.Option("--all", help="Show each check that passed in a row of its own.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Check in seconds whether an ego fits: spaces, normalisation, determinism, memory, speed. 2: it does not."""
@@ -44,5 +45,5 @@ def check_ego_command(
             {"ego": ego, "env_id": env, "verdict": VERDICTS[code], "findings": [asdict(each) for each in findings]}
         )
     else:
-        print_findings(findings, f"{ego} in {env}")
+        print_findings(findings, f"{ego} in {env}", show_all)
     raise typer.Exit(code)

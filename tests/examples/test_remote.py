@@ -1,0 +1,49 @@
+"""Egos in other programs: the short examples pass the check of an ego, and drive alike."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import rare_envs
+from agents import load_ego
+from rare_envs.study.ego_check.findings import Finding, exit_code
+from rare_envs.study.ego_check.subprocess_check import EgoCheckRequest, run_checks
+
+pytest.importorskip("zmq", reason="the extra remote is optional")
+FOLDER = Path(__file__).parents[2] / "examples" / "remote"
+ENV = "rare_envs/CarFollowing-v0"
+NODE = shutil.which("node")
+PROGRAMS = {"ego.py": [sys.executable], "ego.mjs": [NODE]}
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_an_example_is_short(name: str) -> None:
+    assert len((FOLDER / name).read_text().splitlines()) < 40
+
+
+def test_the_examples_pass_the_check_and_drive_alike() -> None:
+    answers = []
+    for name, (program,) in PROGRAMS.items():
+        if program is None:
+            continue
+        port = "*" if name == "ego.py" else "0"
+        command = [program, str(FOLDER / name), port]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+            assert process.stdout is not None
+            address = process.stdout.readline().strip()
+            findings = [each for each in run_checks(EgoCheckRequest(address, ENV)) if isinstance(each, Finding)]
+            ego = load_ego(f"{address}?timeout=20&patience=20")
+            problem = rare_envs.DrivingProblem(ENV, ego=ego)
+            answers.append(problem.evaluate(problem.base.sample(50, np.random.default_rng(0))))
+            ego.close()
+            process.kill()
+        assert exit_code(findings) == 0, [each for each in findings if each.status == "fail"]
+        assert sum(each.status == "pass" for each in findings) > 20
+    for other in answers[1:]:
+        np.testing.assert_allclose(other, answers[0], atol=1e-4)
