@@ -19,16 +19,16 @@ from rare_envs.traffic.state import VEHICLE_LENGTH, VEHICLE_WIDTH, State
 
 EXPERT = IDM(
     desired_speed=40.0,
-    time_headway=0.8,
-    jam_distance=2.0,
+    time_headway=0.3,
+    jam_distance=1.5,
     jam_distance_speed=0.0,
     max_deceleration=8.0,
     cut_off=True,
 )
 """How the expert follows: closer than the ego does in ordinary traffic, so that it overrules the ego in danger only."""
-LOOK_AHEAD, SIDE_MARGIN = 1.5, 0.5
-"""The expert brakes for whoever is within this margin of the ego's path [m], or will be within this time [s] at its
-present speed across."""
+LOOK_AHEAD, SIDE_MARGIN, LEAST_APPROACH = 1.0, 0.5, 0.3
+"""The expert brakes for whoever is within this margin of the ego's path [m], or will be within this time [s], coming
+nearer at more than this speed [m/s]."""
 FREE = 4.0
 """Acceleration of the expert with nobody ahead [m/s^2], the limit of learned drivers; the ego's own is less."""
 
@@ -55,15 +55,15 @@ def expert_acceleration(state: State) -> Tensor:
 
     Example:
         >>> x, y = torch.tensor([[0.0, 15.0]] * 2), torch.tensor([[0.0, 3.5]] * 2)
-        >>> heading, speed = torch.tensor([[0.0, 0.0], [0.0, -0.05]]), torch.full((2, 2), 20.0)
+        >>> heading, speed = torch.tensor([[0.0, 0.0], [0.0, -0.08]]), torch.tensor([[20.0, 15.0]] * 2)
         >>> expert_acceleration(State(x, y, heading, speed, theta=x[:, :0])).tolist()  # beside, and cutting in
-        [4.0, -5.198349475860596]
+        [4.0, -8.0]
     """
     own, others = state.speed[:, :1], state.speed[:, 1:]
-    aside = state.y[:, 1:] - state.y[:, :1]
-    soon = aside + LOOK_AHEAD * others * torch.sin(state.heading[:, 1:])
-    reach = VEHICLE_WIDTH + SIDE_MARGIN
-    in_path = (torch.minimum(aside.abs(), soon.abs()) < reach) | (aside * soon < 0.0)
+    aside, across = state.y[:, 1:] - state.y[:, :1], others * torch.sin(state.heading[:, 1:])
+    soon, reach = aside + LOOK_AHEAD * across, VEHICLE_WIDTH + SIDE_MARGIN
+    comes = (-aside.sign() * across > LEAST_APPROACH) & ((soon.abs() < reach) | (aside * soon < 0.0))
+    in_path = (aside.abs() < reach) | comes
     gap = state.x[:, 1:] - state.x[:, :1] - VEHICLE_LENGTH
     closing = own * torch.cos(state.heading[:, :1]) - others * torch.cos(state.heading[:, 1:])
     wanted = EXPERT.acceleration(own.expand_as(gap), Lead(gap.clamp(min=0.3), closing))

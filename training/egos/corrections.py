@@ -4,9 +4,9 @@
 
 In each round the ego drives ordinary traffic, draws of the scenarios, and failures that a search has found for the ego
 of that round. What it perceives on its way is labelled, and the network learns from all rounds (DAgger). The label in
-ordinary traffic is what the ego did before any correction, so that it forgets nothing; in the scenarios an expert may
-brake harder than that. Half of the failures are held out: they tell whether the ego learned to avoid crashes or those
-scenarios. At test time there is the network alone, which sees what its lidar shows.
+ordinary traffic, and where recorded people were, is what the ego did before any correction, so that it forgets nothing;
+in the scenarios an expert may brake harder than that. Half of the failures are held out: they tell whether the ego
+learned to avoid crashes or those scenarios. At test time there is the network alone, which sees what its lidar shows.
 
 References:
     Ross, Gordon and Bagnell, "A reduction of imitation learning and structured prediction to no-regret online
@@ -27,7 +27,7 @@ import numpy as np
 import torch
 import typer
 from numpy.typing import NDArray
-from torch import nn
+from torch import Tensor, nn
 
 import rare_envs
 import samplers
@@ -44,6 +44,7 @@ from training.egos.correction_labels import Labelled, record_drive
 from training.egos.imitation import JUDGED, JUDGED_SEED
 from training.egos.nominal_driving import draw_inputs, judge_all_cases, make_world
 from training.egos.nominal_traffic import CASES
+from training.imitation.algorithms.expert_pairs import collect_pairs
 from training.imitation.datasets import Source, load_scenes
 from training.imitation.evaluation.realism import header_metrics
 from training.imitation.run_folder import DRIVER
@@ -77,9 +78,11 @@ class CorrectionConfig:
     """
 
     seed: int = 0
-    rounds: int = 2
+    rounds: int = 1
     draws: int = 1000
     """Draws of each scenario in a round."""
+    recorded: int = 100_000
+    """Moments of recorded people, at which the ego is to do what it did."""
     ordinary: int = 100
     """Drives of a minute in each case of ordinary traffic in a round."""
     simulations: int = 2000
@@ -136,13 +139,17 @@ def failing_share(driver: LearnedDriver, env_id: str, x: NDArray[np.float64]) ->
 
 
 def correct_ego(
-    before: LearnedDriver, config: CorrectionConfig, report: Callable[[str], None] = lambda _: None
+    before: LearnedDriver,
+    config: CorrectionConfig,
+    recorded: Tensor | None = None,
+    report: Callable[[str], None] = lambda _: None,
 ) -> tuple[LearnedDriver, list[dict[str, Any]]]:
     """Correct an ego.
 
     Args:
         before: The ego; it stays as it is.
         config: Settings.
+        recorded: What recorded people perceived, of which the ego is to make what it did, shape (n, 51).
         report: Takes a line of progress.
 
     Returns:
@@ -151,7 +158,7 @@ def correct_ego(
     """
     rng = np.random.default_rng(config.seed)
     driver = replace(before, policy=copy.deepcopy(before.policy))
-    data: list[Labelled] = []
+    data: list[Labelled] = [] if recorded is None else [_keep_recorded(before.policy, recorded, config, rng)]
     held, records = [], list[dict[str, Any]]()
     for number in range(config.rounds):
         for k, (env_id, base) in enumerate(SEARCHED):
@@ -176,6 +183,13 @@ def correct_ego(
             failing_share(driver, env_id, x) for x in (driven, kept)
         )
     return driver, records
+
+
+@torch.inference_mode()
+def _keep_recorded(teacher: Policy, features: Tensor, config: CorrectionConfig, rng: np.random.Generator) -> Labelled:
+    """Return some moments of recorded people with what the ego does there before all corrections."""
+    some = features[torch.from_numpy(rng.integers(0, len(features), config.recorded))]
+    return Labelled(some, torch.cat(teacher(some), dim=1))
 
 
 def _record_round(
@@ -205,9 +219,10 @@ def main(
     with report_errors("corrections"):
         config = CorrectionConfig(seed=seed, rounds=rounds)
         before, origin = read_driver(driver), read_provenance(driver)
-        _, test = load_scenes(Source("data", data))
+        learn, test = load_scenes(Source("data", data))
         out.mkdir(parents=True, exist_ok=True)
-    corrected, records = correct_ego(before, config, lambda line: typer.echo(line, err=True))
+    recorded = collect_pairs(stack_scenes(learn)).features
+    corrected, records = correct_ego(before, config, recorded, lambda line: typer.echo(line, err=True))
     replace_text(out / ROUNDS_FILE, json.dumps(records, indent=1) + "\n")
     metrics = header_metrics(stack_scenes(test), corrected)
     ordinary = judge_all_cases(LearnedEgo(corrected), JUDGED, JUDGED_SEED)

@@ -35,9 +35,9 @@ def coasting() -> LearnedDriver:
 
 def test_the_expert_brakes_as_hard_as_idm_behind_a_lead() -> None:
     root = 2.0 * np.sqrt(EXPERT.max_acceleration * EXPERT.comfortable_deceleration)
-    desired_gap = 2.0 + 20.0 * 0.8 + 20.0 * 5.0 / root
-    expected = EXPERT.max_acceleration * (1.0 - (20.0 / 40.0) ** 4 - (desired_gap / 30.0) ** 2)
-    assert expert_acceleration(traffic(30.0, 0.0)).item() == pytest.approx(expected, rel=1e-5)
+    desired_gap = EXPERT.jam_distance + 20.0 * EXPERT.time_headway + 20.0 * 5.0 / root
+    expected = EXPERT.max_acceleration * (1.0 - (20.0 / 40.0) ** 4 - (desired_gap / 15.0) ** 2)
+    assert expert_acceleration(traffic(15.0, 0.0)).item() == pytest.approx(expected, rel=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -45,7 +45,8 @@ def test_the_expert_brakes_as_hard_as_idm_behind_a_lead() -> None:
     [
         (traffic(10.0, 3.5), False),  # beside
         (traffic(10.0, 2.4), True),  # within the margin
-        (traffic(10.0, 3.5, heading=-0.08), True),  # comes 1.8 m nearer within 1.5 s
+        (traffic(10.0, 3.5, heading=-0.08), True),  # comes 1.2 m nearer within 1 s
+        (traffic(10.0, 2.6, heading=-0.01), False),  # sways
         (traffic(10.0, 3.5, heading=0.08), False),  # goes away
         (traffic(10.0, 3.0, heading=-0.5), True),  # will be on the other side by then
         (traffic(-12.0, 0.0), False),  # behind

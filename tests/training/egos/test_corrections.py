@@ -20,7 +20,7 @@ from training.egos.correction_labels import Labelled
 from training.egos.corrections import CorrectionConfig, correct_ego, failing_share, learn_labels
 
 AGENTS = Path(agents.__file__).parent / "data"
-SMALL = CorrectionConfig(rounds=1, draws=4, ordinary=1, simulations=600, steps=20, batch=64)
+SMALL = CorrectionConfig(rounds=1, draws=4, ordinary=1, simulations=600, steps=20, batch=64, recorded=30)
 FAILURES = np.array(
     [[25.0, 5.0, 20.0, 2.0, 40.0, 2.5], [30.0, 3.0, 20.0, 2.0, 40.0, 2.3], [40.0, 2.0, 20.0, 1.0, 40.0, 2.3]]
 )
@@ -50,7 +50,7 @@ def test_the_network_learns_its_labels(ego: LearnedDriver) -> None:
 
 def test_failures_are_counted_and_half_of_them_held_out(ego: LearnedDriver, monkeypatch: pytest.MonkeyPatch) -> None:
     driven: list[np.ndarray[Any, Any]] = []
-    record = corrections.record_drive
+    record, moments = corrections.record_drive, [0]
 
     def find(driver: LearnedDriver, env_id: str, base: str, simulations: int, seed: int) -> tuple[Any, Any]:
         class Found:
@@ -60,7 +60,9 @@ def test_failures_are_counted_and_half_of_them_held_out(ego: LearnedDriver, monk
 
     def watch(driver: Any, teacher: Any, world: Any, x: Any, every: int, corrected: bool) -> Labelled:
         driven.append(x)
-        return record(driver, teacher, world, x, every, corrected)
+        labelled = record(driver, teacher, world, x, every, corrected)
+        moments[0] += len(labelled.features)
+        return labelled
 
     monkeypatch.setattr(corrections, "find_failures", find)
     monkeypatch.setattr(corrections, "record_drive", watch)
@@ -69,7 +71,8 @@ def test_failures_are_counted_and_half_of_them_held_out(ego: LearnedDriver, monk
     monkeypatch.setattr(corrections, "CASES", {})
     weights = ego.policy.head.weight.clone()
     lines: list[str] = []
-    corrected, (only,) = correct_ego(ego, SMALL, lines.append)
+    recorded = torch.rand(50, 51) * 20.0
+    corrected, (only,) = correct_ego(ego, SMALL, recorded, lines.append)
     assert {name: only[name] for name in ("round", "p", "found", "driven", "held_out")} == {
         "round": 0,
         "p": 0.25,
@@ -82,7 +85,7 @@ def test_failures_are_counted_and_half_of_them_held_out(ego: LearnedDriver, monk
     assert only["held_out_failing"] == failing_share(corrected, "rare_envs/CutIn-v0", np.array(kept))
     assert torch.equal(ego.policy.head.weight, weights)  # the ego that is given stays as it is
     assert not torch.equal(corrected.policy.head.weight, weights)
-    assert len(lines) == 2
+    assert len(lines) == 2 and lines[1].startswith(f"round 0: {30 + moments[0]:,} moments")
 
 
 def test_a_search_finds_failures_of_an_ego(ego: LearnedDriver) -> None:
