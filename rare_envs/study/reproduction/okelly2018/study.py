@@ -192,7 +192,7 @@ def _run_own(
                 "high": high,
                 "cov": found.cov,
                 "n_sim": found.n_sim,
-                "method": found.method,
+                "method": found.method.name,
                 "warnings": list(found.warnings),
             }
 

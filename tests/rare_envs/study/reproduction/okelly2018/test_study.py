@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from rare_envs.study.reproduction.okelly2018.scales import SEARCHES
+from rare_envs.study.reproduction.okelly2018.scales import SEARCHES, STUDY_SCALES
 from rare_envs.study.reproduction.okelly2018.study import HighwayStudy, measure_highway
 
 
@@ -52,3 +53,17 @@ def test_the_search_goes_to_small_outcomes(tiny: HighwayStudy, cheap: Any, out: 
     for run in (run for name, run in measured.searches.items() if name.endswith("0.1")):
         found = np.concatenate([each.f for each in run.final])
         assert np.quantile(found, 0.1) < np.quantile(naive, 0.1) - 0.1
+
+
+def test_our_own_method_is_run_once_for_each_threshold(
+    tiny: HighwayStudy, cheap: Any, out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(STUDY_SCALES, ("lidar", "small"), replace(tiny.settings, own=400))
+    measure_highway(tiny, out, cheap, limit=0)
+    assert cheap.evaluated == 0
+    own = measure_highway(tiny, out, cheap).own
+    assert [each["gamma"] for each in own] == list(tiny.gammas)
+    assert all(each["low"] <= each["p"] <= each["high"] and each["n_sim"] <= 400 for each in own)
+    evaluated = cheap.evaluated
+    assert measure_highway(tiny, out, cheap).own == own
+    assert cheap.evaluated == evaluated
