@@ -66,7 +66,7 @@ def reproduce_okelly2018_command(
     with keep_stdout_for_the_answer():
         with as_bad_input(ValueError):
             study, executor = HighwayStudy(ego, scale, seed), places.make()
-        command = f"rare-envs reproduce okelly2018 --scale {scale} --ego {ego} --seed {seed}"
+        command = f"rare-envs reproduce okelly2018 --scale {scale} --ego {ego} --seed {seed} --out FOLDER"
         record = reproduce_okelly2018(study, out, command, executor, at_most, progress=True)
     if as_json:
         print_json(record)

@@ -94,6 +94,9 @@ def _list_estimates(printed: PrintedTable, heads: list[str], found: Mapping[str,
     ]
     values: list[ComparedValue] = []
     for label, row, estimates, reasons in rows:
+        if row not in printed.rows and not estimates:
+            values.append(_not_run(label))
+            continue
         for j, head in enumerate(heads):
             paper = printed.rows[row][j] if row in printed.rows else (None, None)
             values += _pair(label, head, paper, estimates[j] if estimates else None, reasons)
@@ -107,6 +110,11 @@ def _list_estimates(printed: PrintedTable, heads: list[str], found: Mapping[str,
             ComparedValue(labels=labels, quantity=_ERROR, ours=own["p"] * own["cov"], reasons=("extra",)),
         ]
     return values
+
+
+def _not_run(label: str) -> ComparedValue:
+    """Return the one line of a row that the paper does not have and that was not run."""
+    return ComparedValue(labels=(f"{label}: not run", "all"), quantity="all", reasons=("not run",))
 
 
 def _pair(
@@ -143,6 +151,9 @@ def _list_ratios(printed: PrintedTable, heads: list[str], found: Mapping[str, An
     values: list[ComparedValue] = []
     for name, each in found["searches"].items():
         of_paper = name == PRINTED_SEARCH
+        if not of_paper and not each["comparisons"]:
+            values.append(_not_run(f"cross-entropy, {name}"))
+            continue
         for j, head in enumerate(heads):
             ratio = printed.variance_ratio(j) if of_paper else None
             draws = printed.draws["cross-entropy"]

@@ -87,3 +87,11 @@ def test_missed_failures_are_said_to_be_missed() -> None:
     values = make_tables("lidar", GAMMAS, found_of(alone))[1].values
     assert all("missed" in value.reasons for value in values[:3])
     assert (values[4].ours, values[4].paper) == (-5.0, pytest.approx(0.79, abs=0.01))  # (19.8 - 12.4) / 9.4
+
+
+def test_what_the_paper_has_not_and_was_not_run_is_one_line() -> None:
+    name = "starts alone, rho 0.1"
+    found = found_of(RUN) | {"searches": {PRINTED_SEARCH: RUN, name: {**NOT_RUN, "weights_move": False}}}
+    for table in make_tables("lidar", GAMMAS, found):
+        (line,) = (value for value in table.values if name in value.labels[0])
+        assert line.labels == (f"cross-entropy, {name}: not run", "all")
