@@ -89,7 +89,7 @@ def write_notes(study: HighwayStudy, found: Mapping[str, Any]) -> list[str]:
     return [
         *notes,
         f"The full scale was not run: {full.naive:,} naive rollouts and four searches of {full.per_search:,}, "
-        f"{full.rollouts:,} with our own method. At the {speed:,.0f} rollouts a second of the fastest chunk of this "
-        f"run (one core) that is {hours:,.1f} hours of a core, {search:,.1f} for each search; `--scale full` goes on "
+        f"{full.rollouts:,} with our own method. At the {speed:.3g} rollouts a second of the fastest chunk of this "
+        f"run (wall time) that is {hours:,.1f} hours of a core, {search:,.1f} for each search; `--scale full` goes on "
         "where it was stopped.",
     ]
