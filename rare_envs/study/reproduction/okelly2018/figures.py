@@ -14,7 +14,7 @@ from rare_envs.study.reproduction.okelly2018.printed import PRINTED_TABLES
 
 POINTS = 16
 """Thresholds of a curve."""
-_SHOWN_RATIOS = (1e-3, 1e3)
+_SHOWN_RATIOS = (1e-4, 1e4)
 """Ratios beyond are drawn at the edge: a sample variance of 0 says nothing."""
 
 

@@ -19,6 +19,8 @@ BESIDE = 10.0
 """Distance along the road within which a neighbour closes the way to its lane [m]."""
 STARTS = ("s", "t", "heading", "speed")
 RESAMPLES = 999
+LEAST_P = 1e-99
+"""The least p value that is printed."""
 StartColumns = Mapping[str, FloatArray]
 """Scenario parameters by name, (n, 6) each, the ego first."""
 
@@ -130,7 +132,7 @@ def compare_means(
         test = "no spread"
     else:
         found = stats.ttest_ind(failing, ordinary, equal_var=False)
-        test = f"Welch's t = {float(found.statistic):.1f}, p = {float(found.pvalue):.1g}"
+        test = f"Welch's t = {float(found.statistic):.1f}, p = {max(float(found.pvalue), LEAST_P):.1g}"
     means = f"{failing.mean():.3g} / {ordinary.mean():.3g}"
     return TestedClaim(
         claim=claim.text,

@@ -82,6 +82,11 @@ def write_notes(study: HighwayStudy, found: Mapping[str, Any]) -> list[str]:
         f"Made: {found['rollouts']:,} of {ours.rollouts - 4 * ours.own:,} rollouts of naive Monte Carlo and the "
         f"searches, and {len(found['own'])} of {4 if ours.own else 0} estimates by our default method.",
     ]
+    if found["naive"]:
+        events = ", ".join(str(row["events"]) for row in found["naive"])
+        notes.append(
+            f"The naive p rests on {events} events at the four thresholds; ratios to it are no surer than that."
+        )
     full, speed = STUDY_SCALES[study.ego, "full"], found["rollouts_per_second"]
     if study.scale == "full" or speed is None:
         return notes

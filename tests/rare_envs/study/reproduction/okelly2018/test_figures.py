@@ -28,7 +28,7 @@ def test_the_axes_are_the_papers() -> None:
     (axes,) = figure.axes
     assert axes.get_xlabel() == "threshold gamma [s]"
     assert axes.get_yscale() == "log"
-    assert axes.lines[0].get_ydata().tolist() == [1e3, 2.0]
+    assert axes.lines[0].get_ydata().tolist() == [1e4, 2.0]
 
 
 def test_a_figure_without_curves_says_so_and_is_not_drawn() -> None:
