@@ -12,6 +12,7 @@ from agents.learned.checkpoints import SUFFIX, load_driver
 from agents.learned.driver import LearnedDriver, LearnedEgo
 from agents.names import HUMAN, RULE_BASED, SHIPPED_DRIVERS, SHIPPED_EGOS, VISION
 from agents.python_function import call_factory
+from agents.sb3.hub import HUB_PREFIX, find_hub_model
 from agents.sb3.saved_ego import load_saved_ego
 from agents.settings import read_settings
 from agents.vision.checkpoint import holds_vision, load_vision
@@ -21,12 +22,12 @@ from rare_envs.plugins import did_you_mean
 
 EXPECTED_EGO: Final = (
     f"{', '.join(map(repr, (RULE_BASED, HUMAN, *SHIPPED_EGOS, VISION, *SHIPPED_DRIVERS)))}, a path to a {SUFFIX} or "
-    "Stable-Baselines3 .zip, "
+    "Stable-Baselines3 .zip, hf:USER/REPOSITORY, "
     "an .onnx file, module:function, tcp://host:port, or process:EGO for one of these in a process of its own, "
     "noisy:EGO for one behind the imperfections of a full stack"
 )
 EgoKind = Literal[
-    "rule", "learned", "vision", "url", "remote", "process", "noisy", "onnx", "zip", "function", "unknown"
+    "rule", "learned", "vision", "url", "remote", "process", "noisy", "onnx", "zip", "hub", "function", "unknown"
 ]
 
 
@@ -73,7 +74,8 @@ def load_ego(
             (fields of `rare_envs.IDM` and `rare_envs.control.human_driver.HumanDriverModel`); "imitation", the shipped
             ego with lidar; "vision", PilotNet on the front camera; "mgail", "gail" or "bc", drivers of the traffic,
             which as egos act by their mean actions; a path to a `.safetensors` with one of these kinds; a path to a
-            `.zip` saved by Stable-Baselines3; a path to an `.onnx` file (see
+            `.zip` saved by Stable-Baselines3; "hf:USER/REPOSITORY", such a `.zip` of the Hugging Face Hub
+            (`agents.sb3.hub`); a path to an `.onnx` file (see
             `agents.onnx.ego.OnnxEgo` for its form); `module:function`, a function without arguments that returns an ego
             (modules in the working directory are found); `tcp://host:port` for an ego in another program
             (docs/remote.md); or `process:EGO`, any of these files and functions in a process of its own, which is ended
@@ -114,8 +116,8 @@ def load_ego(
         raise ValueError(f"Will not load an ego from {text!r}: download the file, look where it comes from, name it.")
     if kind == "unknown":
         raise ValueError(f"Unknown ego {text!r}{_suggest_ego(text)}; expected {EXPECTED_EGO}.")
-    if kind == "zip":
-        return load_saved_ego(Path(text), algo, trust, stats)
+    if kind in ("zip", "hub"):
+        return load_saved_ego(find_hub_model(text) if kind == "hub" else Path(text), algo, trust, stats)
     if kind == "noisy":
         from agents.imperfect_stack import NoisyEgo, Stack
 
@@ -199,6 +201,8 @@ def find_ego_kind(spec: str) -> EgoKind:
         return "process"
     if spec.startswith("noisy:"):
         return "noisy"
+    if spec.startswith(HUB_PREFIX):
+        return "hub"
     if spec.startswith(("tcp://", "ipc://")):
         return "remote"
     if "://" in spec:

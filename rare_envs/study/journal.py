@@ -12,6 +12,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from agents.loading import strip_prefixes
+from agents.sb3.hub import HUB_PREFIX, find_cached_model
 from rare_envs.study.errors import BadInput
 from rare_envs.study.question import Question, read_question
 from rare_envs.version import __version__
@@ -107,7 +108,10 @@ def digest_files(question: Question) -> dict[str, str]:
 
 
 def find_named_files(name: str) -> list[Path]:
-    """Return the file that an option names, or that of its module: a.zip, noisy:a.zip, module:function."""
+    """Return the file that an option names, or that of its module: a.zip, noisy:a.zip, hf:user/a, module:function."""
+    if name.startswith(HUB_PREFIX):
+        cached = find_cached_model(name)
+        return [] if cached is None else [cached]
     parts = name.split(":")
     modules = [Path(f"{part.replace('.', '/')}{end}") for part in parts[:-1] for end in (".py", "/__init__.py")]
     try:

@@ -25,6 +25,7 @@ EGOS = {
     "mgail, gail, bc, FILE.safetensors": "learned driver with lidar, by its mean actions",
     "vision": "PilotNet on pictures of a front camera, which imitates a driver by rule; see docs/camera.md",
     "FILE.zip": "policy saved by Stable-Baselines3 or sb3-contrib, VecNormalize statistics beside it included",
+    "hf:USER/REPOSITORY": "such a policy of the Hugging Face Hub, from its cache on this machine or downloaded",
     "FILE.onnx": "graph from observations to actions; rare-envs export-ego writes one of a .zip",
     "module:function": "what your function returns: any object with Stable-Baselines3's predict",
     "tcp://HOST:PORT": "program in any language, see docs/remote.md; rare-envs serve-ego serves one of these",

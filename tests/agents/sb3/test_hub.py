@@ -1,0 +1,121 @@
+"""Policies of the Hugging Face Hub, from a local folder in the form of its cache."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from agents import load_ego
+from agents.loading import find_ego_kind
+from agents.sb3.hub import HubName, find_cached_model, find_hub_cache, find_hub_model
+from agents.sb3.saved_ego import SavedEgo
+from rare_envs.study.journal import find_named_files
+
+NAME, COMMIT = "hf:somebody/ppo-Pendulum-v1", "0123abc"
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path))
+    return tmp_path
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What `package_to_hub` of huggingface_sb3 and RL Zoo upload."""
+    folder = tmp_path_factory.mktemp("uploaded")
+    env = VecNormalize(DummyVecEnv([lambda: gym.make("Pendulum-v1")]))
+    env.reset()
+    PPO("MlpPolicy", env, n_steps=8, batch_size=8, seed=0, device="cpu").save(folder / "ppo-Pendulum-v1.zip")
+    env.save(str(folder / "vec_normalize.pkl"))
+    (folder / "train_eval_metrics.zip").write_bytes(b"PK")
+    (folder / "README.md").write_text("A card.")
+    return folder
+
+
+def fill(cache: Path, files: Path) -> Path:
+    """Put files into the cache as the library does: blobs, and links to them in a snapshot."""
+    repository = cache / "models--somebody--ppo-Pendulum-v1"
+    snapshot = repository / "snapshots" / COMMIT
+    for folder in (snapshot, repository / "blobs", repository / "refs"):
+        folder.mkdir(parents=True)
+    (repository / "refs" / "main").write_text(COMMIT)
+    for number, path in enumerate(sorted(files.iterdir())):
+        (repository / "blobs" / str(number)).write_bytes(path.read_bytes())
+        (snapshot / path.name).symlink_to(repository / "blobs" / str(number))
+    return snapshot
+
+
+@pytest.mark.parametrize("name", [NAME, f"{NAME}@main", f"{NAME}@{COMMIT}", f"{NAME}/ppo-Pendulum-v1.zip"])
+def test_a_policy_in_the_cache_is_loaded_without_a_connection(name: str, cache: Path, files: Path) -> None:
+    snapshot = fill(cache, files)
+    ego = load_ego(name)
+    assert isinstance(ego, SavedEgo)
+    assert (ego.algorithm, ego.path) == ("ppo", snapshot / "ppo-Pendulum-v1.zip")
+    assert ego.statistics_path == snapshot / "vec_normalize.pkl"
+    assert ego.predict(np.zeros((2, 3), np.float32))[0].shape == (2, 1)
+    assert find_ego_kind(name) == "hub"
+    assert find_named_files(name) == [ego.path]  # so that a run knows the file by its content
+
+
+def test_what_is_not_there_is_downloaded_where_the_library_is_installed(
+    cache: Path, files: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "huggingface_hub", None)
+    assert find_cached_model(NAME) is None and find_named_files(NAME) == []
+    with pytest.raises(ValueError, match=r"is not in the cache .*pip install 'rare-envs\[hub\]'"):
+        load_ego(NAME)
+    asked: list[dict[str, Any]] = []
+
+    def download(**arguments: Any) -> str:
+        asked.append(arguments)
+        return str(fill(cache, files))
+
+    monkeypatch.setitem(sys.modules, "huggingface_hub", SimpleNamespace(snapshot_download=download))
+    found = find_hub_model(f"{NAME}@main")
+    assert found == find_hub_model(NAME) == find_cached_model(NAME)
+    (once,) = asked
+    assert (once["repo_id"], once["revision"]) == ("somebody/ppo-Pendulum-v1", "main")
+    assert once["allow_patterns"] == ["*.zip", "*.pkl"] and once["cache_dir"] == str(cache)
+
+
+def test_a_download_that_fails_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    def download(**_: Any) -> str:
+        raise ConnectionError("no\nroute")
+
+    monkeypatch.setitem(sys.modules, "huggingface_hub", SimpleNamespace(snapshot_download=download))
+    with pytest.raises(ValueError, match=r"^Cannot download 'hf:somebody/ppo-Pendulum-v1': .*no route"):
+        load_ego(NAME)
+
+
+@pytest.mark.parametrize("text", ["hf:somebody", "hf:../x/y", "hf:a/b/../c.zip", "hf:a/b@../c", "hf:a/b/c.pkl"])
+def test_a_name_of_another_form_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="Expected hf:USER/REPOSITORY"):
+        HubName.read(text)
+
+
+def test_several_models_need_a_file(cache: Path, files: Path) -> None:
+    snapshot = fill(cache, files)
+    (snapshot / "ppo-Pendulum-v1.zip").rename(snapshot / "first.zip")
+    assert find_hub_model(NAME) == snapshot / "first.zip"
+    (snapshot / "second.zip").write_bytes(b"PK")
+    with pytest.raises(ValueError, match=r"/FILE.zip for .* its files are first.zip, second.zip\.$"):
+        load_ego(NAME)
+
+
+def test_the_cache_is_where_the_library_has_it(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    for name in ("HF_HUB_CACHE", "HF_HOME", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    assert find_hub_cache() == Path.home() / ".cache" / "huggingface" / "hub"
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert find_hub_cache() == tmp_path / "huggingface" / "hub"
+    monkeypatch.setenv("HF_HOME", str(tmp_path / "home"))
+    assert find_hub_cache() == tmp_path / "home" / "hub"
