@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rare_envs.study.reproduction.okelly2018 import findings
 from rare_envs.study.reproduction.okelly2018 import study as study_module
 from rare_envs.study.reproduction.okelly2018.scales import StudyScale
 from rare_envs.study.reproduction.okelly2018.study import HighwayStudy
@@ -43,6 +44,7 @@ def cheap(highway: Any) -> CheapHighway:
 @pytest.fixture
 def tiny(monkeypatch: pytest.MonkeyPatch) -> HighwayStudy:
     monkeypatch.setitem(study_module.STUDY_SCALES, ("lidar", "small"), TINY)
+    monkeypatch.setattr(findings, "RESAMPLES", 99)
     return HighwayStudy()
 
 
