@@ -28,7 +28,7 @@ DOORS = {"rare_envs": {"rare_envs.study.rates.total_risk", "rare_envs.study.stor
 
 FLOORS = {
     "samplers": """
-        errors trace validation serialization distributions
+        errors trace validation serialization distributions system
         problem
         sample proposals limit_states
         presentation

@@ -37,6 +37,8 @@ class SubprocessLink:
             trust: Likewise.
             stats: Likewise.
         """
+        if sys.platform == "win32":
+            raise ValueError("Expected Linux or macOS for process:EGO, whose process inherits a socket; use serve-ego.")
         stats = None if stats is None else str(stats)
         self._arguments = json.dumps({"spec": spec, "algo": algo, "trust": trust, "stats": stats})
         self._spec = spec

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import time
 import warnings
 from pathlib import Path
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 
 from samplers.execution.record_file import JournalError, RecordFile
 from samplers.problem import FloatArray
+from samplers.system import sync_folder
 
 SYNC_SECONDS = 1.0
 """Longest time for which finished simulations are not on the disk yet: what a power cut loses, beside the batch."""
@@ -109,7 +109,7 @@ class JournalFile:
             records.clear()
             records.write(_encode(head))
             records.sync()
-            _sync_folder(path.parent)
+            sync_folder(path.parent)
         except BaseException:
             records.close()
             raise
@@ -222,14 +222,3 @@ def _has_simulations(records: RecordFile) -> bool:
 
 def _encode(fields: dict[str, Any]) -> bytes:
     return json.dumps(fields).encode() + b"\n"
-
-
-def _sync_folder(folder: Path) -> None:
-    """Return when the name of a new file is on the disk, where the system can do that."""
-    if os.name != "posix":
-        return
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

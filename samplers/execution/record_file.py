@@ -10,10 +10,11 @@ from __future__ import annotations
 import hashlib
 import os
 import struct
-import sys
 import zlib
 from pathlib import Path
 from typing import IO
+
+from samplers.system import lock_file
 
 MAGIC = b"samplers records 1\n"
 _HEADER = struct.Struct("<QI")
@@ -190,29 +191,3 @@ class RecordFile:
 
     def _digest_of(self, payload: bytes) -> bytes:
         return hashlib.blake2b(self._digest + payload, digest_size=_DIGEST_SIZE).digest()
-
-
-def lock_file(file: IO[bytes]) -> bool:
-    """Lock an open file for this process until it is closed; return False if another process has it.
-
-    The system lets go of the lock when the process ends, however. File systems that know no locks (some network
-    drives) grant every lock.
-    """
-    if sys.platform == "win32":
-        import msvcrt
-
-        file.seek(1 << 62)  # beyond the content, which others may then still read
-        try:
-            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
-        except OSError:
-            return False
-        return True
-    import fcntl
-
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:  # no locks here
-        return True
-    return True

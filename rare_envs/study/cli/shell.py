@@ -26,6 +26,8 @@ DOUBTFUL = 3
 WHOLE = 1_000
 """Characters of a summary in a list of commands: more than any has."""
 
+_SIGPIPE = int(getattr(signal, "SIGPIPE", 13))
+"""Signal of a reader that is gone; Windows has none of this number."""
 _UsageError: type[Exception] = typer.BadParameter.__bases__[0]
 """Error that Typer raises for a wrong option or a missing word; older versions of Typer take it from click."""
 
@@ -68,7 +70,7 @@ class OneLineErrors(SummarisedCommands):
             _fail(str(error))
         except BrokenPipeError:  # whoever read the answer has enough of it
             os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # nothing more to say when Python flushes
-            sys.exit(128 + signal.SIGPIPE)
+            sys.exit(128 + _SIGPIPE)
         except (KeyboardInterrupt, typer.Abort):
             code = 128 + signal.SIGINT
         if received or code == 128 + signal.SIGINT:

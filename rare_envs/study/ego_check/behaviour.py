@@ -185,6 +185,8 @@ def _read_megabytes() -> float:
         with open("/proc/self/statm") as file:
             return int(file.read().split()[1]) * 4096 / 2**20
     except OSError:
-        import resource
-
+        try:
+            import resource
+        except ImportError:  # Windows, where the standard library does not tell
+            return 0.0
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)

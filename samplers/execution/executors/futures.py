@@ -21,7 +21,8 @@ from samplers.execution.executors.base import ExecutorError, Work, WorkerLost, W
 from samplers.execution.executors.chunks import Chunk, Index, Packed
 from samplers.execution.executors.seeding import SeededWork
 from samplers.execution.executors.transport import pack_work
-from samplers.execution.executors.worker import Reply, describe, limit_memory, make_portable
+from samplers.execution.executors.worker import Reply, describe, make_portable
+from samplers.system import limit_memory
 
 POLL_SECONDS = 0.05
 """Time between two looks at jobs that cannot tell when they are done, such as those of submitit."""

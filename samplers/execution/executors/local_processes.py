@@ -20,6 +20,7 @@ from samplers.execution.executors.chunks import Chunk, Index, Packed
 from samplers.execution.executors.seeding import SeededWork
 from samplers.execution.executors.transport import pack_work
 from samplers.execution.executors.worker import Reply
+from samplers.system import end_process
 
 LOAD_SECONDS = 300.0
 """Longest time that a worker may take to import and to load the problem."""
@@ -181,13 +182,7 @@ class _Process:
 
     def kill(self) -> None:
         """End the process at once, and what it has started, where the system has groups of processes."""
-        with suppress(OSError):
-            if self._child.returncode is not None:  # its number may be that of another process by now
-                return
-            if hasattr(os, "killpg"):
-                os.killpg(self._child.pid, signal.SIGKILL)
-            else:
-                self._child.kill()
+        end_process(self._child)
 
     def end(self) -> None:
         """End the process and close its streams."""

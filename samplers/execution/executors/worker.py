@@ -16,6 +16,7 @@ from typing import IO, Any, NamedTuple
 
 from samplers.execution.executors.base import ExecutorError
 from samplers.execution.executors.chunks import Chunk, Index, Packed
+from samplers.system import limit_memory
 
 
 class Reply(NamedTuple):
@@ -80,23 +81,6 @@ def make_portable(error: BaseException) -> BaseException:
 def describe(error: BaseException) -> str:
     """Return the type and the text of an error."""
     return f"{type(error).__name__}: {error}"
-
-
-def limit_memory(n_bytes: int | None) -> None:
-    """Let this process have so many bytes more than now, where the system can limit data."""
-    if n_bytes is None:
-        return
-    try:
-        import resource
-    except ImportError:  # Windows
-        return
-    if not os.path.exists("/proc/self/statm"):  # macOS
-        return
-    with open("/proc/self/statm", encoding="ascii") as file:
-        data = int(file.read().split()[5]) * resource.getpagesize()
-    hard = resource.getrlimit(resource.RLIMIT_DATA)[1]  # which only root may raise
-    soft = data + n_bytes if hard == resource.RLIM_INFINITY else min(data + n_bytes, hard)
-    resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
 
 
 def _take_streams() -> tuple[IO[bytes], IO[bytes]]:

@@ -39,7 +39,7 @@ def test_an_exit_is_one_and_other_errors_are_answers():
 def test_a_limit_of_memory_stays_below_one_that_is_set_already():
     code = """
 import resource
-from samplers.execution.executors.worker import limit_memory
+from samplers.system import limit_memory
 hard = 2**33
 resource.setrlimit(resource.RLIMIT_DATA, (hard, hard))
 limit_memory(2**40)
