@@ -91,10 +91,10 @@ def check_ego(request: EgoCheckRequest) -> list[Finding]:
     from agents.loading import find_ego_kind, strip_prefixes
     from agents.sb3.file_trust import TRUST_ADVICE, TRUST_CONSEQUENCE, find_origin_risks
     from agents.sb3.normalisation import find_statistics
-    from rare_envs.scenarios.registry import find_scenario
+    from rare_envs.scenarios.registry import find_scenario, split_layout
 
     try:
-        find_scenario(request.env_id)
+        find_scenario(split_layout(request.env_id)[0])
     except ValueError as error:
         raise BadInput(error) from error
     if request.time_limit <= 0:
