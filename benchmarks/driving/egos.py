@@ -61,21 +61,20 @@ there, and warnings say so.
 A row of it in Python, with a quarter of the simulations:
 
 ```python
-import agents
 import rare_envs
 import samplers
 
-problem = rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego=agents.load_ego("imitation"), base="us101-15-offsets")
+problem = rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego="idm", base="us101-15-offsets")
 print(samplers.estimate(problem, seed=0, max_sim=1500))
 ```
 
 ```text
-P[f <= 0] = 4.39e-03
-  95 % interval [3.32e-03, 6.45e-03], c.o.v. 0.135
-  base distribution 95 %  5.2e-04 to 3.7e-02 (38 + 15 events of 17 scenes, 30 refits); predictive mean 7e-03
+P[f <= 0] = 7.66e-04
+  95 % interval [6.52e-04, 9.55e-04], c.o.v. 0.080
+  base distribution 95 %  1.4e-05 to 4.3e-02 (38 + 15 events of 17 scenes, 30 refits); predictive mean 5e-03
     assumes that the fitted family is correct (1 component, log gaps); errors of the family are not included
-  1,500 simulations, gain over Monte Carlo 8.33; two-stage, seed 0, converged; 707 failing points
-  valid unless a failure region with probability above 1.8e-02 was missed (166 base draws found no other)
+  1,500 simulations, gain over Monte Carlo 137; two-stage, seed 0, converged; 491 failing points
+  valid unless a failure region with probability above 1.8e-02 was missed (162 base draws found no other)
 ```
 """
 

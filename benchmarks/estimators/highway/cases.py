@@ -1,12 +1,15 @@
 """Cases on the highway: an ego, the noise of the drivers around it, a measure and its threshold."""
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import rare_envs
 from agents import load_ego
 
 HIGHWAY_ID = "rare_envs/Highway-v0"
+COUNTED_EGO = str(Path(__file__).with_name("imitation_uncorrected.safetensors"))
+"""The ego `imitation` before `training.egos.corrections`: the one whose failures were counted."""
 
 
 @dataclass(frozen=True)
@@ -51,12 +54,12 @@ class HighwayCase:
 COUNTED_WORLDS = {
     "idm": HighwayWorld("idm"),
     "idm, noise fixed": HighwayWorld("idm", noise="fixed"),
-    "imitation": HighwayWorld("imitation"),
+    "imitation": HighwayWorld(COUNTED_EGO),
 }
 """Worlds in which failures are counted."""
 WORLDS = COUNTED_WORLDS | {
     "idm, any": HighwayWorld("idm", collisions="any"),
-    "imitation, black box": HighwayWorld("imitation", black_box=True),
+    "imitation, black box": HighwayWorld(COUNTED_EGO, black_box=True),
 }
 CASES = {
     "idm collisions": HighwayCase("idm", "clearance", 0.0),
