@@ -84,6 +84,10 @@ def reproduce_tian2024_command(
     out: ReproductionFolder = Path("tian2024"),
     scale: ScaleOption = ScaleChoice.FULL,
     replications: ReplicationsOption = None,
+    monte_carlo: Annotated[
+        int | None,
+        typer.Option("--monte-carlo-replications", help="Of Monte Carlo, which takes most of the time."),
+    ] = None,
     seed: FirstSeedOption = 0,
     workers: WorkersOption = 1,
     resume: ResumeOption = True,
@@ -93,9 +97,10 @@ def reproduce_tian2024_command(
     from rare_envs.study.reproduction.tian2024.study import REPLICATIONS_FILE, SCALES, TianPlan, reproduce_tian2024
 
     number = SCALES[scale.value] if replications is None else replications
-    command = f"rare-envs reproduce tian2024 --replications {number} --seed {seed}"
+    fewer = "" if monte_carlo is None else f" --monte-carlo-replications {monte_carlo}"
+    command = f"rare-envs reproduce tian2024 --replications {number}{fewer} --seed {seed}"
     with keep_stdout_for_the_answer(), as_bad_input(ValueError, OSError):
-        plan = TianPlan(replications=number, seed=seed)
+        plan = TianPlan(replications=number, seed=seed, monte_carlo=monte_carlo)
         if not resume:
             (out / REPLICATIONS_FILE).unlink(missing_ok=True)
         record = reproduce_tian2024(plan, out, command, workers, progress=True)

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator, StrMethodFormatter
 
 from rare_envs.study.html_report.svg import FigureOfPage
 from rare_envs.study.plots import HIT_COLOUR, LINE_COLOUR, ORDINARY_COLOUR
@@ -14,6 +15,7 @@ from rare_envs.study.reproduction.tian2024.replications import FIGURE7_METHOD, R
 
 _ROMAN = ("I", "II", "III", "IV", "V", "VI", "VII", "VIII")
 _COLOURS = (LINE_COLOUR, HIT_COLOUR, "#2e8b57", "#8e44ad", "#b25b00")
+_PANELS_IN_A_ROW = 2
 _SHOWN_COLUMNS = (0, 1, 5)
 """Of the cut-in's parameters: v1, v2 and dis1y."""
 FIGURE8_METHODS = ("SS", "ADSS", "two-stage")
@@ -69,8 +71,8 @@ def draw_figures(figures: Mapping[str, Mapping[str, Any]]) -> list[FigureOfPage]
     if figures["figure6"]["lines"]:
         drawn.append(_page_figure("figure6", figures, _draw_rates, (8.0, 3.2)))
     if figures["figure7"]["levels"]:
-        rows = -(-len(figures["figure7"]["levels"]) // 3)
-        drawn.append(_page_figure("figure7", figures, _draw_subsets, (8.0, 3.0 * rows)))
+        rows = -(-len(figures["figure7"]["levels"]) // _PANELS_IN_A_ROW)
+        drawn.append(_page_figure("figure7", figures, _draw_subsets, (7.2, 3.4 * rows)))
     if figures["figure8"]["lines"] or any(figures["figure8"]["ends"].values()):
         drawn.append(_page_figure("figure8", figures, _draw_comparison, (6.4, 3.8)))
     return drawn
@@ -84,7 +86,9 @@ def _page_figure(
 
 
 def _line(run: ReplicationRun) -> dict[str, list[float]]:
-    return {"n": [n for n, _, _ in run.trace], "p": [p for _, p, _ in run.trace]}
+    """Return the estimates of p on the way, those of other thresholds left out."""
+    reached = [(n, p) for n, p, threshold in run.trace if threshold <= 0.0]
+    return {"n": [n for n, _ in reached], "p": [p for _, p in reached]}
 
 
 def _in_figure8(run: ReplicationRun) -> bool:
@@ -111,6 +115,8 @@ def _draw_rates(figure: Figure, data: Mapping[str, Any]) -> None:
                 axes.plot(line["n"], line["p"], color=colour, label=system)
                 axes.fill_between(line["n"], low, high, color=colour, alpha=0.15, linewidth=0)
         axes.set_title(scenario, fontsize=9)
+        axes.xaxis.set_major_locator(MaxNLocator(4))
+        axes.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
         axes.set_xlabel("number of simulations")
         axes.set_ylabel("collision rate")
         axes.set_ylim(bottom=0.0)
@@ -119,17 +125,20 @@ def _draw_rates(figure: Figure, data: Mapping[str, Any]) -> None:
 
 def _draw_subsets(figure: Figure, data: Mapping[str, Any]) -> None:
     levels = data["levels"]
-    rows = -(-len(levels) // 3)
+    rows = -(-len(levels) // _PANELS_IN_A_ROW)
     everything = [row for level in levels for row in level]
     limits = [_pad(min(column), max(column)) for column in zip(*everything, strict=True)]
     for number, level in enumerate(levels):
-        axes: Any = figure.add_subplot(rows, 3, number + 1, projection="3d")
+        axes: Any = figure.add_subplot(rows, _PANELS_IN_A_ROW, number + 1, projection="3d")
         v1, v2, dis1y = zip(*level, strict=True) if level else ((), (), ())
         axes.scatter(v1, v2, dis1y, s=4, color=HIT_COLOUR if number == len(levels) - 1 else ORDINARY_COLOUR)
         for set_limits, ends in zip((axes.set_xlim, axes.set_ylim, axes.set_zlim), limits, strict=True):
             set_limits(*ends)
         axes.set_title(f"subset {_ROMAN[number] if number < len(_ROMAN) else number + 1}", fontsize=9)
         axes.tick_params(labelsize=6)
+        for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
+            axis.set_major_locator(MaxNLocator(4))
+        axes.set_box_aspect(None, zoom=0.85)
         axes.set_xlabel("v1 [m/s]", fontsize=7)
         axes.set_ylabel("v2 [m/s]", fontsize=7)
         axes.set_zlabel("dis1y [m]", fontsize=7)

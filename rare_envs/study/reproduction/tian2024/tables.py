@@ -92,11 +92,13 @@ def _compare(key: tuple[str, str, str], paper: str, ours: ReplicationSummary, le
 
     stacked = ("system",) if system == "stack" else ()
     level_methods = paper in ("SS", "ADSS")
-    spread = {"IS": ("squared", "weights"), "MCS": ("squared",)}.get(paper, ("squared", "settings", "limit state"))
+    spread = {"IS": ("squared", "weights"), "MCS": ("squared",)}.get(
+        paper, ("squared", "settings", "limit state", *stacked)
+    )
     cost = {"IS": ("weights",), "MCS": ("stop rule", "traffic")}.get(paper, ("settings",))
     yield value("mean of p", printed.p, ours.mean, ("traffic", *stacked), ours.mean_interval, RELEASED[paper])
     if paper != "MCS":
-        reasons = ("chance",) if level_methods else ("weights", "chance")
+        reasons = ("chance", *stacked) if level_methods else ("weights", "chance")
         yield value("error of the mean against Monte Carlo", printed.error, abs(ours.error), reasons)
     yield value("c.o.v. of p", printed.cov, ours.cov, spread, ours.cov_interval)
     yield value(

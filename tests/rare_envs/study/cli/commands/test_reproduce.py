@@ -75,10 +75,16 @@ def test_it_goes_on_unless_told_otherwise(made: list[int], tmp_path: Path) -> No
 
 @pytest.mark.parametrize(
     "changes",
-    [["--replications", "1"], ["--scale", "huge"], ["--seed", "-1"], ["--workers", "0"], ["--replications", "x"]],
+    [
+        ["--replications", "1"],
+        ["--scale", "huge"],
+        ["--seed", "-1"],
+        ["--workers", "0"],
+        ["--monte-carlo-replications", "9"],
+    ],
 )
 def test_bad_options_of_tian_are_one_line(tmp_path: Path, changes: list[str]) -> None:
-    done = CliRunner().invoke(app, [*TIAN, "--out", str(tmp_path), *changes])
+    done = CliRunner().invoke(app, [*TIAN, "--out", str(tmp_path), "--scale", "small", *changes])
     assert done.exit_code == 2
     assert len(done.stderr.strip().splitlines()) == 1
     assert not list(tmp_path.iterdir())

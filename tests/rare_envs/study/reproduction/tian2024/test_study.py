@@ -35,7 +35,10 @@ def test_a_folder_has_lines_record_and_page(made, tmp_path: Path) -> None:
     assert json.loads((tmp_path / "reproduction.json").read_text()) == record
     assert (record["about"]["seeds"], record["command"]) == ("0 to 1", COMMAND)
     assert [table["name"] for table in record["tables"]] == ["table2", "table3"]
-    assert "trace" not in record["runs"][0]
+    first = record["runs"][0]
+    assert (first["scenario"], first["system"], first["method"]) == ("car-following", "IDM", "IS")
+    assert (first["seed"], first["p"], first["warnings"]) == ([0, 1], [1.5e-4, 2.5e-4], [1, 1])
+    assert first["high"] == [None, None]
     page = (tmp_path / "reproduction.html").read_text()
     assert all(f'id="{name}"' in page for name in ("table2", "table3", "findings", "figure6", "figure7", "figure8"))
 
@@ -47,7 +50,7 @@ def test_a_torn_line_alone_is_made_again(made, tmp_path: Path) -> None:
     file.write_text(text[:-30])
     made.clear()
     assert reproduce_tian2024(PLAN, tmp_path, COMMAND) == whole
-    assert made == [("cut-in", "stack", "improved cross-entropy", 1)]
+    assert made == [("cut-in", "stack", "MC", 1)]
     assert file.read_text() == text
 
 
@@ -56,6 +59,13 @@ def test_more_replications_go_on_with_those_there(made, tmp_path: Path) -> None:
     made.clear()
     reproduce_tian2024(TianPlan(replications=3), tmp_path, COMMAND)
     assert {seed for *_, seed in made} == {2}
+
+
+def test_monte_carlo_may_have_fewer_replications(made, tmp_path: Path) -> None:
+    record = reproduce_tian2024(TianPlan(replications=3, monte_carlo=2), tmp_path, COMMAND)
+    counts = {runs["method"]: len(runs["p"]) for runs in record["runs"]}
+    assert (counts["MC"], counts["SS"]) == (2, 3)
+    assert "over 3 replications (2 of Monte Carlo" in record["notes"][0]
 
 
 def test_runs_of_another_paper_are_refused(made, tmp_path: Path) -> None:
@@ -71,6 +81,8 @@ def test_runs_of_another_paper_are_refused(made, tmp_path: Path) -> None:
     [
         ({"replications": 1}, "2 replications at least"),
         ({"seed": -1}, "a seed of at least 0"),
+        ({"monte_carlo": 1}, "2 to 20 replications of Monte Carlo"),
+        ({"monte_carlo": 21}, "2 to 20 replications of Monte Carlo"),
         ({"scenarios": ("parking",)}, "a scenario of car-following, cut-in, got 'parking'"),
         ({"systems": ()}, "a system of IDM, stack, got none"),
         ({"methods": ("MC", "magic")}, "got 'magic'"),

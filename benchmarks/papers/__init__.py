@@ -1,0 +1,1 @@
+"""Published papers: their tables beside ours, from committed results."""

@@ -1,0 +1,70 @@
+"""Page of the documentation about papers, from the committed records of `rare-envs reproduce`.
+
+    python -m benchmarks.papers.page
+
+writes `docs/papers.md`. The records are `benchmarks/results/tian2024.json` and `okelly2018.json`: the
+`reproduction.json` of a run, under the name of its paper.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+from benchmarks import RESULTS
+from rare_envs.study.reproduction.markdown import format_reproduction
+
+PAPERS_PAGE = Path(__file__).parents[2] / "docs" / "papers.md"
+PAPERS = ("tian2024", "okelly2018")
+READING = """\
+import json
+from pathlib import Path
+
+import rare_envs
+
+results = Path(rare_envs.__file__).parents[1] / "benchmarks" / "results"  # of a clone of the repository
+record = json.loads((results / "tian2024.json").read_text())
+for value in record["tables"][0]["values"]:
+    if value["quantity"] == "gain over plain Monte Carlo":
+        print(f"{value['labels'][0]}, {value['labels'][1]}: paper {value['paper']:.2g}, ours {value['ours']:.2g}")
+"""
+HEAD = """\
+# Papers made anew
+
+One command makes the tables and figures of a paper anew, beside those that were printed:
+
+    rare-envs reproduce tian2024 --out tian2024 --scale small    # 5 replications; full: the paper's 20
+    rare-envs reproduce okelly2018 --out okelly2018
+
+Each writes `reproduction.html` (tables with a column of differences, figures in the paper's axes),
+`reproduction.json` (all numbers, the command, versions, machine and seeds, from which the page is made) and the single
+runs, with which the same command goes on where it has ended. This page is made from the records in
+`benchmarks/results`; to read one:
+"""
+
+
+def read_records() -> dict[str, dict[str, Any]]:
+    """Return the committed records by paper."""
+    files = {paper: RESULTS / f"{paper}.json" for paper in PAPERS}
+    return {paper: json.loads(file.read_text(encoding="utf-8")) for paper, file in files.items() if file.exists()}
+
+
+def format_papers_page() -> str:
+    """Return the page as Markdown."""
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        exec(compile(READING, "reading of the page", "exec"), {})
+    example = f"```python\n{READING}```\n\n```text\n{printed.getvalue()}```\n"
+    return "\n".join([HEAD, example, *(format_reproduction(record) for record in read_records().values())])
+
+
+def main() -> None:
+    """Write the page."""
+    PAPERS_PAGE.write_text(format_papers_page(), encoding="utf-8")
+    print(f"Wrote {PAPERS_PAGE}.")
+
+
+if __name__ == "__main__":
+    main()
