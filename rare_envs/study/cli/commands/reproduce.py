@@ -88,6 +88,10 @@ def reproduce_tian2024_command(
         int | None,
         typer.Option("--monte-carlo-replications", help="Of Monte Carlo, which takes most of the time."),
     ] = None,
+    further: Annotated[
+        int | None,
+        typer.Option("--further-replications", help="Of the methods that the paper does not have."),
+    ] = None,
     seed: FirstSeedOption = 0,
     workers: WorkersOption = 1,
     resume: ResumeOption = True,
@@ -98,9 +102,10 @@ def reproduce_tian2024_command(
 
     number = SCALES[scale.value] if replications is None else replications
     fewer = "" if monte_carlo is None else f" --monte-carlo-replications {monte_carlo}"
+    fewer += "" if further is None else f" --further-replications {further}"
     command = f"rare-envs reproduce tian2024 --replications {number}{fewer} --seed {seed}"
     with keep_stdout_for_the_answer(), as_bad_input(ValueError, OSError):
-        plan = TianPlan(replications=number, seed=seed, monte_carlo=monte_carlo)
+        plan = TianPlan(replications=number, seed=seed, monte_carlo=monte_carlo, further=further)
         if not resume:
             (out / REPLICATIONS_FILE).unlink(missing_ok=True)
         record = reproduce_tian2024(plan, out, command, workers, progress=True)

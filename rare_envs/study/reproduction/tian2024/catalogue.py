@@ -66,7 +66,6 @@ class MethodRow:
 
 
 _N = POINTS_OF_A_LEVEL
-_N_EQUAL = round(ADSS_SIMULATIONS / 3.7)  # four levels, each but the first without its seeds
 METHOD_ROWS = {
     "MC": MethodRow(MonteCarlo(), DRAWS_AT_MOST, HALF_WIDTH / 1.96, "MCS"),
     "IS": MethodRow(
@@ -77,7 +76,6 @@ METHOD_ROWS = {
     "SS": MethodRow(SubsetSimulation(n=_N, distribution="normal"), paper="SS"),
     "ADSS": MethodRow(AdaptiveSubsetSimulation(n=_N), paper="ADSS"),
     "ADSS as printed": MethodRow(AdaptiveSubsetSimulation(n=_N, proposal="metropolis", sigma0="seeds")),
-    "ADSS, 725 a level": MethodRow(AdaptiveSubsetSimulation(n=_N_EQUAL)),
     "two-stage": MethodRow(TwoStage(), ADSS_SIMULATIONS),
     "cross-entropy": MethodRow(CrossEntropy(), ADSS_SIMULATIONS),
     "improved cross-entropy": MethodRow(ImprovedCrossEntropy(), ADSS_SIMULATIONS),

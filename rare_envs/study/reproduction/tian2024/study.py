@@ -44,7 +44,7 @@ class TianPlan:
     Example:
         >>> plan = TianPlan(replications=20)
         >>> len(plan.jobs()), plan.jobs()[0].method, plan.jobs()[-1].method
-        (720, 'IS', 'MC')
+        (640, 'IS', 'MC')
     """
 
     replications: int = SCALES["full"]
@@ -52,6 +52,8 @@ class TianPlan:
     """Of the first replication; the others have the seeds that follow."""
     monte_carlo: int | None = None
     """Replications of Monte Carlo, which take most of the time; None for as many as of the others."""
+    further: int | None = None
+    """Replications of the methods that the paper does not have; None for as many as of those that it has."""
     scenarios: tuple[str, ...] = tuple(SCENARIO_ROWS)
     systems: tuple[str, ...] = tuple(SYSTEMS)
     methods: tuple[str, ...] = tuple(METHOD_ROWS)
@@ -59,11 +61,9 @@ class TianPlan:
     def __post_init__(self) -> None:
         if self.replications < 2:
             raise ValueError(f"Expected 2 replications at least, for a spread, got {self.replications}.")
-        if self.monte_carlo is not None and not 2 <= self.monte_carlo <= self.replications:
-            raise ValueError(
-                f"Expected 2 to {self.replications} replications of Monte Carlo, at most those of the others, got "
-                f"{self.monte_carlo}."
-            )
+        for what, number in (("Monte Carlo", self.monte_carlo), ("further methods", self.further)):
+            if number is not None and not 2 <= number <= self.replications:
+                raise ValueError(f"Expected 2 to {self.replications} replications of {what}, got {number}.")
         if self.seed < 0:
             raise ValueError(f"Expected a seed of at least 0, got {self.seed}.")
         for name, chosen, known in (
@@ -79,9 +79,14 @@ class TianPlan:
             raise ValueError("Expected MC among the methods: the others are compared with it.")
 
     def jobs(self) -> list[ReplicationJob]:
-        """Return the replications, all methods with one seed before those with the next, Monte Carlo at the end."""
-        counts = {method: self.replications for method in self.methods if method != "MC"}
-        return [*self._list_jobs(counts), *self._list_jobs({"MC": self.monte_carlo or self.replications})]
+        """Return the replications: the paper's methods, then further ones, Monte Carlo at the end."""
+        others = [method for method in self.methods if method != "MC"]
+        parts = [
+            {method: self.replications for method in others if METHOD_ROWS[method].paper},
+            {method: self.further or self.replications for method in others if not METHOD_ROWS[method].paper},
+            {"MC": self.monte_carlo or self.replications},
+        ]
+        return [job for counts in parts for job in self._list_jobs(counts)]
 
     def _list_jobs(self, counts: dict[str, int]) -> list[ReplicationJob]:
         """Return the replications of methods, as many of each as is said."""
@@ -147,6 +152,7 @@ def record_replications(plan: TianPlan, runs: Sequence[ReplicationRun], command:
         settings={
             "replications": plan.replications,
             "replications_of_monte_carlo": plan.monte_carlo or plan.replications,
+            "replications_of_further_methods": plan.further or plan.replications,
             "seeds": f"{plan.seed} to {plan.seed + plan.replications - 1}",
             "base": TRAFFIC_BASE,
             "horizon": EPISODE_SECONDS,
@@ -161,8 +167,9 @@ def record_replications(plan: TianPlan, runs: Sequence[ReplicationRun], command:
 
 def _describe_setting(plan: TianPlan) -> list[str]:
     return [
-        f"Every figure is over {plan.replications} replications ({plan.monte_carlo or plan.replications} of Monte "
-        "Carlo, of which the paper does not say how many it made); intervals are 95 %: of a mean by Student's "
+        f"Every figure is over {plan.replications} replications (Monte Carlo {plan.monte_carlo or plan.replications}, "
+        f"methods that the paper does not have {plan.further or plan.replications}; the paper has 20 and does not say "
+        "how many of Monte Carlo); intervals are 95 %: of a mean by Student's "
         "distribution, of a c.o.v. by the chi-square distribution.",
         "Failure is a collision of the ego within 5 s. Systems under test: the IDM with the paper's parameters, and "
         "`noisy:idm`, an imperfect stack around it, where the paper has Apollo.",

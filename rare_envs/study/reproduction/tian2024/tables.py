@@ -61,7 +61,7 @@ def _make_table(scenario: str, found: Summaries, levels: Mapping[tuple[str, str,
         values=tuple(values),
         explanations={name: text for name, text in EXPLANATIONS.items() if name in used},
         measured=tuple(measured),
-        measured_title=f"Our methods with {ADSS_SIMULATIONS:,} simulations, and ADSS in other readings of the paper",
+        measured_title=f"Our methods with {ADSS_SIMULATIONS:,} simulations, and ADSS in its other reading",
     )
 
 

@@ -31,7 +31,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[tuple]:
 
 def test_a_folder_has_lines_record_and_page(made, tmp_path: Path) -> None:
     record = reproduce_tian2024(PLAN, tmp_path, COMMAND)
-    assert len(made) == len((tmp_path / "runs.jsonl").read_text().splitlines()) - 1 == 72
+    assert len(made) == len((tmp_path / "runs.jsonl").read_text().splitlines()) - 1 == 64
     assert json.loads((tmp_path / "reproduction.json").read_text()) == record
     assert (record["about"]["seeds"], record["command"]) == ("0 to 1", COMMAND)
     assert [table["name"] for table in record["tables"]] == ["table2", "table3"]
@@ -61,11 +61,11 @@ def test_more_replications_go_on_with_those_there(made, tmp_path: Path) -> None:
     assert {seed for *_, seed in made} == {2}
 
 
-def test_monte_carlo_may_have_fewer_replications(made, tmp_path: Path) -> None:
-    record = reproduce_tian2024(TianPlan(replications=3, monte_carlo=2), tmp_path, COMMAND)
+def test_monte_carlo_and_further_methods_may_have_fewer_replications(made, tmp_path: Path) -> None:
+    record = reproduce_tian2024(TianPlan(replications=4, monte_carlo=2, further=3), tmp_path, COMMAND)
     counts = {runs["method"]: len(runs["p"]) for runs in record["runs"]}
-    assert (counts["MC"], counts["SS"]) == (2, 3)
-    assert "over 3 replications (2 of Monte Carlo" in record["notes"][0]
+    assert (counts["MC"], counts["SS"], counts["two-stage"]) == (2, 4, 3)
+    assert "over 4 replications (Monte Carlo 2, methods that the paper does not have 3;" in record["notes"][0]
 
 
 def test_runs_of_another_paper_are_refused(made, tmp_path: Path) -> None:
@@ -83,6 +83,7 @@ def test_runs_of_another_paper_are_refused(made, tmp_path: Path) -> None:
         ({"seed": -1}, "a seed of at least 0"),
         ({"monte_carlo": 1}, "2 to 20 replications of Monte Carlo"),
         ({"monte_carlo": 21}, "2 to 20 replications of Monte Carlo"),
+        ({"further": 1}, "2 to 20 replications of further methods"),
         ({"scenarios": ("parking",)}, "a scenario of car-following, cut-in, got 'parking'"),
         ({"systems": ()}, "a system of IDM, stack, got none"),
         ({"methods": ("MC", "magic")}, "got 'magic'"),
