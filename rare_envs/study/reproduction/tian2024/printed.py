@@ -111,7 +111,8 @@ EXPLANATIONS = {
     ),
     "chance": (
         "The mean of 20 replications with a c.o.v. of 0.3 to 0.5 has a standard error of 7 to 11 %: printed errors of "
-        "2 or 3 % are smaller than chance explains, and ours differ from them by chance as well."
+        "2 or 3 % are smaller than chance explains, and ours differ from them by chance as well. "
+        "The c.o.v. of few replications is itself uncertain: see its interval."
     ),
     "text": "Table III itself is not in the text at hand: single runs and figures that the text repeats, see above.",
 }

@@ -92,7 +92,7 @@ def _compare(key: tuple[str, str, str], paper: str, ours: ReplicationSummary, le
 
     stacked = ("system",) if system == "stack" else ()
     level_methods = paper in ("SS", "ADSS")
-    spread = {"IS": ("squared", "weights"), "MCS": ("squared",)}.get(
+    spread = {"IS": ("squared", "weights"), "MCS": ("squared", "chance")}.get(
         paper, ("squared", "settings", "limit state", *stacked)
     )
     cost = {"IS": ("weights",), "MCS": ("stop rule", "traffic")}.get(paper, ("settings",))
