@@ -53,7 +53,7 @@ class Draws:
         return cls(len(f), f[fails], log_weights[fails], x[fails], f[~fails], log_weights[~fails], fails)
 
     def join(self, other: Draws) -> Draws:
-        """Return these draws and others from the same proposal."""
+        """Return these draws and others; `log_weights` are those of the proposal that each is from."""
         if self.n == 0:
             return other
         parts = ("f", "log_weights", "x", "f_safe", "log_weights_safe", "fails")
@@ -71,13 +71,18 @@ class Draws:
             x=self.x,
         )
 
-    def weights_after(self, first: int) -> tuple[DrawWeights, ...]:
-        """Return the weight of each draw in p, in the order of their simulation, of which this many came before."""
+    def weights_after(self, first: int, total: int | None = None) -> tuple[DrawWeights, ...]:
+        """Return the weight of each draw in p, in the order of their simulation, of which this many came before.
+
+        Args:
+            first: Simulations before the first draw.
+            total: Draws that p is the mean of, where others count too; None for these alone.
+        """
         if len(self.fails) != self.n:
             return ()
         in_order = np.empty(self.n)
         in_order[self.fails], in_order[~self.fails] = self.log_weights, self.log_weights_safe
-        return (DrawWeights(first=first, log_weights=in_order - math.log(self.n)),)
+        return (DrawWeights(first=first, log_weights=in_order - math.log(total or self.n)),)
 
     @property
     def ess(self) -> float:

@@ -1,4 +1,4 @@
-"""TwoStage: find every failure region, then estimate from a fresh sample of a mixture made for them."""
+"""TwoStage: find every failure region, then estimate from a sample of mixtures made for them."""
 
 from dataclasses import dataclass, replace
 from typing import ClassVar
@@ -17,7 +17,7 @@ from samplers.validation import check_count
 
 @dataclass(frozen=True, kw_only=True)
 class TwoStage(Method):
-    """Explore, then estimate from a fresh sample; few simulations for any number of failure regions.
+    """Explore, then estimate from draws that had no part in it; few simulations for any number of failure regions.
 
     1. *Exploration* (`exploration.py`, `discovery/`, `regions.py`): base draws; wide draws from N(0, s^2 I), with s as
        large as the levels went deep; subset simulation from the base draws and, in the same batches, lines of descent,
@@ -31,13 +31,14 @@ class TwoStage(Method):
        for each region. After each round but the last, chains grow from failures that the next proposal would hardly
        reach (`discovery/uncovered.py`). In up to 40 dimensions a classifier then screens the last mixture
        (`screening.py`).
-    3. *Estimate* (`stratified.py`): fresh draws from the last mixture, stratified by component, and nothing else.
+    3. *Estimate* (`stratified.py`): fresh draws from the last mixture, stratified by component, together with those of
+       the rounds from the third on, each weighted as a draw of its own mixture.
 
-    Given the first two stages p-hat is unbiased, with two exceptions. Behind a screen, weights rest on its acceptance
-    of each component. It is estimated by draws that are not simulated, and its error, some tenths of a per cent, is
-    common to all weights of a component; the c.o.v. includes it. With a target c.o.v., the draws decide themselves
-    when they end. (Reusing the draws of earlier rounds, as adaptive multiple importance sampling does, would bias p by
-    some per cent and make intervals too short.)
+    p-hat is unbiased, as the estimate from each mixture is given what came before it, with two exceptions. Behind a
+    screen, weights rest on its acceptance of each component. It is estimated by draws that are not simulated, and its
+    error, some tenths of a per cent, is common to all weights of a component; the c.o.v. includes it. With a target
+    c.o.v., the draws decide themselves when they end. (Weighting all draws as if from one mixture, as adaptive multiple
+    importance sampling does, would bias p by some per cent and make intervals too short.)
 
     All stages work in standard normal space, so that wide draws stay within the support of the parameters. A run
     yields 45 to 90 batches, half of them steps of the levels and the lines of descent. Regression of f, subset

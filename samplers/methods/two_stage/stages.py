@@ -6,6 +6,8 @@ ends it, the caller goes on with the state before the step.
 
 import math
 from dataclasses import dataclass, replace
+from functools import reduce
+from typing import NamedTuple
 
 import numpy as np
 
@@ -86,6 +88,14 @@ class RunContext:
         return self.goal.target_cov is not None and cov <= self.goal.target_cov
 
 
+class CountedRound(NamedTuple):
+    """Draws of a round that count in p."""
+
+    sample: StratifiedSample
+    first: int
+    """Simulations before them."""
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RunState:
     """State of a run: draws so far and their trace."""
@@ -100,6 +110,8 @@ class RunState:
     """Base draws in all: of a proposal those of its first component."""
     rounds: tuple[Draws, ...] = ()
     """Draws of the rounds, each weighted as draws of its own proposal."""
+    counted: tuple["CountedRound", ...] = ()
+    """Those of the rounds that count in p."""
     trace: tuple[Level, ...] = ()
 
     def base_share(self, gamma: float) -> float:
@@ -158,8 +170,14 @@ def draw_round(
     context: RunContext, state: RunState, refinement: RefinementState, proposal: MixtureProposal, n: int
 ) -> SimulationSteps[tuple[RunState, RefinementState]]:
     """Draw n points from a proposal and learn from them."""
+    first = context.simulator.n_sim
     state, batch = yield from _draw(context, state, proposal, n)
     gamma, settings = context.goal.gamma, context.settings
+    if len(state.rounds) >= settings.refinement.counted_from:
+        inputs = context.simulator.inputs
+        empty = StratifiedSample.empty(len(proposal.weights), inputs.dim, np.empty(0), settings.min_stratum_draws)
+        counted = CountedRound(empty.add(batch, proposal, inputs, gamma), first)
+        state = replace(state, counted=(*state.counted, counted))
     draws = Draws.from_outcomes(batch.f, proposal.log_weights(batch.u), batch.u, gamma)
     history = state.history.add(batch, gamma)
     refinement = refine_once(refinement, history, proposal, batch, settings.refinement, settings.mixture)
@@ -257,11 +275,15 @@ def fall_back(context: RunContext, state: RunState, levels: int) -> Steps:
 def estimate_afresh(
     context: RunContext, state: RunState, refinement: RefinementState, proposal: MixtureProposal
 ) -> Steps:
-    """Draw from the last proposal until the budget is used or the target is met; p rests on these draws alone."""
+    """Draw from the last proposal until the budget is used or the target is met.
+
+    p rests on these draws and on those of the rounds that count, each weighted as a draw of its own proposal.
+    """
     goal, inputs, stopped = context.goal, context.simulator.inputs, False
     settings = context.settings
     typical = typical_weights(refinement, proposal)
     sample = StratifiedSample.empty(len(proposal.weights), inputs.dim, typical, settings.min_stratum_draws)
+    whole = sample
     size = context.left if goal.target_cov is None else context.target_batch
     while context.left_at_all > 0:
         try:
@@ -270,20 +292,24 @@ def estimate_afresh(
             stopped = True
             break
         sample = sample.add(batch, proposal, inputs, goal.gamma)
-        state = _record_draws(context, state, batch, sample.p, sample.cov, sample.draws.ess)
-        if context.meets_target(sample.cov):
+        whole = reduce(StratifiedSample.join, (each.sample for each in state.counted), sample)
+        state = _record_draws(context, state, batch, whole.p, whole.cov, whole.draws.ess)
+        if context.meets_target(whole.cov):
             break
     if sample.draws.n == 0:
         early = estimate_early(context, state)
         return early if stopped else replace(early, status=Status.BUDGET)
     largest_weight, discovery = 1 / settings.refinement.base_share, refinement.exploration.discovery
-    interval = discovery_interval(sample.draws, sample.cov, goal.confidence, largest_weight, discovery)
-    outcome = _outcome(context, state, sample.draws, sample.cov, interval)
+    interval = discovery_interval(whole.draws, whole.cov, goal.confidence, largest_weight, discovery)
+    outcome = _outcome(context, state, whole.draws, whole.cov, interval)
+    points = sample.to_sample(proposal, state.base_f, state.base_u, goal.gamma, whole.draws)
+    last = CountedRound(sample, context.simulator.n_sim - sample.draws.n)
+    parts = [part.sample.draws.weights_after(part.first, whole.draws.n) for part in (*state.counted, last)]
     return replace(
         outcome,
         warnings=(*outcome.warnings, *_check(context, state, refinement, sample)),
-        sample=replace(sample.to_sample(proposal, state.base_f, state.base_u, goal.gamma), lineages=discovery.lineages),
-        draw_weights=sample.draws.weights_after(context.simulator.n_sim - sample.draws.n),
+        sample=replace(points, lineages=discovery.lineages),
+        draw_weights=tuple(weights for part in parts for weights in part),
         status=Status.STOPPED if stopped else outcome.status,
     )
 

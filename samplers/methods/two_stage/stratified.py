@@ -1,4 +1,4 @@
-"""Stratified sample: fresh draws from a mixture, a fixed number from each component, and p with its error.
+"""Stratified samples: draws from mixtures, a fixed number from each component, and p with its error.
 
 With n_k of n draws from component k and y = weight times indicator of failure, p-hat = sum(y) / n, and its variance is
 sum_k n_k var_k(y) / n^2: that between the components, which independent draws of the mixture would add, is none.
@@ -69,6 +69,30 @@ class StratifiedSample:
             self.min_stratum_draws,
         )
 
+    def join(self, earlier: "StratifiedSample") -> "StratifiedSample":
+        """Return the sample with the draws of an earlier mixture, each weighted as a draw of its own.
+
+        Shares of draws that do not depend on outcomes keep p unbiased, and since the later mixture makes an unbiased p
+        of whatever came before, the errors of the two are uncorrelated.
+
+        Args:
+            earlier: Of another proposal, drawn before this one was made.
+        """
+        if earlier.draws.n == 0:
+            return self
+        draws = earlier.draws.join(self.draws)
+        common = math.hypot(*(each.acceptance_cov * each.draws.n * each.p for each in (earlier, self)))
+        return StratifiedSample(
+            draws,
+            np.concatenate([earlier.counts, self.counts]),
+            np.concatenate([earlier.sums, self.sums]),
+            np.concatenate([earlier.squares, self.squares]),
+            common / (draws.n * draws.p) if draws.p > 0 else 0.0,
+            self.typical,
+            np.concatenate([earlier.u_safe, self.u_safe]),
+            self.min_stratum_draws,
+        )
+
     @property
     def p(self) -> float:
         """Mean of weight times indicator of failure."""
@@ -92,7 +116,14 @@ class StratifiedSample:
             math.sqrt(max(within, 0.0) + largest * largest) / (self.draws.n * self.p), self.acceptance_cov
         )
 
-    def to_sample(self, proposal: MixtureProposal, base_f: FloatArray, base_u: FloatArray, gamma: float) -> Sample:
+    def to_sample(
+        self,
+        proposal: MixtureProposal,
+        base_f: FloatArray,
+        base_u: FloatArray,
+        gamma: float,
+        counted: Draws | None = None,
+    ) -> Sample:
         """Return the weighted points behind p: failing draws as they are, the others together with base draws.
 
         Thresholds above gamma rest on draws that did not fail. The proposal makes few of those where f is large; base
@@ -103,18 +134,20 @@ class StratifiedSample:
             base_f: Outcomes of the base draws, shape (n0,).
             base_u: The base draws, shape (n0, d).
             gamma: Threshold of failure.
+            counted: All draws that p rests on, whose failing ones are taken: these, and those of earlier proposals if
+                any count.
         """
+        counted = self.draws if counted is None else counted
         n, n_base = self.draws.n, len(base_f)
         more = base_f > gamma
         u = np.concatenate([self.u_safe, base_u[more]])
         log_base = math.log(n_base) if n_base else -math.inf
         log_density = np.logaddexp(math.log(n) - proposal.log_weights(u), log_base)
-        k = len(self.draws.f)
-        units = np.concatenate([np.arange(n), n + np.flatnonzero(more)])
+        own = np.arange(len(counted.f) + len(self.u_safe))
         return Sample(
-            f=np.concatenate([self.draws.f, self.draws.f_safe, base_f[more]]),
-            weights=np.concatenate([np.exp(self.draws.log_weights) / n, np.exp(-log_density)]),
-            units=units[: k + len(u)],
-            n_units=n + n_base,
-            x=self.draws.x,
+            f=np.concatenate([counted.f, self.draws.f_safe, base_f[more]]),
+            weights=np.concatenate([np.exp(counted.log_weights) / counted.n, np.exp(-log_density)]),
+            units=np.concatenate([own, counted.n + np.flatnonzero(more)]),
+            n_units=counted.n + n_base,
+            x=counted.x,
         )

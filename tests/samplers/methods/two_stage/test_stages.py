@@ -131,6 +131,23 @@ def test_rounds_go_on_while_their_draws_are_worth_little(drive, rate, noisy, rou
     assert ends[4]
 
 
+def test_rounds_from_the_third_on_count_in_the_estimate(drive):
+    context, state, refinement, proposal, _ = refined(drive)
+    assert len(state.rounds) == 3
+    (third,) = state.counted
+    assert third.sample.draws.p == pytest.approx(state.rounds[2].p)
+    final = context.left
+    outcome = drive(stages.estimate_afresh(context, state, refinement, proposal), PROBLEM).value
+    first, last = outcome.draw_weights
+    assert (first.first, len(first.log_weights)) == (third.first, third.sample.draws.n)
+    assert (last.first, len(last.log_weights)) == (BUDGET - final, final)
+    assert outcome.sample.n_units == third.sample.draws.n + final + len(state.base_f)
+    failing = outcome.sample.f <= 0
+    assert outcome.sample.weights[failing].sum() == pytest.approx(outcome.p, rel=1e-12)
+    assert len(np.unique(outcome.sample.units)) == len(outcome.sample.f)
+    assert failing.sum() > len(third.sample.draws.f) > 0
+
+
 def test_the_estimate_rests_on_its_own_draws(drive):
     context, state, refinement, proposal, _ = refined(drive)
     assert not stages.gives_up(context, state, refinement, proposal, 3, final=True)

@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -121,6 +122,29 @@ def test_batches_together_are_one_sample(rng):
     assert found.cov == pytest.approx(swapped.cov, rel=1e-9)
     y = np.exp(PROPOSAL.log_weights(np.concatenate([first.u, second.u]))) * (np.concatenate([first.f, second.f]) <= 0)
     assert found.p == pytest.approx(y.mean(), rel=1e-12)
+
+
+def test_draws_of_an_earlier_mixture_add_to_the_estimate_and_to_its_variance(rng):
+    """Of two mixtures, a third of the draws from the earlier one: p = (n_1 p_1 + n_2 p_2) / n, errors uncorrelated."""
+    earlier = MixtureProposal(PROPOSAL.candidates, np.array([0.5, 0.2, 0.1, 0.2]))
+    found = []
+    for _ in range(400):
+        own = strata(batch(draw_counts(earlier.weights, 50, rng), rng, earlier), proposal=earlier)
+        found.append(strata(batch(draw_counts(WEIGHTS, 100, rng), rng)).join(own))
+    p = np.array([one.p for one in found])
+    assert found[0].draws.n == found[0].counts.sum() == 150
+    assert p.mean() == pytest.approx(P, abs=4 * p.std() / math.sqrt(400))
+    own_variance = np.array([variance_within(one) for one in found])
+    assert own_variance.mean() == pytest.approx(p.var(ddof=1), rel=4 * math.sqrt(2.5 / 400))
+    alone = strata(batch([20, 30, 30, 20], rng))
+    assert alone.join(StratifiedSample.empty(4, 1, np.empty(0))) is alone
+
+
+def test_the_error_of_a_screen_counts_by_the_share_of_the_draws_behind_it(rng):
+    screened = replace(strata(batch([200, 300, 300, 200], rng)), acceptance_cov=0.04)
+    plain = strata(batch([200, 300, 300, 200], rng))
+    share = screened.p / (screened.p + plain.p)
+    assert screened.join(plain).acceptance_cov == pytest.approx(0.04 * share)
 
 
 def test_a_component_without_weight_changes_nothing():
