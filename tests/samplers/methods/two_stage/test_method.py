@@ -288,18 +288,18 @@ def test_sample_gives_p_and_higher_thresholds():
         assert weights.sum() == pytest.approx(PHI(g - 3.5), abs=4 * np.sqrt((weights**2).sum()))
 
 
-def test_estimate_rests_on_fresh_draws_alone():
+def test_estimate_rests_on_the_draws_of_the_last_round_and_those_after_it_alone():
     """Its points are the last ones asked for; nothing of the exploration counts twice."""
     reference, asked = half_space(100, 3.5), []
     run = TS().start(reference.problem, seed=1)
     while not run.done:
         asked.append(run.ask())
         run.tell(reference.problem.f(asked[-1]))
-    last = asked[-1]
+    last = np.concatenate(asked[-2:])
     result = run.result()
     failing = last[reference.problem.f(last) <= 0]
     np.testing.assert_array_equal(result.sample.x, failing)
-    assert result.trace[-1].n_sim == len(last)
+    assert [level.n_sim for level in result.trace[-2:]] == [len(x) for x in asked[-2:]]
 
 
 # ends before the end
