@@ -1,5 +1,6 @@
 """Environment of one scenario at a time: a `gymnasium.Env` over a batch of one."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -90,7 +91,7 @@ class DrivingEnv(HighwayEnvInterface, gym.Env[SingleObservation, Any]):
             ValueError: If an option is unknown, of the wrong shape, NaN or outside its range.
         """
         super().reset(seed=seed)
-        if options and "config" in options:
+        if isinstance(options, Mapping) and "config" in options:
             self.configure(options["config"])
             options = {name: value for name, value in options.items() if name != "config"}
         self._x = self.space.scenario_x(options, 1, self.np_random)[0]

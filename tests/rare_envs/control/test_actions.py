@@ -90,7 +90,13 @@ def test_discrete_actions_are_rows_of_the_table() -> None:
     same.reset(seed=2)
     np.testing.assert_array_equal(batch.step(np.arange(5))[0], same.step(DISCRETE_ACTIONS)[0])
     model = DQN("MlpPolicy", discrete, buffer_size=50, learning_starts=4, batch_size=4, device="cpu", seed=0).learn(12)
-    assert rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego=model, horizon=1.0).notes == ()
+    named, guessed = (
+        rare_envs.DrivingProblem("rare_envs/CutIn-v0", ego=model, horizon=1.0, **options)
+        for options in ({"action": "discrete"}, {})
+    )
+    assert named.notes == ()
+    assert len(guessed.notes) == 1
+    assert "taken as five accelerations" in guessed.notes[0]
 
 
 def test_agents_of_a_parallel_environment_act_by_index_too() -> None:
