@@ -307,7 +307,7 @@ def estimate_afresh(
     parts = [part.sample.draws.weights_after(part.first, whole.draws.n) for part in (*state.counted, last)]
     return replace(
         outcome,
-        warnings=(*outcome.warnings, *_check(context, state, refinement, sample)),
+        warnings=(*outcome.warnings, *_check(context, state, refinement, sample, whole)),
         sample=replace(points, lineages=discovery.lineages),
         draw_weights=tuple(weights for part in parts for weights in part),
         status=Status.STOPPED if stopped else outcome.status,
@@ -373,14 +373,28 @@ def _draw(
     return replace(state, base_draws=state.base_draws + int(counts[0])), batch
 
 
-def _check(context: RunContext, state: RunState, refinement: RefinementState, sample: StratifiedSample) -> list[str]:
-    """Return the warnings of all checks of an estimate."""
+def _check(
+    context: RunContext,
+    state: RunState,
+    refinement: RefinementState,
+    sample: StratifiedSample,
+    whole: StratifiedSample,
+) -> list[str]:
+    """Return the warnings of all checks of an estimate.
+
+    Args:
+        context: What is fixed for the run.
+        state: Draws so far.
+        refinement: What is known of the regions.
+        sample: Draws of the last proposal.
+        whole: All draws that count.
+    """
     settings, hits = context.settings.diagnostics, int((state.base_f <= context.goal.gamma).sum())
     return [
-        *check_base_draws(sample.p, hits, len(state.base_f), settings),
+        *check_base_draws(whole.p, hits, len(state.base_f), settings),
         *check_rounds(sample, state.rounds, settings),
-        *check_regions(sample, settings),
-        *check_discovery(sample.p, refinement.exploration.discovery, context.goal.confidence, settings),
+        *check_regions(whole, settings),
+        *check_discovery(whole.p, refinement.exploration.discovery, context.goal.confidence, settings),
         *([] if refinement.noisy else check_efficiency(sample, settings)),
     ]
 

@@ -72,8 +72,8 @@ class StratifiedSample:
     def join(self, earlier: "StratifiedSample") -> "StratifiedSample":
         """Return the sample with the draws of an earlier mixture, each weighted as a draw of its own.
 
-        Shares of draws that do not depend on outcomes keep p unbiased, and since the later mixture makes an unbiased p
-        of whatever came before, the errors of the two are uncorrelated.
+        Where the shares of the draws do not depend on outcomes p stays unbiased, and since the later mixture makes an
+        unbiased p of whatever came before, the errors of the two are uncorrelated.
 
         Args:
             earlier: Of another proposal, drawn before this one was made.

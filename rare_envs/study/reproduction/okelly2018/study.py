@@ -33,6 +33,7 @@ from rare_envs.study.reproduction.okelly2018.search import (
     make_base,
     take_step,
 )
+from rare_envs.study.reproduction.record import digest_code
 from samplers.methods.cross_entropy import Product
 
 HIGHWAY_ENV_ID = "rare_envs/Highway-v0"
@@ -78,6 +79,7 @@ class HighwayStudy:
         """What all rollouts of a folder have in common."""
         return {
             "rare_envs": rare_envs.__version__,
+            "code": digest_code(),
             "ego": self.ego,
             "seed": self.seed,
             "settings": asdict(self.settings),

@@ -21,6 +21,7 @@ from rare_envs.study.reproduction.tian2024.catalogue import (
 from samplers.benchmark.runs import use_one_core
 from samplers.estimation import estimate
 from samplers.method import whole_simulations
+from samplers.methods.two_stage.method import TwoStage
 from samplers.result import Estimate
 
 MOST_TRACE_POINTS = 60
@@ -167,6 +168,8 @@ def run_replication(job: ReplicationJob) -> ReplicationRun:
 def _count_final(result: Estimate) -> int:
     """Return the draws that have a weight in p; all simulations where the points of chains stand for each other."""
     weighted = result.simulations.weights if result.simulations is not None else ()
+    if not weighted and isinstance(result.method, TwoStage) and result.sample is not None:
+        return result.sample.n_units  # the search by terms weights points of its own
     return sum(len(part.log_weights) for part in weighted) or result.n_sim
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import rare_envs
 from rare_envs.study.execution.run_lines import RunLines
-from rare_envs.study.reproduction.record import make_record, write_record
+from rare_envs.study.reproduction.record import digest_code, make_record, write_record
 from rare_envs.study.reproduction.tian2024.catalogue import (
     ADSS_SIMULATIONS,
     EPISODE_SECONDS,
@@ -135,7 +135,7 @@ def open_replications(out: Path) -> RunLines[ReplicationJob, ReplicationRun]:
     """Return the replications of a folder."""
     return RunLines(
         out / REPLICATIONS_FILE,
-        {"rare_envs": rare_envs.__version__, "paper": "tian2024"},
+        {"rare_envs": rare_envs.__version__, "code": digest_code(), "paper": "tian2024"},
         ReplicationRun.from_line,
         ReplicationRun.to_line,
         key_of_job=lambda job: (job.scenario, job.system, job.method, job.seed),
