@@ -18,6 +18,8 @@ ELSEWHERE = (
     "rare_envs.highway_env_problem and HighwayEnv's ids, such as highway-fast-v0"
 )
 """Where to go with the observations that HighwayEnv has and this package has not."""
+_COLOUR_CHANNELS = (3, 6, 9, 12)
+"""Channels of one to four coloured frames side by side."""
 
 
 def find_fitting_kinds(observed: Any, vehicles: int = 1) -> tuple[str, ...]:
@@ -50,11 +52,14 @@ def find_fitting_kinds(observed: Any, vehicles: int = 1) -> tuple[str, ...]:
 
 
 def _shows_pictures(observed: Any) -> bool:
-    """Return whether a space is that of coloured pictures, of one frame or several, channels first or last."""
+    """Return whether a space is that of coloured pictures, of one frame or several, channels first or last.
+
+    The channels are the shorter of these two axes; the other one is a side of the picture, of any length.
+    """
     shape = getattr(observed, "shape", None)  # whatever a user's ego declares
     if not isinstance(shape, tuple) or getattr(observed, "dtype", None) != np.uint8:
         return False
-    return len(shape) in (3, 4) and (shape[-1] % 3 == 0 or shape[-3] % 3 == 0)
+    return len(shape) in (3, 4) and min(shape[-1], shape[-3]) in _COLOUR_CHANNELS
 
 
 def choose_observation(needs: EgoNeeds, vehicles: int) -> str:

@@ -38,7 +38,12 @@ def test_each_kind_is_known_by_its_space(kind: str) -> None:
         (spaces.Box(-5, 5, (44,)), ("features",)),  # four frames side by side
         (spaces.Box(-5, 5, (4, 51)), ("lidar",)),
         (spaces.Box(0, 255, (12, 40, 80), np.uint8), ("camera",)),  # four frames of another size, channels first
+        (spaces.Box(0, 255, (84, 84, 12), np.uint8), ("camera",)),
+        (spaces.Box(0, 255, (4, 3, 84, 84), np.uint8), ("camera",)),  # four frames on an axis of their own
         (spaces.Box(0, 255, (4, 128, 64), np.uint8), ()),  # HighwayEnv's grayscale
+        (spaces.Box(0, 255, (1, 84, 84), np.uint8), ()),
+        (spaces.Box(0, 255, (4, 84, 84), np.uint8), ()),
+        (spaces.Box(0, 255, (84, 84, 4), np.uint8), ()),
         (spaces.Box(-1, 1, (7, 11, 11)), ()),  # its occupancy grid
         (spaces.Box(-1, 1, (15, 7)), ()),
         (spaces.Box(-1, 1, (97,)), ()),
@@ -55,9 +60,11 @@ def test_several_or_none_are_refused_in_a_line() -> None:
     both = find_fitting_kinds(observation_space(13, "lidar"), vehicles=13)
     with pytest.raises(ValueError, match="fit features and lidar: say which"):
         choose_observation(EgoNeeds(observations=both), vehicles=13)
-    for shape, elsewhere in (((97,), False), ((15, 7), True), ((4, 128, 64), True), ((7, 11, 11), True)):
+    grayscale = [spaces.Box(0, 255, shape, np.uint8) for shape in ((1, 84, 84), (4, 84, 84), (84, 84, 4))]
+    others = [spaces.Box(-1, 1, shape) for shape in ((15, 7), (4, 128, 64), (7, 11, 11))]
+    for space, elsewhere in ((spaces.Box(-1, 1, (97,)), False), *((each, True) for each in (*grayscale, *others))):
         with pytest.raises(ValueError, match=r"features \(11,\), lidar \(51,\), kinematics \(5, 5\)") as refused:
-            rare_envs.DrivingProblem(CUT_IN, ego=Idle(spaces.Box(-1, 1, shape)))
+            rare_envs.DrivingProblem(CUT_IN, ego=Idle(space))
         assert ("rare_envs.highway_env_problem" in str(refused.value)) == elsewhere
         assert "\n" not in str(refused.value)
 
