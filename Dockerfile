@@ -1,4 +1,7 @@
-# rare-envs in a container: docker build -t rare-envs . && docker run --rm -v "$PWD/runs:/work/runs" rare-envs estimate rare_envs/CutIn-v0
+# rare-envs in a container; the run's folder is left in ./runs:
+#   mkdir -p runs && docker build -t rare-envs .
+#   docker run --rm -v "$PWD/runs:/work/runs" rare-envs estimate rare_envs/CutIn-v0 --out runs/cutin
+# The container's user has the number 1000; where yours (id -u) is another one: --build-arg USER_ID="$(id -u)" to build.
 FROM python:3.11-slim AS build
 WORKDIR /source
 COPY . .
@@ -12,7 +15,8 @@ ARG TORCH_INDEX=https://download.pytorch.org/whl/cpu
 RUN pip install --no-cache-dir --index-url "$TORCH_INDEX" "$(grep '^torch==' /tmp/constraints.txt)" \
     && pip install --no-cache-dir -c /tmp/constraints.txt "$(ls /wheels/*.whl)[fast]" \
     && rm -r /wheels /tmp/constraints.txt
-RUN useradd --create-home user
+ARG USER_ID=1000
+RUN useradd --uid "$USER_ID" --create-home user && mkdir -p /work/runs && chown -R user /work
 USER user
 WORKDIR /work
 ENTRYPOINT ["rare-envs"]
