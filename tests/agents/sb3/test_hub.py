@@ -25,6 +25,7 @@ NAME, COMMIT = "hf:somebody/ppo-Pendulum-v1", "0123abc"
 @pytest.fixture(autouse=True)
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path))
+    monkeypatch.setitem(sys.modules, "huggingface_hub", None)
     return tmp_path
 
 
@@ -69,7 +70,6 @@ def test_a_policy_in_the_cache_is_loaded_without_a_connection(name: str, cache: 
 def test_what_is_not_there_is_downloaded_where_the_library_is_installed(
     cache: Path, files: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(sys.modules, "huggingface_hub", None)
     assert find_cached_model(NAME) is None and find_named_files(NAME) == []
     with pytest.raises(ValueError, match=r"is not in the cache .*pip install 'rare-envs\[hub\]'"):
         load_ego(NAME)
@@ -79,7 +79,7 @@ def test_what_is_not_there_is_downloaded_where_the_library_is_installed(
         asked.append(arguments)
         return str(fill(cache, files))
 
-    monkeypatch.setitem(sys.modules, "huggingface_hub", SimpleNamespace(snapshot_download=download))
+    install(monkeypatch, download)
     found = find_hub_model(f"{NAME}@main")
     assert found == find_hub_model(NAME) == find_cached_model(NAME)
     (once,) = asked
@@ -87,11 +87,65 @@ def test_what_is_not_there_is_downloaded_where_the_library_is_installed(
     assert once["allow_patterns"] == ["*.zip", "*.pkl"] and once["cache_dir"] == str(cache)
 
 
+def install(monkeypatch: pytest.MonkeyPatch, download: Any, file_exists: Any = None) -> None:
+    """Put a stand-in in the place of the library."""
+    library = SimpleNamespace(snapshot_download=download, file_exists=file_exists)
+    monkeypatch.setitem(sys.modules, "huggingface_hub", library)
+
+
+def test_part_of_a_repository_is_completed_at_its_commit(
+    cache: Path, files: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`load_from_hub` of huggingface_sb3 keeps the `.zip` alone; others have only looked at the card."""
+    snapshot = fill(cache, files)
+    asked: list[str] = []
+
+    def download(revision: str, **_: Any) -> str:
+        asked.append(revision)
+        for path in files.iterdir():
+            (snapshot / path.name).unlink(missing_ok=True)
+            (snapshot / path.name).write_bytes(path.read_bytes())
+        return str(snapshot)
+
+    install(monkeypatch, download)
+    for missing in (["vec_normalize.pkl"], ["vec_normalize.pkl", "ppo-Pendulum-v1.zip", "train_eval_metrics.zip"]):
+        for name in missing:
+            (snapshot / name).unlink()
+        assert (find_cached_model(NAME) is None) == (len(missing) == 3)
+        assert load_ego(NAME).statistics_path == snapshot / "vec_normalize.pkl"
+    assert asked == [COMMIT, COMMIT]  # a later revision is another ego, which a resumed run must not get
+
+
+def test_what_may_lack_its_statistics_is_told_where_the_hub_does_not_answer(
+    cache: Path, files: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    snapshot = fill(cache, files)
+    (snapshot / "vec_normalize.pkl").unlink()
+
+    def fail(*_: Any, **__: Any) -> Any:
+        raise ConnectionError("no route")
+
+    def find_missing(**_: Any) -> str:
+        raise type("IncompleteSnapshotError", (OSError,), {})("missing vec_normalize.pkl")
+
+    with pytest.warns(UserWarning, match=r"no VecNormalize statistics of it.*pip install 'rare-envs\[hub\]'"):
+        assert find_hub_model(NAME) == snapshot / "ppo-Pendulum-v1.zip"
+    for download in (fail, lambda **_: str(snapshot)):  # the library returns what is there, without a word
+        install(monkeypatch, download, file_exists=fail)
+        with pytest.warns(UserWarning, match="no VecNormalize statistics of it.*no route"):
+            assert find_hub_model(NAME) == snapshot / "ppo-Pendulum-v1.zip"
+    install(monkeypatch, find_missing)
+    with pytest.raises(ValueError, match=r"^Cannot download .*missing vec_normalize\.pkl"):
+        find_hub_model(NAME)
+    install(monkeypatch, lambda **_: str(snapshot), file_exists=lambda *_, **__: False)  # it has none on the Hub
+    assert find_hub_model(NAME) == snapshot / "ppo-Pendulum-v1.zip"
+
+
 def test_a_download_that_fails_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     def download(**_: Any) -> str:
         raise ConnectionError("no\nroute")
 
-    monkeypatch.setitem(sys.modules, "huggingface_hub", SimpleNamespace(snapshot_download=download))
+    install(monkeypatch, download)
     with pytest.raises(ValueError, match=r"^Cannot download 'hf:somebody/ppo-Pendulum-v1': .*no route"):
         load_ego(NAME)
 
