@@ -10,14 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-import rare_envs
 from benchmarks import RESULTS
 from rare_envs.study.reproduction.okelly2018 import summary
 from rare_envs.study.reproduction.okelly2018.behaviour import RunBehaviour
 from rare_envs.study.reproduction.okelly2018.reproduction import make_okelly_record, reproduce_okelly2018
 from rare_envs.study.reproduction.okelly2018.scales import PRINTED_SEARCH, SEARCHES
 from rare_envs.study.reproduction.okelly2018.search import draw_chunk, make_base
-from rare_envs.study.reproduction.okelly2018.study import HIGHWAY_ENV_ID, HighwayStudy
+from rare_envs.study.reproduction.okelly2018.study import HighwayStudy
 
 
 def test_record_and_page_are_written(
@@ -49,9 +48,7 @@ def test_committed_tables_and_figures_follow_from_the_committed_estimates(commit
 
 
 def test_the_first_rollouts_are_those_of_the_committed_run(committed: dict[str, Any]) -> None:
-    """The run was made with the ego before its correction, which is kept for such records."""
-    file = RESULTS.parent / "estimators" / "highway" / "imitation_uncorrected.safetensors"
-    highway = rare_envs.DrivingProblem(HIGHWAY_ENV_ID, ego=str(file), measure="lidar_ttc", noise="fixed")
+    highway = HighwayStudy().make_problem()
     base = make_base(highway, SEARCHES[PRINTED_SEARCH])
     first = committed["runs"][0]["first"]
     x = draw_chunk(base, HighwayStudy().settings.chunk, committed["about"]["seed"], "naive/0")[: len(first)]
