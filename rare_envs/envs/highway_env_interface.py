@@ -5,7 +5,6 @@ from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
 
-from rare_envs.control.actions import MAX_ACCELERATION, MAX_STEERING
 from rare_envs.envs.highway_env_objects import make_scene
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.reward import COLLISION_COST
@@ -109,10 +108,7 @@ class HighwayEnvInterface:
 
     @property
     def action_type(self) -> Any:
-        """HighwayEnv's description of the actions: with meta-actions a `DiscreteMetaAction`, with `actions_indexes`."""
-        from highway_env.envs.common.action import ContinuousAction, DiscreteMetaAction
+        """HighwayEnv's description of the actions, with their space; with indices it has `actions_indexes`."""
+        from rare_envs.envs.highway_env_actions import describe_actions
 
-        if self.world.clock.action == "meta":
-            return DiscreteMetaAction(self)
-        ranges = {"acceleration_range": (-MAX_ACCELERATION, MAX_ACCELERATION)}
-        return ContinuousAction(self, steering_range=(-MAX_STEERING, MAX_STEERING), **ranges)
+        return describe_actions(self, self.world.clock.action)
