@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,13 @@ import training.ego_training
 from agents import load_ego
 from agents.sb3.saved_ego import load_saved_ego
 from training import train_ego
-from training.ego_retraining import Retraining, ScenariosWithFailures, restore_parameters
+from training.ego_retraining import (
+    Retraining,
+    ScenariosWithFailures,
+    check_retrainable,
+    continue_settings,
+    restore_parameters,
+)
 
 ENV = "rare_envs/CutIn-v0"
 FAILURE = np.array([[25.0, 12.0, 20.0, 2.0, 40.0, 3.5]])
@@ -116,6 +123,35 @@ def test_what_does_not_fit_is_refused_before_training(egos: Path, tmp_path: Path
     with pytest.raises(FileNotFoundError, match=r"No ego at .*pp0\.zip"):
         train_ego(ENV, "ppo", retraining=Retraining(egos / "pp0.zip", FAILURE), **out)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({}, None),
+        ({"algorithm": "a2c"}, r"^Expected an ego trained by ppo, got 'ego\.zip', trained by a2c\.$"),
+        ({"statistics": object()}, "trained behind VecNormalize, train-ego has none"),
+        ({"model": SimpleNamespace(observation_space=4, action_space=2)}, "its observation_space is 4, .* is 3"),
+        ({"model": SimpleNamespace(observation_space=3, action_space=5)}, "its action_space is 5, .* is 2"),
+    ],
+)
+def test_an_ego_trained_otherwise_is_refused(changed: dict[str, Any], said: str | None) -> None:
+    env = SimpleNamespace(observation_space=3, action_space=2)  # anything that compares as spaces do
+    usual = {"path": Path("ego.zip"), "algorithm": "ppo", "statistics": None, "model": env}
+    saved = SimpleNamespace(**{**usual, **changed})
+    if said is None:
+        check_retrainable(saved, "ppo", env)
+        return
+    with pytest.raises(ValueError, match=said):
+        check_retrainable(saved, "ppo", env)
+
+
+def test_a_training_that_goes_on_explores_as_at_its_end_and_learns_at_once() -> None:
+    dqn = {"learning_starts": 100, "exploration_initial_eps": 1.0, "exploration_final_eps": 0.05, "gamma": 0.9}
+    before = dict(dqn)
+    assert continue_settings(dqn) == {**dqn, "learning_starts": 0, "exploration_initial_eps": 0.05}
+    assert dqn == before
+    assert continue_settings({"n_steps": 8}) == {"n_steps": 8}  # PPO has none of these arguments
 
 
 @pytest.mark.parametrize("share", [0.0, 1.0, -0.1, float("nan")])

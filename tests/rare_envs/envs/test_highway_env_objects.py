@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 import torch
 
-from rare_envs.envs.highway_env_objects import make_network, make_scene, make_traffic, world_places, world_point
+from rare_envs.envs.highway_env_objects import (
+    find_crashed,
+    make_network,
+    make_scene,
+    make_traffic,
+    world_places,
+    world_point,
+)
 from rare_envs.make import set_up
 from rare_envs.traffic.road import i80, straight
 from rare_envs.traffic.state import State
@@ -48,3 +55,11 @@ def test_who_touches_the_ego_has_crashed_and_targets_are_those_of_its_controller
     assert bool(episode.collided)
     assert [vehicle.crashed for vehicle in make_scene(episode).vehicles] == [True, True]
     assert [vehicle.crashed for vehicle in make_scene(episode, crashed=[1]).vehicles] == [False, True]
+
+
+def test_the_crashed_are_the_ego_and_those_that_it_touches() -> None:
+    x = torch.tensor([[0.0, 4.0, 40.0, 43.0, 3.0]])
+    y = torch.tensor([[0.0, 0.0, 0.0, 0.0, 4.0]])
+    state = State(x, y, heading=0.0 * x, speed=0.0 * x, theta=x[:, :0])
+    assert find_crashed(state, straight(2)) == {0, 1}  # 2 and 3 touch each other; 4 is beside the ego in its own lane
+    assert find_crashed(state._replace(x=x + torch.tensor([[20.0, 0.0, 0.0, 0.0, 0.0]])), straight(2)) == {0}

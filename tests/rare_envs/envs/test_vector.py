@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 import rare_envs
-from rare_envs.envs.vector import DrivingVectorEnv
+from rare_envs.envs.vector import DrivingVectorEnv, read_autoreset_mode
 from rare_envs.scenarios.registry import SCENARIOS
 
 ids = pytest.mark.parametrize("env_id", rare_envs.ENV_IDS)
@@ -193,6 +193,14 @@ def test_without_autoreset_the_caller_resets_the_rows_that_ended() -> None:
     batch.reset(options={"reset_mask": ~mask})
     *_, truncated, _ = batch.step(still)
     assert not truncated.any()
+
+
+@pytest.mark.parametrize("mode", gym.vector.AutoresetMode)
+def test_a_mode_is_read_by_itself_and_by_gymnasiums_word(mode: gym.vector.AutoresetMode) -> None:
+    assert read_autoreset_mode(mode) is read_autoreset_mode(mode.value) is mode
+    for other in (mode.name, mode.value.lower(), None):
+        with pytest.raises(ValueError, match=f"autoreset_mode {other!r}; expected one of 'NextStep', 'SameStep', 'Dis"):
+            read_autoreset_mode(other)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("mask", [np.zeros(2, bool), np.ones(3, bool), np.array([1, 0])])

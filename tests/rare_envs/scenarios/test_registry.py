@@ -11,6 +11,7 @@ from rare_envs.scenarios.registry import (
     SCENARIOS,
     Registry,
     find_scenario,
+    is_highway_env_id,
     kinematics_id,
     scenario_named,
     split_layout,
@@ -109,6 +110,14 @@ def test_unknown_environment(env_id: object, message: str) -> None:
     with pytest.raises(ValueError, match=message) as caught:
         find_scenario(env_id)  # type: ignore[arg-type]
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("env_id", ["highway-v0", "highway-fast-v0", "merge-v1", "intersection-v1", "roundabout-v0"])
+def test_an_id_of_highway_env_is_its_whole_name(env_id: str) -> None:
+    assert is_highway_env_id(env_id)
+    for other in (f"rare_envs/{env_id}", f"my-{env_id}", env_id.replace("-v", "-slow-v"), env_id.partition("-v")[0]):
+        assert not is_highway_env_id(other)
+    assert not is_highway_env_id(None)
 
 
 def test_an_id_may_name_the_module_that_registers_it(place: str) -> None:

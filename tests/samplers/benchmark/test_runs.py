@@ -1,12 +1,13 @@
 """One run, and what it records."""
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from samplers.benchmark.runs import Job, LimitReached, Meter, find_method, find_problem, run_all, run_once
+from samplers.benchmark.runs import Job, LimitReached, Meter, find_method, find_problem, map_jobs, run_all, run_once
 
 WRONG = "tests.samplers.benchmark.wrong_samplers"
 
@@ -35,6 +36,27 @@ def test_two_processes_give_the_runs_of_one():
     jobs = [Job("ss", problem, seed, 1500) for problem in ("noisy_d6", "six_d8") for seed in range(3)]
     one, two = list(run_all(jobs)), list(run_all(jobs, workers=2))
     assert [replace(run, seconds=0) for run in one] == [replace(run, seconds=0) for run in two]
+
+
+def test_jobs_of_any_kind_are_made_in_order_one_at_a_time_or_by_an_executor():
+    made = []
+
+    def once(job):
+        made.append(job)
+        return -job
+
+    results = map_jobs(once, iter([3, 1, 2]))
+    assert (next(results), made) == (-3, [3])  # the others only once they are wanted: a study keeps what it has
+    assert (list(results), made) == ([-1, -2], [3, 1, 2])
+    made.clear()
+    with ThreadPoolExecutor(1) as executor:
+        assert list(map_jobs(once, iter([3, 1, 2]), workers=7, executor=executor)) == [-3, -1, -2]
+    assert made == [3, 1, 2]
+
+
+@pytest.mark.slow
+def test_jobs_are_made_in_several_processes():
+    assert list(map_jobs(math.sqrt, [9.0, 1.0, 4.0], workers=2)) == [3.0, 1.0, 2.0]
 
 
 def test_noise_differs_between_runs_and_comes_back_with_the_seed():
