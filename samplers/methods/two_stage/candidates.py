@@ -48,7 +48,7 @@ def build_proposal(
     weights = start / start.sum()
     if not state.rounds or len(history.u) == 0:
         return MixtureProposal(candidates, weights)
-    floors = _set_floors(state, candidates, settings, radial=state.dim <= mixture.subspace.high_dim, final=final)
+    floors = _set_floors(state, candidates, settings, radial=state.dim <= settings.radial_dim, final=final)
     u, log_w = _smooth_indicators(history, state.gamma, settings) if state.noisy else (history.u, history.log_weights)
     log_r = log_ratios([candidate.component for candidate in candidates], u)
     weights = minimise_second_moment(log_r, log_w, weights, floors, mixture.weights)

@@ -122,7 +122,7 @@ def test_no_region_is_lost(exact_region, rng, final, least):
 
 
 @pytest.mark.parametrize(
-    ("dim", "noisy", "least"), [(3, False, SETTINGS.radial_share), (41, False, 0.0), (3, True, 0.0)]
+    ("dim", "noisy", "least"), [(3, False, SETTINGS.radial_share), (21, False, 0.0), (3, True, 0.0)]
 )
 def test_radial_draws_reach_failures_beside_the_regions_in_few_dimensions(exact_region, rng, dim, noisy, least):
     state, history, _ = after_round(exact_region, rng, dim=dim, noisy=noisy)
