@@ -143,6 +143,11 @@ def check_spaces(ego: Any, expected: spaces.Space[Any], action: str = "continuou
             )
         return
     discrete = isinstance(acted, spaces.Discrete) and int(acted.n) == len(DISCRETE_ACTIONS)
+    if acted is not None and action == "discrete" and not discrete:
+        raise ValueError(
+            f"The ego acts in {acted}, the environment takes Discrete({len(DISCRETE_ACTIONS)}) (five accelerations); "
+            "leave action='discrete' out for an ego that accelerates and steers."
+        )
     several = isinstance(acted, spaces.MultiDiscrete | spaces.MultiBinary)
     shape = getattr(acted, "shape", None)  # whatever it declares
     if acted is not None and not discrete and (several or shape != (2,)):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from enum import Enum
 from pathlib import Path
 from typing import Annotated
@@ -42,6 +44,16 @@ def reproduce_command() -> None:
     """Make the tables and figures of a published paper anew."""
 
 
+@contextmanager
+def say_how_to_go_on(folder: Path) -> Iterator[None]:
+    """Say where the runs are, and what goes on with them, if an interruption stops them."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        typer.echo(f"The runs so far are in {folder}; the same command goes on with them.", err=True)
+        raise
+
+
 @reproduce_app.command("okelly2018")
 @spread_options
 @use_one_thread()
@@ -63,7 +75,7 @@ def reproduce_okelly2018_command(
 
     if at_most is not None and at_most < 0:
         raise BadInput(f"Expected --at-most to be 0 or more, got {at_most}.")
-    with keep_stdout_for_the_answer():
+    with keep_stdout_for_the_answer(), say_how_to_go_on(out):
         with as_bad_input(ValueError):
             study, executor = HighwayStudy(ego, scale, seed), places.make()
         command = f"rare-envs reproduce okelly2018 --scale {scale} --ego {ego} --seed {seed} --out FOLDER"
@@ -104,7 +116,7 @@ def reproduce_tian2024_command(
     fewer = "" if monte_carlo is None else f" --monte-carlo-replications {monte_carlo}"
     fewer += "" if further is None else f" --further-replications {further}"
     command = f"rare-envs reproduce tian2024 --replications {number}{fewer} --seed {seed}"
-    with keep_stdout_for_the_answer(), as_bad_input(ValueError, OSError):
+    with keep_stdout_for_the_answer(), say_how_to_go_on(out), as_bad_input(ValueError, OSError):
         plan = TianPlan(replications=number, seed=seed, monte_carlo=monte_carlo, further=further)
         if not resume:
             (out / REPLICATIONS_FILE).unlink(missing_ok=True)

@@ -7,6 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from rare_envs.study.cli.app import app
+from rare_envs.study.cli.commands.reproduce import say_how_to_go_on
 from rare_envs.study.reproduction.tian2024 import study
 from tests.rare_envs.study.reproduction.tian2024.made_runs import made_run
 
@@ -95,6 +96,12 @@ def test_a_folder_that_cannot_be_is_one_line(tmp_path: Path) -> None:
     done = CliRunner().invoke(app, [*TIAN, "--out", str(tmp_path / "file"), "--replications", "2"])
     assert done.exit_code == 2
     assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_an_interruption_says_how_to_go_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(KeyboardInterrupt), say_how_to_go_on(tmp_path):
+        raise KeyboardInterrupt
+    assert capsys.readouterr().err == f"The runs so far are in {tmp_path}; the same command goes on with them.\n"
 
 
 def test_an_unknown_paper_is_one_line() -> None:
