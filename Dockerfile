@@ -1,6 +1,6 @@
 # rare-envs in a container; the run's folder is left in ./runs:
 #   mkdir -p runs && docker build -t rare-envs .
-#   docker run --rm -v "$PWD/runs:/work/runs" rare-envs estimate rare_envs/CutIn-v0 --out runs/cutin
+#   docker run --rm -v "$PWD/runs:/data/runs" rare-envs estimate rare_envs/CutIn-v0 --out runs/cutin
 # The container's user has the number 1000; where yours (id -u) is another one: --build-arg USER_ID="$(id -u)" to build.
 FROM python:3.11-slim AS build
 WORKDIR /source
@@ -16,8 +16,8 @@ RUN pip install --no-cache-dir --index-url "$TORCH_INDEX" "$(grep '^torch==' /tm
     && pip install --no-cache-dir -c /tmp/constraints.txt "$(ls /wheels/*.whl)[fast]" \
     && rm -r /wheels /tmp/constraints.txt
 ARG USER_ID=1000
-RUN useradd --uid "$USER_ID" --create-home user && mkdir -p /work/runs && chown -R user /work
+RUN useradd --uid "$USER_ID" --create-home user && mkdir -p /data/runs && chown -R user /data
 USER user
-WORKDIR /work
+WORKDIR /data
 ENTRYPOINT ["rare-envs"]
 CMD ["--help"]

@@ -19,10 +19,11 @@ from samplers.execution.arguments import RunArguments, check_problem
 from samplers.execution.progress import Listener
 from samplers.method import Stepping
 from samplers.methods.auto import Auto
+from samplers.presentation.estimate_display import indent_lines
 from samplers.presentation.notebook_html import html_table
 from samplers.presentation.object_file import read_object, register_stored, write_object
 from samplers.problem import FloatArray, Problem, condition_of
-from samplers.result import Estimate, indent_lines, without_base
+from samplers.result import Estimate, without_base
 from samplers.serialization import to_json_value
 from samplers.statistics.cluster_sums import has_independent_points, interval_of_sum
 from samplers.statistics.intervals import Interval, degrees_of_freedom, zero_hit_bound

@@ -1,26 +1,24 @@
 """Result: the estimate that `estimate` returns."""
 
 import json
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from functools import cached_property
 from os import PathLike
 from typing import TYPE_CHECKING, Any, cast
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from samplers.analysis.base import RatioStore, require_sample
 from samplers.analysis.base_uncertainty import BaseUncertainty, compute_base_uncertainty
 from samplers.analysis.budget import Pilot
-from samplers.analysis.curve import Curve, compute_curve, lowest_known_threshold
+from samplers.analysis.curve import Curve, compute_curve
 from samplers.analysis.failure_modes import Share, split_by_kind
 from samplers.analysis.gate import Verdict, judge_estimate
 from samplers.analysis.reweighting import HasLogProb, Reweighted, find_sibling, reweight_estimate
 from samplers.analysis.sensitivity.parameter_sensitivity import Sensitivity, compute_sensitivity
 from samplers.method import Stepping
-from samplers.presentation.notebook_html import html_table
+from samplers.presentation.estimate_display import EstimateDisplay
 from samplers.presentation.object_file import is_stored, read_object, register_stored, write_object
 from samplers.presentation.point_table import arrow_table, columns_of_sample, columns_of_simulations
 from samplers.presentation.stored_method import StoredMethod
@@ -33,14 +31,10 @@ from samplers.trace import Level, Status
 if TYPE_CHECKING:
     import pandas
     import pyarrow
-    from matplotlib.axes import Axes
-
-PLOTTED_THRESHOLDS = 60
-"""Thresholds of the curve that `Estimate.plot` draws."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Estimate:
+@dataclass(frozen=True, kw_only=True, repr=False)  # its text and line are those of the display
+class Estimate(EstimateDisplay):
     """P[f(X) <= gamma] with its interval, its cost and its failures.
 
     Example:
@@ -323,32 +317,6 @@ class Estimate:
         """Return `to_arrow` as a pandas table; needs pandas."""
         return self.to_arrow(names).to_pandas()
 
-    def plot(self, ax: "Axes | None" = None) -> "Axes":
-        """Draw P[f <= g] over thresholds g with its band, and p with its interval at gamma; needs matplotlib.
-
-        Args:
-            ax: Where to draw; None takes the current axes of pyplot.
-
-        Raises:
-            ValueError: If the method gave no weighted points, or too few of them to draw a curve.
-        """
-        sample = require_sample(self)
-        finite = sample.f[np.isfinite(sample.f)]
-        low = max(lowest_known_threshold(sample, self.gamma), finite.min(initial=math.inf))
-        if not math.isfinite(low):
-            raise ValueError("There is nothing to draw: too few simulations came near failure; give more of them.")
-        order = np.argsort(finite)
-        reached = np.cumsum(sample.weights[np.isfinite(sample.f)][order])
-        high = float(finite[order][min(np.searchsorted(reached, reached[-1] / 2), len(order) - 1)])
-        grid = np.unique([*np.linspace(low, max(low, high, self.gamma), PLOTTED_THRESHOLDS), max(low, self.gamma)])
-        axes = self.curve(grid).plot(ax)
-        axes.axvline(self.gamma, linestyle=":", color="0.4")
-        if self.p > 0:
-            below, above = self.p - self.interval[0], self.interval[1] - self.p
-            axes.errorbar([self.gamma], [self.p], yerr=[[below], [above]], fmt="o", capsize=4, color="0.2")
-        axes.set_title(f"P[f ≤ {self.gamma:g}] = {self.p:.2e}")
-        return axes
-
     def save(self, path: str | PathLike[str]) -> None:
         """Write the estimate to a file that `Estimate.load` reads: all but the base distribution, which is code.
 
@@ -391,48 +359,6 @@ class Estimate:
         vars(stored.estimate)["base_uncertainty"] = stored.base_uncertainty  # its place once it is computed
         return stored.estimate
 
-    def __repr__(self) -> str:
-        """Return one line; `str` has all of it."""
-        low, high = self.interval
-        doubts = f", {len(self.warnings)} warning{'s' * (len(self.warnings) != 1)}" if self.warnings else ""
-        return (
-            f"<Estimate P[f <= {self.gamma:g}] = {self.p:.3e} [{low:.3e}, {high:.3e}], {self.n_sim:,} simulations, "
-            f"{self.method.name}, {self.status}{doubts}>"
-        )
-
-    def _repr_html_(self) -> str:
-        """Return a table for notebooks."""
-        low, high = self.interval
-        rows = [
-            (f"{100 * self.confidence:g} % interval", f"{low:.3e} to {high:.3e}"),
-            ("c.o.v.", "not known" if math.isinf(self.cov) else f"{self.cov:.3g}"),
-            *([("base distribution", str(self.base_uncertainty))] if self.base_uncertainty is not None else []),
-            ("simulations", f"{self.n_sim:,}"),
-            *([] if math.isnan(self.gain) else [("gain over Monte Carlo", f"{self.gain:.3g}")]),
-            ("failing points", f"{self.failures.total:,}"),
-            ("method", f"{self.method.name}, seed {self.seed}, {self.status}"),
-            ("valid", self.proviso),
-        ]
-        notes = [*(f"remark: {text}" for text in self.remarks), *(f"warning: {text}" for text in self.warnings)]
-        return html_table(f"P[f <= {self.gamma:g}] = {self.p:.3e}", rows, notes=notes)
-
-    def __str__(self) -> str:
-        """Return a few lines for people."""
-        low, high = self.interval
-        gain = "" if math.isnan(self.gain) else f", gain over Monte Carlo {self.gain:.3g}"
-        cov = "not known" if math.isinf(self.cov) else f"{self.cov:.3g}"
-        lines = [
-            f"P[f <= {self.gamma:g}] = {self.p:.3e}",
-            f"  {100 * self.confidence:g} % interval [{low:.3e}, {high:.3e}], c.o.v. {cov}",
-            *indent_lines(self.base_uncertainty),
-            f"  {self.n_sim:,} simulations{gain}; {self.method.name}, seed {self.seed}, "
-            f"{self.status}; {self.failures.total:,} failing points",
-            *([f"  chosen {self.choice}"] if self.chose_another else []),
-            f"  valid {self.proviso}",
-        ]
-        lines += [f"  remark: {text}" for text in self.remarks]
-        return "\n".join(lines + [f"  warning: {text}" for text in self.warnings])
-
     def to_dict(self) -> dict[str, Any]:
         """Return plain lists, numbers and strings for JSON; NaN and infinities become None."""
         data = {
@@ -467,11 +393,6 @@ class Estimate:
     def to_json(self) -> str:
         """Return `to_dict` as one line of JSON."""
         return json.dumps(self.to_dict(), allow_nan=False)
-
-
-def indent_lines(value: object | None) -> list[str]:
-    """Return the lines of a value as text, each indented by two spaces; none for None."""
-    return [] if value is None else [f"  {line}" for line in str(value).splitlines()]
 
 
 def method_settings(method: Stepping) -> dict[str, Any]:

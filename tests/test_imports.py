@@ -34,6 +34,7 @@ FLOORS = {
         presentation
         statistics
         analysis method
+        presentation.estimate_display
         result importance mcmc methods.two_stage.mixture
         execution
         methods

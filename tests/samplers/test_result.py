@@ -17,30 +17,6 @@ def result(**options):
     return samplers.estimate(half_space().problem, "adss", seed=1, **options)
 
 
-def test_prints_what_a_person_wants_to_know():
-    text = str(result())
-    for part in ("P[f <= 0] =", "95 % interval", "c.o.v.", "simulations", "gain over Monte Carlo"):
-        assert part in text
-    assert "warning" not in text
-
-
-def test_prints_warnings_and_no_gain_without_hits():
-    never = samplers.FunctionProblem(lambda x: np.ones(len(x)), 1)
-    text = str(samplers.estimate(never, "mc", seed=1, max_sim=100))
-    assert "warning: None of 100 simulations failed" in text
-    assert "gain" not in text
-    assert "c.o.v. not known" in text
-
-
-def test_remarks_are_printed_and_are_no_warnings():
-    few = samplers.estimate(half_space(2, 1.0).problem, "two-stage", seed=1, max_sim=300)
-    text = "max_sim leaves 300 simulations, too few for an exploration (400): base draws only."
-    assert few.remarks == (text,)
-    assert few.warnings == ()
-    assert str(few).endswith(f"\n  remark: {text}")
-    assert few.to_dict()["remarks"] == [text]
-
-
 def test_to_dict_is_plain_json():
     estimate = result()
     data = json.loads(estimate.to_json())
@@ -184,12 +160,6 @@ def test_status_prints_as_its_value():
     assert math.isfinite(result().cov)
 
 
-def test_repr_is_one_short_line():
-    assert "\n" not in repr(result())
-    assert len(repr(result())) <= 160
-    assert f"{result().p:.3e}" in repr(result())
-
-
 def test_an_estimate_comes_back_from_its_file(tmp_path):
     found = result(replicates=2)
     found.save(tmp_path / "result")
@@ -211,19 +181,3 @@ def test_the_uncertainty_of_the_base_is_kept_and_computed_anew_with_the_base(tmp
     with_base = samplers.Estimate.load(tmp_path / "result", base=base)
     assert "base_uncertainty" not in vars(with_base)
     assert with_base.base_uncertainty == found.base_uncertainty
-
-
-def test_the_plot_shows_p_at_gamma():
-    pyplot = pytest.importorskip("matplotlib.pyplot")
-    figure, axes = pyplot.subplots()
-    found = samplers.estimate(half_space(2, 2.0).problem, "mc", seed=0, max_sim=5000)
-    found.plot(axes)
-    line = next(line for line in axes.lines if len(line.get_xdata()) > 10)
-    assert np.interp(0.0, line.get_xdata(), line.get_ydata()) == pytest.approx(found.p)
-    pyplot.close(figure)
-
-
-def test_there_is_nothing_to_plot_where_no_threshold_is_known():
-    never = samplers.FunctionProblem(lambda x: np.full(len(x), np.inf), 1)
-    with pytest.raises(ValueError, match="nothing to draw"):
-        samplers.estimate(never, "mc", seed=1, max_sim=100).plot()

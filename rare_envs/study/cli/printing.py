@@ -16,8 +16,8 @@ from rare_envs.study.columns import MAX_SHOWN, draw_ordinary, find_ordinary_rang
 from rare_envs.study.crash_kinds import KIND_DESCRIPTIONS
 from rare_envs.study.rates.text import describe_injuries, describe_parts, format_interval, format_rate, name_events
 from rare_envs.study.report import Report
+from samplers.presentation.estimate_display import indent_lines
 from samplers.problem import FloatArray
-from samplers.result import indent_lines
 
 ENOUGH, MANY = 3.0, 300_000
 """Simulations over p that show with 95 % a region of failure as probable as all that was found; what they may cost."""
