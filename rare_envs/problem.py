@@ -4,7 +4,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cached_property
 from html import escape
 from typing import Any
 
@@ -12,31 +12,23 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from rare_envs.control.idm import IDM
+from rare_envs.core_choice import CoreChoice
 from rare_envs.distributions.space import Distribution, ScenarioSpace
 from rare_envs.egos.errors import reason_of
 from rare_envs.egos.loading import load_named_ego
 from rare_envs.egos.needs import resolve
 from rare_envs.egos.policy import PolicyDriver, as_driver
-from rare_envs.egos.sb3.dense_networks import read_dense_policy
 from rare_envs.egos.spaces.choice import choose_action, choose_observation, takes_indices
 from rare_envs.egos.wrappers import find_action_bounds
 from rare_envs.make import set_up
 from rare_envs.scenarios.registry import find_scenario, split_layout
-from rare_envs.search_terms import EpisodeTerms, simulate_terms
 from rare_envs.sensors.kinds import read_kinds
-from rare_envs.simulation.compiled.selection import (
-    CompiledEgo,
-    CompiledRollout,
-    CompilerFails,
-    NotCompiled,
-    find_compiled_rollout,
-)
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.measurement import Measurement
 from rare_envs.simulation.rollout import StochasticDriver, rollout
 from rare_envs.simulation.world import World
-from rare_envs.term_gradients import ROLLOUTS_PER_GRADIENT, TermDifferentiator, find_differentiator
+from rare_envs.terms.episode_terms import EpisodeTerms, simulate_terms
+from rare_envs.terms.gradients import ROLLOUTS_PER_GRADIENT, TermDifferentiator, find_differentiator
 from rare_envs.traffic.crash import CRASH_KINDS, Crash
 
 RULE_TILE = 16384
@@ -53,8 +45,6 @@ RULE_CHUNK = 4096
 POLICY_CHUNK = 256
 """Likewise with a policy, which is slower."""
 
-CORES = ("auto", "torch", "numba")
-"""Choices of what simulates."""
 AMBIGUOUS = (
     "the ego's actions 0 to 4 were taken as five accelerations; one that was trained in HighwayEnv needs "
     "action='meta' (--action meta)"
@@ -162,8 +152,7 @@ class DrivingProblem:
         with _ego_errors_as_value_errors(ego):
             self.driver = as_driver(ego, self.world, self.needs)
         self.varies = self.needs.varies
-        self._core = core
-        self._compiled = self._find_compiled()
+        self._core = CoreChoice(core, self.world, self.driver)
         for note in self.notes:
             if note != TAKEN_AS_ACCELERATIONS:
                 warnings.warn(note, AmbiguousActions, stacklevel=2)
@@ -171,25 +160,9 @@ class DrivingProblem:
     def __setattr__(self, name: str, value: Any) -> None:
         """Set an attribute; another world or driver has another compiled rollout, or none, and other gradients."""
         super().__setattr__(name, value)
-        if name in ("world", "driver") and "_compiled" in vars(self):
-            self._compiled = self._find_compiled()
+        if name in ("world", "driver") and "_core" in vars(self):
+            self._core = CoreChoice(self._core.wanted, self.world, self.driver)
             vars(self).pop("gradient", None)
-
-    def _find_compiled(self) -> CompiledRollout | None:
-        """Return the compiled rollout, if the core that was asked for is one and there is one."""
-        core = self._core
-        if core not in CORES:
-            raise ValueError(f"Expected core to be one of {', '.join(map(repr, CORES))}, got {core!r}.")
-        if core == "torch":
-            return None
-        try:
-            return find_compiled_rollout(self.world, self._compiled_ego)
-        except NotCompiled as reason:
-            if core == "numba":
-                raise ValueError(f"core='numba' cannot simulate this: {reason}.") from reason
-            if isinstance(reason, CompilerFails):
-                warnings.warn(f"{reason}; torch simulates, which is slower.", stacklevel=3)
-            return None
 
     def __repr__(self) -> str:
         """Return one line."""
@@ -203,38 +176,15 @@ class DrivingProblem:
         return f"<p>{escape(repr(self)[1:-1])}</p>{self.space._repr_html_()}"
 
     @property
-    def _compiled_ego(self) -> CompiledEgo:
-        """The ego as compiled rollouts take it; NotCompiled if they do not."""
-        driver = self.driver
-        if type(driver) is PolicyDriver:
-            return partial(read_dense_policy, driver.policy)
-        if type(driver) is not IDM:
-            raise NotCompiled(f"the ego, a {type(driver).__name__}, is not compiled")
-        return driver
-
-    def _run_compiled(self, x: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Return f of scenarios x (n, d), NaN where it is not known; None where torch has to simulate."""
-        if self._compiled is None:
-            return None
-        try:
-            return self._compiled(x).astype(np.float64)
-        except NotCompiled as reason:
-            if self._core == "numba":
-                raise ValueError(f"core='numba' cannot simulate this: {reason}.") from reason
-            self._compiled = None
-            warnings.warn(f"{reason}; torch simulates, which is slower.", stacklevel=5)
-            return None
-
-    @property
     def core(self) -> str:
         """What simulates `evaluate`: "torch" or "numba", which compiles now what it has not yet."""
         nothing = np.empty((0, self.world.scenario.size))
-        return "torch" if self._run_compiled(nothing) is None else "numba"
+        return "torch" if self._core.run(nothing) is None else "numba"
 
     @property
     def terms_with_f(self) -> bool:
         """Whether terms come with the rollout that gives f: compiled rollouts have none, torch then simulates them."""
-        return self._compiled is None
+        return self._core.rollout is None
 
     @property
     def dim(self) -> int:
@@ -401,7 +351,7 @@ class DrivingProblem:
 
     def _simulate(self, x: NDArray[np.float64], failed_rows: dict[int, str] | None) -> NDArray[np.float64]:
         x = self.space.validate(np.atleast_2d(x))
-        f = self._run_compiled(x)
+        f = self._core.run(x)
         if f is None:
             f = self._simulate_by_torch(x, failed_rows)
         elif self.needs.queries_policy and np.isnan(f).any():  # torch tells what fails there, and how

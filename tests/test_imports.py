@@ -51,7 +51,8 @@ FLOORS = {
         distributions control sensors
         sensors.camera scenarios measures
         simulation
-        egos make search_terms term_gradients
+        egos make terms
+        core_choice
         multi_agent interop problem
         envs
         exposure

@@ -1,0 +1,96 @@
+"""CoreChoice: compiled rollouts for a world and its ego where they can be had, and torch for everything else."""
+
+from __future__ import annotations
+
+import warnings
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rare_envs.control.idm import IDM
+from rare_envs.egos.policy import PolicyDriver
+from rare_envs.egos.sb3.dense_networks import read_dense_policy
+from rare_envs.simulation.compiled.selection import (
+    CompiledEgo,
+    CompiledRollout,
+    CompilerFails,
+    NotCompiled,
+    find_compiled_rollout,
+)
+from rare_envs.simulation.rollout import Driver
+from rare_envs.simulation.world import World
+
+CORES = ("auto", "torch", "numba")
+"""Choices of what simulates."""
+
+
+class CoreChoice:
+    """What simulates a world and its ego.
+
+    Attributes:
+        wanted: What was asked for, one of `CORES`.
+        rollout: The compiled rollout; None where torch simulates.
+
+    Example:
+        >>> from rare_envs.scenarios.highway import HIGHWAY
+        >>> CoreChoice("auto", World(HIGHWAY), IDM()).rollout is None  # there is no compiled highway
+        True
+    """
+
+    def __init__(self, wanted: str, world: World, driver: Driver) -> None:
+        """Find the compiled rollout, if what was asked for is one and there is one.
+
+        Args:
+            wanted: One of `CORES`.
+            world: The world.
+            driver: The ego.
+
+        Raises:
+            ValueError: There is no such core, or "numba" cannot simulate this.
+        """
+        if wanted not in CORES:
+            raise ValueError(f"Expected core to be one of {', '.join(map(repr, CORES))}, got {wanted!r}.")
+        self.wanted = wanted
+        self.rollout: CompiledRollout | None = None
+        if wanted == "torch":
+            return
+        try:
+            self.rollout = find_compiled_rollout(world, compiled_ego(driver))
+        except NotCompiled as reason:
+            self._give_up(reason, warns=isinstance(reason, CompilerFails), stacklevel=4)
+
+    def run(self, x: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """Return f of scenarios x (n, d), NaN where it is not known; None where torch has to simulate.
+
+        Raises:
+            ValueError: Compiled rollouts were asked for, and have become impossible.
+        """
+        if self.rollout is None:
+            return None
+        try:
+            return self.rollout(x).astype(np.float64)
+        except NotCompiled as reason:
+            self._give_up(reason, warns=True, stacklevel=6)
+            return None
+
+    def _give_up(self, reason: NotCompiled, *, warns: bool, stacklevel: int) -> None:
+        """Leave the simulation to torch, or raise a ValueError where that was not asked for."""
+        if self.wanted == "numba":
+            raise ValueError(f"core='numba' cannot simulate this: {reason}.") from reason
+        self.rollout = None
+        if warns:
+            warnings.warn(f"{reason}; torch simulates, which is slower.", stacklevel=stacklevel)
+
+
+def compiled_ego(driver: Driver) -> CompiledEgo:
+    """Return an ego as compiled rollouts take it.
+
+    Raises:
+        NotCompiled: They do not take it.
+    """
+    if type(driver) is PolicyDriver:
+        return partial(read_dense_policy, driver.policy)
+    if type(driver) is not IDM:
+        raise NotCompiled(f"the ego, a {type(driver).__name__}, is not compiled")
+    return driver

@@ -1,0 +1,1 @@
+"""Terms of which f is the least: simulated, and differentiated."""

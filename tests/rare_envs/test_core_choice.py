@@ -1,0 +1,69 @@
+"""CoreChoice: compiled rollouts where they can be had, torch for everything else, and what is said of it."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+
+from rare_envs import core_choice
+from rare_envs.control.idm import IDM
+from rare_envs.core_choice import CoreChoice
+from rare_envs.scenarios.car_following import CAR_FOLLOWING
+from rare_envs.scenarios.highway import HIGHWAY
+from rare_envs.simulation.compiled.selection import CompilerFails, NotCompiled
+from rare_envs.simulation.world import World
+
+WORLD, X = World(CAR_FOLLOWING), np.array([[20.0, 15.0, 30.0]])
+
+
+def test_an_unknown_core_is_refused() -> None:
+    with pytest.raises(ValueError, match="Expected core to be one of 'auto', 'torch', 'numba', got 'jax'"):
+        CoreChoice("jax", WORLD, IDM())
+
+
+def test_torch_is_never_compiled() -> None:
+    choice = CoreChoice("torch", WORLD, IDM())
+    assert choice.rollout is None
+    assert choice.run(X) is None
+
+
+def test_what_is_not_compiled_is_left_to_torch_in_silence_unless_numba_was_asked_for() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert CoreChoice("auto", World(HIGHWAY), IDM()).rollout is None
+    with pytest.raises(ValueError, match="core='numba' cannot simulate this: the script of the scenario 'highway'"):
+        CoreChoice("numba", World(HIGHWAY), IDM())
+    with pytest.raises(ValueError, match="the ego, a float, is not compiled"):
+        CoreChoice("numba", WORLD, 1.0)  # type: ignore[arg-type]
+
+
+def test_a_compiler_that_fails_is_told_of(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(world: World, ego: object) -> None:
+        raise CompilerFails("numba is installed, but fails here")
+
+    monkeypatch.setattr(core_choice, "find_compiled_rollout", fail)
+    with pytest.warns(UserWarning, match="fails here; torch simulates, which is slower"):
+        assert CoreChoice("auto", WORLD, IDM()).run(X) is None
+
+
+def test_a_rollout_that_has_become_impossible_is_given_up_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    def changed(x: np.ndarray) -> None:
+        raise NotCompiled("the policy has changed")
+
+    monkeypatch.setattr(core_choice, "find_compiled_rollout", lambda world, ego: changed)
+    choice = CoreChoice("auto", WORLD, IDM())
+    with pytest.warns(UserWarning, match="the policy has changed; torch simulates"):
+        assert choice.run(X) is None
+    assert choice.rollout is None
+    with pytest.raises(ValueError, match="core='numba' cannot simulate this: the policy has changed"):
+        CoreChoice("numba", WORLD, IDM()).run(X)
+
+
+def test_compiled_rollouts_give_f() -> None:
+    pytest.importorskip("numba", reason="compiled rollouts need numba, which the extra [fast] installs")
+    found = CoreChoice("numba", WORLD, IDM()).run(X)
+    assert found is not None
+    assert found.tolist() == [6.0]
+    assert found.dtype == np.float64
