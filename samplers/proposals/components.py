@@ -105,6 +105,33 @@ class SubspaceGaussian:
 
 
 @dataclass(frozen=True, eq=False)
+class LiftedComponent:
+    """A component in the coordinates of some orthonormal axes, N(0, 1) in every direction outside their span.
+
+    Example:
+        >>> import numpy as np
+        >>> ring = LiftedComponent(RadialLaw(dim=2, start=9.0, shape=1.0, scale=2.0), axes=np.eye(100)[:, :2])
+        >>> u = ring.sample(1000, np.random.default_rng(0))
+        >>> bool((np.linalg.norm(u[:, :2], axis=1) > 3.0).all()), round(float(u[:, 2:].std()), 1)
+        (True, 1.0)
+    """
+
+    within: MixtureComponent
+    """In r dimensions."""
+    axes: FloatArray
+    """Orthonormal columns, shape (d, r)."""
+
+    def log_ratio(self, u: FloatArray) -> FloatArray:
+        """Return the log ratio; it depends on the coordinates along the axes only."""
+        return self.within.log_ratio(u @ self.axes)
+
+    def sample(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw n points."""
+        xi = rng.standard_normal((n, len(self.axes)))
+        return np.asarray(xi + (self.within.sample(n, rng) - xi @ self.axes) @ self.axes.T)
+
+
+@dataclass(frozen=True, eq=False)
 class HalfSpaceNormal:
     """N(0, I) beyond a plane, axis . u >= start: the optimal proposal for a failure half-space.
 

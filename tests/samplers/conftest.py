@@ -80,7 +80,7 @@ def drive() -> Callable[..., Driven]:
                 x = steps.send(f[-1])
             steps.throw(Interrupted())
         except StopIteration as end:
-            return Driven(end.value, np.concatenate(f))
+            return Driven(end.value, np.concatenate([np.empty(0), *f]))
         raise AssertionError("expected an outcome after an interruption")
 
     return run

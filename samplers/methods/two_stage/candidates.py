@@ -13,11 +13,18 @@ from samplers.methods.two_stage.mixture.settings import (
     MixtureSettings,
     ScreeningSettings,
 )
+from samplers.methods.two_stage.mixture.subspace_em import truncate_weights
 from samplers.methods.two_stage.multiple_importance import MultipleImportanceSample
 from samplers.methods.two_stage.refinement import RefinementState
 from samplers.methods.two_stage.settings import RefinementSettings
 from samplers.problem import FloatArray
-from samplers.proposals.components import HalfSpaceNormal, IsotropicNormal, SubspaceGaussian, log_ratios
+from samplers.proposals.components import (
+    HalfSpaceNormal,
+    IsotropicNormal,
+    LiftedComponent,
+    SubspaceGaussian,
+    log_ratios,
+)
 
 
 def build_proposal(
@@ -54,7 +61,7 @@ def build_proposal(
     weights = minimise_second_moment(log_r, log_w, weights, floors, mixture.weights)
     keeps = kinds == "base"
     if not final:
-        explored = np.isin(kinds, ["explored", "linear"])
+        explored = np.isin(kinds, ["explored", "linear", "spread"])
         weights = np.where(explored, np.maximum(weights, settings.explored_share), weights)
         keeps = keeps | explored
     weights = np.where((weights < settings.min_share) & ~keeps, 0.0, weights)
@@ -85,7 +92,29 @@ def list_candidates(
         *([] if state.noisy else _fit_half_space_components(state, history, settings, edges)),
         *_temper_gaussians(regional, settings.noisy_tempering if state.noisy else settings.tempering),
     ]
+    candidates += _lift_candidates(state, history, settings, edges)
     return [candidate for candidate in candidates if candidate.kind in settings.initial_shares]
+
+
+def _lift_candidates(
+    state: RefinementState, history: MultipleImportanceSample, settings: RefinementSettings, edges: EdgeSettings
+) -> list[ProposalComponent]:
+    """Return components in the span of the slopes, if the exploration has found some, N(0, 1) across it."""
+    axes = state.exploration.slopes
+    if state.within is None or axes is None:
+        return []
+    failures = history.within(axes)
+    inside = [c for c in list_candidates(state.within, failures, settings, edges) if c.kind not in ("base", "wide")]
+    inside.append(ProposalComponent(_fit_spread(state.within, failures), "spread"))
+    return [candidate._replace(component=LiftedComponent(candidate.component, axes)) for candidate in inside]
+
+
+def _fit_spread(state: RefinementState, history: MultipleImportanceSample) -> SubspaceGaussian:
+    """Return the Gaussian around the origin that is as wide as the failures, and at least N(0, I)."""
+    u = history.u if state.rounds and len(history.u) else state.points
+    weights = truncate_weights(history.log_weights) if state.rounds and len(history.u) else np.full(len(u), 1 / len(u))
+    values, axes = np.linalg.eigh((u * weights[:, None]).T @ u)
+    return SubspaceGaussian(axes, np.zeros(len(values)), np.maximum(values, 1.0))
 
 
 def _temper_gaussians(components: list[ProposalComponent], powers: tuple[float, ...]) -> list[ProposalComponent]:
@@ -149,6 +178,8 @@ def _set_floors(
     regions = np.array([candidate.region for candidate in candidates])
     tempered = settings.tempered_share + settings.extra_tempered_share * (1 - state.hit_rate)
     floors = [Floor(kinds == "tempered", settings.noisy_tempered_share if state.noisy else tempered)]
+    if state.rounds and state.rounds[-1].worth(state.gamma) < settings.good_rate:
+        floors.append(Floor(kinds == "spread", settings.spread_share))
     n = len(state.regions)
     if state.scattered or (radial and not state.noisy):
         floors.append(Floor(kinds == "radial", settings.radial_share))

@@ -14,7 +14,12 @@ from samplers.problem import FloatArray, Inputs
 
 
 def meets_too_few(
-    draws: Draws, number: int, levels: int, settings: FallbackSettings = DEFAULT_SETTINGS.fallback
+    draws: Draws,
+    number: int,
+    levels: int,
+    settings: FallbackSettings = DEFAULT_SETTINGS.fallback,
+    *,
+    share: float = 1.0,
 ) -> bool:
     """Return whether the draws of a round meet so few failures that subset simulation does better with the rest.
 
@@ -23,10 +28,11 @@ def meets_too_few(
         number: Of this round, from 1.
         levels: Levels of subset simulation in the exploration.
         settings: Failures that each draw must be worth.
+        share: Of that number, which is enough.
     """
     early = settings.early_rates
     rate = early[number - 1] if number <= len(early) else settings.relative_rate / max(levels, settings.min_levels)
-    return draws.ess < rate * draws.n
+    return draws.ess < share * rate * draws.n
 
 
 def misses_regions(draws: Draws, typical: FloatArray, settings: FallbackSettings = DEFAULT_SETTINGS.fallback) -> bool:

@@ -63,6 +63,10 @@ class MultipleImportanceSample:
             counts,
         )
 
+    def within(self, axes: FloatArray) -> "MultipleImportanceSample":
+        """Return the failing draws alone, in the coordinates of orthonormal axes (d, r)."""
+        return MultipleImportanceSample(self.u @ axes, self.log_weights)
+
     def all_draws(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return all draws, failing or not: u (n, d), f (n,) and log(phi / q) - log(n), shape (n,)."""
         u = np.concatenate([batch.u for batch in self.batches])

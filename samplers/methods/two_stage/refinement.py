@@ -24,6 +24,7 @@ from samplers.methods.two_stage.settings import RefinementSettings
 from samplers.methods.two_stage.simulator import ComponentDraws
 from samplers.problem import FloatArray
 from samplers.proposals.components import SubspaceGaussian, log_ratios
+from samplers.statistics.weights import effective_sample_size
 
 SHARP_KINDS = ("gaussian", "linear", "explored", "half-space", "radial")
 """Components that are meant to hold failures only."""
@@ -43,6 +44,14 @@ class NearDraws(NamedTuple):
     log_weights: FloatArray
     """log(phi / q) with q the round's proposal, shape (n,)."""
 
+    def worth(self, gamma: float) -> float:
+        """Return the independent failures for each draw."""
+        return effective_sample_size(self.log_weights[self.f <= gamma]) / max(len(self.f), 1)
+
+    def within(self, axes: FloatArray) -> "NearDraws":
+        """Return them in the coordinates of orthonormal axes (d, r)."""
+        return self._replace(u=self.u @ axes)
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RefinementState:
@@ -61,6 +70,8 @@ class RefinementState:
     rounds: tuple[NearDraws, ...] = ()
     hit_rate: float = 1.0
     """Share of the last round's draws from SHARP_KINDS that failed."""
+    within: "RefinementState | None" = None
+    """The same in the coordinates of the slopes, where the exploration has found some."""
 
     @property
     def regions(self) -> list[Region]:
@@ -95,7 +106,7 @@ def start_refinement(
     rng: np.random.Generator,
     mixture: MixtureSettings = DEFAULT_MIXTURE_SETTINGS,
 ) -> RefinementState:
-    """Return the initial state, from the exploration alone.
+    """Return the initial state, from the exploration alone; also in the coordinates of its slopes.
 
     Args:
         exploration: Regions of the exploration, at least one.
@@ -104,6 +115,21 @@ def start_refinement(
         rng: Source of randomness of the fits.
         mixture: Of the fits.
     """
+    state = _describe_regions(exploration, gamma, settings, rng, mixture)
+    axes = exploration.slopes
+    if axes is None or axes.shape[1] == 0:
+        return state
+    return replace(state, within=_describe_regions(exploration.within(axes), gamma, settings, rng, mixture))
+
+
+def _describe_regions(
+    exploration: ExplorationResult,
+    gamma: float,
+    settings: RefinementSettings,
+    rng: np.random.Generator,
+    mixture: MixtureSettings,
+) -> RefinementState:
+    """Return the initial state in the coordinates of the exploration."""
     most = settings.noisy_gaussians if exploration.noisy else settings.gaussians_per_region
     explored = tuple(
         ProposalComponent(gaussian, "explored", k)
@@ -140,11 +166,24 @@ def refine_once(
     kinds = np.repeat([candidate.kind for candidate in proposal.candidates], batch.counts)
     sharp, near = np.isin(kinds, SHARP_KINDS), ~np.isin(kinds, DISTANT_KINDS)
     u = batch.u[near]
-    state = replace(
-        state,
-        rounds=(*state.rounds, NearDraws(u, batch.f[near], proposal.log_weights(u))),
-        hit_rate=float((batch.f[sharp] <= state.gamma).mean()) if sharp.any() else 0.0,
-    )
+    draws = NearDraws(u, batch.f[near], proposal.log_weights(u))
+    hit_rate = float((batch.f[sharp] <= state.gamma).mean()) if sharp.any() else 0.0
+    return _learn(state, history, draws, hit_rate, settings, mixture)
+
+
+def _learn(
+    state: RefinementState,
+    history: MultipleImportanceSample,
+    draws: NearDraws,
+    hit_rate: float,
+    settings: RefinementSettings,
+    mixture: MixtureSettings,
+) -> RefinementState:
+    """Return the state, and that in the coordinates of the slopes, moved to the failures of `history`."""
+    axes, within = state.exploration.slopes, state.within
+    if axes is not None and within is not None:
+        within = _learn(within, history.within(axes), draws.within(axes), hit_rate, settings, mixture)
+    state = replace(state, rounds=(*state.rounds, draws), hit_rate=hit_rate, within=within)
     if len(history.u) < settings.min_refit_failures:
         return state
     return replace(

@@ -36,6 +36,10 @@ class Region(NamedTuple):
         """All states, shape (chains x steps, d)."""
         return self.chains.reshape(-1, self.chains.shape[2])
 
+    def within(self, axes: FloatArray) -> "Region":
+        """Return the region in the coordinates of orthonormal axes (d, r)."""
+        return Region(self.chains @ axes, self.u @ axes, self.f)
+
 
 class ChainPaths(NamedTuple):
     """States of chains and what was proposed to them."""
@@ -92,6 +96,12 @@ class ExplorationResult(NamedTuple):
     """Levels that subset simulation passed."""
     discovery: Discovery = Discovery(lineages=1.0)
     """How thorough the search was."""
+    slopes: FloatArray | None = None
+    """Orthonormal directions in which f changes at failing points, shape (d, r); None where they are not sought."""
+
+    def within(self, axes: FloatArray) -> "ExplorationResult":
+        """Return the same in the coordinates of orthonormal axes (d, r)."""
+        return self._replace(regions=[region.within(axes) for region in self.regions], slopes=None)
 
 
 def grow_regions(

@@ -23,6 +23,7 @@ def _initial_shares() -> dict[Kind, float]:
         "explored": 0.2,
         "tempered": 0.25,
         "half-space": 0.1,
+        "spread": 0.2,
     }
 
 
@@ -185,6 +186,32 @@ class RegionSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
+class SlopeSettings:
+    """Gradients of f by finite differences (`discovery/slopes.py`)."""
+
+    min_dim: int = 15
+    """Dimensions from which on they are sought: with fewer, chains show as much."""
+    share: float = 0.12
+    """Share of the budget for them at most: 7 gradients in 100 dimensions at 6,000 simulations."""
+    scattered_share: float = 0.2
+    """The same where the regions are pieces of something like a shell: no chains were run there."""
+    least: int = 3
+    """Gradients that two directions can be told from many with."""
+    most: int = 20
+    """Gradients at most. With 12, one of the three directions of screen_d40 was not found in one run of 24."""
+    step: float = 0.05
+    """Of a finite difference, in standard deviations: over it f bends little, and rounding does not matter."""
+    nearly_all: float = 0.95
+    """The directions are few where this share of the gradients' squares lies in ..."""
+    few: float = 0.65
+    """... so many of them for each gradient. On the shell sphere_d20 0.8 are needed, elsewhere 0.3 to 0.6."""
+    least_part: float = 0.005
+    """Share of the gradients' squares that a direction must hold: noise of f bends gradients less."""
+    most_axes: int = 12
+    """Directions at most. With 8, the c.o.v. of duffing_d60 was 0.21 for 0.15 (24 runs)."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class RefinementSettings:
     """Rounds of draws, and the shares of the components in a proposal (`refinement.py`, `candidates.py`)."""
 
@@ -218,6 +245,10 @@ class RefinementSettings:
     its base `us101-15-offsets` 0, 2, 5 and 10 % had gains of 135, 219, 320 and 242."""
     radial_dim: int = 20
     """Few dimensions. In 25 (series6, 60 runs) it took the coverage from 93 to 87 % and the gain from 48 to 5."""
+    spread_share: float = 0.4
+    """Share of the component that is as wide as the failures in the span of the slopes, while draws are worth less than
+    `good_rate`: there the failures form a ring, and Gaussians fitted to some of them leave gaps. Without it the second
+    moment on oscillator_d100 was 800 to 2,000 times p^2, with it 40 to 70."""
     explored_share: float = 0.01
     """Share that components from the exploration keep until the last round."""
     uncovered_share: float = 0.05
@@ -275,6 +306,9 @@ class FallbackSettings:
     early_rates: tuple[float, ...] = (0.005, 0.006)
     """What each draw of the first rounds must be worth, in independent failures. Less cannot be told from chance; with
     0.008 and more, proposals are given up that are several times better by the third round."""
+    sloped_rate: float = 0.25
+    """Share of these rates that is enough where components lie in the span of slopes: their draws leave few places
+    out, so that the weights met are about as uneven as all of them."""
     relative_rate: float = 0.04
     """The same for the last round, times the levels: subset simulation has an independent failure for each 100 levels
     simulations, and the weights that were met are about four times flatter than all of them."""
@@ -334,6 +368,7 @@ class TwoStageSettings:
     lines: LineSettings = LineSettings()
     terms_alone: TermsAloneSettings = TermsAloneSettings()
     regions: RegionSettings = RegionSettings()
+    slopes: SlopeSettings = SlopeSettings()
     refinement: RefinementSettings = RefinementSettings()
     fallback: FallbackSettings = FallbackSettings()
     diagnostics: DiagnosticSettings = DiagnosticSettings()

@@ -23,6 +23,7 @@ from samplers.methods.two_stage.diagnostics import (
     check_regions,
     check_rounds,
 )
+from samplers.methods.two_stage.discovery.slopes import find_slopes
 from samplers.methods.two_stage.discovery.uncovered import cover_failures, find_uncovered
 from samplers.methods.two_stage.discovery.unseen import discovery_interval
 from samplers.methods.two_stage.exploration import Sizes, find_regions, first_draws
@@ -152,6 +153,10 @@ def explore(context: RunContext, state: RunState) -> SimulationSteps[tuple[RunSt
     exploration = yield from find_regions(
         context.simulator, state.history.batches[0], context.goal, sizes, context.rng, context.settings
     )
+    slopes = yield from find_slopes(
+        context.simulator, exploration, gamma, context.budget, context.rng, context.settings.slopes
+    )
+    exploration = exploration._replace(slopes=slopes)
     n = sum(len(region.f) for region in exploration.regions)
     fails = sum(int((region.f <= gamma).sum()) for region in exploration.regions)
     return _record(context, state, fails / max(n, 1), state.base_share(gamma), n, math.inf), exploration
@@ -251,9 +256,11 @@ def gives_up(
     if refinement.noisy and not (final and context.noise_marginalised):
         return False  # a tempered mixture meets few failures but does not miss any: nothing else is better
     last = state.rounds[-1]
-    if fallback.meets_too_few(last, number, refinement.exploration.levels, settings):
+    share = settings.sloped_rate if refinement.within is not None else 1.0
+    if fallback.meets_too_few(last, number, refinement.exploration.levels, settings, share=share):
         return True
-    doubtful = final and not refinement.noisy and last.ess < context.settings.refinement.good_rate * last.n
+    described = refinement.noisy or refinement.within is not None  # ends of lines in a ring are no typical failures
+    doubtful = final and not described and last.ess < context.settings.refinement.good_rate * last.n
     return doubtful and fallback.misses_regions(last, typical_weights(refinement, proposal), settings)
 
 

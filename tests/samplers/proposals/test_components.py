@@ -10,6 +10,7 @@ from samplers.limit_states import half_space
 from samplers.proposals.components import (
     HalfSpaceNormal,
     IsotropicNormal,
+    LiftedComponent,
     RadialLaw,
     SubspaceGaussian,
     draw_components,
@@ -53,6 +54,7 @@ COMPONENTS = {
     "half-space with a gaussian across": (oblique_half_space(1.0), 3),
     "radial": (RadialLaw(3, 1.0, 1.5, 2.5), 3),
     "radial d=20": (RadialLaw(20, 12.0, 2.0, 4.0), 20),
+    "radial in a plane of 10": (LiftedComponent(RadialLaw(2, 1.0, 1.5, 2.5), rotation(10, 6)[:, :2]), 10),
 }
 each = pytest.mark.parametrize(("component", "dim"), COMPONENTS.values(), ids=COMPONENTS)
 
@@ -78,6 +80,8 @@ def test_draws_and_ratio_are_of_one_density(component, dim, rng):
 def test_weights_of_draws_average_to_the_base_s_probability_of_the_support(component, dim, rng):
     weights = np.exp(-component.log_ratio(component.sample(N, rng)))
     supported = 1.0
+    if isinstance(component, LiftedComponent):
+        component, dim = component.within, component.axes.shape[1]  # N(0, I) across
     if isinstance(component, HalfSpaceNormal):
         supported = stats.norm.sf(component.start)
     if isinstance(component, RadialLaw):

@@ -50,12 +50,19 @@ def cover_failures(
     grown = yield from grow_regions(
         simulator, points, none, gamma, simulator.n_sim + room, rng, settings.regions, settings.mixture
     )
-    added = start_refinement(grown, gamma, settings.refinement, rng, settings.mixture)
+    grown = grown._replace(slopes=refinement.exploration.slopes)
+    return _join(refinement, start_refinement(grown, gamma, settings.refinement, rng, settings.mixture))
+
+
+def _join(refinement: RefinementState, added: RefinementState) -> RefinementState:
+    """Return a state with the regions of another one after its own."""
     known = len(refinement.regions)
+    within = refinement.within and added.within and _join(refinement.within, added.within)
     return replace(
         refinement,
-        exploration=refinement.exploration._replace(regions=[*refinement.regions, *grown.regions]),
+        exploration=refinement.exploration._replace(regions=[*refinement.regions, *added.regions]),
         explored=(*refinement.explored, *(one._replace(region=known + one.region) for one in added.explored)),
         gaussians=[*refinement.gaussians, *added.gaussians],
         linear=(*refinement.linear, *(one._replace(region=known + one.region) for one in added.linear)),
+        within=within,
     )

@@ -12,7 +12,7 @@ from samplers.methods.two_stage.mixture.settings import DEFAULT_MIXTURE_SETTINGS
 from samplers.problem import FloatArray
 from samplers.proposals.components import MixtureComponent, draw_components, draw_counts, log_ratios, mixture_log_ratio
 
-Kind = Literal["base", "wide", "radial", "gaussian", "linear", "explored", "tempered", "half-space"]
+Kind = Literal["base", "wide", "radial", "gaussian", "linear", "explored", "tempered", "half-space", "spread"]
 """Where a component of a proposal comes from:
 
     base        N(0, I), which bounds all weights
@@ -22,6 +22,7 @@ Kind = Literal["base", "wide", "radial", "gaussian", "linear", "explored", "temp
     linear      a half-space and its Gaussian, from linear regression of f
     explored    fitted to the chains of the exploration, never changed
     tempered    q^t phi^(1 - t) of a Gaussian q, which bounds weights where q is a bad description
+    spread      as wide as the failures in the span of a few gradients of f, N(0, 1) across it
     half-space  N(0, I) beyond the edge of a Gaussian's failures
 """
 

@@ -8,13 +8,14 @@ import pytest
 from scipy import stats
 
 from samplers.methods.two_stage.candidates import _smooth_indicators, build_proposal, list_candidates
+from samplers.methods.two_stage.mixture.proposal import NO_REGION
 from samplers.methods.two_stage.multiple_importance import MultipleImportanceSample
-from samplers.methods.two_stage.refinement import refine_once, start_refinement
+from samplers.methods.two_stage.refinement import NearDraws, refine_once, start_refinement
 from samplers.methods.two_stage.regions import ExplorationResult
 from samplers.methods.two_stage.settings import RefinementSettings
 from samplers.methods.two_stage.simulator import ComponentDraws
 from samplers.problem import FunctionProblem
-from samplers.proposals.components import IsotropicNormal, SubspaceGaussian
+from samplers.proposals.components import IsotropicNormal, LiftedComponent, SubspaceGaussian
 
 SETTINGS = RefinementSettings()
 BETA = 3.0
@@ -54,9 +55,64 @@ def test_the_first_proposal_has_the_initial_shares(exact_region, rng):
     state, history, _ = started(exact_region, rng)
     proposal = build_proposal(state, history, SETTINGS, rng)
     present = {kind: a for kind, a in SETTINGS.initial_shares.items() if kind in kinds_of(proposal.candidates)}
-    assert set(SETTINGS.initial_shares) - set(present) == {"explored"}
+    assert set(SETTINGS.initial_shares) - set(present) == {"explored", "spread"}
     for kind, a in present.items():
         assert share(proposal, kind) == pytest.approx(a / sum(present.values()))
+
+
+def sloped(exact_region, rng, regions=2, dim=30):
+    """Return the state of half-spaces along the first axes of 30, whose slopes are known, and an empty history."""
+    problem = half_spaces(dim, regions)
+    found = [exact_region(problem, k, BETA) for k in range(regions)]
+    exploration = ExplorationResult(found, noisy=False, slopes=np.eye(dim)[:, :regions])
+    return start_refinement(exploration, 0.0, SETTINGS, rng), MultipleImportanceSample.empty(dim), problem
+
+
+def test_candidates_in_the_span_of_the_slopes_are_normal_across_it(exact_region, rng):
+    """Each region has components there; the one as wide as all failures is around the origin."""
+    state, history, _ = sloped(exact_region, rng)
+    lifted = [one for one in list_candidates(state, history, SETTINGS) if isinstance(one.component, LiftedComponent)]
+    assert {one.region for one in lifted} == {NO_REGION, 0, 1}
+    assert {"gaussian", "linear", "radial", "spread", "tempered"} <= set(kinds_of(lifted))
+    for one in lifted:
+        across = one.component.sample(200, rng)[:, 2:]
+        assert stats.kstest(across.ravel(), "norm").pvalue > 1e-4
+    (spread,) = (one.component.within for one in lifted if one.kind == "spread")
+    points = state.points[:, :2]
+    np.testing.assert_allclose(spread.centre, 0.0)
+    np.testing.assert_allclose((spread.axes * spread.variance) @ spread.axes.T, points.T @ points / len(points))
+
+
+def test_draws_of_a_round_move_the_components_in_the_span(exact_region, rng):
+    """As those in all coordinates: in the span a Gaussian is exact, in thirty dimensions it is shrunk."""
+    state, history, problem = sloped(exact_region, rng, regions=1)
+    proposal = build_proposal(state, history, SETTINGS, rng)
+    u, counts = proposal.draw(2000, rng)
+    batch = ComponentDraws(proposal.components, counts, u, problem.evaluate(u))
+    history = history.add(batch, 0.0)
+    after = refine_once(state, history, proposal, batch, SETTINGS)
+    mean, variance = stats.truncnorm(BETA, np.inf).stats("mv")
+    (gaussian,) = after.within.gaussians
+    assert gaussian.centre[0] == pytest.approx(mean, abs=0.03)
+    assert variance < gaussian.variance[0] < 1.5 * variance  # raised by two standard errors
+    assert len(after.within.rounds) == 1
+    assert after.within.hit_rate == after.hit_rate
+
+
+@pytest.mark.parametrize(("worth", "floor"), [(0.05, SETTINGS.spread_share), (0.5, 0.0)])
+def test_the_spread_has_a_share_while_draws_are_worth_little(exact_region, rng, worth, floor):
+    """A draw of these is worth a twentieth, or half, of a failure; in a half-space the spread buys nothing."""
+    state, history, problem = sloped(exact_region, rng, regions=1)
+    u = state.points
+    n = round(len(u) / worth)
+    f = np.append(np.full(len(u), -1.0), np.ones(n - len(u)))
+    draws = NearDraws(np.concatenate([u, np.zeros((n - len(u), 30))]), f, np.zeros(n))
+    drawn = build_proposal(state, history, SETTINGS, rng)
+    v, counts = drawn.draw(1000, rng)
+    history = history.add(ComponentDraws(drawn.components, counts, v, problem.evaluate(v)), 0.0)
+    after = build_proposal(replace(state, rounds=(draws,)), history, SETTINGS, rng)
+    assert draws.worth(0.0) == pytest.approx(worth)
+    assert share(after, "spread") == pytest.approx(floor, abs=0.05)
 
 
 def test_candidates_of_a_linear_region(exact_region, rng):
@@ -65,7 +121,7 @@ def test_candidates_of_a_linear_region(exact_region, rng):
     candidates = list_candidates(state, history, SETTINGS)
     assert candidates[0].kind == "base"
     kinds = kinds_of(candidates)
-    assert set(kinds) == set(SETTINGS.initial_shares)
+    assert set(kinds) == set(SETTINGS.initial_shares) - {"spread"}
     assert kinds["radial"] == 2
     gaussian = [c for c in candidates if isinstance(c.component, SubspaceGaussian) and c.kind != "tempered"]
     assert kinds["tempered"] == len(gaussian) * len(SETTINGS.tempering)

@@ -37,6 +37,13 @@ def test_a_proposal_is_given_up_that_meets_failures_too_seldom(number, levels, e
     assert not meets_too_few(worth(enough), number, levels)
 
 
+def test_a_quarter_is_enough_where_the_slopes_of_f_are_known():
+    share = SETTINGS.sloped_rate
+    assert share == 0.25
+    assert meets_too_few(worth(9, n=4000), 3, 4, share=share)
+    assert not meets_too_few(worth(10, n=4000), 3, 4, share=share)
+
+
 @pytest.mark.parametrize(("typical", "misses"), [(29.0, False), (31.0, True)])
 def test_a_proposal_is_given_up_that_is_far_from_most_regions(typical, misses):
     draws = worth(99)

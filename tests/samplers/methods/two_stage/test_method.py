@@ -361,7 +361,7 @@ def case(name):
     return Reference(name, state.problem(), state.p)
 
 
-@pytest.mark.parametrize("name", ["slabs_d20", "squares_d50"])
+@pytest.mark.parametrize("name", ["slabs_d20", "network_d30"])
 def test_subset_simulation_takes_over(recorder, name):
     reference = case(name)
     for seed in range(3):

@@ -1,0 +1,108 @@
+"""Slopes: the few directions in which f changes at its failures, by finite differences.
+
+In dozens of dimensions some hundred failing points do not show in which directions failures differ from N(0, I).
+Gradients of f at a handful of points do, where few directions matter or f is the least or largest of a few nearly
+linear functions. Each gradient costs a simulation for each dimension.
+
+References:
+    Uribe, Papaioannou, Marzouk and Straub, "Cross-entropy-based importance sampling with failure-informed dimension
+    reduction for rare event simulation", SIAM/ASA Journal on Uncertainty Quantification 9, 2021 (eigenvectors of
+    E[grad f grad f^T] over failures, there with gradients that the simulator gives).
+"""
+
+import numpy as np
+
+from samplers.methods.two_stage.regions import ExplorationResult
+from samplers.methods.two_stage.settings import SlopeSettings
+from samplers.methods.two_stage.simulator import SimulationSteps, Simulator
+from samplers.problem import FloatArray
+
+
+def find_slopes(
+    simulator: Simulator,
+    exploration: ExplorationResult,
+    gamma: float,
+    budget: int,
+    rng: np.random.Generator,
+    settings: SlopeSettings,
+) -> SimulationSteps[FloatArray | None]:
+    """Return orthonormal directions in which f changes around the failures, shape (d, r); None where they are not few.
+
+    The gradients are made in three batches, so that a search without result ends early and the later ones may go where
+    the known directions explain least.
+
+    Args:
+        simulator: Gives outcomes.
+        exploration: Regions of failure.
+        gamma: Threshold of failure.
+        budget: Simulations of the whole run.
+        rng: Source of randomness.
+        settings: Dimensions, simulations, step.
+    """
+    dim = simulator.inputs.dim
+    share = settings.scattered_share if exploration.scattered else settings.share
+    n = min(int(share * budget / (dim + 1)), settings.most)
+    if dim < settings.min_dim or n < settings.least or exploration.noisy or not exploration.regions:
+        return None
+    later = n // 4
+    points = _choose_points(exploration, n - 2 * later, gamma, rng)
+    slopes = yield from _differentiate(simulator, points, settings.step)
+    for _ in range(2):
+        if not _have_few_directions(slopes, settings):
+            return None
+        points = _choose_unexplained(exploration, later, gamma, _leading_directions(slopes, settings))
+        more = yield from _differentiate(simulator, points, settings.step)
+        slopes = np.concatenate([slopes, more])
+    return _leading_directions(slopes, settings) if _have_few_directions(slopes, settings) else None
+
+
+def _choose_points(exploration: ExplorationResult, n: int, gamma: float, rng: np.random.Generator) -> FloatArray:
+    """Return at most n points (k, d), in turn the end of a chain of each region and a point beside each.
+
+    f may be capped within a region or beside it; and where failure needs several things at once, a point beside it
+    lacks the one that all points inside may have in plenty.
+    """
+    inside = [region.chains[:, -1] for region in exploration.regions]
+    beside = [region.u[region.f > gamma] for region in exploration.regions]
+    groups = [rng.permutation(u) for u in (*inside, *beside)]
+    turns = np.concatenate([np.arange(len(u)) for u in groups])
+    return np.asarray(np.concatenate(groups)[np.argsort(turns, kind="stable")[:n]])
+
+
+def _choose_unexplained(exploration: ExplorationResult, n: int, gamma: float, axes: FloatArray) -> FloatArray:
+    """Return n points whose outcomes known directions (d, r) explain least, shape (n, d).
+
+    Half of them fail though they are short along these directions, the others are long and do not fail.
+    """
+    inside = np.concatenate([region.chains[:, -1] for region in exploration.regions])
+    beside = np.concatenate([region.u[region.f > gamma] for region in exploration.regions])
+    shortest = np.argsort(np.linalg.norm(inside @ axes, axis=1), kind="stable")[: n - n // 2]
+    longest = np.argsort(-np.linalg.norm(beside @ axes, axis=1), kind="stable")[: n // 2]
+    return np.concatenate([inside[shortest], beside[longest]])
+
+
+def _differentiate(simulator: Simulator, u: FloatArray, step: float) -> SimulationSteps[FloatArray]:
+    """Return the unit gradients (k, d) of f at those of the points u (n, d) where it has one."""
+    n, dim = u.shape
+    beside = u[:, None] + step * np.eye(dim)
+    f = yield from simulator.evaluate(np.concatenate([u, beside.reshape(-1, dim)]))
+    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):  # f may be infinite, or flat
+        slopes = f[n:].reshape(n, dim) - f[:n, None]
+        unit = slopes / np.linalg.norm(slopes, axis=1, keepdims=True)
+    return np.asarray(unit[np.isfinite(unit).all(axis=1)])
+
+
+def _have_few_directions(slopes: FloatArray, settings: SlopeSettings) -> bool:
+    """Return whether nearly all of the unit gradients (k, d) lies in fewer directions than there are gradients."""
+    if len(slopes) < settings.least:
+        return False
+    parts = np.linalg.svd(slopes, compute_uv=False) ** 2 / len(slopes)
+    needed = 1 + int(np.searchsorted(parts.cumsum(), settings.nearly_all))
+    return needed <= settings.few * len(slopes)
+
+
+def _leading_directions(slopes: FloatArray, settings: SlopeSettings) -> FloatArray:
+    """Return the principal directions (d, r) of unit gradients (k, d)."""
+    _, sizes, axes = np.linalg.svd(slopes, full_matrices=False)
+    used = sizes**2 > settings.least_part * len(slopes)
+    return np.asarray(axes[used][: settings.most_axes].T)
