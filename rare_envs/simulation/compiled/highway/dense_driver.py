@@ -71,6 +71,11 @@ def read_dense_driver(offer: OffersDenseDriver) -> DenseDriver:
 
     Raises:
         NotCompiled: It was changed.
+
+    Example:
+        >>> from agents import load_ego
+        >>> read_dense_driver(load_ego("imitation")).low  # acceleration [m/s^2] and yaw rate [rad/s]
+        (-8.0, -0.3)
     """
     driver = offer.dense_driver()
     if driver is None:

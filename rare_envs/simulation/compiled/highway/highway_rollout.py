@@ -31,7 +31,12 @@ ORDERS: dict[int, Any] = {DISTANCES: CLEARANCE, BEAM_TIMES: MEASURES["lidar_ttc"
 
 
 class RolloutTerms(NamedTuple):
-    """f of B rollouts and their J terms; see `rare_envs.terms.episode_terms.EpisodeTerms`."""
+    """f of B rollouts and their J terms; see `rare_envs.terms.episode_terms.EpisodeTerms`.
+
+    Example:
+        >>> RolloutTerms._fields
+        ('f', 'values', 'ticks')
+    """
 
     f: NDArray[np.float32]
     """Shape (B,)."""
@@ -140,6 +145,12 @@ def find_highway_rollout(world: World, ego: Any) -> HighwayRollout:
 
     Raises:
         NotCompiled: There is none.
+
+    Example:
+        >>> from agents import load_driver
+        >>> from rare_envs.simulation import World
+        >>> find_highway_rollout(World(highway.HIGHWAY, background=load_driver("mgail")), IDM()).ego == IDM()
+        True
     """
     background: Any = world.background
     obstacle = _find_obstacle(world)
