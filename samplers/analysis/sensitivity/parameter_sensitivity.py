@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -139,12 +140,19 @@ class Sensitivity:
             "reason": self.reason,
         }
 
-    def plot(self, axes: Sequence[Axes] | None = None) -> Sequence[Axes]:
+    def plot(self, axes: Sequence[Axes] | str | PathLike[str] | None = None) -> Sequence[Axes]:
         """Draw importance of the columns and derivatives by the parameters as bars; needs matplotlib.
 
         Args:
-            axes: Two axes to draw in; None makes a figure of pyplot.
+            axes: Two axes to draw in, or the path of an image to write; None makes a figure of pyplot.
         """
+        if isinstance(axes, str | PathLike):
+            from matplotlib.figure import Figure
+
+            figure = Figure(figsize=(12, 4.5), layout="constrained")
+            drawn = self.plot(figure.subplots(1, 2))
+            figure.savefig(axes)
+            return drawn
         if axes is None:
             from matplotlib import pyplot
 
