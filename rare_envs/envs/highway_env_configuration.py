@@ -97,7 +97,7 @@ gym.make the argument horizon.
             "Expected config to keep its keys, got a removal; copy it with dict(config) to change the copy."
         )
 
-    __delitem__ = pop = popitem = clear = _refuse  # type: ignore[assignment]
+    __delitem__ = pop = popitem = clear = _refuse
 
     def __reduce__(self) -> tuple[Any, ...]:
         return dict, (dict(self),)

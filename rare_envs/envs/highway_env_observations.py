@@ -19,7 +19,8 @@ class EpisodeObservation(ObservationType):  # type: ignore[misc] # HighwayEnv ha
 
     def space(self) -> spaces.Space[Any]:
         """Return the space of the environment's observations."""
-        return self.env.observation_space
+        space: spaces.Space[Any] = self.env.observation_space
+        return space
 
     def observe(self) -> Any:
         """Return what the ego observes now, as `step` returns it.

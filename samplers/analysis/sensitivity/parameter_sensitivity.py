@@ -150,14 +150,17 @@ class Sensitivity:
             from matplotlib.figure import Figure
 
             figure = Figure(figsize=(12, 4.5), layout="constrained")
-            drawn = self.plot(figure.subplots(1, 2))
+            drawn = self._draw(*figure.subplots(1, 2))
             figure.savefig(axes)
             return drawn
         if axes is None:
             from matplotlib import pyplot
 
-            axes = pyplot.subplots(1, 2, figsize=(12, 4.5), layout="constrained")[1]
-        left, right = axes
+            return self._draw(*pyplot.subplots(1, 2, figsize=(12, 4.5), layout="constrained")[1])
+        return self._draw(*axes)
+
+    def _draw(self, left: Axes, right: Axes) -> tuple[Axes, Axes]:
+        """Draw the columns into the left axes and the parameters into the right ones."""
         columns, parameters = self.columns[:SHOWN_PARAMETERS], self.parameters[:SHOWN_PARAMETERS]
         left.barh([c.name for c in columns], [c.importance for c in columns], xerr=[c.error for c in columns])
         left.set_xlabel("importance, share of -log p")
@@ -170,7 +173,7 @@ class Sensitivity:
         right.set_xlabel("change of log p")
         for each in (left, right):
             each.invert_yaxis()
-        return axes
+        return left, right
 
 
 def compute_sensitivity(
