@@ -102,6 +102,10 @@ class VonMisesFisherNakagami:
         fisher = log_normaliser(self.kappa, dim) + self.kappa * ((u @ self.mu) / radius)
         return np.asarray(nakagami + fisher - (dim - 1) * np.log(radius))
 
+    def log_ratio(self, u: FloatArray) -> FloatArray:
+        """Return the log density less that of N(0, I) at u (n, d), shape (n,)."""
+        return np.asarray(self.log_prob(u) + 0.5 * (np.einsum("ij,ij->i", u, u) + len(self.mu) * LOG_TWO_PI))
+
 
 def concentration(length: float, dim: int) -> float:
     """Return kappa of the mean resultant length, R (d - R^2) / (1 - R^2)."""

@@ -81,11 +81,10 @@ def collect(
     situations = make_situations()
     for number in range(drives):
         world, episode = start_situation(situations[number % len(situations)], rows, ticks * VisionEgo.dt, rng)
-        moments = drive_and_label(world, episode, network, network_share, ticks, recorded_share, noise, rng)
-        yield concatenate(list(moments))
+        yield concatenate(list(_drive(world, episode, network, network_share, ticks, recorded_share, noise, rng)))
 
 
-def drive_and_label(
+def _drive(
     world: World,
     episode: Episode,
     network: PilotNet | None,

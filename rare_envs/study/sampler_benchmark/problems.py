@@ -44,13 +44,7 @@ def make_driving_state(counted: CountedCollisions) -> LimitState:
 ALL_PROBLEMS: dict[str, BenchmarkProblem] = {
     **PROBLEMS,
     **{
-        name: BenchmarkProblem(
-            partial(make_driving_state, counted),
-            "driving",
-            "plain rollouts (python -m benchmarks.estimators.truth)",
-            counted.rollouts,
-            "20,000 rollouts of other draws",
-        )
+        name: BenchmarkProblem(partial(make_driving_state, counted), "driving", f"{counted.rollouts:,} plain rollouts")
         for name, counted in COUNTED_COLLISIONS.items()
     },
 }

@@ -15,8 +15,7 @@ from rare_envs.study.execution.run_lines import RunLines
 from rare_envs.study.sampler_benchmark.leaderboard import format_leaderboard
 from rare_envs.study.sampler_benchmark.problems import ALL_PROBLEMS, GROUPS
 from samplers.benchmark import Job, MethodRun, cells_of, find_faults, power_of, run_all, run_once
-from samplers.benchmark.runs import about
-from samplers.benchmark.solvers import find_method
+from samplers.benchmark.runs import about, find_method
 from samplers.serialization import to_json_value
 
 RUNS_FILE, RESULT_FILE, PAGE_FILE = "runs.jsonl", "benchmark.json", "leaderboard.md"
@@ -161,8 +160,6 @@ def _describe_problem(name: str) -> dict[str, Any]:
         "p": state.p,
         "standard_error": state.standard_error,
         "reference": problem.reference,
-        "draws": problem.draws,
-        "second": problem.second,
         "knowable": problem.knowable,
     }
 

@@ -25,6 +25,7 @@ from samplers.proposals.components import (
     SubspaceGaussian,
     log_ratios,
 )
+from samplers.proposals.von_mises_fisher import VonMisesFisherNakagami
 
 
 def build_proposal(
@@ -90,6 +91,7 @@ def list_candidates(
         *_fit_radial_components(state, history, settings, edges),
         *regional,
         *([] if state.noisy else _fit_half_space_components(state, history, settings, edges)),
+        *_fit_directional_components(state, history),
         *_temper_gaussians(regional, settings.noisy_tempering if state.noisy else settings.tempering),
     ]
     candidates += _lift_candidates(state, history, settings, edges)
@@ -111,8 +113,7 @@ def _lift_candidates(
 
 def _fit_spread(state: RefinementState, history: MultipleImportanceSample) -> SubspaceGaussian:
     """Return the Gaussian around the origin that is as wide as the failures, and at least N(0, I)."""
-    u = history.u if state.rounds and len(history.u) else state.points
-    weights = truncate_weights(history.log_weights) if state.rounds and len(history.u) else np.full(len(u), 1 / len(u))
+    u, weights = _weighted_failures(state, history)
     values, axes = np.linalg.eigh((u * weights[:, None]).T @ u)
     return SubspaceGaussian(axes, np.zeros(len(values)), np.maximum(values, 1.0))
 
@@ -138,6 +139,21 @@ def _fit_radial_components(
         log_w = history.log_weights
         radial.append(fit_radial(history.u, np.exp(log_w - log_w.max()), edges))
     return [ProposalComponent(component, "radial") for component in radial]
+
+
+def _fit_directional_components(state: RefinementState, history: MultipleImportanceSample) -> list[ProposalComponent]:
+    """Return one direction with a radius, fitted to all failures, where these are something like a shell or a cone."""
+    if not state.scattered or state.dim < 2:
+        return []
+    law = VonMisesFisherNakagami.fit(*_weighted_failures(state, history))
+    return [ProposalComponent(law, "directional")]
+
+
+def _weighted_failures(state: RefinementState, history: MultipleImportanceSample) -> tuple[FloatArray, FloatArray]:
+    """Return the failing draws u (n, d) and their weights (n,), before the first round the points of all chains."""
+    if state.rounds and len(history.u):
+        return history.u, truncate_weights(history.log_weights)
+    return state.points, np.full(len(state.points), 1 / len(state.points))
 
 
 def _fit_half_space_components(

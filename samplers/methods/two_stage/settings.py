@@ -24,6 +24,7 @@ def _initial_shares() -> dict[Kind, float]:
         "tempered": 0.25,
         "half-space": 0.1,
         "spread": 0.2,
+        "directional": 0.1,
     }
 
 

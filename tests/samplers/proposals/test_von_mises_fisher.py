@@ -100,3 +100,11 @@ def test_directions_have_length_one(rng, dim):
     a = directions(vmfn(dim).mu, 3.0, 1000, rng)
     assert a.shape == (1000, dim)
     np.testing.assert_allclose(np.linalg.norm(a, axis=1), 1)
+
+
+@pytest.mark.parametrize("dim", [2, 7, 120])
+def test_ratio_to_the_base_is_that_of_the_densities(dim, rng):
+    law = VonMisesFisherNakagami(np.eye(dim)[0], 3.0, dim / 3, 1.5 * dim)
+    u = rng.standard_normal((50, dim))
+    expected = law.log_prob(u) - stats.norm.logpdf(u).sum(axis=1)
+    np.testing.assert_allclose(law.log_ratio(u), expected, rtol=1e-10, atol=1e-9)

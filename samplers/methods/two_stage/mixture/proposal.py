@@ -12,11 +12,14 @@ from samplers.methods.two_stage.mixture.settings import DEFAULT_MIXTURE_SETTINGS
 from samplers.problem import FloatArray
 from samplers.proposals.components import MixtureComponent, draw_components, draw_counts, log_ratios, mixture_log_ratio
 
-Kind = Literal["base", "wide", "radial", "gaussian", "linear", "explored", "tempered", "half-space", "spread"]
+Kind = Literal[
+    "base", "wide", "radial", "gaussian", "linear", "explored", "tempered", "half-space", "spread", "directional"
+]
 """Where a component of a proposal comes from:
 
     base        N(0, I), which bounds all weights
     wide        N(0, s^2 I)
+    directional a direction and a radius, for failures like a shell or a cone
     radial      every direction alike, from the radius of the failures on
     gaussian    fitted to weighted failures
     linear      a half-space and its Gaussian, from linear regression of f

@@ -55,7 +55,7 @@ def test_the_first_proposal_has_the_initial_shares(exact_region, rng):
     state, history, _ = started(exact_region, rng)
     proposal = build_proposal(state, history, SETTINGS, rng)
     present = {kind: a for kind, a in SETTINGS.initial_shares.items() if kind in kinds_of(proposal.candidates)}
-    assert set(SETTINGS.initial_shares) - set(present) == {"explored", "spread"}
+    assert set(SETTINGS.initial_shares) - set(present) == {"explored", "spread", "directional"}
     for kind, a in present.items():
         assert share(proposal, kind) == pytest.approx(a / sum(present.values()))
 
@@ -121,10 +121,19 @@ def test_candidates_of_a_linear_region(exact_region, rng):
     candidates = list_candidates(state, history, SETTINGS)
     assert candidates[0].kind == "base"
     kinds = kinds_of(candidates)
-    assert set(kinds) == set(SETTINGS.initial_shares) - {"spread"}
+    assert set(kinds) == set(SETTINGS.initial_shares) - {"spread", "directional"}
     assert kinds["radial"] == 2
     gaussian = [c for c in candidates if isinstance(c.component, SubspaceGaussian) and c.kind != "tempered"]
     assert kinds["tempered"] == len(gaussian) * len(SETTINGS.tempering)
+
+
+def test_pieces_of_a_cone_have_a_direction_in_common(exact_region, rng):
+    """Half-spaces along the three axes as pieces of one set: it lies towards (1, 1, 1)."""
+    state, history, _ = started(exact_region, rng, regions=3, scattered=True)
+    (cone,) = (one for one in list_candidates(state, history, SETTINGS) if one.kind == "directional")
+    assert cone.region == NO_REGION
+    np.testing.assert_allclose(cone.component.mu, np.ones(3) / 3**0.5, atol=0.15)
+    assert cone.component.omega == pytest.approx((state.points**2).sum(axis=1).mean())
 
 
 def test_in_one_dimension_nothing_is_radial(exact_region, rng):
