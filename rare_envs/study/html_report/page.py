@@ -175,7 +175,7 @@ def _read_failing(study: LoadedStudy, names: list[str]) -> tuple[FloatArray, Flo
         table = [np.asarray(study.failures[name], dtype=float) for name in names if name in study.failures]
         x = np.column_stack(table) if len(table) == len(names) else np.empty((0, len(names)))
         return x, np.full(len(x), np.nan)
-    with as_bad_input(ValueError):
+    with as_bad_input(ValueError, OSError):
         found = study.episodes([*names, "log_weight"], failed=True)
     x = np.column_stack([found[name].to_numpy() for name in names]) if names else np.empty((found.num_rows, 0))
     return x, found["log_weight"].to_numpy().astype(float)

@@ -142,6 +142,14 @@ def test_a_damaged_file_is_one_line(
     assert not (tmp_path / "page.html").exists()
 
 
+def test_a_table_that_is_no_file_is_one_line(folder: Path, tmp_path: Path) -> None:
+    run = Path(shutil.copytree(folder, tmp_path / "run"))
+    (run / "episodes.parquet").unlink()
+    (run / "episodes.parquet").mkdir()
+    with pytest.raises(BadInput, match=r"There is no episodes\.parquet"):
+        write_html_report(run)
+
+
 def test_doubts_are_those_of_method_base_and_f() -> None:
     base = {"warnings": ["few events"]}
     found = list_doubts({"warnings": ["coarse"], "base_uncertainty": base, "doubtful": True})
