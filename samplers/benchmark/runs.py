@@ -20,11 +20,10 @@ import scipy
 
 from samplers.benchmark.analytic_states import LimitState
 from samplers.benchmark.catalogue import BenchmarkProblem
-from samplers.benchmark.openturns_methods import OPENTURNS
+from samplers.benchmark.solvers import Solver, find_method
 from samplers.estimation import estimate
 from samplers.method import Stepping
 from samplers.problem import FloatArray, FunctionProblem
-from samplers.registry import METHODS
 from samplers.result import Estimate
 
 _Job = TypeVar("_Job")
@@ -57,8 +56,21 @@ class Job:
     """Module and attribute of the problems by name."""
 
 
-@dataclass(frozen=True)
-class MethodRun:
+@dataclass(frozen=True, kw_only=True)
+class SeededEstimate:
+    """Estimate of one run of a method, and the seed that brings it back."""
+
+    method: str
+    seed: int
+    p: float
+    low: float
+    high: float
+    cov: float
+    """As the run itself states it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MethodRun(SeededEstimate):
     """What came of a run.
 
     Example:
@@ -67,13 +79,7 @@ class MethodRun:
         (True, 1)
     """
 
-    method: str
     problem: str
-    seed: int
-    p: float
-    low: float
-    high: float
-    cov: float
     n_sim: int
     """Points at which f was evaluated."""
     calls: int
@@ -88,11 +94,6 @@ class MethodRun:
     """The budget; None for no limit."""
     stated: int | None = None
     """Simulations that the method states, None if it does not say; fewer than `n_sim` are hidden ones."""
-
-
-Solver = Callable[..., Any]
-"""Called as solver(problem, seed=..., max_sim=...); returns p, low and high, with the c.o.v. if it knows it, or an
-object with `p`, `interval` and perhaps `cov`."""
 
 
 class Meter:
@@ -142,42 +143,6 @@ def find_problem(name: str, catalogue: str = OWN_CATALOGUE) -> BenchmarkProblem:
 def limit_state(name: str, catalogue: str = OWN_CATALOGUE) -> LimitState:
     """Return the limit state of a problem; its p is computed once."""
     return find_problem(name, catalogue).make()
-
-
-def find_method(name: str) -> Stepping | Solver:
-    """Return a method by its name, or by where it stands.
-
-    Args:
-        name: A name of `samplers.METHODS` or `OPENTURNS`; or `module:attribute`, the attribute a class with the
-            protocol of our methods (`samplers.testing.check_method` checks it) or a `Solver`.
-
-    Raises:
-        ValueError: There is no such method.
-
-    Example:
-        >>> find_method("mc").name
-        'mc'
-    """
-    if name in OPENTURNS:
-        return OPENTURNS[name]
-    if ":" not in name:
-        if name not in METHODS:
-            known = ", ".join([*METHODS, *OPENTURNS])
-            raise ValueError(f"Unknown method {name!r}; known: {known}, or module:attribute.")
-        return METHODS[name]()
-    module, _, attribute = name.partition(":")
-    try:
-        found = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError) as error:
-        raise ValueError(f"Cannot load the method {name}: {error}") from None
-    if isinstance(found, type):
-        found = found()
-    if isinstance(found, Stepping):
-        return found
-    if not callable(found):
-        raise ValueError(f"Expected {name} to be a method or a function, got {type(found).__name__}.")
-    solver: Solver = found
-    return solver
 
 
 def rotation_of(job: Job) -> int | None:

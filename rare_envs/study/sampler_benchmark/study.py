@@ -15,7 +15,8 @@ from rare_envs.study.execution.run_lines import RunLines
 from rare_envs.study.sampler_benchmark.leaderboard import format_leaderboard
 from rare_envs.study.sampler_benchmark.problems import ALL_PROBLEMS, GROUPS
 from samplers.benchmark import Job, MethodRun, cells_of, find_faults, power_of, run_all, run_once
-from samplers.benchmark.runs import about, find_method
+from samplers.benchmark.runs import about
+from samplers.benchmark.solvers import find_method
 from samplers.serialization import to_json_value
 
 RUNS_FILE, RESULT_FILE, PAGE_FILE = "runs.jsonl", "benchmark.json", "leaderboard.md"

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from samplers.benchmark.runs import Job, LimitReached, Meter, find_method, find_problem, map_jobs, run_all, run_once
+from samplers.benchmark.runs import Job, LimitReached, Meter, find_problem, map_jobs, run_all, run_once
 
 WRONG = "tests.samplers.benchmark.wrong_samplers"
 
@@ -85,15 +85,6 @@ def test_an_answer_of_two_numbers_is_recorded_as_an_error():
 def test_an_answer_that_is_no_number_is_recorded_as_an_error():
     run = run_once(Job("nan", "lin_d2", 0, 100), lambda problem, seed, max_sim: (math.nan, 0.0, 1.0))
     assert run.error == "ValueError: expected p and an interval, got nan and 0 to 1"
-
-
-@pytest.mark.parametrize(
-    ("name", "said"),
-    [("nothing", "Unknown method 'nothing'"), ("no.such:thing", "Cannot load the method"), ("math:pi", "got float")],
-)
-def test_what_is_no_method_is_refused(name, said):
-    with pytest.raises(ValueError, match=said):
-        find_method(name)
 
 
 def test_an_unknown_problem_is_refused():

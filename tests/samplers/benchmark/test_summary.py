@@ -13,7 +13,19 @@ P = 2.3262907903552502e-04
 
 
 def made(p=P, cov=0.1, low=0.8 * P, high=1.2 * P, **changes) -> MethodRun:
-    run = MethodRun("ce", "lin_d2", 0, p, low, high, cov, n_sim=1000, calls=4, seconds=0.01, status="converged")
+    run = MethodRun(
+        method="ce",
+        problem="lin_d2",
+        seed=0,
+        p=p,
+        low=low,
+        high=high,
+        cov=cov,
+        n_sim=1000,
+        calls=4,
+        seconds=0.01,
+        status="converged",
+    )
     return replace(run, **changes)
 
 

@@ -27,13 +27,13 @@ class ScaleChoice(str, Enum):
     FULL = "full"
 
 
-ReproductionFolder = Annotated[Path, typer.Option("--out", help="Folder of runs, JSON and page.")]
+ReproductionFolder = Annotated[Path, typer.Option("--out", help="Folder of runs, JSON and page, of one reproduction.")]
 ScaleOption = Annotated[ScaleChoice, typer.Option(help="small: minutes; full: as many runs as the paper has.")]
 ReplicationsOption = Annotated[
     int | None, typer.Option("--replications", min=2, help="Replications of every method, instead of the scale's.")
 ]
 ResumeOption = Annotated[
-    bool, typer.Option("--resume/--afresh", help="Go on with the runs in the folder, or make all of them anew.")
+    bool, typer.Option("--resume/--afresh", help="Go on with the runs in the folder, or delete them and make all anew.")
 ]
 WorkersOption = Annotated[int, typer.Option(min=1, help="Processes.")]
 FirstSeedOption = Annotated[int, typer.Option("--seed", min=0, help="Seed of the first replication.")]
@@ -110,6 +110,7 @@ def reproduce_tian2024_command(
     as_json: JsonOption = False,
 ) -> None:
     """Tian et al. 2024: Tables II and III, Figures 6 to 8. Writes reproduction.html and reproduction.json."""
+    from rare_envs.study.reproduction.folder import discard_runs
     from rare_envs.study.reproduction.tian2024.study import REPLICATIONS_FILE, SCALES, TianPlan, reproduce_tian2024
 
     number = SCALES[scale.value] if replications is None else replications
@@ -119,7 +120,7 @@ def reproduce_tian2024_command(
     with keep_stdout_for_the_answer(), say_how_to_go_on(out), as_bad_input(ValueError, OSError):
         plan = TianPlan(replications=number, seed=seed, monte_carlo=monte_carlo, further=further)
         if not resume:
-            (out / REPLICATIONS_FILE).unlink(missing_ok=True)
+            discard_runs(out / REPLICATIONS_FILE, "tian2024")
         record = reproduce_tian2024(plan, out, command, workers, progress=True)
     if as_json:
         print_json(record)

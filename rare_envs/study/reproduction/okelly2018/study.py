@@ -75,13 +75,17 @@ class HighwayStudy:
         return rare_envs.DrivingProblem(HIGHWAY_ENV_ID, ego=EGO_NAMES[self.ego], measure="lidar_ttc", noise="fixed")
 
     @property
+    def identity(self) -> dict[str, Any]:
+        """What tells studies apart."""
+        return {"paper": "okelly2018", "ego": self.ego, "scale": self.scale, "seed": self.seed}
+
+    @property
     def header(self) -> dict[str, Any]:
         """What all rollouts of a folder have in common."""
         return {
+            "study": self.identity,
             "rare_envs": rare_envs.__version__,
             "code": digest_code(),
-            "ego": self.ego,
-            "seed": self.seed,
             "settings": asdict(self.settings),
             "gammas": list(self.gammas),
         }

@@ -18,7 +18,7 @@ from rare_envs.study.reproduction.tian2024.catalogue import (
     SYSTEMS,
     TRAFFIC_BASE,
 )
-from samplers.benchmark.runs import use_one_core
+from samplers.benchmark.runs import SeededEstimate, use_one_core
 from samplers.estimation import estimate
 from samplers.method import whole_simulations
 from samplers.methods.two_stage.method import TwoStage
@@ -49,19 +49,12 @@ class ReplicationJob:
     """Whether points of the levels are kept, for Figure 7."""
 
 
-@dataclass(frozen=True)
-class ReplicationRun:
+@dataclass(frozen=True, kw_only=True)
+class ReplicationRun(SeededEstimate):
     """What came of it."""
 
     scenario: str
     system: str
-    method: str
-    seed: int
-    p: float
-    low: float
-    high: float
-    cov: float
-    """As the run itself states it."""
     n_sim: int
     """Simulations that the method states."""
     simulated: int

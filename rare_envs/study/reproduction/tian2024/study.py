@@ -10,6 +10,7 @@ from typing import Any
 
 import rare_envs
 from rare_envs.study.execution.run_lines import RunLines
+from rare_envs.study.reproduction.folder import check_folder
 from rare_envs.study.reproduction.record import digest_code, make_record, write_record
 from rare_envs.study.reproduction.tian2024.catalogue import (
     ADSS_SIMULATIONS,
@@ -78,6 +79,13 @@ class TianPlan:
         if "MC" not in self.methods:
             raise ValueError("Expected MC among the methods: the others are compared with it.")
 
+    @property
+    def identity(self) -> dict[str, Any]:
+        """What tells reproductions apart."""
+        counts = {"of Monte Carlo": self.monte_carlo, "of further methods": self.further}
+        other = {name: count for name, count in counts.items() if count not in (None, self.replications)}
+        return {"paper": "tian2024", "replications": self.replications, **other, "seed": self.seed}
+
     def jobs(self) -> list[ReplicationJob]:
         """Return the replications: the paper's methods, then further ones, Monte Carlo at the end."""
         others = [method for method in self.methods if method != "MC"]
@@ -119,10 +127,11 @@ def reproduce_tian2024(
         The record.
 
     Raises:
-        BadInput: The folder has runs of another version of the package, or damaged ones.
+        BadInput: The folder has runs of something else or of other code, or damaged ones.
     """
+    check_folder(out, plan.identity)
     out.mkdir(parents=True, exist_ok=True)
-    lines = open_replications(out)
+    lines = open_replications(out, plan)
     runs = lines.complete(
         plan.jobs(), lambda missing: map_jobs(run_replication, missing, workers, executor), progress, "replications"
     )
@@ -131,11 +140,11 @@ def reproduce_tian2024(
     return record
 
 
-def open_replications(out: Path) -> RunLines[ReplicationJob, ReplicationRun]:
+def open_replications(out: Path, plan: TianPlan) -> RunLines[ReplicationJob, ReplicationRun]:
     """Return the replications of a folder."""
     return RunLines(
         out / REPLICATIONS_FILE,
-        {"rare_envs": rare_envs.__version__, "code": digest_code(), "paper": "tian2024"},
+        {"study": plan.identity, "rare_envs": rare_envs.__version__, "code": digest_code()},
         ReplicationRun.from_line,
         ReplicationRun.to_line,
         key_of_job=lambda job: (job.scenario, job.system, job.method, job.seed),

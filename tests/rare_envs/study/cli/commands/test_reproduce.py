@@ -75,6 +75,33 @@ def test_it_goes_on_unless_told_otherwise(made: list[int], tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize(
+    "words", [[*TIAN, "--seed", "1"], [*TIAN, "--scale", "full"], OKELLY, [*OKELLY, "--at-most=0"]]
+)
+def test_a_folder_of_another_reproduction_is_refused_in_a_line(
+    made: list[int], tmp_path: Path, words: list[str]
+) -> None:
+    assert CliRunner().invoke(app, [*TIAN, "--scale", "small", "--out", str(tmp_path)]).exit_code == 0
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    made.clear()
+    done = CliRunner().invoke(app, [*words, "--out", str(tmp_path)])
+    assert done.exit_code == 2
+    assert made == []
+    assert f"{tmp_path} holds tian2024, replications 5, seed 0; this is" in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+@pytest.mark.parametrize("name", ["own.jsonl", "runs.jsonl"])
+def test_runs_of_another_command_are_neither_joined_nor_deleted(made: list[int], tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text('{"rare_envs": "0.1.0"}\n')
+    for words in ([*TIAN, "--afresh"], TIAN, OKELLY):
+        done = CliRunner().invoke(app, [*words, "--out", str(tmp_path)])
+        assert done.exit_code == 2
+        assert "holds runs of another command" in done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+@pytest.mark.parametrize(
     "changes",
     [
         ["--replications", "1"],

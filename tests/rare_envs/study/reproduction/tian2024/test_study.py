@@ -54,11 +54,14 @@ def test_a_torn_line_alone_is_made_again(made, tmp_path: Path) -> None:
     assert file.read_text() == text
 
 
-def test_more_replications_go_on_with_those_there(made, tmp_path: Path) -> None:
+def test_other_replications_are_refused_before_any_is_made(made, tmp_path: Path) -> None:
     reproduce_tian2024(PLAN, tmp_path, COMMAND)
+    before = (tmp_path / "runs.jsonl").read_text()
     made.clear()
-    reproduce_tian2024(TianPlan(replications=3), tmp_path, COMMAND)
-    assert {seed for *_, seed in made} == {2}
+    with pytest.raises(BadInput, match="holds tian2024, replications 2, seed 0; this is tian2024, replications 3"):
+        reproduce_tian2024(TianPlan(replications=3), tmp_path, COMMAND)
+    assert made == []
+    assert (tmp_path / "runs.jsonl").read_text() == before
 
 
 def test_monte_carlo_and_further_methods_may_have_fewer_replications(made, tmp_path: Path) -> None:
@@ -68,11 +71,10 @@ def test_monte_carlo_and_further_methods_may_have_fewer_replications(made, tmp_p
     assert "over 4 replications (Monte Carlo 2, methods that the paper does not have 3;" in record["notes"][0]
 
 
-def test_runs_of_another_paper_are_refused(made, tmp_path: Path) -> None:
+def test_runs_of_other_code_are_refused(made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     reproduce_tian2024(PLAN, tmp_path, COMMAND)
-    file = tmp_path / "runs.jsonl"
-    file.write_text(file.read_text().replace("tian2024", "okelly2018", 1))
-    with pytest.raises(BadInput, match="has runs of paper okelly2018, this is tian2024"):
+    monkeypatch.setattr(study, "digest_code", lambda: "0123456789abcdef")
+    with pytest.raises(BadInput, match=r"has runs of code .*, this is 0123456789abcdef: choose another --out"):
         reproduce_tian2024(PLAN, tmp_path, COMMAND)
 
 

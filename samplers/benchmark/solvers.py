@@ -1,0 +1,67 @@
+"""Methods of the benchmark by name: ours, those of other libraries, and those of a user."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from importlib.util import find_spec
+from typing import Any
+
+from samplers.benchmark.openturns_methods import OPENTURNS
+from samplers.benchmark.uqpy_methods import UQPY
+from samplers.method import Stepping
+from samplers.registry import METHODS
+
+Solver = Callable[..., Any]
+"""Called as solver(problem, seed=..., max_sim=...); returns p, low and high, with the c.o.v. if it knows it, or an
+object with `p`, `interval` and perhaps `cov`."""
+
+OTHERS: dict[str, Solver] = {**OPENTURNS, **UQPY}
+"""Solvers of other libraries, by names that begin with that of the library."""
+NEEDED_MODULES = {"openturns": ("openturns",), "uqpy": ("UQpy", "pkg_resources")}
+"""By library, which is also the name of the extra that installs them."""
+
+
+def find_method(name: str) -> Stepping | Solver:
+    """Return a method by its name, or by where it stands.
+
+    Args:
+        name: A name of `samplers.METHODS`, `OPENTURNS` or `UQPY`; or `module:attribute`, the attribute a class with the
+            protocol of our methods (`samplers.testing.check_method` checks it) or a `Solver`.
+
+    Raises:
+        ValueError: There is no such method, or its library is not installed.
+
+    Example:
+        >>> find_method("mc").name
+        'mc'
+    """
+    if name in OTHERS:
+        _check_installed(name)
+        return OTHERS[name]
+    if ":" not in name:
+        if name not in METHODS:
+            known = ", ".join([*METHODS, *OTHERS])
+            raise ValueError(f"Unknown method {name!r}; known: {known}, or module:attribute.")
+        return METHODS[name]()
+    module, _, attribute = name.partition(":")
+    try:
+        found = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(f"Cannot load the method {name}: {error}") from None
+    if isinstance(found, type):
+        found = found()
+    if isinstance(found, Stepping):
+        return found
+    if not callable(found):
+        raise ValueError(f"Expected {name} to be a method or a function, got {type(found).__name__}.")
+    solver: Solver = found
+    return solver
+
+
+def _check_installed(name: str) -> None:
+    """Raise ValueError if a module that a method needs is missing."""
+    library = name.partition("-")[0]
+    missing = [module for module in NEEDED_MODULES[library] if find_spec(module) is None]
+    if missing:
+        raise ValueError(f'The method {name} needs the module {missing[0]}: pip install "rare-envs[{library}]".')
