@@ -36,6 +36,8 @@ class BenchmarkProblem:
     Example:
         >>> PROBLEMS["lin_d2"].make().p, PROBLEMS["lin_d2"].group
         (0.00023262907903552502, 'analytic')
+        >>> PROBLEMS["rp111_d2"].second
+        'density of the product of two normal variables; weighted draws of f'
     """
 
     make: Callable[[], LimitState]
@@ -43,6 +45,10 @@ class BenchmarkProblem:
     """The set that it is of: "analytic", "highdim" (30 dimensions and more), "public" or "driving"."""
     reference: str = EXACT
     """How its probability is known, in words; the standard error is that of the limit state."""
+    draws: int = 0
+    """Behind the probability; 0 for a closed form or an integral."""
+    second: str = ""
+    """Second, independent derivation, which the tests make."""
     rotation: int | None = None
     """Seed of the rotation of its input space, unless another one is asked for."""
     knowable: bool = True
@@ -53,8 +59,23 @@ def _reference_state(reference: Callable[..., Reference], *args: float) -> Calla
     return lambda: as_limit_state(reference(*args))
 
 
-_analytic = partial(BenchmarkProblem, group="analytic")
-_highdim = partial(BenchmarkProblem, group="highdim")
+NEARER = "plain draws of f with its regions moved nearer"
+_analytic = partial(BenchmarkProblem, group="analytic", second=NEARER)
+_highdim = partial(BenchmarkProblem, group="highdim", second=NEARER)
+_network = partial(
+    BenchmarkProblem,
+    group="highdim",
+    reference=COUNTED,
+    draws=40_000_000,
+    second="plain draws of the inputs, not the layer",
+)
+_driving = partial(
+    BenchmarkProblem,
+    group="driving",
+    reference=SAMPLED,
+    draws=3_000_000,
+    second="weighted draws from a wide normal law",
+)
 
 PROBLEMS: dict[str, BenchmarkProblem] = {
     # one region
@@ -86,19 +107,22 @@ PROBLEMS: dict[str, BenchmarkProblem] = {
     "deceptive_d2": _analytic(partial(opposite, 2, 5.0, 3.5, (0.5, 10.0))),
     "decep_d8": _analytic(partial(half_spaces, 8, (4.9, 3.5), (0.5, 10.0)), rotation=4),
     "decep_box_d3": _analytic(hidden_box, knowable=False),
-    "never_d4": _analytic(never),
+    "never_d4": _analytic(never, second="f of wide draws is positive"),
     # no proposal is to be found: dozens of regions, hundreds of dimensions without a direction
     "slabs_d20": _analytic(partial(slabs, 20, 4.5)),
     "slabs_d500": _highdim(partial(slabs, 500, 5.0)),
     "squares_d50": _highdim(partial(squares, 50, 1.0, 17.0)),
     "squares_d200": _highdim(partial(squares, 200, 0.5, 42.6)),
-    "network_d30": _highdim(partial(network, 30), reference=COUNTED),
-    "network_d400": _highdim(partial(network, 400), reference=COUNTED),
+    "network_d30": _network(partial(network, 30)),
+    "network_d400": _network(partial(network, 400)),
     # every evaluation adds fresh noise; no proposal in u can gain more than 413 and 35
     "noisy_d6": _analytic(partial(half_spaces, 6, (3.5,), noise=0.3), rotation=11),
     "noise2_d4": _analytic(partial(half_spaces, 4, (4.0, 4.2), noise=0.6), rotation=12),
     # driving
-    "car_follow_d3": BenchmarkProblem(car_following, "driving", SAMPLED),
-    "cut_in_d6": BenchmarkProblem(cut_in, "driving", SAMPLED),
-    **{name: BenchmarkProblem(state.make, "public", state.reference) for name, state in PUBLIC_STATES.items()},
+    "car_follow_d3": _driving(car_following),
+    "cut_in_d6": _driving(cut_in),
+    **{
+        name: BenchmarkProblem(state.make, "public", state.reference, state.draws, state.second)
+        for name, state in PUBLIC_STATES.items()
+    },
 }

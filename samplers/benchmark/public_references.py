@@ -25,6 +25,7 @@ CONDITIONAL = (
     "mean of an exact conditional probability over 32 x 2^20 Sobol draws (python -m benchmarks.estimators.public_truth)"
 )
 """How the two without an integral are known."""
+CONDITIONAL_DRAWS = 32 * 2**20
 RP8_MARGINALS = ((120.0, 12.0),) * 4 + ((50.0, 10.0), (40.0, 8.0))
 """Means and standard deviations of log-normal variables."""
 RP8_FACTORS = (1.0, 2.0, 2.0, 1.0, 5.0, 5.0)

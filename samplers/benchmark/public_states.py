@@ -19,6 +19,21 @@ from samplers.benchmark import public_references as references
 from samplers.benchmark.analytic_states import LimitState, PointFunction
 from samplers.problem import FloatArray
 
+WEIGHTED = "weighted draws of f"
+PRODUCT = "density of the product of two normal variables"
+_OTHER_DERIVATIONS: dict[Callable[[], tuple[float, float]], str] = {
+    references.rp8: "sum of random variables of OpenTURNS",
+    references.rp14: "mean of the conditional probability over draws",
+    references.rp22: "Riemann sum of the integral",
+    references.rp28: "product of random variables of OpenTURNS",
+    references.rp38: "plain draws of the conditional probability",
+    references.rp63: "mean over chi-square draws",
+    references.rp75: PRODUCT,
+    references.rp91: "plain draws of the conditional probability",
+    references.rp111: PRODUCT,
+}
+"""By how p is computed; for all problems otbenchmark's own plain Monte Carlo agrees besides."""
+
 
 @dataclass(frozen=True)
 class PublicState:
@@ -38,6 +53,14 @@ class PublicState:
     """The probability that otbenchmark states."""
     reference: str = "closed form or one-dimensional integral"
     """How p is known, in words."""
+    draws: int = 0
+    """Behind p; 0 for integrals."""
+
+    @property
+    def second(self) -> str:
+        """Second derivations, which the tests make."""
+        other = _OTHER_DERIVATIONS.get(self.probability)
+        return f"{other}; {WEIGHTED}" if other else WEIGHTED
 
     def make(self) -> LimitState:
         """Return the limit state; p is computed."""
@@ -181,7 +204,7 @@ PUBLIC_STATES: dict[str, PublicState] = {
     "rp31_d2": PublicState(_rp31, 2, references.rp31, 3.226681209587691e-3),
     "rp33_d3": PublicState(_rp33, 3, references.rp33, 2.57e-3),
     "rp35_d2": PublicState(_rp35, 2, references.rp35, 3.47894632e-3),
-    "rp38_d7": PublicState(_rp38, 7, references.rp38, 8.1e-3, references.CONDITIONAL),
+    "rp38_d7": PublicState(_rp38, 7, references.rp38, 8.1e-3, references.CONDITIONAL, references.CONDITIONAL_DRAWS),
     "rp53_d2": PublicState(_rp53, 2, references.rp53, 3.13e-2),
     "rp54_d20": PublicState(_rp54, 20, references.rp54, 9.98e-4),
     "rp55_d2": PublicState(_rp55, 2, references.rp55, 5.6001442828637038e-01),
@@ -191,7 +214,7 @@ PUBLIC_STATES: dict[str, PublicState] = {
     "rp75_d2": PublicState(_rp75, 2, references.rp75, 9.81929872154689e-3),
     "rp77_d3": PublicState(_rp77, 3, references.rp77, 2.87e-7),
     "rp89_d2": PublicState(_rp89, 2, references.rp89, 5.43e-3),
-    "rp91_d5": PublicState(_rp91, 5, references.rp91, 6.97e-4, references.CONDITIONAL),
+    "rp91_d5": PublicState(_rp91, 5, references.rp91, 6.97e-4, references.CONDITIONAL, references.CONDITIONAL_DRAWS),
     "rp107_d10": PublicState(_rp107, 10, references.rp107, 2.92e-7),
     "rp110_d2": PublicState(_rp110, 2, references.rp110, 3.19e-5),
     "rp111_d2": PublicState(_rp111, 2, references.rp111, 7.65e-7),

@@ -16,7 +16,7 @@ Solver = Callable[..., Any]
 """Called as solver(problem, seed=..., max_sim=...); returns p, low and high, with the c.o.v. if it knows it, or an
 object with `p`, `interval` and perhaps `cov`."""
 
-OTHERS: dict[str, Solver] = {**OPENTURNS, **UQPY}
+OTHER_SOLVERS: dict[str, Solver] = {**OPENTURNS, **UQPY}
 """Solvers of other libraries, by names that begin with that of the library."""
 NEEDED_MODULES = {"openturns": ("openturns",), "uqpy": ("UQpy", "pkg_resources")}
 """By library, which is also the name of the extra that installs them."""
@@ -36,12 +36,12 @@ def find_method(name: str) -> Stepping | Solver:
         >>> find_method("mc").name
         'mc'
     """
-    if name in OTHERS:
+    if name in OTHER_SOLVERS:
         _check_installed(name)
-        return OTHERS[name]
+        return OTHER_SOLVERS[name]
     if ":" not in name:
         if name not in METHODS:
-            known = ", ".join([*METHODS, *OTHERS])
+            known = ", ".join([*METHODS, *OTHER_SOLVERS])
             raise ValueError(f"Unknown method {name!r}; known: {known}, or module:attribute.")
         return METHODS[name]()
     module, _, attribute = name.partition(":")

@@ -18,15 +18,15 @@ import numpy as np
 
 from samplers.benchmark.openturns_methods import LEVELS_OF_A_BUDGET, EstimateNumbers
 from samplers.problem import FloatArray, FunctionProblem
+from samplers.statistics.intervals import log_normal_interval
 
 CONDITIONAL_PROBABILITY = 0.1
 """Of a level: the share of its points that the chains of the next one start from."""
 LEAST_POINTS = 100
 """Of a level."""
-Z_95 = 1.959963984540054
 
 
-def run_subset_simulation(problem: FunctionProblem, seed: int, max_sim: int | None) -> EstimateNumbers:
+def run_uqpy_subset(problem: FunctionProblem, seed: int, max_sim: int | None) -> EstimateNumbers:
     """Estimate P[f(U) <= 0], U ~ N(0, I), by UQpy's subset simulation.
 
     UQpy states no interval. This one is lognormal with the c.o.v. that it states: for dependent chains, or for
@@ -57,22 +57,19 @@ def run_subset_simulation(problem: FunctionProblem, seed: int, max_sim: int | No
             nsamples_per_subset=points,
         )
     cov = found.independent_chains_CoV if math.isnan(found.dependent_chains_CoV) else found.dependent_chains_CoV
-    return lognormal_interval(float(found.failure_probability), float(cov))
+    return interval_of_cov(float(found.failure_probability), float(cov))
 
 
-def lognormal_interval(p: float, cov: float) -> EstimateNumbers:
-    """Return an estimate with the 95 % interval of a lognormal distribution of this c.o.v.
+def interval_of_cov(p: float, cov: float) -> EstimateNumbers:
+    """Return p, a 95 % interval and the c.o.v.; 0 to 1 where p is 0 or the c.o.v. no number.
 
     Example:
-        >>> [f"{value:.2e}" for value in lognormal_interval(1e-3, 0.3)]
-        ['1.00e-03', '5.63e-04', '1.78e-03', '3.00e-01']
-        >>> lognormal_interval(0.0, 0.3)
+        >>> interval_of_cov(0.0, 0.3)
         (0.0, 0.0, 1.0, inf)
     """
     if p <= 0 or not math.isfinite(cov):
-        return max(p, 0.0), 0.0, 1.0, math.inf
-    factor = math.exp(Z_95 * math.sqrt(math.log1p(cov**2)))
-    return p, p / factor, p * factor, cov
+        return p, 0.0, 1.0, math.inf
+    return p, *log_normal_interval(p, cov, 0.95), cov
 
 
 def _log_density(u: FloatArray) -> FloatArray:
@@ -103,5 +100,5 @@ def _make_model(model_class: Any, f: Callable[[FloatArray], FloatArray]) -> Any:
     return BatchModel(model=None)
 
 
-UQPY: dict[str, Callable[..., EstimateNumbers]] = {"uqpy-ss": run_subset_simulation}
+UQPY: dict[str, Callable[..., EstimateNumbers]] = {"uqpy-ss": run_uqpy_subset}
 """Solvers by the names that the benchmark knows them by: solver(problem, seed=..., max_sim=...)."""

@@ -49,7 +49,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "corpus add": ("rare-envs corpus add runs/cutin --corpus corpus --most 5",),
     "corpus run": ("rare-envs corpus run --ego new.zip --corpus corpus --junit corpus.xml",),
     "bench": ("rare-envs bench samplers --method mc,adss --runs 5",),
-    "bench samplers": ("rare-envs bench samplers --method auto,openturns-ss --set analytic --budget 1500 --runs 20",),
+    "bench samplers": ("rare-envs bench samplers --method auto,mine:sampler --set analytic --budget 1500 --runs 20",),
     "reproduce": (
         "rare-envs reproduce tian2024 --scale small --out runs/tian2024",
         "rare-envs reproduce okelly2018 --out runs/okelly2018",

@@ -10,7 +10,7 @@ from typing import Any
 from rare_envs.study.errors import BadInput
 
 
-def check_folder(out: Path, study: Mapping[str, Any]) -> None:
+def check_reproduction_folder(out: Path, study: Mapping[str, Any]) -> None:
     """Refuse a folder with runs of another paper, seed, scale or ego.
 
     Args:
@@ -25,7 +25,7 @@ def check_folder(out: Path, study: Mapping[str, Any]) -> None:
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     with Path(folder, "runs.jsonl").open("w") as file:
         ...         print('{"study": {"paper": "tian2024", "seed": 0}}', file=file)
-        ...     check_folder(Path(folder), {"paper": "tian2024", "seed": 0})  # these runs go on
+        ...     check_reproduction_folder(Path(folder), {"paper": "tian2024", "seed": 0})  # these runs go on
     """
     for file in sorted(out.glob("*.jsonl")):
         held = _read_study(file)
@@ -36,7 +36,7 @@ def check_folder(out: Path, study: Mapping[str, Any]) -> None:
 
 
 def discard_runs(file: Path, paper: str) -> None:
-    """Delete a file of runs if they are of a paper; others stay, for `check_folder` to refuse.
+    """Delete a file of runs if they are of a paper; others stay, for `check_reproduction_folder` to refuse.
 
     Args:
         file: Which need not exist.

@@ -9,6 +9,8 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from samplers.statistics import clopper_pearson
+
 PAGE_COLUMNS = (
     "problem | p | mean / p | gain | coverage % (95 %) | below p % | above p % | own / real c.o.v. | warned % "
     "| simulations | own time [ms] | faults"
@@ -25,11 +27,17 @@ EXPLANATION = """\
 """
 
 
-def format_leaderboard(result: Mapping[str, Any]) -> str:
+OVERVIEW_COLUMNS = (
+    "method | simulations | problems with faults | coverage % (95 %) | below p % | above p % | no answer % | warned %"
+)
+
+
+def format_leaderboard(result: Mapping[str, Any], most: int | None = None) -> str:
     """Return the page of a benchmark as Markdown.
 
     Args:
         result: What `rare_envs.study.sampler_benchmark.study.summarise_study` returns.
+        most: Problems in a table, the worst; None for all.
     """
     about = result["about"]
     plan = about["plan"]
@@ -42,19 +50,18 @@ def format_leaderboard(result: Mapping[str, Any]) -> str:
         f"{about['processor']}.",
         "",
         EXPLANATION,
+        "## All problems of a set together",
+        "",
+        "In alphabetical order. Problems whose region no method can know of are left out.",
+        "",
+        *_format_overview(result),
     ]
     for method in sorted(plan["methods"]):
         lines += [f"## {method}", "", _describe_warnings(result["warnings"][method]), ""]
         for budget in plan["budgets"]:
             cells = [cell for cell in result["cells"] if (cell["method"], cell["max_sim"]) == (method, budget)]
-            lines += [f"### {budget:,} simulations", "", *_format_table(cells), ""]
-    lines += ["## Problems", "", "| problem | set | dimensions | p | standard error | how it is known |"]
-    lines += ["|---|---|---|---|---|---|"]
-    for name, problem in result["problems"].items():
-        error = f"{problem['standard_error']:.1e}" if problem["standard_error"] else "0"
-        known = problem["reference"] + ("" if problem["knowable"] else "; no method can know of its main region")
-        lines.append(f"| {name} | {problem['group']} | {problem['dim']} | {problem['p']:.5g} | {error} | {known} |")
-    return "\n".join(lines) + "\n"
+            lines += [f"### {budget:,} simulations", "", *_format_table(cells, most), ""]
+    return "\n".join([*lines, *_format_problems(result["problems"])]) + "\n"
 
 
 def sort_worst_first(cells: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
@@ -65,9 +72,67 @@ def sort_worst_first(cells: Sequence[Mapping[str, Any]]) -> list[Mapping[str, An
     )
 
 
-def _format_table(cells: Sequence[Mapping[str, Any]]) -> list[str]:
-    rows = [f"| {PAGE_COLUMNS} |", "|---" * (PAGE_COLUMNS.count("|") + 1) + "|"]
-    return rows + [_format_row(cell) for cell in sort_worst_first(cells)]
+def _format_table(cells: Sequence[Mapping[str, Any]], most: int | None) -> list[str]:
+    shown = sort_worst_first(cells)[:most]
+    left = [] if len(shown) == len(cells) else ["", f"The worst {len(shown)} of {len(cells)} problems."]
+    return [*_format_head(PAGE_COLUMNS), *(_format_row(cell) for cell in shown), *left]
+
+
+def _format_overview(result: Mapping[str, Any]) -> list[str]:
+    """Return a table for each set: the runs of each method and budget on all its problems."""
+    lines = []
+    for group in dict.fromkeys(problem["group"] for problem in result["problems"].values()):
+        names = {name for name, problem in result["problems"].items() if problem["group"] == group}
+        lines += [f"### Set {group}, {len(names)} problems", "", *_format_head(OVERVIEW_COLUMNS)]
+        for method in sorted(result["about"]["plan"]["methods"]):
+            for budget in result["about"]["plan"]["budgets"]:
+                cells = [
+                    cell
+                    for cell in result["cells"]
+                    if (cell["method"], cell["max_sim"]) == (method, budget)
+                    and cell["problem"] in names
+                    and result["problems"][cell["problem"]]["knowable"]
+                ]
+                lines += [_format_pooled(method, budget, cells)] if cells else []
+        lines.append("")
+    return lines
+
+
+def _format_pooled(method: str, budget: int, cells: Sequence[Mapping[str, Any]]) -> str:
+    """Return the row of a method's runs on several problems."""
+    runs = sum(cell["runs"] for cell in cells)
+    shares = {
+        name: sum((cell[name] or 0.0) * cell["runs"] for cell in cells) / runs
+        for name in ("coverage", "below", "warned")
+    }
+    raised = sum(cell["raised"] for cell in cells) / runs
+    low, high = clopper_pearson(round(shares["coverage"] * runs), runs, 0.95)
+    above = max(0.0, 1.0 - shares["coverage"] - shares["below"] - raised)
+    values = [
+        method,
+        f"{budget:,}",
+        f"{sum(bool(cell['faults']) for cell in cells)} of {len(cells)}",
+        f"{100 * shares['coverage']:.0f} ({100 * low:.0f} to {100 * high:.0f})",
+        *(f"{100 * share:.0f}" for share in (shares["below"], above, raised, shares["warned"])),
+    ]
+    return f"| {' | '.join(values)} |"
+
+
+def _format_problems(problems: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Return the table of the problems and of how their probabilities are known."""
+    columns = "problem | set | dimensions | p | standard error | draws | how it is known | checked by"
+    lines = ["## Problems", "", *_format_head(columns)]
+    for name, problem in problems.items():
+        error = f"{problem['standard_error']:.1e}" if problem["standard_error"] else "0"
+        draws = f"{problem['draws']:,}" if problem["draws"] else "-"
+        known = problem["reference"] + ("" if problem["knowable"] else "; no method can know of its main region")
+        numbers = f"{problem['dim']} | {problem['p']:.5g} | {error} | {draws}"
+        lines.append(f"| {name} | {problem['group']} | {numbers} | {known} | {problem['second']} |")
+    return lines
+
+
+def _format_head(columns: str) -> list[str]:
+    return [f"| {columns} |", "|---" * (columns.count("|") + 1) + "|"]
 
 
 def _format_row(cell: Mapping[str, Any]) -> str:

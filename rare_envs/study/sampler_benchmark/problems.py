@@ -44,7 +44,13 @@ def make_driving_state(counted: CountedCollisions) -> LimitState:
 ALL_PROBLEMS: dict[str, BenchmarkProblem] = {
     **PROBLEMS,
     **{
-        name: BenchmarkProblem(partial(make_driving_state, counted), "driving", f"{counted.rollouts:,} plain rollouts")
+        name: BenchmarkProblem(
+            partial(make_driving_state, counted),
+            "driving",
+            "plain rollouts (python -m benchmarks.estimators.truth)",
+            counted.rollouts,
+            "20,000 rollouts of other draws",
+        )
         for name, counted in COUNTED_COLLISIONS.items()
     },
 }

@@ -161,6 +161,8 @@ def _describe_problem(name: str) -> dict[str, Any]:
         "p": state.p,
         "standard_error": state.standard_error,
         "reference": problem.reference,
+        "draws": problem.draws,
+        "second": problem.second,
         "knowable": problem.knowable,
     }
 

@@ -44,6 +44,7 @@ def test_probability_against_monte_carlo(state, rotation):
 
 def test_never_is_zero():
     assert never().p == 0.0
+    assert (never().f(10.0 * np.random.default_rng(1).standard_normal((100_000, 4))) > 0).all()
 
 
 def test_rotations_are_orthogonal_and_differ():

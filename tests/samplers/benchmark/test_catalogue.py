@@ -16,6 +16,9 @@ def test_catalogue(name):
     assert 0 < state.p < 0.05 or name == "never_d4" or name in NOT_RARE
     assert state.standard_error <= 0.01 * state.p
     assert (PROBLEMS[name].group == "highdim") == (state.dim >= 30 and PROBLEMS[name].group != "public")
+    assert (PROBLEMS[name].draws > 0) == (state.standard_error > 0)
+    assert PROBLEMS[name].reference
+    assert PROBLEMS[name].second
     rotated = state.problem(rotation=7)
     u = 2 * np.random.default_rng(2).standard_normal((200, state.dim))
     f = rotated.evaluate(u)

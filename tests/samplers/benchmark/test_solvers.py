@@ -5,7 +5,7 @@ import importlib.util
 import pytest
 
 import samplers
-from samplers.benchmark.solvers import NEEDED_MODULES, OTHERS, find_method
+from samplers.benchmark.solvers import NEEDED_MODULES, OTHER_SOLVERS, find_method
 
 
 @pytest.mark.parametrize(
@@ -27,14 +27,14 @@ def guess(problem, seed, max_sim):
     return 1e-3, 0.0, 1.0
 
 
-@pytest.mark.parametrize("name", OTHERS)
+@pytest.mark.parametrize("name", OTHER_SOLVERS)
 def test_a_library_that_is_missing_is_refused_with_what_installs_it(monkeypatch: pytest.MonkeyPatch, name) -> None:
     library = name.partition("-")[0]
     gone = NEEDED_MODULES[library][-1]
     real = importlib.util.find_spec
     found = {module: real("math") for modules in NEEDED_MODULES.values() for module in modules}
     monkeypatch.setattr("samplers.benchmark.solvers.find_spec", found.get)
-    assert find_method(name) is OTHERS[name]
+    assert find_method(name) is OTHER_SOLVERS[name]
     del found[gone]
     with pytest.raises(ValueError, match=rf'needs the module {gone}: pip install "rare-envs\[{library}\]"'):
         find_method(name)

@@ -13,6 +13,10 @@ from rare_envs.study.cli.shell import keep_stdout_for_the_answer, print_json
 from rare_envs.study.errors import as_bad_input
 from rare_envs.threads import use_one_thread
 
+METHOD_HELP = (
+    "Methods, with commas: names as in `estimate`, openturns-ss, -ce, -nais, -form, uqpy-ss, or module:attribute."
+)
+
 bench_app = typer.Typer(help="Measure methods on problems with known probabilities.")
 
 
@@ -24,9 +28,7 @@ def bench_command() -> None:
 @bench_app.command("samplers")
 @use_one_thread()
 def bench_samplers_command(
-    method: Annotated[
-        str, typer.Option(help="Methods, with commas: names, openturns-ss, -ce, -nais, -form, or module:attribute.")
-    ] = "auto,mc,adss,openturns-ss",
+    method: Annotated[str, typer.Option(help=METHOD_HELP)] = "auto,mc,adss",
     groups: Annotated[str, typer.Option("--set", help="Sets: analytic, highdim, public, driving.")] = "analytic,public",
     problems: Annotated[str, typer.Option(help="Problems by name instead of sets.")] = "",
     budget: Annotated[str, typer.Option(help="Simulations of a run, with commas.")] = "300,1500,6000",

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import samplers
-from rare_envs.study.reproduction.folder import check_folder
+from rare_envs.study.reproduction.folder import check_reproduction_folder
 from rare_envs.study.reproduction.okelly2018.figures import describe_figures, make_figures
 from rare_envs.study.reproduction.okelly2018.printed import describe_printed
 from rare_envs.study.reproduction.okelly2018.scales import EGO_NAMES, STUDY_SCALES
@@ -44,7 +44,7 @@ def reproduce_okelly2018(
     Raises:
         BadInput: The folder has rollouts of something else, or damaged ones.
     """
-    check_folder(out, study.identity)
+    check_reproduction_folder(out, study.identity)
     problem = study.make_problem()
     measured = measure_highway(study, out, problem, executor, limit, progress)
     record = make_okelly_record(study, command, summarise_highway(study, problem, measured))

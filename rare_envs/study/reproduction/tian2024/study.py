@@ -10,7 +10,7 @@ from typing import Any
 
 import rare_envs
 from rare_envs.study.execution.run_lines import RunLines
-from rare_envs.study.reproduction.folder import check_folder
+from rare_envs.study.reproduction.folder import check_reproduction_folder
 from rare_envs.study.reproduction.record import digest_code, make_record, write_record
 from rare_envs.study.reproduction.tian2024.catalogue import (
     ADSS_SIMULATIONS,
@@ -129,7 +129,7 @@ def reproduce_tian2024(
     Raises:
         BadInput: The folder has runs of something else or of other code, or damaged ones.
     """
-    check_folder(out, plan.identity)
+    check_reproduction_folder(out, plan.identity)
     out.mkdir(parents=True, exist_ok=True)
     lines = open_replications(out, plan)
     runs = lines.complete(

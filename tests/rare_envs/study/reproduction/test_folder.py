@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from rare_envs.study.errors import BadInput
-from rare_envs.study.reproduction.folder import check_folder, discard_runs
+from rare_envs.study.reproduction.folder import check_reproduction_folder, discard_runs
 from rare_envs.study.reproduction.okelly2018.study import HighwayStudy
 from rare_envs.study.reproduction.tian2024.study import TianPlan
 
@@ -36,9 +36,9 @@ def write_runs(folder: Path, study: dict, name: str = "runs.jsonl") -> Path:
 )
 def test_another_paper_seed_scale_or_ego_is_refused(tmp_path: Path, held: dict, new: dict, said: str) -> None:
     write_runs(tmp_path, held)
-    check_folder(tmp_path, held)
+    check_reproduction_folder(tmp_path, held)
     with pytest.raises(BadInput, match=said) as caught:
-        check_folder(tmp_path, new)
+        check_reproduction_folder(tmp_path, new)
     assert str(tmp_path) in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -47,15 +47,15 @@ def test_another_paper_seed_scale_or_ego_is_refused(tmp_path: Path, held: dict, 
 def test_files_of_other_commands_are_refused(tmp_path: Path, line: str) -> None:
     (tmp_path / "own.jsonl").write_text(line)
     with pytest.raises(BadInput, match="holds runs of another command or version; this is tian2024"):
-        check_folder(tmp_path, TIAN)
+        check_reproduction_folder(tmp_path, TIAN)
 
 
 def test_folders_without_runs_are_taken(tmp_path: Path) -> None:
     """None, an empty one, and one whose first line a stop has cut off."""
-    check_folder(tmp_path / "none", TIAN)
-    check_folder(tmp_path, TIAN)
+    check_reproduction_folder(tmp_path / "none", TIAN)
+    check_reproduction_folder(tmp_path, TIAN)
     (tmp_path / "runs.jsonl").write_text('{"study": {"paper": "okel')
-    check_folder(tmp_path, TIAN)
+    check_reproduction_folder(tmp_path, TIAN)
 
 
 def test_runs_of_another_paper_are_not_deleted(tmp_path: Path) -> None:
