@@ -41,8 +41,8 @@ One command makes the tables and figures of a paper anew, beside those that were
 
 Each writes `reproduction.html` (tables with a column of differences, figures in the paper's axes),
 `reproduction.json` (all numbers, the command, versions, machine and seeds, from which the page is made) and the single
-runs, with which the same command goes on where it has ended. This page is made from the records in
-`benchmarks/results`; to read one:
+runs, with which the same command goes on where it has ended. A folder holds one reproduction: another paper, ego, scale
+or seed is refused. This page is made from the records in `benchmarks/results`; to read one:
 """
 
 

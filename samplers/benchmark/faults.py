@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 
 from scipy import stats
-from scipy.special import ndtr
+from scipy.special import ndtr, stdtrit
 
 from samplers.benchmark.summary import Cell
 
 BIAS_ERRORS = 4.0
-"""Standard errors that a mean may be off: by chance 1 of 16,000 unbiased means is further off."""
+"""Standard errors that a mean of many runs may be off: by chance 1 of 16,000 unbiased means is further off."""
+LEAST_RUNS = 5
+"""With fewer bias is not judged: they may agree by chance, as plain draws with equal numbers of hits do."""
 NOTICED_BIAS = 0.02
 """Bias below which nobody would mind, over p."""
 NOMINAL_COVERAGE = 0.95
@@ -47,14 +49,25 @@ def find_faults(cell: Cell, knowable: bool = True) -> tuple[str, ...]:
     if not knowable:
         return tuple(found)
     bias = cell.mean_over_p - 1.0
+    ended = cell.runs - cell.raised
     error = math.hypot(cell.mean_se, cell.reference_error)
-    if abs(bias) > max(BIAS_ERRORS * error, NOTICED_BIAS) and not _is_bad_luck(cell):
+    if ended >= LEAST_RUNS and abs(bias) > max(errors_allowed(ended) * error, NOTICED_BIAS) and not _is_bad_luck(cell):
         found.append(f"biased: mean / p {cell.mean_over_p:.3g} +- {error:.2g}")
     if _is_too_low(cell):
         low, high = cell.coverage_interval
         held = f"intervals hold p in {100 * cell.coverage:.0f} % of {cell.runs} runs"
         found.append(f"{held} ({100 * low:.0f} to {100 * high:.0f} %)")
     return tuple(found)
+
+
+def errors_allowed(runs: int) -> float:
+    """Return the standard errors that a mean of so many runs may be off, by Student's distribution.
+
+    Example:
+        >>> [round(errors_allowed(runs), 1) for runs in (5, 10, 20, 100)]
+        [17.4, 7.0, 5.1, 4.2]
+    """
+    return float(stdtrit(runs - 1, ndtr(BIAS_ERRORS)))
 
 
 def _is_bad_luck(cell: Cell) -> bool:

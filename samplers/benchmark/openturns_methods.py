@@ -43,12 +43,23 @@ def run_algorithm(
 
     openturns.TBB.Disable()  # one thread
     openturns.RandomGenerator.SetSeed(seed)
+    stops: list[BaseException] = []
+
+    def evaluate(u: FloatArray) -> FloatArray:
+        try:
+            return f(u)
+        except BaseException as error:
+            stops.extend([] if isinstance(error, Exception) else [error])
+            raise
+
     try:
-        algorithm = make(_make_event(f, dim))
+        algorithm = make(_make_event(evaluate, dim))
         algorithm.setMaximumOuterSampling(max(points // BLOCK, 1))
         algorithm.setBlockSize(min(points, BLOCK))
         algorithm.run()
-    except Exception as error:  # an error of f arrives with the traceback as its text
+    except Exception as error:  # an error of f arrives with the traceback as its text, an interruption too
+        if stops:
+            raise stops[0] from None
         raise RuntimeError(str(error).strip().splitlines()[-1]) from None
     result = algorithm.getResult()
     p, half = result.getProbabilityEstimate(), float(ndtri(0.975)) * result.getStandardDeviation()

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from importlib.metadata import version
 from importlib.util import find_spec
 from typing import Any
 
@@ -57,6 +58,17 @@ def find_method(name: str) -> Stepping | Solver:
         raise ValueError(f"Expected {name} to be a method or a function, got {type(found).__name__}.")
     solver: Solver = found
     return solver
+
+
+def find_library_versions(methods: Iterable[str]) -> dict[str, str]:
+    """Return the versions of the other libraries whose methods are among some.
+
+    Example:
+        >>> find_library_versions(["mc", "adss"])
+        {}
+    """
+    libraries = {name.partition("-")[0] for name in methods if name in OTHER_SOLVERS}
+    return {name: version(NEEDED_MODULES[name][0]) for name in sorted(libraries)}
 
 
 def _check_installed(name: str) -> None:

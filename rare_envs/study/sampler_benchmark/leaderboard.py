@@ -46,7 +46,8 @@ def format_leaderboard(result: Mapping[str, Any], most: int | None = None) -> st
         "",
         f"{plan['runs']} runs of each method on {len(plan['problems'])} problems, budgets of "
         f"{_join(f'{each:,}' for each in plan['budgets'])} simulations, seeds from {plan['seed']}. "
-        f"rare_envs {about['rare_envs']}, NumPy {about['numpy']}, SciPy {about['scipy']}, Python {about['python']}, "
+        f"rare_envs {about['rare_envs']}, NumPy {about['numpy']}, SciPy {about['scipy']}, "
+        f"{''.join(f'{name} {version}, ' for name, version in about['libraries'].items())}Python {about['python']}, "
         f"{about['processor']}.",
         "",
         EXPLANATION,
@@ -83,7 +84,7 @@ def _format_overview(result: Mapping[str, Any]) -> list[str]:
     lines = []
     for group in dict.fromkeys(problem["group"] for problem in result["problems"].values()):
         names = {name for name, problem in result["problems"].items() if problem["group"] == group}
-        lines += [f"### Set {group}, {len(names)} problems", "", *_format_head(OVERVIEW_COLUMNS)]
+        lines += [f"### Set {group}", "", *_format_head(OVERVIEW_COLUMNS)]
         for method in sorted(result["about"]["plan"]["methods"]):
             for budget in result["about"]["plan"]["budgets"]:
                 cells = [

@@ -16,7 +16,7 @@ from rare_envs.study.sampler_benchmark.leaderboard import format_leaderboard
 from rare_envs.study.sampler_benchmark.problems import ALL_PROBLEMS, GROUPS
 from samplers.benchmark import Job, MethodRun, cells_of, find_faults, power_of, run_all, run_once
 from samplers.benchmark.runs import about
-from samplers.benchmark.solvers import find_method
+from samplers.benchmark.solvers import find_library_versions, find_method
 from samplers.serialization import to_json_value
 
 RUNS_FILE, RESULT_FILE, PAGE_FILE = "runs.jsonl", "benchmark.json", "leaderboard.md"
@@ -114,7 +114,9 @@ def summarise_study(plan: BenchmarkPlan, runs: Sequence[MethodRun]) -> dict[str,
     cells = cells_of(runs, CATALOGUE)
     return to_json_value(  # type: ignore[no-any-return]  # a dict in, a dict out
         {
-            "about": about(rare_envs=rare_envs.__version__, plan=asdict(plan)),
+            "about": about(
+                rare_envs=rare_envs.__version__, libraries=find_library_versions(plan.methods), plan=asdict(plan)
+            ),
             "problems": {name: _describe_problem(name) for name in plan.problems},
             "cells": [
                 {

@@ -51,6 +51,19 @@ def test_plain_draws_that_hit_seldom_or_never_are_not_called_biased() -> None:
         assert any("biased" in fault for fault in find_faults(cell)) == biased
 
 
+def test_few_runs_that_agree_by_chance_are_not_called_biased() -> None:
+    """Two runs of 1,500 plain draws with p = 2.3e-4 hit once each with a probability of 6 %: both are 2.9 p."""
+    few = [made(1 / 1500, 1.0, 0.0, 1.0, seed=seed, n_sim=1500) for seed in range(4)]
+    (cell,) = cells_of(few)
+    assert find_faults(cell) == ()
+    near = [made((1.45 + 0.1 * (seed % 2)) * P, low=0.0, high=1.0, seed=seed) for seed in range(5)]
+    (cell,) = cells_of(near)
+    assert cell.mean_se == pytest.approx(0.0245, rel=0.01)  # 20 of them off: 5 runs may be 17.4
+    assert "biased" in "; ".join(find_faults(cell))
+    (cell,) = cells_of([replace(run, p=run.p - 0.1 * P) for run in near])  # 16
+    assert find_faults(cell) == ()
+
+
 def test_a_region_that_is_lost_in_every_run_is_found() -> None:
     """Half of p, with errors of 1 % of it."""
     runs = [replace(made((0.49 + 0.02 * (seed % 2)) * P), seed=seed) for seed in range(20)]

@@ -17,6 +17,17 @@ def test_their_methods_on_a_half_space(name) -> None:
     assert 1000 <= run.n_sim <= 15_000
 
 
+@pytest.mark.parametrize("stop", [KeyboardInterrupt, SystemExit])
+def test_an_interruption_stops_the_benchmark_and_is_no_error_of_the_method(stop) -> None:
+    def f(u):
+        raise stop
+
+    from samplers import FunctionProblem
+
+    with pytest.raises(stop):
+        OPENTURNS["openturns-ss"](FunctionProblem(f, 2), seed=0, max_sim=1000)
+
+
 def test_an_error_of_f_is_one_line() -> None:
     def f(u):
         raise ValueError("singular")

@@ -5,7 +5,7 @@ import importlib.util
 import pytest
 
 import samplers
-from samplers.benchmark.solvers import NEEDED_MODULES, OTHER_SOLVERS, find_method
+from samplers.benchmark.solvers import NEEDED_MODULES, OTHER_SOLVERS, find_library_versions, find_method
 
 
 @pytest.mark.parametrize(
@@ -25,6 +25,12 @@ def test_ours_are_methods_and_those_of_a_user_are_what_they_wrote() -> None:
 
 def guess(problem, seed, max_sim):
     return 1e-3, 0.0, 1.0
+
+
+def test_versions_are_those_of_the_libraries_whose_methods_run() -> None:
+    openturns = pytest.importorskip("openturns")
+    assert find_library_versions(["mc", "openturns-ss", "openturns-ce"]) == {"openturns": openturns.__version__}
+    assert find_library_versions(["two-stage", "module:uqpy"]) == {}
 
 
 @pytest.mark.parametrize("name", OTHER_SOLVERS)

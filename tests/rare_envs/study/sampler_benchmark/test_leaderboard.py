@@ -25,7 +25,7 @@ def test_the_page_has_a_table_for_each_method_and_budget_and_says_how_each_p_is_
     assert [line for line in page.splitlines() if line.startswith("##")] == [
         *(
             "## All problems of a set together",
-            "### Set analytic, 2 problems",
+            "### Set analytic",
             "## adss",
             "### 500 simulations",
             "### 1,000 simulations",
