@@ -37,7 +37,7 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
         markdown = markdown.replace(f"](../{source})", f"]({page})")
     return re.sub(
         r"^```math\n(.*?)^```$",
-        lambda block: f"<div>{convert(block[1], display='block')}</div>",
+        lambda block: f'<div class="equation">{convert(block[1], display="block")}</div>',
         markdown,
         flags=re.MULTILINE | re.DOTALL,
     )

@@ -57,7 +57,7 @@ def demo(steps: int, out: Path) -> None:
     print(f"1. Training a PPO ego in {ENV_ID} for {steps:,} steps.", flush=True)
     ego = train_ego(ENV_ID, algo="ppo", steps=steps, seed=0, out=out / "ego.zip")
 
-    print("2. Estimating how often it collides: explore, then estimate from a fresh sample.", flush=True)
+    print("2. Estimating how often it collides: find failures, then estimate from draws made for them.", flush=True)
     study = prepare(Question(env_id=ENV_ID, ego=str(ego), seed=0, trust=True))  # it has just been written
     report = run(study, progress=True)
     write_run(out, report)

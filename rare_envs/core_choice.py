@@ -11,13 +11,9 @@ from numpy.typing import NDArray
 from rare_envs.control.idm import IDM
 from rare_envs.egos.policy import PolicyDriver
 from rare_envs.egos.sb3.dense_networks import read_dense_policy
-from rare_envs.simulation.compiled.selection import (
-    CompiledEgo,
-    CompiledRollout,
-    CompilerFails,
-    NotCompiled,
-    find_compiled_rollout,
-)
+from rare_envs.simulation.compiled.failures import CompilerFails, NotCompiled
+from rare_envs.simulation.compiled.highway import HighwayRollout, OffersDenseDriver, RolloutTerms, read_dense_driver
+from rare_envs.simulation.compiled.selection import CompiledEgo, CompiledRollout, find_compiled_rollout
 from rare_envs.simulation.rollout import Driver
 from rare_envs.simulation.world import World
 
@@ -34,7 +30,7 @@ class CoreChoice:
 
     Example:
         >>> from rare_envs.scenarios.highway import HIGHWAY
-        >>> CoreChoice("auto", World(HIGHWAY), IDM()).rollout is None  # there is no compiled highway
+        >>> CoreChoice("auto", World(HIGHWAY), IDM()).rollout is None  # without drivers nobody decides there
         True
     """
 
@@ -52,7 +48,7 @@ class CoreChoice:
         if wanted not in CORES:
             raise ValueError(f"Expected core to be one of {', '.join(map(repr, CORES))}, got {wanted!r}.")
         self.wanted = wanted
-        self.rollout: CompiledRollout | None = None
+        self.rollout: CompiledRollout | HighwayRollout | None = None
         if wanted == "torch":
             return
         try:
@@ -74,6 +70,20 @@ class CoreChoice:
             self._give_up(reason, warns=True, stacklevel=6)
             return None
 
+    def run_terms(self, x: NDArray[np.float64], gamma: float) -> RolloutTerms | None:
+        """Return f and terms of scenarios x (n, d) for a threshold of f; None where torch has to simulate.
+
+        Raises:
+            ValueError: Compiled rollouts were asked for, and have become impossible.
+        """
+        if not isinstance(self.rollout, HighwayRollout):
+            return None
+        try:
+            return self.rollout.terms(x, gamma)
+        except NotCompiled as reason:
+            self._give_up(reason, warns=True, stacklevel=6)
+            return None
+
     def _give_up(self, reason: NotCompiled, *, warns: bool, stacklevel: int) -> None:
         """Leave the simulation to torch, or raise a ValueError where that was not asked for."""
         if self.wanted == "numba":
@@ -91,6 +101,8 @@ def compiled_ego(driver: Driver) -> CompiledEgo:
     """
     if type(driver) is PolicyDriver:
         return partial(read_dense_policy, driver.policy)
+    if isinstance(driver, OffersDenseDriver):
+        return partial(read_dense_driver, driver)
     if type(driver) is not IDM:
         raise NotCompiled(f"the ego, a {type(driver).__name__}, is not compiled")
     return driver

@@ -23,11 +23,12 @@ from rare_envs.egos.wrappers import find_action_bounds
 from rare_envs.make import set_up
 from rare_envs.scenarios.registry import find_scenario, split_layout
 from rare_envs.sensors.kinds import read_kinds
+from rare_envs.simulation.compiled import CompiledRollout
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.measurement import Measurement
 from rare_envs.simulation.rollout import StochasticDriver, rollout
 from rare_envs.simulation.world import World
-from rare_envs.terms.episode_terms import EpisodeTerms, simulate_terms
+from rare_envs.terms.episode_terms import EpisodeTerms, name_terms, simulate_terms
 from rare_envs.terms.gradients import ROLLOUTS_PER_GRADIENT, TermDifferentiator, find_differentiator
 from rare_envs.traffic.crash import CRASH_KINDS, Crash
 
@@ -121,7 +122,8 @@ class DrivingProblem:
                 rules and 256 with a policy, or what fits into memory. Few suit a slow ego. A network rounds differently
                 by batch, so another number gives other bits; another number of workers does not.
             core: What simulates: "torch", the reference, for everything; "numba", compiled rollouts, for the scripted
-                scenarios with the IDM or a policy of dense layers as ego and the measure `ttc`; "auto" for the compiled
+                scenarios with the IDM or a policy of dense layers as ego and the measure `ttc`, and for the highway
+                with learned drivers, the IDM or one of them as ego, and `ttc` or `lidar_ttc`; "auto" for the compiled
                 ones where they can be had. They differ by rounding; an estimate says which it used
                 (`DrivingProblem.core`).
             **make_kwargs: Further keyword arguments of `gym.make` for this id. Without an `observation` the ego's
@@ -178,13 +180,13 @@ class DrivingProblem:
     @property
     def core(self) -> str:
         """What simulates `evaluate`: "torch" or "numba", which compiles now what it has not yet."""
-        nothing = np.empty((0, self.world.scenario.size))
+        nothing = np.empty((0, self.dim))
         return "torch" if self._core.run(nothing) is None else "numba"
 
     @property
     def terms_with_f(self) -> bool:
-        """Whether terms come with the rollout that gives f: compiled rollouts have none, torch then simulates them."""
-        return self._core.rollout is None
+        """Whether terms come with the rollout that gives f: compiled scripts have none, torch does."""
+        return not isinstance(self._core.rollout, CompiledRollout)
 
     @property
     def dim(self) -> int:
@@ -368,6 +370,11 @@ class DrivingProblem:
 
     def _simulate_terms(self, x: NDArray[np.float64], gamma: float, failed_rows: dict[int, str] | None) -> EpisodeTerms:
         x = self.space.validate(np.atleast_2d(x))
+        found = self._core.run_terms(x, gamma)
+        if found is not None:
+            terms = name_terms(self.world, gamma, *found)
+            self._check_known(x, terms.f, failed_rows)
+            return terms
         terms = simulate_terms(self.world, gamma, lambda world: self._roll_out(world, x, failed_rows))
         self._check_known(x, terms.f, failed_rows)
         return terms

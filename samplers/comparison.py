@@ -19,6 +19,7 @@ from samplers.execution.arguments import RunArguments, check_problem
 from samplers.execution.progress import Listener
 from samplers.method import Stepping
 from samplers.methods.auto import Auto
+from samplers.presentation.drawing import drawing_axes
 from samplers.presentation.estimate_display import indent_lines
 from samplers.presentation.notebook_html import html_table
 from samplers.presentation.object_file import read_object, register_stored, write_object
@@ -90,32 +91,29 @@ class Comparison:
     base_uncertainty: RatioUncertainty | None = None
     """The interval of the ratio that the events behind a fitted base allow; None for a base without refits."""
 
-    def plot(self, ax: "Axes | None" = None) -> "Axes":
+    def plot(self, ax: "Axes | str | PathLike[str] | None" = None) -> "Axes":
         """Draw p of A, of B and of both with their intervals, p on a log scale; needs matplotlib.
 
         Args:
-            ax: Where to draw; None takes the current axes of pyplot.
+            ax: Where to draw, or the path of an image to write, such as "p.png"; None takes pyplot's current axes.
 
         Raises:
             ValueError: If neither failed.
         """
         if self.a.p == 0 and self.b.p == 0:
             raise ValueError("There is nothing to draw: neither A nor B failed; give more simulations.")
-        if ax is None:
-            from matplotlib import pyplot
-
-            ax = pyplot.gca()
         ends = [end for side in (self.a, self.b) for end in (side.p, *side.interval) if end > 0]
         floor = min(ends) / 10  # an end of 0 has no place on a log scale
-        for place, side in enumerate((self.a, self.b)):
-            p, low, high = (max(value, floor) for value in (side.p, *side.interval))
-            ax.errorbar([place], [p], yerr=[[p - low], [high - p]], fmt="o" if side.p > 0 else "v", capsize=4)
-        ax.set_yscale("log")
-        ax.set_xticks([0, 1], ["A", "B"])
-        ax.set_xlim(-0.5, 1.5)
-        ax.set_ylabel(f"P[f ≤ {self.either.gamma:g}]")
-        ax.set_title(self._ratio_text)
-        return ax
+        with drawing_axes(ax) as axes:
+            for place, side in enumerate((self.a, self.b)):
+                p, low, high = (max(value, floor) for value in (side.p, *side.interval))
+                axes.errorbar([place], [p], yerr=[[p - low], [high - p]], fmt="o" if side.p > 0 else "v", capsize=4)
+            axes.set_yscale("log")
+            axes.set_xticks([0, 1], ["A", "B"])
+            axes.set_xlim(-0.5, 1.5)
+            axes.set_ylabel(f"P[f ≤ {self.either.gamma:g}]")
+            axes.set_title(self._ratio_text)
+        return axes
 
     def to_arrow(self, names: Sequence[str] = ()) -> "pyarrow.Table":
         """Return the simulated points behind both probabilities, as `Estimate.to_arrow` of `either` does.

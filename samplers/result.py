@@ -276,6 +276,12 @@ class Estimate(EstimateDisplay):
         fixed = f"given that {self.given}, " if self.given else ""
         if self.base_draws == 0:
             return f"{fixed}unless a failure region was missed (no base draws bound its probability)"
+        if self.p == 0 and self.failures.total == 0:  # the interval itself is about what was missed
+            return (
+                f"{fixed}whatever was missed: {self.base_draws:,} base draws without a failure put p below "
+                f"{self.unseen:.1e} (one-sided {100 * self.confidence:g} %; the interval's end is that of "
+                f"{50 * (1 + self.confidence):g} % or more)"
+            )
         return (
             f"{fixed}unless a failure region with probability above {self.unseen:.1e} was missed "
             f"({self.base_draws:,} base draws found no other)"

@@ -10,10 +10,21 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from agents.learned.coloured_noise import WHITE_NOISE, AutoregressiveNoise
-from agents.learned.networks import ACTION_SIZE, FEATURE_SIZE, HEAD_SIZE, HIDDEN_SIZES, Policy, apply_heads
+from agents.learned.networks import (
+    ACTION_SIZE,
+    FEATURE_CLIP,
+    FEATURE_SIZE,
+    HEAD_SIZE,
+    HIDDEN_SIZES,
+    Policy,
+    apply_heads,
+    head_weights,
+    read_layers,
+)
 from agents.learned.weight_distribution import WeightDistribution
 from rare_envs.control import actions
 from rare_envs.sensors.perception import CURVATURE_COLUMN, SPEED_COLUMN
+from rare_envs.simulation.compiled.highway import DenseDriver
 from rare_envs.simulation.observation import LIDAR_SCALES, observation_space
 from rare_envs.traffic.vehicle_models import steering_for
 
@@ -111,6 +122,31 @@ class LearnedDriver:
         low, high = action.new_tensor(tuple(zip(self.acceleration, self.yaw_rate, strict=True)))
         return action.clamp(low, high).to(features.dtype), memory
 
+    def dense_driver(self) -> DenseDriver | None:
+        """Return its present numbers for compiled rollouts; None if its class or its network was changed."""
+        if type(self) is not LearnedDriver or type(self.colour) is not AutoregressiveNoise:
+            return None
+        layers = read_layers(self.policy)
+        if layers is None:
+            return None
+        scaling, colour = (value.numpy(force=True) for value in self.policy.scaling), self.colour
+        feature_mean, feature_deviation, action_mean, action_deviation = scaling
+        return DenseDriver(
+            feature_mean,
+            feature_deviation,
+            FEATURE_CLIP,
+            hidden=layers,
+            head=head_weights(self.policy).numpy(force=True),
+            log_deviation_cap=float(self.policy.log_std_cap),
+            action_mean=tuple(action_mean),
+            action_deviation=tuple(action_deviation),
+            low=(self.acceleration[0], self.yaw_rate[0]),
+            high=(self.acceleration[1], self.yaw_rate[1]),
+            lag_1=colour.first,
+            lag_2=colour.second,
+            fresh=colour.scale,
+        )
+
     def begin(self, draws: Tensor) -> Tensor:
         """Return the memory of the noise at the start, from independent standard normal draws (B, M, 2, 2)."""
         return self.colour.begin(draws)
@@ -195,6 +231,10 @@ class LearnedEgo:
         if episode.perception is None:
             raise ValueError('Expected a world in which vehicles look: make it with observation="lidar".')
         return self._decide(episode.perception[:, 0]), memory
+
+    def dense_driver(self) -> DenseDriver | None:
+        """Return its present numbers for compiled rollouts; None if its class or its network was changed."""
+        return self.driver.dense_driver() if type(self) is LearnedEgo else None
 
     @torch.inference_mode()
     def predict(

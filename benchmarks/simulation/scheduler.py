@@ -6,6 +6,8 @@ time of each chunk from times that were measured for an ego, and schedules the c
 next one to whichever is free first, as the executors do.
 
     python -m benchmarks.simulation.scheduler --out benchmarks/results/scheduler.json --figure docs/images/scheduler.svg
+
+With `--times FILE` the times of drives are those of an earlier record.
 """
 
 from __future__ import annotations
@@ -24,13 +26,13 @@ import rare_envs
 import samplers
 
 WORKERS = (1, 10, 30, 100, 300, 1000)
-RUNS = ((1000, 1), (6000, 1), (20_000, 1), (60_000, 1), (60_000, 10))
+RUNS = ((1000, 1), (6000, 1), (20_000, 1), (60_000, 1), (600_000, 1), (60_000, 10))
 """Simulations, and replicates that share them."""
 N_TIMED = 40
 
 
-def record_batches(budget: int, replicates: int = 1, seed: int = 0) -> tuple[list[int], float]:
-    """Return the rows of each batch that two-stage asks for in car-following, and the c.o.v. of the answer."""
+def record_batches(budget: int, replicates: int = 1, seed: int = 0) -> tuple[list[int], samplers.Estimate]:
+    """Return the rows of each batch that two-stage asks for in car-following, and the answer."""
     problem = rare_envs.DrivingProblem("rare_envs/CarFollowing-v0", base="us101-gap")
     sizes: list[int] = []
 
@@ -44,7 +46,7 @@ def record_batches(budget: int, replicates: int = 1, seed: int = 0) -> tuple[lis
     found = samplers.estimate(
         Counted(), "two-stage", seed=seed, max_sim=budget, replicates=replicates, ensemble_run=False
     )
-    return sizes, found.cov
+    return sizes, found
 
 
 def measure_times(n: int = N_TIMED, seed: int = 0) -> list[float]:
@@ -82,21 +84,61 @@ def simulate_schedule(batches: Sequence[Sequence[float]], workers: int) -> tuple
     return total, utilisation
 
 
-def measure(seed: int = 0) -> dict[str, Any]:
-    """Return the utilisation of each run by number of workers, and by batch with 1,000 workers."""
-    times, rng = measure_times(), np.random.default_rng(seed)
+def bound_utilisation(sizes: Sequence[int], workers: int) -> float:
+    """Return the largest utilisation that batches of these sizes allow, if all chunks take equally long.
+
+    A batch of n chunks takes as long as n / workers of them, rounded up.
+
+    Example:
+        >>> bound_utilisation([100, 10], workers=100)
+        0.55
+    """
+    return sum(sizes) / (workers * sum(-(-n // workers) for n in sizes))
+
+
+def share_stages(
+    result: samplers.Estimate, sizes: Sequence[int], batches: Sequence[Sequence[float]]
+) -> list[dict[str, Any]]:
+    """Return batches, simulations, utilisation and share of the wall time of each stage, with the most workers.
+
+    Stages are the entries of the trace: the first draws, the search, and the rounds of the estimate.
+    """
+    ends = np.cumsum(sizes)
+    wall = simulate_schedule(batches, WORKERS[-1])[0]
+    stages, begun = [], 0
+    for n in np.cumsum([level.n_sim for level in result.trace]):
+        ended = int(np.searchsorted(ends, n)) + 1
+        part = batches[begun:ended]
+        seconds = simulate_schedule(part, WORKERS[-1])[0]
+        stages.append(
+            {
+                "batches": len(part),
+                "n_sim": sum(map(len, part)),
+                "utilisation": sum(map(sum, part)) / (seconds * WORKERS[-1]),
+                "share_of_time": seconds / wall,
+            }
+        )
+        begun = ended
+    return stages
+
+
+def measure(times: list[float], seed: int = 0) -> dict[str, Any]:
+    """Return the utilisation of each run by number of workers, and by stage and batch with 1,000 workers."""
+    rng = np.random.default_rng(seed)
     found: dict[str, Any] = {"seconds_of_a_drive": times, "workers": WORKERS, "runs": []}
     for budget, replicates in RUNS:
-        sizes, cov = record_batches(budget, replicates)
+        sizes, result = record_batches(budget, replicates)
         drawn = [rng.choice(times, size).tolist() for size in sizes]  # a chunk is one drive
         busy = sum(map(sum, drawn))
         walls = [simulate_schedule(drawn, workers)[0] for workers in WORKERS]
         found["runs"].append(
             {
                 "name": f"{budget:,} simulations" + (f", {replicates} replicates" if replicates > 1 else ""),
-                "cov": cov,
+                "cov": result.cov,
                 "batches": sizes,
                 "utilisation": [busy / (wall * workers) for wall, workers in zip(walls, WORKERS, strict=True)],
+                "bound": [bound_utilisation(sizes, workers) for workers in WORKERS],
+                "stages": share_stages(result, sizes, drawn) if replicates == 1 else [],
                 "speedup": [walls[0] / wall for wall in walls],
                 "by_batch": simulate_schedule(drawn, WORKERS[-1])[1],
             }
@@ -130,9 +172,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--figure", type=Path)
+    parser.add_argument("--times", type=Path)
     given = parser.parse_args()
-    found = measure()
-    found["command"] = f"python -m benchmarks.simulation.scheduler --out {given.out} --figure {given.figure}"
+    times = json.loads(given.times.read_text())["seconds_of_a_drive"] if given.times else measure_times()
+    found = measure(times)
+    options = f"--out {given.out} --figure {given.figure}" + (f" --times {given.times}" if given.times else "")
+    found["command"] = f"python -m benchmarks.simulation.scheduler {options}"
     given.out.write_text(json.dumps(found, indent=1) + "\n")
     if given.figure is not None:
         draw_figure(found, given.figure)

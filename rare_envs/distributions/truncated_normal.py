@@ -246,8 +246,12 @@ def reweight(log_weights: FloatArray, residual: FloatArray, scale: FloatArray) -
 
 
 def choose(score: FloatArray, v: FloatArray) -> NDArray[np.intp]:
-    """Return a component index per column with probability proportional to exp(score), from uniform v."""
-    probability = np.exp(score - log_sum(score))
+    """Return a component index per column with probability proportional to exp(score), from uniform v.
+
+    Where all scores are minus infinity, it is the last one.
+    """
+    total = log_sum(score)
+    probability = np.exp(score - np.where(total == -np.inf, 0.0, total))
     threshold = v * sum_components(probability)
     pick = np.zeros(len(v), dtype=np.intp)
     cumulative = np.zeros(len(v))

@@ -5,25 +5,11 @@ from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
 
+from rare_envs.envs.highway_env_configuration import PICTURE_KEYS, FixedConfiguration
 from rare_envs.envs.highway_env_objects import make_scene
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.reward import COLLISION_COST
 from rare_envs.simulation.world import World
-
-PICTURE_KEYS = frozenset(
-    {
-        "screen_width",
-        "screen_height",
-        "centering_position",
-        "scaling",
-        "show_trajectories",
-        "render_agent",
-        "offscreen_rendering",
-        "manual_control",
-        "real_time_rendering",
-    }
-)
-"""Keys of HighwayEnv's configuration that change neither traffic nor spaces; they are kept, and the picture is ours."""
 
 
 class HighwayEnvInterface:
@@ -37,20 +23,28 @@ class HighwayEnvInterface:
         (20.0, False, 3)
         >>> env.action_type.actions_indexes["FASTER"], env.config["policy_frequency"]
         (3, 1)
+        >>> _ = env.step(1)
+        >>> env.time, env.get_available_actions(), env.observation_type.observe().shape
+        (1.0, [1, 2, 3], (5, 5))
     """
 
     world: World
     render_mode: str | None
     _episode: Episode | None
+    _tick: int
     _scene: tuple[Episode, Any] | None = None
 
     @cached_property
-    def config(self) -> dict[str, Any]:
-        """The configuration under HighwayEnv's names: frequencies [Hz], duration [s], vehicles beside the ego."""
+    def config(self) -> FixedConfiguration:
+        """The configuration under HighwayEnv's names: frequencies [Hz], duration [s], vehicles beside the ego.
+
+        What concerns the picture may be set; for every other key a new value raises a `ValueError` that says which
+        argument of gym.make to use.
+        """
         clock, scenario = self.world.clock, self.world.scenario
         kinds = {"meta": "DiscreteMetaAction", "discrete": "DiscreteAction", "continuous": "ContinuousAction"}
         observation = self.world.sensing.observation
-        return {
+        values: dict[str, Any] = {
             "observation": {"type": "Kinematics" if observation == "kinematics" else observation},
             "action": {"type": kinds[clock.action]},
             "simulation_frequency": round(1.0 / clock.dt),
@@ -66,6 +60,7 @@ class HighwayEnvInterface:
             "manual_control": False,
             "real_time_rendering": False,
         }
+        return FixedConfiguration(values)
 
     def configure(self, config: Mapping[str, Any] | None) -> None:
         """Take a change of the configuration as HighwayEnv's method does, as far as it concerns the picture.
@@ -112,3 +107,34 @@ class HighwayEnvInterface:
         from rare_envs.envs.highway_env_actions import describe_actions
 
         return describe_actions(self, self.world.clock.action)
+
+    def get_available_actions(self) -> list[int]:
+        """Return the indices of the actions that are possible now, as HighwayEnv does.
+
+        Raises:
+            ValueError: If actions are continuous.
+            RuntimeError: Before the first reset.
+        """
+        if self.world.clock.action == "continuous":
+            raise ValueError('Expected actions with indices, got action="continuous"; make it with action="meta".')
+        if self._episode is None:
+            raise RuntimeError("Expected reset() before get_available_actions().")
+        available: list[int] = self.action_type.get_available_actions()
+        return available
+
+    @property
+    def observation_type(self) -> Any:
+        """What the ego observes, with HighwayEnv's `space()` and `observe()`, which gives the observation of now."""
+        from rare_envs.envs.highway_env_observations import describe_observation
+
+        return describe_observation(self, self.world.sensing.observation)
+
+    @property
+    def time(self) -> float:
+        """Time since the reset [s]."""
+        return round(self._tick * self.world.clock.dt, 9)
+
+    @property
+    def steps(self) -> int:
+        """Ticks since the reset, as HighwayEnv counts them: simulation steps, not decisions."""
+        return self._tick

@@ -1,7 +1,7 @@
 """Environment of one scenario at a time: a `gymnasium.Env` over a batch of one."""
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -28,7 +28,8 @@ class DrivingEnv(HighwayEnvInterface, gym.Env[SingleObservation, Any]):
     with a collision and is truncated at the horizon. `info` carries `scenario`, `x`, `min_ttc` [s], `collision`,
     `crashed` (the same), `speed` [m/s] and `reward_terms`, and at the end `measure` (f(x)), `collision_type` and
     `crash`, which say who ran into whom and how hard (`rare_envs.traffic.crash`), or None. Code for HighwayEnv reads
-    `config`, `road`, `vehicle` and `action_type`, see `rare_envs.envs.highway_env_interface`.
+    `config`, `road`, `vehicle`, `time`, `action_type`, `observation_type` and more, see
+    `rare_envs.envs.highway_env_interface`.
 
     Example:
         >>> import gymnasium
@@ -98,9 +99,7 @@ class DrivingEnv(HighwayEnvInterface, gym.Env[SingleObservation, Any]):
         self._tick = 0
         with torch.inference_mode():
             self._episode = self.world.start(torch.from_numpy(self._x[None]).float())
-            observation = map_kinds(
-                lambda part: part[0].numpy(), observe(self._episode, self.world.sensing.observation)
-            )
+            observation = self._observe(self._episode)
         self._show()
         return observation, episode_info(self.space, self._x, self._episode)
 
@@ -120,7 +119,7 @@ class DrivingEnv(HighwayEnvInterface, gym.Env[SingleObservation, Any]):
             self._between = False
             watched = self.world.clock.stride > 1 and (self._recorder or self._display.is_window)
             episode, terms = advance(self.world, self._episode, given, watch=self._watch if watched else None)
-            observation = map_kinds(lambda part: part[0].numpy(), observe(episode, self.world.sensing.observation))
+            observation = self._observe(episode)
             reward = float(terms.total)
         self._episode, self._tick = episode, self._tick + self.world.clock.stride
         terminated = bool(episode.collided)
@@ -128,6 +127,12 @@ class DrivingEnv(HighwayEnvInterface, gym.Env[SingleObservation, Any]):
         info = step_info(self.space, self._x, episode, terms, terminated or truncated)
         self._show()
         return observation, reward, terminated, truncated, info
+
+    def _observe(self, episode: Episode) -> SingleObservation:
+        """Return what the ego observes now, an array or a dictionary of arrays."""
+        with torch.inference_mode():
+            observed = observe(episode, self.world.sensing.observation)
+        return cast("SingleObservation", map_kinds(lambda part: part[0].numpy(), observed))
 
     def _watch(self, episode: Episode) -> None:
         """Render the ticks within a decision; its last one is rendered after it."""

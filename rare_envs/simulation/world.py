@@ -152,13 +152,18 @@ class World:
         Returns:
             The episodes at time 0.
         """
-        own, weather, weights, noise, key = torch.split(x, list(self.columns), dim=1)
-        state = self.scenario.initial(own)
-        background_state = None
-        if self.background is not None:
-            background_state = BackgroundState.start(self.background, weights.contiguous(), self._draws(noise))
+        _, weather, _, _, key = torch.split(x, list(self.columns), dim=1)
+        state, background_state = self.start_traffic(x)
         perception = self._perceive(state, self._place(state))
         return self.start_from(state, perception, background_state, self.sensing.start_camera(weather, key))
+
+    def start_traffic(self, x: Tensor) -> tuple[State, BackgroundState | None]:
+        """Return the traffic at time 0, and the state of its drivers if it has any; x as of `start`."""
+        own, _, weights, noise, _ = torch.split(x, list(self.columns), dim=1)
+        state = self.scenario.initial(own)
+        if self.background is None:
+            return state, None
+        return state, BackgroundState.start(self.background, weights.contiguous(), self._draws(noise))
 
     def start_from(
         self,
@@ -295,7 +300,8 @@ class World:
         """Return draws of the drivers' noise as a tensor of shape (B, 2 + T, M, 2), or (B, 0, M, 2) without noise."""
         if self._noisy and self.noise == "fixed":
             return self._fixed_draws.to(noise).expand(len(noise), -1, -1, -1)
-        return noise.reshape(len(noise), -1 if self._noisy else 0, self._others, 2)
+        ticks = noise.shape[1] // (2 * self._others) if self._noisy else 0
+        return noise.reshape(len(noise), ticks, self._others, 2)
 
     def _place(self, state: State) -> WorldPose | None:
         """Return where the vehicles are in the flat world; None in a world without lidar."""

@@ -7,9 +7,12 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
+MAX_MESSAGE = 2_000
+"""Characters of a message, which may repeat a name or a value of any length; of a longer one the middle is left out."""
+
 
 class BadInput(Exception):
-    r"""Input that cannot be used; the message is one line that says what to do.
+    r"""Input that cannot be used; the message is one line, of at most `MAX_MESSAGE` characters, that says what to do.
 
     Example:
         >>> raise BadInput("Expected a seed,\n  got None.")
@@ -19,7 +22,9 @@ class BadInput(Exception):
     """
 
     def __init__(self, message: object) -> None:
-        super().__init__(" ".join(str(message).split()))
+        text = " ".join(str(message).split())
+        half = MAX_MESSAGE // 2 - 3
+        super().__init__(text if len(text) <= MAX_MESSAGE else f"{text[:half]} ... {text[-half:]}")
 
 
 @contextlib.contextmanager

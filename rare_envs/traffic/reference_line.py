@@ -90,6 +90,15 @@ class ReferenceLine:
         (*_, curvature, slope), ds = self._cell(s)
         return torch.addcmul(curvature, ds, slope)
 
+    def tabulate(self, dtype: torch.dtype, device: torch.device) -> tuple[Tensor, float]:
+        """Return coefficients of the cells, the straights before and after the curve included, (cells, 11).
+
+        A point is x0 + x1 s + x2 s^2 + x3 s^3 along the tangent at the start and likewise across it (four columns
+        each), its heading h + k s + c s^2 / 2 and its curvature k + c s (the last three columns), with s the way since
+        the start of the cell; and the length of a cell [m].
+        """
+        return _table(self, dtype, device)
+
     def nearest(self, x: Tensor, y: Tensor) -> Tensor:
         """Return the way s along the line of the point nearest to (x, y), by Newton's method.
 

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from os import PathLike
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from samplers.analysis.base import MIN_UNITS, WeightedEstimate, cov_inflation, no_outcome_weight, require_sample
 from samplers.presentation.curve_display import CurveDisplay
+from samplers.presentation.drawing import drawing_axes
 from samplers.presentation.object_file import register_stored
 from samplers.problem import FloatArray
 from samplers.sample import Sample
@@ -69,25 +71,22 @@ class ProbabilityCurve(CurveDisplay):
         data = {key: to_json_value(getattr(self, key).tolist()) for key in arrays}  # a field by its name
         return {**data, "confidence": self.confidence}
 
-    def plot(self, ax: "Axes | None" = None) -> "Axes":
+    def plot(self, ax: "Axes | str | PathLike[str] | None" = None) -> "Axes":
         """Draw the curve and its band over the thresholds, p on a log scale; needs matplotlib.
 
         Args:
-            ax: Where to draw; None takes the current axes of pyplot.
+            ax: Where to draw, or the path of an image to write, such as "p.png"; None takes pyplot's current axes.
         """
-        if ax is None:
-            from matplotlib import pyplot
-
-            ax = pyplot.gca()
-        order = np.argsort(self._over)
-        t, p, low, high = (each[order] for each in (self._over, self.p, self.low, self.high))
-        floor = p[p > 0].min(initial=1.0) / 10  # a lower end of 0 has no place on a log scale
-        ax.fill_between(t, np.maximum(low, floor), np.maximum(high, floor), alpha=0.25, linewidth=0)
-        ax.plot(t, np.where(p > 0, p, np.nan))
-        ax.set_yscale("log")
-        ax.set_xlabel(f"threshold {self.symbol}")
-        ax.set_ylabel(f"P[{self.event.replace('<=', '≤')}]")
-        return ax
+        with drawing_axes(ax) as axes:
+            order = np.argsort(self._over)
+            t, p, low, high = (each[order] for each in (self._over, self.p, self.low, self.high))
+            floor = p[p > 0].min(initial=1.0) / 10  # a lower end of 0 has no place on a log scale
+            axes.fill_between(t, np.maximum(low, floor), np.maximum(high, floor), alpha=0.25, linewidth=0)
+            axes.plot(t, np.where(p > 0, p, np.nan))
+            axes.set_yscale("log")
+            axes.set_xlabel(f"threshold {self.symbol}")
+            axes.set_ylabel(f"P[{self.event.replace('<=', '≤')}]")
+        return axes
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)

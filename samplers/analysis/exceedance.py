@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from samplers.analysis.failure_expectation import FurtherFailures, sum_parts_und
 from samplers.analysis.failure_weights import WeightedFailures
 from samplers.analysis.refit_band import RefitBand, compute_refit_band
 from samplers.analysis.refits import EnsembleEstimate, find_fitted_base
+from samplers.presentation.drawing import drawing_axes
 from samplers.problem import FloatArray
 from samplers.sample import Sample
 from samplers.statistics.cluster_sums import UnitSums, unit_sums
@@ -61,22 +63,23 @@ class Exceedance(ProbabilityCurve):
         """Return plain lists and numbers for JSON."""
         return {**super().to_dict(), "base": None if self.base is None else self.base.to_dict()}
 
-    def plot(self, ax: Axes | None = None) -> Axes:
+    def plot(self, ax: Axes | str | PathLike[str] | None = None) -> Axes:
         """Draw the curve, its band and that of the base distribution, p on a log scale; needs matplotlib.
 
         Args:
-            ax: Where to draw; None takes the current axes of pyplot.
+            ax: Where to draw, or the path of an image to write, such as "p.png"; None takes pyplot's current axes.
         """
-        ax = super().plot(ax)
-        ax.collections[-1].set_label(f"sampling, {100 * self.confidence:g} % of all together")
-        if self.base is not None:
-            positive = np.concatenate([self.p / 10, self.base.low])
-            order, floor = np.argsort(self.thresholds), positive[positive > 0].min(initial=1.0)
-            low, high = (np.maximum(each[order], floor) for each in (self.base.low, self.base.high))
-            label = f"base distribution, {100 * self.base.confidence:g} % of all together"
-            ax.fill_between(self.thresholds[order], low, high, color="C1", alpha=0.2, linewidth=0, label=label)
-        ax.legend(frameon=False)
-        return ax
+        with drawing_axes(ax) as axes:
+            super().plot(axes)
+            axes.collections[-1].set_label(f"sampling, {100 * self.confidence:g} % of all together")
+            if self.base is not None:
+                positive = np.concatenate([self.p / 10, self.base.low])
+                order, floor = np.argsort(self.thresholds), positive[positive > 0].min(initial=1.0)
+                low, high = (np.maximum(each[order], floor) for each in (self.base.low, self.base.high))
+                label = f"base distribution, {100 * self.base.confidence:g} % of all together"
+                axes.fill_between(self.thresholds[order], low, high, color="C1", alpha=0.2, linewidth=0, label=label)
+            axes.legend(frameon=False)
+        return axes
 
 
 def compute_exceedance(

@@ -196,7 +196,7 @@ class Run:
         low, high = whole.interval
         if self._on_error == "bound":
             low *= 1 - whole.no_outcome_share
-        status, doubts = self._final_status(whole, meets_target(outcomes, goal.target_cov, self._n_wanted))
+        met = meets_target(outcomes, goal.target_cov, self._n_wanted)
         return Estimate(
             p=whole.p,
             interval=(low, high),
@@ -205,9 +205,9 @@ class Run:
             gamma=goal.gamma,
             n_sim=self._log.n_sim,
             gain=gain_over_monte_carlo(whole.p, whole.cov, self._log.n_sim),
-            status=status,
-            warnings=(*whole.warnings, *self._error_warnings(), *doubts),
-            remarks=whole.remarks,
+            status=self._final_status(whole, met),
+            warnings=(*whole.warnings, *self._error_warnings(), *([] if self._stopped is None else [self._stopped])),
+            remarks=(*whole.remarks, *self._precision_remarks(whole, met)),
             trace=whole.trace,
             failures=self._log.failures,
             method=self._method,
@@ -259,14 +259,17 @@ class Run:
         """Return the outcomes of the replicates that have one."""
         return [replicate.outcome for replicate in self._replicates if replicate.outcome is not None]
 
-    def _final_status(self, whole: Outcome, met: bool) -> tuple[Status, list[str]]:
-        """Return the status of the whole and the warnings that go with it."""
+    def _final_status(self, whole: Outcome, met: bool) -> Status:
+        """Return the status of the whole."""
         if self._stopped is not None:
-            return Status.STOPPED, [self._stopped]
-        if met:
-            return whole.status, []
-        status = Status.BUDGET if whole.status is Status.CONVERGED else whole.status
-        return status, [f"The target c.o.v. {self._goal.target_cov:g} was not met: {whole.cov:.3g}."]
+            return Status.STOPPED
+        return Status.BUDGET if whole.status is Status.CONVERGED and not met else whole.status
+
+    def _precision_remarks(self, whole: Outcome, met: bool) -> list[str]:
+        """Return the remark of a target that was not met: the interval holds, and is wider than was wished."""
+        if met or self._stopped is not None:
+            return []
+        return [f"The target c.o.v. {self._goal.target_cov:g} was not met: {whole.cov:.3g}."]
 
     def _error_warnings(self) -> list[str]:
         """Return the warning of simulations without an outcome, if there were any."""

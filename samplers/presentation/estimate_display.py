@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from os import PathLike
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from samplers.analysis.base import RatioStore, require_sample
 from samplers.analysis.curve import Curve, lowest_known_threshold
+from samplers.presentation.drawing import drawing_axes
 from samplers.presentation.notebook_html import html_table
 
 if TYPE_CHECKING:
@@ -68,11 +70,11 @@ class EstimateDisplay:
         def curve(self, gammas: ArrayLike) -> Curve:
             """Return P[f(X) <= g] for other thresholds g."""
 
-    def plot(self, ax: Axes | None = None) -> Axes:
+    def plot(self, ax: Axes | str | PathLike[str] | None = None) -> Axes:
         """Draw P[f <= g] over thresholds g with its band, and p with its interval at gamma; needs matplotlib.
 
         Args:
-            ax: Where to draw; None takes the current axes of pyplot.
+            ax: Where to draw, or the path of an image to write, such as "p.png"; None takes pyplot's current axes.
 
         Raises:
             ValueError: If the method gave no weighted points, or too few of them to draw a curve.
@@ -86,12 +88,13 @@ class EstimateDisplay:
         reached = np.cumsum(sample.weights[np.isfinite(sample.f)][order])
         high = float(finite[order][min(np.searchsorted(reached, reached[-1] / 2), len(order) - 1)])
         grid = np.unique([*np.linspace(low, max(low, high, self.gamma), PLOTTED_THRESHOLDS), max(low, self.gamma)])
-        axes = self.curve(grid).plot(ax)
-        axes.axvline(self.gamma, linestyle=":", color="0.4")
-        if self.p > 0:
-            below, above = self.p - self.interval[0], self.interval[1] - self.p
-            axes.errorbar([self.gamma], [self.p], yerr=[[below], [above]], fmt="o", capsize=4, color="0.2")
-        axes.set_title(f"P[f ≤ {self.gamma:g}] = {self.p:.2e}")
+        with drawing_axes(ax) as axes:
+            self.curve(grid).plot(axes)
+            axes.axvline(self.gamma, linestyle=":", color="0.4")
+            if self.p > 0:
+                below, above = self.p - self.interval[0], self.interval[1] - self.p
+                axes.errorbar([self.gamma], [self.p], yerr=[[below], [above]], fmt="o", capsize=4, color="0.2")
+            axes.set_title(f"P[f ≤ {self.gamma:g}] = {self.p:.2e}")
         return axes
 
     def __repr__(self) -> str:

@@ -12,7 +12,7 @@ from rare_envs.control.idm import IDM
 from rare_envs.core_choice import CoreChoice
 from rare_envs.scenarios.car_following import CAR_FOLLOWING
 from rare_envs.scenarios.highway import HIGHWAY
-from rare_envs.simulation.compiled.selection import CompilerFails, NotCompiled
+from rare_envs.simulation.compiled.failures import CompilerFails, NotCompiled
 from rare_envs.simulation.world import World
 
 WORLD, X = World(CAR_FOLLOWING), np.array([[20.0, 15.0, 30.0]])

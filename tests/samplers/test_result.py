@@ -52,6 +52,17 @@ def test_says_how_large_a_region_may_have_been_missed():
     assert "no base draws" in str(without)
 
 
+def test_without_a_failure_it_says_which_bound_has_which_level():
+    never = samplers.FunctionProblem(lambda x: np.ones(len(x)), 1)
+    estimate = samplers.estimate(never, "mc", seed=1, max_sim=1000)
+    assert (1 - estimate.interval[1]) ** 1000 == pytest.approx(0.025)
+    assert estimate.proviso == (
+        "whatever was missed: 1,000 base draws without a failure put p below 3.0e-03 "
+        "(one-sided 95 %; the interval's end is that of 97.5 % or more)"
+    )
+    assert "one-sided 90 %; the interval's end is that of 95 %" in replace(estimate, confidence=0.9).proviso
+
+
 def test_says_what_the_problem_holds_fixed():
     problem = samplers.FunctionProblem(lambda u: 2.0 - u[:, 0], 2)
     free = samplers.estimate(problem, "mc", seed=1, max_sim=500)

@@ -81,10 +81,11 @@ def collect(
     situations = make_situations()
     for number in range(drives):
         world, episode = start_situation(situations[number % len(situations)], rows, ticks * VisionEgo.dt, rng)
-        yield concatenate(list(_drive(world, episode, network, network_share, ticks, recorded_share, noise, rng)))
+        moments = drive_and_label(world, episode, network, network_share, ticks, recorded_share, noise, rng)
+        yield concatenate(list(moments))
 
 
-def _drive(
+def drive_and_label(
     world: World,
     episode: Episode,
     network: PilotNet | None,

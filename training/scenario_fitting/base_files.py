@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any
@@ -28,6 +28,7 @@ from training.scenario_fitting.coordinate_systems import (
     held_out_log_prob,
 )
 from training.scenario_fitting.event_filters import EventSet
+from training.scenario_fitting.fit_progress import ignore_progress
 from training.scenario_fitting.mixture import COVARIANCE_FLOOR, EM_STARTS, EVENTS_PER_COMPONENT, SMALLEST_COMPONENT
 from training.scenario_fitting.predictive_checks import check_predictions
 from training.scenario_fitting.refits import describe_family, refit
@@ -67,8 +68,12 @@ class FitRequest:
         return COORDINATE_SYSTEMS[scenario_named(self.scenario).name]
 
 
-def fit_base(request: FitRequest) -> FittedDistribution:
+def fit_base(request: FitRequest, report: Callable[[str], None] = ignore_progress) -> FittedDistribution:
     """Return a base fitted to events: coordinates and components chosen, refits, predictive checks, and its record.
+
+    Args:
+        request: What it is fitted to, and how.
+        report: Told of each fit and refit.
 
     Raises:
         ValueError: The events are too few, or there is no such coordinate system.
@@ -76,11 +81,15 @@ def fit_base(request: FitRequest) -> FittedDistribution:
     events, parameters, seed = request.events, request.parameters, request.seed
     apart = compare_apart(request)
     systems = [system.combine(apart.chosen.system) if apart else system for system in request.systems]
-    fits = [fit_system(events, system, parameters, seed) for system in systems]
+    fits = []
+    for system in systems:
+        report(f"fit in the coordinates {system.name}")
+        fits.append(fit_system(events, system, parameters, seed))
+    report("held-out events")
     held_out = [held_out_log_prob(events, system, parameters, seed) for system in systems]
     chosen = _choose(request, fits, held_out)
     names = [p.name for p in parameters]
-    refits = refit(events, _systems_of_refits(request, apart), parameters, seed, request.n_refits)
+    refits = refit(events, _systems_of_refits(request, apart), parameters, seed, request.n_refits, report)
     return FittedDistribution(
         distribution=chosen.distribution,
         refits=tuple(each.distribution for each in refits),

@@ -141,15 +141,20 @@ def fit_system(
         ValueError: The events are too few, or a parameter does not vary.
     """
     joint = system.coordinates(parameters[: events.joint.shape[1]])
-    fit = select_mixture(joint.to_coordinates(events.joint), seed, most, starts)
+    fit = select_mixture(joint.to_coordinates(events.joint), seed, most, starts, _coordinate_names(joint))
     components, bic_apart = fit.components, 0.0
     if events.apart.shape[1]:
         own = system.coordinates(parameters[events.joint.shape[1] :])
-        apart = select_mixture(own.to_coordinates(events.apart), seed, most=1)
+        apart = select_mixture(own.to_coordinates(events.apart), seed, most=1, names=_coordinate_names(own))
         components = append_independent(components, apart.components)
         bic_apart = apart.bic - _log_jacobian(own, events.apart)
     bic = fit.bic - _log_jacobian(joint, events.joint)
     return SystemFit(system, CoordinateMixture(system.coordinates(parameters), *components), fit, bic, bic_apart)
+
+
+def _coordinate_names(coordinates: Coordinates) -> list[str]:
+    """Return the parameter behind each coordinate."""
+    return [coordinates.names[j] for j in coordinates.columns]
 
 
 def _log_jacobian(coordinates: Coordinates, points: FloatArray) -> float:

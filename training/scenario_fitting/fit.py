@@ -33,6 +33,7 @@ from training.data.formats.text_columns import Gaps
 from training.data.trajectories import Trajectories
 from training.scenario_fitting.base_files import FitRequest, fit_base, format_base
 from training.scenario_fitting.event_filters import EVENT_RECIPES, filter_events, read_events
+from training.scenario_fitting.fit_progress import FitProgress, ignore_progress
 from training.scenario_fitting.own_frequency import ObservedTraffic, count_events
 from training.scenario_fitting.published_highway import build_highway_base
 from training.scenario_fitting.shipped.bases import SHIPPED_BASES, ShippedBase, name_file
@@ -72,6 +73,7 @@ def fit_own_bases(
     name: str,
     seed: int = 0,
     n_refits: int | None = None,
+    progress: FitProgress | None = None,
 ) -> list[Path]:
     """Extract the events of recordings and fit scenarios to them.
 
@@ -84,6 +86,7 @@ def fit_own_bases(
         name: Name of the bases.
         seed: Seed of the fits.
         n_refits: Number of refits, see `refit`.
+        progress: Is told what is done; None prints nothing of it.
 
     Returns:
         The files of the bases.
@@ -98,7 +101,10 @@ def fit_own_bases(
     traffic = ObservedTraffic()
     parts: list[dict[str, Events]] = []
     for table in tables:
-        names |= {str(recording) for recording in np.unique(table.recording)}
+        here = {str(recording) for recording in np.unique(table.recording)}
+        names |= here
+        if progress:
+            progress.say(f"{', '.join(sorted(here))}: {len(table):,} rows read; looking for events")
         traffic = traffic.plus(table)
         parts.append({scenario: EXTRACTORS[scenario](table) for scenario in chosen})
     source = {
@@ -117,8 +123,10 @@ def fit_own_bases(
         events = filter_events(read_events(path, recipe), recipe, scenario_named(scenario).parameters)
         frequency = count_events(scenario, pooled[scenario], len(events.joint), traffic)
         request = FitRequest(scenario, events, source, OWN_COMMAND, frequency, n_refits=n_refits, seed=seed)
+        if progress:
+            progress.say(f"{scenario}: {len(events.joint):,} events; fitting")
         try:
-            base = fit_base(request)
+            base = fit_base(request, ignore_progress if progress is None else progress.counter(scenario))
         except ValueError as error:
             too_few.append(f"{path}: {error}")
             if len(too_few) == len(chosen):
@@ -145,7 +153,16 @@ def main(
 ) -> None:
     """Write base distributions: those of the package, or those of your own recordings."""
     with report_errors("fit"):
-        fit_bases(recordings, out, cut_gaps=cut_gaps, scenarios=scenario, name=name, n_refits=refits, seed=seed)
+        fit_bases(
+            recordings,
+            out,
+            cut_gaps=cut_gaps,
+            scenarios=scenario,
+            name=name,
+            n_refits=refits,
+            seed=seed,
+            progress=True,
+        )
 
 
 def fit_bases(
@@ -157,6 +174,7 @@ def fit_bases(
     name: str = "own",
     n_refits: int | None = None,
     seed: int = 0,
+    progress: bool = False,
 ) -> list[Path]:
     """Fit base distributions to recordings, or those of the package to its events.
 
@@ -170,6 +188,7 @@ def fit_bases(
         name: Name of the bases.
         n_refits: Number of refits, see `refit`.
         seed: Seed of the fits.
+        progress: Whether lines on standard error say how far it has come.
 
     Returns:
         The files of the bases.
@@ -188,7 +207,7 @@ def fit_bases(
         return _write_package_bases(path, scenarios or known, out, seed, n_refits)
     gaps: Gaps = "cut" if cut_gaps else "error"
     tables = load_recordings(kind, path, location=recordings.location, between=recordings.between, gaps=gaps)
-    return fit_own_bases(tables, scenarios, out, name, seed, n_refits)
+    return fit_own_bases(tables, scenarios, out, name, seed, n_refits, FitProgress() if progress else None)
 
 
 def _write_package_bases(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -67,7 +68,11 @@ class MixtureFit:
 
 
 def select_mixture(
-    points: FloatArray, seed: int = 0, most: int = MAX_COMPONENTS, starts: int | None = None
+    points: FloatArray,
+    seed: int = 0,
+    most: int = MAX_COMPONENTS,
+    starts: int | None = None,
+    names: Sequence[str] = (),
 ) -> MixtureFit:
     """Return the Gaussian mixture with the least BIC.
 
@@ -80,6 +85,7 @@ def select_mixture(
         seed: Seed of the starts; the same seed gives the same fit.
         most: Largest number of components to try.
         starts: Starts for each number of components; `EM_STARTS` if None.
+        names: Of the parameters, for messages; parameter 0, parameter 1 and so on by default.
 
     Raises:
         ValueError: There are no more events than parameters, or one of them does not vary.
@@ -94,7 +100,9 @@ def select_mixture(
         raise ValueError(f"{n} events are too few to fit {d} parameters; more than {d} are needed.")
     centre, scale = points.mean(axis=0), points.std(axis=0)
     if (scale == 0).any():
-        raise ValueError(f"Parameter {int(np.argmin(scale))} is the same in all {n} events.")
+        which, value = int(np.argmin(scale)), float(centre[np.argmin(scale)])
+        name = names[which] if names else f"parameter {which}"
+        raise ValueError(f"Expected {name} to vary, got {value:.6g} in all {n} events.")
     standard = (points - centre) / scale
     most = int(np.clip(n // (EVENTS_PER_COMPONENT * d), 1, most))
     starts = EM_STARTS if starts is None else starts

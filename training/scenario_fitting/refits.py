@@ -12,7 +12,7 @@ intervals that held p in 81 and 74 % of 32 and 31 draws of events, refits that c
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from rare_envs.distributions.space import Parameter
 from training.scenario_fitting.coordinate_systems import FOLD_STARTS, CoordinateSystem, SystemFit, fit_system
 from training.scenario_fitting.event_filters import EventSet
+from training.scenario_fitting.fit_progress import ignore_progress
 
 N_REFITS = 30
 """Refits where all are of the same family: the noise of log-spread is then .13."""
@@ -55,6 +56,7 @@ def refit(
     parameters: Sequence[Parameter],
     seed: int = 0,
     n: int | None = None,
+    report: Callable[[str], None] = ignore_progress,
 ) -> tuple[SystemFit, ...]:
     """Return refits, each in the coordinate system that its events support best by the BIC.
 
@@ -65,6 +67,7 @@ def refit(
         seed: Seed of the draws and the fits.
         n: Number of refits; None for `N_REFITS`, or `MORE_REFITS` where coordinates or the number of components
             differ among these.
+        report: Told of each refit.
 
     Returns:
         The refits; none where there are fewer than `MIN_CLUSTERS` clusters.
@@ -78,6 +81,7 @@ def refit(
     refits: list[SystemFit] = []
     wanted = N_REFITS if n is None else n
     while len(refits) < wanted:
+        report(f"refit {len(refits) + 1} of {wanted}")
         drawn = draw_events(events, rng)
         fits = [fit_system(drawn, system, parameters, seed, FOLD_STARTS) for system in systems]
         refits.append(min(fits, key=lambda fit: fit.bic + fit.bic_apart))

@@ -17,7 +17,7 @@ from torch import nn
 
 from rare_envs.egos.wrappers import NormalisedPolicy, RescaledPolicy
 from rare_envs.simulation.compiled.dense_policy import Activation, DensePolicy
-from rare_envs.simulation.compiled.selection import NotCompiled
+from rare_envs.simulation.compiled.failures import NotCompiled
 
 ACTIVATIONS: dict[type[nn.Module], Activation] = {nn.Tanh: "tanh", nn.ReLU: "relu"}
 SB3 = "stable_baselines3"

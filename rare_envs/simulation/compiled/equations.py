@@ -6,7 +6,7 @@ transcendental functions alone. Importing this module needs numba.
 """
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +53,18 @@ class IDMNumbers(NamedTuple):
         return cls(*single(*(getattr(idm, name) for name in cls._fields)))
 
 
+class RoadWidth(Protocol):
+    """The part of a road's numbers that tells how far its edges are [m]."""
+
+    @property
+    def middle(self) -> float:
+        """Middle of the whole road, its y."""
+
+    @property
+    def half(self) -> float:
+        """Half the width of the whole road."""
+
+
 class RoadNumbers(NamedTuple):
     """A straight `Road` with equal lanes [m], in single precision."""
 
@@ -95,11 +107,17 @@ def at_most(value: float, high: float) -> float:
 
 
 @compiled
+def slip_of(steering: float) -> float:
+    """Return the slip angle of the bicycle model [rad]."""
+    return math.atan(math.tan(steering) * _HALF)
+
+
+@compiled
 def bicycle(
     x: float, y: float, heading: float, speed: float, acceleration: float, steering: float, dt: float
 ) -> tuple[float, float, float, float]:
     """Return x, y, heading and speed after a tick: `rare_envs.traffic.vehicle_models.bicycle`."""
-    slip = math.atan(math.tan(steering) * _HALF)
+    slip = slip_of(steering)
     course = heading + slip
     distance = speed * dt
     turn = distance * math.sin(slip) / _HALF_LENGTH
@@ -125,7 +143,13 @@ def centre_of(y: float, road: RoadNumbers) -> float:
 @compiled
 def lane_keeping(y: float, heading: float, speed: float, road: RoadNumbers) -> float:
     """Return the steering angle [rad]: `rare_envs.control.steering.lane_keeping`."""
-    offset, speed = y - centre_of(y, road), max(speed, _NEAREST)
+    return steer_to_line(y - centre_of(y, road), heading, speed)
+
+
+@compiled
+def steer_to_line(offset: float, heading: float, speed: float) -> float:
+    """Return the steering angle [rad]: `rare_envs.control.steering.steering_control`."""
+    speed = max(speed, _NEAREST)
     command = math.asin(clip(offset / (_LATERAL_GAIN * speed), -ONE, ONE))
     command = clip(command, -_MAX_HEADING, _MAX_HEADING)
     return steering_for(_HEADING_GAIN * (command - heading), speed)
@@ -166,7 +190,7 @@ def boxes_overlap(dx: float, dy: float, heading: float, other_heading: float) ->
 
 
 @compiled
-def off_road(y: float, road: RoadNumbers) -> bool:
+def off_road(y: float, road: RoadWidth) -> bool:
     """Return whether y is beyond an outer edge: `Road.off_road`."""
     return abs(y - road.middle) > road.half
 
@@ -180,16 +204,29 @@ def lead_of(
     road: RoadNumbers,
 ) -> tuple[float, float]:
     """Return gap [m] and closing speed [m/s] of vehicle 0's lead: `rare_envs.traffic.lead.lead_of`; arguments (N,)."""
-    lane, nearest, lead_speed = centre_of(y[0], road), _NOWHERE, speed[0]
+    return lead_in_lane(x, y, heading, speed, centre_of(y[0], road), road.reach)
+
+
+@compiled
+def lead_in_lane(
+    x: NDArray[np.float32],
+    y: NDArray[np.float32],
+    heading: NDArray[np.float32],
+    speed: NDArray[np.float32],
+    lane: float,
+    reach: float,
+) -> tuple[float, float]:
+    """Return `lead_of` for a lane [m] and the distance from it within which vehicles reach into it [m]."""
+    nearest, lead_speed = _NOWHERE, speed[0]
     for other in range(1, len(x)):
         ahead = x[other] - x[0]
-        if ahead >= ZERO and abs(y[other] - lane) <= road.reach and ahead <= nearest:
+        if ahead >= ZERO and abs(y[other] - lane) <= reach and ahead <= nearest:
             nearest, lead_speed = ahead, speed[other] * math.cos(heading[other] - heading[0])
     return nearest - BODY_LENGTH, speed[0] - lead_speed
 
 
 @compiled
-def ttc(gap: float, closing_speed: float, y: float, heading: float, speed: float, road: RoadNumbers) -> float:
+def ttc(gap: float, closing_speed: float, y: float, heading: float, speed: float, road: RoadWidth) -> float:
     """Return the time to collision [s]: `rare_envs.measures.time_to_collision.ttc`."""
     to_lead = max(gap, _LEAST_GAP) / at_least(closing_speed, _LEAST_SPEED)
     across = speed * math.sin(heading)

@@ -47,9 +47,9 @@ class NetworkNumbers(NamedTuple):
     @classmethod
     def of(cls, policy: DensePolicy) -> "NetworkNumbers":
         """Return the layers of a policy."""
-        weights, biases, widths = [], [], [_pad(policy.layers[0][0].shape[1])]
+        weights, biases, widths = [], [], [pad_units(policy.layers[0][0].shape[1])]
         for weight, bias in policy.layers:
-            padded = np.zeros((_pad(len(bias)), widths[-1]), dtype=np.float32)
+            padded = np.zeros((pad_units(len(bias)), widths[-1]), dtype=np.float32)
             padded[: weight.shape[0], : weight.shape[1]] = weight
             weights.append(padded.ravel())
             biases.append(np.pad(bias.astype(np.float32), (0, len(padded) - len(bias))))
@@ -57,7 +57,7 @@ class NetworkNumbers(NamedTuple):
         return cls(np.concatenate(weights), np.concatenate(biases), np.array(widths), policy.activation == "tanh")
 
 
-def _pad(width: int) -> int:
+def pad_units(width: int) -> int:
     """Return the next multiple of `UNITS_AT_ONCE`."""
     return -(-width // UNITS_AT_ONCE) * UNITS_AT_ONCE
 
@@ -90,13 +90,14 @@ def apply_layer(weight: SingleArray, bias: SingleArray, before: SingleArray, aft
     Args:
         weight: Shape (outputs, inputs), multiples of `UNITS_AT_ONCE`.
         bias: Shape (outputs,).
-        before: Inputs, shape (at least inputs, `LANES`).
-        after: Outputs, shape (at least outputs, `LANES`), written to.
+        before: Inputs, shape (at least inputs, lanes); many lanes, multiples of 16, are fast.
+        after: Outputs, shape (at least outputs, lanes), written to.
     """
     outputs, inputs = weight.shape
+    lanes = before.shape[1]
     for j in range(0, outputs, 4):
         after0, after1, after2, after3 = after[j], after[j + 1], after[j + 2], after[j + 3]
-        for lane in range(LANES):
+        for lane in range(lanes):
             after0[lane], after1[lane], after2[lane], after3[lane] = bias[j], bias[j + 1], bias[j + 2], bias[j + 3]
         for k in range(0, inputs, 4):
             a0, a1, a2, a3 = weight[j, k], weight[j, k + 1], weight[j, k + 2], weight[j, k + 3]
@@ -104,7 +105,7 @@ def apply_layer(weight: SingleArray, bias: SingleArray, before: SingleArray, aft
             c0, c1, c2, c3 = weight[j + 2, k], weight[j + 2, k + 1], weight[j + 2, k + 2], weight[j + 2, k + 3]
             d0, d1, d2, d3 = weight[j + 3, k], weight[j + 3, k + 1], weight[j + 3, k + 2], weight[j + 3, k + 3]
             before0, before1, before2, before3 = before[k], before[k + 1], before[k + 2], before[k + 3]
-            for lane in range(LANES):
+            for lane in range(lanes):
                 x0, x1, x2, x3 = before0[lane], before1[lane], before2[lane], before3[lane]
                 after0[lane] = after0[lane] + a0 * x0 + a1 * x1 + a2 * x2 + a3 * x3
                 after1[lane] = after1[lane] + b0 * x0 + b1 * x1 + b2 * x2 + b3 * x3

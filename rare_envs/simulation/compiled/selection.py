@@ -15,6 +15,9 @@ from rare_envs.measures.registry import MEASURES
 from rare_envs.plugins import one_line
 from rare_envs.scenarios import car_following, cut_in, hard_brake
 from rare_envs.simulation.compiled.dense_policy import DensePolicy
+from rare_envs.simulation.compiled.failures import CompilerFails, NotCompiled, compiler_failures
+from rare_envs.simulation.compiled.highway.dense_driver import DenseDriver
+from rare_envs.simulation.compiled.highway.highway_rollout import HighwayRollout, find_highway_rollout
 from rare_envs.simulation.observation import EGO_FEATURES, OTHER_FEATURES
 
 if TYPE_CHECKING:
@@ -30,16 +33,9 @@ COMPILED_SCRIPTS = {
 """Names of compiled scripts to the initial state and the motion of the other vehicles that they have."""
 
 
-class NotCompiled(ValueError):
-    """There is no compiled rollout; the message says why."""
-
-
-class CompilerFails(NotCompiled):
-    """numba is installed, but does not work here."""
-
-
-CompiledEgo = IDM | Callable[[], DensePolicy]
-"""An ego that compiled rollouts carry out: the IDM, or what reads the network of a policy, with its present weights."""
+CompiledEgo = IDM | Callable[[], DensePolicy | DenseDriver]
+"""An ego that compiled rollouts carry out: the IDM, or what reads the network of a policy or of a learned driver, with
+its present weights."""
 
 
 @dataclass(frozen=True)
@@ -73,22 +69,16 @@ class CompiledRollout:
         """
         ego = self.ego if isinstance(self.ego, IDM) else self.ego()
         arguments = (self.road, self.dt, self.ticks)
-        try:
+        with compiler_failures():
             from rare_envs.simulation.compiled import policy_rollouts, rollouts
 
             if isinstance(ego, IDM):
                 return rollouts.drive(self.script, x, ego, *arguments)
+            assert isinstance(ego, DensePolicy)
             return policy_rollouts.drive_by_policy(self.script, x, ego, *arguments)
-        except ImportError as error:
-            raise CompilerFails(
-                f"the compiled rollouts fail in this process: {error}; install 'rare-envs[fast]' wherever it is "
-                "simulated, or make it with core='torch'"
-            ) from error
-        except Exception as error:  # numba compiles at the first call, and anything may be raised
-            raise CompilerFails(f"numba is installed, but fails here: {one_line(error)}") from error
 
 
-def find_compiled_rollout(world: World, ego: CompiledEgo) -> CompiledRollout:
+def find_compiled_rollout(world: World, ego: CompiledEgo) -> CompiledRollout | HighwayRollout:
     """Return the compiled rollout of a world and its ego.
 
     Args:
@@ -105,8 +95,12 @@ def find_compiled_rollout(world: World, ego: CompiledEgo) -> CompiledRollout:
         >>> find_compiled_rollout(World(HIGHWAY), IDM())
         Traceback (most recent call last):
             ...
-        rare_envs.simulation.compiled.selection.NotCompiled: the script of the scenario 'highway' is not compiled
+        rare_envs.simulation.compiled.failures.NotCompiled: the script of the scenario 'highway' is not compiled
     """
+    if world.background is not None:
+        found = find_highway_rollout(world, ego)
+        _import_compiler()
+        return found
     obstacle = _find_obstacle(world)
     if obstacle:
         raise NotCompiled(obstacle)
@@ -119,8 +113,10 @@ def find_compiled_rollout(world: World, ego: CompiledEgo) -> CompiledRollout:
     return CompiledRollout(_find_script(scenario), ego, scenario.road, clock.dt, clock.ticks)
 
 
-def _find_policy_obstacle(world: World, policy: DensePolicy) -> str:
+def _find_policy_obstacle(world: World, policy: DensePolicy | DenseDriver) -> str:
     """Return why the torch simulation is needed with a policy as ego; empty if it is not."""
+    if not isinstance(policy, DensePolicy):
+        return "an ego that acts by lidar is not compiled in a scripted scenario"
     if world.sensing.observation != "features":
         return f"the observation {world.sensing.observation!r} is not compiled"
     if world.clock.action == "meta":
@@ -130,11 +126,10 @@ def _find_policy_obstacle(world: World, policy: DensePolicy) -> str:
 
 
 def _find_obstacle(world: World) -> str:
-    """Return why the torch simulation is needed, whatever the ego; empty if it is not."""
+    """Return why the torch simulation of a script is needed, whatever the ego; empty if it is not."""
     scenario, measurement = world.scenario, world.measurement
     obstacles = {
-        f"the script of the scenario {scenario.name!r} is not compiled": world.background is not None
-        or not _find_script(scenario),
+        f"the script of the scenario {scenario.name!r} is not compiled": not _find_script(scenario),
         "curved roads and lanes of different widths are not compiled": scenario.road.reference_line is not None
         or not scenario.road.equal,
         f"the measure {measurement.measure!r} is not compiled": measurement.episode_measure is not MEASURES["ttc"],
@@ -164,5 +159,6 @@ def _import_compiler() -> None:
         raise NotCompiled("numba is not installed: pip install 'rare-envs[fast]'")
     try:
         from rare_envs.simulation.compiled import policy_rollouts, rollouts  # noqa: F401
+        from rare_envs.simulation.compiled.highway import traffic_rollouts  # noqa: F401
     except (ImportError, OSError, RuntimeError) as error:
         raise CompilerFails(f"numba is installed, but fails here: {one_line(error)}") from error

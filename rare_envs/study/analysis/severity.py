@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,6 +28,7 @@ from samplers.analysis import (
     expect_over_failures,
     expect_under_refits,
 )
+from samplers.presentation.drawing import drawing_axes
 from samplers.problem import FloatArray
 
 if TYPE_CHECKING:
@@ -126,18 +128,19 @@ class Severity:
             "unknown": self.unknown,
         }
 
-    def plot(self, ax: Axes | None = None) -> Axes:
+    def plot(self, ax: Axes | str | PathLike[str] | None = None) -> Axes:
         """Draw P[collision with delta-v > v] over v with the bands of sampling and base distribution.
 
         Needs matplotlib.
 
         Args:
-            ax: Where to draw; None takes the current axes of pyplot.
+            ax: Where to draw, or the path of an image to write, such as "p.png"; None takes pyplot's current axes.
         """
-        ax = self.curve.plot(ax)
-        ax.set_xlabel("delta-v [m/s]")
-        ax.set_ylabel("P[collision with a larger delta-v]")
-        return ax
+        with drawing_axes(ax) as axes:
+            self.curve.plot(axes)
+            axes.set_xlabel("delta-v [m/s]")
+            axes.set_ylabel("P[collision with a larger delta-v]")
+        return axes
 
 
 def severity_curve(

@@ -106,7 +106,7 @@ def render_page(study: LoadedStudy, figures: Mapping[str, FigureOfPage], atlas: 
         about=study.about,
         folder=str(study.folder),
         summary=summarise_answer(result, str((study.about.get("base") or {}).get("name") or "its default base")),
-        doubts=list_doubts(result),
+        doubts=[*_describe_changes(study), *list_doubts(result)],
         remarks=[*(result.get("remarks") or []), *(result.get("notes") or [])],
         intervals=describe_intervals(result),
         rate=describe_rate(result),
@@ -128,6 +128,13 @@ def _damage_as_bad_input(folder: Path) -> Iterator[None]:
         yield
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, jinja2.TemplateError) as error:
         raise BadInput(f"{RESULT} or {STUDY} in {str(folder)!r} is damaged: {one_line(error)}.") from error
+
+
+def _describe_changes(study: LoadedStudy) -> list[str]:
+    """Return a warning of files that are not what the run wrote, if there are any."""
+    with as_bad_input(OSError):
+        changed = study.changed_files
+    return [f"not what the run wrote, by the digests in its {STUDY}: {', '.join(changed)}"] if changed else []
 
 
 def list_doubts(result: Mapping[str, Any]) -> list[str]:

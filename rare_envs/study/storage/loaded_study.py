@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import reprlib
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from rare_envs.json_text import parse_json_object
 from rare_envs.study.errors import BadInput
 from rare_envs.study.storage.failure_table import read_failures
 from rare_envs.study.storage.names import EPISODES, FAILURES, RESULT, STUDY, STUDY_FORMAT
+from rare_envs.study.storage.result_digests import find_changed_results
 
 if TYPE_CHECKING:
     import pyarrow
@@ -69,6 +71,14 @@ class LoadedStudy:
     def failures(self) -> dict[str, NDArray[Any]]:
         """The most likely failures, see `read_failures`."""
         return read_failures(self.folder)
+
+    @property
+    def changed_files(self) -> list[str]:
+        """Names of files that are not what the run wrote: damaged, edited, removed, or of another run.
+
+        study.json has their digests; the whole table of simulations is read for its own.
+        """
+        return find_changed_results(self.folder, self.about)
 
     @property
     def episodes_path(self) -> Path:
@@ -199,9 +209,10 @@ def _check_about(about: dict[str, Any], folder: Path) -> dict[str, Any]:
 
 
 def _check_result(result: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """Return a result; raise a BadInput unless it has p and an interval."""
-    p, interval = result.get("p"), result.get("interval")
-    numbers = [p, *(interval if isinstance(interval, list) and len(interval) == 2 else [None])]
-    if any(isinstance(value, bool) or not isinstance(value, int | float) for value in numbers):
-        raise BadInput(f"Expected p and its interval as numbers in {str(folder / RESULT)!r}.")
+    """Return a result; raise a BadInput unless it has p and an interval, finite and not negative."""
+    interval = result.get("interval")
+    numbers = [result.get("p"), *(interval if isinstance(interval, list) and len(interval) == 2 else [None])]
+    known = [value for value in numbers if isinstance(value, int | float) and not isinstance(value, bool)]
+    if len(known) < len(numbers) or not all(0.0 <= value < math.inf for value in known):
+        raise BadInput(f"Expected p and its interval as numbers, 0 or more, in {str(folder / RESULT)!r}.")
     return result

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import re
 import reprlib
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import yaml
 
@@ -19,6 +20,38 @@ ENV_KEY = "env"
 """Key of the environment; the others are the options of `rare-envs estimate`, with - or _ between words."""
 NOT_IN_FILES = ("trust",)
 """Whoever asks decides whether code runs, not a file."""
+
+
+INTEGER, FLOAT = "tag:yaml.org,2002:int", "tag:yaml.org,2002:float"
+
+
+class QuestionLoader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
+    """YAML with the numbers of YAML 1.2: 1e-4 is one, where 1.1 has a text, and 12:30 is none, where 1.1 has 750.
+
+    Words for yes and no are those of 1.1: on, off, yes and no are among them.
+
+    Example:
+        >>> yaml.load("[1e-4, 12:30, 010, .5, off]", Loader=QuestionLoader)
+        [0.0001, '12:30', 10, 0.5, False]
+    """
+
+    yaml_implicit_resolvers: ClassVar = {
+        first: [(tag, pattern) for tag, pattern in found if tag not in (INTEGER, FLOAT)]
+        for first, found in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    }
+
+    def construct_decimal(self, node: yaml.ScalarNode) -> int:
+        """Return a whole number, which begins with zeros or not."""
+        return int(self.construct_scalar(node))
+
+
+QuestionLoader.add_constructor(INTEGER, QuestionLoader.construct_decimal)
+QuestionLoader.add_implicit_resolver(INTEGER, re.compile(r"[-+]?[0-9]+$"), list("-+0123456789"))
+QuestionLoader.add_implicit_resolver(
+    FLOAT,
+    re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?$|[-+]?\.(inf|Inf|INF)$|\.(nan|NaN|NAN)$"),
+    list("-+0123456789."),
+)
 
 
 def read_question_file(path: Path) -> dict[str, Any]:
@@ -93,7 +126,7 @@ def _load_mapping(path: Path) -> dict[str, Any]:
         if path.stat().st_size > MAX_QUESTION_BYTES:
             raise BadInput(f"{str(path)!r} has more than {MAX_QUESTION_BYTES:,} bytes.")
         text = path.read_text(encoding="utf-8")
-        given = yaml.safe_load(text)
+        given = yaml.load(text, Loader=QuestionLoader)
         _refuse_repeated_keys(path, text)
     except OSError as error:
         raise BadInput(f"Cannot read {str(path)!r}: {error.strerror}.") from error

@@ -20,6 +20,7 @@ from rare_envs.json_text import format_json, parse_json_object
 from rare_envs.study.journal import digest_files, find_named_files
 from rare_envs.study.question import Question, Study
 from rare_envs.study.storage.names import STUDY, STUDY_FORMAT
+from rare_envs.study.storage.result_digests import digest_results
 from rare_envs.version import __version__
 from samplers.result import method_settings
 
@@ -67,7 +68,9 @@ def begin_study_file(folder: Path, study: Study) -> None:
 
 
 def finish_study_file(folder: Path, study: Study, seconds: float) -> None:
-    """Note in study.json that the run is done; what it held of the beginning stays.
+    """Note in study.json that the run is done, and the digests of its files; what it held of the beginning stays.
+
+    A study.json of another question, which somebody has put there, is written anew.
 
     Args:
         folder: Of the run.
@@ -80,8 +83,18 @@ def finish_study_file(folder: Path, study: Study, seconds: float) -> None:
     try:
         begun = parse_json_object((folder / STUDY).read_text(encoding="utf-8"), STUDY)
     except (OSError, ValueError):  # of an earlier version, or somebody has removed it
+        begun = {"question": None}
+    if "question" in begun and not _is_same_question(begun["question"], study.question):
         begun = describe_study(study)
-    replace_text(folder / STUDY, format_json({**begun, "finished": _now(), "seconds": seconds}) + "\n")
+    ended = {"finished": _now(), "seconds": seconds, "results": digest_results(folder)}
+    replace_text(folder / STUDY, format_json({**begun, **ended}) + "\n")
+
+
+def _is_same_question(recorded: object, question: Question) -> bool:
+    """Return whether a recorded question is this one, but for what a run that is resumed may change."""
+    changeable = {"trust", "on_error", "core"} | ({"ego"} if find_ego_kind(question.ego) == "remote" else set())
+    asked = {name: value for name, value in asdict(question).items() if name not in changeable}
+    return isinstance(recorded, Mapping) and all(recorded.get(name) == value for name, value in asked.items())
 
 
 def find_versions() -> dict[str, str]:

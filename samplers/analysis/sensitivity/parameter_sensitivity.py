@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -139,17 +140,27 @@ class Sensitivity:
             "reason": self.reason,
         }
 
-    def plot(self, axes: Sequence[Axes] | None = None) -> Sequence[Axes]:
+    def plot(self, axes: Sequence[Axes] | str | PathLike[str] | None = None) -> Sequence[Axes]:
         """Draw importance of the columns and derivatives by the parameters as bars; needs matplotlib.
 
         Args:
-            axes: Two axes to draw in; None makes a figure of pyplot.
+            axes: Two axes to draw in, or the path of an image to write; None makes a figure of pyplot.
         """
+        if isinstance(axes, str | PathLike):
+            from matplotlib.figure import Figure
+
+            figure = Figure(figsize=(12, 4.5), layout="constrained")
+            drawn = self._draw(*figure.subplots(1, 2))
+            figure.savefig(axes)
+            return drawn
         if axes is None:
             from matplotlib import pyplot
 
-            axes = pyplot.subplots(1, 2, figsize=(12, 4.5), layout="constrained")[1]
-        left, right = axes
+            return self._draw(*pyplot.subplots(1, 2, figsize=(12, 4.5), layout="constrained")[1])
+        return self._draw(*axes)
+
+    def _draw(self, left: Axes, right: Axes) -> tuple[Axes, Axes]:
+        """Draw the columns into the left axes and the parameters into the right ones."""
         columns, parameters = self.columns[:SHOWN_PARAMETERS], self.parameters[:SHOWN_PARAMETERS]
         left.barh([c.name for c in columns], [c.importance for c in columns], xerr=[c.error for c in columns])
         left.set_xlabel("importance, share of -log p")
@@ -162,7 +173,7 @@ class Sensitivity:
         right.set_xlabel("change of log p")
         for each in (left, right):
             each.invert_yaxis()
-        return axes
+        return left, right
 
 
 def compute_sensitivity(

@@ -243,3 +243,8 @@ def test_a_quantile_is_found_from_anywhere_in_its_bracket() -> None:
             break
     np.testing.assert_allclose(search.x, stats.expon.ppf(stats.norm.cdf(u)), rtol=1e-8)
     assert (search.take(np.array([2])).x == search.x[2]).all()
+
+
+def test_where_no_component_has_mass_the_last_one_is_chosen_without_a_warning() -> None:
+    score = np.array([[-np.inf, 0.0], [-np.inf, -np.inf]])
+    assert choose(score, np.array([0.3, 0.3])).tolist() == [1, 0]

@@ -73,6 +73,30 @@ def test_a_change_of_what_is_fixed_is_left_out_with_a_warning() -> None:
     assert env.config["simulation_frequency"] == 10 and "lanes_cuont" not in env.config
 
 
+def test_time_goes_on_by_what_a_step_takes() -> None:
+    for env_id, seconds in ((CUT_IN, 1.0), ("rare_envs/CutIn-v0", 0.1)):
+        env = make(env_id)
+        env.reset(seed=0, options={"cut_in_gap": 60.0})
+        assert (env.time, env.steps) == (0.0, 0)
+        for _ in range(3):
+            env.step(env.action_space.sample() if seconds == 0.1 else 1)
+        assert (env.time, env.steps) == (round(3 * seconds, 9), round(30 * seconds))
+        env.reset(seed=0)
+        assert env.time == 0.0
+
+
+def test_available_actions_are_those_of_the_action_type() -> None:
+    env = make()
+    with pytest.raises(RuntimeError, match=r"Expected reset\(\) before get_available_actions"):
+        env.get_available_actions()
+    env.reset(seed=0, options={"ego_speed": 21.0})
+    assert env.get_available_actions() == env.action_type.get_available_actions() != []
+    continuous = make("rare_envs/CutIn-v0")
+    continuous.reset(seed=0)
+    with pytest.raises(ValueError, match='Expected actions with indices, got action="continuous"'):
+        continuous.get_available_actions()
+
+
 @pytest.mark.skipif(importlib.util.find_spec("moviepy") is None, reason="the extra video is optional")
 @pytest.mark.filterwarnings("ignore:invalid escape sequence")  # in moviepy 1's own text, when it is first compiled
 def test_the_script_for_dqn_runs_with_another_id(tmp_path: Path) -> None:

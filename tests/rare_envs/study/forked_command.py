@@ -11,6 +11,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -35,7 +36,9 @@ class Ended(NamedTuple):
 class ForkedCommand:
     """A command that runs in a folder, in a process of its own."""
 
-    def __init__(self, folder: Path, *words: str, kill_at: int = 0, pause: float = 0.0) -> None:
+    def __init__(
+        self, folder: Path, *words: str, kill_at: int = 0, pause: float = 0.0, executor: str | None = None
+    ) -> None:
         """Start it.
 
         Args:
@@ -43,11 +46,14 @@ class ForkedCommand:
             words: Of the command line.
             kill_at: Number of the change of a file's name at which it kills itself, from 1 on; 0 for never.
             pause: Seconds after each chunk in the journal, so that it takes as long as a test needs.
+            executor: Name of one of `open_executor`, in place of what the words say; None for what they say.
         """
         self._outputs = [folder / "printed.txt", folder / "said.txt"]
         for path in self._outputs:
             path.write_text("")
-        self._process = CONTEXT.Process(target=run_command, args=(folder, words, self._outputs, kill_at, pause))
+        self._process = CONTEXT.Process(
+            target=run_command, args=(folder, words, self._outputs, kill_at, pause, executor)
+        )
         self._process.start()
 
     @property
@@ -85,11 +91,15 @@ class ForkedCommand:
         return Ended(code, printed, said)
 
 
-def run_command(folder: Path, words: tuple[str, ...], outputs: list[Path], kill_at: int, pause: float) -> None:
+def run_command(
+    folder: Path, words: tuple[str, ...], outputs: list[Path], kill_at: int, pause: float, executor: str | None
+) -> None:
     """Run a command, without pictures, and exit with its code."""
     from rare_envs.problem import DrivingProblem
     from rare_envs.study import cli, run_directory
+    from rare_envs.study.cli.executor_options import ExecutorOptions
     from samplers.execution.journal import JournalFile
+    from tests.samplers.execution.executors.real_executors import open_executor
 
     os.chdir(folder)
     for number, path in enumerate(outputs, 1):
@@ -101,7 +111,11 @@ def run_command(folder: Path, words: tuple[str, ...], outputs: list[Path], kill_
     JournalFile.append = lambda *words: (append(*words), time.sleep(pause))[0]  # type: ignore[method-assign]
     if kill_at:
         _kill_at_change(kill_at)
-    cli.main()
+    with ExitStack() as stack:
+        if executor is not None:
+            chosen = stack.enter_context(open_executor(executor))
+            ExecutorOptions.make = lambda self: chosen  # type: ignore[method-assign]
+        cli.main()
 
 
 def _kill_at_change(kill_at: int) -> None:

@@ -5,13 +5,20 @@ from pathlib import Path
 
 import pytest
 
-from rare_envs.study.errors import BadInput, as_bad_input, output_folder
+from rare_envs.study.errors import MAX_MESSAGE, BadInput, as_bad_input, output_folder
 
 
 def test_errors_of_these_kinds_become_one_line() -> None:
     with pytest.raises(BadInput, match=r"^two lines$") as caught, as_bad_input(ValueError, OSError):
         raise ValueError("two\n   lines")
     assert isinstance(caught.value.__cause__, ValueError)
+
+
+def test_a_message_that_repeats_a_long_value_is_cut_in_its_middle() -> None:
+    message = str(BadInput(f"Expected a name, got {'x' * 100_000!r}: use a shorter one."))
+    assert MAX_MESSAGE - 10 < len(message) <= MAX_MESSAGE
+    assert message.startswith("Expected a name, got 'xx") and message.endswith("xx': use a shorter one.")
+    assert str(BadInput("y" * MAX_MESSAGE)) == "y" * MAX_MESSAGE
 
 
 def test_other_errors_pass() -> None:

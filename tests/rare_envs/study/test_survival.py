@@ -27,6 +27,7 @@ from samplers.execution.record_file import RecordFile
 from tests.rare_envs.study.conftest import write_base
 from tests.rare_envs.study.forked_command import TILE, ForkedCommand
 from tests.rare_envs.study.refusals import FOLLOWING, SMALL, assert_refused
+from tests.samplers.execution.executors.real_executors import case
 
 Cli = Callable[..., Result]
 NO_SPACE = OSError(28, "No space left on device")
@@ -61,9 +62,9 @@ def episodes_of(folder: Path) -> Any:
     return rare_envs.load_study(folder).episodes().drop(["seconds"])
 
 
-def finish(folder: Path, *words: str) -> None:
+def finish(folder: Path, *words: str, executor: str | None = None) -> None:
     """Run a command to its end, which must be a good one."""
-    ended = ForkedCommand(folder, *words).end()
+    ended = ForkedCommand(folder, *words, executor=executor).end()
     assert ended.code in (0, 3), ended
 
 
@@ -102,7 +103,12 @@ def has_simulations(folder: Path) -> bool:
 
 
 def kill_and_resume(
-    folder: Path, base: str, rng: np.random.Generator, kills: int, options: Callable[[int], tuple[str, ...]]
+    folder: Path,
+    base: str,
+    rng: np.random.Generator,
+    kills: int,
+    chunk: tuple[str, ...] = (),
+    executor_of: Callable[[int], str | None] = lambda number: None,
 ) -> None:
     """Kill a run many times, at its beginning and while it simulates; then let it come to its end.
 
@@ -111,45 +117,49 @@ def kill_and_resume(
         base: Of the run.
         rng: Draws the times.
         kills: Number of kills.
-        options: Further options of the command, by its number.
+        chunk: Option for the size of the chunks.
+        executor_of: Executor of the command of a number.
     """
-    words: tuple[str, ...] = ("estimate", FOLLOWING, "--base", base, *WORDS, "--out", "run")
+    words: tuple[str, ...] = ("estimate", FOLLOWING, "--base", base, *WORDS, *chunk, "--out", "run")
     for number in range(kills):
-        command = ForkedCommand(folder, *words, *options(number), pause=PAUSE)
+        command = ForkedCommand(folder, *words, pause=PAUSE, executor=executor_of(number))
         if number % 4:  # else while it reads what there is, or begins
             command.wait_for_more(folder / "run" / JOURNAL)
         time.sleep(float(rng.uniform(0.0, 0.05 if number % 4 else 0.3)))
         command.kill()
         if has_simulations(folder / "run"):
             words = ("resume", "run")
-    finish(folder, *words, *options(kills))
+    finish(folder, *words, executor=executor_of(kills))
+
+
+def kill_in_final_writes(folder: Path, kill_at: int, *words: str, executor: str | None = None) -> bool:
+    """Kill a command before the change of a file in its final writes, and return whether it had not ended before."""
+    before = len(RESULT_FILES) + 2  # study.json
+    ended = ForkedCommand(folder, *words, kill_at=kill_at + before, executor=executor).end()
+    if ended.code == -signal.SIGKILL:
+        assert (folder / "run" / JOURNAL).exists()
+    return ended.code == -signal.SIGKILL
 
 
 @pytest.mark.parametrize("kills", [3, pytest.param(21, marks=pytest.mark.slow)])
 def test_killed_at_random_times_it_gives_the_same_files(kills: int, tmp_path: Path, base: str, whole: Path) -> None:
-    kill_and_resume(tmp_path, base, np.random.default_rng(21), kills, lambda number: ())
+    kill_and_resume(tmp_path, base, np.random.default_rng(21), kills)
     assert_same_files(tmp_path / "run", whole, *TABLES)
 
 
-@pytest.mark.slow
-def test_killed_under_workers_and_resumed_anywhere_it_gives_the_same_files(
-    tmp_path: Path, base: str, whole: Path
-) -> None:
-    """The driver is killed seven times, and goes on in turn here and with two worker processes."""
-    rng, chunk = np.random.default_rng(22), ("--chunk", str(TILE))
-    words = ("estimate", FOLLOWING, "--base", base, *WORDS, *chunk, "--out", "whole")
-    finish(tmp_path, *words)
-
-    def options(number: int) -> tuple[str, ...]:
-        workers = () if number % 2 else ("--workers", "2")
-        return (
-            workers
-            if (tmp_path / "run" / JOURNAL).exists() and has_simulations(tmp_path / "run")
-            else (*chunk, *workers)
-        )
-
-    kill_and_resume(tmp_path, base, rng, 7, options)
+@pytest.mark.parametrize("name", [case(name) for name in ("local", "futures", "ray")])
+def test_killed_under_every_executor_it_gives_the_same_files(name: str, tmp_path: Path, base: str) -> None:
+    """The driver is killed 21 times, in turn here and under an executor, then five times in the final writes."""
+    chunk = ("--chunk", str(TILE))
+    finish(tmp_path, "estimate", FOLLOWING, "--base", base, *WORDS, *chunk, "--out", "whole")
+    kill_and_resume(tmp_path, base, np.random.default_rng(22), 21, chunk, lambda number: name if number % 3 else None)
     assert_same_files(tmp_path / "run", tmp_path / "whole", *TABLES)
+    for kill_at in KILLS[::2]:
+        shutil.rmtree(tmp_path / "run")
+        words = ("estimate", FOLLOWING, "--base", base, *WORDS, *chunk, "--out", "run")
+        assert kill_in_final_writes(tmp_path, kill_at, *words, executor=name)
+        finish(tmp_path, "resume", "run", executor=name)
+        assert_same_files(tmp_path / "run", tmp_path / "whole", *TABLES)
 
 
 @pytest.mark.parametrize("kill_at", [pytest.param(k, marks=[] if k == 3 else pytest.mark.slow) for k in KILLS])
@@ -157,9 +167,7 @@ def test_killed_in_the_final_writes_it_gives_the_same_files(
     kill_at: int, tmp_path: Path, base: str, whole: Path
 ) -> None:
     words = ("estimate", FOLLOWING, "--base", base, *WORDS, "--out", "run")
-    ended = ForkedCommand(tmp_path, *words, kill_at=kill_at + len(RESULT_FILES) + 2).end()  # study.json
-    if ended.code == -signal.SIGKILL:
-        assert (tmp_path / "run" / JOURNAL).exists()
+    if kill_in_final_writes(tmp_path, kill_at, *words):
         finish(tmp_path, "resume", "run")
     assert_same_files(tmp_path / "run", whole, *TABLES)
 

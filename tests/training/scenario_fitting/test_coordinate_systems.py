@@ -126,3 +126,12 @@ def test_a_tie_of_the_criterion_is_decided_by_the_events_held_out():
     good, noise = np.zeros(50), np.random.default_rng(0).standard_normal(50)
     slightly_worse = good - 0.01 + noise - noise.mean()
     assert choose_system([9.9, 8.0], [good, slightly_worse], np.arange(50)) == 0
+
+
+@pytest.mark.parametrize("system", [PLAIN, LOG_GAP, CLOSING])
+def test_a_parameter_that_does_not_vary_is_named(system):
+    events = closing_events(40)
+    joint = events.joint.copy()
+    joint[:, 0] = 20.0
+    with pytest.raises(ValueError, match="Expected ego_speed to vary, got 20 in all 40 events"):
+        fit_system(EventSet(joint, events.clusters), system, FOLLOWING)

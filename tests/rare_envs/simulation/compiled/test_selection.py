@@ -27,9 +27,9 @@ X = np.array([[20.0, 15.0, 30.0]])
     [
         (CAR_FOLLOWING, {"measure": "thw"}, "measure 'thw'"),
         (CAR_FOLLOWING, {"ego": "human"}, "HumanDriver"),
-        (CAR_FOLLOWING, {"drivers": "mgail"}, "script of the scenario 'car_following'"),
+        (CAR_FOLLOWING, {"drivers": "mgail"}, "scenario 'car_following' with drivers"),
         ("rare_envs/CutIn-v0", {"collisions": "any"}, "collisions of other vehicles"),
-        ("rare_envs/Highway-v0", {}, "script of the scenario 'highway'"),
+        (CAR_FOLLOWING, {"ego": "imitation"}, "an ego that acts by lidar is not compiled in a scripted scenario"),
     ],
 )
 def test_what_is_not_compiled_is_simulated_by_torch(env_id, arguments, reason):

@@ -81,3 +81,9 @@ def test_the_base_distribution_stands_under_the_sampling_interval(
     assert lines[2:4] == [f"  {line}" for line in str(found).splitlines()]
     assert lines[2].startswith("  base distribution 95 %  ")
     assert json.loads(json.dumps(replace(report, estimate=estimate).to_dict()))["base_uncertainty"]["clusters"] == 17
+
+
+def test_less_precision_than_wished_is_no_doubt(cli: Cli, risky: str) -> None:
+    result = cli(*SMALL, "--base", risky, "--target-cov", 0.01)
+    assert result.exit_code == 0
+    assert "remark: The target c.o.v. 0.01 was not met: 0." in result.stdout and "warning" not in result.stdout

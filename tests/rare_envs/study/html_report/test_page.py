@@ -113,6 +113,7 @@ def test_warnings_come_first_and_text_of_files_is_escaped(folder: Path, tmp_path
     assert "<script>" not in text and "&lt;script&gt;alert(1)&lt;/script&gt; the estimate is coarse" in text
     assert text.index("the estimate is coarse") < text.index("The answer") and "gave another f" in text
     assert "&lt;b&gt;a note" in text
+    assert "not what the run wrote, by the digests in its study.json: result.json" in text
 
 
 def test_names_of_egos_and_bases_are_escaped(folder: Path) -> None:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -59,13 +60,28 @@ def test_loading_takes_neither_torch_nor_the_simulation(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["", "{", "[1]", '{"p": "low", "interval": [0, 1]}', '{"p": 0.1, "interval": [0]}', '{"p": true}']
+    "text",
+    [
+        *("", "{", "[1]", '{"p": "low", "interval": [0, 1]}', '{"p": 0.1, "interval": [0]}', '{"p": true}'),
+        *('{"p": NaN, "interval": [0, 1]}', '{"p": 0.1, "interval": [-1, 1]}', '{"p": 0.1, "interval": [0, Infinity]}'),
+    ],
 )
 def test_a_damaged_result_is_refused_in_one_line(folder: Path, tmp_path: Path, text: str) -> None:
     (tmp_path / "failures.csv").write_text("f,log_p0\n")
     (tmp_path / "result.json").write_text(text)
     with pytest.raises(BadInput, match=r"result\.json"):
         rare_envs.load_study(tmp_path)
+
+
+def test_what_is_not_what_the_run_wrote_is_named(folder: Path, tmp_path: Path) -> None:
+    assert rare_envs.load_study(folder).changed_files == []
+    run = Path(shutil.copytree(folder, tmp_path / "run"))
+    (run / "result.json").write_text((run / "result.json").read_text().replace('"p": 0.0', '"p": 0.1', 1))
+    (run / "episodes.parquet").unlink()
+    (run / "report.html").touch()
+    assert rare_envs.load_study(run).changed_files == ["result.json", "episodes.parquet"]
+    (run / "study.json").unlink()
+    assert rare_envs.load_study(run).changed_files == []
 
 
 def test_a_damaged_table_and_unknown_columns_are_refused(folder: Path, tmp_path: Path) -> None:

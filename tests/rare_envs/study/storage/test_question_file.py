@@ -25,6 +25,13 @@ def test_the_same_question_as_a_file_gives_the_same_answer(cli: Cli, risky: str,
     assert filed["question"]["max_sim"] == 200 and filed["p"] > 0
 
 
+def test_numbers_are_those_of_the_command_line(tmp_path: Path) -> None:
+    file = tmp_path / "study.yaml"
+    file.write_text("env: a\nmax-p: 1e-4\ngamma: -1.5E+1\nhorizon: 3\nseed: 010\nmax-sim: 6000\nnoise: off\n")
+    numbers = {"max_p": 1e-4, "gamma": -15.0, "horizon": 3, "seed": 10, "max_sim": 6000, "noise": False}
+    assert read_question_file(file) == {"env_id": "a", **numbers}
+
+
 def test_what_is_typed_comes_before_the_file(cli: Cli, risky: str, tmp_path: Path) -> None:
     file = tmp_path / "study.yaml"
     file.write_text(f"env: rare_envs/Nowhere-v0\nbase: {risky}\nmethod: mc\nmax_sim: 200\nseed: 3\n")
@@ -41,6 +48,7 @@ def test_what_is_typed_comes_before_the_file(cli: Cli, risky: str, tmp_path: Pat
         ("env: rare_envs/CutIn-v0\ntrust: true\n", "cannot say trust: give --trust on the command line"),
         ("env: rare_envs/CutIn-v0\ngamma: low\n", "Expected gamma to be float, got 'low'"),
         ("env: rare_envs/CutIn-v0\nseed: 1.5\n", "Expected seed to be int"),
+        ("env: rare_envs/CutIn-v0\nhorizon: 12:30\n", "Expected horizon to be float . None, got '12:30'"),
         ("max-sim: 3\nmax_sim: 4\n", "same option twice"),
         ("- 1\n- 2\n", "lines like gamma"),
         ("", "lines like gamma"),

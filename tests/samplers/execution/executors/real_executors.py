@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import multiprocessing
 import os
 from collections.abc import Iterator
@@ -9,10 +10,22 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from typing import Any
 
+import pytest
+
 import samplers
 
 LIBRARIES = {"futures": "concurrent.futures", "loky": "loky", "dask": "distributed", "ray": "ray"}
 """What an executor needs; `local` needs nothing."""
+
+
+def case(*values: Any, quick: bool = False) -> Any:
+    """Return a case of a test whose first value is an executor: slow, and skipped without its library."""
+    library = LIBRARIES.get(values[0], "samplers")
+    marks = [
+        pytest.mark.skipif(importlib.util.find_spec(library) is None, reason=f"{library} is not installed"),
+        pytest.mark.filterwarnings("ignore"),  # of the libraries, on sockets and processes that were killed
+    ]
+    return pytest.param(*values, marks=marks if quick else [*marks, pytest.mark.slow])
 
 
 @contextmanager

@@ -14,14 +14,13 @@ import sys
 import time
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 import samplers
 from tests.samplers.execution.executors.egos import BAD, FAULTS, KillsItself, matrix, problem
-from tests.samplers.execution.executors.real_executors import LIBRARIES, open_executor
+from tests.samplers.execution.executors.real_executors import LIBRARIES, case, open_executor
 from tests.samplers.execution.executors.test_local_processes import estimate, is_running
 
 P = 0.15865525393145707
@@ -35,16 +34,6 @@ REASONS = {
     ("ray", "hanging"): "its time limit was 2 s",
 }
 """What the remarks say, where the executor knows it."""
-
-
-def case(*values: Any, quick: bool = False) -> Any:
-    """Return a case of a test whose first value is an executor: slow, and skipped without its library."""
-    library = LIBRARIES.get(values[0], "samplers")
-    marks = [
-        pytest.mark.skipif(importlib.util.find_spec(library) is None, reason=f"{library} is not installed"),
-        pytest.mark.filterwarnings("ignore"),  # of the libraries, on sockets and processes that were killed
-    ]
-    return pytest.param(*values, marks=marks if quick else [*marks, pytest.mark.slow])
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ def test_the_files_that_were_written_are_the_answer(cli: Cli, monkeypatch: pytes
     assert json.loads(answer.stdout) == {"bases": [str(file)]}
     assert "progress" in answer.stderr
     given = {"kind": "i24", "between": (1.0, 2.0), "scenarios": ["cut_in"], "n_refits": 3}
-    assert asked == {**given, "cut_gaps": False, "name": "own", "seed": 0}
+    assert asked == {**given, "cut_gaps": False, "name": "own", "seed": 0, "progress": True}
     assert cli("fit", *words).stdout == f"{file}: rare-envs estimate ENV --base {file}\n"
 
 

@@ -1,0 +1,73 @@
+"""Which worlds of learned drivers have compiled rollouts."""
+
+import pickle
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import agents
+import rare_envs
+from rare_envs.control import IDM
+from rare_envs.scenarios import highway
+from rare_envs.simulation import World
+from rare_envs.simulation.compiled.failures import NotCompiled
+from rare_envs.simulation.compiled.highway import find_highway_rollout
+
+HIGHWAY = "rare_envs/Highway-v0"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        ({"measure": "thw"}, "the measure 'thw' is not compiled"),
+        ({"collisions": "any"}, "collisions of other vehicles are not compiled"),
+        ({"drivers": "idm"}, "the drivers, a .*, are not compiled"),
+        ({"observation": "camera", "weather": True}, "parameters of the weather are not compiled"),
+        ({"ego": "noisy:idm"}, "is not compiled"),
+    ],
+)
+def test_what_is_not_compiled_is_simulated_by_torch(arguments, reason):
+    arguments = {**arguments, "ego": agents.load_ego(arguments.get("ego", "idm"))}
+    assert rare_envs.DrivingProblem(HIGHWAY, **arguments).core == "torch"
+    with pytest.raises(ValueError, match=f"core='numba' cannot simulate this: .*{reason}"):
+        rare_envs.DrivingProblem(HIGHWAY, core="numba", **arguments)
+
+
+def test_another_motion_of_the_drivers_is_not_compiled():
+    scenario = replace(highway.HIGHWAY, driven=lambda state, action, dt: highway.driven(state, action, dt))
+    with pytest.raises(NotCompiled, match="the scenario 'highway' with drivers is not compiled"):
+        find_highway_rollout(World(scenario, background=agents.load_driver("mgail")), IDM())
+
+
+def test_a_policy_among_learned_drivers_is_not_compiled():
+    world = World(highway.HIGHWAY, background=agents.load_driver("mgail"))
+    with pytest.raises(NotCompiled, match="a policy among learned drivers is not compiled"):
+        find_highway_rollout(world, lambda: SimpleNamespace(layers=()))
+
+
+def test_a_problem_is_sent_to_other_processes_with_its_core():
+    problem = rare_envs.DrivingProblem(HIGHWAY, noise="fixed", horizon=2.0)
+    x = problem.base.sample(3, np.random.default_rng(0))
+    sent = pickle.loads(pickle.dumps(problem))
+    assert sent.core == "numba"
+    assert np.array_equal(sent.evaluate(x), problem.evaluate(x))
+
+
+def test_a_driver_that_is_changed_later_is_simulated_by_torch():
+    driver = agents.load_driver("mgail")
+    problem = rare_envs.DrivingProblem(HIGHWAY, drivers=driver, noise=False, horizon=1.0)
+    x = problem.base.sample(2, np.random.default_rng(0))
+    expected = problem.evaluate(x)
+    handle = driver.policy.register_forward_hook(lambda *_: None)
+    with pytest.warns(UserWarning, match="whose network or methods were changed is not compiled; torch simulates"):
+        f = problem.evaluate(x)
+    handle.remove()
+    assert np.allclose(f, expected, atol=1e-4) and problem.core == "torch"
+
+
+def test_no_rows():
+    problem = rare_envs.DrivingProblem(HIGHWAY)
+    assert problem.evaluate(np.empty((0, problem.dim))).shape == (0,)
+    assert problem.terms(np.empty((0, problem.dim))).values.shape == (0, 10)

@@ -1,0 +1,82 @@
+"""Compiled rollouts among learned drivers against the torch simulation: f, collisions, terms and their ticks."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+import rare_envs
+from rare_envs.control import IDM
+
+FAST = IDM(45.0, max_acceleration=4.0, max_deceleration=0.02)
+"""An ego that does not brake, so that there are collisions."""
+CASES = {
+    "ttc": {},
+    "ttc, no noise": {"noise": False, "horizon": 6.0},
+    "lidar": {"measure": "lidar_ttc", "noise": "fixed", "horizon": 4.0},
+    "learned ego": {"measure": "lidar_ttc", "ego": "imitation", "horizon": 4.0},
+    "other drivers": {"drivers": "bc", "horizon": 4.0},
+    "collisions": {"ego": FAST, "drivers": "bc", "horizon": 8.0},
+}
+
+
+@cache
+def problems(case):
+    return [rare_envs.DrivingProblem("rare_envs/Highway-v0", core=core, **CASES[case]) for core in ("numba", "torch")]
+
+
+def points(problem, n=100):
+    """Ordinary noise and drivers, with vehicles at the borders of their boxes and near each other."""
+    rng = np.random.default_rng(1)
+    x, low, high = problem.base.sample(n, rng), np.array(problem.space.low[:24]), np.array(problem.space.high[:24])
+    x[:, :24] = np.where(rng.random((n, 24)) < 0.5, low, high)
+    x[:, :6] = low[:6] + 0.3 * (high - low)[:6] * rng.random((n, 6))
+    return x
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_f_is_that_of_the_torch_simulation(case):
+    compiled, reference = problems(case)
+    x = points(compiled)
+    f, expected = compiled.evaluate(x), reference.evaluate(x)
+    assert compiled.core == "numba" and expected.min() < 9.0
+    assert np.array_equal(f == -1.0, expected == -1.0)
+    assert (np.abs(f - expected) > 1e-4).mean() <= 0.005  # a beam along a corner may meet it or not
+    assert np.median(np.abs(f - expected)) < 1e-5
+    if case == "collisions":
+        assert 0.02 < (expected == -1.0).mean() < 0.5
+
+
+@pytest.mark.parametrize(
+    ("case", "gamma"), [("ttc, no noise", 0.0), ("lidar", 0.0), ("collisions", 0.0), ("collisions", 1.5)]
+)
+def test_terms_are_those_of_the_torch_simulation(case, gamma):
+    compiled, reference = problems(case)
+    x = points(compiled)
+    found, expected = compiled.terms(x, gamma), reference.terms(x, gamma)
+    assert found.names == expected.names and found.threshold == expected.threshold
+    assert np.array_equal(found.f, compiled.evaluate(x))
+    assert np.array_equal(found.lowest <= found.threshold, found.f <= gamma)
+    assert (np.abs(found.values - expected.values) > 1e-3).mean() <= 0.005
+    assert (found.ticks != expected.ticks).mean() <= 0.005
+    assert compiled.terms_with_f
+
+
+@pytest.mark.parametrize("case", ["ttc", "learned ego"])
+def test_a_row_is_the_same_bits_in_any_batch(case):
+    problem, _ = problems(case)
+    x = points(problem, 60)
+    whole = problem.terms(x)
+    assert np.array_equal(np.concatenate([problem.evaluate(row[None]) for row in x[:5]]), whole.f[:5])
+    assert np.array_equal(problem.evaluate(x[::-1])[::-1], whole.f)
+    assert np.array_equal(problem.terms(x[7:]).values, whole.values[7:])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", ["ttc", "collisions", "lidar", "learned ego"])
+def test_f_is_that_of_the_torch_simulation_in_20_000_rollouts(case):
+    compiled, reference = problems(case)
+    x = points(compiled, 20_000)
+    f, expected = compiled.evaluate(x), reference.evaluate(x)
+    assert ((f == -1.0) != (expected == -1.0)).mean() <= 1e-4
+    assert (np.abs(f - expected) > 1e-4).mean() <= 0.005
