@@ -1,4 +1,4 @@
-"""RL Zoo's hyperparameter file: an entry for each environment, with settings that Stable-Baselines3 takes."""
+"""RL Zoo's hyperparameter files: an entry for each environment, with settings that Stable-Baselines3 takes."""
 
 from __future__ import annotations
 
@@ -8,36 +8,62 @@ from typing import Any
 import gymnasium as gym
 import pytest
 import yaml
-from stable_baselines3 import PPO
+from stable_baselines3 import DQN, PPO
 from torch import nn
 
 import rare_envs
 from training.ego_training import HYPERPARAMETERS
 
-FILE = Path(__file__).parents[2] / "examples" / "rl_zoo3" / "ppo.yml"
-OF_THE_ZOO = ("n_envs", "n_timesteps", "policy")
-"""Settings of the training, not of the algorithm."""
+FOLDER = Path(__file__).parents[2] / "examples" / "rl_zoo3"
+OF_THE_ZOO = ("n_envs", "n_timesteps", "policy", "policy_kwargs")
+"""Settings of the training, not of the algorithm, and the policy's, which the Zoo reads as Python."""
+OURS = 256
+"""Environments of `train_ego`; the Zoo's are fewer, with as many transitions between updates."""
+
+Entries = dict[str, dict[str, Any]]
 
 
-@pytest.fixture(scope="module")
-def settings() -> dict[str, dict[str, Any]]:
-    found: dict[str, dict[str, Any]] = yaml.safe_load(FILE.read_text(encoding="utf-8"))
-    return found
+def read(algo: str) -> Entries:
+    entries: Entries = yaml.safe_load((FOLDER / f"{algo}.yml").read_text(encoding="utf-8"))
+    return entries
 
 
-def test_every_environment_has_an_entry(settings: dict[str, dict[str, Any]]) -> None:
-    assert set(settings) == set(rare_envs.ENV_IDS)
+def policy_of(entry: dict[str, Any]) -> dict[str, Any]:
+    policy: dict[str, Any] = eval(entry["policy_kwargs"], {"nn": nn, "dict": dict})  # as RL Zoo reads it
+    return policy
 
 
-def test_settings_are_those_of_our_own_training(settings: dict[str, dict[str, Any]]) -> None:
-    ours = HYPERPARAMETERS["ppo"]
-    for each in settings.values():
-        steps = each["n_steps"] * each["n_envs"]
-        assert steps == ours.settings["n_steps"] * 256
-        same = {name: value for name, value in ours.settings.items() if name != "n_steps"}
-        assert {name: each[name] for name in same} == same
-        policy = eval(each["policy_kwargs"], {"nn": nn, "dict": dict})  # as RL Zoo reads it
-        assert policy == {**ours.policy, "activation_fn": nn.ReLU}
-    algorithm = {name: value for name, value in each.items() if name not in (*OF_THE_ZOO, "policy_kwargs")}
-    algorithm |= {"n_steps": 8, "batch_size": 8}  # there is one environment here
-    PPO(each["policy"], gym.make(rare_envs.ENV_IDS[0]), device="cpu", policy_kwargs=policy, **algorithm)
+def settings_of(entry: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in entry.items() if name not in OF_THE_ZOO}
+
+
+@pytest.mark.parametrize("algo", ["ppo", "dqn"])
+def test_settings_are_those_of_our_own_training(algo: str) -> None:
+    entries, ours, per_step = read(algo), HYPERPARAMETERS[algo], {"ppo": "n_steps", "dqn": "train_freq"}[algo]
+    assert set(entries) == set(rare_envs.ENV_IDS)
+    for entry in entries.values():
+        assert entry[per_step] * entry["n_envs"] == ours.settings[per_step] * OURS
+        same = {name: value for name, value in ours.settings.items() if name != per_step}
+        assert {name: entry[name] for name in same} == same
+        assert policy_of(entry) == {**ours.policy, "activation_fn": nn.ReLU}
+
+
+def test_ppo_takes_them() -> None:
+    entry = read("ppo")[rare_envs.ENV_IDS[0]]
+    few = {"n_steps": 8, "batch_size": 8}  # there is one environment here
+    env = gym.make(rare_envs.ENV_IDS[0])
+    PPO(entry["policy"], env, device="cpu", policy_kwargs=policy_of(entry), **settings_of(entry) | few)
+
+
+def test_dqn_takes_them_with_accelerations_by_index() -> None:
+    entry = read("dqn")[rare_envs.ENV_IDS[0]]
+    assert HYPERPARAMETERS["dqn"].discrete
+    few = {"buffer_size": 64, "learning_starts": 16, "batch_size": 8}
+    env = gym.make(rare_envs.ENV_IDS[0], action="discrete")
+    model = DQN(entry["policy"], env, device="cpu", policy_kwargs=policy_of(entry), **settings_of(entry) | few)
+    assert model.learn(40).num_timesteps >= 40
+
+
+def test_dqn_learns_on_for_as_long_as_ours() -> None:
+    for entry in read("dqn").values():  # `train_ego` keeps every transition, and waits for ten of each environment
+        assert entry["buffer_size"] == entry["n_timesteps"] and entry["learning_starts"] == 10 * OURS
