@@ -153,8 +153,9 @@ def explore(context: RunContext, state: RunState) -> SimulationSteps[tuple[RunSt
     exploration = yield from find_regions(
         context.simulator, state.history.batches[0], context.goal, sizes, context.rng, context.settings
     )
+    slope_settings, high_dim = context.settings.slopes, context.settings.mixture.subspace.high_dim
     slopes = yield from find_slopes(
-        context.simulator, exploration, gamma, context.budget, context.rng, context.settings.slopes
+        context.simulator, exploration, gamma, context.left, context.rng, slope_settings, high_dim
     )
     exploration = exploration._replace(slopes=slopes)
     n = sum(len(region.f) for region in exploration.regions)

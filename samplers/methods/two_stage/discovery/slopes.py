@@ -22,37 +22,42 @@ def find_slopes(
     simulator: Simulator,
     exploration: ExplorationResult,
     gamma: float,
-    budget: int,
+    room: int,
     rng: np.random.Generator,
     settings: SlopeSettings,
+    high_dim: int,
 ) -> SimulationSteps[FloatArray | None]:
     """Return orthonormal directions in which f changes around the failures, shape (d, r); None where they are not few.
 
-    The gradients are made in three batches, so that a search without result ends early and the later ones may go where
-    the known directions explain least.
+    The gradients are made in three batches. Later ones go where the known directions explain least, and are not made
+    where there are too many directions, or where the batch before was explained by what was known.
 
     Args:
         simulator: Gives outcomes.
         exploration: Regions of failure.
         gamma: Threshold of failure.
-        budget: Simulations of the whole run.
+        room: Simulations left of the budget.
         rng: Source of randomness.
         settings: Dimensions, simulations, step.
+        high_dim: Above so many dimensions a component has one direction without slopes.
     """
     dim = simulator.inputs.dim
-    share = settings.scattered_share if exploration.scattered else settings.share
-    n = min(int(share * budget / (dim + 1)), settings.most)
+    short = exploration.scattered or dim > high_dim
+    n = min(int((settings.high_dim_share if short else settings.share) * room / (dim + 1)), settings.most)
     if dim < settings.min_dim or n < settings.least or exploration.noisy or not exploration.regions:
         return None
-    later = n // 4
-    points = _choose_points(exploration, n - 2 * later, gamma, rng)
+    first = max(n - n // 2, settings.least)
+    points = _choose_points(exploration, first, gamma, rng)
     slopes = yield from _differentiate(simulator, points, settings.step)
-    for _ in range(2):
+    for size in ((n - first + 1) // 2, (n - first) // 2):
         if not _have_few_directions(slopes, settings):
             return None
-        points = _choose_unexplained(exploration, later, gamma, _leading_directions(slopes, settings))
+        axes = _leading_directions(slopes, settings)
+        points = _choose_unexplained(exploration, size, gamma, axes)
         more = yield from _differentiate(simulator, points, settings.step)
         slopes = np.concatenate([slopes, more])
+        if ((more @ axes) ** 2).sum() >= settings.nearly_all * len(more):
+            break
     return _leading_directions(slopes, settings) if _have_few_directions(slopes, settings) else None
 
 

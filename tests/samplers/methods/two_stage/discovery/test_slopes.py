@@ -10,7 +10,8 @@ from samplers.methods.two_stage.simulator import Simulator
 from samplers.problem import FunctionProblem
 
 SETTINGS = SlopeSettings()
-BUDGET = 6000
+ROOM = 3300
+HIGH_DIM = 40
 
 
 def region_of(problem, centre, rng, chains=40):
@@ -22,12 +23,12 @@ def region_of(problem, centre, rng, chains=40):
     return Region(inside[:, None], u[outside][:200], f[outside][:200])
 
 
-def slopes_of(f, dim, centre, rng, drive, budget=BUDGET, **flags):
+def slopes_of(f, dim, centre, rng, drive, room=ROOM, **flags):
     """Return the directions, and the number of simulations."""
     problem = FunctionProblem(f, dim)
     exploration = ExplorationResult([region_of(problem, centre, rng)], **{"noisy": False, **flags})
     simulator = Simulator(problem)
-    axes, made = drive(find_slopes(simulator, exploration, 0.0, budget, rng, SETTINGS), problem)
+    axes, made = drive(find_slopes(simulator, exploration, 0.0, room, rng, SETTINGS, HIGH_DIM), problem)
     assert simulator.n_sim == len(made)
     return axes, simulator.n_sim
 
@@ -43,7 +44,9 @@ def test_three_of_forty_coordinates_that_must_all_be_large(rng, drive):
     assert axes.shape == (40, 3)
     assert holds(axes, np.eye(40)[[7, 19, 33]])
     np.testing.assert_allclose(axes.T @ axes, np.eye(3), atol=1e-12)
-    assert n_sim == 17 * 41 <= SETTINGS.share * BUDGET
+    assert (
+        n_sim == 13 * 41 <= SETTINGS.share * ROOM
+    )  # of 17: the third batch is not made where the second was explained
 
 
 @pytest.mark.parametrize("flat", ["inside", "beside"])
@@ -72,23 +75,25 @@ def test_the_gradient_of_a_curved_f_is_right_to_half_a_step(rng, drive):
 
 
 @pytest.mark.parametrize(
-    ("dim", "budget", "flags"),
+    ("dim", "room", "flags"),
     [
-        (14, BUDGET, {}),  # chains show as much
-        (30, 700, {}),  # two gradients
-        (30, BUDGET, {"noisy": True}),
+        (14, ROOM, {}),  # chains show as much
+        (30, 300, {}),  # two gradients
+        (30, ROOM, {"noisy": True}),
     ],
 )
-def test_no_simulation_is_spent_where_gradients_are_no_use(dim, budget, flags, rng, drive):
-    axes, n_sim = slopes_of(lambda u: 2.0 - u[:, 0], dim, 2.0 * np.eye(dim)[0], rng, drive, budget, **flags)
+def test_no_simulation_is_spent_where_gradients_are_no_use(dim, room, flags, rng, drive):
+    axes, n_sim = slopes_of(lambda u: 2.0 - u[:, 0], dim, 2.0 * np.eye(dim)[0], rng, drive, room, **flags)
     assert axes is None
     assert n_sim == 0
 
 
-def test_more_gradients_are_made_where_the_regions_are_pieces_of_a_ring(rng, drive):
+@pytest.mark.parametrize(
+    ("dim", "flags", "most"), [(30, {}, 20), (60, {}, 16), (150, {}, 6), (30, {"scattered": True}, 20)]
+)
+def test_a_plane_is_found_for_a_share_of_the_budget(dim, flags, most, rng, drive):
+    """f falls along another direction at every point of a ring; 30 % of what is left at most, in 40 or fewer 22 %."""
     ring = lambda u: 3.5 - np.hypot(u[:, 0], u[:, 1])  # noqa: E731
-    centre = 3.5 * np.eye(100)[0]
-    _, alone = slopes_of(ring, 100, centre, rng, drive)
-    axes, n_sim = slopes_of(ring, 100, centre, rng, drive, scattered=True)
-    assert (alone, n_sim) == (7 * 101, 11 * 101)
-    assert holds(axes, np.eye(100)[:2])
+    axes, n_sim = slopes_of(ring, dim, 3.5 * np.eye(dim)[0], rng, drive, **flags)
+    assert n_sim <= most * (dim + 1)
+    assert holds(axes, np.eye(dim)[:2])
