@@ -11,14 +11,11 @@ from numpy.typing import NDArray
 from rare_envs.control.idm import IDM
 from rare_envs.egos.policy import PolicyDriver
 from rare_envs.egos.sb3.dense_networks import read_dense_policy
-from rare_envs.simulation.compiled.failures import CompilerFails, NotCompiled
+from rare_envs.simulation.compiled.failures import CompilerFails, NotCompiled, check_core
 from rare_envs.simulation.compiled.highway import HighwayRollout, OffersDenseDriver, RolloutTerms, read_dense_driver
 from rare_envs.simulation.compiled.selection import CompiledEgo, CompiledRollout, find_compiled_rollout
 from rare_envs.simulation.rollout import Driver
 from rare_envs.simulation.world import World
-
-CORES = ("auto", "torch", "numba")
-"""Choices of what simulates."""
 
 
 class CoreChoice:
@@ -45,8 +42,7 @@ class CoreChoice:
         Raises:
             ValueError: There is no such core, or "numba" cannot simulate this.
         """
-        if wanted not in CORES:
-            raise ValueError(f"Expected core to be one of {', '.join(map(repr, CORES))}, got {wanted!r}.")
+        check_core(wanted)
         self.wanted = wanted
         self.rollout: CompiledRollout | HighwayRollout | None = None
         if wanted == "torch":

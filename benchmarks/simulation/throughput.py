@@ -37,17 +37,22 @@ FLOORS = {
     "cut_in_idm_compiled": 3500.0,
     "car_following_ppo": 300.0,
     "car_following_ppo_compiled": 700.0,
-    "env_step": 5.0,
+    "env_step": 20.0,
+    "vec_step": 400.0,
     "adss_latency": 10.0,
     "highway_1": 1.0,
     "highway_64": 30.0,
     "highway_256": 100.0,
     "highway_512": 100.0,
     "highway_1024": 100.0,
+    "highway_25_compiled": 300.0,
+    "highway_1024_compiled": 300.0,
 }
 """Least ratios to HighwayEnv."""
 BATCHES = (1, 64, 256, 512, 1024)
 """Batch sizes of the highway."""
+COMPILED_BATCHES = (25, 1024)
+"""Likewise with compiled rollouts."""
 CEILINGS = {
     "camera_64": 40.0,
     "camera_64_weather": 45.0,
@@ -149,11 +154,26 @@ def _drive_by_policy(model: Any, x: np.ndarray[Any, Any]) -> None:
         road.step(0.1)
 
 
-def step_ratio(steps: int) -> dict[str, float]:
-    """Compare one `env.step` of `gym.make` with HighwayEnv's with two vehicles and the same frequencies."""
+def batch_step_ratio(steps: int, num_envs: int = 256) -> dict[str, float]:
+    """Compare steps of `gym.make_vec`, with random actions and the episodes that these end, with HighwayEnv's."""
+    batch, theirs = gym.make_vec(CAR_FOLLOWING, num_envs), highway_env_pair()
+    actions = np.random.default_rng(0).uniform(-0.3, 0.3, (steps, num_envs, 2)).astype(np.float32)
+
+    def drive_batch() -> None:
+        batch.reset(seed=0)
+        for action in actions:
+            batch.step(action)
+
+    pairs = [
+        (num_envs * steps / seconds(drive_batch), steps / seconds(lambda: _drive_env(theirs, steps))) for _ in range(3)
+    ]
+    return _compare_rates([a for a, _ in pairs], [b for _, b in pairs])
+
+
+def highway_env_pair() -> Any:
+    """Return HighwayEnv's environment with two vehicles and our frequencies."""
     import highway_env  # noqa: F401  (registers its ids)
 
-    ours = gym.make(CAR_FOLLOWING)
     config = {
         "vehicles_count": 1,
         "simulation_frequency": 10,
@@ -161,18 +181,24 @@ def step_ratio(steps: int) -> dict[str, float]:
         "duration": 1e9,
         "action": {"type": "ContinuousAction"},
     }
-    theirs = gym.make("highway-v0", config=config, disable_env_checker=True)
+    return gym.make("highway-v0", config=config, disable_env_checker=True)
 
-    def drive(env: Any, action: Any) -> None:
-        env.reset(seed=0)
-        for _ in range(steps):
-            _, _, terminated, truncated, _ = env.step(action)
-            if terminated or truncated:
-                env.reset()
 
-    still = np.zeros(2, np.float32)
+def _drive_env(env: Any, steps: int) -> None:
+    """Step an environment straight on, with new episodes where one ends."""
+    env.reset(seed=0)
+    for _ in range(steps):
+        _, _, terminated, truncated, _ = env.step(np.zeros(2, np.float32))
+        if terminated or truncated:
+            env.reset()
+
+
+def step_ratio(steps: int) -> dict[str, float]:
+    """Compare one `env.step` of `gym.make` with HighwayEnv's with two vehicles and the same frequencies."""
+    ours, theirs = gym.make(CAR_FOLLOWING), highway_env_pair()
     pairs = [
-        (steps / seconds(lambda: drive(ours, still)), steps / seconds(lambda: drive(theirs, still))) for _ in range(3)
+        (steps / seconds(lambda: _drive_env(ours, steps)), steps / seconds(lambda: _drive_env(theirs, steps)))
+        for _ in range(3)
     ]
     return _compare_rates([a for a, _ in pairs], [b for _, b in pairs])
 
@@ -196,9 +222,9 @@ def latency_ratio() -> dict[str, float]:
     }
 
 
-def measure_highway(batch: int, rounds: int) -> dict[str, float]:
+def measure_highway(batch: int, rounds: int, core: str = "torch") -> dict[str, float]:
     """Compare Highway-v0, the IDM ego and five learned drivers, with HighwayEnv's six IDM vehicles and lidar."""
-    problem = rare_envs.DrivingProblem(HIGHWAY, measure="lidar_ttc")
+    problem = rare_envs.DrivingProblem(HIGHWAY, measure="lidar_ttc", core=core)
     seconds_of_traffic = problem.world.clock.seconds
     x = problem.base.sample(batch, np.random.default_rng(0))
     problem.evaluate(x)
@@ -245,7 +271,7 @@ def measure_camera(batch: int, rounds: int, weather: bool = False) -> dict[str, 
 
 def highway_memory(rollouts: int = 1024) -> dict[str, float]:
     """Return the peak memory of this process after 1,024 rollouts of the highway in one batch."""
-    problem = rare_envs.DrivingProblem(HIGHWAY, measure="lidar_ttc")
+    problem = rare_envs.DrivingProblem(HIGHWAY, measure="lidar_ttc", core="torch")
     x = torch.from_numpy(problem.base.sample(rollouts, np.random.default_rng(0))).float()
     with torch.inference_mode():
         elapsed = seconds(lambda: rollout(problem.world, problem.driver, x))
@@ -293,6 +319,7 @@ def main(
     if not only_camera:
         results = {"highway_memory": highway_memory()}  # first: a peak stays
         results |= {f"highway_{batch}": measure_highway(batch, rounds) for batch in BATCHES}
+        results |= {f"highway_{batch}_compiled": measure_highway(batch, rounds, "numba") for batch in COMPILED_BATCHES}
     results["camera_64"] = measure_camera(64, rounds)
     results["camera_64_weather"] = measure_camera(64, rounds, weather=True)
     if not (only_highway or only_camera):
@@ -303,6 +330,7 @@ def main(
         results["car_following_ppo"] = policy_ratio("torch", rounds)
         results["car_following_ppo_compiled"] = policy_ratio("numba", rounds)
         results["env_step"] = step_ratio(500)
+        results["vec_step"] = batch_step_ratio(200)
         results["adss_latency"] = latency_ratio()
         if with_memory:
             results["memory"] = memory()

@@ -32,7 +32,8 @@ def merge_rows(old: _T, rows: Tensor, new: _T) -> _T:
 
     def merge(old: Any, new: Any) -> Any:
         if not isinstance(old, Tensor):
-            return old.replace_rows(rows, new) if isinstance(old, RowsReplaceable) else old
+            replace = getattr(old, "replace_rows", None)  # of a `RowsReplaceable`; to ask for the protocol is slow
+            return old if replace is None else replace(rows, new)
         old = old.clone()
         old[rows] = new
         return old

@@ -14,7 +14,8 @@ from rare_envs.envs.highway_env_interface import HighwayEnvInterface
 from rare_envs.envs.info import SingleObservation, episode_info, step_info
 from rare_envs.make import set_up
 from rare_envs.sensors.kinds import map_kinds
-from rare_envs.simulation.decision import advance
+from rare_envs.simulation.compiled.scripted_step import find_scripted_step
+from rare_envs.simulation.decision import StepResult, advance
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.observation import observe
 
@@ -41,12 +42,14 @@ class DrivingEnv(HighwayEnvInterface, gym.Env[SingleObservation, Any]):
 
     metadata = {"render_modes": list(RENDER_MODES), "render_fps": 10}  # noqa: RUF012  (Gymnasium's own form)
 
-    def __init__(self, env_id: str, render_mode: str | None = None, **kwargs: Any) -> None:
+    def __init__(self, env_id: str, render_mode: str | None = None, core: str = "auto", **kwargs: Any) -> None:
         """Make the environment.
 
         Args:
             env_id: The scenario's registered id.
             render_mode: None, "rgb_array" or "human".
+            core: What carries out the steps, "torch" or "numba" (compiled, for scripted scenarios); "auto" for the
+                compiled ones where they can be had. They differ by rounding.
             **kwargs: See `rare_envs.make.set_up`.
 
         Raises:
@@ -63,6 +66,7 @@ class DrivingEnv(HighwayEnvInterface, gym.Env[SingleObservation, Any]):
         self._episode: Episode | None = None
         self._tick = 0
         self._recorder: Any = None
+        self._compiled = find_scripted_step(self.world, core)
         self._between = False
 
     def set_record_video_wrapper(self, wrapper: Any) -> None:
@@ -114,12 +118,16 @@ class DrivingEnv(HighwayEnvInterface, gym.Env[SingleObservation, Any]):
         if np.shape(action) != self.action_space.shape:
             wanted = "of shape (2,) (acceleration, steering)" if self.action_space.shape else "as one whole number"
             raise ValueError(f"Expected an action {wanted}, got shape {np.shape(action)}.")
+        moved = None if self._compiled is None else self._compiled.advance(self._episode, np.asarray(action)[None])
         with torch.inference_mode():
-            given = read_actions(self.world.clock.action, torch.as_tensor(np.asarray(action))[None], 1)
-            self._between = False
-            watched = self.world.clock.stride > 1 and (self._recorder or self._display.is_window)
-            episode, terms = advance(self.world, self._episode, given, watch=self._watch if watched else None)
-            observation = self._observe(episode)
+            if moved is None:
+                episode, terms = self._advance_by_torch(action)
+            else:
+                episode, terms = moved.episode, moved.terms
+            if moved is not None and self.world.sensing.observation == "features":
+                observation: SingleObservation = moved.features[0]
+            else:
+                observation = self._observe(episode)
             reward = float(terms.total)
         self._episode, self._tick = episode, self._tick + self.world.clock.stride
         terminated = bool(episode.collided)
@@ -133,6 +141,14 @@ class DrivingEnv(HighwayEnvInterface, gym.Env[SingleObservation, Any]):
         with torch.inference_mode():
             observed = observe(episode, self.world.sensing.observation)
         return cast("SingleObservation", map_kinds(lambda part: part[0].numpy(), observed))
+
+    def _advance_by_torch(self, action: Any) -> StepResult:
+        """Carry out a decision in the simulation of which the compiled steps are a copy."""
+        assert self._episode is not None
+        given = read_actions(self.world.clock.action, torch.as_tensor(np.asarray(action))[None], 1)
+        self._between = False
+        watched = self.world.clock.stride > 1 and (self._recorder or self._display.is_window)
+        return advance(self.world, self._episode, given, watch=self._watch if watched else None)
 
     def _watch(self, episode: Episode) -> None:
         """Render the ticks within a decision; its last one is rendered after it."""

@@ -24,6 +24,7 @@ from rare_envs.envs.info import Info
 from rare_envs.envs.rendering import Renderer
 from rare_envs.make import set_up
 from rare_envs.sensors.kinds import map_kinds
+from rare_envs.simulation.compiled.scripted_step import find_scripted_step
 from rare_envs.simulation.decision import advance
 from rare_envs.simulation.episode import Episode
 from rare_envs.simulation.observation import observe
@@ -58,6 +59,7 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         num_envs: int = 1,
         render_mode: str | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
+        core: str = "auto",
         **kwargs: Any,
     ) -> None:
         """Make the batch.
@@ -67,6 +69,8 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
             num_envs: Number of scenarios.
             render_mode: None or "rgb_array" (one image for each scenario).
             autoreset_mode: Gymnasium's, or its value: "SameStep", "NextStep" or "Disabled".
+            core: What carries out the steps, "torch" or "numba" (compiled, for scripted scenarios); "auto" for the
+                compiled ones where they can be had. They differ by rounding.
             **kwargs: See `rare_envs.make.set_up`.
 
         Raises:
@@ -93,6 +97,7 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         """Episodes that are over and were not replaced yet."""
         self._episode: Episode | None = None
         self._renderer: Renderer | None = None
+        self._compiled = find_scripted_step(self.world, core)
 
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
@@ -160,8 +165,15 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         started = self._replace(np.flatnonzero(fresh)) if fresh.any() else None
         with torch.inference_mode():
             ignored = torch.from_numpy(fresh) if fresh.any() else None
-            given = read_actions(self.world.clock.action, torch.as_tensor(np.asarray(actions)), self.num_envs, ignored)
-            episode, terms = advance(self.world, self._episode, given)
+            moved = (
+                None if self._compiled is None else self._compiled.advance(self._episode, clear_rows(actions, fresh))
+            )
+            if moved is None:
+                given = torch.as_tensor(np.asarray(actions))
+                given = read_actions(self.world.clock.action, given, self.num_envs, ignored)
+                episode, terms = advance(self.world, self._episode, given)
+            else:
+                episode, terms = moved.episode, moved.terms
             if started is not None:  # which do not move in the step that starts them
                 episode = merge_rows(episode, torch.from_numpy(np.flatnonzero(fresh)), started)
             reward = terms.total.double().numpy()
@@ -170,16 +182,29 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
         self._tick += np.where(fresh, 0, self.world.clock.stride)
         terminated = episode.collided.numpy() & ~fresh
         truncated = (self._tick >= self.world.clock.ticks) & ~terminated & ~fresh
-        observation, infos = self._finish(terms, terminated | truncated, fresh)
+        features = None if moved is None or started is not None else moved.features
+        observation, infos = self._finish(terms, terminated | truncated, fresh, features)
         return observation, reward, terminated.copy(), truncated, infos
 
     def _finish(
-        self, terms: RewardTerms, done: NDArray[np.bool_], fresh: NDArray[np.bool_]
+        self,
+        terms: RewardTerms,
+        done: NDArray[np.bool_],
+        fresh: NDArray[np.bool_],
+        features: NDArray[np.float32] | None,
     ) -> tuple[NDArray[np.float32], Info]:
-        """Return observations and infos after a step, and replace what ended if that is to be in the same step."""
+        """Return observations and infos after a step, and replace what ended if that is to be in the same step.
+
+        Args:
+            terms: Of the reward.
+            done: Episodes that have ended in the step.
+            fresh: Those that it has started.
+            features: The observation `features`, where it is known already.
+        """
         assert self._episode is not None
         episode, infos, everyone = self._episode, Info(), np.ones(self.num_envs, dtype=bool)
-        observation = self._observe(episode)
+        known: Any = features if self.world.sensing.observation == "features" else None
+        observation = self._observe(episode) if known is None else known
         if self._mode != AutoresetMode.SAME_STEP:
             self._ended = done.copy()
             infos.update(self._info(episode, everyone))
@@ -290,6 +315,20 @@ class DrivingVectorEnv(VectorEnv[NDArray[np.float32], NDArray[Any], NDArray[Any]
             self._renderer = Renderer(self.world, False, self.metadata["render_fps"])
         episode, draw, dt = self._episode, self._renderer.draw, self.world.clock.dt
         return tuple(draw(episode, self._tick[row] * dt, row).copy() for row in range(self.num_envs))
+
+
+def clear_rows(actions: Any, rows: NDArray[np.bool_]) -> NDArray[Any]:
+    """Return actions with 0 in some rows, boolean (B,); those of another number of rows as they are.
+
+    Example:
+        >>> clear_rows([[1.0, 0.5], [1.0, 0.5]], np.array([True, False])).tolist()
+        [[0.0, 0.0], [1.0, 0.5]]
+    """
+    cleared: NDArray[Any] = np.asarray(actions)
+    if rows.any() and cleared.shape[:1] == rows.shape:
+        cleared = cleared.copy()
+        cleared[rows] = 0
+    return cleared
 
 
 def read_autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:

@@ -132,4 +132,5 @@ def total_of(reward: Any) -> Tensor:
 
 def terms_of(reward: Any) -> dict[str, Tensor]:
     """Return the terms of a reward by name; one, "reward", if it has none."""
-    return dict(reward._asdict()) if isinstance(reward, SummedTerms) else {"reward": reward}
+    has_terms = type(reward) is RewardTerms or isinstance(reward, SummedTerms)  # the first is usual, and fast
+    return dict(reward._asdict()) if has_terms else {"reward": reward}

@@ -24,7 +24,7 @@ TIME_GAP = 1.0
 """To which the way of this time [s] is added; like the other weights our choice."""
 COLLISION_COST = 30.0
 """Cost of a collision, about what a long undisturbed drive is worth under usual discounting."""
-_LEAST_CLOSING = 1e-4
+LEAST_CLOSING = 1e-4
 """Closing speeds are floored here [m/s], so that the time to collision of who does not close is long and finite."""
 
 
@@ -80,7 +80,7 @@ def reward_terms(episode: Episode, action: Tensor) -> RewardTerms:
     offset = offset - torch.round(offset / width) * width  # off the road, as if lanes went on
     effort = action / action.new_tensor([MAX_ACCELERATION, MAX_STEERING])
     gap = lead.gap.clamp(min=0.0)
-    ttc = gap / lead.closing_speed.clamp(min=_LEAST_CLOSING)
+    ttc = gap / lead.closing_speed.clamp(min=LEAST_CLOSING)
     return RewardTerms(
         progress=(along / TARGET_SPEED).clamp(0.0, 1.0),
         comfort=-EFFORT_WEIGHT * effort.square().sum(dim=1),

@@ -1,9 +1,12 @@
-"""Reasons why torch has to simulate."""
+"""Choices of what simulates, and reasons why torch has to."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 from rare_envs.plugins import one_line
+
+CORES = ("auto", "torch", "numba")
+"""Choices of what simulates."""
 
 
 class NotCompiled(ValueError):
@@ -12,6 +15,19 @@ class NotCompiled(ValueError):
 
 class CompilerFails(NotCompiled):
     """numba is installed, but does not work here."""
+
+
+def check_core(core: str) -> None:
+    """Raise a ValueError if there is no such core.
+
+    Example:
+        >>> check_core("jax")
+        Traceback (most recent call last):
+            ...
+        ValueError: Expected core to be one of 'auto', 'torch', 'numba', got 'jax'.
+    """
+    if core not in CORES:
+        raise ValueError(f"Expected core to be one of {', '.join(map(repr, CORES))}, got {core!r}.")
 
 
 @contextmanager

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -111,6 +111,21 @@ def find_compiled_rollout(world: World, ego: CompiledEgo) -> CompiledRollout | H
             raise NotCompiled(obstacle)
     _import_compiler()
     return CompiledRollout(_find_script(scenario), ego, scenario.road, clock.dt, clock.ticks)
+
+
+def find_compiled_script(world: World) -> str:
+    """Return the name of the compiled script that an environment's world follows, with statistics or without.
+
+    Raises:
+        NotCompiled: It follows none, or numba is missing.
+        CompilerFails: numba cannot be used here.
+    """
+    plain = replace(world, measurement=replace(world.measurement, statistics=False))
+    obstacle = "worlds with drivers are not compiled" if world.background is not None else _find_obstacle(plain)
+    if obstacle or world.uses_lidar or "camera" in world.sensing.kinds:
+        raise NotCompiled(obstacle or f"the observation {world.sensing.observation!r} is not compiled")
+    _import_compiler()
+    return _find_script(world.scenario)
 
 
 def _find_policy_obstacle(world: World, policy: DensePolicy | DenseDriver) -> str:

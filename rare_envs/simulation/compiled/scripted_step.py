@@ -1,0 +1,165 @@
+"""Steps of environments of scripted scenarios, compiled: a decision of one tick for a whole batch in one call."""
+
+from __future__ import annotations
+
+import warnings
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from rare_envs.control.actions import DISCRETE_ACTIONS, MAX_ACCELERATION, MAX_STEERING
+from rare_envs.measures import Moment
+from rare_envs.scenarios.cut_in import CUTTER_IDM
+from rare_envs.simulation.compiled.failures import CompilerFails, NotCompiled, check_core, compiler_failures
+from rare_envs.simulation.compiled.selection import find_compiled_script
+from rare_envs.simulation.episode import Episode
+from rare_envs.simulation.reward import RewardTerms
+from rare_envs.traffic.lead import Lead
+from rare_envs.traffic.state import State
+
+if TYPE_CHECKING:
+    from rare_envs.simulation.world import World
+
+SCALES = np.array([MAX_ACCELERATION, MAX_STEERING], dtype=np.float32)
+"""Acceleration [m/s^2] and steering angle [rad] of an action of 1."""
+
+
+class CompiledStep(NamedTuple):
+    """Result of a decision in B episodes; see `rare_envs.simulation.decision.StepResult`."""
+
+    episode: Episode
+    terms: RewardTerms
+    features: NDArray[np.float32]
+    """The observation `features`, shape (B, F)."""
+
+
+class ScriptedStep:
+    """Compiled steps of a world.
+
+    Example:
+        >>> from rare_envs.scenarios.car_following import CAR_FOLLOWING
+        >>> from rare_envs.simulation import World
+        >>> world = World(CAR_FOLLOWING).with_statistics()
+        >>> step = find_scripted_step(world)
+        >>> moved = step.advance(world.start(torch.tensor([[20.0, 15.0, 30.0]])), np.zeros((1, 2), np.float32))
+        >>> round(float(moved.episode.lead.gap), 2), round(float(moved.terms.total), 2)
+        (29.5, 0.92)
+    """
+
+    def __init__(self, world: World) -> None:
+        """Take the numbers of a world.
+
+        Raises:
+            NotCompiled: Its steps are not compiled, or numba is missing.
+            CompilerFails: numba cannot be used here.
+        """
+        script = find_compiled_script(world)
+        if world.clock.stride != 1:
+            raise NotCompiled("decisions of several ticks are not compiled")
+        with compiler_failures():
+            from rare_envs.simulation.compiled import tick_kernel
+            from rare_envs.simulation.compiled.compilation import single
+            from rare_envs.simulation.compiled.equations import IDMNumbers, RoadNumbers
+
+            scripts = {
+                "car_following": tick_kernel.CAR_FOLLOWING_SCRIPT,
+                "cut_in": tick_kernel.CUT_IN_SCRIPT,
+                "hard_brake": tick_kernel.HARD_BRAKE_SCRIPT,
+            }
+            road, dt = world.scenario.road, world.clock.dt
+            self._numbers = (IDMNumbers.of(CUTTER_IDM), RoadNumbers.of(road), single(dt)[0])
+            self._number, self._dt = scripts[script], dt
+            self._try(world)
+
+    def _try(self, world: World) -> None:
+        """Compile, or load what was compiled, by a tick of one episode."""
+        low = [parameter.low for parameter in world.scenario.column_parameters]
+        with torch.inference_mode():
+            episode = world.with_statistics().start(torch.tensor([low]))
+        self.advance(episode, np.zeros((1, 2), dtype=np.float32))
+
+    def advance(self, episode: Episode, action: NDArray[Any]) -> CompiledStep | None:
+        """Carry out a decision.
+
+        Args:
+            episode: B episodes.
+            action: Of the ego, in [-1, 1], shape (B, 2), or numbers of discrete actions, shape (B,).
+
+        Returns:
+            The episodes a tick later, and the reward; None for an action that has to be refused, and for episodes in
+            which vehicles were commanded.
+        """
+        from rare_envs.simulation.compiled.tick_kernel import tick_scripted  # not kept: a step is copied and sent
+
+        old, statistics = episode.state, episode.statistics
+        physical = scale_actions(action, len(old.x))
+        if physical is None or episode.overridden is not None or statistics is None:
+            return None
+        traffic = np.stack([field.numpy() for field in old[:4]])
+        theta, f, collided = old.theta.numpy(), episode.measure_state.numpy(), episode.collided.numpy()
+        if traffic.dtype != np.float32 or f.dtype != np.float32:
+            return None
+        contiguous = np.ascontiguousarray
+        theta = contiguous(theta) if theta.shape[1] else traffic[0]
+        cutter, road, dt = self._numbers
+        before = contiguous(collided)
+        ticked = tick_scripted(self._number, traffic, theta, physical, contiguous(f), before, cutter, road, dt)
+        tensor = torch.from_numpy
+        x, y, heading, speed = map(tensor, ticked.traffic)
+        state, lead = State(x, y, heading, speed, old.theta), Lead(*map(tensor, ticked.lead))
+        least, now = tensor(ticked.f), tensor(ticked.collided)
+        if ticked.eventful:
+            moment = Moment(state, lead, episode.road, None, old, self._dt)
+            statistics = statistics.update(moment, episode.collided, now, least)
+        else:
+            statistics = statistics._replace(least_ttc=least)
+        episode = episode._replace(state=state, lead=lead, measure_state=least, collided=now, statistics=statistics)
+        return CompiledStep(episode, RewardTerms(*map(tensor, ticked.terms)), ticked.features)
+
+
+def find_scripted_step(world: World, core: str = "auto") -> ScriptedStep | None:
+    """Return the compiled steps of a world; None where torch has to carry them out.
+
+    Args:
+        world: With statistics or without.
+        core: "torch" for none, "auto" for compiled ones where they can be had, "numba" for an error elsewhere.
+
+    Raises:
+        ValueError: There is no such core, or "numba" cannot carry out these steps.
+    """
+    check_core(core)
+    if core == "torch":
+        return None
+    try:
+        return ScriptedStep(world)
+    except NotCompiled as reason:
+        if core == "numba":
+            raise ValueError(f"core='numba' cannot simulate this: {reason}.") from reason
+        if isinstance(reason, CompilerFails):
+            warnings.warn(f"{reason}; torch simulates, which is slower.", stacklevel=3)
+    return None
+
+
+def scale_actions(action: NDArray[Any], batch: int) -> NDArray[np.float32] | None:
+    """Return accelerations [m/s^2] and steering angles [rad], shape (B, 2); None for what `to_physical` refuses.
+
+    Args:
+        action: In [-1, 1], shape (B, 2), or numbers of `DISCRETE_ACTIONS`, shape (B,).
+        batch: B.
+
+    Example:
+        >>> scale_actions(np.array([[1.0, -2.0]]), 1).tolist(), scale_actions(np.array([[0.0, np.nan]]), 1)
+        ([[5.0, -0.10000000149011612]], None)
+    """
+    if action.shape == (batch,) and action.dtype.kind in "iu":
+        if action.min() < 0 or action.max() >= len(DISCRETE_ACTIONS):
+            return None
+        action = DISCRETE_ACTIONS[action]
+    if action.shape != (batch, 2) or action.dtype.kind not in "fiu":
+        return None
+    action = action.astype(np.float32)
+    if not np.isfinite(action).all():
+        return None
+    return np.asarray(action.clip(-1.0, 1.0) * SCALES, dtype=np.float32)

@@ -1,0 +1,141 @@
+"""Compiled steps of environments against those of torch: whole episodes with their observations, rewards and infos."""
+
+import importlib.util
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode
+
+import rare_envs  # noqa: F401  (registers its ids)
+from rare_envs.simulation.compiled.scripted_step import find_scripted_step, scale_actions
+
+IDS = ("CarFollowing-v0", "CutIn-v0", "CutIn-v1", "HardBrake-v0")
+
+
+def flat(info, prefix=""):
+    """Return the numbers of an info by name."""
+    found = {}
+    for name, value in info.items():
+        if isinstance(value, dict):
+            found.update(flat(value, f"{prefix}{name}."))
+        else:
+            found[prefix + name] = value
+    return found
+
+
+def assert_same(info, expected, tolerance=1e-5):
+    info, expected = flat(info), flat(expected)
+    assert info.keys() == expected.keys()
+    for name, value in expected.items():
+        if np.asarray(value).dtype.kind == "f":
+            assert np.allclose(info[name], value, rtol=1e-5, atol=tolerance, equal_nan=True), name
+        else:
+            assert np.array_equal(info[name], value), name
+
+
+@pytest.mark.parametrize("observation", ["features", "kinematics"])
+@pytest.mark.parametrize("env_id", IDS)
+def test_episodes_are_those_of_torch(env_id, observation):
+    compiled, reference = (
+        gym.make(f"rare_envs/{env_id}", observation=observation, core=core) for core in ("numba", "torch")
+    )
+    ends, rng = set(), np.random.default_rng(0)
+    for seed in range(6):
+        for env in (compiled, reference):
+            observed, _ = env.reset(seed=seed)
+        mean, over = np.array([(-0.3, 0.9, 0.2)[seed % 3], (0.0, 0.01, 0.4)[seed % 3]]), False
+        while not over:
+            action = rng.normal(mean, 0.05).clip(-1, 1).astype(np.float32)
+            observed, reward, terminated, truncated, info = compiled.step(action)
+            expected, expected_reward, *ends_expected, expected_info = reference.step(action)
+            assert [terminated, truncated] == ends_expected
+            assert observed.dtype == expected.dtype and np.allclose(observed, expected, atol=1e-5)
+            assert reward == pytest.approx(expected_reward, abs=1e-5)
+            assert_same(info, expected_info)
+            over = terminated or truncated
+        ends.add(info["collision_type"])
+        assert compiled.unwrapped._episode.state.x.shape == reference.unwrapped._episode.state.x.shape
+        assert np.allclose(compiled.unwrapped._episode.state.x, reference.unwrapped._episode.state.x, atol=1e-4)
+    assert len(ends) >= 2
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP])
+def test_batches_are_those_of_torch(mode):
+    compiled, reference = (
+        gym.make_vec("rare_envs/CutIn-v0", num_envs=16, horizon=4.0, autoreset_mode=mode, core=core)
+        for core in ("numba", "torch")
+    )
+    rng, ended = np.random.default_rng(0), 0
+    for env in (compiled, reference):
+        env.reset(seed=1)
+    for _ in range(60):
+        actions = rng.normal((0.5, 0.1), 0.2, (16, 2)).clip(-1, 1).astype(np.float32)
+        *found, info = compiled.step(actions)
+        *expected, expected_info = reference.step(actions)
+        for value, other in zip(found, expected, strict=True):
+            assert np.allclose(value, other, atol=1e-4)
+        for infos in (info, expected_info):
+            infos["final_obs"] = np.array([row for row in infos.get("final_obs", ()) if row is not None], np.float32)
+        assert_same(info, expected_info, 1e-4)
+        ended += int(found[2].sum())
+    assert ended > 3
+
+
+def test_actions_are_refused_as_by_torch():
+    env = gym.make("rare_envs/CarFollowing-v0").unwrapped
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="NaN or infinite actions"):
+        env.step(np.array([np.nan, 0.0]))
+    with pytest.raises(ValueError, match="Expected an action of shape"):
+        env.step(np.zeros(3))
+
+
+@pytest.mark.parametrize(
+    ("action", "expected"),
+    [
+        (np.array([[2.0, -1.0]]), [[5.0, -0.1]]),
+        (np.array([[1, 0]]), [[5.0, 0.0]]),
+        (np.array([0]), [[-5.0, 0.0]]),
+        (np.array([5]), None),
+        (np.array([-1]), None),
+        (np.array([0.0]), None),
+        (np.array([[np.inf, 0.0]]), None),
+        (np.zeros((2, 2)), None),
+        (np.array([["a", "b"]]), None),
+    ],
+)
+def test_actions_in_physical_units(action, expected):
+    found = scale_actions(action, 1)
+    assert (found is None) == (expected is None)
+    assert expected is None or np.allclose(found, expected)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "arguments"),
+    [
+        ("Highway-v0", {}),
+        ("CutIn-v0", {"action": "meta"}),
+        ("CutIn-v0", {"observation": "lidar"}),
+        ("CutIn-v0", {"measure": "thw"}),
+        ("CutIn-v0", {"drivers": "mgail"}),
+    ],
+)
+def test_other_worlds_are_stepped_by_torch(env_id, arguments):
+    env = gym.make(f"rare_envs/{env_id}", **arguments).unwrapped
+    assert find_scripted_step(env.world) is None and env._compiled is None
+    with pytest.raises(ValueError, match="core='numba' cannot simulate this"):
+        find_scripted_step(env.world, "numba")
+
+
+def test_steps_are_compiled_unless_torch_is_asked_for():
+    assert gym.make("rare_envs/CutIn-v0").unwrapped._compiled is not None
+    assert gym.make("rare_envs/CutIn-v0", core="torch").unwrapped._compiled is None
+    with pytest.raises(ValueError, match="Expected core to be one of 'auto', 'torch', 'numba', got 'jax'"):
+        gym.make("rare_envs/CutIn-v0", core="jax")
+
+
+def test_without_numba_torch_carries_out_the_steps(monkeypatch):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "numba" else find(name))
+    assert gym.make("rare_envs/CutIn-v0").unwrapped._compiled is None
