@@ -120,9 +120,21 @@ class BetaDistribution:
         return np.where(below < 0.5, special.ndtri(below), -special.ndtri(above))
 
     def from_standard_normal(self, u: FloatArray) -> FloatArray:
-        """Map from standard normal space, (n, d) -> (n, d)."""
+        """Map from standard normal space, (n, d) -> (n, d).
+
+        What stands in the first row as well is not computed again: differences move few coordinates of many.
+        """
         u = np.asarray(u)
-        tail = special.ndtr(-np.abs(u))
-        left, right = special.betaincinv(self.alpha, self.beta, tail), special.betaincinv(self.beta, self.alpha, tail)
-        width = self.high - self.low
-        return np.where(u < 0.0, self.low + width * left, self.high - width * right)
+        if not len(u):
+            return np.empty(u.shape)
+        anew = u != u[:1]
+        anew[0] = True
+        rows, columns = np.nonzero(anew)
+        chosen, alpha, beta = u[rows, columns], self.alpha[columns], self.beta[columns]
+        left = chosen < 0.0
+        shapes = np.where(left, alpha, beta), np.where(left, beta, alpha)
+        part = (self.high - self.low)[columns] * special.betaincinv(*shapes, special.ndtr(-np.abs(chosen)))
+        values = np.where(left, self.low[columns] + part, self.high[columns] - part)
+        x = np.tile(values[: self.dim], (len(u), 1))
+        x[rows, columns] = values
+        return x

@@ -49,3 +49,14 @@ def test_what_is_no_distribution_is_refused(arguments: tuple[list[float], ...], 
         BetaDistribution(*arguments)
     with pytest.raises(ValueError, match="no beta, low, high"):
         BetaDistribution.from_dict({"alpha": [1.0]})
+
+
+def test_rows_that_repeat_the_first_are_mapped_as_alone():
+    rng = np.random.default_rng(5)
+    shapes = rng.uniform(1.0, 5.0, (2, 6))
+    distribution = BetaDistribution(*shapes, np.full(6, -2.0), np.full(6, 3.0))
+    u = np.repeat(3.0 * rng.standard_normal((1, 6)), 9, axis=0)
+    u[2, 1], u[4, 3:], u[6, 0] = 0.0, rng.standard_normal(3), np.inf
+    alone = np.concatenate([distribution.from_standard_normal(row[None]) for row in u])
+    assert np.array_equal(distribution.from_standard_normal(u), alone)
+    assert distribution.from_standard_normal(u[:0]).shape == (0, 6)
