@@ -22,7 +22,7 @@ from rare_envs.traffic.state import State
 if TYPE_CHECKING:
     from rare_envs.simulation.world import World
 
-SCALES = np.array([MAX_ACCELERATION, MAX_STEERING], dtype=np.float32)
+ACTION_SCALES = np.array([MAX_ACCELERATION, MAX_STEERING], dtype=np.float32)
 """Acceleration [m/s^2] and steering angle [rad] of an action of 1."""
 
 
@@ -162,4 +162,4 @@ def scale_actions(action: NDArray[Any], batch: int) -> NDArray[np.float32] | Non
     action = action.astype(np.float32)
     if not np.isfinite(action).all():
         return None
-    return np.asarray(action.clip(-1.0, 1.0) * SCALES, dtype=np.float32)
+    return np.asarray(action.clip(-1.0, 1.0) * ACTION_SCALES, dtype=np.float32)
