@@ -63,7 +63,7 @@ def read_vision_provenance(path: str | PathLike[str]) -> Provenance:
     Example:
         >>> from importlib import resources
         >>> read_vision_provenance(resources.files("agents") / "data" / "vision.safetensors").kind
-        'imitation of a driver by rule with on-policy corrections (DAgger)'
+        'imitation of a driver by rule with on-policy corrections (DAgger), corrected'
     """
     header, _ = read_file(Path(path), _ENTRY)
     require(header, (f.name for f in fields(Provenance)), Path(path))

@@ -34,7 +34,7 @@ PAGE_METHODS = ("two-stage", "adss")
 PAGE_BASES = {"rare_envs/CarFollowing-v0": "us101-gap"}
 """Base distributions in place of the default, where collisions are too rare under that to compare egos."""
 MOST = {"vision": 1500}
-"""Simulations of one run; the others get what the methods take by themselves."""
+"""Simulations of one run at most; the others get what the methods take by themselves."""
 NARROW = 400
 """Width of the pictures [pixels]."""
 HEAD = """# The shipped egos, everywhere
@@ -49,7 +49,8 @@ intervals are those of sampling; the events behind a base distribution leave p o
 for car-following: under its default, `us101`, `idm` has 7.4e-11 and in 6,000 simulations of `imitation` nothing fails;
 `us101-gap` is a test distribution under which egos and methods can be compared.
 
-`vision` has {most:,} simulations at most, which take a quarter of an hour. {missing}
+`vision` has {most:,} simulations at most, which take a quarter of an hour of a core, by the first method only since
+its correction ([camera](camera.md#the-ego-vision)). {missing}
 Rows of 100,000 steps are of short trainings and do not compare with those of 400,000: `ppo` in `HardBrake-v0` still
 crashes in a fifth of the brakings, where one of 400,000 steps crashed in 8e-05 under an earlier base of that scenario.
 Wall times are from a busy machine of two cores, shared with more or less other work. In the older pictures crashed
