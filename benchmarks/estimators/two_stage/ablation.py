@@ -50,6 +50,8 @@ ABLATIONS: dict[str, Mapping[str, Any]] = {
     "half-spaces through edges": _without_kinds("half-space"),
     "half-spaces of the regression": _without_kinds("linear"),
     "radial components": _without_kinds("radial"),
+    "directional component": _without_kinds("directional"),
+    "slopes": {"slopes.min_dim": 10**9},
     "components of the exploration": _without_kinds("explored"),
     "tempered Gaussians": _without_kinds("tempered"),
     "screen": {"mixture.screening.min_class_size": 10**9},
