@@ -130,7 +130,9 @@ def test_a_car_following_base_is_fitted_to_the_data_of_coifman_and_li(simulated,
     assert result.exit_code == 0, result.output
     check_bases(tmp_path, ("car_following",))
     result = run_cli("--coifman", path, "--out", tmp_path, "--scenario", "cut_in")  # no lateral offset
-    assert result.exit_code == 2 and len(result.stderr.splitlines()) == 1
+    read, events, error = result.stderr.splitlines()  # two of progress, one of the error
+    assert result.exit_code == 2 and "too few" in error
+    assert "rows read" in read and events == "cut_in: 17 events; fitting"
 
 
 def test_a_hard_brake_base_is_fitted_to_brakings_to_a_standstill(quick, tmp_path):
