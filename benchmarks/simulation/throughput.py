@@ -164,6 +164,7 @@ def batch_step_ratio(steps: int, num_envs: int = 256) -> dict[str, float]:
         for action in actions:
             batch.step(action)
 
+    drive_batch()  # compiles, and reads what new episodes are drawn from
     pairs = [
         (num_envs * steps / seconds(drive_batch), steps / seconds(lambda: _drive_env(theirs, steps))) for _ in range(3)
     ]
