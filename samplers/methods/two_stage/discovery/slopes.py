@@ -56,7 +56,7 @@ def find_slopes(
         points = _choose_unexplained(exploration, size, gamma, axes)
         more = yield from _differentiate(simulator, points, settings.step)
         slopes = np.concatenate([slopes, more])
-        if ((more @ axes) ** 2).sum() >= settings.nearly_all * len(more):
+        if ((more @ axes) ** 2).sum() >= settings.explained * len(more):
             break
     return _leading_directions(slopes, settings) if _have_few_directions(slopes, settings) else None
 
@@ -98,12 +98,15 @@ def _differentiate(simulator: Simulator, u: FloatArray, step: float) -> Simulati
 
 
 def _have_few_directions(slopes: FloatArray, settings: SlopeSettings) -> bool:
-    """Return whether nearly all of the unit gradients (k, d) lies in fewer directions than there are gradients."""
-    if len(slopes) < settings.least:
+    """Return whether unit gradients (k, d) lie in fewer directions than random ones would.
+
+    Of k random directions the squares of the singular values are worth k d / (k + d) equal ones: (sum s^2)^2 / sum s^4.
+    """
+    k, dim = slopes.shape
+    if k < settings.least:
         return False
-    parts = np.linalg.svd(slopes, compute_uv=False) ** 2 / len(slopes)
-    needed = 1 + int(np.searchsorted(parts.cumsum(), settings.nearly_all))
-    return needed <= settings.few * len(slopes)
+    squares = np.linalg.svd(slopes, compute_uv=False) ** 2
+    return bool(squares.sum() ** 2 / (squares**2).sum() <= settings.few * k * dim / (k + dim))
 
 
 def _leading_directions(slopes: FloatArray, settings: SlopeSettings) -> FloatArray:

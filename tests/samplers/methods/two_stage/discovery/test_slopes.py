@@ -63,7 +63,7 @@ def test_one_direction_is_found_where_f_is_flat_on_one_side(flat, rng, drive):
 
 def test_a_shell_has_no_few_directions(rng, drive):
     """The search ends after half of the gradients."""
-    axes, n_sim = slopes_of(lambda u: 6.5 - np.linalg.norm(u, axis=1), 20, 1.1 * np.ones(20), rng, drive)
+    axes, n_sim = slopes_of(lambda u: 5.5 - np.linalg.norm(u, axis=1), 20, np.zeros(20), rng, drive)
     assert axes is None
     assert n_sim == 10 * 21
 
