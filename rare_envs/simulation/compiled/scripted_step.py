@@ -56,8 +56,8 @@ class ScriptedStep:
             CompilerFails: numba cannot be used here.
         """
         script = find_compiled_script(world)
-        if world.clock.stride != 1:
-            raise NotCompiled("decisions of several ticks are not compiled")
+        if world.clock.action == "meta":
+            raise NotCompiled("meta-actions are not compiled")
         with compiler_failures():
             from rare_envs.simulation.compiled import tick_kernel
             from rare_envs.simulation.compiled.compilation import single

@@ -116,6 +116,7 @@ def test_actions_in_physical_units(action, expected):
     [
         ("Highway-v0", {}),
         ("CutIn-v0", {"action": "meta"}),
+        ("CutIn-v0", {"action": "meta", "dt": 1.0}),  # one tick long
         ("CutIn-v0", {"observation": "lidar"}),
         ("CutIn-v0", {"measure": "thw"}),
         ("CutIn-v0", {"drivers": "mgail"}),
