@@ -102,11 +102,9 @@ def _format_overview(result: Mapping[str, Any]) -> list[str]:
 def _format_pooled(method: str, budget: int, cells: Sequence[Mapping[str, Any]]) -> str:
     """Return the row of a method's runs on several problems."""
     runs = sum(cell["runs"] for cell in cells)
-    shares = {
-        name: sum((cell[name] or 0.0) * cell["runs"] for cell in cells) / runs
-        for name in ("coverage", "below", "warned")
-    }
+    shares = {name: sum(cell[name] * cell["runs"] for cell in cells) / runs for name in ("coverage", "below")}
     raised = sum(cell["raised"] for cell in cells) / runs
+    warned = sum((cell["warned"] or 0.0) * (cell["runs"] - cell["raised"]) for cell in cells) / runs  # of those that end
     low, high = clopper_pearson(round(shares["coverage"] * runs), runs, 0.95)
     above = max(0.0, 1.0 - shares["coverage"] - shares["below"] - raised)
     values = [
@@ -114,7 +112,7 @@ def _format_pooled(method: str, budget: int, cells: Sequence[Mapping[str, Any]])
         f"{budget:,}",
         f"{sum(bool(cell['faults']) for cell in cells)} of {len(cells)}",
         f"{100 * shares['coverage']:.0f} ({100 * low:.0f} to {100 * high:.0f})",
-        *(f"{100 * share:.0f}" for share in (shares["below"], above, raised, shares["warned"])),
+        *(f"{100 * share:.0f}" for share in (shares["below"], above, raised, warned)),
     ]
     return f"| {' | '.join(values)} |"
 

@@ -47,7 +47,7 @@ def test_all_problems_of_a_set_together_by_hand() -> None:
     second.update(runs=6, coverage=1.0, below=0.0, raised=0, warned=None, faults=[])
     assert "| mc | 500 | 1 of 2 | 90 (55 to 100) | 10 | 0 | 0 | 20 |" in format_leaderboard(result).splitlines()
     first.update(coverage=0.25, below=0.0, raised=3, faults=["raised"])
-    assert "| mc | 500 | 1 of 2 | 70 (35 to 93) | 0 | 0 | 30 | 20 |" in format_leaderboard(result).splitlines()
+    assert "| mc | 500 | 1 of 2 | 70 (35 to 93) | 0 | 0 | 30 | 5 |" in format_leaderboard(result).splitlines()
 
 
 def test_only_the_worst_problems_are_shown_where_that_is_asked_for() -> None:
