@@ -104,7 +104,9 @@ def _format_pooled(method: str, budget: int, cells: Sequence[Mapping[str, Any]])
     runs = sum(cell["runs"] for cell in cells)
     shares = {name: sum(cell[name] * cell["runs"] for cell in cells) / runs for name in ("coverage", "below")}
     raised = sum(cell["raised"] for cell in cells) / runs
-    warned = sum((cell["warned"] or 0.0) * (cell["runs"] - cell["raised"]) for cell in cells) / runs  # of those that end
+    warned = (
+        sum((cell["warned"] or 0.0) * (cell["runs"] - cell["raised"]) for cell in cells) / runs
+    )  # of those that end
     low, high = clopper_pearson(round(shares["coverage"] * runs), runs, 0.95)
     above = max(0.0, 1.0 - shares["coverage"] - shares["below"] - raised)
     values = [

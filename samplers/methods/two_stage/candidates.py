@@ -1,5 +1,7 @@
 """Candidates: the components that a proposal may be mixed from, and the shares that minimise its variance."""
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.special import log_ndtr
 
@@ -181,7 +183,9 @@ def _set_floors(
     radial: bool,
     final: bool,
 ) -> list[Floor]:
-    """Return the least shares: of tempered Gaussians, radial components, each region and base draws.
+    """Return the least shares: of tempered Gaussians, spread and radial components, each region and base draws.
+
+    They add up to 1 at most: base draws keep theirs, which bounds all weights, the others are lowered in proportion.
 
     Args:
         state: What is known of the regions.
@@ -202,8 +206,11 @@ def _set_floors(
     if n > 1 and not state.scattered:
         share = settings.final_region_share if final else settings.region_share
         floors += [Floor((regions == k) & (kinds != "tempered"), share / n) for k in range(n)]
-    floors.append(Floor(kinds == "base", settings.noisy_base_share if state.noisy else settings.base_share))
-    return [floor for floor in floors if floor.members.any()]
+    base = settings.noisy_base_share if state.noisy else settings.base_share
+    floors = [floor for floor in floors if floor.members.any()]
+    fit = min(1.0, (1 - base) / max(sum(floor.least for floor in floors), base))
+    floors = [replace(floor, least=fit * floor.least) for floor in floors]
+    return [*floors, Floor(kinds == "base", base)] if "base" in kinds else floors
 
 
 def _smooth_indicators(

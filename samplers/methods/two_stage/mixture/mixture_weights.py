@@ -74,7 +74,8 @@ def raise_to_floors(a: FloatArray, floors: Sequence[Floor]) -> FloatArray:
     """Return weights (k,) raised to the floors, the others lowered in proportion; they add up to 1.
 
     Members of a floor keep their proportions; without any weight they share the floor evenly. Lowering may bring
-    another group under its floor, which is then raised too.
+    another group under its floor, which is then raised too. Floors that add up to more than 1 are lowered in
+    proportion.
 
     Example:
         >>> floor = Floor(np.array([True, True, False, False]), 0.2)
@@ -88,10 +89,10 @@ def raise_to_floors(a: FloatArray, floors: Sequence[Floor]) -> FloatArray:
             return a
         raised += low
         others = ~np.any([f.members for f in raised], axis=0)
-        rest = float(a[others].sum())
-        room = 1 - sum(f.least for f in raised)
+        rest, total = float(a[others].sum()), sum(f.least for f in raised)
+        room = max(1 - total, 0.0) if rest > 0 else 0.0
         a = np.where(others, a * (room / rest if rest > 0 else 0.0), a)
         for f in raised:
-            total = float(a[f.members].sum())
-            inside = a[f.members] / total if total > 0 else np.full(f.members.sum(), 1 / f.members.sum())
-            a[f.members] = inside * (f.least if rest > 0 else f.least / (1 - room))
+            own = float(a[f.members].sum())
+            inside = a[f.members] / own if own > 0 else np.full(f.members.sum(), 1 / f.members.sum())
+            a[f.members] = inside * (f.least if room > 0 else f.least / total)

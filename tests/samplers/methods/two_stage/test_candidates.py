@@ -115,6 +115,21 @@ def test_the_spread_has_a_share_while_draws_are_worth_little(exact_region, rng, 
     assert share(after, "spread") == pytest.approx(floor, abs=0.05)
 
 
+def test_base_draws_keep_their_share_where_all_floors_are_more_than_everything(exact_region, rng):
+    """Half for two regions, 40 % for the spread, 10 % and more for tempered Gaussians, 5 % of base draws: over 1."""
+    state, history, problem = sloped(exact_region, rng, regions=2)
+    drawn = build_proposal(state, history, SETTINGS, rng)
+    u, counts = drawn.draw(1000, rng)
+    history = history.add(ComponentDraws(drawn.components, counts, u, problem.evaluate(u)), 0.0)
+    few = NearDraws(np.concatenate([state.points, np.zeros((20 * len(state.points), 30))]), np.empty(0), np.empty(0))
+    few = few._replace(f=problem.evaluate(few.u), log_weights=np.zeros(len(few.u)))
+    after = build_proposal(replace(state, rounds=(few,), hit_rate=0.3), history, SETTINGS, rng)
+    assert few.worth(0.0) < SETTINGS.good_rate
+    assert share(after, "base") == pytest.approx(SETTINGS.base_share)
+    assert (after.weights >= 0).all()
+    assert share(after, "spread") > 0.3
+
+
 def test_candidates_of_a_linear_region(exact_region, rng):
     """One of each kind at least; the base distribution stands first, for its draws are counted."""
     state, history, _ = after_round(exact_region, rng)

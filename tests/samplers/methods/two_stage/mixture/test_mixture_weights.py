@@ -131,3 +131,18 @@ def test_several_floors_are_kept():
         assert a.sum() == pytest.approx(1.0, abs=1e-12)
         for floor in floors:
             assert a[floor.members].sum() >= 0.999 * floor.least
+
+
+@given(mixtures, st.floats(0.05, 2.0))
+def test_floors_of_more_than_everything_are_lowered_in_proportion(weights, total):
+    a = np.array(weights) / sum(weights)
+    floors = [
+        Floor(only(len(a), 0), 0.2 * total),
+        Floor(only(len(a), 1), 0.3 * total),
+        Floor(only(len(a), 2), 0.5 * total),
+    ]
+    raised = raise_to_floors(a, floors)
+    assert raised.sum() == pytest.approx(1.0, abs=1e-9)
+    assert (raised >= 0).all()
+    if total >= 1:
+        np.testing.assert_allclose(raised[:3], [0.2, 0.3, 0.5], atol=1e-9)
