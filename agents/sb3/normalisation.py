@@ -24,6 +24,8 @@ _NAMES = ("vecnormalize", "vec_normalize")
 """Names of files of statistics: Stable-Baselines3's callbacks and RL Zoo write the first, its examples the second."""
 _BEYOND = 1e-3
 """Observations beyond the bounds by less are rounding."""
+_STEP = 0.5
+"""A change of the observations of ordinary environments in one step is smaller; `VecNormalize` moves some by more."""
 _MIN_ROWS, _SPREAD, _CENTRE = 16, (0.3, 3.0), 1.5
 """From so many rows on, a standard deviation in this range and a mean of at most so much in every column are those of
 normalised observations: some of the environment's own vary by far less."""
@@ -138,7 +140,7 @@ def describe_missing_statistics(header: Mapping[str, Any], last: Any, own: Any, 
         >>> describe_missing_statistics({}, np.array([[0.5, 0.0]]), box, box)
         ''
     """
-    if header.get("_last_original_obs") is not None:
+    if _has_original_observations(header, last):
         return "its file says that it was trained behind VecNormalize"
     if not isinstance(expected, spaces.Box) or expected.dtype != np.float32 or len(expected.shape) != 1:
         return ""
@@ -156,9 +158,39 @@ def describe_missing_statistics(header: Mapping[str, Any], last: Any, own: Any, 
     return ""
 
 
-def open_last_observation(header: Mapping[str, Any]) -> Any:
-    """Return the last observations of a policy's training, normalised if they were; None where the file has none."""
-    entry = header.get("_last_obs")
+def _has_original_observations(header: Mapping[str, Any], last: Any) -> bool:
+    """Return whether a file keeps observations as they were before `VecNormalize`, beside the last ones.
+
+    Algorithms with a replay buffer fill that entry without `VecNormalize` too, by the observations one step earlier,
+    which are of the same scale as the last ones.
+    """
+    if header.get("_last_original_obs") is None or "learning_starts" not in header:
+        return header.get("_last_original_obs") is not None
+    original = open_last_observation(header, "_last_original_obs")
+    if isinstance(original, dict) and isinstance(last, dict):
+        return any(_is_rescaled(last[key], original[key]) for key in original.keys() & last.keys())
+    return _is_rescaled(last, original)
+
+
+def _is_rescaled(last: Any, original: Any) -> bool:
+    """Return whether most rows of `last` are far from those of `original`, in no column equal and other than 0."""
+    if not isinstance(last, np.ndarray) or not isinstance(original, np.ndarray) or last.shape != original.shape:
+        return False
+    if not last.size or last.dtype.kind != "f" or original.dtype.kind != "f":
+        return False
+    before, after = original.reshape(len(original), -1), last.reshape(len(last), -1)
+    kept = ((before == after) & (before != 0.0)).any(axis=1)
+    return bool(np.median(~kept & (np.abs(after - before).max(axis=1) > _STEP)) > 0.5)
+
+
+def open_last_observation(header: Mapping[str, Any], name: str = "_last_obs") -> Any:
+    """Return the last observations of a policy's training, normalised if they were; None where the file has none.
+
+    Args:
+        header: Settings of the file.
+        name: The entry; `_last_original_obs` are those before `VecNormalize`.
+    """
+    entry = header.get(name)
     try:
         return open_pickle(base64.b64decode(str(entry[":serialized:"]))) if isinstance(entry, dict) else None
     except Exception:  # nothing depends on it but a warning

@@ -109,11 +109,11 @@ class Report:
         """Doubts about p: of the method, about the base distribution, the ego's statistics, and f as a function."""
         base = self.estimate.base_uncertainty
         doubts = () if base is None else tuple(f"base distribution: {text}" for text in base.warnings)
-        return (*self.estimate.warnings, *doubts, *self._doubts_of_f)
+        return (*self.estimate.warnings, *doubts, *self.doubts_of_f)
 
     @property
-    def _doubts_of_f(self) -> tuple[str, ...]:
-        """Doubts about the ego's statistics, and f as a function."""
+    def doubts_of_f(self) -> tuple[str, ...]:
+        """Doubts about the ego's statistics, and f as a function; the estimate's own warnings are not among them."""
         again = (self.repeatability.warning,) if self.repeatability and self.repeatability.warning else ()
         return (*self._missing_statistics, *again)
 
@@ -146,7 +146,7 @@ class Report:
         if question.max_p is None:
             return None
         found = self.estimate.meets(question.max_p, question.given_base)
-        doubts = self._doubts_of_f  # the others are the estimate's own
+        doubts = self.doubts_of_f  # the others are the estimate's own
         if found.reason or not doubts:
             return found
         return replace(found, decision="undecided", reason=f"there is a warning: {doubts[0].rstrip('.')}")
@@ -223,6 +223,7 @@ class Report:
             "doubtful": self.doubtful,
             "notes": self.notes,
             "vec_normalize": self.vec_normalize,
+            "missing_statistics": self._missing_statistics[0] if self._missing_statistics else "",
             "seconds": self.seconds,
             "n_failures": failures.total,
             "kinds": {kind: share.to_dict() for kind, share in self.kinds.shares.items()},

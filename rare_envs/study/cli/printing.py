@@ -109,7 +109,7 @@ def print_report(report: Report, out: Path | None = None) -> None:
     if isinstance(report.sensitivity, samplers.Sensitivity):
         for line in indent_lines(report.sensitivity):
             console.print(line)
-    for warning in estimate.warnings:
+    for warning in (*estimate.warnings, *report.doubts_of_f):
         console.print(f"warning: {warning}", style="yellow")
     for remark in estimate.remarks:
         console.print(f"remark: {remark}")

@@ -138,11 +138,13 @@ def _describe_changes(study: LoadedStudy) -> list[str]:
 
 
 def list_doubts(result: Mapping[str, Any]) -> list[str]:
-    """Return all warnings of a run: of the method, of its base distribution, and of f as a function."""
+    """Return all warnings of a run: of the method, of its base distribution, of the ego's statistics, and of f."""
     doubts = [str(text) for text in result.get("warnings") or []]
     base = result.get("base_uncertainty")
     if isinstance(base, dict):
         doubts += [f"base distribution: {text}" for text in base.get("warnings") or []]
+    if result.get("missing_statistics"):
+        doubts.append(str(result["missing_statistics"]))
     again = result.get("repeatability")
     if isinstance(again, dict):
         warning = Repeatability(**again).warning

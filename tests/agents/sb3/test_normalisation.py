@@ -79,6 +79,21 @@ def test_an_ordinary_policy_raises_no_doubt(tmp_path: Path) -> None:
     assert ego.find_missing_statistics(ego.observation_space) == ""
 
 
+@pytest.mark.parametrize("num_envs", [1, 4])
+@pytest.mark.parametrize("normalised", [False, True])
+def test_a_file_with_a_replay_buffer_is_doubted_only_behind_vec_normalize(
+    normalised: bool, num_envs: int, tmp_path: Path
+) -> None:
+    """SAC and DQN fill `_last_original_obs` without `VecNormalize` too."""
+    env: Any = DummyVecEnv([lambda: gym.make(ENV)] * num_envs)
+    env = VecNormalize(env) if normalised else env
+    sb3.SAC("MlpPolicy", env, seed=0, device="cpu", learning_starts=1000, buffer_size=1000).learn(40).save(
+        tmp_path / "ego.zip"
+    )
+    found = load(tmp_path / "ego.zip").find_missing_statistics(env.observation_space)
+    assert ("trained behind VecNormalize" in found) is normalised and bool(found) is normalised
+
+
 def rare_envs_training(num_envs: int) -> Any:
     from training import sb3_vec_env
 

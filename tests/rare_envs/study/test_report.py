@@ -28,12 +28,15 @@ def test_the_result_names_the_statistics_that_were_applied(cli, tmp_path):
     import training
 
     env = VecNormalize(training.sb3_vec_env(FOLLOWING, 4))
-    PPO("MlpPolicy", env, n_steps=8, batch_size=32).save(tmp_path / "ego.zip")
+    PPO("MlpPolicy", env, n_steps=8, batch_size=32).learn(32).save(tmp_path / "ego.zip")
     words = ("estimate", FOLLOWING, "--ego", str(tmp_path / "ego.zip"), "--method", "mc", "--max-sim", "50", "--json")
-    assert json.loads(cli(*words).stdout)["vec_normalize"] is None
+    without = json.loads(cli(*words).stdout)
+    assert without["vec_normalize"] is None and "trained behind VecNormalize" in without["missing_statistics"]
+    assert "warning: the ego has no VecNormalize statistics" in cli(*words[:-1]).stdout
     env.save(str(tmp_path / "vecnormalize.pkl"))
     assert json.loads(cli(*words).stdout)["vec_normalize"] == str(tmp_path / "vecnormalize.pkl")
-    assert "normalised by" in cli(*words[:-1]).stdout
+    shown = cli(*words[:-1]).stdout
+    assert "normalised by" in shown and "warning: the ego has no" not in shown
 
 
 def test_noise_that_nobody_has_is_pointed_out(cli: Cli, risky: str) -> None:

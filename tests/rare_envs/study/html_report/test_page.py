@@ -155,6 +155,7 @@ def test_doubts_are_those_of_method_base_and_f() -> None:
     base = {"warnings": ["few events"]}
     found = list_doubts({"warnings": ["coarse"], "base_uncertainty": base, "doubtful": True})
     assert found == ["coarse", "base distribution: few events"]
+    assert list_doubts({"doubtful": True, "missing_statistics": "no statistics"}) == ["no statistics"]
     assert list_doubts({"doubtful": False}) == [] and len(list_doubts({"doubtful": True})) == 1
 
 
