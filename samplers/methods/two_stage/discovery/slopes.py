@@ -10,7 +10,10 @@ References:
     E[grad f grad f^T] over failures, there with gradients that the simulator gives).
 """
 
+from typing import NamedTuple
+
 import numpy as np
+from numpy.typing import NDArray
 
 from samplers.methods.two_stage.regions import ExplorationResult
 from samplers.methods.two_stage.settings import SlopeSettings
@@ -46,44 +49,74 @@ def find_slopes(
     n = min(int((settings.high_dim_share if short else settings.share) * room / (dim + 1)), settings.most)
     if dim < settings.min_dim or n < settings.least or exploration.noisy or not exploration.regions:
         return None
+    points = _collect_points(exploration, gamma, rng)
     first = max(n - n // 2, settings.least)
-    points = _choose_points(exploration, first, gamma, rng)
-    slopes = yield from _differentiate(simulator, points, settings.step)
+    chosen = np.argsort(points.turns, kind="stable")[:first]
+    slopes = yield from _differentiate(simulator, points.u[chosen], settings.step)
     for size in ((n - first + 1) // 2, (n - first) // 2):
         if not _have_few_directions(slopes, settings):
             return None
-        axes = _leading_directions(slopes, settings)
-        points = _choose_unexplained(exploration, size, gamma, axes)
-        more = yield from _differentiate(simulator, points, settings.step)
+        axes, points = _leading_directions(slopes, settings), points.leave_out(chosen)
+        chosen = _choose_unexplained(points, size, axes)
+        more = yield from _differentiate(simulator, points.u[chosen], settings.step)
         slopes = np.concatenate([slopes, more])
         if ((more @ axes) ** 2).sum() >= settings.explained * len(more):
             break
     return _leading_directions(slopes, settings) if _have_few_directions(slopes, settings) else None
 
 
-def _choose_points(exploration: ExplorationResult, n: int, gamma: float, rng: np.random.Generator) -> FloatArray:
-    """Return at most n points (k, d), in turn the end of a chain of each region and a point beside each.
+class _Points(NamedTuple):
+    """Where gradients may be made."""
 
-    f may be capped within a region or beside it; and where failure needs several things at once, a point beside it
-    lacks the one that all points inside may have in plenty.
+    u: FloatArray
+    """Shape (n, d)."""
+    fails: NDArray[np.bool_]
+    """Shape (n,)."""
+    turns: NDArray[np.int64]
+    """Number of the point among those of its region that fail, or do not, from 0, shape (n,)."""
+
+    def leave_out(self, chosen: NDArray[np.int64]) -> "_Points":
+        """Return the others."""
+        kept = np.setdiff1d(np.arange(len(self.u)), chosen)
+        return _Points(self.u[kept], self.fails[kept], self.turns[kept])
+
+
+def _collect_points(exploration: ExplorationResult, gamma: float, rng: np.random.Generator) -> _Points:
+    """Return the ends of the chains of each region, and points beside it, each in a random order.
+
+    f may be capped within a region or beside it: points whose outcome others share have no gradient. Where failure
+    needs several things at once, a point beside the region lacks the one that all points inside may have in plenty.
     """
-    inside = [region.chains[:, -1] for region in exploration.regions]
-    beside = [region.u[region.f > gamma] for region in exploration.regions]
-    groups = [rng.permutation(u) for u in (*inside, *beside)]
-    turns = np.concatenate([np.arange(len(u)) for u in groups])
-    return np.asarray(np.concatenate(groups)[np.argsort(turns, kind="stable")[:n]])
+    groups, fails = list[FloatArray](), list[bool]()
+    for region in exploration.regions:
+        tied, failing = _find_ties(region.f), region.f <= gamma
+        flat = failing.any() and tied[failing].mean() > 0.5
+        groups += [region.chains[: 0 if flat else None, -1], region.u[~failing & ~tied]]
+        fails += [True, False]
+    sizes = [len(u) for u in groups]
+    return _Points(
+        np.concatenate([rng.permutation(u) for u in groups]),
+        np.repeat(fails, sizes),
+        np.concatenate([np.arange(size) for size in sizes]),
+    )
 
 
-def _choose_unexplained(exploration: ExplorationResult, n: int, gamma: float, axes: FloatArray) -> FloatArray:
-    """Return n points whose outcomes known directions (d, r) explain least, shape (n, d).
+def _find_ties(f: FloatArray) -> NDArray[np.bool_]:
+    """Return which outcomes (n,) others share."""
+    _, where, counts = np.unique(f, return_inverse=True, return_counts=True)
+    return np.asarray(counts[where] > 1)
+
+
+def _choose_unexplained(points: _Points, n: int, axes: FloatArray) -> NDArray[np.int64]:
+    """Return the indices (k,) of at most n points whose outcomes known directions (d, r) explain least.
 
     Half of them fail though they are short along these directions, the others are long and do not fail.
     """
-    inside = np.concatenate([region.chains[:, -1] for region in exploration.regions])
-    beside = np.concatenate([region.u[region.f > gamma] for region in exploration.regions])
-    shortest = np.argsort(np.linalg.norm(inside @ axes, axis=1), kind="stable")[: n - n // 2]
-    longest = np.argsort(-np.linalg.norm(beside @ axes, axis=1), kind="stable")[: n // 2]
-    return np.concatenate([inside[shortest], beside[longest]])
+    length = np.linalg.norm(points.u @ axes, axis=1)
+    shortest = np.argsort(np.where(points.fails, length, np.inf), kind="stable")[: points.fails.sum()]
+    longest = np.argsort(np.where(points.fails, np.inf, -length), kind="stable")[: (~points.fails).sum()]
+    half = longest[: n // 2]
+    return np.concatenate([shortest[: n - len(half)], half])
 
 
 def _differentiate(simulator: Simulator, u: FloatArray, step: float) -> SimulationSteps[FloatArray]:
@@ -100,7 +133,8 @@ def _differentiate(simulator: Simulator, u: FloatArray, step: float) -> Simulati
 def _have_few_directions(slopes: FloatArray, settings: SlopeSettings) -> bool:
     """Return whether unit gradients (k, d) lie in fewer directions than random ones would.
 
-    Of k random directions the squares of the singular values are worth k d / (k + d) equal ones: (sum s^2)^2 / sum s^4.
+    The squares s^2 of the singular values of k random directions are worth about k d / (k + d) equal ones: that is
+    (sum s^2)^2 / sum s^4.
     """
     k, dim = slopes.shape
     if k < settings.least:

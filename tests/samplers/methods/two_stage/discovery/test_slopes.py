@@ -68,6 +68,32 @@ def test_a_shell_has_no_few_directions(rng, drive):
     assert n_sim == 10 * 21
 
 
+def test_no_point_is_taken_twice(rng, drive):
+    """Ends of chains and points beside a ring; those that known directions explain least are others each time."""
+    made = []
+
+    def ring(u):
+        if len(u) < 2000:
+            made.append(u[: len(u) // 31])  # the points, before those beside each
+        return 3.5 - np.hypot(u[:, 0], u[:, 1])
+
+    slopes_of(ring, 30, 3.5 * np.eye(30)[0], rng, drive, scattered=True)
+    points = np.concatenate(made)
+    assert len(made) >= 2
+    assert len(np.unique(points, axis=0)) == len(points) > 10
+
+
+def test_a_plane_is_found_where_failure_is_flat(rng, drive):
+    """-1 on failure: gradients are made beside the ring only."""
+
+    def f(u):
+        r = np.hypot(u[:, 0], u[:, 1])
+        return np.where(r >= 3.5, -1.0, 3.5 - r)
+
+    axes, _ = slopes_of(f, 30, 3.3 * np.eye(30)[0], rng, drive)
+    assert holds(axes, np.eye(30)[:2])
+
+
 def test_the_gradient_of_a_curved_f_is_right_to_half_a_step(rng, drive):
     """f = 3 - u_1 + 0.1 u_2^2 at u_2 near 1: the difference over 0.05 is 0.1 (2 u_2 + 0.05)."""
     axes, _ = slopes_of(lambda u: 3.0 - u[:, 0] + 0.1 * u[:, 1] ** 2, 15, 2.5 * np.eye(15)[0], rng, drive)
