@@ -211,7 +211,7 @@ class SlopeSettings:
     least_part: float = 0.005
     """Share of the gradients' squares that a direction must hold: noise of f bends gradients less."""
     most_axes: int = 12
-    """Directions at most. With 8, the c.o.v. of duffing_d60 was 0.21 for 0.15 (24 runs)."""
+    """Directions at most. With 8, the c.o.v. of duffing_d60 was 0.21 for 0.15 (24 runs each)."""
 
 
 @dataclass(frozen=True, kw_only=True)

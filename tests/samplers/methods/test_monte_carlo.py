@@ -27,7 +27,7 @@ def test_stops_at_the_target():
 def test_says_when_the_target_was_missed():
     result = samplers.estimate(EASY.problem, "mc", seed=1, target_cov=0.01, max_sim=3000)
     assert result.status == "budget"
-    assert any("target" in text for text in result.warnings)
+    assert any("target" in text for text in result.remarks)
 
 
 def test_without_max_sim_n_is_the_limit():

@@ -25,6 +25,7 @@ RUNS = {
     "two regions": (samplers.FunctionProblem(lambda u: 3.0 - np.abs(u[:, 0]), 5), 2000, None),
     "many dimensions": (half_space(60).problem, 2000, None),
     "many faces": (samplers.FunctionProblem(lambda u: 4.2 - np.abs(u).max(axis=1), 10), 6000, None),
+    "sixteen faces": (samplers.FunctionProblem(lambda u: 4.2 - np.abs(u).max(axis=1), 8), 6000, None),
     "all around": (shell().problem, 6000, None),
     "noise": (samplers.FunctionProblem(lambda u: 3.0 - u[:, 0] + NOISE.normal(size=len(u)), 2), 2000, None),
     "subset simulation instead": (samplers.FunctionProblem(lambda u: 4.5 - np.abs(u).max(axis=1), 20), 6000, 0.9),
